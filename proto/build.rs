@@ -1,0 +1,16 @@
+//! Compiles `clearway/v1/*.proto` without a system protoc, and keeps the descriptor set for reflection and recordings.
+
+use std::{env, error::Error, fs, path::PathBuf};
+
+use prost::Message;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let protos = ["clearway/v1/map.proto", "clearway/v1/service.proto"];
+    for proto in protos {
+        println!("cargo::rerun-if-changed={proto}");
+    }
+    let descriptors = protox::compile(protos, ["."])?;
+    fs::write(PathBuf::from(env::var("OUT_DIR")?).join("clearway.v1.bin"), descriptors.encode_to_vec())?;
+    tonic_prost_build::configure().bytes(".clearway.v1").compile_fds(descriptors)?;
+    Ok(())
+}

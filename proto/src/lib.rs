@@ -1,0 +1,13 @@
+//! The wire contract of Clearway. Pure: bytes in, values out.
+//!
+//! [`v1`] holds the generated protobuf and gRPC types, [`DESCRIPTORS`] their descriptor set (for reflection and for
+//! the schemas in recordings), [`codec`] the cells of a channel to bytes and back.
+
+/// Generated from `clearway/v1/*.proto`.
+#[allow(missing_docs, clippy::all)]
+pub mod v1 {
+    tonic::include_proto!("clearway.v1");
+}
+
+/// The encoded `FileDescriptorSet` of `clearway/v1/*.proto`, imports included.
+pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/clearway.v1.bin"));

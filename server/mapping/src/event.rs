@@ -1,0 +1,58 @@
+//! What enters the core. Only the door (live) and the recording's reader make these; nothing behind can tell them apart.
+
+use bytes::Bytes;
+use nalgebra::Isometry3;
+
+/// One thing that happened to one vehicle, in the order the door took it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Event {
+    /// Counts from 0 without a hole.
+    pub sequence: u64,
+    /// When the door read it, ns since the Unix epoch.
+    pub arrival_ns: i64,
+    /// Index of the sensor in the vehicle's configuration; 0 where the body concerns the whole vehicle.
+    pub source: u16,
+    /// What happened.
+    pub body: Body,
+}
+
+/// The kinds of events.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Body {
+    /// One UDP payload as it came: data packet, telemetry, or something to refuse.
+    Datagram(Bytes),
+    /// A turn assembled elsewhere.
+    Scan(Scan),
+    /// Where the vehicle was.
+    EgoPose(EgoPose),
+    /// The door's queue was full: this many events of this source never entered.
+    Lost(u64),
+    /// The source has ended: an unfinished revolution becomes a partial one.
+    End,
+}
+
+/// Points of one turn, in the sensor's frame (REP-103), metres.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Scan {
+    /// Stamp of the turn's end, ns since the Unix epoch.
+    pub stamp_ns: i64,
+    /// Metres.
+    pub x: Vec<f32>,
+    /// Metres.
+    pub y: Vec<f32>,
+    /// Metres.
+    pub z: Vec<f32>,
+    /// 0 to 1.
+    pub intensity: Vec<f32>,
+}
+
+/// Where the vehicle was and how fast.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EgoPose {
+    /// ns since the Unix epoch.
+    pub stamp_ns: i64,
+    /// Ego frame in the locally fixed world frame.
+    pub map_from_ego: Isometry3<f64>,
+    /// Forward speed.
+    pub speed_mps: f64,
+}

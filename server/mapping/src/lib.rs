@@ -1,0 +1,16 @@
+//! Events in, maps out: the papers' algorithms as pure functions of the events.
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | [`event`] | what enters: datagrams, scans, ego poses, losses |
+//! | [`config`] | one vehicle's sensors and maps |
+//! | [`pipeline`] | `step(&Event)` conducts the hops below |
+//! | [`mount`] | first revolutions -> height, pitch and roll of a sensor nobody measured |
+//! | [`sweep`] | revolution or scan + extrinsics + ego pose -> [`sweep::Sweep`] in the ego frame |
+//! | [`map`] | what a map is: geometry, legend, channels |
+//! | [`drivability`] | thesis §IV |
+//! | [`height_difference`] | the thesis' baseline |
+
+pub mod config;
+pub mod event;
+pub mod map;

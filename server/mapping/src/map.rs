@@ -1,0 +1,101 @@
+//! What a map is: a header, and layers of channels over one grid each. Class 0 is unknown everywhere, and is never free.
+
+use nalgebra::Isometry3;
+
+/// Everything made from one revolution (or scan) of one vehicle.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Map {
+    /// Counts from 0 without a hole for each vehicle.
+    pub sequence: u64,
+    /// First firing, ns since the Unix epoch.
+    pub capture_start_ns: i64,
+    /// Last firing; the stamp all points are expressed at, and the one age is measured from.
+    pub capture_end_ns: i64,
+    /// Arrival of the event that completed the map.
+    pub completed_ns: i64,
+    /// Ego frame in the world frame at `capture_end_ns`; `None` while no pose is known.
+    pub map_from_ego: Option<Isometry3<f64>>,
+    /// Forward speed, where known.
+    pub speed_mps: Option<f64>,
+    /// The sensors that contributed.
+    pub sensors: Vec<SensorState>,
+    /// In the order of the configuration.
+    pub layers: Vec<Layer>,
+}
+
+/// One sensor's part in a map.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SensorState {
+    /// From the configuration.
+    pub name: String,
+    /// `hdl32e`, …; `scan` where the turn was assembled elsewhere.
+    pub model: String,
+    /// Data packets of this revolution.
+    pub packets: u32,
+    /// Datagrams refused since the start.
+    pub refused: u64,
+    /// Returns in this revolution.
+    pub returns: u32,
+    /// Measured turning rate; 0 where unknown.
+    pub rpm: f32,
+    /// Share of the turn's azimuths that have firings, 0 to 1.
+    pub completeness: f32,
+    /// `start`, `end`, `gap`, `reversal`, or empty for a whole turn.
+    pub partial: &'static str,
+}
+
+/// One named grid.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Layer {
+    /// `drivability`, `height_difference`, …
+    pub name: &'static str,
+    /// Where the cells lie.
+    pub geometry: Geometry,
+    /// Names of the values of the channel `class`, by value; entry 0 is `unknown`.
+    pub legend: &'static [&'static str],
+    /// The first is `class`.
+    pub channels: Vec<Channel>,
+    /// Segment planes z = ax + by + c, ego frame, by segment id; empty for layers without.
+    pub planes: Vec<[f64; 3]>,
+    /// Named figures of the whole layer (`drivable_share`, …).
+    pub figures: Vec<(&'static str, f64)>,
+}
+
+/// Where cells lie, in the ego frame.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Geometry {
+    /// r-θ grid: cell index = row * columns + column; row 0 innermost, row j spans (r_bench[j-1], r_bench[j]];
+    /// column c spans azimuths [c, c+1) * 2π/columns, counter-clockwise from the ego x axis.
+    Radial {
+        /// Outer radius of each row, metres, ascending.
+        r_bench_m: Vec<f32>,
+        /// Number of columns.
+        columns: u16,
+    },
+}
+
+/// One value a cell.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Channel {
+    /// `class`, `unit_height`, `segment`, `difference`, …
+    pub name: &'static str,
+    /// `""` for a class or an id, else `m`, …
+    pub unit: &'static str,
+    /// A cell's value in `unit` is `raw * scale`.
+    pub scale: f32,
+    /// The raw value that means "nothing is known of this cell".
+    pub unknown: i32,
+    /// Raw values.
+    pub cells: Cells,
+}
+
+/// Raw cell values.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Cells {
+    /// 0 to 255.
+    U8(Vec<u8>),
+    /// -128 to 127.
+    I8(Vec<i8>),
+    /// 0 to 65535.
+    U16(Vec<u16>),
+}
