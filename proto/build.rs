@@ -5,7 +5,7 @@ use std::{env, error::Error, fs, path::PathBuf};
 use prost::Message;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let protos = ["clearway/v1/map.proto", "clearway/v1/service.proto"];
+    let protos = ["clearway/v1/journal.proto", "clearway/v1/map.proto", "clearway/v1/service.proto"];
     for proto in protos {
         println!("cargo::rerun-if-changed={proto}");
     }
