@@ -1,0 +1,98 @@
+// In: a Channel message as read by protobuf.js. Out: its cells as a typed array, or a Refused error that names what was
+// wrong. Nothing is allocated before the claimed count is checked, and no cell is given before all of them are right:
+// count, canonical form (no empty run, neighbours differ, shortest varints, lengths sum to the count), range, CRC.
+// Format: proto/clearway/v1/map.proto, Channel and Encoding.
+
+// A Cartesian grid of 1024 x 1024 cells; what is larger is a mistake or an attack.
+export const CELLS_MAX = 1 << 20;
+
+const TYPES = {
+  1: { cells: Uint8Array, width: 1, min: 0, max: 255, signed: false },
+  2: { cells: Int8Array, width: 1, min: -128, max: 127, signed: true },
+  3: { cells: Uint16Array, width: 2, min: 0, max: 65535, signed: false },
+};
+const RAW = 1, RUNS = 2;
+
+export class Refused extends Error {
+  name = "Refused";
+  constructor(reason, detail) {
+    super(`${reason}: ${detail}`);
+    this.reason = reason;
+  }
+}
+
+// cellsExpected: what the layer's geometry holds.
+export function decodeChannel(channel, cellsExpected) {
+  const { name, cell_type, cell_count, encoding, payload } = channel;
+  const type = TYPES[cell_type];
+  const refuse = (reason, detail) => new Refused(reason, `channel ${name}: ${detail}`);
+  if (!type) throw refuse("cell_type", `${cell_type}; allowed are 1 (u8), 2 (i8), 3 (u16)`);
+  if (cell_count > CELLS_MAX) throw refuse("cell_count", `${cell_count} cells claimed; at most ${CELLS_MAX}`);
+  if (cell_count !== cellsExpected) {
+    throw refuse("cell_count", `${cell_count} cells claimed; the grid has ${cellsExpected}`);
+  }
+  let cells;
+  if (encoding === RAW) cells = readRaw(payload, type, cell_count, refuse);
+  else if (encoding === RUNS) cells = readRuns(payload, type, cell_count, refuse);
+  else throw refuse("encoding", `${encoding}; allowed are 1 (raw), 2 (runs)`);
+  const crc = crc32(littleEndian(cells, type));
+  if (crc !== channel.crc32) throw refuse("crc", `cells have ${hex(crc)}, the message says ${hex(channel.crc32)}`);
+  return cells;
+}
+
+function readRaw(payload, type, count, refuse) {
+  const bytes = count * type.width;
+  if (payload.length !== bytes) throw refuse("payload", `${payload.length} raw bytes; ${count} cells need ${bytes}`);
+  const view = new DataView(payload.buffer, payload.byteOffset, payload.length);
+  const read = { 1: type.signed ? "getInt8" : "getUint8", 2: "getUint16" }[type.width];
+  return type.cells.from({ length: count }, (_, i) => view[read](i * type.width, true));
+}
+
+function readRuns(payload, type, count, refuse) {
+  const cells = new type.cells(count);
+  let at = 0, filled = 0, previous = null;
+  // Values need at most 3 bytes, lengths of up to CELLS_MAX 3 as well; 5 cover any 32-bit number.
+  const varint = () => {
+    for (let value = 0, i = 0; i < 5; i++) {
+      if (at === payload.length) throw refuse("payload", `ends inside a run after ${filled} of ${count} cells`);
+      const byte = payload[at++];
+      value += (byte & 0x7f) * 2 ** (7 * i);
+      if (byte >= 0x80) continue;
+      if (byte === 0 && i > 0) throw refuse("canonical", `a varint before byte ${at} is longer than it need be`);
+      return value;
+    }
+    throw refuse("payload", `a varint before byte ${at} has more than 5 bytes`);
+  };
+  while (at < payload.length) {
+    const coded = varint(), length = varint() + 1;
+    const value = type.signed ? (coded % 2 ? -(coded + 1) / 2 : coded / 2) : coded;
+    if (value < type.min || value > type.max) throw refuse("value", `${value}; allowed are ${type.min} to ${type.max}`);
+    if (value === previous) throw refuse("canonical", `two neighbouring runs of value ${value} at cell ${filled}`);
+    if (length > count - filled) throw refuse("run", `${length} cells at cell ${filled}; ${count - filled} are left`);
+    cells.fill(value, filled, filled + length);
+    filled += length;
+    previous = value;
+  }
+  if (filled !== count) throw refuse("run", `runs cover ${filled} of ${count} cells`);
+  return cells;
+}
+
+function littleEndian(cells, type) {
+  if (type.width === 1) return new Uint8Array(cells.buffer);
+  const bytes = new DataView(new ArrayBuffer(cells.length * 2));
+  cells.forEach((cell, i) => bytes.setUint16(i * 2, cell, true));
+  return new Uint8Array(bytes.buffer);
+}
+
+const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
+  for (let bit = 0; bit < 8; bit++) n = n & 1 ? (n >>> 1) ^ 0xedb88320 : n >>> 1;
+  return n;
+});
+
+export function crc32(bytes) {
+  let crc = -1;
+  for (const byte of bytes) crc = CRC_TABLE[(crc ^ byte) & 0xff] ^ (crc >>> 8);
+  return (crc ^ -1) >>> 0;
+}
+
+const hex = (n) => `0x${n.toString(16).padStart(8, "0")}`;

@@ -1,0 +1,126 @@
+// What the page must never get wrong: cells, places and ages. Run: cd server/web && node --test
+
+import assert from "node:assert/strict";
+import test from "node:test";
+import { freshness, ServerClock } from "./clock.js";
+import { CELLS_MAX, crc32, decodeChannel } from "./codec.js";
+import { egoAt, gridOf, pixelCells } from "./grid.js";
+import { readMapUpdate, WireError } from "./protobuf.js";
+
+const [U8, I8, U16] = [1, 2, 3], [RAW, RUNS] = [1, 2];
+const channel = (cell_type, encoding, payload, raw, cell_count) => ({
+  name: "class", cell_type, encoding, cell_count, payload: Uint8Array.from(payload), crc32: crc32(Uint8Array.from(raw)),
+});
+const refusedFor = (reason, given, expected = given.cell_count) =>
+  assert.throws(() => decodeChannel(given, expected), (error) => error.name === "Refused" && error.reason === reason);
+
+test("the crc is the ieee one", () => {
+  assert.equal(crc32(new TextEncoder().encode("123456789")), 0xcbf43926);
+});
+
+test("raw and runs of every cell type give the cells that went in", () => {
+  assert.deepEqual([...decodeChannel(channel(U8, RAW, [0, 1, 255], [0, 1, 255], 3), 3)], [0, 1, 255]);
+  assert.deepEqual([...decodeChannel(channel(I8, RAW, [128, 255], [128, 255], 2), 2)], [-128, -1]);
+  assert.deepEqual([...decodeChannel(channel(U16, RAW, [1, 2], [1, 2], 1), 1)], [513]);
+  assert.deepEqual([...decodeChannel(channel(U8, RUNS, [2, 2, 0, 0], [2, 2, 2, 0], 4), 4)], [2, 2, 2, 0]);
+  assert.deepEqual([...decodeChannel(channel(I8, RUNS, [255, 1, 0, 254, 1, 0], [128, 127], 2), 2)], [-128, 127]);
+  assert.deepEqual([...decodeChannel(channel(U16, RUNS, [255, 255, 3, 1], [255, 255, 255, 255], 2), 2)], [65535, 65535]);
+});
+
+test("wrong cells are refused by name", () => {
+  const runs = (payload, raw, count) => channel(U8, RUNS, payload, raw, count);
+  refusedFor("cell_count", runs([0, 0], [0], 2 ** 32 - 1));
+  refusedFor("cell_count", runs([0, 0], [0], CELLS_MAX + 1));
+  refusedFor("cell_count", runs([0, 0], [0], 1), 2);
+  refusedFor("run", runs([0, 3], [0, 0], 2));
+  refusedFor("run", runs([0, 0], [0], 2));
+  refusedFor("canonical", runs([1, 0, 1, 0], [1, 1], 2));
+  refusedFor("canonical", runs([0x81, 0x00, 0], [1], 1));
+  refusedFor("payload", runs([1], [1], 1));
+  refusedFor("payload", channel(U8, RAW, [1, 2], [1], 1));
+  refusedFor("value", runs([0x80, 2, 0], [0], 1));
+  refusedFor("crc", runs([1, 0], [2], 1));
+  refusedFor("encoding", channel(U8, 7, [1], [1], 1));
+  refusedFor("cell_type", channel(9, RAW, [1], [1], 1));
+});
+
+test("no message of random bytes gives anything but a value or a named error", () => {
+  let seed = 2;
+  const byte = () => (seed = (Math.imul(seed, 1664525) + 1013904223) >>> 0) >>> 24;
+  for (let i = 0; i < 5000; i++) {
+    const bytes = Uint8Array.from({ length: byte() % 40 }, byte);
+    try {
+      readMapUpdate(bytes);
+    } catch (error) {
+      assert.ok(error instanceof WireError, `${error} for ${bytes}`);
+    }
+    try {
+      decodeChannel(channel(1 + (byte() % 3), RUNS, bytes, [], 32), 32);
+    } catch (error) {
+      assert.equal(error.name, "Refused", `${error} for ${bytes}`);
+    }
+  }
+});
+
+test("an update is read with its stamps whole", () => {
+  const stamp = 1764000000123456789n, bytes = new Uint8Array(14);
+  bytes.set([0x0a, 1, 42, 0x10, 3]);
+  bytes[5] = 0x19;
+  new DataView(bytes.buffer).setBigInt64(6, stamp, true);
+  const update = readMapUpdate(bytes);
+  assert.deepEqual([[...update.map], update.skipped, update.sent_ns], [[42], 3n, stamp]);
+  assert.throws(() => readMapUpdate(bytes.subarray(0, 9)), WireError);
+});
+
+test("columns run counter-clockwise from ahead and a bench belongs to the row within", () => {
+  const grid = gridOf({ radial: { r_bench_m: [1, 2, 4], columns: 4 } });
+  assert.equal(grid.cellAt(0.5, 0.1), 0);
+  assert.equal(grid.cellAt(-0.1, 0.5), 1);
+  assert.equal(grid.cellAt(0.1, -0.5), 3);
+  assert.equal(grid.cellAt(2, 0), 4);
+  assert.equal(grid.cellAt(3, -1e-18), 11);
+  assert.equal(grid.cellAt(4.01, 0), -1);
+  assert.throws(() => gridOf({ radial: { r_bench_m: [2, 1], columns: 4 } }), /bench 1 is 1 m/);
+});
+
+test("a cartesian cell begins at its lower edge", () => {
+  const grid = gridOf({ cartesian: { origin_x_m: -1, origin_y_m: -1, width: 3, height: 2, cell_m: 1 } });
+  assert.deepEqual([grid.cellAt(-1, -1), grid.cellAt(1.5, 0.5), grid.cellAt(2, 0), grid.cellAt(0, 1)], [0, 5, -1, -1]);
+});
+
+test("ahead is up and left is left", () => {
+  const { x, y } = egoAt(0, 0, 10, 5);
+  assert.deepEqual([x, y], [4.5, 4.5]);
+  const grid = gridOf({ radial: { r_bench_m: [20], columns: 4 } });
+  assert.deepEqual([...pixelCells(grid, 2, 5)], [0, 3, 1, 2]);
+});
+
+const ns = (ms) => BigInt(Math.round(ms * 1e6));
+
+test("a skewed clock does not change an age", () => {
+  for (const skew of [-3.6e6, 0, 3.6e6]) {
+    const clock = new ServerClock(), start = 1.7e12 + skew;
+    for (const [at, delay] of [[0, 20], [100, 5], [200, 60]]) clock.sample(at + delay, ns(start + at));
+    const age = freshness({ capture_end_ns: ns(start + 150), valid_until_ns: ns(start + 450) }, clock.now_ns(260));
+    assert.ok(Math.abs(age.age_ms - 105) < 0.1, `${age.age_ms} ms at skew ${skew}`);
+    assert.ok(age.fresh);
+  }
+});
+
+test("a delay that grows a millisecond a map becomes stale", () => {
+  const clock = new ServerClock();
+  let age;
+  for (let i = 0; i < 600; i++) {
+    const sent = 1e12 + i * 100, received = i * 100 + i;
+    clock.sample(received, ns(sent));
+    age = freshness({ capture_end_ns: ns(sent - 60), valid_until_ns: ns(sent + 240) }, clock.now_ns(received));
+  }
+  assert.equal(age.fresh, false);
+  assert.ok(age.age_ms > 640, `${age.age_ms} ms`);
+});
+
+test("a map whose time is unknown, past or from the future is not fresh", () => {
+  const header = { capture_end_ns: ns(1000), valid_until_ns: ns(1300) };
+  const fresh = (now) => freshness(header, now).fresh;
+  assert.deepEqual([null, ns(1301), ns(800), ns(1300)].map(fresh), [false, false, false, true]);
+});

@@ -1,0 +1,37 @@
+// In: the bytes of one MapUpdate. Out: the map with every layer's grid and cells checked, or an error that names what
+// was wrong. A map is taken whole or not at all.
+
+import { decodeChannel, Refused } from "./codec.js";
+import { gridOf } from "./grid.js";
+import { readMap, readMapUpdate } from "./protobuf.js";
+
+// The server's limit is 64 KiB a message; this leaves room for large layers, not for an attack.
+const BYTES_MAX = 4 << 20;
+
+// { skipped, sent_ns, bytes, header, layers: [{ name, legend, grid, channels: [{ name, unit, scale, unknown, cells }],
+// figures }] }; 64-bit values are BigInt.
+export function openUpdate(message) {
+  if (message.length > BYTES_MAX) throw new Refused("length", `${message.length} bytes; at most ${BYTES_MAX}`);
+  const update = readMapUpdate(message);
+  if (update.sent_ns <= 0n) throw new Refused("sent_ns", `${update.sent_ns}; without it no age can be told`);
+  const { header, layers } = readMap(update.map);
+  if (!header) throw new Refused("header", "the map has none");
+  return { ...update, bytes: update.map.length, header, layers: layers.map(openLayer) };
+}
+
+function openLayer(layer) {
+  const grid = gridOf(layer);
+  const channels = layer.channels.map((channel) => {
+    const cells = decodeChannel(channel, grid.cells);
+    if (channel.name === "class") {
+      const unnamed = cells.find((cell) => cell < 0 || cell >= layer.legend.length);
+      if (unnamed !== undefined) {
+        throw new Refused("class", `layer ${layer.name}: ${unnamed}; the legend names ${layer.legend.length}`);
+      }
+    }
+    const { name, unit, scale, unknown } = channel;
+    return { name, unit, scale, unknown, cells };
+  });
+  if (channels.length === 0) throw new Refused("channels", `layer ${layer.name} has none`);
+  return { name: layer.name, legend: layer.legend, grid, channels, figures: layer.figures };
+}

@@ -1,0 +1,36 @@
+// In: numbers. Out: what a person reads.
+
+export const dash = "–";
+
+export const count = (n) => (n === undefined || n === null ? dash : n.toLocaleString("en"));
+
+export const percent = (share, digits = 1) => (Number.isFinite(share) ? `${(100 * share).toFixed(digits)} %` : dash);
+
+export function duration(ms) {
+  if (ms === null || !Number.isFinite(ms)) return dash;
+  if (ms < 0) return `−${duration(-ms)}`;
+  if (ms < 999.5) return `${Math.round(ms)} ms`;
+  if (ms < 59950) return `${(ms / 1e3).toFixed(1)} s`;
+  const s = Math.round(ms / 1e3);
+  if (s < 3600) return `${Math.floor(s / 60)} min ${Math.floor(s % 60)} s`;
+  if (s < 172800) return `${Math.floor(s / 3600)} h ${Math.floor((s % 3600) / 60)} min`;
+  const days = s / 86400;
+  return days < 730 ? `${Math.floor(days)} days` : `${(days / 365.25).toFixed(1)} years`;
+}
+
+export function utc(ns) {
+  const date = new Date(Number(ns / 1000000n));
+  return Number.isNaN(date.getTime()) ? dash : date.toISOString().replace("T", " ").replace("Z", " UTC");
+}
+
+export function bytes(n) {
+  return n < 1024 ? `${n} B` : `${(n / 1024).toFixed(1)} KiB`;
+}
+
+// Azimuth from the ego x axis, counter-clockwise, as a person points.
+export function bearing(azimuth) {
+  const degrees = (azimuth * 180) / Math.PI;
+  const size = Math.abs(degrees).toFixed(1);
+  if (size === "0.0" || size === "180.0") return size === "0.0" ? "straight ahead" : "straight behind";
+  return `${size}° ${degrees > 0 ? "left" : "right"}`;
+}
