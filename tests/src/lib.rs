@@ -1,1 +1,38 @@
-//! stub
+//! What the whole-house tests share: the two binaries, and a place to run them in.
+
+use std::path::PathBuf;
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+
+/// The folder of the binaries, built once for all tests of this process with the profile of the tests.
+///
+/// # Panics
+/// When cargo cannot build them.
+pub fn binaries() -> &'static PathBuf {
+    static BINARIES: OnceLock<PathBuf> = OnceLock::new();
+    BINARIES.get_or_init(|| {
+        let test = std::env::current_exe().expect("the path of this test");
+        let folder = test.ancestors().nth(2).expect("target/<profile>/deps/<test>").to_path_buf();
+        let mut cargo = Command::new(env!("CARGO"));
+        cargo.args(["build", "--quiet", "--workspace", "--bins", "--target-dir"]).arg(folder.parent().expect("target"));
+        if folder.ends_with("release") {
+            cargo.arg("--release");
+        }
+        let built = cargo.current_dir(workspace()).status().expect("cargo runs");
+        assert!(built.success(), "cargo build --workspace --bins: {built}");
+        folder
+    })
+}
+
+/// The repository.
+pub fn workspace() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the repository").to_path_buf()
+}
+
+/// Runs `clearway-server` or `clearway` in `folder` to its end.
+///
+/// # Panics
+/// When the binary cannot be started.
+pub fn run(folder: &std::path::Path, program: &str, arguments: &[&str]) -> Output {
+    Command::new(binaries().join(program)).args(arguments).current_dir(folder).output().expect("the binary starts")
+}

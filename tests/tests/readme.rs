@@ -1,0 +1,105 @@
+//! The README's commands do what the README says.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use clearway_tests::{binaries, run, workspace};
+
+/// Every command line of the README's `sh` blocks, in order.
+fn commands() -> Vec<String> {
+    let readme = fs::read_to_string(workspace().join("README.md")).expect("README.md");
+    let mut inside = false;
+    let mut lines = Vec::new();
+    for line in readme.lines() {
+        match line {
+            "```sh" => inside = true,
+            "```" => inside = false,
+            command if inside => lines.push(command.to_owned()),
+            _ => {}
+        }
+    }
+    lines
+}
+
+/// A server the test stops again, whatever happens.
+struct Stopped(Child);
+
+impl Drop for Stopped {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+fn succeeds(folder: &Path, command: &str) {
+    let words: Vec<_> = command.split_whitespace().collect();
+    let output = run(folder, words[0], &words[1..]);
+    assert!(output.status.success(), "{command}: {}\n{}", output.status, String::from_utf8_lossy(&output.stderr));
+}
+
+#[test]
+fn the_first_command_is_the_demo_and_the_second_runs_all_tests() {
+    let commands = commands();
+    assert_eq!(commands[0], "cargo run --release -- demo");
+    assert_eq!(commands[1], "cargo test --workspace");
+    let ci = fs::read_to_string(workspace().join(".ci/run")).expect(".ci/run");
+    assert_eq!(ci.lines().last(), Some(commands[1].as_str()), ".ci/run ends with the README's test command");
+}
+
+#[test]
+fn the_demo_runs_and_ends_cleanly() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let output = run(folder.path(), "clearway-server", &["demo", "--seconds", "3"]);
+    let said = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{}\n{said}\n{}", output.status, String::from_utf8_lossy(&output.stderr));
+    for place in ["http://", "gRPC", "zenoh", ".mcap", ".png"] {
+        assert!(said.contains(place), "the demo tells of {place}:\n{said}");
+    }
+}
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn a_capture_is_replayed_verified_exported_and_described_as_the_readme_says() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let capture = Path::new(option_env!("CLEARWAY_DATA").unwrap_or_default()).join("pcap/rust-lidar-utils/hdl32_example.pcap");
+    fs::copy(&capture, folder.path().join("drive.pcap")).expect("the HDL-32E capture");
+    let offline: Vec<_> = commands()
+        .into_iter()
+        .filter(|c| ["replay", "verify", "export", "info"].iter().any(|verb| c.split(' ').nth(1) == Some(verb)))
+        .collect();
+    assert_eq!(offline.len(), 4, "{offline:?}");
+    for command in &offline {
+        succeeds(folder.path(), command);
+    }
+    let pictures = fs::read_dir(folder.path().join("maps")).expect("maps/").count();
+    assert!(pictures >= 6, "{pictures} pictures of 5.7 revolutions");
+}
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn the_default_configuration_serves_what_send_sends_to_the_readers() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let capture = Path::new(option_env!("CLEARWAY_DATA").unwrap_or_default()).join("pcap/rust-lidar-utils/hdl32_example.pcap");
+    fs::copy(&capture, folder.path().join("drive.pcap")).expect("the HDL-32E capture");
+    let config = workspace().join("deploy/clearway.toml");
+    let server = Command::new(binaries().join("clearway-server"))
+        .args(["serve", "--config"])
+        .arg(config)
+        .current_dir(folder.path())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("clearway-server starts");
+    let _server = Stopped(server);
+    while !run(folder.path(), "clearway", &["vehicles"]).status.success() {
+        std::thread::yield_now();
+    }
+    for command in commands().iter().filter(|c| c.starts_with("clearway send") || c.starts_with("clearway vehicles")) {
+        succeeds(folder.path(), command);
+    }
+    succeeds(folder.path(), "clearway watch --count 1");
+    let get = commands().into_iter().find(|c| c.starts_with("clearway get")).expect("the README shows `clearway get`");
+    succeeds(folder.path(), &get);
+    assert!(folder.path().join("newest.png").is_file());
+}
