@@ -1,1 +1,24 @@
-//! stub
+//! A simulated vehicle: a world, a ray caster, and the inverse of the Velodyne decoder.
+//!
+//! In: a scene described object by object. Out: the datagrams its sensor would send, and the truth about the ground
+//! around the vehicle. Everything but [`send`] is a pure function of the scene, the seed and the time.
+//!
+//! The files, in the order the data flows:
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | [`ground`], [`object`], [`course`] | the parts a world is made of |
+//! | [`world`] | a description -> [`world::World`] |
+//! | [`scenes`] | the thesis' four scenes and a town |
+//! | [`truth`] | world, pose, time -> which ground is drivable |
+//! | [`plan`] | the same as text, seen from above |
+//! | [`raycast`] | world, rays -> what they meet |
+pub mod course;
+pub mod ground;
+pub mod noise;
+pub mod object;
+pub mod plan;
+pub mod raycast;
+pub mod scenes;
+pub mod truth;
+pub mod world;

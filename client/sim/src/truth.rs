@@ -1,0 +1,378 @@
+//! What is drivable in a world, known from the world itself: the truth the maps are held against.
+//!
+//! In: a world, the vehicle's pose, a time. Out: a raster in the ego frame (x forward, y left, metres). The limits are the
+//! thesis' §IV: a step of one unit (0.25 m), a clearance of 2.5 m, gates 3 m wide (criterion 3).
+
+use nalgebra::{Isometry3, Point3};
+
+use crate::object::Shape;
+use crate::world::World;
+
+/// What a place is to a vehicle that stands at the raster's middle.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Truth {
+    /// Beyond the raster.
+    #[default]
+    Outside,
+    /// Free ground the vehicle reaches through gates wide enough.
+    Drivable,
+    /// Free ground that is reached only through narrower gates, or a niche too narrow for the vehicle: either answer of
+    /// a map can be defended.
+    Tight,
+    /// Free ground with no way to it.
+    Unreachable,
+    /// Ground that is too steep, or the edge of too high a step.
+    Steep,
+    /// Something stands or hangs within the clearance.
+    Obstacle,
+}
+
+impl Truth {
+    /// Whether a map must never call this drivable.
+    pub fn is_forbidden(self) -> bool {
+        matches!(self, Truth::Unreachable | Truth::Steep | Truth::Obstacle)
+    }
+}
+
+/// What a vehicle can do.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Limits {
+    /// Steepest ground, rise over run.
+    pub slope_max: f64,
+    /// Highest step, and highest object that is driven over, metres.
+    pub step_m_max: f64,
+    /// Nothing hangs lower than this over drivable ground, metres.
+    pub clearance_m: f64,
+    /// Narrowest gate, metres.
+    pub gate_m_min: f64,
+}
+
+impl Default for Limits {
+    /// 20 degrees, and the thesis' unit, cut-off height and boundary length (§IV).
+    fn default() -> Self {
+        Self { slope_max: 0.364, step_m_max: 0.25, clearance_m: 2.5, gate_m_min: 3.0 }
+    }
+}
+
+/// The truth about the ground around a vehicle, as a raster in its ego frame.
+#[derive(Clone, Debug)]
+pub struct TruthGrid {
+    /// Distance from the vehicle to each side of the raster, metres.
+    pub half_extent_m: f64,
+    /// Side of a cell, metres.
+    pub cell_m: f64,
+    /// Cells a side.
+    pub side: usize,
+    /// Row by row: cell (i, j) at index `j * side + i` has its middle at x = (i + 0.5) * cell_m - half_extent_m, y alike.
+    pub classes: Vec<Truth>,
+    /// Height of the ground in the ego frame in each cell, metres, in the same order.
+    pub heights: Vec<f32>,
+}
+
+impl TruthGrid {
+    /// The truth at `time` s about a vehicle at `map_from_ego`, `half_extent_m` to each side in cells of `cell_m`.
+    pub fn about(
+        world: &World,
+        map_from_ego: &Isometry3<f64>,
+        time: f64,
+        (half_extent_m, cell_m): (f64, f64),
+        limits: &Limits,
+    ) -> Self {
+        let side = (2.0 * half_extent_m / cell_m).round() as usize;
+        let mut grid = Self {
+            half_extent_m,
+            cell_m,
+            side,
+            classes: vec![Truth::Unreachable; side * side],
+            heights: vec![0.0; side * side],
+        };
+        let places = grid.lay_on_ground(world, map_from_ego);
+        grid.mark_ground(world, &places, limits);
+        grid.mark_objects(world, map_from_ego, time, &places, limits);
+        grid.mark_reachable(limits);
+        grid
+    }
+
+    /// The class at a place in the ego frame, metres; [`Truth::Outside`] beyond the raster.
+    pub fn class_at(&self, x: f64, y: f64) -> Truth {
+        self.index_at(x, y).map_or(Truth::Outside, |index| self.classes[index])
+    }
+
+    /// The height of the ground at a place, both in the ego frame, metres; `None` beyond the raster.
+    pub fn height_at(&self, x: f64, y: f64) -> Option<f32> {
+        self.index_at(x, y).map(|index| self.heights[index])
+    }
+
+    fn index_at(&self, x: f64, y: f64) -> Option<usize> {
+        let i = ((x + self.half_extent_m) / self.cell_m).floor();
+        let j = ((y + self.half_extent_m) / self.cell_m).floor();
+        let inside = |index: f64| index >= 0.0 && index < self.side as f64;
+        (inside(i) && inside(j)).then(|| j as usize * self.side + i as usize)
+    }
+
+    /// Middle of a cell, metres.
+    pub fn middle(&self, index: usize) -> (f64, f64) {
+        let place = |cell: usize| (cell as f64 + 0.5) * self.cell_m - self.half_extent_m;
+        (place(index % self.side), place(index / self.side))
+    }
+
+    /// World place (x, y, height of the ground) under each cell; a tilted vehicle's raster is carried along its z axis.
+    fn lay_on_ground(&mut self, world: &World, map_from_ego: &Isometry3<f64>) -> Vec<[f64; 3]> {
+        let up = map_from_ego.rotation * nalgebra::Vector3::z();
+        (0..self.classes.len())
+            .map(|index| {
+                let (x, y) = self.middle(index);
+                let mut point = map_from_ego * Point3::new(x, y, 0.0);
+                for _ in 0..3 {
+                    point += up * ((world.ground.height(point.x, point.y) - point.z) / up.z);
+                }
+                let ground = world.ground.height(point.x, point.y);
+                let ego = map_from_ego.inverse_transform_point(&Point3::new(point.x, point.y, ground));
+                self.heights[index] = ego.z as f32;
+                [point.x, point.y, ground]
+            })
+            .collect()
+    }
+
+    fn mark_ground(&mut self, world: &World, places: &[[f64; 3]], limits: &Limits) {
+        for (index, &[x, y, z]) in places.iter().enumerate() {
+            let slope = world.ground.slope(x, y);
+            if slope > limits.slope_max {
+                self.classes[index] = Truth::Steep;
+            }
+            let (i, j) = (index % self.side, index / self.side);
+            for other in [(i + 1 < self.side).then_some(index + 1), (j + 1 < self.side).then_some(index + self.side)] {
+                let Some(other) = other else { continue };
+                let [ox, oy, oz] = places[other];
+                let sloping = slope.max(world.ground.slope(ox, oy)) * (ox - x).hypot(oy - y);
+                if (oz - z).abs() > limits.step_m_max + sloping {
+                    self.classes[index] = Truth::Steep;
+                    self.classes[other] = Truth::Steep;
+                }
+            }
+        }
+    }
+
+    fn mark_objects(
+        &mut self,
+        world: &World,
+        map_from_ego: &Isometry3<f64>,
+        time: f64,
+        places: &[[f64; 3]],
+        limits: &Limits,
+    ) {
+        // Half a cell's diagonal: no thin thing slips between two middles.
+        let margin = 0.71 * self.cell_m;
+        for shape in world.shapes_at(time) {
+            let Some((low, high)) = self.cells_about(&shape, map_from_ego) else { continue };
+            for j in low[1]..=high[1] {
+                for i in low[0]..=high[0] {
+                    let index = j * self.side + i;
+                    let [x, y, ground] = places[index];
+                    if let Some((bottom, top)) = shape.column(x, y, margin)
+                        && bottom < ground + limits.clearance_m
+                        && top > ground + limits.step_m_max
+                    {
+                        self.classes[index] = Truth::Obstacle;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Lowest and highest cell indices that a shape can cover, or `None` if it is beyond the raster.
+    fn cells_about(&self, shape: &Shape, map_from_ego: &Isometry3<f64>) -> Option<([usize; 2], [usize; 2])> {
+        let (corners, radius) = shape.outline();
+        // A tilted raster's cells lean with the ground's height: a metre covers that.
+        let margin = radius + 1.0;
+        let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+        for [x, y] in corners {
+            let ego = map_from_ego.inverse_transform_point(&Point3::new(x, y, map_from_ego.translation.z));
+            for (axis, place) in [ego.x, ego.y].into_iter().enumerate() {
+                low[axis] = low[axis].min((place - margin + self.half_extent_m) / self.cell_m);
+                high[axis] = high[axis].max((place + margin + self.half_extent_m) / self.cell_m);
+            }
+        }
+        let last = self.side as f64 - 1.0;
+        let beyond = (0..2).any(|axis| high[axis] < 0.0 || low[axis] > last);
+        (!beyond).then(|| (low.map(|cell| cell.max(0.0) as usize), high.map(|cell| cell.min(last) as usize)))
+    }
+
+    /// Turns free ground into drivable, tight and unreachable ground.
+    fn mark_reachable(&mut self, limits: &Limits) {
+        let free: Vec<bool> = self.classes.iter().map(|&class| class == Truth::Unreachable).collect();
+        let half_gate = limits.gate_m_min / 2.0 / self.cell_m;
+        // Where a disc as wide as a gate fits; what the vehicle's own disc can be rolled to; what that disc sweeps.
+        let fits: Vec<bool> = squared_distance(&free, self.side).iter().map(|&d| d >= half_gate * half_gate).collect();
+        let rolled = self.flood(&fits, limits.gate_m_min);
+        let outside: Vec<bool> = rolled.iter().map(|&rolled| !rolled).collect();
+        let swept = squared_distance(&outside, self.side);
+        let connected = self.flood(&free, limits.gate_m_min);
+        for index in 0..self.classes.len() {
+            if free[index] && swept[index] < half_gate * half_gate {
+                self.classes[index] = Truth::Drivable;
+            } else if connected[index] {
+                self.classes[index] = Truth::Tight;
+            }
+        }
+    }
+
+    /// The open cells connected, side by side, to those within `seed_m` of the vehicle.
+    fn flood(&self, open: &[bool], seed_m: f64) -> Vec<bool> {
+        let mut reached = vec![false; open.len()];
+        let mut front: Vec<usize> = (0..open.len())
+            .filter(|&index| {
+                let (x, y) = self.middle(index);
+                open[index] && x.hypot(y) <= seed_m
+            })
+            .collect();
+        front.iter().for_each(|&index| reached[index] = true);
+        while let Some(index) = front.pop() {
+            let (i, j) = (index % self.side, index / self.side);
+            let sides = [
+                (i > 0).then(|| index - 1),
+                (i + 1 < self.side).then_some(index + 1),
+                (j > 0).then(|| index - self.side),
+                (j + 1 < self.side).then_some(index + self.side),
+            ];
+            for next in sides.into_iter().flatten() {
+                if open[next] && !reached[next] {
+                    reached[next] = true;
+                    front.push(next);
+                }
+            }
+        }
+        reached
+    }
+}
+
+/// Squared distance in cells from each open cell to the nearest closed one; the raster's border is open.
+///
+/// Exact, in two passes of lower envelopes of parabolas (Felzenszwalb and Huttenlocher 2012).
+fn squared_distance(open: &[bool], side: usize) -> Vec<f64> {
+    // Finite, so that two rows without a closed cell do not make infinity minus infinity.
+    let far = (4 * side * side) as f64;
+    let mut distances: Vec<f64> = open.iter().map(|&open| if open { far } else { 0.0 }).collect();
+    let mut line = vec![0.0; side];
+    for pass in [1, side] {
+        let across = if pass == 1 { side } else { 1 };
+        for row in 0..side {
+            for cell in 0..side {
+                line[cell] = distances[row * across + cell * pass];
+            }
+            for (cell, distance) in envelope(&line).into_iter().enumerate() {
+                distances[row * across + cell * pass] = distance;
+            }
+        }
+    }
+    distances
+}
+
+/// Lowest of the parabolas that stand on each value, at each place.
+fn envelope(values: &[f64]) -> Vec<f64> {
+    let mut feet: Vec<usize> = Vec::with_capacity(values.len());
+    let mut from: Vec<f64> = Vec::with_capacity(values.len());
+    let raised = |q: usize| values[q] + (q * q) as f64;
+    for q in 0..values.len() {
+        let mut meet = f64::NEG_INFINITY;
+        while let Some(&foot) = feet.last() {
+            meet = (raised(q) - raised(foot)) / (2.0 * (q as f64 - foot as f64));
+            if meet > from[feet.len() - 1] {
+                break;
+            }
+            feet.pop();
+            from.pop();
+            meet = f64::NEG_INFINITY;
+        }
+        feet.push(q);
+        from.push(meet);
+    }
+    let mut piece = 0;
+    (0..values.len())
+        .map(|q| {
+            while piece + 1 < feet.len() && from[piece + 1] < q as f64 {
+                piece += 1;
+            }
+            let off = q as f64 - feet[piece] as f64;
+            off * off + values[feet[piece]]
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ground::{Ground, Profile, Terrace};
+
+    const EXTENT: (f64, f64) = (20.0, 0.2);
+
+    fn about(world: &World) -> TruthGrid {
+        TruthGrid::about(world, &Isometry3::identity(), 0.0, EXTENT, &Limits::default())
+    }
+
+    /// A fence right round the vehicle, 12 m to each side, with a gate of this width ahead.
+    fn ring_with_gate(width: f64) -> World {
+        let (side, gate) = (12.0, width / 2.0);
+        World::on(Ground::default()).fence(
+            &[[side, gate], [side, side], [-side, side], [-side, -side], [side, -side], [side, -gate]],
+            1.5,
+            Some(crate::world::SLATS),
+        )
+    }
+
+    #[test]
+    fn behind_a_fence_is_reached_through_a_wide_gate_only() {
+        assert_eq!(about(&ring_with_gate(4.0)).class_at(15.0, 0.0), Truth::Drivable);
+        assert_eq!(about(&ring_with_gate(2.0)).class_at(15.0, 0.0), Truth::Tight);
+        let closed = about(&ring_with_gate(0.0));
+        assert_eq!(closed.class_at(15.0, 0.0), Truth::Unreachable);
+        assert_eq!(closed.class_at(12.0, 5.0), Truth::Obstacle);
+        assert_eq!(closed.class_at(5.0, 5.0), Truth::Drivable);
+        assert_eq!(closed.class_at(25.0, 0.0), Truth::Outside);
+    }
+
+    #[test]
+    fn a_beam_is_an_obstacle_below_the_clearance_only() {
+        for (underside, expected) in [(1.6, Truth::Obstacle), (2.4, Truth::Obstacle), (2.6, Truth::Drivable)] {
+            let world = World::on(Ground::default()).beam([8.0, -3.0], [8.0, 3.0], underside, underside + 0.5);
+            assert_eq!(about(&world).class_at(8.0, 0.0), expected, "underside {underside}");
+        }
+    }
+
+    #[test]
+    fn a_kerb_is_climbed_and_a_ledge_is_not() {
+        for (rise, expected) in [(0.15, Truth::Drivable), (0.4, Truth::Unreachable), (-0.4, Truth::Unreachable)] {
+            let terrace =
+                Terrace { centre: [10.0, 0.0], half: [4.0, 4.0], corner: 1.0, outside: false, rise, reflectivity: 0 };
+            let world = World::on(Ground { terraces: vec![terrace], ..Ground::default() });
+            assert_eq!(about(&world).class_at(10.0, 0.0), expected, "rise {rise}");
+        }
+    }
+
+    #[test]
+    fn a_ramp_is_drivable_and_a_bank_is_not() {
+        let ramp = |rise| World::on(Ground { along: Profile::default().ramp(5.0, 15.0, rise), ..Ground::default() });
+        assert_eq!(about(&ramp(1.5)).class_at(17.0, 0.0), Truth::Drivable);
+        let bank = about(&ramp(5.0));
+        assert_eq!(bank.class_at(10.0, 0.0), Truth::Steep);
+        assert_eq!(bank.class_at(17.0, 0.0), Truth::Unreachable);
+    }
+
+    #[test]
+    fn distances_equal_those_of_a_search_through_all_cells() {
+        let side = 17;
+        for seed in 0..20 {
+            let open: Vec<bool> =
+                (0..side * side).map(|cell| crate::noise::uniform(seed << 32 | cell as u64) > 0.05).collect();
+            let distances = squared_distance(&open, side);
+            for cell in 0..side * side {
+                let nearest = (0..side * side).filter(|&other| !open[other]).map(|other| {
+                    let (dx, dy) = ((cell % side).abs_diff(other % side), (cell / side).abs_diff(other / side));
+                    (dx * dx + dy * dy) as f64
+                });
+                let nearest = nearest.fold((4 * side * side) as f64, f64::min);
+                assert_eq!(distances[cell], nearest, "seed {seed} cell {cell}");
+            }
+        }
+    }
+}
