@@ -19,14 +19,14 @@ function list(element, entries) {
 }
 
 export function streamFigures(element, map, stream, server_ahead_ms) {
-  const header = map?.header;
+  const header = map?.header, pose = header?.map_from_ego;
   const ms = (from, to) => duration(Number(to - from) / 1e6);
   list(element, [
     ["Sequence", header ? count(header.sequence) : dash],
     ["Captured until", header ? utc(header.capture_end_ns) : dash],
     ["Capture end → sent", map ? ms(header.capture_end_ns, map.sent_ns) : dash],
     ["Speed", header?.speed_mps == null ? "unknown" : `${header.speed_mps.toFixed(1)} m/s`],
-    ["Pose", header?.map_from_ego ? ["x", "y", "z"].map((k) => header.map_from_ego[k].toFixed(1)).join(", ") + " m" : "unknown"],
+    ["Pose", pose ? `${pose.x.toFixed(1)}, ${pose.y.toFixed(1)}, ${pose.z.toFixed(1)} m` : "unknown"],
     ["Maps taken", count(stream.taken)],
     ["Skipped (server told)", count(stream.skipped), stream.skipped > 0],
     ["Lost on the way", count(stream.lost), stream.lost > 0],

@@ -161,7 +161,8 @@ function showFreshness(age) {
   const share = age?.age_ms == null ? 1 : Math.min(Math.max(age.age_ms / age.validity_ms, 0), 1);
   $("bar").style.transform = `scaleX(${age ? share : 0})`;
   $("age").textContent = age ? duration(age.age_ms) : "–";
-  $("why").textContent = !age ? "waiting for the first map" : age.why || `valid for ${duration(age.validity_ms)} after capture`;
+  const valid = age && `valid for ${duration(age.validity_ms)} after capture`;
+  $("why").textContent = age ? age.why || valid : "waiting for the first map";
   const label = state === "stale" ? `STALE · ${duration(age.age_ms)}` : "";
   panels.forEach((panel) => panel.stale(label));
 }
@@ -171,7 +172,8 @@ function showFigures(now_ms) {
   // Until a connection is old enough, intervals are counted rather than maps.
   const over_ms = first_ms === null ? 0 : now_ms - first_ms;
   const { phase, text, retry_at_ms } = link_state;
-  const rate = phase !== "live" ? 0 : over_ms >= RATE_OVER_MS ? arrivals.length / RATE_OVER_MS : (arrivals.length - 1) / over_ms;
+  const per_ms = over_ms >= RATE_OVER_MS ? arrivals.length / RATE_OVER_MS : (arrivals.length - 1) / over_ms;
+  const rate = phase === "live" ? per_ms : 0;
   $("rate").textContent = (Number.isFinite(rate) && rate > 0 ? 1e3 * rate : 0).toFixed(1);
   $("size").textContent = map ? bytes(map.bytes) : "–";
   const wait = retry_at_ms ? ` · again in ${Math.max(0, Math.ceil((retry_at_ms - now_ms) / 1e3))} s` : "";

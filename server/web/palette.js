@@ -27,7 +27,7 @@ export function scaleColour(t) {
 // Ids that follow one another get hues far apart: steps of the golden angle.
 export function idColour(id) {
   const hue = (id * 137.508) % 360, light = 0.46 + 0.1 * (id % 3);
-  const chroma = 0.5 * (1 - Math.abs(2 * light - 1));
+  const chroma = 0.28 * (1 - Math.abs(2 * light - 1));
   return [0, 8, 4].map((shift) => {
     const k = (shift + hue / 30) % 12;
     return Math.round(255 * (light - chroma * Math.max(-1, Math.min(k - 3, 9 - k, 1))));

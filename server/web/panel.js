@@ -25,9 +25,8 @@ export class Panel {
     this.name = name;
     this.element = template.content.firstElementChild.cloneNode(true);
     const part = (of) => this.element.querySelector(`[data-part="${of}"]`);
-    this.part = Object.fromEntries(
-      ["title", "share", "channel", "plot", "cells", "overlay", "mark", "readout", "legend", "stale"].map((of) => [of, part(of)]),
-    );
+    const parts = ["title", "share", "channel", "plot", "cells", "overlay", "mark", "readout", "legend", "stale"];
+    this.part = Object.fromEntries(parts.map((of) => [of, part(of)]));
     this.part.title.textContent = name;
     this.part.channel.setAttribute("aria-label", `Channel of ${name}`);
     this.part.channel.onchange = () => {
@@ -94,7 +93,8 @@ export class Panel {
     }
     const share = layer.figures.get("drivable_share");
     this.part.share.textContent = share === undefined ? "" : `${percent(share)} drivable`;
-    this.part.overlay.setAttribute("aria-label", `${layer.name} around the vehicle, forward up. ${this.part.share.textContent}`);
+    const label = `${layer.name} around the vehicle, forward up. ${this.part.share.textContent}`;
+    this.part.overlay.setAttribute("aria-label", label);
     if (this.#probe) this.#point(this.#probe);
   }
 
@@ -105,16 +105,20 @@ export class Panel {
     const used = new Uint32Array(high - low + 1);
     for (const cell of cells) used[cell - low]++;
     const words = new Uint32Array(high - low + 1);
-    const paint = (colour) => used.forEach((n, i) => n && (words[i] = word(i + low === unknown ? UNKNOWN : colour(i + low))));
+    const paint = (colour) =>
+      used.forEach((n, i) => n && (words[i] = word(i + low === unknown ? UNKNOWN : colour(i + low))));
+    const unseen = [UNKNOWN, "unknown", (used[unknown - low] ?? 0) / cells.length];
     if (channel.name === "class") {
       layer.legend.forEach((name, value) => (words[value] = word(classColour(name, value))));
-      this.#legend(layer.legend.map((name, value) => [classColour(name, value), name.replaceAll("_", " "), used[value] / cells.length]));
+      this.#legend(layer.legend.map((name, value) => {
+        return [classColour(name, value), name.replaceAll("_", " "), used[value] / cells.length];
+      }));
     } else if (unit === "") {
       paint(idColour);
       const known = used.reduce((sum, n, i) => sum + (n > 0 && i + low !== unknown), 0);
-      this.#legend([[UNKNOWN, "unknown", (used[unknown - low] ?? 0) / cells.length], [null, `${known} ids, one colour each`]]);
+      this.#legend([unseen, [null, `${known} ids, one colour each`]]);
     } else {
-      // The range only grows while a channel is shown: colours that change their meaning ten times a second tell nothing.
+      // The range only grows while a channel is shown: colours that change their meaning with every map tell nothing.
       used.forEach((n, i) => {
         const value = (i + low) * scale;
         if (n === 0 || i + low === unknown) return;
@@ -122,8 +126,8 @@ export class Panel {
       });
       const [from, to] = this.#range ?? [0, 0];
       paint((raw) => scaleColour(to > from ? (raw * scale - from) / (to - from) : 0.5));
-      const stops = [0, 0.25, 0.5, 0.75, 1].map((t) => [scaleColour(t), `${(from + t * (to - from)).toFixed(2)} ${unit}`]);
-      this.#legend([[UNKNOWN, "unknown", (used[unknown - low] ?? 0) / cells.length], ...(this.#range ? stops : [])]);
+      const stop = (t) => [scaleColour(t), `${(from + t * (to - from)).toFixed(2)} ${unit}`];
+      this.#legend([unseen, ...(this.#range ? [0, 0.25, 0.5, 0.75, 1].map(stop) : [])]);
     }
     return words;
   }
@@ -133,7 +137,7 @@ export class Panel {
     if (names !== this.#legendOf) {
       this.#legendOf = names;
       this.part.legend.replaceChildren(...entries.map(([colour, name]) => {
-        const entry = document.createElement("li"), swatch = document.createElement("i"), share = document.createElement("b");
+        const [entry, swatch, share] = ["li", "i", "b"].map((tag) => document.createElement(tag));
         if (colour) swatch.style.background = css(colour);
         entry.append(...(colour ? [swatch] : []), name, share);
         return entry;

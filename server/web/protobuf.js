@@ -108,7 +108,8 @@ const HEADER = {
 };
 const RADIAL = { 1: ["r_bench_m", many(float)], 2: ["columns", uint32] };
 const CARTESIAN = {
-  1: ["origin_x_m", double], 2: ["origin_y_m", double], 3: ["width", uint32], 4: ["height", uint32], 5: ["cell_m", float],
+  1: ["origin_x_m", double], 2: ["origin_y_m", double], 3: ["width", uint32], 4: ["height", uint32],
+  5: ["cell_m", float],
 };
 const PLANE = { 1: ["a", double], 2: ["b", double], 3: ["c", double] };
 const CHANNEL = {
@@ -116,7 +117,8 @@ const CHANNEL = {
   6: ["encoding", uint32], 7: ["cell_count", uint32], 8: ["crc32", fixed32], 9: ["payload", bytes],
 };
 const LAYER = {
-  1: ["name", string], 2: ["radial", message(RADIAL)], 3: ["cartesian", message(CARTESIAN)], 4: ["legend", many(string)],
+  1: ["name", string], 2: ["radial", message(RADIAL)], 3: ["cartesian", message(CARTESIAN)],
+  4: ["legend", many(string)],
   5: ["channels", many(message(CHANNEL))], 6: ["planes", many(message(PLANE))], 7: ["figures", table(double)],
 };
 const MAP = { 1: ["header", message(HEADER)], 2: ["layers", many(message(LAYER))] };
