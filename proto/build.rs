@@ -11,6 +11,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     let descriptors = protox::compile(protos, ["."])?;
     fs::write(PathBuf::from(env::var("OUT_DIR")?).join("clearway.v1.bin"), descriptors.encode_to_vec())?;
-    tonic_prost_build::configure().bytes(".clearway.v1").compile_fds(descriptors)?;
+    // Ordered maps: the same map must always give the same bytes.
+    tonic_prost_build::configure().bytes(".clearway.v1").btree_map(".clearway.v1").compile_fds(descriptors)?;
     Ok(())
 }

@@ -1,7 +1,13 @@
 //! The wire contract of Clearway. Pure: bytes in, values out.
 //!
 //! [`v1`] holds the generated protobuf and gRPC types, [`DESCRIPTORS`] their descriptor set (for reflection and for
-//! the schemas in recordings), [`codec`] the cells of a channel to bytes and back.
+//! the schemas in recordings), [`codec`] the cells of a channel to bytes and back, [`grid`] where cells lie, [`map`] a
+//! whole map's bytes to checked values.
+
+pub mod codec;
+mod decode;
+pub mod grid;
+pub mod map;
 
 /// Generated from `clearway/v1/*.proto`.
 #[allow(missing_docs, clippy::all)]

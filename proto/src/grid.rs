@@ -1,0 +1,152 @@
+//! Where the cells of a layer lie: metres in the ego frame (x forward, y left) to cell index and back.
+//!
+//! In: `RadialGrid` or `CartesianGrid` from the wire, checked. Out: look-ups that are total: a point outside the grid
+//! has no cell.
+
+use std::f64::consts::TAU;
+
+use crate::map::MapError;
+use crate::v1;
+
+/// The geometry of one layer, checked: no look-up panics.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Grid {
+    /// r-θ: cell index = row * columns + column. Row j spans (r_bench_m\[j-1\], r_bench_m\[j\]], row 0 starts at the
+    /// origin; column c spans azimuths [c, c+1) * 2π / columns, counter-clockwise from the ego x axis.
+    Radial {
+        /// Outer radius of each row, metres, ascending.
+        r_bench_m: Vec<f32>,
+        /// At least 1.
+        columns: u32,
+    },
+    /// Cell index = iy * width + ix; cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m).
+    Cartesian {
+        /// Metres.
+        origin_x_m: f64,
+        /// Metres.
+        origin_y_m: f64,
+        /// Cells along x, at least 1.
+        width: u32,
+        /// Cells along y, at least 1.
+        height: u32,
+        /// Edge of a cell, metres.
+        cell_m: f32,
+    },
+}
+
+impl Grid {
+    /// Checks a layer's geometry.
+    ///
+    /// # Errors
+    /// [`MapError::Geometry`] with what is wrong and the value.
+    pub fn from_wire(layer: &v1::Layer) -> Result<Self, MapError> {
+        let wrong = |what: String| MapError::Geometry { layer: layer.name.clone(), what };
+        match &layer.geometry {
+            None => Err(wrong("none given; radial or cartesian is needed".into())),
+            Some(v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m, columns })) => {
+                if *columns == 0 || r_bench_m.is_empty() {
+                    return Err(wrong(format!(
+                        "{} benches and {columns} columns; at least 1 of each is needed",
+                        r_bench_m.len()
+                    )));
+                }
+                let mut inner = 0.0;
+                for (row, &outer) in r_bench_m.iter().enumerate() {
+                    if !outer.is_finite() || outer <= inner {
+                        return Err(wrong(format!(
+                            "bench {row} is {outer} m; a finite value above {inner} m is needed"
+                        )));
+                    }
+                    inner = outer;
+                }
+                Ok(Self::Radial { r_bench_m: r_bench_m.clone(), columns: *columns })
+            }
+            Some(v1::layer::Geometry::Cartesian(grid)) => {
+                let v1::CartesianGrid { origin_x_m, origin_y_m, width, height, cell_m } = *grid;
+                if width == 0 || height == 0 {
+                    return Err(wrong(format!("{width} x {height} cells; at least 1 x 1 is needed")));
+                }
+                if !cell_m.is_finite() || cell_m <= 0.0 {
+                    return Err(wrong(format!("cells of {cell_m} m; a finite edge above 0 is needed")));
+                }
+                if !origin_x_m.is_finite() || !origin_y_m.is_finite() {
+                    return Err(wrong(format!("origin ({origin_x_m}, {origin_y_m}) m; finite values are needed")));
+                }
+                Ok(Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m })
+            }
+        }
+    }
+
+    /// (rows, columns) of the array that the cells make: (benches, columns) or (height, width).
+    pub fn shape(&self) -> (u32, u32) {
+        match self {
+            Self::Radial { r_bench_m, columns } => (r_bench_m.len() as u32, *columns),
+            Self::Cartesian { width, height, .. } => (*height, *width),
+        }
+    }
+
+    /// Number of cells.
+    pub fn cell_count(&self) -> u64 {
+        let (rows, columns) = self.shape();
+        u64::from(rows) * u64::from(columns)
+    }
+
+    /// The cell that holds a point, ego frame, metres; `None` outside the grid and for values that are not finite.
+    pub fn cell_at(&self, x_m: f64, y_m: f64) -> Option<usize> {
+        if !x_m.is_finite() || !y_m.is_finite() {
+            return None;
+        }
+        match self {
+            Self::Radial { r_bench_m, columns } => {
+                let range_m = x_m.hypot(y_m);
+                let row = r_bench_m.partition_point(|&outer| f64::from(outer) < range_m);
+                if row == r_bench_m.len() {
+                    return None;
+                }
+                let turn = (y_m.atan2(x_m) / TAU).rem_euclid(1.0);
+                // A turn just below 1 can round up to `columns`.
+                let column = ((turn * f64::from(*columns)) as usize).min(*columns as usize - 1);
+                Some(row * *columns as usize + column)
+            }
+            Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m } => {
+                let ix = ((x_m - origin_x_m) / f64::from(*cell_m)).floor();
+                let iy = ((y_m - origin_y_m) / f64::from(*cell_m)).floor();
+                let inside = ix >= 0.0 && ix < f64::from(*width) && iy >= 0.0 && iy < f64::from(*height);
+                inside.then(|| iy as usize * *width as usize + ix as usize)
+            }
+        }
+    }
+
+    /// The middle of a cell (x, y), ego frame, metres; `None` past the last cell.
+    pub fn centre_of(&self, index: usize) -> Option<(f64, f64)> {
+        if index as u64 >= self.cell_count() {
+            return None;
+        }
+        Some(match self {
+            Self::Radial { r_bench_m, columns } => {
+                let (row, column) = (index / *columns as usize, index % *columns as usize);
+                let inner = if row == 0 { 0.0 } else { f64::from(r_bench_m[row - 1]) };
+                let range_m = 0.5 * (inner + f64::from(r_bench_m[row]));
+                let (sin, cos) = ((column as f64 + 0.5) / f64::from(*columns) * TAU).sin_cos();
+                (range_m * cos, range_m * sin)
+            }
+            Self::Cartesian { origin_x_m, origin_y_m, width, cell_m, .. } => {
+                let (ix, iy) = (index % *width as usize, index / *width as usize);
+                let edge = f64::from(*cell_m);
+                (origin_x_m + (ix as f64 + 0.5) * edge, origin_y_m + (iy as f64 + 0.5) * edge)
+            }
+        })
+    }
+
+    /// The farthest point of the grid from the vehicle, metres.
+    pub fn range_m_max(&self) -> f64 {
+        match self {
+            Self::Radial { r_bench_m, .. } => r_bench_m.last().map_or(0.0, |&r| f64::from(r)),
+            Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m } => {
+                let end_x = origin_x_m + f64::from(*width) * f64::from(*cell_m);
+                let end_y = origin_y_m + f64::from(*height) * f64::from(*cell_m);
+                origin_x_m.abs().max(end_x.abs()).max(origin_y_m.abs()).max(end_y.abs())
+            }
+        }
+    }
+}

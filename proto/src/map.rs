@@ -1,0 +1,305 @@
+//! A whole map's bytes to checked values, and the parts of a map to bytes.
+//!
+//! In: an encoded `clearway.v1.Map`, from gRPC, zenoh, WebSocket or a recording. Out: [`Map`], whose every channel has
+//! as many cells as its grid and whose every class has a name.
+//!
+//! Protobuf messages concatenate: the bytes of a header followed by those of any selection of layers are the bytes of
+//! the map with these layers. So a server encodes each part once ([`encode_header`], [`encode_layer`]).
+
+use std::collections::BTreeMap;
+
+use bytes::Bytes;
+use prost::Message;
+
+use crate::codec::{Cells, DecodeError, Limits, decode};
+use crate::grid::Grid;
+use crate::v1;
+
+/// The bytes of a map with this header and no layer yet.
+pub fn encode_header(header: &v1::Header) -> Bytes {
+    v1::Map { header: Some(header.clone()), layers: Vec::new() }.encode_to_vec().into()
+}
+
+/// The bytes to append to a header's for a map with this layer.
+pub fn encode_layer(layer: &v1::Layer) -> Bytes {
+    v1::Map { header: None, layers: vec![layer.clone()] }.encode_to_vec().into()
+}
+
+/// A map, decoded and checked.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Map {
+    /// As on the wire.
+    pub header: v1::Header,
+    /// In the order on the wire.
+    pub layers: Vec<Layer>,
+}
+
+/// One named grid of a map.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Layer {
+    /// `drivability`, …
+    pub name: String,
+    /// Where the cells lie.
+    pub grid: Grid,
+    /// Names of the values of channel `class`; entry 0 is `unknown`.
+    pub legend: Vec<String>,
+    /// In the order on the wire; each has [`Grid::cell_count`] cells.
+    pub channels: Vec<Channel>,
+    /// Planes z = ax + by + c in the ego frame, by segment id.
+    pub planes: Vec<[f64; 3]>,
+    /// Figures of the whole layer, such as `drivable_share`.
+    pub figures: BTreeMap<String, f64>,
+}
+
+/// One value a cell.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Channel {
+    /// `class`, `unit_height`, …
+    pub name: String,
+    /// Unit of raw * scale; empty for classes and ids.
+    pub unit: String,
+    /// A cell's value in `unit` is `raw * scale`.
+    pub scale: f32,
+    /// The raw value that means: nothing is known of this cell.
+    pub unknown: i32,
+    /// Raw values.
+    pub cells: Cells,
+}
+
+impl Map {
+    /// The layer of that name.
+    pub fn layer(&self, name: &str) -> Option<&Layer> {
+        self.layers.iter().find(|layer| layer.name == name)
+    }
+}
+
+impl Layer {
+    /// The channel of that name.
+    pub fn channel(&self, name: &str) -> Option<&Channel> {
+        self.channels.iter().find(|channel| channel.name == name)
+    }
+
+    /// The class at a point, ego frame, metres: its value and its name in the legend. What lies outside the grid, or
+    /// in a layer without classes, is unknown: class 0.
+    pub fn class_at(&self, x_m: f64, y_m: f64) -> (u16, &str) {
+        let class = self
+            .grid
+            .cell_at(x_m, y_m)
+            .and_then(|index| self.channel("class")?.cells.get(index))
+            .and_then(|raw| u16::try_from(raw).ok())
+            .unwrap_or(0);
+        (class, self.legend.get(usize::from(class)).map_or("unknown", String::as_str))
+    }
+}
+
+impl Channel {
+    /// A cell's value in [`Channel::unit`]; `None` where nothing is known, and past the last cell.
+    pub fn value(&self, index: usize) -> Option<f64> {
+        let raw = self.cells.get(index)?;
+        (raw != self.unknown).then(|| f64::from(raw) * f64::from(self.scale))
+    }
+}
+
+/// Why a map was refused.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum MapError {
+    /// More bytes than the reader allows.
+    #[error("map of {length} bytes; at most {allowed} are allowed")]
+    TooLong {
+        /// Of the encoded map.
+        length: usize,
+        /// [`Limits::map_bytes`].
+        allowed: usize,
+    },
+    /// Not a protobuf `clearway.v1.Map`.
+    #[error("not an encoded clearway.v1.Map: {0}")]
+    Protobuf(#[from] prost::DecodeError),
+    /// The header is absent, or one of its values is impossible.
+    #[error("header: {what}")]
+    Header {
+        /// What is wrong, the value and what is needed.
+        what: String,
+    },
+    /// Two layers, or two channels of a layer, with one name.
+    #[error("{what} {name:?} occurs twice; names are unique")]
+    Twice {
+        /// `layer` or `channel`.
+        what: &'static str,
+        /// The name.
+        name: String,
+    },
+    /// A grid that cannot be.
+    #[error("layer {layer:?}, geometry: {what}")]
+    Geometry {
+        /// The layer's name.
+        layer: String,
+        /// What is wrong, the value and what is needed.
+        what: String,
+    },
+    /// All channels together claim more cells than the reader allows.
+    #[error("the channels claim {cells} cells together; at most {allowed} are allowed")]
+    TooManyCells {
+        /// Claimed.
+        cells: u64,
+        /// [`Limits::map_cells`].
+        allowed: u64,
+    },
+    /// A channel whose cells are not those of its grid.
+    #[error("layer {layer:?}, channel {channel:?}: {cell_count} cells; the grid has {expected}")]
+    CellCount {
+        /// The layer's name.
+        layer: String,
+        /// The channel's name.
+        channel: String,
+        /// Claimed.
+        cell_count: u32,
+        /// Of the grid.
+        expected: u64,
+    },
+    /// A channel whose payload was refused.
+    #[error("layer {layer:?}, channel {channel:?}: {source}")]
+    Cells {
+        /// The layer's name.
+        layer: String,
+        /// The channel's name.
+        channel: String,
+        /// What is wrong with the payload.
+        source: DecodeError,
+    },
+    /// The legend does not start with `unknown`.
+    #[error("layer {layer:?}: legend starts with {first:?}; class 0 is \"unknown\" in every legend")]
+    Legend {
+        /// The layer's name.
+        layer: String,
+        /// Entry 0, empty if there is none.
+        first: String,
+    },
+    /// A class without a name.
+    #[error("layer {layer:?}: class {class} in cell {cell}; the legend has {legend} entries")]
+    Class {
+        /// The layer's name.
+        layer: String,
+        /// The cell's index.
+        cell: usize,
+        /// Its value.
+        class: i32,
+        /// Entries.
+        legend: usize,
+    },
+}
+
+impl MapError {
+    /// The variant's name in the golden vectors, the same in every client language; a refused payload has its own
+    /// [`DecodeError::name`].
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::TooLong { .. } => "too_long",
+            Self::Protobuf(_) => "protobuf",
+            Self::Header { .. } => "header",
+            Self::Twice { .. } => "twice",
+            Self::Geometry { .. } => "geometry",
+            Self::TooManyCells { .. } => "too_many_cells",
+            Self::CellCount { .. } => "cell_count",
+            Self::Cells { source, .. } => source.name(),
+            Self::Legend { .. } => "legend",
+            Self::Class { .. } => "class",
+        }
+    }
+}
+
+/// Decodes an encoded `clearway.v1.Map`. Claimed cell counts are compared with the grid and with the limits before any
+/// cell is made.
+///
+/// # Errors
+/// [`MapError`], naming the first thing found wrong.
+pub fn decode_map(bytes: Bytes, limits: &Limits) -> Result<Map, MapError> {
+    if bytes.len() > limits.map_bytes {
+        return Err(MapError::TooLong { length: bytes.len(), allowed: limits.map_bytes });
+    }
+    let map = v1::Map::decode(bytes)?;
+    let header = check_header(map.header)?;
+    check_unique("layer", map.layers.iter().map(|layer| &layer.name))?;
+    let channels = map.layers.iter().flat_map(|layer| &layer.channels);
+    let cells = channels.map(|channel| u64::from(channel.cell_count)).sum();
+    if cells > limits.map_cells {
+        return Err(MapError::TooManyCells { cells, allowed: limits.map_cells });
+    }
+    let layers = map.layers.into_iter().map(|layer| decode_layer(layer, limits)).collect::<Result<_, _>>()?;
+    Ok(Map { header, layers })
+}
+
+fn check_header(header: Option<v1::Header>) -> Result<v1::Header, MapError> {
+    let wrong = |what: String| MapError::Header { what };
+    let header = header.ok_or_else(|| wrong("absent; every map has one".into()))?;
+    if header.capture_start_ns > header.capture_end_ns {
+        return Err(wrong(format!(
+            "capture starts at {} ns; that is after its end at {} ns",
+            header.capture_start_ns, header.capture_end_ns
+        )));
+    }
+    if let Some(p) = &header.map_from_ego {
+        let norm = (p.qx * p.qx + p.qy * p.qy + p.qz * p.qz + p.qw * p.qw).sqrt();
+        let finite = [p.x, p.y, p.z, norm].iter().all(|v| v.is_finite());
+        if !finite || (norm - 1.0).abs() > 1e-3 {
+            return Err(wrong(format!(
+                "map_from_ego at ({}, {}, {}) m with a quaternion of norm {norm}; finite metres and norm 1 are needed",
+                p.x, p.y, p.z
+            )));
+        }
+    }
+    Ok(header)
+}
+
+fn check_unique<'a>(what: &'static str, names: impl Iterator<Item = &'a String>) -> Result<(), MapError> {
+    let mut names: Vec<_> = names.collect();
+    names.sort_unstable();
+    match names.array_windows().find(|[a, b]| a == b) {
+        Some([name, _]) => Err(MapError::Twice { what, name: (*name).clone() }),
+        None => Ok(()),
+    }
+}
+
+fn decode_layer(layer: v1::Layer, limits: &Limits) -> Result<Layer, MapError> {
+    let grid = Grid::from_wire(&layer)?;
+    check_unique("channel", layer.channels.iter().map(|channel| &channel.name))?;
+    let expected = grid.cell_count();
+    let mut channels = Vec::with_capacity(layer.channels.len());
+    for channel in &layer.channels {
+        let (layer, name) = (layer.name.clone(), channel.name.clone());
+        if u64::from(channel.cell_count) != expected {
+            return Err(MapError::CellCount { layer, channel: name, cell_count: channel.cell_count, expected });
+        }
+        let cells =
+            decode(channel, limits).map_err(|source| MapError::Cells { layer, channel: name.clone(), source })?;
+        let v1::Channel { unit, scale, unknown, .. } = channel;
+        channels.push(Channel { name, unit: unit.clone(), scale: *scale, unknown: *unknown, cells });
+    }
+    let planes = layer.planes.iter().map(|plane| [plane.a, plane.b, plane.c]).collect();
+    let figures = layer.figures.into_iter().collect();
+    let layer = Layer { name: layer.name, grid, legend: layer.legend, channels, planes, figures };
+    check_classes(&layer)?;
+    Ok(layer)
+}
+
+/// A planner that meets a class without a name could not know whether it may drive there.
+fn check_classes(layer: &Layer) -> Result<(), MapError> {
+    let Some(channel) = layer.channel("class") else { return Ok(()) };
+    let (name, legend) = (layer.name.clone(), layer.legend.len());
+    if layer.legend.first().is_none_or(|first| first != "unknown") {
+        let first = layer.legend.first().cloned().unwrap_or_default();
+        return Err(MapError::Legend { layer: name, first });
+    }
+    let nameless = |class: i32| usize::try_from(class).map_or(true, |class| class >= legend);
+    let found = match &channel.cells {
+        Cells::U8(cells) => cells.iter().position(|&class| nameless(class.into())),
+        Cells::I8(cells) => cells.iter().position(|&class| nameless(class.into())),
+        Cells::U16(cells) => cells.iter().position(|&class| nameless(class.into())),
+    };
+    match found {
+        Some(cell) => {
+            let class = channel.cells.get(cell).unwrap_or_default();
+            Err(MapError::Class { layer: name, cell, class, legend })
+        }
+        None => Ok(()),
+    }
+}
