@@ -1,5 +1,10 @@
 //! One vehicle's sensors and maps, as the configuration file spells them. Units in keys; unknown keys refused.
+//!
+//! In: the tables `[vehicle]`, `[[vehicle.sensor]]` and `[vehicle.maps.*]`. Out: the same as values, checked by
+//! [`VehicleConfig::validate`], whose errors name the key, its value and what is allowed. Lengths are metres, angles
+//! degrees here and radians everywhere behind.
 
+use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
 use clearway_lidar::model::Model;
@@ -24,7 +29,7 @@ pub struct VehicleConfig {
 pub struct SensorConfig {
     /// Unique within the vehicle.
     pub name: String,
-    /// Found from the data where absent; for scans: whose elevations the grid's rows come from.
+    /// Found from the data where absent; for scans: whose elevations the grid's rows come from, and so needed there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub model: Option<Model>,
     /// Found from the data where absent.
@@ -36,12 +41,20 @@ pub struct SensorConfig {
     /// Encoder angle at which turns are cut; 180 is behind the vehicle.
     #[serde(default = "behind")]
     pub cut_azimuth_deg: f32,
+    /// Returns nearer to the sensor than this are the vehicle itself and are dropped.
+    #[serde(default = "own_body")]
+    pub range_m_min: f32,
     /// `ego_from_sensor`: x, y, z in metres, roll, pitch, yaw in degrees.
     pub extrinsics: Extrinsics,
 }
 
 fn behind() -> f32 {
     180.0
+}
+
+/// A roof-mounted sensor sees roof, rails and bonnet within this range, and no ground: it stands higher than 1 m.
+fn own_body() -> f32 {
+    2.0
 }
 
 /// `ego_from_sensor`, as people write it. Rotation = Rz(yaw) Ry(pitch) Rx(roll).
@@ -62,16 +75,239 @@ pub struct Extrinsics {
     pub yaw_deg: f64,
 }
 
-/// Which maps are made. A map that is absent is not made.
+impl Extrinsics {
+    /// The transform that carries points of the sensor's frame into the ego frame.
+    pub fn ego_from_sensor(&self) -> Isometry3<f64> {
+        Isometry3::from_parts(
+            Translation3::new(self.x_m, self.y_m, self.z_m),
+            UnitQuaternion::from_euler_angles(
+                self.roll_deg.to_radians(),
+                self.pitch_deg.to_radians(),
+                self.yaw_deg.to_radians(),
+            ),
+        )
+    }
+}
+
+/// Which maps are made, each in its own table. A map that is switched off costs nothing.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MapsConfig {
     /// Age after capture at which a map is stale.
     pub valid_ms: u32,
+    /// The thesis' drivability map.
+    pub drivability: DrivabilityConfig,
+    /// The thesis' baseline.
+    pub height_difference: HeightDifferenceConfig,
 }
 
 impl Default for MapsConfig {
     fn default() -> Self {
-        Self { valid_ms: 300 }
+        Self {
+            valid_ms: 300,
+            drivability: DrivabilityConfig::default(),
+            height_difference: HeightDifferenceConfig::default(),
+        }
+    }
+}
+
+/// Parameters of [`crate::drivability`]; the thesis' value, or the reading's where the thesis has none, is the default.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DrivabilityConfig {
+    /// Whether the map is made.
+    pub enabled: bool,
+    /// Points farther than this over the ground are dropped; the outermost row ends here.
+    pub range_m_max: f32,
+    /// Points higher than this over the ground are dropped: the vehicle passes under them.
+    pub overhang_m: f32,
+    /// Height of one unit.
+    pub unit_height_m: f32,
+    /// Added to z before it is cut into units; half a unit puts level ground in the middle of unit 0, the thesis has 0.
+    pub offset_m: f32,
+    /// Columns of a turn, a multiple of 4; 360, 180 and 90 are the thesis' 1, 2 and 4 degrees.
+    pub columns: u16,
+    /// Where segments start to grow.
+    pub seed: Seed,
+    /// With `seed = "blind_zone"`: how far out a column's innermost cell may still be a seed.
+    pub blind_zone_m: f32,
+    /// Empty rows a segment grows across; 0 is the thesis.
+    pub bridge_rows: u8,
+    /// How far a segment's plane may miss its neighbour's boundary cells (criterion 2).
+    pub plane_error_m_max: f32,
+    /// Least width of a contiguous boundary the vehicle drives across (criterion 3).
+    pub gate_m_min: f32,
+}
+
+impl Default for DrivabilityConfig {
+    fn default() -> Self {
+        Self {
+            enabled: true,
+            range_m_max: 60.0,
+            overhang_m: 2.5,
+            unit_height_m: 0.25,
+            offset_m: 0.125,
+            columns: 360,
+            seed: Seed::BlindZone,
+            blind_zone_m: 7.0,
+            bridge_rows: 2,
+            plane_error_m_max: 0.25,
+            gate_m_min: 3.0,
+        }
+    }
+}
+
+/// Where segments start to grow.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Seed {
+    /// In every column, the innermost cell that holds a point within the blind zone, if it is about as high as the
+    /// ground under the vehicle.
+    BlindZone,
+    /// Cell (0, 0) alone, as the thesis has it.
+    FirstCell,
+}
+
+/// Parameters of [`crate::height_difference`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct HeightDifferenceConfig {
+    /// Whether the map is made.
+    pub enabled: bool,
+    /// Points farther than this over the ground are dropped; the outermost row ends here.
+    pub range_m_max: f32,
+    /// A cell whose highest and lowest points differ by more is an obstacle.
+    pub difference_m_max: f32,
+    /// Columns of a turn, a multiple of 4.
+    pub columns: u16,
+}
+
+impl Default for HeightDifferenceConfig {
+    fn default() -> Self {
+        Self { enabled: true, range_m_max: 60.0, difference_m_max: 0.25, columns: 360 }
+    }
+}
+
+/// A value of the configuration that cannot be used.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("{key} = {value}: allowed is {allowed}")]
+pub struct ConfigError {
+    /// Full path of the key, `vehicle.maps.drivability.columns`.
+    pub key: String,
+    /// As it was given.
+    pub value: String,
+    /// What would have been taken.
+    pub allowed: &'static str,
+}
+
+impl ConfigError {
+    pub(crate) fn new(key: impl Into<String>, value: impl ToString, allowed: &'static str) -> Self {
+        Self { key: key.into(), value: value.to_string(), allowed }
+    }
+}
+
+impl VehicleConfig {
+    /// Checks every value, in the order of the file.
+    ///
+    /// # Errors
+    /// The first value that cannot be used.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_name("vehicle.name", &self.name)?;
+        if self.sensors.len() != 1 {
+            let allowed = "one [[vehicle.sensor]] a vehicle: maps are made from one sensor's revolutions";
+            return Err(ConfigError::new("vehicle.sensor", format!("{} tables", self.sensors.len()), allowed));
+        }
+        for (index, sensor) in self.sensors.iter().enumerate() {
+            sensor.validate(&format!("vehicle.sensor[{index}]"))?;
+        }
+        self.maps.validate()
+    }
+}
+
+impl SensorConfig {
+    fn validate(&self, at: &str) -> Result<(), ConfigError> {
+        check_name(&format!("{at}.name"), &self.name)?;
+        if let Some(rpm) = self.rpm {
+            // The manuals state 300 to 1200; hosts set a little beyond.
+            check(f64::from(rpm), 60.0..=2400.0, || format!("{at}.rpm"), "60 to 2400")?;
+        }
+        check(f64::from(self.cut_azimuth_deg), 0.0..=360.0, || format!("{at}.cut_azimuth_deg"), "0 to 360")?;
+        check(f64::from(self.range_m_min), 0.0..=20.0, || format!("{at}.range_m_min"), "0 to 20")?;
+        let extrinsics = &self.extrinsics;
+        for (key, value) in [("x_m", extrinsics.x_m), ("y_m", extrinsics.y_m)] {
+            check(value, -20.0..=20.0, || format!("{at}.extrinsics.{key}"), "-20 to 20")?;
+        }
+        // The rings' radii follow from the height, so a sensor in the ground has none.
+        check(extrinsics.z_m, 0.1..=20.0, || format!("{at}.extrinsics.z_m"), "0.1 to 20")?;
+        let angles =
+            [("roll_deg", extrinsics.roll_deg), ("pitch_deg", extrinsics.pitch_deg), ("yaw_deg", extrinsics.yaw_deg)];
+        for (key, value) in angles {
+            check(value, -360.0..=360.0, || format!("{at}.extrinsics.{key}"), "-360 to 360")?;
+        }
+        Ok(())
+    }
+}
+
+impl MapsConfig {
+    /// Checks every value of every map, whether made or not.
+    ///
+    /// # Errors
+    /// The first value that cannot be used.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check(f64::from(self.valid_ms), 1.0..=60_000.0, || "vehicle.maps.valid_ms".into(), "1 to 60000")?;
+        let at = "vehicle.maps.drivability";
+        let drivability = &self.drivability;
+        let metres = [
+            ("range_m_max", drivability.range_m_max, RANGE),
+            ("overhang_m", drivability.overhang_m, (0.5..=20.0, "0.5 to 20")),
+            ("unit_height_m", drivability.unit_height_m, (0.05..=1.0, "0.05 to 1")),
+            ("offset_m", drivability.offset_m, (0.0..=1.0, "0 to 1")),
+            ("blind_zone_m", drivability.blind_zone_m, (0.0..=60.0, "0 to 60")),
+            ("plane_error_m_max", drivability.plane_error_m_max, (0.0..=10.0, "0 to 10")),
+            ("gate_m_min", drivability.gate_m_min, (0.0..=20.0, "0 to 20")),
+        ];
+        for (key, value, (allowed, said)) in metres {
+            check(f64::from(value), allowed, || format!("{at}.{key}"), said)?;
+        }
+        check(f64::from(drivability.bridge_rows), 0.0..=8.0, || format!("{at}.bridge_rows"), "0 to 8")?;
+        check_columns(at, drivability.columns)?;
+        let at = "vehicle.maps.height_difference";
+        let difference = &self.height_difference;
+        let (allowed, said) = RANGE;
+        check(f64::from(difference.range_m_max), allowed, || format!("{at}.range_m_max"), said)?;
+        let key = || format!("{at}.difference_m_max");
+        check(f64::from(difference.difference_m_max), 0.01..=10.0, key, "0.01 to 10")?;
+        check_columns(at, difference.columns)
+    }
+}
+
+type Allowed = (std::ops::RangeInclusive<f64>, &'static str);
+const RANGE: Allowed = (5.0..=200.0, "5 to 200");
+
+fn check(
+    value: f64,
+    allowed: std::ops::RangeInclusive<f64>,
+    key: impl FnOnce() -> String,
+    said: &'static str,
+) -> Result<(), ConfigError> {
+    // NaN is in no range, so it is refused too.
+    if allowed.contains(&value) { Ok(()) } else { Err(ConfigError::new(key(), value, said)) }
+}
+
+fn check_columns(at: &str, columns: u16) -> Result<(), ConfigError> {
+    // A quarter turn must be whole columns: the azimuth is found within its quadrant.
+    if (8..=1440).contains(&columns) && columns.is_multiple_of(4) {
+        Ok(())
+    } else {
+        Err(ConfigError::new(format!("{at}.columns"), columns, "a multiple of 4 from 8 to 1440"))
+    }
+}
+
+fn check_name(key: &str, name: &str) -> Result<(), ConfigError> {
+    let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-' || c == '_';
+    if !name.is_empty() && name.len() <= 64 && name.chars().all(allowed) {
+        Ok(())
+    } else {
+        Err(ConfigError::new(key, format!("{name:?}"), "1 to 64 of the characters a-z, 0-9, - and _"))
     }
 }

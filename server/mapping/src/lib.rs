@@ -6,11 +6,17 @@
 //! | [`config`] | one vehicle's sensors and maps |
 //! | [`pipeline`] | `step(&Event)` conducts the hops below |
 //! | [`mount`] | first revolutions -> height, pitch and roll of a sensor nobody measured |
-//! | [`sweep`] | revolution or scan + extrinsics + ego pose -> [`sweep::Sweep`] in the ego frame |
+//! | [`sweep`] | revolution or scan + extrinsics -> [`sweep::Sweep`] in the ego frame |
 //! | [`map`] | what a map is: geometry, legend, channels |
+//! | [`radial`] | the thesis' r-θ grid: position -> cell |
 //! | [`drivability`] | thesis §IV |
 //! | [`height_difference`] | the thesis' baseline |
 
 pub mod config;
+pub mod drivability;
 pub mod event;
+pub mod height_difference;
 pub mod map;
+pub mod pipeline;
+pub mod radial;
+pub mod sweep;

@@ -1,0 +1,207 @@
+//! The thesis' r-θ grid (§IV.1): rows are rings of range, columns are azimuth.
+//!
+//! In: the lasers' elevations, the sensor's height, the number of columns; then points, ego frame, metres. Out: each
+//! point's cell, `row * columns + column`. Rows follow the sensor: `r_bench` separates the rings its lasers draw on
+//! level ground.
+
+use std::f32::consts::FRAC_PI_2;
+
+use clearway_lidar::calibration::Calibration;
+
+use crate::map::Geometry;
+use crate::sweep::Sweep;
+
+/// Points are taken in chunks of this many, so that their cells stay in the first cache level.
+const CHUNK: usize = 1024;
+
+/// Buckets of the row table: the bits of r² above this one, 256 steps an octave, 0.2 % of r.
+const BUCKET_SHIFT: u32 = 15;
+
+/// Rings nearer to one another than this cannot be told apart under 2 cm of range noise and share a row.
+const RING_SPACING_M_MIN: f32 = 0.02;
+
+/// Cells by range and azimuth about the ego origin.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RadialGrid {
+    /// Outer radius of each row, ascending; the last is the largest range.
+    r_bench_m: Vec<f32>,
+    r_bench_squared: Vec<f32>,
+    columns: usize,
+    /// First row that may hold a squared range, by the float's upper bits.
+    row_of_bucket: Vec<u16>,
+    first_bucket: u32,
+    /// What the rows were made from.
+    made_from: Option<(std::sync::Arc<Calibration>, f32)>,
+}
+
+impl RadialGrid {
+    /// A grid with the rows `r_bench_m` (outer radii, metres, positive, ascending) and `columns` (a multiple of 4).
+    pub fn new(r_bench_m: Vec<f32>, columns: u16) -> Self {
+        let r_bench_squared: Vec<f32> = r_bench_m.iter().map(|r| r * r).collect();
+        let innermost = r_bench_squared.first().copied().unwrap_or(1.0);
+        let outermost = r_bench_squared.last().copied().unwrap_or(1.0);
+        let first_bucket = innermost.to_bits() >> BUCKET_SHIFT;
+        let buckets = (outermost.to_bits() >> BUCKET_SHIFT) - first_bucket + 1;
+        let row_of_bucket = (0..buckets)
+            .map(|bucket| {
+                let least = f32::from_bits((first_bucket + bucket) << BUCKET_SHIFT);
+                r_bench_squared.partition_point(|bench| *bench < least) as u16
+            })
+            .collect();
+        let columns = usize::from(columns);
+        Self { r_bench_m, r_bench_squared, columns, row_of_bucket, first_bucket, made_from: None }
+    }
+
+    /// Sees to it that the rows are those of the sensor that made `sweep`; gives whether the grid changed.
+    pub fn follow(&mut self, sweep: &Sweep, range_m_max: f32, columns: u16) -> bool {
+        let Some(calibration) = &sweep.calibration else {
+            let changed = self.r_bench_m != [range_m_max];
+            if changed {
+                *self = Self::new(vec![range_m_max], columns);
+            }
+            return changed;
+        };
+        let height = sweep.mount_height_m;
+        // The sensor's table is shared by all its revolutions: the pointer is compared first, the table only after.
+        if let Some((held, held_height)) = &self.made_from
+            && *held_height == height
+            && (std::sync::Arc::ptr_eq(held, calibration) || held == calibration)
+        {
+            return false;
+        }
+        let rings = ring_radii_m(calibration, height, range_m_max);
+        *self = Self::new(r_bench_m(&rings, range_m_max), columns);
+        self.made_from = Some((std::sync::Arc::clone(calibration), height));
+        true
+    }
+
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.r_bench_m.len()
+    }
+
+    /// Number of columns.
+    pub fn columns(&self) -> usize {
+        self.columns
+    }
+
+    /// Number of cells.
+    pub fn cells(&self) -> usize {
+        self.rows() * self.columns
+    }
+
+    /// Inner and outer radius of a row, metres.
+    pub fn row_span_m(&self, row: usize) -> (f32, f32) {
+        let inner = if row == 0 { 0.0 } else { self.r_bench_m[row - 1] };
+        (inner, self.r_bench_m[row])
+    }
+
+    /// Writes where the cells lie into `geometry`, keeping its buffer.
+    pub fn describe(&self, geometry: &mut Geometry) {
+        let Geometry::Radial { r_bench_m, columns } = geometry;
+        r_bench_m.clone_from(&self.r_bench_m);
+        *columns = self.columns as u16;
+    }
+
+    /// The cell that holds a position; `None` beyond the last row.
+    pub fn cell(&self, x: f32, y: f32) -> Option<usize> {
+        let row = self.row(x * x + y * y)?;
+        Some(row * self.columns + column(x, y, self.columns as f32 / 4.0, self.columns as u32 / 4) as usize)
+    }
+
+    /// Calls `take(first_point, cells)` for every chunk of the sweep; a cell of `self.cells()` means: beyond the grid.
+    pub fn for_each_chunk(&self, sweep: &Sweep, mut take: impl FnMut(usize, &[u32])) {
+        let mut ranges_squared = [0.0f32; CHUNK];
+        let mut cells = [0u32; CHUNK];
+        let quarter = self.columns as u32 / 4;
+        let quarter_f = quarter as f32;
+        for (index, (x, y)) in sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).enumerate() {
+            let n = x.len();
+            // Arithmetic alone first, so that it runs four or eight points at a time; the tables after.
+            for (((range_squared, cell), &x), &y) in ranges_squared.iter_mut().zip(&mut cells).zip(x).zip(y) {
+                *range_squared = x * x + y * y;
+                *cell = column(x, y, quarter_f, quarter);
+            }
+            for (cell, range_squared) in cells[..n].iter_mut().zip(&ranges_squared) {
+                *cell = match self.row(*range_squared) {
+                    Some(row) => *cell + (row * self.columns) as u32,
+                    None => self.cells() as u32,
+                };
+            }
+            take(index * CHUNK, &cells[..n]);
+        }
+    }
+
+    /// First row j with `range <= r_bench[j]`.
+    #[inline(always)]
+    fn row(&self, range_squared: f32) -> Option<usize> {
+        let bucket = (range_squared.to_bits() >> BUCKET_SHIFT).saturating_sub(self.first_bucket) as usize;
+        let mut row = usize::from(*self.row_of_bucket.get(bucket)?);
+        // A bucket seldom holds a border, and then one: the loop runs once or not at all.
+        while row < self.r_bench_squared.len() && range_squared > self.r_bench_squared[row] {
+            row += 1;
+        }
+        (row < self.r_bench_squared.len()).then_some(row)
+    }
+}
+
+/// Column of a position, counter-clockwise from the x axis.
+///
+/// The position is first turned into the first quadrant by whole quarter turns, which is exact; so a world turned by 90
+/// degrees gives the same columns, a quarter further. Within the quadrant the angle is off by less than 2 µrad.
+#[inline(always)]
+fn column(x: f32, y: f32, quarter: f32, quarter_columns: u32) -> u32 {
+    let (ax, ay) = (x.abs(), y.abs());
+    // Quadrants are half-open: [0, 90°) has x > 0, y >= 0, and so on around.
+    let second = x <= 0.0 && y > 0.0;
+    let third = x < 0.0 && y <= 0.0;
+    let fourth = x >= 0.0 && y < 0.0;
+    let swapped = second | fourth;
+    let (along, across) = if swapped { (ay, ax) } else { (ax, ay) };
+    let turns = u32::from(second) + 2 * u32::from(third) + 3 * u32::from(fourth);
+    let within = (quarter_angle(across, along) * (quarter / FRAC_PI_2)) as i32 as u32;
+    // Rounding may carry an angle just under 90° onto the border.
+    let within = if within < quarter_columns { within } else { quarter_columns - 1 };
+    turns * quarter_columns + within
+}
+
+/// atan2 of two numbers that are not negative, 0 for (0, 0): odd polynomial to degree 15 on [0, 1], mirrored at 45°.
+/// Coefficients: least-squares minimax of atan on [0, 1], error under 4e-8 before rounding.
+#[inline(always)]
+fn quarter_angle(y: f32, x: f32) -> f32 {
+    let steep = y > x;
+    let (small, large) = if steep { (x, y) } else { (y, x) };
+    // Keeps 0/0 at 0.
+    let t = small / if large > f32::MIN_POSITIVE { large } else { f32::MIN_POSITIVE };
+    let s = t * t;
+    let p = ATAN.iter().rev().fold(0.0, |p, c| p * s + c) * t;
+    if steep { FRAC_PI_2 - p } else { p }
+}
+
+const ATAN: [f32; 8] =
+    [0.999_999_34, -0.333_298_6, 0.199_465_66, -0.139_086_29, 0.096_421_94, -0.055_912_29, 0.021_862_93, -0.004_054_559];
+
+/// Radii at which the lasers meet level ground `height_m` under the sensor, metres, ascending: those within
+/// `range_m_max`. A laser at elevation e, its origin v above the sensor's along its own normal, meets it at
+/// `(height + v cos e) / tan(-e) - v sin e`.
+pub fn ring_radii_m(calibration: &Calibration, height_m: f32, range_m_max: f32) -> Vec<f32> {
+    let height = f64::from(height_m);
+    let radius = |laser: &clearway_lidar::calibration::LaserCalibration| {
+        let (sin, cos) = laser.vert_correction.sin_cos();
+        let offset = laser.vert_offset_correction;
+        let range = (height + offset * cos) / -sin;
+        (range * cos - offset * sin) as f32
+    };
+    let meets_ground = |r: &f32| *r > 0.0 && *r < range_m_max;
+    let mut radii: Vec<f32> = calibration.lasers.iter().map(radius).filter(meets_ground).collect();
+    radii.sort_by(f32::total_cmp);
+    radii.dedup_by(|outer, inner| *outer - *inner < RING_SPACING_M_MIN);
+    radii
+}
+
+/// `r_bench`: outer radius of each row, metres. A bench lies midway between neighbouring rings, so that noise does not
+/// throw a ring over a row border; the last is the largest range.
+pub fn r_bench_m(rings_m: &[f32], range_m_max: f32) -> Vec<f32> {
+    let midway = rings_m.windows(2).map(|pair| (pair[0] + pair[1]) / 2.0);
+    midway.chain([range_m_max]).collect()
+}
