@@ -4,6 +4,7 @@
 //! sectors of azimuth about the sensor, nearest first, so that a ray looks only at the few it can meet.
 
 use std::f64::consts::{PI, TAU};
+use std::ops::Deref;
 
 use crate::object::{Kind, Shape};
 use crate::world::World;
@@ -24,9 +25,10 @@ pub struct Hit {
     pub reflectivity: u8,
 }
 
-/// Casts rays into a world at one time from about one place.
-pub struct Caster<'w> {
-    world: &'w World,
+/// Casts rays into a world at one time from about one place; `W` is a `&World` or an `Arc<World>`.
+#[derive(Clone, Debug)]
+pub struct Caster<W> {
+    world: W,
     range_m_max: f64,
     shapes: Vec<Shape>,
     moving: Vec<usize>,
@@ -36,14 +38,14 @@ pub struct Caster<'w> {
     time: f64,
 }
 
-impl<'w> Caster<'w> {
+impl<W: Deref<Target = World>> Caster<W> {
     /// A caster at `origin` (metres, world) and `time` s; rays end at `range_m_max`.
-    pub fn new(world: &'w World, origin: [f64; 3], time: f64, range_m_max: f64) -> Self {
+    pub fn new(world: W, origin: [f64; 3], time: f64, range_m_max: f64) -> Self {
         let moving = (0..world.objects.len()).filter(|&index| world.objects[index].drive.is_some()).collect();
         let mut caster = Self {
+            shapes: world.shapes_at(time),
             world,
             range_m_max,
-            shapes: world.shapes_at(time),
             moving,
             sectors: vec![Vec::new(); SECTORS],
             centre: [origin[0], origin[1]],

@@ -16,7 +16,7 @@ pub struct Scene {
     /// What it is called.
     pub name: &'static str,
     /// The ground and what is on it.
-    pub world: World,
+    pub world: Arc<World>,
     /// The vehicle's way.
     pub drive: Drive,
     /// The drivable share the thesis reports for it (table of §V), percent.
@@ -27,7 +27,7 @@ const ASPHALT: u8 = 15;
 
 fn standing(name: &'static str, world: World, paper_share: f64) -> Scene {
     let course = Arc::new(Course::from(0.0, 0.0, 0.0).straight(1.0));
-    Scene { name, world, drive: Drive::steady(course, 0.0, 0.0, 0.0), paper_share: Some(paper_share) }
+    Scene { name, world: Arc::new(world), drive: Drive::steady(course, 0.0, 0.0, 0.0), paper_share: Some(paper_share) }
 }
 
 /// All the thesis' scenes, in the order of its table.
@@ -168,7 +168,7 @@ pub fn town() -> Scene {
     for (start, speed) in [(150.0, -7.0), (260.0, -7.0), (390.0, -7.0)] {
         world = world.moving_car(Drive::steady(course.clone(), start, 1.8, speed));
     }
-    Scene { name: "town", world, drive, paper_share: None }
+    Scene { name: "town", world: Arc::new(world), drive, paper_share: None }
 }
 
 /// Houses with gardens fenced in between them, inside and outside the street.
