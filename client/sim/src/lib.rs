@@ -1,6 +1,7 @@
 //! A simulated vehicle: a world, a ray caster, and the inverse of the Velodyne decoder.
 //!
 //! In: a scene described object by object. Out: the datagrams its sensor would send, and the truth about the ground
+//! around the vehicle. Everything but [`send`] is a pure function of the scene, the seed and the time.
 //!
 //! The files, in the order the data flows:
 //!
@@ -13,15 +14,23 @@
 //! | [`plan`] | the same as text, seen from above |
 //! | [`pose`] | scene, time -> where the vehicle is |
 //! | [`raycast`] | world, rays -> what they meet |
+//! | [`scanner`] | world, poses, one sensor's figures -> firings of raw returns |
+//! | [`encode`] | firings -> 1206-byte data packets |
 //! | [`telemetry`] | place, speed, time -> 512-byte telemetry datagrams |
+//! | [`vehicle`] | all of the above: datagrams without end |
+//! | [`send`] | datagrams -> UDP, paced by the clock |
 pub mod course;
+pub mod encode;
 pub mod ground;
 pub mod noise;
 pub mod object;
 pub mod plan;
 pub mod pose;
 pub mod raycast;
+pub mod scanner;
 pub mod scenes;
+pub mod send;
 pub mod telemetry;
 pub mod truth;
+pub mod vehicle;
 pub mod world;

@@ -42,7 +42,12 @@ mod tests {
         let across = Profile::through(&[(-100.0, 0.0), (100.0, 10.0)]);
         let world = World::on(Ground { along, across, ..Ground::default() });
         let course = std::sync::Arc::new(Course::from(20.0, 0.0, 0.3).straight(1.0));
-        let scene = Scene { name: "slope", world: world.into(), drive: Drive::steady(course, 0.0, 0.0, 0.0), paper_share: None };
+        let scene = Scene {
+            name: "slope",
+            world: world.into(),
+            drive: Drive::steady(course, 0.0, 0.0, 0.0),
+            paper_share: None,
+        };
         let pose = scene.pose_at(0.0);
         for place in [[3.0, 0.0], [0.0, 2.0], [-4.0, -1.0]] {
             let point = pose * nalgebra::Point3::new(place[0], place[1], 0.0);

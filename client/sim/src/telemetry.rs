@@ -3,8 +3,7 @@
 //! In: stamp, place, speed, course. Layout: HDL-32E manual, appendix "Positioning data packet": microseconds past the
 //! hour at byte 198, PPS state at 202, NMEA text from 206, everything else 0.
 
-/// Bytes of a telemetry datagram.
-pub const TELEMETRY_BYTES: usize = 512;
+use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
 /// A place on the globe that stands for the world's origin; x points east there.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -89,9 +88,9 @@ fn civil_date(day: i64) -> (i64, i64, i64) {
 }
 
 /// The datagram sent at `stamp_ns` (ns since the Unix epoch), its device time locked to the receiver's pulse.
-pub fn telemetry(stamp_ns: i64, fix: &Fix) -> [u8; TELEMETRY_BYTES] {
+pub fn telemetry(stamp_ns: i64, fix: &Fix) -> [u8; TELEMETRY_LENGTH] {
     const PPS_LOCKED: u8 = 2;
-    let mut payload = [0; TELEMETRY_BYTES];
+    let mut payload = [0; TELEMETRY_LENGTH];
     payload[198..202].copy_from_slice(&device_us(stamp_ns).to_le_bytes());
     payload[202] = PPS_LOCKED;
     let sentence = fix.gprmc();
@@ -110,7 +109,9 @@ mod tests {
 
     #[test]
     fn dates_are_those_of_the_calendar() {
-        for (day, date) in [(0, (1970, 1, 1)), (11_016, (2000, 2, 29)), (20_453, (2025, 12, 31)), (20_454, (2026, 1, 1))] {
+        for (day, date) in
+            [(0, (1970, 1, 1)), (11_016, (2000, 2, 29)), (20_453, (2025, 12, 31)), (20_454, (2026, 1, 1))]
+        {
             assert_eq!(civil_date(day), date);
         }
     }
@@ -131,7 +132,8 @@ mod tests {
     fn a_hundred_metres_north_is_a_hundred_metres_on_the_globe() {
         let datum = Datum::default();
         let (latitude, longitude) = datum.globe(0.0, 100.0);
-        assert!((latitude - datum.latitude_deg - 100.0 / 110_863.0).abs() < 1e-8, "{latitude}");
+        // A degree of latitude there, by the usual series: 111132.92 - 559.82 cos 2φ + 1.175 cos 4φ.
+        assert!((latitude - datum.latitude_deg - 100.0 / 110_857.2).abs() < 1e-8, "{latitude}");
         assert_eq!(longitude, datum.longitude_deg);
     }
 }

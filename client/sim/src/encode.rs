@@ -1,0 +1,124 @@
+//! Firings to data packets: the decoder's inverse.
+//!
+//! In: firings of raw returns, in time order. Out: 1206 bytes (clearway-lidar's `packet.rs` has the layout). Which block
+//! holds what is read from the model's [`ModelSpec`], the same that the decoder reads.
+
+use clearway_lidar::calibration::Calibration;
+use clearway_lidar::calibration::unit_table::status_bytes;
+use clearway_lidar::model::{Model, ModelSpec, RETURNS_PER_BLOCK, ReturnMode, S1_FLAGS};
+use clearway_lidar::packet::{BLOCK_LENGTH, PACKET_LENGTH};
+
+use crate::telemetry::device_us;
+
+/// One echo on the wire; distance 0: no return.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct RawReturn {
+    /// Distance counts.
+    pub distance: u16,
+    /// 0 to 255.
+    pub intensity: u8,
+}
+
+/// One firing as the sensor's electronics hold it.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RawFiring {
+    /// When, ns since the Unix epoch.
+    pub stamp_ns: i64,
+    /// Encoder angle, hundredths of a degree, in `0..36000`.
+    pub azimuth: u16,
+    /// One slot a laser, for the only echo or the strongest.
+    pub strongest: Vec<RawReturn>,
+    /// One slot a laser for the last echo of dual-return mode; else empty.
+    pub last: Vec<RawReturn>,
+}
+
+/// Packs firings, one packet at a time.
+#[derive(Clone, Debug)]
+pub struct Encoder {
+    spec: &'static ModelSpec,
+    mode: ReturnMode,
+    /// The status type and value of an HDL-64E's packets, over and over.
+    status: Vec<(u8, u8)>,
+    firings: Vec<RawFiring>,
+    packets: i64,
+}
+
+impl Encoder {
+    /// An encoder of `model` in `mode`. An HDL-64E S2 or S3 sends `calibration` a byte a packet, over and over.
+    pub fn new(model: Model, mode: ReturnMode, calibration: &Calibration) -> Self {
+        let status = match model {
+            Model::Hdl64eS2 | Model::Hdl64eS3 => status_bytes(model, calibration),
+            _ => Vec::new(),
+        };
+        Self { spec: model.spec(), mode, status, firings: Vec::new(), packets: 0 }
+    }
+
+    /// The same encoder with `number` as its next packet and nothing begun.
+    pub fn at_packet(mut self, number: i64) -> Self {
+        self.firings.clear();
+        self.packets = number;
+        self
+    }
+
+    /// Takes the next firing; gives the packet it completed, if any.
+    pub fn push(&mut self, firing: RawFiring) -> Option<[u8; PACKET_LENGTH]> {
+        self.firings.push(firing);
+        (self.firings.len() == self.spec.firings_per_packet(self.mode)).then(|| {
+            let bytes = self.packet();
+            self.firings.clear();
+            self.packets += 1;
+            bytes
+        })
+    }
+
+    fn packet(&self) -> [u8; PACKET_LENGTH] {
+        let mut bytes = [0; PACKET_LENGTH];
+        let used = self.spec.blocks_used(self.mode);
+        for (block, bytes) in bytes.chunks_exact_mut(BLOCK_LENGTH).take(used).enumerate() {
+            let place = self.spec.place(block, self.mode);
+            let flag = self.spec.flag(block, self.mode).unwrap_or(S1_FLAGS[block % S1_FLAGS.len()]);
+            bytes[..2].copy_from_slice(&flag.to_le_bytes());
+            bytes[2..4].copy_from_slice(&self.firings[place.firing].azimuth.to_le_bytes());
+            let first = self.spec.first_laser(flag).expect("a flag of the model's own");
+            for (index, bytes) in bytes[4..].chunks_exact_mut(3).enumerate() {
+                // A block of a 16-laser model holds two firings, one after the other.
+                let (firing, laser) = if self.spec.lasers < RETURNS_PER_BLOCK {
+                    (place.firing + index / self.spec.lasers, index % self.spec.lasers)
+                } else {
+                    (place.firing, first + index)
+                };
+                let firing = &self.firings[firing];
+                let slots = if place.echo == 0 { &firing.strongest } else { &firing.last };
+                let RawReturn { distance, intensity } = slots[laser];
+                bytes[..2].copy_from_slice(&distance.to_le_bytes());
+                bytes[2] = intensity;
+            }
+        }
+        bytes[1200..].copy_from_slice(&self.tail());
+        bytes
+    }
+
+    /// The last six bytes: time past the hour, and return mode and model or status.
+    fn tail(&self) -> [u8; 6] {
+        let [a, b, c, d] = device_us(self.firings[0].stamp_ns).to_le_bytes();
+        match (self.spec.model_bytes.first(), self.status.len() as i64) {
+            (Some(&model), _) => [a, b, c, d, mode_byte(self.mode), model],
+            // An S1 has no clock: firmware and spin count, temperature and its unit, in turn.
+            (None, 0) if self.packets % 2 == 0 => *b"\x58\x02v25c",
+            (None, 0) => *b"\x00\x19DegC",
+            (None, length) => {
+                let (kind, value) = self.status[self.packets.rem_euclid(length) as usize];
+                [a, b, c, d, kind, value]
+            }
+        }
+    }
+}
+
+/// Byte 1204 of all but the HDL-64E (VLP-16 manual 63-9243, table 9-1).
+fn mode_byte(mode: ReturnMode) -> u8 {
+    match mode {
+        ReturnMode::Strongest => 0x37,
+        ReturnMode::Last => 0x38,
+        ReturnMode::Dual => 0x39,
+    }
+}

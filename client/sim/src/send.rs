@@ -1,0 +1,117 @@
+//! The one impure file: a vehicle's datagrams over UDP, paced by the clock.
+//!
+//! In: datagrams in device-time order. Out: UDP to a data port and a telemetry port, and a count of what was sent.
+
+use std::io;
+use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use crate::vehicle::{Datagram, Kind};
+
+/// How fast device time passes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Pace {
+    /// As the clock does.
+    RealTime,
+    /// So many times as fast; above 0.
+    Times(f64),
+    /// Without waiting.
+    AsFastAsPossible,
+}
+
+/// When to stop: at whichever comes first.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Until<'a> {
+    /// Somebody sets this.
+    pub stop: Option<&'a AtomicBool>,
+    /// So much device time has passed.
+    pub device_time: Option<Duration>,
+}
+
+/// What was sent.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Sent {
+    /// Data packets.
+    pub packets: u64,
+    /// Telemetry datagrams.
+    pub telemetry: u64,
+    /// Device time from the first datagram to the last.
+    pub device_time: Duration,
+}
+
+/// Datagrams that are due this soon leave at once: the clock is asked for one short burst a millisecond, and as each
+/// burst is measured from the beginning, the long-run rate is exact.
+const BURST: Duration = Duration::from_millis(1);
+
+/// Sends datagrams until there are no more or `until` says so; blocks.
+///
+/// # Errors
+/// The operating system's, from opening the socket or sending.
+pub fn drive(
+    datagrams: impl IntoIterator<Item = Datagram>,
+    data: SocketAddr,
+    telemetry: SocketAddr,
+    pace: Pace,
+    until: Until<'_>,
+) -> io::Result<Sent> {
+    let own: SocketAddr =
+        if data.is_ipv4() { (Ipv4Addr::UNSPECIFIED, 0).into() } else { (Ipv6Addr::UNSPECIFIED, 0).into() };
+    let socket = UdpSocket::bind(own)?;
+    let began = Instant::now();
+    let mut first_ns = None;
+    let mut sent = Sent::default();
+    for datagram in datagrams {
+        let first_ns = *first_ns.get_or_insert(datagram.stamp_ns);
+        let device_time = Duration::from_nanos(u64::try_from(datagram.stamp_ns - first_ns).unwrap_or(0));
+        let ended = until.device_time.is_some_and(|end| device_time > end);
+        if ended || until.stop.is_some_and(|stop| stop.load(Ordering::Relaxed)) {
+            break;
+        }
+        let due = match pace {
+            Pace::RealTime => device_time,
+            Pace::Times(times) => device_time.div_f64(times),
+            Pace::AsFastAsPossible => Duration::ZERO,
+        };
+        let early = due.saturating_sub(began.elapsed());
+        if early > BURST {
+            std::thread::sleep(early);
+        }
+        match datagram.kind {
+            Kind::Data => {
+                socket.send_to(&datagram.payload, data)?;
+                sent.packets += 1;
+            }
+            Kind::Telemetry => {
+                socket.send_to(&datagram.payload, telemetry)?;
+                sent.telemetry += 1;
+            }
+        }
+        sent.device_time = device_time;
+    }
+    Ok(sent)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_datagram_arrives_at_its_own_port_in_order() {
+        let (data, telemetry) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
+        let datagrams = (0..40_u8).map(|number| Datagram {
+            stamp_ns: i64::from(number) * 1_000_000,
+            kind: if number % 4 == 0 { Kind::Telemetry } else { Kind::Data },
+            payload: vec![number; 10],
+        });
+        let ends = (data.local_addr().unwrap(), telemetry.local_addr().unwrap());
+        let until = Until { device_time: Some(Duration::from_millis(31)), ..Until::default() };
+        let sent = drive(datagrams, ends.0, ends.1, Pace::AsFastAsPossible, until).unwrap();
+        assert_eq!(sent, Sent { packets: 24, telemetry: 8, device_time: Duration::from_millis(31) });
+        let mut buffer = [0; 64];
+        for number in 0..32 {
+            let socket = if number % 4 == 0 { &telemetry } else { &data };
+            assert_eq!((socket.recv(&mut buffer).unwrap(), buffer[0]), (10, number));
+        }
+    }
+}

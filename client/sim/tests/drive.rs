@@ -1,0 +1,106 @@
+//! A vehicle's stream of datagrams: rates, order, repeatability, a way that is free to drive.
+
+use clearway_lidar::model::{Model, ReturnMode};
+use clearway_lidar::telemetry::Telemetry;
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes;
+use clearway_sim::truth::{Limits, Truth};
+use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
+
+fn town(config: ScannerConfig) -> SimulatedVehicle {
+    SimulatedVehicle::new(scenes::town(), config)
+}
+
+fn first_second(vehicle: SimulatedVehicle) -> Vec<Datagram> {
+    let start_ns = vehicle.start_ns();
+    vehicle.take_while(|datagram| datagram.stamp_ns < start_ns + 1_000_000_000).collect()
+}
+
+#[test]
+fn each_model_sends_as_many_packets_a_second_as_its_manual_says() {
+    for (model, return_mode, expected) in [
+        (Model::Hdl64eS2, ReturnMode::Strongest, 3472),
+        (Model::Hdl64eS3, ReturnMode::Dual, 5787),
+        (Model::Hdl32e, ReturnMode::Strongest, 1808),
+        (Model::Vlp16, ReturnMode::Strongest, 753),
+        (Model::Vlp16, ReturnMode::Dual, 1507),
+    ] {
+        let datagrams = first_second(town(ScannerConfig { model, return_mode, ..ScannerConfig::default() }));
+        let count = |kind| datagrams.iter().filter(|datagram| datagram.kind == kind).count();
+        assert_eq!((count(Kind::Data), count(Kind::Telemetry)), (expected, 100), "{model:?} {return_mode:?}");
+    }
+}
+
+#[test]
+fn datagrams_come_in_the_order_of_their_stamps_and_have_their_lengths() {
+    let datagrams = first_second(town(ScannerConfig::default()));
+    assert!(datagrams.windows(2).all(|pair| pair[0].stamp_ns <= pair[1].stamp_ns));
+    for datagram in &datagrams {
+        assert_eq!(datagram.payload.len(), if datagram.kind == Kind::Data { 1206 } else { 512 });
+    }
+}
+
+#[test]
+fn the_same_seed_sends_the_same_bytes_from_wherever_it_begins() {
+    let config = ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() };
+    let late = town(config.clone()).from_turn(4);
+    let packets = |vehicle: SimulatedVehicle| vehicle.filter(|datagram| datagram.kind == Kind::Data);
+    let expected: Vec<Datagram> = packets(late).take(50).collect();
+    let whole = packets(town(config.clone())).skip_while(|datagram| datagram.stamp_ns < expected[0].stamp_ns);
+    assert_eq!(whole.take(50).collect::<Vec<_>>(), expected);
+    let other = packets(town(ScannerConfig { seed: 2, ..config }).from_turn(4)).take(50).collect::<Vec<_>>();
+    assert_ne!(other, expected, "another seed, other noise");
+}
+
+#[test]
+fn telemetry_tells_the_vehicles_time_place_and_speed() {
+    let vehicle = town(ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() });
+    let mut last = None;
+    for datagram in vehicle.clone().filter(|datagram| datagram.kind == Kind::Telemetry).take(250) {
+        let telemetry = Telemetry::new(&datagram.payload).expect("the decoder reads what the encoder writes");
+        assert_eq!(i64::from(telemetry.device_us), datagram.stamp_ns / 1000 % 3_600_000_000);
+        let fix = telemetry.gprmc.expect("a fix");
+        let fix_ns = fix.utc_ns.expect("a time");
+        assert!((0..1_000_000_000).contains(&(datagram.stamp_ns - fix_ns)));
+        let place = vehicle.pose_at(fix_ns).translation;
+        let (latitude, longitude) = vehicle.datum().globe(place.x, place.y);
+        // A ten-thousandth of a minute.
+        assert!((fix.latitude_deg.unwrap() - latitude).abs() < 1e-6);
+        assert!((fix.longitude_deg.unwrap() - longitude).abs() < 1e-6);
+        assert!((fix.speed_knots.unwrap() * 1852.0 / 3600.0 - vehicle.speed_at(fix_ns)).abs() < 0.03);
+        last = Some(fix_ns);
+    }
+    assert_eq!(last, Some(vehicle.start_ns() + 2_000_000_000));
+}
+
+#[test]
+fn the_way_round_the_town_is_free_and_never_ends() {
+    let vehicle = town(ScannerConfig::default());
+    let limits = Limits::default();
+    for second in (0..150).chain([100_000]) {
+        let stamp_ns = vehicle.start_ns() + second * 1_000_000_000;
+        let truth = vehicle.truth_at(stamp_ns, 8.0, 0.2, &limits);
+        // The vehicle's own footprint, 4.4 m by 1.8 m.
+        for part in 0..=22 {
+            for side in [-0.9, 0.0, 0.9] {
+                let class = truth.class_at(-2.2 + 0.2 * f64::from(part), side);
+                assert_eq!(class, Truth::Drivable, "after {second} s at part {part}, {side} m beside");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_turn_comes_with_the_truth_of_its_end() {
+    let vehicle = SimulatedVehicle::new(scenes::fenced_road_under_canopy(), ScannerConfig::default());
+    let turn = vehicle.turn(0);
+    assert_eq!(turn.revolution.partial, None);
+    assert_eq!(turn.map_from_ego, vehicle.pose_at(turn.revolution.end_ns));
+    assert_eq!(turn.truth.class_at(0.0, 10.0), Truth::Unreachable, "behind the fence");
+    assert_eq!(turn.truth.class_at(6.0, 0.0), Truth::Drivable, "under the canopy");
+    let ahead = scenes::fenced_road_with_low_overhang();
+    let turn = SimulatedVehicle::new(ahead, ScannerConfig::default()).turn(0);
+    assert_eq!(turn.truth.class_at(9.0, 0.0), Truth::Obstacle, "the overhang");
+    assert_eq!(turn.truth.class_at(14.0, 0.0), Truth::Unreachable, "behind the overhang");
+    assert_eq!(turn.truth.class_at(-14.0, 0.0), Truth::Drivable, "the way back");
+}
