@@ -8,11 +8,37 @@
 //! | file | in -> out |
 //! |---|---|
 //! | [`capture`] | pcap or pcapng file -> UDP payloads |
+//! | [`velodyne_scan`] | one `velodyne_msgs/VelodyneScan` message -> packets |
 //! | [`model`] | the sensors and their nominal figures |
 //! | [`calibration`] | factory tables, ROS YAML, Velodyne XML -> per-laser corrections |
 //! | [`packet`] | 1206 bytes -> [`packet::Packet`], or [`Refusal`] |
 //! | [`telemetry`] | 512 bytes -> [`telemetry::Telemetry`] |
-//! | [`time`] | device microseconds past the hour -> stamps |
-//! | [`firing`] | packet -> firings |
-//! | [`revolution`] | firings -> [`Revolution`] |
-//! | [`sensor`] | all of the above behind one door: datagram in, revolution out |
+//! | `identify` | packet -> model |
+//! | [`sensor`] | the door: datagram in, revolution out |
+//! | `decoder` | packets of a known model -> revolutions, by way of the next five |
+//! | `time` | device microseconds past the hour -> stamps |
+//! | `firing` | packet -> firings |
+//! | `turns` | firings -> cuts, gaps, reversals |
+//! | `beam` | raw returns -> corrected points |
+//! | [`revolution`] | the range image |
+
+mod beam;
+pub mod calibration;
+pub mod capture;
+mod decoder;
+mod firing;
+mod identify;
+pub mod model;
+pub mod packet;
+pub mod revolution;
+pub mod sensor;
+pub mod telemetry;
+mod time;
+mod turns;
+pub mod velodyne_scan;
+
+pub use calibration::{Calibration, CalibrationError, LaserCalibration};
+pub use model::{Model, ModelSpec, ReturnMode};
+pub use packet::Refusal;
+pub use revolution::{Echo, Firing, Partial, Point, Revolution};
+pub use sensor::{CalibrationSource, Sensor, SensorConfig, SensorStatus};

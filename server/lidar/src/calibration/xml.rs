@@ -1,0 +1,91 @@
+//! Velodyne's `db.xml`: a Boost serialisation archive, degrees and centimetres.
+//!
+//! In: text. Out: [`Calibration`] of the enabled lasers, radians and metres.
+
+use roxmltree::{Document, Node, ParsingOptions};
+
+use super::{
+    ANGLE_RAD, Calibration, CalibrationError, FOCAL, LENGTH_M, LaserCalibration, RESOLUTION_M, bounded, complete,
+};
+
+/// `distLSB_` is centimetres a count; every other length is centimetres, every angle degrees.
+const M_PER_CM: f64 = 0.01;
+
+pub(super) fn read(text: &str) -> Result<Calibration, CalibrationError> {
+    // The archives open with a (bare) document type, which roxmltree refuses unless told.
+    let options = ParsingOptions { allow_dtd: true, nodes_limit: 100_000, ..ParsingOptions::default() };
+    let document = Document::parse_with_options(text, options).map_err(|e| CalibrationError::Xml(e.to_string()))?;
+    let db = child(document.root_element(), "DB", "the calibration database")?;
+    let points = child(db, "points_", "a list of lasers")?;
+    let enabled = list(db, "enabled_");
+    let min_intensity = list(db, "minIntensity_");
+    let max_intensity = list(db, "maxIntensity_");
+    let resolution = number(db, "DB", "distLSB_", M_PER_CM, RESOLUTION_M)?
+        .ok_or(CalibrationError::Missing { key: "DB.distLSB_".into(), allowed: RESOLUTION_M.1 })?;
+
+    let mut lasers = Vec::new();
+    for (index, item) in points.children().filter(|node| node.has_tag_name("item")).enumerate() {
+        if enabled.get(index).is_some_and(|flag| *flag == 0.0) {
+            continue;
+        }
+        let mut laser = laser(&format!("points_.item[{index}].px"), child(item, "px", "one laser")?)?;
+        let byte = |list: &[f64]| list.get(usize::from(laser.laser_id)).map(|v| v.clamp(0.0, 255.0) as u8);
+        (laser.min_intensity, laser.max_intensity) = (byte(&min_intensity), byte(&max_intensity));
+        lasers.push(laser);
+    }
+    complete(resolution, lasers)
+}
+
+fn laser(path: &str, px: Node<'_, '_>) -> Result<LaserCalibration, CalibrationError> {
+    const RAD_PER_DEG: f64 = std::f64::consts::PI / 180.0;
+    let angle = |key| number(px, path, key, RAD_PER_DEG, ANGLE_RAD);
+    let length = |key| number(px, path, key, M_PER_CM, LENGTH_M);
+    const ID: ((f64, f64), &str) = ((0.0, 127.0), "a whole number, 0 to 127");
+    let missing = |key: &str, allowed| CalibrationError::Missing { key: format!("{path}.{key}"), allowed };
+    Ok(LaserCalibration {
+        laser_id: number(px, path, "id_", 1.0, ID)?.ok_or_else(|| missing("id_", ID.1))? as u16,
+        vert_correction: angle("vertCorrection_")?.ok_or_else(|| missing("vertCorrection_", ANGLE_RAD.1))?,
+        rot_correction: angle("rotCorrection_")?.unwrap_or(0.0),
+        dist_correction: length("distCorrection_")?.unwrap_or(0.0),
+        vert_offset_correction: length("vertOffsetCorrection_")?.unwrap_or(0.0),
+        horiz_offset_correction: length("horizOffsetCorrection_")?.unwrap_or(0.0),
+        two_pt_correction_available: false,
+        dist_correction_x: length("distCorrectionX_")?,
+        dist_correction_y: length("distCorrectionY_")?,
+        focal_distance: number(px, path, "focalDistance_", M_PER_CM, FOCAL)?,
+        focal_slope: number(px, path, "focalSlope_", 1.0, FOCAL)?,
+        min_intensity: None,
+        max_intensity: None,
+    })
+}
+
+fn child<'a, 'i>(node: Node<'a, 'i>, name: &str, allowed: &'static str) -> Result<Node<'a, 'i>, CalibrationError> {
+    node.children()
+        .find(|n| n.has_tag_name(name))
+        .ok_or_else(|| CalibrationError::Missing { key: format!("{}.{name}", node.tag_name().name()), allowed })
+}
+
+/// The numbers of a list such as `enabled_`; empty if it is missing (older files have none).
+fn list(db: Node<'_, '_>, name: &str) -> Vec<f64> {
+    let items = db.children().find(|n| n.has_tag_name(name)).into_iter().flat_map(|n| n.children());
+    items.filter(|n| n.has_tag_name("item")).map(|n| text(n).parse().unwrap_or(0.0)).collect()
+}
+
+fn number(
+    node: Node<'_, '_>,
+    path: &str,
+    key: &str,
+    factor: f64,
+    (bounds, allowed): ((f64, f64), &'static str),
+) -> Result<Option<f64>, CalibrationError> {
+    let Some(found) = node.children().find(|n| n.has_tag_name(key)) else { return Ok(None) };
+    let written = text(found);
+    let path = || format!("{path}.{key}");
+    let value: f64 =
+        written.parse().map_err(|_| CalibrationError::Value { key: path(), value: format!("`{written}`"), allowed })?;
+    bounded(path, value * factor, bounds, allowed).map(Some)
+}
+
+fn text<'a>(node: Node<'a, '_>) -> &'a str {
+    node.text().unwrap_or("").trim()
+}

@@ -1,0 +1,280 @@
+//! pcap and pcapng captures to UDP payloads.
+//!
+//! In: the bytes of a capture (Ethernet with or without VLAN tags, Linux cooked, raw IP). Out: [`Datagram`]s in file
+//! order. What is no whole UDP datagram is passed over and counted; a file that ends inside a packet gives all that came
+//! before, then an error that says where.
+
+use std::io::Read;
+use std::net::{IpAddr, SocketAddr};
+
+use etherparse::{NetSlice, SlicedPacket, TransportSlice};
+use pcap_parser::traits::PcapReaderIterator;
+use pcap_parser::{Block, Linktype, PcapBlockOwned, PcapError};
+
+/// No packet, and so no block, of a usable capture is longer (the snapshot length has been 65,535 or 262,144).
+const BLOCK_LENGTH_MAX: usize = 512 * 1024;
+/// A pcapng file's first block is read at once; it holds a few comments.
+const HEAD_LENGTH: usize = 16 * 1024;
+const NS_PER_SECOND: i128 = 1_000_000_000;
+
+/// One UDP datagram of a capture.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Datagram {
+    /// When it was captured, ns since the Unix epoch.
+    pub stamp_ns: i64,
+    /// Who sent it.
+    pub source: SocketAddr,
+    /// The port it was sent to: 2368 for data, 8308 for telemetry, out of the box.
+    pub destination_port: u16,
+    /// The UDP payload.
+    pub payload: Vec<u8>,
+}
+
+/// Packets of a capture that were passed over.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Skipped {
+    /// ARP, TCP and the like.
+    pub not_udp: u64,
+    /// Pieces of fragmented datagrams.
+    pub fragmented: u64,
+    /// Cut off at capture, damaged, or of a link type not known here.
+    pub unreadable: u64,
+}
+
+/// Why a capture cannot be read (further).
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum CaptureError {
+    /// Neither pcap nor pcapng.
+    #[error("not a capture: it starts with {start:02x?}; pcap or pcapng is allowed")]
+    Format {
+        /// At most four bytes.
+        start: Vec<u8>,
+    },
+    /// The file ends inside a packet.
+    #[error("the capture is cut off inside the packet that starts at byte {offset}")]
+    Truncated {
+        /// From the start of the file.
+        offset: u64,
+    },
+    /// A block that makes no sense.
+    #[error("the capture is damaged at byte {offset}: {what}")]
+    Damaged {
+        /// From the start of the file.
+        offset: u64,
+        /// What the reader says.
+        what: String,
+    },
+    /// The file cannot be read.
+    #[error("reading the capture at byte {offset}: {what}")]
+    Read {
+        /// From the start of the file.
+        offset: u64,
+        /// What the system says.
+        what: String,
+    },
+}
+
+/// Reads a capture: an iterator over [`Datagram`]s that ends after the first error.
+pub struct Capture<'a> {
+    blocks: Box<dyn PcapReaderIterator + Send + 'a>,
+    interfaces: Interfaces,
+    skipped: Skipped,
+    offset: u64,
+    ended: bool,
+}
+
+impl<'a> Capture<'a> {
+    /// Opens a capture.
+    ///
+    /// # Errors
+    /// [`CaptureError::Format`], [`CaptureError::Truncated`] within the file's header, [`CaptureError::Read`].
+    pub fn new(mut reader: impl Read + Send + 'a) -> Result<Self, CaptureError> {
+        let read = |e: std::io::Error| CaptureError::Read { offset: 0, what: e.to_string() };
+        let mut head = Vec::new();
+        reader.by_ref().take(HEAD_LENGTH as u64).read_to_end(&mut head).map_err(read)?;
+        let start = head[..head.len().min(4)].to_vec();
+        let blocks = pcap_parser::create_reader(BLOCK_LENGTH_MAX, std::io::Cursor::new(head).chain(reader));
+        let blocks = blocks.map_err(|error| match error {
+            PcapError::Incomplete(_) if start.len() == 4 => CaptureError::Truncated { offset: 0 },
+            PcapError::ReadError => CaptureError::Read { offset: 0, what: "a read failed".into() },
+            _ => CaptureError::Format { start },
+        })?;
+        Ok(Self { blocks, interfaces: Interfaces::default(), skipped: Skipped::default(), offset: 0, ended: false })
+    }
+
+    /// What was passed over so far.
+    pub fn skipped(&self) -> Skipped {
+        self.skipped
+    }
+
+    /// Bytes of the file read so far, in whole packets.
+    pub fn offset(&self) -> u64 {
+        self.offset
+    }
+
+    /// Reads on to the next datagram; `None` at a clean end.
+    fn read(&mut self) -> Result<Option<Datagram>, CaptureError> {
+        let offset = self.offset;
+        loop {
+            let (length, found) = match self.blocks.next() {
+                Ok((length, block)) => (length, self.interfaces.take(&block, &mut self.skipped)),
+                Err(PcapError::Eof) => return Ok(None),
+                Err(PcapError::Incomplete(_)) => {
+                    refill(self.blocks.as_mut(), self.offset)?;
+                    continue;
+                }
+                Err(PcapError::UnexpectedEof) => return Err(CaptureError::Truncated { offset: self.offset }),
+                Err(error) => return Err(damaged(&error, self.offset)),
+            };
+            self.blocks.consume(length);
+            self.offset += length as u64;
+            if length == 0 {
+                return Err(CaptureError::Damaged { offset, what: "a block of no length".into() });
+            }
+            if found.is_some() {
+                return Ok(found);
+            }
+        }
+    }
+}
+
+impl Iterator for Capture<'_> {
+    type Item = Result<Datagram, CaptureError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.ended {
+            return None;
+        }
+        let item = self.read().transpose();
+        self.ended = !matches!(item, Some(Ok(_)));
+        item
+    }
+}
+
+fn refill(blocks: &mut (dyn PcapReaderIterator + Send + '_), offset: u64) -> Result<(), CaptureError> {
+    let before = blocks.data().len();
+    let refilled = blocks.refill().is_ok();
+    if !refilled {
+        return Err(CaptureError::Read { offset, what: "a read failed".into() });
+    }
+    if blocks.data().len() == before && !blocks.reader_exhausted() {
+        return Err(CaptureError::Damaged { offset, what: format!("a block longer than {BLOCK_LENGTH_MAX} bytes") });
+    }
+    if blocks.data().len() == before && blocks.reader_exhausted() && before > 0 {
+        return Err(CaptureError::Truncated { offset });
+    }
+    Ok(())
+}
+
+fn damaged(error: &PcapError<&[u8]>, offset: u64) -> CaptureError {
+    let what = match error {
+        PcapError::BufferTooSmall => format!("a block longer than {BLOCK_LENGTH_MAX} bytes"),
+        PcapError::NomError(_, kind) => format!("{kind:?}"),
+        PcapError::OwnedNomError(_, kind) => format!("{kind:?}"),
+        PcapError::ReadError => return CaptureError::Read { offset, what: "a read failed".into() },
+        other => format!("{other:?}"),
+    };
+    CaptureError::Damaged { offset, what }
+}
+
+/// What the headers of a capture say of the packets after them.
+#[derive(Default)]
+struct Interfaces {
+    list: Vec<Interface>,
+}
+
+#[derive(Clone, Copy)]
+struct Interface {
+    link: Linktype,
+    ticks_per_second: u64,
+    offset_s: i64,
+}
+
+impl Interfaces {
+    /// Takes one block; gives the datagram, if it holds one.
+    fn take(&mut self, block: &PcapBlockOwned<'_>, skipped: &mut Skipped) -> Option<Datagram> {
+        match block {
+            PcapBlockOwned::LegacyHeader(header) => {
+                let ticks_per_second = if header.is_nanosecond_precision() { 1_000_000_000 } else { 1_000_000 };
+                self.list = vec![Interface { link: header.network, ticks_per_second, offset_s: 0 }];
+                None
+            }
+            PcapBlockOwned::Legacy(packet) => {
+                let interface = *self.list.first()?;
+                let ticks = u64::from(packet.ts_sec) * interface.ticks_per_second + u64::from(packet.ts_usec);
+                interface.datagram(ticks, packet.data, skipped)
+            }
+            PcapBlockOwned::NG(block) => self.take_ng(block, skipped),
+        }
+    }
+
+    fn take_ng(&mut self, block: &Block<'_>, skipped: &mut Skipped) -> Option<Datagram> {
+        match block {
+            Block::SectionHeader(_) => self.list.clear(),
+            Block::InterfaceDescription(description) => self.list.push(Interface {
+                link: description.linktype,
+                ticks_per_second: ticks_per_second(description.if_tsresol),
+                offset_s: description.if_tsoffset,
+            }),
+            Block::EnhancedPacket(packet) => {
+                let ticks = u64::from(packet.ts_high) << 32 | u64::from(packet.ts_low);
+                let data = packet.data.get(..packet.caplen as usize).unwrap_or(packet.data);
+                let Some(interface) = self.list.get(packet.if_id as usize).copied() else {
+                    skipped.unreadable += 1;
+                    return None;
+                };
+                return interface.datagram(ticks, data, skipped);
+            }
+            // A simple packet has no stamp.
+            Block::SimplePacket(_) => skipped.unreadable += 1,
+            _ => {}
+        }
+        None
+    }
+}
+
+/// pcapng's if_tsresol: a power of ten, or of two with the highest bit; what does not fit is the usual microsecond.
+fn ticks_per_second(if_tsresol: u8) -> u64 {
+    let (base, power) = if if_tsresol & 0x80 == 0 { (10_u64, if_tsresol) } else { (2, if_tsresol & 0x7F) };
+    base.checked_pow(power.into()).unwrap_or(1_000_000)
+}
+
+impl Interface {
+    fn datagram(self, ticks: u64, data: &[u8], skipped: &mut Skipped) -> Option<Datagram> {
+        let sliced = match self.link {
+            Linktype::ETHERNET => SlicedPacket::from_ethernet(data).ok(),
+            Linktype::LINUX_SLL => SlicedPacket::from_linux_sll(data).ok(),
+            Linktype::RAW | Linktype::IPV4 | Linktype::IPV6 | Linktype(12 | 14) => SlicedPacket::from_ip(data).ok(),
+            _ => None,
+        };
+        let Some(sliced) = sliced else {
+            skipped.unreadable += 1;
+            return None;
+        };
+        if sliced.is_ip_payload_fragmented() {
+            skipped.fragmented += 1;
+            return None;
+        }
+        let address = match &sliced.net {
+            Some(NetSlice::Ipv4(ip)) => Some(IpAddr::V4(ip.header().source_addr())),
+            Some(NetSlice::Ipv6(ip)) => Some(IpAddr::V6(ip.header().source_addr())),
+            _ => None,
+        };
+        let (Some(address), Some(TransportSlice::Udp(udp))) = (address, &sliced.transport) else {
+            skipped.not_udp += 1;
+            return None;
+        };
+        Some(Datagram {
+            stamp_ns: self.stamp_ns(ticks),
+            source: SocketAddr::new(address, udp.source_port()),
+            destination_port: udp.destination_port(),
+            payload: udp.payload().to_vec(),
+        })
+    }
+
+    fn stamp_ns(self, ticks: u64) -> i64 {
+        let ns = i128::from(ticks) * NS_PER_SECOND / i128::from(self.ticks_per_second);
+        let ns = ns + i128::from(self.offset_s) * NS_PER_SECOND;
+        i64::try_from(ns).unwrap_or(i64::MAX)
+    }
+}

@@ -1,0 +1,239 @@
+//! One telemetry datagram: 512 bytes.
+//!
+//! In: a UDP payload (port 8308). Out: [`Telemetry`]: device time, PPS state and the GPRMC sentence. Layout (HDL-32E
+//! application note 63-9277, VLP-16 manual 9.3.3): microseconds past the hour u32 at 198, PPS state at 202, NMEA text
+//! from 206 to the first line's end.
+
+use crate::packet::Refusal;
+
+/// Bytes of a telemetry datagram.
+pub const TELEMETRY_LENGTH: usize = 512;
+const DEVICE_US: usize = 198;
+const PPS: usize = 202;
+const NMEA: std::ops::Range<usize> = 206..334;
+const METRES_PER_SECOND_PER_KNOT: f64 = 1852.0 / 3600.0;
+
+/// What a telemetry datagram says.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Telemetry {
+    /// Microseconds past the hour, on the clock of the data packets.
+    pub device_us: u32,
+    /// State of the pulse per second.
+    pub pps: Pps,
+    /// `None` when no receiver is connected.
+    pub gprmc: Option<Gprmc>,
+}
+
+/// State of the pulse per second (VLP-16 manual 9.3.3).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pps {
+    /// No pulse seen (and what an HDL-32E always sends).
+    Absent,
+    /// Being locked to.
+    Attempting,
+    /// Locked.
+    Locked,
+    /// It was there once.
+    Error,
+    /// Another value.
+    Unknown(u8),
+}
+
+/// A GPRMC sentence: recommended minimum of position, time and speed.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Gprmc {
+    /// Whether the receiver calls its fix valid (`A`).
+    pub valid: bool,
+    /// Time and date, ns since the Unix epoch; `None` if either is empty.
+    pub utc_ns: Option<i64>,
+    /// Degrees, north positive.
+    pub latitude_deg: Option<f64>,
+    /// Degrees, east positive.
+    pub longitude_deg: Option<f64>,
+    /// Speed over ground, knots.
+    pub speed_knots: Option<f64>,
+    /// Course over ground, degrees clockwise from true north.
+    pub course_deg: Option<f64>,
+}
+
+/// What is wrong with a sentence.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum NmeaError {
+    /// Bytes that are not printable ASCII.
+    #[error("byte {byte:#04x} at {at} of the sentence; printable ASCII is allowed")]
+    Byte {
+        /// The byte.
+        byte: u8,
+        /// Counted from the sentence's start.
+        at: usize,
+    },
+    /// Not `$..RMC`.
+    #[error("sentence starts with `{start}`; $GPRMC, or RMC of another system, is allowed")]
+    Sentence {
+        /// At most eight characters of it.
+        start: String,
+    },
+    /// Sum missing or wrong.
+    #[error("checksum `{written}`; {computed:02X} is right")]
+    Checksum {
+        /// As sent; empty if there is none.
+        written: String,
+        /// Of the text as it arrived.
+        computed: u8,
+    },
+    /// A field that cannot be read.
+    #[error("{field}: `{value}`; it must be {allowed}")]
+    Field {
+        /// Its name.
+        field: &'static str,
+        /// As it was sent.
+        value: String,
+        /// What it must be.
+        allowed: &'static str,
+    },
+}
+
+impl Telemetry {
+    /// Reads a datagram.
+    ///
+    /// # Errors
+    /// [`Refusal::Length`]; [`Refusal::Nmea`] if there is a sentence and it is damaged.
+    pub fn new(payload: &[u8]) -> Result<Self, Refusal> {
+        if payload.len() != TELEMETRY_LENGTH {
+            return Err(Refusal::Length { length: payload.len() });
+        }
+        let device_us = u32::from_le_bytes(payload[DEVICE_US..DEVICE_US + 4].try_into().expect("four bytes"));
+        let pps = match payload[PPS] {
+            0 => Pps::Absent,
+            1 => Pps::Attempting,
+            2 => Pps::Locked,
+            3 => Pps::Error,
+            other => Pps::Unknown(other),
+        };
+        let text = payload[NMEA].split(|byte| matches!(byte, 0 | b'\r' | b'\n')).next().unwrap_or_default();
+        let gprmc = if text.is_empty() { None } else { Some(Gprmc::parse(text).map_err(Refusal::Nmea)?) };
+        Ok(Self { device_us, pps, gprmc })
+    }
+}
+
+impl Gprmc {
+    /// Reads one sentence, `$` to checksum, without its line end.
+    ///
+    /// # Errors
+    /// [`NmeaError`].
+    pub fn parse(sentence: &[u8]) -> Result<Self, NmeaError> {
+        if let Some(at) = sentence.iter().position(|byte| !(0x20..0x7F).contains(byte)) {
+            return Err(NmeaError::Byte { byte: sentence[at], at });
+        }
+        let sentence: String = sentence.iter().map(|byte| char::from(*byte)).collect();
+        let fields = checked_fields(&sentence)?;
+        let field = |index: usize| fields.get(index).copied().unwrap_or("");
+        Ok(Self {
+            valid: match field(2) {
+                "A" => true,
+                "V" | "" => false,
+                other => return Err(wrong("status", other, "A or V")),
+            },
+            utc_ns: utc_ns(field(1), field(9))?,
+            latitude_deg: angle("latitude", field(3), field(4), ("N", "S"), 90.0)?,
+            longitude_deg: angle("longitude", field(5), field(6), ("E", "W"), 180.0)?,
+            speed_knots: number("speed", field(7), 0.0..=1000.0, "0 to 1000 knots")?,
+            course_deg: number("course", field(8), 0.0..=360.0, "0 to 360 degrees")?,
+        })
+    }
+
+    /// Speed over ground, m/s.
+    pub fn speed_mps(&self) -> Option<f64> {
+        self.speed_knots.map(|knots| knots * METRES_PER_SECOND_PER_KNOT)
+    }
+}
+
+/// The comma-separated fields, after the sum was found right.
+fn checked_fields(sentence: &str) -> Result<Vec<&str>, NmeaError> {
+    let not_rmc = || NmeaError::Sentence { start: sentence.chars().take(8).collect() };
+    let body = sentence.strip_prefix('$').ok_or_else(not_rmc)?;
+    let (text, written) = body.split_once('*').unwrap_or((body, ""));
+    let fields: Vec<&str> = text.split(',').collect();
+    if !(fields[0].len() == 5 && fields[0].ends_with("RMC")) {
+        return Err(not_rmc());
+    }
+    let computed = text.bytes().fold(0, |sum, byte| sum ^ byte);
+    let written = written.trim();
+    if written.len() != 2 || u8::from_str_radix(written, 16) != Ok(computed) {
+        return Err(NmeaError::Checksum { written: written.into(), computed });
+    }
+    Ok(fields)
+}
+
+fn wrong(field: &'static str, value: &str, allowed: &'static str) -> NmeaError {
+    NmeaError::Field { field, value: value.into(), allowed }
+}
+
+fn number(
+    field: &'static str,
+    value: &str,
+    bounds: std::ops::RangeInclusive<f64>,
+    allowed: &'static str,
+) -> Result<Option<f64>, NmeaError> {
+    if value.is_empty() {
+        return Ok(None);
+    }
+    let number = value.parse().ok().filter(|number| bounds.contains(number));
+    number.map(Some).ok_or_else(|| wrong(field, value, allowed))
+}
+
+/// `3707.8178` and `N`: degrees and decimal minutes run together.
+fn angle(
+    field: &'static str,
+    value: &str,
+    hemisphere: &str,
+    (positive, negative): (&str, &str),
+    limit_deg: f64,
+) -> Result<Option<f64>, NmeaError> {
+    const ALLOWED: &str = "degrees and minutes, such as 3707.8178, and a hemisphere";
+    let Some(run_together) = number(field, value, 0.0..=18_060.0, ALLOWED)? else { return Ok(None) };
+    let degrees = (run_together / 100.0).floor() + run_together % 100.0 / 60.0;
+    let sign = match hemisphere {
+        h if h == positive => 1.0,
+        h if h == negative => -1.0,
+        other => return Err(wrong(field, &format!("{value},{other}"), ALLOWED)),
+    };
+    if degrees > limit_deg {
+        return Err(wrong(field, value, ALLOWED));
+    }
+    Ok(Some(sign * degrees))
+}
+
+/// `214106.5` and `230715`: ns since the Unix epoch.
+fn utc_ns(time: &str, date: &str) -> Result<Option<i64>, NmeaError> {
+    if time.is_empty() || date.is_empty() {
+        return Ok(None);
+    }
+    let [hour, minute, second] = pairs(time).ok_or_else(|| wrong("time", time, "hhmmss or hhmmss.s"))?;
+    let [day, month, year] = pairs(date).ok_or_else(|| wrong("date", date, "ddmmyy"))?;
+    if hour > 23 || minute > 59 || second > 60 {
+        return Err(wrong("time", time, "000000 to 235960"));
+    }
+    if !(1..=12).contains(&month) || !(1..=31).contains(&day) {
+        return Err(wrong("date", date, "a day of a month"));
+    }
+    let fraction = time.split_once('.').map_or(Ok(0.0), |(_, digits)| format!("0.{digits}").parse());
+    let fraction: f64 = fraction.map_err(|_| wrong("time", time, "hhmmss or hhmmss.s"))?;
+    let seconds = days_since_1970(2000 + year, month, day) * 86_400 + hour * 3_600 + minute * 60 + second;
+    Ok(Some(seconds * 1_000_000_000 + (fraction * 1e9).round() as i64))
+}
+
+/// The first three pairs of digits.
+fn pairs(text: &str) -> Option<[i64; 3]> {
+    let digits = text.as_bytes().get(..6)?;
+    let whole = digits.iter().all(u8::is_ascii_digit) && matches!(text.as_bytes().get(6), None | Some(b'.'));
+    whole.then(|| std::array::from_fn(|i| i64::from(digits[2 * i] - b'0') * 10 + i64::from(digits[2 * i + 1] - b'0')))
+}
+
+/// Proleptic Gregorian days from 1 January 1970, by Howard Hinnant's `days_from_civil`.
+fn days_since_1970(year: i64, month: i64, day: i64) -> i64 {
+    let year = if month <= 2 { year - 1 } else { year };
+    let (era, year_of_era) = (year.div_euclid(400), year.rem_euclid(400));
+    let day_of_year = (153 * ((month + 9) % 12) + 2) / 5 + day - 1;
+    era * 146_097 + year_of_era * 365 + year_of_era / 4 - year_of_era / 100 + day_of_year - 719_468
+}
