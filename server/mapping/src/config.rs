@@ -133,6 +133,10 @@ pub struct DrivabilityConfig {
     pub blind_zone_m: f32,
     /// Empty rows a segment grows across; 0 is the thesis.
     pub bridge_rows: u8,
+    /// Greatest step between boundary cells of two segments (criterion 1); two units make it the thesis' own.
+    pub step_m_max: f32,
+    /// Rise over distance between boundary cells that is a slope, not a step (criterion 1).
+    pub grade_max: f32,
     /// How far a segment's plane may miss its neighbour's boundary cells (criterion 2).
     pub plane_error_m_max: f32,
     /// Least width of a contiguous boundary the vehicle drives across (criterion 3).
@@ -151,6 +155,8 @@ impl Default for DrivabilityConfig {
             seed: Seed::BlindZone,
             blind_zone_m: 7.0,
             bridge_rows: 2,
+            step_m_max: 0.15,
+            grade_max: 0.15,
             plane_error_m_max: 0.25,
             gate_m_min: 3.0,
         }
@@ -263,6 +269,8 @@ impl MapsConfig {
             ("unit_height_m", drivability.unit_height_m, (0.05..=1.0, "0.05 to 1")),
             ("offset_m", drivability.offset_m, (0.0..=1.0, "0 to 1")),
             ("blind_zone_m", drivability.blind_zone_m, (0.0..=60.0, "0 to 60")),
+            ("step_m_max", drivability.step_m_max, (0.0..=10.0, "0 to 10")),
+            ("grade_max", drivability.grade_max, (0.0..=1.0, "0 to 1")),
             ("plane_error_m_max", drivability.plane_error_m_max, (0.0..=10.0, "0 to 10")),
             ("gate_m_min", drivability.gate_m_min, (0.0..=20.0, "0 to 20")),
         ];

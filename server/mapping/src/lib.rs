@@ -17,6 +17,7 @@ pub mod drivability;
 pub mod event;
 pub mod height_difference;
 pub mod map;
+pub mod mount;
 pub mod pipeline;
 pub mod radial;
 pub mod sweep;

@@ -40,7 +40,7 @@ pub struct SensorState {
     pub rpm: f32,
     /// Share of the turn's azimuths that have firings, 0 to 1.
     pub completeness: f32,
-    /// `start`, `end`, `gap`, `reversal`, or empty for a whole turn.
+    /// `start`, `end`, `gap`, `reversal`, `overlong`, or empty for a whole turn.
     pub partial: &'static str,
 }
 

@@ -11,6 +11,7 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::{Partial, Revolution};
 use clearway_lidar::sensor::{Refusal, Sensor, SensorStatus};
+use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
 use crate::config::{ConfigError, VehicleConfig};
 use crate::drivability::Drivability;
@@ -204,7 +205,6 @@ impl Pipeline {
     }
 
     fn step_datagram(&mut self, payload: &[u8], arrival_ns: i64) -> Result<bool, Rejected> {
-        let telemetry_before = self.sensor.status().telemetry;
         let completed = self.sensor.push(payload, arrival_ns)?;
         let made = match completed {
             None => false,
@@ -215,7 +215,7 @@ impl Pipeline {
             }
         };
         self.newest_is_revolution |= made;
-        if self.sensor.status().telemetry > telemetry_before {
+        if payload.len() == TELEMETRY_LENGTH {
             self.ledger.telemetry += 1;
         } else {
             self.ledger.decoded += 1;
@@ -397,6 +397,7 @@ fn partial_name(partial: Partial) -> &'static str {
         Partial::End => "end",
         Partial::Gap => "gap",
         Partial::Reversal => "reversal",
+        Partial::Overlong => "overlong",
     }
 }
 

@@ -1,0 +1,163 @@
+//! What every map owes, held against each of them.
+
+mod common;
+
+use clearway_lidar::model::Model;
+use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig};
+use clearway_mapping::drivability::Drivability;
+use clearway_mapping::height_difference::HeightDifference;
+use clearway_mapping::map::{Cells, Layer};
+use clearway_mapping::sweep::Sweep;
+use common::*;
+
+/// A map under test: makes a layer from a sweep, into buffers it was handed.
+trait Maker {
+    fn layer(&self) -> Layer;
+    fn make(&mut self, sweep: &Sweep, layer: &mut Layer);
+}
+
+impl Maker for Drivability {
+    fn layer(&self) -> Layer {
+        Drivability::layer(self)
+    }
+    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
+        Drivability::make(self, sweep, layer);
+    }
+}
+
+impl Maker for HeightDifference {
+    fn layer(&self) -> Layer {
+        HeightDifference::layer(self)
+    }
+    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
+        HeightDifference::make(self, sweep, layer);
+    }
+}
+
+fn makers() -> Vec<Box<dyn Maker>> {
+    let mut makers: Vec<Box<dyn Maker>> = Vec::new();
+    for columns in [360, 180, 90] {
+        let drivability = DrivabilityConfig { columns, ..DrivabilityConfig::default() };
+        makers.push(Box::new(Drivability::new(&drivability)));
+        makers.push(Box::new(Drivability::new(&DrivabilityConfig { bridge_rows: 0, ..drivability })));
+        makers.push(Box::new(HeightDifference::new(&HeightDifferenceConfig { columns, ..Default::default() })));
+    }
+    makers
+}
+
+fn make(maker: &mut dyn Maker, sweep: &Sweep) -> Layer {
+    let mut layer = maker.layer();
+    maker.make(sweep, &mut layer);
+    layer
+}
+
+fn every_cell_is_written(layer: &Layer) {
+    let (rows, columns) = size(layer);
+    for channel in &layer.channels {
+        assert_eq!(values(layer, channel.name).len(), rows * columns, "{} {}", layer.name, channel.name);
+    }
+}
+
+#[test]
+fn an_empty_sweep_gives_a_whole_map_of_unknown_cells() {
+    for mut maker in makers() {
+        for sweep in [Sweep::default(), empty(Model::Hdl64eS2), empty(Model::Vlp16)] {
+            let layer = make(maker.as_mut(), &sweep);
+            every_cell_is_written(&layer);
+            for channel in &layer.channels {
+                let written = values(&layer, channel.name);
+                assert!(written.iter().all(|v| *v == channel.unknown), "{} {}", layer.name, channel.name);
+            }
+            assert_eq!(figure(&layer, "drivable_share"), 0.0);
+        }
+    }
+}
+
+#[test]
+fn level_ground_is_drivable_wherever_a_point_fell() {
+    for model in [Model::Hdl64eS2, Model::Hdl32e, Model::Vlp16, Model::Vls128] {
+        let sweep = cast(model, plain);
+        for mut maker in makers() {
+            let layer = make(maker.as_mut(), &sweep);
+            every_cell_is_written(&layer);
+            assert_eq!(figure(&layer, "drivable_share"), 1.0, "{model:?} {}", layer.name);
+        }
+    }
+}
+
+#[test]
+fn a_wall_is_an_obstacle_to_every_map() {
+    let sweep = cast(Model::Hdl64eS2, court);
+    for mut maker in makers() {
+        let layer = make(maker.as_mut(), &sweep);
+        let (_, columns) = size(&layer);
+        let ahead = benches(&layer).iter().position(|r| *r >= 15.0).unwrap();
+        let name = layer.legend[usize::from(classes(&layer)[ahead * columns])];
+        assert_eq!(name, "obstacle", "{} straight ahead, 15 m", layer.name);
+    }
+}
+
+#[test]
+fn the_same_sweep_gives_the_same_bytes_again() {
+    let sweep = cast(Model::Hdl64eS2, court);
+    for mut maker in makers() {
+        assert_eq!(make(maker.as_mut(), &sweep), make(maker.as_mut(), &sweep));
+    }
+}
+
+#[test]
+fn the_order_of_the_points_says_nothing() {
+    let mut sweep = cast(Model::Hdl64eS2, court);
+    // Equally high points of one cell, so that ties are met too.
+    for k in 0..200 {
+        let angle = k as f32 * 0.031;
+        add(&mut sweep, [9.0 * angle.cos(), 9.0 * angle.sin(), 0.5]);
+        add(&mut sweep, [9.01 * angle.cos(), 9.01 * angle.sin(), 0.5]);
+    }
+    for mut maker in makers() {
+        let layer = make(maker.as_mut(), &sweep);
+        for seed in 1..4 {
+            assert_eq!(make(maker.as_mut(), &shuffled(&sweep, seed)), layer, "seed {seed}");
+        }
+    }
+}
+
+#[test]
+fn a_world_turned_by_90_degrees_gives_the_map_a_quarter_further() {
+    let sweep = cast(Model::Hdl64eS2, court);
+    for mut maker in makers() {
+        let (layer, quarter) = (make(maker.as_mut(), &sweep), make(maker.as_mut(), &turned(&sweep)));
+        let (_, columns) = size(&layer);
+        // Segments are counted in the order they are found, which begins at column 0.
+        for channel in layer.channels.iter().filter(|c| c.name != "segment") {
+            let (before, after) = (values(&layer, channel.name), values(&quarter, channel.name));
+            for (row, (before, after)) in before.chunks(columns).zip(after.chunks(columns)).enumerate() {
+                let mut before = before.to_vec();
+                before.rotate_right(columns / 4);
+                assert_eq!(before, after, "{} {} row {row}", layer.name, channel.name);
+            }
+        }
+    }
+}
+
+#[test]
+fn buffers_used_before_leave_no_trace() {
+    let sweep = cast(Model::Hdl64eS2, court);
+    for mut maker in makers() {
+        let fresh = make(maker.as_mut(), &sweep);
+        // The maker has seen another sensor's world, and the layer holds garbage of another size.
+        make(maker.as_mut(), &cast(Model::Vlp16, plain));
+        let mut garbage = maker.layer();
+        for channel in &mut garbage.channels {
+            match &mut channel.cells {
+                Cells::U8(cells) => *cells = vec![0xa5; 99_999],
+                Cells::I8(cells) => *cells = vec![-3; 7],
+                Cells::U16(cells) => *cells = vec![0xa5a5; 99_999],
+            }
+        }
+        garbage.planes = vec![[9.0; 3]; 70];
+        garbage.figures = vec![("drivable_share", -1.0), ("left_over", 1.0)];
+        maker.make(&sweep, &mut garbage);
+        assert_eq!(garbage, fresh);
+    }
+}
