@@ -69,11 +69,13 @@ fn compare(vehicle: &SimulatedVehicle, revolution: &Revolution) -> Differences {
                     assert_eq!(config.model, Model::Hdl64eS1, "every laser fires in every firing");
                     continue;
                 }
-                let last = config.return_mode == ReturnMode::Last || echo == 1;
-                let hit: Option<Hit> = if last {
-                    caster.cast_behind_leaves(from, to)
-                } else {
-                    caster.cast(from, to, scanner.draw(index, laser))
+                let nearest = || caster.cast(from, to, scanner.draw(index, laser));
+                let last = caster.cast_behind_leaves(from, to);
+                let hit: Option<Hit> = match (config.return_mode, echo) {
+                    (ReturnMode::Last, _) => last,
+                    // The decoder takes out a last echo that is the strongest too.
+                    (_, 1) => last.filter(|_| nearest() != last),
+                    _ => nearest(),
                 };
                 let hit = hit.filter(|hit| scanner.reports(laser, hit.range_m));
                 assert_eq!(range_m > 0.0, hit.is_some(), "firing {index} laser {laser}: {range_m} m, {hit:?}");
