@@ -1,1 +1,32 @@
-//! stub
+//! The shell around Clearway's core: doors, engines, publishers, recorder, replay. All clocks, sockets, threads and logs
+//! of the house are in here.
+//!
+//! The files, in the order a datagram meets them:
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | [`config`] | one TOML -> what is served where, recorded, and which vehicles there are |
+//! | [`ingest`] | datagrams, captures, scans -> numbered events on one queue a vehicle: the door |
+//! | [`engine`] | events -> journal, step, encoded maps |
+//! | [`wire`] | map -> bytes, once |
+//! | [`publish`] | newest map -> gRPC, zenoh, page |
+//! | [`record`] | every event and every map -> MCAP |
+//! | [`recording`] | MCAP -> events and maps |
+//! | [`replay`] | files -> maps, as live |
+//! | [`clouds`] | revolutions -> PCD files |
+//! | [`verify`] | recording -> are these the maps of these events? |
+//! | [`status`] | ledger, rates, latency of each vehicle |
+//! | [`server`] | all of it, put together |
+
+pub mod clouds;
+pub mod config;
+pub mod engine;
+pub mod ingest;
+pub mod publish;
+pub mod record;
+pub mod recording;
+pub mod replay;
+pub mod server;
+pub mod status;
+pub mod verify;
+pub mod wire;

@@ -1,0 +1,96 @@
+//! Revolutions -> one binary PCD file (v0.7) each, `<revolution>.pcd`, points in the sensor's frame, metres.
+//!
+//! Fields, little-endian and without padding: x y z intensity (f32; intensity 0 to 255 as the sensor reports it), ring
+//! (u16, 0 lowest), laser (u16, firing order), time (f32, seconds since the revolution's first firing), return_type (u8,
+//! 0 strongest, 1 last). Points in firing order, within a firing by laser, strongest before last.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+
+use clearway_lidar::model::ReturnMode;
+use clearway_lidar::revolution::Revolution;
+
+use crate::engine::Observer;
+use crate::ingest::locked;
+
+/// The folder the clouds go to.
+#[derive(Clone, Debug)]
+pub struct Clouds {
+    folder: PathBuf,
+}
+
+/// Why a cloud cannot be written.
+#[derive(Debug, thiserror::Error)]
+#[error("point cloud {}: {source}", file.display())]
+pub struct CloudError {
+    /// The folder or file.
+    pub file: PathBuf,
+    /// Why.
+    pub source: std::io::Error,
+}
+
+/// How many clouds were written, or why no more.
+pub type Written = Arc<Mutex<Result<u64, CloudError>>>;
+
+impl Clouds {
+    /// Makes the folder.
+    ///
+    /// # Errors
+    /// [`CloudError`] where it cannot be made.
+    pub fn create(folder: &Path) -> Result<Self, CloudError> {
+        let made = std::fs::create_dir_all(folder);
+        made.map_err(|source| CloudError { file: folder.to_owned(), source })?;
+        Ok(Self { folder: folder.to_owned() })
+    }
+
+    /// Looks at each map's revolution and writes it; scans that came assembled are not written again.
+    pub fn observer(self) -> (Observer, Written) {
+        let written: Written = Arc::new(Mutex::new(Ok(0)));
+        let count = written.clone();
+        let observer: Observer = Box::new(move |pipeline, _| {
+            let Some(revolution) = pipeline.newest_revolution() else { return };
+            let mut written = locked(&written);
+            let Ok(count) = *written else { return };
+            let file = self.folder.join(format!("{:06}.pcd", revolution.sequence));
+            let done = std::fs::File::create(&file).and_then(|mut open| open.write_all(&pcd(revolution)));
+            *written = done.map(|()| count + 1).map_err(|source| CloudError { file, source });
+        });
+        (observer, count)
+    }
+}
+
+/// A revolution as a PCD file.
+pub fn pcd(revolution: &Revolution) -> Vec<u8> {
+    let rings = revolution.calibration.rings();
+    let (mut points, mut data) = (0_u32, Vec::new());
+    for (index, firing) in revolution.firings.iter().enumerate() {
+        let time = firing.offset_ns as f32 * 1e-9;
+        for laser in 0..revolution.lasers {
+            let slot = index * revolution.lasers + laser;
+            for (number, echo) in revolution.echoes.iter().enumerate() {
+                // 0: no return, NaN: did not fire.
+                if !(echo.range_m[slot] > 0.0) {
+                    continue;
+                }
+                let last = number == 1 || revolution.return_mode == ReturnMode::Last;
+                for value in [echo.x[slot], echo.y[slot], echo.z[slot], f32::from(echo.intensity[slot])] {
+                    data.extend_from_slice(&value.to_le_bytes());
+                }
+                data.extend_from_slice(&rings[laser].to_le_bytes());
+                data.extend_from_slice(&(laser as u16).to_le_bytes());
+                data.extend_from_slice(&time.to_le_bytes());
+                data.push(u8::from(last));
+                points += 1;
+            }
+        }
+    }
+    let mut file = format!(
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z intensity ring laser time return_type\n\
+         SIZE 4 4 4 4 2 2 4 1\nTYPE F F F F U U F U\nCOUNT 1 1 1 1 1 1 1 1\nWIDTH {points}\nHEIGHT 1\n\
+         VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA binary\n"
+    )
+    .into_bytes();
+    file.append(&mut data);
+    file
+}

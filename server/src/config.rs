@@ -1,0 +1,418 @@
+//! One TOML file -> [`Config`]: what is served where, what is recorded, and which vehicles there are.
+//!
+//! Unknown keys are refused with their line; values that make no sense are named with the file, the key, the value and
+//! what is allowed. Calibration files are read here too, so that nothing opens a socket before all of it is known good.
+//! `deploy/clearway.toml` holds every key with its default.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+
+use clearway_lidar::calibration::Calibration;
+use clearway_mapping::config::{MapsConfig, SensorConfig, VehicleConfig};
+use serde::{Deserialize, Serialize};
+
+/// The whole configuration.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Maps over gRPC.
+    #[serde(default)]
+    pub grpc: Grpc,
+    /// The page, its WebSocket, `/healthz` and `/metrics`.
+    #[serde(default)]
+    pub page: Page,
+    /// Maps over zenoh.
+    #[serde(default)]
+    pub zenoh: Zenoh,
+    /// The recording.
+    #[serde(default)]
+    pub recorder: Recorder,
+    /// One or more vehicles.
+    #[serde(default, rename = "vehicle")]
+    pub vehicles: Vec<Vehicle>,
+}
+
+/// `[grpc]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Grpc {
+    /// Whether it is served at all.
+    pub enabled: bool,
+    /// Address and port; port 0 takes a free one.
+    pub listen: SocketAddr,
+}
+
+impl Default for Grpc {
+    fn default() -> Self {
+        Self { enabled: true, listen: SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 50051) }
+    }
+}
+
+/// `[page]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Page {
+    /// Whether it is served at all.
+    pub enabled: bool,
+    /// Address and port; port 0 takes a free one.
+    pub listen: SocketAddr,
+}
+
+impl Default for Page {
+    fn default() -> Self {
+        Self { enabled: true, listen: SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 8080) }
+    }
+}
+
+/// `[zenoh]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Zenoh {
+    /// Whether it is published at all.
+    pub enabled: bool,
+    /// Part played in the zenoh network.
+    pub mode: ZenohMode,
+    /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
+    pub listen: Vec<String>,
+    /// Endpoints of routers or peers to connect to.
+    pub connect: Vec<String>,
+    /// Look for peers by multicast.
+    pub scouting: bool,
+}
+
+impl Default for Zenoh {
+    fn default() -> Self {
+        Self {
+            enabled: true,
+            mode: ZenohMode::Peer,
+            listen: vec!["tcp/127.0.0.1:7447".into()],
+            connect: Vec::new(),
+            scouting: false,
+        }
+    }
+}
+
+/// Part played in the zenoh network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ZenohMode {
+    /// Talks to whoever connects, and to the endpoints of `connect`.
+    Peer,
+    /// Hangs on one router.
+    Client,
+    /// Is itself a router.
+    Router,
+}
+
+impl ZenohMode {
+    /// As the zenoh configuration spells it.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Peer => "peer",
+            Self::Client => "client",
+            Self::Router => "router",
+        }
+    }
+}
+
+/// `[recorder]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Recorder {
+    /// MCAP file to write; empty: nothing is recorded.
+    pub file: PathBuf,
+    /// How much a crash may cost.
+    pub flush_ms: u64,
+    /// Events and maps that may wait for the disk.
+    pub queue: usize,
+}
+
+impl Default for Recorder {
+    fn default() -> Self {
+        Self { file: PathBuf::new(), flush_ms: 1000, queue: 16_384 }
+    }
+}
+
+/// One `[[vehicle]]`: its sensors and maps, and the doors its events come through.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Vehicle {
+    /// Names the vehicle in keys and topics: `[a-z0-9_-]+`.
+    pub name: String,
+    /// Events that may wait for the engine; more are counted as lost.
+    #[serde(default = "queue")]
+    pub queue: usize,
+    /// The UDP door; a vehicle without one is fed by other doors.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub udp: Option<Udp>,
+    /// Which maps are made, and how.
+    #[serde(default)]
+    pub maps: MapsConfig,
+    /// The sensors; the first one leads.
+    #[serde(rename = "sensor")]
+    pub sensors: Vec<SensorConfig>,
+}
+
+fn queue() -> usize {
+    8192
+}
+
+impl Vehicle {
+    /// What the core needs of it.
+    pub fn core(&self) -> VehicleConfig {
+        VehicleConfig { name: self.name.clone(), sensors: self.sensors.clone(), maps: self.maps.clone() }
+    }
+}
+
+/// `[vehicle.udp]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Udp {
+    /// Where data packets arrive.
+    pub data: SocketAddr,
+    /// Where telemetry arrives.
+    pub telemetry: SocketAddr,
+    /// Asked of the kernel for each socket.
+    pub receive_buffer_bytes: usize,
+    /// Sender of each sensor, by sensor name: `"192.168.1.201"`, or with its port. Datagrams of anyone else are refused.
+    /// Empty: whatever arrives is the one sensor's.
+    pub from: BTreeMap<String, Sender>,
+}
+
+impl Default for Udp {
+    fn default() -> Self {
+        let any = |port| SocketAddr::new(Ipv4Addr::UNSPECIFIED.into(), port);
+        Self { data: any(2368), telemetry: any(8308), receive_buffer_bytes: 4 << 20, from: BTreeMap::new() }
+    }
+}
+
+/// A sender's address, with its port or without.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged, expecting = "an address such as \"192.168.1.201\" or \"192.168.1.201:2368\"")]
+pub enum Sender {
+    /// Any port of this address.
+    Address(IpAddr),
+    /// This port alone.
+    Socket(SocketAddr),
+}
+
+impl Sender {
+    /// Whether `peer` is this sender.
+    pub fn is(&self, peer: SocketAddr) -> bool {
+        match self {
+            Self::Address(address) => *address == peer.ip().to_canonical(),
+            Self::Socket(socket) => socket.port() == peer.port() && socket.ip() == peer.ip().to_canonical(),
+        }
+    }
+}
+
+/// What is wrong with a configuration.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("configuration {}: {source}", file.display())]
+    Read {
+        /// The configuration file.
+        file: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Not TOML, an unknown key, a value of the wrong kind. The source shows line and column.
+    #[error("configuration {}: {source}", file.display())]
+    Parse {
+        /// The configuration file.
+        file: PathBuf,
+        /// Where and why.
+        source: Box<toml::de::Error>,
+    },
+    /// An override is not `key=value`.
+    #[error("--set {text}: expected KEY=VALUE, such as grpc.listen=\"0.0.0.0:50051\"")]
+    Override {
+        /// The override.
+        text: String,
+    },
+    /// A value that makes no sense.
+    #[error("configuration {}: {key} = {value}: allowed: {allowed}", file.display())]
+    Value {
+        /// The configuration file.
+        file: PathBuf,
+        /// Path of the key.
+        key: String,
+        /// What was found.
+        value: String,
+        /// What may stand there.
+        allowed: String,
+    },
+    /// A sensor's calibration file is missing or unreadable.
+    #[error("configuration {}: {key} = {}: {reason}", file.display(), calibration.display())]
+    Calibration {
+        /// The configuration file.
+        file: PathBuf,
+        /// Path of the key.
+        key: String,
+        /// The calibration file.
+        calibration: PathBuf,
+        /// What is wrong with it, and what is allowed.
+        reason: String,
+    },
+}
+
+impl Config {
+    /// Reads `file`, applies the overrides (`grpc.listen=…`, in order) and checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`], which names the file, the key, the value and what is allowed.
+    pub fn load(file: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let text =
+            std::fs::read_to_string(file).map_err(|source| ConfigError::Read { file: file.to_owned(), source })?;
+        Self::parse(&text, file, overrides)
+    }
+
+    /// [`Config::load`] of a text; `file` is only named in errors, and where relative calibration paths start.
+    ///
+    /// # Errors
+    /// [`ConfigError`], which names the file, the key, the value and what is allowed.
+    pub fn parse(text: &str, file: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let parse = |source| ConfigError::Parse { file: file.to_owned(), source: Box::new(source) };
+        let mut config: Self = toml::from_str(text).map_err(parse)?;
+        if !overrides.is_empty() {
+            let mut table: toml::Table = toml::from_str(text).map_err(parse)?;
+            for text in overrides {
+                set(&mut table, text)?;
+            }
+            config = table.try_into().map_err(parse)?;
+        }
+        config.check(file)?;
+        Ok(config)
+    }
+
+    /// One vehicle with one sensor and every default. Its extrinsics are yet to be set: the sensor stands 2 m above the
+    /// ground, level.
+    pub fn of_one_vehicle(vehicle: &str, sensor: &str) -> Self {
+        let text = format!(
+            "[[vehicle]]\nname = {vehicle:?}\n[[vehicle.sensor]]\nname = {sensor:?}\n[vehicle.sensor.extrinsics]\n\
+             x_m = 0.0\ny_m = 0.0\nz_m = 2.0\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n"
+        );
+        toml::from_str(&text).expect("a name and extrinsics are all that has no default")
+    }
+
+    /// The configuration as TOML, every default spelled out.
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("configurations have string keys only")
+    }
+
+    /// Checks what the types cannot.
+    ///
+    /// # Errors
+    /// [`ConfigError::Value`] for the first value that makes no sense.
+    pub fn check(&self, file: &Path) -> Result<(), ConfigError> {
+        let wrong = |key: String, value: &dyn ToString, allowed: &str| {
+            Err(ConfigError::Value {
+                file: file.to_owned(),
+                key,
+                value: value.to_string(),
+                allowed: allowed.to_owned(),
+            })
+        };
+        if self.vehicles.is_empty() {
+            return wrong("vehicle".into(), &"[]", "at least one [[vehicle]]");
+        }
+        if !(10..=60_000).contains(&self.recorder.flush_ms) {
+            return wrong("recorder.flush_ms".into(), &self.recorder.flush_ms, "10 to 60000 ms");
+        }
+        if !(16..=1 << 20).contains(&self.recorder.queue) {
+            return wrong("recorder.queue".into(), &self.recorder.queue, "16 to 1048576 events");
+        }
+        for (key, endpoints) in [("zenoh.listen", &self.zenoh.listen), ("zenoh.connect", &self.zenoh.connect)] {
+            if let Some(endpoint) = endpoints.iter().find(|e| !e.starts_with("tcp/")) {
+                return wrong(key.into(), endpoint, "endpoints such as \"tcp/127.0.0.1:7447\"");
+            }
+        }
+        let mut names = BTreeSet::new();
+        for vehicle in &self.vehicles {
+            if let Err(error) = vehicle.core().validate() {
+                return wrong(format!("{} (of {})", error.key, vehicle.name), &error.value, error.allowed);
+            }
+            if !names.insert(&vehicle.name) {
+                return wrong("vehicle.name".into(), &vehicle.name, "each vehicle its own");
+            }
+            let at = |key: &str| format!("vehicle.{key} (of {})", vehicle.name);
+            if !(16..=1 << 20).contains(&vehicle.queue) {
+                return wrong(at("queue"), &vehicle.queue, "16 to 1048576 events");
+            }
+            let sensors: BTreeSet<_> = vehicle.sensors.iter().map(|sensor| sensor.name.as_str()).collect();
+            if sensors.len() < vehicle.sensors.len() {
+                return wrong(at("sensor.name"), &"(twice the same)", "each sensor its own");
+            }
+            if let Some(udp) = &vehicle.udp {
+                if let Some(unknown) = udp.from.keys().find(|name| !sensors.contains(name.as_str())) {
+                    let known: Vec<_> = sensors.iter().copied().collect();
+                    return wrong(at("udp.from"), unknown, &format!("the vehicle's sensors: {}", known.join(", ")));
+                }
+                let missing = vehicle.sensors.iter().find(|s| !udp.from.contains_key(&s.name));
+                if let Some(sensor) = missing.filter(|_| vehicle.sensors.len() > 1) {
+                    let allowed = "one sender for each of several sensors, or they cannot be told apart";
+                    return wrong(at("udp.from"), &format!("(nothing for {})", sensor.name), allowed);
+                }
+                if !(65_536..=1 << 30).contains(&udp.receive_buffer_bytes) {
+                    return wrong(
+                        at("udp.receive_buffer_bytes"),
+                        &udp.receive_buffer_bytes,
+                        "65536 to 1073741824 bytes",
+                    );
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Reads the calibration files of all sensors: by vehicle and sensor, in the order of the configuration; `None`
+    /// where the factory's table serves. Relative paths start at the configuration's folder, `file`'s parent.
+    ///
+    /// # Errors
+    /// [`ConfigError::Calibration`] with what is wrong and what is allowed.
+    pub fn calibrations(&self, file: &Path) -> Result<Vec<Vec<Option<Calibration>>>, ConfigError> {
+        let of = |vehicle: &Vehicle, sensor: &SensorConfig| {
+            let Some(path) = &sensor.calibration else { return Ok(None) };
+            let path = file.parent().unwrap_or(Path::new("")).join(path);
+            let wrong = |reason: String| ConfigError::Calibration {
+                file: file.to_owned(),
+                key: format!("vehicle.sensor.calibration (of {}/{})", vehicle.name, sensor.name),
+                calibration: path.clone(),
+                reason,
+            };
+            let text = std::fs::read_to_string(&path).map_err(|error| wrong(error.to_string()))?;
+            let table = Calibration::load_str(&text).map_err(|error| wrong(error.to_string()))?;
+            if let Some(model) = sensor.model {
+                table.fits(model).map_err(|error| wrong(error.to_string()))?;
+            }
+            Ok(Some(table))
+        };
+        self.vehicles.iter().map(|v| v.sensors.iter().map(|s| of(v, s)).collect()).collect()
+    }
+}
+
+/// `a.b=value`: the value is TOML, or a bare string.
+fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
+    let wrong = || ConfigError::Override { text: text.to_owned() };
+    let (path, value) = text.split_once('=').ok_or_else(wrong)?;
+    let value = match toml::from_str::<toml::Table>(&format!("v = {value}")) {
+        Ok(mut parsed) => parsed.remove("v").ok_or_else(wrong)?,
+        Err(_) => toml::Value::String(value.to_owned()),
+    };
+    let mut keys: Vec<&str> = path.trim().split('.').collect();
+    let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(wrong)?;
+    let mut place = table;
+    for key in keys {
+        let slot = place.entry(key).or_insert_with(|| toml::Value::Table(toml::Table::new()));
+        // `vehicle.udp.data` means the first vehicle's: the common case has one.
+        let slot = match slot {
+            toml::Value::Array(items) => items.first_mut().ok_or_else(wrong)?,
+            other => other,
+        };
+        place = slot.as_table_mut().ok_or_else(wrong)?;
+    }
+    place.insert(last.to_owned(), value);
+    Ok(())
+}

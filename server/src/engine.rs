@@ -1,0 +1,114 @@
+//! One named OS thread a vehicle: events in, encoded maps out.
+//!
+//! The journal comes first, then the step: what was recorded is what was processed. The newest map goes into a
+//! latest-value slot that every reader looks at in its own time; the recorder gets every map.
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, TryRecvError};
+use std::thread::JoinHandle;
+use std::time::Instant;
+
+use clearway_mapping::config::MapsConfig;
+use clearway_mapping::event::Event;
+use clearway_mapping::pipeline::Pipeline;
+use tokio::sync::watch;
+
+use crate::record::Journal;
+use crate::status::VehicleStatus;
+use crate::wire::{self, EncodedMap};
+
+/// The newest map of one vehicle; `None` before the first.
+pub type Newest = Option<Arc<EncodedMap>>;
+
+/// Sees the pipeline after each event that completed a map.
+pub type Observer = Box<dyn FnMut(&Pipeline, &EncodedMap) + Send>;
+
+/// One vehicle's engine, before it runs.
+pub struct Engine {
+    /// The vehicle's core.
+    pub pipeline: Pipeline,
+    /// Age after capture at which a map is stale.
+    pub valid_ms: u32,
+    /// Where the newest map goes.
+    pub newest: watch::Sender<Newest>,
+    /// The vehicle's part of the recording.
+    pub journal: Option<Journal>,
+    /// Where ledger, rates and latency go.
+    pub status: Arc<VehicleStatus>,
+    /// Looks at what the maps were made from.
+    pub observer: Option<Observer>,
+}
+
+/// The layers of a vehicle's maps, in order.
+pub fn layers(maps: &MapsConfig) -> Vec<&'static str> {
+    let drivability = maps.drivability.enabled.then_some("drivability");
+    let height_difference = maps.height_difference.enabled.then_some("height_difference");
+    drivability.into_iter().chain(height_difference).collect()
+}
+
+impl Engine {
+    /// Runs until the last door of the vehicle is gone and its queue is empty.
+    ///
+    /// # Errors
+    /// What the system says where it has no thread to give.
+    pub fn start(mut self, events: Receiver<Event>) -> std::io::Result<JoinHandle<()>> {
+        std::thread::Builder::new().name(format!("engine {}", self.status.name)).spawn(move || {
+            // Marks the end however it comes, so that a dead engine is seen as one.
+            struct Stopped(Arc<VehicleStatus>);
+            impl Drop for Stopped {
+                fn drop(&mut self) {
+                    self.0.engine_stopped();
+                }
+            }
+            let _stopped = Stopped(self.status.clone());
+            while let Some(event) = self.next(&events) {
+                self.take(&event);
+            }
+        })
+    }
+
+    /// The next event; the status is brought up to date whenever there is nothing else to do.
+    fn next(&self, events: &Receiver<Event>) -> Option<Event> {
+        match events.try_recv() {
+            Ok(event) => Some(event),
+            Err(TryRecvError::Empty) => {
+                self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors());
+                events.recv().ok().or_else(|| self.last())
+            }
+            Err(TryRecvError::Disconnected) => self.last(),
+        }
+    }
+
+    fn last(&self) -> Option<Event> {
+        self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors());
+        None
+    }
+
+    fn take(&mut self, event: &Event) {
+        if let Some(journal) = &self.journal {
+            journal.event(event);
+        }
+        let started = Instant::now();
+        let map = match self.pipeline.step(event) {
+            Ok(Some(map)) => map,
+            Ok(None) => return,
+            Err(rejected) => {
+                tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %rejected, "refused");
+                return;
+            }
+        };
+        let states = map.sensors.iter().map(wire::sensor).collect();
+        let encoded = Arc::new(EncodedMap::new(map, self.status.name.clone(), self.status.boot_id, self.valid_ms));
+        let latency = started.elapsed();
+        // The status first: whoever has seen a map finds it counted.
+        self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors());
+        self.status.mapped(&encoded, states, latency);
+        self.newest.send_replace(Some(encoded.clone()));
+        if let Some(observer) = &mut self.observer {
+            observer(&self.pipeline, &encoded);
+        }
+        if let Some(journal) = &self.journal {
+            journal.map(encoded);
+        }
+    }
+}

@@ -1,0 +1,191 @@
+//! The door: readings in, numbered [`Event`]s out, on one bounded queue a vehicle.
+//!
+//! Only this file (live and captured readings) and the recording's reader make an [`Event`]; nothing behind the queue
+//! can tell them apart. A live reading gets the clock's stamp here; a captured one brings its own. A full queue costs
+//! the newest readings: they are counted and become one [`Body::Lost`] as soon as there is space again.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use clearway_mapping::event::{Body, Event};
+
+pub mod capture;
+pub mod files;
+pub mod kitti;
+pub mod mcap;
+
+pub mod udp;
+
+/// What a file source yields: an event without its number.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Reading {
+    /// Stamp of the capture, ns since the Unix epoch.
+    pub arrival_ns: i64,
+    /// Index of the sensor in the vehicle's configuration.
+    pub source: u16,
+    /// What happened.
+    pub body: Body,
+}
+
+/// The queue's far end is gone: the engine has stopped.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the vehicle's engine has stopped")]
+pub struct Closed;
+
+/// One vehicle's door. Clones share numbering and queue; the queue ends when the last clone is dropped.
+#[derive(Clone, Debug)]
+pub struct Door {
+    shared: Arc<Mutex<Inside>>,
+    outside: Arc<Outside>,
+}
+
+/// What stayed outside a door; outlives its queue.
+#[derive(Debug, Default)]
+pub struct Outside {
+    refused: Mutex<BTreeMap<&'static str, u64>>,
+    untold: AtomicU64,
+}
+
+impl Outside {
+    /// Datagrams turned away before they became events, by reason.
+    pub fn refused(&self) -> BTreeMap<&'static str, u64> {
+        locked(&self.refused).clone()
+    }
+
+    /// Readings that found the queue full and that the engine has not been told of yet.
+    pub fn untold(&self) -> u64 {
+        self.untold.load(Ordering::Relaxed)
+    }
+}
+
+#[derive(Debug)]
+struct Inside {
+    queue: SyncSender<Event>,
+    next_sequence: u64,
+    /// Readings that found the queue full, by source, not yet told to the engine.
+    untold: BTreeMap<u16, u64>,
+}
+
+/// A door and the queue behind it, `capacity` events long.
+pub fn door(capacity: usize) -> (Door, Receiver<Event>) {
+    let (queue, events) = sync_channel(capacity);
+    let inside = Inside { queue, next_sequence: 0, untold: BTreeMap::new() };
+    (Door { shared: Arc::new(Mutex::new(inside)), outside: Arc::default() }, events)
+}
+
+impl Door {
+    /// Takes a live reading, stamped now. Never waits: a full queue counts the reading as lost.
+    ///
+    /// # Errors
+    /// [`Closed`] when the engine has stopped.
+    pub fn enter(&self, source: u16, body: Body) -> Result<(), Closed> {
+        let mut inside = locked(&self.shared);
+        let arrival_ns = now_ns();
+        inside.tell_losses(arrival_ns)?;
+        if !inside.untold.is_empty() || !inside.offer(arrival_ns, source, body)? {
+            *inside.untold.entry(source).or_default() += 1;
+        }
+        self.outside.untold.store(inside.untold.values().sum(), Ordering::Relaxed);
+        Ok(())
+    }
+
+    /// Takes a captured reading with its own stamp; waits while the queue is full, so that a file loses nothing.
+    ///
+    /// # Errors
+    /// [`Closed`] when the engine has stopped.
+    pub fn enter_captured(&self, reading: Reading) -> Result<(), Closed> {
+        let Reading { arrival_ns, source, body } = reading;
+        let mut inside = locked(&self.shared);
+        let sequence = inside.next_sequence;
+        inside.queue.send(Event { sequence, arrival_ns, source, body }).map_err(|_| Closed)?;
+        inside.next_sequence += 1;
+        Ok(())
+    }
+
+    /// Counts a datagram that was turned away before it became an event.
+    pub fn refuse(&self, reason: &'static str) {
+        *locked(&self.outside.refused).entry(reason).or_default() += 1;
+    }
+
+    /// What stayed outside.
+    pub fn outside(&self) -> Arc<Outside> {
+        self.outside.clone()
+    }
+}
+
+/// Nothing under these locks panics between two related writes, so a poisoned lock still guards whole values.
+pub(crate) fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Inside {
+    /// Puts one event on the queue; `false` when it is full.
+    fn offer(&mut self, arrival_ns: i64, source: u16, body: Body) -> Result<bool, Closed> {
+        match self.queue.try_send(Event { sequence: self.next_sequence, arrival_ns, source, body }) {
+            Ok(()) => {
+                self.next_sequence += 1;
+                Ok(true)
+            }
+            Err(TrySendError::Full(_)) => Ok(false),
+            Err(TrySendError::Disconnected(_)) => Err(Closed),
+        }
+    }
+
+    /// Turns the losses counted so far into events, as far as there is space.
+    fn tell_losses(&mut self, arrival_ns: i64) -> Result<(), Closed> {
+        while let Some((source, lost)) = self.untold.first_key_value().map(|(s, n)| (*s, *n)) {
+            if !self.offer(arrival_ns, source, Body::Lost(lost))? {
+                break;
+            }
+            self.untold.remove(&source);
+        }
+        Ok(())
+    }
+}
+
+/// The system clock, ns since the Unix epoch. The door, the freshness stamps of the publishers and the status read it.
+pub(crate) fn now_ns() -> i64 {
+    match SystemTime::now().duration_since(UNIX_EPOCH) {
+        Ok(since) => i64::try_from(since.as_nanos()).unwrap_or(i64::MAX),
+        Err(before) => -i64::try_from(before.duration().as_nanos()).unwrap_or(i64::MAX),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn events_are_numbered_without_a_hole_and_a_full_queue_becomes_one_loss() {
+        let (door, events) = door(2);
+        for _ in 0..5 {
+            door.enter(1, Body::End).unwrap();
+        }
+        assert_eq!(door.outside().untold(), 3);
+        let taken: Vec<_> = events.try_iter().collect();
+        assert_eq!(taken.iter().map(|e| e.sequence).collect::<Vec<_>>(), [0, 1]);
+        door.enter(0, Body::End).unwrap();
+        let taken: Vec<_> = events.try_iter().collect();
+        assert_eq!(taken[0].body, Body::Lost(3));
+        assert_eq!((taken[0].sequence, taken[0].source), (2, 1));
+        assert_eq!((taken[1].sequence, taken[1].source), (3, 0));
+        assert_eq!(door.outside().untold(), 0);
+    }
+
+    #[test]
+    fn a_captured_reading_keeps_its_stamp() {
+        let (door, events) = door(2);
+        door.enter_captured(Reading { arrival_ns: 42, source: 0, body: Body::End }).unwrap();
+        assert_eq!(events.recv().unwrap().arrival_ns, 42);
+    }
+
+    #[test]
+    fn a_door_without_an_engine_says_so() {
+        let (door, events) = door(2);
+        drop(events);
+        assert_eq!(door.enter(0, Body::End), Err(Closed));
+    }
+}

@@ -1,0 +1,144 @@
+//! The page, embedded, with its WebSocket `/live?vehicle=V`, `/vehicles`, `/healthz` and `/metrics`.
+//!
+//! The WebSocket sends each newest map as a binary `clearway.v1.MapUpdate` with all layers, and the status once a second
+//! as a JSON text. A browser that takes nothing for a while is dropped.
+
+use std::time::Duration;
+
+use axum::Router;
+use axum::extract::ws::{Message as Frame, WebSocket, WebSocketUpgrade};
+use axum::extract::{Query, State};
+use axum::http::{StatusCode, Uri, header};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use axum::serve::ListenerExt;
+use bytes::Bytes;
+use clearway_proto::v1;
+use prost::Message;
+use rust_embed::RustEmbed;
+use serde_json::Value;
+use tokio::net::TcpListener;
+
+use super::{Served, Vehicles};
+use crate::ingest::now_ns;
+use crate::status::{Reader, prometheus};
+
+/// A browser that has not taken a frame for this long shows nothing true any more.
+const SEND_TIMEOUT: Duration = Duration::from_secs(5);
+const STATUS_PERIOD: Duration = Duration::from_secs(1);
+/// A page sends nothing but pongs.
+const MESSAGE_BYTES_MAX: usize = 4096;
+
+#[derive(RustEmbed)]
+#[folder = "web/"]
+struct Assets;
+
+/// Serves until `stop` resolves.
+///
+/// # Errors
+/// What the listener says.
+pub async fn serve(
+    listener: TcpListener,
+    vehicles: Vehicles,
+    stop: impl Future<Output = ()> + Send + 'static,
+) -> std::io::Result<()> {
+    let router = Router::new()
+        .route("/live", get(live))
+        .route("/vehicles", get(list))
+        .route("/healthz", get(health))
+        .route("/metrics", get(metrics))
+        .fallback(asset)
+        .with_state(vehicles);
+    let listener = listener.tap_io(|stream| {
+        // A failure leaves the default, which is slower but right.
+        let _ = stream.set_nodelay(true);
+    });
+    axum::serve(listener, router).with_graceful_shutdown(stop).await
+}
+
+async fn asset(uri: Uri) -> Response {
+    let path = uri.path().trim_start_matches('/');
+    let path = if path.is_empty() { "index.html" } else { path };
+    // The page's own tests lie beside it.
+    let is_asset = !path.ends_with(".mjs") && !path.ends_with(".json");
+    match Assets::get(path).filter(|_| is_asset) {
+        Some(file) => {
+            let kind = file.metadata.mimetype().to_owned();
+            let headers = [(header::CONTENT_TYPE, kind), (header::CACHE_CONTROL, "no-cache".to_owned())];
+            (headers, file.data.into_owned()).into_response()
+        }
+        None => (StatusCode::NOT_FOUND, format!("nothing at {}\n", uri.path())).into_response(),
+    }
+}
+
+async fn list(State(vehicles): State<Vehicles>) -> impl IntoResponse {
+    let all: Vec<Value> = vehicles.statuses().iter().map(|status| status.to_json()).collect();
+    ([(header::CONTENT_TYPE, "application/json")], Value::from(all).to_string())
+}
+
+async fn health(State(vehicles): State<Vehicles>) -> Response {
+    match vehicles.statuses().iter().find(|status| !status.is_alive()) {
+        None => "ok\n".into_response(),
+        Some(dead) => {
+            let text = format!("the engine of vehicle {} has stopped\n", dead.name);
+            (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
+        }
+    }
+}
+
+async fn metrics(State(vehicles): State<Vehicles>) -> impl IntoResponse {
+    let kind = [(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")];
+    (kind, prometheus(&vehicles.statuses()))
+}
+
+#[derive(serde::Deserialize)]
+struct Wanted {
+    #[serde(default)]
+    vehicle: String,
+}
+
+async fn live(State(vehicles): State<Vehicles>, Query(wanted): Query<Wanted>, upgrade: WebSocketUpgrade) -> Response {
+    match vehicles.find(&wanted.vehicle) {
+        Ok(served) => {
+            let served = served.clone();
+            upgrade.max_message_size(MESSAGE_BYTES_MAX).on_upgrade(move |socket| stream(socket, served))
+        }
+        Err(unknown) => (StatusCode::NOT_FOUND, format!("{unknown}\n")).into_response(),
+    }
+}
+
+/// Sends until the browser goes, stalls, or the engine stops.
+async fn stream(mut socket: WebSocket, served: Served) {
+    let _reader = Reader::new(&served.status.page_readers);
+    let mut newest = served.newest.clone();
+    newest.mark_changed();
+    let mut every = tokio::time::interval(STATUS_PERIOD);
+    let mut last_sequence = None;
+    loop {
+        let frame = tokio::select! {
+            changed = newest.changed() => {
+                let Ok(()) = changed else { break };
+                let map = newest.borrow_and_update().clone();
+                let Some(map) = map else { continue };
+                let skipped = last_sequence.map_or(0, |last: u64| map.sequence.saturating_sub(last + 1));
+                last_sequence = Some(map.sequence);
+                let update = v1::MapUpdate { map: map.select(&[]), skipped, sent_ns: now_ns() };
+                Frame::Binary(Bytes::from(update.encode_to_vec()))
+            }
+            _ = every.tick() => {
+                let mut status = served.status.to_json();
+                status["type"] = "status".into();
+                Frame::Text(status.to_string().into())
+            }
+            received = socket.recv() => match received {
+                // Nothing a page could say is of interest; pings are answered by the library.
+                Some(Ok(_)) => continue,
+                Some(Err(_)) | None => break,
+            },
+        };
+        match tokio::time::timeout(SEND_TIMEOUT, socket.send(frame)).await {
+            Ok(Ok(())) => {}
+            Ok(Err(_)) | Err(_) => break,
+        }
+    }
+}

@@ -1,0 +1,175 @@
+//! Maps over zenoh, one layer a key: `clearway/<vehicle>/map/<layer>`.
+//!
+//! Late joiners get the current map from the publisher's cache; the same key answers queries with it. Misses can be
+//! detected. A liveliness token `clearway/<vehicle>` lives as long as the vehicle is served; `clearway/<vehicle>/status`
+//! has the status once a second, JSON. Congestion drops: blocking would let one stopped peer hold up the healthy ones.
+
+use std::time::Duration;
+
+use tokio::task::JoinSet;
+use zenoh::bytes::Encoding;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::qos::CongestionControl;
+use zenoh::{Config, Session};
+use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
+
+use super::{Served, Vehicles};
+use crate::config::Zenoh as Options;
+
+const STATUS_PERIOD: Duration = Duration::from_secs(1);
+/// How often a quiet publisher tells its last sequence, so that a lost last map is noticed.
+const HEARTBEAT: Duration = Duration::from_secs(1);
+
+/// The open session and what it publishes.
+pub struct Publisher {
+    session: Session,
+    tokens: Vec<LivelinessToken>,
+    tasks: JoinSet<()>,
+}
+
+/// Why zenoh is not published.
+#[derive(Debug, thiserror::Error)]
+#[error("zenoh: {what}: {reason}")]
+pub struct ZenohError {
+    /// What was tried.
+    what: String,
+    /// What zenoh says.
+    reason: zenoh::Error,
+}
+
+fn failed(what: impl Into<String>) -> impl FnOnce(zenoh::Error) -> ZenohError {
+    let what = what.into();
+    |reason| ZenohError { what, reason }
+}
+
+impl Publisher {
+    /// Opens the session, declares every vehicle's keys and starts publishing. Needs a multi-thread runtime.
+    ///
+    /// # Errors
+    /// [`ZenohError`] with what zenoh says.
+    pub async fn start(options: &Options, vehicles: &Vehicles) -> Result<Self, ZenohError> {
+        let config = session_config(options)?;
+        let endpoints = options.listen.join(", ");
+        let session = zenoh::open(config).await.map_err(failed(format!("open (listen {endpoints})")))?;
+        let mut publisher = Self { session, tokens: Vec::new(), tasks: JoinSet::new() };
+        for served in vehicles.0.iter() {
+            publisher.publish(served).await?;
+        }
+        Ok(publisher)
+    }
+
+    /// Where the session listens, ports found.
+    pub async fn endpoints(&self) -> Vec<String> {
+        self.session.info().locators().await.iter().map(ToString::to_string).collect()
+    }
+
+    /// Ends publishing; the tokens vanish at once.
+    pub async fn stop(mut self) {
+        self.tasks.shutdown().await;
+        for token in self.tokens {
+            if let Err(error) = token.undeclare().await {
+                tracing::warn!(%error, "zenoh: liveliness token");
+            }
+        }
+        if let Err(error) = self.session.close().await {
+            tracing::warn!(%error, "zenoh: close");
+        }
+    }
+
+    async fn publish(&mut self, served: &Served) -> Result<(), ZenohError> {
+        let vehicle = &served.status.name;
+        let mut publishers = Vec::new();
+        for layer in &served.status.layers {
+            let key = format!("clearway/{vehicle}/map/{layer}");
+            let publisher = self
+                .session
+                .declare_publisher(key.clone())
+                .encoding(map_encoding())
+                .congestion_control(CongestionControl::Drop)
+                // Its own sequence numbers: the cache needs them or time stamps, and with them misses are seen.
+                .sample_miss_detection(MissDetectionConfig::default().sporadic_heartbeat(HEARTBEAT))
+                .cache(CacheConfig::default().max_samples(1))
+                .publisher_detection()
+                .await
+                .map_err(failed(format!("publisher {key}")))?;
+            publishers.push((*layer, publisher));
+            self.answer(served, layer, key).await?;
+        }
+        let key = format!("clearway/{vehicle}/status");
+        let status = self.session.declare_publisher(key.clone()).encoding(Encoding::APPLICATION_JSON);
+        let status =
+            status.congestion_control(CongestionControl::Drop).await.map_err(failed(format!("publisher {key}")))?;
+        let token = self.session.liveliness().declare_token(format!("clearway/{vehicle}"));
+        self.tokens.push(token.await.map_err(failed(format!("liveliness clearway/{vehicle}")))?);
+        self.tasks.spawn(send_maps(served.clone(), publishers));
+        self.tasks.spawn({
+            let served = served.clone();
+            async move {
+                let mut every = tokio::time::interval(STATUS_PERIOD);
+                loop {
+                    every.tick().await;
+                    if let Err(error) = status.put(served.status.to_json().to_string()).await {
+                        tracing::warn!(%error, "zenoh: status");
+                    }
+                }
+            }
+        });
+        Ok(())
+    }
+
+    /// Answers queries on a layer's key with its newest map.
+    async fn answer(&mut self, served: &Served, layer: &'static str, key: String) -> Result<(), ZenohError> {
+        let queryable = self.session.declare_queryable(key.clone()).complete(true);
+        let queries = queryable.await.map_err(failed(format!("queryable {key}")))?;
+        let newest = served.newest.clone();
+        self.tasks.spawn(async move {
+            while let Ok(query) = queries.recv_async().await {
+                let map = newest.borrow().clone();
+                let Some(map) = map else { continue };
+                let Some((_, chunk)) = map.layers.iter().find(|(name, _)| *name == layer) else { continue };
+                if let Err(error) = query.reply(&key, map.layer(chunk)).encoding(map_encoding()).await {
+                    tracing::debug!(%error, "zenoh: reply");
+                }
+            }
+        });
+        Ok(())
+    }
+}
+
+async fn send_maps(served: Served, publishers: Vec<(&'static str, AdvancedPublisher<'static>)>) {
+    let mut newest = served.newest.clone();
+    newest.mark_changed();
+    while newest.changed().await.is_ok() {
+        let map = newest.borrow_and_update().clone();
+        let Some(map) = map else { continue };
+        for (layer, chunk) in &map.layers {
+            let Some((_, publisher)) = publishers.iter().find(|(name, _)| name == layer) else { continue };
+            if let Err(error) = publisher.put(map.layer(chunk)).await {
+                tracing::warn!(%error, layer, "zenoh: put");
+            }
+        }
+    }
+    // The engine has stopped, but the current map stays in the caches until the session ends.
+    std::future::pending::<()>().await;
+}
+
+fn map_encoding() -> Encoding {
+    Encoding::APPLICATION_PROTOBUF.with_schema("clearway.v1.Map")
+}
+
+fn session_config(options: &Options) -> Result<Config, ZenohError> {
+    let mut config = Config::default();
+    let json = |value: serde_json::Value| value.to_string();
+    let settings = [
+        ("mode", json(options.mode.as_str().into())),
+        ("listen/endpoints", json(options.listen.clone().into())),
+        ("connect/endpoints", json(options.connect.clone().into())),
+        ("scouting/multicast/enabled", json(options.scouting.into())),
+        ("scouting/gossip/enabled", json(options.scouting.into())),
+        ("timestamping/enabled", json(true.into())),
+    ];
+    for (key, value) in settings {
+        config.insert_json5(key, &value).map_err(failed(format!("{key} = {value}")))?;
+    }
+    Ok(config)
+}

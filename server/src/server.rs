@@ -1,0 +1,344 @@
+//! Puts the house together: doors, engines, recorder and publishers of one configuration, started in an order in which
+//! nothing is lost and stopped in the reverse one.
+
+use std::collections::BTreeMap;
+use std::hash::{BuildHasher, Hasher};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use clearway_lidar::calibration::Calibration;
+use clearway_mapping::pipeline::Pipeline;
+use tokio::net::TcpListener;
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+
+use crate::config::Config;
+use crate::engine::{Engine, Observer, layers};
+use crate::ingest::{Door, door, udp};
+use crate::publish::{Served, Vehicles, grpc, page};
+use crate::record::{Preface, RecordError, Recorder};
+use crate::status::VehicleStatus;
+
+/// A stalled peer may not keep the server from ending.
+const PUBLISHERS_STOP: Duration = Duration::from_secs(2);
+
+/// What a server is started with.
+#[derive(Default)]
+pub struct Setup {
+    /// Checked.
+    pub config: Config,
+    /// Of every sensor, as [`Config::calibrations`] gives them.
+    pub calibrations: Vec<Vec<Option<Calibration>>>,
+    /// Names this run in maps and recordings; drawn where absent.
+    pub boot_id: Option<u64>,
+    /// Events come from files: a full recorder queue holds them up, instead of losing anything.
+    pub from_files: bool,
+    /// Put before the recorded configuration as comments, a line each.
+    pub remarks: Vec<String>,
+    /// Put into the recording's metadata.
+    pub notes: BTreeMap<String, String>,
+    /// Looks at what the maps of the first vehicle were made from.
+    pub observer: Option<Observer>,
+}
+
+/// Why a server did not start.
+#[derive(Debug, thiserror::Error)]
+pub enum StartError {
+    /// A vehicle cannot be as configured.
+    #[error(transparent)]
+    Vehicle(#[from] clearway_mapping::config::ConfigError),
+    /// The recording cannot be created.
+    #[error(transparent)]
+    Record(#[from] RecordError),
+    /// An address cannot be listened on.
+    #[error("{what} {at}: {source}")]
+    Listen {
+        /// The configuration key.
+        what: &'static str,
+        /// The address.
+        at: SocketAddr,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A vehicle's sockets cannot be bound.
+    #[error("vehicle {vehicle}: {source}")]
+    Udp {
+        /// The vehicle's name.
+        vehicle: Arc<str>,
+        /// Which address, and why.
+        source: std::io::Error,
+    },
+    /// An engine's thread cannot be started.
+    #[error("vehicle {vehicle}: no thread for its engine: {source}")]
+    Thread {
+        /// The vehicle's name.
+        vehicle: Arc<str>,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// zenoh cannot be published.
+    #[cfg(feature = "zenoh")]
+    #[error(transparent)]
+    Zenoh(#[from] crate::publish::zenoh::ZenohError),
+    /// zenoh is asked for, but not built in.
+    #[error("zenoh.enabled = true: this clearway-server was built without the feature zenoh; allowed: false")]
+    NoZenoh,
+}
+
+/// One vehicle of a running server.
+pub struct RunningVehicle {
+    /// The vehicle's name.
+    pub name: Arc<str>,
+    /// Where its events enter.
+    pub door: Door,
+    /// Its sockets, where it has some: data, telemetry.
+    pub udp: Option<(SocketAddr, SocketAddr)>,
+}
+
+/// A running server. Dropping it without [`Running::shutdown`] leaves an unfinished recording.
+pub struct Running {
+    /// The newest maps and the status of all vehicles.
+    pub vehicles: Vehicles,
+    /// The vehicles' doors.
+    pub doors: Vec<RunningVehicle>,
+    /// Where gRPC is served.
+    pub grpc: Option<SocketAddr>,
+    /// Where the page is served.
+    pub page: Option<SocketAddr>,
+    /// Where zenoh listens.
+    pub zenoh: Vec<String>,
+    engines: Vec<(Arc<str>, JoinHandle<()>)>,
+    recorder: Option<Recorder>,
+    readers: JoinSet<()>,
+    publishers: JoinSet<()>,
+    stop: watch::Sender<bool>,
+    #[cfg(feature = "zenoh")]
+    publisher: Option<crate::publish::zenoh::Publisher>,
+}
+
+/// What did not end as it should have.
+#[derive(Debug, thiserror::Error)]
+pub enum EndError {
+    /// An engine died.
+    #[error("the engine of vehicle {0} panicked")]
+    Engine(Arc<str>),
+    /// The recording is not whole.
+    #[error("the recording is not whole: {0}")]
+    Recording(String),
+}
+
+/// The server.
+pub struct Server;
+
+impl Server {
+    /// Starts everything the configuration asks for: recorder, engines, publishers, and the sockets last. Needs a
+    /// multi-thread tokio runtime.
+    ///
+    /// # Errors
+    /// [`StartError`], after which nothing is left running.
+    pub async fn start(setup: Setup) -> Result<Running, StartError> {
+        let Setup { config, mut calibrations, boot_id, from_files, remarks, notes, mut observer } = setup;
+        let boot_id = boot_id.unwrap_or_else(random);
+        calibrations.resize_with(config.vehicles.len(), Vec::new);
+        let mut pipelines = Vec::new();
+        for (vehicle, tables) in config.vehicles.iter().zip(&mut calibrations) {
+            tables.resize(vehicle.sensors.len(), None);
+            pipelines.push(Pipeline::new(&vehicle.core(), tables.clone())?);
+        }
+        // Listeners before the recorder: a port in use must not cost an earlier recording its file.
+        let grpc = listen("grpc.listen", config.grpc.enabled.then_some(config.grpc.listen)).await?;
+        let page = listen("page.listen", config.page.enabled.then_some(config.page.listen)).await?;
+        let sockets = config.vehicles.iter().map(|v| {
+            let bind = v.udp.as_ref().map(udp::Sockets::bind).transpose();
+            bind.map_err(|source| StartError::Udp { vehicle: v.name.as_str().into(), source })
+        });
+        let sockets: Vec<_> = sockets.collect::<Result<_, _>>()?;
+
+        let names: Vec<Arc<str>> = config.vehicles.iter().map(|v| v.name.as_str().into()).collect();
+        let (recorder, journals) = match crate::record::wanted(&config.recorder) {
+            None => (None, Vec::new()),
+            Some(_) => {
+                let preface = preface(&config, &calibrations, boot_id, &names, &remarks, notes);
+                let (recorder, journals) = Recorder::start(&config.recorder, &preface, from_files)?;
+                (Some(recorder), journals)
+            }
+        };
+        let mut journals = journals.into_iter();
+
+        let (mut served, mut doors, mut engines) = (Vec::new(), Vec::new(), Vec::new());
+        for ((vehicle, name), pipeline) in config.vehicles.iter().zip(&names).zip(pipelines) {
+            let (door, events) = door(vehicle.queue);
+            let counts = recorder.as_ref().map(Recorder::counts);
+            let status =
+                Arc::new(VehicleStatus::new(name.clone(), boot_id, layers(&vehicle.maps), door.outside(), counts));
+            let (newest, receiver) = watch::channel(None);
+            let engine = Engine {
+                pipeline,
+                valid_ms: vehicle.maps.valid_ms,
+                newest,
+                journal: journals.next(),
+                status: status.clone(),
+                observer: observer.take(),
+            };
+            let thread = engine.start(events).map_err(|source| StartError::Thread { vehicle: name.clone(), source })?;
+            engines.push((name.clone(), thread));
+            served.push(Served { status, newest: receiver });
+            doors.push(RunningVehicle { name: name.clone(), door, udp: None });
+        }
+        let vehicles = Vehicles(served.into());
+
+        let (stop, stopped) = watch::channel(false);
+        let stopped = move || {
+            let mut stopped = stopped.clone();
+            async move {
+                // An error means that the sender is gone, which is a stop too.
+                let _ = stopped.wait_for(|stop| *stop).await;
+            }
+        };
+        let mut publishers = JoinSet::new();
+        let address = |listener: &TcpListener| listener.local_addr().ok();
+        let (grpc_at, page_at) = (grpc.as_ref().and_then(address), page.as_ref().and_then(address));
+        if let Some(listener) = grpc {
+            let (vehicles, stopped) = (vehicles.clone(), stopped());
+            publishers.spawn(async move {
+                if let Err(error) = grpc::serve(listener, vehicles, stopped).await {
+                    tracing::error!(%error, "grpc ended");
+                }
+            });
+        }
+        if let Some(listener) = page {
+            let (vehicles, stopped) = (vehicles.clone(), stopped());
+            publishers.spawn(async move {
+                if let Err(error) = page::serve(listener, vehicles, stopped).await {
+                    tracing::error!(%error, "page ended");
+                }
+            });
+        }
+        #[cfg(not(feature = "zenoh"))]
+        if config.zenoh.enabled {
+            return Err(StartError::NoZenoh);
+        }
+        #[cfg(feature = "zenoh")]
+        let publisher = match config.zenoh.enabled {
+            true => Some(crate::publish::zenoh::Publisher::start(&config.zenoh, &vehicles).await?),
+            false => None,
+        };
+        let mut running = Running {
+            vehicles,
+            doors,
+            grpc: grpc_at,
+            page: page_at,
+            zenoh: Vec::new(),
+            engines,
+            recorder,
+            readers: JoinSet::new(),
+            publishers,
+            stop,
+            #[cfg(feature = "zenoh")]
+            publisher,
+        };
+        #[cfg(feature = "zenoh")]
+        if let Some(publisher) = &running.publisher {
+            running.zenoh = publisher.endpoints().await;
+        }
+        running.open_sockets(&config, sockets)?;
+        Ok(running)
+    }
+}
+
+impl Running {
+    /// The file being recorded to.
+    pub fn recording(&self) -> Option<String> {
+        self.recorder.as_ref().map(|recorder| recorder.counts().to_proto().file)
+    }
+
+    fn open_sockets(&mut self, config: &Config, sockets: Vec<Option<udp::Sockets>>) -> Result<(), StartError> {
+        for (index, (vehicle, sockets)) in config.vehicles.iter().zip(sockets).enumerate() {
+            let (Some(udp), Some(sockets)) = (&vehicle.udp, sockets) else { continue };
+            let running = &mut self.doors[index];
+            let (data, telemetry) =
+                sockets.addresses().map_err(|source| StartError::Udp { vehicle: running.name.clone(), source })?;
+            running.udp = Some((data, telemetry));
+            self.vehicles.0[index].status.watch_sockets(&[data, telemetry]);
+            let senders = udp::senders(&udp.from, vehicle.sensors.iter().map(|sensor| &sensor.name));
+            self.readers.spawn(sockets.run(senders, running.door.clone()));
+        }
+        Ok(())
+    }
+
+    /// Ends it all: no more readings, every event taken processed and recorded, the recording finished, the readers told.
+    ///
+    /// # Errors
+    /// [`EndError`] where an engine had died or the recording is not whole; everything has ended all the same.
+    pub async fn shutdown(mut self) -> Result<(), EndError> {
+        self.readers.shutdown().await;
+        self.doors.clear();
+        let (engines, recorder) = (self.engines, self.recorder);
+        let ended = tokio::task::spawn_blocking(move || {
+            let mut outcome = Ok(());
+            for (name, engine) in engines {
+                if engine.join().is_err() {
+                    outcome = Err(EndError::Engine(name));
+                }
+            }
+            match recorder.map(Recorder::finish) {
+                Some(Err(reason)) => Err(EndError::Recording(reason)),
+                _ => outcome,
+            }
+        });
+        let outcome = ended.await.unwrap_or_else(|error| Err(EndError::Recording(error.to_string())));
+        self.stop.send_replace(true);
+        let mut publishers = self.publishers;
+        let all = async { while publishers.join_next().await.is_some() {} };
+        if tokio::time::timeout(PUBLISHERS_STOP, all).await.is_err() {
+            publishers.shutdown().await;
+        }
+        #[cfg(feature = "zenoh")]
+        if let Some(publisher) = self.publisher
+            && tokio::time::timeout(PUBLISHERS_STOP, publisher.stop()).await.is_err()
+        {
+            tracing::warn!("zenoh did not close in time");
+        }
+        outcome
+    }
+}
+
+async fn listen(what: &'static str, at: Option<SocketAddr>) -> Result<Option<TcpListener>, StartError> {
+    let Some(at) = at else { return Ok(None) };
+    TcpListener::bind(at).await.map(Some).map_err(|source| StartError::Listen { what, at, source })
+}
+
+/// What the recording says before its first event.
+fn preface(
+    config: &Config,
+    calibrations: &[Vec<Option<Calibration>>],
+    boot_id: u64,
+    names: &[Arc<str>],
+    remarks: &[String],
+    mut notes: BTreeMap<String, String>,
+) -> Preface {
+    let mut tables = Vec::new();
+    for (vehicle, of_vehicle) in config.vehicles.iter().zip(calibrations) {
+        for (sensor, table) in vehicle.sensors.iter().zip(of_vehicle) {
+            let key = format!("calibration/{}/{}", vehicle.name, sensor.name);
+            let source = match &sensor.calibration {
+                Some(file) => file.clone(),
+                None => "the factory's table of the model, or the one in the sensor's status bytes".into(),
+            };
+            notes.insert(key, source);
+            if let Some(table) = table {
+                tables.push((vehicle.name.clone(), sensor.name.clone(), table.to_yaml()));
+            }
+        }
+    }
+    let remarks: String = remarks.iter().map(|remark| format!("# {remark}\n")).collect();
+    let vehicles = names.iter().zip(&config.vehicles).map(|(name, v)| (name.clone(), layers(&v.maps))).collect();
+    Preface { boot_id, config: remarks + &config.to_toml(), vehicles, calibrations: tables, notes }
+}
+
+/// Sixty-four bits nobody else has: each `RandomState` is keyed by the system's randomness.
+fn random() -> u64 {
+    std::hash::RandomState::new().build_hasher().finish()
+}

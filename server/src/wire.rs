@@ -1,0 +1,285 @@
+//! [`Map`] -> [`EncodedMap`], once: a header chunk and one chunk a layer, each a piece of one `clearway.v1.Map`.
+//!
+//! Protobuf messages concatenate: header and layer chunks put behind each other are the message, so any selection of
+//! layers costs one copy and no encoding, and the bytes of one layer are the same over zenoh, gRPC and in a recording.
+//! No clock goes into the bytes: the same events give the same bytes.
+
+use std::sync::Arc;
+
+use bytes::{Bytes, BytesMut};
+use clearway_mapping::event::{Body, EgoPose, Event, Scan};
+use clearway_mapping::map::{Cells, Geometry, Layer, Map, SensorState};
+use clearway_proto::codec::{self, CellsRef};
+use clearway_proto::map::{encode_header, encode_layer};
+use clearway_proto::v1;
+use nalgebra::{Isometry3, Quaternion, Translation3, Unit};
+use prost::Message;
+
+/// One map, ready for any reader. Cloning it costs reference counts.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EncodedMap {
+    /// The vehicle's name.
+    pub vehicle: Arc<str>,
+    /// Of the map.
+    pub sequence: u64,
+    /// Of the map; age is measured from here.
+    pub capture_end_ns: i64,
+    /// Of the map: arrival of the event that completed it.
+    pub completed_ns: i64,
+    /// Share of the judged cells that are drivable, where the map has that layer.
+    pub drivable_share: Option<f64>,
+    /// An encoded `Map` with the header alone.
+    pub header: Bytes,
+    /// By layer name, in the map's order: an encoded `Map` with this layer alone.
+    pub layers: Vec<(&'static str, Bytes)>,
+}
+
+impl EncodedMap {
+    /// Encodes `map` of `vehicle`; `boot_id` names this run of the server, `valid_ms` how long the map may be used.
+    pub fn new(map: &Map, vehicle: Arc<str>, boot_id: u64, valid_ms: u32) -> Self {
+        let header = encode_header(&header(map, &vehicle, boot_id, valid_ms));
+        let encode = |layer: &Layer| (layer.name, encode_layer(&self::layer(layer)));
+        let share = |layer: &Layer| layer.figures.iter().find(|(name, _)| *name == "drivable_share").map(|(_, v)| *v);
+        Self {
+            vehicle,
+            sequence: map.sequence,
+            capture_end_ns: map.capture_end_ns,
+            completed_ns: map.completed_ns,
+            drivable_share: map.layers.iter().find_map(share),
+            header,
+            layers: map.layers.iter().map(encode).collect(),
+        }
+    }
+
+    /// The encoded map with these layers, in the map's order; every layer where none is named. Names nobody knows are
+    /// left out.
+    pub fn select(&self, layers: &[String]) -> Bytes {
+        let wanted = |name: &str| layers.is_empty() || layers.iter().any(|layer| layer == name);
+        let chunks = || self.layers.iter().filter(|(name, _)| wanted(name)).map(|(_, bytes)| bytes);
+        let mut message = BytesMut::with_capacity(self.header.len() + chunks().map(Bytes::len).sum::<usize>());
+        message.extend_from_slice(&self.header);
+        chunks().for_each(|chunk| message.extend_from_slice(chunk));
+        message.freeze()
+    }
+
+    /// The encoded map with one layer: what zenoh carries and the recording holds.
+    pub fn layer(&self, chunk: &Bytes) -> Bytes {
+        let mut message = BytesMut::with_capacity(self.header.len() + chunk.len());
+        message.extend_from_slice(&self.header);
+        message.extend_from_slice(chunk);
+        message.freeze()
+    }
+}
+
+fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
+    v1::Header {
+        vehicle: vehicle.to_owned(),
+        boot_id,
+        sequence: map.sequence,
+        capture_start_ns: map.capture_start_ns,
+        capture_end_ns: map.capture_end_ns,
+        completed_ns: map.completed_ns,
+        valid_until_ns: map.capture_end_ns.saturating_add(i64::from(valid_ms) * 1_000_000),
+        map_from_ego: map.map_from_ego.as_ref().map(pose),
+        speed_mps: map.speed_mps,
+        sensors: map.sensors.iter().map(sensor).collect(),
+    }
+}
+
+fn pose(isometry: &Isometry3<f64>) -> v1::Pose {
+    let (t, q) = (isometry.translation.vector, isometry.rotation.coords);
+    v1::Pose { x: t.x, y: t.y, z: t.z, qx: q.x, qy: q.y, qz: q.z, qw: q.w }
+}
+
+pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
+    v1::SensorState {
+        name: state.name.clone(),
+        model: state.model.clone(),
+        packets: state.packets,
+        refused: state.refused,
+        returns: state.returns,
+        rpm: state.rpm,
+        completeness: state.completeness,
+        partial: state.partial.to_owned(),
+    }
+}
+
+fn layer(layer: &Layer) -> v1::Layer {
+    let geometry = match &layer.geometry {
+        Geometry::Radial { r_bench_m, columns } => {
+            v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m: r_bench_m.clone(), columns: u32::from(*columns) })
+        }
+    };
+    let channel = |channel: &clearway_mapping::map::Channel| {
+        let cells = match &channel.cells {
+            Cells::U8(cells) => CellsRef::U8(cells),
+            Cells::I8(cells) => CellsRef::I8(cells),
+            Cells::U16(cells) => CellsRef::U16(cells),
+        };
+        codec::encode(cells).into_channel(channel.name, channel.unit, channel.scale, channel.unknown)
+    };
+    v1::Layer {
+        name: layer.name.to_owned(),
+        geometry: Some(geometry),
+        legend: layer.legend.iter().map(|&class| class.to_owned()).collect(),
+        channels: layer.channels.iter().map(channel).collect(),
+        planes: layer.planes.iter().map(|&[a, b, c]| v1::Plane { a, b, c }).collect(),
+        figures: layer.figures.iter().map(|&(name, value)| (name.to_owned(), value)).collect(),
+    }
+}
+
+/// An event as the journal holds it.
+pub fn event_to_proto(event: &Event) -> v1::Event {
+    let body = match &event.body {
+        Body::Datagram(payload) => v1::event::Body::Datagram(payload.clone()),
+        Body::Scan(scan) => v1::event::Body::Scan(v1::Scan {
+            stamp_ns: scan.stamp_ns,
+            x: scan.x.clone(),
+            y: scan.y.clone(),
+            z: scan.z.clone(),
+            intensity: scan.intensity.clone(),
+        }),
+        Body::EgoPose(ego) => v1::event::Body::EgoPose(v1::EgoPose {
+            stamp_ns: ego.stamp_ns,
+            map_from_ego: Some(pose(&ego.map_from_ego)),
+            speed_mps: ego.speed_mps,
+        }),
+        Body::Lost(events) => v1::event::Body::Lost(*events),
+        Body::End => v1::event::Body::End(v1::End {}),
+    };
+    v1::Event {
+        sequence: event.sequence,
+        arrival_ns: event.arrival_ns,
+        source: u32::from(event.source),
+        body: Some(body),
+    }
+}
+
+/// An event of a journal that is none.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum EventError {
+    /// Not protobuf.
+    #[error("not a clearway.v1.Event: {0}")]
+    Decode(#[from] prost::DecodeError),
+    /// A source no vehicle has.
+    #[error("event {sequence}: source {source_index}: 0 to 65535 is allowed")]
+    Source {
+        /// The event's.
+        sequence: u64,
+        /// What was found.
+        source_index: u32,
+    },
+    /// A body this version does not know, or an ego pose without a pose.
+    #[error("event {sequence}: no {what}")]
+    Missing {
+        /// The event's.
+        sequence: u64,
+        /// `body` or `pose`.
+        what: &'static str,
+    },
+}
+
+/// An event out of a journal, exactly as it was.
+///
+/// # Errors
+/// [`EventError`] where the bytes are no event.
+pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventError> {
+    let event = v1::Event::decode(bytes)?;
+    let sequence = event.sequence;
+    let source =
+        u16::try_from(event.source).map_err(|_| EventError::Source { sequence, source_index: event.source })?;
+    let body = match event.body.ok_or(EventError::Missing { sequence, what: "body" })? {
+        v1::event::Body::Datagram(payload) => Body::Datagram(payload),
+        v1::event::Body::Scan(v1::Scan { stamp_ns, x, y, z, intensity }) => {
+            Body::Scan(Scan { stamp_ns, x, y, z, intensity })
+        }
+        v1::event::Body::EgoPose(ego) => {
+            let pose = ego.map_from_ego.ok_or(EventError::Missing { sequence, what: "pose" })?;
+            // Not normalised again: a rounding would make another pose of it than the one that was processed.
+            let rotation = Unit::new_unchecked(Quaternion::new(pose.qw, pose.qx, pose.qy, pose.qz));
+            let map_from_ego = Isometry3::from_parts(Translation3::new(pose.x, pose.y, pose.z), rotation);
+            Body::EgoPose(EgoPose { stamp_ns: ego.stamp_ns, map_from_ego, speed_mps: ego.speed_mps })
+        }
+        v1::event::Body::Lost(events) => Body::Lost(events),
+        v1::event::Body::End(v1::End {}) => Body::End,
+    };
+    Ok(Event { sequence, arrival_ns: event.arrival_ns, source, body })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_event_comes_out_of_the_journal_as_it_went_in() {
+        let pose = Isometry3::new(nalgebra::vector![1.0, 2.0, 3.0], nalgebra::vector![0.1, 0.2, 0.3]);
+        let bodies = [
+            Body::Datagram(Bytes::from_static(b"anything")),
+            Body::Scan(Scan { stamp_ns: 7, x: vec![1.0], y: vec![2.0], z: vec![f32::MIN], intensity: vec![0.5] }),
+            Body::EgoPose(EgoPose { stamp_ns: -1, map_from_ego: pose, speed_mps: 15.0 }),
+            Body::Lost(12),
+            Body::End,
+        ];
+        for (sequence, body) in (0..).zip(bodies) {
+            let event = Event { sequence, arrival_ns: i64::MIN + 1, source: 3, body };
+            assert_eq!(event_from_bytes(event_to_proto(&event).encode_to_vec().into()), Ok(event));
+        }
+    }
+
+    #[test]
+    fn bytes_that_are_no_event_are_named() {
+        assert!(matches!(event_from_bytes(Bytes::from_static(b"\xff")), Err(EventError::Decode(_))));
+        let missing = Err(EventError::Missing { sequence: 0, what: "body" });
+        assert_eq!(event_from_bytes(Bytes::new()), missing);
+        let far = v1::Event { source: 70_000, ..v1::Event::default() };
+        let source = Err(EventError::Source { sequence: 0, source_index: 70_000 });
+        assert_eq!(event_from_bytes(far.encode_to_vec().into()), source);
+    }
+
+    fn map() -> Map {
+        let layer = |name| Layer {
+            name,
+            geometry: Geometry::Radial { r_bench_m: vec![5.0, 60.0], columns: 4 },
+            legend: &["unknown", "drivable"],
+            channels: vec![clearway_mapping::map::Channel {
+                name: "class",
+                unit: "",
+                scale: 1.0,
+                unknown: 0,
+                cells: Cells::U8(vec![1, 1, 0, 0, 1, 1, 1, 0]),
+            }],
+            planes: vec![[0.0, 0.0, 1.0]],
+            figures: vec![("drivable_share", 0.5), ("cells", 5.0)],
+        };
+        Map {
+            sequence: 9,
+            capture_start_ns: 1,
+            capture_end_ns: 100,
+            completed_ns: 101,
+            map_from_ego: None,
+            speed_mps: None,
+            sensors: Vec::new(),
+            layers: vec![layer("drivability"), layer("height_difference")],
+        }
+    }
+
+    #[test]
+    fn chunks_put_behind_each_other_are_the_message() {
+        let encoded = EncodedMap::new(&map(), "car".into(), 7, 300);
+        let whole = v1::Map::decode(encoded.select(&[])).unwrap();
+        assert_eq!(whole.layers.len(), 2);
+        let header = whole.header.unwrap();
+        assert_eq!((header.sequence, header.boot_id, header.valid_until_ns), (9, 7, 300_000_100));
+        let one = encoded.select(&["height_difference".into()]);
+        assert_eq!(one, encoded.layer(&encoded.layers[1].1));
+        let one = v1::Map::decode(one).unwrap();
+        assert_eq!(one.layers.iter().map(|l| l.name.as_str()).collect::<Vec<_>>(), ["height_difference"]);
+        assert_eq!(encoded.drivable_share, Some(0.5));
+    }
+
+    #[test]
+    fn the_same_map_gives_the_same_bytes() {
+        let encode = || EncodedMap::new(&map(), "car".into(), 7, 300);
+        assert_eq!(encode(), encode());
+    }
+}
