@@ -1,0 +1,101 @@
+//! Properties of the codec: what goes in comes out, there is one form for each content, and nothing panics.
+
+use bytes::Bytes;
+use clearway_proto::codec::{self, Cells, DecodeError, Limits};
+use clearway_proto::{map, v1};
+use proptest::collection::vec;
+use proptest::prelude::*;
+
+/// Runs of few values and noise, in all cell types.
+fn cells() -> impl Strategy<Value = Cells> {
+    let spans = |length| vec((any::<u16>(), prop_oneof![Just(1_usize), 1..40_usize, 1..2000_usize]), 0..length);
+    let spread = |spans: Vec<(u16, usize)>| spans.into_iter().flat_map(|(v, n)| std::iter::repeat_n(v, n)).collect();
+    (spans(40).prop_map(spread), 0..3_u8).prop_map(|(values, kind): (Vec<u16>, u8)| match kind {
+        0 => Cells::U8(values.into_iter().map(|v| v as u8).collect()),
+        1 => Cells::I8(values.into_iter().map(|v| v as i8).collect()),
+        _ => Cells::U16(values),
+    })
+}
+
+fn channel() -> impl Strategy<Value = v1::Channel> {
+    (0..4_i32, 1..3_i32, 0..300_u32, vec(prop_oneof![0..4_u8, any::<u8>()], 0..40)).prop_map(
+        |(cell_type, encoding, cell_count, payload)| v1::Channel {
+            cell_type,
+            encoding,
+            cell_count,
+            payload: payload.into(),
+            ..Default::default()
+        },
+    )
+}
+
+proptest! {
+    #[test]
+    fn what_is_encoded_decodes_to_itself_and_is_never_larger_than_raw(cells in cells()) {
+        let encoded = codec::encode(cells.as_ref());
+        prop_assert!(encoded.payload.len() <= cells.as_ref().to_le_bytes().len());
+        let channel = encoded.into_channel("c", "", 1.0, 0);
+        prop_assert_eq!(codec::decode(&channel, &Limits::default()), Ok(cells));
+    }
+
+    #[test]
+    fn runs_that_decode_are_the_ones_the_encoder_makes(mut channel in channel()) {
+        // The CRC is put right where it alone is wrong, so that the canonical form is what decides.
+        if let Err(DecodeError::Crc { computed, .. }) = codec::decode(&channel, &Limits::default()) {
+            channel.crc32 = computed;
+        }
+        if let Ok(cells) = codec::decode(&channel, &Limits::default())
+            && channel.encoding() == v1::Encoding::Runs
+        {
+            prop_assert_eq!(codec::encode(cells.as_ref()).payload, channel.payload);
+        }
+    }
+
+    #[test]
+    fn any_bytes_are_a_map_or_are_refused(bytes in vec(any::<u8>(), 0..400)) {
+        let _ = map::decode_map(Bytes::from(bytes), &Limits::default());
+    }
+
+    #[test]
+    fn a_golden_map_with_bytes_changed_is_a_map_or_is_refused(changes in vec((any::<prop::sample::Index>(), any::<u8>()), 1..6)) {
+        let mut bytes = include_bytes!("../golden/map.bin").to_vec();
+        for (at, byte) in changes {
+            let at = at.index(bytes.len());
+            bytes[at] = byte;
+        }
+        if let Ok(map) = map::decode_map(Bytes::from(bytes), &Limits::default()) {
+            for layer in &map.layers {
+                layer.class_at(3.0, 4.0);
+                for channel in &layer.channels {
+                    prop_assert_eq!(channel.cells.len() as u64, layer.grid.cell_count());
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_middle_of_a_cell_lies_in_that_cell(benches in vec(0.01_f32..3.0, 1..60), columns in 1..720_u32, at in any::<prop::sample::Index>()) {
+        let r_bench_m = benches.iter().scan(0.0, |r, step| { *r += step; Some(*r) }).collect();
+        let grid = clearway_proto::grid::Grid::Radial { r_bench_m, columns };
+        let index = at.index(grid.cell_count() as usize);
+        let (x, y) = grid.centre_of(index).unwrap();
+        prop_assert_eq!(grid.cell_at(x, y), Some(index));
+    }
+}
+
+#[test]
+fn long_runs_of_many_channels_are_refused_before_their_cells_are_made() {
+    // Each channel keeps the limit of one channel; together they would take 80 MiB from 120 bytes.
+    let channel = |name: usize| v1::Channel {
+        name: name.to_string(),
+        cell_type: v1::CellType::U16.into(),
+        encoding: v1::Encoding::Runs.into(),
+        cell_count: 4 << 20,
+        payload: Bytes::from_static(&[1, 0xff, 0xff, 0xff, 1]),
+        ..Default::default()
+    };
+    let layer = v1::Layer { channels: (0..10).map(channel).collect(), ..Default::default() };
+    let bytes = [map::encode_header(&v1::Header::default()), map::encode_layer(&layer)].concat();
+    let refused = map::decode_map(bytes.into(), &Limits::default()).unwrap_err();
+    assert_eq!(refused, map::MapError::TooManyCells { cells: 40 << 20, allowed: 16 << 20 });
+}

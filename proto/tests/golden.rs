@@ -1,0 +1,325 @@
+//! The golden vectors in `golden/`: what the encoder makes equals the files, what the files hold decodes or is refused
+//! under its name. Clients in other languages read the same files. `CLEARWAY_BLESS=1` writes them anew.
+
+use std::path::PathBuf;
+
+use bytes::Bytes;
+use clearway_proto::codec::{self, Cells, Limits};
+use clearway_proto::{map, v1};
+use prost::Message;
+use serde_json::{Value, json};
+
+fn golden(file: &str) -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("golden").join(file)
+}
+
+/// Compares with the file, or writes it when asked to bless.
+fn assert_golden(file: &str, made: &[u8]) {
+    let path = golden(file);
+    if std::env::var_os("CLEARWAY_BLESS").is_some() {
+        std::fs::write(&path, made).unwrap();
+    }
+    let stored = std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    assert!(stored == made, "{file} differs from what the encoder makes; CLEARWAY_BLESS=1 writes it anew");
+}
+
+fn pretty(value: &Value) -> Vec<u8> {
+    let mut text = serde_json::to_string_pretty(value).unwrap();
+    text.push('\n');
+    text.into_bytes()
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn unhex(text: &str) -> Vec<u8> {
+    (0..text.len()).step_by(2).map(|at| u8::from_str_radix(&text[at..at + 2], 16).unwrap()).collect()
+}
+
+/// Cells as [value, length] pairs, so that long ones stay readable.
+fn spans(cells: &Cells) -> Vec<[i64; 2]> {
+    let mut spans: Vec<[i64; 2]> = Vec::new();
+    for value in (0..cells.len()).map(|index| i64::from(cells.get(index).unwrap())) {
+        match spans.last_mut() {
+            Some(last) if last[0] == value => last[1] += 1,
+            _ => spans.push([value, 1]),
+        }
+    }
+    spans
+}
+
+fn good_vectors() -> Vec<(&'static str, Cells)> {
+    let boundary = |length: usize| [vec![3; length], vec![0; 2]].concat();
+    vec![
+        ("empty", Cells::U8(vec![])),
+        ("single_cell", Cells::U8(vec![7])),
+        ("single_run", Cells::U8(vec![1; 100_000])),
+        ("two_cells_equal", Cells::U8(vec![1; 2])),
+        ("three_cells_equal", Cells::U8(vec![1; 3])),
+        ("alternating", Cells::U8((0..64).map(|i| i % 2).collect())),
+        ("largest_value", Cells::U8(vec![255; 9])),
+        ("run_of_128", Cells::U8(boundary(128))),
+        ("run_of_129", Cells::U8(boundary(129))),
+        ("run_of_16385", Cells::U8(boundary(16_385))),
+        ("signed", Cells::I8([vec![-128; 20], vec![-1; 20], vec![0; 20], vec![1; 20], vec![127; 20]].concat())),
+        ("signed_alternating", Cells::I8((0..40).map(|i| if i % 2 == 0 { -1 } else { 1 }).collect())),
+        ("u16", Cells::U16([vec![0; 9], vec![255; 9], vec![256; 9], vec![65_535; 9]].concat())),
+        ("u16_ascending", Cells::U16((0..300).collect())),
+        ("u16_pairs", Cells::U16((0..200).map(|i| i / 2).collect())),
+    ]
+}
+
+#[test]
+fn the_encoder_makes_the_golden_channels() {
+    let mut vectors = Vec::new();
+    for (name, cells) in good_vectors() {
+        let channel = codec::encode(cells.as_ref()).into_channel(name, "", 1.0, 0);
+        assert_eq!(codec::decode(&channel, &Limits::default()), Ok(cells.clone()), "{name}");
+        vectors.push(json!({
+            "name": name,
+            "cell_type": channel.cell_type,
+            "encoding": channel.encoding,
+            "cell_count": channel.cell_count,
+            "crc32": channel.crc32,
+            "payload_hex": hex(&channel.payload),
+            "cells_value_length": spans(&cells),
+        }));
+    }
+    assert_golden("channels.json", &pretty(&json!(vectors)));
+}
+
+/// (name, expected error, cell type, encoding, cell count, payload); the CRC is that of the stated cells or 0.
+type Bad = (&'static str, &'static str, i32, i32, u32, Vec<u8>);
+
+fn bad_vectors() -> Vec<Bad> {
+    let (u8_, i8_, u16_) = (v1::CellType::U8 as i32, v1::CellType::I8 as i32, v1::CellType::U16 as i32);
+    let (raw, runs) = (v1::Encoding::Raw as i32, v1::Encoding::Runs as i32);
+    let max = u32::MAX;
+    vec![
+        ("claims_2_32_cells_as_one_run", "too_many_cells", u8_, runs, max, vec![1, 0xfe, 0xff, 0xff, 0xff, 0x0f]),
+        ("claims_2_32_cells_with_nothing", "too_many_cells", u16_, runs, max, vec![]),
+        ("claims_2_32_raw_cells", "too_many_cells", u8_, raw, max, vec![0; 4]),
+        ("one_cell_over_the_limit", "too_many_cells", u8_, runs, (4 << 20) + 1, vec![1, 0x80, 0x80, 0x80, 0x02]),
+        ("cell_type_unspecified", "cell_type", 0, raw, 1, vec![0]),
+        ("cell_type_unheard_of", "cell_type", 9, raw, 1, vec![0]),
+        ("cell_type_negative", "cell_type", -1, raw, 1, vec![0]),
+        ("encoding_unspecified", "encoding", u8_, 0, 1, vec![0]),
+        ("encoding_unheard_of", "encoding", u8_, 7, 1, vec![0]),
+        ("encoding_negative", "encoding", u8_, i32::MIN, 1, vec![0]),
+        ("raw_short", "raw_length", u8_, raw, 5, vec![0; 4]),
+        ("raw_long", "raw_length", u8_, raw, 3, vec![0; 4]),
+        ("raw_empty", "raw_length", u8_, raw, 3, vec![]),
+        ("raw_for_no_cells", "raw_length", u8_, raw, 0, vec![0]),
+        ("raw_u16_odd", "raw_length", u16_, raw, 2, vec![0; 3]),
+        ("raw_u16_in_single_bytes", "raw_length", u16_, raw, 4, vec![0; 4]),
+        ("runs_as_long_as_raw", "runs_not_smaller", u8_, runs, 2, vec![1, 1]),
+        ("runs_longer_than_raw", "runs_not_smaller", u8_, runs, 2, vec![1, 0, 2, 0]),
+        ("runs_for_no_cells", "runs_not_smaller", u8_, runs, 0, vec![]),
+        ("runs_bytes_for_no_cells", "runs_not_smaller", u8_, runs, 0, vec![1, 0]),
+        ("runs_u16_as_long_as_raw", "runs_not_smaller", u16_, runs, 1, vec![1, 0]),
+        ("no_runs", "too_few_cells", u8_, runs, 10, vec![]),
+        ("runs_end_early", "too_few_cells", u8_, runs, 10, vec![1, 4, 2, 3]),
+        ("runs_end_one_early", "too_few_cells", u8_, runs, 10, vec![1, 8]),
+        ("value_without_length", "truncated", u8_, runs, 10, vec![1]),
+        ("value_cut", "truncated", u8_, runs, 10, vec![0x81]),
+        ("length_cut", "truncated", u8_, runs, 1000, vec![1, 0xe7]),
+        ("second_value_without_length", "truncated", u8_, runs, 10, vec![1, 4, 2]),
+        ("value_two_bytes_for_one", "overlong_varint", u8_, runs, 10, vec![0x81, 0, 9]),
+        ("length_two_bytes_for_one", "overlong_varint", u8_, runs, 10, vec![1, 0x89, 0]),
+        ("zero_in_five_bytes", "overlong_varint", u8_, runs, 10, vec![0x80, 0x80, 0x80, 0x80, 0, 9]),
+        ("length_in_six_bytes", "overlong_varint", u8_, runs, 10, vec![1, 0x80, 0x80, 0x80, 0x80, 0x80, 1]),
+        ("value_in_ten_bytes", "overlong_varint", u8_, runs, 40, [vec![0xff; 9], vec![1, 9]].concat()),
+        ("u8_256", "value_too_large", u8_, runs, 10, vec![0x80, 2, 9]),
+        ("i8_zigzag_256", "value_too_large", i8_, runs, 10, vec![0x80, 2, 9]),
+        ("u16_65536", "value_too_large", u16_, runs, 10, vec![0x80, 0x80, 4, 9]),
+        ("u8_2_34", "value_too_large", u8_, runs, 10, vec![0xff, 0xff, 0xff, 0xff, 0x7f, 9]),
+        ("neighbours_equal", "equal_neighbours", u8_, runs, 10, vec![1, 4, 1, 4]),
+        ("third_equals_second", "equal_neighbours", u8_, runs, 10, vec![1, 1, 2, 1, 2, 5]),
+        ("neighbours_equal_signed", "equal_neighbours", i8_, runs, 10, vec![1, 4, 1, 4]),
+        ("run_one_too_long", "run_too_long", u8_, runs, 10, vec![1, 10]),
+        ("second_run_too_long", "run_too_long", u8_, runs, 10, vec![1, 4, 2, 5]),
+        ("run_of_2_35", "run_too_long", u8_, runs, 10, vec![1, 0xff, 0xff, 0xff, 0xff, 0x7f]),
+        ("byte_after_the_last_run", "trailing_bytes", u8_, runs, 10, vec![1, 9, 0]),
+        ("run_after_the_last_cell", "trailing_bytes", u8_, runs, 10, vec![1, 9, 2, 0]),
+        ("raw_with_a_wrong_crc", "crc", u8_, raw, 3, vec![1, 2, 3]),
+        ("runs_with_a_wrong_crc", "crc", u8_, runs, 10, vec![1, 9]),
+        ("largest_channel_with_a_wrong_crc", "crc", u16_, runs, 4 << 20, vec![1, 0xff, 0xff, 0xff, 1]),
+    ]
+}
+
+#[test]
+fn every_bad_channel_is_refused_under_its_name() {
+    let bad = bad_vectors();
+    assert!(bad.len() >= 40);
+    let mut vectors = Vec::new();
+    for (name, error, cell_type, encoding, cell_count, payload) in bad {
+        let payload_hex = hex(&payload);
+        let channel = v1::Channel { cell_type, encoding, cell_count, payload: payload.into(), ..Default::default() };
+        let refused = codec::decode(&channel, &Limits::default()).expect_err(name);
+        assert_eq!(refused.name(), error, "{name}: {refused}");
+        vectors.push(json!({
+            "name": name, "error": error, "cell_type": cell_type, "encoding": encoding, "cell_count": cell_count,
+            "crc32": 0, "payload_hex": payload_hex,
+        }));
+    }
+    assert_golden("bad_channels.json", &pretty(&json!(vectors)));
+}
+
+#[test]
+fn the_stored_channels_decode_to_their_stored_cells() {
+    let stored: Vec<Value> = serde_json::from_slice(&std::fs::read(golden("channels.json")).unwrap()).unwrap();
+    assert_eq!(stored.len(), good_vectors().len());
+    for vector in stored {
+        let number = |key: &str| vector[key].as_i64().unwrap();
+        let channel = v1::Channel {
+            cell_type: number("cell_type") as i32,
+            encoding: number("encoding") as i32,
+            cell_count: number("cell_count") as u32,
+            crc32: number("crc32") as u32,
+            payload: unhex(vector["payload_hex"].as_str().unwrap()).into(),
+            ..Default::default()
+        };
+        let cells = codec::decode(&channel, &Limits::default()).unwrap();
+        assert_eq!(json!(spans(&cells)), vector["cells_value_length"], "{}", vector["name"]);
+    }
+}
+
+fn golden_map() -> (v1::Header, v1::Layer, v1::Layer) {
+    let header = v1::Header {
+        vehicle: "alpha".into(),
+        boot_id: 0x0123_4567_89ab_cdef,
+        sequence: 42,
+        capture_start_ns: 1_700_000_000_000_000_000,
+        capture_end_ns: 1_700_000_000_100_000_000,
+        completed_ns: 1_700_000_000_101_000_000,
+        valid_until_ns: 1_700_000_000_400_000_000,
+        map_from_ego: Some(v1::Pose { x: 1.5, y: -2.0, z: 0.25, qx: 0.0, qy: 0.0, qz: 0.6, qw: 0.8 }),
+        speed_mps: Some(15.0),
+        sensors: vec![v1::SensorState {
+            name: "top".into(),
+            model: "hdl64e_s2".into(),
+            packets: 348,
+            refused: 2,
+            returns: 110_000,
+            rpm: 600.0,
+            completeness: 1.0,
+            partial: String::new(),
+        }],
+    };
+    let radial = v1::RadialGrid { r_bench_m: vec![4.0, 8.0, 12.0], columns: 8 };
+    let class: Vec<u8> = [[1; 8], [1, 1, 1, 1, 2, 2, 1, 1], [0, 0, 1, 1, 3, 3, 0, 0]].concat();
+    let height: Vec<i8> = (0..24).map(|i| if i < 16 { -2 } else { i }).collect();
+    let drivability = v1::Layer {
+        name: "drivability".into(),
+        geometry: Some(v1::layer::Geometry::Radial(radial)),
+        legend: ["unknown", "drivable", "not_drivable", "obstacle"].map(String::from).to_vec(),
+        channels: vec![
+            codec::encode(codec::CellsRef::U8(&class)).into_channel("class", "", 1.0, 0),
+            codec::encode(codec::CellsRef::I8(&height)).into_channel("unit_height", "m", 0.02, -128),
+        ],
+        planes: vec![v1::Plane { a: 0.01, b: -0.02, c: 0.0 }],
+        figures: [("drivable_share".to_string(), 0.8), ("judged_share".to_string(), 0.75)].into(),
+    };
+    let grid = v1::CartesianGrid { origin_x_m: -1.0, origin_y_m: -0.5, width: 4, height: 2, cell_m: 0.5 };
+    let hits: Vec<u16> = vec![0, 0, 0, 0, 0, 0, 300, 2];
+    let flat = v1::Layer {
+        name: "hits".into(),
+        geometry: Some(v1::layer::Geometry::Cartesian(grid)),
+        channels: vec![codec::encode(codec::CellsRef::U16(&hits)).into_channel("hits", "", 1.0, 0)],
+        ..Default::default()
+    };
+    (header, drivability, flat)
+}
+
+#[test]
+fn the_golden_map_is_its_header_and_its_layers_behind_each_other() {
+    let (header, drivability, flat) = golden_map();
+    let bytes = [map::encode_header(&header), map::encode_layer(&drivability), map::encode_layer(&flat)].concat();
+    assert_golden("map.bin", &bytes);
+    let whole = v1::Map { header: Some(header), layers: vec![drivability, flat] };
+    assert_eq!(v1::Map::decode(&bytes[..]).unwrap(), whole);
+
+    let map = map::decode_map(Bytes::from(bytes), &Limits::default()).unwrap();
+    let looks =
+        [(2.0, 0.1), (0.0, 0.0), (-6.0, -0.1), (-6.0, 0.1), (-10.0, -0.1), (10.0, 0.1), (13.0, 0.0), (0.1, 6.0)];
+    let layers: Vec<_> = map
+        .layers
+        .iter()
+        .map(|layer| {
+            let channels = layer.channels.iter();
+            let channels: Vec<_> = channels
+                .map(|c| json!({"name": c.name, "unit": c.unit, "scale": c.scale, "unknown": c.unknown, "cells_value_length": spans(&c.cells)}))
+                .collect();
+            let (rows, columns) = layer.grid.shape();
+            json!({"name": layer.name, "shape": [rows, columns], "legend": layer.legend, "channels": channels, "figures": layer.figures})
+        })
+        .collect();
+    let layer = map.layer("drivability").unwrap();
+    let looks: Vec<_> =
+        looks.iter().map(|&(x, y)| json!({"x_m": x, "y_m": y, "class": layer.class_at(x, y).1})).collect();
+    let described = json!({
+        "vehicle": map.header.vehicle,
+        "sequence": map.header.sequence,
+        "capture_end_ns": map.header.capture_end_ns,
+        "valid_until_ns": map.header.valid_until_ns,
+        "layers": layers,
+        "classes_of_drivability": looks,
+    });
+    assert_golden("map.json", &pretty(&described));
+}
+
+#[test]
+fn a_map_with_one_thing_wrong_is_refused_under_that_name() {
+    type Spoil = fn(&mut v1::Map);
+    let spoils: [(&str, &str, Spoil); 18] = [
+        ("no_header", "header", |map| map.header = None),
+        ("capture_backwards", "header", |map| map.header.as_mut().unwrap().capture_end_ns = 0),
+        ("pose_not_finite", "header", |map| pose(map).x = f64::NAN),
+        ("quaternion_of_norm_0", "header", |map| *pose(map) = v1::Pose::default()),
+        ("two_layers_with_one_name", "twice", |map| map.layers[1].name = "drivability".into()),
+        ("two_channels_with_one_name", "twice", |map| map.layers[0].channels[1].name = "class".into()),
+        ("no_geometry", "geometry", |map| map.layers[0].geometry = None),
+        ("no_columns", "geometry", |map| radial(map).columns = 0),
+        ("no_benches", "geometry", |map| radial(map).r_bench_m.clear()),
+        ("benches_descending", "geometry", |map| radial(map).r_bench_m[2] = 7.0),
+        ("bench_not_finite", "geometry", |map| radial(map).r_bench_m[2] = f32::INFINITY),
+        ("bench_at_0", "geometry", |map| radial(map).r_bench_m[0] = 0.0),
+        ("cell_edge_negative", "geometry", |map| cartesian(map).cell_m = -0.5),
+        ("origin_not_finite", "geometry", |map| cartesian(map).origin_x_m = f64::NAN),
+        ("more_columns_than_cells", "cell_count", |map| radial(map).columns = 0x2000_0000),
+        ("legend_without_unknown", "legend", |map| map.layers[0].legend[0] = "free".into()),
+        ("class_without_a_name", "class", |map| map.layers[0].legend.truncate(3)),
+        ("payload_spoilt", "crc", |map| map.layers[0].channels[0].crc32 ^= 1),
+    ];
+    let (header, drivability, flat) = golden_map();
+    let whole = v1::Map { header: Some(header), layers: vec![drivability, flat] };
+    let mut vectors = Vec::new();
+    for (name, error, spoil) in spoils {
+        let mut map = whole.clone();
+        spoil(&mut map);
+        let bytes = map.encode_to_vec();
+        let refused = map::decode_map(Bytes::from(bytes.clone()), &Limits::default()).expect_err(name);
+        assert_eq!(refused.name(), error, "{name}: {refused}");
+        vectors.push(json!({"name": name, "error": error, "map_hex": hex(&bytes)}));
+    }
+    assert_golden("bad_maps.json", &pretty(&json!(vectors)));
+}
+
+fn pose(map: &mut v1::Map) -> &mut v1::Pose {
+    map.header.as_mut().unwrap().map_from_ego.as_mut().unwrap()
+}
+
+fn radial(map: &mut v1::Map) -> &mut v1::RadialGrid {
+    match &mut map.layers[0].geometry {
+        Some(v1::layer::Geometry::Radial(grid)) => grid,
+        other => panic!("{other:?}"),
+    }
+}
+
+fn cartesian(map: &mut v1::Map) -> &mut v1::CartesianGrid {
+    match &mut map.layers[1].geometry {
+        Some(v1::layer::Geometry::Cartesian(grid)) => grid,
+        other => panic!("{other:?}"),
+    }
+}
