@@ -115,6 +115,15 @@ impl<W: Deref<Target = World>> Caster<W> {
         self.cast_through(origin, direction, None)
     }
 
+    /// Whether the ground at (x, y) can be seen from `origin` (metres, world); leaves do not hide it.
+    pub fn sees_ground(&self, origin: [f64; 3], x: f64, y: f64) -> bool {
+        const TOLERANCE_M: f64 = 0.05;
+        let way = [x - origin[0], y - origin[1], self.world.ground.height(x, y) - origin[2]];
+        let range = way.iter().map(|part| part * part).sum::<f64>().sqrt();
+        let met = self.cast_behind_leaves(origin, way.map(|part| part / range));
+        range <= self.range_m_max && met.is_none_or(|hit| hit.range_m > range - TOLERANCE_M)
+    }
+
     fn cast_through(&self, origin: [f64; 3], direction: [f64; 3], draw: Option<u64>) -> Option<Hit> {
         let flat = direction[0].hypot(direction[1]);
         let bearing = direction[1].atan2(direction[0]);
@@ -169,14 +178,39 @@ fn distance(from: [f64; 2], shape: &Shape) -> f64 {
     }
 }
 
-impl World {
-    /// Whether the ground at (x, y) can be seen from a place (metres, world) at `time` s; leaves do not hide it.
-    pub fn sees_ground(&self, from: [f64; 3], x: f64, y: f64, time: f64) -> bool {
-        let z = self.ground.height(x, y);
-        let way = [x - from[0], y - from[1], z - from[2]];
-        let range = way.iter().map(|part| part * part).sum::<f64>().sqrt();
-        let direction = way.map(|part| part / range);
-        let met = Caster::new(self, from, time, range + 1.0).cast_behind_leaves(from, direction);
-        met.is_none_or(|hit| hit.range_m > range - 0.05)
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scenes;
+
+    #[test]
+    fn sectors_change_nothing_but_the_time() {
+        let scene = scenes::town();
+        let world: &World = &scene.world;
+        let mut caster = Caster::new(world, [0.0; 3], 0.0, 120.0);
+        for step in 0..6_000_u64 {
+            // Along the drive, so that the sectors are sometimes fresh and sometimes near their slack.
+            let time = step as f64 * 0.004;
+            let (x, y, _) = scene.drive.at(time);
+            let origin = [x, y, 1.9];
+            caster.move_to(origin, time);
+            let (azimuth, elevation) = (step as f64 * 0.7, -0.4 + 0.5 * crate::noise::uniform(step));
+            let direction = [elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()];
+            let objects = world.shapes_at(time).into_iter().enumerate();
+            let met = objects
+                .filter_map(|(index, shape)| shape.meets(origin, direction, step ^ (index as u64).rotate_left(40)));
+            let nearest = met.chain(world.ground.meets(origin, direction, 120.0)).fold(f64::INFINITY, f64::min);
+            let cast = caster.cast(origin, direction, step).map_or(f64::INFINITY, |hit| hit.range_m);
+            assert!(cast == nearest || (cast.is_infinite() && nearest > 120.0), "step {step}: {cast} for {nearest}");
+        }
+    }
+
+    #[test]
+    fn ground_behind_a_house_is_not_seen_and_ground_before_it_is() {
+        let world = World::default().house(10.0, 0.0, 0.0, [4.0, 8.0], 5.0).canopy(0.0, 10.0, 3.0, 1.0);
+        let (caster, eye) = (Caster::new(&world, [0.0, 0.0, 1.9], 0.0, 120.0), [0.0, 0.0, 1.9]);
+        assert!(caster.sees_ground(eye, 7.5, 0.0));
+        assert!(!caster.sees_ground(eye, 20.0, 0.0));
+        assert!(caster.sees_ground(eye, 0.0, 20.0), "leaves hide nothing for certain");
     }
 }

@@ -58,8 +58,8 @@ pub fn slopes_with_obstacles() -> Scene {
         (-6.6, 0.0),
         (5.5, 0.0),
         (5.5, 0.14),
-        (8.5, 0.14),
-        (8.5, 0.8),
+        (7.0, 0.14),
+        (7.0, 0.8),
     ]);
     // The profile along begins at 0 before its first ramp, 1.8 m over the vehicle.
     let along = along.raised(1.8);
@@ -74,7 +74,7 @@ pub fn slopes_with_obstacles() -> Scene {
         .wall(&[[-40.0, -13.0], [-12.0, -13.0]], 2.2);
     for step in 0..9 {
         let x = -34.0 + 8.5 * f64::from(step);
-        world = world.tree(x, -14.5, 2.2, 2.8).pole(x + 3.0, 7.9, 0.1, 6.0);
+        world = world.tree(x, -14.5, 2.2, 2.8).pole(x + 3.0, 6.6, 0.1, 6.0);
     }
     standing("slopes with obstacles", world, 63.4)
 }
@@ -84,44 +84,46 @@ pub fn fenced_road_under_canopy() -> Scene {
     standing("fenced road under canopy", fenced_road(), 78.3)
 }
 
-/// The same with something hanging too low over the road ahead (figure 8): 37.00 %.
+/// The same with something hanging too low over the road just ahead (figure 8): 37.00 %.
 pub fn fenced_road_with_low_overhang() -> Scene {
-    let (x, y) = on_the_bend(9.0, 0.0);
-    let across = 6.4;
-    let world = fenced_road().beam([x, y - across], [x, y + across], 1.5, 2.2);
+    let (left, right) = (on_the_bend(4.0, ROAD_HALF_M), on_the_bend(4.0, -ROAD_HALF_M));
+    let world = fenced_road().beam(left, right, 1.5, 2.2);
     standing("fenced road with low overhang", world, 37.0)
 }
 
+/// Half the width of the fenced road, metres.
+const ROAD_HALF_M: f64 = 7.5;
+
 /// The road's middle line: straight behind the vehicle, then a wide bend to the left.
-fn on_the_bend(station: f64, left: f64) -> (f64, f64) {
+fn on_the_bend(station: f64, left: f64) -> [f64; 2] {
     let line = Course::from(-70.0, 0.0, 0.0).straight(75.0).arc(90.0, 1.0);
     let (x, y, _) = line.at(station + 70.0, left);
-    (x, y)
+    [x, y]
 }
 
 fn fenced_road() -> World {
-    let line = |left: f64| -> Vec<[f64; 2]> {
-        (-17..=17).map(|step| on_the_bend(4.0 * f64::from(step), left).into()).collect()
+    let line = |left: f64, from: i32, to: i32| -> Vec<[f64; 2]> {
+        (from..=to).map(|step| on_the_bend(4.0 * f64::from(step), left)).collect()
     };
+    // Slats on the left; on the right a wall that gives way to slats.
     let mut world = World::on(Ground { reflectivity: ASPHALT, ..Ground::default() })
-        .fence(&line(6.5), 1.4, Some(SLATS))
-        .fence(&line(-6.5), 1.4, Some(SLATS));
-    // The ends of the road are closed well away, so that nothing behind the fences is reached round them.
-    for end in [-17, 17] {
-        let (left, right) = (on_the_bend(4.0 * f64::from(end), 6.5), on_the_bend(4.0 * f64::from(end), -6.5));
-        world = world.fence(&[left.into(), right.into()], 1.4, Some(SLATS));
-    }
+        .fence(&line(ROAD_HALF_M, BEHIND, 17), 1.4, Some(SLATS))
+        .wall(&line(-ROAD_HALF_M, BEHIND, 4), 2.0)
+        .fence(&line(-ROAD_HALF_M, 4, 17), 1.4, Some(SLATS));
+    // The road's ends are closed, by a wall close behind and a fence far ahead, so that nothing is reached round them.
+    let across = |step: i32| [ROAD_HALF_M, -ROAD_HALF_M].map(|left| on_the_bend(4.0 * f64::from(step), left));
+    world = world.wall(&across(BEHIND), 2.0).fence(&across(17), 1.4, Some(SLATS));
     for step in 0..8 {
-        let station = -26.0 + 8.0 * f64::from(step);
-        let (left, right) = (on_the_bend(station, 8.6), on_the_bend(station + 3.0, -8.4));
-        world = world.tree(left.0, left.1, 3.2, 2.9).tree(right.0, right.1, 3.0, 3.0);
+        let station = -18.0 + 8.0 * f64::from(step);
+        let ([left_x, left_y], [right_x, right_y]) = (on_the_bend(station, 9.6), on_the_bend(station + 3.0, -9.4));
+        world = world.tree(left_x, left_y, 3.2, 2.9).tree(right_x, right_y, 3.0, 3.0);
     }
-    for (station, left) in [(-7.0, 2.0), (6.0, -1.5), (13.0, 1.5), (21.0, 0.0)] {
-        let (x, y) = on_the_bend(station, left);
+    for (station, left) in [(-3.5, 2.0), (6.0, -1.5), (13.0, 1.5), (21.0, 0.0)] {
+        let [x, y] = on_the_bend(station, left);
         world = world.canopy(x, y, 4.0, 2.9);
     }
-    let (car_x, car_y) = on_the_bend(-16.0, 5.0);
-    world.parked_car(car_x, car_y, 0.0).wall(&[[-30.0, 24.0], [6.0, 24.0]], 2.5).house(
+    let [car_x, car_y] = on_the_bend(19.0, -6.2);
+    world.parked_car(car_x, car_y, 0.15).wall(&[[-30.0, 24.0], [6.0, 24.0]], 2.5).house(
         20.0,
         -26.0,
         0.3,
@@ -129,6 +131,9 @@ fn fenced_road() -> World {
         6.0,
     )
 }
+
+/// Where the fenced road ends behind the vehicle, in steps of 4 m.
+const BEHIND: i32 = -2;
 
 /// Half the width of the town's street, kerb to kerb, metres: two lanes and a parking strip on either side.
 const STREET_HALF_M: f64 = 5.6;

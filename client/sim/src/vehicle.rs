@@ -8,7 +8,7 @@ use std::sync::Arc;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::Revolution;
 use clearway_lidar::sensor::{Sensor, SensorConfig};
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Point3};
 
 use crate::encode::Encoder;
 use crate::raycast::Caster;
@@ -123,6 +123,19 @@ impl SimulatedVehicle {
     pub fn truth_at(&self, stamp_ns: i64, half_extent_m: f64, cell_m: f64, limits: &Limits) -> TruthGrid {
         let (pose, time) = (self.pose_at(stamp_ns), self.time(stamp_ns));
         TruthGrid::about(&self.scene.world, &pose, time, (half_extent_m, cell_m), limits)
+    }
+
+    /// Whether the ground in each cell of a truth raster made for `stamp_ns` can be seen by the sensor then, in its order.
+    pub fn sees(&self, stamp_ns: i64, truth: &TruthGrid) -> Vec<bool> {
+        let (map_from_ego, time) = (self.pose_at(stamp_ns), self.time(stamp_ns));
+        let eye: [f64; 3] = (map_from_ego * self.scanner.config().ego_from_sensor).translation.vector.into();
+        let caster = Caster::new(self.scene.world.clone(), eye, time, self.scanner.config().range_m_max);
+        let sees = |index: usize| {
+            let (x, y) = truth.middle(index);
+            let place = map_from_ego * Point3::new(x, y, f64::from(truth.heights[index]));
+            caster.sees_ground(eye, place.x, place.y)
+        };
+        (0..truth.classes.len()).map(sees).collect()
     }
 
     /// The datagrams from the beginning of turn `number` on (0 starts at the scene's beginning; turns before exist too).

@@ -99,7 +99,6 @@ fn modes(model: Model) -> Vec<ReturnMode> {
     if model.spec().dual_return {
         modes.push(ReturnMode::Dual);
     }
-    // An HDL-64E does not say which single echo it sends.
     modes
 }
 

@@ -1,6 +1,8 @@
 //! A vehicle's stream of datagrams: rates, order, repeatability, a way that is free to drive.
 
+use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::{Model, ReturnMode};
+use clearway_lidar::sensor::{CalibrationSource, Sensor, SensorConfig};
 use clearway_lidar::telemetry::Telemetry;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
@@ -100,7 +102,47 @@ fn a_turn_comes_with_the_truth_of_its_end() {
     assert_eq!(turn.truth.class_at(6.0, 0.0), Truth::Drivable, "under the canopy");
     let ahead = scenes::fenced_road_with_low_overhang();
     let turn = SimulatedVehicle::new(ahead, ScannerConfig::default()).turn(0);
-    assert_eq!(turn.truth.class_at(9.0, 0.0), Truth::Obstacle, "the overhang");
+    assert_eq!(turn.truth.class_at(4.0, 0.0), Truth::Obstacle, "the overhang");
     assert_eq!(turn.truth.class_at(14.0, 0.0), Truth::Unreachable, "behind the overhang");
-    assert_eq!(turn.truth.class_at(-14.0, 0.0), Truth::Drivable, "the way back");
+    assert_eq!(turn.truth.class_at(-5.0, 0.0), Truth::Drivable, "the way back");
+}
+
+#[test]
+fn an_hdl_64e_tells_its_own_table_in_its_status_bytes() {
+    let mut own = Calibration::factory(Model::Hdl64eS2);
+    for laser in &mut own.lasers {
+        laser.dist_correction = 0.8 + 0.01 * f64::from(laser.laser_id);
+        laser.horiz_offset_correction = if laser.laser_id % 2 == 0 { 0.026 } else { -0.026 };
+    }
+    let vehicle = town(ScannerConfig { calibration: Some(own.clone()), ..ScannerConfig::default() });
+    let mut sensor = Sensor::new(SensorConfig::default());
+    let mut told = None;
+    // The table takes 4,160 packets; it is used from the next turn on.
+    for datagram in vehicle.take(4_160 + 2 * 360 + 200) {
+        if let Some(revolution) = sensor.push(&datagram.payload, datagram.stamp_ns).expect("a sound datagram") {
+            told = Some(revolution.calibration.clone());
+        }
+    }
+    assert_eq!(sensor.status().calibration, CalibrationSource::Unit);
+    assert_eq!(
+        (sensor.status().model, sensor.status().return_mode),
+        (Some(Model::Hdl64eS2), Some(ReturnMode::Strongest))
+    );
+    for (told, own) in told.expect("a turn").lasers.iter().zip(&own.lasers) {
+        assert!((told.vert_correction - own.vert_correction).abs() < 0.0051_f64.to_radians());
+        assert!((told.dist_correction - own.dist_correction).abs() < 0.00051);
+        assert!((told.horiz_offset_correction - own.horiz_offset_correction).abs() < 0.00051);
+    }
+}
+
+#[test]
+fn what_the_sensor_sees_is_less_than_what_is_there() {
+    let vehicle = SimulatedVehicle::new(scenes::town(), ScannerConfig::default());
+    let stamp_ns = vehicle.start_ns();
+    let truth = vehicle.truth_at(stamp_ns, 40.0, 0.4, &Limits::default());
+    let sees = vehicle.sees(stamp_ns, &truth);
+    let (hidden, seen): (Vec<usize>, Vec<usize>) = (0..sees.len()).partition(|&index| !sees[index]);
+    assert!(hidden.len() > sees.len() / 4 && seen.len() > sees.len() / 8, "{} of {}", seen.len(), sees.len());
+    let near = seen.iter().filter(|&&index| truth.middle(index).0.hypot(truth.middle(index).1) < 1.5).count();
+    assert_eq!(near, (0..sees.len()).filter(|&i| truth.middle(i).0.hypot(truth.middle(i).1) < 1.5).count());
 }
