@@ -169,6 +169,8 @@ impl SimulatedVehicle {
     pub fn revolution(&self, number: i64) -> Revolution {
         let config = SensorConfig {
             model: Some(self.scanner.config().model),
+            // A VLS-128's dual-return packets hold one firing: alone they do not show how fast it turns.
+            rpm: Some(self.scanner.config().rpm as f32),
             calibration: Some(self.scanner.calibration().clone()),
             ..SensorConfig::default()
         };

@@ -132,7 +132,7 @@ fn every_model_in_every_return_mode_decodes_to_the_world_it_saw() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(12))]
+    #![proptest_config(ProptestConfig { cases: 12, max_shrink_iters: 8, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn any_sensor_at_any_rate_anywhere_in_town_decodes_to_the_world_it_saw(
