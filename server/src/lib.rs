@@ -15,11 +15,13 @@
 //! | [`replay`] | files -> maps, as live |
 //! | [`clouds`] | revolutions -> PCD files |
 //! | [`verify`] | recording -> are these the maps of these events? |
+//! | [`demo`] | a simulated vehicle against the whole of it |
 //! | [`status`] | ledger, rates, latency of each vehicle |
 //! | [`server`] | all of it, put together |
 
 pub mod clouds;
 pub mod config;
+pub mod demo;
 pub mod engine;
 pub mod ingest;
 pub mod publish;

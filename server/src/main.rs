@@ -7,11 +7,12 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use clap::{Parser, Subcommand, ValueEnum};
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
 use clearway_server::config::Config;
+use clearway_server::demo::{self, Places, Second};
 use clearway_server::replay::{self, Mount, Progress, Speed, Summary};
 use clearway_server::server::{Running, Server, Setup};
 use clearway_server::verify::verify;
@@ -142,7 +143,7 @@ fn model(text: &str) -> Result<Model, String> {
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,zenoh=warn"));
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,zenoh=error"));
     let logs = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
     match arguments.log_format {
         LogFormat::Text => logs.with_ansi(std::io::stderr().is_terminal()).init(),
@@ -151,7 +152,8 @@ fn main() -> ExitCode {
     match run(arguments.command) {
         Ok(code) => code,
         Err(error) => {
-            eprintln!("clearway-server: {error:#}");
+            // The errors of this house name their causes themselves.
+            eprintln!("clearway-server: {error}");
             ExitCode::FAILURE
         }
     }
@@ -168,7 +170,7 @@ fn run(command: Command) -> Result<ExitCode> {
             say(&checked.to_toml());
             Ok(ExitCode::SUCCESS)
         }
-        Command::Demo { .. } => bail!("not in this build"),
+        Command::Demo { seconds, record, json } => runtime()?.block_on(run_demo(seconds, record, json)),
     }
 }
 
@@ -330,6 +332,43 @@ fn text(summary: &Summary) -> String {
         lines.push(format!("{} point clouds written", summary.clouds));
     }
     lines.join("\n") + "\n"
+}
+
+async fn run_demo(seconds: Option<f64>, record: Option<PathBuf>, json: bool) -> Result<ExitCode> {
+    let duration = seconds.map(Duration::try_from_secs_f64).transpose().context("--seconds: a time is needed")?;
+    let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
+    let record = record.unwrap_or_else(|| folder.join("demo.mcap"));
+    let options = demo::Options { duration, record, any_port: false };
+    let begun = |places: &Places| {
+        if json {
+            return;
+        }
+        places.notes.iter().for_each(|note| say(&format!("{note}\n")));
+        say(&format!(
+            "A simulated car drives through a simulated town.\n  page       http://{}/\n  gRPC       {}   (clearway watch \
+             --server http://{})\n  zenoh      {}   (clearway/car/map/drivability)\n  recording  {}\n",
+            places.page,
+            places.grpc,
+            places.grpc,
+            places.zenoh.join(", "),
+            places.record.display(),
+        ));
+    };
+    let second = |second: &Second, _: &Running| {
+        say(&if json { format!("{}\n", second.to_json()) } else { format!("{}\n", second.line()) });
+    };
+    let stop = stop_signal()?;
+    let summary = demo::demo(options, begun, second, stop).await?;
+    if json {
+        say(&format!("{}\n", summary.to_json()));
+    } else {
+        let (sent, last) = (summary.sent, &summary.last.snapshot);
+        say(&format!(
+            "The car sent {} data packets and {} telemetry datagrams; {} were received, {} maps made.\n",
+            sent.packets, sent.telemetry, last.ledger.received, last.maps
+        ));
+    }
+    Ok(ExitCode::SUCCESS)
 }
 
 fn verify_file(file: &Path, json: bool) -> Result<ExitCode> {

@@ -132,6 +132,8 @@ pub enum Mount {
     Given,
     /// The ground in the first revolutions.
     Estimated(MountEstimate),
+    /// Nowhere: the files hold no revolution.
+    Unneeded,
 }
 
 /// What came of a replay.
@@ -168,7 +170,11 @@ impl Summary {
         });
         let e = &self.extrinsics;
         let mut mount = json!({
-            "source": match self.mount { Mount::Given => "given", Mount::Estimated(_) => "estimated" },
+            "source": match self.mount {
+                Mount::Given => "given",
+                Mount::Estimated(_) => "estimated",
+                Mount::Unneeded => "none",
+            },
             "x_m": e.x_m, "y_m": e.y_m, "z_m": e.z_m,
             "roll_deg": e.roll_deg, "pitch_deg": e.pitch_deg, "yaw_deg": e.yaw_deg,
         });
@@ -297,11 +303,15 @@ fn plan(options: &Options) -> Result<Plan, ReplayError> {
         }
         None if given => Mount::Given,
         None => {
-            let estimate = first_revolutions(open()?, sensor, tables[0][0].clone())?;
-            let estimate = self::estimate(&estimate).map_err(|source| ReplayError::Mount { source })?;
-            sensor.extrinsics = estimate.extrinsics();
-            remarks.push(format!("extrinsics of {}: {}", sensor.name, describe(&estimate)));
-            Mount::Estimated(estimate)
+            let revolutions = first_revolutions(open()?, sensor, tables[0][0].clone())?;
+            if revolutions.is_empty() {
+                Mount::Unneeded
+            } else {
+                let estimate = estimate(&revolutions).map_err(|source| ReplayError::Mount { source })?;
+                sensor.extrinsics = estimate.extrinsics();
+                remarks.push(format!("extrinsics of {}: {}", sensor.name, describe(&estimate)));
+                Mount::Estimated(estimate)
+            }
         }
     };
     let extrinsics = sensor.extrinsics;

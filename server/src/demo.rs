@@ -1,0 +1,238 @@
+//! The whole house in one process, on loopback: a simulated vehicle sends real UDP datagrams in real time at a server of
+//! its own; a line a second says what comes of them.
+
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use clearway_mapping::config::Extrinsics;
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes::town;
+use clearway_sim::send::{Pace, Sent, Until, drive};
+use clearway_sim::vehicle::SimulatedVehicle;
+use serde_json::{Value, json};
+
+use crate::config::{Config, Udp};
+use crate::ingest::now_ns;
+use crate::server::{Running, Server, Setup, StartError};
+use crate::status::Snapshot;
+
+/// What a demo is asked for.
+#[derive(Clone, Debug, Default)]
+pub struct Options {
+    /// Ends after so long; without, when `stop` resolves.
+    pub duration: Option<Duration>,
+    /// Where to record.
+    pub record: PathBuf,
+    /// Ports of the operating system's choice everywhere, for tests that run beside each other.
+    pub any_port: bool,
+}
+
+/// Where to look, as the demo begins.
+#[derive(Clone, Debug)]
+pub struct Places {
+    /// The page.
+    pub page: SocketAddr,
+    /// gRPC.
+    pub grpc: SocketAddr,
+    /// zenoh's endpoints.
+    pub zenoh: Vec<String>,
+    /// The recording.
+    pub record: PathBuf,
+    /// What had to be chosen otherwise than usual.
+    pub notes: Vec<String>,
+}
+
+/// One second of it.
+#[derive(Clone, Debug)]
+pub struct Second {
+    /// Since the beginning.
+    pub elapsed: Duration,
+    /// Ledger, rates, latency.
+    pub snapshot: Snapshot,
+    /// Age of the newest map, from its capture's end.
+    pub age_ms: Option<f64>,
+}
+
+/// Why a demo did not come to its end.
+#[derive(Debug, thiserror::Error)]
+pub enum DemoError {
+    /// The server did not start.
+    #[error(transparent)]
+    Start(#[from] StartError),
+    /// The server did not end as it should have.
+    #[error(transparent)]
+    End(#[from] crate::server::EndError),
+    /// The simulated vehicle could not send.
+    #[error("the simulated vehicle: {0}")]
+    Vehicle(#[from] std::io::Error),
+}
+
+/// What came of it.
+#[derive(Clone, Debug)]
+pub struct Summary {
+    /// The last second.
+    pub last: Second,
+    /// What the vehicle sent.
+    pub sent: Sent,
+}
+
+impl Second {
+    /// In one line.
+    pub fn line(&self) -> String {
+        let Self { elapsed, snapshot, age_ms } = self;
+        let figure = |value: Option<f64>, unit: &str| value.map_or("-".into(), |value| format!("{value:.1} {unit}"));
+        format!(
+            "{:>4} s  {:>6} revolutions  {:>8} packets  {} refused  {} lost  age {}  latency {}  drivable {}",
+            elapsed.as_secs(),
+            snapshot.revolutions(),
+            snapshot.ledger.received,
+            snapshot.refused(),
+            snapshot.ledger.lost + snapshot.kernel_drops.unwrap_or(0),
+            figure(*age_ms, "ms"),
+            figure(snapshot.latency_ms_p50, "ms"),
+            figure(snapshot.drivable_share.map(|share| 100.0 * share), "%"),
+        )
+    }
+
+    /// As an object.
+    pub fn to_json(&self) -> Value {
+        let Self { elapsed, snapshot, age_ms } = self;
+        json!({
+            "seconds": elapsed.as_secs_f64(),
+            "revolutions": snapshot.revolutions(),
+            "maps": snapshot.maps,
+            "packets": {
+                "received": snapshot.ledger.received, "decoded": snapshot.ledger.decoded, "refused": snapshot.ledger.refused,
+            },
+            "telemetry": snapshot.ledger.telemetry,
+            "lost": snapshot.ledger.lost,
+            "kernel_drops": snapshot.kernel_drops,
+            "age_ms": age_ms,
+            "latency_ms": { "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 },
+            "drivable_share": snapshot.drivable_share,
+        })
+    }
+}
+
+impl Summary {
+    /// As an object.
+    pub fn to_json(&self) -> Value {
+        let mut object = self.last.to_json();
+        object["sent"] = json!({ "packets": self.sent.packets, "telemetry": self.sent.telemetry });
+        object
+    }
+}
+
+/// Drives until the duration has passed or `stop` resolves. `begun` is told where to look, `second` sees the newest map's
+/// server once a second. Needs a multi-thread tokio runtime.
+///
+/// # Errors
+/// [`DemoError`]; nothing is left running.
+pub async fn demo(
+    options: Options,
+    begun: impl FnOnce(&Places),
+    mut second: impl FnMut(&Second, &Running),
+    stop: impl Future<Output = ()>,
+) -> Result<Summary, DemoError> {
+    let (config, notes) = configuration(&options);
+    let running = Server::start(Setup { config, ..Setup::default() }).await?;
+    let nowhere = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
+    begun(&Places {
+        page: running.page.unwrap_or(nowhere),
+        grpc: running.grpc.unwrap_or(nowhere),
+        zenoh: running.zenoh.clone(),
+        record: options.record.clone(),
+        notes,
+    });
+    let (data, telemetry) = running.doors[0].udp.unwrap_or((nowhere, nowhere));
+    let halt = Arc::new(AtomicBool::new(false));
+    let vehicle = std::thread::Builder::new().name("simulated vehicle".into()).spawn({
+        let halt = halt.clone();
+        move || {
+            let scene = town();
+            // Last of all, so that the vehicle's first firing is now.
+            let vehicle = SimulatedVehicle::starting_at(scene, ScannerConfig::default(), now_ns());
+            drive(vehicle, data, telemetry, Pace::RealTime, Until { stop: Some(&halt), device_time: None })
+        }
+    })?;
+
+    let began = tokio::time::Instant::now();
+    let end = async {
+        match options.duration {
+            Some(duration) => tokio::time::sleep_until(began + duration).await,
+            None => std::future::pending().await,
+        }
+    };
+    tokio::pin!(stop, end);
+    let now = |running: &Running| {
+        let snapshot = running.vehicles.0[0].status.snapshot();
+        let age_ms = (snapshot.maps > 0).then(|| (now_ns() - snapshot.newest_capture_end_ns) as f64 / 1e6);
+        Second { elapsed: began.elapsed(), snapshot, age_ms }
+    };
+    let mut every = tokio::time::interval_at(began + Duration::from_secs(1), Duration::from_secs(1));
+    loop {
+        tokio::select! {
+            biased;
+            () = &mut stop => break,
+            _ = every.tick() => second(&now(&running), &running),
+            () = &mut end => break,
+        }
+        if vehicle.is_finished() {
+            break;
+        }
+    }
+    let last = now(&running);
+    halt.store(true, Ordering::Relaxed);
+    let sent = tokio::task::spawn_blocking(move || vehicle.join()).await;
+    let status = running.vehicles.0[0].status.clone();
+    running.shutdown().await?;
+    let sent = match sent {
+        Ok(Ok(sent)) => sent?,
+        Ok(Err(_)) | Err(_) => return Err(std::io::Error::other("panicked").into()),
+    };
+    // Kernel drops were read while the sockets were open; the rest is complete only now.
+    let kernel_drops = last.snapshot.kernel_drops;
+    let snapshot = Snapshot { kernel_drops, ..status.snapshot() };
+    Ok(Summary { last: Second { snapshot, ..last }, sent })
+}
+
+/// The usual ports where they are free, any where they are not.
+fn configuration(options: &Options) -> (Config, Vec<String>) {
+    let mut config = Config::of_one_vehicle("car", "top");
+    let mut notes = Vec::new();
+    let mut port = |what: &str, at: SocketAddr| {
+        if options.any_port {
+            return SocketAddr::new(at.ip(), 0);
+        }
+        match TcpListener::bind(at) {
+            Ok(_) => at,
+            Err(error) => {
+                notes.push(format!("{what}: {at}: {error}; another port is used"));
+                SocketAddr::new(at.ip(), 0)
+            }
+        }
+    };
+    config.grpc.listen = port("gRPC", config.grpc.listen);
+    config.page.listen = port("page", config.page.listen);
+    let zenoh = port("zenoh", SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 7447));
+    config.zenoh.listen = vec![format!("tcp/{zenoh}")];
+    config.recorder.file = options.record.clone();
+    let vehicle = &mut config.vehicles[0];
+    let any = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
+    vehicle.udp = Some(Udp { data: any, telemetry: any, ..Udp::default() });
+    // The simulated vehicle knows where its sensor is.
+    let mounted = ScannerConfig::default().ego_from_sensor;
+    let (roll, pitch, yaw) = mounted.rotation.euler_angles();
+    vehicle.sensors[0].extrinsics = Extrinsics {
+        x_m: mounted.translation.x,
+        y_m: mounted.translation.y,
+        z_m: mounted.translation.z,
+        roll_deg: roll.to_degrees(),
+        pitch_deg: pitch.to_degrees(),
+        yaw_deg: yaw.to_degrees(),
+    };
+    (config, notes)
+}
