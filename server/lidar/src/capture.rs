@@ -7,7 +7,7 @@
 use std::io::Read;
 use std::net::{IpAddr, SocketAddr};
 
-use etherparse::{NetSlice, SlicedPacket, TransportSlice};
+use etherparse::{EtherType, LaxNetSlice, LaxSlicedPacket, TransportSlice};
 use pcap_parser::traits::PcapReaderIterator;
 use pcap_parser::{Block, Linktype, PcapBlockOwned, PcapError};
 
@@ -239,31 +239,46 @@ fn ticks_per_second(if_tsresol: u8) -> u64 {
     base.checked_pow(power.into()).unwrap_or(1_000_000)
 }
 
+/// `LINKTYPE_LINUX_SLL2`, which pcap-parser has no name for.
+const LINUX_SLL2: Linktype = Linktype(276);
+
+/// A Linux cooked packet: the ethertype stands at `ether_type`, the network header follows at `header`.
+fn cooked(data: &[u8], ether_type: usize, header: usize) -> Option<LaxSlicedPacket<'_>> {
+    let payload = data.get(header..)?;
+    let ether_type = EtherType(u16::from_be_bytes([data[ether_type], data[ether_type + 1]]));
+    Some(LaxSlicedPacket::from_ether_type(ether_type, payload))
+}
+
 impl Interface {
     fn datagram(self, ticks: u64, data: &[u8], skipped: &mut Skipped) -> Option<Datagram> {
+        // Lax: a VLP-16's telemetry has the IP length of its data packets.
         let sliced = match self.link {
-            Linktype::ETHERNET => SlicedPacket::from_ethernet(data).ok(),
-            Linktype::LINUX_SLL => SlicedPacket::from_linux_sll(data).ok(),
-            Linktype::RAW | Linktype::IPV4 | Linktype::IPV6 | Linktype(12 | 14) => SlicedPacket::from_ip(data).ok(),
+            Linktype::ETHERNET => LaxSlicedPacket::from_ethernet(data).ok(),
+            Linktype::LINUX_SLL => cooked(data, 14, 16),
+            LINUX_SLL2 => cooked(data, 0, 20),
+            Linktype::RAW | Linktype::IPV4 | Linktype::IPV6 | Linktype(12 | 14) => LaxSlicedPacket::from_ip(data).ok(),
             _ => None,
         };
         let Some(sliced) = sliced else {
             skipped.unreadable += 1;
             return None;
         };
-        if sliced.is_ip_payload_fragmented() {
-            skipped.fragmented += 1;
+        let (address, fragmented) = match &sliced.net {
+            Some(LaxNetSlice::Ipv4(ip)) => (IpAddr::V4(ip.header().source_addr()), ip.payload().fragmented),
+            Some(LaxNetSlice::Ipv6(ip)) => (IpAddr::V6(ip.header().source_addr()), ip.payload().fragmented),
+            _ => {
+                skipped.not_udp += 1;
+                return None;
+            }
+        };
+        let Some(TransportSlice::Udp(udp)) = &sliced.transport else {
+            *(if fragmented { &mut skipped.fragmented } else { &mut skipped.not_udp }) += 1;
+            return None;
+        };
+        if usize::from(udp.length()) != udp.slice().len() {
+            skipped.unreadable += 1;
             return None;
         }
-        let address = match &sliced.net {
-            Some(NetSlice::Ipv4(ip)) => Some(IpAddr::V4(ip.header().source_addr())),
-            Some(NetSlice::Ipv6(ip)) => Some(IpAddr::V6(ip.header().source_addr())),
-            _ => None,
-        };
-        let (Some(address), Some(TransportSlice::Udp(udp))) = (address, &sliced.transport) else {
-            skipped.not_udp += 1;
-            return None;
-        };
         Some(Datagram {
             stamp_ns: self.stamp_ns(ticks),
             source: SocketAddr::new(address, udp.source_port()),

@@ -28,8 +28,11 @@ pub(crate) struct Decoder {
     current: Revolution,
     /// The newest finished one; its memory is used again.
     done: Revolution,
-    /// Timeline of the first firing of `current`.
+    /// Timeline of the first firing of `current`, and how late its stamp is.
     first_ns: i64,
+    late_ns: i64,
+    /// Firings of the newest turn that missed nothing.
+    firings_whole: Option<u32>,
     /// Counts the sensor turns a block, and the azimuth at which the packet before began.
     step: Option<u32>,
     packet_azimuth: Option<u32>,
@@ -68,6 +71,8 @@ impl Decoder {
             done: revolution.clone(),
             current: revolution,
             first_ns: 0,
+            late_ns: 0,
+            firings_whole: None,
             step: None,
             packet_azimuth: None,
             rpm_configured: config.rpm,
@@ -122,8 +127,7 @@ impl Decoder {
         self.current.packets += 1;
         if let Some(cut) = cut {
             self.end_turn(first_row + cut.firing, cut.travelled, cut.time_ns);
-            self.first_ns = cut.time_ns;
-            self.current.start_ns = self.clock.turn_starts(cut.time_ns);
+            (self.first_ns, self.late_ns, self.current.start_ns) = (cut.time_ns, cut.late_ns, cut.start_ns);
             (self.current.partial, self.current.packets) = (cut.partial, 1);
             if self.learn_from_unit() {
                 self.decode(packet, cut.firing, 0);
@@ -136,12 +140,13 @@ impl Decoder {
     /// Ends the stream; whether there was an unfinished turn.
     pub fn finish(&mut self) -> bool {
         let Some(last) = self.current.firings.last() else { return false };
-        let last_ns = self.first_ns + i64::from(last.offset_ns);
+        let last_ns = self.first_ns + self.late_ns + i64::from(last.offset_ns);
         if !self.turns.ends_at_cut(self.expected()) {
             self.current.partial.get_or_insert(Partial::End);
         }
         let travelled = self.turns.travelled();
         self.end_turn(self.current.firings.len(), travelled, last_ns);
+        self.clock.turn_ended(self.done.end_ns);
         self.turns.forget();
         self.packet_azimuth = None;
         self.learn_from_unit();
@@ -160,7 +165,7 @@ impl Decoder {
         }
         self.mode = mode;
         self.status.return_mode = Some(mode);
-        self.step = None;
+        (self.step, self.firings_whole) = (None, None);
         self.current = Revolution::new(self.spec.model, mode, Arc::clone(&self.current.calibration));
         if !ended {
             self.done = self.current.clone();
@@ -209,12 +214,17 @@ impl Decoder {
             if (crossed || overlong) && may_cut && cut.is_none() {
                 let overlong = (!crossed).then_some(Partial::Overlong);
                 self.current.partial = self.current.partial.or(overlong);
-                cut = Some(Cut { firing, time_ns, travelled: self.turns.restart(), partial: flaw.or(overlong) });
+                self.clock.turn_ended(self.current.start_ns + i64::from(offset_ns));
+                let (start_ns, late_ns) = self.clock.turn_starts(time_ns);
+                let partial = flaw.or(overlong);
+                cut = Some(Cut { firing, time_ns, start_ns, late_ns, travelled: self.turns.restart(), partial });
                 offset_ns = 0;
             }
-            let start_ns = cut.as_ref().map_or(self.first_ns, |cut| cut.time_ns);
+            let (first_ns, late_ns) =
+                cut.as_ref().map_or((self.first_ns, self.late_ns), |cut| (cut.time_ns, cut.late_ns));
+            let since_start_ns = time_ns.saturating_sub(first_ns).saturating_sub(late_ns).max(0);
             // Device time that runs backwards inside a turn stands still instead.
-            offset_ns = offset_ns.max(u32::try_from(time_ns.saturating_sub(start_ns).max(0)).unwrap_or(u32::MAX));
+            offset_ns = offset_ns.max(u32::try_from(since_start_ns).unwrap_or(u32::MAX));
             rows[firing] = Firing::new(azimuth, offset_ns);
         }
         self.current.grow(&rows[..firings.azimuths().len()]);
@@ -223,7 +233,7 @@ impl Decoder {
 
     fn begin_turn(&mut self, azimuth: u32, time_ns: i64, expected: u32) {
         self.first_ns = time_ns;
-        self.current.start_ns = self.clock.turn_starts(time_ns);
+        (self.current.start_ns, self.late_ns) = self.clock.turn_starts(time_ns);
         if !self.turns.starts_at_cut(azimuth, expected) {
             self.current.partial.get_or_insert(Partial::Start);
         }
@@ -266,9 +276,12 @@ impl Decoder {
         let done = &mut self.done;
         done.sequence = self.status.revolutions;
         done.rpm = rpm;
-        done.firings_expected = self.spec.firings_per_turn(self.mode, rpm).min(MAX_FIRINGS_PER_TURN) as u32;
+        if done.partial.is_none() {
+            self.firings_whole = Some(done.firings.len() as u32);
+        }
+        let nominal = self.spec.firings_per_turn(self.mode, rpm).min(MAX_FIRINGS_PER_TURN) as u32;
+        done.firings_expected = self.firings_whole.unwrap_or(nominal);
         done.end_ns = done.start_ns + done.firings.last().map_or(0, |firing| i64::from(firing.offset_ns));
-        self.clock.turn_ended(done.end_ns);
         self.status.revolutions += 1;
         self.status.returns += done.returns() as u64;
     }
@@ -309,6 +322,8 @@ struct Cut {
     /// The first of the next turn, counted from the packet's first.
     firing: usize,
     time_ns: i64,
+    start_ns: i64,
+    late_ns: i64,
     travelled: u64,
     /// What the next turn misses from the start.
     partial: Option<Partial>,

@@ -38,7 +38,8 @@ pub struct Revolution {
     pub partial: Option<Partial>,
     /// Data packets that contributed.
     pub packets: u32,
-    /// Firings a whole turn has at this rate, rounded; seen ones are `firings.len()`.
+    /// Firings of a whole turn: this one's, else the newest whole one's, else by the manual's period; seen ones are
+    /// `firings.len()`.
     pub firings_expected: u32,
 }
 

@@ -11,8 +11,10 @@ const NS_PER_HOUR: i64 = 3_600_000_000_000;
 const US_PER_HOUR: u32 = 3_600_000_000;
 /// GPRMC tells the second that has passed; the datagram comes within a few.
 const GPRMC_AGE_NS_MAX: i64 = 10_000_000_000;
+/// A device whose time past the hour is this near to arrival's has been set by GPS: its hour is UTC's.
+const SET_BY_GPS_NS_MAX: i64 = 2_000_000_000;
 /// A timeline this far from arrival is anchored anew: the device was restarted, or its clock set.
-const DRIFT_NS_MAX: i64 = 1_000_000_000;
+const DRIFT_NS_MAX: i64 = 5_000_000_000;
 
 /// Carries one sensor's device time.
 #[derive(Clone, Debug, Default)]
@@ -40,7 +42,10 @@ impl DeviceClock {
             self.gps_zero_ns.is_some() || zero.saturating_add(time_ns).abs_diff(sent_ns) < DRIFT_NS_MAX as u64
         });
         if !anchored {
-            self.zero_ns = Some(sent_ns.saturating_sub(time_ns));
+            let zero_ns = sent_ns.saturating_sub(time_ns);
+            let hour_ns = zero_ns.saturating_add(NS_PER_HOUR / 2).div_euclid(NS_PER_HOUR) * NS_PER_HOUR;
+            let set_by_gps = device_us.is_some() && zero_ns.abs_diff(hour_ns) < SET_BY_GPS_NS_MAX as u64;
+            self.zero_ns = Some(if set_by_gps { hour_ns } else { zero_ns });
         }
         self.last_ns = Some(time_ns);
         time_ns
@@ -66,13 +71,15 @@ impl DeviceClock {
         self.gps_zero_ns = Some(utc_ns + age_ns - time_ns);
     }
 
-    /// The stamp of a turn that starts at `time_ns` on the timeline: never before the end of the turn before.
-    pub fn turn_starts(&mut self, time_ns: i64) -> i64 {
+    /// The stamp of a turn that starts at `time_ns` on the timeline, and by how much it is late: stamps never go back
+    /// before the end of the turn before, so that they stand still while a clock set back catches up.
+    pub fn turn_starts(&mut self, time_ns: i64) -> (i64, i64) {
         if self.gps_zero_ns.is_some() {
             self.zero_ns = self.gps_zero_ns;
         }
-        self.newest_ns = self.zero_ns.unwrap_or(0).saturating_add(time_ns).max(self.newest_ns);
-        self.newest_ns
+        let stamp_ns = self.zero_ns.unwrap_or(0).saturating_add(time_ns);
+        self.newest_ns = stamp_ns.max(self.newest_ns);
+        (self.newest_ns, self.newest_ns - stamp_ns)
     }
 
     /// Takes note of the stamp at which a turn ended.
