@@ -1,1 +1,98 @@
-//! stub
+//! What a planner uses: the newest map with its age, and what lies at a point in metres.
+//!
+//! ```no_run
+//! use clearway_client::{Client, Subscription, now_ns};
+//!
+//! # async fn plan() -> Result<(), clearway_client::ClientError> {
+//! let client = Client::connect("localhost:50051").await?;
+//! let mut maps = client.subscribe(Subscription { layers: vec!["drivability".into()], ..Default::default() }).await?;
+//! loop {
+//!     let update = maps.next().await?;
+//!     if update.map.is_stale(now_ns()) {
+//!         continue;
+//!     }
+//!     let (_, class) = update.map.layer("drivability")?.class_at(12.0, -1.5);
+//!     println!("12 m ahead, 1.5 m to the right: {class}; {} maps skipped", update.skipped);
+//! }
+//! # }
+//! ```
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | [`view`] | bytes -> [`MapView`]: decoded once, cheap to clone, with its age |
+//! | [`stream`] | updates -> the newest map in a slot, skips counted |
+//! | [`grpc`] | a server's address -> [`Client`] |
+//! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`) |
+
+pub mod grpc;
+pub mod stream;
+pub mod view;
+#[cfg(feature = "zenoh")]
+pub mod zenoh;
+
+pub use clearway_proto::map::{Channel, Layer};
+pub use clearway_proto::{codec, grid, v1};
+
+pub use grpc::{Client, Subscription};
+pub use stream::{MapStream, Update};
+pub use view::{MapView, now_ns};
+#[cfg(feature = "zenoh")]
+pub use zenoh::ZenohClient;
+
+use clearway_proto::map::MapError;
+
+/// Why there is no map.
+#[derive(Clone, Debug, thiserror::Error)]
+pub enum ClientError {
+    /// An address that is none.
+    #[error("server address {address:?}: {reason}; HOST:PORT or http://HOST:PORT is allowed, such as localhost:50051")]
+    Address {
+        /// As given.
+        address: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Nobody answers there.
+    #[error("no clearway-server answers at {address}: {reason}")]
+    Unreachable {
+        /// As dialled.
+        address: String,
+        /// What the transport says.
+        reason: String,
+    },
+    /// The server said no, with its reason.
+    #[error("{address}: {reason} ({code})")]
+    Refused {
+        /// As dialled.
+        address: String,
+        /// What the server says.
+        reason: String,
+        /// The gRPC code, such as `NotFound`.
+        code: String,
+    },
+    /// The stream of maps is over.
+    #[error("{address} has ended the stream of maps")]
+    Ended {
+        /// As dialled.
+        address: String,
+    },
+    /// A map that is not right.
+    #[error("refused a map: {0}")]
+    Map(#[from] MapError),
+    /// The map has no such layer.
+    #[error("no layer {layer:?}; the map has {}", present.join(", "))]
+    NoLayer {
+        /// As asked for.
+        layer: String,
+        /// What there is.
+        present: Vec<String>,
+    },
+    /// What zenoh says.
+    #[error("zenoh, {what}: {reason}")]
+    Zenoh {
+        /// What was tried.
+        what: String,
+        /// What zenoh says.
+        reason: String,
+    },
+}

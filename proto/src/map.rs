@@ -90,6 +90,12 @@ impl Layer {
             .unwrap_or(0);
         (class, self.legend.get(usize::from(class)).map_or("unknown", String::as_str))
     }
+
+    /// A channel's value at a point, ego frame, metres, in the channel's unit. `None` where nothing is known: outside
+    /// the grid, in a cell marked unknown, and where the layer has no such channel.
+    pub fn value_at(&self, channel: &str, x_m: f64, y_m: f64) -> Option<f64> {
+        self.channel(channel)?.value(self.grid.cell_at(x_m, y_m)?)
+    }
 }
 
 impl Channel {

@@ -1,0 +1,165 @@
+//! Maps over gRPC.
+//!
+//! In: a server's address. Out: its vehicles, their newest maps, and [`MapStream`]s. Each stream has its own connection
+//! with a small window and acknowledges every map: a stalled reader then holds up nobody, and gets nothing old.
+
+use std::time::Duration;
+
+use clearway_proto::v1;
+use clearway_proto::v1::map_service_client::MapServiceClient;
+use tokio::sync::mpsc;
+use tokio_stream::StreamExt;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::Status;
+use tonic::transport::{Channel, Endpoint};
+
+use crate::ClientError;
+use crate::stream::{Feed, MapStream};
+use crate::view::MapView;
+
+/// No map of ours is longer than 64 KiB, so this holds one in flight and no heap of old ones.
+const WINDOW_BYTES: u32 = 65_535;
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+/// A server that is gone without a word (a pulled cable) is noticed after two of these.
+const KEEPALIVE: Duration = Duration::from_secs(2);
+
+/// A server's maps.
+#[derive(Clone, Debug)]
+pub struct Client {
+    address: String,
+    endpoint: Endpoint,
+    service: MapServiceClient<Channel>,
+}
+
+/// Which maps to stream. `Default`: every layer of the server's only vehicle, two in flight.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Subscription {
+    /// Empty where the server has a single vehicle.
+    pub vehicle: String,
+    /// Empty: every layer.
+    pub layers: Vec<String>,
+    /// Maps on their way without an acknowledgement, at least 1. With 2 the next one travels while one is looked at.
+    pub max_in_flight: u32,
+}
+
+impl Default for Subscription {
+    fn default() -> Self {
+        Self { vehicle: String::new(), layers: Vec::new(), max_in_flight: 2 }
+    }
+}
+
+impl Client {
+    /// Connects to `HOST:PORT` or `http://HOST:PORT`.
+    ///
+    /// # Errors
+    /// [`ClientError::Address`] for what is no address, [`ClientError::Unreachable`] where nobody answers.
+    pub async fn connect(address: &str) -> Result<Self, ClientError> {
+        let wrong = |reason: &str| ClientError::Address { address: address.into(), reason: reason.into() };
+        let rest = address.strip_prefix("http://").unwrap_or(address).trim_end_matches('/');
+        if rest.contains("://") {
+            return Err(wrong("another scheme than http"));
+        }
+        match rest.rsplit_once(':') {
+            None => return Err(wrong("no port")),
+            Some(("", _)) => return Err(wrong("no host")),
+            Some((_, port)) if port.parse::<u16>().is_err() => return Err(wrong("the port is no number up to 65535")),
+            Some(_) => {}
+        }
+        let url = format!("http://{rest}");
+        let endpoint = Endpoint::from_shared(url.clone()).map_err(|error| wrong(&innermost(&error)))?;
+        let endpoint = endpoint
+            .connect_timeout(CONNECT_TIMEOUT)
+            .tcp_nodelay(true)
+            .initial_stream_window_size(WINDOW_BYTES)
+            .initial_connection_window_size(4 * WINDOW_BYTES)
+            .http2_keep_alive_interval(KEEPALIVE)
+            .keep_alive_timeout(KEEPALIVE);
+        let service = MapServiceClient::new(dial(&endpoint, &url).await?);
+        Ok(Self { address: url, endpoint, service })
+    }
+
+    /// The server's vehicles and what it knows of them.
+    ///
+    /// # Errors
+    /// What the server or the transport says.
+    pub async fn vehicles(&self) -> Result<Vec<v1::Vehicle>, ClientError> {
+        let answer = self.service.clone().list_vehicles(v1::ListVehiclesRequest {}).await;
+        Ok(answer.map_err(|status| refused(&self.address, &status))?.into_inner().vehicles)
+    }
+
+    /// The newest map of a vehicle (empty: the only one) with these layers (none named: all).
+    ///
+    /// # Errors
+    /// What the server or the transport says, or what is wrong with the map.
+    pub async fn newest(&self, vehicle: &str, layers: &[String]) -> Result<MapView, ClientError> {
+        let request = v1::GetMapRequest { vehicle: vehicle.into(), layers: layers.to_vec() };
+        let answer = self.service.clone().get_map(request).await;
+        MapView::decode(answer.map_err(|status| refused(&self.address, &status))?.into_inner().map)
+    }
+
+    /// Streams maps over a connection of their own.
+    ///
+    /// # Errors
+    /// What the server or the transport says; an unknown vehicle or layer is refused here.
+    pub async fn subscribe(&self, subscription: Subscription) -> Result<MapStream, ClientError> {
+        let Subscription { vehicle, layers, max_in_flight } = subscription;
+        let selection = v1::Selection { vehicle, layers, max_in_flight: max_in_flight.max(1) };
+        let mut service = MapServiceClient::new(dial(&self.endpoint, &self.address).await?);
+        let (acknowledge, requests) = mpsc::channel(8);
+        let first = tokio_stream::once(v1::WatchRequest { selection: Some(selection), acknowledged: None });
+        let updates = service.watch(first.chain(ReceiverStream::new(requests))).await;
+        let updates = updates.map_err(|status| refused(&self.address, &status))?.into_inner();
+        let address = self.address.clone();
+        Ok(MapStream::spawn(move |feed| follow(feed, address, updates, acknowledge)))
+    }
+}
+
+/// Takes every update, acknowledges it, and says in the end why there are no more.
+async fn follow(
+    feed: Feed,
+    address: String,
+    mut updates: tonic::Streaming<v1::MapUpdate>,
+    acknowledge: mpsc::Sender<v1::WatchRequest>,
+) -> ClientError {
+    loop {
+        let update = match updates.message().await {
+            Ok(Some(update)) => update,
+            Ok(None) => return ClientError::Ended { address },
+            Err(status) => return refused(&address, &status),
+        };
+        let map = match MapView::decode(update.map) {
+            Ok(map) => map,
+            Err(error) => return error,
+        };
+        let acknowledged = v1::WatchRequest { selection: None, acknowledged: Some(map.sequence()) };
+        feed.put(map, update.skipped);
+        if acknowledge.send(acknowledged).await.is_err() {
+            return ClientError::Ended { address };
+        }
+    }
+}
+
+async fn dial(endpoint: &Endpoint, address: &str) -> Result<Channel, ClientError> {
+    let unreachable = |error| ClientError::Unreachable { address: address.into(), reason: innermost(&error) };
+    endpoint.connect().await.map_err(unreachable)
+}
+
+fn refused(address: &str, status: &Status) -> ClientError {
+    if let Some(source) = std::error::Error::source(status) {
+        return ClientError::Unreachable { address: address.into(), reason: innermost(source) };
+    }
+    ClientError::Refused {
+        address: address.into(),
+        reason: status.message().into(),
+        code: format!("{:?}", status.code()),
+    }
+}
+
+/// "transport error" says little; what caused it says what to do.
+fn innermost(error: &dyn std::error::Error) -> String {
+    let mut error = error;
+    while let Some(source) = error.source() {
+        error = source;
+    }
+    error.to_string()
+}
