@@ -166,8 +166,8 @@ impl Revolution {
         match (self.return_mode, image) {
             (ReturnMode::Strongest, _) => 1,
             (ReturnMode::Last, _) | (ReturnMode::Dual, 1) => 2,
-            (ReturnMode::Dual, _) if self.echoes[1].range_m[slot] > 0.0 => 1,
-            (ReturnMode::Dual, _) => 3,
+            (ReturnMode::Dual, _) if self.echoes[0].repeated_by(&self.echoes[1], slot) => 3,
+            (ReturnMode::Dual, _) => 1,
         }
     }
 
@@ -222,6 +222,12 @@ impl Echo {
                 (self.range_m[slot] == strongest.range_m[slot]) & (self.intensity[slot] == strongest.intensity[slot]);
             self.range_m[slot] = if same { 0.0 } else { self.range_m[slot] };
         }
+    }
+
+    /// Whether the last echo was this one: its range was taken out, its place left.
+    fn repeated_by(&self, last: &Echo, slot: usize) -> bool {
+        let place = |echo: &Echo| [echo.x[slot], echo.y[slot], echo.z[slot]];
+        last.range_m[slot] == 0.0 && place(self) == place(last)
     }
 
     fn arrays(&mut self) -> [&mut Vec<f32>; 4] {
