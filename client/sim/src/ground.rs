@@ -110,6 +110,16 @@ impl Terrace {
         inside != self.outside
     }
 
+    /// Whether the outline may lie between two places: not if both are inside it (it is convex), or both beyond one side.
+    fn may_be_crossed(&self, ends: [[f64; 2]; 2]) -> bool {
+        let inside = |[x, y]: [f64; 2]| self.holds(x, y) != self.outside;
+        let beyond = (0..2).any(|axis| {
+            let [a, b] = ends.map(|end| end[axis] - self.centre[axis]);
+            a.min(b) > self.half[axis] || a.max(b) < -self.half[axis]
+        });
+        !beyond && !ends.into_iter().all(inside)
+    }
+
     /// Where a line crosses the outline: entering and leaving.
     fn crossings(&self, origin: [f64; 2], direction: [f64; 2]) -> Option<(f64, f64)> {
         let o = [origin[0] - self.centre[0], origin[1] - self.centre[1]];
@@ -250,10 +260,13 @@ impl Ground {
         if (over + climb * from).min(over + climb * to) > highest_rise {
             return None;
         }
+        // Above the highest rise no outline matters.
+        let from = if climb < 0.0 { from.max(((highest_rise - over) / climb).min(to)) } else { from };
         // Outlines of terraces cut the way through the patch into stretches of equal rise.
         let mut cuts = [to; 34];
         let mut count = 0;
-        for terrace in &self.terraces {
+        let ends = [from, to].map(|t| [origin[0] + t * direction[0], origin[1] + t * direction[1]]);
+        for terrace in self.terraces.iter().filter(|terrace| terrace.may_be_crossed(ends)) {
             let Some((enter, leave)) = terrace.crossings([origin[0], origin[1]], [direction[0], direction[1]]) else {
                 continue;
             };

@@ -19,6 +19,8 @@
 //! | [`telemetry`] | place, speed, time -> 512-byte telemetry datagrams |
 //! | [`vehicle`] | all of the above: datagrams without end |
 //! | [`send`] | datagrams -> UDP, paced by the clock |
+//! | [`noise`] | chance by key, for all of them |
+
 pub mod course;
 pub mod encode;
 pub mod ground;

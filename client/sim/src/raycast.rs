@@ -74,7 +74,7 @@ impl<W: Deref<Target = World>> Caster<W> {
         let mut near: Vec<(f64, usize)> = Vec::with_capacity(self.shapes.len());
         for (index, shape) in self.shapes.iter().enumerate() {
             let distance = distance(self.centre, shape);
-            if distance < self.range_m_max {
+            if distance < self.range_m_max + SLACK_M {
                 near.push((distance, index));
             }
         }
