@@ -1,0 +1,182 @@
+//! Recordings are the maps of their events, and where one is not, it is said which map, layer and cell.
+
+mod house;
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::Path;
+
+use clearway_mapping::event::Body;
+use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode};
+use clearway_proto::v1;
+use clearway_server::ingest::Reading;
+use clearway_server::recording::{Recording, RecordingError};
+use clearway_server::verify::{What, verify};
+use house::{config, readings, start};
+use mcap::records::Record;
+use prost::Message;
+
+/// A recording of the simulated vehicle.
+async fn recording(file: &Path) {
+    let mut config = config();
+    config.grpc.enabled = false;
+    config.recorder.file = file.to_owned();
+    let running = start(config).await;
+    let mut readings = readings(5);
+    let arrival_ns = readings.last().unwrap().arrival_ns;
+    readings.push(Reading { arrival_ns, source: 0, body: Body::End });
+    let door = running.doors[0].door.clone();
+    let fed = move || readings.into_iter().try_for_each(|reading| door.enter_captured(reading));
+    tokio::task::spawn_blocking(fed).await.unwrap().unwrap();
+    running.shutdown().await.unwrap();
+}
+
+/// Copies a recording, passing every message through `change`; `None` leaves it out.
+fn copy(from: &Path, to: &Path, mut change: impl FnMut(&str, u32, Vec<u8>) -> Option<Vec<u8>>) {
+    let bytes = std::fs::read(from).unwrap();
+    let mut writer = mcap::Writer::new(BufWriter::new(File::create(to).unwrap())).unwrap();
+    for record in mcap::read::LinearReader::new(&bytes).unwrap() {
+        match record.unwrap() {
+            Record::Metadata(metadata) => writer.write_metadata(&metadata).unwrap(),
+            Record::Attachment { header, data, .. } => {
+                let mcap::records::AttachmentHeader { log_time, create_time, name, media_type } = header;
+                writer.attach(&mcap::Attachment { log_time, create_time, name, media_type, data }).unwrap();
+            }
+            _ => {}
+        }
+    }
+    for message in mcap::MessageStream::new(&bytes).unwrap() {
+        let mut message = message.unwrap();
+        let topic = message.channel.topic.clone();
+        if let Some(data) = change(&topic, message.sequence, message.data.into_owned()) {
+            message.data = data.into();
+            writer.write(&message).unwrap();
+        }
+    }
+    writer.finish().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_planted_change_is_named_by_sequence_layer_and_cell() {
+    let folder = tempfile::tempdir().unwrap();
+    let (whole, planted) = (folder.path().join("whole.mcap"), folder.path().join("planted.mcap"));
+    recording(&whole).await;
+    let report = verify(&whole).unwrap();
+    assert!(report.is_good() && report.maps >= 5 && report.equal == 2 * report.maps, "{report:?}");
+
+    // One cell of the third map's class goes from whatever it is to an obstacle or back.
+    let (row, column, columns) = (3, 17, 360);
+    let mut was_and_is = None;
+    copy(&whole, &planted, |topic, sequence, data| {
+        if topic != "/car/map/drivability" || sequence != 2 {
+            return Some(data);
+        }
+        let mut map = v1::Map::decode(&data[..]).unwrap();
+        let channel = &mut map.layers[0].channels[0];
+        let Cells::U8(mut cells) = decode(channel, &Limits::default()).unwrap() else { panic!("classes are u8") };
+        let cell = &mut cells[row * columns + column];
+        let was = *cell;
+        *cell = if was == 3 { 1 } else { 3 };
+        was_and_is = Some((i32::from(*cell), i32::from(was)));
+        let v1::Channel { name, unit, scale, unknown, .. } = channel.clone();
+        *channel = encode(CellsRef::U8(&cells)).into_channel(&name, &unit, scale, unknown);
+        Some(map.encode_to_vec())
+    });
+    let report = verify(&planted).unwrap();
+    assert_eq!(report.different, 1);
+    let difference = &report.differences[0];
+    assert_eq!((&*difference.vehicle, difference.sequence, &*difference.layer), ("car", 2, "drivability"));
+    let (recorded, made) = was_and_is.unwrap();
+    let channel = "class".to_owned();
+    assert_eq!(difference.what, What::Cell { row: row as u32, column: column as u32, channel, recorded, made });
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_missing_map_a_changed_header_and_a_hole_in_the_journal_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let (whole, planted) = (folder.path().join("whole.mcap"), folder.path().join("planted.mcap"));
+    recording(&whole).await;
+
+    copy(&whole, &planted, |topic, sequence, data| (topic != "/car/map/drivability" || sequence != 1).then_some(data));
+    let report = verify(&planted).unwrap();
+    assert_eq!((report.different, &report.differences[0].what), (1, &What::Missing));
+    assert_eq!(report.differences[0].sequence, 1);
+
+    copy(&whole, &planted, |topic, sequence, data| {
+        if topic != "/car/map/height_difference" || sequence != 0 {
+            return Some(data);
+        }
+        let mut map = v1::Map::decode(&data[..]).unwrap();
+        map.header.as_mut().unwrap().capture_end_ns += 1;
+        Some(map.encode_to_vec())
+    });
+    let report = verify(&planted).unwrap();
+    let What::Field { field, .. } = &report.differences[0].what else { panic!("{:?}", report.differences) };
+    assert_eq!((report.different, field.as_str()), (1, "header capture_end_ns"));
+
+    copy(&whole, &planted, |topic, sequence, data| (topic != "/car/journal" || sequence != 40).then_some(data));
+    let report = verify(&planted).unwrap();
+    assert_eq!((report.differences[0].sequence, &report.differences[0].what), (40, &What::Hole { found: 41 }));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recording_cut_by_a_crash_is_read_to_its_last_whole_chunk_and_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let (whole, cut) = (folder.path().join("whole.mcap"), folder.path().join("cut.mcap"));
+    recording(&whole).await;
+    let bytes = std::fs::read(&whole).unwrap();
+    let events_in = |length: usize| {
+        std::fs::write(&cut, &bytes[..length]).unwrap();
+        verify(&cut).map(|report| (report.is_good(), report.cut, report.events))
+    };
+    let all = verify(&whole).unwrap().events;
+    let mut most = 0;
+    for percent in [60, 75, 90, 99] {
+        let (good, is_cut, events) = events_in(bytes.len() * percent / 100).unwrap();
+        assert!(good && is_cut && events <= all, "{percent} %: {events} of {all}");
+        most = most.max(events);
+    }
+    assert!(most > 0, "whole chunks before the cut are read");
+    assert!(matches!(events_in(3), Err(clearway_server::verify::VerifyError::Recording(_))));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn damage_is_named_and_never_passes_for_a_good_recording() {
+    let folder = tempfile::tempdir().unwrap();
+    let (whole, damaged) = (folder.path().join("whole.mcap"), folder.path().join("damaged.mcap"));
+    recording(&whole).await;
+    let mut bytes = std::fs::read(&whole).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 0x10;
+    std::fs::write(&damaged, &bytes).unwrap();
+    let error = verify(&damaged).unwrap_err().to_string();
+    assert!(error.contains("damaged.mcap") && error.contains("damaged after"), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recording_holds_what_it_takes_to_make_its_maps_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("whole.mcap");
+    recording(&file).await;
+    let recording = Recording::open(&file).unwrap();
+    let notes: &BTreeMap<String, String> = &recording.preface().notes;
+    assert_eq!(notes["vehicles"], "car");
+    assert_eq!(notes["boot_id"], recording.preface().boot_id.to_string());
+    assert!(notes["calibration/car/top"].contains("factory"), "{notes:?}");
+    let (config, tables) = recording.config().unwrap();
+    assert_eq!(config.vehicles, house::config().vehicles);
+    assert_eq!(tables, [[None]]);
+}
+
+#[test]
+fn a_foreign_mcap_file_is_no_recording() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("foreign.mcap");
+    mcap::Writer::new(BufWriter::new(File::create(&file).unwrap())).unwrap().finish().unwrap();
+    let error = verify(&file).unwrap_err();
+    assert!(
+        matches!(error, clearway_server::verify::VerifyError::Recording(RecordingError::NoConfig { .. })),
+        "{error}"
+    );
+}

@@ -1,0 +1,137 @@
+//! Recorded drives through the whole house: the counts are exact, and what is wrong with a file is said.
+
+mod house;
+
+use std::path::{Path, PathBuf};
+
+use clearway_server::replay::{Mount, Options, ReplayError, Summary, replay};
+use clearway_server::verify::verify;
+
+async fn replayed(options: Options) -> Result<Summary, ReplayError> {
+    house::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await
+}
+
+#[cfg(clearway_data)]
+fn drive(path: &str) -> PathBuf {
+    Path::new(env!("CLEARWAY_DATA")).join(path)
+}
+
+#[cfg(not(clearway_data))]
+fn drive(path: &str) -> PathBuf {
+    PathBuf::from(path)
+}
+
+const HDL32: &str = "pcap/rust-lidar-utils/hdl32_example.pcap";
+
+#[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+async fn every_packet_of_the_hdl32_drive_is_decoded_mapped_recorded_and_verified() {
+    let folder = tempfile::tempdir().unwrap();
+    let record = folder.path().join("d.mcap");
+    let options = Options { files: vec![drive(HDL32)], record: Some(record.clone()), ..Options::default() };
+    let summary = replayed(options).await.unwrap();
+    let snapshot = &summary.snapshot;
+    assert_eq!((snapshot.ledger.received, snapshot.ledger.decoded, snapshot.ledger.telemetry), (976, 876, 100));
+    assert_eq!((snapshot.refused(), snapshot.ledger.lost), (0, 0));
+    // 5.7 turns: the first and the last are parts of one.
+    assert_eq!((snapshot.revolutions(), snapshot.maps), (6, 6));
+    let sensor = &snapshot.sensors[0].status;
+    assert_eq!(sensor.model, Some(clearway_lidar::model::Model::Hdl32e));
+    assert!((sensor.rpm.unwrap() - 703.0).abs() < 3.0, "{:?}", sensor.rpm);
+    assert!(matches!(summary.mount, Mount::Estimated(_)));
+    assert!((1.5..2.5).contains(&summary.extrinsics.z_m), "{:?}", summary.extrinsics);
+    assert!(summary.truncated.is_empty());
+
+    let report = verify(&record).unwrap();
+    assert!(report.is_good(), "{:?}", report.differences);
+    assert_eq!((report.events, report.maps, report.equal), (977, 6, 12));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+async fn the_same_drive_makes_the_same_bytes_from_the_capture_and_from_its_recording() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let options =
+        |file: PathBuf, record: &str| Options { files: vec![file], record: Some(at(record)), ..Options::default() };
+    replayed(options(drive(HDL32), "a.mcap")).await.unwrap();
+    replayed(options(drive(HDL32), "b.mcap")).await.unwrap();
+    replayed(options(at("a.mcap"), "c.mcap")).await.unwrap();
+    let maps = house::recorded(&at("a.mcap"));
+    assert_eq!(maps.len(), 12);
+    assert_eq!(house::recorded(&at("b.mcap")), maps);
+    assert_eq!(house::recorded(&at("c.mcap")), maps);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+async fn a_truncated_capture_yields_what_it_holds_and_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let cut = folder.path().join("cut.pcap");
+    let whole = std::fs::read(drive(HDL32)).unwrap();
+    std::fs::write(&cut, &whole[..whole.len() / 2 + 7]).unwrap();
+    let summary = replayed(Options { files: vec![cut.clone()], ..Options::default() }).await.unwrap();
+    let ledger = &summary.snapshot.ledger;
+    assert_eq!(ledger.received, ledger.decoded + ledger.telemetry);
+    assert!((400..976 / 2 + 10).contains(&ledger.received), "{ledger:?}");
+    assert_eq!(summary.truncated.len(), 1);
+    assert_eq!(summary.truncated[0].file, cut);
+    assert!(summary.to_json()["truncated"][0]["reason"].as_str().unwrap().contains("cut off"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+async fn scans_of_a_folder_become_a_map_each() {
+    let options = Options { files: vec![drive("kitti/patchwork-plusplus")], ..Options::default() };
+    let summary = replayed(options).await.unwrap();
+    assert_eq!((summary.snapshot.maps, summary.snapshot.ledger.decoded), (3, 3));
+    // KITTI's own calibration says 1.73 m.
+    assert!((1.6..1.9).contains(&summary.extrinsics.z_m), "{:?}", summary.extrinsics);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+async fn velodyne_scan_messages_are_read_packet_by_packet_and_clouds_are_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = Options {
+        files: vec![drive("mcap/nebula_vls128_none.mcap")],
+        clouds: Some(folder.path().join("clouds")),
+        ..Options::default()
+    };
+    let summary = replayed(options).await.unwrap();
+    assert_eq!((summary.snapshot.ledger.received, summary.snapshot.ledger.decoded), (2193, 2193));
+    assert_eq!(summary.clouds, summary.snapshot.maps);
+    let mut points = 0;
+    for cloud in std::fs::read_dir(folder.path().join("clouds")).unwrap() {
+        let bytes = std::fs::read(cloud.unwrap().path()).unwrap();
+        let text = String::from_utf8_lossy(&bytes);
+        let (header, _) = text.split_once("DATA binary\n").unwrap();
+        let count: usize = header.lines().find_map(|l| l.strip_prefix("POINTS ")).unwrap().parse().unwrap();
+        assert_eq!(bytes.len(), header.len() + "DATA binary\n".len() + count * 25);
+        points += count as u64;
+    }
+    assert_eq!(points, summary.snapshot.sensors[0].status.returns);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_file_that_is_nothing_known_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("drive.pcap");
+    std::fs::write(&file, b"this is no capture at all").unwrap();
+    let error = replayed(Options { files: vec![file], ..Options::default() }).await.unwrap_err().to_string();
+    assert!(error.contains("drive.pcap") && error.contains("pcap or pcapng is allowed"), "{error}");
+    let missing = Options { files: vec![PathBuf::from("/no/such.pcap")], ..Options::default() };
+    assert!(replayed(missing).await.unwrap_err().to_string().contains("/no/such.pcap"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_mount_that_cannot_be_estimated_is_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("wall.bin");
+    let points = (0..2000).map(|i| [5.0f32, (i % 50) as f32 * 0.1 - 2.5, (i / 50) as f32 * 0.1, 0.5]);
+    let bytes: Vec<u8> = points.flatten().flat_map(|value| value.to_le_bytes()).collect();
+    std::fs::write(&file, bytes).unwrap();
+    let error = replayed(Options { files: vec![file], ..Options::default() }).await.unwrap_err();
+    assert!(matches!(error, ReplayError::Mount { .. }));
+    assert!(error.to_string().contains("--extrinsics x,y,z,roll,pitch,yaw"), "{error}");
+}

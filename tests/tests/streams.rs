@@ -1,0 +1,281 @@
+//! Maps on their way to readers: the same bytes everywhere, and no reader can slow another.
+
+mod house;
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use bytes::Bytes;
+use clearway_proto::v1;
+use clearway_sim::send::{Pace, Until, drive};
+use house::{config, feed, grpc, readings, recorded, selection, sequence, start, until, vehicle, within};
+use tokio::net::UdpSocket;
+use tokio::sync::mpsc;
+use tonic::{Code, Streaming};
+use zenoh::Session;
+use zenoh_ext::{AdvancedSubscriberBuilderExt, HistoryConfig};
+
+const LAYER: &str = "drivability";
+
+/// A request stream the test writes to.
+struct Requests(mpsc::Sender<v1::WatchRequest>);
+
+impl Requests {
+    async fn acknowledge(&self, sequence: u64) {
+        let request = v1::WatchRequest { selection: None, acknowledged: Some(sequence) };
+        self.0.send(request).await.expect("the stream is open");
+    }
+}
+
+async fn watch(running: &clearway_server::server::Running, max_in_flight: u32) -> (Requests, Streaming<v1::MapUpdate>) {
+    let (sender, mut requests) = mpsc::channel(16);
+    sender.send(selection("car", &[LAYER], max_in_flight)).await.unwrap();
+    let requests = futures::stream::poll_fn(move |context| requests.poll_recv(context));
+    let updates = within("watch", grpc(running).await.watch(requests)).await.expect("watch").into_inner();
+    (Requests(sender), updates)
+}
+
+/// A zenoh session connected to the server and to nobody else.
+async fn session(running: &clearway_server::server::Running) -> Session {
+    let mut config = zenoh::Config::default();
+    let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
+    config.insert_json5("mode", "\"client\"").unwrap();
+    config.insert_json5("connect/endpoints", &format!("[{endpoint:?}]")).unwrap();
+    config.insert_json5("scouting/multicast/enabled", "false").unwrap();
+    within("zenoh", zenoh::open(config).into_future()).await.expect("zenoh answers")
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_live_drive_over_udp_reaches_grpc_and_zenoh_with_the_bytes_of_the_recording() {
+    let folder = tempfile::tempdir().unwrap();
+    let record = folder.path().join("live.mcap");
+    let mut config = config();
+    config.zenoh.enabled = true;
+    config.recorder.file = record.clone();
+    let running = start(config).await;
+    let (data, telemetry) = running.doors[0].udp.unwrap();
+
+    let session = session(&running).await;
+    let subscriber = session.declare_subscriber(format!("clearway/car/map/{LAYER}")).await.unwrap();
+    let (_requests, mut updates) = watch(&running, 0).await;
+
+    let halt = Arc::new(AtomicBool::new(false));
+    let car = std::thread::spawn({
+        let halt = halt.clone();
+        move || drive(vehicle(), data, telemetry, Pace::RealTime, Until { stop: Some(&halt), device_time: None })
+    });
+    let mut over_grpc = BTreeMap::new();
+    let mut over_zenoh = BTreeMap::new();
+    within("three maps over gRPC and zenoh", async {
+        while over_grpc.len() < 3 || over_zenoh.len() < 3 {
+            tokio::select! {
+                update = updates.message() => {
+                    let map = update.expect("gRPC streams").expect("no end").map;
+                    over_grpc.insert(sequence(&map), map);
+                }
+                sample = subscriber.recv_async() => {
+                    let map = Bytes::from(sample.expect("zenoh streams").payload().to_bytes().into_owned());
+                    over_zenoh.insert(sequence(&map), map);
+                }
+            }
+        }
+    })
+    .await;
+    halt.store(true, Ordering::Relaxed);
+    let sent = car.join().unwrap().unwrap();
+    let status = running.vehicles.0[0].status.clone();
+    session.close().await.unwrap();
+    within("shutdown", running.shutdown()).await.unwrap();
+
+    let ledger = status.snapshot().ledger;
+    assert!(ledger.received <= sent.packets + sent.telemetry && ledger.refused.is_empty(), "{ledger:?} of {sent:?}");
+    let recorded = recorded(&record);
+    for (sequence, map) in over_grpc.iter().chain(&over_zenoh) {
+        assert_eq!(recorded[&(*sequence, LAYER.to_owned())], map, "sequence {sequence}");
+    }
+    let report = clearway_server::verify::verify(&record).unwrap();
+    assert!(report.is_good() && report.maps >= 3, "{report:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn refused_datagrams_are_counted_by_reason_and_the_ledger_adds_up() {
+    let running = start(config()).await;
+    let (data, _) = running.doors[0].udp.unwrap();
+    let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
+    let flags = vec![0x11; 1206];
+    let mut azimuth = vec![0; 1206];
+    for block in azimuth[..1200].chunks_exact_mut(100) {
+        // Block flag EEFF, azimuth 0xFFFF: more than a turn.
+        block[..4].copy_from_slice(&[0xff, 0xee, 0xff, 0xff]);
+    }
+    for datagram in [&b"hello"[..], &[0; 1205], &[0; 1207], &flags, &azimuth] {
+        socket.send_to(datagram, data).await.unwrap();
+    }
+    let ledger = || running.vehicles.0[0].status.snapshot().ledger;
+    until("five datagrams", || ledger().received == 5).await;
+    let ledger = ledger();
+    assert_eq!(ledger.refused.get("length"), Some(&3), "{ledger:?}");
+    assert_eq!(ledger.refused.get("block_flag"), Some(&1), "{ledger:?}");
+    assert_eq!(ledger.refused.get("azimuth"), Some(&1), "{ledger:?}");
+    assert_eq!(ledger.received, ledger.decoded + ledger.telemetry + ledger.refused.values().sum::<u64>());
+    running.shutdown().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_sender_nobody_configured_is_refused_for_its_source() {
+    let mut config = config();
+    let udp = config.vehicles[0].udp.as_mut().unwrap();
+    udp.from.insert("top".into(), clearway_server::config::Sender::Address("127.0.0.2".parse().unwrap()));
+    let running = start(config).await;
+    let (data, _) = running.doors[0].udp.unwrap();
+    let packet = readings(1).into_iter().find_map(|reading| match reading.body {
+        clearway_mapping::event::Body::Datagram(payload) if payload.len() == 1206 => Some(payload),
+        _ => None,
+    });
+    let packet = packet.expect("the vehicle sends data");
+    for sender in ["127.0.0.1:0", "127.0.0.2:0"] {
+        UdpSocket::bind(sender).await.unwrap().send_to(&packet, data).await.unwrap();
+    }
+    let snapshot = || running.vehicles.0[0].status.snapshot();
+    until("two datagrams", || snapshot().ledger.received == 2).await;
+    assert_eq!(snapshot().ledger.refused, [("source", 1)].into());
+    running.shutdown().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_unknown_vehicle_or_layer_is_answered_with_the_known_ones() {
+    let running = start(config()).await;
+    let mut client = grpc(&running).await;
+    let get = |vehicle: &str, layer: &str| v1::GetMapRequest { vehicle: vehicle.into(), layers: vec![layer.into()] };
+    let status = client.get_map(get("truck", LAYER)).await.unwrap_err();
+    assert_eq!(status.code(), Code::NotFound);
+    assert!(status.message().contains("truck") && status.message().contains("car"), "{status}");
+    let status = client.get_map(get("car", "weather")).await.unwrap_err();
+    assert_eq!(status.code(), Code::InvalidArgument);
+    assert!(status.message().contains("drivability, height_difference"), "{status}");
+    let status = client.get_map(get("car", LAYER)).await.unwrap_err();
+    assert_eq!(status.code(), Code::Unavailable, "no map yet: {status}");
+
+    let requests = |request| futures::stream::iter([request]);
+    let status = client.watch(requests(selection("truck", &[], 0))).await.unwrap_err();
+    assert_eq!(status.code(), Code::NotFound);
+    let status = client.watch(requests(selection("car", &["weather"], 0))).await.unwrap_err();
+    assert_eq!(status.code(), Code::InvalidArgument);
+    let status = client.watch(requests(v1::WatchRequest::default())).await.unwrap_err();
+    assert!(status.message().contains("selection"), "{status}");
+
+    let vehicles = client.list_vehicles(v1::ListVehiclesRequest {}).await.unwrap().into_inner().vehicles;
+    assert_eq!(vehicles.iter().map(|v| v.name.as_str()).collect::<Vec<_>>(), ["car"]);
+    assert_eq!(vehicles[0].layers, ["drivability", "height_difference"]);
+    running.shutdown().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn health_and_reflection_answer() {
+    use tonic_health::pb::health_check_response::ServingStatus;
+    use tonic_health::pb::{HealthCheckRequest, health_client::HealthClient};
+    use tonic_reflection::pb::v1::ServerReflectionRequest;
+    use tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient;
+    use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;
+    use tonic_reflection::pb::v1::server_reflection_response::MessageResponse;
+
+    let running = start(config()).await;
+    let channel = tonic::transport::Channel::from_shared(format!("http://{}", running.grpc.unwrap())).unwrap();
+    let channel = channel.connect().await.unwrap();
+    let request = HealthCheckRequest { service: "clearway.v1.MapService".into() };
+    let health = HealthClient::new(channel.clone()).check(request).await.unwrap().into_inner();
+    assert_eq!(health.status(), ServingStatus::Serving);
+
+    let list = MessageRequest::ListServices(String::new());
+    let request = ServerReflectionRequest { host: String::new(), message_request: Some(list) };
+    let mut client = ServerReflectionClient::new(channel);
+    let answers = client.server_reflection_info(futures::stream::iter([request])).await.unwrap();
+    let answer = answers.into_inner().message().await.unwrap().unwrap().message_response;
+    let Some(MessageResponse::ListServicesResponse(list)) = answer else { panic!("{answer:?}") };
+    assert!(list.service.iter().any(|service| service.name == "clearway.v1.MapService"), "{list:?}");
+    running.shutdown().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_late_zenoh_joiner_gets_the_current_map_and_the_same_key_answers_queries() {
+    let mut config = config();
+    config.zenoh.enabled = true;
+    let running = start(config).await;
+    let maps = feed(&running, readings(3)).await;
+    let newest = running.vehicles.0[0].newest.borrow().clone().expect("a map");
+    assert_eq!(newest.sequence, maps - 1);
+    let expected = newest.select(&[LAYER.into()]);
+
+    let session = session(&running).await;
+    let key = format!("clearway/car/map/{LAYER}");
+    let replies = session.get(&key).await.unwrap();
+    let reply = within("an answer", replies.recv_async()).await.unwrap();
+    assert_eq!(Bytes::from(reply.result().unwrap().payload().to_bytes().into_owned()), expected);
+
+    let joiner =
+        session.declare_subscriber(&key).history(HistoryConfig::default().detect_late_publishers()).await.unwrap();
+    let sample = within("the current map", joiner.recv_async()).await.unwrap();
+    assert_eq!(Bytes::from(sample.payload().to_bytes().into_owned()), expected);
+
+    let tokens = session.liveliness().get("clearway/*").await.unwrap();
+    let token = within("the vehicle's token", tokens.recv_async()).await.unwrap();
+    assert_eq!(token.result().unwrap().key_expr().as_str(), "clearway/car");
+    session.close().await.unwrap();
+    running.shutdown().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_reader_that_never_reads_slows_nobody_and_costs_no_more_than_its_credits() {
+    let running = start(config()).await;
+    let (stopped_requests, mut stopped) = watch(&running, 2).await;
+    let (requests, mut healthy) = watch(&running, 1).await;
+
+    // Fed less than a turn at a time (some 350 datagrams), a reader that keeps up misses none of them.
+    let mut turns: Vec<Vec<_>> = vec![Vec::new()];
+    for reading in readings(12) {
+        turns.last_mut().unwrap().push(reading);
+        if turns.last().unwrap().len() == 300 {
+            turns.push(Vec::new());
+        }
+    }
+    let mut next = 0;
+    for turn in turns {
+        let maps = feed(&running, turn).await;
+        while next < maps {
+            let update = within("a map", healthy.message()).await.unwrap().unwrap();
+            assert_eq!((sequence(&update.map), update.skipped), (next, 0));
+            requests.acknowledge(next).await;
+            next += 1;
+        }
+    }
+    assert!(next >= 10, "{next} maps");
+
+    // The stopped one has two old maps, and then the newest, with the number it missed.
+    let first = within("a map", stopped.message()).await.unwrap().unwrap();
+    let second = within("a map", stopped.message()).await.unwrap().unwrap();
+    assert_eq!(sequence(&second.map), sequence(&first.map) + 1 + second.skipped);
+    let third = tokio::time::timeout(Duration::from_millis(1), stopped.message()).await;
+    assert!(third.is_err(), "no third map without an acknowledgement");
+    let second = sequence(&second.map);
+    stopped_requests.acknowledge(second).await;
+    let third = within("a map", stopped.message()).await.unwrap().unwrap();
+    assert_eq!((sequence(&third.map), third.skipped), (next - 1, next - 2 - second));
+
+    assert_eq!(running.vehicles.0[0].status.to_proto().readers["grpc"], 2);
+    drop((stopped, stopped_requests));
+    let readers = || running.vehicles.0[0].status.to_proto().readers["grpc"];
+    until("a reader that has gone is not counted", || readers() == 1).await;
+    within("shutdown", running.shutdown()).await.unwrap();
+    let end = within("the end", async {
+        loop {
+            match healthy.message().await {
+                Ok(Some(_)) => continue,
+                other => break other,
+            }
+        }
+    })
+    .await;
+    assert_eq!(end.unwrap_err().code(), Code::Unavailable, "the reader is told that the server stops");
+}
