@@ -1,0 +1,69 @@
+//! One layer of a map -> JSON: geometry, pose, stamps, legend, figures, and the cells where asked for.
+
+use clearway_client::codec::Cells;
+use clearway_client::grid::Grid;
+use clearway_client::{Channel, Layer, MapView};
+use serde_json::{Value, json};
+
+/// The document. Arrays are row by row, in the order of the grid's cell index.
+pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
+    let header = map.header();
+    let geometry = match &layer.grid {
+        Grid::Radial { r_bench_m, columns } => {
+            json!({"kind": "radial", "r_bench_m": r_bench_m, "columns": columns})
+        }
+        Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m } => json!({
+            "kind": "cartesian", "origin_x_m": origin_x_m, "origin_y_m": origin_y_m, "width": width,
+            "height": height, "cell_m": cell_m,
+        }),
+    };
+    let pose = header
+        .map_from_ego
+        .as_ref()
+        .map(|p| json!({"x": p.x, "y": p.y, "z": p.z, "qx": p.qx, "qy": p.qy, "qz": p.qz, "qw": p.qw}));
+    let sensors = header.sensors.iter().map(|s| {
+        json!({
+            "name": s.name, "model": s.model, "packets": s.packets, "refused": s.refused, "returns": s.returns,
+            "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
+        })
+    });
+    let (rows, columns) = layer.grid.shape();
+    json!({
+        "vehicle": header.vehicle,
+        "boot_id": header.boot_id,
+        "sequence": header.sequence,
+        "capture_start_ns": header.capture_start_ns,
+        "capture_end_ns": header.capture_end_ns,
+        "completed_ns": header.completed_ns,
+        "valid_until_ns": header.valid_until_ns,
+        "map_from_ego": pose,
+        "speed_mps": header.speed_mps,
+        "sensors": sensors.collect::<Vec<_>>(),
+        "layer": layer.name,
+        "geometry": geometry,
+        "shape": [rows, columns],
+        "legend": layer.legend,
+        "planes": layer.planes,
+        "figures": layer.figures,
+        "channels": layer.channels.iter().map(|c| channel(c, with_cells)).collect::<Vec<_>>(),
+    })
+}
+
+fn channel(channel: &Channel, with_cells: bool) -> Value {
+    let dtype = match channel.cells {
+        Cells::U8(_) => "u1",
+        Cells::I8(_) => "i1",
+        Cells::U16(_) => "u2",
+    };
+    let mut document = json!({
+        "name": channel.name, "unit": channel.unit, "scale": channel.scale, "unknown": channel.unknown, "dtype": dtype,
+    });
+    if with_cells {
+        document["cells"] = match &channel.cells {
+            Cells::U8(cells) => json!(cells),
+            Cells::I8(cells) => json!(cells),
+            Cells::U16(cells) => json!(cells),
+        };
+    }
+    document
+}

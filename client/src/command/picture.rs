@@ -1,0 +1,112 @@
+//! One layer of a map -> a PNG: from above, the vehicle in the middle, its forward axis up, its left on the left.
+//!
+//! The picture turns with the vehicle: up is ahead, not north. Classes have colours by name; a layer without classes is
+//! drawn from its first channel, dark to light.
+
+use anyhow::{Context, Result};
+use clearway_client::Layer;
+
+/// Colours told apart also by those who see no red and green: the lightness differs too.
+pub const UNKNOWN: [u8; 3] = [38, 40, 44];
+const DRIVABLE: [u8; 3] = [64, 176, 128];
+const NOT_DRIVABLE: [u8; 3] = [232, 176, 64];
+const OBSTACLE: [u8; 3] = [176, 40, 48];
+/// For classes this version has no colour for.
+const OTHERS: [[u8; 3]; 4] = [[96, 144, 224], [168, 120, 208], [120, 200, 216], [216, 144, 176]];
+const RING: [u8; 3] = [112, 116, 124];
+const VEHICLE: [u8; 3] = [244, 244, 248];
+/// Half of a car's length and breadth, metres.
+const VEHICLE_HALF_M: (f64, f64) = (2.2, 0.9);
+
+/// How to draw.
+pub struct Style {
+    /// Edge of the picture.
+    pub pixels: u32,
+    /// Edge of the ground shown is twice this; `None`: the whole grid.
+    pub range_m: Option<f64>,
+    /// Rings every so many metres.
+    pub rings_m: Option<f64>,
+    /// A mark where the vehicle stands.
+    pub vehicle: bool,
+}
+
+/// Draws a layer and encodes the picture.
+///
+/// # Errors
+/// What the PNG encoder says.
+pub fn png(layer: &Layer, style: &Style) -> Result<Vec<u8>> {
+    let pixels = style.pixels as usize;
+    let mut rgb = vec![0; pixels * pixels * 3];
+    let range_m = style.range_m.unwrap_or(layer.grid.range_m_max());
+    let metres = 2.0 * range_m / pixels as f64;
+    let colours = Colours::of(layer);
+    for (index, pixel) in rgb.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+        let x_m = range_m - ((index / pixels) as f64 + 0.5) * metres;
+        let y_m = range_m - ((index % pixels) as f64 + 0.5) * metres;
+        let on_ring = style.rings_m.is_some_and(|every| {
+            let rings = x_m.hypot(y_m) / every;
+            rings > 0.5 && (rings - rings.round()).abs() * every < 0.5 * metres
+        });
+        *pixel = if style.vehicle && x_m.abs() < VEHICLE_HALF_M.0 && y_m.abs() < VEHICLE_HALF_M.1 {
+            VEHICLE
+        } else if on_ring {
+            RING
+        } else {
+            layer.grid.cell_at(x_m, y_m).map_or(UNKNOWN, |cell| colours.of_cell(layer, cell))
+        };
+    }
+    let mut file = Vec::new();
+    let mut encoder = png::Encoder::new(&mut file, style.pixels, style.pixels);
+    encoder.set_color(png::ColorType::Rgb);
+    encoder.set_depth(png::BitDepth::Eight);
+    let mut writer = encoder.write_header().context("PNG header")?;
+    writer.write_image_data(&rgb).context("PNG pixels")?;
+    writer.finish().context("PNG end")?;
+    Ok(file)
+}
+
+enum Colours {
+    /// By class; the index is that of the channel.
+    Classes(usize, Vec<[u8; 3]>),
+    /// Least and greatest known value of channel 0.
+    Shades(f64, f64),
+}
+
+impl Colours {
+    fn of(layer: &Layer) -> Self {
+        if let Some(channel) = layer.channels.iter().position(|channel| channel.name == "class") {
+            let colour = |(class, name): (usize, &String)| match name.as_str() {
+                "unknown" => UNKNOWN,
+                "drivable" => DRIVABLE,
+                "not_drivable" => NOT_DRIVABLE,
+                "obstacle" => OBSTACLE,
+                _ => OTHERS[class % OTHERS.len()],
+            };
+            return Self::Classes(channel, layer.legend.iter().enumerate().map(colour).collect());
+        }
+        let (mut least, mut greatest) = (f64::INFINITY, f64::NEG_INFINITY);
+        if let Some(channel) = layer.channels.first() {
+            for value in (0..channel.cells.len()).filter_map(|cell| channel.value(cell)) {
+                least = least.min(value);
+                greatest = greatest.max(value);
+            }
+        }
+        Self::Shades(least, greatest)
+    }
+
+    fn of_cell(&self, layer: &Layer, cell: usize) -> [u8; 3] {
+        match self {
+            Self::Classes(channel, colours) => {
+                let class = layer.channels[*channel].cells.get(cell).and_then(|class| usize::try_from(class).ok());
+                class.and_then(|class| colours.get(class)).copied().unwrap_or(UNKNOWN)
+            }
+            Self::Shades(least, greatest) => match layer.channels.first().and_then(|channel| channel.value(cell)) {
+                Some(value) => {
+                    let share = (value - least) / (greatest - least).max(f64::MIN_POSITIVE);
+                    [72 + (share * 168.0) as u8; 3]
+                }
+                None => UNKNOWN,
+            },
+        }
+    }
+}

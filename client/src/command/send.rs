@@ -1,0 +1,186 @@
+//! A capture -> its datagrams, sent again over UDP at the recorded pace.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufReader;
+use std::net::{SocketAddr, ToSocketAddrs, UdpSocket};
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use clearway_lidar::capture::Capture;
+use clearway_lidar::velodyne_scan::VelodyneScan;
+use serde_json::json;
+
+use super::progress_bar;
+use super::recording::Recording;
+
+/// Bytes of a Velodyne data packet and of a telemetry datagram; nothing else is sent.
+const PACKET_BYTES: usize = 1206;
+const TELEMETRY_BYTES: usize = 512;
+/// A capture with a hole of hours is not a reason to sit and wait.
+const PAUSE_MAX: Duration = Duration::from_secs(60);
+
+/// Send a capture's datagrams: data packets (1206 bytes) and telemetry (512 bytes) of a pcap, a pcapng, or the
+/// VelodyneScan messages of an MCAP file.
+#[derive(Args)]
+pub struct Options {
+    /// The capture.
+    file: PathBuf,
+    /// Where data packets go.
+    #[arg(long, value_name = "udp://HOST:PORT")]
+    to: String,
+    /// Where telemetry goes; with the data packets unless given.
+    #[arg(long, value_name = "udp://HOST:PORT")]
+    telemetry_to: Option<String>,
+    /// Multiple of the recorded pace, or max for as fast as it goes.
+    #[arg(long, default_value = "1", value_name = "X|max", value_parser = speed)]
+    speed: Speed,
+    /// Print one JSON object at the end.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy)]
+enum Speed {
+    Times(f64),
+    Max,
+}
+
+fn speed(text: &str) -> Result<Speed, String> {
+    match text.parse::<f64>() {
+        _ if text == "max" => Ok(Speed::Max),
+        Ok(times) if (0.001..=1000.0).contains(&times) => Ok(Speed::Times(times)),
+        _ => Err("0.001 to 1000, or max, is allowed".into()),
+    }
+}
+
+fn target(text: &str) -> Result<SocketAddr> {
+    let rest = text.strip_prefix("udp://").with_context(|| format!("{text:?}: udp://HOST:PORT is allowed"))?;
+    let mut found = rest.to_socket_addrs().with_context(|| format!("{text:?}: udp://HOST:PORT is allowed"))?;
+    found.next().with_context(|| format!("{text:?}: the host has no address"))
+}
+
+/// Sends.
+///
+/// # Errors
+/// What cannot be read or sent; a capture that is cut is no error, but is said.
+pub fn run(options: &Options) -> Result<()> {
+    let to = target(&options.to)?;
+    let telemetry_to = options.telemetry_to.as_deref().map_or(Ok(to), target)?;
+    let length = std::fs::metadata(&options.file).with_context(|| format!("open {}", options.file.display()))?.len();
+    let mut sender = Sender::new(to, telemetry_to, options.speed)?;
+    let progress = progress_bar(length);
+    let mut cut = None;
+    if options.file.extension().is_some_and(|extension| extension == "mcap") {
+        let mut recording = Recording::open(&options.file)?;
+        while let Some(message) = recording.next() {
+            let message = message.with_context(|| options.file.display().to_string())?;
+            progress.set_position(recording.bytes_read);
+            if !message.is_velodyne_scan() {
+                sender.skip("not a VelodyneScan", 1);
+                continue;
+            }
+            let scan = VelodyneScan::new(&message.data).with_context(|| message.topic.clone())?;
+            for packet in scan.packets() {
+                let (stamp_ns, packet) = packet.with_context(|| message.topic.clone())?;
+                sender.send(stamp_ns, packet)?;
+            }
+        }
+        cut = recording.cut.clone();
+    } else {
+        let file = File::open(&options.file).with_context(|| format!("open {}", options.file.display()))?;
+        let mut capture = Capture::new(BufReader::new(file)).with_context(|| options.file.display().to_string())?;
+        while let Some(datagram) = capture.next() {
+            progress.set_position(capture.offset());
+            match datagram {
+                Ok(datagram) => sender.send(datagram.stamp_ns, &datagram.payload)?,
+                Err(error) => cut = Some(error.to_string()),
+            }
+        }
+        let skipped = capture.skipped();
+        sender.skip("not UDP", skipped.not_udp);
+        sender.skip("fragmented", skipped.fragmented);
+        sender.skip("unreadable", skipped.unreadable);
+    }
+    progress.finish_and_clear();
+    let Sender { packets, telemetry, skipped, .. } = &sender;
+    let seconds = sender.started.map_or(0.0, |(at, _)| at.elapsed().as_secs_f64());
+    if options.json {
+        let document = json!({
+            "packets": packets, "telemetry": telemetry, "skipped": skipped, "seconds": seconds, "cut": cut,
+        });
+        println!("{document}");
+    } else {
+        println!(
+            "sent {packets} data packets to {to} and {telemetry} telemetry datagrams to {telemetry_to} in {seconds:.1} s"
+        );
+        for (reason, count) in skipped {
+            println!("skipped {count}: {reason}");
+        }
+        if let Some(cut) = &cut {
+            println!("the capture is not whole: {cut}");
+        }
+    }
+    if *packets + *telemetry == 0 {
+        bail!("{} has no Velodyne datagram", options.file.display());
+    }
+    Ok(())
+}
+
+struct Sender {
+    socket: UdpSocket,
+    to: SocketAddr,
+    telemetry_to: SocketAddr,
+    speed: Speed,
+    /// When the first datagram went, and its stamp.
+    started: Option<(Instant, i64)>,
+    packets: u64,
+    telemetry: u64,
+    skipped: BTreeMap<String, u64>,
+}
+
+impl Sender {
+    fn new(to: SocketAddr, telemetry_to: SocketAddr, speed: Speed) -> Result<Self> {
+        let any = if to.is_ipv4() { "0.0.0.0:0" } else { "[::]:0" };
+        let socket = UdpSocket::bind(any).context("open a UDP socket")?;
+        let skipped = BTreeMap::new();
+        Ok(Self { socket, to, telemetry_to, speed, started: None, packets: 0, telemetry: 0, skipped })
+    }
+
+    fn skip(&mut self, reason: &str, count: u64) {
+        if count > 0 {
+            *self.skipped.entry(reason.to_owned()).or_default() += count;
+        }
+    }
+
+    fn send(&mut self, stamp_ns: i64, payload: &[u8]) -> Result<()> {
+        let (to, count) = match payload.len() {
+            PACKET_BYTES => (self.to, &mut self.packets),
+            TELEMETRY_BYTES => (self.telemetry_to, &mut self.telemetry),
+            length => {
+                self.skip(&format!("{length} bytes; 1206 and 512 are sent"), 1);
+                return Ok(());
+            }
+        };
+        let (started, first_ns) = *self.started.get_or_insert_with(|| (Instant::now(), stamp_ns));
+        if let Speed::Times(times) = self.speed {
+            let due = Duration::from_secs_f64((stamp_ns.saturating_sub(first_ns)).max(0) as f64 * 1e-9 / times);
+            let pause = due.saturating_sub(started.elapsed());
+            if pause > PAUSE_MAX {
+                // Time goes on from here.
+                self.started = Some((Instant::now(), stamp_ns));
+            } else {
+                std::thread::sleep(pause);
+            }
+        }
+        match self.socket.send_to(payload, to) {
+            Ok(_) => *count += 1,
+            // An answer to an earlier datagram, on loopback: nobody listens yet, and UDP does not care.
+            Err(error) if error.kind() == std::io::ErrorKind::ConnectionRefused => *count += 1,
+            Err(error) => return Err(error).with_context(|| format!("send to {to}")),
+        }
+        Ok(())
+    }
+}
