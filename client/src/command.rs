@@ -5,7 +5,6 @@ pub mod export;
 pub mod get;
 pub mod info;
 pub mod npy;
-pub mod picture;
 pub mod recording;
 pub mod send;
 pub mod vehicles;

@@ -22,9 +22,12 @@
 //! | [`view`] | bytes -> [`MapView`]: decoded once, cheap to clone, with its age |
 //! | [`stream`] | updates -> the newest map in a slot, skips counted |
 //! | [`grpc`] | a server's address -> [`Client`] |
+//! | `picture` | a layer -> a PNG from above (feature `picture`) |
 //! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`) |
 
 pub mod grpc;
+#[cfg(feature = "picture")]
+pub mod picture;
 pub mod stream;
 pub mod view;
 #[cfg(feature = "zenoh")]

@@ -7,9 +7,9 @@ use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use clearway_client::{Layer, MapView};
 
-use super::picture::{self, Style};
 use super::recording::Recording;
 use super::{document, npy, progress_bar};
+use clearway_client::picture::{self, Style};
 
 /// Export the maps of a recording, one file a map.
 ///

@@ -8,7 +8,8 @@ use clap::Args;
 use clearway_client::{Client, now_ns};
 
 use super::export::Drawing;
-use super::{SERVER, document, npy, picture, say};
+use super::{SERVER, document, npy, say};
+use clearway_client::picture;
 
 /// Get the newest map: its figures, or with --out one layer as a file.
 #[derive(Args)]

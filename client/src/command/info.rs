@@ -72,6 +72,9 @@ fn describe(object: &Map<String, Value>, indent: &str, lines: &mut Vec<String>) 
                 describe(inner, &format!("{indent}  "), lines);
             }
             Value::Null => lines.push(format!("{indent}{key}: not known")),
+            Value::String(text) if text.contains('\n') => {
+                lines.push(format!("{indent}{key}: {} lines; --json prints them", text.lines().count()));
+            }
             Value::String(text) => lines.push(format!("{indent}{key}: {text}")),
             other => lines.push(format!("{indent}{key}: {other}")),
         }

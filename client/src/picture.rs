@@ -3,11 +3,10 @@
 //! The picture turns with the vehicle: up is ahead, not north. Classes have colours by name; a layer without classes is
 //! drawn from its first channel, dark to light.
 
-use anyhow::{Context, Result};
-use clearway_client::Layer;
+use clearway_proto::map::Layer;
 
 /// Colours told apart also by those who see no red and green: the lightness differs too.
-pub const UNKNOWN: [u8; 3] = [38, 40, 44];
+const UNKNOWN: [u8; 3] = [38, 40, 44];
 const DRIVABLE: [u8; 3] = [64, 176, 128];
 const NOT_DRIVABLE: [u8; 3] = [232, 176, 64];
 const OBSTACLE: [u8; 3] = [176, 40, 48];
@@ -19,6 +18,7 @@ const VEHICLE: [u8; 3] = [244, 244, 248];
 const VEHICLE_HALF_M: (f64, f64) = (2.2, 0.9);
 
 /// How to draw.
+#[derive(Clone, Copy, Debug)]
 pub struct Style {
     /// Edge of the picture.
     pub pixels: u32,
@@ -34,7 +34,7 @@ pub struct Style {
 ///
 /// # Errors
 /// What the PNG encoder says.
-pub fn png(layer: &Layer, style: &Style) -> Result<Vec<u8>> {
+pub fn png(layer: &Layer, style: &Style) -> Result<Vec<u8>, png::EncodingError> {
     let pixels = style.pixels as usize;
     let mut rgb = vec![0; pixels * pixels * 3];
     let range_m = style.range_m.unwrap_or(layer.grid.range_m_max());
@@ -59,9 +59,9 @@ pub fn png(layer: &Layer, style: &Style) -> Result<Vec<u8>> {
     let mut encoder = png::Encoder::new(&mut file, style.pixels, style.pixels);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_depth(png::BitDepth::Eight);
-    let mut writer = encoder.write_header().context("PNG header")?;
-    writer.write_image_data(&rgb).context("PNG pixels")?;
-    writer.finish().context("PNG end")?;
+    let mut writer = encoder.write_header()?;
+    writer.write_image_data(&rgb)?;
+    writer.finish()?;
     Ok(file)
 }
 
