@@ -125,7 +125,7 @@ pub struct DrivabilityConfig {
     pub unit_height_m: f32,
     /// Added to z before it is cut into units; half a unit puts level ground in the middle of unit 0, the thesis has 0.
     pub offset_m: f32,
-    /// Columns of a turn, a multiple of 4; 360, 180 and 90 are the thesis' 1, 2 and 4 degrees.
+    /// Columns of a turn; 360, 180 and 90 are the thesis' 1, 2 and 4 degrees.
     pub columns: u16,
     /// Where segments start to grow.
     pub seed: Seed,
@@ -133,6 +133,8 @@ pub struct DrivabilityConfig {
     pub blind_zone_m: f32,
     /// Empty rows a segment grows across; 0 is the thesis.
     pub bridge_rows: u8,
+    /// Whether a cell between two higher ones is no way through; false is the thesis.
+    pub close_gaps: bool,
     /// Greatest step between boundary cells of two segments (criterion 1); two units make it the thesis' own.
     pub step_m_max: f32,
     /// Rise over distance between boundary cells that is a slope, not a step (criterion 1).
@@ -155,6 +157,7 @@ impl Default for DrivabilityConfig {
             seed: Seed::BlindZone,
             blind_zone_m: 7.0,
             bridge_rows: 2,
+            close_gaps: true,
             step_m_max: 0.15,
             grade_max: 0.15,
             plane_error_m_max: 0.25,
@@ -184,7 +187,7 @@ pub struct HeightDifferenceConfig {
     pub range_m_max: f32,
     /// A cell whose highest and lowest points differ by more is an obstacle.
     pub difference_m_max: f32,
-    /// Columns of a turn, a multiple of 4.
+    /// Columns of a turn.
     pub columns: u16,
 }
 
@@ -303,11 +306,10 @@ fn check(
 }
 
 fn check_columns(at: &str, columns: u16) -> Result<(), ConfigError> {
-    // A quarter turn must be whole columns: the azimuth is found within its quadrant.
-    if (8..=1440).contains(&columns) && columns.is_multiple_of(4) {
+    if (8..=1440).contains(&columns) {
         Ok(())
     } else {
-        Err(ConfigError::new(format!("{at}.columns"), columns, "a multiple of 4 from 8 to 1440"))
+        Err(ConfigError::new(format!("{at}.columns"), columns, "8 to 1440"))
     }
 }
 

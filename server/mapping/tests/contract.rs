@@ -128,6 +128,10 @@ fn a_world_turned_by_90_degrees_gives_the_map_a_quarter_further() {
     for mut maker in makers() {
         let (layer, quarter) = (make(maker.as_mut(), &sweep), make(maker.as_mut(), &turned(&sweep)));
         let (_, columns) = size(&layer);
+        // A quarter of 90 columns ends within one.
+        if columns % 4 != 0 {
+            continue;
+        }
         // Segments are counted in the order they are found, which begins at column 0.
         for channel in layer.channels.iter().filter(|c| c.name != "segment") {
             let (before, after) = (values(&layer, channel.name), values(&quarter, channel.name));

@@ -195,11 +195,11 @@ fn a_high_thing_beside_the_vehicle_is_no_seed() {
 
 #[test]
 fn a_plane_is_found_through_sloping_ground() {
-    let sweep = painted(|_, _, x, y| Some(0.002 * x - 0.001 * y + 0.01));
+    let sweep = painted(|_, _, x, y| Some(0.001 * x - 0.0005 * y + 0.01));
     let layer = map(&DrivabilityConfig::default(), &sweep);
     assert_eq!(layer.planes.len(), 2);
     let [a, b, c] = layer.planes[0];
-    assert!((a - 0.002).abs() < 1e-6 && (b + 0.001).abs() < 1e-6 && (c - 0.01).abs() < 1e-5, "{a} {b} {c}");
+    assert!((a - 0.001).abs() < 1e-6 && (b + 0.0005).abs() < 1e-6 && (c - 0.01).abs() < 1e-5, "{a} {b} {c}");
     assert_eq!(layer.planes[1], [0.0; 3], "the unreachable segment has none");
 }
 

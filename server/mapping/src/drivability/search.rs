@@ -18,7 +18,7 @@ use crate::radial::RadialGrid;
 
 use super::heights::Heights;
 use super::planes::Planes;
-use super::segments::{Segments, counter_clockwise, outward};
+use super::segments::{Segments, counter_clockwise, is_step, outward};
 use super::SEGMENT_UNKNOWN;
 
 /// Which segments the vehicle can get to.
@@ -27,9 +27,12 @@ pub struct Search {
     sides: Vec<Side>,
     /// For each corner of the grid the last side that touched it.
     corners: Vec<u32>,
+    /// For each side an earlier one of its group, or itself.
     group: Vec<u32>,
+    /// Width of each group of sides of one boundary, metres, at its first side.
+    widths: Vec<f32>,
+    /// Segments drivable from one another, both ways, sorted.
     links: Vec<(u16, u16)>,
-    first_link: Vec<u32>,
     drivable: Vec<bool>,
     queue: VecDeque<u16>,
 }
@@ -85,7 +88,8 @@ impl Search {
             for other in [Some(counter_clockwise), outward].into_iter().flatten().filter(|other| reached(*other)) {
                 let (a, b) = (of_cell[cell], of_cell[other]);
                 if a != b
-                    && are_level(heights, config, cell, other)
+                    && is_step(grid, heights, config, cell, other)
+                    && is_taken(heights, config, cell, other)
                     && planes_agree(planes, heights, config, (a, cell), (b, other))
                 {
                     let segments = (a.min(b), a.max(b));
@@ -116,18 +120,21 @@ impl Search {
                     self.corners[corner] = index;
                 }
             }
-            let mut widths = vec![0.0f32; boundary.len()];
+            self.widths.clear();
+            self.widths.resize(boundary.len(), 0.0);
             for (index, side) in (first..).zip(boundary) {
                 let root = find(&mut self.group, index);
-                let width = &mut widths[(root - first) as usize];
+                let width = &mut self.widths[(root - first) as usize];
                 *width += width_m(grid, side);
                 widest = widest.max(*width);
             }
             if widest >= config.gate_m_min {
-                self.links.push(boundary[0].segments);
+                let (a, b) = boundary[0].segments;
+                self.links.extend([(a, b), (b, a)]);
             }
             first += boundary.len() as u32;
         }
+        self.links.sort_unstable();
     }
 
     /// Thesis, steps 1 and 2: breadth first from segment 0.
@@ -137,16 +144,12 @@ impl Search {
         if segments == 0 {
             return;
         }
-        let backward = self.links.iter().map(|(a, b)| (*b, *a));
-        let mut both: Vec<_> = self.links.iter().copied().chain(backward).collect();
-        both.sort_unstable();
-        self.first_link.clear();
         self.queue.clear();
         self.queue.push_back(0);
         self.drivable[0] = true;
         while let Some(segment) = self.queue.pop_front() {
-            let start = both.partition_point(|link| link.0 < segment);
-            for (_, other) in both[start..].iter().take_while(|link| link.0 == segment) {
+            let start = self.links.partition_point(|link| link.0 < segment);
+            for (_, other) in self.links[start..].iter().take_while(|link| link.0 == segment) {
                 if !self.drivable[usize::from(*other)] {
                     self.drivable[usize::from(*other)] = true;
                     self.queue.push_back(*other);
@@ -156,14 +159,11 @@ impl Search {
     }
 }
 
-/// Criterion 1: boundary cells differ by at most one unit, and their highest points by a step or a slope the vehicle
-/// takes.
-fn are_level(heights: &Heights, config: &DrivabilityConfig, cell: usize, other: usize) -> bool {
-    let units = heights.units();
+/// Criterion 1, in metres: the highest points of boundary cells differ by a step or a slope the vehicle takes.
+fn is_taken(heights: &Heights, config: &DrivabilityConfig, cell: usize, other: usize) -> bool {
     let ([xa, ya, za], [xb, yb, zb]) = (heights.points()[cell], heights.points()[other]);
     let distance = ((xa - xb) * (xa - xb) + (ya - yb) * (ya - yb)).sqrt();
-    let rise_max = config.step_m_max.max(config.grade_max * distance);
-    units[cell].abs_diff(units[other]) <= 1 && (za - zb).abs() <= rise_max
+    (za - zb).abs() <= config.step_m_max.max(config.grade_max * distance)
 }
 
 /// Criterion 2: the plane of the larger segment, carried to the boundary cell of the other, is off by little.

@@ -142,3 +142,22 @@ pub fn kitti(path: &str) -> clearway_mapping::event::Scan {
     }
     scan
 }
+
+/// UDP payloads of an Ethernet pcap, with the stamps of the capture, ns.
+#[cfg(clearway_data)]
+pub fn pcap_payloads(bytes: &[u8]) -> Vec<(&[u8], i64)> {
+    let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
+    let mut at = 24;
+    let mut payloads = Vec::new();
+    while at + 16 <= bytes.len() {
+        let (stamp_ns, length) = (i64::from(word(at)) * 1_000_000_000 + i64::from(word(at + 4)) * 1000, word(at + 8));
+        // The capture is cut off inside its last record.
+        if at + 16 + length as usize > bytes.len() {
+            break;
+        }
+        // Ethernet 14, IPv4 20, UDP 8 bytes.
+        payloads.push((&bytes[at + 16 + 42..at + 16 + length as usize], stamp_ns));
+        at += 16 + length as usize;
+    }
+    payloads
+}
