@@ -66,18 +66,19 @@ pub fn pcd(revolution: &Revolution) -> Vec<u8> {
     let (mut points, mut data) = (0_u32, Vec::new());
     for (index, firing) in revolution.firings.iter().enumerate() {
         let time = firing.offset_ns as f32 * 1e-9;
-        for laser in 0..revolution.lasers {
+        for (laser, ring) in rings.iter().enumerate().take(revolution.lasers) {
             let slot = index * revolution.lasers + laser;
             for (number, echo) in revolution.echoes.iter().enumerate() {
+                let range_m = echo.range_m[slot];
                 // 0: no return, NaN: did not fire.
-                if !(echo.range_m[slot] > 0.0) {
+                if range_m.is_nan() || range_m <= 0.0 {
                     continue;
                 }
                 let last = number == 1 || revolution.return_mode == ReturnMode::Last;
                 for value in [echo.x[slot], echo.y[slot], echo.z[slot], f32::from(echo.intensity[slot])] {
                     data.extend_from_slice(&value.to_le_bytes());
                 }
-                data.extend_from_slice(&rings[laser].to_le_bytes());
+                data.extend_from_slice(&ring.to_le_bytes());
                 data.extend_from_slice(&(laser as u16).to_le_bytes());
                 data.extend_from_slice(&time.to_le_bytes());
                 data.push(u8::from(last));

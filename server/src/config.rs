@@ -12,6 +12,9 @@ use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::{MapsConfig, SensorConfig, VehicleConfig};
 use serde::{Deserialize, Serialize};
 
+/// The configured tables by vehicle and sensor, in the order of the configuration; `None` where the factory's serves.
+pub type Calibrations = Vec<Vec<Option<Calibration>>>;
+
 /// The whole configuration.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -372,7 +375,7 @@ impl Config {
     ///
     /// # Errors
     /// [`ConfigError::Calibration`] with what is wrong and what is allowed.
-    pub fn calibrations(&self, file: &Path) -> Result<Vec<Vec<Option<Calibration>>>, ConfigError> {
+    pub fn calibrations(&self, file: &Path) -> Result<Calibrations, ConfigError> {
         let of = |vehicle: &Vehicle, sensor: &SensorConfig| {
             let Some(path) = &sensor.calibration else { return Ok(None) };
             let path = file.parent().unwrap_or(Path::new("")).join(path);
@@ -418,117 +421,4 @@ fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const COMMENTED: &str = include_str!("../../deploy/clearway.toml");
-    /// What has no default, and nothing else.
-    const NEEDED: &str = "[[vehicle]]\nname = \"car\"\n[vehicle.udp]\n[[vehicle.sensor]]\nname = \"top\"\n\
-        [vehicle.sensor.extrinsics]\nx_m = 0.0\ny_m = 0.0\nz_m = 1.9\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n";
-
-    fn parse(text: &str) -> Result<Config, ConfigError> {
-        Config::parse(text, Path::new("clearway.toml"), &[])
-    }
-
-    fn error(text: &str) -> String {
-        parse(text).unwrap_err().to_string()
-    }
-
-    /// The paths of all keys, array items without their index.
-    fn keys(value: &toml::Value, at: &str, found: &mut BTreeSet<String>) {
-        match value {
-            toml::Value::Table(table) => {
-                for (key, value) in table {
-                    let at = format!("{at}.{key}");
-                    found.insert(at.clone());
-                    keys(value, &at, found);
-                }
-            }
-            toml::Value::Array(items) => items.iter().for_each(|item| keys(item, at, found)),
-            _ => {}
-        }
-    }
-
-    #[test]
-    fn the_commented_configuration_says_the_defaults_and_all_of_them() {
-        let commented = parse(COMMENTED).unwrap();
-        assert_eq!(commented, parse(NEEDED).unwrap());
-        let (mut said, mut all) = (BTreeSet::new(), BTreeSet::new());
-        keys(&toml::from_str(COMMENTED).unwrap(), "", &mut said);
-        keys(&toml::from_str(&commented.to_toml()).unwrap(), "", &mut all);
-        let missing: Vec<_> = all.difference(&said).collect();
-        assert!(missing.is_empty(), "not in deploy/clearway.toml: {missing:?}");
-        // Keys without a default stand there as comments.
-        for optional in ["# model = ", "# rpm = ", "# calibration = ", "# top = "] {
-            assert!(COMMENTED.contains(optional), "{optional}");
-        }
-    }
-
-    #[test]
-    fn the_effective_configuration_reads_back_as_itself() {
-        let config = parse(COMMENTED).unwrap();
-        assert_eq!(parse(&config.to_toml()).unwrap(), config);
-    }
-
-    #[test]
-    fn an_unknown_key_is_refused_with_file_and_line() {
-        let error = error(&format!("[grpc]\nlisten = \"127.0.0.1:1\"\nliste = 3\n{NEEDED}"));
-        assert!(error.contains("clearway.toml") && error.contains("line 3") && error.contains("liste"), "{error}");
-        assert!(error.contains("enabled"), "what is allowed: {error}");
-    }
-
-    #[test]
-    fn a_value_out_of_bounds_is_named_with_file_key_value_and_what_is_allowed() {
-        let wrong = [
-            ("name = \"car\"", "name = \"The Car\"", "The Car"),
-            ("z_m = 1.9", "z_m = 1900.0", "0.1 to 20"),
-            ("name = \"car\"", "name = \"car\"\nqueue = 3", "16 to 1048576"),
-            ("[vehicle.udp]", "[vehicle.udp]\nfrom = { roof = \"10.0.0.1\" }", "top"),
-            ("[vehicle.udp]", "[vehicle.udp]\nreceive_buffer_bytes = 1", "65536"),
-            ("[[vehicle]]", "[zenoh]\nlisten = [\"quic/1.2.3.4:1\"]\n[[vehicle]]", "tcp/127.0.0.1:7447"),
-            ("[[vehicle]]", "[recorder]\nflush_ms = 1\n[[vehicle]]", "10 to 60000"),
-        ];
-        for (from, to, allowed) in wrong {
-            let error = error(&NEEDED.replacen(from, to, 1));
-            assert!(error.contains("clearway.toml") && error.contains(allowed), "{to}: {error}");
-        }
-        assert!(error("").contains("at least one [[vehicle]]"));
-        assert!(error(&NEEDED.replace("z_m = 1.9\n", "")).contains("z_m"), "a missing transform is an error");
-        assert!(error(&format!("{NEEDED}{NEEDED}")).contains("each vehicle its own"));
-    }
-
-    #[test]
-    fn a_calibration_that_is_none_is_named_before_anything_starts() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("clearway.toml");
-        let text = NEEDED.replace("name = \"top\"", "name = \"top\"\ncalibration = \"top.yaml\"");
-        let config = Config::parse(&text, &file, &[]).unwrap();
-        let missing = config.calibrations(&file).unwrap_err().to_string();
-        assert!(missing.contains("top.yaml") && missing.contains("vehicle.sensor.calibration"), "{missing}");
-        std::fs::write(folder.path().join("top.yaml"), "lasers: [{laser_id: nine}]").unwrap();
-        let wrong = config.calibrations(&file).unwrap_err().to_string();
-        assert!(wrong.contains("laser_id") && wrong.contains("nine"), "{wrong}");
-    }
-
-    #[test]
-    fn an_override_sets_what_the_file_says_otherwise() {
-        let set = |text: &str| Config::parse(NEEDED, Path::new("clearway.toml"), &[text.to_owned()]);
-        assert_eq!(set("grpc.listen=0.0.0.0:9").unwrap().grpc.listen.port(), 9);
-        assert_eq!(set("zenoh.enabled = false").unwrap().zenoh.enabled, false);
-        assert_eq!(set("vehicle.maps.drivability.columns=180").unwrap().vehicles[0].maps.drivability.columns, 180);
-        assert!(set("grpc.liste=1").is_err());
-        assert!(matches!(set("nonsense"), Err(ConfigError::Override { .. })));
-    }
-
-    #[test]
-    fn a_sender_is_an_address_or_a_socket() {
-        let from = |text: &str| {
-            parse(&NEEDED.replace("[vehicle.udp]", &format!("[vehicle.udp]\nfrom = {{ top = {text:?} }}")))
-        };
-        let sender = |text: &str| from(text).unwrap().vehicles[0].udp.clone().unwrap().from["top"];
-        assert!(sender("10.0.0.1").is("10.0.0.1:77".parse().unwrap()));
-        assert!(!sender("10.0.0.1:78").is("10.0.0.1:77".parse().unwrap()));
-        assert!(sender("10.0.0.1").is("[::ffff:10.0.0.1]:77".parse().unwrap()), "as a dual-stack socket shows it");
-        assert!(from("the roof").unwrap_err().to_string().contains("192.168.1.201"));
-    }
-}
+mod tests;

@@ -2,12 +2,15 @@
 //! its own; a line a second says what comes of them.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use clearway_client::picture::{self, Style};
 use clearway_mapping::config::Extrinsics;
+use clearway_proto::codec::Limits;
+use clearway_proto::map::decode_map;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
 use clearway_sim::send::{Pace, Sent, Until, drive};
@@ -18,6 +21,7 @@ use crate::config::{Config, Udp};
 use crate::ingest::now_ns;
 use crate::server::{Running, Server, Setup, StartError};
 use crate::status::Snapshot;
+use crate::wire::EncodedMap;
 
 /// What a demo is asked for.
 #[derive(Clone, Debug, Default)]
@@ -26,6 +30,8 @@ pub struct Options {
     pub duration: Option<Duration>,
     /// Where to record.
     pub record: PathBuf,
+    /// Where to draw the newest map, each second anew.
+    pub picture: PathBuf,
     /// Ports of the operating system's choice everywhere, for tests that run beside each other.
     pub any_port: bool,
 }
@@ -41,6 +47,8 @@ pub struct Places {
     pub zenoh: Vec<String>,
     /// The recording.
     pub record: PathBuf,
+    /// The newest map, drawn from above.
+    pub picture: PathBuf,
     /// What had to be chosen otherwise than usual.
     pub notes: Vec<String>,
 }
@@ -65,6 +73,14 @@ pub enum DemoError {
     /// The server did not end as it should have.
     #[error(transparent)]
     End(#[from] crate::server::EndError),
+    /// The picture could not be drawn.
+    #[error("picture {}: {reason}", file.display())]
+    Picture {
+        /// The file.
+        file: PathBuf,
+        /// Why.
+        reason: String,
+    },
     /// The simulated vehicle could not send.
     #[error("the simulated vehicle: {0}")]
     Vehicle(#[from] std::io::Error),
@@ -134,7 +150,7 @@ impl Summary {
 pub async fn demo(
     options: Options,
     begun: impl FnOnce(&Places),
-    mut second: impl FnMut(&Second, &Running),
+    mut second: impl FnMut(&Second),
     stop: impl Future<Output = ()>,
 ) -> Result<Summary, DemoError> {
     let (config, notes) = configuration(&options);
@@ -145,6 +161,7 @@ pub async fn demo(
         grpc: running.grpc.unwrap_or(nowhere),
         zenoh: running.zenoh.clone(),
         record: options.record.clone(),
+        picture: options.picture.clone(),
         notes,
     });
     let (data, telemetry) = running.doors[0].udp.unwrap_or((nowhere, nowhere));
@@ -177,7 +194,13 @@ pub async fn demo(
         tokio::select! {
             biased;
             () = &mut stop => break,
-            _ = every.tick() => second(&now(&running), &running),
+            _ = every.tick() => {
+                second(&now(&running));
+                let newest = running.vehicles.0[0].newest.borrow().clone();
+                if let Some(map) = newest {
+                    tokio::task::block_in_place(|| draw(&map, &options.picture))?;
+                }
+            }
             () = &mut end => break,
         }
         if vehicle.is_finished() {
@@ -197,6 +220,18 @@ pub async fn demo(
     let kernel_drops = last.snapshot.kernel_drops;
     let snapshot = Snapshot { kernel_drops, ..status.snapshot() };
     Ok(Summary { last: Second { snapshot, ..last }, sent })
+}
+
+/// Draws a map's drivability; whoever looks at the file sees a whole picture, the old or the new one.
+fn draw(map: &EncodedMap, file: &Path) -> Result<(), DemoError> {
+    let wrong = |reason: String| DemoError::Picture { file: file.to_owned(), reason };
+    let map = decode_map(map.select(&["drivability".into()]), &Limits::default()).map_err(|e| wrong(e.to_string()))?;
+    let Some(layer) = map.layer("drivability") else { return Ok(()) };
+    let style = Style { pixels: 640, range_m: None, rings_m: Some(10.0), vehicle: true };
+    let bytes = picture::png(layer, &style).map_err(|error| wrong(error.to_string()))?;
+    let unfinished = file.with_extension("png.part");
+    std::fs::write(&unfinished, bytes).map_err(|error| wrong(error.to_string()))?;
+    std::fs::rename(&unfinished, file).map_err(|error| wrong(error.to_string()))
 }
 
 /// The usual ports where they are free, any where they are not.

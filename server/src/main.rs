@@ -273,7 +273,7 @@ async fn replay_files(arguments: ReplayArguments) -> Result<ExitCode> {
     if json {
         say(&format!("{:#}\n", summary.to_json()));
     } else {
-        say(&text(&summary));
+        say(&summary.to_text());
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -300,45 +300,12 @@ async fn draw(progress: Arc<Progress>, shown: bool) {
     }
 }
 
-/// A summary for people.
-fn text(summary: &Summary) -> String {
-    let snapshot = &summary.snapshot;
-    let ledger = &snapshot.ledger;
-    let mut lines = vec![format!(
-        "{} received, {} decoded, {} telemetry, {} refused, {} lost",
-        ledger.received,
-        ledger.decoded,
-        ledger.telemetry,
-        snapshot.refused(),
-        ledger.lost
-    )];
-    lines.extend(ledger.refused.iter().map(|(reason, n)| format!("  refused for {reason}: {n}")));
-    for sensor in &snapshot.sensors {
-        let model = sensor.status.model.map_or("unknown model", clearway_mapping::pipeline::model_name);
-        let rpm = sensor.status.rpm.map_or(String::new(), |rpm| format!(", {rpm:.0} rpm"));
-        let (revolutions, returns) = (sensor.status.revolutions, sensor.status.returns);
-        lines.push(format!("{}: {model}{rpm}, {revolutions} revolutions, {returns} returns", sensor.name));
-    }
-    let share =
-        snapshot.drivable_share.map_or(String::new(), |share| format!(", newest {:.1} % drivable", 100.0 * share));
-    lines.push(format!("{} maps{share}", snapshot.maps));
-    if let (Some(p50), Some(p99)) = (snapshot.latency_ms_p50, snapshot.latency_ms_p99) {
-        lines.push(format!("a map took {p50:.2} ms in the median, {p99:.2} ms at the 99th percentile"));
-    }
-    if let Some(record) = &summary.record {
-        lines.push(format!("recorded {}", record.display()));
-    }
-    if summary.clouds > 0 {
-        lines.push(format!("{} point clouds written", summary.clouds));
-    }
-    lines.join("\n") + "\n"
-}
-
 async fn run_demo(seconds: Option<f64>, record: Option<PathBuf>, json: bool) -> Result<ExitCode> {
     let duration = seconds.map(Duration::try_from_secs_f64).transpose().context("--seconds: a time is needed")?;
     let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
     let record = record.unwrap_or_else(|| folder.join("demo.mcap"));
-    let options = demo::Options { duration, record, any_port: false };
+    let picture = record.with_extension("png");
+    let options = demo::Options { duration, record, picture, any_port: false };
     let begun = |places: &Places| {
         if json {
             return;
@@ -346,15 +313,16 @@ async fn run_demo(seconds: Option<f64>, record: Option<PathBuf>, json: bool) -> 
         places.notes.iter().for_each(|note| say(&format!("{note}\n")));
         say(&format!(
             "A simulated car drives through a simulated town.\n  page       http://{}/\n  gRPC       {}   (clearway watch \
-             --server http://{})\n  zenoh      {}   (clearway/car/map/drivability)\n  recording  {}\n",
+             --server http://{})\n  zenoh      {}   (clearway/car/map/drivability)\n  recording  {}\n  newest map {}   (drawn each second)\n",
             places.page,
             places.grpc,
             places.grpc,
             places.zenoh.join(", "),
             places.record.display(),
+            places.picture.display(),
         ));
     };
-    let second = |second: &Second, _: &Running| {
+    let second = |second: &Second| {
         say(&if json { format!("{}\n", second.to_json()) } else { format!("{}\n", second.line()) });
     };
     let stop = stop_signal()?;

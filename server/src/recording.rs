@@ -17,7 +17,7 @@ use mcap::sans_io::LinearReaderOptions;
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader};
 use mcap::{McapError, parse_record};
 
-use crate::config::{Config, ConfigError};
+use crate::config::{Calibrations, Config, ConfigError};
 use crate::wire::{EventError, event_from_bytes};
 
 /// No chunk of ours exceeds a few MiB; a length beyond this is damage, refused before it is allocated.
@@ -189,7 +189,7 @@ impl Recording {
     ///
     /// # Errors
     /// [`RecordingError`] where either is missing or unreadable.
-    pub fn config(&self) -> Result<(Config, Vec<Vec<Option<Calibration>>>), RecordingError> {
+    pub fn config(&self) -> Result<(Config, Calibrations), RecordingError> {
         let text = self.preface.config.as_ref().ok_or_else(|| RecordingError::NoConfig { file: self.file.clone() })?;
         let config = Config::parse(text, &self.file.join("config.toml"), &[])?;
         let table = |vehicle: &str, sensor: &clearway_mapping::config::SensorConfig| {

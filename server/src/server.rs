@@ -14,7 +14,7 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-use crate::config::Config;
+use crate::config::{Calibrations, Config};
 use crate::engine::{Engine, Observer, layers};
 use crate::ingest::{Door, door, udp};
 use crate::publish::{Served, Vehicles, grpc, page};
@@ -30,7 +30,7 @@ pub struct Setup {
     /// Checked.
     pub config: Config,
     /// Of every sensor, as [`Config::calibrations`] gives them.
-    pub calibrations: Vec<Vec<Option<Calibration>>>,
+    pub calibrations: Calibrations,
     /// Names this run in maps and recordings; drawn where absent.
     pub boot_id: Option<u64>,
     /// Events come from files: a full recorder queue holds them up, instead of losing anything.

@@ -1,0 +1,180 @@
+//! Everything a replay knows before its first event: which files, whose configuration, how the sensor is mounted.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use clearway_lidar::calibration::Calibration;
+use clearway_lidar::model::Model;
+use clearway_lidar::revolution::{Echo, Revolution};
+use clearway_lidar::sensor::{Sensor, SensorConfig as LidarConfig};
+use clearway_mapping::config::{Extrinsics, SensorConfig};
+use clearway_mapping::event::{Body, Scan};
+use clearway_mapping::mount::estimate;
+
+use super::{Mount, Options, ReplayError, describe};
+use crate::clouds::{Clouds, Written};
+use crate::config::{Calibrations, Config, Recorder};
+use crate::ingest::files::{Kind, Readings};
+use crate::recording::Recording;
+use crate::server::Setup;
+
+/// Revolutions the mount is estimated from.
+const MOUNT_REVOLUTIONS: usize = 10;
+
+/// Everything known before the first event.
+pub(super) struct Plan {
+    pub(super) setup: Setup,
+    pub(super) mount: Mount,
+    pub(super) extrinsics: Extrinsics,
+    pub(super) readings: Readings,
+    /// How many clouds were written, or why no more.
+    pub(super) clouds: Option<Written>,
+}
+
+pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
+    let open = || Readings::open(&options.files, options.vehicle.as_deref());
+    let readings = open()?;
+    let recorded = readings.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
+    let scans = readings.files().all(|(_, kind)| kind == Kind::Scan);
+    let (mut config, mut tables, boot_id, given) = configured(options, recorded.as_deref())?;
+    let vehicle = &mut config.vehicles[0];
+    vehicle.udp = None;
+    let sensor = &mut vehicle.sensors[0];
+    sensor.model = options.model.or(sensor.model);
+    // Scans do not tell who made them, and KITTI's were made by this one.
+    if scans && sensor.model.is_none() && tables[0][0].is_none() {
+        sensor.model = Some(Model::Hdl64eS2);
+    }
+    sensor.rpm = options.rpm.or(sensor.rpm);
+    if let Some(file) = &options.calibration {
+        sensor.calibration = Some(file.display().to_string());
+        tables = config.calibrations(Path::new(""))?;
+    }
+    let sensor = &mut config.vehicles[0].sensors[0];
+    let mut remarks = Vec::new();
+    let mount = match options.extrinsics {
+        Some(extrinsics) => {
+            sensor.extrinsics = extrinsics;
+            Mount::Given
+        }
+        None if given => Mount::Given,
+        None => {
+            let revolutions = first_revolutions(open()?, sensor, tables[0][0].clone())?;
+            if revolutions.is_empty() {
+                Mount::Unneeded
+            } else {
+                let estimate = estimate(&revolutions).map_err(|source| ReplayError::Mount { source })?;
+                sensor.extrinsics = estimate.extrinsics();
+                remarks.push(format!("extrinsics of {}: {}", sensor.name, describe(&estimate)));
+                Mount::Estimated(estimate)
+            }
+        }
+    };
+    let extrinsics = sensor.extrinsics;
+    config.recorder.file = options.record.clone().unwrap_or_default();
+    if !options.serve {
+        (config.grpc.enabled, config.page.enabled, config.zenoh.enabled) = (false, false, false);
+    }
+    config.check(options.config.as_deref().unwrap_or(Path::new("(replay)")))?;
+    // The same files and settings name the same run; served maps need a name of their own, or a reader that saw them
+    // before would take them for old ones.
+    let boot_id = boot_id.or_else(|| (!options.serve).then(|| fingerprint(&config, &options.files)));
+    let mut notes = BTreeMap::new();
+    if let Some(remark) = remarks.first() {
+        notes.insert("mount".to_owned(), remark.clone());
+    }
+    let clouds = options.clouds.as_deref().map(Clouds::create).transpose()?;
+    let (observer, clouds) = clouds.map(Clouds::observer).unzip();
+    let setup = Setup { config, calibrations: tables, boot_id, from_files: true, remarks, notes, observer };
+    Ok(Plan { setup, mount, extrinsics, readings, clouds })
+}
+
+type Configured = (Config, Calibrations, Option<u64>, bool);
+
+/// The configuration, the calibration tables, the boot id to keep, and whether the extrinsics are known: from `--config`,
+/// else from the recording itself, else plain.
+fn configured(options: &Options, recorded: Option<&Path>) -> Result<Configured, ReplayError> {
+    let pick = |config: &mut Config, tables: &mut Calibrations| {
+        let index = match &options.vehicle {
+            None => 0,
+            Some(name) => config.vehicles.iter().position(|v| v.name == *name).ok_or_else(|| ReplayError::Vehicle {
+                name: name.clone(),
+                known: config.vehicles.iter().map(|v| v.name.as_str()).collect::<Vec<_>>().join(", "),
+            })?,
+        };
+        config.vehicles = vec![config.vehicles.swap_remove(index)];
+        *tables = vec![tables.swap_remove(index)];
+        Ok::<_, ReplayError>(())
+    };
+    if let Some(file) = &options.config {
+        let mut config = Config::load(file, &options.set)?;
+        let mut tables = config.calibrations(file)?;
+        pick(&mut config, &mut tables)?;
+        return Ok((config, tables, None, true));
+    }
+    if let Some(file) = recorded {
+        let recording = Recording::open(file)?;
+        if recording.preface().config.is_some() {
+            let (mut config, mut tables) = recording.config()?;
+            pick(&mut config, &mut tables)?;
+            // What the recording says of its own publishers and files is not for this run.
+            let config = Config { vehicles: config.vehicles, ..Config::default() };
+            return Ok((config, tables, Some(recording.preface().boot_id), true));
+        }
+    }
+    Ok((Config::of_one_vehicle("car", "top"), vec![vec![None]], None, false))
+}
+
+/// The points of the first revolutions (or scans), sensor frame, metres.
+fn first_revolutions(
+    readings: Readings,
+    config: &SensorConfig,
+    calibration: Option<Calibration>,
+) -> Result<Vec<Vec<[f32; 3]>>, ReplayError> {
+    let mut sensor = Sensor::new(LidarConfig {
+        model: config.model,
+        rpm: config.rpm,
+        calibration,
+        cut_azimuth_deg: config.cut_azimuth_deg,
+    });
+    let mut clouds = Vec::new();
+    for reading in readings {
+        let reading = reading?;
+        match &reading.body {
+            // What is refused is counted and named on the real pass.
+            Body::Datagram(payload) => {
+                if let Ok(Some(revolution)) = sensor.push(payload, reading.arrival_ns) {
+                    clouds.push(points_of(revolution));
+                }
+            }
+            Body::Scan(scan) => clouds.push(points_of_scan(scan)),
+            Body::End => clouds.extend(sensor.finish().map(points_of)),
+            Body::EgoPose(_) | Body::Lost(_) => {}
+        }
+        if clouds.len() >= MOUNT_REVOLUTIONS {
+            break;
+        }
+    }
+    Ok(clouds)
+}
+
+fn points_of(revolution: &Revolution) -> Vec<[f32; 3]> {
+    let echo = revolution.echoes.first();
+    let returned = |echo: &Echo| {
+        let slots = (0..echo.range_m.len()).filter(|&slot| echo.range_m[slot] > 0.0);
+        slots.map(|slot| [echo.x[slot], echo.y[slot], echo.z[slot]]).collect()
+    };
+    echo.map(returned).unwrap_or_default()
+}
+
+fn points_of_scan(scan: &Scan) -> Vec<[f32; 3]> {
+    scan.x.iter().zip(&scan.y).zip(&scan.z).map(|((&x, &y), &z)| [x, y, z]).collect()
+}
+
+/// FNV-1a over settings and file names.
+fn fingerprint(config: &Config, files: &[PathBuf]) -> u64 {
+    let settings = Config { recorder: Recorder::default(), ..config.clone() }.to_toml();
+    let names = files.iter().filter_map(|file| file.file_name()).flat_map(|name| name.as_encoded_bytes());
+    let bytes = settings.as_bytes().iter().chain(names);
+    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
+}

@@ -1,0 +1,140 @@
+//! What came of a replay, for programs and for people.
+
+use std::path::PathBuf;
+
+use clearway_mapping::config::Extrinsics;
+use clearway_mapping::mount::MountEstimate;
+use clearway_mapping::pipeline::model_name;
+use serde_json::{Value, json};
+
+use crate::ingest::files::Truncated;
+use crate::status::Snapshot;
+
+/// Where the mount came from.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Mount {
+    /// Options, configuration or recording.
+    Given,
+    /// The ground in the first revolutions.
+    Estimated(MountEstimate),
+    /// Nowhere: the files hold no revolution.
+    Unneeded,
+}
+
+/// What came of a replay.
+#[derive(Clone, Debug)]
+pub struct Summary {
+    /// Ledger, sensors, maps, latency.
+    pub snapshot: Snapshot,
+    /// The extrinsics used.
+    pub extrinsics: Extrinsics,
+    /// Where they came from.
+    pub mount: Mount,
+    /// Files that ended in the middle of something.
+    pub truncated: Vec<Truncated>,
+    /// What else is worth knowing.
+    pub notes: Vec<String>,
+    /// Point clouds written.
+    pub clouds: u64,
+    /// Wall time.
+    pub seconds: f64,
+    /// The recording written.
+    pub record: Option<PathBuf>,
+}
+
+impl Summary {
+    /// One object with all of it.
+    pub fn to_json(&self) -> Value {
+        let Snapshot { ledger, sensors, .. } = &self.snapshot;
+        let sensors = sensors.iter().map(|sensor| {
+            let model = sensor.status.model.map(model_name);
+            json!({
+                "name": sensor.name, "model": model, "returns": sensor.status.returns, "rpm": sensor.status.rpm,
+                "revolutions": sensor.status.revolutions,
+            })
+        });
+        let e = &self.extrinsics;
+        let mut mount = json!({
+            "source": match self.mount {
+                Mount::Given => "given",
+                Mount::Estimated(_) => "estimated",
+                Mount::Unneeded => "none",
+            },
+            "x_m": e.x_m, "y_m": e.y_m, "z_m": e.z_m,
+            "roll_deg": e.roll_deg, "pitch_deg": e.pitch_deg, "yaw_deg": e.yaw_deg,
+        });
+        if let Mount::Estimated(estimate) = &self.mount {
+            mount["revolutions"] = estimate.revolutions.into();
+            mount["residual_m"] = estimate.residual_m.into();
+            mount["inliers"] = estimate.inliers.into();
+            mount["samples"] = estimate.samples.into();
+        }
+        let truncated = self.truncated.iter().map(|t| json!({ "file": t.file, "reason": t.reason }));
+        json!({
+            "packets": { "received": ledger.received, "decoded": ledger.decoded, "refused": ledger.refused },
+            "telemetry": ledger.telemetry,
+            "lost": ledger.lost,
+            "revolutions": self.snapshot.revolutions(),
+            "maps": self.snapshot.maps,
+            "sensors": sensors.collect::<Vec<_>>(),
+            "latency_ms": { "p50": self.snapshot.latency_ms_p50, "p99": self.snapshot.latency_ms_p99 },
+            "drivable_share": self.snapshot.drivable_share,
+            "mount": mount,
+            "truncated": truncated.collect::<Vec<_>>(),
+            "notes": self.notes,
+            "clouds": self.clouds,
+            "record": self.record,
+            "seconds": self.seconds,
+        })
+    }
+
+    /// A few lines for people.
+    pub fn to_text(&self) -> String {
+        let summary = self;
+        let snapshot = &summary.snapshot;
+        let ledger = &snapshot.ledger;
+        let mut lines = vec![format!(
+            "{} received, {} decoded, {} telemetry, {} refused, {} lost",
+            ledger.received,
+            ledger.decoded,
+            ledger.telemetry,
+            snapshot.refused(),
+            ledger.lost
+        )];
+        lines.extend(ledger.refused.iter().map(|(reason, n)| format!("  refused for {reason}: {n}")));
+        for sensor in &snapshot.sensors {
+            let model = sensor.status.model.map_or("unknown model", model_name);
+            let rpm = sensor.status.rpm.map_or(String::new(), |rpm| format!(", {rpm:.0} rpm"));
+            let (revolutions, returns) = (sensor.status.revolutions, sensor.status.returns);
+            lines.push(format!("{}: {model}{rpm}, {revolutions} revolutions, {returns} returns", sensor.name));
+        }
+        let share =
+            snapshot.drivable_share.map_or(String::new(), |share| format!(", newest {:.1} % drivable", 100.0 * share));
+        lines.push(format!("{} maps{share}", snapshot.maps));
+        if let (Some(p50), Some(p99)) = (snapshot.latency_ms_p50, snapshot.latency_ms_p99) {
+            lines.push(format!("a map took {p50:.2} ms in the median, {p99:.2} ms at the 99th percentile"));
+        }
+        if let Some(record) = &summary.record {
+            lines.push(format!("recorded {}", record.display()));
+        }
+        if summary.clouds > 0 {
+            lines.push(format!("{} point clouds written", summary.clouds));
+        }
+        lines.join("\n") + "\n"
+    }
+}
+
+/// An estimate in one line.
+pub fn describe(estimate: &MountEstimate) -> String {
+    format!(
+        "estimated from the ground in {} revolutions: height {:.3} m, pitch {:.2} deg, roll {:.2} deg ({} of {} places on \
+         one plane, residual {:.3} m)",
+        estimate.revolutions,
+        estimate.height_m,
+        estimate.pitch_rad.to_degrees(),
+        estimate.roll_rad.to_degrees(),
+        estimate.inliers,
+        estimate.samples,
+        estimate.residual_m,
+    )
+}
