@@ -1,0 +1,70 @@
+//! A capture written here goes through `clearway send` to sockets here.
+
+mod common;
+
+use std::net::UdpSocket;
+use std::time::Duration;
+
+use common::{clearway, text};
+use serde_json::Value;
+
+/// A pcap of Ethernet frames with one UDP datagram each.
+fn pcap(payloads: &[Vec<u8>]) -> Vec<u8> {
+    let mut file = vec![0xd4, 0xc3, 0xb2, 0xa1, 2, 0, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff, 0, 0, 1, 0, 0, 0];
+    for (index, payload) in payloads.iter().enumerate() {
+        let mut frame = vec![0xff; 12];
+        frame.extend([0x08, 0x00, 0x45, 0]);
+        frame.extend((28 + payload.len() as u16).to_be_bytes());
+        frame.extend([0, 0, 0, 0, 64, 17, 0, 0, 192, 168, 1, 201, 255, 255, 255, 255]);
+        frame.extend([2368_u16, 2368, 8 + payload.len() as u16, 0].iter().flat_map(|v| v.to_be_bytes()));
+        frame.extend(payload);
+        let length = (frame.len() as u32).to_le_bytes();
+        file.extend(1_700_000_000_u32.to_le_bytes());
+        file.extend((1000 * index as u32).to_le_bytes());
+        file.extend(length);
+        file.extend(length);
+        file.extend(frame);
+    }
+    file
+}
+
+fn received(socket: &UdpSocket) -> Vec<Vec<u8>> {
+    let mut buffer = [0; 2048];
+    let mut datagrams = Vec::new();
+    // All was sent before this is read: loopback delivers at once.
+    socket.set_read_timeout(Some(Duration::from_millis(200))).unwrap();
+    while let Ok(length) = socket.recv(&mut buffer) {
+        datagrams.push(buffer[..length].to_vec());
+    }
+    datagrams
+}
+
+#[test]
+fn data_and_telemetry_go_their_ways_unchanged_and_the_rest_is_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("drive.pcap");
+    let payloads = [vec![1; 1206], vec![2; 512], vec![3; 100], vec![4; 1206]];
+    let mut bytes = pcap(&payloads);
+    bytes.truncate(bytes.len() - 1);
+    std::fs::write(&file, &bytes).unwrap();
+    let (data, telemetry) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
+    let target = |socket: &UdpSocket| format!("udp://{}", socket.local_addr().unwrap());
+    let (to, telemetry_to) = (target(&data), target(&telemetry));
+    let path = file.to_str().unwrap();
+    let done = clearway(&["send", path, "--to", &to, "--telemetry-to", &telemetry_to, "--speed", "max", "--json"]);
+    assert!(done.status.success(), "{}", text(&done.stderr));
+    assert_eq!(received(&data), [vec![1; 1206]]);
+    assert_eq!(received(&telemetry), [vec![2; 512]]);
+    let document: Value = serde_json::from_slice(&done.stdout).unwrap();
+    assert_eq!((&document["packets"], &document["telemetry"]), (&1.into(), &1.into()));
+    assert_eq!(document["skipped"]["100 bytes; 1206 and 512 are sent"], 1);
+    assert!(document["cut"].as_str().unwrap().contains("cut off"), "the last packet lacks a byte: {document}");
+}
+
+#[test]
+fn what_is_no_target_is_refused_with_what_is_allowed() {
+    let done = clearway(&["send", "/nowhere", "--to", "tcp://127.0.0.1:1"]);
+    assert_eq!(done.status.code(), Some(1));
+    assert!(text(&done.stderr).contains("udp://HOST:PORT is allowed"), "{}", text(&done.stderr));
+    assert_eq!(clearway(&["send", "/nowhere", "--to", "udp://127.0.0.1:1", "--speed", "0"]).status.code(), Some(2));
+}

@@ -1,0 +1,135 @@
+//! A client against a small service in this process.
+
+mod common;
+
+use std::pin::Pin;
+use std::sync::Mutex;
+
+use clearway_client::v1::map_service_server::{MapService, MapServiceServer};
+use clearway_client::{Client, ClientError, Subscription, v1};
+use common::{CAPTURE_END_NS, map};
+use futures::{Stream, stream};
+use tokio::sync::mpsc;
+use tonic::{Request, Response, Status, Streaming};
+
+type Updates = Vec<Result<v1::MapUpdate, Status>>;
+
+/// Sends what it was given; tells every request it gets.
+struct Script {
+    updates: Mutex<Updates>,
+    requests: mpsc::UnboundedSender<v1::WatchRequest>,
+}
+
+#[tonic::async_trait]
+impl MapService for Script {
+    type WatchStream = Pin<Box<dyn Stream<Item = Result<v1::MapUpdate, Status>> + Send>>;
+
+    async fn watch(
+        &self,
+        request: Request<Streaming<v1::WatchRequest>>,
+    ) -> Result<Response<Self::WatchStream>, Status> {
+        let mut requests = request.into_inner();
+        let told = self.requests.clone();
+        tokio::spawn(async move {
+            while let Ok(Some(request)) = requests.message().await {
+                let _ = told.send(request);
+            }
+        });
+        let updates = std::mem::take(&mut *self.updates.lock().unwrap());
+        Ok(Response::new(Box::pin(stream::iter(updates))))
+    }
+
+    async fn get_map(&self, request: Request<v1::GetMapRequest>) -> Result<Response<v1::MapUpdate>, Status> {
+        match request.into_inner().vehicle.as_str() {
+            "alpha" => Ok(Response::new(v1::MapUpdate { map: map(9, CAPTURE_END_NS), ..Default::default() })),
+            other => Err(Status::not_found(format!("no vehicle {other:?}; there is alpha"))),
+        }
+    }
+
+    async fn list_vehicles(
+        &self,
+        _: Request<v1::ListVehiclesRequest>,
+    ) -> Result<Response<v1::ListVehiclesResponse>, Status> {
+        let alpha = v1::Vehicle { name: "alpha".into(), maps: 10, ..Default::default() };
+        Ok(Response::new(v1::ListVehiclesResponse { vehicles: vec![alpha] }))
+    }
+}
+
+async fn serve(updates: Updates) -> (String, mpsc::UnboundedReceiver<v1::WatchRequest>) {
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let (requests, told) = mpsc::unbounded_channel();
+    let service = MapServiceServer::new(Script { updates: Mutex::new(updates), requests });
+    let incoming = tonic::transport::server::TcpIncoming::from(listener);
+    tokio::spawn(tonic::transport::Server::builder().add_service(service).serve_with_incoming(incoming));
+    (address, told)
+}
+
+fn update(sequence: u64, skipped: u64) -> Result<v1::MapUpdate, Status> {
+    Ok(v1::MapUpdate { map: map(sequence, CAPTURE_END_NS), skipped, sent_ns: 0 })
+}
+
+#[tokio::test]
+async fn every_map_is_acknowledged_and_the_newest_is_handed_out_with_the_skipped_ones_counted() {
+    let (address, mut told) = serve(vec![update(0, 0), update(3, 2), update(4, 0)]).await;
+    let client = Client::connect(&address).await.unwrap();
+    let layers = vec!["drivability".to_string()];
+    let mut maps = client.subscribe(Subscription { layers: layers.clone(), ..Default::default() }).await.unwrap();
+    let selection = told.recv().await.unwrap().selection.unwrap();
+    assert_eq!(selection, v1::Selection { vehicle: String::new(), layers, max_in_flight: 2 });
+    for sequence in [0, 3, 4] {
+        assert_eq!(told.recv().await.unwrap().acknowledged, Some(sequence));
+    }
+    // However the looks fell between the updates, every map was either given or counted.
+    let (mut given, mut skipped, mut newest) = (0, 0, None);
+    let ended = loop {
+        match maps.next().await {
+            Ok(update) => {
+                given += 1;
+                skipped += update.skipped;
+                newest = Some(update.map.sequence());
+            }
+            Err(error) => break error,
+        }
+    };
+    assert!(matches!(ended, ClientError::Ended { .. }), "{ended}");
+    assert_eq!(newest, Some(4));
+    assert!(given >= 1 && given + skipped <= 5, "{given} given, {skipped} skipped of 5");
+    assert_eq!(maps.newest().unwrap().sequence(), 4);
+}
+
+#[tokio::test]
+async fn a_map_that_is_not_right_ends_the_stream_instead_of_being_shown() {
+    let spoilt = v1::MapUpdate { map: map(1, CAPTURE_END_NS).slice(..100), ..Default::default() };
+    let (address, _told) = serve(vec![Ok(spoilt)]).await;
+    let client = Client::connect(&address).await.unwrap();
+    let mut maps = client.subscribe(Subscription::default()).await.unwrap();
+    let error = maps.next().await.unwrap_err();
+    assert!(matches!(error, ClientError::Map(_)), "{error}");
+    assert!(maps.newest().is_none());
+}
+
+#[tokio::test]
+async fn the_servers_refusal_reaches_the_caller_in_its_words() {
+    let (address, _told) = serve(vec![Err(Status::unavailable("the vehicle's engine has stopped"))]).await;
+    let client = Client::connect(&format!("http://{address}")).await.unwrap();
+    assert_eq!(client.vehicles().await.unwrap()[0].name, "alpha");
+    assert_eq!(client.newest("alpha", &[]).await.unwrap().sequence(), 9);
+    let error = client.newest("beta", &[]).await.unwrap_err().to_string();
+    assert!(error.contains("no vehicle \"beta\"; there is alpha (NotFound)"), "{error}");
+    let mut maps = client.subscribe(Subscription::default()).await.unwrap();
+    let error = maps.next().await.unwrap_err().to_string();
+    assert!(error.contains("the vehicle's engine has stopped (Unavailable)"), "{error}");
+}
+
+#[tokio::test]
+async fn bad_addresses_are_named_with_what_is_allowed() {
+    for address in ["localhost", "localhost:", ":50051", "localhost:70000", "https://localhost:1", "a b:1"] {
+        let error = Client::connect(address).await.unwrap_err();
+        assert!(matches!(error, ClientError::Address { .. }), "{address}: {error}");
+        assert!(error.to_string().contains("HOST:PORT or http://HOST:PORT is allowed"), "{error}");
+    }
+    let closed = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
+    let error = Client::connect(&closed.to_string()).await.unwrap_err();
+    assert!(error.to_string().starts_with("no clearway-server answers at http://127.0.0.1:"), "{error}");
+}

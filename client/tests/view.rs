@@ -1,0 +1,72 @@
+//! Look-ups in metres and age.
+
+mod common;
+
+use clearway_client::{ClientError, MapView};
+use common::{CAPTURE_END_NS, map};
+
+fn view() -> MapView {
+    MapView::decode(map(5, CAPTURE_END_NS)).unwrap()
+}
+
+#[test]
+fn the_class_at_a_point_is_that_of_the_cell_around_it() {
+    let view = view();
+    let layer = view.layer("drivability").unwrap();
+    let expected = [
+        ((5.0, 5.0), "drivable"),
+        ((-5.0, 5.0), "not_drivable"),
+        ((-5.0, -5.0), "unknown"),
+        ((5.0, -5.0), "drivable"),
+        ((10.0, -10.0), "obstacle"),
+        ((20.0, -15.0), "drivable"),
+        // A bench belongs to the row inside of it, a column starts at its azimuth.
+        ((10.0, 0.0), "drivable"),
+        ((0.0, 15.0), "not_drivable"),
+        ((0.0, -10.0), "drivable"),
+        ((0.0, -10.1), "obstacle"),
+        ((0.0, 0.0), "drivable"),
+        // Outside of the grid, and nowhere.
+        ((30.1, 0.0), "unknown"),
+        ((-25.0, 25.0), "unknown"),
+        ((f64::NAN, 0.0), "unknown"),
+        ((f64::INFINITY, 0.0), "unknown"),
+    ];
+    for ((x, y), class) in expected {
+        assert_eq!(layer.class_at(x, y).1, class, "at ({x}, {y})");
+    }
+    assert_eq!(layer.class_at(10.0, -10.0), (3, "obstacle"));
+}
+
+#[test]
+fn a_value_is_scaled_and_nothing_where_it_is_unknown() {
+    let view = view();
+    let layer = view.layer("drivability").unwrap();
+    assert_eq!(layer.value_at("unit_height", 10.0, -10.0), Some(3.5));
+    assert_eq!(layer.value_at("unit_height", -5.0, -5.0), None, "marked unknown");
+    assert_eq!(layer.value_at("unit_height", 100.0, 0.0), None, "outside");
+    assert_eq!(layer.value_at("speed", 10.0, -10.0), None, "no such channel");
+}
+
+#[test]
+fn a_map_is_stale_when_its_validity_has_passed_or_its_age_is_not_known() {
+    let view = view();
+    let ms = 1_000_000;
+    assert_eq!(view.age_ms(CAPTURE_END_NS + 40 * ms), 40.0);
+    assert!(!view.is_stale(CAPTURE_END_NS));
+    assert!(!view.is_stale(CAPTURE_END_NS + 300 * ms));
+    assert!(view.is_stale(CAPTURE_END_NS + 300 * ms + 1));
+    assert!(!view.is_stale(CAPTURE_END_NS - 300 * ms), "clocks may differ a little");
+    assert!(view.is_stale(CAPTURE_END_NS - 301 * ms), "a clock this far behind cannot tell the age");
+    assert!(view.is_stale(i64::MAX) && view.is_stale(i64::MIN));
+}
+
+#[test]
+fn an_unknown_layer_is_named_with_those_there_are() {
+    match view().layer("roughness") {
+        Err(ClientError::NoLayer { layer, present }) => {
+            assert_eq!((layer.as_str(), present), ("roughness", vec!["drivability".to_string()]));
+        }
+        other => panic!("{other:?}"),
+    }
+}
