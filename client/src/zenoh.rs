@@ -87,8 +87,10 @@ impl ZenohClient {
         let subscriber = self.session.declare_subscriber(key.clone()).with(RingChannel::new(1));
         let subscriber = subscriber.await.map_err(failed(format!("subscribe to {key}")))?;
         let first = query(&self.session, &key).await?;
-        let address = self.endpoint.clone();
+        // The session closes with its last clone, and takes the subscriber along: the stream keeps one.
+        let Self { session, endpoint: address } = self.clone();
         Ok(MapStream::spawn(move |feed| async move {
+            let _session = session;
             let mut last = None;
             if let Some(bytes) = first
                 && let Err(error) = offer(&feed, &mut last, bytes)
