@@ -253,6 +253,7 @@ fn configuration(options: &Options) -> (Config, Vec<String>) {
     config.grpc.listen = port("gRPC", config.grpc.listen);
     config.page.listen = port("page", config.page.listen);
     let zenoh = port("zenoh", SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 7447));
+    config.zenoh.enabled = cfg!(feature = "zenoh");
     config.zenoh.listen = vec![format!("tcp/{zenoh}")];
     config.recorder.file = options.record.clone();
     let vehicle = &mut config.vehicles[0];

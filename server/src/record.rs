@@ -250,6 +250,9 @@ impl Tape {
             .compression(Some(Compression::Zstd))
             // In the recorder's own thread: by default each writer starts a thread a core.
             .compression_threads(0)
+            // A chunk goes to the file whole, its length first: else a crash would leave one with a length of 0, which
+            // no reader can tell from damage.
+            .disable_seeking(true)
             .create(BufWriter::new(file))?;
         let names: Vec<&str> = preface.vehicles.iter().map(|(name, _)| &**name).collect();
         let mut metadata = preface.notes.clone();

@@ -140,6 +140,9 @@ impl Server {
     /// [`StartError`], after which nothing is left running.
     pub async fn start(setup: Setup) -> Result<Running, StartError> {
         let Setup { config, mut calibrations, boot_id, from_files, remarks, notes, mut observer } = setup;
+        if config.zenoh.enabled && !cfg!(feature = "zenoh") {
+            return Err(StartError::NoZenoh);
+        }
         let boot_id = boot_id.unwrap_or_else(random);
         calibrations.resize_with(config.vehicles.len(), Vec::new);
         let mut pipelines = Vec::new();
@@ -215,10 +218,6 @@ impl Server {
                     tracing::error!(%error, "page ended");
                 }
             });
-        }
-        #[cfg(not(feature = "zenoh"))]
-        if config.zenoh.enabled {
-            return Err(StartError::NoZenoh);
         }
         #[cfg(feature = "zenoh")]
         let publisher = match config.zenoh.enabled {

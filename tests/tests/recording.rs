@@ -180,3 +180,58 @@ fn a_foreign_mcap_file_is_no_recording() {
         "{error}"
     );
 }
+
+/// A server of its own process, recording to `file`; and where it listens for data.
+fn serving(folder: &Path, file: &Path) -> (std::process::Child, std::net::SocketAddr) {
+    let free = || std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let data = free();
+    let mut config = config();
+    (config.grpc.enabled, config.page.enabled, config.zenoh.enabled) = (false, false, false);
+    config.recorder.file = file.to_owned();
+    config.recorder.flush_ms = 50;
+    let udp = config.vehicles[0].udp.as_mut().unwrap();
+    (udp.data, udp.telemetry) = (data, free());
+    let path = folder.join("clearway.toml");
+    std::fs::write(&path, config.to_toml()).unwrap();
+    let server = std::process::Command::new(clearway_tests::binaries().join("clearway-server"))
+        .args(["serve", "--config"])
+        .arg(&path)
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    (server, data)
+}
+
+/// Sends the vehicle's data until the recording has grown to `bytes`.
+fn drive_until(file: &Path, bytes: u64, data: std::net::SocketAddr) {
+    let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    let payloads = readings(10).into_iter().filter_map(|reading| match reading.body {
+        Body::Datagram(payload) if payload.len() == 1206 => Some(payload),
+        _ => None,
+    });
+    let payloads: Vec<_> = payloads.collect();
+    for payload in payloads.iter().cycle() {
+        // A server that is not up yet refuses; it will hear the next turn.
+        let _ = socket.send_to(payload, data);
+        if file.metadata().is_ok_and(|metadata| metadata.len() > bytes) {
+            return;
+        }
+        std::thread::yield_now();
+    }
+}
+
+#[test]
+fn sigterm_leaves_a_whole_recording_and_sigkill_one_that_can_be_read_to_its_cut() {
+    let folder = tempfile::tempdir().unwrap();
+    for (signal, cut) in [("-TERM", false), ("-KILL", true)] {
+        let file = folder.path().join(format!("live{signal}.mcap"));
+        let (mut server, data) = serving(folder.path(), &file);
+        drive_until(&file, 1_000_000, data);
+        let killed = std::process::Command::new("kill").args([signal, &server.id().to_string()]).status().unwrap();
+        assert!(killed.success());
+        let ended = server.wait().unwrap();
+        assert_eq!(ended.success(), !cut, "{signal}: {ended}");
+        let report = verify(&file).unwrap();
+        assert!(report.is_good() && report.events > 0 && report.cut == cut, "{signal}: {report:?}");
+    }
+}

@@ -279,3 +279,79 @@ async fn a_reader_that_never_reads_slows_nobody_and_costs_no_more_than_its_credi
     .await;
     assert_eq!(end.unwrap_err().code(), Code::Unavailable, "the reader is told that the server stops");
 }
+
+/// One frame of a WebSocket: its opcode and payload. Servers do not mask.
+async fn frame(stream: &mut tokio::net::TcpStream) -> (u8, Vec<u8>) {
+    use tokio::io::AsyncReadExt;
+    let mut head = [0; 2];
+    stream.read_exact(&mut head).await.unwrap();
+    let length = match head[1] {
+        126 => u64::from(stream.read_u16().await.unwrap()),
+        127 => stream.read_u64().await.unwrap(),
+        short => u64::from(short),
+    };
+    let mut payload = vec![0; usize::try_from(length).unwrap()];
+    stream.read_exact(&mut payload).await.unwrap();
+    (head[0] & 0x0f, payload)
+}
+
+/// A plain HTTP request: its whole answer.
+async fn http(address: std::net::SocketAddr, path: &str) -> String {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    let mut stream = tokio::net::TcpStream::connect(address).await.unwrap();
+    let request = format!("GET {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n");
+    stream.write_all(request.as_bytes()).await.unwrap();
+    let mut answer = Vec::new();
+    within("an answer", stream.read_to_end(&mut answer)).await.unwrap();
+    String::from_utf8_lossy(&answer).into_owned()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_page_its_live_maps_and_the_metrics_are_served() {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    let mut config = config();
+    config.page.enabled = true;
+    let running = start(config).await;
+    let address = running.page.unwrap();
+    let maps = feed(&running, readings(2)).await;
+    assert!(maps > 0);
+    let newest = running.vehicles.0[0].newest.borrow().clone().unwrap();
+
+    let index = http(address, "/").await;
+    assert!(index.starts_with("HTTP/1.1 200") && index.contains("text/html") && index.contains("<canvas"), "{index}");
+    assert!(http(address, "/no/such/thing").await.starts_with("HTTP/1.1 404"));
+    assert!(http(address, "/../Cargo.toml").await.starts_with("HTTP/1.1 404"));
+    assert!(http(address, "/healthz").await.ends_with("ok\n"));
+    let metrics = http(address, "/metrics").await;
+    assert!(metrics.contains(&format!("clearway_maps_total{{vehicle=\"car\"}} {maps}\n")), "{metrics}");
+    let vehicles = http(address, "/vehicles").await;
+    let (_, body) = vehicles.split_once("\r\n\r\n").unwrap();
+    let vehicles: serde_json::Value = serde_json::from_str(body).unwrap();
+    assert_eq!(vehicles[0]["name"], "car");
+
+    let mut stream = tokio::net::TcpStream::connect(address).await.unwrap();
+    let upgrade = "GET /live?vehicle=car HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+        Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n";
+    stream.write_all(upgrade.as_bytes()).await.unwrap();
+    let mut head = Vec::new();
+    while !head.ends_with(b"\r\n\r\n") {
+        head.push(stream.read_u8().await.unwrap());
+    }
+    assert!(head.starts_with(b"HTTP/1.1 101"));
+    let (mut update, mut status) = (None, None);
+    within("a map and a status", async {
+        while update.is_none() || status.is_none() {
+            match frame(&mut stream).await {
+                (2, payload) => update = Some(<v1::MapUpdate as prost::Message>::decode(&payload[..]).unwrap()),
+                (1, payload) => status = Some(serde_json::from_slice::<serde_json::Value>(&payload).unwrap()),
+                other => panic!("{other:?}"),
+            }
+        }
+    })
+    .await;
+    assert_eq!(update.unwrap().map, newest.select(&[]));
+    let status = status.unwrap();
+    assert_eq!((&status["type"], &status["ledger"]["lost"]), (&"status".into(), &0.into()));
+    drop(stream);
+    within("shutdown", running.shutdown()).await.unwrap();
+}

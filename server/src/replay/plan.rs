@@ -78,7 +78,10 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     config.check(options.config.as_deref().unwrap_or(Path::new("(replay)")))?;
     // The same files and settings name the same run; served maps need a name of their own, or a reader that saw them
     // before would take them for old ones.
-    let boot_id = boot_id.or_else(|| (!options.serve).then(|| fingerprint(&config, &options.files)));
+    let altered = options.extrinsics.is_some() || options.model.is_some() || options.rpm.is_some();
+    let same_maps = !altered && options.calibration.is_none();
+    let boot_id =
+        boot_id.filter(|_| same_maps).or_else(|| (!options.serve).then(|| fingerprint(&config, &options.files)));
     let mut notes = BTreeMap::new();
     if let Some(remark) = remarks.first() {
         notes.insert("mount".to_owned(), remark.clone());
