@@ -14,7 +14,7 @@ fn scene(noise: u32) -> Cells {
     };
     let class = |x: usize, y: usize| {
         let wave = ((x as f32 / 23.0).sin() * 40.0) as isize + 200;
-        u8::from((y as isize) < wave) + u8::from((x / 50 + y / 70) % 4 == 0)
+        u8::from((y as isize) < wave) + u8::from((x / 50 + y / 70).is_multiple_of(4))
     };
     let cells = (0..SIDE * SIDE).map(|i| if random() % 1000 < noise { 3 } else { class(i % SIDE, i / SIDE) });
     Cells::U8(cells.collect())

@@ -99,3 +99,17 @@ fn long_runs_of_many_channels_are_refused_before_their_cells_are_made() {
     let refused = map::decode_map(bytes.into(), &Limits::default()).unwrap_err();
     assert_eq!(refused, map::MapError::TooManyCells { cells: 40 << 20, allowed: 16 << 20 });
 }
+
+#[test]
+fn the_fuzz_corpus_decodes_or_is_refused() {
+    let corpus = concat!(env!("CARGO_MANIFEST_DIR"), "/fuzz/corpus/decode_map");
+    let mut maps = Vec::new();
+    for entry in std::fs::read_dir(corpus).unwrap() {
+        let path = entry.unwrap().path();
+        if map::decode_map(std::fs::read(&path).unwrap().into(), &Limits::default()).is_ok() {
+            maps.push(path.file_name().unwrap().to_owned());
+        }
+    }
+    maps.sort_unstable();
+    assert_eq!(maps, ["golden", "header_alone"]);
+}
