@@ -24,7 +24,7 @@ pub const DIFFERENCE_UNKNOWN: u16 = u16::MAX;
 pub struct HeightDifference {
     config: HeightDifferenceConfig,
     grid: RadialGrid,
-    /// Highest and lowest z of each cell, and of one more cell for points beyond the grid.
+    /// Highest and lowest z of each cell, and of one more row for points beyond the grid.
     span: Vec<[f32; 2]>,
 }
 
@@ -66,7 +66,7 @@ impl HeightDifference {
     pub fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
         self.grid.follow(sweep, self.config.range_m_max, self.config.columns);
         self.span.clear();
-        self.span.resize(self.grid.cells() + 1, [f32::NEG_INFINITY, f32::INFINITY]);
+        self.span.resize(self.grid.cells() + self.grid.columns(), [f32::NEG_INFINITY, f32::INFINITY]);
         let span = &mut self.span;
         self.grid.for_each_chunk(sweep, |first, cells| {
             for (cell, &z) in cells.iter().zip(&sweep.z[first..]) {

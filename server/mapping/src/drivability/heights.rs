@@ -30,8 +30,8 @@ impl Heights {
     /// Thesis, "Setting up the radial grid": every point into its cell, those too far or too high dropped.
     pub fn set_up(&mut self, grid: &RadialGrid, sweep: &Sweep, config: &DrivabilityConfig) {
         self.highest.clear();
-        // One more cell takes the points beyond the grid.
-        self.highest.resize(grid.cells() + 1, EMPTY);
+        // One more row takes the points beyond the grid.
+        self.highest.resize(grid.cells() + grid.columns(), EMPTY);
         let highest = &mut self.highest;
         grid.for_each_chunk(sweep, |first, cells| {
             for (i, (cell, &z)) in cells.iter().zip(&sweep.z[first..]).enumerate() {

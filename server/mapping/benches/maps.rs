@@ -1,0 +1,79 @@
+//! Maps from one sweep of an HDL-64E, one thread: points a second beside the time.
+//!
+//! The sweep is KITTI's first scan where the recorded drives are, else a simulated turn.
+
+use clearway_lidar::calibration::Calibration;
+use clearway_lidar::model::Model;
+use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig};
+use clearway_mapping::drivability::Drivability;
+use clearway_mapping::event::Scan;
+use clearway_mapping::height_difference::HeightDifference;
+use clearway_mapping::sweep::{Mount, Sweep};
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::vehicle::SimulatedVehicle;
+use divan::Bencher;
+use divan::counter::ItemsCount;
+use std::sync::Arc;
+
+fn main() {
+    divan::main();
+}
+
+fn mount(height_m: f64) -> Mount {
+    Mount { ego_from_sensor: nalgebra::Isometry3::translation(0.0, 0.0, height_m), range_m_min: 2.0 }
+}
+
+/// KITTI's first scan, x y z intensity a point.
+fn kitti() -> Option<Scan> {
+    let folder = option_env!("CLEARWAY_DATA")?;
+    let bytes = std::fs::read(format!("{folder}/kitti/patchwork-plusplus/000000.bin")).ok()?;
+    let mut scan = Scan::default();
+    for point in bytes.chunks_exact(16) {
+        let value = |i: usize| f32::from_le_bytes([point[4 * i], point[4 * i + 1], point[4 * i + 2], point[4 * i + 3]]);
+        scan.x.push(value(0));
+        scan.y.push(value(1));
+        scan.z.push(value(2));
+        scan.intensity.push(value(3));
+    }
+    Some(scan)
+}
+
+fn sweep() -> Sweep {
+    let mut sweep = Sweep::default();
+    match kitti() {
+        Some(scan) => {
+            sweep.take_scan(&scan, &Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount(1.73));
+        }
+        None => sweep.take_revolution(&turn(), &mount(1.9)),
+    }
+    sweep
+}
+
+fn turn() -> clearway_lidar::revolution::Revolution {
+    SimulatedVehicle::new(clearway_sim::scenes::town(), ScannerConfig::default()).revolution(1)
+}
+
+#[divan::bench(args = [360, 180, 90])]
+fn drivability(bencher: Bencher, columns: u16) {
+    let sweep = sweep();
+    let mut map = Drivability::new(&DrivabilityConfig { columns, ..DrivabilityConfig::default() });
+    let mut layer = map.layer();
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
+}
+
+#[divan::bench]
+fn height_difference(bencher: Bencher) {
+    let sweep = sweep();
+    let mut map = HeightDifference::new(&HeightDifferenceConfig::default());
+    let mut layer = map.layer();
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
+}
+
+#[divan::bench]
+fn sweep_of_a_revolution(bencher: Bencher) {
+    let revolution = turn();
+    let mount = mount(1.9);
+    let mut sweep = Sweep::default();
+    let slots = revolution.echoes[0].range_m.len();
+    bencher.counter(ItemsCount::new(slots)).bench_local(|| sweep.take_revolution(&revolution, &mount));
+}

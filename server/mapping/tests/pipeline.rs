@@ -1,0 +1,258 @@
+//! Events in, maps out: what is counted, what is refused, and that the same events give the same maps.
+
+mod common;
+
+use bytes::Bytes;
+use clearway_lidar::model::Model;
+use clearway_mapping::config::{ConfigError, Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::event::{Body, EgoPose, Event, Scan};
+use clearway_mapping::map::Map;
+use clearway_mapping::pipeline::{Pipeline, Rejected};
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes;
+use clearway_sim::vehicle::SimulatedVehicle;
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+
+fn config(model: Option<Model>) -> VehicleConfig {
+    VehicleConfig {
+        name: "car-1".into(),
+        sensors: vec![SensorConfig {
+            name: "top".into(),
+            model,
+            rpm: None,
+            calibration: None,
+            cut_azimuth_deg: 180.0,
+            range_m_min: 2.0,
+            extrinsics: Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.9, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 },
+        }],
+        maps: MapsConfig::default(),
+    }
+}
+
+fn pipeline(model: Option<Model>) -> Pipeline {
+    Pipeline::new(&config(model), vec![None]).unwrap()
+}
+
+fn event(sequence: u64, body: Body) -> Event {
+    Event { sequence, arrival_ns: 1_000 + sequence as i64, source: 0, body }
+}
+
+/// Datagrams of a standing simulated vehicle, two turns and a bit.
+fn drive() -> Vec<Event> {
+    let vehicle = SimulatedVehicle::new(scenes::flat(), ScannerConfig { model: Model::Vlp16, ..Default::default() });
+    let until_ns = vehicle.start_ns() + 260_000_000;
+    let datagrams = vehicle.take_while(|datagram| datagram.stamp_ns < until_ns);
+    let event = |(sequence, datagram): (usize, clearway_sim::vehicle::Datagram)| Event {
+        sequence: sequence as u64,
+        arrival_ns: datagram.stamp_ns,
+        source: 0,
+        body: Body::Datagram(Bytes::from(datagram.payload)),
+    };
+    datagrams.enumerate().map(event).collect()
+}
+
+fn maps(pipeline: &mut Pipeline, events: &[Event]) -> Vec<Map> {
+    events.iter().filter_map(|event| pipeline.step(event).ok().flatten().cloned()).collect()
+}
+
+fn scan(stamp_ns: i64) -> Scan {
+    let angle = |i: i32| i as f32 * 0.01;
+    let ring = |i: i32| 5.0 + 0.2 * (i / 628) as f32;
+    Scan {
+        stamp_ns,
+        x: (0..6280).map(|i| ring(i) * angle(i).cos()).collect(),
+        y: (0..6280).map(|i| ring(i) * angle(i).sin()).collect(),
+        z: vec![-1.9; 6280],
+        intensity: vec![0.5; 6280],
+    }
+}
+
+#[test]
+fn a_drive_becomes_a_map_a_turn_and_the_end_gives_the_rest_as_partial() {
+    let events = drive();
+    let mut pipeline = pipeline(Some(Model::Vlp16));
+    assert!(pipeline.newest_revolution().is_none());
+    let mut made = maps(&mut pipeline, &events);
+    let end = Event { sequence: events.len() as u64, arrival_ns: 7, source: 0, body: Body::End };
+    made.push(pipeline.step(&end).unwrap().unwrap().clone());
+    assert_eq!(pipeline.step(&end), Ok(None), "nothing is left");
+
+    assert_eq!(made.iter().map(|map| map.sequence).collect::<Vec<_>>(), [0, 1, 2, 3][..made.len()]);
+    assert!(made.len() >= 3, "{} maps", made.len());
+    let whole = &made[1];
+    assert_eq!(whole.sensors[0].partial, "");
+    assert_eq!(whole.sensors[0].model, "vlp16");
+    assert_eq!(whole.sensors[0].completeness, 1.0);
+    assert!((whole.sensors[0].rpm - 600.0).abs() < 5.0);
+    assert!(whole.capture_end_ns - whole.capture_start_ns > 95_000_000);
+    assert!(whole.completed_ns >= whole.capture_end_ns);
+    assert_eq!(whole.layers.iter().map(|layer| layer.name).collect::<Vec<_>>(), ["drivability", "height_difference"]);
+    assert!(common::figure(&whole.layers[0], "drivable_share") > 0.95);
+    assert_eq!(made.last().unwrap().sensors[0].partial, "end");
+    assert_eq!(made.last().unwrap().completed_ns, 7);
+    assert_eq!(pipeline.newest_revolution().unwrap().end_ns, made.last().unwrap().capture_end_ns);
+    let status = &pipeline.sensors()[0];
+    assert_eq!((status.name.as_str(), status.status.model), ("top", Some(Model::Vlp16)));
+}
+
+#[test]
+fn the_same_events_give_the_same_maps() {
+    let events = drive();
+    let first = maps(&mut pipeline(None), &events);
+    assert!(!first.is_empty());
+    assert_eq!(maps(&mut pipeline(None), &events), first);
+}
+
+#[test]
+fn the_ledger_is_exact_and_a_refused_datagram_leaves_no_trace_in_the_maps() {
+    let clean = drive();
+    let expected = maps(&mut pipeline(Some(Model::Vlp16)), &clean);
+    let mut pipeline = pipeline(Some(Model::Vlp16));
+    let mut made = Vec::new();
+    let (mut data, mut telemetry) = (0, 0);
+    for (index, event) in clean.iter().enumerate() {
+        if index % 10 == 0 {
+            let short = Event { body: Body::Datagram(Bytes::from(vec![0; index % 1000])), ..event.clone() };
+            let rejected = pipeline.step(&short).unwrap_err();
+            assert_eq!(rejected.reason(), "length", "{rejected}");
+            let stranger = Event { source: 3, ..event.clone() };
+            let rejected = pipeline.step(&stranger).unwrap_err();
+            assert_eq!(rejected, Rejected::Source { source_index: 3, sensors: 1 });
+            assert_eq!(pipeline.step(&Event { body: Body::Lost(2), ..event.clone() }), Ok(None));
+        }
+        let Body::Datagram(payload) = &event.body else { unreachable!() };
+        if payload.len() == 512 { telemetry += 1 } else { data += 1 }
+        made.extend(pipeline.step(event).unwrap().cloned());
+    }
+    let bad = clean.len().div_ceil(10) as u64;
+    let ledger = pipeline.ledger();
+    assert_eq!(ledger.received, clean.len() as u64 + 2 * bad);
+    assert_eq!((ledger.decoded, ledger.telemetry), (data, telemetry));
+    assert_eq!(ledger.refused, [("length", bad), ("source", bad)].into());
+    assert_eq!(ledger.lost, 2 * bad);
+    assert_eq!(ledger.received, ledger.decoded + ledger.telemetry + ledger.refused.values().sum::<u64>());
+
+    assert_eq!(made.len(), expected.len());
+    for (made, expected) in made.iter().zip(&expected) {
+        assert_eq!(made.layers, expected.layers);
+        assert!(made.sensors[0].refused > 0);
+    }
+}
+
+#[test]
+fn a_scan_enters_at_the_sweep() {
+    let mut pipeline = pipeline(Some(Model::Hdl64eS2));
+    let map = pipeline.step(&event(0, Body::Scan(scan(50)))).unwrap().unwrap();
+    assert_eq!((map.capture_start_ns, map.capture_end_ns, map.completed_ns), (50, 50, 1_000));
+    assert_eq!(map.sensors[0].model, "scan");
+    assert_eq!(map.sensors[0].returns, 6280);
+    assert!(common::figure(&map.layers[0], "drivable_share") > 0.9);
+    assert!(pipeline.newest_revolution().is_none());
+}
+
+#[test]
+fn points_of_a_scan_that_are_no_positions_are_left_out_and_counted() {
+    let mut wild = scan(50);
+    for (index, value) in [(0, f32::NAN), (1, f32::INFINITY), (2, -f32::INFINITY), (3, 1e9)] {
+        wild.x[index] = value;
+        wild.z[index + 10] = value;
+    }
+    let mut pipeline = pipeline(Some(Model::Hdl64eS2));
+    let map = pipeline.step(&event(0, Body::Scan(wild))).unwrap().unwrap();
+    assert_eq!(map.sensors[0].returns, 6280 - 8);
+    assert_eq!(pipeline.ledger().points_dropped, 8);
+}
+
+#[test]
+fn scans_that_cannot_be_taken_say_why() {
+    let mut torn = scan(60);
+    torn.z.pop();
+    let mut known = pipeline(Some(Model::Hdl64eS2));
+    known.step(&event(0, Body::Scan(scan(50)))).unwrap();
+    let rejected = known.step(&event(1, Body::Scan(torn))).unwrap_err();
+    assert_eq!(rejected.to_string(), "scan with 6280 x, 6280 y, 6279 z and 6280 intensities: the four lengths must be equal");
+    let rejected = known.step(&event(2, Body::Scan(scan(50)))).unwrap_err();
+    assert_eq!(rejected, Rejected::Stamp { stamp_ns: 50, newest_ns: 50 });
+    let rejected = pipeline(None).step(&event(0, Body::Scan(scan(50)))).unwrap_err();
+    assert_eq!(rejected.reason(), "model");
+    assert!(rejected.to_string().contains("top"), "{rejected}");
+    assert_eq!(known.ledger().refused, [("scan_lengths", 1), ("stamp", 1)].into());
+    assert_eq!((known.ledger().received, known.ledger().decoded), (3, 1));
+    let map = known.step(&event(3, Body::Scan(scan(51)))).unwrap().unwrap();
+    assert_eq!(map.sequence, 1, "rejected scans take no number");
+}
+
+#[test]
+fn the_newest_pose_goes_with_the_map_and_bad_poses_do_not() {
+    let pose = |stamp_ns, x, speed_mps| {
+        let map_from_ego = Isometry3::from_parts(Translation3::new(x, 2.0, 3.0), UnitQuaternion::identity());
+        Body::EgoPose(EgoPose { stamp_ns, map_from_ego, speed_mps })
+    };
+    let mut pipeline = pipeline(Some(Model::Hdl64eS2));
+    assert_eq!(pipeline.step(&event(0, Body::Scan(scan(10)))).unwrap().unwrap().map_from_ego, None);
+    pipeline.step(&event(1, pose(20, 1.0, 5.0))).unwrap();
+    for bad in [pose(30, f64::NAN, 5.0), pose(30, 1.0, f64::INFINITY)] {
+        assert_eq!(pipeline.step(&event(2, bad)), Err(Rejected::Pose { stamp_ns: 30 }));
+    }
+    let mut squashed = EgoPose { stamp_ns: 30, map_from_ego: Isometry3::identity(), speed_mps: 0.0 };
+    squashed.map_from_ego.rotation = UnitQuaternion::new_unchecked(Quaternion::new(0.5, 0.0, 0.0, 0.0));
+    assert_eq!(pipeline.step(&event(3, Body::EgoPose(squashed))), Err(Rejected::Pose { stamp_ns: 30 }));
+    assert_eq!(pipeline.step(&event(4, pose(20, 9.0, 9.0))), Err(Rejected::Stamp { stamp_ns: 20, newest_ns: 20 }));
+    let map = pipeline.step(&event(5, Body::Scan(scan(25)))).unwrap().unwrap();
+    assert_eq!(map.map_from_ego.unwrap().translation.x, 1.0);
+    assert_eq!(map.speed_mps, Some(5.0));
+    let ledger = pipeline.ledger();
+    assert_eq!((ledger.poses, ledger.poses_refused, ledger.received), (1, 4, 2));
+}
+
+#[test]
+fn maps_switched_off_are_not_made() {
+    let mut off = config(Some(Model::Hdl64eS2));
+    off.maps.drivability.enabled = false;
+    let mut pipeline = Pipeline::new(&off, vec![None]).unwrap();
+    let map = pipeline.step(&event(0, Body::Scan(scan(10)))).unwrap().unwrap();
+    assert_eq!(map.layers.iter().map(|layer| layer.name).collect::<Vec<_>>(), ["height_difference"]);
+    off.maps.height_difference.enabled = false;
+    let mut pipeline = Pipeline::new(&off, vec![None]).unwrap();
+    assert!(pipeline.step(&event(0, Body::Scan(scan(10)))).unwrap().unwrap().layers.is_empty());
+}
+
+#[test]
+fn a_configuration_that_cannot_work_names_key_value_and_what_is_allowed() {
+    let refuse = |change: &dyn Fn(&mut VehicleConfig)| -> ConfigError {
+        let mut config = config(None);
+        change(&mut config);
+        let calibrations = vec![None; config.sensors.len()];
+        Pipeline::new(&config, calibrations).err().expect("the configuration must be refused")
+    };
+    let none = refuse(&|c| c.sensors.clear());
+    assert_eq!((none.key.as_str(), none.value.as_str()), ("vehicle.sensor", "0 tables"));
+    let two = refuse(&|c| c.sensors.push(c.sensors[0].clone()));
+    assert_eq!(two.value, "2 tables");
+    let name = refuse(&|c| c.name = "Car 1".into());
+    assert_eq!(
+        name.to_string(),
+        "vehicle.name = \"Car 1\": allowed is 1 to 64 of the characters a-z, 0-9, - and _"
+    );
+    let height = refuse(&|c| c.sensors[0].extrinsics.z_m = f64::NAN);
+    assert_eq!(height.to_string(), "vehicle.sensor[0].extrinsics.z_m = NaN: allowed is 0.1 to 20");
+    let others: [(&str, &dyn Fn(&mut VehicleConfig)); 12] = [
+        ("vehicle.sensor[0].name", &|c| c.sensors[0].name.clear()),
+        ("vehicle.sensor[0].rpm", &|c| c.sensors[0].rpm = Some(0.0)),
+        ("vehicle.sensor[0].cut_azimuth_deg", &|c| c.sensors[0].cut_azimuth_deg = -1.0),
+        ("vehicle.sensor[0].range_m_min", &|c| c.sensors[0].range_m_min = f32::INFINITY),
+        ("vehicle.sensor[0].extrinsics.x_m", &|c| c.sensors[0].extrinsics.x_m = 1e9),
+        ("vehicle.sensor[0].extrinsics.yaw_deg", &|c| c.sensors[0].extrinsics.yaw_deg = f64::INFINITY),
+        ("vehicle.maps.valid_ms", &|c| c.maps.valid_ms = 0),
+        ("vehicle.maps.drivability.columns", &|c| c.maps.drivability.columns = 0),
+        ("vehicle.maps.drivability.unit_height_m", &|c| c.maps.drivability.unit_height_m = 0.0),
+        ("vehicle.maps.drivability.range_m_max", &|c| c.maps.drivability.range_m_max = f32::NAN),
+        ("vehicle.maps.height_difference.columns", &|c| c.maps.height_difference.columns = 9999),
+        ("vehicle.maps.height_difference.difference_m_max", &|c| c.maps.height_difference.difference_m_max = -1.0),
+    ];
+    for (key, change) in others {
+        assert_eq!(refuse(change).key, key);
+    }
+    let mismatch = Pipeline::new(&config(None), Vec::new()).err().unwrap();
+    assert_eq!(mismatch.key, "vehicle.sensor");
+}
