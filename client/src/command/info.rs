@@ -87,7 +87,7 @@ fn recording(file: &Path) -> Result<Value> {
     let (mut events, mut maps, mut scans) = (0_u64, BTreeMap::<(String, String), u64>::new(), 0_u64);
     let mut grids: BTreeMap<String, Value> = BTreeMap::new();
     let mut span: Option<(u64, u64)> = None;
-    while let Some(message) = recording.next() {
+    for message in recording.by_ref() {
         let message = message?;
         *messages.entry(message.topic.clone()).or_default() += 1;
         let at = message.log_time_ns;
@@ -143,7 +143,7 @@ fn capture(file: &Path) -> Result<Value> {
     let mut ports: BTreeMap<String, u64> = BTreeMap::new();
     let mut span: Option<(i64, i64)> = None;
     let mut cut = None;
-    while let Some(datagram) = capture.next() {
+    for datagram in capture.by_ref() {
         let datagram = match datagram {
             Ok(datagram) => datagram,
             Err(error) => {
