@@ -196,8 +196,10 @@ impl Recorder {
 /// Writes what comes until nobody is left to send; a failing disk ends the writing, not the listening.
 fn run(tape: Tape, entries: &Receiver<Entry>, flush: Duration, counts: &RecorderCounts) {
     let stop = |error: McapError| {
-        tracing::error!(file = %counts.file, %error, "the recording stops here; maps are still served");
-        *locked(&counts.stopped) = Some(error.to_string());
+        // The library says that writing failed, and only its source says why.
+        let reason = std::error::Error::source(&error).map_or(error.to_string(), |source| format!("{error}: {source}"));
+        tracing::error!(file = %counts.file, %reason, "the recording stops here; maps are still served");
+        *locked(&counts.stopped) = Some(reason);
     };
     let mut tape = Some(tape);
     let mut flush_at: Option<Instant> = None;

@@ -235,3 +235,25 @@ fn sigterm_leaves_a_whole_recording_and_sigkill_one_that_can_be_read_to_its_cut(
         assert!(report.is_good() && report.events > 0 && report.cut == cut, "{signal}: {report:?}");
     }
 }
+
+#[test]
+fn a_disk_that_fails_ends_the_recording_with_its_reason_and_maps_go_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("full.mcap");
+    // No file of this process may grow beyond half a megabyte; the write fails instead of the process.
+    let limited = "trap '' XFSZ; ulimit -f 1024; exec \"$0\" demo --seconds 4 --json --record \"$1\"";
+    let output = std::process::Command::new("sh")
+        .args(["-c", limited])
+        .arg(clearway_tests::binaries().join("clearway-server"))
+        .arg(&file)
+        .output()
+        .unwrap();
+    let (said, complained) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(!output.status.success(), "an incomplete recording is no success");
+    assert!(complained.contains("the recording is not whole") && complained.contains("File too large"), "{complained}");
+    let seconds: Vec<serde_json::Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let maps = |second: usize| seconds[second]["maps"].as_u64().unwrap();
+    assert!(maps(3) > maps(1), "maps are made after the disk has failed: {said}");
+    let report = verify(&file).unwrap();
+    assert!(report.is_good() && report.cut, "what was recorded before is good: {report:?}");
+}
