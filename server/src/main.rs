@@ -117,7 +117,7 @@ struct ReplayArguments {
     /// Overrides a key of the configuration.
     #[arg(long, value_name = "KEY=VALUE", requires = "config")]
     set: Vec<String>,
-    /// Publish the maps like live ones, until SIGINT or SIGTERM.
+    /// Publish the maps, until SIGINT or SIGTERM. They keep the stamps of their capture, so readers call old ones stale.
     #[arg(long)]
     serve: bool,
     /// Whose journal (of a recording) or configuration is used, where there are several.

@@ -355,3 +355,43 @@ async fn the_page_its_live_maps_and_the_metrics_are_served() {
     drop(stream);
     within("shutdown", running.shutdown()).await.unwrap();
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let record = folder.path().join("two.mcap");
+    let mut config = config();
+    config.recorder.file = record.clone();
+    let mut truck = config.vehicles[0].clone();
+    truck.name = "truck".into();
+    truck.maps.height_difference.enabled = false;
+    config.vehicles.push(truck);
+    let running = start(config).await;
+    let mut client = grpc(&running).await;
+
+    // The car hears two turns, the truck one.
+    let maps = feed(&running, readings(2)).await;
+    let (data, _) = running.doors[1].udp.unwrap();
+    let halt = Duration::from_millis(250);
+    let until_then = Until { stop: None, device_time: Some(halt) };
+    tokio::task::spawn_blocking(move || drive(vehicle(), data, data, Pace::RealTime, until_then))
+        .await
+        .unwrap()
+        .unwrap();
+    until("a map of the truck", || running.vehicles.0[1].newest.borrow().is_some()).await;
+
+    let get = |vehicle: &str| v1::GetMapRequest { vehicle: vehicle.into(), layers: Vec::new() };
+    let layers = |map: &Bytes| {
+        let map = <v1::Map as prost::Message>::decode(map.clone()).unwrap();
+        (map.header.unwrap().vehicle, map.layers.len())
+    };
+    let car = client.get_map(get("car")).await.unwrap().into_inner().map;
+    assert_eq!((sequence(&car), layers(&car)), (maps - 1, ("car".to_owned(), 2)));
+    let truck = client.get_map(get("truck")).await.unwrap().into_inner().map;
+    assert_eq!(layers(&truck), ("truck".to_owned(), 1));
+    let status = client.get_map(get("")).await.unwrap_err();
+    assert!(status.message().contains("car, truck"), "of several vehicles one must be named: {status}");
+    within("shutdown", running.shutdown()).await.unwrap();
+    let report = clearway_server::verify::verify(&record).unwrap();
+    assert!(report.is_good() && report.maps > maps, "{report:?}");
+}
