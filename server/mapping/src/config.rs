@@ -143,6 +143,8 @@ pub struct DrivabilityConfig {
     pub plane_error_m_max: f32,
     /// Least width of a contiguous boundary the vehicle drives across (criterion 3).
     pub gate_m_min: f32,
+    /// Which boundary must be that wide.
+    pub gate: Gate,
 }
 
 impl Default for DrivabilityConfig {
@@ -159,9 +161,10 @@ impl Default for DrivabilityConfig {
             bridge_rows: 2,
             close_gaps: true,
             step_m_max: 0.15,
-            grade_max: 0.15,
+            grade_max: 0.2,
             plane_error_m_max: 0.25,
             gate_m_min: 3.0,
+            gate: Gate::ToDrivableGround,
         }
     }
 }
@@ -175,6 +178,16 @@ pub enum Seed {
     BlindZone,
     /// Cell (0, 0) alone, as the thesis has it.
     FirstCell,
+}
+
+/// Which contiguous boundary must be as wide as a gate (criterion 3).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Gate {
+    /// The one to all the ground found drivable so far.
+    ToDrivableGround,
+    /// The one between two segments, as the thesis has it.
+    BetweenSegments,
 }
 
 /// Parameters of [`crate::height_difference`].

@@ -55,7 +55,9 @@ pub struct MountEstimate {
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum MountError {
     /// Nothing to look at.
-    #[error("{samples} places with points from 2.5 to 20 m around the sensor in {revolutions} revolution(s); 100 a revolution are needed")]
+    #[error(
+        "{samples} places with points from 2.5 to 20 m around the sensor in {revolutions} revolution(s); 100 a revolution are needed"
+    )]
     TooFewPoints {
         /// Cells of 0.5 m that hold points.
         samples: usize,
@@ -228,11 +230,12 @@ fn best_candidate(samples: &[Vector3<f64>]) -> Option<Plane> {
         plane.is_plausible().then(|| (inliers(), plane))
     });
     // Of equally good ones the first drawn.
-    candidates.fold(None, |best: Option<(usize, Plane)>, next| match best {
-        Some(held) if held.0 >= next.0 => Some(held),
-        _ => Some(next),
-    })
-    .map(|(_, plane)| plane)
+    candidates
+        .fold(None, |best: Option<(usize, Plane)>, next| match best {
+            Some(held) if held.0 >= next.0 => Some(held),
+            _ => Some(next),
+        })
+        .map(|(_, plane)| plane)
 }
 
 fn sectors(points: &[Vector3<f64>]) -> u32 {

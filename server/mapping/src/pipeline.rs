@@ -180,7 +180,9 @@ impl Pipeline {
             Ok(made) => Ok(made.then_some(&self.maker.map)),
             Err(rejected) => {
                 match event.body {
-                    Body::Datagram(_) | Body::Scan(_) => *self.ledger.refused.entry(rejected.reason()).or_default() += 1,
+                    Body::Datagram(_) | Body::Scan(_) => {
+                        *self.ledger.refused.entry(rejected.reason()).or_default() += 1
+                    }
                     Body::EgoPose(_) => self.ledger.poses_refused += 1,
                     Body::Lost(_) | Body::End => {}
                 }

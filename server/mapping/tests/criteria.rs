@@ -148,7 +148,13 @@ fn criterion_3_a_gate_narrower_than_3_m_is_not_crossed() {
     let gate = |half_width: f32| {
         painted(move |_, _, x, y| {
             let wall = (15.0..17.0).contains(&x.hypot(y)) && (y.abs() > half_width || x < 0.0);
-            Some(if wall { 1.0 } else if x.hypot(y) >= 15.0 { 0.14 } else { 0.0 })
+            Some(if wall {
+                1.0
+            } else if x.hypot(y) >= 15.0 {
+                0.14
+            } else {
+                0.0
+            })
         })
     };
     let behind = row_at(25.0);
@@ -162,7 +168,8 @@ fn criterion_3_a_gate_narrower_than_3_m_is_not_crossed() {
 fn empty_rows_are_bridged_as_far_as_configured() {
     let (near, far) = (row_at(15.0), row_at(25.0));
     let gap = |rows: usize| painted(move |row, _, _, _| (!(near..near + rows).contains(&row)).then_some(0.0));
-    for (bridge_rows, empty_rows, reached) in [(0, 1, false), (1, 1, true), (1, 2, false), (2, 2, true), (2, 3, false)] {
+    for (bridge_rows, empty_rows, reached) in [(0, 1, false), (1, 1, true), (1, 2, false), (2, 2, true), (2, 3, false)]
+    {
         let config = DrivabilityConfig { bridge_rows, ..DrivabilityConfig::default() };
         let layer = map(&config, &gap(empty_rows));
         let expected = if reached { DRIVABLE } else { OBSTACLE };

@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{DrivabilityConfig, Extrinsics};
+use clearway_mapping::config::{DrivabilityConfig, Extrinsics, Gate};
 use clearway_mapping::drivability::{DRIVABLE, Drivability, UNKNOWN};
 use clearway_mapping::map::Layer;
 use clearway_mapping::radial::RadialGrid;
@@ -72,7 +72,8 @@ fn labelled_frame() -> (Sweep, Vec<u32>) {
     let labels: Vec<u32> =
         bytes.chunks_exact(4).map(|label| u32::from_le_bytes(label.try_into().unwrap()) & 0xffff).collect();
     assert_eq!(labels.len(), scan.x.len());
-    let extrinsics = Extrinsics { x_m: 0.0, y_m: 0.0, z_m: KITTI_HEIGHT_M, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
+    let extrinsics =
+        Extrinsics { x_m: 0.0, y_m: 0.0, z_m: KITTI_HEIGHT_M, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
     let mount = Mount { ego_from_sensor: extrinsics.ego_from_sensor(), range_m_min: 2.0 };
     let mut sweep = Sweep::default();
     sweep.take_scan(&scan, &Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount);
@@ -171,7 +172,13 @@ fn wider_columns_and_the_thesis_own_reading_stay_useful() {
     #[cfg(clearway_data)]
     {
         let own = DrivabilityConfig::default();
-        let thesis = DrivabilityConfig { bridge_rows: 0, close_gaps: false, step_m_max: 0.5, ..own.clone() };
+        let thesis = DrivabilityConfig {
+            bridge_rows: 0,
+            close_gaps: false,
+            step_m_max: 0.5,
+            gate: Gate::BetweenSegments,
+            ..own.clone()
+        };
         let readings = [
             DrivabilityConfig { columns: 180, ..own.clone() },
             DrivabilityConfig { columns: 90, ..own.clone() },

@@ -121,7 +121,11 @@ fn the_ledger_is_exact_and_a_refused_datagram_leaves_no_trace_in_the_maps() {
             assert_eq!(pipeline.step(&Event { body: Body::Lost(2), ..event.clone() }), Ok(None));
         }
         let Body::Datagram(payload) = &event.body else { unreachable!() };
-        if payload.len() == 512 { telemetry += 1 } else { data += 1 }
+        if payload.len() == 512 {
+            telemetry += 1
+        } else {
+            data += 1
+        }
         made.extend(pipeline.step(event).unwrap().cloned());
     }
     let bad = clean.len().div_ceil(10) as u64;
@@ -170,7 +174,10 @@ fn scans_that_cannot_be_taken_say_why() {
     let mut known = pipeline(Some(Model::Hdl64eS2));
     known.step(&event(0, Body::Scan(scan(50)))).unwrap();
     let rejected = known.step(&event(1, Body::Scan(torn))).unwrap_err();
-    assert_eq!(rejected.to_string(), "scan with 6280 x, 6280 y, 6279 z and 6280 intensities: the four lengths must be equal");
+    assert_eq!(
+        rejected.to_string(),
+        "scan with 6280 x, 6280 y, 6279 z and 6280 intensities: the four lengths must be equal"
+    );
     let rejected = known.step(&event(2, Body::Scan(scan(50)))).unwrap_err();
     assert_eq!(rejected, Rejected::Stamp { stamp_ns: 50, newest_ns: 50 });
     let rejected = pipeline(None).step(&event(0, Body::Scan(scan(50)))).unwrap_err();
@@ -230,10 +237,7 @@ fn a_configuration_that_cannot_work_names_key_value_and_what_is_allowed() {
     let two = refuse(&|c| c.sensors.push(c.sensors[0].clone()));
     assert_eq!(two.value, "2 tables");
     let name = refuse(&|c| c.name = "Car 1".into());
-    assert_eq!(
-        name.to_string(),
-        "vehicle.name = \"Car 1\": allowed is 1 to 64 of the characters a-z, 0-9, - and _"
-    );
+    assert_eq!(name.to_string(), "vehicle.name = \"Car 1\": allowed is 1 to 64 of the characters a-z, 0-9, - and _");
     let height = refuse(&|c| c.sensors[0].extrinsics.z_m = f64::NAN);
     assert_eq!(height.to_string(), "vehicle.sensor[0].extrinsics.z_m = NaN: allowed is 0.1 to 20");
     let others: [(&str, &dyn Fn(&mut VehicleConfig)); 12] = [

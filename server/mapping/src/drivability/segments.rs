@@ -157,7 +157,8 @@ fn adjacent(grid: &RadialGrid, units: &[i8], bridge_rows: u8, cell: usize) -> [O
     let across = 1..=usize::from(bridge_rows) + 1;
     let inward = across.take_while(|step| *step <= row).map(|step| cell - step * columns).find(known);
     let (right, left) = (clockwise(columns, cell), counter_clockwise(columns, cell));
-    let mut adjacent = [inward, outward(grid, units, bridge_rows, cell), Some(right), Some(left), None, None, None, None];
+    let mut adjacent =
+        [inward, outward(grid, units, bridge_rows, cell), Some(right), Some(left), None, None, None, None];
     if bridge_rows > 0 {
         let inner = cell.checked_sub(columns).filter(|inner| !known(inner)).map(|_| columns);
         let outer = Some(cell + columns).filter(|outer| *outer < units.len() && !known(outer)).map(|_| columns);

@@ -13,11 +13,7 @@ pub const HEIGHT_M: f32 = 1.8;
 
 /// An empty sweep of a sensor 1.8 m over the ground.
 pub fn empty(model: Model) -> Sweep {
-    Sweep {
-        calibration: Some(Arc::new(Calibration::factory(model))),
-        mount_height_m: HEIGHT_M,
-        ..Sweep::default()
-    }
+    Sweep { calibration: Some(Arc::new(Calibration::factory(model))), mount_height_m: HEIGHT_M, ..Sweep::default() }
 }
 
 /// Adds one point, ego frame, metres.
@@ -36,9 +32,7 @@ pub fn cast(model: Model, inside: impl Fn(f32, f32, f32) -> bool) -> Sweep {
         let azimuth = (step as f32 + 0.25) * std::f32::consts::TAU / 720.0;
         for laser in &lasers {
             let (sin, cos) = (laser.vert_correction as f32).sin_cos();
-            let at = |range: f32| {
-                [range * cos * azimuth.cos(), range * cos * azimuth.sin(), HEIGHT_M + range * sin]
-            };
+            let at = |range: f32| [range * cos * azimuth.cos(), range * cos * azimuth.sin(), HEIGHT_M + range * sin];
             let mut range = 2.0;
             while range < 80.0 {
                 let next = range + 0.02 + 0.002 * range;
@@ -68,7 +62,8 @@ pub fn plain(_x: f32, _y: f32, z: f32) -> bool {
 
 /// Level ground with a wall across the road 15 m ahead, closed by walls 8 m to both sides and 20 m behind.
 pub fn court(x: f32, y: f32, z: f32) -> bool {
-    z <= 0.0 || (z <= 1.6 && ((15.0..15.3).contains(&x) || (-20.3..-20.0).contains(&x) || (8.0..8.3).contains(&y.abs())))
+    z <= 0.0
+        || (z <= 1.6 && ((15.0..15.3).contains(&x) || (-20.3..-20.0).contains(&x) || (8.0..8.3).contains(&y.abs())))
 }
 
 /// The sweep with its points in another order, the same for the same seed.
