@@ -15,11 +15,14 @@ pub struct Limits {
     pub map_cells: u64,
     /// Bytes of one encoded map. 4 MiB: what gRPC receives by default; ours have under 64 KiB.
     pub map_bytes: usize,
+    /// Layers, channels, planes, sensors and names of one map together. 64 Ki: as many planes as a map can have
+    /// segments; a part takes some hundred bytes of memory.
+    pub map_parts: usize,
 }
 
 impl Default for Limits {
     fn default() -> Self {
-        Self { channel_cells: 4 << 20, map_cells: 16 << 20, map_bytes: 4 << 20 }
+        Self { channel_cells: 4 << 20, map_cells: 16 << 20, map_bytes: 4 << 20, map_parts: 1 << 16 }
     }
 }
 

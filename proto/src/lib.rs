@@ -8,6 +8,7 @@ pub mod codec;
 mod decode;
 pub mod grid;
 pub mod map;
+mod parts;
 
 /// Generated from `clearway/v1/*.proto`.
 #[allow(missing_docs, clippy::all)]

@@ -13,7 +13,7 @@ use prost::Message;
 
 use crate::codec::{Cells, DecodeError, Limits, decode};
 use crate::grid::Grid;
-use crate::v1;
+use crate::{parts, v1};
 
 /// The bytes of a map with this header and no layer yet.
 pub fn encode_header(header: &v1::Header) -> Bytes {
@@ -117,6 +117,14 @@ pub enum MapError {
         /// [`Limits::map_bytes`].
         allowed: usize,
     },
+    /// More layers, channels, planes, sensors and names than the reader allows.
+    #[error("map of {parts} parts; at most {allowed} are allowed")]
+    TooManyParts {
+        /// Claimed.
+        parts: usize,
+        /// [`Limits::map_parts`].
+        allowed: usize,
+    },
     /// Not a protobuf `clearway.v1.Map`.
     #[error("not an encoded clearway.v1.Map: {0}")]
     Protobuf(#[from] prost::DecodeError),
@@ -200,6 +208,7 @@ impl MapError {
     pub fn name(&self) -> &'static str {
         match self {
             Self::TooLong { .. } => "too_long",
+            Self::TooManyParts { .. } => "too_many_parts",
             Self::Protobuf(_) => "protobuf",
             Self::Header { .. } => "header",
             Self::Twice { .. } => "twice",
@@ -221,6 +230,10 @@ impl MapError {
 pub fn decode_map(bytes: Bytes, limits: &Limits) -> Result<Map, MapError> {
     if bytes.len() > limits.map_bytes {
         return Err(MapError::TooLong { length: bytes.len(), allowed: limits.map_bytes });
+    }
+    let parts = parts::count(&bytes);
+    if parts > limits.map_parts {
+        return Err(MapError::TooManyParts { parts, allowed: limits.map_parts });
     }
     let map = v1::Map::decode(bytes)?;
     let header = check_header(map.header)?;

@@ -113,3 +113,12 @@ fn the_fuzz_corpus_decodes_or_is_refused() {
     maps.sort_unstable();
     assert_eq!(maps, ["golden", "header_alone"]);
 }
+
+#[test]
+fn a_map_of_a_million_empty_layers_is_refused_before_any_is_made() {
+    // Field 2 of `Map`, a layer, of no bytes.
+    let hostile = Bytes::from([0x12, 0x00].repeat(1 << 20));
+    let allowed = Limits::default().map_parts;
+    let refused = map::decode_map(hostile, &Limits::default());
+    assert_eq!(refused, Err(map::MapError::TooManyParts { parts: 1 << 20, allowed }));
+}
