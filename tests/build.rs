@@ -10,7 +10,11 @@ fn main() {
     println!("cargo::rustc-check-cfg=cfg(clearway_data)");
     let beside = || {
         let package = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR")?);
-        package.ancestors().find(|folder| folder.join("ARCHITECTURE.md").is_file())?.parent().map(|p| p.join("shared/data"))
+        package
+            .ancestors()
+            .find(|folder| folder.join("ARCHITECTURE.md").is_file())?
+            .parent()
+            .map(|p| p.join("shared/data"))
     };
     let Some(data) = env::var_os("CLEARWAY_DATA").map(PathBuf::from).or_else(beside) else { return };
     let index = data.join("INDEX.md");

@@ -99,3 +99,8 @@ pub enum ClientError {
         reason: String,
     },
 }
+
+/// The README's code, compiled.
+#[cfg(doctest)]
+#[doc = include_str!("../../README.md")]
+struct Readme;
