@@ -247,8 +247,8 @@ impl Pipeline {
         let rotation = pose.map_from_ego.rotation.coords;
         let position = pose.map_from_ego.translation.vector;
         let finite = position.iter().all(|v| v.is_finite()) && pose.speed_mps.is_finite();
-        // NaN fails the comparison too.
-        if !finite || !((rotation.norm() - 1.0).abs() < 1e-6) {
+        // A NaN in the quaternion makes the norm NaN, which is in no range.
+        if !finite || !(1.0 - 1e-6..=1.0 + 1e-6).contains(&rotation.norm()) {
             return Err(Rejected::Pose { stamp_ns: pose.stamp_ns });
         }
         check_newer(pose.stamp_ns, self.pose.as_ref().map(|p| p.stamp_ns))?;

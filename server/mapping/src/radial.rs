@@ -2,7 +2,8 @@
 //!
 //! In: the lasers' elevations, the sensor's height, the number of columns; then points, ego frame, metres. Out: each
 //! point's cell, `row * columns + column`. Rows follow the sensor: `r_bench` separates the rings its lasers draw on
-//! level ground.
+//! level ground. The circles are drawn about the ego origin, as in the thesis; the rings lie about the sensor, so the
+//! reference point of the ego frame is best chosen under it, or within a metre or two.
 
 use std::f32::consts::{FRAC_PI_2, TAU};
 use std::sync::Arc;
@@ -59,14 +60,12 @@ impl RadialGrid {
         Self { r_bench_m, r_bench_squared, row_of_bucket, first_bucket, borders_a_bucket, quadrants, made_from: None }
     }
 
-    /// Sees to it that the rows are those of the sensor that made `sweep`; gives whether the grid changed.
-    pub fn follow(&mut self, sweep: &Sweep, range_m_max: f32, columns: u16) -> bool {
+    /// Sees to it that the rows are those of the sensor that made `sweep`.
+    pub fn follow(&mut self, sweep: &Sweep, range_m_max: f32, columns: u16) {
         let Some(calibration) = &sweep.calibration else {
-            let changed = self.r_bench_m != [range_m_max];
-            if changed {
-                *self = Self::new(vec![range_m_max], columns);
-            }
-            return changed;
+            // Nobody's sweep: one row to the largest range.
+            *self = Self::new(vec![range_m_max], columns);
+            return;
         };
         let height = sweep.mount_height_m;
         // The sensor's table is shared by all its revolutions: the pointer is compared first, the table only after.
@@ -74,12 +73,11 @@ impl RadialGrid {
             && *held_height == height
             && (Arc::ptr_eq(held, calibration) || held == calibration)
         {
-            return false;
+            return;
         }
         let rings = ring_radii_m(calibration, height, range_m_max);
         *self = Self::new(r_bench_m(&rings, range_m_max), columns);
         self.made_from = Some((Arc::clone(calibration), height));
-        true
     }
 
     /// Number of rows.

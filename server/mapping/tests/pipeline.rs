@@ -224,9 +224,12 @@ fn maps_switched_off_are_not_made() {
     assert!(pipeline.step(&event(0, Body::Scan(scan(10)))).unwrap().unwrap().layers.is_empty());
 }
 
+/// One value of a configuration made wrong.
+type Change<'a> = &'a dyn Fn(&mut VehicleConfig);
+
 #[test]
 fn a_configuration_that_cannot_work_names_key_value_and_what_is_allowed() {
-    let refuse = |change: &dyn Fn(&mut VehicleConfig)| -> ConfigError {
+    let refuse = |change: Change| -> ConfigError {
         let mut config = config(None);
         change(&mut config);
         let calibrations = vec![None; config.sensors.len()];
@@ -240,7 +243,7 @@ fn a_configuration_that_cannot_work_names_key_value_and_what_is_allowed() {
     assert_eq!(name.to_string(), "vehicle.name = \"Car 1\": allowed is 1 to 64 of the characters a-z, 0-9, - and _");
     let height = refuse(&|c| c.sensors[0].extrinsics.z_m = f64::NAN);
     assert_eq!(height.to_string(), "vehicle.sensor[0].extrinsics.z_m = NaN: allowed is 0.1 to 20");
-    let others: [(&str, &dyn Fn(&mut VehicleConfig)); 12] = [
+    let others: [(&str, Change); 12] = [
         ("vehicle.sensor[0].name", &|c| c.sensors[0].name.clear()),
         ("vehicle.sensor[0].rpm", &|c| c.sensors[0].rpm = Some(0.0)),
         ("vehicle.sensor[0].cut_azimuth_deg", &|c| c.sensors[0].cut_azimuth_deg = -1.0),

@@ -60,11 +60,6 @@ impl Planes {
         &self.of_segment
     }
 
-    /// Whether a segment has enough cells for a plane.
-    pub fn is_fitted(&self, segment: u16) -> bool {
-        self.moments[usize::from(segment)].cells >= CELLS_MIN
-    }
-
     /// Cells of a segment.
     pub fn cells(&self, segment: u16) -> u32 {
         self.moments[usize::from(segment)].cells

@@ -205,5 +205,5 @@ pub fn counter_clockwise(columns: usize, cell: usize) -> usize {
 
 /// The next cell of the same row, clockwise.
 fn clockwise(columns: usize, cell: usize) -> usize {
-    if cell % columns == 0 { cell + columns - 1 } else { cell - 1 }
+    if cell.is_multiple_of(columns) { cell + columns - 1 } else { cell - 1 }
 }
