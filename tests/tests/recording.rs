@@ -181,6 +181,34 @@ fn a_foreign_mcap_file_is_no_recording() {
     );
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn whatever_bytes_are_changed_the_reader_answers_and_invents_no_event() {
+    use proptest::prelude::*;
+    use proptest::test_runner::TestRunner;
+    let folder = tempfile::tempdir().unwrap();
+    let (whole, changed) = (folder.path().join("whole.mcap"), folder.path().join("changed.mcap"));
+    recording(&whole).await;
+    let bytes = std::fs::read(&whole).unwrap();
+    let events = verify(&whole).unwrap().events;
+    let changes = prop::collection::vec((0..bytes.len(), any::<u8>()), 1..4);
+    let mut runner = TestRunner::new(ProptestConfig { cases: 60, ..ProptestConfig::default() });
+    runner
+        .run(&(changes, 0..bytes.len() / 4), |(changes, missing)| {
+            let mut bytes = bytes.clone();
+            for (at, byte) in changes {
+                bytes[at] = byte;
+            }
+            bytes.truncate(bytes.len() - missing);
+            std::fs::write(&changed, &bytes).unwrap();
+            // Read, refused or found different: all are answers. A panic is none.
+            if let Ok(report) = verify(&changed) {
+                prop_assert!(report.events <= events, "{report:?}");
+            }
+            Ok(())
+        })
+        .unwrap();
+}
+
 /// A server of its own process, recording to `file`; and where it listens for data.
 fn serving(folder: &Path, file: &Path) -> (std::process::Child, std::net::SocketAddr) {
     let free = || std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
