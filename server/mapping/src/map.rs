@@ -64,7 +64,7 @@ pub struct Layer {
 /// Where cells lie, in the ego frame.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Geometry {
-    /// r-θ grid: cell index = row * columns + column; row 0 innermost, row j spans (r_bench[j-1], r_bench[j]];
+    /// r-θ grid: cell index = row * columns + column; row 0 innermost, row j spans `(r_bench[j-1], r_bench[j]]`;
     /// column c spans azimuths [c, c+1) * 2π/columns, counter-clockwise from the ego x axis.
     Radial {
         /// Outer radius of each row, metres, ascending.

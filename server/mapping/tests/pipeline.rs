@@ -263,3 +263,63 @@ fn a_configuration_that_cannot_work_names_key_value_and_what_is_allowed() {
     let mismatch = Pipeline::new(&config(None), Vec::new()).err().unwrap();
     assert_eq!(mismatch.key, "vehicle.sensor");
 }
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn recorded_drives_become_maps_with_the_road_drivable() {
+    #[cfg(clearway_data)]
+    for (path, height, data, telemetry, whole, ahead_m) in [
+        ("pcap/rust-lidar-utils/hdl32_example.pcap", 2.165, 876, 100, 4, 20.0),
+        ("pcap/opendlv/proxy-velodyne16/sampleShort.pcap", 1.59, 291, 56, 2, 10.0),
+    ] {
+        let mut config = config(None);
+        let extrinsics = &mut config.sensors[0].extrinsics;
+        (extrinsics.z_m, extrinsics.pitch_deg, extrinsics.roll_deg) = (height, -1.4, 1.4);
+        let mut pipeline = Pipeline::new(&config, vec![None]).unwrap();
+        let bytes = std::fs::read(common::data(path)).unwrap();
+        let payloads = common::pcap_payloads(&bytes);
+        let read = payloads.len() as u64;
+        let mut events: Vec<Event> = (0..)
+            .zip(payloads)
+            .map(|(sequence, (payload, arrival_ns))| Event {
+                sequence,
+                arrival_ns,
+                source: 0,
+                body: Body::Datagram(Bytes::copy_from_slice(payload)),
+            })
+            .collect();
+        events.push(Event {
+            sequence: read,
+            arrival_ns: events.last().unwrap().arrival_ns,
+            source: 0,
+            body: Body::End,
+        });
+        let made = maps(&mut pipeline, &events);
+        let ledger = pipeline.ledger();
+        println!("{path}: {} maps, {ledger:?}", made.len());
+        assert_eq!(ledger.received, read);
+        assert_eq!(ledger.decoded + ledger.telemetry, read, "nothing refused");
+        assert_eq!((ledger.decoded, ledger.telemetry), (data, telemetry));
+        assert!(made.iter().filter(|map| map.sensors[0].partial.is_empty()).count() >= whole);
+        for map in made.iter().filter(|map| map.sensors[0].partial.is_empty()) {
+            let layer = &map.layers[0];
+            let (_, columns) = common::size(layer);
+            // The lane ahead, 2 degrees to either side.
+            let lane = (0..).zip(common::benches(layer)).take_while(|(_, bench)| **bench <= ahead_m);
+            let cells: Vec<u8> = lane
+                .flat_map(|(row, _)| {
+                    [0, 1, columns - 2, columns - 1].map(|c| common::classes(layer)[row * columns + c])
+                })
+                .filter(|class| *class != 0)
+                .collect();
+            let drivable = cells.iter().filter(|class| **class == 1).count();
+            println!(
+                "map {}: share {:.3}, lane {drivable}/{}",
+                map.sequence,
+                common::figure(layer, "drivable_share"),
+                cells.len()
+            );
+            assert!(cells.len() >= 8 && drivable * 10 >= cells.len() * 9);
+        }
+    }
+}
