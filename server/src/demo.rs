@@ -23,6 +23,9 @@ use crate::server::{Running, Server, Setup, StartError};
 use crate::status::Snapshot;
 use crate::wire::EncodedMap;
 
+/// The last datagrams are through the sockets long before this.
+const SETTLE: Duration = Duration::from_millis(500);
+
 /// What a demo is asked for.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
@@ -209,13 +212,21 @@ pub async fn demo(
     }
     let last = now(&running);
     halt.store(true, Ordering::Relaxed);
-    let sent = tokio::task::spawn_blocking(move || vehicle.join()).await;
-    let status = running.vehicles.0[0].status.clone();
-    running.shutdown().await?;
-    let sent = match sent {
-        Ok(Ok(sent)) => sent?,
-        Ok(Err(_)) | Err(_) => return Err(std::io::Error::other("panicked").into()),
+    let sent = match tokio::task::spawn_blocking(move || vehicle.join()).await {
+        Ok(Ok(sent)) => sent,
+        Ok(Err(_)) | Err(_) => Err(std::io::Error::other("panicked")),
     };
+    let status = running.vehicles.0[0].status.clone();
+    let on_their_way = || {
+        let received = status.snapshot().ledger.received + last.snapshot.kernel_drops.unwrap_or(0);
+        sent.as_ref().is_ok_and(|sent| received < sent.packets + sent.telemetry)
+    };
+    let settled = tokio::time::Instant::now() + SETTLE;
+    while on_their_way() && tokio::time::Instant::now() < settled {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    running.shutdown().await?;
+    let sent = sent?;
     // Kernel drops were read while the sockets were open; the rest is complete only now.
     let kernel_drops = last.snapshot.kernel_drops;
     let snapshot = Snapshot { kernel_drops, ..status.snapshot() };

@@ -360,3 +360,30 @@ fn verify_file(file: &Path, json: bool) -> Result<ExitCode> {
 fn say(text: &str) {
     let _ = std::io::stdout().write_all(text.as_bytes());
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn extrinsics_are_six_numbers_in_metres_and_degrees() {
+        let given = extrinsics("1,-0.5,1.9,0,-2.5,90").unwrap();
+        assert_eq!((given.x_m, given.y_m, given.z_m), (1.0, -0.5, 1.9));
+        assert_eq!((given.roll_deg, given.pitch_deg, given.yaw_deg), (0.0, -2.5, 90.0));
+        for wrong in ["", "1,2,3", "1,2,3,4,5,6,7", "1,2,3,4,5,x,6"] {
+            assert!(extrinsics(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_model_nobody_knows_is_answered_with_those_that_are() {
+        assert_eq!(model("vls128"), Ok(Model::Vls128));
+        assert!(model("ouster").unwrap_err().contains("hdl64e_s2"));
+    }
+
+    #[test]
+    fn the_command_line_is_sound() {
+        use clap::CommandFactory;
+        Arguments::command().debug_assert();
+    }
+}

@@ -338,3 +338,26 @@ pub fn unused(file: &Path) -> PathBuf {
     let numbered = (1_u64..).map(|number| file.with_file_name(format!("{stem}-{number}.{extension}")));
     std::iter::once(file.to_owned()).chain(numbered).find(|file| !file.exists()).unwrap_or_else(|| file.to_owned())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_new_run_never_writes_over_an_earlier_recording() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("car.mcap");
+        for expected in ["car.mcap", "car-1.mcap", "car-2.mcap"] {
+            let found = unused(&file);
+            assert_eq!(found, folder.path().join(expected));
+            File::create(found).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_file_that_cannot_be_created_is_named() {
+        let options = Options { file: "/proc/no/such.mcap".into(), ..Options::default() };
+        let error = Recorder::start(&options, &Preface::default(), false).map(|_| ()).unwrap_err().to_string();
+        assert!(error.contains("/proc/no"), "{error}");
+    }
+}

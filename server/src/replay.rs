@@ -199,3 +199,18 @@ fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) 
     }
     Ok(readings)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_speed_is_a_word_or_a_factor_above_nothing() {
+        assert_eq!("as-recorded".parse(), Ok(Speed::Times(1.0)));
+        assert_eq!("max".parse(), Ok(Speed::Max));
+        assert_eq!("2.5".parse(), Ok(Speed::Times(2.5)));
+        for wrong in ["0", "-1", "inf", "NaN", "fast"] {
+            assert!(wrong.parse::<Speed>().unwrap_err().contains("as-recorded, max"), "{wrong}");
+        }
+    }
+}
