@@ -13,9 +13,9 @@ use futures::{Stream, stream};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tonic::transport::Server;
-use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status, Streaming};
 
+use super::connections::Connections;
 use super::{Served, Unknown, Vehicles};
 use crate::engine::Newest;
 use crate::ingest::now_ns;
@@ -51,8 +51,6 @@ pub async fn serve(
             .register_encoded_file_descriptor_set(DESCRIPTORS)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    // `Server::tcp_nodelay` does not reach a listener of our own.
-    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
     let maps = MapServiceServer::new(Maps { vehicles }).max_decoding_message_size(REQUEST_BYTES_MAX);
     Server::builder()
         .http2_keepalive_interval(Some(KEEPALIVE))
@@ -66,7 +64,7 @@ pub async fn serve(
         .add_service(reflection().build_v1()?)
         // Older grpcurl knows only this one.
         .add_service(reflection().build_v1alpha()?)
-        .serve_with_incoming_shutdown(incoming, stop)
+        .serve_with_incoming_shutdown(Connections::new(listener).stream(), stop)
         .await?;
     Ok(())
 }

@@ -11,7 +11,6 @@ use axum::extract::{Query, State};
 use axum::http::{StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use axum::serve::ListenerExt;
 use bytes::Bytes;
 use clearway_proto::v1;
 use prost::Message;
@@ -19,6 +18,7 @@ use rust_embed::RustEmbed;
 use serde_json::Value;
 use tokio::net::TcpListener;
 
+use super::connections::Connections;
 use super::{Served, Vehicles};
 use crate::ingest::now_ns;
 use crate::status::{Reader, prometheus};
@@ -49,11 +49,7 @@ pub async fn serve(
         .route("/metrics", get(metrics))
         .fallback(asset)
         .with_state(vehicles);
-    let listener = listener.tap_io(|stream| {
-        // A failure leaves the default, which is slower but right.
-        let _ = stream.set_nodelay(true);
-    });
-    axum::serve(listener, router).with_graceful_shutdown(stop).await
+    axum::serve(Connections::new(listener), router).with_graceful_shutdown(stop).await
 }
 
 async fn asset(uri: Uri) -> Response {
