@@ -44,11 +44,11 @@ impl Clouds {
         Ok(Self { folder: folder.to_owned() })
     }
 
-    /// Looks at each map's revolution and writes it; scans that came assembled are not written again.
+    /// Looks at each revolution and writes it; scans that came assembled are not written again.
     pub fn observer(self) -> (Observer, Written) {
         let written: Written = Arc::new(Mutex::new(Ok(0)));
         let count = written.clone();
-        let observer: Observer = Box::new(move |pipeline, _| {
+        let observer: Observer = Box::new(move |pipeline| {
             let Some(revolution) = pipeline.newest_revolution() else { return };
             let mut written = locked(&written);
             let Ok(count) = *written else { return };

@@ -20,8 +20,8 @@ use crate::wire::{self, EncodedMap};
 /// The newest map of one vehicle; `None` before the first.
 pub type Newest = Option<Arc<EncodedMap>>;
 
-/// Sees the pipeline after each event that completed a map.
-pub type Observer = Box<dyn FnMut(&Pipeline, &EncodedMap) + Send>;
+/// Sees the pipeline after each event that completed a revolution.
+pub type Observer = Box<dyn FnMut(&Pipeline) + Send>;
 
 /// One vehicle's engine, before it runs.
 pub struct Engine {
@@ -97,18 +97,23 @@ impl Engine {
                 return;
             }
         };
-        let states = map.sensors.iter().map(wire::sensor).collect();
-        let encoded = Arc::new(EncodedMap::new(map, self.status.name.clone(), self.status.boot_id, self.valid_ms));
+        // Where every map is switched off, a revolution makes none.
+        let made = (!map.layers.is_empty()).then(|| {
+            let states = map.sensors.iter().map(wire::sensor).collect();
+            (Arc::new(EncodedMap::new(map, self.status.name.clone(), self.status.boot_id, self.valid_ms)), states)
+        });
         let latency = started.elapsed();
         // The status first: whoever has seen a map finds it counted.
         self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors());
-        self.status.mapped(&encoded, states, latency);
-        self.newest.send_replace(Some(encoded.clone()));
-        if let Some(observer) = &mut self.observer {
-            observer(&self.pipeline, &encoded);
+        if let Some((encoded, states)) = made {
+            self.status.mapped(&encoded, states, latency);
+            self.newest.send_replace(Some(encoded.clone()));
+            if let Some(journal) = &self.journal {
+                journal.map(encoded);
+            }
         }
-        if let Some(journal) = &self.journal {
-            journal.map(encoded);
+        if let Some(observer) = &mut self.observer {
+            observer(&self.pipeline);
         }
     }
 }

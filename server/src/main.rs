@@ -254,8 +254,8 @@ async fn replay_files(arguments: ReplayArguments) -> Result<ExitCode> {
     let bar = tokio::spawn(draw(progress.clone(), !json && std::io::stderr().is_terminal()));
     let stop = stop_signal()?;
     let started = |running: &Running, summary: &Summary| {
-        if let Mount::Estimated(estimate) = &summary.mount {
-            eprintln!("extrinsics {}", replay::describe(estimate));
+        if let Some(said) = replay::describe(&summary.mount) {
+            eprintln!("extrinsics {said}");
         }
         tell(running);
     };

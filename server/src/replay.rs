@@ -2,7 +2,8 @@
 //! same files always make the same maps.
 //!
 //! A capture rarely says how its sensor was mounted. Without extrinsics a first pass over the first revolutions finds
-//! height, pitch and roll from the ground around the vehicle; the figures are said, and recorded.
+//! height, pitch and roll from the ground around the vehicle; the figures are said, and recorded. Where there is no ground to
+//! find, nothing is guessed: the files are decoded and no map is made, and that is said too.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -11,7 +12,6 @@ use std::time::{Duration, Instant};
 
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
-use clearway_mapping::mount::MountError;
 
 use crate::clouds::CloudError;
 use crate::config::ConfigError;
@@ -98,15 +98,6 @@ pub enum ReplayError {
         name: String,
         /// What there is.
         known: String,
-    },
-    /// The mount is not known, and cannot be found.
-    #[error(
-        "the files do not say how the sensor is mounted, and its mount cannot be estimated: {source}; give it with \
-         --extrinsics x,y,z,roll,pitch,yaw (metres and degrees, such as 0,0,1.9,0,0,0), or with --config FILE"
-    )]
-    Mount {
-        /// Why not.
-        source: MountError,
     },
     /// The point clouds cannot be written.
     #[error(transparent)]

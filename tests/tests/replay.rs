@@ -4,7 +4,7 @@ mod house;
 
 use std::path::{Path, PathBuf};
 
-use clearway_server::replay::{Mount, Options, ReplayError, Summary, replay};
+use clearway_server::replay::{Mount, Options, ReplayError, Summary, describe, replay};
 use clearway_server::verify::verify;
 
 async fn replayed(options: Options) -> Result<Summary, ReplayError> {
@@ -125,13 +125,15 @@ async fn a_file_that_is_nothing_known_is_named() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_mount_that_cannot_be_estimated_is_asked_for() {
+async fn without_ground_to_estimate_a_mount_from_no_map_is_made_and_the_mount_is_asked_for() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("wall.bin");
     let points = (0..2000).map(|i| [5.0f32, (i % 50) as f32 * 0.1 - 2.5, (i / 50) as f32 * 0.1, 0.5]);
     let bytes: Vec<u8> = points.flatten().flat_map(|value| value.to_le_bytes()).collect();
     std::fs::write(&file, bytes).unwrap();
-    let error = replayed(Options { files: vec![file], ..Options::default() }).await.unwrap_err();
-    assert!(matches!(error, ReplayError::Mount { .. }));
-    assert!(error.to_string().contains("--extrinsics x,y,z,roll,pitch,yaw"), "{error}");
+    let summary = replayed(Options { files: vec![file], ..Options::default() }).await.unwrap();
+    assert_eq!((summary.snapshot.ledger.decoded, summary.snapshot.maps), (1, 0));
+    assert!(matches!(summary.mount, Mount::Unknown(_)), "{:?}", summary.mount);
+    let said = describe(&summary.mount).unwrap();
+    assert!(said.contains("--extrinsics x,y,z,roll,pitch,yaw"), "{said}");
 }

@@ -210,6 +210,15 @@ impl Default for HeightDifferenceConfig {
     }
 }
 
+impl MapsConfig {
+    /// Every map switched off.
+    pub fn none() -> Self {
+        let mut maps = Self::default();
+        (maps.drivability.enabled, maps.height_difference.enabled) = (false, false);
+        maps
+    }
+}
+
 /// A value of the configuration that cannot be used.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error("{key} = {value}: allowed is {allowed}")]

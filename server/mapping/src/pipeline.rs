@@ -13,7 +13,7 @@ use clearway_lidar::revolution::{Partial, Revolution};
 use clearway_lidar::sensor::{Refusal, Sensor, SensorStatus};
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
-use crate::config::{ConfigError, VehicleConfig};
+use crate::config::{ConfigError, SensorConfig, VehicleConfig};
 use crate::drivability::Drivability;
 use crate::event::{Body, EgoPose, Event, Scan};
 use crate::height_difference::HeightDifference;
@@ -28,6 +28,8 @@ pub struct Pipeline {
     scan_calibration: Option<Arc<Calibration>>,
     pose: Option<EgoPose>,
     scan_stamp_ns: Option<i64>,
+    /// Scans taken, and their points.
+    scans: (u64, u64),
     ledger: Ledger,
     newest_is_revolution: bool,
     maker: Maker,
@@ -59,7 +61,7 @@ pub struct Ledger {
 pub struct NamedStatus {
     /// From the configuration.
     pub name: String,
-    /// From the data.
+    /// From the data; a scan counts as a revolution.
     pub status: SensorStatus,
 }
 
@@ -149,6 +151,7 @@ impl Pipeline {
             scan_calibration,
             pose: None,
             scan_stamp_ns: None,
+            scans: (0, 0),
             ledger: Ledger::default(),
             newest_is_revolution: false,
             maker: Maker::new(config),
@@ -198,7 +201,11 @@ impl Pipeline {
 
     /// The sensors in the order of the configuration.
     pub fn sensors(&self) -> Vec<NamedStatus> {
-        self.config.sensors.iter().map(|s| NamedStatus { name: s.name.clone(), status: self.sensor.status() }).collect()
+        let mut status = self.sensor.status();
+        status.revolutions += self.scans.0;
+        status.returns += self.scans.1;
+        let named = |sensor: &SensorConfig| NamedStatus { name: sensor.name.clone(), status: status.clone() };
+        self.config.sensors.iter().map(named).collect()
     }
 
     /// The revolution that made the newest map; `None` before the first, and where a scan made it.
@@ -238,6 +245,7 @@ impl Pipeline {
         let refused = self.ledger.refused.values().sum();
         let dropped = self.maker.scan(scan, calibration, &self.config, self.pose.as_ref(), refused, arrival_ns);
         self.ledger.points_dropped += dropped;
+        self.scans = (self.scans.0 + 1, self.scans.1 + u64::from(self.maker.sweep.returns));
         self.ledger.decoded += 1;
         self.newest_is_revolution = false;
         Ok(true)

@@ -7,7 +7,7 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::{Echo, Revolution};
 use clearway_lidar::sensor::{Sensor, SensorConfig as LidarConfig};
-use clearway_mapping::config::{Extrinsics, SensorConfig};
+use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig};
 use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::mount::estimate;
 
@@ -63,14 +63,17 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
             if revolutions.is_empty() {
                 Mount::Unneeded
             } else {
-                let estimate = estimate(&revolutions).map_err(|source| ReplayError::Mount { source })?;
-                sensor.extrinsics = estimate.extrinsics();
-                remarks.push(format!("extrinsics of {}: {}", sensor.name, describe(&estimate)));
-                Mount::Estimated(estimate)
+                let mount = estimate(&revolutions).map_or_else(Mount::Unknown, Mount::Estimated);
+                remarks.extend(describe(&mount).map(|said| format!("extrinsics of {}: {said}", sensor.name)));
+                match &mount {
+                    Mount::Estimated(estimate) => sensor.extrinsics = estimate.extrinsics(),
+                    _ => config.vehicles[0].maps = MapsConfig::none(),
+                }
+                mount
             }
         }
     };
-    let extrinsics = sensor.extrinsics;
+    let extrinsics = config.vehicles[0].sensors[0].extrinsics;
     config.recorder.file = options.record.clone().unwrap_or_default();
     if !options.serve {
         (config.grpc.enabled, config.page.enabled, config.zenoh.enabled) = (false, false, false);

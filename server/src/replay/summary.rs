@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clearway_mapping::config::Extrinsics;
-use clearway_mapping::mount::MountEstimate;
+use clearway_mapping::mount::{MountError, MountEstimate};
 use clearway_mapping::pipeline::model_name;
 use serde_json::{Value, json};
 
@@ -17,6 +17,8 @@ pub enum Mount {
     Given,
     /// The ground in the first revolutions.
     Estimated(MountEstimate),
+    /// The ground could not be found; no map was made.
+    Unknown(MountError),
     /// Nowhere: the files hold no revolution.
     Unneeded,
 }
@@ -58,20 +60,27 @@ impl Summary {
             "source": match self.mount {
                 Mount::Given => "given",
                 Mount::Estimated(_) => "estimated",
+                Mount::Unknown(_) => "unknown",
                 Mount::Unneeded => "none",
             },
             "x_m": e.x_m, "y_m": e.y_m, "z_m": e.z_m,
             "roll_deg": e.roll_deg, "pitch_deg": e.pitch_deg, "yaw_deg": e.yaw_deg,
         });
-        if let Mount::Estimated(estimate) = &self.mount {
-            mount["revolutions"] = estimate.revolutions.into();
-            mount["residual_m"] = estimate.residual_m.into();
-            mount["inliers"] = estimate.inliers.into();
-            mount["samples"] = estimate.samples.into();
+        match &self.mount {
+            Mount::Estimated(estimate) => {
+                mount["revolutions"] = estimate.revolutions.into();
+                mount["residual_m"] = estimate.residual_m.into();
+                mount["inliers"] = estimate.inliers.into();
+                mount["samples"] = estimate.samples.into();
+            }
+            Mount::Unknown(why) => mount["reason"] = why.to_string().into(),
+            Mount::Given | Mount::Unneeded => {}
         }
         let truncated = self.truncated.iter().map(|t| json!({ "file": t.file, "reason": t.reason }));
         json!({
-            "packets": { "received": ledger.received, "decoded": ledger.decoded, "refused": ledger.refused },
+            "packets": {
+                "received": ledger.received - ledger.telemetry, "decoded": ledger.decoded, "refused": ledger.refused,
+            },
             "telemetry": ledger.telemetry,
             "lost": ledger.lost,
             "revolutions": self.snapshot.revolutions(),
@@ -124,17 +133,25 @@ impl Summary {
     }
 }
 
-/// An estimate in one line.
-pub fn describe(estimate: &MountEstimate) -> String {
-    format!(
-        "estimated from the ground in {} revolutions: height {:.3} m, pitch {:.2} deg, roll {:.2} deg ({} of {} places on \
-         one plane, residual {:.3} m)",
-        estimate.revolutions,
-        estimate.height_m,
-        estimate.pitch_rad.to_degrees(),
-        estimate.roll_rad.to_degrees(),
-        estimate.inliers,
-        estimate.samples,
-        estimate.residual_m,
-    )
+/// What was found out about the mount, in one line; nothing where it was not looked for.
+pub fn describe(mount: &Mount) -> Option<String> {
+    match mount {
+        Mount::Estimated(estimate) => Some(format!(
+            "estimated from the ground in {} revolutions: height {:.3} m, pitch {:.2} deg, roll {:.2} deg ({} of {} places \
+             on one plane, residual {:.3} m)",
+            estimate.revolutions,
+            estimate.height_m,
+            estimate.pitch_rad.to_degrees(),
+            estimate.roll_rad.to_degrees(),
+            estimate.inliers,
+            estimate.samples,
+            estimate.residual_m,
+        )),
+        Mount::Unknown(why) => Some(format!(
+            "unknown, so no map is made: the files do not say how the sensor is mounted, and it cannot be estimated: {why}; \
+             give it with --extrinsics x,y,z,roll,pitch,yaw (metres and degrees, such as 0,0,1.9,0,0,0), or with --config \
+             FILE"
+        )),
+        Mount::Given | Mount::Unneeded => None,
+    }
 }
