@@ -123,9 +123,7 @@ impl Second {
             "seconds": elapsed.as_secs_f64(),
             "revolutions": snapshot.revolutions(),
             "maps": snapshot.maps,
-            "packets": {
-                "received": snapshot.ledger.received, "decoded": snapshot.ledger.decoded, "refused": snapshot.ledger.refused,
-            },
+            "packets": snapshot.packets_json(),
             "telemetry": snapshot.ledger.telemetry,
             "lost": snapshot.ledger.lost,
             "kernel_drops": snapshot.kernel_drops,

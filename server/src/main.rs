@@ -13,7 +13,7 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
 use clearway_server::config::Config;
 use clearway_server::demo::{self, Places, Second};
-use clearway_server::replay::{self, Mount, Progress, Speed, Summary};
+use clearway_server::replay::{self, Progress, Speed, Summary};
 use clearway_server::server::{Running, Server, Setup};
 use clearway_server::verify::verify;
 use indicatif::{ProgressBar, ProgressStyle};

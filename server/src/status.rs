@@ -106,6 +106,12 @@ impl Snapshot {
         self.sensors.iter().map(|sensor| sensor.status.revolutions).sum()
     }
 
+    /// What came of everything but telemetry: received = decoded + the sum of refused.
+    pub fn packets_json(&self) -> Value {
+        let Ledger { received, telemetry, decoded, refused, .. } = &self.ledger;
+        json!({ "received": received - telemetry, "decoded": decoded, "refused": refused })
+    }
+
     /// Datagrams refused, for any reason.
     pub fn refused(&self) -> u64 {
         self.ledger.refused.values().sum()

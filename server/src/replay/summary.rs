@@ -55,32 +55,9 @@ impl Summary {
                 "revolutions": sensor.status.revolutions,
             })
         });
-        let e = &self.extrinsics;
-        let mut mount = json!({
-            "source": match self.mount {
-                Mount::Given => "given",
-                Mount::Estimated(_) => "estimated",
-                Mount::Unknown(_) => "unknown",
-                Mount::Unneeded => "none",
-            },
-            "x_m": e.x_m, "y_m": e.y_m, "z_m": e.z_m,
-            "roll_deg": e.roll_deg, "pitch_deg": e.pitch_deg, "yaw_deg": e.yaw_deg,
-        });
-        match &self.mount {
-            Mount::Estimated(estimate) => {
-                mount["revolutions"] = estimate.revolutions.into();
-                mount["residual_m"] = estimate.residual_m.into();
-                mount["inliers"] = estimate.inliers.into();
-                mount["samples"] = estimate.samples.into();
-            }
-            Mount::Unknown(why) => mount["reason"] = why.to_string().into(),
-            Mount::Given | Mount::Unneeded => {}
-        }
         let truncated = self.truncated.iter().map(|t| json!({ "file": t.file, "reason": t.reason }));
         json!({
-            "packets": {
-                "received": ledger.received - ledger.telemetry, "decoded": ledger.decoded, "refused": ledger.refused,
-            },
+            "packets": self.snapshot.packets_json(),
             "telemetry": ledger.telemetry,
             "lost": ledger.lost,
             "revolutions": self.snapshot.revolutions(),
@@ -88,13 +65,35 @@ impl Summary {
             "sensors": sensors.collect::<Vec<_>>(),
             "latency_ms": { "p50": self.snapshot.latency_ms_p50, "p99": self.snapshot.latency_ms_p99 },
             "drivable_share": self.snapshot.drivable_share,
-            "mount": mount,
+            "mount": self.mount_json(),
             "truncated": truncated.collect::<Vec<_>>(),
             "notes": self.notes,
             "clouds": self.clouds,
             "record": self.record,
             "seconds": self.seconds,
         })
+    }
+
+    fn mount_json(&self) -> Value {
+        let e = &self.extrinsics;
+        let mut known = json!({
+            "source": "given",
+            "x_m": e.x_m, "y_m": e.y_m, "z_m": e.z_m,
+            "roll_deg": e.roll_deg, "pitch_deg": e.pitch_deg, "yaw_deg": e.yaw_deg,
+        });
+        match &self.mount {
+            Mount::Given => known,
+            Mount::Estimated(estimate) => {
+                known["source"] = "estimated".into();
+                known["revolutions"] = estimate.revolutions.into();
+                known["residual_m"] = estimate.residual_m.into();
+                known["inliers"] = estimate.inliers.into();
+                known["samples"] = estimate.samples.into();
+                known
+            }
+            Mount::Unknown(why) => json!({ "source": "unknown", "reason": why.to_string() }),
+            Mount::Unneeded => json!({ "source": "none" }),
+        }
     }
 
     /// A few lines for people.
