@@ -8,7 +8,6 @@ use std::sync::mpsc::{Receiver, TryRecvError};
 use std::thread::JoinHandle;
 use std::time::Instant;
 
-use clearway_mapping::config::MapsConfig;
 use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use tokio::sync::watch;
@@ -37,13 +36,6 @@ pub struct Engine {
     pub status: Arc<VehicleStatus>,
     /// Looks at what the maps were made from.
     pub observer: Option<Observer>,
-}
-
-/// The layers of a vehicle's maps, in order.
-pub fn layers(maps: &MapsConfig) -> Vec<&'static str> {
-    let drivability = maps.drivability.enabled.then_some("drivability");
-    let height_difference = maps.height_difference.enabled.then_some("height_difference");
-    drivability.into_iter().chain(height_difference).collect()
 }
 
 impl Engine {

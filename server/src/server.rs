@@ -9,13 +9,13 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use clearway_lidar::calibration::Calibration;
-use clearway_mapping::pipeline::Pipeline;
+use clearway_mapping::pipeline::{Pipeline, layer_names};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use crate::config::{Calibrations, Config};
-use crate::engine::{Engine, Observer, layers};
+use crate::engine::{Engine, Observer};
 use crate::ingest::{Door, door, udp};
 use crate::publish::{Served, Vehicles, grpc, page};
 use crate::record::{Preface, RecordError, Recorder};
@@ -175,7 +175,7 @@ impl Server {
             let (door, events) = door(vehicle.queue);
             let counts = recorder.as_ref().map(Recorder::counts);
             let status =
-                Arc::new(VehicleStatus::new(name.clone(), boot_id, layers(&vehicle.maps), door.outside(), counts));
+                Arc::new(VehicleStatus::new(name.clone(), boot_id, layer_names(&vehicle.maps), door.outside(), counts));
             let (newest, receiver) = watch::channel(None);
             let engine = Engine {
                 pipeline,
@@ -333,7 +333,7 @@ fn preface(
         }
     }
     let remarks: String = remarks.iter().map(|remark| format!("# {remark}\n")).collect();
-    let vehicles = names.iter().zip(&config.vehicles).map(|(name, v)| (name.clone(), layers(&v.maps))).collect();
+    let vehicles = names.iter().zip(&config.vehicles).map(|(name, v)| (name.clone(), layer_names(&v.maps))).collect();
     Preface { boot_id, config: remarks + &config.to_toml(), vehicles, calibrations: tables, notes }
 }
 

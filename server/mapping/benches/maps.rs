@@ -8,6 +8,7 @@ use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig};
 use clearway_mapping::drivability::Drivability;
 use clearway_mapping::event::Scan;
 use clearway_mapping::height_difference::HeightDifference;
+use clearway_mapping::map::LayerMaker;
 use clearway_mapping::sweep::{Mount, Sweep};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::vehicle::SimulatedVehicle;

@@ -19,7 +19,7 @@ pub mod search;
 pub mod segments;
 
 use crate::config::DrivabilityConfig;
-use crate::map::{Cells, Channel, Geometry, Layer};
+use crate::map::{Cells, Channel, Geometry, Layer, LayerMaker};
 use crate::radial::RadialGrid;
 use crate::sweep::Sweep;
 
@@ -66,40 +66,6 @@ impl Drivability {
         }
     }
 
-    /// The layer without cells.
-    pub fn layer(&self) -> Layer {
-        let unit = |name, unit, scale, unknown, cells| Channel { name, unit, scale, unknown, cells };
-        Layer {
-            name: "drivability",
-            geometry: Geometry::Radial { r_bench_m: Vec::new(), columns: self.config.columns },
-            legend: LEGEND,
-            channels: vec![
-                unit("class", "", 1.0, i32::from(UNKNOWN), Cells::U8(Vec::new())),
-                unit(
-                    "unit_height",
-                    "m",
-                    self.config.unit_height_m,
-                    i32::from(UNIT_HEIGHT_UNKNOWN),
-                    Cells::I8(Vec::new()),
-                ),
-                unit("segment", "", 1.0, i32::from(SEGMENT_UNKNOWN), Cells::U16(Vec::new())),
-            ],
-            planes: Vec::new(),
-            figures: Vec::new(),
-        }
-    }
-
-    /// Makes the layer of one sweep in `layer`, a [`Drivability::layer`], in place of what it held. Every cell is
-    /// written.
-    pub fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
-        self.grid.follow(sweep, self.config.range_m_max, self.config.columns);
-        self.heights.set_up(&self.grid, sweep, &self.config);
-        self.segments.grow(&self.grid, &self.heights, &self.config);
-        self.planes.fit(&self.heights, &self.segments);
-        self.search.run(&self.grid, &self.heights, &self.segments, &self.planes, &self.config);
-        self.write(layer);
-    }
-
     fn write(&self, layer: &mut Layer) {
         self.grid.describe(&mut layer.geometry);
         let [class, unit_height, segment] = &mut layer.channels[..] else { unreachable!("layer() gives three") };
@@ -126,5 +92,38 @@ impl Drivability {
         layer.planes.extend_from_slice(self.planes.of_segment());
         layer.figures.clear();
         layer.figures.push(("drivable_share", if known == 0 { 0.0 } else { drivable as f64 / known as f64 }));
+    }
+}
+
+impl LayerMaker for Drivability {
+    fn layer(&self) -> Layer {
+        let unit = |name, unit, scale, unknown, cells| Channel { name, unit, scale, unknown, cells };
+        Layer {
+            name: "drivability",
+            geometry: Geometry::Radial { r_bench_m: Vec::new(), columns: self.config.columns },
+            legend: LEGEND,
+            channels: vec![
+                unit("class", "", 1.0, i32::from(UNKNOWN), Cells::U8(Vec::new())),
+                unit(
+                    "unit_height",
+                    "m",
+                    self.config.unit_height_m,
+                    i32::from(UNIT_HEIGHT_UNKNOWN),
+                    Cells::I8(Vec::new()),
+                ),
+                unit("segment", "", 1.0, i32::from(SEGMENT_UNKNOWN), Cells::U16(Vec::new())),
+            ],
+            planes: Vec::new(),
+            figures: Vec::new(),
+        }
+    }
+
+    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
+        self.grid.follow(sweep, self.config.range_m_max, self.config.columns);
+        self.heights.set_up(&self.grid, sweep, &self.config);
+        self.segments.grow(&self.grid, &self.heights, &self.config);
+        self.planes.fit(&self.heights, &self.segments);
+        self.search.run(&self.grid, &self.heights, &self.segments, &self.planes, &self.config);
+        self.write(layer);
     }
 }

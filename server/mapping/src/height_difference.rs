@@ -5,7 +5,7 @@
 //! one under branches, for an obstacle, and calls ground behind a fence drivable, as the thesis shows.
 
 use crate::config::HeightDifferenceConfig;
-use crate::map::{Cells, Channel, Geometry, Layer};
+use crate::map::{Cells, Channel, Geometry, Layer, LayerMaker};
 use crate::radial::RadialGrid;
 use crate::sweep::Sweep;
 
@@ -33,9 +33,10 @@ impl HeightDifference {
     pub fn new(config: &HeightDifferenceConfig) -> Self {
         Self { config: config.clone(), grid: RadialGrid::default(), span: Vec::new() }
     }
+}
 
-    /// The layer without cells.
-    pub fn layer(&self) -> Layer {
+impl LayerMaker for HeightDifference {
+    fn layer(&self) -> Layer {
         Layer {
             name: "height_difference",
             geometry: Geometry::Radial { r_bench_m: Vec::new(), columns: self.config.columns },
@@ -61,9 +62,7 @@ impl HeightDifference {
         }
     }
 
-    /// Makes the layer of one sweep in `layer`, a [`HeightDifference::layer`], in place of what it held. Every cell is
-    /// written.
-    pub fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
+    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
         self.grid.follow(sweep, self.config.range_m_max, self.config.columns);
         self.span.clear();
         self.span.resize(self.grid.cells() + self.grid.columns(), [f32::NEG_INFINITY, f32::INFINITY]);

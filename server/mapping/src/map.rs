@@ -2,6 +2,8 @@
 
 use nalgebra::Isometry3;
 
+use crate::sweep::Sweep;
+
 /// Everything made from one revolution (or scan) of one vehicle.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Map {
@@ -61,6 +63,16 @@ pub struct Layer {
     pub figures: Vec<(&'static str, f64)>,
 }
 
+/// Makes one layer from sweep after sweep, reusing its buffers.
+pub trait LayerMaker: Send {
+    /// The layer without cells.
+    fn layer(&self) -> Layer;
+
+    /// Makes the layer of one sweep in `layer`, one of [`LayerMaker::layer`], in place of what it held. Every cell is
+    /// written.
+    fn make(&mut self, sweep: &Sweep, layer: &mut Layer);
+}
+
 /// Where cells lie, in the ego frame.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Geometry {
@@ -71,6 +83,19 @@ pub enum Geometry {
         r_bench_m: Vec<f32>,
         /// Number of columns.
         columns: u16,
+    },
+    /// Square cells: index = iy * width + ix; cell (ix, iy) spans `origin + i * cell_m` to `origin + (i + 1) * cell_m`.
+    Cartesian {
+        /// Corner of cell (0, 0), metres forward.
+        origin_x_m: f64,
+        /// Corner of cell (0, 0), metres to the left.
+        origin_y_m: f64,
+        /// Cells along x.
+        width: u32,
+        /// Cells along y.
+        height: u32,
+        /// Side of a cell.
+        cell_m: f32,
     },
 }
 

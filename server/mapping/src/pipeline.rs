@@ -13,11 +13,11 @@ use clearway_lidar::revolution::{Partial, Revolution};
 use clearway_lidar::sensor::{Refusal, Sensor, SensorStatus};
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
-use crate::config::{ConfigError, SensorConfig, VehicleConfig};
+use crate::config::{ConfigError, MapsConfig, SensorConfig, VehicleConfig};
 use crate::drivability::Drivability;
 use crate::event::{Body, EgoPose, Event, Scan};
 use crate::height_difference::HeightDifference;
-use crate::map::{Map, SensorState};
+use crate::map::{LayerMaker, Map, SensorState};
 use crate::sweep::{Mount, Sweep};
 
 /// One vehicle's way from events to maps.
@@ -290,25 +290,20 @@ struct Maker {
     maps_made: u64,
     mount: Mount,
     sweep: Sweep,
-    drivability: Option<Drivability>,
-    height_difference: Option<HeightDifference>,
+    layer_makers: Vec<Box<dyn LayerMaker>>,
     map: Map,
 }
 
 impl Maker {
     fn new(config: &VehicleConfig) -> Self {
-        let maps = &config.maps;
-        let drivability = maps.drivability.enabled.then(|| Drivability::new(&maps.drivability));
-        let height_difference = maps.height_difference.enabled.then(|| HeightDifference::new(&maps.height_difference));
-        let layers = drivability.iter().map(Drivability::layer);
-        let layers = layers.chain(height_difference.iter().map(HeightDifference::layer)).collect();
+        let layer_makers = layer_makers(&config.maps);
+        let layers = layer_makers.iter().map(|maker| maker.layer()).collect();
         let sensor = &config.sensors[0];
         Self {
             maps_made: 0,
             mount: Mount { ego_from_sensor: sensor.extrinsics.ego_from_sensor(), range_m_min: sensor.range_m_min },
             sweep: Sweep::default(),
-            drivability,
-            height_difference,
+            layer_makers,
             map: Map {
                 sequence: 0,
                 capture_start_ns: 0,
@@ -380,14 +375,27 @@ impl Maker {
         map.speed_mps = pose.map(|p| p.speed_mps);
         map.sensors.clear();
         map.sensors.push(sensor);
-        let mut layers = map.layers.iter_mut();
-        if let (Some(drivability), Some(layer)) = (&mut self.drivability, layers.next()) {
-            drivability.make(&self.sweep, layer);
-        }
-        if let (Some(height_difference), Some(layer)) = (&mut self.height_difference, layers.next()) {
-            height_difference.make(&self.sweep, layer);
+        for (maker, layer) in self.layer_makers.iter_mut().zip(&mut map.layers) {
+            maker.make(&self.sweep, layer);
         }
     }
+}
+
+/// The maps that are switched on, in the order of their layers.
+fn layer_makers(maps: &MapsConfig) -> Vec<Box<dyn LayerMaker>> {
+    let mut makers: Vec<Box<dyn LayerMaker>> = Vec::new();
+    if maps.drivability.enabled {
+        makers.push(Box::new(Drivability::new(&maps.drivability)));
+    }
+    if maps.height_difference.enabled {
+        makers.push(Box::new(HeightDifference::new(&maps.height_difference)));
+    }
+    makers
+}
+
+/// Names of the layers of a vehicle's maps, in order.
+pub fn layer_names(maps: &MapsConfig) -> Vec<&'static str> {
+    layer_makers(maps).iter().map(|maker| maker.layer().name).collect()
 }
 
 /// Share of the turn's degrees in which a firing lies.

@@ -103,7 +103,7 @@ impl RadialGrid {
 
     /// Writes where the cells lie into `geometry`, keeping its buffer.
     pub fn describe(&self, geometry: &mut Geometry) {
-        let Geometry::Radial { r_bench_m, columns } = geometry;
+        let Geometry::Radial { r_bench_m, columns } = geometry else { unreachable!("the layer of a radial grid") };
         r_bench_m.clone_from(&self.r_bench_m);
         *columns = self.quadrants.columns;
     }

@@ -6,36 +6,12 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig};
 use clearway_mapping::drivability::Drivability;
 use clearway_mapping::height_difference::HeightDifference;
-use clearway_mapping::map::{Cells, Layer};
+use clearway_mapping::map::{Cells, Layer, LayerMaker};
 use clearway_mapping::sweep::Sweep;
 use common::*;
 
-/// A map under test: makes a layer from a sweep, into buffers it was handed.
-trait Maker {
-    fn layer(&self) -> Layer;
-    fn make(&mut self, sweep: &Sweep, layer: &mut Layer);
-}
-
-impl Maker for Drivability {
-    fn layer(&self) -> Layer {
-        Drivability::layer(self)
-    }
-    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
-        Drivability::make(self, sweep, layer);
-    }
-}
-
-impl Maker for HeightDifference {
-    fn layer(&self) -> Layer {
-        HeightDifference::layer(self)
-    }
-    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
-        HeightDifference::make(self, sweep, layer);
-    }
-}
-
-fn makers() -> Vec<Box<dyn Maker>> {
-    let mut makers: Vec<Box<dyn Maker>> = Vec::new();
+fn makers() -> Vec<Box<dyn LayerMaker>> {
+    let mut makers: Vec<Box<dyn LayerMaker>> = Vec::new();
     for columns in [360, 180, 90] {
         let drivability = DrivabilityConfig { columns, ..DrivabilityConfig::default() };
         makers.push(Box::new(Drivability::new(&drivability)));
@@ -45,7 +21,7 @@ fn makers() -> Vec<Box<dyn Maker>> {
     makers
 }
 
-fn make(maker: &mut dyn Maker, sweep: &Sweep) -> Layer {
+fn make(maker: &mut dyn LayerMaker, sweep: &Sweep) -> Layer {
     let mut layer = maker.layer();
     maker.make(sweep, &mut layer);
     layer

@@ -8,7 +8,7 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{DrivabilityConfig, Seed};
 use clearway_mapping::drivability::{DRIVABLE, Drivability, NOT_DRIVABLE, OBSTACLE, UNKNOWN};
-use clearway_mapping::map::Layer;
+use clearway_mapping::map::{Layer, LayerMaker};
 use clearway_mapping::radial::{r_bench_m, ring_radii_m};
 use clearway_mapping::sweep::Sweep;
 use common::*;

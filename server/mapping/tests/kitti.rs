@@ -11,7 +11,7 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{DrivabilityConfig, Extrinsics, Gate};
 use clearway_mapping::drivability::{DRIVABLE, Drivability, UNKNOWN};
-use clearway_mapping::map::Layer;
+use clearway_mapping::map::{Layer, LayerMaker};
 use clearway_mapping::radial::RadialGrid;
 use clearway_mapping::sweep::{Mount, Sweep};
 use common::*;

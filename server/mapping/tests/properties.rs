@@ -10,6 +10,7 @@ use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig, Seed};
 use clearway_mapping::drivability::{Drivability, UNKNOWN};
 use clearway_mapping::event::Scan;
 use clearway_mapping::height_difference::HeightDifference;
+use clearway_mapping::map::LayerMaker;
 use clearway_mapping::radial::RadialGrid;
 use clearway_mapping::sweep::{Mount, Sweep};
 use common::*;

@@ -12,7 +12,7 @@ mod common;
 use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig};
 use clearway_mapping::drivability::{self, Drivability};
 use clearway_mapping::height_difference::{self, HeightDifference};
-use clearway_mapping::map::Layer;
+use clearway_mapping::map::{Layer, LayerMaker};
 use clearway_mapping::radial::RadialGrid;
 use clearway_mapping::sweep::{Mount, Sweep};
 use clearway_sim::ground::{Ground, Profile};

@@ -78,6 +78,7 @@ const VLP32C: [(f64, f64); 32] = [
 ];
 
 /// Elevation, degrees; the azimuth offsets repeat every eight lasers.
+#[expect(clippy::approx_constant, reason = "-6.28 is an elevation")]
 const VLS128_ELEVATION: [f64; 128] = [
     -11.742, -1.99, 3.4, -5.29, -0.78, 4.61, -4.08, 1.31, -6.5, -1.11, 4.28, -4.41, 0.1, 6.48, -3.2, 2.19, -3.86, 1.53,
     -9.244, -1.77, 2.74, -5.95, -0.56, 4.83, -2.98, 2.41, -6.28, -0.89, 3.62, -5.07, 0.32, 7.58, -0.34, 5.18, -3.64,

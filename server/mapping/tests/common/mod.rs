@@ -85,13 +85,13 @@ pub fn turned(sweep: &Sweep) -> Sweep {
 
 /// Rows and columns of a layer.
 pub fn size(layer: &Layer) -> (usize, usize) {
-    let Geometry::Radial { r_bench_m, columns } = &layer.geometry;
+    let Geometry::Radial { r_bench_m, columns } = &layer.geometry else { panic!("{} is no radial grid", layer.name) };
     (r_bench_m.len(), usize::from(*columns))
 }
 
 /// Outer radii of a layer's rows.
 pub fn benches(layer: &Layer) -> &[f32] {
-    let Geometry::Radial { r_bench_m, .. } = &layer.geometry;
+    let Geometry::Radial { r_bench_m, .. } = &layer.geometry else { panic!("{} is no radial grid", layer.name) };
     r_bench_m
 }
 
