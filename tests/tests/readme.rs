@@ -62,8 +62,7 @@ fn the_demo_runs_and_ends_cleanly() {
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn a_capture_is_replayed_verified_exported_and_described_as_the_readme_says() {
     let folder = tempfile::tempdir().expect("a folder");
-    let capture =
-        Path::new(option_env!("CLEARWAY_DATA").unwrap_or_default()).join("pcap/rust-lidar-utils/hdl32_example.pcap");
+    let capture = Path::new(env!("CLEARWAY_DATA")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
     fs::copy(&capture, folder.path().join("drive.pcap")).expect("the HDL-32E capture");
     let offline: Vec<_> = commands()
         .into_iter()
@@ -81,8 +80,7 @@ fn a_capture_is_replayed_verified_exported_and_described_as_the_readme_says() {
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn the_default_configuration_serves_what_send_sends_to_the_readers() {
     let folder = tempfile::tempdir().expect("a folder");
-    let capture =
-        Path::new(option_env!("CLEARWAY_DATA").unwrap_or_default()).join("pcap/rust-lidar-utils/hdl32_example.pcap");
+    let capture = Path::new(env!("CLEARWAY_DATA")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
     fs::copy(&capture, folder.path().join("drive.pcap")).expect("the HDL-32E capture");
     let config = workspace().join("deploy/clearway.toml");
     let server = Command::new(binaries().join("clearway-server"))

@@ -11,14 +11,8 @@ async fn replayed(options: Options) -> Result<Summary, ReplayError> {
     house::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await
 }
 
-#[cfg(clearway_data)]
 fn drive(path: &str) -> PathBuf {
     Path::new(env!("CLEARWAY_DATA")).join(path)
-}
-
-#[cfg(not(clearway_data))]
-fn drive(path: &str) -> PathBuf {
-    PathBuf::from(path)
 }
 
 const HDL32: &str = "pcap/rust-lidar-utils/hdl32_example.pcap";

@@ -57,7 +57,7 @@ fn packet(model: Model, index: usize) -> Vec<u8> {
         for laser in 0..32_usize {
             let hash = (index * 12 + block) * 32 + laser;
             let hash = hash.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40;
-            let distance = if hash % 8 == 0 { 0 } else { 1_500 + hash % 28_500 };
+            let distance = if hash.is_multiple_of(8) { 0 } else { 1_500 + hash % 28_500 };
             bytes.extend((distance as u16).to_le_bytes());
             bytes.push(hash as u8);
         }

@@ -65,7 +65,6 @@ impl GroundHeight {
     }
 }
 
-#[cfg(clearway_data)]
 fn labelled_frame() -> (Sweep, Vec<u32>) {
     let scan = kitti("kitti/patchwork-plusplus/000000.bin");
     let bytes = std::fs::read(data("kitti/mmdet3d/000000.label")).unwrap();
@@ -129,7 +128,6 @@ fn share(of: &[bool], that: impl Fn(usize) -> bool) -> f64 {
     cells.iter().filter(|cell| that(**cell)).count() as f64 / cells.len() as f64
 }
 
-#[cfg(clearway_data)]
 fn shares(config: &DrivabilityConfig) -> [f64; 3] {
     let (sweep, labels) = labelled_frame();
     let mut map = Drivability::new(config);
@@ -157,37 +155,31 @@ fn shares(config: &DrivabilityConfig) -> [f64; 3] {
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn the_labelled_frame_reaches_its_targets() {
-    #[cfg(clearway_data)]
-    {
-        let [free, road, reachable] = shares(&DrivabilityConfig::default());
-        assert!(free >= 0.9995, "{free}");
-        assert!(road >= 0.99, "{road}");
-        assert!(reachable >= 0.95, "{reachable}");
-    }
+    let [free, road, reachable] = shares(&DrivabilityConfig::default());
+    assert!(free >= 0.9995, "{free}");
+    assert!(road >= 0.99, "{road}");
+    assert!(reachable >= 0.95, "{reachable}");
 }
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn wider_columns_and_the_thesis_own_reading_stay_useful() {
-    #[cfg(clearway_data)]
-    {
-        let own = DrivabilityConfig::default();
-        let thesis = DrivabilityConfig {
-            bridge_rows: 0,
-            close_gaps: false,
-            step_m_max: 0.5,
-            gate: Gate::BetweenSegments,
-            ..own.clone()
-        };
-        let readings = [
-            DrivabilityConfig { columns: 180, ..own.clone() },
-            DrivabilityConfig { columns: 90, ..own.clone() },
-            thesis.clone(),
-            DrivabilityConfig { offset_m: 0.0, ..thesis },
-        ];
-        for config in readings {
-            let [free, road, reachable] = shares(&config);
-            assert!(free >= 0.997 && road >= 0.97 && reachable >= 0.95, "{config:?}");
-        }
+    let own = DrivabilityConfig::default();
+    let thesis = DrivabilityConfig {
+        bridge_rows: 0,
+        close_gaps: false,
+        step_m_max: 0.5,
+        gate: Gate::BetweenSegments,
+        ..own.clone()
+    };
+    let readings = [
+        DrivabilityConfig { columns: 180, ..own.clone() },
+        DrivabilityConfig { columns: 90, ..own.clone() },
+        thesis.clone(),
+        DrivabilityConfig { offset_m: 0.0, ..thesis },
+    ];
+    for config in readings {
+        let [free, road, reachable] = shares(&config);
+        assert!(free >= 0.997 && road >= 0.97 && reachable >= 0.95, "{config:?}");
     }
 }

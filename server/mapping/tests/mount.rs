@@ -60,14 +60,12 @@ fn wild_points_are_no_harm() {
     assert!(estimate([wild.repeat(1000)]).is_err());
 }
 
-#[cfg(clearway_data)]
 fn recorded(path: &str, model: Option<Model>) -> Vec<Vec<[f32; 3]>> {
     use clearway_lidar::sensor::{Sensor, SensorConfig};
     let mut sensor = Sensor::new(SensorConfig { model, ..SensorConfig::default() });
-    let bytes = std::fs::read(common::data(path)).unwrap();
     let mut revolutions = Vec::new();
-    for (payload, stamp_ns) in common::pcap_payloads(&bytes) {
-        if let Ok(Some(revolution)) = sensor.push(payload, stamp_ns)
+    for datagram in common::datagrams(path) {
+        if let Ok(Some(revolution)) = sensor.push(&datagram.payload, datagram.stamp_ns)
             && revolution.partial.is_none()
         {
             revolutions.push(points(revolution));
@@ -79,27 +77,24 @@ fn recorded(path: &str, model: Option<Model>) -> Vec<Vec<[f32; 3]>> {
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn recorded_drives_give_the_mount_their_ground_shows() {
-    #[cfg(clearway_data)]
-    {
-        // 1.73 m is published; the labelled road of frame 0 itself lies on a plane 1.795 m under the sensor, tilted 0.5
-        // degrees in pitch and 1.5 in roll.
-        for frame in 0..3 {
-            let scan = common::kitti(&format!("kitti/patchwork-plusplus/00000{frame}.bin"));
-            let points: Vec<_> = (0..scan.x.len()).map(|i| [scan.x[i], scan.y[i], scan.z[i]]).collect();
-            let found = estimate([points]).unwrap();
-            println!("KITTI {frame}: {found:?}");
-            assert!((found.height_m - 1.795).abs() < 0.03, "{found:?}");
-            assert!((found.roll_rad.to_degrees() - 1.55).abs() < 0.3, "{found:?}");
-        }
-        let found = estimate(recorded("pcap/rust-lidar-utils/hdl32_example.pcap", None)).unwrap();
-        println!("HDL-32E: {found:?}");
-        assert!((found.height_m - 2.14).abs() < 0.05 && found.residual_m < 0.05, "{found:?}");
-        let found = estimate(recorded("pcap/opendlv/proxy-velodyne16/sampleShort.pcap", None)).unwrap();
-        println!("VLP-16: {found:?}");
-        assert!((found.height_m - 1.59).abs() < 0.05 && found.residual_m < 0.05, "{found:?}");
-        // Indoors, on a table.
-        let refused = estimate(recorded("pcap/rust-lidar-utils/velodyne_example.pcap", None));
-        println!("indoors: {refused:?}");
-        assert!(refused.is_err());
+    // 1.73 m is published; the labelled road of frame 0 itself lies on a plane 1.795 m under the sensor, tilted 0.5
+    // degrees in pitch and 1.5 in roll.
+    for frame in 0..3 {
+        let scan = common::kitti(&format!("kitti/patchwork-plusplus/00000{frame}.bin"));
+        let points: Vec<_> = (0..scan.x.len()).map(|i| [scan.x[i], scan.y[i], scan.z[i]]).collect();
+        let found = estimate([points]).unwrap();
+        println!("KITTI {frame}: {found:?}");
+        assert!((found.height_m - 1.795).abs() < 0.03, "{found:?}");
+        assert!((found.roll_rad.to_degrees() - 1.55).abs() < 0.3, "{found:?}");
     }
+    let found = estimate(recorded("pcap/rust-lidar-utils/hdl32_example.pcap", None)).unwrap();
+    println!("HDL-32E: {found:?}");
+    assert!((found.height_m - 2.14).abs() < 0.05 && found.residual_m < 0.05, "{found:?}");
+    let found = estimate(recorded("pcap/opendlv/proxy-velodyne16/sampleShort.pcap", None)).unwrap();
+    println!("VLP-16: {found:?}");
+    assert!((found.height_m - 1.59).abs() < 0.05 && found.residual_m < 0.05, "{found:?}");
+    // Indoors, on a table.
+    let refused = estimate(recorded("pcap/rust-lidar-utils/velodyne_example.pcap", None));
+    println!("indoors: {refused:?}");
+    assert!(refused.is_err());
 }

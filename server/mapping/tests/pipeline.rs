@@ -267,7 +267,6 @@ fn a_configuration_that_cannot_work_names_key_value_and_what_is_allowed() {
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn recorded_drives_become_maps_with_the_road_drivable() {
-    #[cfg(clearway_data)]
     for (path, height, data, telemetry, whole, ahead_m) in [
         ("pcap/rust-lidar-utils/hdl32_example.pcap", 2.165, 876, 100, 4, 20.0),
         ("pcap/opendlv/proxy-velodyne16/sampleShort.pcap", 1.59, 291, 56, 2, 10.0),
@@ -276,16 +275,15 @@ fn recorded_drives_become_maps_with_the_road_drivable() {
         let extrinsics = &mut config.sensors[0].extrinsics;
         (extrinsics.z_m, extrinsics.pitch_deg, extrinsics.roll_deg) = (height, -1.4, 1.4);
         let mut pipeline = Pipeline::new(&config, vec![None]).unwrap();
-        let bytes = std::fs::read(common::data(path)).unwrap();
-        let payloads = common::pcap_payloads(&bytes);
-        let read = payloads.len() as u64;
+        let datagrams = common::datagrams(path);
+        let read = datagrams.len() as u64;
         let mut events: Vec<Event> = (0..)
-            .zip(payloads)
-            .map(|(sequence, (payload, arrival_ns))| Event {
+            .zip(datagrams)
+            .map(|(sequence, datagram)| Event {
                 sequence,
-                arrival_ns,
+                arrival_ns: datagram.stamp_ns,
                 source: 0,
-                body: Body::Datagram(Bytes::copy_from_slice(payload)),
+                body: Body::Datagram(datagram.payload.into()),
             })
             .collect();
         events.push(Event {

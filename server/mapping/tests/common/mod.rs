@@ -118,13 +118,11 @@ pub fn figure(layer: &Layer, name: &str) -> f64 {
 }
 
 /// Folder of the recorded drives.
-#[cfg(clearway_data)]
 pub fn data(path: &str) -> std::path::PathBuf {
     std::path::Path::new(env!("CLEARWAY_DATA")).join(path)
 }
 
 /// A KITTI scan: x, y, z, intensity a point, sensor frame.
-#[cfg(clearway_data)]
 pub fn kitti(path: &str) -> clearway_mapping::event::Scan {
     let bytes = std::fs::read(data(path)).unwrap();
     let mut scan = clearway_mapping::event::Scan::default();
@@ -138,21 +136,8 @@ pub fn kitti(path: &str) -> clearway_mapping::event::Scan {
     scan
 }
 
-/// UDP payloads of an Ethernet pcap, with the stamps of the capture, ns.
-#[cfg(clearway_data)]
-pub fn pcap_payloads(bytes: &[u8]) -> Vec<(&[u8], i64)> {
-    let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
-    let mut at = 24;
-    let mut payloads = Vec::new();
-    while at + 16 <= bytes.len() {
-        let (stamp_ns, length) = (i64::from(word(at)) * 1_000_000_000 + i64::from(word(at + 4)) * 1000, word(at + 8));
-        // The capture is cut off inside its last record.
-        if at + 16 + length as usize > bytes.len() {
-            break;
-        }
-        // Ethernet 14, IPv4 20, UDP 8 bytes.
-        payloads.push((&bytes[at + 16 + 42..at + 16 + length as usize], stamp_ns));
-        at += 16 + length as usize;
-    }
-    payloads
+/// Datagrams of a capture, up to where it is cut off.
+pub fn datagrams(path: &str) -> Vec<clearway_lidar::capture::Datagram> {
+    let file = std::fs::File::open(data(path)).unwrap();
+    clearway_lidar::capture::Capture::new(file).unwrap().map_while(Result::ok).collect()
 }
