@@ -3,8 +3,12 @@
 use std::fs;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::sync::{Mutex, PoisonError};
 
 use clearway_tests::{binaries, run, workspace};
+
+/// The demo and a server with the default configuration want the same ports.
+static DEFAULT_PORTS: Mutex<()> = Mutex::new(());
 
 /// Every command line of the README's `sh` blocks, in order.
 fn commands() -> Vec<String> {
@@ -49,6 +53,7 @@ fn the_first_command_is_the_demo_and_the_second_runs_all_tests() {
 
 #[test]
 fn the_demo_runs_and_ends_cleanly() {
+    let _ports = DEFAULT_PORTS.lock().unwrap_or_else(PoisonError::into_inner);
     let folder = tempfile::tempdir().expect("a folder");
     let output = run(folder.path(), "clearway-server", &["demo", "--seconds", "3"]);
     let said = String::from_utf8_lossy(&output.stdout);
@@ -79,6 +84,7 @@ fn a_capture_is_replayed_verified_exported_and_described_as_the_readme_says() {
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn the_default_configuration_serves_what_send_sends_to_the_readers() {
+    let _ports = DEFAULT_PORTS.lock().unwrap_or_else(PoisonError::into_inner);
     let folder = tempfile::tempdir().expect("a folder");
     let capture = Path::new(env!("CLEARWAY_DATA")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
     fs::copy(&capture, folder.path().join("drive.pcap")).expect("the HDL-32E capture");
@@ -91,9 +97,10 @@ fn the_default_configuration_serves_what_send_sends_to_the_readers() {
         .stderr(Stdio::null())
         .spawn()
         .expect("clearway-server starts");
-    let _server = Stopped(server);
+    let mut server = Stopped(server);
     while !run(folder.path(), "clearway", &["vehicles"]).status.success() {
-        std::thread::yield_now();
+        let ended = server.0.try_wait().expect("the server's state");
+        assert!(ended.is_none(), "clearway-server serve ended: {ended:?}");
     }
     for command in commands().iter().filter(|c| c.starts_with("clearway send") || c.starts_with("clearway vehicles")) {
         succeeds(folder.path(), command);
