@@ -2,13 +2,12 @@
 //!
 //! Fields, little-endian and without padding: x y z intensity (f32; intensity 0 to 255 as the sensor reports it), ring
 //! (u16, 0 lowest), laser (u16, firing order), time (f32, seconds since the revolution's first firing), return_type (u8,
-//! 0 strongest, 1 last). Points in firing order, within a firing by laser, strongest before last.
+//! 1 strongest, 2 last, 3 both in one). Points in firing order, within a firing by laser, strongest before last.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
-use clearway_lidar::model::ReturnMode;
 use clearway_lidar::revolution::Revolution;
 
 use crate::engine::Observer;
@@ -62,29 +61,16 @@ impl Clouds {
 
 /// A revolution as a PCD file.
 pub fn pcd(revolution: &Revolution) -> Vec<u8> {
-    let rings = revolution.calibration.rings();
     let (mut points, mut data) = (0_u32, Vec::new());
-    for (index, firing) in revolution.firings.iter().enumerate() {
-        let time = firing.offset_ns as f32 * 1e-9;
-        for (laser, ring) in rings.iter().enumerate().take(revolution.lasers) {
-            let slot = index * revolution.lasers + laser;
-            for (number, echo) in revolution.echoes.iter().enumerate() {
-                let range_m = echo.range_m[slot];
-                // 0: no return, NaN: did not fire.
-                if range_m.is_nan() || range_m <= 0.0 {
-                    continue;
-                }
-                let last = number == 1 || revolution.return_mode == ReturnMode::Last;
-                for value in [echo.x[slot], echo.y[slot], echo.z[slot], f32::from(echo.intensity[slot])] {
-                    data.extend_from_slice(&value.to_le_bytes());
-                }
-                data.extend_from_slice(&ring.to_le_bytes());
-                data.extend_from_slice(&(laser as u16).to_le_bytes());
-                data.extend_from_slice(&time.to_le_bytes());
-                data.push(u8::from(last));
-                points += 1;
-            }
+    for point in revolution.points() {
+        for value in [point.x, point.y, point.z, f32::from(point.intensity)] {
+            data.extend_from_slice(&value.to_le_bytes());
         }
+        data.extend_from_slice(&point.ring.to_le_bytes());
+        data.extend_from_slice(&point.laser.to_le_bytes());
+        data.extend_from_slice(&((point.time_ns - revolution.start_ns) as f32 * 1e-9).to_le_bytes());
+        data.push(point.return_type);
+        points += 1;
     }
     let mut file = format!(
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z intensity ring laser time return_type\n\

@@ -208,7 +208,13 @@ impl Calibration {
 }
 
 /// Sorts lasers by id and asks for each of `0..n` once, with sound values.
-fn complete(distance_m_per_count: f64, mut lasers: Vec<LaserCalibration>) -> Result<Calibration, CalibrationError> {
+fn complete(
+    distance_m_per_count: Option<f64>,
+    mut lasers: Vec<LaserCalibration>,
+) -> Result<Calibration, CalibrationError> {
+    // Tables without a resolution come from drivers that took 2 mm for every sensor but those with 4 mm.
+    let usual = if lasers.len() == 128 { 0.004 } else { 0.002 };
+    let distance_m_per_count = distance_m_per_count.unwrap_or(usual);
     lasers.sort_by_key(|laser| laser.laser_id);
     for (expected, laser) in lasers.iter().enumerate() {
         if usize::from(laser.laser_id) != expected {

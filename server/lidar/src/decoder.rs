@@ -91,7 +91,10 @@ impl Decoder {
     }
 
     pub fn take_telemetry(&mut self, telemetry: &Telemetry) {
-        self.clock.telemetry(telemetry);
+        // An HDL-64E S1 sends no time that telemetry could place.
+        if self.spec.model != Model::Hdl64eS1 {
+            self.clock.telemetry(telemetry);
+        }
     }
 
     /// The revolution that [`Decoder::take`] or [`Decoder::finish`] said was done.
@@ -260,11 +263,8 @@ impl Decoder {
 
     /// Gives away the first `rows` firings of the current turn; the others begin the next.
     fn end_turn(&mut self, rows: usize, travelled: u64, end_ns: i64) {
-        let next = &mut self.done;
-        next.clear();
-        next.model = self.current.model;
-        next.calibration.clone_from(&self.current.calibration);
-        self.current.move_tail(rows, next);
+        self.done.begin_like(&self.current);
+        self.current.move_tail(rows, &mut self.done);
         std::mem::swap(&mut self.current, &mut self.done);
 
         let lasted_ns = end_ns - self.first_ns;

@@ -172,9 +172,12 @@ impl Revolution {
     }
 
     /// Empties the image for the next turn, keeping its memory.
-    pub(crate) fn clear(&mut self) {
+    pub(crate) fn begin_like(&mut self, other: &Revolution) {
         self.firings.clear();
         self.echoes.iter_mut().for_each(|echo| echo.truncate(0));
+        self.echoes.resize_with(other.echoes.len(), Echo::default);
+        (self.model, self.return_mode, self.lasers) = (other.model, other.return_mode, other.lasers);
+        self.calibration.clone_from(&other.calibration);
         (self.partial, self.packets) = (None, 0);
     }
 

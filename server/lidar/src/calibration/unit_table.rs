@@ -97,7 +97,7 @@ fn read(table: &[u8], warned: bool) -> Option<(Model, Calibration)> {
         _ => return None,
     };
     let lasers = lasers_of(table).map(laser).collect::<Vec<_>>();
-    let calibration = super::complete(model.spec().distance_m_per_count, lasers).ok()?;
+    let calibration = super::complete(Some(model.spec().distance_m_per_count), lasers).ok()?;
     calibration.fits(model).ok()?;
     Some((model, calibration))
 }

@@ -20,8 +20,7 @@ pub(super) fn read(text: &str) -> Result<Calibration, CalibrationError> {
     let enabled = list(db, "enabled_");
     let min_intensity = list(db, "minIntensity_");
     let max_intensity = list(db, "maxIntensity_");
-    let resolution = number(db, "DB", "distLSB_", M_PER_CM, RESOLUTION_M)?
-        .ok_or(CalibrationError::Missing { key: "DB.distLSB_".into(), allowed: RESOLUTION_M.1 })?;
+    let resolution = number(db, "DB", "distLSB_", M_PER_CM, RESOLUTION_M)?;
 
     let mut lasers = Vec::new();
     for (index, item) in points.children().filter(|node| node.has_tag_name("item")).enumerate() {

@@ -24,10 +24,7 @@ pub(super) fn read(text: &str) -> Result<Calibration, CalibrationError> {
     {
         return Err(root.wrong("num_lasers", node, "the number of lasers listed"));
     }
-    // Tables without a resolution come from drivers that took 2 mm for every sensor but those with 4 mm.
-    let usual = if lasers.len() == 128 { 0.004 } else { 0.002 };
-    let resolution = root.number("distance_resolution", RESOLUTION_M)?.unwrap_or(usual);
-    complete(resolution, lasers)
+    complete(root.number("distance_resolution", RESOLUTION_M)?, lasers)
 }
 
 pub(super) fn write(calibration: &Calibration) -> String {

@@ -1,0 +1,12 @@
+//! What the decoder does with streams made here, sound and damaged.
+
+mod calibration;
+mod capture;
+mod corpora;
+mod models;
+mod properties;
+mod stream;
+mod telemetry;
+mod turns;
+mod unit_table;
+mod velodyne_scan;

@@ -1,0 +1,151 @@
+//! Whatever the bytes: no panic, and a refused datagram leaves the sensor as it was.
+
+use clearway_lidar::{Model, ReturnMode, Revolution, Sensor, SensorConfig};
+use proptest::collection::vec;
+use proptest::prelude::*;
+
+use crate::corpora::entries;
+use crate::stream::{START_NS, Stream};
+use crate::{capture, telemetry, velodyne_scan};
+
+fn models() -> impl Strategy<Value = Model> {
+    proptest::sample::select(Model::ALL.to_vec())
+}
+
+/// Bytes to overwrite: where, and with what.
+fn damage() -> impl Strategy<Value = Vec<(prop::sample::Index, u8)>> {
+    vec((any::<prop::sample::Index>(), any::<u8>()), 0..8)
+}
+
+fn damaged(mut bytes: Vec<u8>, damage: &[(prop::sample::Index, u8)]) -> Vec<u8> {
+    damage.iter().for_each(|(at, byte)| *at.get_mut(&mut bytes) = *byte);
+    bytes
+}
+
+/// What a hostile or broken network does to a stream.
+#[derive(Clone, Debug)]
+enum Event {
+    Sent { skip: usize },
+    Damaged { damage: Vec<(prop::sample::Index, u8)> },
+    Azimuths { azimuths: Vec<u16> },
+    Noise { bytes: Vec<u8> },
+    Other { model: Model, dual: bool },
+    Telemetry { damage: Vec<(prop::sample::Index, u8)> },
+    Finish,
+}
+
+fn events() -> impl Strategy<Value = Event> {
+    prop_oneof![
+        8 => (0..40_usize).prop_map(|skip| Event::Sent { skip }),
+        4 => damage().prop_map(|damage| Event::Damaged { damage }),
+        2 => vec(0..=36_001_u16, 12).prop_map(|azimuths| Event::Azimuths { azimuths }),
+        1 => prop_oneof![Just(1206_usize), Just(512), 0..1300_usize]
+            .prop_flat_map(|length| vec(any::<u8>(), length))
+            .prop_map(|bytes| Event::Noise { bytes }),
+        1 => (models(), any::<bool>()).prop_map(|(model, dual)| Event::Other { model, dual }),
+        1 => damage().prop_map(|damage| Event::Telemetry { damage }),
+        1 => Just(Event::Finish),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 96, ..ProptestConfig::default() })]
+
+    #[test]
+    fn any_bytes_are_taken_or_refused(bytes in vec(any::<u8>(), 0..4000)) {
+        entries::packet(&bytes);
+        entries::telemetry(&bytes);
+        entries::capture(&bytes);
+        entries::calibration(&bytes);
+    }
+
+    #[test]
+    fn any_stream_of_damaged_packets_is_decoded_or_refused(
+        model in models(),
+        configured in any::<bool>(),
+        cut_azimuth_deg in -720.0..720.0_f32,
+        events in vec(events(), 1..60),
+    ) {
+        let stream = Stream { start_azimuth: 17_000, ..Stream::of(model) };
+        let config = SensorConfig { model: configured.then_some(model), cut_azimuth_deg, ..SensorConfig::default() };
+        let mut sensor = Sensor::new(config);
+        let mut index = 0;
+        for event in events {
+            let datagram = match event {
+                Event::Finish => {
+                    if let Some(turn) = sensor.finish() {
+                        prop_assert!(turn.start_ns <= turn.end_ns);
+                    }
+                    continue;
+                }
+                Event::Sent { skip } => {
+                    index += skip;
+                    stream.packet(index)
+                }
+                Event::Damaged { damage } => damaged(stream.packet(index), &damage),
+                Event::Azimuths { azimuths } => {
+                    let mut packet = stream.packet(index);
+                    for (block, azimuth) in azimuths.into_iter().enumerate() {
+                        packet[100 * block + 2..100 * block + 4].copy_from_slice(&azimuth.to_le_bytes());
+                    }
+                    packet
+                }
+                Event::Noise { bytes } => bytes,
+                Event::Other { model, dual } => {
+                    let mode = if dual { ReturnMode::Dual } else { ReturnMode::Strongest };
+                    Stream { mode, ..Stream::of(model) }.packet(index)
+                }
+                Event::Telemetry { damage } => damaged(telemetry::datagram(5_000_000, "$GPRMC,,V,,,,,,,,,,N*53\r\n"), &damage),
+            };
+            index += 1;
+            let before = sensor.status();
+            match sensor.push(&datagram, stream.arrival_ns(index)) {
+                Ok(None) => {}
+                Ok(Some(turn)) => {
+                    prop_assert!(turn.start_ns <= turn.end_ns);
+                    prop_assert_eq!(turn.points().count(), turn.returns());
+                    prop_assert_eq!(turn.echoes[0].range_m.len(), turn.firings.len() * turn.lasers);
+                }
+                Err(_) => prop_assert_eq!(sensor.status(), before),
+            }
+        }
+    }
+
+    #[test]
+    fn a_refused_datagram_changes_nothing_that_comes_after(
+        model in models(),
+        at in 0..200_usize,
+        damage in damage(),
+        noise in vec(any::<u8>(), 0..1300),
+    ) {
+        let stream = Stream::of(model);
+        let decode = |bad: &[Vec<u8>]| {
+            let mut sensor = Sensor::new(SensorConfig::default());
+            let mut turns = stream.push(&mut sensor, 0..at);
+            let refused = bad.iter().all(|bad| sensor.push(bad, START_NS).is_err());
+            turns.extend(stream.push(&mut sensor, at..260));
+            turns.extend(sensor.finish().cloned());
+            let turn = |turn: &Revolution| (turn.start_ns, turn.end_ns, turn.partial, turn.points().collect::<Vec<_>>());
+            (refused, turns.iter().map(turn).collect::<Vec<_>>(), sensor.status())
+        };
+        let mut bad = vec![damaged(stream.packet(at), &damage), noise];
+        bad.retain(|bad| decode(std::slice::from_ref(bad)).0);
+        let ((_, turns, status), (_, expected_turns, expected_status)) = (decode(&bad), decode(&[]));
+        prop_assert!(turns == expected_turns);
+        prop_assert_eq!(status, expected_status);
+    }
+
+    #[test]
+    fn damaged_captures_and_messages_are_read_or_refused(damage in damage(), end in any::<prop::sample::Index>()) {
+        let frames = [capture::ethernet(&capture::ip_packet(&[1; 64], 0), true), capture::ethernet(&[0; 9], false)];
+        for bytes in [
+            capture::pcap(1, &frames, false, false),
+            capture::pcapng(&frames, 6, 1),
+            velodyne_scan::message("velodyne", &[(1, 2, vec![3; 1206]), (3, 4, vec![5; 1206])]),
+        ] {
+            let mut bytes = damaged(bytes, &damage);
+            bytes.truncate(end.index(bytes.len()) + 1);
+            entries::capture(&bytes);
+        }
+    }
+}

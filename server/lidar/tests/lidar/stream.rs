@@ -1,0 +1,74 @@
+//! A small encoder: packets of any model that looks at a round wall.
+
+use clearway_lidar::model::{BLOCK_FLAGS, BLOCKS_PER_PACKET, S1_FLAGS};
+use clearway_lidar::{Model, ReturnMode, Revolution, Sensor};
+
+/// When the streams start: 11:33:20 UTC on 14 May 2033, and the same past the hour.
+pub const START_NS: i64 = 2_000_000_000_000_000_000;
+
+/// A sensor at 10 turns a second, a wall `distance` counts away all around.
+#[derive(Clone, Copy)]
+pub struct Stream {
+    pub model: Model,
+    pub mode: ReturnMode,
+    pub start_azimuth: u32,
+    pub device_us: u32,
+    pub distance: u16,
+}
+
+impl Stream {
+    pub fn of(model: Model) -> Self {
+        let past_hour_us = START_NS / 1_000 % 3_600_000_000;
+        let mode = ReturnMode::Strongest;
+        Self { model, mode, start_azimuth: 18_000, device_us: past_hour_us as u32, distance: 5_000 }
+    }
+
+    fn time_ns(&self, packet: usize, firing: usize) -> u64 {
+        let spec = self.model.spec();
+        (packet * spec.firings_per_packet(self.mode) + firing) as u64 * u64::from(spec.period_ns(self.mode))
+    }
+
+    /// Packets of so many turns, rounded up.
+    pub fn packets(&self, turns: f64) -> usize {
+        (turns * 1e8 / f64::from(self.model.spec().packet_period_ns(self.mode))).ceil() as usize
+    }
+
+    pub fn packet(&self, index: usize) -> Vec<u8> {
+        let spec = self.model.spec();
+        let mut bytes = Vec::with_capacity(1206);
+        for block in 0..BLOCKS_PER_PACKET {
+            if block >= spec.blocks_used(self.mode) {
+                bytes.extend([0xFF; 100]);
+                continue;
+            }
+            let place = spec.place(block, self.mode);
+            let flag = if self.model == Model::Hdl64eS1 { S1_FLAGS[block % 4] } else { BLOCK_FLAGS[place.bank] };
+            let turned = self.time_ns(index, place.firing) * 36_000 / 100_000_000;
+            bytes.extend(flag.to_le_bytes());
+            bytes.extend((((u64::from(self.start_azimuth) + turned) % 36_000) as u16).to_le_bytes());
+            for laser in 0..32_u8 {
+                bytes.extend((self.distance + 500 * place.echo as u16).to_le_bytes());
+                bytes.push(laser);
+            }
+        }
+        let device_us = (u64::from(self.device_us) + self.time_ns(index, 0) / 1_000) % 3_600_000_000;
+        bytes.extend((device_us as u32).to_le_bytes());
+        bytes.push(match self.mode {
+            ReturnMode::Strongest => 0x37,
+            ReturnMode::Last => 0x38,
+            ReturnMode::Dual => 0x39,
+        });
+        bytes.push(spec.model_bytes.first().copied().unwrap_or(b'0'));
+        bytes
+    }
+
+    pub fn arrival_ns(&self, index: usize) -> i64 {
+        START_NS + self.time_ns(index + 1, 0) as i64
+    }
+
+    /// Pushes packets `from..to`; the revolutions they complete.
+    pub fn push(&self, sensor: &mut Sensor, packets: impl IntoIterator<Item = usize>) -> Vec<Revolution> {
+        let push = |index| sensor.push(&self.packet(index), self.arrival_ns(index)).unwrap().cloned();
+        packets.into_iter().filter_map(push).collect()
+    }
+}

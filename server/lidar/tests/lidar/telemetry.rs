@@ -1,0 +1,104 @@
+//! Telemetry datagrams, sound and damaged.
+
+use clearway_lidar::telemetry::{NmeaError, Pps, Telemetry};
+use clearway_lidar::{Model, Refusal, Sensor, SensorConfig};
+
+use crate::stream::{START_NS, Stream};
+
+const SENTENCE: &str = "$GPRMC,214106,A,3707.8178,N,12139.2690,W,010.3,188.2,230715,013.8,E,D*05\r\n";
+
+pub fn datagram(device_us: u32, sentence: &str) -> Vec<u8> {
+    let mut bytes = vec![0; 512];
+    bytes[198..202].copy_from_slice(&device_us.to_le_bytes());
+    bytes[202] = 2;
+    bytes[206..206 + sentence.len()].copy_from_slice(sentence.as_bytes());
+    bytes
+}
+
+pub fn with_sum(text: &str) -> String {
+    format!("${text}*{:02X}\r\n", text.bytes().fold(0, |sum, byte| sum ^ byte))
+}
+
+#[test]
+fn a_fix_is_read_to_the_last_field() {
+    let telemetry = Telemetry::new(&datagram(2_467_110_195, SENTENCE)).unwrap();
+    assert_eq!((telemetry.device_us, telemetry.pps), (2_467_110_195, Pps::Locked));
+    let fix = telemetry.gprmc.unwrap();
+    assert!(fix.valid);
+    assert_eq!(fix.utc_ns, Some(1_437_687_666_000_000_000));
+    assert!((fix.latitude_deg.unwrap() - 37.130_296_667).abs() < 1e-9);
+    assert!((fix.longitude_deg.unwrap() + 121.654_483_333).abs() < 1e-9);
+    assert_eq!((fix.speed_knots, fix.course_deg), (Some(10.3), Some(188.2)));
+    assert!((fix.speed_mps().unwrap() - 5.298_78).abs() < 1e-4);
+}
+
+#[test]
+fn no_receiver_and_no_fix_are_fine() {
+    assert_eq!(Telemetry::new(&datagram(0, "")).unwrap().gprmc, None);
+    let fix = Telemetry::new(&datagram(0, &with_sum("GPRMC,,V,,,,,,,,,,N"))).unwrap().gprmc.unwrap();
+    assert!(!fix.valid && fix.utc_ns.is_none() && fix.latitude_deg.is_none());
+}
+
+#[test]
+fn damaged_sentences_are_refused_as_nmea_with_what_was_wrong() {
+    let refusal = |sentence: &str| match Telemetry::new(&datagram(0, sentence)).unwrap_err() {
+        refusal @ Refusal::Nmea(_) => (refusal.reason(), refusal.to_string()),
+        other => panic!("{other}"),
+    };
+    let flipped = SENTENCE.replace("3707", "3708");
+    assert_eq!(refusal(&flipped), ("nmea", "telemetry: checksum `05`; 0A is right".into()));
+    for (text, named) in [
+        ("GPGGA,1", "RMC"),
+        ("GPRMC,254106,A,,,,,,,230715", "time: `254106`"),
+        ("GPRMC,214106,A,,,,,,,231315", "date: `231315`"),
+        ("GPRMC,214106,X", "status: `X`"),
+        ("GPRMC,214106,A,9107.8178,N", "latitude: `9107.8178`"),
+        ("GPRMC,214106,A,3707.8178,Q", "latitude: `3707.8178,Q`"),
+        ("GPRMC,214106,A,,,,,fast", "speed: `fast`"),
+        ("GPRMC,2141,A,,,,,,,230715", "time: `2141`"),
+    ] {
+        let (_, shown) = refusal(&with_sum(text));
+        assert!(shown.contains(named), "{text}: {shown}");
+    }
+    assert!(refusal("GPRMC").1.contains("RMC"));
+    assert!(matches!(
+        Telemetry::new(&datagram(0, "$GPRMC\u{7f}")).unwrap_err(),
+        Refusal::Nmea(NmeaError::Byte { byte: 0x7F, at: 6 })
+    ));
+}
+
+#[test]
+fn gprmc_gives_the_hour_and_a_refused_datagram_nothing() {
+    // The device's own time agrees with GPRMC, while the host that recorded it lives in another hour.
+    let past_hour_us = 41 * 60_000_000 + 7_100_000;
+    let stream = Stream { device_us: past_hour_us, ..Stream::of(Model::Vlp16) };
+    let mut sensor = Sensor::new(SensorConfig::default());
+    let before = sensor.status();
+    assert!(sensor.push(&datagram(past_hour_us, &SENTENCE.replace("*05", "*06")), START_NS).is_err());
+    assert_eq!(sensor.status(), before);
+    assert!(sensor.push(&datagram(past_hour_us, SENTENCE), START_NS).unwrap().is_none());
+    assert_eq!((sensor.status().telemetry, sensor.status().pps), (1, Some(Pps::Locked)));
+    let turns = stream.push(&mut sensor, 0..stream.packets(1.1));
+    assert_eq!(turns[0].start_ns, 1_437_687_660_000_000_000 + 7_100_000_000);
+}
+
+#[test]
+fn a_clock_set_back_makes_stamps_stand_still_until_it_catches_up() {
+    // Started without GPS, 30 s ahead of the device's own hour; then GPRMC sets it back by them.
+    let utc_past_hour_us = 41 * 60_000_000 + 7_100_000;
+    let stream = Stream { device_us: utc_past_hour_us, ..Stream::of(Model::Vlp16) };
+    let arrival_ns = |index| 1_437_687_667_250_000_000 + stream.arrival_ns(index) - START_NS + 9_000_000_000;
+    let mut sensor = Sensor::new(SensorConfig::default());
+    let mut turns = Vec::new();
+    for index in 0..stream.packets(1.6) {
+        turns.extend(sensor.push(&stream.packet(index), arrival_ns(index)).unwrap().cloned());
+    }
+    sensor.push(&datagram(utc_past_hour_us, SENTENCE), 0).unwrap();
+    for index in stream.packets(1.6)..stream.packets(100.0) {
+        turns.extend(sensor.push(&stream.packet(index), arrival_ns(index)).unwrap().cloned());
+    }
+    assert!(turns.windows(2).all(|pair| pair[0].end_ns <= pair[1].start_ns));
+    let last = turns.last().unwrap();
+    let utc_ns = 1_437_687_667_100_000_000 + last.sequence as i64 * 100_000_000;
+    assert!((last.start_ns - utc_ns).abs() < 1_000_000, "{}", last.start_ns - utc_ns);
+}

@@ -1,0 +1,176 @@
+//! Cuts, gaps, reversals, half fields of view, standing sensors, the hour's end.
+
+use clearway_lidar::model::AZIMUTHS_PER_TURN;
+use clearway_lidar::{Model, Partial, ReturnMode, Sensor, SensorConfig};
+
+use crate::stream::{START_NS, Stream};
+use crate::telemetry;
+
+#[test]
+fn turns_are_cut_between_firings_at_the_azimuth_asked_for() {
+    for cut_azimuth_deg in [0.0, 0.01, 90.0, 179.99, 180.0, 359.99] {
+        for model in Model::ALL {
+            let stream = Stream { start_azimuth: 4_321, ..Stream::of(model) };
+            let mut sensor = Sensor::new(SensorConfig { cut_azimuth_deg, ..SensorConfig::default() });
+            let turns = stream.push(&mut sensor, 0..stream.packets(3.0));
+            assert!(turns.len() >= 2, "{model:?} {cut_azimuth_deg}");
+            assert_eq!(turns[0].partial, Some(Partial::Start));
+            for turn in &turns[1..] {
+                assert_eq!(turn.partial, None);
+                let past_cut = |firing: usize| {
+                    (turn.firings[firing].azimuth_rad.to_degrees() - cut_azimuth_deg + 360.0005) % 360.0
+                };
+                assert!(past_cut(0) < 0.25, "{model:?} {cut_azimuth_deg} {}", past_cut(0));
+                assert!(past_cut(turn.firings.len() - 1) > 359.75, "{model:?} {cut_azimuth_deg}");
+                assert_eq!(turn.echoes[0].range_m.len(), turn.firings.len() * turn.lasers);
+                assert_eq!(turn.echoes[0].intensity.len(), turn.firings.len() * turn.lasers);
+            }
+            assert!(turns.windows(2).all(|pair| pair[0].sequence + 1 == pair[1].sequence));
+        }
+    }
+}
+
+#[test]
+fn a_stream_ended_inside_a_turn_is_partial_and_one_ended_at_the_cut_is_whole() {
+    let stream = Stream::of(Model::Vlp16);
+    let mut sensor = Sensor::new(SensorConfig::default());
+    stream.push(&mut sensor, 0..stream.packets(0.5));
+    assert_eq!(sensor.finish().unwrap().partial, Some(Partial::End));
+    assert!(sensor.finish().is_none());
+
+    let stream = Stream::of(Model::Hdl32e);
+    let mut sensor = Sensor::new(SensorConfig::default());
+    // 181 packets are 2,172 firings, all but the last of one turn and two of the next.
+    let turn = stream.push(&mut sensor, 0..181).remove(0);
+    assert_eq!((turn.firings.len(), turn.partial), (2_171, None));
+}
+
+#[test]
+fn one_packet_lost_anywhere_is_seen_in_every_model() {
+    for mode in [ReturnMode::Strongest, ReturnMode::Dual] {
+        for model in Model::ALL.into_iter().filter(|model| mode == ReturnMode::Strongest || model.spec().dual_return) {
+            let stream = Stream { mode, ..Stream::of(model) };
+            for lost in [20, 50, stream.packets(0.7)] {
+                let mut sensor = Sensor::new(SensorConfig::default());
+                let turns = stream.push(&mut sensor, (0..stream.packets(2.1)).filter(|index| *index != lost));
+                assert_eq!(turns[0].partial, Some(Partial::Gap), "{model:?} {mode:?} packet {lost}");
+                assert_eq!(turns[1].partial, None, "{model:?} {mode:?} packet {lost}");
+            }
+        }
+    }
+}
+
+#[test]
+fn packets_out_of_order_are_a_reversal() {
+    let stream = Stream::of(Model::Hdl64eS2);
+    let mut sensor = Sensor::new(SensorConfig::default());
+    let mut order: Vec<usize> = (0..stream.packets(1.1)).collect();
+    order.swap(100, 101);
+    let turns = stream.push(&mut sensor, order);
+    assert!(matches!(turns[0].partial, Some(Partial::Gap | Partial::Reversal)));
+    assert!(turns[0].firings.windows(2).all(|pair| pair[0].offset_ns <= pair[1].offset_ns));
+}
+
+#[test]
+fn half_a_field_of_view_gives_one_turn_a_turn_and_says_how_much_was_seen() {
+    let stream = Stream { start_azimuth: 9_000, ..Stream::of(Model::Vlp16) };
+    let ahead = |index: &usize| {
+        let packet = stream.packet(*index);
+        !(9_000..27_000).contains(&u16::from_le_bytes([packet[2], packet[3]]))
+    };
+    let mut sensor = Sensor::new(SensorConfig::default());
+    let turns = stream.push(&mut sensor, (0..stream.packets(4.2)).filter(ahead));
+    assert!(turns.len() >= 3, "{}", turns.len());
+    for turn in &turns[1..] {
+        let seen = turn.firings.len() as f32 / turn.firings_expected as f32;
+        assert!((seen - 0.5).abs() < 0.02, "{seen}");
+        assert_eq!(turn.partial, Some(Partial::Gap));
+        assert!((turn.rpm - 600.0).abs() < 3.0, "{}", turn.rpm);
+    }
+}
+
+#[test]
+fn a_sensor_that_stands_still_fills_no_memory() {
+    let stream = Stream::of(Model::Hdl64eS2);
+    let still: Vec<u8> = {
+        let mut packet = stream.packet(0);
+        (0..12).for_each(|block| packet[block * 100 + 2..block * 100 + 4].copy_from_slice(&[0, 1]));
+        packet
+    };
+    let mut sensor = Sensor::new(SensorConfig::default());
+    let mut longest = 0;
+    for index in 0..10_000 {
+        if let Some(turn) = sensor.push(&still, stream.arrival_ns(index)).unwrap() {
+            assert!(matches!(turn.partial, Some(Partial::Start | Partial::Overlong)));
+            longest = longest.max(turn.firings.len());
+        }
+    }
+    assert!(longest > 0 && longest <= 12_500, "{longest}");
+}
+
+#[test]
+fn azimuths_in_disorder_cut_one_turn_a_packet_at_most() {
+    let stream = Stream::of(Model::Vlp16);
+    let mut packet = stream.packet(0);
+    for block in 0..12 {
+        let azimuth = (block as u32 * 14_000 % AZIMUTHS_PER_TURN) as u16;
+        packet[block * 100 + 2..block * 100 + 4].copy_from_slice(&azimuth.to_le_bytes());
+    }
+    let mut sensor = Sensor::new(SensorConfig::default());
+    let mut firings = 0;
+    for index in 0..50 {
+        let turn = sensor.push(&packet, stream.arrival_ns(index)).unwrap();
+        firings += turn.map_or(0, |turn| turn.firings.len());
+    }
+    firings += sensor.finish().map_or(0, |turn| turn.firings.len());
+    assert_eq!(firings, 50 * 24);
+}
+
+#[test]
+fn stamps_go_on_over_the_hour() {
+    let mut stream = Stream::of(Model::Hdl32e);
+    stream.device_us = 3_599_900_000;
+    let mut sensor = Sensor::new(SensorConfig::default());
+    let turns = stream.push(&mut sensor, 0..stream.packets(4.1));
+    assert_eq!(turns.len(), 4);
+    for (index, pair) in turns.windows(2).enumerate() {
+        let between_ns = pair[1].start_ns - pair[0].start_ns;
+        assert!((between_ns - 100_000_000).abs() < 60_000, "{index}: {between_ns}");
+        assert!(pair[0].end_ns < pair[1].start_ns);
+    }
+}
+
+#[test]
+fn a_device_that_knows_the_hour_is_stamped_by_it_and_another_by_arrival() {
+    let stream = Stream::of(Model::Hdl32e);
+    let mut sensor = Sensor::new(SensorConfig::default());
+    let turns = stream.push(&mut sensor, 0..stream.packets(1.1));
+    assert_eq!(turns[0].start_ns, START_NS);
+
+    let boot = Stream { device_us: 1_000_000, ..stream };
+    let mut sensor = Sensor::new(SensorConfig::default());
+    let turns = boot.push(&mut sensor, 0..stream.packets(1.1));
+    assert!((turns[0].start_ns - START_NS).abs() < 1_000, "{}", turns[0].start_ns - START_NS);
+}
+
+#[test]
+fn telemetry_does_not_move_the_stamps_of_a_sensor_without_device_time() {
+    let stream = Stream::of(Model::Hdl64eS1);
+    let mut sensor = Sensor::new(SensorConfig { model: Some(Model::Hdl64eS1), ..SensorConfig::default() });
+    let sentence = telemetry::with_sum("GPRMC,120000,A,4807.0380,N,01131.0000,E,022.4,084.4,010126,003.1,W");
+    assert!(sensor.push(&telemetry::datagram(5, &sentence), START_NS).unwrap().is_none());
+    let turns = stream.push(&mut sensor, 0..stream.packets(1.1));
+    assert!((turns[0].start_ns - START_NS).abs() < 1_000_000_000, "{}", turns[0].start_ns);
+}
+
+#[test]
+fn a_change_of_return_mode_ends_the_turn() {
+    let single = Stream::of(Model::Vlp16);
+    let dual = Stream { mode: ReturnMode::Dual, start_azimuth: 0, ..single };
+    let mut sensor = Sensor::new(SensorConfig::default());
+    assert!(single.push(&mut sensor, 0..30).is_empty());
+    let turns = dual.push(&mut sensor, 60..61);
+    assert_eq!((turns[0].echoes.len(), turns[0].partial), (1, Some(Partial::End)));
+    let turns = dual.push(&mut sensor, 61..500);
+    assert!(turns.iter().all(|turn| turn.echoes.len() == 2));
+}
