@@ -49,6 +49,8 @@ function readRaw(payload, type, count, refuse) {
 }
 
 function readRuns(payload, type, count, refuse) {
+  const raw = count * type.width;
+  if (payload.length >= raw) throw refuse("canonical", `${payload.length} bytes of runs; the raw cells have ${raw}`);
   const cells = new type.cells(count);
   let at = 0, filled = 0, previous = null;
   // Values need at most 3 bytes, lengths of up to CELLS_MAX 3 as well; 5 cover any 32-bit number.

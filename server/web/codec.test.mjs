@@ -1,6 +1,7 @@
 // What the page must never get wrong: cells, places and ages. Run: cd server/web && node --test
 
 import assert from "node:assert/strict";
+import { readFileSync } from "node:fs";
 import test from "node:test";
 import { freshness, ServerClock } from "./clock.js";
 import { CELLS_MAX, crc32, decodeChannel } from "./codec.js";
@@ -22,9 +23,29 @@ test("raw and runs of every cell type give the cells that went in", () => {
   assert.deepEqual([...decodeChannel(channel(U8, RAW, [0, 1, 255], [0, 1, 255], 3), 3)], [0, 1, 255]);
   assert.deepEqual([...decodeChannel(channel(I8, RAW, [128, 255], [128, 255], 2), 2)], [-128, -1]);
   assert.deepEqual([...decodeChannel(channel(U16, RAW, [1, 2], [1, 2], 1), 1)], [513]);
-  assert.deepEqual([...decodeChannel(channel(U8, RUNS, [2, 2, 0, 0], [2, 2, 2, 0], 4), 4)], [2, 2, 2, 0]);
-  assert.deepEqual([...decodeChannel(channel(I8, RUNS, [255, 1, 0, 254, 1, 0], [128, 127], 2), 2)], [-128, 127]);
-  assert.deepEqual([...decodeChannel(channel(U16, RUNS, [255, 255, 3, 1], [255, 255, 255, 255], 2), 2)], [65535, 65535]);
+  const eight = (...two) => two.flatMap((cell) => Array(4).fill(cell));
+  assert.deepEqual([...decodeChannel(channel(U8, RUNS, [2, 3, 0, 3], eight(2, 0), 8), 8)], eight(2, 0));
+  assert.deepEqual([...decodeChannel(channel(I8, RUNS, [255, 1, 3, 254, 1, 3], eight(128, 127), 8), 8)], eight(-128, 127));
+  const ones = Array(8).fill(255);
+  assert.deepEqual([...decodeChannel(channel(U16, RUNS, [255, 255, 3, 3], ones, 4), 4)], Array(4).fill(65535));
+});
+
+const golden = (file) => JSON.parse(readFileSync(new URL(`../../proto/golden/${file}`, import.meta.url)));
+const bytesOf = (hex) => Uint8Array.from(hex.match(/../g) ?? [], (byte) => parseInt(byte, 16));
+
+test("the golden channels decode to their cells", () => {
+  for (const vector of golden("channels.json")) {
+    const cells = vector.cells_value_length.flatMap(([value, length]) => Array(length).fill(value));
+    const decoded = decodeChannel({ ...vector, payload: bytesOf(vector.payload_hex) }, vector.cell_count);
+    assert.deepEqual([...decoded], cells, vector.name);
+  }
+});
+
+test("the golden bad channels are refused", () => {
+  for (const vector of golden("bad_channels.json")) {
+    const given = { ...vector, payload: bytesOf(vector.payload_hex) };
+    assert.throws(() => decodeChannel(given, vector.cell_count), { name: "Refused" }, vector.name);
+  }
 });
 
 test("wrong cells are refused by name", () => {
@@ -32,14 +53,15 @@ test("wrong cells are refused by name", () => {
   refusedFor("cell_count", runs([0, 0], [0], 2 ** 32 - 1));
   refusedFor("cell_count", runs([0, 0], [0], CELLS_MAX + 1));
   refusedFor("cell_count", runs([0, 0], [0], 1), 2);
-  refusedFor("run", runs([0, 3], [0, 0], 2));
-  refusedFor("run", runs([0, 0], [0], 2));
-  refusedFor("canonical", runs([1, 0, 1, 0], [1, 1], 2));
-  refusedFor("canonical", runs([0x81, 0x00, 0], [1], 1));
-  refusedFor("payload", runs([1], [1], 1));
+  refusedFor("run", runs([0, 9], [0, 0], 9));
+  refusedFor("run", runs([0, 0], [0], 9));
+  refusedFor("canonical", runs([1, 0, 1, 7], [1, 1], 9));
+  refusedFor("canonical", runs([1, 0, 0, 0], [1, 0], 2));
+  refusedFor("canonical", runs([0x81, 0x00, 8], [1], 9));
+  refusedFor("payload", runs([1], [1], 9));
   refusedFor("payload", channel(U8, RAW, [1, 2], [1], 1));
-  refusedFor("value", runs([0x80, 2, 0], [0], 1));
-  refusedFor("crc", runs([1, 0], [2], 1));
+  refusedFor("value", runs([0x80, 2, 8], [0], 9));
+  refusedFor("crc", runs([1, 8], [2], 9));
   refusedFor("encoding", channel(U8, 7, [1], [1], 1));
   refusedFor("cell_type", channel(9, RAW, [1], [1], 1));
 });
