@@ -11,7 +11,7 @@ pub mod map;
 mod parts;
 
 /// Generated from `clearway/v1/*.proto`.
-#[allow(missing_docs, clippy::all)]
+#[allow(missing_docs, clippy::all, rustdoc::broken_intra_doc_links)]
 pub mod v1 {
     tonic::include_proto!("clearway.v1");
 }
