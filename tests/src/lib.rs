@@ -4,7 +4,10 @@ use std::path::PathBuf;
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-/// The folder of the binaries, built once for all tests of this process with the profile of the tests.
+/// The folder of the binaries, brought up to date once for all tests of this process.
+///
+/// `cargo test --workspace` has just built them, beside the tests of their packages; after a `cargo test` of this package
+/// alone they may be old.
 ///
 /// # Panics
 /// When cargo cannot build them.
@@ -14,12 +17,14 @@ pub fn binaries() -> &'static PathBuf {
         let test = std::env::current_exe().expect("the path of this test");
         let folder = test.ancestors().nth(2).expect("target/<profile>/deps/<test>").to_path_buf();
         let mut cargo = Command::new(env!("CARGO"));
-        cargo.args(["build", "--quiet", "--workspace", "--bins", "--target-dir"]).arg(folder.parent().expect("target"));
+        // The same build as `cargo test --workspace`, so that nothing is built twice.
+        cargo.args(["test", "--quiet", "--workspace", "--no-run", "--target-dir"]);
+        cargo.arg(folder.parent().expect("target"));
         if folder.ends_with("release") {
             cargo.arg("--release");
         }
-        let built = cargo.current_dir(workspace()).status().expect("cargo runs");
-        assert!(built.success(), "cargo build --workspace --bins: {built}");
+        let built = cargo.current_dir(workspace()).output().expect("cargo runs");
+        assert!(built.status.success(), "cargo test --no-run: {}", String::from_utf8_lossy(&built.stderr));
         folder
     })
 }
