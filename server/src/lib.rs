@@ -23,6 +23,7 @@ pub mod clouds;
 pub mod config;
 pub mod demo;
 pub mod engine;
+pub mod evaluate;
 pub mod ingest;
 pub mod publish;
 pub mod record;

@@ -209,6 +209,11 @@ impl Pipeline {
         self.config.sensors.iter().map(named).collect()
     }
 
+    /// The newest map, until the next one is made; `None` before the first.
+    pub fn newest_map(&self) -> Option<&Map> {
+        (self.maker.maps_made > 0).then_some(&self.maker.map)
+    }
+
     /// The points the newest map was made from, ego frame at its capture's end; empty before the first.
     pub fn newest_sweep(&self) -> &Sweep {
         &self.maker.sweep

@@ -92,17 +92,19 @@ impl Sweep {
         for ((&x, &y), &z) in scan.x.iter().zip(&scan.y).zip(&scan.z) {
             let [ex, ey, ez] = transform.apply(x, y, z);
             (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
-            // NaN fails every comparison.
-            let position = x.abs() <= POSITION_M_MAX && y.abs() <= POSITION_M_MAX && z.abs() <= POSITION_M_MAX;
-            let range_squared = x * x + y * y + z * z;
-            let seen = position && range_squared > 0.0;
+            let (position, seen) = is_return(x, y, z);
             dropped += u64::from(!position);
             returns += u32::from(seen);
-            kept += usize::from(seen && range_squared >= mount.range_m_min * mount.range_m_min);
+            kept += usize::from(seen && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min);
         }
         self.returns = returns;
         self.close(kept);
         dropped
+    }
+
+    /// Whether [`Sweep::take_scan`] keeps this point (sensor frame, metres) of a sensor so mounted.
+    pub fn keeps(mount: &Mount, [x, y, z]: [f32; 3]) -> bool {
+        is_return(x, y, z).1 && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min
     }
 
     fn prepare(&mut self, calibration: &Arc<Calibration>, mount: &Mount) {
@@ -125,6 +127,19 @@ impl Sweep {
             axis.truncate(kept);
         }
     }
+}
+
+/// Whether a scan's point is a position at all, and whether it is one with a return.
+#[inline(always)]
+fn is_return(x: f32, y: f32, z: f32) -> (bool, bool) {
+    // NaN fails every comparison.
+    let position = x.abs() <= POSITION_M_MAX && y.abs() <= POSITION_M_MAX && z.abs() <= POSITION_M_MAX;
+    (position, position && squared_range(x, y, z) > 0.0)
+}
+
+#[inline(always)]
+fn squared_range(x: f32, y: f32, z: f32) -> f32 {
+    x * x + y * y + z * z
 }
 
 /// Calls `take` for each firing with its slots and its transform, interpolated between the knots.
