@@ -139,7 +139,7 @@ struct EvaluateArguments {
     /// Degrees a column of the radial maps spans.
     #[arg(long, value_name = "1|2|4", value_parser = columns)]
     columns: Option<u16>,
-    /// How the scans' sensor is mounted, as for replay; estimated from the ground, folder by folder, where absent.
+    /// How the scans' sensor is mounted, as for replay; as on KITTI's car where absent.
     #[arg(long, value_name = "x,y,z,roll,pitch,yaw", value_parser = extrinsics, allow_hyphen_values = true)]
     extrinsics: Option<Extrinsics>,
     /// Judge the maps of this configuration's first vehicle.

@@ -289,7 +289,7 @@ mod tests {
     fn labels_that_do_not_fit_their_scan_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("0.label");
-        let mut read = |labels: &[u32], bytes_over: usize| {
+        let read = |labels: &[u32], bytes_over: usize| {
             let mut bytes: Vec<u8> = labels.iter().flat_map(|label| label.to_le_bytes()).collect();
             bytes.extend(vec![0; bytes_over]);
             std::fs::write(&file, bytes).unwrap();

@@ -162,11 +162,9 @@ fn scan_of(labels: &Path) -> Result<PathBuf, PairsError> {
             let stem = labels.file_stem().unwrap_or_default().to_string_lossy().into_owned();
             Err(PairsError::NoScan { labels: labels.to_owned(), stem })
         }
-        [first, second, ..] => Err(PairsError::Ambiguous {
-            labels: labels.to_owned(),
-            first: first.clone(),
-            second: second.clone(),
-        }),
+        [first, second, ..] => {
+            Err(PairsError::Ambiguous { labels: labels.to_owned(), first: first.clone(), second: second.clone() })
+        }
     }
 }
 
@@ -214,7 +212,10 @@ mod tests {
     #[test]
     fn scans_and_labels_are_paired_beside_each_other_in_a_sequence_and_in_sibling_folders() {
         let pair = |scan: &str, labels: &str| (scan.to_owned(), labels.to_owned());
-        assert_eq!(names(&["0.bin", "0.label", "1.label", "1.bin"]), [pair("0.bin", "0.label"), pair("1.bin", "1.label")]);
+        assert_eq!(
+            names(&["0.bin", "0.label", "1.label", "1.bin"]),
+            [pair("0.bin", "0.label"), pair("1.bin", "1.label")]
+        );
         let sequences = ["s/00/velodyne/0.bin", "s/00/labels/0.label", "s/01/velodyne/0.bin", "s/01/labels/0.label"];
         let expected = [pair(sequences[0], sequences[1]), pair(sequences[2], sequences[3])];
         assert_eq!(names(&sequences), expected);

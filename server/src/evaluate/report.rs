@@ -30,7 +30,7 @@ pub struct Source {
     pub frames: u64,
     /// Scans without labels, left alone.
     pub unlabelled: usize,
-    /// How the sensor was taken to be mounted, folder by folder.
+    /// How the sensor was taken to be mounted, folder by folder, and why.
     pub mounts: Vec<String>,
     /// By layer, in the order of the maps.
     pub layers: Vec<(String, Tally)>,

@@ -52,7 +52,9 @@ pub fn drive(scene: Scene, pipeline: &mut Pipeline, revolutions: u64, mut judge:
             step(pipeline, next_pose_ns, pose);
             next_pose_ns += POSE_PERIOD_NS;
         }
-        let Some(end_ns) = step(pipeline, datagram.stamp_ns, Body::Datagram(Bytes::from(datagram.payload))) else { continue };
+        let Some(end_ns) = step(pipeline, datagram.stamp_ns, Body::Datagram(Bytes::from(datagram.payload))) else {
+            continue;
+        };
         let truth = vehicle.truth_at(end_ns, RASTER_M.0, RASTER_M.1, &Limits::default());
         judge(pipeline, points(pipeline.newest_sweep(), &truth));
         judged += 1;
