@@ -5,7 +5,8 @@
 //!
 //! Between two poses translation is linear and rotation a slerp; beyond the newest pose the motion since
 //! [`BASELINE_NS`] before it goes on unchanged, for at most `extrapolation_ms`. Where poses do not reach, the vehicle is
-//! taken to go straight ahead with the newest speed known; where none is known, nothing is moved. All of it is a pure
+//! taken to go straight ahead with the newest speed known; where none is known, nothing is moved. Poses that jump within
+//! a revolution do not reach either. All of it is a pure
 //! function of the events so far: no map waits for a pose that may yet come, so a replay moves each firing as the
 //! drive did. A pose that arrives after the revolution it belongs to serves the next one.
 
@@ -25,6 +26,10 @@ const POSES_MAX: usize = 1024;
 const GAP_NS_MAX: i64 = 1_000_000_000;
 /// The velocity beyond the newest pose is measured over at least this long: a millimetre of noise then makes 2 cm/s.
 const BASELINE_NS: i64 = 50_000_000;
+/// Nothing on wheels is faster: poses that say so have jumped, as when a receiver finds its satellites again.
+const SPEED_MPS_MAX: f64 = 100.0;
+/// What a pose may be off by beside its neighbour without having jumped.
+const JUMP_M_MAX: f64 = 0.5;
 /// Firings from one exact pose to the next; between, the matrices are interpolated. A turn of 1 rad/s errs by less than a
 /// tenth of a millimetre at 100 m in the millisecond of 16 firings.
 pub(crate) const KNOT_FIRINGS: usize = 16;
@@ -131,7 +136,7 @@ impl Motion {
             Some(after) if after.stamp_ns == stamp_ns => Some(after.map_from_ego),
             Some(after) => {
                 let before = &self.poses[next - 1];
-                (after.stamp_ns - before.stamp_ns <= GAP_NS_MAX).then(|| between(before, after, stamp_ns))
+                (after.stamp_ns.saturating_sub(before.stamp_ns) <= GAP_NS_MAX).then(|| between(before, after, stamp_ns))
             }
             None => {
                 let near = stamp_ns.saturating_sub(last.stamp_ns) <= reach_ns;
@@ -193,7 +198,12 @@ impl Motion {
             let end_from_map = map_from_end.inverse();
             for stamp_ns in stamps() {
                 let Some(map_from_ego) = self.map_from_ego(stamp_ns) else { break };
-                moved.end_from_ego.push(end_from_map * map_from_ego);
+                let end_from_ego = end_from_map * map_from_ego;
+                let seconds = (end_ns - stamp_ns) as f64 * 1e-9;
+                if end_from_ego.translation.vector.norm() > JUMP_M_MAX + SPEED_MPS_MAX * seconds {
+                    break;
+                }
+                moved.end_from_ego.push(end_from_ego);
             }
             if moved.end_from_ego.len() == stamps().count() {
                 moved.compensation = Compensation::Poses;
@@ -211,7 +221,7 @@ impl Motion {
 }
 
 fn share(from_ns: i64, to_ns: i64, stamp_ns: i64) -> f64 {
-    (stamp_ns - from_ns) as f64 / (to_ns - from_ns) as f64
+    stamp_ns.saturating_sub(from_ns) as f64 / to_ns.saturating_sub(from_ns) as f64
 }
 
 /// The pose at a stamp on the way from one pose to another; shares below 0 and above 1 go on beyond.
@@ -229,11 +239,11 @@ fn between(from: &EgoPose, to: &EgoPose, stamp_ns: i64) -> Isometry3<f64> {
 /// there is no other near enough.
 fn along(pose: &EgoPose, other: Option<&EgoPose>, stamp_ns: i64) -> Isometry3<f64> {
     match other {
-        Some(other) if (1..=GAP_NS_MAX).contains(&(other.stamp_ns - pose.stamp_ns).abs()) => {
+        Some(other) if (1..=GAP_NS_MAX).contains(&other.stamp_ns.saturating_sub(pose.stamp_ns).saturating_abs()) => {
             between(other, pose, stamp_ns)
         }
         _ => {
-            let seconds = (stamp_ns - pose.stamp_ns) as f64 * 1e-9;
+            let seconds = stamp_ns.saturating_sub(pose.stamp_ns) as f64 * 1e-9;
             pose.map_from_ego * Translation3::from(Vector3::x() * (seconds * pose.speed_mps))
         }
     }

@@ -107,7 +107,9 @@ pub enum Rejected {
         newest_ns: i64,
     },
     /// An ego pose that is no pose.
-    #[error("ego pose of {stamp_ns} ns: position, unit quaternion and speed must be finite")]
+    #[error(
+        "ego pose of {stamp_ns} ns: position within 10^9 m, a unit quaternion and speed within 1000 m/s are allowed"
+    )]
     Pose {
         /// The event's.
         stamp_ns: i64,
@@ -268,9 +270,9 @@ impl Pipeline {
     fn step_ego_pose(&mut self, pose: &EgoPose) -> Result<(), Rejected> {
         let rotation = pose.map_from_ego.rotation.coords;
         let position = pose.map_from_ego.translation.vector;
-        let finite = position.iter().all(|v| v.is_finite()) && pose.speed_mps.is_finite();
-        // A NaN in the quaternion makes the norm NaN, which is in no range.
-        if !finite || !(1.0 - 1e-6..=1.0 + 1e-6).contains(&rotation.norm()) {
+        // NaN fails every comparison, and a NaN in the quaternion makes the norm NaN, which is in no range.
+        let possible = position.iter().all(|v| v.abs() <= 1e9) && pose.speed_mps.abs() <= 1000.0;
+        if !possible || !(1.0 - 1e-6..=1.0 + 1e-6).contains(&rotation.norm()) {
             return Err(Rejected::Pose { stamp_ns: pose.stamp_ns });
         }
         check_newer(pose.stamp_ns, self.motion.newest_pose().map(|p| p.stamp_ns))?;

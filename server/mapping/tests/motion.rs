@@ -246,6 +246,52 @@ fn poses_out_of_order_are_refused_and_leave_the_walls_alone() {
 }
 
 #[test]
+fn a_pose_that_jumps_tears_no_wall() {
+    let mut events = drive(Some(10_000_000), false);
+    let expected = second(MotionConfig::default(), &drive(None, false));
+    let middle = events.len() / 2;
+    for event in &mut events[middle..] {
+        if let Body::EgoPose(pose) = &mut event.body {
+            pose.map_from_ego.translation.x += 80.0;
+        }
+    }
+    let (map, sweep) = second(MotionConfig::default(), &events);
+    assert_eq!(map.compensation, Compensation::Speed, "the jump lies in the second revolution");
+    assert_eq!(sweep.x.len(), expected.1.x.len());
+    let off = sweep.x.iter().zip(&expected.1.x).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(off < 0.05, "{off}: as by GPRMC alone, but for the tenths of its knots");
+}
+
+#[test]
+fn stamps_and_places_at_the_ends_of_their_types_move_nothing_and_break_nothing() {
+    let mut pipeline = Pipeline::new(&config(MotionConfig::default()), vec![None]).unwrap();
+    let mut step = |event: &Event| pipeline.step(event).map(|map| map.map(|map| map.compensation));
+    let far = |stamp_ns, x| EgoPose { stamp_ns, map_from_ego: at(x, 0.0, 0.0), speed_mps: 0.0 };
+    for (stamp_ns, x) in [(i64::MIN, 1e9), (i64::MIN + 1, -1e9)] {
+        let body = Body::EgoPose(far(stamp_ns, x));
+        step(&Event { sequence: 0, arrival_ns: i64::MIN, source: 0, body }).unwrap();
+    }
+    for pose in [far(0, 1.1e9), EgoPose { speed_mps: 1e300, ..far(0, 0.0) }] {
+        let rejected = step(&Event { sequence: 0, arrival_ns: 0, source: 0, body: Body::EgoPose(pose) }).unwrap_err();
+        assert!(rejected.to_string().contains("within 1000 m/s"), "{rejected}");
+    }
+    let made: Vec<_> = drive(None, true).iter().filter_map(|event| step(event).unwrap()).collect();
+    step(&Event { sequence: 0, arrival_ns: i64::MAX, source: 0, body: Body::EgoPose(far(i64::MAX, 0.0)) }).unwrap();
+    assert!(made.len() >= 2 && made.iter().all(|compensation| *compensation == Compensation::None));
+    let motion = |stamps: [i64; 2]| {
+        let mut motion = Motion::new(&MotionConfig::default());
+        stamps.into_iter().for_each(|stamp_ns| motion.take_pose(&far(stamp_ns, 1.0)));
+        motion
+    };
+    for stamps in [[i64::MIN, i64::MAX], [i64::MIN, 0], [0, i64::MAX]] {
+        for stamp_ns in [i64::MIN, -1, 0, 1, i64::MAX] {
+            let pose = motion(stamps).map_from_ego(stamp_ns);
+            assert!(pose.is_none_or(|pose| pose.translation.x.is_finite()), "{stamps:?} {stamp_ns}");
+        }
+    }
+}
+
+#[test]
 fn a_speed_grows_old() {
     let events = drive(None, false);
     let mut pipeline = Pipeline::new(&config(MotionConfig::default()), vec![None]).unwrap();

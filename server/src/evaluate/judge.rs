@@ -21,8 +21,8 @@ pub const OBSTACLE_M_MAX: f32 = 2.5;
 /// A point higher over its cell's lowest is not ground.
 pub const GROUND_OVER_LOWEST_M: f32 = 0.3;
 
-/// Names of the classes, over all maps, that let a vehicle pass.
-const DRIVABLE: [&str; 4] = ["drivable", "flat", "flat_inferred", "clear"];
+/// Names of the classes, over all maps, that let a vehicle pass; in no map does one of them mean anything else.
+const DRIVABLE: [&str; 8] = ["drivable", "flat", "flat_inferred", "clear", "passable", "road", "free", "path"];
 
 /// What a point says of its cell.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
