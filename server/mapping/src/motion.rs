@@ -3,12 +3,11 @@
 //! In: ego poses and the sensor's own GPRMC speed, as events brought them. Out: the ego pose at a stamp, and for a
 //! revolution [`Moved`]: `end_from_ego` along its firings, ego frame at the firing -> ego frame at the last firing.
 //!
-//! Between two poses translation is linear and rotation a slerp; beyond the newest pose the motion since
-//! [`BASELINE_NS`] before it goes on unchanged, for at most `extrapolation_ms`. Where poses do not reach, the vehicle is
-//! taken to go straight ahead with the newest speed known; where none is known, nothing is moved. Poses that jump within
-//! a revolution do not reach either. All of it is a pure
-//! function of the events so far: no map waits for a pose that may yet come, so a replay moves each firing as the
-//! drive did. A pose that arrives after the revolution it belongs to serves the next one.
+//! Between two poses translation is linear and rotation a slerp; beyond the newest pose the motion of its last 50 ms goes
+//! on unchanged, for at most `extrapolation_ms`. Where poses do not reach, or jump within the revolution, the vehicle is
+//! taken to go straight ahead with the newest speed known; where none is known, nothing is moved. All of it is a pure
+//! function of the events so far: no map waits for a pose that may yet come, so a replay moves each firing as the drive
+//! did. A pose that arrives after the revolution it belongs to serves the next one.
 
 use std::collections::VecDeque;
 

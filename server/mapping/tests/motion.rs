@@ -464,9 +464,8 @@ fn kittis_scans_lie_on_one_another_in_the_map_frame_of_their_headers() {
         let ego_from_sensor = config.sensors[0].extrinsics.ego_from_sensor();
         let mut pipeline = Pipeline::new(&config, vec![None]).unwrap();
         let mut clouds = Vec::new();
-        for index in 0..3 {
+        for (index, p) in poses.iter().enumerate().take(3) {
             let stamp_ns = index as i64 * 100_000_000;
-            let p = &poses[index];
             let rotation = nalgebra::Matrix3::new(p[0], p[1], p[2], p[4], p[5], p[6], p[8], p[9], p[10]);
             let first_from_this =
                 Isometry3::from_parts(Translation3::new(p[3], p[7], p[11]), UnitQuaternion::from_matrix(&rotation));
