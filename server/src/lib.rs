@@ -15,6 +15,7 @@
 //! | [`replay`] | files -> maps, as live |
 //! | [`clouds`] | revolutions -> PCD files |
 //! | [`verify`] | recording -> are these the maps of these events? |
+//! | [`evaluate`] | labelled scans, simulated scenes -> how right each map is |
 //! | [`demo`] | a simulated vehicle against the whole of it |
 //! | [`status`] | ledger, rates, latency of each vehicle |
 //! | [`server`] | all of it, put together |
@@ -23,6 +24,7 @@ pub mod clouds;
 pub mod config;
 pub mod demo;
 pub mod engine;
+pub mod evaluate;
 pub mod ingest;
 pub mod publish;
 pub mod record;

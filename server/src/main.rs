@@ -1,4 +1,4 @@
-//! The command `clearway-server`: serve, replay, verify, check, demo.
+//! The command `clearway-server`: serve, replay, verify, evaluate, check, demo.
 
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
@@ -13,6 +13,7 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
 use clearway_server::config::Config;
 use clearway_server::demo::{self, Places, Second};
+use clearway_server::evaluate;
 use clearway_server::replay::{self, Progress, Speed, Summary};
 use clearway_server::server::{Running, Server, Setup};
 use clearway_server::verify::verify;
@@ -53,6 +54,8 @@ enum Command {
         #[arg(long)]
         json: bool,
     },
+    /// Judge every map against labelled scans (SemanticKITTI's .bin and .label) or simulated scenes.
+    Evaluate(EvaluateArguments),
     /// Check a configuration and print it with every default.
     Check {
         #[command(flatten)]
@@ -125,6 +128,33 @@ struct ReplayArguments {
     vehicle: Option<String>,
 }
 
+#[derive(clap::Args)]
+struct EvaluateArguments {
+    /// Folders with .bin and .label files of the same names, or sim:flat, sim:slopes, sim:canopy, sim:overhang, sim:town.
+    #[arg(required = true, value_name = "PATH")]
+    paths: Vec<String>,
+    /// One object on stdout.
+    #[arg(long)]
+    json: bool,
+    /// Degrees a column of the radial maps spans.
+    #[arg(long, value_name = "1|2|4", value_parser = columns)]
+    columns: Option<u16>,
+    /// How the scans' sensor is mounted, as for replay; as on KITTI's car where absent.
+    #[arg(long, value_name = "x,y,z,roll,pitch,yaw", value_parser = extrinsics, allow_hyphen_values = true)]
+    extrinsics: Option<Extrinsics>,
+    /// Judge the maps of this configuration's first vehicle.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Overrides a key of the configuration.
+    #[arg(long, value_name = "KEY=VALUE", requires = "config")]
+    set: Vec<String>,
+}
+
+fn columns(text: &str) -> Result<u16, String> {
+    let degrees = text.parse().ok().filter(|degrees| evaluate::columns(*degrees).is_some());
+    degrees.ok_or_else(|| "1, 2 or 4 degrees are allowed".into())
+}
+
 fn extrinsics(text: &str) -> Result<Extrinsics, String> {
     let numbers: Vec<f64> = text.split(',').filter_map(|number| number.trim().parse().ok()).collect();
     match numbers[..] {
@@ -164,6 +194,7 @@ fn run(command: Command) -> Result<ExitCode> {
         Command::Serve { config } => runtime()?.block_on(serve(&config)),
         Command::Replay(arguments) => runtime()?.block_on(replay_files(*arguments)),
         Command::Verify { file, json } => verify_file(&file, json),
+        Command::Evaluate(arguments) => evaluate_maps(arguments),
         Command::Check { config } => {
             let checked = load(&config)?;
             checked.calibrations(&config.config)?;
@@ -354,6 +385,21 @@ fn verify_file(file: &Path, json: bool) -> Result<ExitCode> {
         }
     }
     Ok(if report.is_good() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+fn evaluate_maps(arguments: EvaluateArguments) -> Result<ExitCode> {
+    let EvaluateArguments { paths, json, columns, extrinsics, config, set } = arguments;
+    let options = evaluate::Options { paths, columns_deg: columns, extrinsics, config, set };
+    let shown = !json && std::io::stderr().is_terminal();
+    let bar = if shown { ProgressBar::new(0) } else { ProgressBar::hidden() };
+    let outcome = evaluate::evaluate(&options, |done, total| {
+        bar.set_length(total);
+        bar.set_position(done);
+    });
+    bar.finish_and_clear();
+    let report = outcome?;
+    say(&if json { format!("{:#}\n", report.to_json()) } else { report.to_text() });
+    Ok(ExitCode::SUCCESS)
 }
 
 /// Prints; a reader that has gone (`| head`) is no error.

@@ -83,6 +83,7 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
         map_from_ego: map.map_from_ego.as_ref().map(pose),
         speed_mps: map.speed_mps,
         sensors: map.sensors.iter().map(sensor).collect(),
+        compensation: map.compensation.as_str().to_owned(),
     }
 }
 
@@ -261,6 +262,7 @@ mod tests {
             completed_ns: 101,
             map_from_ego: None,
             speed_mps: None,
+            compensation: clearway_mapping::motion::Compensation::Speed,
             sensors: Vec::new(),
             layers: vec![layer("drivability"), layer("height_difference")],
         }
@@ -273,6 +275,7 @@ mod tests {
         assert_eq!(whole.layers.len(), 2);
         let header = whole.header.unwrap();
         assert_eq!((header.sequence, header.boot_id, header.valid_until_ns), (9, 7, 300_000_100));
+        assert_eq!(header.compensation, "speed");
         let one = encoded.select(&["height_difference".into()]);
         assert_eq!(one, encoded.layer(&encoded.layers[1].1));
         let one = v1::Map::decode(one).unwrap();

@@ -27,6 +27,7 @@ export function streamFigures(element, map, stream, server_ahead_ms) {
     ["Capture end → sent", map ? ms(header.capture_end_ns, map.sent_ns) : dash],
     ["Speed", header?.speed_mps == null ? "unknown" : `${header.speed_mps.toFixed(1)} m/s`],
     ["Pose", pose ? `${pose.x.toFixed(1)}, ${pose.y.toFixed(1)}, ${pose.z.toFixed(1)} m` : "unknown"],
+    ["Points moved by", header?.compensation || "unknown"],
     ["Maps taken", count(stream.taken)],
     ["Skipped (server told)", count(stream.skipped), stream.skipped > 0],
     ["Lost on the way", count(stream.lost), stream.lost > 0],

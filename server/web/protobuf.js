@@ -105,6 +105,7 @@ const HEADER = {
   1: ["vehicle", string], 2: ["boot_id", fixed64], 3: ["sequence", uint64], 4: ["capture_start_ns", sfixed64],
   5: ["capture_end_ns", sfixed64], 6: ["completed_ns", sfixed64], 7: ["valid_until_ns", sfixed64],
   8: ["map_from_ego", message(POSE)], 9: ["speed_mps", optional(double)], 10: ["sensors", many(message(SENSOR))],
+  11: ["compensation", string],
 };
 const RADIAL = { 1: ["r_bench_m", many(float)], 2: ["columns", uint32] };
 const CARTESIAN = {

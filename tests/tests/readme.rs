@@ -83,6 +83,24 @@ fn a_capture_is_replayed_verified_exported_and_described_as_the_readme_says() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn the_maps_are_judged_as_the_readme_says() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let data = Path::new(option_env!("CLEARWAY_DATA").unwrap_or_default()).join("kitti");
+    for (file, place) in [("patchwork-plusplus/000000.bin", "velodyne"), ("mmdet3d/000000.label", "labels")] {
+        let to = folder.path().join("sequences/00").join(place);
+        fs::create_dir_all(&to).expect("the layout of SemanticKITTI");
+        let from = data.join(file);
+        fs::copy(&from, to.join(from.file_name().expect("a name"))).expect("the labelled frame");
+    }
+    let evaluations: Vec<_> = commands().into_iter().filter(|c| c.starts_with("clearway-server evaluate")).collect();
+    assert_eq!(evaluations.len(), 2, "{evaluations:?}");
+    for command in &evaluations {
+        succeeds(folder.path(), command);
+    }
+}
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn the_default_configuration_serves_what_send_sends_to_the_readers() {
     let _ports = DEFAULT_PORTS.lock().unwrap_or_else(PoisonError::into_inner);
     let folder = tempfile::tempdir().expect("a folder");

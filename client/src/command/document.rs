@@ -38,6 +38,7 @@ pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
         "valid_until_ns": header.valid_until_ns,
         "map_from_ego": pose,
         "speed_mps": header.speed_mps,
+        "compensation": header.compensation,
         "sensors": sensors.collect::<Vec<_>>(),
         "layer": layer.name,
         "geometry": geometry,

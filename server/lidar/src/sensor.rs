@@ -182,6 +182,11 @@ impl Sensor {
         (decoder.revolutions() > 0).then(|| decoder.finished())
     }
 
+    /// The newest telemetry's GPRMC, if it had one.
+    pub fn gprmc(&self) -> Option<&Gprmc> {
+        self.telemetry.as_ref()?.gprmc.as_ref()
+    }
+
     /// What is known so far.
     pub fn status(&self) -> SensorStatus {
         let mut status = self.decoder.as_ref().map(|decoder| decoder.status()).unwrap_or_default();

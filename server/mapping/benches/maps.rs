@@ -4,11 +4,12 @@
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig};
+use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig, MotionConfig};
 use clearway_mapping::drivability::Drivability;
-use clearway_mapping::event::Scan;
+use clearway_mapping::event::{EgoPose, Scan};
 use clearway_mapping::height_difference::HeightDifference;
 use clearway_mapping::map::LayerMaker;
+use clearway_mapping::motion::{Motion, Moved};
 use clearway_mapping::sweep::{Mount, Sweep};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::vehicle::SimulatedVehicle;
@@ -76,4 +77,27 @@ fn sweep_of_a_revolution(bencher: Bencher) {
     let mut sweep = Sweep::default();
     let slots = revolution.echoes[0].range_m.len();
     bencher.counter(ItemsCount::new(slots)).bench_local(|| sweep.take_revolution(&revolution, &mount));
+}
+
+/// The same with a pose each 10 ms: finding the motion, and moving every firing.
+#[divan::bench]
+fn sweep_of_a_moving_revolution(bencher: Bencher) {
+    let revolution = turn();
+    let mount = mount(1.9);
+    let mut motion = Motion::new(&MotionConfig::default());
+    for step in 0..=20 {
+        let seconds = f64::from(step) * 0.01;
+        let map_from_ego = nalgebra::Isometry3::new(
+            nalgebra::vector![15.0 * seconds, 0.0, 0.0],
+            nalgebra::vector![0.0, 0.0, 0.3 * seconds],
+        );
+        let stamp_ns = revolution.end_ns + i64::from(step - 15) * 10_000_000;
+        motion.take_pose(&EgoPose { stamp_ns, map_from_ego, speed_mps: 15.0 });
+    }
+    let (mut sweep, mut moved) = (Sweep::default(), Moved::default());
+    let slots = revolution.echoes[0].range_m.len();
+    bencher.counter(ItemsCount::new(slots)).bench_local(|| {
+        motion.through(&revolution, revolution.end_ns, &mut moved);
+        sweep.take_moving_revolution(&revolution, &mount, &moved.end_from_ego);
+    });
 }

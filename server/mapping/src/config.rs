@@ -95,6 +95,8 @@ impl Extrinsics {
 pub struct MapsConfig {
     /// Age after capture at which a map is stale.
     pub valid_ms: u32,
+    /// How the points of a turn are moved to its end.
+    pub motion: MotionConfig,
     /// The thesis' drivability map.
     pub drivability: DrivabilityConfig,
     /// The thesis' baseline.
@@ -105,9 +107,29 @@ impl Default for MapsConfig {
     fn default() -> Self {
         Self {
             valid_ms: 300,
+            motion: MotionConfig::default(),
             drivability: DrivabilityConfig::default(),
             height_difference: HeightDifferenceConfig::default(),
         }
+    }
+}
+
+/// Parameters of [`crate::motion`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MotionConfig {
+    /// Whether points are moved; the pose of a map's header is interpolated either way.
+    pub enabled: bool,
+    /// How far beyond the newest pose (and before the oldest) its motion is taken to go on.
+    pub extrapolation_ms: u32,
+    /// How old the newest speed may be where poses do not reach; 0 leaves such turns as they are.
+    pub speed_age_ms: u32,
+}
+
+impl Default for MotionConfig {
+    /// Two turns at 10 Hz; two sentences of a receiver that speaks each second.
+    fn default() -> Self {
+        Self { enabled: true, extrapolation_ms: 200, speed_age_ms: 2000 }
     }
 }
 
@@ -286,6 +308,12 @@ impl MapsConfig {
     /// The first value that cannot be used.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check(f64::from(self.valid_ms), 1.0..=60_000.0, || "vehicle.maps.valid_ms".into(), "1 to 60000")?;
+        let motion = &self.motion;
+        let at = "vehicle.maps.motion";
+        let reach = f64::from(motion.extrapolation_ms);
+        check(reach, 0.0..=1000.0, || format!("{at}.extrapolation_ms"), "0 to 1000")?;
+        let age = f64::from(motion.speed_age_ms);
+        check(age, 0.0..=10_000.0, || format!("{at}.speed_age_ms"), "0 to 10000")?;
         let at = "vehicle.maps.drivability";
         let drivability = &self.drivability;
         let metres = [

@@ -6,6 +6,7 @@
 //! | [`config`] | one vehicle's sensors and maps |
 //! | [`pipeline`] | `step(&Event)` conducts the hops below |
 //! | [`mount`] | first revolutions -> height, pitch and roll of a sensor nobody measured |
+//! | [`motion`] | ego poses, speed + revolution -> where the vehicle was at each firing |
 //! | [`sweep`] | revolution or scan + extrinsics -> [`sweep::Sweep`] in the ego frame |
 //! | [`map`] | what a map is: geometry, legend, channels |
 //! | [`radial`] | the thesis' r-θ grid: position -> cell |
@@ -17,6 +18,7 @@ pub mod drivability;
 pub mod event;
 pub mod height_difference;
 pub mod map;
+pub mod motion;
 pub mod mount;
 pub mod pipeline;
 pub mod radial;

@@ -2,6 +2,7 @@
 
 use nalgebra::Isometry3;
 
+use crate::motion::Compensation;
 use crate::sweep::Sweep;
 
 /// Everything made from one revolution (or scan) of one vehicle.
@@ -15,10 +16,12 @@ pub struct Map {
     pub capture_end_ns: i64,
     /// Arrival of the event that completed the map.
     pub completed_ns: i64,
-    /// Ego frame in the world frame at `capture_end_ns`; `None` while no pose is known.
+    /// Ego frame in the world frame at `capture_end_ns`, interpolated; `None` where no pose is near enough.
     pub map_from_ego: Option<Isometry3<f64>>,
     /// Forward speed, where known.
     pub speed_mps: Option<f64>,
+    /// What moved the points to `capture_end_ns`.
+    pub compensation: Compensation,
     /// The sensors that contributed.
     pub sensors: Vec<SensorState>,
     /// In the order of the configuration.

@@ -18,6 +18,7 @@ use crate::drivability::Drivability;
 use crate::event::{Body, EgoPose, Event, Scan};
 use crate::height_difference::HeightDifference;
 use crate::map::{LayerMaker, Map, SensorState};
+use crate::motion::{Compensation, Motion, Moved};
 use crate::sweep::{Mount, Sweep};
 
 /// One vehicle's way from events to maps.
@@ -26,7 +27,7 @@ pub struct Pipeline {
     sensor: Sensor,
     /// Table of the grid's rows where turns come as scans; `None` while neither file nor model is configured.
     scan_calibration: Option<Arc<Calibration>>,
-    pose: Option<EgoPose>,
+    motion: Motion,
     scan_stamp_ns: Option<i64>,
     /// Scans taken, and their points.
     scans: (u64, u64),
@@ -106,7 +107,9 @@ pub enum Rejected {
         newest_ns: i64,
     },
     /// An ego pose that is no pose.
-    #[error("ego pose of {stamp_ns} ns: position, unit quaternion and speed must be finite")]
+    #[error(
+        "ego pose of {stamp_ns} ns: position within 10^9 m, a unit quaternion and speed within 1000 m/s are allowed"
+    )]
     Pose {
         /// The event's.
         stamp_ns: i64,
@@ -149,7 +152,7 @@ impl Pipeline {
                 cut_azimuth_deg: sensor.cut_azimuth_deg,
             }),
             scan_calibration,
-            pose: None,
+            motion: Motion::new(&config.maps.motion),
             scan_stamp_ns: None,
             scans: (0, 0),
             ledger: Ledger::default(),
@@ -208,6 +211,16 @@ impl Pipeline {
         self.config.sensors.iter().map(named).collect()
     }
 
+    /// The newest map, until the next one is made; `None` before the first.
+    pub fn newest_map(&self) -> Option<&Map> {
+        (self.maker.maps_made > 0).then_some(&self.maker.map)
+    }
+
+    /// The points the newest map was made from, ego frame at its capture's end; empty before the first.
+    pub fn newest_sweep(&self) -> &Sweep {
+        &self.maker.sweep
+    }
+
     /// The revolution that made the newest map; `None` before the first, and where a scan made it.
     pub fn newest_revolution(&self) -> Option<&Revolution> {
         if self.newest_is_revolution { self.sensor.newest() } else { None }
@@ -219,13 +232,16 @@ impl Pipeline {
             None => false,
             Some(revolution) => {
                 let refused = self.ledger.refused.values().sum();
-                self.maker.revolution(revolution, &self.config, self.pose.as_ref(), refused, arrival_ns);
+                self.maker.revolution(revolution, &self.config, &self.motion, refused, arrival_ns);
                 true
             }
         };
         self.newest_is_revolution |= made;
         if payload.len() == TELEMETRY_LENGTH {
             self.ledger.telemetry += 1;
+            if let Some(gprmc) = self.sensor.gprmc() {
+                self.motion.take_gprmc(gprmc, arrival_ns);
+            }
         } else {
             self.ledger.decoded += 1;
         }
@@ -243,7 +259,7 @@ impl Pipeline {
         };
         self.scan_stamp_ns = Some(scan.stamp_ns);
         let refused = self.ledger.refused.values().sum();
-        let dropped = self.maker.scan(scan, calibration, &self.config, self.pose.as_ref(), refused, arrival_ns);
+        let dropped = self.maker.scan(scan, calibration, &self.config, &self.motion, refused, arrival_ns);
         self.ledger.points_dropped += dropped;
         self.scans = (self.scans.0 + 1, self.scans.1 + u64::from(self.maker.sweep.returns));
         self.ledger.decoded += 1;
@@ -254,13 +270,13 @@ impl Pipeline {
     fn step_ego_pose(&mut self, pose: &EgoPose) -> Result<(), Rejected> {
         let rotation = pose.map_from_ego.rotation.coords;
         let position = pose.map_from_ego.translation.vector;
-        let finite = position.iter().all(|v| v.is_finite()) && pose.speed_mps.is_finite();
-        // A NaN in the quaternion makes the norm NaN, which is in no range.
-        if !finite || !(1.0 - 1e-6..=1.0 + 1e-6).contains(&rotation.norm()) {
+        // NaN fails every comparison, and a NaN in the quaternion makes the norm NaN, which is in no range.
+        let possible = position.iter().all(|v| v.abs() <= 1e9) && pose.speed_mps.abs() <= 1000.0;
+        if !possible || !(1.0 - 1e-6..=1.0 + 1e-6).contains(&rotation.norm()) {
             return Err(Rejected::Pose { stamp_ns: pose.stamp_ns });
         }
-        check_newer(pose.stamp_ns, self.pose.as_ref().map(|p| p.stamp_ns))?;
-        self.pose = Some(pose.clone());
+        check_newer(pose.stamp_ns, self.motion.newest_pose().map(|p| p.stamp_ns))?;
+        self.motion.take_pose(pose);
         self.ledger.poses += 1;
         Ok(())
     }
@@ -270,7 +286,7 @@ impl Pipeline {
         match self.sensor.finish() {
             None => false,
             Some(revolution) => {
-                self.maker.revolution(revolution, &self.config, self.pose.as_ref(), refused, arrival_ns);
+                self.maker.revolution(revolution, &self.config, &self.motion, refused, arrival_ns);
                 self.newest_is_revolution = true;
                 true
             }
@@ -289,6 +305,7 @@ fn check_newer(stamp_ns: i64, newest_ns: Option<i64>) -> Result<(), Rejected> {
 struct Maker {
     maps_made: u64,
     mount: Mount,
+    moved: Moved,
     sweep: Sweep,
     layer_makers: Vec<Box<dyn LayerMaker>>,
     map: Map,
@@ -302,6 +319,7 @@ impl Maker {
         Self {
             maps_made: 0,
             mount: Mount { ego_from_sensor: sensor.extrinsics.ego_from_sensor(), range_m_min: sensor.range_m_min },
+            moved: Moved::default(),
             sweep: Sweep::default(),
             layer_makers,
             map: Map {
@@ -311,6 +329,7 @@ impl Maker {
                 completed_ns: 0,
                 map_from_ego: None,
                 speed_mps: None,
+                compensation: Compensation::None,
                 sensors: Vec::new(),
                 layers,
             },
@@ -321,11 +340,14 @@ impl Maker {
         &mut self,
         revolution: &Revolution,
         config: &VehicleConfig,
-        pose: Option<&EgoPose>,
+        motion: &Motion,
         refused: u64,
         arrival_ns: i64,
     ) {
-        self.sweep.take_revolution(revolution, &self.mount);
+        motion.through(revolution, arrival_ns, &mut self.moved);
+        self.sweep.take_moving_revolution(revolution, &self.mount, &self.moved.end_from_ego);
+        (self.map.compensation, self.map.speed_mps) = (self.moved.compensation, self.moved.speed_mps);
+        self.map.map_from_ego = motion.map_from_ego(revolution.end_ns);
         let state = SensorState {
             name: config.sensors[0].name.clone(),
             model: model_name(revolution.model).to_owned(),
@@ -336,7 +358,7 @@ impl Maker {
             completeness: completeness(revolution),
             partial: revolution.partial.map_or("", partial_name),
         };
-        self.map(state, (revolution.start_ns, revolution.end_ns), pose, arrival_ns);
+        self.map(state, (revolution.start_ns, revolution.end_ns), arrival_ns);
     }
 
     /// Gives the number of points left out because they are no positions.
@@ -345,11 +367,13 @@ impl Maker {
         scan: &Scan,
         calibration: &Arc<Calibration>,
         config: &VehicleConfig,
-        pose: Option<&EgoPose>,
+        motion: &Motion,
         refused: u64,
         arrival_ns: i64,
     ) -> u64 {
         let dropped = self.sweep.take_scan(scan, calibration, &self.mount);
+        self.map.compensation = Compensation::None;
+        (self.map.map_from_ego, self.map.speed_mps) = motion.at(scan.stamp_ns, arrival_ns);
         let state = SensorState {
             name: config.sensors[0].name.clone(),
             model: "scan".to_owned(),
@@ -360,19 +384,17 @@ impl Maker {
             completeness: 1.0,
             partial: "",
         };
-        self.map(state, (scan.stamp_ns, scan.stamp_ns), pose, arrival_ns);
+        self.map(state, (scan.stamp_ns, scan.stamp_ns), arrival_ns);
         dropped
     }
 
     /// The newest sweep's map, in place of the one before.
-    fn map(&mut self, sensor: SensorState, capture_ns: (i64, i64), pose: Option<&EgoPose>, arrival_ns: i64) {
+    fn map(&mut self, sensor: SensorState, capture_ns: (i64, i64), arrival_ns: i64) {
         let map = &mut self.map;
         map.sequence = self.maps_made;
         self.maps_made += 1;
         (map.capture_start_ns, map.capture_end_ns) = capture_ns;
         map.completed_ns = arrival_ns;
-        map.map_from_ego = pose.map(|p| p.map_from_ego);
-        map.speed_mps = pose.map(|p| p.speed_mps);
         map.sensors.clear();
         map.sensors.push(sensor);
         for (maker, layer) in self.layer_makers.iter_mut().zip(&mut map.layers) {

@@ -1,7 +1,8 @@
 //! The points of one turn in the ego frame.
 //!
-//! In: a [`Revolution`] or [`Scan`] in the sensor's frame, and how the sensor is mounted. Out: a [`Sweep`], only
-//! returns, ego frame, metres, with what the grid's rows follow from. Compaction and transform are one pass.
+//! In: a [`Revolution`] or [`Scan`] in the sensor's frame, how the sensor is mounted, and how the vehicle moved. Out: a
+//! [`Sweep`], only returns, ego frame at the turn's last firing, metres, with what the grid's rows follow from.
+//! Compaction, motion and transform are one pass; each firing has one rigid transform.
 
 use std::sync::Arc;
 
@@ -10,6 +11,7 @@ use clearway_lidar::revolution::Revolution;
 use nalgebra::Isometry3;
 
 use crate::event::Scan;
+use crate::motion::knots;
 
 /// No sensor of the family reaches half as far; a coordinate beyond is not a position.
 const POSITION_M_MAX: f32 = 1000.0;
@@ -41,23 +43,39 @@ pub struct Sweep {
 }
 
 impl Sweep {
-    /// Fills the sweep from a revolution, in place of what it held.
+    /// Fills the sweep from a revolution of a vehicle at rest, in place of what it held.
     pub fn take_revolution(&mut self, revolution: &Revolution, mount: &Mount) {
+        self.take_moving_revolution(revolution, mount, &[]);
+    }
+
+    /// Fills the sweep from a revolution, in place of what it held; `end_from_ego` is
+    /// [`crate::motion::Moved::end_from_ego`] of this revolution, or empty to leave the points where they were seen.
+    pub fn take_moving_revolution(&mut self, revolution: &Revolution, mount: &Mount, end_from_ego: &[Isometry3<f64>]) {
         self.prepare(&revolution.calibration, mount);
-        let transform = Transform::new(mount);
+        let at_rest = Transform::new(&mount.ego_from_sensor);
+        let moving: Vec<Transform> =
+            end_from_ego.iter().map(|moved| Transform::new(&(moved * mount.ego_from_sensor))).collect();
         let slots: usize = revolution.echoes.iter().map(|echo| echo.range_m.len()).sum();
         let mut kept = self.open(slots);
         let mut returns = 0;
         for echo in &revolution.echoes {
-            let n = echo.range_m.len();
-            let (x, y, z) = (&echo.x[..n], &echo.y[..n], &echo.z[..n]);
-            for i in 0..n {
-                let range = echo.range_m[i];
-                let [ex, ey, ez] = transform.apply(x[i], y[i], z[i]);
-                (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
-                // Not fired is NaN and no return is 0: neither passes. Written always, kept by moving on: no branch.
-                returns += u32::from(range > 0.0);
-                kept += usize::from(range > 0.0 && range >= mount.range_m_min);
+            let mut take = |slots: std::ops::Range<usize>, transform: Transform| {
+                let n = slots.len();
+                let range_m = &echo.range_m[slots.clone()][..n];
+                let (x, y, z) = (&echo.x[slots.clone()][..n], &echo.y[slots.clone()][..n], &echo.z[slots][..n]);
+                for i in 0..n {
+                    let range = range_m[i];
+                    let [ex, ey, ez] = transform.apply(x[i], y[i], z[i]);
+                    (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
+                    // Not fired is NaN and no return is 0: neither passes. Written always, kept by moving on: no branch.
+                    returns += u32::from(range > 0.0);
+                    kept += usize::from(range > 0.0 && range >= mount.range_m_min);
+                }
+            };
+            if moving.is_empty() {
+                take(0..echo.range_m.len(), at_rest);
+            } else {
+                for_each_firing(revolution, &moving, &mut take);
             }
         }
         self.returns = returns;
@@ -68,23 +86,25 @@ impl Sweep {
     /// is not finite or lies beyond 1 km. The four arrays must be equally long.
     pub fn take_scan(&mut self, scan: &Scan, calibration: &Arc<Calibration>, mount: &Mount) -> u64 {
         self.prepare(calibration, mount);
-        let transform = Transform::new(mount);
+        let transform = Transform::new(&mount.ego_from_sensor);
         let mut kept = self.open(scan.x.len());
         let (mut returns, mut dropped) = (0, 0);
         for ((&x, &y), &z) in scan.x.iter().zip(&scan.y).zip(&scan.z) {
             let [ex, ey, ez] = transform.apply(x, y, z);
             (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
-            // NaN fails every comparison.
-            let position = x.abs() <= POSITION_M_MAX && y.abs() <= POSITION_M_MAX && z.abs() <= POSITION_M_MAX;
-            let range_squared = x * x + y * y + z * z;
-            let seen = position && range_squared > 0.0;
+            let (position, seen) = is_return(x, y, z);
             dropped += u64::from(!position);
             returns += u32::from(seen);
-            kept += usize::from(seen && range_squared >= mount.range_m_min * mount.range_m_min);
+            kept += usize::from(seen && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min);
         }
         self.returns = returns;
         self.close(kept);
         dropped
+    }
+
+    /// Whether [`Sweep::take_scan`] keeps this point (sensor frame, metres) of a sensor so mounted.
+    pub fn keeps(mount: &Mount, [x, y, z]: [f32; 3]) -> bool {
+        is_return(x, y, z).1 && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min
     }
 
     fn prepare(&mut self, calibration: &Arc<Calibration>, mount: &Mount) {
@@ -109,20 +129,67 @@ impl Sweep {
     }
 }
 
+/// Whether a scan's point is a position at all, and whether it is one with a return.
+#[inline(always)]
+fn is_return(x: f32, y: f32, z: f32) -> (bool, bool) {
+    // NaN fails every comparison.
+    let position = x.abs() <= POSITION_M_MAX && y.abs() <= POSITION_M_MAX && z.abs() <= POSITION_M_MAX;
+    (position, position && squared_range(x, y, z) > 0.0)
+}
+
+#[inline(always)]
+fn squared_range(x: f32, y: f32, z: f32) -> f32 {
+    x * x + y * y + z * z
+}
+
+/// Calls `take` for each firing with its slots and its transform, interpolated between the knots.
+#[inline(always)]
+fn for_each_firing(
+    revolution: &Revolution,
+    moving: &[Transform],
+    take: &mut impl FnMut(std::ops::Range<usize>, Transform),
+) {
+    let (firings, lasers) = (&revolution.firings, revolution.lasers);
+    let mut knot = knots(firings.len()).zip(moving);
+    let Some(mut from) = knot.next() else { return };
+    take(0..lasers, *from.1);
+    for to in knot {
+        let (start, end) = (firings[from.0].offset_ns, firings[to.0].offset_ns);
+        let per_ns = 1.0 / end.saturating_sub(start).max(1) as f32;
+        for (firing, slots) in (from.0 + 1..=to.0).map(|firing| (firing, firing * lasers..(firing + 1) * lasers)) {
+            let share = firings[firing].offset_ns.saturating_sub(start) as f32 * per_ns;
+            take(slots, from.1.towards(to.1, share));
+        }
+        from = to;
+    }
+}
+
 /// `ego_from_sensor` in single precision: 8 µm at 120 m, where the sensor's own step is 2 mm.
+#[derive(Clone, Copy)]
 struct Transform {
     rotation: [[f32; 3]; 3],
     translation: [f32; 3],
 }
 
 impl Transform {
-    fn new(mount: &Mount) -> Self {
-        let rotation = mount.ego_from_sensor.rotation.to_rotation_matrix();
-        let translation = mount.ego_from_sensor.translation;
+    fn new(ego_from_sensor: &Isometry3<f64>) -> Self {
+        let rotation = ego_from_sensor.rotation.to_rotation_matrix();
+        let translation = ego_from_sensor.translation;
         let row = |i: usize| [0, 1, 2].map(|j| rotation[(i, j)] as f32);
         Self {
             rotation: [row(0), row(1), row(2)],
             translation: [translation.x as f32, translation.y as f32, translation.z as f32],
+        }
+    }
+
+    /// Between two transforms that differ by the motion of a millisecond, where a line serves for the arc.
+    #[inline(always)]
+    fn towards(&self, to: &Self, share: f32) -> Self {
+        let mix = |a: f32, b: f32| a + share * (b - a);
+        let row = |i: usize| [0, 1, 2].map(|j| mix(self.rotation[i][j], to.rotation[i][j]));
+        Self {
+            rotation: [row(0), row(1), row(2)],
+            translation: [0, 1, 2].map(|i| mix(self.translation[i], to.translation[i])),
         }
     }
 
