@@ -6,7 +6,7 @@ use clearway_tests::run;
 use serde_json::Value;
 
 fn kitti() -> String {
-    Path::new(option_env!("CLEARWAY_DATA").unwrap_or_default()).join("kitti").display().to_string()
+    Path::new(env!("CLEARWAY_DATA")).join("kitti").display().to_string()
 }
 
 fn judged(arguments: &[&str]) -> Value {

@@ -354,13 +354,12 @@ fn apart(a: &[[f64; 3]], b: &[[f64; 3]]) -> (f64, f64) {
 }
 
 /// Revolutions of the HDL-32E capture cut at an azimuth, each with the arrival of its last packet and what GPRMC had said.
-#[cfg(clearway_data)]
 fn hdl32e(cut_azimuth_deg: f32, motion: &mut Motion) -> Vec<(Revolution, i64)> {
-    let bytes = std::fs::read(common::data("pcap/rust-lidar-utils/hdl32_example.pcap")).unwrap();
     let mut sensor = Sensor::new(LidarConfig { cut_azimuth_deg, ..LidarConfig::default() });
     let mut revolutions = Vec::new();
-    for (payload, arrival_ns) in common::pcap_payloads(&bytes) {
-        if let Ok(Some(revolution)) = sensor.push(payload, arrival_ns) {
+    for datagram in common::datagrams("pcap/rust-lidar-utils/hdl32_example.pcap") {
+        let arrival_ns = datagram.stamp_ns;
+        if let Ok(Some(revolution)) = sensor.push(&datagram.payload, arrival_ns) {
             revolutions.extend(revolution.partial.is_none().then(|| (revolution.clone(), arrival_ns)));
         }
         if let Some(gprmc) = sensor.gprmc() {
@@ -376,120 +375,107 @@ fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
     // Turns cut at 90 and at 270 degrees: the half they share by direction, one saw a whole turn before the other, and in
     // between the car moved by 1.3 m. Each sweep lies in the ego frame at its own end; the car's own speed carries one into
     // the other. Only a sweep without motion in it can lie on another that was cut elsewhere.
-    #[cfg(clearway_data)]
-    {
-        let mut motion = Motion::new(&MotionConfig::default());
-        let (right, left) = (hdl32e(90.0, &mut motion), hdl32e(270.0, &mut motion));
-        let mount = Mount {
-            ego_from_sensor: Extrinsics {
-                x_m: 0.0,
-                y_m: 0.0,
-                z_m: 2.165,
-                roll_deg: 1.4,
-                pitch_deg: -1.4,
-                yaw_deg: 0.0,
-            }
+    let mut motion = Motion::new(&MotionConfig::default());
+    let (right, left) = (hdl32e(90.0, &mut motion), hdl32e(270.0, &mut motion));
+    let mount = Mount {
+        ego_from_sensor: Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 2.165, roll_deg: 1.4, pitch_deg: -1.4, yaw_deg: 0.0 }
             .ego_from_sensor(),
-            range_m_min: 2.5,
-        };
-        // Standing things at the side the sweeps share by direction but not by firing, metres, as of the end of `at_ns`.
-        let street = |revolution: &Revolution, arrival_ns: i64, compensate: bool, first_half: bool, to_ns: i64| {
-            let mut moved = Moved::default();
-            motion.through(revolution, arrival_ns, &mut moved);
-            assert_eq!(moved.compensation, Compensation::Speed);
-            let speed_mps = moved.speed_mps.unwrap();
-            if !compensate {
-                moved.end_from_ego.clear();
-            }
-            let mut half = revolution.clone();
-            let middle = half.firings.len() / 2;
-            let lasers = half.lasers;
-            for echo in &mut half.echoes {
-                let drop = if first_half { middle * lasers..echo.range_m.len() } else { 0..middle * lasers };
-                echo.range_m[drop].fill(0.0);
-            }
-            let mut sweep = Sweep::default();
-            sweep.take_moving_revolution(&half, &mount, &moved.end_from_ego);
-            let since = (to_ns - revolution.end_ns) as f64 * 1e-9 * speed_mps;
-            let place = |i: usize| [f64::from(sweep.x[i]) - since, f64::from(sweep.y[i]), f64::from(sweep.z[i])];
-            let places: Vec<[f64; 3]> = (0..sweep.x.len()).map(place).collect();
-            let standing = |p: &[f64; 3]| (0.5..4.0).contains(&p[2]) && p[0].hypot(p[1]) < 25.0;
-            places.into_iter().filter(standing).collect::<Vec<_>>()
-        };
-        let mut pairs = 0;
-        for (early, early_arrival) in &right {
-            // The one that ends half a turn later: its second half looks where the first half of this one did.
-            let period_ns = early.end_ns - early.start_ns;
-            let later = left.iter().find(|(later, _)| {
-                let since = later.end_ns - early.end_ns;
-                since > period_ns / 4 && since < period_ns * 3 / 4
-            });
-            let Some((later, later_arrival)) = later else { continue };
-            // How far one must still be shifted along the road to lie best on the other.
-            let off = |compensate: bool| {
-                let a = street(early, *early_arrival, compensate, true, later.end_ns);
-                let b = street(later, *later_arrival, compensate, false, later.end_ns);
-                assert!(a.len() > 500 && b.len() > 500, "{} and {} points", a.len(), b.len());
-                let shifts = (-20..=20).map(|step| f64::from(step) * 0.05);
-                let shifted = |shift: f64| a.iter().step_by(4).map(|p| [p[0] + shift, p[1], p[2]]).collect::<Vec<_>>();
-                let scores = shifts.map(|shift| (apart(&shifted(shift), &b).1, shift));
-                scores.min_by(|a, b| a.0.total_cmp(&b.0)).unwrap()
-            };
-            let (with, without) = (off(true), off(false));
-            println!(
-                "off by {:.2} m along the road with the car's own speed (then {:.3} m apart), {:.2} m without",
-                with.1, with.0, without.1
-            );
-            assert!(with.1.abs() <= 0.1 && without.1.abs() >= 0.5, "{with:?} {without:?}");
-            pairs += 1;
+        range_m_min: 2.5,
+    };
+    // Standing things at the side the sweeps share by direction but not by firing, metres, as of the end of `at_ns`.
+    let street = |revolution: &Revolution, arrival_ns: i64, compensate: bool, first_half: bool, to_ns: i64| {
+        let mut moved = Moved::default();
+        motion.through(revolution, arrival_ns, &mut moved);
+        assert_eq!(moved.compensation, Compensation::Speed);
+        let speed_mps = moved.speed_mps.unwrap();
+        if !compensate {
+            moved.end_from_ego.clear();
         }
-        assert!(pairs >= 3, "{pairs} pairs");
+        let mut half = revolution.clone();
+        let middle = half.firings.len() / 2;
+        let lasers = half.lasers;
+        for echo in &mut half.echoes {
+            let drop = if first_half { middle * lasers..echo.range_m.len() } else { 0..middle * lasers };
+            echo.range_m[drop].fill(0.0);
+        }
+        let mut sweep = Sweep::default();
+        sweep.take_moving_revolution(&half, &mount, &moved.end_from_ego);
+        let since = (to_ns - revolution.end_ns) as f64 * 1e-9 * speed_mps;
+        let place = |i: usize| [f64::from(sweep.x[i]) - since, f64::from(sweep.y[i]), f64::from(sweep.z[i])];
+        let places: Vec<[f64; 3]> = (0..sweep.x.len()).map(place).collect();
+        let standing = |p: &[f64; 3]| (0.5..4.0).contains(&p[2]) && p[0].hypot(p[1]) < 25.0;
+        places.into_iter().filter(standing).collect::<Vec<_>>()
+    };
+    let mut pairs = 0;
+    for (early, early_arrival) in &right {
+        // The one that ends half a turn later: its second half looks where the first half of this one did.
+        let period_ns = early.end_ns - early.start_ns;
+        let later = left.iter().find(|(later, _)| {
+            let since = later.end_ns - early.end_ns;
+            since > period_ns / 4 && since < period_ns * 3 / 4
+        });
+        let Some((later, later_arrival)) = later else { continue };
+        // How far one must still be shifted along the road to lie best on the other.
+        let off = |compensate: bool| {
+            let a = street(early, *early_arrival, compensate, true, later.end_ns);
+            let b = street(later, *later_arrival, compensate, false, later.end_ns);
+            assert!(a.len() > 500 && b.len() > 500, "{} and {} points", a.len(), b.len());
+            let shifts = (-20..=20).map(|step| f64::from(step) * 0.05);
+            let shifted = |shift: f64| a.iter().step_by(4).map(|p| [p[0] + shift, p[1], p[2]]).collect::<Vec<_>>();
+            let scores = shifts.map(|shift| (apart(&shifted(shift), &b).1, shift));
+            scores.min_by(|a, b| a.0.total_cmp(&b.0)).unwrap()
+        };
+        let (with, without) = (off(true), off(false));
+        println!(
+            "off by {:.2} m along the road with the car's own speed (then {:.3} m apart), {:.2} m without",
+            with.1, with.0, without.1
+        );
+        assert!(with.1.abs() <= 0.1 && without.1.abs() >= 0.5, "{with:?} {without:?}");
+        pairs += 1;
     }
+    assert!(pairs >= 3, "{pairs} pairs");
 }
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn kittis_scans_lie_on_one_another_in_the_map_frame_of_their_headers() {
-    #[cfg(clearway_data)]
-    {
-        let text = std::fs::read_to_string(common::data("kitti/patchwork-plusplus/icp_poses_DERIVED.json")).unwrap();
-        let numbers = |pose: &str| -> Vec<f64> {
-            let matrix = &pose[..pose.find("]\n  ]").unwrap()];
-            matrix.split([',', '[', ']', '\n']).filter_map(|word| word.trim().parse().ok()).collect()
-        };
-        let poses: Vec<Vec<f64>> = text.split("\"T_first_from_this\":").skip(1).map(numbers).collect();
-        let mut config = config(MotionConfig::default());
-        config.sensors[0].model = Some(Model::Hdl64eS2);
-        config.sensors[0].extrinsics.z_m = 1.73;
-        let ego_from_sensor = config.sensors[0].extrinsics.ego_from_sensor();
-        let mut pipeline = Pipeline::new(&config, vec![None]).unwrap();
-        let mut clouds = Vec::new();
-        for (index, p) in poses.iter().enumerate().take(3) {
-            let stamp_ns = index as i64 * 100_000_000;
-            let rotation = nalgebra::Matrix3::new(p[0], p[1], p[2], p[4], p[5], p[6], p[8], p[9], p[10]);
-            let first_from_this =
-                Isometry3::from_parts(Translation3::new(p[3], p[7], p[11]), UnitQuaternion::from_matrix(&rotation));
-            // The derived poses are the sensor's; the map frame is the first ego frame.
-            let map_from_ego = ego_from_sensor * first_from_this * ego_from_sensor.inverse();
-            let event = |body| Event { sequence: 0, arrival_ns: stamp_ns, source: 0, body };
-            pipeline.step(&event(Body::EgoPose(pose(stamp_ns, map_from_ego)))).unwrap();
-            let scan = Scan { stamp_ns, ..common::kitti(&format!("kitti/patchwork-plusplus/00000{index}.bin")) };
-            let map = pipeline.step(&event(Body::Scan(scan))).unwrap().unwrap();
-            assert_eq!(map.compensation, Compensation::None, "KITTI has moved its points already");
-            let from_header = map.map_from_ego.unwrap();
-            assert_eq!(from_header, map_from_ego, "a pose of the scan's own stamp, to the bit");
-            let sweep = pipeline.newest_sweep();
-            let near = |i: &usize| sweep.z[*i] > 0.4 && sweep.x[*i].hypot(sweep.y[*i]) < 25.0;
-            let point = |i: usize| Point3::new(sweep.x[i], sweep.y[i], sweep.z[i]).cast::<f64>();
-            let points: Vec<Point3<f64>> = (0..sweep.x.len()).filter(near).map(point).collect();
-            let placed: Vec<[f64; 3]> = points.iter().map(|point| (from_header * point).into()).collect();
-            let raw: Vec<[f64; 3]> = points.iter().map(|point| (*point).into()).collect();
-            clouds.push((placed, raw));
-        }
-        for pair in clouds.windows(2) {
-            let (with, without) = (apart(&pair[1].0, &pair[0].0), apart(&pair[1].1, &pair[0].1));
-            println!("median and mean distance: {with:.3?} m with the headers' poses, {without:.3?} m without");
-            assert!(with.0 < 0.05 && with.0 < 0.6 * without.0, "{with:?} {without:?}");
-        }
+    let text = std::fs::read_to_string(common::data("kitti/patchwork-plusplus/icp_poses_DERIVED.json")).unwrap();
+    let numbers = |pose: &str| -> Vec<f64> {
+        let matrix = &pose[..pose.find("]\n  ]").unwrap()];
+        matrix.split([',', '[', ']', '\n']).filter_map(|word| word.trim().parse().ok()).collect()
+    };
+    let poses: Vec<Vec<f64>> = text.split("\"T_first_from_this\":").skip(1).map(numbers).collect();
+    let mut config = config(MotionConfig::default());
+    config.sensors[0].model = Some(Model::Hdl64eS2);
+    config.sensors[0].extrinsics.z_m = 1.73;
+    let ego_from_sensor = config.sensors[0].extrinsics.ego_from_sensor();
+    let mut pipeline = Pipeline::new(&config, vec![None]).unwrap();
+    let mut clouds = Vec::new();
+    for (index, p) in poses.iter().enumerate().take(3) {
+        let stamp_ns = index as i64 * 100_000_000;
+        let rotation = nalgebra::Matrix3::new(p[0], p[1], p[2], p[4], p[5], p[6], p[8], p[9], p[10]);
+        let first_from_this =
+            Isometry3::from_parts(Translation3::new(p[3], p[7], p[11]), UnitQuaternion::from_matrix(&rotation));
+        // The derived poses are the sensor's; the map frame is the first ego frame.
+        let map_from_ego = ego_from_sensor * first_from_this * ego_from_sensor.inverse();
+        let event = |body| Event { sequence: 0, arrival_ns: stamp_ns, source: 0, body };
+        pipeline.step(&event(Body::EgoPose(pose(stamp_ns, map_from_ego)))).unwrap();
+        let scan = Scan { stamp_ns, ..common::kitti(&format!("kitti/patchwork-plusplus/00000{index}.bin")) };
+        let map = pipeline.step(&event(Body::Scan(scan))).unwrap().unwrap();
+        assert_eq!(map.compensation, Compensation::None, "KITTI has moved its points already");
+        let from_header = map.map_from_ego.unwrap();
+        assert_eq!(from_header, map_from_ego, "a pose of the scan's own stamp, to the bit");
+        let sweep = pipeline.newest_sweep();
+        let near = |i: &usize| sweep.z[*i] > 0.4 && sweep.x[*i].hypot(sweep.y[*i]) < 25.0;
+        let point = |i: usize| Point3::new(sweep.x[i], sweep.y[i], sweep.z[i]).cast::<f64>();
+        let points: Vec<Point3<f64>> = (0..sweep.x.len()).filter(near).map(point).collect();
+        let placed: Vec<[f64; 3]> = points.iter().map(|point| (from_header * point).into()).collect();
+        let raw: Vec<[f64; 3]> = points.iter().map(|point| (*point).into()).collect();
+        clouds.push((placed, raw));
+    }
+    for pair in clouds.windows(2) {
+        let (with, without) = (apart(&pair[1].0, &pair[0].0), apart(&pair[1].1, &pair[0].1));
+        println!("median and mean distance: {with:.3?} m with the headers' poses, {without:.3?} m without");
+        assert!(with.0 < 0.05 && with.0 < 0.6 * without.0, "{with:?} {without:?}");
     }
 }
