@@ -18,7 +18,9 @@ use crate::drivability::Drivability;
 use crate::event::{Body, EgoPose, Event, Scan};
 use crate::height_difference::HeightDifference;
 use crate::map::{LayerMaker, Map, SensorState};
+use crate::series::Series;
 use crate::sweep::{Mount, Sweep};
+use crate::terrain::Terrain;
 
 /// One vehicle's way from events to maps.
 pub struct Pipeline {
@@ -290,6 +292,8 @@ struct Maker {
     maps_made: u64,
     mount: Mount,
     sweep: Sweep,
+    /// Where a map asks for it.
+    series: Option<Series>,
     layer_makers: Vec<Box<dyn LayerMaker>>,
     map: Map,
 }
@@ -303,6 +307,7 @@ impl Maker {
             maps_made: 0,
             mount: Mount { ego_from_sensor: sensor.extrinsics.ego_from_sensor(), range_m_min: sensor.range_m_min },
             sweep: Sweep::default(),
+            series: config.maps.terrain.enabled.then(Series::default),
             layer_makers,
             map: Map {
                 sequence: 0,
@@ -326,6 +331,9 @@ impl Maker {
         arrival_ns: i64,
     ) {
         self.sweep.take_revolution(revolution, &self.mount);
+        if let Some(series) = &mut self.series {
+            self.sweep.take_deviations(revolution, &self.mount, series);
+        }
         let state = SensorState {
             name: config.sensors[0].name.clone(),
             model: model_name(revolution.model).to_owned(),
@@ -389,6 +397,9 @@ fn layer_makers(maps: &MapsConfig) -> Vec<Box<dyn LayerMaker>> {
     }
     if maps.height_difference.enabled {
         makers.push(Box::new(HeightDifference::new(&maps.height_difference)));
+    }
+    if maps.terrain.enabled {
+        makers.push(Box::new(Terrain::new(&maps.terrain)));
     }
     makers
 }

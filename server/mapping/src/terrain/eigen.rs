@@ -1,0 +1,144 @@
+//! Principal components of a covariance, in closed form, as far as the maps need them.
+//!
+//! In: variances xx, yy, zz and covariances xy, xz, yz, m². Out: the eigenvalues, and which of them belongs to the most
+//! vertical eigenvector: Neuhaus 2009 eq. 1. The trigonometric solution of the characteristic polynomial in f64, scaled
+//! first; the vertical share of an eigenvector follows from the eigenvalues of the matrix and those of its horizontal
+//! part, so no eigenvector is computed.
+
+use std::f64::consts::TAU;
+
+/// Eigenvalues nearer to one another than this share of the largest entry are one double eigenvalue: beneath, the closed
+/// form's rounding decides which eigenvector is which.
+const DOUBLE: f64 = 1e-6;
+
+/// What principal component analysis says of some points.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Principal {
+    /// Variance along the principal axes, m², largest first.
+    pub values: [f64; 3],
+    /// Index of the value along the most vertical axis.
+    pub vertical: usize,
+}
+
+impl Principal {
+    /// Of a covariance matrix: xx, yy, zz, xy, xz, yz.
+    pub fn of(covariance: [f64; 6]) -> Self {
+        let scale = covariance.iter().fold(0.0f64, |largest, value| largest.max(value.abs()));
+        if scale == 0.0 {
+            return Self::default();
+        }
+        // No number is never flat.
+        if covariance.iter().any(|value| !value.is_finite()) {
+            return Self { values: [f64::INFINITY; 3], vertical: 0 };
+        }
+        let scaled = covariance.map(|value| value / scale);
+        let values = eigenvalues(scaled);
+        Self { values: values.map(|value| (value * scale).max(0.0)), vertical: most_vertical(scaled, values) }
+    }
+
+    /// The local height disturbance h (eq. 1), m².
+    pub fn height_disturbance(&self) -> f64 {
+        self.values[self.vertical]
+    }
+}
+
+/// Written so that x and y may change places without changing a bit of the result.
+fn eigenvalues([xx, yy, zz, xy, xz, yz]: [f64; 6]) -> [f64; 3] {
+    let mean = ((xx + yy) + zz) / 3.0;
+    let (x, y, z) = (xx - mean, yy - mean, zz - mean);
+    let spread = ((x * x + y * y) + z * z) + 2.0 * (xy * xy + (xz * xz + yz * yz));
+    let radius = (spread / 6.0).sqrt();
+    if radius < 1e-15 {
+        return [mean; 3];
+    }
+    let determinant = ((x * y) * z + 2.0 * (xy * (xz * yz))) - (x * (yz * yz) + y * (xz * xz)) - z * (xy * xy);
+    let angle = (determinant / (2.0 * radius * radius * radius)).clamp(-1.0, 1.0).acos() / 3.0;
+    let largest = mean + 2.0 * radius * angle.cos();
+    let smallest = mean + 2.0 * radius * (angle + TAU / 3.0).cos();
+    [largest, 3.0 * mean - largest - smallest, smallest]
+}
+
+fn most_vertical([xx, yy, _, xy, ..]: [f64; 6], values: [f64; 3]) -> usize {
+    let [a, b, c] = values;
+    // Squared vertical component of the eigenvector of `of`, whose value is none of the two others.
+    let vertical =
+        |of: f64, others: [f64; 2]| ((xx - of) * (yy - of) - xy * xy) / ((of - others[0]) * (of - others[1]));
+    let (upper, lower) = (a - b < DOUBLE, b - c < DOUBLE);
+    match (upper, lower) {
+        // Any direction is an eigenvector.
+        (true, true) => 0,
+        // Of the eigenvectors in the plane of a double value one is as vertical as the plane.
+        (true, false) => {
+            let single = vertical(c, [a, b]);
+            if single > 1.0 - single { 2 } else { 0 }
+        }
+        (false, true) => {
+            let single = vertical(a, [b, c]);
+            if single > 1.0 - single { 0 } else { 1 }
+        }
+        (false, false) => {
+            let shares = [vertical(a, [b, c]), vertical(b, [a, c]), vertical(c, [a, b])];
+            let above = |i: usize, j: usize| shares[i] > shares[j];
+            if above(0, 1) && above(0, 2) {
+                0
+            } else if above(1, 2) {
+                1
+            } else {
+                2
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Matrix3, Rotation3, Vector3};
+    use proptest::prelude::*;
+
+    fn entries(m: &Matrix3<f64>) -> [f64; 6] {
+        [m[(0, 0)], m[(1, 1)], m[(2, 2)], m[(0, 1)], m[(0, 2)], m[(1, 2)]]
+    }
+
+    proptest! {
+        #[test]
+        fn values_and_the_vertical_one_are_those_the_matrix_was_made_of(
+            values in prop::array::uniform3(0f64..30.0), roll in -3f64..3.0, pitch in -1.5f64..1.5, yaw in -3f64..3.0,
+            thin in 0f64..1.0,
+        ) {
+            let mut values = values;
+            values[2] *= thin.powi(6);
+            let axes = Rotation3::from_euler_angles(roll, pitch, yaw);
+            let matrix = axes.matrix() * Matrix3::from_diagonal(&Vector3::from(values)) * axes.matrix().transpose();
+            let found = Principal::of(entries(&matrix));
+            let mut sorted = values;
+            sorted.sort_by(|a, b| b.total_cmp(a));
+            for (found, made) in found.values.iter().zip(sorted) {
+                prop_assert!((found - made).abs() < 1e-9 * sorted[0], "{found} {made}");
+            }
+            let shares: Vec<f64> = (0..3).map(|i| axes.matrix()[(2, i)].powi(2)).collect();
+            let most = (0..3).max_by(|i, j| shares[*i].total_cmp(&shares[*j])).unwrap();
+            let clear = (0..3).all(|i| i == most || shares[most] - shares[i] > 1e-3);
+            let apart = (0..3).all(|i| i == most || (values[most] - values[i]).abs() > 1e-4 * sorted[0]);
+            if clear && apart {
+                prop_assert!((found.height_disturbance() - values[most]).abs() < 1e-9 * sorted[0]);
+            }
+        }
+    }
+
+    #[test]
+    fn exact_shapes_have_the_disturbance_one_expects() {
+        let h = |covariance| Principal::of(covariance).height_disturbance();
+        // Level plane, pole, wall, ball, line along x, nothing.
+        assert_eq!(h([1.0, 1.0, 0.0, 0.0, 0.0, 0.0]), 0.0);
+        assert!((h([1e-4, 1e-4, 1.0, 0.0, 0.0, 0.0]) - 1.0).abs() < 1e-12);
+        assert!((h([0.0, 1.0, 0.5, 0.0, 0.0, 0.0]) - 0.5).abs() < 1e-12);
+        assert!((h([2.0, 2.0, 2.0, 0.0, 0.0, 0.0]) - 2.0).abs() < 1e-12);
+        assert!(h([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]).abs() < 1e-12);
+        assert_eq!(h([0.0; 6]), 0.0);
+        assert_eq!(h([f64::NAN; 6]), f64::INFINITY);
+        assert_eq!(h([1.0, 1.0, f64::NAN, 0.0, 0.0, 0.0]), f64::INFINITY);
+        // A plane rising by 30 %.
+        assert!(h([1.0, 1.0, 0.09, 0.0, 0.3, 0.0]).abs() < 1e-12);
+    }
+}
