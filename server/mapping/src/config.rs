@@ -241,6 +241,8 @@ pub struct TerrainConfig {
     pub start_m_max: f32,
     /// With `form = "grounded"`: greatest step between neighbouring regions of the ground.
     pub step_m_max: f32,
+    /// With `form = "grounded"`: widest gap without points over which regions can be neighbours, as far rings are.
+    pub bridge_m_max: f32,
     /// With `form = "grounded"`: widest hole in seen ground that is inferred to be flat.
     pub inference_m_max: f32,
     /// Deviation of the sensor's own ranges, taken off the roughness.
@@ -262,10 +264,11 @@ impl Default for TerrainConfig {
             flatness_m2_max: 0.005,
             points_min: 3,
             residual_m_max: 0.15,
-            grade_max: 0.4,
+            grade_max: 0.2,
             blind_zone_m: 7.0,
             start_m_max: 0.25,
             step_m_max: 0.15,
+            bridge_m_max: 8.0,
             inference_m_max: 3.0,
             noise_m: 0.02,
             roughness_points_min: 5,
@@ -405,6 +408,7 @@ impl TerrainConfig {
             ("blind_zone_m", self.blind_zone_m, (0.0..=60.0, "0 to 60")),
             ("start_m_max", self.start_m_max, (0.01..=10.0, "0.01 to 10")),
             ("step_m_max", self.step_m_max, (0.0..=10.0, "0 to 10")),
+            ("bridge_m_max", self.bridge_m_max, (0.0..=20.0, "0 to 20")),
             ("inference_m_max", self.inference_m_max, (0.0..=20.0, "0 to 20")),
             // The plane of a stretch of one ring needs some.
             ("noise_m", self.noise_m, (0.001..=1.0, "0.001 to 1")),

@@ -30,7 +30,7 @@ use crate::sweep::Sweep;
 
 use ground::Ground;
 use moments::{Cells, half_width};
-use regions::{FIRST_FLAT, OBSTACLE as NOT_FLAT, Plane, Regions};
+use regions::{FIRST_FLAT, NOTHING, OBSTACLE as NOT_FLAT, Plane, Regions};
 use roughness::Roughness;
 
 /// No point fell into the cell, or too few to judge it by, and no flat region speaks for it.
@@ -90,13 +90,14 @@ impl Terrain {
         class.clear();
         let region_of = self.regions.of_cell();
         if self.config.form == Form::Grounded {
-            let (joined, inferred) = (self.ground.joined(), self.ground.inferred());
-            class.extend(region_of.iter().zip(&self.seen).zip(inferred).map(|((&region, &seen), &inferred)| {
+            let (joined, filled) = (self.ground.joined(), self.ground.filled());
+            class.extend(region_of.iter().zip(&self.seen).zip(filled).map(|((&region, &seen), &filled)| {
                 match (region, seen) {
                     (NOT_FLAT, _) => OBSTACLE,
                     (FIRST_FLAT.., true) if joined[(region - FIRST_FLAT) as usize] => FLAT,
                     (FIRST_FLAT.., true) => FLAT_ELEVATED,
-                    (FIRST_FLAT.., false) if inferred => FLAT_INFERRED,
+                    (FIRST_FLAT.., false) if filled => FLAT_INFERRED,
+                    (NOTHING, true) if filled => FLAT,
                     _ => UNKNOWN,
                 }
             }));

@@ -8,7 +8,7 @@
 use crate::config::TerrainConfig;
 
 use super::moments::Cells;
-use super::regions::{FIRST_FLAT, Regions};
+use super::regions::{FIRST_FLAT, NOTHING, Plane, Regions};
 
 /// Joined regions, and filled holes.
 #[derive(Clone, Debug, Default)]
@@ -16,9 +16,7 @@ pub struct Ground {
     /// Forest of regions; node 0 is the ground under the vehicle, node `1 + i` region `i`.
     parent: Vec<u32>,
     joined: Vec<bool>,
-    inferred: Vec<bool>,
-    /// In the row being walked, by column: row of the nearest seen ground before.
-    last_in_column: Vec<u32>,
+    filled: Vec<bool>,
 }
 
 impl Ground {
@@ -28,6 +26,7 @@ impl Ground {
         self.parent.extend(0..=regions.planes().len() as u32);
         self.start_under_the_vehicle(cells, regions, seen, config);
         self.join_neighbours(cells, regions, config);
+        self.join_over_gaps(cells, regions, seen, config);
         self.joined.clear();
         for node in 1..self.parent.len() as u32 {
             let joined = self.root(node) == self.root(0);
@@ -99,39 +98,33 @@ impl Ground {
         self.parent[a.max(b) as usize] = a.min(b);
     }
 
-    /// Along every row and every column: unseen cells of joined regions between two seen ones at most a span apart.
-    fn fill_holes(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
-        const NONE: u32 = u32::MAX;
-        let width = cells.width();
-        let span = (config.inference_m_max / cells.cell_m()).round() as usize;
-        self.inferred.clear();
-        self.inferred.resize(width * width, false);
-        self.last_in_column.clear();
-        self.last_in_column.resize(width, NONE);
-        let of_cell = regions.of_cell();
-        let is_ground = |region: u32| region >= FIRST_FLAT && self.joined[(region - FIRST_FLAT) as usize];
-        for iy in 0..width {
-            let mut last_in_row = NONE;
-            for ix in 0..width {
-                let cell = iy * width + ix;
-                if !seen[cell] {
-                    continue;
-                }
-                if !is_ground(of_cell[cell]) {
-                    // Whatever stands there ends the hole.
-                    (last_in_row, self.last_in_column[ix]) = (NONE, NONE);
-                    continue;
-                }
-                let (row, column) = (last_in_row, self.last_in_column[ix]);
-                if row != NONE && ix - row as usize - 1 <= span {
-                    (row as usize + 1..ix).for_each(|x| self.inferred[iy * width + x] |= is_ground(of_cell[iy * width + x]));
-                }
-                if column != NONE && iy - column as usize - 1 <= span {
-                    (column as usize + 1..iy).for_each(|y| self.inferred[y * width + ix] |= is_ground(of_cell[y * width + ix]));
-                }
-                (last_in_row, self.last_in_column[ix]) = (ix as u32, iy as u32);
+    /// Along every row and every column: flat regions with nothing but unseen cells between them, as the rings of far ground
+    /// are, whose planes meet half-way without a step.
+    fn join_over_gaps(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
+        let view = View { cells, regions, seen, config };
+        let span = (config.bridge_m_max / cells.cell_m()).round() as usize;
+        view.for_each_hole(span, |region| region >= FIRST_FLAT, |hole| {
+            if view.step_m(hole.from, hole.to) <= config.step_m_max {
+                let node = |cell: usize| regions.of_cell()[cell] - FIRST_FLAT + 1;
+                self.join(node(hole.from), node(hole.to));
             }
-        }
+        });
+    }
+
+    /// Along every row and every column, between two seen cells of the ground: unseen cells of its regions, and seen ones
+    /// of too few points that lie on it.
+    fn fill_holes(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
+        let view = View { cells, regions, seen, config };
+        let (joined, of_cell) = (&self.joined, regions.of_cell());
+        let is_ground = |region: u32| region >= FIRST_FLAT && joined[(region - FIRST_FLAT) as usize];
+        self.filled.clear();
+        self.filled.resize(seen.len(), false);
+        let (filled, span) = (&mut self.filled, (config.inference_m_max / cells.cell_m()).round() as usize);
+        view.for_each_hole(span, is_ground, |hole| {
+            for cell in hole.within() {
+                filled[cell] |= seen[cell] || is_ground(of_cell[cell]);
+            }
+        });
     }
 
     /// By flat region: whether it joins the ground under the vehicle.
@@ -139,8 +132,95 @@ impl Ground {
         &self.joined
     }
 
-    /// By cell: whether it lies in a hole of seen ground.
-    pub fn inferred(&self) -> &[bool] {
-        &self.inferred
+    /// By cell: whether it lies in a hole of seen ground: unseen there, or seen with too few points to be judged alone.
+    pub fn filled(&self) -> &[bool] {
+        &self.filled
+    }
+}
+
+/// Two cells of one row or column, and those between them.
+struct Hole {
+    from: usize,
+    to: usize,
+    stride: usize,
+}
+
+impl Hole {
+    fn within(&self) -> impl Iterator<Item = usize> + use<> {
+        (self.from + self.stride..self.to).step_by(self.stride)
+    }
+}
+
+struct View<'a> {
+    cells: &'a Cells,
+    regions: &'a Regions,
+    seen: &'a [bool],
+    config: &'a TerrainConfig,
+}
+
+impl View<'_> {
+    /// Calls `take` for every pair of neighbouring seen cells of a row or column whose regions are `of_ground`, with at most
+    /// `span` cells between, in which nothing stands: those are unseen, or their few points lie on the ground of both.
+    fn for_each_hole(&self, span: usize, of_ground: impl Fn(u32) -> bool, mut take: impl FnMut(&Hole)) {
+        const NONE: u32 = u32::MAX;
+        let width = self.cells.width();
+        let of_cell = self.regions.of_cell();
+        let mut last_in_column = vec![NONE; width];
+        for iy in 0..width {
+            let mut last_in_row = NONE;
+            for ix in 0..width {
+                let cell = iy * width + ix;
+                if !self.seen[cell] {
+                    continue;
+                }
+                let region = of_cell[cell];
+                if region == NOTHING {
+                    // Too few points to be judged alone: checked where the hole ends.
+                    continue;
+                }
+                if !of_ground(region) {
+                    (last_in_row, last_in_column[ix]) = (NONE, NONE);
+                    continue;
+                }
+                for (last, stride) in [(last_in_row, 1), (last_in_column[ix], width)] {
+                    let between = if last == NONE { 0 } else { (cell - last as usize) / stride - 1 };
+                    if between > 0 && between <= span {
+                        let hole = Hole { from: last as usize, to: cell, stride };
+                        if hole.within().all(|cell| !self.seen[cell] || self.lies_on_both(cell, &hole)) {
+                            take(&hole);
+                        }
+                    }
+                }
+                (last_in_row, last_in_column[ix]) = (cell as u32, cell as u32);
+            }
+        }
+    }
+
+    fn lies_on_both(&self, cell: usize, hole: &Hole) -> bool {
+        let (x, y) = self.place(cell);
+        let [lowest, highest] = self.cells.span_m(self.cells.slot_at(x, y));
+        let (x, y) = (self.cells.centre_m(x), self.cells.centre_m(y));
+        [hole.from, hole.to].into_iter().all(|end| {
+            let height = self.plane(end).height_m(x, y);
+            highest - height <= self.config.residual_m_max && height - lowest <= self.config.residual_m_max
+        })
+    }
+
+    /// Step between the planes of two cells, half-way between them.
+    fn step_m(&self, from: usize, to: usize) -> f32 {
+        let ((ax, ay), (bx, by)) = (self.place(from), self.place(to));
+        let middle = |a: usize, b: usize| (self.cells.centre_m(a) + self.cells.centre_m(b)) / 2.0;
+        let (x, y) = (middle(ax, bx), middle(ay, by));
+        (self.plane(from).height_m(x, y) - self.plane(to).height_m(x, y)).abs()
+    }
+
+    fn plane(&self, cell: usize) -> Plane {
+        self.regions.planes()[(self.regions.of_cell()[cell] - FIRST_FLAT) as usize]
+    }
+
+    /// Where a cell of the grid lies in the division.
+    fn place(&self, cell: usize) -> (usize, usize) {
+        let (width, margin) = (self.cells.width(), self.cells.margin());
+        (cell % width + margin, cell / width + margin)
     }
 }

@@ -221,6 +221,11 @@ impl Cells {
         self.span[slot].map(|mm| mm as f32 * 1e-3)
     }
 
+    /// The slot of the cell at a place, cells of the division. The cell must hold a point.
+    pub fn slot_at(&self, x: usize, y: usize) -> usize {
+        self.slots_before(morton(x as u32) | morton(y as u32) << 1)
+    }
+
     /// Code of a slot's cell.
     pub fn code(&self, slot: usize) -> u32 {
         self.code_of_slot[slot]
