@@ -271,7 +271,7 @@ impl Default for TerrainConfig {
             bridge_m_max: 8.0,
             inference_m_max: 3.0,
             noise_m: 0.02,
-            roughness_points_min: 5,
+            roughness_points_min: 3,
             planes: false,
         }
     }

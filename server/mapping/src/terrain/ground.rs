@@ -17,6 +17,7 @@ pub struct Ground {
     parent: Vec<u32>,
     joined: Vec<bool>,
     filled: Vec<bool>,
+    seen_cells: Vec<u32>,
 }
 
 impl Ground {
@@ -26,6 +27,8 @@ impl Ground {
         self.parent.extend(0..=regions.planes().len() as u32);
         self.start_under_the_vehicle(cells, regions, seen, config);
         self.join_neighbours(cells, regions, config);
+        self.seen_cells.clear();
+        self.seen_cells.extend((0..seen.len() as u32).filter(|cell| seen[*cell as usize]));
         self.join_over_gaps(cells, regions, seen, config);
         self.joined.clear();
         for node in 1..self.parent.len() as u32 {
@@ -58,26 +61,24 @@ impl Ground {
 
     /// Flat regions that touch, and whose planes meet there without a step.
     fn join_neighbours(&mut self, cells: &Cells, regions: &Regions, config: &TerrainConfig) {
-        let (width, margin) = (cells.width(), cells.margin());
+        let (width, margin) = (cells.width() as u32, cells.margin());
         let (of_cell, planes) = (regions.of_cell(), regions.planes());
-        for iy in 0..width {
-            for ix in 0..width {
-                let here = of_cell[iy * width + ix];
-                if here < FIRST_FLAT {
+        // Each region looks over its far sides; the near ones are far sides of its neighbours.
+        for (here, &[left, low, right, high]) in regions.extents().iter().enumerate() {
+            let ahead = (low..high).filter(|_| right < width).map(|iy| (right, iy, -0.5, 0.0));
+            let beside = (left..right).filter(|_| high < width).map(|ix| (ix, high, 0.0, -0.5));
+            let mut last = NOTHING;
+            for (ix, iy, dx, dy) in ahead.chain(beside) {
+                let other = of_cell[(iy * width + ix) as usize];
+                if other < FIRST_FLAT {
                     continue;
                 }
-                let (x, y) = (cells.centre_m(ix + margin), cells.centre_m(iy + margin));
-                let half = cells.cell_m() / 2.0;
-                let ahead = if ix + 1 < width { of_cell[iy * width + ix + 1] } else { here };
-                let beside = if iy + 1 < width { of_cell[(iy + 1) * width + ix] } else { here };
-                for (other, x, y) in [(ahead, x + half, y), (beside, x, y + half)] {
-                    if other == here || other < FIRST_FLAT {
-                        continue;
-                    }
-                    let height = |region: u32| planes[(region - FIRST_FLAT) as usize].height_m(x, y);
-                    if (height(here) - height(other)).abs() <= config.step_m_max {
-                        self.join(here - FIRST_FLAT + 1, other - FIRST_FLAT + 1);
-                    }
+                let (x, y) = (cells.centre_m(ix as usize + margin), cells.centre_m(iy as usize + margin));
+                let (x, y) = (x + dx * cells.cell_m(), y + dy * cells.cell_m());
+                let step = planes[here].height_m(x, y) - planes[(other - FIRST_FLAT) as usize].height_m(x, y);
+                if other != last && step.abs() <= config.step_m_max {
+                    self.join(here as u32 + 1, other - FIRST_FLAT + 1);
+                    last = other;
                 }
             }
         }
@@ -101,7 +102,8 @@ impl Ground {
     /// Along every row and every column: flat regions with nothing but unseen cells between them, as the rings of far ground
     /// are, whose planes meet half-way without a step.
     fn join_over_gaps(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
-        let view = View { cells, regions, seen, config };
+        let seen_cells = std::mem::take(&mut self.seen_cells);
+        let view = View { cells, regions, seen, seen_cells: &seen_cells, config };
         let span = (config.bridge_m_max / cells.cell_m()).round() as usize;
         view.for_each_hole(span, |region| region >= FIRST_FLAT, |hole| {
             if view.step_m(hole.from, hole.to) <= config.step_m_max {
@@ -109,12 +111,13 @@ impl Ground {
                 self.join(node(hole.from), node(hole.to));
             }
         });
+        self.seen_cells = seen_cells;
     }
 
     /// Along every row and every column, between two seen cells of the ground: unseen cells of its regions, and seen ones
     /// of too few points that lie on it.
     fn fill_holes(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
-        let view = View { cells, regions, seen, config };
+        let view = View { cells, regions, seen, seen_cells: &self.seen_cells, config };
         let (joined, of_cell) = (&self.joined, regions.of_cell());
         let is_ground = |region: u32| region >= FIRST_FLAT && joined[(region - FIRST_FLAT) as usize];
         self.filled.clear();
@@ -155,6 +158,8 @@ struct View<'a> {
     cells: &'a Cells,
     regions: &'a Regions,
     seen: &'a [bool],
+    /// The same as a list, row by row.
+    seen_cells: &'a [u32],
     config: &'a TerrainConfig,
 }
 
@@ -166,33 +171,31 @@ impl View<'_> {
         let width = self.cells.width();
         let of_cell = self.regions.of_cell();
         let mut last_in_column = vec![NONE; width];
-        for iy in 0..width {
-            let mut last_in_row = NONE;
-            for ix in 0..width {
-                let cell = iy * width + ix;
-                if !self.seen[cell] {
-                    continue;
-                }
-                let region = of_cell[cell];
-                if region == NOTHING {
-                    // Too few points to be judged alone: checked where the hole ends.
-                    continue;
-                }
-                if !of_ground(region) {
-                    (last_in_row, last_in_column[ix]) = (NONE, NONE);
-                    continue;
-                }
-                for (last, stride) in [(last_in_row, 1), (last_in_column[ix], width)] {
-                    let between = if last == NONE { 0 } else { (cell - last as usize) / stride - 1 };
-                    if between > 0 && between <= span {
-                        let hole = Hole { from: last as usize, to: cell, stride };
-                        if hole.within().all(|cell| !self.seen[cell] || self.lies_on_both(cell, &hole)) {
-                            take(&hole);
-                        }
+        let (mut row, mut last_in_row) = (0, NONE);
+        for &cell in self.seen_cells {
+            let (cell, region) = (cell as usize, of_cell[cell as usize]);
+            if region == NOTHING {
+                // Too few points to be judged alone: checked where the hole ends.
+                continue;
+            }
+            let (iy, ix) = (cell / width, cell % width);
+            if iy != row {
+                (row, last_in_row) = (iy, NONE);
+            }
+            if !of_ground(region) {
+                (last_in_row, last_in_column[ix]) = (NONE, NONE);
+                continue;
+            }
+            for (last, stride) in [(last_in_row, 1), (last_in_column[ix], width)] {
+                let apart = if last == NONE { 0 } else { cell - last as usize };
+                if apart > stride && apart <= (span + 1) * stride {
+                    let hole = Hole { from: last as usize, to: cell, stride };
+                    if hole.within().all(|cell| !self.seen[cell] || self.lies_on_both(cell, &hole)) {
+                        take(&hole);
                     }
                 }
-                (last_in_row, last_in_column[ix]) = (cell as u32, cell as u32);
             }
+            (last_in_row, last_in_column[ix]) = (cell as u32, cell as u32);
         }
     }
 

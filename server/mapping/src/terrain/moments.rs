@@ -5,76 +5,69 @@
 //! cell (Morton order). A region of that division is a stretch of the order, so its sums are one difference. It is a
 //! summed-area table of only those cells that hold something: a tenth of them on real scans.
 //!
-//! Integers are exact: the sums do not depend on the order of the points.
+//! Sums of whole numbers are exact: they do not depend on the order of the points.
 
 use crate::sweep::Sweep;
 
 /// Code of a point that lies in no cell.
 const NOWHERE: u32 = u32::MAX;
-/// Points lower than this are no positions on the ground, metres; it bounds the sums, which need 52 of 63 bits.
+/// Points lower than this are no positions on the ground, metres; it bounds the sums.
 const DEPTH_M_MAX: f32 = 100.0;
 
 /// Sums over the points of a region: number, coordinates in mm, products in mm².
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+///
+/// All are whole numbers. They stay exact in an `f64`, in whatever order they are added, below 2^53: the products of
+/// 900,000 points all of which lie 100 m away.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Moments {
-    /// Points.
-    pub n: i64,
-    /// Sums of x, y, z.
-    pub first: [i64; 3],
-    /// Sums of xx, yy, zz, xy, xz, yz.
-    pub second: [i64; 6],
+    /// n; x, y, z; xx, yy, zz, xy, xz, yz.
+    sums: [f64; 10],
 }
 
 impl Moments {
-    fn add(&mut self, [x, y, z]: [i32; 3]) {
-        let [x, y, z] = [i64::from(x), i64::from(y), i64::from(z)];
-        self.n += 1;
-        for (sum, value) in self.first.iter_mut().zip([x, y, z]) {
-            *sum += value;
-        }
-        for (sum, value) in self.second.iter_mut().zip([x * x, y * y, z * z, x * y, x * z, y * z]) {
-            *sum += value;
-        }
+    #[inline(always)]
+    fn add(&mut self, [x, y, z]: [f32; 3]) {
+        let [x, y, z] = [x, y, z].map(f64::from);
+        let values = [1.0, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z];
+        (0..10).for_each(|i| self.sums[i] += values[i]);
     }
 
+    #[inline(always)]
     fn plus(mut self, other: &Self) -> Self {
-        self.n += other.n;
-        (0..3).for_each(|i| self.first[i] += other.first[i]);
-        (0..6).for_each(|i| self.second[i] += other.second[i]);
+        (0..10).for_each(|i| self.sums[i] += other.sums[i]);
         self
     }
 
     fn minus(mut self, other: &Self) -> Self {
-        self.n -= other.n;
-        (0..3).for_each(|i| self.first[i] -= other.first[i]);
-        (0..6).for_each(|i| self.second[i] -= other.second[i]);
+        (0..10).for_each(|i| self.sums[i] -= other.sums[i]);
         self
+    }
+
+    /// Number of points.
+    pub fn points(&self) -> f64 {
+        self.sums[0]
     }
 
     /// Centre of the points, metres. There must be one.
     pub fn mean(&self) -> [f64; 3] {
-        self.first.map(|sum| sum as f64 / self.n as f64 * 1e-3)
+        let [n, x, y, z, ..] = self.sums;
+        [x, y, z].map(|sum| sum / n * 1e-3)
     }
 
     /// Variances xx, yy, zz and covariances xy, xz, yz, m². There must be a point.
     ///
-    /// The centre is taken off in whole millimetres first, exactly, so that nothing cancels far from the vehicle.
+    /// What is left of rounding is 1e-12 m² a hundred metres out.
     pub fn covariance(&self) -> [f64; 6] {
-        let centre = self.first.map(|sum| sum / self.n);
-        [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)].map(|(i, j)| self.about(centre, i, j))
+        let share = 1.0 / self.points();
+        let [_, x, y, z, xx, yy, zz, xy, xz, yz] = self.sums.map(|sum| sum * share);
+        [xx - x * x, yy - y * y, zz - z * z, xy - x * y, xz - x * z, yz - y * z].map(|mm2| mm2 * 1e-6)
     }
 
     /// Variance of the height alone, m².
     pub fn variance_z(&self) -> f64 {
-        self.about([0, 0, self.first[2] / self.n], 2, 2)
-    }
-
-    fn about(&self, centre: [i64; 3], i: usize, j: usize) -> f64 {
-        let product = self.second[if i == j { i } else { i + j + 2 }];
-        let (a, b) = (centre[i], centre[j]);
-        let about = product - a * self.first[j] - b * self.first[i] + self.n * a * b;
-        let rest = |axis: usize| (self.first[axis] - self.n * centre[axis]) as f64 / self.n as f64;
-        (about as f64 / self.n as f64 - rest(i) * rest(j)) * 1e-6
+        let share = 1.0 / self.points();
+        let (z, zz) = (self.sums[3] * share, self.sums[6] * share);
+        (zz - z * z) * 1e-6
     }
 }
 
@@ -95,7 +88,7 @@ pub struct Cells {
     /// Sums of all slots before; one more than slots.
     sums: Vec<Moments>,
     /// Lowest and highest point of each slot, mm.
-    span: Vec<[i32; 2]>,
+    span: Vec<[f32; 2]>,
 }
 
 /// Cells of a grid from the ego origin to its edge.
@@ -155,17 +148,28 @@ impl Cells {
         self.sums.clear();
         self.sums.resize(slots + 1, Moments::default());
         self.span.clear();
-        self.span.resize(slots, [i32::MAX, i32::MIN]);
-        for (point, &code) in self.code_of_point.iter().enumerate() {
-            if code == NOWHERE {
-                continue;
+        self.span.resize(slots, [f32::INFINITY, -f32::INFINITY]);
+        // A laser's neighbouring points mostly share a cell: they are summed before they are written.
+        let (mut code, mut held, mut low, mut high) = (NOWHERE, Moments::default(), f32::INFINITY, -f32::INFINITY);
+        let mut write = |code: u32, held: &Moments, low: f32, high: f32| {
+            if code != NOWHERE {
+                let slot = slot(&self.occupied, &self.slots_before, code);
+                self.sums[slot + 1] = self.sums[slot + 1].plus(held);
+                let [lowest, highest] = &mut self.span[slot];
+                (*lowest, *highest) = ((*lowest).min(low), (*highest).max(high));
             }
-            let slot = slot(&self.occupied, &self.slots_before, code);
-            let [x, y, z] = [sweep.x[point], sweep.y[point], sweep.z[point]].map(millimetres);
-            self.sums[slot + 1].add([x, y, z]);
-            let [lowest, highest] = &mut self.span[slot];
-            (*lowest, *highest) = ((*lowest).min(z), (*highest).max(z));
+        };
+        let points = self.code_of_point.iter().zip(&sweep.x).zip(&sweep.y).zip(&sweep.z);
+        for (((&next, &x), &y), &z) in points {
+            if next != code {
+                write(code, &held, low, high);
+                (code, held, low, high) = (next, Moments::default(), f32::INFINITY, -f32::INFINITY);
+            }
+            let [x, y, z] = [x, y, z].map(millimetres);
+            held.add([x, y, z]);
+            (low, high) = (if z < low { z } else { low }, if z > high { z } else { high });
         }
+        write(code, &held, low, high);
         let mut running = Moments::default();
         for sums in &mut self.sums {
             running = running.plus(sums);
@@ -218,7 +222,7 @@ impl Cells {
 
     /// Lowest and highest point of a slot, metres.
     pub fn span_m(&self, slot: usize) -> [f32; 2] {
-        self.span[slot].map(|mm| mm as f32 * 1e-3)
+        self.span[slot].map(|mm| mm * 1e-3)
     }
 
     /// The slot of the cell at a place, cells of the division. The cell must hold a point.
@@ -244,10 +248,12 @@ fn slot(occupied: &[u64], slots_before: &[u32], code: u32) -> usize {
     (slots_before[word] + before.count_ones()) as usize
 }
 
-/// Whole millimetres, halves away from zero, so that a turned world rounds alike.
-fn millimetres(metres: f32) -> i32 {
-    let mm = metres * 1e3;
-    (mm + 0.5f32.copysign(mm)) as i32
+/// Whole millimetres; a turned world rounds alike.
+#[inline(always)]
+fn millimetres(metres: f32) -> f32 {
+    // Above 2^23 an f32 holds nothing but whole numbers.
+    const WHOLE: f32 = 1.5 * 8_388_608.0;
+    (metres * 1e3 + WHOLE) - WHOLE
 }
 
 fn floor(value: f32) -> i32 {

@@ -51,6 +51,8 @@ impl Plane {
 #[derive(Clone, Debug, Default)]
 pub struct Regions {
     planes: Vec<Plane>,
+    /// By flat region: its first column and row in the grid, and the first ones behind it.
+    extents: Vec<[u32; 4]>,
     of_cell: Vec<u32>,
     /// By slot: the cell's place in the grid.
     cell_of_slot: Vec<u32>,
@@ -64,6 +66,7 @@ impl Regions {
     pub fn find(&mut self, cells: &Cells, config: &TerrainConfig) {
         let width = cells.width();
         self.planes.clear();
+        self.extents.clear();
         self.of_cell.clear();
         self.of_cell.resize(width * width, NOTHING);
         self.shape_of_cell.clear();
@@ -83,7 +86,7 @@ impl Regions {
         self.shape_of_cell.resize(self.of_cell.len(), super::SHAPE_UNKNOWN);
         for slot in 0..cells.slots() {
             let moments = cells.moments(slot, slot + 1);
-            if moments.n < i64::from(config.points_min) {
+            if moments.points() < f64::from(config.points_min) {
                 continue;
             }
             let principal = Principal::of(moments.covariance());
@@ -105,7 +108,7 @@ impl Regions {
             }
             let moments = cells.moments(from, to);
             // Of fewer points no part can be judged either.
-            if moments.n < i64::from(config.points_min) {
+            if moments.points() < f64::from(config.points_min) {
                 continue;
             }
             if is_flat(&moments, f64::from(config.flatness_m2_max)) {
@@ -138,8 +141,9 @@ impl Regions {
             let clip = |place: usize| place.saturating_sub(cells.margin()).min(cells.width());
             clip(first)..clip(first + side as usize)
         };
-        let columns = within(x);
-        for row in within(y) {
+        let (columns, rows) = (within(x), within(y));
+        self.extents.push([columns.start, rows.start, columns.end, rows.end].map(|place| place as u32));
+        for row in rows {
             let first = row * cells.width();
             self.of_cell[first + columns.start..first + columns.end].fill(region);
         }
@@ -153,6 +157,11 @@ impl Regions {
     /// By flat region.
     pub fn planes(&self) -> &[Plane] {
         &self.planes
+    }
+
+    /// By flat region of the division: its first column and row in the grid, and the first ones behind it.
+    pub fn extents(&self) -> &[[u32; 4]] {
+        &self.extents
     }
 
     /// By slot: the cell's index in the grid.
