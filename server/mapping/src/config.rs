@@ -258,7 +258,7 @@ impl Default for TerrainConfig {
         Self {
             enabled: true,
             form: Form::Grounded,
-            range_m_max: 60.0,
+            range_m_max: 50.0,
             cell_m: 0.25,
             overhang_m: 2.5,
             flatness_m2_max: 0.005,
@@ -271,7 +271,7 @@ impl Default for TerrainConfig {
             bridge_m_max: 8.0,
             inference_m_max: 3.0,
             noise_m: 0.02,
-            roughness_points_min: 3,
+            roughness_points_min: 4,
             planes: false,
         }
     }

@@ -23,13 +23,13 @@ pub struct Principal {
 impl Principal {
     /// Of a covariance matrix: xx, yy, zz, xy, xz, yz.
     pub fn of(covariance: [f64; 6]) -> Self {
+        // What is no number is not flat.
+        if covariance.iter().any(|value| !value.is_finite()) {
+            return Self { values: [f64::INFINITY; 3], vertical: 0 };
+        }
         let scale = covariance.iter().fold(0.0f64, |largest, value| largest.max(value.abs()));
         if scale == 0.0 {
             return Self::default();
-        }
-        // No number is never flat.
-        if covariance.iter().any(|value| !value.is_finite()) {
-            return Self { values: [f64::INFINITY; 3], vertical: 0 };
         }
         let scaled = covariance.map(|value| value / scale);
         let values = eigenvalues(scaled);

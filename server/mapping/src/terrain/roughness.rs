@@ -14,8 +14,8 @@ use super::moments::Cells;
 const STEPS_A_METRE: f32 = 1e4;
 /// A larger deviation is an edge, not ground, metres; it bounds the sums.
 const DEVIATION_M_MAX: f32 = 10.0;
-/// Value of one raw unit: a millimetre of range a metre of distance.
-pub const SCALE: f32 = 1e-3;
+/// Value of one raw unit: a fifth of a millimetre of range a metre of distance.
+pub const SCALE: f32 = 2e-4;
 
 /// Roughness of every slot.
 #[derive(Clone, Debug, Default)]

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
+use clearway_mapping::event::Scan;
 use clearway_mapping::sweep::{Mount, Sweep};
 
 #[cfg(clearway_data)]
@@ -51,6 +52,22 @@ impl GroundHeight {
     }
 }
 
+/// A KITTI scan as a sweep.
+#[cfg(clearway_data)]
+pub fn kitti_sweep(path: &str) -> Sweep {
+    sweep_of(&kitti(path))
+}
+
+#[cfg(clearway_data)]
+fn sweep_of(scan: &Scan) -> Sweep {
+    let extrinsics =
+        Extrinsics { x_m: 0.0, y_m: 0.0, z_m: KITTI_HEIGHT_M, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
+    let mount = Mount { ego_from_sensor: extrinsics.ego_from_sensor(), range_m_min: 2.0 };
+    let mut sweep = Sweep::default();
+    sweep.take_scan(scan, &Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount);
+    sweep
+}
+
 /// The frame as a sweep, and the label of each of its points.
 #[cfg(clearway_data)]
 pub fn labelled_frame() -> (Sweep, Vec<u32>) {
@@ -59,11 +76,7 @@ pub fn labelled_frame() -> (Sweep, Vec<u32>) {
     let labels: Vec<u32> =
         bytes.chunks_exact(4).map(|label| u32::from_le_bytes(label.try_into().unwrap()) & 0xffff).collect();
     assert_eq!(labels.len(), scan.x.len());
-    let extrinsics =
-        Extrinsics { x_m: 0.0, y_m: 0.0, z_m: KITTI_HEIGHT_M, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
-    let mount = Mount { ego_from_sensor: extrinsics.ego_from_sensor(), range_m_min: 2.0 };
-    let mut sweep = Sweep::default();
-    sweep.take_scan(&scan, &Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount);
+    let sweep = sweep_of(&scan);
     // The sweep leaves out what lies within 2 m; so must the labels.
     let seen = |i: &usize| (scan.x[*i].powi(2) + scan.y[*i].powi(2) + scan.z[*i].powi(2)) >= 4.0;
     let labels: Vec<u32> = (0..labels.len()).filter(seen).map(|i| labels[i]).collect();
