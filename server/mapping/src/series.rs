@@ -116,7 +116,8 @@ mod tests {
         for laser in [0, 31, 32, 63] {
             let own: Vec<f32> = ranges.iter().skip(laser).step_by(lasers).copied().filter(|r| !r.is_nan()).collect();
             let alone = deviations(&own, 1);
-            let together: Vec<f32> = found.iter().skip(laser).step_by(lasers).copied().filter(|d| !d.is_nan()).collect();
+            let together: Vec<f32> =
+                found.iter().skip(laser).step_by(lasers).copied().filter(|d| !d.is_nan()).collect();
             assert_eq!(alone, together, "laser {laser}");
         }
         assert_eq!(deviations(&[], 64), []);

@@ -74,7 +74,8 @@ impl Sweep {
         let first = series.take(revolution);
         self.deviation_m.clear();
         for (number, echo) in revolution.echoes.iter().enumerate() {
-            let kept = echo.range_m.iter().enumerate().filter(|(_, range)| **range > 0.0 && **range >= mount.range_m_min);
+            let kept =
+                echo.range_m.iter().enumerate().filter(|(_, range)| **range > 0.0 && **range >= mount.range_m_min);
             self.deviation_m.extend(kept.map(|(slot, _)| if number == 0 { first[slot] } else { f32::NAN }));
         }
     }

@@ -10,8 +10,8 @@ use clearway_mapping::map::{Layer, LayerMaker};
 use clearway_mapping::series::Series;
 use clearway_mapping::sweep::{Mount, Sweep};
 use clearway_mapping::terrain::{
-    FLAT, FLAT_ELEVATED, FLAT_INFERRED, OBSTACLE, ROUGHNESS_UNKNOWN, SHAPE_LINE, SHAPE_PLANE, SHAPE_SCATTER, SHAPE_UNKNOWN,
-    Terrain,
+    FLAT, FLAT_ELEVATED, FLAT_INFERRED, OBSTACLE, ROUGHNESS_UNKNOWN, SHAPE_LINE, SHAPE_PLANE, SHAPE_SCATTER,
+    SHAPE_UNKNOWN, Terrain,
 };
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::{self, Scene};
@@ -316,7 +316,9 @@ fn no_flat_cell_of_the_simulated_worlds_holds_an_object() {
             let found = of(&|cell| free[cell] && !high[cell] && drivable(cell));
             [wrong as f64, of(&drivable) as f64, found as f64 / is as f64]
         });
-        println!("{name}: grid {wrong:?}, paper {flat:?}, grounded {found:?} (flat cells with an object, flat, recall)");
+        println!(
+            "{name}: grid {wrong:?}, paper {flat:?}, grounded {found:?} (flat cells with an object, flat, recall)"
+        );
         assert!(found[0] <= 0.001 * found[1], "{name}: {found:?}");
         assert!(found[2] >= 0.95, "{name}: {found:?}");
     }

@@ -105,12 +105,16 @@ impl Ground {
         let seen_cells = std::mem::take(&mut self.seen_cells);
         let view = View { cells, regions, seen, seen_cells: &seen_cells, config };
         let span = (config.bridge_m_max / cells.cell_m()).round() as usize;
-        view.for_each_hole(span, |region| region >= FIRST_FLAT, |hole| {
-            if view.step_m(hole.from, hole.to) <= config.step_m_max {
-                let node = |cell: usize| regions.of_cell()[cell] - FIRST_FLAT + 1;
-                self.join(node(hole.from), node(hole.to));
-            }
-        });
+        view.for_each_hole(
+            span,
+            |region| region >= FIRST_FLAT,
+            |hole| {
+                if view.step_m(hole.from, hole.to) <= config.step_m_max {
+                    let node = |cell: usize| regions.of_cell()[cell] - FIRST_FLAT + 1;
+                    self.join(node(hole.from), node(hole.to));
+                }
+            },
+        );
         self.seen_cells = seen_cells;
     }
 

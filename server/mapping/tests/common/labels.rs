@@ -112,7 +112,8 @@ pub fn truth_by_cell(
         let over = point[2] - height.about(point);
         obstacle[cell] |= !is_ground(*label) && *label > 1 && over > 0.3 && over <= 2.5;
     }
-    let without_obstacle = |held: &[bool]| held.iter().zip(&obstacle).map(|(held, obstacle)| *held && !*obstacle).collect();
+    let without_obstacle =
+        |held: &[bool]| held.iter().zip(&obstacle).map(|(held, obstacle)| *held && !*obstacle).collect();
     TruthByCell { road: without_obstacle(&road), free: without_obstacle(&ground), obstacle }
 }
 
