@@ -1,4 +1,4 @@
-//! The scenes: the thesis' four (§V, figures 5 to 8) and a town to drive in for ever.
+//! The scenes: the thesis' four (§V, figures 5 to 8), a dirt track, and a town to drive in for ever.
 //!
 //! Each is a [`World`] and the [`Drive`] of the vehicle in it. In the thesis' scenes the vehicle stands at the world's
 //! origin and looks along x.
@@ -134,6 +134,20 @@ fn fenced_road() -> World {
 
 /// Where the fenced road ends behind the vehicle, in steps of 4 m.
 const BEHIND: i32 = -2;
+
+/// Half the width of the dirt track, metres.
+pub const TRACK_HALF_M: f64 = 3.0;
+
+/// A smooth dirt track along x between ploughed fields, whose furrows, 5 cm deep, run along it (Neuhaus 2009, figure 4).
+pub fn dirt_track_between_fields() -> Scene {
+    // A ridge 0.5 m wide every 1.5 m, with sides of 0.1 m.
+    let ridge = |from: f64| [(from, 0.0), (from + 0.1, 0.05), (from + 0.4, 0.05), (from + 0.5, 0.0)];
+    let right = (0..28).rev().flat_map(|k| ridge(-TRACK_HALF_M - 0.5 - 1.5 * f64::from(k)));
+    let left = (0..28).flat_map(|k| ridge(TRACK_HALF_M + 1.5 * f64::from(k)));
+    let across = Profile::through(&right.chain(left).collect::<Vec<_>>());
+    let ground = Ground { across, reflectivity: 45, ..Ground::default() };
+    Scene { paper_share: None, ..standing("dirt track between fields", World::on(ground), 0.0) }
+}
 
 /// Half the width of the town's street, kerb to kerb, metres: two lanes and a parking strip on either side.
 const STREET_HALF_M: f64 = 5.6;

@@ -4,13 +4,15 @@
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig, MotionConfig};
+use clearway_mapping::config::{DrivabilityConfig, Form, HeightDifferenceConfig, MotionConfig, TerrainConfig};
 use clearway_mapping::drivability::Drivability;
 use clearway_mapping::event::{EgoPose, Scan};
 use clearway_mapping::height_difference::HeightDifference;
 use clearway_mapping::map::LayerMaker;
 use clearway_mapping::motion::{Motion, Moved};
+use clearway_mapping::series::Series;
 use clearway_mapping::sweep::{Mount, Sweep};
+use clearway_mapping::terrain::Terrain;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::vehicle::SimulatedVehicle;
 use divan::Bencher;
@@ -100,4 +102,32 @@ fn sweep_of_a_moving_revolution(bencher: Bencher) {
         motion.through(&revolution, revolution.end_ns, &mut moved);
         sweep.take_moving_revolution(&revolution, &mount, &moved.end_from_ego);
     });
+}
+
+#[divan::bench(args = [Form::Grounded, Form::Paper, Form::Grid])]
+fn terrain(bencher: Bencher, form: Form) {
+    let sweep = sweep();
+    let mut map = Terrain::new(&TerrainConfig { form, ..TerrainConfig::default() });
+    let mut layer = map.layer();
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
+}
+
+/// The same with roughness: a simulated turn, whose distance series are known.
+#[divan::bench]
+fn terrain_with_roughness(bencher: Bencher) {
+    let (revolution, mount) = (turn(), mount(1.9));
+    let mut sweep = Sweep::default();
+    sweep.take_revolution(&revolution, &mount);
+    sweep.take_deviations(&revolution, &mount, &mut Series::default());
+    let mut map = Terrain::new(&TerrainConfig::default());
+    let mut layer = map.layer();
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
+}
+
+#[divan::bench]
+fn deviations_of_a_revolution(bencher: Bencher) {
+    let (revolution, mount) = (turn(), mount(1.9));
+    let (mut sweep, mut series) = (Sweep::default(), Series::default());
+    let slots = revolution.echoes[0].range_m.len();
+    bencher.counter(ItemsCount::new(slots)).bench_local(|| sweep.take_deviations(&revolution, &mount, &mut series));
 }

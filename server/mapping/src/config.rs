@@ -101,6 +101,8 @@ pub struct MapsConfig {
     pub drivability: DrivabilityConfig,
     /// The thesis' baseline.
     pub height_difference: HeightDifferenceConfig,
+    /// Neuhaus' terrain map.
+    pub terrain: TerrainConfig,
 }
 
 impl Default for MapsConfig {
@@ -110,6 +112,7 @@ impl Default for MapsConfig {
             motion: MotionConfig::default(),
             drivability: DrivabilityConfig::default(),
             height_difference: HeightDifferenceConfig::default(),
+            terrain: TerrainConfig::default(),
         }
     }
 }
@@ -232,11 +235,88 @@ impl Default for HeightDifferenceConfig {
     }
 }
 
+/// Parameters of [`crate::terrain`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TerrainConfig {
+    /// Whether the map is made.
+    pub enabled: bool,
+    /// Which reading of the paper.
+    pub form: Form,
+    /// The grid reaches this far from the vehicle in each direction.
+    pub range_m_max: f32,
+    /// Side of a cell.
+    pub cell_m: f32,
+    /// Points higher than this over the ground under the vehicle are dropped: the vehicle passes under them.
+    pub overhang_m: f32,
+    /// A region whose local height disturbance (a variance, eq. 1) is less is flat.
+    pub flatness_m2_max: f32,
+    /// Fewer points cannot be judged.
+    pub points_min: u16,
+    /// With `form = "grounded"`: how far a point of a flat region may lie off its plane.
+    pub residual_m_max: f32,
+    /// With `form = "grounded"`: rise over run beyond which a flat region is no ground.
+    pub grade_max: f32,
+    /// With `form = "grounded"`: how far out flat ground may be taken for the ground under the vehicle.
+    pub blind_zone_m: f32,
+    /// With `form = "grounded"`: how much higher or lower it may be.
+    pub start_m_max: f32,
+    /// With `form = "grounded"`: greatest step between neighbouring regions of the ground.
+    pub step_m_max: f32,
+    /// With `form = "grounded"`: widest gap without points over which regions can be neighbours, as far rings are.
+    pub bridge_m_max: f32,
+    /// With `form = "grounded"`: widest hole in seen ground that is inferred to be flat.
+    pub inference_m_max: f32,
+    /// Deviation of the sensor's own ranges, taken off the roughness.
+    pub noise_m: f32,
+    /// Fewer points with a distance series have no roughness.
+    pub roughness_points_min: u16,
+    /// Whether the layer carries each flat cell's plane: height and slopes.
+    pub planes: bool,
+}
+
+impl Default for TerrainConfig {
+    fn default() -> Self {
+        Self {
+            enabled: true,
+            form: Form::Grounded,
+            range_m_max: 50.0,
+            cell_m: 0.25,
+            overhang_m: 2.5,
+            flatness_m2_max: 0.005,
+            points_min: 3,
+            residual_m_max: 0.15,
+            grade_max: 0.2,
+            blind_zone_m: 7.0,
+            start_m_max: 0.25,
+            step_m_max: 0.15,
+            bridge_m_max: 8.0,
+            inference_m_max: 3.0,
+            noise_m: 0.02,
+            roughness_points_min: 4,
+            planes: false,
+        }
+    }
+}
+
+/// How [`crate::terrain`] finds flat cells.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Form {
+    /// Hierarchical division, flat regions joined to the ground under the vehicle, inference within seen ground.
+    Grounded,
+    /// Hierarchical division as published (§2.3).
+    Paper,
+    /// Every cell for itself (§2.2), with the shape of its points.
+    Grid,
+}
+
 impl MapsConfig {
     /// Every map switched off.
     pub fn none() -> Self {
         let mut maps = Self::default();
         (maps.drivability.enabled, maps.height_difference.enabled) = (false, false);
+        maps.terrain.enabled = false;
         maps
     }
 }
@@ -338,7 +418,36 @@ impl MapsConfig {
         check(f64::from(difference.range_m_max), allowed, || format!("{at}.range_m_max"), said)?;
         let key = || format!("{at}.difference_m_max");
         check(f64::from(difference.difference_m_max), 0.01..=10.0, key, "0.01 to 10")?;
-        check_columns(at, difference.columns)
+        check_columns(at, difference.columns)?;
+        self.terrain.validate("vehicle.maps.terrain")
+    }
+}
+
+impl TerrainConfig {
+    fn validate(&self, at: &str) -> Result<(), ConfigError> {
+        let metres = [
+            // 2000 cells a side at most.
+            ("range_m_max", self.range_m_max, (5.0..=100.0, "5 to 100")),
+            ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
+            ("overhang_m", self.overhang_m, (0.5..=100.0, "0.5 to 100")),
+            ("flatness_m2_max", self.flatness_m2_max, (1e-6..=1.0, "0.000001 to 1")),
+            ("residual_m_max", self.residual_m_max, (0.01..=10.0, "0.01 to 10")),
+            ("grade_max", self.grade_max, (0.01..=10.0, "0.01 to 10")),
+            ("blind_zone_m", self.blind_zone_m, (0.0..=60.0, "0 to 60")),
+            ("start_m_max", self.start_m_max, (0.01..=10.0, "0.01 to 10")),
+            ("step_m_max", self.step_m_max, (0.0..=10.0, "0 to 10")),
+            ("bridge_m_max", self.bridge_m_max, (0.0..=20.0, "0 to 20")),
+            ("inference_m_max", self.inference_m_max, (0.0..=20.0, "0 to 20")),
+            // The plane of a stretch of one ring needs some.
+            ("noise_m", self.noise_m, (0.001..=1.0, "0.001 to 1")),
+        ];
+        for (key, value, (allowed, said)) in metres {
+            check(f64::from(value), allowed, || format!("{at}.{key}"), said)?;
+        }
+        for (key, value) in [("points_min", self.points_min), ("roughness_points_min", self.roughness_points_min)] {
+            check(f64::from(value), 1.0..=1000.0, || format!("{at}.{key}"), "1 to 1000")?;
+        }
+        Ok(())
     }
 }
 

@@ -12,6 +12,8 @@
 //! | [`radial`] | the thesis' r-θ grid: position -> cell |
 //! | [`drivability`] | thesis §IV |
 //! | [`height_difference`] | the thesis' baseline |
+//! | [`series`] | revolution -> how far each range lies from its laser's neighbouring ones |
+//! | [`terrain`] | Neuhaus 2009 §2 |
 
 pub mod config;
 pub mod drivability;
@@ -22,4 +24,6 @@ pub mod motion;
 pub mod mount;
 pub mod pipeline;
 pub mod radial;
+pub mod series;
 pub mod sweep;
+pub mod terrain;

@@ -19,7 +19,9 @@ use crate::event::{Body, EgoPose, Event, Scan};
 use crate::height_difference::HeightDifference;
 use crate::map::{LayerMaker, Map, SensorState};
 use crate::motion::{Compensation, Motion, Moved};
+use crate::series::Series;
 use crate::sweep::{Mount, Sweep};
+use crate::terrain::Terrain;
 
 /// One vehicle's way from events to maps.
 pub struct Pipeline {
@@ -307,6 +309,8 @@ struct Maker {
     mount: Mount,
     moved: Moved,
     sweep: Sweep,
+    /// Where a map asks for it.
+    series: Option<Series>,
     layer_makers: Vec<Box<dyn LayerMaker>>,
     map: Map,
 }
@@ -321,6 +325,7 @@ impl Maker {
             mount: Mount { ego_from_sensor: sensor.extrinsics.ego_from_sensor(), range_m_min: sensor.range_m_min },
             moved: Moved::default(),
             sweep: Sweep::default(),
+            series: config.maps.terrain.enabled.then(Series::default),
             layer_makers,
             map: Map {
                 sequence: 0,
@@ -348,6 +353,9 @@ impl Maker {
         self.sweep.take_moving_revolution(revolution, &self.mount, &self.moved.end_from_ego);
         (self.map.compensation, self.map.speed_mps) = (self.moved.compensation, self.moved.speed_mps);
         self.map.map_from_ego = motion.map_from_ego(revolution.end_ns);
+        if let Some(series) = &mut self.series {
+            self.sweep.take_deviations(revolution, &self.mount, series);
+        }
         let state = SensorState {
             name: config.sensors[0].name.clone(),
             model: model_name(revolution.model).to_owned(),
@@ -411,6 +419,9 @@ fn layer_makers(maps: &MapsConfig) -> Vec<Box<dyn LayerMaker>> {
     }
     if maps.height_difference.enabled {
         makers.push(Box::new(HeightDifference::new(&maps.height_difference)));
+    }
+    if maps.terrain.enabled {
+        makers.push(Box::new(Terrain::new(&maps.terrain)));
     }
     makers
 }

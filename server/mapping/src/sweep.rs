@@ -12,6 +12,7 @@ use nalgebra::Isometry3;
 
 use crate::event::Scan;
 use crate::motion::knots;
+use crate::series::Series;
 
 /// No sensor of the family reaches half as far; a coordinate beyond is not a position.
 const POSITION_M_MAX: f32 = 1000.0;
@@ -34,6 +35,9 @@ pub struct Sweep {
     pub y: Vec<f32>,
     /// Up, over the ground under the vehicle.
     pub z: Vec<f32>,
+    /// How far each range lies from the mean of its laser's neighbouring ones, metres (NaN: not known); empty unless
+    /// [`Sweep::take_deviations`] filled it.
+    pub deviation_m: Vec<f32>,
     /// Returns of the turn before those of the vehicle itself were dropped.
     pub returns: u32,
     /// Elevations of the lasers that made the points; `None` in a sweep that was never filled.
@@ -82,6 +86,18 @@ impl Sweep {
         self.close(kept);
     }
 
+    /// Adds one deviation a point, in step with the points that [`Sweep::take_revolution`] took from the same revolution;
+    /// a second echo has no series.
+    pub fn take_deviations(&mut self, revolution: &Revolution, mount: &Mount, series: &mut Series) {
+        let first = series.take(revolution);
+        self.deviation_m.clear();
+        for (number, echo) in revolution.echoes.iter().enumerate() {
+            let kept =
+                echo.range_m.iter().enumerate().filter(|(_, range)| **range > 0.0 && **range >= mount.range_m_min);
+            self.deviation_m.extend(kept.map(|(slot, _)| if number == 0 { first[slot] } else { f32::NAN }));
+        }
+    }
+
     /// Fills the sweep from a scan, in place of what it held; gives the number of points left out because a coordinate
     /// is not finite or lies beyond 1 km. The four arrays must be equally long.
     pub fn take_scan(&mut self, scan: &Scan, calibration: &Arc<Calibration>, mount: &Mount) -> u64 {
@@ -112,6 +128,7 @@ impl Sweep {
             self.calibration = Some(Arc::clone(calibration));
         }
         self.mount_height_m = mount.ego_from_sensor.translation.z as f32;
+        self.deviation_m.clear();
     }
 
     /// Room for `slots` points and one more to write what is not kept; gives the first free index.

@@ -3,11 +3,12 @@
 mod common;
 
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig};
+use clearway_mapping::config::{DrivabilityConfig, Form, HeightDifferenceConfig, TerrainConfig};
 use clearway_mapping::drivability::Drivability;
 use clearway_mapping::height_difference::HeightDifference;
 use clearway_mapping::map::{Cells, Layer, LayerMaker};
 use clearway_mapping::sweep::Sweep;
+use clearway_mapping::terrain::Terrain;
 use common::*;
 
 fn makers() -> Vec<Box<dyn LayerMaker>> {
@@ -17,6 +18,9 @@ fn makers() -> Vec<Box<dyn LayerMaker>> {
         makers.push(Box::new(Drivability::new(&drivability)));
         makers.push(Box::new(Drivability::new(&DrivabilityConfig { bridge_rows: 0, ..drivability })));
         makers.push(Box::new(HeightDifference::new(&HeightDifferenceConfig { columns, ..Default::default() })));
+    }
+    for form in [Form::Grounded, Form::Paper, Form::Grid] {
+        makers.push(Box::new(Terrain::new(&TerrainConfig { form, planes: true, ..TerrainConfig::default() })));
     }
     makers
 }
@@ -66,9 +70,8 @@ fn a_wall_is_an_obstacle_to_every_map() {
     let sweep = cast(Model::Hdl64eS2, court);
     for mut maker in makers() {
         let layer = make(maker.as_mut(), &sweep);
-        let (_, columns) = size(&layer);
-        let ahead = benches(&layer).iter().position(|r| *r >= 15.0).unwrap();
-        let name = layer.legend[usize::from(classes(&layer)[ahead * columns])];
+        let ahead = cell_at(&layer, 15.0005, 0.02).unwrap();
+        let name = layer.legend[usize::from(classes(&layer)[ahead])];
         assert_eq!(name, "obstacle", "{} straight ahead, 15 m", layer.name);
     }
 }
@@ -100,7 +103,7 @@ fn the_order_of_the_points_says_nothing() {
 
 #[test]
 fn a_world_turned_by_90_degrees_gives_the_map_a_quarter_further() {
-    let sweep = cast(Model::Hdl64eS2, court);
+    let sweep = off_borders(&cast(Model::Hdl64eS2, court));
     for mut maker in makers() {
         let (layer, quarter) = (make(maker.as_mut(), &sweep), make(maker.as_mut(), &turned(&sweep)));
         let (_, columns) = size(&layer);
@@ -108,12 +111,12 @@ fn a_world_turned_by_90_degrees_gives_the_map_a_quarter_further() {
         if columns % 4 != 0 {
             continue;
         }
-        // Segments are counted in the order they are found, which begins at column 0.
-        for channel in layer.channels.iter().filter(|c| c.name != "segment") {
+        // Segments are counted in the order they are found, which begins at column 0; slopes turn with the world.
+        let stays = |name: &str| !matches!(name, "segment" | "slope_x" | "slope_y");
+        for channel in layer.channels.iter().filter(|c| stays(c.name)) {
             let (before, after) = (values(&layer, channel.name), values(&quarter, channel.name));
+            let before = quarter_turned(&layer, &before);
             for (row, (before, after)) in before.chunks(columns).zip(after.chunks(columns)).enumerate() {
-                let mut before = before.to_vec();
-                before.rotate_right(columns / 4);
                 assert_eq!(before, after, "{} {} row {row}", layer.name, channel.name);
             }
         }

@@ -6,13 +6,14 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig, Seed};
+use clearway_mapping::config::{DrivabilityConfig, Form, HeightDifferenceConfig, Seed, TerrainConfig};
 use clearway_mapping::drivability::{Drivability, UNKNOWN};
 use clearway_mapping::event::Scan;
 use clearway_mapping::height_difference::HeightDifference;
 use clearway_mapping::map::LayerMaker;
 use clearway_mapping::radial::RadialGrid;
 use clearway_mapping::sweep::{Mount, Sweep};
+use clearway_mapping::terrain::{self, Terrain};
 use common::*;
 use nalgebra::Isometry3;
 use proptest::prelude::*;
@@ -91,6 +92,42 @@ proptest! {
         let (rows, columns) = size(&layer);
         prop_assert_eq!(classes(&layer).len(), rows * columns);
         prop_assert_eq!(values(&layer, "difference").len(), rows * columns);
+    }
+
+    #[test]
+    fn terrain_is_known_from_points_alone_whatever_they_are(
+        points in points(), form in prop::sample::select(vec![Form::Grounded, Form::Paper, Form::Grid]),
+        cell_m in 0.1f32..2.0, range_m_max in 5f32..100.0, points_min in 1u16..6, planes in any::<bool>(),
+        deviations in prop::collection::vec(any::<f32>(), 400), seed in any::<u64>(),
+    ) {
+        let mut sweep = empty(Model::Hdl64eS2);
+        points.iter().for_each(|point| add(&mut sweep, *point));
+        sweep.deviation_m = deviations[..points.len()].to_vec();
+        let config = TerrainConfig {
+            form, cell_m, range_m_max, points_min, planes, roughness_points_min: 1, ..TerrainConfig::default()
+        };
+        let mut map = Terrain::new(&config);
+        let mut layer = map.layer();
+        map.make(&sweep, &mut layer);
+
+        let (rows, columns) = size(&layer);
+        // Not by cell_at: whether a border falls to one side or the other is rounding.
+        let held = classes(&layer).iter().filter(|c| matches!(**c, terrain::FLAT | terrain::OBSTACLE)).count();
+        prop_assert!(held <= points.len());
+        for channel in &layer.channels {
+            let written = values(&layer, channel.name);
+            prop_assert_eq!(written.len(), rows * columns);
+            for (value, class) in written.iter().zip(classes(&layer)) {
+                let known = *class != terrain::UNKNOWN || channel.name == "shape";
+                prop_assert!(known || *value == channel.unknown, "{} {}", channel.name, value);
+            }
+        }
+
+        sweep.deviation_m.clear();
+        map.make(&sweep, &mut layer);
+        let mut again = map.layer();
+        map.make(&shuffled(&sweep, seed), &mut again);
+        prop_assert_eq!(layer, again);
     }
 
     #[test]

@@ -1,11 +1,14 @@
 //! Sweeps for the tests: rays of a real sensor cast into worlds of a few lines, and the recorded scans.
 #![allow(dead_code)]
 
+pub mod labels;
+
 use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::map::{Cells, Geometry, Layer};
+use clearway_mapping::radial::RadialGrid;
 use clearway_mapping::sweep::Sweep;
 
 /// Height of the sensor in all synthetic worlds, metres.
@@ -83,10 +86,54 @@ pub fn turned(sweep: &Sweep) -> Sweep {
     Sweep { x: sweep.y.iter().map(|y| -y).collect(), y: sweep.x.clone(), ..sweep.clone() }
 }
 
+/// The sweep without the points that lie exactly on a border of square cells of 0.25 m: such a point belongs to the cell
+/// behind the border, and turned to the one before.
+pub fn off_borders(sweep: &Sweep) -> Sweep {
+    let kept = |i: &usize| [sweep.x[*i], sweep.y[*i]].iter().all(|v| (v * 4.0).fract() != 0.0);
+    let order: Vec<usize> = (0..sweep.x.len()).filter(kept).collect();
+    let pick = |axis: &[f32]| order.iter().map(|i| axis[*i]).collect();
+    Sweep { x: pick(&sweep.x), y: pick(&sweep.y), z: pick(&sweep.z), ..sweep.clone() }
+}
+
 /// Rows and columns of a layer.
 pub fn size(layer: &Layer) -> (usize, usize) {
-    let Geometry::Radial { r_bench_m, columns } = &layer.geometry else { panic!("{} is no radial grid", layer.name) };
-    (r_bench_m.len(), usize::from(*columns))
+    match &layer.geometry {
+        Geometry::Radial { r_bench_m, columns } => (r_bench_m.len(), usize::from(*columns)),
+        Geometry::Cartesian { width, height, .. } => (*height as usize, *width as usize),
+    }
+}
+
+/// The cell of a layer that holds a position, if any does.
+pub fn cell_at(layer: &Layer, x: f32, y: f32) -> Option<usize> {
+    match &layer.geometry {
+        Geometry::Radial { r_bench_m, columns } => RadialGrid::new(r_bench_m.clone(), *columns).cell(x, y),
+        Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m } => {
+            let place = |v: f32, origin: f64| ((f64::from(v) - origin) / f64::from(*cell_m)).floor();
+            let (i, j) = (place(x, *origin_x_m), place(y, *origin_y_m));
+            let inside = i >= 0.0 && j >= 0.0 && i < f64::from(*width) && j < f64::from(*height);
+            inside.then(|| j as usize * *width as usize + i as usize)
+        }
+    }
+}
+
+/// A channel's values after the ego frame was turned by 90° counter-clockwise under them.
+pub fn quarter_turned(layer: &Layer, values: &[i32]) -> Vec<i32> {
+    let (rows, columns) = size(layer);
+    match &layer.geometry {
+        Geometry::Radial { .. } => values
+            .chunks(columns)
+            .flat_map(|row| {
+                let mut row = row.to_vec();
+                row.rotate_right(columns / 4);
+                row
+            })
+            .collect(),
+        // What was at (ix, iy) is at (width - 1 - iy, ix).
+        Geometry::Cartesian { .. } => {
+            assert_eq!(rows, columns, "only a square is itself after a quarter turn");
+            (0..rows * columns).map(|cell| values[(columns - 1 - cell % columns) * columns + cell / columns]).collect()
+        }
+    }
 }
 
 /// Outer radii of a layer's rows.

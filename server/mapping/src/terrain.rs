@@ -1,0 +1,216 @@
+//! Neuhaus' terrain map (Neuhaus 2009 §2): where the ground is flat, by hierarchical principal component analysis, and how
+//! rough it is there.
+//!
+//! In: a [`Sweep`], ego frame, metres. Out: the layer `terrain`, square cells about the vehicle. The steps:
+//!
+//! | step | paper | where |
+//! |---|---|---|
+//! | points to cells; sums over any region in O(1) | §2.2 | [`moments`] |
+//! | principal components, local height disturbance h | §2.1, eq. 1 | [`eigen`] |
+//! | hierarchical division into flat regions (or each cell for itself) | §2.2, §2.3 | [`regions`] |
+//! | regions that join the ground under the vehicle; bounded inference | beyond the paper | [`ground`] |
+//! | roughness of flat cells | §2.4, §2.5, eq. 3 and 4 | [`crate::series`], [`roughness`] |
+//!
+//! Three forms stand side by side ([`Form`]). `paper`: as published; car roofs are flat, and cells far beyond the last
+//! point are inferred. `grounded`: a flat region holds no point that stands out of its plane, joins the ground under the
+//! vehicle without a step, and speaks only for holes in seen ground. `grid`: each cell for itself, with the shape of its
+//! points.
+//!
+//! Nothing depends on the order of the points: all sums are over whole numbers.
+
+pub mod eigen;
+pub mod ground;
+pub mod moments;
+pub mod regions;
+pub mod roughness;
+
+use crate::config::{Form, TerrainConfig};
+use crate::map::{Cells as Raw, Channel, Geometry, Layer, LayerMaker};
+use crate::sweep::Sweep;
+
+use ground::Ground;
+use moments::{Cells, half_width};
+use regions::{FIRST_FLAT, NOTHING, OBSTACLE as NOT_FLAT, Plane, Regions};
+use roughness::Roughness;
+
+/// No point fell into the cell, or too few to judge it by, and no flat region speaks for it.
+pub const UNKNOWN: u8 = 0;
+/// Points fell into the cell, and it is part of flat ground.
+pub const FLAT: u8 = 1;
+/// No point fell into the cell; the flat region about it speaks for it.
+pub const FLAT_INFERRED: u8 = 2;
+/// Flat, but not joined to the ground under the vehicle: a car's roof, a wall's top, a far bank.
+pub const FLAT_ELEVATED: u8 = 3;
+/// Not flat even by itself.
+pub const OBSTACLE: u8 = 4;
+/// Names of the classes, by value.
+pub const LEGEND: &[&str] = &["unknown", "flat", "flat_inferred", "flat_elevated", "obstacle"];
+
+/// Raw `roughness` of a cell that is not flat, or has too few points with a distance series.
+pub const ROUGHNESS_UNKNOWN: u8 = u8::MAX;
+/// Raw `height` and slopes of a cell without a plane.
+pub const PLANE_UNKNOWN: i8 = i8::MIN;
+
+/// Raw `shape` of a cell that was not judged.
+pub const SHAPE_UNKNOWN: u8 = 0;
+/// Points without a direction.
+pub const SHAPE_SCATTER: u8 = 1;
+/// Points along a line.
+pub const SHAPE_LINE: u8 = 2;
+/// Points of a plane.
+pub const SHAPE_PLANE: u8 = 3;
+
+/// Metres of a raw unit of `height`, and rise over run of one of `slope_x` and `slope_y`.
+const PLANE_SCALES: [f32; 3] = [0.05, 0.02, 0.02];
+
+/// Makes the layer from sweep after sweep, reusing its buffers.
+pub struct Terrain {
+    config: TerrainConfig,
+    cells: Cells,
+    regions: Regions,
+    ground: Ground,
+    roughness: Roughness,
+    seen: Vec<bool>,
+}
+
+impl Terrain {
+    /// Parameters must have passed [`crate::config::MapsConfig::validate`].
+    pub fn new(config: &TerrainConfig) -> Self {
+        Self {
+            config: config.clone(),
+            cells: Cells::new(config.range_m_max, config.cell_m),
+            regions: Regions::default(),
+            ground: Ground::default(),
+            roughness: Roughness::default(),
+            seen: Vec::new(),
+        }
+    }
+
+    fn classify(&self, class: &mut Vec<u8>) {
+        class.clear();
+        let region_of = self.regions.of_cell();
+        if self.config.form == Form::Grounded {
+            let (joined, filled) = (self.ground.joined(), self.ground.filled());
+            class.extend(region_of.iter().zip(&self.seen).zip(filled).map(|((&region, &seen), &filled)| {
+                match (region, seen) {
+                    (NOT_FLAT, _) => OBSTACLE,
+                    (FIRST_FLAT.., true) if joined[(region - FIRST_FLAT) as usize] => FLAT,
+                    (FIRST_FLAT.., true) => FLAT_ELEVATED,
+                    (FIRST_FLAT.., false) if filled => FLAT_INFERRED,
+                    (NOTHING, true) if filled => FLAT,
+                    _ => UNKNOWN,
+                }
+            }));
+        } else {
+            class.extend(region_of.iter().zip(&self.seen).map(|(&region, &seen)| match (region, seen) {
+                (NOT_FLAT, _) => OBSTACLE,
+                (FIRST_FLAT.., true) => FLAT,
+                (FIRST_FLAT.., false) => FLAT_INFERRED,
+                _ => UNKNOWN,
+            }));
+        }
+    }
+
+    /// Roughness of the flat cells (drivable regions are examined further, §2.4).
+    fn write_roughness(&mut self, sweep: &Sweep, class: &[u8], raw: &mut Vec<u8>) {
+        raw.clear();
+        raw.resize(class.len(), ROUGHNESS_UNKNOWN);
+        if sweep.deviation_m.is_empty() {
+            return;
+        }
+        self.roughness.take(sweep, &self.cells);
+        for (slot, &cell) in self.regions.cell_of_slot().iter().enumerate() {
+            let cell = cell as usize;
+            if class[cell] == FLAT {
+                let [x, y] = self.centre_m(cell);
+                let distance_m = (x * x + y * y + sweep.mount_height_m * sweep.mount_height_m).sqrt();
+                raw[cell] = self.roughness.raw(slot, distance_m, &self.config);
+            }
+        }
+    }
+
+    fn write_planes(&self, class: &[u8], channels: &mut [Channel]) {
+        for (axis, channel) in channels.iter_mut().enumerate() {
+            let Raw::I8(raw) = &mut channel.cells else { unreachable!("layer() gives i8") };
+            raw.clear();
+            raw.extend(class.iter().zip(self.regions.of_cell()).enumerate().map(|(cell, (&class, &region))| {
+                if region < FIRST_FLAT || class == UNKNOWN {
+                    return PLANE_UNKNOWN;
+                }
+                let plane @ Plane([a, b, _]) = &self.regions.planes()[(region - FIRST_FLAT) as usize];
+                let [x, y] = self.centre_m(cell);
+                let value = [plane.height_m(x, y), *a, *b][axis] / PLANE_SCALES[axis];
+                value.round().clamp(f32::from(i8::MIN + 1), f32::from(i8::MAX)) as i8
+            }));
+        }
+    }
+
+    /// Middle of a cell of the grid, metres.
+    fn centre_m(&self, cell: usize) -> [f32; 2] {
+        let (width, margin) = (self.cells.width(), self.cells.margin());
+        [cell % width, cell / width].map(|place| self.cells.centre_m(place + margin))
+    }
+}
+
+impl LayerMaker for Terrain {
+    fn layer(&self) -> Layer {
+        let channel = |name, unit, scale, unknown, cells| Channel { name, unit, scale, unknown, cells };
+        let mut channels = vec![channel("class", "", 1.0, i32::from(UNKNOWN), Raw::U8(Vec::new()))];
+        if self.config.form == Form::Grid {
+            channels.push(channel("shape", "", 1.0, i32::from(SHAPE_UNKNOWN), Raw::U8(Vec::new())));
+        }
+        channels.push(channel("roughness", "", roughness::SCALE, i32::from(ROUGHNESS_UNKNOWN), Raw::U8(Vec::new())));
+        if self.config.planes {
+            for (name, unit, scale) in
+                [("height", "m", PLANE_SCALES[0]), ("slope_x", "", PLANE_SCALES[1]), ("slope_y", "", PLANE_SCALES[2])]
+            {
+                channels.push(channel(name, unit, scale, i32::from(PLANE_UNKNOWN), Raw::I8(Vec::new())));
+            }
+        }
+        let cell_m = self.config.cell_m;
+        let half = half_width(self.config.range_m_max, cell_m);
+        let origin = -f64::from(half) * f64::from(cell_m);
+        let side = 2 * half as u32;
+        Layer {
+            name: "terrain",
+            geometry: Geometry::Cartesian { origin_x_m: origin, origin_y_m: origin, width: side, height: side, cell_m },
+            legend: LEGEND,
+            channels,
+            planes: Vec::new(),
+            figures: Vec::new(),
+        }
+    }
+
+    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
+        self.cells.take(sweep, self.config.overhang_m);
+        self.regions.find(&self.cells, &self.config);
+        self.seen.clear();
+        self.seen.resize(self.regions.of_cell().len(), false);
+        self.regions.cell_of_slot().iter().for_each(|cell| self.seen[*cell as usize] = true);
+        if self.config.form == Form::Grounded {
+            self.ground.find(&self.cells, &self.regions, &self.seen, &self.config);
+        }
+
+        let mut channels = layer.channels.iter_mut();
+        let mut next = || match &mut channels.next().expect("a channel of layer()").cells {
+            Raw::U8(cells) => cells,
+            other => unreachable!("layer() gives u8, not {other:?}"),
+        };
+        let class = next();
+        self.classify(class);
+        if self.config.form == Form::Grid {
+            next().clone_from(self.regions.shape_of_cell());
+        }
+        self.write_roughness(sweep, class, next());
+        self.write_planes(class, channels.into_slice());
+
+        let count = |of: u8| class.iter().filter(|class| **class == of).count() as f64;
+        let [flat, inferred, elevated, obstacle] = [FLAT, FLAT_INFERRED, FLAT_ELEVATED, OBSTACLE].map(count);
+        let judged = flat + elevated + obstacle;
+        layer.planes.clear();
+        layer.figures.clear();
+        layer.figures.push(("drivable_share", if judged == 0.0 { 0.0 } else { flat / judged }));
+        layer.figures.push(("inferred_share", if flat == 0.0 { 0.0 } else { inferred / flat }));
+        layer.figures.push(("flat_regions", self.regions.planes().len() as f64));
+    }
+}
