@@ -107,11 +107,10 @@ mod tests {
         // 64 lasers; the upper bank fires in every third firing only, as an HDL-64E S1 does.
         let (lasers, firings) = (64, 30);
         let range = |firing: usize, laser: usize| 5.0 + laser as f32 + 0.01 * ((firing * 7 + laser * 3) % 11) as f32;
-        let mut ranges = vec![0.0; lasers * firings];
-        for slot in 0..ranges.len() {
-            let (firing, laser) = (slot / lasers, slot % lasers);
-            ranges[slot] = if laser >= 32 && firing % 3 != 0 { f32::NAN } else { range(firing, laser) };
-        }
+        let ranges: Vec<f32> = (0..lasers * firings)
+            .map(|slot| (slot / lasers, slot % lasers))
+            .map(|(firing, laser)| if laser >= 32 && firing % 3 != 0 { f32::NAN } else { range(firing, laser) })
+            .collect();
         let found = deviations(&ranges, lasers);
         for laser in [0, 31, 32, 63] {
             let own: Vec<f32> = ranges.iter().skip(laser).step_by(lasers).copied().filter(|r| !r.is_nan()).collect();
