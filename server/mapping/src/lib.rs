@@ -2,7 +2,7 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | [`event`] | what enters: datagrams, scans, ego poses, losses |
+//! | [`event`] | what enters: datagrams, scans, ego poses, roads, losses |
 //! | [`config`] | one vehicle's sensors and maps |
 //! | [`pipeline`] | `step(&Event)` conducts the hops below |
 //! | [`mount`] | first revolutions -> height, pitch and roll of a sensor nobody measured |
@@ -11,6 +11,9 @@
 //! | [`radial`] | the thesis' r-θ grid: position -> cell |
 //! | [`drivability`] | thesis §IV |
 //! | [`height_difference`] | the thesis' baseline |
+//! | [`road`] | RDDF and RNDF files, checked roads |
+//! | [`speed`] | Lindström 2005 |
+//! | [`safe_path`] | thesis §VI |
 
 pub mod config;
 pub mod drivability;
@@ -20,4 +23,7 @@ pub mod map;
 pub mod mount;
 pub mod pipeline;
 pub mod radial;
+pub mod road;
+pub mod safe_path;
+pub mod speed;
 pub mod sweep;

@@ -15,9 +15,12 @@ use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
 use crate::config::{ConfigError, MapsConfig, SensorConfig, VehicleConfig};
 use crate::drivability::Drivability;
-use crate::event::{Body, EgoPose, Event, Scan};
+use crate::event::{Body, EgoPose, Event, Road, Scan};
 use crate::height_difference::HeightDifference;
-use crate::map::{LayerMaker, Map, SensorState};
+use crate::map::{Context, LayerMaker, Map, SensorState};
+use crate::road::{self, RoadError, Roads};
+use crate::safe_path::SafePath;
+use crate::speed::Speed;
 use crate::sweep::{Mount, Sweep};
 
 /// One vehicle's way from events to maps.
@@ -27,6 +30,7 @@ pub struct Pipeline {
     /// Table of the grid's rows where turns come as scans; `None` while neither file nor model is configured.
     scan_calibration: Option<Arc<Calibration>>,
     pose: Option<EgoPose>,
+    roads: Roads,
     scan_stamp_ns: Option<i64>,
     /// Scans taken, and their points.
     scans: (u64, u64),
@@ -52,6 +56,10 @@ pub struct Ledger {
     pub poses: u64,
     /// Ego poses not taken.
     pub poses_refused: u64,
+    /// Roads taken.
+    pub roads: u64,
+    /// Roads not taken, by [`Rejected::reason`].
+    pub roads_refused: BTreeMap<&'static str, u64>,
     /// Points of scans that were no positions (not finite, or beyond any sensor's reach) and were left out.
     pub points_dropped: u64,
 }
@@ -97,7 +105,7 @@ pub enum Rejected {
         /// The sensor's name.
         sensor: String,
     },
-    /// A scan or ego pose not newer than the one before.
+    /// A scan, ego pose or road not newer than the one before.
     #[error("stamp {stamp_ns} ns: later than {newest_ns} ns is allowed")]
     Stamp {
         /// The event's.
@@ -105,6 +113,9 @@ pub enum Rejected {
         /// The newest taken.
         newest_ns: i64,
     },
+    /// A road that is no road.
+    #[error(transparent)]
+    Road(#[from] RoadError),
     /// An ego pose that is no pose.
     #[error("ego pose of {stamp_ns} ns: position, unit quaternion and speed must be finite")]
     Pose {
@@ -114,7 +125,8 @@ pub enum Rejected {
 }
 
 impl Rejected {
-    /// The ledger's key: the decoder's own (`length`, `block_flag`, …), or `source`, `scan_lengths`, `model`, `stamp`, `pose`.
+    /// The ledger's key: the decoder's own (`length`, `block_flag`, …), or `source`, `scan_lengths`, `model`, `stamp`,
+    /// `pose`, or a road's own ([`RoadError::reason`]).
     pub fn reason(&self) -> &'static str {
         match self {
             Self::Datagram(refusal) => refusal.reason(),
@@ -123,6 +135,7 @@ impl Rejected {
             Self::ScanModel { .. } => "model",
             Self::Stamp { .. } => "stamp",
             Self::Pose { .. } => "pose",
+            Self::Road(refused) => refused.reason(),
         }
     }
 }
@@ -150,6 +163,7 @@ impl Pipeline {
             }),
             scan_calibration,
             pose: None,
+            roads: Roads::default(),
             scan_stamp_ns: None,
             scans: (0, 0),
             ledger: Ledger::default(),
@@ -167,10 +181,11 @@ impl Pipeline {
         match &event.body {
             Body::Datagram(_) | Body::Scan(_) => self.ledger.received += 1,
             Body::Lost(events) => self.ledger.lost += events,
-            Body::EgoPose(_) | Body::End => {}
+            Body::EgoPose(_) | Body::Road(_) | Body::End => {}
         }
         let outcome = match &event.body {
             Body::EgoPose(pose) => self.step_ego_pose(pose).map(|()| false),
+            Body::Road(road) => self.step_road(road).map(|()| false),
             Body::Lost(_) => Ok(false),
             _ if usize::from(event.source) >= self.config.sensors.len() => {
                 Err(Rejected::Source { source_index: event.source, sensors: self.config.sensors.len() })
@@ -187,6 +202,7 @@ impl Pipeline {
                         *self.ledger.refused.entry(rejected.reason()).or_default() += 1
                     }
                     Body::EgoPose(_) => self.ledger.poses_refused += 1,
+                    Body::Road(_) => *self.ledger.roads_refused.entry(rejected.reason()).or_default() += 1,
                     Body::Lost(_) | Body::End => {}
                 }
                 Err(rejected)
@@ -219,7 +235,8 @@ impl Pipeline {
             None => false,
             Some(revolution) => {
                 let refused = self.ledger.refused.values().sum();
-                self.maker.revolution(revolution, &self.config, self.pose.as_ref(), refused, arrival_ns);
+                let known = (self.pose.as_ref(), &self.roads);
+                self.maker.revolution(revolution, &self.config, known, refused, arrival_ns);
                 true
             }
         };
@@ -243,7 +260,8 @@ impl Pipeline {
         };
         self.scan_stamp_ns = Some(scan.stamp_ns);
         let refused = self.ledger.refused.values().sum();
-        let dropped = self.maker.scan(scan, calibration, &self.config, self.pose.as_ref(), refused, arrival_ns);
+        let known = (self.pose.as_ref(), &self.roads);
+        let dropped = self.maker.scan(scan, calibration, &self.config, known, refused, arrival_ns);
         self.ledger.points_dropped += dropped;
         self.scans = (self.scans.0 + 1, self.scans.1 + u64::from(self.maker.sweep.returns));
         self.ledger.decoded += 1;
@@ -265,12 +283,21 @@ impl Pipeline {
         Ok(())
     }
 
+    fn step_road(&mut self, road: &Road) -> Result<(), Rejected> {
+        road::check(road)?;
+        check_newer(road.stamp_ns, self.roads.newest_stamp_ns(road.purpose))?;
+        self.roads.take(road, self.pose.as_ref().map(|pose| pose.map_from_ego));
+        self.ledger.roads += 1;
+        Ok(())
+    }
+
     fn step_end(&mut self, arrival_ns: i64) -> bool {
         let refused = self.ledger.refused.values().sum();
         match self.sensor.finish() {
             None => false,
             Some(revolution) => {
-                self.maker.revolution(revolution, &self.config, self.pose.as_ref(), refused, arrival_ns);
+                let known = (self.pose.as_ref(), &self.roads);
+                self.maker.revolution(revolution, &self.config, known, refused, arrival_ns);
                 self.newest_is_revolution = true;
                 true
             }
@@ -284,6 +311,9 @@ fn check_newer(stamp_ns: i64, newest_ns: Option<i64>) -> Result<(), Rejected> {
         _ => Ok(()),
     }
 }
+
+/// What other events told: the newest ego pose, the newest roads.
+type Known<'a> = (Option<&'a EgoPose>, &'a Roads);
 
 /// The hops behind the sensor, with the buffers they reuse from map to map.
 struct Maker {
@@ -321,7 +351,7 @@ impl Maker {
         &mut self,
         revolution: &Revolution,
         config: &VehicleConfig,
-        pose: Option<&EgoPose>,
+        known: Known<'_>,
         refused: u64,
         arrival_ns: i64,
     ) {
@@ -336,7 +366,7 @@ impl Maker {
             completeness: completeness(revolution),
             partial: revolution.partial.map_or("", partial_name),
         };
-        self.map(state, (revolution.start_ns, revolution.end_ns), pose, arrival_ns);
+        self.map(state, (revolution.start_ns, revolution.end_ns), known, arrival_ns);
     }
 
     /// Gives the number of points left out because they are no positions.
@@ -345,7 +375,7 @@ impl Maker {
         scan: &Scan,
         calibration: &Arc<Calibration>,
         config: &VehicleConfig,
-        pose: Option<&EgoPose>,
+        known: Known<'_>,
         refused: u64,
         arrival_ns: i64,
     ) -> u64 {
@@ -360,12 +390,12 @@ impl Maker {
             completeness: 1.0,
             partial: "",
         };
-        self.map(state, (scan.stamp_ns, scan.stamp_ns), pose, arrival_ns);
+        self.map(state, (scan.stamp_ns, scan.stamp_ns), known, arrival_ns);
         dropped
     }
 
     /// The newest sweep's map, in place of the one before.
-    fn map(&mut self, sensor: SensorState, capture_ns: (i64, i64), pose: Option<&EgoPose>, arrival_ns: i64) {
+    fn map(&mut self, sensor: SensorState, capture_ns: (i64, i64), (pose, roads): Known<'_>, arrival_ns: i64) {
         let map = &mut self.map;
         map.sequence = self.maps_made;
         self.maps_made += 1;
@@ -375,8 +405,12 @@ impl Maker {
         map.speed_mps = pose.map(|p| p.speed_mps);
         map.sensors.clear();
         map.sensors.push(sensor);
-        for (maker, layer) in self.layer_makers.iter_mut().zip(&mut map.layers) {
-            maker.make(&self.sweep, layer);
+        let (road, route) = (roads.to_paint(), roads.route());
+        for (index, maker) in self.layer_makers.iter_mut().enumerate() {
+            let (earlier, rest) = map.layers.split_at_mut(index);
+            let context =
+                Context { earlier, stamp_ns: capture_ns.1, map_from_ego: map.map_from_ego, road, route };
+            maker.make_with(&self.sweep, &context, &mut rest[0]);
         }
     }
 }
@@ -389,6 +423,13 @@ fn layer_makers(maps: &MapsConfig) -> Vec<Box<dyn LayerMaker>> {
     }
     if maps.height_difference.enabled {
         makers.push(Box::new(HeightDifference::new(&maps.height_difference)));
+    }
+    if maps.speed.enabled {
+        makers.push(Box::new(Speed::new(&maps.speed)));
+    }
+    // Behind the layers whose obstacles it keeps away from.
+    if maps.safe_path.enabled {
+        makers.push(Box::new(SafePath::new(&maps.safe_path)));
     }
     makers
 }
