@@ -50,8 +50,8 @@ impl Links {
         let mut nearest: Vec<(i32, usize)> = found.iter().enumerate().map(|(i, p)| (away_squared(p), i)).collect();
         nearest.retain(|(away, _)| f64::from(*away) <= 4.0 * join_cells * join_cells);
         nearest.sort_unstable();
-        // A vehicle that stands beside a wall may leave it, and need not touch it.
-        let room = width_cells.min(f64::from(own_clearance).sqrt()) - 2.0;
+        // A vehicle that stands nearer to a wall than a path would be may leave it, and need not come nearer.
+        let room = width_cells.min(f64::from(own_clearance).sqrt());
 
         let own = Point { cell: 0, place: own_place, clearance_squared: own_clearance, links: Vec::new() };
         self.points.push(own);

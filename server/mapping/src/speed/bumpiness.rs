@@ -19,6 +19,8 @@ pub const OBSTACLE_BUMPINESS: f32 = f32::INFINITY;
 
 /// Points lower than this are no ground a vehicle at 0 gets to; ±20 m keep millimetres in 16 bits.
 const LOWEST_M: f32 = -20.0;
+/// Makes every height positive, and half a millimetre to round with.
+const OFFSET_MM: f32 = 20_000.5;
 /// Cells a side of a block.
 const BLOCK: usize = 4;
 
@@ -88,7 +90,8 @@ impl HeightMap {
                 continue;
             }
             let index = iy as usize * self.side + ix as usize;
-            let millimetres = (z * 1000.0).round_ties_even() as i16;
+            // Positive first, so that cutting off rounds.
+            let millimetres = ((z * 1000.0 + OFFSET_MM) as i32 - OFFSET_MM as i32) as i16;
             let cell = &mut self.cells[index];
             if cell.points == 0 {
                 self.met.push(index as u32);

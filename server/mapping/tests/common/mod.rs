@@ -6,6 +6,7 @@ use std::sync::Arc;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::map::{Cells, Geometry, Layer};
+use clearway_mapping::radial::RadialGrid;
 use clearway_mapping::sweep::Sweep;
 
 /// Height of the sensor in all synthetic worlds, metres.
@@ -85,8 +86,10 @@ pub fn turned(sweep: &Sweep) -> Sweep {
 
 /// Rows and columns of a layer.
 pub fn size(layer: &Layer) -> (usize, usize) {
-    let Geometry::Radial { r_bench_m, columns } = &layer.geometry else { panic!("{} is no radial grid", layer.name) };
-    (r_bench_m.len(), usize::from(*columns))
+    match &layer.geometry {
+        Geometry::Radial { r_bench_m, columns } => (r_bench_m.len(), usize::from(*columns)),
+        Geometry::Cartesian { width, height, .. } => (*height as usize, *width as usize),
+    }
 }
 
 /// Outer radii of a layer's rows.
@@ -109,6 +112,17 @@ pub fn values(layer: &Layer, name: &str) -> Vec<i32> {
         Cells::U8(cells) => cells.iter().map(|c| i32::from(*c)).collect(),
         Cells::I8(cells) => cells.iter().map(|c| i32::from(*c)).collect(),
         Cells::U16(cells) => cells.iter().map(|c| i32::from(*c)).collect(),
+    }
+}
+
+/// The cell that holds a position.
+pub fn cell_at(layer: &Layer, x: f32, y: f32) -> usize {
+    match &layer.geometry {
+        Geometry::Radial { r_bench_m, columns } => RadialGrid::new(r_bench_m.clone(), *columns).cell(x, y).unwrap(),
+        Geometry::Cartesian { origin_x_m, origin_y_m, width, cell_m, .. } => {
+            let steps = |m: f32, origin: &f64| ((f64::from(m) - origin) / f64::from(*cell_m)) as usize;
+            steps(y, origin_y_m) * *width as usize + steps(x, origin_x_m)
+        }
     }
 }
 
