@@ -332,7 +332,9 @@ fn decode_points(layer: &str, points: Vec<v1::SafePoint>) -> Result<Vec<SafePoin
         let wrong = |what| MapError::SafePoint { layer: layer.to_owned(), point: index, what };
         let v1::SafePoint { x, y, radius, links } = point;
         if !(x.is_finite() && y.is_finite() && radius.is_finite() && radius >= 0.0) {
-            return Err(wrong(format!("({x}, {y}) m, radius {radius} m; finite metres and a radius of 0 or more are needed")));
+            return Err(wrong(format!(
+                "({x}, {y}) m, radius {radius} m; finite metres and a radius of 0 or more are needed"
+            )));
         }
         // Ascending and before the point: no link is named twice, and a path cannot be followed in a circle.
         let bound = index as u64;

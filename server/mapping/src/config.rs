@@ -309,6 +309,8 @@ pub struct SafePathConfig {
     pub vehicle_width_m: f32,
     /// The sensor does not see the ground this near to the vehicle: what is unknown there is no obstacle.
     pub blind_zone_m: f32,
+    /// Unseen ground no wider than this between drivable cells of one ring or azimuth is no obstacle.
+    pub hole_m_max: f32,
     /// Farthest safe point the vehicle joins its path at.
     pub join_m_max: f32,
 }
@@ -321,6 +323,7 @@ impl Default for SafePathConfig {
             cell_m: 0.25,
             vehicle_width_m: 2.0,
             blind_zone_m: 7.0,
+            hole_m_max: 1.0,
             join_m_max: 15.0,
         }
     }
@@ -475,6 +478,7 @@ impl SafePathConfig {
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
             ("vehicle_width_m", self.vehicle_width_m, (0.1..=10.0, "0.1 to 10")),
             ("blind_zone_m", self.blind_zone_m, (0.0..=60.0, "0 to 60")),
+            ("hole_m_max", self.hole_m_max, (0.0..=5.0, "0 to 5")),
             ("join_m_max", self.join_m_max, (0.0..=100.0, "0 to 100")),
         ];
         for (key, value, (allowed, said)) in values {

@@ -408,8 +408,7 @@ impl Maker {
         let (road, route) = (roads.to_paint(), roads.route());
         for (index, maker) in self.layer_makers.iter_mut().enumerate() {
             let (earlier, rest) = map.layers.split_at_mut(index);
-            let context =
-                Context { earlier, stamp_ns: capture_ns.1, map_from_ego: map.map_from_ego, road, route };
+            let context = Context { earlier, stamp_ns: capture_ns.1, map_from_ego: map.map_from_ego, road, route };
             maker.make_with(&self.sweep, &context, &mut rest[0]);
         }
     }

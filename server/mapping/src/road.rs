@@ -66,7 +66,9 @@ pub enum RoadError {
         width_m: f64,
     },
     /// A histogram without votes, or with votes that cannot be.
-    #[error("{bins} orientation bins with {votes} votes together: 2 to 3600 bins, none negative, and a vote are allowed")]
+    #[error(
+        "{bins} orientation bins with {votes} votes together: 2 to 3600 bins, none negative, and a vote are allowed"
+    )]
     Orientations {
         /// How many.
         bins: usize,

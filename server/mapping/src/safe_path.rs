@@ -11,7 +11,7 @@
 //! | ridge: neighbouring cells whose nearest obstacles are two; its exact radii; thinned to one-cell lines | [`ridge`] |
 //! | links between neighbours on the lines, from the vehicle on | [`links`] |
 //!
-//! Unknown ground is no way through: it counts like an obstacle. The thesis keeps no more than the picture; here each
+//! Unknown ground is no way through: it counts like an obstacle, but for the blind zone and narrow holes ([`free`]). The thesis keeps no more than the picture; here each
 //! point knows its radius (the thesis' safety radius), and is kept where the vehicle fits: twice the radius is at least
 //! its width. What lies beyond the grid is not known to this map.
 
@@ -67,7 +67,7 @@ impl SafePath {
         let Cells::U8(class) = &mut class.cells else { unreachable!("layer() gives u8") };
         class.clear();
         class.extend(self.free.states().iter().map(|state| match state {
-            State::Unknown | State::Blind => UNKNOWN,
+            State::Unknown | State::Blind | State::Hole => UNKNOWN,
             State::Drivable => FREE,
             State::Obstacle => OBSTACLE,
         }));
@@ -120,7 +120,7 @@ impl LayerMaker for SafePath {
 
     fn make_with(&mut self, _sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         let drivability = context.earlier.iter().find(|layer| layer.name == "drivability");
-        self.free.fill(drivability, self.config.blind_zone_m);
+        self.free.fill(drivability, &self.config);
         self.distances.measure(self.free.states());
         let width_cells = f64::from(self.config.vehicle_width_m) / f64::from(self.config.cell_m);
         self.ridge.find(self.free.states(), &self.distances, width_cells);

@@ -224,7 +224,11 @@ fn a_vehicle_on_a_real_lane_has_that_lane_painted_as_wide_as_the_file_says() {
             let painted_m = across.len() as f64 * 0.25;
             let width_m = lane.width_m.unwrap();
             // Where the lane bends at the next waypoint, its edge points lie nearer to the pair's own line; a cell each way.
-            assert!((0.85 * width_m - 0.25..=width_m + 0.25).contains(&painted_m), "lane {}: {painted_m} m of {width_m} m", lane.name);
+            assert!(
+                (0.85 * width_m - 0.25..=width_m + 0.25).contains(&painted_m),
+                "lane {}: {painted_m} m of {width_m} m",
+                lane.name
+            );
             let middle = (across[0] + across[across.len() - 1] + 1) as f64 / 2.0;
             assert!((middle - rows as f64 / 2.0).abs() <= 1.0, "lane {}: middle at row {middle}", lane.name);
             let speeds = common::values(&layer, "speed");

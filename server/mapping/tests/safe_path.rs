@@ -57,7 +57,9 @@ fn a_gate_exactly_as_wide_as_the_vehicle_is_a_way_through_and_a_narrower_one_is_
     let side = 80;
     for width in [5, 6, 7, 8, 9, 12] {
         for gate_from in [20, 33, 34, 47] {
-            for (gate, across_x) in [(width - 1, true), (width - 1, false), (width, true), (width, false), (width + 1, true)] {
+            for (gate, across_x) in
+                [(width - 1, true), (width - 1, false), (width, true), (width, false), (width + 1, true)]
+            {
                 let states = court_with_gate(side, gate_from, gate, across_x);
                 let (_, links) = paths(side, &states, width as f64);
                 let beyond = |point: &&Point| point.place[usize::from(!across_x)] > 2 * (side as i32 / 2 + 13);
@@ -98,18 +100,21 @@ fn open_ground_has_no_safe_points_and_closed_ground_neither() {
 /// Rectangles of obstacles and of unknown cells on drivable ground, with a few blind cells.
 fn worlds() -> impl Strategy<Value = (usize, Vec<State>)> {
     let rectangle = (0usize..48, 0usize..48, 1usize..14, 1usize..5, 0u8..4);
-    (prop::collection::vec(rectangle, 0..14), prop::sample::select(vec![24usize, 40, 48])).prop_map(|(rectangles, side)| {
-        let mut states = vec![State::Drivable; side * side];
-        for (x, y, long, wide, kind) in rectangles {
-            let (dx, dy) = if kind % 2 == 0 { (long, wide) } else { (wide, long) };
-            for iy in y..(y + dy).min(side) {
-                for ix in x..(x + dx).min(side) {
-                    states[iy * side + ix] = [State::Obstacle, State::Unknown, State::Obstacle, State::Blind][usize::from(kind)];
+    (prop::collection::vec(rectangle, 0..14), prop::sample::select(vec![24usize, 40, 48])).prop_map(
+        |(rectangles, side)| {
+            let mut states = vec![State::Drivable; side * side];
+            for (x, y, long, wide, kind) in rectangles {
+                let (dx, dy) = if kind % 2 == 0 { (long, wide) } else { (wide, long) };
+                for iy in y..(y + dy).min(side) {
+                    for ix in x..(x + dx).min(side) {
+                        states[iy * side + ix] =
+                            [State::Obstacle, State::Unknown, State::Obstacle, State::Blind][usize::from(kind)];
+                    }
                 }
             }
-        }
-        (side, states)
-    })
+            (side, states)
+        },
+    )
 }
 
 proptest! {
@@ -232,16 +237,13 @@ fn real_streets_have_paths_both_ways() {
         use clearway_mapping::sweep::Mount;
 
         let scan = kitti(&format!("kitti/patchwork-plusplus/00000{frame}.bin"));
-        let mount = Mount { ego_from_sensor: nalgebra::Isometry3::translation(0.0, 0.0, 1.73), range_m_min: 2.0 };
+        // The vehicle's own bonnet returns from (2.5, ±0.5, 0.8) m in these scans.
+        let mount = Mount { ego_from_sensor: nalgebra::Isometry3::translation(0.0, 0.0, 1.73), range_m_min: 3.0 };
         let mut sweep = Sweep::default();
         sweep.take_scan(&scan, &std::sync::Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount);
         let (_, layer) = make(&sweep, &SafePathConfig::default());
         let reach = |most: fn(f64, f64) -> f64| layer.points.iter().map(|point| point.x_m).fold(0.0, most);
         println!("{frame}: {:?} x {} to {} m", layer.figures, reach(f64::min), reach(f64::max));
-        let (_, columns) = size(&layer);
-        for row in classes(&layer).chunks(columns).rev().step_by(3) {
-            println!("{}", row.iter().step_by(2).map(|c| [' ', '.', '#', 'o'][usize::from(*c)]).collect::<String>());
-        }
-        assert!(reach(f64::max) > 15.0 && reach(f64::min) < -15.0, "frame {frame}");
+        assert!(reach(f64::max) > 25.0 && reach(f64::min) < -25.0, "frame {frame}");
     }
 }

@@ -74,8 +74,9 @@ fn read_row(line: usize, row: &str, before: Option<&Row>) -> Result<Row, LineRef
     let at = |what| (line, what);
     let number_field = fields.next().unwrap_or("").trim();
     let refused = |what, found: &str, allowed| LineRefused { line, what, found: found.to_owned(), allowed };
-    let count =
-        number_field.parse::<u32>().map_err(|_| refused("number", number_field, "a whole number from 0 to 4294967295"))?;
+    let count = number_field
+        .parse::<u32>()
+        .map_err(|_| refused("number", number_field, "a whole number from 0 to 4294967295"))?;
     let row = Row {
         number: count,
         latitude_deg: latitude(line, fields.next())?,

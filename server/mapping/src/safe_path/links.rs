@@ -26,14 +26,7 @@ impl Links {
     }
 
     /// Links anew. The vehicle joins every line it can drive straight to within `join_cells`, at its nearest point.
-    pub fn link(
-        &mut self,
-        ridge: &Ridge,
-        states: &[State],
-        distances: &Distances,
-        width_cells: f64,
-        join_cells: f64,
-    ) {
+    pub fn link(&mut self, ridge: &Ridge, states: &[State], distances: &Distances, width_cells: f64, join_cells: f64) {
         self.points.clear();
         let found = ridge.points();
         self.not_reached = found.len();

@@ -143,7 +143,9 @@ impl Ridge {
                 continue;
             }
             let middle = [2 * (cell % side) as i32, 2 * (cell / side) as i32];
-            let Some(mut best) = distances.clearance_squared(middle).map(|clearance| (clearance, middle)) else { return };
+            let Some(mut best) = distances.clearance_squared(middle).map(|clearance| (clearance, middle)) else {
+                return;
+            };
             for (bit, [dx, dy]) in ACROSS {
                 let neighbour = cell as i32 + dx + dy * side as i32;
                 if self.across[cell] & bit == 0 || states[neighbour as usize] != State::Drivable {

@@ -127,15 +127,15 @@ impl HeightMap {
             let around = lowest_around(ix / BLOCK, iy / BLOCK, blocks_a_side, |i| self.blocks[i]);
             let highest = i32::from(cell.highest);
             let obstacle = highest - i32::from(near) > over_cells || highest - i32::from(around) > over_blocks;
-            self.bumpiness_m[index] =
-                if obstacle { OBSTACLE_BUMPINESS } else { self.bumpiness(ix, iy) };
+            self.bumpiness_m[index] = if obstacle { OBSTACLE_BUMPINESS } else { self.bumpiness(ix, iy) };
         }
     }
 
     fn bumpiness(&self, ix: usize, iy: usize) -> f32 {
         let index = iy * self.side + ix;
         let here = self.means_m[index];
-        let mean = |inside: bool, at: isize| if inside { self.means_m[index.wrapping_add_signed(at)] } else { f32::NAN };
+        let mean =
+            |inside: bool, at: isize| if inside { self.means_m[index.wrapping_add_signed(at)] } else { f32::NAN };
         let row = self.side as isize;
         let (back, ahead) = (mean(ix > 0, -1), mean(ix + 1 < self.side, 1));
         let (right, left) = (mean(iy > 0, -row), mean(iy + 1 < self.side, row));
