@@ -312,6 +312,36 @@ proptest! {
     }
 
     #[test]
+    fn a_cell_is_known_where_a_point_fell_and_nowhere_else(
+        points in prop::collection::vec((
+            prop_oneof![8 => -50f32..50.0, 1 => any::<f32>()],
+            prop_oneof![8 => -50f32..50.0, 1 => any::<f32>()],
+            prop_oneof![6 => -0.5f32..0.5, 2 => -40f32..5.0, 1 => any::<f32>()],
+        ), 0..300),
+        seed in any::<u64>(),
+    ) {
+        let mut sweep = empty(Model::Vlp16);
+        points.iter().for_each(|(x, y, z)| add(&mut sweep, [*x, *y, *z]));
+        let config = SpeedConfig::default();
+        let layer = make(&config, &sweep, &Context::default());
+        let mut held = vec![false; 160 * 160];
+        for (x, y, z) in points {
+            let inside = [x, y].iter().all(|v| (-40.0..40.0).contains(v)) && z > -20.0 && z <= config.overhang_m;
+            if inside {
+                held[cell_at(&layer, x, y)] = true;
+            }
+        }
+        let speeds = values(&layer, "speed");
+        for (cell, held) in held.iter().enumerate() {
+            prop_assert_eq!(classes(&layer)[cell] != UNKNOWN, *held);
+            let (class, raw) = (classes(&layer)[cell], speeds[cell]);
+            prop_assert_eq!(class == UNKNOWN, raw == layer.channels[1].unknown);
+            prop_assert_eq!(class == OBSTACLE, raw == 0);
+        }
+        prop_assert_eq!(&make(&config, &shuffled(&sweep, seed), &Context::default()), &layer);
+    }
+
+    #[test]
     fn any_checked_road_is_painted_and_any_other_refused_without_a_panic(
         points in prop::collection::vec((prop_oneof![-60f64..60.0, any::<f64>()], -60f64..60.0), 0..8),
         widths in prop::collection::vec(prop_oneof![8 => 0f64..20.0, 1 => any::<f64>()], 0..8),

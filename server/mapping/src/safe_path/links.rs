@@ -86,7 +86,7 @@ impl Links {
 fn neighbours(ridge: &Ridge, point: &Point) -> Vec<usize> {
     let (ix, iy) = ((point.cell % ridge.side()) as i32, (point.cell / ridge.side()) as i32);
     let held = AROUND.map(|[dx, dy]| ridge.point_in(ix + dx, iy + dy));
-    let is_side = |i: usize| i % 2 == 0;
+    let is_side = |i: usize| i.is_multiple_of(2);
     let led_to = |i: usize| held[(i + 7) % 8].is_some() || held[(i + 1) % 8].is_some();
     (0..8).filter(|&i| is_side(i) || !led_to(i)).filter_map(|i| held[i]).collect()
 }
