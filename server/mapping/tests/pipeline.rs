@@ -86,7 +86,8 @@ fn a_drive_becomes_a_map_a_turn_and_the_end_gives_the_rest_as_partial() {
     assert!((whole.sensors[0].rpm - 600.0).abs() < 5.0);
     assert!(whole.capture_end_ns - whole.capture_start_ns > 95_000_000);
     assert!(whole.completed_ns >= whole.capture_end_ns);
-    assert_eq!(whole.layers.iter().map(|layer| layer.name).collect::<Vec<_>>(), ["drivability", "height_difference"]);
+    let names = ["drivability", "height_difference", "speed", "safe_path"];
+    assert_eq!(whole.layers.iter().map(|layer| layer.name).collect::<Vec<_>>(), names);
     assert!(common::figure(&whole.layers[0], "drivable_share") > 0.95);
     assert_eq!(made.last().unwrap().sensors[0].partial, "end");
     assert_eq!(made.last().unwrap().completed_ns, 7);
@@ -218,8 +219,11 @@ fn maps_switched_off_are_not_made() {
     off.maps.drivability.enabled = false;
     let mut pipeline = Pipeline::new(&off, vec![None]).unwrap();
     let map = pipeline.step(&event(0, Body::Scan(scan(10)))).unwrap().unwrap();
-    assert_eq!(map.layers.iter().map(|layer| layer.name).collect::<Vec<_>>(), ["height_difference"]);
-    off.maps.height_difference.enabled = false;
+    assert_eq!(
+        map.layers.iter().map(|layer| layer.name).collect::<Vec<_>>(),
+        ["height_difference", "speed", "safe_path"]
+    );
+    off.maps = MapsConfig::none();
     let mut pipeline = Pipeline::new(&off, vec![None]).unwrap();
     assert!(pipeline.step(&event(0, Body::Scan(scan(10)))).unwrap().unwrap().layers.is_empty());
 }

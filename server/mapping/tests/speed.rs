@@ -320,6 +320,10 @@ proptest! {
         ), 0..300),
         seed in any::<u64>(),
     ) {
+        // Single precision has 4 µm at 40 m: a point that near to a border may fall on either side of it.
+        let near_a_border = |v: f32| v.abs() < 41.0 && (v * 2.0 - (v * 2.0).round()).abs() < 1e-4;
+        let mut points = points;
+        points.retain(|(x, y, _)| !near_a_border(*x) && !near_a_border(*y));
         let mut sweep = empty(Model::Vlp16);
         points.iter().for_each(|(x, y, z)| add(&mut sweep, [*x, *y, *z]));
         let config = SpeedConfig::default();
