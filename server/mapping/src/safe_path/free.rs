@@ -138,8 +138,9 @@ fn close_holes(of_radial_cell: &mut [State], r_bench_m: &[f32], columns: usize, 
         let ring = &mut of_radial_cell[row * columns..][..columns];
         let Some(first) = ring.iter().position(|state| state.is_free()) else { continue };
         // Once around, from one drivable cell to itself.
+        let around = |i: usize| if first + i < columns { first + i } else { first + i - columns };
         let width_m = |from: usize, to: usize| (to - from - 1) as f32 * column_m;
-        close_along(columns + 1, |i| (first + i) % columns, |from, to| width_m(from, to) <= hole_m_max, ring);
+        close_along(columns + 1, around, |from, to| width_m(from, to) <= hole_m_max, ring);
     }
     for column in 0..columns {
         let width_m = |from: usize, to: usize| r_bench_m[to - 1] - r_bench_m[from];
