@@ -49,6 +49,21 @@ pub struct Layer {
     pub planes: Vec<[f64; 3]>,
     /// Figures of the whole layer, such as `drivable_share`.
     pub figures: BTreeMap<String, f64>,
+    /// Safe points, the vehicle's own place first; empty in layers without.
+    pub points: Vec<SafePoint>,
+}
+
+/// A place in the ego frame that is as far as can be from the obstacles on both sides.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SafePoint {
+    /// Metres forward.
+    pub x_m: f32,
+    /// Metres to the left.
+    pub y_m: f32,
+    /// Distance to the nearest cell that is not free.
+    pub radius_m: f32,
+    /// Indices of points before this one that the vehicle gets to straight from here, ascending.
+    pub links: Vec<u32>,
 }
 
 /// One value a cell.
@@ -180,6 +195,16 @@ pub enum MapError {
         /// What is wrong with the payload.
         source: DecodeError,
     },
+    /// A safe point that cannot be.
+    #[error("layer {layer:?}, safe point {point}: {what}")]
+    SafePoint {
+        /// The layer's name.
+        layer: String,
+        /// Its index.
+        point: usize,
+        /// What is wrong, the value and what is needed.
+        what: String,
+    },
     /// The legend does not start with `unknown`.
     #[error("layer {layer:?}: legend starts with {first:?}; class 0 is \"unknown\" in every legend")]
     Legend {
@@ -216,6 +241,7 @@ impl MapError {
             Self::TooManyCells { .. } => "too_many_cells",
             Self::CellCount { .. } => "cell_count",
             Self::Cells { source, .. } => source.name(),
+            Self::SafePoint { .. } => "safe_point",
             Self::Legend { .. } => "legend",
             Self::Class { .. } => "class",
         }
@@ -295,9 +321,29 @@ fn decode_layer(layer: v1::Layer, limits: &Limits) -> Result<Layer, MapError> {
     }
     let planes = layer.planes.iter().map(|plane| [plane.a, plane.b, plane.c]).collect();
     let figures = layer.figures.into_iter().collect();
-    let layer = Layer { name: layer.name, grid, legend: layer.legend, channels, planes, figures };
+    let points = decode_points(&layer.name, layer.points)?;
+    let layer = Layer { name: layer.name, grid, legend: layer.legend, channels, planes, figures, points };
     check_classes(&layer)?;
     Ok(layer)
+}
+
+fn decode_points(layer: &str, points: Vec<v1::SafePoint>) -> Result<Vec<SafePoint>, MapError> {
+    let decode_point = |(index, point): (usize, v1::SafePoint)| {
+        let wrong = |what| MapError::SafePoint { layer: layer.to_owned(), point: index, what };
+        let v1::SafePoint { x, y, radius, links } = point;
+        if !(x.is_finite() && y.is_finite() && radius.is_finite() && radius >= 0.0) {
+            return Err(wrong(format!(
+                "({x}, {y}) m, radius {radius} m; finite metres and a radius of 0 or more are needed"
+            )));
+        }
+        // Ascending and before the point: no link is named twice, and a path cannot be followed in a circle.
+        let bound = index as u64;
+        if !links.is_sorted_by(|a, b| a < b) || links.last().is_some_and(|&last| u64::from(last) >= bound) {
+            return Err(wrong(format!("links {links:?}; points before it, each once, in order, are needed")));
+        }
+        Ok(SafePoint { x_m: x, y_m: y, radius_m: radius, links })
+    };
+    points.into_iter().enumerate().map(decode_point).collect()
 }
 
 /// A planner that meets a class without a name could not know whether it may drive there.

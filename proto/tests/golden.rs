@@ -221,6 +221,7 @@ fn golden_map() -> (v1::Header, v1::Layer, v1::Layer) {
         ],
         planes: vec![v1::Plane { a: 0.01, b: -0.02, c: 0.0 }],
         figures: [("drivable_share".to_string(), 0.8), ("judged_share".to_string(), 0.75)].into(),
+        points: Vec::new(),
     };
     let grid = v1::CartesianGrid { origin_x_m: -1.0, origin_y_m: -0.5, width: 4, height: 2, cell_m: 0.5 };
     let hits: Vec<u16> = vec![0, 0, 0, 0, 0, 0, 300, 2];
@@ -228,6 +229,9 @@ fn golden_map() -> (v1::Header, v1::Layer, v1::Layer) {
         name: "hits".into(),
         geometry: Some(v1::layer::Geometry::Cartesian(grid)),
         channels: vec![codec::encode(codec::CellsRef::U16(&hits)).into_channel("hits", "", 1.0, 0)],
+        points: [(0.0, 0.0, 0.5, vec![]), (0.25, 0.5, 1.5, vec![0]), (-0.5, 0.25, 0.75, vec![0, 1])]
+            .map(|(x, y, radius, links)| v1::SafePoint { x, y, radius, links })
+            .to_vec(),
         ..Default::default()
     };
     (header, drivability, flat)
@@ -253,7 +257,9 @@ fn the_golden_map_is_its_header_and_its_layers_behind_each_other() {
                 .map(|c| json!({"name": c.name, "unit": c.unit, "scale": c.scale, "unknown": c.unknown, "cells_value_length": spans(&c.cells)}))
                 .collect();
             let (rows, columns) = layer.grid.shape();
-            json!({"name": layer.name, "shape": [rows, columns], "legend": layer.legend, "channels": channels, "figures": layer.figures})
+            let points: Vec<_> =
+                layer.points.iter().map(|p| json!({"x_m": p.x_m, "y_m": p.y_m, "radius_m": p.radius_m, "links": p.links})).collect();
+            json!({"name": layer.name, "shape": [rows, columns], "legend": layer.legend, "channels": channels, "figures": layer.figures, "points": points})
         })
         .collect();
     let layer = map.layer("drivability").unwrap();
@@ -273,7 +279,7 @@ fn the_golden_map_is_its_header_and_its_layers_behind_each_other() {
 #[test]
 fn a_map_with_one_thing_wrong_is_refused_under_that_name() {
     type Spoil = fn(&mut v1::Map);
-    let spoils: [(&str, &str, Spoil); 18] = [
+    let spoils: [(&str, &str, Spoil); 22] = [
         ("no_header", "header", |map| map.header = None),
         ("capture_backwards", "header", |map| map.header.as_mut().unwrap().capture_end_ns = 0),
         ("pose_not_finite", "header", |map| pose(map).x = f64::NAN),
@@ -291,6 +297,10 @@ fn a_map_with_one_thing_wrong_is_refused_under_that_name() {
         ("more_columns_than_cells", "cell_count", |map| radial(map).columns = 0x2000_0000),
         ("legend_without_unknown", "legend", |map| map.layers[0].legend[0] = "free".into()),
         ("class_without_a_name", "class", |map| map.layers[0].legend.truncate(3)),
+        ("safe_point_not_finite", "safe_point", |map| map.layers[1].points[1].x = f32::NAN),
+        ("safe_radius_negative", "safe_point", |map| map.layers[1].points[1].radius = -0.5),
+        ("safe_point_linked_to_itself", "safe_point", |map| map.layers[1].points[2].links[1] = 2),
+        ("safe_points_linked_twice", "safe_point", |map| map.layers[1].points[2].links[1] = 0),
         ("payload_spoilt", "crc", |map| map.layers[0].channels[0].crc32 ^= 1),
     ];
     let (header, drivability, flat) = golden_map();

@@ -7,8 +7,8 @@
 use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
-use clearway_mapping::event::{Body, EgoPose, Event, Scan};
-use clearway_mapping::map::{Cells, Geometry, Layer, Map, SensorState};
+use clearway_mapping::event::{Body, EgoPose, Event, Road, RoadFrame, RoadPurpose, Scan};
+use clearway_mapping::map::{Cells, Geometry, Layer, Map, SafePoint, SensorState};
 use clearway_proto::codec::{self, CellsRef};
 use clearway_proto::map::{encode_header, encode_layer};
 use clearway_proto::v1;
@@ -129,7 +129,59 @@ fn layer(layer: &Layer) -> v1::Layer {
         channels: layer.channels.iter().map(channel).collect(),
         planes: layer.planes.iter().map(|&[a, b, c]| v1::Plane { a, b, c }).collect(),
         figures: layer.figures.iter().map(|&(name, value)| (name.to_owned(), value)).collect(),
+        points: layer.points.iter().map(safe_point).collect(),
     }
+}
+
+/// Single precision: 4 µm at 60 m.
+fn safe_point(point: &SafePoint) -> v1::SafePoint {
+    let SafePoint { x_m, y_m, radius_m, links } = point;
+    v1::SafePoint { x: *x_m as f32, y: *y_m as f32, radius: *radius_m as f32, links: links.clone() }
+}
+
+fn road(road: &Road) -> v1::Road {
+    let purpose = match road.purpose {
+        RoadPurpose::Paint => v1::RoadPurpose::Paint,
+        RoadPurpose::Route => v1::RoadPurpose::Route,
+    };
+    let frame = match road.frame {
+        RoadFrame::Ego => v1::RoadFrame::Ego,
+        RoadFrame::Map => v1::RoadFrame::Map,
+    };
+    v1::Road {
+        stamp_ns: road.stamp_ns,
+        purpose: purpose.into(),
+        frame: frame.into(),
+        x: road.points.iter().map(|[x, _]| *x).collect(),
+        y: road.points.iter().map(|[_, y]| *y).collect(),
+        width: road.widths_m.clone(),
+        orientations: road.orientations.clone(),
+    }
+}
+
+/// What the core would refuse stays as it is: the journal holds it too. `Err` names what has no counterpart.
+fn road_from_proto(road: v1::Road) -> Result<Road, &'static str> {
+    let purpose = match road.purpose() {
+        v1::RoadPurpose::Paint => RoadPurpose::Paint,
+        v1::RoadPurpose::Route => RoadPurpose::Route,
+        v1::RoadPurpose::Unspecified => return Err("known road purpose"),
+    };
+    let frame = match road.frame() {
+        v1::RoadFrame::Ego => RoadFrame::Ego,
+        v1::RoadFrame::Map => RoadFrame::Map,
+        v1::RoadFrame::Unspecified => return Err("known road frame"),
+    };
+    if road.x.len() != road.y.len() {
+        return Err("y for every x of the road");
+    }
+    Ok(Road {
+        stamp_ns: road.stamp_ns,
+        purpose,
+        frame,
+        points: road.x.into_iter().zip(road.y).map(|(x, y)| [x, y]).collect(),
+        widths_m: road.width,
+        orientations: road.orientations,
+    })
 }
 
 /// An event as the journal holds it.
@@ -148,6 +200,7 @@ pub fn event_to_proto(event: &Event) -> v1::Event {
             map_from_ego: Some(pose(&ego.map_from_ego)),
             speed_mps: ego.speed_mps,
         }),
+        Body::Road(road) => v1::event::Body::Road(self::road(road)),
         Body::Lost(events) => v1::event::Body::Lost(*events),
         Body::End => v1::event::Body::End(v1::End {}),
     };
@@ -173,12 +226,12 @@ pub enum EventError {
         /// What was found.
         source_index: u32,
     },
-    /// A body this version does not know, or an ego pose without a pose.
+    /// A body this version does not know, an ego pose without a pose, or a road without frame or purpose.
     #[error("event {sequence}: no {what}")]
     Missing {
         /// The event's.
         sequence: u64,
-        /// `body` or `pose`.
+        /// `body`, `pose`, or what of a road.
         what: &'static str,
     },
 }
@@ -204,6 +257,9 @@ pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventError> {
             let map_from_ego = Isometry3::from_parts(Translation3::new(pose.x, pose.y, pose.z), rotation);
             Body::EgoPose(EgoPose { stamp_ns: ego.stamp_ns, map_from_ego, speed_mps: ego.speed_mps })
         }
+        v1::event::Body::Road(road) => {
+            Body::Road(road_from_proto(road).map_err(|what| EventError::Missing { sequence, what })?)
+        }
         v1::event::Body::Lost(events) => Body::Lost(events),
         v1::event::Body::End(v1::End {}) => Body::End,
     };
@@ -221,6 +277,14 @@ mod tests {
             Body::Datagram(Bytes::from_static(b"anything")),
             Body::Scan(Scan { stamp_ns: 7, x: vec![1.0], y: vec![2.0], z: vec![f32::MIN], intensity: vec![0.5] }),
             Body::EgoPose(EgoPose { stamp_ns: -1, map_from_ego: pose, speed_mps: 15.0 }),
+            Body::Road(Road {
+                stamp_ns: 5,
+                purpose: RoadPurpose::Route,
+                frame: RoadFrame::Map,
+                points: vec![[0.0, -1.5], [1e9, 2.0]],
+                widths_m: vec![3.5],
+                orientations: vec![1.0, 0.25],
+            }),
             Body::Lost(12),
             Body::End,
         ];
@@ -235,6 +299,16 @@ mod tests {
         assert!(matches!(event_from_bytes(Bytes::from_static(b"\xff")), Err(EventError::Decode(_))));
         let missing = Err(EventError::Missing { sequence: 0, what: "body" });
         assert_eq!(event_from_bytes(Bytes::new()), missing);
+        for (road, what) in [
+            (v1::Road { frame: 1, ..Default::default() }, "known road purpose"),
+            (v1::Road { purpose: 9, frame: 1, ..Default::default() }, "known road purpose"),
+            (v1::Road { purpose: 1, frame: 3, ..Default::default() }, "known road frame"),
+            (v1::Road { purpose: 1, frame: 1, x: vec![0.0], ..Default::default() }, "y for every x of the road"),
+        ] {
+            let event = v1::Event { body: Some(v1::event::Body::Road(road)), ..Default::default() };
+            let missing = Err(EventError::Missing { sequence: 0, what });
+            assert_eq!(event_from_bytes(event.encode_to_vec().into()), missing);
+        }
         let far = v1::Event { source: 70_000, ..v1::Event::default() };
         let source = Err(EventError::Source { sequence: 0, source_index: 70_000 });
         assert_eq!(event_from_bytes(far.encode_to_vec().into()), source);
@@ -254,6 +328,7 @@ mod tests {
             }],
             planes: vec![[0.0, 0.0, 1.0]],
             figures: vec![("drivable_share", 0.5), ("cells", 5.0)],
+            points: vec![SafePoint { x_m: 1.5, y_m: -2.0, radius_m: 0.25, links: Vec::new() }],
         };
         Map {
             sequence: 9,

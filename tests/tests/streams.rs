@@ -154,7 +154,7 @@ async fn an_unknown_vehicle_or_layer_is_answered_with_the_known_ones() {
     assert!(status.message().contains("truck") && status.message().contains("car"), "{status}");
     let status = client.get_map(get("car", "weather")).await.unwrap_err();
     assert_eq!(status.code(), Code::InvalidArgument);
-    assert!(status.message().contains("drivability, height_difference"), "{status}");
+    assert!(status.message().contains("drivability, height_difference, terrain, speed, safe_path"), "{status}");
     let status = client.get_map(get("car", LAYER)).await.unwrap_err();
     assert_eq!(status.code(), Code::Unavailable, "no map yet: {status}");
 
@@ -168,7 +168,7 @@ async fn an_unknown_vehicle_or_layer_is_answered_with_the_known_ones() {
 
     let vehicles = client.list_vehicles(v1::ListVehiclesRequest {}).await.unwrap().into_inner().vehicles;
     assert_eq!(vehicles.iter().map(|v| v.name.as_str()).collect::<Vec<_>>(), ["car"]);
-    assert_eq!(vehicles[0].layers, ["drivability", "height_difference", "terrain"]);
+    assert_eq!(vehicles[0].layers, ["drivability", "height_difference", "terrain", "speed", "safe_path"]);
     running.shutdown().await.unwrap();
 }
 
@@ -386,9 +386,9 @@ async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
         (map.header.unwrap().vehicle, map.layers.len())
     };
     let car = client.get_map(get("car")).await.unwrap().into_inner().map;
-    assert_eq!((sequence(&car), layers(&car)), (maps - 1, ("car".to_owned(), 3)));
+    assert_eq!((sequence(&car), layers(&car)), (maps - 1, ("car".to_owned(), house::LAYERS as usize)));
     let truck = client.get_map(get("truck")).await.unwrap().into_inner().map;
-    assert_eq!(layers(&truck), ("truck".to_owned(), 2));
+    assert_eq!(layers(&truck), ("truck".to_owned(), house::LAYERS as usize - 1));
     let status = client.get_map(get("")).await.unwrap_err();
     assert!(status.message().contains("car, truck"), "of several vehicles one must be named: {status}");
     within("shutdown", running.shutdown()).await.unwrap();

@@ -4,13 +4,18 @@
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{DrivabilityConfig, Form, HeightDifferenceConfig, MotionConfig, TerrainConfig};
+use clearway_mapping::config::{
+    DrivabilityConfig, Form, HeightDifferenceConfig, MotionConfig, SafePathConfig, SpeedConfig, TerrainConfig,
+};
 use clearway_mapping::drivability::Drivability;
-use clearway_mapping::event::{EgoPose, Scan};
+use clearway_mapping::event::{EgoPose, Road, RoadFrame, RoadPurpose, Scan};
 use clearway_mapping::height_difference::HeightDifference;
-use clearway_mapping::map::LayerMaker;
+use clearway_mapping::map::{Context, LayerMaker};
 use clearway_mapping::motion::{Motion, Moved};
+use clearway_mapping::road::TakenRoad;
+use clearway_mapping::safe_path::SafePath;
 use clearway_mapping::series::Series;
+use clearway_mapping::speed::Speed;
 use clearway_mapping::sweep::{Mount, Sweep};
 use clearway_mapping::terrain::Terrain;
 use clearway_sim::scanner::ScannerConfig;
@@ -130,4 +135,35 @@ fn deviations_of_a_revolution(bencher: Bencher) {
     let (mut sweep, mut series) = (Sweep::default(), Series::default());
     let slots = revolution.echoes[0].range_m.len();
     bencher.counter(ItemsCount::new(slots)).bench_local(|| sweep.take_deviations(&revolution, &mount, &mut series));
+}
+
+/// With a road of 20 points, 6 m wide.
+#[divan::bench]
+fn speed(bencher: Bencher) {
+    let sweep = sweep();
+    let road = Road {
+        stamp_ns: 0,
+        purpose: RoadPurpose::Paint,
+        frame: RoadFrame::Ego,
+        points: (0..20).map(|i| [2.0 * f64::from(i), 0.05 * f64::from(i * i)]).collect(),
+        widths_m: vec![6.0; 20],
+        orientations: Vec::new(),
+    };
+    let taken = TakenRoad { road, map_from_ego: None };
+    let mut map = Speed::new(&SpeedConfig::default());
+    let mut layer = map.layer();
+    let context = Context { road: Some(&taken), ..Context::default() };
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make_with(&sweep, &context, &mut layer));
+}
+
+#[divan::bench]
+fn safe_path(bencher: Bencher) {
+    let sweep = sweep();
+    let mut drivability = Drivability::new(&DrivabilityConfig::default());
+    let mut earlier = [drivability.layer()];
+    drivability.make(&sweep, &mut earlier[0]);
+    let mut map = SafePath::new(&SafePathConfig::default());
+    let mut layer = map.layer();
+    let context = Context { earlier: &earlier, ..Context::default() };
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make_with(&sweep, &context, &mut layer));
 }

@@ -91,6 +91,7 @@ impl Drivability {
         layer.planes.clear();
         layer.planes.extend_from_slice(self.planes.of_segment());
         layer.figures.clear();
+        layer.points.clear();
         layer.figures.push(("drivable_share", if known == 0 { 0.0 } else { drivable as f64 / known as f64 }));
     }
 }
@@ -115,6 +116,7 @@ impl LayerMaker for Drivability {
             ],
             planes: Vec::new(),
             figures: Vec::new(),
+            points: Vec::new(),
         }
     }
 

@@ -25,6 +25,8 @@ pub enum Body {
     Scan(Scan),
     /// Where the vehicle was.
     EgoPose(EgoPose),
+    /// Where a road lies.
+    Road(Road),
     /// The door's queue was full: this many events of this source never entered.
     Lost(u64),
     /// The source has ended: an unfinished revolution becomes a partial one.
@@ -55,4 +57,39 @@ pub struct EgoPose {
     pub map_from_ego: Isometry3<f64>,
     /// Forward speed.
     pub speed_mps: f64,
+}
+
+/// A road as points along its middle and its width there. Checked by [`crate::road::check`] when it is taken.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Road {
+    /// When it was seen or read, ns since the Unix epoch; in the ego frame, the frame of that stamp.
+    pub stamp_ns: i64,
+    /// What it is for.
+    pub purpose: RoadPurpose,
+    /// What the points are relative to.
+    pub frame: RoadFrame,
+    /// x, y in metres, in the order they are driven.
+    pub points: Vec<[f64; 2]>,
+    /// Whole width at each point.
+    pub widths_m: Vec<f64>,
+    /// Votes for each dominant orientation in the detector's image; empty where no image told of the road.
+    pub orientations: Vec<f32>,
+}
+
+/// What a road is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RoadPurpose {
+    /// A road that was detected, or a lane: painted into the speed map, in place of the one before.
+    Paint,
+    /// The centre line of the route (RDDF): never painted; its curvature says where a detector cannot follow.
+    Route,
+}
+
+/// What a road's points are relative to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RoadFrame {
+    /// The vehicle when the road was seen.
+    Ego,
+    /// The locally fixed world frame; needs an ego pose to be used.
+    Map,
 }

@@ -59,6 +59,7 @@ impl LayerMaker for HeightDifference {
             ],
             planes: Vec::new(),
             figures: Vec::new(),
+            points: Vec::new(),
         }
     }
 
@@ -97,6 +98,7 @@ impl LayerMaker for HeightDifference {
         let drivable = class.iter().filter(|c| **c == DRIVABLE).count();
         layer.planes.clear();
         layer.figures.clear();
+        layer.points.clear();
         layer.figures.push(("drivable_share", if known == 0 { 0.0 } else { drivable as f64 / known as f64 }));
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | [`event`] | what enters: datagrams, scans, ego poses, losses |
+//! | [`event`] | what enters: datagrams, scans, ego poses, roads, losses |
 //! | [`config`] | one vehicle's sensors and maps |
 //! | [`pipeline`] | `step(&Event)` conducts the hops below |
 //! | [`mount`] | first revolutions -> height, pitch and roll of a sensor nobody measured |
@@ -14,6 +14,9 @@
 //! | [`height_difference`] | the thesis' baseline |
 //! | [`series`] | revolution -> how far each range lies from its laser's neighbouring ones |
 //! | [`terrain`] | Neuhaus 2009 §2 |
+//! | [`road`] | RDDF and RNDF files, checked roads |
+//! | [`speed`] | Lindström 2005 |
+//! | [`safe_path`] | thesis §VI |
 
 pub mod config;
 pub mod drivability;
@@ -24,6 +27,9 @@ pub mod motion;
 pub mod mount;
 pub mod pipeline;
 pub mod radial;
+pub mod road;
+pub mod safe_path;
 pub mod series;
+pub mod speed;
 pub mod sweep;
 pub mod terrain;

@@ -3,6 +3,7 @@
 use nalgebra::Isometry3;
 
 use crate::motion::Compensation;
+use crate::road::TakenRoad;
 use crate::sweep::Sweep;
 
 /// Everything made from one revolution (or scan) of one vehicle.
@@ -64,6 +65,36 @@ pub struct Layer {
     pub planes: Vec<[f64; 3]>,
     /// Named figures of the whole layer (`drivable_share`, …).
     pub figures: Vec<(&'static str, f64)>,
+    /// Safe points, the vehicle's own place first; empty for layers without.
+    pub points: Vec<SafePoint>,
+}
+
+/// A place that is as far as can be from the obstacles on both sides.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct SafePoint {
+    /// Metres forward.
+    pub x_m: f64,
+    /// Metres to the left.
+    pub y_m: f64,
+    /// Distance to the nearest cell that is not free.
+    pub radius_m: f64,
+    /// Points, all before this one, that the vehicle gets to from here; so each link is named once.
+    pub links: Vec<u32>,
+}
+
+/// What is known beside the sweep when a map is made.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Context<'a> {
+    /// Layers of the same map made before this one, in the map's order.
+    pub earlier: &'a [Layer],
+    /// The map's `capture_end_ns`.
+    pub stamp_ns: i64,
+    /// Newest ego pose; `None` while no pose is known.
+    pub map_from_ego: Option<Isometry3<f64>>,
+    /// Newest road to paint.
+    pub road: Option<&'a TakenRoad>,
+    /// Newest route.
+    pub route: Option<&'a TakenRoad>,
 }
 
 /// Makes one layer from sweep after sweep, reusing its buffers.
@@ -74,6 +105,13 @@ pub trait LayerMaker: Send {
     /// Makes the layer of one sweep in `layer`, one of [`LayerMaker::layer`], in place of what it held. Every cell is
     /// written.
     fn make(&mut self, sweep: &Sweep, layer: &mut Layer);
+
+    /// The same, for a map that uses more than the sweep; what the pipeline calls.
+    fn make_with(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
+        // Most maps are made from the sweep alone.
+        let _ = context;
+        self.make(sweep, layer);
+    }
 }
 
 /// Where cells lie, in the ego frame.

@@ -15,11 +15,14 @@ use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
 use crate::config::{ConfigError, MapsConfig, SensorConfig, VehicleConfig};
 use crate::drivability::Drivability;
-use crate::event::{Body, EgoPose, Event, Scan};
+use crate::event::{Body, EgoPose, Event, Road, Scan};
 use crate::height_difference::HeightDifference;
-use crate::map::{LayerMaker, Map, SensorState};
+use crate::map::{Context, LayerMaker, Map, SensorState};
 use crate::motion::{Compensation, Motion, Moved};
+use crate::road::{self, RoadError, Roads};
+use crate::safe_path::SafePath;
 use crate::series::Series;
+use crate::speed::Speed;
 use crate::sweep::{Mount, Sweep};
 use crate::terrain::Terrain;
 
@@ -30,6 +33,7 @@ pub struct Pipeline {
     /// Table of the grid's rows where turns come as scans; `None` while neither file nor model is configured.
     scan_calibration: Option<Arc<Calibration>>,
     motion: Motion,
+    roads: Roads,
     scan_stamp_ns: Option<i64>,
     /// Scans taken, and their points.
     scans: (u64, u64),
@@ -55,6 +59,10 @@ pub struct Ledger {
     pub poses: u64,
     /// Ego poses not taken.
     pub poses_refused: u64,
+    /// Roads taken.
+    pub roads: u64,
+    /// Roads not taken, by [`Rejected::reason`].
+    pub roads_refused: BTreeMap<&'static str, u64>,
     /// Points of scans that were no positions (not finite, or beyond any sensor's reach) and were left out.
     pub points_dropped: u64,
 }
@@ -100,7 +108,7 @@ pub enum Rejected {
         /// The sensor's name.
         sensor: String,
     },
-    /// A scan or ego pose not newer than the one before.
+    /// A scan, ego pose or road not newer than the one before.
     #[error("stamp {stamp_ns} ns: later than {newest_ns} ns is allowed")]
     Stamp {
         /// The event's.
@@ -108,6 +116,9 @@ pub enum Rejected {
         /// The newest taken.
         newest_ns: i64,
     },
+    /// A road that is no road.
+    #[error(transparent)]
+    Road(#[from] RoadError),
     /// An ego pose that is no pose.
     #[error(
         "ego pose of {stamp_ns} ns: position within 10^9 m, a unit quaternion and speed within 1000 m/s are allowed"
@@ -119,7 +130,8 @@ pub enum Rejected {
 }
 
 impl Rejected {
-    /// The ledger's key: the decoder's own (`length`, `block_flag`, …), or `source`, `scan_lengths`, `model`, `stamp`, `pose`.
+    /// The ledger's key: the decoder's own (`length`, `block_flag`, …), or `source`, `scan_lengths`, `model`, `stamp`,
+    /// `pose`, or a road's own ([`RoadError::reason`]).
     pub fn reason(&self) -> &'static str {
         match self {
             Self::Datagram(refusal) => refusal.reason(),
@@ -128,6 +140,7 @@ impl Rejected {
             Self::ScanModel { .. } => "model",
             Self::Stamp { .. } => "stamp",
             Self::Pose { .. } => "pose",
+            Self::Road(refused) => refused.reason(),
         }
     }
 }
@@ -155,6 +168,7 @@ impl Pipeline {
             }),
             scan_calibration,
             motion: Motion::new(&config.maps.motion),
+            roads: Roads::default(),
             scan_stamp_ns: None,
             scans: (0, 0),
             ledger: Ledger::default(),
@@ -172,10 +186,11 @@ impl Pipeline {
         match &event.body {
             Body::Datagram(_) | Body::Scan(_) => self.ledger.received += 1,
             Body::Lost(events) => self.ledger.lost += events,
-            Body::EgoPose(_) | Body::End => {}
+            Body::EgoPose(_) | Body::Road(_) | Body::End => {}
         }
         let outcome = match &event.body {
             Body::EgoPose(pose) => self.step_ego_pose(pose).map(|()| false),
+            Body::Road(road) => self.step_road(road).map(|()| false),
             Body::Lost(_) => Ok(false),
             _ if usize::from(event.source) >= self.config.sensors.len() => {
                 Err(Rejected::Source { source_index: event.source, sensors: self.config.sensors.len() })
@@ -192,6 +207,7 @@ impl Pipeline {
                         *self.ledger.refused.entry(rejected.reason()).or_default() += 1
                     }
                     Body::EgoPose(_) => self.ledger.poses_refused += 1,
+                    Body::Road(_) => *self.ledger.roads_refused.entry(rejected.reason()).or_default() += 1,
                     Body::Lost(_) | Body::End => {}
                 }
                 Err(rejected)
@@ -234,7 +250,8 @@ impl Pipeline {
             None => false,
             Some(revolution) => {
                 let refused = self.ledger.refused.values().sum();
-                self.maker.revolution(revolution, &self.config, &self.motion, refused, arrival_ns);
+                let known = (&self.motion, &self.roads);
+                self.maker.revolution(revolution, &self.config, known, refused, arrival_ns);
                 true
             }
         };
@@ -261,7 +278,8 @@ impl Pipeline {
         };
         self.scan_stamp_ns = Some(scan.stamp_ns);
         let refused = self.ledger.refused.values().sum();
-        let dropped = self.maker.scan(scan, calibration, &self.config, &self.motion, refused, arrival_ns);
+        let known = (&self.motion, &self.roads);
+        let dropped = self.maker.scan(scan, calibration, &self.config, known, refused, arrival_ns);
         self.ledger.points_dropped += dropped;
         self.scans = (self.scans.0 + 1, self.scans.1 + u64::from(self.maker.sweep.returns));
         self.ledger.decoded += 1;
@@ -283,12 +301,21 @@ impl Pipeline {
         Ok(())
     }
 
+    fn step_road(&mut self, road: &Road) -> Result<(), Rejected> {
+        road::check(road)?;
+        check_newer(road.stamp_ns, self.roads.newest_stamp_ns(road.purpose))?;
+        self.roads.take(road, self.motion.map_from_ego(road.stamp_ns));
+        self.ledger.roads += 1;
+        Ok(())
+    }
+
     fn step_end(&mut self, arrival_ns: i64) -> bool {
         let refused = self.ledger.refused.values().sum();
         match self.sensor.finish() {
             None => false,
             Some(revolution) => {
-                self.maker.revolution(revolution, &self.config, &self.motion, refused, arrival_ns);
+                let known = (&self.motion, &self.roads);
+                self.maker.revolution(revolution, &self.config, known, refused, arrival_ns);
                 self.newest_is_revolution = true;
                 true
             }
@@ -302,6 +329,9 @@ fn check_newer(stamp_ns: i64, newest_ns: Option<i64>) -> Result<(), Rejected> {
         _ => Ok(()),
     }
 }
+
+/// What other events told: the newest ego pose, the newest roads.
+type Known<'a> = (&'a Motion, &'a Roads);
 
 /// The hops behind the sensor, with the buffers they reuse from map to map.
 struct Maker {
@@ -345,7 +375,7 @@ impl Maker {
         &mut self,
         revolution: &Revolution,
         config: &VehicleConfig,
-        motion: &Motion,
+        (motion, roads): Known<'_>,
         refused: u64,
         arrival_ns: i64,
     ) {
@@ -366,7 +396,7 @@ impl Maker {
             completeness: completeness(revolution),
             partial: revolution.partial.map_or("", partial_name),
         };
-        self.map(state, (revolution.start_ns, revolution.end_ns), arrival_ns);
+        self.map(state, (revolution.start_ns, revolution.end_ns), roads, arrival_ns);
     }
 
     /// Gives the number of points left out because they are no positions.
@@ -375,7 +405,7 @@ impl Maker {
         scan: &Scan,
         calibration: &Arc<Calibration>,
         config: &VehicleConfig,
-        motion: &Motion,
+        (motion, roads): Known<'_>,
         refused: u64,
         arrival_ns: i64,
     ) -> u64 {
@@ -392,12 +422,12 @@ impl Maker {
             completeness: 1.0,
             partial: "",
         };
-        self.map(state, (scan.stamp_ns, scan.stamp_ns), arrival_ns);
+        self.map(state, (scan.stamp_ns, scan.stamp_ns), roads, arrival_ns);
         dropped
     }
 
     /// The newest sweep's map, in place of the one before.
-    fn map(&mut self, sensor: SensorState, capture_ns: (i64, i64), arrival_ns: i64) {
+    fn map(&mut self, sensor: SensorState, capture_ns: (i64, i64), roads: &Roads, arrival_ns: i64) {
         let map = &mut self.map;
         map.sequence = self.maps_made;
         self.maps_made += 1;
@@ -405,8 +435,11 @@ impl Maker {
         map.completed_ns = arrival_ns;
         map.sensors.clear();
         map.sensors.push(sensor);
-        for (maker, layer) in self.layer_makers.iter_mut().zip(&mut map.layers) {
-            maker.make(&self.sweep, layer);
+        let (road, route) = (roads.to_paint(), roads.route());
+        for (index, maker) in self.layer_makers.iter_mut().enumerate() {
+            let (earlier, rest) = map.layers.split_at_mut(index);
+            let context = Context { earlier, stamp_ns: capture_ns.1, map_from_ego: map.map_from_ego, road, route };
+            maker.make_with(&self.sweep, &context, &mut rest[0]);
         }
     }
 }
@@ -422,6 +455,13 @@ fn layer_makers(maps: &MapsConfig) -> Vec<Box<dyn LayerMaker>> {
     }
     if maps.terrain.enabled {
         makers.push(Box::new(Terrain::new(&maps.terrain)));
+    }
+    if maps.speed.enabled {
+        makers.push(Box::new(Speed::new(&maps.speed)));
+    }
+    // Behind the layers whose obstacles it keeps away from.
+    if maps.safe_path.enabled {
+        makers.push(Box::new(SafePath::new(&maps.safe_path)));
     }
     makers
 }

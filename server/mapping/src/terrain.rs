@@ -177,6 +177,7 @@ impl LayerMaker for Terrain {
             legend: LEGEND,
             channels,
             planes: Vec::new(),
+            points: Vec::new(),
             figures: Vec::new(),
         }
     }
@@ -208,6 +209,7 @@ impl LayerMaker for Terrain {
         let [flat, inferred, elevated, obstacle] = [FLAT, FLAT_INFERRED, FLAT_ELEVATED, OBSTACLE].map(count);
         let judged = flat + elevated + obstacle;
         layer.planes.clear();
+        layer.points.clear();
         layer.figures.clear();
         layer.figures.push(("drivable_share", if judged == 0.0 { 0.0 } else { flat / judged }));
         layer.figures.push(("inferred_share", if flat == 0.0 { 0.0 } else { inferred / flat }));

@@ -7,7 +7,7 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::{ConfigError, Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
 use clearway_mapping::map::Map;
-use clearway_mapping::pipeline::{Pipeline, Rejected, layer_names};
+use clearway_mapping::pipeline::{Pipeline, Rejected};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
 use clearway_sim::vehicle::SimulatedVehicle;
@@ -87,8 +87,7 @@ fn a_drive_becomes_a_map_a_turn_and_the_end_gives_the_rest_as_partial() {
     assert!(whole.capture_end_ns - whole.capture_start_ns > 95_000_000);
     assert!(whole.completed_ns >= whole.capture_end_ns);
     let names: Vec<&str> = whole.layers.iter().map(|layer| layer.name).collect();
-    assert_eq!(names, layer_names(&MapsConfig::default()));
-    assert_eq!(names[..3], ["drivability", "height_difference", "terrain"]);
+    assert_eq!(names, ["drivability", "height_difference", "terrain", "speed", "safe_path"]);
     assert!(common::figure(&whole.layers[0], "drivable_share") > 0.95);
     assert_eq!(made.last().unwrap().sensors[0].partial, "end");
     assert_eq!(made.last().unwrap().completed_ns, 7);
@@ -223,7 +222,7 @@ fn maps_switched_off_are_not_made() {
     let mut pipeline = Pipeline::new(&off, vec![None]).unwrap();
     let map = pipeline.step(&event(0, Body::Scan(scan(10)))).unwrap().unwrap();
     assert_eq!(map.layers.iter().map(|layer| layer.name).collect::<Vec<_>>(), ["height_difference"]);
-    off.maps.height_difference.enabled = false;
+    off.maps = MapsConfig::none();
     let mut pipeline = Pipeline::new(&off, vec![None]).unwrap();
     assert!(pipeline.step(&event(0, Body::Scan(scan(10)))).unwrap().unwrap().layers.is_empty());
 }

@@ -289,6 +289,7 @@ mod tests {
                 cells: Cells::U8(vec![1, 1, 2, 0]),
             }],
             planes: Vec::new(),
+            points: Vec::new(),
             figures: Vec::new(),
         }
     }

@@ -19,6 +19,9 @@ use clearway_sim::vehicle::SimulatedVehicle;
 use prost::Message;
 use tonic::transport::Channel;
 
+/// Layers of a map by the default configuration.
+pub const LAYERS: u64 = 5;
+
 /// Nothing in these tests takes a tenth of it; a test that hangs must end all the same.
 const PATIENCE: Duration = Duration::from_secs(120);
 

@@ -86,10 +86,10 @@ pub fn turned(sweep: &Sweep) -> Sweep {
     Sweep { x: sweep.y.iter().map(|y| -y).collect(), y: sweep.x.clone(), ..sweep.clone() }
 }
 
-/// The sweep without the points that lie exactly on a border of square cells of 0.25 m: such a point belongs to the cell
-/// behind the border, and turned to the one before.
+/// The sweep without the points that lie within rounding of a border of square cells of 0.25 m: such a point belongs to
+/// the cell behind the border, and turned to the one before.
 pub fn off_borders(sweep: &Sweep) -> Sweep {
-    let kept = |i: &usize| [sweep.x[*i], sweep.y[*i]].iter().all(|v| (v * 4.0).fract() != 0.0);
+    let kept = |i: &usize| [sweep.x[*i], sweep.y[*i]].iter().all(|v| (v * 4.0 - (v * 4.0).round()).abs() > 1e-4);
     let order: Vec<usize> = (0..sweep.x.len()).filter(kept).collect();
     let pick = |axis: &[f32]| order.iter().map(|i| axis[*i]).collect();
     Sweep { x: pick(&sweep.x), y: pick(&sweep.y), z: pick(&sweep.z), ..sweep.clone() }

@@ -1,0 +1,167 @@
+//! Exact Euclidean distances to the nearest cell that is not free, in whole numbers.
+//!
+//! In: a [`State`] a cell. Out: for every cell the nearest such cell (its site), for any half-cell place the exact
+//! distance to the nearest such cell's square. Meijster, Roerdink and Hesselink 2000: first along columns, then along
+//! rows as a lower envelope of parabolas; linear in the cells.
+
+use super::free::State;
+
+/// Row or column that stands for "none".
+const NONE: u16 = u16::MAX;
+
+/// Distances over a grid of `side` cells along x and y, cell index = iy * side + ix.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Distances {
+    side: usize,
+    /// Row of the nearest site in the same column; [`NONE`] in a column without.
+    row_of_site: Vec<u16>,
+    /// Column of the nearest site of all; [`NONE`] without any site.
+    column_of_site: Vec<u16>,
+    /// Envelope of one row: columns of the parabolas, and the cell from which each is the lowest.
+    envelope: Vec<(u16, u16)>,
+}
+
+impl Distances {
+    /// Over a grid without sites.
+    pub fn new(side: usize) -> Self {
+        let none = vec![NONE; side * side];
+        Self { side, row_of_site: none.clone(), column_of_site: none, envelope: Vec::new() }
+    }
+
+    /// Cells along x, and along y.
+    pub fn side(&self) -> usize {
+        self.side
+    }
+
+    /// Measures anew.
+    pub fn measure(&mut self, states: &[State]) {
+        self.along_columns(states);
+        for iy in 0..self.side {
+            self.along_row(iy);
+        }
+    }
+
+    fn along_columns(&mut self, states: &[State]) {
+        let side = self.side;
+        // Upwards: the nearest site at or under each cell.
+        for iy in 0..side {
+            let (before, here) = self.row_of_site.split_at_mut(iy * side);
+            let here = &mut here[..side];
+            let states = &states[iy * side..][..side];
+            match iy {
+                0 => here.fill(NONE),
+                _ => here.copy_from_slice(&before[(iy - 1) * side..]),
+            }
+            for (row, state) in here.iter_mut().zip(states) {
+                *row = if state.is_free() { *row } else { iy as u16 };
+            }
+        }
+        // Downwards: the one over it, where that is nearer.
+        for iy in (0..side.saturating_sub(1)).rev() {
+            let (here, above) = self.row_of_site.split_at_mut((iy + 1) * side);
+            for (row, &over) in here[iy * side..].iter_mut().zip(&above[..side]) {
+                // NONE is farther than any row.
+                let (under_by, over_by) = ((iy as u16).abs_diff(*row), over.abs_diff(iy as u16));
+                *row = if over_by < under_by { over } else { *row };
+            }
+        }
+    }
+
+    fn along_row(&mut self, iy: usize) {
+        let side = self.side;
+        let rows = &self.row_of_site[iy * side..][..side];
+        let height_squared = |ix: u16| {
+            let height = i32::from(rows[usize::from(ix)]) - iy as i32;
+            height * height
+        };
+        let value = |at: u16, ix: u16| {
+            let along = i32::from(at) - i32::from(ix);
+            along * along + height_squared(ix)
+        };
+        self.envelope.clear();
+        for ix in 0..side as u16 {
+            if rows[usize::from(ix)] == NONE {
+                continue;
+            }
+            // A parabola that is not lower even where it began is nowhere the lowest.
+            while self.envelope.last().is_some_and(|&(held, from)| value(from, held) > value(from, ix)) {
+                self.envelope.pop();
+            }
+            match self.envelope.last() {
+                None => self.envelope.push((ix, 0)),
+                Some(&(held, _)) => {
+                    let (u, i) = (i32::from(ix), i32::from(held));
+                    let meets = (u * u - i * i + height_squared(ix) - height_squared(held)).div_euclid(2 * (u - i));
+                    if meets + 1 < side as i32 {
+                        self.envelope.push((ix, (meets + 1) as u16));
+                    }
+                }
+            }
+        }
+        let columns = &mut self.column_of_site[iy * side..][..side];
+        if self.envelope.is_empty() {
+            columns.fill(NONE);
+        }
+        let mut end = side;
+        for &(ix, from) in self.envelope.iter().rev() {
+            columns[usize::from(from)..end].fill(ix);
+            end = usize::from(from);
+        }
+    }
+
+    /// The nearest site to a cell, `[ix, iy]`; `None` where every cell is free.
+    #[inline]
+    pub fn site(&self, index: usize) -> Option<[i32; 2]> {
+        let column = self.column_of_site[index];
+        if column == NONE {
+            return None;
+        }
+        let row = self.row_of_site[index / self.side * self.side + usize::from(column)];
+        Some([i32::from(column), i32::from(row)])
+    }
+
+    /// Squared distance from a place to the nearest square of a cell that is not free; place and distance in half cells,
+    /// the middle of cell (ix, iy) at (2 ix, 2 iy). `None` where every cell is free. The place lies within the grid.
+    pub fn clearance_squared(&self, [hx, hy]: [i32; 2]) -> Option<i32> {
+        let side = self.side as i32;
+        let (row, between_rows) = ((hy / 2) as usize, hy % 2 == 1);
+        let rows = &self.row_of_site[row * self.side..][..self.side];
+        let above = between_rows.then(|| &self.row_of_site[(row + 1) * self.side..][..self.side]);
+        // From the place up or down to the nearest square in a column.
+        let height = |ix: i32| {
+            let distance = |rows: &[u16], iy: usize| match rows[ix as usize] {
+                NONE => None,
+                site => Some(i32::from(site.abs_diff(iy as u16))),
+            };
+            match above {
+                // A site in one row's column is a site in the other's too.
+                Some(above) => Some(2 * distance(rows, row)?.min(distance(above, row + 1)?)),
+                None => Some((2 * distance(rows, row)? - 1).max(0)),
+            }
+        };
+        let mut nearest = None::<i32>;
+        let mut look = |ix: i32| {
+            let along = ((2 * ix - hx).abs() - 1).max(0);
+            if nearest.is_some_and(|nearest| along * along >= nearest) {
+                return false;
+            }
+            if let Some(height) = height(ix) {
+                let squared = along * along + height * height;
+                nearest = Some(nearest.map_or(squared, |nearest| nearest.min(squared)));
+            }
+            true
+        };
+        let middle = hx / 2;
+        for ix in middle..side {
+            if !look(ix) {
+                break;
+            }
+        }
+        for ix in (0..middle).rev() {
+            if !look(ix) {
+                break;
+            }
+        }
+        nearest
+    }
+}

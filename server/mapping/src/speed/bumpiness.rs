@@ -1,0 +1,166 @@
+//! The height map and what it says of each cell: a step, or how bumpy it is.
+//!
+//! In: the sweep's points, ego frame, metres. Out: a figure a cell, metres. The paper leaves the measure open ("methods
+//! similar to image processing methods"); the reading here:
+//!
+//! - a cell is an obstacle if its highest point rises over the lowest point near it by more than a step and what the
+//!   grade explains: over the 3 × 3 cells around it, and over the 3 × 3 blocks of 4 × 4 cells around it, so that a roof
+//!   is not taken for ground because no ground was seen right beside it;
+//! - its bumpiness is the larger of the heights' standard deviation within it, less what the slope of its neighbours
+//!   explains, and half the second difference of the heights across it.
+//!
+//! Heights are summed in whole millimetres, so their order says nothing.
+
+use crate::config::SpeedConfig;
+use crate::sweep::Sweep;
+
+/// Bumpiness of an obstacle.
+pub const OBSTACLE_BUMPINESS: f32 = f32::INFINITY;
+
+/// Points lower than this are no ground a vehicle at 0 gets to; ±20 m keep millimetres in 16 bits.
+const LOWEST_M: f32 = -20.0;
+/// Makes every height positive, and half a millimetre to round with.
+const OFFSET_MM: f32 = 20_000.5;
+/// Cells a side of a block.
+const BLOCK: usize = 4;
+
+/// Sums of one cell's heights, mm.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Cell {
+    highest: i16,
+    lowest: i16,
+    points: u32,
+    sum: i64,
+    squares: i64,
+}
+
+const EMPTY: Cell = Cell { highest: i16::MIN, lowest: i16::MAX, points: 0, sum: 0, squares: 0 };
+
+/// Heights by cell, row by row, `side` cells along x and y; the vehicle stands in the middle.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeightMap {
+    side: usize,
+    cells: Vec<Cell>,
+    /// Cells that hold a point, in the order they were first met.
+    met: Vec<u32>,
+    /// Lowest height of each block.
+    blocks: Vec<i16>,
+    /// Mean height of each cell, metres; NaN without points.
+    means_m: Vec<f32>,
+    bumpiness_m: Vec<f32>,
+}
+
+impl HeightMap {
+    /// An empty map.
+    pub fn new(side: usize) -> Self {
+        Self {
+            side,
+            cells: vec![EMPTY; side * side],
+            met: Vec::new(),
+            blocks: Vec::new(),
+            means_m: vec![f32::NAN; side * side],
+            bumpiness_m: vec![f32::NAN; side * side],
+        }
+    }
+
+    /// Cells along x, and along y.
+    pub fn side(&self) -> usize {
+        self.side
+    }
+
+    /// By cell: NaN where nothing was seen, [`OBSTACLE_BUMPINESS`] for an obstacle.
+    pub fn bumpiness_m(&self) -> &[f32] {
+        &self.bumpiness_m
+    }
+
+    /// Takes the points of a sweep, in place of those before.
+    pub fn fill(&mut self, sweep: &Sweep, config: &SpeedConfig) {
+        for &cell in &self.met {
+            self.cells[cell as usize] = EMPTY;
+            self.means_m[cell as usize] = f32::NAN;
+            self.bumpiness_m[cell as usize] = f32::NAN;
+        }
+        self.met.clear();
+        let (middle, cells_a_m, side) = ((self.side / 2) as f32, 1.0 / config.cell_m, self.side as f32);
+        for ((&x, &y), &z) in sweep.x.iter().zip(&sweep.y).zip(&sweep.z) {
+            let (ix, iy) = (x * cells_a_m + middle, y * cells_a_m + middle);
+            // NaN fails every comparison.
+            let inside = ix >= 0.0 && ix < side && iy >= 0.0 && iy < side;
+            if !(inside && z > LOWEST_M && z <= config.overhang_m) {
+                continue;
+            }
+            let index = iy as usize * self.side + ix as usize;
+            // Positive first, so that cutting off rounds.
+            let millimetres = ((z * 1000.0 + OFFSET_MM) as i32 - OFFSET_MM as i32) as i16;
+            let cell = &mut self.cells[index];
+            if cell.points == 0 {
+                self.met.push(index as u32);
+            }
+            let wide = i64::from(millimetres);
+            cell.highest = cell.highest.max(millimetres);
+            cell.lowest = cell.lowest.min(millimetres);
+            cell.points += 1;
+            cell.sum += wide;
+            cell.squares += wide * wide;
+        }
+    }
+
+    /// Judges every cell that holds a point.
+    pub fn judge(&mut self, config: &SpeedConfig) {
+        let side = self.side;
+        let blocks_a_side = side.div_ceil(BLOCK);
+        self.blocks.clear();
+        self.blocks.resize(blocks_a_side * blocks_a_side, i16::MAX);
+        for &index in &self.met {
+            let cell = &self.cells[index as usize];
+            self.means_m[index as usize] = (cell.sum as f64 / f64::from(cell.points) * 1e-3) as f32;
+            let block = index as usize / side / BLOCK * blocks_a_side + index as usize % side / BLOCK;
+            self.blocks[block] = self.blocks[block].min(cell.lowest);
+        }
+        let over = |distance_m: f32| ((config.step_m_max + config.grade_max * distance_m) * 1000.0) as i32;
+        // From the middle of a cell or block to the far side of its neighbour.
+        let (over_cells, over_blocks) = (over(1.5 * config.cell_m), over(1.5 * BLOCK as f32 * config.cell_m));
+        for &index in &self.met {
+            let (index, cell) = (index as usize, self.cells[index as usize]);
+            let (ix, iy) = (index % side, index / side);
+            let near = lowest_around(ix, iy, side, |i| self.cells[i].lowest);
+            let around = lowest_around(ix / BLOCK, iy / BLOCK, blocks_a_side, |i| self.blocks[i]);
+            let highest = i32::from(cell.highest);
+            let obstacle = highest - i32::from(near) > over_cells || highest - i32::from(around) > over_blocks;
+            self.bumpiness_m[index] = if obstacle { OBSTACLE_BUMPINESS } else { self.bumpiness(ix, iy) };
+        }
+    }
+
+    fn bumpiness(&self, ix: usize, iy: usize) -> f32 {
+        let index = iy * self.side + ix;
+        let here = self.means_m[index];
+        let mean =
+            |inside: bool, at: isize| if inside { self.means_m[index.wrapping_add_signed(at)] } else { f32::NAN };
+        let row = self.side as isize;
+        let (back, ahead) = (mean(ix > 0, -1), mean(ix + 1 < self.side, 1));
+        let (right, left) = (mean(iy > 0, -row), mean(iy + 1 < self.side, row));
+        // What is not known on both sides is NaN, and NaN is neither larger nor explains anything.
+        let bend = f32::max(0.0, (back - 2.0 * here + ahead).abs() / 2.0).max((right - 2.0 * here + left).abs() / 2.0);
+        let rise_squared = |rise: f32| if rise.is_nan() { 0.0 } else { rise * rise };
+        // Twice the rise across one cell.
+        let rises = rise_squared(ahead - back) + rise_squared(left - right);
+        // A plane that rises by h across a cell has the variance h²/12 in it.
+        let explained = rises / 4.0 / 12.0;
+        let cell = &self.cells[index];
+        let points = f64::from(cell.points);
+        let mean_mm = cell.sum as f64 / points;
+        let variance = ((cell.squares as f64 / points - mean_mm * mean_mm) * 1e-6) as f32;
+        bend.max((variance - explained).max(0.0).sqrt())
+    }
+}
+
+/// The lowest of the 3 × 3 values around (ix, iy).
+fn lowest_around(ix: usize, iy: usize, side: usize, value: impl Fn(usize) -> i16) -> i16 {
+    let mut lowest = i16::MAX;
+    for y in iy.saturating_sub(1)..(iy + 2).min(side) {
+        for x in ix.saturating_sub(1)..(ix + 2).min(side) {
+            lowest = lowest.min(value(y * side + x));
+        }
+    }
+    lowest
+}
