@@ -8,8 +8,12 @@ use clearway_proto::map::Layer;
 /// Colours told apart also by those who see no red and green: the lightness differs too.
 const UNKNOWN: [u8; 3] = [38, 40, 44];
 const DRIVABLE: [u8; 3] = [64, 176, 128];
+/// Filled in, or free without a judgement of the ground.
+const WEAKLY_DRIVABLE: [u8; 3] = [44, 112, 88];
 const NOT_DRIVABLE: [u8; 3] = [232, 176, 64];
 const OBSTACLE: [u8; 3] = [176, 40, 48];
+const ROAD: [u8; 3] = [120, 190, 240];
+const PATH: [u8; 3] = [250, 250, 240];
 /// For classes this version has no colour for.
 const OTHERS: [[u8; 3]; 4] = [[96, 144, 224], [168, 120, 208], [120, 200, 216], [216, 144, 176]];
 const RING: [u8; 3] = [112, 116, 124];
@@ -77,8 +81,11 @@ impl Colours {
         if let Some(channel) = layer.channels.iter().position(|channel| channel.name == "class") {
             let colour = |(class, name): (usize, &String)| match name.as_str() {
                 "unknown" => UNKNOWN,
-                "drivable" => DRIVABLE,
-                "not_drivable" => NOT_DRIVABLE,
+                "drivable" | "flat" | "passable" => DRIVABLE,
+                "flat_inferred" | "free" => WEAKLY_DRIVABLE,
+                "not_drivable" | "flat_elevated" => NOT_DRIVABLE,
+                "road" => ROAD,
+                "path" => PATH,
                 "obstacle" => OBSTACLE,
                 _ => OTHERS[class % OTHERS.len()],
             };

@@ -1,5 +1,5 @@
 // In: a layer's legend or a channel's values. Out: colours, as [red, green, blue].
-// The four classes differ in lightness as well as in hue (unknown, obstacle, drivable, not_drivable from dark to
+// The first four classes differ in lightness as well as in hue (unknown, obstacle, drivable, not_drivable from dark to
 // light), so that they stay apart for colour-blind eyes and in grey.
 
 const CLASSES = {
@@ -7,8 +7,15 @@ const CLASSES = {
   drivable: [28, 158, 150],
   not_drivable: [244, 184, 66],
   obstacle: [196, 38, 56],
+  flat: [28, 158, 150],
+  flat_inferred: [22, 110, 106],
+  flat_elevated: [244, 184, 66],
+  passable: [28, 158, 150],
+  free: [22, 110, 106],
+  road: [120, 190, 240],
+  path: [250, 250, 240],
 };
-// Classes of later layers, by value.
+// Classes without a colour of their own, by value.
 const OTHERS = [[86, 120, 200], [190, 140, 210], [120, 190, 240], [150, 160, 90], [220, 220, 220], [140, 90, 60]];
 
 export const UNKNOWN = CLASSES.unknown;

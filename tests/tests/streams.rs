@@ -154,7 +154,7 @@ async fn an_unknown_vehicle_or_layer_is_answered_with_the_known_ones() {
     assert!(status.message().contains("truck") && status.message().contains("car"), "{status}");
     let status = client.get_map(get("car", "weather")).await.unwrap_err();
     assert_eq!(status.code(), Code::InvalidArgument);
-    assert!(status.message().contains("drivability, height_difference, terrain, speed, safe_path"), "{status}");
+    assert!(status.message().contains("drivability, height_difference, terrain"), "{status}");
     let status = client.get_map(get("car", LAYER)).await.unwrap_err();
     assert_eq!(status.code(), Code::Unavailable, "no map yet: {status}");
 
@@ -168,7 +168,7 @@ async fn an_unknown_vehicle_or_layer_is_answered_with_the_known_ones() {
 
     let vehicles = client.list_vehicles(v1::ListVehiclesRequest {}).await.unwrap().into_inner().vehicles;
     assert_eq!(vehicles.iter().map(|v| v.name.as_str()).collect::<Vec<_>>(), ["car"]);
-    assert_eq!(vehicles[0].layers, ["drivability", "height_difference", "terrain", "speed", "safe_path"]);
+    assert_eq!(vehicles[0].layers, ["drivability", "height_difference", "terrain"]);
     running.shutdown().await.unwrap();
 }
 

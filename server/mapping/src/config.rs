@@ -350,7 +350,7 @@ pub struct SpeedConfig {
 impl Default for SpeedConfig {
     fn default() -> Self {
         Self {
-            enabled: true,
+            enabled: false,
             extent_m: 40.0,
             cell_m: 0.5,
             overhang_m: 2.5,
@@ -419,7 +419,7 @@ pub struct SafePathConfig {
 impl Default for SafePathConfig {
     fn default() -> Self {
         Self {
-            enabled: true,
+            enabled: false,
             extent_m: 30.0,
             cell_m: 0.25,
             vehicle_width_m: 2.0,
