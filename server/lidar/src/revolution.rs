@@ -58,6 +58,19 @@ pub enum Partial {
     Overlong,
 }
 
+impl Partial {
+    /// As the wire spells it.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Start => "start",
+            Self::End => "end",
+            Self::Gap => "gap",
+            Self::Reversal => "reversal",
+            Self::Overlong => "overlong",
+        }
+    }
+}
+
 /// One pass of all lasers.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Firing {

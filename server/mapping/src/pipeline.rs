@@ -394,7 +394,7 @@ impl Maker {
             returns: self.sweep.returns,
             rpm: revolution.rpm,
             completeness: completeness(revolution),
-            partial: revolution.partial.map_or("", partial_name),
+            partial: revolution.partial.map_or("", Partial::as_str),
         };
         self.map(state, (revolution.start_ns, revolution.end_ns), roads, arrival_ns);
     }
@@ -480,16 +480,6 @@ fn completeness(revolution: &Revolution) -> f32 {
         seen[(degree as usize).min(359)] = true;
     }
     seen.iter().filter(|s| **s).count() as f32 / 360.0
-}
-
-fn partial_name(partial: Partial) -> &'static str {
-    match partial {
-        Partial::Start => "start",
-        Partial::End => "end",
-        Partial::Gap => "gap",
-        Partial::Reversal => "reversal",
-        Partial::Overlong => "overlong",
-    }
 }
 
 /// The model as the configuration and the wire spell it.
