@@ -184,17 +184,32 @@ fn road_from_proto(road: v1::Road) -> Result<Road, &'static str> {
     })
 }
 
+fn scan(scan: &Scan) -> v1::Scan {
+    v1::Scan {
+        stamp_ns: scan.stamp_ns,
+        x: scan.x.clone(),
+        y: scan.y.clone(),
+        z: scan.z.clone(),
+        intensity: scan.intensity.clone(),
+        ring: scan.ring.iter().map(|ring| u32::from(*ring)).collect(),
+        offset_ns: scan.offset_ns.clone(),
+        no_returns: scan.no_returns.as_flattened().to_vec(),
+    }
+}
+
+/// What the core would refuse stays as it is: the journal holds it too. `Err` names what has no counterpart.
+pub(crate) fn scan_from_proto(scan: v1::Scan) -> Result<Scan, &'static str> {
+    let v1::Scan { stamp_ns, x, y, z, intensity, ring, offset_ns, no_returns } = scan;
+    let ring = ring.into_iter().map(u16::try_from).collect::<Result<_, _>>().map_err(|_| "ring under 65536")?;
+    let (directions, []) = no_returns.as_chunks::<3>() else { return Err("z for every x and y of no_returns") };
+    Ok(Scan { stamp_ns, x, y, z, intensity, ring, offset_ns, no_returns: directions.to_vec() })
+}
+
 /// An event as the journal holds it.
 pub fn event_to_proto(event: &Event) -> v1::Event {
     let body = match &event.body {
         Body::Datagram(payload) => v1::event::Body::Datagram(payload.clone()),
-        Body::Scan(scan) => v1::event::Body::Scan(v1::Scan {
-            stamp_ns: scan.stamp_ns,
-            x: scan.x.clone(),
-            y: scan.y.clone(),
-            z: scan.z.clone(),
-            intensity: scan.intensity.clone(),
-        }),
+        Body::Scan(scan) => v1::event::Body::Scan(self::scan(scan)),
         Body::EgoPose(ego) => v1::event::Body::EgoPose(v1::EgoPose {
             stamp_ns: ego.stamp_ns,
             map_from_ego: Some(pose(&ego.map_from_ego)),
@@ -226,12 +241,13 @@ pub enum EventError {
         /// What was found.
         source_index: u32,
     },
-    /// A body this version does not know, an ego pose without a pose, or a road without frame or purpose.
+    /// A body this version does not know, an ego pose without a pose, a road without frame or purpose, a scan with half a
+    /// direction.
     #[error("event {sequence}: no {what}")]
     Missing {
         /// The event's.
         sequence: u64,
-        /// `body`, `pose`, or what of a road.
+        /// `body`, `pose`, or what of a road or scan.
         what: &'static str,
     },
 }
@@ -247,8 +263,8 @@ pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventError> {
         u16::try_from(event.source).map_err(|_| EventError::Source { sequence, source_index: event.source })?;
     let body = match event.body.ok_or(EventError::Missing { sequence, what: "body" })? {
         v1::event::Body::Datagram(payload) => Body::Datagram(payload),
-        v1::event::Body::Scan(v1::Scan { stamp_ns, x, y, z, intensity }) => {
-            Body::Scan(Scan { stamp_ns, x, y, z, intensity })
+        v1::event::Body::Scan(scan) => {
+            Body::Scan(scan_from_proto(scan).map_err(|what| EventError::Missing { sequence, what })?)
         }
         v1::event::Body::EgoPose(ego) => {
             let pose = ego.map_from_ego.ok_or(EventError::Missing { sequence, what: "pose" })?;
@@ -275,7 +291,16 @@ mod tests {
         let pose = Isometry3::new(nalgebra::vector![1.0, 2.0, 3.0], nalgebra::vector![0.1, 0.2, 0.3]);
         let bodies = [
             Body::Datagram(Bytes::from_static(b"anything")),
-            Body::Scan(Scan { stamp_ns: 7, x: vec![1.0], y: vec![2.0], z: vec![f32::MIN], intensity: vec![0.5] }),
+            Body::Scan(Scan {
+                stamp_ns: 7,
+                x: vec![1.0],
+                y: vec![2.0],
+                z: vec![f32::MIN],
+                intensity: vec![0.5],
+                ring: vec![u16::MAX],
+                offset_ns: vec![-20_000_000],
+                no_returns: vec![[0.0, 0.6, -0.8]],
+            }),
             Body::EgoPose(EgoPose { stamp_ns: -1, map_from_ego: pose, speed_mps: 15.0 }),
             Body::Road(Road {
                 stamp_ns: 5,

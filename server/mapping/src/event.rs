@@ -33,10 +33,10 @@ pub enum Body {
     End,
 }
 
-/// Points of one turn, in the sensor's frame (REP-103), metres.
+/// Points of one turn, or of one pass over a field of view, in the sensor's frame (REP-103), metres.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scan {
-    /// Stamp of the turn's end, ns since the Unix epoch.
+    /// Stamp of the scan's end, ns since the Unix epoch.
     pub stamp_ns: i64,
     /// Metres.
     pub x: Vec<f32>,
@@ -46,6 +46,12 @@ pub struct Scan {
     pub z: Vec<f32>,
     /// 0 to 1.
     pub intensity: Vec<f32>,
+    /// Rank of each point's laser by elevation, 0 lowest; empty where the sensor does not tell.
+    pub ring: Vec<u16>,
+    /// When each point was seen, ns after `stamp_ns` (so at most 0); empty where all were seen at once.
+    pub offset_ns: Vec<i32>,
+    /// Directions (unit vectors, sensor's frame) of rays that came back with nothing; empty where the sensor does not tell.
+    pub no_returns: Vec<[f32; 3]>,
 }
 
 /// Where the vehicle was and how fast.

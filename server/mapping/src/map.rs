@@ -97,10 +97,36 @@ pub struct Context<'a> {
     pub route: Option<&'a TakenRoad>,
 }
 
+/// One sensor's turn or scan, as the maps that gather evidence between two maps see it.
+#[derive(Clone, Copy, Debug)]
+pub struct Rays<'a> {
+    /// Index of the sensor in the vehicle's configuration.
+    pub sensor: u16,
+    /// When the turn ended, ns since the Unix epoch; the ego frame below is the one of this moment.
+    pub stamp_ns: i64,
+    /// What came back, ego frame.
+    pub returns: &'a Sweep,
+    /// The sensor's place, ego frame, metres.
+    pub origin_m: [f32; 3],
+    /// Directions (unit vectors, ego frame) of rays that came back with nothing; empty where the sensor does not tell.
+    pub no_returns: &'a [[f32; 3]],
+    /// Ego frame in the world frame at `stamp_ns`; `None` where no pose is near enough.
+    pub map_from_ego: Option<Isometry3<f64>>,
+    /// Forward speed, where known.
+    pub speed_mps: Option<f64>,
+}
+
 /// Makes one layer from sweep after sweep, reusing its buffers.
 pub trait LayerMaker: Send {
     /// The layer without cells.
     fn layer(&self) -> Layer;
+
+    /// Takes one sensor's turn or scan as it ends, in the order of the events; for maps that gather evidence at each
+    /// sensor's own rate.
+    fn take(&mut self, rays: &Rays<'_>) {
+        // Most maps are made from the map's sweep alone.
+        let _ = rays;
+    }
 
     /// Makes the layer of one sweep in `layer`, one of [`LayerMaker::layer`], in place of what it held. Every cell is
     /// written.

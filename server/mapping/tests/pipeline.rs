@@ -64,6 +64,7 @@ fn scan(stamp_ns: i64) -> Scan {
         y: (0..6280).map(|i| ring(i) * angle(i).sin()).collect(),
         z: vec![-1.9; 6280],
         intensity: vec![0.5; 6280],
+        ..Scan::default()
     }
 }
 

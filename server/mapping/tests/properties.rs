@@ -133,8 +133,8 @@ proptest! {
     #[test]
     fn a_scan_keeps_positions_and_drops_the_rest(points in points()) {
         let column = |axis: usize| points.iter().map(|p| p[axis]).collect::<Vec<_>>();
-        let scan =
-            Scan { stamp_ns: 0, x: column(0), y: column(1), z: column(2), intensity: vec![0.0; points.len()] };
+        let (x, y, z) = (column(0), column(1), column(2));
+        let scan = Scan { x, y, z, intensity: vec![0.0; points.len()], ..Scan::default() };
         let mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
         let mut sweep = Sweep::default();
         let dropped = sweep.take_scan(&scan, &Arc::new(Calibration::factory(Model::Vlp16)), &mount);
