@@ -3,7 +3,6 @@
 
 use std::collections::VecDeque;
 use std::fmt::Write as _;
-use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -12,7 +11,7 @@ use clearway_mapping::pipeline::{Ledger, NamedStatus};
 use clearway_proto::v1;
 use serde_json::{Value, json};
 
-use crate::ingest::{Outside, locked, now_ns, udp};
+use crate::ingest::{Outside, locked, now_ns};
 use crate::record::RecorderCounts;
 use crate::wire::EncodedMap;
 
@@ -38,7 +37,6 @@ pub struct VehicleStatus {
     pub page_readers: Arc<AtomicU32>,
     outside: Arc<Outside>,
     recorder: Option<Arc<RecorderCounts>>,
-    sockets: Mutex<Vec<SocketAddr>>,
     engine_stopped: AtomicBool,
     inside: Mutex<Inside>,
 }
@@ -96,8 +94,6 @@ pub struct Snapshot {
     pub maps_hz: f64,
     /// Datagrams a second over the newest maps.
     pub packets_hz: f64,
-    /// Datagrams the kernel dropped at this vehicle's sockets; `None` where the kernel does not tell.
-    pub kernel_drops: Option<u64>,
 }
 
 impl Snapshot {
@@ -135,15 +131,9 @@ impl VehicleStatus {
             page_readers: Arc::default(),
             outside,
             recorder,
-            sockets: Mutex::default(),
             engine_stopped: AtomicBool::new(false),
             inside: Mutex::default(),
         }
-    }
-
-    /// The vehicle's sockets, whose kernel drops are shown.
-    pub fn watch_sockets(&self, sockets: &[SocketAddr]) {
-        *locked(&self.sockets) = sockets.to_vec();
     }
 
     /// Whether the vehicle's engine still takes events.
@@ -180,15 +170,9 @@ impl VehicleStatus {
 
     /// The status now.
     pub fn snapshot(&self) -> Snapshot {
-        let sockets = locked(&self.sockets).clone();
-        let kernel_drops = if sockets.is_empty() { None } else { udp::kernel_drops(&sockets) };
         let inside = locked(&self.inside);
         let mut ledger = inside.ledger.clone();
-        for (reason, count) in self.outside.refused() {
-            ledger.received += count;
-            *ledger.refused.entry(reason).or_default() += count;
-        }
-        ledger.lost += self.outside.untold();
+        self.outside.add_to(&mut ledger);
         let mut latencies: Vec<u64> = inside.latencies_ns.iter().copied().collect();
         latencies.sort_unstable();
         let (maps_hz, packets_hz) = rates(&inside.paces);
@@ -202,7 +186,6 @@ impl VehicleStatus {
             latency_ms_p99: percentile_ms(&latencies, 99),
             maps_hz,
             packets_hz,
-            kernel_drops,
         }
     }
 
@@ -223,6 +206,7 @@ impl VehicleStatus {
                 telemetry: snapshot.ledger.telemetry,
                 refused: snapshot.ledger.refused.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect(),
                 lost: snapshot.ledger.lost,
+                kernel_drops: snapshot.ledger.kernel_drops,
             }),
             recorder: Some(self.recorder.as_ref().map(|counts| counts.to_proto()).unwrap_or_default()),
             readers: readers
@@ -255,7 +239,7 @@ impl VehicleStatus {
             "sensors": sensors.collect::<Vec<_>>(),
             "ledger": {
                 "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
-                "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": snapshot.kernel_drops,
+                "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
             },
             "recorder": {
                 "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
@@ -316,11 +300,8 @@ pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {
     family("clearway_packets_refused_total", "counter", "Datagrams and scans refused, by reason.", &refused);
     let lost = each(&|s, _| s.ledger.lost as f64);
     family("clearway_events_lost_total", "counter", "Readings that found the door's queue full.", &lost);
-    let drops: Vec<_> = all
-        .iter()
-        .filter_map(|(v, s, _)| s.kernel_drops.map(|n| (format!("vehicle=\"{}\"", v.name), n as f64)))
-        .collect();
-    family("clearway_kernel_drops", "gauge", "Datagrams the kernel dropped at the vehicle's open sockets.", &drops);
+    let drops = each(&|s, _| s.ledger.kernel_drops as f64);
+    family("clearway_kernel_drops_total", "counter", "Datagrams the kernel dropped at the vehicle's sockets.", &drops);
     let maps = each(&|_, p| p.maps as f64);
     family("clearway_maps_total", "counter", "Maps made.", &maps);
     let revolutions = each(&|s, _| s.revolutions() as f64);
@@ -365,8 +346,8 @@ mod tests {
     #[test]
     fn what_the_door_turned_away_is_in_the_ledger_and_the_ledger_adds_up() {
         let (door, _events) = crate::ingest::door(4);
-        door.refuse("source");
-        door.refuse("source");
+        door.refuse_stranger(([10, 0, 0, 9], 2368).into());
+        door.refuse_stranger(([10, 0, 0, 9], 2368).into());
         let status = VehicleStatus::new("car".into(), 1, vec!["drivability"], door.outside(), None);
         let ledger = Ledger { received: 3, decoded: 2, telemetry: 1, ..Ledger::default() };
         status.stepped(&ledger, Vec::new());

@@ -15,7 +15,7 @@ use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
 use crate::config::{ConfigError, MapsConfig, SensorConfig, VehicleConfig};
 use crate::drivability::Drivability;
-use crate::event::{Body, EgoPose, Event, Road, Scan};
+use crate::event::{Body, Cause, EgoPose, Event, Road, Scan};
 use crate::height_difference::HeightDifference;
 use crate::map::{Context, LayerMaker, Map, SensorState};
 use crate::motion::{Compensation, Motion, Moved};
@@ -53,8 +53,10 @@ pub struct Ledger {
     pub telemetry: u64,
     /// Datagrams and scans not taken, by [`Rejected::reason`].
     pub refused: BTreeMap<&'static str, u64>,
-    /// Events that never entered, as [`Body::Lost`] says.
+    /// Readings that found the door's queue full.
     pub lost: u64,
+    /// Datagrams the kernel dropped before anybody read them.
+    pub kernel_drops: u64,
     /// Ego poses taken.
     pub poses: u64,
     /// Ego poses not taken.
@@ -65,6 +67,20 @@ pub struct Ledger {
     pub roads_refused: BTreeMap<&'static str, u64>,
     /// Points of scans that were no positions (not finite, or beyond any sensor's reach) and were left out.
     pub points_dropped: u64,
+}
+
+impl Ledger {
+    /// Counts readings that never became events: lost, or refused at the door.
+    pub fn stayed_outside(&mut self, cause: Cause, count: u64) {
+        let reason = match cause {
+            Cause::Queue => return self.lost += count,
+            Cause::Kernel => return self.kernel_drops += count,
+            Cause::Sender => "source",
+            Cause::Length => "length",
+        };
+        self.received += count;
+        *self.refused.entry(reason).or_default() += count;
+    }
 }
 
 /// A sensor as configured, and what it has shown of itself.
@@ -185,13 +201,13 @@ impl Pipeline {
     pub fn step(&mut self, event: &Event) -> Result<Option<&Map>, Rejected> {
         match &event.body {
             Body::Datagram(_) | Body::Scan(_) => self.ledger.received += 1,
-            Body::Lost(events) => self.ledger.lost += events,
+            Body::Lost { cause, count } => self.ledger.stayed_outside(*cause, *count),
             Body::EgoPose(_) | Body::Road(_) | Body::End => {}
         }
         let outcome = match &event.body {
             Body::EgoPose(pose) => self.step_ego_pose(pose).map(|()| false),
             Body::Road(road) => self.step_road(road).map(|()| false),
-            Body::Lost(_) => Ok(false),
+            Body::Lost { .. } => Ok(false),
             _ if usize::from(event.source) >= self.config.sensors.len() => {
                 Err(Rejected::Source { source_index: event.source, sensors: self.config.sensors.len() })
             }
@@ -208,7 +224,7 @@ impl Pipeline {
                     }
                     Body::EgoPose(_) => self.ledger.poses_refused += 1,
                     Body::Road(_) => *self.ledger.roads_refused.entry(rejected.reason()).or_default() += 1,
-                    Body::Lost(_) | Body::End => {}
+                    Body::Lost { .. } | Body::End => {}
                 }
                 Err(rejected)
             }
