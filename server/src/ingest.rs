@@ -258,7 +258,10 @@ mod tests {
         let flood = |door: &Door| (0..9).for_each(|port| door.refuse_stranger(([10, 0, 0, 9], port).into()));
         flood(&door);
         door.leave_outside(1, Cause::Length, 2);
-        assert_eq!((untold(&door).received, untold(&door).refused["source"], untold(&door).refused["length"]), (11, 9, 2));
+        assert_eq!(
+            (untold(&door).received, untold(&door).refused["source"], untold(&door).refused["length"]),
+            (11, 9, 2)
+        );
         door.enter(0, Body::End).unwrap();
         let bodies = |events: &Receiver<Event>| events.try_iter().map(|event| event.body).collect::<Vec<_>>();
         let lost = |cause, count| Body::Lost { cause, count };

@@ -11,7 +11,7 @@ use clearway_mapping::pipeline::{Ledger, NamedStatus};
 use clearway_proto::v1;
 use serde_json::{Value, json};
 
-use crate::ingest::{Outside, locked, now_ns};
+use crate::ingest::{Outside, Stranger, locked, now_ns};
 use crate::record::RecorderCounts;
 use crate::wire::EncodedMap;
 
@@ -213,6 +213,7 @@ impl VehicleStatus {
                 .map(|(name, count)| (name.to_owned(), count.load(Ordering::Relaxed)))
                 .into_iter()
                 .collect(),
+            strangers: self.outside.strangers().iter().map(stranger).collect(),
         }
     }
 
@@ -246,11 +247,19 @@ impl VehicleStatus {
                 "stopped": self.recorder.as_ref().and_then(|counts| counts.stopped()),
             },
             "readers": proto.readers,
+            "strangers": proto.strangers.iter().map(|s| {
+                json!({ "address": s.address, "datagrams": s.datagrams, "newest_ns": s.newest_ns.to_string() })
+            }).collect::<Vec<_>>(),
             "rates": { "maps_hz": snapshot.maps_hz, "packets_hz": snapshot.packets_hz },
             "latency_ms": { "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 },
             "alive": self.is_alive(),
         })
     }
+}
+
+fn stranger(stranger: &Stranger) -> v1::Stranger {
+    let Stranger { address, datagrams, newest_ns } = *stranger;
+    v1::Stranger { address: address.to_string(), datagrams, newest_ns }
 }
 
 /// Maps and datagrams a second.

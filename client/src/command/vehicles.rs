@@ -63,10 +63,13 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
         "sensors": sensors.collect::<Vec<_>>(),
         "ledger": {
             "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
-            "refused": ledger.refused, "lost": ledger.lost,
+            "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
         },
         "recorder": {"file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost},
         "readers": vehicle.readers,
+        "strangers": vehicle.strangers.iter().map(|s| {
+            json!({"address": s.address, "datagrams": s.datagrams, "newest_age_ms": (now - s.newest_ns) as f64 * 1e-6})
+        }).collect::<Vec<_>>(),
     })
 }
 
@@ -90,9 +93,14 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
         let refused: Vec<_> = ledger.refused.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
         let refused = if refused.is_empty() { "0".into() } else { refused.join(", ") };
         lines.push(format!(
-            "  datagrams: {} received, {} decoded, {} telemetry, refused {refused}, lost {}",
-            ledger.received, ledger.decoded, ledger.telemetry, ledger.lost
+            "  datagrams: {} received, {} decoded, {} telemetry, refused {refused}; beside them lost {}, dropped by the \
+             kernel {}",
+            ledger.received, ledger.decoded, ledger.telemetry, ledger.lost, ledger.kernel_drops
         ));
+    }
+    for s in &vehicle.strangers {
+        let age = (now - s.newest_ns) as f64 * 1e-9;
+        lines.push(format!("  unknown sender {}: {} datagrams, the newest {age:.0} s ago", s.address, s.datagrams));
     }
     match vehicle.recorder.as_ref().filter(|recorder| !recorder.file.is_empty()) {
         Some(r) => lines.push(format!("  recording {}: {} events, {} maps, lost {}", r.file, r.events, r.maps, r.lost)),

@@ -120,7 +120,10 @@ fn the_ledger_is_exact_and_a_refused_datagram_leaves_no_trace_in_the_maps() {
             let stranger = Event { source: 3, ..event.clone() };
             let rejected = pipeline.step(&stranger).unwrap_err();
             assert_eq!(rejected, Rejected::Source { source_index: 3, sensors: 1 });
-            assert_eq!(pipeline.step(&Event { body: Body::Lost { cause: Cause::Queue, count: 2 }, ..event.clone() }), Ok(None));
+            assert_eq!(
+                pipeline.step(&Event { body: Body::Lost { cause: Cause::Queue, count: 2 }, ..event.clone() }),
+                Ok(None)
+            );
         }
         let Body::Datagram(payload) = &event.body else { unreachable!() };
         if payload.len() == 512 {

@@ -65,11 +65,11 @@ pub enum Sender {
 }
 
 impl Sender {
-    /// Whether `peer` is this sender.
+    /// Whether `peer` (an IPv4 address as such) is this sender.
     pub fn is(&self, peer: SocketAddr) -> bool {
         match self {
-            Self::Address(address) => *address == peer.ip().to_canonical(),
-            Self::Socket(socket) => socket.port() == peer.port() && socket.ip() == peer.ip().to_canonical(),
+            Self::Address(address) => *address == peer.ip(),
+            Self::Socket(socket) => *socket == peer,
         }
     }
 
@@ -203,7 +203,11 @@ pub(super) fn check(vehicles: &[Vehicle]) -> Result<(), (String, String, String)
             let vehicle = |route: Route| &vehicles[route.vehicle].name;
             let allowed = format!(
                 "a sender of its own, or ports of its own, for each sensor at {}: {} of {} and {} of {} cannot be told apart",
-                listener.at, sensor(a), vehicle(a), sensor(b), vehicle(b)
+                listener.at,
+                sensor(a),
+                vehicle(a),
+                sensor(b),
+                vehicle(b)
             );
             let value = b.from.or(a.from).map_or("(nothing)".to_owned(), |from| format!("{from:?}"));
             return Err((format!("vehicle.udp.from (of {})", vehicle(b)), value, allowed));

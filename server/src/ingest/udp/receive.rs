@@ -26,7 +26,7 @@ const SLOTS: usize = 2 * BATCH;
 /// One datagram.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Received {
-    /// Whence it came.
+    /// Whence it came; an IPv4 address as such, whatever kind of socket heard it.
     pub peer: SocketAddr,
     /// How long it was.
     pub length: usize,
@@ -105,6 +105,7 @@ fn drops_of(message: &RecvMsg<'_, '_, SockaddrStorage>) -> Option<u32> {
 
 fn peer_of(message: &RecvMsg<'_, '_, SockaddrStorage>) -> Option<SocketAddr> {
     let address = message.address.as_ref()?;
-    let v4 = address.as_sockaddr_in().map(|a| SocketAddr::new(IpAddr::V4(a.ip()), a.port()));
-    v4.or_else(|| address.as_sockaddr_in6().map(|a| SocketAddr::new(IpAddr::V6(a.ip()), a.port())))
+    let v4 = address.as_sockaddr_in().map(|a| (IpAddr::V4(a.ip()), a.port()));
+    let (ip, port) = v4.or_else(|| address.as_sockaddr_in6().map(|a| (IpAddr::V6(a.ip()), a.port())))?;
+    Some(SocketAddr::new(ip.to_canonical(), port))
 }
