@@ -191,7 +191,6 @@ fn road_from_proto(road: v1::Road) -> Result<Road, &'static str> {
 }
 
 fn sensor_config(sensor: &SensorConfig) -> v1::Sensor {
-    // The core refuses a calibration file here, so none is lost.
     let Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg } = sensor.extrinsics;
     v1::Sensor {
         name: sensor.name.clone(),
@@ -206,6 +205,7 @@ fn sensor_config(sensor: &SensorConfig) -> v1::Sensor {
         roll_deg,
         pitch_deg,
         yaw_deg,
+        calibration: sensor.calibration.clone(),
     }
 }
 
@@ -217,6 +217,7 @@ pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, &'st
     Ok(SensorConfig {
         model,
         rpm: sensor.rpm,
+        calibration: sensor.calibration,
         cut_azimuth_deg: sensor.cut_azimuth_deg.unwrap_or(plain.cut_azimuth_deg),
         range_m_min: sensor.range_m_min.unwrap_or(plain.range_m_min),
         elevations_deg: sensor.elevations_deg,
@@ -329,6 +330,8 @@ pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventError> {
 
 #[cfg(test)]
 mod tests {
+    use clearway_mapping::map::Part;
+
     use super::*;
 
     #[test]
@@ -417,7 +420,11 @@ mod tests {
             map_from_ego: None,
             speed_mps: None,
             compensation: clearway_mapping::motion::Compensation::Speed,
-            sensors: Vec::new(),
+            made_by: 1,
+            sensors: vec![
+                SensorState { name: "top".into(), state: Part::Late, age_ms: Some(250.5), ..SensorState::default() },
+                SensorState { name: "left".into(), packets_expected: 75, state: Part::Ok, ..SensorState::default() },
+            ],
             layers: vec![layer("drivability"), layer("height_difference")],
         }
     }
@@ -429,7 +436,9 @@ mod tests {
         assert_eq!(whole.layers.len(), 2);
         let header = whole.header.unwrap();
         assert_eq!((header.sequence, header.boot_id, header.valid_until_ns), (9, 7, 300_000_100));
-        assert_eq!(header.compensation, "speed");
+        assert_eq!((header.compensation.as_str(), header.made_by.as_str()), ("speed", "left"));
+        let sensors: Vec<_> = header.sensors.iter().map(|s| (s.state.as_str(), s.age_ms, s.packets_expected)).collect();
+        assert_eq!(sensors, [("late", Some(250.5), 0), ("ok", None, 75)]);
         let one = encoded.select(&["height_difference".into()]);
         assert_eq!(one, encoded.layer(&encoded.layers[1].1));
         let one = v1::Map::decode(one).unwrap();
