@@ -66,7 +66,7 @@ fn main() {
     let sending = sender.join().expect("no panic");
     drop(events);
     readers.stop();
-    outside.add_to(&mut ledger);
+    outside.add_to(&mut ledger, []);
     let per_second = |n: u64, took: Duration| n as f64 / took.as_secs_f64();
     println!("sent    {count:>9} in {:.2} s, {:.0} a second", sending.as_secs_f64(), per_second(count, sending));
     println!("taken   {taken:>9} in {:.2} s, {:.0} a second", took.as_secs_f64(), per_second(taken, took));

@@ -72,10 +72,14 @@ pub struct Stranger {
 }
 
 impl Outside {
-    /// Adds what the engine, whose ledger this is, has not been told of yet.
-    pub fn add_to(&self, ledger: &mut Ledger) {
-        for (&(cause, _), &count) in &*locked(&self.untold) {
+    /// Adds what the engine has not been told of yet to its ledger, and to those of its sensors.
+    pub fn add_to<'a>(&self, ledger: &mut Ledger, sensors: impl IntoIterator<Item = &'a mut Ledger>) {
+        let mut sensors: Vec<_> = sensors.into_iter().collect();
+        for (&(cause, source), &count) in &*locked(&self.untold) {
             ledger.stayed_outside(cause, count);
+            if let Some(sensor) = sensors.get_mut(usize::from(source)).filter(|_| cause.has_source()) {
+                sensor.stayed_outside(cause, count);
+            }
         }
     }
 
@@ -233,7 +237,7 @@ mod tests {
 
     fn untold(door: &Door) -> Ledger {
         let mut ledger = Ledger::default();
-        door.outside().add_to(&mut ledger);
+        door.outside().add_to(&mut ledger, []);
         ledger
     }
 

@@ -172,13 +172,14 @@ impl VehicleStatus {
     pub fn snapshot(&self) -> Snapshot {
         let inside = locked(&self.inside);
         let mut ledger = inside.ledger.clone();
-        self.outside.add_to(&mut ledger);
+        let mut sensors = inside.sensors.clone();
+        self.outside.add_to(&mut ledger, sensors.iter_mut().map(|sensor| &mut sensor.ledger));
         let mut latencies: Vec<u64> = inside.latencies_ns.iter().copied().collect();
         latencies.sort_unstable();
         let (maps_hz, packets_hz) = rates(&inside.paces);
         Snapshot {
             ledger,
-            sensors: inside.sensors.clone(),
+            sensors,
             maps: inside.maps,
             newest_capture_end_ns: inside.newest_capture_end_ns,
             drivable_share: inside.drivable_share,
@@ -200,14 +201,8 @@ impl VehicleStatus {
             maps: snapshot.maps,
             newest_capture_end_ns: snapshot.newest_capture_end_ns,
             sensors: locked(&self.inside).states.clone(),
-            ledger: Some(v1::Ledger {
-                received: snapshot.ledger.received,
-                decoded: snapshot.ledger.decoded,
-                telemetry: snapshot.ledger.telemetry,
-                refused: snapshot.ledger.refused.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect(),
-                lost: snapshot.ledger.lost,
-                kernel_drops: snapshot.ledger.kernel_drops,
-            }),
+            ledger: Some(ledger(&snapshot.ledger)),
+            sensor_ledgers: snapshot.sensors.iter().map(|s| (s.name.clone(), ledger(&s.ledger))).collect(),
             recorder: Some(self.recorder.as_ref().map(|counts| counts.to_proto()).unwrap_or_default()),
             readers: readers
                 .map(|(name, count)| (name.to_owned(), count.load(Ordering::Relaxed)))
@@ -223,10 +218,13 @@ impl VehicleStatus {
         let proto = self.to_proto();
         let snapshot = self.snapshot();
         let (ledger, recorder) = (proto.ledger.unwrap_or_default(), proto.recorder.unwrap_or_default());
+        let ledger_json = self::ledger_json(&ledger);
         let sensors = proto.sensors.iter().map(|s| {
             json!({
                 "name": s.name, "model": s.model, "packets": s.packets, "refused": s.refused, "returns": s.returns,
                 "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
+                "packets_expected": s.packets_expected, "state": s.state, "age_ms": s.age_ms,
+                "ledger": proto.sensor_ledgers.get(&s.name).map(self::ledger_json),
             })
         });
         json!({
@@ -238,10 +236,7 @@ impl VehicleStatus {
             "now_ns": now_ns().to_string(),
             "drivable_share": snapshot.drivable_share,
             "sensors": sensors.collect::<Vec<_>>(),
-            "ledger": {
-                "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
-                "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
-            },
+            "ledger": ledger_json,
             "recorder": {
                 "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
                 "stopped": self.recorder.as_ref().and_then(|counts| counts.stopped()),
@@ -262,6 +257,28 @@ fn stranger(stranger: &Stranger) -> v1::Stranger {
     v1::Stranger { address: address.to_string(), datagrams, newest_ns }
 }
 
+fn ledger_json(ledger: &v1::Ledger) -> Value {
+    json!({
+        "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
+        "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops, "points_dropped": ledger.points_dropped,
+        "own_body": ledger.own_body, "through_body": ledger.through_body,
+    })
+}
+
+fn ledger(ledger: &Ledger) -> v1::Ledger {
+    v1::Ledger {
+        received: ledger.received,
+        decoded: ledger.decoded,
+        telemetry: ledger.telemetry,
+        refused: ledger.refused.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect(),
+        lost: ledger.lost,
+        kernel_drops: ledger.kernel_drops,
+        points_dropped: ledger.points_dropped,
+        own_body: ledger.own_body,
+        through_body: ledger.through_body,
+    }
+}
+
 /// Maps and datagrams a second.
 fn rates(paces: &VecDeque<(Instant, u64)>) -> (f64, f64) {
     let (Some((first, before)), Some((last, after))) = (paces.front(), paces.back()) else { return (0.0, 0.0) };
@@ -276,6 +293,10 @@ fn rates(paces: &VecDeque<(Instant, u64)>) -> (f64, f64) {
 fn percentile_ms(ascending_ns: &[u64], percent: usize) -> Option<f64> {
     let rank = (ascending_ns.len() * percent).div_ceil(100).max(1);
     ascending_ns.get(rank - 1).map(|&ns| ns as f64 / 1e6)
+}
+
+fn labels(vehicle: &str, sensor: &str) -> String {
+    format!("vehicle=\"{vehicle}\",sensor=\"{sensor}\"")
 }
 
 /// The status of all vehicles in Prometheus' text format.
@@ -311,6 +332,27 @@ pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {
     family("clearway_events_lost_total", "counter", "Readings that found the door's queue full.", &lost);
     let drops = each(&|s, _| s.ledger.kernel_drops as f64);
     family("clearway_kernel_drops_total", "counter", "Datagrams the kernel dropped at the vehicle's sockets.", &drops);
+    let of_sensors = |value: &dyn Fn(&Ledger) -> u64| -> Vec<(String, f64)> {
+        let sensors = all.iter().flat_map(|(v, s, _)| s.sensors.iter().map(move |sensor| (v, sensor)));
+        sensors.map(|(v, s)| (labels(&v.name, &s.name), value(&s.ledger) as f64)).collect()
+    };
+    let received = of_sensors(&|ledger| ledger.received);
+    family("clearway_sensor_received_total", "counter", "Datagrams and scans received from a sensor.", &received);
+    let decoded = of_sensors(&|ledger| ledger.decoded);
+    family("clearway_sensor_decoded_total", "counter", "A sensor's data packets and scans decoded.", &decoded);
+    let telemetry = of_sensors(&|ledger| ledger.telemetry);
+    family("clearway_sensor_telemetry_total", "counter", "A sensor's telemetry datagrams read.", &telemetry);
+    let lost = of_sensors(&|ledger| ledger.lost);
+    family("clearway_sensor_lost_total", "counter", "A sensor's readings that found the queue full.", &lost);
+    let refused: Vec<_> = all
+        .iter()
+        .flat_map(|(v, s, _)| s.sensors.iter().map(move |sensor| (v, sensor)))
+        .flat_map(|(v, s)| {
+            s.ledger.refused.iter().map(move |(reason, n)| (labels(&v.name, &s.name), reason, *n as f64))
+        })
+        .map(|(labels, reason, n)| (format!("{labels},reason=\"{reason}\""), n))
+        .collect();
+    family("clearway_sensor_refused_total", "counter", "A sensor's datagrams and scans refused, by reason.", &refused);
     let maps = each(&|_, p| p.maps as f64);
     family("clearway_maps_total", "counter", "Maps made.", &maps);
     let revolutions = each(&|s, _| s.revolutions() as f64);

@@ -75,14 +75,18 @@ async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording()
     let vehicle = &mut config.vehicles[0];
     // The telemetry's socket hears IPv4 and IPv6.
     let (data, telemetry) = ("127.0.0.1:0".parse().unwrap(), "[::]:0".parse().unwrap());
-    let from = BTreeMap::from([("top".to_owned(), Sender::Address("127.0.0.2".parse().unwrap()))]);
+    let mut side = vehicle.sensors[0].clone();
+    side.name = "side".into();
+    vehicle.sensors.push(side);
+    let sender = |name: &str, address: &str| (name.to_owned(), Sender::Address(address.parse().unwrap()));
+    let from = BTreeMap::from([sender("top", "127.0.0.2"), sender("side", "127.0.0.4")]);
     vehicle.udp = Some(Udp { data, telemetry, from, ..Udp::default() });
     let running = start(config).await;
     let (data, telemetry) = running.doors[0].udp.unwrap();
     let telemetry = SocketAddr::new("127.0.0.1".parse().unwrap(), telemetry.port());
 
     let (packets, position) = datagrams();
-    let (sensor, stranger) = (socket("127.0.0.2"), socket("127.0.0.3"));
+    let (sensor, stranger, side) = (socket("127.0.0.2"), socket("127.0.0.3"), socket("127.0.0.4"));
     let mut broken = packets[0].clone();
     broken[0] = 0;
     // In turns of one batch or less, so that the kernel's buffer holds whatever the machine does meanwhile.
@@ -100,20 +104,30 @@ async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording()
         sensor.send_to(&[0xff; 1536], data).unwrap();
         sensor.send_to(&[0xff; 1537], data).unwrap();
         sensor.send_to(&[0xff; 65_507], data).unwrap();
+        side.send_to(&packets[0], data).unwrap();
+        side.send_to(&[0xff; 65_507], data).unwrap();
         stranger.send_to(&packets[0], data).unwrap();
         stranger.send_to(&position, telemetry).unwrap();
         let stranger = UdpSocket::bind("[::1]:0").unwrap();
         stranger.send_to(&position, SocketAddr::new("::1".parse().unwrap(), telemetry.port())).unwrap();
     }
-    sent += 1 + 3 * 9;
+    sent += 1 + 3 * 11;
     until("all are counted", || ledger(&running, 0).received == sent).await;
 
     let counted = ledger(&running, 0);
     assert!(adds_up(&counted), "{counted:?}");
-    assert_eq!((counted.decoded, counted.telemetry), (packets.len() as u64, 1));
-    assert_eq!(counted.refused, [("block_flag", 3), ("length", 15), ("source", 9)].into());
+    assert_eq!((counted.decoded, counted.telemetry), (packets.len() as u64 + 3, 1));
+    assert_eq!(counted.refused, [("block_flag", 3), ("length", 18), ("source", 9)].into());
     assert_eq!((counted.lost, counted.kernel_drops), (0, 0));
     let status = running.vehicles.0[0].status.clone();
+    let sensors = status.snapshot().sensors;
+    assert!(sensors.iter().all(|sensor| adds_up(&sensor.ledger)), "{sensors:?}");
+    assert_eq!((sensors[0].ledger.decoded, sensors[0].ledger.telemetry), (packets.len() as u64, 1));
+    assert_eq!(sensors[0].ledger.refused, [("block_flag", 3), ("length", 15)].into());
+    assert_eq!((sensors[1].ledger.received, sensors[1].ledger.decoded, sensors[1].ledger.refused["length"]), (6, 3, 3));
+    let metrics = clearway_server::status::prometheus(std::slice::from_ref(&status));
+    let line = "clearway_sensor_refused_total{vehicle=\"car\",sensor=\"side\",reason=\"length\"} 3\n";
+    assert!(metrics.contains(line), "{metrics}");
     let strangers = status.to_proto().strangers;
     let known = strangers.iter().find(|s| s.address == stranger.local_addr().unwrap().to_string());
     assert_eq!(known.expect("the stranger is shown").datagrams, 6);
