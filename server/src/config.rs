@@ -149,6 +149,9 @@ pub struct Vehicle {
     /// The UDP door; a vehicle without one is fed by other doors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub udp: Option<Udp>,
+    /// The ROS 2 door, through rmw_zenoh's key space.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ros: Option<Ros>,
     /// Which maps are made, and how.
     #[serde(default)]
     pub maps: MapsConfig,
@@ -187,6 +190,40 @@ impl Default for Udp {
     fn default() -> Self {
         let any = |port| SocketAddr::new(Ipv4Addr::UNSPECIFIED.into(), port);
         Self { data: any(2368), telemetry: any(8308), receive_buffer_bytes: 4 << 20, from: BTreeMap::new() }
+    }
+}
+
+/// `[vehicle.ros]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Ros {
+    /// `ROS_DOMAIN_ID`.
+    pub domain: u32,
+    /// Odometry or stamped poses; empty: poses come by tf.
+    pub pose: String,
+    /// Without `pose`: the frame tf tells the vehicle's place in; empty: no poses.
+    pub fixed_frame: String,
+    /// The vehicle's own frame, its origin on the ground.
+    pub ego_frame: String,
+    /// Transforms that move; empty: none are heard.
+    pub tf: String,
+    /// Transforms that do not; empty: none are heard.
+    pub tf_static: String,
+    /// Topic of each sensor (PointCloud2 or VelodyneScan), by sensor name.
+    pub sensors: BTreeMap<String, String>,
+}
+
+impl Default for Ros {
+    fn default() -> Self {
+        Self {
+            domain: 0,
+            pose: String::new(),
+            fixed_frame: "odom".into(),
+            ego_frame: "base_link".into(),
+            tf: "/tf".into(),
+            tf_static: "/tf_static".into(),
+            sensors: BTreeMap::new(),
+        }
     }
 }
 
@@ -348,6 +385,27 @@ impl Config {
             if sensors.len() < vehicle.sensors.len() {
                 return wrong(at("sensor.name"), &"(twice the same)", "each sensor its own");
             }
+            if let Some(ros) = &vehicle.ros {
+                if !self.zenoh.enabled {
+                    return wrong(at("ros"), &"(set)", "only with zenoh.enabled = true: it comes through zenoh");
+                }
+                if ros.domain > 232 {
+                    return wrong(at("ros.domain"), &ros.domain, "0 to 232");
+                }
+                if let Some(unknown) = ros.sensors.keys().find(|name| !sensors.contains(name.as_str())) {
+                    let known: Vec<_> = sensors.iter().copied().collect();
+                    return wrong(at("ros.sensors"), unknown, &format!("the vehicle's sensors: {}", known.join(", ")));
+                }
+                let topics = ros.sensors.values().chain([&ros.pose, &ros.tf, &ros.tf_static]);
+                let mut named: Vec<_> = topics.filter(|topic| !topic.is_empty()).collect();
+                if let Some(topic) = named.iter().find(|topic| !is_topic(topic)) {
+                    return wrong(at("ros"), topic, "topics such as \"/sensing/top/points\"");
+                }
+                named.sort_unstable();
+                if let Some(pair) = named.windows(2).find(|pair| pair[0] == pair[1]) {
+                    return wrong(at("ros"), pair[0], "each topic once");
+                }
+            }
             if let Some(udp) = &vehicle.udp {
                 if let Some(unknown) = udp.from.keys().find(|name| !sensors.contains(name.as_str())) {
                     let known: Vec<_> = sensors.iter().copied().collect();
@@ -394,6 +452,12 @@ impl Config {
         };
         self.vehicles.iter().map(|v| v.sensors.iter().map(|s| of(v, s)).collect()).collect()
     }
+}
+
+/// Whether ROS allows such a topic: parts of letters, digits and underscores, each behind a slash.
+fn is_topic(topic: &str) -> bool {
+    let part = |part: &str| !part.is_empty() && part.bytes().all(|byte| byte == b'_' || byte.is_ascii_alphanumeric());
+    topic.strip_prefix('/').is_some_and(|rest| rest.split('/').all(part))
 }
 
 /// `a.b=value`: the value is TOML, or a bare string.

@@ -67,6 +67,8 @@ pub struct Options {
     pub extrinsics: Option<Extrinsics>,
     /// The sensor's model; found from the data where absent.
     pub model: Option<Model>,
+    /// ROS topics of an MCAP file; chosen where none is named.
+    pub topics: Vec<String>,
     /// Its turning rate; found from the data where absent.
     pub rpm: Option<f32>,
     /// Configuration whose vehicle and publishers are used.
@@ -186,8 +188,10 @@ fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) 
             std::thread::sleep(due.saturating_sub(began.elapsed()));
         }
         progress.bytes_read.store(readings.bytes_read(), Ordering::Relaxed);
+        readings.untold().into_iter().for_each(|reason| door.refuse(reason));
         door.enter_captured(reading).map_err(|_| ReplayError::Engine)?;
     }
+    readings.untold().into_iter().for_each(|reason| door.refuse(reason));
     Ok(readings)
 }
 

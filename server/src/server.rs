@@ -116,6 +116,8 @@ pub struct Running {
     stop: watch::Sender<bool>,
     #[cfg(feature = "zenoh")]
     publisher: Option<crate::publish::zenoh::Publisher>,
+    #[cfg(feature = "zenoh")]
+    ros: Vec<crate::ingest::ros::live::Listener>,
 }
 
 /// What did not end as it should have.
@@ -237,10 +239,18 @@ impl Server {
             stop,
             #[cfg(feature = "zenoh")]
             publisher,
+            #[cfg(feature = "zenoh")]
+            ros: Vec::new(),
         };
         #[cfg(feature = "zenoh")]
         if let Some(publisher) = &running.publisher {
             running.zenoh = publisher.endpoints().await;
+            for (vehicle, running_vehicle) in config.vehicles.iter().zip(&running.doors) {
+                let Some(ros) = &vehicle.ros else { continue };
+                let sensors = vehicle.sensors.iter().map(|sensor| &sensor.name);
+                let door = running_vehicle.door.clone();
+                running.ros.push(crate::ingest::ros::live::listen(publisher.session(), ros, sensors, door).await?);
+            }
         }
         running.open_sockets(&config, sockets)?;
         Ok(running)
@@ -273,6 +283,10 @@ impl Running {
     /// [`EndError`] where an engine had died or the recording is not whole; everything has ended all the same.
     pub async fn shutdown(mut self) -> Result<(), EndError> {
         self.readers.shutdown().await;
+        #[cfg(feature = "zenoh")]
+        for listener in self.ros {
+            listener.stop().await;
+        }
         self.doors.clear();
         let (engines, recorder) = (self.engines, self.recorder);
         let ended = tokio::task::spawn_blocking(move || {

@@ -58,9 +58,9 @@ impl Frames {
         chain
     }
 
-    /// Whether `frame` is `ancestor` or hangs on it.
-    pub fn hangs_on(&self, frame: &str, ancestor: &str) -> bool {
-        self.up(name(frame)).iter().any(|(above, _)| *above == name(ancestor))
+    /// How many transforms above `frame` its `ancestor` stands; 0 where they are the same, `None` where it is none.
+    pub fn steps_up(&self, frame: &str, ancestor: &str) -> Option<usize> {
+        self.up(name(frame)).iter().position(|(above, _)| *above == name(ancestor))
     }
 }
 

@@ -30,7 +30,8 @@ fn a_frame_is_found_up_and_down_the_tree_and_nowhere_else() {
     assert_eq!(at("top", "/top"), Some(Point3::origin()));
     assert_eq!(at("base_link", "left"), None);
     assert_eq!(at("base_link", "nowhere"), None);
-    assert!(frames.hangs_on("top", "map") && !frames.hangs_on("left", "map") && frames.knows("rig"));
+    assert_eq!([frames.steps_up("top", "map"), frames.steps_up("left", "map")], [Some(3), None]);
+    assert!(frames.knows("rig") && !frames.knows("nowhere"));
 }
 
 #[test]
