@@ -16,6 +16,8 @@ use crate::recording::{Entry, Recording, RecordingError};
 const LOOK_NS: i64 = 10_000_000_000;
 /// The vehicle's own frame, the first of these that tf knows; REP-105 puts `base_footprint` on the ground (REP-120).
 const EGO_FRAMES: [&str; 2] = ["base_footprint", "base_link"];
+/// Heights over the ground that a sensor may be mounted at; tf's of another was told in a frame that is not on the ground.
+const HEIGHTS_M: std::ops::RangeInclusive<f64> = 0.1..=20.0;
 /// Frames that do not move, best first (REP-105).
 const FIXED_FRAMES: [&str; 2] = ["map", "odom"];
 
@@ -41,7 +43,10 @@ pub enum ChoiceError {
 #[derive(Clone, Debug, Default)]
 pub struct Offered {
     topics: BTreeMap<String, Offer>,
+    /// All frames, as they lay last.
     frames: Frames,
+    /// Those that do not move.
+    latched: Frames,
 }
 
 #[derive(Clone, Debug)]
@@ -61,7 +66,7 @@ pub struct SensorTopic {
     pub topic: String,
     /// The frame of what it brings.
     pub frame_id: String,
-    /// Where tf puts that frame on the vehicle; `None` where no chain of transforms tells.
+    /// Where tf puts that frame on the vehicle; `None` where no chain of transforms tells, or tells no possible height.
     pub ego_from_sensor: Option<Isometry3<f64>>,
 }
 
@@ -76,7 +81,7 @@ pub struct Choice {
     pub ego_frame: String,
     /// What was taken and what was left, for people.
     pub notes: Vec<String>,
-    frames: Frames,
+    latched: Frames,
 }
 
 impl Offered {
@@ -98,13 +103,16 @@ impl Offered {
     }
 
     fn see(&mut self, topic: String, kind: Kind, bytes: &[u8]) {
-        let order = self.topics.len();
+        let (order, are_static) = (self.topics.len(), topic.ends_with("tf_static"));
         let offer = self.topics.entry(topic).or_insert(Offer { kind, frame_id: None, points: 0, order });
         // What cannot be read is counted and named when it is taken.
         match kind {
             Kind::TfMessage => {
                 for transform in tf_message(bytes).unwrap_or_default() {
                     self.frames.take(&transform);
+                    if are_static {
+                        self.latched.take(&transform);
+                    }
                 }
             }
             _ if offer.frame_id.is_some() => {}
@@ -150,11 +158,12 @@ impl Offered {
         let place = |topic: &&String| {
             let frame_id = self.topics[*topic].frame_id.clone().unwrap_or_default();
             let ego_from_sensor = self.frames.a_from_b(ego_frame, &frame_id);
+            let ego_from_sensor = ego_from_sensor.filter(|placed| HEIGHTS_M.contains(&placed.translation.z));
             SensorTopic { topic: (*topic).clone(), frame_id, ego_from_sensor }
         };
         let sensors = sensors.iter().map(place).collect();
         let notes = self.notes(&sensors, pose.as_ref(), ego_frame);
-        Ok(Choice { sensors, pose, ego_frame: ego_frame.to_owned(), notes, frames: self.frames.clone() })
+        Ok(Choice { sensors, pose, ego_frame: ego_frame.to_owned(), notes, latched: self.latched.clone() })
     }
 
     fn sensors(&self, ego_frame: &str) -> Vec<&String> {
@@ -199,7 +208,10 @@ impl Offered {
             notes.push(match sensor.ego_from_sensor {
                 Some(_) => format!("{} was taken, its frame {} placed by tf", sensor.topic, sensor.frame_id),
                 None => {
-                    format!("{} was taken; tf does not join its frame {} to {ego_frame}", sensor.topic, sensor.frame_id)
+                    format!(
+                        "{} was taken; tf does not place its frame {} 0.1 to 20 m over {ego_frame}",
+                        sensor.topic, sensor.frame_id
+                    )
                 }
             });
         }
@@ -222,10 +234,10 @@ impl Offered {
 }
 
 impl Choice {
-    /// What takes these topics' messages. The transforms seen so far are known from its start: a latched one holds for the
-    /// messages before it too.
+    /// What takes these topics' messages. The transforms that do not move are known from its start: they hold for the
+    /// messages before them too.
     pub fn intake(&self) -> Intake {
         let sensors = self.sensors.iter().zip(0..).map(|(sensor, index)| (sensor.topic.clone(), index)).collect();
-        Intake::new(sensors, self.pose.clone(), &self.ego_frame, self.frames.clone())
+        Intake::new(sensors, self.pose.clone(), &self.ego_frame, self.latched.clone())
     }
 }
