@@ -12,8 +12,10 @@ use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::{BodyConfig, FusionConfig, MapsConfig, SensorConfig, VehicleConfig};
 use serde::{Deserialize, Serialize};
 
+mod ros;
 mod udp;
 
+pub use ros::Ros;
 pub use udp::{Listener, Ports, Route, Sender, Udp, listeners};
 
 /// The configured tables by vehicle and sensor, in the order of the configuration; `None` where the factory's serves.
@@ -153,6 +155,9 @@ pub struct Vehicle {
     /// The UDP door; a vehicle without one is fed by other doors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub udp: Option<Udp>,
+    /// The ROS 2 door, through rmw_zenoh's key space.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ros: Option<Ros>,
     /// How one map is made of several sensors.
     #[serde(default)]
     pub fusion: FusionConfig,
@@ -317,6 +322,11 @@ impl Config {
             let at = |key: &str| format!("vehicle.{key} (of {})", vehicle.name);
             if !(16..=1 << 20).contains(&vehicle.queue) {
                 return wrong(at("queue"), &vehicle.queue, "16 to 1048576 events");
+            }
+            if let Some(ros) = &vehicle.ros
+                && let Err((key, value, allowed)) = ros.check(self.zenoh.enabled, &vehicle.sensors)
+            {
+                return wrong(at(key), &value, &allowed);
             }
         }
         if let Err((key, value, allowed)) = udp::check(&self.vehicles) {

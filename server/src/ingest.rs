@@ -18,6 +18,7 @@ pub mod capture;
 pub mod files;
 pub mod kitti;
 pub mod mcap;
+pub mod ros;
 
 pub mod udp;
 

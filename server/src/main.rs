@@ -114,6 +114,9 @@ struct ReplayArguments {
     /// The sensor's turning rate, where the data lies about it.
     #[arg(long)]
     rpm: Option<f32>,
+    /// A ROS topic of an MCAP file, several times for several; sensors and poses are chosen where absent.
+    #[arg(long = "topic", value_name = "TOPIC")]
+    topics: Vec<String>,
     /// Take vehicle, maps and publishers from this configuration.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -276,6 +279,7 @@ async fn replay_files(arguments: ReplayArguments) -> Result<ExitCode> {
         extrinsics: arguments.extrinsics,
         model: arguments.model,
         rpm: arguments.rpm,
+        topics: arguments.topics,
         config: arguments.config,
         set: arguments.set,
         serve: arguments.serve,

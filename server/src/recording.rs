@@ -1,5 +1,5 @@
-//! An MCAP file -> its preface, events and maps, in file order. Reads what [`crate::record`] writes, and
-//! `velodyne_msgs/VelodyneScan` messages of anyone's.
+//! An MCAP file -> its preface, events and maps, in file order. Reads what [`crate::record`] writes, and the ROS 2
+//! messages of anyone's that [`clearway_ros`] knows.
 //!
 //! A file cut by a crash yields all its whole chunks and says that it was cut. Damage is an error, whatever came before
 //! it: chunks are checked against their CRC before anything of them is given.
@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use bytes::Bytes;
 use clearway_lidar::calibration::Calibration;
 use clearway_mapping::event::Event;
+use clearway_ros::Kind;
 use mcap::records::Record;
 use mcap::sans_io::LinearReaderOptions;
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader};
@@ -42,10 +43,14 @@ pub enum Entry {
         /// An encoded `clearway.v1.Map` with this one layer.
         bytes: Bytes,
     },
-    /// A `velodyne_msgs/VelodyneScan`, CDR.
-    VelodyneScan {
+    /// A ROS 2 message, CDR.
+    Ros {
         /// The topic.
         topic: String,
+        /// What it is.
+        kind: Kind,
+        /// When it was logged, ns since the Unix epoch.
+        log_ns: i64,
         /// The message.
         bytes: Bytes,
     },
@@ -135,7 +140,7 @@ pub struct Recording {
 enum Topic {
     Journal { vehicle: String, topic: String },
     Map { vehicle: String, layer: String },
-    VelodyneScan { topic: String },
+    Ros { topic: String, kind: Kind },
     Other,
 }
 
@@ -234,7 +239,7 @@ impl Recording {
                 }
                 Record::Channel(channel) => {
                     let schema = self.schemas.get(&channel.schema_id).map_or("", String::as_str);
-                    self.topics.insert(channel.id, topic(channel.topic, schema));
+                    self.topics.insert(channel.id, topic(channel.topic, schema, &channel.message_encoding));
                 }
                 Record::Message { header, data } => {
                     self.messages += 1;
@@ -243,7 +248,10 @@ impl Recording {
                     match topic {
                         Topic::Other => {}
                         Topic::Map { vehicle, layer } => return Ok(Some(Entry::Map { vehicle, layer, bytes })),
-                        Topic::VelodyneScan { topic } => return Ok(Some(Entry::VelodyneScan { topic, bytes })),
+                        Topic::Ros { topic, kind } => {
+                            let log_ns = i64::try_from(header.log_time).unwrap_or(i64::MAX);
+                            return Ok(Some(Entry::Ros { topic, kind, log_ns, bytes }));
+                        }
                         Topic::Journal { vehicle, topic } => match event_from_bytes(bytes) {
                             Ok(event) => return Ok(Some(Entry::Event { vehicle, event })),
                             Err(source) => {
@@ -290,9 +298,10 @@ impl Iterator for Recording {
     }
 }
 
-fn topic(topic: String, schema: &str) -> Topic {
-    if matches!(schema, "velodyne_msgs/msg/VelodyneScan" | "velodyne_msgs/VelodyneScan") {
-        return Topic::VelodyneScan { topic };
+fn topic(topic: String, schema: &str, encoding: &str) -> Topic {
+    // Bags converted from ROS 1 have the same types in an encoding of their own.
+    if let Some(kind) = Kind::of(schema).filter(|_| encoding == "cdr") {
+        return Topic::Ros { topic, kind };
     }
     let parts: Vec<&str> = topic.split('/').collect();
     match (schema, &parts[..]) {

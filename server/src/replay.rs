@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
+use clearway_mapping::event::Cause;
 
 use crate::clouds::CloudError;
 use crate::config::ConfigError;
@@ -67,6 +68,8 @@ pub struct Options {
     pub extrinsics: Option<Extrinsics>,
     /// The sensor's model; found from the data where absent.
     pub model: Option<Model>,
+    /// ROS topics of an MCAP file; chosen where none is named.
+    pub topics: Vec<String>,
     /// Its turning rate; found from the data where absent.
     pub rpm: Option<f32>,
     /// Configuration whose vehicle and publishers are used.
@@ -186,8 +189,10 @@ fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) 
             std::thread::sleep(due.saturating_sub(began.elapsed()));
         }
         progress.bytes_read.store(readings.bytes_read(), Ordering::Relaxed);
+        door.leave_outside(0, Cause::Observation, readings.untold());
         door.enter_captured(reading).map_err(|_| ReplayError::Engine)?;
     }
+    door.leave_outside(0, Cause::Observation, readings.untold());
     Ok(readings)
 }
 

@@ -119,6 +119,8 @@ pub struct Running {
     stop: watch::Sender<bool>,
     #[cfg(feature = "zenoh")]
     publisher: Option<crate::publish::zenoh::Publisher>,
+    #[cfg(feature = "zenoh")]
+    ros: Vec<crate::ingest::ros::live::Listener>,
 }
 
 /// What did not end as it should have.
@@ -239,10 +241,18 @@ impl Server {
             stop,
             #[cfg(feature = "zenoh")]
             publisher,
+            #[cfg(feature = "zenoh")]
+            ros: Vec::new(),
         };
         #[cfg(feature = "zenoh")]
         if let Some(publisher) = &running.publisher {
             running.zenoh = publisher.endpoints().await;
+            for (vehicle, running_vehicle) in config.vehicles.iter().zip(&running.doors) {
+                let Some(ros) = &vehicle.ros else { continue };
+                let sensors = vehicle.sensors.iter().map(|sensor| &sensor.name);
+                let door = running_vehicle.door.clone();
+                running.ros.push(crate::ingest::ros::live::listen(publisher.session(), ros, sensors, door).await?);
+            }
         }
         let doors: Vec<Door> = running.doors.iter().map(|vehicle| vehicle.door.clone()).collect();
         for (index, vehicle) in running.doors.iter_mut().enumerate() {
@@ -267,6 +277,10 @@ impl Running {
         if let Some(readers) = self.udp.take() {
             // Fails only where the runtime is going down, and the threads end without it.
             let _ = tokio::task::spawn_blocking(move || readers.stop()).await;
+        }
+        #[cfg(feature = "zenoh")]
+        for listener in self.ros {
+            listener.stop().await;
         }
         self.doors.clear();
         let (engines, recorder) = (self.engines, self.recorder);

@@ -214,7 +214,7 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
                     Some(made) => report.add(&vehicle, sequence, &layer, first_difference(&bytes, &made)),
                 }
             }
-            Entry::VelodyneScan { .. } => {}
+            Entry::Ros { .. } => {}
         }
     }
     report.cut = recording.is_cut();

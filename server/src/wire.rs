@@ -280,6 +280,7 @@ fn loss_cause(cause: Cause) -> v1::LossCause {
         Cause::Kernel => v1::LossCause::Kernel,
         Cause::Sender => v1::LossCause::Sender,
         Cause::Length => v1::LossCause::Length,
+        Cause::Observation => v1::LossCause::Observation,
     }
 }
 
@@ -337,7 +338,7 @@ pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventError> {
             Body::Sensor(Box::new(sensor))
         }
         v1::event::Body::Lost(count) => {
-            let causes = [Cause::Queue, Cause::Kernel, Cause::Sender, Cause::Length];
+            let causes = [Cause::Queue, Cause::Kernel, Cause::Sender, Cause::Length, Cause::Observation];
             let cause = causes.into_iter().find(|cause| i32::from(loss_cause(*cause)) == event.lost_cause);
             let cause = cause.ok_or(EventError::Missing { sequence, what: "known cause of a loss" })?;
             Body::Lost { cause, count }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use clearway_lidar::capture::Capture;
-use clearway_lidar::velodyne_scan::VelodyneScan;
+use clearway_ros::velodyne_scan::VelodyneScan;
 use serde_json::json;
 
 use super::progress_bar;

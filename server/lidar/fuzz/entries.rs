@@ -3,7 +3,6 @@
 use clearway_lidar::calibration::unit_table::UnitTable;
 use clearway_lidar::capture::Capture;
 use clearway_lidar::telemetry::Telemetry;
-use clearway_lidar::velodyne_scan::VelodyneScan;
 use clearway_lidar::{Calibration, Model, Sensor, SensorConfig};
 
 /// A stream: a byte that names the model or none, then datagrams of 1206 bytes.
@@ -36,13 +35,10 @@ pub fn telemetry(bytes: &[u8]) {
     drop(Telemetry::new(&datagram));
 }
 
-/// A capture file, and the same bytes as a `VelodyneScan` message.
+/// A capture file.
 pub fn capture(bytes: &[u8]) {
     if let Ok(capture) = Capture::new(bytes) {
         capture.for_each(drop);
-    }
-    if let Ok(scan) = VelodyneScan::new(bytes) {
-        scan.packets().for_each(drop);
     }
 }
 

@@ -8,7 +8,6 @@
 //! | file | in -> out |
 //! |---|---|
 //! | [`capture`] | pcap or pcapng file -> UDP payloads |
-//! | [`velodyne_scan`] | one `velodyne_msgs/VelodyneScan` message -> packets |
 //! | [`model`] | the sensors and their nominal figures |
 //! | [`calibration`] | factory tables, ROS YAML, Velodyne XML -> per-laser corrections |
 //! | [`packet`] | 1206 bytes -> [`packet::Packet`], or [`Refusal`] |
@@ -35,7 +34,6 @@ pub mod sensor;
 pub mod telemetry;
 mod time;
 mod turns;
-pub mod velodyne_scan;
 
 pub use calibration::{Calibration, CalibrationError, LaserCalibration};
 pub use model::{Model, ModelSpec, ReturnMode};

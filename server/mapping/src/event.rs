@@ -54,6 +54,8 @@ pub enum Cause {
     Sender,
     /// A datagram longer than any the door takes.
     Length,
+    /// A message that is no observation; its sender has been told why.
+    Observation,
 }
 
 impl Cause {

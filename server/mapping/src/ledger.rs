@@ -58,6 +58,7 @@ impl Ledger {
             Cause::Kernel => return self.kernel_drops += count,
             Cause::Sender => "source",
             Cause::Length => "length",
+            Cause::Observation => "observation",
         };
         self.received += count;
         *self.refused.entry(reason).or_default() += count;

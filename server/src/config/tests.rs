@@ -150,3 +150,31 @@ fn sensors_that_cannot_be_told_apart_are_refused() {
         assert!(error.contains("top of car and top of truck cannot be told apart"), "{error}");
     }
 }
+
+#[test]
+fn the_ros_door_as_the_default_file_shows_it_is_taken_and_wrong_topics_are_named() {
+    let shown = include_str!("../../../deploy/clearway.toml");
+    let from = shown.find("# [vehicle.ros]").unwrap();
+    let block: String = shown[from..].lines().take_while(|line| !line.is_empty()).fold(String::new(), |block, line| {
+        let line = line.strip_prefix("# ").unwrap_or(line);
+        let is_key = line.starts_with('[') || line.split_once(" = ").is_some_and(|(key, _)| !key.contains(' '));
+        if is_key { block + line + "\n" } else { block }
+    });
+    let head = "[[vehicle]]\nname = \"car\"\n";
+    let sensor = NEEDED.split_once("[vehicle.udp]\n").unwrap().1;
+    let parse = |ros: &str, set: &[String]| Config::parse(&format!("{head}{ros}{sensor}"), Path::new("a.toml"), set);
+    let ros = parse(&block, &[]).unwrap().vehicles[0].ros.clone().unwrap();
+    let expected =
+        Ros { pose: "/odom".into(), sensors: [("top".into(), "/velodyne_points".into())].into(), ..Ros::default() };
+    assert_eq!(ros, expected);
+    for (set, said) in [
+        ("vehicle.ros.pose=odom", "vehicle.ros (of car) = odom: allowed: topics such as"),
+        ("vehicle.ros.pose=/velodyne_points", "vehicle.ros (of car) = /velodyne_points: allowed: each topic once"),
+        ("vehicle.ros.sensors.left=/a", "vehicle.ros.sensors (of car) = left: allowed: the vehicle's sensors: top"),
+        ("vehicle.ros.domain=233", "vehicle.ros.domain (of car) = 233: allowed: 0 to 232"),
+        ("zenoh.enabled=false", "vehicle.ros (of car) = (set): allowed: only with zenoh.enabled = true"),
+    ] {
+        let error = parse(&block, &[set.to_owned()]).unwrap_err().to_string();
+        assert!(error.contains(said), "{error}");
+    }
+}

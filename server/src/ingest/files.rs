@@ -10,6 +10,8 @@ use clearway_mapping::event::Body;
 use super::capture::CaptureError;
 use super::kitti::ScanError;
 use super::mcap::McapError;
+use super::mcap::Wanted;
+use super::ros::Intake;
 use super::{Reading, capture, kitti, mcap};
 
 /// What a file holds.
@@ -37,6 +39,16 @@ pub enum FilesError {
     /// A file of no known kind.
     #[error("{}: not pcap, pcapng, MCAP, KITTI .bin or .pcd", file.display())]
     Kind {
+        /// Which.
+        file: PathBuf,
+    },
+    /// A bag in the older storage of ROS 2.
+    #[error(
+        "{}: a ROS 2 bag in sqlite3; MCAP is read: write `output_bags: [{{uri: converted, storage_id: mcap, all_topics: true}}]` \
+         into convert.yaml, then `ros2 bag convert -i {} -o convert.yaml`",
+        file.display(), file.display()
+    )]
+    Sqlite {
         /// Which.
         file: PathBuf,
     },
@@ -69,7 +81,11 @@ pub struct Truncated {
 /// The readings of several files; an iterator that stops at the first file that cannot be read.
 pub struct Readings {
     files: VecDeque<(PathBuf, Kind)>,
-    vehicle: Option<String>,
+    wanted: Wanted,
+    /// Takes the ROS messages of the next file of a bag.
+    intake: Option<Intake>,
+    /// Messages refused in files already closed, and not told to the door yet.
+    untold: u64,
     open: Option<Open>,
     scans: u64,
     bytes_before: u64,
@@ -86,11 +102,11 @@ enum Open {
 }
 
 impl Readings {
-    /// Looks at the files, without reading them yet. `vehicle` names whose journal is read out of recordings of several.
+    /// Looks at the files, without reading them yet; `wanted` is what is read of MCAP files.
     ///
     /// # Errors
     /// [`FilesError`] for the first file that is missing or of no known kind.
-    pub fn open(files: &[PathBuf], vehicle: Option<&str>) -> Result<Self, FilesError> {
+    pub fn open(files: &[PathBuf], wanted: Wanted) -> Result<Self, FilesError> {
         let mut all = VecDeque::new();
         for file in files {
             if file.is_dir() {
@@ -101,7 +117,9 @@ impl Readings {
         }
         Ok(Self {
             files: all,
-            vehicle: vehicle.map(str::to_owned),
+            wanted,
+            intake: None,
+            untold: 0,
             open: None,
             scans: 0,
             bytes_before: 0,
@@ -142,6 +160,15 @@ impl Readings {
         &self.notes
     }
 
+    /// Messages that were refused since this was last asked, before they became readings.
+    pub fn untold(&mut self) -> u64 {
+        let mut untold = std::mem::take(&mut self.untold);
+        if let Some(Open::Mcap(_, source)) = &mut self.open {
+            untold += source.untold();
+        }
+        untold
+    }
+
     fn read(&mut self) -> Result<Option<Reading>, FilesError> {
         loop {
             let next = match &mut self.open {
@@ -162,7 +189,7 @@ impl Readings {
             match kind {
                 Kind::Capture => self.open = Some(Open::Capture(file.clone(), Box::new(capture::Source::open(&file)?))),
                 Kind::Mcap => {
-                    let source = mcap::Source::open(&file, self.vehicle.as_deref())?;
+                    let source = mcap::Source::open(&file, &self.wanted, self.intake.take())?;
                     self.open = Some(Open::Mcap(file, Box::new(source)));
                 }
                 Kind::Scan => {
@@ -187,14 +214,14 @@ impl Readings {
                 }
                 self.notes.extend(source.notes().into_iter().map(|note| format!("{}: {note}", file.display())));
             }
-            Some(Open::Mcap(file, source)) => {
+            Some(Open::Mcap(file, mut source)) => {
                 if source.recording().is_cut() {
                     let reason = "the file ends without its closing records, as after a crash".into();
                     self.truncated.push(Truncated { file: file.clone(), reason });
                 }
-                let ignored =
-                    source.ignored().iter().map(|topic| format!("{}: {topic} was left alone", file.display()));
-                self.notes.extend(ignored);
+                self.notes.extend(source.notes().into_iter().map(|note| format!("{}: {note}", file.display())));
+                self.untold += source.untold();
+                self.intake = source.into_intake();
             }
         }
     }
@@ -228,6 +255,7 @@ pub fn kind(file: &Path) -> Result<Kind, FilesError> {
         [0x4d, 0x3c, 0xb2, 0xa1, ..] | [0xa1, 0xb2, 0x3c, 0x4d, ..] => return Ok(Kind::Capture),
         [0x0a, 0x0d, 0x0d, 0x0a, ..] => return Ok(Kind::Capture),
         [0x89, b'M', b'C', b'A', b'P', ..] => return Ok(Kind::Mcap),
+        b"SQLite f" => return Err(FilesError::Sqlite { file: file.to_owned() }),
         _ => {}
     }
     // Without its magic a file is read as what its name says, and the reader says what is wrong with it.
@@ -248,7 +276,8 @@ fn folder(folder: &Path) -> Result<Vec<(PathBuf, Kind)>, FilesError> {
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(open)? {
         let file = entry.map_err(open)?.path();
-        if file.is_file() && kind_by_name(&file).is_some() {
+        let bag = file.extension().is_some_and(|extension| extension == "db3");
+        if file.is_file() && (bag || kind_by_name(&file).is_some()) {
             files.push((file.clone(), kind(&file)?));
         }
     }
@@ -275,6 +304,8 @@ mod tests {
         assert_eq!(kind(&at("a.bin", &[0x89, b'M', b'C', b'A', b'P'])).unwrap(), Kind::Mcap);
         assert_eq!(kind(&at("b.bin", &[0; 16])).unwrap(), Kind::Scan);
         assert!(matches!(kind(&at("notes.txt", b"hello")), Err(FilesError::Kind { .. })));
+        let bag = Readings::open(&[at("bag_0.db3", b"SQLite format 3\0").parent().unwrap().into()], Wanted::default());
+        assert!(bag.err().unwrap().to_string().contains("ros2 bag convert -i"));
         assert!(matches!(kind(Path::new("/no/such/file")), Err(FilesError::Open { .. })));
     }
 
@@ -286,7 +317,7 @@ mod tests {
             std::fs::write(folder.path().join(name), bytes).unwrap();
         }
         let readings: Vec<_> =
-            Readings::open(&[folder.path().to_owned()], None).unwrap().collect::<Result<_, _>>().unwrap();
+            Readings::open(&[folder.path().to_owned()], Wanted::default()).unwrap().collect::<Result<_, _>>().unwrap();
         let x = |reading: &Reading| match &reading.body {
             Body::Scan(scan) => scan.x[0],
             _ => f32::NAN,

@@ -1,23 +1,36 @@
-//! One MCAP file -> readings: the journal of one vehicle where the file is a recording of ours, else the
-//! `velodyne_msgs/VelodyneScan` messages of its first such topic, packet by packet with their own stamps.
+//! One MCAP file -> readings: the journal of one vehicle where the file is a recording of ours, else the ROS 2 messages of
+//! the topics that [`super::ros`] chooses.
 
-use std::collections::{BTreeSet, VecDeque};
-use std::path::{Path, PathBuf};
-
-use clearway_lidar::velodyne_scan::{VelodyneScan, VelodyneScanError};
-use clearway_mapping::event::Body;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::path::Path;
 
 use super::Reading;
+use super::ros::{ChoiceError, Intake, Offered};
 use crate::recording::{Entry, Recording, RecordingError};
+
+/// What is read of MCAP files.
+#[derive(Clone, Debug, Default)]
+pub struct Wanted {
+    /// The vehicle whose journal is read out of recordings of several; the first one met where `None`.
+    pub vehicle: Option<String>,
+    /// ROS topics; chosen where none is named.
+    pub topics: Vec<String>,
+    /// Sensors the vehicle may have; a topic more is left alone.
+    pub sensors_max: usize,
+}
 
 /// An open MCAP file; an iterator over its readings.
 pub struct Source {
-    file: PathBuf,
     recording: Recording,
-    /// The vehicle whose journal is read; the first one met where `None`.
     vehicle: Option<String>,
-    topic: Option<String>,
+    /// What takes the ROS messages; `None` where the file is a recording of ours.
+    intake: Option<Intake>,
+    notes: Vec<String>,
     ignored: BTreeSet<String>,
+    /// By topic: messages that were not taken, and what was wrong with the first.
+    refused: BTreeMap<String, (u64, String)>,
+    /// Those not told to the door yet.
+    untold: u64,
     waiting: VecDeque<Reading>,
     is_journal: bool,
 }
@@ -28,30 +41,35 @@ pub enum McapError {
     /// The file cannot be read.
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    /// A message is no VelodyneScan.
-    #[error("{}: {topic}: {source}", file.display())]
-    VelodyneScan {
-        /// The file.
-        file: PathBuf,
-        /// The topic.
-        topic: String,
-        /// What is wrong.
-        source: VelodyneScanError,
-    },
+    /// Its topics cannot be chosen.
+    #[error(transparent)]
+    Choice(#[from] ChoiceError),
 }
 
 impl Source {
-    /// Opens the file; `vehicle` names the one whose journal is wanted.
+    /// Opens the file. `intake` comes from the file before, so that a bag in several files is one; where there is none,
+    /// the topics are chosen.
     ///
     /// # Errors
-    /// [`McapError`] where the file cannot be read or is no MCAP.
-    pub fn open(file: &Path, vehicle: Option<&str>) -> Result<Self, McapError> {
+    /// [`McapError`] where the file cannot be read, is no MCAP, or has not the topics wanted.
+    pub fn open(file: &Path, wanted: &Wanted, intake: Option<Intake>) -> Result<Self, McapError> {
+        let recording = Recording::open(file)?;
+        let (mut intake, mut notes) = (intake, Vec::new());
+        if recording.preface().config.is_some() {
+            intake = None;
+        } else if intake.is_none() {
+            let choice = Offered::look(file)?.choose(file, &wanted.topics, wanted.sensors_max)?;
+            notes.clone_from(&choice.notes);
+            intake = Some(choice.intake());
+        }
         Ok(Self {
-            file: file.to_owned(),
-            recording: Recording::open(file)?,
-            vehicle: vehicle.map(str::to_owned),
-            topic: None,
+            recording,
+            vehicle: wanted.vehicle.clone(),
+            intake,
+            notes,
             ignored: BTreeSet::new(),
+            refused: BTreeMap::new(),
+            untold: 0,
             waiting: VecDeque::new(),
             is_journal: false,
         })
@@ -67,12 +85,25 @@ impl Source {
         self.is_journal
     }
 
-    /// Journals and topics that were left alone.
-    pub fn ignored(&self) -> &BTreeSet<String> {
-        &self.ignored
+    /// What was taken, left alone and refused.
+    pub fn notes(&self) -> Vec<String> {
+        let ignored = self.ignored.iter().map(|topic| format!("{topic} was left alone"));
+        let refused = self.refused.iter();
+        let refused = refused.map(|(topic, (n, first))| format!("{topic}: {n} messages refused, the first: {first}"));
+        self.notes.iter().cloned().chain(ignored).chain(refused).collect()
     }
 
-    fn take(&mut self, entry: Entry) -> Result<(), McapError> {
+    /// Messages that were refused since this was last asked.
+    pub fn untold(&mut self) -> u64 {
+        std::mem::take(&mut self.untold)
+    }
+
+    /// What takes the ROS messages of the bag's next file.
+    pub fn into_intake(self) -> Option<Intake> {
+        self.intake
+    }
+
+    fn take(&mut self, entry: Entry) {
         match entry {
             Entry::Event { vehicle, event } => {
                 if *self.vehicle.get_or_insert_with(|| vehicle.clone()) == vehicle {
@@ -83,22 +114,17 @@ impl Source {
                     self.ignored.insert(format!("/{vehicle}/journal"));
                 }
             }
-            Entry::VelodyneScan { topic, bytes } => {
-                let first = self.topic.get_or_insert_with(|| topic.clone());
-                if self.is_journal || *first != topic {
-                    self.ignored.insert(topic);
-                    return Ok(());
-                }
-                let wrong = |source| McapError::VelodyneScan { file: self.file.clone(), topic: topic.clone(), source };
-                for packet in VelodyneScan::new(&bytes).map_err(wrong)?.packets() {
-                    let (arrival_ns, payload) = packet.map_err(wrong)?;
-                    let body = Body::Datagram(bytes.slice_ref(payload));
-                    self.waiting.push_back(Reading { arrival_ns, source: 0, body });
+            Entry::Ros { topic, kind, log_ns, bytes } => {
+                let Some(intake) = self.intake.as_mut().filter(|intake| intake.wants(&topic, kind)) else {
+                    return;
+                };
+                if let Err(refused) = intake.take(&topic, kind, log_ns, &bytes, &mut self.waiting) {
+                    self.untold += 1;
+                    self.refused.entry(topic).or_insert_with(|| (0, refused.to_string())).0 += 1;
                 }
             }
             Entry::Map { .. } => {}
         }
-        Ok(())
     }
 }
 
@@ -110,12 +136,9 @@ impl Iterator for Source {
             if let Some(reading) = self.waiting.pop_front() {
                 return Some(Ok(reading));
             }
-            let taken = match self.recording.next()? {
+            match self.recording.next()? {
                 Ok(entry) => self.take(entry),
-                Err(error) => Err(error.into()),
-            };
-            if let Err(error) = taken {
-                return Some(Err(error));
+                Err(error) => return Some(Err(error.into())),
             }
         }
     }

@@ -37,7 +37,7 @@ pub struct ZenohError {
     reason: zenoh::Error,
 }
 
-fn failed(what: impl Into<String>) -> impl FnOnce(zenoh::Error) -> ZenohError {
+pub(crate) fn failed(what: impl Into<String>) -> impl FnOnce(zenoh::Error) -> ZenohError {
     let what = what.into();
     |reason| ZenohError { what, reason }
 }
@@ -56,6 +56,11 @@ impl Publisher {
             publisher.publish(served).await?;
         }
         Ok(publisher)
+    }
+
+    /// The session, for the doors that listen on it.
+    pub fn session(&self) -> &Session {
+        &self.session
     }
 
     /// Where the session listens, ports found.

@@ -10,16 +10,21 @@ use clearway_lidar::sensor::{Sensor, SensorConfig as LidarConfig};
 use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig};
 use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::mount::estimate;
+use nalgebra::Isometry3;
 
 use super::{Mount, Options, ReplayError, describe};
 use crate::clouds::{Clouds, Written};
 use crate::config::{Calibrations, Config, Recorder};
-use crate::ingest::files::{Kind, Readings};
+use crate::ingest::files::{FilesError, Kind, Readings};
+use crate::ingest::mcap::{McapError, Wanted};
+use crate::ingest::ros::Offered;
 use crate::recording::Recording;
 use crate::server::Setup;
 
 /// Revolutions the mount is estimated from.
 const MOUNT_REVOLUTIONS: usize = 10;
+/// Sensors a vehicle may have.
+const SENSORS_MAX: usize = 1;
 
 /// Everything known before the first event.
 pub(super) struct Plan {
@@ -32,13 +37,16 @@ pub(super) struct Plan {
 }
 
 pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
-    let open = || Readings::open(&options.files, options.vehicle.as_deref());
+    let wanted =
+        || Wanted { vehicle: options.vehicle.clone(), topics: options.topics.clone(), sensors_max: SENSORS_MAX };
+    let open = || Readings::open(&options.files, wanted());
     let readings = open()?;
     let recorded = readings.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
     let scans = readings.files().all(|(_, kind)| kind == Kind::Scan);
     let (mut config, mut tables, boot_id, given) = configured(options, recorded.as_deref())?;
+    let placed = if given { None } else { placed_by_tf(recorded.as_deref(), &wanted())? };
     let vehicle = &mut config.vehicles[0];
-    vehicle.udp = None;
+    (vehicle.udp, vehicle.ros) = (None, None);
     let sensor = &mut vehicle.sensors[0];
     sensor.model = options.model.or(sensor.model);
     // Scans do not tell who made them, and KITTI's were made by this one.
@@ -58,6 +66,11 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
             Mount::Given
         }
         None if given => Mount::Given,
+        None if let Some((extrinsics, mount)) = placed => {
+            sensor.extrinsics = extrinsics;
+            remarks.extend(describe(&mount).map(|said| format!("extrinsics of {}: {said}", sensor.name)));
+            mount
+        }
         None => {
             let revolutions = first_revolutions(open()?, sensor, tables[0][0].clone())?;
             if revolutions.is_empty() {
@@ -129,6 +142,26 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Configured, 
         }
     }
     Ok((Config::of_one_vehicle("car", "top"), vec![vec![None]], None, false))
+}
+
+/// The extrinsics that the transforms of a ROS bag give the sensor.
+fn placed_by_tf(bag: Option<&Path>, wanted: &Wanted) -> Result<Option<(Extrinsics, Mount)>, ReplayError> {
+    let Some(file) = bag else { return Ok(None) };
+    let offered = Offered::look(file).map_err(McapError::from).map_err(FilesError::from)?;
+    let choice = offered.choose(file, &wanted.topics, wanted.sensors_max).map_err(McapError::from);
+    let choice = choice.map_err(FilesError::from)?;
+    Ok(choice.sensors.first().and_then(|sensor| {
+        let ego_from_sensor = sensor.ego_from_sensor?;
+        let mount = Mount::Tf { ego_frame: choice.ego_frame.clone(), frame_id: sensor.frame_id.clone() };
+        Some((extrinsics_of(&ego_from_sensor), mount))
+    }))
+}
+
+fn extrinsics_of(ego_from_sensor: &Isometry3<f64>) -> Extrinsics {
+    let (roll, pitch, yaw) = ego_from_sensor.rotation.euler_angles();
+    let [x_m, y_m, z_m] = ego_from_sensor.translation.vector.into();
+    let [roll_deg, pitch_deg, yaw_deg] = [roll, pitch, yaw].map(f64::to_degrees);
+    Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg }
 }
 
 /// The points of the first revolutions (or scans), sensor frame, metres.

@@ -15,6 +15,13 @@ use crate::status::Snapshot;
 pub enum Mount {
     /// Options, configuration or recording.
     Given,
+    /// The transforms of a ROS bag.
+    Tf {
+        /// The vehicle's frame.
+        ego_frame: String,
+        /// The sensor's.
+        frame_id: String,
+    },
     /// The ground in the first revolutions.
     Estimated(MountEstimate),
     /// The ground could not be found; no map was made.
@@ -83,6 +90,12 @@ impl Summary {
         });
         match &self.mount {
             Mount::Given => known,
+            Mount::Tf { ego_frame, frame_id } => {
+                known["source"] = "tf".into();
+                known["ego_frame"] = ego_frame.clone().into();
+                known["frame_id"] = frame_id.clone().into();
+                known
+            }
             Mount::Estimated(estimate) => {
                 known["source"] = "estimated".into();
                 known["revolutions"] = estimate.revolutions.into();
@@ -145,6 +158,10 @@ pub fn describe(mount: &Mount) -> Option<String> {
             estimate.inliers,
             estimate.samples,
             estimate.residual_m,
+        )),
+        Mount::Tf { ego_frame, frame_id } => Some(format!(
+            "tf's transform from {frame_id} to {ego_frame}; the origin of {ego_frame} is taken to be on the ground, else give \
+             --extrinsics"
         )),
         Mount::Unknown(why) => Some(format!(
             "unknown, so no map is made: the files do not say how the sensor is mounted, and it cannot be estimated: {why}; \

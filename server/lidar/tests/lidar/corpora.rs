@@ -9,7 +9,7 @@ use clearway_lidar::calibration::unit_table::status_bytes;
 use clearway_lidar::{Calibration, Model, ReturnMode};
 
 use crate::stream::Stream;
-use crate::{capture, telemetry, velodyne_scan};
+use crate::{capture, telemetry};
 
 fn folder(target: &str) -> PathBuf {
     [env!("CARGO_MANIFEST_DIR"), "fuzz", "corpus", target].iter().collect()
@@ -74,7 +74,6 @@ fn write_seeds() {
     write("capture", "nanoseconds_big_endian.pcap", &capture::pcap(1, &frames, true, true));
     write("capture", "raw_ip.pcap", &capture::pcap(101, &[capture::ip_packet(&[1, 2, 3], 0x2000)], false, false));
     write("capture", "nanoseconds.pcapng", &capture::pcapng(&frames, 9, 1 << 40));
-    write("capture", "scan.cdr", &velodyne_scan::message("velodyne", &[(1, 2, vec![3; 1206])]));
     write(
         "calibration",
         "short.xml",

@@ -9,4 +9,3 @@ mod stream;
 mod telemetry;
 mod turns;
 mod unit_table;
-mod velodyne_scan;

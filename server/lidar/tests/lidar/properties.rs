@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use crate::corpora::entries;
 use crate::stream::{START_NS, Stream};
-use crate::{capture, telemetry, velodyne_scan};
+use crate::{capture, telemetry};
 
 fn models() -> impl Strategy<Value = Model> {
     proptest::sample::select(Model::ALL.to_vec())
@@ -141,7 +141,6 @@ proptest! {
         for bytes in [
             capture::pcap(1, &frames, false, false),
             capture::pcapng(&frames, 6, 1),
-            velodyne_scan::message("velodyne", &[(1, 2, vec![3; 1206]), (3, 4, vec![5; 1206])]),
         ] {
             let mut bytes = damaged(bytes, &damage);
             bytes.truncate(end.index(bytes.len()) + 1);

@@ -11,8 +11,8 @@ mod vls128;
 use std::path::PathBuf;
 
 use clearway_lidar::capture::{Capture, Datagram};
-use clearway_lidar::velodyne_scan::VelodyneScan;
 use clearway_lidar::{Point, Revolution, Sensor, SensorConfig};
+use clearway_ros::velodyne_scan::VelodyneScan;
 
 /// A file of the recorded drives.
 pub fn data(path: &str) -> PathBuf {

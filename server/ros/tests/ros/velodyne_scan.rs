@@ -1,6 +1,7 @@
 //! `VelodyneScan` messages.
 
-use clearway_lidar::velodyne_scan::{VelodyneScan, VelodyneScanError};
+use clearway_ros::MessageError;
+use clearway_ros::velodyne_scan::VelodyneScan;
 
 pub fn message(frame_id: &str, packets: &[(i32, u32, Vec<u8>)]) -> Vec<u8> {
     let mut bytes = vec![0, 1, 0, 0];
@@ -27,7 +28,7 @@ fn packets_come_out_as_they_went_in() {
         let sent: Vec<_> = (0..3).map(|i| (100 + i, 7 * i as u32, vec![i as u8; 1206])).collect();
         let bytes = message(frame_id, &sent);
         let scan = VelodyneScan::new(&bytes).unwrap();
-        assert_eq!((scan.stamp_ns, scan.frame_id, scan.count), (12_000_000_034, frame_id, 3));
+        assert_eq!((scan.header.stamp_ns, scan.header.frame_id, scan.count), (12_000_000_034, frame_id, 3));
         let read: Vec<_> = scan.packets().map(Result::unwrap).collect();
         for ((stamp_ns, data), (seconds, nanoseconds, expected)) in read.iter().zip(&sent) {
             assert_eq!(*stamp_ns, i64::from(*seconds) * 1_000_000_000 + i64::from(*nanoseconds));
@@ -41,12 +42,12 @@ fn a_claimed_length_that_the_message_has_not_is_refused() {
     let bytes = message("velodyne", &[(1, 2, vec![3; 1206])]);
     for end in 0..bytes.len() {
         let shown = VelodyneScan::new(&bytes[..end]).unwrap_err();
-        assert!(matches!(shown, VelodyneScanError::Truncated { .. }), "{end}: {shown}");
+        assert!(matches!(shown, MessageError::Truncated { .. }), "{end}: {shown}");
     }
     let mut greedy = bytes.clone();
     greedy[28..32].copy_from_slice(&u32::MAX.to_le_bytes());
-    assert!(matches!(VelodyneScan::new(&greedy), Err(VelodyneScanError::Truncated { what: "packets", .. })));
+    assert!(matches!(VelodyneScan::new(&greedy), Err(MessageError::Truncated { what: "packets", .. })));
     let mut other = bytes;
     other[1] = 9;
-    assert_eq!(VelodyneScan::new(&other).unwrap_err(), VelodyneScanError::Encapsulation { found: [0, 9] });
+    assert_eq!(VelodyneScan::new(&other).unwrap_err(), MessageError::Encapsulation { found: [0, 9] });
 }

@@ -1,0 +1,185 @@
+//! One `sensor_msgs/msg/PointCloud2` message.
+//!
+//! In: the bytes of a message. Out: header, layout and the points' bytes, read in place; [`crate::points`] makes numbers
+//! of them. Layout: header; height, width; fields (name, offset, datatype, count); is_bigendian; point_step, row_step;
+//! data; is_dense.
+
+use crate::cdr::{Header, MessageError, Reader, Writer, length};
+
+/// A driver's point has a dozen fields.
+const FIELDS_MAX: usize = 256;
+/// Bytes the shortest field takes: name 4 + 1, padding 3, offset 4, datatype 1, and count 4 after padding 3.
+const FIELD_LENGTH: usize = 20;
+
+/// A message, read in place. `data` holds all its points: `height` rows of `width` points, and each field lies within its
+/// point.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PointCloud2<'a> {
+    /// Stamp, and the frame of the points.
+    pub header: Header<'a>,
+    /// Rows; 1 where the cloud has no order.
+    pub height: u32,
+    /// Points of a row.
+    pub width: u32,
+    /// What each point has.
+    pub fields: Vec<Field<'a>>,
+    /// Whether the points' numbers have their greatest byte first; the message's own order is another matter.
+    pub big_endian: bool,
+    /// Bytes from one point to the next.
+    pub point_step: u32,
+    /// Bytes from one row to the next.
+    pub row_step: u32,
+    /// The points.
+    pub data: &'a [u8],
+    /// Whether all points are said to be positions; nothing here relies on it.
+    pub dense: bool,
+}
+
+/// `sensor_msgs/PointField`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Field<'a> {
+    /// Such as `x` or `intensity`.
+    pub name: &'a str,
+    /// Bytes from the point's start.
+    pub offset: u32,
+    /// [`Datatype`] as a number; drivers write others too, in fields nobody needs.
+    pub datatype: u8,
+    /// Elements.
+    pub count: u32,
+}
+
+/// What a field's elements are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Datatype {
+    /// One signed byte.
+    Int8 = 1,
+    /// One byte.
+    Uint8,
+    /// Two bytes, signed.
+    Int16,
+    /// Two bytes.
+    Uint16,
+    /// Four bytes, signed.
+    Int32,
+    /// Four bytes.
+    Uint32,
+    /// Single precision.
+    Float32,
+    /// Double precision.
+    Float64,
+}
+
+impl Datatype {
+    /// In the order of their numbers, from 1.
+    pub const ALL: [Self; 8] =
+        [Self::Int8, Self::Uint8, Self::Int16, Self::Uint16, Self::Int32, Self::Uint32, Self::Float32, Self::Float64];
+
+    /// By its number.
+    pub fn of(number: u8) -> Option<Self> {
+        Self::ALL.into_iter().find(|datatype| *datatype as u8 == number)
+    }
+
+    /// Bytes of one.
+    pub fn size(self) -> u32 {
+        match self {
+            Self::Int8 | Self::Uint8 => 1,
+            Self::Int16 | Self::Uint16 => 2,
+            Self::Int32 | Self::Uint32 | Self::Float32 => 4,
+            Self::Float64 => 8,
+        }
+    }
+}
+
+impl<'a> PointCloud2<'a> {
+    /// Reads a message.
+    ///
+    /// # Errors
+    /// [`MessageError`], also where rows, points or fields do not fit into one another.
+    pub fn new(message: &'a [u8]) -> Result<Self, MessageError> {
+        let mut reader = Reader::new(message)?;
+        let header = reader.header()?;
+        let (height, width) = (reader.u32("height")?, reader.u32("width")?);
+        let count = reader.count("fields", FIELD_LENGTH)?;
+        if count > FIELDS_MAX {
+            return Err(MessageError::value("fields", count, "up to 256 fields"));
+        }
+        let fields = (0..count).map(|_| field(&mut reader)).collect::<Result<_, _>>()?;
+        let big_endian = reader.u8("is_bigendian")? != 0;
+        let (point_step, row_step) = (reader.u32("point_step")?, reader.u32("row_step")?);
+        let held = reader.count("data", 1)?;
+        let data = reader.take("data", held)?;
+        let dense = reader.u8("is_dense")? != 0;
+        let cloud = Self { header, height, width, fields, big_endian, point_step, row_step, data, dense };
+        cloud.check()?;
+        Ok(cloud)
+    }
+
+    /// Whether there is not one point.
+    pub fn is_empty(&self) -> bool {
+        self.height == 0 || self.width == 0
+    }
+
+    /// The bytes of each point, row by row.
+    pub fn rows(&self) -> impl Iterator<Item = &'a [u8]> + use<'a> {
+        let rows = if self.is_empty() { 0 } else { self.height as usize };
+        let (width, point, row, data) =
+            (self.width as usize, self.point_step as usize, self.row_step as usize, self.data);
+        (0..rows).flat_map(move |index| data[index * row..][..width * point].chunks_exact(point))
+    }
+
+    /// The message, little-endian.
+    pub fn to_cdr(&self) -> Vec<u8> {
+        let mut writer = Writer::default();
+        writer.header(&self.header).u32(self.height).u32(self.width).u32(length(self.fields.len()));
+        for field in &self.fields {
+            writer.text(field.name).u32(field.offset).bytes(&[field.datatype]).u32(field.count);
+        }
+        writer.bytes(&[self.big_endian.into()]).u32(self.point_step).u32(self.row_step);
+        writer.u32(length(self.data.len())).bytes(self.data).bytes(&[self.dense.into()]);
+        writer.finish()
+    }
+
+    fn check(&self) -> Result<(), MessageError> {
+        if self.is_empty() {
+            return Ok(());
+        }
+        if self.point_step == 0 {
+            return Err(MessageError::value("point_step", 0, "at least 1 where there are points"));
+        }
+        let (row, needed) = (u64::from(self.width) * u64::from(self.point_step), u64::from(self.row_step));
+        if needed < row {
+            return Err(MessageError::value("row_step", needed, "at least width times point_step"));
+        }
+        // The last row may lack the padding the others have.
+        let needed = u128::from(needed) * u128::from(self.height - 1) + u128::from(row);
+        if needed > self.data.len() as u128 {
+            let found = format!("{} bytes for {} x {} points", self.data.len(), self.height, self.width);
+            return Err(MessageError::value("data", found, "row_step a row"));
+        }
+        let inside = |field: &&Field| {
+            let size = Datatype::of(field.datatype).map_or(1, Datatype::size);
+            let end = u64::from(field.offset) + u64::from(field.count) * u64::from(size);
+            end <= u64::from(self.point_step)
+        };
+        match self.fields.iter().find(|field| !inside(field)) {
+            None => Ok(()),
+            Some(field) => Err(MessageError::value("fields[]", described(field), "fields that end within point_step")),
+        }
+    }
+}
+
+/// A field in words, for errors.
+pub(crate) fn described(field: &Field) -> String {
+    let Field { name, offset, datatype, count } = field;
+    format!("{name} (offset {offset}, datatype {datatype}, count {count})")
+}
+
+fn field<'a>(reader: &mut Reader<'a>) -> Result<Field<'a>, MessageError> {
+    Ok(Field {
+        name: reader.text("fields[].name")?,
+        offset: reader.u32("fields[].offset")?,
+        datatype: reader.u8("fields[].datatype")?,
+        count: reader.u32("fields[].count")?,
+    })
+}

@@ -1,0 +1,51 @@
+//! One `velodyne_msgs/msg/VelodyneScan` message.
+//!
+//! In: the bytes of a message. Out: header and packets, read in place. Layout: header; packets (count u32, each stamp and
+//! 1,206 bytes).
+
+use crate::cdr::{Header, MessageError, Reader};
+
+/// Bytes of one data packet.
+pub const PACKET_LENGTH: usize = 1206;
+/// Bytes of one packet in a message, less the padding before it.
+const ENTRY_LENGTH: usize = 8 + PACKET_LENGTH;
+
+/// A message, read in place.
+#[derive(Clone, Debug)]
+pub struct VelodyneScan<'a> {
+    /// Stamp, and the sensor's name in the ROS tree.
+    pub header: Header<'a>,
+    /// Packets the message has.
+    pub count: usize,
+    reader: Reader<'a>,
+}
+
+impl<'a> VelodyneScan<'a> {
+    /// Reads the header and finds the packets.
+    ///
+    /// # Errors
+    /// [`MessageError`], also if fewer bytes are left than the packets would take.
+    pub fn new(message: &'a [u8]) -> Result<Self, MessageError> {
+        let mut reader = Reader::new(message)?;
+        let header = reader.header()?;
+        let count = reader.count("packets", ENTRY_LENGTH)?;
+        Ok(Self { header, count, reader })
+    }
+
+    /// The packets in order, each with its stamp, ns since the Unix epoch. An error ends them.
+    pub fn packets(&self) -> impl Iterator<Item = Result<(i64, &'a [u8; PACKET_LENGTH]), MessageError>> + use<'a> {
+        let (mut reader, mut left) = (self.reader.clone(), self.count);
+        std::iter::from_fn(move || {
+            left = left.checked_sub(1)?;
+            let packet = packet(&mut reader);
+            left = if packet.is_err() { 0 } else { left };
+            Some(packet)
+        })
+    }
+}
+
+fn packet<'a>(reader: &mut Reader<'a>) -> Result<(i64, &'a [u8; PACKET_LENGTH]), MessageError> {
+    let stamp_ns = reader.stamp("packets[].stamp")?;
+    let data = reader.take("packets[].data", PACKET_LENGTH)?;
+    Ok((stamp_ns, data.try_into().expect("that many bytes")))
+}

@@ -1,0 +1,97 @@
+//! What rosbags writes is read as it was meant, and what is written here is what rosbags writes.
+
+use clearway_ros::pose::{Odometry, StampedTransform, pose_stamped, tf_message, tf_message_to_cdr};
+use clearway_ros::velodyne_scan::VelodyneScan;
+use clearway_ros::{PointCloud2, Points};
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+
+use crate::{STAMP_NS, golden};
+
+fn points(name: &str) -> Points {
+    Points::of(&PointCloud2::new(&golden(name)).unwrap()).unwrap()
+}
+
+#[test]
+fn seconds_after_the_stamp_are_velodynes() {
+    let read = points("velodyne");
+    assert_eq!((read.x, read.y, read.z), (vec![10.0, 12.0], vec![0.0, 1.0], vec![-2.0, 2.0]));
+    assert_eq!((read.intensity, read.ring), (vec![0.2, 1.0], vec![0, 15]));
+    assert_eq!((read.stamp_ns, read.offset_ns, read.no_returns), (STAMP_NS, vec![-100_000_001, 0], 1));
+}
+
+#[test]
+fn padded_rows_nanoseconds_rings_from_the_top_and_zeros_for_no_return_are_ousters() {
+    let read = points("ouster");
+    assert_eq!((read.x, read.z), (vec![5.0, 5.0, 6.0], vec![1.0, -1.0, -1.0]));
+    assert_eq!((read.ring, read.intensity), (vec![63, 0, 0], vec![0.5, 0.25, 1.0]));
+    assert_eq!((read.stamp_ns, read.no_returns), (STAMP_NS + 100_000_000, 1));
+    assert_eq!(read.offset_ns, [-100_000_000, -100_000_000, 0]);
+}
+
+#[test]
+fn seconds_since_the_epoch_are_hesais_and_big_endian_is_read() {
+    let read = points("hesai_big_endian");
+    assert_eq!((read.x, read.y, read.z), (vec![1.0, 3.0], vec![2.0, 2.0], vec![3.0, -1.0]));
+    assert_eq!((read.stamp_ns, read.offset_ns), (STAMP_NS + 125_000_000, vec![-125_000_000, 0]));
+    assert_eq!((read.ring, read.intensity), (vec![2, 1], vec![0.0, 100.0 / 255.0]));
+}
+
+#[test]
+fn nanoseconds_since_the_epoch_are_livoxs_and_double_positions_are_read() {
+    let read = points("livox");
+    assert_eq!((read.x, read.z, read.ring), (vec![1.0, 3.0], vec![3.0, 1.0], vec![1, 0]));
+    // A double holds ns since the epoch in steps of 256.
+    assert!((read.stamp_ns - STAMP_NS - 62_500_000).abs() <= 128, "{}", read.stamp_ns);
+    assert!((read.offset_ns[0] + 62_500_000).abs() <= 256 && read.offset_ns[1] == 0, "{:?}", read.offset_ns);
+}
+
+#[test]
+fn byte_intensities_and_channels_are_nebulas() {
+    let read = points("nebula");
+    assert_eq!((read.intensity, read.ring), (vec![0.2, 1.0], vec![0, 127]));
+    assert_eq!((read.stamp_ns, read.offset_ns), (STAMP_NS + 99_000_000, vec![-99_000_000, 0]));
+}
+
+#[test]
+fn a_cloud_is_written_as_rosbags_writes_it() {
+    for name in ["velodyne", "ouster", "livox", "nebula"] {
+        let bytes = golden(name);
+        assert_eq!(PointCloud2::new(&bytes).unwrap().to_cdr(), bytes, "{name}");
+    }
+}
+
+fn golden_pose() -> Isometry3<f64> {
+    let rotation = UnitQuaternion::from_quaternion(Quaternion::new(0.8, 0.0, 0.0, 0.6));
+    Isometry3::from_parts(Translation3::new(1.0, 2.0, 3.0), rotation)
+}
+
+#[test]
+fn poses_are_read_with_their_frames_and_speeds() {
+    let bytes = golden("odometry");
+    let odometry = Odometry::new(&bytes).unwrap();
+    assert_eq!((odometry.linear_mps, odometry.angular_rps), ([15.0, 0.5, 0.0], [0.0, 0.0, 0.25]));
+    let StampedTransform { header, child_frame_id, parent_from_child } = odometry.transform.clone();
+    assert_eq!((header.stamp_ns, header.frame_id, child_frame_id), (STAMP_NS, "odom", "base_link"));
+    assert_eq!(parent_from_child, golden_pose());
+    assert_eq!(Odometry::new(&odometry.to_cdr()), Ok(odometry));
+
+    let bytes = golden("pose_stamped");
+    let pose = pose_stamped(&bytes).unwrap();
+    assert_eq!((pose.header.frame_id, pose.parent_from_child), ("map", golden_pose()));
+
+    let bytes = golden("tf_message");
+    let transforms = tf_message(&bytes).unwrap();
+    let frames: Vec<_> = transforms.iter().map(|t| (t.header.frame_id, t.child_frame_id, t.header.stamp_ns)).collect();
+    assert_eq!(frames, [("map", "odom", STAMP_NS), ("odom", "base_link", STAMP_NS - 250_000_000)]);
+    assert_eq!(transforms[1].parent_from_child, golden_pose());
+    assert_eq!(tf_message_to_cdr(&transforms), bytes);
+}
+
+#[test]
+fn packets_are_read_with_their_stamps() {
+    let bytes = golden("velodyne_scan");
+    let scan = VelodyneScan::new(&bytes).unwrap();
+    assert_eq!((scan.header.stamp_ns, scan.header.frame_id, scan.count), (STAMP_NS, "velodyne", 3));
+    let packets: Vec<_> = scan.packets().map(Result::unwrap).map(|(stamp_ns, data)| (stamp_ns, data[1205])).collect();
+    assert_eq!(packets, [0, 1, 2].map(|i| (1_700_000_000_000_000_000 + i64::from(i), i)));
+}

@@ -1,0 +1,78 @@
+//! `[vehicle.ros]`: which ROS 2 topics feed a vehicle.
+
+use std::collections::BTreeMap;
+
+use clearway_mapping::config::SensorConfig;
+use serde::{Deserialize, Serialize};
+
+/// `[vehicle.ros]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Ros {
+    /// `ROS_DOMAIN_ID`.
+    pub domain: u32,
+    /// Odometry or stamped poses; empty: poses come by tf.
+    pub pose: String,
+    /// Without `pose`: the frame tf tells the vehicle's place in; empty: no poses.
+    pub fixed_frame: String,
+    /// The vehicle's own frame, its origin on the ground.
+    pub ego_frame: String,
+    /// Transforms that move; empty: none are heard.
+    pub tf: String,
+    /// Transforms that do not; empty: none are heard.
+    pub tf_static: String,
+    /// Topic of each sensor (PointCloud2 or VelodyneScan), by sensor name.
+    pub sensors: BTreeMap<String, String>,
+}
+
+impl Default for Ros {
+    fn default() -> Self {
+        Self {
+            domain: 0,
+            pose: String::new(),
+            fixed_frame: "odom".into(),
+            ego_frame: "base_link".into(),
+            tf: "/tf".into(),
+            tf_static: "/tf_static".into(),
+            sensors: BTreeMap::new(),
+        }
+    }
+}
+
+impl Ros {
+    /// Checks every value; `Err` has the key, the value and what is allowed.
+    pub(super) fn check(
+        &self,
+        zenoh_enabled: bool,
+        sensors: &[SensorConfig],
+    ) -> Result<(), (&'static str, String, String)> {
+        if !zenoh_enabled {
+            let allowed = "only with zenoh.enabled = true: it comes through zenoh";
+            return Err(("ros", "(set)".into(), allowed.into()));
+        }
+        if self.domain > 232 {
+            return Err(("ros.domain", self.domain.to_string(), "0 to 232".into()));
+        }
+        if let Some(unknown) = self.sensors.keys().find(|name| !sensors.iter().any(|sensor| sensor.name == **name)) {
+            let known: Vec<_> = sensors.iter().map(|sensor| sensor.name.as_str()).collect();
+            let allowed = format!("the vehicle's sensors: {}", known.join(", "));
+            return Err(("ros.sensors", unknown.clone(), allowed));
+        }
+        let topics = self.sensors.values().chain([&self.pose, &self.tf, &self.tf_static]);
+        let mut named: Vec<_> = topics.filter(|topic| !topic.is_empty()).collect();
+        if let Some(topic) = named.iter().find(|topic| !is_topic(topic)) {
+            return Err(("ros", (*topic).clone(), "topics such as \"/sensing/top/points\"".into()));
+        }
+        named.sort_unstable();
+        match named.windows(2).find(|pair| pair[0] == pair[1]) {
+            Some(pair) => Err(("ros", pair[0].clone(), "each topic once".into())),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Whether ROS allows such a topic: parts of letters, digits and underscores, each behind a slash.
+fn is_topic(topic: &str) -> bool {
+    let part = |part: &str| !part.is_empty() && part.bytes().all(|byte| byte == b'_' || byte.is_ascii_alphanumeric());
+    topic.strip_prefix('/').is_some_and(|rest| rest.split('/').all(part))
+}

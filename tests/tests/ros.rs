@@ -1,0 +1,284 @@
+//! ROS 2 users: bags and live topics become the maps that the sensor's own packets make, and what is wrong is counted.
+
+mod house;
+
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+
+use clearway_lidar::model::Model;
+use clearway_lidar::sensor::{Sensor, SensorConfig};
+use clearway_mapping::config::Extrinsics;
+use clearway_mapping::event::Body;
+use clearway_ros::PointCloud2;
+use clearway_ros::cdr::Header;
+use clearway_ros::point_cloud2::Field;
+use clearway_ros::pose::{Odometry, StampedTransform, tf_message_to_cdr};
+use clearway_server::config::Ros;
+use clearway_server::replay::{Mount, Options, ReplayError, Summary, replay};
+use clearway_server::verify::verify;
+use house::{readings, until, within};
+use mcap::records::MessageHeader;
+use nalgebra::{Isometry3, Vector3};
+use zenoh::qos::CongestionControl;
+
+const CLOUD: &str = "sensor_msgs/msg/PointCloud2";
+const ODOMETRY: &str = "nav_msgs/msg/Odometry";
+const TF: &str = "tf2_msgs/msg/TFMessage";
+
+/// Topic, type, when it was logged, and the bytes.
+type Message = (&'static str, &'static str, i64, Vec<u8>);
+
+/// The simulated vehicle's turns as velodyne_pointcloud publishes them, with the stamp of each.
+fn clouds(tenths: i64) -> Vec<(i64, Vec<u8>)> {
+    let mut sensor = Sensor::new(SensorConfig { model: Some(Model::Hdl64eS2), ..SensorConfig::default() });
+    let mut clouds = Vec::new();
+    for reading in readings(tenths) {
+        let Body::Datagram(payload) = reading.body else { continue };
+        let Ok(Some(turn)) = sensor.push(&payload, reading.arrival_ns) else { continue };
+        let mut data = Vec::new();
+        for point in turn.points() {
+            let time = (point.time_ns - turn.end_ns) as f32 * 1e-9;
+            for value in [point.x, point.y, point.z, point.intensity.into()] {
+                data.extend(value.to_le_bytes());
+            }
+            data.extend(point.ring.to_le_bytes());
+            data.extend(time.to_le_bytes());
+        }
+        clouds.push((turn.end_ns, cloud("velodyne", turn.end_ns, &data).to_cdr()));
+    }
+    clouds
+}
+
+/// A cloud of points of 22 bytes.
+fn cloud<'a>(frame_id: &'a str, stamp_ns: i64, data: &'a [u8]) -> PointCloud2<'a> {
+    let fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7), ("ring", 16, 4), ("time", 18, 7)];
+    let field = |(name, offset, datatype)| Field { name, offset, datatype, count: 1 };
+    PointCloud2 {
+        header: Header { stamp_ns, frame_id },
+        height: 1,
+        width: (data.len() / 22) as u32,
+        fields: fields.into_iter().map(field).collect(),
+        big_endian: false,
+        point_step: 22,
+        row_step: data.len() as u32,
+        data,
+        dense: true,
+    }
+}
+
+fn transform<'a>(stamp_ns: i64, parent: &'a str, child: &'a str, [x, y, z]: [f64; 3]) -> StampedTransform<'a> {
+    let parent_from_child = Isometry3::new(Vector3::new(x, y, z), Vector3::zeros());
+    StampedTransform { header: Header { stamp_ns, frame_id: parent }, child_frame_id: child, parent_from_child }
+}
+
+fn odometry(stamp_ns: i64) -> Vec<u8> {
+    let transform = transform(stamp_ns, "odom", "base_link", [7.0, 1.0, 0.0]);
+    Odometry { transform, linear_mps: [0.5, 0.0, 0.0], angular_rps: [0.0; 3] }.to_cdr()
+}
+
+fn bag(file: &Path, messages: &[Message]) {
+    let mut writer = mcap::Writer::new(BufWriter::new(File::create(file).unwrap())).unwrap();
+    for (sequence, (topic, kind, log_ns, bytes)) in messages.iter().enumerate() {
+        let schema = writer.add_schema(kind, "ros2msg", b"").unwrap();
+        let channel_id = writer.add_channel(schema, topic, "cdr", &Default::default()).unwrap();
+        let (log_time, sequence) = (*log_ns as u64, sequence as u32);
+        let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
+        writer.write_to_known_channel(&header, bytes).unwrap();
+    }
+    writer.finish().unwrap();
+}
+
+/// Three turns with odometry between, a map frame, a mount, a second cloud of the same sensor, one put together, and a
+/// broken one.
+fn drive() -> Vec<Message> {
+    let turns = clouds(4);
+    let start_ns = turns[0].0;
+    let mount = [transform(start_ns, "base_link", "velodyne", [0.0, 0.0, 1.9])];
+    let mut messages = vec![
+        ("/tf_static", TF, start_ns, tf_message_to_cdr(&mount)),
+        ("/obstacles", CLOUD, start_ns, cloud("velodyne", start_ns, &[0; 22]).to_cdr()),
+        ("/merged", CLOUD, start_ns, cloud("base_link", start_ns, &[0; 220]).to_cdr()),
+    ];
+    for (stamp_ns, turn) in turns {
+        messages.push(("/odom", ODOMETRY, stamp_ns, odometry(stamp_ns)));
+        messages.push(("/velodyne_points", CLOUD, stamp_ns + 1000, turn));
+    }
+    let broken = messages.last().unwrap().3[..5000].to_vec();
+    messages.push(("/velodyne_points", CLOUD, start_ns + 400_000_000, broken));
+    messages
+}
+
+async fn replayed(options: Options) -> Result<Summary, ReplayError> {
+    within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await
+}
+
+fn options(file: &Path) -> Options {
+    Options { files: vec![file.to_owned()], model: Some(Model::Hdl64eS2), ..Options::default() }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bag_of_clouds_odometry_and_tf_is_mapped_where_tf_puts_the_sensor_recorded_and_verified() {
+    let folder = tempfile::tempdir().unwrap();
+    let (file, record) = (folder.path().join("bag.mcap"), folder.path().join("maps.mcap"));
+    let messages = drive();
+    let turns = messages.iter().filter(|(topic, ..)| *topic == "/odom").count() as u64;
+    bag(&file, &messages);
+    let summary = replayed(Options { record: Some(record.clone()), ..options(&file) }).await.unwrap();
+
+    let ledger = &summary.snapshot.ledger;
+    assert!(turns >= 3);
+    assert_eq!((summary.snapshot.maps, ledger.decoded, ledger.poses, ledger.poses_refused), (turns, turns, turns, 0));
+    assert_eq!((ledger.refused["ros_truncated"], ledger.received), (1, turns + 1));
+    assert!(
+        matches!(&summary.mount, Mount::Tf { ego_frame, frame_id } if ego_frame == "base_link" && frame_id == "velodyne")
+    );
+    assert_eq!(summary.extrinsics, Extrinsics { z_m: 1.9, ..summary.extrinsics });
+    assert!(summary.snapshot.drivable_share.unwrap() > 0.3, "{:?}", summary.snapshot.drivable_share);
+    let notes = summary.notes.join("\n");
+    for said in [
+        "/velodyne_points was taken, its frame velodyne placed by tf",
+        "/odom was taken for poses of base_link",
+        "/obstacles (sensor_msgs/msg/PointCloud2) was left alone",
+        "/merged (sensor_msgs/msg/PointCloud2) was left alone",
+        "/velodyne_points: 1 messages refused, the first: data needs",
+    ] {
+        assert!(notes.contains(said), "{said:?} is not in {notes}");
+    }
+    let report = verify(&record).unwrap();
+    assert!(report.is_good() && report.maps == turns, "{:?}", report.differences);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_cloud_of_the_points_makes_nearly_the_map_of_the_packets() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("bag.mcap");
+    bag(&file, &drive());
+    let summary = replayed(options(&file)).await.unwrap();
+    let running = house::start(house::config()).await;
+    house::feed(&running, readings(4)).await;
+    let packets = running.vehicles.0[0].status.snapshot().drivable_share.unwrap();
+    running.shutdown().await.unwrap();
+    let clouds = summary.snapshot.drivable_share.unwrap();
+    assert!((packets - clouds).abs() < 0.02, "{packets} of packets, {clouds} of clouds");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn topics_are_taken_as_asked_for_and_one_that_is_not_there_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("bag.mcap");
+    bag(&file, &drive());
+    let asked = |topics: &[&str]| Options { topics: topics.iter().map(|&t| t.into()).collect(), ..options(&file) };
+    let summary = replayed(asked(&["/merged"])).await.unwrap();
+    assert!(
+        summary.notes.join("\n").contains("/merged was taken; tf does not place its frame base_link 0.1 to 20 m"),
+        "{:?}",
+        summary.notes
+    );
+    assert_eq!(summary.snapshot.ledger.received, 1);
+    let error = replayed(asked(&["/nowhere"])).await.unwrap_err().to_string();
+    assert!(
+        error.contains("--topic /nowhere: the file has") && error.contains("/odom (nav_msgs/msg/Odometry)"),
+        "{error}"
+    );
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn without_an_odometry_the_chain_of_tf_gives_poses_and_speed_and_a_bag_in_two_files_is_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let files = [0, 1].map(|part| folder.path().join(format!("bag_{part}.mcap")));
+    let mut messages = drive();
+    messages.pop();
+    let stamps: Vec<i64> = messages.iter().filter(|m| m.0 == "/odom").map(|m| m.2).collect();
+    for message in messages.iter_mut().filter(|m| m.0 == "/odom") {
+        let x = (message.2 - stamps[0]) as f64 * 1e-9 * 12.0;
+        *message =
+            ("/tf", TF, message.2, tf_message_to_cdr(&[transform(message.2, "odom", "base_link", [x, 0.0, 0.0])]));
+    }
+    // A localisation stamps ahead and seldom; it moves the chain, and makes no pose of its own.
+    let ahead = transform(stamps[0] + 500_000_000, "map", "odom", [100.0, 0.0, 0.0]);
+    messages.insert(1, ("/tf", TF, stamps[0], tf_message_to_cdr(&[ahead])));
+    let (first, second) = messages.split_at(messages.len() - 2);
+    bag(&files[0], first);
+    bag(&files[1], second);
+    let record = folder.path().join("maps.mcap");
+    let summary =
+        replayed(Options { files: files.to_vec(), record: Some(record.clone()), ..options(&files[0]) }).await.unwrap();
+    let ledger = &summary.snapshot.ledger;
+    // The first only begins.
+    assert_eq!((ledger.poses, ledger.poses_refused), (stamps.len() as u64 - 1, 0));
+    assert_eq!(summary.snapshot.maps, stamps.len() as u64);
+    assert!(summary.notes.join("\n").contains("tf was taken for poses of base_link in map"), "{:?}", summary.notes);
+    for entry in clearway_server::recording::Recording::open(&record).unwrap() {
+        let clearway_server::recording::Entry::Event { event, .. } = entry.unwrap() else { continue };
+        let Body::EgoPose(pose) = event.body else { continue };
+        assert!((pose.speed_mps - 12.0).abs() < 1e-6, "{pose:?}");
+        assert!(stamps.contains(&pose.stamp_ns) && pose.map_from_ego.translation.x >= 100.0, "{pose:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn live_topics_of_rmw_zenoh_reach_the_map_and_strangers_are_counted() {
+    let mut config = house::config();
+    config.zenoh.enabled = true;
+    config.vehicles[0].udp = None;
+    config.vehicles[0].sensors[0].model = Some(Model::Hdl64eS2);
+    let sensors = [("top".to_owned(), "/velodyne_points".to_owned())].into();
+    config.vehicles[0].ros = Some(Ros { domain: 7, pose: "/odom".into(), sensors, ..Ros::default() });
+    config.check(Path::new("test")).unwrap();
+    let running = house::start(config).await;
+    let status = running.vehicles.0[0].status.clone();
+
+    let mut peer = zenoh::Config::default();
+    let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).unwrap();
+    peer.insert_json5("mode", "\"client\"").unwrap();
+    peer.insert_json5("connect/endpoints", &format!("[{endpoint:?}]")).unwrap();
+    peer.insert_json5("scouting/multicast/enabled", "false").unwrap();
+    let session = within("zenoh", zenoh::open(peer).into_future()).await.unwrap();
+    let attachment = |sequence: i64| [&sequence.to_le_bytes()[..], &9_i64.to_le_bytes(), &[16], &[3; 16]].concat();
+    let cloud_key = "7/velodyne_points/sensor_msgs::msg::dds_::PointCloud2_/RIHS01_00";
+    let odometry_key = "7/odom/nav_msgs::msg::dds_::Odometry_/TypeHashNotSupported";
+    // Reliable, as rmw_zenoh declares it: megabytes at once would be dropped else.
+    let publisher = |key| session.declare_publisher(key).congestion_control(CongestionControl::Block);
+    let string_key = "7/velodyne_points/std_msgs::msg::dds_::String_/h";
+    let [cloud, odom, string] = [cloud_key, odometry_key, string_key].map(publisher);
+    let (cloud, odom, string) = (cloud.await.unwrap(), odom.await.unwrap(), string.await.unwrap());
+    for publisher in [&cloud, &odom] {
+        let matching = publisher.matching_listener().await.unwrap();
+        while !publisher.matching_status().await.unwrap().matching() {
+            within("the server listens", matching.recv_async()).await.unwrap();
+        }
+    }
+    let turns = clouds(4);
+    for (sequence, (stamp_ns, turn)) in (0..).zip(&turns) {
+        odom.put(odometry(*stamp_ns)).await.unwrap();
+        // Of the cloud's row two numbers are missing before the last.
+        let last = sequence + 1 == turns.len() as i64;
+        let sequence = if last { sequence + 2 } else { sequence };
+        cloud.put(turn.clone()).attachment(attachment(sequence)).await.unwrap();
+    }
+    // Another type, and bytes that are none.
+    string.put(vec![0, 1, 0, 0]).await.unwrap();
+    odom.put(vec![0, 1, 0, 0, 1]).attachment(vec![1, 2, 3]).await.unwrap();
+    let n = turns.len() as u64;
+    until("all is taken or refused", || {
+        let ledger = status.snapshot().ledger;
+        ledger.poses == n && ledger.decoded == n && ledger.refused.len() == 2
+    })
+    .await;
+    let snapshot = status.snapshot();
+    assert_eq!((snapshot.maps, snapshot.ledger.lost), (n, 2));
+    assert_eq!((snapshot.ledger.refused["ros_type"], snapshot.ledger.refused["ros_truncated"]), (1, 1));
+    assert!(snapshot.drivable_share.unwrap() > 0.3);
+    session.close().await.unwrap();
+    running.shutdown().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+async fn a_sqlite3_bag_is_refused_with_the_command_that_converts_it() {
+    let folder = "ros2bag/nebula/decoder_ground_truth/vlp16/1673400471837873222";
+    let file: PathBuf = Path::new(env!("CLEARWAY_DATA")).join(folder);
+    let error = replayed(options(&file)).await.unwrap_err().to_string();
+    assert!(error.contains("_0.db3: a ROS 2 bag in sqlite3") && error.contains("ros2 bag convert -i"), "{error}");
+}
