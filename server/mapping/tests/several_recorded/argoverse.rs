@@ -93,13 +93,11 @@ fn unpack(block: &[u8], out: &mut Vec<u8>) {
     let mut bytes = block.iter().map(|byte| usize::from(*byte));
     while let Some(token) = bytes.next() {
         let length = |short: usize, bytes: &mut dyn Iterator<Item = usize>| {
+            let mut more = if short == 15 { 255 } else { 0 };
             let mut length = short;
-            while short == 15 {
-                let more = bytes.next().unwrap();
+            while more == 255 {
+                more = bytes.next().unwrap();
                 length += more;
-                if more < 255 {
-                    break;
-                }
             }
             length
         };
