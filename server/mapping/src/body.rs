@@ -53,15 +53,16 @@ impl Body {
     /// Whether the way from the sensor to the point has a part inside: the slabs' shares of the way overlap.
     fn crosses(&self, point_m: [f32; 3]) -> bool {
         let (mut enter, mut leave) = (0.0f32, 1.0f32);
-        for axis in 0..3 {
-            let (from, way) = (self.sensor_m[axis], point_m[axis] - self.sensor_m[axis]);
+        let slabs = self.min_m.iter().zip(&self.max_m);
+        for ((&from, &to), (&min, &max)) in self.sensor_m.iter().zip(&point_m).zip(slabs) {
+            let way = to - from;
             if way == 0.0 {
-                if !(self.min_m[axis]..=self.max_m[axis]).contains(&from) {
+                if !(min..=max).contains(&from) {
                     return false;
                 }
                 continue;
             }
-            let (a, b) = ((self.min_m[axis] - from) / way, (self.max_m[axis] - from) / way);
+            let (a, b) = ((min - from) / way, (max - from) / way);
             (enter, leave) = (enter.max(a.min(b)), leave.min(a.max(b)));
         }
         enter < leave

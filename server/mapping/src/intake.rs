@@ -297,10 +297,15 @@ fn look_for_no_returns(revolution: &Revolution, mount: &Mount, moved: &Moved, no
             .get(number / KNOT_FIRINGS)
             .map_or(mount.ego_from_sensor, |end_from_ego| end_from_ego * mount.ego_from_sensor);
         for (_, &(rotation, [up, flat])) in range_m.iter().zip(&lasers).filter(|(range, _)| **range == 0.0) {
-            let (sin, cos) = (firing.azimuth_rad - rotation).sin_cos();
-            no_returns.push(turned(&ego_from_sensor, [flat * cos, -flat * sin, up]));
+            no_returns.push(turned(&ego_from_sensor, direction(firing.azimuth_rad - rotation, [up, flat])));
         }
     }
+}
+
+/// Of a laser with this sine and cosine of its elevation, sensor's frame; azimuths run clockwise.
+fn direction(azimuth_rad: f32, [up, flat]: [f32; 2]) -> [f32; 3] {
+    let (sin, cos) = azimuth_rad.sin_cos();
+    [flat * cos, -flat * sin, up]
 }
 
 fn turned(by: &Isometry3<f64>, direction: [f32; 3]) -> [f32; 3] {
@@ -324,4 +329,45 @@ fn completeness(revolution: &Revolution) -> f32 {
         seen[(degree as usize).min(359)] = true;
     }
     seen.iter().filter(|s| **s).count() as f32 / 360.0
+}
+
+#[cfg(test)]
+mod tests {
+    use clearway_lidar::model::Model;
+    use clearway_sim::scanner::ScannerConfig;
+    use clearway_sim::scenes;
+    use clearway_sim::vehicle::SimulatedVehicle;
+
+    use super::*;
+
+    #[test]
+    fn a_ray_without_a_return_points_where_its_laser_did() {
+        let config = ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() };
+        let revolution = SimulatedVehicle::new(scenes::flat(), config).revolution(1);
+        let echo = &revolution.echoes[0];
+        let at = |slot: usize| (slot / revolution.lasers, slot % revolution.lasers);
+        let mut checked = 0;
+        for slot in (0..echo.range_m.len()).filter(|slot| echo.range_m[*slot] > 5.0) {
+            let (firing, laser) = at(slot);
+            let laser = &revolution.calibration.lasers[laser];
+            let elevation = [laser.vert_correction.sin() as f32, laser.vert_correction.cos() as f32];
+            let ray = direction(revolution.firings[firing].azimuth_rad - laser.rot_correction as f32, elevation);
+            let along = [echo.x[slot], echo.y[slot], echo.z[slot]].iter().zip(ray).map(|(p, r)| p * r).sum::<f32>();
+            // Half a degree.
+            assert!(along / echo.range_m[slot] > 0.99996, "slot {slot}");
+            checked += 1;
+        }
+        assert!(checked > 5000);
+        let turned = Isometry3::new(Vector3::new(0.0, 0.0, 1.9), Vector3::new(0.0, 0.0, std::f64::consts::FRAC_PI_2));
+        let (mut level, mut left) = (Vec::new(), Vec::new());
+        let mut mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
+        look_for_no_returns(&revolution, &mount, &Moved::default(), &mut level);
+        mount.ego_from_sensor = turned;
+        look_for_no_returns(&revolution, &mount, &Moved::default(), &mut left);
+        assert_eq!(level.len(), echo.range_m.iter().filter(|range| **range == 0.0).count());
+        assert!(level.len() > 10_000 && level.iter().any(|ray| ray[2] > 0.2), "the sky gives nothing back");
+        for (level, left) in level.iter().zip(&left) {
+            assert!((level[0] - left[1]).abs() < 1e-5 && (level[1] + left[0]).abs() < 1e-5 && level[2] == left[2]);
+        }
+    }
 }
