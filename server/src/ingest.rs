@@ -160,15 +160,16 @@ impl Door {
         strangers.push_back(Stranger { address, datagrams, newest_ns: now_ns() });
     }
 
-    /// Tells the engine of all that stayed outside, waiting for space: nothing will enter after it.
+    /// Tells the engine of all that stayed outside, waiting for space. For the end, when nothing will follow that would bring it along.
     ///
     /// # Errors
     /// [`Closed`] when the engine has stopped.
     pub fn close(&self) -> Result<(), Closed> {
         let mut inside = locked(&self.shared);
-        let untold = std::mem::take(&mut *locked(&self.outside.untold));
-        for ((cause, source), count) in untold {
-            inside.wait(Reading { arrival_ns: now_ns(), source, body: Body::Lost { cause, count } })?;
+        let next = || locked(&self.outside.untold).pop_first();
+        while let Some(((cause, source), count)) = next() {
+            let told = inside.wait(Reading { arrival_ns: now_ns(), source, body: Body::Lost { cause, count } });
+            told.inspect_err(|_| self.leave_outside(source, cause, count))?;
         }
         Ok(())
     }

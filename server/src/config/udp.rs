@@ -149,7 +149,8 @@ pub fn listeners(vehicles: &[Vehicle]) -> Vec<Listener> {
             let own = udp.ports.get(&sensor.name);
             let named = own.is_some() || udp.from.contains_key(&sensor.name);
             // Where any sensor is named, the others are fed by other doors.
-            if !named && !(udp.from.is_empty() && udp.ports.is_empty()) {
+            let any_named = !udp.from.is_empty() || !udp.ports.is_empty();
+            if any_named && !named {
                 continue;
             }
             let route = Route { from: udp.from.get(&sensor.name).copied(), vehicle: index, source };

@@ -153,6 +153,7 @@ fn read(socket: Socket, listener: &Listener, doors: &[Door], stopped: &PipeReade
     let mut batch = Vec::with_capacity(BATCH);
     while wait(receiver.socket(), stopped)? {
         match receiver.receive(&mut batch) {
+            // Any of them may have been meant.
             Ok(drops) => heard.iter().for_each(|heard| heard.door.leave_outside(0, Cause::Kernel, drops)),
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => continue,
             // It belongs to one datagram (an ICMP answer, say); the socket goes on.

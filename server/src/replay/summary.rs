@@ -66,7 +66,7 @@ impl Summary {
         json!({
             "packets": self.snapshot.packets_json(),
             "telemetry": ledger.telemetry,
-            "lost": ledger.lost,
+            "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
             "revolutions": self.snapshot.revolutions(),
             "maps": self.snapshot.maps,
             "sensors": sensors.collect::<Vec<_>>(),
