@@ -129,7 +129,7 @@ async fn a_bag_of_clouds_odometry_and_tf_is_mapped_where_tf_puts_the_sensor_reco
     let ledger = &summary.snapshot.ledger;
     assert!(turns >= 3);
     assert_eq!((summary.snapshot.maps, ledger.decoded, ledger.poses, ledger.poses_refused), (turns, turns, turns, 0));
-    assert_eq!((ledger.refused["ros_truncated"], ledger.received), (1, turns + 1));
+    assert_eq!((ledger.refused["observation"], ledger.received), (1, turns + 1));
     assert!(
         matches!(&summary.mount, Mount::Tf { ego_frame, frame_id } if ego_frame == "base_link" && frame_id == "velodyne")
     );
@@ -268,7 +268,7 @@ async fn live_topics_of_rmw_zenoh_reach_the_map_and_strangers_are_counted() {
     .await;
     let snapshot = status.snapshot();
     assert_eq!((snapshot.maps, snapshot.ledger.lost), (n, 2));
-    assert_eq!((snapshot.ledger.refused["ros_type"], snapshot.ledger.refused["ros_truncated"]), (1, 1));
+    assert_eq!(snapshot.ledger.refused["observation"], 2);
     assert!(snapshot.drivable_share.unwrap() > 0.3);
     session.close().await.unwrap();
     running.shutdown().await.unwrap();

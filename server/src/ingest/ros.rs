@@ -64,17 +64,6 @@ pub enum Refused {
     },
 }
 
-impl Refused {
-    /// The ledger's word for it.
-    pub fn reason(&self) -> &'static str {
-        match self {
-            Self::Message(error) => error.reason(),
-            Self::Kind { .. } => "ros_type",
-            Self::Frame { .. } | Self::Frames { .. } => "ros_frame",
-        }
-    }
-}
-
 /// The chosen topics of one vehicle, and what their messages have told so far.
 #[derive(Clone, Debug)]
 pub struct Intake {

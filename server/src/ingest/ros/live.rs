@@ -106,13 +106,13 @@ impl Ear {
         self.door.leave_outside(self.intake.source(topic), Cause::Queue, missing);
         let name = sample.key_expr().as_str().rsplit('/').nth(1).unwrap_or_default();
         let Some(kind) = Kind::of(name) else {
-            tracing::debug!(topic, name, "ros: not a type that is read");
+            tracing::info!(topic, name, "ros: not a type that is read");
             return self.door.leave_outside(0, Cause::Observation, 1);
         };
         let bytes = sample.payload().to_bytes().into_owned().into();
         let mut readings = VecDeque::new();
         if let Err(refused) = self.intake.take(topic, kind, 0, &bytes, &mut readings) {
-            tracing::debug!(topic, %refused, "ros: refused");
+            tracing::info!(topic, %refused, "ros: refused");
             return self.door.leave_outside(0, Cause::Observation, 1);
         }
         for reading in readings {
