@@ -62,6 +62,13 @@ impl Stream {
         bytes
     }
 
+    /// A packet with the time of the one at `index`.
+    pub fn at_time_of(&self, index: usize, packet: &[u8]) -> Vec<u8> {
+        let mut packet = packet.to_vec();
+        packet[1200..1204].copy_from_slice(&self.packet(index)[1200..1204]);
+        packet
+    }
+
     pub fn arrival_ns(&self, index: usize) -> i64 {
         START_NS + self.time_ns(index + 1, 0) as i64
     }
