@@ -136,7 +136,7 @@ impl Decoder {
         let span_ns = i64::from(self.spec.packet_period_ns(mode));
         let time_ns = self.clock.timeline_ns(device_us, arrival_ns, span_ns);
 
-        let torn = self.take_gap(packet.azimuth(0), gap);
+        let torn = self.take_gap(firings.azimuths(), gap);
         let first_row = self.current.firings.len();
         let cut = self.follow(&firings, time_ns, torn, may_cut && !done);
         self.decode(packet, 0, first_row);
@@ -259,12 +259,12 @@ impl Decoder {
     }
 
     /// Takes note of what is missing before a packet; whether that is a turn or more, or nobody knows how much.
-    fn take_gap(&mut self, azimuth: u32, gap: Gap) -> bool {
+    fn take_gap(&mut self, azimuths: &[u32], gap: Gap) -> bool {
         let span = self.expected() * self.spec.firings_per_packet(self.mode) as u32;
         if gap.jumped {
             self.loss.jump();
         }
-        let lost = self.loss.take(gap.missing, azimuth, span);
+        let lost = self.loss.take(gap, azimuths, span);
         let torn = gap.jumped || u64::from(gap.missing) * u64::from(span) >= u64::from(AZIMUTHS_PER_TURN);
         if !self.current.firings.is_empty() {
             self.current.packets_expected = self.current.packets_expected.saturating_add(lost);

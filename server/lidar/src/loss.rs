@@ -6,6 +6,7 @@
 
 use crate::firing::forward;
 use crate::model::AZIMUTHS_PER_TURN;
+use crate::order::Gap;
 
 /// Gaps shorter than this are no field of view: 15 degrees, counts.
 const DARK_MIN: u32 = 1_500;
@@ -28,16 +29,17 @@ pub(crate) struct Loss {
     doubtful: Option<Dark>,
     /// The field of view's dark sector.
     dark: Option<Dark>,
-    /// Where the packet before began, and counts it turned.
-    before: Option<(u32, u32)>,
+    /// Where the packet before ended.
+    before: Option<u32>,
 }
 
 impl Loss {
-    /// Takes a packet that begins at `azimuth` and turns `span` counts, with `missing` before it; gives how many of them
-    /// may have been lost.
-    pub fn take(&mut self, missing: u32, azimuth: u32, span: u32) -> u32 {
-        let from = self.before.replace((azimuth, span)).map_or(azimuth, |(azimuth, span)| azimuth + span);
-        let from = from % AZIMUTHS_PER_TURN;
+    /// Takes a packet with firings at these azimuths that turns `span` counts, and what is missing before it; gives how many
+    /// packets may have been lost.
+    pub fn take(&mut self, gap: Gap, azimuths: &[u32], span: u32) -> u32 {
+        let missing = gap.missing;
+        let (Some(&azimuth), Some(&last)) = (azimuths.first(), azimuths.last()) else { return 0 };
+        let from = self.before.replace((last + span / azimuths.len() as u32) % AZIMUTHS_PER_TURN).unwrap_or(azimuth);
         let reach = WANDER_PACKETS * span;
         let lights = |dark: &Dark| {
             let inside = forward(dark.from, azimuth);
@@ -47,6 +49,9 @@ impl Loss {
             self.lost += u64::from(lost.packets);
         }
         self.dark.take_if(|dark| lights(dark));
+        if gap.dark > 0 {
+            self.see_dark_inside(azimuths, gap.dark, span);
+        }
         if missing == 0 {
             return 0;
         }
@@ -71,6 +76,16 @@ impl Loss {
         missing
     }
 
+    /// The field of view ends and begins again inside a packet: nothing was lost there.
+    fn see_dark_inside(&mut self, azimuths: &[u32], packets: u32, span: u32) {
+        let steps = azimuths.windows(2).map(|pair| Dark { from: pair[0], to: pair[1], packets });
+        let Some(dark) = steps.max_by_key(Dark::width) else { return };
+        if dark.width() >= DARK_MIN {
+            self.doubtful.take_if(|gap| gap.is_about(&dark, WANDER_PACKETS * span));
+            self.dark = Some(dark);
+        }
+    }
+
     /// Packets lost so far, and of which it is certain.
     pub fn lost(&self) -> u64 {
         self.lost
@@ -89,6 +104,10 @@ impl Loss {
 }
 
 impl Dark {
+    fn width(&self) -> u32 {
+        forward(self.from, self.to)
+    }
+
     fn is_about(&self, other: &Dark, reach: u32) -> bool {
         near(self.from, other.from, reach) && near(self.to, other.to, reach)
     }

@@ -26,6 +26,8 @@ const PAUSE_US_MAX: i64 = 1_000_000;
 /// the device's clock was set.
 const PLAYED_FASTEST: i64 = 20;
 const US_PER_HOUR: i64 = 3_600_000_000;
+/// How long a sensor was dark inside a packet is known to this many packet periods.
+const DARK_SLACK: i64 = 3;
 /// Counts a block that no sensor exceeds: 4 degrees.
 const STEP_MAX: u32 = 400;
 
@@ -34,6 +36,8 @@ const STEP_MAX: u32 = 400;
 pub(crate) struct Gap {
     /// Packets that did not come.
     pub missing: u32,
+    /// Packet periods for which the sensor was dark while it filled the packet itself.
+    pub dark: u32,
     /// The device's time was set, or it was restarted.
     pub jumped: bool,
 }
@@ -55,6 +59,8 @@ struct Mark {
     azimuth: u32,
     /// Counts from this packet's beginning to the next one's.
     span: u32,
+    /// Counts inside this packet in which a sensor with a field of view was dark.
+    dark: u32,
     period_ns: i64,
     /// Packet periods until the next packet: one, and those in which a sensor with a field of view was dark.
     length: i64,
@@ -82,6 +88,8 @@ pub(crate) struct Order {
     newest: Option<(Mark, i64, i64)>,
     /// Place and length of the packet that passed last.
     passed: Option<(i64, i64)>,
+    /// 256ths of a count that the sensor turns a packet, the mean of the last 16 or so.
+    span_mean: Option<u32>,
     /// Those that passed lately.
     remembered: VecDeque<Mark>,
     /// A packet out of line, which was refused.
@@ -100,18 +108,16 @@ impl Order {
         mode: ReturnMode,
         arrival_ns: i64,
     ) -> Result<Way, Refusal> {
-        let mark = Mark::of(packet, spec, mode);
+        let mut mark = Mark::of(packet, spec, mode);
+        self.measure(&mut mark);
         let (place, jumped) = self.place(&mark, arrival_ns)?;
         self.jump = None;
         if self.newest.is_none_or(|(_, newest, _)| newest <= place) {
             self.newest = Some((mark, place, arrival_ns));
         }
-        if let Some((last, length)) = self.passed
-            && self.waiting.is_empty()
-            && place <= last + length
-        {
+        if self.waiting.is_empty() && self.missing_before(place).is_some_and(|missing| missing <= 0) {
             self.pass(&mark, place);
-            return Ok(Way::Next(Gap { missing: 0, jumped }));
+            return Ok(Way::Next(Gap { missing: 0, dark: mark.dark_periods(), jumped }));
         }
         let payload = *packet.bytes();
         let waiting = match self.spare.pop() {
@@ -132,17 +138,19 @@ impl Order {
         let first = self.waiting.front()?;
         let (_, newest, _) = self.newest?;
         // The packet before the first one waiting would have come by now.
-        let due = match self.passed {
-            Some((last, length)) => first.place <= last + length || newest > last + length + REORDER_PACKETS as i64,
-            None => newest >= first.place + REORDER_PACKETS as i64,
+        let reach = REORDER_PACKETS as i64;
+        let due = match self.missing_before(first.place) {
+            Some(missing) => missing <= 0 || newest - first.place + missing > reach,
+            None => newest - first.place >= reach,
         };
         if !due && !end {
             return None;
         }
         let first = self.waiting.pop_front()?;
-        let missing = self.passed.map_or(0, |(last, length)| (first.place - last - length).max(0));
+        let missing = self.missing_before(first.place).map_or(0, |missing| missing.max(0));
         self.pass(&first.mark, first.place);
-        let gap = Gap { missing: u32::try_from(missing).unwrap_or(u32::MAX), jumped: first.jumped };
+        let missing = u32::try_from(missing).unwrap_or(u32::MAX);
+        let gap = Gap { missing, dark: first.mark.dark_periods(), jumped: first.jumped };
         let packet = Packet::new(&first.payload[..]).expect("it was taken before it was held");
         let said = decode(&packet, first.arrival_ns, gap);
         self.spare.push(first);
@@ -158,6 +166,26 @@ impl Order {
     pub fn forget(&mut self) {
         (self.newest, self.passed, self.jump) = (None, None, None);
         self.remembered.clear();
+    }
+
+    /// Packet periods between the packet that passed last and a place; `None` where a stream begins.
+    fn missing_before(&self, place: i64) -> Option<i64> {
+        let (last, length) = self.passed?;
+        let missing = place - last - length;
+        let dark = length > 1;
+        Some(if dark && missing <= DARK_SLACK { missing.min(0) } else { missing })
+    }
+
+    /// How long a packet is follows from how fast the sensor turns: one packet alone tells that to 5 % only.
+    fn measure(&mut self, mark: &mut Mark) {
+        let span = 256 * mark.span;
+        if mark.dark == 0 {
+            let mean = self.span_mean.filter(|mean| span.abs_diff(*mean) < *mean / 4);
+            self.span_mean = Some(mean.map_or(span, |mean| (15 * mean + span + 8) / 16));
+            return;
+        }
+        let mean = self.span_mean.unwrap_or(span).max(1);
+        mark.length = 1 + i64::from((256 * mark.dark + mean / 2) / mean);
     }
 
     fn pass(&mut self, mark: &Mark, place: i64) {
@@ -210,27 +238,33 @@ impl Mark {
         let blocks = spec.blocks_per_firing * echoes;
         let columns = (BLOCKS_PER_PACKET / blocks) as u32;
         let azimuth = packet.azimuth(0);
-        let (mut span, mut length) = (0, 1);
+        let (mut span, mut dark) = (0, 0);
         if columns > 1 {
             let last = (columns as usize - 1) * blocks;
             let ends = [(0, blocks), (last - blocks, last)];
             let step = ends.map(|(from, to)| forward(packet.azimuth(from), packet.azimuth(to))).into_iter().min();
             let step = step.filter(|step| *step <= STEP_MAX).unwrap_or(0);
-            span = step * columns;
-            // Where the field of view ends inside a packet, the sensor is dark until it begins again.
-            let dark = forward(azimuth, packet.azimuth(last)).saturating_sub(span);
-            if step > 0 && dark < AZIMUTHS_PER_TURN - STEP_MAX {
-                length += i64::from((dark + span / 2) / span);
+            let turned = forward(azimuth, packet.azimuth(last));
+            if turned <= 2 * step * columns {
+                span = (turned * columns + columns / 2) / (columns - 1);
+            } else if step > 0 && turned < AZIMUTHS_PER_TURN - STEP_MAX {
+                // The field of view ends inside the packet: the sensor was dark until it began again.
+                (span, dark) = (step * columns, turned - step * (columns - 1));
             }
         }
         Self {
             device_us: (!timeless).then(|| packet.device_us()),
             azimuth,
             span,
+            dark,
             period_ns: i64::from(spec.packet_period_ns(mode)),
-            length,
+            length: 1,
             sum: if timeless { sum(packet.bytes()) } else { 0 },
         }
+    }
+
+    fn dark_periods(&self) -> u32 {
+        (self.length - 1) as u32
     }
 
     /// Packet periods from this packet to another, by device time; where that does not tell, by azimuth, within half a

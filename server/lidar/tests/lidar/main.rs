@@ -4,6 +4,7 @@ mod calibration;
 mod capture;
 mod corpora;
 mod models;
+mod order;
 mod properties;
 mod stream;
 mod telemetry;
