@@ -1,5 +1,6 @@
 //! What the decoder does with streams made here, sound and damaged.
 
+mod bad_datagrams;
 mod calibration;
 mod capture;
 mod corpora;
