@@ -204,7 +204,7 @@ fn golden_map() -> (v1::Header, v1::Layer, v1::Layer) {
             returns: 110_000,
             rpm: 600.0,
             completeness: 1.0,
-            partial: String::new(),
+            ..v1::SensorState::default()
         }],
         compensation: "poses".into(),
     };

@@ -102,6 +102,14 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
         rpm: state.rpm,
         completeness: state.completeness,
         partial: state.partial.to_owned(),
+        packets_expected: state.packets_expected,
+        blocked_sectors: state
+            .blocked
+            .sectors
+            .iter()
+            .map(|sector| v1::BlockedSector { from_deg: sector.from_deg.into(), to_deg: sector.to_deg.into() })
+            .collect(),
+        blocked_lasers: state.blocked.lasers.iter().map(|&laser| laser.into()).collect(),
     }
 }
 

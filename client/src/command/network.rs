@@ -9,7 +9,7 @@ const PACKETS_A_BURST: f64 = 200.0;
 
 /// What the network does to the datagrams on their way.
 #[derive(Args)]
-pub struct Options {
+pub struct Network {
     /// Share of the datagrams to lose, percent.
     #[arg(long, default_value = "0", value_name = "PERCENT", value_parser = share)]
     loss: f64,
@@ -41,7 +41,7 @@ fn share(text: &str) -> Result<f64, String> {
     percent.map(|percent: f64| percent / 100.0).ok_or_else(|| "0 to 100 percent is allowed".into())
 }
 
-impl Options {
+impl Network {
     /// What was asked for; `None`: nothing.
     pub fn faults(&self) -> Option<Faults> {
         let faults = Faults {

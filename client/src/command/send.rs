@@ -41,7 +41,7 @@ pub struct Options {
     #[arg(long, default_value = "1", value_name = "X|max", value_parser = speed)]
     speed: Speed,
     #[command(flatten)]
-    network: network::Options,
+    network: network::Network,
     /// Print one JSON object at the end.
     #[arg(long)]
     json: bool,

@@ -1,5 +1,6 @@
 //! What a map is: a header, and layers of channels over one grid each. Class 0 is unknown everywhere, and is never free.
 
+use clearway_lidar::blocked::Blocked;
 use nalgebra::Isometry3;
 
 use crate::motion::Compensation;
@@ -38,6 +39,8 @@ pub struct SensorState {
     pub model: String,
     /// Data packets of this revolution.
     pub packets: u32,
+    /// The same and those that were missing before them, ±1 a gap; 0 for a scan.
+    pub packets_expected: u32,
     /// Datagrams refused since the start.
     pub refused: u64,
     /// Returns in this revolution.
@@ -48,6 +51,8 @@ pub struct SensorState {
     pub completeness: f32,
     /// `start`, `end`, `gap`, `reversal`, `overlong`, or empty for a whole turn.
     pub partial: &'static str,
+    /// Where the sensor used to see and did not in this revolution.
+    pub blocked: Blocked,
 }
 
 /// One named grid.

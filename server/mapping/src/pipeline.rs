@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use clearway_lidar::blocked::Blocked;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::{Partial, Revolution};
@@ -397,11 +398,13 @@ impl Maker {
             name: config.sensors[0].name.clone(),
             model: model_name(revolution.model).to_owned(),
             packets: revolution.packets,
+            packets_expected: revolution.packets_expected,
             refused,
             returns: self.sweep.returns,
             rpm: revolution.rpm,
             completeness: completeness(revolution),
             partial: revolution.partial.map_or("", Partial::as_str),
+            blocked: revolution.blocked.clone(),
         };
         self.map(state, (revolution.start_ns, revolution.end_ns), roads, arrival_ns);
     }
@@ -423,11 +426,13 @@ impl Maker {
             name: config.sensors[0].name.clone(),
             model: "scan".to_owned(),
             packets: 0,
+            packets_expected: 0,
             refused,
             returns: self.sweep.returns,
             rpm: 0.0,
             completeness: 1.0,
             partial: "",
+            blocked: Blocked::default(),
         };
         self.map(state, (scan.stamp_ns, scan.stamp_ns), roads, arrival_ns);
         dropped

@@ -1,7 +1,7 @@
 //! The table of bad datagrams: each refused by name, or taken for a stated reason, with the stream beside it unharmed.
 
 use clearway_lidar::model::BLOCK_FLAGS;
-use clearway_lidar::{Model, ReturnMode, Revolution, Sensor, SensorConfig};
+use clearway_lidar::{Echo, Model, ReturnMode, Revolution, Sensor, SensorConfig};
 
 use crate::stream::{START_NS, Stream};
 use crate::telemetry::{datagram, with_sum};
@@ -132,7 +132,7 @@ fn table(stream: &Stream) -> Vec<Bad> {
 }
 
 /// The stream with a datagram before packet `BEFORE`: what came of it, the turns and all the status tells of them.
-fn decode(stream: &Stream, bad: Option<&[u8]>) -> (&'static str, Vec<String>, u64) {
+fn decode(stream: &Stream, bad: Option<&[u8]>) -> (&'static str, Vec<impl PartialEq + use<>>, u64) {
     let mut sensor = Sensor::new(SensorConfig::default());
     let mut turns = stream.push(&mut sensor, 0..BEFORE);
     let before = sensor.status();
@@ -150,8 +150,14 @@ fn decode(stream: &Stream, bad: Option<&[u8]>) -> (&'static str, Vec<String>, u6
     };
     turns.extend(stream.push(&mut sensor, BEFORE..PACKETS));
     turns.extend(sensor.finish().cloned());
-    let whole = |turn: &Revolution| format!("{turn:?}");
-    (outcome, turns.iter().map(whole).collect(), sensor.status().packets)
+    // Every laser fires: there is no NaN to compare.
+    let whole = |turn: Revolution| {
+        let echo = |echo: Echo| (echo.range_m, echo.x, echo.y, echo.z, echo.intensity);
+        let echoes: Vec<_> = turn.echoes.into_iter().map(echo).collect();
+        let counts = (turn.sequence, turn.packets, turn.packets_expected, turn.firings_expected, turn.partial);
+        (counts, turn.start_ns, turn.end_ns, turn.rpm, turn.firings, echoes)
+    };
+    (outcome, turns.into_iter().map(whole).collect(), sensor.status().packets)
 }
 
 #[test]

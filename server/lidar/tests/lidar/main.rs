@@ -1,6 +1,7 @@
 //! What the decoder does with streams made here, sound and damaged.
 
 mod bad_datagrams;
+mod blocked;
 mod calibration;
 mod capture;
 mod corpora;
