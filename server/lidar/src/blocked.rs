@@ -3,10 +3,9 @@
 //! In: finished revolutions. Out: [`Blocked`]: sectors and lasers that used to bring returns and now bring none, or only
 //! such as lie on the window itself. One turn tells; until a return comes from there again, every turn does.
 
-use crate::model::RETURNS_PER_BLOCK;
 use crate::revolution::Revolution;
 
-/// Whole degrees of encoder angle.
+/// Whole degrees of direction, clockwise from above.
 const DEGREES: usize = 360;
 /// A sector narrower than this is a gap between things, not a covered window.
 const SECTOR_DEG_MIN: usize = 5;
@@ -14,7 +13,7 @@ const SECTOR_DEG_MIN: usize = 5;
 const TURNS_KNOWN: u8 = 5;
 /// Returns nearer than this come from the window or the vehicle.
 const RANGE_M_MIN: f32 = 1.0;
-/// A laser that brought returns in fewer of its firings looked at the sky.
+/// A laser that brought returns from fewer of its degrees looked at the sky.
 const LASER_SHARE_MIN: f32 = 0.25;
 
 /// What of a sensor's view is covered.
@@ -26,7 +25,8 @@ pub struct Blocked {
     pub lasers: Vec<u16>,
 }
 
-/// A sector of encoder angles, whole degrees, clockwise from above; it may go over 360.
+/// A sector of directions, whole degrees clockwise from the sensor's x axis seen from above: encoder angles less each
+/// laser's own offset. It may go over 360.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BlockedSector {
     /// First degree, in `0..360`.
@@ -40,6 +40,17 @@ impl Blocked {
     pub fn is_empty(&self) -> bool {
         self.sectors.is_empty() && self.lasers.is_empty()
     }
+
+    /// Whether what `laser` does not see at `azimuth_rad` (its encoder angle less its own offset) may be hidden rather than
+    /// absent; the sectors' edges count as hidden for another degree.
+    pub fn hides(&self, laser: usize, azimuth_rad: f32) -> bool {
+        let azimuth_deg = azimuth_rad.to_degrees();
+        let inside = |sector: &BlockedSector| {
+            (azimuth_deg - f32::from(sector.from_deg) + 1.0).rem_euclid(360.0)
+                <= f32::from(sector.to_deg - sector.from_deg) + 2.0
+        };
+        self.lasers.iter().any(|hidden| usize::from(*hidden) == laser) || self.sectors.iter().any(inside)
+    }
 }
 
 /// What one sensor's degrees and lasers used to bring.
@@ -47,9 +58,12 @@ impl Blocked {
 pub(crate) struct View {
     degrees: [Known; DEGREES],
     lasers: Vec<Known>,
-    /// Returns of each laser in the turn at hand, and its firings.
-    counts: Vec<(u32, u32)>,
+    /// Of the turn at hand, by degree of encoder angle and laser: [`FIRED`] and [`FAR`].
+    seen: Vec<u8>,
 }
+
+const FIRED: u8 = 1;
+const FAR: u8 = 2;
 
 /// Turns in a row with returns, and whether they have ceased.
 #[derive(Clone, Copy, Debug, Default)]
@@ -60,51 +74,63 @@ struct Known {
 
 impl Default for View {
     fn default() -> Self {
-        Self { degrees: [Known::default(); DEGREES], lasers: Vec::new(), counts: Vec::new() }
+        Self { degrees: [Known::default(); DEGREES], lasers: Vec::new(), seen: Vec::new() }
     }
 }
 
 impl View {
     /// Looks at a finished turn and writes in it what is blocked; gives its number of returns.
     pub fn take(&mut self, turn: &mut Revolution) -> u64 {
-        self.lasers.resize(turn.lasers, Known::default());
-        self.counts.clear();
-        self.counts.resize(turn.lasers, (0, 0));
-        let mut degrees: [Option<bool>; DEGREES] = [None; DEGREES];
-        let width = RETURNS_PER_BLOCK.min(turn.lasers);
-        let mut returns = 0;
-        for echo in &turn.echoes {
-            for (firing, ranges) in turn.firings.iter().zip(echo.range_m.chunks_exact(turn.lasers)) {
-                let mut far = 0;
-                for (ranges, counts) in ranges.chunks_exact(width).zip(self.counts.chunks_exact_mut(width)) {
-                    for (range, (seen, fired)) in ranges.iter().zip(counts) {
-                        returns += u32::from(*range > 0.0);
-                        far += u32::from(*range >= RANGE_M_MIN);
-                        *seen += u32::from(*range >= RANGE_M_MIN);
-                        *fired += u32::from(*range >= 0.0);
-                    }
-                }
-                let degree = (firing.azimuth_rad.to_degrees() as usize).min(DEGREES - 1);
-                *degrees[degree].get_or_insert(false) |= far > 0;
+        let returns = self.look(turn);
+        let mut directions = [0; DEGREES];
+        let mut lasers = vec![(0, 0); turn.lasers];
+        for (laser, (fired, far)) in lasers.iter_mut().enumerate() {
+            // Where the laser looks is its encoder angle less its own offset.
+            let offset_deg = turn.calibration.lasers[laser % turn.calibration.lasers.len()].rot_correction.to_degrees();
+            let offset = (offset_deg.round() as i64).rem_euclid(DEGREES as i64) as usize;
+            for degree in 0..DEGREES {
+                let seen = self.seen[degree * turn.lasers + laser];
+                directions[(degree + DEGREES - offset) % DEGREES] |= seen;
+                *fired += u32::from(seen & FIRED);
+                *far += u32::from(seen & FAR) / u32::from(FAR);
             }
         }
-        // A turn of which little came tells nothing of its lasers.
-        let whole = degrees.iter().flatten().count() >= DEGREES / 2;
-        for (known, seen) in self.degrees.iter_mut().zip(degrees) {
-            known.take(seen);
+        for (known, seen) in self.degrees.iter_mut().zip(directions) {
+            known.take((seen & FIRED > 0).then_some(seen & FAR > 0));
         }
-        for (known, (seen, fired)) in self.lasers.iter_mut().zip(&self.counts) {
-            let often = *seen as f32 >= LASER_SHARE_MIN * *fired as f32;
-            // Between none and often nothing is learned.
-            known.take((whole && *fired > 0 && (often || *seen == 0)).then_some(*seen > 0));
-            known.dark &= *seen == 0;
+        for (known, (fired, far)) in self.lasers.iter_mut().zip(lasers) {
+            let often = far as f32 >= LASER_SHARE_MIN * fired as f32;
+            // A turn of which little came tells nothing, and between none and often nothing is learned.
+            known.take((fired >= DEGREES as u32 / 2 && (often || far == 0)).then_some(far > 0));
+            known.dark &= far == 0;
         }
         turn.blocked.sectors.clear();
         self.sectors(&mut turn.blocked.sectors);
         turn.blocked.lasers.clear();
         let dark = self.lasers.iter().enumerate().filter(|(_, known)| known.dark);
         turn.blocked.lasers.extend(dark.map(|(laser, _)| laser as u16));
-        u64::from(returns)
+        returns
+    }
+
+    /// Fills `seen`; gives the number of returns.
+    fn look(&mut self, turn: &Revolution) -> u64 {
+        self.lasers.resize(turn.lasers, Known::default());
+        self.seen.clear();
+        self.seen.resize(DEGREES * turn.lasers, 0);
+        let mut returns = 0;
+        for echo in &turn.echoes {
+            for (firing, ranges) in turn.firings.iter().zip(echo.range_m.chunks_exact(turn.lasers)) {
+                let degree = (firing.azimuth_rad.to_degrees() as usize).min(DEGREES - 1);
+                let seen = &mut self.seen[degree * turn.lasers..(degree + 1) * turn.lasers];
+                let mut here = 0;
+                for (seen, range) in seen.iter_mut().zip(ranges) {
+                    *seen |= u8::from(*range >= 0.0) * FIRED | u8::from(*range >= RANGE_M_MIN) * FAR;
+                    here += u32::from(*range > 0.0);
+                }
+                returns += u64::from(here);
+            }
+        }
+        returns
     }
 
     /// Runs of dark degrees, wide enough, the one over the encoder's zero as one.

@@ -2,6 +2,7 @@
 
 use bytes::Bytes;
 use clearway_lidar::blocked::BlockedSector;
+use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::{Model, ReturnMode};
 use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, Event};
@@ -22,9 +23,16 @@ fn pipeline(model: Model) -> Pipeline {
         calibration: None,
         cut_azimuth_deg: 180.0,
         range_m_min: 2.0,
+        elevations_deg: Vec::new(),
         extrinsics,
     };
-    let config = VehicleConfig { name: "car-1".into(), sensors: vec![sensor], maps: MapsConfig::default() };
+    let config = VehicleConfig {
+        name: "car-1".into(),
+        sensors: vec![sensor],
+        fusion: Default::default(),
+        body: None,
+        maps: MapsConfig::default(),
+    };
     Pipeline::new(&config, vec![None]).unwrap()
 }
 
@@ -71,7 +79,7 @@ fn copies_and_packets_out_of_order_leave_maps_as_they_were_but_for_when_they_wer
 
 #[test]
 fn whatever_the_network_does_the_ledger_is_exact_and_nothing_breaks() {
-    let streams = [Model::Vlp16, Model::Hdl32e].map(|model| (model, datagrams(model, 6.0, true)));
+    let streams = [Model::Vlp16, Model::Hdl32e].map(|model| (model, datagrams(model, 4.0, true)));
     for seed in 0..100 {
         let share = |what: u64, most: f64| uniform(mixed(seed ^ what << 8)) * most;
         let (model, sent) = &streams[seed as usize % streams.len()];
@@ -99,10 +107,21 @@ fn whatever_the_network_does_the_ledger_is_exact_and_nothing_breaks() {
 }
 
 /// Covers the window from one degree of encoder angle to another: nothing comes back from there, or what the cover sends.
-fn covered(mut datagram: Datagram, from_deg: u16, to_deg: u16, cover: impl Fn(usize) -> u16) -> Datagram {
+fn covered(
+    model: Model,
+    mut datagram: Datagram,
+    [from_deg, to_deg]: [u16; 2],
+    cover: impl Fn(usize) -> u16,
+) -> Datagram {
+    let (spec, calibration) = (model.spec(), Calibration::factory(model));
+    let dark = f64::from(from_deg)..f64::from(to_deg);
     for block in datagram.payload[..1200].chunks_exact_mut(100) {
-        if (100 * from_deg..100 * to_deg).contains(&u16::from_le_bytes([block[2], block[3]])) {
-            for (index, distance) in block[4..].chunks_exact_mut(3).enumerate() {
+        let azimuth_deg = f64::from(u16::from_le_bytes([block[2], block[3]])) / 100.0;
+        let first = spec.first_laser(u16::from_le_bytes([block[0], block[1]])).unwrap();
+        for (index, distance) in block[4..].chunks_exact_mut(3).enumerate() {
+            let laser = &calibration.lasers[(first + index) % spec.lasers];
+            // An HDL-64E's lasers look up to 9 degrees to the side of its encoder angle.
+            if dark.contains(&(azimuth_deg - laser.rot_correction.to_degrees()).rem_euclid(360.0)) {
                 distance[..2].copy_from_slice(&cover(index).to_le_bytes());
             }
         }
@@ -145,8 +164,7 @@ fn inside(layer: &Layer, (from_deg, to_deg): (f64, f64)) -> (usize, usize) {
 #[test]
 fn a_covered_sector_is_flagged_within_two_turns_and_unknown_in_every_map() {
     let (from_deg, to_deg) = (30, 110);
-    // An HDL-64E's lasers look up to 9 degrees to the side of its encoder angle.
-    let dark_deg = (f64::from(from_deg) + 10.0, f64::from(to_deg) - 10.0);
+    let dark_deg = (f64::from(from_deg), f64::from(to_deg));
     // Nothing; dirt that sends light back from the window, as near as a sensor reports; both, laser by laser.
     let covers: [fn(usize) -> u16; 3] = [|_| 0, |index| 250 + index as u16, |index| [0, 300][index % 2]];
     for model in [Model::Vlp16, Model::Hdl64eS2] {
@@ -156,8 +174,11 @@ fn a_covered_sector_is_flagged_within_two_turns_and_unknown_in_every_map() {
             let sent = datagrams(model, 12.2, false);
             let dirty_ns = sent[0].stamp_ns + 800_000_000;
             for datagram in sent {
-                let datagram =
-                    if datagram.stamp_ns >= dirty_ns { covered(datagram, from_deg, to_deg, cover) } else { datagram };
+                let datagram = if datagram.stamp_ns >= dirty_ns {
+                    covered(model, datagram, [from_deg, to_deg], cover)
+                } else {
+                    datagram
+                };
                 if let Some(map) = step(&mut pipeline, datagram) {
                     turns.push((map, pipeline.newest_revolution().unwrap().blocked.clone()));
                 }

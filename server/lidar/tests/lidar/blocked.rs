@@ -1,6 +1,6 @@
 //! Windows that are covered, and worlds that are merely empty.
 
-use clearway_lidar::{Blocked, Model, ReturnMode, Revolution, Sensor, SensorConfig};
+use clearway_lidar::{Blocked, BlockedSector, Calibration, Model, ReturnMode, Revolution, Sensor, SensorConfig};
 
 use crate::stream::Stream;
 
@@ -10,7 +10,7 @@ const COVERED: usize = 4;
 
 /// Ten turns of which the last four have the returns that `cover(laser, degree)` lets through.
 fn turns(stream: &Stream, cover: impl Fn(usize, u32) -> Option<u16>) -> Vec<Revolution> {
-    let spec = stream.model.spec();
+    let (spec, calibration) = (stream.model.spec(), Calibration::factory(stream.model));
     let mut sensor = Sensor::new(SensorConfig { model: Some(stream.model), ..SensorConfig::default() });
     let change = stream.packets(CLEAN as f64);
     let mut turns = Vec::new();
@@ -18,10 +18,12 @@ fn turns(stream: &Stream, cover: impl Fn(usize, u32) -> Option<u16>) -> Vec<Revo
         let mut packet = stream.packet(index);
         for block in (0..spec.blocks_used(stream.mode)).filter(|_| index >= change) {
             let bytes = &mut packet[100 * block..100 * (block + 1)];
-            let degree = u32::from(u16::from_le_bytes([bytes[2], bytes[3]])) / 100;
+            let azimuth_deg = f64::from(u16::from_le_bytes([bytes[2], bytes[3]])) / 100.0;
             let bank = spec.place(block, stream.mode).bank;
             for (place, distance) in bytes[4..].chunks_exact_mut(3).enumerate() {
-                if let Some(counts) = cover((32 * bank + place) % spec.lasers, degree) {
+                let laser = (32 * bank + place) % spec.lasers;
+                let looks_deg = azimuth_deg - calibration.lasers[laser].rot_correction.to_degrees();
+                if let Some(counts) = cover(laser, looks_deg.rem_euclid(360.0) as u32) {
                     distance[..2].copy_from_slice(&counts.to_le_bytes());
                 }
             }
@@ -55,6 +57,10 @@ fn a_sector_without_returns_or_with_near_ones_alone_is_blocked_within_two_turns(
             assert_eq!(blocked.lasers.len(), if to_deg == 360 { model.spec().lasers } else { 0 }, "{model:?}");
         }
     }
+    let over_zero = Blocked { sectors: vec![BlockedSector { from_deg: 350, to_deg: 380 }], lasers: vec![7] };
+    let hidden = |degrees: f32| over_zero.hides(0, degrees.to_radians());
+    assert!(hidden(350.0) && hidden(-5.0) && hidden(0.0) && hidden(379.0) && hidden(20.9) && hidden(349.1));
+    assert!(!hidden(348.5) && !hidden(21.5) && !hidden(180.0) && over_zero.hides(7, 3.0));
     // Four degrees are a gap between things.
     let turns = turns(&Stream::of(Model::Hdl32e), |_, degree| (40..44).contains(&degree).then_some(0));
     assert!(turns.iter().all(|turn| turn.blocked.is_empty()));
