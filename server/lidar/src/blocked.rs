@@ -124,7 +124,7 @@ impl View {
                 let seen = &mut self.seen[degree * turn.lasers..(degree + 1) * turn.lasers];
                 let mut here = 0;
                 for (seen, range) in seen.iter_mut().zip(ranges) {
-                    *seen |= u8::from(*range >= 0.0) * FIRED | u8::from(*range >= RANGE_M_MIN) * FAR;
+                    *seen |= (u8::from(*range >= 0.0) * FIRED) | (u8::from(*range >= RANGE_M_MIN) * FAR);
                     here += u32::from(*range > 0.0);
                 }
                 returns += u64::from(here);
