@@ -55,7 +55,7 @@ fn an_hdl64e_s1_without_time_is_put_in_order_by_azimuth() {
     // The S1's last bytes are text, not time.
     let packet = |index: usize| {
         let mut packet = stream.packet(index);
-        packet[1200..].copy_from_slice(if index % 2 == 0 { b"\x58\x02v25c" } else { b"\x00\x19DegC" });
+        packet[1200..].copy_from_slice(if index.is_multiple_of(2) { b"\x58\x02v25c" } else { b"\x00\x19DegC" });
         (packet, stream.arrival_ns(index))
     };
     let clean: Vec<_> = (0..stream.packets(2.3)).map(packet).collect();
