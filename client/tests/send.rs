@@ -82,3 +82,35 @@ fn what_is_no_target_is_refused_with_what_is_allowed() {
     assert!(text(&done.stderr).contains("udp://HOST:PORT is allowed"), "{}", text(&done.stderr));
     assert_eq!(clearway(&["send", "/nowhere", "--to", "udp://127.0.0.1:1", "--speed", "0"]).status.code(), Some(2));
 }
+
+#[test]
+fn a_bad_network_does_what_it_says_and_the_same_for_the_same_seed() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("drive.pcap");
+    let payloads: Vec<Vec<u8>> = (0..60_u8).map(|number| vec![number; 1206]).collect();
+    std::fs::write(&file, pcap(&payloads)).unwrap();
+    let send = |seed: &str| {
+        let data = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let to = format!("udp://{}", data.local_addr().unwrap());
+        let path = file.to_str().unwrap();
+        let network = ["--loss", "10", "--duplicate", "20", "--reorder", "8", "--truncate", "5", "--seed", seed];
+        let done = clearway(&[&["send", path, "--to", &to, "--speed", "max", "--json"][..], &network].concat());
+        assert!(done.status.success(), "{}", text(&done.stderr));
+        let document: Value = serde_json::from_slice(&done.stdout).unwrap();
+        (received(&data), document["network"].clone())
+    };
+    let (arrived, counts) = send("7");
+    let count = |name: &str| counts[name].as_u64().unwrap();
+    assert_eq!((count("taken"), count("arrived")), (60, arrived.len() as u64));
+    assert_eq!(arrived.len() as u64, 60 - count("packets_lost") + count("duplicated"));
+    assert_eq!(arrived.iter().filter(|payload| payload.len() < 1206).count() as u64, count("truncated"));
+    let (first_bytes, in_order) =
+        (arrived.iter().filter_map(|payload| payload.first()), |pair: &[u8]| pair[0] <= pair[1]);
+    assert!(!first_bytes.copied().collect::<Vec<_>>().windows(2).all(in_order));
+    assert!(["packets_lost", "gaps", "duplicated", "reordered", "truncated"].iter().all(|name| count(name) > 0));
+    assert_eq!(send("7"), (arrived.clone(), counts.clone()));
+    assert_ne!(send("8").0, arrived);
+
+    let done = clearway(&["send", "/nowhere", "--to", "udp://127.0.0.1:1", "--loss", "101"]);
+    assert!(text(&done.stderr).contains("0 to 100 percent is allowed"), "{}", text(&done.stderr));
+}

@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use clearway_lidar::sensor::SensorStatus;
 use clearway_mapping::pipeline::{Ledger, NamedStatus};
 use clearway_proto::v1;
 use serde_json::{Value, json};
@@ -221,9 +222,12 @@ impl VehicleStatus {
         let ledger_json = self::ledger_json(&ledger);
         let sensors = proto.sensors.iter().map(|s| {
             json!({
-                "name": s.name, "model": s.model, "packets": s.packets, "refused": s.refused, "returns": s.returns,
+                "name": s.name, "model": s.model, "packets": s.packets, "packets_expected": s.packets_expected,
+                "refused": s.refused, "returns": s.returns,
                 "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
-                "packets_expected": s.packets_expected, "state": s.state, "age_ms": s.age_ms,
+                "blocked_deg": s.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
+                "blocked_lasers": s.blocked_lasers,
+                "state": s.state, "age_ms": s.age_ms,
                 "ledger": proto.sensor_ledgers.get(&s.name).map(self::ledger_json),
             })
         });
@@ -330,6 +334,20 @@ pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {
     family("clearway_packets_refused_total", "counter", "Datagrams and scans refused, by reason.", &refused);
     let lost = each(&|s, _| s.ledger.lost as f64);
     family("clearway_events_lost_total", "counter", "Readings that found the door's queue full.", &lost);
+    let of_sensors = |value: &dyn Fn(&SensorStatus) -> f64| -> Vec<(String, f64)> {
+        let labels = |vehicle: &str, sensor: &str| format!("vehicle=\"{vehicle}\",sensor=\"{sensor}\"");
+        let of = |(v, s, _): &(&Arc<VehicleStatus>, Snapshot, v1::Vehicle)| -> Vec<(String, f64)> {
+            s.sensors.iter().map(|sensor| (labels(&v.name, &sensor.name), value(&sensor.status))).collect()
+        };
+        all.iter().flat_map(of).collect()
+    };
+    let missing = of_sensors(&|status| status.packets_lost as f64);
+    let help = "Data packets that never came, by device time and azimuth, +-1 a gap.";
+    family("clearway_packets_missing_total", "counter", help, &missing);
+    let blocked = of_sensors(&|status| {
+        status.blocked.sectors.iter().map(|sector| f64::from(sector.to_deg - sector.from_deg)).sum()
+    });
+    family("clearway_blocked_degrees", "gauge", "Degrees in which a sensor used to see and does no more.", &blocked);
     let drops = each(&|s, _| s.ledger.kernel_drops as f64);
     family("clearway_kernel_drops_total", "counter", "Datagrams the kernel dropped at the vehicle's sockets.", &drops);
     let of_sensors = |value: &dyn Fn(&Ledger) -> u64| -> Vec<(String, f64)> {

@@ -106,6 +106,13 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
         completeness: state.completeness,
         partial: state.partial.to_owned(),
         packets_expected: state.packets_expected,
+        blocked_sectors: state
+            .blocked
+            .sectors
+            .iter()
+            .map(|sector| v1::BlockedSector { from_deg: sector.from_deg.into(), to_deg: sector.to_deg.into() })
+            .collect(),
+        blocked_lasers: state.blocked.lasers.iter().map(|&laser| laser.into()).collect(),
         state: state.state.as_str().to_owned(),
         age_ms: state.age_ms,
     }

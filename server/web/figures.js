@@ -73,11 +73,15 @@ export function houseFigures(element, status) {
 
 export function sensorRows(body, sensors) {
   const rows = sensors.map((sensor) => {
+    const blocked = [
+      ...(sensor.blocked_sectors ?? []).map(({ from_deg, to_deg }) => `${from_deg}° to ${to_deg}°`),
+      ...(sensor.blocked_lasers ?? []).map((laser) => `laser ${laser}`),
+    ].join(", ");
     const row = document.createElement("tr");
     const texts = [
       sensor.name, sensor.model || "not known yet", sensor.rpm ? sensor.rpm.toFixed(0) : dash, count(sensor.returns),
       count(sensor.packets), count(sensor.refused), percent(sensor.completeness),
-      sensor.partial ? `partial: ${sensor.partial}` : "whole",
+      (sensor.partial ? `partial: ${sensor.partial}` : "whole") + (blocked && `, blocked: ${blocked}`),
     ];
     texts.forEach((text, i) => {
       const cell = document.createElement(i ? "td" : "th");
@@ -85,7 +89,7 @@ export function sensorRows(body, sensors) {
       cell.textContent = text;
       row.append(cell);
     });
-    row.lastChild.classList.toggle("alarm", Boolean(sensor.partial));
+    row.lastChild.classList.toggle("alarm", Boolean(sensor.partial || blocked));
     return row;
   });
   body.replaceChildren(...rows);

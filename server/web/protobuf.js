@@ -97,9 +97,11 @@ function decode(fields, from) {
 }
 
 const POSE = Object.fromEntries(["x", "y", "z", "qx", "qy", "qz", "qw"].map((name, i) => [i + 1, [name, double]]));
+const SECTOR = { 1: ["from_deg", uint32], 2: ["to_deg", uint32] };
 const SENSOR = {
   1: ["name", string], 2: ["model", string], 3: ["packets", uint32], 4: ["refused", uint64], 5: ["returns", uint32],
-  6: ["rpm", float], 7: ["completeness", float], 8: ["partial", string],
+  6: ["rpm", float], 7: ["completeness", float], 8: ["partial", string], 9: ["packets_expected", uint32],
+  14: ["blocked_sectors", many(message(SECTOR))], 15: ["blocked_lasers", many(uint32)],
 };
 const HEADER = {
   1: ["vehicle", string], 2: ["boot_id", fixed64], 3: ["sequence", uint64], 4: ["capture_start_ns", sfixed64],

@@ -18,12 +18,14 @@
 //! | [`encode`] | firings -> 1206-byte data packets |
 //! | [`telemetry`] | place, speed, time -> 512-byte telemetry datagrams |
 //! | [`vehicle`] | all of the above: datagrams without end |
+//! | [`impair`] | datagrams -> what a bad network leaves of them |
 //! | [`send`] | datagrams -> UDP, paced by the clock |
 //! | [`noise`] | chance by key, for all of them |
 
 pub mod course;
 pub mod encode;
 pub mod ground;
+pub mod impair;
 pub mod noise;
 pub mod object;
 pub mod plan;

@@ -23,8 +23,10 @@ pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
         .map(|p| json!({"x": p.x, "y": p.y, "z": p.z, "qx": p.qx, "qy": p.qy, "qz": p.qz, "qw": p.qw}));
     let sensors = header.sensors.iter().map(|s| {
         json!({
-            "name": s.name, "model": s.model, "packets": s.packets, "refused": s.refused, "returns": s.returns,
+            "name": s.name, "model": s.model, "packets": s.packets, "packets_expected": s.packets_expected, "refused": s.refused, "returns": s.returns,
             "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
+            "blocked_deg": s.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
+            "blocked_lasers": s.blocked_lasers,
         })
     });
     let (rows, columns) = layer.grid.shape();

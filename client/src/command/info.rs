@@ -178,6 +178,7 @@ fn capture(file: &Path) -> Result<Value> {
                 "return_mode": status.return_mode.map(|mode| format!("{mode:?}").to_lowercase()),
                 "rpm": status.rpm,
                 "packets": status.packets,
+                "packets_lost": status.packets_lost,
                 "telemetry": status.telemetry,
                 "returns": status.returns,
                 "revolutions": status.revolutions,

@@ -11,8 +11,11 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use clearway_lidar::capture::Capture;
 use clearway_ros::velodyne_scan::VelodyneScan;
+use clearway_sim::impair::{Counts, Impairment};
+use clearway_sim::vehicle::{Datagram, Kind};
 use serde_json::json;
 
+use super::network;
 use super::progress_bar;
 use super::recording::Recording;
 
@@ -40,6 +43,8 @@ pub struct Options {
     /// Multiple of the recorded pace, or max for as fast as it goes.
     #[arg(long, default_value = "1", value_name = "X|max", value_parser = speed)]
     speed: Speed,
+    #[command(flatten)]
+    network: network::Network,
     /// Print one JSON object at the end.
     #[arg(long)]
     json: bool,
@@ -80,7 +85,8 @@ pub fn run(options: &Options) -> Result<()> {
     let to = target(&options.to)?;
     let telemetry_to = options.telemetry_to.as_deref().map_or(Ok(to), target)?;
     let length = std::fs::metadata(&options.file).with_context(|| format!("open {}", options.file.display()))?.len();
-    let mut sender = Sender::new(to, telemetry_to, options.bind, options.speed)?;
+    let sender = Sender::new(to, telemetry_to, options.bind, options.speed)?;
+    let mut sender = Through { network: options.network.faults().map(Impairment::new), sender };
     let progress = progress_bar(length);
     let mut cut = None;
     if options.file.extension().is_some_and(|extension| extension == "mcap") {
@@ -89,7 +95,7 @@ pub fn run(options: &Options) -> Result<()> {
             let message = message.with_context(|| options.file.display().to_string())?;
             progress.set_position(recording.bytes_read);
             if !message.is_velodyne_scan() {
-                sender.skip("not a VelodyneScan", 1);
+                sender.sender.skip("not a VelodyneScan", 1);
                 continue;
             }
             let scan = VelodyneScan::new(&message.data).with_context(|| message.topic.clone())?;
@@ -110,22 +116,27 @@ pub fn run(options: &Options) -> Result<()> {
             }
         }
         let skipped = capture.skipped();
-        sender.skip("not UDP", skipped.not_udp);
-        sender.skip("fragmented", skipped.fragmented);
-        sender.skip("unreadable", skipped.unreadable);
+        sender.sender.skip("not UDP", skipped.not_udp);
+        sender.sender.skip("fragmented", skipped.fragmented);
+        sender.sender.skip("unreadable", skipped.unreadable);
     }
     progress.finish_and_clear();
+    let (sender, counts) = sender.finish()?;
     let Sender { packets, telemetry, skipped, .. } = &sender;
     let seconds = sender.started.map_or(0.0, |(at, _)| at.elapsed().as_secs_f64());
     if options.json {
         let document = json!({
             "packets": packets, "telemetry": telemetry, "skipped": skipped, "seconds": seconds, "cut": cut,
+            "network": counts.as_ref().map(network::document),
         });
         println!("{document}");
     } else {
         println!(
             "sent {packets} data packets to {to} and {telemetry} telemetry datagrams to {telemetry_to} in {seconds:.1} s"
         );
+        if let Some(counts) = &counts {
+            println!("{}", network::line(counts));
+        }
         for (reason, count) in skipped {
             println!("skipped {count}: {reason}");
         }
@@ -137,6 +148,37 @@ pub fn run(options: &Options) -> Result<()> {
         bail!("{} has no Velodyne datagram", options.file.display());
     }
     Ok(())
+}
+
+/// A sender behind a network, good or bad.
+struct Through {
+    network: Option<Impairment>,
+    sender: Sender,
+}
+
+impl Through {
+    fn send(&mut self, stamp_ns: i64, payload: &[u8]) -> Result<()> {
+        let kind = match payload.len() {
+            PACKET_BYTES => Kind::Data,
+            TELEMETRY_BYTES => Kind::Telemetry,
+            length => {
+                self.sender.skip(&format!("{length} bytes; 1206 and 512 are sent"), 1);
+                return Ok(());
+            }
+        };
+        let Some(network) = &mut self.network else { return self.sender.send(stamp_ns, kind, payload) };
+        let mut arriving = network.push(Datagram { stamp_ns, kind, payload: payload.to_vec() });
+        arriving.try_for_each(|datagram| self.sender.send(datagram.stamp_ns, datagram.kind, &datagram.payload))
+    }
+
+    /// Sends what is still under way; gives what the network did.
+    fn finish(mut self) -> Result<(Sender, Option<Counts>)> {
+        if let Some(network) = &mut self.network {
+            let mut arriving = network.finish();
+            arriving.try_for_each(|datagram| self.sender.send(datagram.stamp_ns, datagram.kind, &datagram.payload))?;
+        }
+        Ok((self.sender, self.network.map(|network| network.counts())))
+    }
 }
 
 struct Sender {
@@ -167,14 +209,10 @@ impl Sender {
         }
     }
 
-    fn send(&mut self, stamp_ns: i64, payload: &[u8]) -> Result<()> {
-        let (to, count) = match payload.len() {
-            PACKET_BYTES => (self.to, &mut self.packets),
-            TELEMETRY_BYTES => (self.telemetry_to, &mut self.telemetry),
-            length => {
-                self.skip(&format!("{length} bytes; 1206 and 512 are sent"), 1);
-                return Ok(());
-            }
+    fn send(&mut self, stamp_ns: i64, kind: Kind, payload: &[u8]) -> Result<()> {
+        let (to, count) = match kind {
+            Kind::Data => (self.to, &mut self.packets),
+            Kind::Telemetry => (self.telemetry_to, &mut self.telemetry),
         };
         let (started, first_ns) = *self.started.get_or_insert_with(|| (Instant::now(), stamp_ns));
         if let Speed::Times(times) = self.speed {

@@ -50,8 +50,10 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
     let recorder = vehicle.recorder.clone().unwrap_or_default();
     let sensors = vehicle.sensors.iter().map(|s| {
         json!({
-            "name": s.name, "model": s.model, "packets": s.packets, "refused": s.refused, "returns": s.returns,
+            "name": s.name, "model": s.model, "packets": s.packets, "packets_expected": s.packets_expected, "refused": s.refused, "returns": s.returns,
             "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
+            "blocked_deg": s.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
+            "blocked_lasers": s.blocked_lasers,
             "ledger": vehicle.sensor_ledgers.get(&s.name).map(ledger_document),
         })
     });
@@ -93,12 +95,17 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
         vec![format!("{}: {} maps, {age}; layers {}", vehicle.name, vehicle.maps, vehicle.layers.join(", "))];
     for s in &vehicle.sensors {
         let partial = if s.partial.is_empty() { String::new() } else { format!(", partial ({})", s.partial) };
+        let sectors: Vec<_> = s.blocked_sectors.iter().map(|b| format!("{} to {} deg", b.from_deg, b.to_deg)).collect();
+        let lasers: Vec<_> = s.blocked_lasers.iter().map(|laser| format!("laser {laser}")).collect();
+        let blocked = [sectors, lasers].concat().join(", ");
+        let blocked = if blocked.is_empty() { blocked } else { format!(", BLOCKED: {blocked}") };
         lines.push(format!(
-            "  sensor {} ({}): {:.0} rpm, {} packets and {} returns a turn, {:.1} % of the turn{partial}",
+            "  sensor {} ({}): {:.0} rpm, {} of {} packets and {} returns a turn, {:.1} % of the turn{partial}{blocked}",
             s.name,
             s.model,
             s.rpm,
             s.packets,
+            s.packets_expected,
             s.returns,
             100.0 * s.completeness
         ));

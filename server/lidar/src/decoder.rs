@@ -6,10 +6,13 @@
 use std::sync::Arc;
 
 use crate::beam::Beams;
+use crate::blocked::View;
 use crate::calibration::{Calibration, unit_table::UnitTable};
 use crate::firing::{MAX_FIRINGS, PacketFirings};
 use crate::identify;
+use crate::loss::Loss;
 use crate::model::{AZIMUTHS_PER_TURN, Model, ModelSpec, RETURNS_PER_BLOCK, ReturnMode};
+use crate::order::Gap;
 use crate::packet::{Packet, Refusal};
 use crate::revolution::{Firing, Partial, Revolution};
 use crate::sensor::{CalibrationSource, SensorConfig, SensorStatus};
@@ -24,6 +27,8 @@ pub(crate) struct Decoder {
     beams: Beams,
     clock: DeviceClock,
     turns: Turns,
+    loss: Loss,
+    view: View,
     /// Being filled.
     current: Revolution,
     /// The newest finished one; its memory is used again.
@@ -68,6 +73,8 @@ impl Decoder {
             beams: Beams::new(spec, &calibration),
             clock: DeviceClock::default(),
             turns: Turns::new(config.cut_azimuth_deg),
+            loss: Loss::default(),
+            view: View::default(),
             done: revolution.clone(),
             current: revolution,
             first_ns: 0,
@@ -107,13 +114,18 @@ impl Decoder {
         self.status.revolutions
     }
 
-    pub fn status(&self) -> SensorStatus {
-        self.status.clone()
+    /// The model's figures.
+    pub fn spec(&self) -> &'static ModelSpec {
+        self.spec
     }
 
-    /// Decodes a packet that [`Decoder::check`] let through; whether it completed a turn, which it does only if it
-    /// `may_cut`.
-    pub fn take(&mut self, packet: &Packet<'_>, mode: ReturnMode, arrival_ns: i64, may_cut: bool) -> bool {
+    pub fn status(&self) -> SensorStatus {
+        SensorStatus { packets_lost: self.loss.lost(), blocked: self.done.blocked.clone(), ..self.status.clone() }
+    }
+
+    /// Decodes a packet that [`Decoder::check`] let through and that comes after `gap`; whether it completed a turn, which
+    /// it does only if it `may_cut`.
+    pub fn take(&mut self, packet: &Packet<'_>, mode: ReturnMode, arrival_ns: i64, gap: Gap, may_cut: bool) -> bool {
         let mut done = self.change_mode(mode) && may_cut;
         self.status.packets += 1;
         self.listen_to_unit(packet);
@@ -124,20 +136,28 @@ impl Decoder {
         let span_ns = i64::from(self.spec.packet_period_ns(mode));
         let time_ns = self.clock.timeline_ns(device_us, arrival_ns, span_ns);
 
+        let torn = self.take_gap(firings.azimuths(), gap);
         let first_row = self.current.firings.len();
-        let cut = self.follow(&firings, time_ns, may_cut && !done);
+        let cut = self.follow(&firings, time_ns, torn, may_cut && !done);
         self.decode(packet, 0, first_row);
         self.current.packets += 1;
+        self.current.packets_expected += 1;
         if let Some(cut) = cut {
-            self.end_turn(first_row + cut.firing, cut.travelled, cut.time_ns);
+            self.end_turn(first_row + cut.firing, if torn { 0 } else { cut.travelled }, cut.time_ns);
             (self.first_ns, self.late_ns, self.current.start_ns) = (cut.time_ns, cut.late_ns, cut.start_ns);
-            (self.current.partial, self.current.packets) = (cut.partial, 1);
+            (self.current.partial, self.current.packets, self.current.packets_expected) = (cut.partial, 1, 1);
             if self.learn_from_unit() {
                 self.decode(packet, cut.firing, 0);
             }
             done = true;
         }
         done
+    }
+
+    /// Decodes a packet that was held, as [`Decoder::take`] does.
+    pub fn take_due(&mut self, packet: &Packet<'_>, arrival_ns: i64, gap: Gap, may_cut: bool) -> bool {
+        // It was let through when it came, which at most another of the HDL-64E's names has changed since.
+        self.check(packet).is_ok_and(|mode| self.take(packet, mode, arrival_ns, gap, may_cut))
     }
 
     /// Ends the stream; whether there was an unfinished turn.
@@ -152,6 +172,7 @@ impl Decoder {
         self.clock.turn_ended(self.done.end_ns);
         self.turns.forget();
         self.packet_azimuth = None;
+        self.loss.finish();
         self.learn_from_unit();
         true
     }
@@ -194,8 +215,9 @@ impl Decoder {
         self.step.unwrap_or(0) / self.spec.firings_per_block as u32
     }
 
-    /// Adds the packet's firings to the current turn and finds the one at which to cut.
-    fn follow(&mut self, firings: &PacketFirings, time_ns: i64, may_cut: bool) -> Option<Cut> {
+    /// Adds the packet's firings to the current turn and finds the one at which to cut: the first, if the turn is `torn`
+    /// before it.
+    fn follow(&mut self, firings: &PacketFirings, time_ns: i64, torn: bool, may_cut: bool) -> Option<Cut> {
         let (period_ns, expected) = (i64::from(self.spec.period_ns(self.mode)), self.expected());
         let overlong = self.current.firings.len() + MAX_FIRINGS > MAX_FIRINGS_PER_TURN;
         let mut cut: Option<Cut> = None;
@@ -207,6 +229,8 @@ impl Decoder {
                 self.begin_turn(azimuth, time_ns, expected);
             }
             let (step, crossed) = self.turns.follow(azimuth, expected);
+            let torn = torn && firing == 0;
+            let (step, crossed) = (if torn { Step::Gap } else { step }, crossed || torn);
             let flaw = match step {
                 Step::Even => (crossed && (!may_cut || cut.is_some())).then_some(Partial::Reversal),
                 Step::Gap => Some(Partial::Gap),
@@ -232,6 +256,21 @@ impl Decoder {
         }
         self.current.grow(&rows[..firings.azimuths().len()]);
         cut
+    }
+
+    /// Takes note of what is missing before a packet; whether that is a turn or more, or nobody knows how much.
+    fn take_gap(&mut self, azimuths: &[u32], gap: Gap) -> bool {
+        let span = self.expected() * self.spec.firings_per_packet(self.mode) as u32;
+        if gap.jumped {
+            self.loss.jump();
+        }
+        let lost = self.loss.take(gap, azimuths, span);
+        let torn = gap.jumped || u64::from(gap.missing) * u64::from(span) >= u64::from(AZIMUTHS_PER_TURN);
+        if !self.current.firings.is_empty() {
+            self.current.packets_expected = self.current.packets_expected.saturating_add(lost);
+            return torn;
+        }
+        false
     }
 
     fn begin_turn(&mut self, azimuth: u32, time_ns: i64, expected: u32) {
@@ -283,7 +322,7 @@ impl Decoder {
         done.firings_expected = self.firings_whole.unwrap_or(nominal);
         done.end_ns = done.start_ns + done.firings.last().map_or(0, |firing| i64::from(firing.offset_ns));
         self.status.revolutions += 1;
-        self.status.returns += done.returns() as u64;
+        self.status.returns += self.view.take(done);
     }
 
     fn listen_to_unit(&mut self, packet: &Packet<'_>) {

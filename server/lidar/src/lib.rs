@@ -14,20 +14,26 @@
 //! | [`telemetry`] | 512 bytes -> [`telemetry::Telemetry`] |
 //! | `identify` | packet -> model |
 //! | [`sensor`] | the door: datagram in, revolution out |
-//! | `decoder` | packets of a known model -> revolutions, by way of the next five |
+//! | `order` | packets as they arrive -> in the order they were sent, without copies |
+//! | `decoder` | packets of a known model -> revolutions, by way of the next seven |
 //! | `time` | device microseconds past the hour -> stamps |
 //! | `firing` | packet -> firings |
 //! | `turns` | firings -> cuts, gaps, reversals |
+//! | `loss` | packets missing -> packets lost |
 //! | `beam` | raw returns -> corrected points |
 //! | [`revolution`] | the range image |
+//! | [`blocked`] | revolutions -> sectors and lasers that see nothing any more |
 
 mod beam;
+pub mod blocked;
 pub mod calibration;
 pub mod capture;
 mod decoder;
 mod firing;
 mod identify;
+mod loss;
 pub mod model;
+mod order;
 pub mod packet;
 pub mod revolution;
 pub mod sensor;
@@ -35,6 +41,7 @@ pub mod telemetry;
 mod time;
 mod turns;
 
+pub use blocked::{Blocked, BlockedSector};
 pub use calibration::{Calibration, CalibrationError, LaserCalibration};
 pub use model::{Model, ModelSpec, ReturnMode};
 pub use packet::Refusal;

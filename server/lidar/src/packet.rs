@@ -53,6 +53,34 @@ pub enum Refusal {
         /// The bytes it may send.
         allowed: Vec<u16>,
     },
+    /// A copy of a packet that came before.
+    #[error("a copy of the packet of {}, azimuth {azimuth}", at(.device_us))]
+    Duplicate {
+        /// Microseconds past the hour; `None`: the sensor sends none.
+        device_us: Option<u32>,
+        /// Of block 0, hundredths of a degree.
+        azimuth: u32,
+    },
+    /// A packet that came when the ones after it had long been decoded.
+    #[error("the packet of {}, azimuth {azimuth} is {packets} packets late; {} are allowed", at(.device_us), crate::order::REORDER_PACKETS)]
+    Late {
+        /// Microseconds past the hour; `None`: the sensor sends none.
+        device_us: Option<u32>,
+        /// Of block 0, hundredths of a degree.
+        azimuth: u32,
+        /// Packet periods from it to the packet decoded last.
+        packets: i64,
+    },
+    /// A time far from the packet's before, which nothing confirms yet: the next packet may.
+    #[error("the packet of {}, azimuth {azimuth} does not follow the one of {}: the next packet must confirm it", at(.device_us), at(.newest_us))]
+    DeviceTime {
+        /// Microseconds past the hour; `None`: the sensor sends none.
+        device_us: Option<u32>,
+        /// Of block 0, hundredths of a degree.
+        azimuth: u32,
+        /// The newest packet's time.
+        newest_us: Option<u32>,
+    },
     /// The table configured is another sensor's.
     #[error("calibration: {0}")]
     Calibration(crate::calibration::CalibrationError),
@@ -62,13 +90,16 @@ pub enum Refusal {
 }
 
 impl Refusal {
-    /// `length`, `block_flag`, `azimuth`, `model`, `calibration` or `nmea`.
+    /// `length`, `block_flag`, `azimuth`, `model`, `duplicate`, `late`, `device_time`, `calibration` or `nmea`.
     pub fn reason(&self) -> &'static str {
         match self {
             Refusal::Length { .. } => "length",
             Refusal::BlockFlag { .. } => "block_flag",
             Refusal::Azimuth { .. } => "azimuth",
             Refusal::Model { .. } => "model",
+            Refusal::Duplicate { .. } => "duplicate",
+            Refusal::Late { .. } => "late",
+            Refusal::DeviceTime { .. } => "device_time",
             Refusal::Calibration(_) => "calibration",
             Refusal::Nmea(_) => "nmea",
         }
@@ -84,6 +115,10 @@ impl std::fmt::Display for Hex<'_> {
         }
         Ok(())
     }
+}
+
+fn at(device_us: &Option<u32>) -> String {
+    device_us.map_or("no device time".to_owned(), |us| format!("device time {us} us"))
 }
 
 fn of(model: &Option<Model>) -> String {
@@ -122,6 +157,10 @@ impl<'a> Packet<'a> {
         self.return_mode() == Some(ReturnMode::Dual)
             && (0..8).all(|block| self.flag(block) == BLOCK_FLAGS[block / 2])
             && Model::Vls128.spec().model_bytes.contains(&self.model_byte())
+    }
+
+    pub(crate) fn bytes(&self) -> &'a [u8; PACKET_LENGTH] {
+        self.bytes
     }
 
     fn u16_at(&self, at: usize) -> u16 {

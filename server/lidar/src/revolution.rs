@@ -5,6 +5,7 @@
 use std::f32::consts::TAU;
 use std::sync::Arc;
 
+use crate::blocked::Blocked;
 use crate::calibration::Calibration;
 use crate::model::{AZIMUTHS_PER_TURN, Model, RETURNS_PER_BLOCK, ReturnMode};
 
@@ -38,6 +39,11 @@ pub struct Revolution {
     pub partial: Option<Partial>,
     /// Data packets that contributed.
     pub packets: u32,
+    /// The same and those that were missing before them, ±1 a gap; where a field of view is set, without its dark sector
+    /// (from the second turn on). A gap that goes over the cut counts in the turn in which it begins.
+    pub packets_expected: u32,
+    /// Where the sensor used to see and does no more.
+    pub blocked: Blocked,
     /// Firings of a whole turn: this one's, else the newest whole one's, else by the manual's period; seen ones are
     /// `firings.len()`.
     pub firings_expected: u32,
@@ -136,6 +142,8 @@ impl Revolution {
             rpm: 0.0,
             partial: None,
             packets: 0,
+            packets_expected: 0,
+            blocked: Blocked::default(),
             firings_expected: 0,
         }
     }
@@ -191,7 +199,7 @@ impl Revolution {
         self.echoes.resize_with(other.echoes.len(), Echo::default);
         (self.model, self.return_mode, self.lasers) = (other.model, other.return_mode, other.lasers);
         self.calibration.clone_from(&other.calibration);
-        (self.partial, self.packets) = (None, 0);
+        (self.partial, self.packets, self.packets_expected) = (None, 0, 0);
     }
 
     /// Adds empty firings: no laser has fired yet.

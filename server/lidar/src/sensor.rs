@@ -3,10 +3,12 @@
 //! In: UDP payloads of one sensor, data and telemetry alike, in the order of their arrival. Out: [`Revolution`]s, in the
 //! sensor's frame. A datagram that is refused leaves everything as it was.
 
+use crate::blocked::Blocked;
 use crate::calibration::Calibration;
 use crate::decoder::Decoder;
 use crate::identify::{self, Finding, PACKETS_HELD};
 use crate::model::{Model, ReturnMode};
+use crate::order::{Order, Way};
 pub use crate::packet::Refusal;
 use crate::packet::{PACKET_LENGTH, Packet};
 use crate::revolution::Revolution;
@@ -38,6 +40,7 @@ pub struct Sensor {
     config: SensorConfig,
     /// Packets that came before the model was known.
     held: Vec<(Box<[u8]>, i64)>,
+    order: Order,
     decoder: Option<Box<Decoder>>,
     /// The newest telemetry, and how many there were.
     telemetry: Option<Telemetry>,
@@ -65,16 +68,22 @@ pub struct SensorStatus {
     pub return_mode: Option<ReturnMode>,
     /// Measured over the last turn (or configured).
     pub rpm: Option<f32>,
-    /// Data packets decoded; those held until the model is known are not counted yet.
+    /// Data packets decoded; those held are not counted yet.
     pub packets: u64,
-    /// Data packets held until the model is known.
+    /// Data packets held until the model is known, or until those before them have come.
     pub packets_held: usize,
+    /// Data packets that never came, or too late, ±1 a gap. A long gap is counted a turn later, when it has not come back
+    /// at the same place as the dark side of a field of view does. Of an HDL-64E S1, whose packets carry no time, gaps of
+    /// less than half a turn.
+    pub packets_lost: u64,
     /// Telemetry datagrams read.
     pub telemetry: u64,
     /// Returns (echoes with a range) in the revolutions given.
     pub returns: u64,
     /// Revolutions given.
     pub revolutions: u64,
+    /// Where the sensor used to see and did not in the newest revolution.
+    pub blocked: Blocked,
     /// Whose table is in use.
     pub calibration: CalibrationSource,
     /// State of the pulse per second in the newest telemetry.
@@ -86,11 +95,15 @@ pub struct SensorStatus {
 impl Sensor {
     /// A sensor that has seen nothing.
     pub fn new(config: SensorConfig) -> Self {
-        Self { config, held: Vec::new(), decoder: None, telemetry: None, telemetry_count: 0 }
+        Self { config, held: Vec::new(), order: Order::default(), decoder: None, telemetry: None, telemetry_count: 0 }
     }
 
     /// Takes one UDP payload that arrived at `arrival_ns` (ns since the Unix epoch); gives the revolution it completed,
     /// if any. At most one turn is cut a datagram.
+    ///
+    /// Copies of packets and packets out of order by up to 32 leave no trace in the revolutions: a packet that follows the
+    /// one before is decoded at once; behind a gap, and where the stream begins, packets are held until the missing one
+    /// has come or 32 packet periods have passed.
     ///
     /// # Errors
     /// [`Refusal`] with the value that was wrong; the sensor's state is as if the datagram had not come.
@@ -117,17 +130,28 @@ impl Sensor {
         payload: &[u8],
         arrival_ns: i64,
     ) -> Result<Option<&Revolution>, Refusal> {
-        let mut done = false;
         if self.decoder.is_none() {
             let Some(model) = self.find_model(packet)? else {
+                if self.held.iter().any(|(held, _)| **held == *payload) {
+                    let device_us = Some(packet.device_us());
+                    return Err(Refusal::Duplicate { device_us, azimuth: packet.azimuth(0) });
+                }
                 self.held.push((payload.into(), arrival_ns));
                 return Ok(None);
             };
-            done = self.start(model, packet)?;
+            self.start(model, packet)?;
         }
         let Some(decoder) = &mut self.decoder else { return Ok(None) };
         let mode = decoder.check(packet)?;
-        done = decoder.take(packet, mode, arrival_ns, !done) || done;
+        let mut done = match self.order.take(packet, decoder.spec(), mode, arrival_ns)? {
+            Way::Next(gap) => decoder.take(packet, mode, arrival_ns, gap, true),
+            Way::Held => false,
+        };
+        // What is due behind a cut waits for the next datagram: one revolution at a time.
+        while !done && let Some(cut) = self.order.due(false, |packet, ns, gap| decoder.take_due(packet, ns, gap, true))
+        {
+            done = cut;
+        }
         Ok(done.then(|| decoder.finished()))
     }
 
@@ -146,22 +170,22 @@ impl Sensor {
         })
     }
 
-    /// Makes the decoder, if `packet` fits it, and decodes what was held; whether that completed a turn.
-    fn start(&mut self, model: Model, packet: &Packet<'_>) -> Result<bool, Refusal> {
+    /// Makes the decoder, if `packet` fits it, and puts what was held in order.
+    fn start(&mut self, model: Model, packet: &Packet<'_>) -> Result<(), Refusal> {
         let mut decoder = Decoder::new(model, &self.config)?;
         decoder.check(packet)?;
         if let Some(telemetry) = &self.telemetry {
             decoder.take_telemetry(telemetry);
         }
-        let mut done = false;
         for (payload, arrival_ns) in self.held.drain(..) {
             let Ok(held) = Packet::new(&payload) else { continue };
             if let Ok(mode) = decoder.check(&held) {
-                done = decoder.take(&held, mode, arrival_ns, !done) || done;
+                // A stream's first packets all wait, and more than these: none passes yet.
+                let _ = self.order.take(&held, decoder.spec(), mode, arrival_ns);
             }
         }
         self.decoder = Some(Box::new(decoder));
-        Ok(done)
+        Ok(())
     }
 
     /// Ends the stream: the unfinished revolution, flagged partial unless it ends at the cut. The sensor can go on with
@@ -173,6 +197,8 @@ impl Sensor {
             self.start(Model::Hdl32e, &Packet::new(&first).ok()?).ok()?;
         }
         let decoder = self.decoder.as_mut()?;
+        while self.order.due(true, |packet, ns, gap| decoder.take_due(packet, ns, gap, false)).is_some() {}
+        self.order.forget();
         decoder.finish().then(|| decoder.finished())
     }
 
@@ -192,7 +218,7 @@ impl Sensor {
         let mut status = self.decoder.as_ref().map(|decoder| decoder.status()).unwrap_or_default();
         status.model = status.model.or(self.config.model);
         status.rpm = self.config.rpm.or(status.rpm);
-        status.packets_held = self.held.len();
+        status.packets_held = self.held.len() + self.order.held();
         status.telemetry = self.telemetry_count;
         status.pps = self.telemetry.as_ref().map(|telemetry| telemetry.pps);
         status.gprmc = self.telemetry.as_ref().and_then(|telemetry| telemetry.gprmc.clone());

@@ -186,7 +186,7 @@ impl Intake {
             name: self.name.clone(),
             model: crate::pipeline::model_name(revolution.model).to_owned(),
             packets: revolution.packets,
-            packets_expected: packets_expected(revolution),
+            packets_expected: revolution.packets_expected,
             refused: 0,
             returns: turn.sweep.returns,
             rpm: revolution.rpm,
@@ -194,6 +194,7 @@ impl Intake {
             partial: revolution.partial.map_or("", Partial::as_str),
             state: if revolution.partial.is_some() { Part::Partial } else { Part::Ok },
             age_ms: None,
+            blocked: revolution.blocked.clone(),
         };
         (turn.start_ns, turn.end_ns, turn.is_revolution) = (revolution.start_ns, revolution.end_ns, true);
         self.end_turn(motion, now);
@@ -276,7 +277,7 @@ fn check(scan: &Scan) -> Result<(), Rejected> {
     }
 }
 
-/// Directions of the firings' lasers that came back with nothing, in place of what `no_returns` held. A laser is taken to
+/// Directions of the firings' lasers that came back with nothing, but for those that are hidden, in place of what `no_returns` held. A laser is taken to
 /// fire with the first of its firing, 0.2 degrees off at most.
 fn look_for_no_returns(revolution: &Revolution, mount: &Mount, moved: &Moved, no_returns: &mut Vec<[f32; 3]>) {
     no_returns.clear();
@@ -296,8 +297,12 @@ fn look_for_no_returns(revolution: &Revolution, mount: &Mount, moved: &Moved, no
             .end_from_ego
             .get(number / KNOT_FIRINGS)
             .map_or(mount.ego_from_sensor, |end_from_ego| end_from_ego * mount.ego_from_sensor);
-        for (_, &(rotation, [up, flat])) in range_m.iter().zip(&lasers).filter(|(range, _)| **range == 0.0) {
-            no_returns.push(turned(&ego_from_sensor, direction(firing.azimuth_rad - rotation, [up, flat])));
+        let nothing = range_m.iter().zip(&lasers).enumerate().filter(|(_, (range, _))| **range == 0.0);
+        for (laser, (_, &(rotation, [up, flat]))) in nothing {
+            let azimuth_rad = firing.azimuth_rad - rotation;
+            if !revolution.blocked.hides(laser, azimuth_rad) {
+                no_returns.push(turned(&ego_from_sensor, direction(azimuth_rad, [up, flat])));
+            }
         }
     }
 }
@@ -311,13 +316,6 @@ fn direction(azimuth_rad: f32, [up, flat]: [f32; 2]) -> [f32; 3] {
 fn turned(by: &Isometry3<f64>, direction: [f32; 3]) -> [f32; 3] {
     let turned = by.rotation * Vector3::from(direction.map(f64::from));
     [turned.x, turned.y, turned.z].map(|metres| metres as f32)
-}
-
-/// Data packets of a turn with the firings that are expected of it.
-fn packets_expected(revolution: &Revolution) -> u32 {
-    let seen = revolution.firings.len().max(1) as u64;
-    let expected = u64::from(revolution.firings_expected).max(seen);
-    u32::try_from((u64::from(revolution.packets) * expected).div_ceil(seen)).unwrap_or(u32::MAX)
 }
 
 /// Share of the turn's degrees in which a firing lies.

@@ -46,9 +46,9 @@ pub struct Ledger {
 }
 
 impl Ledger {
-    /// Datagrams and scans not taken, for any reason.
+    /// Datagrams and scans refused, but for copies of packets: those leave no trace in a map.
     pub fn refused_sum(&self) -> u64 {
-        self.refused.values().sum()
+        self.refused.iter().filter(|(reason, _)| **reason != "duplicate").map(|(_, count)| count).sum()
     }
 
     /// Counts readings that never became events: lost, or refused at the door.

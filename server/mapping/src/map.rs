@@ -1,5 +1,6 @@
 //! What a map is: a header, and layers of channels over one grid each. Class 0 is unknown everywhere, and is never free.
 
+use clearway_lidar::blocked::Blocked;
 use nalgebra::Isometry3;
 
 use crate::motion::Compensation;
@@ -40,9 +41,9 @@ pub struct SensorState {
     pub model: String,
     /// Data packets of this revolution.
     pub packets: u32,
-    /// Data packets of a turn like this one without loss; 0 for scans.
+    /// The same and those that were missing before them, ±1 a gap; 0 for scans.
     pub packets_expected: u32,
-    /// Datagrams and scans refused since the start.
+    /// Datagrams and scans refused since the start, but for copies of packets.
     pub refused: u64,
     /// Returns in this revolution.
     pub returns: u32,
@@ -52,6 +53,8 @@ pub struct SensorState {
     pub completeness: f32,
     /// `start`, `end`, `gap`, `reversal`, `overlong`, or empty for a whole turn.
     pub partial: &'static str,
+    /// Where the sensor used to see and did not in this revolution.
+    pub blocked: Blocked,
     /// Whether its newest turn is in the map.
     pub state: Part,
     /// From its newest turn's end to the map's stamp; `None` before its first turn.

@@ -56,6 +56,19 @@ fn write_seeds() {
             Calibration::factory(model).to_yaml().as_bytes(),
         );
     }
+    // What a network does to a few packets: late, twice, lost, from another time.
+    let streams = Stream::of(Model::Vlp16);
+    let orders: [(&str, Vec<usize>); 4] = [
+        ("out_of_order", (0..40).map(|index| index ^ 5).collect()),
+        ("twice", (0..40).map(|index| index / 2 + index % 2 * 3).collect()),
+        ("lost", (0..140).filter(|index| index % 7 != 0 && !(40..130).contains(index)).collect()),
+        ("restarts", (0..60).map(|index| [index, index + 3_000][index / 20 % 2]).collect()),
+    ];
+    for (name, order) in orders {
+        let mut bytes = vec![4];
+        order.into_iter().for_each(|index| bytes.extend(streams.packet(index)));
+        write("packet", name, &bytes);
+    }
     let mut found = vec![0xFF];
     (0..3).for_each(|packet| found.extend(Stream::of(Model::Hdl32e).packet(packet)));
     write("packet", "model_unknown", &found);
@@ -67,6 +80,15 @@ fn write_seeds() {
     write("telemetry", "unfinished", &telemetry::datagram(5, sentence));
     write("telemetry", "no_fix", &telemetry::datagram(5, "$GPRMC,,V,,,,,,,,,,N*53\r\n"));
     write("telemetry", "empty", &telemetry::datagram(5, ""));
+    for (name, text) in [
+        ("latitude_91", "GPRMC,120000,A,9107.0380,N,01131.0000,E,022.4,084.4,010120,003.1,W"),
+        ("no_commas", "GPRMC"),
+        ("long_fields", "GPRMC,120000.000000000000000000000000000000001,A,4807.0380,N,01131.0,E,1e3,0.0,010100"),
+        ("leap_second", "GPRMC,235960,A,4807.0380,N,01131.0000,E,022.4,084.4,311216,003.1,W"),
+        ("no_date", "GPRMC,120000,A,4807.0380,N,01131.0000,E,022.4,084.4,,003.1,W"),
+    ] {
+        write("telemetry", name, &telemetry::datagram(5, &telemetry::with_sum(text)));
+    }
     write("telemetry", "wrong_sum", &telemetry::datagram(5, &format!("{sentence}00\r\n")));
 
     let frames = [capture::ethernet(&capture::ip_packet(&[1, 2, 3], 0), false), capture::ethernet(&[0; 9], true)];

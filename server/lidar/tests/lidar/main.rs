@@ -1,9 +1,12 @@
 //! What the decoder does with streams made here, sound and damaged.
 
+mod bad_datagrams;
+mod blocked;
 mod calibration;
 mod capture;
 mod corpora;
 mod models;
+mod order;
 mod properties;
 mod stream;
 mod telemetry;

@@ -123,7 +123,9 @@ proptest! {
             let mut sensor = Sensor::new(SensorConfig::default());
             let mut turns = stream.push(&mut sensor, 0..at);
             let refused = bad.iter().all(|bad| sensor.push(bad, START_NS).is_err());
-            turns.extend(stream.push(&mut sensor, at..260));
+            // One that was not refused makes copies of packets to come.
+            let push = |index| sensor.push(&stream.packet(index), stream.arrival_ns(index)).ok().flatten().cloned();
+            turns.extend((at..260).filter_map(push));
             turns.extend(sensor.finish().cloned());
             let turn = |turn: &Revolution| (turn.start_ns, turn.end_ns, turn.partial, turn.points().collect::<Vec<_>>());
             (refused, turns.iter().map(turn).collect::<Vec<_>>(), sensor.status())

@@ -1,6 +1,6 @@
 //! A small encoder: packets of any model that looks at a round wall.
 
-use clearway_lidar::model::{BLOCK_FLAGS, BLOCKS_PER_PACKET, S1_FLAGS};
+use clearway_lidar::model::{AZIMUTHS_PER_TURN, BLOCK_FLAGS, BLOCKS_PER_PACKET, S1_FLAGS};
 use clearway_lidar::{Model, ReturnMode, Revolution, Sensor};
 
 /// When the streams start: 11:33:20 UTC on 14 May 2033, and the same past the hour.
@@ -60,6 +60,45 @@ impl Stream {
         });
         bytes.push(spec.model_bytes.first().copied().unwrap_or(b'0'));
         bytes
+    }
+
+    /// `count` packets and their arrivals of a sensor that turns `rpm(seconds)` and sends the columns that are `lit`,
+    /// counted from azimuth 180 degrees on.
+    pub fn turning(&self, count: usize, rpm: impl Fn(f64) -> f64, lit: impl Fn(u32) -> bool) -> Vec<(Vec<u8>, i64)> {
+        let spec = self.model.spec();
+        let echoes = if self.mode == ReturnMode::Dual { 2 } else { 1 };
+        let blocks = spec.blocks_per_firing * echoes;
+        let columns = BLOCKS_PER_PACKET / blocks;
+        let column_s = f64::from(spec.packet_period_ns(self.mode)) * 1e-9 / columns as f64;
+        let (mut turned, mut seconds) = (18_000.0, 0.0);
+        let mut packet = || {
+            let mut bytes = self.packet(0);
+            for column in 0..columns {
+                while !lit(turned as u32 % AZIMUTHS_PER_TURN) {
+                    turned += rpm(seconds) / 60.0 * f64::from(AZIMUTHS_PER_TURN) * column_s;
+                    seconds += column_s;
+                }
+                if column == 0 {
+                    let device_us = (f64::from(self.device_us) + seconds * 1e6) as u64 % 3_600_000_000;
+                    bytes[1200..1204].copy_from_slice(&(device_us as u32).to_le_bytes());
+                }
+                for block in column * blocks..(column + 1) * blocks {
+                    let azimuth = (turned as u32 % AZIMUTHS_PER_TURN) as u16;
+                    bytes[100 * block + 2..100 * block + 4].copy_from_slice(&azimuth.to_le_bytes());
+                }
+                turned += rpm(seconds) / 60.0 * f64::from(AZIMUTHS_PER_TURN) * column_s;
+                seconds += column_s;
+            }
+            (bytes, START_NS + (seconds * 1e9) as i64)
+        };
+        (0..count).map(|_| packet()).collect()
+    }
+
+    /// A packet with the time of the one at `index`.
+    pub fn at_time_of(&self, index: usize, packet: &[u8]) -> Vec<u8> {
+        let mut packet = packet.to_vec();
+        packet[1200..1204].copy_from_slice(&self.packet(index)[1200..1204]);
+        packet
     }
 
     pub fn arrival_ns(&self, index: usize) -> i64 {
