@@ -205,6 +205,8 @@ fn golden_map() -> (v1::Header, v1::Layer, v1::Layer) {
             rpm: 600.0,
             completeness: 1.0,
             partial: String::new(),
+            clock: String::new(),
+            clock_offset_ms: 0,
         }],
         compensation: "poses".into(),
     };

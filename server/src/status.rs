@@ -242,6 +242,7 @@ impl VehicleStatus {
             json!({
                 "name": s.name, "model": s.model, "packets": s.packets, "refused": s.refused, "returns": s.returns,
                 "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
+            "clock": s.clock, "clock_offset_ms": s.clock_offset_ms,
             })
         });
         json!({

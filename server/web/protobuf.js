@@ -58,6 +58,7 @@ const string = kind(LENGTH, "", text);
 const bytes = kind(LENGTH, new Uint8Array(0), (r) => r.chunk());
 const uint32 = kind(VARINT, 0, low32);
 const sint32 = kind(VARINT, 0, (r) => ((n) => (n >>> 1) ^ -(n & 1))(low32(r)));
+const sint64 = kind(VARINT, 0n, (r) => ((n) => (n >> 1n) ^ -(n & 1n))(r.varint()));
 const uint64 = kind(VARINT, 0n, (r) => r.varint());
 const fixed32 = kind(FIXED32, 0, (r) => r.view.getUint32(r.take(4), true));
 const fixed64 = kind(FIXED64, 0n, (r) => r.view.getBigUint64(r.take(8), true));
@@ -99,7 +100,8 @@ function decode(fields, from) {
 const POSE = Object.fromEntries(["x", "y", "z", "qx", "qy", "qz", "qw"].map((name, i) => [i + 1, [name, double]]));
 const SENSOR = {
   1: ["name", string], 2: ["model", string], 3: ["packets", uint32], 4: ["refused", uint64], 5: ["returns", uint32],
-  6: ["rpm", float], 7: ["completeness", float], 8: ["partial", string],
+  6: ["rpm", float], 7: ["completeness", float], 8: ["partial", string], 9: ["clock", string],
+  10: ["clock_offset_ms", sint64],
 };
 const HEADER = {
   1: ["vehicle", string], 2: ["boot_id", fixed64], 3: ["sequence", uint64], 4: ["capture_start_ns", sfixed64],

@@ -25,6 +25,7 @@ pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
         json!({
             "name": s.name, "model": s.model, "packets": s.packets, "refused": s.refused, "returns": s.returns,
             "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
+            "clock": s.clock, "clock_offset_ms": s.clock_offset_ms,
         })
     });
     let (rows, columns) = layer.grid.shape();

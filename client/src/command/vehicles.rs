@@ -52,6 +52,7 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
         json!({
             "name": s.name, "model": s.model, "packets": s.packets, "refused": s.refused, "returns": s.returns,
             "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
+            "clock": s.clock, "clock_offset_ms": s.clock_offset_ms,
         })
     });
     json!({
@@ -77,13 +78,15 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
     for s in &vehicle.sensors {
         let partial = if s.partial.is_empty() { String::new() } else { format!(", partial ({})", s.partial) };
         lines.push(format!(
-            "  sensor {} ({}): {:.0} rpm, {} packets and {} returns a turn, {:.1} % of the turn{partial}",
+            "  sensor {} ({}): {:.0} rpm, {} packets and {} returns a turn, {:.1} % of the turn{partial}, clock {} (host {:+} ms)",
             s.name,
             s.model,
             s.rpm,
             s.packets,
             s.returns,
-            100.0 * s.completeness
+            100.0 * s.completeness,
+            s.clock,
+            s.clock_offset_ms
         ));
     }
     if let Some(ledger) = &vehicle.ledger {

@@ -15,8 +15,9 @@
 //! | [`telemetry`] | 512 bytes -> [`telemetry::Telemetry`] |
 //! | `identify` | packet -> model |
 //! | [`sensor`] | the door: datagram in, revolution out |
-//! | `decoder` | packets of a known model -> revolutions, by way of the next five |
-//! | `time` | device microseconds past the hour -> stamps |
+//! | `decoder` | packets of a known model -> revolutions, by way of the next six |
+//! | `timeline` | device microseconds past the hour -> one timeline |
+//! | [`clock`] | timeline, telemetry, arrival -> stamps |
 //! | `firing` | packet -> firings |
 //! | `turns` | firings -> cuts, gaps, reversals |
 //! | `beam` | raw returns -> corrected points |
@@ -25,6 +26,7 @@
 mod beam;
 pub mod calibration;
 pub mod capture;
+pub mod clock;
 mod decoder;
 mod firing;
 mod identify;
@@ -33,11 +35,12 @@ pub mod packet;
 pub mod revolution;
 pub mod sensor;
 pub mod telemetry;
-mod time;
+mod timeline;
 mod turns;
 pub mod velodyne_scan;
 
 pub use calibration::{Calibration, CalibrationError, LaserCalibration};
+pub use clock::Clock;
 pub use model::{Model, ModelSpec, ReturnMode};
 pub use packet::Refusal;
 pub use revolution::{Echo, Firing, Partial, Point, Revolution};

@@ -48,6 +48,10 @@ pub struct SensorState {
     pub completeness: f32,
     /// `start`, `end`, `gap`, `reversal`, `overlong`, or empty for a whole turn.
     pub partial: &'static str,
+    /// The clock the stamps follow, as [`clearway_lidar::Clock::as_str`] spells it; `sender` where a scan brings its stamp.
+    pub clock: &'static str,
+    /// By how much the host's clock is ahead of the stamps, ms.
+    pub clock_offset_ms: i64,
 }
 
 /// One named grid.

@@ -395,6 +395,8 @@ impl Maker {
             rpm: revolution.rpm,
             completeness: completeness(revolution),
             partial: revolution.partial.map_or("", Partial::as_str),
+            clock: revolution.clock.as_str(),
+            clock_offset_ms: revolution.clock_offset_ms,
         };
         self.map(state, (revolution.start_ns, revolution.end_ns), roads, arrival_ns);
     }
@@ -421,6 +423,8 @@ impl Maker {
             rpm: 0.0,
             completeness: 1.0,
             partial: "",
+            clock: "sender",
+            clock_offset_ms: arrival_ns.saturating_sub(scan.stamp_ns) / 1_000_000,
         };
         self.map(state, (scan.stamp_ns, scan.stamp_ns), roads, arrival_ns);
         dropped
