@@ -2,6 +2,7 @@
 
 mod calibration;
 mod capture;
+mod clocks;
 mod corpora;
 mod models;
 mod properties;
