@@ -100,8 +100,8 @@ function decode(fields, from) {
 const POSE = Object.fromEntries(["x", "y", "z", "qx", "qy", "qz", "qw"].map((name, i) => [i + 1, [name, double]]));
 const SENSOR = {
   1: ["name", string], 2: ["model", string], 3: ["packets", uint32], 4: ["refused", uint64], 5: ["returns", uint32],
-  6: ["rpm", float], 7: ["completeness", float], 8: ["partial", string], 9: ["clock", string],
-  10: ["clock_offset_ms", sint64],
+  6: ["rpm", float], 7: ["completeness", float], 8: ["partial", string], 12: ["clock", string],
+  13: ["clock_offset_ms", sint64],
 };
 const HEADER = {
   1: ["vehicle", string], 2: ["boot_id", fixed64], 3: ["sequence", uint64], 4: ["capture_start_ns", sfixed64],
