@@ -53,6 +53,7 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
             "name": s.name, "model": s.model, "packets": s.packets, "refused": s.refused, "returns": s.returns,
             "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
             "clock": s.clock, "clock_offset_ms": s.clock_offset_ms,
+            "ledger": vehicle.sensor_ledgers.get(&s.name).map(ledger_document),
         })
     });
     json!({
@@ -62,13 +63,29 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
         "maps": vehicle.maps,
         "newest_age_ms": age_ms(vehicle, now),
         "sensors": sensors.collect::<Vec<_>>(),
-        "ledger": {
-            "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
-            "refused": ledger.refused, "lost": ledger.lost,
-        },
+        "ledger": ledger_document(&ledger),
         "recorder": {"file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost},
         "readers": vehicle.readers,
+        "strangers": vehicle.strangers.iter().map(|s| {
+            json!({"address": s.address, "datagrams": s.datagrams, "newest_age_ms": (now - s.newest_ns) as f64 * 1e-6})
+        }).collect::<Vec<_>>(),
     })
+}
+
+fn ledger_document(ledger: &v1::Ledger) -> Value {
+    json!({
+        "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
+        "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
+    })
+}
+
+fn ledger_line(ledger: &v1::Ledger) -> String {
+    let refused: Vec<_> = ledger.refused.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
+    let refused = if refused.is_empty() { "0".into() } else { refused.join(", ") };
+    format!(
+        "datagrams: {} received, {} decoded, {} telemetry, refused {refused}; lost {}",
+        ledger.received, ledger.decoded, ledger.telemetry, ledger.lost
+    )
 }
 
 fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
@@ -88,14 +105,14 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
             s.clock,
             s.clock_offset_ms
         ));
+        lines.extend(vehicle.sensor_ledgers.get(&s.name).map(|ledger| format!("    {}", ledger_line(ledger))));
     }
     if let Some(ledger) = &vehicle.ledger {
-        let refused: Vec<_> = ledger.refused.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
-        let refused = if refused.is_empty() { "0".into() } else { refused.join(", ") };
-        lines.push(format!(
-            "  datagrams: {} received, {} decoded, {} telemetry, refused {refused}, lost {}",
-            ledger.received, ledger.decoded, ledger.telemetry, ledger.lost
-        ));
+        lines.push(format!("  {}, dropped by the kernel {}", ledger_line(ledger), ledger.kernel_drops));
+    }
+    for s in &vehicle.strangers {
+        let age = (now - s.newest_ns) as f64 * 1e-9;
+        lines.push(format!("  unknown sender {}: {} datagrams, the newest {age:.0} s ago", s.address, s.datagrams));
     }
     match vehicle.recorder.as_ref().filter(|recorder| !recorder.file.is_empty()) {
         Some(r) => lines.push(format!("  recording {}: {} events, {} maps, lost {}", r.file, r.events, r.maps, r.lost)),
