@@ -227,6 +227,7 @@ impl VehicleStatus {
                 "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
                 "blocked_deg": s.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
                 "blocked_lasers": s.blocked_lasers,
+                "clock": s.clock, "clock_offset_ms": s.clock_offset_ms,
                 "state": s.state, "age_ms": s.age_ms,
                 "ledger": proto.sensor_ledgers.get(&s.name).map(self::ledger_json),
             })

@@ -105,6 +105,8 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
         rpm: state.rpm,
         completeness: state.completeness,
         partial: state.partial.to_owned(),
+        clock: state.clock.to_owned(),
+        clock_offset_ms: state.clock_offset_ms,
         packets_expected: state.packets_expected,
         blocked_sectors: state
             .blocked

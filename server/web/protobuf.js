@@ -58,6 +58,7 @@ const string = kind(LENGTH, "", text);
 const bytes = kind(LENGTH, new Uint8Array(0), (r) => r.chunk());
 const uint32 = kind(VARINT, 0, low32);
 const sint32 = kind(VARINT, 0, (r) => ((n) => (n >>> 1) ^ -(n & 1))(low32(r)));
+const sint64 = kind(VARINT, 0n, (r) => ((n) => (n >> 1n) ^ -(n & 1n))(r.varint()));
 const uint64 = kind(VARINT, 0n, (r) => r.varint());
 const fixed32 = kind(FIXED32, 0, (r) => r.view.getUint32(r.take(4), true));
 const fixed64 = kind(FIXED64, 0n, (r) => r.view.getBigUint64(r.take(8), true));
@@ -101,6 +102,7 @@ const SECTOR = { 1: ["from_deg", uint32], 2: ["to_deg", uint32] };
 const SENSOR = {
   1: ["name", string], 2: ["model", string], 3: ["packets", uint32], 4: ["refused", uint64], 5: ["returns", uint32],
   6: ["rpm", float], 7: ["completeness", float], 8: ["partial", string], 9: ["packets_expected", uint32],
+  12: ["clock", string], 13: ["clock_offset_ms", sint64],
   14: ["blocked_sectors", many(message(SECTOR))], 15: ["blocked_lasers", many(uint32)],
 };
 const HEADER = {

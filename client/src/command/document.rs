@@ -27,6 +27,7 @@ pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
             "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
             "blocked_deg": s.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
             "blocked_lasers": s.blocked_lasers,
+            "clock": s.clock, "clock_offset_ms": s.clock_offset_ms,
         })
     });
     let (rows, columns) = layer.grid.shape();

@@ -177,6 +177,8 @@ fn capture(file: &Path) -> Result<Value> {
                 "model": status.model.map(|model| model.spec().name),
                 "return_mode": status.return_mode.map(|mode| format!("{mode:?}").to_lowercase()),
                 "rpm": status.rpm,
+                "clock": status.clock.map(|clock| clock.as_str()),
+                "clock_offset_ms": status.clock_offset_ms,
                 "packets": status.packets,
                 "packets_lost": status.packets_lost,
                 "telemetry": status.telemetry,

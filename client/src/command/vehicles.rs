@@ -54,6 +54,7 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
             "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
             "blocked_deg": s.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
             "blocked_lasers": s.blocked_lasers,
+            "clock": s.clock, "clock_offset_ms": s.clock_offset_ms,
             "ledger": vehicle.sensor_ledgers.get(&s.name).map(ledger_document),
         })
     });
@@ -100,14 +101,17 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
         let blocked = [sectors, lasers].concat().join(", ");
         let blocked = if blocked.is_empty() { blocked } else { format!(", BLOCKED: {blocked}") };
         lines.push(format!(
-            "  sensor {} ({}): {:.0} rpm, {} of {} packets and {} returns a turn, {:.1} % of the turn{partial}{blocked}",
+            "  sensor {} ({}): {:.0} rpm, {} of {} packets and {} returns a turn, {:.1} % of the turn{partial}{blocked}, clock {} \
+             (host {:+} ms)",
             s.name,
             s.model,
             s.rpm,
             s.packets,
             s.packets_expected,
             s.returns,
-            100.0 * s.completeness
+            100.0 * s.completeness,
+            s.clock,
+            s.clock_offset_ms
         ));
         lines.extend(vehicle.sensor_ledgers.get(&s.name).map(|ledger| format!("    {}", ledger_line(ledger))));
     }

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use crate::beam::Beams;
 use crate::blocked::View;
 use crate::calibration::{Calibration, unit_table::UnitTable};
+use crate::clock::DeviceClock;
 use crate::firing::{MAX_FIRINGS, PacketFirings};
 use crate::identify;
 use crate::loss::Loss;
@@ -17,8 +18,7 @@ use crate::packet::{Packet, Refusal};
 use crate::revolution::{Firing, Partial, Revolution};
 use crate::sensor::{CalibrationSource, SensorConfig, SensorStatus};
 use crate::telemetry::Telemetry;
-use crate::time::DeviceClock;
-use crate::turns::{MAX_FIRINGS_PER_TURN, Step, Turns, expected_step};
+use crate::turns::{LONGEST_FORWARD, MAX_FIRINGS_PER_TURN, Step, Turns, expected_step};
 
 #[derive(Clone, Debug)]
 pub(crate) struct Decoder {
@@ -33,9 +33,8 @@ pub(crate) struct Decoder {
     current: Revolution,
     /// The newest finished one; its memory is used again.
     done: Revolution,
-    /// Timeline of the first firing of `current`, and how late its stamp is.
+    /// The first firing of `current` on the clock's timeline.
     first_ns: i64,
-    late_ns: i64,
     /// Firings of the newest turn that missed nothing.
     firings_whole: Option<u32>,
     /// Counts the sensor turns a block, and the azimuth at which the packet before began.
@@ -78,7 +77,6 @@ impl Decoder {
             done: revolution.clone(),
             current: revolution,
             first_ns: 0,
-            late_ns: 0,
             firings_whole: None,
             step: None,
             packet_azimuth: None,
@@ -97,10 +95,11 @@ impl Decoder {
         identify::check(packet, self.spec.model)
     }
 
-    pub fn take_telemetry(&mut self, telemetry: &Telemetry) {
+    pub fn take_telemetry(&mut self, telemetry: &Telemetry, arrival_ns: i64) {
         // An HDL-64E S1 sends no time that telemetry could place.
         if self.spec.model != Model::Hdl64eS1 {
-            self.clock.telemetry(telemetry);
+            let tells_pps = self.spec.model != Model::Hdl32e && !self.spec.model.is_hdl64e();
+            self.clock.telemetry(telemetry, tells_pps, arrival_ns);
         }
     }
 
@@ -130,11 +129,14 @@ impl Decoder {
         self.status.packets += 1;
         self.listen_to_unit(packet);
 
+        let before = self.packet_azimuth;
         let firings = PacketFirings::new(packet, self.spec, mode, self.step_across(packet));
         self.step = firings.step;
-        let device_us = (self.spec.model != Model::Hdl64eS1).then(|| packet.device_us());
         let span_ns = i64::from(self.spec.packet_period_ns(mode));
-        let time_ns = self.clock.timeline_ns(device_us, arrival_ns, span_ns);
+        let timed = self.spec.model != Model::Hdl64eS1;
+        let elapsed_ns = if timed { span_ns } else { span_ns * self.packets_since(before, packet) };
+        let device_us = timed.then(|| packet.device_us());
+        let time_ns = self.clock.packet(device_us, elapsed_ns, arrival_ns, span_ns);
 
         let torn = self.take_gap(firings.azimuths(), gap);
         let first_row = self.current.firings.len();
@@ -144,7 +146,7 @@ impl Decoder {
         self.current.packets_expected += 1;
         if let Some(cut) = cut {
             self.end_turn(first_row + cut.firing, if torn { 0 } else { cut.travelled }, cut.time_ns);
-            (self.first_ns, self.late_ns, self.current.start_ns) = (cut.time_ns, cut.late_ns, cut.start_ns);
+            self.first_ns = cut.time_ns;
             (self.current.partial, self.current.packets, self.current.packets_expected) = (cut.partial, 1, 1);
             if self.learn_from_unit() {
                 self.decode(packet, cut.firing, 0);
@@ -163,13 +165,12 @@ impl Decoder {
     /// Ends the stream; whether there was an unfinished turn.
     pub fn finish(&mut self) -> bool {
         let Some(last) = self.current.firings.last() else { return false };
-        let last_ns = self.first_ns + self.late_ns + i64::from(last.offset_ns);
+        let last_ns = self.first_ns + i64::from(last.offset_ns);
         if !self.turns.ends_at_cut(self.expected()) {
             self.current.partial.get_or_insert(Partial::End);
         }
         let travelled = self.turns.travelled();
         self.end_turn(self.current.firings.len(), travelled, last_ns);
-        self.clock.turn_ended(self.done.end_ns);
         self.turns.forget();
         self.packet_azimuth = None;
         self.loss.finish();
@@ -206,6 +207,15 @@ impl Decoder {
         Some(across.filter(|step| (nominal / 2..=nominal + nominal / 2).contains(step)).unwrap_or(nominal))
     }
 
+    /// Packets from the one that began at azimuth `before` to this one, as a sensor without a clock shows them by
+    /// turning.
+    fn packets_since(&self, before: Option<u32>, packet: &Packet<'_>) -> i64 {
+        let turned = before.map_or(0, |before| crate::firing::forward(before, packet.azimuth(0)));
+        let firing = expected_step(self.spec, self.mode, self.rpm()).max(1);
+        let one = firing * self.spec.firings_per_packet(self.mode) as u32;
+        if turned > LONGEST_FORWARD { 1 } else { i64::from((turned + one / 2) / one).max(1) }
+    }
+
     fn rpm(&self) -> f32 {
         self.rpm_configured.or(self.status.rpm).unwrap_or(self.spec.rpm_nominal)
     }
@@ -223,10 +233,12 @@ impl Decoder {
         let mut cut: Option<Cut> = None;
         let mut rows = [Firing { azimuth_rad: 0.0, offset_ns: 0 }; MAX_FIRINGS];
         let mut offset_ns = self.current.firings.last().map_or(0, |firing| firing.offset_ns);
+        let mut first_ns = self.first_ns;
         for (firing, azimuth) in firings.azimuths().iter().copied().enumerate() {
             let time_ns = time_ns.saturating_add(firing as i64 * period_ns);
             if self.current.firings.is_empty() && firing == 0 {
                 self.begin_turn(azimuth, time_ns, expected);
+                first_ns = time_ns;
             }
             let (step, crossed) = self.turns.follow(azimuth, expected);
             let torn = torn && firing == 0;
@@ -241,17 +253,12 @@ impl Decoder {
             if (crossed || overlong) && may_cut && cut.is_none() {
                 let overlong = (!crossed).then_some(Partial::Overlong);
                 self.current.partial = self.current.partial.or(overlong);
-                self.clock.turn_ended(self.current.start_ns + i64::from(offset_ns));
-                let (start_ns, late_ns) = self.clock.turn_starts(time_ns);
                 let partial = flaw.or(overlong);
-                cut = Some(Cut { firing, time_ns, start_ns, late_ns, travelled: self.turns.restart(), partial });
-                offset_ns = 0;
+                cut = Some(Cut { firing, time_ns, travelled: self.turns.restart(), partial });
+                (first_ns, offset_ns) = (time_ns, 0);
             }
-            let (first_ns, late_ns) =
-                cut.as_ref().map_or((self.first_ns, self.late_ns), |cut| (cut.time_ns, cut.late_ns));
-            let since_start_ns = time_ns.saturating_sub(first_ns).saturating_sub(late_ns).max(0);
             // Device time that runs backwards inside a turn stands still instead.
-            offset_ns = offset_ns.max(u32::try_from(since_start_ns).unwrap_or(u32::MAX));
+            offset_ns = offset_ns.max(u32::try_from((time_ns - first_ns).max(0)).unwrap_or(u32::MAX));
             rows[firing] = Firing::new(azimuth, offset_ns);
         }
         self.current.grow(&rows[..firings.azimuths().len()]);
@@ -275,7 +282,6 @@ impl Decoder {
 
     fn begin_turn(&mut self, azimuth: u32, time_ns: i64, expected: u32) {
         self.first_ns = time_ns;
-        (self.current.start_ns, self.late_ns) = self.clock.turn_starts(time_ns);
         if !self.turns.starts_at_cut(azimuth, expected) {
             self.current.partial.get_or_insert(Partial::Start);
         }
@@ -320,7 +326,10 @@ impl Decoder {
         }
         let nominal = self.spec.firings_per_turn(self.mode, rpm).min(MAX_FIRINGS_PER_TURN) as u32;
         done.firings_expected = self.firings_whole.unwrap_or(nominal);
-        done.end_ns = done.start_ns + done.firings.last().map_or(0, |firing| i64::from(firing.offset_ns));
+        let stamp = self.clock.stamp(self.first_ns, &mut done.firings);
+        (done.start_ns, done.end_ns) = (stamp.start_ns, stamp.end_ns);
+        (done.clock, done.clock_offset_ms) = (stamp.clock, stamp.clock_offset_ms);
+        (self.status.clock, self.status.clock_offset_ms) = (Some(stamp.clock), stamp.clock_offset_ms);
         self.status.revolutions += 1;
         self.status.returns += self.view.take(done);
     }
@@ -361,8 +370,6 @@ struct Cut {
     /// The first of the next turn, counted from the packet's first.
     firing: usize,
     time_ns: i64,
-    start_ns: i64,
-    late_ns: i64,
     travelled: u64,
     /// What the next turn misses from the start.
     partial: Option<Partial>,

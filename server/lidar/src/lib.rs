@@ -15,8 +15,9 @@
 //! | `identify` | packet -> model |
 //! | [`sensor`] | the door: datagram in, revolution out |
 //! | `order` | packets as they arrive -> in the order they were sent, without copies |
-//! | `decoder` | packets of a known model -> revolutions, by way of the next seven |
-//! | `time` | device microseconds past the hour -> stamps |
+//! | `decoder` | packets of a known model -> revolutions, by way of the next eight |
+//! | `timeline` | device microseconds past the hour -> one timeline |
+//! | [`clock`] | timeline, telemetry, arrival -> stamps |
 //! | `firing` | packet -> firings |
 //! | `turns` | firings -> cuts, gaps, reversals |
 //! | `loss` | packets missing -> packets lost |
@@ -28,6 +29,7 @@ mod beam;
 pub mod blocked;
 pub mod calibration;
 pub mod capture;
+pub mod clock;
 mod decoder;
 mod firing;
 mod identify;
@@ -38,11 +40,12 @@ pub mod packet;
 pub mod revolution;
 pub mod sensor;
 pub mod telemetry;
-mod time;
+mod timeline;
 mod turns;
 
 pub use blocked::{Blocked, BlockedSector};
 pub use calibration::{Calibration, CalibrationError, LaserCalibration};
+pub use clock::Clock;
 pub use model::{Model, ModelSpec, ReturnMode};
 pub use packet::Refusal;
 pub use revolution::{Echo, Firing, Partial, Point, Revolution};

@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use crate::blocked::Blocked;
 use crate::calibration::Calibration;
+use crate::clock::Clock;
 use crate::model::{AZIMUTHS_PER_TURN, Model, RETURNS_PER_BLOCK, ReturnMode};
 
 /// One turn of one sensor as a range image: `lasers` slots a firing, firings in time order.
@@ -33,6 +34,11 @@ pub struct Revolution {
     pub start_ns: i64,
     /// Stamp of the last firing, ns since the Unix epoch.
     pub end_ns: i64,
+    /// The clock the stamps follow.
+    pub clock: Clock,
+    /// By how much the host's clock is ahead of the stamps, ms: arrival of the turn's quickest packet less its stamp, so
+    /// that the way from the sensor counts too.
+    pub clock_offset_ms: i64,
     /// Measured turning rate.
     pub rpm: f32,
     /// Why the turn is not whole; `None` for a whole one.
@@ -139,6 +145,8 @@ impl Revolution {
             calibration,
             start_ns: 0,
             end_ns: 0,
+            clock: Clock::Arrival,
+            clock_offset_ms: 0,
             rpm: 0.0,
             partial: None,
             packets: 0,

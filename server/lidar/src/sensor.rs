@@ -5,6 +5,7 @@
 
 use crate::blocked::Blocked;
 use crate::calibration::Calibration;
+use crate::clock::Clock;
 use crate::decoder::Decoder;
 use crate::identify::{self, Finding, PACKETS_HELD};
 use crate::model::{Model, ReturnMode};
@@ -42,8 +43,8 @@ pub struct Sensor {
     held: Vec<(Box<[u8]>, i64)>,
     order: Order,
     decoder: Option<Box<Decoder>>,
-    /// The newest telemetry, and how many there were.
-    telemetry: Option<Telemetry>,
+    /// The newest telemetry with its arrival, and how many there were.
+    telemetry: Option<(Telemetry, i64)>,
     telemetry_count: u64,
 }
 
@@ -86,6 +87,10 @@ pub struct SensorStatus {
     pub blocked: Blocked,
     /// Whose table is in use.
     pub calibration: CalibrationSource,
+    /// The clock the newest revolution's stamps follow; `None` before the first.
+    pub clock: Option<Clock>,
+    /// By how much the host's clock is ahead of it, ms ([`Revolution::clock_offset_ms`]).
+    pub clock_offset_ms: i64,
     /// State of the pulse per second in the newest telemetry.
     pub pps: Option<Pps>,
     /// The newest GPRMC.
@@ -109,19 +114,19 @@ impl Sensor {
     /// [`Refusal`] with the value that was wrong; the sensor's state is as if the datagram had not come.
     pub fn push(&mut self, payload: &[u8], arrival_ns: i64) -> Result<Option<&Revolution>, Refusal> {
         match payload.len() {
-            TELEMETRY_LENGTH => self.push_telemetry(Telemetry::new(payload)?),
+            TELEMETRY_LENGTH => self.push_telemetry(Telemetry::new(payload)?, arrival_ns),
             PACKET_LENGTH => return self.push_packet(&Packet::new(payload)?, payload, arrival_ns),
             length => return Err(Refusal::Length { length }),
         }
         Ok(None)
     }
 
-    fn push_telemetry(&mut self, telemetry: Telemetry) {
+    fn push_telemetry(&mut self, telemetry: Telemetry, arrival_ns: i64) {
         if let Some(decoder) = &mut self.decoder {
-            decoder.take_telemetry(&telemetry);
+            decoder.take_telemetry(&telemetry, arrival_ns);
         }
         self.telemetry_count += 1;
-        self.telemetry = Some(telemetry);
+        self.telemetry = Some((telemetry, arrival_ns));
     }
 
     fn push_packet(
@@ -174,8 +179,8 @@ impl Sensor {
     fn start(&mut self, model: Model, packet: &Packet<'_>) -> Result<(), Refusal> {
         let mut decoder = Decoder::new(model, &self.config)?;
         decoder.check(packet)?;
-        if let Some(telemetry) = &self.telemetry {
-            decoder.take_telemetry(telemetry);
+        if let Some((telemetry, arrival_ns)) = &self.telemetry {
+            decoder.take_telemetry(telemetry, *arrival_ns);
         }
         for (payload, arrival_ns) in self.held.drain(..) {
             let Ok(held) = Packet::new(&payload) else { continue };
@@ -210,7 +215,7 @@ impl Sensor {
 
     /// The newest telemetry's GPRMC, if it had one.
     pub fn gprmc(&self) -> Option<&Gprmc> {
-        self.telemetry.as_ref()?.gprmc.as_ref()
+        self.telemetry.as_ref()?.0.gprmc.as_ref()
     }
 
     /// What is known so far.
@@ -220,8 +225,8 @@ impl Sensor {
         status.rpm = self.config.rpm.or(status.rpm);
         status.packets_held = self.held.len() + self.order.held();
         status.telemetry = self.telemetry_count;
-        status.pps = self.telemetry.as_ref().map(|telemetry| telemetry.pps);
-        status.gprmc = self.telemetry.as_ref().and_then(|telemetry| telemetry.gprmc.clone());
+        status.pps = self.telemetry.as_ref().map(|(telemetry, _)| telemetry.pps);
+        status.gprmc = self.telemetry.as_ref().and_then(|(telemetry, _)| telemetry.gprmc.clone());
         status
     }
 }

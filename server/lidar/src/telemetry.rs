@@ -44,7 +44,7 @@ pub enum Pps {
 pub struct Gprmc {
     /// Whether the receiver calls its fix valid (`A`).
     pub valid: bool,
-    /// Time and date, ns since the Unix epoch; `None` if either is empty.
+    /// Time and date, ns since the Unix epoch, of 1980 to 2079; `None` if either is empty.
     pub utc_ns: Option<i64>,
     /// Degrees, north positive.
     pub latitude_deg: Option<f64>,
@@ -219,7 +219,9 @@ fn utc_ns(time: &str, date: &str) -> Result<Option<i64>, NmeaError> {
     }
     let fraction = time.split_once('.').map_or(Ok(0.0), |(_, digits)| format!("0.{digits}").parse());
     let fraction: f64 = fraction.map_err(|_| wrong("time", time, "hhmmss or hhmmss.s"))?;
-    let seconds = days_since_1970(2000 + year, month, day) * 86_400 + hour * 3_600 + minute * 60 + second;
+    // Two digits: receivers that begin at GPS's first day, 6 January 1980, write 80.
+    let century = if year >= 80 { 1900 } else { 2000 };
+    let seconds = days_since_1970(century + year, month, day) * 86_400 + hour * 3_600 + minute * 60 + second;
     Ok(Some(seconds * 1_000_000_000 + (fraction * 1e9).round() as i64))
 }
 

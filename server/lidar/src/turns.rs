@@ -11,7 +11,7 @@ use crate::model::{AZIMUTHS_PER_TURN, ModelSpec, ReturnMode};
 pub const MAX_FIRINGS_PER_TURN: usize = 12_500;
 
 /// Steps longer than this are taken as backward: packets out of order, not a sensor that sees a tenth of a turn.
-const LONGEST_FORWARD: u32 = AZIMUTHS_PER_TURN - AZIMUTHS_PER_TURN / 10;
+pub(crate) const LONGEST_FORWARD: u32 = AZIMUTHS_PER_TURN - AZIMUTHS_PER_TURN / 10;
 /// Backward steps up to this are the encoder's tremble.
 const TREMBLE: u32 = 20;
 

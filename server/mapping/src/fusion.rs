@@ -163,6 +163,8 @@ fn state(intake: &Intake, part: Part, stamp_ns: i64) -> SensorState {
         model: turn.state.model.clone(),
         refused: intake.ledger.refused_sum(),
         state: part,
+        clock: turn.state.clock,
+        clock_offset_ms: turn.state.clock_offset_ms,
         age_ms: (intake.turns > 0).then(|| (age_ns as f64 / NS_A_MS as f64) as f32),
         ..seen
     }

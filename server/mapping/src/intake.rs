@@ -195,6 +195,8 @@ impl Intake {
             state: if revolution.partial.is_some() { Part::Partial } else { Part::Ok },
             age_ms: None,
             blocked: revolution.blocked.clone(),
+            clock: revolution.clock.as_str(),
+            clock_offset_ms: revolution.clock_offset_ms,
         };
         (turn.start_ns, turn.end_ns, turn.is_revolution) = (revolution.start_ns, revolution.end_ns, true);
         self.end_turn(motion, now);
@@ -236,6 +238,8 @@ impl Intake {
             // Whoever assembled it knows its field of view.
             completeness: 1.0,
             state: Part::Ok,
+            clock: "sender",
+            clock_offset_ms: now.arrival_ns.saturating_sub(scan.stamp_ns) / 1_000_000,
             ..SensorState::default()
         };
         let first = scan.offset_ns.iter().min().copied().unwrap_or(0);

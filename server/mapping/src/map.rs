@@ -55,6 +55,10 @@ pub struct SensorState {
     pub partial: &'static str,
     /// Where the sensor used to see and did not in this revolution.
     pub blocked: Blocked,
+    /// The clock the stamps follow, as [`clearway_lidar::Clock::as_str`] spells it; `sender` where a scan brings its stamp.
+    pub clock: &'static str,
+    /// By how much the host's clock is ahead of the stamps, ms.
+    pub clock_offset_ms: i64,
     /// Whether its newest turn is in the map.
     pub state: Part,
     /// From its newest turn's end to the map's stamp; `None` before its first turn.

@@ -58,6 +58,30 @@ fn scan(stamp_ns: i64) -> Scan {
 }
 
 #[test]
+fn a_host_clock_that_steps_changes_no_map_of_a_sensor_on_gps_but_what_is_said_of_the_host() {
+    const HOUR_NS: i64 = 3_600_000_000_000;
+    let run = |step_ns: i64| {
+        let mut events = drive();
+        let middle = events.len() / 2;
+        events[middle..].iter_mut().for_each(|event| event.arrival_ns += step_ns);
+        maps(&mut pipeline(Some(Model::Vlp16)), &events)
+    };
+    let steady = run(0);
+    for step_ns in [HOUR_NS, -HOUR_NS] {
+        let mut stepped = run(step_ns);
+        let last = stepped.last().unwrap();
+        assert_eq!((last.sensors[0].clock, last.sensors[0].clock_offset_ms), ("gps", step_ns / 1_000_000));
+        for (map, steady) in stepped.iter_mut().zip(&steady) {
+            map.completed_ns = steady.completed_ns;
+            // The age of a GPRMC's speed is the host's to tell.
+            (map.compensation, map.speed_mps) = (steady.compensation, steady.speed_mps);
+            map.sensors[0].clock_offset_ms = steady.sensors[0].clock_offset_ms;
+        }
+        assert!(stepped == steady, "{step_ns}");
+    }
+}
+
+#[test]
 fn a_drive_becomes_a_map_a_turn_and_the_end_gives_the_rest_as_partial() {
     let events = drive();
     let mut pipeline = pipeline(Some(Model::Vlp16));
@@ -73,6 +97,8 @@ fn a_drive_becomes_a_map_a_turn_and_the_end_gives_the_rest_as_partial() {
     assert_eq!(whole.sensors[0].partial, "");
     assert_eq!(whole.sensors[0].model, "vlp16");
     assert_eq!(whole.sensors[0].completeness, 1.0);
+    // The vehicle's device time is UTC's and its telemetry says so; the stream comes without delay.
+    assert_eq!((whole.sensors[0].clock, whole.sensors[0].clock_offset_ms), ("gps", 0));
     assert!((whole.sensors[0].rpm - 600.0).abs() < 5.0);
     assert!(whole.capture_end_ns - whole.capture_start_ns > 95_000_000);
     assert!(whole.completed_ns >= whole.capture_end_ns);

@@ -4,6 +4,7 @@ mod bad_datagrams;
 mod blocked;
 mod calibration;
 mod capture;
+mod clocks;
 mod corpora;
 mod models;
 mod order;

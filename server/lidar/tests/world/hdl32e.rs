@@ -1,6 +1,6 @@
 //! An HDL-32E on a moving car, beside velodyne-decoder, and one packet of another.
 
-use clearway_lidar::{Model, Revolution, Sensor, SensorConfig};
+use clearway_lidar::{Clock, Model, Revolution, Sensor, SensorConfig};
 
 use crate::{against, archive, data, decode_capture, distance_m, points, spread};
 
@@ -29,6 +29,9 @@ fn stamps_follow_gprmc() {
     assert!(revolutions.windows(2).all(|pair| pair[0].end_ns < pair[1].start_ns));
     // The first packet says 164,473,090 µs past the hour; it is 22 h on 11 December 2012.
     assert_eq!(revolutions[0].start_ns, 1_355_263_200_000_000_000 + 164_473_090_000);
+    assert!(revolutions.iter().all(|revolution| revolution.clock == Clock::Gps));
+    // The host that recorded it was 0.9 s ahead.
+    assert!(revolutions.iter().all(|revolution| (904..=905).contains(&revolution.clock_offset_ms)));
 }
 
 #[test]

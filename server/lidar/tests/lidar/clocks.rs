@@ -1,0 +1,389 @@
+//! Scripts of what happens to clocks: stamps always rise, and are right again one turn later.
+
+use clearway_lidar::{Clock, Model, Revolution, Sensor, SensorConfig};
+use proptest::collection::vec;
+use proptest::prelude::*;
+
+use crate::stream::Stream;
+use crate::telemetry::{datagram, with_sum};
+
+const S: i64 = 1_000_000_000;
+const HOUR: i64 = 3_600 * S;
+const TURN: i64 = S / 10;
+/// 18 May 2033, 0 h UTC.
+const MIDNIGHT: i64 = 1_999_987_200 * S;
+/// When it happens, in most scripts: inside a turn.
+const EVENT: i64 = 1_033_000_000;
+
+/// One script; all functions take ns since its beginning.
+#[derive(Clone, Copy)]
+struct Script {
+    name: &'static str,
+    /// UTC at its beginning.
+    utc_ns: i64,
+    lasts_ns: i64,
+    /// Device time, ns; taken past the hour.
+    device_ns: fn(i64) -> i64,
+    /// How far the host's clock is ahead of UTC.
+    host_ns: fn(i64) -> i64,
+    /// PPS state and what the receiver says: time and date, valid.
+    telemetry: fn(i64) -> Option<(u8, String)>,
+    /// How far right stamps are ahead of UTC.
+    right_ns: fn(i64) -> i64,
+    event_ns: i64,
+    /// From the event until stamps must be right.
+    healed_ns: i64,
+    tolerance_ns: i64,
+    last: Clock,
+}
+
+const BASE: Script = Script {
+    name: "",
+    utc_ns: NOON,
+    lasts_ns: 2 * S,
+    device_ns: |t| NOON + t,
+    host_ns: |_| 0,
+    telemetry: |t| gps(NOON + t),
+    right_ns: |_| 0,
+    event_ns: EVENT,
+    healed_ns: TURN,
+    tolerance_ns: 200_000,
+    last: Clock::Gps,
+};
+const NOON: i64 = MIDNIGHT + 12 * HOUR + 1_234 * S;
+/// A second before the day, and an hour, ends.
+const LATE: i64 = MIDNIGHT + 24 * HOUR - S;
+/// A free-running device, 500 s after it was switched on.
+const FREE: fn(i64) -> i64 = |t| 500 * S + t;
+const SILENT: fn(i64) -> Option<(u8, String)> = |_| None;
+
+fn rmc(second: i64, status: char, date: &str) -> String {
+    let of_day = second % 86_400;
+    let (hour, minute) = (of_day / 3_600, of_day / 60 % 60);
+    with_sum(&format!(
+        "GPRMC,{hour:02}{minute:02}{:02},{status},3707.8178,N,12139.2690,W,010.3,188.2,{date}",
+        of_day % 60
+    ))
+}
+
+/// The sentence of 0.3 s ago, pulse locked.
+fn gps(utc_ns: i64) -> Option<(u8, String)> {
+    let second = (utc_ns - MIDNIGHT - 300_000_000) / S;
+    Some((2, rmc(second, 'A', if second < 86_400 { "180533" } else { "190533" })))
+}
+
+fn dated(t: i64, date: &str) -> Option<(u8, String)> {
+    Some((2, rmc((NOON + t - MIDNIGHT) / S, 'A', date)))
+}
+
+fn after<T>(t: i64, then: T, before: T) -> T {
+    if t >= EVENT { then } else { before }
+}
+
+fn scripts() -> Vec<Script> {
+    let late = Script { utc_ns: LATE, device_ns: |t| LATE + t, telemetry: |t| gps(LATE + t), ..BASE };
+    let free = Script { device_ns: FREE, telemetry: SILENT, last: Clock::Arrival, ..BASE };
+    vec![
+        Script { name: "the hour and the day end, and telemetry comes at that microsecond", event_ns: S, ..late },
+        Script { name: "the hour ends without telemetry", telemetry: SILENT, last: Clock::Device, event_ns: S, ..late },
+        Script {
+            name: "GPS is gained: the device jumps to UTC; the host was 20 s behind",
+            device_ns: |t| after(t, NOON, 500 * S) + t,
+            telemetry: |t| after(t, gps(NOON + t), Some((1, rmc(0, 'V', "010100")))),
+            host_ns: |_| -20 * S,
+            right_ns: |t| after(t, 0, -20 * S),
+            ..BASE
+        },
+        Script {
+            name: "GPS is gained a little ahead of the host: slower until it is right",
+            device_ns: |t| after(t, NOON, 500 * S) + t,
+            telemetry: |t| after(t, gps(NOON + t), None),
+            host_ns: |_| 40_000_000,
+            right_ns: |t| after(t, 0, 40_000_000),
+            healed_ns: 2 * TURN,
+            ..BASE
+        },
+        Script {
+            name: "GPS is lost, the host 7 s off: nothing changes",
+            telemetry: |t| after(t, Some((0, rmc(0, 'V', ""))), gps(NOON + t)),
+            host_ns: |_| 7 * S,
+            last: Clock::GpsUnlocked,
+            ..BASE
+        },
+        Script {
+            name: "telemetry ends",
+            telemetry: |t| after(t, None, gps(NOON + t)),
+            lasts_ns: 5 * S,
+            last: Clock::GpsUnlocked,
+            ..BASE
+        },
+        Script {
+            name: "the pulse is lost",
+            telemetry: |t| gps(NOON + t).map(|(pps, text)| (after(t, 3, pps), text)),
+            last: Clock::GpsUnlocked,
+            ..BASE
+        },
+        Script { name: "the host steps an hour on, under GPS", host_ns: |t| after(t, HOUR, 0), ..BASE },
+        Script { name: "the host steps an hour back, under GPS", host_ns: |t| after(t, -HOUR, 0), ..BASE },
+        Script {
+            name: "the host steps an hour on and nobody else knows the time",
+            host_ns: |t| after(t, HOUR, 0),
+            right_ns: |t| after(t, HOUR, 0),
+            ..free
+        },
+        Script {
+            name: "the host steps an hour back: stamps go on as they did",
+            host_ns: |t| after(t, -HOUR, 0),
+            last: Clock::Held,
+            ..free
+        },
+        Script {
+            name: "the sensor is restarted",
+            device_ns: |t| after(t, t - EVENT, 500 * S + t),
+            tolerance_ns: 11_000_000,
+            ..free
+        },
+        Script {
+            name: "the sensor is restarted and finds no GPS; the host is 7 s off",
+            device_ns: |t| after(t, t - EVENT, NOON + t),
+            telemetry: |t| after(t, None, gps(NOON + t)),
+            host_ns: |_| 7 * S,
+            tolerance_ns: 2_000_000,
+            last: Clock::GpsUnlocked,
+            ..BASE
+        },
+        Script {
+            name: "the pulse alone sets the part of a second 0.7 s back",
+            device_ns: |t| after(t, 499_300_000_000, 500 * S) + t,
+            tolerance_ns: 11_000_000,
+            ..free
+        },
+        Script {
+            name: "a capture played at ten times its speed",
+            host_ns: |t| -t / 10 * 9,
+            tolerance_ns: TURN,
+            last: Clock::Held,
+            ..free
+        },
+        Script {
+            name: "all arrivals equal",
+            host_ns: |t| -t,
+            tolerance_ns: TURN + 2_000_000,
+            last: Clock::Held,
+            ..free
+        },
+        Script { name: "the receiver says 1980", telemetry: |t| dated(t, "060180"), last: Clock::Device, ..BASE },
+        Script {
+            name: "the receiver is 1024 weeks late",
+            telemetry: |t| dated(t, "021013"),
+            last: Clock::Device,
+            ..BASE
+        },
+        Script { name: "the device does not follow its receiver", telemetry: |t| gps(NOON + t), ..free },
+        Script {
+            name: "a leap second, counted past the hour; Unix time repeats it",
+            device_ns: |t| t + if t < 2 * S { HOUR - S } else { -2 * S },
+            telemetry: |t| match t - 300_000_000 {
+                0..S => Some((2, rmc(86_399, 'A', "180533"))),
+                S..2_000_000_000 => Some((2, with_sum("GPRMC,235960,A,,,,,,,180533"))),
+                _ => gps(LATE + t - S),
+            },
+            host_ns: |t| if t < 2 * S { 0 } else { -S },
+            right_ns: |t| if t < 2 * S { 0 } else { -S },
+            event_ns: 2 * S,
+            lasts_ns: 5 * S,
+            healed_ns: 2 * S + TURN,
+            ..late
+        },
+    ]
+}
+
+fn with_device_us(mut packet: Vec<u8>, device_us: u32) -> Vec<u8> {
+    packet[1200..1204].copy_from_slice(&device_us.to_le_bytes());
+    packet
+}
+
+/// Every turn of a script; telemetry 50 times a second.
+fn play(script: &Script, sensor: &mut Sensor) -> Vec<Revolution> {
+    let stream = Stream::of(Model::Vlp16);
+    let period = i64::from(Model::Vlp16.spec().packet_period_ns(stream.mode));
+    let mut turns = Vec::new();
+    let mut telemetry_ns = 0;
+    for (index, t) in (0..script.lasts_ns).step_by(period as usize).enumerate() {
+        let arrival = |t: i64| script.utc_ns + t + (script.host_ns)(t);
+        if t >= telemetry_ns {
+            if let Some((pps, sentence)) = (script.telemetry)(telemetry_ns) {
+                let mut payload = datagram(past_hour_us(script, telemetry_ns), &sentence);
+                payload[202] = pps;
+                assert!(sensor.push(&payload, arrival(telemetry_ns)).unwrap().is_none());
+            }
+            telemetry_ns += S / 50;
+        }
+        let packet = with_device_us(stream.packet(index), past_hour_us(script, t));
+        turns.extend(sensor.push(&packet, arrival(t + period)).unwrap().cloned());
+    }
+    turns
+}
+
+fn past_hour_us(script: &Script, t: i64) -> u32 {
+    let us = (script.device_ns)(t) / 1_000;
+    // A leap second is told as it is counted; all else past the hour.
+    if (3_600_000_000..3_601_000_000).contains(&us) { us as u32 } else { (us % 3_600_000_000) as u32 }
+}
+
+fn assert_rising(name: &str, turns: &[Revolution]) {
+    for pair in turns.windows(2) {
+        assert!(pair[0].end_ns < pair[1].start_ns, "{name}: turn {}", pair[1].sequence);
+    }
+    for turn in turns {
+        assert!(turn.start_ns < turn.end_ns, "{name}: turn {}", turn.sequence);
+        assert!(turn.firings.windows(2).all(|pair| pair[0].offset_ns < pair[1].offset_ns), "{name}: {}", turn.sequence);
+    }
+}
+
+#[test]
+fn stamps_rise_and_are_right_again_one_turn_after_whatever_happens_to_a_clock() {
+    for script in scripts() {
+        let turns = play(&script, &mut Sensor::new(SensorConfig::default()));
+        let name = script.name;
+        assert_rising(name, &turns);
+        assert!(turns.len() as i64 >= script.lasts_ns / TURN - 1, "{name}: {} turns", turns.len());
+        for (index, turn) in turns.iter().enumerate() {
+            let t = index as i64 * TURN;
+            if (script.event_ns - TURN..script.event_ns + script.healed_ns).contains(&t) {
+                continue;
+            }
+            let error_ns = turn.start_ns - (script.utc_ns + t + (script.right_ns)(t));
+            assert!(error_ns.abs() <= script.tolerance_ns, "{name}: turn {index} is {error_ns} ns off");
+        }
+        assert_eq!(turns.last().unwrap().clock, script.last, "{name}");
+    }
+}
+
+#[test]
+fn the_turn_says_how_far_the_host_is_from_its_clock() {
+    let offset = |host_ns| {
+        let turns = play(&Script { host_ns, ..BASE }, &mut Sensor::new(SensorConfig::default()));
+        turns.last().unwrap().clock_offset_ms
+    };
+    assert_eq!(offset(|_| 0), 0);
+    assert_eq!(offset(|t| after(t, HOUR, 0)), 3_600_000);
+    assert_eq!(offset(|_| -250_000_000), -250);
+}
+
+#[test]
+fn two_sensors_on_different_hours_give_one_time() {
+    let gps = play(
+        &Script { utc_ns: LATE, device_ns: |t| LATE + t, telemetry: |t| gps(LATE + t), ..BASE },
+        &mut Sensor::new(SensorConfig::default()),
+    );
+    let free = play(
+        &Script { utc_ns: LATE, device_ns: FREE, telemetry: SILENT, ..BASE },
+        &mut Sensor::new(SensorConfig::default()),
+    );
+    assert_eq!((gps[5].clock, free[5].clock), (Clock::Gps, Clock::Arrival));
+    for (gps, free) in gps.iter().zip(&free) {
+        assert!((gps.start_ns - free.start_ns).abs() < 2_000, "{}", gps.start_ns - free.start_ns);
+    }
+}
+
+/// Every 20th packet of three minutes.
+#[test]
+fn a_device_that_drifts_by_100_ppm_stays_within_12_ms_of_arrival() {
+    let stream = Stream::of(Model::Vlp16);
+    let period = i64::from(Model::Vlp16.spec().packet_period_ns(stream.mode));
+    for ppm in [-100, 100] {
+        let mut sensor = Sensor::new(SensorConfig { model: Some(Model::Vlp16), ..SensorConfig::default() });
+        let (mut turns, mut worst_ns) = (Vec::new(), 0);
+        for index in (0..stream.packets(1_800.0)).step_by(20) {
+            let t = index as i64 * period;
+            let packet = with_device_us(stream.packet(index), (FREE(t + t / 1_000_000 * ppm) / 1_000) as u32);
+            if let Some(turn) = sensor.push(&packet, NOON + t + period).unwrap().cloned() {
+                // At 600 rpm the azimuth tells the true time within the turn.
+                let turned_deg = turn.firings.last().unwrap().azimuth_rad.to_degrees() - 180.0;
+                let true_ns = NOON + (f64::from(turned_deg) / 360.0 * TURN as f64) as i64;
+                let error_ns = (turn.end_ns - true_ns + TURN / 2).rem_euclid(TURN) - TURN / 2;
+                worst_ns = worst_ns.max(error_ns.abs());
+                turns.push(turn);
+            }
+        }
+        assert_rising("drift", &turns);
+        assert!((5_000_000..12_000_000).contains(&worst_ns), "{ppm} ppm: {worst_ns}");
+    }
+}
+
+#[test]
+fn jitter_bursts_and_wild_device_times_change_no_stamp() {
+    for model in [Model::Vlp16, Model::Hdl32e, Model::Hdl64eS1] {
+        let stream = Stream { device_us: 500_000_000, ..Stream::of(model) };
+        let packets = stream.packets(20.5);
+        let stamps = |late_ns: fn(usize) -> i64, wild: fn(usize) -> bool| {
+            let mut sensor = Sensor::new(SensorConfig { model: Some(model), ..SensorConfig::default() });
+            let mut turns = Vec::new();
+            for index in 0..packets {
+                let mut packet = stream.packet(index);
+                if wild(index) && model != Model::Hdl64eS1 {
+                    packet = with_device_us(packet, (index as u32).wrapping_mul(2_654_435_761));
+                }
+                turns.extend(sensor.push(&packet, stream.arrival_ns(index) + late_ns(index)).unwrap().cloned());
+            }
+            turns.iter().map(|turn| (turn.start_ns, turn.end_ns, turn.clock)).collect::<Vec<_>>()
+        };
+        let clean = stamps(|_| 0, |_| false);
+        assert!(clean.len() >= 20);
+        // Late by up to 7 ms, now and then not at all; 100 packets in a row that come at once.
+        let jitter = |index: usize| if index % 50 == 7 { 0 } else { (index as i64 * 7_919 % 7_001) * 1_000 };
+        let burst = |index: usize| if (400..500).contains(&index) { (500 - index as i64) * 300_000 } else { 0 };
+        assert_eq!(stamps(jitter, |_| false), clean, "{model:?}");
+        assert_eq!(stamps(burst, |_| false), clean, "{model:?}");
+        // A packet whose device time is damaged is taken to come a period after the one before.
+        for (wild, clean) in stamps(|_| 0, |index| index % 90 == 60).iter().zip(&clean) {
+            assert!(
+                wild.0.abs_diff(clean.0) < 1_000 && wild.1.abs_diff(clean.1) < 1_000,
+                "{model:?} {wild:?} {clean:?}"
+            );
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
+
+    #[test]
+    fn whatever_the_times_stamps_rise(
+        timed in any::<bool>(),
+        events in vec((0..5_u8, any::<u32>(), any::<i64>(), 0..86_400_i64, 0..2_000_i64), 1..150),
+    ) {
+        let model = if timed { Model::Vlp16 } else { Model::Hdl64eS1 };
+        let stream = Stream::of(model);
+        let mut sensor = Sensor::new(SensorConfig { model: Some(model), ..SensorConfig::default() });
+        let (mut newest_ns, mut index, mut device_us, mut arrival_ns) = (i64::MIN, 0, 0_u32, NOON);
+        for (kind, us, ns, second, near) in events {
+            match kind {
+                0 => device_us = us,
+                1 => arrival_ns = ns,
+                2 => arrival_ns = arrival_ns.saturating_add((near - 1_000) * 5_000_000),
+                3 => {
+                    let date = format!("{:02}{:02}{:02}", 1 + us % 28, 1 + us % 12, us % 100);
+                    let text = rmc(second, if near % 9 == 0 { 'V' } else { 'A' }, &date);
+                    device_us = ((second * 1_000_000 + near * 1_000) % 3_600_000_000) as u32;
+                    let mut payload = datagram(device_us, &text);
+                    payload[202] = (near % 5) as u8;
+                    prop_assert!(sensor.push(&payload, arrival_ns).unwrap().is_none());
+                }
+                _ => {}
+            }
+            for _ in 0..40 {
+                index += 1;
+                device_us = device_us.wrapping_add(1_327);
+                arrival_ns = arrival_ns.saturating_add(1_327_000);
+                let packet = with_device_us(stream.packet(index), device_us);
+                if let Some(turn) = sensor.push(&packet, arrival_ns).unwrap() {
+                    prop_assert!(newest_ns < turn.start_ns, "{newest_ns} {}", turn.start_ns);
+                    prop_assert!(turn.start_ns <= turn.end_ns);
+                    newest_ns = turn.end_ns;
+                }
+            }
+        }
+    }
+}
