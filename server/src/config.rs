@@ -149,6 +149,9 @@ pub struct Vehicle {
     /// The UDP door; a vehicle without one is fed by other doors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub udp: Option<Udp>,
+    /// Observations over gRPC and zenoh.
+    #[serde(default)]
+    pub ingest: Ingest,
     /// Which maps are made, and how.
     #[serde(default)]
     pub maps: MapsConfig,
@@ -165,6 +168,24 @@ impl Vehicle {
     /// What the core needs of it.
     pub fn core(&self) -> VehicleConfig {
         VehicleConfig { name: self.name.clone(), sensors: self.sensors.clone(), maps: self.maps.clone() }
+    }
+}
+
+/// `[vehicle.ingest]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Ingest {
+    /// Whether anybody may send scans, poses, roads and packets.
+    pub enabled: bool,
+    /// Points of one scan; the longest message follows from it.
+    pub points_max: usize,
+    /// Streams at once; each may have its share of half the queue on the way.
+    pub streams_max: usize,
+}
+
+impl Default for Ingest {
+    fn default() -> Self {
+        Self { enabled: true, points_max: 2_000_000, streams_max: 8 }
     }
 }
 
@@ -343,6 +364,12 @@ impl Config {
             let at = |key: &str| format!("vehicle.{key} (of {})", vehicle.name);
             if !(16..=1 << 20).contains(&vehicle.queue) {
                 return wrong(at("queue"), &vehicle.queue, "16 to 1048576 events");
+            }
+            if !(1000..=20_000_000).contains(&vehicle.ingest.points_max) {
+                return wrong(at("ingest.points_max"), &vehicle.ingest.points_max, "1000 to 20000000 points");
+            }
+            if !(1..=64).contains(&vehicle.ingest.streams_max) {
+                return wrong(at("ingest.streams_max"), &vehicle.ingest.streams_max, "1 to 64 streams");
             }
             let sensors: BTreeSet<_> = vehicle.sensors.iter().map(|sensor| sensor.name.as_str()).collect();
             if sensors.len() < vehicle.sensors.len() {

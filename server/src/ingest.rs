@@ -7,16 +7,21 @@
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use clearway_mapping::event::{Body, Event};
 
+use ticket::{Ticket, Verdict};
+
 pub mod capture;
+pub mod entrance;
 pub mod files;
+pub mod grpc;
 pub mod kitti;
 pub mod mcap;
-
+pub mod observation;
+pub mod ticket;
 pub mod udp;
 
 /// What a file source yields: an event without its number.
@@ -35,11 +40,39 @@ pub struct Reading {
 #[error("the vehicle's engine has stopped")]
 pub struct Closed;
 
+/// What waits for the engine.
+#[derive(Debug)]
+pub struct Queued {
+    /// What happened.
+    pub event: Event,
+    /// Who wants to hear what became of it; the recording does not see this.
+    pub ticket: Option<Ticket>,
+}
+
 /// One vehicle's door. Clones share numbering and queue; the queue ends when the last clone is dropped.
 #[derive(Clone, Debug)]
 pub struct Door {
     shared: Arc<Mutex<Inside>>,
     outside: Arc<Outside>,
+}
+
+/// A way to a door that does not keep it open.
+#[derive(Clone, Debug)]
+pub struct WeakDoor {
+    shared: Weak<Mutex<Inside>>,
+    outside: Arc<Outside>,
+}
+
+impl WeakDoor {
+    /// The door, while somebody else keeps it open.
+    pub fn door(&self) -> Option<Door> {
+        Some(Door { shared: self.shared.upgrade()?, outside: self.outside.clone() })
+    }
+
+    /// What stayed outside, also when the door is gone.
+    pub fn outside(&self) -> &Outside {
+        &self.outside
+    }
 }
 
 /// What stayed outside a door; outlives its queue.
@@ -55,6 +88,11 @@ impl Outside {
         locked(&self.refused).clone()
     }
 
+    /// Counts one.
+    pub(crate) fn refuse(&self, reason: &'static str) {
+        *locked(&self.refused).entry(reason).or_default() += 1;
+    }
+
     /// Readings that found the queue full and that the engine has not been told of yet.
     pub fn untold(&self) -> u64 {
         self.untold.load(Ordering::Relaxed)
@@ -63,14 +101,14 @@ impl Outside {
 
 #[derive(Debug)]
 struct Inside {
-    queue: SyncSender<Event>,
+    queue: SyncSender<Queued>,
     next_sequence: u64,
     /// Readings that found the queue full, by source, not yet told to the engine.
     untold: BTreeMap<u16, u64>,
 }
 
 /// A door and the queue behind it, `capacity` events long.
-pub fn door(capacity: usize) -> (Door, Receiver<Event>) {
+pub fn door(capacity: usize) -> (Door, Receiver<Queued>) {
     let (queue, events) = sync_channel(capacity);
     let inside = Inside { queue, next_sequence: 0, untold: BTreeMap::new() };
     (Door { shared: Arc::new(Mutex::new(inside)), outside: Arc::default() }, events)
@@ -82,14 +120,52 @@ impl Door {
     /// # Errors
     /// [`Closed`] when the engine has stopped.
     pub fn enter(&self, source: u16, body: Body) -> Result<(), Closed> {
+        self.enter_with(None, source, body, None)
+    }
+
+    /// Takes an observation whose sender hears by `ticket` what becomes of it, be it that the queue was full. Stamped now
+    /// unless it brings its own stamp; never waits.
+    ///
+    /// # Errors
+    /// [`Closed`] when the engine has stopped; the ticket says so too.
+    pub fn enter_observed(
+        &self,
+        captured_ns: Option<i64>,
+        source: u16,
+        body: Body,
+        ticket: Ticket,
+    ) -> Result<(), Closed> {
+        self.enter_with(captured_ns, source, body, Some(ticket))
+    }
+
+    fn enter_with(
+        &self,
+        captured_ns: Option<i64>,
+        source: u16,
+        body: Body,
+        ticket: Option<Ticket>,
+    ) -> Result<(), Closed> {
         let mut inside = locked(&self.shared);
-        let arrival_ns = now_ns();
-        inside.tell_losses(arrival_ns)?;
-        if !inside.untold.is_empty() || !inside.offer(arrival_ns, source, body)? {
+        let now_ns = now_ns();
+        inside.tell_losses(now_ns)?;
+        let lost = match inside.untold.is_empty() {
+            true => inside.offer(captured_ns.unwrap_or(now_ns), source, body, ticket)?,
+            false => Some(ticket),
+        };
+        if let Some(ticket) = lost {
             *inside.untold.entry(source).or_default() += 1;
+            if let Some(ticket) = ticket {
+                let message = "the vehicle's queue is full: the engine does not keep up".to_owned();
+                ticket.tell(Verdict::Refused { reason: "queue", message });
+            }
         }
         self.outside.untold.store(inside.untold.values().sum(), Ordering::Relaxed);
         Ok(())
+    }
+
+    /// A way to this door that does not keep it open.
+    pub fn weak(&self) -> WeakDoor {
+        WeakDoor { shared: Arc::downgrade(&self.shared), outside: self.outside.clone() }
     }
 
     /// Takes a captured reading with its own stamp; waits while the queue is full, so that a file loses nothing.
@@ -100,14 +176,15 @@ impl Door {
         let Reading { arrival_ns, source, body } = reading;
         let mut inside = locked(&self.shared);
         let sequence = inside.next_sequence;
-        inside.queue.send(Event { sequence, arrival_ns, source, body }).map_err(|_| Closed)?;
+        let event = Event { sequence, arrival_ns, source, body };
+        inside.queue.send(Queued { event, ticket: None }).map_err(|_| Closed)?;
         inside.next_sequence += 1;
         Ok(())
     }
 
     /// Counts a datagram that was turned away before it became an event.
     pub fn refuse(&self, reason: &'static str) {
-        *locked(&self.outside.refused).entry(reason).or_default() += 1;
+        self.outside.refuse(reason);
     }
 
     /// What stayed outside.
@@ -122,14 +199,21 @@ pub(crate) fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Inside {
-    /// Puts one event on the queue; `false` when it is full.
-    fn offer(&mut self, arrival_ns: i64, source: u16, body: Body) -> Result<bool, Closed> {
-        match self.queue.try_send(Event { sequence: self.next_sequence, arrival_ns, source, body }) {
+    /// Puts one event on the queue; gives its ticket back where the queue is full.
+    fn offer(
+        &mut self,
+        arrival_ns: i64,
+        source: u16,
+        body: Body,
+        ticket: Option<Ticket>,
+    ) -> Result<Option<Option<Ticket>>, Closed> {
+        let event = Event { sequence: self.next_sequence, arrival_ns, source, body };
+        match self.queue.try_send(Queued { event, ticket }) {
             Ok(()) => {
                 self.next_sequence += 1;
-                Ok(true)
+                Ok(None)
             }
-            Err(TrySendError::Full(_)) => Ok(false),
+            Err(TrySendError::Full(queued)) => Ok(Some(queued.ticket)),
             Err(TrySendError::Disconnected(_)) => Err(Closed),
         }
     }
@@ -137,7 +221,7 @@ impl Inside {
     /// Turns the losses counted so far into events, as far as there is space.
     fn tell_losses(&mut self, arrival_ns: i64) -> Result<(), Closed> {
         while let Some((source, lost)) = self.untold.first_key_value().map(|(s, n)| (*s, *n)) {
-            if !self.offer(arrival_ns, source, Body::Lost(lost))? {
+            if self.offer(arrival_ns, source, Body::Lost(lost), None)?.is_some() {
                 break;
             }
             self.untold.remove(&source);
@@ -165,10 +249,10 @@ mod tests {
             door.enter(1, Body::End).unwrap();
         }
         assert_eq!(door.outside().untold(), 3);
-        let taken: Vec<_> = events.try_iter().collect();
+        let taken: Vec<_> = events.try_iter().map(|queued| queued.event).collect();
         assert_eq!(taken.iter().map(|e| e.sequence).collect::<Vec<_>>(), [0, 1]);
         door.enter(0, Body::End).unwrap();
-        let taken: Vec<_> = events.try_iter().collect();
+        let taken: Vec<_> = events.try_iter().map(|queued| queued.event).collect();
         assert_eq!(taken[0].body, Body::Lost(3));
         assert_eq!((taken[0].sequence, taken[0].source), (2, 1));
         assert_eq!((taken[1].sequence, taken[1].source), (3, 0));
@@ -179,7 +263,7 @@ mod tests {
     fn a_captured_reading_keeps_its_stamp() {
         let (door, events) = door(2);
         door.enter_captured(Reading { arrival_ns: 42, source: 0, body: Body::End }).unwrap();
-        assert_eq!(events.recv().unwrap().arrival_ns, 42);
+        assert_eq!(events.recv().unwrap().event.arrival_ns, 42);
     }
 
     #[test]
