@@ -113,13 +113,15 @@ impl Ingester {
         Ok(self.refusals())
     }
 
-    /// What the server has refused since this was last asked, as far as it is known; the newest 4096.
+    /// What the server has refused since this was last asked, as far as it is known, by number; the newest 4096.
     pub fn refusals(&mut self) -> Vec<Refusal> {
         let mut refusals = Vec::new();
         self.heard.0.send_if_modified(|heard| {
             refusals = std::mem::take(&mut heard.refusals);
             false
         });
+        // What never reached the engine is told before what waits for it.
+        refusals.sort_by_key(|refusal| refusal.number);
         refusals
     }
 

@@ -25,7 +25,7 @@ impl Observation {
         Self::of(sensor, v1::observation::Body::Scan(scan))
     }
 
-    /// 0 to 1, one a point. Of a scan, as the four that follow; nothing changes anything else.
+    /// 0 to 1, one a point. This and the four that follow are a scan's; of anything else they change nothing.
     pub fn intensity(self, intensity: &[f32]) -> Self {
         self.with_scan(|scan| scan.intensity = pack(intensity))
     }
@@ -42,7 +42,9 @@ impl Observation {
 
     /// When each column was seen, ns after the scan's stamp, and how many points it has: the points lie column by column.
     pub fn columns(mut self, offsets_ns: &[i32], points: &[u16]) -> Self {
-        self.0.columns = Some(v1::Columns { offset_ns: pack(offsets_ns), points: pack(points) });
+        if let Some(v1::observation::Body::Scan(_)) = self.0.body {
+            self.0.columns = Some(v1::Columns { offset_ns: pack(offsets_ns), points: pack(points) });
+        }
         self
     }
 

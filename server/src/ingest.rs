@@ -23,6 +23,8 @@ pub mod mcap;
 pub mod observation;
 pub mod ticket;
 pub mod udp;
+#[cfg(feature = "zenoh")]
+pub mod zenoh;
 
 /// What a file source yields: an event without its number.
 #[derive(Clone, Debug, PartialEq)]
@@ -257,6 +259,31 @@ mod tests {
         assert_eq!((taken[0].sequence, taken[0].source), (2, 1));
         assert_eq!((taken[1].sequence, taken[1].source), (3, 0));
         assert_eq!(door.outside().untold(), 0);
+    }
+
+    #[test]
+    fn whoever_holds_a_ticket_hears_that_the_queue_was_full_or_the_engine_gone() {
+        use super::ticket::Mark;
+        let (verdicts, mut told) = tokio::sync::mpsc::unbounded_channel();
+        let ticket = |number| Ticket::new(Mark { client: 0, number }, &verdicts);
+        let (door, events) = door(1);
+        door.enter_observed(Some(42), 0, Body::End, ticket(1)).unwrap();
+        assert!(told.try_recv().is_err(), "the engine has not spoken");
+        door.enter_observed(None, 0, Body::End, ticket(2)).unwrap();
+        let (mark, verdict) = told.try_recv().unwrap();
+        assert!(mark.number == 2 && matches!(verdict, Verdict::Refused { reason: "queue", .. }), "{verdict:?}");
+        assert_eq!(door.outside().untold(), 1, "the engine is told too");
+
+        let weak = door.weak();
+        let Queued { event, ticket: waiting } = events.recv().unwrap();
+        assert_eq!(event.arrival_ns, 42, "captured then");
+        waiting.unwrap().tell(Verdict::Taken);
+        assert_eq!(told.try_recv().unwrap().1, Verdict::Taken);
+        drop(events);
+        assert_eq!(weak.door().unwrap().enter_observed(None, 0, Body::End, ticket(3)), Err(Closed));
+        assert!(matches!(told.try_recv().unwrap().1, Verdict::Refused { reason: "stopped", .. }));
+        drop(door);
+        assert!(weak.door().is_none(), "a weak way keeps no door open");
     }
 
     #[test]

@@ -225,7 +225,7 @@ impl Server {
         }
         #[cfg(feature = "zenoh")]
         let publisher = match config.zenoh.enabled {
-            true => Some(crate::publish::zenoh::Publisher::start(&config.zenoh, &vehicles).await?),
+            true => Some(crate::publish::zenoh::Publisher::start(&config.zenoh, &vehicles, &entrances).await?),
             false => None,
         };
         let mut running = Running {

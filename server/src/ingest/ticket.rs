@@ -165,6 +165,28 @@ impl Account {
         }
     }
 
+    /// Events and bytes whose fate is not known yet.
+    pub fn in_flight(&self) -> (usize, usize) {
+        (self.events, self.bytes)
+    }
+
+    /// Takes note of the numbers between the newest one and this, which no observation had.
+    pub fn miss(&mut self, number: u64) {
+        if let Some(first) = self.newest.and_then(|newest| newest.checked_add(1))
+            && number > first
+        {
+            let missed = number - first;
+            let message =
+                format!("{missed} observations from number {first} on never came, or found the server's queue full");
+            self.refuse(first, "missed", message, missed);
+        }
+    }
+
+    /// What the last report acknowledged, once more.
+    pub fn newest_report(&self) -> v1::IngestReport {
+        v1::IngestReport { acknowledged: self.acknowledged, refused: Vec::new(), client: self.client }
+    }
+
     /// What has not been told yet, if anything.
     pub fn report(&mut self) -> Option<v1::IngestReport> {
         if self.reported == Some(self.acknowledged) && self.refused.is_empty() {
