@@ -4,6 +4,7 @@ pub mod document;
 pub mod export;
 pub mod get;
 pub mod info;
+pub mod ingest;
 pub mod npy;
 pub mod recording;
 pub mod send;

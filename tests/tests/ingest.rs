@@ -453,6 +453,33 @@ async fn the_same_session_over_zenoh_makes_the_same_maps_and_hears_the_same_refu
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn the_command_sends_scans_poses_and_a_road_and_says_what_was_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let point = |x: f32, y: f32| [x, y, -1.9, 0.5].map(f32::to_le_bytes).concat();
+    let plain: Vec<u8> = (0..400_u16).map(f32::from).flat_map(|i| point(3.0 + i % 20.0, i / 20.0 - 10.0)).collect();
+    let write = |name: &str, bytes: &[u8]| std::fs::write(folder.path().join(name), bytes).unwrap();
+    write("0.bin", &plain);
+    write("1.bin", &plain);
+    write("way.tum", b"100.0 0 0 0 0 0 0 1\n100.1 1 0 0 0 0 0 1\n100.1 1 0 0 0 0 0 1\n");
+    write("route.rddf", b"1,30.0,-97.0,10,20\n2,30.001,-97.0,10,20\n");
+    let running = start(scanned_config(), &folder.path().join("r.mcap")).await;
+    let server = running.grpc.unwrap().to_string();
+    let at = folder.path().to_owned();
+    let output = tokio::task::spawn_blocking(move || {
+        let files = ["ingest", "0.bin", "1.bin", "way.tum", "route.rddf", "--fast", "--json", "--server", &server];
+        clearway_tests::run(&at, "clearway", &files)
+    });
+    let output = output.await.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let said: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(said["sent"], serde_json::json!({ "poses": 3, "roads": 1, "scans": 2 }));
+    assert_eq!(said["refused"], serde_json::json!({ "stamp": 1 }), "the pose that came twice");
+    let ledger = running.vehicles.0[0].status.snapshot().ledger;
+    assert_eq!((ledger.decoded, ledger.poses, ledger.poses_refused, ledger.roads), (2, 2, 1, 1));
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_server_that_stops_has_told_what_became_of_everything() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("r.mcap");
