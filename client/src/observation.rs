@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use clearway_proto::packed::pack;
 use clearway_proto::v1;
 
-pub use clearway_proto::v1::{RoadFrame, RoadPurpose};
+pub use clearway_proto::v1::{RoadFrame, RoadPurpose, Sensor};
 
 /// One scan, ego pose, road, or handful of packets, ready to be sent. Stamps are ns since the Unix epoch, frames REP-103
 /// (x forward, y left, z up), lengths metres. Lists are not checked here: the server refuses what does not fit together,
@@ -84,6 +84,12 @@ impl Observation {
         let packets =
             v1::Packets { captured_ns: pack(&stamps), lengths: pack(&lengths), payloads: payloads.concat().into() };
         Self::of(sensor, v1::observation::Body::Packets(packets))
+    }
+
+    /// A sensor that the server's configuration does not name; from here on it is known by its name. The same again changes
+    /// nothing.
+    pub fn declare(sensor: Sensor) -> Self {
+        Self::of("", v1::observation::Body::Declaration(sensor))
     }
 
     /// The sensor has ended: an unfinished turn becomes a partial one.

@@ -160,8 +160,9 @@ impl ZenohClient {
 /// Where an observation is put.
 fn key_of(prefix: &str, observation: &v1::Observation) -> String {
     use v1::observation::Body;
-    let (kind, sensor) = match observation.body {
+    let (kind, sensor) = match &observation.body {
         Some(Body::EgoPose(_)) => ("pose", ""),
+        Some(Body::Declaration(declared)) => ("sensor", &*declared.name),
         Some(Body::Road(_)) => ("road", ""),
         Some(Body::Packets(_)) => ("packet", &*observation.sensor),
         Some(Body::End(_)) => ("end", &*observation.sensor),

@@ -122,11 +122,11 @@ impl Door {
     /// # Errors
     /// [`Closed`] when the engine has stopped.
     pub fn enter(&self, source: u16, body: Body) -> Result<(), Closed> {
-        self.enter_with(None, source, body, None)
+        self.enter_with(None, source, body, None).map(drop)
     }
 
     /// Takes an observation whose sender hears by `ticket` what becomes of it, be it that the queue was full. Stamped now
-    /// unless it brings its own stamp; never waits.
+    /// unless it brings its own stamp; never waits. Gives whether it is on the queue.
     ///
     /// # Errors
     /// [`Closed`] when the engine has stopped; the ticket says so too.
@@ -136,7 +136,7 @@ impl Door {
         source: u16,
         body: Body,
         ticket: Ticket,
-    ) -> Result<(), Closed> {
+    ) -> Result<bool, Closed> {
         self.enter_with(captured_ns, source, body, Some(ticket))
     }
 
@@ -146,7 +146,7 @@ impl Door {
         source: u16,
         body: Body,
         ticket: Option<Ticket>,
-    ) -> Result<(), Closed> {
+    ) -> Result<bool, Closed> {
         let mut inside = locked(&self.shared);
         let now_ns = now_ns();
         inside.tell_losses(now_ns)?;
@@ -154,6 +154,7 @@ impl Door {
             true => inside.offer(captured_ns.unwrap_or(now_ns), source, body, ticket)?,
             false => Some(ticket),
         };
+        let entered = lost.is_none();
         if let Some(ticket) = lost {
             *inside.untold.entry(source).or_default() += 1;
             if let Some(ticket) = ticket {
@@ -162,7 +163,7 @@ impl Door {
             }
         }
         self.outside.untold.store(inside.untold.values().sum(), Ordering::Relaxed);
-        Ok(())
+        Ok(entered)
     }
 
     /// A way to this door that does not keep it open.

@@ -7,11 +7,11 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use bytes::Bytes;
-use clearway_client::observation::{RoadFrame, RoadPurpose, by_reason};
+use clearway_client::observation::{RoadFrame, RoadPurpose, Sensor, by_reason};
 use clearway_client::{Client, ClientError, Ingester, Observation, Refusal, ZenohClient};
 use clearway_lidar::model::Model;
 use clearway_mapping::event::Body;
-use clearway_proto::packed::pack;
+use clearway_proto::packed::{pack, unpack};
 use clearway_proto::v1;
 use clearway_proto::v1::ingest_service_client::IngestServiceClient;
 use clearway_server::config::Config;
@@ -192,9 +192,45 @@ async fn a_session_of_scans_poses_and_roads_over_grpc_makes_moved_maps_with_the_
     assert_eq!(speed.len(), 4);
     for map in &speed {
         let header = map.header.as_ref().unwrap();
+        assert_eq!(header.compensation, "poses");
         assert!(header.map_from_ego.is_some() && header.speed_mps.unwrap() > 1.0, "{header:?}");
         assert!(road_cells(map) > 10, "{} cells of road ahead", road_cells(map));
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_sensor_that_the_stream_declares_is_mapped_recorded_and_declared_again_without_harm() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("r.mcap");
+    let running = start(scanned_config(), &file).await;
+    let sensor = Sensor { name: "left".into(), x_m: 1.0, y_m: 0.8, z_m: 1.9, yaw_deg: 90.0, ..Sensor::default() };
+    let rays = |sensor: &str, stamp_ns: i64| {
+        let v1::Scan { x, y, z, .. } = plain(stamp_ns);
+        let [x, y, z] = [x, y, z].map(|list| unpack::<f32>(&list).unwrap());
+        Observation::scan(sensor, stamp_ns, &x, &y, &z).captured_at(stamp_ns)
+    };
+    let declared = || Observation::declare(sensor.clone()).captured_at(1_000_000_000);
+    let mut first = ingester(&running).await;
+    let told_first = vec![declared(), rays("left", 1_000_000_000), rays("top", 1_010_000_000)];
+    assert_eq!(told(&mut first, told_first).await, []);
+
+    let mut second = ingester(&running).await;
+    let moved = Observation::declare(Sensor { y_m: -0.8, ..sensor.clone() });
+    let nowhere = Observation::declare(Sensor { name: "right".into(), z_m: f64::NAN, ..sensor.clone() });
+    let strange = Observation::declare(Sensor { name: "up".into(), model: Some("ouster".into()), ..sensor.clone() });
+    let refusals = told(&mut second, vec![declared(), moved, nowhere, strange, rays("left", 1_100_000_000)]).await;
+    assert_eq!(by_reason(&refusals), [("missing", 1), ("sensor", 2)].into());
+    assert!(refusals[0].message.contains("each sensor its own"), "{refusals:?}");
+    assert!(refusals[1].message.contains("z_m"), "{refusals:?}");
+    let snapshot = running.vehicles.0[0].status.snapshot();
+    let names: Vec<_> = snapshot.sensors.iter().map(|sensor| sensor.name.as_str()).collect();
+    assert_eq!(names, ["top", "left"]);
+    assert_eq!((snapshot.ledger.decoded, snapshot.maps), (3, 1), "the lead's scan makes the map");
+    within("shutdown", running.shutdown()).await.unwrap();
+    let report = verify(&file).unwrap();
+    assert!(report.is_good() && report.maps == 1, "{report:?}");
+    let header = layer(&recorded(&file), "drivability")[0].header.clone().unwrap();
+    assert_eq!(header.sensors.iter().map(|sensor| sensor.returns).collect::<Vec<_>>(), [7200, 7200]);
 }
 
 /// A scan of a plain as the observations below change it.

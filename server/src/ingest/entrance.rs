@@ -1,14 +1,16 @@
 //! One vehicle as those who send observations see it: its sensors, its limits, and the way to its door. gRPC and zenoh
 //! come in here alike.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
+use clearway_mapping::config::{SensorConfig, VehicleConfig};
+use clearway_mapping::event::Body;
 use clearway_proto::v1;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
 use super::observation::{self, Limits, ObservationError};
-use super::ticket::{Account, Mark, Ticket, Verdicts};
-use super::{Closed, Door, WeakDoor};
+use super::ticket::{Account, Mark, Ticket, Verdict, Verdicts};
+use super::{Door, WeakDoor, locked};
 use crate::config::Vehicle;
 use crate::publish::Unknown;
 
@@ -22,7 +24,8 @@ pub struct Entrance {
     /// Events of one client that may wait for their verdict: all streams together fill half the vehicle's queue, so that
     /// the other half is the UDP door's.
     pub in_flight_max: usize,
-    sensors: Vec<String>,
+    /// With the sensors that were declared: what the engine will have made of the events sent so far.
+    config: Mutex<VehicleConfig>,
     streams: Arc<Semaphore>,
     streams_max: usize,
     door: WeakDoor,
@@ -36,7 +39,7 @@ impl Entrance {
             vehicle: vehicle.name.as_str().into(),
             limits: Limits::of_points(vehicle.ingest.points_max),
             in_flight_max: (vehicle.queue / (2 * streams_max)).max(1),
-            sensors: vehicle.sensors.iter().map(|sensor| sensor.name.clone()).collect(),
+            config: Mutex::new(vehicle.core()),
             streams: Arc::new(Semaphore::new(streams_max)),
             streams_max,
             door: door.weak(),
@@ -84,11 +87,10 @@ impl Entrance {
                 account.enter(number, bodies.len(), bytes);
                 for (captured_ns, body) in bodies {
                     let ticket = Ticket::new(Mark { client, number }, verdicts);
-                    // A ticket that finds no engine says so itself.
-                    let _: Result<(), Closed> = match self.door.door() {
-                        Some(door) => door.enter_observed(captured_ns, source, body, ticket),
-                        None => Err(Closed),
-                    };
+                    match body {
+                        Body::Sensor(sensor) => self.declare(captured_ns, sensor, ticket),
+                        body => _ = self.enter(captured_ns, source, body, ticket),
+                    }
                 }
             }
         }
@@ -111,19 +113,48 @@ impl Entrance {
         self.door.outside().refuse(reason);
     }
 
+    /// Whether it is on the queue; the ticket knows where it is not.
+    fn enter(&self, captured_ns: Option<i64>, source: u16, body: Body, ticket: Ticket) -> bool {
+        match self.door.door() {
+            Some(door) => door.enter_observed(captured_ns, source, body, ticket).unwrap_or(false),
+            None => false,
+        }
+    }
+
+    /// Declares a sensor as the next one, or one that is there already. The engine will judge it as it is judged here, so
+    /// that its name can be used at once.
+    fn declare(&self, captured_ns: Option<i64>, sensor: Box<SensorConfig>, ticket: Ticket) {
+        let mut config = locked(&self.config);
+        let before = config.sensors.len();
+        let index = config.sensors.iter().position(|known| *known == *sensor).unwrap_or(before);
+        let declared = config.declare(index, &sensor).map_err(|error| error.to_string());
+        match declared.and_then(|()| u16::try_from(index).map_err(|error| error.to_string())) {
+            Ok(source) => {
+                if !self.enter(captured_ns, source, Body::Sensor(sensor), ticket) {
+                    config.sensors.truncate(before);
+                }
+            }
+            Err(message) => {
+                self.count("sensor");
+                ticket.tell(Verdict::Refused { reason: "sensor", message });
+            }
+        }
+    }
+
     /// The sensor an observation is of; 0 where it concerns the whole vehicle.
     fn source(&self, observation: &v1::Observation) -> Result<u16, Unknown> {
-        use v1::observation::Body::{EgoPose, Road};
+        use v1::observation::Body::{Declaration, EgoPose, Road};
         let name = &observation.sensor;
-        if matches!(observation.body, Some(EgoPose(_) | Road(_)) | None) || (name.is_empty() && self.sensors.len() == 1)
-        {
+        let sensors = &locked(&self.config).sensors;
+        let of_vehicle = matches!(observation.body, Some(EgoPose(_) | Road(_) | Declaration(_)) | None);
+        if of_vehicle || (name.is_empty() && sensors.len() == 1) {
             return Ok(0);
         }
-        let index = self.sensors.iter().position(|sensor| sensor == name);
+        let index = sensors.iter().position(|sensor| sensor.name == *name);
         index.and_then(|index| u16::try_from(index).ok()).ok_or_else(|| Unknown::Sensor {
             name: name.clone(),
             vehicle: self.vehicle.to_string(),
-            known: self.sensors.join(", "),
+            known: sensors.iter().map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", "),
         })
     }
 }

@@ -9,7 +9,7 @@ use clearway_mapping::event::Body;
 use clearway_proto::packed::unpack;
 use clearway_proto::v1;
 
-use crate::wire::{ego_pose_from_proto, road_from_proto, scan_from_proto};
+use crate::wire::{ego_pose_from_proto, road_from_proto, scan_from_proto, sensor_from_proto};
 
 /// What one observation may be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -52,7 +52,7 @@ pub enum ObservationError {
         bytes_max: usize,
     },
     /// Nothing in it, or something this version does not know.
-    #[error("observation without a body: scan, ego_pose, road, packets or end is allowed")]
+    #[error("observation without a body: scan, ego_pose, road, packets, end or declaration is allowed")]
     Body,
     /// A list with part of a number.
     #[error("{list} of {bytes} bytes: {number_bytes} a number are allowed")]
@@ -104,10 +104,10 @@ pub enum ObservationError {
         /// What there is.
         bytes: usize,
     },
-    /// A pose without a pose, a road that lacks something.
+    /// A pose without a pose, a road or sensor that lacks something.
     #[error("{body} without {what}")]
     Missing {
-        /// `ego_pose` or `road`, `scan`.
+        /// `ego_pose`, `road`, `scan` or `declaration`.
         body: &'static str,
         /// What is allowed and not there.
         what: &'static str,
@@ -163,6 +163,9 @@ pub fn bodies(observation: v1::Observation, limits: &Limits) -> Result<Bodies, O
         }
         v1::observation::Body::Road(road) => Body::Road(road_from_proto(road).map_err(missing("road"))?),
         v1::observation::Body::End(v1::End {}) => Body::End,
+        v1::observation::Body::Declaration(sensor) => {
+            Body::Sensor(Box::new(sensor_from_proto(sensor).map_err(missing("declaration"))?))
+        }
     };
     Ok(vec![(captured_ns, body)])
 }

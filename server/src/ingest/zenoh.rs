@@ -1,4 +1,4 @@
-//! Observations over zenoh: `clearway/<vehicle>/ingest/{scan,packet,end}/<sensor>`, `…/{pose,road}`; what becomes of them
+//! Observations over zenoh: `clearway/<vehicle>/ingest/{scan,packet,end,sensor}/<sensor>`, `…/{pose,road}`; what becomes of them
 //! goes to `clearway/<vehicle>/ingest/report`.
 //!
 //! zenoh's callbacks only put a sample aside, as many as there is room for; one task a vehicle reads them. Samples that
@@ -140,7 +140,7 @@ impl Ingest {
             Some(sensor) => sensor.clone_into(&mut observation.sensor),
             None => {
                 let message = format!(
-                    "key ingest/{key} with another body: scan/<sensor>, packet/<sensor>, end/<sensor>, pose and road are allowed"
+                    "key ingest/{key} with another body: scan/<sensor>, packet/<sensor>, end/<sensor>, sensor/<sensor>, pose and road are allowed"
                 );
                 return self.entrance.refuse(account, number, "key", message);
             }
@@ -160,6 +160,7 @@ fn sensor_of<'k>(key: &'k str, body: Option<&v1::observation::Body>) -> Option<&
         Body::End(_) => kind == "end",
         Body::EgoPose(_) => key == "pose",
         Body::Road(_) => key == "road",
+        Body::Declaration(declared) => kind == "sensor" && sensor == declared.name,
     };
     fits.then_some(sensor)
 }
