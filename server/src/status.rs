@@ -270,6 +270,8 @@ fn ledger_json(ledger: &v1::Ledger) -> Value {
         "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
         "refused": ledger.refused, "lost": ledger.lost, "points_dropped": ledger.points_dropped,
         "own_body": ledger.own_body, "through_body": ledger.through_body,
+        "poses": ledger.poses, "poses_refused": ledger.poses_refused,
+        "roads": ledger.roads, "roads_refused": ledger.roads_refused,
     })
 }
 
@@ -283,6 +285,10 @@ fn ledger(ledger: &Ledger) -> v1::Ledger {
         points_dropped: ledger.points_dropped,
         own_body: ledger.own_body,
         through_body: ledger.through_body,
+        poses: ledger.poses,
+        poses_refused: ledger.poses_refused,
+        roads: ledger.roads,
+        roads_refused: ledger.roads_refused.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect(),
     }
 }
 
@@ -338,6 +344,14 @@ pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {
         .filter_map(|(v, s, _)| s.kernel_drops.map(|n| (format!("vehicle=\"{}\"", v.name), n as f64)))
         .collect();
     family("clearway_kernel_drops", "gauge", "Datagrams the kernel dropped at the vehicle's open sockets.", &drops);
+    let poses = each(&|s, _| s.ledger.poses as f64);
+    family("clearway_poses_total", "counter", "Ego poses taken.", &poses);
+    let poses = each(&|s, _| s.ledger.poses_refused as f64);
+    family("clearway_poses_refused_total", "counter", "Ego poses refused.", &poses);
+    let roads = each(&|s, _| s.ledger.roads as f64);
+    family("clearway_roads_total", "counter", "Roads taken.", &roads);
+    let roads = each(&|s, _| s.ledger.roads_refused.values().sum::<u64>() as f64);
+    family("clearway_roads_refused_total", "counter", "Roads refused.", &roads);
     let maps = each(&|_, p| p.maps as f64);
     family("clearway_maps_total", "counter", "Maps made.", &maps);
     let revolutions = each(&|s, _| s.revolutions() as f64);

@@ -64,6 +64,8 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
         "ledger": {
             "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
             "refused": ledger.refused, "lost": ledger.lost,
+            "poses": ledger.poses, "poses_refused": ledger.poses_refused,
+            "roads": ledger.roads, "roads_refused": ledger.roads_refused,
         },
         "recorder": {"file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost},
         "readers": vehicle.readers,
@@ -93,6 +95,13 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
             "  datagrams: {} received, {} decoded, {} telemetry, refused {refused}, lost {}",
             ledger.received, ledger.decoded, ledger.telemetry, ledger.lost
         ));
+        let roads_refused: u64 = ledger.roads_refused.values().sum();
+        if ledger.poses + ledger.poses_refused + ledger.roads + roads_refused > 0 {
+            lines.push(format!(
+                "  poses: {} taken, {} refused; roads: {} taken, {roads_refused} refused",
+                ledger.poses, ledger.poses_refused, ledger.roads
+            ));
+        }
     }
     match vehicle.recorder.as_ref().filter(|recorder| !recorder.file.is_empty()) {
         Some(r) => lines.push(format!("  recording {}: {} events, {} maps, lost {}", r.file, r.events, r.maps, r.lost)),
