@@ -453,7 +453,7 @@ async fn strangers_crowds_and_giants_are_told_what_is_allowed() {
     let (_, end) = within("a place", giant()).await;
     let status = end.expect("a message of 200 kB ends the stream");
     assert!(status.code() == Code::OutOfRange && status.message().contains("97536"), "{status:?}");
-    assert_eq!(running.vehicles.0[0].status.snapshot().ledger.refused.get("message"), Some(&1));
+    assert_eq!(running.vehicles.0[0].status.snapshot().ledger.refused.get("observation"), Some(&1));
     within("shutdown", running.shutdown()).await.unwrap();
 }
 

@@ -4,7 +4,7 @@
 use std::sync::{Arc, Mutex};
 
 use clearway_mapping::config::{SensorConfig, VehicleConfig};
-use clearway_mapping::event::Body;
+use clearway_mapping::event::{Body, Cause};
 use clearway_proto::v1;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
@@ -110,7 +110,13 @@ impl Entrance {
 
     /// Counts what did not become an event, where nobody can be told.
     pub fn count(&self, reason: &'static str) {
-        self.door.outside().refuse(reason);
+        let cause = match reason {
+            "queue" => Cause::Queue,
+            "source" => Cause::Sender,
+            _ => Cause::Observation,
+        };
+        // Nobody has looked whose it is: no sensor has this number.
+        self.door.outside().leave(u16::MAX, cause, 1);
     }
 
     /// Whether it is on the queue; the ticket knows where it is not.
