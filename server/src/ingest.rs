@@ -185,12 +185,13 @@ impl Door {
     ) -> Result<bool, Closed> {
         let mut inside = locked(&self.shared);
         let mut untold = locked(&self.outside.untold);
-        let now_ns = now_ns();
+        // Losses are told at the same stamp: a captured drive's time does not jump to the clock's and back.
+        let arrival_ns = captured_ns.unwrap_or_else(now_ns);
         // Behind a loss that is not told yet nothing enters, so that the journal has it where it happened.
-        let mut has_space = inside.tell(&mut untold, now_ns)?;
+        let mut has_space = inside.tell(&mut untold, arrival_ns)?;
         for (source, body, ticket) in readings {
             let turned_away = match has_space {
-                true => inside.offer(captured_ns.unwrap_or(now_ns), source, body, ticket)?,
+                true => inside.offer(arrival_ns, source, body, ticket)?,
                 false => Some(ticket),
             };
             if let Some(ticket) = turned_away {
