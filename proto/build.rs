@@ -5,8 +5,8 @@ use std::{env, error::Error, fs, path::PathBuf};
 use prost::Message;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let protos = ["clearway/v1/journal.proto", "clearway/v1/map.proto", "clearway/v1/service.proto"];
-    for proto in protos {
+    let protos = ["ingest", "journal", "map", "service"].map(|name| format!("clearway/v1/{name}.proto"));
+    for proto in &protos {
         println!("cargo::rerun-if-changed={proto}");
     }
     let descriptors = protox::compile(protos, ["."])?;

@@ -4,6 +4,7 @@ pub mod document;
 pub mod export;
 pub mod get;
 pub mod info;
+pub mod ingest;
 pub mod network;
 mod npy;
 pub mod recording;

@@ -6,6 +6,7 @@
 use std::time::Duration;
 
 use clearway_proto::v1;
+use clearway_proto::v1::ingest_service_client::IngestServiceClient;
 use clearway_proto::v1::map_service_client::MapServiceClient;
 use tokio::sync::mpsc;
 use tokio_stream::StreamExt;
@@ -14,6 +15,7 @@ use tonic::Status;
 use tonic::transport::{Channel, Endpoint};
 
 use crate::ClientError;
+use crate::ingest::{Deliver, Ear, Ingester};
 use crate::stream::{Feed, MapStream};
 use crate::view::MapView;
 
@@ -111,6 +113,42 @@ impl Client {
         let updates = updates.map_err(|status| refused(&self.address, &status))?.into_inner();
         let address = self.address.clone();
         Ok(MapStream::spawn(move |feed| follow(feed, address, updates, acknowledge)))
+    }
+
+    /// Opens a stream for a vehicle's observations, over a connection of its own.
+    ///
+    /// # Errors
+    /// What the server or the transport says; an unknown vehicle is refused here.
+    pub async fn ingest(&self, vehicle: &str) -> Result<Ingester, ClientError> {
+        let mut service = IngestServiceClient::new(dial(&self.endpoint, &self.address).await?);
+        // One: what waits is bounded by the acknowledgements.
+        let (observations, requests) = mpsc::channel(1);
+        let greeting = tokio_stream::once(v1::Observation { vehicle: vehicle.into(), ..Default::default() });
+        let reports = service.stream(greeting.chain(ReceiverStream::new(requests))).await;
+        let mut reports = reports.map_err(|status| refused(&self.address, &status))?.into_inner();
+        let (heard, address) = (Ear::new(), self.address.clone());
+        tokio::spawn({
+            let (heard, address) = (heard.clone(), address.clone());
+            async move {
+                heard.end(loop {
+                    match reports.message().await {
+                        Ok(Some(report)) => heard.report(report),
+                        Ok(None) => break ClientError::Ended { address },
+                        Err(status) => break refused(&address, &status),
+                    }
+                });
+            }
+        });
+        let deliver: Deliver = Box::new({
+            let address = address.clone();
+            move |observation| {
+                let (observations, address) = (observations.clone(), address.clone());
+                Box::pin(
+                    async move { observations.send(observation).await.map_err(|_| ClientError::Ended { address }) },
+                )
+            }
+        });
+        Ok(Ingester::new(address, deliver, heard))
     }
 }
 

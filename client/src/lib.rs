@@ -1,4 +1,5 @@
-//! What a planner uses: the newest map with its age, and what lies at a point in metres.
+//! What a planner uses: the newest map with its age, and what lies at a point in metres; and what a vehicle uses to send
+//! its scans, poses and roads.
 //!
 //! ```no_run
 //! use clearway_client::{Client, Subscription, now_ns};
@@ -22,10 +23,14 @@
 //! | [`view`] | bytes -> [`MapView`]: decoded once, cheap to clone, with its age |
 //! | [`stream`] | updates -> the newest map in a slot, skips counted |
 //! | [`grpc`] | a server's address -> [`Client`] |
+//! | [`observation`] | scans, poses, roads, packets -> [`Observation`] |
+//! | [`ingest`] | observations -> the server, and what became of them |
 //! | `picture` | a layer -> a PNG from above (feature `picture`) |
 //! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`) |
 
 pub mod grpc;
+pub mod ingest;
+pub mod observation;
 #[cfg(feature = "picture")]
 pub mod picture;
 pub mod stream;
@@ -37,6 +42,8 @@ pub use clearway_proto::map::{Channel, Layer};
 pub use clearway_proto::{codec, grid, v1};
 
 pub use grpc::{Client, Subscription};
+pub use ingest::Ingester;
+pub use observation::{Observation, Refusal};
 pub use stream::{MapStream, Update};
 pub use view::{MapView, now_ns};
 #[cfg(feature = "zenoh")]
@@ -73,8 +80,18 @@ pub enum ClientError {
         /// The gRPC code, such as `NotFound`.
         code: String,
     },
-    /// The stream of maps is over.
-    #[error("{address} has ended the stream of maps")]
+    /// The server has not told what became of what was sent.
+    #[error("{address} has acknowledged {acknowledged} of {sent} observations, and then nothing for 10 s")]
+    Silent {
+        /// As dialled.
+        address: String,
+        /// How many were sent.
+        sent: u64,
+        /// How many of them were acknowledged.
+        acknowledged: u64,
+    },
+    /// The stream of maps or observations is over.
+    #[error("{address} has ended the stream")]
     Ended {
         /// As dialled.
         address: String,

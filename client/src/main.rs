@@ -1,4 +1,5 @@
-//! The command `clearway`: watch, get and export maps, look into recordings and captures, send captures.
+//! The command `clearway`: watch, get and export maps, look into recordings and captures, send captures, scans, poses and
+//! roads.
 //!
 //! Exit codes: 0 fine, 1 failure, 2 usage.
 
@@ -7,7 +8,7 @@ mod command;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
-use command::{export, get, info, send, vehicles, watch};
+use command::{export, get, info, ingest, send, vehicles, watch};
 
 /// Maps of where a vehicle may drive, from a clearway-server or a recording.
 #[derive(Parser)]
@@ -25,6 +26,7 @@ enum Command {
     Info(info::Options),
     Export(export::Options),
     Send(send::Options),
+    Ingest(ingest::Options),
 }
 
 fn main() -> ExitCode {
@@ -39,6 +41,7 @@ fn main() -> ExitCode {
         Command::Info(options) => info::run(&options),
         Command::Export(options) => export::run(&options),
         Command::Send(options) => send::run(&options),
+        Command::Ingest(options) => command::block_on(ingest::run(options)),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

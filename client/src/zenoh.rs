@@ -1,16 +1,22 @@
 //! Maps over zenoh: keys `clearway/<vehicle>/map/<layer>`, liveliness tokens `clearway/<vehicle>`.
 //!
-//! In: a router's or server's endpoint. Out: the same [`MapView`] and [`MapStream`] as over gRPC. Needs tokio's
+//! In: a router's or server's endpoint. Out: the same [`MapView`], [`MapStream`] and [`Ingester`] as over gRPC. Needs tokio's
 //! multi-thread runtime: zenoh panics in a current-thread one.
 
+use std::hash::{BuildHasher, Hasher};
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
+use clearway_proto::v1;
+use prost::Message;
 use zenoh::handlers::RingChannel;
+use zenoh::qos::CongestionControl;
 use zenoh::sample::SampleKind;
 use zenoh::{Config, Session};
 
 use crate::ClientError;
+use crate::ingest::{Deliver, Ear, Ingester};
 use crate::stream::{Feed, MapStream};
 use crate::view::MapView;
 
@@ -107,6 +113,63 @@ impl ZenohClient {
             }
         }))
     }
+}
+
+impl ZenohClient {
+    /// A way to send a vehicle's observations; sensors must be named.
+    ///
+    /// # Errors
+    /// What zenoh says; [`ClientError::Refused`] for a vehicle nobody serves, listing those that are served.
+    pub async fn ingest(&self, vehicle: &str) -> Result<Ingester, ClientError> {
+        let served = self.vehicles().await?;
+        if !served.iter().any(|name| name == vehicle) {
+            let reason = format!("vehicle {vehicle:?} is not known; known: {}", served.join(", "));
+            return Err(ClientError::Refused { address: self.endpoint.clone(), reason, code: "NotFound".into() });
+        }
+        // Nobody else's: each `RandomState` is keyed by the system's randomness.
+        let client = std::hash::RandomState::new().build_hasher().finish();
+        let (heard, prefix) = (Ear::new(), format!("clearway/{vehicle}/ingest"));
+        let key = format!("{prefix}/report");
+        let reports = self.session.declare_subscriber(key.clone()).callback({
+            let heard = heard.clone();
+            move |sample| {
+                // What is no report, or another's, is not for us.
+                match v1::IngestReport::decode(&*sample.payload().to_bytes()) {
+                    Ok(report) if report.client == client => heard.report(report),
+                    _ => {}
+                }
+            }
+        });
+        let reports = Arc::new(reports.await.map_err(failed(format!("subscribe to {key}")))?);
+        let session = self.session.clone();
+        let deliver: Deliver = Box::new(move |observation| {
+            let (session, reports) = (session.clone(), reports.clone());
+            let key = key_of(&prefix, &observation);
+            let bytes = v1::Observation { client, ..observation }.encode_to_vec();
+            Box::pin(async move {
+                // Held until the last observation is on its way.
+                let _reports = reports;
+                let put = session.put(&key, bytes).congestion_control(CongestionControl::Block);
+                put.await.map_err(failed(format!("put {key}")))
+            })
+        });
+        Ok(Ingester::new(self.endpoint.clone(), deliver, heard))
+    }
+}
+
+/// Where an observation is put.
+fn key_of(prefix: &str, observation: &v1::Observation) -> String {
+    use v1::observation::Body;
+    let (kind, sensor) = match &observation.body {
+        Some(Body::EgoPose(_)) => ("pose", ""),
+        Some(Body::Declaration(declared)) => ("sensor", &*declared.name),
+        Some(Body::Road(_)) => ("road", ""),
+        Some(Body::Packets(_)) => ("packet", &*observation.sensor),
+        Some(Body::End(_)) => ("end", &*observation.sensor),
+        Some(Body::Scan(_)) | None => ("scan", &*observation.sensor),
+    };
+    let key = format!("{prefix}/{kind}/{sensor}");
+    key.trim_end_matches('/').to_owned()
 }
 
 /// Puts a map that is newer than the last; the holes in the sequence are the skipped ones. Another boot id is another

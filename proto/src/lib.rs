@@ -2,12 +2,13 @@
 //!
 //! [`v1`] holds the generated protobuf and gRPC types, [`DESCRIPTORS`] their descriptor set (for reflection and for
 //! the schemas in recordings), [`codec`] the cells of a channel to bytes and back, [`grid`] where cells lie, [`map`] a
-//! whole map's bytes to checked values.
+//! whole map's bytes to checked values, [`packed`] a scan's lists of numbers to bytes and back.
 
 pub mod codec;
 mod decode;
 pub mod grid;
 pub mod map;
+pub mod packed;
 mod parts;
 
 /// Generated from `clearway/v1/*.proto`.

@@ -53,8 +53,8 @@ fn main() {
     let (mut taken, mut ledger) = (0, Ledger::default());
     let mut took = Duration::ZERO;
     let began = Instant::now();
-    for event in &events {
-        match event.body {
+    for queued in &events {
+        match queued.event.body {
             Body::Lost { cause, count } => ledger.stayed_outside(cause, count),
             Body::Datagram(payload) if payload.is_empty() => break,
             _ => {

@@ -158,6 +158,9 @@ pub struct Vehicle {
     /// The ROS 2 door, through rmw_zenoh's key space.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ros: Option<Ros>,
+    /// Observations over gRPC and zenoh.
+    #[serde(default)]
+    pub ingest: Ingest,
     /// How one map is made of several sensors.
     #[serde(default)]
     pub fusion: FusionConfig,
@@ -186,6 +189,24 @@ impl Vehicle {
             body: self.body,
             maps: self.maps.clone(),
         }
+    }
+}
+
+/// `[vehicle.ingest]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Ingest {
+    /// Whether anybody may send scans, poses, roads and packets.
+    pub enabled: bool,
+    /// Points of one scan; the longest message follows from it.
+    pub points_max: usize,
+    /// Streams at once; each may have its share of half the queue on the way.
+    pub streams_max: usize,
+}
+
+impl Default for Ingest {
+    fn default() -> Self {
+        Self { enabled: true, points_max: 2_000_000, streams_max: 8 }
     }
 }
 
@@ -327,6 +348,12 @@ impl Config {
                 && let Err((key, value, allowed)) = ros.check(self.zenoh.enabled, &vehicle.sensors)
             {
                 return wrong(at(key), &value, &allowed);
+            }
+            if !(1000..=20_000_000).contains(&vehicle.ingest.points_max) {
+                return wrong(at("ingest.points_max"), &vehicle.ingest.points_max, "1000 to 20000000 points");
+            }
+            if !(1..=64).contains(&vehicle.ingest.streams_max) {
+                return wrong(at("ingest.streams_max"), &vehicle.ingest.streams_max, "1 to 64 streams");
             }
         }
         if let Err((key, value, allowed)) = udp::check(&self.vehicles) {

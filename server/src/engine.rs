@@ -9,9 +9,11 @@ use std::thread::JoinHandle;
 use std::time::Instant;
 
 use clearway_mapping::event::Event;
-use clearway_mapping::pipeline::Pipeline;
+use clearway_mapping::pipeline::{Pipeline, Rejected};
 use tokio::sync::watch;
 
+use crate::ingest::Queued;
+use crate::ingest::ticket::Verdict;
 use crate::record::Journal;
 use crate::status::VehicleStatus;
 use crate::wire::{self, EncodedMap};
@@ -43,7 +45,7 @@ impl Engine {
     ///
     /// # Errors
     /// What the system says where it has no thread to give.
-    pub fn start(mut self, events: Receiver<Event>) -> std::io::Result<JoinHandle<()>> {
+    pub fn start(mut self, events: Receiver<Queued>) -> std::io::Result<JoinHandle<()>> {
         std::thread::Builder::new().name(format!("engine {}", self.status.name)).spawn(move || {
             // Marks the end however it comes, so that a dead engine is seen as one.
             struct Stopped(Arc<VehicleStatus>);
@@ -53,16 +55,20 @@ impl Engine {
                 }
             }
             let _stopped = Stopped(self.status.clone());
-            while let Some(event) = self.next(&events) {
-                self.take(&event);
+            while let Some(Queued { event, ticket }) = self.next(&events) {
+                let outcome = self.take(&event);
+                // Behind everything else: whoever hears that an event was taken finds its map.
+                if let Some(ticket) = ticket {
+                    ticket.tell(Verdict::of(outcome));
+                }
             }
         })
     }
 
     /// The next event; the status is brought up to date whenever there is nothing else to do.
-    fn next(&self, events: &Receiver<Event>) -> Option<Event> {
+    fn next(&self, events: &Receiver<Queued>) -> Option<Queued> {
         match events.try_recv() {
-            Ok(event) => Some(event),
+            Ok(queued) => Some(queued),
             Err(TryRecvError::Empty) => {
                 self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors());
                 events.recv().ok().or_else(|| self.last())
@@ -71,22 +77,22 @@ impl Engine {
         }
     }
 
-    fn last(&self) -> Option<Event> {
+    fn last(&self) -> Option<Queued> {
         self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors());
         None
     }
 
-    fn take(&mut self, event: &Event) {
+    fn take(&mut self, event: &Event) -> Result<(), Rejected> {
         if let Some(journal) = &self.journal {
             journal.event(event);
         }
         let started = Instant::now();
         let map = match self.pipeline.step(event) {
             Ok(Some(map)) => map,
-            Ok(None) => return,
+            Ok(None) => return Ok(()),
             Err(rejected) => {
                 tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %rejected, "refused");
-                return;
+                return Err(rejected);
             }
         };
         // Where every map is switched off, a revolution makes none.
@@ -107,5 +113,6 @@ impl Engine {
         if let Some(observer) = &mut self.observer {
             observer(&self.pipeline);
         }
+        Ok(())
     }
 }

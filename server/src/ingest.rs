@@ -8,19 +8,26 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use clearway_mapping::event::{Body, Cause, Event};
 use clearway_mapping::pipeline::Ledger;
 
+use ticket::{Ticket, Verdict};
+
 pub mod capture;
+pub mod entrance;
 pub mod files;
+pub mod grpc;
 pub mod kitti;
 pub mod mcap;
+pub mod observation;
 pub mod ros;
-
+pub mod ticket;
 pub mod udp;
+#[cfg(feature = "zenoh")]
+pub mod zenoh;
 
 /// What a file source yields: an event without its number.
 #[derive(Clone, Debug, PartialEq)]
@@ -38,11 +45,39 @@ pub struct Reading {
 #[error("the vehicle's engine has stopped")]
 pub struct Closed;
 
+/// What waits for the engine.
+#[derive(Debug)]
+pub struct Queued {
+    /// What happened.
+    pub event: Event,
+    /// Who wants to hear what became of it; the recording does not see this.
+    pub ticket: Option<Ticket>,
+}
+
 /// One vehicle's door. Clones share numbering and queue; the queue ends when the last clone is dropped.
 #[derive(Clone, Debug)]
 pub struct Door {
     shared: Arc<Mutex<Inside>>,
     outside: Arc<Outside>,
+}
+
+/// A way to a door that does not keep it open.
+#[derive(Clone, Debug)]
+pub struct WeakDoor {
+    shared: Weak<Mutex<Inside>>,
+    outside: Arc<Outside>,
+}
+
+impl WeakDoor {
+    /// The door, while somebody else keeps it open.
+    pub fn door(&self) -> Option<Door> {
+        Some(Door { shared: self.shared.upgrade()?, outside: self.outside.clone() })
+    }
+
+    /// What stayed outside, also when the door is gone.
+    pub fn outside(&self) -> &Outside {
+        &self.outside
+    }
 }
 
 /// A full queue is told of as soon as there is space, other causes this often: a flood from strangers must not fill the
@@ -84,6 +119,13 @@ impl Outside {
         }
     }
 
+    /// Counts readings that stay outside.
+    pub(crate) fn leave(&self, source: u16, cause: Cause, count: u64) {
+        if count > 0 {
+            *locked(&self.untold).entry((cause, source)).or_default() += count;
+        }
+    }
+
     /// The last few strangers, newest last.
     pub fn strangers(&self) -> Vec<Stranger> {
         locked(&self.strangers).iter().copied().collect()
@@ -92,13 +134,13 @@ impl Outside {
 
 #[derive(Debug)]
 struct Inside {
-    queue: SyncSender<Event>,
+    queue: SyncSender<Queued>,
     next_sequence: u64,
     told_ns: i64,
 }
 
 /// A door and the queue behind it, `capacity` events long.
-pub fn door(capacity: usize) -> (Door, Receiver<Event>) {
+pub fn door(capacity: usize) -> (Door, Receiver<Queued>) {
     let (queue, events) = sync_channel(capacity);
     let inside = Inside { queue, next_sequence: 0, told_ns: 0 };
     (Door { shared: Arc::new(Mutex::new(inside)), outside: Arc::default() }, events)
@@ -118,18 +160,56 @@ impl Door {
     /// # Errors
     /// [`Closed`] when the engine has stopped.
     pub fn enter_all(&self, readings: impl IntoIterator<Item = (u16, Body)>) -> Result<(), Closed> {
+        self.enter_with(None, readings.into_iter().map(|(source, body)| (source, body, None))).map(drop)
+    }
+
+    /// Takes an observation whose sender hears by `ticket` what becomes of it, be it that the queue was full. Stamped now
+    /// unless it brings its own stamp; never waits. Gives whether it is on the queue.
+    ///
+    /// # Errors
+    /// [`Closed`] when the engine has stopped; the ticket says so too.
+    pub fn enter_observed(
+        &self,
+        captured_ns: Option<i64>,
+        source: u16,
+        body: Body,
+        ticket: Ticket,
+    ) -> Result<bool, Closed> {
+        self.enter_with(captured_ns, [(source, body, Some(ticket))])
+    }
+
+    /// Gives whether all of it is on the queue.
+    fn enter_with(
+        &self,
+        captured_ns: Option<i64>,
+        readings: impl IntoIterator<Item = (u16, Body, Option<Ticket>)>,
+    ) -> Result<bool, Closed> {
         let mut inside = locked(&self.shared);
         let mut untold = locked(&self.outside.untold);
-        let arrival_ns = now_ns();
+        // Losses are told at the same stamp: a captured drive's time does not jump to the clock's and back.
+        let arrival_ns = captured_ns.unwrap_or_else(now_ns);
         // Behind a loss that is not told yet nothing enters, so that the journal has it where it happened.
         let mut has_space = inside.tell(&mut untold, arrival_ns)?;
-        for (source, body) in readings {
-            has_space = has_space && inside.offer(arrival_ns, source, body)?;
-            if !has_space {
+        for (source, body, ticket) in readings {
+            let turned_away = match has_space {
+                true => inside.offer(arrival_ns, source, body, ticket)?,
+                false => Some(ticket),
+            };
+            if let Some(ticket) = turned_away {
+                has_space = false;
                 *untold.entry((Cause::Queue, source)).or_default() += 1;
+                if let Some(ticket) = ticket {
+                    let message = "the vehicle's queue is full: the engine does not keep up".to_owned();
+                    ticket.tell(Verdict::Refused { reason: "queue", message });
+                }
             }
         }
-        Ok(())
+        Ok(has_space)
+    }
+
+    /// A way to this door that does not keep it open.
+    pub fn weak(&self) -> WeakDoor {
+        WeakDoor { shared: Arc::downgrade(&self.shared), outside: self.outside.clone() }
     }
 
     /// Takes a captured reading with its own stamp; waits while the queue is full, so that a file loses nothing.
@@ -142,9 +222,7 @@ impl Door {
 
     /// Counts readings that stay outside.
     pub fn leave_outside(&self, source: u16, cause: Cause, count: u64) {
-        if count > 0 {
-            *locked(&self.outside.untold).entry((cause, source)).or_default() += count;
-        }
+        self.outside.leave(source, cause, count);
     }
 
     /// Refuses a datagram whose sender is none of the vehicle's sensors, and remembers the sender.
@@ -186,14 +264,21 @@ pub(crate) fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Inside {
-    /// Puts one event on the queue; `false` when it is full.
-    fn offer(&mut self, arrival_ns: i64, source: u16, body: Body) -> Result<bool, Closed> {
-        match self.queue.try_send(Event { sequence: self.next_sequence, arrival_ns, source, body }) {
+    /// Puts one event on the queue; gives its ticket back where the queue is full.
+    fn offer(
+        &mut self,
+        arrival_ns: i64,
+        source: u16,
+        body: Body,
+        ticket: Option<Ticket>,
+    ) -> Result<Option<Option<Ticket>>, Closed> {
+        let event = Event { sequence: self.next_sequence, arrival_ns, source, body };
+        match self.queue.try_send(Queued { event, ticket }) {
             Ok(()) => {
                 self.next_sequence += 1;
-                Ok(true)
+                Ok(None)
             }
-            Err(TrySendError::Full(_)) => Ok(false),
+            Err(TrySendError::Full(queued)) => Ok(Some(queued.ticket)),
             Err(TrySendError::Disconnected(_)) => Err(Closed),
         }
     }
@@ -202,7 +287,8 @@ impl Inside {
     fn wait(&mut self, reading: Reading) -> Result<(), Closed> {
         let Reading { arrival_ns, source, body } = reading;
         let sequence = self.next_sequence;
-        self.queue.send(Event { sequence, arrival_ns, source, body }).map_err(|_| Closed)?;
+        let event = Event { sequence, arrival_ns, source, body };
+        self.queue.send(Queued { event, ticket: None }).map_err(|_| Closed)?;
         self.next_sequence += 1;
         Ok(())
     }
@@ -215,7 +301,7 @@ impl Inside {
             if cause != Cause::Queue && !is_due {
                 break;
             }
-            if !self.offer(arrival_ns, source, Body::Lost { cause, count })? {
+            if self.offer(arrival_ns, source, Body::Lost { cause, count }, None)?.is_some() {
                 return Ok(false);
             }
             entry.remove();
@@ -248,10 +334,10 @@ mod tests {
         let (door, events) = door(2);
         door.enter_all((0..5).map(|_| (1, Body::End))).unwrap();
         assert_eq!(untold(&door).lost, 3);
-        let taken: Vec<_> = events.try_iter().collect();
+        let taken: Vec<_> = events.try_iter().map(|queued| queued.event).collect();
         assert_eq!(taken.iter().map(|e| e.sequence).collect::<Vec<_>>(), [0, 1]);
         door.enter(0, Body::End).unwrap();
-        let taken: Vec<_> = events.try_iter().collect();
+        let taken: Vec<_> = events.try_iter().map(|queued| queued.event).collect();
         assert_eq!(taken[0].body, Body::Lost { cause: Cause::Queue, count: 3 });
         assert_eq!((taken[0].sequence, taken[0].source), (2, 1));
         assert_eq!((taken[1].sequence, taken[1].source), (3, 0));
@@ -269,7 +355,7 @@ mod tests {
             (11, 9, 2)
         );
         door.enter(0, Body::End).unwrap();
-        let bodies = |events: &Receiver<Event>| events.try_iter().map(|event| event.body).collect::<Vec<_>>();
+        let bodies = |events: &Receiver<Queued>| events.try_iter().map(|queued| queued.event.body).collect::<Vec<_>>();
         let lost = |cause, count| Body::Lost { cause, count };
         assert_eq!(bodies(&events), [lost(Cause::Sender, 9), lost(Cause::Length, 2), Body::End]);
         flood(&door);
@@ -283,10 +369,35 @@ mod tests {
     }
 
     #[test]
+    fn whoever_holds_a_ticket_hears_that_the_queue_was_full_or_the_engine_gone() {
+        use super::ticket::Mark;
+        let (verdicts, mut told) = tokio::sync::mpsc::unbounded_channel();
+        let ticket = |number| Ticket::new(Mark { client: 0, number }, &verdicts);
+        let (door, events) = door(1);
+        door.enter_observed(Some(42), 0, Body::End, ticket(1)).unwrap();
+        assert!(told.try_recv().is_err(), "the engine has not spoken");
+        door.enter_observed(None, 0, Body::End, ticket(2)).unwrap();
+        let (mark, verdict) = told.try_recv().unwrap();
+        assert!(mark.number == 2 && matches!(verdict, Verdict::Refused { reason: "queue", .. }), "{verdict:?}");
+        assert_eq!(untold(&door).lost, 1, "the engine is told too");
+
+        let weak = door.weak();
+        let Queued { event, ticket: waiting } = events.recv().unwrap();
+        assert_eq!(event.arrival_ns, 42, "captured then");
+        waiting.unwrap().tell(Verdict::Taken);
+        assert_eq!(told.try_recv().unwrap().1, Verdict::Taken);
+        drop(events);
+        assert_eq!(weak.door().unwrap().enter_observed(None, 0, Body::End, ticket(3)), Err(Closed));
+        assert!(matches!(told.try_recv().unwrap().1, Verdict::Refused { reason: "stopped", .. }));
+        drop(door);
+        assert!(weak.door().is_none(), "a weak way keeps no door open");
+    }
+
+    #[test]
     fn a_captured_reading_keeps_its_stamp() {
         let (door, events) = door(2);
         door.enter_captured(Reading { arrival_ns: 42, source: 0, body: Body::End }).unwrap();
-        assert_eq!(events.recv().unwrap().arrival_ns, 42);
+        assert_eq!(events.recv().unwrap().event.arrival_ns, 42);
     }
 
     #[test]

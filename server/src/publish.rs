@@ -38,6 +38,16 @@ pub enum Unknown {
         /// What there is.
         known: String,
     },
+    /// No sensor of this name, or none named where there are several.
+    #[error("sensor {name:?} is not known; vehicle {vehicle} has: {known}")]
+    Sensor {
+        /// What was named.
+        name: String,
+        /// Whose.
+        vehicle: String,
+        /// What there is.
+        known: String,
+    },
     /// No layer of this name.
     #[error("layer {name:?} is not known; vehicle {vehicle} has: {known}")]
     Layer {

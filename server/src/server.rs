@@ -16,6 +16,7 @@ use tokio::task::JoinSet;
 
 use crate::config::{Calibrations, Config};
 use crate::engine::{Engine, Observer};
+use crate::ingest::entrance::{Entrance, Entrances};
 use crate::ingest::{Door, door, udp};
 use crate::publish::{Served, Vehicles, grpc, page};
 use crate::record::{Preface, RecordError, Recorder};
@@ -197,6 +198,9 @@ impl Server {
         let vehicles = Vehicles(served.into());
 
         let (stop, stopped) = watch::channel(false);
+        let open = config.vehicles.iter().zip(&doors).filter(|(vehicle, _)| vehicle.ingest.enabled);
+        let entrances =
+            Entrances::new(open.map(|(vehicle, running)| Entrance::new(vehicle, &running.door)), stopped.clone());
         let stopped = move || {
             let mut stopped = stopped.clone();
             async move {
@@ -208,9 +212,9 @@ impl Server {
         let address = |listener: &TcpListener| listener.local_addr().ok();
         let (grpc_at, page_at) = (grpc.as_ref().and_then(address), page.as_ref().and_then(address));
         if let Some(listener) = grpc {
-            let (vehicles, stopped) = (vehicles.clone(), stopped());
+            let (vehicles, entrances, stopped) = (vehicles.clone(), entrances.clone(), stopped());
             publishers.spawn(async move {
-                if let Err(error) = grpc::serve(listener, vehicles, stopped).await {
+                if let Err(error) = grpc::serve(listener, vehicles, entrances, stopped).await {
                     tracing::error!(%error, "grpc ended");
                 }
             });
@@ -225,7 +229,7 @@ impl Server {
         }
         #[cfg(feature = "zenoh")]
         let publisher = match config.zenoh.enabled {
-            true => Some(crate::publish::zenoh::Publisher::start(&config.zenoh, &vehicles).await?),
+            true => Some(crate::publish::zenoh::Publisher::start(&config.zenoh, &vehicles, &entrances).await?),
             false => None,
         };
         let mut running = Running {

@@ -267,6 +267,8 @@ fn ledger_json(ledger: &v1::Ledger) -> Value {
         "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
         "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops, "points_dropped": ledger.points_dropped,
         "own_body": ledger.own_body, "through_body": ledger.through_body,
+        "poses": ledger.poses, "poses_refused": ledger.poses_refused,
+        "roads": ledger.roads, "roads_refused": ledger.roads_refused,
     })
 }
 
@@ -281,6 +283,10 @@ fn ledger(ledger: &Ledger) -> v1::Ledger {
         points_dropped: ledger.points_dropped,
         own_body: ledger.own_body,
         through_body: ledger.through_body,
+        poses: ledger.poses,
+        poses_refused: ledger.poses_refused,
+        roads: ledger.roads,
+        roads_refused: ledger.roads_refused.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect(),
     }
 }
 
@@ -372,6 +378,14 @@ pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {
         .map(|(labels, reason, n)| (format!("{labels},reason=\"{reason}\""), n))
         .collect();
     family("clearway_sensor_refused_total", "counter", "A sensor's datagrams and scans refused, by reason.", &refused);
+    let poses = each(&|s, _| s.ledger.poses as f64);
+    family("clearway_poses_total", "counter", "Ego poses taken.", &poses);
+    let poses = each(&|s, _| s.ledger.poses_refused as f64);
+    family("clearway_poses_refused_total", "counter", "Ego poses refused.", &poses);
+    let roads = each(&|s, _| s.ledger.roads as f64);
+    family("clearway_roads_total", "counter", "Roads taken.", &roads);
+    let roads = each(&|s, _| s.ledger.roads_refused.values().sum::<u64>() as f64);
+    family("clearway_roads_refused_total", "counter", "Roads refused.", &roads);
     let maps = each(&|_, p| p.maps as f64);
     family("clearway_maps_total", "counter", "Maps made.", &maps);
     let revolutions = each(&|s, _| s.revolutions() as f64);

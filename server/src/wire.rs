@@ -13,6 +13,7 @@ use clearway_mapping::map::{Cells, Geometry, Layer, Map, SafePoint, SensorState}
 use clearway_mapping::pipeline::{model_name, model_of_name};
 use clearway_proto::codec::{self, CellsRef};
 use clearway_proto::map::{encode_header, encode_layer};
+use clearway_proto::packed::{pack, unpack};
 use clearway_proto::v1;
 use nalgebra::{Isometry3, Quaternion, Translation3, Unit};
 use prost::Message;
@@ -175,7 +176,7 @@ fn road(road: &Road) -> v1::Road {
 }
 
 /// What the core would refuse stays as it is: the journal holds it too. `Err` names what has no counterpart.
-fn road_from_proto(road: v1::Road) -> Result<Road, &'static str> {
+pub(crate) fn road_from_proto(road: v1::Road) -> Result<Road, &'static str> {
     let purpose = match road.purpose() {
         v1::RoadPurpose::Paint => RoadPurpose::Paint,
         v1::RoadPurpose::Route => RoadPurpose::Route,
@@ -197,6 +198,15 @@ fn road_from_proto(road: v1::Road) -> Result<Road, &'static str> {
         widths_m: road.width,
         orientations: road.orientations,
     })
+}
+
+/// `None` where the pose is missing.
+pub(crate) fn ego_pose_from_proto(ego: &v1::EgoPose) -> Option<EgoPose> {
+    let pose = ego.map_from_ego.as_ref()?;
+    // Not normalised again: a rounding would make another pose of it than the one that was processed.
+    let rotation = Unit::new_unchecked(Quaternion::new(pose.qw, pose.qx, pose.qy, pose.qz));
+    let map_from_ego = Isometry3::from_parts(Translation3::new(pose.x, pose.y, pose.z), rotation);
+    Some(EgoPose { stamp_ns: ego.stamp_ns, map_from_ego, speed_mps: ego.speed_mps })
 }
 
 fn sensor_config(sensor: &SensorConfig) -> v1::Sensor {
@@ -237,22 +247,32 @@ pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, &'st
 fn scan(scan: &Scan) -> v1::Scan {
     v1::Scan {
         stamp_ns: scan.stamp_ns,
-        x: scan.x.clone(),
-        y: scan.y.clone(),
-        z: scan.z.clone(),
-        intensity: scan.intensity.clone(),
-        ring: scan.ring.iter().map(|ring| u32::from(*ring)).collect(),
-        offset_ns: scan.offset_ns.clone(),
-        no_returns: scan.no_returns.as_flattened().to_vec(),
+        x: pack(&scan.x),
+        y: pack(&scan.y),
+        z: pack(&scan.z),
+        intensity: pack(&scan.intensity),
+        ring: pack(&scan.ring),
+        offset_ns: pack(&scan.offset_ns),
+        no_returns: pack(scan.no_returns.as_flattened()),
     }
 }
 
 /// What the core would refuse stays as it is: the journal holds it too. `Err` names what has no counterpart.
 pub(crate) fn scan_from_proto(scan: v1::Scan) -> Result<Scan, &'static str> {
-    let v1::Scan { stamp_ns, x, y, z, intensity, ring, offset_ns, no_returns } = scan;
-    let ring = ring.into_iter().map(u16::try_from).collect::<Result<_, _>>().map_err(|_| "ring under 65536")?;
+    const PART: &str = "whole number at the end of a scan's list";
+    let floats = |bytes: &[u8]| unpack(bytes).ok_or(PART);
+    let no_returns = floats(&scan.no_returns)?;
     let (directions, []) = no_returns.as_chunks::<3>() else { return Err("z for every x and y of no_returns") };
-    Ok(Scan { stamp_ns, x, y, z, intensity, ring, offset_ns, no_returns: directions.to_vec() })
+    Ok(Scan {
+        stamp_ns: scan.stamp_ns,
+        x: floats(&scan.x)?,
+        y: floats(&scan.y)?,
+        z: floats(&scan.z)?,
+        intensity: floats(&scan.intensity)?,
+        ring: unpack(&scan.ring).ok_or(PART)?,
+        offset_ns: unpack(&scan.offset_ns).ok_or(PART)?,
+        no_returns: directions.to_vec(),
+    })
 }
 
 /// An event as the journal holds it.
@@ -333,11 +353,7 @@ pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventError> {
             Body::Scan(scan_from_proto(scan).map_err(|what| EventError::Missing { sequence, what })?)
         }
         v1::event::Body::EgoPose(ego) => {
-            let pose = ego.map_from_ego.ok_or(EventError::Missing { sequence, what: "pose" })?;
-            // Not normalised again: a rounding would make another pose of it than the one that was processed.
-            let rotation = Unit::new_unchecked(Quaternion::new(pose.qw, pose.qx, pose.qy, pose.qz));
-            let map_from_ego = Isometry3::from_parts(Translation3::new(pose.x, pose.y, pose.z), rotation);
-            Body::EgoPose(EgoPose { stamp_ns: ego.stamp_ns, map_from_ego, speed_mps: ego.speed_mps })
+            Body::EgoPose(ego_pose_from_proto(&ego).ok_or(EventError::Missing { sequence, what: "pose" })?)
         }
         v1::event::Body::Road(road) => {
             Body::Road(road_from_proto(road).map_err(|what| EventError::Missing { sequence, what })?)

@@ -204,12 +204,12 @@ fn a_million_datagrams_add_up_exactly() {
         door.enter_all(readings).unwrap();
         // An engine that stalls now and then.
         if random.next_u32() % 8 == 0 {
-            events.try_iter().for_each(|event| drop(pipeline.step(&event)));
+            events.try_iter().for_each(|queued| drop(pipeline.step(&queued.event)));
         }
     }
-    events.try_iter().for_each(|event| drop(pipeline.step(&event)));
+    events.try_iter().for_each(|queued| drop(pipeline.step(&queued.event)));
     door.close().unwrap();
-    events.try_iter().for_each(|event| drop(pipeline.step(&event)));
+    events.try_iter().for_each(|queued| drop(pipeline.step(&queued.event)));
 
     let ledger = pipeline.ledger();
     assert!(adds_up(ledger), "{ledger:?}");

@@ -78,6 +78,8 @@ fn ledger_document(ledger: &v1::Ledger) -> Value {
     json!({
         "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
         "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
+        "poses": ledger.poses, "poses_refused": ledger.poses_refused,
+        "roads": ledger.roads, "roads_refused": ledger.roads_refused,
     })
 }
 
@@ -117,6 +119,13 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
     }
     if let Some(ledger) = &vehicle.ledger {
         lines.push(format!("  {}, dropped by the kernel {}", ledger_line(ledger), ledger.kernel_drops));
+        let roads_refused: u64 = ledger.roads_refused.values().sum();
+        if ledger.poses + ledger.poses_refused + ledger.roads + roads_refused > 0 {
+            lines.push(format!(
+                "  poses: {} taken, {} refused; roads: {} taken, {roads_refused} refused",
+                ledger.poses, ledger.poses_refused, ledger.roads
+            ));
+        }
     }
     for s in &vehicle.strangers {
         let age = (now - s.newest_ns) as f64 * 1e-9;

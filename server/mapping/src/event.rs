@@ -54,7 +54,7 @@ pub enum Cause {
     Sender,
     /// A datagram longer than any the door takes.
     Length,
-    /// A message that is no observation; its sender has been told why.
+    /// A message that is no observation, or none of the ROS 2 messages that are read.
     Observation,
 }
 

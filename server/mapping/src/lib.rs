@@ -17,6 +17,7 @@
 //! | [`radial`] | the thesis' r-θ grid: position -> cell |
 //! | [`drivability`] | thesis §IV |
 //! | [`height_difference`] | the thesis' baseline |
+//! | [`scan_file`] | KITTI `.bin`, `.pcd` -> scan |
 //! | [`series`] | revolution -> how far each range lies from its laser's neighbouring ones |
 //! | [`terrain`] | Neuhaus 2009 §2 |
 //! | [`road`] | RDDF and RNDF files, checked roads |
@@ -39,6 +40,7 @@ pub mod radial;
 mod rings;
 pub mod road;
 pub mod safe_path;
+pub mod scan_file;
 pub mod series;
 pub mod speed;
 pub mod sweep;

@@ -1,4 +1,5 @@
-//! Maps over gRPC: `clearway.v1.MapService`, standard health and reflection.
+//! Maps over gRPC: `clearway.v1.MapService`, standard health and reflection, and beside them what vehicles send
+//! ([`crate::ingest::grpc`]).
 //!
 //! A `Watch` reader is a stream that is asked for its next update when the transport has room for one, and looks at the
 //! newest-map slot only then: a slow reader skips maps and is told how many, and costs the engine nothing. Credits bound
@@ -18,14 +19,19 @@ use tonic::{Request, Response, Status, Streaming};
 use super::connections::Connections;
 use super::{Served, Unknown, Vehicles};
 use crate::engine::Newest;
+use crate::ingest::entrance::Entrances;
+use crate::ingest::grpc::Ingest;
 use crate::ingest::now_ns;
 use crate::status::Reader;
 use crate::wire::EncodedMap;
 
+use v1::ingest_service_server::IngestServiceServer;
 use v1::map_service_server::{MapService, MapServiceServer};
 
 /// Requests are names and numbers; anything longer is not meant for us.
 const REQUEST_BYTES_MAX: usize = 64 << 10;
+/// What a peer may have sent and nobody has read: a connection costs no more.
+const WINDOW_BYTES: u32 = 1 << 20;
 /// Streams a connection: a fleet page watches some vehicles' layers, nobody a hundred.
 const STREAMS_MAX: u32 = 128;
 /// A reader that opens `Watch` says what it wants at once.
@@ -42,10 +48,15 @@ const IN_FLIGHT_MAX: u32 = 64;
 pub async fn serve(
     listener: TcpListener,
     vehicles: Vehicles,
+    entrances: Entrances,
     stop: impl Future<Output = ()>,
 ) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<MapServiceServer<Maps>>().await;
+    let ingest = (!entrances.all().is_empty()).then(|| Ingest::new(entrances).service());
+    if ingest.is_some() {
+        health.set_serving::<IngestServiceServer<Ingest>>().await;
+    }
     let reflection = || {
         tonic_reflection::server::Builder::configure()
             .register_encoded_file_descriptor_set(DESCRIPTORS)
@@ -55,11 +66,13 @@ pub async fn serve(
     Server::builder()
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE))
-        .initial_stream_window_size(REQUEST_BYTES_MAX as u32)
-        .initial_connection_window_size(1 << 20)
+        // A scan is megabytes; what is not read yet is bounded by the connection's window either way.
+        .initial_stream_window_size(WINDOW_BYTES)
+        .initial_connection_window_size(WINDOW_BYTES)
         .max_concurrent_streams(STREAMS_MAX)
         .http2_max_header_list_size(16 << 10)
         .add_service(maps)
+        .add_optional_service(ingest)
         .add_service(health_service)
         .add_service(reflection().build_v1()?)
         // Older grpcurl knows only this one.
@@ -76,7 +89,7 @@ struct Maps {
 impl From<Unknown> for Status {
     fn from(unknown: Unknown) -> Self {
         match unknown {
-            Unknown::Vehicle { .. } => Status::not_found(unknown.to_string()),
+            Unknown::Vehicle { .. } | Unknown::Sensor { .. } => Status::not_found(unknown.to_string()),
             Unknown::Layer { .. } => Status::invalid_argument(unknown.to_string()),
         }
     }

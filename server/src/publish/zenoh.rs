@@ -15,6 +15,8 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 
 use super::{Served, Vehicles};
 use crate::config::Zenoh as Options;
+use crate::ingest::entrance::Entrances;
+use crate::ingest::zenoh::Ingest;
 
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
 /// How often a quiet publisher tells its last sequence, so that a lost last map is noticed.
@@ -43,17 +45,21 @@ pub(crate) fn failed(what: impl Into<String>) -> impl FnOnce(zenoh::Error) -> Ze
 }
 
 impl Publisher {
-    /// Opens the session, declares every vehicle's keys and starts publishing. Needs a multi-thread runtime.
+    /// Opens the session, declares every vehicle's keys and starts publishing, and taking what vehicles send. Needs a multi-thread runtime.
     ///
     /// # Errors
     /// [`ZenohError`] with what zenoh says.
-    pub async fn start(options: &Options, vehicles: &Vehicles) -> Result<Self, ZenohError> {
+    pub async fn start(options: &Options, vehicles: &Vehicles, entrances: &Entrances) -> Result<Self, ZenohError> {
         let config = session_config(options)?;
         let endpoints = options.listen.join(", ");
         let session = zenoh::open(config).await.map_err(failed(format!("open (listen {endpoints})")))?;
         let mut publisher = Self { session, tokens: Vec::new(), tasks: JoinSet::new() };
         for served in vehicles.0.iter() {
             publisher.publish(served).await?;
+        }
+        for entrance in entrances.all() {
+            let ingest = Ingest::subscribe(&publisher.session, entrance.clone()).await?;
+            publisher.tasks.spawn(ingest.run());
         }
         Ok(publisher)
     }

@@ -1,0 +1,260 @@
+//! Files, by their names' endings -> what is sent when.
+
+use std::fs::File;
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use clearway_client::observation::{RoadFrame, RoadPurpose};
+use clearway_client::{Observation, now_ns};
+use clearway_lidar::capture::{Capture, CaptureError};
+use clearway_mapping::event::{Road, RoadPurpose as Purpose};
+use clearway_mapping::road::rddf::Rddf;
+use clearway_mapping::road::rndf::Rndf;
+use clearway_mapping::road::{FOOT_M, LineRefused, LocalFrame};
+use clearway_mapping::scan_file::{read_bin, read_pcd};
+
+/// Datagrams of a drive in one observation, at most: 50 ms of an HDL-64E.
+const PACKETS: usize = 175;
+/// A drive's datagrams do not wait longer for others.
+const PACKETS_NS: i64 = 20_000_000;
+/// An RNDF lane without a width is as wide as most.
+const LANE_M: f64 = 12.0 * FOOT_M;
+
+/// What is sent when.
+pub struct Plan {
+    /// Scans, poses and roads, by stamp.
+    pub items: Vec<(i64, Item)>,
+    /// Captures, with stamps of their own.
+    pub drives: Vec<PathBuf>,
+    /// Lines that were left out.
+    pub notes: Vec<String>,
+}
+
+/// One thing to be sent.
+pub enum Item {
+    /// Position, quaternion x y z w, forward speed.
+    Pose([f64; 3], [f64; 4], f64),
+    /// A road in the map frame.
+    Road(Road),
+    /// A file with a scan.
+    Scan(PathBuf),
+}
+
+impl Item {
+    /// What it is, and how it is sent.
+    ///
+    /// # Errors
+    /// A scan that cannot be read.
+    pub fn read(&self, sensor: &str, stamp_ns: i64) -> Result<(&'static str, Observation)> {
+        Ok(match self {
+            Self::Pose(at, turned, speed_mps) => ("poses", Observation::pose(stamp_ns, *at, *turned, *speed_mps)),
+            Self::Road(road) => {
+                let points: Vec<[f64; 3]> =
+                    road.points.iter().zip(&road.widths_m).map(|(&[x, y], &width)| [x, y, width]).collect();
+                let purpose = match road.purpose {
+                    Purpose::Paint => RoadPurpose::Paint,
+                    Purpose::Route => RoadPurpose::Route,
+                };
+                ("roads", Observation::road(stamp_ns, purpose, RoadFrame::Map, &points))
+            }
+            Self::Scan(file) => {
+                let bytes = std::fs::read(file).with_context(|| file.display().to_string())?;
+                let scan = if ending(file) == "pcd" { read_pcd(&bytes) } else { read_bin(&bytes) };
+                let scan = scan.with_context(|| file.display().to_string())?;
+                let observation = Observation::scan(sensor, stamp_ns, &scan.x, &scan.y, &scan.z);
+                ("scans", observation.intensity(&scan.intensity))
+            }
+        })
+    }
+}
+
+fn ending(file: &Path) -> &str {
+    file.extension().and_then(|extension| extension.to_str()).unwrap_or("")
+}
+
+impl Plan {
+    /// Of the files named.
+    ///
+    /// # Errors
+    /// A file that cannot be read or is of no known kind; scans that are more than the poses.
+    pub fn of(options: &super::Options) -> Result<Self> {
+        let (mut scans, mut poses, mut roads) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut drives, mut notes) = (Vec::new(), Vec::new());
+        for file in &options.files {
+            let text = || std::fs::read_to_string(file).with_context(|| file.display().to_string());
+            match ending(file) {
+                "bin" | "pcd" => scans.push(file.clone()),
+                "pcap" | "pcapng" => drives.push(file.clone()),
+                "tum" => poses.extend(read_poses(&text()?).with_context(|| file.display().to_string())?),
+                "rddf" | "rndf" => {
+                    let (road, refused) = read_road(&text()?, ending(file), options);
+                    notes.extend(refused.iter().map(|line| format!("{}: {line}", file.display())));
+                    roads.push(road.with_context(|| file.display().to_string())?);
+                }
+                other => bail!("{}: .{other}: bin, pcd, pcap, pcapng, tum, rddf and rndf are allowed", file.display()),
+            }
+        }
+        if !poses.is_empty() && scans.len() > poses.len() {
+            bail!("{} scans and {} poses: a pose for each scan stamps it, or none", scans.len(), poses.len());
+        }
+        let first_ns = poses.first().map_or_else(now_ns, |(stamp_ns, _)| *stamp_ns);
+        let stamp_ns = |index: usize| match poses.get(index) {
+            Some((stamp_ns, _)) => *stamp_ns,
+            None => first_ns.saturating_add((index as f64 * 1e9 / options.hz) as i64),
+        };
+        let scans = scans.into_iter().enumerate().map(|(index, file)| (stamp_ns(index), Item::Scan(file)));
+        // Each road its own stamp: the newest counts.
+        let roads = (0..).zip(roads).map(|(index, road)| (first_ns.saturating_add(index), Item::Road(road)));
+        let mut items: Vec<_> = roads.chain(scans).collect();
+        items.extend(poses);
+        // What a map needs comes before its scan.
+        items.sort_by_key(|(stamp_ns, item)| (*stamp_ns, matches!(item, Item::Scan(_))));
+        Ok(Self { items, drives, notes })
+    }
+}
+
+/// Lines of "seconds x y z qx qy qz qw"; speeds follow from the distance to the line before.
+fn read_poses(text: &str) -> Result<Vec<(i64, Item)>> {
+    let mut poses: Vec<(i64, [f64; 7])> = Vec::new();
+    for (index, line) in text.lines().enumerate() {
+        let line = line.split('#').next().unwrap_or("").trim();
+        if line.is_empty() {
+            continue;
+        }
+        let numbers: Vec<f64> = line.split_whitespace().filter_map(|number| number.parse().ok()).collect();
+        let [seconds, rest @ ..] = &numbers[..] else {
+            bail!("line {}: {line:?}: eight numbers are needed", index + 1)
+        };
+        let Ok(pose) = <[f64; 7]>::try_from(rest) else {
+            bail!("line {}: {line:?}: eight numbers are needed", index + 1)
+        };
+        poses.push(((seconds * 1e9).round() as i64, pose));
+    }
+    let speed_mps = |from: &(i64, [f64; 7]), to: &(i64, [f64; 7])| {
+        let [dx, dy, dz] = [0, 1, 2].map(|axis| to.1[axis] - from.1[axis]);
+        let seconds = to.0.saturating_sub(from.0) as f64 * 1e-9;
+        let [qx, qy, qz, qw] = [3, 4, 5, 6].map(|axis| to.1[axis]);
+        // The way driven, along the vehicle's x axis: backwards is negative.
+        let forward = [1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy + qw * qz), 2.0 * (qx * qz - qw * qy)];
+        let driven_m = dx * forward[0] + dy * forward[1] + dz * forward[2];
+        if seconds > 0.0 { driven_m / seconds } else { 0.0 }
+    };
+    let item = |index: usize| {
+        let (stamp_ns, [x, y, z, qx, qy, qz, qw]) = poses[index];
+        let (from, to) = if index > 0 { (index - 1, index) } else { (0, 1.min(poses.len() - 1)) };
+        (stamp_ns, Item::Pose([x, y, z], [qx, qy, qz, qw], speed_mps(&poses[from], &poses[to])))
+    };
+    Ok((0..poses.len()).map(item).collect())
+}
+
+/// The route of an RDDF, or one lane of an RNDF to paint; and the lines that were left out.
+fn read_road(text: &str, ending: &str, options: &super::Options) -> (Result<Road>, Vec<LineRefused>) {
+    let frame = |of_file: Option<LocalFrame>| match options.origin {
+        Some([latitude, longitude]) => Some(LocalFrame::about(latitude, longitude)),
+        None => of_file,
+    };
+    if ending == "rddf" {
+        let rddf = Rddf::read(text);
+        let road = frame(rddf.local_frame()).map(|frame| rddf.road(&frame, Purpose::Route, 0));
+        return (road.context("no row of a route"), rddf.refused);
+    }
+    let mut rndf = Rndf::read(text);
+    let names: Vec<String> = rndf.lanes.iter().map(|lane| lane.name.clone()).collect();
+    let frame = frame(rndf.local_frame());
+    let lane = match &options.lane {
+        None => rndf.lanes.first(),
+        Some(name) => rndf.lanes.iter().find(|lane| lane.name == *name),
+    };
+    let road = lane.zip(frame).and_then(|(lane, frame)| lane.road(&frame, Some(LANE_M), 0));
+    let road = road.with_context(|| format!("no such lane with two points; lanes: {}", names.join(", ")));
+    (road, std::mem::take(&mut rndf.refused))
+}
+
+/// Some datagrams with their stamps.
+type Packets = Vec<(i64, Vec<u8>)>;
+
+/// A capture's datagrams, some at a time. One that was cut off gives what it holds.
+///
+/// # Errors
+/// A file that cannot be read.
+pub fn chunks(file: &Path) -> Result<impl Iterator<Item = Result<Packets, CaptureError>>> {
+    let open = File::open(file).with_context(|| format!("open {}", file.display()))?;
+    let capture = Capture::new(BufReader::new(open)).with_context(|| file.display().to_string())?;
+    let mut datagrams = capture.peekable();
+    Ok(std::iter::from_fn(move || {
+        let mut packets = Packets::new();
+        while packets.len() < PACKETS {
+            let first_ns = packets.first().map(|(stamp_ns, _)| *stamp_ns);
+            let near =
+                |stamp_ns: i64| first_ns.is_none_or(|first| (0..=PACKETS_NS).contains(&stamp_ns.saturating_sub(first)));
+            match datagrams.next_if(|next| packets.is_empty() || next.as_ref().is_ok_and(|d| near(d.stamp_ns))) {
+                Some(Ok(datagram)) => packets.push((datagram.stamp_ns, datagram.payload)),
+                Some(Err(CaptureError::Truncated { .. })) | None => break,
+                Some(Err(error)) => return Some(Err(error)),
+            }
+        }
+        (!packets.is_empty()).then_some(Ok(packets))
+    }))
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Arguments {
+        #[command(flatten)]
+        options: super::super::Options,
+    }
+
+    fn plan(folder: &Path, files: &[(&str, &[u8])]) -> Result<Plan> {
+        let mut arguments = vec!["ingest".to_owned()];
+        for (name, bytes) in files {
+            std::fs::write(folder.join(name), bytes).unwrap();
+            arguments.push(folder.join(name).display().to_string());
+        }
+        Plan::of(&Arguments::parse_from(arguments).options)
+    }
+
+    #[test]
+    fn scans_are_stamped_by_poses_and_sent_behind_them() {
+        let folder = tempfile::tempdir().unwrap();
+        let poses = b"# seconds x y z qx qy qz qw\n1.5 0 0 0 0 0 1 0\n2.0 -4 0 0 0 0 1 0\n2.5 -3 0 0 0 0 1 0\n";
+        let rddf = b"1,30.0,-97.0,10,20\n2,30.001,-97.0,10,20\nthree,1,2\n";
+        let files: [(&str, &[u8]); 4] = [("a.bin", &[0; 16]), ("b.bin", &[0; 16]), ("p.tum", poses), ("r.rddf", rddf)];
+        let plan = plan(folder.path(), &files).unwrap();
+        let kind = |item: &Item| match item {
+            Item::Pose(..) => "pose",
+            Item::Road(_) => "road",
+            Item::Scan(_) => "scan",
+        };
+        let kinds: Vec<_> = plan.items.iter().map(|(stamp_ns, item)| (*stamp_ns, kind(item))).collect();
+        let half = 500_000_000;
+        let expected = [(3 * half, "road"), (3 * half, "pose"), (3 * half, "scan"), (4 * half, "pose")];
+        assert_eq!(kinds[..4], expected);
+        assert_eq!(kinds[4..], [(4 * half, "scan"), (5 * half, "pose")]);
+        let speeds = plan.items.iter().filter_map(|(_, item)| match item {
+            Item::Pose(_, _, speed_mps) => Some(*speed_mps),
+            _ => None,
+        });
+        // The vehicle looks the other way: it drove ahead, and then backed.
+        assert_eq!(speeds.collect::<Vec<_>>(), [8.0, 8.0, -2.0]);
+        assert!(plan.notes.len() == 1 && plan.notes[0].contains("line 3"), "{:?}", plan.notes);
+    }
+
+    #[test]
+    fn files_that_do_not_belong_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let said = |files: &[(&str, &[u8])]| format!("{:#}", plan(folder.path(), files).err().unwrap());
+        assert!(said(&[("a.txt", b"")]).contains(".txt"));
+        assert!(said(&[("a.tum", b"1 2 3\n")]).contains("eight numbers"));
+        assert!(said(&[("a.rddf", b"")]).contains("no row"));
+        assert!(said(&[("a.rndf", b"RNDF_name x\n")]).contains("no such lane"));
+        assert!(
+            said(&[("a.bin", b""), ("b.bin", b""), ("a.tum", b"1 0 0 0 0 0 0 1\n")]).contains("2 scans and 1 poses")
+        );
+    }
+}

@@ -1,0 +1,538 @@
+//! Scans, poses, roads and tunnelled packets over the network: the same maps as by any other door, and for everything
+//! that is not taken a reason.
+
+mod house;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use bytes::Bytes;
+use clearway_client::observation::{RoadFrame, RoadPurpose, Sensor, by_reason};
+use clearway_client::{Client, ClientError, Ingester, Observation, Refusal, ZenohClient};
+use clearway_lidar::model::Model;
+use clearway_mapping::event::Body;
+use clearway_proto::packed::{pack, unpack};
+use clearway_proto::v1;
+use clearway_proto::v1::ingest_service_client::IngestServiceClient;
+use clearway_server::config::Config;
+use clearway_server::ingest::Reading;
+use clearway_server::server::{Running, Server, Setup};
+use clearway_server::verify::verify;
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes::town;
+use clearway_sim::vehicle::SimulatedVehicle;
+use house::{config, feed, readings, recorded, within};
+use prost::Message;
+use tonic::Code;
+
+/// A server with a boot id that two runs have in common, recording to `file`.
+async fn start(mut config: Config, file: &Path) -> Running {
+    config.recorder.file = file.to_owned();
+    let setup = Setup { config, from_files: true, boot_id: Some(7), ..Setup::default() };
+    Server::start(setup).await.expect("the server starts")
+}
+
+async fn client(running: &Running) -> Client {
+    Client::connect(&running.grpc.expect("gRPC is served").to_string()).await.expect("gRPC answers")
+}
+
+async fn ingester(running: &Running) -> Ingester {
+    within("a stream", client(running).await.ingest("car")).await.expect("the car is known")
+}
+
+/// Sends everything and gives what was refused.
+async fn told(ingester: &mut Ingester, observations: Vec<Observation>) -> Vec<Refusal> {
+    for observation in observations {
+        within("room", ingester.send(observation)).await.expect("the stream is open");
+    }
+    within("verdicts", ingester.settled()).await.expect("the stream is open")
+}
+
+/// Datagrams as observations of `count` each.
+fn tunnelled(readings: &[Reading], count: usize) -> Vec<Observation> {
+    let packet = |reading: &Reading| match &reading.body {
+        Body::Datagram(payload) => (reading.arrival_ns, payload.clone()),
+        other => panic!("no datagram: {other:?}"),
+    };
+    let packets = |chunk: &[Reading]| Observation::packets("top", &chunk.iter().map(packet).collect::<Vec<_>>());
+    readings.chunks(count).map(packets).collect()
+}
+
+/// Holds a drive's maps, come as tunnelled packets, against those it makes by the door of files.
+async fn assert_tunnelled_makes_the_maps_of_the_file_door(config: Config, readings: Vec<Reading>) -> usize {
+    let folder = tempfile::tempdir().unwrap();
+    let (by_file, by_grpc) = (folder.path().join("file.mcap"), folder.path().join("grpc.mcap"));
+    let end_ns = readings.last().expect("a drive").arrival_ns;
+    let end = Reading { arrival_ns: end_ns, source: 0, body: Body::End };
+
+    let running = start(config.clone(), &by_file).await;
+    feed(&running, readings.clone()).await;
+    let door = running.doors[0].door.clone();
+    tokio::task::spawn_blocking(move || door.enter_captured(end)).await.unwrap().unwrap();
+    within("shutdown", running.shutdown()).await.unwrap();
+
+    let running = start(config, &by_grpc).await;
+    let mut ingester = ingester(&running).await;
+    let mut observations = tunnelled(&readings, 97);
+    observations.push(Observation::end("").captured_at(end_ns));
+    assert_eq!(told(&mut ingester, observations).await, []);
+    within("shutdown", running.shutdown()).await.unwrap();
+
+    let maps = recorded(&by_file);
+    assert!(recorded(&by_grpc) == maps, "the same bytes");
+    let report = verify(&by_grpc).unwrap();
+    assert!(report.is_good(), "{:?}", report.differences);
+    maps.len()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_drive_tunnelled_over_grpc_makes_the_maps_of_the_file_door() {
+    let maps = assert_tunnelled_makes_the_maps_of_the_file_door(config(), readings(5)).await;
+    assert!(maps as u64 >= 5 * house::LAYERS, "{maps}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+async fn a_recorded_drive_tunnelled_over_grpc_makes_the_maps_of_the_file_door() {
+    let file = Path::new(env!("CLEARWAY_DATA")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
+    let drive = clearway_server::ingest::capture::Source::open(&file).unwrap();
+    let readings: Vec<Reading> = drive.map(Result::unwrap).collect();
+    assert_eq!(readings.len(), 976);
+    let maps = assert_tunnelled_makes_the_maps_of_the_file_door(config(), readings).await;
+    assert_eq!(maps as u64, 6 * house::LAYERS);
+}
+
+/// A car in the town whose sensor's turns come as scans; the speed map is on.
+fn scanned_config() -> Config {
+    let mut config = config();
+    config.vehicles[0].udp = None;
+    config.vehicles[0].maps.speed.enabled = true;
+    config.vehicles[0].sensors[0].model = Some(Model::Hdl32e);
+    config
+}
+
+/// What the car tells of `turns` turns: poses at 100 Hz, the road ahead, and each turn as a scan with the time of each
+/// point, or of each column.
+fn scanned(turns: i64, by_column: bool) -> Vec<Observation> {
+    let scanner = ScannerConfig { model: Model::Hdl32e, ..ScannerConfig::default() };
+    let car = SimulatedVehicle::new(town(), scanner);
+    let mut observations = Vec::new();
+    for number in 1..=turns {
+        let turn = car.revolution(number);
+        let end_ns = turn.end_ns;
+        let first_ns = end_ns - 100_000_000 + 10_000_000;
+        for stamp_ns in (first_ns..=end_ns).step_by(10_000_000) {
+            let pose = car.pose_at(stamp_ns);
+            let (at, turned) = (pose.translation.vector, pose.rotation.coords);
+            let turned = [turned.x, turned.y, turned.z, turned.w];
+            let pose = Observation::pose(stamp_ns, at.into(), turned, car.speed_at(stamp_ns));
+            observations.push(pose.captured_at(stamp_ns));
+        }
+        let points: Vec<[f64; 3]> = (0..12).map(|i| [f64::from(i) * 3.0, 0.0, 6.0]).collect();
+        let road = Observation::road(end_ns, RoadPurpose::Paint, RoadFrame::Ego, &points);
+        observations.push(road.captured_at(end_ns));
+
+        let (mut x, mut y, mut z, mut intensity) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        let (mut rings, mut offsets_ns, mut columns) = (Vec::new(), Vec::new(), (Vec::new(), Vec::new()));
+        let echo = &turn.echoes[0];
+        for (firing, when) in turn.firings.iter().enumerate() {
+            let offset_ns = i32::try_from(turn.start_ns + i64::from(when.offset_ns) - end_ns).unwrap();
+            let before = x.len();
+            for slot in (firing * turn.lasers..(firing + 1) * turn.lasers).filter(|slot| echo.range_m[*slot] > 0.0) {
+                x.push(echo.x[slot]);
+                y.push(echo.y[slot]);
+                z.push(echo.z[slot]);
+                intensity.push(f32::from(echo.intensity[slot]) / 255.0);
+                rings.push(u16::try_from(slot % turn.lasers).unwrap());
+                offsets_ns.push(offset_ns);
+            }
+            columns.0.push(offset_ns);
+            columns.1.push(u16::try_from(x.len() - before).unwrap());
+        }
+        let scan = Observation::scan("top", end_ns, &x, &y, &z).intensity(&intensity).rings(&rings);
+        let scan = if by_column { scan.columns(&columns.0, &columns.1) } else { scan.offsets_ns(&offsets_ns) };
+        observations.push(scan.captured_at(end_ns));
+    }
+    observations
+}
+
+/// Maps of one layer in a recording, in order.
+fn layer(maps: &BTreeMap<(u64, String), Bytes>, layer: &str) -> Vec<v1::Map> {
+    let of = maps.iter().filter(|((_, name), _)| name == layer);
+    of.map(|(_, bytes)| v1::Map::decode(bytes.clone()).unwrap()).collect()
+}
+
+/// Cells of class `road` on the vehicle's own lane.
+fn road_cells(map: &v1::Map) -> u32 {
+    let bytes = map.encode_to_vec();
+    let view = clearway_client::MapView::decode(bytes.into()).unwrap();
+    let speed = view.layer("speed").unwrap();
+    (10..60).map(|half_m| u32::from(speed.class_at(f64::from(half_m) * 0.5, 0.0).1 == "road")).sum()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_session_of_scans_poses_and_roads_over_grpc_makes_moved_maps_with_the_road_and_verifies() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let turns = 4;
+    for (file, by_column) in [("points.mcap", false), ("columns.mcap", true)] {
+        let running = start(scanned_config(), &at(file)).await;
+        let mut ingester = ingester(&running).await;
+        assert_eq!(told(&mut ingester, scanned(turns, by_column)).await, []);
+        let ledger = running.vehicles.0[0].status.snapshot().ledger;
+        let taken = (ledger.decoded, ledger.poses, ledger.roads, ledger.received, ledger.lost);
+        assert_eq!(taken, (4, 40, 4, 4, 0), "acknowledged is counted: {ledger:?}");
+        within("shutdown", running.shutdown()).await.unwrap();
+        let report = verify(&at(file)).unwrap();
+        assert!(report.is_good() && report.maps == 4 && report.events == 48, "{report:?}");
+    }
+    let maps = recorded(&at("points.mcap"));
+    assert!(recorded(&at("columns.mcap")) == maps, "time by column says what time by point says");
+    let speed = layer(&maps, "speed");
+    assert_eq!(speed.len(), 4);
+    for map in &speed {
+        let header = map.header.as_ref().unwrap();
+        assert_eq!(header.compensation, "poses");
+        assert!(header.map_from_ego.is_some() && header.speed_mps.unwrap() > 1.0, "{header:?}");
+        assert!(road_cells(map) > 10, "{} cells of road ahead", road_cells(map));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_sensor_that_the_stream_declares_is_mapped_recorded_and_declared_again_without_harm() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("r.mcap");
+    let running = start(scanned_config(), &file).await;
+    let sensor = Sensor { name: "left".into(), x_m: 1.0, y_m: 0.8, z_m: 1.9, yaw_deg: 90.0, ..Sensor::default() };
+    let rays = |sensor: &str, stamp_ns: i64| {
+        let v1::Scan { x, y, z, .. } = plain(stamp_ns);
+        let [x, y, z] = [x, y, z].map(|list| unpack::<f32>(&list).unwrap());
+        Observation::scan(sensor, stamp_ns, &x, &y, &z).captured_at(stamp_ns)
+    };
+    let declared = || Observation::declare(sensor.clone()).captured_at(1_000_000_000);
+    let mut first = ingester(&running).await;
+    let told_first = vec![declared(), rays("left", 1_000_000_000), rays("top", 1_010_000_000)];
+    assert_eq!(told(&mut first, told_first).await, []);
+
+    let mut second = ingester(&running).await;
+    let moved = Observation::declare(Sensor { y_m: -0.8, ..sensor.clone() });
+    let nowhere = Observation::declare(Sensor { name: "right".into(), z_m: f64::NAN, ..sensor.clone() });
+    let strange = Observation::declare(Sensor { name: "up".into(), model: Some("ouster".into()), ..sensor.clone() });
+    let refusals = told(&mut second, vec![declared(), moved, nowhere, strange, rays("left", 1_100_000_000)]).await;
+    assert_eq!(by_reason(&refusals), [("missing", 1), ("sensor", 2)].into());
+    assert!(refusals[0].message.contains("each sensor its own"), "{refusals:?}");
+    assert!(refusals[1].message.contains("z_m"), "{refusals:?}");
+    let snapshot = running.vehicles.0[0].status.snapshot();
+    let names: Vec<_> = snapshot.sensors.iter().map(|sensor| sensor.name.as_str()).collect();
+    assert_eq!(names, ["top", "left"]);
+    assert_eq!((snapshot.ledger.decoded, snapshot.maps), (3, 1), "the lead's scan makes the map");
+    within("shutdown", running.shutdown()).await.unwrap();
+    let report = verify(&file).unwrap();
+    assert!(report.is_good() && report.maps == 1, "{report:?}");
+    let header = layer(&recorded(&file), "drivability")[0].header.clone().unwrap();
+    assert_eq!(header.sensors.iter().map(|sensor| sensor.returns).collect::<Vec<_>>(), [7200, 7200]);
+}
+
+/// A scan of a plain as the observations below change it.
+fn plain(stamp_ns: i64) -> v1::Scan {
+    let rays = 0..7200_u32;
+    let place = |ray: u32| (f64::from(ray) * 0.05_f64.to_radians(), 3.0 + f64::from(ray % 20) * 1.5);
+    let list = |of: &dyn Fn(f64, f64) -> f64| -> Vec<f32> {
+        rays.clone().map(place).map(|(angle, range_m)| of(angle, range_m) as f32).collect()
+    };
+    let (x, y) = (list(&|angle, range_m| angle.cos() * range_m), list(&|angle, range_m| angle.sin() * range_m));
+    v1::Scan { stamp_ns, x: pack(&x), y: pack(&y), z: pack(&list(&|_, _| -1.9)), ..Default::default() }
+}
+
+fn scan(number: u64, scan: v1::Scan) -> v1::Observation {
+    let body = Some(v1::observation::Body::Scan(scan));
+    v1::Observation { number, captured_ns: 1_000_000_000, body, ..Default::default() }
+}
+
+/// Every list of `scan` with its last number replaced.
+fn spoilt(scan: v1::Scan, last: f32) -> v1::Scan {
+    let mut x = scan.x.to_vec();
+    let end = x.len() - 4;
+    x[end..].copy_from_slice(&last.to_le_bytes());
+    v1::Scan { x: x.into(), ..scan }
+}
+
+/// Sends raw observations in one stream and gives every report, and how the stream ended.
+async fn reports(running: &Running, sent: Vec<v1::Observation>) -> (Vec<v1::IngestReport>, Option<tonic::Status>) {
+    let channel = tonic::transport::Channel::from_shared(format!("http://{}", running.grpc.unwrap())).unwrap();
+    let mut client = IngestServiceClient::new(channel.connect().await.unwrap());
+    let mut streamed = match within("an answer", client.stream(futures::stream::iter(sent))).await {
+        Ok(streamed) => streamed.into_inner(),
+        Err(status) => return (Vec::new(), Some(status)),
+    };
+    let mut reports = Vec::new();
+    loop {
+        match within("a report", streamed.message()).await {
+            Ok(Some(report)) => reports.push(report),
+            Ok(None) => return (reports, None),
+            Err(status) => return (reports, Some(status)),
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn whatever_is_no_observation_is_refused_by_name_and_leaves_the_maps_as_they_would_be() {
+    let folder = tempfile::tempdir().unwrap();
+    let (clean, hostile) = (folder.path().join("clean.mcap"), folder.path().join("hostile.mcap"));
+    let good = [1_000_000_000, 1_100_000_000].map(plain);
+    let mut config = scanned_config();
+    config.vehicles[0].ingest.points_max = 10_000;
+
+    let running = start(config.clone(), &clean).await;
+    let sent = good.iter().cloned().zip(1..).map(|(plain, number)| scan(number, plain)).collect();
+    assert!(reports(&running, sent).await.1.is_none());
+    within("shutdown", running.shutdown()).await.unwrap();
+
+    let base = plain(1_050_000_000);
+    let short = |bytes: &Bytes| bytes.slice(..bytes.len() - 4);
+    let cut = |bytes: &Bytes| bytes.slice(..bytes.len() - 1);
+    let of = |body| v1::Observation { body: Some(body), ..Default::default() };
+    let columns = |offset_ns: &[i32], points: &[u16]| v1::Observation {
+        columns: Some(v1::Columns { offset_ns: pack(offset_ns), points: pack(points) }),
+        ..scan(0, base.clone())
+    };
+    let packets = |lengths: &[u16], payloads: &'static [u8]| {
+        let captured_ns = pack(&vec![5_i64; lengths.len()]);
+        let packets = v1::Packets { captured_ns, lengths: pack(lengths), payloads: Bytes::from_static(payloads) };
+        of(v1::observation::Body::Packets(packets))
+    };
+    let pose = |pose: Option<v1::Pose>, speed_mps| {
+        of(v1::observation::Body::EgoPose(v1::EgoPose { stamp_ns: 5, map_from_ego: pose, speed_mps }))
+    };
+    let level = v1::Pose { qw: 1.0, ..Default::default() };
+    let road = |x: &[f64], y: &[f64], width: &[f64], kinds: (i32, i32)| {
+        let (x, y, width) = (x.to_vec(), y.to_vec(), width.to_vec());
+        let road = v1::Road { x, y, width, purpose: kinds.0, frame: kinds.1, ..Default::default() };
+        of(v1::observation::Body::Road(road))
+    };
+    let bad: Vec<(&str, v1::Observation)> = vec![
+        ("body", v1::Observation::default()),
+        ("packed", scan(0, v1::Scan { x: cut(&base.x), ..base.clone() })),
+        ("packed", scan(0, v1::Scan { intensity: Bytes::from_static(&[1, 2, 3]), ..base.clone() })),
+        ("packed", scan(0, v1::Scan { ring: Bytes::from_static(&[1]), ..base.clone() })),
+        ("packed", scan(0, v1::Scan { offset_ns: Bytes::from_static(&[1; 6]), ..base.clone() })),
+        ("packed", scan(0, v1::Scan { no_returns: Bytes::from_static(&[1; 16]), ..base.clone() })),
+        ("points", scan(0, v1::Scan { x: vec![0; 40_004].into(), ..base.clone() })),
+        ("points", scan(0, v1::Scan { no_returns: vec![0; 120_012].into(), ..base.clone() })),
+        ("scan_lengths", scan(0, v1::Scan { y: short(&base.y), ..base.clone() })),
+        ("scan_lengths", scan(0, v1::Scan { z: Bytes::new(), ..base.clone() })),
+        ("scan_lengths", scan(0, v1::Scan { intensity: pack(&[0.5_f32]), ..base.clone() })),
+        ("stamp", scan(0, plain(1_000_000_000))),
+        ("stamp", scan(0, plain(i64::MIN))),
+        ("columns", columns(&[0], &[7199])),
+        ("columns", columns(&[0, 0], &[7200])),
+        ("columns", columns(&[0; 20_000], &[65_535; 20_000])),
+        ("packets", packets(&[], b"")),
+        ("packets", packets(&[65_535], b"abc")),
+        ("packets", packets(&[1], b"abc")),
+        ("packets", packets(&[0; 1025], b"")),
+        ("length", packets(&[3], b"abc")),
+        ("missing", pose(None, 0.0)),
+        ("pose", pose(Some(v1::Pose::default()), 0.0)),
+        ("pose", pose(Some(v1::Pose { x: f64::NAN, ..level }), 0.0)),
+        ("pose", pose(Some(v1::Pose { y: 1e10, ..level }), 0.0)),
+        ("pose", pose(Some(level), f64::INFINITY)),
+        ("missing", road(&[0.0, 1.0], &[0.0], &[3.0, 3.0], (1, 1))),
+        ("missing", road(&[0.0, 1.0], &[0.0, 0.0], &[3.0, 3.0], (0, 1))),
+        ("missing", road(&[0.0, 1.0], &[0.0, 0.0], &[3.0, 3.0], (1, 9))),
+        ("road_points", road(&[0.0], &[0.0], &[3.0], (1, 1))),
+        ("road_widths", road(&[0.0, 1.0], &[0.0, 0.0], &[3.0], (1, 1))),
+        ("road_width", road(&[0.0, 1.0], &[0.0, 0.0], &[3.0, -1.0], (1, 1))),
+        ("road_point", road(&[0.0, f64::NAN], &[0.0, 0.0], &[3.0, 3.0], (1, 1))),
+        ("road_coinciding", road(&[0.0, 0.0], &[0.0, 0.0], &[3.0, 3.0], (1, 1))),
+    ];
+    let mut sent = vec![scan(1, good[0].clone())];
+    let numbered =
+        |(number, (_, observation)): (u64, &(&str, v1::Observation))| v1::Observation { number, ..observation.clone() };
+    sent.extend((2..).zip(&bad).map(numbered));
+    let last = sent.len() as u64 + 1;
+    // One number twice; it does not count as an observation of its own.
+    sent.push(v1::Observation { number: 2, ..scan(0, base.clone()) });
+    sent.push(scan(last, good[1].clone()));
+
+    let running = start(config, &hostile).await;
+    let (reports, end) = reports(&running, sent).await;
+    assert!(end.is_none(), "{end:?}");
+    assert_eq!(reports.last().unwrap().acknowledged, last, "{reports:?}");
+    let mut refused: Vec<_> = reports.iter().flat_map(|report| &report.refused).collect();
+    let twice = refused.iter().position(|refused| refused.reason == "number").expect("a number came twice");
+    assert!(refused.remove(twice).message.contains("more than"));
+    refused.sort_by_key(|refused| refused.number);
+    let reasons: Vec<_> = refused.iter().map(|refused| (refused.number, refused.reason.as_str())).collect();
+    let expected: Vec<_> = (2..).zip(&bad).map(|(number, (reason, _))| (number, *reason)).collect();
+    assert_eq!(reasons, expected);
+
+    let ledger = running.vehicles.0[0].status.snapshot().ledger;
+    assert_eq!(ledger.received, ledger.decoded + ledger.telemetry + ledger.refused.values().sum::<u64>());
+    let (poses, roads) = (ledger.poses_refused, ledger.roads_refused.values().sum::<u64>());
+    let counted = ledger.refused.values().sum::<u64>() + poses + roads;
+    assert_eq!((ledger.decoded, poses, roads, counted), (2, 4, 5, bad.len() as u64 + 1), "each once: {ledger:?}");
+    within("shutdown", running.shutdown()).await.unwrap();
+    assert!(verify(&hostile).unwrap().is_good());
+    let cells = |file: &Path| -> Vec<_> {
+        let maps = recorded(file).into_values().map(|bytes| v1::Map::decode(bytes).unwrap());
+        maps.map(|map| map.layers).collect()
+    };
+    assert!(cells(&hostile) == cells(&clean), "nothing of them is in a map");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn points_that_are_nowhere_are_counted_and_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let running = start(scanned_config(), &folder.path().join("r.mcap")).await;
+    let wild = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e9];
+    let stamps = (1_i64..).map(|n| n * 100_000_000);
+    let sent = wild.iter().zip(stamps).zip(1..).map(|((&x, stamp), number)| scan(number, spoilt(plain(stamp), x)));
+    let (reports, _) = reports(&running, sent.collect()).await;
+    assert!(reports.iter().all(|report| report.refused.is_empty()));
+    let ledger = running.vehicles.0[0].status.snapshot().ledger;
+    assert_eq!((ledger.decoded, ledger.points_dropped), (4, 4));
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn strangers_crowds_and_giants_are_told_what_is_allowed() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = scanned_config();
+    (config.vehicles[0].ingest.points_max, config.vehicles[0].ingest.streams_max) = (1000, 1);
+    let running = start(config, &folder.path().join("r.mcap")).await;
+    let client = client(&running).await;
+    let refused = |outcome: Result<Ingester, ClientError>| match outcome {
+        Err(ClientError::Refused { reason, code, .. }) => (code, reason),
+        other => panic!("{:?}", other.map(drop)),
+    };
+    let (code, reason) = refused(client.ingest("truck").await);
+    assert!(code == "NotFound" && reason.contains("truck") && reason.contains("car"), "{reason}");
+
+    let mut first = ingester(&running).await;
+    let (code, reason) = refused(client.ingest("car").await);
+    assert!(code == "ResourceExhausted" && reason.contains("allow"), "{reason}");
+
+    first.send(Observation::end("bottom")).await.unwrap();
+    let refusals = within("a refusal", first.settled()).await.unwrap();
+    assert_eq!(by_reason(&refusals), [("source", 1)].into());
+    assert!(refusals[0].message.contains("bottom") && refusals[0].message.contains("top"));
+    let ended = within("the end", async {
+        loop {
+            if let Err(error) = first.send(Observation::end("")).await {
+                return error;
+            }
+        }
+    });
+    let ended = ended.await.to_string();
+    assert!(ended.contains("bottom") && ended.contains("top"), "{ended}");
+    drop(first);
+
+    let place = || async {
+        loop {
+            match client.ingest("car").await {
+                Ok(ingester) => return ingester,
+                // The stream before may not be quite gone.
+                Err(ClientError::Refused { .. }) => tokio::task::yield_now().await,
+                Err(other) => panic!("{other}"),
+            }
+        }
+    };
+    drop(within("a place", place()).await);
+    let giant = v1::Scan { x: vec![0; 200_000].into(), ..Default::default() };
+    let giant = || async {
+        loop {
+            let hello = v1::Observation::default();
+            let (reports, end) = reports(&running, vec![hello, scan(1, giant.clone())]).await;
+            match end {
+                Some(status) if status.code() == Code::ResourceExhausted => tokio::task::yield_now().await,
+                end => return (reports, end),
+            }
+        }
+    };
+    let (_, end) = within("a place", giant()).await;
+    let status = end.expect("a message of 200 kB ends the stream");
+    assert!(status.code() == Code::OutOfRange && status.message().contains("97536"), "{status:?}");
+    assert_eq!(running.vehicles.0[0].status.snapshot().ledger.refused.get("observation"), Some(&1));
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn the_same_session_over_zenoh_makes_the_same_maps_and_hears_the_same_refusals() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let running = start(scanned_config(), &at("grpc.mcap")).await;
+    let mut grpc = ingester(&running).await;
+    assert_eq!(told(&mut grpc, scanned(2, false)).await, []);
+    within("shutdown", running.shutdown()).await.unwrap();
+
+    let mut config = scanned_config();
+    config.zenoh.enabled = true;
+    let running = start(config, &at("zenoh.mcap")).await;
+    let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
+    let client = within("zenoh", ZenohClient::connect(endpoint)).await.unwrap();
+    let unknown = within("an answer", client.ingest("truck")).await.err().unwrap().to_string();
+    assert!(unknown.contains("truck") && unknown.contains("car"), "{unknown}");
+    let mut zenoh = within("a way", client.ingest("car")).await.unwrap();
+    assert_eq!(told(&mut zenoh, scanned(2, false)).await, []);
+
+    let stale = Observation::pose(5, [0.0; 3], [0.0, 0.0, 0.0, 1.0], 0.0);
+    let strange = Observation::scan("bottom", 5, &[1.0], &[1.0], &[1.0]);
+    let crooked = Observation::scan("top", i64::MAX, &[1.0], &[1.0, 2.0], &[1.0]);
+    let refusals = told(&mut zenoh, vec![stale, strange, crooked]).await;
+    assert_eq!(by_reason(&refusals), [("stamp", 1), ("source", 1), ("scan_lengths", 1)].into());
+    assert!(refusals[1].message.contains("top"), "{refusals:?}");
+    within("shutdown", running.shutdown()).await.unwrap();
+
+    assert!(recorded(&at("zenoh.mcap")) == recorded(&at("grpc.mcap")), "the same bytes");
+    assert!(verify(&at("zenoh.mcap")).unwrap().is_good());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn the_command_sends_scans_poses_and_a_road_and_says_what_was_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let point = |x: f32, y: f32| [x, y, -1.9, 0.5].map(f32::to_le_bytes).concat();
+    let plain: Vec<u8> = (0..400_u16).map(f32::from).flat_map(|i| point(3.0 + i % 20.0, i / 20.0 - 10.0)).collect();
+    let write = |name: &str, bytes: &[u8]| std::fs::write(folder.path().join(name), bytes).unwrap();
+    write("0.bin", &plain);
+    write("1.bin", &plain);
+    write("way.tum", b"100.0 0 0 0 0 0 0 1\n100.1 1 0 0 0 0 0 1\n100.1 1 0 0 0 0 0 1\n");
+    write("route.rddf", b"1,30.0,-97.0,10,20\n2,30.001,-97.0,10,20\n");
+    let running = start(scanned_config(), &folder.path().join("r.mcap")).await;
+    let server = running.grpc.unwrap().to_string();
+    let at = folder.path().to_owned();
+    let output = tokio::task::spawn_blocking(move || {
+        let files = ["ingest", "0.bin", "1.bin", "way.tum", "route.rddf", "--fast", "--json", "--server", &server];
+        clearway_tests::run(&at, "clearway", &files)
+    });
+    let output = output.await.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let said: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(said["sent"], serde_json::json!({ "poses": 3, "roads": 1, "scans": 2 }));
+    assert_eq!(said["refused"], serde_json::json!({ "stamp": 1 }), "the pose that came twice");
+    let ledger = running.vehicles.0[0].status.snapshot().ledger;
+    assert_eq!((ledger.decoded, ledger.poses, ledger.poses_refused, ledger.roads), (2, 2, 1, 1));
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_server_that_stops_has_told_what_became_of_everything() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("r.mcap");
+    let running = start(config(), &file).await;
+    let mut ingester = ingester(&running).await;
+    assert_eq!(told(&mut ingester, tunnelled(&readings(1), 50)).await, []);
+    within("shutdown", running.shutdown()).await.unwrap();
+    let mut later = Vec::new();
+    let error = within("the end", async {
+        loop {
+            match ingester.send(Observation::end("")).await {
+                Ok(number) => later.push(number),
+                Err(error) => break error,
+            }
+        }
+    })
+    .await;
+    assert!(matches!(error, ClientError::Refused { .. } | ClientError::Unreachable { .. }), "{error}");
+    assert!(verify(&file).unwrap().is_good());
+}
