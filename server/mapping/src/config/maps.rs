@@ -265,7 +265,7 @@ pub struct SpeedConfig {
 impl Default for SpeedConfig {
     fn default() -> Self {
         Self {
-            enabled: false,
+            enabled: true,
             extent_m: 40.0,
             cell_m: 0.5,
             overhang_m: 2.5,
@@ -323,6 +323,10 @@ pub struct SafePathConfig {
     pub cell_m: f32,
     /// Points nearer than half of this to an obstacle are no way through; obstacles nearer to one another count as one.
     pub vehicle_width_m: f32,
+    /// The vehicle reaches this far before the ego origin; what returns from within its outline is no obstacle.
+    pub vehicle_front_m: f32,
+    /// And this far behind it.
+    pub vehicle_rear_m: f32,
     /// The sensor does not see the ground this near to the vehicle: what is unknown there is no obstacle.
     pub blind_zone_m: f32,
     /// Unseen ground no wider than this between drivable cells of one ring or azimuth is no obstacle.
@@ -334,10 +338,12 @@ pub struct SafePathConfig {
 impl Default for SafePathConfig {
     fn default() -> Self {
         Self {
-            enabled: false,
+            enabled: true,
             extent_m: 30.0,
             cell_m: 0.25,
             vehicle_width_m: 2.0,
+            vehicle_front_m: 3.0,
+            vehicle_rear_m: 2.0,
             blind_zone_m: 7.0,
             hole_m_max: 1.0,
             join_m_max: 15.0,
@@ -468,6 +474,8 @@ impl SafePathConfig {
             ("extent_m", self.extent_m, (5.0..=200.0, "5 to 200")),
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
             ("vehicle_width_m", self.vehicle_width_m, (0.1..=10.0, "0.1 to 10")),
+            ("vehicle_front_m", self.vehicle_front_m, (0.0..=20.0, "0 to 20")),
+            ("vehicle_rear_m", self.vehicle_rear_m, (0.0..=20.0, "0 to 20")),
             ("blind_zone_m", self.blind_zone_m, (0.0..=60.0, "0 to 60")),
             ("hole_m_max", self.hole_m_max, (0.0..=5.0, "0 to 5")),
             ("join_m_max", self.join_m_max, (0.0..=100.0, "0 to 100")),
