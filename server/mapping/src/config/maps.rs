@@ -186,6 +186,8 @@ pub struct TerrainConfig {
     pub step_m_max: f32,
     /// With `form = "grounded"`: widest gap without points over which regions can be neighbours, as far rings are.
     pub bridge_m_max: f32,
+    /// With `form = "grounded"`: least width between obstacles the vehicle drives through; 0 takes every way.
+    pub gate_m_min: f32,
     /// With `form = "grounded"`: widest hole in seen ground that is inferred to be flat.
     pub inference_m_max: f32,
     /// Deviation of the sensor's own ranges, taken off the roughness.
@@ -212,6 +214,7 @@ impl Default for TerrainConfig {
             start_m_max: 0.25,
             step_m_max: 0.15,
             bridge_m_max: 8.0,
+            gate_m_min: 2.0,
             inference_m_max: 3.0,
             noise_m: 0.02,
             roughness_points_min: 4,
@@ -419,6 +422,7 @@ impl TerrainConfig {
             ("start_m_max", self.start_m_max, (0.01..=10.0, "0.01 to 10")),
             ("step_m_max", self.step_m_max, (0.0..=10.0, "0 to 10")),
             ("bridge_m_max", self.bridge_m_max, (0.0..=20.0, "0 to 20")),
+            ("gate_m_min", self.gate_m_min, (0.0..=20.0, "0 to 20")),
             ("inference_m_max", self.inference_m_max, (0.0..=20.0, "0 to 20")),
             // The plane of a stretch of one ring needs some.
             ("noise_m", self.noise_m, (0.001..=1.0, "0.001 to 1")),
