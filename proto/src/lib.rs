@@ -9,6 +9,7 @@ mod decode;
 pub mod grid;
 pub mod map;
 mod parts;
+mod rows;
 
 /// Generated from `clearway/v1/*.proto`.
 #[allow(missing_docs, clippy::all, rustdoc::broken_intra_doc_links)]
