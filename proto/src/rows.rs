@@ -225,7 +225,7 @@ impl<'a> BitReader<'a> {
     /// Nothing but zeros to the end of the byte, and no other byte.
     fn finish(mut self) -> Result<(), DecodeError> {
         let offset = self.at.div_ceil(8);
-        while self.at % 8 != 0 {
+        while !self.at.is_multiple_of(8) {
             if self.bit()? {
                 return Err(DecodeError::TrailingBytes { offset: offset - 1, left: 1 });
             }
