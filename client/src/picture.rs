@@ -83,7 +83,7 @@ impl Colours {
                 "unknown" => UNKNOWN,
                 "drivable" | "flat" | "passable" => DRIVABLE,
                 "flat_inferred" | "free" => WEAKLY_DRIVABLE,
-                "not_drivable" | "flat_elevated" => NOT_DRIVABLE,
+                "not_drivable" | "flat_elevated" | "flat_unreachable" => NOT_DRIVABLE,
                 "road" => ROAD,
                 "path" => PATH,
                 "obstacle" => OBSTACLE,

@@ -4,13 +4,14 @@
 //! everything before it allocates anything.
 //!
 //! Runs are canonical, so that equal cells have equal bytes: for each run varint(value) varint(length - 1), signed
-//! values zigzag, neighbours differ, lengths sum to the cell count, no overlong varint. A channel is sent raw whenever
-//! its runs would not be smaller.
+//! values zigzag, neighbours differ, lengths sum to the cell count, no overlong varint. [`crate::rows`] predicts every row
+//! by the one before. A channel is sent as what is smallest; of equals, raw before runs before rows.
 
 use std::borrow::Cow;
 
 use bytes::Bytes;
 
+use crate::rows::{COLUMNS_MAX, encode_rows};
 use crate::v1;
 
 pub use crate::decode::{DecodeError, Limits, decode};
@@ -106,7 +107,7 @@ impl<'a> CellsRef<'a> {
 pub struct Encoded {
     /// Of the cells.
     pub cell_type: v1::CellType,
-    /// Raw, or runs where they are smaller.
+    /// What was smallest.
     pub encoding: v1::Encoding,
     /// Number of cells.
     pub cell_count: u32,
@@ -134,24 +135,40 @@ impl Encoded {
     }
 }
 
-/// Encodes cells: canonical runs, or raw where runs would not be smaller.
+/// Encodes cells without rows: canonical runs, or raw where runs would not be smaller.
 ///
 /// # Panics
 /// With 2³² cells or more: no grid has them, and [`Limits`] refuses far fewer.
 pub fn encode(cells: CellsRef<'_>) -> Encoded {
+    encode_grid(cells, 0)
+}
+
+/// Encodes the cells of a grid with rows of `columns` cells: as rows, runs or raw, whichever is smallest.
+///
+/// # Panics
+/// As [`encode`].
+pub fn encode_grid(cells: CellsRef<'_>, columns: usize) -> Encoded {
     let raw = cells.to_le_bytes();
-    let runs = match cells {
-        CellsRef::U8(_) => encode_runs::<1>(&raw, u64::from),
-        CellsRef::I8(_) => encode_runs::<1>(&raw, |bits| u64::from(zigzag(bits as u8 as i8))),
-        CellsRef::U16(_) => encode_runs::<2>(&raw, u64::from),
+    let [runs, rows] = match cells {
+        CellsRef::U8(_) => both::<1>(&raw, columns, u64::from),
+        CellsRef::I8(_) => both::<1>(&raw, columns, |bits| u64::from(zigzag(bits as u8 as i8))),
+        CellsRef::U16(_) => both::<2>(&raw, columns, u64::from),
     };
     let crc32 = crc32fast::hash(&raw);
-    let (encoding, payload) = match runs {
-        Some(runs) => (v1::Encoding::Runs, Bytes::from(runs)),
-        None => (v1::Encoding::Raw, Bytes::from(raw.into_owned())),
+    let (encoding, payload) = match (runs, rows) {
+        (Some(runs), Some(rows)) if runs.len() <= rows.len() => (v1::Encoding::Runs, Bytes::from(runs)),
+        (_, Some(rows)) => (v1::Encoding::Rows, Bytes::from(rows)),
+        (Some(runs), None) => (v1::Encoding::Runs, Bytes::from(runs)),
+        (None, None) => (v1::Encoding::Raw, Bytes::from(raw.into_owned())),
     };
     let cell_count = u32::try_from(cells.len()).expect("a grid has fewer than 2^32 cells");
     Encoded { cell_type: cells.cell_type(), encoding, cell_count, crc32, payload }
+}
+
+/// Runs, and rows; `None` where they are not smaller than the cells themselves, or there are no rows.
+fn both<const W: usize>(raw: &[u8], columns: usize, wire_value: impl Fn(u16) -> u64 + Copy) -> [Option<Vec<u8>>; 2] {
+    let rows = (1..=COLUMNS_MAX).contains(&columns) && columns * W <= raw.len();
+    [encode_runs::<W>(raw, wire_value), if rows { encode_rows::<W>(raw, columns, wire_value) } else { None }]
 }
 
 /// Runs of `W`-byte little-endian cells; `None` as soon as they are not smaller than the cells themselves.
@@ -171,12 +188,12 @@ fn encode_runs<const W: usize>(raw: &[u8], wire_value: impl Fn(u16) -> u64) -> O
 }
 
 /// One cell's bits.
-fn cell_bits<const W: usize>(raw: &[u8], at: usize) -> u16 {
+pub(crate) fn cell_bits<const W: usize>(raw: &[u8], at: usize) -> u16 {
     if W == 1 { u16::from(raw[at]) } else { u16::from_le_bytes([raw[at], raw[at + 1]]) }
 }
 
 /// Where the run that starts at `start` ends, bytes; eight bytes are compared at a time.
-fn run_end<const W: usize>(raw: &[u8], start: usize) -> usize {
+pub(crate) fn run_end<const W: usize>(raw: &[u8], start: usize) -> usize {
     let bits = u64::from(cell_bits::<W>(raw, start));
     let pattern = bits * if W == 1 { 0x0101_0101_0101_0101 } else { 0x0001_0001_0001_0001 };
     let tail_start = start + (raw.len() - start) / 8 * 8;
@@ -204,7 +221,7 @@ pub(crate) fn unzigzag(value: u8) -> i8 {
     ((value >> 1) as i8) ^ -((value & 1) as i8)
 }
 
-fn put_varint(out: &mut Vec<u8>, mut value: u64) {
+pub(crate) fn put_varint(out: &mut Vec<u8>, mut value: u64) {
     while value >= 0x80 {
         out.push(value as u8 | 0x80);
         value >>= 7;

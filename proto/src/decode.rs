@@ -4,6 +4,7 @@
 //! canonical form and CRC are checked in a first pass that allocates nothing; the second makes the cells.
 
 use crate::codec::{Cells, unzigzag};
+use crate::rows::for_each_stretch;
 use crate::v1;
 
 /// What a decoder accepts before it allocates.
@@ -44,7 +45,7 @@ pub enum DecodeError {
         value: i32,
     },
     /// The encoding is none that exists.
-    #[error("encoding {value}; 1 (raw) and 2 (runs) exist")]
+    #[error("encoding {value}; 1 (raw), 2 (runs) and 3 (rows) exist")]
     Encoding {
         /// On the wire.
         value: i32,
@@ -59,8 +60,8 @@ pub enum DecodeError {
         /// Bytes these cells take.
         expected: u64,
     },
-    /// Runs that should have been sent raw.
-    #[error("runs of {length} bytes; they must be smaller than the {raw} bytes of the raw cells")]
+    /// Runs or rows that should have been sent raw.
+    #[error("runs or rows of {length} bytes; they must be smaller than the {raw} bytes of the raw cells")]
     RunsNotSmaller {
         /// Bytes of the payload.
         length: usize,
@@ -73,8 +74,8 @@ pub enum DecodeError {
         /// Bytes of the payload.
         offset: usize,
     },
-    /// A varint that is longer than its value needs, or longer than five bytes.
-    #[error("overlong varint at byte {offset}")]
+    /// A varint or number that is longer than its value needs, or than any value here.
+    #[error("overlong number at byte {offset}")]
     OverlongVarint {
         /// Where it starts.
         offset: usize,
@@ -89,8 +90,16 @@ pub enum DecodeError {
         /// Largest on the wire.
         allowed: u64,
     },
-    /// Two neighbouring runs with one value.
-    #[error("the run at byte {offset} repeats the value of the run before it ({value} on the wire)")]
+    /// Rows of no grid.
+    #[error("rows of {columns} columns; 1 to {allowed} are allowed")]
+    Columns {
+        /// Claimed.
+        columns: u64,
+        /// As many as there are cells, and as the decoder holds.
+        allowed: u64,
+    },
+    /// Two neighbouring runs with one value, or a run where a row would have been copied.
+    #[error("the run at byte {offset} repeats the value before it or a row before ({value} on the wire)")]
     EqualNeighbours {
         /// Where the second starts.
         offset: usize,
@@ -147,6 +156,7 @@ impl DecodeError {
             Self::ValueTooLarge { .. } => "value_too_large",
             Self::EqualNeighbours { .. } => "equal_neighbours",
             Self::RunTooLong { .. } => "run_too_long",
+            Self::Columns { .. } => "columns",
             Self::TooFewCells { .. } => "too_few_cells",
             Self::TrailingBytes { .. } => "trailing_bytes",
             Self::Crc { .. } => "crc",
@@ -185,6 +195,16 @@ pub fn decode(channel: &v1::Channel, limits: &Limits) -> Result<Cells, DecodeErr
             }
             crc_of_runs(payload, cell_count, value_max, signed)?
         }
+        Ok(v1::Encoding::Rows) => {
+            if payload.len() as u64 >= raw_length {
+                return Err(DecodeError::RunsNotSmaller { length: payload.len(), raw: raw_length });
+            }
+            let mut crc = CrcOfCells::new(value_max, signed);
+            for_each_stretch(payload, cell_count, value_max, |value, length| {
+                crc.take(u64::from(value), length as u64)
+            })?;
+            crc.finish()
+        }
         Ok(v1::Encoding::Unspecified) | Err(_) => return Err(DecodeError::Encoding { value: channel.encoding }),
     };
     if computed != channel.crc32 {
@@ -192,26 +212,63 @@ pub fn decode(channel: &v1::Channel, limits: &Limits) -> Result<Cells, DecodeErr
     }
 
     let raw = channel.encoding() == v1::Encoding::Raw;
-    let count = cell_count as usize;
     Ok(match channel.cell_type() {
         v1::CellType::U8 if raw => Cells::U8(payload.to_vec()),
-        v1::CellType::U8 => Cells::U8(fill(payload, count, value_max, |value| value as u8)?),
+        v1::CellType::U8 => Cells::U8(fill(channel, value_max, |value| value as u8)?),
         v1::CellType::I8 if raw => Cells::I8(payload.iter().map(|&v| v as i8).collect()),
-        v1::CellType::I8 => Cells::I8(fill(payload, count, value_max, |value| unzigzag(value as u8))?),
+        v1::CellType::I8 => Cells::I8(fill(channel, value_max, |value| unzigzag(value as u8))?),
         v1::CellType::U16 if raw => {
             Cells::U16(payload.as_chunks::<2>().0.iter().map(|&v| u16::from_le_bytes(v)).collect())
         }
-        v1::CellType::U16 => Cells::U16(fill(payload, count, value_max, |value| value as u16)?),
+        v1::CellType::U16 => Cells::U16(fill(channel, value_max, |value| value as u16)?),
         v1::CellType::Unspecified => return Err(bad_type),
     })
 }
 
+/// CRC of cells, from stretches of equal ones.
+struct CrcOfCells {
+    wide: bool,
+    signed: bool,
+    block: [u8; 1024],
+    filled: usize,
+    crc: crc32fast::Hasher,
+}
+
+impl CrcOfCells {
+    fn new(value_max: u64, signed: bool) -> Self {
+        Self { wide: value_max > 0xff, signed, block: [0; 1024], filled: 0, crc: crc32fast::Hasher::new() }
+    }
+
+    fn take(&mut self, value: u64, length: u64) {
+        let bits = if self.signed { u16::from(unzigzag(value as u8) as u8) } else { value as u16 };
+        let [low, high] = bits.to_le_bytes();
+        let mut bytes = length as usize * if self.wide { 2 } else { 1 };
+        while bytes > 0 {
+            let taken = bytes.min(self.block.len() - self.filled);
+            let part = &mut self.block[self.filled..self.filled + taken];
+            if self.wide {
+                part.as_chunks_mut::<2>().0.fill([low, high]);
+            } else {
+                part.fill(low);
+            }
+            self.filled += taken;
+            bytes -= taken;
+            if self.filled == self.block.len() {
+                self.crc.update(&self.block);
+                self.filled = 0;
+            }
+        }
+    }
+
+    fn finish(mut self) -> u32 {
+        self.crc.update(&self.block[..self.filled]);
+        self.crc.finalize()
+    }
+}
+
 /// Checks every run and gives the CRC of the cells they stand for, without making them.
 fn crc_of_runs(payload: &[u8], cell_count: u32, value_max: u64, signed: bool) -> Result<u32, DecodeError> {
-    const BLOCK: usize = 1024;
-    let mut block = [0_u8; BLOCK];
-    let mut filled = 0;
-    let mut crc = crc32fast::Hasher::new();
+    let mut crc = CrcOfCells::new(value_max, signed);
     let mut runs = Runs { payload, offset: 0, value_max };
     let mut cells = 0_u64;
     let mut previous = None;
@@ -229,42 +286,24 @@ fn crc_of_runs(payload: &[u8], cell_count: u32, value_max: u64, signed: bool) ->
         }
         previous = Some(value);
         cells += length;
-
-        let bits = if signed { u16::from(unzigzag(value as u8) as u8) } else { value as u16 };
-        let [low, high] = bits.to_le_bytes();
-        let wide = value_max > 0xff;
-        let mut bytes = length as usize * if wide { 2 } else { 1 };
-        while bytes > 0 {
-            let taken = bytes.min(BLOCK - filled);
-            let part = &mut block[filled..filled + taken];
-            if wide {
-                part.as_chunks_mut::<2>().0.fill([low, high]);
-            } else {
-                part.fill(low);
-            }
-            filled += taken;
-            bytes -= taken;
-            if filled == BLOCK {
-                crc.update(&block);
-                filled = 0;
-            }
-        }
+        crc.take(value, length);
     }
     if runs.offset != payload.len() {
         return Err(DecodeError::TrailingBytes { offset: runs.offset, left: payload.len() - runs.offset });
     }
-    crc.update(&block[..filled]);
-    Ok(crc.finalize())
+    Ok(crc.finish())
 }
 
-/// Makes the cells of runs that [`crc_of_runs`] has accepted.
-fn fill<T: Clone>(
-    payload: &[u8],
-    count: usize,
-    value_max: u64,
-    cell: impl Fn(u64) -> T,
-) -> Result<Vec<T>, DecodeError> {
-    let mut cells = Vec::with_capacity(count);
+/// Makes the cells of runs or rows that the first pass has accepted.
+fn fill<T: Clone>(channel: &v1::Channel, value_max: u64, cell: impl Fn(u64) -> T) -> Result<Vec<T>, DecodeError> {
+    let payload = &channel.payload[..];
+    let mut cells = Vec::with_capacity(channel.cell_count as usize);
+    if channel.encoding() == v1::Encoding::Rows {
+        for_each_stretch(payload, channel.cell_count, value_max, |value, length| {
+            cells.resize(cells.len() + length, cell(u64::from(value)));
+        })?;
+        return Ok(cells);
+    }
     let mut runs = Runs { payload, offset: 0, value_max };
     while let Some((value, length)) = runs.next()? {
         cells.resize(cells.len() + length as usize, cell(value));

@@ -10,6 +10,7 @@ pub mod grid;
 pub mod map;
 pub mod packed;
 mod parts;
+mod rows;
 
 /// Generated from `clearway/v1/*.proto`.
 #[allow(missing_docs, clippy::all, rustdoc::broken_intra_doc_links)]

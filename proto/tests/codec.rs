@@ -18,7 +18,7 @@ fn cells() -> impl Strategy<Value = Cells> {
 }
 
 fn channel() -> impl Strategy<Value = v1::Channel> {
-    (0..4_i32, 1..3_i32, 0..300_u32, vec(prop_oneof![0..4_u8, any::<u8>()], 0..40)).prop_map(
+    (0..4_i32, 1..4_i32, 0..300_u32, vec(prop_oneof![0..4_u8, any::<u8>()], 0..40)).prop_map(
         |(cell_type, encoding, cell_count, payload)| v1::Channel {
             cell_type,
             encoding,
@@ -36,6 +36,29 @@ proptest! {
         prop_assert!(encoded.payload.len() <= cells.as_ref().to_le_bytes().len());
         let channel = encoded.into_channel("c", "", 1.0, 0);
         prop_assert_eq!(codec::decode(&channel, &Limits::default()), Ok(cells));
+    }
+
+    #[test]
+    fn the_cells_of_a_grid_decode_to_themselves_and_are_never_larger_than_runs(cells in cells(), columns in 1..3000_usize) {
+        let encoded = codec::encode_grid(cells.as_ref(), columns);
+        prop_assert!(encoded.payload.len() <= codec::encode(cells.as_ref()).payload.len());
+        let channel = encoded.into_channel("c", "", 1.0, 0);
+        prop_assert_eq!(codec::decode(&channel, &Limits::default()), Ok(cells));
+    }
+
+    #[test]
+    fn rows_that_decode_are_the_ones_the_encoder_makes(columns in 1..6_u8, bytes in vec(any::<u8>(), 0..12), cell_count in 5..60_u32) {
+        let payload = Bytes::from([&[columns], &bytes[..]].concat());
+        let (cell_type, encoding) = (v1::CellType::U8 as i32, v1::Encoding::Rows as i32);
+        let mut channel = v1::Channel { cell_type, encoding, cell_count, payload, ..Default::default() };
+        if let Err(DecodeError::Crc { computed, .. }) = codec::decode(&channel, &Limits::default()) {
+            channel.crc32 = computed;
+        }
+        if let Ok(cells) = codec::decode(&channel, &Limits::default()) {
+            let encoded = codec::encode_grid(cells.as_ref(), usize::from(columns));
+            // Where runs are as small they are sent.
+            prop_assert!(encoded.payload == channel.payload || encoded.payload.len() <= channel.payload.len() && encoded.encoding == v1::Encoding::Runs);
+        }
     }
 
     #[test]

@@ -70,11 +70,26 @@ fn good_vectors() -> Vec<(&'static str, Cells)> {
     ]
 }
 
+/// Grids of so many columns whose rows resemble one another.
+fn good_grids() -> Vec<(&'static str, Cells, usize)> {
+    let patch = |cell: usize| u8::from((4..9).contains(&(cell / 20)) && (3..12).contains(&(cell % 20)));
+    let arcs = |cell: usize| ((cell / 20).pow(2) + (cell % 20).pow(2)) / 40;
+    vec![
+        ("rows_of_zeros", Cells::U8(vec![0; 4000]), 40),
+        ("rows_of_ones", Cells::U8(vec![1; 4000]), 40),
+        ("rows_patch", Cells::U8((0..400).map(patch).collect()), 20),
+        ("rows_arcs_signed", Cells::I8((0..400).map(|cell| 3 - arcs(cell) as i8).collect()), 20),
+        ("rows_arcs_u16", Cells::U16((0..390).map(|cell| 300 * arcs(cell) as u16).collect()), 20),
+        ("rows_one_column", Cells::U8((0..100).map(|cell| cell / 30).collect()), 1),
+    ]
+}
+
 #[test]
 fn the_encoder_makes_the_golden_channels() {
     let mut vectors = Vec::new();
-    for (name, cells) in good_vectors() {
-        let channel = codec::encode(cells.as_ref()).into_channel(name, "", 1.0, 0);
+    let without_rows = good_vectors().into_iter().map(|(name, cells)| (name, cells, 0));
+    for (name, cells, columns) in without_rows.chain(good_grids()) {
+        let channel = codec::encode_grid(cells.as_ref(), columns).into_channel(name, "", 1.0, 0);
         assert_eq!(codec::decode(&channel, &Limits::default()), Ok(cells.clone()), "{name}");
         vectors.push(json!({
             "name": name,
@@ -95,6 +110,7 @@ type Bad = (&'static str, &'static str, i32, i32, u32, Vec<u8>);
 fn bad_vectors() -> Vec<Bad> {
     let (u8_, i8_, u16_) = (v1::CellType::U8 as i32, v1::CellType::I8 as i32, v1::CellType::U16 as i32);
     let (raw, runs) = (v1::Encoding::Raw as i32, v1::Encoding::Runs as i32);
+    let rows = v1::Encoding::Rows as i32;
     let max = u32::MAX;
     vec![
         ("claims_2_32_cells_as_one_run", "too_many_cells", u8_, runs, max, vec![1, 0xfe, 0xff, 0xff, 0xff, 0x0f]),
@@ -144,6 +160,29 @@ fn bad_vectors() -> Vec<Bad> {
         ("run_after_the_last_cell", "trailing_bytes", u8_, runs, 10, vec![1, 9, 2, 0]),
         ("raw_with_a_wrong_crc", "crc", u8_, raw, 3, vec![1, 2, 3]),
         ("runs_with_a_wrong_crc", "crc", u8_, runs, 10, vec![1, 9]),
+        ("rows_as_long_as_raw", "runs_not_smaller", u8_, rows, 2, vec![2, 0x80]),
+        ("rows_with_nothing", "truncated", u8_, rows, 9, vec![]),
+        ("rows_columns_cut", "truncated", u8_, rows, 900, vec![0x80]),
+        ("rows_columns_overlong", "overlong_varint", u8_, rows, 9, vec![0x83, 0]),
+        ("rows_of_no_columns", "columns", u8_, rows, 9, vec![0, 0x80]),
+        ("rows_of_more_columns_than_cells", "columns", u8_, rows, 9, vec![10, 0x80]),
+        ("rows_of_16385_columns", "columns", u8_, rows, 1 << 20, vec![0x81, 0x80, 1]),
+        ("rows_end_early", "truncated", u8_, rows, 9, vec![3]),
+        // Copy 0 (1), another value (0), which is 0 (1): the same as before the first row.
+        ("rows_value_as_a_row_before", "equal_neighbours", u8_, rows, 9, vec![3, 0b1011_0000, 0]),
+        // Copy 9 + 1 of 9 cells: 0001011 is 10.
+        ("rows_copy_too_long", "run_too_long", u8_, rows, 9, vec![3, 0b0001_0110]),
+        // Copy 0, value 1 (0 010), a run of 10 (0001010).
+        ("rows_run_too_long", "run_too_long", u8_, rows, 9, vec![3, 0b1001_0000, 0b1010_0000]),
+        // Copy 0, value 1, a run of 1; copy 0, value 1.
+        ("rows_run_goes_on", "equal_neighbours", u8_, rows, 9, vec![3, 0b1001_0110, 0b0101_0000]),
+        // Copy 0, as the cell before: there is none.
+        ("rows_first_cell_as_the_one_before", "value_too_large", u8_, rows, 9, vec![3, 0b1100_0000]),
+        ("rows_number_of_33_zeros", "overlong_varint", u8_, rows, 9, vec![3, 0, 0, 0, 0, 0x40]),
+        // Copy 9 (0001010), then a 1 where zeros fill up.
+        ("rows_not_filled_up_with_zeros", "trailing_bytes", u8_, rows, 9, vec![3, 0b0001_0101]),
+        ("rows_with_a_byte_after", "trailing_bytes", u8_, rows, 9, vec![3, 0b0001_0100, 0]),
+        ("rows_with_a_wrong_crc", "crc", u8_, rows, 9, vec![3, 0b0001_0100]),
         ("largest_channel_with_a_wrong_crc", "crc", u16_, runs, 4 << 20, vec![1, 0xff, 0xff, 0xff, 1]),
     ]
 }
@@ -169,7 +208,7 @@ fn every_bad_channel_is_refused_under_its_name() {
 #[test]
 fn the_stored_channels_decode_to_their_stored_cells() {
     let stored: Vec<Value> = serde_json::from_slice(&std::fs::read(golden("channels.json")).unwrap()).unwrap();
-    assert_eq!(stored.len(), good_vectors().len());
+    assert_eq!(stored.len(), good_vectors().len() + good_grids().len());
     for vector in stored {
         let number = |key: &str| vector[key].as_i64().unwrap();
         let channel = v1::Channel {

@@ -130,13 +130,17 @@ fn layer(layer: &Layer) -> v1::Layer {
             v1::layer::Geometry::Cartesian(v1::CartesianGrid { origin_x_m, origin_y_m, width, height, cell_m })
         }
     };
+    let columns = match &layer.geometry {
+        Geometry::Radial { columns, .. } => usize::from(*columns),
+        Geometry::Cartesian { width, .. } => *width as usize,
+    };
     let channel = |channel: &clearway_mapping::map::Channel| {
         let cells = match &channel.cells {
             Cells::U8(cells) => CellsRef::U8(cells),
             Cells::I8(cells) => CellsRef::I8(cells),
             Cells::U16(cells) => CellsRef::U16(cells),
         };
-        codec::encode(cells).into_channel(channel.name, channel.unit, channel.scale, channel.unknown)
+        codec::encode_grid(cells, columns).into_channel(channel.name, channel.unit, channel.scale, channel.unknown)
     };
     v1::Layer {
         name: layer.name.to_owned(),

@@ -11,7 +11,9 @@ const TYPES = {
   2: { cells: Int8Array, width: 1, min: -128, max: 127, signed: true },
   3: { cells: Uint16Array, width: 2, min: 0, max: 65535, signed: false },
 };
-const RAW = 1, RUNS = 2;
+const RAW = 1, RUNS = 2, ROWS = 3;
+// The same bound as the server's.
+const COLUMNS_MAX = 1 << 14;
 
 export class Refused extends Error {
   name = "Refused";
@@ -34,7 +36,8 @@ export function decodeChannel(channel, cellsExpected) {
   let cells;
   if (encoding === RAW) cells = readRaw(payload, type, cell_count, refuse);
   else if (encoding === RUNS) cells = readRuns(payload, type, cell_count, refuse);
-  else throw refuse("encoding", `${encoding}; allowed are 1 (raw), 2 (runs)`);
+  else if (encoding === ROWS) cells = readRows(payload, type, cell_count, refuse);
+  else throw refuse("encoding", `${encoding}; allowed are 1 (raw), 2 (runs), 3 (rows)`);
   const crc = crc32(littleEndian(cells, type));
   if (crc !== channel.crc32) throw refuse("crc", `cells have ${hex(crc)}, the message says ${hex(channel.crc32)}`);
   return cells;
@@ -67,8 +70,7 @@ function readRuns(payload, type, count, refuse) {
   };
   while (at < payload.length) {
     const coded = varint(), length = varint() + 1;
-    const value = type.signed ? (coded % 2 ? -(coded + 1) / 2 : coded / 2) : coded;
-    if (value < type.min || value > type.max) throw refuse("value", `${value}; allowed are ${type.min} to ${type.max}`);
+    const value = cellValue(coded, type, refuse);
     if (value === previous) throw refuse("canonical", `two neighbouring runs of value ${value} at cell ${filled}`);
     if (length > count - filled) throw refuse("run", `${length} cells at cell ${filled}; ${count - filled} are left`);
     cells.fill(value, filled, filled + length);
@@ -77,6 +79,62 @@ function readRuns(payload, type, count, refuse) {
   }
   if (filled !== count) throw refuse("run", `runs cover ${filled} of ${count} cells`);
   return cells;
+}
+
+// Rows predicted by the rows before: cells as a row before, a run of another value, and so on.
+function readRows(payload, type, count, refuse) {
+  const raw = count * type.width;
+  if (payload.length >= raw) throw refuse("canonical", `${payload.length} bytes of rows; the raw cells have ${raw}`);
+  let columns = 0, at = 0;
+  for (let byte = 0x80; byte >= 0x80; at++) {
+    if (at === payload.length || at === 4) throw refuse("payload", "ends inside the number of columns");
+    byte = payload[at];
+    if (byte === 0 && at > 0) throw refuse("canonical", "the number of columns is longer than it need be");
+    columns += (byte & 0x7f) * 2 ** (7 * at);
+  }
+  if (columns < 1 || columns > Math.min(COLUMNS_MAX, count)) throw refuse("columns", `${columns}; ${count} cells`);
+  const cells = new type.cells(count);
+  let bit = at * 8, filled = 0, run = null;
+  const next = () => {
+    if (bit === payload.length * 8) throw refuse("payload", `ends inside a run after ${filled} of ${count} cells`);
+    return (payload[bit >> 3] >> (7 - (bit++ & 7))) & 1;
+  };
+  const number = () => {
+    let more = 0, value = 1;
+    while (!next()) if (++more > 32) throw refuse("payload", "a number of more than 32 bits");
+    for (; more > 0; more--) value = value * 2 + next();
+    return value - 1;
+  };
+  const above = (cell) => (cell < columns ? 0 : cells[cell - columns]);
+  const fits = (length) => {
+    if (length > count - filled) throw refuse("run", `${length} cells at cell ${filled}; ${count - filled} are left`);
+    return filled + length;
+  };
+  while (filled < count) {
+    const end = fits(number());
+    if (filled < end && above(filled) === run) throw refuse("canonical", `a run of value ${run} goes on at cell ${filled}`);
+    if (filled < end) run = null;
+    for (; filled < end; filled++) cells[filled] = above(filled);
+    if (filled === count) break;
+    const before = filled > 0 ? cells[filled - 1] : null, same = next();
+    if (same && before === null) throw refuse("value", "as the one before the first cell");
+    const value = same ? before : cellValue(number(), type, refuse);
+    if (value === above(filled) || (!same && value === before) || value === run) {
+      throw refuse("canonical", `value ${value} at cell ${filled} is the one before it or a row before`);
+    }
+    const runEnd = fits(number() + 1);
+    cells.fill(value, filled, runEnd);
+    [filled, run] = [runEnd, value];
+  }
+  while (bit % 8) if (next()) throw refuse("payload", "not filled up with zeros");
+  if (bit !== payload.length * 8) throw refuse("payload", `${payload.length - bit / 8} bytes after the last cell`);
+  return cells;
+}
+
+function cellValue(coded, type, refuse) {
+  const value = type.signed ? (coded % 2 ? -(coded + 1) / 2 : coded / 2) : coded;
+  if (value < type.min || value > type.max) throw refuse("value", `${value}; allowed are ${type.min} to ${type.max}`);
+  return value;
 }
 
 function littleEndian(cells, type) {

@@ -8,7 +8,7 @@ import { CELLS_MAX, crc32, decodeChannel } from "./codec.js";
 import { egoAt, gridOf, pixelCells } from "./grid.js";
 import { readMapUpdate, WireError } from "./protobuf.js";
 
-const [U8, I8, U16] = [1, 2, 3], [RAW, RUNS] = [1, 2];
+const [U8, I8, U16] = [1, 2, 3], [RAW, RUNS, ROWS] = [1, 2, 3];
 const channel = (cell_type, encoding, payload, raw, cell_count) => ({
   name: "class", cell_type, encoding, cell_count, payload: Uint8Array.from(payload), crc32: crc32(Uint8Array.from(raw)),
 });
@@ -77,7 +77,7 @@ test("no message of random bytes gives anything but a value or a named error", (
       assert.ok(error instanceof WireError, `${error} for ${bytes}`);
     }
     try {
-      decodeChannel(channel(1 + (byte() % 3), RUNS, bytes, [], 32), 32);
+      decodeChannel(channel(1 + (byte() % 3), i % 2 ? RUNS : ROWS, bytes, [], 32), 32);
     } catch (error) {
       assert.equal(error.name, "Refused", `${error} for ${bytes}`);
     }

@@ -10,6 +10,7 @@ const CLASSES = {
   flat: [28, 158, 150],
   flat_inferred: [22, 110, 106],
   flat_elevated: [244, 184, 66],
+  flat_unreachable: [170, 128, 60],
   passable: [28, 158, 150],
   free: [22, 110, 106],
   road: [120, 190, 240],

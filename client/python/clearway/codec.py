@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 CELLS_MAX = 4 << 20
 
 _TYPES = {1: np.dtype("u1"), 2: np.dtype("i1"), 3: np.dtype("<u2")}
-_RAW, _RUNS = 1, 2
+_DIGITS = bytes.maketrans(b"\0\1", b"01")
+_RAW, _RUNS, _ROWS = 1, 2, 3
+#: Columns of coded rows: what the server makes at most.
+_COLUMNS_MAX = 1 << 14
 
 
 def decode(channel: map_pb2.Channel, cells_max: int = CELLS_MAX) -> np.ndarray:
@@ -36,12 +39,12 @@ def decode(channel: map_pb2.Channel, cells_max: int = CELLS_MAX) -> np.ndarray:
         if len(payload) != raw_length:
             raise DecodeError("raw_length", f"raw payload of {len(payload)} bytes; {count} cells take {raw_length}")
         cells = np.frombuffer(payload, dtype)
-    elif channel.encoding == _RUNS:
+    elif channel.encoding in (_RUNS, _ROWS):
         if len(payload) >= raw_length:
             raise DecodeError("runs_not_smaller", f"runs of {len(payload)} bytes; under {raw_length} is needed")
-        cells = _runs(payload, count, dtype)
+        cells = (_runs if channel.encoding == _RUNS else _rows)(payload, count, dtype)
     else:
-        raise DecodeError("encoding", f"encoding {channel.encoding}; 1 (raw) and 2 (runs) exist")
+        raise DecodeError("encoding", f"encoding {channel.encoding}; 1 (raw), 2 (runs) and 3 (rows) exist")
     computed = zlib.crc32(cells.tobytes())
     if computed != channel.crc32:
         raise DecodeError("crc", f"CRC-32 of the cells is {computed:08x}; the channel says {channel.crc32:08x}")
@@ -61,6 +64,73 @@ def _runs(payload: bytes, count: int, dtype: np.dtype) -> np.ndarray:
     if dtype.kind == "i":
         values = (values >> 1) ^ -(values & 1)
     return np.repeat(values.astype(dtype), lengths)
+
+
+def _rows(payload: bytes, count: int, dtype: np.dtype) -> np.ndarray:
+    """Rows predicted by the rows before: cells as a row before, a run of another value, and so on."""
+    top = (1 << (8 * dtype.itemsize)) - 1
+    columns = at = 0
+    while at == 0 or payload[at - 1] >= 0x80:
+        if at == len(payload):
+            raise DecodeError("truncated", f"payload ends at byte {at}, inside the number of columns")
+        if at == 4 or (at > 0 and payload[at] == 0):
+            raise DecodeError("overlong_varint", "overlong varint at byte 0")
+        columns |= (payload[at] & 0x7F) << (7 * at)
+        at += 1
+    if not 1 <= columns <= min(_COLUMNS_MAX, count):
+        raise DecodeError("columns", f"rows of {columns} columns; 1 to {min(_COLUMNS_MAX, count)} are allowed")
+    bits, at = np.unpackbits(np.frombuffer(payload, np.uint8)).tobytes(), 8 * at
+
+    def number() -> int:
+        nonlocal at
+        one = bits.find(b"\1", at, at + 33)
+        if one < 0 and at + 33 <= len(bits):
+            raise DecodeError("overlong_varint", f"overlong number at byte {at // 8}")
+        end = 2 * one - at + 1
+        if one < 0 or end > len(bits):
+            raise DecodeError("truncated", f"payload ends at byte {len(payload)}, inside a run")
+        value = int(bits[one:end].translate(_DIGITS), 2) - 1
+        at = end
+        return value
+
+    def fits(length: int) -> int:
+        if length > count - filled:
+            raise DecodeError("run_too_long", f"{length} cells at cell {filled}; {count - filled} are left")
+        return filled + length
+
+    def above() -> int:
+        return int(cells[filled - columns]) if filled >= columns else 0
+
+    # On the wire, signed values zigzag.
+    cells, filled, run = np.zeros(count, np.uint16 if top > 0xFF else np.uint8), 0, None
+    while filled < count:
+        end = fits(number())
+        if filled < end and above() == run:
+            raise DecodeError("equal_neighbours", f"the run before cell {filled} goes on")
+        run = None if filled < end else run
+        filled = max(filled, min(end, columns))
+        while filled < end:
+            stretch = min(columns, end - filled)
+            cells[filled : filled + stretch] = cells[filled - columns : filled - columns + stretch]
+            filled += stretch
+        if filled == count:
+            break
+        if at == len(bits):
+            raise DecodeError("truncated", f"payload ends at byte {len(payload)}, inside a run")
+        before, same, at = int(cells[filled - 1]) if filled else None, bits[at], at + 1
+        value = before if same else number()
+        if value is None or value > top:
+            raise DecodeError("value_too_large", f"value {value} at cell {filled}; at most {top} is allowed")
+        if value in (above(), run) or (not same and value == before):
+            raise DecodeError("equal_neighbours", f"value {value} at cell {filled} is the one before it or above")
+        end = fits(number() + 1)
+        cells[filled:end] = value
+        filled, run = end, value
+    if b"\1" in bits[at:] or len(bits) - at >= 8:
+        raise DecodeError("trailing_bytes", f"{(len(bits) - at + 7) // 8} bytes follow the last cell")
+    if dtype.kind == "i":
+        return ((cells >> 1) ^ -(cells & 1)).astype(dtype)
+    return cells.astype(dtype)
 
 
 def _varints(payload: bytes) -> np.ndarray | None:

@@ -1,7 +1,7 @@
 //! Safe points (thesis §VI): places as far as can be from the obstacles on both sides, linked into paths that start at
 //! the vehicle.
 //!
-//! In: the layer `drivability` of the same map. Out: the layer `safe_path`: points with radii and links, and the
+//! In: the layer `drivability` of the same map, and its sweep. Out: the layer `safe_path`: points with radii and links, and the
 //! Cartesian grid they were found on. The steps:
 //!
 //! | step | where |
@@ -118,9 +118,9 @@ impl LayerMaker for SafePath {
         self.make_with(sweep, &Context::default(), layer);
     }
 
-    fn make_with(&mut self, _sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
+    fn make_with(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         let drivability = context.earlier.iter().find(|layer| layer.name == "drivability");
-        self.free.fill(drivability, &self.config);
+        self.free.fill(drivability, sweep, &self.config);
         self.distances.measure(self.free.states());
         let width_cells = f64::from(self.config.vehicle_width_m) / f64::from(self.config.cell_m);
         self.ridge.find(self.free.states(), &self.distances, width_cells);

@@ -9,11 +9,12 @@
 //! | principal components, local height disturbance h | §2.1, eq. 1 | [`eigen`] |
 //! | hierarchical division into flat regions (or each cell for itself) | §2.2, §2.3 | [`regions`] |
 //! | regions that join the ground under the vehicle; bounded inference | beyond the paper | [`ground`] |
+//! | which of it the vehicle gets to | beyond the paper | [`shadow`], [`reach`] |
 //! | roughness of flat cells | §2.4, §2.5, eq. 3 and 4 | [`crate::series`], [`roughness`] |
 //!
 //! Three forms stand side by side ([`Form`]). `paper`: as published; car roofs are flat, and cells far beyond the last
 //! point are inferred. `grounded`: a flat region holds no point that stands out of its plane, joins the ground under the
-//! vehicle without a step, and speaks only for holes in seen ground. `grid`: each cell for itself, with the shape of its
+//! vehicle without a step, by ways the vehicle fits through, and speaks only for holes in seen ground. `grid`: each cell for itself, with the shape of its
 //! points.
 //!
 //! Nothing depends on the order of the points: all sums are over whole numbers.
@@ -21,8 +22,10 @@
 pub mod eigen;
 pub mod ground;
 pub mod moments;
+pub mod reach;
 pub mod regions;
 pub mod roughness;
+pub mod shadow;
 
 use crate::config::{Form, TerrainConfig};
 use crate::map::{Cells as Raw, Channel, Geometry, Layer, LayerMaker};
@@ -30,8 +33,10 @@ use crate::sweep::Sweep;
 
 use ground::Ground;
 use moments::{Cells, half_width};
+use reach::{Passage, Reach};
 use regions::{FIRST_FLAT, NOTHING, OBSTACLE as NOT_FLAT, Plane, Regions};
 use roughness::Roughness;
+use shadow::Shadow;
 
 /// No point fell into the cell, or too few to judge it by, and no flat region speaks for it.
 pub const UNKNOWN: u8 = 0;
@@ -43,8 +48,10 @@ pub const FLAT_INFERRED: u8 = 2;
 pub const FLAT_ELEVATED: u8 = 3;
 /// Not flat even by itself.
 pub const OBSTACLE: u8 = 4;
+/// Flat and as high as the ground under the vehicle, but no way the vehicle fits through leads there.
+pub const FLAT_UNREACHABLE: u8 = 5;
 /// Names of the classes, by value.
-pub const LEGEND: &[&str] = &["unknown", "flat", "flat_inferred", "flat_elevated", "obstacle"];
+pub const LEGEND: &[&str] = &["unknown", "flat", "flat_inferred", "flat_elevated", "obstacle", "flat_unreachable"];
 
 /// Raw `roughness` of a cell that is not flat, or has too few points with a distance series.
 pub const ROUGHNESS_UNKNOWN: u8 = u8::MAX;
@@ -60,6 +67,9 @@ pub const SHAPE_LINE: u8 = 2;
 /// Points of a plane.
 pub const SHAPE_PLANE: u8 = 3;
 
+/// What stands lower than this hides no more than itself: a kerb is no fence.
+const STANDS_M_MIN: f32 = 0.5;
+
 /// Metres of a raw unit of `height`, and rise over run of one of `slope_x` and `slope_y`.
 const PLANE_SCALES: [f32; 3] = [0.05, 0.02, 0.02];
 
@@ -69,6 +79,8 @@ pub struct Terrain {
     cells: Cells,
     regions: Regions,
     ground: Ground,
+    shadow: Shadow,
+    reach: Reach,
     roughness: Roughness,
     seen: Vec<bool>,
 }
@@ -81,12 +93,14 @@ impl Terrain {
             cells: Cells::new(config.range_m_max, config.cell_m),
             regions: Regions::default(),
             ground: Ground::default(),
+            shadow: Shadow::default(),
+            reach: Reach::default(),
             roughness: Roughness::default(),
             seen: Vec::new(),
         }
     }
 
-    fn classify(&self, class: &mut Vec<u8>) {
+    fn classify(&mut self, sensor_m: f32, class: &mut Vec<u8>) {
         class.clear();
         let region_of = self.regions.of_cell();
         if self.config.form == Form::Grounded {
@@ -101,6 +115,7 @@ impl Terrain {
                     _ => UNKNOWN,
                 }
             }));
+            self.gate(class, sensor_m);
         } else {
             class.extend(region_of.iter().zip(&self.seen).map(|(&region, &seen)| match (region, seen) {
                 (NOT_FLAT, _) => OBSTACLE,
@@ -108,6 +123,46 @@ impl Terrain {
                 (FIRST_FLAT.., false) => FLAT_INFERRED,
                 _ => UNKNOWN,
             }));
+        }
+    }
+
+    /// Takes back ground the vehicle does not get to; what is only inferred there is not known.
+    fn gate(&mut self, class: &mut [u8], sensor_m: f32) {
+        let TerrainConfig { gate_m_min, blind_zone_m, cell_m, .. } = self.config;
+        let (cells, seen, bridged) = (&self.cells, &self.seen, self.ground.bridged());
+        self.shadow.clear(class.len(), |cell| cells.middle_m(cell));
+        for (slot, &cell) in
+            self.regions.cell_of_slot().iter().enumerate().filter(|(_, cell)| class[**cell as usize] == OBSTACLE)
+        {
+            let [lowest_m, highest_m] = cells.span_m(slot);
+            if highest_m - lowest_m >= STANDS_M_MIN {
+                self.shadow.cast(cell as usize, cell_m, [lowest_m, highest_m], sensor_m);
+            }
+        }
+
+        let (regions, joined, shadow) = (self.regions.of_cell(), self.ground.joined(), &self.shadow);
+        let is_ground = |region: u32| region >= FIRST_FLAT && joined[(region - FIRST_FLAT) as usize];
+        let is_blind = |cell: usize| {
+            let [x, y] = cells.middle_m(cell);
+            x * x + y * y <= blind_zone_m * blind_zone_m
+        };
+        let passage = |cell: usize| match class[cell] {
+            FLAT => Passage::Open,
+            OBSTACLE | FLAT_ELEVATED => Passage::Closed,
+            _ if seen[cell] => Passage::None,
+            FLAT_INFERRED => Passage::Open,
+            _ if (bridged[cell] || is_ground(regions[cell])) && !shadow.hides(cell) => Passage::Open,
+            _ if is_blind(cell) => Passage::Open,
+            _ => Passage::None,
+        };
+        let width = cells.width();
+        // Between obstacles so far apart at least this many whole cells are free, less one: the disc's middle.
+        let radius = ((gate_m_min / cell_m - 2.0) / 2.0).max(0.0) as usize;
+        self.reach.find(width, radius, (0..class.len()).map(passage));
+        for (cell, class) in class.iter_mut().enumerate() {
+            if matches!(*class, FLAT | FLAT_INFERRED) && !self.reach.reached(cell % width, cell / width) {
+                *class = if *class == FLAT { FLAT_UNREACHABLE } else { UNKNOWN };
+            }
         }
     }
 
@@ -122,7 +177,7 @@ impl Terrain {
         for (slot, &cell) in self.regions.cell_of_slot().iter().enumerate() {
             let cell = cell as usize;
             if class[cell] == FLAT {
-                let [x, y] = self.centre_m(cell);
+                let [x, y] = self.cells.middle_m(cell);
                 let distance_m = (x * x + y * y + sweep.mount_height_m * sweep.mount_height_m).sqrt();
                 raw[cell] = self.roughness.raw(slot, distance_m, &self.config);
             }
@@ -138,17 +193,11 @@ impl Terrain {
                     return PLANE_UNKNOWN;
                 }
                 let plane @ Plane([a, b, _]) = &self.regions.planes()[(region - FIRST_FLAT) as usize];
-                let [x, y] = self.centre_m(cell);
+                let [x, y] = self.cells.middle_m(cell);
                 let value = [plane.height_m(x, y), *a, *b][axis] / PLANE_SCALES[axis];
                 value.round().clamp(f32::from(i8::MIN + 1), f32::from(i8::MAX)) as i8
             }));
         }
-    }
-
-    /// Middle of a cell of the grid, metres.
-    fn centre_m(&self, cell: usize) -> [f32; 2] {
-        let (width, margin) = (self.cells.width(), self.cells.margin());
-        [cell % width, cell / width].map(|place| self.cells.centre_m(place + margin))
     }
 }
 
@@ -198,7 +247,7 @@ impl LayerMaker for Terrain {
             other => unreachable!("layer() gives u8, not {other:?}"),
         };
         let class = next();
-        self.classify(class);
+        self.classify(sweep.mount_height_m, class);
         if self.config.form == Form::Grid {
             next().clone_from(self.regions.shape_of_cell());
         }
@@ -206,8 +255,8 @@ impl LayerMaker for Terrain {
         self.write_planes(class, channels.into_slice());
 
         let count = |of: u8| class.iter().filter(|class| **class == of).count() as f64;
-        let [flat, inferred, elevated, obstacle] = [FLAT, FLAT_INFERRED, FLAT_ELEVATED, OBSTACLE].map(count);
-        let judged = flat + elevated + obstacle;
+        let [flat, inferred] = [FLAT, FLAT_INFERRED].map(count);
+        let judged = flat + [FLAT_ELEVATED, OBSTACLE, FLAT_UNREACHABLE].map(count).iter().sum::<f64>();
         layer.planes.clear();
         layer.points.clear();
         layer.figures.clear();

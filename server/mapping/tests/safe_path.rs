@@ -221,6 +221,32 @@ fn a_courts_paths_start_at_the_vehicle_and_stay_on_its_drivable_ground() {
 }
 
 #[test]
+fn the_vehicles_own_bonnet_is_no_obstacle_and_a_box_before_it_is() {
+    // 1.6 m wide and 0.9 m high, from `front` back by 0.7 m: it hides the ground behind it.
+    let with_box = |front: f32, vehicle_front_m: f32| {
+        let inside = |x: f32, y: f32, z: f32| {
+            court(x, y, z) || ((front - 0.7..front).contains(&x) && y.abs() < 0.8 && (0.3..0.9).contains(&z))
+        };
+        make(&cast(Model::Hdl64eS2, inside), &SafePathConfig { vehicle_front_m, ..SafePathConfig::default() }).1
+    };
+    // The way the vehicle drives at first: right before it.
+    let ahead = |layer: &Layer| {
+        let near = |x: f64, y: f64| (3.0..6.0).contains(&x) && y.abs() < 1.0;
+        layer.points.iter().filter(|point| near(point.x_m, point.y_m)).count()
+    };
+    let room = |layer: &Layer| layer.points[0].radius_m;
+    let (own, before) = (with_box(2.9, 3.0), with_box(4.2, 3.0));
+    let unknown_outline = with_box(2.9, 0.0);
+    assert!(room(&own) > 2.0 && room(&unknown_outline) < 1.5, "{} {}", room(&own), room(&unknown_outline));
+    let reach = |layer: &Layer| layer.points.iter().map(|point| point.x_m).fold(0.0, f64::max);
+    assert!(reach(&own) > 6.0, "{}", reach(&own));
+    assert_eq!(ahead(&before), 0);
+    // What it hides is not free either, but for the blind zone.
+    let free = |layer: &Layer| classes(layer)[cell_at(layer, 3.4, 0.1).unwrap()];
+    assert_eq!((free(&own), free(&before)), (UNKNOWN, OBSTACLE));
+}
+
+#[test]
 fn without_drivability_nothing_is_known() {
     let mut map = SafePath::new(&SafePathConfig::default());
     let mut layer = map.layer();
@@ -237,8 +263,8 @@ fn real_streets_have_paths_both_ways() {
         use clearway_mapping::sweep::Mount;
 
         let scan = kitti(&format!("kitti/patchwork-plusplus/00000{frame}.bin"));
-        // The vehicle's own bonnet returns from (2.5, ±0.5, 0.8) m in these scans.
-        let mount = Mount { ego_from_sensor: nalgebra::Isometry3::translation(0.0, 0.0, 1.73), range_m_min: 3.0 };
+        // The vehicle's own bonnet returns from (2.5, ±0.5, 0.8) m in these scans: it is no obstacle.
+        let mount = Mount { ego_from_sensor: nalgebra::Isometry3::translation(0.0, 0.0, 1.73), range_m_min: 2.0 };
         let mut sweep = Sweep::default();
         sweep.take_scan(&scan, &std::sync::Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount);
         let (_, layer) = make(&sweep, &SafePathConfig::default());

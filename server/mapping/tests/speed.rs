@@ -163,6 +163,45 @@ fn bumps_slow_down_and_a_slope_does_not() {
 }
 
 #[test]
+fn mirrored_returns_under_the_ground_make_no_obstacle_of_the_ground_about_them() {
+    let config = SpeedConfig::default();
+    let mut sweep = level();
+    // As in KITTI's scans: a stroke of one laser 3 m under the ground, 2.5 m long.
+    (0..25).for_each(|k| add(&mut sweep, [9.0, 2.0 + 0.1 * k as f32, -3.0]));
+    let plain = make(&config, &level(), &Context::default());
+    let layer = make(&config, &sweep, &Context::default());
+    assert_eq!(classes(&layer), classes(&plain));
+    assert_eq!(values(&layer, "speed"), values(&plain, "speed"));
+
+    // Alone where nothing else was seen, they are not known to be ground.
+    let mut alone = level();
+    (0..25).for_each(|k| add(&mut alone, [20.7, 2.0 + 0.1 * k as f32, -3.0]));
+    let cell = cell_at(&layer, 20.7, 3.0).unwrap();
+    assert_eq!(classes(&make(&config, &alone, &Context::default()))[cell], UNKNOWN);
+
+    // A drop that wide is no ghost: its edge is not passed.
+    let mut ditch = level();
+    let within = |x: f32| (8.0..11.0).contains(&x);
+    ditch.z.iter_mut().zip(&ditch.x).for_each(|(z, x)| *z = if within(*x) { -3.0 } else { *z });
+    let layer = make(&config, &ditch, &Context::default());
+    let edge = (-10..10).map(|k| cell_at(&layer, 7.75, 0.5 * k as f32).unwrap());
+    edge.for_each(|cell| assert_eq!(classes(&layer)[cell], OBSTACLE));
+}
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn the_labelled_frames_road_is_passable_in_spite_of_its_mirrored_returns() {
+    let (sweep, labels) = labels::labelled_frame();
+    let layer = make(&SpeedConfig::default(), &sweep, &Context::default());
+    let truth = labels::truth_by_cell(&sweep, &labels, classes(&layer).len(), |x, y| cell_at(&layer, x, y));
+    let passable: Vec<bool> = classes(&layer).iter().map(|class| *class == PASSABLE).collect();
+    let road = labels::share(&truth.road, |cell| passable[cell]);
+    let free = labels::share(&passable, |cell| !truth.obstacle[cell]);
+    println!("road passable {:.2} %, passable free {:.2} %", 100.0 * road, 100.0 * free);
+    assert!(road >= 0.99 && free >= 0.97, "{road} {free}");
+}
+
+#[test]
 fn painting_stops_the_moment_the_orientations_are_random_and_says_so() {
     let sweep = level();
     let config = SpeedConfig::default();

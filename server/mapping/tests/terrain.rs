@@ -10,8 +10,8 @@ use clearway_mapping::map::{Layer, LayerMaker};
 use clearway_mapping::series::Series;
 use clearway_mapping::sweep::{Mount, Sweep};
 use clearway_mapping::terrain::{
-    FLAT, FLAT_ELEVATED, FLAT_INFERRED, OBSTACLE, ROUGHNESS_UNKNOWN, SHAPE_LINE, SHAPE_PLANE, SHAPE_SCATTER,
-    SHAPE_UNKNOWN, Terrain,
+    FLAT, FLAT_ELEVATED, FLAT_INFERRED, FLAT_UNREACHABLE, OBSTACLE, ROUGHNESS_UNKNOWN, SHAPE_LINE, SHAPE_PLANE,
+    SHAPE_SCATTER, SHAPE_UNKNOWN, Terrain,
 };
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::{self, Scene};
@@ -315,5 +315,35 @@ fn no_flat_cell_of_the_simulated_worlds_holds_an_object() {
         );
         assert!(found[0] <= 0.001 * found[1], "{name}: {found:?}");
         assert!(found[2] >= 0.95, "{name}: {found:?}");
+    }
+}
+
+#[test]
+fn ground_behind_a_closed_fence_or_a_low_beam_is_flat_but_not_reached() {
+    for (scene, behind_min) in
+        [(scenes::fenced_road_under_canopy(), 1500), (scenes::fenced_road_with_low_overhang(), 2000)]
+    {
+        let name = scene.name;
+        let config = ScannerConfig::default();
+        let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
+        let turn = SimulatedVehicle::new(scene, config).turn(1);
+        let mut sweep = Sweep::default();
+        sweep.take_revolution(&turn.revolution, &mount);
+        let layer = terrain(&sweep, &TerrainConfig::default());
+        let unreachable = |cell: usize| {
+            let middle = |i: usize| (i as f64 + 0.5) * 0.25 - 50.0;
+            turn.truth.class_at(middle(cell % 400), middle(cell / 400)) == Truth::Unreachable
+        };
+        let count = |wanted: &dyn Fn(u8) -> bool| {
+            let cells = classes(&layer).iter().enumerate();
+            cells.filter(|(cell, class)| wanted(**class) && unreachable(*cell)).count()
+        };
+        let (reached, behind) = (count(&is_drivable), count(&|class| class == FLAT_UNREACHABLE));
+        println!("{name}: {reached} cells behind are drivable, {behind} are not");
+        // A cell of the fence's own line may hold ground of both sides.
+        assert!(reached <= 10 && behind >= behind_min, "{name}: {reached} {behind}");
+        // The paper's form knows no gate.
+        let open = terrain(&sweep, &TerrainConfig { form: Form::Paper, ..TerrainConfig::default() });
+        assert!(!classes(&open).contains(&FLAT_UNREACHABLE));
     }
 }

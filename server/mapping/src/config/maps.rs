@@ -186,6 +186,8 @@ pub struct TerrainConfig {
     pub step_m_max: f32,
     /// With `form = "grounded"`: widest gap without points over which regions can be neighbours, as far rings are.
     pub bridge_m_max: f32,
+    /// With `form = "grounded"`: least width between obstacles the vehicle drives through; 0 takes every way.
+    pub gate_m_min: f32,
     /// With `form = "grounded"`: widest hole in seen ground that is inferred to be flat.
     pub inference_m_max: f32,
     /// Deviation of the sensor's own ranges, taken off the roughness.
@@ -212,6 +214,7 @@ impl Default for TerrainConfig {
             start_m_max: 0.25,
             step_m_max: 0.15,
             bridge_m_max: 8.0,
+            gate_m_min: 2.0,
             inference_m_max: 3.0,
             noise_m: 0.02,
             roughness_points_min: 4,
@@ -265,7 +268,7 @@ pub struct SpeedConfig {
 impl Default for SpeedConfig {
     fn default() -> Self {
         Self {
-            enabled: false,
+            enabled: true,
             extent_m: 40.0,
             cell_m: 0.5,
             overhang_m: 2.5,
@@ -323,6 +326,10 @@ pub struct SafePathConfig {
     pub cell_m: f32,
     /// Points nearer than half of this to an obstacle are no way through; obstacles nearer to one another count as one.
     pub vehicle_width_m: f32,
+    /// The vehicle reaches this far before the ego origin; what returns from within its outline is no obstacle.
+    pub vehicle_front_m: f32,
+    /// And this far behind it.
+    pub vehicle_rear_m: f32,
     /// The sensor does not see the ground this near to the vehicle: what is unknown there is no obstacle.
     pub blind_zone_m: f32,
     /// Unseen ground no wider than this between drivable cells of one ring or azimuth is no obstacle.
@@ -334,10 +341,12 @@ pub struct SafePathConfig {
 impl Default for SafePathConfig {
     fn default() -> Self {
         Self {
-            enabled: false,
+            enabled: true,
             extent_m: 30.0,
             cell_m: 0.25,
             vehicle_width_m: 2.0,
+            vehicle_front_m: 3.0,
+            vehicle_rear_m: 2.0,
             blind_zone_m: 7.0,
             hole_m_max: 1.0,
             join_m_max: 15.0,
@@ -413,6 +422,7 @@ impl TerrainConfig {
             ("start_m_max", self.start_m_max, (0.01..=10.0, "0.01 to 10")),
             ("step_m_max", self.step_m_max, (0.0..=10.0, "0 to 10")),
             ("bridge_m_max", self.bridge_m_max, (0.0..=20.0, "0 to 20")),
+            ("gate_m_min", self.gate_m_min, (0.0..=20.0, "0 to 20")),
             ("inference_m_max", self.inference_m_max, (0.0..=20.0, "0 to 20")),
             // The plane of a stretch of one ring needs some.
             ("noise_m", self.noise_m, (0.001..=1.0, "0.001 to 1")),
@@ -468,6 +478,8 @@ impl SafePathConfig {
             ("extent_m", self.extent_m, (5.0..=200.0, "5 to 200")),
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
             ("vehicle_width_m", self.vehicle_width_m, (0.1..=10.0, "0.1 to 10")),
+            ("vehicle_front_m", self.vehicle_front_m, (0.0..=20.0, "0 to 20")),
+            ("vehicle_rear_m", self.vehicle_rear_m, (0.0..=20.0, "0 to 20")),
             ("blind_zone_m", self.blind_zone_m, (0.0..=60.0, "0 to 60")),
             ("hole_m_max", self.hole_m_max, (0.0..=5.0, "0 to 5")),
             ("join_m_max", self.join_m_max, (0.0..=100.0, "0 to 100")),

@@ -1,6 +1,7 @@
 //! Which cells of a Cartesian grid about the vehicle are free.
 //!
-//! In: the layer `drivability`, radial. Out: a [`State`] a cell, that of the radial cell its middle lies in. Ground
+//! In: the layer `drivability`, radial, and the sweep it was made from. Out: a [`State`] a cell, that of the radial cell its
+//! middle lies in. A radial cell that holds nothing but returns of the vehicle's own outline (its bonnet) says nothing. Ground
 //! nobody saw is not free, but for the blind zone: in a column whose innermost seen cell is drivable and begins within
 //! it, the ground nearer to the vehicle, which no laser meets, is taken to be like it, as the thesis does when segments
 //! grow from the vehicle (§IV.3); and for holes in drivable ground too narrow to matter, a cell or two where a laser's
@@ -10,6 +11,7 @@ use crate::config::SafePathConfig;
 use crate::drivability;
 use crate::map::{Cells, Geometry, Layer};
 use crate::radial::RadialGrid;
+use crate::sweep::Sweep;
 
 /// What a cell is to the vehicle.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -34,6 +36,13 @@ impl State {
     }
 }
 
+/// What the points of a radial cell are.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Returns {
+    own: bool,
+    other: bool,
+}
+
 /// States row by row, `side` cells along x and y; the vehicle stands in the middle.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Free {
@@ -41,6 +50,9 @@ pub struct Free {
     cell_m: f64,
     states: Vec<State>,
     of_radial_cell: Vec<State>,
+    grid: RadialGrid,
+    /// By radial cell in reach of the vehicle's outline: what its points are.
+    returns: Vec<Returns>,
     /// Radial cell of each cell's middle; past the last where the radial grid does not reach.
     radial_cell: Vec<u32>,
     /// What `radial_cell` was made for.
@@ -55,6 +67,8 @@ impl Free {
             cell_m,
             states: vec![State::Unknown; side * side],
             of_radial_cell: Vec::new(),
+            grid: RadialGrid::default(),
+            returns: Vec::new(),
             radial_cell: Vec::new(),
             made_for: None,
         }
@@ -71,7 +85,7 @@ impl Free {
     }
 
     /// Takes the newest drivability, in place of the one before; without it nothing is known.
-    pub fn fill(&mut self, drivability: Option<&Layer>, config: &SafePathConfig) {
+    pub fn fill(&mut self, drivability: Option<&Layer>, sweep: &Sweep, config: &SafePathConfig) {
         let Some(layer) = drivability else { return self.states.fill(State::Unknown) };
         let Geometry::Radial { r_bench_m, columns } = &layer.geometry else { unreachable!("drivability is radial") };
         let Cells::U8(class) = &layer.channels[0].cells else { unreachable!("drivability's class is u8") };
@@ -85,6 +99,7 @@ impl Free {
             drivability::DRIVABLE => State::Drivable,
             _ => State::Obstacle,
         }));
+        self.forget_the_vehicle(sweep, config);
         let columns = usize::from(*columns);
         see_blind_zone(&mut self.of_radial_cell, r_bench_m, columns, config.blind_zone_m);
         close_holes(&mut self.of_radial_cell, r_bench_m, columns, config.hole_m_max);
@@ -93,18 +108,41 @@ impl Free {
         for (state, &cell) in self.states.iter_mut().zip(&self.radial_cell) {
             *state = self.of_radial_cell[cell as usize];
         }
-        self.stand(f64::from(config.vehicle_width_m) / 2.0);
+        self.stand(config);
+    }
+
+    /// Takes back what the vehicle's own returns said, where a cell holds no other.
+    fn forget_the_vehicle(&mut self, sweep: &Sweep, config: &SafePathConfig) {
+        let SafePathConfig { vehicle_front_m, vehicle_rear_m, vehicle_width_m, .. } = *config;
+        let corner_m = vehicle_front_m.max(vehicle_rear_m).hypot(vehicle_width_m / 2.0);
+        // Up to the end of the last row that reaches the outline.
+        let rows = (0..self.grid.rows()).take_while(|row| self.grid.row_span_m(*row).0 < corner_m).count();
+        let reach_m = rows.checked_sub(1).map_or(0.0, |last| self.grid.row_span_m(last).1);
+        self.returns.clear();
+        self.returns.resize(rows * self.grid.columns(), Returns::default());
+        for (&x, &y) in sweep.x.iter().zip(&sweep.y).filter(|(x, y)| **x * **x + **y * **y <= reach_m * reach_m) {
+            if let Some(returns) = self.grid.cell(x, y).and_then(|cell| self.returns.get_mut(cell)) {
+                let own = is_within_the_vehicle(x, y, config);
+                (returns.own, returns.other) = (returns.own | own, returns.other | !own);
+            }
+        }
+        for (state, returns) in self.of_radial_cell.iter_mut().zip(&self.returns) {
+            if returns.own && !returns.other {
+                *state = State::Unknown;
+            }
+        }
     }
 
     /// Where the vehicle stands nothing else can, whatever was seen of the vehicle itself.
-    fn stand(&mut self, radius_m: f64) {
-        let middle = |i: usize| (i as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m;
-        let reach = (radius_m / self.cell_m).ceil() as usize;
+    fn stand(&mut self, config: &SafePathConfig) {
+        let middle = |i: usize| ((i as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32;
+        let longest_m = config.vehicle_front_m.max(config.vehicle_rear_m).max(config.vehicle_width_m);
+        let reach = (f64::from(longest_m) / self.cell_m).ceil() as usize;
         let near = (self.side / 2).saturating_sub(reach)..(self.side / 2 + reach).min(self.side);
         for iy in near.clone() {
             for ix in near.clone() {
                 let state = &mut self.states[iy * self.side + ix];
-                if middle(ix).hypot(middle(iy)) < radius_m && !state.is_free() {
+                if is_within_the_vehicle(middle(ix), middle(iy), config) && !state.is_free() {
                     *state = State::Blind;
                 }
             }
@@ -112,12 +150,17 @@ impl Free {
     }
 
     fn look_up(&mut self, r_bench_m: &[f32], columns: u16) {
-        let grid = RadialGrid::new(r_bench_m.to_vec(), columns);
+        self.grid = RadialGrid::new(r_bench_m.to_vec(), columns);
         let middle = |i: usize| ((i as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32;
-        let cell = |index: usize| grid.cell(middle(index % self.side), middle(index / self.side));
+        let cell = |index: usize| self.grid.cell(middle(index % self.side), middle(index / self.side));
         let cells = 0..self.side * self.side;
-        self.radial_cell = cells.map(|index| cell(index).unwrap_or(grid.cells()) as u32).collect();
+        self.radial_cell = cells.map(|index| cell(index).unwrap_or(self.grid.cells()) as u32).collect();
     }
+}
+
+/// Whether a place lies within the vehicle's outline.
+fn is_within_the_vehicle(x: f32, y: f32, config: &SafePathConfig) -> bool {
+    (-config.vehicle_rear_m..=config.vehicle_front_m).contains(&x) && y.abs() <= config.vehicle_width_m / 2.0
 }
 
 fn see_blind_zone(of_radial_cell: &mut [State], r_bench_m: &[f32], columns: usize, blind_zone_m: f32) {

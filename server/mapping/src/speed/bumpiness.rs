@@ -3,9 +3,12 @@
 //! In: the sweep's points, ego frame, metres. Out: a figure a cell, metres. The paper leaves the measure open ("methods
 //! similar to image processing methods"); the reading here:
 //!
-//! - a cell is an obstacle if its highest point rises over the lowest point near it by more than a step and what the
-//!   grade explains: over the 3 × 3 cells around it, and over the 3 × 3 blocks of 4 × 4 cells around it, so that a roof
-//!   is not taken for ground because no ground was seen right beside it;
+//! - the floor about a block of 4 × 4 cells is the lowest height in the 3 × 3 blocks, unless it lies further under a few
+//!   cells more than the ground may fall there: mirrored returns lie metres under the ground, a few cells of them side by
+//!   side, and are outvoted. What lies under the floor is forgotten, and the rest of such a cell is its highest point;
+//! - a cell is an obstacle if its highest point rises by more than a step and what the grade explains over the lowest
+//!   point of the 3 × 3 cells around it, or over the floor, so that a roof is not taken for ground because no ground was
+//!   seen right beside it;
 //! - its bumpiness is the larger of the heights' standard deviation within it, less what the slope of its neighbours
 //!   explains, and half the second difference of the heights across it.
 //!
@@ -23,6 +26,10 @@ const LOWEST_M: f32 = -20.0;
 const OFFSET_MM: f32 = 20_000.5;
 /// Cells a side of a block.
 const BLOCK: usize = 4;
+/// So many cells of 3 × 3 blocks are outvoted: the largest ghosts of the recorded drives cover six.
+const OUTVOTED_CELLS: usize = 8;
+/// Where few cells were seen, no more than one of so many.
+const OUTVOTED_SHARE: usize = 8;
 
 /// Sums of one cell's heights, mm.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -43,8 +50,10 @@ pub struct HeightMap {
     cells: Vec<Cell>,
     /// Cells that hold a point, in the order they were first met.
     met: Vec<u32>,
-    /// Lowest height of each block.
-    blocks: Vec<i16>,
+    /// Lowest heights of the cells of each block that hold a point.
+    lowest_of_block: Vec<([i16; BLOCK * BLOCK], u8)>,
+    /// By block: the lowest height about it that is not outvoted.
+    floors: Vec<i16>,
     /// Mean height of each cell, metres; NaN without points.
     means_m: Vec<f32>,
     bumpiness_m: Vec<f32>,
@@ -57,7 +66,8 @@ impl HeightMap {
             side,
             cells: vec![EMPTY; side * side],
             met: Vec::new(),
-            blocks: Vec::new(),
+            lowest_of_block: Vec::new(),
+            floors: Vec::new(),
             means_m: vec![f32::NAN; side * side],
             bumpiness_m: vec![f32::NAN; side * side],
         }
@@ -107,28 +117,75 @@ impl HeightMap {
 
     /// Judges every cell that holds a point.
     pub fn judge(&mut self, config: &SpeedConfig) {
-        let side = self.side;
-        let blocks_a_side = side.div_ceil(BLOCK);
-        self.blocks.clear();
-        self.blocks.resize(blocks_a_side * blocks_a_side, i16::MAX);
+        let over = |distance_m: f32| ((config.step_m_max + config.grade_max * distance_m) * 1000.0) as i32;
+        // From the middle of a cell or block to the far side of its neighbour.
+        let (over_cells, over_floor) = (over(1.5 * config.cell_m), over(1.5 * BLOCK as f32 * config.cell_m));
+        self.find_floors(over_floor);
+        self.forget_ghosts();
         for &index in &self.met {
             let cell = &self.cells[index as usize];
             self.means_m[index as usize] = (cell.sum as f64 / f64::from(cell.points) * 1e-3) as f32;
-            let block = index as usize / side / BLOCK * blocks_a_side + index as usize % side / BLOCK;
-            self.blocks[block] = self.blocks[block].min(cell.lowest);
         }
-        let over = |distance_m: f32| ((config.step_m_max + config.grade_max * distance_m) * 1000.0) as i32;
-        // From the middle of a cell or block to the far side of its neighbour.
-        let (over_cells, over_blocks) = (over(1.5 * config.cell_m), over(1.5 * BLOCK as f32 * config.cell_m));
         for &index in &self.met {
             let (index, cell) = (index as usize, self.cells[index as usize]);
-            let (ix, iy) = (index % side, index / side);
-            let near = lowest_around(ix, iy, side, |i| self.cells[i].lowest);
-            let around = lowest_around(ix / BLOCK, iy / BLOCK, blocks_a_side, |i| self.blocks[i]);
+            let (ix, iy) = (index % self.side, index / self.side);
+            let near = around(ix, iy, self.side).map(|i| self.cells[i].lowest).min().unwrap_or(cell.lowest);
+            let floor = self.floors[self.block(index)];
             let highest = i32::from(cell.highest);
-            let obstacle = highest - i32::from(near) > over_cells || highest - i32::from(around) > over_blocks;
+            let obstacle = highest - i32::from(near) > over_cells || highest - i32::from(floor) > over_floor;
             self.bumpiness_m[index] = if obstacle { OBSTACLE_BUMPINESS } else { self.bumpiness(ix, iy) };
         }
+    }
+
+    fn block(&self, cell: usize) -> usize {
+        cell / self.side / BLOCK * self.side.div_ceil(BLOCK) + cell % self.side / BLOCK
+    }
+
+    fn find_floors(&mut self, over_floor: i32) {
+        let blocks_a_side = self.side.div_ceil(BLOCK);
+        let blocks = blocks_a_side * blocks_a_side;
+        self.lowest_of_block.clear();
+        self.lowest_of_block.resize(blocks, ([0; BLOCK * BLOCK], 0));
+        for &cell in &self.met {
+            let block = self.block(cell as usize);
+            let (heights, cells) = &mut self.lowest_of_block[block];
+            heights[usize::from(*cells)] = self.cells[cell as usize].lowest;
+            *cells += 1;
+        }
+        self.floors.clear();
+        self.floors.resize(blocks, i16::MIN);
+        let mut lowest = Vec::with_capacity(9 * BLOCK * BLOCK);
+        for block in (0..blocks).filter(|block| self.lowest_of_block[*block].1 > 0) {
+            lowest.clear();
+            for near in around(block % blocks_a_side, block / blocks_a_side, blocks_a_side) {
+                let (heights, cells) = &self.lowest_of_block[near];
+                lowest.extend_from_slice(&heights[..usize::from(*cells)]);
+            }
+            let outvoted = (lowest.len() / OUTVOTED_SHARE).min(OUTVOTED_CELLS);
+            let voted = i32::from(*lowest.select_nth_unstable(outvoted).1);
+            let is_ghost = |height: i16| voted - i32::from(height) > over_floor / 2;
+            let floor = lowest.iter().filter(|height| !is_ghost(**height)).min();
+            self.floors[block] = *floor.expect("the voted height is none");
+        }
+    }
+
+    /// Drops what lies under the floor; a cell of nothing else holds no point.
+    fn forget_ghosts(&mut self) {
+        let mut met = std::mem::take(&mut self.met);
+        met.retain(|&index| {
+            let floor = i32::from(self.floors[self.block(index as usize)]);
+            let cell = &mut self.cells[index as usize];
+            let is_ghost = |height: i16| i32::from(height) < floor;
+            if is_ghost(cell.highest) {
+                *cell = EMPTY;
+            } else if is_ghost(cell.lowest) {
+                let highest = cell.highest;
+                let wide = i64::from(highest);
+                *cell = Cell { highest, lowest: highest, points: 1, sum: wide, squares: wide * wide };
+            }
+            cell.points > 0
+        });
+        self.met = met;
     }
 
     fn bumpiness(&self, ix: usize, iy: usize) -> f32 {
@@ -154,13 +211,8 @@ impl HeightMap {
     }
 }
 
-/// The lowest of the 3 × 3 values around (ix, iy).
-fn lowest_around(ix: usize, iy: usize, side: usize, value: impl Fn(usize) -> i16) -> i16 {
-    let mut lowest = i16::MAX;
-    for y in iy.saturating_sub(1)..(iy + 2).min(side) {
-        for x in ix.saturating_sub(1)..(ix + 2).min(side) {
-            lowest = lowest.min(value(y * side + x));
-        }
-    }
-    lowest
+/// Indices of the 3 × 3 cells or blocks around (ix, iy), as many as there are.
+fn around(ix: usize, iy: usize, side: usize) -> impl Iterator<Item = usize> {
+    let near = move |i: usize| i.saturating_sub(1)..(i + 2).min(side);
+    near(iy).flat_map(move |y| near(ix).map(move |x| y * side + x))
 }

@@ -17,6 +17,7 @@ pub struct Ground {
     parent: Vec<u32>,
     joined: Vec<bool>,
     filled: Vec<bool>,
+    bridged: Vec<bool>,
     seen_cells: Vec<u32>,
 }
 
@@ -103,6 +104,8 @@ impl Ground {
     /// are, whose planes meet half-way without a step.
     fn join_over_gaps(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
         let seen_cells = std::mem::take(&mut self.seen_cells);
+        self.bridged.clear();
+        self.bridged.resize(seen.len(), false);
         let view = View { cells, regions, seen, seen_cells: &seen_cells, config };
         let span = (config.bridge_m_max / cells.cell_m()).round() as usize;
         view.for_each_hole(
@@ -112,6 +115,7 @@ impl Ground {
                 if view.step_m(hole.from, hole.to) <= config.step_m_max {
                     let node = |cell: usize| regions.of_cell()[cell] - FIRST_FLAT + 1;
                     self.join(node(hole.from), node(hole.to));
+                    hole.within().for_each(|cell| self.bridged[cell] = true);
                 }
             },
         );
@@ -142,6 +146,11 @@ impl Ground {
     /// By cell: whether it lies in a hole of seen ground: unseen there, or seen with too few points to be judged alone.
     pub fn filled(&self) -> &[bool] {
         &self.filled
+    }
+
+    /// By cell: whether it lies in a gap over which two regions were joined.
+    pub fn bridged(&self) -> &[bool] {
+        &self.bridged
     }
 }
 

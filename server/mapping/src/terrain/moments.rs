@@ -204,6 +204,11 @@ impl Cells {
         (place as f32 - self.root_half as f32 + 0.5) * self.cell_m
     }
 
+    /// Middle of a cell of the grid, metres.
+    pub fn middle_m(&self, cell: usize) -> [f32; 2] {
+        [cell % self.width(), cell / self.width()].map(|place| self.centre_m(place + self.margin()))
+    }
+
     /// Slots: cells that hold a point.
     pub fn slots(&self) -> usize {
         self.code_of_slot.len()
