@@ -10,8 +10,10 @@ use serde::{Deserialize, Serialize};
 use clearway_lidar::model::Model;
 
 mod maps;
+mod occupancy;
 
 pub use maps::*;
+pub use occupancy::OccupancyConfig;
 
 /// One vehicle: all the core needs to turn its events into maps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -14,6 +14,7 @@
 //! | [`height_difference`] | the thesis' baseline |
 //! | [`series`] | revolution -> how far each range lies from its laser's neighbouring ones |
 //! | [`terrain`] | Neuhaus 2009 §2 |
+//! | [`occupancy`] | Seo 2014 §2 |
 //! | [`road`] | RDDF and RNDF files, checked roads |
 //! | [`speed`] | Lindström 2005 |
 //! | [`safe_path`] | thesis §VI |
@@ -25,6 +26,7 @@ pub mod height_difference;
 pub mod map;
 pub mod motion;
 pub mod mount;
+pub mod occupancy;
 pub mod pipeline;
 pub mod radial;
 pub mod road;

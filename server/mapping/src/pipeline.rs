@@ -19,6 +19,7 @@ use crate::event::{Body, EgoPose, Event, Road, Scan};
 use crate::height_difference::HeightDifference;
 use crate::map::{Context, LayerMaker, Map, SensorState};
 use crate::motion::{Compensation, Motion, Moved};
+use crate::occupancy::Occupancy;
 use crate::road::{self, RoadError, Roads};
 use crate::safe_path::SafePath;
 use crate::series::Series;
@@ -455,6 +456,9 @@ fn layer_makers(maps: &MapsConfig) -> Vec<Box<dyn LayerMaker>> {
     }
     if maps.terrain.enabled {
         makers.push(Box::new(Terrain::new(&maps.terrain)));
+    }
+    if maps.occupancy.enabled {
+        makers.push(Box::new(Occupancy::new(&maps.occupancy)));
     }
     if maps.speed.enabled {
         makers.push(Box::new(Speed::new(&maps.speed)));
