@@ -83,6 +83,11 @@ impl Footprints {
         Self(shapes.filter(|(kind, _)| !matches!(kind, Kind::Leaves | Kind::Beam | Kind::Fence)).collect())
     }
 
+    /// Whether a thing covers a place (metres, world) or comes nearer to it than `margin_m` along its own sides.
+    pub fn near(&self, [x, y]: [f64; 2], margin_m: f64) -> bool {
+        self.0.iter().any(|(_, shape)| shape.column(x, y, margin_m).is_some())
+    }
+
     /// The thing that covers all these places (metres, world), if one does; a thing that covers corners covers what lies
     /// between them.
     pub fn covering(&self, places: &[[f64; 2]]) -> Option<Kind> {

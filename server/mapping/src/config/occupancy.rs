@@ -18,8 +18,10 @@ pub struct OccupancyConfig {
     pub clearance_m: f32,
     /// Returns from here on up are not counted: the vehicle passes under them.
     pub overhang_m: f32,
-    /// A ray proves a cell clear where it is no higher than this over it; what is lower stays unnoticed there.
-    pub clear_height_m: f32,
+    /// A ray proves a cell clear where it is at least as high as this over it: it could be under a car's body, if lower.
+    pub clear_height_m_min: f32,
+    /// And no higher than this: what is lower than the ray stays unnoticed.
+    pub clear_height_m_max: f32,
     /// Reliable range of the sensors (§2: 150 m); farther cells are out of range.
     pub range_m_max: f32,
     /// Rays that came back with nothing clear as far as this; 0: they prove nothing.
@@ -32,7 +34,7 @@ pub struct OccupancyConfig {
     pub hits_slow: u8,
     /// Returns at high speed, and where the speed is not known.
     pub hits_fast: u8,
-    /// Maps for which a cell stays occupied that nobody sees, or clear that rays only pass over.
+    /// Maps for which a cell stays occupied that nobody sees.
     pub hold_maps: u8,
 }
 
@@ -45,7 +47,8 @@ impl Default for OccupancyConfig {
             cell_m: 0.25,
             clearance_m: 0.3,
             overhang_m: 5.0,
-            clear_height_m: 0.5,
+            clear_height_m_min: 0.2,
+            clear_height_m_max: 0.5,
             range_m_max: 150.0,
             no_return_m: 0.0,
             speed_mps_slow: 4.4,
@@ -64,7 +67,8 @@ impl OccupancyConfig {
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
             ("clearance_m", self.clearance_m, (0.05..=2.0, "0.05 to 2")),
             ("overhang_m", self.overhang_m, (0.5..=20.0, "0.5 to 20")),
-            ("clear_height_m", self.clear_height_m, (0.05..=5.0, "0.05 to 5")),
+            ("clear_height_m_min", self.clear_height_m_min, (-1.0..=2.0, "-1 to 2")),
+            ("clear_height_m_max", self.clear_height_m_max, (0.05..=5.0, "0.05 to 5")),
             ("range_m_max", self.range_m_max, (5.0..=300.0, "5 to 300")),
             ("no_return_m", self.no_return_m, (0.0..=300.0, "0 to 300")),
             ("speed_mps_slow", self.speed_mps_slow, (0.0..=100.0, "0 to 100")),
@@ -81,6 +85,10 @@ impl OccupancyConfig {
             if fits { Ok(()) } else { Err(ConfigError::new(format!("{at}.{key}"), value, said)) }
         };
         ordered("overhang_m", self.overhang_m, self.overhang_m > self.clearance_m, "more than clearance_m")?;
+        let band = self.clear_height_m_max > self.clear_height_m_min;
+        ordered("clear_height_m_max", self.clear_height_m_max, band, "more than clear_height_m_min")?;
+        let lower = self.clear_height_m_min < self.clearance_m;
+        ordered("clear_height_m_min", self.clear_height_m_min, lower, "less than clearance_m")?;
         let faster = self.speed_mps_fast > self.speed_mps_slow;
         ordered("speed_mps_fast", self.speed_mps_fast, faster, "more than speed_mps_slow")?;
         super::maps::check_cells(at, self.extent_m, self.cell_m)

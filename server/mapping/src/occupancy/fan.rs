@@ -2,14 +2,14 @@
 //!
 //! In: [`Rays`], ego frame, metres. Out: hits counted in the [`Window`], and one trace for each direction that has rays.
 //!
-//! A ray proves a cell free where it passes low over it: at most `clear_height_m`. A ray from the roof over a car proves
-//! nothing of the car's cells. So every direction (a quarter of a degree) keeps a row of bits, one for each step of a
+//! A ray proves a cell free where it passes low over it: at the height of a bumper, `clear_height_m_min` to `_max`. From the
+//! roof over a car it proves nothing of the car's cells, and neither does it under the car's body. So every direction (a quarter of a degree) keeps a row of bits, one for each step of a
 //! cell's side outward, of where some ray of it is low; rays only set bits, and their order says nothing.
 //!
-//! A trace ends at the nearest return that counts, of its own direction or of either neighbour: rays of one direction
-//! differ by part of its width, and the trace must not run along the edge of a thing just inside. Behind that return the
-//! cells are hidden, but for those where a ray comes down on the ground, as far back as it is under the vehicle's
-//! clearance, if nothing stands on that stretch: a ray that comes back from under a car proves nothing either.
+//! A trace ends at the nearest return from above the ground, of its own direction or of the two to either side: rays of one direction
+//! differ by part of its width, some get lost, and the trace must not run along a thing just inside its edge. Behind it the
+//! cells are hidden, but for those where a ray comes down on the ground: there from where it is under the vehicle's
+//! clearance, if nothing stands on its way from there to its end, so that it has passed beneath nothing.
 
 use super::window::Window;
 use crate::config::OccupancyConfig;
@@ -18,15 +18,20 @@ use crate::radial::Quadrants;
 
 /// Directions about a sensor; a quarter of a degree each, as finely as the paper's units look.
 const DIRECTIONS: usize = 1440;
-/// Steps after which a direction goes on as two lines: 128 cells out it is more than half a cell wide.
-const FORK: usize = 128;
+/// Directions to either side whose hits end a trace too.
+const BESIDE: isize = 2;
+/// Steps after which a direction goes on as two lines: 112 cells out it is half a cell wide.
+const FORK: usize = 112;
 /// Nearest hit of a direction without.
 const NONE: u16 = u16::MAX;
 
-/// A return from the ground: its direction, and the steps from where its ray is under the clearance to the return.
+/// A return from the ground, and steps of its ray: where it comes under the clearance, where it is too low to prove
+/// anything, and where it ends.
 struct Ground {
     direction: u16,
-    steps: (u16, u16),
+    from: u16,
+    low: u16,
+    end: u16,
 }
 
 /// Buffers reused from scan to scan.
@@ -47,11 +52,11 @@ pub struct Fan {
     ground: Vec<Ground>,
 }
 
-/// The part of a ray, by distance over the ground, that is at most `height` over or under the ground.
+/// The part of a ray, by distance over the ground, between two heights.
 #[inline(always)]
-fn within_height(origin_z: f32, climb: f32, height: f32) -> (f32, f32) {
+fn between_heights(origin_z: f32, climb: f32, low: f32, high: f32) -> (f32, f32) {
     // Level rays give infinities of the right signs; `max` and `min` pass over NaN.
-    let (a, b) = ((height - origin_z) / climb, (-height - origin_z) / climb);
+    let (a, b) = ((low - origin_z) / climb, (high - origin_z) / climb);
     (a.min(b).max(0.0), a.max(b))
 }
 
@@ -105,7 +110,7 @@ impl Fan {
             self.present[direction] = true;
             let climb = (z - oz) / range;
             let reliable = range <= config.range_m_max;
-            let (from, to) = within_height(oz, climb, config.clear_height_m);
+            let (from, to) = between_heights(oz, climb, config.clear_height_m_min, config.clear_height_m_max);
             self.set_low(direction, from * per_m, to.min(range).min(config.range_m_max) * per_m);
             if !reliable || z >= config.overhang_m {
                 continue;
@@ -113,14 +118,16 @@ impl Fan {
             let step = (range * per_m) as usize;
             if z >= config.clearance_m {
                 window.hit(px + x * turn_x - y * turn_y, py + x * turn_y + y * turn_x);
+            }
+            if z >= config.clear_height_m_min {
                 self.nearest_hit[direction] = self.nearest_hit[direction].min(step.min(NONE as usize) as u16);
                 if step < self.steps {
                     self.hits[direction * self.words + step / 64] |= 1 << (step % 64);
                 }
             } else if step < self.steps {
-                let (from, _) = within_height(oz, climb, config.clearance_m);
-                let from = (from.min(range) * per_m) as u16;
-                self.ground.push(Ground { direction: direction as u16, steps: (from, step as u16) });
+                let (from, to) = between_heights(oz, climb, config.clear_height_m_min, config.clearance_m);
+                let [from, low] = [from, to].map(|metres| (metres.min(range) * per_m + 0.5) as u16);
+                self.ground.push(Ground { direction: direction as u16, from, low, end: step as u16 + 1 });
             }
         }
     }
@@ -131,40 +138,39 @@ impl Fan {
         for &[dx, dy, dz] in rays.no_returns {
             let direction = self.directions.column(dx, dy) as usize;
             self.present[direction] = true;
-            let (from, to) = within_height(rays.origin_m[2], dz / (dx * dx + dy * dy).sqrt(), config.clear_height_m);
+            let climb = dz / (dx * dx + dy * dy).sqrt();
+            let (low, high) = (config.clear_height_m_min, config.clear_height_m_max);
+            let (from, to) = between_heights(rays.origin_m[2], climb, low, high);
             self.set_low(direction, from * per_m, to.min(farthest) * per_m);
         }
     }
 
-    /// Sets the bits of the steps whose middles lie from one distance on, up to the step of the other (both in cells).
+    /// Sets the bits of the steps whose middles lie between two distances, in cells.
     #[inline(always)]
     fn set_low(&mut self, direction: usize, from: f32, to: f32) {
         // NaN and what lies behind the sensor become 0, what is beyond the row its end.
-        let (first, end) = ((from + 0.5) as usize, if to > 0.0 { to as usize + 1 } else { 0 });
+        let (first, end) = ((from + 0.5) as usize, (to + 0.5) as usize);
         let row = &mut self.low[direction * self.words..][..self.words];
         set_bits(row, first, end.min(self.steps));
     }
 
-    /// Nearest hit of a direction and its neighbours.
-    #[inline(always)]
+    /// Nearest hit of a direction and those beside it.
     fn nearest(&self, direction: usize) -> usize {
-        let [right, left] = neighbours(direction);
-        usize::from(self.nearest_hit[direction].min(self.nearest_hit[right]).min(self.nearest_hit[left]))
+        let nearest = about(direction).map(|direction| self.nearest_hit[direction]).min();
+        usize::from(nearest.unwrap_or(NONE))
     }
 
     /// What returns from the ground prove behind the nearest hit.
     fn prove_ground(&mut self) {
-        for &Ground { direction, steps: (from, to) } in &self.ground {
-            let (direction, from, to) = (usize::from(direction), usize::from(from), usize::from(to));
-            if to <= self.nearest(direction) {
+        for &Ground { direction, from, low, end } in &self.ground {
+            let (direction, from, low, end) =
+                (usize::from(direction), usize::from(from), usize::from(low), usize::from(end));
+            if low <= self.nearest(direction) {
                 continue;
             }
-            let [right, left] = neighbours(direction);
-            let stands = [right, direction, left]
-                .into_iter()
-                .any(|d| any_bit(&self.hits[d * self.words..][..self.words], from, to + 1));
-            if !stands {
-                set_bits(&mut self.proved[direction * self.words..][..self.words], from, to + 1);
+            let mut rows = about(direction).map(|direction| &self.hits[direction * self.words..][..self.words]);
+            if !rows.any(|row| any_bit(row, from, end)) {
+                set_bits(&mut self.proved[direction * self.words..][..self.words], from, low);
             }
         }
     }
@@ -176,6 +182,7 @@ impl Fan {
         let from = [place.cells[0] + ox * cos - oy * sin, place.cells[1] + ox * sin + oy * cos];
         let reach = ((config.range_m_max / config.cell_m) as usize).min(self.steps);
         let mut free = vec![0; self.words];
+        window.begin_scan(rays.sensor);
         // What is hidden first: a cell that one direction sees and its neighbour does not has been seen.
         for hiding in [true, false] {
             for direction in (0..DIRECTIONS).filter(|direction| self.looks(*direction)) {
@@ -185,26 +192,24 @@ impl Fan {
                     let (trace, steps) = window.trace(from, [x * cos - y * sin, x * sin + y * cos]);
                     let steps = if line == 0 { 0..steps.min(reach).min(FORK) } else { FORK..steps.min(reach) };
                     if hiding {
-                        window.hide(&trace, steps.start.max(nearest)..steps.end, rays.sensor);
+                        window.hide(&trace, steps.start.max(nearest)..steps.end);
                     } else {
                         let clear = |step: usize| free[step / 64] >> (step % 64) & 1 == 1;
-                        window.look(&trace, steps.start..steps.end.min(seen), rays.sensor, clear);
+                        window.look(&trace, steps.start..steps.end.min(seen), clear);
                     }
                 }
             }
         }
-        window.speak();
     }
 
     /// Whether anything is known of a direction. Rays farther apart than a direction is wide leave every other empty.
     fn looks(&self, direction: usize) -> bool {
-        let [right, left] = neighbours(direction);
-        self.present[direction] || self.present[right] && self.present[left]
+        self.present[direction] || self.present[turned(direction, -1)] && self.present[turned(direction, 1)]
     }
 
     /// Writes one bit for each step a direction proves free; gives the first step from which on it sees nothing.
     fn write_free(&self, direction: usize, nearest: usize, free: &mut [u64]) -> usize {
-        let [right, left] = neighbours(direction).map(|beside| beside * self.words);
+        let [right, left] = [-1, 1].map(|beside| turned(direction, beside) * self.words);
         let own = direction * self.words;
         let mut seen = nearest;
         for (word, free) in free.iter_mut().enumerate() {
@@ -235,11 +240,16 @@ impl Fan {
     }
 }
 
+/// A direction, `beside` of them to the left (or less than 0 to the right).
 #[inline(always)]
-fn neighbours(direction: usize) -> [usize; 2] {
-    let right = if direction == 0 { DIRECTIONS - 1 } else { direction - 1 };
-    let left = if direction == DIRECTIONS - 1 { 0 } else { direction + 1 };
-    [right, left]
+fn turned(direction: usize, beside: isize) -> usize {
+    (direction + DIRECTIONS).wrapping_add_signed(beside) % DIRECTIONS
+}
+
+/// A direction and those whose hits end its trace.
+#[inline(always)]
+fn about(direction: usize) -> impl Iterator<Item = usize> {
+    (-BESIDE..=BESIDE).map(move |beside| turned(direction, beside))
 }
 
 /// The bits of one word of a row that lie in `first..end`.

@@ -56,7 +56,7 @@ use Next::{Go, Hold};
 pub const TRANSITIONS: [[Next; 8]; 5] = [
     // Silence            Nothing             Overhead       Hidden          Through    ThroughDoubted FewHits      Hits
     [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // unknown
-    [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Hold(UNKNOWN), Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // clear
+    [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // clear
     [Hold(UNKNOWN),      Hold(OUT_OF_RANGE), Hold(UNKNOWN), Hold(OCCLUDED), Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // occupied
     [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // occluded
     [Go(OUT_OF_RANGE),   Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // out_of_range

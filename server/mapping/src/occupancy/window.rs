@@ -9,11 +9,10 @@ use nalgebra::Isometry3;
 
 use super::states::{Cell, Evidence};
 
-/// Sensors whose views of a cell are told apart; more of them share.
-const SENSORS: u16 = 8;
-/// Bits of a cell's evidence: which sensors see it clear (0 to 7), and these.
-const HIDDEN: u16 = 1 << 8;
-const LOOKED_AT: u16 = 1 << 9;
+/// A cell's evidence: the number of the last scan that saw it clear, counted from 1 since the last map, and these.
+const SCANS: u16 = (1 << 14) - 1;
+const HIDDEN: u16 = 1 << 14;
+const LOOKED_AT: u16 = 1 << 15;
 /// Fraction bits of positions on a trace. So many, because a trace must fall on a border of cells never, not seldom.
 const FRACTION: u32 = 32;
 
@@ -39,8 +38,10 @@ pub struct Window {
     cells: Vec<Cell>,
     told: Vec<u16>,
     fresh: Vec<u8>,
-    /// Whether any ray was taken since the last map.
-    spoken: bool,
+    /// The sensor of each scan since the last map, from scan 1 on.
+    scans: Vec<u16>,
+    /// Whether each of them is its sensor's last.
+    newest: Vec<bool>,
 }
 
 /// A way of equal steps through the window; gives the index of the cell at the middle of each step.
@@ -75,7 +76,8 @@ impl Window {
             cells: vec![Cell::default(); cells],
             told: vec![0; cells],
             fresh: vec![0; cells],
-            spoken: false,
+            scans: vec![0],
+            newest: vec![false],
         }
     }
 
@@ -177,6 +179,8 @@ impl Window {
     /// steps lie in the window: none from a place outside.
     pub fn trace(&self, from: [f64; 2], direction: [f64; 2]) -> (Trace, usize) {
         let side = self.side as f64;
+        let inside = from.iter().all(|at| (0.0..side).contains(at));
+        let from = if inside { from } else { [0.0; 2] };
         let fixed = |cells: f64| (cells * (1_i64 << FRACTION) as f64).round() as i64;
         let mask = (1 << self.bits) - 1;
         let step = direction.map(fixed);
@@ -191,40 +195,56 @@ impl Window {
                 f64::INFINITY
             }
         };
-        let inside = from.iter().all(|at| (0.0..side).contains(at));
         // The last middle of a step before the border.
         let steps = if inside { (way(0).min(way(1)) - 0.5).ceil().max(0.0) as usize } else { 0 };
         (Trace { at, step, mask, bits: self.bits }, steps)
     }
 
-    /// Says that rays have been taken: from now on a cell nobody looks at is out of range.
-    pub fn speak(&mut self) {
-        self.spoken = true;
+    /// Begins a sensor's next scan.
+    pub fn begin_scan(&mut self, sensor: u16) {
+        if self.scans.len() > usize::from(SCANS) {
+            // Nobody has asked for a map for so long that what was seen is of no use.
+            self.told.fill(0);
+            self.scans.truncate(1);
+        }
+        self.scans.push(sensor);
     }
 
-    /// These steps of a sensor's trace are hidden from it.
+    /// These steps of a trace of the scan just begun are hidden from its sensor.
     #[inline(always)]
-    pub fn hide(&mut self, trace: &Trace, steps: std::ops::Range<usize>, sensor: u16) {
-        let others = !(1 << (sensor % SENSORS));
+    pub fn hide(&mut self, trace: &Trace, steps: std::ops::Range<usize>) {
+        let sensor = self.scans[self.scans.len() - 1];
         for step in steps {
             let told = &mut self.told[trace.cell(step)];
             // What this sensor saw clear a moment ago it does not see any more.
-            *told = *told & others | HIDDEN | LOOKED_AT;
+            let others = self.scans[usize::from(*told & SCANS)] != sensor;
+            *told = *told & if others { SCANS } else { 0 } | HIDDEN | LOOKED_AT;
         }
     }
 
-    /// A sensor looks over these steps of its trace; where `clear(step)`, it sees that nothing is there.
+    /// The scan just begun looks over these steps of its trace; where `clear(step)`, it sees that nothing is there.
     #[inline(always)]
-    pub fn look(&mut self, trace: &Trace, steps: std::ops::Range<usize>, sensor: u16, clear: impl Fn(usize) -> bool) {
+    pub fn look(&mut self, trace: &Trace, steps: std::ops::Range<usize>, clear: impl Fn(usize) -> bool) {
+        let scan = self.scans.len() as u16 - 1;
         for step in steps {
-            let seen = u16::from(clear(step)) << (sensor % SENSORS);
-            self.told[trace.cell(step)] |= seen | LOOKED_AT;
+            let told = &mut self.told[trace.cell(step)];
+            *told = if clear(step) { *told & !SCANS | scan } else { *told } | LOOKED_AT;
+        }
+    }
+
+    /// Marks the last scan of each sensor; only these say what is clear now.
+    fn find_newest(&mut self) {
+        self.newest.clear();
+        self.newest.resize(self.scans.len(), false);
+        for scan in (1..self.scans.len()).rev() {
+            self.newest[scan] = !self.scans[scan + 1..].contains(&self.scans[scan]);
         }
     }
 
     /// Judges every cell by what was told of it since the last map, and gives each, row by row, to `write`.
     pub fn judge(&mut self, hits_needed: u8, hold_maps: u8, mut write: impl FnMut(Cell)) {
-        let nothing = if self.spoken { Evidence::Nothing } else { Evidence::Silence };
+        self.find_newest();
+        let nothing = if self.scans.len() > 1 { Evidence::Nothing } else { Evidence::Silence };
         let n = 1 << self.bits;
         let first = (self.corner[0] & (n as i64 - 1)) as usize;
         for y in 0..self.side as i64 {
@@ -236,8 +256,9 @@ impl Window {
                 for ((cell, told), fresh) in cells.zip(&mut self.told[part.clone()]).zip(&mut self.fresh[part]) {
                     let strongest = match *told {
                         0 => nothing,
-                        told if told & 0xff != 0 => Evidence::Through,
+                        told if self.newest[usize::from(told & SCANS)] => Evidence::Through,
                         told if told & HIDDEN != 0 => Evidence::Hidden,
+                        // Or seen clear, and then lost out of sight.
                         _ => Evidence::Overhead,
                     };
                     *cell = cell.judged(*fresh, strongest, hits_needed, hold_maps);
@@ -246,7 +267,7 @@ impl Window {
                 }
             }
         }
-        self.spoken = false;
+        self.scans.truncate(1);
         if !self.anchored {
             // Nobody knows where these cells will be when the next map is made.
             self.cells.fill(Cell::default());

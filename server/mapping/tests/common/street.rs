@@ -1,6 +1,6 @@
 //! The simulated six-unit vehicle, its scans put into the ego frame of their ends, as the pipeline does.
 
-use clearway_mapping::map::{Context, Layer, LayerMaker, Rays};
+use clearway_mapping::map::{Context, Geometry, Layer, LayerMaker, Rays};
 use clearway_mapping::occupancy::Occupancy;
 use clearway_mapping::sweep::Sweep;
 use clearway_sim::planes::PlaneUnit;
@@ -46,6 +46,20 @@ pub fn scan(scene: &Scene, unit: &PlaneUnit, number: i64) -> Taken {
         origin_m: unit.ego_from_sensor.translation.vector.map(|v| v as f32).into(),
         map_from_ego,
     }
+}
+
+/// Corners of a layer's cell in the world.
+pub fn cell_corners(layer: &Layer, cell: usize, map_from_ego: &Isometry3<f64>) -> [[f64; 2]; 4] {
+    let Geometry::Cartesian { origin_x_m, origin_y_m, width, cell_m, yaw_rad, .. } = layer.geometry else {
+        panic!("{} has no square cells", layer.name)
+    };
+    let (sin, cos) = yaw_rad.sin_cos();
+    [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)].map(|(i, j)| {
+        let x = origin_x_m + ((cell % width as usize) as f64 + i) * f64::from(cell_m);
+        let y = origin_y_m + ((cell / width as usize) as f64 + j) * f64::from(cell_m);
+        let place = map_from_ego * Point3::new(x * cos + y * sin, y * cos - x * sin, 0.0);
+        [place.x, place.y]
+    })
 }
 
 impl Street {
