@@ -94,6 +94,10 @@ impl LayerMaker for Occupancy {
         }
     }
 
+    fn wants_no_returns(&self) -> bool {
+        self.config.no_return_m > 0.0
+    }
+
     fn take(&mut self, rays: &Rays<'_>) {
         // Who sees nothing at all has not looked.
         if rays.returns.x.is_empty() && rays.no_returns.is_empty() {

@@ -1,0 +1,56 @@
+"""Maps of a Clearway server as numpy arrays.
+
+    for m in clearway.watch("localhost:50051", layers=["drivability"]):
+        print(m.sequence, m.age_ms(), m["drivability"].classes.shape)
+
+An address is `HOST:PORT` for gRPC, or `zenoh:ENDPOINT` (`zenoh:tcp/localhost:7447`) for zenoh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from . import over_grpc, over_zenoh
+from .errors import ClearwayError, DecodeError
+from .map import FREE, OBSTACLES, CartesianGrid, Channel, Layer, Map, Obstacle, RadialGrid, SafePoint, now_ns
+from .recording import read
+from .stream import MapStream
+
+__all__ = [
+    "FREE", "OBSTACLES", "CartesianGrid", "Channel", "ClearwayError", "DecodeError", "Layer", "Map", "MapStream",
+    "Obstacle", "RadialGrid", "SafePoint", "get", "now_ns", "read", "vehicles", "watch",
+]  # fmt: skip
+
+
+def watch(address: str, vehicle: str = "", layers: Sequence[str] = (), max_in_flight: int = 2) -> MapStream:
+    """Streams the newest map, beginning with the one there is.
+
+    `vehicle` may be left out over gRPC where the server has one; no `layers` means all of them, and over zenoh they must
+    be named. `max_in_flight` maps are on their way without an acknowledgement (gRPC). Errors of the server (an unknown
+    vehicle or layer: the message lists the known ones) are raised by the first look.
+    """
+    if endpoint := _zenoh(address, vehicle, layers):
+        return over_zenoh.watch(endpoint, vehicle, layers)
+    return over_grpc.watch(address, vehicle, layers, max_in_flight)
+
+
+def get(address: str, vehicle: str = "", layers: Sequence[str] = ()) -> Map:
+    """The newest map at this moment; it may be stale."""
+    if endpoint := _zenoh(address, vehicle, layers):
+        return over_zenoh.get(endpoint, vehicle, layers)
+    return over_grpc.get(address, vehicle, layers)
+
+
+def vehicles(address: str) -> list[str]:
+    """Names of the vehicles that are served now, in order."""
+    if address.startswith("zenoh:"):
+        return over_zenoh.vehicles(address.removeprefix("zenoh:"))
+    return sorted(vehicle.name for vehicle in over_grpc.vehicles(address))
+
+
+def _zenoh(address: str, vehicle: str, layers: Sequence[str]) -> str | None:
+    if not address.startswith("zenoh:"):
+        return None
+    if not vehicle or not layers:
+        raise ClearwayError("selection", f"{address}: over zenoh vehicle and layers are named, such as layers=['terrain']")
+    return address.removeprefix("zenoh:")

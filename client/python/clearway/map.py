@@ -1,0 +1,350 @@
+"""One map as a planner sees it: layers as numpy arrays, look-ups in the ego frame, and the age.
+
+In: an encoded `clearway.v1.Map`, whoever carried it. Frames are REP-103: x forward, y left, metres, the origin on the
+ground under the vehicle. Class 0 is unknown everywhere and is never free.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from google.protobuf.message import DecodeError as ProtobufError
+
+from . import codec
+from .errors import ClearwayError, DecodeError
+from .v1 import map_pb2
+
+#: Classes a vehicle may drive on, over all layers.
+FREE = frozenset({"drivable", "flat", "flat_inferred", "clear", "passable", "road", "free", "path"})
+#: Classes that hold something to keep away from, over all layers.
+OBSTACLES = frozenset({"obstacle", "occupied"})
+
+#: Cells of all channels of a map that are accepted.
+CELLS_MAX = 16 << 20
+#: Bytes of a map that are accepted; gRPC's default. Those of a server with default grids have under 64 KiB.
+BYTES_MAX = 4 << 20
+
+
+def now_ns() -> int:
+    """This machine's clock, ns since the Unix epoch."""
+    return time.time_ns()
+
+
+@dataclass(frozen=True)
+class RadialGrid:
+    """Array shape (rows, columns): row j spans (r_bench_m[j-1], r_bench_m[j]], column c the azimuths
+    [c, c+1) * 2 pi / columns, counter-clockwise from the ego x axis."""
+
+    r_bench_m: np.ndarray
+    columns: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return len(self.r_bench_m), self.columns
+
+    def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        """Cell index of each point, -1 outside the grid."""
+        row = np.searchsorted(self.r_bench_m, np.hypot(x_m, y_m), side="left")
+        turn = np.mod(np.arctan2(y_m, x_m) / math.tau, 1.0)
+        column = np.minimum((turn * self.columns).astype(np.int64), self.columns - 1)
+        return np.where(row < len(self.r_bench_m), row * self.columns + column, -1)
+
+    def centres(self) -> np.ndarray:
+        """Middle of every cell, shape (rows, columns, 2)."""
+        outer = self.r_bench_m
+        range_m = 0.5 * (np.concatenate(([0.0], outer[:-1])) + outer)
+        azimuth = (np.arange(self.columns) + 0.5) / self.columns * math.tau
+        return range_m[:, None, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
+
+
+@dataclass(frozen=True)
+class CartesianGrid:
+    """Array shape (height, width), indexed [iy, ix]: cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m).
+
+    Along the grid's axes, which begin at the ego frame's origin and in which that frame has the heading `yaw_rad`.
+    """
+
+    origin_x_m: float
+    origin_y_m: float
+    width: int
+    height: int
+    cell_m: float
+    yaw_rad: float = 0.0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.height, self.width
+
+    def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        """Cell index of each point, -1 outside the grid."""
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        ix = np.floor((x_m * cos - y_m * sin - self.origin_x_m) / self.cell_m).astype(np.int64)
+        iy = np.floor((x_m * sin + y_m * cos - self.origin_y_m) / self.cell_m).astype(np.int64)
+        inside = (ix >= 0) & (ix < self.width) & (iy >= 0) & (iy < self.height)
+        return np.where(inside, iy * self.width + ix, -1)
+
+    def centres(self) -> np.ndarray:
+        """Middle of every cell in the ego frame, shape (height, width, 2)."""
+        x, y = np.meshgrid(
+            self.origin_x_m + (np.arange(self.width) + 0.5) * self.cell_m,
+            self.origin_y_m + (np.arange(self.height) + 0.5) * self.cell_m,
+        )
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        return np.stack([x * cos + y * sin, y * cos - x * sin], axis=-1)
+
+
+Grid = RadialGrid | CartesianGrid
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One value a cell."""
+
+    name: str
+    #: Unit of `values`; empty for classes and ids.
+    unit: str
+    #: `values = raw * scale`.
+    scale: float
+    #: The raw value that means: nothing is known of this cell.
+    unknown: int
+    #: Raw values, in the shape of the grid; not to be written to.
+    raw: np.ndarray
+
+    @property
+    def values(self) -> np.ndarray:
+        """Values in `unit`, NaN where nothing is known."""
+        return np.where(self.raw == self.unknown, np.nan, self.raw * np.float64(self.scale))
+
+
+class SafePoint(NamedTuple):
+    """A place as far as can be from the obstacles on both sides."""
+
+    x_m: float
+    y_m: float
+    #: Distance to the nearest cell that is not free.
+    radius_m: float
+    #: Indices of points before this one that the vehicle gets to straight from here.
+    links: tuple[int, ...]
+
+
+class Obstacle(NamedTuple):
+    """A cell with something in it."""
+
+    x_m: float
+    y_m: float
+    distance_m: float
+
+
+class Layer:
+    """One named grid of a map."""
+
+    def __init__(self, message: map_pb2.Layer) -> None:
+        self.name: str = message.name
+        self.grid: Grid = _grid(message)
+        #: Names of the values of the channel `class`; entry 0 is `unknown`.
+        self.legend: tuple[str, ...] = tuple(message.legend)
+        self.channels: dict[str, Channel] = {}
+        for channel in message.channels:
+            if channel.name in self.channels:
+                raise DecodeError("twice", f"channel {channel.name!r} occurs twice; names are unique")
+            self.channels[channel.name] = self._channel(channel)
+        #: Planes z = ax + by + c in the ego frame, by segment id, shape (n, 3).
+        self.planes = np.array([(p.a, p.b, p.c) for p in message.planes], dtype=np.float64).reshape(-1, 3)
+        #: Figures of the whole layer, such as `drivable_share`.
+        self.figures: dict[str, float] = dict(message.figures)
+        #: Safe points, the vehicle's own place first.
+        self.points: tuple[SafePoint, ...] = tuple(self._points(message))
+        self._check_classes()
+
+    @property
+    def classes(self) -> np.ndarray:
+        """Class of each cell, in the shape of the grid; names are in `legend`. 0 is unknown, and never free."""
+        return self._class_channel().raw
+
+    @property
+    def free(self) -> np.ndarray:
+        """Whether each cell is of a class a vehicle may drive on."""
+        return self._is_one_of(FREE)
+
+    @property
+    def obstacles(self) -> np.ndarray:
+        """Whether each cell holds something to keep away from."""
+        return self._is_one_of(OBSTACLES)
+
+    def class_at(self, x_m: float, y_m: float) -> str:
+        """Name of the class at a point; what lies outside the grid is unknown."""
+        cell = int(self.grid.cells_at(np.float64(x_m), np.float64(y_m)))
+        return "unknown" if cell < 0 else self.legend[int(self.classes.flat[cell])]
+
+    def value_at(self, channel: str, x_m: float, y_m: float) -> float:
+        """A channel's value at a point in the channel's unit; NaN where nothing is known."""
+        cell = int(self.grid.cells_at(np.float64(x_m), np.float64(y_m)))
+        return math.nan if cell < 0 else float(self.channels[channel].values.flat[cell])
+
+    def is_free(self, footprint: Sequence[tuple[float, float]], step_m: float = 0.1) -> bool:
+        """Whether every cell under a polygon (corners x, y in metres) is known and free; looked at every `step_m`."""
+        corners = np.asarray(footprint, dtype=np.float64)
+        if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
+            raise ClearwayError("footprint", f"footprint {footprint!r}: three or more finite corners (x, y) are needed")
+        points = _inside(corners, step_m)
+        cells = self.grid.cells_at(points[:, 0], points[:, 1])
+        return bool((cells >= 0).all() and self.free.ravel()[cells].all())
+
+    def nearest_obstacle(self, x_m: float = 0.0, y_m: float = 0.0) -> Obstacle | None:
+        """The obstacle cell whose middle is nearest to a point; `None` where the layer knows of none."""
+        centres = self.grid.centres()[self.obstacles]
+        if not len(centres):
+            return None
+        distances = np.hypot(centres[:, 0] - x_m, centres[:, 1] - y_m)
+        nearest = int(distances.argmin())
+        return Obstacle(*map(float, centres[nearest]), float(distances[nearest]))
+
+    def _channel(self, message: map_pb2.Channel) -> Channel:
+        rows, columns = self.grid.shape
+        if message.cell_count != rows * columns:
+            text = f"channel {message.name!r} has {message.cell_count} cells; the grid has {rows * columns}"
+            raise DecodeError("cell_count", text)
+        raw = codec.decode(message).reshape(rows, columns)
+        raw.flags.writeable = False
+        return Channel(message.name, message.unit, message.scale, message.unknown, raw)
+
+    def _points(self, message: map_pb2.Layer) -> Iterator[SafePoint]:
+        for index, point in enumerate(message.points):
+            links = tuple(point.links)
+            rising = all(a < b for a, b in zip(links, links[1:])) and (not links or links[-1] < index)
+            finite = all(map(math.isfinite, (point.x, point.y, point.radius))) and point.radius >= 0
+            if not (rising and finite):
+                raise DecodeError("safe_point", f"safe point {index}: {point}")
+            yield SafePoint(point.x, point.y, point.radius, links)
+
+    def _check_classes(self) -> None:
+        channel = self.channels.get("class")
+        if channel is None:
+            return
+        if not self.legend or self.legend[0] != "unknown":
+            raise DecodeError("legend", f"legend {self.legend}: entry 0 is 'unknown' everywhere")
+        if channel.raw.size and (channel.raw.min() < 0 or channel.raw.max() >= len(self.legend)):
+            raise DecodeError("class", f"class {channel.raw.max()} has no name among {self.legend}")
+
+    def _class_channel(self) -> Channel:
+        if "class" not in self.channels:
+            raise ClearwayError("class", f"layer {self.name!r} has no classes; its channels: {list(self.channels)}")
+        return self.channels["class"]
+
+    def _is_one_of(self, names: frozenset[str]) -> np.ndarray:
+        return np.array([name in names for name in self.legend])[self.classes]
+
+
+class Map:
+    """A map, decoded and checked. `map["drivability"]` is a layer."""
+
+    def __init__(self, encoded: bytes, skipped: int = 0) -> None:
+        if len(encoded) > BYTES_MAX:
+            raise DecodeError("too_long", f"map of {len(encoded)} bytes; at most {BYTES_MAX} are allowed")
+        try:
+            message = map_pb2.Map.FromString(encoded)
+        except ProtobufError as fault:
+            raise DecodeError("protobuf", f"not an encoded clearway.v1.Map: {fault}") from None
+        _check_header(message)
+        #: As on the wire: stamps, pose, speed, sensors.
+        self.header: map_pb2.Header = message.header
+        #: Maps made since the one looked at before and not seen by this reader.
+        self.skipped = skipped
+        self._message = message
+
+    @property
+    def vehicle(self) -> str:
+        return self.header.vehicle
+
+    @property
+    def sequence(self) -> int:
+        """Counts from 0 without a hole within one run of the server, which `header.boot_id` names."""
+        return self.header.sequence
+
+    @cached_property
+    def layers(self) -> dict[str, Layer]:
+        """Layers by name, in the server's order; decoded at the first look."""
+        cells = sum(channel.cell_count for layer in self._message.layers for channel in layer.channels)
+        if cells > CELLS_MAX:
+            raise DecodeError("too_many_cells", f"the channels claim {cells} cells; at most {CELLS_MAX} are allowed")
+        layers: dict[str, Layer] = {}
+        for message in self._message.layers:
+            if message.name in layers:
+                raise DecodeError("twice", f"layer {message.name!r} occurs twice; names are unique")
+            layers[message.name] = Layer(message)
+        return layers
+
+    def __getitem__(self, name: str) -> Layer:
+        if name not in self.layers:
+            raise ClearwayError("layer", f"no layer {name!r}; this map has {', '.join(self.layers) or 'none'}")
+        return self.layers[name]
+
+    def age_ms(self, at_ns: int | None = None) -> float:
+        """Age, measured from the end of the capture; negative where this machine's clock is behind the server's."""
+        at_ns = now_ns() if at_ns is None else at_ns
+        return (at_ns - self.header.capture_end_ns) * 1e-6
+
+    @property
+    def stale(self) -> bool:
+        """Whether the map must not be used any more."""
+        return self.is_stale(now_ns())
+
+    def is_stale(self, at_ns: int) -> bool:
+        """Whether its validity has passed at a time, or its capture lies further ahead of that time than its validity
+        lasts, so that its age is not known."""
+        valid_ns = self.header.valid_until_ns - self.header.capture_end_ns
+        return at_ns > self.header.valid_until_ns or at_ns - self.header.capture_end_ns < -valid_ns
+
+    def __repr__(self) -> str:
+        layers = ", ".join(layer.name for layer in self._message.layers)
+        return f"<Map {self.sequence} of {self.vehicle}: {layers}>"
+
+
+def _grid(message: map_pb2.Layer) -> Grid:
+    kind = message.WhichOneof("geometry")
+    if kind == "radial":
+        benches = np.array(message.radial.r_bench_m, dtype=np.float64)
+        rising = np.isfinite(benches).all() and (np.diff(benches, prepend=0.0) > 0).all()
+        if message.radial.columns and len(benches) and rising:
+            return RadialGrid(benches, message.radial.columns)
+    elif kind == "cartesian":
+        grid = message.cartesian
+        finite = all(map(math.isfinite, (grid.origin_x_m, grid.origin_y_m, grid.cell_m, grid.yaw_rad)))
+        if grid.width and grid.height and finite and grid.cell_m > 0:
+            yaw_rad = grid.yaw_rad
+            return CartesianGrid(grid.origin_x_m, grid.origin_y_m, grid.width, grid.height, grid.cell_m, yaw_rad)
+    geometry = getattr(message, kind) if kind else "none"
+    raise DecodeError("geometry", f"layer {message.name!r}, geometry: {geometry}")
+
+
+def _check_header(message: map_pb2.Map) -> None:
+    header = message.header
+    if not message.HasField("header") or header.capture_start_ns > header.capture_end_ns:
+        raise DecodeError("header", "header absent, or a capture that starts after its end")
+    if header.HasField("map_from_ego"):
+        pose = header.map_from_ego
+        norm = math.hypot(pose.qx, pose.qy, pose.qz, pose.qw)
+        if not all(map(math.isfinite, (pose.x, pose.y, pose.z))) or not abs(norm - 1) <= 1e-3:
+            raise DecodeError("header", f"map_from_ego {pose}: finite metres and a unit quaternion are needed")
+
+
+def _inside(corners: np.ndarray, step_m: float) -> np.ndarray:
+    """Points in and on a polygon, no more than `step_m` apart."""
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    axes = [np.linspace(a, b, max(2, math.ceil((b - a) / step_m) + 1)) for a, b in zip(low, high)]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    within = np.zeros(len(grid), dtype=bool)
+    edges = []
+    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0)):
+        crosses = (ay > grid[:, 1]) != (by > grid[:, 1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            within ^= crosses & (grid[:, 0] < (bx - ax) * (grid[:, 1] - ay) / (by - ay) + ax)
+        parts = max(2, math.ceil(math.hypot(bx - ax, by - ay) / step_m) + 1)
+        edges.append(np.linspace((ax, ay), (bx, by), parts))
+    return np.concatenate([grid[within], *edges])

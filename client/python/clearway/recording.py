@@ -1,0 +1,27 @@
+"""Maps out of a recording (MCAP), in the order they were made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from os import PathLike
+
+from .errors import ClearwayError
+from .map import Map
+
+
+def read(file: str | PathLike[str], layer: str, vehicle: str = "") -> Iterator[Map]:
+    """Gives the recorded maps of one layer; `vehicle` may be left out where the recording has one."""
+    try:
+        from mcap.reader import make_reader
+    except ImportError:
+        raise ClearwayError("mcap", "mcap is not installed: pip install 'clearway[recording]'") from None
+    with open(file, "rb") as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        topics = {channel.topic for channel in summary.channels.values()} if summary else set()
+        wanted = {t for t in topics if t.endswith(f"/map/{layer}") and (not vehicle or t == f"/{vehicle}/map/{layer}")}
+        if len(wanted) != 1:
+            known = ", ".join(sorted(t for t in topics if "/map/" in t)) or "none"
+            raise ClearwayError("layer", f"{file}: {len(wanted)} topics fit layer {layer!r}; the recording has {known}")
+        for _, _, message in reader.iter_messages(topics=wanted):
+            yield Map(message.data)

@@ -1,0 +1,95 @@
+"""The decoder against the golden vectors in proto/golden, which every client language reads."""
+
+import json
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clearway
+from clearway import codec
+from clearway.v1 import map_pb2
+
+GOLDEN = Path(__file__).resolve().parents[3] / "proto" / "golden"
+
+
+def golden(name: str):
+    return json.loads((GOLDEN / name).read_text())
+
+
+def channel(vector) -> map_pb2.Channel:
+    fields = {key: vector[key] for key in ("cell_type", "encoding", "cell_count", "crc32")}
+    return map_pb2.Channel(payload=bytes.fromhex(vector["payload_hex"]), **fields)
+
+
+@pytest.mark.parametrize("vector", golden("channels.json"), ids=lambda vector: vector["name"])
+def test_a_channel_has_the_cells_that_were_encoded(vector):
+    expected = [value for value, length in vector["cells_value_length"] for _ in range(length)]
+    assert codec.decode(channel(vector)).tolist() == expected
+
+
+@pytest.mark.parametrize("vector", golden("bad_channels.json"), ids=lambda vector: vector["name"])
+def test_a_bad_channel_is_refused_by_name_and_what_it_claims_is_not_allocated(vector):
+    message = channel(vector)
+    tracemalloc.start()
+    with pytest.raises(clearway.DecodeError) as error:
+        codec.decode(message)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert error.value.reason == vector["error"]
+    # Only the CRC needs the cells, and then no more of them than a reader accepts.
+    cells = 4 * codec.CELLS_MAX if vector["error"] == "crc" else 0
+    assert peak <= 64 * len(message.payload) + (64 << 10) + cells
+
+
+@pytest.mark.parametrize("vector", golden("bad_maps.json"), ids=lambda vector: vector["name"])
+def test_a_bad_map_is_refused_by_name(vector):
+    with pytest.raises(clearway.DecodeError) as error:
+        clearway.Map(bytes.fromhex(vector["map_hex"])).layers
+    assert error.value.reason == vector["error"]
+
+
+def test_the_golden_map_says_what_every_other_client_reads_in_it():
+    told = golden("map.json")
+    m = clearway.Map((GOLDEN / "map.bin").read_bytes())
+    assert (m.vehicle, m.sequence, m.header.valid_until_ns) == (told["vehicle"], told["sequence"], told["valid_until_ns"])
+    assert list(m.layers) == [layer["name"] for layer in told["layers"]]
+    for expected in told["layers"]:
+        layer = m[expected["name"]]
+        assert list(layer.grid.shape) == expected["shape"] and list(layer.legend) == expected["legend"]
+        assert layer.figures == expected["figures"]
+        for values in expected["channels"]:
+            cells = [value for value, length in values["cells_value_length"] for _ in range(length)]
+            assert layer.channels[values["name"]].raw.ravel().tolist() == cells
+        assert [(p.x_m, p.y_m, p.radius_m, list(p.links)) for p in layer.points] == [
+            (p["x_m"], p["y_m"], p["radius_m"], p["links"]) for p in expected["points"]
+        ]
+    for at in told["classes_of_drivability"]:
+        assert m["drivability"].class_at(at["x_m"], at["y_m"]) == at["class"]
+
+
+def test_a_map_is_stale_after_its_validity_and_when_its_age_cannot_be_known():
+    m = clearway.Map((GOLDEN / "map.bin").read_bytes())
+    end, until = m.header.capture_end_ns, m.header.valid_until_ns
+    valid = until - end
+    assert [m.is_stale(at) for at in (end, until, until + 1, end - valid, end - valid - 1)] == [False, False, True, False, True]
+    assert m.age_ms(end + 5_000_000) == 5.0
+
+
+def test_a_footprint_is_free_only_where_all_of_it_is_known_and_free():
+    layer = clearway.Map((GOLDEN / "map.bin").read_bytes())["drivability"]
+    centres = layer.grid.centres()
+    assert [layer.class_at(x, y) for x, y in centres.reshape(-1, 2)] == [layer.legend[c] for c in layer.classes.ravel()]
+    free, other = np.argwhere(layer.free)[0], np.argwhere(~layer.free)[0]
+
+    def square(cell, half=0.05):
+        x, y = centres[tuple(cell)]
+        return [(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]
+
+    assert layer.is_free(square(free)) and not layer.is_free(square(other))
+    assert not layer.is_free(square(free, half=100.0)), "what lies outside the grid is not known"
+    nearest = layer.nearest_obstacle()
+    assert nearest is not None and layer.class_at(nearest.x_m, nearest.y_m) == "obstacle"
+    with pytest.raises(clearway.ClearwayError, match="three or more finite corners"):
+        layer.is_free([(0, 0), (1, float("nan")), (2, 2)])

@@ -1,0 +1,101 @@
+"""Against a running server, whose addresses are in CLEARWAY_GRPC, CLEARWAY_ZENOH and CLEARWAY_RECORDING."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import clearway
+
+GRPC, ZENOH, RECORDING = (os.environ.get(f"CLEARWAY_{name}", "") for name in ("GRPC", "ZENOH", "RECORDING"))
+pytestmark = pytest.mark.skipif(not GRPC, reason="CLEARWAY_GRPC names no server")
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+TRANSPORTS = [{"address": GRPC}, {"address": f"zenoh:{ZENOH}", "vehicle": "car"}]
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS, ids=["grpc", "zenoh"])
+def test_the_newest_map_comes_as_arrays(transport):
+    with clearway.watch(**transport, layers=["drivability", "terrain"]) as maps:
+        m = next(maps)
+    assert list(m.layers) == ["drivability", "terrain"] and m.vehicle == "car"
+    layer = m["drivability"]
+    assert layer.classes.shape == layer.grid.shape and layer.classes.dtype == "uint8"
+    assert layer.free.any() and layer.class_at(10.0, 0.0) == "drivable"
+    assert m["terrain"].is_free([(9, -1), (12, -1), (12, 1), (9, 1)])
+    assert m.header.sensors[0].returns > 1000
+    with pytest.raises(ValueError, match="read-only"):
+        layer.classes[0, 0] = 1
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS, ids=["grpc", "zenoh"])
+def test_get_and_watch_give_the_same_map(transport):
+    one = clearway.get(**transport, layers=["drivability"])
+    with clearway.watch(**transport, layers=["drivability"]) as maps:
+        other = next(maps)
+    assert one.sequence <= other.sequence
+    if one.sequence == other.sequence:
+        assert (one["drivability"].classes == other["drivability"].classes).all()
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS, ids=["grpc", "zenoh"])
+def test_a_slow_loop_body_gets_the_newest_map_and_is_told_what_it_skipped(transport):
+    with clearway.watch(**transport, layers=["drivability"]) as maps:
+        first = next(maps)
+        while maps.newest().sequence < first.sequence + 3:
+            pass
+        newest = maps.newest().sequence
+        second = next(maps)
+    assert second.sequence >= newest
+    assert second.sequence - first.sequence == second.skipped + 1
+
+
+def test_every_layer_comes_where_none_is_named():
+    with clearway.watch(GRPC) as maps:
+        assert {"drivability", "terrain"} <= set(next(maps).layers)
+
+
+def test_the_vehicles_are_known_on_both_transports():
+    assert clearway.vehicles(GRPC) == ["car"] == clearway.vehicles(f"zenoh:{ZENOH}")
+
+
+@pytest.mark.parametrize("wrong, known", [({"vehicle": "bus"}, "car"), ({"layers": ["dirt"]}, "drivability")])
+def test_an_unknown_vehicle_or_layer_is_answered_with_the_known_ones(wrong, known):
+    with pytest.raises(clearway.ClearwayError, match=known):
+        clearway.get(GRPC, **wrong)
+    with pytest.raises(clearway.ClearwayError, match=known):
+        next(clearway.watch(GRPC, **wrong))
+
+
+def test_a_closed_stream_ends_its_loop():
+    seen = []
+    maps = clearway.watch(GRPC, layers=["drivability"])
+    for m in maps:
+        seen.append(m.sequence)
+        if len(seen) == 2:
+            maps.close()
+    assert len(seen) == 2
+
+
+def test_nobody_at_an_address_is_named():
+    with pytest.raises(clearway.ClearwayError, match="nobody answers"):
+        clearway.vehicles("127.0.0.1:9")
+
+
+@pytest.mark.parametrize("example", ["follow.py", "footprint.py"])
+def test_the_examples_run(example):
+    run = subprocess.Popen([sys.executable, "-u", EXAMPLES / example, GRPC], stdout=subprocess.PIPE, text=True)
+    try:
+        assert run.stdout is not None and run.stdout.readline().startswith("map ")
+    finally:
+        run.kill()
+        run.wait()
+
+
+def test_a_recording_gives_its_maps_in_order():
+    sequences = [m.sequence for m in clearway.read(RECORDING, "drivability")]
+    assert sequences and sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+    assert clearway.read(RECORDING, "drivability").__next__()["drivability"].free.any()
+    with pytest.raises(clearway.ClearwayError, match="/car/map/drivability"):
+        next(clearway.read(RECORDING, "dirt"))

@@ -1,0 +1,111 @@
+//! The Python client's own tests, against a running server: installed from the tree into an environment of its own.
+
+mod house;
+
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use clearway_sim::send::{Pace, Until, drive};
+use house::{config, feed, readings, start, until, vehicle, within};
+
+const REPOSITORY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
+
+fn run(command: &mut Command, hint: &str) {
+    let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}; {hint}"));
+    let said = [output.stdout, output.stderr].concat();
+    assert!(output.status.success(), "{command:?}: {}; {hint}\n{}", output.status, String::from_utf8_lossy(&said));
+}
+
+fn files(folder: &Path, into: &mut Vec<PathBuf>) {
+    let skipped = ["build", "__pycache__", ".pytest_cache", "clearway.egg-info", "golden"];
+    for entry in std::fs::read_dir(folder).expect("a folder of the repository") {
+        let path = entry.expect("readable").path();
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        if path.is_dir() && !skipped.contains(&name) {
+            files(&path, into);
+        } else if path.is_file() {
+            into.push(path);
+        }
+    }
+}
+
+/// What is installed follows from these files.
+fn fingerprint(repository: &Path) -> String {
+    let mut paths = Vec::new();
+    files(&repository.join("client/python"), &mut paths);
+    files(&repository.join("proto/clearway"), &mut paths);
+    paths.sort();
+    let mut hasher = DefaultHasher::new();
+    for path in paths {
+        (&path, std::fs::read(&path).expect("readable")).hash(&mut hasher);
+    }
+    format!("{:016x}", hasher.finish())
+}
+
+/// The interpreter of an environment with the client as it lies in the tree; made anew only where that has changed.
+fn python() -> PathBuf {
+    let repository = Path::new(REPOSITORY).canonicalize().expect("the repository");
+    let environment = Path::new(env!("CARGO_TARGET_TMPDIR")).join("python-client");
+    let (interpreter, stamp) = (environment.join("bin/python"), environment.join("installed"));
+    let wanted = fingerprint(&repository);
+    if std::fs::read_to_string(&stamp).is_ok_and(|installed| installed == wanted) {
+        return interpreter;
+    }
+    let hint = "the Python client's tests need Debian's python3 and python3-venv, and a package registry";
+    run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&environment), hint);
+    // Built from a copy: a build leaves its traces in the folder it builds from.
+    let copy = environment.join("tree");
+    let package = copy.join("client/python");
+    let sources = [repository.join("client/python"), repository.join("proto")];
+    for (from, to) in sources.iter().zip(["client", "."]) {
+        std::fs::create_dir_all(copy.join(to)).expect("a folder of ours");
+        run(Command::new("cp").arg("-r").arg(from).arg(copy.join(to)), hint);
+    }
+    let what = format!("{}[zenoh,recording,test]", package.display());
+    run(Command::new(&interpreter).args(["-m", "pip", "install", "--quiet", "--no-input", &what]), hint);
+    std::fs::write(&stamp, wanted).expect("a file of ours");
+    interpreter
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording() {
+    let interpreter = tokio::task::spawn_blocking(python).await.expect("the Python client installs");
+
+    let folder = tempfile::tempdir().unwrap();
+    let recording = folder.path().join("recorded.mcap");
+    let mut recorded = config();
+    recorded.recorder.file.clone_from(&recording);
+    let running = start(recorded).await;
+    feed(&running, readings(4)).await;
+    within("shutdown", running.shutdown()).await.unwrap();
+
+    let mut live = config();
+    live.zenoh.enabled = true;
+    let running = start(live).await;
+    let (data, telemetry) = running.doors[0].udp.unwrap();
+    let halt = Arc::new(AtomicBool::new(false));
+    let car = std::thread::spawn({
+        let halt = halt.clone();
+        move || drive(vehicle(), data, telemetry, Pace::RealTime, Until { stop: Some(&halt), device_time: None })
+    });
+    let status = running.vehicles.0[0].status.clone();
+    until("a map", || status.snapshot().maps > 0).await;
+
+    let zenoh = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens").clone();
+    let grpc = running.grpc.expect("gRPC is served").to_string();
+    let tests = tokio::task::spawn_blocking(move || {
+        let tests = Path::new(REPOSITORY).join("client/python/tests");
+        let mut pytest = Command::new(interpreter);
+        pytest.args(["-B", "-m", "pytest", "-q", "-p", "no:cacheprovider"]).arg(tests);
+        pytest.env("CLEARWAY_GRPC", grpc).env("CLEARWAY_ZENOH", zenoh).env("CLEARWAY_RECORDING", recording);
+        run(&mut pytest, "pytest names what failed");
+    });
+    let outcome = tests.await;
+    halt.store(true, Ordering::Relaxed);
+    car.join().unwrap().unwrap();
+    within("shutdown", running.shutdown()).await.unwrap();
+    outcome.expect("the Python client's tests pass");
+}
