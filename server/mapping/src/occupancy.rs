@@ -18,7 +18,8 @@
 //! twenty.
 //!
 //! Hits add up over maps, so a single Velodyne at 10 Hz on a standing vehicle names near cars at once and far ones after
-//! some turns; until then their cells are unknown, with their hits beside. Heights are over the plane under the vehicle.
+//! some turns; until then their cells are unknown, with their hits beside. Heights of returns are over the plane under the
+//! vehicle; those of rays that come back from the ground, over the line from there to the return.
 //!
 //! Without an ego pose nobody can say where last map's cells are now: the grid is then the vehicle's own and holds only
 //! what was seen since the last map (`world_aligned` is 0).

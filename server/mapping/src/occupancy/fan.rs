@@ -22,6 +22,10 @@ const DIRECTIONS: usize = 1440;
 const BESIDE: isize = 2;
 /// Steps after which a direction goes on as two lines: 112 cells out it is half a cell wide.
 const FORK: usize = 112;
+/// A return so far under the plane, and under the steepest road from the vehicle to it, is a mirror image: its ray proves
+/// nothing.
+const BELOW_M: f32 = 0.3;
+const GRADE_MAX: f32 = 0.1;
 /// Nearest hit of a direction without.
 const NONE: u16 = u16::MAX;
 
@@ -108,7 +112,11 @@ impl Fan {
             let range = (dx * dx + dy * dy).sqrt();
             let direction = self.directions.column(dx, dy) as usize;
             self.present[direction] = true;
-            let climb = (z - oz) / range;
+            if z < -BELOW_M - GRADE_MAX * range {
+                continue;
+            }
+            // The ground of a ray that comes back from the ground leads there, up or down, in a straight line.
+            let climb = if z < config.clear_height_m_min { -oz } else { z - oz } / range;
             let reliable = range <= config.range_m_max;
             let (from, to) = between_heights(oz, climb, config.clear_height_m_min, config.clear_height_m_max);
             self.set_low(direction, from * per_m, to.min(range).min(config.range_m_max) * per_m);

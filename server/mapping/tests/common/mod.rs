@@ -2,6 +2,7 @@
 #![allow(dead_code)]
 
 pub mod labels;
+pub mod opencalib;
 pub mod street;
 
 use std::sync::Arc;
