@@ -373,7 +373,7 @@ fn six_sensors_go_through_the_pipeline_as_events_and_the_same_events_give_the_sa
         let ([x_m, y_m, z_m], (_, _, yaw)): ([f64; 3], _) =
             (unit.ego_from_sensor.translation.vector.into(), unit.ego_from_sensor.rotation.euler_angles());
         let extrinsics = Extrinsics { x_m, y_m, z_m, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: yaw.to_degrees() };
-        SensorConfig { range_m_min: 0.3, ..SensorConfig::new(&format!("unit_{number}"), extrinsics) }
+        SensorConfig { range_m_min: 0.3, ..SensorConfig::new(format!("unit_{number}"), extrinsics) }
     });
     let mut config = VehicleConfig::new("car", sensors.collect());
     config.fusion.period_ms = 100;
@@ -455,7 +455,10 @@ fn any_pose() -> impl Strategy<Value = Option<Isometry3<f64>>> {
     }))
 }
 
-fn any_scan() -> impl Strategy<Value = (Vec<[f32; 3]>, Vec<[f32; 3]>, [f32; 3], u16, Option<Isometry3<f64>>)> {
+/// Returns, rays without, the sensor's place, its number, the vehicle's pose.
+type AnyScan = (Vec<[f32; 3]>, Vec<[f32; 3]>, [f32; 3], u16, Option<Isometry3<f64>>);
+
+fn any_scan() -> impl Strategy<Value = AnyScan> {
     let height = prop_oneof![4 => -0.6f32..6.0, 1 => coordinate()];
     let points = prop::collection::vec((coordinate(), coordinate(), height).prop_map(|(x, y, z)| [x, y, z]), 0..300);
     let unit = || -1f32..1.0;
