@@ -51,8 +51,22 @@ fn data_and_telemetry_go_their_ways_unchanged_and_the_rest_is_counted() {
     let target = |socket: &UdpSocket| format!("udp://{}", socket.local_addr().unwrap());
     let (to, telemetry_to) = (target(&data), target(&telemetry));
     let path = file.to_str().unwrap();
-    let done = clearway(&["send", path, "--to", &to, "--telemetry-to", &telemetry_to, "--speed", "max", "--json"]);
+    let done = clearway(&[
+        "send",
+        path,
+        "--to",
+        &to,
+        "--telemetry-to",
+        &telemetry_to,
+        "--speed",
+        "max",
+        "--bind",
+        "127.0.0.2",
+        "--json",
+    ]);
     assert!(done.status.success(), "{}", text(&done.stderr));
+    let (_, sender) = data.peek_from(&mut []).unwrap();
+    assert_eq!(sender.ip().to_string(), "127.0.0.2");
     assert_eq!(received(&data), [vec![1; 1206]]);
     assert_eq!(received(&telemetry), [vec![2; 512]]);
     let document: Value = serde_json::from_slice(&done.stdout).unwrap();

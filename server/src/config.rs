@@ -4,13 +4,17 @@
 //! what is allowed. Calibration files are read here too, so that nothing opens a socket before all of it is known good.
 //! `deploy/clearway.toml` holds every key with its default.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::collections::BTreeSet;
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 
 use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::{BodyConfig, FusionConfig, MapsConfig, SensorConfig, VehicleConfig};
 use serde::{Deserialize, Serialize};
+
+mod udp;
+
+pub use udp::{Listener, Ports, Route, Sender, Udp, listeners};
 
 /// The configured tables by vehicle and sensor, in the order of the configuration; `None` where the factory's serves.
 pub type Calibrations = Vec<Vec<Option<Calibration>>>;
@@ -180,48 +184,6 @@ impl Vehicle {
     }
 }
 
-/// `[vehicle.udp]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Udp {
-    /// Where data packets arrive.
-    pub data: SocketAddr,
-    /// Where telemetry arrives.
-    pub telemetry: SocketAddr,
-    /// Asked of the kernel for each socket.
-    pub receive_buffer_bytes: usize,
-    /// Sender of each sensor, by sensor name: `"192.168.1.201"`, or with its port. Datagrams of anyone else are refused.
-    /// Empty: whatever arrives is the one sensor's.
-    pub from: BTreeMap<String, Sender>,
-}
-
-impl Default for Udp {
-    fn default() -> Self {
-        let any = |port| SocketAddr::new(Ipv4Addr::UNSPECIFIED.into(), port);
-        Self { data: any(2368), telemetry: any(8308), receive_buffer_bytes: 4 << 20, from: BTreeMap::new() }
-    }
-}
-
-/// A sender's address, with its port or without.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(untagged, expecting = "an address such as \"192.168.1.201\" or \"192.168.1.201:2368\"")]
-pub enum Sender {
-    /// Any port of this address.
-    Address(IpAddr),
-    /// This port alone.
-    Socket(SocketAddr),
-}
-
-impl Sender {
-    /// Whether `peer` is this sender.
-    pub fn is(&self, peer: SocketAddr) -> bool {
-        match self {
-            Self::Address(address) => *address == peer.ip().to_canonical(),
-            Self::Socket(socket) => socket.port() == peer.port() && socket.ip() == peer.ip().to_canonical(),
-        }
-    }
-}
-
 /// What is wrong with a configuration.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
@@ -356,25 +318,9 @@ impl Config {
             if !(16..=1 << 20).contains(&vehicle.queue) {
                 return wrong(at("queue"), &vehicle.queue, "16 to 1048576 events");
             }
-            let sensors: BTreeSet<_> = vehicle.sensors.iter().map(|sensor| sensor.name.as_str()).collect();
-            if let Some(udp) = &vehicle.udp {
-                if let Some(unknown) = udp.from.keys().find(|name| !sensors.contains(name.as_str())) {
-                    let known: Vec<_> = sensors.iter().copied().collect();
-                    return wrong(at("udp.from"), unknown, &format!("the vehicle's sensors: {}", known.join(", ")));
-                }
-                let missing = vehicle.sensors.iter().find(|s| !udp.from.contains_key(&s.name));
-                if let Some(sensor) = missing.filter(|_| vehicle.sensors.len() > 1) {
-                    let allowed = "one sender for each of several sensors, or they cannot be told apart";
-                    return wrong(at("udp.from"), &format!("(nothing for {})", sensor.name), allowed);
-                }
-                if !(65_536..=1 << 30).contains(&udp.receive_buffer_bytes) {
-                    return wrong(
-                        at("udp.receive_buffer_bytes"),
-                        &udp.receive_buffer_bytes,
-                        "65536 to 1073741824 bytes",
-                    );
-                }
-            }
+        }
+        if let Err((key, value, allowed)) = udp::check(&self.vehicles) {
+            return wrong(key, &value, &allowed);
         }
         Ok(())
     }

@@ -109,7 +109,7 @@ impl Second {
             snapshot.revolutions(),
             snapshot.ledger.received,
             snapshot.refused(),
-            snapshot.ledger.lost + snapshot.kernel_drops.unwrap_or(0),
+            snapshot.ledger.lost + snapshot.ledger.kernel_drops,
             figure(*age_ms, "ms"),
             figure(snapshot.latency_ms_p50, "ms"),
             figure(snapshot.drivable_share.map(|share| 100.0 * share), "%"),
@@ -126,7 +126,7 @@ impl Second {
             "packets": snapshot.packets_json(),
             "telemetry": snapshot.ledger.telemetry,
             "lost": snapshot.ledger.lost,
-            "kernel_drops": snapshot.kernel_drops,
+            "kernel_drops": snapshot.ledger.kernel_drops,
             "age_ms": age_ms,
             "latency_ms": { "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 },
             "drivable_share": snapshot.drivable_share,
@@ -216,8 +216,9 @@ pub async fn demo(
     };
     let status = running.vehicles.0[0].status.clone();
     let on_their_way = || {
-        let received = status.snapshot().ledger.received + last.snapshot.kernel_drops.unwrap_or(0);
-        sent.as_ref().is_ok_and(|sent| received < sent.packets + sent.telemetry)
+        let ledger = status.snapshot().ledger;
+        let accounted = ledger.received + ledger.lost + ledger.kernel_drops;
+        sent.as_ref().is_ok_and(|sent| accounted < sent.packets + sent.telemetry)
     };
     let settled = tokio::time::Instant::now() + SETTLE;
     while on_their_way() && tokio::time::Instant::now() < settled {
@@ -225,10 +226,8 @@ pub async fn demo(
     }
     running.shutdown().await?;
     let sent = sent?;
-    // Kernel drops were read while the sockets were open; the rest is complete only now.
-    let kernel_drops = last.snapshot.kernel_drops;
-    let snapshot = Snapshot { kernel_drops, ..status.snapshot() };
-    Ok(Summary { last: Second { snapshot, ..last }, sent })
+    // Complete only now.
+    Ok(Summary { last: Second { snapshot: status.snapshot(), ..last }, sent })
 }
 
 /// Draws a map's drivability; whoever looks at the file sees a whole picture, the old or the new one.

@@ -1,16 +1,18 @@
 //! The door: readings in, numbered [`Event`]s out, on one bounded queue a vehicle.
 //!
 //! Only this file (live and captured readings) and the recording's reader make an [`Event`]; nothing behind the queue
-//! can tell them apart. A live reading gets the clock's stamp here; a captured one brings its own. A full queue costs
-//! the newest readings: they are counted and become one [`Body::Lost`] as soon as there is space again.
+//! can tell them apart. A live reading gets the clock's stamp here; a captured one brings its own. What does not become an
+//! event (the queue or the kernel's buffer was full, the sender is nobody's, the datagram too long) is counted, and the
+//! counts become [`Body::Lost`] events: the journal, and every replay of it, knows all that stayed outside.
 
-use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::collections::{BTreeMap, VecDeque};
+use std::net::SocketAddr;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use clearway_mapping::event::{Body, Event};
+use clearway_mapping::event::{Body, Cause, Event};
+use clearway_mapping::pipeline::Ledger;
 
 pub mod capture;
 pub mod files;
@@ -42,22 +44,48 @@ pub struct Door {
     outside: Arc<Outside>,
 }
 
+/// A full queue is told of as soon as there is space, other causes this often: a flood from strangers must not fill the
+/// journal.
+const TELL_NS: u64 = 100_000_000;
+/// Strangers remembered, newest last.
+const STRANGERS: usize = 8;
+
 /// What stayed outside a door; outlives its queue.
 #[derive(Debug, Default)]
 pub struct Outside {
-    refused: Mutex<BTreeMap<&'static str, u64>>,
-    untold: AtomicU64,
+    untold: Mutex<Untold>,
+    strangers: Mutex<VecDeque<Stranger>>,
+}
+
+/// Readings that stayed outside and that the engine has not been told of yet; a full queue comes first.
+type Untold = BTreeMap<(Cause, u16), u64>;
+
+/// A sender that is none of the vehicle's sensors.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stranger {
+    /// Whence its datagrams came.
+    pub address: SocketAddr,
+    /// How many, since it is remembered.
+    pub datagrams: u64,
+    /// When the newest came, ns since the Unix epoch.
+    pub newest_ns: i64,
 }
 
 impl Outside {
-    /// Datagrams turned away before they became events, by reason.
-    pub fn refused(&self) -> BTreeMap<&'static str, u64> {
-        locked(&self.refused).clone()
+    /// Adds what the engine has not been told of yet to its ledger, and to those of its sensors.
+    pub fn add_to<'a>(&self, ledger: &mut Ledger, sensors: impl IntoIterator<Item = &'a mut Ledger>) {
+        let mut sensors: Vec<_> = sensors.into_iter().collect();
+        for (&(cause, source), &count) in &*locked(&self.untold) {
+            ledger.stayed_outside(cause, count);
+            if let Some(sensor) = sensors.get_mut(usize::from(source)).filter(|_| cause.has_source()) {
+                sensor.stayed_outside(cause, count);
+            }
+        }
     }
 
-    /// Readings that found the queue full and that the engine has not been told of yet.
-    pub fn untold(&self) -> u64 {
-        self.untold.load(Ordering::Relaxed)
+    /// The last few strangers, newest last.
+    pub fn strangers(&self) -> Vec<Stranger> {
+        locked(&self.strangers).iter().copied().collect()
     }
 }
 
@@ -65,14 +93,13 @@ impl Outside {
 struct Inside {
     queue: SyncSender<Event>,
     next_sequence: u64,
-    /// Readings that found the queue full, by source, not yet told to the engine.
-    untold: BTreeMap<u16, u64>,
+    told_ns: i64,
 }
 
 /// A door and the queue behind it, `capacity` events long.
 pub fn door(capacity: usize) -> (Door, Receiver<Event>) {
     let (queue, events) = sync_channel(capacity);
-    let inside = Inside { queue, next_sequence: 0, untold: BTreeMap::new() };
+    let inside = Inside { queue, next_sequence: 0, told_ns: 0 };
     (Door { shared: Arc::new(Mutex::new(inside)), outside: Arc::default() }, events)
 }
 
@@ -82,13 +109,25 @@ impl Door {
     /// # Errors
     /// [`Closed`] when the engine has stopped.
     pub fn enter(&self, source: u16, body: Body) -> Result<(), Closed> {
+        self.enter_all([(source, body)])
+    }
+
+    /// [`Door::enter`] for what was read at once: one stamp for all.
+    ///
+    /// # Errors
+    /// [`Closed`] when the engine has stopped.
+    pub fn enter_all(&self, readings: impl IntoIterator<Item = (u16, Body)>) -> Result<(), Closed> {
         let mut inside = locked(&self.shared);
+        let mut untold = locked(&self.outside.untold);
         let arrival_ns = now_ns();
-        inside.tell_losses(arrival_ns)?;
-        if !inside.untold.is_empty() || !inside.offer(arrival_ns, source, body)? {
-            *inside.untold.entry(source).or_default() += 1;
+        // Behind a loss that is not told yet nothing enters, so that the journal has it where it happened.
+        let mut has_space = inside.tell(&mut untold, arrival_ns)?;
+        for (source, body) in readings {
+            has_space = has_space && inside.offer(arrival_ns, source, body)?;
+            if !has_space {
+                *untold.entry((Cause::Queue, source)).or_default() += 1;
+            }
         }
-        self.outside.untold.store(inside.untold.values().sum(), Ordering::Relaxed);
         Ok(())
     }
 
@@ -97,17 +136,40 @@ impl Door {
     /// # Errors
     /// [`Closed`] when the engine has stopped.
     pub fn enter_captured(&self, reading: Reading) -> Result<(), Closed> {
-        let Reading { arrival_ns, source, body } = reading;
-        let mut inside = locked(&self.shared);
-        let sequence = inside.next_sequence;
-        inside.queue.send(Event { sequence, arrival_ns, source, body }).map_err(|_| Closed)?;
-        inside.next_sequence += 1;
-        Ok(())
+        locked(&self.shared).wait(reading)
     }
 
-    /// Counts a datagram that was turned away before it became an event.
-    pub fn refuse(&self, reason: &'static str) {
-        *locked(&self.outside.refused).entry(reason).or_default() += 1;
+    /// Counts readings that stay outside.
+    pub fn leave_outside(&self, source: u16, cause: Cause, count: u64) {
+        if count > 0 {
+            *locked(&self.outside.untold).entry((cause, source)).or_default() += count;
+        }
+    }
+
+    /// Refuses a datagram whose sender is none of the vehicle's sensors, and remembers the sender.
+    pub fn refuse_stranger(&self, address: SocketAddr) {
+        self.leave_outside(0, Cause::Sender, 1);
+        let mut strangers = locked(&self.outside.strangers);
+        let known = strangers.iter().position(|stranger| stranger.address == address);
+        let known = known.and_then(|index| strangers.remove(index));
+        if known.is_none() && strangers.len() == STRANGERS {
+            strangers.pop_front();
+        }
+        let datagrams = known.map_or(0, |stranger| stranger.datagrams) + 1;
+        strangers.push_back(Stranger { address, datagrams, newest_ns: now_ns() });
+    }
+
+    /// Tells the engine of all that stayed outside, waiting for space: nothing will enter after it.
+    ///
+    /// # Errors
+    /// [`Closed`] when the engine has stopped.
+    pub fn close(&self) -> Result<(), Closed> {
+        let mut inside = locked(&self.shared);
+        let untold = std::mem::take(&mut *locked(&self.outside.untold));
+        for ((cause, source), count) in untold {
+            inside.wait(Reading { arrival_ns: now_ns(), source, body: Body::Lost { cause, count } })?;
+        }
+        Ok(())
     }
 
     /// What stayed outside.
@@ -134,15 +196,30 @@ impl Inside {
         }
     }
 
-    /// Turns the losses counted so far into events, as far as there is space.
-    fn tell_losses(&mut self, arrival_ns: i64) -> Result<(), Closed> {
-        while let Some((source, lost)) = self.untold.first_key_value().map(|(s, n)| (*s, *n)) {
-            if !self.offer(arrival_ns, source, Body::Lost(lost))? {
+    /// Puts one event on the queue once there is space.
+    fn wait(&mut self, reading: Reading) -> Result<(), Closed> {
+        let Reading { arrival_ns, source, body } = reading;
+        let sequence = self.next_sequence;
+        self.queue.send(Event { sequence, arrival_ns, source, body }).map_err(|_| Closed)?;
+        self.next_sequence += 1;
+        Ok(())
+    }
+
+    /// Turns what stayed outside so far, and is due, into events; `false` when there is no space for all of it.
+    fn tell(&mut self, untold: &mut Untold, arrival_ns: i64) -> Result<bool, Closed> {
+        let is_due = self.told_ns.abs_diff(arrival_ns) >= TELL_NS;
+        while let Some(entry) = untold.first_entry() {
+            let ((cause, source), count) = (*entry.key(), *entry.get());
+            if cause != Cause::Queue && !is_due {
                 break;
             }
-            self.untold.remove(&source);
+            if !self.offer(arrival_ns, source, Body::Lost { cause, count })? {
+                return Ok(false);
+            }
+            entry.remove();
+            self.told_ns = arrival_ns;
         }
-        Ok(())
+        Ok(true)
     }
 }
 
@@ -158,21 +235,49 @@ pub(crate) fn now_ns() -> i64 {
 mod tests {
     use super::*;
 
+    fn untold(door: &Door) -> Ledger {
+        let mut ledger = Ledger::default();
+        door.outside().add_to(&mut ledger, []);
+        ledger
+    }
+
     #[test]
     fn events_are_numbered_without_a_hole_and_a_full_queue_becomes_one_loss() {
         let (door, events) = door(2);
-        for _ in 0..5 {
-            door.enter(1, Body::End).unwrap();
-        }
-        assert_eq!(door.outside().untold(), 3);
+        door.enter_all((0..5).map(|_| (1, Body::End))).unwrap();
+        assert_eq!(untold(&door).lost, 3);
         let taken: Vec<_> = events.try_iter().collect();
         assert_eq!(taken.iter().map(|e| e.sequence).collect::<Vec<_>>(), [0, 1]);
         door.enter(0, Body::End).unwrap();
         let taken: Vec<_> = events.try_iter().collect();
-        assert_eq!(taken[0].body, Body::Lost(3));
+        assert_eq!(taken[0].body, Body::Lost { cause: Cause::Queue, count: 3 });
         assert_eq!((taken[0].sequence, taken[0].source), (2, 1));
         assert_eq!((taken[1].sequence, taken[1].source), (3, 0));
-        assert_eq!(door.outside().untold(), 0);
+        assert_eq!(untold(&door), Ledger::default());
+    }
+
+    #[test]
+    fn what_stays_outside_is_told_at_once_then_seldom_and_all_of_it_before_the_end() {
+        let (door, events) = door(16);
+        let flood = |door: &Door| (0..9).for_each(|port| door.refuse_stranger(([10, 0, 0, 9], port).into()));
+        flood(&door);
+        door.leave_outside(1, Cause::Length, 2);
+        assert_eq!(
+            (untold(&door).received, untold(&door).refused["source"], untold(&door).refused["length"]),
+            (11, 9, 2)
+        );
+        door.enter(0, Body::End).unwrap();
+        let bodies = |events: &Receiver<Event>| events.try_iter().map(|event| event.body).collect::<Vec<_>>();
+        let lost = |cause, count| Body::Lost { cause, count };
+        assert_eq!(bodies(&events), [lost(Cause::Sender, 9), lost(Cause::Length, 2), Body::End]);
+        flood(&door);
+        door.leave_outside(0, Cause::Kernel, 5);
+        door.close().unwrap();
+        assert_eq!(bodies(&events), [lost(Cause::Kernel, 5), lost(Cause::Sender, 9)]);
+        assert_eq!(untold(&door), Ledger::default());
+        let strangers = door.outside().strangers();
+        assert_eq!(strangers.iter().map(|s| s.address.port()).collect::<Vec<_>>(), [1, 2, 3, 4, 5, 6, 7, 8]);
+        assert!(strangers.iter().all(|stranger| stranger.datagrams == 1), "the one that was forgotten pushed each out");
     }
 
     #[test]

@@ -68,8 +68,11 @@ pub enum StartError {
         /// The vehicle's name.
         vehicle: Arc<str>,
         /// Which address, and why.
-        source: std::io::Error,
+        source: udp::BindError,
     },
+    /// The sockets cannot be read.
+    #[error("no thread for a udp socket: {0}")]
+    UdpThread(std::io::Error),
     /// An engine's thread cannot be started.
     #[error("vehicle {vehicle}: no thread for its engine: {source}")]
     Thread {
@@ -93,7 +96,7 @@ pub struct RunningVehicle {
     pub name: Arc<str>,
     /// Where its events enter.
     pub door: Door,
-    /// Its sockets, where it has some: data, telemetry.
+    /// Where its first sensor that sends datagrams is heard, if any: data, telemetry.
     pub udp: Option<(SocketAddr, SocketAddr)>,
 }
 
@@ -111,7 +114,7 @@ pub struct Running {
     pub zenoh: Vec<String>,
     engines: Vec<(Arc<str>, JoinHandle<()>)>,
     recorder: Option<Recorder>,
-    readers: JoinSet<()>,
+    udp: Option<udp::Readers>,
     publishers: JoinSet<()>,
     stop: watch::Sender<bool>,
     #[cfg(feature = "zenoh")]
@@ -153,11 +156,10 @@ impl Server {
         // Listeners before the recorder: a port in use must not cost an earlier recording its file.
         let grpc = listen("grpc.listen", config.grpc.enabled.then_some(config.grpc.listen)).await?;
         let page = listen("page.listen", config.page.enabled.then_some(config.page.listen)).await?;
-        let sockets = config.vehicles.iter().map(|v| {
-            let bind = v.udp.as_ref().map(udp::Sockets::bind).transpose();
-            bind.map_err(|source| StartError::Udp { vehicle: v.name.as_str().into(), source })
-        });
-        let sockets: Vec<_> = sockets.collect::<Result<_, _>>()?;
+        let sockets = udp::Sockets::bind(&config.vehicles).map_err(|source| StartError::Udp {
+            vehicle: config.vehicles[source.vehicle].name.as_str().into(),
+            source,
+        })?;
 
         let names: Vec<Arc<str>> = config.vehicles.iter().map(|v| v.name.as_str().into()).collect();
         let (recorder, journals) = match crate::record::wanted(&config.recorder) {
@@ -232,7 +234,7 @@ impl Server {
             zenoh: Vec::new(),
             engines,
             recorder,
-            readers: JoinSet::new(),
+            udp: None,
             publishers,
             stop,
             #[cfg(feature = "zenoh")]
@@ -242,7 +244,11 @@ impl Server {
         if let Some(publisher) = &running.publisher {
             running.zenoh = publisher.endpoints().await;
         }
-        running.open_sockets(&config, sockets)?;
+        let doors: Vec<Door> = running.doors.iter().map(|vehicle| vehicle.door.clone()).collect();
+        for (index, vehicle) in running.doors.iter_mut().enumerate() {
+            vehicle.udp = sockets.addresses(index);
+        }
+        running.udp = Some(sockets.read(&doors).map_err(StartError::UdpThread)?);
         Ok(running)
     }
 }
@@ -253,26 +259,15 @@ impl Running {
         self.recorder.as_ref().map(|recorder| recorder.counts().to_proto().file)
     }
 
-    fn open_sockets(&mut self, config: &Config, sockets: Vec<Option<udp::Sockets>>) -> Result<(), StartError> {
-        for (index, (vehicle, sockets)) in config.vehicles.iter().zip(sockets).enumerate() {
-            let (Some(udp), Some(sockets)) = (&vehicle.udp, sockets) else { continue };
-            let running = &mut self.doors[index];
-            let (data, telemetry) =
-                sockets.addresses().map_err(|source| StartError::Udp { vehicle: running.name.clone(), source })?;
-            running.udp = Some((data, telemetry));
-            self.vehicles.0[index].status.watch_sockets(&[data, telemetry]);
-            let senders = udp::senders(&udp.from, vehicle.sensors.iter().map(|sensor| &sensor.name));
-            self.readers.spawn(sockets.run(senders, running.door.clone()));
-        }
-        Ok(())
-    }
-
     /// Ends it all: no more readings, every event taken processed and recorded, the recording finished, the readers told.
     ///
     /// # Errors
     /// [`EndError`] where an engine had died or the recording is not whole; everything has ended all the same.
     pub async fn shutdown(mut self) -> Result<(), EndError> {
-        self.readers.shutdown().await;
+        if let Some(readers) = self.udp.take() {
+            // Fails only where the runtime is going down, and the threads end without it.
+            let _ = tokio::task::spawn_blocking(move || readers.stop()).await;
+        }
         self.doors.clear();
         let (engines, recorder) = (self.engines, self.recorder);
         let ended = tokio::task::spawn_blocking(move || {

@@ -3,7 +3,6 @@
 
 use std::collections::VecDeque;
 use std::fmt::Write as _;
-use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -12,7 +11,7 @@ use clearway_mapping::pipeline::{Ledger, NamedStatus};
 use clearway_proto::v1;
 use serde_json::{Value, json};
 
-use crate::ingest::{Outside, locked, now_ns, udp};
+use crate::ingest::{Outside, Stranger, locked, now_ns};
 use crate::record::RecorderCounts;
 use crate::wire::EncodedMap;
 
@@ -38,7 +37,6 @@ pub struct VehicleStatus {
     pub page_readers: Arc<AtomicU32>,
     outside: Arc<Outside>,
     recorder: Option<Arc<RecorderCounts>>,
-    sockets: Mutex<Vec<SocketAddr>>,
     engine_stopped: AtomicBool,
     inside: Mutex<Inside>,
 }
@@ -96,8 +94,6 @@ pub struct Snapshot {
     pub maps_hz: f64,
     /// Datagrams a second over the newest maps.
     pub packets_hz: f64,
-    /// Datagrams the kernel dropped at this vehicle's sockets; `None` where the kernel does not tell.
-    pub kernel_drops: Option<u64>,
 }
 
 impl Snapshot {
@@ -135,15 +131,9 @@ impl VehicleStatus {
             page_readers: Arc::default(),
             outside,
             recorder,
-            sockets: Mutex::default(),
             engine_stopped: AtomicBool::new(false),
             inside: Mutex::default(),
         }
-    }
-
-    /// The vehicle's sockets, whose kernel drops are shown.
-    pub fn watch_sockets(&self, sockets: &[SocketAddr]) {
-        *locked(&self.sockets) = sockets.to_vec();
     }
 
     /// Whether the vehicle's engine still takes events.
@@ -180,21 +170,16 @@ impl VehicleStatus {
 
     /// The status now.
     pub fn snapshot(&self) -> Snapshot {
-        let sockets = locked(&self.sockets).clone();
-        let kernel_drops = if sockets.is_empty() { None } else { udp::kernel_drops(&sockets) };
         let inside = locked(&self.inside);
         let mut ledger = inside.ledger.clone();
-        for (reason, count) in self.outside.refused() {
-            ledger.received += count;
-            *ledger.refused.entry(reason).or_default() += count;
-        }
-        ledger.lost += self.outside.untold();
+        let mut sensors = inside.sensors.clone();
+        self.outside.add_to(&mut ledger, sensors.iter_mut().map(|sensor| &mut sensor.ledger));
         let mut latencies: Vec<u64> = inside.latencies_ns.iter().copied().collect();
         latencies.sort_unstable();
         let (maps_hz, packets_hz) = rates(&inside.paces);
         Snapshot {
             ledger,
-            sensors: inside.sensors.clone(),
+            sensors,
             maps: inside.maps,
             newest_capture_end_ns: inside.newest_capture_end_ns,
             drivable_share: inside.drivable_share,
@@ -202,7 +187,6 @@ impl VehicleStatus {
             latency_ms_p99: percentile_ms(&latencies, 99),
             maps_hz,
             packets_hz,
-            kernel_drops,
         }
     }
 
@@ -224,6 +208,7 @@ impl VehicleStatus {
                 .map(|(name, count)| (name.to_owned(), count.load(Ordering::Relaxed)))
                 .into_iter()
                 .collect(),
+            strangers: self.outside.strangers().iter().map(stranger).collect(),
         }
     }
 
@@ -233,8 +218,7 @@ impl VehicleStatus {
         let proto = self.to_proto();
         let snapshot = self.snapshot();
         let (ledger, recorder) = (proto.ledger.unwrap_or_default(), proto.recorder.unwrap_or_default());
-        let mut ledger_json = self::ledger_json(&ledger);
-        ledger_json["kernel_drops"] = snapshot.kernel_drops.into();
+        let ledger_json = self::ledger_json(&ledger);
         let sensors = proto.sensors.iter().map(|s| {
             json!({
                 "name": s.name, "model": s.model, "packets": s.packets, "refused": s.refused, "returns": s.returns,
@@ -258,6 +242,9 @@ impl VehicleStatus {
                 "stopped": self.recorder.as_ref().and_then(|counts| counts.stopped()),
             },
             "readers": proto.readers,
+            "strangers": proto.strangers.iter().map(|s| {
+                json!({ "address": s.address, "datagrams": s.datagrams, "newest_ns": s.newest_ns.to_string() })
+            }).collect::<Vec<_>>(),
             "rates": { "maps_hz": snapshot.maps_hz, "packets_hz": snapshot.packets_hz },
             "latency_ms": { "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 },
             "alive": self.is_alive(),
@@ -265,10 +252,15 @@ impl VehicleStatus {
     }
 }
 
+fn stranger(stranger: &Stranger) -> v1::Stranger {
+    let Stranger { address, datagrams, newest_ns } = *stranger;
+    v1::Stranger { address: address.to_string(), datagrams, newest_ns }
+}
+
 fn ledger_json(ledger: &v1::Ledger) -> Value {
     json!({
         "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
-        "refused": ledger.refused, "lost": ledger.lost, "points_dropped": ledger.points_dropped,
+        "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops, "points_dropped": ledger.points_dropped,
         "own_body": ledger.own_body, "through_body": ledger.through_body,
     })
 }
@@ -280,6 +272,7 @@ fn ledger(ledger: &Ledger) -> v1::Ledger {
         telemetry: ledger.telemetry,
         refused: ledger.refused.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect(),
         lost: ledger.lost,
+        kernel_drops: ledger.kernel_drops,
         points_dropped: ledger.points_dropped,
         own_body: ledger.own_body,
         through_body: ledger.through_body,
@@ -300,6 +293,10 @@ fn rates(paces: &VecDeque<(Instant, u64)>) -> (f64, f64) {
 fn percentile_ms(ascending_ns: &[u64], percent: usize) -> Option<f64> {
     let rank = (ascending_ns.len() * percent).div_ceil(100).max(1);
     ascending_ns.get(rank - 1).map(|&ns| ns as f64 / 1e6)
+}
+
+fn labels(vehicle: &str, sensor: &str) -> String {
+    format!("vehicle=\"{vehicle}\",sensor=\"{sensor}\"")
 }
 
 /// The status of all vehicles in Prometheus' text format.
@@ -333,11 +330,29 @@ pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {
     family("clearway_packets_refused_total", "counter", "Datagrams and scans refused, by reason.", &refused);
     let lost = each(&|s, _| s.ledger.lost as f64);
     family("clearway_events_lost_total", "counter", "Readings that found the door's queue full.", &lost);
-    let drops: Vec<_> = all
+    let drops = each(&|s, _| s.ledger.kernel_drops as f64);
+    family("clearway_kernel_drops_total", "counter", "Datagrams the kernel dropped at the vehicle's sockets.", &drops);
+    let of_sensors = |value: &dyn Fn(&Ledger) -> u64| -> Vec<(String, f64)> {
+        let sensors = all.iter().flat_map(|(v, s, _)| s.sensors.iter().map(move |sensor| (v, sensor)));
+        sensors.map(|(v, s)| (labels(&v.name, &s.name), value(&s.ledger) as f64)).collect()
+    };
+    let received = of_sensors(&|ledger| ledger.received);
+    family("clearway_sensor_received_total", "counter", "Datagrams and scans received from a sensor.", &received);
+    let decoded = of_sensors(&|ledger| ledger.decoded);
+    family("clearway_sensor_decoded_total", "counter", "A sensor's data packets and scans decoded.", &decoded);
+    let telemetry = of_sensors(&|ledger| ledger.telemetry);
+    family("clearway_sensor_telemetry_total", "counter", "A sensor's telemetry datagrams read.", &telemetry);
+    let lost = of_sensors(&|ledger| ledger.lost);
+    family("clearway_sensor_lost_total", "counter", "A sensor's readings that found the queue full.", &lost);
+    let refused: Vec<_> = all
         .iter()
-        .filter_map(|(v, s, _)| s.kernel_drops.map(|n| (format!("vehicle=\"{}\"", v.name), n as f64)))
+        .flat_map(|(v, s, _)| s.sensors.iter().map(move |sensor| (v, sensor)))
+        .flat_map(|(v, s)| {
+            s.ledger.refused.iter().map(move |(reason, n)| (labels(&v.name, &s.name), reason, *n as f64))
+        })
+        .map(|(labels, reason, n)| (format!("{labels},reason=\"{reason}\""), n))
         .collect();
-    family("clearway_kernel_drops", "gauge", "Datagrams the kernel dropped at the vehicle's open sockets.", &drops);
+    family("clearway_sensor_refused_total", "counter", "A sensor's datagrams and scans refused, by reason.", &refused);
     let maps = each(&|_, p| p.maps as f64);
     family("clearway_maps_total", "counter", "Maps made.", &maps);
     let revolutions = each(&|s, _| s.revolutions() as f64);
@@ -382,8 +397,8 @@ mod tests {
     #[test]
     fn what_the_door_turned_away_is_in_the_ledger_and_the_ledger_adds_up() {
         let (door, _events) = crate::ingest::door(4);
-        door.refuse("source");
-        door.refuse("source");
+        door.refuse_stranger(([10, 0, 0, 9], 2368).into());
+        door.refuse_stranger(([10, 0, 0, 9], 2368).into());
         let status = VehicleStatus::new("car".into(), 1, vec!["drivability"], door.outside(), None);
         let ledger = Ledger { received: 3, decoded: 2, telemetry: 1, ..Ledger::default() };
         status.stepped(&ledger, Vec::new());

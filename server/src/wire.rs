@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
 use clearway_mapping::config::{Extrinsics, SensorConfig};
-use clearway_mapping::event::{Body, EgoPose, Event, Road, RoadFrame, RoadPurpose, Scan};
+use clearway_mapping::event::{Body, Cause, EgoPose, Event, Road, RoadFrame, RoadPurpose, Scan};
 use clearway_mapping::map::{Cells, Geometry, Layer, Map, SafePoint, SensorState};
 use clearway_mapping::pipeline::{model_name, model_of_name};
 use clearway_proto::codec::{self, CellsRef};
@@ -248,6 +248,10 @@ pub(crate) fn scan_from_proto(scan: v1::Scan) -> Result<Scan, &'static str> {
 
 /// An event as the journal holds it.
 pub fn event_to_proto(event: &Event) -> v1::Event {
+    let lost_cause = match event.body {
+        Body::Lost { cause, .. } => loss_cause(cause),
+        _ => v1::LossCause::Queue,
+    };
     let body = match &event.body {
         Body::Datagram(payload) => v1::event::Body::Datagram(payload.clone()),
         Body::Scan(scan) => v1::event::Body::Scan(self::scan(scan)),
@@ -258,7 +262,7 @@ pub fn event_to_proto(event: &Event) -> v1::Event {
         }),
         Body::Road(road) => v1::event::Body::Road(self::road(road)),
         Body::Sensor(sensor) => v1::event::Body::Sensor(sensor_config(sensor)),
-        Body::Lost(events) => v1::event::Body::Lost(*events),
+        Body::Lost { count, .. } => v1::event::Body::Lost(*count),
         Body::End => v1::event::Body::End(v1::End {}),
     };
     v1::Event {
@@ -266,6 +270,16 @@ pub fn event_to_proto(event: &Event) -> v1::Event {
         arrival_ns: event.arrival_ns,
         source: u32::from(event.source),
         body: Some(body),
+        lost_cause: lost_cause.into(),
+    }
+}
+
+fn loss_cause(cause: Cause) -> v1::LossCause {
+    match cause {
+        Cause::Queue => v1::LossCause::Queue,
+        Cause::Kernel => v1::LossCause::Kernel,
+        Cause::Sender => v1::LossCause::Sender,
+        Cause::Length => v1::LossCause::Length,
     }
 }
 
@@ -283,13 +297,13 @@ pub enum EventError {
         /// What was found.
         source_index: u32,
     },
-    /// A body this version does not know, an ego pose without a pose, a road without frame or purpose, a scan with half a
-    /// direction, a sensor of an unknown model.
+    /// A body this version does not know, an ego pose without a pose, a loss without a cause, a road without frame or
+    /// purpose, a scan with half a direction, a sensor of an unknown model.
     #[error("event {sequence}: no {what}")]
     Missing {
         /// The event's.
         sequence: u64,
-        /// `body`, `pose`, or what of a road, scan or sensor.
+        /// `body`, `pose`, or what of a loss, road, scan or sensor.
         what: &'static str,
     },
 }
@@ -322,7 +336,12 @@ pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventError> {
             let sensor = sensor_from_proto(sensor).map_err(|what| EventError::Missing { sequence, what })?;
             Body::Sensor(Box::new(sensor))
         }
-        v1::event::Body::Lost(events) => Body::Lost(events),
+        v1::event::Body::Lost(count) => {
+            let causes = [Cause::Queue, Cause::Kernel, Cause::Sender, Cause::Length];
+            let cause = causes.into_iter().find(|cause| i32::from(loss_cause(*cause)) == event.lost_cause);
+            let cause = cause.ok_or(EventError::Missing { sequence, what: "known cause of a loss" })?;
+            Body::Lost { cause, count }
+        }
         v1::event::Body::End(v1::End {}) => Body::End,
     };
     Ok(Event { sequence, arrival_ns: event.arrival_ns, source, body })
@@ -367,7 +386,8 @@ mod tests {
                     Extrinsics { x_m: 1.0, y_m: -2.0, z_m: 0.5, roll_deg: 3.0, pitch_deg: 4.0, yaw_deg: -90.0 },
                 )
             })),
-            Body::Lost(12),
+            Body::Lost { cause: Cause::Queue, count: 12 },
+            Body::Lost { cause: Cause::Kernel, count: 3 },
             Body::End,
         ];
         for (sequence, body) in (0..).zip(bodies) {

@@ -50,6 +50,7 @@ export function packetFigures(element, status) {
     ["Refused", count(refused.reduce((sum, [, n]) => sum + n, 0))],
     ...refused.map(([reason, n]) => [`refused: ${reason.replaceAll("_", " ")}`, count(n), n > 0]),
     ["Lost at the door", count(ledger.lost ?? 0), ledger.lost > 0],
+    ["Dropped by the kernel", count(ledger.kernel_drops ?? 0), ledger.kernel_drops > 0],
   ]);
 }
 

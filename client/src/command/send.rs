@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::BufReader;
-use std::net::{SocketAddr, ToSocketAddrs, UdpSocket};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, ToSocketAddrs, UdpSocket};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -34,6 +34,9 @@ pub struct Options {
     /// Where telemetry goes; with the data packets unless given.
     #[arg(long, value_name = "udp://HOST:PORT")]
     telemetry_to: Option<String>,
+    /// Address to send from, with a port or without: how a server tells several senders apart.
+    #[arg(long, value_name = "ADDRESS", value_parser = own_address)]
+    bind: Option<SocketAddr>,
     /// Multiple of the recorded pace, or max for as fast as it goes.
     #[arg(long, default_value = "1", value_name = "X|max", value_parser = speed)]
     speed: Speed,
@@ -56,6 +59,13 @@ fn speed(text: &str) -> Result<Speed, String> {
     }
 }
 
+fn own_address(text: &str) -> Result<SocketAddr, String> {
+    let without_port = || text.parse::<IpAddr>().map(|ip| SocketAddr::new(ip, 0));
+    text.parse()
+        .or_else(|_| without_port())
+        .map_err(|_| "an address such as 127.0.0.2 or 127.0.0.2:2368 is allowed".into())
+}
+
 fn target(text: &str) -> Result<SocketAddr> {
     let rest = text.strip_prefix("udp://").with_context(|| format!("{text:?}: udp://HOST:PORT is allowed"))?;
     let mut found = rest.to_socket_addrs().with_context(|| format!("{text:?}: udp://HOST:PORT is allowed"))?;
@@ -70,7 +80,7 @@ pub fn run(options: &Options) -> Result<()> {
     let to = target(&options.to)?;
     let telemetry_to = options.telemetry_to.as_deref().map_or(Ok(to), target)?;
     let length = std::fs::metadata(&options.file).with_context(|| format!("open {}", options.file.display()))?.len();
-    let mut sender = Sender::new(to, telemetry_to, options.speed)?;
+    let mut sender = Sender::new(to, telemetry_to, options.bind, options.speed)?;
     let progress = progress_bar(length);
     let mut cut = None;
     if options.file.extension().is_some_and(|extension| extension == "mcap") {
@@ -142,9 +152,11 @@ struct Sender {
 }
 
 impl Sender {
-    fn new(to: SocketAddr, telemetry_to: SocketAddr, speed: Speed) -> Result<Self> {
-        let any = if to.is_ipv4() { "0.0.0.0:0" } else { "[::]:0" };
-        let socket = UdpSocket::bind(any).context("open a UDP socket")?;
+    fn new(to: SocketAddr, telemetry_to: SocketAddr, bind: Option<SocketAddr>, speed: Speed) -> Result<Self> {
+        let any =
+            SocketAddr::new(if to.is_ipv4() { Ipv4Addr::UNSPECIFIED.into() } else { Ipv6Addr::UNSPECIFIED.into() }, 0);
+        let own = bind.unwrap_or(any);
+        let socket = UdpSocket::bind(own).with_context(|| format!("open a UDP socket at {own}"))?;
         let skipped = BTreeMap::new();
         Ok(Self { socket, to, telemetry_to, speed, started: None, packets: 0, telemetry: 0, skipped })
     }

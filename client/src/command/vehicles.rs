@@ -52,6 +52,7 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
         json!({
             "name": s.name, "model": s.model, "packets": s.packets, "refused": s.refused, "returns": s.returns,
             "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
+            "ledger": vehicle.sensor_ledgers.get(&s.name).map(ledger_document),
         })
     });
     json!({
@@ -61,13 +62,29 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
         "maps": vehicle.maps,
         "newest_age_ms": age_ms(vehicle, now),
         "sensors": sensors.collect::<Vec<_>>(),
-        "ledger": {
-            "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
-            "refused": ledger.refused, "lost": ledger.lost,
-        },
+        "ledger": ledger_document(&ledger),
         "recorder": {"file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost},
         "readers": vehicle.readers,
+        "strangers": vehicle.strangers.iter().map(|s| {
+            json!({"address": s.address, "datagrams": s.datagrams, "newest_age_ms": (now - s.newest_ns) as f64 * 1e-6})
+        }).collect::<Vec<_>>(),
     })
+}
+
+fn ledger_document(ledger: &v1::Ledger) -> Value {
+    json!({
+        "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
+        "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
+    })
+}
+
+fn ledger_line(ledger: &v1::Ledger) -> String {
+    let refused: Vec<_> = ledger.refused.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
+    let refused = if refused.is_empty() { "0".into() } else { refused.join(", ") };
+    format!(
+        "datagrams: {} received, {} decoded, {} telemetry, refused {refused}; lost {}",
+        ledger.received, ledger.decoded, ledger.telemetry, ledger.lost
+    )
 }
 
 fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
@@ -85,14 +102,14 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
             s.returns,
             100.0 * s.completeness
         ));
+        lines.extend(vehicle.sensor_ledgers.get(&s.name).map(|ledger| format!("    {}", ledger_line(ledger))));
     }
     if let Some(ledger) = &vehicle.ledger {
-        let refused: Vec<_> = ledger.refused.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
-        let refused = if refused.is_empty() { "0".into() } else { refused.join(", ") };
-        lines.push(format!(
-            "  datagrams: {} received, {} decoded, {} telemetry, refused {refused}, lost {}",
-            ledger.received, ledger.decoded, ledger.telemetry, ledger.lost
-        ));
+        lines.push(format!("  {}, dropped by the kernel {}", ledger_line(ledger), ledger.kernel_drops));
+    }
+    for s in &vehicle.strangers {
+        let age = (now - s.newest_ns) as f64 * 1e-9;
+        lines.push(format!("  unknown sender {}: {} datagrams, the newest {age:.0} s ago", s.address, s.datagrams));
     }
     match vehicle.recorder.as_ref().filter(|recorder| !recorder.file.is_empty()) {
         Some(r) => lines.push(format!("  recording {}: {} events, {} maps, lost {}", r.file, r.events, r.maps, r.lost)),

@@ -32,10 +32,35 @@ pub enum Body {
     /// A sensor that the configuration does not name; the event's source is its index, the next one. The same again
     /// changes nothing.
     Sensor(Box<SensorConfig>),
-    /// The door's queue was full: this many events of this source never entered.
-    Lost(u64),
+    /// So many readings never became events.
+    Lost {
+        /// Why.
+        cause: Cause,
+        /// How many.
+        count: u64,
+    },
     /// The source has ended: an unfinished revolution becomes a partial one.
     End,
+}
+
+/// Why a reading never became an event.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Cause {
+    /// The door's queue was full.
+    Queue,
+    /// The kernel's receive buffer was full: nobody knows whose these were.
+    Kernel,
+    /// The sender is none of the vehicle's sensors.
+    Sender,
+    /// A datagram longer than any the door takes.
+    Length,
+}
+
+impl Cause {
+    /// Whether it is known which sensor's the reading was.
+    pub fn has_source(self) -> bool {
+        matches!(self, Self::Queue | Self::Length)
+    }
 }
 
 /// Points of one turn, or of one pass over a field of view, in the sensor's frame (REP-103), metres.

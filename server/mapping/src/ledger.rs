@@ -6,6 +6,7 @@ use clearway_lidar::sensor::Refusal;
 
 use crate::body::Hidden;
 use crate::config::ConfigError;
+use crate::event::Cause;
 use crate::road::RoadError;
 
 /// What came of everything that reached a vehicle, or one of its sensors: `received = decoded + telemetry + the sum of
@@ -20,8 +21,10 @@ pub struct Ledger {
     pub telemetry: u64,
     /// Datagrams and scans not taken, by [`Rejected::reason`].
     pub refused: BTreeMap<&'static str, u64>,
-    /// Events that never entered, as [`crate::event::Body::Lost`] says.
+    /// Readings that found the door's queue full.
     pub lost: u64,
+    /// Datagrams the kernel dropped before anybody read them; the vehicle's alone.
+    pub kernel_drops: u64,
     /// Ego poses taken.
     pub poses: u64,
     /// Ego poses not taken.
@@ -46,6 +49,18 @@ impl Ledger {
     /// Datagrams and scans not taken, for any reason.
     pub fn refused_sum(&self) -> u64 {
         self.refused.values().sum()
+    }
+
+    /// Counts readings that never became events: lost, or refused at the door.
+    pub fn stayed_outside(&mut self, cause: Cause, count: u64) {
+        let reason = match cause {
+            Cause::Queue => return self.lost += count,
+            Cause::Kernel => return self.kernel_drops += count,
+            Cause::Sender => "source",
+            Cause::Length => "length",
+        };
+        self.received += count;
+        *self.refused.entry(reason).or_default() += count;
     }
 
     pub(crate) fn add_dropped(&mut self, dropped: Dropped) {

@@ -105,7 +105,10 @@ impl Pipeline {
         self.now = Some(now);
         match &event.body {
             Body::Datagram(_) | Body::Scan(_) => self.count(event.source, |ledger| ledger.received += 1),
-            Body::Lost(events) => self.count(event.source, |ledger| ledger.lost += events),
+            Body::Lost { cause, count } if cause.has_source() => {
+                self.count(event.source, |ledger| ledger.stayed_outside(*cause, *count));
+            }
+            Body::Lost { cause, count } => self.ledger.stayed_outside(*cause, *count),
             Body::EgoPose(_) | Body::Road(_) | Body::Sensor(_) | Body::End => {}
         }
         match self.take(event, now) {
@@ -123,7 +126,7 @@ impl Pipeline {
                     Body::EgoPose(_) => self.ledger.poses_refused += 1,
                     Body::Road(_) => *self.ledger.roads_refused.entry(reason).or_default() += 1,
                     Body::Sensor(_) => self.ledger.sensors_refused += 1,
-                    Body::Lost(_) | Body::End => {}
+                    Body::Lost { .. } | Body::End => {}
                 }
                 Err(rejected)
             }
@@ -174,7 +177,7 @@ impl Pipeline {
             Body::EgoPose(pose) => self.take_ego_pose(pose).map(|()| None),
             Body::Road(road) => self.take_road(road).map(|()| None),
             Body::Sensor(sensor) => self.take_sensor(event.source, sensor).map(|()| None),
-            Body::Lost(_) => Ok(None),
+            Body::Lost { .. } => Ok(None),
             Body::Datagram(payload) => self.take_datagram(event.source, payload, now),
             Body::Scan(scan) => self.take_scan(event.source, scan, now).map(Some),
             Body::End => {

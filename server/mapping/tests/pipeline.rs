@@ -5,7 +5,7 @@ mod common;
 use bytes::Bytes;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{BodyConfig, ConfigError, Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
-use clearway_mapping::event::{Body, EgoPose, Event, Scan};
+use clearway_mapping::event::{Body, Cause, EgoPose, Event, Scan};
 use clearway_mapping::map::Map;
 use clearway_mapping::pipeline::{Pipeline, Rejected};
 use clearway_sim::scanner::ScannerConfig;
@@ -109,7 +109,10 @@ fn the_ledger_is_exact_and_a_refused_datagram_leaves_no_trace_in_the_maps() {
             let stranger = Event { source: 3, ..event.clone() };
             let rejected = pipeline.step(&stranger).unwrap_err();
             assert_eq!(rejected, Rejected::Source { source_index: 3, sensors: 1 });
-            assert_eq!(pipeline.step(&Event { body: Body::Lost(2), ..event.clone() }), Ok(None));
+            assert_eq!(
+                pipeline.step(&Event { body: Body::Lost { cause: Cause::Queue, count: 2 }, ..event.clone() }),
+                Ok(None)
+            );
         }
         let Body::Datagram(payload) = &event.body else { unreachable!() };
         if payload.len() == 512 {

@@ -40,7 +40,7 @@ fn the_commented_configuration_says_the_defaults_and_all_of_them() {
     let missing: Vec<_> = all.difference(&said).collect();
     assert!(missing.is_empty(), "not in deploy/clearway.toml: {missing:?}");
     // Keys without a default stand there as comments.
-    for optional in ["# model = ", "# rpm = ", "# calibration = ", "# top = "] {
+    for optional in ["# model = ", "# rpm = ", "# calibration = ", "# top = \"", "# top = {"] {
         assert!(COMMENTED.contains(optional), "{optional}");
     }
 }
@@ -66,6 +66,10 @@ fn a_value_out_of_bounds_is_named_with_file_key_value_and_what_is_allowed() {
         ("name = \"car\"", "name = \"car\"\nqueue = 3", "16 to 1048576"),
         ("[vehicle.udp]", "[vehicle.udp]\nfrom = { roof = \"10.0.0.1\" }", "top"),
         ("[vehicle.udp]", "[vehicle.udp]\nreceive_buffer_bytes = 1", "65536"),
+        ("[vehicle.udp]", "[vehicle.udp]\nports = { roof = { data = 1, telemetry = 2 } }", "top"),
+        ("[vehicle.udp]", "[vehicle.udp]\nports = { top = { data = 70000, telemetry = 2 } }", "u16"),
+        ("[vehicle.udp]", "[vehicle.udp]\ngroups = [\"10.0.0.1\"]", "multicast"),
+        ("[vehicle.udp]", "[vehicle.udp]\ngroups = [\"ff02::1\"]", "multicast"),
         ("[[vehicle]]", "[zenoh]\nlisten = [\"quic/1.2.3.4:1\"]\n[[vehicle]]", "tcp/127.0.0.1:7447"),
         ("[[vehicle]]", "[recorder]\nflush_ms = 1\n[[vehicle]]", "10 to 60000"),
     ];
@@ -108,6 +112,41 @@ fn a_sender_is_an_address_or_a_socket() {
     let sender = |text: &str| from(text).unwrap().vehicles[0].udp.clone().unwrap().from["top"];
     assert!(sender("10.0.0.1").is("10.0.0.1:77".parse().unwrap()));
     assert!(!sender("10.0.0.1:78").is("10.0.0.1:77".parse().unwrap()));
-    assert!(sender("10.0.0.1").is("[::ffff:10.0.0.1]:77".parse().unwrap()), "as a dual-stack socket shows it");
     assert!(from("the roof").unwrap_err().to_string().contains("192.168.1.201"));
+}
+
+/// A car and a truck at the default ports, each with this `[vehicle.udp]`.
+fn two(car: &str, truck: &str) -> Result<Config, ConfigError> {
+    let one = |name: &str, udp: &str| NEEDED.replace("\"car\"", name).replace("[vehicle.udp]", udp);
+    parse(&(one("\"car\"", &format!("[vehicle.udp]\n{car}")) + &one("\"truck\"", &format!("[vehicle.udp]\n{truck}"))))
+}
+
+#[test]
+fn vehicles_share_sockets_where_their_senders_tell_them_apart() {
+    let config = two("from.top = \"10.0.0.1\"", "from.top = \"10.0.0.2:2368\"\ngroups = [\"239.1.2.3\"]").unwrap();
+    let sockets = listeners(&config.vehicles);
+    assert_eq!(sockets.iter().map(|s| s.at.port()).collect::<Vec<_>>(), [2368, 8308]);
+    assert_eq!(sockets[0].groups.len(), 1);
+    let vehicle = |peer: &str| sockets[0].route(peer.parse().unwrap()).map(|route| (route.vehicle, route.source));
+    assert_eq!(vehicle("10.0.0.1:7"), Some((0, 0)));
+    assert_eq!(vehicle("10.0.0.2:2368"), Some((1, 0)));
+    assert_eq!((vehicle("10.0.0.2:7"), vehicle("10.0.0.3:2368")), (None, None));
+
+    let ports = two("", "ports.top = { data = 2369, telemetry = 2369 }").unwrap();
+    let sockets = listeners(&ports.vehicles);
+    let heard: Vec<_> = sockets.iter().map(|s| (s.at.port(), s.routes[0].vehicle, s.routes.len())).collect();
+    assert_eq!(heard, [(2368, 0, 1), (8308, 0, 1), (2369, 1, 1)]);
+}
+
+#[test]
+fn sensors_that_cannot_be_told_apart_are_refused() {
+    for (car, truck) in [
+        ("", ""),
+        ("from.top = \"10.0.0.1\"", ""),
+        ("from.top = \"10.0.0.1\"", "from.top = \"10.0.0.1:2368\""),
+        ("ports.top = { data = 8308, telemetry = 1 }", ""),
+    ] {
+        let error = two(car, truck).unwrap_err().to_string();
+        assert!(error.contains("top of car and top of truck cannot be told apart"), "{error}");
+    }
 }

@@ -1,143 +1,216 @@
-//! UDP sockets -> the door. One task a socket; a datagram longer than any sensor's is taken whole, so that the decoder
-//! can refuse it by its true length.
+//! UDP sockets -> the vehicles' doors. One named OS thread a socket; several sensors and several vehicles can share a socket
+//! and are told apart by their senders.
+//!
+//! The threads do nothing else and wait for nobody: where an engine does not keep up, readings are lost in its door's
+//! queue and counted there, not in the kernel's buffer.
 
-use std::collections::BTreeMap;
-use std::net::SocketAddr;
+use std::io::{self, PipeReader, PipeWriter};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::os::fd::AsFd;
+use std::thread::JoinHandle;
 
-use bytes::Bytes;
-use clearway_mapping::event::Body;
-use socket2::{Domain, Protocol, Socket, Type};
-use tokio::net::UdpSocket;
+use clearway_mapping::event::{Body, Cause};
+use nix::net::if_::if_nametoindex;
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
 
-use super::Door;
-use crate::config::{Sender, Udp};
+use super::{Closed, Door};
+use crate::config::{Listener, Vehicle, listeners};
 
-/// Larger than any UDP payload: an oversized datagram must be seen as such, not cut to a plausible length.
-const DATAGRAM_MAX: usize = 65_536;
+mod receive;
 
-/// A vehicle's bound sockets, before anything is read.
-#[derive(Debug)]
-pub struct Sockets {
-    data: UdpSocket,
-    telemetry: UdpSocket,
+pub use receive::{BATCH, DATAGRAM_BYTES_MAX, Received, Receiver};
+
+/// The bound sockets of all vehicles, before anything is read.
+#[derive(Debug, Default)]
+pub struct Sockets(Vec<(Socket, SocketAddr, Listener)>);
+
+/// A socket that cannot be had.
+#[derive(Debug, thiserror::Error)]
+#[error("udp {at}: {source}")]
+pub struct BindError {
+    /// Index of the first vehicle that asks for it.
+    pub vehicle: usize,
+    /// Where it was to be bound.
+    pub at: SocketAddr,
+    /// Why.
+    pub source: io::Error,
 }
 
 impl Sockets {
-    /// Binds both sockets with the receive buffer asked for; says so when the kernel gives less.
+    /// Binds what the vehicles ask for, with the receive buffers asked for; says so when the kernel gives less.
     ///
     /// # Errors
-    /// What the kernel says, with the address it says it of.
-    pub fn bind(udp: &Udp) -> std::io::Result<Self> {
-        let bind = |at: SocketAddr, what: &str| {
-            bind(at, udp.receive_buffer_bytes)
-                .map_err(|error| std::io::Error::new(error.kind(), format!("udp {what} {at}: {error}")))
-        };
-        Ok(Self { data: bind(udp.data, "data")?, telemetry: bind(udp.telemetry, "telemetry")? })
+    /// [`BindError`] for the first socket that cannot be had.
+    pub fn bind(vehicles: &[Vehicle]) -> Result<Self, BindError> {
+        let bound = listeners(vehicles).into_iter().map(|listener| match bind(&listener) {
+            Ok((socket, at)) => Ok((socket, at, listener)),
+            Err(source) => Err(BindError { vehicle: listener.routes[0].vehicle, at: listener.at, source }),
+        });
+        Ok(Self(bound.collect::<Result<_, _>>()?))
     }
 
-    /// The addresses really bound: data, telemetry.
+    /// Where a vehicle's first sensor that sends datagrams is heard: data, telemetry.
+    pub fn addresses(&self, vehicle: usize) -> Option<(SocketAddr, SocketAddr)> {
+        let source = self.0.iter().flat_map(|(.., l)| &l.routes).find(|route| route.vehicle == vehicle)?.source;
+        let hears = |l: &Listener| l.routes.iter().any(|route| (route.vehicle, route.source) == (vehicle, source));
+        let mut at = self.0.iter().filter(|(.., listener)| hears(listener)).map(|(_, at, _)| *at);
+        // Data comes before telemetry in `listeners`; both may arrive at one socket.
+        let data = at.next()?;
+        Some((data, at.next().unwrap_or(data)))
+    }
+
+    /// Reads all sockets, each on a thread of its own, until the [`Readers`] are stopped; `doors` in the order of the
+    /// vehicles.
     ///
     /// # Errors
-    /// What the kernel says.
-    pub fn addresses(&self) -> std::io::Result<(SocketAddr, SocketAddr)> {
-        Ok((self.data.local_addr()?, self.telemetry.local_addr()?))
-    }
-
-    /// Reads both sockets until the engine stops; `senders` gives each sensor's sender, in the order of the sensors.
-    pub async fn run(self, senders: Vec<Option<Sender>>, door: Door) {
-        tokio::join!(read(self.data, &senders, &door), read(self.telemetry, &senders, &door));
+    /// What the system says where it has no thread or pipe to give.
+    pub fn read(self, doors: &[Door]) -> io::Result<Readers> {
+        let (stopped, stop) = io::pipe()?;
+        let mut threads = Vec::new();
+        for (socket, at, listener) in self.0 {
+            let (doors, stopped) = (doors.to_vec(), stopped.try_clone()?);
+            let read = move || {
+                if let Err(error) = read(socket, &listener, &doors, &stopped) {
+                    tracing::error!(%at, %error, "udp ended");
+                }
+            };
+            threads.push(std::thread::Builder::new().name(format!("udp {}", at.port())).spawn(read)?);
+        }
+        Ok(Readers { stop, threads })
     }
 }
 
-/// The configured senders in the order of the sensors.
-pub fn senders(from: &BTreeMap<String, Sender>, sensors: impl Iterator<Item = impl AsRef<str>>) -> Vec<Option<Sender>> {
-    sensors.map(|name| from.get(name.as_ref()).copied()).collect()
+/// The running threads; they end when this is dropped.
+#[derive(Debug)]
+pub struct Readers {
+    stop: PipeWriter,
+    threads: Vec<JoinHandle<()>>,
 }
 
-fn bind(at: SocketAddr, receive_buffer_bytes: usize) -> std::io::Result<UdpSocket> {
-    let socket = Socket::new(Domain::for_address(at), Type::DGRAM, Some(Protocol::UDP))?;
-    socket.set_recv_buffer_size(receive_buffer_bytes)?;
+impl Readers {
+    /// Ends all threads, and has their doors tell what stayed outside. Blocks until that is done.
+    pub fn stop(self) {
+        drop(self.stop);
+        for thread in self.threads {
+            if thread.join().is_err() {
+                tracing::error!("a udp thread panicked");
+            }
+        }
+    }
+}
+
+fn bind(listener: &Listener) -> io::Result<(Socket, SocketAddr)> {
+    let Listener { at, receive_buffer_bytes, groups, .. } = listener;
+    let socket = Socket::new(Domain::for_address(*at), Type::DGRAM, Some(Protocol::UDP))?;
+    socket.set_recv_buffer_size(*receive_buffer_bytes)?;
     // Linux reports twice what it was asked for: half of it is its own bookkeeping.
-    let given = socket.recv_buffer_size()? / if cfg!(target_os = "linux") { 2 } else { 1 };
-    if given < receive_buffer_bytes {
+    let given = socket.recv_buffer_size()? / 2;
+    if given < *receive_buffer_bytes {
         tracing::warn!(%at, asked = receive_buffer_bytes, given, "receive buffer clamped: raise net.core.rmem_max");
     }
     socket.set_nonblocking(true)?;
-    socket.bind(&at.into())?;
-    UdpSocket::from_std(socket.into())
+    if at.is_ipv6() {
+        // [::] hears IPv4 too, whatever net.ipv6.bindv6only says.
+        socket.set_only_v6(false)?;
+    }
+    socket.bind(&(*at).into())?;
+    for (group, interface) in groups {
+        join(&socket, *group, interface).map_err(|error| {
+            io::Error::new(error.kind(), format!("join {group} on interface {interface:?}: {error}"))
+        })?;
+    }
+    let at = socket.local_addr()?.as_socket().ok_or(io::ErrorKind::AddrNotAvailable)?;
+    Ok((socket, at))
 }
 
-async fn read(socket: UdpSocket, senders: &[Option<Sender>], door: &Door) {
-    let mut buffer = vec![0; DATAGRAM_MAX];
-    loop {
-        let (length, peer) = match socket.recv_from(&mut buffer).await {
-            Ok(received) => received,
-            // A receive error belongs to one datagram (an ICMP answer, say); the socket goes on.
-            Err(error) => {
-                tracing::warn!(%error, "udp receive");
-                tokio::task::yield_now().await;
-                continue;
-            }
-        };
-        let Some(source) = source_of(senders, peer) else {
-            door.refuse("source");
-            continue;
-        };
-        if door.enter(source, Body::Datagram(Bytes::copy_from_slice(&buffer[..length]))).is_err() {
-            return;
+fn join(socket: &Socket, group: IpAddr, interface: &str) -> io::Result<()> {
+    let index = if interface.is_empty() { None } else { Some(if_nametoindex(interface)?) };
+    match group {
+        IpAddr::V4(group) => {
+            let any = InterfaceIndexOrAddress::Address(Ipv4Addr::UNSPECIFIED);
+            let on = index.map_or(any, InterfaceIndexOrAddress::Index);
+            socket.join_multicast_v4_n(&group, &on)?;
+            // Otherwise every group that anybody on this host has joined is heard.
+            socket.set_multicast_all_v4(false)
+        }
+        IpAddr::V6(group) => {
+            socket.join_multicast_v6(&group, index.unwrap_or(0))?;
+            socket.set_multicast_all_v6(false)
         }
     }
 }
 
-/// The sensor a peer speaks for: the one it is configured for, or the one that takes anybody.
-fn source_of(senders: &[Option<Sender>], peer: SocketAddr) -> Option<u16> {
-    let index = senders.iter().position(|sender| sender.is_none_or(|sender| sender.is(peer)))?;
-    u16::try_from(index).ok()
-}
-
-/// Datagrams the kernel dropped at sockets bound to these ports, from `/proc/net/udp`; `None` where there is no such file.
-pub fn kernel_drops(addresses: &[SocketAddr]) -> Option<u64> {
-    let mut drops = 0;
-    for table in ["/proc/net/udp", "/proc/net/udp6"] {
-        let Ok(text) = std::fs::read_to_string(table) else { continue };
-        drops += drops_in(&text, addresses)?;
-    }
-    Some(drops)
-}
-
-fn drops_in(table: &str, addresses: &[SocketAddr]) -> Option<u64> {
-    let mut drops = 0;
-    for line in table.lines().skip(1) {
-        let mut columns = line.split_whitespace();
-        let port = columns.nth(1)?.rsplit_once(':').and_then(|(_, port)| u16::from_str_radix(port, 16).ok())?;
-        if addresses.iter().any(|address| address.port() == port) {
-            drops += columns.last()?.parse::<u64>().ok()?;
+/// Reads one socket until `stopped` has no other end any more, or every engine behind it has stopped.
+fn read(socket: Socket, listener: &Listener, doors: &[Door], stopped: &PipeReader) -> io::Result<()> {
+    let mut receiver = Receiver::new(socket)?;
+    let mut heard: Vec<Heard> = Vec::new();
+    for route in &listener.routes {
+        if !heard.iter().any(|heard| heard.vehicle == route.vehicle) {
+            heard.push(Heard { vehicle: route.vehicle, door: &doors[route.vehicle], readings: Vec::new() });
         }
     }
-    Some(drops)
+    let mut batch = Vec::with_capacity(BATCH);
+    while wait(receiver.socket(), stopped)? {
+        match receiver.receive(&mut batch) {
+            Ok(drops) => heard.iter().for_each(|heard| heard.door.leave_outside(0, Cause::Kernel, drops)),
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => continue,
+            // It belongs to one datagram (an ICMP answer, say); the socket goes on.
+            Err(error) => tracing::warn!(at = %listener.at, %error, "udp receive"),
+        }
+        for datagram in batch.drain(..) {
+            sort(datagram, listener, &mut heard);
+        }
+        heard.retain_mut(|heard| heard.enter().is_ok());
+        if heard.is_empty() {
+            return Ok(());
+        }
+    }
+    for heard in heard {
+        // A closed door has nobody to tell.
+        let _ = heard.door.close();
+    }
+    Ok(())
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
+/// One vehicle that is heard at a socket.
+struct Heard<'a> {
+    vehicle: usize,
+    door: &'a Door,
+    /// What came for it in one batch.
+    readings: Vec<(u16, Body)>,
+}
 
-    #[test]
-    fn a_sensor_without_a_sender_takes_anybody_and_a_sensor_with_one_takes_nobody_else() {
-        let peer: SocketAddr = "192.168.1.201:2368".parse().unwrap();
-        let stranger: SocketAddr = "192.168.1.7:2368".parse().unwrap();
-        assert_eq!(source_of(&[None], stranger), Some(0));
-        let known = Some(Sender::Address(peer.ip()));
-        let other = Some(Sender::Socket("192.168.1.202:2368".parse().unwrap()));
-        assert_eq!(source_of(&[other, known], peer), Some(1));
-        assert_eq!(source_of(&[other, known], stranger), None);
+impl Heard<'_> {
+    fn enter(&mut self) -> Result<(), Closed> {
+        if self.readings.is_empty() { Ok(()) } else { self.door.enter_all(self.readings.drain(..)) }
     }
+}
 
-    #[test]
-    fn the_kernels_drops_are_read_from_its_table() {
-        let table = "   sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  timeout inode ref pointer drops\n  \
-            412: 00000000:0940 00000000:0000 07 00000000:00000000 00:00000000 00000000  0 0 3811 2 0000000000000000 17\n  \
-            413: 00000000:2074 00000000:0000 07 00000000:00000000 00:00000000 00000000  0 0 3812 2 0000000000000000 4\n";
-        assert_eq!(drops_in(table, &["0.0.0.0:2368".parse().unwrap()]), Some(17));
-        assert_eq!(drops_in(table, &["0.0.0.0:1".parse().unwrap()]), Some(0));
+/// Gives a datagram to its vehicle. A stranger's is counted by the first vehicle of the socket, so that each datagram is in
+/// one ledger.
+fn sort(datagram: Received, listener: &Listener, heard: &mut [Heard<'_>]) {
+    let Some(route) = listener.route(datagram.peer) else {
+        if let Some(first) = heard.first() {
+            first.door.refuse_stranger(datagram.peer);
+        }
+        return;
+    };
+    let Some(heard) = heard.iter_mut().find(|heard| heard.vehicle == route.vehicle) else { return };
+    if datagram.length > DATAGRAM_BYTES_MAX {
+        heard.door.leave_outside(route.source, Cause::Length, 1);
+    } else {
+        heard.readings.push((route.source, Body::Datagram(datagram.payload)));
+    }
+}
+
+/// Waits for a datagram; `false` when there is nothing more to wait for.
+fn wait(socket: &Socket, stopped: &PipeReader) -> io::Result<bool> {
+    let mut ends = [PollFd::new(socket.as_fd(), PollFlags::POLLIN), PollFd::new(stopped.as_fd(), PollFlags::POLLIN)];
+    match poll(&mut ends, PollTimeout::NONE) {
+        Ok(_) => Ok(ends[1].revents().is_none_or(|happened| happened.is_empty())),
+        // A signal.
+        Err(nix::Error::EINTR) => Ok(true),
+        Err(error) => Err(error.into()),
     }
 }

@@ -1,0 +1,75 @@
+//! What the UDP door takes: datagrams over loopback, from a thread that sends them, to an engine that only counts them.
+//!
+//!   cargo bench -p clearway-server --bench udp                       flat out, 2,000,000 datagrams
+//!   cargo bench -p clearway-server --bench udp -- 6254 60            6,254 a second for 60 seconds, nothing may be lost
+//!
+//! Every datagram is accounted for: sent = taken + lost in the queue + dropped by the kernel.
+
+use std::net::UdpSocket;
+use std::time::{Duration, Instant};
+
+use clearway_mapping::event::Body;
+use clearway_mapping::pipeline::Ledger;
+use clearway_server::config::{Config, Udp};
+use clearway_server::ingest::{door, udp};
+
+/// Datagrams between two looks at the clock.
+const BURST: u64 = 32;
+
+fn main() {
+    let numbers: Vec<u64> = std::env::args().skip(1).filter_map(|argument| argument.parse().ok()).collect();
+    let (rate, count) = match numbers[..] {
+        [rate, seconds] => (Some(rate), rate * seconds),
+        [count] => (None, count),
+        _ => (None, 2_000_000),
+    };
+    let mut config = Config::of_one_vehicle("car", "top");
+    let any = "127.0.0.1:0".parse().expect("an address");
+    config.vehicles[0].udp = Some(Udp { data: any, telemetry: any, ..Udp::default() });
+    let sockets = udp::Sockets::bind(&config.vehicles).expect("free ports");
+    let (data, _) = sockets.addresses(0).expect("a socket");
+    let (door, events) = door(config.vehicles[0].queue);
+    let readers = sockets.read(std::slice::from_ref(&door)).expect("threads");
+    let outside = door.outside();
+    drop(door);
+
+    let sender = std::thread::spawn(move || {
+        let socket = UdpSocket::bind("127.0.0.1:0").expect("a free port");
+        socket.connect(data).expect("loopback");
+        let began = Instant::now();
+        for number in 0..count {
+            if let Some(rate) = rate.filter(|_| number % BURST == 0) {
+                let due = Duration::from_secs_f64(number as f64 / rate as f64);
+                std::thread::sleep(due.saturating_sub(began.elapsed()));
+            }
+            socket.send(&[0x5a; 1206]).expect("loopback takes datagrams");
+        }
+        let took = began.elapsed();
+        // The kernel tells its drops with the next datagram it takes; by now there is space for one.
+        std::thread::sleep(Duration::from_millis(500));
+        socket.send(&[]).expect("loopback takes datagrams");
+        took
+    });
+    let (mut taken, mut ledger) = (0, Ledger::default());
+    let mut took = Duration::ZERO;
+    let began = Instant::now();
+    for event in &events {
+        match event.body {
+            Body::Lost { cause, count } => ledger.stayed_outside(cause, count),
+            Body::Datagram(payload) if payload.is_empty() => break,
+            _ => {
+                taken += 1;
+                took = began.elapsed();
+            }
+        }
+    }
+    let sending = sender.join().expect("no panic");
+    drop(events);
+    readers.stop();
+    outside.add_to(&mut ledger, []);
+    let per_second = |n: u64, took: Duration| n as f64 / took.as_secs_f64();
+    println!("sent    {count:>9} in {:.2} s, {:.0} a second", sending.as_secs_f64(), per_second(count, sending));
+    println!("taken   {taken:>9} in {:.2} s, {:.0} a second", took.as_secs_f64(), per_second(taken, took));
+    println!("lost    {:>9} in the queue, {} in the kernel", ledger.lost, ledger.kernel_drops);
+    assert_eq!(taken + ledger.lost + ledger.kernel_drops, count, "every datagram is accounted for");
+}

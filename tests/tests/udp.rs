@@ -1,0 +1,325 @@
+//! Datagrams over real sockets: nothing is lost without being counted, and maps do not tell a socket from a file.
+
+mod house;
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufReader;
+use std::net::{SocketAddr, UdpSocket};
+use std::path::{Path, PathBuf};
+
+use clearway_lidar::capture::Capture;
+use clearway_mapping::event::{Body, Cause};
+use clearway_mapping::pipeline::{Ledger, Pipeline};
+use clearway_proto::v1;
+use clearway_server::config::{Config, Sender, Udp};
+use clearway_server::ingest::door;
+use clearway_server::recording::{Entry, Recording};
+use clearway_server::replay::{Options, replay};
+use clearway_server::server::Running;
+use clearway_server::verify::verify;
+use house::{config, recorded, start, until, within};
+use proptest::prelude::Rng;
+use proptest::test_runner::{RngAlgorithm, TestRng};
+use prost::Message;
+
+const HDL32: &str = "pcap/rust-lidar-utils/hdl32_example.pcap";
+const VLP16: &str = "pcap/opendlv/proxy-velodyne16/sampleShort.pcap";
+
+fn adds_up(ledger: &Ledger) -> bool {
+    ledger.received == ledger.decoded + ledger.telemetry + ledger.refused.values().sum::<u64>()
+}
+
+fn ledger(running: &Running, vehicle: usize) -> Ledger {
+    running.vehicles.0[vehicle].status.snapshot().ledger
+}
+
+fn socket(from: &str) -> UdpSocket {
+    UdpSocket::bind((from, 0)).expect("a free port")
+}
+
+/// A port that nobody else asks for at this address.
+fn port_at(address: &str) -> SocketAddr {
+    socket(address).local_addr().expect("bound")
+}
+
+/// Data packets of the simulated vehicle, and a telemetry datagram.
+fn datagrams() -> (Vec<Vec<u8>>, Vec<u8>) {
+    let all: Vec<Vec<u8>> = house::vehicle().take(1500).map(|datagram| datagram.payload).collect();
+    let telemetry = all.iter().find(|payload| payload.len() == 512).expect("one a turn").clone();
+    (all.into_iter().filter(|payload| payload.len() == 1206).collect(), telemetry)
+}
+
+/// The ledger a recording's events add up to.
+fn replayed(record: &Path, vehicle: &str) -> Ledger {
+    let mut recording = Recording::open(record).unwrap();
+    let (config, tables) = recording.config().unwrap();
+    let index = config.vehicles.iter().position(|v| v.name == vehicle).unwrap();
+    let mut pipeline = Pipeline::new(&config.vehicles[index].core(), tables[index].clone()).unwrap();
+    for entry in &mut recording {
+        if let Entry::Event { vehicle: of, event } = entry.unwrap()
+            && of == vehicle
+        {
+            let _ = pipeline.step(&event);
+        }
+    }
+    pipeline.ledger().clone()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording() {
+    let folder = tempfile::tempdir().unwrap();
+    let record = folder.path().join("d.mcap");
+    let mut config = config();
+    config.recorder.file = record.clone();
+    let vehicle = &mut config.vehicles[0];
+    // The telemetry's socket hears IPv4 and IPv6.
+    let (data, telemetry) = ("127.0.0.1:0".parse().unwrap(), "[::]:0".parse().unwrap());
+    let mut side = vehicle.sensors[0].clone();
+    side.name = "side".into();
+    vehicle.sensors.push(side);
+    let sender = |name: &str, address: &str| (name.to_owned(), Sender::Address(address.parse().unwrap()));
+    let from = BTreeMap::from([sender("top", "127.0.0.2"), sender("side", "127.0.0.4")]);
+    vehicle.udp = Some(Udp { data, telemetry, from, ..Udp::default() });
+    let running = start(config).await;
+    let (data, telemetry) = running.doors[0].udp.unwrap();
+    let telemetry = SocketAddr::new("127.0.0.1".parse().unwrap(), telemetry.port());
+
+    let (packets, position) = datagrams();
+    let (sensor, stranger, side) = (socket("127.0.0.2"), socket("127.0.0.3"), socket("127.0.0.4"));
+    let mut broken = packets[0].clone();
+    broken[0] = 0;
+    // In turns of one batch or less, so that the kernel's buffer holds whatever the machine does meanwhile.
+    let mut sent = 0;
+    for packet in &packets {
+        sensor.send_to(packet, data).unwrap();
+        sent += 1;
+        until("each is taken", || ledger(&running, 0).received + 50 > sent).await;
+    }
+    sensor.send_to(&position, telemetry).unwrap();
+    for _ in 0..3 {
+        sensor.send_to(&[], data).unwrap();
+        sensor.send_to(&packets[0][..1205], data).unwrap();
+        sensor.send_to(&broken, data).unwrap();
+        sensor.send_to(&[0xff; 1536], data).unwrap();
+        sensor.send_to(&[0xff; 1537], data).unwrap();
+        sensor.send_to(&[0xff; 65_507], data).unwrap();
+        side.send_to(&packets[0], data).unwrap();
+        side.send_to(&[0xff; 65_507], data).unwrap();
+        stranger.send_to(&packets[0], data).unwrap();
+        stranger.send_to(&position, telemetry).unwrap();
+        let stranger = UdpSocket::bind("[::1]:0").unwrap();
+        stranger.send_to(&position, SocketAddr::new("::1".parse().unwrap(), telemetry.port())).unwrap();
+    }
+    sent += 1 + 3 * 11;
+    until("all are counted", || ledger(&running, 0).received == sent).await;
+
+    let counted = ledger(&running, 0);
+    assert!(adds_up(&counted), "{counted:?}");
+    assert_eq!((counted.decoded, counted.telemetry), (packets.len() as u64 + 3, 1));
+    assert_eq!(counted.refused, [("block_flag", 3), ("length", 18), ("source", 9)].into());
+    assert_eq!((counted.lost, counted.kernel_drops), (0, 0));
+    let status = running.vehicles.0[0].status.clone();
+    let sensors = status.snapshot().sensors;
+    assert!(sensors.iter().all(|sensor| adds_up(&sensor.ledger)), "{sensors:?}");
+    assert_eq!((sensors[0].ledger.decoded, sensors[0].ledger.telemetry), (packets.len() as u64, 1));
+    assert_eq!(sensors[0].ledger.refused, [("block_flag", 3), ("length", 15)].into());
+    assert_eq!((sensors[1].ledger.received, sensors[1].ledger.decoded, sensors[1].ledger.refused["length"]), (6, 3, 3));
+    let metrics = clearway_server::status::prometheus(std::slice::from_ref(&status));
+    let line = "clearway_sensor_refused_total{vehicle=\"car\",sensor=\"side\",reason=\"length\"} 3\n";
+    assert!(metrics.contains(line), "{metrics}");
+    let strangers = status.to_proto().strangers;
+    let known = strangers.iter().find(|s| s.address == stranger.local_addr().unwrap().to_string());
+    assert_eq!(known.expect("the stranger is shown").datagrams, 6);
+    assert_eq!(strangers.len(), 4, "{strangers:?}");
+
+    within("shutdown", running.shutdown()).await.unwrap();
+    assert_eq!(status.snapshot().ledger, counted);
+    assert_eq!(replayed(&record, "car"), counted, "the recording tells what stayed outside too");
+    assert!(verify(&record).unwrap().is_good());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_group_is_heard_on_its_interface() {
+    let mut config = config();
+    let groups = vec!["239.255.77.1".parse().unwrap()];
+    let any = "0.0.0.0:0".parse().unwrap();
+    config.vehicles[0].udp = Some(Udp { data: any, telemetry: any, groups, interface: "lo".into(), ..Udp::default() });
+    let running = start(config).await;
+    let (data, _) = running.doors[0].udp.unwrap();
+    let sender = socket2::Socket::from(socket("127.0.0.1"));
+    sender.set_multicast_if_v4(&"127.0.0.1".parse().unwrap()).unwrap();
+    let sender = UdpSocket::from(sender);
+    sender.send_to(&datagrams().0[0], ("239.255.77.1", data.port())).unwrap();
+    until("the datagram to the group is taken", || ledger(&running, 0).decoded == 1).await;
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[test]
+fn a_million_datagrams_add_up_exactly() {
+    let seed = 7;
+    println!("seed {seed}");
+    let mut seed_bytes = [0; 32];
+    seed_bytes[0] = seed;
+    let mut random = TestRng::from_seed(RngAlgorithm::ChaCha, &seed_bytes);
+    let mut config = config();
+    config.vehicles[0].sensors[0].model = Some(clearway_sim::scanner::ScannerConfig::default().model);
+    let maps = &mut config.vehicles[0].maps;
+    (maps.drivability.enabled, maps.height_difference.enabled, maps.terrain.enabled) = (false, false, false);
+    let mut pipeline = Pipeline::new(&config.vehicles[0].core(), vec![None]).unwrap();
+    let (door, events) = door(256);
+
+    let (packets, position) = datagrams();
+    let mut broken = packets[0].clone();
+    broken[0] = 0;
+    let kinds = [position, broken, Vec::new(), vec![0; 1205], vec![0; 1536]].map(bytes::Bytes::from);
+    let packets: Vec<_> = packets.into_iter().map(bytes::Bytes::from).collect();
+    let total = 1_000_000;
+    let (mut sent, mut outside, mut next) = (0_u64, [0_u64; 3], 0);
+    while sent < total {
+        let size = u64::from(random.next_u32() % 64).min(total - sent);
+        sent += size;
+        let mut readings = Vec::new();
+        for _ in 0..size {
+            match random.next_u32() % 16 {
+                0 => {
+                    door.refuse_stranger(([10, 0, 0, (random.next_u32() % 16) as u8], 2368).into());
+                    outside[0] += 1;
+                }
+                1 => {
+                    door.leave_outside(0, Cause::Length, 1);
+                    outside[1] += 1;
+                }
+                2 => {
+                    door.leave_outside(0, Cause::Kernel, 1);
+                    outside[2] += 1;
+                }
+                kind @ 3..8 => readings.push((0, Body::Datagram(kinds[kind as usize - 3].clone()))),
+                _ => {
+                    readings.push((0, Body::Datagram(packets[next % packets.len()].clone())));
+                    next += 1;
+                }
+            }
+        }
+        door.enter_all(readings).unwrap();
+        // An engine that stalls now and then.
+        if random.next_u32() % 8 == 0 {
+            events.try_iter().for_each(|event| drop(pipeline.step(&event)));
+        }
+    }
+    events.try_iter().for_each(|event| drop(pipeline.step(&event)));
+    door.close().unwrap();
+    events.try_iter().for_each(|event| drop(pipeline.step(&event)));
+
+    let ledger = pipeline.ledger();
+    assert!(adds_up(ledger), "{ledger:?}");
+    assert_eq!(ledger.received + ledger.lost + ledger.kernel_drops, total);
+    assert_eq!((ledger.refused["source"], ledger.kernel_drops), (outside[0], outside[2]));
+    assert!(ledger.refused["length"] > outside[1] && ledger.refused["block_flag"] > 0 && ledger.telemetry > 0);
+    assert!(ledger.decoded > total / 4 && ledger.lost > total / 100, "{ledger:?}");
+}
+
+fn drive(path: &str) -> PathBuf {
+    Path::new(env!("CLEARWAY_DATA")).join(path)
+}
+
+/// The vehicle `name` with a level sensor 1.9 m up, heard at `at` from `from`.
+fn heard_at(name: &str, at: SocketAddr, from: &str) -> clearway_server::config::Vehicle {
+    let mut vehicle = Config::of_one_vehicle(name, "top").vehicles.remove(0);
+    vehicle.sensors[0].extrinsics.z_m = 1.9;
+    let from = [("top".to_owned(), Sender::Address(from.parse().unwrap()))].into();
+    vehicle.udp = Some(Udp { data: at, telemetry: at, from, ..Udp::default() });
+    vehicle
+}
+
+/// A copy of a capture that begins with its first telemetry datagram. These captures are years old: sent today, their sensors'
+/// own clocks must be known before the first turn is stamped, as stamps never go back.
+fn with_its_clock_first(capture: &Path, copy: PathBuf) -> PathBuf {
+    const FILE_HEADER: usize = 24;
+    const RECORD_HEADER: usize = 16;
+    const TELEMETRY_FRAME: usize = 14 + 20 + 8 + 512;
+    let bytes = std::fs::read(capture).unwrap();
+    let (mut records, mut rest) = (Vec::new(), &bytes[FILE_HEADER..]);
+    while let Some(length) = rest.get(8..12) {
+        let length = RECORD_HEADER + u32::from_le_bytes(length.try_into().unwrap()) as usize;
+        // One of them is cut in its last datagram.
+        let Some((record, after)) = rest.split_at_checked(length) else { break };
+        records.push(record);
+        rest = after;
+    }
+    let telemetry = records.iter().position(|record| record.len() == RECORD_HEADER + TELEMETRY_FRAME).unwrap();
+    records[..=telemetry].rotate_right(1);
+    std::fs::write(&copy, [&bytes[..FILE_HEADER], &records.concat()].concat()).unwrap();
+    copy
+}
+
+/// Sends a capture's datagrams as fast as it goes; gives their number.
+fn send(capture: &Path, from: &str, to: SocketAddr) -> u64 {
+    let socket = socket(from);
+    let capture = Capture::new(BufReader::new(File::open(capture).unwrap())).unwrap();
+    capture.map(|datagram| socket.send_to(&datagram.unwrap().payload, to).unwrap()).count() as u64
+}
+
+/// A map without what says when and where it was made: arrivals, the vehicle's name and the server's run. The stamps of the
+/// capture itself are the sensor's, and stay.
+fn without_arrival(map: &[u8]) -> v1::Map {
+    let mut map = v1::Map::decode(map).unwrap();
+    let header = map.header.as_mut().unwrap();
+    (header.vehicle, header.boot_id, header.completed_ns) = (String::new(), 0, 0);
+    map
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+async fn two_captures_sent_to_one_port_at_once_give_both_vehicles_the_maps_of_their_files() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let captures = [("car", HDL32, "127.0.0.2"), ("van", VLP16, "127.0.0.3")]
+        .map(|(vehicle, capture, from)| (vehicle, with_its_clock_first(&drive(capture), at(vehicle)), from));
+    let one_port = port_at("127.9.9.9");
+    let mut config = config();
+    config.vehicles = captures.iter().map(|(vehicle, _, from)| heard_at(vehicle, one_port, from)).collect();
+    config.recorder.file = at("live.mcap");
+    let extrinsics = config.vehicles[0].sensors[0].extrinsics;
+    let running = start(config).await;
+    let senders = captures.clone().map(|(_, capture, from)| std::thread::spawn(move || send(&capture, from, one_port)));
+    let sent = senders.map(|sender| sender.join().unwrap());
+    assert_eq!(sent, [976, 347]);
+    until("all are taken", || [0, 1].map(|vehicle| ledger(&running, vehicle).received) == sent).await;
+    within("shutdown", running.shutdown()).await.unwrap();
+    let live = recorded_of(&at("live.mcap"));
+
+    for (vehicle, capture, _) in captures {
+        let record = at("file.mcap");
+        let options = Options {
+            files: vec![capture],
+            record: Some(record.clone()),
+            extrinsics: Some(extrinsics),
+            ..Options::default()
+        };
+        within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
+        let mut file: Vec<_> = recorded(&record).into_iter().collect();
+        // The file's end gives the last, unfinished turn; a socket has no end.
+        let last = file.last().unwrap().0.0;
+        file.retain(|((sequence, _), _)| *sequence < last);
+        assert!(file.len() >= 3 * house::LAYERS as usize, "{} maps", file.len());
+        let live: Vec<_> = live.iter().filter(|((of, ..), _)| of == vehicle).collect();
+        assert_eq!(live.len(), file.len(), "{vehicle}");
+        for (((_, sequence, layer), live), (key, file)) in live.into_iter().zip(file) {
+            assert_eq!((*sequence, layer), (key.0, &key.1));
+            let (live, file) = (without_arrival(live), without_arrival(&file));
+            assert_eq!(live.header, file.header, "{vehicle}, map {sequence}, layer {layer}");
+            assert!(live.layers == file.layers, "{vehicle}, map {sequence}, layer {layer}");
+        }
+    }
+}
+
+/// The recorded bytes by vehicle, sequence and layer.
+fn recorded_of(file: &Path) -> BTreeMap<(String, u64, String), bytes::Bytes> {
+    let entries = Recording::open(file).unwrap().map(|entry| entry.unwrap());
+    let maps = entries.filter_map(|entry| match entry {
+        Entry::Map { vehicle, layer, bytes } => Some(((vehicle, house::sequence(&bytes), layer), bytes)),
+        _ => None,
+    });
+    maps.collect()
+}
