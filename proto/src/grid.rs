@@ -163,3 +163,27 @@ fn turned(x: f64, y: f64, angle: f64) -> (f64, f64) {
     let (sin, cos) = angle.sin_cos();
     (x * cos - y * sin, x * sin + y * cos)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_grid_that_turns_under_the_vehicle_is_looked_up_along_its_own_axes() {
+        let grid =
+            |yaw_rad| Grid::Cartesian { origin_x_m: -2.0, origin_y_m: -2.0, width: 4, height: 4, cell_m: 1.0, yaw_rad };
+        // The vehicle heads along the grid's y axis: ahead is up the rows, to the left is down the columns.
+        let quarter = grid(TAU / 4.0);
+        assert_eq!(
+            [(1.5, 0.5), (-0.5, 1.5), (2.5, 0.0)].map(|(x, y)| quarter.cell_at(x, y)),
+            [Some(13), Some(4), None]
+        );
+        for yaw_rad in [0.0, 0.3, -2.0, 4.0] {
+            let grid = grid(yaw_rad);
+            for cell in 0..16 {
+                let (x, y) = grid.centre_of(cell).unwrap();
+                assert_eq!(grid.cell_at(x, y), Some(cell), "yaw {yaw_rad}");
+            }
+        }
+    }
+}
