@@ -12,6 +12,8 @@ const DRIVABLE: [u8; 3] = [64, 176, 128];
 const WEAKLY_DRIVABLE: [u8; 3] = [44, 112, 88];
 const NOT_DRIVABLE: [u8; 3] = [232, 176, 64];
 const OBSTACLE: [u8; 3] = [176, 40, 48];
+const HIDDEN: [u8; 3] = [92, 92, 128];
+const OUT_OF_RANGE: [u8; 3] = [14, 15, 17];
 const ROAD: [u8; 3] = [120, 190, 240];
 const PATH: [u8; 3] = [250, 250, 240];
 /// For classes this version has no colour for.
@@ -81,12 +83,14 @@ impl Colours {
         if let Some(channel) = layer.channels.iter().position(|channel| channel.name == "class") {
             let colour = |(class, name): (usize, &String)| match name.as_str() {
                 "unknown" => UNKNOWN,
-                "drivable" | "flat" | "passable" => DRIVABLE,
+                "drivable" | "flat" | "passable" | "clear" => DRIVABLE,
                 "flat_inferred" | "free" => WEAKLY_DRIVABLE,
                 "not_drivable" | "flat_elevated" | "flat_unreachable" => NOT_DRIVABLE,
                 "road" => ROAD,
                 "path" => PATH,
-                "obstacle" => OBSTACLE,
+                "obstacle" | "occupied" => OBSTACLE,
+                "occluded" => HIDDEN,
+                "out_of_range" => OUT_OF_RANGE,
                 _ => OTHERS[class % OTHERS.len()],
             };
             return Self::Classes(channel, layer.legend.iter().enumerate().map(colour).collect());

@@ -19,7 +19,8 @@ pub enum Grid {
         /// At least 1.
         columns: u32,
     },
-    /// Cell index = iy * width + ix; cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m).
+    /// Cell index = iy * width + ix; cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m) along the grid's
+    /// axes, which begin at the ego frame's origin.
     Cartesian {
         /// Metres.
         origin_x_m: f64,
@@ -31,6 +32,8 @@ pub enum Grid {
         height: u32,
         /// Edge of a cell, metres.
         cell_m: f32,
+        /// Heading of the ego frame in the grid's axes; 0 where these are the vehicle's own.
+        yaw_rad: f64,
     },
 }
 
@@ -62,7 +65,7 @@ impl Grid {
                 Ok(Self::Radial { r_bench_m: r_bench_m.clone(), columns: *columns })
             }
             Some(v1::layer::Geometry::Cartesian(grid)) => {
-                let v1::CartesianGrid { origin_x_m, origin_y_m, width, height, cell_m } = *grid;
+                let v1::CartesianGrid { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad } = *grid;
                 if width == 0 || height == 0 {
                     return Err(wrong(format!("{width} x {height} cells; at least 1 x 1 is needed")));
                 }
@@ -72,7 +75,10 @@ impl Grid {
                 if !origin_x_m.is_finite() || !origin_y_m.is_finite() {
                     return Err(wrong(format!("origin ({origin_x_m}, {origin_y_m}) m; finite values are needed")));
                 }
-                Ok(Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m })
+                if !yaw_rad.is_finite() {
+                    return Err(wrong(format!("yaw {yaw_rad} rad; a finite value is needed")));
+                }
+                Ok(Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad })
             }
         }
     }
@@ -108,7 +114,8 @@ impl Grid {
                 let column = ((turn * f64::from(*columns)) as usize).min(*columns as usize - 1);
                 Some(row * *columns as usize + column)
             }
-            Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m } => {
+            Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad } => {
+                let (x_m, y_m) = turned(x_m, y_m, *yaw_rad);
                 let ix = ((x_m - origin_x_m) / f64::from(*cell_m)).floor();
                 let iy = ((y_m - origin_y_m) / f64::from(*cell_m)).floor();
                 let inside = ix >= 0.0 && ix < f64::from(*width) && iy >= 0.0 && iy < f64::from(*height);
@@ -130,22 +137,52 @@ impl Grid {
                 let (sin, cos) = ((column as f64 + 0.5) / f64::from(*columns) * TAU).sin_cos();
                 (range_m * cos, range_m * sin)
             }
-            Self::Cartesian { origin_x_m, origin_y_m, width, cell_m, .. } => {
+            Self::Cartesian { origin_x_m, origin_y_m, width, cell_m, yaw_rad, .. } => {
                 let (ix, iy) = (index % *width as usize, index / *width as usize);
                 let edge = f64::from(*cell_m);
-                (origin_x_m + (ix as f64 + 0.5) * edge, origin_y_m + (iy as f64 + 0.5) * edge)
+                turned(origin_x_m + (ix as f64 + 0.5) * edge, origin_y_m + (iy as f64 + 0.5) * edge, -yaw_rad)
             }
         })
     }
 
-    /// The farthest point of the grid from the vehicle, metres.
+    /// How far the grid reaches from the vehicle along its own axes, metres.
     pub fn range_m_max(&self) -> f64 {
         match self {
             Self::Radial { r_bench_m, .. } => r_bench_m.last().map_or(0.0, |&r| f64::from(r)),
-            Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m } => {
+            Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, .. } => {
                 let end_x = origin_x_m + f64::from(*width) * f64::from(*cell_m);
                 let end_y = origin_y_m + f64::from(*height) * f64::from(*cell_m);
                 origin_x_m.abs().max(end_x.abs()).max(origin_y_m.abs()).max(end_y.abs())
+            }
+        }
+    }
+}
+
+/// A place turned counter-clockwise about the origin; by 0 it stays what it is, to the bit.
+fn turned(x: f64, y: f64, angle: f64) -> (f64, f64) {
+    let (sin, cos) = angle.sin_cos();
+    (x * cos - y * sin, x * sin + y * cos)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_grid_that_turns_under_the_vehicle_is_looked_up_along_its_own_axes() {
+        let grid =
+            |yaw_rad| Grid::Cartesian { origin_x_m: -2.0, origin_y_m: -2.0, width: 4, height: 4, cell_m: 1.0, yaw_rad };
+        // The vehicle heads along the grid's y axis: ahead is up the rows, to the left is down the columns.
+        let quarter = grid(TAU / 4.0);
+        assert_eq!(
+            [(1.5, 0.5), (-0.5, 1.5), (2.5, 0.0)].map(|(x, y)| quarter.cell_at(x, y)),
+            [Some(13), Some(4), None]
+        );
+        for yaw_rad in [0.0, 0.3, -2.0, 4.0] {
+            let grid = grid(yaw_rad);
+            for cell in 0..16 {
+                let (x, y) = grid.centre_of(cell).unwrap();
+                assert_eq!(grid.cell_at(x, y), Some(cell), "yaw {yaw_rad}");
             }
         }
     }

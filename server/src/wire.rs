@@ -126,8 +126,8 @@ fn layer(layer: &Layer) -> v1::Layer {
         Geometry::Radial { r_bench_m, columns } => {
             v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m: r_bench_m.clone(), columns: u32::from(*columns) })
         }
-        &Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m } => {
-            v1::layer::Geometry::Cartesian(v1::CartesianGrid { origin_x_m, origin_y_m, width, height, cell_m })
+        &Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad } => {
+            v1::layer::Geometry::Cartesian(v1::CartesianGrid { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad })
         }
     };
     let columns = match &layer.geometry {

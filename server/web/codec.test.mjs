@@ -106,8 +106,15 @@ test("columns run counter-clockwise from ahead and a bench belongs to the row wi
 });
 
 test("a cartesian cell begins at its lower edge", () => {
-  const grid = gridOf({ cartesian: { origin_x_m: -1, origin_y_m: -1, width: 3, height: 2, cell_m: 1 } });
+  const grid = gridOf({ cartesian: { origin_x_m: -1, origin_y_m: -1, width: 3, height: 2, cell_m: 1, yaw_rad: 0 } });
   assert.deepEqual([grid.cellAt(-1, -1), grid.cellAt(1.5, 0.5), grid.cellAt(2, 0), grid.cellAt(0, 1)], [0, 5, -1, -1]);
+});
+
+test("a grid that turns under the vehicle is looked up along its own axes", () => {
+  // The vehicle heads along the grid's y axis: ahead is up the rows, to the left is down the columns.
+  const yaw_rad = Math.PI / 2;
+  const grid = gridOf({ cartesian: { origin_x_m: -2, origin_y_m: -2, width: 4, height: 4, cell_m: 1, yaw_rad } });
+  assert.deepEqual([grid.cellAt(1.5, 0.5), grid.cellAt(-0.5, 1.5), grid.cellAt(2.5, 0)], [13, 4, -1]);
 });
 
 test("ahead is up and left is left", () => {

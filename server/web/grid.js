@@ -42,21 +42,23 @@ function radial({ r_bench_m, columns }) {
   return { key: `radial ${columns} ${r_bench_m.join()}`, cells, radius_m: benches[rows - 1], cellAt };
 }
 
-function cartesian({ origin_x_m, origin_y_m, width, height, cell_m }) {
+function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad }) {
   const cells = width * height;
   if (cells === 0 || cells > CELLS_MAX) {
     throw new Refused("geometry", `${width} x ${height} cells; allowed are 1 to ${CELLS_MAX}`);
   }
   if (!(cell_m > 0 && cell_m < Infinity)) throw new Refused("geometry", `cell_m is ${cell_m}; it must be over 0`);
-  if (!Number.isFinite(origin_x_m + origin_y_m)) {
-    throw new Refused("geometry", `origin is (${origin_x_m}, ${origin_y_m}) m; it must be finite`);
+  if (!Number.isFinite(origin_x_m + origin_y_m + yaw_rad)) {
+    throw new Refused("geometry", `origin is (${origin_x_m}, ${origin_y_m}) m, yaw ${yaw_rad} rad; they must be finite`);
   }
+  const cos = Math.cos(yaw_rad), sin = Math.sin(yaw_rad);
   const cellAt = (x, y) => {
-    const ix = Math.floor((x - origin_x_m) / cell_m), iy = Math.floor((y - origin_y_m) / cell_m);
+    const ix = Math.floor((x * cos - y * sin - origin_x_m) / cell_m);
+    const iy = Math.floor((x * sin + y * cos - origin_y_m) / cell_m);
     return ix >= 0 && ix < width && iy >= 0 && iy < height ? iy * width + ix : -1;
   };
   const edges = [origin_x_m, origin_x_m + width * cell_m, origin_y_m, origin_y_m + height * cell_m];
-  const key = `cartesian ${origin_x_m} ${origin_y_m} ${width} ${height} ${cell_m}`;
+  const key = `cartesian ${origin_x_m} ${origin_y_m} ${width} ${height} ${cell_m} ${yaw_rad}`;
   return { key, cells, radius_m: Math.max(...edges.map(Math.abs)), cellAt };
 }
 
@@ -66,7 +68,8 @@ export function egoAt(px, py, size, view_m) {
   return { x: (size / 2 - py - 0.5) * metres, y: (size / 2 - px - 0.5) * metres };
 }
 
-// Layers of one map mostly share a geometry, so their panels share a table. A view change makes new ones.
+// Layers of one map mostly share a geometry, so their panels share a table. A view change makes new ones, and so does each
+// map of a grid that turns under the vehicle; the table used longest ago goes.
 const TABLES_KEPT = 4;
 const tables = new Map();
 
@@ -82,7 +85,8 @@ export function pixelCells(grid, size, view_m) {
       }
     }
     if (tables.size >= TABLES_KEPT) tables.delete(tables.keys().next().value);
-    tables.set(key, table);
   }
+  tables.delete(key);
+  tables.set(key, table);
   return table;
 }

@@ -13,6 +13,10 @@ const CLASSES = {
   flat_unreachable: [170, 128, 60],
   passable: [28, 158, 150],
   free: [22, 110, 106],
+  clear: [28, 158, 150],
+  occupied: [196, 38, 56],
+  occluded: [92, 92, 128],
+  out_of_range: [24, 26, 30],
   road: [120, 190, 240],
   path: [250, 250, 240],
 };

@@ -114,7 +114,7 @@ const HEADER = {
 const RADIAL = { 1: ["r_bench_m", many(float)], 2: ["columns", uint32] };
 const CARTESIAN = {
   1: ["origin_x_m", double], 2: ["origin_y_m", double], 3: ["width", uint32], 4: ["height", uint32],
-  5: ["cell_m", float],
+  5: ["cell_m", float], 6: ["yaw_rad", double],
 };
 const PLANE = { 1: ["a", double], 2: ["b", double], 3: ["c", double] };
 const CHANNEL = {

@@ -65,13 +65,17 @@ class RadialGrid:
 
 @dataclass(frozen=True)
 class CartesianGrid:
-    """Array shape (height, width), indexed [iy, ix]: cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m)."""
+    """Array shape (height, width), indexed [iy, ix]: cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m).
+
+    Along the grid's axes, which begin at the ego frame's origin and in which that frame has the heading `yaw_rad`.
+    """
 
     origin_x_m: float
     origin_y_m: float
     width: int
     height: int
     cell_m: float
+    yaw_rad: float = 0.0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -79,16 +83,20 @@ class CartesianGrid:
 
     def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Cell index of each point, -1 outside the grid."""
-        ix = np.floor((x_m - self.origin_x_m) / self.cell_m).astype(np.int64)
-        iy = np.floor((y_m - self.origin_y_m) / self.cell_m).astype(np.int64)
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        ix = np.floor((x_m * cos - y_m * sin - self.origin_x_m) / self.cell_m).astype(np.int64)
+        iy = np.floor((x_m * sin + y_m * cos - self.origin_y_m) / self.cell_m).astype(np.int64)
         inside = (ix >= 0) & (ix < self.width) & (iy >= 0) & (iy < self.height)
         return np.where(inside, iy * self.width + ix, -1)
 
     def centres(self) -> np.ndarray:
-        """Middle of every cell, shape (height, width, 2)."""
-        x = self.origin_x_m + (np.arange(self.width) + 0.5) * self.cell_m
-        y = self.origin_y_m + (np.arange(self.height) + 0.5) * self.cell_m
-        return np.stack(np.meshgrid(x, y), axis=-1)
+        """Middle of every cell in the ego frame, shape (height, width, 2)."""
+        x, y = np.meshgrid(
+            self.origin_x_m + (np.arange(self.width) + 0.5) * self.cell_m,
+            self.origin_y_m + (np.arange(self.height) + 0.5) * self.cell_m,
+        )
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        return np.stack([x * cos + y * sin, y * cos - x * sin], axis=-1)
 
 
 Grid = RadialGrid | CartesianGrid
@@ -307,9 +315,10 @@ def _grid(message: map_pb2.Layer) -> Grid:
             return RadialGrid(benches, message.radial.columns)
     elif kind == "cartesian":
         grid = message.cartesian
-        finite = all(map(math.isfinite, (grid.origin_x_m, grid.origin_y_m, grid.cell_m)))
+        finite = all(map(math.isfinite, (grid.origin_x_m, grid.origin_y_m, grid.cell_m, grid.yaw_rad)))
         if grid.width and grid.height and finite and grid.cell_m > 0:
-            return CartesianGrid(grid.origin_x_m, grid.origin_y_m, grid.width, grid.height, grid.cell_m)
+            yaw_rad = grid.yaw_rad
+            return CartesianGrid(grid.origin_x_m, grid.origin_y_m, grid.width, grid.height, grid.cell_m, yaw_rad)
     geometry = getattr(message, kind) if kind else "none"
     raise DecodeError("geometry", f"layer {message.name!r}, geometry: {geometry}")
 

@@ -15,6 +15,8 @@
 //! | [`pose`] | scene, time -> where the vehicle is |
 //! | [`raycast`] | world, rays -> what they meet |
 //! | [`scanner`] | world, poses, one sensor's figures -> firings of raw returns |
+//! | [`planes`] | world, poses, a unit of a few planes -> whole scans, with the rays that met nothing |
+//! | [`traffic`] | six such units on a car in traffic, and the ground each object covers |
 //! | [`encode`] | firings -> 1206-byte data packets |
 //! | [`telemetry`] | place, speed, time -> 512-byte telemetry datagrams |
 //! | [`vehicle`] | all of the above: datagrams without end |
@@ -29,12 +31,14 @@ pub mod impair;
 pub mod noise;
 pub mod object;
 pub mod plan;
+pub mod planes;
 pub mod pose;
 pub mod raycast;
 pub mod scanner;
 pub mod scenes;
 pub mod send;
 pub mod telemetry;
+pub mod traffic;
 pub mod truth;
 pub mod vehicle;
 pub mod world;

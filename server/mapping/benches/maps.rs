@@ -5,20 +5,24 @@
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{
-    DrivabilityConfig, Form, HeightDifferenceConfig, MotionConfig, SafePathConfig, SpeedConfig, TerrainConfig,
+    DrivabilityConfig, Form, HeightDifferenceConfig, MotionConfig, OccupancyConfig, SafePathConfig, SpeedConfig,
+    TerrainConfig,
 };
 use clearway_mapping::drivability::Drivability;
 use clearway_mapping::event::{EgoPose, Road, RoadFrame, RoadPurpose, Scan};
 use clearway_mapping::height_difference::HeightDifference;
-use clearway_mapping::map::{Context, LayerMaker};
+use clearway_mapping::map::{Context, LayerMaker, Rays};
 use clearway_mapping::motion::{Motion, Moved};
+use clearway_mapping::occupancy::Occupancy;
 use clearway_mapping::road::TakenRoad;
 use clearway_mapping::safe_path::SafePath;
 use clearway_mapping::series::Series;
 use clearway_mapping::speed::Speed;
 use clearway_mapping::sweep::{Mount, Sweep};
 use clearway_mapping::terrain::Terrain;
+use clearway_sim::planes::PlaneUnit;
 use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::traffic;
 use clearway_sim::vehicle::SimulatedVehicle;
 use divan::Bencher;
 use divan::counter::ItemsCount;
@@ -166,4 +170,93 @@ fn safe_path(bencher: Bencher) {
     let mut layer = map.layer();
     let context = Context { earlier: &earlier, ..Context::default() };
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make_with(&sweep, &context, &mut layer));
+}
+
+/// What six units of four planes send in 100 ms from a vehicle in traffic: 52,800 rays, those without a return among them.
+fn six_units() -> Vec<(Sweep, [f32; 3])> {
+    let scene = traffic::street(0.0);
+    let scan = |unit: &PlaneUnit, number| {
+        let scan = unit.scan(&scene, number);
+        let mut sweep = Sweep::default();
+        for i in 0..scan.x.len() {
+            let point = nalgebra::Point3::new(scan.x[i], scan.y[i], scan.z[i]).cast::<f64>();
+            let point = (unit.ego_from_sensor * point).cast::<f32>();
+            sweep.x.push(point.x);
+            sweep.y.push(point.y);
+            sweep.z.push(point.z);
+        }
+        (sweep, unit.ego_from_sensor.translation.vector.cast::<f32>().into())
+    };
+    let units = traffic::six_units();
+    (1..=5).flat_map(|number| units.iter().map(move |unit| (unit, number))).map(|(u, n)| scan(u, n)).collect()
+}
+
+/// All scans of 100 ms and the layer written.
+#[divan::bench]
+fn occupancy_of_six_units(bencher: Bencher) {
+    let scans = six_units();
+    let mut map = Occupancy::new(&OccupancyConfig::default());
+    let mut layer = map.layer();
+    let pose = Some(nalgebra::Isometry3::identity());
+    let context = Context { map_from_ego: pose, ..Context::default() };
+    bencher.counter(ItemsCount::new(52_800_usize)).bench_local(|| {
+        for (number, (returns, origin_m)) in scans.iter().enumerate() {
+            let rays = Rays {
+                sensor: (number % 6) as u16,
+                stamp_ns: 0,
+                returns,
+                origin_m: *origin_m,
+                no_returns: &[],
+                map_from_ego: pose,
+                speed_mps: Some(0.0),
+            };
+            map.take(&rays);
+        }
+        map.make_with(&Sweep::default(), &context, &mut layer);
+    });
+}
+
+/// The floor beside it: a plain Bresenham line for each return, from its sensor to the border, one store a cell.
+#[divan::bench]
+fn bresenham_of_six_units(bencher: Bencher) {
+    const SIDE: i32 = 400;
+    let scans = six_units();
+    let mut cells = vec![0_u8; (SIDE * SIDE) as usize];
+    bencher.counter(ItemsCount::new(52_800_usize)).bench_local(|| {
+        for (sweep, [ox, oy, _]) in &scans {
+            let cell = |metres: f32| (metres * 4.0).floor() as i32 + SIDE / 2;
+            let (x0, y0) = (cell(*ox), cell(*oy));
+            for (x, y) in sweep.x.iter().zip(&sweep.y) {
+                let (hit_x, hit_y) = (cell(*x), cell(*y));
+                let far = 100.0 / ((x - ox).hypot(y - oy)).max(0.1);
+                let (x1, y1) = (cell(ox + (x - ox) * far), cell(oy + (y - oy) * far));
+                let (dx, dy) = ((x1 - x0).abs(), -(y1 - y0).abs());
+                let (sx, sy) = ((x1 - x0).signum(), (y1 - y0).signum());
+                let (mut x, mut y, mut error, mut state) = (x0, y0, dx + dy, 1);
+                while (0..SIDE).contains(&x) && (0..SIDE).contains(&y) {
+                    state = if (x, y) == (hit_x, hit_y) { 3 } else { state };
+                    cells[(y * SIDE + x) as usize] = state;
+                    let twice = 2 * error;
+                    (x, error) = if twice >= dy { (x + sx, error + dy) } else { (x, error) };
+                    (y, error) = if twice <= dx { (y + sy, error + dx) } else { (y, error) };
+                }
+            }
+        }
+        divan::black_box(&cells);
+    });
+}
+
+/// One turn of an HDL-64E and the layer written.
+#[divan::bench]
+fn occupancy_of_a_turn(bencher: Bencher) {
+    let sweep = sweep();
+    let mut map = Occupancy::new(&OccupancyConfig::default());
+    let mut layer = map.layer();
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| {
+        let origin_m = [0.0, 0.0, sweep.mount_height_m];
+        let returns = &sweep;
+        let (map_from_ego, speed_mps) = (Some(nalgebra::Isometry3::identity()), Some(0.0));
+        map.take(&Rays { sensor: 0, stamp_ns: 0, returns, origin_m, no_returns: &[], map_from_ego, speed_mps });
+        map.make(&sweep, &mut layer);
+    });
 }

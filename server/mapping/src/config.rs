@@ -11,9 +11,11 @@ use clearway_lidar::model::Model;
 
 mod fusion;
 mod maps;
+mod occupancy;
 
 pub use fusion::*;
 pub use maps::*;
+pub use occupancy::OccupancyConfig;
 
 /// Sensors of one vehicle, declared ones included: each keeps its newest turn, some megabytes.
 pub const SENSORS_MAX: usize = 32;

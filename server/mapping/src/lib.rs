@@ -20,6 +20,7 @@
 //! | [`scan_file`] | KITTI `.bin`, `.pcd` -> scan |
 //! | [`series`] | revolution -> how far each range lies from its laser's neighbouring ones |
 //! | [`terrain`] | Neuhaus 2009 §2 |
+//! | [`occupancy`] | Seo 2014 §2 |
 //! | [`road`] | RDDF and RNDF files, checked roads |
 //! | [`speed`] | Lindström 2005 |
 //! | [`safe_path`] | thesis §VI |
@@ -35,6 +36,7 @@ pub mod ledger;
 pub mod map;
 pub mod motion;
 pub mod mount;
+pub mod occupancy;
 pub mod pipeline;
 pub mod radial;
 mod rings;

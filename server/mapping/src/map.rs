@@ -205,11 +205,13 @@ pub enum Geometry {
         /// Number of columns.
         columns: u16,
     },
-    /// Square cells: index = iy * width + ix; cell (ix, iy) spans `origin + i * cell_m` to `origin + (i + 1) * cell_m`.
+    /// Square cells: index = iy * width + ix; cell (ix, iy) spans `origin + i * cell_m` to `origin + (i + 1) * cell_m` along
+    /// the grid's axes, which begin at the ego frame's origin: `(x cos yaw - y sin yaw, x sin yaw + y cos yaw)` are the
+    /// grid's coordinates of the ego frame's (x, y).
     Cartesian {
-        /// Corner of cell (0, 0), metres forward.
+        /// Corner of cell (0, 0), metres along the grid's x axis.
         origin_x_m: f64,
-        /// Corner of cell (0, 0), metres to the left.
+        /// Corner of cell (0, 0), metres along the grid's y axis.
         origin_y_m: f64,
         /// Cells along x.
         width: u32,
@@ -217,6 +219,8 @@ pub enum Geometry {
         height: u32,
         /// Side of a cell.
         cell_m: f32,
+        /// Heading of the ego frame in the grid's axes; 0 where these are the vehicle's own.
+        yaw_rad: f64,
     },
 }
 

@@ -19,6 +19,7 @@ use crate::ledger::Dropped;
 pub use crate::ledger::{Ledger, Rejected};
 use crate::map::{Context, LayerMaker, Map};
 use crate::motion::{Compensation, Motion};
+use crate::occupancy::Occupancy;
 use crate::road::{self, Roads};
 use crate::safe_path::SafePath;
 use crate::speed::Speed;
@@ -286,6 +287,9 @@ fn layer_makers(maps: &MapsConfig) -> Vec<Box<dyn LayerMaker>> {
     }
     if maps.terrain.enabled {
         makers.push(Box::new(Terrain::new(&maps.terrain)));
+    }
+    if maps.occupancy.enabled {
+        makers.push(Box::new(Occupancy::new(&maps.occupancy)));
     }
     if maps.speed.enabled {
         makers.push(Box::new(Speed::new(&maps.speed)));

@@ -166,7 +166,7 @@ impl RadialGrid {
 /// whole columns, a world turned by 90 degrees gives the same columns, a quarter further. Within the quadrant the angle is
 /// off by less than 2 µrad, a tenth of a millimetre at 60 m.
 #[derive(Clone, Debug, Default, PartialEq)]
-struct Quadrants {
+pub(crate) struct Quadrants {
     columns: u16,
     columns_a_rad: f32,
     /// Column that holds each quadrant's beginning, and where in it the quadrant begins, 0 to 1.
@@ -177,7 +177,7 @@ struct Quadrants {
 }
 
 impl Quadrants {
-    fn new(columns: u16) -> Self {
+    pub(crate) fn new(columns: u16) -> Self {
         let quarters = [0, 1, 2, 3].map(|quadrant| quadrant * u32::from(columns));
         Self {
             columns,
@@ -189,7 +189,7 @@ impl Quadrants {
     }
 
     #[inline(always)]
-    fn column(&self, x: f32, y: f32) -> u32 {
+    pub(crate) fn column(&self, x: f32, y: f32) -> u32 {
         // Quadrants are half-open: [0, 90°) has x > 0, y >= 0, and so on around.
         let second = x <= 0.0 && y > 0.0;
         let third = x < 0.0 && y <= 0.0;

@@ -98,6 +98,7 @@ impl LayerMaker for SafePath {
                 width: side,
                 height: side,
                 cell_m: self.config.cell_m,
+                yaw_rad: 0.0,
             },
             legend: LEGEND,
             channels: vec![Channel {

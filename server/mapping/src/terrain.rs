@@ -222,7 +222,14 @@ impl LayerMaker for Terrain {
         let side = 2 * half as u32;
         Layer {
             name: "terrain",
-            geometry: Geometry::Cartesian { origin_x_m: origin, origin_y_m: origin, width: side, height: side, cell_m },
+            geometry: Geometry::Cartesian {
+                origin_x_m: origin,
+                origin_y_m: origin,
+                width: side,
+                height: side,
+                cell_m,
+                yaw_rad: 0.0,
+            },
             legend: LEGEND,
             channels,
             planes: Vec::new(),

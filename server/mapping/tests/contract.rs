@@ -4,11 +4,12 @@ mod common;
 
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{
-    DrivabilityConfig, Form, HeightDifferenceConfig, SafePathConfig, SpeedConfig, TerrainConfig,
+    DrivabilityConfig, Form, HeightDifferenceConfig, OccupancyConfig, SafePathConfig, SpeedConfig, TerrainConfig,
 };
 use clearway_mapping::drivability::Drivability;
 use clearway_mapping::height_difference::HeightDifference;
 use clearway_mapping::map::{Cells, Context, Layer, LayerMaker, SafePoint};
+use clearway_mapping::occupancy::Occupancy;
 use clearway_mapping::safe_path::{self, SafePath};
 use clearway_mapping::speed::Speed;
 use clearway_mapping::sweep::Sweep;
@@ -33,6 +34,20 @@ impl LayerMaker for Behind {
     }
 }
 
+/// The occupancy of one turn.
+struct Taken(Occupancy);
+
+impl LayerMaker for Taken {
+    fn layer(&self) -> Layer {
+        self.0.layer()
+    }
+
+    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
+        self.0.take(&rays(sweep));
+        self.0.make(sweep, layer);
+    }
+}
+
 /// Share of the judged cells that are drivable, or passable; `None` in maps that do not judge cells.
 fn share(layer: &Layer) -> Option<f64> {
     let named = |(name, _): &&(&str, f64)| ["drivable_share", "passable_share"].contains(name);
@@ -52,6 +67,7 @@ fn makers() -> Vec<Box<dyn LayerMaker>> {
     }
     makers.push(Box::new(Speed::new(&SpeedConfig::default())));
     let drivability = Drivability::new(&DrivabilityConfig::default());
+    makers.push(Box::new(Taken(Occupancy::new(&OccupancyConfig::default()))));
     makers.push(Box::new(Behind { drivability, safe_path: SafePath::new(&SafePathConfig::default()) }));
     makers
 }
@@ -104,7 +120,8 @@ fn a_wall_is_an_obstacle_to_every_map() {
         let layer = make(maker.as_mut(), &sweep);
         // A wall within a cell may show in the cell before or behind where grids are turned into one another.
         let name = |x| layer.legend[usize::from(classes(&layer)[cell_at(&layer, x, 0.01).unwrap()])];
-        assert!([14.76, 15.01, 15.26].iter().any(|x| name(*x) == "obstacle"), "{} straight ahead, 15 m", layer.name);
+        let stands = |x: &f32| ["obstacle", "occupied"].contains(&name(*x));
+        assert!([14.76, 15.01, 15.26].iter().any(stands), "{} straight ahead, 15 m", layer.name);
     }
 }
 

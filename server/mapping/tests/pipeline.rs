@@ -103,7 +103,7 @@ fn a_drive_becomes_a_map_a_turn_and_the_end_gives_the_rest_as_partial() {
     assert!(whole.capture_end_ns - whole.capture_start_ns > 95_000_000);
     assert!(whole.completed_ns >= whole.capture_end_ns);
     let names: Vec<&str> = whole.layers.iter().map(|layer| layer.name).collect();
-    assert_eq!(names, ["drivability", "height_difference", "terrain", "speed", "safe_path"]);
+    assert_eq!(names, ["drivability", "height_difference", "terrain", "occupancy", "speed", "safe_path"]);
     assert!(common::figure(&whole.layers[0], "drivable_share") > 0.95);
     assert_eq!(made.last().unwrap().sensors[0].partial, "end");
     assert_eq!(made.last().unwrap().completed_ns, 7);

@@ -20,7 +20,7 @@ use prost::Message;
 use tonic::transport::Channel;
 
 /// Layers of a map by the default configuration.
-pub const LAYERS: u64 = 5;
+pub const LAYERS: u64 = 6;
 
 /// Nothing in these tests takes a tenth of it; a test that hangs must end all the same.
 const PATIENCE: Duration = Duration::from_secs(120);

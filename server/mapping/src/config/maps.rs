@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{ConfigError, check};
+use super::{ConfigError, OccupancyConfig, check};
 
 /// Which maps are made, each in its own table. A map that is switched off costs nothing.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -18,6 +18,8 @@ pub struct MapsConfig {
     pub height_difference: HeightDifferenceConfig,
     /// Neuhaus' terrain map.
     pub terrain: TerrainConfig,
+    /// Seo's occupancy map.
+    pub occupancy: OccupancyConfig,
     /// Lindström's speed map.
     pub speed: SpeedConfig,
     /// The thesis' safe points.
@@ -32,6 +34,7 @@ impl Default for MapsConfig {
             drivability: DrivabilityConfig::default(),
             height_difference: HeightDifferenceConfig::default(),
             terrain: TerrainConfig::default(),
+            occupancy: OccupancyConfig::default(),
             speed: SpeedConfig::default(),
             safe_path: SafePathConfig::default(),
         }
@@ -358,13 +361,11 @@ impl MapsConfig {
     /// Every map switched off.
     pub fn none() -> Self {
         let mut maps = Self::default();
-        (maps.drivability.enabled, maps.height_difference.enabled) = (false, false);
-        (maps.terrain.enabled, maps.speed.enabled, maps.safe_path.enabled) = (false, false, false);
+        (maps.drivability.enabled, maps.height_difference.enabled, maps.terrain.enabled) = (false, false, false);
+        (maps.occupancy.enabled, maps.speed.enabled, maps.safe_path.enabled) = (false, false, false);
         maps
     }
-}
 
-impl MapsConfig {
     /// Checks every value of every map, whether made or not.
     ///
     /// # Errors
@@ -403,6 +404,7 @@ impl MapsConfig {
         check(f64::from(difference.difference_m_max), 0.01..=10.0, key, "0.01 to 10")?;
         check_columns(at, difference.columns)?;
         self.terrain.validate("vehicle.maps.terrain")?;
+        self.occupancy.validate("vehicle.maps.occupancy")?;
         self.speed.validate("vehicle.maps.speed")?;
         self.safe_path.validate("vehicle.maps.safe_path")
     }
@@ -492,7 +494,7 @@ impl SafePathConfig {
 }
 
 /// 1000 cells a side keep a message of one-byte cells under 1 MB.
-fn check_cells(at: &str, extent_m: f32, cell_m: f32) -> Result<(), ConfigError> {
+pub(super) fn check_cells(at: &str, extent_m: f32, cell_m: f32) -> Result<(), ConfigError> {
     if extent_m / cell_m <= 500.0 {
         return Ok(());
     }

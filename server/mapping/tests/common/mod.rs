@@ -2,12 +2,14 @@
 #![allow(dead_code)]
 
 pub mod labels;
+pub mod opencalib;
+pub mod street;
 
 use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::map::{Cells, Geometry, Layer};
+use clearway_mapping::map::{Cells, Geometry, Layer, Rays};
 use clearway_mapping::radial::RadialGrid;
 use clearway_mapping::sweep::Sweep;
 
@@ -107,9 +109,10 @@ pub fn size(layer: &Layer) -> (usize, usize) {
 pub fn cell_at(layer: &Layer, x: f32, y: f32) -> Option<usize> {
     match &layer.geometry {
         Geometry::Radial { r_bench_m, columns } => RadialGrid::new(r_bench_m.clone(), *columns).cell(x, y),
-        Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m } => {
-            let place = |v: f32, origin: f64| ((f64::from(v) - origin) / f64::from(*cell_m)).floor();
-            let (i, j) = (place(x, *origin_x_m), place(y, *origin_y_m));
+        Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad } => {
+            let ((x, y), (sin, cos)) = ((f64::from(x), f64::from(y)), yaw_rad.sin_cos());
+            let place = |v: f64, origin: f64| ((v - origin) / f64::from(*cell_m)).floor();
+            let (i, j) = (place(x * cos - y * sin, *origin_x_m), place(x * sin + y * cos, *origin_y_m));
             let inside = i >= 0.0 && j >= 0.0 && i < f64::from(*width) && j < f64::from(*height);
             inside.then(|| j as usize * *width as usize + i as usize)
         }
@@ -187,4 +190,17 @@ pub fn kitti(path: &str) -> clearway_mapping::event::Scan {
 pub fn datagrams(path: &str) -> Vec<clearway_lidar::capture::Datagram> {
     let file = std::fs::File::open(data(path)).unwrap();
     clearway_lidar::capture::Capture::new(file).unwrap().map_while(Result::ok).collect()
+}
+
+/// One sensor's turn as `take()` gets it: what came back, from a sensor at the sweep's mount.
+pub fn rays(sweep: &Sweep) -> Rays<'_> {
+    Rays {
+        sensor: 0,
+        stamp_ns: 0,
+        returns: sweep,
+        origin_m: [0.0, 0.0, sweep.mount_height_m],
+        no_returns: &[],
+        map_from_ego: None,
+        speed_mps: None,
+    }
 }

@@ -1,0 +1,113 @@
+//! The life of a cell (Seo 2014, figure 4): which state follows from the state it had and what one map's rays tell of it.
+//!
+//! In: a [`Cell`] and its [`Evidence`] since the last map. Out: the cell as it is published.
+
+/// Nobody has looked at the cell, or those who did could not tell (the paper's "unobserved").
+pub const UNKNOWN: u8 = 0;
+/// Rays passed through the cell low over the ground and met nothing in it.
+pub const CLEAR: u8 = 1;
+/// As many returns came from the cell as its speed asks for.
+pub const OCCUPIED: u8 = 2;
+/// Something nearer hides the cell.
+pub const OCCLUDED: u8 = 3;
+/// Beyond the reliable range, or outside every field of view since the last map.
+pub const OUT_OF_RANGE: u8 = 4;
+/// Names of the states, by value.
+pub const LEGEND: &[&str] = &["unknown", "clear", "occupied", "occluded", "out_of_range"];
+
+/// What the rays since the last map tell of one cell; the stronger comes later and wins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Evidence {
+    /// No sensor has sent anything.
+    Silence,
+    /// Sensors have, but none looks here.
+    Nothing,
+    /// Rays went by overhead only.
+    Overhead,
+    /// Behind something.
+    Hidden,
+    /// Low rays went through, and none came back from here.
+    Through,
+    /// The same, but earlier returns from here are not yet outweighed.
+    ThroughDoubted,
+    /// Returns, with those before fewer than it takes.
+    FewHits,
+    /// Returns, with those before as many as it takes.
+    Hits,
+}
+
+/// What follows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Next {
+    /// This state, now.
+    Go(u8),
+    /// The state it has, until it has not been confirmed for longer than `hold_maps`; then this one.
+    Hold(u8),
+}
+
+use Next::{Go, Hold};
+
+/// `TRANSITIONS[state][evidence]`.
+///
+/// Figure 4 says that a cell is first unobserved, and then occupied or occluded as sensors look; here every arrow is
+/// named. A clear cell loses that name the moment nobody looks at it; an occupied one keeps its name for a few maps,
+/// because what hides it, or a sensor's pause, does not make it go away.
+#[rustfmt::skip]
+pub const TRANSITIONS: [[Next; 8]; 5] = [
+    // Silence            Nothing             Overhead       Hidden          Through    ThroughDoubted FewHits      Hits
+    [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // unknown
+    [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // clear
+    [Hold(UNKNOWN),      Hold(OUT_OF_RANGE), Hold(UNKNOWN), Hold(OCCLUDED), Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // occupied
+    [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // occluded
+    [Go(OUT_OF_RANGE),   Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // out_of_range
+];
+
+/// What is kept of a cell from map to map.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Cell {
+    /// [`UNKNOWN`] … [`OUT_OF_RANGE`].
+    pub state: u8,
+    /// Returns counted, faded by rays that went through; 255 in an occupied cell that nothing has gone through.
+    pub hits: u8,
+    /// Maps since a ray came back from here or went through.
+    pub age: u8,
+}
+
+impl Cell {
+    /// The cell one map later: `fresh` returns came from it, and `told` is the strongest of what other rays tell
+    /// ([`Evidence::Silence`] to [`Evidence::Through`]). It takes `hits_needed` returns (at least 1) to be occupied.
+    #[inline(always)]
+    pub fn judged(self, fresh: u8, told: Evidence, hits_needed: u8, hold_maps: u8) -> Self {
+        let (mut hits, mut evidence) = (self.hits, told);
+        if fresh > 0 {
+            // Returns win over rays that went through in the same cycle: something is there, or was a moment ago.
+            hits = hits.saturating_add(fresh);
+            evidence = if hits >= hits_needed { Evidence::Hits } else { Evidence::FewHits };
+        } else if told == Evidence::Through {
+            // No longer enough at once, so that nothing leaves a trail; not forgotten at once, so that a thin thing that
+            // rays miss now and then is never clear.
+            hits = (hits >> 2).min(hits_needed - 1);
+            evidence = if hits > 0 { Evidence::ThroughDoubted } else { Evidence::Through };
+        }
+        let age = if evidence as u8 >= Evidence::Through as u8 { 0 } else { self.age.saturating_add(1) };
+        let over = age > hold_maps;
+        let state = match TRANSITIONS[usize::from(self.state)][evidence as usize] {
+            Go(state) => state,
+            Hold(later) => {
+                if over {
+                    later
+                } else {
+                    self.state
+                }
+            }
+        };
+        let hits = if evidence == Evidence::Hits {
+            u8::MAX
+        } else if over {
+            0
+        } else {
+            hits
+        };
+        Self { state, hits, age }
+    }
+}
