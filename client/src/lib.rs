@@ -36,7 +36,7 @@ pub mod zenoh;
 pub use clearway_proto::map::{Channel, Layer};
 pub use clearway_proto::{codec, grid, v1};
 
-pub use grpc::{Client, Subscription};
+pub use grpc::{Client, Subscription, Tls};
 pub use stream::{MapStream, Update};
 pub use view::{MapView, now_ns};
 #[cfg(feature = "zenoh")]
@@ -48,7 +48,9 @@ use clearway_proto::map::MapError;
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum ClientError {
     /// An address that is none.
-    #[error("server address {address:?}: {reason}; HOST:PORT or http://HOST:PORT is allowed, such as localhost:50051")]
+    #[error(
+        "server address {address:?}: {reason}; HOST:PORT is allowed, such as localhost:50051; with certificates too"
+    )]
     Address {
         /// As given.
         address: String,
