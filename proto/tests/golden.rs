@@ -205,8 +205,10 @@ fn golden_map() -> (v1::Header, v1::Layer, v1::Layer) {
             rpm: 600.0,
             completeness: 1.0,
             partial: String::new(),
+            ..Default::default()
         }],
         compensation: "poses".into(),
+        ..Default::default()
     };
     let radial = v1::RadialGrid { r_bench_m: vec![4.0, 8.0, 12.0], columns: 8 };
     let class: Vec<u8> = [[1; 8], [1, 1, 1, 1, 2, 2, 1, 1], [0, 0, 1, 1, 3, 3, 0, 0]].concat();

@@ -9,7 +9,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 
 use clearway_lidar::calibration::Calibration;
-use clearway_mapping::config::{MapsConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::config::{BodyConfig, FusionConfig, MapsConfig, SensorConfig, VehicleConfig};
 use serde::{Deserialize, Serialize};
 
 /// The configured tables by vehicle and sensor, in the order of the configuration; `None` where the factory's serves.
@@ -196,10 +196,16 @@ pub struct Vehicle {
     /// The UDP door; a vehicle without one is fed by other doors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub udp: Option<Udp>,
+    /// How one map is made of several sensors.
+    #[serde(default)]
+    pub fusion: FusionConfig,
+    /// Where the vehicle itself is; nothing is taken for it where absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub body: Option<BodyConfig>,
     /// Which maps are made, and how.
     #[serde(default)]
     pub maps: MapsConfig,
-    /// The sensors; the first one leads.
+    /// The sensors.
     #[serde(rename = "sensor")]
     pub sensors: Vec<SensorConfig>,
 }
@@ -211,7 +217,13 @@ fn queue() -> usize {
 impl Vehicle {
     /// What the core needs of it.
     pub fn core(&self) -> VehicleConfig {
-        VehicleConfig { name: self.name.clone(), sensors: self.sensors.clone(), maps: self.maps.clone() }
+        VehicleConfig {
+            name: self.name.clone(),
+            sensors: self.sensors.clone(),
+            fusion: self.fusion.clone(),
+            body: self.body,
+            maps: self.maps.clone(),
+        }
     }
 }
 
@@ -405,9 +417,6 @@ impl Config {
                 return wrong(at("queue"), &vehicle.queue, "16 to 1048576 events");
             }
             let sensors: BTreeSet<_> = vehicle.sensors.iter().map(|sensor| sensor.name.as_str()).collect();
-            if sensors.len() < vehicle.sensors.len() {
-                return wrong(at("sensor.name"), &"(twice the same)", "each sensor its own");
-            }
             if let Some(udp) = &vehicle.udp {
                 if let Some(unknown) = udp.from.keys().find(|name| !sensors.contains(name.as_str())) {
                     let known: Vec<_> = sensors.iter().copied().collect();

@@ -217,13 +217,8 @@ impl VehicleStatus {
             maps: snapshot.maps,
             newest_capture_end_ns: snapshot.newest_capture_end_ns,
             sensors: locked(&self.inside).states.clone(),
-            ledger: Some(v1::Ledger {
-                received: snapshot.ledger.received,
-                decoded: snapshot.ledger.decoded,
-                telemetry: snapshot.ledger.telemetry,
-                refused: snapshot.ledger.refused.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect(),
-                lost: snapshot.ledger.lost,
-            }),
+            ledger: Some(ledger(&snapshot.ledger)),
+            sensor_ledgers: snapshot.sensors.iter().map(|s| (s.name.clone(), ledger(&s.ledger))).collect(),
             recorder: Some(self.recorder.as_ref().map(|counts| counts.to_proto()).unwrap_or_default()),
             readers: readers
                 .map(|(name, count)| (name.to_owned(), count.load(Ordering::Relaxed)))
@@ -238,10 +233,14 @@ impl VehicleStatus {
         let proto = self.to_proto();
         let snapshot = self.snapshot();
         let (ledger, recorder) = (proto.ledger.unwrap_or_default(), proto.recorder.unwrap_or_default());
+        let mut ledger_json = self::ledger_json(&ledger);
+        ledger_json["kernel_drops"] = snapshot.kernel_drops.into();
         let sensors = proto.sensors.iter().map(|s| {
             json!({
                 "name": s.name, "model": s.model, "packets": s.packets, "refused": s.refused, "returns": s.returns,
                 "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
+                "packets_expected": s.packets_expected, "state": s.state, "age_ms": s.age_ms,
+                "ledger": proto.sensor_ledgers.get(&s.name).map(self::ledger_json),
             })
         });
         json!({
@@ -253,10 +252,7 @@ impl VehicleStatus {
             "now_ns": now_ns().to_string(),
             "drivable_share": snapshot.drivable_share,
             "sensors": sensors.collect::<Vec<_>>(),
-            "ledger": {
-                "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
-                "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": snapshot.kernel_drops,
-            },
+            "ledger": ledger_json,
             "recorder": {
                 "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
                 "stopped": self.recorder.as_ref().and_then(|counts| counts.stopped()),
@@ -266,6 +262,27 @@ impl VehicleStatus {
             "latency_ms": { "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 },
             "alive": self.is_alive(),
         })
+    }
+}
+
+fn ledger_json(ledger: &v1::Ledger) -> Value {
+    json!({
+        "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
+        "refused": ledger.refused, "lost": ledger.lost, "points_dropped": ledger.points_dropped,
+        "own_body": ledger.own_body, "through_body": ledger.through_body,
+    })
+}
+
+fn ledger(ledger: &Ledger) -> v1::Ledger {
+    v1::Ledger {
+        received: ledger.received,
+        decoded: ledger.decoded,
+        telemetry: ledger.telemetry,
+        refused: ledger.refused.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect(),
+        lost: ledger.lost,
+        points_dropped: ledger.points_dropped,
+        own_body: ledger.own_body,
+        through_body: ledger.through_body,
     }
 }
 

@@ -250,7 +250,7 @@ fn first_difference(recorded: &Bytes, made: &Bytes) -> What {
         (was, is) => return field("message", &was.err(), &is.err()),
     };
     let (head, new) = (was.header.unwrap_or_default(), is.header.unwrap_or_default());
-    let fields: [(&str, &dyn fmt::Debug, &dyn fmt::Debug); 11] = [
+    let fields: [(&str, &dyn fmt::Debug, &dyn fmt::Debug); 12] = [
         ("header vehicle", &head.vehicle, &new.vehicle),
         ("header boot_id", &head.boot_id, &new.boot_id),
         ("header sequence", &head.sequence, &new.sequence),
@@ -262,6 +262,7 @@ fn first_difference(recorded: &Bytes, made: &Bytes) -> What {
         ("header speed_mps", &head.speed_mps, &new.speed_mps),
         ("header sensors", &head.sensors, &new.sensors),
         ("header compensation", &head.compensation, &new.compensation),
+        ("header made_by", &head.made_by, &new.made_by),
     ];
     for (name, a, b) in fields {
         // Debug prints every bit that matters: floats in full, and -0 apart from 0.

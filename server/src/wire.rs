@@ -7,8 +7,10 @@
 use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
+use clearway_mapping::config::{Extrinsics, SensorConfig};
 use clearway_mapping::event::{Body, EgoPose, Event, Road, RoadFrame, RoadPurpose, Scan};
 use clearway_mapping::map::{Cells, Geometry, Layer, Map, SafePoint, SensorState};
+use clearway_mapping::pipeline::{model_name, model_of_name};
 use clearway_proto::codec::{self, CellsRef};
 use clearway_proto::map::{encode_header, encode_layer};
 use clearway_proto::v1;
@@ -84,6 +86,7 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
         speed_mps: map.speed_mps,
         sensors: map.sensors.iter().map(sensor).collect(),
         compensation: map.compensation.as_str().to_owned(),
+        made_by: map.sensors.get(usize::from(map.made_by)).map_or(String::new(), |sensor| sensor.name.clone()),
     }
 }
 
@@ -102,6 +105,9 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
         rpm: state.rpm,
         completeness: state.completeness,
         partial: state.partial.to_owned(),
+        packets_expected: state.packets_expected,
+        state: state.state.as_str().to_owned(),
+        age_ms: state.age_ms,
     }
 }
 
@@ -184,6 +190,41 @@ fn road_from_proto(road: v1::Road) -> Result<Road, &'static str> {
     })
 }
 
+fn sensor_config(sensor: &SensorConfig) -> v1::Sensor {
+    let Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg } = sensor.extrinsics;
+    v1::Sensor {
+        name: sensor.name.clone(),
+        model: sensor.model.map(|model| model_name(model).to_owned()),
+        rpm: sensor.rpm,
+        cut_azimuth_deg: Some(sensor.cut_azimuth_deg),
+        range_m_min: Some(sensor.range_m_min),
+        elevations_deg: sensor.elevations_deg.clone(),
+        x_m,
+        y_m,
+        z_m,
+        roll_deg,
+        pitch_deg,
+        yaw_deg,
+        calibration: sensor.calibration.clone(),
+    }
+}
+
+/// `Err` names what has no counterpart.
+pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, &'static str> {
+    let v1::Sensor { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, .. } = sensor;
+    let plain = SensorConfig::new(sensor.name, Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg });
+    let model = sensor.model.map(|name| model_of_name(&name).ok_or("known sensor model")).transpose()?;
+    Ok(SensorConfig {
+        model,
+        rpm: sensor.rpm,
+        calibration: sensor.calibration,
+        cut_azimuth_deg: sensor.cut_azimuth_deg.unwrap_or(plain.cut_azimuth_deg),
+        range_m_min: sensor.range_m_min.unwrap_or(plain.range_m_min),
+        elevations_deg: sensor.elevations_deg,
+        ..plain
+    })
+}
+
 fn scan(scan: &Scan) -> v1::Scan {
     v1::Scan {
         stamp_ns: scan.stamp_ns,
@@ -216,6 +257,7 @@ pub fn event_to_proto(event: &Event) -> v1::Event {
             speed_mps: ego.speed_mps,
         }),
         Body::Road(road) => v1::event::Body::Road(self::road(road)),
+        Body::Sensor(sensor) => v1::event::Body::Sensor(sensor_config(sensor)),
         Body::Lost(events) => v1::event::Body::Lost(*events),
         Body::End => v1::event::Body::End(v1::End {}),
     };
@@ -242,12 +284,12 @@ pub enum EventError {
         source_index: u32,
     },
     /// A body this version does not know, an ego pose without a pose, a road without frame or purpose, a scan with half a
-    /// direction.
+    /// direction, a sensor of an unknown model.
     #[error("event {sequence}: no {what}")]
     Missing {
         /// The event's.
         sequence: u64,
-        /// `body`, `pose`, or what of a road or scan.
+        /// `body`, `pose`, or what of a road, scan or sensor.
         what: &'static str,
     },
 }
@@ -276,6 +318,10 @@ pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventError> {
         v1::event::Body::Road(road) => {
             Body::Road(road_from_proto(road).map_err(|what| EventError::Missing { sequence, what })?)
         }
+        v1::event::Body::Sensor(sensor) => {
+            let sensor = sensor_from_proto(sensor).map_err(|what| EventError::Missing { sequence, what })?;
+            Body::Sensor(Box::new(sensor))
+        }
         v1::event::Body::Lost(events) => Body::Lost(events),
         v1::event::Body::End(v1::End {}) => Body::End,
     };
@@ -284,6 +330,8 @@ pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventError> {
 
 #[cfg(test)]
 mod tests {
+    use clearway_mapping::map::Part;
+
     use super::*;
 
     #[test]
@@ -310,6 +358,15 @@ mod tests {
                 widths_m: vec![3.5],
                 orientations: vec![1.0, 0.25],
             }),
+            Body::Sensor(Box::new(SensorConfig {
+                model: Some(clearway_lidar::model::Model::PuckHiRes),
+                rpm: Some(600.0),
+                elevations_deg: vec![-15.0, 1.5],
+                ..SensorConfig::new(
+                    "left-2",
+                    Extrinsics { x_m: 1.0, y_m: -2.0, z_m: 0.5, roll_deg: 3.0, pitch_deg: 4.0, yaw_deg: -90.0 },
+                )
+            })),
             Body::Lost(12),
             Body::End,
         ];
@@ -363,7 +420,11 @@ mod tests {
             map_from_ego: None,
             speed_mps: None,
             compensation: clearway_mapping::motion::Compensation::Speed,
-            sensors: Vec::new(),
+            made_by: 1,
+            sensors: vec![
+                SensorState { name: "top".into(), state: Part::Late, age_ms: Some(250.5), ..SensorState::default() },
+                SensorState { name: "left".into(), packets_expected: 75, state: Part::Ok, ..SensorState::default() },
+            ],
             layers: vec![layer("drivability"), layer("height_difference")],
         }
     }
@@ -375,7 +436,9 @@ mod tests {
         assert_eq!(whole.layers.len(), 2);
         let header = whole.header.unwrap();
         assert_eq!((header.sequence, header.boot_id, header.valid_until_ns), (9, 7, 300_000_100));
-        assert_eq!(header.compensation, "speed");
+        assert_eq!((header.compensation.as_str(), header.made_by.as_str()), ("speed", "left"));
+        let sensors: Vec<_> = header.sensors.iter().map(|s| (s.state.as_str(), s.age_ms, s.packets_expected)).collect();
+        assert_eq!(sensors, [("late", Some(250.5), 0), ("ok", None, 75)]);
         let one = encoded.select(&["height_difference".into()]);
         assert_eq!(one, encoded.layer(&encoded.layers[1].1));
         let one = v1::Map::decode(one).unwrap();

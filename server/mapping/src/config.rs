@@ -1,6 +1,6 @@
 //! One vehicle's sensors and maps, as the configuration file spells them. Units in keys; unknown keys refused.
 //!
-//! In: the tables `[vehicle]`, `[[vehicle.sensor]]` and `[vehicle.maps.*]`. Out: the same as values, checked by
+//! In: the tables `[vehicle]`, `[[vehicle.sensor]]`, `[vehicle.fusion]`, `[vehicle.body]` and `[vehicle.maps.*]`. Out: the same as values, checked by
 //! [`VehicleConfig::validate`], whose errors name the key, its value and what is allowed. Lengths are metres, angles
 //! degrees here and radians everywhere behind.
 
@@ -9,9 +9,16 @@ use serde::{Deserialize, Serialize};
 
 use clearway_lidar::model::Model;
 
+mod fusion;
 mod maps;
 
+pub use fusion::*;
 pub use maps::*;
+
+/// Sensors of one vehicle, declared ones included: each keeps its newest turn, some megabytes.
+pub const SENSORS_MAX: usize = 32;
+/// Lasers of a sensor that sends scans; the largest built have 128.
+pub const RINGS_MAX: usize = 256;
 
 /// One vehicle: all the core needs to turn its events into maps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -19,9 +26,15 @@ pub use maps::*;
 pub struct VehicleConfig {
     /// Names the vehicle in keys and topics: `[a-z0-9_-]+`.
     pub name: String,
-    /// The sensors; the first one leads: its revolutions make the maps.
+    /// The sensors; an event's source is an index into them.
     #[serde(rename = "sensor")]
     pub sensors: Vec<SensorConfig>,
+    /// How one map is made of several sensors.
+    #[serde(default)]
+    pub fusion: FusionConfig,
+    /// Where the vehicle itself is; nothing is taken for it where absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub body: Option<BodyConfig>,
     /// Which maps are made, and how.
     #[serde(default)]
     pub maps: MapsConfig,
@@ -33,7 +46,7 @@ pub struct VehicleConfig {
 pub struct SensorConfig {
     /// Unique within the vehicle.
     pub name: String,
-    /// Found from the data where absent; for scans: whose elevations the grid's rows come from, and so needed there.
+    /// Found from the data where absent; for scans: whose elevations the rows of radial maps come from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub model: Option<Model>,
     /// Found from the data where absent.
@@ -48,6 +61,10 @@ pub struct SensorConfig {
     /// Returns nearer to the sensor than this are the vehicle itself and are dropped.
     #[serde(default = "own_body")]
     pub range_m_min: f32,
+    /// For scans of a sensor that is no [`Model`]: elevation of each laser, degrees. Where this is empty too, they are
+    /// measured from the rings of its first scan; where that tells none, radial maps led by it are unknown.
+    #[serde(default)]
+    pub elevations_deg: Vec<f32>,
     /// `ego_from_sensor`: x, y, z in metres, roll, pitch, yaw in degrees.
     pub extrinsics: Extrinsics,
 }
@@ -112,24 +129,87 @@ impl ConfigError {
 }
 
 impl VehicleConfig {
+    /// A vehicle with these sensors and every default.
+    pub fn new(name: impl Into<String>, sensors: Vec<SensorConfig>) -> Self {
+        let (fusion, maps) = (FusionConfig::default(), MapsConfig::default());
+        Self { name: name.into(), sensors, fusion, body: None, maps }
+    }
+
     /// Checks every value, in the order of the file.
     ///
     /// # Errors
     /// The first value that cannot be used.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_name("vehicle.name", &self.name)?;
-        if self.sensors.len() != 1 {
-            let allowed = "one [[vehicle.sensor]] a vehicle: maps are made from one sensor's revolutions";
-            return Err(ConfigError::new("vehicle.sensor", format!("{} tables", self.sensors.len()), allowed));
+        if !(1..=SENSORS_MAX).contains(&self.sensors.len()) {
+            let tables = format!("{} tables", self.sensors.len());
+            return Err(ConfigError::new("vehicle.sensor", tables, "1 to 32 [[vehicle.sensor]] a vehicle"));
         }
-        for (index, sensor) in self.sensors.iter().enumerate() {
-            sensor.validate(&format!("vehicle.sensor[{index}]"))?;
+        for index in 0..self.sensors.len() {
+            self.check_sensor(index, &self.sensors[index])?;
         }
+        if self.lead().is_none() {
+            return Err(ConfigError::new("vehicle.fusion.lead", &self.fusion.lead, "the name of one of the sensors"));
+        }
+        self.fusion.validate()?;
+        self.body.iter().try_for_each(BodyConfig::validate)?;
         self.maps.validate()
+    }
+
+    /// Index of the sensor whose turns make the maps; `None` where the name is no sensor's.
+    pub fn lead(&self) -> Option<usize> {
+        if self.fusion.lead.is_empty() {
+            return Some(0);
+        }
+        self.sensors.iter().position(|sensor| sensor.name == self.fusion.lead)
+    }
+
+    /// Takes a sensor that the file does not name as the vehicle's sensor number `index`: the next one. The same again
+    /// changes nothing, so that whoever declares it may do so whenever he connects.
+    ///
+    /// # Errors
+    /// A wrong index, a name already taken, a value that cannot be used, or a calibration file: the core reads none.
+    pub fn declare(&mut self, index: usize, sensor: &SensorConfig) -> Result<(), ConfigError> {
+        let at = || format!("vehicle.sensor[{index}]");
+        if self.sensors.get(index) == Some(sensor) {
+            return Ok(());
+        }
+        if index != self.sensors.len() || index >= SENSORS_MAX {
+            return Err(ConfigError::new("vehicle.sensor", index, "the next index, under 32"));
+        }
+        if let Some(calibration) = &sensor.calibration {
+            return Err(ConfigError::new(at() + ".calibration", calibration, "none for a declared sensor"));
+        }
+        self.check_sensor(index, sensor)?;
+        self.sensors.push(sensor.clone());
+        Ok(())
+    }
+
+    fn check_sensor(&self, index: usize, sensor: &SensorConfig) -> Result<(), ConfigError> {
+        let at = format!("vehicle.sensor[{index}]");
+        sensor.validate(&at)?;
+        match self.sensors.iter().take(index).any(|before| before.name == sensor.name) {
+            true => Err(ConfigError::new(at + ".name", &sensor.name, "each sensor its own")),
+            false => Ok(()),
+        }
     }
 }
 
 impl SensorConfig {
+    /// A sensor with every default.
+    pub fn new(name: impl Into<String>, extrinsics: Extrinsics) -> Self {
+        Self {
+            name: name.into(),
+            model: None,
+            rpm: None,
+            calibration: None,
+            cut_azimuth_deg: behind(),
+            range_m_min: own_body(),
+            elevations_deg: Vec::new(),
+            extrinsics,
+        }
+    }
+
     fn validate(&self, at: &str) -> Result<(), ConfigError> {
         check_name(&format!("{at}.name"), &self.name)?;
         if let Some(rpm) = self.rpm {
@@ -138,6 +218,13 @@ impl SensorConfig {
         }
         check(f64::from(self.cut_azimuth_deg), 0.0..=360.0, || format!("{at}.cut_azimuth_deg"), "0 to 360")?;
         check(f64::from(self.range_m_min), 0.0..=20.0, || format!("{at}.range_m_min"), "0 to 20")?;
+        if self.elevations_deg.len() > RINGS_MAX {
+            let given = format!("{} elevations", self.elevations_deg.len());
+            return Err(ConfigError::new(format!("{at}.elevations_deg"), given, "at most 256"));
+        }
+        for &elevation in &self.elevations_deg {
+            check(f64::from(elevation), -90.0..=90.0, || format!("{at}.elevations_deg"), "-90 to 90")?;
+        }
         let extrinsics = &self.extrinsics;
         for (key, value) in [("x_m", extrinsics.x_m), ("y_m", extrinsics.y_m)] {
             check(value, -20.0..=20.0, || format!("{at}.extrinsics.{key}"), "-20 to 20")?;

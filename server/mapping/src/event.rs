@@ -3,6 +3,8 @@
 use bytes::Bytes;
 use nalgebra::Isometry3;
 
+use crate::config::SensorConfig;
+
 /// One thing that happened to one vehicle, in the order the door took it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Event {
@@ -10,7 +12,7 @@ pub struct Event {
     pub sequence: u64,
     /// When the door read it, ns since the Unix epoch.
     pub arrival_ns: i64,
-    /// Index of the sensor in the vehicle's configuration; 0 where the body concerns the whole vehicle.
+    /// Index of the sensor: those of the configuration first, then those declared; 0 where the body concerns the whole vehicle.
     pub source: u16,
     /// What happened.
     pub body: Body,
@@ -27,6 +29,9 @@ pub enum Body {
     EgoPose(EgoPose),
     /// Where a road lies.
     Road(Road),
+    /// A sensor that the configuration does not name; the event's source is its index, the next one. The same again
+    /// changes nothing.
+    Sensor(Box<SensorConfig>),
     /// The door's queue was full: this many events of this source never entered.
     Lost(u64),
     /// The source has ended: an unfinished revolution becomes a partial one.

@@ -5,6 +5,11 @@
 //! | [`event`] | what enters: datagrams, scans, ego poses, roads, losses |
 //! | [`config`] | one vehicle's sensors and maps |
 //! | [`pipeline`] | `step(&Event)` conducts the hops below |
+//! | [`ledger`] | what came of every event, and why not |
+//! | `intake` | one sensor's events -> its newest turn |
+//! | `rings` | a scan's rings -> elevations of the lasers that drew them |
+//! | [`body`] | returns on or behind the vehicle itself |
+//! | [`fusion`] | whose turn makes a map, and the newest turns of all sensors in it |
 //! | [`mount`] | first revolutions -> height, pitch and roll of a sensor nobody measured |
 //! | [`motion`] | ego poses, speed + revolution -> where the vehicle was at each firing |
 //! | [`sweep`] | revolution or scan + extrinsics -> [`sweep::Sweep`] in the ego frame |
@@ -18,15 +23,20 @@
 //! | [`speed`] | Lindström 2005 |
 //! | [`safe_path`] | thesis §VI |
 
+pub mod body;
 pub mod config;
 pub mod drivability;
 pub mod event;
+pub mod fusion;
 pub mod height_difference;
+mod intake;
+pub mod ledger;
 pub mod map;
 pub mod motion;
 pub mod mount;
 pub mod pipeline;
 pub mod radial;
+mod rings;
 pub mod road;
 pub mod safe_path;
 pub mod series;

@@ -6,7 +6,7 @@ use crate::motion::Compensation;
 use crate::road::TakenRoad;
 use crate::sweep::Sweep;
 
-/// Everything made from one revolution (or scan) of one vehicle.
+/// Everything made from one revolution (or scan) of one vehicle's lead, and the newest ones of its other sensors.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Map {
     /// Counts from 0 without a hole for each vehicle.
@@ -23,14 +23,16 @@ pub struct Map {
     pub speed_mps: Option<f64>,
     /// What moved the points to `capture_end_ns`.
     pub compensation: Compensation,
-    /// The sensors that contributed.
+    /// Index of the sensor whose turn made the map: the lead, or one that stands in for it.
+    pub made_by: u16,
+    /// Every sensor of the vehicle, in the order of the configuration, whether it contributed or not.
     pub sensors: Vec<SensorState>,
     /// In the order of the configuration.
     pub layers: Vec<Layer>,
 }
 
-/// One sensor's part in a map.
-#[derive(Clone, Debug, PartialEq)]
+/// One sensor's part in a map; what counts one turn is 0 where it has none in it.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct SensorState {
     /// From the configuration.
     pub name: String,
@@ -38,7 +40,9 @@ pub struct SensorState {
     pub model: String,
     /// Data packets of this revolution.
     pub packets: u32,
-    /// Datagrams refused since the start.
+    /// Data packets of a turn like this one without loss; 0 for scans.
+    pub packets_expected: u32,
+    /// Datagrams and scans refused since the start.
     pub refused: u64,
     /// Returns in this revolution.
     pub returns: u32,
@@ -48,6 +52,44 @@ pub struct SensorState {
     pub completeness: f32,
     /// `start`, `end`, `gap`, `reversal`, `overlong`, or empty for a whole turn.
     pub partial: &'static str,
+    /// Whether its newest turn is in the map.
+    pub state: Part,
+    /// From its newest turn's end to the map's stamp; `None` before its first turn.
+    pub age_ms: Option<f32>,
+}
+
+/// Whether a sensor's newest turn is in a map, and why not.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Part {
+    /// Whole.
+    Ok,
+    /// A turn that is not whole.
+    Partial,
+    /// No: it is too old, or its clock is behind.
+    Late,
+    /// No: its clock is ahead.
+    Ahead,
+    /// No: the sensor gives none.
+    #[default]
+    Silent,
+}
+
+impl Part {
+    /// As the wire spells it.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Ok => "ok",
+            Self::Partial => "partial",
+            Self::Late => "late",
+            Self::Ahead => "ahead",
+            Self::Silent => "silent",
+        }
+    }
+
+    /// Whether the map holds points of the turn.
+    pub fn contributes(self) -> bool {
+        matches!(self, Self::Ok | Self::Partial)
+    }
 }
 
 /// One named grid.
@@ -126,6 +168,11 @@ pub trait LayerMaker: Send {
     fn take(&mut self, rays: &Rays<'_>) {
         // Most maps are made from the map's sweep alone.
         let _ = rays;
+    }
+
+    /// Whether [`LayerMaker::take`] uses [`Rays::no_returns`]: where no map does, they are not looked for.
+    fn wants_no_returns(&self) -> bool {
+        false
     }
 
     /// Makes the layer of one sweep in `layer`, one of [`LayerMaker::layer`], in place of what it held. Every cell is

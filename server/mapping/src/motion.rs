@@ -16,7 +16,7 @@ use clearway_lidar::telemetry::Gprmc;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
 use crate::config::MotionConfig;
-use crate::event::EgoPose;
+use crate::event::{EgoPose, Scan};
 
 /// Poses kept: a second at 1 kHz, and more than one revolution of any sensor at any rate.
 const POSES_MAX: usize = 1024;
@@ -34,15 +34,17 @@ const JUMP_M_MAX: f64 = 0.5;
 pub(crate) const KNOT_FIRINGS: usize = 16;
 
 /// What moved a sweep's firings to one stamp.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+///
+/// Of two, the lesser knows less.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Compensation {
     /// Nothing: no motion is known, it is switched off, or the points came as a scan and their times are not known.
     #[default]
     None,
-    /// Ego poses.
-    Poses,
     /// The newest speed, straight ahead.
     Speed,
+    /// Ego poses.
+    Poses,
 }
 
 impl Compensation {
@@ -63,14 +65,15 @@ pub struct Moved {
     pub compensation: Compensation,
     /// Forward speed at the end, m/s, where known.
     pub speed_mps: Option<f64>,
-    /// `end_from_ego` at firings 0, 16, 32, … and at the last one; empty where nothing is moved.
+    /// `end_from_ego` at firings 0, 16, 32, … and at the last one (of a scan: at 2 to 257 moments, evenly spaced); empty
+    /// where nothing is moved.
     pub end_from_ego: Vec<Isometry3<f64>>,
 }
 
 /// Indices of the firings at which [`Moved::end_from_ego`] is exact.
-pub(crate) fn knots(firings: usize) -> impl Iterator<Item = usize> {
-    let last = firings.saturating_sub(1);
-    (0..last).step_by(KNOT_FIRINGS).chain((firings > 0).then_some(last))
+pub(crate) fn knots(firings: usize) -> impl ExactSizeIterator<Item = usize> + Clone {
+    let count = if firings == 0 { 0 } else { (firings - 1).div_ceil(KNOT_FIRINGS) + 1 };
+    (0..count).map(move |knot| (knot * KNOT_FIRINGS).min(firings - 1))
 }
 
 /// A speed somebody told of.
@@ -159,7 +162,7 @@ impl Motion {
         }
     }
 
-    /// The ego frame and its speed at a scan's stamp; its points stay as they are.
+    /// The ego frame and its speed at a turn's end.
     pub fn at(&self, stamp_ns: i64, arrival_ns: i64) -> (Option<Isometry3<f64>>, Option<f64>) {
         let pose = self.map_from_ego(stamp_ns);
         let speed_mps = match pose {
@@ -181,30 +184,38 @@ impl Motion {
 
     /// How the ego frame moved through a revolution that an event of `arrival_ns` completed, in place of what `moved` held.
     pub fn through(&self, revolution: &Revolution, arrival_ns: i64, moved: &mut Moved) {
+        let offset = |firing: usize| i64::from(revolution.firings[firing].offset_ns);
+        let stamps = knots(revolution.firings.len()).map(|firing| revolution.start_ns + offset(firing));
+        self.through_stamps(stamps, revolution.end_ns, arrival_ns, moved);
+    }
+
+    /// The same for a scan; where its points' times are not known nothing is moved.
+    pub fn through_scan(&self, scan: &Scan, arrival_ns: i64, moved: &mut Moved) {
+        let knots = ScanKnots::of(scan);
+        let stamps = (0..knots.count()).map(|knot| scan.stamp_ns.saturating_add(knots.offset_ns(knot)));
+        self.through_stamps(stamps, scan.stamp_ns, arrival_ns, moved);
+    }
+
+    fn through_stamps(
+        &self,
+        stamps: impl ExactSizeIterator<Item = i64> + Clone,
+        end_ns: i64,
+        arrival_ns: i64,
+        moved: &mut Moved,
+    ) {
         moved.end_from_ego.clear();
-        let end_ns = revolution.end_ns;
-        let pose = self.map_from_ego(end_ns);
-        (_, moved.speed_mps) = self.at(end_ns, arrival_ns);
-        moved.compensation = Compensation::None;
-        if !self.config.enabled {
+        let (pose, speed_mps) = self.at(end_ns, arrival_ns);
+        (moved.compensation, moved.speed_mps) = (Compensation::None, speed_mps);
+        if !self.config.enabled || stamps.len() == 0 {
             return;
         }
-        let stamps = || {
-            let offset = |firing: usize| i64::from(revolution.firings[firing].offset_ns);
-            knots(revolution.firings.len()).map(move |firing| revolution.start_ns + offset(firing))
-        };
         if let Some(map_from_end) = pose {
             let end_from_map = map_from_end.inverse();
-            for stamp_ns in stamps() {
-                let Some(map_from_ego) = self.map_from_ego(stamp_ns) else { break };
-                let end_from_ego = end_from_map * map_from_ego;
-                let seconds = (end_ns - stamp_ns) as f64 * 1e-9;
-                if end_from_ego.translation.vector.norm() > JUMP_M_MAX + SPEED_MPS_MAX * seconds {
-                    break;
-                }
+            for stamp_ns in stamps.clone() {
+                let Some(end_from_ego) = self.carry_by_poses(&end_from_map, stamp_ns, end_ns) else { break };
                 moved.end_from_ego.push(end_from_ego);
             }
-            if moved.end_from_ego.len() == stamps().count() {
+            if moved.end_from_ego.len() == stamps.len() {
                 moved.compensation = Compensation::Poses;
                 return;
             }
@@ -213,9 +224,72 @@ impl Motion {
         if let Some(speed_mps) = self.newest_speed_mps(end_ns, arrival_ns) {
             moved.speed_mps = Some(speed_mps);
             moved.compensation = Compensation::Speed;
-            let ahead = |stamp_ns: i64| (stamp_ns - end_ns) as f64 * 1e-9 * speed_mps;
-            moved.end_from_ego.extend(stamps().map(|stamp_ns| Isometry3::translation(ahead(stamp_ns), 0.0, 0.0)));
+            moved.end_from_ego.extend(stamps.map(|stamp_ns| straight_ahead(speed_mps, stamp_ns, end_ns)));
         }
+    }
+
+    /// `to_from_from`: carries points of the ego frame at one stamp into the one at another, and what is known of the way.
+    pub fn carry(&self, from_ns: i64, to_ns: i64, arrival_ns: i64) -> (Isometry3<f64>, Compensation) {
+        let by_poses = || self.carry_by_poses(&self.map_from_ego(to_ns)?.inverse(), from_ns, to_ns);
+        let by_speed = || Some(straight_ahead(self.newest_speed_mps(to_ns, arrival_ns)?, from_ns, to_ns));
+        if !self.config.enabled {
+            return (Isometry3::identity(), Compensation::None);
+        }
+        by_poses()
+            .map(|carried| (carried, Compensation::Poses))
+            .or_else(|| by_speed().map(|carried| (carried, Compensation::Speed)))
+            .unwrap_or((Isometry3::identity(), Compensation::None))
+    }
+
+    /// `None` where the poses do not reach `from_ns`, or jump on the way.
+    fn carry_by_poses(&self, to_from_map: &Isometry3<f64>, from_ns: i64, to_ns: i64) -> Option<Isometry3<f64>> {
+        let to_from_ego = to_from_map * self.map_from_ego(from_ns)?;
+        let seconds = to_ns.saturating_sub(from_ns).saturating_abs() as f64 * 1e-9;
+        let near = to_from_ego.translation.vector.norm() <= JUMP_M_MAX + SPEED_MPS_MAX * seconds;
+        near.then_some(to_from_ego)
+    }
+}
+
+fn straight_ahead(speed_mps: f64, from_ns: i64, to_ns: i64) -> Isometry3<f64> {
+    Isometry3::translation(from_ns.saturating_sub(to_ns) as f64 * 1e-9 * speed_mps, 0.0, 0.0)
+}
+
+/// The moments of a scan at which [`Moved::end_from_ego`] is exact: evenly spaced from its first point to its stamp.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct ScanKnots {
+    /// From the first point to the stamp; `None` where the scan does not tell its points' times.
+    span_ns: Option<i64>,
+}
+
+impl ScanKnots {
+    /// A line serves for the arc of a millisecond, as between the knots of a revolution.
+    const STEP_NS: i64 = 1_000_000;
+    const STEPS_MAX: i64 = 256;
+
+    pub(crate) fn of(scan: &Scan) -> Self {
+        Self { span_ns: scan.offset_ns.iter().min().map(|first| -i64::from(*first)) }
+    }
+
+    fn steps(&self) -> i64 {
+        self.span_ns.map_or(0, |span_ns| (span_ns / Self::STEP_NS).clamp(1, Self::STEPS_MAX))
+    }
+
+    fn count(&self) -> usize {
+        self.span_ns.map_or(0, |_| self.steps() as usize + 1)
+    }
+
+    fn offset_ns(&self, knot: usize) -> i64 {
+        let span_ns = self.span_ns.unwrap_or(0);
+        span_ns * knot as i64 / self.steps().max(1) - span_ns
+    }
+
+    /// The knot before a point, of those that another follows, and the share of the way to it.
+    #[inline(always)]
+    pub(crate) fn place(&self, offset_ns: i32) -> (usize, f32) {
+        let span_ns = self.span_ns.unwrap_or(0);
+        let steps = (i64::from(offset_ns) + span_ns) as f32 * self.steps() as f32 / span_ns.max(1) as f32;
+        let knot = (steps as usize).min((self.steps() as usize).saturating_sub(1));
+        (knot, steps - knot as f32)
     }
 }
 

@@ -1,70 +1,43 @@
 //! Conducts one vehicle: events in, maps out, nothing but the events deciding.
 //!
-//! In: [`Event`]s in the order the door took them. Out: a [`Map`] for every revolution or scan an event completes.
-//! The hops: datagram -> `lidar` -> [`Revolution`] -> [`Sweep`] -> one layer a map -> [`Map`]. A scan that was
-//! assembled elsewhere enters at the sweep.
-
-use std::collections::BTreeMap;
-use std::sync::Arc;
+//! In: [`Event`]s in the order the door took them. Out: a [`Map`] for every turn that makes one. The hops: datagram or scan
+//! -> its sensor's [`Intake`] -> that sensor's newest turn -> [`Fusion`] -> the map's [`Sweep`] -> one layer a map -> [`Map`].
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_lidar::revolution::{Partial, Revolution};
-use clearway_lidar::sensor::{Refusal, Sensor, SensorStatus};
+use clearway_lidar::revolution::Revolution;
+use clearway_lidar::sensor::SensorStatus;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
 use crate::config::{ConfigError, MapsConfig, SensorConfig, VehicleConfig};
 use crate::drivability::Drivability;
 use crate::event::{Body, EgoPose, Event, Road, Scan};
+use crate::fusion::Fusion;
 use crate::height_difference::HeightDifference;
-use crate::map::{Context, LayerMaker, Map, SensorState};
-use crate::motion::{Compensation, Motion, Moved};
-use crate::road::{self, RoadError, Roads};
+use crate::intake::{Intake, Moment, Wanted};
+use crate::ledger::Dropped;
+pub use crate::ledger::{Ledger, Rejected};
+use crate::map::{Context, LayerMaker, Map};
+use crate::motion::{Compensation, Motion};
+use crate::road::{self, Roads};
 use crate::safe_path::SafePath;
-use crate::series::Series;
 use crate::speed::Speed;
-use crate::sweep::{Mount, Sweep};
+use crate::sweep::Sweep;
 use crate::terrain::Terrain;
 
 /// One vehicle's way from events to maps.
 pub struct Pipeline {
     config: VehicleConfig,
-    sensor: Sensor,
-    /// Table of the grid's rows where turns come as scans; `None` while neither file nor model is configured.
-    scan_calibration: Option<Arc<Calibration>>,
+    /// By source.
+    intakes: Vec<Intake>,
     motion: Motion,
     roads: Roads,
-    scan_stamp_ns: Option<i64>,
-    /// Scans taken, and their points.
-    scans: (u64, u64),
+    fusion: Fusion,
     ledger: Ledger,
-    newest_is_revolution: bool,
-    maker: Maker,
-}
-
-/// What came of everything that reached the core. `received = decoded + telemetry + the sum of refused`, exactly.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Ledger {
-    /// Datagrams and scans.
-    pub received: u64,
-    /// Data packets and scans taken.
-    pub decoded: u64,
-    /// Telemetry datagrams read.
-    pub telemetry: u64,
-    /// Datagrams and scans not taken, by [`Rejected::reason`].
-    pub refused: BTreeMap<&'static str, u64>,
-    /// Events that never entered, as [`Body::Lost`] says.
-    pub lost: u64,
-    /// Ego poses taken.
-    pub poses: u64,
-    /// Ego poses not taken.
-    pub poses_refused: u64,
-    /// Roads taken.
-    pub roads: u64,
-    /// Roads not taken, by [`Rejected::reason`].
-    pub roads_refused: BTreeMap<&'static str, u64>,
-    /// Points of scans that were no positions (not finite, or beyond any sensor's reach) and were left out.
-    pub points_dropped: u64,
+    now: Option<Moment>,
+    maps_made: u64,
+    layer_makers: Vec<Box<dyn LayerMaker>>,
+    map: Map,
 }
 
 /// A sensor as configured, and what it has shown of itself.
@@ -74,75 +47,8 @@ pub struct NamedStatus {
     pub name: String,
     /// From the data; a scan counts as a revolution.
     pub status: SensorStatus,
-}
-
-/// An event that was not taken. The pipeline's state is as if it had not come, but for the ledger.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum Rejected {
-    /// The decoder refused the datagram.
-    #[error(transparent)]
-    Datagram(#[from] Refusal),
-    /// No such sensor.
-    #[error("source {source_index}: the vehicle has {sensors} sensor(s), counted from 0")]
-    Source {
-        /// The event's.
-        source_index: u16,
-        /// How many are configured.
-        sensors: usize,
-    },
-    /// A scan whose arrays do not belong together.
-    #[error("scan with {x} x, {y} y, {z} z and {intensity} intensities: the four lengths must be equal")]
-    ScanLengths {
-        /// Length of `x`.
-        x: usize,
-        /// Length of `y`.
-        y: usize,
-        /// Length of `z`.
-        z: usize,
-        /// Length of `intensity`.
-        intensity: usize,
-    },
-    /// A scan of a sensor whose rings are not known.
-    #[error("scan of sensor {sensor}: set its model or calibration, the grid's rows come from its elevations")]
-    ScanModel {
-        /// The sensor's name.
-        sensor: String,
-    },
-    /// A scan, ego pose or road not newer than the one before.
-    #[error("stamp {stamp_ns} ns: later than {newest_ns} ns is allowed")]
-    Stamp {
-        /// The event's.
-        stamp_ns: i64,
-        /// The newest taken.
-        newest_ns: i64,
-    },
-    /// A road that is no road.
-    #[error(transparent)]
-    Road(#[from] RoadError),
-    /// An ego pose that is no pose.
-    #[error(
-        "ego pose of {stamp_ns} ns: position within 10^9 m, a unit quaternion and speed within 1000 m/s are allowed"
-    )]
-    Pose {
-        /// The event's.
-        stamp_ns: i64,
-    },
-}
-
-impl Rejected {
-    /// The ledger's key: the decoder's own (`length`, `block_flag`, …), or `source`, `scan_lengths`, `model`, `stamp`,
-    /// `pose`, or a road's own ([`RoadError::reason`]).
-    pub fn reason(&self) -> &'static str {
-        match self {
-            Self::Datagram(refusal) => refusal.reason(),
-            Self::Source { .. } => "source",
-            Self::ScanLengths { .. } => "scan_lengths",
-            Self::ScanModel { .. } => "model",
-            Self::Stamp { .. } => "stamp",
-            Self::Pose { .. } => "pose",
-            Self::Road(refused) => refused.reason(),
-        }
-    }
+    /// What came of everything this sensor sent.
+    pub ledger: Ledger,
 }
 
 impl Pipeline {
@@ -153,27 +59,37 @@ impl Pipeline {
     /// [`ConfigError`] for the first value that cannot be used.
     pub fn new(config: &VehicleConfig, calibrations: Vec<Option<Calibration>>) -> Result<Self, ConfigError> {
         config.validate()?;
-        let [sensor] = &config.sensors[..] else { unreachable!("validate() takes one sensor") };
-        let Ok([calibration]) = <[Option<Calibration>; 1]>::try_from(calibrations) else {
+        if calibrations.len() != config.sensors.len() {
             return Err(ConfigError::new("vehicle.sensor", "calibrations", "one calibration, or none, a sensor"));
+        }
+        let layer_makers = layer_makers(&config.maps);
+        let lead = config.lead().expect("validate() finds the lead");
+        let no_returns = layer_makers.iter().any(|maker| maker.wants_no_returns());
+        let intake = |(index, (sensor, calibration)): (usize, (&SensorConfig, _))| {
+            let wanted = Wanted { deviations: index == lead && config.maps.terrain.enabled, no_returns };
+            Intake::new(sensor, calibration, config.body.as_ref(), wanted)
         };
-        let factory = || sensor.model.map(Calibration::factory);
-        let scan_calibration = calibration.clone().or_else(factory).map(Arc::new);
         Ok(Self {
-            sensor: Sensor::new(clearway_lidar::sensor::SensorConfig {
-                model: sensor.model,
-                rpm: sensor.rpm,
-                calibration,
-                cut_azimuth_deg: sensor.cut_azimuth_deg,
-            }),
-            scan_calibration,
+            intakes: config.sensors.iter().zip(calibrations).enumerate().map(intake).collect(),
             motion: Motion::new(&config.maps.motion),
             roads: Roads::default(),
-            scan_stamp_ns: None,
-            scans: (0, 0),
+            fusion: Fusion::new(&config.fusion, lead),
             ledger: Ledger::default(),
-            newest_is_revolution: false,
-            maker: Maker::new(config),
+            now: None,
+            maps_made: 0,
+            map: Map {
+                sequence: 0,
+                capture_start_ns: 0,
+                capture_end_ns: 0,
+                completed_ns: 0,
+                map_from_ego: None,
+                speed_mps: None,
+                compensation: Compensation::None,
+                made_by: 0,
+                sensors: Vec::new(),
+                layers: layer_makers.iter().map(|maker| maker.layer()).collect(),
+            },
+            layer_makers,
             config: config.clone(),
         })
     }
@@ -183,31 +99,29 @@ impl Pipeline {
     /// # Errors
     /// [`Rejected`] with the values that were wrong, once counted in the ledger.
     pub fn step(&mut self, event: &Event) -> Result<Option<&Map>, Rejected> {
+        let first = Moment { arrival_ns: event.arrival_ns, event_ns: 0 };
+        let now = self.now.map_or(first, |before| before.next(event.arrival_ns));
+        self.now = Some(now);
         match &event.body {
-            Body::Datagram(_) | Body::Scan(_) => self.ledger.received += 1,
-            Body::Lost(events) => self.ledger.lost += events,
-            Body::EgoPose(_) | Body::Road(_) | Body::End => {}
+            Body::Datagram(_) | Body::Scan(_) => self.count(event.source, |ledger| ledger.received += 1),
+            Body::Lost(events) => self.count(event.source, |ledger| ledger.lost += events),
+            Body::EgoPose(_) | Body::Road(_) | Body::Sensor(_) | Body::End => {}
         }
-        let outcome = match &event.body {
-            Body::EgoPose(pose) => self.step_ego_pose(pose).map(|()| false),
-            Body::Road(road) => self.step_road(road).map(|()| false),
-            Body::Lost(_) => Ok(false),
-            _ if usize::from(event.source) >= self.config.sensors.len() => {
-                Err(Rejected::Source { source_index: event.source, sensors: self.config.sensors.len() })
+        match self.take(event, now) {
+            Ok(None) => Ok(None),
+            Ok(Some(dropped)) => {
+                self.count(event.source, |ledger| ledger.add_dropped(dropped));
+                Ok(self.end_turn(event.source, now).then_some(&self.map))
             }
-            Body::Datagram(payload) => self.step_datagram(payload, event.arrival_ns),
-            Body::Scan(scan) => self.step_scan(scan, event.arrival_ns),
-            Body::End => Ok(self.step_end(event.arrival_ns)),
-        };
-        match outcome {
-            Ok(made) => Ok(made.then_some(&self.maker.map)),
             Err(rejected) => {
+                let reason = rejected.reason();
                 match event.body {
                     Body::Datagram(_) | Body::Scan(_) => {
-                        *self.ledger.refused.entry(rejected.reason()).or_default() += 1
+                        self.count(event.source, |ledger| *ledger.refused.entry(reason).or_default() += 1);
                     }
                     Body::EgoPose(_) => self.ledger.poses_refused += 1,
-                    Body::Road(_) => *self.ledger.roads_refused.entry(rejected.reason()).or_default() += 1,
+                    Body::Road(_) => *self.ledger.roads_refused.entry(reason).or_default() += 1,
+                    Body::Sensor(_) => self.ledger.sensors_refused += 1,
                     Body::Lost(_) | Body::End => {}
                 }
                 Err(rejected)
@@ -215,79 +129,80 @@ impl Pipeline {
         }
     }
 
-    /// What came of everything so far.
+    /// What came of everything so far, of all sensors.
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
     }
 
-    /// The sensors in the order of the configuration.
+    /// The sensors in the order of the configuration, then those declared.
     pub fn sensors(&self) -> Vec<NamedStatus> {
-        let mut status = self.sensor.status();
-        status.revolutions += self.scans.0;
-        status.returns += self.scans.1;
-        let named = |sensor: &SensorConfig| NamedStatus { name: sensor.name.clone(), status: status.clone() };
-        self.config.sensors.iter().map(named).collect()
+        let named = |intake: &Intake| NamedStatus {
+            name: intake.name().to_owned(),
+            status: intake.status(),
+            ledger: intake.ledger.clone(),
+        };
+        self.intakes.iter().map(named).collect()
     }
 
     /// The newest map, until the next one is made; `None` before the first.
     pub fn newest_map(&self) -> Option<&Map> {
-        (self.maker.maps_made > 0).then_some(&self.maker.map)
+        (self.maps_made > 0).then_some(&self.map)
     }
 
-    /// The points the newest map was made from, ego frame at its capture's end; empty before the first.
+    /// The points the newest map was made from, ego frame at its capture's end; empty before the first turn.
     pub fn newest_sweep(&self) -> &Sweep {
-        &self.maker.sweep
+        self.fusion.sweep(&self.intakes)
     }
 
     /// The revolution that made the newest map; `None` before the first, and where a scan made it.
     pub fn newest_revolution(&self) -> Option<&Revolution> {
-        if self.newest_is_revolution { self.sensor.newest() } else { None }
+        self.intakes[self.fusion.maker()?].revolution()
     }
 
-    fn step_datagram(&mut self, payload: &[u8], arrival_ns: i64) -> Result<bool, Rejected> {
-        let completed = self.sensor.push(payload, arrival_ns)?;
-        let made = match completed {
-            None => false,
-            Some(revolution) => {
-                let refused = self.ledger.refused.values().sum();
-                let known = (&self.motion, &self.roads);
-                self.maker.revolution(revolution, &self.config, known, refused, arrival_ns);
-                true
+    /// The vehicle's ledger, and its sensor's where there is one.
+    fn count(&mut self, source: u16, add: impl Fn(&mut Ledger)) {
+        add(&mut self.ledger);
+        if let Some(intake) = self.intakes.get_mut(usize::from(source)) {
+            add(&mut intake.ledger);
+        }
+    }
+
+    /// What was left out of the turn that the event completed, if it completed one.
+    fn take(&mut self, event: &Event, now: Moment) -> Result<Option<Dropped>, Rejected> {
+        match &event.body {
+            Body::EgoPose(pose) => self.take_ego_pose(pose).map(|()| None),
+            Body::Road(road) => self.take_road(road).map(|()| None),
+            Body::Sensor(sensor) => self.take_sensor(event.source, sensor).map(|()| None),
+            Body::Lost(_) => Ok(None),
+            Body::Datagram(payload) => self.take_datagram(event.source, payload, now),
+            Body::Scan(scan) => self.take_scan(event.source, scan, now).map(Some),
+            Body::End => {
+                let motion = &self.motion;
+                Ok(intake_of(&mut self.intakes, event.source)?.finish(motion, now))
             }
-        };
-        self.newest_is_revolution |= made;
+        }
+    }
+
+    fn take_datagram(&mut self, source: u16, payload: &[u8], now: Moment) -> Result<Option<Dropped>, Rejected> {
+        let intake = intake_of(&mut self.intakes, source)?;
+        let completed = intake.take_datagram(payload, &self.motion, now)?;
         if payload.len() == TELEMETRY_LENGTH {
-            self.ledger.telemetry += 1;
-            if let Some(gprmc) = self.sensor.gprmc() {
-                self.motion.take_gprmc(gprmc, arrival_ns);
-            }
+            intake.tell_speed(&mut self.motion, now);
+            self.count(source, |ledger| ledger.telemetry += 1);
         } else {
-            self.ledger.decoded += 1;
+            self.count(source, |ledger| ledger.decoded += 1);
         }
-        Ok(made)
+        Ok(completed)
     }
 
-    fn step_scan(&mut self, scan: &Scan, arrival_ns: i64) -> Result<bool, Rejected> {
-        let (x, y, z, intensity) = (scan.x.len(), scan.y.len(), scan.z.len(), scan.intensity.len());
-        if x != y || x != z || x != intensity {
-            return Err(Rejected::ScanLengths { x, y, z, intensity });
-        }
-        check_newer(scan.stamp_ns, self.scan_stamp_ns)?;
-        let Some(calibration) = &self.scan_calibration else {
-            return Err(Rejected::ScanModel { sensor: self.config.sensors[0].name.clone() });
-        };
-        self.scan_stamp_ns = Some(scan.stamp_ns);
-        let refused = self.ledger.refused.values().sum();
-        let known = (&self.motion, &self.roads);
-        let dropped = self.maker.scan(scan, calibration, &self.config, known, refused, arrival_ns);
-        self.ledger.points_dropped += dropped;
-        self.scans = (self.scans.0 + 1, self.scans.1 + u64::from(self.maker.sweep.returns));
-        self.ledger.decoded += 1;
-        self.newest_is_revolution = false;
-        Ok(true)
+    fn take_scan(&mut self, source: u16, scan: &Scan, now: Moment) -> Result<Dropped, Rejected> {
+        let (motion, deadline_ns) = (&self.motion, self.fusion.deadline_ns);
+        let dropped = intake_of(&mut self.intakes, source)?.take_scan(scan, motion, now, deadline_ns)?;
+        self.count(source, |ledger| ledger.decoded += 1);
+        Ok(dropped)
     }
 
-    fn step_ego_pose(&mut self, pose: &EgoPose) -> Result<(), Rejected> {
+    fn take_ego_pose(&mut self, pose: &EgoPose) -> Result<(), Rejected> {
         let rotation = pose.map_from_ego.rotation.coords;
         let position = pose.map_from_ego.translation.vector;
         // NaN fails every comparison, and a NaN in the quaternion makes the norm NaN, which is in no range.
@@ -295,153 +210,66 @@ impl Pipeline {
         if !possible || !(1.0 - 1e-6..=1.0 + 1e-6).contains(&rotation.norm()) {
             return Err(Rejected::Pose { stamp_ns: pose.stamp_ns });
         }
-        check_newer(pose.stamp_ns, self.motion.newest_pose().map(|p| p.stamp_ns))?;
+        Rejected::unless_newer(pose.stamp_ns, self.motion.newest_pose().map(|p| p.stamp_ns))?;
         self.motion.take_pose(pose);
         self.ledger.poses += 1;
         Ok(())
     }
 
-    fn step_road(&mut self, road: &Road) -> Result<(), Rejected> {
+    fn take_road(&mut self, road: &Road) -> Result<(), Rejected> {
         road::check(road)?;
-        check_newer(road.stamp_ns, self.roads.newest_stamp_ns(road.purpose))?;
+        Rejected::unless_newer(road.stamp_ns, self.roads.newest_stamp_ns(road.purpose))?;
         self.roads.take(road, self.motion.map_from_ego(road.stamp_ns));
         self.ledger.roads += 1;
         Ok(())
     }
 
-    fn step_end(&mut self, arrival_ns: i64) -> bool {
-        let refused = self.ledger.refused.values().sum();
-        match self.sensor.finish() {
-            None => false,
-            Some(revolution) => {
-                let known = (&self.motion, &self.roads);
-                self.maker.revolution(revolution, &self.config, known, refused, arrival_ns);
-                self.newest_is_revolution = true;
-                true
-            }
+    fn take_sensor(&mut self, source: u16, sensor: &SensorConfig) -> Result<(), Rejected> {
+        self.config.declare(usize::from(source), sensor)?;
+        if self.intakes.len() < self.config.sensors.len() {
+            let no_returns = self.layer_makers.iter().any(|maker| maker.wants_no_returns());
+            let wanted = Wanted { deviations: false, no_returns };
+            self.intakes.push(Intake::new(sensor, None, self.config.body.as_ref(), wanted));
         }
+        self.ledger.sensors += 1;
+        Ok(())
     }
-}
 
-fn check_newer(stamp_ns: i64, newest_ns: Option<i64>) -> Result<(), Rejected> {
-    match newest_ns {
-        Some(newest_ns) if stamp_ns <= newest_ns => Err(Rejected::Stamp { stamp_ns, newest_ns }),
-        _ => Ok(()),
-    }
-}
-
-/// What other events told: the newest ego pose, the newest roads.
-type Known<'a> = (&'a Motion, &'a Roads);
-
-/// The hops behind the sensor, with the buffers they reuse from map to map.
-struct Maker {
-    maps_made: u64,
-    mount: Mount,
-    moved: Moved,
-    sweep: Sweep,
-    /// Where a map asks for it.
-    series: Option<Series>,
-    layer_makers: Vec<Box<dyn LayerMaker>>,
-    map: Map,
-}
-
-impl Maker {
-    fn new(config: &VehicleConfig) -> Self {
-        let layer_makers = layer_makers(&config.maps);
-        let layers = layer_makers.iter().map(|maker| maker.layer()).collect();
-        let sensor = &config.sensors[0];
-        Self {
-            maps_made: 0,
-            mount: Mount { ego_from_sensor: sensor.extrinsics.ego_from_sensor(), range_m_min: sensor.range_m_min },
-            moved: Moved::default(),
-            sweep: Sweep::default(),
-            series: config.maps.terrain.enabled.then(Series::default),
-            layer_makers,
-            map: Map {
-                sequence: 0,
-                capture_start_ns: 0,
-                capture_end_ns: 0,
-                completed_ns: 0,
-                map_from_ego: None,
-                speed_mps: None,
-                compensation: Compensation::None,
-                sensors: Vec::new(),
-                layers,
-            },
+    /// A sensor's turn has ended: the maps that gather see it, and perhaps it makes a map.
+    fn end_turn(&mut self, source: u16, now: Moment) -> bool {
+        let index = usize::from(source);
+        let rays = self.intakes[index].rays(source);
+        self.layer_makers.iter_mut().for_each(|maker| maker.take(&rays));
+        let makes_map = self.fusion.makes_map(index, &self.intakes, now);
+        if makes_map {
+            self.make_map(source, now);
         }
+        makes_map
     }
 
-    fn revolution(
-        &mut self,
-        revolution: &Revolution,
-        config: &VehicleConfig,
-        (motion, roads): Known<'_>,
-        refused: u64,
-        arrival_ns: i64,
-    ) {
-        motion.through(revolution, arrival_ns, &mut self.moved);
-        self.sweep.take_moving_revolution(revolution, &self.mount, &self.moved.end_from_ego);
-        (self.map.compensation, self.map.speed_mps) = (self.moved.compensation, self.moved.speed_mps);
-        self.map.map_from_ego = motion.map_from_ego(revolution.end_ns);
-        if let Some(series) = &mut self.series {
-            self.sweep.take_deviations(revolution, &self.mount, series);
-        }
-        let state = SensorState {
-            name: config.sensors[0].name.clone(),
-            model: model_name(revolution.model).to_owned(),
-            packets: revolution.packets,
-            refused,
-            returns: self.sweep.returns,
-            rpm: revolution.rpm,
-            completeness: completeness(revolution),
-            partial: revolution.partial.map_or("", Partial::as_str),
-        };
-        self.map(state, (revolution.start_ns, revolution.end_ns), roads, arrival_ns);
-    }
-
-    /// Gives the number of points left out because they are no positions.
-    fn scan(
-        &mut self,
-        scan: &Scan,
-        calibration: &Arc<Calibration>,
-        config: &VehicleConfig,
-        (motion, roads): Known<'_>,
-        refused: u64,
-        arrival_ns: i64,
-    ) -> u64 {
-        let dropped = self.sweep.take_scan(scan, calibration, &self.mount);
-        self.map.compensation = Compensation::None;
-        (self.map.map_from_ego, self.map.speed_mps) = motion.at(scan.stamp_ns, arrival_ns);
-        let state = SensorState {
-            name: config.sensors[0].name.clone(),
-            model: "scan".to_owned(),
-            packets: 0,
-            refused,
-            returns: self.sweep.returns,
-            rpm: 0.0,
-            completeness: 1.0,
-            partial: "",
-        };
-        self.map(state, (scan.stamp_ns, scan.stamp_ns), roads, arrival_ns);
-        dropped
-    }
-
-    /// The newest sweep's map, in place of the one before.
-    fn map(&mut self, sensor: SensorState, capture_ns: (i64, i64), roads: &Roads, arrival_ns: i64) {
-        let map = &mut self.map;
+    /// The map of a sensor's newest turn, in place of the one before.
+    fn make_map(&mut self, source: u16, now: Moment) {
+        let gathered = self.fusion.gather(usize::from(source), &self.intakes, &self.motion, now);
+        let (map, turn) = (&mut self.map, &self.intakes[usize::from(source)].turn);
         map.sequence = self.maps_made;
         self.maps_made += 1;
-        (map.capture_start_ns, map.capture_end_ns) = capture_ns;
-        map.completed_ns = arrival_ns;
-        map.sensors.clear();
-        map.sensors.push(sensor);
-        let (road, route) = (roads.to_paint(), roads.route());
+        (map.capture_start_ns, map.capture_end_ns, map.completed_ns) = (gathered.start_ns, turn.end_ns, now.arrival_ns);
+        (map.map_from_ego, map.speed_mps) = (turn.map_from_ego, turn.speed_mps);
+        (map.compensation, map.sensors, map.made_by) = (gathered.compensation, gathered.sensors, source);
+        let sweep = self.fusion.sweep(&self.intakes);
+        let (road, route) = (self.roads.to_paint(), self.roads.route());
         for (index, maker) in self.layer_makers.iter_mut().enumerate() {
             let (earlier, rest) = map.layers.split_at_mut(index);
-            let context = Context { earlier, stamp_ns: capture_ns.1, map_from_ego: map.map_from_ego, road, route };
-            maker.make_with(&self.sweep, &context, &mut rest[0]);
+            let context =
+                Context { earlier, stamp_ns: map.capture_end_ns, map_from_ego: map.map_from_ego, road, route };
+            maker.make_with(sweep, &context, &mut rest[0]);
         }
     }
+}
+
+fn intake_of(intakes: &mut [Intake], source_index: u16) -> Result<&mut Intake, Rejected> {
+    let sensors = intakes.len();
+    intakes.get_mut(usize::from(source_index)).ok_or(Rejected::Source { source_index, sensors })
 }
 
 /// The maps that are switched on, in the order of their layers.
@@ -471,15 +299,10 @@ pub fn layer_names(maps: &MapsConfig) -> Vec<&'static str> {
     layer_makers(maps).iter().map(|maker| maker.layer().name).collect()
 }
 
-/// Share of the turn's degrees in which a firing lies.
-fn completeness(revolution: &Revolution) -> f32 {
-    let mut seen = [false; 360];
-    for firing in &revolution.firings {
-        let degree = firing.azimuth_rad.to_degrees();
-        // `as` saturates, so an azimuth of exactly 2π (or a wild one) falls into the last degree.
-        seen[(degree as usize).min(359)] = true;
-    }
-    seen.iter().filter(|s| **s).count() as f32 / 360.0
+/// The model that [`model_name`] spells so.
+pub fn model_of_name(name: &str) -> Option<Model> {
+    let models = [Model::Hdl64eS1, Model::Hdl64eS2, Model::Hdl64eS3, Model::Hdl32e, Model::Vlp16, Model::PuckHiRes];
+    models.into_iter().chain([Model::Vlp32c, Model::Vls128]).find(|model| model_name(*model) == name)
 }
 
 /// The model as the configuration and the wire spell it.

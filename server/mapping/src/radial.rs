@@ -116,7 +116,11 @@ impl RadialGrid {
 
     /// Calls `take(first_point, cells)` for every chunk of the sweep. A point beyond the last row falls into the row after
     /// it: its cell is `self.cells()` or more, and less than `self.cells() + self.columns()`.
+    /// A sweep of nobody knows whose rings has no rows to fall into.
     pub fn for_each_chunk(&self, sweep: &Sweep, mut take: impl FnMut(usize, &[u32])) {
+        if sweep.calibration.is_none() {
+            return;
+        }
         let mut ranges_squared = [0.0f32; CHUNK];
         let mut cells = [0u32; CHUNK];
         let columns = self.columns() as u32;

@@ -1,8 +1,8 @@
 //! The points of one turn in the ego frame.
 //!
-//! In: a [`Revolution`] or [`Scan`] in the sensor's frame, how the sensor is mounted, and how the vehicle moved. Out: a
-//! [`Sweep`], only returns, ego frame at the turn's last firing, metres, with what the grid's rows follow from.
-//! Compaction, motion and transform are one pass; each firing has one rigid transform.
+//! In: a [`Revolution`] or [`Scan`] in the sensor's frame, how the sensor is mounted, how the vehicle moved, and where the
+//! vehicle itself is. Out: a [`Sweep`], only returns of the surroundings, ego frame at the turn's last firing, metres, with
+//! what the grid's rows follow from. Compaction, motion and transform are one pass; each firing has one rigid transform.
 
 use std::sync::Arc;
 
@@ -10,8 +10,10 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
 use nalgebra::Isometry3;
 
+use crate::body::{Body, Hidden};
 use crate::event::Scan;
-use crate::motion::knots;
+use crate::ledger::Dropped;
+use crate::motion::{ScanKnots, knots};
 use crate::series::Series;
 
 /// No sensor of the family reaches half as far; a coordinate beyond is not a position.
@@ -40,7 +42,7 @@ pub struct Sweep {
     pub deviation_m: Vec<f32>,
     /// Returns of the turn before those of the vehicle itself were dropped.
     pub returns: u32,
-    /// Elevations of the lasers that made the points; `None` in a sweep that was never filled.
+    /// Elevations of the lasers the rows of radial maps come from; `None` where nobody knows them: those maps are unknown.
     pub calibration: Option<Arc<Calibration>>,
     /// Height of the sensor over the ground.
     pub mount_height_m: f32,
@@ -55,13 +57,37 @@ impl Sweep {
     /// Fills the sweep from a revolution, in place of what it held; `end_from_ego` is
     /// [`crate::motion::Moved::end_from_ego`] of this revolution, or empty to leave the points where they were seen.
     pub fn take_moving_revolution(&mut self, revolution: &Revolution, mount: &Mount, end_from_ego: &[Isometry3<f64>]) {
-        self.prepare(&revolution.calibration, mount);
+        self.take_revolution_around(revolution, mount, end_from_ego, None);
+    }
+
+    /// The same without the returns that the vehicle's own body hides; gives how many those are.
+    pub fn take_revolution_around(
+        &mut self,
+        revolution: &Revolution,
+        mount: &Mount,
+        end_from_ego: &[Isometry3<f64>],
+        body: Option<&Body>,
+    ) -> Dropped {
+        match body {
+            None => self.fill(revolution, mount, end_from_ego, |_| None),
+            Some(body) => self.fill(revolution, mount, end_from_ego, hides(mount, body)),
+        }
+    }
+
+    fn fill(
+        &mut self,
+        revolution: &Revolution,
+        mount: &Mount,
+        end_from_ego: &[Isometry3<f64>],
+        hides: impl Fn([f32; 3]) -> Option<Hidden>,
+    ) -> Dropped {
+        self.prepare(Some(&revolution.calibration), mount);
         let at_rest = Transform::new(&mount.ego_from_sensor);
-        let moving: Vec<Transform> =
-            end_from_ego.iter().map(|moved| Transform::new(&(moved * mount.ego_from_sensor))).collect();
+        let moving = transforms(mount, end_from_ego);
         let slots: usize = revolution.echoes.iter().map(|echo| echo.range_m.len()).sum();
         let mut kept = self.open(slots);
         let mut returns = 0;
+        let mut dropped = Dropped::default();
         for echo in &revolution.echoes {
             let mut take = |slots: std::ops::Range<usize>, transform: Transform| {
                 let n = slots.len();
@@ -73,7 +99,10 @@ impl Sweep {
                     (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
                     // Not fired is NaN and no return is 0: neither passes. Written always, kept by moving on: no branch.
                     returns += u32::from(range > 0.0);
-                    kept += usize::from(range > 0.0 && range >= mount.range_m_min);
+                    let far = range > 0.0 && range >= mount.range_m_min;
+                    let hidden = hides([x[i], y[i], z[i]]).filter(|_| far);
+                    dropped.count(hidden);
+                    kept += usize::from(far && hidden.is_none());
                 }
             };
             if moving.is_empty() {
@@ -84,16 +113,34 @@ impl Sweep {
         }
         self.returns = returns;
         self.close(kept);
+        dropped
     }
 
     /// Adds one deviation a point, in step with the points that [`Sweep::take_revolution`] took from the same revolution;
     /// a second echo has no series.
     pub fn take_deviations(&mut self, revolution: &Revolution, mount: &Mount, series: &mut Series) {
+        self.take_deviations_around(revolution, mount, series, None);
+    }
+
+    /// The same in step with [`Sweep::take_revolution_around`].
+    pub fn take_deviations_around(
+        &mut self,
+        revolution: &Revolution,
+        mount: &Mount,
+        series: &mut Series,
+        body: Option<&Body>,
+    ) {
         let first = series.take(revolution);
+        let hides = body.map(|body| hides(mount, body));
         self.deviation_m.clear();
         for (number, echo) in revolution.echoes.iter().enumerate() {
-            let kept =
+            let hidden = |slot: usize| {
+                let hides = hides.as_ref();
+                hides.is_some_and(|hides| hides([echo.x[slot], echo.y[slot], echo.z[slot]]).is_some())
+            };
+            let far =
                 echo.range_m.iter().enumerate().filter(|(_, range)| **range > 0.0 && **range >= mount.range_m_min);
+            let kept = far.filter(|(slot, _)| !hidden(*slot));
             self.deviation_m.extend(kept.map(|(slot, _)| if number == 0 { first[slot] } else { f32::NAN }));
         }
     }
@@ -101,21 +148,77 @@ impl Sweep {
     /// Fills the sweep from a scan, in place of what it held; gives the number of points left out because a coordinate
     /// is not finite or lies beyond 1 km. The four arrays must be equally long.
     pub fn take_scan(&mut self, scan: &Scan, calibration: &Arc<Calibration>, mount: &Mount) -> u64 {
+        self.take_scan_around(scan, Some(calibration), mount, &[], None).no_position
+    }
+
+    /// The same of a sensor whose elevations may not be known, each point moved from when it was seen (`end_from_ego` is
+    /// [`crate::motion::Moved::end_from_ego`] of this scan, or empty), without what the vehicle's own body hides.
+    pub fn take_scan_around(
+        &mut self,
+        scan: &Scan,
+        calibration: Option<&Arc<Calibration>>,
+        mount: &Mount,
+        end_from_ego: &[Isometry3<f64>],
+        body: Option<&Body>,
+    ) -> Dropped {
         self.prepare(calibration, mount);
-        let transform = Transform::new(&mount.ego_from_sensor);
+        let at_rest = Transform::new(&mount.ego_from_sensor);
+        let moving = transforms(mount, end_from_ego);
+        let knots = ScanKnots::of(scan);
+        let hides = body.map(|body| hides(mount, body));
         let mut kept = self.open(scan.x.len());
-        let (mut returns, mut dropped) = (0, 0);
-        for ((&x, &y), &z) in scan.x.iter().zip(&scan.y).zip(&scan.z) {
+        let mut returns = 0;
+        let mut dropped = Dropped::default();
+        for (index, ((&x, &y), &z)) in scan.x.iter().zip(&scan.y).zip(&scan.z).enumerate() {
+            let transform = if moving.is_empty() {
+                at_rest
+            } else {
+                let (knot, share) = knots.place(scan.offset_ns[index]);
+                moving[knot].towards(&moving[knot + 1], share)
+            };
             let [ex, ey, ez] = transform.apply(x, y, z);
             (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
             let (position, seen) = is_return(x, y, z);
-            dropped += u64::from(!position);
+            let far = seen && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min;
+            let hidden = hides.as_ref().and_then(|hides| hides([x, y, z])).filter(|_| far);
+            dropped.no_position += u64::from(!position);
+            dropped.count(hidden);
             returns += u32::from(seen);
-            kept += usize::from(seen && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min);
+            kept += usize::from(far && hidden.is_none());
         }
         self.returns = returns;
         self.close(kept);
         dropped
+    }
+
+    /// Becomes a copy of another sweep, keeping its memory.
+    pub(crate) fn copy(&mut self, other: &Sweep) {
+        for (axis, of) in [(&mut self.x, &other.x), (&mut self.y, &other.y), (&mut self.z, &other.z)] {
+            axis.clone_from(of);
+        }
+        self.deviation_m.clone_from(&other.deviation_m);
+        self.calibration.clone_from(&other.calibration);
+        (self.returns, self.mount_height_m) = (other.returns, other.mount_height_m);
+    }
+
+    /// Adds another sensor's points, carried by `carried`; their distance series are not known here. The rows of radial
+    /// maps become the other's where this sweep has none.
+    pub(crate) fn append(&mut self, other: &Sweep, carried: &Isometry3<f64>) {
+        let transform = Transform::new(carried);
+        for ((&x, &y), &z) in other.x.iter().zip(&other.y).zip(&other.z) {
+            let [x, y, z] = transform.apply(x, y, z);
+            self.x.push(x);
+            self.y.push(y);
+            self.z.push(z);
+        }
+        self.returns += other.returns;
+        if !self.deviation_m.is_empty() {
+            self.deviation_m.resize(self.x.len(), f32::NAN);
+        }
+        if self.calibration.is_none() && other.calibration.is_some() {
+            self.calibration.clone_from(&other.calibration);
+            self.mount_height_m = other.mount_height_m;
+        }
     }
 
     /// Whether [`Sweep::take_scan`] keeps this point (sensor frame, metres) of a sensor so mounted.
@@ -123,10 +226,8 @@ impl Sweep {
         is_return(x, y, z).1 && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min
     }
 
-    fn prepare(&mut self, calibration: &Arc<Calibration>, mount: &Mount) {
-        if !self.calibration.as_ref().is_some_and(|held| Arc::ptr_eq(held, calibration)) {
-            self.calibration = Some(Arc::clone(calibration));
-        }
+    fn prepare(&mut self, calibration: Option<&Arc<Calibration>>, mount: &Mount) {
+        self.calibration = calibration.map(Arc::clone);
         self.mount_height_m = mount.ego_from_sensor.translation.z as f32;
         self.deviation_m.clear();
     }
@@ -146,9 +247,20 @@ impl Sweep {
     }
 }
 
+/// What the body hides of a point of the sensor's frame, at the moment it was seen.
+fn hides(mount: &Mount, body: &Body) -> impl Fn([f32; 3]) -> Option<Hidden> {
+    let (at_rest, body) = (Transform::new(&mount.ego_from_sensor), *body);
+    move |[x, y, z]| body.hides(at_rest.apply(x, y, z))
+}
+
+/// `end_from_sensor` at each knot.
+fn transforms(mount: &Mount, end_from_ego: &[Isometry3<f64>]) -> Vec<Transform> {
+    end_from_ego.iter().map(|moved| Transform::new(&(moved * mount.ego_from_sensor))).collect()
+}
+
 /// Whether a scan's point is a position at all, and whether it is one with a return.
 #[inline(always)]
-fn is_return(x: f32, y: f32, z: f32) -> (bool, bool) {
+pub(crate) fn is_return(x: f32, y: f32, z: f32) -> (bool, bool) {
     // NaN fails every comparison.
     let position = x.abs() <= POSITION_M_MAX && y.abs() <= POSITION_M_MAX && z.abs() <= POSITION_M_MAX;
     (position, position && squared_range(x, y, z) > 0.0)

@@ -86,16 +86,8 @@ fn vehicle() -> SimulatedVehicle {
 fn config(motion: MotionConfig) -> VehicleConfig {
     let maps = MapsConfig { motion, ..MapsConfig::default() };
     let extrinsics = Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.9, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
-    let sensor = SensorConfig {
-        name: "top".into(),
-        model: Some(Model::Hdl32e),
-        rpm: None,
-        calibration: None,
-        cut_azimuth_deg: 180.0,
-        range_m_min: 2.0,
-        extrinsics,
-    };
-    VehicleConfig { name: "car".into(), sensors: vec![sensor], maps }
+    let sensor = SensorConfig { model: Some(Model::Hdl32e), ..SensorConfig::new("top", extrinsics) };
+    VehicleConfig { maps, ..VehicleConfig::new("car", vec![sensor]) }
 }
 
 /// What comes in of 300 ms: datagrams, telemetry unless `silent`, and a pose every `pose_ns` where that is given.

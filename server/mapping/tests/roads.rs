@@ -3,7 +3,7 @@
 mod common;
 
 use bytes::Bytes;
-use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::config::{Extrinsics, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, EgoPose, Event, Road, RoadFrame, RoadPurpose};
 use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::road::rddf::Rddf;
@@ -24,16 +24,7 @@ fn good() -> Road {
 #[test]
 fn a_road_that_is_none_is_refused_by_name_and_counted_and_the_one_before_stays() {
     let extrinsics = Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.9, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
-    let sensor = SensorConfig {
-        name: "top".into(),
-        model: None,
-        rpm: None,
-        calibration: None,
-        cut_azimuth_deg: 180.0,
-        range_m_min: 2.0,
-        extrinsics,
-    };
-    let config = VehicleConfig { name: "car".into(), sensors: vec![sensor], maps: MapsConfig::default() };
+    let config = VehicleConfig::new("car", vec![SensorConfig::new("top", extrinsics)]);
     let mut pipeline = Pipeline::new(&config, vec![None]).unwrap();
     let step = |pipeline: &mut Pipeline, body| {
         let event = Event { sequence: 0, arrival_ns: 0, source: 0, body };

@@ -156,7 +156,7 @@ fn first_revolutions(
             }
             Body::Scan(scan) => clouds.push(points_of_scan(scan)),
             Body::End => clouds.extend(sensor.finish().map(points_of)),
-            Body::EgoPose(_) | Body::Road(_) | Body::Lost(_) => {}
+            Body::EgoPose(_) | Body::Road(_) | Body::Sensor(_) | Body::Lost(_) => {}
         }
         if clouds.len() >= MOUNT_REVOLUTIONS {
             break;
