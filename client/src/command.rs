@@ -12,11 +12,48 @@ pub mod send;
 pub mod vehicles;
 pub mod watch;
 
+use std::path::PathBuf;
+
 use anyhow::{Context, Result};
+use clap::Args;
+use clearway_client::{Client, Tls};
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// Where a server listens unless told otherwise.
-pub const SERVER: &str = "localhost:50051";
+const SERVER: &str = "localhost:50051";
+
+/// Which server, and how it is met.
+#[derive(Args)]
+pub struct Server {
+    /// The server's gRPC address.
+    #[arg(long = "server", default_value = SERVER, env = "CLEARWAY_SERVER")]
+    pub address: String,
+    /// PEM file with the CA of the server's certificate: the connection is encrypted.
+    #[arg(long, value_name = "FILE.pem", env = "CLEARWAY_CA")]
+    ca: Option<PathBuf>,
+    /// PEM file with this client's certificate, where the server asks for one.
+    #[arg(long, value_name = "FILE.pem", env = "CLEARWAY_CERT", requires_all = ["ca", "key"])]
+    cert: Option<PathBuf>,
+    /// PEM file with its private key.
+    #[arg(long, value_name = "FILE.key", env = "CLEARWAY_KEY", requires = "cert")]
+    key: Option<PathBuf>,
+}
+
+impl Server {
+    /// Connects.
+    ///
+    /// # Errors
+    /// A file that cannot be read, or what the transport says.
+    pub async fn connect(&self) -> Result<Client> {
+        let read = |file: &PathBuf| std::fs::read_to_string(file).with_context(|| format!("read {}", file.display()));
+        let Some(ca) = &self.ca else { return Ok(Client::connect(&self.address).await?) };
+        let identity = match (&self.cert, &self.key) {
+            (Some(certificate), Some(key)) => Some((read(certificate)?, read(key)?)),
+            _ => None,
+        };
+        Ok(Client::connect_tls(&self.address, &Tls { ca: read(ca)?, identity, server_name: String::new() }).await?)
+    }
+}
 
 /// zenoh needs the multi-thread runtime.
 pub fn block_on(work: impl Future<Output = Result<()>>) -> Result<()> {

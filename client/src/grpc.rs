@@ -12,7 +12,7 @@ use tokio::sync::mpsc;
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
-use tonic::transport::{Channel, Endpoint};
+use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
 
 use crate::ClientError;
 use crate::ingest::{Deliver, Ear, Ingester};
@@ -44,6 +44,17 @@ pub struct Subscription {
     pub max_in_flight: u32,
 }
 
+/// What a client shows, and whom it believes. All PEM.
+#[derive(Clone, Default)]
+pub struct Tls {
+    /// The CA that the server's certificate must be of.
+    pub ca: String,
+    /// The client's own certificate and private key, where the server asks who is there.
+    pub identity: Option<(String, String)>,
+    /// The name that must stand in the server's certificate; the address' host where empty.
+    pub server_name: String,
+}
+
 impl Default for Subscription {
     fn default() -> Self {
         Self { vehicle: String::new(), layers: Vec::new(), max_in_flight: 2 }
@@ -51,15 +62,32 @@ impl Default for Subscription {
 }
 
 impl Client {
-    /// Connects to `HOST:PORT` or `http://HOST:PORT`.
+    /// Connects to `HOST:PORT` or `http://HOST:PORT`, in plain text.
     ///
     /// # Errors
     /// [`ClientError::Address`] for what is no address, [`ClientError::Unreachable`] where nobody answers.
     pub async fn connect(address: &str) -> Result<Self, ClientError> {
+        Self::open(address, None).await
+    }
+
+    /// Connects to `HOST:PORT` or `https://HOST:PORT` with certificates.
+    ///
+    /// # Errors
+    /// [`ClientError::Address`] for what is no address or no certificate, [`ClientError::Unreachable`] where nobody answers
+    /// or one side does not believe the other; a client the server does not know may hear of it at its first call only.
+    pub async fn connect_tls(address: &str, tls: &Tls) -> Result<Self, ClientError> {
+        Self::open(address, Some(tls)).await
+    }
+
+    async fn open(address: &str, tls: Option<&Tls>) -> Result<Self, ClientError> {
         let wrong = |reason: &str| ClientError::Address { address: address.into(), reason: reason.into() };
-        let rest = address.strip_prefix("http://").unwrap_or(address).trim_end_matches('/');
+        let scheme = if tls.is_some() { "https://" } else { "http://" };
+        let rest = address.strip_prefix(scheme).unwrap_or(address).trim_end_matches('/');
+        if rest.starts_with("https://") {
+            return Err(wrong("https needs certificates"));
+        }
         if rest.contains("://") {
-            return Err(wrong("another scheme than http"));
+            return Err(wrong(&format!("another scheme than {scheme}")));
         }
         match rest.rsplit_once(':') {
             None => return Err(wrong("no port")),
@@ -67,8 +95,11 @@ impl Client {
             Some((_, port)) if port.parse::<u16>().is_err() => return Err(wrong("the port is no number up to 65535")),
             Some(_) => {}
         }
-        let url = format!("http://{rest}");
-        let endpoint = Endpoint::from_shared(url.clone()).map_err(|error| wrong(&innermost(&error)))?;
+        let url = format!("{scheme}{rest}");
+        let mut endpoint = Endpoint::from_shared(url.clone()).map_err(|error| wrong(&innermost(&error)))?;
+        if let Some(tls) = tls {
+            endpoint = endpoint.tls_config(tls.to_tonic()).map_err(|error| wrong(&innermost(&error)))?;
+        }
         let endpoint = endpoint
             .connect_timeout(CONNECT_TIMEOUT)
             .tcp_nodelay(true)
@@ -149,6 +180,19 @@ impl Client {
             }
         });
         Ok(Ingester::new(address, deliver, heard))
+    }
+}
+
+impl Tls {
+    fn to_tonic(&self) -> ClientTlsConfig {
+        let mut config = ClientTlsConfig::new().ca_certificate(Certificate::from_pem(&self.ca));
+        if let Some((certificate, key)) = &self.identity {
+            config = config.identity(Identity::from_pem(certificate, key));
+        }
+        if !self.server_name.is_empty() {
+            config = config.domain_name(&self.server_name);
+        }
+        config
     }
 }
 

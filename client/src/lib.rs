@@ -41,7 +41,7 @@ pub mod zenoh;
 pub use clearway_proto::map::{Channel, Layer};
 pub use clearway_proto::{codec, grid, v1};
 
-pub use grpc::{Client, Subscription};
+pub use grpc::{Client, Subscription, Tls};
 pub use ingest::Ingester;
 pub use observation::{Observation, Refusal};
 pub use stream::{MapStream, Update};
@@ -55,7 +55,9 @@ use clearway_proto::map::MapError;
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum ClientError {
     /// An address that is none.
-    #[error("server address {address:?}: {reason}; HOST:PORT or http://HOST:PORT is allowed, such as localhost:50051")]
+    #[error(
+        "server address {address:?}: {reason}; HOST:PORT is allowed, such as localhost:50051; with certificates too"
+    )]
     Address {
         /// As given.
         address: String,

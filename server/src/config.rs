@@ -50,12 +50,55 @@ pub struct Grpc {
     pub enabled: bool,
     /// Address and port; port 0 takes a free one.
     pub listen: SocketAddr,
+    /// Certificates; plain text without.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tls: Option<Tls>,
+    /// Who may do what, once client certificates are asked for.
+    pub access: Access,
 }
 
 impl Default for Grpc {
     fn default() -> Self {
-        Self { enabled: true, listen: SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 50051) }
+        let listen = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 50051);
+        Self { enabled: true, listen, tls: None, access: Access::default() }
     }
+}
+
+/// `[grpc.tls]`: PEM files; relative paths start at the configuration's folder.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Tls {
+    /// The server's certificate, and those between it and the CA.
+    pub certificate: PathBuf,
+    /// Its private key. Only the path is ever recorded.
+    pub key: PathBuf,
+    /// Whose certificates clients must have; without, no client is asked who it is.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub client_ca: Option<PathBuf>,
+}
+
+/// `[grpc.access]`: names in client certificates (common name or DNS name), by what their bearers may do. Whoever is in no
+/// list may do nothing.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Access {
+    /// May read maps and status.
+    pub readers: Vec<String>,
+    /// May send scans, poses, roads and packets.
+    pub ingesters: Vec<String>,
+    /// May do both, and control recordings.
+    pub operators: Vec<String>,
+}
+
+/// The files of `[grpc.tls]`, read. The key never leaves this value.
+#[derive(Clone)]
+pub struct Certificates {
+    /// PEM.
+    pub certificate: String,
+    /// PEM.
+    pub key: String,
+    /// PEM.
+    pub client_ca: Option<String>,
 }
 
 /// `[page]`.
@@ -88,6 +131,9 @@ pub struct Zenoh {
     pub connect: Vec<String>,
     /// Look for peers by multicast.
     pub scouting: bool,
+    /// A zenoh configuration (JSON5) to begin with: TLS, access control; the keys above stand over it. Empty: zenoh's own
+    /// defaults.
+    pub file: PathBuf,
 }
 
 impl Default for Zenoh {
@@ -98,6 +144,7 @@ impl Default for Zenoh {
             listen: vec!["tcp/127.0.0.1:7447".into()],
             connect: Vec::new(),
             scouting: false,
+            file: PathBuf::new(),
         }
     }
 }
@@ -247,15 +294,15 @@ pub enum ConfigError {
         /// What may stand there.
         allowed: String,
     },
-    /// A sensor's calibration file is missing or unreadable.
-    #[error("configuration {}: {key} = {}: {reason}", file.display(), calibration.display())]
-    Calibration {
+    /// A file that the configuration names (a calibration, a certificate) is missing or unreadable.
+    #[error("configuration {}: {key} = {}: {reason}", file.display(), named.display())]
+    File {
         /// The configuration file.
         file: PathBuf,
         /// Path of the key.
         key: String,
-        /// The calibration file.
-        calibration: PathBuf,
+        /// The file it names.
+        named: PathBuf,
         /// What is wrong with it, and what is allowed.
         reason: String,
     },
@@ -321,6 +368,15 @@ impl Config {
         if self.vehicles.is_empty() {
             return wrong("vehicle".into(), &"[]", "at least one [[vehicle]]");
         }
+        let Access { readers, ingesters, operators } = &self.grpc.access;
+        let asked = self.grpc.tls.as_ref().is_some_and(|tls| tls.client_ca.is_some());
+        if let Some(name) = readers.iter().chain(ingesters).chain(operators).next().filter(|_| !asked) {
+            return wrong(
+                "grpc.access".into(),
+                name,
+                "nobody, unless grpc.tls.client_ca says whose certificates to ask for",
+            );
+        }
         if !(10..=60_000).contains(&self.recorder.flush_ms) {
             return wrong("recorder.flush_ms".into(), &self.recorder.flush_ms, "10 to 60000 ms");
         }
@@ -328,8 +384,12 @@ impl Config {
             return wrong("recorder.queue".into(), &self.recorder.queue, "16 to 1048576 events");
         }
         for (key, endpoints) in [("zenoh.listen", &self.zenoh.listen), ("zenoh.connect", &self.zenoh.connect)] {
-            if let Some(endpoint) = endpoints.iter().find(|e| !e.starts_with("tcp/")) {
-                return wrong(key.into(), endpoint, "endpoints such as \"tcp/127.0.0.1:7447\"");
+            if let Some(endpoint) = endpoints.iter().find(|e| !e.starts_with("tcp/") && !e.starts_with("tls/")) {
+                return wrong(
+                    key.into(),
+                    endpoint,
+                    "endpoints such as \"tcp/127.0.0.1:7447\" or \"tls/localhost:7447\"",
+                );
             }
         }
         let mut names = BTreeSet::new();
@@ -362,19 +422,44 @@ impl Config {
         Ok(())
     }
 
+    /// Reads the files of `[grpc.tls]`; `None` where there is no such table. Relative paths start at the configuration's
+    /// folder, `file`'s parent.
+    ///
+    /// # Errors
+    /// [`ConfigError::File`] with what is wrong.
+    pub fn certificates(&self, file: &Path) -> Result<Option<Certificates>, ConfigError> {
+        let Some(tls) = &self.grpc.tls else { return Ok(None) };
+        let read = |key: &str, path: &PathBuf| {
+            let named = file.parent().unwrap_or(Path::new("")).join(path);
+            let wrong = |reason: String| ConfigError::File {
+                file: file.to_owned(),
+                key: format!("grpc.tls.{key}"),
+                named: named.clone(),
+                reason,
+            };
+            let text = std::fs::read_to_string(&named).map_err(|error| wrong(error.to_string()))?;
+            let what = if key == "key" { "PRIVATE KEY-----" } else { "BEGIN CERTIFICATE-----" };
+            let found = text.contains(what);
+            if found { Ok(text) } else { Err(wrong(format!("no PEM block \"{what}\" in it"))) }
+        };
+        let client_ca = tls.client_ca.as_ref().map(|path| read("client_ca", path)).transpose()?;
+        let (certificate, key) = (read("certificate", &tls.certificate)?, read("key", &tls.key)?);
+        Ok(Some(Certificates { certificate, key, client_ca }))
+    }
+
     /// Reads the calibration files of all sensors: by vehicle and sensor, in the order of the configuration; `None`
     /// where the factory's table serves. Relative paths start at the configuration's folder, `file`'s parent.
     ///
     /// # Errors
-    /// [`ConfigError::Calibration`] with what is wrong and what is allowed.
+    /// [`ConfigError::File`] with what is wrong and what is allowed.
     pub fn calibrations(&self, file: &Path) -> Result<Calibrations, ConfigError> {
         let of = |vehicle: &Vehicle, sensor: &SensorConfig| {
             let Some(path) = &sensor.calibration else { return Ok(None) };
             let path = file.parent().unwrap_or(Path::new("")).join(path);
-            let wrong = |reason: String| ConfigError::Calibration {
+            let wrong = |reason: String| ConfigError::File {
                 file: file.to_owned(),
                 key: format!("vehicle.sensor.calibration (of {}/{})", vehicle.name, sensor.name),
-                calibration: path.clone(),
+                named: path.clone(),
                 reason,
             };
             let text = std::fs::read_to_string(&path).map_err(|error| wrong(error.to_string()))?;

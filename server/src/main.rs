@@ -201,6 +201,7 @@ fn run(command: Command) -> Result<ExitCode> {
         Command::Check { config } => {
             let checked = load(&config)?;
             checked.calibrations(&config.config)?;
+            checked.certificates(&config.config)?;
             say(&checked.to_toml());
             Ok(ExitCode::SUCCESS)
         }
@@ -222,12 +223,13 @@ fn load(arguments: &ConfigArguments) -> Result<Config> {
 async fn serve(arguments: &ConfigArguments) -> Result<ExitCode> {
     let mut config = load(arguments)?;
     let calibrations = config.calibrations(&arguments.config)?;
+    let certificates = config.certificates(&arguments.config)?;
     if let Some(file) = clearway_server::record::wanted(&config.recorder) {
         config.recorder.file = clearway_server::record::unused(file);
     }
     // Asked for before anything starts, so that no signal can fall between.
     let stop = stop_signal()?;
-    let running = Server::start(Setup { config, calibrations, ..Setup::default() }).await?;
+    let running = Server::start(Setup { config, calibrations, certificates, ..Setup::default() }).await?;
     tell(&running);
     stop.await;
     tracing::info!("stopping");

@@ -8,6 +8,7 @@ use tokio::sync::watch;
 use crate::engine::Newest;
 use crate::status::VehicleStatus;
 
+pub mod access;
 pub mod connections;
 pub mod grpc;
 pub mod page;

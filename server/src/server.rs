@@ -14,7 +14,7 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-use crate::config::{Calibrations, Config};
+use crate::config::{Calibrations, Certificates, Config};
 use crate::engine::{Engine, Observer};
 use crate::ingest::entrance::{Entrance, Entrances};
 use crate::ingest::{Door, door, udp};
@@ -32,6 +32,8 @@ pub struct Setup {
     pub config: Config,
     /// Of every sensor, as [`Config::calibrations`] gives them.
     pub calibrations: Calibrations,
+    /// As [`Config::certificates`] gives them; gRPC is plain text without.
+    pub certificates: Option<Certificates>,
     /// Names this run in maps and recordings; drawn where absent.
     pub boot_id: Option<u64>,
     /// Events come from files: a full recorder queue holds them up, instead of losing anything.
@@ -63,6 +65,9 @@ pub enum StartError {
         /// Why.
         source: std::io::Error,
     },
+    /// The certificates are of no use.
+    #[error("grpc.tls: {0}; a PEM certificate (chain), its PEM private key and PEM CA certificates are allowed")]
+    Certificates(String),
     /// A vehicle's sockets cannot be bound.
     #[error("vehicle {vehicle}: {source}")]
     Udp {
@@ -145,7 +150,7 @@ impl Server {
     /// # Errors
     /// [`StartError`], after which nothing is left running.
     pub async fn start(setup: Setup) -> Result<Running, StartError> {
-        let Setup { config, mut calibrations, boot_id, from_files, remarks, notes, mut observer } = setup;
+        let Setup { config, mut calibrations, certificates, boot_id, from_files, remarks, notes, mut observer } = setup;
         if config.zenoh.enabled && !cfg!(feature = "zenoh") {
             return Err(StartError::NoZenoh);
         }
@@ -212,9 +217,11 @@ impl Server {
         let address = |listener: &TcpListener| listener.local_addr().ok();
         let (grpc_at, page_at) = (grpc.as_ref().and_then(address), page.as_ref().and_then(address));
         if let Some(listener) = grpc {
+            let security = grpc::Security::new(certificates, &config.grpc.access);
+            let security = security.map_err(|error| StartError::Certificates(sources(&error)))?;
             let (vehicles, entrances, stopped) = (vehicles.clone(), entrances.clone(), stopped());
             publishers.spawn(async move {
-                if let Err(error) = grpc::serve(listener, vehicles, entrances, stopped).await {
+                if let Err(error) = grpc::serve(listener, security, vehicles, entrances, stopped).await {
                     tracing::error!(%error, "grpc ended");
                 }
             });
@@ -315,6 +322,12 @@ impl Running {
         }
         outcome
     }
+}
+
+/// An error and all that caused it: "transport error" says little.
+fn sources(error: &dyn std::error::Error) -> String {
+    let causes = std::iter::successors(Some(error), |error| error.source());
+    causes.map(ToString::to_string).collect::<Vec<_>>().join(": ")
 }
 
 async fn listen(what: &'static str, at: Option<SocketAddr>) -> Result<Option<TcpListener>, StartError> {

@@ -5,18 +5,17 @@ use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use clearway_client::{Client, now_ns};
+use clearway_client::now_ns;
 
 use super::export::Drawing;
-use super::{SERVER, document, npy, say};
+use super::{Server, document, npy, say};
 use clearway_client::picture;
 
 /// Get the newest map: its figures, or with --out one layer as a file.
 #[derive(Args)]
 pub struct Options {
-    /// The server's gRPC address.
-    #[arg(long, default_value = SERVER, env = "CLEARWAY_SERVER")]
-    server: String,
+    #[command(flatten)]
+    server: Server,
     /// The vehicle, where the server has several.
     #[arg(long, default_value = "")]
     vehicle: String,
@@ -42,7 +41,7 @@ pub async fn run(options: Options) -> Result<()> {
     {
         bail!("--out {}: the name ends in {extension:?}; .png, .npy and .json are allowed", out.display());
     }
-    let client = Client::connect(&server).await?;
+    let client = server.connect().await?;
     let layers: Vec<String> = layer.iter().cloned().collect();
     let map = client.newest(&vehicle, &layers).await?;
     let layer = match &layer {

@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use clearway_client::{Client, Ingester, Observation, Refusal};
+use clearway_client::{Ingester, Observation, Refusal};
 use serde_json::json;
 
-use super::{SERVER, say};
+use super::{Server, say};
 
 mod files;
 
@@ -20,11 +20,10 @@ pub struct Options {
     /// The files. Scans are stamped as the poses are, one each, or from now on at --hz where there are none.
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// The server's gRPC address.
-    #[arg(long, default_value = SERVER, env = "CLEARWAY_SERVER")]
-    server: String,
+    #[command(flatten)]
+    server: Server,
     /// Over zenoh instead, by this endpoint, such as tcp/localhost:7447.
-    #[arg(long, value_name = "ENDPOINT", conflicts_with = "server")]
+    #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
     zenoh: Option<String>,
     /// The vehicle; over zenoh, and where there are several, it must be given.
     #[arg(long, default_value = "")]
@@ -74,7 +73,7 @@ pub async fn run(options: Options) -> Result<()> {
     let plan = files::Plan::of(&options)?;
     let ingester = match &options.zenoh {
         Some(endpoint) => over_zenoh(endpoint, &options.vehicle).await?,
-        None => Client::connect(&options.server).await?.ingest(&options.vehicle).await?,
+        None => options.server.connect().await?.ingest(&options.vehicle).await?,
     };
     let mut sender =
         Sender { ingester, paced: !options.fast, begun: None, sent: BTreeMap::new(), refusals: Vec::new() };

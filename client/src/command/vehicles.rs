@@ -2,17 +2,16 @@
 
 use anyhow::Result;
 use clap::Args;
-use clearway_client::{Client, now_ns, v1};
+use clearway_client::{now_ns, v1};
 use serde_json::{Value, json};
 
-use super::{SERVER, say};
+use super::{Server, say};
 
 /// List a server's vehicles: maps, sensors, what was refused or lost, readers, recorder.
 #[derive(Args)]
 pub struct Options {
-    /// The server's gRPC address.
-    #[arg(long, default_value = SERVER, env = "CLEARWAY_SERVER")]
-    server: String,
+    #[command(flatten)]
+    server: Server,
     /// One JSON array.
     #[arg(long)]
     json: bool,
@@ -23,7 +22,7 @@ pub struct Options {
 /// # Errors
 /// What the server says.
 pub async fn run(options: Options) -> Result<()> {
-    let vehicles = Client::connect(&options.server).await?.vehicles().await?;
+    let vehicles = options.server.connect().await?.vehicles().await?;
     let now = now_ns();
     if options.json {
         let documents: Vec<_> = vehicles.iter().map(|vehicle| document(vehicle, now)).collect();

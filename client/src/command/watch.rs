@@ -2,19 +2,18 @@
 
 use anyhow::{Result, bail};
 use clap::Args;
-use clearway_client::{Client, MapStream, Subscription, Update, now_ns};
+use clearway_client::{MapStream, Subscription, Update, now_ns};
 use serde_json::json;
 
-use super::{SERVER, say};
+use super::{Server, say};
 
 /// Watch maps as they come, one line each: sequence, age, drivable share, bytes, skipped.
 #[derive(Args)]
 pub struct Options {
-    /// The server's gRPC address.
-    #[arg(long, default_value = SERVER, env = "CLEARWAY_SERVER")]
-    server: String,
+    #[command(flatten)]
+    server: Server,
     /// Over zenoh instead, by this endpoint, such as tcp/localhost:7447.
-    #[arg(long, value_name = "ENDPOINT", conflicts_with = "server")]
+    #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
     zenoh: Option<String>,
     /// The vehicle, where there are several.
     #[arg(long)]
@@ -41,7 +40,7 @@ pub async fn run(options: Options) -> Result<()> {
             let Options { vehicle, layers, .. } = &options;
             let vehicle = vehicle.clone().unwrap_or_default();
             let subscription = Subscription { vehicle, layers: layers.clone(), ..Subscription::default() };
-            Client::connect(&options.server).await?.subscribe(subscription).await?
+            options.server.connect().await?.subscribe(subscription).await?
         }
     };
     let mut seen = 0;

@@ -7,17 +7,20 @@
 
 use std::collections::VecDeque;
 use std::pin::Pin;
+use std::sync::Arc;
 use std::time::Duration;
 
 use clearway_proto::{DESCRIPTORS, v1};
 use futures::{Stream, stream};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
-use tonic::transport::Server;
+use tonic::transport::{Certificate, Identity, Server, ServerTlsConfig};
 use tonic::{Request, Response, Status, Streaming};
 
+use super::access::{Access, Guard};
 use super::connections::Connections;
 use super::{Served, Unknown, Vehicles};
+use crate::config::{self, Certificates};
 use crate::engine::Newest;
 use crate::ingest::entrance::Entrances;
 use crate::ingest::grpc::Ingest;
@@ -41,16 +44,45 @@ const KEEPALIVE: Duration = Duration::from_secs(10);
 /// What a reader may ask to have on its way: more would only be older.
 const IN_FLIGHT_MAX: u32 = 64;
 
+/// A peer that has begun a handshake has no reason to wait.
+const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// How peers are met: in plain text and trusting everybody, or with certificates.
+pub struct Security {
+    builder: Server,
+    guard: Guard,
+}
+
+impl Security {
+    /// From the configuration and the files it names; without certificates plain text.
+    ///
+    /// # Errors
+    /// What the transport says of the certificates.
+    pub fn new(certificates: Option<Certificates>, access: &config::Access) -> Result<Self, tonic::transport::Error> {
+        let Some(Certificates { certificate, key, client_ca }) = certificates else {
+            return Ok(Self { builder: Server::builder(), guard: Guard(None) });
+        };
+        let mut tls = ServerTlsConfig::new().identity(Identity::from_pem(certificate, key)).timeout(HANDSHAKE_TIMEOUT);
+        let guard = Guard(client_ca.is_some().then(|| Arc::new(Access::new(access))));
+        if let Some(client_ca) = client_ca {
+            tls = tls.client_ca_root(Certificate::from_pem(client_ca));
+        }
+        Ok(Self { builder: Server::builder().tls_config(tls)?, guard })
+    }
+}
+
 /// Serves until `stop` resolves and all streams have ended.
 ///
 /// # Errors
 /// What the transport says.
 pub async fn serve(
     listener: TcpListener,
+    security: Security,
     vehicles: Vehicles,
     entrances: Entrances,
     stop: impl Future<Output = ()>,
 ) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+    let Security { builder, guard } = security;
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<MapServiceServer<Maps>>().await;
     let ingest = (!entrances.all().is_empty()).then(|| Ingest::new(entrances).service());
@@ -63,7 +95,8 @@ pub async fn serve(
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
     let maps = MapServiceServer::new(Maps { vehicles }).max_decoding_message_size(REQUEST_BYTES_MAX);
-    Server::builder()
+    builder
+        .layer(guard)
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE))
         // A scan is megabytes; what is not read yet is bounded by the connection's window either way.

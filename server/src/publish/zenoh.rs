@@ -169,7 +169,10 @@ fn map_encoding() -> Encoding {
 }
 
 fn session_config(options: &Options) -> Result<Config, ZenohError> {
-    let mut config = Config::default();
+    let mut config = match options.file.as_os_str().is_empty() {
+        true => Config::default(),
+        false => Config::from_file(&options.file).map_err(failed(format!("zenoh.file {}", options.file.display())))?,
+    };
     let json = |value: serde_json::Value| value.to_string();
     let settings = [
         ("mode", json(options.mode.as_str().into())),

@@ -104,7 +104,8 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     }
     let clouds = options.clouds.as_deref().map(Clouds::create).transpose()?;
     let (observer, clouds) = clouds.map(Clouds::observer).unzip();
-    let setup = Setup { config, calibrations: tables, boot_id, from_files: true, remarks, notes, observer };
+    let setup =
+        Setup { config, calibrations: tables, boot_id, from_files: true, remarks, notes, observer, ..Setup::default() };
     Ok(Plan { setup, mount, extrinsics, readings, clouds })
 }
 

@@ -1,0 +1,159 @@
+//! Certificates and roles: who is let in, who is told what they may not do, and what of it is recorded.
+
+mod house;
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::OnceLock;
+
+use clearway_client::{Client, ClientError, Subscription, Tls};
+use clearway_server::config::{Access, Config, Tls as TlsConfig};
+use clearway_server::server::{Running, Server, Setup};
+use house::{config, feed, grpc, readings, within};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+
+/// Certificates of a CA, and of another one, as the script makes them.
+fn certificates(ca: &str) -> PathBuf {
+    static MADE: OnceLock<tempfile::TempDir> = OnceLock::new();
+    let folder = MADE.get_or_init(|| {
+        let folder = tempfile::tempdir().unwrap();
+        for ca in ["ours", "theirs"] {
+            let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/make-test-ca.sh");
+            let made = Command::new("sh").arg(script).arg(folder.path().join(ca)).output().expect("a shell");
+            let said = String::from_utf8_lossy(&made.stderr).into_owned();
+            assert!(made.status.success(), "deploy/make-test-ca.sh needs Debian's openssl: {said}");
+        }
+        folder
+    });
+    folder.path().join(ca)
+}
+
+fn secured(ask_clients: bool) -> Config {
+    let folder = certificates("ours");
+    let mut config = config();
+    config.grpc.tls = Some(TlsConfig {
+        certificate: folder.join("server.pem"),
+        key: folder.join("server.key"),
+        client_ca: ask_clients.then(|| folder.join("ca.pem")),
+    });
+    if ask_clients {
+        config.grpc.access = Access {
+            readers: vec!["reader".into()],
+            ingesters: vec!["ingester".into()],
+            operators: vec!["operator".into()],
+        };
+    }
+    config
+}
+
+async fn start(config: Config) -> Running {
+    let certificates = config.certificates(Path::new("")).expect("the certificates are there");
+    let setup = Setup { config, certificates, from_files: true, ..Setup::default() };
+    Server::start(setup).await.expect("the server starts")
+}
+
+fn tls(ca: &str, identity: Option<(&str, &str)>) -> Tls {
+    let read = |folder: &Path, file: String| std::fs::read_to_string(folder.join(file)).expect("a certificate");
+    let identity = identity.map(|(of, name)| {
+        let folder = certificates(of);
+        (read(&folder, format!("{name}.pem")), read(&folder, format!("{name}.key")))
+    });
+    Tls { ca: read(&certificates(ca), "ca.pem".into()), identity, server_name: "localhost".into() }
+}
+
+/// Connects and asks for the vehicles; the handshake's refusal may show in either.
+async fn vehicles(running: &Running, tls: &Tls) -> Result<usize, ClientError> {
+    let address = running.grpc.expect("gRPC is served").to_string();
+    within("an answer", async { Ok(Client::connect_tls(&address, tls).await?.vehicles().await?.len()) }).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn with_a_servers_certificate_alone_everybody_reads_over_tls_and_nobody_in_plain_text() {
+    let running = start(secured(false)).await;
+    assert_eq!(vehicles(&running, &tls("ours", None)).await.unwrap(), 1);
+    let believed = vehicles(&running, &tls("theirs", None)).await;
+    assert!(matches!(believed, Err(ClientError::Unreachable { .. })), "{believed:?}");
+    let address = running.grpc.unwrap().to_string();
+    let plain = within("an answer", async { Client::connect(&address).await?.vehicles().await }).await;
+    assert!(plain.is_err(), "{plain:?}");
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_certificate_opens_what_its_roles_allow_and_nothing_else() {
+    let running = start(secured(true)).await;
+    feed(&running, readings(2)).await;
+    let address = running.grpc.unwrap().to_string();
+    for (name, may_watch) in [("reader", true), ("operator", true), ("ingester", false), ("server", false)] {
+        let client = Client::connect_tls(&address, &tls("ours", Some(("ours", name)))).await.expect("a handshake");
+        let watched = within("an answer", async {
+            let mut maps = client.subscribe(Subscription::default()).await?;
+            maps.next().await.map(|update| update.map.sequence())
+        })
+        .await;
+        match watched {
+            Ok(_) => assert!(may_watch, "{name} may not watch"),
+            Err(ClientError::Refused { reason, code, .. }) => {
+                assert!(!may_watch && code == "PermissionDenied", "{name}: {reason}");
+                assert!(reason.contains(name) && reason.contains("allowed roles are [reader, operator]"), "{reason}");
+            }
+            Err(other) => panic!("{name}: {other}"),
+        }
+        assert_eq!(client.vehicles().await.is_ok(), name != "server", "{name}");
+    }
+    for stranger in [None, Some(("theirs", "reader"))] {
+        let answer = vehicles(&running, &tls("ours", stranger)).await;
+        assert!(answer.is_err(), "{stranger:?} is let in");
+    }
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recording_holds_the_path_of_the_key_and_nothing_of_the_key() {
+    let folder = tempfile::tempdir().unwrap();
+    let record = folder.path().join("secured.mcap");
+    let mut config = secured(true);
+    config.recorder.file.clone_from(&record);
+    let running = start(config).await;
+    feed(&running, readings(1)).await;
+    within("shutdown", running.shutdown()).await.unwrap();
+    let recording = clearway_server::recording::Recording::open(&record).unwrap();
+    let text = recording.preface().config.clone().unwrap();
+    assert!(text.contains("server.key") && !text.contains("PRIVATE"), "{text}");
+    let key = std::fs::read_to_string(certificates("ours").join("server.key")).unwrap();
+    let secret = key.lines().nth(1).expect("base64").as_bytes();
+    let bytes = std::fs::read(&record).unwrap();
+    assert!(!bytes.windows(secret.len()).any(|window| window == secret));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn peers_that_shake_no_hand_reset_or_say_too_much_leave_the_others_served() {
+    let running = start(config()).await;
+    feed(&running, readings(2)).await;
+    let address = running.grpc.unwrap();
+    // Opened, and never a byte: they wait for their place, or lose it.
+    let mut silent = Vec::new();
+    for _ in 0..200 {
+        silent.push(TcpStream::connect(address).await.expect("a place in the kernel's queue"));
+    }
+    let mut client = grpc(&running).await;
+    for _ in 0..100 {
+        // A stream begun and dropped at once.
+        let begun = client.watch(tokio_stream::once(house::selection("car", &[], 1))).await;
+        drop(begun.expect("a stream"));
+    }
+    let long = clearway_proto::v1::GetMapRequest { vehicle: "x".repeat(1 << 20), layers: Vec::new() };
+    let refused = client.get_map(long).await.unwrap_err();
+    assert_eq!(refused.code(), tonic::Code::OutOfRange, "{refused:?}");
+    let mut garbage = TcpStream::connect(address).await.unwrap();
+    garbage.write_all(&[0xff; 4096]).await.unwrap();
+    let mut rest = Vec::new();
+    let _closed = within("the server hangs up", garbage.read_to_end(&mut rest)).await;
+
+    let request = clearway_proto::v1::GetMapRequest { vehicle: "car".into(), layers: Vec::new() };
+    let map = within("a map", client.get_map(request)).await.expect("the newest map").into_inner();
+    assert!(!map.map.is_empty());
+    assert_eq!(running.vehicles.0[0].status.snapshot().maps, 2);
+    within("shutdown", running.shutdown()).await.unwrap();
+}
