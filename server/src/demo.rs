@@ -16,6 +16,7 @@ use clearway_sim::scenes::town;
 use clearway_sim::send::{Pace, Sent, Until, drive};
 use clearway_sim::vehicle::SimulatedVehicle;
 use serde_json::{Value, json};
+use tokio::time::MissedTickBehavior;
 
 use crate::config::{Config, Udp};
 use crate::ingest::now_ns;
@@ -191,10 +192,12 @@ pub async fn demo(
         Second { elapsed: began.elapsed(), snapshot, age_ms }
     };
     let mut every = tokio::time::interval_at(began + Duration::from_secs(1), Duration::from_secs(1));
+    every.set_missed_tick_behavior(MissedTickBehavior::Skip);
     loop {
         tokio::select! {
             biased;
             () = &mut stop => break,
+            () = &mut end => break,
             _ = every.tick() => {
                 second(&now(&running));
                 let newest = running.vehicles.0[0].newest.borrow().clone();
@@ -202,7 +205,6 @@ pub async fn demo(
                     tokio::task::block_in_place(|| draw(&map, &options.picture))?;
                 }
             }
-            () = &mut end => break,
         }
         if vehicle.is_finished() {
             break;
