@@ -8,7 +8,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use clearway_client::picture::{self, Style};
-use clearway_mapping::config::Extrinsics;
 use clearway_proto::codec::Limits;
 use clearway_proto::map::decode_map;
 use clearway_sim::scanner::ScannerConfig;
@@ -22,6 +21,8 @@ use crate::ingest::now_ns;
 use crate::server::{Running, Server, Setup, StartError};
 use crate::status::Snapshot;
 use crate::wire::EncodedMap;
+
+pub mod rig;
 
 /// The last datagrams are through the sockets long before this.
 const SETTLE: Duration = Duration::from_millis(500);
@@ -268,15 +269,6 @@ fn configuration(options: &Options) -> (Config, Vec<String>) {
     let any = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
     vehicle.udp = Some(Udp { data: any, telemetry: any, ..Udp::default() });
     // The simulated vehicle knows where its sensor is.
-    let mounted = ScannerConfig::default().ego_from_sensor;
-    let (roll, pitch, yaw) = mounted.rotation.euler_angles();
-    vehicle.sensors[0].extrinsics = Extrinsics {
-        x_m: mounted.translation.x,
-        y_m: mounted.translation.y,
-        z_m: mounted.translation.z,
-        roll_deg: roll.to_degrees(),
-        pitch_deg: pitch.to_degrees(),
-        yaw_deg: yaw.to_degrees(),
-    };
+    vehicle.sensors[0].extrinsics = rig::extrinsics(&ScannerConfig::default().ego_from_sensor);
     (config, notes)
 }
