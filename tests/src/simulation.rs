@@ -290,7 +290,12 @@ impl<'a> House<'a> {
                     if self.plant == Some(Plant::EndlessSilence) && *source == 1 {
                         trouble.silent = Some(HEAL_NS..END_NS + 1);
                     }
-                    let Some(mut datagram) = trouble::troubled(datagram.clone(), at_ns, &trouble) else { continue };
+                    let Some(mut datagram) = trouble::troubled(datagram.clone(), at_ns, &trouble) else {
+                        // Networks wait for no later packet, as the order in which packets are late has it.
+                        let arrived = self.networks[*source].finish().collect();
+                        self.under_way(*source, arrived);
+                        continue;
+                    };
                     if let Some(sector) = covered {
                         let mount = &self.drive.rig.scanners[*source].1.ego_from_sensor;
                         trouble::cover_datagram(&mut datagram, sector, mount);
@@ -329,9 +334,14 @@ impl<'a> House<'a> {
             arrived.extend(network.finish());
             arrived.push(datagram);
         }
+        self.under_way(source, arrived);
+    }
+
+    /// Nothing arrives before the tick in which it is known.
+    fn under_way(&mut self, source: usize, arrived: Vec<Datagram>) {
         for datagram in arrived {
             self.datagrams += 1;
-            let when = (datagram.stamp_ns, self.datagrams);
+            let when = (datagram.stamp_ns.max(self.now_ns - TICK_NS), self.datagrams);
             self.arriving.insert(when, (source as u16, datagram.payload));
         }
     }
@@ -424,7 +434,8 @@ impl<'a> House<'a> {
         }
         let stuck = self.plant == Some(Plant::StuckStamp);
         if let Some(before) = self.maps.last().filter(|before| stuck || before.capture_end_ns >= encoded.capture_end_ns) {
-            let found = format!("map {}: {} after {}", map.sequence, encoded.capture_end_ns, before.capture_end_ns);
+            let back_ms = (before.capture_end_ns - encoded.capture_end_ns) / 1_000_000;
+            let found = format!("{back_ms} ms before map {}: {}", before.sequence, describe(map));
             return Err(breach("stamps", found));
         }
         if let Some((sector, when)) = &self.fate.covered {

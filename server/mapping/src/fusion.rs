@@ -109,7 +109,7 @@ impl Fusion {
 
     /// Whether the sensor's turns come no later after their stamps, nor earlier before them, than the timeliest fresh
     /// sensor's, give or take the deadline.
-    fn is_timely(&self, intake: &Intake, intakes: &[Intake], now: Moment) -> bool {
+    pub fn is_timely(&self, intake: &Intake, intakes: &[Intake], now: Moment) -> bool {
         let off_ns =
             |intake: &Intake| intake.turn.completed.arrival_ns.saturating_sub(intake.turn.end_ns).saturating_abs();
         let fresh = intakes.iter().filter(|other| other.turns > 0 && self.is_fresh(other, now));

@@ -121,8 +121,11 @@ impl Fate {
             restart: (!plain && dice.happens(0.15))
                 .then(|| (dice.of(2 * TURN_NS..HEAL_NS), dice.of(0..3_600_000_000) as u32)),
         };
-        let troubles = (0..sensors).map(|_| trouble(&mut dice)).collect();
-        let host_clock = (!plain && dice.happens(0.2)).then(|| {
+        let troubles: Vec<Trouble> = (0..sensors).map(|_| trouble(&mut dice)).collect();
+        // A silence during which the host's clock steps cannot be told from a restart until telemetry tells; stamps that
+        // went ahead by then take their time to come back, at half speed.
+        let speaks = (troubles[..turning].iter()).all(|trouble| trouble.silent.is_none());
+        let host_clock = (!plain && speaks && dice.happens(0.35)).then(|| {
             let step_ns = if dice.happens(0.5) { 3_600_000_000_000 } else { 2_000_000_000 };
             let step_ns = if dice.happens(0.5) { step_ns } else { -step_ns };
             (during(&mut dice, HEAL_NS), step_ns)
