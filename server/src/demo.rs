@@ -271,7 +271,8 @@ fn configuration(options: &Options) -> (Config, Vec<String>) {
     let any = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
     let rig = self::vehicle(options, 0);
     let vehicle = &mut config.vehicles[0];
-    let sender = |(index, (name, _)): (usize, &(String, _))| (name.clone(), Sender::Address(car::address(index).into()));
+    let sender =
+        |(index, (name, _)): (usize, &(String, _))| (name.clone(), Sender::Address(car::address(index).into()));
     let from = rig.scanners.iter().enumerate().map(sender).filter(|_| options.many_sensors).collect();
     vehicle.udp = Some(Udp { data: any, telemetry: any, from, ..Udp::default() });
     vehicle.maps.speed.enabled |= options.many_sensors;

@@ -348,12 +348,7 @@ async fn draw(progress: Arc<Progress>, shown: bool) {
     }
 }
 
-async fn run_demo(
-    seconds: Option<f64>,
-    record: Option<PathBuf>,
-    many_sensors: bool,
-    json: bool,
-) -> Result<ExitCode> {
+async fn run_demo(seconds: Option<f64>, record: Option<PathBuf>, many_sensors: bool, json: bool) -> Result<ExitCode> {
     let duration = seconds.map(Duration::try_from_secs_f64).transpose().context("--seconds: a time is needed")?;
     let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
     let record = record.unwrap_or_else(|| folder.join("demo.mcap"));

@@ -217,12 +217,7 @@ impl<D: Disk> Scribe<D> {
     ///
     /// # Errors
     /// [`RecordError::Write`] when the preface cannot be written.
-    pub fn new(
-        disk: D,
-        options: &Options,
-        preface: &Preface,
-        wait: bool,
-    ) -> Result<(Self, Vec<Journal>), RecordError> {
+    pub fn new(disk: D, options: &Options, preface: &Preface, wait: bool) -> Result<(Self, Vec<Journal>), RecordError> {
         let wrong = |source| RecordError::Write { file: options.file.clone(), source };
         let tape = Some(Tape::new(disk, preface).map_err(wrong)?);
         let (queue, entries) = sync_channel(options.queue);

@@ -199,7 +199,13 @@ impl<'a> House<'a> {
         let vehicle = &config.vehicles[0];
         let layers = layer_names(&vehicle.maps);
         let clock = Arc::new(AtomicI64::new(0));
-        let (door, events) = door_by(Clock::new({ let clock = clock.clone(); move || clock.load(Ordering::Relaxed) }), vehicle.queue);
+        let (door, events) = door_by(
+            Clock::new({
+                let clock = clock.clone();
+                move || clock.load(Ordering::Relaxed)
+            }),
+            vehicle.queue,
+        );
         let vehicles = vec![("car".into(), layers.clone())];
         let preface = Preface { boot_id: 1, config: config.to_toml(), vehicles, ..Preface::default() };
         let disk = MemoryDisk::new(fate.disk.clone());
@@ -278,11 +284,14 @@ impl<'a> House<'a> {
     /// Everything that leaves a sensor in this tick goes into its network.
     fn send(&mut self) {
         let quiet = Trouble::default();
-        while let Some(sent) = self.drive.sent.get(self.next_sent).filter(|s| s.offset_ns - self.fate.offset_ns <= self.now_ns) {
+        while let Some(sent) =
+            self.drive.sent.get(self.next_sent).filter(|s| s.offset_ns - self.fate.offset_ns <= self.now_ns)
+        {
             self.next_sent += 1;
             let at_ns = sent.offset_ns - self.fate.offset_ns;
             let healthy = at_ns >= HEAL_NS && self.plant != Some(Plant::EndlessSilence);
-            let covered = self.fate.covered.as_ref().filter(|(_, when)| when.contains(&at_ns)).map(|(sector, _)| sector);
+            let covered =
+                self.fate.covered.as_ref().filter(|(_, when)| when.contains(&at_ns)).map(|(sector, _)| sector);
             let trouble = |source: usize| if healthy { &quiet } else { &self.fate.troubles[source] };
             match &sent.what {
                 What::Datagram(source, datagram) => {
@@ -371,7 +380,8 @@ impl<'a> House<'a> {
     }
 
     fn set_clock(&self, at_ns: i64) {
-        let ahead_ns = self.fate.host_clock.as_ref().filter(|(when, _)| when.contains(&at_ns)).map_or(0, |(_, step)| *step);
+        let ahead_ns =
+            self.fate.host_clock.as_ref().filter(|(when, _)| when.contains(&at_ns)).map_or(0, |(_, step)| *step);
         self.clock.store(self.drive.rig.start_ns + self.fate.offset_ns + at_ns + ahead_ns, Ordering::Relaxed);
     }
 
@@ -413,7 +423,8 @@ impl<'a> House<'a> {
     fn step(&mut self) -> Result<(), Breach> {
         while let Ok(queued) = self.events.try_recv() {
             self.taken += 1;
-            let journal = (self.plant == Some(Plant::UnrecordedEvent) && self.taken == 300).then(|| self.engine.journal.take());
+            let journal =
+                (self.plant == Some(Plant::UnrecordedEvent) && self.taken == 300).then(|| self.engine.journal.take());
             self.engine.take(queued);
             if let Some(journal) = journal {
                 self.engine.journal = journal;
@@ -433,7 +444,8 @@ impl<'a> House<'a> {
             return Err(breach("map", format!("number {} after {} maps", encoded.sequence, self.maps.len())));
         }
         let stuck = self.plant == Some(Plant::StuckStamp);
-        if let Some(before) = self.maps.last().filter(|before| stuck || before.capture_end_ns >= encoded.capture_end_ns) {
+        if let Some(before) = self.maps.last().filter(|before| stuck || before.capture_end_ns >= encoded.capture_end_ns)
+        {
             let back_ms = (before.capture_end_ns - encoded.capture_end_ns) / 1_000_000;
             let found = format!("{back_ms} ms before map {}: {}", before.sequence, describe(map));
             return Err(breach("stamps", found));
@@ -588,8 +600,10 @@ fn freed(map: &Map) -> Map {
 fn describe(map: &Map) -> String {
     let sensor = |sensor: &clearway_mapping::map::SensorState| {
         let (name, state, age) = (&sensor.name, sensor.state.as_str(), sensor.age_ms.unwrap_or(f32::NAN));
-        format!("{name} {state} {age:.0} ms, clock {} {} ms, partial {:?}, blocked {:?}",
-            sensor.clock, sensor.clock_offset_ms, sensor.partial, sensor.blocked)
+        format!(
+            "{name} {state} {age:.0} ms, clock {} {} ms, partial {:?}, blocked {:?}",
+            sensor.clock, sensor.clock_offset_ms, sensor.partial, sensor.blocked
+        )
     };
     let sensors: Vec<String> = map.sensors.iter().map(sensor).collect();
     format!("map {} by {}: {}", map.sequence, map.made_by, sensors.join("; "))

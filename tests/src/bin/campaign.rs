@@ -104,7 +104,9 @@ fn report(seeds: u64, sum: &Outcome, failures: &[Failure], seconds: f64) {
         seconds / 3600.0,
         simulated / seconds
     );
-    println!("{events} events, {refused} refused, {lost} lost, {maps} maps; readers got {read} and were told of {skipped} they missed");
+    println!(
+        "{events} events, {refused} refused, {lost} lost, {maps} maps; readers got {read} and were told of {skipped} they missed"
+    );
     println!("whole again {healed_in} turns after the faults at the latest");
     if !failures.is_empty() {
         let seeds: Vec<String> = failures.iter().map(|failure| failure.seed.to_string()).collect();

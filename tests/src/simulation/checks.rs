@@ -33,7 +33,10 @@ pub fn adds_up(whose: &str, ledger: &Ledger) -> Result<(), Breach> {
     let sum = ledger.decoded + ledger.telemetry + ledger.refused.values().sum::<u64>();
     match ledger.received == sum {
         true => Ok(()),
-        false => Err(breach("ledger", format!("{whose}: received {}, and the parts make {sum}: {ledger:?}", ledger.received))),
+        false => Err(breach(
+            "ledger",
+            format!("{whose}: received {}, and the parts make {sum}: {ledger:?}", ledger.received),
+        )),
     }
 }
 
@@ -61,7 +64,9 @@ pub fn nothing_free(drive: &Drive, covered_deg: &Range<i64>, map: &Map) -> Resul
     let hidden = covered_deg.start + COVERED_EDGE_DEG..covered_deg.end - COVERED_EDGE_DEG;
     for layer in &map.layers {
         let free: Vec<u8> = (layer.legend.iter().enumerate())
-            .filter(|(_, class)| matches!(**class, "drivable" | "clear" | "flat" | "passable" | "road" | "free" | "path"))
+            .filter(|(_, class)| {
+                matches!(**class, "drivable" | "clear" | "flat" | "passable" | "road" | "free" | "path")
+            })
             .map(|(value, _)| value as u8)
             .collect();
         let Cells::U8(classes) = &layer.channels[0].cells else { continue };
@@ -94,7 +99,8 @@ pub fn centre(layer: &Layer, cell: usize) -> [f64; 2] {
         &Geometry::Cartesian { origin_x_m, origin_y_m, width, cell_m, yaw_rad, .. } => {
             let at = |origin: f64, index: usize| origin + (index as f64 + 0.5) * f64::from(cell_m);
             let (x, y) = (at(origin_x_m, cell % width as usize), at(origin_y_m, cell / width as usize));
-            let place = nalgebra::Rotation3::from_axis_angle(&nalgebra::Vector3::z_axis(), -yaw_rad) * Point3::new(x, y, 0.0);
+            let place =
+                nalgebra::Rotation3::from_axis_angle(&nalgebra::Vector3::z_axis(), -yaw_rad) * Point3::new(x, y, 0.0);
             [place.x, place.y]
         }
     }
@@ -102,5 +108,7 @@ pub fn centre(layer: &Layer, cell: usize) -> [f64; 2] {
 
 /// Whether every sensor is whole and in this map.
 pub fn is_healthy(map: &Map) -> bool {
-    map.sensors.iter().all(|sensor| sensor.state.as_str() == "ok" && sensor.partial.is_empty() && sensor.blocked.is_empty())
+    map.sensors
+        .iter()
+        .all(|sensor| sensor.state.as_str() == "ok" && sensor.partial.is_empty() && sensor.blocked.is_empty())
 }

@@ -132,7 +132,9 @@ impl Fate {
         });
         let disk = match dice.of(0..10) {
             0..5 => DiskFate::Sound,
-            5..7 => DiskFate::Crash(dice.of(TURN_NS..END_NS), if dice.happens(0.5) { dice.of(0..5000) as usize } else { 0 }),
+            5..7 => {
+                DiskFate::Crash(dice.of(TURN_NS..END_NS), if dice.happens(0.5) { dice.of(0..5000) as usize } else { 0 })
+            }
             7..9 => DiskFate::Full(dice.of(20_000..3_000_000) as usize),
             _ => DiskFate::Hiccup(dice.of(20_000..3_000_000) as usize),
         };

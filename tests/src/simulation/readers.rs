@@ -93,7 +93,9 @@ impl Reader {
         let healthy = now_ns >= HEAL_NS;
         let rests = match &self.habit {
             Habit::Slow => now_ns < self.looks_ns,
-            Habit::Stopped(while_ns) => while_ns.contains(&now_ns) || (plant == Some(Plant::AsleepReader) && now_ns > HEAL_NS),
+            Habit::Stopped(while_ns) => {
+                while_ns.contains(&now_ns) || (plant == Some(Plant::AsleepReader) && now_ns > HEAL_NS)
+            }
             _ => false,
         };
         if rests && now_ns < END_NS {
@@ -198,6 +200,9 @@ impl Reader {
         if self.last == newest || self.habit == Habit::Garbled {
             return Ok(());
         }
-        Err(breach("converge", format!("{:?} has map {:?} in the end, and the newest is {newest:?}", self.habit, self.last)))
+        Err(breach(
+            "converge",
+            format!("{:?} has map {:?} in the end, and the newest is {newest:?}", self.habit, self.last),
+        ))
     }
 }
