@@ -266,7 +266,7 @@ fn ledger_json(ledger: &v1::Ledger) -> Value {
     json!({
         "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
         "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops, "points_dropped": ledger.points_dropped,
-        "own_body": ledger.own_body, "through_body": ledger.through_body,
+        "own_body": ledger.own_body, "through_body": ledger.through_body, "blind": ledger.blind,
         "poses": ledger.poses, "poses_refused": ledger.poses_refused,
         "roads": ledger.roads, "roads_refused": ledger.roads_refused,
     })
@@ -283,6 +283,7 @@ fn ledger(ledger: &Ledger) -> v1::Ledger {
         points_dropped: ledger.points_dropped,
         own_body: ledger.own_body,
         through_body: ledger.through_body,
+        blind: ledger.blind,
         poses: ledger.poses,
         poses_refused: ledger.poses_refused,
         roads: ledger.roads,

@@ -272,6 +272,8 @@ fn a_configuration_that_cannot_work_names_key_value_and_what_is_allowed() {
         ("vehicle.body.z_m_max", &|c| c.body = body(3.0, f32::NAN)),
         ("vehicle.sensor[0].name", &|c| c.sensors[0].name.clear()),
         ("vehicle.sensor[0].rpm", &|c| c.sensors[0].rpm = Some(0.0)),
+        ("vehicle.sensor[0].blind_deg", &|c| c.sensors[0].blind_deg = vec![[10.0, 361.0]]),
+        ("vehicle.sensor[0].gps_late_days_max", &|c| c.sensors[0].gps_late_days_max = f64::NAN),
         ("vehicle.sensor[0].cut_azimuth_deg", &|c| c.sensors[0].cut_azimuth_deg = -1.0),
         ("vehicle.sensor[0].range_m_min", &|c| c.sensors[0].range_m_min = f32::INFINITY),
         ("vehicle.sensor[0].extrinsics.x_m", &|c| c.sensors[0].extrinsics.x_m = 1e9),

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::{Echo, Revolution};
-use clearway_lidar::sensor::{Sensor, SensorConfig as LidarConfig};
+use clearway_lidar::sensor::Sensor;
 use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig};
 use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::mount::estimate;
@@ -171,12 +171,7 @@ fn first_revolutions(
     config: &SensorConfig,
     calibration: Option<Calibration>,
 ) -> Result<Vec<Vec<[f32; 3]>>, ReplayError> {
-    let mut sensor = Sensor::new(LidarConfig {
-        model: config.model,
-        rpm: config.rpm,
-        calibration,
-        cut_azimuth_deg: config.cut_azimuth_deg,
-    });
+    let mut sensor = Sensor::new(config.lidar(calibration));
     let mut clouds = Vec::new();
     for reading in readings {
         let reading = reading?;

@@ -1,6 +1,6 @@
 //! Scripts of what happens to clocks: stamps always rise, and are right again one turn later.
 
-use clearway_lidar::{Clock, Model, Revolution, Sensor, SensorConfig};
+use clearway_lidar::{Clock, Model, Refusal, Revolution, Sensor, SensorConfig};
 use proptest::collection::vec;
 use proptest::prelude::*;
 
@@ -179,6 +179,31 @@ fn scripts() -> Vec<Script> {
             last: Clock::Device,
             ..BASE
         },
+        Script {
+            name: "an old capture played live, its telemetry after its data",
+            telemetry: |t| after(t, gps(NOON + t), None),
+            host_ns: |_| 20_000 * HOUR + 1_000 * S,
+            right_ns: |_| 20_000 * HOUR + 1_000 * S,
+            last: Clock::Arrival,
+            ..BASE
+        },
+        Script {
+            name: "an old capture played live, its device's counter set inside it",
+            device_ns: |t| after(t, NOON, 500 * S) + t,
+            telemetry: |t| after(t, gps(NOON + t), None),
+            host_ns: |_| 20_000 * HOUR + 1_000 * S,
+            right_ns: |_| 20_000 * HOUR + 1_000 * S,
+            tolerance_ns: 11_000_000,
+            last: Clock::Arrival,
+            ..BASE
+        },
+        Script {
+            name: "a host whose clock nobody set, under GPS",
+            host_ns: |_| -MIDNIGHT,
+            telemetry: |t| after(t, gps(NOON + t), None),
+            right_ns: |t| after(t, 0, -MIDNIGHT),
+            ..BASE
+        },
         Script { name: "the device does not follow its receiver", telemetry: |t| gps(NOON + t), ..free },
         Script {
             name: "a leap second, counted past the hour; Unix time repeats it",
@@ -205,6 +230,11 @@ fn with_device_us(mut packet: Vec<u8>, device_us: u32) -> Vec<u8> {
 
 /// Every turn of a script; telemetry 50 times a second.
 fn play(script: &Script, sensor: &mut Sensor) -> Vec<Revolution> {
+    numbered(script, sensor).into_iter().map(|(_, turn)| turn).collect()
+}
+
+/// The same with the number that each turn has by true time: one that is torn has that of its other part.
+fn numbered(script: &Script, sensor: &mut Sensor) -> Vec<(i64, Revolution)> {
     let stream = Stream::of(Model::Vlp16);
     let period = i64::from(Model::Vlp16.spec().packet_period_ns(stream.mode));
     let mut turns = Vec::new();
@@ -220,9 +250,18 @@ fn play(script: &Script, sensor: &mut Sensor) -> Vec<Revolution> {
             telemetry_ns += S / 50;
         }
         let packet = with_device_us(stream.packet(index), past_hour_us(script, t));
-        turns.extend(sensor.push(&packet, arrival(t + period)).unwrap().cloned());
+        turns.extend(push(sensor, &packet, arrival(t + period)).map(|turn| ((t - TURN / 10) / TURN, turn.clone())));
     }
     turns
+}
+
+/// A packet whose device time fits nothing before is refused until the next one confirms the jump; nothing else is.
+fn push<'a>(sensor: &'a mut Sensor, packet: &[u8], arrival_ns: i64) -> Option<&'a Revolution> {
+    match sensor.push(packet, arrival_ns) {
+        Ok(turn) => turn,
+        Err(Refusal::DeviceTime { .. }) => None,
+        Err(other) => panic!("{other}"),
+    }
 }
 
 fn past_hour_us(script: &Script, t: i64) -> u32 {
@@ -244,12 +283,13 @@ fn assert_rising(name: &str, turns: &[Revolution]) {
 #[test]
 fn stamps_rise_and_are_right_again_one_turn_after_whatever_happens_to_a_clock() {
     for script in scripts() {
-        let turns = play(&script, &mut Sensor::new(SensorConfig::default()));
+        let numbered = numbered(&script, &mut Sensor::new(SensorConfig::default()));
         let name = script.name;
+        let turns: Vec<_> = numbered.iter().map(|(_, turn)| turn.clone()).collect();
         assert_rising(name, &turns);
         assert!(turns.len() as i64 >= script.lasts_ns / TURN - 1, "{name}: {} turns", turns.len());
-        for (index, turn) in turns.iter().enumerate() {
-            let t = index as i64 * TURN;
+        for (index, turn) in numbered {
+            let t = index * TURN;
             if (script.event_ns - TURN..script.event_ns + script.healed_ns).contains(&t) {
                 continue;
             }
@@ -325,7 +365,7 @@ fn jitter_bursts_and_wild_device_times_change_no_stamp() {
                 if wild(index) && model != Model::Hdl64eS1 {
                     packet = with_device_us(packet, (index as u32).wrapping_mul(2_654_435_761));
                 }
-                turns.extend(sensor.push(&packet, stream.arrival_ns(index) + late_ns(index)).unwrap().cloned());
+                turns.extend(push(&mut sensor, &packet, stream.arrival_ns(index) + late_ns(index)).cloned());
             }
             turns.iter().map(|turn| (turn.start_ns, turn.end_ns, turn.clock)).collect::<Vec<_>>()
         };
@@ -336,10 +376,11 @@ fn jitter_bursts_and_wild_device_times_change_no_stamp() {
         let burst = |index: usize| if (400..500).contains(&index) { (500 - index as i64) * 300_000 } else { 0 };
         assert_eq!(stamps(jitter, |_| false), clean, "{model:?}");
         assert_eq!(stamps(burst, |_| false), clean, "{model:?}");
-        // A packet whose device time is damaged is taken to come a period after the one before.
+        // A packet whose device time is damaged is refused, be it a turn's last.
+        let packet_ns = u64::from(model.spec().packet_period_ns(stream.mode)) + 1_000;
         for (wild, clean) in stamps(|_| 0, |index| index % 90 == 60).iter().zip(&clean) {
             assert!(
-                wild.0.abs_diff(clean.0) < 1_000 && wild.1.abs_diff(clean.1) < 1_000,
+                wild.0.abs_diff(clean.0) < packet_ns && wild.1.abs_diff(clean.1) < packet_ns,
                 "{model:?} {wild:?} {clean:?}"
             );
         }
@@ -378,7 +419,7 @@ proptest! {
                 device_us = device_us.wrapping_add(1_327);
                 arrival_ns = arrival_ns.saturating_add(1_327_000);
                 let packet = with_device_us(stream.packet(index), device_us);
-                if let Some(turn) = sensor.push(&packet, arrival_ns).unwrap() {
+                if let Some(turn) = push(&mut sensor, &packet, arrival_ns) {
                     prop_assert!(newest_ns < turn.start_ns, "{newest_ns} {}", turn.start_ns);
                     prop_assert!(turn.start_ns <= turn.end_ns);
                     newest_ns = turn.end_ns;
