@@ -374,9 +374,9 @@ mod tests {
         let turned = Isometry3::new(Vector3::new(0.0, 0.0, 1.9), Vector3::new(0.0, 0.0, std::f64::consts::FRAC_PI_2));
         let (mut level, mut left) = (Vec::new(), Vec::new());
         let mut mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
-        look_for_no_returns(&revolution, &mount, &Moved::default(), &mut level);
+        look_for_no_returns(&revolution, &mount, &Moved::default(), None, &mut level);
         mount.ego_from_sensor = turned;
-        look_for_no_returns(&revolution, &mount, &Moved::default(), &mut left);
+        look_for_no_returns(&revolution, &mount, &Moved::default(), None, &mut left);
         assert_eq!(level.len(), echo.range_m.iter().filter(|range| **range == 0.0).count());
         assert!(level.len() > 10_000 && level.iter().any(|ray| ray[2] > 0.2), "the sky gives nothing back");
         for (level, left) in level.iter().zip(&left) {
