@@ -106,7 +106,8 @@ impl Encoder {
             return None;
         }
         let begun_ns = self.packets.rem_euclid(CYCLE) * i64::from(self.spec.packet_period_ns(self.mode));
-        let ([year, month, day], [hour, minute, second]) = civil_time(self.firings[0].stamp_ns - begun_ns - 1_000_000_000);
+        let ([year, month, day], [hour, minute, second]) =
+            civil_time(self.firings[0].stamp_ns - begun_ns - 1_000_000_000);
         let value = match kind {
             b'H' => hour,
             b'M' => minute,

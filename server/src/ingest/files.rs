@@ -9,8 +9,7 @@ use clearway_mapping::event::Body;
 
 use super::capture::CaptureError;
 use super::kitti::ScanError;
-use super::mcap::McapError;
-use super::mcap::Wanted;
+use super::mcap::{McapError, Untold, Wanted};
 use super::ros::Intake;
 use super::{Reading, capture, kitti, mcap};
 
@@ -85,7 +84,7 @@ pub struct Readings {
     /// Takes the ROS messages of the next file of a bag.
     intake: Option<Intake>,
     /// Messages refused in files already closed, and not told to the door yet.
-    untold: u64,
+    untold: Untold,
     open: Option<Open>,
     scans: u64,
     bytes_before: u64,
@@ -119,7 +118,7 @@ impl Readings {
             files: all,
             wanted,
             intake: None,
-            untold: 0,
+            untold: Untold::new(),
             open: None,
             scans: 0,
             bytes_before: 0,
@@ -161,10 +160,10 @@ impl Readings {
     }
 
     /// Messages that were refused since this was last asked, before they became readings.
-    pub fn untold(&mut self) -> u64 {
+    pub fn untold(&mut self) -> Untold {
         let mut untold = std::mem::take(&mut self.untold);
         if let Some(Open::Mcap(_, source)) = &mut self.open {
-            untold += source.untold();
+            add(&mut untold, source.untold());
         }
         untold
     }
@@ -232,11 +231,15 @@ impl Readings {
                     self.truncated.push(Truncated { file: file.clone(), reason });
                 }
                 self.notes.extend(source.notes().into_iter().map(|note| format!("{}: {note}", file.display())));
-                self.untold += source.untold();
+                add(&mut self.untold, source.untold());
                 self.intake = source.into_intake();
             }
         }
     }
+}
+
+fn add(untold: &mut Untold, more: Untold) {
+    more.into_iter().for_each(|(whose, count)| *untold.entry(whose).or_default() += count);
 }
 
 impl Iterator for Readings {
