@@ -1,7 +1,7 @@
 //! What the server knows of each vehicle: ledger, rates, latency, readers, recorder. One snapshot, written by the
 //! engine, read by gRPC, zenoh, the page, `/metrics` and the command line.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 use std::fmt::Write as _;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
@@ -296,7 +296,7 @@ fn ledger(ledger: &Ledger) -> v1::Ledger {
     }
 }
 
-fn by_name(counts: &BTreeMap<&'static str, u64>) -> HashMap<String, u64> {
+fn by_name(counts: &BTreeMap<&'static str, u64>) -> BTreeMap<String, u64> {
     counts.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect()
 }
 
