@@ -228,13 +228,22 @@ fn with_device_us(mut packet: Vec<u8>, device_us: u32) -> Vec<u8> {
     packet
 }
 
-/// Every turn of a script; telemetry 50 times a second.
-fn play(script: &Script, sensor: &mut Sensor) -> Vec<Revolution> {
-    numbered(script, sensor).into_iter().map(|(_, turn)| turn).collect()
+/// The turn a packet completes. The first packet of another time is refused until the next one confirms it, and copies are.
+fn take<'a>(sensor: &'a mut Sensor, packet: &[u8], arrival_ns: i64) -> Option<&'a Revolution> {
+    match sensor.push(packet, arrival_ns) {
+        Ok(turn) => turn,
+        Err(Refusal::DeviceTime { .. } | Refusal::Late { .. } | Refusal::Duplicate { .. }) => None,
+        Err(refusal) => panic!("{refusal}"),
+    }
 }
 
-/// The same with the number that each turn has by true time: one that is torn has that of its other part.
-fn numbered(script: &Script, sensor: &mut Sensor) -> Vec<(i64, Revolution)> {
+/// Every turn of a script.
+fn play(script: &Script, sensor: &mut Sensor) -> Vec<Revolution> {
+    play_timed(script, sensor).into_iter().map(|(turn, _)| turn).collect()
+}
+
+/// Every turn of a script, and when the packet came that completed it; telemetry 50 times a second.
+fn play_timed(script: &Script, sensor: &mut Sensor) -> Vec<(Revolution, i64)> {
     let stream = Stream::of(Model::Vlp16);
     let period = i64::from(Model::Vlp16.spec().packet_period_ns(stream.mode));
     let mut turns = Vec::new();
@@ -250,18 +259,9 @@ fn numbered(script: &Script, sensor: &mut Sensor) -> Vec<(i64, Revolution)> {
             telemetry_ns += S / 50;
         }
         let packet = with_device_us(stream.packet(index), past_hour_us(script, t));
-        turns.extend(push(sensor, &packet, arrival(t + period)).map(|turn| ((t - TURN / 10) / TURN, turn.clone())));
+        turns.extend(take(sensor, &packet, arrival(t + period)).map(|turn| (turn.clone(), t)));
     }
     turns
-}
-
-/// A packet whose device time fits nothing before is refused until the next one confirms the jump; nothing else is.
-fn push<'a>(sensor: &'a mut Sensor, packet: &[u8], arrival_ns: i64) -> Option<&'a Revolution> {
-    match sensor.push(packet, arrival_ns) {
-        Ok(turn) => turn,
-        Err(Refusal::DeviceTime { .. }) => None,
-        Err(other) => panic!("{other}"),
-    }
 }
 
 fn past_hour_us(script: &Script, t: i64) -> u32 {
@@ -283,14 +283,17 @@ fn assert_rising(name: &str, turns: &[Revolution]) {
 #[test]
 fn stamps_rise_and_are_right_again_one_turn_after_whatever_happens_to_a_clock() {
     for script in scripts() {
-        let numbered = numbered(&script, &mut Sensor::new(SensorConfig::default()));
+        let (turns, done): (Vec<_>, Vec<_>) =
+            play_timed(&script, &mut Sensor::new(SensorConfig::default())).into_iter().unzip();
         let name = script.name;
-        let turns: Vec<_> = numbered.iter().map(|(_, turn)| turn.clone()).collect();
         assert_rising(name, &turns);
         assert!(turns.len() as i64 >= script.lasts_ns / TURN - 1, "{name}: {} turns", turns.len());
-        for (index, turn) in numbered {
-            let t = index * TURN;
-            if (script.event_ns - TURN..script.event_ns + script.healed_ns).contains(&t) {
+        for (index, (turn, done)) in turns.iter().zip(done).enumerate() {
+            // Where the device's time jumps, a turn is torn in two: the whole ones are told by when they ended.
+            let t = (done + TURN / 2) / TURN * TURN - TURN;
+            let torn = turn.partial.is_some() && (0..=TURN).contains(&(done - script.event_ns));
+            let healing = (script.event_ns - TURN..script.event_ns + script.healed_ns).contains(&t);
+            if torn || healing {
                 continue;
             }
             let error_ns = turn.start_ns - (script.utc_ns + t + (script.right_ns)(t));
@@ -358,7 +361,7 @@ fn hdl64e(gps: u8) -> Vec<Revolution> {
         let mut packet = stream.packet(index);
         let status = b"HMSDNYGTV1234567"[index % 16];
         (packet[1204], packet[1205]) = (status, cycle.get(index % 16).map_or(0, |value| *value as u8));
-        turns.extend(push(&mut sensor, &packet, utc_ns + t + period + 3 * HOUR + 100 * S).cloned());
+        turns.extend(take(&mut sensor, &packet, utc_ns + t + period + 3 * HOUR + 100 * S).cloned());
     }
     let first = turns.iter().map(|turn| turn.start_ns - utc_ns).next().unwrap();
     assert!([0, 3 * HOUR + 100 * S].iter().any(|right_ns| (first - right_ns).abs() < 1_000_000), "{gps}: {first}");
@@ -416,7 +419,7 @@ fn jitter_bursts_and_wild_device_times_change_no_stamp() {
                 if wild(index) && model != Model::Hdl64eS1 {
                     packet = with_device_us(packet, (index as u32).wrapping_mul(2_654_435_761));
                 }
-                turns.extend(push(&mut sensor, &packet, stream.arrival_ns(index) + late_ns(index)).cloned());
+                turns.extend(take(&mut sensor, &packet, stream.arrival_ns(index) + late_ns(index)).cloned());
             }
             turns.iter().map(|turn| (turn.start_ns, turn.end_ns, turn.clock)).collect::<Vec<_>>()
         };
@@ -427,11 +430,11 @@ fn jitter_bursts_and_wild_device_times_change_no_stamp() {
         let burst = |index: usize| if (400..500).contains(&index) { (500 - index as i64) * 300_000 } else { 0 };
         assert_eq!(stamps(jitter, |_| false), clean, "{model:?}");
         assert_eq!(stamps(burst, |_| false), clean, "{model:?}");
-        // A packet whose device time is damaged is refused, be it a turn's last.
-        let packet_ns = u64::from(model.spec().packet_period_ns(stream.mode)) + 1_000;
+        // A packet whose device time is damaged is refused: where it would have begun or ended a turn, the next one does.
+        let packet_ns = model.spec().packet_period_ns(stream.mode) as u64;
         for (wild, clean) in stamps(|_| 0, |index| index % 90 == 60).iter().zip(&clean) {
             assert!(
-                wild.0.abs_diff(clean.0) < packet_ns && wild.1.abs_diff(clean.1) < packet_ns,
+                wild.0.abs_diff(clean.0) <= packet_ns && wild.1.abs_diff(clean.1) <= packet_ns,
                 "{model:?} {wild:?} {clean:?}"
             );
         }
@@ -470,7 +473,7 @@ proptest! {
                 device_us = device_us.wrapping_add(1_327);
                 arrival_ns = arrival_ns.saturating_add(1_327_000);
                 let packet = with_device_us(stream.packet(index), device_us);
-                if let Some(turn) = push(&mut sensor, &packet, arrival_ns) {
+                if let Some(turn) = take(&mut sensor, &packet, arrival_ns) {
                     prop_assert!(newest_ns < turn.start_ns, "{newest_ns} {}", turn.start_ns);
                     prop_assert!(turn.start_ns <= turn.end_ns);
                     newest_ns = turn.end_ns;
