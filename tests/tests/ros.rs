@@ -317,7 +317,7 @@ async fn live_topics_of_rmw_zenoh_reach_the_map_and_strangers_are_counted() {
     let n = turns.len() as u64;
     until("all is taken or refused", || {
         let ledger = status.snapshot().ledger;
-        ledger.poses == n && ledger.decoded == n && ledger.refused.len() == 2
+        ledger.poses == n && ledger.decoded == n && ledger.refused.get("observation") == Some(&2)
     })
     .await;
     let snapshot = status.snapshot();
