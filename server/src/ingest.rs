@@ -121,6 +121,8 @@ const STRANGERS: usize = 8;
 pub struct Outside {
     untold: Mutex<Untold>,
     strangers: Mutex<VecDeque<Stranger>>,
+    /// What the ledger calls `observation`, by its own name.
+    observations: Mutex<BTreeMap<&'static str, u64>>,
 }
 
 /// Readings that stayed outside and that the engine has not been told of yet; a full queue comes first.
@@ -154,6 +156,18 @@ impl Outside {
         if count > 0 {
             *locked(&self.untold).entry((cause, source)).or_default() += count;
         }
+    }
+
+    /// Counts messages that are no observations of a sensor, or of [`clearway_mapping::event::NOBODY`]: the ledger has one word
+    /// for them, here each keeps its `reason`.
+    pub(crate) fn leave_observations(&self, source: u16, reason: &'static str, count: u64) {
+        self.leave(source, Cause::Observation, count);
+        *locked(&self.observations).entry(reason).or_default() += count;
+    }
+
+    /// The observations refused since the server's start, by reason.
+    pub fn observations_refused(&self) -> BTreeMap<&'static str, u64> {
+        locked(&self.observations).clone()
     }
 
     /// The last few strangers, newest last.

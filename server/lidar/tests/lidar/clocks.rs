@@ -179,6 +179,31 @@ fn scripts() -> Vec<Script> {
             last: Clock::Device,
             ..BASE
         },
+        Script {
+            name: "an old capture played live, its telemetry after its data",
+            telemetry: |t| after(t, gps(NOON + t), None),
+            host_ns: |_| 20_000 * HOUR + 1_000 * S,
+            right_ns: |_| 20_000 * HOUR + 1_000 * S,
+            last: Clock::Arrival,
+            ..BASE
+        },
+        Script {
+            name: "an old capture played live, its device's counter set inside it",
+            device_ns: |t| after(t, NOON, 500 * S) + t,
+            telemetry: |t| after(t, gps(NOON + t), None),
+            host_ns: |_| 20_000 * HOUR + 1_000 * S,
+            right_ns: |_| 20_000 * HOUR + 1_000 * S,
+            tolerance_ns: 11_000_000,
+            last: Clock::Arrival,
+            ..BASE
+        },
+        Script {
+            name: "a host whose clock nobody set, under GPS",
+            host_ns: |_| -MIDNIGHT,
+            telemetry: |t| after(t, gps(NOON + t), None),
+            right_ns: |t| after(t, 0, -MIDNIGHT),
+            ..BASE
+        },
         Script { name: "the device does not follow its receiver", telemetry: |t| gps(NOON + t), ..free },
         Script {
             name: "a leap second, counted past the hour; Unix time repeats it",
@@ -279,6 +304,20 @@ fn stamps_rise_and_are_right_again_one_turn_after_whatever_happens_to_a_clock() 
 }
 
 #[test]
+fn gps_time_of_years_ago_is_believed_where_the_configuration_says_so() {
+    let config = SensorConfig { gps_late_ns_max: 100 * 365 * 24 * HOUR, ..SensorConfig::default() };
+    let script = Script { name: "an old capture", host_ns: |_| 20_000 * HOUR, ..BASE };
+    let turns = play(&script, &mut Sensor::new(config.clone()));
+    assert!(turns.iter().all(|turn| turn.clock == Clock::Gps) && (turns[0].start_ns - NOON).abs() < 1_000_000);
+    // Behind stamps already given it is no use: they follow arrival.
+    let script = Script { telemetry: |t| after(t, gps(NOON + t), None), ..script };
+    let turns = play(&script, &mut Sensor::new(config));
+    assert_rising(script.name, &turns);
+    let last = turns.last().unwrap();
+    assert_eq!((last.clock, last.clock_offset_ms), (Clock::Device, 0));
+}
+
+#[test]
 fn the_turn_says_how_far_the_host_is_from_its_clock() {
     let offset = |host_ns| {
         let turns = play(&Script { host_ns, ..BASE }, &mut Sensor::new(SensorConfig::default()));
@@ -302,6 +341,43 @@ fn two_sensors_on_different_hours_give_one_time() {
     assert_eq!((gps[5].clock, free[5].clock), (Clock::Gps, Clock::Arrival));
     for (gps, free) in gps.iter().zip(&free) {
         assert!((gps.start_ns - free.start_ns).abs() < 2_000, "{}", gps.start_ns - free.start_ns);
+    }
+}
+
+/// The turns of an HDL-64E that ends an hour and a day, its receiver in state `gps`; the host is 3 h and 100 s ahead.
+fn hdl64e(gps: u8) -> Vec<Revolution> {
+    let utc_ns = MIDNIGHT + 24 * HOUR - S / 2;
+    let stream = Stream { device_us: (utc_ns / 1_000 % 3_600_000_000) as u32, ..Stream::of(Model::Hdl64eS2) };
+    let period = i64::from(Model::Hdl64eS2.spec().packet_period_ns(stream.mode));
+    let mut sensor = Sensor::new(SensorConfig { model: Some(Model::Hdl64eS2), ..SensorConfig::default() });
+    let mut turns = Vec::new();
+    for index in 0..stream.packets(15.2) {
+        let t = index as i64 * period;
+        // Each byte is read from the clock when it is sent, so that a cycle may hold two seconds' parts.
+        let second = (utc_ns + t - MIDNIGHT - 300_000_000) / S;
+        let of_day = second % 86_400;
+        let day = if second < 86_400 { 18 } else { 19 };
+        let cycle = [of_day / 3_600, of_day / 60 % 60, of_day % 60, day, 5, 33, i64::from(gps), 25, 0x47];
+        let mut packet = stream.packet(index);
+        let status = b"HMSDNYGTV1234567"[index % 16];
+        (packet[1204], packet[1205]) = (status, cycle.get(index % 16).map_or(0, |value| *value as u8));
+        turns.extend(take(&mut sensor, &packet, utc_ns + t + period + 3 * HOUR + 100 * S).cloned());
+    }
+    let first = turns.iter().map(|turn| turn.start_ns - utc_ns).next().unwrap();
+    assert!([0, 3 * HOUR + 100 * S].iter().any(|right_ns| (first - right_ns).abs() < 1_000_000), "{gps}: {first}");
+    assert_rising("HDL-64E", &turns);
+    let lasted_ns = turns.last().unwrap().end_ns - turns[0].start_ns;
+    assert!((lasted_ns - turns.len() as i64 * TURN).abs() < 1_000_000, "{gps}: {lasted_ns}");
+    turns
+}
+
+#[test]
+fn an_hdl64e_tells_gps_time_by_its_status_bytes() {
+    for (gps, clock) in [(b'A', Clock::Gps), (b'V', Clock::GpsUnlocked), (b'P', Clock::Arrival), (0, Clock::Arrival)] {
+        let turns = hdl64e(gps);
+        assert!(turns.len() >= 14 && turns.iter().all(|turn| turn.clock == clock), "{gps}: {:?}", turns[0].clock);
+        let is_gps = clock != Clock::Arrival;
+        assert_eq!(turns[0].start_ns < MIDNIGHT + 24 * HOUR, is_gps, "{gps}");
     }
 }
 
