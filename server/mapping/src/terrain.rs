@@ -238,6 +238,10 @@ impl LayerMaker for Terrain {
         }
     }
 
+    fn wants_deviations(&self) -> bool {
+        true
+    }
+
     fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
         self.cells.take(sweep, self.config.overhang_m);
         self.regions.find(&self.cells, &self.config);
