@@ -142,26 +142,24 @@ impl Terrain {
 
         let (regions, joined, shadow) = (self.regions.of_cell(), self.ground.joined(), &self.shadow);
         let is_ground = |region: u32| region >= FIRST_FLAT && joined[(region - FIRST_FLAT) as usize];
-        let is_blind = |cell: usize| {
-            let [x, y] = cells.middle_m(cell);
-            x * x + y * y <= blind_zone_m * blind_zone_m
-        };
         let passage = |cell: usize| match class[cell] {
             FLAT => Passage::Open,
             OBSTACLE | FLAT_ELEVATED => Passage::Closed,
             _ if seen[cell] => Passage::None,
             FLAT_INFERRED => Passage::Open,
             _ if (bridged[cell] || is_ground(regions[cell])) && !shadow.hides(cell) => Passage::Open,
-            _ if is_blind(cell) => Passage::Open,
+            _ if shadow.distance_m(cell) <= blind_zone_m => Passage::Open,
             _ => Passage::None,
         };
         let width = cells.width();
         // Between obstacles so far apart at least this many whole cells are free, less one: the disc's middle.
         let radius = ((gate_m_min / cell_m - 2.0) / 2.0).max(0.0) as usize;
         self.reach.find(width, radius, (0..class.len()).map(passage));
-        for (cell, class) in class.iter_mut().enumerate() {
-            if matches!(*class, FLAT | FLAT_INFERRED) && !self.reach.reached(cell % width, cell / width) {
-                *class = if *class == FLAT { FLAT_UNREACHABLE } else { UNKNOWN };
+        for (iy, row) in class.chunks_exact_mut(width).enumerate() {
+            for (ix, class) in row.iter_mut().enumerate() {
+                if matches!(*class, FLAT | FLAT_INFERRED) && !self.reach.reached(ix, iy) {
+                    *class = if *class == FLAT { FLAT_UNREACHABLE } else { UNKNOWN };
+                }
             }
         }
     }
