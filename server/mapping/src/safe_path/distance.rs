@@ -129,13 +129,13 @@ impl Distances {
 
     /// The nearest site to a cell, `[ix, iy]`; `None` where every cell is free.
     #[inline]
-    pub fn site(&self, index: usize) -> Option<[i32; 2]> {
-        let column = self.column_of_site[index];
+    pub fn site(&self, ix: usize, iy: usize) -> Option<[i32; 2]> {
+        let row = iy * self.side;
+        let column = self.column_of_site[row + ix];
         if column == NONE {
             return None;
         }
-        let row = self.row_of_site[index / self.side * self.side + usize::from(column)];
-        Some([i32::from(column), i32::from(row)])
+        Some([i32::from(column), i32::from(self.row_of_site[row + usize::from(column)])])
     }
 
     /// Squared distance from a place to the nearest square of a cell that is not free; place and distance in half cells,

@@ -28,17 +28,17 @@ pub struct Reach {
 }
 
 impl Reach {
-    /// Floods a grid of `width` × `width` cells, given row by row, with a disc of `radius` cells about its middle one.
-    pub fn find(&mut self, width: usize, radius: usize, cells: impl Iterator<Item = Passage>) {
+    /// Floods a grid of `width` × `width` cells, `cell(ix, iy)` telling what each is, with a disc of `radius` cells about its
+    /// middle one.
+    pub fn find(&mut self, width: usize, radius: usize, cell: impl Fn(usize, usize) -> Passage) {
         for bits in [&mut self.open, &mut self.closed, &mut self.widened, &mut self.reached] {
             bits.clear(width);
         }
-        let mut cells = cells;
-        let words = self.open.words.iter_mut().zip(&mut self.closed.words).enumerate();
         let stride = self.open.stride;
-        for (at, (open, closed)) in words {
-            let first = at % stride * 64;
-            for (bit, passage) in cells.by_ref().take((width - first).min(64)).enumerate() {
+        for (at, (open, closed)) in self.open.words.iter_mut().zip(&mut self.closed.words).enumerate() {
+            let (first, iy) = (at % stride * 64, at / stride);
+            for bit in 0..(width - first).min(64) {
+                let passage = cell(first + bit, iy);
                 *open |= u64::from(passage == Passage::Open) << bit;
                 *closed |= u64::from(passage == Passage::Closed) << bit;
             }
@@ -191,7 +191,7 @@ mod tests {
             _ => Passage::None,
         };
         let mut reach = Reach::default();
-        reach.find(picture.len(), radius, picture.iter().flat_map(|row| row.chars().map(passage)));
+        reach.find(picture.len(), radius, |ix, iy| passage(picture[iy].as_bytes()[ix].into()));
         let drawn = |(iy, row): (usize, &&str)| {
             let cell = |(ix, c): (usize, char)| if c == '.' && reach.reached(ix, iy) { 'o' } else { c };
             row.chars().enumerate().map(cell).collect()
@@ -234,7 +234,7 @@ mod tests {
             if wall(iy) && ix != gap(iy) { Passage::Closed } else { Passage::Open }
         };
         let mut reach = Reach::default();
-        reach.find(width, 0, (0..width * width).map(passage));
+        reach.find(width, 0, |ix, iy| passage(iy * width + ix));
         assert!(
             (0..width * width)
                 .all(|cell| reach.reached(cell % width, cell / width) == (passage(cell) == Passage::Open))
