@@ -152,6 +152,6 @@ async fn a_map_of_all_default_layers_is_at_most_64_kib_on_every_kind_of_sensor()
         let largest = whole.values().max().unwrap();
         println!("{file}: {largest} bytes at most in {} maps; by layer {most:?}", whole.len());
         assert!(*largest <= 64 << 10, "{file}: {largest}");
-        assert!(most["safe_path"] <= 6_000, "{file}: {most:?}");
+        assert!(most["safe_path"] <= 7_000, "{file}: {most:?}");
     }
 }
