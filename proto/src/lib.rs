@@ -2,7 +2,8 @@
 //!
 //! [`v1`] holds the generated protobuf and gRPC types, [`DESCRIPTORS`] their descriptor set (for reflection and for
 //! the schemas in recordings), [`codec`] the cells of a channel to bytes and back, [`grid`] where cells lie, [`map`] a
-//! whole map's bytes to checked values, [`packed`] a scan's lists of numbers to bytes and back.
+//! whole map's bytes to checked values, [`packed`] a scan's lists of numbers to bytes and back, [`safe_points`] a layer's
+//! points.
 
 pub mod codec;
 mod decode;
@@ -11,6 +12,7 @@ pub mod map;
 pub mod packed;
 mod parts;
 mod rows;
+pub mod safe_points;
 
 /// Generated from `clearway/v1/*.proto`.
 #[allow(missing_docs, clippy::all, rustdoc::broken_intra_doc_links)]

@@ -13,7 +13,7 @@ use prost::Message;
 
 use crate::codec::{Cells, DecodeError, Limits, decode};
 use crate::grid::Grid;
-use crate::{parts, v1};
+use crate::{parts, safe_points, v1};
 
 /// The bytes of a map with this header and no layer yet.
 pub fn encode_header(header: &v1::Header) -> Bytes {
@@ -321,29 +321,13 @@ fn decode_layer(layer: v1::Layer, limits: &Limits) -> Result<Layer, MapError> {
     }
     let planes = layer.planes.iter().map(|plane| [plane.a, plane.b, plane.c]).collect();
     let figures = layer.figures.into_iter().collect();
-    let points = decode_points(&layer.name, layer.points)?;
+    let points = match &layer.safe_points {
+        Some(packed) => safe_points::unpack(&layer.name, packed, limits.map_parts)?,
+        None => Vec::new(),
+    };
     let layer = Layer { name: layer.name, grid, legend: layer.legend, channels, planes, figures, points };
     check_classes(&layer)?;
     Ok(layer)
-}
-
-fn decode_points(layer: &str, points: Vec<v1::SafePoint>) -> Result<Vec<SafePoint>, MapError> {
-    let decode_point = |(index, point): (usize, v1::SafePoint)| {
-        let wrong = |what| MapError::SafePoint { layer: layer.to_owned(), point: index, what };
-        let v1::SafePoint { x, y, radius, links } = point;
-        if !(x.is_finite() && y.is_finite() && radius.is_finite() && radius >= 0.0) {
-            return Err(wrong(format!(
-                "({x}, {y}) m, radius {radius} m; finite metres and a radius of 0 or more are needed"
-            )));
-        }
-        // Ascending and before the point: no link is named twice, and a path cannot be followed in a circle.
-        let bound = index as u64;
-        if !links.is_sorted_by(|a, b| a < b) || links.last().is_some_and(|&last| u64::from(last) >= bound) {
-            return Err(wrong(format!("links {links:?}; points before it, each once, in order, are needed")));
-        }
-        Ok(SafePoint { x_m: x, y_m: y, radius_m: radius, links })
-    };
-    points.into_iter().enumerate().map(decode_point).collect()
 }
 
 /// A planner that meets a class without a name could not know whether it may drive there.

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use bytes::Bytes;
 use clearway_proto::codec::{self, Cells, Limits};
-use clearway_proto::{map, v1};
+use clearway_proto::{map, safe_points, v1};
 use prost::Message;
 use serde_json::{Value, json};
 
@@ -262,7 +262,7 @@ fn golden_map() -> (v1::Header, v1::Layer, v1::Layer) {
         ],
         planes: vec![v1::Plane { a: 0.01, b: -0.02, c: 0.0 }],
         figures: [("drivable_share".to_string(), 0.8), ("judged_share".to_string(), 0.75)].into(),
-        points: Vec::new(),
+        safe_points: None,
     };
     let grid = v1::CartesianGrid { origin_x_m: -1.0, origin_y_m: -0.5, width: 4, height: 2, cell_m: 0.5, yaw_rad: 0.0 };
     let hits: Vec<u16> = vec![0, 0, 0, 0, 0, 0, 300, 2];
@@ -270,12 +270,21 @@ fn golden_map() -> (v1::Header, v1::Layer, v1::Layer) {
         name: "hits".into(),
         geometry: Some(v1::layer::Geometry::Cartesian(grid)),
         channels: vec![codec::encode(codec::CellsRef::U16(&hits)).into_channel("hits", "", 1.0, 0)],
-        points: [(0.0, 0.0, 0.5, vec![]), (0.25, 0.5, 1.5, vec![0]), (-0.5, 0.25, 0.75, vec![0, 1])]
-            .map(|(x, y, radius, links)| v1::SafePoint { x, y, radius, links })
-            .to_vec(),
+        safe_points: Some(safe_points::pack(&points_of_flat(), 0.125)),
         ..Default::default()
     };
     (header, drivability, flat)
+}
+
+fn points_of_flat() -> Vec<map::SafePoint> {
+    [
+        (0.0, 0.0, 0.5, vec![]),
+        (0.25, 0.5, 1.5, vec![0]),
+        (-0.5, 0.25, 0.75, vec![0, 1]),
+        (1.0, -0.125, 0.25, vec![0, 1]),
+    ]
+    .map(|(x_m, y_m, radius_m, links)| map::SafePoint { x_m, y_m, radius_m, links })
+    .to_vec()
 }
 
 #[test]
@@ -287,6 +296,7 @@ fn the_golden_map_is_its_header_and_its_layers_behind_each_other() {
     assert_eq!(v1::Map::decode(&bytes[..]).unwrap(), whole);
 
     let map = map::decode_map(Bytes::from(bytes), &Limits::default()).unwrap();
+    assert_eq!(map.layers[1].points, points_of_flat());
     let looks =
         [(2.0, 0.1), (0.0, 0.0), (-6.0, -0.1), (-6.0, 0.1), (-10.0, -0.1), (10.0, 0.1), (13.0, 0.0), (0.1, 6.0)];
     let layers: Vec<_> = map
@@ -320,7 +330,7 @@ fn the_golden_map_is_its_header_and_its_layers_behind_each_other() {
 #[test]
 fn a_map_with_one_thing_wrong_is_refused_under_that_name() {
     type Spoil = fn(&mut v1::Map);
-    let spoils: [(&str, &str, Spoil); 22] = [
+    let spoils: [(&str, &str, Spoil); 30] = [
         ("no_header", "header", |map| map.header = None),
         ("capture_backwards", "header", |map| map.header.as_mut().unwrap().capture_end_ns = 0),
         ("pose_not_finite", "header", |map| pose(map).x = f64::NAN),
@@ -338,10 +348,18 @@ fn a_map_with_one_thing_wrong_is_refused_under_that_name() {
         ("more_columns_than_cells", "cell_count", |map| radial(map).columns = 0x2000_0000),
         ("legend_without_unknown", "legend", |map| map.layers[0].legend[0] = "free".into()),
         ("class_without_a_name", "class", |map| map.layers[0].legend.truncate(3)),
-        ("safe_point_not_finite", "safe_point", |map| map.layers[1].points[1].x = f32::NAN),
-        ("safe_radius_negative", "safe_point", |map| map.layers[1].points[1].radius = -0.5),
-        ("safe_point_linked_to_itself", "safe_point", |map| map.layers[1].points[2].links[1] = 2),
-        ("safe_points_linked_twice", "safe_point", |map| map.layers[1].points[2].links[1] = 0),
+        ("safe_points_of_infinite_steps", "safe_point", |map| points(map).step_m = f32::INFINITY),
+        ("safe_points_in_no_steps", "safe_point", |map| points(map).step_m = 0.0),
+        ("safe_point_too_far", "safe_point", |map| points(map).x[1] = i32::MIN),
+        ("safe_points_of_two_lengths", "safe_point", |map| points(map).y.truncate(3)),
+        ("safe_radius_negative", "safe_point", |map| points(map).radius_cm[1] = -51),
+        ("safe_line_that_starts_beyond", "safe_point", |map| points(map).starts[0] = 4),
+        ("safe_line_that_starts_twice", "safe_point", |map| points(map).starts.push(0)),
+        ("safe_link_beyond", "safe_point", |map| points(map).link_from[0] = 4),
+        ("safe_link_before_the_first", "safe_point", |map| points(map).link_back[0] = 3),
+        ("safe_link_to_the_point_before", "safe_point", |map| points(map).link_back[0] = 1),
+        ("safe_points_linked_twice", "safe_point", |map| points(map).link_back[2] = 3),
+        ("safe_links_of_two_lengths", "safe_point", |map| points(map).link_back.truncate(2)),
         ("payload_spoilt", "crc", |map| map.layers[0].channels[0].crc32 ^= 1),
     ];
     let (header, drivability, flat) = golden_map();
@@ -360,6 +378,10 @@ fn a_map_with_one_thing_wrong_is_refused_under_that_name() {
 
 fn pose(map: &mut v1::Map) -> &mut v1::Pose {
     map.header.as_mut().unwrap().map_from_ego.as_mut().unwrap()
+}
+
+fn points(map: &mut v1::Map) -> &mut v1::SafePoints {
+    map.layers[1].safe_points.as_mut().unwrap()
 }
 
 fn radial(map: &mut v1::Map) -> &mut v1::RadialGrid {

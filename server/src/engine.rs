@@ -97,6 +97,7 @@ impl Engine {
             journal.event(event);
         }
         let started = Instant::now();
+        self.want();
         let map = match self.pipeline.step(event) {
             Ok(Some(map)) => map,
             Ok(None) => return Ok(()),
@@ -105,8 +106,8 @@ impl Engine {
                 return Err(rejected);
             }
         };
-        // Where every map is switched off, a revolution makes none.
-        let made = (!map.layers.is_empty()).then(|| {
+        // Where every map is switched off, a revolution makes none; where nobody takes one, a header.
+        let made = (!self.status.layers.is_empty()).then(|| {
             let states = map.sensors.iter().map(wire::sensor).collect();
             (Arc::new(EncodedMap::new(map, self.status.name.clone(), self.status.boot_id, self.valid_ms)), states)
         });
@@ -124,5 +125,12 @@ impl Engine {
             observer(&self.pipeline);
         }
         Ok(())
+    }
+
+    /// Tells the pipeline which layers somebody takes. With a journal all are made: a replay knows nothing of the readers
+    /// there were.
+    fn want(&mut self) {
+        let (all, demand) = (self.journal.is_some(), &self.status.demand);
+        self.pipeline.want(|layer| all || demand.is_taken(layer));
     }
 }

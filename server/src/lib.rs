@@ -7,6 +7,7 @@
 //! |---|---|
 //! | [`config`] | one TOML -> what is served where, recorded, and which vehicles there are |
 //! | [`ingest`] | datagrams, captures, scans -> numbered events on one queue a vehicle: the door |
+//! | [`demand`] | readers -> which layers are to be made |
 //! | [`engine`] | events -> journal, step, encoded maps |
 //! | [`wire`] | map -> bytes, once |
 //! | [`publish`] | newest map -> gRPC, zenoh, page |
@@ -22,6 +23,7 @@
 
 pub mod clouds;
 pub mod config;
+pub mod demand;
 pub mod demo;
 pub mod engine;
 pub mod evaluate;

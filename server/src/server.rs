@@ -15,6 +15,7 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use crate::config::{Calibrations, Certificates, Config};
+use crate::demand::Taken;
 use crate::engine::{Engine, Observer};
 use crate::ingest::entrance::{Entrance, Entrances};
 use crate::ingest::{Door, door, udp};
@@ -123,6 +124,8 @@ pub struct Running {
     udp: Option<udp::Readers>,
     publishers: JoinSet<()>,
     stop: watch::Sender<bool>,
+    /// What is made whether or not somebody else takes it.
+    _taken: Vec<Taken>,
     #[cfg(feature = "zenoh")]
     publisher: Option<crate::publish::zenoh::Publisher>,
     #[cfg(feature = "zenoh")]
@@ -180,13 +183,15 @@ impl Server {
         };
         let mut journals = journals.into_iter();
 
-        let (mut served, mut doors, mut engines) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut served, mut doors, mut engines, mut taken) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         for ((vehicle, name), pipeline) in config.vehicles.iter().zip(&names).zip(pipelines) {
             let (door, events) = door(vehicle.queue);
             let counts = recorder.as_ref().map(Recorder::counts);
             let status =
                 Arc::new(VehicleStatus::new(name.clone(), boot_id, layer_names(&vehicle.maps), door.outside(), counts));
             let (newest, receiver) = watch::channel(None);
+            // Files are read for their maps: who comes late finds the last one, and the summary knows its figures.
+            taken.extend(from_files.then(|| status.demand.take(&[])));
             let engine = Engine {
                 pipeline,
                 valid_ms: vehicle.maps.valid_ms,
@@ -250,6 +255,7 @@ impl Server {
             udp: None,
             publishers,
             stop,
+            _taken: taken,
             #[cfg(feature = "zenoh")]
             publisher,
             #[cfg(feature = "zenoh")]

@@ -12,6 +12,7 @@ use clearway_mapping::pipeline::{Ledger, NamedStatus};
 use clearway_proto::v1;
 use serde_json::{Value, json};
 
+use crate::demand::Demand;
 use crate::ingest::{Outside, Stranger, locked, now_ns};
 use crate::record::RecorderCounts;
 use crate::wire::EncodedMap;
@@ -32,6 +33,8 @@ pub struct VehicleStatus {
     pub boot_id: u64,
     /// The layers of its maps, in order.
     pub layers: Vec<&'static str>,
+    /// Which of the layers somebody takes.
+    pub demand: Demand,
     /// Readers over gRPC.
     pub grpc_readers: Arc<AtomicU32>,
     /// Open pages.
@@ -87,7 +90,7 @@ pub struct Snapshot {
     pub maps: u64,
     /// Of the newest map; 0 before the first.
     pub newest_capture_end_ns: i64,
-    /// Of the newest map.
+    /// Of the newest map, while somebody takes that layer.
     pub drivable_share: Option<f64>,
     /// Step and encode a map, median; `None` before the first map.
     pub latency_ms_p50: Option<f64>,
@@ -129,6 +132,7 @@ impl VehicleStatus {
         Self {
             name,
             boot_id,
+            demand: Demand::new(&layers),
             layers,
             grpc_readers: Arc::default(),
             page_readers: Arc::default(),

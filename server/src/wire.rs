@@ -149,14 +149,21 @@ fn layer(layer: &Layer) -> v1::Layer {
         channels: layer.channels.iter().map(channel).collect(),
         planes: layer.planes.iter().map(|&[a, b, c]| v1::Plane { a, b, c }).collect(),
         figures: layer.figures.iter().map(|&(name, value)| (name.to_owned(), value)).collect(),
-        points: layer.points.iter().map(safe_point).collect(),
+        safe_points: safe_points(layer),
     }
 }
 
-/// Single precision: 4 µm at 60 m.
-fn safe_point(point: &SafePoint) -> v1::SafePoint {
-    let SafePoint { x_m, y_m, radius_m, links } = point;
-    v1::SafePoint { x: *x_m as f32, y: *y_m as f32, radius: *radius_m as f32, links: links.clone() }
+/// Places lie in the middle of a cell or between two.
+fn safe_points(layer: &Layer) -> Option<v1::SafePoints> {
+    let Geometry::Cartesian { cell_m, .. } = layer.geometry else { return None };
+    let single = |SafePoint { x_m, y_m, radius_m, links }: &SafePoint| clearway_proto::map::SafePoint {
+        x_m: *x_m as f32,
+        y_m: *y_m as f32,
+        radius_m: *radius_m as f32,
+        links: links.clone(),
+    };
+    let points: Vec<_> = layer.points.iter().map(single).collect();
+    (!points.is_empty()).then(|| clearway_proto::safe_points::pack(&points, cell_m / 2.0))
 }
 
 fn road(road: &Road) -> v1::Road {
@@ -467,7 +474,7 @@ mod tests {
             }],
             planes: vec![[0.0, 0.0, 1.0]],
             figures: vec![("drivable_share", 0.5), ("cells", 5.0)],
-            points: vec![SafePoint { x_m: 1.5, y_m: -2.0, radius_m: 0.25, links: Vec::new() }],
+            points: Vec::new(),
         };
         Map {
             sequence: 9,

@@ -2,6 +2,7 @@
 
 mod house;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use clearway_server::replay::{Mount, Options, ReplayError, Summary, describe, replay};
@@ -130,4 +131,28 @@ async fn without_ground_to_estimate_a_mount_from_no_map_is_made_and_the_mount_is
     assert!(matches!(summary.mount, Mount::Unknown(_)), "{:?}", summary.mount);
     let said = describe(&summary.mount).unwrap();
     assert!(said.contains("--extrinsics x,y,z,roll,pitch,yaw"), "{said}");
+}
+
+/// WIRE.md: a map with every default layer travels in one zenoh frame and one DDS-sized burst.
+#[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+async fn a_map_of_all_default_layers_is_at_most_64_kib_but_for_a_vls128() {
+    // A VLS-128's is not, by a fifth: it may grow no larger.
+    for (file, allowed) in [(HDL32, 64), ("kitti/udacity_data_2", 64), ("mcap/nebula_vls128_none.mcap", 80)] {
+        let folder = tempfile::tempdir().unwrap();
+        let record = folder.path().join("sizes.mcap");
+        let options = Options { files: vec![drive(file)], record: Some(record.clone()), ..Options::default() };
+        replayed(options).await.unwrap();
+        let (mut whole, mut most) = (BTreeMap::<u64, usize>::new(), BTreeMap::<String, usize>::new());
+        for ((sequence, layer), bytes) in house::recorded(&record) {
+            // Each with the header, which a whole map has once.
+            *whole.entry(sequence).or_default() += bytes.len();
+            let most = most.entry(layer).or_default();
+            *most = bytes.len().max(*most);
+        }
+        let largest = whole.values().max().unwrap();
+        println!("{file}: {largest} bytes at most in {} maps; by layer {most:?}", whole.len());
+        assert!(*largest <= allowed << 10, "{file}: {largest}");
+        assert!(most["safe_path"] <= 7_000, "{file}: {most:?}");
+    }
 }

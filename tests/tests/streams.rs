@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use clearway_proto::v1;
+use clearway_server::server::{Server, Setup};
 use clearway_sim::send::{Pace, Until, drive};
 use house::{config, feed, grpc, readings, recorded, selection, sequence, start, until, vehicle, within};
 use tokio::net::UdpSocket;
@@ -168,7 +169,7 @@ async fn an_unknown_vehicle_or_layer_is_answered_with_the_known_ones() {
 
     let vehicles = client.list_vehicles(v1::ListVehiclesRequest {}).await.unwrap().into_inner().vehicles;
     assert_eq!(vehicles.iter().map(|v| v.name.as_str()).collect::<Vec<_>>(), ["car"]);
-    assert_eq!(vehicles[0].layers, ["drivability", "height_difference", "terrain", "occupancy"]);
+    assert_eq!(vehicles[0].layers.len() as u64, house::LAYERS);
     running.shutdown().await.unwrap();
 }
 
@@ -394,4 +395,37 @@ async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
     within("shutdown", running.shutdown()).await.unwrap();
     let report = clearway_server::verify::verify(&record).unwrap();
     assert!(report.is_good() && report.maps > maps, "{report:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn layers_are_made_while_somebody_takes_them_and_a_late_joiner_gets_his_with_the_next_map() {
+    let setup = Setup { config: config(), ..Setup::default() };
+    let running = Server::start(setup).await.expect("the server starts");
+    let newest = || running.vehicles.0[0].newest.borrow().clone().expect("a map");
+    let layers = || newest().layers.iter().map(|(name, _)| *name).collect::<Vec<_>>();
+    let all = readings(9);
+    let third = all.len() / 3;
+    let part = |number: usize| all[number * third..(number + 1) * third].to_vec();
+
+    // Maps are counted, and told as alive, but nobody takes a layer.
+    assert!(feed(&running, part(0)).await >= 2);
+    assert!(layers().is_empty());
+
+    let (requests, mut updates) = watch(&running, 0).await;
+    let demand = running.vehicles.0[0].status.demand.clone();
+    until("the reader's layer is taken", || demand.is_taken(LAYER)).await;
+    assert!(!demand.is_taken("terrain"));
+    let before = newest().sequence;
+    feed(&running, part(1)).await;
+    let update = within("a map", updates.message()).await.unwrap().unwrap();
+    assert!(sequence(&update.map) > before, "no map without the layer is sent");
+    assert_eq!(layers(), [LAYER]);
+
+    drop((requests, updates));
+    until("the reader is gone", || !demand.is_taken(LAYER)).await;
+    let taken = demand.take(&["safe_path".into()]);
+    feed(&running, part(2)).await;
+    assert_eq!(layers(), ["drivability", "safe_path"], "what it is made from comes along");
+    assert!(taken.are_in(&newest()));
+    within("shutdown", running.shutdown()).await.unwrap();
 }

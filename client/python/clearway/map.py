@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,10 @@ OBSTACLES = frozenset({"obstacle", "occupied"})
 CELLS_MAX = 16 << 20
 #: Bytes of a map that are accepted; gRPC's default. Those of a server with default grids have under 64 KiB.
 BYTES_MAX = 4 << 20
+#: Safe points of a layer.
+POINTS_MAX = 1 << 16
+#: Steps a safe point may lie away: beyond, single precision is not exact.
+STEPS_MAX = 1 << 24
 
 
 def now_ns() -> int:
@@ -159,7 +164,7 @@ class Layer:
         #: Figures of the whole layer, such as `drivable_share`.
         self.figures: dict[str, float] = dict(message.figures)
         #: Safe points, the vehicle's own place first.
-        self.points: tuple[SafePoint, ...] = tuple(self._points(message))
+        self.points: tuple[SafePoint, ...] = tuple(self._points(message.safe_points))
         self._check_classes()
 
     @property
@@ -214,14 +219,35 @@ class Layer:
         raw.flags.writeable = False
         return Channel(message.name, message.unit, message.scale, message.unknown, raw)
 
-    def _points(self, message: map_pb2.Layer) -> Iterator[SafePoint]:
-        for index, point in enumerate(message.points):
-            links = tuple(point.links)
-            rising = all(a < b for a, b in zip(links, links[1:])) and (not links or links[-1] < index)
-            finite = all(map(math.isfinite, (point.x, point.y, point.radius))) and point.radius >= 0
-            if not (rising and finite):
-                raise DecodeError("safe_point", f"safe point {index}: {point}")
-            yield SafePoint(point.x, point.y, point.radius, links)
+    def _points(self, packed: map_pb2.SafePoints) -> Iterator[SafePoint]:
+        """The differences summed up; at most `POINTS_MAX` points."""
+        count, step = len(packed.x), packed.step_m
+        if len(packed.y) != count or len(packed.radius_cm) != count or count > POINTS_MAX:
+            raise DecodeError("safe_point", f"{count}, {len(packed.y)} and {len(packed.radius_cm)} values")
+        if count and not (math.isfinite(step) and step > 0):
+            raise DecodeError("safe_point", f"steps of {step} m; finite metres over 0 are needed")
+        links = self._links(packed, count)
+        for index, sums in enumerate(zip(*map(accumulate, (packed.x, packed.y, packed.radius_cm)))):
+            if max(map(abs, sums)) > STEPS_MAX or sums[2] < 0:
+                raise DecodeError("safe_point", f"safe point {index}: {sums} steps and cm")
+            yield SafePoint(sums[0] * step, sums[1] * step, sums[2] / 100, tuple(links[index]))
+
+    @staticmethod
+    def _links(packed: map_pb2.SafePoints, count: int) -> list[list[int]]:
+        starts = list(accumulate(packed.starts))
+        if 0 in packed.starts or starts and starts[-1] >= count or len(packed.link_from) != len(packed.link_back):
+            raise DecodeError("safe_point", f"lines that start at {starts} of {count} safe points")
+        links: list[list[int]] = [[] for _ in range(count)]
+        before = (-1, -1)
+        for start, back in zip(accumulate(packed.link_from), packed.link_back):
+            link = (start, start - back)
+            if start >= count or back < 2 or back > start or link <= before:
+                raise DecodeError("safe_point", f"a link {link} among {count} safe points")
+            links[start].append(link[1])
+            before = link
+        for index in set(range(1, count)).difference(starts):
+            links[index].append(index - 1)
+        return links
 
     def _check_classes(self) -> None:
         channel = self.channels.get("class")

@@ -120,6 +120,19 @@ impl Intake {
         &self.name
     }
 
+    /// What the maps want of the turns from now on.
+    pub fn want(&mut self, wanted: Wanted) {
+        match (&self.series, wanted.deviations) {
+            (None, true) => self.series = Some(Series::default()),
+            (Some(_), false) => self.series = None,
+            (None, false) | (Some(_), true) => {}
+        }
+        self.wants_no_returns = wanted.no_returns;
+        if !wanted.no_returns {
+            self.turn.no_returns.clear();
+        }
+    }
+
     /// What the sensor has shown of itself; a scan counts as a revolution.
     pub fn status(&self) -> SensorStatus {
         let mut status = self.sensor.status();

@@ -32,6 +32,7 @@ pub mod event;
 pub mod fusion;
 pub mod height_difference;
 mod intake;
+mod layers;
 pub mod ledger;
 pub mod map;
 pub mod motion;

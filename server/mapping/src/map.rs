@@ -28,7 +28,7 @@ pub struct Map {
     pub made_by: u16,
     /// Every sensor of the vehicle, in the order of the configuration, whether it contributed or not.
     pub sensors: Vec<SensorState>,
-    /// In the order of the configuration.
+    /// Those that are wanted, and those they are made from, in the order of the configuration.
     pub layers: Vec<Layer>,
 }
 
@@ -175,6 +175,17 @@ pub trait LayerMaker: Send {
     fn take(&mut self, rays: &Rays<'_>) {
         // Most maps are made from the map's sweep alone.
         let _ = rays;
+    }
+
+    /// Names of the earlier layers it is made from.
+    fn needs(&self) -> &'static [&'static str] {
+        &[]
+    }
+
+    /// Whether [`LayerMaker::make`] uses the deviations of the lead's distance series: where no map does, they are not
+    /// measured.
+    fn wants_deviations(&self) -> bool {
+        false
     }
 
     /// Whether [`LayerMaker::take`] uses [`Rays::no_returns`]: where no map does, they are not looked for.

@@ -10,21 +10,16 @@ use clearway_lidar::sensor::SensorStatus;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
 use crate::config::{ConfigError, MapsConfig, SensorConfig, VehicleConfig};
-use crate::drivability::Drivability;
 use crate::event::{Body, EgoPose, Event, Road, Scan};
 use crate::fusion::Fusion;
-use crate::height_difference::HeightDifference;
 use crate::intake::{Intake, Moment, Wanted};
+use crate::layers::Layers;
 use crate::ledger::Dropped;
 pub use crate::ledger::{Ledger, Rejected};
-use crate::map::{Context, LayerMaker, Map};
+use crate::map::{Context, Map};
 use crate::motion::{Compensation, Motion};
-use crate::occupancy::Occupancy;
 use crate::road::{self, Roads};
-use crate::safe_path::SafePath;
-use crate::speed::Speed;
 use crate::sweep::Sweep;
-use crate::terrain::Terrain;
 
 /// One vehicle's way from events to maps.
 pub struct Pipeline {
@@ -37,7 +32,7 @@ pub struct Pipeline {
     ledger: Ledger,
     now: Option<Moment>,
     maps_made: u64,
-    layer_makers: Vec<Box<dyn LayerMaker>>,
+    layers: Layers,
     map: Map,
 }
 
@@ -63,11 +58,11 @@ impl Pipeline {
         if calibrations.len() != config.sensors.len() {
             return Err(ConfigError::new("vehicle.sensor", "calibrations", "one calibration, or none, a sensor"));
         }
-        let layer_makers = layer_makers(&config.maps);
+        let layers = Layers::new(&config.maps);
         let lead = config.lead().expect("validate() finds the lead");
-        let no_returns = layer_makers.iter().any(|maker| maker.wants_no_returns());
+        let wanted = layers.wanted();
         let intake = |(index, (sensor, calibration)): (usize, (&SensorConfig, _))| {
-            let wanted = Wanted { deviations: index == lead && config.maps.terrain.enabled, no_returns };
+            let wanted = Wanted { deviations: wanted.deviations && index == lead, ..wanted };
             Intake::new(sensor, calibration, config.body.as_ref(), wanted)
         };
         Ok(Self {
@@ -88,9 +83,9 @@ impl Pipeline {
                 compensation: Compensation::None,
                 made_by: 0,
                 sensors: Vec::new(),
-                layers: layer_makers.iter().map(|maker| maker.layer()).collect(),
+                layers: Vec::new(),
             },
-            layer_makers,
+            layers,
             config: config.clone(),
         })
     }
@@ -131,6 +126,25 @@ impl Pipeline {
                 Err(rejected)
             }
         }
+    }
+
+    /// From now on makes the layers that are named and those they are made from; the others cost nothing and are in no
+    /// map. All are wanted before the first call. Layers that gather evidence begin from unknown when they are wanted
+    /// again, so only where all are wanted throughout do the same events give the same bytes of every layer.
+    pub fn want(&mut self, is_wanted: impl Fn(&str) -> bool) {
+        if !self.layers.want(&self.config.maps, is_wanted) {
+            return;
+        }
+        let wanted = self.layers.wanted();
+        let lead = self.config.lead();
+        for (index, intake) in self.intakes.iter_mut().enumerate() {
+            intake.want(Wanted { deviations: wanted.deviations && lead == Some(index), ..wanted });
+        }
+    }
+
+    /// How often each layer was made, in the order of the layers.
+    pub fn layers_made(&self) -> Vec<(&'static str, u64)> {
+        self.layers.made()
     }
 
     /// What came of everything so far, of all sensors.
@@ -231,8 +245,7 @@ impl Pipeline {
     fn take_sensor(&mut self, source: u16, sensor: &SensorConfig) -> Result<(), Rejected> {
         self.config.declare(usize::from(source), sensor)?;
         if self.intakes.len() < self.config.sensors.len() {
-            let no_returns = self.layer_makers.iter().any(|maker| maker.wants_no_returns());
-            let wanted = Wanted { deviations: false, no_returns };
+            let wanted = Wanted { deviations: false, ..self.layers.wanted() };
             self.intakes.push(Intake::new(sensor, None, self.config.body.as_ref(), wanted));
         }
         self.ledger.sensors += 1;
@@ -245,7 +258,7 @@ impl Pipeline {
         // What comes that much too late is evidence of a world that has moved on.
         if self.fusion.is_timely(&self.intakes[index], &self.intakes, now) {
             let rays = self.intakes[index].rays(source);
-            self.layer_makers.iter_mut().for_each(|maker| maker.take(&rays));
+            self.layers.take(&rays);
         }
         let makes_map = self.fusion.makes_map(index, &self.intakes, now);
         if makes_map {
@@ -265,12 +278,9 @@ impl Pipeline {
         (map.compensation, map.sensors, map.made_by) = (gathered.compensation, gathered.sensors, source);
         let sweep = self.fusion.sweep(&self.intakes);
         let (road, route) = (self.roads.to_paint(), self.roads.route());
-        for (index, maker) in self.layer_makers.iter_mut().enumerate() {
-            let (earlier, rest) = map.layers.split_at_mut(index);
-            let context =
-                Context { earlier, stamp_ns: map.capture_end_ns, map_from_ego: map.map_from_ego, road, route };
-            maker.make_with(sweep, &context, &mut rest[0]);
-        }
+        let context =
+            Context { earlier: &[], stamp_ns: map.capture_end_ns, map_from_ego: map.map_from_ego, road, route };
+        self.layers.make(sweep, &context, &mut map.layers);
     }
 }
 
@@ -279,34 +289,9 @@ fn intake_of(intakes: &mut [Intake], source_index: u16) -> Result<&mut Intake, R
     intakes.get_mut(usize::from(source_index)).ok_or(Rejected::Source { source_index, sensors })
 }
 
-/// The maps that are switched on, in the order of their layers.
-fn layer_makers(maps: &MapsConfig) -> Vec<Box<dyn LayerMaker>> {
-    let mut makers: Vec<Box<dyn LayerMaker>> = Vec::new();
-    if maps.drivability.enabled {
-        makers.push(Box::new(Drivability::new(&maps.drivability)));
-    }
-    if maps.height_difference.enabled {
-        makers.push(Box::new(HeightDifference::new(&maps.height_difference)));
-    }
-    if maps.terrain.enabled {
-        makers.push(Box::new(Terrain::new(&maps.terrain)));
-    }
-    if maps.occupancy.enabled {
-        makers.push(Box::new(Occupancy::new(&maps.occupancy)));
-    }
-    if maps.speed.enabled {
-        makers.push(Box::new(Speed::new(&maps.speed)));
-    }
-    // Behind the layers whose obstacles it keeps away from.
-    if maps.safe_path.enabled {
-        makers.push(Box::new(SafePath::new(&maps.safe_path)));
-    }
-    makers
-}
-
 /// Names of the layers of a vehicle's maps, in order.
 pub fn layer_names(maps: &MapsConfig) -> Vec<&'static str> {
-    layer_makers(maps).iter().map(|maker| maker.layer().name).collect()
+    Layers::new(maps).made().into_iter().map(|(name, _)| name).collect()
 }
 
 /// The model that [`model_name`] spells so.

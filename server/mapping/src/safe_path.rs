@@ -114,6 +114,10 @@ impl LayerMaker for SafePath {
         }
     }
 
+    fn needs(&self) -> &'static [&'static str] {
+        &["drivability"]
+    }
+
     /// Without another layer nothing is known.
     fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
         self.make_with(sweep, &Context::default(), layer);

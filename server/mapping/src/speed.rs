@@ -74,27 +74,23 @@ impl Speed {
         let (Cells::U8(class), Cells::U8(speed)) = (&mut class.cells, &mut speed.cells) else {
             unreachable!("layer() gives u8 and u8")
         };
+        let (mut passable, mut road) = (0u32, 0u32);
         class.clear();
+        class.resize(self.heights.bumpiness_m().len(), UNKNOWN);
         speed.clear();
-        let (mut known, mut passable, mut road) = (0u32, 0u32, 0u32);
-        let unknown = self.unknown();
-        for (&bumpiness, &bonus) in self.heights.bumpiness_m().iter().zip(self.painter.bonus_mps()) {
-            // NaN where nothing was seen.
-            let (cell, raw) = if bumpiness.is_nan() {
-                (UNKNOWN, unknown)
-            } else if bumpiness == OBSTACLE_BUMPINESS {
-                (OBSTACLE, 0)
-            } else {
-                let on_road = bonus != NO_ROAD;
-                let mps = self.off_road_mps(bumpiness) + if on_road { bonus } else { 0.0 };
-                (if on_road { ROAD } else { PASSABLE }, (mps / SPEED_SCALE_MPS) as u8)
-            };
-            known += u32::from(cell != UNKNOWN);
-            passable += u32::from(cell == PASSABLE || cell == ROAD);
-            road += u32::from(cell == ROAD);
-            class.push(cell);
-            speed.push(raw);
+        speed.resize(class.len(), self.unknown());
+        for cell in self.heights.known() {
+            let (bumpiness, bonus) = (self.heights.bumpiness_m()[cell], self.painter.bonus_mps()[cell]);
+            if bumpiness == OBSTACLE_BUMPINESS {
+                (class[cell], speed[cell]) = (OBSTACLE, 0);
+                continue;
+            }
+            let on_road = bonus != NO_ROAD;
+            let mps = self.off_road_mps(bumpiness) + if on_road { bonus } else { 0.0 };
+            (class[cell], speed[cell]) = (if on_road { ROAD } else { PASSABLE }, (mps / SPEED_SCALE_MPS) as u8);
+            (passable, road) = (passable + 1, road + u32::from(on_road));
         }
+        let known = self.heights.known().len() as u32;
         let share = |part: u32| if known == 0 { 0.0 } else { f64::from(part) / f64::from(known) };
         let flag = |set: bool| f64::from(u8::from(set));
         let gates = &self.gates;

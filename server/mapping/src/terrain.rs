@@ -34,7 +34,7 @@ use crate::sweep::Sweep;
 use ground::Ground;
 use moments::{Cells, half_width};
 use reach::{Passage, Reach};
-use regions::{FIRST_FLAT, NOTHING, OBSTACLE as NOT_FLAT, Plane, Regions};
+use regions::{FIRST_FLAT, OBSTACLE as NOT_FLAT, Plane, Regions};
 use roughness::Roughness;
 use shadow::Shadow;
 
@@ -104,17 +104,23 @@ impl Terrain {
         class.clear();
         let region_of = self.regions.of_cell();
         if self.config.form == Form::Grounded {
-            let (joined, filled) = (self.ground.joined(), self.ground.filled());
-            class.extend(region_of.iter().zip(&self.seen).zip(filled).map(|((&region, &seen), &filled)| {
-                match (region, seen) {
-                    (NOT_FLAT, _) => OBSTACLE,
-                    (FIRST_FLAT.., true) if joined[(region - FIRST_FLAT) as usize] => FLAT,
-                    (FIRST_FLAT.., true) => FLAT_ELEVATED,
-                    (FIRST_FLAT.., false) if filled => FLAT_INFERRED,
-                    (NOTHING, true) if filled => FLAT,
+            let joined = self.ground.joined();
+            // What is neither seen nor filled stays unknown.
+            class.resize(region_of.len(), UNKNOWN);
+            for &cell in self.regions.cell_of_slot() {
+                class[cell as usize] = match region_of[cell as usize] {
+                    NOT_FLAT => OBSTACLE,
+                    region @ FIRST_FLAT.. if joined[(region - FIRST_FLAT) as usize] => FLAT,
+                    FIRST_FLAT.. => FLAT_ELEVATED,
                     _ => UNKNOWN,
+                };
+            }
+            for &cell in self.ground.filled() {
+                let class = &mut class[cell as usize];
+                if *class == UNKNOWN {
+                    *class = if self.seen[cell as usize] { FLAT } else { FLAT_INFERRED };
                 }
-            }));
+            }
             self.gate(class, sensor_m);
         } else {
             class.extend(region_of.iter().zip(&self.seen).map(|(&region, &seen)| match (region, seen) {
@@ -142,26 +148,26 @@ impl Terrain {
 
         let (regions, joined, shadow) = (self.regions.of_cell(), self.ground.joined(), &self.shadow);
         let is_ground = |region: u32| region >= FIRST_FLAT && joined[(region - FIRST_FLAT) as usize];
-        let is_blind = |cell: usize| {
-            let [x, y] = cells.middle_m(cell);
-            x * x + y * y <= blind_zone_m * blind_zone_m
-        };
-        let passage = |cell: usize| match class[cell] {
-            FLAT => Passage::Open,
-            OBSTACLE | FLAT_ELEVATED => Passage::Closed,
-            _ if seen[cell] => Passage::None,
-            FLAT_INFERRED => Passage::Open,
-            _ if (bridged[cell] || is_ground(regions[cell])) && !shadow.hides(cell) => Passage::Open,
-            _ if is_blind(cell) => Passage::Open,
+        let width = cells.width();
+        let blind = (blind_zone_m / cell_m).ceil() as usize;
+        let is_near = |ix: usize| ix + blind >= width / 2 && ix < width / 2 + blind;
+        let passage = |ix: usize, iy: usize| match (iy * width + ix, class[iy * width + ix]) {
+            (_, FLAT) => Passage::Open,
+            (_, OBSTACLE | FLAT_ELEVATED) => Passage::Closed,
+            (cell, _) if seen[cell] => Passage::None,
+            (_, FLAT_INFERRED) => Passage::Open,
+            (cell, _) if (bridged[cell] || is_ground(regions[cell])) && !shadow.hides(cell) => Passage::Open,
+            (cell, _) if is_near(ix) && is_near(iy) && shadow.distance_m(cell) <= blind_zone_m => Passage::Open,
             _ => Passage::None,
         };
-        let width = cells.width();
         // Between obstacles so far apart at least this many whole cells are free, less one: the disc's middle.
         let radius = ((gate_m_min / cell_m - 2.0) / 2.0).max(0.0) as usize;
-        self.reach.find(width, radius, (0..class.len()).map(passage));
-        for (cell, class) in class.iter_mut().enumerate() {
-            if matches!(*class, FLAT | FLAT_INFERRED) && !self.reach.reached(cell % width, cell / width) {
-                *class = if *class == FLAT { FLAT_UNREACHABLE } else { UNKNOWN };
+        self.reach.find(width, radius, passage);
+        for (iy, row) in class.chunks_exact_mut(width).enumerate() {
+            for (ix, class) in row.iter_mut().enumerate() {
+                if matches!(*class, FLAT | FLAT_INFERRED) && !self.reach.reached(ix, iy) {
+                    *class = if *class == FLAT { FLAT_UNREACHABLE } else { UNKNOWN };
+                }
             }
         }
     }
@@ -236,6 +242,10 @@ impl LayerMaker for Terrain {
             points: Vec::new(),
             figures: Vec::new(),
         }
+    }
+
+    fn wants_deviations(&self) -> bool {
+        true
     }
 
     fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {

@@ -349,3 +349,50 @@ fn recorded_drives_become_maps_with_the_road_drivable() {
         }
     }
 }
+
+#[test]
+fn a_layer_that_nobody_wants_is_neither_made_nor_in_a_map_and_comes_with_the_next_when_somebody_does() {
+    let all = ["drivability", "height_difference", "terrain", "occupancy", "speed", "safe_path"];
+    let names = |map: &Map| map.layers.iter().map(|layer| layer.name).collect::<Vec<_>>();
+    let (mut everything, mut wanted) = (pipeline(None), pipeline(None));
+    assert_eq!(everything.layers_made(), all.map(|layer| (layer, 0)));
+    // What is wanted, and what the map then holds: safe_path is made from drivability.
+    let steps: [(&[&str], &[&str]); 6] = [
+        (&[], &[]),
+        (&["terrain"], &["terrain"]),
+        (&["safe_path", "speed"], &["drivability", "speed", "safe_path"]),
+        (&["occupancy"], &["occupancy"]),
+        (&[], &[]),
+        (&all, &all),
+    ];
+    for (number, (want, has)) in (1..).zip(steps) {
+        let event = event(number, Body::Scan(scan(100_000_000 * number as i64)));
+        let expected = everything.step(&event).unwrap().unwrap();
+        wanted.want(|layer| want.contains(&layer));
+        let map = wanted.step(&event).unwrap().unwrap();
+        assert_eq!(names(map), has);
+        assert_eq!((map.sequence, &map.sensors), (expected.sequence, &expected.sensors));
+        // Occupancy gathers hits over maps, and begins anew: all others are the same, cell by cell.
+        for layer in map.layers.iter().filter(|layer| layer.name != "occupancy") {
+            let same = expected.layers.iter().find(|other| other.name == layer.name).unwrap();
+            assert_eq!(layer, same);
+        }
+    }
+    assert_eq!(everything.layers_made(), all.map(|layer| (layer, 6)));
+    let made: Vec<u64> = wanted.layers_made().iter().map(|(_, made)| *made).collect();
+    assert_eq!(made, [2, 1, 2, 2, 2, 2]);
+}
+
+#[test]
+fn roughness_is_measured_again_when_terrain_is_wanted_again() {
+    let events = drive();
+    let roughness = |maps: &[Map]| maps.last().unwrap().layers.iter().find(|layer| layer.name == "terrain").cloned();
+    let mut late = pipeline(Some(Model::Vlp16));
+    late.want(|_| false);
+    let half = events.len() / 2;
+    assert!(maps(&mut late, &events[..half]).iter().all(|map| map.layers.is_empty()));
+    late.want(|layer| layer == "terrain");
+    let made = roughness(&maps(&mut late, &events[half..]));
+    assert!(made.is_some());
+    assert_eq!(made, roughness(&maps(&mut pipeline(Some(Model::Vlp16)), &events)));
+}

@@ -129,7 +129,7 @@ proptest! {
             let [x, y] = [(cell % side) as i32, (cell / side) as i32];
             let squared = |[sx, sy]: [i32; 2]| (sx - x) * (sx - x) + (sy - y) * (sy - y);
             let nearest = closed.iter().map(|site| squared(*site)).min();
-            prop_assert_eq!(distances.site(cell).map(squared), nearest, "{} {}", x, y);
+            prop_assert_eq!(distances.site(cell % side, cell / side).map(squared), nearest, "{} {}", x, y);
         }
     }
 

@@ -21,6 +21,7 @@ use super::access::{Access, Guard};
 use super::connections::Connections;
 use super::{Served, Unknown, Vehicles};
 use crate::config::{self, Certificates};
+use crate::demand::Taken;
 use crate::engine::Newest;
 use crate::ingest::entrance::Entrances;
 use crate::ingest::grpc::Ingest;
@@ -149,9 +150,12 @@ impl MapService for Maps {
         let v1::GetMapRequest { vehicle, layers } = request.into_inner();
         let served = self.vehicles.find(&vehicle)?;
         served.check_layers(&layers)?;
-        let newest = served.newest.borrow().clone();
-        let map =
-            newest.ok_or_else(|| Status::unavailable(format!("vehicle {} has no map yet", served.status.name)))?;
+        let name = &served.status.name;
+        if served.newest.borrow().is_none() {
+            return Err(Status::unavailable(format!("vehicle {name} has no map yet")));
+        }
+        let newest = served.status.demand.take(&layers).newest(&served.newest).await;
+        let map = newest.ok_or_else(|| Status::unavailable(format!("vehicle {name} makes no map at present")))?;
         Ok(Response::new(v1::MapUpdate { map: map.select(&layers), skipped: 0, sent_ns: now_ns() }))
     }
 
@@ -194,6 +198,8 @@ struct Watch<R> {
     credits: Credits,
     last_sequence: Option<u64>,
     over: bool,
+    /// Until it goes, its layers are made.
+    taken: Taken,
     // Last, and only held: the reader is counted while this lives.
     _reader: Reader,
 }
@@ -206,6 +212,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         Self {
             requests: Some(requests),
             newest,
+            taken: served.status.demand.take(&selection.layers),
             layers: selection.layers,
             credits: Credits::new(selection.max_in_flight as usize),
             last_sequence: None,
@@ -239,7 +246,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
                 changed = self.newest.changed(), if self.credits.left() => {
                     changed.map_err(|_| Status::unavailable("the vehicle's engine has stopped"))?;
                     let newest = self.newest.borrow_and_update().clone();
-                    if let Some(map) = newest {
+                    if let Some(map) = newest.filter(|map| self.taken.are_in(map)) {
                         return Ok(Some(self.update(&map)));
                     }
                 },

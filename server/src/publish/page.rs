@@ -106,6 +106,7 @@ async fn live(State(vehicles): State<Vehicles>, Query(wanted): Query<Wanted>, up
 /// Sends until the browser goes, stalls, or the engine stops.
 async fn stream(mut socket: WebSocket, served: Served) {
     let _reader = Reader::new(&served.status.page_readers);
+    let taken = served.status.demand.take(&[]);
     let mut newest = served.newest.clone();
     newest.mark_changed();
     let mut every = tokio::time::interval(STATUS_PERIOD);
@@ -115,7 +116,7 @@ async fn stream(mut socket: WebSocket, served: Served) {
             changed = newest.changed() => {
                 let Ok(()) = changed else { break };
                 let map = newest.borrow_and_update().clone();
-                let Some(map) = map else { continue };
+                let Some(map) = map.filter(|map| taken.are_in(map)) else { continue };
                 let skipped = last_sequence.map_or(0, |last: u64| map.sequence.saturating_sub(last + 1));
                 last_sequence = Some(map.sequence);
                 let update = v1::MapUpdate { map: map.select(&[]), skipped, sent_ns: now_ns() };

@@ -1,14 +1,16 @@
 //! Maps over zenoh, one layer a key: `clearway/<vehicle>/map/<layer>`.
 //!
-//! Late joiners get the current map from the publisher's cache; the same key answers queries with it. Misses can be
-//! detected. A liveliness token `clearway/<vehicle>` lives as long as the vehicle is served; `clearway/<vehicle>/status`
+//! A layer is made while somebody subscribes to its key, and for who asks for it: late joiners get the current map from the
+//! publisher's cache (an old one where nobody took it; its age tells), the same key answers queries. Misses can be detected. A liveliness token `clearway/<vehicle>` lives as long as the vehicle is served; `clearway/<vehicle>/status`
 //! has the status once a second, JSON. Congestion drops: blocking would let one stopped peer hold up the healthy ones.
 
 use std::time::Duration;
 
 use tokio::task::JoinSet;
 use zenoh::bytes::Encoding;
+use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
+use zenoh::matching::{MatchingListener, MatchingStatus};
 use zenoh::qos::CongestionControl;
 use zenoh::{Config, Session};
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
@@ -103,6 +105,9 @@ impl Publisher {
                 .publisher_detection()
                 .await
                 .map_err(failed(format!("publisher {key}")))?;
+            let matching = publisher.matching_listener().await.map_err(failed(format!("subscribers of {key}")))?;
+            let matches = publisher.matching_status().await.map_err(failed(format!("subscribers of {key}")))?;
+            self.tasks.spawn(take_while(served.clone(), layer, matches.matching(), matching));
             publishers.push((*layer, publisher));
             self.answer(served, layer, key).await?;
         }
@@ -132,11 +137,10 @@ impl Publisher {
     async fn answer(&mut self, served: &Served, layer: &'static str, key: String) -> Result<(), ZenohError> {
         let queryable = self.session.declare_queryable(key.clone()).complete(true);
         let queries = queryable.await.map_err(failed(format!("queryable {key}")))?;
-        let newest = served.newest.clone();
+        let (newest, demand) = (served.newest.clone(), served.status.demand.clone());
         self.tasks.spawn(async move {
             while let Ok(query) = queries.recv_async().await {
-                let map = newest.borrow().clone();
-                let Some(map) = map else { continue };
+                let Some(map) = demand.take(&[layer.to_owned()]).newest(&newest).await else { continue };
                 let Some((_, chunk)) = map.layers.iter().find(|(name, _)| *name == layer) else { continue };
                 if let Err(error) = query.reply(&key, map.layer(chunk)).encoding(map_encoding()).await {
                     tracing::debug!(%error, "zenoh: reply");
@@ -144,6 +148,22 @@ impl Publisher {
             }
         });
         Ok(())
+    }
+}
+
+/// Takes a layer while the listener says that somebody subscribes to it.
+async fn take_while(
+    served: Served,
+    layer: &'static str,
+    mut matches: bool,
+    matching: MatchingListener<FifoChannelHandler<MatchingStatus>>,
+) {
+    loop {
+        let _taken = matches.then(|| served.status.demand.take(&[layer.to_owned()]));
+        match matching.recv_async().await {
+            Ok(status) => matches = status.matching(),
+            Err(_) => return,
+        }
     }
 }
 

@@ -67,9 +67,27 @@ impl Distances {
         }
     }
 
+    /// A cell that is not free is its own site, and hides those beyond it: each stretch of free cells is measured with the
+    /// two beside it alone.
     fn along_row(&mut self, iy: usize) {
-        let side = self.side;
-        let rows = &self.row_of_site[iy * side..][..side];
+        let mut from = 0;
+        for ix in 0..self.side {
+            if usize::from(self.row_of_site[iy * self.side + ix]) == iy {
+                self.along_stretch(iy, from, ix + 1);
+                self.column_of_site[iy * self.side + ix] = ix as u16;
+                from = ix;
+            }
+        }
+        self.along_stretch(iy, from, self.side);
+    }
+
+    /// Measures the free cells among `from..end` of a row by the sites of these columns.
+    fn along_stretch(&mut self, iy: usize, from: usize, end: usize) {
+        // Two that are not free lie beside one another: nothing is between them.
+        if end - from <= 2 && from > 0 && end < self.side {
+            return;
+        }
+        let rows = &self.row_of_site[iy * self.side..][..self.side];
         let height_squared = |ix: u16| {
             let height = i32::from(rows[usize::from(ix)]) - iy as i32;
             height * height
@@ -79,45 +97,45 @@ impl Distances {
             along * along + height_squared(ix)
         };
         self.envelope.clear();
-        for ix in 0..side as u16 {
+        for ix in from as u16..end as u16 {
             if rows[usize::from(ix)] == NONE {
                 continue;
             }
             // A parabola that is not lower even where it began is nowhere the lowest.
-            while self.envelope.last().is_some_and(|&(held, from)| value(from, held) > value(from, ix)) {
+            while self.envelope.last().is_some_and(|&(held, began)| value(began, held) > value(began, ix)) {
                 self.envelope.pop();
             }
             match self.envelope.last() {
-                None => self.envelope.push((ix, 0)),
+                None => self.envelope.push((ix, from as u16)),
                 Some(&(held, _)) => {
                     let (u, i) = (i32::from(ix), i32::from(held));
                     let meets = (u * u - i * i + height_squared(ix) - height_squared(held)).div_euclid(2 * (u - i));
-                    if meets + 1 < side as i32 {
+                    if meets + 1 < end as i32 {
                         self.envelope.push((ix, (meets + 1) as u16));
                     }
                 }
             }
         }
-        let columns = &mut self.column_of_site[iy * side..][..side];
+        let columns = &mut self.column_of_site[iy * self.side..][..end];
         if self.envelope.is_empty() {
-            columns.fill(NONE);
+            columns[from..].fill(NONE);
         }
-        let mut end = side;
-        for &(ix, from) in self.envelope.iter().rev() {
-            columns[usize::from(from)..end].fill(ix);
-            end = usize::from(from);
+        let mut end = end;
+        for &(ix, began) in self.envelope.iter().rev() {
+            columns[usize::from(began)..end].fill(ix);
+            end = usize::from(began);
         }
     }
 
     /// The nearest site to a cell, `[ix, iy]`; `None` where every cell is free.
     #[inline]
-    pub fn site(&self, index: usize) -> Option<[i32; 2]> {
-        let column = self.column_of_site[index];
+    pub fn site(&self, ix: usize, iy: usize) -> Option<[i32; 2]> {
+        let row = iy * self.side;
+        let column = self.column_of_site[row + ix];
         if column == NONE {
             return None;
         }
-        let row = self.row_of_site[index / self.side * self.side + usize::from(column)];
-        Some([i32::from(column), i32::from(row)])
+        Some([i32::from(column), i32::from(self.row_of_site[row + usize::from(column)])])
     }
 
     /// Squared distance from a place to the nearest square of a cell that is not free; place and distance in half cells,

@@ -87,15 +87,15 @@ impl Ridge {
         self.mark(states, distances, width_cells);
         self.keep(states, distances, width_cells);
         self.thin();
-        self.point_of_cell.fill(0);
         for (index, point) in self.points.iter().enumerate() {
             self.point_of_cell[point.cell] = index as u32 + 1;
         }
     }
 
     fn mark(&mut self, states: &[State], distances: &Distances, width_cells: f64) {
+        // No point lies in any other cell.
         for &cell in &self.marked {
-            self.across[cell as usize] = 0;
+            (self.across[cell as usize], self.point_of_cell[cell as usize]) = (0, 0);
         }
         self.marked.clear();
         let side = self.side;
@@ -106,20 +106,22 @@ impl Ridge {
                 if !states[p].is_free() {
                     continue;
                 }
-                let Some(site) = distances.site(p) else { return };
+                let Some(site) = distances.site(ix, iy) else { return };
                 // Towards the next column and the next row; the other two ways come from there.
-                for (there, q, to, back) in [(ix + 1 < side, p + 1, 1, 2), (iy + 1 < side, p + side, 4, 8)] {
+                for (there, [qx, qy], to, back) in
+                    [(ix + 1 < side, [ix + 1, iy], 1, 2), (iy + 1 < side, [ix, iy + 1], 4, 8)]
+                {
+                    let q = qy * side + qx;
                     if !there || !states[q].is_free() {
                         continue;
                     }
-                    let Some(other) = distances.site(q) else { return };
+                    let Some(other) = distances.site(qx, qy) else { return };
                     let apart = [site[0] - other[0], site[1] - other[1]];
                     if apart[0] * apart[0] + apart[1] * apart[1] < apart_min {
                         continue;
                     }
                     // |site - m|² - |other - m|² with m between p and q: not negative where the place that is equally
                     // far lies on p's side.
-                    let (qx, qy) = if to == 1 { (ix + 1, iy) } else { (ix, iy + 1) };
                     let sum = [site[0] + other[0] - (ix + qx) as i32, site[1] + other[1] - (iy + qy) as i32];
                     let on_p = apart[0] * sum[0] + apart[1] * sum[1] >= 0;
                     let (cell, bit) = if on_p { (p, to) } else { (q, back) };
@@ -168,7 +170,6 @@ impl Ridge {
     /// Takes points away, those with the least room first, until lines are one cell wide: a point whose neighbours hang
     /// together without it, unless it is the end of a line.
     fn thin(&mut self) {
-        self.point_of_cell.fill(0);
         self.points.iter().for_each(|point| self.point_of_cell[point.cell] = 1);
         let mut order: Vec<(i32, usize)> = self.points.iter().map(|p| (p.clearance_squared, p.cell)).collect();
         order.sort_unstable();

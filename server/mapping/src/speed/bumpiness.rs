@@ -50,8 +50,8 @@ pub struct HeightMap {
     cells: Vec<Cell>,
     /// Cells that hold a point, in the order they were first met.
     met: Vec<u32>,
-    /// Lowest heights of the cells of each block that hold a point.
-    lowest_of_block: Vec<([i16; BLOCK * BLOCK], u8)>,
+    /// Lowest height of each cell, block by block; [`EMPTY`]'s in cells without a point.
+    lowest_of_block: Vec<[i16; BLOCK * BLOCK]>,
     /// By block: the lowest height about it that is not outvoted.
     floors: Vec<i16>,
     /// Mean height of each cell, metres; NaN without points.
@@ -81,6 +81,11 @@ impl HeightMap {
     /// By cell: NaN where nothing was seen, [`OBSTACLE_BUMPINESS`] for an obstacle.
     pub fn bumpiness_m(&self) -> &[f32] {
         &self.bumpiness_m
+    }
+
+    /// Cells of which something is known: that hold a point, ghosts left out.
+    pub fn known(&self) -> impl ExactSizeIterator<Item = usize> {
+        self.met.iter().map(|cell| *cell as usize)
     }
 
     /// Takes the points of a sweep, in place of those before.
@@ -145,27 +150,23 @@ impl HeightMap {
         let blocks_a_side = self.side.div_ceil(BLOCK);
         let blocks = blocks_a_side * blocks_a_side;
         self.lowest_of_block.clear();
-        self.lowest_of_block.resize(blocks, ([0; BLOCK * BLOCK], 0));
+        self.lowest_of_block.resize(blocks, [EMPTY.lowest; BLOCK * BLOCK]);
         for &cell in &self.met {
-            let block = self.block(cell as usize);
-            let (heights, cells) = &mut self.lowest_of_block[block];
-            heights[usize::from(*cells)] = self.cells[cell as usize].lowest;
-            *cells += 1;
+            let (block, cell) = (self.block(cell as usize), cell as usize);
+            let place = cell / self.side % BLOCK * BLOCK + cell % self.side % BLOCK;
+            self.lowest_of_block[block][place] = self.cells[cell].lowest;
         }
         self.floors.clear();
         self.floors.resize(blocks, i16::MIN);
-        let mut lowest = Vec::with_capacity(9 * BLOCK * BLOCK);
-        for block in (0..blocks).filter(|block| self.lowest_of_block[*block].1 > 0) {
-            lowest.clear();
+        let holds = |height: &i16| *height != EMPTY.lowest;
+        let is_met = |block: &usize| self.lowest_of_block[*block].iter().any(holds);
+        let mut heights = Vec::with_capacity(9 * BLOCK * BLOCK);
+        for block in (0..blocks).filter(is_met) {
+            heights.clear();
             for near in around(block % blocks_a_side, block / blocks_a_side, blocks_a_side) {
-                let (heights, cells) = &self.lowest_of_block[near];
-                lowest.extend_from_slice(&heights[..usize::from(*cells)]);
+                heights.extend_from_slice(&self.lowest_of_block[near]);
             }
-            let outvoted = (lowest.len() / OUTVOTED_SHARE).min(OUTVOTED_CELLS);
-            let voted = i32::from(*lowest.select_nth_unstable(outvoted).1);
-            let is_ghost = |height: i16| voted - i32::from(height) > over_floor / 2;
-            let floor = lowest.iter().filter(|height| !is_ghost(**height)).min();
-            self.floors[block] = *floor.expect("the voted height is none");
+            self.floors[block] = floor(&mut heights, over_floor / 2);
         }
     }
 
@@ -209,6 +210,23 @@ impl HeightMap {
         let variance = ((cell.squares as f64 / points - mean_mm * mean_mm) * 1e-6) as f32;
         bend.max((variance - explained).max(0.0).sqrt())
     }
+}
+
+/// The lowest of the heights that lies no more than `ghost_mm` under what a few of them outvote. One at least is no
+/// [`EMPTY`]'s.
+fn floor(heights: &mut Vec<i16>, ghost_mm: i32) -> i16 {
+    let lowest = heights.iter().copied().min().expect("a height");
+    let held = heights.iter().filter(|height| **height != EMPTY.lowest).count();
+    let outvoted = (held / OUTVOTED_SHARE).min(OUTVOTED_CELLS);
+    // Mostly more of them lie about the lowest than could be outvoted.
+    let about = (i32::from(lowest) + ghost_mm).min(i32::from(EMPTY.lowest) - 1) as i16;
+    if heights.iter().filter(|height| **height <= about).count() > outvoted {
+        return lowest;
+    }
+    heights.retain(|height| *height != EMPTY.lowest);
+    let voted = i32::from(*heights.select_nth_unstable(outvoted).1);
+    let floor = heights.iter().filter(|height| voted - i32::from(**height) <= ghost_mm).min();
+    *floor.expect("the voted height is none")
 }
 
 /// Indices of the 3 × 3 cells or blocks around (ix, iy), as many as there are.

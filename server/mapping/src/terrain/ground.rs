@@ -16,7 +16,9 @@ pub struct Ground {
     /// Forest of regions; node 0 is the ground under the vehicle, node `1 + i` region `i`.
     parent: Vec<u32>,
     joined: Vec<bool>,
-    filled: Vec<bool>,
+    /// Cells that are filled, each once, and by cell whether it is.
+    filled: Vec<u32>,
+    is_filled: Vec<bool>,
     bridged: Vec<bool>,
     seen_cells: Vec<u32>,
 }
@@ -129,11 +131,16 @@ impl Ground {
         let (joined, of_cell) = (&self.joined, regions.of_cell());
         let is_ground = |region: u32| region >= FIRST_FLAT && joined[(region - FIRST_FLAT) as usize];
         self.filled.clear();
-        self.filled.resize(seen.len(), false);
-        let (filled, span) = (&mut self.filled, (config.inference_m_max / cells.cell_m()).round() as usize);
+        self.is_filled.clear();
+        self.is_filled.resize(seen.len(), false);
+        let (filled, is_filled) = (&mut self.filled, &mut self.is_filled);
+        let span = (config.inference_m_max / cells.cell_m()).round() as usize;
         view.for_each_hole(span, is_ground, |hole| {
             for cell in hole.within() {
-                filled[cell] |= seen[cell] || is_ground(of_cell[cell]);
+                if !is_filled[cell] && (seen[cell] || is_ground(of_cell[cell])) {
+                    is_filled[cell] = true;
+                    filled.push(cell as u32);
+                }
             }
         });
     }
@@ -143,8 +150,8 @@ impl Ground {
         &self.joined
     }
 
-    /// By cell: whether it lies in a hole of seen ground: unseen there, or seen with too few points to be judged alone.
-    pub fn filled(&self) -> &[bool] {
+    /// Cells that lie in a hole of seen ground: unseen there, or seen with too few points to be judged alone.
+    pub fn filled(&self) -> &[u32] {
         &self.filled
     }
 

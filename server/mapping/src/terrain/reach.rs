@@ -28,16 +28,19 @@ pub struct Reach {
 }
 
 impl Reach {
-    /// Floods a grid of `width` × `width` cells, given row by row, with a disc of `radius` cells about its middle one.
-    pub fn find(&mut self, width: usize, radius: usize, cells: impl Iterator<Item = Passage>) {
+    /// Floods a grid of `width` × `width` cells, `cell(ix, iy)` telling what each is, with a disc of `radius` cells about its
+    /// middle one.
+    pub fn find(&mut self, width: usize, radius: usize, cell: impl Fn(usize, usize) -> Passage) {
         for bits in [&mut self.open, &mut self.closed, &mut self.widened, &mut self.reached] {
             bits.clear(width);
         }
-        for (cell, passage) in cells.enumerate() {
-            match passage {
-                Passage::None => {}
-                Passage::Open => self.open.set(cell % width, cell / width),
-                Passage::Closed => self.closed.set(cell % width, cell / width),
+        let stride = self.open.stride;
+        for (at, (open, closed)) in self.open.words.iter_mut().zip(&mut self.closed.words).enumerate() {
+            let (first, iy) = (at % stride * 64, at / stride);
+            for bit in 0..(width - first).min(64) {
+                let passage = cell(first + bit, iy);
+                *open |= u64::from(passage == Passage::Open) << bit;
+                *closed |= u64::from(passage == Passage::Closed) << bit;
             }
         }
         self.widened.widen(&self.closed, radius);
@@ -107,6 +110,7 @@ impl Bits {
     /// Spreads over sides of cells wherever `open` allows.
     fn flood(&mut self, open: &Self) {
         let rows = open.words.len() / open.stride;
+        self.words.iter_mut().zip(&open.words).for_each(|(word, open)| *word = fill(*word, *open));
         loop {
             let mut grown = false;
             // Down and up; a flood that turns back takes another round.
@@ -119,28 +123,40 @@ impl Bits {
         }
     }
 
-    /// From one row to the next, and along it; whether it grew.
+    /// From one row to the next, and along it; whether it grew. A word holds all that its own bits spread to, before and
+    /// after, so one that gains nothing is left alone.
     fn spread(&mut self, open: &Self, iy: usize, from: usize) -> bool {
         let mut grown = false;
-        let stride = self.stride;
+        let (row, from) = (iy * self.stride, from * self.stride);
         let mut carry = 0;
-        for word in 0..stride {
-            let at = iy * stride + word;
-            let start = self.words[at] | (self.words[from * stride + word] | carry) & open.words[at];
-            let filled = fill_up(start, open.words[at]);
-            grown |= filled != self.words[at];
-            self.words[at] = filled;
-            carry = filled >> 63;
+        for word in 0..self.stride {
+            grown |= self.gain(open, row + word, self.words[from + word] | carry);
+            carry = self.words[row + word] >> 63;
         }
         carry = 0;
-        for at in (iy * stride..(iy + 1) * stride).rev() {
-            let start = self.words[at] | carry & open.words[at];
-            let filled = fill_up(start.reverse_bits(), open.words[at].reverse_bits()).reverse_bits();
-            grown |= filled != self.words[at];
-            self.words[at] = filled;
-            carry = filled << 63;
+        for word in (0..self.stride).rev() {
+            grown |= self.gain(open, row + word, carry);
+            carry = self.words[row + word] << 63;
         }
         grown
+    }
+
+    /// Adds bits to a word, and what they spread to; whether it grew.
+    fn gain(&mut self, open: &Self, at: usize, bits: u64) -> bool {
+        let bits = self.words[at] | bits & open.words[at];
+        let grown = bits != self.words[at];
+        if grown {
+            self.words[at] = fill(bits, open.words[at]);
+        }
+        grown
+    }
+}
+
+/// Spreads set bits both ways as long as `open` has them.
+fn fill(bits: u64, open: u64) -> u64 {
+    match bits {
+        0 => 0,
+        _ => fill_up(bits, open) | fill_up(bits.reverse_bits(), open.reverse_bits()).reverse_bits(),
     }
 }
 
@@ -175,7 +191,7 @@ mod tests {
             _ => Passage::None,
         };
         let mut reach = Reach::default();
-        reach.find(picture.len(), radius, picture.iter().flat_map(|row| row.chars().map(passage)));
+        reach.find(picture.len(), radius, |ix, iy| passage(picture[iy].as_bytes()[ix].into()));
         let drawn = |(iy, row): (usize, &&str)| {
             let cell = |(ix, c): (usize, char)| if c == '.' && reach.reached(ix, iy) { 'o' } else { c };
             row.chars().enumerate().map(cell).collect()
@@ -218,7 +234,7 @@ mod tests {
             if wall(iy) && ix != gap(iy) { Passage::Closed } else { Passage::Open }
         };
         let mut reach = Reach::default();
-        reach.find(width, 0, (0..width * width).map(passage));
+        reach.find(width, 0, |ix, iy| passage(iy * width + ix));
         assert!(
             (0..width * width)
                 .all(|cell| reach.reached(cell % width, cell / width) == (passage(cell) == Passage::Open))

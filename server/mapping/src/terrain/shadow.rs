@@ -53,6 +53,11 @@ impl Shadow {
         }
     }
 
+    /// Distance of a cell's middle.
+    pub fn distance_m(&self, cell: usize) -> f32 {
+        self.place_of_cell[cell].1
+    }
+
     /// Whether the ground in a cell is hidden.
     pub fn hides(&self, cell: usize) -> bool {
         let (azimuth, distance_m) = self.place_of_cell[cell];
