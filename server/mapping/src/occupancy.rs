@@ -105,7 +105,9 @@ impl LayerMaker for Occupancy {
             return;
         }
         self.speed_mps = rays.speed_mps;
-        self.window.follow(rays.map_from_ego.as_ref());
+        if !self.window.follow(rays.map_from_ego.as_ref()) {
+            self.fan.forget();
+        }
         self.fan.take(rays, &self.config, &mut self.window);
     }
 
@@ -116,20 +118,17 @@ impl LayerMaker for Occupancy {
         let (Cells::U8(class), Cells::U8(hits)) = (&mut class.cells, &mut hits.cells) else {
             unreachable!("layer() gives u8 and u8")
         };
+        let cells = self.window.side() * self.window.side();
         class.clear();
-        hits.clear();
-        let (mut clear, mut occupied) = (0u32, 0u32);
-        self.window.judge(needed, self.config.hold_maps, |cell| {
-            clear += u32::from(cell.state == CLEAR);
-            occupied += u32::from(cell.state == OCCUPIED);
-            class.push(cell.state);
-            hits.push(cell.hits);
-        });
-        let share = |part: u32| f64::from(part) / (class.len() as f64);
+        class.resize(cells, 0);
+        hits.resize(cells, 0);
+        let any = self.fan.tell(&self.config, &self.window, class);
+        self.window.judge([needed, self.config.hold_maps], any, class, hits);
+        let share = |state: u8| class.iter().filter(|class| **class == state).count() as f64 / cells as f64;
         layer.figures.clear();
         layer.figures.extend([
-            ("clear_share", share(clear)),
-            ("occupied_share", share(occupied)),
+            ("clear_share", share(CLEAR)),
+            ("occupied_share", share(OCCUPIED)),
             ("hits_needed", f64::from(needed)),
             ("world_aligned", f64::from(u8::from(self.window.anchored()))),
         ]);

@@ -59,7 +59,7 @@ fn each_arrow_of_a_cells_life_goes_where_the_table_says() {
         (CLEAR, "u o u h c u x"),
         (OCCUPIED, "U O U H u x x"),
         (OCCLUDED, "u o u h c u x"),
-        (OUT_OF_RANGE, "o o u h c u x"),
+        (OUT_OF_RANGE, "u o u h c u x"),
     ];
     let state_of = |letter: char| match letter.to_ascii_lowercase() {
         'u' => UNKNOWN,

@@ -1,16 +1,23 @@
-//! The rays of one scan about their sensor: in each direction, how far the view goes and where it proves the ground free.
+//! The rays of each sensor's newest scan about that sensor: in each direction, how far the view goes and where it proves the
+//! ground free.
 //!
-//! In: [`Rays`], ego frame, metres. Out: hits counted in the [`Window`], and one trace for each direction that has rays.
+//! In: [`Rays`], ego frame, metres. Out: hits counted in the [`Window`] as scans come, and, when the map is made, what each
+//! cell is told by one trace for each direction that has rays.
 //!
 //! A ray proves a cell free where it passes low over it: at the height of a bumper, `clear_height_m_min` to `_max`. From the
-//! roof over a car it proves nothing of the car's cells, and neither does it under the car's body. So every direction (a quarter of a degree) keeps a row of bits, one for each step of a
-//! cell's side outward, of where some ray of it is low; rays only set bits, and their order says nothing.
+//! roof over a car it proves nothing of the car's cells, and neither does it under the car's body. So every direction (a
+//! quarter of a degree) keeps a row of bits, one for each step of a cell's side outward, of where some ray of it is low; rays
+//! only set bits, and their order says nothing.
 //!
-//! A trace ends at the nearest return from above the ground, of its own direction or of the two to either side: rays of one direction
-//! differ by part of its width, some get lost, and the trace must not run along a thing just inside its edge. Behind it the
-//! cells are hidden, but for those where a ray comes down on the ground: there from where it is under the vehicle's
-//! clearance, if nothing stands on its way from there to its end, so that it has passed beneath nothing.
+//! A trace ends at the nearest return from above the ground, of its own direction or of the two to either side: rays of one
+//! direction differ by part of its width, some get lost, and the trace must not run along a thing just inside its edge.
+//! Behind it the cells are hidden, but for those where a ray comes down on the ground: there from where it is under the
+//! vehicle's clearance, if nothing stands on its way from there to its end, so that it has passed beneath nothing.
+//!
+//! Only a sensor's newest scan says what is clear and what is hidden now. So lines are drawn once a map, however many scans
+//! came since the last one.
 
+use super::states::{HIDDEN, LOOKED_AT, THROUGH};
 use super::window::Window;
 use crate::config::OccupancyConfig;
 use crate::map::Rays;
@@ -28,6 +35,10 @@ const BELOW_M: f32 = 0.3;
 const GRADE_MAX: f32 = 0.1;
 /// Nearest hit of a direction without.
 const NONE: u16 = u16::MAX;
+/// Points are taken in chunks of this many, so that what is worked out of them stays in the first cache level.
+const CHUNK: usize = 256;
+/// Fraction bits of positions on a trace. So many, because a trace must fall on a border of cells never, not seldom.
+const FRACTION: u32 = 32;
 
 /// A return from the ground, and steps of its ray: where it comes under the clearance, where it is too low to prove
 /// anything, and where it ends.
@@ -38,14 +49,46 @@ struct Ground {
     end: u16,
 }
 
-/// Buffers reused from scan to scan.
+/// What follows from a point by arithmetic alone. Distances in steps from the sensor.
+#[derive(Clone, Copy, Default)]
+struct Ray {
+    direction: u32,
+    range: f32,
+    /// Where its ray is at the height of a bumper.
+    first: i32,
+    end: i32,
+    /// Where it comes under the clearance, and where it is too low to prove anything.
+    under: i32,
+    low: i32,
+}
+
+/// All the sensors' newest scans.
 pub struct Fan {
+    compass: Compass,
+    views: Vec<View>,
+    /// What one direction's trace tells, step by step; reused.
+    telling: Vec<u8>,
+}
+
+/// Directions about a sensor.
+struct Compass {
     directions: Quadrants,
     /// Each direction's middle, and the middles of its halves: far out a direction is wider than the spacing of lines that
     /// leave no cell between them.
     lines: Vec<[[f64; 2]; 3]>,
     steps: usize,
     words: usize,
+}
+
+/// What one sensor's newest scan tells of the directions about it.
+struct View {
+    sensor: u16,
+    /// Whether the scan came since the last map.
+    fresh: bool,
+    /// The sensor's place, cells of the world.
+    at: [f64; 2],
+    /// Heading of the ego frame in the window's axes, rad.
+    yaw_rad: f64,
     present: Vec<bool>,
     nearest_hit: Vec<u16>,
     /// One bit a step; `words` words a direction.
@@ -56,17 +99,46 @@ pub struct Fan {
     ground: Vec<Ground>,
 }
 
-/// The part of a ray, by distance over the ground, between two heights.
-#[inline(always)]
-fn between_heights(origin_z: f32, climb: f32, low: f32, high: f32) -> (f32, f32) {
-    // Level rays give infinities of the right signs; `max` and `min` pass over NaN.
-    let (a, b) = ((low - origin_z) / climb, (high - origin_z) / climb);
-    (a.min(b).max(0.0), a.max(b))
-}
-
 impl Fan {
     /// For a window whose far corner is `reach_m` from a sensor in its middle.
     pub fn new(reach_m: f32, cell_m: f32) -> Self {
+        let compass = Compass::new(reach_m, cell_m);
+        Self { telling: vec![0; compass.steps], compass, views: Vec::new() }
+    }
+
+    /// Takes one scan in place of its sensor's last, and its hits into the window, which follows the vehicle already.
+    pub fn take(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, window: &mut Window) {
+        let known = self.views.iter().position(|view| view.sensor == rays.sensor);
+        let index = known.unwrap_or_else(|| {
+            self.views.push(View::new(rays.sensor, &self.compass));
+            self.views.len() - 1
+        });
+        let view = &mut self.views[index];
+        view.clear(&self.compass);
+        view.stand(rays, config, window);
+        view.take_returns(rays, config, &self.compass, window);
+        view.take_no_returns(rays, config, &self.compass);
+    }
+
+    /// Forgets all scans.
+    pub fn forget(&mut self) {
+        self.views.iter_mut().for_each(|view| view.fresh = false);
+    }
+
+    /// Adds what the scans since the last map tell to each cell of the window, row by row; whether there were any.
+    pub fn tell(&mut self, config: &OccupancyConfig, window: &Window, told: &mut [u8]) -> bool {
+        let mut any = false;
+        for view in self.views.iter_mut().filter(|view| view.fresh) {
+            view.prove_ground(&self.compass);
+            view.trace(config, &self.compass, window, &mut self.telling, told);
+            (view.fresh, any) = (false, true);
+        }
+        any
+    }
+}
+
+impl Compass {
+    fn new(reach_m: f32, cell_m: f32) -> Self {
         let steps = (reach_m / cell_m).ceil() as usize + 1;
         let words = steps.div_ceil(64);
         // Turned by whole quarters, so that a turned world gives a turned map to the bit.
@@ -76,90 +148,107 @@ impl Fan {
             [[x, y], [-y, x], [-x, -y], [y, -x]][direction / (DIRECTIONS / 4)]
         };
         let lines = (0..DIRECTIONS).map(|direction| [0.5, 0.25, 0.75].map(|within| line(direction, within)));
+        let directions = Quadrants::new(DIRECTIONS as u16);
+        Self { directions, lines: lines.collect(), steps: words * 64, words }
+    }
+
+    fn row(&self, direction: usize) -> std::ops::Range<usize> {
+        direction * self.words..(direction + 1) * self.words
+    }
+}
+
+impl View {
+    fn new(sensor: u16, compass: &Compass) -> Self {
+        let bits = || vec![0; DIRECTIONS * compass.words];
         Self {
-            directions: Quadrants::new(DIRECTIONS as u16),
-            lines: lines.collect(),
-            steps: words * 64,
-            words,
+            sensor,
+            fresh: false,
+            at: [0.0; 2],
+            yaw_rad: 0.0,
             present: vec![false; DIRECTIONS],
             nearest_hit: vec![NONE; DIRECTIONS],
-            low: vec![0; DIRECTIONS * words],
-            hits: vec![0; DIRECTIONS * words],
-            proved: vec![0; DIRECTIONS * words],
+            low: bits(),
+            hits: bits(),
+            proved: bits(),
             ground: Vec::new(),
         }
     }
 
-    /// Takes one scan into the window, which follows the vehicle already.
-    pub fn take(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, window: &mut Window) {
-        self.take_returns(rays, config, window);
-        self.take_no_returns(rays, config);
-        self.prove_ground();
-        self.trace(rays, config, window);
-        self.clear();
+    fn clear(&mut self, compass: &Compass) {
+        for direction in (0..DIRECTIONS).filter(|direction| self.present[*direction]) {
+            for bits in [&mut self.low, &mut self.hits, &mut self.proved] {
+                bits[compass.row(direction)].fill(0);
+            }
+        }
+        self.present.fill(false);
+        self.nearest_hit.fill(NONE);
+        self.ground.clear();
     }
 
-    fn take_returns(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, window: &mut Window) {
-        let [ox, oy, oz] = rays.origin_m;
+    /// Where the sensor is in the world, as the window knows it now.
+    fn stand(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, window: &Window) {
+        let (place, corner) = (window.place(), window.corner());
+        let (sin, cos) = place.yaw_rad.sin_cos();
+        let [x, y] = [rays.origin_m[0], rays.origin_m[1]].map(|metres| f64::from(metres / config.cell_m));
+        let from = [place.cells[0] + x * cos - y * sin, place.cells[1] + x * sin + y * cos];
+        self.at = [0, 1].map(|i| corner[i] as f64 + from[i]);
+        (self.yaw_rad, self.fresh) = (place.yaw_rad, true);
+    }
+
+    fn take_returns(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, compass: &Compass, window: &mut Window) {
         let place = window.place();
         let (sin, cos) = place.yaw_rad.sin_cos();
         let per_m = 1.0 / config.cell_m;
         let (turn_x, turn_y) = (cos as f32 * per_m, sin as f32 * per_m);
         let [px, py] = place.cells.map(|cells| cells as f32);
+        let range_max = config.range_m_max * per_m;
         let sweep = rays.returns;
-        for ((&x, &y), &z) in sweep.x.iter().zip(&sweep.y).zip(&sweep.z) {
-            let (dx, dy) = (x - ox, y - oy);
-            let range = (dx * dx + dy * dy).sqrt();
-            let direction = self.directions.column(dx, dy) as usize;
-            self.present[direction] = true;
-            if z < -BELOW_M - GRADE_MAX * range {
-                continue;
+        let mut chunk = [Ray::default(); CHUNK];
+        let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
+        for ((xs, ys), zs) in chunks {
+            // Arithmetic alone first, so that it runs four points at a time; the rows after.
+            for (((ray, &x), &y), &z) in chunk.iter_mut().zip(xs).zip(ys).zip(zs) {
+                *ray = Ray::of([x, y, z], rays.origin_m, config, compass);
             }
-            // The ground of a ray that comes back from the ground leads there, up or down, in a straight line.
-            let climb = if z < config.clear_height_m_min { -oz } else { z - oz } / range;
-            let reliable = range <= config.range_m_max;
-            let (from, to) = between_heights(oz, climb, config.clear_height_m_min, config.clear_height_m_max);
-            self.set_low(direction, from * per_m, to.min(range).min(config.range_m_max) * per_m);
-            if !reliable || z >= config.overhang_m {
-                continue;
-            }
-            let step = (range * per_m) as usize;
-            if z >= config.clearance_m {
-                window.hit(px + x * turn_x - y * turn_y, py + x * turn_y + y * turn_x);
-            }
-            if z >= config.clear_height_m_min {
-                self.nearest_hit[direction] = self.nearest_hit[direction].min(step.min(NONE as usize) as u16);
-                if step < self.steps {
-                    self.hits[direction * self.words + step / 64] |= 1 << (step % 64);
+            for (((ray, &x), &y), &z) in chunk.iter().zip(xs).zip(ys).zip(zs) {
+                let direction = ray.direction as usize;
+                self.present[direction] = true;
+                if z < -BELOW_M - GRADE_MAX * config.cell_m * ray.range {
+                    continue;
                 }
-            } else if step < self.steps {
-                let (from, to) = between_heights(oz, climb, config.clear_height_m_min, config.clearance_m);
-                let [from, low] = [from, to].map(|metres| (metres.min(range) * per_m + 0.5) as u16);
-                self.ground.push(Ground { direction: direction as u16, from, low, end: step as u16 + 1 });
+                let row = compass.row(direction);
+                set_bits(&mut self.low[row.clone()], ray.first as usize, ray.end as usize);
+                if !(ray.range <= range_max) || z >= config.overhang_m {
+                    continue;
+                }
+                let step = ray.range as usize;
+                if z >= config.clear_height_m_min {
+                    if z >= config.clearance_m {
+                        window.hit(px + x * turn_x - y * turn_y, py + x * turn_y + y * turn_x);
+                    }
+                    self.nearest_hit[direction] = self.nearest_hit[direction].min(step.min(NONE as usize) as u16);
+                    if step < compass.steps {
+                        self.hits[row.start + step / 64] |= 1 << (step % 64);
+                    }
+                } else if step < compass.steps {
+                    let [direction, from, low] = [ray.direction as i32, ray.under, ray.low].map(|value| value as u16);
+                    self.ground.push(Ground { direction, from, low, end: step as u16 + 1 });
+                }
             }
         }
     }
 
-    fn take_no_returns(&mut self, rays: &Rays<'_>, config: &OccupancyConfig) {
-        let per_m = 1.0 / config.cell_m;
-        let farthest = config.no_return_m.min(config.range_m_max);
+    fn take_no_returns(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, compass: &Compass) {
+        let farthest = config.no_return_m.min(config.range_m_max) / config.cell_m;
         for &[dx, dy, dz] in rays.no_returns {
-            let direction = self.directions.column(dx, dy) as usize;
+            let direction = compass.directions.column(dx, dy) as usize;
             self.present[direction] = true;
-            let climb = dz / (dx * dx + dy * dy).sqrt();
-            let (low, high) = (config.clear_height_m_min, config.clear_height_m_max);
-            let (from, to) = between_heights(rays.origin_m[2], climb, low, high);
-            self.set_low(direction, from * per_m, to.min(farthest) * per_m);
+            let steps_a_m = (dx * dx + dy * dy).sqrt() / dz / config.cell_m;
+            let height = |height_m: f32| (height_m - rays.origin_m[2]) * steps_a_m;
+            let (from, to) = between(height(config.clear_height_m_min), height(config.clear_height_m_max));
+            let (first, end) = (middle(from, compass.steps), middle(to.min(farthest), compass.steps));
+            set_bits(&mut self.low[compass.row(direction)], first as usize, end as usize);
         }
-    }
-
-    /// Sets the bits of the steps whose middles lie between two distances, in cells.
-    #[inline(always)]
-    fn set_low(&mut self, direction: usize, from: f32, to: f32) {
-        // NaN and what lies behind the sensor become 0, what is beyond the row its end.
-        let (first, end) = ((from + 0.5) as usize, (to + 0.5) as usize);
-        let row = &mut self.low[direction * self.words..][..self.words];
-        set_bits(row, first, end.min(self.steps));
     }
 
     /// Nearest hit of a direction and those beside it.
@@ -169,43 +258,33 @@ impl Fan {
     }
 
     /// What returns from the ground prove behind the nearest hit.
-    fn prove_ground(&mut self) {
+    fn prove_ground(&mut self, compass: &Compass) {
+        let nearest: Vec<usize> = (0..DIRECTIONS).map(|direction| self.nearest(direction)).collect();
         for &Ground { direction, from, low, end } in &self.ground {
             let (direction, from, low, end) =
                 (usize::from(direction), usize::from(from), usize::from(low), usize::from(end));
-            if low <= self.nearest(direction) {
+            if low <= nearest[direction] {
                 continue;
             }
-            let mut rows = about(direction).map(|direction| &self.hits[direction * self.words..][..self.words]);
+            let mut rows = about(direction).map(|direction| &self.hits[compass.row(direction)]);
             if !rows.any(|row| any_bit(row, from, end)) {
-                set_bits(&mut self.proved[direction * self.words..][..self.words], from, low);
+                set_bits(&mut self.proved[compass.row(direction)], from, low);
             }
         }
     }
 
-    fn trace(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, window: &mut Window) {
-        let place = window.place();
-        let (sin, cos) = place.yaw_rad.sin_cos();
-        let [ox, oy] = [rays.origin_m[0], rays.origin_m[1]].map(|metres| f64::from(metres / config.cell_m));
-        let from = [place.cells[0] + ox * cos - oy * sin, place.cells[1] + ox * sin + oy * cos];
-        let reach = ((config.range_m_max / config.cell_m) as usize).min(self.steps);
-        let mut free = vec![0; self.words];
-        window.begin_scan(rays.sensor);
-        // What is hidden first: a cell that one direction sees and its neighbour does not has been seen.
-        for hiding in [true, false] {
-            for direction in (0..DIRECTIONS).filter(|direction| self.looks(*direction)) {
-                let nearest = self.nearest(direction);
-                let seen = if hiding { 0 } else { self.write_free(direction, nearest, &mut free) };
-                for (line, &[x, y]) in self.lines[direction].iter().enumerate() {
-                    let (trace, steps) = window.trace(from, [x * cos - y * sin, x * sin + y * cos]);
-                    let steps = if line == 0 { 0..steps.min(reach).min(FORK) } else { FORK..steps.min(reach) };
-                    if hiding {
-                        window.hide(&trace, steps.start.max(nearest)..steps.end);
-                    } else {
-                        let clear = |step: usize| free[step / 64] >> (step % 64) & 1 == 1;
-                        window.look(&trace, steps.start..steps.end.min(seen), clear);
-                    }
-                }
+    fn trace(&self, config: &OccupancyConfig, compass: &Compass, window: &Window, telling: &mut [u8], told: &mut [u8]) {
+        let corner = window.corner();
+        let from = [0, 1].map(|i| self.at[i] - corner[i] as f64);
+        let (sin, cos) = self.yaw_rad.sin_cos();
+        let reach = ((config.range_m_max / config.cell_m) as usize).min(compass.steps);
+        for direction in (0..DIRECTIONS).filter(|direction| self.looks(*direction)) {
+            self.write_telling(direction, compass, telling);
+            for (line, &[x, y]) in compass.lines[direction].iter().enumerate() {
+                let way = [x * cos - y * sin, x * sin + y * cos];
+                let steps = steps_within(window.side(), from, way).min(reach);
+                let steps = if line == 0 { 0..steps.min(FORK) } else { FORK.min(steps)..steps };
+                tell_along(from, way, steps.start, &telling[steps], window.side(), told);
             }
         }
     }
@@ -215,36 +294,105 @@ impl Fan {
         self.present[direction] || self.present[turned(direction, -1)] && self.present[turned(direction, 1)]
     }
 
-    /// Writes one bit for each step a direction proves free; gives the first step from which on it sees nothing.
-    fn write_free(&self, direction: usize, nearest: usize, free: &mut [u64]) -> usize {
-        let [right, left] = [-1, 1].map(|beside| turned(direction, beside) * self.words);
-        let own = direction * self.words;
-        let mut seen = nearest;
-        for (word, free) in free.iter_mut().enumerate() {
+    /// Writes what a direction tells of each of its steps.
+    fn write_telling(&self, direction: usize, compass: &Compass, telling: &mut [u8]) {
+        let nearest = self.nearest(direction);
+        let (seen, hidden) = telling.split_at_mut(nearest.min(compass.steps));
+        seen.fill(LOOKED_AT);
+        hidden.fill(LOOKED_AT | HIDDEN);
+        let [own, right, left] = [0, -1, 1].map(|beside| compass.row(turned(direction, beside)).start);
+        for (word, telling) in telling.chunks_exact_mut(64).enumerate() {
             // An empty direction sees what both beside it see.
             let (low, proved) = match self.present[direction] {
                 true => (self.low[own + word], self.proved[own + word]),
                 false => (self.low[right + word] & self.low[left + word], 0),
             };
             let before = bits_of_word(word, 0, nearest);
-            *free = low & before | proved & !before;
-            if proved != 0 {
-                seen = seen.max((word + 1) * 64 - proved.leading_zeros() as usize);
+            let mut free = low & before | proved & !before;
+            while free != 0 {
+                let first = free.trailing_zeros() as usize;
+                let end = first + (!(free >> first)).trailing_zeros() as usize;
+                telling[first..end].fill(LOOKED_AT | THROUGH);
+                free &= !bits_of_word(0, first, end);
             }
         }
-        seen
     }
+}
 
-    fn clear(&mut self) {
-        for direction in (0..DIRECTIONS).filter(|direction| self.present[*direction]) {
-            let row = direction * self.words..(direction + 1) * self.words;
-            for bits in [&mut self.low, &mut self.hits, &mut self.proved] {
-                bits[row.clone()].fill(0);
-            }
+impl Ray {
+    #[inline(always)]
+    fn of([x, y, z]: [f32; 3], [ox, oy, oz]: [f32; 3], config: &OccupancyConfig, compass: &Compass) -> Self {
+        let (dx, dy) = (x - ox, y - oy);
+        let range_m = (dx * dx + dy * dy).sqrt();
+        let range = range_m / config.cell_m;
+        // The ground of a ray that comes back from the ground leads there, up or down, in a straight line.
+        let rise = if z < config.clear_height_m_min { -oz } else { z - oz };
+        let steps_a_m = range / rise;
+        let height = |height_m: f32| (height_m - oz) * steps_a_m;
+        let bumper = height(config.clear_height_m_min);
+        let (from, to) = between(bumper, height(config.clear_height_m_max));
+        let (under, low) = between(bumper, height(config.clearance_m));
+        let reliable = range.min(config.range_m_max / config.cell_m);
+        Self {
+            direction: compass.directions.column(dx, dy),
+            range,
+            first: middle(from, compass.steps),
+            end: middle(to.min(reliable), compass.steps),
+            under: middle(under.min(range), compass.steps),
+            low: middle(low.min(range), compass.steps),
         }
-        self.present.fill(false);
-        self.nearest_hit.fill(NONE);
-        self.ground.clear();
+    }
+}
+
+/// The part of a ray between two heights, from where it passes them. What lies behind the sensor begins at 0.
+#[inline(always)]
+fn between(a: f32, b: f32) -> (f32, f32) {
+    // Level rays give infinities of the right signs; `max` and `min` pass over NaN.
+    (a.min(b).max(0.0), a.max(b))
+}
+
+/// The first step whose middle lies beyond a distance.
+#[inline(always)]
+fn middle(steps: f32, most: usize) -> i32 {
+    // NaN and what lies behind the sensor become 0.
+    ((steps + 0.5).max(0.0) as i32).min(most as i32)
+}
+
+/// How many steps of a cell's side along `way` (length 1) have their middles in a window; none from a place outside.
+fn steps_within(side: usize, from: [f64; 2], way: [f64; 2]) -> usize {
+    let side = side as f64;
+    if !from.iter().all(|at| (0.0..side).contains(at)) {
+        return 0;
+    }
+    let to_border = |i: usize| {
+        let (at, d) = (from[i], way[i]);
+        if d > 0.0 {
+            (side - at) / d
+        } else if d < 0.0 {
+            at / -d
+        } else {
+            f64::INFINITY
+        }
+    };
+    (to_border(0).min(to_border(1)) - 0.5).ceil().max(0.0) as usize
+}
+
+/// Adds what a trace tells, from its step `first` on, to the cells in the middle of its steps.
+#[inline(always)]
+fn tell_along(from: [f64; 2], way: [f64; 2], first: usize, telling: &[u8], side: usize, told: &mut [u8]) {
+    if telling.is_empty() {
+        // From a place outside the window, which may be any.
+        return;
+    }
+    let fixed = |cells: f64| (cells * (1_i64 << FRACTION) as f64).round() as i64;
+    let step = way.map(fixed);
+    let [mut x, mut y] = [0, 1].map(|i| fixed(from[i]) + step[i] / 2 + step[i] * first as i64);
+    for telling in telling {
+        // The last step may round over the border.
+        if let Some(told) = told.get_mut((y >> FRACTION) as usize * side + (x >> FRACTION) as usize) {
+            *told |= telling;
+        }
+        (x, y) = (x + step[0], y + step[1]);
     }
 }
 

@@ -15,6 +15,13 @@ pub const OUT_OF_RANGE: u8 = 4;
 /// Names of the states, by value.
 pub const LEGEND: &[&str] = &["unknown", "clear", "occupied", "occluded", "out_of_range"];
 
+/// Told of a cell: a sensor looks there, over it or through it.
+pub const LOOKED_AT: u8 = 1;
+/// Told of a cell: low rays of a sensor's newest scan go through it.
+pub const THROUGH: u8 = 2;
+/// Told of a cell: something hides it from a sensor.
+pub const HIDDEN: u8 = 4;
+
 /// What the rays since the last map tell of one cell; the stronger comes later and wins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Evidence {
@@ -36,6 +43,17 @@ pub enum Evidence {
     Hits,
 }
 
+/// The strongest of what was told of a cell; `any`: whether any sensor sent anything.
+pub fn evidence(told: u8, any: bool) -> Evidence {
+    match told {
+        told if told & THROUGH != 0 => Evidence::Through,
+        told if told & HIDDEN != 0 => Evidence::Hidden,
+        told if told & LOOKED_AT != 0 => Evidence::Overhead,
+        _ if any => Evidence::Nothing,
+        _ => Evidence::Silence,
+    }
+}
+
 /// What follows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next {
@@ -47,19 +65,16 @@ pub enum Next {
 
 use Next::{Go, Hold};
 
-/// `TRANSITIONS[state][evidence]`.
+/// `TRANSITIONS[whether the cell is occupied][evidence]`.
 ///
 /// Figure 4 says that a cell is first unobserved, and then occupied or occluded as sensors look; here every arrow is
-/// named. A clear cell loses that name the moment nobody looks at it; an occupied one keeps its name for a few maps,
-/// because what hides it, or a sensor's pause, does not make it go away.
+/// named. A cell loses its name the moment nobody confirms it; only an occupied one keeps its name for a few maps, because
+/// what hides it, or a sensor's pause, does not make it go away.
 #[rustfmt::skip]
-pub const TRANSITIONS: [[Next; 8]; 5] = [
-    // Silence            Nothing             Overhead       Hidden          Through    ThroughDoubted FewHits      Hits
-    [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // unknown
-    [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // clear
-    [Hold(UNKNOWN),      Hold(OUT_OF_RANGE), Hold(UNKNOWN), Hold(OCCLUDED), Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // occupied
-    [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // occluded
-    [Go(OUT_OF_RANGE),   Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // out_of_range
+pub const TRANSITIONS: [[Next; 8]; 2] = [
+    // Silence       Nothing             Overhead       Hidden          Through    ThroughDoubted FewHits      Hits
+    [Go(UNKNOWN),   Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // any other
+    [Hold(UNKNOWN), Hold(OUT_OF_RANGE), Hold(UNKNOWN), Hold(OCCLUDED), Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // occupied
 ];
 
 /// What is kept of a cell from map to map.
@@ -91,7 +106,7 @@ impl Cell {
         }
         let age = if evidence as u8 >= Evidence::Through as u8 { 0 } else { self.age.saturating_add(1) };
         let over = age > hold_maps;
-        let state = match TRANSITIONS[usize::from(self.state)][evidence as usize] {
+        let state = match TRANSITIONS[usize::from(self.state == OCCUPIED)][evidence as usize] {
             Go(state) => state,
             Hold(later) => {
                 if over {
