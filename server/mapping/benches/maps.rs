@@ -108,7 +108,7 @@ fn sweep_of_a_moving_revolution(bencher: Bencher) {
     let (mut sweep, mut moved) = (Sweep::default(), Moved::default());
     let slots = revolution.echoes[0].range_m.len();
     bencher.counter(ItemsCount::new(slots)).bench_local(|| {
-        motion.through(&revolution, revolution.end_ns, &mut moved);
+        motion.through(&revolution, &mut moved);
         sweep.take_moving_revolution(&revolution, &mount, &moved.end_from_ego);
     });
 }
@@ -259,4 +259,42 @@ fn occupancy_of_a_turn(bencher: Bencher) {
         map.take(&Rays { sensor: 0, stamp_ns: 0, returns, origin_m, no_returns: &[], map_from_ego, speed_mps });
         map.make(&sweep, &mut layer);
     });
+}
+
+#[divan::bench]
+fn occupancy_scratch_take_turn(bencher: Bencher) {
+    let sweep = sweep();
+    let mut map = Occupancy::new(&OccupancyConfig::default());
+    bencher.bench_local(|| {
+        let origin_m = [0.0, 0.0, sweep.mount_height_m];
+        let (map_from_ego, speed_mps) = (Some(nalgebra::Isometry3::identity()), Some(0.0));
+        map.take(&Rays { sensor: 0, stamp_ns: 0, returns: &sweep, origin_m, no_returns: &[], map_from_ego, speed_mps });
+    });
+}
+#[divan::bench]
+fn occupancy_scratch_take_six(bencher: Bencher) {
+    let scans = six_units();
+    let mut map = Occupancy::new(&OccupancyConfig::default());
+    let pose = Some(nalgebra::Isometry3::identity());
+    bencher.bench_local(|| {
+        for (number, (returns, origin_m)) in scans.iter().enumerate() {
+            map.take(&Rays {
+                sensor: (number % 6) as u16,
+                stamp_ns: 0,
+                returns,
+                origin_m: *origin_m,
+                no_returns: &[],
+                map_from_ego: pose,
+                speed_mps: Some(0.0),
+            });
+        }
+    });
+}
+#[divan::bench]
+fn occupancy_scratch_make_empty(bencher: Bencher) {
+    let mut map = Occupancy::new(&OccupancyConfig::default());
+    let mut layer = map.layer();
+    let pose = Some(nalgebra::Isometry3::identity());
+    let context = Context { map_from_ego: pose, ..Context::default() };
+    bencher.bench_local(|| map.make_with(&Sweep::default(), &context, &mut layer));
 }

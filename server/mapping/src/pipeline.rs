@@ -191,7 +191,7 @@ impl Pipeline {
         let intake = intake_of(&mut self.intakes, source)?;
         let completed = intake.take_datagram(payload, &self.motion, now)?;
         if payload.len() == TELEMETRY_LENGTH {
-            intake.tell_speed(&mut self.motion, now);
+            intake.tell_speed(&mut self.motion);
             self.count(source, |ledger| ledger.telemetry += 1);
         } else {
             self.count(source, |ledger| ledger.decoded += 1);
@@ -242,6 +242,7 @@ impl Pipeline {
     /// A sensor's turn has ended: the maps that gather see it, and perhaps it makes a map.
     fn end_turn(&mut self, source: u16, now: Moment) -> bool {
         let index = usize::from(source);
+        self.motion.take_turn(self.intakes[index].turn.end_ns);
         let rays = self.intakes[index].rays(source);
         self.layer_makers.iter_mut().for_each(|maker| maker.take(&rays));
         let makes_map = self.fusion.makes_map(index, &self.intakes, now);

@@ -17,11 +17,13 @@
 //! Only a sensor's newest scan says what is clear and what is hidden now. So lines are drawn once a map, however many scans
 //! came since the last one.
 
+use std::ops::Range;
+
 use super::states::{HIDDEN, LOOKED_AT, THROUGH};
 use super::window::Window;
 use crate::config::OccupancyConfig;
 use crate::map::Rays;
-use crate::radial::Quadrants;
+use crate::radial::{Quadrants, nearest_whole, whole};
 
 /// Directions about a sensor; a quarter of a degree each, as finely as the paper's units look.
 const DIRECTIONS: usize = 1440;
@@ -35,6 +37,8 @@ const BELOW_M: f32 = 0.3;
 const GRADE_MAX: f32 = 0.1;
 /// Nearest hit of a direction without.
 const NONE: u16 = u16::MAX;
+/// Steps are counted no farther, metres or miles beyond every window.
+const STEPS_MAX: f32 = 65_000.0;
 /// Points are taken in chunks of this many, so that what is worked out of them stays in the first cache level.
 const CHUNK: usize = 256;
 /// Fraction bits of positions on a trace. So many, because a trace must fall on a border of cells never, not seldom.
@@ -49,17 +53,17 @@ struct Ground {
     end: u16,
 }
 
-/// What follows from a point by arithmetic alone. Distances in steps from the sensor.
-#[derive(Clone, Copy, Default)]
-struct Ray {
-    direction: u32,
-    range: f32,
-    /// Where its ray is at the height of a bumper.
-    first: i32,
-    end: i32,
-    /// Where it comes under the clearance, and where it is too low to prove anything.
-    under: i32,
-    low: i32,
+/// What follows from points by arithmetic alone, in steps from the sensor.
+struct Chunk {
+    direction: [u32; CHUNK],
+    range: [f32; CHUNK],
+    step: [u32; CHUNK],
+    /// From where to where their rays are at the height of a bumper.
+    first: [u32; CHUNK],
+    end: [u32; CHUNK],
+    /// Where they come under the clearance, and where they are too low to prove anything.
+    under: [u32; CHUNK],
+    low: [u32; CHUNK],
 }
 
 /// All the sensors' newest scans.
@@ -152,7 +156,7 @@ impl Compass {
         Self { directions, lines: lines.collect(), steps: words * 64, words }
     }
 
-    fn row(&self, direction: usize) -> std::ops::Range<usize> {
+    fn row(&self, direction: usize) -> Range<usize> {
         direction * self.words..(direction + 1) * self.words
     }
 }
@@ -203,36 +207,35 @@ impl View {
         let [px, py] = place.cells.map(|cells| cells as f32);
         let range_max = config.range_m_max * per_m;
         let sweep = rays.returns;
-        let mut chunk = [Ray::default(); CHUNK];
+        let mut chunk = Chunk::default();
         let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
         for ((xs, ys), zs) in chunks {
-            // Arithmetic alone first, so that it runs four points at a time; the rows after.
-            for (((ray, &x), &y), &z) in chunk.iter_mut().zip(xs).zip(ys).zip(zs) {
-                *ray = Ray::of([x, y, z], rays.origin_m, config, compass);
-            }
-            for (((ray, &x), &y), &z) in chunk.iter().zip(xs).zip(ys).zip(zs) {
-                let direction = ray.direction as usize;
+            chunk.fill([xs, ys, zs], rays.origin_m, config, compass);
+            for (i, ((&x, &y), &z)) in xs.iter().zip(ys).zip(zs).enumerate() {
+                let (direction, range) = (chunk.direction[i] as usize, chunk.range[i]);
                 self.present[direction] = true;
-                if z < -BELOW_M - GRADE_MAX * config.cell_m * ray.range {
+                if z < -BELOW_M - GRADE_MAX * config.cell_m * range {
                     continue;
                 }
                 let row = compass.row(direction);
-                set_bits(&mut self.low[row.clone()], ray.first as usize, ray.end as usize);
-                if !(ray.range <= range_max) || z >= config.overhang_m {
+                set_bits(&mut self.low[row.clone()], chunk.first[i] as usize, chunk.end[i] as usize);
+                if !(range <= range_max) || z >= config.overhang_m {
                     continue;
                 }
-                let step = ray.range as usize;
+                let step = chunk.step[i] as u16;
+                let inside = usize::from(step) < compass.steps;
                 if z >= config.clear_height_m_min {
                     if z >= config.clearance_m {
                         window.hit(px + x * turn_x - y * turn_y, py + x * turn_y + y * turn_x);
                     }
-                    self.nearest_hit[direction] = self.nearest_hit[direction].min(step.min(NONE as usize) as u16);
-                    if step < compass.steps {
-                        self.hits[row.start + step / 64] |= 1 << (step % 64);
+                    self.nearest_hit[direction] = self.nearest_hit[direction].min(step);
+                    if inside {
+                        self.hits[row.start + usize::from(step) / 64] |= 1 << (step % 64);
                     }
-                } else if step < compass.steps {
-                    let [direction, from, low] = [ray.direction as i32, ray.under, ray.low].map(|value| value as u16);
-                    self.ground.push(Ground { direction, from, low, end: step as u16 + 1 });
+                } else if inside {
+                    let [direction, from, low] =
+                        [direction as u32, chunk.under[i], chunk.low[i]].map(|value| value as u16);
+                    self.ground.push(Ground { direction, from, low, end: step + 1 });
                 }
             }
         }
@@ -246,7 +249,8 @@ impl View {
             let steps_a_m = (dx * dx + dy * dy).sqrt() / dz / config.cell_m;
             let height = |height_m: f32| (height_m - rays.origin_m[2]) * steps_a_m;
             let (from, to) = between(height(config.clear_height_m_min), height(config.clear_height_m_max));
-            let (first, end) = (middle(from, compass.steps), middle(to.min(farthest), compass.steps));
+            let steps = compass.steps as f32;
+            let (first, end) = (nearest_whole(least(from, steps)), nearest_whole(least(to, least(farthest, steps))));
             set_bits(&mut self.low[compass.row(direction)], first as usize, end as usize);
         }
     }
@@ -278,13 +282,15 @@ impl View {
         let from = [0, 1].map(|i| self.at[i] - corner[i] as f64);
         let (sin, cos) = self.yaw_rad.sin_cos();
         let reach = ((config.range_m_max / config.cell_m) as usize).min(compass.steps);
+        if !from.iter().all(|at| (0.0..window.side() as f64).contains(at)) {
+            return;
+        }
         for direction in (0..DIRECTIONS).filter(|direction| self.looks(*direction)) {
             self.write_telling(direction, compass, telling);
             for (line, &[x, y]) in compass.lines[direction].iter().enumerate() {
-                let way = [x * cos - y * sin, x * sin + y * cos];
-                let steps = steps_within(window.side(), from, way).min(reach);
-                let steps = if line == 0 { 0..steps.min(FORK) } else { FORK.min(steps)..steps };
-                tell_along(from, way, steps.start, &telling[steps], window.side(), told);
+                let way = Way::new(from, [x * cos - y * sin, x * sin + y * cos], window.side());
+                let steps = if line == 0 { 0..way.steps(reach.min(FORK)) } else { FORK..way.steps(reach).max(FORK) };
+                way.tell(steps, telling, told);
             }
         }
     }
@@ -319,80 +325,101 @@ impl View {
     }
 }
 
-impl Ray {
+impl Default for Chunk {
+    fn default() -> Self {
+        let none = [0; CHUNK];
+        Self { direction: none, range: [0.0; CHUNK], step: none, first: none, end: none, under: none, low: none }
+    }
+}
+
+impl Chunk {
+    /// Free of branches and tables, so that it runs four points at a time.
     #[inline(always)]
-    fn of([x, y, z]: [f32; 3], [ox, oy, oz]: [f32; 3], config: &OccupancyConfig, compass: &Compass) -> Self {
-        let (dx, dy) = (x - ox, y - oy);
-        let range_m = (dx * dx + dy * dy).sqrt();
-        let range = range_m / config.cell_m;
-        // The ground of a ray that comes back from the ground leads there, up or down, in a straight line.
-        let rise = if z < config.clear_height_m_min { -oz } else { z - oz };
-        let steps_a_m = range / rise;
-        let height = |height_m: f32| (height_m - oz) * steps_a_m;
-        let bumper = height(config.clear_height_m_min);
-        let (from, to) = between(bumper, height(config.clear_height_m_max));
-        let (under, low) = between(bumper, height(config.clearance_m));
-        let reliable = range.min(config.range_m_max / config.cell_m);
-        Self {
-            direction: compass.directions.column(dx, dy),
-            range,
-            first: middle(from, compass.steps),
-            end: middle(to.min(reliable), compass.steps),
-            under: middle(under.min(range), compass.steps),
-            low: middle(low.min(range), compass.steps),
+    fn fill(&mut self, [xs, ys, zs]: [&[f32]; 3], origin_m: [f32; 3], config: &OccupancyConfig, compass: &Compass) {
+        let [ox, oy, oz] = origin_m;
+        let (per_m, steps) = (1.0 / config.cell_m, compass.steps as f32);
+        let [lowest, highest, clearance] =
+            [config.clear_height_m_min, config.clear_height_m_max, config.clearance_m].map(|height_m| height_m - oz);
+        let reliable = config.range_m_max * per_m;
+        let n = xs.len();
+        let (xs, ys, zs) = (&xs[..n], &ys[..n], &zs[..n]);
+        let (direction, range_of, step) = (&mut self.direction[..n], &mut self.range[..n], &mut self.step[..n]);
+        let (first, end) = (&mut self.first[..n], &mut self.end[..n]);
+        let (under_of, low_of) = (&mut self.under[..n], &mut self.low[..n]);
+        for i in 0..n {
+            let (dx, dy, z) = (xs[i] - ox, ys[i] - oy, zs[i]);
+            let range = (dx * dx + dy * dy).sqrt() * per_m;
+            // The ground of a ray that comes back from the ground leads there, up or down, in a straight line.
+            let rise = if z < config.clear_height_m_min { -oz } else { z - oz };
+            let steps_a_m = range / rise;
+            let (from, to) = between(lowest * steps_a_m, highest * steps_a_m);
+            let (under, low) = between(lowest * steps_a_m, clearance * steps_a_m);
+            direction[i] = compass.directions.column(dx, dy);
+            range_of[i] = range;
+            step[i] = whole(least(range, STEPS_MAX));
+            first[i] = nearest_whole(least(from, steps));
+            end[i] = nearest_whole(least(to, least(least(reliable, range), steps)));
+            under_of[i] = nearest_whole(least(under, least(range, steps)));
+            low_of[i] = nearest_whole(least(low, least(range, steps)));
         }
     }
 }
 
-/// The part of a ray between two heights, from where it passes them. What lies behind the sensor begins at 0.
+/// The part of a ray between two heights, from where it passes them. What lies behind the sensor becomes 0.
 #[inline(always)]
 fn between(a: f32, b: f32) -> (f32, f32) {
-    // Level rays give infinities of the right signs; `max` and `min` pass over NaN.
-    (a.min(b).max(0.0), a.max(b))
+    // Level rays give infinities of the right signs. NaN fails every comparison.
+    let (from, to) = if a < b { (a, b) } else { (b, a) };
+    (if from > 0.0 { from } else { 0.0 }, if to > 0.0 { to } else { 0.0 })
 }
 
-/// The first step whose middle lies beyond a distance.
+/// The lesser of two; the second, where the first is NaN.
 #[inline(always)]
-fn middle(steps: f32, most: usize) -> i32 {
-    // NaN and what lies behind the sensor become 0.
-    ((steps + 0.5).max(0.0) as i32).min(most as i32)
+fn least(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
 }
 
-/// How many steps of a cell's side along `way` (length 1) have their middles in a window; none from a place outside.
-fn steps_within(side: usize, from: [f64; 2], way: [f64; 2]) -> usize {
-    let side = side as f64;
-    if !from.iter().all(|at| (0.0..side).contains(at)) {
-        return 0;
-    }
-    let to_border = |i: usize| {
-        let (at, d) = (from[i], way[i]);
-        if d > 0.0 {
-            (side - at) / d
-        } else if d < 0.0 {
-            at / -d
-        } else {
-            f64::INFINITY
-        }
-    };
-    (to_border(0).min(to_border(1)) - 0.5).ceil().max(0.0) as usize
+/// A way of equal steps, length 1, through a window.
+struct Way {
+    at: [i64; 2],
+    step: [i64; 2],
+    side: usize,
 }
 
-/// Adds what a trace tells, from its step `first` on, to the cells in the middle of its steps.
-#[inline(always)]
-fn tell_along(from: [f64; 2], way: [f64; 2], first: usize, telling: &[u8], side: usize, told: &mut [u8]) {
-    if telling.is_empty() {
-        // From a place outside the window, which may be any.
-        return;
+impl Way {
+    /// From a place in cells from the window's corner, along a direction of length 1.
+    fn new(from: [f64; 2], direction: [f64; 2], side: usize) -> Self {
+        let fixed = |cells: f64| (cells * (1_i64 << FRACTION) as f64) as i64;
+        let step = direction.map(fixed);
+        Self { at: [0, 1].map(|i| fixed(from[i]) + step[i] / 2), step, side }
     }
-    let fixed = |cells: f64| (cells * (1_i64 << FRACTION) as f64).round() as i64;
-    let step = way.map(fixed);
-    let [mut x, mut y] = [0, 1].map(|i| fixed(from[i]) + step[i] / 2 + step[i] * first as i64);
-    for telling in telling {
-        // The last step may round over the border.
-        if let Some(told) = told.get_mut((y >> FRACTION) as usize * side + (x >> FRACTION) as usize) {
-            *told |= telling;
+
+    /// The middle of a step.
+    fn middle(&self, number: usize) -> [i64; 2] {
+        [0, 1].map(|i| self.at[i] + self.step[i] * number as i64)
+    }
+
+    /// How many steps have their middles in the window, of `most`.
+    fn steps(&self, most: usize) -> usize {
+        let end = (self.side as i64) << FRACTION;
+        let inside = |number: usize| self.middle(number).iter().all(|at| (0..end).contains(at));
+        let (mut least, mut most) = (0, most);
+        // The window is convex: a way that has left it does not come back.
+        while least < most {
+            let number = least.midpoint(most);
+            (least, most) = if inside(number) { (number + 1, most) } else { (least, number) };
         }
-        (x, y) = (x + step[0], y + step[1]);
+        least
+    }
+
+    /// Adds what is told of these steps to the cells in their middles.
+    #[inline(always)]
+    fn tell(&self, steps: Range<usize>, telling: &[u8], told: &mut [u8]) {
+        let [mut x, mut y] = self.middle(steps.start);
+        for telling in &telling[steps] {
+            told[(y >> FRACTION) as usize * self.side + (x >> FRACTION) as usize] |= telling;
+            (x, y) = (x + self.step[0], y + self.step[1]);
+        }
     }
 }
 
@@ -418,7 +445,15 @@ fn bits_of_word(word: usize, first: usize, end: usize) -> u64 {
 #[inline(always)]
 fn set_bits(row: &mut [u64], first: usize, end: usize) {
     if first < end {
-        (first / 64..end.div_ceil(64)).for_each(|word| row[word] |= bits_of_word(word, first, end));
+        let last = end - 1;
+        let (from, to) = (u64::MAX << (first % 64), u64::MAX >> (63 - last % 64));
+        if first / 64 == last / 64 {
+            row[first / 64] |= from & to;
+        } else {
+            row[first / 64] |= from;
+            row[first / 64 + 1..last / 64].fill(u64::MAX);
+            row[last / 64] |= to;
+        }
     }
 }
 

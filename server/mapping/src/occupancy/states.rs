@@ -37,7 +37,7 @@ pub enum Evidence {
     Through,
     /// The same, but earlier returns from here are not yet outweighed.
     ThroughDoubted,
-    /// Returns, with those before fewer than it takes.
+    /// Returns, with those before fewer than it takes; where the cell is hidden as well, that says more.
     FewHits,
     /// Returns, with those before as many as it takes.
     Hits,
@@ -89,6 +89,16 @@ pub struct Cell {
 }
 
 impl Cell {
+    /// The hits as published: 255 in an occupied cell, in an unknown one the power of two they reach (what tells 20 returns
+    /// from 23 is chance, and would be half of the layer's bytes), 0 in any other.
+    pub fn level(self) -> u8 {
+        match (self.state, self.hits) {
+            (OCCUPIED, hits) => hits,
+            (UNKNOWN, hits) if hits > 0 => 1 << hits.ilog2(),
+            _ => 0,
+        }
+    }
+
     /// The cell one map later: `fresh` returns came from it, and `told` is the strongest of what other rays tell
     /// ([`Evidence::Silence`] to [`Evidence::Through`]). It takes `hits_needed` returns (at least 1) to be occupied.
     #[inline(always)]
@@ -97,14 +107,18 @@ impl Cell {
         if fresh > 0 {
             // Returns win over rays that went through in the same cycle: something is there, or was a moment ago.
             hits = hits.saturating_add(fresh);
-            evidence = if hits >= hits_needed { Evidence::Hits } else { Evidence::FewHits };
+            evidence = match told {
+                _ if hits >= hits_needed => Evidence::Hits,
+                Evidence::Hidden => Evidence::Hidden,
+                _ => Evidence::FewHits,
+            };
         } else if told == Evidence::Through {
             // No longer enough at once, so that nothing leaves a trail; not forgotten at once, so that a thin thing that
             // rays miss now and then is never clear.
             hits = (hits >> 2).min(hits_needed - 1);
             evidence = if hits > 0 { Evidence::ThroughDoubted } else { Evidence::Through };
         }
-        let age = if evidence as u8 >= Evidence::Through as u8 { 0 } else { self.age.saturating_add(1) };
+        let age = if fresh > 0 || told == Evidence::Through { 0 } else { self.age.saturating_add(1) };
         let over = age > hold_maps;
         let state = match TRANSITIONS[usize::from(self.state == OCCUPIED)][evidence as usize] {
             Go(state) => state,

@@ -8,6 +8,7 @@
 use nalgebra::Isometry3;
 
 use super::states::{Cell, evidence};
+use crate::radial::whole;
 
 /// Beside a state: it stands already. Beyond all that can be told of a cell.
 const JUDGED: u8 = 8;
@@ -31,16 +32,11 @@ pub struct Window {
     /// Whether the axes are the world's; without a pose they are the vehicle's own.
     anchored: bool,
     place: Place,
-    kept: Vec<Kept>,
-    /// Indices of the cells of which anything is kept, each once.
+    cells: Vec<Cell>,
+    /// Returns from each cell since the last map.
+    fresh: Vec<u8>,
+    /// Indices of the cells with returns, then or before, each once.
     listed: Vec<u32>,
-}
-
-/// What is kept of a cell, and the returns from it since the last map.
-#[derive(Clone, Copy, Default)]
-struct Kept {
-    cell: Cell,
-    fresh: u8,
 }
 
 impl Window {
@@ -54,7 +50,8 @@ impl Window {
             corner: [0, 0],
             anchored: false,
             place: Place { cells: [side as f64 / 2.0; 2], yaw_rad: 0.0 },
-            kept: vec![Kept::default(); 1 << (2 * bits)],
+            cells: vec![Cell::default(); 1 << (2 * bits)],
+            fresh: vec![0; 1 << (2 * bits)],
             listed: Vec::new(),
         }
     }
@@ -102,7 +99,9 @@ impl Window {
     }
 
     fn forget(&mut self) {
-        self.listed.drain(..).for_each(|index| self.kept[index as usize] = Kept::default());
+        for index in self.listed.drain(..) {
+            (self.cells[index as usize], self.fresh[index as usize]) = (Cell::default(), 0);
+        }
     }
 
     /// Moves the corner; forgets what leaves the window.
@@ -118,7 +117,7 @@ impl Window {
                 (0..self.side as i64).contains(&at)
             });
             if !stays {
-                self.kept[*index as usize] = Kept::default();
+                (self.cells[*index as usize], self.fresh[*index as usize]) = (Cell::default(), 0);
             }
             stays
         });
@@ -139,13 +138,13 @@ impl Window {
         // NaN fails every comparison.
         if x >= 0.0 && y >= 0.0 && x < side && y < side {
             let mask = (1 << self.bits) - 1;
-            let (x, y) = ((self.corner[0] + x as i64) & mask, (self.corner[1] + y as i64) & mask);
+            let [x, y] = [(x, 0), (y, 1)].map(|(at, i)| (self.corner[i] + i64::from(whole(at))) & mask);
             let index = (y << self.bits | x) as usize;
-            let kept = &mut self.kept[index];
-            if kept.fresh == 0 && kept.cell.hits == 0 {
+            let fresh = &mut self.fresh[index];
+            if *fresh == 0 && self.cells[index].hits == 0 {
                 self.listed.push(index as u32);
             }
-            kept.fresh = kept.fresh.saturating_add(1);
+            *fresh = fresh.saturating_add(1);
         }
     }
 
@@ -155,11 +154,11 @@ impl Window {
         hits.fill(0);
         let mut listed = std::mem::take(&mut self.listed);
         listed.retain(|index| {
-            let [x, y] = self.cell(*index);
-            let (at, kept) = (y * self.side + x, &mut self.kept[*index as usize]);
-            let cell = kept.cell.judged(kept.fresh, evidence(class[at], any), needed, hold_maps);
-            (class[at], hits[at]) = (JUDGED | cell.state, cell.hits);
-            *kept = if cell.hits > 0 { Kept { cell, fresh: 0 } } else { Kept::default() };
+            let ([x, y], index) = (self.cell(*index), *index as usize);
+            let (at, fresh) = (y * self.side + x, std::mem::take(&mut self.fresh[index]));
+            let cell = self.cells[index].judged(fresh, evidence(class[at], any), needed, hold_maps);
+            (class[at], hits[at]) = (JUDGED | cell.state, cell.level());
+            self.cells[index] = if cell.hits > 0 { cell } else { Cell::default() };
             cell.hits > 0
         });
         self.listed = listed;
