@@ -6,6 +6,7 @@ use bytes::Bytes;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::Revolution;
 use clearway_lidar::sensor::{Sensor, SensorConfig as LidarConfig};
+use clearway_lidar::telemetry::Telemetry;
 use clearway_mapping::config::{Extrinsics, MapsConfig, MotionConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
 use clearway_mapping::map::Map;
@@ -285,16 +286,23 @@ fn stamps_and_places_at_the_ends_of_their_types_move_nothing_and_break_nothing()
 
 #[test]
 fn a_speed_grows_old() {
-    let events = drive(None, false);
-    let mut pipeline = Pipeline::new(&config(MotionConfig::default()), vec![None]).unwrap();
-    let mut compensation = Vec::new();
-    for event in &events {
-        // The receiver repeats its first sentence for ever, and the packets of the second turn come late.
-        let late_ns = if compensation.is_empty() { 0 } else { 2_500_000_000 };
-        let event = Event { arrival_ns: event.arrival_ns + late_ns, ..event.clone() };
-        compensation.extend(pipeline.step(&event).unwrap().map(|map| map.compensation));
+    let telemetry = drive(None, false).into_iter().find_map(|event| match event.body {
+        Body::Datagram(payload) => Telemetry::new(&payload).ok(),
+        _ => None,
+    });
+    let gprmc = telemetry.unwrap().gprmc.unwrap();
+    let mut motion = Motion::new(&MotionConfig::default());
+    let known = |motion: &Motion, stamp_ms: i64| motion.at(stamp_ms * 1_000_000).1.is_some();
+    assert!(!known(&motion, 0));
+    motion.take_gprmc(&gprmc, None);
+    // Before the first turn has ended nobody can say when that was.
+    assert_eq!([0, 100_000].map(|stamp_ms| known(&motion, stamp_ms)), [true, true]);
+    for turn_ms in [100, 200, 300] {
+        motion.take_turn(turn_ms * 1_000_000);
+        // The receiver repeats its first sentence for ever.
+        motion.take_gprmc(&gprmc, Some(turn_ms * 1_000_000));
     }
-    assert_eq!(compensation[..2], [Compensation::Speed, Compensation::None]);
+    assert_eq!([400, 2_100, 2_101].map(|stamp_ms| known(&motion, stamp_ms)), [true, true, false]);
 }
 
 #[test]

@@ -14,6 +14,10 @@
 //! Behind it the cells are hidden, but for those where a ray comes down on the ground: there from where it is under the
 //! vehicle's clearance, if nothing stands on its way from there to its end, so that it has passed beneath nothing.
 //!
+//! Heights are over the plane under the vehicle. Where the ground dips under it, what stands there may not reach over the
+//! plane: there a return counts that is higher by the clearance than the lowest about it, a metre along its direction and a
+//! degree across.
+//!
 //! Only a sensor's newest scan says what is clear and what is hidden now. So lines are drawn once a map, however many scans
 //! came since the last one.
 
@@ -24,6 +28,7 @@ use super::window::Window;
 use crate::config::OccupancyConfig;
 use crate::map::Rays;
 use crate::radial::{Quadrants, nearest_whole, whole};
+use crate::sweep::Sweep;
 
 /// Directions about a sensor; a quarter of a degree each, as finely as the paper's units look.
 const DIRECTIONS: usize = 1440;
@@ -35,6 +40,8 @@ const FORK: usize = 112;
 /// nothing.
 const BELOW_M: f32 = 0.3;
 const GRADE_MAX: f32 = 0.1;
+/// Directions and steps of a patch of ground.
+const PATCH: [usize; 2] = [4, 4];
 /// Nearest hit of a direction without.
 const NONE: u16 = u16::MAX;
 /// Steps are counted no farther, metres or miles beyond every window.
@@ -51,6 +58,7 @@ struct Ground {
     from: u16,
     low: u16,
     end: u16,
+    point: u32,
 }
 
 /// What follows from points by arithmetic alone, in steps from the sensor.
@@ -101,6 +109,9 @@ struct View {
     /// As `low`, behind the nearest hit.
     proved: Vec<u64>,
     ground: Vec<Ground>,
+    /// Lowest return of each patch of ground, where it lies in a dip; else infinite.
+    dips: Vec<f32>,
+    dipped: bool,
 }
 
 impl Fan {
@@ -156,6 +167,16 @@ impl Compass {
         Self { directions, lines: lines.collect(), steps: words * 64, words }
     }
 
+    /// Patches of ground about the sensor.
+    fn patches(&self) -> usize {
+        DIRECTIONS / PATCH[0] * self.steps / PATCH[1]
+    }
+
+    /// The patch that holds a step of a direction.
+    fn patch(&self, direction: usize, step: usize) -> usize {
+        direction / PATCH[0] * (self.steps / PATCH[1]) + step / PATCH[1]
+    }
+
     fn row(&self, direction: usize) -> Range<usize> {
         direction * self.words..(direction + 1) * self.words
     }
@@ -175,6 +196,8 @@ impl View {
             hits: bits(),
             proved: bits(),
             ground: Vec::new(),
+            dips: vec![f32::INFINITY; compass.patches()],
+            dipped: false,
         }
     }
 
@@ -187,6 +210,9 @@ impl View {
         self.present.fill(false);
         self.nearest_hit.fill(NONE);
         self.ground.clear();
+        if std::mem::take(&mut self.dipped) {
+            self.dips.fill(f32::INFINITY);
+        }
     }
 
     /// Where the sensor is in the world, as the window knows it now.
@@ -200,16 +226,14 @@ impl View {
     }
 
     fn take_returns(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, compass: &Compass, window: &mut Window) {
-        let place = window.place();
-        let (sin, cos) = place.yaw_rad.sin_cos();
-        let per_m = 1.0 / config.cell_m;
-        let (turn_x, turn_y) = (cos as f32 * per_m, sin as f32 * per_m);
-        let [px, py] = place.cells.map(|cells| cells as f32);
-        let range_max = config.range_m_max * per_m;
+        let range_max = config.range_m_max / config.cell_m;
+        // Ground from here on down is deep enough for a thing on it to stay under `clear_height_m_min`.
+        let dip = config.clear_height_m_min - config.clearance_m;
+        let onto = window.from_ego();
         let sweep = rays.returns;
         let mut chunk = Chunk::default();
         let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
-        for ((xs, ys), zs) in chunks {
+        for (number, ((xs, ys), zs)) in chunks.enumerate() {
             chunk.fill([xs, ys, zs], rays.origin_m, config, compass);
             for (i, ((&x, &y), &z)) in xs.iter().zip(ys).zip(zs).enumerate() {
                 let (direction, range) = (chunk.direction[i] as usize, chunk.range[i]);
@@ -226,17 +250,43 @@ impl View {
                 let inside = usize::from(step) < compass.steps;
                 if z >= config.clear_height_m_min {
                     if z >= config.clearance_m {
-                        window.hit(px + x * turn_x - y * turn_y, py + x * turn_y + y * turn_x);
+                        window.hit(onto.place(x, y));
                     }
-                    self.nearest_hit[direction] = self.nearest_hit[direction].min(step);
-                    if inside {
-                        self.hits[row.start + usize::from(step) / 64] |= 1 << (step % 64);
-                    }
+                    self.meet(direction, step, compass);
                 } else if inside {
-                    let [direction, from, low] =
-                        [direction as u32, chunk.under[i], chunk.low[i]].map(|value| value as u16);
-                    self.ground.push(Ground { direction, from, low, end: step + 1 });
+                    let [from, low] = [chunk.under[i], chunk.low[i]].map(|value| value as u16);
+                    let point = (number * CHUNK + i) as u32;
+                    self.ground.push(Ground { direction: direction as u16, from, low, end: step + 1, point });
+                    if z < dip {
+                        let lowest = &mut self.dips[compass.patch(direction, step.into())];
+                        (*lowest, self.dipped) = (lowest.min(z), true);
+                    }
                 }
+            }
+        }
+        if self.dipped {
+            self.take_things_in_dips(sweep, config, compass, window);
+        }
+    }
+
+    /// A direction's ray meets a thing.
+    #[inline(always)]
+    fn meet(&mut self, direction: usize, step: u16, compass: &Compass) {
+        self.nearest_hit[direction] = self.nearest_hit[direction].min(step);
+        if usize::from(step) < compass.steps {
+            self.hits[direction * compass.words + usize::from(step) / 64] |= 1 << (step % 64);
+        }
+    }
+
+    /// Returns that were taken for the ground's, and lie too high over the ground about them.
+    fn take_things_in_dips(&mut self, sweep: &Sweep, config: &OccupancyConfig, compass: &Compass, window: &mut Window) {
+        let onto = window.from_ego();
+        for index in 0..self.ground.len() {
+            let Ground { direction, end, point, .. } = self.ground[index];
+            let (direction, step, point) = (usize::from(direction), end - 1, point as usize);
+            if sweep.z[point] - self.dips[compass.patch(direction, step.into())] >= config.clearance_m {
+                window.hit(onto.place(sweep.x[point], sweep.y[point]));
+                self.meet(direction, step, compass);
             }
         }
     }
@@ -264,7 +314,7 @@ impl View {
     /// What returns from the ground prove behind the nearest hit.
     fn prove_ground(&mut self, compass: &Compass) {
         let nearest: Vec<usize> = (0..DIRECTIONS).map(|direction| self.nearest(direction)).collect();
-        for &Ground { direction, from, low, end } in &self.ground {
+        for &Ground { direction, from, low, end, .. } in &self.ground {
             let (direction, from, low, end) =
                 (usize::from(direction), usize::from(from), usize::from(low), usize::from(end));
             if low <= nearest[direction] {
@@ -289,7 +339,8 @@ impl View {
             self.write_telling(direction, compass, telling);
             for (line, &[x, y]) in compass.lines[direction].iter().enumerate() {
                 let way = Way::new(from, [x * cos - y * sin, x * sin + y * cos], window.side());
-                let steps = if line == 0 { 0..way.steps(reach.min(FORK)) } else { FORK..way.steps(reach).max(FORK) };
+                let near = reach.min(FORK);
+                let steps = if line == 0 { 0..way.steps(near) } else { near..way.steps(reach).max(near) };
                 way.tell(steps, telling, told);
             }
         }

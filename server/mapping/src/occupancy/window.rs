@@ -39,6 +39,21 @@ pub struct Window {
     listed: Vec<u32>,
 }
 
+/// From the ego frame, metres, into the window, cells from its corner.
+pub struct FromEgo {
+    at: [f32; 2],
+    turn: [f32; 2],
+}
+
+impl FromEgo {
+    /// Where a place lies.
+    #[inline(always)]
+    pub fn place(&self, x: f32, y: f32) -> [f32; 2] {
+        let ([px, py], [cos, sin]) = (self.at, self.turn);
+        [px + x * cos - y * sin, py + x * sin + y * cos]
+    }
+}
+
 impl Window {
     /// A window of `side` cells nobody has looked at.
     pub fn new(side: usize, cell_m: f64) -> Self {
@@ -131,9 +146,16 @@ impl Window {
         [from(index, 0), from(index >> self.bits, 1)]
     }
 
+    /// The way from the ego frame into the window, for as long as the vehicle stays where it is.
+    pub fn from_ego(&self) -> FromEgo {
+        let (sin, cos) = self.place.yaw_rad.sin_cos();
+        let turn = [cos, sin].map(|part| (part / self.cell_m) as f32);
+        FromEgo { at: self.place.cells.map(|cells| cells as f32), turn }
+    }
+
     /// Counts a return from a place, cells from the window's corner.
     #[inline(always)]
-    pub fn hit(&mut self, x: f32, y: f32) {
+    pub fn hit(&mut self, [x, y]: [f32; 2]) {
         let side = self.side as f32;
         // NaN fails every comparison.
         if x >= 0.0 && y >= 0.0 && x < side && y < side {
