@@ -1,6 +1,6 @@
 //! Scripts of what happens to clocks: stamps always rise, and are right again one turn later.
 
-use clearway_lidar::{Clock, Model, Revolution, Sensor, SensorConfig};
+use clearway_lidar::{Clock, Model, Refusal, Revolution, Sensor, SensorConfig};
 use proptest::collection::vec;
 use proptest::prelude::*;
 
@@ -203,8 +203,22 @@ fn with_device_us(mut packet: Vec<u8>, device_us: u32) -> Vec<u8> {
     packet
 }
 
-/// Every turn of a script; telemetry 50 times a second.
+/// The turn a packet completes. The first packet of another time is refused until the next one confirms it, and copies are.
+fn take<'a>(sensor: &'a mut Sensor, packet: &[u8], arrival_ns: i64) -> Option<&'a Revolution> {
+    match sensor.push(packet, arrival_ns) {
+        Ok(turn) => turn,
+        Err(Refusal::DeviceTime { .. } | Refusal::Late { .. } | Refusal::Duplicate { .. }) => None,
+        Err(refusal) => panic!("{refusal}"),
+    }
+}
+
+/// Every turn of a script.
 fn play(script: &Script, sensor: &mut Sensor) -> Vec<Revolution> {
+    play_timed(script, sensor).into_iter().map(|(turn, _)| turn).collect()
+}
+
+/// Every turn of a script, and when the packet came that completed it; telemetry 50 times a second.
+fn play_timed(script: &Script, sensor: &mut Sensor) -> Vec<(Revolution, i64)> {
     let stream = Stream::of(Model::Vlp16);
     let period = i64::from(Model::Vlp16.spec().packet_period_ns(stream.mode));
     let mut turns = Vec::new();
@@ -220,7 +234,7 @@ fn play(script: &Script, sensor: &mut Sensor) -> Vec<Revolution> {
             telemetry_ns += S / 50;
         }
         let packet = with_device_us(stream.packet(index), past_hour_us(script, t));
-        turns.extend(sensor.push(&packet, arrival(t + period)).unwrap().cloned());
+        turns.extend(take(sensor, &packet, arrival(t + period)).map(|turn| (turn.clone(), t)));
     }
     turns
 }
@@ -244,13 +258,17 @@ fn assert_rising(name: &str, turns: &[Revolution]) {
 #[test]
 fn stamps_rise_and_are_right_again_one_turn_after_whatever_happens_to_a_clock() {
     for script in scripts() {
-        let turns = play(&script, &mut Sensor::new(SensorConfig::default()));
+        let (turns, done): (Vec<_>, Vec<_>) =
+            play_timed(&script, &mut Sensor::new(SensorConfig::default())).into_iter().unzip();
         let name = script.name;
         assert_rising(name, &turns);
         assert!(turns.len() as i64 >= script.lasts_ns / TURN - 1, "{name}: {} turns", turns.len());
-        for (index, turn) in turns.iter().enumerate() {
-            let t = index as i64 * TURN;
-            if (script.event_ns - TURN..script.event_ns + script.healed_ns).contains(&t) {
+        for (index, (turn, done)) in turns.iter().zip(done).enumerate() {
+            // Where the device's time jumps, a turn is torn in two: the whole ones are told by when they ended.
+            let t = (done + TURN / 2) / TURN * TURN - TURN;
+            let torn = turn.partial.is_some() && (0..=TURN).contains(&(done - script.event_ns));
+            let healing = (script.event_ns - TURN..script.event_ns + script.healed_ns).contains(&t);
+            if torn || healing {
                 continue;
             }
             let error_ns = turn.start_ns - (script.utc_ns + t + (script.right_ns)(t));
@@ -325,7 +343,7 @@ fn jitter_bursts_and_wild_device_times_change_no_stamp() {
                 if wild(index) && model != Model::Hdl64eS1 {
                     packet = with_device_us(packet, (index as u32).wrapping_mul(2_654_435_761));
                 }
-                turns.extend(sensor.push(&packet, stream.arrival_ns(index) + late_ns(index)).unwrap().cloned());
+                turns.extend(take(&mut sensor, &packet, stream.arrival_ns(index) + late_ns(index)).cloned());
             }
             turns.iter().map(|turn| (turn.start_ns, turn.end_ns, turn.clock)).collect::<Vec<_>>()
         };
@@ -336,10 +354,11 @@ fn jitter_bursts_and_wild_device_times_change_no_stamp() {
         let burst = |index: usize| if (400..500).contains(&index) { (500 - index as i64) * 300_000 } else { 0 };
         assert_eq!(stamps(jitter, |_| false), clean, "{model:?}");
         assert_eq!(stamps(burst, |_| false), clean, "{model:?}");
-        // A packet whose device time is damaged is taken to come a period after the one before.
+        // A packet whose device time is damaged is refused: where it would have begun or ended a turn, the next one does.
+        let packet_ns = model.spec().packet_period_ns(stream.mode) as u64;
         for (wild, clean) in stamps(|_| 0, |index| index % 90 == 60).iter().zip(&clean) {
             assert!(
-                wild.0.abs_diff(clean.0) < 1_000 && wild.1.abs_diff(clean.1) < 1_000,
+                wild.0.abs_diff(clean.0) <= packet_ns && wild.1.abs_diff(clean.1) <= packet_ns,
                 "{model:?} {wild:?} {clean:?}"
             );
         }
@@ -378,7 +397,7 @@ proptest! {
                 device_us = device_us.wrapping_add(1_327);
                 arrival_ns = arrival_ns.saturating_add(1_327_000);
                 let packet = with_device_us(stream.packet(index), device_us);
-                if let Some(turn) = sensor.push(&packet, arrival_ns).unwrap() {
+                if let Some(turn) = take(&mut sensor, &packet, arrival_ns) {
                     prop_assert!(newest_ns < turn.start_ns, "{newest_ns} {}", turn.start_ns);
                     prop_assert!(turn.start_ns <= turn.end_ns);
                     newest_ns = turn.end_ns;
