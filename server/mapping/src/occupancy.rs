@@ -7,7 +7,7 @@
 //! | step | paper | where |
 //! |---|---|---|
 //! | a square that scrolls with the vehicle | §2 ("ScrollingByteMap") | [`window`] |
-//! | rays to hits, and to lines traced outward from the sensor | algorithm 1 | [`fan`] |
+//! | rays to hits, and to lines traced outward from the sensor | algorithm 1 | [`fan`], [`way`] |
 //! | evidence to states; hits fade | figure 4 | [`states`] |
 //! | how many hits make a cell occupied | figure 5 | [`Occupancy::hits_needed`] |
 //!
@@ -26,6 +26,7 @@
 
 pub mod fan;
 pub mod states;
+pub mod way;
 pub mod window;
 
 use crate::config::OccupancyConfig;

@@ -24,6 +24,7 @@
 use std::ops::Range;
 
 use super::states::{HIDDEN, LOOKED_AT, THROUGH};
+use super::way::Way;
 use super::window::Window;
 use crate::config::OccupancyConfig;
 use crate::map::Rays;
@@ -48,8 +49,6 @@ const NONE: u16 = u16::MAX;
 const STEPS_MAX: f32 = 65_000.0;
 /// Points are taken in chunks of this many, so that what is worked out of them stays in the first cache level.
 const CHUNK: usize = 256;
-/// Fraction bits of positions on a trace. So many, because a trace must fall on a border of cells never, not seldom.
-const FRACTION: u32 = 32;
 
 /// A return from the ground, and steps of its ray: where it comes under the clearance, where it is too low to prove
 /// anything, and where it ends.
@@ -243,7 +242,7 @@ impl View {
                 }
                 let row = compass.row(direction);
                 set_bits(&mut self.low[row.clone()], chunk.first[i] as usize, chunk.end[i] as usize);
-                if !(range <= range_max) || z >= config.overhang_m {
+                if range > range_max || range.is_nan() || z >= config.overhang_m {
                     continue;
                 }
                 let step = chunk.step[i] as u16;
@@ -428,50 +427,6 @@ fn between(a: f32, b: f32) -> (f32, f32) {
 #[inline(always)]
 fn least(a: f32, b: f32) -> f32 {
     if a < b { a } else { b }
-}
-
-/// A way of equal steps, length 1, through a window.
-struct Way {
-    at: [i64; 2],
-    step: [i64; 2],
-    side: usize,
-}
-
-impl Way {
-    /// From a place in cells from the window's corner, along a direction of length 1.
-    fn new(from: [f64; 2], direction: [f64; 2], side: usize) -> Self {
-        let fixed = |cells: f64| (cells * (1_i64 << FRACTION) as f64) as i64;
-        let step = direction.map(fixed);
-        Self { at: [0, 1].map(|i| fixed(from[i]) + step[i] / 2), step, side }
-    }
-
-    /// The middle of a step.
-    fn middle(&self, number: usize) -> [i64; 2] {
-        [0, 1].map(|i| self.at[i] + self.step[i] * number as i64)
-    }
-
-    /// How many steps have their middles in the window, of `most`.
-    fn steps(&self, most: usize) -> usize {
-        let end = (self.side as i64) << FRACTION;
-        let inside = |number: usize| self.middle(number).iter().all(|at| (0..end).contains(at));
-        let (mut least, mut most) = (0, most);
-        // The window is convex: a way that has left it does not come back.
-        while least < most {
-            let number = least.midpoint(most);
-            (least, most) = if inside(number) { (number + 1, most) } else { (least, number) };
-        }
-        least
-    }
-
-    /// Adds what is told of these steps to the cells in their middles.
-    #[inline(always)]
-    fn tell(&self, steps: Range<usize>, telling: &[u8], told: &mut [u8]) {
-        let [mut x, mut y] = self.middle(steps.start);
-        for telling in &telling[steps] {
-            told[(y >> FRACTION) as usize * self.side + (x >> FRACTION) as usize] |= telling;
-            (x, y) = (x + self.step[0], y + self.step[1]);
-        }
-    }
 }
 
 /// A direction, `beside` of them to the left (or less than 0 to the right).
