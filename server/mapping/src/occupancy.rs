@@ -13,13 +13,14 @@
 //!
 //! Three readings go beyond the paper's words. (1) A ray proves a cell free only where it is low over it, so that a sensor
 //! on the roof, whose rays pass over cars, serves like one in the bumper ([`fan`]). (2) Cells are judged when the map is
-//! written, from all that was told since the last one: a scan costs its points and its lines, never the grid. (3) A
+//! written: a scan costs its points, a map one set of lines a sensor and one pass over the grid. (3) A
 //! vehicle whose speed nobody knows is taken to be fast, where two hits suffice: the other way an obstacle would wait for
 //! twenty.
 //!
 //! Hits add up over maps, so a single Velodyne at 10 Hz on a standing vehicle names near cars at once and far ones after
-//! some turns; until then their cells are unknown, with their hits beside. Heights of returns are over the plane under the
-//! vehicle; those of rays that come back from the ground, over the line from there to the return.
+//! some turns; until then their cells are unknown, with the power of two that their hits reach beside, or occluded where
+//! something hides them as well. Heights of returns are over the plane under the vehicle, or over the ground about them
+//! where that dips; those of rays that come back from the ground, over the line from there to the return.
 //!
 //! Without an ego pose nobody can say where last map's cells are now: the grid is then the vehicle's own and holds only
 //! what was seen since the last map (`world_aligned` is 0).
