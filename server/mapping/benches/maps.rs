@@ -108,7 +108,7 @@ fn sweep_of_a_moving_revolution(bencher: Bencher) {
     let (mut sweep, mut moved) = (Sweep::default(), Moved::default());
     let slots = revolution.echoes[0].range_m.len();
     bencher.counter(ItemsCount::new(slots)).bench_local(|| {
-        motion.through(&revolution, revolution.end_ns, &mut moved);
+        motion.through(&revolution, &mut moved);
         sweep.take_moving_revolution(&revolution, &mount, &moved.end_from_ego);
     });
 }

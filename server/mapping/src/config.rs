@@ -13,10 +13,12 @@ use clearway_lidar::model::Model;
 mod fusion;
 mod maps;
 mod occupancy;
+mod speed;
 
 pub use fusion::*;
 pub use maps::*;
 pub use occupancy::OccupancyConfig;
+pub use speed::{Bonus, SpeedConfig};
 
 /// Sensors of one vehicle, declared ones included: each keeps its newest turn, some megabytes.
 pub const SENSORS_MAX: usize = 32;

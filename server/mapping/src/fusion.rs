@@ -130,7 +130,7 @@ impl Fusion {
         for (index, intake) in intakes.iter().enumerate() {
             let part = if index == source { maker.state.state } else { self.part(intake, maker.end_ns, now) };
             if index != source && part.contributes() {
-                let (carried, compensation) = motion.carry(intake.turn.end_ns, maker.end_ns, now.arrival_ns);
+                let (carried, compensation) = motion.carry(intake.turn.end_ns, maker.end_ns);
                 if !self.fused {
                     self.sweep.copy(&maker.sweep);
                     self.fused = true;

@@ -167,9 +167,9 @@ impl Intake {
     }
 
     /// The newest telemetry's GPRMC.
-    pub fn tell_speed(&self, motion: &mut Motion, now: Moment) {
+    pub fn tell_speed(&self, motion: &mut Motion) {
         if let Some(gprmc) = self.sensor.gprmc() {
-            motion.take_gprmc(gprmc, now.arrival_ns);
+            motion.take_gprmc(gprmc, self.sensor.newest().map(|revolution| revolution.end_ns));
         }
     }
 
@@ -182,7 +182,7 @@ impl Intake {
     fn take_revolution(&mut self, motion: &Motion, now: Moment) -> Option<Dropped> {
         let revolution = self.sensor.newest()?;
         let (turn, mount, screen) = (&mut self.turn, &self.mount, self.screen.as_ref());
-        motion.through(revolution, now.arrival_ns, &mut self.moved);
+        motion.through(revolution, &mut self.moved);
         let dropped = turn.sweep.take_revolution_around(revolution, mount, &self.moved.end_from_ego, screen);
         if let Some(series) = &mut self.series {
             turn.sweep.take_deviations_around(revolution, mount, series, screen);
@@ -231,7 +231,7 @@ impl Intake {
             self.scan_calibration = rings::measured(scan).map(Arc::new);
         }
         let turn = &mut self.turn;
-        motion.through_scan(scan, now.arrival_ns, &mut self.moved);
+        motion.through_scan(scan, &mut self.moved);
         let (calibration, moved) = (self.scan_calibration.as_ref(), &self.moved.end_from_ego);
         let dropped = turn.sweep.take_scan_around(scan, calibration, &self.mount, moved, self.screen.as_ref());
         turn.no_returns.clear();

@@ -79,7 +79,9 @@ pub(crate) fn knots(firings: usize) -> impl ExactSizeIterator<Item = usize> + Cl
 /// A speed somebody told of.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Told {
-    arrival_ns: i64,
+    /// End of the sensor's turn it came after; `None` until a turn has ended. No clock of the host's tells its age, so
+    /// none that steps makes it old.
+    stamp_ns: Option<i64>,
     /// Of the sentence: one that is repeated is no news.
     utc_ns: Option<i64>,
     speed_mps: f64,
@@ -114,12 +116,20 @@ impl Motion {
         self.poses.push_back(pose.clone());
     }
 
-    /// Takes the speed over ground of a sensor's GPRMC that arrived at `arrival_ns`, if the receiver calls it valid. It is a
-    /// speed without a sign: who drives backwards for long switches the fall-back off or sends poses.
-    pub fn take_gprmc(&mut self, gprmc: &Gprmc, arrival_ns: i64) {
+    /// Takes the speed over ground of a GPRMC that came after the turn of its sensor that ended at `stamp_ns` (`None`: before
+    /// its first), if the receiver calls it valid. It is a speed without a sign: who drives backwards for long switches the
+    /// fall-back off or sends poses.
+    pub fn take_gprmc(&mut self, gprmc: &Gprmc, stamp_ns: Option<i64>) {
         let repeated = self.told.is_some_and(|told| told.utc_ns.is_some() && told.utc_ns == gprmc.utc_ns);
         if let (true, false, Some(speed_mps)) = (gprmc.valid, repeated, gprmc.speed_mps()) {
-            self.told = Some(Told { arrival_ns, utc_ns: gprmc.utc_ns, speed_mps });
+            self.told = Some(Told { stamp_ns, utc_ns: gprmc.utc_ns, speed_mps });
+        }
+    }
+
+    /// Takes note that a turn has ended: what was told before any had is taken to be of this moment.
+    pub fn take_turn(&mut self, stamp_ns: i64) {
+        if let Some(told) = &mut self.told {
+            told.stamp_ns.get_or_insert(stamp_ns);
         }
     }
 
@@ -163,48 +173,43 @@ impl Motion {
     }
 
     /// The ego frame and its speed at a turn's end.
-    pub fn at(&self, stamp_ns: i64, arrival_ns: i64) -> (Option<Isometry3<f64>>, Option<f64>) {
+    pub fn at(&self, stamp_ns: i64) -> (Option<Isometry3<f64>>, Option<f64>) {
         let pose = self.map_from_ego(stamp_ns);
         let speed_mps = match pose {
             Some(_) => self.pose_speed_mps(stamp_ns),
-            None => self.newest_speed_mps(stamp_ns, arrival_ns),
+            None => self.newest_speed_mps(stamp_ns),
         };
         (pose, speed_mps)
     }
 
     /// The newest speed anybody told of, if it is no older than `speed_age_ms`: of the newest pose by its stamp, of the
-    /// sensor's telemetry by its arrival (its receiver's second says little of when the car was that fast).
-    fn newest_speed_mps(&self, stamp_ns: i64, arrival_ns: i64) -> Option<f64> {
+    /// sensor's telemetry by the turn it came after (its receiver's second says little of when the car was that fast).
+    fn newest_speed_mps(&self, stamp_ns: i64) -> Option<f64> {
         let pose = self.poses.back().map(|pose| (stamp_ns.saturating_sub(pose.stamp_ns), pose.speed_mps));
-        let told = self.told.map(|told| (arrival_ns.saturating_sub(told.arrival_ns), told.speed_mps));
+        let told_ns = |told: &Told| told.stamp_ns.unwrap_or(stamp_ns);
+        let told = self.told.map(|told| (stamp_ns.saturating_sub(told_ns(&told)), told.speed_mps));
         let age_ns_max = i64::from(self.config.speed_age_ms) * 1_000_000;
         let fresh = [pose, told].into_iter().flatten().filter(|(age_ns, _)| age_ns.saturating_abs() <= age_ns_max);
         fresh.min_by_key(|(age_ns, _)| age_ns.saturating_abs()).map(|(_, speed_mps)| speed_mps)
     }
 
-    /// How the ego frame moved through a revolution that an event of `arrival_ns` completed, in place of what `moved` held.
-    pub fn through(&self, revolution: &Revolution, arrival_ns: i64, moved: &mut Moved) {
+    /// How the ego frame moved through a revolution, in place of what `moved` held.
+    pub fn through(&self, revolution: &Revolution, moved: &mut Moved) {
         let offset = |firing: usize| i64::from(revolution.firings[firing].offset_ns);
         let stamps = knots(revolution.firings.len()).map(|firing| revolution.start_ns + offset(firing));
-        self.through_stamps(stamps, revolution.end_ns, arrival_ns, moved);
+        self.through_stamps(stamps, revolution.end_ns, moved);
     }
 
     /// The same for a scan; where its points' times are not known nothing is moved.
-    pub fn through_scan(&self, scan: &Scan, arrival_ns: i64, moved: &mut Moved) {
+    pub fn through_scan(&self, scan: &Scan, moved: &mut Moved) {
         let knots = ScanKnots::of(scan);
         let stamps = (0..knots.count()).map(|knot| scan.stamp_ns.saturating_add(knots.offset_ns(knot)));
-        self.through_stamps(stamps, scan.stamp_ns, arrival_ns, moved);
+        self.through_stamps(stamps, scan.stamp_ns, moved);
     }
 
-    fn through_stamps(
-        &self,
-        stamps: impl ExactSizeIterator<Item = i64> + Clone,
-        end_ns: i64,
-        arrival_ns: i64,
-        moved: &mut Moved,
-    ) {
+    fn through_stamps(&self, stamps: impl ExactSizeIterator<Item = i64> + Clone, end_ns: i64, moved: &mut Moved) {
         moved.end_from_ego.clear();
-        let (pose, speed_mps) = self.at(end_ns, arrival_ns);
+        let (pose, speed_mps) = self.at(end_ns);
         (moved.compensation, moved.speed_mps) = (Compensation::None, speed_mps);
         if !self.config.enabled || stamps.len() == 0 {
             return;
@@ -221,7 +226,7 @@ impl Motion {
             }
             moved.end_from_ego.clear();
         }
-        if let Some(speed_mps) = self.newest_speed_mps(end_ns, arrival_ns) {
+        if let Some(speed_mps) = self.newest_speed_mps(end_ns) {
             moved.speed_mps = Some(speed_mps);
             moved.compensation = Compensation::Speed;
             moved.end_from_ego.extend(stamps.map(|stamp_ns| straight_ahead(speed_mps, stamp_ns, end_ns)));
@@ -229,9 +234,9 @@ impl Motion {
     }
 
     /// `to_from_from`: carries points of the ego frame at one stamp into the one at another, and what is known of the way.
-    pub fn carry(&self, from_ns: i64, to_ns: i64, arrival_ns: i64) -> (Isometry3<f64>, Compensation) {
+    pub fn carry(&self, from_ns: i64, to_ns: i64) -> (Isometry3<f64>, Compensation) {
         let by_poses = || self.carry_by_poses(&self.map_from_ego(to_ns)?.inverse(), from_ns, to_ns);
-        let by_speed = || Some(straight_ahead(self.newest_speed_mps(to_ns, arrival_ns)?, from_ns, to_ns));
+        let by_speed = || Some(straight_ahead(self.newest_speed_mps(to_ns)?, from_ns, to_ns));
         if !self.config.enabled {
             return (Isometry3::identity(), Compensation::None);
         }

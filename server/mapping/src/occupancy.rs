@@ -7,25 +7,27 @@
 //! | step | paper | where |
 //! |---|---|---|
 //! | a square that scrolls with the vehicle | §2 ("ScrollingByteMap") | [`window`] |
-//! | rays to hits, and to lines traced outward from the sensor | algorithm 1 | [`fan`] |
+//! | rays to hits, and to lines traced outward from the sensor | algorithm 1 | [`fan`], [`way`] |
 //! | evidence to states; hits fade | figure 4 | [`states`] |
 //! | how many hits make a cell occupied | figure 5 | [`Occupancy::hits_needed`] |
 //!
 //! Three readings go beyond the paper's words. (1) A ray proves a cell free only where it is low over it, so that a sensor
 //! on the roof, whose rays pass over cars, serves like one in the bumper ([`fan`]). (2) Cells are judged when the map is
-//! written, from all that was told since the last one: a scan costs its points and its lines, never the grid. (3) A
+//! written: a scan costs its points, a map one set of lines a sensor and one pass over the grid. (3) A
 //! vehicle whose speed nobody knows is taken to be fast, where two hits suffice: the other way an obstacle would wait for
 //! twenty.
 //!
 //! Hits add up over maps, so a single Velodyne at 10 Hz on a standing vehicle names near cars at once and far ones after
-//! some turns; until then their cells are unknown, with their hits beside. Heights of returns are over the plane under the
-//! vehicle; those of rays that come back from the ground, over the line from there to the return.
+//! some turns; until then their cells are unknown, with the power of two that their hits reach beside, or occluded where
+//! something hides them as well. Heights of returns are over the plane under the vehicle, or over the ground about them
+//! where that dips; those of rays that come back from the ground, over the line from there to the return.
 //!
 //! Without an ego pose nobody can say where last map's cells are now: the grid is then the vehicle's own and holds only
 //! what was seen since the last map (`world_aligned` is 0).
 
 pub mod fan;
 pub mod states;
+pub mod way;
 pub mod window;
 
 use crate::config::OccupancyConfig;
@@ -105,7 +107,9 @@ impl LayerMaker for Occupancy {
             return;
         }
         self.speed_mps = rays.speed_mps;
-        self.window.follow(rays.map_from_ego.as_ref());
+        if !self.window.follow(rays.map_from_ego.as_ref()) {
+            self.fan.forget();
+        }
         self.fan.take(rays, &self.config, &mut self.window);
     }
 
@@ -116,20 +120,17 @@ impl LayerMaker for Occupancy {
         let (Cells::U8(class), Cells::U8(hits)) = (&mut class.cells, &mut hits.cells) else {
             unreachable!("layer() gives u8 and u8")
         };
+        let cells = self.window.side() * self.window.side();
         class.clear();
-        hits.clear();
-        let (mut clear, mut occupied) = (0u32, 0u32);
-        self.window.judge(needed, self.config.hold_maps, |cell| {
-            clear += u32::from(cell.state == CLEAR);
-            occupied += u32::from(cell.state == OCCUPIED);
-            class.push(cell.state);
-            hits.push(cell.hits);
-        });
-        let share = |part: u32| f64::from(part) / (class.len() as f64);
+        class.resize(cells, 0);
+        hits.resize(cells, 0);
+        let any = self.fan.tell(&self.config, &self.window, class);
+        self.window.judge([needed, self.config.hold_maps], any, class, hits);
+        let share = |state: u8| class.iter().filter(|class| **class == state).count() as f64 / cells as f64;
         layer.figures.clear();
         layer.figures.extend([
-            ("clear_share", share(clear)),
-            ("occupied_share", share(occupied)),
+            ("clear_share", share(CLEAR)),
+            ("occupied_share", share(OCCUPIED)),
             ("hits_needed", f64::from(needed)),
             ("world_aligned", f64::from(u8::from(self.window.anchored()))),
         ]);

@@ -205,7 +205,7 @@ impl Pipeline {
         let intake = intake_of(&mut self.intakes, source)?;
         let completed = intake.take_datagram(payload, &self.motion, now)?;
         if payload.len() == TELEMETRY_LENGTH {
-            intake.tell_speed(&mut self.motion, now);
+            intake.tell_speed(&mut self.motion);
             self.count(source, |ledger| ledger.telemetry += 1);
         } else {
             self.count(source, |ledger| ledger.decoded += 1);
@@ -255,6 +255,7 @@ impl Pipeline {
     /// A sensor's turn has ended: the maps that gather see it, and perhaps it makes a map.
     fn end_turn(&mut self, source: u16, now: Moment) -> bool {
         let index = usize::from(source);
+        self.motion.take_turn(self.intakes[index].turn.end_ns);
         // What comes that much too late is evidence of a world that has moved on.
         if self.fusion.is_timely(&self.intakes[index], &self.intakes, now) {
             let rays = self.intakes[index].rays(source);

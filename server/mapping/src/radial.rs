@@ -19,6 +19,9 @@ const CHUNK: usize = 1024;
 /// Buckets of the row table: the bits of r² above this one, 256 steps an octave, 0.2 % of r.
 const BUCKET_SHIFT: u32 = 15;
 
+/// 2²³: from here on floats are whole numbers, one apart.
+const WHOLE_FROM: f32 = 8_388_608.0;
+
 /// Rings nearer to one another than this cannot be told apart under 2 cm of range noise and share a row.
 const RING_SPACING_M_MIN: f32 = 0.02;
 
@@ -203,8 +206,20 @@ impl Quadrants {
         let within = quarter_angle(across, along) * self.columns_a_rad;
         // NaN fails the comparison too.
         let within = if within < self.most { within } else { self.most };
-        first + (within + offset) as i32 as u32
+        first + whole(within + offset)
     }
+}
+
+/// The whole number nearest to one from 0 to 2²²: without the checks of a cast, which would take points one at a time.
+#[inline(always)]
+pub(crate) fn nearest_whole(value: f32) -> u32 {
+    (value + WHOLE_FROM).to_bits() - WHOLE_FROM.to_bits()
+}
+
+/// The same rounded down.
+#[inline(always)]
+pub(crate) fn whole(value: f32) -> u32 {
+    nearest_whole(value) - u32::from(value + WHOLE_FROM - WHOLE_FROM > value)
 }
 
 /// atan2 of two numbers that are not negative, 0 for (0, 0): odd polynomial to degree 11 on [0, 1], mirrored at 45°.

@@ -149,7 +149,8 @@ fn middle(geometry: &Geometry, cell: usize) -> (f64, f64) {
     }
 }
 
-/// Cells at least 2 m inside a sector of encoder angles: how many, and how many of them are not unknown.
+/// Cells at least 2 m inside a sector of encoder angles: how many, and how many of them claim knowledge. `occupancy` has a
+/// name of its own for what nobody looks at, and lets what was occupied a moment ago stay so: neither is seen now.
 fn inside(layer: &Layer, (from_deg, to_deg): (f64, f64)) -> (usize, usize) {
     let Cells::U8(classes) = &layer.channels[0].cells else { panic!("{}: a class is a byte", layer.name) };
     let far_inside = |cell: &usize| {
@@ -160,7 +161,9 @@ fn inside(layer: &Layer, (from_deg, to_deg): (f64, f64)) -> (usize, usize) {
         beside > 0.0 && r * beside.sin() > 2.0
     };
     let cells: Vec<usize> = (0..classes.len()).filter(far_inside).collect();
-    (cells.len(), cells.iter().filter(|cell| classes[**cell] != 0).count())
+    let unseen = ["unknown", "out_of_range", "occupied"];
+    let known = |cell: &&usize| !unseen.contains(&layer.legend[usize::from(classes[**cell])]);
+    (cells.len(), cells.iter().filter(known).count())
 }
 
 #[test]

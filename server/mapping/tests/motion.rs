@@ -6,6 +6,7 @@ use bytes::Bytes;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::Revolution;
 use clearway_lidar::sensor::{Sensor, SensorConfig as LidarConfig};
+use clearway_lidar::telemetry::Telemetry;
 use clearway_mapping::config::{Extrinsics, MapsConfig, MotionConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
 use clearway_mapping::map::Map;
@@ -285,16 +286,23 @@ fn stamps_and_places_at_the_ends_of_their_types_move_nothing_and_break_nothing()
 
 #[test]
 fn a_speed_grows_old() {
-    let events = drive(None, false);
-    let mut pipeline = Pipeline::new(&config(MotionConfig::default()), vec![None]).unwrap();
-    let mut compensation = Vec::new();
-    for event in &events {
-        // The receiver repeats its first sentence for ever, and the packets of the second turn come late.
-        let late_ns = if compensation.is_empty() { 0 } else { 2_500_000_000 };
-        let event = Event { arrival_ns: event.arrival_ns + late_ns, ..event.clone() };
-        compensation.extend(pipeline.step(&event).unwrap().map(|map| map.compensation));
+    let telemetry = drive(None, false).into_iter().find_map(|event| match event.body {
+        Body::Datagram(payload) => Telemetry::new(&payload).ok(),
+        _ => None,
+    });
+    let gprmc = telemetry.unwrap().gprmc.unwrap();
+    let mut motion = Motion::new(&MotionConfig::default());
+    let known = |motion: &Motion, stamp_ms: i64| motion.at(stamp_ms * 1_000_000).1.is_some();
+    assert!(!known(&motion, 0));
+    motion.take_gprmc(&gprmc, None);
+    // Before the first turn has ended nobody can say when that was.
+    assert_eq!([0, 100_000].map(|stamp_ms| known(&motion, stamp_ms)), [true, true]);
+    for turn_ms in [100, 200, 300] {
+        motion.take_turn(turn_ms * 1_000_000);
+        // The receiver repeats its first sentence for ever.
+        motion.take_gprmc(&gprmc, Some(turn_ms * 1_000_000));
     }
-    assert_eq!(compensation[..2], [Compensation::Speed, Compensation::None]);
+    assert_eq!([400, 2_100, 2_101].map(|stamp_ms| known(&motion, stamp_ms)), [true, true, false]);
 }
 
 #[test]
@@ -309,7 +317,7 @@ fn a_vlp16_in_dual_return_moves_both_echoes() {
     motion.take_pose(&pose(revolution.start_ns, at(0.0, 0.0, 0.0)));
     motion.take_pose(&pose(revolution.end_ns, at(1.5, 0.0, 0.0)));
     let mut moved = Moved::default();
-    motion.through(&revolution, revolution.end_ns, &mut moved);
+    motion.through(&revolution, &mut moved);
     let mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
     let (mut rest, mut sweep) = (Sweep::default(), Sweep::default());
     rest.take_revolution(&revolution, &mount);
@@ -345,17 +353,16 @@ fn apart(a: &[[f64; 3]], b: &[[f64; 3]]) -> (f64, f64) {
     (distances[distances.len() / 2], distances.iter().sum::<f64>() / distances.len() as f64)
 }
 
-/// Revolutions of the HDL-32E capture cut at an azimuth, each with the arrival of its last packet and what GPRMC had said.
-fn hdl32e(cut_azimuth_deg: f32, motion: &mut Motion) -> Vec<(Revolution, i64)> {
+/// Revolutions of the HDL-32E capture cut at an azimuth and what GPRMC had said.
+fn hdl32e(cut_azimuth_deg: f32, motion: &mut Motion) -> Vec<Revolution> {
     let mut sensor = Sensor::new(LidarConfig { cut_azimuth_deg, ..LidarConfig::default() });
     let mut revolutions = Vec::new();
     for datagram in common::datagrams("pcap/rust-lidar-utils/hdl32_example.pcap") {
-        let arrival_ns = datagram.stamp_ns;
-        if let Ok(Some(revolution)) = sensor.push(&datagram.payload, arrival_ns) {
-            revolutions.extend(revolution.partial.is_none().then(|| (revolution.clone(), arrival_ns)));
+        if let Ok(Some(revolution)) = sensor.push(&datagram.payload, datagram.stamp_ns) {
+            revolutions.extend(revolution.partial.is_none().then(|| revolution.clone()));
         }
         if let Some(gprmc) = sensor.gprmc() {
-            motion.take_gprmc(gprmc, arrival_ns);
+            motion.take_gprmc(gprmc, sensor.newest().map(|revolution| revolution.end_ns));
         }
     }
     revolutions
@@ -375,9 +382,9 @@ fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
         range_m_min: 2.5,
     };
     // Standing things at the side the sweeps share by direction but not by firing, metres, as of the end of `at_ns`.
-    let street = |revolution: &Revolution, arrival_ns: i64, compensate: bool, first_half: bool, to_ns: i64| {
+    let street = |revolution: &Revolution, compensate: bool, first_half: bool, to_ns: i64| {
         let mut moved = Moved::default();
-        motion.through(revolution, arrival_ns, &mut moved);
+        motion.through(revolution, &mut moved);
         assert_eq!(moved.compensation, Compensation::Speed);
         let speed_mps = moved.speed_mps.unwrap();
         if !compensate {
@@ -399,18 +406,18 @@ fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
         places.into_iter().filter(standing).collect::<Vec<_>>()
     };
     let mut pairs = 0;
-    for (early, early_arrival) in &right {
+    for early in &right {
         // The one that ends half a turn later: its second half looks where the first half of this one did.
         let period_ns = early.end_ns - early.start_ns;
-        let later = left.iter().find(|(later, _)| {
+        let later = left.iter().find(|later| {
             let since = later.end_ns - early.end_ns;
             since > period_ns / 4 && since < period_ns * 3 / 4
         });
-        let Some((later, later_arrival)) = later else { continue };
+        let Some(later) = later else { continue };
         // How far one must still be shifted along the road to lie best on the other.
         let off = |compensate: bool| {
-            let a = street(early, *early_arrival, compensate, true, later.end_ns);
-            let b = street(later, *later_arrival, compensate, false, later.end_ns);
+            let a = street(early, compensate, true, later.end_ns);
+            let b = street(later, compensate, false, later.end_ns);
             assert!(a.len() > 500 && b.len() > 500, "{} and {} points", a.len(), b.len());
             let shifts = (-20..=20).map(|step| f64::from(step) * 0.05);
             let shifted = |shift: f64| a.iter().step_by(4).map(|p| [p[0] + shift, p[1], p[2]]).collect::<Vec<_>>();

@@ -51,15 +51,16 @@ fn each_arrow_of_a_cells_life_goes_where_the_table_says() {
         ("hidden", Evidence::Hidden, 0),
         ("through", Evidence::Through, 0),
         ("few hits", Evidence::Through, NEEDED - 1),
+        ("few hits, hidden", Evidence::Hidden, NEEDED - 1),
         ("hits", Evidence::Hidden, NEEDED),
     ];
     // A capital: the state is held for `hold_maps` first.
     let expected = [
-        (UNKNOWN, "u o u h c u x"),
-        (CLEAR, "u o u h c u x"),
-        (OCCUPIED, "U O U H u x x"),
-        (OCCLUDED, "u o u h c u x"),
-        (OUT_OF_RANGE, "o o u h c u x"),
+        (UNKNOWN, "u o u h c u h x"),
+        (CLEAR, "u o u h c u h x"),
+        (OCCUPIED, "U O U H u x x x"),
+        (OCCLUDED, "u o u h c u h x"),
+        (OUT_OF_RANGE, "u o u h c u h x"),
     ];
     let state_of = |letter: char| match letter.to_ascii_lowercase() {
         'u' => UNKNOWN,
@@ -414,10 +415,10 @@ fn hardly_a_clear_cell_of_the_labelled_frame_holds_an_obstacle() {
         100.0 * road,
         100.0 * obstacle
     );
-    // What leaks stands in dips beside and at the end of the road, where the ground lies under the vehicle's plane.
-    assert!(free >= 0.998, "{free}");
-    assert!(road >= 0.93, "{road}");
-    assert!(obstacle >= 0.5, "{obstacle}");
+    // What leaks hardly reaches over the vehicle's clearance.
+    assert!(free >= 0.999, "{free}");
+    assert!(road >= 0.95, "{road}");
+    assert!(obstacle >= 0.7, "{obstacle}");
 }
 
 #[test]

@@ -73,8 +73,6 @@ fn a_host_clock_that_steps_changes_no_map_of_a_sensor_on_gps_but_what_is_said_of
         assert_eq!((last.sensors[0].clock, last.sensors[0].clock_offset_ms), ("gps", step_ns / 1_000_000));
         for (map, steady) in stepped.iter_mut().zip(&steady) {
             map.completed_ns = steady.completed_ns;
-            // The age of a GPRMC's speed is the host's to tell.
-            (map.compensation, map.speed_mps) = (steady.compensation, steady.speed_mps);
             map.sensors[0].clock_offset_ms = steady.sensors[0].clock_offset_ms;
         }
         assert!(stepped == steady, "{step_ns}");

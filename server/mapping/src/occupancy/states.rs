@@ -15,6 +15,13 @@ pub const OUT_OF_RANGE: u8 = 4;
 /// Names of the states, by value.
 pub const LEGEND: &[&str] = &["unknown", "clear", "occupied", "occluded", "out_of_range"];
 
+/// Told of a cell: a sensor looks there, over it or through it.
+pub const LOOKED_AT: u8 = 1;
+/// Told of a cell: low rays of a sensor's newest scan go through it.
+pub const THROUGH: u8 = 2;
+/// Told of a cell: something hides it from a sensor.
+pub const HIDDEN: u8 = 4;
+
 /// What the rays since the last map tell of one cell; the stronger comes later and wins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Evidence {
@@ -30,10 +37,21 @@ pub enum Evidence {
     Through,
     /// The same, but earlier returns from here are not yet outweighed.
     ThroughDoubted,
-    /// Returns, with those before fewer than it takes.
+    /// Returns, with those before fewer than it takes; where the cell is hidden as well, that says more.
     FewHits,
     /// Returns, with those before as many as it takes.
     Hits,
+}
+
+/// The strongest of what was told of a cell; `any`: whether any sensor sent anything.
+pub fn evidence(told: u8, any: bool) -> Evidence {
+    match told {
+        told if told & THROUGH != 0 => Evidence::Through,
+        told if told & HIDDEN != 0 => Evidence::Hidden,
+        told if told & LOOKED_AT != 0 => Evidence::Overhead,
+        _ if any => Evidence::Nothing,
+        _ => Evidence::Silence,
+    }
 }
 
 /// What follows.
@@ -47,19 +65,16 @@ pub enum Next {
 
 use Next::{Go, Hold};
 
-/// `TRANSITIONS[state][evidence]`.
+/// `TRANSITIONS[whether the cell is occupied][evidence]`.
 ///
 /// Figure 4 says that a cell is first unobserved, and then occupied or occluded as sensors look; here every arrow is
-/// named. A clear cell loses that name the moment nobody looks at it; an occupied one keeps its name for a few maps,
-/// because what hides it, or a sensor's pause, does not make it go away.
+/// named. A cell loses its name the moment nobody confirms it; only an occupied one keeps its name for a few maps, because
+/// what hides it, or a sensor's pause, does not make it go away.
 #[rustfmt::skip]
-pub const TRANSITIONS: [[Next; 8]; 5] = [
-    // Silence            Nothing             Overhead       Hidden          Through    ThroughDoubted FewHits      Hits
-    [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // unknown
-    [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // clear
-    [Hold(UNKNOWN),      Hold(OUT_OF_RANGE), Hold(UNKNOWN), Hold(OCCLUDED), Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // occupied
-    [Go(UNKNOWN),        Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // occluded
-    [Go(OUT_OF_RANGE),   Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // out_of_range
+pub const TRANSITIONS: [[Next; 8]; 2] = [
+    // Silence       Nothing             Overhead       Hidden          Through    ThroughDoubted FewHits      Hits
+    [Go(UNKNOWN),   Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // any other
+    [Hold(UNKNOWN), Hold(OUT_OF_RANGE), Hold(UNKNOWN), Hold(OCCLUDED), Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // occupied
 ];
 
 /// What is kept of a cell from map to map.
@@ -74,6 +89,16 @@ pub struct Cell {
 }
 
 impl Cell {
+    /// The hits as published: 255 in an occupied cell, in an unknown one the power of two they reach (what tells 20 returns
+    /// from 23 is chance, and would be half of the layer's bytes), 0 in any other.
+    pub fn level(self) -> u8 {
+        match (self.state, self.hits) {
+            (OCCUPIED, hits) => hits,
+            (UNKNOWN, hits) if hits > 0 => 1 << hits.ilog2(),
+            _ => 0,
+        }
+    }
+
     /// The cell one map later: `fresh` returns came from it, and `told` is the strongest of what other rays tell
     /// ([`Evidence::Silence`] to [`Evidence::Through`]). It takes `hits_needed` returns (at least 1) to be occupied.
     #[inline(always)]
@@ -82,16 +107,20 @@ impl Cell {
         if fresh > 0 {
             // Returns win over rays that went through in the same cycle: something is there, or was a moment ago.
             hits = hits.saturating_add(fresh);
-            evidence = if hits >= hits_needed { Evidence::Hits } else { Evidence::FewHits };
+            evidence = match told {
+                _ if hits >= hits_needed => Evidence::Hits,
+                Evidence::Hidden => Evidence::Hidden,
+                _ => Evidence::FewHits,
+            };
         } else if told == Evidence::Through {
             // No longer enough at once, so that nothing leaves a trail; not forgotten at once, so that a thin thing that
             // rays miss now and then is never clear.
             hits = (hits >> 2).min(hits_needed - 1);
             evidence = if hits > 0 { Evidence::ThroughDoubted } else { Evidence::Through };
         }
-        let age = if evidence as u8 >= Evidence::Through as u8 { 0 } else { self.age.saturating_add(1) };
+        let age = if fresh > 0 || told == Evidence::Through { 0 } else { self.age.saturating_add(1) };
         let over = age > hold_maps;
-        let state = match TRANSITIONS[usize::from(self.state)][evidence as usize] {
+        let state = match TRANSITIONS[usize::from(self.state == OCCUPIED)][evidence as usize] {
             Go(state) => state,
             Hold(later) => {
                 if over {

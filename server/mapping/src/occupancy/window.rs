@@ -1,20 +1,17 @@
 //! The square of cells about the vehicle, its axes the world's, scrolled by whole cells.
 //!
-//! In: where the vehicle is; what rays tell of cells. Out: every cell, judged and written row by row.
+//! In: where the vehicle is; returns. Out: every cell, judged and written.
 //!
 //! World cell (i, j) is kept at (i mod n, j mod n), n the power of two over the window's side: nothing moves when the
-//! vehicle does, and only the rows and columns that come into the window are cleared.
+//! vehicle does. Of most cells nothing is kept at all; those with returns are listed, and only they are looked after.
 
 use nalgebra::Isometry3;
 
-use super::states::{Cell, Evidence};
+use super::states::{Cell, evidence};
+use crate::radial::whole;
 
-/// A cell's evidence: the number of the last scan that saw it clear, counted from 1 since the last map, and these.
-const SCANS: u16 = (1 << 14) - 1;
-const HIDDEN: u16 = 1 << 14;
-const LOOKED_AT: u16 = 1 << 15;
-/// Fraction bits of positions on a trace. So many, because a trace must fall on a border of cells never, not seldom.
-const FRACTION: u32 = 32;
+/// Beside a state: it stands already. Beyond all that can be told of a cell.
+const JUDGED: u8 = 8;
 
 /// Where the ego frame lies in the window.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -25,7 +22,7 @@ pub struct Place {
     pub yaw_rad: f64,
 }
 
-/// The window, what is known of its cells, and what has been told since the last map.
+/// The window, and what is known of its cells.
 pub struct Window {
     side: usize,
     cell_m: f64,
@@ -36,28 +33,24 @@ pub struct Window {
     anchored: bool,
     place: Place,
     cells: Vec<Cell>,
-    told: Vec<u16>,
+    /// Returns from each cell since the last map.
     fresh: Vec<u8>,
-    /// The sensor of each scan since the last map, from scan 1 on.
-    scans: Vec<u16>,
-    /// Whether each of them is its sensor's last.
-    newest: Vec<bool>,
+    /// Indices of the cells with returns, then or before, each once.
+    listed: Vec<u32>,
 }
 
-/// A way of equal steps through the window; gives the index of the cell at the middle of each step.
-pub struct Trace {
-    at: [i64; 2],
-    step: [i64; 2],
-    mask: i64,
-    bits: u32,
+/// From the ego frame, metres, into the window, cells from its corner.
+pub struct FromEgo {
+    at: [f32; 2],
+    turn: [f32; 2],
 }
 
-impl Trace {
-    /// The cell in the middle of step `number`.
+impl FromEgo {
+    /// Where a place lies.
     #[inline(always)]
-    pub fn cell(&self, number: usize) -> usize {
-        let axis = |i: usize| ((self.at[i] + self.step[i] * number as i64) >> FRACTION) & self.mask;
-        (axis(1) << self.bits | axis(0)) as usize
+    pub fn place(&self, x: f32, y: f32) -> [f32; 2] {
+        let ([px, py], [cos, sin]) = (self.at, self.turn);
+        [px + x * cos - y * sin, py + x * sin + y * cos]
     }
 }
 
@@ -65,7 +58,6 @@ impl Window {
     /// A window of `side` cells nobody has looked at.
     pub fn new(side: usize, cell_m: f64) -> Self {
         let bits = side.next_power_of_two().trailing_zeros();
-        let cells = 1 << (2 * bits);
         Self {
             side,
             cell_m,
@@ -73,17 +65,20 @@ impl Window {
             corner: [0, 0],
             anchored: false,
             place: Place { cells: [side as f64 / 2.0; 2], yaw_rad: 0.0 },
-            cells: vec![Cell::default(); cells],
-            told: vec![0; cells],
-            fresh: vec![0; cells],
-            scans: vec![0],
-            newest: vec![false],
+            cells: vec![Cell::default(); 1 << (2 * bits)],
+            fresh: vec![0; 1 << (2 * bits)],
+            listed: Vec::new(),
         }
     }
 
     /// Cells a side.
     pub fn side(&self) -> usize {
         self.side
+    }
+
+    /// World index of the first cell.
+    pub fn corner(&self) -> [i64; 2] {
+        self.corner
     }
 
     /// Where the ego frame lies.
@@ -96,181 +91,107 @@ impl Window {
         self.anchored
     }
 
-    /// Scrolls to the vehicle. Without a pose the window is the vehicle's own, and holds nothing of before.
-    pub fn follow(&mut self, map_from_ego: Option<&Isometry3<f64>>) {
+    /// Scrolls to the vehicle. Without a pose the window is the vehicle's own. Whether what was seen before still has a
+    /// place in it: not when a first pose comes, or none comes any more.
+    pub fn follow(&mut self, map_from_ego: Option<&Isometry3<f64>>) -> bool {
         let half = (self.side / 2) as i64;
+        let goes_on = self.anchored == map_from_ego.is_some();
+        if !goes_on {
+            self.forget();
+        }
+        self.anchored = map_from_ego.is_some();
         let Some(pose) = map_from_ego else {
-            if self.anchored {
-                self.forget();
-                self.anchored = false;
-                self.corner = [0, 0];
-                self.place = Place { cells: [half as f64; 2], yaw_rad: 0.0 };
-            }
-            return;
+            self.corner = [0, 0];
+            self.place = Place { cells: [half as f64; 2], yaw_rad: 0.0 };
+            return goes_on;
         };
         let forward = pose.rotation * nalgebra::Vector3::x();
         let at = [pose.translation.x / self.cell_m, pose.translation.y / self.cell_m];
-        let corner = at.map(|cells| cells.floor() as i64 - half);
-        if self.anchored {
-            self.scroll(corner);
-        } else {
-            self.forget();
-            self.anchored = true;
-        }
-        self.corner = corner;
-        let cells = [0, 1].map(|i| at[i] - corner[i] as f64);
+        self.scroll(at.map(|cells| cells.floor() as i64 - half));
+        let cells = [0, 1].map(|i| at[i] - self.corner[i] as f64);
         self.place = Place { cells, yaw_rad: forward.y.atan2(forward.x) };
+        goes_on
     }
 
     fn forget(&mut self) {
-        self.cells.fill(Cell::default());
-        self.told.fill(0);
-        self.fresh.fill(0);
+        for index in self.listed.drain(..) {
+            (self.cells[index as usize], self.fresh[index as usize]) = (Cell::default(), 0);
+        }
     }
 
-    /// Clears what comes into a window with this corner.
+    /// Moves the corner; forgets what leaves the window.
     fn scroll(&mut self, corner: [i64; 2]) {
-        let side = self.side as i64;
-        let entering = [0, 1].map(|i| {
-            let moved = corner[i] - self.corner[i];
-            if moved > 0 {
-                (self.corner[i] + side).max(corner[i])..corner[i] + side
-            } else {
-                corner[i]..(corner[i] - moved).min(corner[i] + side)
+        if corner == self.corner {
+            return;
+        }
+        let mut listed = std::mem::take(&mut self.listed);
+        listed.retain(|index| {
+            let cell = self.cell(*index);
+            let stays = [0, 1].into_iter().all(|i| {
+                let at = self.corner[i] + cell[i] as i64 - corner[i];
+                (0..self.side as i64).contains(&at)
+            });
+            if !stays {
+                (self.cells[*index as usize], self.fresh[*index as usize]) = (Cell::default(), 0);
             }
+            stays
         });
-        let [columns, rows] = entering;
-        for y in corner[1]..corner[1] + side {
-            for x in columns.clone() {
-                self.clear(x, y);
-            }
-        }
-        for y in rows {
-            for x in corner[0]..corner[0] + side {
-                self.clear(x, y);
-            }
-        }
+        (self.listed, self.corner) = (listed, corner);
     }
 
-    fn clear(&mut self, x: i64, y: i64) {
-        let index = self.index(x, y);
-        (self.cells[index], self.told[index], self.fresh[index]) = (Cell::default(), 0, 0);
-    }
-
-    /// Index of a world cell.
-    #[inline(always)]
-    fn index(&self, x: i64, y: i64) -> usize {
+    /// Where a listed cell lies from the corner.
+    fn cell(&self, index: u32) -> [usize; 2] {
         let mask = (1 << self.bits) - 1;
-        ((y & mask) << self.bits | (x & mask)) as usize
+        let from = |at: u32, i: usize| ((i64::from(at) - self.corner[i]) & mask) as usize;
+        [from(index, 0), from(index >> self.bits, 1)]
+    }
+
+    /// The way from the ego frame into the window, for as long as the vehicle stays where it is.
+    pub fn from_ego(&self) -> FromEgo {
+        let (sin, cos) = self.place.yaw_rad.sin_cos();
+        let turn = [cos, sin].map(|part| (part / self.cell_m) as f32);
+        FromEgo { at: self.place.cells.map(|cells| cells as f32), turn }
     }
 
     /// Counts a return from a place, cells from the window's corner.
     #[inline(always)]
-    pub fn hit(&mut self, x: f32, y: f32) {
+    pub fn hit(&mut self, [x, y]: [f32; 2]) {
         let side = self.side as f32;
         // NaN fails every comparison.
         if x >= 0.0 && y >= 0.0 && x < side && y < side {
-            let index = self.index(self.corner[0] + x as i64, self.corner[1] + y as i64);
-            self.fresh[index] = self.fresh[index].saturating_add(1);
-        }
-    }
-
-    /// The way from a place (cells from the corner) in a direction (length 1), in steps of a cell; and how many of its
-    /// steps lie in the window: none from a place outside.
-    pub fn trace(&self, from: [f64; 2], direction: [f64; 2]) -> (Trace, usize) {
-        let side = self.side as f64;
-        let inside = from.iter().all(|at| (0.0..side).contains(at));
-        let from = if inside { from } else { [0.0; 2] };
-        let fixed = |cells: f64| (cells * (1_i64 << FRACTION) as f64).round() as i64;
-        let mask = (1 << self.bits) - 1;
-        let step = direction.map(fixed);
-        let at = [0, 1].map(|i| ((self.corner[i] & mask) << FRACTION) + fixed(from[i]) + step[i] / 2);
-        let way = |i: usize| {
-            let (at, d) = (from[i], direction[i]);
-            if d > 0.0 {
-                (side - at) / d
-            } else if d < 0.0 {
-                at / -d
-            } else {
-                f64::INFINITY
+            let mask = (1 << self.bits) - 1;
+            let [x, y] = [(x, 0), (y, 1)].map(|(at, i)| (self.corner[i] + i64::from(whole(at))) & mask);
+            let index = (y << self.bits | x) as usize;
+            let fresh = &mut self.fresh[index];
+            if *fresh == 0 && self.cells[index].hits == 0 {
+                self.listed.push(index as u32);
             }
-        };
-        // The last middle of a step before the border.
-        let steps = if inside { (way(0).min(way(1)) - 0.5).ceil().max(0.0) as usize } else { 0 };
-        (Trace { at, step, mask, bits: self.bits }, steps)
-    }
-
-    /// Begins a sensor's next scan.
-    pub fn begin_scan(&mut self, sensor: u16) {
-        if self.scans.len() > usize::from(SCANS) {
-            // Nobody has asked for a map for so long that what was seen is of no use.
-            self.told.fill(0);
-            self.scans.truncate(1);
-        }
-        self.scans.push(sensor);
-    }
-
-    /// These steps of a trace of the scan just begun are hidden from its sensor.
-    #[inline(always)]
-    pub fn hide(&mut self, trace: &Trace, steps: std::ops::Range<usize>) {
-        let sensor = self.scans[self.scans.len() - 1];
-        for step in steps {
-            let told = &mut self.told[trace.cell(step)];
-            // What this sensor saw clear a moment ago it does not see any more.
-            let others = self.scans[usize::from(*told & SCANS)] != sensor;
-            *told = *told & if others { SCANS } else { 0 } | HIDDEN | LOOKED_AT;
+            *fresh = fresh.saturating_add(1);
         }
     }
 
-    /// The scan just begun looks over these steps of its trace; where `clear(step)`, it sees that nothing is there.
-    #[inline(always)]
-    pub fn look(&mut self, trace: &Trace, steps: std::ops::Range<usize>, clear: impl Fn(usize) -> bool) {
-        let scan = self.scans.len() as u16 - 1;
-        for step in steps {
-            let told = &mut self.told[trace.cell(step)];
-            *told = if clear(step) { *told & !SCANS | scan } else { *told } | LOOKED_AT;
-        }
-    }
-
-    /// Marks the last scan of each sensor; only these say what is clear now.
-    fn find_newest(&mut self) {
-        self.newest.clear();
-        self.newest.resize(self.scans.len(), false);
-        for scan in (1..self.scans.len()).rev() {
-            self.newest[scan] = !self.scans[scan + 1..].contains(&self.scans[scan]);
-        }
-    }
-
-    /// Judges every cell by what was told of it since the last map, and gives each, row by row, to `write`.
-    pub fn judge(&mut self, hits_needed: u8, hold_maps: u8, mut write: impl FnMut(Cell)) {
-        self.find_newest();
-        let nothing = if self.scans.len() > 1 { Evidence::Nothing } else { Evidence::Silence };
-        let n = 1 << self.bits;
-        let first = (self.corner[0] & (n as i64 - 1)) as usize;
-        for y in 0..self.side as i64 {
-            let row = self.index(0, self.corner[1] + y);
-            // A row that reaches over the end goes on at the beginning.
-            let before = (n - first).min(self.side);
-            for part in [row + first..row + first + before, row..row + self.side - before] {
-                let cells = self.cells[part.clone()].iter_mut();
-                for ((cell, told), fresh) in cells.zip(&mut self.told[part.clone()]).zip(&mut self.fresh[part]) {
-                    let strongest = match *told {
-                        0 => nothing,
-                        told if self.newest[usize::from(told & SCANS)] => Evidence::Through,
-                        told if told & HIDDEN != 0 => Evidence::Hidden,
-                        // Or seen clear, and then lost out of sight.
-                        _ => Evidence::Overhead,
-                    };
-                    *cell = cell.judged(*fresh, strongest, hits_needed, hold_maps);
-                    (*told, *fresh) = (0, 0);
-                    write(*cell);
-                }
-            }
-        }
-        self.scans.truncate(1);
+    /// Judges every cell. In: in `class` what was told of it since the last map ([`super::states::LOOKED_AT`] and so on), and
+    /// whether any sensor sent anything. Out: the states in `class`, the returns in `hits`.
+    pub fn judge(&mut self, [needed, hold_maps]: [u8; 2], any: bool, class: &mut [u8], hits: &mut [u8]) {
+        hits.fill(0);
+        let mut listed = std::mem::take(&mut self.listed);
+        listed.retain(|index| {
+            let ([x, y], index) = (self.cell(*index), *index as usize);
+            let (at, fresh) = (y * self.side + x, std::mem::take(&mut self.fresh[index]));
+            let cell = self.cells[index].judged(fresh, evidence(class[at], any), needed, hold_maps);
+            (class[at], hits[at]) = (JUDGED | cell.state, cell.level());
+            self.cells[index] = if cell.hits > 0 { cell } else { Cell::default() };
+            cell.hits > 0
+        });
+        self.listed = listed;
+        let states: [u8; 16] = std::array::from_fn(|told| match told as u8 {
+            told if told & JUDGED != 0 => told & !JUDGED,
+            told => Cell::default().judged(0, evidence(told, any), needed, hold_maps).state,
+        });
+        class.iter_mut().for_each(|class| *class = states[usize::from(*class & 15)]);
         if !self.anchored {
             // Nobody knows where these cells will be when the next map is made.
-            self.cells.fill(Cell::default());
+            self.forget();
         }
     }
 }
