@@ -446,7 +446,7 @@ impl<'a> House<'a> {
         let stuck = self.plant == Some(Plant::StuckStamp);
         if let Some(before) = self.maps.last().filter(|before| stuck || before.capture_end_ns >= encoded.capture_end_ns)
         {
-            let back_ms = (before.capture_end_ns - encoded.capture_end_ns) / 1_000_000;
+            let back_ms = before.capture_end_ns.saturating_sub(encoded.capture_end_ns) / 1_000_000;
             let found = format!("{back_ms} ms before map {}: {}", before.sequence, describe(map));
             return Err(breach("stamps", found));
         }

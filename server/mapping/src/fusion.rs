@@ -79,7 +79,8 @@ impl Fusion {
             index == source || (self.is_fresh(&intakes[index], now) && self.is_timely(&intakes[index], intakes, now))
         });
         let may = self.is_timely(&intakes[source], intakes, now) && (overdue || leads == Some(source));
-        may && (overdue || (self.is_due(source, &intakes[source]) && self.is_newer(source, &intakes[source])))
+        let newer = self.is_newer(source, &intakes[source], overdue);
+        may && newer && (overdue || self.is_due(source, &intakes[source]))
     }
 
     /// Whether `period_ms` has passed since this sensor made the last map. A clock set back is due at once.
@@ -91,9 +92,13 @@ impl Fusion {
     }
 
     /// Whether the turn ended after the last map's stamp: where another sensor takes over, its newest turn may be the older
-    /// one. The same sensor's stamps rise by themselves, unless its clock was set back.
-    fn is_newer(&self, source: usize, intake: &Intake) -> bool {
-        self.last.is_none_or(|made| made.maker == source || intake.turn.end_ns > made.stamp_ns)
+    /// one. The same sensor's stamps rise by themselves, unless its clock was set back; all clocks may have been, once a map
+    /// is overdue and the turn older by more than the deadline.
+    fn is_newer(&self, source: usize, intake: &Intake, overdue: bool) -> bool {
+        self.last.is_none_or(|made| {
+            let newer_ns = intake.turn.end_ns.saturating_sub(made.stamp_ns);
+            made.maker == source || newer_ns > 0 || (overdue && newer_ns < -self.deadline_ns)
+        })
     }
 
     fn order(&self, sensors: usize) -> impl Iterator<Item = usize> {

@@ -116,10 +116,11 @@ impl Fate {
             let from_ns = dice.of(2 * TURN_NS..HEAL_NS - TURN_NS);
             from_ns..(from_ns + dice.of(1..longest_ns)).min(HEAL_NS)
         };
-        let trouble = |dice: &mut Dice| Trouble {
-            silent: dice.happens(0.25).then(|| during(dice, HEAL_NS)),
-            restart: (!plain && dice.happens(0.15))
-                .then(|| (dice.of(2 * TURN_NS..HEAL_NS), dice.of(0..3_600_000_000) as u32)),
+        let trouble = |dice: &mut Dice| {
+            let silent = dice.happens(0.25).then(|| during(dice, HEAL_NS));
+            let restarts = !plain && silent.is_none() && dice.happens(0.15);
+            let restart = || (dice.of(2 * TURN_NS..HEAL_NS), dice.of(0..3_600_000_000) as u32);
+            Trouble { silent, restart: restarts.then(restart) }
         };
         let troubles: Vec<Trouble> = (0..sensors).map(|_| trouble(&mut dice)).collect();
         // A silence during which the host's clock steps cannot be told from a restart until telemetry tells; stamps that
