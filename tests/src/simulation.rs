@@ -324,7 +324,7 @@ impl<'a> House<'a> {
                             trouble::cover_scan(&mut observation, sector, mount);
                         }
                     }
-                    self.waiting.push_back(observation);
+                    self.waiting.push_back(*observation);
                 }
             }
         }

@@ -29,7 +29,7 @@ pub enum What {
     /// Of a turning sensor, by its index.
     Datagram(usize, Datagram),
     /// Of the whole car, or of the sensor it names.
-    Observation(v1::Observation),
+    Observation(Box<v1::Observation>),
 }
 
 /// A drive, and the configuration of the car.
@@ -66,7 +66,7 @@ impl Drive {
         let told = rig.told().take_while(|told| told.stamp_ns < end_ns);
         sent.extend(told.map(|told| Sent {
             offset_ns: told.stamp_ns - START_NS,
-            what: What::Observation(told.observation.into()),
+            what: What::Observation(Box::new(told.observation.into())),
         }));
         sent.sort_by_key(|sent| sent.offset_ns);
         let mut config = Config::of_one_vehicle("car", "top");

@@ -24,7 +24,7 @@ impl Dice {
     }
 
     /// A well mixed number.
-    pub fn next(&mut self) -> u64 {
+    pub fn draw(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(1);
         mixed(self.0)
     }
@@ -169,7 +169,7 @@ fn network(dice: &mut Dice, plain: bool) -> Faults {
         burst_packets: dice.of(1..200) as u32,
         reorder: if dice.happens(0.3) { dice.of(1..33) as u32 } else { 0 },
         delay_ns: if dice.happens(0.3) { dice.of(0..5_000_000) } else { 0 },
-        seed: dice.next(),
+        seed: dice.draw(),
     }
 }
 

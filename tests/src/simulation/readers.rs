@@ -68,7 +68,7 @@ pub fn readers(dice: &mut Dice, layers: &[&'static str]) -> Vec<Reader> {
     ];
     let reader = |(habit, max_in_flight)| {
         let wanted = layers.iter().filter(|_| dice.happens(0.5)).map(|&layer| layer.to_owned()).collect();
-        let dice = Dice::new(dice.next());
+        let dice = Dice::new(dice.draw());
         let (open, last, in_flight) = (None, None, VecDeque::new());
         let (looks_ns, updates, skipped) = (0, 0, 0);
         Reader { habit, layers: wanted, max_in_flight, dice, looks_ns, open, last, in_flight, updates, skipped }
@@ -141,7 +141,7 @@ impl Reader {
                 0 => Some(0),
                 1 => Some(u64::MAX),
                 2 => None,
-                3 => Some(self.dice.next()),
+                3 => Some(self.dice.draw()),
                 _ => self.last,
             },
             _ => self.last,

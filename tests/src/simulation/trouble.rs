@@ -80,7 +80,7 @@ pub fn cover_scan(observation: &mut v1::Observation, sector_deg: &Range<i64>, eg
 pub fn garbage(dice: &mut Dice) -> Vec<u8> {
     let lengths = [0, 1, 42, 511, 512, 513, 1205, 1206, 1206, 1206, 1207, 1535];
     let length = lengths[dice.of(0..lengths.len() as i64) as usize];
-    (0..length).map(|_| dice.next() as u8).collect()
+    (0..length).map(|_| dice.draw() as u8).collect()
 }
 
 /// An observation that cannot be one, of a sensor that there is or is not.
