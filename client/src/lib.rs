@@ -56,7 +56,7 @@ use clearway_proto::map::MapError;
 pub enum ClientError {
     /// An address that is none.
     #[error(
-        "server address {address:?}: {reason}; HOST:PORT is allowed, such as localhost:50051; with certificates too"
+        "server address {address:?}: {reason}; HOST:PORT or http://HOST:PORT is allowed, such as localhost:50051, and https://HOST:PORT with certificates"
     )]
     Address {
         /// As given.

@@ -13,6 +13,13 @@ pub use clearway_proto::v1::{RoadFrame, RoadPurpose, Sensor};
 #[derive(Clone, Debug, PartialEq)]
 pub struct Observation(pub(crate) v1::Observation);
 
+impl From<Observation> for v1::Observation {
+    /// As the wire carries it, not numbered yet.
+    fn from(observation: Observation) -> Self {
+        observation.0
+    }
+}
+
 impl Observation {
     fn of(sensor: &str, body: v1::observation::Body) -> Self {
         Self(v1::Observation { sensor: sensor.into(), body: Some(body), ..Default::default() })

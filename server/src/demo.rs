@@ -1,27 +1,31 @@
 //! The whole house in one process, on loopback: a simulated vehicle sends real UDP datagrams in real time at a server of
-//! its own; a line a second says what comes of them.
+//! its own, and with many sensors scans, poses and roads over real gRPC; a line a second says what comes of them.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use clearway_client::picture::{self, Style};
-use clearway_mapping::config::Extrinsics;
 use clearway_proto::codec::Limits;
 use clearway_proto::map::decode_map;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
-use clearway_sim::send::{Pace, Sent, Until, drive};
-use clearway_sim::vehicle::SimulatedVehicle;
+use clearway_sim::send::Sent;
+use clearway_sim::traffic::street;
 use serde_json::{Value, json};
+use tokio::time::MissedTickBehavior;
 
-use crate::config::{Config, Udp};
+use crate::config::{Config, Sender, Udp};
 use crate::ingest::now_ns;
 use crate::server::{Running, Server, Setup, StartError};
 use crate::status::Snapshot;
 use crate::wire::EncodedMap;
+
+use car::Car;
+use rig::Rig;
+
+pub mod car;
+pub mod rig;
 
 /// The last datagrams are through the sockets long before this.
 const SETTLE: Duration = Duration::from_millis(500);
@@ -35,6 +39,8 @@ pub struct Options {
     pub record: PathBuf,
     /// Where to draw the newest map, each second anew.
     pub picture: PathBuf,
+    /// Two turning LIDARs and six that scan, poses and roads, in traffic; else one on the roof, in the town.
+    pub many_sensors: bool,
     /// Ports of the operating system's choice everywhere, for tests that run beside each other.
     pub any_port: bool,
 }
@@ -87,6 +93,9 @@ pub enum DemoError {
     /// The simulated vehicle could not send.
     #[error("the simulated vehicle: {0}")]
     Vehicle(#[from] std::io::Error),
+    /// The simulated vehicle's scans, poses or roads could not be told.
+    #[error("the simulated vehicle: {0}")]
+    Told(#[from] clearway_client::ClientError),
 }
 
 /// What came of it.
@@ -165,17 +174,9 @@ pub async fn demo(
         picture: options.picture.clone(),
         notes,
     });
-    let (data, telemetry) = running.doors[0].udp.unwrap_or((nowhere, nowhere));
-    let halt = Arc::new(AtomicBool::new(false));
-    let vehicle = std::thread::Builder::new().name("simulated vehicle".into()).spawn({
-        let halt = halt.clone();
-        move || {
-            let scene = town();
-            // Last of all, so that the vehicle's first firing is now.
-            let vehicle = SimulatedVehicle::starting_at(scene, ScannerConfig::default(), now_ns());
-            drive(vehicle, data, telemetry, Pace::RealTime, Until { stop: Some(&halt), device_time: None })
-        }
-    })?;
+    let doors = running.doors[0].udp.unwrap_or((nowhere, nowhere));
+    // Last of all, so that the vehicle's first firing is now.
+    let car = Car::start(vehicle(&options, now_ns()), doors, running.grpc.unwrap_or(nowhere))?;
 
     let began = tokio::time::Instant::now();
     let end = async {
@@ -191,10 +192,12 @@ pub async fn demo(
         Second { elapsed: began.elapsed(), snapshot, age_ms }
     };
     let mut every = tokio::time::interval_at(began + Duration::from_secs(1), Duration::from_secs(1));
+    every.set_missed_tick_behavior(MissedTickBehavior::Skip);
     loop {
         tokio::select! {
             biased;
             () = &mut stop => break,
+            () = &mut end => break,
             _ = every.tick() => {
                 second(&now(&running));
                 let newest = running.vehicles.0[0].newest.borrow().clone();
@@ -202,18 +205,13 @@ pub async fn demo(
                     tokio::task::block_in_place(|| draw(&map, &options.picture))?;
                 }
             }
-            () = &mut end => break,
         }
-        if vehicle.is_finished() {
+        if car.has_stopped() {
             break;
         }
     }
     let last = now(&running);
-    halt.store(true, Ordering::Relaxed);
-    let sent = match tokio::task::spawn_blocking(move || vehicle.join()).await {
-        Ok(Ok(sent)) => sent,
-        Ok(Err(_)) | Err(_) => Err(std::io::Error::other("panicked")),
-    };
+    let sent = car.stop().await;
     let status = running.vehicles.0[0].status.clone();
     let on_their_way = || {
         let ledger = status.snapshot().ledger;
@@ -242,6 +240,14 @@ fn draw(map: &EncodedMap, file: &Path) -> Result<(), DemoError> {
     std::fs::rename(&unfinished, file).map_err(|error| wrong(error.to_string()))
 }
 
+/// The car, its scene beginning at `start_ns`.
+fn vehicle(options: &Options, start_ns: i64) -> Rig {
+    if options.many_sensors {
+        return Rig::many(street(8.0), start_ns);
+    }
+    Rig { scene: town(), start_ns, scanners: vec![("top".into(), ScannerConfig::default())], units: Vec::new() }
+}
+
 /// The usual ports where they are free, any where they are not.
 fn configuration(options: &Options) -> (Config, Vec<String>) {
     let mut config = Config::of_one_vehicle("car", "top");
@@ -264,19 +270,19 @@ fn configuration(options: &Options) -> (Config, Vec<String>) {
     config.zenoh.enabled = cfg!(feature = "zenoh");
     config.zenoh.listen = vec![format!("tcp/{zenoh}")];
     config.recorder.file = options.record.clone();
-    let vehicle = &mut config.vehicles[0];
     let any = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
-    vehicle.udp = Some(Udp { data: any, telemetry: any, ..Udp::default() });
-    // The simulated vehicle knows where its sensor is.
-    let mounted = ScannerConfig::default().ego_from_sensor;
-    let (roll, pitch, yaw) = mounted.rotation.euler_angles();
-    vehicle.sensors[0].extrinsics = Extrinsics {
-        x_m: mounted.translation.x,
-        y_m: mounted.translation.y,
-        z_m: mounted.translation.z,
-        roll_deg: roll.to_degrees(),
-        pitch_deg: pitch.to_degrees(),
-        yaw_deg: yaw.to_degrees(),
-    };
+    let rig = self::vehicle(options, 0);
+    let vehicle = &mut config.vehicles[0];
+    let sender =
+        |(index, (name, _)): (usize, &(String, _))| (name.clone(), Sender::Address(car::address(index).into()));
+    let from = rig.scanners.iter().enumerate().map(sender).filter(|_| options.many_sensors).collect();
+    vehicle.udp = Some(Udp { data: any, telemetry: any, from, ..Udp::default() });
+    vehicle.maps.speed.enabled |= options.many_sensors;
+    // The simulated vehicle knows where its sensors are.
+    if options.many_sensors {
+        vehicle.sensors = rig.sensors();
+    } else {
+        vehicle.sensors[0].extrinsics = rig::extrinsics(&rig.scanners[0].1.ego_from_sensor);
+    }
     (config, notes)
 }

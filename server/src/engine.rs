@@ -55,14 +55,24 @@ impl Engine {
                 }
             }
             let _stopped = Stopped(self.status.clone());
-            while let Some(Queued { event, ticket }) = self.next(&events) {
-                let outcome = self.take(&event);
-                // Behind everything else: whoever hears that an event was taken finds its map.
-                if let Some(ticket) = ticket {
-                    ticket.tell(Verdict::of(outcome));
-                }
+            while let Some(queued) = self.next(&events) {
+                self.take(queued);
             }
         })
+    }
+
+    /// Takes one event, without a thread: what [`Engine::start`] does with each.
+    pub fn take(&mut self, Queued { event, ticket }: Queued) {
+        let outcome = self.step(&event);
+        // Behind everything else: whoever hears that an event was taken finds its map.
+        if let Some(ticket) = ticket {
+            ticket.tell(Verdict::of(outcome));
+        }
+    }
+
+    /// Brings the status up to date: what [`Engine::start`] does whenever nothing waits.
+    pub fn rest(&self) {
+        self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors());
     }
 
     /// The next event; the status is brought up to date whenever there is nothing else to do.
@@ -70,7 +80,7 @@ impl Engine {
         match events.try_recv() {
             Ok(queued) => Some(queued),
             Err(TryRecvError::Empty) => {
-                self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors());
+                self.rest();
                 events.recv().ok().or_else(|| self.last())
             }
             Err(TryRecvError::Disconnected) => self.last(),
@@ -78,11 +88,11 @@ impl Engine {
     }
 
     fn last(&self) -> Option<Queued> {
-        self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors());
+        self.rest();
         None
     }
 
-    fn take(&mut self, event: &Event) -> Result<(), Rejected> {
+    fn step(&mut self, event: &Event) -> Result<(), Rejected> {
         if let Some(journal) = &self.journal {
             journal.event(event);
         }
@@ -103,7 +113,7 @@ impl Engine {
         });
         let latency = started.elapsed();
         // The status first: whoever has seen a map finds it counted.
-        self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors());
+        self.rest();
         if let Some((encoded, states)) = made {
             self.status.mapped(&encoded, states, latency);
             self.newest.send_replace(Some(encoded.clone()));

@@ -54,11 +54,39 @@ pub struct Queued {
     pub ticket: Option<Ticket>,
 }
 
+/// Gives the time, ns since the Unix epoch: the system's by default, a simulation's own.
+#[derive(Clone)]
+pub struct Clock(Arc<dyn Fn() -> i64 + Send + Sync>);
+
+impl Clock {
+    /// A clock that shows what `now` gives.
+    pub fn new(now: impl Fn() -> i64 + Send + Sync + 'static) -> Self {
+        Self(Arc::new(now))
+    }
+
+    fn now_ns(&self) -> i64 {
+        (self.0)()
+    }
+}
+
+impl Default for Clock {
+    fn default() -> Self {
+        Self::new(now_ns)
+    }
+}
+
+impl std::fmt::Debug for Clock {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("Clock").field(&self.now_ns()).finish()
+    }
+}
+
 /// One vehicle's door. Clones share numbering and queue; the queue ends when the last clone is dropped.
 #[derive(Clone, Debug)]
 pub struct Door {
     shared: Arc<Mutex<Inside>>,
     outside: Arc<Outside>,
+    clock: Clock,
 }
 
 /// A way to a door that does not keep it open.
@@ -66,12 +94,14 @@ pub struct Door {
 pub struct WeakDoor {
     shared: Weak<Mutex<Inside>>,
     outside: Arc<Outside>,
+    clock: Clock,
 }
 
 impl WeakDoor {
     /// The door, while somebody else keeps it open.
     pub fn door(&self) -> Option<Door> {
-        Some(Door { shared: self.shared.upgrade()?, outside: self.outside.clone() })
+        let (outside, clock) = (self.outside.clone(), self.clock.clone());
+        Some(Door { shared: self.shared.upgrade()?, outside, clock })
     }
 
     /// What stayed outside, also when the door is gone.
@@ -91,6 +121,8 @@ const STRANGERS: usize = 8;
 pub struct Outside {
     untold: Mutex<Untold>,
     strangers: Mutex<VecDeque<Stranger>>,
+    /// What the ledger calls `observation`, by its own name.
+    observations: Mutex<BTreeMap<&'static str, u64>>,
 }
 
 /// Readings that stayed outside and that the engine has not been told of yet; a full queue comes first.
@@ -126,6 +158,18 @@ impl Outside {
         }
     }
 
+    /// Counts messages that are no observations of a sensor, or of [`clearway_mapping::event::NOBODY`]: the ledger has one word
+    /// for them, here each keeps its `reason`.
+    pub(crate) fn leave_observations(&self, source: u16, reason: &'static str, count: u64) {
+        self.leave(source, Cause::Observation, count);
+        *locked(&self.observations).entry(reason).or_default() += count;
+    }
+
+    /// The observations refused since the server's start, by reason.
+    pub fn observations_refused(&self) -> BTreeMap<&'static str, u64> {
+        locked(&self.observations).clone()
+    }
+
     /// The last few strangers, newest last.
     pub fn strangers(&self) -> Vec<Stranger> {
         locked(&self.strangers).iter().copied().collect()
@@ -141,9 +185,14 @@ struct Inside {
 
 /// A door and the queue behind it, `capacity` events long.
 pub fn door(capacity: usize) -> (Door, Receiver<Queued>) {
+    door_by(Clock::default(), capacity)
+}
+
+/// A door that stamps what is live by `clock`.
+pub fn door_by(clock: Clock, capacity: usize) -> (Door, Receiver<Queued>) {
     let (queue, events) = sync_channel(capacity);
     let inside = Inside { queue, next_sequence: 0, told_ns: 0 };
-    (Door { shared: Arc::new(Mutex::new(inside)), outside: Arc::default() }, events)
+    (Door { shared: Arc::new(Mutex::new(inside)), outside: Arc::default(), clock }, events)
 }
 
 impl Door {
@@ -187,7 +236,7 @@ impl Door {
         let mut inside = locked(&self.shared);
         let mut untold = locked(&self.outside.untold);
         // Losses are told at the same stamp: a captured drive's time does not jump to the clock's and back.
-        let arrival_ns = captured_ns.unwrap_or_else(now_ns);
+        let arrival_ns = captured_ns.unwrap_or_else(|| self.clock.now_ns());
         // Behind a loss that is not told yet nothing enters, so that the journal has it where it happened.
         let mut has_space = inside.tell(&mut untold, arrival_ns)?;
         for (source, body, ticket) in readings {
@@ -209,7 +258,7 @@ impl Door {
 
     /// A way to this door that does not keep it open.
     pub fn weak(&self) -> WeakDoor {
-        WeakDoor { shared: Arc::downgrade(&self.shared), outside: self.outside.clone() }
+        WeakDoor { shared: Arc::downgrade(&self.shared), outside: self.outside.clone(), clock: self.clock.clone() }
     }
 
     /// Takes a captured reading with its own stamp; waits while the queue is full, so that a file loses nothing.
@@ -235,7 +284,7 @@ impl Door {
             strangers.pop_front();
         }
         let datagrams = known.map_or(0, |stranger| stranger.datagrams) + 1;
-        strangers.push_back(Stranger { address, datagrams, newest_ns: now_ns() });
+        strangers.push_back(Stranger { address, datagrams, newest_ns: self.clock.now_ns() });
     }
 
     /// Tells the engine of all that stayed outside, waiting for space. For the end, when nothing will follow that would bring it along.
@@ -246,7 +295,8 @@ impl Door {
         let mut inside = locked(&self.shared);
         let next = || locked(&self.outside.untold).pop_first();
         while let Some(((cause, source), count)) = next() {
-            let told = inside.wait(Reading { arrival_ns: now_ns(), source, body: Body::Lost { cause, count } });
+            let arrival_ns = self.clock.now_ns();
+            let told = inside.wait(Reading { arrival_ns, source, body: Body::Lost { cause, count } });
             told.inspect_err(|_| self.leave_outside(source, cause, count))?;
         }
         Ok(())

@@ -69,10 +69,19 @@ enum Command {
         /// Where to record; a temporary file where absent.
         #[arg(long)]
         record: Option<PathBuf>,
+        /// One turning LIDAR in a town; or two of them and six that scan, poses and roads over gRPC, in traffic.
+        #[arg(long, value_enum, default_value = "one")]
+        sensors: Sensors,
         /// One object a second on stdout, and a summary.
         #[arg(long)]
         json: bool,
     },
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Sensors {
+    One,
+    Many,
 }
 
 #[derive(clap::Args)]
@@ -205,7 +214,9 @@ fn run(command: Command) -> Result<ExitCode> {
             say(&checked.to_toml());
             Ok(ExitCode::SUCCESS)
         }
-        Command::Demo { seconds, record, json } => runtime()?.block_on(run_demo(seconds, record, json)),
+        Command::Demo { seconds, record, sensors, json } => {
+            runtime()?.block_on(run_demo(seconds, record, sensors == Sensors::Many, json))
+        }
     }
 }
 
@@ -337,12 +348,12 @@ async fn draw(progress: Arc<Progress>, shown: bool) {
     }
 }
 
-async fn run_demo(seconds: Option<f64>, record: Option<PathBuf>, json: bool) -> Result<ExitCode> {
+async fn run_demo(seconds: Option<f64>, record: Option<PathBuf>, many_sensors: bool, json: bool) -> Result<ExitCode> {
     let duration = seconds.map(Duration::try_from_secs_f64).transpose().context("--seconds: a time is needed")?;
     let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
     let record = record.unwrap_or_else(|| folder.join("demo.mcap"));
     let picture = record.with_extension("png");
-    let options = demo::Options { duration, record, picture, any_port: false };
+    let options = demo::Options { duration, record, picture, many_sensors, any_port: false };
     let begun = |places: &Places| {
         if json {
             return;

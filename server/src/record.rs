@@ -8,7 +8,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::BufWriter;
+use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
@@ -20,6 +20,7 @@ use bytes::Bytes;
 use clearway_mapping::event::Event;
 use clearway_proto::{DESCRIPTORS, v1};
 use mcap::records::{MessageHeader, Metadata};
+use mcap::write::NoSeek;
 use mcap::{Attachment, Compression, McapError, WriteOptions};
 use prost::Message;
 
@@ -160,19 +161,12 @@ impl Recorder {
             std::fs::create_dir_all(folder).map_err(|source| RecordError::Create { file: path.clone(), source })?;
         }
         let file = File::create(&path).map_err(|source| RecordError::Create { file: path.clone(), source })?;
-        let tape = Tape::new(file, preface).map_err(|source| RecordError::Write { file: path.clone(), source })?;
-        let (queue, entries) = sync_channel(options.queue);
-        let counts = Arc::new(RecorderCounts { file: path.display().to_string(), ..RecorderCounts::default() });
-        let flush = Duration::from_millis(options.flush_ms);
+        let (scribe, journals) = Scribe::new(file, options, preface, wait)?;
+        let counts = scribe.counts();
         let thread = std::thread::Builder::new()
             .name("recorder".into())
-            .spawn({
-                let counts = counts.clone();
-                move || run(tape, &entries, flush, &counts)
-            })
+            .spawn(move || scribe.run())
             .map_err(|source| RecordError::Create { file: path, source })?;
-        let journal = |vehicle| Journal { vehicle, queue: queue.clone(), counts: counts.clone(), wait };
-        let journals = (0..preface.vehicles.len()).map(journal).collect();
         Ok((Self { counts, thread }, journals))
     }
 
@@ -193,49 +187,116 @@ impl Recorder {
     }
 }
 
-/// Writes what comes until nobody is left to send; a failing disk ends the writing, not the listening.
-fn run(tape: Tape, entries: &Receiver<Entry>, flush: Duration, counts: &RecorderCounts) {
-    let stop = |error: McapError| {
-        // The library says that writing failed, and only its source says why.
-        let reason = std::error::Error::source(&error).map_or(error.to_string(), |source| format!("{error}: {source}"));
-        tracing::error!(file = %counts.file, %reason, "the recording stops here; maps are still served");
-        *locked(&counts.stopped) = Some(reason);
-    };
-    let mut tape = Some(tape);
-    let mut flush_at: Option<Instant> = None;
-    loop {
-        let entry = match flush_at {
-            None => entries.recv().map_err(|_| RecvTimeoutError::Disconnected),
-            Some(at) => entries.recv_timeout(at.saturating_duration_since(Instant::now())),
-        };
-        let mut outcome = Ok(());
-        match (&mut tape, entry) {
-            (None, Ok(_)) => counts.lose(),
-            (Some(tape), Ok(entry)) => {
-                outcome = tape.write(&entry, counts);
-                flush_at.get_or_insert_with(|| Instant::now() + flush);
+/// Where a recording's bytes go.
+pub trait Disk: Write + Send {
+    /// Makes sure that what was written outlives a crash of the machine.
+    ///
+    /// # Errors
+    /// What the disk says.
+    fn keep(&mut self) -> io::Result<()>;
+}
+
+impl Disk for File {
+    fn keep(&mut self) -> io::Result<()> {
+        self.sync_all()
+    }
+}
+
+/// What writes a recording, without thread and clock: whoever has it says when. A failing disk ends the writing, not the
+/// listening.
+pub struct Scribe<D: Disk> {
+    tape: Option<Tape<D>>,
+    entries: Receiver<Entry>,
+    flush: Duration,
+    flush_at: Option<Instant>,
+    counts: Arc<RecorderCounts>,
+}
+
+impl<D: Disk> Scribe<D> {
+    /// Writes the preface to `disk`, and gives each vehicle its way in, as [`Recorder::start`] does.
+    ///
+    /// # Errors
+    /// [`RecordError::Write`] when the preface cannot be written.
+    pub fn new(disk: D, options: &Options, preface: &Preface, wait: bool) -> Result<(Self, Vec<Journal>), RecordError> {
+        let wrong = |source| RecordError::Write { file: options.file.clone(), source };
+        let tape = Some(Tape::new(disk, preface).map_err(wrong)?);
+        let (queue, entries) = sync_channel(options.queue);
+        let counts = Arc::new(RecorderCounts { file: options.file.display().to_string(), ..RecorderCounts::default() });
+        let journal = |vehicle| Journal { vehicle, queue: queue.clone(), counts: counts.clone(), wait };
+        let journals = (0..preface.vehicles.len()).map(journal).collect();
+        Ok((Self { tape, entries, flush: Duration::from_millis(options.flush_ms), flush_at: None, counts }, journals))
+    }
+
+    /// What the recording holds so far.
+    pub fn counts(&self) -> Arc<RecorderCounts> {
+        self.counts.clone()
+    }
+
+    /// Writes what comes until nobody is left to send.
+    fn run(mut self) {
+        loop {
+            let entry = match self.flush_at {
+                None => self.entries.recv().map_err(|_| RecvTimeoutError::Disconnected),
+                Some(at) => self.entries.recv_timeout(at.saturating_duration_since(Instant::now())),
+            };
+            match entry {
+                Ok(entry) => self.write(&entry, Instant::now()),
+                Err(RecvTimeoutError::Timeout) => self.flush_if_due(Instant::now()),
+                Err(RecvTimeoutError::Disconnected) => break,
             }
-            (_, Err(RecvTimeoutError::Timeout)) => {}
-            (_, Err(RecvTimeoutError::Disconnected)) => break,
         }
-        // Looked at on every turn: a queue that never runs dry must not put the flush off.
-        if outcome.is_ok() && flush_at.is_some_and(|at| at <= Instant::now()) {
-            flush_at = None;
-            outcome = tape.as_mut().map_or(Ok(()), Tape::flush);
+        self.finish();
+    }
+
+    /// Writes one of the events and maps that wait, if any, as at `now`; gives whether there was one.
+    pub fn take(&mut self, now: Instant) -> bool {
+        let entry = self.entries.try_recv();
+        match &entry {
+            Ok(entry) => self.write(entry, now),
+            Err(_) => self.flush_if_due(now),
         }
-        if let Err(error) = outcome {
-            stop(error);
-            (tape, flush_at) = (None, None);
+        entry.is_ok()
+    }
+
+    /// Ends the recording, once all journals are dropped.
+    pub fn finish(mut self) {
+        if let Some(Err(error)) = self.tape.take().map(Tape::finish) {
+            self.stop(&error);
         }
     }
-    if let Some(Err(error)) = tape.map(Tape::finish) {
-        stop(error);
+
+    fn write(&mut self, entry: &Entry, now: Instant) {
+        let Some(tape) = &mut self.tape else { return self.counts.lose() };
+        if let Err(error) = tape.write(entry, &self.counts) {
+            return self.stop(&error);
+        }
+        self.flush_at.get_or_insert(now + self.flush);
+        // Looked at after each: a queue that never runs dry must not put the flush off.
+        self.flush_if_due(now);
+    }
+
+    fn flush_if_due(&mut self, now: Instant) {
+        if self.flush_at.is_none_or(|at| at > now) {
+            return;
+        }
+        self.flush_at = None;
+        if let Some(Err(error)) = self.tape.as_mut().map(Tape::flush) {
+            self.stop(&error);
+        }
+    }
+
+    fn stop(&mut self, error: &McapError) {
+        // The library says that writing failed, and only its source says why.
+        let reason = std::error::Error::source(error).map_or(error.to_string(), |source| format!("{error}: {source}"));
+        tracing::error!(file = %self.counts.file, %reason, "the recording stops here; maps are still served");
+        *locked(&self.counts.stopped) = Some(reason);
+        (self.tape, self.flush_at) = (None, None);
     }
 }
 
 /// The open file.
-struct Tape {
-    writer: mcap::Writer<BufWriter<File>>,
+struct Tape<D: Disk> {
+    writer: mcap::Writer<NoSeek<BufWriter<D>>>,
     vehicles: Vec<VehicleChannels>,
 }
 
@@ -244,8 +305,8 @@ struct VehicleChannels {
     maps: BTreeMap<&'static str, u16>,
 }
 
-impl Tape {
-    fn new(file: File, preface: &Preface) -> Result<Self, McapError> {
+impl<D: Disk> Tape<D> {
+    fn new(disk: D, preface: &Preface) -> Result<Self, McapError> {
         let mut writer = WriteOptions::new()
             .profile("")
             .library(concat!("clearway/", env!("CARGO_PKG_VERSION")))
@@ -255,7 +316,7 @@ impl Tape {
             // A chunk goes to the file whole, its length first: else a crash would leave one with a length of 0, which
             // no reader can tell from damage.
             .disable_seeking(true)
-            .create(BufWriter::new(file))?;
+            .create(NoSeek::new(BufWriter::new(disk)))?;
         let names: Vec<&str> = preface.vehicles.iter().map(|(name, _)| &**name).collect();
         let mut metadata = preface.notes.clone();
         metadata.insert("boot_id".into(), preface.boot_id.to_string());
@@ -320,8 +381,9 @@ impl Tape {
     fn finish(mut self) -> Result<(), McapError> {
         self.writer.finish()?;
         // `finish` leaves the last bytes to the file's own buffer.
-        let file = self.writer.into_inner().into_inner().map_err(|error| McapError::Io(error.into_error()))?;
-        file.sync_all().map_err(McapError::Io)
+        let buffer = self.writer.into_inner().into_inner();
+        let mut disk = buffer.into_inner().map_err(|error| McapError::Io(error.into_error()))?;
+        disk.keep().map_err(McapError::Io)
     }
 }
 

@@ -12,7 +12,6 @@ use std::time::{Duration, Instant};
 
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
-use clearway_mapping::event::Cause;
 
 use crate::clouds::CloudError;
 use crate::config::ConfigError;
@@ -189,11 +188,18 @@ fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) 
             std::thread::sleep(due.saturating_sub(began.elapsed()));
         }
         progress.bytes_read.store(readings.bytes_read(), Ordering::Relaxed);
-        door.leave_outside(0, Cause::Observation, readings.untold());
+        tell(&mut readings, door);
         door.enter_captured(reading).map_err(|_| ReplayError::Engine)?;
     }
-    door.leave_outside(0, Cause::Observation, readings.untold());
+    tell(&mut readings, door);
     Ok(readings)
+}
+
+/// Has the door count the messages that were refused.
+fn tell(readings: &mut Readings, door: &Door) {
+    for ((source, reason), count) in readings.untold() {
+        door.outside().leave_observations(source, reason, count);
+    }
 }
 
 #[cfg(test)]

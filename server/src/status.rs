@@ -1,7 +1,7 @@
 //! What the server knows of each vehicle: ledger, rates, latency, readers, recorder. One snapshot, written by the
 //! engine, read by gRPC, zenoh, the page, `/metrics` and the command line.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::fmt::Write as _;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
@@ -84,6 +84,8 @@ pub struct Snapshot {
     pub ledger: Ledger,
     /// The sensors and what they have shown.
     pub sensors: Vec<NamedStatus>,
+    /// What the ledger calls `observation`, by its own name, since the server's start.
+    pub observations_refused: BTreeMap<&'static str, u64>,
     /// Maps made.
     pub maps: u64,
     /// Of the newest map; 0 before the first.
@@ -185,6 +187,7 @@ impl VehicleStatus {
         Snapshot {
             ledger,
             sensors,
+            observations_refused: self.outside.observations_refused(),
             maps: inside.maps,
             newest_capture_end_ns: inside.newest_capture_end_ns,
             drivable_share: inside.drivable_share,
@@ -214,6 +217,7 @@ impl VehicleStatus {
                 .into_iter()
                 .collect(),
             strangers: self.outside.strangers().iter().map(stranger).collect(),
+            observations_refused: by_name(&snapshot.observations_refused),
         }
     }
 
@@ -246,6 +250,7 @@ impl VehicleStatus {
             "drivable_share": snapshot.drivable_share,
             "sensors": sensors.collect::<Vec<_>>(),
             "ledger": ledger_json,
+            "observations_refused": proto.observations_refused,
             "recorder": {
                 "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
                 "stopped": self.recorder.as_ref().and_then(|counts| counts.stopped()),
@@ -270,7 +275,7 @@ fn ledger_json(ledger: &v1::Ledger) -> Value {
     json!({
         "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
         "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops, "points_dropped": ledger.points_dropped,
-        "own_body": ledger.own_body, "through_body": ledger.through_body,
+        "own_body": ledger.own_body, "through_body": ledger.through_body, "blind": ledger.blind,
         "poses": ledger.poses, "poses_refused": ledger.poses_refused,
         "roads": ledger.roads, "roads_refused": ledger.roads_refused,
     })
@@ -281,17 +286,22 @@ fn ledger(ledger: &Ledger) -> v1::Ledger {
         received: ledger.received,
         decoded: ledger.decoded,
         telemetry: ledger.telemetry,
-        refused: ledger.refused.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect(),
+        refused: by_name(&ledger.refused),
         lost: ledger.lost,
         kernel_drops: ledger.kernel_drops,
         points_dropped: ledger.points_dropped,
         own_body: ledger.own_body,
         through_body: ledger.through_body,
+        blind: ledger.blind,
         poses: ledger.poses,
         poses_refused: ledger.poses_refused,
         roads: ledger.roads,
-        roads_refused: ledger.roads_refused.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect(),
+        roads_refused: by_name(&ledger.roads_refused),
     }
+}
+
+fn by_name(counts: &BTreeMap<&'static str, u64>) -> BTreeMap<String, u64> {
+    counts.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect()
 }
 
 /// Maps and datagrams a second.
@@ -343,6 +353,13 @@ pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {
         .map(|(vehicle, reason, n)| (format!("vehicle=\"{vehicle}\",reason=\"{reason}\""), n))
         .collect();
     family("clearway_packets_refused_total", "counter", "Datagrams and scans refused, by reason.", &refused);
+    let refused: Vec<_> = all
+        .iter()
+        .flat_map(|(v, s, _)| s.observations_refused.iter().map(move |(r, n)| (v.name.clone(), r, *n as f64)))
+        .map(|(vehicle, reason, n)| (format!("vehicle=\"{vehicle}\",reason=\"{reason}\""), n))
+        .collect();
+    let help = "Messages that are no observations, which the ledger calls observation, by their own reason.";
+    family("clearway_observations_refused_total", "counter", help, &refused);
     let lost = each(&|s, _| s.ledger.lost as f64);
     family("clearway_events_lost_total", "counter", "Readings that found the door's queue full.", &lost);
     let of_sensors = |value: &dyn Fn(&SensorStatus) -> f64| -> Vec<(String, f64)> {

@@ -236,6 +236,8 @@ fn sensor_config(sensor: &SensorConfig) -> v1::Sensor {
         pitch_deg,
         yaw_deg,
         calibration: sensor.calibration.clone(),
+        blind_deg: sensor.blind_deg.as_flattened().to_vec(),
+        gps_late_days_max: Some(sensor.gps_late_days_max),
     }
 }
 
@@ -243,6 +245,7 @@ fn sensor_config(sensor: &SensorConfig) -> v1::Sensor {
 pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, &'static str> {
     let v1::Sensor { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, .. } = sensor;
     let plain = SensorConfig::new(sensor.name, Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg });
+    let (blind_deg, []) = sensor.blind_deg.as_chunks() else { return Err("pairs in blind_deg") };
     let model = sensor.model.map(|name| model_of_name(&name).ok_or("known sensor model")).transpose()?;
     Ok(SensorConfig {
         model,
@@ -250,6 +253,8 @@ pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, &'st
         calibration: sensor.calibration,
         cut_azimuth_deg: sensor.cut_azimuth_deg.unwrap_or(plain.cut_azimuth_deg),
         range_m_min: sensor.range_m_min.unwrap_or(plain.range_m_min),
+        blind_deg: blind_deg.to_vec(),
+        gps_late_days_max: sensor.gps_late_days_max.unwrap_or(plain.gps_late_days_max),
         elevations_deg: sensor.elevations_deg,
         ..plain
     })
@@ -418,6 +423,8 @@ mod tests {
                 model: Some(clearway_lidar::model::Model::PuckHiRes),
                 rpm: Some(600.0),
                 elevations_deg: vec![-15.0, 1.5],
+                blind_deg: vec![[350.0, 10.0], [80.0, 100.0]],
+                gps_late_days_max: 0.5,
                 ..SensorConfig::new(
                     "left-2",
                     Extrinsics { x_m: 1.0, y_m: -2.0, z_m: 0.5, roll_deg: 3.0, pitch_deg: 4.0, yaw_deg: -90.0 },

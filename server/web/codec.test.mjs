@@ -7,6 +7,7 @@ import { freshness, ServerClock } from "./clock.js";
 import { CELLS_MAX, crc32, decodeChannel } from "./codec.js";
 import { egoAt, gridOf, pixelCells } from "./grid.js";
 import { readMapUpdate, WireError } from "./protobuf.js";
+import { clockWords } from "./text.js";
 
 const [U8, I8, U16] = [1, 2, 3], [RAW, RUNS, ROWS] = [1, 2, 3];
 const channel = (cell_type, encoding, payload, raw, cell_count) => ({
@@ -152,4 +153,11 @@ test("a map whose time is unknown, past or from the future is not fresh", () => 
   const header = { capture_end_ns: ns(1000), valid_until_ns: ns(1300) };
   const fresh = (now) => freshness(header, now).fresh;
   assert.deepEqual([null, ns(1301), ns(800), ns(1300)].map(fresh), [false, false, false, true]);
+});
+
+test("a sensor's clock is named with how far the host is from it", () => {
+  assert.equal(clockWords("gps", 0n), "GPS");
+  assert.equal(clockWords("gps_unlocked", -7000n), "GPS, not locked, host 7.0 s behind");
+  assert.equal(clockWords("arrival", 1n), "arrival, host 1 ms ahead");
+  assert.equal(clockWords("", undefined), "–");
 });

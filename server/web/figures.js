@@ -1,7 +1,7 @@
 // In: the newest map, the stream's counts, the server's status. Out: the page's figures as text.
 // Status message: JSON of clearway.v1 Vehicle with "type": "status", snake_case keys, 64-bit numbers as numbers.
 
-import { bytes, count, dash, duration, percent, utc } from "./text.js";
+import { bytes, clockWords, count, dash, duration, percent, utc } from "./text.js";
 
 const STATUS_LATE_MS = 3000;
 
@@ -80,7 +80,7 @@ export function sensorRows(body, sensors) {
     const row = document.createElement("tr");
     const texts = [
       sensor.name, sensor.model || "not known yet", sensor.rpm ? sensor.rpm.toFixed(0) : dash, count(sensor.returns),
-      count(sensor.packets), count(sensor.refused), percent(sensor.completeness),
+      count(sensor.packets), count(sensor.refused), percent(sensor.completeness), clockWords(sensor.clock, sensor.clock_offset_ms),
       (sensor.partial ? `partial: ${sensor.partial}` : "whole") + (blocked && `, blocked: ${blocked}`),
     ];
     texts.forEach((text, i) => {

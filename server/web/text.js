@@ -18,6 +18,14 @@ export function duration(ms) {
   return days < 730 ? `${Math.floor(days)} days` : `${(days / 365.25).toFixed(1)} years`;
 }
 
+// The clock a sensor's stamps follow, and how far the host's is from them (BigInt, ms).
+export function clockWords(clock, offset_ms) {
+  const words = { gps: "GPS", gps_unlocked: "GPS, not locked" }[clock] ?? clock;
+  const ms = Number(offset_ms ?? 0n);
+  if (!words) return dash;
+  return ms === 0 ? words : `${words}, host ${duration(Math.abs(ms))} ${ms > 0 ? "ahead" : "behind"}`;
+}
+
 export function utc(ns) {
   const date = new Date(Number(ns / 1000000n));
   return Number.isNaN(date.getTime()) ? dash : date.toISOString().replace("T", " ").replace("Z", " UTC");

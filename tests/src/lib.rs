@@ -1,8 +1,10 @@
-//! What the whole-house tests share: the two binaries, and a place to run them in.
+//! What the whole-house tests share: the two binaries, a place to run them in, and the simulation of it all.
 
 use std::path::PathBuf;
 use std::process::{Command, Output};
 use std::sync::OnceLock;
+
+pub mod simulation;
 
 /// The folder of the binaries, brought up to date once for all tests of this process.
 ///

@@ -130,6 +130,8 @@ async fn a_bag_of_clouds_odometry_and_tf_is_mapped_where_tf_puts_the_sensor_reco
     assert!(turns >= 3);
     assert_eq!((summary.snapshot.maps, ledger.decoded, ledger.poses, ledger.poses_refused), (turns, turns, turns, 0));
     assert_eq!((ledger.refused["observation"], ledger.received), (1, turns + 1));
+    assert_eq!(summary.snapshot.sensors[0].ledger.refused["observation"], 1, "it is known whose it was");
+    assert_eq!(summary.snapshot.observations_refused, [("ros_message", 1)].into());
     assert!(
         matches!(&summary.mount, Mount::Tf { ego_frame, frame_id } if ego_frame == "base_link" && frame_id == "velodyne")
     );
@@ -147,6 +149,58 @@ async fn a_bag_of_clouds_odometry_and_tf_is_mapped_where_tf_puts_the_sensor_reco
     }
     let report = verify(&record).unwrap();
     assert!(report.is_good() && report.maps == turns, "{:?}", report.differences);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bag_of_several_sensors_makes_one_map_of_all_that_tf_places() {
+    let folder = tempfile::tempdir().unwrap();
+    let (file, record) = (folder.path().join("bag.mcap"), folder.path().join("maps.mcap"));
+    let mut messages = drive();
+    let (turns, start_ns) = (clouds(4), messages[0].2);
+    let mounts = [
+        transform(start_ns, "base_link", "velodyne", [0.0, 0.0, 1.9]),
+        transform(start_ns, "base_link", "Lidar/Left", [0.3, 1.0, 1.9]),
+    ];
+    messages[0].3 = tf_message_to_cdr(&mounts);
+    // What the second one sees it saw 10 ms before the first; of a third nobody knows where it is.
+    for (stamp_ns, _) in &turns {
+        let data = points_of(&turns, *stamp_ns);
+        let at = messages.iter().position(|m| m.0 == "/velodyne_points" && m.2 == stamp_ns + 1000).unwrap();
+        let left = cloud("Lidar/Left", stamp_ns - 10_000_000, &data).to_cdr();
+        messages.insert(at, ("/left_points", CLOUD, stamp_ns + 500, left));
+        messages.insert(at, ("/lost_points", CLOUD, stamp_ns + 500, cloud("nowhere", *stamp_ns, &data).to_cdr()));
+    }
+    bag(&file, &messages);
+    let summary = replayed(Options { record: Some(record.clone()), ..options(&file) }).await.unwrap();
+    let (n, snapshot) = (turns.len() as u64, &summary.snapshot);
+    let sensors = snapshot.sensors.iter().map(|sensor| (sensor.name.as_str(), sensor.ledger.decoded));
+    let mut sensors: Vec<_> = sensors.collect();
+    sensors.sort_unstable();
+    assert_eq!(sensors, [("lidar_left", n), ("velodyne", n)]);
+    let notes = summary.notes.join("\n");
+    assert!(notes.contains("/lost_points (sensor_msgs/msg/PointCloud2) was left alone"), "{notes}");
+    let report = verify(&record).unwrap();
+    assert!(report.is_good() && report.maps >= n, "{:?}", report.differences);
+    let maps = house::recorded(&record);
+    let header = |bytes: &bytes::Bytes| <clearway_proto::v1::Map as prost::Message>::decode(&bytes[..]).unwrap().header;
+    let last = header(maps.last_key_value().unwrap().1).unwrap();
+    assert!(last.sensors.len() == 2 && last.sensors.iter().all(|sensor| sensor.returns > 1000), "{:?}", last.sensors);
+    // Each has its own place, and its own end.
+    let entries = clearway_server::recording::Recording::open(&record).unwrap().map(|entry| entry.unwrap());
+    let ends = entries.filter_map(|entry| match entry {
+        clearway_server::recording::Entry::Event { event, .. } if event.body == Body::End => Some(event.source),
+        _ => None,
+    });
+    assert_eq!(ends.collect::<Vec<_>>(), [0, 1]);
+    let (config, _) = clearway_server::recording::Recording::open(&record).unwrap().config().unwrap();
+    let places = config.vehicles[0].sensors.iter().map(|sensor| (sensor.name.as_str(), sensor.extrinsics.y_m));
+    assert!(places.clone().any(|place| place == ("lidar_left", 1.0)), "{:?}", places.collect::<Vec<_>>());
+}
+
+/// The data of the cloud of this stamp.
+fn points_of(turns: &[(i64, Vec<u8>)], stamp_ns: i64) -> Vec<u8> {
+    let (_, bytes) = turns.iter().find(|(of_ns, _)| *of_ns == stamp_ns).unwrap();
+    PointCloud2::new(bytes).unwrap().data.to_vec()
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -263,12 +317,15 @@ async fn live_topics_of_rmw_zenoh_reach_the_map_and_strangers_are_counted() {
     let n = turns.len() as u64;
     until("all is taken or refused", || {
         let ledger = status.snapshot().ledger;
-        ledger.poses == n && ledger.decoded == n && ledger.refused.len() == 2
+        ledger.poses == n && ledger.decoded == n && ledger.refused.get("observation") == Some(&2)
     })
     .await;
     let snapshot = status.snapshot();
     assert_eq!((snapshot.maps, snapshot.ledger.lost), (n, 2));
     assert_eq!(snapshot.ledger.refused["observation"], 2);
+    assert_eq!(snapshot.observations_refused, [("ros_message", 1), ("ros_type", 1)].into());
+    // Odometry is no sensor's.
+    assert_eq!(snapshot.sensors[0].ledger.refused["observation"], 1);
     assert!(snapshot.drivable_share.unwrap() > 0.3);
     session.close().await.unwrap();
     running.shutdown().await.unwrap();

@@ -7,7 +7,7 @@ use std::process::Command;
 use std::sync::OnceLock;
 
 use clearway_client::{Client, ClientError, Subscription, Tls};
-use clearway_server::config::{Access, Config, Tls as TlsConfig};
+use clearway_server::config::{Access, Config, Tls as TlsConfig, ZenohMode};
 use clearway_server::server::{Running, Server, Setup};
 use house::{config, feed, grpc, readings, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -156,4 +156,98 @@ async fn peers_that_shake_no_hand_reset_or_say_too_much_leave_the_others_served(
     assert!(!map.map.is_empty());
     assert_eq!(running.vehicles.0[0].status.snapshot().maps, 2);
     within("shutdown", running.shutdown()).await.unwrap();
+}
+
+/// A file of deploy/zenoh with these certificates instead of those in `certificates/`.
+fn zenoh_file(name: &str, certificates: &Path) -> String {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/zenoh").join(name);
+    let text = std::fs::read_to_string(file).expect("a file of the repository");
+    text.replace("\"certificates/", &format!("\"{}/", certificates.display()))
+}
+
+/// A session of a client that hangs on the router and shows this certificate.
+async fn zenoh_client(router: &str, ca: &str, name: &str) -> zenoh::Result<zenoh::Session> {
+    let folder = certificates(ca);
+    let text = zenoh_file("server.json5", &folder);
+    let text = ["connect_certificate", "connect_private_key"].iter().fold(text, |text, key| {
+        let ending = if key.ends_with("key") { "key" } else { "pem" };
+        let (from, to) = (format!("{key}: \"{}/server.{ending}\"", folder.display()), folder.join(name));
+        text.replace(&from, &format!("{key}: \"{}.{ending}\"", to.display()))
+    });
+    let mut config = zenoh::Config::from_json5(&text)?;
+    let ours = certificates("ours").join("ca.pem");
+    let settings = [
+        ("mode", "\"client\"".to_owned()),
+        ("connect/endpoints", format!("[{router:?}]")),
+        ("connect/timeout_ms", "5000".to_owned()),
+        ("listen/endpoints", "[]".to_owned()),
+        ("scouting/multicast/enabled", "false".to_owned()),
+        // Whoever it is, it believes the router.
+        ("transport/link/tls/root_ca_certificate", format!("{:?}", ours.display().to_string())),
+    ];
+    for (key, value) in settings {
+        config.insert_json5(key, &value)?;
+    }
+    within("zenoh", zenoh::open(config).into_future()).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn behind_the_router_of_deploy_each_certificate_does_what_its_rules_allow() {
+    let folder = tempfile::tempdir().unwrap();
+    let ours = certificates("ours");
+    let text = zenoh_file("router.json5", &ours).replace("tls/0.0.0.0:7447", "tls/127.0.0.1:0");
+    let router =
+        within("a router", zenoh::open(zenoh::Config::from_json5(&text).unwrap()).into_future()).await.unwrap();
+    let locators = router.info().locators().await;
+    let port = locators.iter().find_map(|at| at.to_string().rsplit_once(':').map(|(_, port)| port.to_owned()));
+    let at = format!("tls/localhost:{}", port.expect("the router listens"));
+
+    let mut config = config();
+    let file = folder.path().join("server.json5");
+    std::fs::write(&file, zenoh_file("server.json5", &ours)).unwrap();
+    config.zenoh.enabled = true;
+    (config.zenoh.mode, config.zenoh.listen, config.zenoh.connect) = (ZenohMode::Client, Vec::new(), vec![at.clone()]);
+    config.zenoh.file = file;
+    let running = house::start(config).await;
+
+    let reader = zenoh_client(&at, "ours", "reader").await.expect("a session");
+    let unlisted = zenoh_client(&at, "ours", "operator").await.expect("a session");
+    let ingester = zenoh_client(&at, "ours", "ingester").await.expect("a session");
+    assert!(zenoh_client(&at, "theirs", "reader").await.is_err(), "a certificate of another CA is let in");
+
+    let key = "clearway/car/map/drivability";
+    let maps = reader.declare_subscriber(key).await.unwrap();
+    let nothing = unlisted.declare_subscriber(key).await.unwrap();
+    // A certificate of the server's name may see everything: it is the judge of what the others put.
+    let judge = zenoh_client(&at, "ours", "server").await.expect("a session");
+    let put = judge.declare_subscriber("clearway/car/**").await.unwrap();
+    let mut drive = readings(6);
+    let rest = drive.split_off(drive.len() / 2);
+    feed(&running, drive).await;
+    within("the reader's first map", async {
+        // What the server declares travels; an answer shows that it has arrived, and so has the reader's subscription.
+        while reader.get(key).await.unwrap().recv_async().await.is_err() {}
+    })
+    .await;
+    feed(&running, rest).await;
+    within("the next map", maps.recv_async().into_future()).await.expect("a map");
+    ingester.put("clearway/car/map/drivability", "a false map").await.unwrap();
+    ingester.put("clearway/car/ingest/pose", "something to refuse").await.unwrap();
+    within("what the ingester may put", async {
+        loop {
+            let sample = put.recv_async().await.unwrap();
+            assert_ne!(*sample.payload().to_bytes(), *b"a false map", "an ingester may not put maps");
+            if sample.key_expr().as_str() == "clearway/car/ingest/pose" {
+                break;
+            }
+        }
+    })
+    .await;
+    assert!(matches!(nothing.try_recv(), Ok(None)), "an unlisted certificate is told of maps");
+
+    for session in [reader, unlisted, ingester, judge] {
+        session.close().await.unwrap();
+    }
+    within("shutdown", running.shutdown()).await.unwrap();
+    router.close().await.unwrap();
 }

@@ -8,7 +8,7 @@ use clearway_lidar::calibration::unit_table::status_bytes;
 use clearway_lidar::model::{Model, ModelSpec, RETURNS_PER_BLOCK, ReturnMode, S1_FLAGS};
 use clearway_lidar::packet::{BLOCK_LENGTH, PACKET_LENGTH};
 
-use crate::telemetry::device_us;
+use crate::telemetry::{civil_time, device_us};
 
 /// One echo on the wire; distance 0: no return.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -98,6 +98,29 @@ impl Encoder {
         bytes
     }
 
+    /// What an HDL-64E under GPS says of the time: binary, the second before this one, as its GPRMC tells it (HDL-64E S3
+    /// manual, appendix E). All of a cycle is said as its first packet finds it.
+    fn clock_value(&self, kind: u8) -> Option<u8> {
+        const CYCLE: i64 = 16;
+        if !b"HMSDNYG".contains(&kind) {
+            return None;
+        }
+        let begun_ns = self.packets.rem_euclid(CYCLE) * i64::from(self.spec.packet_period_ns(self.mode));
+        let ([year, month, day], [hour, minute, second]) =
+            civil_time(self.firings[0].stamp_ns - begun_ns - 1_000_000_000);
+        let value = match kind {
+            b'H' => hour,
+            b'M' => minute,
+            b'S' => second,
+            b'D' => day,
+            b'N' => month,
+            b'Y' => year % 100,
+            // Pulse and time are both there.
+            _ => b'A'.into(),
+        };
+        u8::try_from(value).ok()
+    }
+
     /// The last six bytes: time past the hour, and return mode and model or status.
     fn tail(&self) -> [u8; 6] {
         let [a, b, c, d] = device_us(self.firings[0].stamp_ns).to_le_bytes();
@@ -108,7 +131,7 @@ impl Encoder {
             (None, 0) => *b"\x00\x19DegC",
             (None, length) => {
                 let (kind, value) = self.status[self.packets.rem_euclid(length) as usize];
-                [a, b, c, d, kind, value]
+                [a, b, c, d, kind, self.clock_value(kind).unwrap_or(value)]
             }
         }
     }

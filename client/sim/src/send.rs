@@ -57,6 +57,21 @@ pub fn drive(
 ) -> io::Result<Sent> {
     let own: SocketAddr =
         if data.is_ipv4() { (Ipv4Addr::UNSPECIFIED, 0).into() } else { (Ipv6Addr::UNSPECIFIED, 0).into() };
+    drive_from(own, datagrams, data, telemetry, pace, until)
+}
+
+/// [`drive`] from an address of the sensor's own.
+///
+/// # Errors
+/// The operating system's, from opening the socket or sending.
+pub fn drive_from(
+    own: SocketAddr,
+    datagrams: impl IntoIterator<Item = Datagram>,
+    data: SocketAddr,
+    telemetry: SocketAddr,
+    pace: Pace,
+    until: Until<'_>,
+) -> io::Result<Sent> {
     let socket = UdpSocket::bind(own)?;
     let began = Instant::now();
     let mut first_ns = None;

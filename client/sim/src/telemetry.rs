@@ -52,10 +52,7 @@ pub struct Fix {
 impl Fix {
     /// The fix as an NMEA 0183 RMC sentence with its checksum and line end.
     pub fn gprmc(&self) -> String {
-        let second = self.stamp_ns.div_euclid(1_000_000_000);
-        let (year, month, day) = civil_date(second.div_euclid(86_400));
-        let of_day = second.rem_euclid(86_400);
-        let (hour, minute, second) = (of_day / 3600, of_day / 60 % 60, of_day % 60);
+        let ([year, month, day], [hour, minute, second]) = civil_time(self.stamp_ns);
         // Ten-thousandths of a minute first, so that rounding carries into the degrees.
         let angle = |degrees: f64| {
             let parts = (degrees.abs() * 600_000.0).round() as u64;
@@ -74,6 +71,14 @@ impl Fix {
         let checksum = body.bytes().fold(0, |sum, byte| sum ^ byte);
         format!("${body}*{checksum:02X}\r\n")
     }
+}
+
+/// Year, month and day, hour, minute and second of a stamp, UTC.
+pub(crate) fn civil_time(stamp_ns: i64) -> ([i64; 3], [i64; 3]) {
+    let second = stamp_ns.div_euclid(1_000_000_000);
+    let (year, month, day) = civil_date(second.div_euclid(86_400));
+    let of_day = second.rem_euclid(86_400);
+    ([year, month, day], [of_day / 3600, of_day / 60 % 60, of_day % 60])
 }
 
 /// Year, month and day of a day counted from 1970-01-01 (the Gregorian rule, in eras of 400 years from 1 March of year 0).

@@ -5,9 +5,13 @@
 //!
 //! Device time runs on one [`Timeline`]; Unix time is that plus an *offset*, one a turn, chosen when the turn ends:
 //!
-//! - From GPRMC, where the receiver calls it valid, its date can be, and the device's own minutes and seconds follow it.
+//! - From GPRMC (an HDL-64E S2 or S3: from its status bytes), where the receiver calls it valid, the device's own minutes
+//!   and seconds follow it, and it is older than its arrival by no more than
+//!   [`crate::SensorConfig::gps_late_ns_max`].
 //!   The offset is then a whole number of hours and the same to the nanosecond whatever the arrivals are. It stays in
-//!   force when GPS or the pulse is lost, over a restart, and against a host that says otherwise.
+//!   force when GPS or the pulse is lost, over a restart, and against a host that says otherwise. An older GPRMC is an old
+//!   capture's, played live, or a receiver's that has lost count of the weeks: then arrival tells the time, as the planners'
+//!   clocks do. A GPRMC later than its arrival is believed: nothing comes before it was sent, so the host was never set.
 //! - Else from arrival, by the packet of a turn that came quickest: a late packet is late by any amount, none comes before
 //!   it was sent. The offset is held, not averaged: it changes when a turn's quickest packet is later by more than
 //!   [`STEP_NS_MAX`] (the host's clock was set, or the first turn came from a full socket buffer), or when those of ten
@@ -15,7 +19,8 @@
 //! - Where that puts the device's own minutes and seconds within [`HOUR_ERROR_NS_MAX`] of UTC's, somebody has set them (GPS
 //!   without telemetry, PTP), and the offset is the whole hours.
 //!
-//! Stamps always rise. A correction forward is made at once; one backward by running at half speed, up to
+//! GPS time that lies farther behind the stamps given than they catch up with ([`CATCH_UP_NS_MAX`]) is not waited for: arrival
+//! goes on. Stamps always rise. A correction forward is made at once; one backward by running at half speed, up to
 //! [`CATCH_UP_NS_MAX`]; beyond that it is not made. Host clocks that fall behind the device at once (set back, or a
 //! capture played too fast) are not followed. [`Clock::Held`] says so while it lasts.
 
@@ -30,8 +35,8 @@ const GPRMC_AGE_NS: std::ops::RangeInclusive<i64> = -500_000_000..=2_900_000_000
 const GPS_SILENCE_NS_MAX: i64 = 3 * NS_PER_SECOND;
 /// 1 January 2005: no sensor of these is older. A receiver without a fix says 1980.
 const EARLIEST_NS: i64 = 1_104_537_600 * NS_PER_SECOND;
-/// The GPS week has 10 bits: a receiver that does not know which 1024 weeks these are is wrong by them.
-const WEEK_ROLLOVER_NS: i64 = 1024 * 7 * 24 * NS_PER_HOUR;
+/// A host's clock is wrong by hours (a time zone, a battery), not by days; receivers are wrong by 1024 weeks.
+pub const GPS_LATE_NS_MAX: i64 = 24 * NS_PER_HOUR;
 /// Arrivals later than 2096, where stamps would near the end of their 64 bits, are taken for that.
 const ARRIVAL_NS_MAX: i64 = 4_000_000_000 * NS_PER_SECOND;
 /// Above what networks and schedulers delay a whole turn by.
@@ -89,6 +94,7 @@ pub(crate) struct Stamp {
 /// Keeps one sensor's time.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct DeviceClock {
+    gps_late_ns_max: i64,
     timeline: Timeline,
     gps: Option<Gps>,
     /// Telemetry from beyond a jump that no data packet has shown yet.
@@ -125,6 +131,10 @@ struct Quickest {
 }
 
 impl DeviceClock {
+    pub fn new(gps_late_ns_max: i64) -> Self {
+        Self { gps_late_ns_max, ..Self::default() }
+    }
+
     /// Takes telemetry that arrived at `arrival_ns`. `tells_pps`: whether the model's PPS state means anything.
     pub fn telemetry(&mut self, telemetry: &Telemetry, tells_pps: bool, arrival_ns: i64) {
         let locked = match telemetry.pps {
@@ -132,7 +142,7 @@ impl DeviceClock {
             Pps::Absent => !tells_pps,
             Pps::Attempting | Pps::Error | Pps::Unknown(_) => false,
         };
-        let Some(utc_ns) = device_utc_ns(telemetry, arrival_ns) else {
+        let Some(utc_ns) = device_utc_ns(telemetry, arrival_ns, self.gps_late_ns_max) else {
             self.gps.iter_mut().for_each(|gps| gps.locked = false);
             return;
         };
@@ -196,16 +206,16 @@ impl DeviceClock {
 
     /// The offset of a turn, and the clock it follows.
     fn choose(&mut self, first_ns: i64, turn_ns: Option<i64>) -> (i64, Clock) {
-        let wanted = match self.gps {
+        let newest_ns = self.newest.map(|newest| newest.end_ns);
+        let in_reach = |offset_ns: i64| newest_ns.is_none_or(|ns| ns - (offset_ns + first_ns) <= CATCH_UP_NS_MAX);
+        let wanted = match self.gps.filter(|gps| in_reach(gps.offset_ns)) {
             Some(gps) => {
                 let lost = !gps.locked || first_ns - gps.told_ns > GPS_SILENCE_NS_MAX;
                 Some((gps.offset_ns, if lost { Clock::GpsUnlocked } else { Clock::Gps }))
             }
             None => self.by_arrival(first_ns, turn_ns),
         };
-        let out_of_reach =
-            |offset_ns: i64| self.newest.is_some_and(|newest| newest.end_ns - (offset_ns + first_ns) > CATCH_UP_NS_MAX);
-        match (wanted.filter(|(offset_ns, _)| !out_of_reach(*offset_ns)), self.anchor) {
+        match (wanted.filter(|(offset_ns, _)| in_reach(*offset_ns)), self.anchor) {
             (Some(wanted), _) => *self.anchor.insert(wanted),
             (None, held) => (held.map_or(0, |(offset_ns, _)| offset_ns), Clock::Held),
         }
@@ -256,12 +266,10 @@ impl Quickest {
 }
 
 /// UTC when the device's clock showed what telemetry says, if its GPRMC can be believed.
-fn device_utc_ns(telemetry: &Telemetry, arrival_ns: i64) -> Option<i64> {
+fn device_utc_ns(telemetry: &Telemetry, arrival_ns: i64, late_ns_max: i64) -> Option<i64> {
     let gprmc = telemetry.gprmc.as_ref().filter(|gprmc| gprmc.valid)?;
     let utc_ns = gprmc.utc_ns.filter(|utc_ns| *utc_ns >= EARLIEST_NS)?;
-    let late_ns = arrival_ns.saturating_sub(utc_ns);
-    let rollovers = late_ns.saturating_add(WEEK_ROLLOVER_NS / 2).div_euclid(WEEK_ROLLOVER_NS);
-    if rollovers > 0 && (late_ns - rollovers * WEEK_ROLLOVER_NS).abs() < 24 * NS_PER_HOUR {
+    if arrival_ns.saturating_sub(utc_ns) > late_ns_max {
         return None;
     }
     let age_ns = nearest_hour(i64::from(telemetry.device_us) * 1_000 - utc_ns, 0);

@@ -19,6 +19,7 @@ use crate::revolution::{Firing, Partial, Revolution};
 use crate::sensor::{CalibrationSource, SensorConfig, SensorStatus};
 use crate::telemetry::Telemetry;
 use crate::turns::{LONGEST_FORWARD, MAX_FIRINGS_PER_TURN, Step, Turns, expected_step};
+use crate::unit_clock::UnitClock;
 
 #[derive(Clone, Debug)]
 pub(crate) struct Decoder {
@@ -49,6 +50,7 @@ pub(crate) struct Decoder {
 #[derive(Clone, Debug, Default)]
 struct Unit {
     table: UnitTable,
+    clock: UnitClock,
     model_open: bool,
     calibration_open: bool,
     model: Option<Model>,
@@ -70,7 +72,7 @@ impl Decoder {
             spec,
             mode: ReturnMode::Strongest,
             beams: Beams::new(spec, &calibration),
-            clock: DeviceClock::default(),
+            clock: DeviceClock::new(config.gps_late_ns_max),
             turns: Turns::new(config.cut_azimuth_deg),
             loss: Loss::default(),
             view: View::default(),
@@ -127,7 +129,7 @@ impl Decoder {
     pub fn take(&mut self, packet: &Packet<'_>, mode: ReturnMode, arrival_ns: i64, gap: Gap, may_cut: bool) -> bool {
         let mut done = self.change_mode(mode) && may_cut;
         self.status.packets += 1;
-        self.listen_to_unit(packet);
+        self.listen_to_unit(packet, arrival_ns);
 
         let before = self.packet_azimuth;
         let firings = PacketFirings::new(packet, self.spec, mode, self.step_across(packet));
@@ -225,6 +227,11 @@ impl Decoder {
         self.step.unwrap_or(0) / self.spec.firings_per_block as u32
     }
 
+    /// Counts from packet to packet.
+    fn span(&self) -> u32 {
+        self.expected() * self.spec.firings_per_packet(self.mode) as u32
+    }
+
     /// Adds the packet's firings to the current turn and finds the one at which to cut: the first, if the turn is `torn`
     /// before it.
     fn follow(&mut self, firings: &PacketFirings, time_ns: i64, torn: bool, may_cut: bool) -> Option<Cut> {
@@ -240,7 +247,11 @@ impl Decoder {
                 self.begin_turn(azimuth, time_ns, expected);
                 first_ns = time_ns;
             }
-            let (step, crossed) = self.turns.follow(azimuth, expected);
+            let last = self.turns.last();
+            let (mut step, crossed) = self.turns.follow(azimuth, expected);
+            if step == Step::Gap && last.is_some_and(|last| self.loss.is_dark(last, azimuth, self.span())) {
+                step = Step::Even;
+            }
             let torn = torn && firing == 0;
             let (step, crossed) = (if torn { Step::Gap } else { step }, crossed || torn);
             let flaw = match step {
@@ -267,7 +278,7 @@ impl Decoder {
 
     /// Takes note of what is missing before a packet; whether that is a turn or more, or nobody knows how much.
     fn take_gap(&mut self, azimuths: &[u32], gap: Gap) -> bool {
-        let span = self.expected() * self.spec.firings_per_packet(self.mode) as u32;
+        let span = self.span();
         if gap.jumped {
             self.loss.jump();
         }
@@ -330,13 +341,18 @@ impl Decoder {
         (done.start_ns, done.end_ns) = (stamp.start_ns, stamp.end_ns);
         (done.clock, done.clock_offset_ms) = (stamp.clock, stamp.clock_offset_ms);
         (self.status.clock, self.status.clock_offset_ms) = (Some(stamp.clock), stamp.clock_offset_ms);
+        let count_rad = std::f32::consts::TAU / AZIMUTHS_PER_TURN as f32;
+        done.dark_rad = self.loss.dark().map(|ends| ends.map(|count| count as f32 * count_rad));
         self.status.revolutions += 1;
         self.status.returns += self.view.take(done);
     }
 
-    fn listen_to_unit(&mut self, packet: &Packet<'_>) {
+    fn listen_to_unit(&mut self, packet: &Packet<'_>, arrival_ns: i64) {
         if !self.spec.model.is_hdl64e() || self.spec.model == Model::Hdl64eS1 {
             return;
+        }
+        if let Some(told) = self.unit.clock.push(packet.status(), packet.device_us()) {
+            self.clock.telemetry(&told, true, arrival_ns);
         }
         let found = self.unit.table.push(packet.status());
         let s3 = self.unit.table.is_s3() || self.mode == ReturnMode::Dual;

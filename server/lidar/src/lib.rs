@@ -15,7 +15,8 @@
 //! | `identify` | packet -> model |
 //! | [`sensor`] | the door: datagram in, revolution out |
 //! | `order` | packets as they arrive -> in the order they were sent, without copies |
-//! | `decoder` | packets of a known model -> revolutions, by way of the next eight |
+//! | `decoder` | packets of a known model -> revolutions, by way of the next nine |
+//! | `unit_clock` | status bytes of an HDL-64E -> what telemetry would say |
 //! | `timeline` | device microseconds past the hour -> one timeline |
 //! | [`clock`] | timeline, telemetry, arrival -> stamps |
 //! | `firing` | packet -> firings |
@@ -42,10 +43,11 @@ pub mod sensor;
 pub mod telemetry;
 mod timeline;
 mod turns;
+mod unit_clock;
 
 pub use blocked::{Blocked, BlockedSector};
 pub use calibration::{Calibration, CalibrationError, LaserCalibration};
-pub use clock::Clock;
+pub use clock::{Clock, GPS_LATE_NS_MAX};
 pub use model::{Model, ModelSpec, ReturnMode};
 pub use packet::Refusal;
 pub use revolution::{Echo, Firing, Partial, Point, Revolution};

@@ -86,6 +86,16 @@ impl Loss {
         }
     }
 
+    /// Encoder counts from which and to which the sensor is dark turn after turn; `None` while it was not, twice.
+    pub fn dark(&self) -> Option<[u32; 2]> {
+        self.dark.map(|dark| [dark.from, dark.to])
+    }
+
+    /// Whether nothing but the dark sector lies between firings at two azimuths; a packet turns `span` counts.
+    pub fn is_dark(&self, from: u32, to: u32, span: u32) -> bool {
+        self.dark.is_some_and(|dark| dark.is_about(&Dark { from, to, packets: 0 }, WANDER_PACKETS * span))
+    }
+
     /// Packets lost so far, and of which it is certain.
     pub fn lost(&self) -> u64 {
         self.lost

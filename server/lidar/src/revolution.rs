@@ -48,6 +48,10 @@ pub struct Revolution {
     /// The same and those that were missing before them, ±1 a gap; where a field of view is set, without its dark sector
     /// (from the second turn on). A gap that goes over the cut counts in the turn in which it begins.
     pub packets_expected: u32,
+    /// Encoder angles (as in [`Firing::azimuth_rad`]) between which the sensor fires nothing: the dark side of the field of
+    /// view it was set to. Learnt: a gap of 15 degrees or more that the next turn has too, in which device time shows
+    /// nothing but a pause. It is no gap of the turn and no packet of it is expected.
+    pub dark_rad: Option<[f32; 2]>,
     /// Where the sensor used to see and does no more.
     pub blocked: Blocked,
     /// Firings of a whole turn: this one's, else the newest whole one's, else by the manual's period; seen ones are
@@ -151,6 +155,7 @@ impl Revolution {
             partial: None,
             packets: 0,
             packets_expected: 0,
+            dark_rad: None,
             blocked: Blocked::default(),
             firings_expected: 0,
         }

@@ -5,7 +5,7 @@
 
 use crate::blocked::Blocked;
 use crate::calibration::Calibration;
-use crate::clock::Clock;
+use crate::clock::{Clock, GPS_LATE_NS_MAX};
 use crate::decoder::Decoder;
 use crate::identify::{self, Finding, PACKETS_HELD};
 use crate::model::{Model, ReturnMode};
@@ -27,11 +27,13 @@ pub struct SensorConfig {
     pub calibration: Option<Calibration>,
     /// Where turns are cut, degrees of encoder angle.
     pub cut_azimuth_deg: f32,
+    /// GPS time older than its arrival by more than this is not believed: [`crate::clock`].
+    pub gps_late_ns_max: i64,
 }
 
 impl Default for SensorConfig {
     fn default() -> Self {
-        Self { model: None, rpm: None, calibration: None, cut_azimuth_deg: 180.0 }
+        Self { model: None, rpm: None, calibration: None, cut_azimuth_deg: 180.0, gps_late_ns_max: GPS_LATE_NS_MAX }
     }
 }
 

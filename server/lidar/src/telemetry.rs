@@ -214,15 +214,24 @@ fn utc_ns(time: &str, date: &str) -> Result<Option<i64>, NmeaError> {
     if hour > 23 || minute > 59 || second > 60 {
         return Err(wrong("time", time, "000000 to 235960"));
     }
-    if !(1..=12).contains(&month) || !(1..=31).contains(&day) {
-        return Err(wrong("date", date, "a day of a month"));
-    }
+    let whole_ns = utc_ns_of([year, month, day], [hour, minute, second]);
+    let whole_ns = whole_ns.ok_or_else(|| wrong("date", date, "a day of a month"))?;
     let fraction = time.split_once('.').map_or(Ok(0.0), |(_, digits)| format!("0.{digits}").parse());
     let fraction: f64 = fraction.map_err(|_| wrong("time", time, "hhmmss or hhmmss.s"))?;
+    Ok(Some(whole_ns + (fraction * 1e9).round() as i64))
+}
+
+/// ns since the Unix epoch of a year of two digits, a month and a day, and an hour, a minute and a second; `None` where
+/// there is no such moment.
+pub(crate) fn utc_ns_of([year, month, day]: [i64; 3], [hour, minute, second]: [i64; 3]) -> Option<i64> {
+    let is_time = hour <= 23 && minute <= 59 && second <= 60;
+    if !is_time || year > 99 || !(1..=12).contains(&month) || !(1..=31).contains(&day) {
+        return None;
+    }
     // Two digits: receivers that begin at GPS's first day, 6 January 1980, write 80.
     let century = if year >= 80 { 1900 } else { 2000 };
     let seconds = days_since_1970(century + year, month, day) * 86_400 + hour * 3_600 + minute * 60 + second;
-    Ok(Some(seconds * 1_000_000_000 + (fraction * 1e9).round() as i64))
+    Some(seconds * 1_000_000_000)
 }
 
 /// The first three pairs of digits.

@@ -62,6 +62,11 @@ impl Turns {
         (step, to_cut <= turned)
     }
 
+    /// Azimuth of the firing followed last.
+    pub fn last(&self) -> Option<u32> {
+        self.last
+    }
+
     /// Counts travelled from the turn's first firing to its last; starts anew with the firing followed last.
     pub fn restart(&mut self) -> u64 {
         std::mem::take(&mut self.travelled)

@@ -7,6 +7,7 @@
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
+use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 
 mod fusion;
@@ -19,6 +20,8 @@ pub use occupancy::OccupancyConfig;
 
 /// Sensors of one vehicle, declared ones included: each keeps its newest turn, some megabytes.
 pub const SENSORS_MAX: usize = 32;
+/// Blind sectors of one sensor.
+pub const BLIND_MAX: usize = 16;
 /// Lasers of a sensor that sends scans; the largest built have 128.
 pub const RINGS_MAX: usize = 256;
 
@@ -63,6 +66,14 @@ pub struct SensorConfig {
     /// Returns nearer to the sensor than this are the vehicle itself and are dropped.
     #[serde(default = "own_body")]
     pub range_m_min: f32,
+    /// Sectors in which the sensor sees nothing but the vehicle or its own mount: `[from, to]` in degrees clockwise from the
+    /// sensor's x axis seen from above; `to` below `from` goes over 0. Returns there are dropped, and stay unknown.
+    #[serde(default)]
+    pub blind_deg: Vec<[f32; 2]>,
+    /// GPS time older than its arrival by more days is not believed, and the sensor's stamps follow the host's clock: then a
+    /// capture is played live, or the receiver has lost count of the weeks.
+    #[serde(default = "a_day")]
+    pub gps_late_days_max: f64,
     /// For scans of a sensor that is no [`Model`]: elevation of each laser, degrees. Where this is empty too, they are
     /// measured from the rings of its first scan; where that tells none, radial maps led by it are unknown.
     #[serde(default)]
@@ -78,6 +89,11 @@ fn behind() -> f32 {
 /// A roof-mounted sensor sees roof, rails and bonnet within this range, and no ground: it stands higher than 1 m.
 fn own_body() -> f32 {
     2.0
+}
+
+/// Hosts' clocks are wrong by hours, not by days.
+fn a_day() -> f64 {
+    1.0
 }
 
 /// `ego_from_sensor`, as people write it. Rotation = Rz(yaw) Ry(pitch) Rx(roll).
@@ -198,6 +214,17 @@ impl VehicleConfig {
 }
 
 impl SensorConfig {
+    /// What the decoder needs to know, with the sensor's own table.
+    pub fn lidar(&self, calibration: Option<Calibration>) -> clearway_lidar::SensorConfig {
+        clearway_lidar::SensorConfig {
+            model: self.model,
+            rpm: self.rpm,
+            calibration,
+            cut_azimuth_deg: self.cut_azimuth_deg,
+            gps_late_ns_max: (self.gps_late_days_max * 86_400e9) as i64,
+        }
+    }
+
     /// A sensor with every default.
     pub fn new(name: impl Into<String>, extrinsics: Extrinsics) -> Self {
         Self {
@@ -207,6 +234,8 @@ impl SensorConfig {
             calibration: None,
             cut_azimuth_deg: behind(),
             range_m_min: own_body(),
+            blind_deg: Vec::new(),
+            gps_late_days_max: a_day(),
             elevations_deg: Vec::new(),
             extrinsics,
         }
@@ -220,6 +249,15 @@ impl SensorConfig {
         }
         check(f64::from(self.cut_azimuth_deg), 0.0..=360.0, || format!("{at}.cut_azimuth_deg"), "0 to 360")?;
         check(f64::from(self.range_m_min), 0.0..=20.0, || format!("{at}.range_m_min"), "0 to 20")?;
+        if self.blind_deg.len() > BLIND_MAX {
+            let given = format!("{} sectors", self.blind_deg.len());
+            return Err(ConfigError::new(format!("{at}.blind_deg"), given, "at most 16"));
+        }
+        for &end in self.blind_deg.as_flattened() {
+            check(f64::from(end), 0.0..=360.0, || format!("{at}.blind_deg"), "0 to 360")?;
+        }
+        // A century: i64 stamps end in 2262.
+        check(self.gps_late_days_max, 0.0..=36_525.0, || format!("{at}.gps_late_days_max"), "0 to 36525")?;
         if self.elevations_deg.len() > RINGS_MAX {
             let given = format!("{} elevations", self.elevations_deg.len());
             return Err(ConfigError::new(format!("{at}.elevations_deg"), given, "at most 256"));

@@ -43,6 +43,9 @@ pub enum Body {
     End,
 }
 
+/// The source of a reading that is no sensor's, or of which nobody knows whose it was.
+pub const NOBODY: u16 = u16::MAX;
+
 /// Why a reading never became an event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Cause {
@@ -59,9 +62,9 @@ pub enum Cause {
 }
 
 impl Cause {
-    /// Whether it is known which sensor's the reading was.
+    /// Whether it may be known which sensor's the reading was; [`NOBODY`] where it is not.
     pub fn has_source(self) -> bool {
-        matches!(self, Self::Queue | Self::Length)
+        !matches!(self, Self::Kernel | Self::Sender)
     }
 }
 

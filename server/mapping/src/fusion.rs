@@ -79,7 +79,7 @@ impl Fusion {
             index == source || (self.is_fresh(&intakes[index], now) && self.is_timely(&intakes[index], intakes, now))
         });
         let may = self.is_timely(&intakes[source], intakes, now) && (overdue || leads == Some(source));
-        may && (overdue || self.is_due(source, &intakes[source]))
+        may && (overdue || (self.is_due(source, &intakes[source]) && self.is_newer(source, &intakes[source])))
     }
 
     /// Whether `period_ms` has passed since this sensor made the last map. A clock set back is due at once.
@@ -88,6 +88,12 @@ impl Fusion {
             let since_ns = intake.turn.end_ns.saturating_sub(made.stamp_ns);
             made.maker != source || since_ns < 0 || since_ns >= self.period_ns - self.period_ns / 10
         })
+    }
+
+    /// Whether the turn ended after the last map's stamp: where another sensor takes over, its newest turn may be the older
+    /// one. The same sensor's stamps rise by themselves, unless its clock was set back.
+    fn is_newer(&self, source: usize, intake: &Intake) -> bool {
+        self.last.is_none_or(|made| made.maker == source || intake.turn.end_ns > made.stamp_ns)
     }
 
     fn order(&self, sensors: usize) -> impl Iterator<Item = usize> {
@@ -103,7 +109,7 @@ impl Fusion {
 
     /// Whether the sensor's turns come no later after their stamps, nor earlier before them, than the timeliest fresh
     /// sensor's, give or take the deadline.
-    fn is_timely(&self, intake: &Intake, intakes: &[Intake], now: Moment) -> bool {
+    pub fn is_timely(&self, intake: &Intake, intakes: &[Intake], now: Moment) -> bool {
         let off_ns =
             |intake: &Intake| intake.turn.completed.arrival_ns.saturating_sub(intake.turn.end_ns).saturating_abs();
         let fresh = intakes.iter().filter(|other| other.turns > 0 && self.is_fresh(other, now));

@@ -10,7 +10,7 @@ use clearway_lidar::revolution::{Partial, Revolution};
 use clearway_lidar::sensor::{Sensor, SensorStatus};
 use nalgebra::{Isometry3, Vector3};
 
-use crate::body::Body;
+use crate::body::Screen;
 use crate::config::{BodyConfig, SensorConfig};
 use crate::event::Scan;
 use crate::ledger::{Dropped, Ledger, Rejected};
@@ -70,7 +70,7 @@ pub(crate) struct Intake {
     name: String,
     sensor: Sensor,
     mount: Mount,
-    body: Option<Body>,
+    screen: Option<Screen>,
     /// Of the lasers behind scans; `None` while nobody tells.
     scan_calibration: Option<Arc<Calibration>>,
     newest_scan: Option<(i64, i64)>,
@@ -101,13 +101,8 @@ impl Intake {
         Self {
             name: config.name.clone(),
             scan_calibration: calibration.clone().or_else(factory).or(configured).map(Arc::new),
-            sensor: Sensor::new(clearway_lidar::sensor::SensorConfig {
-                model: config.model,
-                rpm: config.rpm,
-                calibration,
-                cut_azimuth_deg: config.cut_azimuth_deg,
-            }),
-            body: body.map(|body| Body::new(body, [place.x, place.y, place.z].map(|metres| metres as f32))),
+            sensor: Sensor::new(config.lidar(calibration)),
+            screen: Screen::new(body, [place.x, place.y, place.z].map(|metres| metres as f32), &config.blind_deg),
             mount: Mount { ego_from_sensor, range_m_min: config.range_m_min },
             newest_scan: None,
             scans: 0,
@@ -186,14 +181,14 @@ impl Intake {
 
     fn take_revolution(&mut self, motion: &Motion, now: Moment) -> Option<Dropped> {
         let revolution = self.sensor.newest()?;
-        let (turn, mount, body) = (&mut self.turn, &self.mount, self.body.as_ref());
+        let (turn, mount, screen) = (&mut self.turn, &self.mount, self.screen.as_ref());
         motion.through(revolution, now.arrival_ns, &mut self.moved);
-        let dropped = turn.sweep.take_revolution_around(revolution, mount, &self.moved.end_from_ego, body);
+        let dropped = turn.sweep.take_revolution_around(revolution, mount, &self.moved.end_from_ego, screen);
         if let Some(series) = &mut self.series {
-            turn.sweep.take_deviations_around(revolution, mount, series, body);
+            turn.sweep.take_deviations_around(revolution, mount, series, screen);
         }
         if self.wants_no_returns {
-            look_for_no_returns(revolution, mount, &self.moved, &mut turn.no_returns);
+            look_for_no_returns(revolution, mount, &self.moved, screen, &mut turn.no_returns);
         }
         turn.state = SensorState {
             name: self.name.clone(),
@@ -238,11 +233,12 @@ impl Intake {
         let turn = &mut self.turn;
         motion.through_scan(scan, now.arrival_ns, &mut self.moved);
         let (calibration, moved) = (self.scan_calibration.as_ref(), &self.moved.end_from_ego);
-        let dropped = turn.sweep.take_scan_around(scan, calibration, &self.mount, moved, self.body.as_ref());
+        let dropped = turn.sweep.take_scan_around(scan, calibration, &self.mount, moved, self.screen.as_ref());
         turn.no_returns.clear();
         if self.wants_no_returns {
             let into_ego = |ray: &[f32; 3]| turned(&self.mount.ego_from_sensor, *ray);
-            turn.no_returns.extend(scan.no_returns.iter().map(into_ego));
+            let blind = |ray: &[f32; 3]| self.screen.as_ref().is_some_and(|screen| screen.blinds(*ray));
+            turn.no_returns.extend(scan.no_returns.iter().filter(|ray| !blind(ray)).map(into_ego));
         }
         turn.state = SensorState {
             name: self.name.clone(),
@@ -296,7 +292,13 @@ fn check(scan: &Scan) -> Result<(), Rejected> {
 
 /// Directions of the firings' lasers that came back with nothing, but for those that are hidden, in place of what `no_returns` held. A laser is taken to
 /// fire with the first of its firing, 0.2 degrees off at most.
-fn look_for_no_returns(revolution: &Revolution, mount: &Mount, moved: &Moved, no_returns: &mut Vec<[f32; 3]>) {
+fn look_for_no_returns(
+    revolution: &Revolution,
+    mount: &Mount,
+    moved: &Moved,
+    screen: Option<&Screen>,
+    no_returns: &mut Vec<[f32; 3]>,
+) {
     no_returns.clear();
     let Some(echo) = revolution.echoes.first() else { return };
     let lasers: Vec<(f32, [f32; 2])> = (revolution.calibration.lasers.iter())
@@ -317,8 +319,10 @@ fn look_for_no_returns(revolution: &Revolution, mount: &Mount, moved: &Moved, no
         let nothing = range_m.iter().zip(&lasers).enumerate().filter(|(_, (range, _))| **range == 0.0);
         for (laser, (_, &(rotation, [up, flat]))) in nothing {
             let azimuth_rad = firing.azimuth_rad - rotation;
-            if !revolution.blocked.hides(laser, azimuth_rad) {
-                no_returns.push(turned(&ego_from_sensor, direction(azimuth_rad, [up, flat])));
+            let ray = direction(azimuth_rad, [up, flat]);
+            let blind = screen.is_some_and(|screen| screen.blinds(ray));
+            if !blind && !revolution.blocked.hides(laser, azimuth_rad) {
+                no_returns.push(turned(&ego_from_sensor, ray));
             }
         }
     }
@@ -335,7 +339,7 @@ fn turned(by: &Isometry3<f64>, direction: [f32; 3]) -> [f32; 3] {
     [turned.x, turned.y, turned.z].map(|metres| metres as f32)
 }
 
-/// Share of the turn's degrees in which a firing lies.
+/// Share of the field of view's degrees in which a firing lies.
 fn completeness(revolution: &Revolution) -> f32 {
     let mut seen = [false; 360];
     for firing in &revolution.firings {
@@ -343,7 +347,14 @@ fn completeness(revolution: &Revolution) -> f32 {
         // `as` saturates, so an azimuth of exactly 2π (or a wild one) falls into the last degree.
         seen[(degree as usize).min(359)] = true;
     }
-    seen.iter().filter(|s| **s).count() as f32 / 360.0
+    let dark = |degree: usize| {
+        revolution.dark_rad.is_some_and(|ends| {
+            let [from_deg, to_deg] = ends.map(f32::to_degrees);
+            (degree as f32 - from_deg).rem_euclid(360.0) + 1.0 <= (to_deg - from_deg).rem_euclid(360.0)
+        })
+    };
+    let lit = (0..360).filter(|&degree| seen[degree] || !dark(degree)).count();
+    seen.iter().filter(|s| **s).count() as f32 / lit.max(1) as f32
 }
 
 #[cfg(test)]
@@ -376,9 +387,9 @@ mod tests {
         let turned = Isometry3::new(Vector3::new(0.0, 0.0, 1.9), Vector3::new(0.0, 0.0, std::f64::consts::FRAC_PI_2));
         let (mut level, mut left) = (Vec::new(), Vec::new());
         let mut mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
-        look_for_no_returns(&revolution, &mount, &Moved::default(), &mut level);
+        look_for_no_returns(&revolution, &mount, &Moved::default(), None, &mut level);
         mount.ego_from_sensor = turned;
-        look_for_no_returns(&revolution, &mount, &Moved::default(), &mut left);
+        look_for_no_returns(&revolution, &mount, &Moved::default(), None, &mut left);
         assert_eq!(level.len(), echo.range_m.iter().filter(|range| **range == 0.0).count());
         assert!(level.len() > 10_000 && level.iter().any(|ray| ray[2] > 0.2), "the sky gives nothing back");
         for (level, left) in level.iter().zip(&left) {

@@ -43,6 +43,8 @@ pub struct Ledger {
     pub own_body: u64,
     /// Returns left out because their ray crosses the vehicle.
     pub through_body: u64,
+    /// Returns left out because they lie in a sector that the configuration calls blind.
+    pub blind: u64,
 }
 
 impl Ledger {
@@ -68,6 +70,7 @@ impl Ledger {
         self.points_dropped += dropped.no_position;
         self.own_body += dropped.own_body;
         self.through_body += dropped.through_body;
+        self.blind += dropped.blind;
     }
 }
 
@@ -80,6 +83,8 @@ pub struct Dropped {
     pub own_body: u64,
     /// Behind the vehicle.
     pub through_body: u64,
+    /// In a blind sector.
+    pub blind: u64,
 }
 
 impl Dropped {
@@ -87,6 +92,7 @@ impl Dropped {
     pub(crate) fn count(&mut self, hidden: Option<Hidden>) {
         self.own_body += u64::from(hidden == Some(Hidden::OwnBody));
         self.through_body += u64::from(hidden == Some(Hidden::ThroughBody));
+        self.blind += u64::from(hidden == Some(Hidden::Blind));
     }
 }
 

@@ -255,8 +255,11 @@ impl Pipeline {
     /// A sensor's turn has ended: the maps that gather see it, and perhaps it makes a map.
     fn end_turn(&mut self, source: u16, now: Moment) -> bool {
         let index = usize::from(source);
-        let rays = self.intakes[index].rays(source);
-        self.layers.take(&rays);
+        // What comes that much too late is evidence of a world that has moved on.
+        if self.fusion.is_timely(&self.intakes[index], &self.intakes, now) {
+            let rays = self.intakes[index].rays(source);
+            self.layers.take(&rays);
+        }
         let makes_map = self.fusion.makes_map(index, &self.intakes, now);
         if makes_map {
             self.make_map(source, now);

@@ -10,7 +10,7 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
 use nalgebra::Isometry3;
 
-use crate::body::{Body, Hidden};
+use crate::body::{Hidden, Screen};
 use crate::event::Scan;
 use crate::ledger::Dropped;
 use crate::motion::{ScanKnots, knots};
@@ -60,17 +60,17 @@ impl Sweep {
         self.take_revolution_around(revolution, mount, end_from_ego, None);
     }
 
-    /// The same without the returns that the vehicle's own body hides; gives how many those are.
+    /// The same without the returns that the vehicle's own body or a blind sector hides; gives how many those are.
     pub fn take_revolution_around(
         &mut self,
         revolution: &Revolution,
         mount: &Mount,
         end_from_ego: &[Isometry3<f64>],
-        body: Option<&Body>,
+        screen: Option<&Screen>,
     ) -> Dropped {
-        match body {
+        match screen {
             None => self.fill(revolution, mount, end_from_ego, |_| None),
-            Some(body) => self.fill(revolution, mount, end_from_ego, hides(mount, body)),
+            Some(screen) => self.fill(revolution, mount, end_from_ego, hides(mount, screen)),
         }
     }
 
@@ -128,10 +128,10 @@ impl Sweep {
         revolution: &Revolution,
         mount: &Mount,
         series: &mut Series,
-        body: Option<&Body>,
+        screen: Option<&Screen>,
     ) {
         let first = series.take(revolution);
-        let hides = body.map(|body| hides(mount, body));
+        let hides = screen.map(|screen| hides(mount, screen));
         self.deviation_m.clear();
         for (number, echo) in revolution.echoes.iter().enumerate() {
             let hidden = |slot: usize| {
@@ -152,20 +152,20 @@ impl Sweep {
     }
 
     /// The same of a sensor whose elevations may not be known, each point moved from when it was seen (`end_from_ego` is
-    /// [`crate::motion::Moved::end_from_ego`] of this scan, or empty), without what the vehicle's own body hides.
+    /// [`crate::motion::Moved::end_from_ego`] of this scan, or empty), without what the vehicle's own body or a blind sector hides.
     pub fn take_scan_around(
         &mut self,
         scan: &Scan,
         calibration: Option<&Arc<Calibration>>,
         mount: &Mount,
         end_from_ego: &[Isometry3<f64>],
-        body: Option<&Body>,
+        screen: Option<&Screen>,
     ) -> Dropped {
         self.prepare(calibration, mount);
         let at_rest = Transform::new(&mount.ego_from_sensor);
         let moving = transforms(mount, end_from_ego);
         let knots = ScanKnots::of(scan);
-        let hides = body.map(|body| hides(mount, body));
+        let hides = screen.map(|screen| hides(mount, screen));
         let mut kept = self.open(scan.x.len());
         let mut returns = 0;
         let mut dropped = Dropped::default();
@@ -247,10 +247,10 @@ impl Sweep {
     }
 }
 
-/// What the body hides of a point of the sensor's frame, at the moment it was seen.
-fn hides(mount: &Mount, body: &Body) -> impl Fn([f32; 3]) -> Option<Hidden> {
-    let (at_rest, body) = (Transform::new(&mount.ego_from_sensor), *body);
-    move |[x, y, z]| body.hides(at_rest.apply(x, y, z))
+/// What hides a point of the sensor's frame, at the moment it was seen.
+fn hides(mount: &Mount, screen: &Screen) -> impl Fn([f32; 3]) -> Option<Hidden> {
+    let at_rest = Transform::new(&mount.ego_from_sensor);
+    move |[x, y, z]| screen.hides([x, y, z], || at_rest.apply(x, y, z))
 }
 
 /// `end_from_sensor` at each knot.

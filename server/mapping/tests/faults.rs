@@ -22,6 +22,8 @@ fn pipeline(model: Model) -> Pipeline {
         rpm: None,
         calibration: None,
         cut_azimuth_deg: 180.0,
+        blind_deg: Vec::new(),
+        gps_late_days_max: 1.0,
         range_m_min: 2.0,
         elevations_deg: Vec::new(),
         extrinsics,

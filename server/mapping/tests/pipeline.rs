@@ -263,7 +263,7 @@ fn a_configuration_that_cannot_work_names_key_value_and_what_is_allowed() {
     let height = refuse(&|c| c.sensors[0].extrinsics.z_m = f64::NAN);
     assert_eq!(height.to_string(), "vehicle.sensor[0].extrinsics.z_m = NaN: allowed is 0.1 to 20");
     let body = |x_m_max, z_m_max| Some(BodyConfig { x_m_min: -1.0, x_m_max, y_m_min: -1.0, y_m_max: 1.0, z_m_max });
-    let others: [(&str, Change); 18] = [
+    let others: [(&str, Change); 20] = [
         ("vehicle.sensor", &|c| c.sensors = vec![c.sensors[0].clone(); 33]),
         ("vehicle.sensor[0].elevations_deg", &|c| c.sensors[0].elevations_deg = vec![f32::NAN]),
         ("vehicle.fusion.lead", &|c| c.fusion.lead = "roof".into()),
@@ -272,6 +272,8 @@ fn a_configuration_that_cannot_work_names_key_value_and_what_is_allowed() {
         ("vehicle.body.z_m_max", &|c| c.body = body(3.0, f32::NAN)),
         ("vehicle.sensor[0].name", &|c| c.sensors[0].name.clear()),
         ("vehicle.sensor[0].rpm", &|c| c.sensors[0].rpm = Some(0.0)),
+        ("vehicle.sensor[0].blind_deg", &|c| c.sensors[0].blind_deg = vec![[10.0, 361.0]]),
+        ("vehicle.sensor[0].gps_late_days_max", &|c| c.sensors[0].gps_late_days_max = f64::NAN),
         ("vehicle.sensor[0].cut_azimuth_deg", &|c| c.sensors[0].cut_azimuth_deg = -1.0),
         ("vehicle.sensor[0].range_m_min", &|c| c.sensors[0].range_m_min = f32::INFINITY),
         ("vehicle.sensor[0].extrinsics.x_m", &|c| c.sensors[0].extrinsics.x_m = 1e9),

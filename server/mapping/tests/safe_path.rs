@@ -153,12 +153,13 @@ proptest! {
             let apart = |a: &[i32; 2], b: &[i32; 2]| f64::from(a[0] - b[0]).hypot(f64::from(a[1] - b[1]));
             prop_assert!(near.iter().any(|a| near.iter().any(|b| apart(a, b) >= width)), "{:?}", point);
         }
-        // Lines one cell wide: no two by two cells of them.
-        for iy in 0..side as i32 - 1 {
-            for ix in 0..side as i32 - 1 {
-                let block = [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dx, dy)| ridge.point_in(ix + dx, iy + dy).is_some());
-                prop_assert!(!block.iter().all(|held| *held), "{} {}", ix, iy);
-            }
+        // Lines one cell wide: no two by two cells of them, but where four lines meet, one at each cell.
+        let held = |[ix, iy]: [i32; 2]| ridge.point_in(ix, iy).is_some();
+        for [ix, iy] in (0..side as i32 - 1).flat_map(|iy| (0..side as i32 - 1).map(move |ix| [ix, iy])) {
+            let block = [[ix, iy], [ix + 1, iy], [ix, iy + 1], [ix + 1, iy + 1]];
+            let around = |[x, y]: [i32; 2]| (y - 1..=y + 1).flat_map(move |y| (x - 1..=x + 1).map(move |x| [x, y]));
+            let goes_on = |cell: [i32; 2]| around(cell).any(|beside| !block.contains(&beside) && held(beside));
+            prop_assert!(!block.iter().all(|cell| held(*cell)) || block.iter().all(|cell| goes_on(*cell)), "{:?}", block);
         }
         // Links lead back, and on to where the vehicle is.
         for (index, point) in links.points().iter().enumerate() {

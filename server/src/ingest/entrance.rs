@@ -4,7 +4,7 @@
 use std::sync::{Arc, Mutex};
 
 use clearway_mapping::config::{SensorConfig, VehicleConfig};
-use clearway_mapping::event::{Body, Cause};
+use clearway_mapping::event::{Body, Cause, NOBODY};
 use clearway_proto::v1;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
@@ -66,6 +66,7 @@ impl Entrance {
         verdicts: &Verdicts,
     ) -> Result<(), Unknown> {
         let (client, number) = (observation.client, observation.number);
+        let of_vehicle = is_of_vehicle(&observation);
         if let Err(message) = account.count(number) {
             self.refuse(account, number, "number", message);
             return Ok(());
@@ -81,7 +82,8 @@ impl Entrance {
         match observation::bodies(observation, &self.limits) {
             Err(error) => {
                 account.enter(number, 0, 0);
-                self.refuse_error(account, number, &error);
+                self.leave(if of_vehicle { NOBODY } else { source }, error.reason());
+                account.refuse(number, error.reason(), error.to_string(), 1);
             }
             Ok(bodies) => {
                 account.enter(number, bodies.len(), bytes);
@@ -110,13 +112,16 @@ impl Entrance {
 
     /// Counts what did not become an event, where nobody can be told.
     pub fn count(&self, reason: &'static str) {
-        let cause = match reason {
-            "queue" => Cause::Queue,
-            "source" => Cause::Sender,
-            _ => Cause::Observation,
-        };
-        // Nobody has looked whose it is: no sensor has this number.
-        self.door.outside().leave(u16::MAX, cause, 1);
+        self.leave(NOBODY, reason);
+    }
+
+    fn leave(&self, source: u16, reason: &'static str) {
+        let outside = self.door.outside();
+        match reason {
+            "queue" => outside.leave(source, Cause::Queue, 1),
+            "source" => outside.leave(source, Cause::Sender, 1),
+            _ => outside.leave_observations(source, reason, 1),
+        }
     }
 
     /// Whether it is on the queue; the ticket knows where it is not.
@@ -149,11 +154,9 @@ impl Entrance {
 
     /// The sensor an observation is of; 0 where it concerns the whole vehicle.
     fn source(&self, observation: &v1::Observation) -> Result<u16, Unknown> {
-        use v1::observation::Body::{Declaration, EgoPose, Road};
         let name = &observation.sensor;
         let sensors = &locked(&self.config).sensors;
-        let of_vehicle = matches!(observation.body, Some(EgoPose(_) | Road(_) | Declaration(_)) | None);
-        if of_vehicle || (name.is_empty() && sensors.len() == 1) {
+        if is_of_vehicle(observation) || (name.is_empty() && sensors.len() == 1) {
             return Ok(0);
         }
         let index = sensors.iter().position(|sensor| sensor.name == *name);
@@ -163,6 +166,12 @@ impl Entrance {
             known: sensors.iter().map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", "),
         })
     }
+}
+
+/// Whether an observation is of no sensor but of the whole vehicle.
+fn is_of_vehicle(observation: &v1::Observation) -> bool {
+    use v1::observation::Body::{Declaration, EgoPose, Road};
+    matches!(observation.body, Some(EgoPose(_) | Road(_) | Declaration(_)) | None)
 }
 
 /// The entrances of all vehicles that have one, in the order of the configuration.

@@ -1,7 +1,7 @@
 //! Files and folders, in the order given -> readings. What a file is, its first bytes tell, else its name: pcap, pcapng,
 //! MCAP, KITTI `.bin`, `.pcd`. A folder stands for the files in it, by name.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -9,8 +9,7 @@ use clearway_mapping::event::Body;
 
 use super::capture::CaptureError;
 use super::kitti::ScanError;
-use super::mcap::McapError;
-use super::mcap::Wanted;
+use super::mcap::{McapError, Untold, Wanted};
 use super::ros::Intake;
 use super::{Reading, capture, kitti, mcap};
 
@@ -85,12 +84,12 @@ pub struct Readings {
     /// Takes the ROS messages of the next file of a bag.
     intake: Option<Intake>,
     /// Messages refused in files already closed, and not told to the door yet.
-    untold: u64,
+    untold: Untold,
     open: Option<Open>,
     scans: u64,
     bytes_before: u64,
-    /// Stamp of the newest reading, and whether an unfinished revolution may be behind it.
-    pending_end: Option<i64>,
+    /// Stamp of the newest reading behind which unfinished revolutions may be, and the sensors they may be of.
+    pending_ends: (i64, BTreeSet<u16>),
     truncated: Vec<Truncated>,
     notes: Vec<String>,
     over: bool,
@@ -119,11 +118,11 @@ impl Readings {
             files: all,
             wanted,
             intake: None,
-            untold: 0,
+            untold: Untold::new(),
             open: None,
             scans: 0,
             bytes_before: 0,
-            pending_end: None,
+            pending_ends: Default::default(),
             truncated: Vec::new(),
             notes: Vec::new(),
             over: false,
@@ -161,10 +160,10 @@ impl Readings {
     }
 
     /// Messages that were refused since this was last asked, before they became readings.
-    pub fn untold(&mut self) -> u64 {
+    pub fn untold(&mut self) -> Untold {
         let mut untold = std::mem::take(&mut self.untold);
         if let Some(Open::Mcap(_, source)) = &mut self.open {
-            untold += source.untold();
+            add(&mut untold, source.untold());
         }
         untold
     }
@@ -178,13 +177,14 @@ impl Readings {
             };
             if let Some(reading) = next {
                 let journal = matches!(&self.open, Some(Open::Mcap(_, source)) if source.is_journal());
-                self.pending_end = (!journal).then_some(reading.arrival_ns);
+                self.await_end(&reading, journal);
                 return Ok(Some(reading));
             }
             self.close();
             let Some((file, kind)) = self.files.pop_front() else {
-                let end = self.pending_end.take();
-                return Ok(end.map(|arrival_ns| Reading { arrival_ns, source: 0, body: Body::End }));
+                let (arrival_ns, sources) = &mut self.pending_ends;
+                let (arrival_ns, source) = (*arrival_ns, sources.pop_first());
+                return Ok(source.map(|source| Reading { arrival_ns, source, body: Body::End }));
             };
             match kind {
                 Kind::Capture => self.open = Some(Open::Capture(file.clone(), Box::new(capture::Source::open(&file)?))),
@@ -196,10 +196,21 @@ impl Readings {
                     let reading = kitti::read(&file, self.scans)?;
                     self.scans += 1;
                     self.bytes_before += file.metadata().map_or(0, |metadata| metadata.len());
-                    self.pending_end = Some(reading.arrival_ns);
+                    self.await_end(&reading, false);
                     return Ok(Some(reading));
                 }
             }
+        }
+    }
+
+    /// Takes note of a sensor whose end the files do not tell, as a journal does.
+    fn await_end(&mut self, reading: &Reading, is_journal: bool) {
+        let (newest_ns, sources) = &mut self.pending_ends;
+        *newest_ns = reading.arrival_ns;
+        if is_journal {
+            sources.clear();
+        } else if matches!(reading.body, Body::Datagram(_) | Body::Scan(_)) {
+            sources.insert(reading.source);
         }
     }
 
@@ -220,11 +231,15 @@ impl Readings {
                     self.truncated.push(Truncated { file: file.clone(), reason });
                 }
                 self.notes.extend(source.notes().into_iter().map(|note| format!("{}: {note}", file.display())));
-                self.untold += source.untold();
+                add(&mut self.untold, source.untold());
                 self.intake = source.into_intake();
             }
         }
     }
+}
+
+fn add(untold: &mut Untold, more: Untold) {
+    more.into_iter().for_each(|(whose, count)| *untold.entry(whose).or_default() += count);
 }
 
 impl Iterator for Readings {

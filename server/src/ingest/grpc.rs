@@ -54,7 +54,11 @@ impl IngestService for Ingest {
         let mut observations = request.into_inner();
         let first = tokio::time::timeout(OPENING_TIMEOUT, observations.message())
             .await
-            .map_err(|_| Status::deadline_exceeded(format!("no observation within {OPENING_TIMEOUT:?}")))??;
+            .map_err(|_| Status::deadline_exceeded(format!("no observation within {OPENING_TIMEOUT:?}")))?;
+        // Nobody can read which vehicle it was for: the first one counts it, so that it is in one ledger.
+        let first = first.inspect_err(|status| {
+            self.entrances.all().first().filter(|_| is_refusal(status)).inspect(|first| first.count("message"));
+        })?;
         let first = first.ok_or_else(|| Status::invalid_argument("a stream without an observation"))?;
         let entrance = self.entrances.find(&first.vehicle)?.clone();
         let own_place = entrance.stream().map_err(|streams_max| {
@@ -143,8 +147,7 @@ impl Ingester {
                     Ok(Some(observation)) => self.take(observation),
                     Ok(None) => self.finish(None),
                     Err(status) => {
-                        // Too long, or no observation: not the network's doing.
-                        if matches!(status.code(), Code::OutOfRange | Code::Internal) {
+                        if is_refusal(&status) {
                             self.entrance.count("message");
                         }
                         self.finish(Some(status));
@@ -173,6 +176,11 @@ impl Ingester {
         self.observations = None;
         self.end = end;
     }
+}
+
+/// Whether a message was too long, or no observation: not the network's doing.
+fn is_refusal(status: &Status) -> bool {
+    matches!(status.code(), Code::OutOfRange | Code::Internal)
 }
 
 async fn next_observation(

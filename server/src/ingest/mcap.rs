@@ -8,6 +8,9 @@ use super::Reading;
 use super::ros::{ChoiceError, Intake, Offered};
 use crate::recording::{Entry, Recording, RecordingError};
 
+/// Messages refused that the door has not been told of yet, by sensor and reason.
+pub type Untold = BTreeMap<(u16, &'static str), u64>;
+
 /// What is read of MCAP files.
 #[derive(Clone, Debug, Default)]
 pub struct Wanted {
@@ -29,8 +32,7 @@ pub struct Source {
     ignored: BTreeSet<String>,
     /// By topic: messages that were not taken, and what was wrong with the first.
     refused: BTreeMap<String, (u64, String)>,
-    /// Those not told to the door yet.
-    untold: u64,
+    untold: Untold,
     waiting: VecDeque<Reading>,
     is_journal: bool,
 }
@@ -69,7 +71,7 @@ impl Source {
             notes,
             ignored: BTreeSet::new(),
             refused: BTreeMap::new(),
-            untold: 0,
+            untold: Untold::new(),
             waiting: VecDeque::new(),
             is_journal: false,
         })
@@ -94,7 +96,7 @@ impl Source {
     }
 
     /// Messages that were refused since this was last asked.
-    pub fn untold(&mut self) -> u64 {
+    pub fn untold(&mut self) -> Untold {
         std::mem::take(&mut self.untold)
     }
 
@@ -119,7 +121,7 @@ impl Source {
                     return;
                 };
                 if let Err(refused) = intake.take(&topic, kind, log_ns, &bytes, &mut self.waiting) {
-                    self.untold += 1;
+                    *self.untold.entry((intake.source(&topic), refused.reason())).or_default() += 1;
                     self.refused.entry(topic).or_insert_with(|| (0, refused.to_string())).0 += 1;
                 }
             }

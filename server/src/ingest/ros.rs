@@ -8,7 +8,7 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use bytes::Bytes;
-use clearway_mapping::event::{Body, EgoPose, Scan};
+use clearway_mapping::event::{Body, EgoPose, NOBODY, Scan};
 use clearway_ros::pose::{Odometry, StampedTransform, pose_stamped, tf_message};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, MessageError, PointCloud2, Points};
@@ -64,6 +64,18 @@ pub enum Refused {
     },
 }
 
+impl Refused {
+    /// The name it is counted by.
+    pub fn reason(&self) -> &'static str {
+        match self {
+            Self::Message(_) => "ros_message",
+            Self::Kind { .. } => "ros_kind",
+            Self::Frame { .. } => "ros_frame",
+            Self::Frames { .. } => "ros_frames",
+        }
+    }
+}
+
 /// The chosen topics of one vehicle, and what their messages have told so far.
 #[derive(Clone, Debug)]
 pub struct Intake {
@@ -88,9 +100,9 @@ impl Intake {
         kind == Kind::TfMessage || self.sensors.contains_key(topic) || self.is_pose(topic)
     }
 
-    /// The sensor this topic is taken for; 0 for what concerns the whole vehicle.
+    /// The sensor this topic is taken for; [`NOBODY`] for what concerns the whole vehicle.
     pub fn source(&self, topic: &str) -> u16 {
-        self.sensors.get(topic).copied().unwrap_or(0)
+        self.sensors.get(topic).copied().unwrap_or(NOBODY)
     }
 
     fn is_pose(&self, topic: &str) -> bool {

@@ -51,7 +51,6 @@ pub const RPCS: &[(&str, &[Role])] = &[
     ("/clearway.v1.IngestService/Stream", &[Role::Ingester]),
     ("/grpc.health.v1.Health/Check", &[Role::Reader, Role::Ingester]),
     ("/grpc.health.v1.Health/Watch", &[Role::Reader, Role::Ingester]),
-    ("/grpc.health.v1.Health/List", &[Role::Reader, Role::Ingester]),
     ("/grpc.reflection.v1.ServerReflection/ServerReflectionInfo", &[Role::Reader, Role::Ingester]),
     ("/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo", &[Role::Reader, Role::Ingester]),
 ];

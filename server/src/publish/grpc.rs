@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clearway_proto::{DESCRIPTORS, v1};
-use futures::{Stream, stream};
+use futures::{Stream, StreamExt, stream};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tonic::transport::{Certificate, Identity, Server, ServerTlsConfig};
@@ -143,13 +143,7 @@ impl MapService for Maps {
             .map_err(|_| Status::deadline_exceeded(format!("no selection within {SELECTION_TIMEOUT:?}")))??;
         let selection = first.and_then(|first| first.selection);
         let selection = selection.ok_or_else(|| Status::invalid_argument("the first request carries a selection"))?;
-        let served = self.vehicles.find(&selection.vehicle)?;
-        served.check_layers(&selection.layers)?;
-        if selection.max_in_flight > IN_FLIGHT_MAX {
-            let asked = selection.max_in_flight;
-            return Err(Status::invalid_argument(format!("max_in_flight {asked}: 0 to {IN_FLIGHT_MAX} is allowed")));
-        }
-        Ok(Response::new(Box::pin(Watch::new(served, selection, requests).updates())))
+        Ok(Response::new(Box::pin(watch(&self.vehicles, selection, requests)?)))
     }
 
     async fn get_map(&self, request: Request<v1::GetMapRequest>) -> Result<Response<v1::MapUpdate>, Status> {
@@ -174,9 +168,31 @@ impl MapService for Maps {
     }
 }
 
+/// The updates of one reader of `Watch`: what it selected of the newest maps, as far as what it acknowledges allows. Any
+/// executor drives it.
+///
+/// # Errors
+/// What is wrong with the selection.
+pub fn watch<R>(
+    vehicles: &Vehicles,
+    selection: v1::Selection,
+    requests: R,
+) -> Result<impl Stream<Item = Result<v1::MapUpdate, Status>> + Send + use<R>, Status>
+where
+    R: Stream<Item = Result<v1::WatchRequest, Status>> + Send + Unpin,
+{
+    let served = vehicles.find(&selection.vehicle)?;
+    served.check_layers(&selection.layers)?;
+    if selection.max_in_flight > IN_FLIGHT_MAX {
+        let asked = selection.max_in_flight;
+        return Err(Status::invalid_argument(format!("max_in_flight {asked}: 0 to {IN_FLIGHT_MAX} is allowed")));
+    }
+    Ok(Watch::new(served, selection, requests).updates())
+}
+
 /// One reader of `Watch`.
-struct Watch {
-    requests: Option<Streaming<v1::WatchRequest>>,
+struct Watch<R> {
+    requests: Option<R>,
     newest: watch::Receiver<Newest>,
     layers: Vec<String>,
     credits: Credits,
@@ -188,8 +204,8 @@ struct Watch {
     _reader: Reader,
 }
 
-impl Watch {
-    fn new(served: &Served, selection: v1::Selection, requests: Streaming<v1::WatchRequest>) -> Self {
+impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
+    fn new(served: &Served, selection: v1::Selection, requests: R) -> Self {
         let mut newest = served.newest.clone();
         // The current map, if there is one, is the first update.
         newest.mark_changed();
@@ -246,9 +262,12 @@ impl Watch {
     }
 }
 
-async fn next_request(requests: &mut Option<Streaming<v1::WatchRequest>>) -> Result<Option<v1::WatchRequest>, Status> {
+async fn next_request<R>(requests: &mut Option<R>) -> Result<Option<v1::WatchRequest>, Status>
+where
+    R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin,
+{
     match requests {
-        Some(requests) => requests.message().await,
+        Some(requests) => requests.next().await.transpose(),
         None => std::future::pending().await,
     }
 }

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::{Echo, Revolution};
-use clearway_lidar::sensor::{Sensor, SensorConfig as LidarConfig};
-use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig};
+use clearway_lidar::sensor::Sensor;
+use clearway_mapping::config::{Extrinsics, MapsConfig, SENSORS_MAX, SensorConfig};
 use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::mount::estimate;
 use nalgebra::Isometry3;
@@ -17,14 +17,12 @@ use crate::clouds::{Clouds, Written};
 use crate::config::{Calibrations, Config, Recorder};
 use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::mcap::{McapError, Wanted};
-use crate::ingest::ros::Offered;
+use crate::ingest::ros::{Choice, Offered, PoseFrom, SensorTopic};
 use crate::recording::Recording;
 use crate::server::Setup;
 
 /// Revolutions the mount is estimated from.
 const MOUNT_REVOLUTIONS: usize = 10;
-/// Sensors a vehicle may have.
-const SENSORS_MAX: usize = 1;
 
 /// Everything known before the first event.
 pub(super) struct Plan {
@@ -37,40 +35,60 @@ pub(super) struct Plan {
 }
 
 pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
-    let wanted =
-        || Wanted { vehicle: options.vehicle.clone(), topics: options.topics.clone(), sensors_max: SENSORS_MAX };
-    let open = || Readings::open(&options.files, wanted());
-    let readings = open()?;
-    let recorded = readings.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
-    let scans = readings.files().all(|(_, kind)| kind == Kind::Scan);
+    let files = Readings::open(&options.files, Wanted::default())?;
+    let recorded = files.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
+    let scans = files.files().all(|(_, kind)| kind == Kind::Scan);
     let (mut config, mut tables, boot_id, given) = configured(options, recorded.as_deref())?;
-    let placed = if given { None } else { placed_by_tf(recorded.as_deref(), &wanted())? };
     let vehicle = &mut config.vehicles[0];
     (vehicle.udp, vehicle.ros) = (None, None);
+    let mut wanted = Wanted {
+        vehicle: options.vehicle.clone(),
+        topics: options.topics.clone(),
+        sensors_max: if given { vehicle.sensors.len() } else { SENSORS_MAX },
+    };
+    let mut remarks = Vec::new();
+    let mut placed = None;
+    if let Some(bag) = recorded.as_deref().filter(|_| !given) {
+        let mut choice = choice(bag, &wanted)?;
+        keep_placed(&mut choice.sensors, options.extrinsics.is_some());
+        // Named, the same are chosen again when the bag is read.
+        wanted.topics = choice.sensors.iter().map(|sensor| sensor.topic.clone()).collect();
+        if let Some(PoseFrom::Topic(topic)) = &choice.pose {
+            wanted.topics.push(topic.clone());
+        }
+        if !choice.sensors.is_empty() {
+            (wanted.sensors_max, tables) = (choice.sensors.len(), vec![vec![None; choice.sensors.len()]]);
+            let mounts;
+            (vehicle.sensors, mounts) = sensors_of(&choice);
+            for (sensor, mount) in vehicle.sensors.iter().zip(&mounts) {
+                let said = mount.as_ref().and_then(describe);
+                remarks.extend(said.map(|said| format!("extrinsics of {}: {said}", sensor.name)));
+            }
+            placed = mounts.into_iter().next().flatten();
+        }
+    }
+    let open = || Readings::open(&options.files, wanted.clone());
+    let readings = open()?;
+    for sensor in &mut vehicle.sensors {
+        (sensor.model, sensor.rpm) = (options.model.or(sensor.model), options.rpm.or(sensor.rpm));
+    }
     let sensor = &mut vehicle.sensors[0];
-    sensor.model = options.model.or(sensor.model);
     // Scans do not tell who made them, and KITTI's were made by this one.
     if scans && sensor.model.is_none() && tables[0][0].is_none() {
         sensor.model = Some(Model::Hdl64eS2);
     }
-    sensor.rpm = options.rpm.or(sensor.rpm);
     if let Some(file) = &options.calibration {
         sensor.calibration = Some(file.display().to_string());
         tables = config.calibrations(Path::new(""))?;
     }
     let sensor = &mut config.vehicles[0].sensors[0];
-    let mut remarks = Vec::new();
     let mount = match options.extrinsics {
         Some(extrinsics) => {
             sensor.extrinsics = extrinsics;
             Mount::Given
         }
         None if given => Mount::Given,
-        None if let Some((extrinsics, mount)) = placed => {
-            sensor.extrinsics = extrinsics;
-            remarks.extend(describe(&mount).map(|said| format!("extrinsics of {}: {said}", sensor.name)));
-            mount
-        }
+        None if let Some(mount) = placed => mount,
         None => {
             let revolutions = first_revolutions(open()?, sensor, tables[0][0].clone())?;
             if revolutions.is_empty() {
@@ -99,8 +117,8 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     let boot_id =
         boot_id.filter(|_| same_maps).or_else(|| (!options.serve).then(|| fingerprint(&config, &options.files)));
     let mut notes = BTreeMap::new();
-    if let Some(remark) = remarks.first() {
-        notes.insert("mount".to_owned(), remark.clone());
+    if !remarks.is_empty() {
+        notes.insert("mount".to_owned(), remarks.join("\n"));
     }
     let clouds = options.clouds.as_deref().map(Clouds::create).transpose()?;
     let (observer, clouds) = clouds.map(Clouds::observer).unzip();
@@ -145,17 +163,53 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Configured, 
     Ok((Config::of_one_vehicle("car", "top"), vec![vec![None]], None, false))
 }
 
-/// The extrinsics that the transforms of a ROS bag give the sensor.
-fn placed_by_tf(bag: Option<&Path>, wanted: &Wanted) -> Result<Option<(Extrinsics, Mount)>, ReplayError> {
-    let Some(file) = bag else { return Ok(None) };
-    let offered = Offered::look(file).map_err(McapError::from).map_err(FilesError::from)?;
-    let choice = offered.choose(file, &wanted.topics, wanted.sensors_max).map_err(McapError::from);
-    let choice = choice.map_err(FilesError::from)?;
-    Ok(choice.sensors.first().and_then(|sensor| {
-        let ego_from_sensor = sensor.ego_from_sensor?;
-        let mount = Mount::Tf { ego_frame: choice.ego_frame.clone(), frame_id: sensor.frame_id.clone() };
-        Some((extrinsics_of(&ego_from_sensor), mount))
-    }))
+/// What is taken of a ROS bag.
+fn choice(bag: &Path, wanted: &Wanted) -> Result<Choice, ReplayError> {
+    let offered = Offered::look(bag).map_err(McapError::from).map_err(FilesError::from)?;
+    let choice = offered.choose(bag, &wanted.topics, wanted.sensors_max).map_err(McapError::from);
+    Ok(choice.map_err(FilesError::from)?)
+}
+
+/// Of several sensors those are taken that tf places; where it places none the first, whose place is to be found or
+/// `is_given`.
+fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
+    let mut number = 0;
+    let mut known = |sensor: &SensorTopic| {
+        number += 1;
+        sensor.ego_from_sensor.is_some() || (number == 1 && is_given)
+    };
+    match sensors.iter().any(|sensor| sensor.ego_from_sensor.is_some()) {
+        true => sensors.retain(&mut known),
+        false => sensors.truncate(1),
+    }
+}
+
+/// The vehicle's sensors as the transforms of a ROS bag place them. An only one is `top`, several are named by their frames.
+fn sensors_of(choice: &Choice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
+    let mut sensors: Vec<SensorConfig> = Vec::new();
+    for (index, sensor) in choice.sensors.iter().enumerate() {
+        let mut name = name_of_frame(&sensor.frame_id);
+        if choice.sensors.len() == 1 {
+            name = "top".to_owned();
+        } else if sensors.iter().any(|before| before.name == name) {
+            name = format!("{name}-{index}");
+        }
+        // Where tf tells nothing the place is given or estimated hereafter.
+        let ego_from_sensor = sensor.ego_from_sensor.unwrap_or_else(|| Isometry3::translation(0.0, 0.0, 2.0));
+        sensors.push(SensorConfig::new(name, extrinsics_of(&ego_from_sensor)));
+    }
+    let mount = |sensor: &SensorTopic| {
+        let tf = Mount::Tf { ego_frame: choice.ego_frame.clone(), frame_id: sensor.frame_id.clone() };
+        sensor.ego_from_sensor.map(|_| tf)
+    };
+    (sensors, choice.sensors.iter().map(mount).collect())
+}
+
+/// A frame's id in the letters of a sensor's name.
+fn name_of_frame(frame_id: &str) -> String {
+    let letter = |c: char| if c.is_ascii_alphanumeric() || c == '-' { c.to_ascii_lowercase() } else { '_' };
+    let name: String = frame_id.chars().map(letter).take(48).collect();
+    if name.is_empty() { "sensor".to_owned() } else { name }
 }
 
 fn extrinsics_of(ego_from_sensor: &Isometry3<f64>) -> Extrinsics {
@@ -171,12 +225,7 @@ fn first_revolutions(
     config: &SensorConfig,
     calibration: Option<Calibration>,
 ) -> Result<Vec<Vec<[f32; 3]>>, ReplayError> {
-    let mut sensor = Sensor::new(LidarConfig {
-        model: config.model,
-        rpm: config.rpm,
-        calibration,
-        cut_azimuth_deg: config.cut_azimuth_deg,
-    });
+    let mut sensor = Sensor::new(config.lidar(calibration));
     let mut clouds = Vec::new();
     for reading in readings {
         let reading = reading?;

@@ -149,7 +149,7 @@ pub fn status_bytes(model: Model, calibration: &Calibration) -> Vec<(u8, u8)> {
     let mut sent = Vec::with_capacity(PACKETS_PER_TABLE);
     for (cycle, seven) in digits.collect::<Vec<_>>().chunks(BYTES_PER_CYCLE).enumerate() {
         // A made-up clock: noon on 1 January 2020, no GPS, 25 degrees, version 4.07.
-        sent.extend(CLOCK_TYPES.iter().copied().zip([12, 0, 0, 1, 1, 20, b'A', 25, 0x47]));
+        sent.extend(CLOCK_TYPES.iter().copied().zip([12, 0, 0, 1, 1, 20, 0, 25, 0x47]));
         sent.extend_from_slice(seven);
         if s3 && cycle % 4 == 0 && cycle > 0 {
             sent[cycle * CYCLE + CLOCK_TYPES.len()].0 = WARNING_TYPE;

@@ -1,6 +1,6 @@
 //! Scripts of what happens to clocks: stamps always rise, and are right again one turn later.
 
-use clearway_lidar::{Clock, Model, Revolution, Sensor, SensorConfig};
+use clearway_lidar::{Clock, Model, Refusal, Revolution, Sensor, SensorConfig};
 use proptest::collection::vec;
 use proptest::prelude::*;
 
@@ -179,6 +179,31 @@ fn scripts() -> Vec<Script> {
             last: Clock::Device,
             ..BASE
         },
+        Script {
+            name: "an old capture played live, its telemetry after its data",
+            telemetry: |t| after(t, gps(NOON + t), None),
+            host_ns: |_| 20_000 * HOUR + 1_000 * S,
+            right_ns: |_| 20_000 * HOUR + 1_000 * S,
+            last: Clock::Arrival,
+            ..BASE
+        },
+        Script {
+            name: "an old capture played live, its device's counter set inside it",
+            device_ns: |t| after(t, NOON, 500 * S) + t,
+            telemetry: |t| after(t, gps(NOON + t), None),
+            host_ns: |_| 20_000 * HOUR + 1_000 * S,
+            right_ns: |_| 20_000 * HOUR + 1_000 * S,
+            tolerance_ns: 11_000_000,
+            last: Clock::Arrival,
+            ..BASE
+        },
+        Script {
+            name: "a host whose clock nobody set, under GPS",
+            host_ns: |_| -MIDNIGHT,
+            telemetry: |t| after(t, gps(NOON + t), None),
+            right_ns: |t| after(t, 0, -MIDNIGHT),
+            ..BASE
+        },
         Script { name: "the device does not follow its receiver", telemetry: |t| gps(NOON + t), ..free },
         Script {
             name: "a leap second, counted past the hour; Unix time repeats it",
@@ -203,8 +228,22 @@ fn with_device_us(mut packet: Vec<u8>, device_us: u32) -> Vec<u8> {
     packet
 }
 
-/// Every turn of a script; telemetry 50 times a second.
+/// The turn a packet completes. The first packet of another time is refused until the next one confirms it, and copies are.
+fn take<'a>(sensor: &'a mut Sensor, packet: &[u8], arrival_ns: i64) -> Option<&'a Revolution> {
+    match sensor.push(packet, arrival_ns) {
+        Ok(turn) => turn,
+        Err(Refusal::DeviceTime { .. } | Refusal::Late { .. } | Refusal::Duplicate { .. }) => None,
+        Err(refusal) => panic!("{refusal}"),
+    }
+}
+
+/// Every turn of a script.
 fn play(script: &Script, sensor: &mut Sensor) -> Vec<Revolution> {
+    play_timed(script, sensor).into_iter().map(|(turn, _)| turn).collect()
+}
+
+/// Every turn of a script, and when the packet came that completed it; telemetry 50 times a second.
+fn play_timed(script: &Script, sensor: &mut Sensor) -> Vec<(Revolution, i64)> {
     let stream = Stream::of(Model::Vlp16);
     let period = i64::from(Model::Vlp16.spec().packet_period_ns(stream.mode));
     let mut turns = Vec::new();
@@ -220,7 +259,7 @@ fn play(script: &Script, sensor: &mut Sensor) -> Vec<Revolution> {
             telemetry_ns += S / 50;
         }
         let packet = with_device_us(stream.packet(index), past_hour_us(script, t));
-        turns.extend(sensor.push(&packet, arrival(t + period)).unwrap().cloned());
+        turns.extend(take(sensor, &packet, arrival(t + period)).map(|turn| (turn.clone(), t)));
     }
     turns
 }
@@ -244,13 +283,17 @@ fn assert_rising(name: &str, turns: &[Revolution]) {
 #[test]
 fn stamps_rise_and_are_right_again_one_turn_after_whatever_happens_to_a_clock() {
     for script in scripts() {
-        let turns = play(&script, &mut Sensor::new(SensorConfig::default()));
+        let (turns, done): (Vec<_>, Vec<_>) =
+            play_timed(&script, &mut Sensor::new(SensorConfig::default())).into_iter().unzip();
         let name = script.name;
         assert_rising(name, &turns);
         assert!(turns.len() as i64 >= script.lasts_ns / TURN - 1, "{name}: {} turns", turns.len());
-        for (index, turn) in turns.iter().enumerate() {
-            let t = index as i64 * TURN;
-            if (script.event_ns - TURN..script.event_ns + script.healed_ns).contains(&t) {
+        for (index, (turn, done)) in turns.iter().zip(done).enumerate() {
+            // Where the device's time jumps, a turn is torn in two: the whole ones are told by when they ended.
+            let t = (done + TURN / 2) / TURN * TURN - TURN;
+            let torn = turn.partial.is_some() && (0..=TURN).contains(&(done - script.event_ns));
+            let healing = (script.event_ns - TURN..script.event_ns + script.healed_ns).contains(&t);
+            if torn || healing {
                 continue;
             }
             let error_ns = turn.start_ns - (script.utc_ns + t + (script.right_ns)(t));
@@ -258,6 +301,20 @@ fn stamps_rise_and_are_right_again_one_turn_after_whatever_happens_to_a_clock() 
         }
         assert_eq!(turns.last().unwrap().clock, script.last, "{name}");
     }
+}
+
+#[test]
+fn gps_time_of_years_ago_is_believed_where_the_configuration_says_so() {
+    let config = SensorConfig { gps_late_ns_max: 100 * 365 * 24 * HOUR, ..SensorConfig::default() };
+    let script = Script { name: "an old capture", host_ns: |_| 20_000 * HOUR, ..BASE };
+    let turns = play(&script, &mut Sensor::new(config.clone()));
+    assert!(turns.iter().all(|turn| turn.clock == Clock::Gps) && (turns[0].start_ns - NOON).abs() < 1_000_000);
+    // Behind stamps already given it is no use: they follow arrival.
+    let script = Script { telemetry: |t| after(t, gps(NOON + t), None), ..script };
+    let turns = play(&script, &mut Sensor::new(config));
+    assert_rising(script.name, &turns);
+    let last = turns.last().unwrap();
+    assert_eq!((last.clock, last.clock_offset_ms), (Clock::Device, 0));
 }
 
 #[test]
@@ -284,6 +341,43 @@ fn two_sensors_on_different_hours_give_one_time() {
     assert_eq!((gps[5].clock, free[5].clock), (Clock::Gps, Clock::Arrival));
     for (gps, free) in gps.iter().zip(&free) {
         assert!((gps.start_ns - free.start_ns).abs() < 2_000, "{}", gps.start_ns - free.start_ns);
+    }
+}
+
+/// The turns of an HDL-64E that ends an hour and a day, its receiver in state `gps`; the host is 3 h and 100 s ahead.
+fn hdl64e(gps: u8) -> Vec<Revolution> {
+    let utc_ns = MIDNIGHT + 24 * HOUR - S / 2;
+    let stream = Stream { device_us: (utc_ns / 1_000 % 3_600_000_000) as u32, ..Stream::of(Model::Hdl64eS2) };
+    let period = i64::from(Model::Hdl64eS2.spec().packet_period_ns(stream.mode));
+    let mut sensor = Sensor::new(SensorConfig { model: Some(Model::Hdl64eS2), ..SensorConfig::default() });
+    let mut turns = Vec::new();
+    for index in 0..stream.packets(15.2) {
+        let t = index as i64 * period;
+        // Each byte is read from the clock when it is sent, so that a cycle may hold two seconds' parts.
+        let second = (utc_ns + t - MIDNIGHT - 300_000_000) / S;
+        let of_day = second % 86_400;
+        let day = if second < 86_400 { 18 } else { 19 };
+        let cycle = [of_day / 3_600, of_day / 60 % 60, of_day % 60, day, 5, 33, i64::from(gps), 25, 0x47];
+        let mut packet = stream.packet(index);
+        let status = b"HMSDNYGTV1234567"[index % 16];
+        (packet[1204], packet[1205]) = (status, cycle.get(index % 16).map_or(0, |value| *value as u8));
+        turns.extend(take(&mut sensor, &packet, utc_ns + t + period + 3 * HOUR + 100 * S).cloned());
+    }
+    let first = turns.iter().map(|turn| turn.start_ns - utc_ns).next().unwrap();
+    assert!([0, 3 * HOUR + 100 * S].iter().any(|right_ns| (first - right_ns).abs() < 1_000_000), "{gps}: {first}");
+    assert_rising("HDL-64E", &turns);
+    let lasted_ns = turns.last().unwrap().end_ns - turns[0].start_ns;
+    assert!((lasted_ns - turns.len() as i64 * TURN).abs() < 1_000_000, "{gps}: {lasted_ns}");
+    turns
+}
+
+#[test]
+fn an_hdl64e_tells_gps_time_by_its_status_bytes() {
+    for (gps, clock) in [(b'A', Clock::Gps), (b'V', Clock::GpsUnlocked), (b'P', Clock::Arrival), (0, Clock::Arrival)] {
+        let turns = hdl64e(gps);
+        assert!(turns.len() >= 14 && turns.iter().all(|turn| turn.clock == clock), "{gps}: {:?}", turns[0].clock);
+        let is_gps = clock != Clock::Arrival;
+        assert_eq!(turns[0].start_ns < MIDNIGHT + 24 * HOUR, is_gps, "{gps}");
     }
 }
 
@@ -325,7 +419,7 @@ fn jitter_bursts_and_wild_device_times_change_no_stamp() {
                 if wild(index) && model != Model::Hdl64eS1 {
                     packet = with_device_us(packet, (index as u32).wrapping_mul(2_654_435_761));
                 }
-                turns.extend(sensor.push(&packet, stream.arrival_ns(index) + late_ns(index)).unwrap().cloned());
+                turns.extend(take(&mut sensor, &packet, stream.arrival_ns(index) + late_ns(index)).cloned());
             }
             turns.iter().map(|turn| (turn.start_ns, turn.end_ns, turn.clock)).collect::<Vec<_>>()
         };
@@ -336,10 +430,11 @@ fn jitter_bursts_and_wild_device_times_change_no_stamp() {
         let burst = |index: usize| if (400..500).contains(&index) { (500 - index as i64) * 300_000 } else { 0 };
         assert_eq!(stamps(jitter, |_| false), clean, "{model:?}");
         assert_eq!(stamps(burst, |_| false), clean, "{model:?}");
-        // A packet whose device time is damaged is taken to come a period after the one before.
+        // A packet whose device time is damaged is refused: where it would have begun or ended a turn, the next one does.
+        let packet_ns = model.spec().packet_period_ns(stream.mode) as u64;
         for (wild, clean) in stamps(|_| 0, |index| index % 90 == 60).iter().zip(&clean) {
             assert!(
-                wild.0.abs_diff(clean.0) < 1_000 && wild.1.abs_diff(clean.1) < 1_000,
+                wild.0.abs_diff(clean.0) <= packet_ns && wild.1.abs_diff(clean.1) <= packet_ns,
                 "{model:?} {wild:?} {clean:?}"
             );
         }
@@ -378,7 +473,7 @@ proptest! {
                 device_us = device_us.wrapping_add(1_327);
                 arrival_ns = arrival_ns.saturating_add(1_327_000);
                 let packet = with_device_us(stream.packet(index), device_us);
-                if let Some(turn) = sensor.push(&packet, arrival_ns).unwrap() {
+                if let Some(turn) = take(&mut sensor, &packet, arrival_ns) {
                     prop_assert!(newest_ns < turn.start_ns, "{newest_ns} {}", turn.start_ns);
                     prop_assert!(turn.start_ns <= turn.end_ns);
                     newest_ns = turn.end_ns;

@@ -72,14 +72,16 @@ fn gprmc_gives_the_hour_and_a_refused_datagram_nothing() {
     // The device's own time agrees with GPRMC, while the host that recorded it lives in another hour.
     let past_hour_us = 41 * 60_000_000 + 7_100_000;
     let stream = Stream { device_us: past_hour_us, ..Stream::of(Model::Vlp16) };
+    let utc_ns = 1_437_687_660_000_000_000 + 7_100_000_000;
+    let arrival_ns = |index| utc_ns + stream.arrival_ns(index) - START_NS + 3 * 3_600_000_000_000;
     let mut sensor = Sensor::new(SensorConfig::default());
     let before = sensor.status();
-    assert!(sensor.push(&datagram(past_hour_us, &SENTENCE.replace("*05", "*06")), START_NS).is_err());
+    assert!(sensor.push(&datagram(past_hour_us, &SENTENCE.replace("*05", "*06")), arrival_ns(0)).is_err());
     assert_eq!(sensor.status(), before);
-    assert!(sensor.push(&datagram(past_hour_us, SENTENCE), START_NS).unwrap().is_none());
+    assert!(sensor.push(&datagram(past_hour_us, SENTENCE), arrival_ns(0)).unwrap().is_none());
     assert_eq!((sensor.status().telemetry, sensor.status().pps), (1, Some(Pps::Locked)));
-    let turns = stream.push(&mut sensor, 0..stream.packets(1.1));
-    assert_eq!(turns[0].start_ns, 1_437_687_660_000_000_000 + 7_100_000_000);
+    let push = |index| sensor.push(&stream.packet(index), arrival_ns(index)).unwrap().map(|turn| turn.start_ns);
+    assert_eq!((0..stream.packets(1.1)).find_map(push), Some(utc_ns));
 }
 
 #[test]

@@ -107,19 +107,23 @@ impl Ear {
         let name = sample.key_expr().as_str().rsplit('/').nth(1).unwrap_or_default();
         let Some(kind) = Kind::of(name) else {
             tracing::info!(topic, name, "ros: not a type that is read");
-            return self.door.leave_outside(0, Cause::Observation, 1);
+            return self.refuse(topic, "ros_type");
         };
         let bytes = sample.payload().to_bytes().into_owned().into();
         let mut readings = VecDeque::new();
         if let Err(refused) = self.intake.take(topic, kind, 0, &bytes, &mut readings) {
             tracing::info!(topic, %refused, "ros: refused");
-            return self.door.leave_outside(0, Cause::Observation, 1);
+            return self.refuse(topic, refused.reason());
         }
         for reading in readings {
             if self.door.enter(reading.source, reading.body).is_err() {
                 return;
             }
         }
+    }
+
+    fn refuse(&self, topic: &str, reason: &'static str) {
+        self.door.outside().leave_observations(self.intake.source(topic), reason, 1);
     }
 
     /// How many messages of its publisher are missing before this one.

@@ -1,0 +1,114 @@
+//! What must be true of a run, at every step and in the end.
+
+use std::ops::Range;
+
+use clearway_mapping::map::{Cells, Geometry, Layer, Map};
+use clearway_mapping::pipeline::{Ledger, NamedStatus};
+use nalgebra::Point3;
+
+use super::drive::Drive;
+use super::trouble::inside;
+
+/// A check that found something.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Breach {
+    /// Which one.
+    pub check: &'static str,
+    /// What it found.
+    pub found: String,
+}
+
+/// Of this check.
+pub fn breach(check: &'static str, found: impl Into<String>) -> Breach {
+    Breach { check, found: found.into() }
+}
+
+/// Nearer cells can be seen past the edge of the covered sector, from where the car was a turn ago.
+const COVERED_M_MIN: f64 = 8.0;
+/// And so can the outermost degrees of the sector.
+const COVERED_EDGE_DEG: i64 = 15;
+
+/// Received = decoded + telemetry + refused by reason.
+pub fn adds_up(whose: &str, ledger: &Ledger) -> Result<(), Breach> {
+    let sum = ledger.decoded + ledger.telemetry + ledger.refused.values().sum::<u64>();
+    match ledger.received == sum {
+        true => Ok(()),
+        false => Err(breach(
+            "ledger",
+            format!("{whose}: received {}, and the parts make {sum}: {ledger:?}", ledger.received),
+        )),
+    }
+}
+
+/// Every reading that came to the door is in the vehicle's ledger, and the sensors' ledgers are parts of it.
+pub fn accounts(offered: u64, ledger: &Ledger, sensors: &[NamedStatus]) -> Result<(), Breach> {
+    adds_up("the vehicle", ledger)?;
+    for sensor in sensors {
+        adds_up(&sensor.name, &sensor.ledger)?;
+    }
+    let roads = ledger.roads + ledger.roads_refused.values().sum::<u64>();
+    let known = ledger.received + ledger.lost + ledger.poses + ledger.poses_refused + roads;
+    let sum: u64 = sensors.iter().map(|sensor| sensor.ledger.received + sensor.ledger.lost).sum();
+    if known != offered {
+        return Err(breach("ledger", format!("{offered} came to the door, {known} are known: {ledger:?}")));
+    }
+    if sum > ledger.received + ledger.lost {
+        return Err(breach("ledger", format!("the sensors have {sum}, the vehicle {ledger:?}")));
+    }
+    Ok(())
+}
+
+/// Nothing is free where every sensor's window is covered.
+pub fn nothing_free(drive: &Drive, covered_deg: &Range<i64>, map: &Map) -> Result<(), Breach> {
+    let sensors = &drive.config.vehicles[0].sensors;
+    let hidden = covered_deg.start + COVERED_EDGE_DEG..covered_deg.end - COVERED_EDGE_DEG;
+    for layer in &map.layers {
+        let free: Vec<u8> = (layer.legend.iter().enumerate())
+            .filter(|(_, class)| {
+                matches!(**class, "drivable" | "clear" | "flat" | "passable" | "road" | "free" | "path")
+            })
+            .map(|(value, _)| value as u8)
+            .collect();
+        let Cells::U8(classes) = &layer.channels[0].cells else { continue };
+        for (cell, _) in classes.iter().enumerate().filter(|(_, class)| free.contains(class)) {
+            let [x, y] = centre(layer, cell);
+            let from = |sensor: &clearway_mapping::config::SensorConfig| {
+                let at = sensor.extrinsics.ego_from_sensor().translation;
+                (y - at.y).atan2(x - at.x).to_degrees()
+            };
+            if x.hypot(y) >= COVERED_M_MIN && sensors.iter().all(|sensor| inside(&hidden, from(sensor))) {
+                let class = layer.legend[usize::from(classes[cell])];
+                let found = format!("map {}: {} at ({x:.1}, {y:.1}) is {class}", map.sequence, layer.name);
+                return Err(breach("covered", found));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The middle of a cell, ego frame.
+pub fn centre(layer: &Layer, cell: usize) -> [f64; 2] {
+    match &layer.geometry {
+        Geometry::Radial { r_bench_m, columns } => {
+            let (row, column) = (cell / usize::from(*columns), cell % usize::from(*columns));
+            let inner = if row == 0 { 0.0 } else { f64::from(r_bench_m[row - 1]) };
+            let range = (inner + f64::from(r_bench_m[row])) / 2.0;
+            let angle = (column as f64 + 0.5) * std::f64::consts::TAU / f64::from(*columns);
+            [range * angle.cos(), range * angle.sin()]
+        }
+        &Geometry::Cartesian { origin_x_m, origin_y_m, width, cell_m, yaw_rad, .. } => {
+            let at = |origin: f64, index: usize| origin + (index as f64 + 0.5) * f64::from(cell_m);
+            let (x, y) = (at(origin_x_m, cell % width as usize), at(origin_y_m, cell / width as usize));
+            let place =
+                nalgebra::Rotation3::from_axis_angle(&nalgebra::Vector3::z_axis(), -yaw_rad) * Point3::new(x, y, 0.0);
+            [place.x, place.y]
+        }
+    }
+}
+
+/// Whether every sensor is whole and in this map.
+pub fn is_healthy(map: &Map) -> bool {
+    map.sensors
+        .iter()
+        .all(|sensor| sensor.state.as_str() == "ok" && sensor.partial.is_empty() && sensor.blocked.is_empty())
+}

@@ -1,0 +1,132 @@
+//! A car of two turning LIDARs and six that scan, through real sockets and a real stream: one map of all of them, and it is
+//! the world's.
+
+mod house;
+
+use std::collections::BTreeMap;
+use std::iter::Peekable;
+use std::net::UdpSocket;
+
+use clearway_client::{Client, MapView};
+use clearway_mapping::config::BodyConfig;
+use clearway_proto::v1;
+use clearway_server::config::{Sender, Udp};
+use clearway_server::demo::car::address;
+use clearway_server::demo::rig::{Rig, Told};
+use clearway_sim::traffic::{Footprints, street};
+use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
+use house::{config, start, until, within};
+use nalgebra::{Isometry3, Point3, Quaternion, Translation3, Unit};
+
+const START_NS: i64 = 1_767_270_000_000_000_000;
+/// So long do they send.
+const END_NS: i64 = START_NS + 800_000_000;
+/// Datagrams on their way: as many as the smallest kernel buffer holds.
+const UNDER_WAY: u64 = 60;
+
+/// The next reading of any of them, in the order of their stamps.
+enum Next {
+    Datagram(usize, Datagram),
+    Told(Told),
+}
+
+fn next(sensors: &mut [Peekable<SimulatedVehicle>], told: &mut Peekable<impl Iterator<Item = Told>>) -> Next {
+    let sent = |(index, sensor): (usize, &mut Peekable<SimulatedVehicle>)| Some((sensor.peek()?.stamp_ns, index));
+    let (stamp_ns, index) = sensors.iter_mut().enumerate().filter_map(sent).min().expect("they do not end");
+    match told.next_if(|told| told.stamp_ns <= stamp_ns) {
+        Some(told) => Next::Told(told),
+        None => Next::Datagram(index, sensors[index].next().expect("just seen")),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn eight_sensors_through_real_doors_make_one_map_and_its_occupancy_is_the_worlds() {
+    let rig = Rig::many(street(8.0), START_NS);
+    let mut config = config();
+    let vehicle = &mut config.vehicles[0];
+    vehicle.sensors = rig.sensors();
+    vehicle.maps.speed.enabled = true;
+    // Arrivals are the test machine's affair.
+    vehicle.fusion.deadline_ms = 10_000;
+    vehicle.body = None::<BodyConfig>;
+    let any = "127.0.0.1:0".parse().unwrap();
+    let sender = |(index, (name, _)): (usize, &(String, _))| (name.clone(), Sender::Address(address(index).into()));
+    let from: BTreeMap<_, _> = rig.scanners.iter().enumerate().map(sender).collect();
+    vehicle.udp = Some(Udp { data: any, telemetry: any, from, ..Udp::default() });
+    let running = start(config).await;
+    let status = running.vehicles.0[0].status.clone();
+    let (data, telemetry) = running.doors[0].udp.unwrap();
+    let client = Client::connect(&running.grpc.unwrap().to_string()).await.unwrap();
+    let mut ingester = within("a stream", client.ingest("car")).await.unwrap();
+
+    let sockets: Vec<UdpSocket> = (0..2).map(|index| UdpSocket::bind((address(index), 0)).unwrap()).collect();
+    let mut sensors: Vec<_> = (0..2).map(|index| rig.vehicle(index).peekable()).collect();
+    let mut told = rig.told().peekable();
+    let (mut sent, mut scans) = (0, 0);
+    loop {
+        match next(&mut sensors, &mut told) {
+            Next::Datagram(_, datagram) if datagram.stamp_ns > END_NS => break,
+            Next::Datagram(index, datagram) => {
+                let to = if datagram.kind == Kind::Data { data } else { telemetry };
+                sockets[index].send_to(&datagram.payload, to).unwrap();
+                sent += 1;
+                until("room", || status.snapshot().ledger.received + UNDER_WAY > sent + scans).await;
+            }
+            Next::Told(told) => {
+                let observation: v1::Observation = told.observation.clone().into();
+                scans += u64::from(matches!(observation.body, Some(v1::observation::Body::Scan(_))));
+                until("all datagrams", || status.snapshot().ledger.received + 1 + UNDER_WAY / 2 > sent + scans).await;
+                within("room", ingester.send(told.observation)).await.unwrap();
+            }
+        }
+    }
+    assert_eq!(within("verdicts", ingester.settled()).await.unwrap(), []);
+    until("all datagrams", || status.snapshot().ledger.received == sent + scans).await;
+    let snapshot = status.snapshot();
+    assert_eq!((snapshot.refused(), snapshot.ledger.lost, snapshot.ledger.kernel_drops), (0, 0, 0));
+    assert!(snapshot.sensors.iter().all(|sensor| sensor.ledger.decoded > 30), "{:?}", snapshot.sensors);
+
+    let newest = running.vehicles.0[0].newest.borrow().clone().expect("a map");
+    let map = MapView::decode(newest.select(&[])).unwrap();
+    let header = map.header();
+    let states: Vec<_> = header.sensors.iter().map(|sensor| (&*sensor.name, &*sensor.state)).collect();
+    assert!(states.len() == 8 && states.iter().all(|(_, state)| *state == "ok"), "{states:?}");
+    assert_eq!((&*header.made_by, &*header.compensation), ("top", "poses"));
+    hold_against_truth(&map, &rig);
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+/// No clear cell lies inside a thing, and where a cell is occupied, something was lately.
+fn hold_against_truth(map: &MapView, rig: &Rig) {
+    let header = map.header();
+    let v1::Pose { x, y, z, qx, qy, qz, qw } = header.map_from_ego.expect("poses are told");
+    let turned = Unit::new_normalize(Quaternion::new(qw, qx, qy, qz));
+    let map_from_ego = Isometry3::from_parts(Translation3::new(x, y, z), turned);
+    let time = (header.capture_end_ns - rig.start_ns) as f64 * 1e-9;
+    let world = &rig.scene.world;
+    let now = Footprints::at(world, time);
+    let lately: Vec<Footprints> = (0..=6).map(|step| Footprints::at(world, time - 0.05 * f64::from(step))).collect();
+    let layer = map.layer("occupancy").unwrap();
+    let (mut clear, mut occupied) = (0, 0);
+    for index in 0..layer.grid.cell_count() as usize {
+        let (x, y) = layer.grid.centre_of(index).unwrap();
+        let place = map_from_ego * Point3::new(x, y, 0.0);
+        let middle = [place.x, place.y];
+        match layer.class_at(x, y).1 {
+            "clear" => {
+                // The corners' circle: what covers it covers the cell.
+                let around = [[0.177, 0.0], [0.0, 0.177], [-0.177, 0.0], [0.0, -0.177]];
+                let corners = around.map(|[dx, dy]| [middle[0] + dx, middle[1] + dy]);
+                assert_eq!(now.covering(&corners), None, "clear inside a thing: {middle:?} at {time} s");
+                clear += 1;
+            }
+            "occupied" => {
+                let touched = lately.iter().any(|footprints| footprints.near(middle, 0.28));
+                assert!(touched, "occupied, and nothing was there for 0.3 s: {middle:?} at {time} s");
+                occupied += 1;
+            }
+            _ => {}
+        }
+    }
+    assert!(clear > 2000 && occupied > 50, "{clear} clear, {occupied} occupied");
+}
