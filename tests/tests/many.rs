@@ -27,14 +27,14 @@ const UNDER_WAY: u64 = 60;
 /// The next reading of any of them, in the order of their stamps.
 enum Next {
     Datagram(usize, Datagram),
-    Told(Told),
+    Told(Box<Told>),
 }
 
 fn next(sensors: &mut [Peekable<SimulatedVehicle>], told: &mut Peekable<impl Iterator<Item = Told>>) -> Next {
     let sent = |(index, sensor): (usize, &mut Peekable<SimulatedVehicle>)| Some((sensor.peek()?.stamp_ns, index));
     let (stamp_ns, index) = sensors.iter_mut().enumerate().filter_map(sent).min().expect("they do not end");
     match told.next_if(|told| told.stamp_ns <= stamp_ns) {
-        Some(told) => Next::Told(told),
+        Some(told) => Next::Told(Box::new(told)),
         None => Next::Datagram(index, sensors[index].next().expect("just seen")),
     }
 }
