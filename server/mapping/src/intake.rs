@@ -221,8 +221,6 @@ impl Intake {
         deadline_ns: i64,
     ) -> Result<Dropped, Rejected> {
         check(scan)?;
-        // Where no other sensor tells the time, a scan from before 1970 would stamp the map.
-        Rejected::unless_newer(scan.stamp_ns, Some(-1))?;
         if let Some((newest_ns, taken_ns)) = self.newest_scan
             && (scan.stamp_ns == newest_ns || now.event_ns.saturating_sub(taken_ns) <= deadline_ns)
         {

@@ -111,7 +111,7 @@ impl Fate {
         });
         // A flipped bit makes a return where the window is covered, and a clock that jumps moves the turns.
         let plain = covered.is_some();
-        let networks = (0..turning).map(|_| network(&mut dice, plain)).collect();
+        let networks: Vec<Faults> = (0..turning).map(|_| network(&mut dice, plain)).collect();
         let during = |dice: &mut Dice, longest_ns| {
             let from_ns = dice.of(2 * TURN_NS..HEAL_NS - TURN_NS);
             from_ns..(from_ns + dice.of(1..longest_ns)).min(HEAL_NS)
@@ -123,9 +123,10 @@ impl Fate {
             Trouble { silent, restart: restarts.then(restart) }
         };
         let troubles: Vec<Trouble> = (0..sensors).map(|_| trouble(&mut dice)).collect();
-        // A silence during which the host's clock steps cannot be told from a restart until telemetry tells; stamps that
+        // A silence, or a long gap, during which the host's clock steps cannot be told from a restart until telemetry tells; stamps that
         // went ahead by then take their time to come back, at half speed.
-        let speaks = (troubles[..turning].iter()).all(|trouble| trouble.silent.is_none());
+        let speaks = (troubles[..turning].iter()).all(|trouble| trouble.silent.is_none())
+            && networks.iter().all(|network| network.burst == 0.0);
         let host_clock = (!plain && speaks && dice.happens(0.35)).then(|| {
             let step_ns = if dice.happens(0.5) { 3_600_000_000_000 } else { 2_000_000_000 };
             let step_ns = if dice.happens(0.5) { step_ns } else { -step_ns };

@@ -92,7 +92,7 @@ pub fn nonsense(stamp_ns: i64, dice: &mut Dice) -> v1::Observation {
         1 => ("nobody", Some(Body::Scan(scan(&[1.0], &[2.0])))),
         2 => ("ahead", Some(Body::Scan(scan(&[1.0, 2.0], &[2.0])))),
         3 => ("ahead", Some(Body::Scan(v1::Scan { x: Bytes::from_static(&[1, 2, 3]), ..scan(&[], &[]) }))),
-        4 => ("ahead", Some(Body::Scan(v1::Scan { stamp_ns: i64::MIN, ..scan(&[3.0], &[4.0]) }))),
+        4 => ("ahead", Some(Body::Scan(v1::Scan { ring: pack(&[1_u16, 2]), ..scan(&[3.0], &[4.0]) }))),
         5 => ("", Some(Body::EgoPose(v1::EgoPose { stamp_ns, map_from_ego: None, speed_mps: f64::NAN }))),
         _ => ("", Some(Body::Road(v1::Road { stamp_ns, x: vec![f64::NAN], ..Default::default() }))),
     };
