@@ -3,10 +3,10 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | [`fate`] | seed -> what goes wrong, and when |
+//! | [`mod@fate`] | seed -> what goes wrong, and when |
 //! | [`drive`] | a simulated car with several sensors -> what it sends, cast once |
 //! | [`trouble`] | what it sends -> what troubled sensors send, and nonsense |
-//! | [`readers`] | the newest map -> readers of every kind, at the server's own streams |
+//! | [`mod@readers`] | the newest map -> readers of every kind, at the server's own streams |
 //! | [`tape`] | the server's own recorder -> a disk that fails as told, verified |
 //! | [`checks`] | what must be true |
 //!
