@@ -4,9 +4,9 @@
 //! latest-value slot that every reader looks at in its own time; the recorder gets every map.
 
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, TryRecvError};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
 use std::thread::JoinHandle;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::{Pipeline, Rejected};
@@ -17,6 +17,9 @@ use crate::ingest::ticket::Verdict;
 use crate::record::Journal;
 use crate::status::VehicleStatus;
 use crate::wire::{self, EncodedMap};
+
+/// How often an engine without events looks whether somebody has come who wants the newest map.
+const LOOK_AROUND: Duration = Duration::from_millis(20);
 
 /// The newest map of one vehicle; `None` before the first.
 pub type Newest = Option<Arc<EncodedMap>>;
@@ -76,14 +79,27 @@ impl Engine {
     }
 
     /// The next event; the status is brought up to date whenever there is nothing else to do.
-    fn next(&self, events: &Receiver<Queued>) -> Option<Queued> {
+    fn next(&mut self, events: &Receiver<Queued>) -> Option<Queued> {
         match events.try_recv() {
-            Ok(queued) => Some(queued),
-            Err(TryRecvError::Empty) => {
-                self.rest();
-                events.recv().ok().or_else(|| self.last())
+            Ok(queued) => return Some(queued),
+            Err(TryRecvError::Empty) => self.rest(),
+            Err(TryRecvError::Disconnected) => return self.last(),
+        }
+        loop {
+            match events.recv_timeout(LOOK_AROUND) {
+                Ok(queued) => return Some(queued),
+                Err(RecvTimeoutError::Timeout) => self.make_late(),
+                Err(RecvTimeoutError::Disconnected) => return self.last(),
             }
-            Err(TryRecvError::Disconnected) => self.last(),
+        }
+    }
+
+    /// A map for whoever came after the last event, where the newest was made for nobody.
+    fn make_late(&mut self) {
+        let started = Instant::now();
+        self.want();
+        if self.pipeline.make_late().is_some() {
+            self.publish(started);
         }
     }
 
@@ -98,14 +114,20 @@ impl Engine {
         }
         let started = Instant::now();
         self.want();
-        let map = match self.pipeline.step(event) {
-            Ok(Some(map)) => map,
-            Ok(None) => return Ok(()),
+        match self.pipeline.step(event) {
+            Ok(Some(_)) => self.publish(started),
+            Ok(None) => {}
             Err(rejected) => {
                 tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %rejected, "refused");
                 return Err(rejected);
             }
-        };
+        }
+        Ok(())
+    }
+
+    /// Encodes the newest map and puts it where readers and recorder find it.
+    fn publish(&mut self, started: Instant) {
+        let Some(map) = self.pipeline.newest_map() else { return };
         // Where every map is switched off, a revolution makes none; where nobody takes one, a header.
         let made = (!self.status.layers.is_empty()).then(|| {
             let states = map.sensors.iter().map(wire::sensor).collect();
@@ -124,7 +146,6 @@ impl Engine {
         if let Some(observer) = &mut self.observer {
             observer(&self.pipeline);
         }
-        Ok(())
     }
 
     /// Tells the pipeline which layers somebody takes. With a journal all are made: a replay knows nothing of the readers

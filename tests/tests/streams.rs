@@ -398,7 +398,7 @@ async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn layers_are_made_while_somebody_takes_them_and_a_late_joiner_gets_his_with_the_next_map() {
+async fn layers_are_made_while_somebody_takes_them_and_a_late_joiner_gets_his_of_the_newest_turn() {
     let setup = Setup { config: config(), ..Setup::default() };
     let running = Server::start(setup).await.expect("the server starts");
     let newest = || running.vehicles.0[0].newest.borrow().clone().expect("a map");
@@ -411,14 +411,17 @@ async fn layers_are_made_while_somebody_takes_them_and_a_late_joiner_gets_his_wi
     assert!(feed(&running, part(0)).await >= 2);
     assert!(layers().is_empty());
 
+    let made_for_nobody = newest();
     let (requests, mut updates) = watch(&running, 0).await;
     let demand = running.vehicles.0[0].status.demand.clone();
     until("the reader's layer is taken", || demand.is_taken(LAYER)).await;
     assert!(!demand.is_taken("terrain"));
-    let before = newest().sequence;
+    let update = within("the newest turn's map", updates.message()).await.unwrap().unwrap();
+    assert_eq!(sequence(&update.map), made_for_nobody.sequence + 1, "no map without the layer is sent");
+    assert_eq!(newest().capture_end_ns, made_for_nobody.capture_end_ns);
+    assert_eq!(layers(), [LAYER]);
     feed(&running, part(1)).await;
-    let update = within("a map", updates.message()).await.unwrap().unwrap();
-    assert!(sequence(&update.map) > before, "no map without the layer is sent");
+    within("the next turn's map", updates.message()).await.unwrap().unwrap();
     assert_eq!(layers(), [LAYER]);
 
     drop((requests, updates));

@@ -56,6 +56,11 @@ impl Layers {
         self.0.iter().map(|slot| (slot.name, slot.made)).collect()
     }
 
+    /// Whether any layer is wanted.
+    pub fn are_wanted(&self) -> bool {
+        self.0.iter().any(|slot| slot.wanted.is_some())
+    }
+
     /// What the wanted layers want of every turn.
     pub fn wanted(&self) -> Wanted {
         let any = |asks: fn(&dyn LayerMaker) -> bool| {

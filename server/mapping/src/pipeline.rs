@@ -32,6 +32,8 @@ pub struct Pipeline {
     ledger: Ledger,
     now: Option<Moment>,
     maps_made: u64,
+    /// Whether a turn has ended that is in no map.
+    turn_since_map: bool,
     layers: Layers,
     map: Map,
 }
@@ -73,6 +75,7 @@ impl Pipeline {
             ledger: Ledger::default(),
             now: None,
             maps_made: 0,
+            turn_since_map: false,
             map: Map {
                 sequence: 0,
                 capture_start_ns: 0,
@@ -265,7 +268,24 @@ impl Pipeline {
         if makes_map {
             self.make_map(source, now);
         }
+        self.turn_since_map = !makes_map;
         makes_map
+    }
+
+    /// Makes the newest map once more, under the next sequence, where it was made for nobody and somebody has come since: a
+    /// late reader need not wait for a sensor that may be silent. `None` where there is nothing to make, and where another
+    /// sensor's turn has ended since. Layers that gather evidence have seen one turn.
+    pub fn make_late(&mut self) -> Option<&Map> {
+        let was_for_nobody = self.maps_made > 0 && self.map.layers.is_empty();
+        if !was_for_nobody || !self.layers.are_wanted() || self.turn_since_map {
+            return None;
+        }
+        let source = self.map.made_by;
+        self.layers.take(&self.intakes[usize::from(source)].rays(source));
+        self.map.sequence = self.maps_made;
+        self.maps_made += 1;
+        self.make_layers();
+        Some(&self.map)
     }
 
     /// The map of a sensor's newest turn, in place of the one before.
@@ -277,7 +297,11 @@ impl Pipeline {
         (map.capture_start_ns, map.capture_end_ns, map.completed_ns) = (gathered.start_ns, turn.end_ns, now.arrival_ns);
         (map.map_from_ego, map.speed_mps) = (turn.map_from_ego, turn.speed_mps);
         (map.compensation, map.sensors, map.made_by) = (gathered.compensation, gathered.sensors, source);
-        let sweep = self.fusion.sweep(&self.intakes);
+        self.make_layers();
+    }
+
+    fn make_layers(&mut self) {
+        let (map, sweep) = (&mut self.map, self.fusion.sweep(&self.intakes));
         let (road, route) = (self.roads.to_paint(), self.roads.route());
         let context =
             Context { earlier: &[], stamp_ns: map.capture_end_ns, map_from_ego: map.map_from_ego, road, route };
