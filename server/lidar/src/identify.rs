@@ -42,6 +42,11 @@ pub(crate) fn find(packet: &Packet<'_>) -> Result<Finding, Refusal> {
     check(packet, model).map(|_| Finding::Model(model))
 }
 
+/// Whether the model is one of those that [`Finding::Hdl32eOrVlp16`] leaves open.
+pub(crate) fn is_of_two(model: Model) -> bool {
+    matches!(model, Model::Hdl32e | Model::Vlp16)
+}
+
 /// The model of a packet with byte 0x21, from the device time that passed since the packet before.
 pub(crate) fn by_rate(before: &Packet<'_>, packet: &Packet<'_>) -> Option<Model> {
     let passed_us = packet.device_us().wrapping_sub(before.device_us());

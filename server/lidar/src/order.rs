@@ -109,8 +109,8 @@ impl Order {
         arrival_ns: i64,
     ) -> Result<Way, Refusal> {
         let mut mark = Mark::of(packet, spec, mode);
-        self.measure(&mut mark);
         let (place, jumped) = self.place(&mark, arrival_ns)?;
+        self.measure(&mut mark);
         self.jump = None;
         if self.newest.is_none_or(|(_, newest, _)| newest <= place) {
             self.newest = Some((mark, place, arrival_ns));

@@ -43,6 +43,7 @@ pub struct Sensor {
     config: SensorConfig,
     /// Packets that came before the model was known.
     held: Vec<(Box<[u8]>, i64)>,
+    held_unfit: u64,
     order: Order,
     decoder: Option<Box<Decoder>>,
     /// The newest telemetry with its arrival, and how many there were.
@@ -75,6 +76,8 @@ pub struct SensorStatus {
     pub packets: u64,
     /// Data packets held until the model is known, or until those before them have come.
     pub packets_held: usize,
+    /// Data packets that were held, and then did not fit the model found: taken and not decoded.
+    pub packets_unfit: u64,
     /// Data packets that never came, or too late, ±1 a gap. A long gap is counted a turn later, when it has not come back
     /// at the same place as the dark side of a field of view does. Of an HDL-64E S1, whose packets carry no time, gaps of
     /// less than half a turn.
@@ -102,7 +105,15 @@ pub struct SensorStatus {
 impl Sensor {
     /// A sensor that has seen nothing.
     pub fn new(config: SensorConfig) -> Self {
-        Self { config, held: Vec::new(), order: Order::default(), decoder: None, telemetry: None, telemetry_count: 0 }
+        Self {
+            config,
+            held: Vec::new(),
+            held_unfit: 0,
+            order: Order::default(),
+            decoder: None,
+            telemetry: None,
+            telemetry_count: 0,
+        }
     }
 
     /// Takes one UDP payload that arrived at `arrival_ns` (ns since the Unix epoch); gives the revolution it completed,
@@ -138,15 +149,16 @@ impl Sensor {
         arrival_ns: i64,
     ) -> Result<Option<&Revolution>, Refusal> {
         if self.decoder.is_none() {
+            if self.held.iter().any(|(held, _)| **held == *payload) {
+                let device_us = Some(packet.device_us());
+                return Err(Refusal::Duplicate { device_us, azimuth: packet.azimuth(0) });
+            }
             let Some(model) = self.find_model(packet)? else {
-                if self.held.iter().any(|(held, _)| **held == *payload) {
-                    let device_us = Some(packet.device_us());
-                    return Err(Refusal::Duplicate { device_us, azimuth: packet.azimuth(0) });
-                }
                 self.held.push((payload.into(), arrival_ns));
                 return Ok(None);
             };
-            self.start(model, packet)?;
+            self.start(model, Some((packet, arrival_ns)))?;
+            return Ok(None);
         }
         let Some(decoder) = &mut self.decoder else { return Ok(None) };
         let mode = decoder.check(packet)?;
@@ -177,31 +189,40 @@ impl Sensor {
         })
     }
 
-    /// Makes the decoder, if `packet` fits it, and puts what was held in order.
-    fn start(&mut self, model: Model, packet: &Packet<'_>) -> Result<(), Refusal> {
+    /// Makes the decoder and puts what was held, and `packet`, in order; without `packet`, at the stream's end. A
+    /// stream's first packets all wait, and more than these: none passes yet.
+    fn start(&mut self, model: Model, packet: Option<(&Packet<'_>, i64)>) -> Result<(), Refusal> {
         let mut decoder = Decoder::new(model, &self.config)?;
-        decoder.check(packet)?;
         if let Some((telemetry, arrival_ns)) = &self.telemetry {
             decoder.take_telemetry(telemetry, *arrival_ns);
         }
-        for (payload, arrival_ns) in self.held.drain(..) {
-            let Ok(held) = Packet::new(&payload) else { continue };
-            if let Ok(mode) = decoder.check(&held) {
-                // A stream's first packets all wait, and more than these: none passes yet.
-                let _ = self.order.take(&held, decoder.spec(), mode, arrival_ns);
-            }
+        let newest = packet.map(|(packet, ns)| Ok((packet, decoder.check(packet)?, ns))).transpose()?;
+        let (mut order, mut unfit) = (Order::default(), 0);
+        for (payload, arrival_ns) in &self.held {
+            let held = Packet::new(payload)?;
+            let taken = identify::is_of_two(model)
+                && decoder.check(&held).is_ok_and(|mode| order.take(&held, decoder.spec(), mode, *arrival_ns).is_ok());
+            unfit += u64::from(!taken);
         }
-        self.decoder = Some(Box::new(decoder));
+        if let Some((packet, mode, ns)) = newest
+            && order.take(packet, decoder.spec(), mode, ns).is_err()
+        {
+            // What was held is from another time: the stream begins here.
+            (order, unfit) = (Order::default(), self.held.len() as u64);
+            order.take(packet, decoder.spec(), mode, ns)?;
+        }
+        self.held.clear();
+        self.held_unfit += unfit;
+        (self.order, self.decoder) = (order, Some(Box::new(decoder)));
         Ok(())
     }
 
     /// Ends the stream: the unfinished revolution, flagged partial unless it ends at the cut. The sensor can go on with
     /// a new turn afterwards.
     pub fn finish(&mut self) -> Option<&Revolution> {
-        if let (None, Some((first, _))) = (&self.decoder, self.held.first()) {
+        if self.decoder.is_none() && !self.held.is_empty() {
             // Too few packets to tell their rate: the byte is believed.
-            let first = first.clone();
-            self.start(Model::Hdl32e, &Packet::new(&first).ok()?).ok()?;
+            self.start(Model::Hdl32e, None).ok()?;
         }
         let decoder = self.decoder.as_mut()?;
         while self.order.due(true, |packet, ns, gap| decoder.take_due(packet, ns, gap, false)).is_some() {}
@@ -215,6 +236,11 @@ impl Sensor {
         (decoder.revolutions() > 0).then(|| decoder.finished())
     }
 
+    /// [`SensorStatus::packets_unfit`].
+    pub fn packets_unfit(&self) -> u64 {
+        self.held_unfit
+    }
+
     /// The newest telemetry's GPRMC, if it had one.
     pub fn gprmc(&self) -> Option<&Gprmc> {
         self.telemetry.as_ref()?.0.gprmc.as_ref()
@@ -226,6 +252,7 @@ impl Sensor {
         status.model = status.model.or(self.config.model);
         status.rpm = self.config.rpm.or(status.rpm);
         status.packets_held = self.held.len() + self.order.held();
+        status.packets_unfit = self.held_unfit;
         status.telemetry = self.telemetry_count;
         status.pps = self.telemetry.as_ref().map(|(telemetry, _)| telemetry.pps);
         status.gprmc = self.telemetry.as_ref().and_then(|(telemetry, _)| telemetry.gprmc.clone());

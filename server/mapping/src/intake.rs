@@ -80,6 +80,7 @@ pub(crate) struct Intake {
     series: Option<Series>,
     wants_no_returns: bool,
     moved: Moved,
+    unfit: u64,
     pub ledger: Ledger,
     /// Turns completed so far.
     pub turns: u64,
@@ -110,6 +111,7 @@ impl Intake {
             series: wanted.deviations.then(Series::default),
             wants_no_returns: wanted.no_returns,
             moved: Moved::default(),
+            unfit: 0,
             ledger: Ledger::default(),
             turns: 0,
             turn: Turn::default(),
@@ -164,6 +166,13 @@ impl Intake {
     pub fn take_datagram(&mut self, payload: &[u8], motion: &Motion, now: Moment) -> Result<Option<Dropped>, Rejected> {
         let completed = self.sensor.push(payload, now.arrival_ns)?.is_some();
         Ok(if completed { self.take_revolution(motion, now) } else { None })
+    }
+
+    /// Packets that counted as decoded while they were held, and then were not of the model found.
+    pub fn count_unfit(&mut self) -> u64 {
+        let unfit = self.sensor.packets_unfit() - self.unfit;
+        self.unfit += unfit;
+        unfit
     }
 
     /// The newest telemetry's GPRMC.

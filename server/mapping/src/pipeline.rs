@@ -198,8 +198,9 @@ impl Pipeline {
             Body::Datagram(payload) => self.take_datagram(event.source, payload, now),
             Body::Scan(scan) => self.take_scan(event.source, scan, now).map(Some),
             Body::End => {
-                let motion = &self.motion;
-                Ok(intake_of(&mut self.intakes, event.source)?.finish(motion, now))
+                let left_out = intake_of(&mut self.intakes, event.source)?.finish(&self.motion, now);
+                self.count_unfit(event.source);
+                Ok(left_out)
             }
         }
     }
@@ -213,7 +214,19 @@ impl Pipeline {
         } else {
             self.count(source, |ledger| ledger.decoded += 1);
         }
+        self.count_unfit(source);
         Ok(completed)
+    }
+
+    /// What was held until the model was known, and then did not fit it, was not decoded after all.
+    fn count_unfit(&mut self, source: u16) {
+        let unfit = self.intakes.get_mut(usize::from(source)).map_or(0, Intake::count_unfit);
+        if unfit > 0 {
+            self.count(source, |ledger| {
+                ledger.decoded -= unfit;
+                *ledger.refused.entry("model").or_default() += unfit;
+            });
+        }
     }
 
     fn take_scan(&mut self, source: u16, scan: &Scan, now: Moment) -> Result<Dropped, Rejected> {

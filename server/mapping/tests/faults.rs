@@ -14,7 +14,7 @@ use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
 
-fn pipeline(model: Model) -> Pipeline {
+fn config(model: Model) -> VehicleConfig {
     let extrinsics = Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.9, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
     let sensor = SensorConfig {
         name: "top".into(),
@@ -28,14 +28,17 @@ fn pipeline(model: Model) -> Pipeline {
         elevations_deg: Vec::new(),
         extrinsics,
     };
-    let config = VehicleConfig {
+    VehicleConfig {
         name: "car-1".into(),
         sensors: vec![sensor],
         fusion: Default::default(),
         body: None,
         maps: MapsConfig::default(),
-    };
-    Pipeline::new(&config, vec![None]).unwrap()
+    }
+}
+
+fn pipeline(model: Model) -> Pipeline {
+    Pipeline::new(&config(model), vec![None]).unwrap()
 }
 
 fn datagrams(model: Model, turns: f64, with_telemetry: bool) -> Vec<Datagram> {
@@ -106,6 +109,19 @@ fn whatever_the_network_does_the_ledger_is_exact_and_nothing_breaks() {
         assert!(ledger.refused.get("length").copied().unwrap_or(0) <= counts.truncated, "{faults:?} {ledger:?}");
         assert!(maps.windows(2).all(|pair| pair[0].capture_end_ns <= pair[1].capture_start_ns), "{faults:?}");
     }
+}
+
+#[test]
+fn a_packet_held_that_fits_no_model_found_is_refused_in_the_ledger() {
+    let mut config = config(Model::Vlp16);
+    config.sensors[0].model = None;
+    let mut pipeline = Pipeline::new(&config, vec![None]).unwrap();
+    let stray = datagrams(Model::Hdl32e, 0.01, false).into_iter().take(1);
+    for datagram in stray.chain(datagrams(Model::Vlp16, 0.1, false)) {
+        step(&mut pipeline, datagram);
+    }
+    let ledger = pipeline.ledger();
+    assert_eq!((ledger.refused.get("model"), ledger.received), (Some(&1), ledger.decoded + 1));
 }
 
 /// Covers the window from one degree of encoder angle to another: nothing comes back from there, or what the cover sends.

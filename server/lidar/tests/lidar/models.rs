@@ -99,6 +99,38 @@ fn a_vlp16_with_the_byte_of_an_hdl32e_is_known_by_its_rate_and_no_packet_is_lost
 }
 
 #[test]
+fn a_stray_held_before_the_model_was_known_is_counted_and_holds_up_nobody() {
+    let stray = Stream::of(Model::Hdl32e).packet(0);
+    // An S3 is an S2 until its status table has come.
+    for model in Model::ALL.into_iter().filter(|model| *model != Model::Hdl64eS3) {
+        let stream = Stream { start_azimuth: 17_000, device_us: 5_000_000, ..Stream::of(model) };
+        let mut sensor = Sensor::new(SensorConfig::default());
+        assert!(sensor.push(&stray, stream.arrival_ns(0)).unwrap().is_none());
+        for index in 0..40 {
+            sensor.push(&stream.packet(index), stream.arrival_ns(index)).unwrap();
+        }
+        let status = sensor.status();
+        let of_stream = status.packets + status.packets_held as u64;
+        assert_eq!((status.model, status.packets_unfit, of_stream), (Some(model), 1, 40), "{model:?}");
+    }
+}
+
+#[test]
+fn sixteen_strays_from_other_times_hold_up_nobody() {
+    let stream = Stream::of(Model::Hdl32e);
+    let mut sensor = Sensor::new(SensorConfig::default());
+    for stray in 1..17 {
+        let other = Stream { device_us: 100_000_000 * stray, ..stream };
+        sensor.push(&other.packet(0), stream.arrival_ns(0)).unwrap();
+    }
+    for index in 0..40 {
+        sensor.push(&stream.packet(index), stream.arrival_ns(index)).unwrap();
+    }
+    let status = sensor.status();
+    assert_eq!((status.packets_unfit, status.packets + status.packets_held as u64), (16, 40));
+}
+
+#[test]
 fn a_byte_that_no_rate_confirms_is_believed_in_the_end() {
     let stream = Stream::of(Model::Hdl32e);
     // Every third packet arrives: 1,659 µs fits neither model.
