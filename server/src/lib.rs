@@ -10,6 +10,7 @@
 //! | [`demand`] | readers -> which layers are to be made |
 //! | [`engine`] | events -> journal, step, encoded maps |
 //! | [`wire`] | map -> bytes, once |
+| [`cuts`] | those bytes -> a region's, a delta's, once |
 //! | [`publish`] | newest map -> gRPC, zenoh, page |
 //! | [`record`] | every event and every map -> MCAP |
 //! | [`recording`] | MCAP -> events and maps |
@@ -23,6 +24,7 @@
 
 pub mod clouds;
 pub mod config;
+pub mod cuts;
 pub mod demand;
 pub mod demo;
 pub mod engine;

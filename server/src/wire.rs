@@ -18,6 +18,8 @@ use clearway_proto::v1;
 use nalgebra::{Isometry3, Quaternion, Translation3, Unit};
 use prost::Message;
 
+use crate::cuts::Cuts;
+
 /// One map, ready for any reader. Cloning it costs reference counts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EncodedMap {
@@ -35,6 +37,10 @@ pub struct EncodedMap {
     pub header: Bytes,
     /// By layer name, in the map's order: an encoded `Map` with this layer alone.
     pub layers: Vec<(&'static str, Bytes)>,
+    /// Maps of this run, this one included, that were a turn made again for layers that had been taken by nobody.
+    pub remade: u64,
+    /// What readers asked of it.
+    pub(crate) cuts: Cuts,
 }
 
 impl EncodedMap {
@@ -51,6 +57,8 @@ impl EncodedMap {
             drivable_share: map.layers.iter().find_map(share),
             header,
             layers: map.layers.iter().map(encode).collect(),
+            remade: 0,
+            cuts: Cuts::default(),
         }
     }
 

@@ -119,7 +119,7 @@ async fn stream(mut socket: WebSocket, served: Served) {
                 let Some(map) = map.filter(|map| taken.are_in(map)) else { continue };
                 let skipped = last_sequence.map_or(0, |last: u64| map.sequence.saturating_sub(last + 1));
                 last_sequence = Some(map.sequence);
-                let update = v1::MapUpdate { map: map.select(&[]), skipped, sent_ns: now_ns() };
+                let update = v1::MapUpdate { map: map.select(&[]), skipped, sent_ns: now_ns(), left_out: 0 };
                 Frame::Binary(Bytes::from(update.encode_to_vec()))
             }
             _ = every.tick() => {
