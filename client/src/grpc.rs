@@ -5,9 +5,11 @@
 
 use std::time::Duration;
 
+use bytes::Bytes;
 use clearway_proto::v1;
 use clearway_proto::v1::ingest_service_client::IngestServiceClient;
 use clearway_proto::v1::map_service_client::MapServiceClient;
+use prost::Message;
 use tokio::sync::mpsc;
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::ReceiverStream;
@@ -15,6 +17,7 @@ use tonic::Status;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
 
 use crate::ClientError;
+use crate::freshness::Clock;
 use crate::ingest::{Deliver, Ear, Ingester};
 use crate::stream::{Feed, MapStream};
 use crate::view::MapView;
@@ -42,6 +45,12 @@ pub struct Subscription {
     pub layers: Vec<String>,
     /// Maps on their way without an acknowledgement, at least 1. With 2 the next one travels while one is looked at.
     pub max_in_flight: u32,
+    /// At most so many maps a second; every map where absent.
+    pub max_rate_hz: Option<f64>,
+    /// The part of each layer that is sent, in the ego frame; all of it where absent.
+    pub region: Option<v1::Region>,
+    /// Layers travel as what has changed since the map before: less on the link, the same maps.
+    pub deltas: bool,
 }
 
 /// What a client shows, and whom it believes. All PEM.
@@ -57,7 +66,14 @@ pub struct Tls {
 
 impl Default for Subscription {
     fn default() -> Self {
-        Self { vehicle: String::new(), layers: Vec::new(), max_in_flight: 2 }
+        Self {
+            vehicle: String::new(),
+            layers: Vec::new(),
+            max_in_flight: 2,
+            max_rate_hz: None,
+            region: None,
+            deltas: false,
+        }
     }
 }
 
@@ -127,7 +143,8 @@ impl Client {
     pub async fn newest(&self, vehicle: &str, layers: &[String]) -> Result<MapView, ClientError> {
         let request = v1::GetMapRequest { vehicle: vehicle.into(), layers: layers.to_vec() };
         let answer = self.service.clone().get_map(request).await;
-        MapView::decode(answer.map_err(|status| refused(&self.address, &status))?.into_inner().map)
+        let map = MapView::decode(answer.map_err(|status| refused(&self.address, &status))?.into_inner().map)?;
+        Ok(map.arrived(&Clock::default()))
     }
 
     /// Streams maps over a connection of their own.
@@ -135,11 +152,12 @@ impl Client {
     /// # Errors
     /// What the server or the transport says; an unknown vehicle or layer is refused here.
     pub async fn subscribe(&self, subscription: Subscription) -> Result<MapStream, ClientError> {
-        let Subscription { vehicle, layers, max_in_flight } = subscription;
-        let selection = v1::Selection { vehicle, layers, max_in_flight: max_in_flight.max(1) };
+        let Subscription { vehicle, layers, max_in_flight, max_rate_hz, region, deltas } = subscription;
+        let max_in_flight = max_in_flight.max(1);
+        let selection = v1::Selection { vehicle, layers, max_in_flight, max_rate_hz, region, deltas };
         let mut service = MapServiceClient::new(dial(&self.endpoint, &self.address).await?);
         let (acknowledge, requests) = mpsc::channel(8);
-        let first = tokio_stream::once(v1::WatchRequest { selection: Some(selection), acknowledged: None });
+        let first = tokio_stream::once(v1::WatchRequest { selection: Some(selection), ..Default::default() });
         let updates = service.watch(first.chain(ReceiverStream::new(requests))).await;
         let updates = updates.map_err(|status| refused(&self.address, &status))?.into_inner();
         let address = self.address.clone();
@@ -196,29 +214,51 @@ impl Tls {
     }
 }
 
-/// Takes every update, acknowledges it, and says in the end why there are no more.
+/// Takes every update, acknowledges it, and says in the end why there are no more. A delta against a map that is not here (an
+/// update was lost) is not shown: a whole map is asked for, and what was not shown counts as skipped.
 async fn follow(
     feed: Feed,
     address: String,
     mut updates: tonic::Streaming<v1::MapUpdate>,
-    acknowledge: mpsc::Sender<v1::WatchRequest>,
+    requests: mpsc::Sender<v1::WatchRequest>,
 ) -> ClientError {
+    let mut base: Option<MapView> = None;
+    let (mut asked, mut skipped, mut left_out) = (false, 0, 0);
     loop {
         let update = match updates.message().await {
             Ok(Some(update)) => update,
             Ok(None) => return ClientError::Ended { address },
             Err(status) => return refused(&address, &status),
         };
-        let map = match MapView::decode(update.map) {
-            Ok(map) => map,
-            Err(error) => return error,
+        (skipped, left_out) = (skipped + update.skipped, left_out + update.left_out);
+        let request = match MapView::decode_on(update.map.clone(), base.as_ref()) {
+            Ok(map) => {
+                let acknowledged = Some(map.sequence());
+                base = Some(map.clone());
+                feed.put(map, skipped, left_out);
+                (asked, skipped, left_out) = (false, 0, 0);
+                v1::WatchRequest { acknowledged, ..Default::default() }
+            }
+            Err(error) => {
+                let Some(acknowledged) = sequence_of_delta(update.map) else { return error };
+                tracing::debug!(sequence = acknowledged, %error, "a delta is of no use, a whole map is asked for");
+                skipped += 1;
+                // More deltas may be on the way already; one question is enough for them all.
+                let want_full = !std::mem::replace(&mut asked, true);
+                v1::WatchRequest { acknowledged: Some(acknowledged), want_full, selection: None }
+            }
         };
-        let acknowledged = v1::WatchRequest { selection: None, acknowledged: Some(map.sequence()) };
-        feed.put(map, update.skipped);
-        if acknowledge.send(acknowledged).await.is_err() {
+        if requests.send(request).await.is_err() {
             return ClientError::Ended { address };
         }
     }
+}
+
+/// Of a map with a layer that needs another map; `None` where it stands for itself, or is no map.
+fn sequence_of_delta(bytes: Bytes) -> Option<u64> {
+    let map = v1::Map::decode(bytes).ok()?;
+    let is_delta = map.layers.iter().any(|layer| layer.base_sequence.is_some());
+    map.header.filter(|_| is_delta).map(|header| header.sequence)
 }
 
 async fn dial(endpoint: &Endpoint, address: &str) -> Result<Channel, ClientError> {

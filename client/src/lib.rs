@@ -20,6 +20,7 @@
 //!
 //! | file | in -> out |
 //! |---|---|
+//! | `freshness` | two clocks -> how old a map is at least |
 //! | [`view`] | bytes -> [`MapView`]: decoded once, cheap to clone, with its age |
 //! | [`stream`] | updates -> the newest map in a slot, skips counted |
 //! | [`grpc`] | a server's address -> [`Client`] |
@@ -28,6 +29,7 @@
 //! | `picture` | a layer -> a PNG from above (feature `picture`) |
 //! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`) |
 
+mod freshness;
 pub mod grpc;
 pub mod ingest;
 pub mod observation;
@@ -41,11 +43,12 @@ pub mod zenoh;
 pub use clearway_proto::map::{Channel, Layer};
 pub use clearway_proto::{codec, grid, v1};
 
+pub use freshness::now_ns;
 pub use grpc::{Client, Subscription, Tls};
 pub use ingest::Ingester;
 pub use observation::{Observation, Refusal};
-pub use stream::{MapStream, Update};
-pub use view::{MapView, now_ns};
+pub use stream::{MapStream, Sight, Update};
+pub use view::MapView;
 #[cfg(feature = "zenoh")]
 pub use zenoh::ZenohClient;
 

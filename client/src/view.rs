@@ -4,20 +4,23 @@
 //! y left, metres), and the age, measured from the end of the capture.
 
 use std::sync::Arc;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use bytes::Bytes;
 use clearway_proto::codec::Limits;
-use clearway_proto::map::{Layer, Map, decode_map};
+use clearway_proto::delta::decode_map_on;
+use clearway_proto::map::{Layer, Map};
 use clearway_proto::v1;
 
 use crate::ClientError;
+use crate::freshness::{Arrival, Clock, now_ns};
 
 /// A map, decoded once. Cloning it costs a reference count.
 #[derive(Clone, Debug)]
 pub struct MapView {
     map: Arc<Map>,
     bytes: Bytes,
+    /// Absent where the map came from no server.
+    arrival: Option<Arc<Arrival>>,
 }
 
 impl MapView {
@@ -26,7 +29,22 @@ impl MapView {
     /// # Errors
     /// [`ClientError::Map`], naming the first thing found wrong.
     pub fn decode(bytes: Bytes) -> Result<Self, ClientError> {
-        Ok(Self { map: Arc::new(decode_map(bytes.clone(), &Limits::default())?), bytes })
+        Self::decode_on(bytes, None)
+    }
+
+    /// As [`MapView::decode`], of a map that may be a delta against `base`.
+    ///
+    /// # Errors
+    /// [`ClientError::Map`], also where the delta is against another map.
+    pub fn decode_on(bytes: Bytes, base: Option<&Self>) -> Result<Self, ClientError> {
+        let map = decode_map_on(bytes.clone(), base.map(|base| &*base.map), &Limits::default())?;
+        Ok(Self { map: Arc::new(map), bytes, arrival: None })
+    }
+
+    /// The map came just now.
+    pub(crate) fn arrived(self, clock: &Clock) -> Self {
+        let arrival = Arrival::new(clock.clone(), self.map.header.capture_end_ns);
+        Self { arrival: Some(Arc::new(arrival)), ..self }
     }
 
     /// The header as on the wire: stamps, pose, speed, sensors.
@@ -44,7 +62,7 @@ impl MapView {
         self.map.header.sequence
     }
 
-    /// The encoded map, as it came.
+    /// The encoded map, as it came: with [`crate::Subscription::deltas`] it may need the one before.
     pub fn bytes(&self) -> &Bytes {
         &self.bytes
     }
@@ -65,9 +83,11 @@ impl MapView {
         })
     }
 
-    /// Age at `now_ns`, ns, from the end of the capture; negative where this machine's clock is behind the server's.
+    /// Age at `now_ns`, ns, from the end of the capture. Of a map from a server at least its age when it came and the time
+    /// since, so that no step of the clock makes it younger; else negative where `now_ns` is before the capture.
     pub fn age_ns(&self, now_ns: i64) -> i64 {
-        now_ns.saturating_sub(self.map.header.capture_end_ns)
+        let by_wall_ns = now_ns.saturating_sub(self.map.header.capture_end_ns);
+        self.arrival.as_ref().map_or(by_wall_ns, |arrival| arrival.age_ns_min().max(by_wall_ns))
     }
 
     /// [`MapView::age_ns`] in milliseconds.
@@ -75,22 +95,26 @@ impl MapView {
         self.age_ns(now_ns) as f64 * 1e-6
     }
 
+    /// How long the map may be used after the end of its capture, ns.
+    fn valid_ns(&self) -> i64 {
+        self.map.header.valid_until_ns.saturating_sub(self.map.header.capture_end_ns)
+    }
+
     /// Whether the map must not be used any more at `now_ns`: its validity has passed, or its capture lies further
     /// ahead of this clock than its validity lasts, so that its age is not known.
     pub fn is_stale(&self, now_ns: i64) -> bool {
-        let header = &self.map.header;
-        let valid_ns = header.valid_until_ns.saturating_sub(header.capture_end_ns);
-        now_ns > header.valid_until_ns || self.age_ns(now_ns) < valid_ns.saturating_neg()
+        let ahead_ns = self.map.header.capture_end_ns.saturating_sub(now_ns);
+        self.age_ns(now_ns) > self.valid_ns() || ahead_ns > self.valid_ns()
+    }
+
+    /// As far as is known now, ns until the map is stale; `None` where it is already.
+    pub(crate) fn fresh_for_ns(&self) -> Option<i64> {
+        let now_ns = self.arrival.as_ref().map_or_else(now_ns, |arrival| arrival.now_ns());
+        (!self.is_stale(now_ns)).then(|| self.valid_ns().saturating_sub(self.age_ns(now_ns)))
     }
 
     /// A figure of the first layer that states it, such as `drivable_share`.
     pub fn figure(&self, name: &str) -> Option<f64> {
         self.map.layers.iter().find_map(|layer| layer.figures.get(name).copied())
     }
-}
-
-/// This machine's clock, ns since the Unix epoch.
-pub fn now_ns() -> i64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
 }

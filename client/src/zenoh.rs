@@ -16,6 +16,7 @@ use zenoh::sample::SampleKind;
 use zenoh::{Config, Session};
 
 use crate::ClientError;
+use crate::freshness::Clock;
 use crate::ingest::{Deliver, Ear, Ingester};
 use crate::stream::{Feed, MapStream};
 use crate::view::MapView;
@@ -80,7 +81,8 @@ impl ZenohClient {
     /// What zenoh says, or what is wrong with the map.
     pub async fn newest(&self, vehicle: &str, layer: &str) -> Result<Option<MapView>, ClientError> {
         let key = format!("clearway/{vehicle}/map/{layer}");
-        query(&self.session, &key).await?.map(MapView::decode).transpose()
+        let map = query(&self.session, &key).await?.map(MapView::decode).transpose()?;
+        Ok(map.map(|map| map.arrived(&Clock::default())))
     }
 
     /// Streams one layer of one vehicle, beginning with the newest map there is.
@@ -183,7 +185,7 @@ fn offer(feed: &Feed, last: &mut Option<(u64, u64)>, bytes: Bytes) -> Result<(),
         _ => 0,
     };
     *last = Some((boot_id, sequence));
-    feed.put(map, skipped);
+    feed.put(map, skipped, 0);
     Ok(())
 }
 

@@ -76,7 +76,7 @@ async fn every_map_is_acknowledged_and_the_newest_is_handed_out_with_the_skipped
     let layers = vec!["drivability".to_string()];
     let mut maps = client.subscribe(Subscription { layers: layers.clone(), ..Default::default() }).await.unwrap();
     let selection = told.recv().await.unwrap().selection.unwrap();
-    assert_eq!(selection, v1::Selection { vehicle: String::new(), layers, max_in_flight: 2 });
+    assert_eq!(selection, v1::Selection { vehicle: String::new(), layers, max_in_flight: 2, ..Default::default() });
     for sequence in [0, 3, 4] {
         assert_eq!(told.recv().await.unwrap().acknowledged, Some(sequence));
     }

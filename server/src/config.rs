@@ -50,6 +50,8 @@ pub struct Grpc {
     pub enabled: bool,
     /// Address and port; port 0 takes a free one.
     pub listen: SocketAddr,
+    /// Peers connected at once; more are told so.
+    pub connections_max: usize,
     /// Certificates; plain text without.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls: Option<Tls>,
@@ -60,7 +62,7 @@ pub struct Grpc {
 impl Default for Grpc {
     fn default() -> Self {
         let listen = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 50051);
-        Self { enabled: true, listen, tls: None, access: Access::default() }
+        Self { enabled: true, listen, connections_max: 256, tls: None, access: Access::default() }
     }
 }
 
@@ -376,6 +378,9 @@ impl Config {
                 name,
                 "nobody, unless grpc.tls.client_ca says whose certificates to ask for",
             );
+        }
+        if !(1..=65_536).contains(&self.grpc.connections_max) {
+            return wrong("grpc.connections_max".into(), &self.grpc.connections_max, "1 to 65536 connections");
         }
         if !(10..=60_000).contains(&self.recorder.flush_ms) {
             return wrong("recorder.flush_ms".into(), &self.recorder.flush_ms, "10 to 60000 ms");

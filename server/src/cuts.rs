@@ -85,7 +85,8 @@ impl EncodedMap {
     ) -> Result<Bytes, RegionError> {
         let (name, whole) = &self.layers[index];
         let base = base.and_then(|base| Some((base, base.layers.iter().position(|(of, _)| of == name)?)));
-        let bits = |region: &v1::Region| [region.x_from_m, region.x_to_m, region.y_from_m, region.y_to_m].map(f64::to_bits);
+        let bits =
+            |region: &v1::Region| [region.x_from_m, region.x_to_m, region.y_from_m, region.y_to_m].map(f64::to_bits);
         let slot = |base| self.cuts.slot((index, region.map(bits), base));
         match (region, base) {
             (None, None) => Ok(whole.clone()),

@@ -10,7 +10,7 @@
 //! | [`demand`] | readers -> which layers are to be made |
 //! | [`engine`] | events -> journal, step, encoded maps |
 //! | [`wire`] | map -> bytes, once |
-| [`cuts`] | those bytes -> a region's, a delta's, once |
+//! | [`cuts`] | those bytes -> a region of them, a delta, once |
 //! | [`publish`] | newest map -> gRPC, zenoh, page |
 //! | [`record`] | every event and every map -> MCAP |
 //! | [`recording`] | MCAP -> events and maps |

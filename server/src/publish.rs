@@ -12,8 +12,8 @@ pub mod access;
 pub mod connections;
 pub mod grpc;
 pub mod page;
+pub mod reader;
 pub mod selection;
-pub mod watch;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
 

@@ -226,8 +226,10 @@ impl Server {
             let security = grpc::Security::new(certificates, &config.grpc.access);
             let security = security.map_err(|error| StartError::Certificates(sources(&error)))?;
             let (vehicles, entrances, stopped) = (vehicles.clone(), entrances.clone(), stopped());
+            let connections_max = config.grpc.connections_max;
             publishers.spawn(async move {
-                if let Err(error) = grpc::serve(listener, security, vehicles, entrances, stopped).await {
+                if let Err(error) = grpc::serve(listener, security, connections_max, vehicles, entrances, stopped).await
+                {
                     tracing::error!(%error, "grpc ended");
                 }
             });

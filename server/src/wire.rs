@@ -158,6 +158,7 @@ fn layer(layer: &Layer) -> v1::Layer {
         planes: layer.planes.iter().map(|&[a, b, c]| v1::Plane { a, b, c }).collect(),
         figures: layer.figures.iter().map(|&(name, value)| (name.to_owned(), value)).collect(),
         safe_points: safe_points(layer),
+        base_sequence: None,
     }
 }
 

@@ -25,7 +25,7 @@ struct Requests(mpsc::Sender<v1::WatchRequest>);
 
 impl Requests {
     async fn acknowledge(&self, sequence: u64) {
-        let request = v1::WatchRequest { selection: None, acknowledged: Some(sequence) };
+        let request = v1::WatchRequest { acknowledged: Some(sequence), ..Default::default() };
         self.0.send(request).await.expect("the stream is open");
     }
 }

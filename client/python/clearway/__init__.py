@@ -15,6 +15,7 @@ from .errors import ClearwayError, DecodeError
 from .map import FREE, OBSTACLES, CartesianGrid, Channel, Layer, Map, Obstacle, RadialGrid, SafePoint, now_ns
 from .recording import read
 from .stream import MapStream
+from .v1 import map_pb2, service_pb2
 
 __all__ = [
     "FREE", "OBSTACLES", "CartesianGrid", "Channel", "ClearwayError", "DecodeError", "Layer", "Map", "MapStream",
@@ -22,16 +23,34 @@ __all__ = [
 ]  # fmt: skip
 
 
-def watch(address: str, vehicle: str = "", layers: Sequence[str] = (), max_in_flight: int = 2) -> MapStream:
+def watch(
+    address: str,
+    vehicle: str = "",
+    layers: Sequence[str] = (),
+    max_in_flight: int = 2,
+    max_rate_hz: float | None = None,
+    region: Sequence[float] | None = None,
+    deltas: bool = False,
+) -> MapStream:
     """Streams the newest map, beginning with the one there is.
 
     `vehicle` may be left out over gRPC where the server has one; no `layers` means all of them, and over zenoh they must
-    be named. `max_in_flight` maps are on their way without an acknowledgement (gRPC). Errors of the server (an unknown
-    vehicle or layer: the message lists the known ones) are raised by the first look.
+    be named. The rest is gRPC's: `max_in_flight` maps are on their way without an acknowledgement, at most `max_rate_hz` come
+    a second, of each layer the `region` (x_from_m, x_to_m, y_from_m, y_to_m) in the ego frame, and with `deltas` as what has
+    changed since the map before: less on the link, the same maps. Errors of the server (an unknown vehicle or layer: the
+    message lists the known ones) are raised by the first look.
     """
     if endpoint := _zenoh(address, vehicle, layers):
+        if max_rate_hz is not None or region is not None or deltas:
+            raise ClearwayError("selection", f"{address}: max_rate_hz, region and deltas are for gRPC, HOST:PORT")
         return over_zenoh.watch(endpoint, vehicle, layers)
-    return over_grpc.watch(address, vehicle, layers, max_in_flight)
+    selection = service_pb2.Selection(vehicle=vehicle, layers=layers, max_in_flight=max_in_flight, deltas=deltas)
+    if max_rate_hz is not None:
+        selection.max_rate_hz = max_rate_hz
+    if region is not None:
+        x_from_m, x_to_m, y_from_m, y_to_m = region
+        selection.region.CopyFrom(map_pb2.Region(x_from_m=x_from_m, x_to_m=x_to_m, y_from_m=y_from_m, y_to_m=y_to_m))
+    return over_grpc.watch(address, selection)
 
 
 def get(address: str, vehicle: str = "", layers: Sequence[str] = ()) -> Map:

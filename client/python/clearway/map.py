@@ -6,8 +6,8 @@ ground under the vehicle. Class 0 is unknown everywhere and is never free.
 
 from __future__ import annotations
 
+import copy
 import math
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +19,7 @@ from google.protobuf.message import DecodeError as ProtobufError
 
 from . import codec
 from .errors import ClearwayError, DecodeError
+from .freshness import Arrival, Clock, now_ns
 from .v1 import map_pb2
 
 #: Classes a vehicle may drive on, over all layers.
@@ -34,11 +35,6 @@ BYTES_MAX = 4 << 20
 POINTS_MAX = 1 << 16
 #: Steps a safe point may lie away: beyond, single precision is not exact.
 STEPS_MAX = 1 << 24
-
-
-def now_ns() -> int:
-    """This machine's clock, ns since the Unix epoch."""
-    return time.time_ns()
 
 
 @dataclass(frozen=True)
@@ -282,7 +278,22 @@ class Map:
         self.header: map_pb2.Header = message.header
         #: Maps made since the one looked at before and not seen by this reader.
         self.skipped = skipped
+        #: Maps made since then that `max_rate_hz` left out, or that were the same turn again.
+        self.left_out = 0
+        #: When the map came to this process; `None` where it came from no server.
+        self._arrival: Arrival | None = None
         self._message = message
+
+    def arrived(self, clock: Clock = Clock()) -> Map:
+        """The map came just now."""
+        self._arrival = Arrival.of(self.header.capture_end_ns, clock)
+        return self
+
+    def again(self, skipped: int = 0, left_out: int = 0) -> Map:
+        """The same map, for another look at the stream."""
+        other = copy.copy(self)
+        other.skipped, other.left_out = skipped, left_out
+        return other
 
     @property
     def vehicle(self) -> str:
@@ -311,21 +322,36 @@ class Map:
             raise ClearwayError("layer", f"no layer {name!r}; this map has {', '.join(self.layers) or 'none'}")
         return self.layers[name]
 
+    def age_ns(self, at_ns: int | None = None) -> int:
+        """Age, measured from the end of the capture. Of a map from a server at least its age when it came and the time
+        since, so that no step of the clock makes it younger; else negative before the capture."""
+        by_wall_ns = (self._now_ns() if at_ns is None else at_ns) - self.header.capture_end_ns
+        return by_wall_ns if self._arrival is None else max(by_wall_ns, self._arrival.age_ns_min())
+
     def age_ms(self, at_ns: int | None = None) -> float:
-        """Age, measured from the end of the capture; negative where this machine's clock is behind the server's."""
-        at_ns = now_ns() if at_ns is None else at_ns
-        return (at_ns - self.header.capture_end_ns) * 1e-6
+        """`age_ns` in milliseconds."""
+        return self.age_ns(at_ns) * 1e-6
 
     @property
     def stale(self) -> bool:
         """Whether the map must not be used any more."""
-        return self.is_stale(now_ns())
+        return self.is_stale(self._now_ns())
 
     def is_stale(self, at_ns: int) -> bool:
         """Whether its validity has passed at a time, or its capture lies further ahead of that time than its validity
         lasts, so that its age is not known."""
-        valid_ns = self.header.valid_until_ns - self.header.capture_end_ns
-        return at_ns > self.header.valid_until_ns or at_ns - self.header.capture_end_ns < -valid_ns
+        valid_ns = self._valid_ns()
+        return self.age_ns(at_ns) > valid_ns or at_ns - self.header.capture_end_ns < -valid_ns
+
+    def fresh_for_s(self) -> float:
+        """As far as is known now, seconds until the map is stale; 0 where it is already."""
+        return 0.0 if self.stale else (self._valid_ns() - self.age_ns() + 1) * 1e-9
+
+    def _valid_ns(self) -> int:
+        return self.header.valid_until_ns - self.header.capture_end_ns
+
+    def _now_ns(self) -> int:
+        return now_ns() if self._arrival is None else self._arrival.clock.wall_ns()
 
     def __repr__(self) -> str:
         layers = ", ".join(layer.name for layer in self._message.layers)

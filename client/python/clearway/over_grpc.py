@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import grpc
 
-from .errors import ClearwayError
+from .errors import ClearwayError, DecodeError
 from .map import BYTES_MAX, Map
 from .stream import MapStream
 from .v1 import map_pb2, service_pb2, service_pb2_grpc
@@ -54,15 +54,14 @@ def get(address: str, vehicle: str, layers: Sequence[str]) -> Map:
     with channel:
         try:
             request = service_pb2.GetMapRequest(vehicle=vehicle, layers=layers)
-            return Map(service.GetMap(request, timeout=_ANSWER_S).map)
+            return Map(service.GetMap(request, timeout=_ANSWER_S).map).arrived()
         except grpc.RpcError as error:
             raise _refused(address, error) from None
 
 
-def watch(address: str, vehicle: str, layers: Sequence[str], max_in_flight: int) -> MapStream:
+def watch(address: str, selection: service_pb2.Selection) -> MapStream:
     channel, service = _service(address)
     requests: queue.SimpleQueue[service_pb2.WatchRequest | None] = queue.SimpleQueue()
-    selection = service_pb2.Selection(vehicle=vehicle, layers=layers, max_in_flight=max_in_flight)
     requests.put(service_pb2.WatchRequest(selection=selection))
 
     def outgoing() -> Iterator[service_pb2.WatchRequest]:
@@ -74,14 +73,12 @@ def watch(address: str, vehicle: str, layers: Sequence[str], max_in_flight: int)
 
     def follow() -> None:
         try:
-            for update in updates:
-                header = map_pb2.Map.FromString(update.map).header
-                stream.put(update.map, update.skipped)
-                if max_in_flight:
-                    requests.put(service_pb2.WatchRequest(acknowledged=header.sequence))
+            _follow(stream, updates, requests.put, acknowledges=selection.max_in_flight > 0)
             stream.end(ClearwayError("ended", f"{address}: the server has ended the stream"))
         except grpc.RpcError as error:
             stream.end(_refused(address, error))
+        except ClearwayError as error:
+            stream.end(error)
         except Exception as error:  # noqa: BLE001: whatever it is, the reader is told and does not wait for ever.
             stream.end(ClearwayError("protobuf", f"{address}: {error}"))
 
@@ -93,3 +90,34 @@ def watch(address: str, vehicle: str, layers: Sequence[str], max_in_flight: int)
     stream.on_close(close)
     threading.Thread(target=follow, name="clearway watch", daemon=True).start()
     return stream
+
+
+def _follow(
+    stream: MapStream,
+    updates: Iterable[service_pb2.MapUpdate],
+    request: Callable[[service_pb2.WatchRequest], None],
+    *,
+    acknowledges: bool,
+) -> None:
+    """Takes every update and acknowledges it. A delta against a map that is not here (an update was lost) is not shown: a
+    whole map is asked for, and what was not shown counts as skipped."""
+    base: Map | None = None
+    asked, skipped, left_out = False, 0, 0
+    for update in updates:
+        skipped, left_out = skipped + update.skipped, left_out + update.left_out
+        message = map_pb2.Map.FromString(update.map)
+        answer = service_pb2.WatchRequest()
+        if acknowledges:
+            answer.acknowledged = message.header.sequence
+        try:
+            base = Map(update.map, base=base)
+            stream.put(base, skipped, left_out)
+            asked, skipped, left_out = False, 0, 0
+        except DecodeError:
+            if not any(layer.HasField("base_sequence") for layer in message.layers):
+                raise
+            # More deltas may be on the way already; one question is enough for them all.
+            answer.want_full, asked = not asked, True
+            skipped += 1
+        if answer.want_full or acknowledges:
+            request(answer)

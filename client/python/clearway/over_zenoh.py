@@ -61,7 +61,7 @@ def get(endpoint: str, vehicle: str, layers: Sequence[str]) -> Map:
                 if part is None:
                     raise ClearwayError("NOT_FOUND", f"{endpoint}: nobody serves clearway/{vehicle}/map/{layer}")
                 if whole := gathered.take(part):
-                    return Map(whole[0])
+                    return Map(whole[0]).arrived()
     raise ClearwayError("zenoh", f"{endpoint}: no ten queries found the layers {', '.join(layers)} of one map")
 
 
@@ -72,7 +72,9 @@ def watch(endpoint: str, vehicle: str, layers: Sequence[str]) -> MapStream:
     def take(sample: zenoh.Sample) -> None:
         try:
             if whole := gathered.take(sample.payload.to_bytes()):
-                stream.put(*whole)
+                stream.put(Map(whole[0]), whole[1])
+        except ClearwayError as error:
+            stream.end(error)
         except Exception as error:  # noqa: BLE001: whatever it is, the reader is told and does not wait for ever.
             stream.end(ClearwayError("protobuf", f"{sample.key_expr}: {error}"))
 
@@ -80,7 +82,7 @@ def watch(endpoint: str, vehicle: str, layers: Sequence[str]) -> MapStream:
     for layer in layers:
         part = _newest(session, vehicle, layer)
         if part is not None and (whole := gathered.take(part)):
-            stream.put(*whole)
+            stream.put(Map(whole[0]), whole[1])
 
     def close() -> None:
         for subscriber in subscribers:

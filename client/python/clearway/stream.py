@@ -1,7 +1,8 @@
 """Maps, as fast as they come, to the newest map, as fast as it is asked for.
 
 A background thread fills one slot; a reader whose loop body is slow, or that only looks now and then, never gets an old
-map from a queue, because there is none.
+map from a queue, because there is none. And a reader that waits is told when the map it has becomes stale, also where nothing
+comes any more.
 """
 
 from __future__ import annotations
@@ -10,19 +11,23 @@ import threading
 from collections.abc import Callable, Iterator
 
 from .errors import ClearwayError
+from .freshness import LOOK_S, Clock
 from .map import Map
 
 
 class MapStream:
     """An endless iterator over the newest map. Close it, or use it in a `with` statement."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock = Clock()) -> None:
+        self._clock = clock
         self._changed = threading.Condition()
-        self._newest: bytes | None = None
-        #: Maps since the start of the stream, those that were skipped included.
-        self._made = 0
-        #: `_made` at the previous look; `None` before the first.
-        self._seen: int | None = None
+        self._newest: Map | None = None
+        #: Maps since the start of the stream: all but those left out, and those left out at the reader's wish.
+        self._made, self._left_out = 0, 0
+        #: `_made` and `_left_out` at the previous look; `None` before the first.
+        self._seen: tuple[int, int] | None = None
+        #: The map given last, until it is told as stale.
+        self._fresh: Map | None = None
         self._ended: ClearwayError | None = None
         self._closed = False
         self._close: Callable[[], None] = lambda: None
@@ -32,26 +37,40 @@ class MapStream:
 
     def __next__(self) -> Map:
         """Waits for a map newer than the one given last. Raises why there will be no more; ends when closed."""
+        return self._next(tell_stale=False)
+
+    def next_or_stale(self) -> Map:
+        """Waits for a map newer than the one given last, or until that one is stale: then it is given again, once, at most
+        20 ms late, whether or not anything comes. Ask the map: `m.stale`. Raises why there will be no more, and
+        `StopIteration` when closed."""
+        return self._next(tell_stale=True)
+
+    def _next(self, *, tell_stale: bool) -> Map:
         with self._changed:
-            # A wait without limit would not let Ctrl-C through on every platform.
-            while not (self._closed or self._ended or (self._newest is not None and self._made != self._seen)):
-                self._changed.wait(1.0)
+            while not (self._closed or self._is_unseen() or self._ended):
+                given = self._fresh if tell_stale else None
+                if given is not None and given.stale:
+                    self._fresh = None
+                    return given.again()
+                # A wait without limit would not let Ctrl-C through on every platform.
+                self._changed.wait(1.0 if given is None else min(LOOK_S, given.fresh_for_s()))
             if self._closed:
                 raise StopIteration
-            if self._newest is None or self._made == self._seen:
+            newest = self._newest
+            if newest is None or not self._is_unseen():
                 assert self._ended is not None
                 raise self._ended
             # The first look has missed nothing: the reader was not there before.
-            skipped = 0 if self._seen is None else self._made - self._seen - 1
-            self._seen = self._made
-            encoded = self._newest
-        return Map(encoded, skipped)
+            before = self._seen or (self._made - 1, self._left_out)
+            self._seen = (self._made, self._left_out)
+            given = newest.again(self._made - before[0] - 1, self._left_out - before[1])
+            self._fresh = None if given.stale else given
+            return given
 
     def newest(self) -> Map | None:
         """The newest map at this moment, without waiting and without counting as a look; it may be stale."""
         with self._changed:
-            encoded = self._newest
-        return None if encoded is None else Map(encoded)
+            return self._newest
 
     def close(self) -> None:
         """Ends the stream; whoever waits for a map stops waiting."""
@@ -69,12 +88,18 @@ class MapStream:
     def __del__(self) -> None:
         self._close()
 
-    def put(self, encoded: bytes, skipped: int) -> None:
-        """Makes a map the newest; `skipped` maps lie between it and the one before. For the background thread."""
+    def put(self, m: Map, skipped: int, left_out: int = 0) -> None:
+        """Makes a map the newest; between it and the one before lie `skipped` maps, and `left_out` ones that the reader did
+        not want. One that is no newer than the newest of the same run of the server (a replayed one) is passed over. For the
+        background thread."""
+        m.arrived(self._clock)
         with self._changed:
-            self._made += 1 + skipped
-            self._newest = encoded
-            self._changed.notify_all()
+            newest = self._newest
+            if newest is None or newest.header.boot_id != m.header.boot_id or newest.sequence < m.sequence:
+                self._made += 1 + skipped
+                self._left_out += left_out
+                self._newest = m
+                self._changed.notify_all()
 
     def end(self, reason: ClearwayError) -> None:
         """There will be no more maps. For the background thread."""
@@ -85,3 +110,6 @@ class MapStream:
     def on_close(self, close: Callable[[], None]) -> None:
         """What else ends with the stream."""
         self._close = close
+
+    def _is_unseen(self) -> bool:
+        return self._newest is not None and self._seen != (self._made, self._left_out)

@@ -19,6 +19,7 @@ use tower_service::Service;
 use x509_parser::extensions::GeneralName;
 use x509_parser::prelude::{FromDer, X509Certificate};
 
+use super::connections::Place;
 use crate::config;
 
 /// What a peer may be.
@@ -95,7 +96,7 @@ impl Access {
     }
 }
 
-/// Lets through what [`Access`] allows; `None` lets everything through.
+/// Lets through what [`Access`] allows (`None` lets everything through) of whom there is a place for.
 #[derive(Clone, Debug)]
 pub struct Guard(pub Option<Arc<Access>>);
 
@@ -127,8 +128,9 @@ where
     }
 
     fn call(&mut self, request: Request<B>) -> Self::Future {
-        let denied = self.access.as_ref().and_then(|access| access.check(request.uri().path(), &names(&request)).err());
-        match denied {
+        let allowed =
+            || self.access.as_ref().map_or(Ok(()), |access| access.check(request.uri().path(), &names(&request)));
+        match has_place(&request).and_then(|()| allowed()).err() {
             None => Either::Left(self.inner.call(request)),
             Some(status) => {
                 tracing::info!(status = status.message(), "denied");
@@ -138,9 +140,19 @@ where
     }
 }
 
+fn has_place<B>(request: &Request<B>) -> Result<(), Status> {
+    let encrypted = request.extensions().get::<TlsConnectInfo<Place>>().map(|tls| *tls.get_ref());
+    match encrypted.or_else(|| request.extensions().get().copied()) {
+        Some(Place::Lobby(connections_max)) => Err(Status::resource_exhausted(format!(
+            "{connections_max} connections are open, which grpc.connections_max allows; try again when one has gone"
+        ))),
+        Some(Place::Room) | None => Ok(()),
+    }
+}
+
 /// The names in the peer's own certificate, which the handshake has checked against `client_ca`: common name and DNS names.
 fn names<B>(request: &Request<B>) -> Vec<String> {
-    let certificates = request.extensions().get::<TlsConnectInfo<()>>().and_then(TlsConnectInfo::peer_certs);
+    let certificates = request.extensions().get::<TlsConnectInfo<Place>>().and_then(TlsConnectInfo::peer_certs);
     let Some(certificate) = certificates.as_ref().and_then(|chain| chain.first()) else { return Vec::new() };
     // What does not parse has no name, and so no role.
     let Ok((_, certificate)) = X509Certificate::from_der(certificate) else { return Vec::new() };

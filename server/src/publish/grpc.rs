@@ -1,13 +1,12 @@
 //! Maps over gRPC: `clearway.v1.MapService`, standard health and reflection, and beside them what vehicles send
 //! ([`crate::ingest::grpc`]).
 //!
-//! What a peer may cost is set here, explicitly, each limit with its reason; what one reader gets is [`super::watch`]'s.
+//! What a peer may cost is set here, explicitly, each limit with its reason; what one reader gets is [`super::reader`]'s.
 
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use clearway_proto::region::RegionError;
 use clearway_proto::{DESCRIPTORS, v1};
 use futures::Stream;
 use tokio::net::TcpListener;
@@ -16,7 +15,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::access::{Access, Guard};
 use super::connections::Connections;
-use super::watch::watch;
+use super::reader::watch;
 use super::{Unknown, Vehicles};
 use crate::config::{self, Certificates};
 use crate::ingest::entrance::Entrances;
@@ -74,6 +73,7 @@ impl Security {
 pub async fn serve(
     listener: TcpListener,
     security: Security,
+    connections_max: usize,
     vehicles: Vehicles,
     entrances: Entrances,
     stop: impl Future<Output = ()>,
@@ -108,7 +108,7 @@ pub async fn serve(
         .add_service(reflection().build_v1()?)
         // Older grpcurl knows only this one.
         .add_service(reflection().build_v1alpha()?)
-        .serve_with_incoming_shutdown(Connections::new(listener).stream(), stop)
+        .serve_with_incoming_shutdown(Connections::new(listener, connections_max).with_lobby().stream(), stop)
         .await?;
     Ok(())
 }
@@ -123,12 +123,6 @@ impl From<Unknown> for Status {
             Unknown::Vehicle { .. } | Unknown::Sensor { .. } => Status::not_found(unknown.to_string()),
             Unknown::Layer { .. } => Status::invalid_argument(unknown.to_string()),
         }
-    }
-}
-
-impl From<RegionError> for Status {
-    fn from(error: RegionError) -> Self {
-        Status::invalid_argument(error.to_string())
     }
 }
 

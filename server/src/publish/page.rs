@@ -26,6 +26,8 @@ use crate::status::{Reader, prometheus};
 /// A browser that has not taken a frame for this long shows nothing true any more.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
+/// Browsers at once, with a few connections each; a fleet's pages are served by a proxy that has a few of its own.
+const CONNECTIONS_MAX: usize = 256;
 /// A page sends nothing but pongs.
 const MESSAGE_BYTES_MAX: usize = 4096;
 
@@ -49,7 +51,7 @@ pub async fn serve(
         .route("/metrics", get(metrics))
         .fallback(asset)
         .with_state(vehicles);
-    axum::serve(Connections::new(listener), router).with_graceful_shutdown(stop).await
+    axum::serve(Connections::new(listener, CONNECTIONS_MAX), router).with_graceful_shutdown(stop).await
 }
 
 async fn asset(uri: Uri) -> Response {

@@ -6,6 +6,7 @@
 
 use std::collections::VecDeque;
 
+use bytes::Bytes;
 use clearway_proto::v1;
 use tonic::Status;
 
@@ -50,9 +51,19 @@ impl Selection {
             credits: Credits::new(max_in_flight as usize),
         };
         // Where there is a map already, a region that it does not reach is refused before the stream begins.
-        let newest = served.newest.borrow().clone();
-        newest.map_or(Ok(()), |newest| newest.cut(&selection.layers, selection.region.as_ref(), None).map(drop))?;
+        if let Some(newest) = served.newest.borrow().clone().filter(|_| selection.region.is_some()) {
+            selection.bytes(&newest, None)?;
+        }
         Ok(selection)
+    }
+
+    /// What is sent of a map, as a delta against `base` where there is one.
+    ///
+    /// # Errors
+    /// The region lies outside a layer's grid.
+    pub fn bytes(&self, map: &EncodedMap, base: Option<&EncodedMap>) -> Result<Bytes, Status> {
+        let bytes = map.cut(&self.layers, self.region.as_ref(), base);
+        bytes.map_err(|error| Status::invalid_argument(error.to_string()))
     }
 }
 
@@ -196,7 +207,10 @@ mod tests {
         let mut credits = Credits::new(2);
         credits.send(10);
         credits.send(14);
-        assert!(credits.acknowledge(9).is_err() && credits.acknowledge(12).is_err(), "skipped maps were not sent either");
+        assert!(
+            credits.acknowledge(9).is_err() && credits.acknowledge(12).is_err(),
+            "skipped maps were not sent either"
+        );
         credits.acknowledge(14).unwrap();
     }
 

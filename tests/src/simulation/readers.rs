@@ -8,12 +8,13 @@ use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 
 use clearway_proto::v1;
-use clearway_server::publish::{Vehicles, grpc};
+use clearway_server::publish::Vehicles;
+use clearway_server::publish::reader::watch;
 use clearway_server::wire::EncodedMap;
 use futures::Stream;
 use futures::channel::mpsc::{UnboundedSender, unbounded};
 use prost::Message;
-use tonic::Status;
+use tonic::{Code, Status};
 
 use super::Plant;
 use super::checks::{Breach, breach};
@@ -125,8 +126,9 @@ impl Reader {
     fn subscribe(&mut self, vehicles: &Vehicles) -> Result<(), Breach> {
         let (requests, heard) = unbounded();
         let max_in_flight = self.max_in_flight as u32;
-        let selection = v1::Selection { vehicle: "car".into(), layers: self.layers.clone(), max_in_flight };
-        let updates = grpc::watch(vehicles, selection, heard);
+        let layers = self.layers.clone();
+        let selection = v1::Selection { vehicle: "car".into(), layers, max_in_flight, ..Default::default() };
+        let updates = watch(vehicles, selection, heard);
         let updates = updates.map_err(|status| breach("reader", format!("{:?} is refused: {status}", self.habit)))?;
         self.open = Some((Box::pin(updates), requests));
         (self.last, self.in_flight) = (None, VecDeque::new());
@@ -148,7 +150,7 @@ impl Reader {
         };
         let Some((_, requests)) = &self.open else { return };
         // Nobody drops the other end but with this one.
-        let _ = requests.unbounded_send(Ok(v1::WatchRequest { selection: None, acknowledged }));
+        let _ = requests.unbounded_send(Ok(v1::WatchRequest { acknowledged, ..Default::default() }));
         if let Some(acknowledged) = acknowledged {
             self.in_flight.retain(|sent| *sent > acknowledged);
         }
@@ -159,6 +161,13 @@ impl Reader {
         match updates.as_mut().poll_next(&mut Context::from_waker(Waker::noop())) {
             Poll::Pending => Ok(None),
             Poll::Ready(Some(Ok(update))) => Ok(Some(update)),
+            // It has acknowledged what it was never sent, and comes again.
+            Poll::Ready(Some(Err(status)))
+                if self.habit == Habit::Garbled && status.code() == Code::InvalidArgument =>
+            {
+                self.open = None;
+                Ok(None)
+            }
             Poll::Ready(other) => Err(breach("reader", format!("{:?} is sent away: {other:?}", self.habit))),
         }
     }

@@ -100,8 +100,8 @@ pub async fn grpc(running: &Running) -> MapServiceClient<Channel> {
 /// A first request of `Watch`.
 pub fn selection(vehicle: &str, layers: &[&str], max_in_flight: u32) -> v1::WatchRequest {
     let layers = layers.iter().map(|&layer| layer.to_owned()).collect();
-    let selection = v1::Selection { vehicle: vehicle.into(), layers, max_in_flight };
-    v1::WatchRequest { selection: Some(selection), acknowledged: None }
+    let selection = v1::Selection { vehicle: vehicle.into(), layers, max_in_flight, ..Default::default() };
+    v1::WatchRequest { selection: Some(selection), ..Default::default() }
 }
 
 pub fn sequence(map: &Bytes) -> u64 {

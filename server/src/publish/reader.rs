@@ -120,13 +120,13 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
     }
 
     fn send(&mut self, map: Arc<EncodedMap>) -> Result<v1::MapUpdate, Status> {
-        let Selection { layers, region, deltas, rate, credits } = &mut self.selection;
-        let base = self.last.as_deref().filter(|_| *deltas && !self.want_full);
-        let bytes = map.cut(layers, region.as_ref(), base)?;
-        let (skipped, left_out) = self.last.as_ref().map_or((0, 0), |last| rate.between(last, &map));
-        rate.send(map.capture_end_ns);
-        credits.send(map.sequence);
-        (self.last, self.want_full) = (Some(map), false);
+        let Self { selection, last, want_full, .. } = self;
+        let base = last.as_deref().filter(|_| selection.deltas && !*want_full);
+        let bytes = selection.bytes(&map, base)?;
+        let (skipped, left_out) = last.as_ref().map_or((0, 0), |last| selection.rate.between(last, &map));
+        selection.rate.send(map.capture_end_ns);
+        selection.credits.send(map.sequence);
+        (*last, *want_full) = (Some(map), false);
         Ok(v1::MapUpdate { map: bytes, skipped, sent_ns: now_ns(), left_out })
     }
 }

@@ -1,0 +1,367 @@
+//! Readers of `Watch` over real sockets: what they ask for, what they are told, and that the bad ones cost nobody anything.
+
+mod house;
+
+use std::net::SocketAddr;
+use std::sync::{Arc, Weak};
+
+use clearway_proto::v1;
+use clearway_proto::v1::map_service_client::MapServiceClient;
+use clearway_server::ingest::Reading;
+use clearway_server::server::{Server, Setup};
+use clearway_server::wire::EncodedMap;
+use house::{config, feed, readings, sequence, start, until, within};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{Semaphore, mpsc};
+use tonic::transport::Channel;
+use tonic::{Code, Status, Streaming};
+
+const LAYER: &str = "drivability";
+
+/// A reader the test plays by hand.
+struct Reader {
+    requests: mpsc::Sender<v1::WatchRequest>,
+    updates: Streaming<v1::MapUpdate>,
+}
+
+impl Reader {
+    async fn open(client: &mut MapServiceClient<Channel>, selection: v1::Selection) -> Result<Self, Status> {
+        let (requests, mut heard) = mpsc::channel(16);
+        requests.send(v1::WatchRequest { selection: Some(selection), ..Default::default() }).await.expect("room");
+        let heard = futures::stream::poll_fn(move |context| heard.poll_recv(context));
+        let updates = within("watch", client.watch(heard)).await?.into_inner();
+        Ok(Self { requests, updates })
+    }
+
+    async fn acknowledge(&self, sequence: u64) {
+        let request = v1::WatchRequest { acknowledged: Some(sequence), ..Default::default() };
+        self.requests.send(request).await.expect("the stream is open");
+    }
+
+    async fn next(&mut self) -> Result<v1::MapUpdate, Status> {
+        within("a map", self.updates.message()).await.map(|update| update.expect("no end"))
+    }
+
+    /// The next map, acknowledged: its sequence, how many were missed before it, how many left out.
+    async fn take(&mut self) -> (u64, u64, u64) {
+        let update = self.next().await.expect("a map");
+        let sequence = sequence(&update.map);
+        self.acknowledge(sequence).await;
+        (sequence, update.skipped, update.left_out)
+    }
+}
+
+fn of_layer(max_in_flight: u32) -> v1::Selection {
+    v1::Selection { layers: vec![LAYER.into()], max_in_flight, ..Default::default() }
+}
+
+/// As any tonic client connects, with the windows it has by default.
+async fn plain(address: SocketAddr) -> MapServiceClient<Channel> {
+    let channel = Channel::from_shared(format!("http://{address}")).unwrap().connect().await;
+    MapServiceClient::new(channel.expect("gRPC answers"))
+}
+
+/// Less than a turn each (some 350 datagrams): a reader that keeps up misses no map of it.
+fn portions(tenths: i64) -> Vec<Vec<Reading>> {
+    readings(tenths).chunks(300).map(<[_]>::to_vec).collect()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_a_reader_asks_for_and_cannot_have_is_refused_by_name_and_disturbs_nobody() {
+    let running = start(config()).await;
+    let mut client = plain(running.grpc.unwrap()).await;
+    let mut healthy = Reader::open(&mut client, of_layer(1)).await.unwrap();
+    feed(&running, readings(2)).await;
+    let first = healthy.take().await.0;
+
+    let far = v1::Region { x_from_m: 500.0, x_to_m: 600.0, y_from_m: -5.0, y_to_m: 5.0 };
+    let wrong = [
+        (v1::Selection { max_rate_hz: Some(0.0), ..of_layer(1) }, "max_rate_hz 0: more than 0"),
+        (v1::Selection { max_rate_hz: Some(f64::NAN), ..of_layer(1) }, "max_rate_hz NaN"),
+        (v1::Selection { max_rate_hz: Some(-2.0), ..of_layer(1) }, "max_rate_hz -2"),
+        (v1::Selection { max_rate_hz: Some(f64::INFINITY), ..of_layer(1) }, "max_rate_hz inf"),
+        (v1::Selection { region: Some(far), ..of_layer(1) }, "region"),
+        (of_layer(65), "max_in_flight 65: 0 to 64"),
+    ];
+    for (selection, named) in wrong {
+        let status = Reader::open(&mut client, selection).await.map(drop).unwrap_err();
+        assert_eq!(status.code(), Code::InvalidArgument, "{status}");
+        assert!(status.message().contains(named), "{named}: {status}");
+    }
+
+    let mut liar = Reader::open(&mut client, of_layer(2)).await.unwrap();
+    liar.take().await;
+    liar.acknowledge(4711).await;
+    let status = liar.next().await.unwrap_err();
+    assert_eq!(status.code(), Code::InvalidArgument, "{status}");
+    let last = format!("acknowledged 4711: this map was never sent on this stream; the last one sent is {first}");
+    assert!(status.message().starts_with(&last), "{status}");
+
+    let long = v1::Selection { vehicle: "v".repeat(70_000), ..of_layer(1) };
+    let status = Reader::open(&mut client, long).await.map(drop).unwrap_err();
+    assert_eq!(status.code(), Code::OutOfRange, "{status}");
+    assert!(status.message().contains("65536"), "{status}");
+
+    let maps = feed(&running, readings(2)).await;
+    assert!(maps > first + 1);
+    assert!(healthy.take().await.0 > first, "the healthy reader goes on");
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_rate_picks_maps_by_their_stamps_and_what_it_left_out_is_told_from_what_was_lost() {
+    let running = start(config()).await;
+    let mut client = plain(running.grpc.unwrap()).await;
+    let halved = v1::Selection { max_rate_hz: Some(5.0), ..of_layer(1) };
+    let mut reader = Reader::open(&mut client, halved.clone()).await.unwrap();
+    let mut slow = Reader::open(&mut client, halved).await.unwrap();
+    let mut all = Reader::open(&mut client, of_layer(1)).await.unwrap();
+    let (mut next, mut picked, mut first) = (0, Vec::new(), None);
+    for portion in portions(14) {
+        let maps = feed(&running, portion).await;
+        while next < maps {
+            assert_eq!(all.take().await, (next, 0, 0));
+            if next == 0 {
+                first = Some(sequence(&slow.next().await.unwrap().map));
+            }
+            if next % 2 == 0 {
+                picked.push(reader.take().await);
+            }
+            next += 1;
+        }
+    }
+    assert!(picked.len() >= 5, "{picked:?}");
+    let expected = (0..).step_by(2).map(|sequence| (sequence, 0, u64::from(sequence > 0)));
+    assert!(picked.iter().copied().eq(expected.take(picked.len())), "{picked:?}");
+
+    // One that did not acknowledge for all this time is told what it missed, and what it would not have got anyway.
+    slow.acknowledge(first.unwrap()).await;
+    let (sequence, skipped, left_out) = slow.take().await;
+    assert_eq!((sequence, skipped + left_out), (next - 1, next - 2));
+    assert!(skipped.abs_diff(picked.len() as u64 - 2) <= 1, "{skipped} missed, {left_out} left out");
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_late_joiner_gets_the_current_map_and_only_the_late_joiner() {
+    let running = Server::start(Setup { config: config(), ..Setup::default() }).await.expect("the server starts");
+    let mut client = plain(running.grpc.unwrap()).await;
+    let mut early = Reader::open(&mut client, of_layer(1)).await.unwrap();
+    let demand = running.vehicles.0[0].status.demand.clone();
+    until("the early reader is there", || demand.is_taken(LAYER)).await;
+    let portions = portions(6);
+    let half = portions.len() / 2;
+    let mut next = 0;
+    for portion in portions[..half].to_vec() {
+        let maps = feed(&running, portion).await;
+        for expected in next..maps {
+            assert_eq!(early.take().await, (expected, 0, 0));
+        }
+        next = maps;
+    }
+    assert!(next > 0);
+
+    let terrain = v1::Selection { layers: vec!["terrain".into()], max_in_flight: 1, ..Default::default() };
+    let mut late = Reader::open(&mut client, terrain).await.unwrap();
+    assert_eq!(late.take().await, (next, 0, 0), "the turn is made again for it");
+    let again = Reader::open(&mut client, of_layer(1)).await.unwrap().take().await;
+    assert_eq!(again, (next, 0, 0), "who joins now gets what there is");
+    let mut portions = portions[half..].iter();
+    while running.vehicles.0[0].status.snapshot().maps == next + 1 {
+        feed(&running, portions.next().expect("a turn more").clone()).await;
+    }
+    assert_eq!(early.take().await, (next + 1, 0, 1), "the early reader had that turn, and missed nothing");
+    assert_eq!(late.take().await, (next + 1, 0, 0));
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+/// A link to the server that lets through as many of its bytes as it is allowed to.
+struct Link {
+    address: SocketAddr,
+    allowed: Arc<Semaphore>,
+}
+
+impl Link {
+    async fn to(server: SocketAddr) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let (address, allowed) = (listener.local_addr().unwrap(), Arc::new(Semaphore::new(0)));
+        let rate = allowed.clone();
+        tokio::spawn(async move {
+            let (mut near, _) = listener.accept().await.unwrap();
+            let (mut far_reads, mut far_writes) = TcpStream::connect(server).await.unwrap().into_split();
+            let (mut near_reads, mut near_writes) = near.split();
+            let up = tokio::io::copy(&mut near_reads, &mut far_writes);
+            let down = async {
+                let mut byte = [0];
+                while far_reads.read_exact(&mut byte).await.is_ok() {
+                    rate.acquire().await.expect("open").forget();
+                    if near_writes.write_all(&byte).await.is_err() {
+                        break;
+                    }
+                }
+            };
+            tokio::join!(up, down)
+        });
+        Self { address, allowed }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_stopped_and_a_slow_reader_cost_eight_healthy_ones_nothing_and_resume_with_the_newest_map() {
+    /// What the wire's greetings take, and 10 kB/s of a server of ten maps a second.
+    const GREETING_BYTES: usize = 1000;
+    const BYTES_A_TURN: usize = 1000;
+    let running = start(config()).await;
+    let server = running.grpc.unwrap();
+    let [link, wall] = [Link::to(server).await, Link::to(server).await];
+    [&link, &wall].iter().for_each(|link| link.allowed.add_permits(GREETING_BYTES));
+    // With small windows as our own client has, and with a plain client's, which hold minutes of maps.
+    let mut slow = Reader::open(&mut plain(link.address).await, of_layer(2)).await.unwrap();
+    let mut deaf = Reader::open(&mut plain(wall.address).await, of_layer(0)).await.unwrap();
+    let mut stopped = Reader::open(&mut plain(server).await, of_layer(2)).await.unwrap();
+    let mut small = Reader::open(&mut house::grpc(&running).await, of_layer(2)).await.unwrap();
+    let mut healthy = Vec::new();
+    for index in 0..8 {
+        let mut client = if index % 2 == 0 { plain(server).await } else { house::grpc(&running).await };
+        healthy.push(Reader::open(&mut client, of_layer(1 + index % 3)).await.unwrap());
+    }
+
+    let mut made: Vec<Weak<EncodedMap>> = Vec::new();
+    let mut next = 0;
+    for portion in portions(20) {
+        let maps = feed(&running, portion).await;
+        for expected in next..maps {
+            made.push(Arc::downgrade(running.vehicles.0[0].newest.borrow().as_ref().unwrap()));
+            for reader in &mut healthy {
+                assert_eq!(reader.take().await, (expected, 0, 0));
+            }
+            link.allowed.add_permits(BYTES_A_TURN);
+        }
+        next = maps;
+    }
+    assert!(next >= 18, "{next} maps");
+    // Each reader holds the map it was sent last, the slot the newest; nothing else keeps one.
+    let alive = made.iter().filter(|map| map.upgrade().is_some()).count();
+    assert!(alive <= 1 + 4, "{alive} of {next} maps are kept");
+
+    for reader in [&mut stopped, &mut small] {
+        let on_the_way =
+            [reader.next().await.unwrap(), reader.next().await.unwrap()].map(|update| sequence(&update.map));
+        assert_eq!(on_the_way[0], 0);
+        reader.acknowledge(on_the_way[1]).await;
+        let (sequence, skipped, _) = reader.take().await;
+        assert_eq!((sequence, skipped), (next - 1, next - 2 - on_the_way[1]), "the first new map is the newest");
+    }
+    // The slow one had no more than its credits on the way: after those, the newest comes.
+    link.allowed.add_permits(Semaphore::MAX_PERMITS / 2);
+    let (mut before, mut seen) = (slow.take().await, 1);
+    while before.0 < next - 1 {
+        let update = slow.take().await;
+        assert_eq!(update.0, before.0 + 1 + update.1, "what it missed is counted");
+        (before, seen) = (update, seen + 1);
+    }
+    assert!(seen <= 3, "{seen} maps over a link of 10 kB/s, of which all but two were on the way");
+    // Who never acknowledges at all gets what was on the way, and no gap is untold.
+    wall.allowed.add_permits(Semaphore::MAX_PERMITS / 2);
+    let mut expected = 0;
+    while expected < next {
+        let update = deaf.next().await.unwrap();
+        assert_eq!(sequence(&update.map), expected + update.skipped);
+        expected += update.skipped + 1;
+    }
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_thousand_idle_connections_take_no_more_than_their_places_and_the_next_peer_is_told() {
+    let mut config = config();
+    config.grpc.connections_max = 32;
+    let running = start(config).await;
+    let server = running.grpc.unwrap();
+    let mut healthy = Reader::open(&mut plain(server).await, of_layer(1)).await.unwrap();
+    let mut idle = Vec::new();
+    for _ in 0..1000 {
+        let mut connection = TcpStream::connect(server).await.unwrap();
+        // A greeting, so that it counts as alive; some are closed before it.
+        let _ = connection.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").await;
+        idle.push(connection);
+    }
+    let mut next = 0;
+    for portion in portions(3) {
+        let maps = feed(&running, portion).await;
+        for expected in next..maps {
+            assert_eq!(healthy.take().await, (expected, 0, 0));
+        }
+        next = maps;
+    }
+    // The lobby is full of them too; as soon as it is not, whoever comes hears why there is no place.
+    let status = within("an answer", async {
+        loop {
+            let channel = Channel::from_shared(format!("http://{server}")).unwrap().connect_lazy();
+            let request = v1::ListVehiclesRequest {};
+            match MapServiceClient::new(channel).list_vehicles(request).await {
+                Err(status) if status.code() == Code::ResourceExhausted => return status,
+                Err(status) => assert_eq!(status.code(), Code::Unavailable, "{status}"),
+                Ok(_) => panic!("there is no place"),
+            }
+        }
+    })
+    .await;
+    assert!(status.message().starts_with("32 connections are open, which grpc.connections_max allows"), "{status}");
+    drop(idle);
+    within("a place", async {
+        let connect = || Channel::from_shared(format!("http://{server}")).unwrap().connect_lazy();
+        while MapServiceClient::new(connect()).list_vehicles(v1::ListVehiclesRequest {}).await.is_err() {}
+    })
+    .await;
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+/// An HTTP/2 frame.
+fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
+    let length = u32::try_from(payload.len()).unwrap().to_be_bytes();
+    [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
+}
+
+/// Opens a `Watch`, and resets it.
+fn open_and_reset(stream: u32) -> Vec<u8> {
+    let path = b"/clearway.v1.MapService/Watch";
+    let kind = b"application/grpc";
+    // POST, http; path, authority and content-type as literals.
+    let headers =
+        [&[0x83, 0x86, 0x04, path.len() as u8], &path[..], b"\x01\x01x\x0f\x10", &[kind.len() as u8], kind].concat();
+    [frame(1, 4, stream, &headers), frame(3, 0, stream, &8u32.to_be_bytes())].concat()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn who_opens_and_resets_streams_in_a_loop_loses_its_connection_and_nobody_else_does() {
+    let running = start(config()).await;
+    let server = running.grpc.unwrap();
+    let mut healthy = Reader::open(&mut plain(server).await, of_layer(1)).await.unwrap();
+    let mut hostile = TcpStream::connect(server).await.unwrap();
+    let mut said = [&b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"[..], &frame(4, 0, 0, &[])].concat();
+    (0..20_000).for_each(|index| said.extend(open_and_reset(2 * index + 1)));
+    // The server may close before all of it is said.
+    let _ = hostile.write_all(&said).await;
+    let mut heard = Vec::new();
+    let _ = within("the end", hostile.read_to_end(&mut heard)).await;
+    drop(hostile);
+
+    // A client that means no harm but gives up at once each time, over one connection.
+    let mut hasty = plain(server).await;
+    for _ in 0..300 {
+        drop(Reader::open(&mut hasty, of_layer(0)).await);
+    }
+    let mut next = 0;
+    for portion in portions(3) {
+        let maps = feed(&running, portion).await;
+        for expected in next..maps {
+            assert_eq!(healthy.take().await, (expected, 0, 0));
+        }
+        next = maps;
+    }
+    let readers = || running.vehicles.0[0].status.to_proto().readers["grpc"];
+    until("only the healthy reader is left", || readers() == 1).await;
+    within("shutdown", running.shutdown()).await.unwrap();
+}
