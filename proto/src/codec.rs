@@ -212,7 +212,7 @@ pub(crate) fn run_end<const W: usize>(raw: &[u8], start: usize) -> usize {
 }
 
 /// Small magnitudes to small numbers: 0, -1, 1, -2 … become 0, 1, 2, 3 …
-fn zigzag(value: i8) -> u8 {
+pub(crate) fn zigzag(value: i8) -> u8 {
     ((value << 1) ^ (value >> 7)) as u8
 }
 

@@ -169,20 +169,30 @@ impl DecodeError {
 /// # Errors
 /// [`DecodeError`], naming the first thing found wrong; a raw payload is accepted even where runs would be smaller.
 pub fn decode(channel: &v1::Channel, limits: &Limits) -> Result<Cells, DecodeError> {
+    let computed = check(channel, limits)?;
+    if computed != channel.crc32 {
+        return Err(DecodeError::Crc { stated: channel.crc32, computed });
+    }
+    make(channel)
+}
+
+/// Decodes what the payload holds, whatever the CRC says: a delta's CRC is of other cells.
+pub(crate) fn decode_differences(channel: &v1::Channel, limits: &Limits) -> Result<Cells, DecodeError> {
+    check(channel, limits)?;
+    make(channel)
+}
+
+/// Checks counts and canonical form, and gives the CRC of the cells without making them.
+fn check(channel: &v1::Channel, limits: &Limits) -> Result<u32, DecodeError> {
     let cell_count = channel.cell_count;
     if cell_count > limits.channel_cells {
         return Err(DecodeError::TooManyCells { cell_count, allowed: limits.channel_cells });
     }
-    let bad_type = DecodeError::CellType { value: channel.cell_type };
-    let (width, value_max) = match v1::CellType::try_from(channel.cell_type) {
-        Ok(v1::CellType::U8 | v1::CellType::I8) => (1_u64, 0xff),
-        Ok(v1::CellType::U16) => (2, 0xffff),
-        Ok(v1::CellType::Unspecified) | Err(_) => return Err(bad_type),
-    };
+    let (width, value_max) = width_and_value_max(channel)?;
     let payload = &channel.payload[..];
     let raw_length = u64::from(cell_count) * width;
     let signed = channel.cell_type() == v1::CellType::I8;
-    let computed = match v1::Encoding::try_from(channel.encoding) {
+    Ok(match v1::Encoding::try_from(channel.encoding) {
         Ok(v1::Encoding::Raw) => {
             if payload.len() as u64 != raw_length {
                 return Err(DecodeError::RawLength { length: payload.len(), cell_count, expected: raw_length });
@@ -206,11 +216,22 @@ pub fn decode(channel: &v1::Channel, limits: &Limits) -> Result<Cells, DecodeErr
             crc.finish()
         }
         Ok(v1::Encoding::Unspecified) | Err(_) => return Err(DecodeError::Encoding { value: channel.encoding }),
-    };
-    if computed != channel.crc32 {
-        return Err(DecodeError::Crc { stated: channel.crc32, computed });
-    }
+    })
+}
 
+/// Bytes of a cell, and the largest value of one on the wire.
+fn width_and_value_max(channel: &v1::Channel) -> Result<(u64, u64), DecodeError> {
+    match v1::CellType::try_from(channel.cell_type) {
+        Ok(v1::CellType::U8 | v1::CellType::I8) => Ok((1, 0xff)),
+        Ok(v1::CellType::U16) => Ok((2, 0xffff)),
+        Ok(v1::CellType::Unspecified) | Err(_) => Err(DecodeError::CellType { value: channel.cell_type }),
+    }
+}
+
+/// The cells of a channel that is checked.
+fn make(channel: &v1::Channel) -> Result<Cells, DecodeError> {
+    let (_, value_max) = width_and_value_max(channel)?;
+    let payload = &channel.payload[..];
     let raw = channel.encoding() == v1::Encoding::Raw;
     Ok(match channel.cell_type() {
         v1::CellType::U8 if raw => Cells::U8(payload.to_vec()),
@@ -221,7 +242,7 @@ pub fn decode(channel: &v1::Channel, limits: &Limits) -> Result<Cells, DecodeErr
             Cells::U16(payload.as_chunks::<2>().0.iter().map(|&v| u16::from_le_bytes(v)).collect())
         }
         v1::CellType::U16 => Cells::U16(fill(channel, value_max, |value| value as u16)?),
-        v1::CellType::Unspecified => return Err(bad_type),
+        v1::CellType::Unspecified => return Err(DecodeError::CellType { value: channel.cell_type }),
     })
 }
 

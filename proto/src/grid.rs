@@ -34,6 +34,10 @@ pub enum Grid {
         cell_m: f32,
         /// Heading of the ego frame in the grid's axes; 0 where these are the vehicle's own.
         yaw_rad: f64,
+        /// Number of cell (0, 0) along x among all there could be: the world's where the axes are the world's.
+        first_ix: i64,
+        /// The same along y.
+        first_iy: i64,
     },
 }
 
@@ -65,7 +69,8 @@ impl Grid {
                 Ok(Self::Radial { r_bench_m: r_bench_m.clone(), columns: *columns })
             }
             Some(v1::layer::Geometry::Cartesian(grid)) => {
-                let v1::CartesianGrid { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad } = *grid;
+                let v1::CartesianGrid { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix, first_iy } =
+                    *grid;
                 if width == 0 || height == 0 {
                     return Err(wrong(format!("{width} x {height} cells; at least 1 x 1 is needed")));
                 }
@@ -78,7 +83,7 @@ impl Grid {
                 if !yaw_rad.is_finite() {
                     return Err(wrong(format!("yaw {yaw_rad} rad; a finite value is needed")));
                 }
-                Ok(Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad })
+                Ok(Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix, first_iy })
             }
         }
     }
@@ -114,7 +119,7 @@ impl Grid {
                 let column = ((turn * f64::from(*columns)) as usize).min(*columns as usize - 1);
                 Some(row * *columns as usize + column)
             }
-            Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad } => {
+            Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
                 let (x_m, y_m) = turned(x_m, y_m, *yaw_rad);
                 let ix = ((x_m - origin_x_m) / f64::from(*cell_m)).floor();
                 let iy = ((y_m - origin_y_m) / f64::from(*cell_m)).floor();
@@ -159,7 +164,7 @@ impl Grid {
 }
 
 /// A place turned counter-clockwise about the origin; by 0 it stays what it is, to the bit.
-fn turned(x: f64, y: f64, angle: f64) -> (f64, f64) {
+pub(crate) fn turned(x: f64, y: f64, angle: f64) -> (f64, f64) {
     let (sin, cos) = angle.sin_cos();
     (x * cos - y * sin, x * sin + y * cos)
 }
@@ -170,8 +175,16 @@ mod tests {
 
     #[test]
     fn a_grid_that_turns_under_the_vehicle_is_looked_up_along_its_own_axes() {
-        let grid =
-            |yaw_rad| Grid::Cartesian { origin_x_m: -2.0, origin_y_m: -2.0, width: 4, height: 4, cell_m: 1.0, yaw_rad };
+        let grid = |yaw_rad| Grid::Cartesian {
+            origin_x_m: -2.0,
+            origin_y_m: -2.0,
+            width: 4,
+            height: 4,
+            cell_m: 1.0,
+            yaw_rad,
+            first_ix: 0,
+            first_iy: 0,
+        };
         // The vehicle heads along the grid's y axis: ahead is up the rows, to the left is down the columns.
         let quarter = grid(TAU / 4.0);
         assert_eq!(

@@ -2,15 +2,17 @@
 //!
 //! [`v1`] holds the generated protobuf and gRPC types, [`DESCRIPTORS`] their descriptor set (for reflection and for
 //! the schemas in recordings), [`codec`] the cells of a channel to bytes and back, [`grid`] where cells lie, [`map`] a
-//! whole map's bytes to checked values, [`packed`] a scan's lists of numbers to bytes and back, [`safe_points`] a layer's
+//! whole map's bytes to checked values, [`delta`] a layer as what changed, [`region`] the part of a layer about a place, [`packed`] a scan's lists of numbers to bytes and back, [`safe_points`] a layer's
 //! points.
 
 pub mod codec;
 mod decode;
+pub mod delta;
 pub mod grid;
 pub mod map;
 pub mod packed;
 mod parts;
+pub mod region;
 mod rows;
 pub mod safe_points;
 

@@ -13,7 +13,7 @@ use prost::Message;
 
 use crate::codec::{Cells, DecodeError, Limits, decode};
 use crate::grid::Grid;
-use crate::{parts, safe_points, v1};
+use crate::{delta, parts, safe_points, v1};
 
 /// The bytes of a map with this header and no layer yet.
 pub fn encode_header(header: &v1::Header) -> Bytes {
@@ -121,6 +121,30 @@ impl Channel {
     }
 }
 
+/// Names one map among all there are.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MapId {
+    /// `Header.vehicle`.
+    pub vehicle: String,
+    /// `Header.boot_id`.
+    pub boot_id: u64,
+    /// `Header.sequence`.
+    pub sequence: u64,
+}
+
+impl MapId {
+    /// Of the map with this header.
+    pub fn of(header: &v1::Header) -> Self {
+        Self { vehicle: header.vehicle.clone(), boot_id: header.boot_id, sequence: header.sequence }
+    }
+}
+
+impl std::fmt::Display for MapId {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "map {} of {:?}, boot id {:016x}", self.sequence, self.vehicle, self.boot_id)
+    }
+}
+
 /// Why a map was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum MapError {
@@ -195,6 +219,32 @@ pub enum MapError {
         /// What is wrong with the payload.
         source: DecodeError,
     },
+    /// A delta without the map it stands on, or one that has not this layer.
+    #[error("layer {layer:?} is a delta to that of map {base_sequence}, which is needed and not there")]
+    NoBase {
+        /// The layer's name.
+        layer: String,
+        /// Of the map it stands on.
+        base_sequence: u64,
+    },
+    /// A delta to another map than the one given.
+    #[error("layer {layer:?} is a delta to {needed}; given was {given}")]
+    OtherBase {
+        /// The layer's name.
+        layer: String,
+        /// What it stands on.
+        needed: Box<MapId>,
+        /// What was given.
+        given: Box<MapId>,
+    },
+    /// A delta to a layer whose cells are not comparable.
+    #[error("layer {layer:?} is a delta that does not fit its base: {what}")]
+    BaseShape {
+        /// The layer's name.
+        layer: String,
+        /// What is different.
+        what: String,
+    },
     /// A safe point that cannot be.
     #[error("layer {layer:?}, safe point {point}: {what}")]
     SafePoint {
@@ -241,6 +291,9 @@ impl MapError {
             Self::TooManyCells { .. } => "too_many_cells",
             Self::CellCount { .. } => "cell_count",
             Self::Cells { source, .. } => source.name(),
+            Self::NoBase { .. } => "no_base",
+            Self::OtherBase { .. } => "other_base",
+            Self::BaseShape { .. } => "base_shape",
             Self::SafePoint { .. } => "safe_point",
             Self::Legend { .. } => "legend",
             Self::Class { .. } => "class",
@@ -252,8 +305,17 @@ impl MapError {
 /// cell is made.
 ///
 /// # Errors
-/// [`MapError`], naming the first thing found wrong.
+/// [`MapError`], naming the first thing found wrong; a delta is refused.
 pub fn decode_map(bytes: Bytes, limits: &Limits) -> Result<Map, MapError> {
+    decode_map_on(bytes, None, limits)
+}
+
+/// As [`decode_map`], with the map that deltas stand on: whole layers do without it.
+///
+/// # Errors
+/// [`MapError`], naming the first thing found wrong: [`MapError::NoBase`], [`MapError::OtherBase`] and
+/// [`MapError::BaseShape`] where a delta stands on something else, before any cell is made.
+pub fn decode_map_on(bytes: Bytes, base: Option<&Map>, limits: &Limits) -> Result<Map, MapError> {
     if bytes.len() > limits.map_bytes {
         return Err(MapError::TooLong { length: bytes.len(), allowed: limits.map_bytes });
     }
@@ -269,7 +331,11 @@ pub fn decode_map(bytes: Bytes, limits: &Limits) -> Result<Map, MapError> {
     if cells > limits.map_cells {
         return Err(MapError::TooManyCells { cells, allowed: limits.map_cells });
     }
-    let layers = map.layers.into_iter().map(|layer| decode_layer(layer, limits)).collect::<Result<_, _>>()?;
+    let on_base = |layer: v1::Layer| {
+        let base = delta::base_of(&layer, MapId::of(&header), base)?;
+        decode_layer(layer, base, limits)
+    };
+    let layers = map.layers.into_iter().map(on_base).collect::<Result<_, _>>()?;
     Ok(Map { header, layers })
 }
 
@@ -304,18 +370,24 @@ fn check_unique<'a>(what: &'static str, names: impl Iterator<Item = &'a String>)
     }
 }
 
-fn decode_layer(layer: v1::Layer, limits: &Limits) -> Result<Layer, MapError> {
+/// `base`: the layer that a delta stands on.
+pub(crate) fn decode_layer(layer: v1::Layer, base: Option<&Layer>, limits: &Limits) -> Result<Layer, MapError> {
     let grid = Grid::from_wire(&layer)?;
     check_unique("channel", layer.channels.iter().map(|channel| &channel.name))?;
     let expected = grid.cell_count();
     let mut channels = Vec::with_capacity(layer.channels.len());
     for channel in &layer.channels {
-        let (layer, name) = (layer.name.clone(), channel.name.clone());
+        let (base_sequence, layer, name) = (layer.base_sequence, layer.name.clone(), channel.name.clone());
         if u64::from(channel.cell_count) != expected {
             return Err(MapError::CellCount { layer, channel: name, cell_count: channel.cell_count, expected });
         }
-        let cells =
-            decode(channel, limits).map_err(|source| MapError::Cells { layer, channel: name.clone(), source })?;
+        let cells = match (base_sequence, base) {
+            (None, _) => {
+                decode(channel, limits).map_err(|source| MapError::Cells { layer, channel: name.clone(), source })?
+            }
+            (Some(_), Some(base)) => delta::decode_on(base, &grid, &layer, channel, limits)?,
+            (Some(base_sequence), None) => return Err(MapError::NoBase { layer, base_sequence }),
+        };
         let v1::Channel { unit, scale, unknown, .. } = channel;
         channels.push(Channel { name, unit: unit.clone(), scale: *scale, unknown: *unknown, cells });
     }

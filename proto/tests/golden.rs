@@ -262,9 +262,16 @@ fn golden_map() -> (v1::Header, v1::Layer, v1::Layer) {
         ],
         planes: vec![v1::Plane { a: 0.01, b: -0.02, c: 0.0 }],
         figures: [("drivable_share".to_string(), 0.8), ("judged_share".to_string(), 0.75)].into(),
-        safe_points: None,
+        ..Default::default()
     };
-    let grid = v1::CartesianGrid { origin_x_m: -1.0, origin_y_m: -0.5, width: 4, height: 2, cell_m: 0.5, yaw_rad: 0.0 };
+    let grid = v1::CartesianGrid {
+        origin_x_m: -1.0,
+        origin_y_m: -0.5,
+        width: 4,
+        height: 2,
+        cell_m: 0.5,
+        ..Default::default()
+    };
     let hits: Vec<u16> = vec![0, 0, 0, 0, 0, 0, 300, 2];
     let flat = v1::Layer {
         name: "hits".into(),

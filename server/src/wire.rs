@@ -134,8 +134,18 @@ fn layer(layer: &Layer) -> v1::Layer {
         Geometry::Radial { r_bench_m, columns } => {
             v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m: r_bench_m.clone(), columns: u32::from(*columns) })
         }
-        &Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad } => {
-            v1::layer::Geometry::Cartesian(v1::CartesianGrid { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad })
+        &Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_cell } => {
+            let [first_ix, first_iy] = first_cell;
+            v1::layer::Geometry::Cartesian(v1::CartesianGrid {
+                origin_x_m,
+                origin_y_m,
+                width,
+                height,
+                cell_m,
+                yaw_rad,
+                first_ix,
+                first_iy,
+            })
         }
     };
     let columns = match &layer.geometry {

@@ -12,9 +12,9 @@ pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
         Grid::Radial { r_bench_m, columns } => {
             json!({"kind": "radial", "r_bench_m": r_bench_m, "columns": columns})
         }
-        Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad } => json!({
+        Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix, first_iy } => json!({
             "kind": "cartesian", "origin_x_m": origin_x_m, "origin_y_m": origin_y_m, "width": width,
-            "height": height, "cell_m": cell_m, "yaw_rad": yaw_rad,
+            "height": height, "cell_m": cell_m, "yaw_rad": yaw_rad, "first_ix": first_ix, "first_iy": first_iy,
         }),
     };
     let pose = header

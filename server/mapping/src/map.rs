@@ -232,6 +232,8 @@ pub enum Geometry {
         cell_m: f32,
         /// Heading of the ego frame in the grid's axes; 0 where these are the vehicle's own.
         yaw_rad: f64,
+        /// World index (x, y) of cell (0, 0) where the axes are the world's; 0 where they are the vehicle's own.
+        first_cell: [i64; 2],
     },
 }
 

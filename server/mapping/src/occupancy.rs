@@ -78,6 +78,7 @@ impl Occupancy {
             height: side,
             cell_m: self.config.cell_m,
             yaw_rad: place.yaw_rad,
+            first_cell: self.window.corner(),
         }
     }
 }

@@ -99,6 +99,7 @@ impl LayerMaker for SafePath {
                 height: side,
                 cell_m: self.config.cell_m,
                 yaw_rad: 0.0,
+                first_cell: [0, 0],
             },
             legend: LEGEND,
             channels: vec![Channel {

@@ -131,6 +131,7 @@ impl LayerMaker for Speed {
                 height: side,
                 cell_m: self.config.cell_m,
                 yaw_rad: 0.0,
+                first_cell: [0, 0],
             },
             legend: LEGEND,
             channels: vec![

@@ -235,6 +235,7 @@ impl LayerMaker for Terrain {
                 height: side,
                 cell_m,
                 yaw_rad: 0.0,
+                first_cell: [0, 0],
             },
             legend: LEGEND,
             channels,

@@ -260,15 +260,17 @@ fn locate(geometry: &Geometry) -> Box<dyn Fn([f32; 3]) -> Option<usize>> {
             let grid = RadialGrid::new(r_bench_m.clone(), columns);
             Box::new(move |[x, y, _]| grid.cell(x, y))
         }
-        Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad } => Box::new(move |[x, y, _]| {
-            let ((x, y), (sin, cos)) = ((f64::from(x), f64::from(y)), yaw_rad.sin_cos());
-            let (x, y) = (x * cos - y * sin, x * sin + y * cos);
-            let index = |place: f64, origin: f64, cells: u32| {
-                let index = ((place - origin) / f64::from(cell_m)).floor();
-                (index >= 0.0 && index < f64::from(cells)).then_some(index as usize)
-            };
-            Some(index(y, origin_y_m, height)? * width as usize + index(x, origin_x_m, width)?)
-        }),
+        Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
+            Box::new(move |[x, y, _]| {
+                let ((x, y), (sin, cos)) = ((f64::from(x), f64::from(y)), yaw_rad.sin_cos());
+                let (x, y) = (x * cos - y * sin, x * sin + y * cos);
+                let index = |place: f64, origin: f64, cells: u32| {
+                    let index = ((place - origin) / f64::from(cell_m)).floor();
+                    (index >= 0.0 && index < f64::from(cells)).then_some(index as usize)
+                };
+                Some(index(y, origin_y_m, height)? * width as usize + index(x, origin_x_m, width)?)
+            })
+        }
     }
 }
 
@@ -288,6 +290,7 @@ mod tests {
                 height: 1,
                 cell_m: 1.0,
                 yaw_rad: 0.0,
+                first_cell: [0, 0],
             },
             legend: &["unknown", "drivable", "obstacle"],
             channels: vec![Channel {

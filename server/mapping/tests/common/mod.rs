@@ -109,7 +109,7 @@ pub fn size(layer: &Layer) -> (usize, usize) {
 pub fn cell_at(layer: &Layer, x: f32, y: f32) -> Option<usize> {
     match &layer.geometry {
         Geometry::Radial { r_bench_m, columns } => RadialGrid::new(r_bench_m.clone(), *columns).cell(x, y),
-        Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad } => {
+        Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
             let ((x, y), (sin, cos)) = ((f64::from(x), f64::from(y)), yaw_rad.sin_cos());
             let place = |v: f64, origin: f64| ((v - origin) / f64::from(*cell_m)).floor();
             let (i, j) = (place(x * cos - y * sin, *origin_x_m), place(x * sin + y * cos, *origin_y_m));

@@ -1,0 +1,187 @@
+//! A layer as what changed since an earlier map: `Layer.base_sequence` of map.proto, made and taken apart.
+//!
+//! In: two whole layers, or a delta and the map it stands on. Out: the delta, or the cells it leads to.
+//!
+//! Every cell is predicted to be what the cell of the same place was: in a radial grid the one of the same row and column,
+//! in a Cartesian one the one of the same number, so that a grid may scroll by whole cells, grow and shrink; `unknown` where
+//! the base has none. The differences go through the same encodings as cells do: mostly 0, they make long runs. The CRC is
+//! of the cells that come out, so what is put on a wrong base is refused and never a wrong cell.
+
+use crate::codec::{Cells, encode_grid, unzigzag, zigzag};
+use crate::decode::{DecodeError, Limits, decode_differences};
+use crate::grid::Grid;
+use crate::map::{Layer, Map, MapError, MapId, decode_layer};
+use crate::v1;
+use prost::Message;
+
+/// `new` as its difference from `base`, a layer of the map `base_sequence` of the same vehicle and boot id; both whole. The
+/// same layers make the same bytes.
+///
+/// `None` where `new` has to be sent whole: the grids or channels are not of one kind, a layer is not whole or not within the
+/// limits, or the delta is not smaller.
+pub fn encode_delta(base: &v1::Layer, base_sequence: u64, new: &v1::Layer, limits: &Limits) -> Option<v1::Layer> {
+    let old = decode_layer(base.clone(), None, limits).ok()?;
+    let decoded = decode_layer(new.clone(), None, limits).ok()?;
+    if old.channels.len() != decoded.channels.len() {
+        return None;
+    }
+    let shift = Shift::new(&old, &decoded.grid).ok()?;
+    let mut delta = v1::Layer { base_sequence: Some(base_sequence), ..new.clone() };
+    for (channel, now) in delta.channels.iter_mut().zip(&decoded.channels) {
+        let before =
+            old.channel(&now.name).filter(|before| (before.scale, before.unknown) == (now.scale, now.unknown))?;
+        let differences = shift.differences(&before.cells, &now.cells, now.unknown)?;
+        let encoded = encode_grid(differences.as_ref(), decoded.grid.shape().1 as usize);
+        (channel.encoding, channel.payload) = (encoded.encoding.into(), encoded.payload);
+    }
+    (delta.encoded_len() < new.encoded_len()).then_some(delta)
+}
+
+/// The layer of `base` that a layer of the map `id` stands on; `None` for a whole layer.
+pub(crate) fn base_of<'a>(layer: &v1::Layer, id: MapId, base: Option<&'a Map>) -> Result<Option<&'a Layer>, MapError> {
+    let Some(base_sequence) = layer.base_sequence else { return Ok(None) };
+    let name = || layer.name.clone();
+    let base = base.ok_or_else(|| MapError::NoBase { layer: name(), base_sequence })?;
+    let (needed, given) = (MapId { sequence: base_sequence, ..id }, MapId::of(&base.header));
+    if needed != given {
+        return Err(MapError::OtherBase { layer: name(), needed: Box::new(needed), given: Box::new(given) });
+    }
+    base.layer(&layer.name).map(Some).ok_or_else(|| MapError::NoBase { layer: name(), base_sequence })
+}
+
+/// The cells of one channel of a delta. Whether the base fits is known before any cell is made; the CRC, of the cells that
+/// come out, after.
+pub(crate) fn decode_on(
+    base: &Layer,
+    grid: &Grid,
+    layer: &str,
+    channel: &v1::Channel,
+    limits: &Limits,
+) -> Result<Cells, MapError> {
+    let misfit = |what: String| MapError::BaseShape { layer: layer.to_owned(), what };
+    let wrong = |source| MapError::Cells { layer: layer.to_owned(), channel: channel.name.clone(), source };
+    let shift = Shift::new(base, grid).map_err(misfit)?;
+    let name = &channel.name;
+    let before = base.channel(name).ok_or_else(|| misfit(format!("channel {name:?} is not in the base")))?;
+    let [here, there] = [channel.cell_type, before.cells.as_ref().cell_type().into()];
+    if here != there {
+        return Err(misfit(format!("channel {name:?} has cell type {here}; in the base {there}")));
+    }
+    let differences = decode_differences(channel, limits).map_err(wrong)?;
+    let cells = shift.sums(&before.cells, differences, channel.unknown);
+    let cells = cells.ok_or_else(|| misfit(format!("channel {name:?} has cells of another type in the base")))?;
+    let computed = crc32fast::hash(&cells.as_ref().to_le_bytes());
+    if computed != channel.crc32 {
+        return Err(wrong(DecodeError::Crc { stated: channel.crc32, computed }));
+    }
+    Ok(cells)
+}
+
+/// Where the cells of a grid lie in the grid of its base.
+struct Shift {
+    /// (rows, columns) of the base.
+    from: [i128; 2],
+    /// (rows, columns) of the grid.
+    to: [i128; 2],
+    /// Cell (row, column) of the grid is cell (row, column) + `by` of the base.
+    by: [i128; 2],
+}
+
+impl Shift {
+    /// `Err` says why no cell of the base tells anything of a cell of the grid.
+    fn new(base: &Layer, grid: &Grid) -> Result<Self, String> {
+        let by = match (&base.grid, grid) {
+            (
+                Grid::Radial { r_bench_m: before, columns: columns_before },
+                Grid::Radial { r_bench_m: now, columns: columns_now },
+            ) => {
+                if before != now || columns_before != columns_now {
+                    return Err("other benches or columns than the base has".into());
+                }
+                [0, 0]
+            }
+            (
+                Grid::Cartesian { cell_m: before, first_ix: x_before, first_iy: y_before, .. },
+                Grid::Cartesian { cell_m: now, first_ix: x_now, first_iy: y_now, .. },
+            ) => {
+                if before != now {
+                    return Err(format!("cells of {now} m; those of the base have {before} m"));
+                }
+                [(y_now, y_before), (x_now, x_before)].map(|(now, before)| i128::from(*now) - i128::from(*before))
+            }
+            _ => return Err("one grid is radial, the other Cartesian".into()),
+        };
+        let shape = |grid: &Grid| <[u32; 2]>::from(grid.shape()).map(i128::from);
+        Ok(Self { from: shape(&base.grid), to: shape(grid), by })
+    }
+
+    /// What the base predicts of every cell.
+    fn predicted<T: Copy>(&self, base: &[T], unknown: T) -> Vec<T> {
+        let [rows, columns] = self.to.map(|cells| cells as usize);
+        let mut cells = vec![unknown; rows * columns];
+        // The rows and columns of the grid that the base has too.
+        let [shared_rows, shared_columns] = [0, 1].map(|i| {
+            let start = (-self.by[i]).clamp(0, self.to[i]);
+            start..(self.from[i] - self.by[i]).clamp(start, self.to[i])
+        });
+        let length = (shared_columns.end - shared_columns.start) as usize;
+        if length > 0 {
+            for row in shared_rows {
+                let to = row as usize * columns + shared_columns.start as usize;
+                let from = ((row + self.by[0]) * self.from[1] + shared_columns.start + self.by[1]) as usize;
+                cells[to..to + length].copy_from_slice(&base[from..from + length]);
+            }
+        }
+        cells
+    }
+
+    /// What is added to the prediction to make `cells`; `None` for cells of two types.
+    fn differences(&self, base: &Cells, cells: &Cells, unknown: i32) -> Option<Cells> {
+        Some(match (base, cells) {
+            (Cells::U8(base), Cells::U8(cells)) => {
+                let predicted = self.predicted(base, unknown as u8);
+                Cells::U8(zip(predicted, cells, |before, now| zigzag(now.wrapping_sub(before) as i8)))
+            }
+            (Cells::I8(base), Cells::I8(cells)) => {
+                Cells::I8(zip(self.predicted(base, unknown as i8), cells, |before, now| now.wrapping_sub(before)))
+            }
+            (Cells::U16(base), Cells::U16(cells)) => {
+                let predicted = self.predicted(base, unknown as u16);
+                Cells::U16(zip(predicted, cells, |before, now| zigzag_wide(now.wrapping_sub(before) as i16)))
+            }
+            _ => return None,
+        })
+    }
+
+    /// The way back from [`Self::differences`].
+    fn sums(&self, base: &Cells, differences: Cells, unknown: i32) -> Option<Cells> {
+        Some(match (base, &differences) {
+            (Cells::U8(base), Cells::U8(differences)) => {
+                let predicted = self.predicted(base, unknown as u8);
+                Cells::U8(zip(predicted, differences, |before, more| before.wrapping_add_signed(unzigzag(more))))
+            }
+            (Cells::I8(base), Cells::I8(differences)) => {
+                Cells::I8(zip(self.predicted(base, unknown as i8), differences, i8::wrapping_add))
+            }
+            (Cells::U16(base), Cells::U16(differences)) => {
+                let predicted = self.predicted(base, unknown as u16);
+                Cells::U16(zip(predicted, differences, |before, more| before.wrapping_add_signed(unzigzag_wide(more))))
+            }
+            _ => return None,
+        })
+    }
+}
+
+/// Cell by cell, in place of the first.
+fn zip<T: Copy>(mut cells: Vec<T>, others: &[T], of: impl Fn(T, T) -> T) -> Vec<T> {
+    cells.iter_mut().zip(others).for_each(|(cell, other)| *cell = of(*cell, *other));
+    cells
+}
+
+fn zigzag_wide(value: i16) -> u16 {
+    ((value << 1) ^ (value >> 15)) as u16
+}
+
+fn unzigzag_wide(value: u16) -> i16 {
+    ((value >> 1) as i16) ^ -((value & 1) as i16)
+}
