@@ -215,7 +215,8 @@ impl Tls {
 }
 
 /// Takes every update, acknowledges it, and says in the end why there are no more. A delta against a map that is not here (an
-/// update was lost) is not shown: a whole map is asked for, and what was not shown counts as skipped.
+/// update was lost) is not shown: a whole map is asked for. All that was not shown counts as skipped, but for what the reader
+/// did not want.
 async fn follow(
     feed: Feed,
     address: String,
@@ -223,26 +224,25 @@ async fn follow(
     requests: mpsc::Sender<v1::WatchRequest>,
 ) -> ClientError {
     let mut base: Option<MapView> = None;
-    let (mut asked, mut skipped, mut left_out) = (false, 0, 0);
+    let (mut asked, mut left_out) = (false, 0);
     loop {
         let update = match updates.message().await {
             Ok(Some(update)) => update,
             Ok(None) => return ClientError::Ended { address },
             Err(status) => return refused(&address, &status),
         };
-        (skipped, left_out) = (skipped + update.skipped, left_out + update.left_out);
+        left_out += update.left_out;
         let request = match MapView::decode_on(update.map.clone(), base.as_ref()) {
             Ok(map) => {
-                let acknowledged = Some(map.sequence());
-                base = Some(map.clone());
-                feed.put(map, skipped, left_out);
-                (asked, skipped, left_out) = (false, 0, 0);
-                v1::WatchRequest { acknowledged, ..Default::default() }
+                let sequence = map.sequence();
+                let last = base.replace(map.clone()).map_or(sequence, |last| last.sequence() + 1);
+                feed.put(map, sequence.saturating_sub(last).saturating_sub(left_out), left_out);
+                (asked, left_out) = (false, 0);
+                v1::WatchRequest { acknowledged: Some(sequence), ..Default::default() }
             }
             Err(error) => {
                 let Some(acknowledged) = sequence_of_delta(update.map) else { return error };
                 tracing::debug!(sequence = acknowledged, %error, "a delta is of no use, a whole map is asked for");
-                skipped += 1;
                 // More deltas may be on the way already; one question is enough for them all.
                 let want_full = !std::mem::replace(&mut asked, true);
                 v1::WatchRequest { acknowledged: Some(acknowledged), want_full, selection: None }

@@ -20,7 +20,7 @@ pub struct Update {
     pub map: MapView,
     /// Maps made since the previous look and not seen by this reader: it, or its link, was slow.
     pub skipped: u64,
-    /// Maps made since the previous look that [`crate::Subscription::max_rate_hz`] left out, or that were the same turn again.
+    /// Maps made since the previous look that [`crate::Subscription::max_rate_hz`] left out.
     pub left_out: u64,
 }
 

@@ -7,8 +7,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use clearway_proto::codec::Limits;
-use clearway_proto::delta::decode_map_on;
-use clearway_proto::map::{Layer, Map};
+use clearway_proto::map::{Layer, Map, decode_map_on};
 use clearway_proto::v1;
 
 use crate::ClientError;

@@ -108,7 +108,7 @@ fn delta(from: &Bytes, base_sequence: u64, to: &Bytes) -> Option<Bytes> {
 }
 
 fn cropped(chunk: &Bytes, region: &v1::Region) -> Result<Bytes, RegionError> {
-    decoded(chunk).map_or(Ok(chunk.clone()), |layer| Ok(encode_layer(&crop(&layer, region)?)))
+    decoded(chunk).map_or(Ok(chunk.clone()), |layer| Ok(encode_layer(&crop(&layer, region, &Limits::default())?)))
 }
 
 /// The layer of a chunk; `None` never, for chunks that [`encode_layer`] made.

@@ -41,8 +41,6 @@ pub struct Engine {
     pub status: Arc<VehicleStatus>,
     /// Looks at what the maps were made from.
     pub observer: Option<Observer>,
-    /// Maps made again for who came late.
-    pub remade: u64,
 }
 
 impl Engine {
@@ -101,7 +99,6 @@ impl Engine {
         let started = Instant::now();
         self.want();
         if self.pipeline.make_late().is_some() {
-            self.remade += 1;
             self.publish(started);
         }
     }
@@ -134,8 +131,7 @@ impl Engine {
         // Where every map is switched off, a revolution makes none; where nobody takes one, a header.
         let made = (!self.status.layers.is_empty()).then(|| {
             let states = map.sensors.iter().map(wire::sensor).collect();
-            let encoded = EncodedMap::new(map, self.status.name.clone(), self.status.boot_id, self.valid_ms);
-            (Arc::new(EncodedMap { remade: self.remade, ..encoded }), states)
+            (Arc::new(EncodedMap::new(map, self.status.name.clone(), self.status.boot_id, self.valid_ms)), states)
         });
         let latency = started.elapsed();
         // The status first: whoever has seen a map finds it counted.

@@ -199,7 +199,6 @@ impl Server {
                 journal: journals.next(),
                 status: status.clone(),
                 observer: observer.take(),
-                remade: 0,
             };
             let thread = engine.start(events).map_err(|source| StartError::Thread { vehicle: name.clone(), source })?;
             engines.push((name.clone(), thread));

@@ -37,8 +37,6 @@ pub struct EncodedMap {
     pub header: Bytes,
     /// By layer name, in the map's order: an encoded `Map` with this layer alone.
     pub layers: Vec<(&'static str, Bytes)>,
-    /// Maps of this run, this one included, that were a turn made again for layers that had been taken by nobody.
-    pub remade: u64,
     /// What readers asked of it.
     pub(crate) cuts: Cuts,
 }
@@ -57,7 +55,6 @@ impl EncodedMap {
             drivable_share: map.layers.iter().find_map(share),
             header,
             layers: map.layers.iter().map(encode).collect(),
-            remade: 0,
             cuts: Cuts::default(),
         }
     }

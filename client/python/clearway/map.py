@@ -278,7 +278,7 @@ class Map:
         self.header: map_pb2.Header = message.header
         #: Maps made since the one looked at before and not seen by this reader.
         self.skipped = skipped
-        #: Maps made since then that `max_rate_hz` left out, or that were the same turn again.
+        #: Maps made since then that `max_rate_hz` left out.
         self.left_out = 0
         #: When the map came to this process; `None` where it came from no server.
         self._arrival: Arrival | None = None

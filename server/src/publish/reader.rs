@@ -112,11 +112,9 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         Ok(())
     }
 
-    /// A map without one of the layers was made before this reader came; one of the turn it has already, for another.
+    /// A map without one of the layers was made before this reader came.
     fn is_due(&self, map: &EncodedMap) -> bool {
-        let is_new = self.last.as_ref().is_none_or(|last| last.capture_end_ns != map.capture_end_ns);
-        let is_wanted = self.want_full || is_new && self.selection.rate.is_due(map.capture_end_ns);
-        is_wanted && self.taken.are_in(map)
+        (self.want_full || self.selection.rate.is_due(map.capture_end_ns)) && self.taken.are_in(map)
     }
 
     fn send(&mut self, map: Arc<EncodedMap>) -> Result<v1::MapUpdate, Status> {

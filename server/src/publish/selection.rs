@@ -7,6 +7,7 @@
 use std::collections::VecDeque;
 
 use bytes::Bytes;
+use clearway_proto::region::{self, RegionError};
 use clearway_proto::v1;
 use tonic::Status;
 
@@ -50,6 +51,8 @@ impl Selection {
             rate: Rate::new(max_rate_hz)?,
             credits: Credits::new(max_in_flight as usize),
         };
+        let refused = |error: RegionError| Status::invalid_argument(error.to_string());
+        selection.region.as_ref().map_or(Ok(()), region::check).map_err(refused)?;
         // Where there is a map already, a region that it does not reach is refused before the stream begins.
         if let Some(newest) = served.newest.borrow().clone().filter(|_| selection.region.is_some()) {
             selection.bytes(&newest, None)?;
@@ -72,8 +75,8 @@ impl Selection {
 pub struct Rate {
     /// 0: every map.
     period_ns: i64,
-    /// Stamp at which the next map is due; before the first, any.
-    due_ns: i64,
+    /// Stamp from which on the next map is sent; `None` before the first.
+    due_ns: Option<i64>,
 }
 
 impl Rate {
@@ -87,17 +90,25 @@ impl Rate {
                 return Err(Status::invalid_argument(text));
             }
         };
-        Ok(Self { period_ns, due_ns: i64::MIN })
+        Ok(Self { period_ns, due_ns: None })
     }
 
-    /// Whether a map captured at `stamp_ns` is to be sent. Turns are not quite even: half a period early is in time.
+    /// Whether a map captured at `stamp_ns` is to be sent.
     pub fn is_due(&self, stamp_ns: i64) -> bool {
-        stamp_ns >= self.due_ns.saturating_sub(self.period_ns / 2)
+        self.period_ns == 0 || self.due_ns.is_none_or(|due_ns| stamp_ns >= due_ns)
     }
 
-    /// A map captured then is sent.
+    /// A map captured then is sent. The next is due a period after this one was, however late it came, so that a rate is kept
+    /// of which the maps' own is no multiple; but a reader that was away does not catch up. A quarter of a period keeps turns
+    /// that are not quite even on their side of it.
     pub fn send(&mut self, stamp_ns: i64) {
-        self.due_ns = self.due_ns.max(stamp_ns).saturating_add(self.period_ns);
+        let quarter_ns = self.period_ns / 4;
+        self.due_ns = match self.due_ns {
+            None => Some(stamp_ns.saturating_add(3 * quarter_ns)),
+            // A whole map that was asked for comes between two that are due.
+            Some(due_ns) if stamp_ns < due_ns => Some(due_ns),
+            Some(due_ns) => Some(due_ns.saturating_add(self.period_ns).max(stamp_ns.saturating_add(quarter_ns))),
+        };
     }
 
     /// Of `between` maps captured between two that were sent, how many there was room for.
@@ -109,11 +120,10 @@ impl Rate {
         between.min(u64::try_from(periods - 1).unwrap_or(0))
     }
 
-    /// What lies between two maps that were sent: (missed, left out at the reader's wish).
+    /// Of the maps between two that were sent: (missed, left out at the reader's wish).
     pub fn between(&self, last: &EncodedMap, next: &EncodedMap) -> (u64, u64) {
         let all = next.sequence.saturating_sub(last.sequence.saturating_add(1));
-        let turns = all.saturating_sub(next.remade - last.remade);
-        let missed = self.room(turns, [last.capture_end_ns, next.capture_end_ns]);
+        let missed = self.room(all, [last.capture_end_ns, next.capture_end_ns]);
         (missed, all - missed)
     }
 }
