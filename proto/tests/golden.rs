@@ -1,37 +1,14 @@
 //! The golden vectors in `golden/`: what the encoder makes equals the files, what the files hold decodes or is refused
 //! under its name. Clients in other languages read the same files. `CLEARWAY_BLESS=1` writes them anew.
 
-use std::path::PathBuf;
+mod common;
 
 use bytes::Bytes;
 use clearway_proto::codec::{self, Cells, Limits};
 use clearway_proto::{map, safe_points, v1};
+use common::{assert_golden, golden, hex, pretty};
 use prost::Message;
 use serde_json::{Value, json};
-
-fn golden(file: &str) -> PathBuf {
-    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("golden").join(file)
-}
-
-/// Compares with the file, or writes it when asked to bless.
-fn assert_golden(file: &str, made: &[u8]) {
-    let path = golden(file);
-    if std::env::var_os("CLEARWAY_BLESS").is_some() {
-        std::fs::write(&path, made).unwrap();
-    }
-    let stored = std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-    assert!(stored == made, "{file} differs from what the encoder makes; CLEARWAY_BLESS=1 writes it anew");
-}
-
-fn pretty(value: &Value) -> Vec<u8> {
-    let mut text = serde_json::to_string_pretty(value).unwrap();
-    text.push('\n');
-    text.into_bytes()
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
 
 fn unhex(text: &str) -> Vec<u8> {
     (0..text.len()).step_by(2).map(|at| u8::from_str_radix(&text[at..at + 2], 16).unwrap()).collect()

@@ -23,8 +23,9 @@ export class Refused extends Error {
   }
 }
 
-// cellsExpected: what the layer's geometry holds.
-export function decodeChannel(channel, cellsExpected) {
+// cellsExpected: what the layer's geometry holds. predict, in a delta: makes the cells that the differences are added to, in
+// a given typed array; it is asked when all else is checked.
+export function decodeChannel(channel, cellsExpected, predict = null) {
   const { name, cell_type, cell_count, encoding, payload } = channel;
   const type = TYPES[cell_type];
   const refuse = (reason, detail) => new Refused(reason, `channel ${name}: ${detail}`);
@@ -38,6 +39,13 @@ export function decodeChannel(channel, cellsExpected) {
   else if (encoding === RUNS) cells = readRuns(payload, type, cell_count, refuse);
   else if (encoding === ROWS) cells = readRows(payload, type, cell_count, refuse);
   else throw refuse("encoding", `${encoding}; allowed are 1 (raw), 2 (runs), 3 (rows)`);
+  if (predict) {
+    const before = predict(type.cells);
+    // Differences of unsigned cells zigzag; all wrap.
+    for (let i = 0; i < cells.length; i++) {
+      cells[i] = before[i] + (type.signed ? cells[i] : (cells[i] >> 1) ^ -(cells[i] & 1));
+    }
+  }
   const crc = crc32(littleEndian(cells, type));
   if (crc !== channel.crc32) throw refuse("crc", `cells have ${hex(crc)}, the message says ${hex(channel.crc32)}`);
   return cells;

@@ -6,6 +6,7 @@ import test from "node:test";
 import { freshness, ServerClock } from "./clock.js";
 import { CELLS_MAX, crc32, decodeChannel } from "./codec.js";
 import { egoAt, gridOf, pixelCells } from "./grid.js";
+import { openMap } from "./map.js";
 import { readMapUpdate, WireError } from "./protobuf.js";
 import { clockWords } from "./text.js";
 
@@ -39,6 +40,26 @@ test("the golden channels decode to their cells", () => {
     const cells = vector.cells_value_length.flatMap(([value, length]) => Array(length).fill(value));
     const decoded = decodeChannel({ ...vector, payload: bytesOf(vector.payload_hex) }, vector.cell_count);
     assert.deepEqual([...decoded], cells, vector.name);
+  }
+});
+
+const goldenMap = (name) => new Uint8Array(readFileSync(new URL(`../../proto/golden/${name}.bin`, import.meta.url)));
+
+test("the golden delta on its base is the golden whole", () => {
+  const opened = openMap(goldenMap("delta"), openMap(goldenMap("delta_base")));
+  const plain = ({ header, layers }) => ({
+    header, layers: layers.map(({ grid, ...rest }) => ({ ...rest, grid: [grid.key, grid.shape, grid.first] })),
+  });
+  assert.deepEqual(plain(opened), plain(openMap(goldenMap("delta_whole"))));
+  assert.notDeepEqual(opened.layers[0].grid.first, [0n, 0n]);
+});
+
+test("a delta on a wrong base is refused", () => {
+  // The page looks at the grid before the channels, and calls what is wrong with counts and payloads by its own words.
+  const words = { too_many_cells: "geometry", truncated: "payload" };
+  for (const { name, error, base_hex, map_hex } of golden("bad_deltas.json")) {
+    const base = base_hex && openMap(bytesOf(base_hex));
+    assert.throws(() => openMap(bytesOf(map_hex), base), { name: "Refused", reason: words[error] ?? error }, name);
   }
 });
 

@@ -4,7 +4,8 @@
 
 import { CELLS_MAX, Refused } from "./codec.js";
 
-// A checked geometry: { key, cells, radius_m, cellAt(x, y) -> cell index or -1 }.
+// A checked geometry: { key, cells, radius_m, cellAt(x, y) -> cell index or -1 }, and for deltas { kind: equal where cells are
+// comparable, shape: [rows, columns], first: [number of the first row, of the first column] }.
 export function gridOf(layer) {
   if (layer.radial) return radial(layer.radial);
   if (layer.cartesian) return cartesian(layer.cartesian);
@@ -39,10 +40,11 @@ function radial({ r_bench_m, columns }) {
     const column = Math.floor((azimuth < 0 ? azimuth + turn : azimuth) * perRadian);
     return row * columns + Math.min(column, columns - 1);
   };
-  return { key: `radial ${columns} ${r_bench_m.join()}`, cells, radius_m: benches[rows - 1], cellAt };
+  const key = `radial ${columns} ${r_bench_m.join()}`;
+  return { key, cells, radius_m: benches[rows - 1], cellAt, kind: key, shape: [rows, columns], first: [0n, 0n] };
 }
 
-function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad }) {
+function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix = 0n, first_iy = 0n }) {
   const cells = width * height;
   if (cells === 0 || cells > CELLS_MAX) {
     throw new Refused("geometry", `${width} x ${height} cells; allowed are 1 to ${CELLS_MAX}`);
@@ -59,7 +61,8 @@ function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad }) {
   };
   const edges = [origin_x_m, origin_x_m + width * cell_m, origin_y_m, origin_y_m + height * cell_m];
   const key = `cartesian ${origin_x_m} ${origin_y_m} ${width} ${height} ${cell_m} ${yaw_rad}`;
-  return { key, cells, radius_m: Math.max(...edges.map(Math.abs)), cellAt };
+  const radius_m = Math.max(...edges.map(Math.abs));
+  return { key, cells, radius_m, cellAt, kind: `cartesian ${cell_m}`, shape: [height, width], first: [first_iy, first_ix] };
 }
 
 // Ego metres at the middle of a pixel of a canvas `size` pixels wide that shows `view_m` to every side.

@@ -72,7 +72,7 @@ const link = new Link({
 function takeUpdate(message, received_ms) {
   let next;
   try {
-    next = openUpdate(message);
+    next = openUpdate(message, map);
   } catch (error) {
     stream.refused++;
     refused_since++;

@@ -2,6 +2,7 @@
 // was wrong. A map is taken whole or not at all.
 
 import { decodeChannel, Refused } from "./codec.js";
+import { baseOf, predictor } from "./delta.js";
 import { gridOf } from "./grid.js";
 import { readMap, readMapUpdate } from "./protobuf.js";
 
@@ -10,19 +11,24 @@ const BYTES_MAX = 4 << 20;
 
 // { skipped, sent_ns, bytes, header, layers: [{ name, legend, grid, channels: [{ name, unit, scale, unknown, cells }],
 // figures }] }; 64-bit values are BigInt.
-export function openUpdate(message) {
+// base: the map opened before, which deltas stand on.
+export function openUpdate(message, base = null) {
   if (message.length > BYTES_MAX) throw new Refused("length", `${message.length} bytes; at most ${BYTES_MAX}`);
   const update = readMapUpdate(message);
   if (update.sent_ns <= 0n) throw new Refused("sent_ns", `${update.sent_ns}; without it no age can be told`);
-  const { header, layers } = readMap(update.map);
-  if (!header) throw new Refused("header", "the map has none");
-  return { ...update, bytes: update.map.length, header, layers: layers.map(openLayer) };
+  return { ...update, bytes: update.map.length, ...openMap(update.map, base) };
 }
 
-function openLayer(layer) {
+export function openMap(bytes, base = null) {
+  const { header, layers } = readMap(bytes);
+  if (!header) throw new Refused("header", "the map has none");
+  return { header, layers: layers.map((layer) => openLayer(layer, baseOf(layer, header, base))) };
+}
+
+function openLayer(layer, before) {
   const grid = gridOf(layer);
   const channels = layer.channels.map((channel) => {
-    const cells = decodeChannel(channel, grid.cells);
+    const cells = decodeChannel(channel, grid.cells, before && predictor(layer.name, grid, before, channel));
     if (channel.name === "class") {
       const unnamed = cells.find((cell) => cell < 0 || cell >= layer.legend.length);
       if (unnamed !== undefined) {

@@ -114,7 +114,7 @@ const HEADER = {
 const RADIAL = { 1: ["r_bench_m", many(float)], 2: ["columns", uint32] };
 const CARTESIAN = {
   1: ["origin_x_m", double], 2: ["origin_y_m", double], 3: ["width", uint32], 4: ["height", uint32],
-  5: ["cell_m", float], 6: ["yaw_rad", double],
+  5: ["cell_m", float], 6: ["yaw_rad", double], 7: ["first_ix", sint64], 8: ["first_iy", sint64],
 };
 const PLANE = { 1: ["a", double], 2: ["b", double], 3: ["c", double] };
 const CHANNEL = {
@@ -125,6 +125,7 @@ const LAYER = {
   1: ["name", string], 2: ["radial", message(RADIAL)], 3: ["cartesian", message(CARTESIAN)],
   4: ["legend", many(string)],
   5: ["channels", many(message(CHANNEL))], 6: ["planes", many(message(PLANE))], 7: ["figures", table(double)],
+  10: ["base_sequence", optional(uint64)],
 };
 const MAP = { 1: ["header", message(HEADER)], 2: ["layers", many(message(LAYER))] };
 const MAP_UPDATE = { 1: ["map", bytes], 2: ["skipped", uint64], 3: ["sent_ns", sfixed64] };

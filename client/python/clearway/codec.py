@@ -1,12 +1,13 @@
 """A channel's payload back to its cells: the numpy twin of `proto/src/decode.rs`, held to the same golden vectors.
 
 In: a `Channel` message from anywhere, hostile or not. Out: a one-dimensional array of raw cells, or a `DecodeError`.
-Claimed counts are checked before any cell is made.
+Claimed counts are checked before any cell is made. In a delta the cells are differences from those predicted.
 """
 
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,8 +27,13 @@ _RAW, _RUNS, _ROWS = 1, 2, 3
 _COLUMNS_MAX = 1 << 14
 
 
-def decode(channel: map_pb2.Channel, cells_max: int = CELLS_MAX) -> np.ndarray:
-    """Gives the cells in the order of the grid's cell index; raises `DecodeError` with the first thing found wrong."""
+def decode(
+    channel: map_pb2.Channel, cells_max: int = CELLS_MAX, predict: Callable[[np.dtype], np.ndarray] | None = None
+) -> np.ndarray:
+    """Gives the cells in the order of the grid's cell index; raises `DecodeError` with the first thing found wrong.
+
+    `predict`, for a delta, makes the cells that the differences are added to; it is asked when counts are checked.
+    """
     count, payload = channel.cell_count, channel.payload
     if count > cells_max:
         raise DecodeError("too_many_cells", f"{count} cells; at most {cells_max} are allowed")
@@ -45,6 +51,9 @@ def decode(channel: map_pb2.Channel, cells_max: int = CELLS_MAX) -> np.ndarray:
         cells = (_runs if channel.encoding == _RUNS else _rows)(payload, count, dtype)
     else:
         raise DecodeError("encoding", f"encoding {channel.encoding}; 1 (raw), 2 (runs) and 3 (rows) exist")
+    if predict is not None:
+        # Differences of unsigned cells zigzag; all wrap.
+        cells = predict(dtype) + (cells if dtype.kind == "i" else (cells >> 1) ^ -(cells & 1))
     computed = zlib.crc32(cells.tobytes())
     if computed != channel.crc32:
         raise DecodeError("crc", f"CRC-32 of the cells is {computed:08x}; the channel says {channel.crc32:08x}")

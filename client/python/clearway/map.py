@@ -77,6 +77,9 @@ class CartesianGrid:
     height: int
     cell_m: float
     yaw_rad: float = 0.0
+    #: Number of cell (0, 0) among all there could be: the world's where the axes are the world's.
+    first_ix: int = 0
+    first_iy: int = 0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -145,16 +148,18 @@ class Obstacle(NamedTuple):
 class Layer:
     """One named grid of a map."""
 
-    def __init__(self, message: map_pb2.Layer) -> None:
+    def __init__(self, message: map_pb2.Layer, base: Layer | None = None) -> None:
         self.name: str = message.name
         self.grid: Grid = _grid(message)
+        #: Cell (row, column) of a delta is predicted by cell (row, column) + shift of the base.
+        self._shift = _shift(message.name, base.grid, self.grid) if base else (0, 0)
         #: Names of the values of the channel `class`; entry 0 is `unknown`.
         self.legend: tuple[str, ...] = tuple(message.legend)
         self.channels: dict[str, Channel] = {}
         for channel in message.channels:
             if channel.name in self.channels:
                 raise DecodeError("twice", f"channel {channel.name!r} occurs twice; names are unique")
-            self.channels[channel.name] = self._channel(channel)
+            self.channels[channel.name] = self._channel(channel, base)
         #: Planes z = ax + by + c in the ego frame, by segment id, shape (n, 3).
         self.planes = np.array([(p.a, p.b, p.c) for p in message.planes], dtype=np.float64).reshape(-1, 3)
         #: Figures of the whole layer, such as `drivable_share`.
@@ -206,14 +211,31 @@ class Layer:
         nearest = int(distances.argmin())
         return Obstacle(*map(float, centres[nearest]), float(distances[nearest]))
 
-    def _channel(self, message: map_pb2.Channel) -> Channel:
+    def _channel(self, message: map_pb2.Channel, base: Layer | None) -> Channel:
         rows, columns = self.grid.shape
         if message.cell_count != rows * columns:
             text = f"channel {message.name!r} has {message.cell_count} cells; the grid has {rows * columns}"
             raise DecodeError("cell_count", text)
-        raw = codec.decode(message).reshape(rows, columns)
+        predict = None if base is None else lambda dtype: self._predicted(message, base, dtype)
+        raw = codec.decode(message, predict=predict).reshape(rows, columns)
         raw.flags.writeable = False
         return Channel(message.name, message.unit, message.scale, message.unknown, raw)
+
+    def _predicted(self, message: map_pb2.Channel, base: Layer, dtype: np.dtype) -> np.ndarray:
+        before = base.channels.get(message.name)
+        if before is None or before.raw.dtype != dtype:
+            raise DecodeError("base_shape", f"layer {self.name!r}: the base has no such channel {message.name!r}")
+        cells = np.full(self.grid.shape, np.int64(message.unknown).astype(dtype), dtype)
+        # The rows and columns of this grid that the base has too.
+        spans = []
+        for size, size_before, by in zip(self.grid.shape, base.grid.shape, self._shift):
+            start = min(max(0, -by), size)
+            spans.append((start, max(start, min(size, size_before - by)), by))
+        here = tuple(slice(start, end) for start, end, _ in spans)
+        there = tuple(slice(start + by, end + by) for start, end, by in spans)
+        if all(start < end for start, end, _ in spans):
+            cells[here] = before.raw[there]
+        return cells.ravel()
 
     def _points(self, packed: map_pb2.SafePoints) -> Iterator[SafePoint]:
         """The differences summed up; at most `POINTS_MAX` points."""
@@ -266,7 +288,8 @@ class Layer:
 class Map:
     """A map, decoded and checked. `map["drivability"]` is a layer."""
 
-    def __init__(self, encoded: bytes, skipped: int = 0) -> None:
+    def __init__(self, encoded: bytes, skipped: int = 0, base: Map | None = None) -> None:
+        """`base`: the map that deltas stand on; whole layers do without it."""
         if len(encoded) > BYTES_MAX:
             raise DecodeError("too_long", f"map of {len(encoded)} bytes; at most {BYTES_MAX} are allowed")
         try:
@@ -283,6 +306,12 @@ class Map:
         #: When the map came to this process; `None` where it came from no server.
         self._arrival: Arrival | None = None
         self._message = message
+        self._bases: dict[str, Layer] = {}
+        if any(layer.HasField("base_sequence") for layer in message.layers):
+            self._bases = {layer.name: _base(message, layer, base) for layer in message.layers if layer.HasField("base_sequence")}
+            # At once: no map keeps the one before it, and that the one before it.
+            self.layers
+            self._bases = {}
 
     def arrived(self, clock: Clock = Clock()) -> Map:
         """The map came just now."""
@@ -314,7 +343,7 @@ class Map:
         for message in self._message.layers:
             if message.name in layers:
                 raise DecodeError("twice", f"layer {message.name!r} occurs twice; names are unique")
-            layers[message.name] = Layer(message)
+            layers[message.name] = Layer(message, self._bases.get(message.name))
         return layers
 
     def __getitem__(self, name: str) -> Layer:
@@ -369,10 +398,34 @@ def _grid(message: map_pb2.Layer) -> Grid:
         grid = message.cartesian
         finite = all(map(math.isfinite, (grid.origin_x_m, grid.origin_y_m, grid.cell_m, grid.yaw_rad)))
         if grid.width and grid.height and finite and grid.cell_m > 0:
-            yaw_rad = grid.yaw_rad
-            return CartesianGrid(grid.origin_x_m, grid.origin_y_m, grid.width, grid.height, grid.cell_m, yaw_rad)
+            origin = (grid.origin_x_m, grid.origin_y_m)
+            first = (grid.first_ix, grid.first_iy)
+            return CartesianGrid(*origin, grid.width, grid.height, grid.cell_m, grid.yaw_rad, *first)
     geometry = getattr(message, kind) if kind else "none"
     raise DecodeError("geometry", f"layer {message.name!r}, geometry: {geometry}")
+
+
+def _base(message: map_pb2.Map, layer: map_pb2.Layer, base: Map | None) -> Layer:
+    """The layer that a delta stands on."""
+    if base is None:
+        raise DecodeError("no_base", f"layer {layer.name!r} is a delta to that of map {layer.base_sequence}")
+    given = (base.vehicle, base.header.boot_id, base.sequence)
+    needed = (message.header.vehicle, message.header.boot_id, layer.base_sequence)
+    if needed != given:
+        raise DecodeError("other_base", f"layer {layer.name!r} is a delta to map {needed}; given was {given}")
+    if layer.name not in base.layers:
+        raise DecodeError("no_base", f"layer {layer.name!r} is a delta, and not in its base")
+    return base.layers[layer.name]
+
+
+def _shift(layer: str, before: Grid, now: Grid) -> tuple[int, int]:
+    """(rows, columns) from a grid's cells to those of its base that tell of the same places."""
+    if isinstance(before, CartesianGrid) and isinstance(now, CartesianGrid) and before.cell_m == now.cell_m:
+        return now.first_iy - before.first_iy, now.first_ix - before.first_ix
+    if isinstance(before, RadialGrid) and isinstance(now, RadialGrid):
+        if before.columns == now.columns and np.array_equal(before.r_bench_m, now.r_bench_m):
+            return 0, 0
+    raise DecodeError("base_shape", f"layer {layer!r} is a delta to a grid that is not comparable")
 
 
 def _check_header(message: map_pb2.Map) -> None:

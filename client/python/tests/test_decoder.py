@@ -50,6 +50,26 @@ def test_a_bad_map_is_refused_by_name(vector):
     assert error.value.reason == vector["error"]
 
 
+def test_the_golden_delta_on_its_base_is_the_golden_whole():
+    base, delta, whole = ((GOLDEN / f"delta{name}.bin").read_bytes() for name in ("_base", "", "_whole"))
+    opened, expected = clearway.Map(delta, base=clearway.Map(base)), clearway.Map(whole)
+    assert list(opened.layers) == list(expected.layers) and opened.header == expected.header
+    for name, layer in expected.layers.items():
+        for channel, values in layer.channels.items():
+            assert np.array_equal(opened[name].channels[channel].raw, values.raw), (name, channel)
+        assert opened[name].figures == layer.figures and opened[name].legend == layer.legend
+    grid, whole_grid = opened["occupancy"].grid, expected["occupancy"].grid
+    assert (grid.first_ix, grid.first_iy) == (whole_grid.first_ix, whole_grid.first_iy) != (0, 0)
+
+
+@pytest.mark.parametrize("vector", golden("bad_deltas.json"), ids=lambda vector: vector["name"])
+def test_a_delta_on_a_wrong_base_is_refused_by_name(vector):
+    base = vector["base_hex"] and clearway.Map(bytes.fromhex(vector["base_hex"]))
+    with pytest.raises(clearway.DecodeError) as error:
+        clearway.Map(bytes.fromhex(vector["map_hex"]), base=base)
+    assert error.value.reason == vector["error"]
+
+
 def test_the_golden_map_says_what_every_other_client_reads_in_it():
     told = golden("map.json")
     m = clearway.Map((GOLDEN / "map.bin").read_bytes())

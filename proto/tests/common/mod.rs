@@ -1,0 +1,29 @@
+//! The files in `golden/`, read and, with `CLEARWAY_BLESS=1`, written.
+
+use std::path::PathBuf;
+
+use serde_json::Value;
+
+pub fn golden(file: &str) -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("golden").join(file)
+}
+
+/// Compares with the file, or writes it when asked to bless.
+pub fn assert_golden(file: &str, made: &[u8]) {
+    let path = golden(file);
+    if std::env::var_os("CLEARWAY_BLESS").is_some() {
+        std::fs::write(&path, made).unwrap();
+    }
+    let stored = std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    assert!(stored == made, "{file} differs from what the encoder makes; CLEARWAY_BLESS=1 writes it anew");
+}
+
+pub fn pretty(value: &Value) -> Vec<u8> {
+    let mut text = serde_json::to_string_pretty(value).unwrap();
+    text.push('\n');
+    text.into_bytes()
+}
+
+pub fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
