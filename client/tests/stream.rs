@@ -7,8 +7,12 @@ use std::sync::Mutex;
 
 use clearway_client::v1::map_service_server::{MapService, MapServiceServer};
 use clearway_client::{Client, ClientError, Subscription, v1};
+use clearway_proto::codec::Limits;
+use clearway_proto::delta::encode_delta;
+use clearway_proto::map::{encode_header, encode_layer};
 use common::{CAPTURE_END_NS, map};
 use futures::{Stream, stream};
+use prost::Message;
 use tokio::sync::mpsc;
 use tonic::{Request, Response, Status, Streaming};
 
@@ -96,6 +100,48 @@ async fn every_map_is_acknowledged_and_the_newest_is_handed_out_with_the_skipped
     assert_eq!(newest, Some(4));
     assert!(given >= 1 && given + skipped <= 5, "{given} given, {skipped} skipped of 5");
     assert_eq!(maps.newest().unwrap().sequence(), 4);
+}
+
+/// The map of that sequence as a delta against another.
+fn delta(sequence: u64, base_sequence: u64) -> Result<v1::MapUpdate, Status> {
+    let [base, map] = [base_sequence, sequence].map(|sequence| v1::Map::decode(map(sequence, CAPTURE_END_NS)).unwrap());
+    let layer =
+        encode_delta(&base.layers[0], base_sequence, &map.layers[0], &Limits::default()).expect("no change is short");
+    let bytes = [encode_header(&map.header.unwrap()), encode_layer(&layer)].concat();
+    Ok(v1::MapUpdate { map: bytes.into(), ..Default::default() })
+}
+
+#[tokio::test]
+async fn a_lost_update_leads_to_a_whole_map_and_never_to_a_wrong_cell() {
+    // Map 1 is lost on the way; 3 is under way already when the server hears of it.
+    let (address, mut told) = serve(vec![update(0, 0), delta(2, 1), delta(3, 2), update(4, 0), delta(5, 4)]).await;
+    let client = Client::connect(&address).await.unwrap();
+    let mut maps = client.subscribe(Subscription { deltas: true, ..Default::default() }).await.unwrap();
+    assert!(told.recv().await.unwrap().selection.unwrap().deltas);
+    for (sequence, want_full) in [(0, false), (2, true), (3, false), (4, false), (5, false)] {
+        let request = told.recv().await.unwrap();
+        assert_eq!((request.acknowledged, request.want_full), (Some(sequence), want_full));
+    }
+    let (mut given, mut skipped) = (Vec::new(), 0);
+    while let Ok(update) = maps.next().await {
+        let layer = update.map.layer("drivability").unwrap();
+        assert_eq!(layer.class_at(10.0, -10.0), (3, "obstacle"));
+        given.push(update.map.sequence());
+        skipped += update.skipped;
+    }
+    assert!(given.iter().all(|sequence| [0, 4, 5].contains(sequence)), "{given:?}");
+    assert_eq!(given.last(), Some(&5));
+    assert_eq!(given[0] + given.len() as u64 + skipped, 6, "{given:?}, and {skipped} are told as skipped");
+}
+
+#[tokio::test]
+async fn a_delta_nobody_asked_for_is_not_shown_either() {
+    let (address, mut told) = serve(vec![delta(2, 1), update(3, 0)]).await;
+    let client = Client::connect(&address).await.unwrap();
+    let mut maps = client.subscribe(Subscription::default()).await.unwrap();
+    told.recv().await.unwrap();
+    assert!(told.recv().await.unwrap().want_full);
+    assert_eq!(maps.next().await.unwrap().map.sequence(), 3);
 }
 
 #[tokio::test]

@@ -5,6 +5,8 @@ mod house;
 use std::net::SocketAddr;
 use std::sync::{Arc, Weak};
 
+use clearway_proto::codec::Limits;
+use clearway_proto::map::{Map, decode_map, decode_map_on};
 use clearway_proto::v1;
 use clearway_proto::v1::map_service_client::MapServiceClient;
 use clearway_server::ingest::Reading;
@@ -90,11 +92,11 @@ async fn what_a_reader_asks_for_and_cannot_have_is_refused_by_name_and_disturbs_
     }
 
     let mut liar = Reader::open(&mut client, of_layer(2)).await.unwrap();
-    liar.take().await;
+    let newest = liar.take().await.0;
     liar.acknowledge(4711).await;
     let status = liar.next().await.unwrap_err();
     assert_eq!(status.code(), Code::InvalidArgument, "{status}");
-    let last = format!("acknowledged 4711: this map was never sent on this stream; the last one sent is {first}");
+    let last = format!("acknowledged 4711: this map was never sent on this stream; the last one sent is {newest}");
     assert!(status.message().starts_with(&last), "{status}");
 
     let long = v1::Selection { vehicle: "v".repeat(70_000), ..of_layer(1) };
@@ -161,6 +163,63 @@ async fn a_late_joiner_gets_the_current_map_and_only_the_late_joiner() {
         next = maps;
     }
     assert!(next >= 2, "{next} maps");
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn deltas_lead_to_the_cells_of_whole_maps_and_a_reader_that_lost_one_gets_a_whole_map_at_once() {
+    let running = start(config()).await;
+    let mut client = plain(running.grpc.unwrap()).await;
+    let every = || v1::Selection { max_in_flight: 1, ..Default::default() };
+    let mut whole = Reader::open(&mut client, every()).await.unwrap();
+    let mut reader = Reader::open(&mut client, v1::Selection { deltas: true, ..every() }).await.unwrap();
+    let ahead = v1::Region { x_from_m: 0.0, x_to_m: 20.0, y_from_m: -8.0, y_to_m: 8.0 };
+    let cut = v1::Selection { deltas: true, region: Some(ahead), ..every() };
+    let mut near = Reader::open(&mut client, cut).await.unwrap();
+
+    let limits = Limits::default();
+    let (mut base, mut near_base): (Option<Map>, Option<Map>) = (None, None);
+    let (mut next, mut whole_bytes, mut delta_bytes, mut near_bytes) = (0, 0, 0, 0);
+    for portion in portions(8) {
+        let maps = feed(&running, portion).await;
+        for expected in next..maps {
+            let update = whole.next().await.unwrap();
+            whole.acknowledge(expected).await;
+            let truth = decode_map(update.map.clone(), &limits).unwrap();
+            let delta = reader.next().await.unwrap();
+            assert_eq!(decode_map_on(delta.map.clone(), base.as_ref(), &limits).unwrap(), truth, "map {expected}");
+            let part = near.next().await.unwrap();
+            near.acknowledge(expected).await;
+            let part_map = decode_map_on(part.map.clone(), near_base.as_ref(), &limits).unwrap();
+            for (layer, of) in part_map.layers.iter().zip(&truth.layers) {
+                assert!(layer.grid.cell_count() < of.grid.cell_count(), "{}", layer.name);
+                for (x, y) in [(0.5, 0.5), (10.1, -7.9), (19.9, 7.9), (5.0, 0.0)] {
+                    assert_eq!(layer.class_at(x, y), of.class_at(x, y), "{} at ({x}, {y})", layer.name);
+                }
+            }
+            if expected > 0 {
+                whole_bytes += update.map.len();
+                delta_bytes += delta.map.len();
+                near_bytes += part.map.len();
+            }
+            if expected == 3 {
+                // This one is lost on its way, says the reader, which has acknowledged nothing yet.
+                let lost = v1::WatchRequest { acknowledged: Some(expected), want_full: true, selection: None };
+                reader.requests.send(lost).await.unwrap();
+                let again = reader.next().await.unwrap();
+                assert_eq!((again.map, again.skipped, again.left_out), (update.map, 0, 0), "whole, and at once");
+            }
+            reader.acknowledge(expected).await;
+            (base, near_base) = (Some(truth), Some(part_map));
+        }
+        next = maps;
+    }
+    assert!(next > 5, "{next} maps");
+    println!("{next} maps: whole {whole_bytes} bytes, deltas {delta_bytes}, deltas of a region {near_bytes}");
+    assert!(
+        delta_bytes < whole_bytes && near_bytes < delta_bytes,
+        "{delta_bytes}, {near_bytes} of {whole_bytes} bytes"
+    );
     within("shutdown", running.shutdown()).await.unwrap();
 }
 

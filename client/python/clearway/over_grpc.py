@@ -100,24 +100,24 @@ def _follow(
     acknowledges: bool,
 ) -> None:
     """Takes every update and acknowledges it. A delta against a map that is not here (an update was lost) is not shown: a
-    whole map is asked for, and what was not shown counts as skipped."""
+    whole map is asked for. All that was not shown counts as skipped, but for what the reader did not want."""
     base: Map | None = None
-    asked, skipped, left_out = False, 0, 0
+    asked, left_out = False, 0
     for update in updates:
-        skipped, left_out = skipped + update.skipped, left_out + update.left_out
+        left_out += update.left_out
         message = map_pb2.Map.FromString(update.map)
         answer = service_pb2.WatchRequest()
         if acknowledges:
             answer.acknowledged = message.header.sequence
         try:
-            base = Map(update.map, base=base)
-            stream.put(base, skipped, left_out)
-            asked, skipped, left_out = False, 0, 0
+            m = Map(update.map, base=base)
+            between = 0 if base is None else m.sequence - base.sequence - 1
+            stream.put(m, max(between - left_out, 0), left_out)
+            base, asked, left_out = m, False, 0
         except DecodeError:
             if not any(layer.HasField("base_sequence") for layer in message.layers):
                 raise
             # More deltas may be on the way already; one question is enough for them all.
             answer.want_full, asked = not asked, True
-            skipped += 1
         if answer.want_full or acknowledges:
             request(answer)

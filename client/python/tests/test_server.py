@@ -42,13 +42,35 @@ def test_get_and_watch_give_the_same_map(transport):
 @pytest.mark.parametrize("transport", TRANSPORTS, ids=["grpc", "zenoh"])
 def test_a_slow_loop_body_gets_the_newest_map_and_is_told_what_it_skipped(transport):
     with clearway.watch(**transport, layers=["drivability"]) as maps:
-        first = next(maps)
+        first = maps.next_or_stale()
         while maps.newest().sequence < first.sequence + 3:
             pass
         newest = maps.newest().sequence
         second = next(maps)
     assert second.sequence >= newest
     assert second.sequence - first.sequence == second.skipped + 1
+
+
+def test_deltas_of_a_region_at_a_rate_give_the_cells_of_whole_maps():
+    wanted = dict(layers=["drivability", "terrain"], region=(0, 20, -8, 8))
+    with clearway.watch(GRPC, **wanted, deltas=True, max_rate_hz=5) as few, clearway.watch(GRPC, **wanted) as all_of_them:
+        got = [next(few) for _ in range(3)]
+        whole = {}
+        while got[-1].sequence not in whole:
+            m = next(all_of_them)
+            whole[m.sequence] = m
+            assert m.sequence <= got[-1].sequence + 50
+    assert all(m.left_out for m in got[1:])
+    assert got[0]["terrain"].grid.width < 100
+    for m in got:
+        for layer in (layer for name, layer in m.layers.items() if m.sequence in whole):
+            assert (layer.classes == whole[m.sequence][layer.name].classes).all()
+
+
+@pytest.mark.parametrize("wrong", [{"max_rate_hz": 0.0}, {"max_rate_hz": float("nan")}, {"region": (500, 600, 0, 1)}])
+def test_a_selection_that_cannot_be_had_is_refused_by_name(wrong):
+    with pytest.raises(clearway.ClearwayError, match=next(iter(wrong))):
+        next(clearway.watch(GRPC, **wrong))
 
 
 def test_every_layer_comes_where_none_is_named():
