@@ -70,7 +70,7 @@ async fn serve(updates: Updates) -> (String, mpsc::UnboundedReceiver<v1::WatchRe
 }
 
 fn update(sequence: u64, skipped: u64) -> Result<v1::MapUpdate, Status> {
-    Ok(v1::MapUpdate { map: map(sequence, CAPTURE_END_NS), skipped, sent_ns: 0 })
+    Ok(v1::MapUpdate { map: map(sequence, CAPTURE_END_NS), skipped, ..Default::default() })
 }
 
 #[tokio::test]

@@ -21,6 +21,12 @@ pub struct Options {
     /// Layers, separated by commas; all unless given. Over zenoh one, drivability unless given.
     #[arg(long, value_delimiter = ',')]
     layers: Vec<String>,
+    /// At most so many maps a second; all unless given.
+    #[arg(long, value_name = "HZ", conflicts_with = "zenoh")]
+    max_rate_hz: Option<f64>,
+    /// Let only what has changed travel.
+    #[arg(long, conflicts_with = "zenoh")]
+    deltas: bool,
     /// One JSON object a line.
     #[arg(long)]
     json: bool,
@@ -37,9 +43,10 @@ pub async fn run(options: Options) -> Result<()> {
     let mut maps = match &options.zenoh {
         Some(endpoint) => over_zenoh(endpoint, &options).await?,
         None => {
-            let Options { vehicle, layers, .. } = &options;
-            let vehicle = vehicle.clone().unwrap_or_default();
-            let subscription = Subscription { vehicle, layers: layers.clone(), ..Subscription::default() };
+            let Options { vehicle, layers, max_rate_hz, deltas, .. } = &options;
+            let (vehicle, layers) = (vehicle.clone().unwrap_or_default(), layers.clone());
+            let (max_rate_hz, deltas) = (*max_rate_hz, *deltas);
+            let subscription = Subscription { vehicle, layers, max_rate_hz, deltas, ..Subscription::default() };
             options.server.connect().await?.subscribe(subscription).await?
         }
     };
@@ -60,6 +67,7 @@ fn line(update: &Update, as_json: bool) -> String {
         let document = json!({
             "vehicle": map.vehicle(), "sequence": map.sequence(), "age_ms": map.age_ms(now), "stale": map.is_stale(now),
             "drivable_share": share, "bytes": map.bytes().len(), "skipped": skipped,
+            "left_out": update.left_out,
             "layers": map.layers().iter().map(|layer| &layer.name).collect::<Vec<_>>(),
         });
         return document.to_string();

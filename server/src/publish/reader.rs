@@ -11,7 +11,7 @@ use futures::{Stream, StreamExt, stream};
 use tokio::sync::watch;
 use tonic::Status;
 
-use super::selection::Selection;
+use super::selection::{Selection, Sent};
 use super::{Served, Vehicles};
 use crate::demand::Taken;
 use crate::engine::Newest;
@@ -40,8 +40,10 @@ struct Watch<R> {
     requests: Option<R>,
     newest: watch::Receiver<Newest>,
     selection: Selection,
-    /// The map this reader was sent last: what deltas are put on, and what maps are counted from.
-    last: Option<Arc<EncodedMap>>,
+    /// What this reader was sent last.
+    last: Option<Sent>,
+    /// The same map, for a reader of deltas alone: they are put on it. A stopped reader keeps nothing else.
+    base: Option<Arc<EncodedMap>>,
     /// The reader asked for a whole map.
     want_full: bool,
     over: bool,
@@ -62,6 +64,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
             taken: served.status.demand.take(&selection.layers),
             selection,
             last: None,
+            base: None,
             want_full: false,
             over: false,
             _reader: Reader::new(&served.status.grpc_readers),
@@ -118,13 +121,13 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
     }
 
     fn send(&mut self, map: Arc<EncodedMap>) -> Result<v1::MapUpdate, Status> {
-        let Self { selection, last, want_full, .. } = self;
-        let base = last.as_deref().filter(|_| selection.deltas && !*want_full);
-        let bytes = selection.bytes(&map, base)?;
-        let (skipped, left_out) = last.as_ref().map_or((0, 0), |last| selection.rate.between(last, &map));
-        selection.rate.send(map.capture_end_ns);
-        selection.credits.send(map.sequence);
-        (*last, *want_full) = (Some(map), false);
+        let Self { selection, last, base, want_full, .. } = self;
+        let bytes = selection.bytes(&map, base.as_deref().filter(|_| !*want_full))?;
+        let sent = Sent { sequence: map.sequence, stamp_ns: map.capture_end_ns };
+        let (skipped, left_out) = last.replace(sent).map_or((0, 0), |last| selection.rate.between(last, sent));
+        selection.rate.send(sent.stamp_ns);
+        selection.credits.send(sent.sequence);
+        (*base, *want_full) = (selection.deltas.then_some(map), false);
         Ok(v1::MapUpdate { map: bytes, skipped, sent_ns: now_ns(), left_out })
     }
 }

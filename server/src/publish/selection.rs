@@ -121,11 +121,20 @@ impl Rate {
     }
 
     /// Of the maps between two that were sent: (missed, left out at the reader's wish).
-    pub fn between(&self, last: &EncodedMap, next: &EncodedMap) -> (u64, u64) {
+    pub fn between(&self, last: Sent, next: Sent) -> (u64, u64) {
         let all = next.sequence.saturating_sub(last.sequence.saturating_add(1));
-        let missed = self.room(all, [last.capture_end_ns, next.capture_end_ns]);
+        let missed = self.room(all, [last.stamp_ns, next.stamp_ns]);
         (missed, all - missed)
     }
+}
+
+/// A map that was sent, as far as those between it and the next are counted.
+#[derive(Clone, Copy, Debug)]
+pub struct Sent {
+    /// The map's.
+    pub sequence: u64,
+    /// Of the end of its capture.
+    pub stamp_ns: i64,
 }
 
 /// What is on its way to a reader without an acknowledgement.
