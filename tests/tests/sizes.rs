@@ -1,0 +1,174 @@
+//! How many bytes the maps of recorded scans take: of each layer and channel, whole and as a delta to the map before.
+//! `cargo test -p clearway-tests --test sizes -- --nocapture` prints the table.
+
+#![cfg_attr(not(clearway_data), allow(unused))]
+
+mod house;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use clearway_mapping::event::{Body, EgoPose, Event};
+use clearway_mapping::pipeline::Pipeline;
+use clearway_proto::codec::Limits;
+use clearway_proto::delta::encode_delta;
+use clearway_proto::v1;
+use clearway_server::recording::{Entry, Recording};
+use clearway_server::replay::{Options, replay};
+use clearway_server::wire::EncodedMap;
+use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion, Vector3};
+use prost::Message;
+
+/// A recorded drive, and where the vehicle was at a share of its scans or seconds.
+struct Drive {
+    name: &'static str,
+    path: &'static str,
+    poses: Poses,
+}
+
+enum Poses {
+    /// Nobody knows.
+    None,
+    /// One a scan, in a file of the folder.
+    PerScan(&'static str),
+    /// Straight ahead.
+    SpeedMps(f64),
+}
+
+const DRIVES: [Drive; 6] = [
+    Drive { name: "hdl64e kitti", path: "kitti/patchwork-plusplus", poses: Poses::PerScan("icp_poses_DERIVED.json") },
+    Drive { name: "hdl64e udacity", path: "kitti/udacity_data_2", poses: Poses::PerScan("icp_poses_DERIVED.json") },
+    Drive { name: "hdl32e nuscenes", path: "nuscenes/mmdet3d", poses: Poses::None },
+    Drive { name: "hdl32e", path: "pcap/rust-lidar-utils/hdl32_example.pcap", poses: Poses::SpeedMps(15.0) },
+    Drive { name: "vlp16", path: "pcap/opendlv/proxy-velodyne16/sampleShort.pcap", poses: Poses::SpeedMps(5.1) },
+    Drive { name: "vls128", path: "mcap/nebula_vls128_none.mcap", poses: Poses::None },
+];
+
+/// Maps of a drive: whole message, and layers by name.
+struct Sized {
+    message: usize,
+    layers: Vec<v1::Layer>,
+}
+
+/// Replays a drive once to learn its events and how its sensor is mounted, then makes its maps with the poses added.
+async fn maps(drive: &Drive) -> Vec<Sized> {
+    let folder = tempfile::tempdir().unwrap();
+    let (file, record) = (Path::new(env!("CLEARWAY_DATA")).join(drive.path), folder.path().join("drive.mcap"));
+    let options = Options { files: vec![file.clone()], record: Some(record.clone()), ..Options::default() };
+    house::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
+    let mut recording = Recording::open(&record).unwrap();
+    let (config, tables) = recording.config().unwrap();
+    let events = recording.by_ref().filter_map(|entry| match entry.unwrap() {
+        Entry::Event { event, .. } => Some(event),
+        _ => None,
+    });
+    let mut pipeline = Pipeline::new(&config.vehicles[0].core(), tables.into_iter().next().unwrap()).unwrap();
+    let mut made = Vec::new();
+    let mut sequence = 0;
+    for event in with_poses(drive, &file, events.collect()) {
+        let event = Event { sequence, ..event };
+        sequence += 1;
+        if let Ok(Some(map)) = pipeline.step(&event) {
+            let encoded = EncodedMap::new(map, "car".into(), 7, 300);
+            let bytes = encoded.select(&[]);
+            made.push(Sized { message: bytes.len(), layers: v1::Map::decode(bytes).unwrap().layers });
+        }
+    }
+    assert!(!made.is_empty(), "{} makes no map", drive.name);
+    made
+}
+
+fn with_poses(drive: &Drive, folder: &Path, events: Vec<Event>) -> Vec<Event> {
+    let pose = |event: &Event, stamp_ns: i64, map_from_ego: Isometry3<f64>| Event {
+        body: Body::EgoPose(EgoPose { stamp_ns, map_from_ego, speed_mps: 3.5 }),
+        ..event.clone()
+    };
+    match drive.poses {
+        Poses::None => events,
+        Poses::PerScan(file) => {
+            let text = std::fs::read(folder.join(file)).unwrap();
+            let list: Vec<serde_json::Value> = serde_json::from_slice(&text).unwrap();
+            let mut poses = list.iter().map(|entry| {
+                let rows: [[f64; 4]; 4] = serde_json::from_value(entry["T_first_from_this"].clone()).unwrap();
+                let turn = Matrix3::from_fn(|row, column| rows[row][column]);
+                let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&turn));
+                Isometry3::from_parts(Vector3::new(rows[0][3], rows[1][3], rows[2][3]).into(), turn)
+            });
+            let mut all = Vec::new();
+            for event in events {
+                if let Body::Scan(scan) = &event.body {
+                    all.push(pose(&event, scan.stamp_ns, poses.next().expect("a pose for every scan")));
+                }
+                all.push(event);
+            }
+            all
+        }
+        Poses::SpeedMps(speed_mps) => {
+            let Some(first_ns) = events.first().map(|event| event.arrival_ns) else { return events };
+            let mut all = Vec::new();
+            for (number, event) in events.into_iter().enumerate() {
+                let x = (event.arrival_ns - first_ns) as f64 * 1e-9 * speed_mps;
+                if number % 10 == 0 {
+                    all.push(pose(&event, event.arrival_ns, Isometry3::translation(x, 0.0, 0.0)));
+                }
+                all.push(event);
+            }
+            all
+        }
+    }
+}
+
+/// Bytes by what takes them, summed over maps, and how many maps.
+#[derive(Default)]
+struct Table(BTreeMap<String, (usize, usize)>);
+
+impl Table {
+    fn add(&mut self, what: String, bytes: usize) {
+        let (sum, maps) = self.0.entry(what).or_default();
+        (*sum, *maps) = (*sum + bytes, *maps + 1);
+    }
+
+    fn mean(&self, what: &str) -> f64 {
+        self.0.get(what).map_or(f64::NAN, |(sum, maps)| *sum as f64 / *maps as f64)
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+async fn maps_of_recorded_scans_are_as_small_as_promised() {
+    let mut classes = Table::default();
+    for drive in &DRIVES {
+        let maps = maps(drive).await;
+        let mut table = Table::default();
+        for (number, map) in maps.iter().enumerate() {
+            table.add("message".into(), map.message);
+            for layer in &map.layers {
+                table.add(format!("{} whole", layer.name), layer.encoded_len());
+                for channel in &layer.channels {
+                    table.add(format!("{}.{} whole", layer.name, channel.name), channel.payload.len());
+                }
+                let Some(before) = number.checked_sub(1) else { continue };
+                let before = maps[before].layers.iter().find(|before| before.name == layer.name).unwrap();
+                let delta = encode_delta(before, 1, layer, &Limits::default());
+                table.add(format!("{} sent", layer.name), delta.as_ref().unwrap_or(layer).encoded_len());
+                for channel in &delta.as_ref().unwrap_or(layer).channels {
+                    table.add(format!("{}.{} sent", layer.name, channel.name), channel.payload.len());
+                }
+            }
+        }
+        let largest = maps.iter().map(|map| map.message).max().unwrap();
+        println!("{}: {} maps, largest message {largest} bytes", drive.name, maps.len());
+        for what in table.0.keys() {
+            println!("    {what}: {:.0}", table.mean(what));
+        }
+        for map in &maps {
+            let occupancy = map.layers.iter().find(|layer| layer.name == "occupancy").unwrap();
+            let class = occupancy.channels.iter().find(|channel| channel.name == "class").unwrap();
+            classes.add(drive.name.into(), class.payload.len());
+            classes.add("all".into(), class.payload.len());
+        }
+        assert!(largest <= 65_536, "{}: {largest} bytes", drive.name);
+    }
+    println!("class of occupancy, all maps: {:.0} bytes", classes.mean("all"));
+    assert!(classes.mean("hdl64e kitti") <= 7500.0);
+}
