@@ -127,6 +127,24 @@ fn a_lead_that_stops_never_holds_the_map_and_leads_again_when_it_is_back() {
 }
 
 #[test]
+fn the_rows_of_radial_maps_stay_the_leads_whoever_makes_the_map() {
+    let mut coarse = config();
+    // To this one alone all the ground is one row.
+    coarse.sensors[1].elevations_deg = vec![-5.0];
+    let rows = |pipeline: &mut Pipeline, event: &Event| {
+        let map = step(pipeline, event)?;
+        Some((map.made_by, common::benches(&map.layers[0]).to_vec()))
+    };
+    let mut alone = pipeline(&coarse);
+    assert_eq!(rows(&mut alone, &scan(1, 300 * MS)).map(|(maker, rows)| (maker, rows.len())), Some((1, 1)));
+    let mut pipeline = pipeline(&coarse);
+    let (_, of_lead) = rows(&mut pipeline, &scan(0, 100 * MS)).unwrap();
+    assert!(of_lead.len() > 4);
+    let stands_in = (1..6).find_map(|n| rows(&mut pipeline, &scan(1, (n + 1) * 100 * MS)));
+    assert_eq!(stands_in, Some((1, of_lead)));
+}
+
+#[test]
 fn a_lead_that_lags_or_jumps_does_not_lead_and_is_named_with_its_age() {
     for (name, off_ns, part) in [
         ("lags", -700 * MS, Part::Late),
