@@ -261,10 +261,10 @@ impl Pipeline {
     }
 
     fn take_sensor(&mut self, source: u16, sensor: &SensorConfig) -> Result<(), Rejected> {
-        self.config.declare(usize::from(source), sensor)?;
+        let calibration = self.config.declare(usize::from(source), sensor)?;
         if self.intakes.len() < self.config.sensors.len() {
             let wanted = Wanted { deviations: false, ..self.layers.wanted() };
-            self.intakes.push(Intake::new(sensor, None, self.config.body.as_ref(), wanted));
+            self.intakes.push(Intake::new(sensor, calibration, self.config.body.as_ref(), wanted));
         }
         self.ledger.sensors += 1;
         Ok(())
