@@ -202,6 +202,35 @@ impl Disk for File {
     }
 }
 
+/// A disk that has failed once is not written again: the library closes what it drops, and a disk that has recovered would
+/// then hold a file that ends in order and lacks the rest.
+struct OnceFailed<D: Disk> {
+    disk: D,
+    failed: Option<io::ErrorKind>,
+}
+
+impl<D: Disk> OnceFailed<D> {
+    fn unless_failed<T>(&mut self, act: impl FnOnce(&mut D) -> io::Result<T>) -> io::Result<T> {
+        match self.failed {
+            Some(kind) => Err(kind.into()),
+            // An interrupted call is made again, and has failed nothing.
+            None => act(&mut self.disk).inspect_err(|error| {
+                self.failed = Some(error.kind()).filter(|kind| *kind != io::ErrorKind::Interrupted);
+            }),
+        }
+    }
+}
+
+impl<D: Disk> Write for OnceFailed<D> {
+    fn write(&mut self, data: &[u8]) -> io::Result<usize> {
+        self.unless_failed(|disk| disk.write(data))
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.unless_failed(Write::flush)
+    }
+}
+
 /// What writes a recording, without thread and clock: whoever has it says when. A failing disk ends the writing, not the
 /// listening.
 pub struct Scribe<D: Disk> {
@@ -296,7 +325,7 @@ impl<D: Disk> Scribe<D> {
 
 /// The open file.
 struct Tape<D: Disk> {
-    writer: mcap::Writer<NoSeek<BufWriter<D>>>,
+    writer: mcap::Writer<NoSeek<BufWriter<OnceFailed<D>>>>,
     vehicles: Vec<VehicleChannels>,
 }
 
@@ -316,7 +345,7 @@ impl<D: Disk> Tape<D> {
             // A chunk goes to the file whole, its length first: else a crash would leave one with a length of 0, which
             // no reader can tell from damage.
             .disable_seeking(true)
-            .create(NoSeek::new(BufWriter::new(disk)))?;
+            .create(NoSeek::new(BufWriter::new(OnceFailed { disk, failed: None })))?;
         let names: Vec<&str> = preface.vehicles.iter().map(|(name, _)| &**name).collect();
         let mut metadata = preface.notes.clone();
         metadata.insert("boot_id".into(), preface.boot_id.to_string());
@@ -382,8 +411,8 @@ impl<D: Disk> Tape<D> {
         self.writer.finish()?;
         // `finish` leaves the last bytes to the file's own buffer.
         let buffer = self.writer.into_inner().into_inner();
-        let mut disk = buffer.into_inner().map_err(|error| McapError::Io(error.into_error()))?;
-        disk.keep().map_err(McapError::Io)
+        let mut whole = buffer.into_inner().map_err(|error| McapError::Io(error.into_error()))?;
+        whole.disk.keep().map_err(McapError::Io)
     }
 }
 

@@ -16,6 +16,9 @@ const NS_PER_US: i64 = 1_000;
 const STEP_NS_MAX: i64 = 100_000_000;
 /// A longer silence: device time and arrival tell of the same one if they differ by less than this and a hundredth of it.
 const SILENCE_ERROR_NS_MAX: i64 = 100_000_000;
+/// A device starts up for longer than this: one whose count went on by less was silent, whatever a host's clock that was
+/// set meanwhile says.
+const START_UP_NS_MIN: i64 = 10 * NS_PER_SECOND;
 /// Longer silences are not measured by arrival: a host's clock that steps by years is no silence.
 const SILENCE_NS_MAX: i64 = 24 * NS_PER_HOUR;
 /// During a leap second the counter may go on past the hour.
@@ -68,9 +71,10 @@ impl Timeline {
             self.last = Some(Last { past_hour_ns, time_ns, sent_ns });
             return (time_ns, Went::Started);
         };
-        let arrived_ns = (sent_ns - last.sent_ns).clamp(0, SILENCE_NS_MAX);
+        let host_ns = sent_ns - last.sent_ns;
+        let arrived_ns = host_ns.clamp(0, SILENCE_NS_MAX);
         let (step_ns, went) = match (past_hour_ns, last.past_hour_ns) {
-            (Some(now), Some(before)) => self.step_ns(now, before, elapsed_ns, arrived_ns),
+            (Some(now), Some(before)) => self.step_ns(now, before, elapsed_ns, host_ns),
             (_, None) if arrived_ns > STEP_NS_MAX => (elapsed_ns, Went::Jumped),
             _ => (elapsed_ns, Went::On),
         };
@@ -85,7 +89,8 @@ impl Timeline {
         (time_ns, went)
     }
 
-    fn step_ns(&mut self, now_ns: i64, before_ns: i64, elapsed_ns: i64, arrived_ns: i64) -> (i64, Went) {
+    fn step_ns(&mut self, now_ns: i64, before_ns: i64, elapsed_ns: i64, host_ns: i64) -> (i64, Went) {
+        let arrived_ns = host_ns.clamp(0, SILENCE_NS_MAX);
         let ahead_ns = nearest_hour(now_ns - before_ns, 0);
         if ahead_ns.abs() <= STEP_NS_MAX {
             self.suspect = None;
@@ -95,6 +100,12 @@ impl Timeline {
         if silence_ns > 0 && (silence_ns - arrived_ns).abs() < SILENCE_ERROR_NS_MAX + arrived_ns / 100 {
             self.suspect = None;
             return (silence_ns, Went::On);
+        }
+        // A host that went on by less than the device counted was not set: the device's counter was.
+        let host_was_set = !(-SILENCE_ERROR_NS_MAX..=ahead_ns).contains(&host_ns);
+        if host_was_set && (0..START_UP_NS_MIN).contains(&ahead_ns) {
+            self.suspect = None;
+            return (ahead_ns, Went::On);
         }
         let goes_on = |suspect: &Suspect| (0..=STEP_NS_MAX).contains(&nearest_hour(now_ns - suspect.past_hour_ns, 0));
         match self.suspect.take().filter(goes_on) {

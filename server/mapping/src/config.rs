@@ -22,6 +22,8 @@ pub use speed::{Bonus, SpeedConfig};
 
 /// Sensors of one vehicle, declared ones included: each keeps its newest turn, some megabytes.
 pub const SENSORS_MAX: usize = 32;
+/// Half as much again as the longest table of any model, a VLS-128's.
+const CALIBRATION_BYTES_MAX: usize = 64 << 10;
 /// Blind sectors of one sensor.
 pub const BLIND_MAX: usize = 16;
 /// Lasers of a sensor that sends scans; the largest built have 128.
@@ -59,7 +61,8 @@ pub struct SensorConfig {
     /// Found from the data where absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rpm: Option<f32>,
-    /// The sensor's own table: path of a ROS YAML or Velodyne XML file; the factory's where absent.
+    /// The sensor's own table: path of a ROS YAML or Velodyne XML file (of a declared sensor: the text of a ROS YAML one);
+    /// the factory's where absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub calibration: Option<String>,
     /// Encoder angle at which turns are cut; 180 is behind the vehicle.
@@ -185,24 +188,25 @@ impl VehicleConfig {
     }
 
     /// Takes a sensor that the file does not name as the vehicle's sensor number `index`: the next one. The same again
-    /// changes nothing, so that whoever declares it may do so whenever he connects.
+    /// changes nothing, so that whoever declares it may do so whenever he connects. Gives the new one's table, if it brings
+    /// one: its `calibration` is no path but the table's text, so that a replay needs no file.
     ///
     /// # Errors
-    /// A wrong index, a name already taken, a value that cannot be used, or a calibration file: the core reads none.
-    pub fn declare(&mut self, index: usize, sensor: &SensorConfig) -> Result<(), ConfigError> {
-        let at = || format!("vehicle.sensor[{index}]");
+    /// A wrong index, a name already taken, a value that cannot be used, or a calibration that is none.
+    pub fn declare(&mut self, index: usize, sensor: &SensorConfig) -> Result<Option<Calibration>, ConfigError> {
         if self.sensors.get(index) == Some(sensor) {
-            return Ok(());
+            return Ok(None);
         }
         if index != self.sensors.len() || index >= SENSORS_MAX {
             return Err(ConfigError::new("vehicle.sensor", index, "the next index, under 32"));
         }
-        if let Some(calibration) = &sensor.calibration {
-            return Err(ConfigError::new(at() + ".calibration", calibration, "none for a declared sensor"));
-        }
         self.check_sensor(index, sensor)?;
+        let calibration = sensor.declared_calibration().map_err(|what| {
+            let allowed = "the text of a ROS YAML table, up to 65536 bytes, of as many lasers as the model has";
+            ConfigError::new(format!("vehicle.sensor[{index}].calibration"), what, allowed)
+        })?;
         self.sensors.push(sensor.clone());
-        Ok(())
+        Ok(calibration)
     }
 
     fn check_sensor(&self, index: usize, sensor: &SensorConfig) -> Result<(), ConfigError> {
@@ -225,6 +229,17 @@ impl SensorConfig {
             cut_azimuth_deg: self.cut_azimuth_deg,
             gps_late_ns_max: (self.gps_late_days_max * 86_400e9) as i64,
         }
+    }
+
+    /// The table that a declaration brings as text; `Err` with what is wrong.
+    fn declared_calibration(&self) -> Result<Option<Calibration>, String> {
+        let Some(text) = &self.calibration else { return Ok(None) };
+        if text.len() > CALIBRATION_BYTES_MAX {
+            return Err(format!("{} bytes", text.len()));
+        }
+        let table = Calibration::from_yaml(text).map_err(|error| error.to_string())?;
+        self.model.map_or(Ok(()), |model| table.fits(model)).map_err(|error| error.to_string())?;
+        Ok(Some(table))
     }
 
     /// A sensor with every default.

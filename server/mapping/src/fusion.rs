@@ -8,6 +8,8 @@
 //!   for `deadline_ms` of event time, or whose turns come that much later after their stamps (or that much before them)
 //!   than the timeliest sensor's, does not lead; the next one's turns make the maps until it is back.
 //! - `deadline_ms` after the last map (`period_ms` where that is more) any sensor's turn makes one: nobody holds the map.
+//! - The rows of radial maps are the lead's, once it has given a turn, whoever makes the map: to a sensor of few planes a row
+//!   may be all there is, and one return in it would make all of it drivable.
 //! - A turn farther than `deadline_ms` from the map's stamp is not in it, and its sensor is named with its age.
 //!
 //! Between two maps the order in which different sensors' turns come makes no difference to the layers made of the sweep.
@@ -136,17 +138,27 @@ impl Fusion {
             let part = if index == source { maker.state.state } else { self.part(intake, maker.end_ns, now) };
             if index != source && part.contributes() {
                 let (carried, compensation) = motion.carry(intake.turn.end_ns, maker.end_ns);
-                if !self.fused {
-                    self.sweep.copy(&maker.sweep);
-                    self.fused = true;
-                }
+                self.fuse(&maker.sweep);
                 self.sweep.append(&intake.turn.sweep, &carried);
                 gathered.start_ns = gathered.start_ns.min(intake.turn.start_ns);
                 gathered.compensation = gathered.compensation.min(compensation).min(intake.turn.compensation);
             }
             gathered.sensors.push(state(intake, part, maker.end_ns));
         }
+        let lead = &intakes[self.lead].turn.sweep;
+        if source != self.lead && lead.calibration.is_some() {
+            self.fuse(&maker.sweep);
+            self.sweep.take_rows(lead);
+        }
         gathered
+    }
+
+    /// The map's sweep is no sensor's own.
+    fn fuse(&mut self, maker: &Sweep) {
+        if !self.fused {
+            self.sweep.copy(maker);
+            self.fused = true;
+        }
     }
 
     fn part(&self, intake: &Intake, stamp_ns: i64, now: Moment) -> Part {

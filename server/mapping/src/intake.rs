@@ -278,6 +278,7 @@ impl Intake {
 }
 
 fn check(scan: &Scan) -> Result<(), Rejected> {
+    Rejected::unless_in_range(scan.stamp_ns)?;
     let (x, y, z, intensity) = (scan.x.len(), scan.y.len(), scan.z.len(), scan.intensity.len());
     if x != y || x != z || x != intensity {
         return Err(Rejected::ScanLengths { x, y, z, intensity });

@@ -96,6 +96,9 @@ impl Dropped {
     }
 }
 
+/// Later stamps, of 2116 and on, near the end of what 64 bits of nanoseconds hold; the earliest is 1970's first.
+pub const STAMP_NS_MAX: i64 = 1 << 62;
+
 /// An event that was not taken. The pipeline's state is as if it had not come, but for the ledger.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum Rejected {
@@ -155,6 +158,12 @@ pub enum Rejected {
         /// The newest taken.
         newest_ns: i64,
     },
+    /// A scan, ego pose or road of a time that cannot be.
+    #[error("stamp {stamp_ns} ns: 0 to {STAMP_NS_MAX} ns since the epoch is allowed")]
+    StampRange {
+        /// The event's.
+        stamp_ns: i64,
+    },
     /// A road that is no road.
     #[error(transparent)]
     Road(#[from] RoadError),
@@ -170,7 +179,7 @@ pub enum Rejected {
 
 impl Rejected {
     /// The ledger's key: the decoder's own (`length`, `block_flag`, …), or `source`, `sensor`, `scan_lengths`,
-    /// `scan_offset`, `no_returns`, `stamp`, `pose`, or a road's own ([`RoadError::reason`]).
+    /// `scan_offset`, `no_returns`, `stamp`, `stamp_range`, `pose`, or a road's own ([`RoadError::reason`]).
     pub fn reason(&self) -> &'static str {
         match self {
             Self::Datagram(refusal) => refusal.reason(),
@@ -180,9 +189,14 @@ impl Rejected {
             Self::ScanOffset { .. } => "scan_offset",
             Self::NoReturn { .. } => "no_returns",
             Self::Stamp { .. } => "stamp",
+            Self::StampRange { .. } => "stamp_range",
             Self::Pose { .. } => "pose",
             Self::Road(refused) => refused.reason(),
         }
+    }
+
+    pub(crate) fn unless_in_range(stamp_ns: i64) -> Result<(), Self> {
+        if (0..=STAMP_NS_MAX).contains(&stamp_ns) { Ok(()) } else { Err(Self::StampRange { stamp_ns }) }
     }
 
     pub(crate) fn unless_newer(stamp_ns: i64, newest_ns: Option<i64>) -> Result<(), Self> {

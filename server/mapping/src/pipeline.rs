@@ -237,6 +237,7 @@ impl Pipeline {
     }
 
     fn take_ego_pose(&mut self, pose: &EgoPose) -> Result<(), Rejected> {
+        Rejected::unless_in_range(pose.stamp_ns)?;
         let rotation = pose.map_from_ego.rotation.coords;
         let position = pose.map_from_ego.translation.vector;
         // NaN fails every comparison, and a NaN in the quaternion makes the norm NaN, which is in no range.
@@ -251,6 +252,7 @@ impl Pipeline {
     }
 
     fn take_road(&mut self, road: &Road) -> Result<(), Rejected> {
+        Rejected::unless_in_range(road.stamp_ns)?;
         road::check(road)?;
         Rejected::unless_newer(road.stamp_ns, self.roads.newest_stamp_ns(road.purpose))?;
         self.roads.take(road, self.motion.map_from_ego(road.stamp_ns));
@@ -259,10 +261,10 @@ impl Pipeline {
     }
 
     fn take_sensor(&mut self, source: u16, sensor: &SensorConfig) -> Result<(), Rejected> {
-        self.config.declare(usize::from(source), sensor)?;
+        let calibration = self.config.declare(usize::from(source), sensor)?;
         if self.intakes.len() < self.config.sensors.len() {
             let wanted = Wanted { deviations: false, ..self.layers.wanted() };
-            self.intakes.push(Intake::new(sensor, None, self.config.body.as_ref(), wanted));
+            self.intakes.push(Intake::new(sensor, calibration, self.config.body.as_ref(), wanted));
         }
         self.ledger.sensors += 1;
         Ok(())

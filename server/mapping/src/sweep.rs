@@ -229,9 +229,14 @@ impl Sweep {
             self.deviation_m.resize(self.x.len(), f32::NAN);
         }
         if self.calibration.is_none() && other.calibration.is_some() {
-            self.calibration.clone_from(&other.calibration);
-            self.mount_height_m = other.mount_height_m;
+            self.take_rows(other);
         }
+    }
+
+    /// Takes over whose rows radial maps have.
+    pub(crate) fn take_rows(&mut self, other: &Sweep) {
+        self.calibration.clone_from(&other.calibration);
+        self.mount_height_m = other.mount_height_m;
     }
 
     /// Whether [`Sweep::take_scan`] keeps this point (sensor frame, metres) of a sensor so mounted.

@@ -3,6 +3,7 @@
 mod common;
 
 use bytes::Bytes;
+use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{BodyConfig, Extrinsics, FusionConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
@@ -127,6 +128,25 @@ fn a_lead_that_stops_never_holds_the_map_and_leads_again_when_it_is_back() {
 }
 
 #[test]
+fn the_rows_of_radial_maps_stay_the_leads_whoever_makes_the_map() {
+    let mut coarse = config();
+    // To this one alone all the ground is one row.
+    coarse.sensors[1].elevations_deg = vec![-5.0];
+    let rows = |pipeline: &mut Pipeline, event: &Event| {
+        let map = step(pipeline, event)?;
+        Some((map.made_by, common::benches(&map.layers[0]).to_vec()))
+    };
+    let mut alone = pipeline(&coarse);
+    assert_eq!(rows(&mut alone, &scan(1, 10 * MS)), None);
+    assert_eq!(rows(&mut alone, &scan(1, 300 * MS)).map(|(maker, rows)| (maker, rows.len())), Some((1, 1)));
+    let mut pipeline = pipeline(&coarse);
+    let (_, of_lead) = rows(&mut pipeline, &scan(0, 100 * MS)).unwrap();
+    assert!(of_lead.len() > 4);
+    let stands_in = (1..6).find_map(|n| rows(&mut pipeline, &scan(1, (n + 1) * 100 * MS)));
+    assert_eq!(stands_in, Some((1, of_lead)));
+}
+
+#[test]
 fn a_lead_that_lags_or_jumps_does_not_lead_and_is_named_with_its_age() {
     for (name, off_ns, part) in [
         ("lags", -700 * MS, Part::Late),
@@ -175,7 +195,7 @@ fn a_fast_lead_makes_a_map_a_period() {
     let fusion = FusionConfig { period_ms: 100, ..FusionConfig::default() };
     let mut pipeline = pipeline(&VehicleConfig { fusion, ..config() });
     // 50 Hz with 2 ms of jitter.
-    let stamps = (0..50).map(|n: i64| n * 20 * MS + (n * 7 % 5 - 2) * MS);
+    let stamps = (1..51).map(|n: i64| n * 20 * MS + (n * 7 % 5 - 2) * MS);
     let made: Vec<Map> = stamps.filter_map(|stamp_ns| step(&mut pipeline, &scan(0, stamp_ns))).collect();
     assert!((10..=11).contains(&made.len()), "{}", made.len());
 }
@@ -191,15 +211,22 @@ fn the_configured_lead_leads() {
 
 #[test]
 fn older_turns_are_carried_to_the_maps_stamp_by_the_poses_or_the_speed() {
+    const SECOND: i64 = 1000 * MS;
     let pose = |ms: i64, x: f64| {
         let map_from_ego = Isometry3::new(Vector3::new(x, 0.0, 0.0), Vector3::zeros());
-        event(0, ms * MS, Body::EgoPose(EgoPose { stamp_ns: ms * MS, map_from_ego, speed_mps: 20.0 }))
+        event(0, SECOND + ms * MS, Body::EgoPose(EgoPose { stamp_ns: SECOND + ms * MS, map_from_ego, speed_mps: 20.0 }))
     };
     let wall = |pipeline: &mut Pipeline| {
         // A post at x = 10 in the world, 5 m to the left: seen by the left one at 40 ms, from x = 0.8.
-        let post = Scan { x: vec![4.0], y: vec![-9.2], z: vec![0.0], intensity: vec![0.0], ..ahead(40 * MS, &[], 0.0) };
-        pipeline.step(&event(1, 40 * MS, Body::Scan(post))).unwrap();
-        let map = step(pipeline, &scan(0, 100 * MS)).unwrap();
+        let post = Scan {
+            x: vec![4.0],
+            y: vec![-9.2],
+            z: vec![0.0],
+            intensity: vec![0.0],
+            ..ahead(SECOND + 40 * MS, &[], 0.0)
+        };
+        pipeline.step(&event(1, SECOND + 40 * MS, Body::Scan(post))).unwrap();
+        let map = step(pipeline, &scan(0, SECOND + 100 * MS)).unwrap();
         (map.compensation, pipeline.newest_sweep().x[2])
     };
     let mut driven = pipeline(&config());
@@ -419,6 +446,26 @@ fn two_turning_sensors_have_a_decoder_and_a_ledger_each_and_their_order_between_
 }
 
 #[test]
+fn a_declared_sensor_is_decoded_by_the_table_it_brings() {
+    let mut table = Calibration::factory(Model::Vlp16);
+    table.lasers.iter_mut().for_each(|laser| laser.dist_correction += 1.0);
+    let ranges = |calibration: Option<String>| {
+        let mut pipeline = pipeline(&config());
+        let declared = SensorConfig { calibration, ..SensorConfig::new("rear", at(0.0, 0.0, 1.9, 0.0)) };
+        pipeline.step(&event(3, 1, Body::Sensor(Box::new(declared)))).unwrap();
+        for moved in velodyne(Model::Vlp16, 1.9, 450) {
+            pipeline.step(&Event { source: 3, ..moved }).unwrap();
+        }
+        let sweep = pipeline.newest_sweep();
+        sweep.x.iter().zip(&sweep.y).map(|(x, y)| x.hypot(*y)).collect::<Vec<_>>()
+    };
+    let (plain, tabled) = (ranges(None), ranges(Some(table.to_yaml())));
+    assert!(plain.len() > 5000 && plain.len() == tabled.len(), "{} {}", plain.len(), tabled.len());
+    // A metre along the beam is at least cos 15 degrees of it on the ground.
+    assert!(plain.iter().zip(&tabled).all(|(plain, tabled)| (0.96..1.001).contains(&(tabled - plain))));
+}
+
+#[test]
 fn a_host_clock_that_steps_holds_no_map() {
     for step_ns in [-3_600_000 * MS, 3_600_000 * MS] {
         let mut pipeline = pipeline(&config());
@@ -463,10 +510,24 @@ fn a_sensor_is_declared_by_an_event_and_what_cannot_be_one_is_refused_by_name() 
         let refused = pipeline.step(&wrong).unwrap_err();
         assert_eq!((refused.reason(), refused.to_string()), ("sensor", format!("declared sensor: {said}")));
     }
+    let tabled = |text: &str| {
+        let plain = SensorConfig::new("rear", at(-1.0, 0.0, 1.0, 180.0));
+        let calibration = Some(text.to_owned());
+        event(3, 1, Body::Sensor(Box::new(SensorConfig { model: Some(Model::Vlp16), calibration, ..plain })))
+    };
+    let hdl32e = Calibration::factory(Model::Hdl32e).to_yaml();
+    for (text, said) in [("rear.yaml", "rear.yaml"), (&*hdl32e, "32"), (&" ".repeat(65_537), "65537 bytes")] {
+        let refused = pipeline.step(&tabled(text)).unwrap_err();
+        let message = refused.to_string();
+        assert!(
+            refused.reason() == "sensor" && message.contains("[3].calibration") && message.contains(said),
+            "{message}"
+        );
+    }
     let good = declare(3, "rear", at(-1.0, 0.0, 1.0, 180.0));
     assert_eq!(pipeline.step(&good), Ok(None));
     assert_eq!(pipeline.step(&good), Ok(None), "the same again changes nothing");
-    assert_eq!((pipeline.ledger().sensors, pipeline.ledger().sensors_refused), (2, 4));
+    assert_eq!((pipeline.ledger().sensors, pipeline.ledger().sensors_refused), (2, 7));
     assert_eq!(pipeline.step(&rear), Ok(None));
     let map = step(&mut pipeline, &scan(0, 20 * MS)).unwrap();
     assert_eq!((map.sensors[3].name.as_str(), map.sensors[3].state), ("rear", Part::Ok));

@@ -260,16 +260,21 @@ fn stamps_and_places_at_the_ends_of_their_types_move_nothing_and_break_nothing()
     let mut pipeline = Pipeline::new(&config(MotionConfig::default()), vec![None]).unwrap();
     let mut step = |event: &Event| pipeline.step(event).map(|map| map.map(|map| map.compensation));
     let far = |stamp_ns, x| EgoPose { stamp_ns, map_from_ego: at(x, 0.0, 0.0), speed_mps: 0.0 };
-    for (stamp_ns, x) in [(i64::MIN, 1e9), (i64::MIN + 1, -1e9)] {
+    for (stamp_ns, x) in [(0, 1e9), (1, -1e9)] {
         let body = Body::EgoPose(far(stamp_ns, x));
         step(&Event { sequence: 0, arrival_ns: i64::MIN, source: 0, body }).unwrap();
     }
-    for pose in [far(0, 1.1e9), EgoPose { speed_mps: 1e300, ..far(0, 0.0) }] {
+    for stamp_ns in [i64::MIN, -1, (1 << 62) + 1, i64::MAX] {
+        let body = Body::EgoPose(far(stamp_ns, 0.0));
+        let rejected = step(&Event { sequence: 0, arrival_ns: 0, source: 0, body }).unwrap_err();
+        assert_eq!((&rejected, rejected.reason()), (&Rejected::StampRange { stamp_ns }, "stamp_range"));
+    }
+    for pose in [far(2, 1.1e9), EgoPose { speed_mps: 1e300, ..far(2, 0.0) }] {
         let rejected = step(&Event { sequence: 0, arrival_ns: 0, source: 0, body: Body::EgoPose(pose) }).unwrap_err();
         assert!(rejected.to_string().contains("within 1000 m/s"), "{rejected}");
     }
     let made: Vec<_> = drive(None, true).iter().filter_map(|event| step(event).unwrap()).collect();
-    step(&Event { sequence: 0, arrival_ns: i64::MAX, source: 0, body: Body::EgoPose(far(i64::MAX, 0.0)) }).unwrap();
+    step(&Event { sequence: 0, arrival_ns: i64::MAX, source: 0, body: Body::EgoPose(far(1 << 62, 0.0)) }).unwrap();
     assert!(made.len() >= 2 && made.iter().all(|compensation| *compensation == Compensation::None));
     let motion = |stamps: [i64; 2]| {
         let mut motion = Motion::new(&MotionConfig::default());

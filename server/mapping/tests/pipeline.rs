@@ -198,8 +198,12 @@ fn scans_that_cannot_be_taken_say_why() {
     );
     let rejected = known.step(&event(2, Body::Scan(scan(50)))).unwrap_err();
     assert_eq!(rejected, Rejected::Stamp { stamp_ns: 50, newest_ns: 50 });
-    assert_eq!(known.ledger().refused, [("scan_lengths", 1), ("stamp", 1)].into());
-    assert_eq!((known.ledger().received, known.ledger().decoded), (3, 1));
+    for stamp_ns in [i64::MIN, -1, (1 << 62) + 1, i64::MAX] {
+        let rejected = known.step(&event(2, Body::Scan(scan(stamp_ns)))).unwrap_err();
+        assert_eq!(rejected, Rejected::StampRange { stamp_ns });
+    }
+    assert_eq!(known.ledger().refused, [("scan_lengths", 1), ("stamp", 1), ("stamp_range", 4)].into());
+    assert_eq!((known.ledger().received, known.ledger().decoded), (7, 1));
     let map = known.step(&event(3, Body::Scan(scan(51)))).unwrap().unwrap();
     assert_eq!(map.sequence, 1, "rejected scans take no number");
 }

@@ -139,7 +139,7 @@ impl Entrance {
         let before = config.sensors.len();
         let index = config.sensors.iter().position(|known| *known == *sensor).unwrap_or(before);
         let declared = config.declare(index, &sensor).map_err(|error| error.to_string());
-        match declared.and_then(|()| u16::try_from(index).map_err(|error| error.to_string())) {
+        match declared.and_then(|_| u16::try_from(index).map_err(|error| error.to_string())) {
             Ok(source) => {
                 if !self.enter(captured_ns, source, Body::Sensor(sensor), ticket) {
                     config.sensors.truncate(before);

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use clearway_mapping::map::{Cells, Geometry, Layer, Map};
+use clearway_mapping::map::{Cells, Geometry, Layer, Map, SensorState};
 use clearway_mapping::pipeline::{Ledger, NamedStatus};
 use nalgebra::Point3;
 
@@ -111,4 +111,28 @@ pub fn is_healthy(map: &Map) -> bool {
     map.sensors
         .iter()
         .all(|sensor| sensor.state.as_str() == "ok" && sensor.partial.is_empty() && sensor.blocked.is_empty())
+}
+
+/// The map with every cell called by the second class of its layer, the one that is free.
+pub fn freed(map: &Map) -> Map {
+    let mut map = map.clone();
+    for layer in &mut map.layers {
+        if let Cells::U8(classes) = &mut layer.channels[0].cells {
+            classes.fill(1);
+        }
+    }
+    map
+}
+
+/// A map's sensors in a line.
+pub fn describe(map: &Map) -> String {
+    let sensor = |sensor: &SensorState| {
+        let (name, state, age) = (&sensor.name, sensor.state.as_str(), sensor.age_ms.unwrap_or(f32::NAN));
+        format!(
+            "{name} {state} {age:.0} ms, clock {} {} ms, partial {:?}, blocked {:?}",
+            sensor.clock, sensor.clock_offset_ms, sensor.partial, sensor.blocked
+        )
+    };
+    let sensors: Vec<String> = map.sensors.iter().map(sensor).collect();
+    format!("map {} by {}: {}", map.sequence, map.made_by, sensors.join("; "))
 }

@@ -123,12 +123,7 @@ impl Fate {
             Trouble { silent, restart: restarts.then(restart) }
         };
         let troubles: Vec<Trouble> = (0..sensors).map(|_| trouble(&mut dice)).collect();
-        // A silence, or a long gap, during which the host's clock steps cannot be told from a restart until telemetry tells, and a
-        // sensor restarted without satellites while the host is wrong has no right clock at all; stamps that went ahead by then
-        // take their time to come back, at half speed.
-        let speaks = (troubles[..turning].iter()).all(|trouble| trouble.silent.is_none() && trouble.restart.is_none())
-            && networks.iter().all(|network| network.burst == 0.0);
-        let host_clock = (!plain && speaks && dice.happens(0.35)).then(|| {
+        let host_clock = (!plain && dice.happens(0.35)).then(|| {
             let step_ns = if dice.happens(0.5) { 3_600_000_000_000 } else { 2_000_000_000 };
             let step_ns = if dice.happens(0.5) { step_ns } else { -step_ns };
             (during(&mut dice, HEAL_NS), step_ns)

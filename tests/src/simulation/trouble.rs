@@ -87,13 +87,16 @@ pub fn garbage(dice: &mut Dice) -> Vec<u8> {
 pub fn nonsense(stamp_ns: i64, dice: &mut Dice) -> v1::Observation {
     use v1::observation::Body;
     let scan = |x: &[f32], y: &[f32]| v1::Scan { stamp_ns, x: pack(x), y: pack(y), z: pack(y), ..Default::default() };
-    let (sensor, body) = match dice.of(0..7) {
+    let level = Some(v1::Pose { qw: 1.0, ..Default::default() });
+    let (sensor, body) = match dice.of(0..9) {
         0 => ("ahead", None),
         1 => ("nobody", Some(Body::Scan(scan(&[1.0], &[2.0])))),
         2 => ("ahead", Some(Body::Scan(scan(&[1.0, 2.0], &[2.0])))),
         3 => ("ahead", Some(Body::Scan(v1::Scan { x: Bytes::from_static(&[1, 2, 3]), ..scan(&[], &[]) }))),
         4 => ("ahead", Some(Body::Scan(v1::Scan { ring: pack(&[1_u16, 2]), ..scan(&[3.0], &[4.0]) }))),
-        5 => ("", Some(Body::EgoPose(v1::EgoPose { stamp_ns, map_from_ego: None, speed_mps: f64::NAN }))),
+        5 => ("ahead", Some(Body::Scan(v1::Scan { stamp_ns: i64::MIN, ..scan(&[1.0], &[2.0]) }))),
+        6 => ("", Some(Body::EgoPose(v1::EgoPose { stamp_ns: i64::MAX, map_from_ego: level, speed_mps: 0.0 }))),
+        7 => ("", Some(Body::EgoPose(v1::EgoPose { stamp_ns, map_from_ego: None, speed_mps: f64::NAN }))),
         _ => ("", Some(Body::Road(v1::Road { stamp_ns, x: vec![f64::NAN], ..Default::default() }))),
     };
     v1::Observation { sensor: sensor.into(), body, ..Default::default() }

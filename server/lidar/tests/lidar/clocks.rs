@@ -31,6 +31,8 @@ struct Script {
     /// How far right stamps are ahead of UTC.
     right_ns: fn(i64) -> i64,
     event_ns: i64,
+    /// For so long after the event nothing is sent.
+    silence_ns: i64,
     /// From the event until stamps must be right.
     healed_ns: i64,
     tolerance_ns: i64,
@@ -46,6 +48,7 @@ const BASE: Script = Script {
     telemetry: |t| gps(NOON + t),
     right_ns: |_| 0,
     event_ns: EVENT,
+    silence_ns: 0,
     healed_ns: TURN,
     tolerance_ns: 200_000,
     last: Clock::Gps,
@@ -83,6 +86,7 @@ fn after<T>(t: i64, then: T, before: T) -> T {
 fn scripts() -> Vec<Script> {
     let late = Script { utc_ns: LATE, device_ns: |t| LATE + t, telemetry: |t| gps(LATE + t), ..BASE };
     let free = Script { device_ns: FREE, telemetry: SILENT, last: Clock::Arrival, ..BASE };
+    let silent = Script { silence_ns: 3 * TURN, healed_ns: 4 * TURN, ..BASE };
     vec![
         Script { name: "the hour and the day end, and telemetry comes at that microsecond", event_ns: S, ..late },
         Script { name: "the hour ends without telemetry", telemetry: SILENT, last: Clock::Device, event_ns: S, ..late },
@@ -125,6 +129,29 @@ fn scripts() -> Vec<Script> {
         },
         Script { name: "the host steps an hour on, under GPS", host_ns: |t| after(t, HOUR, 0), ..BASE },
         Script { name: "the host steps an hour back, under GPS", host_ns: |t| after(t, -HOUR, 0), ..BASE },
+        Script { name: "the host steps 2 s on during a silence, under GPS", host_ns: |t| after(t, 2 * S, 0), ..silent },
+        Script {
+            name: "the host steps 2 s back during a silence, under GPS",
+            host_ns: |t| after(t, -2 * S, 0),
+            ..silent
+        },
+        Script { name: "the host steps an hour back during a silence", host_ns: |t| after(t, -HOUR, 0), ..silent },
+        Script {
+            name: "the host steps 2 s on during a silence and nobody else knows the time",
+            host_ns: |t| after(t, 2 * S, 0),
+            right_ns: |t| after(t, 2 * S, 0),
+            silence_ns: silent.silence_ns,
+            healed_ns: silent.healed_ns,
+            ..free
+        },
+        Script {
+            name: "the host steps 2 s back during a silence and nobody else knows the time: stamps go on as they did",
+            host_ns: |t| after(t, -2 * S, 0),
+            silence_ns: silent.silence_ns,
+            healed_ns: silent.healed_ns,
+            last: Clock::Held,
+            ..free
+        },
         Script {
             name: "the host steps an hour on and nobody else knows the time",
             host_ns: |t| after(t, HOUR, 0),
@@ -250,6 +277,10 @@ fn play_timed(script: &Script, sensor: &mut Sensor) -> Vec<(Revolution, i64)> {
     let mut telemetry_ns = 0;
     for (index, t) in (0..script.lasts_ns).step_by(period as usize).enumerate() {
         let arrival = |t: i64| script.utc_ns + t + (script.host_ns)(t);
+        if (script.event_ns..script.event_ns + script.silence_ns).contains(&t) {
+            telemetry_ns = t;
+            continue;
+        }
         if t >= telemetry_ns {
             if let Some((pps, sentence)) = (script.telemetry)(telemetry_ns) {
                 let mut payload = datagram(past_hour_us(script, telemetry_ns), &sentence);
@@ -287,7 +318,11 @@ fn stamps_rise_and_are_right_again_one_turn_after_whatever_happens_to_a_clock() 
             play_timed(&script, &mut Sensor::new(SensorConfig::default())).into_iter().unzip();
         let name = script.name;
         assert_rising(name, &turns);
-        assert!(turns.len() as i64 >= script.lasts_ns / TURN - 1, "{name}: {} turns", turns.len());
+        assert!(
+            turns.len() as i64 >= (script.lasts_ns - script.silence_ns) / TURN - 1,
+            "{name}: {} turns",
+            turns.len()
+        );
         for (index, (turn, done)) in turns.iter().zip(done).enumerate() {
             // Where the device's time jumps, a turn is torn in two: the whole ones are told by when they ended.
             let t = (done + TURN / 2) / TURN * TURN - TURN;

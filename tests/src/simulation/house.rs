@@ -1,0 +1,261 @@
+//! The house: from what arrives at its doors to maps, readers and a recording, in ticks of a simulated clock.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::sync::mpsc::Receiver;
+use std::time::{Duration, Instant};
+
+use clearway_mapping::pipeline::{Pipeline, layer_names};
+use clearway_proto::v1;
+use clearway_server::config::Config;
+use clearway_server::engine::Engine;
+use clearway_server::ingest::entrance::Entrance;
+use clearway_server::ingest::ticket::{Account, Mark, Verdict, Verdicts};
+use clearway_server::ingest::{Clock, Door, Queued, door_by};
+use clearway_server::publish::{Served, Vehicles};
+use clearway_server::record::{Preface, Scribe};
+use clearway_server::status::VehicleStatus;
+use clearway_server::wire::EncodedMap;
+use clearway_sim::impair::Impairment;
+use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
+use tokio::sync::watch;
+
+use super::checks::{Breach, accounts, adds_up, breach, describe, freed, is_healthy, nothing_free};
+use super::drive::{Drive, drives};
+use super::fate::{Dice, DiskFate, END_NS, Fate, HEAL_NS, TURN_NS};
+use super::readers::{Reader, readers};
+use super::tape::MemoryDisk;
+use super::{FLUSH_MS, Plant, TICK_NS};
+
+/// Turns with a covered window until maps must show it: the one it happened in, another, and what a stopped sensor's
+/// newest turn may still contribute.
+const TURNS_TO_COVER: i64 = 4;
+
+/// The house, and the street outside.
+pub(super) struct House<'a> {
+    pub(super) fate: &'a Fate,
+    pub(super) plant: Option<Plant>,
+    pub(super) drive: &'static Drive,
+    pub(super) dice: Dice,
+    pub(super) now_ns: i64,
+
+    pub(super) clock: Arc<AtomicI64>,
+    pub(super) door: Door,
+    pub(super) events: Receiver<Queued>,
+    pub(super) engine: Engine,
+    pub(super) vehicles: Vehicles,
+    pub(super) maps: Vec<Arc<EncodedMap>>,
+    pub(super) taken: u64,
+    /// When the newest map came that was not whole.
+    pub(super) unwhole_ns: i64,
+
+    pub(super) networks: Vec<Impairment>,
+    /// Datagrams on their way, by when they arrive.
+    pub(super) arriving: BTreeMap<(i64, u64), (u16, Vec<u8>)>,
+    pub(super) datagrams: u64,
+    pub(super) next_sent: usize,
+    pub(super) offered: u64,
+
+    pub(super) entrance: Entrance,
+    pub(super) waiting: VecDeque<v1::Observation>,
+    pub(super) account: Account,
+    pub(super) observations: u64,
+    pub(super) verdicts: Verdicts,
+    pub(super) told: UnboundedReceiver<(Mark, Verdict)>,
+
+    pub(super) readers: Vec<Reader>,
+
+    pub(super) began: Instant,
+    pub(super) disk: MemoryDisk,
+    pub(super) scribe: Option<Scribe<MemoryDisk>>,
+    /// Events given to the recorder by the end of each tick.
+    pub(super) given: Vec<u64>,
+    /// What was on the disk when the machine died.
+    pub(super) left: Option<Vec<u8>>,
+}
+
+impl<'a> House<'a> {
+    pub fn new(fate: &'a Fate, plant: Option<Plant>) -> Self {
+        let drive = &drives()[fate.drive];
+        let config = config(drive, fate);
+        let vehicle = &config.vehicles[0];
+        let layers = layer_names(&vehicle.maps);
+        let clock = Arc::new(AtomicI64::new(0));
+        let (door, events) = door_by(
+            Clock::new({
+                let clock = clock.clone();
+                move || clock.load(Ordering::Relaxed)
+            }),
+            vehicle.queue,
+        );
+        let vehicles = vec![("car".into(), layers.clone())];
+        let preface = Preface { boot_id: 1, config: config.to_toml(), vehicles, ..Preface::default() };
+        let disk = MemoryDisk::new(fate.disk.clone());
+        let (scribe, journal) = match Scribe::new(disk.clone(), &config.recorder, &preface, false) {
+            Ok((scribe, mut journals)) => (Some(scribe), journals.pop()),
+            // The disk is full before the first event; a server would not start, and one that does not record does.
+            Err(_) => (None, None),
+        };
+        let counts = scribe.as_ref().map(Scribe::counts);
+        let status = Arc::new(VehicleStatus::new("car".into(), 1, layers.clone(), door.outside(), counts));
+        let (newest, receiver) = watch::channel(None);
+        let pipeline = Pipeline::new(&vehicle.core(), vec![None; vehicle.sensors.len()]).expect("a car that can be");
+        let valid_ms = vehicle.maps.valid_ms;
+        let engine = Engine { pipeline, valid_ms, newest, journal, status: status.clone(), observer: None };
+        let mut dice = Dice::new(!fate.seed);
+        let (verdicts, told) = unbounded_channel();
+        Self {
+            fate,
+            plant,
+            drive,
+            now_ns: 0,
+            clock,
+            entrance: Entrance::new(vehicle, &door),
+            door,
+            events,
+            engine,
+            vehicles: Vehicles(vec![Served { status, newest: receiver }].into()),
+            maps: Vec::new(),
+            taken: 0,
+            unwhole_ns: 0,
+            networks: fate.networks.iter().map(|faults| Impairment::new(*faults)).collect(),
+            arriving: BTreeMap::new(),
+            datagrams: 0,
+            next_sent: drive.sent.partition_point(|sent| sent.offset_ns < fate.offset_ns),
+            offered: 0,
+            waiting: VecDeque::new(),
+            account: Account::new(0),
+            observations: 0,
+            verdicts,
+            told,
+            readers: readers(&mut dice, &layers),
+            dice,
+            began: Instant::now(),
+            disk,
+            scribe,
+            given: Vec::new(),
+            left: None,
+        }
+    }
+
+    pub fn run(&mut self) -> Result<(), Breach> {
+        while self.now_ns < END_NS {
+            self.now_ns += TICK_NS;
+            self.send();
+            self.arrive();
+            self.observe();
+            if !during(&self.fate.engine_stall, self.now_ns) {
+                self.step()?;
+                self.engine.rest();
+                let snapshot = self.vehicles.0[0].status.snapshot();
+                accounts(self.offered, &snapshot.ledger, &snapshot.sensors)?;
+            }
+            for reader in &mut self.readers {
+                reader.look(self.now_ns, &self.vehicles, &self.maps, self.plant)?;
+            }
+            let open = self.readers.iter().filter(|reader| reader.is_open()).count() as u32;
+            let counted = self.vehicles.0[0].status.grpc_readers.load(Ordering::Relaxed);
+            if counted != open {
+                return Err(breach("reader", format!("{open} readers are there, {counted} are counted")));
+            }
+            self.record();
+        }
+        Ok(())
+    }
+
+    /// The engine takes everything that waits.
+    pub fn step(&mut self) -> Result<(), Breach> {
+        while let Ok(queued) = self.events.try_recv() {
+            self.taken += 1;
+            let journal =
+                (self.plant == Some(Plant::UnrecordedEvent) && self.taken == 300).then(|| self.engine.journal.take());
+            self.engine.take(queued);
+            if let Some(journal) = journal {
+                self.engine.journal = journal;
+            }
+            adds_up("the vehicle", self.engine.pipeline.ledger())?;
+            let newest = self.engine.newest.borrow().clone();
+            if let Some(map) = newest.filter(|map| self.maps.len() as u64 <= map.sequence) {
+                self.check_map(map)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn check_map(&mut self, encoded: Arc<EncodedMap>) -> Result<(), Breach> {
+        let Some(map) = self.engine.pipeline.newest_map() else { return Err(breach("map", "encoded, and never made")) };
+        if encoded.sequence != self.maps.len() as u64 || encoded.sequence != map.sequence {
+            return Err(breach("map", format!("number {} after {} maps", encoded.sequence, self.maps.len())));
+        }
+        let stuck = self.plant == Some(Plant::StuckStamp);
+        if let Some(before) = self.maps.last().filter(|before| stuck || before.capture_end_ns >= encoded.capture_end_ns)
+        {
+            let back_ms = before.capture_end_ns.saturating_sub(encoded.capture_end_ns) / 1_000_000;
+            let found = format!("{back_ms} ms before map {}: {}", before.sequence, describe(map));
+            return Err(breach("stamps", found));
+        }
+        if let Some((sector, when)) = &self.fate.covered {
+            let at_ns = map.completed_ns - self.drive.rig.start_ns - self.fate.offset_ns;
+            if (when.start + TURNS_TO_COVER * TURN_NS..when.end).contains(&at_ns) {
+                match self.plant {
+                    Some(Plant::FreedCells) => nothing_free(self.drive, sector, &freed(map))?,
+                    _ => nothing_free(self.drive, sector, map)?,
+                }
+            }
+        }
+        if !is_healthy(map) {
+            self.unwhole_ns = self.now_ns;
+        }
+        self.maps.push(encoded);
+        Ok(())
+    }
+
+    pub fn instant(&self) -> Instant {
+        self.began + Duration::from_nanos(self.now_ns.unsigned_abs())
+    }
+
+    /// The recorder writes everything that waits.
+    fn record(&mut self) {
+        let now = self.instant();
+        if !during(&self.fate.recorder_stall, self.now_ns)
+            && let Some(scribe) = &mut self.scribe
+        {
+            while scribe.take(now) {}
+        }
+        self.given.push(self.taken);
+        if let DiskFate::Crash(at_ns, torn) = self.fate.disk
+            && self.left.is_none()
+            && self.now_ns >= at_ns
+        {
+            let mut bytes = self.disk.bytes();
+            bytes.truncate(bytes.len() - torn.min(bytes.len()));
+            self.left = Some(bytes);
+        }
+    }
+}
+
+/// Whether a fault lasts.
+pub(super) fn during(when: &Option<Range<i64>>, now_ns: i64) -> bool {
+    now_ns < HEAL_NS && when.as_ref().is_some_and(|when| when.contains(&now_ns))
+}
+
+/// The drive's car, as this run has it.
+fn config(drive: &Drive, fate: &Fate) -> Config {
+    let mut config = drive.config.clone();
+    config.recorder.flush_ms = FLUSH_MS;
+    config.recorder.queue = fate.recorder_queue;
+    let vehicle = &mut config.vehicles[0];
+    vehicle.queue = fate.queue;
+    let maps = &mut vehicle.maps;
+    if fate.all_maps {
+        maps.speed.enabled = true;
+    } else {
+        for enabled in [&mut maps.height_difference.enabled, &mut maps.terrain.enabled, &mut maps.safe_path.enabled] {
+            *enabled = false;
+        }
+        (maps.occupancy.extent_m, maps.occupancy.cell_m) = (30.0, 0.5);
+    }
+    config
+}
