@@ -251,7 +251,8 @@ fn a_delta_without_its_base_or_on_one_that_does_not_fit_is_refused_by_name() {
         refuse(name, error, Some(&base.encode_to_vec()), &delta);
     }
     let base = golden_map(41, &golden_layers(1));
-    let spoils: [(&str, &str, fn(&mut v1::Layer)); 4] = [
+    type SpoilDelta = fn(&mut v1::Layer);
+    let spoils: [(&str, &str, SpoilDelta); 4] = [
         ("more_cells_than_the_grid", "cell_count", |layer| layer.channels[0].cell_count += 1),
         ("of_2_32_cells", "too_many_cells", |layer| {
             (cartesian(layer).width, cartesian(layer).height) = (u32::MAX, 1);
