@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 mod ros;
 mod udp;
 
-pub use ros::Ros;
+pub use ros::{Ros, Ros2};
 pub use udp::{Listener, Ports, Route, Sender, Udp, listeners};
 
 /// The configured tables by vehicle and sensor, in the order of the configuration; `None` where the factory's serves.
@@ -34,6 +34,9 @@ pub struct Config {
     /// Maps over zenoh.
     #[serde(default)]
     pub zenoh: Zenoh,
+    /// Maps for Foxglove.
+    #[serde(default)]
+    pub foxglove: Foxglove,
     /// The recording.
     #[serde(default)]
     pub recorder: Recorder,
@@ -131,6 +134,8 @@ pub struct Zenoh {
     pub connect: Vec<String>,
     /// Look for peers by multicast.
     pub scouting: bool,
+    /// Maps as ROS 2 topics.
+    pub ros2: Ros2,
     /// A zenoh configuration (JSON5) to begin with: TLS, access control; the keys above stand over it. Empty: zenoh's own
     /// defaults.
     pub file: PathBuf,
@@ -144,6 +149,7 @@ impl Default for Zenoh {
             listen: vec!["tcp/127.0.0.1:7447".into()],
             connect: Vec::new(),
             scouting: false,
+            ros2: Ros2::default(),
             file: PathBuf::new(),
         }
     }
@@ -169,6 +175,22 @@ impl ZenohMode {
             Self::Client => "client",
             Self::Router => "router",
         }
+    }
+}
+
+/// `[foxglove]`: a WebSocket for Foxglove; whoever reaches it may read.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Foxglove {
+    /// Whether it is served at all.
+    pub enabled: bool,
+    /// Address and port; port 0 takes a free one.
+    pub listen: SocketAddr,
+}
+
+impl Default for Foxglove {
+    fn default() -> Self {
+        Self { enabled: false, listen: SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 8765) }
     }
 }
 
@@ -391,6 +413,9 @@ impl Config {
                     "endpoints such as \"tcp/127.0.0.1:7447\" or \"tls/localhost:7447\"",
                 );
             }
+        }
+        if let Err((key, value, allowed)) = self.zenoh.ros2.check(self.zenoh.enabled, &self.vehicles) {
+            return wrong(key.into(), &value, &allowed);
         }
         let mut names = BTreeSet::new();
         for vehicle in &self.vehicles {

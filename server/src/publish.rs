@@ -1,4 +1,4 @@
-//! The newest map of each vehicle -> whoever asks: gRPC, zenoh, the page. All of them look at the same slots and send
+//! The newest map of each vehicle -> whoever asks: gRPC, zenoh, ROS 2, Foxglove, the page. All of them look at the same slots and send
 //! the same bytes; none of them can hold up an engine.
 
 use std::sync::Arc;
@@ -10,8 +10,11 @@ use crate::status::VehicleStatus;
 
 pub mod access;
 pub mod connections;
+pub mod foxglove;
 pub mod grpc;
 pub mod page;
+#[cfg(feature = "zenoh")]
+mod ros;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
 

@@ -1,9 +1,14 @@
-//! `[vehicle.ros]`: which ROS 2 topics feed a vehicle.
+//! `[vehicle.ros]`: which ROS 2 topics feed a vehicle; `[zenoh.ros2]`: which ones its maps become.
 
 use std::collections::BTreeMap;
 
 use clearway_mapping::config::SensorConfig;
 use serde::{Deserialize, Serialize};
+
+use super::Vehicle;
+
+/// What `ROS_DOMAIN_ID` may be.
+const DOMAIN_MAX: u32 = 232;
 
 /// `[vehicle.ros]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -50,7 +55,7 @@ impl Ros {
             let allowed = "only with zenoh.enabled = true: it comes through zenoh";
             return Err(("ros", "(set)".into(), allowed.into()));
         }
-        if self.domain > 232 {
+        if self.domain > DOMAIN_MAX {
             return Err(("ros.domain", self.domain.to_string(), "0 to 232".into()));
         }
         if let Some(unknown) = self.sensors.keys().find(|name| !sensors.iter().any(|sensor| sensor.name == **name)) {
@@ -67,6 +72,58 @@ impl Ros {
         match named.windows(2).find(|pair| pair[0] == pair[1]) {
             Some(pair) => Err(("ros", pair[0].clone(), "each topic once".into())),
             None => Ok(()),
+        }
+    }
+}
+
+/// `[zenoh.ros2]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Ros2 {
+    /// Whether maps are published to ROS 2 at all.
+    pub enabled: bool,
+    /// `ROS_DOMAIN_ID`.
+    pub domain: u32,
+    /// What stands before `/<vehicle>/<layer>`; may be empty.
+    pub namespace: String,
+}
+
+impl Default for Ros2 {
+    fn default() -> Self {
+        Self { enabled: false, domain: 0, namespace: "/clearway".into() }
+    }
+}
+
+impl Ros2 {
+    /// Checks every value; `Err` has the key, the value and what is allowed.
+    pub(super) fn check(
+        &self,
+        zenoh_enabled: bool,
+        vehicles: &[Vehicle],
+    ) -> Result<(), (&'static str, String, String)> {
+        if self.domain > DOMAIN_MAX {
+            return Err(("zenoh.ros2.domain", self.domain.to_string(), format!("0 to {DOMAIN_MAX}")));
+        }
+        if !self.enabled {
+            return Ok(());
+        }
+        if !zenoh_enabled {
+            let allowed = "only with zenoh.enabled = true: it goes through zenoh";
+            return Err(("zenoh.ros2.enabled", "true".into(), allowed.into()));
+        }
+        // ROS 2 takes no name that begins with a digit.
+        let is_name = |topic: &str| {
+            is_topic(topic) && !topic.split('/').any(|part| part.starts_with(|c: char| c.is_ascii_digit()))
+        };
+        if !self.namespace.is_empty() && !is_name(&self.namespace) {
+            return Err(("zenoh.ros2.namespace", self.namespace.clone(), "such as \"/clearway\", or empty".into()));
+        }
+        match vehicles.iter().find(|vehicle| !is_name(&format!("/{}", vehicle.name))) {
+            None => Ok(()),
+            Some(vehicle) => {
+                let allowed = "with zenoh.ros2.enabled: letters, digits and underscores, no digit first";
+                Err(("vehicle.name", vehicle.name.clone(), allowed.into()))
+            }
         }
     }
 }
