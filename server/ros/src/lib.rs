@@ -11,7 +11,7 @@
 //! | [`velodyne_scan`] | `velodyne_msgs/VelodyneScan` -> packets |
 //! | [`point_cloud2`] | `sensor_msgs/PointCloud2` -> fields and bytes; and back |
 //! | [`points`] | fields and bytes -> positions, intensities, rings, times, by the drivers' conventions |
-//! | [`occupancy_grid`] | `nav_msgs/OccupancyGrid` -> cells; and back |
+//! | [`occupancy_grid`] | cells -> `nav_msgs/OccupancyGrid` |
 //! | [`pose`] | `nav_msgs/Odometry`, `geometry_msgs/PoseStamped`, `tf2_msgs/TFMessage` -> poses |
 //! | [`frames`] | transforms -> where one frame lies in another |
 //! | [`published`] | the types that are published: names, hashes, definitions |

@@ -1,13 +1,13 @@
 //! One `nav_msgs/msg/OccupancyGrid` message.
 //!
-//! In: cells and where they lie. Out: the bytes of a message, and back. Layout: header; info (map_load_time, resolution f32,
+//! In: cells and where they lie. Out: the bytes of a message. Layout: header; info (map_load_time, resolution f32,
 //! width, height, origin: the pose of cell (0, 0)'s lower corner in the header's frame); data (i8 a cell, row by row, x
 //! first: 0 free to 100 occupied, -1 unknown).
 
 use nalgebra::Isometry3;
 
-use crate::cdr::{Header, MessageError, Reader, Writer, length};
-use crate::pose::{pose, write_pose};
+use crate::cdr::{Header, Writer, length};
+use crate::pose::write_pose;
 
 /// A grid of occupancies.
 #[derive(Clone, Debug, PartialEq)]
@@ -26,27 +26,7 @@ pub struct OccupancyGrid<'a> {
     pub data: Vec<i8>,
 }
 
-impl<'a> OccupancyGrid<'a> {
-    /// Reads a message.
-    ///
-    /// # Errors
-    /// [`MessageError`], also where there are not as many cells as width and height say.
-    pub fn new(message: &'a [u8]) -> Result<Self, MessageError> {
-        let mut reader = Reader::new(message)?;
-        let header = reader.header()?;
-        reader.stamp("info.map_load_time")?;
-        let resolution_m = f32::from_bits(reader.u32("info.resolution")?);
-        let (width, height) = (reader.u32("info.width")?, reader.u32("info.height")?);
-        let origin = pose(&mut reader, "info.origin")?;
-        let count = reader.count("data", 1)?;
-        if count as u64 != u64::from(width) * u64::from(height) {
-            let found = format!("{count} cells for {width} x {height}");
-            return Err(MessageError::value("data", found, "width * height cells"));
-        }
-        let data = reader.take("data", count)?.iter().map(|cell| cell.cast_signed()).collect();
-        Ok(Self { header, resolution_m, width, height, origin, data })
-    }
-
+impl OccupancyGrid<'_> {
     /// The message, little-endian; the map was loaded when it was made.
     pub fn to_cdr(&self) -> Vec<u8> {
         let mut writer = Writer::default();

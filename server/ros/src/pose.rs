@@ -103,7 +103,7 @@ pub fn tf_message_to_cdr(transforms: &[StampedTransform]) -> Vec<u8> {
 }
 
 /// A `geometry_msgs/Pose` or `Transform`: position, then quaternion x y z w.
-pub(crate) fn pose(reader: &mut Reader, what: &'static str) -> Result<Isometry3<f64>, MessageError> {
+fn pose(reader: &mut Reader, what: &'static str) -> Result<Isometry3<f64>, MessageError> {
     let [x, y, z] = finite(reader.f64s(what)?, what)?;
     let [i, j, k, w] = reader.f64s(what)?;
     let quaternion = Quaternion::new(w, i, j, k);
