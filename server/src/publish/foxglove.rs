@@ -29,6 +29,8 @@ const BACKLOG: usize = 32;
 /// The running WebSocket server.
 pub struct Publisher {
     server: WebSocketServerHandle,
+    /// What joins channels and server; neither of them keeps it.
+    _context: Arc<Context>,
     tasks: JoinSet<()>,
 }
 
@@ -48,7 +50,7 @@ impl Publisher {
         for stage in stages {
             tasks.spawn(async move { stage.play().await });
         }
-        Ok(Self { server, tasks })
+        Ok(Self { server, _context: context, tasks })
     }
 
     /// The port that is listened on.
