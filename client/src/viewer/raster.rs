@@ -190,3 +190,86 @@ impl Rasters {
         raster
     }
 }
+
+// The legends are those of the core, which the command knows.
+#[cfg(all(test, feature = "cli"))]
+mod tests {
+    use clearway_proto::codec::Cells;
+    use clearway_proto::map::Channel;
+
+    use super::*;
+
+    const LEGEND: [&str; 4] = ["unknown", "drivable", "not_drivable", "obstacle"];
+
+    fn layer(grid: Grid, classes: Vec<u8>) -> Layer {
+        let class =
+            Channel { name: "class".into(), unit: String::new(), scale: 1.0, unknown: 0, cells: Cells::U8(classes) };
+        Layer {
+            name: "drivability".into(),
+            grid,
+            legend: LEGEND.map(String::from).to_vec(),
+            channels: vec![class],
+            planes: Vec::new(),
+            figures: BTreeMap::new(),
+            points: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn every_class_of_every_layer_has_an_occupancy_that_was_chosen_and_unknown_is_never_free() {
+        use clearway_mapping::{drivability, height_difference, safe_path, speed, terrain};
+        let of = |legend: &[&str]| legend.iter().map(|class| occupancy(class)).collect::<Vec<_>>();
+        assert_eq!(of(drivability::LEGEND), [-1, 0, 100, 100]);
+        assert_eq!(of(height_difference::LEGEND), [-1, 0, 100]);
+        assert_eq!(of(terrain::LEGEND), [-1, 0, -1, 100, 100, 100]);
+        assert_eq!(of(&["unknown", "clear", "occupied", "occluded", "out_of_range"]), [-1, 0, 100, -1, -1]);
+        assert_eq!(of(speed::LEGEND), [-1, 0, 100, 0]);
+        assert_eq!(of(safe_path::LEGEND), [-1, 0, 100, 0]);
+        assert_eq!(occupancy("a class of a later version"), -1);
+    }
+
+    #[test]
+    fn no_radial_cell_that_is_not_free_falls_between_square_ones() {
+        let r_bench_m: Vec<f32> = (1..=40).map(|row| 0.02 * (row * row) as f32).collect();
+        let grid = Grid::Radial { r_bench_m, columns: 360 };
+        // Any mixture of classes.
+        let class = |cell: u64| (cell.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 61).saturating_sub(4) as u8;
+        let classes: Vec<u8> = (0..grid.cell_count()).map(class).collect();
+        let layer = layer(grid.clone(), classes.clone());
+        let raster = Raster::of(&grid);
+        let (occupancies, rgba) = (raster.occupancies(&layer), raster.rgba(&layer));
+        let half_m = 0.5 * f64::from(raster.cell_m) * f64::from(raster.width);
+        let square = |x_m: f64, y_m: f64| {
+            let [column, row] = [x_m, y_m].map(|m| ((m + half_m) / f64::from(raster.cell_m)) as usize);
+            row * raster.width as usize + column
+        };
+        for (cell, class) in classes.iter().enumerate() {
+            let (x_m, y_m) = grid.centre_of(cell).unwrap();
+            let shown = occupancies[square(x_m, y_m)];
+            match class {
+                0 => assert_ne!(shown, FREE, "unknown cell {cell}"),
+                1 => {}
+                _ => assert_eq!(shown, OCCUPIED, "obstacle cell {cell}"),
+            }
+        }
+        let free = occupancies.iter().filter(|&&occupancy| occupancy == FREE).count();
+        assert!(free > 1000, "{free} free cells of {}", occupancies.len());
+        assert_eq!((occupancies[0], &rgba[..4]), (UNKNOWN, &[0; 4][..]), "the corner lies outside");
+        assert_eq!(rgba.len(), 4 * occupancies.len());
+    }
+
+    #[test]
+    fn a_turned_grid_keeps_its_cells_and_says_where_they_lie() {
+        let grid =
+            Grid::Cartesian { origin_x_m: -1.5, origin_y_m: -0.5, width: 4, height: 3, cell_m: 0.5, yaw_rad: 0.7 };
+        let layer = layer(grid.clone(), (0..12).map(|cell| cell % 4).collect());
+        let raster = Raster::of(&grid);
+        assert_eq!(raster.occupancies(&layer), [-1, 0, 100, 100].repeat(3));
+        for cell in 0..12_usize {
+            let (column, row) = ((cell % 4) as f64, (cell / 4) as f64);
+            let middle = raster.ego_from_raster * nalgebra::Point3::new(0.5 * column + 0.25, 0.5 * row + 0.25, 0.0);
+            let (x_m, y_m) = grid.centre_of(cell).unwrap();
+            assert!((middle.x - x_m).abs() < 1e-9 && (middle.y - y_m).abs() < 1e-9, "{middle} is not {x_m}, {y_m}");
+        }
+    }
+}

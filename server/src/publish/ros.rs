@@ -17,6 +17,7 @@ use tokio::task::JoinSet;
 use zenoh::Session;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::qos::CongestionControl;
+use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
 
 use super::Served;
@@ -91,7 +92,9 @@ impl<'a> Node<'a> {
     async fn topic(&mut self, topic: &str, kind: &Published, qos: &str) -> Result<Topic, ZenohError> {
         let (name, hash) = (kind.dds_name(), kind.hash);
         let key = format!("{}/{}/{name}/{hash}", self.options.domain, topic.trim_start_matches('/'));
-        let publisher = self.session.declare_publisher(key.clone()).congestion_control(CongestionControl::Drop);
+        // Not to ourselves: a vehicle may take its own poses from the same /tf.
+        let publisher = self.session.declare_publisher(key.clone()).allowed_destination(Locality::Remote);
+        let publisher = publisher.congestion_control(CongestionControl::Drop);
         let publisher = match qos {
             LATCHED => publisher
                 .cache(CacheConfig::default().max_samples(1))
