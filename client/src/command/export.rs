@@ -119,13 +119,14 @@ pub fn run(options: &Options) -> Result<()> {
     while let Some(message) = recording.next() {
         let message = message.with_context(|| file.display().to_string())?;
         progress.set_position(recording.bytes_read);
-        if !message.vehicle().is_some_and(|of| vehicle.as_ref().is_none_or(|only| only == of)) {
+        let Some(of_vehicle) = message.vehicle() else { continue };
+        if vehicle.as_ref().is_some_and(|only| only != of_vehicle) {
             continue;
         }
         if let Some(viewer) = &mut viewer {
             viewer.take_event(&message, &recording.attachments)?;
         }
-        let Some((of_vehicle, of_layer)) = message.map_of() else { continue };
+        let Some((_, of_layer)) = message.map_of() else { continue };
         if layer.as_ref().is_some_and(|only| only != of_layer) {
             continue;
         }
