@@ -59,6 +59,11 @@ async def main(url):
             wish = {"id": ids[topic], "channelId": channels[topic]["id"]}
             await socket.send(json.dumps({"op": "subscribe", "subscriptions": [wish]}))
 
+        # One who wants everything and reads nothing is nobody else's trouble.
+        stalled = await connect(url, subprotocols=["foxglove.sdk.v1"], max_queue=1)
+        wishes = [{"id": ids[topic], "channelId": channel["id"]} for topic, channel in channels.items()]
+        await stalled.send(json.dumps({"op": "subscribe", "subscriptions": wishes}))
+
         # The points' subscription has been heard when what was asked for after it comes.
         now = ["/car/map/drivability", "/car/map/occupancy", "/tf"]
         for topic in [LATER, *now]:
@@ -68,6 +73,7 @@ async def main(url):
         print(json.dumps({"name": info["name"], "channels": topics, **{topic: told[ids[topic]] for topic in now}}), flush=True)
         told = await receive(socket, decoders, {ids[LATER]})
         print(json.dumps(told[ids[LATER]]), flush=True)
+        stalled.transport.abort()
 
 
 asyncio.run(asyncio.wait_for(main(sys.argv[1]), 60))

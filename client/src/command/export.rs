@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
-use clearway_client::{Layer, MapView};
+use clearway_client::{Channel, Layer, MapView};
 
 use self::viewer_file::{Dialect, ViewerFile};
 use super::recording::{Message, Recording};
@@ -60,13 +60,25 @@ pub enum Format {
     Ros2,
 }
 
-impl Format {
-    fn dialect(self) -> Option<Dialect> {
-        match self {
-            Self::Png | Self::Npy | Self::Json => None,
-            Self::Foxglove => Some(Dialect::Foxglove),
-            Self::Ros2 => Some(Dialect::Ros2),
-        }
+/// Makes one map's files: what is put behind its name, and the bytes.
+type Files = fn(&MapView, &Layer, &Style) -> Result<Vec<(String, Vec<u8>)>>;
+
+/// Where maps go.
+enum Output {
+    Files(Files),
+    Viewer(Box<ViewerFile>),
+}
+
+impl Output {
+    fn new(options: &Options) -> Result<Self> {
+        let viewer = |dialect| ViewerFile::create(&options.out, dialect, !options.no_points).map(Box::new);
+        Ok(match options.format {
+            Format::Png => Self::Files(png),
+            Format::Npy => Self::Files(npy),
+            Format::Json => Self::Files(json),
+            Format::Foxglove => Self::Viewer(viewer(Dialect::Foxglove)?),
+            Format::Ros2 => Self::Viewer(viewer(Dialect::Ros2)?),
+        })
     }
 }
 
@@ -105,13 +117,10 @@ fn metres(text: &str) -> Result<f64, String> {
 /// # Errors
 /// What cannot be read or written; an unknown layer or vehicle, with those there are.
 pub fn run(options: &Options) -> Result<()> {
-    let Options { recording: file, layer, format, out, vehicle, .. } = options;
+    let Options { recording: file, layer, out, vehicle, .. } = options;
     let length = fs::metadata(file).with_context(|| format!("open {}", file.display()))?.len();
     let mut recording = Recording::open(file)?;
-    let mut viewer = match format.dialect() {
-        None => None,
-        Some(dialect) => Some(ViewerFile::create(out, dialect, !options.no_points)?),
-    };
+    let mut output = Output::new(options)?;
     let style = options.drawing.style();
     let progress = progress_bar(length);
     let mut maps = 0_u64;
@@ -123,7 +132,7 @@ pub fn run(options: &Options) -> Result<()> {
         if vehicle.as_ref().is_some_and(|only| only != of_vehicle) {
             continue;
         }
-        if let Some(viewer) = &mut viewer {
+        if let Output::Viewer(viewer) = &mut output {
             viewer.take_event(&message, &recording.attachments)?;
         }
         let Some((_, of_layer)) = message.map_of() else { continue };
@@ -135,23 +144,23 @@ pub fn run(options: &Options) -> Result<()> {
         }
         let map = decode(&message, file)?;
         let of_layer = map.layer(of_layer)?;
-        match &mut viewer {
-            Some(viewer) => viewer.take_map(&map, of_layer, message.log_time_ns)?,
-            None if vehicles.len() > 1 => {
+        match &mut output {
+            Output::Viewer(viewer) => viewer.take_map(&map, of_layer, message.log_time_ns)?,
+            Output::Files(_) if vehicles.len() > 1 => {
                 bail!("{} has maps of {}: name one with --vehicle", file.display(), vehicles.join(" and "))
             }
-            None => {
+            Output::Files(files) => {
                 if maps == 0 {
                     fs::create_dir_all(out).with_context(|| format!("make the folder {}", out.display()))?;
                 }
-                write(&map, of_layer, *format, &style, out)?;
+                write(&format!("{:06}_{}", map.sequence(), of_layer.name), files(&map, of_layer, &style)?, out)?;
             }
         }
         maps += 1;
         progress.set_message(format!("{maps} maps"));
     }
     progress.finish_and_clear();
-    if let Some(viewer) = viewer {
+    if let Output::Viewer(viewer) = output {
         viewer.finish().with_context(|| format!("write {}", out.display()))?;
     }
     if let Some(cut) = &recording.cut {
@@ -187,22 +196,23 @@ fn nothing_exported(file: &Path, recording: &Recording, layer: Option<&str>, veh
 }
 
 /// Writes one map's files.
-fn write(map: &MapView, layer: &Layer, format: Format, style: &Style, out: &Path) -> Result<()> {
-    let stem = format!("{:06}_{}", map.sequence(), layer.name);
-    let write = |name: String, bytes: Vec<u8>| {
-        let path = out.join(name);
+fn write(stem: &str, files: Vec<(String, Vec<u8>)>, out: &Path) -> Result<()> {
+    files.into_iter().try_for_each(|(rest, bytes)| {
+        let path = out.join(format!("{stem}{rest}"));
         fs::write(&path, bytes).with_context(|| format!("write {}", path.display()))
-    };
-    match format {
-        Format::Png => write(format!("{stem}.png"), picture::png(layer, style)?),
-        // One file for all maps: `ViewerFile`.
-        Format::Foxglove | Format::Ros2 => Ok(()),
-        Format::Json => write(format!("{stem}.json"), serde_json::to_vec(&document::layer(map, layer, true))?),
-        Format::Npy => {
-            for channel in &layer.channels {
-                write(format!("{stem}_{}.npy", channel.name), npy::encode(&channel.cells, layer.grid.shape()))?;
-            }
-            write(format!("{stem}.json"), serde_json::to_vec_pretty(&document::layer(map, layer, false))?)
-        }
-    }
+    })
+}
+
+fn png(_: &MapView, layer: &Layer, style: &Style) -> Result<Vec<(String, Vec<u8>)>> {
+    Ok(vec![(".png".into(), picture::png(layer, style)?)])
+}
+
+fn json(map: &MapView, layer: &Layer, _: &Style) -> Result<Vec<(String, Vec<u8>)>> {
+    Ok(vec![(".json".into(), serde_json::to_vec(&document::layer(map, layer, true))?)])
+}
+
+fn npy(map: &MapView, layer: &Layer, _: &Style) -> Result<Vec<(String, Vec<u8>)>> {
+    let array = |channel: &Channel| (format!("_{}.npy", channel.name), npy::encode(&channel.cells, layer.grid.shape()));
+    let document = serde_json::to_vec_pretty(&document::layer(map, layer, false))?;
+    Ok(layer.channels.iter().map(array).chain([(".json".into(), document)]).collect())
 }
