@@ -10,9 +10,9 @@ use std::process::Stdio;
 use clearway_client::MapView;
 use clearway_client::viewer::Raster;
 use clearway_mapping::event::{Body, EgoPose};
-use clearway_server::config::{Config, Ros2};
+use clearway_server::config::{Config, Foxglove, Ros2};
 use clearway_server::ingest::Reading;
-use clearway_server::server::Running;
+use clearway_server::server::{Running, Server, Setup};
 use house::{LAYERS, config, feed, readings, start, venv, within};
 use nalgebra::{Isometry3, Vector3};
 use serde_json::{Value, json};
@@ -95,10 +95,19 @@ async fn a_ros_2_subscriber_who_comes_late_finds_every_layer_and_the_vehicle_on_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn no_layer_is_made_for_topics_and_channels_nobody_subscribes_to() {
+    let mut config = ros2();
+    config.foxglove = Foxglove { enabled: true, listen: "127.0.0.1:0".parse().unwrap() };
+    let running = Server::start(Setup { config, ..Setup::default() }).await.unwrap();
+    assert!(feed(&running, readings(4)).await >= 3);
+    assert_eq!(newest(&running).layers(), []);
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_foxglove_client_is_shown_the_current_map_at_once_and_points_from_then_on() {
     let mut config = config();
-    config.foxglove.enabled = true;
-    config.foxglove.listen = "127.0.0.1:0".parse().unwrap();
+    config.foxglove = Foxglove { enabled: true, listen: "127.0.0.1:0".parse().unwrap() };
     let running = start(config).await;
     let mut readings = readings(8);
     place(&running, &readings).await;
