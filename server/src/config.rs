@@ -14,9 +14,11 @@ use serde::{Deserialize, Serialize};
 
 mod ros;
 mod udp;
+mod zenoh;
 
-pub use ros::{Ros, Ros2};
+pub use ros::Ros;
 pub use udp::{Listener, Ports, Route, Sender, Udp, listeners};
+pub use zenoh::{Ros2, Zenoh, ZenohMode};
 
 /// The configured tables by vehicle and sensor, in the order of the configuration; `None` where the factory's serves.
 pub type Calibrations = Vec<Vec<Option<Calibration>>>;
@@ -117,64 +119,6 @@ pub struct Page {
 impl Default for Page {
     fn default() -> Self {
         Self { enabled: true, listen: SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 8080) }
-    }
-}
-
-/// `[zenoh]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Zenoh {
-    /// Whether it is published at all.
-    pub enabled: bool,
-    /// Part played in the zenoh network.
-    pub mode: ZenohMode,
-    /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
-    pub listen: Vec<String>,
-    /// Endpoints of routers or peers to connect to.
-    pub connect: Vec<String>,
-    /// Look for peers by multicast.
-    pub scouting: bool,
-    /// Maps as ROS 2 topics.
-    pub ros2: Ros2,
-    /// A zenoh configuration (JSON5) to begin with: TLS, access control; the keys above stand over it. Empty: zenoh's own
-    /// defaults.
-    pub file: PathBuf,
-}
-
-impl Default for Zenoh {
-    fn default() -> Self {
-        Self {
-            enabled: true,
-            mode: ZenohMode::Peer,
-            listen: vec!["tcp/127.0.0.1:7447".into()],
-            connect: Vec::new(),
-            scouting: false,
-            ros2: Ros2::default(),
-            file: PathBuf::new(),
-        }
-    }
-}
-
-/// Part played in the zenoh network.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ZenohMode {
-    /// Talks to whoever connects, and to the endpoints of `connect`.
-    Peer,
-    /// Hangs on one router.
-    Client,
-    /// Is itself a router.
-    Router,
-}
-
-impl ZenohMode {
-    /// As the zenoh configuration spells it.
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Peer => "peer",
-            Self::Client => "client",
-            Self::Router => "router",
-        }
     }
 }
 

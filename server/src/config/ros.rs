@@ -1,14 +1,12 @@
-//! `[vehicle.ros]`: which ROS 2 topics feed a vehicle; `[zenoh.ros2]`: which ones its maps become.
+//! `[vehicle.ros]`: which ROS 2 topics feed a vehicle.
 
 use std::collections::BTreeMap;
 
 use clearway_mapping::config::SensorConfig;
 use serde::{Deserialize, Serialize};
 
-use super::Vehicle;
-
 /// What `ROS_DOMAIN_ID` may be.
-const DOMAIN_MAX: u32 = 232;
+pub(super) const DOMAIN_MAX: u32 = 232;
 
 /// `[vehicle.ros]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -76,60 +74,8 @@ impl Ros {
     }
 }
 
-/// `[zenoh.ros2]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Ros2 {
-    /// Whether maps are published to ROS 2 at all.
-    pub enabled: bool,
-    /// `ROS_DOMAIN_ID`.
-    pub domain: u32,
-    /// What stands before `/<vehicle>/<layer>`; may be empty.
-    pub namespace: String,
-}
-
-impl Default for Ros2 {
-    fn default() -> Self {
-        Self { enabled: false, domain: 0, namespace: "/clearway".into() }
-    }
-}
-
-impl Ros2 {
-    /// Checks every value; `Err` has the key, the value and what is allowed.
-    pub(super) fn check(
-        &self,
-        zenoh_enabled: bool,
-        vehicles: &[Vehicle],
-    ) -> Result<(), (&'static str, String, String)> {
-        if self.domain > DOMAIN_MAX {
-            return Err(("zenoh.ros2.domain", self.domain.to_string(), format!("0 to {DOMAIN_MAX}")));
-        }
-        if !self.enabled {
-            return Ok(());
-        }
-        if !zenoh_enabled {
-            let allowed = "only with zenoh.enabled = true: it goes through zenoh";
-            return Err(("zenoh.ros2.enabled", "true".into(), allowed.into()));
-        }
-        // ROS 2 takes no name that begins with a digit.
-        let is_name = |topic: &str| {
-            is_topic(topic) && !topic.split('/').any(|part| part.starts_with(|c: char| c.is_ascii_digit()))
-        };
-        if !self.namespace.is_empty() && !is_name(&self.namespace) {
-            return Err(("zenoh.ros2.namespace", self.namespace.clone(), "such as \"/clearway\", or empty".into()));
-        }
-        match vehicles.iter().find(|vehicle| !is_name(&format!("/{}", vehicle.name))) {
-            None => Ok(()),
-            Some(vehicle) => {
-                let allowed = "with zenoh.ros2.enabled: letters, digits and underscores, no digit first";
-                Err(("vehicle.name", vehicle.name.clone(), allowed.into()))
-            }
-        }
-    }
-}
-
 /// Whether ROS allows such a topic: parts of letters, digits and underscores, each behind a slash.
-fn is_topic(topic: &str) -> bool {
+pub(super) fn is_topic(topic: &str) -> bool {
     let part = |part: &str| !part.is_empty() && part.bytes().all(|byte| byte == b'_' || byte.is_ascii_alphanumeric());
     topic.strip_prefix('/').is_some_and(|rest| rest.split('/').all(part))
 }
