@@ -27,6 +27,7 @@
 //! | [`observation`] | scans, poses, roads, packets -> [`Observation`] |
 //! | [`ingest`] | observations -> the server, and what became of them |
 //! | `picture` | a layer -> a PNG from above (feature `picture`) |
+//! | `viewer` | a map -> ROS 2 and Foxglove messages (feature `viewers`) |
 //! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`) |
 
 mod freshness;
@@ -37,6 +38,8 @@ pub mod observation;
 pub mod picture;
 pub mod stream;
 pub mod view;
+#[cfg(feature = "viewers")]
+pub mod viewer;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
 
