@@ -21,6 +21,7 @@
 //! | file | in -> out |
 //! |---|---|
 //! | [`view`] | bytes -> [`MapView`]: decoded once, cheap to clone, with its age |
+//! | [`footprint`] | a map, a rectangle or a point -> whether it is free, the nearest obstacle |
 //! | [`stream`] | updates -> the newest map in a slot, skips counted |
 //! | [`grpc`] | a server's address -> [`Client`] |
 //! | [`observation`] | scans, poses, roads, packets -> [`Observation`] |
@@ -28,6 +29,7 @@
 //! | `picture` | a layer -> a PNG from above (feature `picture`) |
 //! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`) |
 
+pub mod footprint;
 pub mod grpc;
 pub mod ingest;
 pub mod observation;
@@ -41,6 +43,7 @@ pub mod zenoh;
 pub use clearway_proto::map::{Channel, Layer};
 pub use clearway_proto::{codec, grid, v1};
 
+pub use footprint::{Footprint, Obstacle};
 pub use grpc::{Client, Subscription, Tls};
 pub use ingest::Ingester;
 pub use observation::{Observation, Refusal};
