@@ -13,16 +13,20 @@ use clearway_client::{ClientError, MapView};
 const CELL_M: f64 = 0.5;
 /// It looks this far, metres.
 const REACH_M: f64 = 16.0;
-/// From the vehicle's middle to anything: half its width, its corners in bends, half a cell of the map and of its own.
-const CLEARANCE_M: f64 = 1.5;
+/// Three discs about these places of the vehicle, metres ahead of its middle, cover it; each has a radius of 1.16 m.
+const DISCS_M: [f64; 3] = [1.45, 0.0, -1.45];
+/// From the middle of a disc to an obstacle's: its radius, and half a cell. Where that is not to be had, less at a crawl.
+const CLEARANCES_M: [(f64, f64); 2] = [(1.5, MPS_MAX), (1.2, 1.0)];
 /// Where it begins, the ground about it that its sensor cannot see is taken on trust, metres.
 const STAND_M: f64 = 5.0;
-/// What was seen is forgotten after this, ns.
-const MEMORY_NS: i64 = 8_000_000_000;
+/// And driven over so slowly, m/s.
+const STAND_MPS: f64 = 2.0;
+/// An obstacle that is not seen again is forgotten after this, ns; the ground under it is then unknown.
+const MEMORY_NS: i64 = 2_000_000_000;
 /// Never faster, m/s.
 const MPS_MAX: f64 = 8.0;
 /// Braking, and to the side, m/s².
-const BRAKE_MPS2: f64 = 3.0;
+const BRAKE_MPS2: f64 = 4.0;
 /// Tightest turn, 1/m.
 const CURVATURE_MAX: f64 = 0.2;
 
@@ -70,12 +74,16 @@ impl Planner {
             }
         };
         let begins = self.seen.is_empty();
-        self.seen.retain(|_, seen| stamp_ns - seen.stamp_ns < MEMORY_NS);
+        let here = [self.ego[0], self.ego[1]];
+        self.seen.retain(|cell, seen| {
+            let is_fresh = seen.mps > 0.0 || stamp_ns - seen.stamp_ns < MEMORY_NS;
+            is_fresh && distance(middle(*cell), here) < 1.25 * REACH_M
+        });
         for cell in about(self.cell_of_ego(), REACH_M) {
             let [x, y] = self.in_ego(middle(cell));
             let mps = match layer.class_at(x, y).1 {
                 "passable" | "road" => layer.value_at("speed", x, y).unwrap_or(0.0),
-                "unknown" if begins && x.hypot(y) < STAND_M => 1.0,
+                "unknown" if begins && x.hypot(y) < STAND_M => STAND_MPS,
                 _ => continue,
             };
             self.seen.insert(cell, Seen { mps, stamp_ns });
@@ -90,6 +98,27 @@ impl Planner {
         Ok(())
     }
 
+    /// What it knows of the ground about the vehicle, ahead up: `.` passable, `#` an obstacle, blank nobody saw.
+    pub fn picture(&self) -> String {
+        let here = self.cell_of_ego();
+        let mark = |ahead: i32, left: i32| {
+            let cell = cell_of(self.in_map([f64::from(ahead) * CELL_M, f64::from(left) * CELL_M]));
+            match self.seen.get(&cell) {
+                _ if cell == here => '^',
+                None => ' ',
+                Some(seen) => {
+                    if seen.mps > 0.0 {
+                        '.'
+                    } else {
+                        '#'
+                    }
+                }
+            }
+        };
+        let line = |ahead| (-24..=24).rev().map(|left| mark(ahead, left)).chain(['\n']).collect::<String>();
+        (-8..=24).rev().map(line).collect()
+    }
+
     /// The place so many metres straight ahead, in the planner's frame.
     pub fn ahead(&self, metres: f64) -> Place {
         self.in_map([metres, 0.0])
@@ -97,21 +126,42 @@ impl Planner {
 
     /// The next move towards a goal, or to where the way ends nearest to it.
     pub fn next_move(&self, goal: Place) -> Move {
-        let open = self.open();
-        let way = self.way(goal, &open);
-        let way_m: f64 = way.array_windows().map(|[a, b]| distance(*a, *b)).sum();
-        let [x, y] =
-            self.in_ego(*way.iter().rev().find(|place| self.is_straight_to(**place, &open)).unwrap_or(&way[0]));
-        let range_m = x.hypot(y);
-        if range_m < 1.0 || x < 0.0 {
-            return Move { curvature_per_m: 0.0, mps: 0.0, way_m };
+        let mut way_m = 0.0;
+        for (clearance_m, mps) in CLEARANCES_M {
+            let open = self.open(clearance_m);
+            let way = self.way(goal, &open);
+            way_m = way.array_windows().map(|[a, b]| distance(*a, *b)).sum();
+            let ahead =
+                way.iter().rev().map(|place| self.in_ego(*place)).filter(|[x, y]| *x > 0.0 && x.hypot(*y) > 2.0);
+            let mut arcs = ahead.map(|[x, y]| (2.0 * y / (x * x + y * y), x.hypot(y)));
+            if let Some((curvature_per_m, _)) =
+                arcs.find(|(curvature, length_m)| self.is_clear(*curvature, *length_m, &open))
+            {
+                let seen = way.iter().filter_map(|place| self.seen.get(&cell_of(*place)));
+                let allowed = seen.take(6).map(|seen| seen.mps).fold(mps, f64::min);
+                let in_bend = (BRAKE_MPS2 / curvature_per_m.abs()).sqrt();
+                let to_stop = (2.0 * BRAKE_MPS2 * (way_m - 2.0).max(0.0)).sqrt();
+                return Move { curvature_per_m, mps: allowed.min(in_bend).min(to_stop), way_m };
+            }
         }
-        let curvature_per_m = (2.0 * y / (range_m * range_m)).clamp(-CURVATURE_MAX, CURVATURE_MAX);
-        let seen = way.iter().filter_map(|place| self.seen.get(&cell_of(*place)));
-        let allowed = seen.take(6).map(|seen| seen.mps).fold(MPS_MAX, f64::min);
-        let in_bend = (BRAKE_MPS2 / curvature_per_m.abs()).sqrt();
-        let to_stop = (2.0 * BRAKE_MPS2 * (way_m - 2.0).max(0.0)).sqrt();
-        Move { curvature_per_m, mps: allowed.min(in_bend).min(to_stop), way_m }
+        Move { curvature_per_m: 0.0, mps: 0.0, way_m }
+    }
+
+    /// Whether the vehicle may follow an arc so far.
+    fn is_clear(&self, curvature_per_m: f64, length_m: f64, open: &HashMap<Cell, f64>) -> bool {
+        let steps = (length_m / (CELL_M / 2.0)).ceil();
+        let is_open = |step: f64, disc_m: f64| {
+            let turned = curvature_per_m * length_m * step / steps;
+            // The chord of an arc points half as far round as the arc turns.
+            let (chord_m, (half_sin, half_cos)) = (length_m * step / steps, (turned / 2.0).sin_cos());
+            let (sin, cos) = turned.sin_cos();
+            let place = [chord_m * half_cos + disc_m * cos, chord_m * half_sin + disc_m * sin];
+            open.contains_key(&cell_of(self.in_map(place)))
+        };
+        // What the tail stands in it leaves.
+        let discs = |step: f64| DISCS_M.into_iter().filter(move |disc_m| length_m * step / steps + disc_m > 0.5);
+        curvature_per_m.abs() <= CURVATURE_MAX
+            && (0..=steps as u32).map(f64::from).all(|step| discs(step).all(|disc_m| is_open(step, disc_m)))
     }
 
     /// A* over the planner's cells; begins with the vehicle's place.
@@ -134,7 +184,7 @@ impl Planner {
             if distance(middle(cell), goal) < CELL_M {
                 break;
             }
-            for next in about(cell, CELL_M).filter(|next| *next != cell) {
+            for next in about(cell, 1.5 * CELL_M).filter(|next| *next != cell) {
                 let Some(mps) = open.get(&next) else { continue };
                 let spent = spent + distance(middle(cell), middle(next)) / mps.min(MPS_MAX);
                 if best.get(&next).is_none_or(|(before, _)| spent < *before) {
@@ -149,25 +199,17 @@ impl Planner {
         way
     }
 
-    /// Speeds of the cells the vehicle's middle may be in: seen, passable, and nothing within the clearance.
-    fn open(&self) -> HashMap<Cell, f64> {
+    /// Speeds of the cells a disc's middle may be in: seen, passable, and no obstacle within the clearance.
+    fn open(&self, clearance_m: f64) -> HashMap<Cell, f64> {
         let near = |cell: &Cell| distance(middle(*cell), [self.ego[0], self.ego[1]]) < REACH_M;
         let seen = self.seen.iter().filter(|(cell, _)| near(cell));
         let mut open: HashMap<Cell, f64> = seen.clone().map(|(cell, seen)| (*cell, seen.mps)).collect();
         for (obstacle, _) in seen.filter(|(_, seen)| seen.mps == 0.0) {
-            for cell in about(*obstacle, CLEARANCE_M) {
+            for cell in about(*obstacle, clearance_m) {
                 open.remove(&cell);
             }
         }
         open
-    }
-
-    /// Whether the vehicle may go straight to a place.
-    fn is_straight_to(&self, place: Place, open: &HashMap<Cell, f64>) -> bool {
-        let from = [self.ego[0], self.ego[1]];
-        let steps = (distance(from, place) / (CELL_M / 2.0)).ceil().max(1.0);
-        let at = |step: f64| [0, 1].map(|axis| from[axis] + (place[axis] - from[axis]) * step / steps);
-        (1..=steps as u32).all(|step| open.contains_key(&cell_of(at(f64::from(step)))))
     }
 
     fn cell_of_ego(&self) -> Cell {
@@ -197,10 +239,11 @@ fn distance(a: Place, b: Place) -> f64 {
     (a[0] - b[0]).hypot(a[1] - b[1])
 }
 
-/// The cells whose middles lie within so many metres of a cell's to each side, cut to a disc beyond its neighbours.
+/// A cell and those whose middles lie within so many metres of its own.
 fn about([ix, iy]: Cell, reach_m: f64) -> impl Iterator<Item = Cell> {
-    let reach = (reach_m / CELL_M).round() as i32;
+    let cells = reach_m / CELL_M;
+    let reach = cells as i32;
     let square = (-reach..=reach).flat_map(move |dx| (-reach..=reach).map(move |dy| [dx, dy]));
-    let disc = square.filter(move |[dx, dy]| reach < 2 || dx * dx + dy * dy <= reach * reach);
+    let disc = square.filter(move |[dx, dy]| f64::from(dx * dx + dy * dy) <= cells * cells);
     disc.map(move |[dx, dy]| [ix + dx, iy + dy])
 }

@@ -25,6 +25,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
         planner.take(&map)?;
         let Move { curvature_per_m, mps, way_m } = planner.next_move(planner.ahead(12.0));
+        println!("{}", planner.picture());
         println!("map {}: a way of {way_m:4.1} m; drive {mps:.1} m/s, turn {curvature_per_m:+.3} 1/m", map.sequence());
     }
 }
