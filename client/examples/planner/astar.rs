@@ -25,6 +25,8 @@ const STAND_MPS: f64 = 2.0;
 const MEMORY_NS: i64 = 2_000_000_000;
 /// Never faster, m/s.
 const MPS_MAX: f64 = 8.0;
+/// Nothing nearer is aimed at, metres.
+const NEAREST_M: f64 = 2.0;
 /// Braking, and to the side, m/s².
 const BRAKE_MPS2: f64 = 4.0;
 /// Tightest turn, 1/m.
@@ -106,13 +108,8 @@ impl Planner {
             match self.seen.get(&cell) {
                 _ if cell == here => '^',
                 None => ' ',
-                Some(seen) => {
-                    if seen.mps > 0.0 {
-                        '.'
-                    } else {
-                        '#'
-                    }
-                }
+                Some(seen) if seen.mps == 0.0 => '#',
+                Some(_) => '.',
             }
         };
         let line = |ahead| (-24..=24).rev().map(|left| mark(ahead, left)).chain(['\n']).collect::<String>();
@@ -124,30 +121,32 @@ impl Planner {
         self.in_map([metres, 0.0])
     }
 
-    /// The next move towards a goal, or to where the way ends nearest to it.
+    /// The next move towards a goal, or to where the way ends nearest to it: the arc to the farthest place of the way that
+    /// can be followed up to there.
     pub fn next_move(&self, goal: Place) -> Move {
         let mut way_m = 0.0;
         for (clearance_m, mps) in CLEARANCES_M {
             let open = self.open(clearance_m);
             let way = self.way(goal, &open);
             way_m = way.array_windows().map(|[a, b]| distance(*a, *b)).sum();
-            let ahead =
-                way.iter().rev().map(|place| self.in_ego(*place)).filter(|[x, y]| *x > 0.0 && x.hypot(*y) > 2.0);
+            let ahead = way.iter().rev().map(|place| self.in_ego(*place)).filter(|[x, _]| *x > NEAREST_M);
             let mut arcs = ahead.map(|[x, y]| (2.0 * y / (x * x + y * y), x.hypot(y)));
-            if let Some((curvature_per_m, _)) =
-                arcs.find(|(curvature, length_m)| self.is_clear(*curvature, *length_m, &open))
-            {
-                let seen = way.iter().filter_map(|place| self.seen.get(&cell_of(*place)));
-                let allowed = seen.take(6).map(|seen| seen.mps).fold(mps, f64::min);
-                let in_bend = (BRAKE_MPS2 / curvature_per_m.abs()).sqrt();
-                let to_stop = (2.0 * BRAKE_MPS2 * (way_m - 2.0).max(0.0)).sqrt();
-                return Move { curvature_per_m, mps: allowed.min(in_bend).min(to_stop), way_m };
-            }
+            let Some((curvature_per_m, length_m)) =
+                arcs.find(|(bend, length_m)| self.is_clear(*bend, *length_m, &open))
+            else {
+                continue;
+            };
+            let seen = way.iter().filter_map(|place| self.seen.get(&cell_of(*place)));
+            let allowed = seen.take(6).map(|seen| seen.mps).fold(mps, f64::min);
+            let in_bend = (BRAKE_MPS2 / curvature_per_m.abs()).sqrt();
+            // A map is a tenth of a second old, and the next one comes in another.
+            let to_stop = (2.0 * BRAKE_MPS2 * (length_m - 1.0)).sqrt();
+            return Move { curvature_per_m, mps: allowed.min(in_bend).min(to_stop), way_m };
         }
         Move { curvature_per_m: 0.0, mps: 0.0, way_m }
     }
 
-    /// Whether the vehicle may follow an arc so far.
+    /// Whether the vehicle may follow an arc so far; bends are slight enough to take an arc to be as long as its chord.
     fn is_clear(&self, curvature_per_m: f64, length_m: f64, open: &HashMap<Cell, f64>) -> bool {
         let steps = (length_m / (CELL_M / 2.0)).ceil();
         let is_open = |step: f64, disc_m: f64| {
