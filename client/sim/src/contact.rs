@@ -36,7 +36,7 @@ impl Hull {
     /// Whether the ground it covers meets what a shape covers.
     fn meets(&self, shape: &Shape) -> bool {
         let (outline, radius) = shape.outline();
-        let corners = outline.map(|corner| self.from_world(corner));
+        let corners = outline.map(|corner| self.in_own_frame(corner));
         let half = [self.size[0] / 2.0, self.size[1] / 2.0];
         if radius > 0.0 {
             let off = |axis: usize| (corners[0][axis].abs() - half[axis]).max(0.0);
@@ -54,7 +54,7 @@ impl Hull {
         })
     }
 
-    fn from_world(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+    fn in_own_frame(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         let ((sin, cos), dx, dy) = (self.heading.sin_cos(), x - self.x, y - self.y);
         [dx * cos + dy * sin, dy * cos - dx * sin]
     }
