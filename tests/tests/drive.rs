@@ -117,6 +117,9 @@ impl Loop {
             planner.take(if driven.turns % 2 == 0 { &over_grpc } else { &over_zenoh }).unwrap();
             let (x, y, _) = route.course.at(route.start + driven.length_m + GOAL_M, route.left);
             next = planner.next_move([x, y]);
+            if driven.turns % 100 == 0 {
+                println!("{driven:?}: {next:?}");
+            }
             assert!(driven.seconds < 30.0 + driven.length_m / 2.0, "it does not get on: {driven:?}, {next:?}");
         }
         let ledger = self.running.vehicles.0[0].status.snapshot().ledger;

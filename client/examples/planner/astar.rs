@@ -129,18 +129,17 @@ impl Planner {
             let open = self.open(clearance_m);
             let way = self.way(goal, &open);
             way_m = way.array_windows().map(|[a, b]| distance(*a, *b)).sum();
-            let ahead = way.iter().rev().map(|place| self.in_ego(*place)).filter(|[x, _]| *x > NEAREST_M);
+            let ahead =
+                way.iter().rev().map(|place| self.in_ego(*place)).filter(|[x, y]| *x > 0.0 && x.hypot(*y) > NEAREST_M);
             let mut arcs = ahead.map(|[x, y]| (2.0 * y / (x * x + y * y), x.hypot(y)));
-            let Some((curvature_per_m, length_m)) =
-                arcs.find(|(bend, length_m)| self.is_clear(*bend, *length_m, &open))
+            let Some((curvature_per_m, _)) = arcs.find(|(bend, length_m)| self.is_clear(*bend, *length_m, &open))
             else {
                 continue;
             };
             let seen = way.iter().filter_map(|place| self.seen.get(&cell_of(*place)));
             let allowed = seen.take(6).map(|seen| seen.mps).fold(mps, f64::min);
             let in_bend = (BRAKE_MPS2 / curvature_per_m.abs()).sqrt();
-            // A map is a tenth of a second old, and the next one comes in another.
-            let to_stop = (2.0 * BRAKE_MPS2 * (length_m - 1.0)).sqrt();
+            let to_stop = (2.0 * BRAKE_MPS2 * (way_m - 2.0).max(0.0)).sqrt();
             return Move { curvature_per_m, mps: allowed.min(in_bend).min(to_stop), way_m };
         }
         Move { curvature_per_m: 0.0, mps: 0.0, way_m }
