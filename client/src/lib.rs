@@ -22,6 +22,7 @@
 //! |---|---|
 //! | `freshness` | two clocks -> how old a map is at least |
 //! | [`view`] | bytes -> [`MapView`]: decoded once, cheap to clone, with its age |
+//! | [`footprint`] | a map, a rectangle or a point -> whether it is free, the nearest obstacle |
 //! | [`stream`] | updates -> the newest map in a slot, skips counted |
 //! | [`grpc`] | a server's address -> [`Client`] |
 //! | [`observation`] | scans, poses, roads, packets -> [`Observation`] |
@@ -30,6 +31,7 @@
 //! | `viewer` | a map -> ROS 2 and Foxglove messages (feature `viewers`) |
 //! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`) |
 
+pub mod footprint;
 mod freshness;
 pub mod grpc;
 pub mod ingest;
@@ -46,6 +48,7 @@ pub mod zenoh;
 pub use clearway_proto::map::{Channel, Layer};
 pub use clearway_proto::{codec, grid, v1};
 
+pub use footprint::{Footprint, Obstacle};
 pub use freshness::now_ns;
 pub use grpc::{Client, Subscription, Tls};
 pub use ingest::Ingester;

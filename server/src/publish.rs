@@ -14,9 +14,9 @@ pub mod foxglove;
 pub mod grpc;
 pub mod page;
 pub mod reader;
-pub mod selection;
 #[cfg(feature = "zenoh")]
 mod ros;
+pub mod selection;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
 
