@@ -39,7 +39,9 @@ fn world(seed: u64, time: u64, ix: i64, iy: i64) -> u16 {
         (h ^ h >> 29).wrapping_mul(0xbf58_476d_1ce4_e5b9) >> 40
     };
     let changed = hash(ix, iy, time).is_multiple_of(300);
-    (hash(ix >> 2, iy >> 2, if changed { time } else { 0 }) % 5 * 13_007) as u16
+    let patch = hash(ix >> 2, iy >> 2, if changed { time } else { 0 });
+    // Its class, and what cells of one class differ by.
+    (patch % 5 * 13_007 + hash(ix, iy, 0) % 90) as u16
 }
 
 /// A grid of three channels, one of each type, at a place of the endless one.

@@ -19,8 +19,6 @@ pub const OBSTACLE: u8 = 2;
 pub const LEGEND: &[&str] = &["unknown", "drivable", "obstacle"];
 /// Raw `difference` of a cell without points.
 pub const DIFFERENCE_UNKNOWN: u16 = u16::MAX;
-/// Of the channel `difference`. 2 cm is what a sensor's ranges vary by; finer steps would be bytes that say nothing.
-const STEPS_A_METRE: f32 = 50.0;
 
 /// Makes the layer from sweep after sweep, reusing its buffers.
 pub struct HeightDifference {
@@ -54,7 +52,7 @@ impl LayerMaker for HeightDifference {
                 Channel {
                     name: "difference",
                     unit: "m",
-                    scale: 1.0 / STEPS_A_METRE,
+                    scale: 0.01,
                     unknown: i32::from(DIFFERENCE_UNKNOWN),
                     cells: Cells::U16(Vec::new()),
                 },
@@ -93,7 +91,7 @@ impl LayerMaker for HeightDifference {
         }));
         difference.clear();
         difference.extend(spans.iter().map(|[highest, lowest]| match highest - lowest {
-            apart if apart >= 0.0 => ((apart * STEPS_A_METRE).round() as u16).min(DIFFERENCE_UNKNOWN - 1),
+            apart if apart >= 0.0 => ((apart * 100.0).round() as u16).min(DIFFERENCE_UNKNOWN - 1),
             _ => DIFFERENCE_UNKNOWN,
         }));
         let known = class.iter().filter(|c| **c != UNKNOWN).count();

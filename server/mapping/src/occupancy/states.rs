@@ -89,10 +89,11 @@ pub struct Cell {
 }
 
 impl Cell {
-    /// The hits as published: in an unknown cell the power of two they reach (what tells 20 returns from 23 is chance, and
-    /// would be half of the layer's bytes), 0 in any other: in an occupied one they are always 255, as its state says.
+    /// The hits as published: 255 in an occupied cell, in an unknown one the power of two they reach (what tells 20 returns
+    /// from 23 is chance, and would be half of the layer's bytes), 0 in any other.
     pub fn level(self) -> u8 {
         match (self.state, self.hits) {
+            (OCCUPIED, hits) => hits,
             (UNKNOWN, hits) if hits > 0 => 1 << hits.ilog2(),
             _ => 0,
         }
