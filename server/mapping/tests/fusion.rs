@@ -484,6 +484,27 @@ fn a_host_clock_that_steps_holds_no_map() {
 }
 
 #[test]
+fn a_turn_that_a_silence_held_back_makes_no_map_older_than_the_last_though_the_host_steps_as_it_ends() {
+    let mut events = velodyne(Model::Vlp16, 1.9, 2000);
+    let start_ns = events[0].arrival_ns;
+    let silent = start_ns + 550 * MS..start_ns + 1300 * MS;
+    events.retain(|event| !silent.contains(&event.arrival_ns));
+    events.extend((1..20).map(|n| scan(1, start_ns + n * 100 * MS)).filter(|event| event.arrival_ns < silent.end));
+    events.sort_by_key(|event| event.arrival_ns);
+    for host_ns in [0, 2_000 * MS, 3_600_000 * MS, -2_000 * MS] {
+        let mut pipeline = pipeline(&config());
+        let made: Vec<i64> = (events.iter())
+            .filter_map(|event| {
+                let ahead_ns = if event.arrival_ns < silent.end { 0 } else { host_ns };
+                step(&mut pipeline, &Event { arrival_ns: event.arrival_ns + ahead_ns, ..event.clone() })
+            })
+            .map(|map| map.capture_end_ns)
+            .collect();
+        assert!(made.len() > 12 && made.is_sorted_by(|before, after| before < after), "{host_ns}: {made:?}");
+    }
+}
+
+#[test]
 fn a_sensor_is_declared_by_an_event_and_what_cannot_be_one_is_refused_by_name() {
     let mut pipeline = pipeline(&config());
     let declare = |source: u16, name: &str, extrinsics| {

@@ -129,6 +129,14 @@ fn scripts() -> Vec<Script> {
         },
         Script { name: "the host steps an hour on, under GPS", host_ns: |t| after(t, HOUR, 0), ..BASE },
         Script { name: "the host steps an hour back, under GPS", host_ns: |t| after(t, -HOUR, 0), ..BASE },
+        Script {
+            name: "GPS is gained and the host set an hour on between two packets",
+            device_ns: |t| after(t, NOON, 1_414 * S) + t,
+            telemetry: |t| after(t, gps(NOON + t), None),
+            host_ns: |t| after(t, 0, -HOUR),
+            right_ns: |t| after(t, 0, -HOUR),
+            ..BASE
+        },
         Script { name: "the host steps 2 s on during a silence, under GPS", host_ns: |t| after(t, 2 * S, 0), ..silent },
         Script {
             name: "the host steps 2 s back during a silence, under GPS",
