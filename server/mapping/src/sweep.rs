@@ -131,18 +131,31 @@ impl Sweep {
         screen: Option<&Screen>,
     ) {
         let first = series.take(revolution);
-        let hides = screen.map(|screen| hides(mount, screen));
-        self.deviation_m.clear();
-        for (number, echo) in revolution.echoes.iter().enumerate() {
-            let hidden = |slot: usize| {
-                let hides = hides.as_ref();
-                hides.is_some_and(|hides| hides([echo.x[slot], echo.y[slot], echo.z[slot]]).is_some())
-            };
-            let far =
-                echo.range_m.iter().enumerate().filter(|(_, range)| **range > 0.0 && **range >= mount.range_m_min);
-            let kept = far.filter(|(slot, _)| !hidden(*slot));
-            self.deviation_m.extend(kept.map(|(slot, _)| if number == 0 { first[slot] } else { f32::NAN }));
+        match screen {
+            None => self.fill_deviations(revolution, mount, first, |_| None),
+            Some(screen) => self.fill_deviations(revolution, mount, first, hides(mount, screen)),
         }
+    }
+
+    fn fill_deviations(
+        &mut self,
+        revolution: &Revolution,
+        mount: &Mount,
+        first: &[f32],
+        hides: impl Fn([f32; 3]) -> Option<Hidden>,
+    ) {
+        // As the points: written always, kept by moving on.
+        self.deviation_m.resize(revolution.echoes.iter().map(|echo| echo.range_m.len()).sum::<usize>() + 1, f32::NAN);
+        let mut kept = 0;
+        for (number, echo) in revolution.echoes.iter().enumerate() {
+            let slots = echo.range_m.iter().zip(first).zip(&echo.x).zip(&echo.y).zip(&echo.z);
+            for ((((&range, &deviation), &x), &y), &z) in slots {
+                self.deviation_m[kept] = if number == 0 { deviation } else { f32::NAN };
+                let far = range > 0.0 && range >= mount.range_m_min;
+                kept += usize::from(far && hides([x, y, z]).is_none());
+            }
+        }
+        self.deviation_m.truncate(kept);
     }
 
     /// Fills the sweep from a scan, in place of what it held; gives the number of points left out because a coordinate

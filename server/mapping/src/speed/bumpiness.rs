@@ -15,6 +15,7 @@
 //! Heights are summed in whole millimetres, so their order says nothing.
 
 use crate::config::SpeedConfig;
+use crate::radial::whole;
 use crate::sweep::Sweep;
 
 /// Bumpiness of an obstacle.
@@ -24,6 +25,10 @@ pub const OBSTACLE_BUMPINESS: f32 = f32::INFINITY;
 const LOWEST_M: f32 = -20.0;
 /// Makes every height positive, and half a millimetre to round with.
 const OFFSET_MM: f32 = 20_000.5;
+/// Points are taken in chunks of this many, so that what is worked out of them stays in the first cache level.
+const CHUNK: usize = 256;
+/// Of a point that lies in no cell.
+const NOWHERE: u32 = u32::MAX;
 /// Cells a side of a block.
 const BLOCK: usize = 4;
 /// So many cells of 3 × 3 blocks are outvoted: the largest ghosts of the recorded drives cover six.
@@ -39,6 +44,27 @@ struct Cell {
     points: u32,
     sum: i64,
     squares: i64,
+}
+
+impl Cell {
+    #[inline(always)]
+    fn take(&mut self, millimetres: i16) {
+        let wide = i64::from(millimetres);
+        self.highest = self.highest.max(millimetres);
+        self.lowest = self.lowest.min(millimetres);
+        self.points += 1;
+        self.sum += wide;
+        self.squares += wide * wide;
+    }
+
+    #[inline(always)]
+    fn add(&mut self, other: &Self) {
+        self.highest = self.highest.max(other.highest);
+        self.lowest = self.lowest.min(other.lowest);
+        self.points += other.points;
+        self.sum += other.sum;
+        self.squares += other.squares;
+    }
 }
 
 const EMPTY: Cell = Cell { highest: i16::MIN, lowest: i16::MAX, points: 0, sum: 0, squares: 0 };
@@ -96,27 +122,55 @@ impl HeightMap {
             self.bumpiness_m[cell as usize] = f32::NAN;
         }
         self.met.clear();
-        let (middle, cells_a_m, side) = ((self.side / 2) as f32, 1.0 / config.cell_m, self.side as f32);
-        for ((&x, &y), &z) in sweep.x.iter().zip(&sweep.y).zip(&sweep.z) {
-            let (ix, iy) = (x * cells_a_m + middle, y * cells_a_m + middle);
-            // NaN fails every comparison.
-            let inside = ix >= 0.0 && ix < side && iy >= 0.0 && iy < side;
-            if !(inside && z > LOWEST_M && z <= config.overhang_m) {
-                continue;
+        let (mut cells, mut millimetres) = ([NOWHERE; CHUNK], [0; CHUNK]);
+        // A laser's neighbouring points mostly share a cell: they are summed before they are written.
+        let (mut index, mut held) = (NOWHERE, EMPTY);
+        let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
+        for ((xs, ys), zs) in chunks {
+            self.find_cells([xs, ys, zs], config, &mut cells, &mut millimetres);
+            for (&next, &millimetres) in cells.iter().zip(&millimetres).take(xs.len()) {
+                if next != index {
+                    self.add(index, &held);
+                    (index, held) = (next, EMPTY);
+                }
+                held.take(millimetres as i16);
             }
-            let index = iy as usize * self.side + ix as usize;
-            // Positive first, so that cutting off rounds.
-            let millimetres = ((z * 1000.0 + OFFSET_MM) as i32 - OFFSET_MM as i32) as i16;
-            let cell = &mut self.cells[index];
+        }
+        self.add(index, &held);
+    }
+
+    #[inline(always)]
+    fn add(&mut self, index: u32, held: &Cell) {
+        if index != NOWHERE {
+            let cell = &mut self.cells[index as usize];
             if cell.points == 0 {
-                self.met.push(index as u32);
+                self.met.push(index);
             }
-            let wide = i64::from(millimetres);
-            cell.highest = cell.highest.max(millimetres);
-            cell.lowest = cell.lowest.min(millimetres);
-            cell.points += 1;
-            cell.sum += wide;
-            cell.squares += wide * wide;
+            cell.add(held);
+        }
+    }
+
+    /// Cell and height of each point. Free of branches and tables, so that it runs four points at a time.
+    fn find_cells(
+        &self,
+        [xs, ys, zs]: [&[f32]; 3],
+        config: &SpeedConfig,
+        cells: &mut [u32; CHUNK],
+        millimetres: &mut [i32; CHUNK],
+    ) {
+        let (middle, cells_a_m, side) = ((self.side / 2) as f32, 1.0 / config.cell_m, self.side as f32);
+        let n = xs.len().min(CHUNK);
+        let (xs, ys, zs) = (&xs[..n], &ys[..n], &zs[..n]);
+        let (cells, millimetres) = (&mut cells[..n], &mut millimetres[..n]);
+        for i in 0..n {
+            let (ix, iy, z) = (xs[i] * cells_a_m + middle, ys[i] * cells_a_m + middle, zs[i]);
+            // NaN fails every comparison.
+            let within = (ix >= 0.0) & (ix < side) & (iy >= 0.0) & (iy < side);
+            let inside = within & (z > LOWEST_M) & (z <= config.overhang_m);
+            let [ix, iy, z] = [ix, iy, z * 1000.0 + OFFSET_MM].map(|value| whole(if inside { value } else { 0.0 }));
+            cells[i] = if inside { iy * self.side as u32 + ix } else { NOWHERE };
+            // Positive first, so that cutting off rounds.
+            millimetres[i] = z as i32 - OFFSET_MM as i32;
         }
     }
 

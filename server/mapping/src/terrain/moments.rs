@@ -9,8 +9,10 @@
 
 use crate::sweep::Sweep;
 
-/// Code of a point that lies in no cell.
+/// Of a point that lies in no cell.
 const NOWHERE: u32 = u32::MAX;
+/// From 2^23 to 2^24 an f32 holds whole numbers, and nothing else.
+const WHOLE: f32 = 1.5 * 8_388_608.0;
 /// Points lower than this are no positions on the ground, metres; it bounds the sums.
 const DEPTH_M_MAX: f32 = 100.0;
 
@@ -79,7 +81,8 @@ pub struct Cells {
     /// Cells from the ego origin to the edge of the division, a power of two.
     root_half: i32,
     cell_m: f32,
-    code_of_point: Vec<u32>,
+    /// Code of each point's cell, and once the slots are numbered its slot.
+    cell_of_point: Vec<u32>,
     /// One bit a cell of the division, by code: whether it holds a point.
     occupied: Vec<u64>,
     /// Occupied cells before each word of `occupied`.
@@ -114,8 +117,8 @@ impl Cells {
 
     fn find_cells(&mut self, sweep: &Sweep, overhang_m: f32) {
         let (scale, half, root_half) = (1.0 / self.cell_m, self.half as f32, self.root_half);
-        self.code_of_point.resize(sweep.x.len(), NOWHERE);
-        for (((code, &x), &y), &z) in self.code_of_point.iter_mut().zip(&sweep.x).zip(&sweep.y).zip(&sweep.z) {
+        self.cell_of_point.resize(sweep.x.len(), NOWHERE);
+        for (((code, &x), &y), &z) in self.cell_of_point.iter_mut().zip(&sweep.x).zip(&sweep.y).zip(&sweep.z) {
             let (i, j) = (x * scale, y * scale);
             // NaN fails every comparison.
             let inside = (i >= -half) & (i < half) & (j >= -half) & (j < half) & (z <= overhang_m) & (z > -DEPTH_M_MAX);
@@ -130,7 +133,7 @@ impl Cells {
         let cells = (4 * self.root_half * self.root_half) as usize;
         self.occupied.clear();
         self.occupied.resize(cells.div_ceil(64), 0);
-        for &code in self.code_of_point.iter().filter(|code| **code != NOWHERE) {
+        for &code in self.cell_of_point.iter().filter(|code| **code != NOWHERE) {
             self.occupied[(code >> 6) as usize] |= 1 << (code & 63);
         }
         self.slots_before.clear();
@@ -152,26 +155,30 @@ impl Cells {
         self.span.clear();
         self.span.resize(slots, [f32::INFINITY, -f32::INFINITY]);
         // A laser's neighbouring points mostly share a cell: they are summed before they are written.
-        let (mut code, mut held, mut low, mut high) = (NOWHERE, Moments::default(), f32::INFINITY, -f32::INFINITY);
-        let mut write = |code: u32, held: &Moments, low: f32, high: f32| {
-            if code != NOWHERE {
-                let slot = slot(&self.occupied, &self.slots_before, code);
+        let nothing = (Moments::default(), f32::INFINITY, -f32::INFINITY);
+        let (mut code, mut place, (mut held, mut low, mut high)) = (NOWHERE, NOWHERE, nothing);
+        let mut write = |slot: u32, held: &Moments, low: f32, high: f32| {
+            if slot != NOWHERE {
+                let slot = slot as usize;
                 self.sums[slot + 1] = self.sums[slot + 1].plus(held);
                 let [lowest, highest] = &mut self.span[slot];
                 (*lowest, *highest) = ((*lowest).min(low), (*highest).max(high));
             }
         };
-        let points = self.code_of_point.iter().zip(&sweep.x).zip(&sweep.y).zip(&sweep.z);
-        for (((&next, &x), &y), &z) in points {
-            if next != code {
-                write(code, &held, low, high);
-                (code, held, low, high) = (next, Moments::default(), f32::INFINITY, -f32::INFINITY);
+        let points = self.cell_of_point.iter_mut().zip(&sweep.x).zip(&sweep.y).zip(&sweep.z);
+        for (((cell, &x), &y), &z) in points {
+            if *cell != code {
+                write(place, &held, low, high);
+                (code, (held, low, high)) = (*cell, nothing);
+                let inside = code != NOWHERE;
+                place = if inside { slot(&self.occupied, &self.slots_before, code) as u32 } else { NOWHERE };
             }
+            *cell = place;
             let [x, y, z] = [x, y, z].map(millimetres);
             held.add([x, y, z]);
             (low, high) = (if z < low { z } else { low }, if z > high { z } else { high });
         }
-        write(code, &held, low, high);
+        write(place, &held, low, high);
         let mut running = Moments::default();
         for sums in &mut self.sums {
             running = running.plus(sums);
@@ -244,8 +251,7 @@ impl Cells {
 
     /// The slot of every point, in the sweep's order; `None` for those left out.
     pub fn slot_of_points(&self) -> impl Iterator<Item = Option<usize>> + '_ {
-        let found = |code: &u32| (*code != NOWHERE).then(|| slot(&self.occupied, &self.slots_before, *code));
-        self.code_of_point.iter().map(found)
+        self.cell_of_point.iter().map(|slot| (*slot != NOWHERE).then_some(*slot as usize))
     }
 }
 
@@ -258,14 +264,15 @@ fn slot(occupied: &[u64], slots_before: &[u32], code: u32) -> usize {
 /// Whole millimetres; a turned world rounds alike.
 #[inline(always)]
 fn millimetres(metres: f32) -> f32 {
-    // Above 2^23 an f32 holds nothing but whole numbers.
-    const WHOLE: f32 = 1.5 * 8_388_608.0;
     (metres * 1e3 + WHOLE) - WHOLE
 }
 
+/// Rounds down what lies within 2²² of 0: without the checks of a cast, which would take points one at a time.
+#[inline(always)]
 fn floor(value: f32) -> i32 {
-    let whole = value as i32;
-    whole.saturating_sub(i32::from(value < whole as f32))
+    let nearest = value + WHOLE;
+    let whole = (nearest.to_bits() as i32).wrapping_sub(WHOLE.to_bits() as i32);
+    whole.wrapping_sub(i32::from(nearest - WHOLE > value))
 }
 
 /// Spreads the lower 16 bits to the even places.
