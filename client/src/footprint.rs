@@ -104,7 +104,7 @@ fn covers_only(grid: &Grid, corners: &[[f64; 2]], is_fit: &dyn Fn(usize) -> bool
         Grid::Radial { r_bench_m, columns } => {
             (0..*columns).all(|column| column_fits(r_bench_m, (column, *columns), corners, is_fit))
         }
-        Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad } => {
+        Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
             let (sin, cos) = yaw_rad.sin_cos();
             let edge = f64::from(*cell_m);
             let in_cells =
@@ -198,7 +198,7 @@ fn extent(polygon: &[[f64; 2]], axis: usize) -> (f64, f64) {
 /// The cells of `count` in a row that a stretch touches, its ends in cells; `None` where it reaches outside.
 fn touched((low, high): (f64, f64), slack: f64, count: u32) -> Option<std::ops::RangeInclusive<usize>> {
     let (low, high) = ((low - slack).floor(), (high + slack).floor());
-    (low >= 0.0 && high < f64::from(count)).then(|| low as usize..=high as usize)
+    (low >= 0.0 && high < f64::from(count)).then_some(low as usize..=high as usize)
 }
 
 /// The place in a cell that is nearest to a point, ego frame.

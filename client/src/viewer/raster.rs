@@ -65,7 +65,7 @@ impl Raster {
     pub fn of(grid: &Grid) -> Self {
         match *grid {
             Grid::Radial { .. } => Self::of_radial(grid),
-            Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad } => {
+            Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
                 let ego_from_axes = Isometry3::rotation(Vector3::z() * -yaw_rad);
                 let ego_from_raster = ego_from_axes * Isometry3::translation(origin_x_m, origin_y_m, 0.0);
                 Self { grid: grid.clone(), width, height, cell_m, ego_from_raster, samples: None }
