@@ -72,10 +72,8 @@ async fn maps(drive: &Drive) -> Vec<Sized> {
     }
     let mut pipeline = Pipeline::new(&config.vehicles[0].core(), tables.into_iter().next().unwrap()).unwrap();
     let mut made = Vec::new();
-    let mut sequence = 0;
-    for event in with_poses(drive, &file, ahead_ns.expect("a map"), events) {
+    for (sequence, event) in (0..).zip(with_poses(drive, &file, ahead_ns.expect("a map"), events)) {
         let event = Event { sequence, ..event };
-        sequence += 1;
         if let Ok(Some(map)) = pipeline.step(&event) {
             let encoded = EncodedMap::new(map, "car".into(), 7, 300);
             let bytes = encoded.select(&[]);
