@@ -114,10 +114,10 @@ impl Loop {
             driven.seconds = self.seconds(stamps.end);
             driven.length_m = along(&route, driven.length_m, self.vehicle.scene().drive.at(driven.seconds));
             // The same bytes: each carrier brings every other map.
-            planner.take(if driven.turns % 2 == 0 { &over_grpc } else { &over_zenoh }).unwrap();
+            planner.take(if driven.turns.is_multiple_of(2) { &over_grpc } else { &over_zenoh }).unwrap();
             let (x, y, _) = route.course.at(route.start + driven.length_m + GOAL_M, route.left);
             next = planner.next_move([x, y]);
-            if driven.turns % 100 == 0 {
+            if driven.turns.is_multiple_of(100) {
                 println!("{driven:?}: {next:?}");
             }
             assert!(driven.seconds < 30.0 + driven.length_m / 2.0, "it does not get on: {driven:?}, {next:?}");
