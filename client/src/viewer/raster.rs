@@ -260,8 +260,16 @@ mod tests {
 
     #[test]
     fn a_turned_grid_keeps_its_cells_and_says_where_they_lie() {
-        let grid =
-            Grid::Cartesian { origin_x_m: -1.5, origin_y_m: -0.5, width: 4, height: 3, cell_m: 0.5, yaw_rad: 0.7 };
+        let grid = Grid::Cartesian {
+            origin_x_m: -1.5,
+            origin_y_m: -0.5,
+            width: 4,
+            height: 3,
+            cell_m: 0.5,
+            yaw_rad: 0.7,
+            first_ix: 0,
+            first_iy: 0,
+        };
         let layer = layer(grid.clone(), (0..12).map(|cell| cell % 4).collect());
         let raster = Raster::of(&grid);
         assert_eq!(raster.occupancies(&layer), [-1, 0, 100, 100].repeat(3));
