@@ -27,7 +27,7 @@
 //! | [`observation`] | scans, poses, roads, packets -> [`Observation`] |
 //! | [`ingest`] | observations -> the server, and what became of them |
 //! | `picture` | a layer -> a PNG from above (feature `picture`) |
-//! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`) |
+//! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`); its `tap`: one key -> the newest map |
 
 mod freshness;
 pub mod grpc;
