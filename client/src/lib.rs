@@ -22,13 +22,16 @@
 //! |---|---|
 //! | `freshness` | two clocks -> how old a map is at least |
 //! | [`view`] | bytes -> [`MapView`]: decoded once, cheap to clone, with its age |
+//! | [`footprint`] | a map, a rectangle or a point -> whether it is free, the nearest obstacle |
 //! | [`stream`] | updates -> the newest map in a slot, skips counted |
 //! | [`grpc`] | a server's address -> [`Client`] |
 //! | [`observation`] | scans, poses, roads, packets -> [`Observation`] |
 //! | [`ingest`] | observations -> the server, and what became of them |
 //! | `picture` | a layer -> a PNG from above (feature `picture`) |
+//! | `viewer` | a map -> ROS 2 and Foxglove messages (feature `viewers`) |
 //! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`); its `tap`: one key -> the newest map |
 
+pub mod footprint;
 mod freshness;
 pub mod grpc;
 pub mod ingest;
@@ -37,12 +40,15 @@ pub mod observation;
 pub mod picture;
 pub mod stream;
 pub mod view;
+#[cfg(feature = "viewers")]
+pub mod viewer;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
 
 pub use clearway_proto::map::{Channel, Layer};
 pub use clearway_proto::{codec, grid, v1};
 
+pub use footprint::{Footprint, Obstacle};
 pub use freshness::now_ns;
 pub use grpc::{Client, Subscription, Tls};
 pub use ingest::Ingester;

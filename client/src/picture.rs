@@ -71,7 +71,7 @@ pub fn png(layer: &Layer, style: &Style) -> Result<Vec<u8>, png::EncodingError> 
     Ok(file)
 }
 
-enum Colours {
+pub(crate) enum Colours {
     /// By class; the index is that of the channel.
     Classes(usize, Vec<[u8; 3]>),
     /// Least and greatest known value of channel 0.
@@ -79,7 +79,7 @@ enum Colours {
 }
 
 impl Colours {
-    fn of(layer: &Layer) -> Self {
+    pub(crate) fn of(layer: &Layer) -> Self {
         if let Some(channel) = layer.channels.iter().position(|channel| channel.name == "class") {
             let colour = |(class, name): (usize, &String)| match name.as_str() {
                 "unknown" => UNKNOWN,
@@ -105,7 +105,7 @@ impl Colours {
         Self::Shades(least, greatest)
     }
 
-    fn of_cell(&self, layer: &Layer, cell: usize) -> [u8; 3] {
+    pub(crate) fn of_cell(&self, layer: &Layer, cell: usize) -> [u8; 3] {
         match self {
             Self::Classes(channel, colours) => {
                 let class = layer.channels[*channel].cells.get(cell).and_then(|class| usize::try_from(class).ok());

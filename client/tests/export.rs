@@ -1,14 +1,23 @@
 //! A recording written here goes through `clearway export` and `clearway info`.
 
 mod common;
+#[path = "../../tests/tests/house/venv.rs"]
+mod venv;
 
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
+use clearway_lidar::model::Model;
+use clearway_lidar::sensor::{Sensor, SensorConfig};
+use clearway_proto::v1;
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes::flat;
+use clearway_sim::vehicle::SimulatedVehicle;
 use common::{CAPTURE_END_NS, CLASSES, clearway, map, text};
-use serde_json::Value;
+use prost::Message;
+use serde_json::{Value, json};
 
 /// Three maps of alpha, as the server lays them out; unfinished: as a crash leaves it.
 fn record(path: &Path, finished: bool) {
@@ -160,4 +169,148 @@ fn files_of_no_kind_known_are_refused_and_wrong_usage_is_another_exit_code() {
     assert_eq!(exported.status.code(), Some(1));
     assert!(text(&exported.stderr).contains("not an MCAP file"), "{}", text(&exported.stderr));
     assert_eq!(clearway(&["export", path, "--format", "gif"]).status.code(), Some(2));
+}
+
+const CONFIG: &str = "[[vehicle]]\nname = 'alpha'\nqueue = 16\n[[vehicle.sensor]]\nname = 'top'\nmodel = 'hdl64e_s2'\n\
+    [vehicle.sensor.extrinsics]\nx_m = 0.5\ny_m = 0.0\nz_m = 1.9\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n";
+
+/// A journal of some turns of a simulated vehicle and three maps of a vehicle at rest that looks to its left, as the server
+/// lays them out. Gives the bytes of the points of each turn.
+fn record_drive(path: &Path) -> Vec<usize> {
+    let mut writer = mcap::WriteOptions::new().compression_threads(0).create(File::create(path).unwrap()).unwrap();
+    let (name, data) = ("config.toml".to_owned(), CONFIG.as_bytes().into());
+    let media_type = "application/toml".to_owned();
+    writer.attach(&mcap::Attachment { log_time: 0, create_time: 0, name, media_type, data }).unwrap();
+    let mut channel = |schema: &str, topic: &str| {
+        let schema = writer.add_schema(schema, "protobuf", clearway_proto::DESCRIPTORS).unwrap();
+        writer.add_channel(schema, topic, "protobuf", &BTreeMap::new()).unwrap()
+    };
+    let journal = channel("clearway.v1.Event", "/alpha/journal");
+    let layers = ["drivability", "second"].map(|layer| channel("clearway.v1.Map", &format!("/alpha/map/{layer}")));
+    let mut put = |channel_id: u16, log_ns: i64, bytes: &[u8]| {
+        let header = mcap::records::MessageHeader {
+            channel_id,
+            sequence: 0,
+            log_time: log_ns as u64,
+            publish_time: log_ns as u64,
+        };
+        writer.write_to_known_channel(&header, bytes).unwrap();
+    };
+    let mut event = |arrival_ns: i64, body: v1::event::Body| {
+        let event = v1::Event { arrival_ns, body: Some(body), ..Default::default() };
+        put(journal, arrival_ns, &event.encode_to_vec());
+    };
+    let mut sensor = Sensor::new(SensorConfig { model: Some(Model::Hdl64eS2), ..SensorConfig::default() });
+    let (mut turns, mut last_ns) = (Vec::new(), 0);
+    // Tunnelled by somebody who knows of a second sensor: of no sensor here.
+    let stray = v1::Event { source: 3, body: Some(v1::event::Body::End(v1::End {})), ..Default::default() };
+    for datagram in SimulatedVehicle::new(flat(), ScannerConfig::default()).take(1200) {
+        if let Ok(Some(turn)) = sensor.push(&datagram.payload, datagram.stamp_ns) {
+            turns.push(12 * turn.returns());
+        }
+        last_ns = datagram.stamp_ns;
+        event(last_ns, v1::event::Body::Datagram(datagram.payload.into()));
+    }
+    turns.extend(sensor.finish().map(|turn| 12 * turn.returns()));
+    event(last_ns, v1::event::Body::End(v1::End {}));
+    put(journal, last_ns, &stray.encode_to_vec());
+    for sequence in 0..3 {
+        let end_ns = CAPTURE_END_NS + 100_000_000 * sequence;
+        let mut map = v1::Map::decode(map(sequence as u64, end_ns)).unwrap();
+        let header = map.header.as_mut().unwrap();
+        let half = std::f64::consts::FRAC_1_SQRT_2;
+        header.map_from_ego = Some(v1::Pose { x: 4.0, y: 2.0, qz: half, qw: half, ..Default::default() });
+        header.speed_mps = Some(3.5);
+        put(layers[0], end_ns + 1_000_000, &map.encode_to_vec());
+        map.layers[0].name = "second".into();
+        put(layers[1], end_ns + 1_000_000, &map.encode_to_vec());
+    }
+    writer.finish().unwrap();
+    turns
+}
+
+/// Exports, and has a stranger read what came of it.
+fn exported(format: &str, more: &[&str]) -> (Value, Vec<usize>) {
+    let folder = folder();
+    let [file, out] = ["run.mcap", "out.mcap"].map(|name| folder.path().join(name));
+    let turns = record_drive(&file);
+    let paths = [file.to_str().unwrap(), out.to_str().unwrap()];
+    let arguments = [&["export", paths[0], "--format", format, "--out", paths[1]], more].concat();
+    let done = clearway(&arguments);
+    assert!(done.status.success(), "{}", text(&done.stderr));
+    let again = clearway(&arguments);
+    assert!(!again.status.success() && text(&again.stderr).contains("exists"), "{}", text(&again.stderr));
+    (serde_json::from_str(&venv::run(venv::script("viewer_file.py").arg(&out), "mcap")).unwrap(), turns)
+}
+
+fn schemas(told: &Value) -> Vec<(&str, &str, u64)> {
+    let topics = told.as_object().unwrap().iter();
+    topics.map(|(topic, of)| (&**topic, of["schema"].as_str().unwrap(), of["count"].as_u64().unwrap())).collect()
+}
+
+#[test]
+fn a_file_for_ros_2_has_occupancy_grids_tf_and_odometry_that_a_stranger_reads() {
+    let (told, _) = exported("ros2", &[]);
+    let expected = [
+        ("/clearway/alpha/drivability", "nav_msgs/msg/OccupancyGrid", 3),
+        ("/clearway/alpha/odometry", "nav_msgs/msg/Odometry", 3),
+        ("/clearway/alpha/second", "nav_msgs/msg/OccupancyGrid", 3),
+        ("/tf", "tf2_msgs/msg/TFMessage", 3),
+    ];
+    assert_eq!(schemas(&told), expected);
+    let grid = &told["/clearway/alpha/drivability"]["last"];
+    assert_eq!(
+        grid["header"],
+        json!({"stamp": {"sec": 1_700_000_000, "nanosec": 300_000_000}, "frame_id": "alpha/base_link"})
+    );
+    assert_eq!((&grid["info"]["width"], &grid["info"]["resolution"]), (&json!(240), &json!(0.25)));
+    let at =
+        |x_m: f64, y_m: f64| grid["data"][((y_m + 30.0) * 4.0) as usize * 240 + ((x_m + 30.0) * 4.0) as usize].as_i64();
+    assert_eq!(at(6.1, 6.1), Some(0), "ahead and to the left: drivable");
+    assert_eq!(at(-6.1, 6.1), Some(100), "behind and to the left: not drivable");
+    assert_eq!(at(-6.1, -6.1), Some(-1), "behind and to the right: unknown");
+    assert_eq!(at(10.1, -10.1), Some(100), "ahead and to the right, 14 m off: an obstacle");
+    assert_eq!(at(29.1, 29.1), Some(-1), "outside of the grid");
+    let transform = &told["/tf"]["last"]["transforms"][0];
+    assert_eq!(
+        (&transform["header"]["frame_id"], &transform["child_frame_id"]),
+        (&json!("map"), &json!("alpha/base_link"))
+    );
+    assert_eq!(transform["transform"]["translation"], json!({"x": 4.0, "y": 2.0, "z": 0.0}));
+    let odometry = &told["/clearway/alpha/odometry"]["last"];
+    assert_eq!(odometry["twist"]["twist"]["linear"]["x"], 3.5);
+    assert_eq!(odometry["pose"]["pose"]["orientation"]["z"], json!(std::f64::consts::FRAC_1_SQRT_2));
+}
+
+#[test]
+fn a_file_for_foxglove_has_coloured_grids_transforms_and_the_points_of_every_turn() {
+    let (told, turns) = exported("foxglove", &[]);
+    let clouds = turns.len() as u64;
+    assert!(clouds >= 3, "{turns:?}");
+    let expected = [
+        ("/alpha/map/drivability", "foxglove.Grid", 3),
+        ("/alpha/map/second", "foxglove.Grid", 3),
+        ("/alpha/points/top", "foxglove.PointCloud", clouds),
+        ("/tf", "foxglove.FrameTransforms", 3 + clouds),
+    ];
+    assert_eq!(schemas(&told), expected);
+    let grid = &told["/alpha/map/drivability"]["last"];
+    assert_eq!(grid["timestamp"], "2023-11-14T22:13:20.300Z");
+    assert_eq!((&grid["frame_id"], &grid["column_count"]), (&json!("alpha/base_link"), &json!(240)));
+    assert_eq!(grid["data"]["length"], 240 * 240 * 4);
+    let cloud = &told["/alpha/points/top"]["last"];
+    assert_eq!((&cloud["frame_id"], &cloud["data"]["length"]), (&json!("alpha/top"), &json!(turns[turns.len() - 1])));
+    // The simulated vehicle drives later than the maps were made: the last is the sensor's mount.
+    let transform = &told["/tf"]["last"]["transforms"][0];
+    assert_eq!(
+        (&transform["parent_frame_id"], &transform["child_frame_id"]),
+        (&json!("alpha/base_link"), &json!("alpha/top"))
+    );
+    assert_eq!(transform["translation"], json!({"x": 0.5, "z": 1.9}));
+}
+
+#[test]
+fn a_file_for_foxglove_has_one_layer_and_no_points_where_that_is_asked_for() {
+    let (told, _) = exported("foxglove", &["--layer", "second", "--no-points"]);
+    assert_eq!(schemas(&told), [("/alpha/map/second", "foxglove.Grid", 3), ("/tf", "foxglove.FrameTransforms", 3)]);
 }

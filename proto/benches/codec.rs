@@ -1,6 +1,10 @@
-//! Cells to payload and back: 160,000 cells (400 x 400) of a drivability-like map, and of noise.
+//! Cells to payload and back: 160,000 cells (400 x 400) of a drivability-like map, and of noise; a layer of them as a delta to
+//! the one before, from which it has scrolled by 3 cells.
 
 use clearway_proto::codec::{self, Cells, Limits};
+use clearway_proto::delta;
+use clearway_proto::map::{decode_map, decode_map_on, encode_header, encode_layer};
+use clearway_proto::v1;
 use divan::{Bencher, counter::ItemsCount};
 
 const SIDE: usize = 400;
@@ -34,6 +38,49 @@ fn decode(bencher: Bencher, noise: u32) {
     bencher
         .counter(ItemsCount::new(cells.len()))
         .bench(|| codec::decode(divan::black_box(&channel), &Limits::default()));
+}
+
+/// The scene as a layer whose first cell is cell (`first_ix`, 0) of the world.
+fn layer(first_ix: i64) -> v1::Layer {
+    let Cells::U8(scene) = scene(0) else { unreachable!("scene() gives u8") };
+    let shift = first_ix as usize;
+    let class = |cell: usize| {
+        let changed = cell.wrapping_mul(2_654_435_761) % 1000 < 5 * shift;
+        if changed { 3 } else { scene[cell / SIDE * SIDE + (cell + shift) % SIDE] }
+    };
+    let cells: Vec<u8> = (0..SIDE * SIDE).map(class).collect();
+    let side = SIDE as u32;
+    let grid = v1::CartesianGrid { width: side, height: side, cell_m: 0.25, first_ix, ..Default::default() };
+    v1::Layer {
+        name: "occupancy".into(),
+        geometry: Some(v1::layer::Geometry::Cartesian(grid)),
+        legend: ["unknown", "clear", "occupied", "occluded"].map(String::from).to_vec(),
+        channels: vec![codec::encode_grid(codec::CellsRef::U8(&cells), SIDE).into_channel("class", "", 1.0, 0)],
+        ..Default::default()
+    }
+}
+
+#[divan::bench]
+fn encode_delta(bencher: Bencher) {
+    let (before, now) = (layer(0), layer(3));
+    bencher
+        .counter(ItemsCount::new(SIDE * SIDE))
+        .bench(|| delta::encode_delta(divan::black_box(&before), 1, &now, &Limits::default()));
+}
+
+#[divan::bench]
+fn decode_delta(bencher: Bencher) {
+    let (before, now) = (layer(0), layer(3));
+    let message = |sequence, layer: &v1::Layer| {
+        [encode_header(&v1::Header { sequence, ..Default::default() }), encode_layer(layer)].concat().into()
+    };
+    let base = decode_map(message(1, &before), &Limits::default()).expect("a map");
+    let delta = delta::encode_delta(&before, 1, &now, &Limits::default()).expect("a smaller delta");
+    let message: bytes::Bytes = message(2, &delta);
+    println!("delta: {} bytes, whole: {}", message.len(), encode_layer(&now).len());
+    bencher
+        .counter(ItemsCount::new(SIDE * SIDE))
+        .bench(|| decode_map_on(divan::black_box(message.clone()), Some(&base), &Limits::default()));
 }
 
 fn main() {

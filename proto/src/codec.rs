@@ -6,6 +6,10 @@
 //! Runs are canonical, so that equal cells have equal bytes: for each run varint(value) varint(length - 1), signed
 //! values zigzag, neighbours differ, lengths sum to the cell count, no overlong varint. [`crate::rows`] predicts every row
 //! by the one before. A channel is sent as what is smallest; of equals, raw before runs before rows.
+//!
+//! There is no general compression on top. Over 29 maps of recorded scans (348 channels) rows take 46 % of what runs take; runs
+//! with zstd (level 3) take 7 % less than rows, but for classes 6 % more, which are half of a map. That is not worth a library
+//! in every client, nor stored bytes that follow its version.
 
 use std::borrow::Cow;
 
@@ -115,6 +119,8 @@ pub struct Encoded {
     pub crc32: u32,
     /// Never longer than the raw cells.
     pub payload: Bytes,
+    /// [`v1::Channel::by_class`]; empty where the payload holds the cells themselves.
+    pub by_class: Bytes,
 }
 
 impl Encoded {
@@ -131,6 +137,7 @@ impl Encoded {
             cell_count: self.cell_count,
             crc32: self.crc32,
             payload: self.payload,
+            by_class: self.by_class,
         }
     }
 }
@@ -162,7 +169,7 @@ pub fn encode_grid(cells: CellsRef<'_>, columns: usize) -> Encoded {
         (None, None) => (v1::Encoding::Raw, Bytes::from(raw.into_owned())),
     };
     let cell_count = u32::try_from(cells.len()).expect("a grid has fewer than 2^32 cells");
-    Encoded { cell_type: cells.cell_type(), encoding, cell_count, crc32, payload }
+    Encoded { cell_type: cells.cell_type(), encoding, cell_count, crc32, payload, by_class: Bytes::new() }
 }
 
 /// Runs, and rows; `None` where they are not smaller than the cells themselves, or there are no rows.

@@ -176,7 +176,15 @@ pub fn decode(channel: &v1::Channel, limits: &Limits) -> Result<Cells, DecodeErr
     make(channel)
 }
 
-/// Decodes what the payload holds, whatever the CRC says: a delta's CRC is of other cells.
+/// Whether these are the cells that were encoded.
+pub(crate) fn check_crc(channel: &v1::Channel, cells: &Cells) -> Result<(), DecodeError> {
+    match crc32fast::hash(&cells.as_ref().to_le_bytes()) {
+        computed if computed == channel.crc32 => Ok(()),
+        computed => Err(DecodeError::Crc { stated: channel.crc32, computed }),
+    }
+}
+
+/// Decodes what the payload holds, whatever the CRC says: that of differences is of the cells they lead to.
 pub(crate) fn decode_differences(channel: &v1::Channel, limits: &Limits) -> Result<Cells, DecodeError> {
     check(channel, limits)?;
     make(channel)

@@ -7,10 +7,11 @@
 //! the base has none. The differences go through the same encodings as cells do: mostly 0, they make long runs. The CRC is
 //! of the cells that come out, so what is put on a wrong base is refused and never a wrong cell.
 
-use crate::codec::{Cells, encode_grid, unzigzag, zigzag};
-use crate::decode::{DecodeError, Limits, decode_differences};
+use crate::codec::{Cells, encode_grid};
+use crate::decode::{Limits, check_crc, decode_differences};
 use crate::grid::Grid;
 use crate::map::{Layer, Map, MapError, MapId, decode_layer};
+use crate::predicted::{differences, sums};
 use crate::v1;
 use prost::Message;
 
@@ -30,9 +31,10 @@ pub fn encode_delta(base: &v1::Layer, base_sequence: u64, new: &v1::Layer, limit
     for (channel, now) in delta.channels.iter_mut().zip(&decoded.channels) {
         let before =
             old.channel(&now.name).filter(|before| (before.scale, before.unknown) == (now.scale, now.unknown))?;
-        let differences = shift.differences(&before.cells, &now.cells, now.unknown)?;
+        let differences = differences(shift.predicted(&before.cells, now.unknown), &now.cells)?;
         let encoded = encode_grid(differences.as_ref(), decoded.grid.shape().1 as usize);
         (channel.encoding, channel.payload) = (encoded.encoding.into(), encoded.payload);
+        channel.by_class.clear();
     }
     (delta.encoded_len() < new.encoded_len()).then_some(delta)
 }
@@ -67,13 +69,13 @@ pub(crate) fn decode_on(
     if here != there {
         return Err(misfit(format!("channel {name:?} has cell type {here}; in the base {there}")));
     }
-    let differences = decode_differences(channel, limits).map_err(wrong)?;
-    let cells = shift.sums(&before.cells, differences, channel.unknown);
-    let cells = cells.ok_or_else(|| misfit(format!("channel {name:?} has cells of another type in the base")))?;
-    let computed = crc32fast::hash(&cells.as_ref().to_le_bytes());
-    if computed != channel.crc32 {
-        return Err(wrong(DecodeError::Crc { stated: channel.crc32, computed }));
+    if !channel.by_class.is_empty() {
+        return Err(misfit(format!("channel {name:?} is told by class too")));
     }
+    let differences = decode_differences(channel, limits).map_err(wrong)?;
+    let cells = sums(shift.predicted(&before.cells, channel.unknown), &differences);
+    let cells = cells.ok_or_else(|| misfit(format!("channel {name:?} has cells of another type in the base")))?;
+    check_crc(channel, &cells).map_err(wrong)?;
     Ok(cells)
 }
 
@@ -116,7 +118,15 @@ impl Shift {
     }
 
     /// What the base predicts of every cell.
-    fn predicted<T: Copy>(&self, base: &[T], unknown: T) -> Vec<T> {
+    fn predicted(&self, base: &Cells, unknown: i32) -> Cells {
+        match base {
+            Cells::U8(base) => Cells::U8(self.shifted(base, unknown as u8)),
+            Cells::I8(base) => Cells::I8(self.shifted(base, unknown as i8)),
+            Cells::U16(base) => Cells::U16(self.shifted(base, unknown as u16)),
+        }
+    }
+
+    fn shifted<T: Copy>(&self, base: &[T], unknown: T) -> Vec<T> {
         let [rows, columns] = self.to.map(|cells| cells as usize);
         let mut cells = vec![unknown; rows * columns];
         // The rows and columns of the grid that the base has too.
@@ -134,54 +144,4 @@ impl Shift {
         }
         cells
     }
-
-    /// What is added to the prediction to make `cells`; `None` for cells of two types.
-    fn differences(&self, base: &Cells, cells: &Cells, unknown: i32) -> Option<Cells> {
-        Some(match (base, cells) {
-            (Cells::U8(base), Cells::U8(cells)) => {
-                let predicted = self.predicted(base, unknown as u8);
-                Cells::U8(zip(predicted, cells, |before, now| zigzag(now.wrapping_sub(before) as i8)))
-            }
-            (Cells::I8(base), Cells::I8(cells)) => {
-                Cells::I8(zip(self.predicted(base, unknown as i8), cells, |before, now| now.wrapping_sub(before)))
-            }
-            (Cells::U16(base), Cells::U16(cells)) => {
-                let predicted = self.predicted(base, unknown as u16);
-                Cells::U16(zip(predicted, cells, |before, now| zigzag_wide(now.wrapping_sub(before) as i16)))
-            }
-            _ => return None,
-        })
-    }
-
-    /// The way back from [`Self::differences`].
-    fn sums(&self, base: &Cells, differences: Cells, unknown: i32) -> Option<Cells> {
-        Some(match (base, &differences) {
-            (Cells::U8(base), Cells::U8(differences)) => {
-                let predicted = self.predicted(base, unknown as u8);
-                Cells::U8(zip(predicted, differences, |before, more| before.wrapping_add_signed(unzigzag(more))))
-            }
-            (Cells::I8(base), Cells::I8(differences)) => {
-                Cells::I8(zip(self.predicted(base, unknown as i8), differences, i8::wrapping_add))
-            }
-            (Cells::U16(base), Cells::U16(differences)) => {
-                let predicted = self.predicted(base, unknown as u16);
-                Cells::U16(zip(predicted, differences, |before, more| before.wrapping_add_signed(unzigzag_wide(more))))
-            }
-            _ => return None,
-        })
-    }
-}
-
-/// Cell by cell, in place of the first.
-fn zip<T: Copy>(mut cells: Vec<T>, others: &[T], of: impl Fn(T, T) -> T) -> Vec<T> {
-    cells.iter_mut().zip(others).for_each(|(cell, other)| *cell = of(*cell, *other));
-    cells
-}
-
-fn zigzag_wide(value: i16) -> u16 {
-    ((value << 1) ^ (value >> 15)) as u16
-}
-
-fn unzigzag_wide(value: u16) -> i16 {
-    ((value >> 1) as i16) ^ -((value & 1) as i16)
 }

@@ -12,6 +12,7 @@ pub mod grid;
 pub mod map;
 pub mod packed;
 mod parts;
+pub mod predicted;
 pub mod region;
 mod rows;
 pub mod safe_points;

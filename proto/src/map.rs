@@ -13,6 +13,7 @@ use prost::Message;
 
 use crate::codec::{Cells, DecodeError, Limits, decode};
 use crate::grid::Grid;
+use crate::predicted::{Misfit, decode_beside};
 use crate::{delta, parts, safe_points, v1};
 
 /// The bytes of a map with this header and no layer yet.
@@ -245,6 +246,16 @@ pub enum MapError {
         /// What is different.
         what: String,
     },
+    /// A channel told by class that does not fit the classes.
+    #[error("layer {layer:?}, channel {channel:?} is told by class: {what}")]
+    ByClass {
+        /// The layer's name.
+        layer: String,
+        /// The channel's name.
+        channel: String,
+        /// What does not fit.
+        what: String,
+    },
     /// A safe point that cannot be.
     #[error("layer {layer:?}, safe point {point}: {what}")]
     SafePoint {
@@ -294,6 +305,7 @@ impl MapError {
             Self::NoBase { .. } => "no_base",
             Self::OtherBase { .. } => "other_base",
             Self::BaseShape { .. } => "base_shape",
+            Self::ByClass { .. } => "by_class",
             Self::SafePoint { .. } => "safe_point",
             Self::Legend { .. } => "legend",
             Self::Class { .. } => "class",
@@ -375,6 +387,7 @@ pub(crate) fn decode_layer(layer: v1::Layer, base: Option<&Layer>, limits: &Limi
     let grid = Grid::from_wire(&layer)?;
     check_unique("channel", layer.channels.iter().map(|channel| &channel.name))?;
     let expected = grid.cell_count();
+    let classes = layer.legend.len();
     let mut channels = Vec::with_capacity(layer.channels.len());
     for channel in &layer.channels {
         let (base_sequence, layer, name) = (layer.base_sequence, layer.name.clone(), channel.name.clone());
@@ -382,8 +395,16 @@ pub(crate) fn decode_layer(layer: v1::Layer, base: Option<&Layer>, limits: &Limi
             return Err(MapError::CellCount { layer, channel: name, cell_count: channel.cell_count, expected });
         }
         let cells = match (base_sequence, base) {
-            (None, _) => {
+            (None, _) if channel.by_class.is_empty() => {
                 decode(channel, limits).map_err(|source| MapError::Cells { layer, channel: name.clone(), source })?
+            }
+            (None, _) => {
+                let class = channels.iter().find(|channel: &&Channel| channel.name == "class");
+                let told = decode_beside(channel, class.map(|class| &class.cells), classes, limits);
+                told.map_err(|misfit| match misfit {
+                    Misfit::Classes(what) => MapError::ByClass { layer, channel: name.clone(), what },
+                    Misfit::Cells(source) => MapError::Cells { layer, channel: name.clone(), source },
+                })?
             }
             (Some(_), Some(base)) => delta::decode_on(base, &grid, &layer, channel, limits)?,
             (Some(base_sequence), None) => return Err(MapError::NoBase { layer, base_sequence }),

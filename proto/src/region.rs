@@ -9,6 +9,7 @@
 use crate::codec::{Cells, CellsRef, Limits, encode_grid};
 use crate::grid::{Grid, turned};
 use crate::map::{MapError, decode_layer};
+use crate::predicted::encode_beside;
 use crate::v1;
 
 /// Why a layer has no such part.
@@ -73,11 +74,17 @@ pub fn crop(layer: &v1::Layer, region: &v1::Region, limits: &Limits) -> Result<v
         }
         None => {}
     }
+    let class = decoded.channel("class").map(|class| kept(&class.cells, columns_before, &rows, &columns));
     for (channel, whole) in cropped.channels.iter_mut().zip(&decoded.channels) {
         let cells = kept(&whole.cells, columns_before, &rows, &columns);
-        let encoded = encode_grid(cells.as_ref(), columns.len());
+        let encoded = match &class {
+            Some(Cells::U8(class)) if channel.name != "class" => {
+                encode_beside(cells.as_ref(), class, layer.legend.len(), columns.len())
+            }
+            _ => encode_grid(cells.as_ref(), columns.len()),
+        };
         (channel.encoding, channel.cell_count) = (encoded.encoding.into(), encoded.cell_count);
-        (channel.crc32, channel.payload) = (encoded.crc32, encoded.payload);
+        (channel.crc32, channel.payload, channel.by_class) = (encoded.crc32, encoded.payload, encoded.by_class);
     }
     Ok(cropped)
 }

@@ -39,7 +39,9 @@ fn world(seed: u64, time: u64, ix: i64, iy: i64) -> u16 {
         (h ^ h >> 29).wrapping_mul(0xbf58_476d_1ce4_e5b9) >> 40
     };
     let changed = hash(ix, iy, time).is_multiple_of(300);
-    (hash(ix >> 2, iy >> 2, if changed { time } else { 0 }) % 5 * 13_007) as u16
+    let patch = hash(ix >> 2, iy >> 2, if changed { time } else { 0 });
+    // Its class, and what cells of one class differ by.
+    (patch % 5 * 13_007 + hash(ix, iy, 0) % 90) as u16
 }
 
 /// A grid of three channels, one of each type, at a place of the endless one.
@@ -251,7 +253,8 @@ fn a_delta_without_its_base_or_on_one_that_does_not_fit_is_refused_by_name() {
         refuse(name, error, Some(&base.encode_to_vec()), &delta);
     }
     let base = golden_map(41, &golden_layers(1));
-    let spoils: [(&str, &str, fn(&mut v1::Layer)); 4] = [
+    type SpoilDelta = fn(&mut v1::Layer);
+    let spoils: [(&str, &str, SpoilDelta); 4] = [
         ("more_cells_than_the_grid", "cell_count", |layer| layer.channels[0].cell_count += 1),
         ("of_2_32_cells", "too_many_cells", |layer| {
             (cartesian(layer).width, cartesian(layer).height) = (u32::MAX, 1);

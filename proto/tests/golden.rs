@@ -314,7 +314,11 @@ fn the_golden_map_is_its_header_and_its_layers_behind_each_other() {
 #[test]
 fn a_map_with_one_thing_wrong_is_refused_under_that_name() {
     type Spoil = fn(&mut v1::Map);
-    let spoils: [(&str, &str, Spoil); 30] = [
+    let spoils: [(&str, &str, Spoil); 34] = [
+        ("by_class_of_too_few", "by_class", |map| map.layers[0].channels[1].by_class = vec![1; 3].into()),
+        ("by_class_of_classes", "by_class", |map| map.layers[0].channels[0].by_class = vec![0; 4].into()),
+        ("by_class_without_classes", "by_class", |map| map.layers[1].channels[0].by_class = vec![0; 2].into()),
+        ("by_class_of_other_cells", "crc", |map| map.layers[0].channels[1].by_class = vec![1; 4].into()),
         ("no_header", "header", |map| map.header = None),
         ("capture_backwards", "header", |map| map.header.as_mut().unwrap().capture_end_ns = 0),
         ("pose_not_finite", "header", |map| pose(map).x = f64::NAN),

@@ -14,9 +14,11 @@ use serde::{Deserialize, Serialize};
 
 mod ros;
 mod udp;
+mod zenoh;
 
 pub use ros::Ros;
 pub use udp::{Listener, Ports, Route, Sender, Udp, listeners};
+pub use zenoh::{Ros2, Zenoh, ZenohMode};
 
 /// The configured tables by vehicle and sensor, in the order of the configuration; `None` where the factory's serves.
 pub type Calibrations = Vec<Vec<Option<Calibration>>>;
@@ -34,6 +36,9 @@ pub struct Config {
     /// Maps over zenoh.
     #[serde(default)]
     pub zenoh: Zenoh,
+    /// Maps for Foxglove.
+    #[serde(default)]
+    pub foxglove: Foxglove,
     /// The recording.
     #[serde(default)]
     pub recorder: Recorder,
@@ -119,58 +124,19 @@ impl Default for Page {
     }
 }
 
-/// `[zenoh]`.
+/// `[foxglove]`: a WebSocket for Foxglove; whoever reaches it may read.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct Zenoh {
-    /// Whether it is published at all.
+pub struct Foxglove {
+    /// Whether it is served at all.
     pub enabled: bool,
-    /// Part played in the zenoh network.
-    pub mode: ZenohMode,
-    /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
-    pub listen: Vec<String>,
-    /// Endpoints of routers or peers to connect to.
-    pub connect: Vec<String>,
-    /// Look for peers by multicast.
-    pub scouting: bool,
-    /// A zenoh configuration (JSON5) to begin with: TLS, access control; the keys above stand over it. Empty: zenoh's own
-    /// defaults.
-    pub file: PathBuf,
+    /// Address and port; port 0 takes a free one.
+    pub listen: SocketAddr,
 }
 
-impl Default for Zenoh {
+impl Default for Foxglove {
     fn default() -> Self {
-        Self {
-            enabled: true,
-            mode: ZenohMode::Peer,
-            listen: vec!["tcp/127.0.0.1:7447".into()],
-            connect: Vec::new(),
-            scouting: false,
-            file: PathBuf::new(),
-        }
-    }
-}
-
-/// Part played in the zenoh network.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ZenohMode {
-    /// Talks to whoever connects, and to the endpoints of `connect`.
-    Peer,
-    /// Hangs on one router.
-    Client,
-    /// Is itself a router.
-    Router,
-}
-
-impl ZenohMode {
-    /// As the zenoh configuration spells it.
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Peer => "peer",
-            Self::Client => "client",
-            Self::Router => "router",
-        }
+        Self { enabled: false, listen: SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 8765) }
     }
 }
 
@@ -396,6 +362,9 @@ impl Config {
                     "endpoints such as \"tcp/127.0.0.1:7447\" or \"tls/localhost:7447\"",
                 );
             }
+        }
+        if let Err((key, value, allowed)) = self.zenoh.ros2.check(self.zenoh.enabled, &self.vehicles) {
+            return wrong(key.into(), &value, &allowed);
         }
         let mut names = BTreeSet::new();
         for vehicle in &self.vehicles {

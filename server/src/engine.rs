@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::{Pipeline, Rejected};
+use clearway_mapping::sweep::Sweep;
 use tokio::sync::watch;
 
 use crate::ingest::Queued;
@@ -23,6 +24,9 @@ const LOOK_AROUND: Duration = Duration::from_millis(20);
 
 /// The newest map of one vehicle; `None` before the first.
 pub type Newest = Option<Arc<EncodedMap>>;
+
+/// The points of the newest map of one vehicle, ego frame, with their stamp; `None` before the first that somebody took.
+pub type NewestSweep = Option<Arc<(i64, Sweep)>>;
 
 /// Sees the pipeline after each event that completed a revolution.
 pub type Observer = Box<dyn FnMut(&Pipeline) + Send>;
@@ -134,6 +138,11 @@ impl Engine {
             (Arc::new(EncodedMap::new(map, self.status.name.clone(), self.status.boot_id, self.valid_ms)), states)
         });
         let latency = started.elapsed();
+        // Before its map: whoever has that finds them.
+        if self.status.sweeps.receiver_count() > 0 {
+            let sweep = self.pipeline.newest_sweep().clone();
+            self.status.sweeps.send_replace(Some(Arc::new((map.capture_end_ns, sweep))));
+        }
         // The status first: whoever has seen a map finds it counted.
         self.rest();
         if let Some((encoded, states)) = made {

@@ -264,6 +264,9 @@ fn tell(running: &Running) {
     for endpoint in &running.zenoh {
         tracing::info!(%endpoint, "zenoh");
     }
+    if let Some(at) = running.foxglove {
+        tracing::info!("foxglove ws://{at}");
+    }
     if let Some(recording) = running.recording() {
         tracing::info!(%recording, "recording");
     }

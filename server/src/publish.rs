@@ -1,5 +1,5 @@
-//! The newest map of each vehicle -> whoever asks: gRPC, zenoh, the page. All of them look at the same slots and send
-//! the same bytes; none of them can hold up an engine.
+//! The newest map of each vehicle -> whoever asks: gRPC, zenoh, ROS 2, Foxglove, the page. All of them look at the same
+//! slots and send the same bytes, or what they decode from them; none of them can hold up an engine.
 
 use std::sync::Arc;
 
@@ -10,9 +10,12 @@ use crate::status::VehicleStatus;
 
 pub mod access;
 pub mod connections;
+pub mod foxglove;
 pub mod grpc;
 pub mod page;
 pub mod reader;
+#[cfg(feature = "zenoh")]
+mod ros;
 pub mod selection;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;

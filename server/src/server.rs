@@ -14,7 +14,7 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-use crate::config::{Calibrations, Certificates, Config};
+use crate::config::{Calibrations, Certificates, Config, Foxglove};
 use crate::demand::Taken;
 use crate::engine::{Engine, Observer};
 use crate::ingest::entrance::{Entrance, Entrances};
@@ -88,6 +88,14 @@ pub enum StartError {
         /// Why.
         source: std::io::Error,
     },
+    /// The Foxglove WebSocket cannot be served.
+    #[error("foxglove.listen {at}: {source}")]
+    Foxglove {
+        /// The address.
+        at: SocketAddr,
+        /// Why.
+        source: foxglove::FoxgloveError,
+    },
     /// zenoh cannot be published.
     #[cfg(feature = "zenoh")]
     #[error(transparent)]
@@ -119,6 +127,8 @@ pub struct Running {
     pub page: Option<SocketAddr>,
     /// Where zenoh listens.
     pub zenoh: Vec<String>,
+    /// Where Foxglove connects.
+    pub foxglove: Option<SocketAddr>,
     engines: Vec<(Arc<str>, JoinHandle<()>)>,
     recorder: Option<Recorder>,
     udp: Option<udp::Readers>,
@@ -126,6 +136,7 @@ pub struct Running {
     stop: watch::Sender<bool>,
     /// What is made whether or not somebody else takes it.
     _taken: Vec<Taken>,
+    viewers: Option<crate::publish::foxglove::Publisher>,
     #[cfg(feature = "zenoh")]
     publisher: Option<crate::publish::zenoh::Publisher>,
     #[cfg(feature = "zenoh")]
@@ -241,6 +252,13 @@ impl Server {
                 }
             });
         }
+        let viewers = match config.foxglove {
+            Foxglove { enabled: false, .. } => None,
+            Foxglove { listen: at, .. } => {
+                let started = crate::publish::foxglove::Publisher::start(&config.foxglove, &vehicles).await;
+                Some(started.map_err(|source| StartError::Foxglove { at, source })?)
+            }
+        };
         #[cfg(feature = "zenoh")]
         let publisher = match config.zenoh.enabled {
             true => Some(crate::publish::zenoh::Publisher::start(&config.zenoh, &vehicles, &entrances).await?),
@@ -252,12 +270,14 @@ impl Server {
             grpc: grpc_at,
             page: page_at,
             zenoh: Vec::new(),
+            foxglove: viewers.as_ref().map(|viewers| SocketAddr::new(config.foxglove.listen.ip(), viewers.port())),
             engines,
             recorder,
             udp: None,
             publishers,
             stop,
             _taken: taken,
+            viewers,
             #[cfg(feature = "zenoh")]
             publisher,
             #[cfg(feature = "zenoh")]
@@ -321,6 +341,11 @@ impl Running {
         let all = async { while publishers.join_next().await.is_some() {} };
         if tokio::time::timeout(PUBLISHERS_STOP, all).await.is_err() {
             publishers.shutdown().await;
+        }
+        if let Some(viewers) = self.viewers
+            && tokio::time::timeout(PUBLISHERS_STOP, viewers.stop()).await.is_err()
+        {
+            tracing::warn!("the Foxglove WebSocket did not close in time");
         }
         #[cfg(feature = "zenoh")]
         if let Some(publisher) = self.publisher

@@ -11,8 +11,10 @@ use clearway_lidar::sensor::SensorStatus;
 use clearway_mapping::pipeline::{Ledger, NamedStatus};
 use clearway_proto::v1;
 use serde_json::{Value, json};
+use tokio::sync::watch;
 
 use crate::demand::Demand;
+use crate::engine::NewestSweep;
 use crate::ingest::{Outside, Stranger, locked, now_ns};
 use crate::record::RecorderCounts;
 use crate::wire::EncodedMap;
@@ -35,6 +37,8 @@ pub struct VehicleStatus {
     pub layers: Vec<&'static str>,
     /// Which of the layers somebody takes.
     pub demand: Demand,
+    /// Where the newest map's points go while somebody takes them.
+    pub sweeps: watch::Sender<NewestSweep>,
     /// Readers over gRPC.
     pub grpc_readers: Arc<AtomicU32>,
     /// Open pages.
@@ -133,6 +137,7 @@ impl VehicleStatus {
             name,
             boot_id,
             demand: Demand::new(&layers),
+            sweeps: watch::Sender::new(None),
             layers,
             grpc_readers: Arc::default(),
             page_readers: Arc::default(),

@@ -14,6 +14,7 @@ use clearway_mapping::pipeline::{model_name, model_of_name};
 use clearway_proto::codec::{self, CellsRef};
 use clearway_proto::map::{encode_header, encode_layer};
 use clearway_proto::packed::{pack, unpack};
+use clearway_proto::predicted::encode_beside;
 use clearway_proto::v1;
 use nalgebra::{Isometry3, Quaternion, Translation3, Unit};
 use prost::Message;
@@ -149,13 +150,20 @@ fn layer(layer: &Layer) -> v1::Layer {
         Geometry::Radial { columns, .. } => usize::from(*columns),
         Geometry::Cartesian { width, .. } => *width as usize,
     };
+    let class = layer.channels.iter().find(|channel| channel.name == "class");
     let channel = |channel: &clearway_mapping::map::Channel| {
         let cells = match &channel.cells {
             Cells::U8(cells) => CellsRef::U8(cells),
             Cells::I8(cells) => CellsRef::I8(cells),
             Cells::U16(cells) => CellsRef::U16(cells),
         };
-        codec::encode_grid(cells, columns).into_channel(channel.name, channel.unit, channel.scale, channel.unknown)
+        let encoded = match class.map(|class| &class.cells) {
+            Some(Cells::U8(class)) if channel.name != "class" => {
+                encode_beside(cells, class, layer.legend.len(), columns)
+            }
+            _ => codec::encode_grid(cells, columns),
+        };
+        encoded.into_channel(channel.name, channel.unit, channel.scale, channel.unknown)
     };
     v1::Layer {
         name: layer.name.to_owned(),

@@ -23,8 +23,8 @@ export class Refused extends Error {
   }
 }
 
-// cellsExpected: what the layer's geometry holds. predict, in a delta: makes the cells that the differences are added to, in
-// a given typed array; it is asked when all else is checked.
+// cellsExpected: what the layer's geometry holds. predict, in a delta or of a channel told by class: makes the cells that
+// the differences are added to, in a given typed array; it is asked when all else is checked.
 export function decodeChannel(channel, cellsExpected, predict = null) {
   const { name, cell_type, cell_count, encoding, payload } = channel;
   const type = TYPES[cell_type];
@@ -49,6 +49,20 @@ export function decodeChannel(channel, cellsExpected, predict = null) {
   const crc = crc32(littleEndian(cells, type));
   if (crc !== channel.crc32) throw refuse("crc", `cells have ${hex(crc)}, the message says ${hex(channel.crc32)}`);
   return cells;
+}
+
+// What predicts the cells of a channel told by class: of each class what its cells mostly are. classes: those of the cells,
+// null where there are none.
+export function byClass(channel, classes, legend) {
+  const refuse = (detail) => new Refused("by_class", `channel ${channel.name}: ${detail}`);
+  const { width, signed } = TYPES[channel.cell_type] ?? TYPES[1];
+  if (!(classes instanceof Uint8Array)) throw refuse('no channel "class" of u8 before it');
+  const { by_class } = channel, length = legend.length * width;
+  if (by_class.length !== length) throw refuse(`${by_class.length} bytes; ${length} are needed`);
+  const view = new DataView(by_class.buffer, by_class.byteOffset, length);
+  const of = (k) => (width === 2 ? view.getUint16(2 * k, true) : signed ? view.getInt8(k) : view.getUint8(k));
+  const table = legend.map((_, k) => of(k));
+  return (Cells) => Cells.from(classes, (k) => table[k]);
 }
 
 function readRaw(payload, type, count, refuse) {

@@ -45,6 +45,12 @@ test("the golden channels decode to their cells", () => {
 
 const goldenMap = (name) => new Uint8Array(readFileSync(new URL(`../../proto/golden/${name}.bin`, import.meta.url)));
 
+test("the golden map told by class is the one told cell by cell", () => {
+  const [told, plain] = ["by_class", "by_class_plain"].map((name) => openMap(goldenMap(name)).layers[0].channels);
+  assert.deepEqual(told, plain);
+  assert.equal(told.length, 4);
+});
+
 test("the golden delta on its base is the golden whole", () => {
   const opened = openMap(goldenMap("delta"), openMap(goldenMap("delta_base")));
   const plain = ({ header, layers }) => ({

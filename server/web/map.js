@@ -1,7 +1,7 @@
 // In: the bytes of one MapUpdate. Out: the map with every layer's grid and cells checked, or an error that names what
 // was wrong. A map is taken whole or not at all.
 
-import { decodeChannel, Refused } from "./codec.js";
+import { byClass, decodeChannel, Refused } from "./codec.js";
 import { baseOf, predictor } from "./delta.js";
 import { gridOf } from "./grid.js";
 import { readMap, readMapUpdate } from "./protobuf.js";
@@ -27,13 +27,18 @@ export function openMap(bytes, base = null) {
 
 function openLayer(layer, before) {
   const grid = gridOf(layer);
+  let classes = null;
   const channels = layer.channels.map((channel) => {
-    const cells = decodeChannel(channel, grid.cells, before && predictor(layer.name, grid, before, channel));
+    const told = channel.by_class.length > 0;
+    if (told && before) throw new Refused("base_shape", `layer ${layer.name}: ${channel.name} is told by class too`);
+    const predict = told ? byClass(channel, classes, layer.legend) : before && predictor(layer.name, grid, before, channel);
+    const cells = decodeChannel(channel, grid.cells, predict);
     if (channel.name === "class") {
       const unnamed = cells.find((cell) => cell < 0 || cell >= layer.legend.length);
       if (unnamed !== undefined) {
         throw new Refused("class", `layer ${layer.name}: ${unnamed}; the legend names ${layer.legend.length}`);
       }
+      classes = cells;
     }
     const { name, unit, scale, unknown } = channel;
     return { name, unit, scale, unknown, cells };

@@ -233,6 +233,24 @@ async fn a_sensor_that_the_stream_declares_is_mapped_recorded_and_declared_again
     assert_eq!(header.sensors.iter().map(|sensor| sensor.returns).collect::<Vec<_>>(), [7200, 7200]);
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn what_a_blind_sector_hides_is_counted_as_far_as_the_status_and_unknown_in_the_map() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("r.mcap");
+    let mut config = scanned_config();
+    // Clockwise, so 80 to 100 degrees to the left of the vehicle.
+    config.vehicles[0].sensors[0].blind_deg = vec![[260.0, 280.0]];
+    let running = start(config, &file).await;
+    assert!(reports(&running, vec![scan(1, plain(1_000_000_000))]).await.1.is_none());
+    let status = &running.vehicles.0[0].status;
+    let (snapshot, said) = (status.snapshot(), status.to_json());
+    assert!((399..=401).contains(&snapshot.ledger.blind), "20 of 360 degrees of 7200 rays: {}", snapshot.ledger.blind);
+    assert_eq!(snapshot.sensors[0].ledger.blind, snapshot.ledger.blind);
+    assert!(said.to_string().contains(&format!("\"blind\":{}", snapshot.ledger.blind)), "{said}");
+    within("shutdown", running.shutdown()).await.unwrap();
+    assert!(verify(&file).unwrap().is_good());
+}
+
 /// A scan of a plain as the observations below change it.
 fn plain(stamp_ns: i64) -> v1::Scan {
     let rays = 0..7200_u32;

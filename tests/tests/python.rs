@@ -9,15 +9,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use clearway_sim::send::{Pace, Until, drive};
+use house::venv::{environment, run};
 use house::{config, feed, readings, start, until, vehicle, within};
 
 const REPOSITORY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
-
-fn run(command: &mut Command, hint: &str) {
-    let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}; {hint}"));
-    let said = [output.stdout, output.stderr].concat();
-    assert!(output.status.success(), "{command:?}: {}; {hint}\n{}", output.status, String::from_utf8_lossy(&said));
-}
 
 fn files(folder: &Path, into: &mut Vec<PathBuf>) {
     let skipped = ["build", "__pycache__", ".pytest_cache", "clearway.egg-info", "golden"];
@@ -48,26 +43,16 @@ fn fingerprint(repository: &Path) -> String {
 /// The interpreter of an environment with the client as it lies in the tree; made anew only where that has changed.
 fn python() -> PathBuf {
     let repository = Path::new(REPOSITORY).canonicalize().expect("the repository");
-    let environment = Path::new(env!("CARGO_TARGET_TMPDIR")).join("python-client");
-    let (interpreter, stamp) = (environment.join("bin/python"), environment.join("installed"));
-    let wanted = fingerprint(&repository);
-    if std::fs::read_to_string(&stamp).is_ok_and(|installed| installed == wanted) {
-        return interpreter;
-    }
-    let hint = "the Python client's tests need Debian's python3 and python3-venv, and a package registry";
-    run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&environment), hint);
-    // Built from a copy: a build leaves its traces in the folder it builds from.
-    let copy = environment.join("tree");
-    let package = copy.join("client/python");
-    let sources = [repository.join("client/python"), repository.join("proto")];
-    for (from, to) in sources.iter().zip(["client", "."]) {
-        std::fs::create_dir_all(copy.join(to)).expect("a folder of ours");
-        run(Command::new("cp").arg("-r").arg(from).arg(copy.join(to)), hint);
-    }
-    let what = format!("{}[zenoh,recording,test]", package.display());
-    run(Command::new(&interpreter).args(["-m", "pip", "install", "--quiet", "--no-input", &what]), hint);
-    std::fs::write(&stamp, wanted).expect("a file of ours");
-    interpreter
+    environment("python-client", &fingerprint(&repository), |environment| {
+        // Built from a copy: a build leaves its traces in the folder it builds from.
+        let copy = environment.join("tree");
+        let sources = [repository.join("client/python"), repository.join("proto")];
+        for (from, to) in sources.iter().zip(["client", "."]) {
+            std::fs::create_dir_all(copy.join(to)).expect("a folder of ours");
+            run(Command::new("cp").arg("-r").arg(from).arg(copy.join(to)), "cp");
+        }
+        vec![format!("{}[zenoh,recording,test]", copy.join("client/python").display()).into()]
+    })
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]

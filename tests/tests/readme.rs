@@ -1,5 +1,8 @@
 //! The README's commands do what the README says.
 
+#[path = "house/venv.rs"]
+mod venv;
+
 use std::fs;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -73,12 +76,21 @@ fn a_capture_is_replayed_verified_exported_and_described_as_the_readme_says() {
         .into_iter()
         .filter(|c| ["replay", "verify", "export", "info"].iter().any(|verb| c.split(' ').nth(1) == Some(verb)))
         .collect();
-    assert_eq!(offline.len(), 4, "{offline:?}");
+    assert_eq!(offline.len(), 6, "{offline:?}");
     for command in &offline {
         succeeds(folder.path(), command);
     }
     let pictures = fs::read_dir(folder.path().join("maps")).expect("maps/").count();
     assert!(pictures >= 6, "{pictures} pictures of 5.7 revolutions");
+    for (name, schema) in [("drive.foxglove.mcap", "foxglove.Grid"), ("drive.ros2.mcap", "nav_msgs/msg/OccupancyGrid")]
+    {
+        let told =
+            venv::run(venv::script("viewer_file.py").arg(folder.path().join(name)), "the README says who reads it");
+        let told: serde_json::Value = serde_json::from_str(&told).expect("one object");
+        let topics = told.as_object().expect("topics by name").values();
+        let grids = topics.filter(|topic| topic["schema"] == schema && topic["count"].as_u64() >= Some(6)).count();
+        assert_eq!(grids, 6, "every layer of 5.7 revolutions in {name}");
+    }
 }
 
 #[test]

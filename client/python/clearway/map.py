@@ -217,9 +217,23 @@ class Layer:
             text = f"channel {message.name!r} has {message.cell_count} cells; the grid has {rows * columns}"
             raise DecodeError("cell_count", text)
         predict = None if base is None else lambda dtype: self._predicted(message, base, dtype)
+        if message.by_class:
+            if base is not None:
+                raise DecodeError("base_shape", f"layer {self.name!r}: {message.name!r} is told by class too")
+            predict = lambda dtype: self._by_class(message, dtype)  # noqa: E731
         raw = codec.decode(message, predict=predict).reshape(rows, columns)
         raw.flags.writeable = False
         return Channel(message.name, message.unit, message.scale, message.unknown, raw)
+
+    def _by_class(self, message: map_pb2.Channel, dtype: np.dtype) -> np.ndarray:
+        classes = self.channels.get("class")
+        if classes is None or classes.raw.dtype != np.uint8:
+            raise DecodeError("by_class", f"layer {self.name!r}: no channel 'class' of u8 before {message.name!r}")
+        length = len(self.legend) * dtype.itemsize
+        if len(message.by_class) != length or classes.raw.max(initial=0) >= len(self.legend):
+            text = f"{len(message.by_class)} bytes by class; {length} are needed, and no class beyond"
+            raise DecodeError("by_class", f"layer {self.name!r}, channel {message.name!r}: {text}")
+        return np.frombuffer(message.by_class, dtype)[classes.raw].reshape(-1)
 
     def _predicted(self, message: map_pb2.Channel, base: Layer, dtype: np.dtype) -> np.ndarray:
         before = base.channels.get(message.name)

@@ -50,6 +50,14 @@ def test_a_bad_map_is_refused_by_name(vector):
     assert error.value.reason == vector["error"]
 
 
+def test_the_golden_map_told_by_class_is_the_one_told_cell_by_cell():
+    told, plain = (Map((GOLDEN / f"{name}.bin").read_bytes()) for name in ("by_class", "by_class_plain"))
+    channels = told["occupancy"].channels
+    assert list(channels) == ["class", "hits", "unit_height", "difference"]
+    for name, channel in channels.items():
+        np.testing.assert_array_equal(channel.raw, plain["occupancy"].channels[name].raw)
+
+
 def test_the_golden_delta_on_its_base_is_the_golden_whole():
     base, delta, whole = ((GOLDEN / f"delta{name}.bin").read_bytes() for name in ("_base", "", "_whole"))
     opened, expected = clearway.Map(delta, base=clearway.Map(base)), clearway.Map(whole)

@@ -17,6 +17,7 @@
 //! | [`scanner`] | world, poses, one sensor's figures -> firings of raw returns |
 //! | [`planes`] | world, poses, a unit of a few planes -> whole scans, with the rays that met nothing |
 //! | [`traffic`] | six such units on a car in traffic, and the ground each object covers |
+//! | [`contact`] | world, a vehicle's place and size -> what it touches |
 //! | [`encode`] | firings -> 1206-byte data packets |
 //! | [`telemetry`] | place, speed, time -> 512-byte telemetry datagrams |
 //! | [`vehicle`] | all of the above: datagrams without end |
@@ -24,6 +25,7 @@
 //! | [`send`] | datagrams -> UDP, paced by the clock |
 //! | [`noise`] | chance by key, for all of them |
 
+pub mod contact;
 pub mod course;
 pub mod encode;
 pub mod ground;

@@ -10,6 +10,7 @@ use clearway_lidar::revolution::Revolution;
 use clearway_lidar::sensor::{Sensor, SensorConfig};
 use nalgebra::{Isometry3, Point3};
 
+use crate::course::{Course, Drive};
 use crate::encode::Encoder;
 use crate::raycast::Caster;
 use crate::scanner::{Scanner, ScannerConfig};
@@ -191,6 +192,23 @@ impl SimulatedVehicle {
             }
         }
         unreachable!("datagrams do not end")
+    }
+
+    /// From the next firing on, which this gives the stamp of, the vehicle follows an arc of this curvature (1/m, left
+    /// positive) from where it is, at `speed` m/s. What is asked about the time before is from then on told as if it had
+    /// always done so.
+    pub fn steer(&mut self, curvature: f64, speed: f64) -> i64 {
+        let offset_ns = self.scanner.firing_ns(self.next_firing);
+        let time = offset_ns as f64 * 1e-9;
+        let (x, y, heading) = self.scene.drive.at(time);
+        let course = Course::from(x, y, heading);
+        let course = if curvature == 0.0 {
+            course.straight(1.0)
+        } else {
+            course.arc(curvature.recip().abs(), curvature.signum())
+        };
+        self.scene.drive = Drive::steady(Arc::new(course), -speed * time, 0.0, speed);
+        self.start_ns + offset_ns
     }
 
     fn time(&self, stamp_ns: i64) -> f64 {

@@ -146,3 +146,21 @@ fn what_the_sensor_sees_is_less_than_what_is_there() {
     let near = seen.iter().filter(|&&index| truth.middle(index).0.hypot(truth.middle(index).1) < 1.5).count();
     assert_eq!(near, (0..sees.len()).filter(|&i| truth.middle(i).0.hypot(truth.middle(i).1) < 1.5).count());
 }
+
+#[test]
+fn a_steered_vehicle_goes_on_from_where_it_is_along_the_arc_it_is_told() {
+    let mut vehicle = town(ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() });
+    vehicle.nth(100);
+    for (curvature, speed) in [(0.1, 5.0), (0.0, 8.0), (-0.05, 3.0), (0.0, 0.0)] {
+        let scene = vehicle.scene().clone();
+        let begins_ns = vehicle.steer(curvature, speed);
+        let at = |time_ns: i64| vehicle.scene().drive.at((time_ns - vehicle.start_ns()) as f64 * 1e-9);
+        let (before, begins) = (scene.drive.at((begins_ns - vehicle.start_ns()) as f64 * 1e-9), at(begins_ns));
+        let gap = (before.0 - begins.0).hypot(before.1 - begins.1) + (before.2 - begins.2).abs();
+        assert!(gap < 1e-9, "{before:?}, {begins:?}");
+        let later = at(begins_ns + 1_000_000_000);
+        assert!((later.2 - begins.2 - curvature * speed).abs() < 1e-9, "{begins:?}, {later:?}");
+        assert!((later.0 - begins.0).hypot(later.1 - begins.1) <= speed + 1e-9 && vehicle.speed_at(begins_ns) == speed);
+        assert!(vehicle.by_ref().nth(50).expect("no end").stamp_ns > begins_ns);
+    }
+}

@@ -1,36 +1,46 @@
-//! A recording -> one picture, array or document a map.
+//! A recording -> one picture, array or document a map, or one file for viewers.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
-use clearway_client::{Layer, MapView};
+use clearway_client::{Channel, Layer, MapView};
 
-use super::recording::Recording;
+use self::viewer_file::{Dialect, ViewerFile};
+use super::recording::{Message, Recording};
 use super::{document, npy, progress_bar};
 use clearway_client::picture::{self, Style};
 
-/// Export the maps of a recording, one file a map.
+mod turns;
+mod viewer_file;
+
+/// Export the maps of a recording: one file a map, or one MCAP file for viewers.
 ///
 /// Files are named by the map's sequence in six digits: png and json `<sequence>_<layer>.<format>`; npy
 /// `<sequence>_<layer>_<channel>.npy` (NumPy 1.0, shape (rows, columns)) and one `<sequence>_<layer>.json` with
 /// geometry, pose, stamps and class legend. Pictures look from above: vehicle in the middle, forward up, left left.
+///
+/// foxglove and ros2 write one new MCAP file with every layer, of every vehicle: coloured grids, transforms and the sensors'
+/// points; or occupancy grids (0 free, 100 occupied, -1 unknown), tf and odometry.
 #[derive(Args)]
 pub struct Options {
     /// The MCAP file; one cut by a crash gives what it holds.
     recording: PathBuf,
-    /// The layer, such as drivability.
-    #[arg(long)]
-    layer: String,
+    /// The layer, such as drivability; foxglove and ros2 take all unless told.
+    #[arg(long, required_if_eq_any([("format", "png"), ("format", "npy"), ("format", "json")]))]
+    layer: Option<String>,
     #[arg(long, value_enum)]
     format: Format,
-    /// The folder to write to; made if absent.
+    /// The folder to write to, made if absent; foxglove and ros2: the file, which must not be there yet.
     #[arg(long)]
     out: PathBuf,
     /// The vehicle, where the recording has several.
     #[arg(long)]
     vehicle: Option<String>,
+    /// foxglove: leave out the sensors' points, which are most of the file.
+    #[arg(long)]
+    no_points: bool,
     #[command(flatten)]
     drawing: Drawing,
 }
@@ -44,6 +54,32 @@ pub enum Format {
     Npy,
     /// One document, cells included.
     Json,
+    /// An MCAP file of Foxglove's messages.
+    Foxglove,
+    /// An MCAP file of ROS 2 messages.
+    Ros2,
+}
+
+/// Makes one map's files: what is put behind its name, and the bytes.
+type Files = fn(&MapView, &Layer, &Style) -> Result<Vec<(String, Vec<u8>)>>;
+
+/// Where maps go.
+enum Output {
+    Files(Files),
+    Viewer(Box<ViewerFile>),
+}
+
+impl Output {
+    fn new(options: &Options) -> Result<Self> {
+        let viewer = |dialect| ViewerFile::create(&options.out, dialect, !options.no_points).map(Box::new);
+        Ok(match options.format {
+            Format::Png => Self::Files(png),
+            Format::Npy => Self::Files(npy),
+            Format::Json => Self::Files(json),
+            Format::Foxglove => Self::Viewer(viewer(Dialect::Foxglove)?),
+            Format::Ros2 => Self::Viewer(viewer(Dialect::Ros2)?),
+        })
+    }
 }
 
 /// How pictures are drawn.
@@ -81,77 +117,102 @@ fn metres(text: &str) -> Result<f64, String> {
 /// # Errors
 /// What cannot be read or written; an unknown layer or vehicle, with those there are.
 pub fn run(options: &Options) -> Result<()> {
-    let Options { recording: file, layer, format, out, vehicle, .. } = options;
+    let Options { recording: file, layer, out, vehicle, .. } = options;
     let length = fs::metadata(file).with_context(|| format!("open {}", file.display()))?.len();
     let mut recording = Recording::open(file)?;
+    let mut output = Output::new(options)?;
     let style = options.drawing.style();
     let progress = progress_bar(length);
     let mut maps = 0_u64;
-    let mut only_vehicle: Option<String> = vehicle.clone();
-    let mut vehicles = Vec::new();
+    let mut vehicles: Vec<String> = Vec::new();
     while let Some(message) = recording.next() {
         let message = message.with_context(|| file.display().to_string())?;
         progress.set_position(recording.bytes_read);
-        let Some((of_vehicle, of_layer)) = message.map_of() else { continue };
+        let Some(of_vehicle) = message.vehicle() else { continue };
+        if vehicle.as_ref().is_some_and(|only| only != of_vehicle) {
+            continue;
+        }
+        if let Output::Viewer(viewer) = &mut output {
+            viewer.take_event(&message, &recording.attachments)?;
+        }
+        let Some((_, of_layer)) = message.map_of() else { continue };
+        if layer.as_ref().is_some_and(|only| only != of_layer) {
+            continue;
+        }
         if !vehicles.iter().any(|known| known == of_vehicle) {
             vehicles.push(of_vehicle.to_owned());
         }
-        if of_layer != layer {
-            continue;
+        let map = decode(&message, file)?;
+        let of_layer = map.layer(of_layer)?;
+        match &mut output {
+            Output::Viewer(viewer) => viewer.take_map(&map, of_layer, message.log_time_ns)?,
+            Output::Files(_) if vehicles.len() > 1 => {
+                bail!("{} has maps of {}: name one with --vehicle", file.display(), vehicles.join(" and "))
+            }
+            Output::Files(files) => {
+                if maps == 0 {
+                    fs::create_dir_all(out).with_context(|| format!("make the folder {}", out.display()))?;
+                }
+                write(&format!("{:06}_{}", map.sequence(), of_layer.name), files(&map, of_layer, &style)?, out)?;
+            }
         }
-        match &only_vehicle {
-            None => only_vehicle = Some(of_vehicle.to_owned()),
-            Some(only) if only == of_vehicle => {}
-            Some(_) if vehicle.is_some() => continue,
-            Some(only) => bail!("{} has maps of {only} and {of_vehicle}: name one with --vehicle", file.display()),
-        }
-        let map =
-            MapView::decode(message.data.clone()).with_context(|| format!("{}, {}", file.display(), message.topic))?;
-        if maps == 0 {
-            fs::create_dir_all(out).with_context(|| format!("make the folder {}", out.display()))?;
-        }
-        write(&map, map.layer(layer)?, *format, &style, out)?;
         maps += 1;
         progress.set_message(format!("{maps} maps"));
     }
     progress.finish_and_clear();
+    if let Output::Viewer(viewer) = output {
+        viewer.finish().with_context(|| format!("write {}", out.display()))?;
+    }
     if let Some(cut) = &recording.cut {
         eprintln!("clearway: {} is {cut}; exported what it holds", file.display());
     }
     if maps == 0 {
-        let layers = recording.layers();
-        if layers.is_empty() {
-            bail!("{} has no maps", file.display());
-        }
-        if !layers.contains(layer) {
-            bail!("{} has no layer {layer:?}; it has {}", file.display(), layers.join(", "));
-        }
-        match vehicle {
-            Some(name) if !vehicles.contains(name) => {
-                bail!("{} has no vehicle {name:?} with maps; it has {}", file.display(), vehicles.join(", "))
-            }
-            _ => bail!("{} has layer {layer:?}, but no map in it", file.display()),
-        }
+        bail!("{}", nothing_exported(file, &recording, layer.as_deref(), vehicle.as_deref()));
     }
-    println!("{maps} maps of {layer} in {}", out.display());
+    println!("{maps} maps of {} in {}", layer.as_deref().unwrap_or("all layers"), out.display());
     Ok(())
 }
 
-/// Writes one map's files.
-fn write(map: &MapView, layer: &Layer, format: Format, style: &Style, out: &Path) -> Result<()> {
-    let stem = format!("{:06}_{}", map.sequence(), layer.name);
-    let write = |name: String, bytes: Vec<u8>| {
-        let path = out.join(name);
-        fs::write(&path, bytes).with_context(|| format!("write {}", path.display()))
+fn decode(message: &Message, file: &Path) -> Result<MapView> {
+    MapView::decode(message.data.clone()).with_context(|| format!("{}, {}", file.display(), message.topic))
+}
+
+/// Why there was no map, and what there is instead.
+fn nothing_exported(file: &Path, recording: &Recording, layer: Option<&str>, vehicle: Option<&str>) -> String {
+    let (file, layers, vehicles) = (file.display(), recording.layers(), recording.vehicles());
+    let absent = |name: Option<&str>, of: &[String]| {
+        name.filter(|name| !of.iter().any(|known| known == name)).map(str::to_owned)
     };
-    match format {
-        Format::Png => write(format!("{stem}.png"), picture::png(layer, style)?),
-        Format::Json => write(format!("{stem}.json"), serde_json::to_vec(&document::layer(map, layer, true))?),
-        Format::Npy => {
-            for channel in &layer.channels {
-                write(format!("{stem}_{}.npy", channel.name), npy::encode(&channel.cells, layer.grid.shape()))?;
-            }
-            write(format!("{stem}.json"), serde_json::to_vec_pretty(&document::layer(map, layer, false))?)
-        }
+    if layers.is_empty() {
+        return format!("{file} has no maps");
     }
+    if let Some(name) = absent(layer, &layers) {
+        return format!("{file} has no layer {name:?}; it has {}", layers.join(", "));
+    }
+    match absent(vehicle, &vehicles) {
+        Some(name) => format!("{file} has no vehicle {name:?} with maps; it has {}", vehicles.join(", ")),
+        None => format!("{file} has these layers, but no map in them"),
+    }
+}
+
+/// Writes one map's files.
+fn write(stem: &str, files: Vec<(String, Vec<u8>)>, out: &Path) -> Result<()> {
+    files.into_iter().try_for_each(|(rest, bytes)| {
+        let path = out.join(format!("{stem}{rest}"));
+        fs::write(&path, bytes).with_context(|| format!("write {}", path.display()))
+    })
+}
+
+fn png(_: &MapView, layer: &Layer, style: &Style) -> Result<Vec<(String, Vec<u8>)>> {
+    Ok(vec![(".png".into(), picture::png(layer, style)?)])
+}
+
+fn json(map: &MapView, layer: &Layer, _: &Style) -> Result<Vec<(String, Vec<u8>)>> {
+    Ok(vec![(".json".into(), serde_json::to_vec(&document::layer(map, layer, true))?)])
+}
+
+fn npy(map: &MapView, layer: &Layer, _: &Style) -> Result<Vec<(String, Vec<u8>)>> {
+    let array = |channel: &Channel| (format!("_{}.npy", channel.name), npy::encode(&channel.cells, layer.grid.shape()));
+    let document = serde_json::to_vec_pretty(&document::layer(map, layer, false))?;
+    Ok(layer.channels.iter().map(array).chain([(".json".into(), document)]).collect())
 }

@@ -2,7 +2,7 @@
 //!
 //! A file cut by a crash yields all its whole chunks, and then says that it was cut; so does one with damage inside.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
@@ -33,6 +33,17 @@ impl Message {
     /// Vehicle and layer, where this is a map.
     pub fn map_of(&self) -> Option<(&str, &str)> {
         map_topic(&self.topic, &self.schema)
+    }
+
+    /// The vehicle, where this is its journal.
+    pub fn journal_of(&self) -> Option<&str> {
+        let vehicle = self.topic.strip_prefix('/')?.strip_suffix("/journal")?;
+        (self.schema == "clearway.v1.Event").then_some(vehicle)
+    }
+
+    /// The vehicle, where this is a map or a journal.
+    pub fn vehicle(&self) -> Option<&str> {
+        self.map_of().map(|(vehicle, _)| vehicle).or_else(|| self.journal_of())
     }
 
     /// Whether this is one of anyone's Velodyne scans.
@@ -92,12 +103,18 @@ impl Recording {
 
     /// Names of the layers seen so far.
     pub fn layers(&self) -> Vec<String> {
+        self.map_topics(|(_, layer)| layer)
+    }
+
+    /// Names of the vehicles with maps seen so far.
+    pub fn vehicles(&self) -> Vec<String> {
+        self.map_topics(|(vehicle, _)| vehicle)
+    }
+
+    fn map_topics(&self, part: impl for<'a> Fn((&'a str, &'a str)) -> &'a str) -> Vec<String> {
         let topics = self.channels.values();
-        let mut layers: Vec<_> =
-            topics.filter_map(|(topic, schema)| Some(map_topic(topic, schema)?.1.to_owned())).collect();
-        layers.sort_unstable();
-        layers.dedup();
-        layers
+        let parts = topics.filter_map(|(topic, schema)| map_topic(topic, schema)).map(|of| part(of).to_owned());
+        parts.collect::<BTreeSet<_>>().into_iter().collect()
     }
 
     fn read(&mut self) -> Result<Option<Message>> {

@@ -1,4 +1,5 @@
 //! The files in `golden/`, read and, with `CLEARWAY_BLESS=1`, written.
+#![allow(dead_code, reason = "each test file uses its part")]
 
 use std::path::PathBuf;
 

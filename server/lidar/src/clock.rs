@@ -19,6 +19,10 @@
 //! - Where that puts the device's own minutes and seconds within [`HOUR_ERROR_NS_MAX`] of UTC's, somebody has set them (GPS
 //!   without telemetry, PTP), and the offset is the whole hours.
 //!
+//! A host's clock that is set while a device is silent is not believed about the silence (`timeline.rs`). One that is set between
+//! the two packets between which the device's own clock jumps is: nobody else tells how long that took. Stamps that went
+//! ahead by that are held until GPS, or the host, has caught up with them.
+//!
 //! GPS time that lies farther behind the stamps given than they catch up with ([`CATCH_UP_NS_MAX`]) is not waited for: arrival
 //! goes on. Stamps always rise. A correction forward is made at once; one backward by running at half speed, up to
 //! [`CATCH_UP_NS_MAX`]; beyond that it is not made. Host clocks that fall behind the device at once (set back, or a

@@ -21,6 +21,9 @@ use crate::telemetry::Telemetry;
 use crate::turns::{LONGEST_FORWARD, MAX_FIRINGS_PER_TURN, Step, Turns, expected_step};
 use crate::unit_clock::UnitClock;
 
+/// At 60 rpm; where more time has passed from packet to packet, another turn has begun.
+const TURN_NS_MAX: i64 = 1_000_000_000;
+
 #[derive(Clone, Debug)]
 pub(crate) struct Decoder {
     spec: &'static ModelSpec,
@@ -36,6 +39,8 @@ pub(crate) struct Decoder {
     done: Revolution,
     /// The first firing of `current` on the clock's timeline.
     first_ns: i64,
+    /// Of the newest packet, on the timeline.
+    packet_ns: i64,
     /// Firings of the newest turn that missed nothing.
     firings_whole: Option<u32>,
     /// Counts the sensor turns a block, and the azimuth at which the packet before began.
@@ -79,6 +84,7 @@ impl Decoder {
             done: revolution.clone(),
             current: revolution,
             first_ns: 0,
+            packet_ns: 0,
             firings_whole: None,
             step: None,
             packet_azimuth: None,
@@ -140,7 +146,8 @@ impl Decoder {
         let device_us = timed.then(|| packet.device_us());
         let time_ns = self.clock.packet(device_us, elapsed_ns, arrival_ns, span_ns);
 
-        let torn = self.take_gap(firings.azimuths(), gap);
+        let passed_ns = time_ns - std::mem::replace(&mut self.packet_ns, time_ns);
+        let torn = self.take_gap(firings.azimuths(), gap, passed_ns);
         let first_row = self.current.firings.len();
         let cut = self.follow(&firings, time_ns, torn, may_cut && !done);
         self.decode(packet, 0, first_row);
@@ -277,13 +284,14 @@ impl Decoder {
     }
 
     /// Takes note of what is missing before a packet; whether that is a turn or more, or nobody knows how much.
-    fn take_gap(&mut self, azimuths: &[u32], gap: Gap) -> bool {
+    fn take_gap(&mut self, azimuths: &[u32], gap: Gap, passed_ns: i64) -> bool {
         let span = self.span();
         if gap.jumped {
             self.loss.jump();
         }
         let lost = self.loss.take(gap, azimuths, span);
-        let torn = gap.jumped || u64::from(gap.missing) * u64::from(span) >= u64::from(AZIMUTHS_PER_TURN);
+        let turned = u64::from(gap.missing) * u64::from(span) >= u64::from(AZIMUTHS_PER_TURN);
+        let torn = gap.jumped || turned || passed_ns > TURN_NS_MAX;
         if !self.current.firings.is_empty() {
             self.current.packets_expected = self.current.packets_expected.saturating_add(lost);
             return torn;

@@ -95,12 +95,21 @@ impl Fusion {
 
     /// Whether the turn ended after the last map's stamp: where another sensor takes over, its newest turn may be the older
     /// one. The same sensor's stamps rise by themselves, unless its clock was set back; all clocks may have been, once a map
-    /// is overdue and the turn older by more than the deadline.
+    /// is overdue and the turn older by more than the deadline. A turn that ended long before it was completed is none of
+    /// another clock: its sensor was silent until now.
     fn is_newer(&self, source: usize, intake: &Intake, overdue: bool) -> bool {
         self.last.is_none_or(|made| {
             let newer_ns = intake.turn.end_ns.saturating_sub(made.stamp_ns);
-            made.maker == source || newer_ns > 0 || (overdue && newer_ns < -self.deadline_ns)
+            let set_back = overdue && newer_ns < -self.deadline_ns && !self.came_late(intake);
+            made.maker == source || newer_ns > 0 || set_back
         })
+    }
+
+    /// Whether the turn was completed later than the deadline after its end, as the host's clock had it then.
+    fn came_late(&self, intake: &Intake) -> bool {
+        let host_ns = intake.turn.state.clock_offset_ms.saturating_mul(NS_A_MS);
+        let since_ns = intake.turn.completed.arrival_ns.saturating_sub(intake.turn.end_ns).saturating_sub(host_ns);
+        since_ns.saturating_abs() > self.deadline_ns
     }
 
     fn order(&self, sensors: usize) -> impl Iterator<Item = usize> {

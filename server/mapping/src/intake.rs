@@ -278,7 +278,6 @@ impl Intake {
 }
 
 fn check(scan: &Scan) -> Result<(), Rejected> {
-    Rejected::unless_in_range(scan.stamp_ns)?;
     let (x, y, z, intensity) = (scan.x.len(), scan.y.len(), scan.z.len(), scan.intensity.len());
     if x != y || x != z || x != intensity {
         return Err(Rejected::ScanLengths { x, y, z, intensity });
@@ -296,7 +295,7 @@ fn check(scan: &Scan) -> Result<(), Rejected> {
     let unit = |ray: &[f32; 3]| (0.998..=1.002).contains(&ray.iter().map(|v| v * v).sum::<f32>());
     match scan.no_returns.iter().find(|ray| !unit(ray)) {
         Some(&direction) => Err(Rejected::NoReturn { direction }),
-        None => Ok(()),
+        None => Rejected::unless_in_range(scan.stamp_ns),
     }
 }
 

@@ -396,6 +396,29 @@ fn velodyne(model: Model, height_m: f64, until_ms: i64) -> Vec<Event> {
 }
 
 #[test]
+fn half_a_field_of_view_is_complete_and_half_a_turn_lost_is_not() {
+    let events = velodyne(Model::Vlp16, 1.9, 2000);
+    let lost_ns = events[0].arrival_ns + 1000 * MS..events[0].arrival_ns + 1100 * MS;
+    let is_ahead = |event: &Event| match &event.body {
+        Body::Datagram(packet) if packet.len() == 1206 => {
+            !(9_000..27_000).contains(&u16::from_le_bytes([packet[2], packet[3]]))
+        }
+        _ => true,
+    };
+    let made = |keep: &dyn Fn(&Event) -> bool| -> Vec<(f32, Part)> {
+        let mut pipeline = pipeline(&config());
+        let maps = events.iter().filter(|event| keep(event)).filter_map(|event| step(&mut pipeline, event));
+        maps.map(|map| (map.sensors[0].completeness, map.sensors[0].state)).collect()
+    };
+    let half = made(&is_ahead);
+    assert!(half.len() > 15 && half[5..].iter().all(|(share, part)| *share > 0.98 && *part == Part::Ok), "{half:?}");
+    let once = made(&|event| is_ahead(event) || !lost_ns.contains(&event.arrival_ns));
+    let partial: Vec<f32> = once.iter().filter(|(_, part)| *part == Part::Partial).map(|(share, _)| *share).collect();
+    let lost: f32 = partial[1..].iter().map(|share| 1.0 - share).sum();
+    assert!((0.45..0.55).contains(&lost), "the first turn begins somewhere; then half a turn is missing: {once:?}");
+}
+
+#[test]
 fn two_turning_sensors_have_a_decoder_and_a_ledger_each_and_their_order_between_two_maps_is_free() {
     let mut config = config();
     let low = SensorConfig { model: Some(Model::Hdl32e), ..SensorConfig::new("low", at(0.0, 0.0, 1.5, 0.0)) };
@@ -480,6 +503,27 @@ fn a_host_clock_that_steps_holds_no_map() {
             made += usize::from(step(&mut pipeline, &event(1, arrival_ns, scan(1, stamp_ns).body)).is_some());
         }
         assert!((17..=24).contains(&made), "{step_ns}: {made} maps in 2 s");
+    }
+}
+
+#[test]
+fn a_turn_that_a_silence_held_back_makes_no_map_older_than_the_last_though_the_host_steps_as_it_ends() {
+    let mut events = velodyne(Model::Vlp16, 1.9, 2000);
+    let start_ns = events[0].arrival_ns;
+    let silent = start_ns + 550 * MS..start_ns + 1300 * MS;
+    events.retain(|event| !silent.contains(&event.arrival_ns));
+    events.extend((1..20).map(|n| scan(1, start_ns + n * 100 * MS)).filter(|event| event.arrival_ns < silent.end));
+    events.sort_by_key(|event| event.arrival_ns);
+    for host_ns in [0, 2_000 * MS, 3_600_000 * MS, -2_000 * MS] {
+        let mut pipeline = pipeline(&config());
+        let made: Vec<i64> = (events.iter())
+            .filter_map(|event| {
+                let ahead_ns = if event.arrival_ns < silent.end { 0 } else { host_ns };
+                step(&mut pipeline, &Event { arrival_ns: event.arrival_ns + ahead_ns, ..event.clone() })
+            })
+            .map(|map| map.capture_end_ns)
+            .collect();
+        assert!(made.len() > 12 && made.is_sorted_by(|before, after| before < after), "{host_ns}: {made:?}");
     }
 }
 

@@ -218,6 +218,12 @@ impl Writer {
         self
     }
 
+    /// Signed bytes as they are, without a count.
+    pub fn signed_bytes(&mut self, bytes: &[i8]) -> &mut Self {
+        self.message.extend(bytes.iter().map(|byte| byte.cast_unsigned()));
+        self
+    }
+
     fn number(&mut self, bytes: &[u8]) -> &mut Self {
         let length = (self.message.len() - ENCAPSULATION).next_multiple_of(bytes.len());
         self.message.resize(ENCAPSULATION + length, 0);

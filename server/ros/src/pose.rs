@@ -114,7 +114,7 @@ fn pose(reader: &mut Reader, what: &'static str) -> Result<Isometry3<f64>, Messa
     Ok(Isometry3::from_parts(Translation3::new(x, y, z), UnitQuaternion::from_quaternion(quaternion)))
 }
 
-fn write_pose<'a>(writer: &'a mut Writer, pose: &Isometry3<f64>) -> &'a mut Writer {
+pub(crate) fn write_pose<'a>(writer: &'a mut Writer, pose: &Isometry3<f64>) -> &'a mut Writer {
     // Both are stored as they are written: x y z, and x y z w.
     writer.f64s(pose.translation.vector.as_slice()).f64s(pose.rotation.coords.as_slice())
 }

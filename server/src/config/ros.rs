@@ -5,6 +5,9 @@ use std::collections::BTreeMap;
 use clearway_mapping::config::SensorConfig;
 use serde::{Deserialize, Serialize};
 
+/// What `ROS_DOMAIN_ID` may be.
+pub(super) const DOMAIN_MAX: u32 = 232;
+
 /// `[vehicle.ros]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -50,7 +53,7 @@ impl Ros {
             let allowed = "only with zenoh.enabled = true: it comes through zenoh";
             return Err(("ros", "(set)".into(), allowed.into()));
         }
-        if self.domain > 232 {
+        if self.domain > DOMAIN_MAX {
             return Err(("ros.domain", self.domain.to_string(), "0 to 232".into()));
         }
         if let Some(unknown) = self.sensors.keys().find(|name| !sensors.iter().any(|sensor| sensor.name == **name)) {
@@ -72,7 +75,7 @@ impl Ros {
 }
 
 /// Whether ROS allows such a topic: parts of letters, digits and underscores, each behind a slash.
-fn is_topic(topic: &str) -> bool {
+pub(super) fn is_topic(topic: &str) -> bool {
     let part = |part: &str| !part.is_empty() && part.bytes().all(|byte| byte == b'_' || byte.is_ascii_alphanumeric());
     topic.strip_prefix('/').is_some_and(|rest| rest.split('/').all(part))
 }

@@ -178,3 +178,24 @@ fn the_ros_door_as_the_default_file_shows_it_is_taken_and_wrong_topics_are_named
         assert!(error.contains(said), "{error}");
     }
 }
+
+#[test]
+fn names_that_ros_2_does_not_know_are_refused_only_where_maps_go_to_it() {
+    let ros2 = |ros2: &str| format!("[zenoh.ros2]\n{ros2}\n{NEEDED}");
+    let names = NEEDED.replace("\"car\"", "\"4-wheeler\"");
+    assert!(parse(&names).is_ok());
+    let refused = error(&format!("[zenoh.ros2]\nenabled = true\n{names}"));
+    assert!(refused.contains("vehicle.name = 4-wheeler") && refused.contains("no digit first"), "{refused}");
+    for (key, value, allowed) in [
+        ("namespace", "\"clearway\"", "such as \"/clearway\", or empty"),
+        ("namespace", "\"/\"", "such as \"/clearway\", or empty"),
+        ("namespace", "\"/fleet/7\"", "such as \"/clearway\", or empty"),
+        ("domain", "233", "0 to 232"),
+    ] {
+        let refused = error(&ros2(&format!("enabled = true\n{key} = {value}")));
+        assert!(refused.contains(&format!("zenoh.ros2.{key}")) && refused.contains(allowed), "{refused}");
+    }
+    assert!(parse(&ros2("enabled = true\nnamespace = \"\"")).is_ok());
+    let refused = error(&format!("[zenoh]\nenabled = false\n{}", ros2("enabled = true")));
+    assert!(refused.contains("zenoh.ros2.enabled = true: allowed: only with zenoh.enabled = true"), "{refused}");
+}

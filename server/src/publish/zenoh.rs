@@ -19,6 +19,7 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Config, Session};
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig, RepliesConfig};
 
+use super::ros::Node;
 use super::{Served, Vehicles};
 use crate::config::Zenoh as Options;
 use crate::ingest::entrance::Entrances;
@@ -94,6 +95,13 @@ impl Publisher {
         let mut publisher = Self { session, tokens: Vec::new(), tasks: JoinSet::new() };
         for served in vehicles.0.iter() {
             publisher.publish(served).await?;
+        }
+        if options.ros2.enabled {
+            let mut node = Node::declare(&publisher.session, &options.ros2).await?;
+            for served in vehicles.0.iter() {
+                node.publish(served, &mut publisher.tasks).await?;
+            }
+            publisher.tokens.append(&mut node.into_tokens());
         }
         for entrance in entrances.all() {
             let ingest = Ingest::subscribe(&publisher.session, entrance.clone()).await?;

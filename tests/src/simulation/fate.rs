@@ -13,6 +13,10 @@ pub const HEAL_NS: i64 = 18 * TURN_NS;
 /// The run ends here.
 pub const END_NS: i64 = HEAL_NS + 10 * TURN_NS;
 
+/// Where a device's counter jumps between the same two packets as the host's clock is set, nobody tells how much time has
+/// passed, and stamps that went ahead are held (`clearway_lidar::clock`). The longest burst of loss lasts less than this.
+const APART_NS: i64 = 3 * TURN_NS;
+
 /// Chance, draw after draw.
 #[derive(Clone, Debug)]
 pub struct Dice(u64);
@@ -126,8 +130,13 @@ impl Fate {
         let host_clock = (!plain && dice.happens(0.35)).then(|| {
             let step_ns = if dice.happens(0.5) { 3_600_000_000_000 } else { 2_000_000_000 };
             let step_ns = if dice.happens(0.5) { step_ns } else { -step_ns };
-            (during(&mut dice, HEAL_NS), step_ns)
+            let when = during(&mut dice, HEAL_NS);
+            (when.start..when.end.min(HEAL_NS - 2 * APART_NS), step_ns)
         });
+        // A device's counter jumps when it is restarted, and when its receiver is back after the faults.
+        let jumps = || troubles.iter().filter_map(|trouble| trouble.restart.map(|(at_ns, _)| at_ns)).chain([HEAL_NS]);
+        let is_apart = |at_ns: i64| jumps().all(|jump_ns| (at_ns - jump_ns).abs() > APART_NS);
+        let host_clock = host_clock.filter(|(when, _)| !when.is_empty() && is_apart(when.start) && is_apart(when.end));
         let disk = match dice.of(0..10) {
             0..5 => DiskFate::Sound,
             5..7 => {

@@ -79,6 +79,10 @@ fn dated(t: i64, date: &str) -> Option<(u8, String)> {
     Some((2, rmc((NOON + t - MIDNIGHT) / S, 'A', date)))
 }
 
+fn restarted(t: i64) -> bool {
+    (EVENT - TURN..EVENT).contains(&t)
+}
+
 fn after<T>(t: i64, then: T, before: T) -> T {
     if t >= EVENT { then } else { before }
 }
@@ -129,6 +133,15 @@ fn scripts() -> Vec<Script> {
         },
         Script { name: "the host steps an hour on, under GPS", host_ns: |t| after(t, HOUR, 0), ..BASE },
         Script { name: "the host steps an hour back, under GPS", host_ns: |t| after(t, -HOUR, 0), ..BASE },
+        Script {
+            name: "restarted while the host is an hour back, and GPS is gained and the host set between the same two packets",
+            device_ns: |t| if restarted(t) { 1_034 * S + t } else { NOON + t },
+            telemetry: |t| if restarted(t) { None } else { gps(NOON + t) },
+            host_ns: |t| if restarted(t) { -HOUR } else { 0 },
+            event_ns: EVENT - TURN,
+            healed_ns: 2 * TURN,
+            ..BASE
+        },
         Script { name: "the host steps 2 s on during a silence, under GPS", host_ns: |t| after(t, 2 * S, 0), ..silent },
         Script {
             name: "the host steps 2 s back during a silence, under GPS",

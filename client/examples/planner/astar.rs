@@ -1,0 +1,247 @@
+//! `speed` maps to a way and a move: A* by travel time over ground that was seen to be passable.
+//!
+//! In: maps, a goal. Out: the next [`Move`]. Frame: the maps' world ("map") where the vehicle tells its ego poses; what was
+//! seen is then remembered for a while, since a sensor sees nothing close by. Without poses each map stands alone, in the
+//! ego frame. Ground that nobody saw is never entered, but for where the vehicle stands at first.
+
+use std::cmp::Reverse;
+use std::collections::{BinaryHeap, HashMap};
+
+use clearway_client::{ClientError, MapView};
+
+/// Edge of a cell of the planner's own grid, metres.
+const CELL_M: f64 = 0.5;
+/// It looks this far, metres.
+const REACH_M: f64 = 16.0;
+/// Three discs about these places of the vehicle, metres ahead of its middle, cover it; each has a radius of 1.16 m.
+const DISCS_M: [f64; 3] = [1.45, 0.0, -1.45];
+/// From the middle of a disc to an obstacle's: its radius, and half a cell. Where that is not to be had, less at a crawl.
+const CLEARANCES_M: [(f64, f64); 2] = [(1.5, MPS_MAX), (1.2, 1.0)];
+/// Where it begins, the ground about it that its sensor cannot see is taken on trust, metres.
+const STAND_M: f64 = 5.0;
+/// And driven over so slowly, m/s.
+const STAND_MPS: f64 = 2.0;
+/// An obstacle that is not seen again is forgotten after this, ns; the ground under it is then unknown.
+const MEMORY_NS: i64 = 2_000_000_000;
+/// Never faster, m/s.
+const MPS_MAX: f64 = 8.0;
+/// Nothing nearer is aimed at, metres.
+const NEAREST_M: f64 = 2.0;
+/// Braking, and to the side, m/s².
+const BRAKE_MPS2: f64 = 4.0;
+/// Tightest turn, 1/m.
+const CURVATURE_MAX: f64 = 0.2;
+
+/// A place, metres.
+pub type Place = [f64; 2];
+type Cell = [i32; 2];
+
+/// What the vehicle should do until the next map.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Move {
+    /// Of the arc to follow, left positive, 1/m.
+    pub curvature_per_m: f64,
+    /// 0 where there is no way.
+    pub mps: f64,
+    /// Length of the way found towards the goal.
+    pub way_m: f64,
+}
+
+/// Remembers what it was shown.
+#[derive(Debug, Default)]
+pub struct Planner {
+    seen: HashMap<Cell, Seen>,
+    /// Of the newest map: x, y, heading.
+    ego: [f64; 3],
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Seen {
+    /// 0: an obstacle.
+    mps: f64,
+    stamp_ns: i64,
+}
+
+impl Planner {
+    /// Takes a map with the layer `speed`.
+    pub fn take(&mut self, map: &MapView) -> Result<(), ClientError> {
+        let (layer, stamp_ns) = (map.layer("speed")?, map.header().capture_end_ns);
+        self.ego = match &map.header().map_from_ego {
+            Some(p) => {
+                [p.x, p.y, f64::atan2(2.0 * (p.qw * p.qz + p.qx * p.qy), 1.0 - 2.0 * (p.qy * p.qy + p.qz * p.qz))]
+            }
+            None => {
+                self.seen.clear();
+                [0.0; 3]
+            }
+        };
+        let begins = self.seen.is_empty();
+        let here = [self.ego[0], self.ego[1]];
+        self.seen.retain(|cell, seen| {
+            let is_fresh = seen.mps > 0.0 || stamp_ns - seen.stamp_ns < MEMORY_NS;
+            is_fresh && distance(middle(*cell), here) < 1.25 * REACH_M
+        });
+        for cell in about(self.cell_of_ego(), REACH_M) {
+            let [x, y] = self.in_ego(middle(cell));
+            let mps = match layer.class_at(x, y).1 {
+                "passable" | "road" => layer.value_at("speed", x, y).unwrap_or(0.0),
+                "unknown" if begins && x.hypot(y) < STAND_M => STAND_MPS,
+                _ => continue,
+            };
+            self.seen.insert(cell, Seen { mps, stamp_ns });
+        }
+        // By the obstacles' own cells: none falls between two of the planner's.
+        let Some(classes) = layer.channel("class").map(|channel| &channel.cells) else { return Ok(()) };
+        let obstacle = layer.legend.iter().position(|name| name == "obstacle").map(|class| class as i32);
+        for index in (0..layer.grid.cell_count() as usize).filter(|&index| classes.get(index) == obstacle) {
+            let Some((x, y)) = layer.grid.centre_of(index).filter(|(x, y)| x.hypot(*y) < REACH_M) else { continue };
+            self.seen.insert(cell_of(self.in_map([x, y])), Seen { mps: 0.0, stamp_ns });
+        }
+        Ok(())
+    }
+
+    /// What it knows of the ground about the vehicle, ahead up: `.` passable, `#` an obstacle, blank nobody saw.
+    pub fn picture(&self) -> String {
+        let here = self.cell_of_ego();
+        let mark = |ahead: i32, left: i32| {
+            let cell = cell_of(self.in_map([f64::from(ahead) * CELL_M, f64::from(left) * CELL_M]));
+            match self.seen.get(&cell) {
+                _ if cell == here => '^',
+                None => ' ',
+                Some(seen) if seen.mps == 0.0 => '#',
+                Some(_) => '.',
+            }
+        };
+        let line = |ahead| (-24..=24).rev().map(|left| mark(ahead, left)).chain(['\n']).collect::<String>();
+        (-8..=24).rev().map(line).collect()
+    }
+
+    /// The place so many metres straight ahead, in the planner's frame.
+    pub fn ahead(&self, metres: f64) -> Place {
+        self.in_map([metres, 0.0])
+    }
+
+    /// The next move towards a goal, or to where the way ends nearest to it: the arc to the farthest place of the way that
+    /// can be followed up to there.
+    pub fn next_move(&self, goal: Place) -> Move {
+        let mut way_m = 0.0;
+        for (clearance_m, mps) in CLEARANCES_M {
+            let open = self.open(clearance_m);
+            let way = self.way(goal, &open);
+            way_m = way.array_windows().map(|[a, b]| distance(*a, *b)).sum();
+            let ahead =
+                way.iter().rev().map(|place| self.in_ego(*place)).filter(|[x, y]| *x > 0.0 && x.hypot(*y) > NEAREST_M);
+            let mut arcs = ahead.map(|[x, y]| (2.0 * y / (x * x + y * y), x.hypot(y)));
+            let Some((curvature_per_m, _)) = arcs.find(|(bend, length_m)| self.is_clear(*bend, *length_m, &open))
+            else {
+                continue;
+            };
+            let seen = way.iter().filter_map(|place| self.seen.get(&cell_of(*place)));
+            let allowed = seen.take(6).map(|seen| seen.mps).fold(mps, f64::min);
+            let in_bend = (BRAKE_MPS2 / curvature_per_m.abs()).sqrt();
+            let to_stop = (2.0 * BRAKE_MPS2 * (way_m - 2.0).max(0.0)).sqrt();
+            return Move { curvature_per_m, mps: allowed.min(in_bend).min(to_stop), way_m };
+        }
+        Move { curvature_per_m: 0.0, mps: 0.0, way_m }
+    }
+
+    /// Whether the vehicle may follow an arc so far; bends are slight enough to take an arc to be as long as its chord.
+    fn is_clear(&self, curvature_per_m: f64, length_m: f64, open: &HashMap<Cell, f64>) -> bool {
+        let steps = (length_m / (CELL_M / 2.0)).ceil();
+        let is_open = |step: f64, disc_m: f64| {
+            let turned = curvature_per_m * length_m * step / steps;
+            // The chord of an arc points half as far round as the arc turns.
+            let (chord_m, (half_sin, half_cos)) = (length_m * step / steps, (turned / 2.0).sin_cos());
+            let (sin, cos) = turned.sin_cos();
+            let place = [chord_m * half_cos + disc_m * cos, chord_m * half_sin + disc_m * sin];
+            open.contains_key(&cell_of(self.in_map(place)))
+        };
+        // What the tail stands in it leaves.
+        let discs = |step: f64| DISCS_M.into_iter().filter(move |disc_m| length_m * step / steps + disc_m > 0.5);
+        curvature_per_m.abs() <= CURVATURE_MAX
+            && (0..=steps as u32).map(f64::from).all(|step| discs(step).all(|disc_m| is_open(step, disc_m)))
+    }
+
+    /// A* over the planner's cells; begins with the vehicle's place.
+    fn way(&self, goal: Place, open: &HashMap<Cell, f64>) -> Vec<Place> {
+        let start = self.cell_of_ego();
+        let left_s = |cell: Cell| distance(middle(cell), goal) / MPS_MAX;
+        let mut best: HashMap<Cell, (f64, Cell)> = HashMap::from([(start, (0.0, start))]);
+        // Times in µs: whole numbers have an order.
+        let rank = |seconds: f64| Reverse((seconds * 1e6) as u64);
+        let mut queue = BinaryHeap::from([(rank(left_s(start)), start)]);
+        let mut nearest = start;
+        while let Some((Reverse(total), cell)) = queue.pop() {
+            let spent = best[&cell].0;
+            if rank(spent + left_s(cell)).0 < total {
+                continue;
+            }
+            if left_s(cell) < left_s(nearest) {
+                nearest = cell;
+            }
+            if distance(middle(cell), goal) < CELL_M {
+                break;
+            }
+            for next in about(cell, 1.5 * CELL_M).filter(|next| *next != cell) {
+                let Some(mps) = open.get(&next) else { continue };
+                let spent = spent + distance(middle(cell), middle(next)) / mps.min(MPS_MAX);
+                if best.get(&next).is_none_or(|(before, _)| spent < *before) {
+                    best.insert(next, (spent, cell));
+                    queue.push((rank(spent + left_s(next)), next));
+                }
+            }
+        }
+        let back = std::iter::successors(Some(nearest), |cell| (*cell != start).then(|| best[cell].1));
+        let mut way: Vec<Place> = back.map(middle).collect();
+        way.reverse();
+        way
+    }
+
+    /// Speeds of the cells a disc's middle may be in: seen, passable, and no obstacle within the clearance.
+    fn open(&self, clearance_m: f64) -> HashMap<Cell, f64> {
+        let near = |cell: &Cell| distance(middle(*cell), [self.ego[0], self.ego[1]]) < REACH_M;
+        let seen = self.seen.iter().filter(|(cell, _)| near(cell));
+        let mut open: HashMap<Cell, f64> = seen.clone().map(|(cell, seen)| (*cell, seen.mps)).collect();
+        for (obstacle, _) in seen.filter(|(_, seen)| seen.mps == 0.0) {
+            for cell in about(*obstacle, clearance_m) {
+                open.remove(&cell);
+            }
+        }
+        open
+    }
+
+    fn cell_of_ego(&self) -> Cell {
+        cell_of([self.ego[0], self.ego[1]])
+    }
+
+    fn in_ego(&self, [x, y]: Place) -> Place {
+        let ([dx, dy], (sin, cos)) = ([x - self.ego[0], y - self.ego[1]], self.ego[2].sin_cos());
+        [dx * cos + dy * sin, dy * cos - dx * sin]
+    }
+
+    fn in_map(&self, [x, y]: Place) -> Place {
+        let (sin, cos) = self.ego[2].sin_cos();
+        [self.ego[0] + x * cos - y * sin, self.ego[1] + x * sin + y * cos]
+    }
+}
+
+fn cell_of(place: Place) -> Cell {
+    place.map(|value| (value / CELL_M).floor() as i32)
+}
+
+fn middle(cell: Cell) -> Place {
+    cell.map(|index| (f64::from(index) + 0.5) * CELL_M)
+}
+
+fn distance(a: Place, b: Place) -> f64 {
+    (a[0] - b[0]).hypot(a[1] - b[1])
+}
+
+/// A cell and those whose middles lie within so many metres of its own.
+fn about([ix, iy]: Cell, reach_m: f64) -> impl Iterator<Item = Cell> {
+    let cells = reach_m / CELL_M;
+    let reach = cells as i32;
+    let square = (-reach..=reach).flat_map(move |dx| (-reach..=reach).map(move |dy| [dx, dy]));
+    let disc = square.filter(move |[dx, dy]| f64::from(dx * dx + dy * dy) <= cells * cells);
+    disc.map(move |[dx, dy]| [ix + dx, iy + dy])
+}

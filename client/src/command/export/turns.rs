@@ -1,0 +1,134 @@
+//! A recording's journal -> the turns of each sensor, decoded again: points in the sensor's own frame, as it saw them.
+//!
+//! The recorded configuration and calibrations say how. Points are not moved to the turn's end, and what the maps leave out
+//! (the vehicle itself, blind sectors) is there.
+
+use std::collections::BTreeMap;
+
+use anyhow::{Context, Result};
+use clearway_client::v1;
+use clearway_lidar::calibration::Calibration;
+use clearway_lidar::revolution::Revolution;
+use clearway_lidar::sensor::Sensor;
+use clearway_mapping::config::{Extrinsics, SensorConfig};
+use clearway_mapping::pipeline::model_of_name;
+use clearway_proto::packed::unpack;
+use nalgebra::Isometry3;
+use prost::Message;
+use serde::Deserialize;
+
+/// One turn of one sensor.
+pub struct Turn<'a> {
+    /// The sensor's name.
+    pub sensor: &'a str,
+    /// Of its end, ns since the Unix epoch.
+    pub stamp_ns: i64,
+    /// Where the sensor sits.
+    pub ego_from_sensor: &'a Isometry3<f64>,
+    /// Sensor frame, metres.
+    pub points: Vec<[f32; 3]>,
+}
+
+/// The sensors of every vehicle, by index.
+pub struct Turns(BTreeMap<String, Vec<OneSensor>>);
+
+struct OneSensor {
+    name: String,
+    ego_from_sensor: Isometry3<f64>,
+    decoder: Sensor,
+}
+
+/// Of the recorded configuration, what matters here.
+#[derive(Deserialize)]
+struct Config {
+    #[serde(rename = "vehicle")]
+    vehicles: Vec<Vehicle>,
+}
+
+#[derive(Deserialize)]
+struct Vehicle {
+    name: String,
+    #[serde(rename = "sensor")]
+    sensors: Vec<SensorConfig>,
+}
+
+impl Turns {
+    /// The sensors of a recording, by its attachments; none where it has no configuration.
+    ///
+    /// # Errors
+    /// What is wrong with the configuration or a calibration.
+    pub fn new(attachments: &BTreeMap<String, Vec<u8>>) -> Result<Self> {
+        let Some(config) = attachments.get("config.toml") else { return Ok(Self(BTreeMap::new())) };
+        let config: Config = toml::from_str(&String::from_utf8_lossy(config)).context("attachment config.toml")?;
+        let sensors = |vehicle: Vehicle| {
+            let one = |sensor: &SensorConfig| {
+                let name = format!("calibration/{}/{}.yaml", vehicle.name, sensor.name);
+                let table = attachments.get(&name).map(|table| Calibration::load_str(&String::from_utf8_lossy(table)));
+                let table = table.transpose().with_context(|| format!("attachment {name}"))?;
+                Ok(OneSensor::new(sensor, table))
+            };
+            let sensors = vehicle.sensors.iter().map(one).collect::<Result<_>>()?;
+            Ok((vehicle.name.clone(), sensors))
+        };
+        config.vehicles.into_iter().map(sensors).collect::<Result<_>>().map(Self)
+    }
+
+    /// Takes an event of a vehicle's journal; gives the turn that it completes. What a sensor refuses completes none.
+    ///
+    /// # Errors
+    /// Where the bytes are no event.
+    pub fn take(&mut self, vehicle: &str, event: &[u8]) -> Result<Option<Turn<'_>>> {
+        use v1::event::Body;
+        let Some(sensors) = self.0.get_mut(vehicle) else { return Ok(None) };
+        let event = v1::Event::decode(event).with_context(|| format!("journal of {vehicle}"))?;
+        let index = event.source as usize;
+        if let Some(Body::Sensor(sensor)) = &event.body {
+            if index == sensors.len() {
+                sensors.push(OneSensor::new(&declared(sensor), None));
+            }
+            return Ok(None);
+        }
+        let Some(OneSensor { name, ego_from_sensor, decoder }) = sensors.get_mut(index) else { return Ok(None) };
+        let turn = match &event.body {
+            Some(Body::Datagram(payload)) => decoder.push(payload, event.arrival_ns).ok().flatten().map(of_revolution),
+            Some(Body::End(_)) => decoder.finish().map(of_revolution),
+            Some(Body::Scan(scan)) => of_scan(scan),
+            _ => None,
+        };
+        Ok(turn.map(|(stamp_ns, points)| Turn { sensor: name, stamp_ns, ego_from_sensor, points }))
+    }
+}
+
+impl OneSensor {
+    fn new(config: &SensorConfig, table: Option<Calibration>) -> Self {
+        Self {
+            name: config.name.clone(),
+            ego_from_sensor: config.extrinsics.ego_from_sensor(),
+            decoder: Sensor::new(config.lidar(table)),
+        }
+    }
+}
+
+fn of_revolution(revolution: &Revolution) -> (i64, Vec<[f32; 3]>) {
+    (revolution.end_ns, revolution.points().map(|point| [point.x, point.y, point.z]).collect())
+}
+
+/// `None` where the lists are not of one length.
+fn of_scan(scan: &v1::Scan) -> Option<(i64, Vec<[f32; 3]>)> {
+    let [x, y, z]: [Vec<f32>; 3] = [unpack(&scan.x)?, unpack(&scan.y)?, unpack(&scan.z)?];
+    let points = x.iter().zip(&y).zip(&z).map(|((&x, &y), &z)| [x, y, z]).collect();
+    (x.len() == y.len() && y.len() == z.len()).then_some((scan.stamp_ns, points))
+}
+
+/// A sensor that a stream told of, with what decoding needs.
+fn declared(sensor: &v1::Sensor) -> SensorConfig {
+    let &v1::Sensor { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, .. } = sensor;
+    let plain = SensorConfig::new(&sensor.name, Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg });
+    SensorConfig {
+        model: sensor.model.as_deref().and_then(model_of_name),
+        rpm: sensor.rpm,
+        cut_azimuth_deg: sensor.cut_azimuth_deg.unwrap_or(plain.cut_azimuth_deg),
+        gps_late_days_max: sensor.gps_late_days_max.unwrap_or(plain.gps_late_days_max),
+        ..plain
+    }
+}

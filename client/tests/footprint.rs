@@ -1,0 +1,147 @@
+//! Whether a footprint is free and where the nearest obstacle lies, against looking everywhere.
+
+mod common;
+
+use std::f64::consts::{FRAC_PI_2, PI};
+
+use bytes::Bytes;
+use clearway_client::codec::{CellsRef, encode};
+use clearway_client::v1::layer::Geometry;
+use clearway_client::{Footprint, MapView, v1};
+use clearway_proto::map::{encode_header, encode_layer};
+use proptest::prelude::*;
+
+const SIDE: u32 = 6;
+const BENCHES: [f32; 3] = [0.6, 1.3, 2.5];
+/// Between two looks; what the brute force may miss is a little more than this.
+const LOOK_M: f64 = 0.02;
+
+fn radial(columns: u32) -> Geometry {
+    Geometry::Radial(v1::RadialGrid { r_bench_m: BENCHES.to_vec(), columns })
+}
+
+fn cartesian(yaw_rad: f64) -> Geometry {
+    let (origin_x_m, origin_y_m) = (-1.4, -1.7);
+    let (width, height) = (SIDE, SIDE);
+    Geometry::Cartesian(v1::CartesianGrid {
+        origin_x_m,
+        origin_y_m,
+        width,
+        height,
+        cell_m: 0.5,
+        yaw_rad,
+        ..Default::default()
+    })
+}
+
+/// A map of one layer `drivability` with these classes.
+fn view(geometry: Geometry, classes: &[u8]) -> MapView {
+    let layer = v1::Layer {
+        name: "drivability".into(),
+        geometry: Some(geometry),
+        legend: ["unknown", "drivable", "not_drivable", "obstacle"].map(String::from).to_vec(),
+        channels: vec![encode(CellsRef::U8(classes)).into_channel("class", "", 1.0, 0)],
+        ..Default::default()
+    };
+    MapView::decode(Bytes::from([encode_header(&v1::Header::default()), encode_layer(&layer)].concat())).unwrap()
+}
+
+/// Places of a footprint grown by `margin_m`, its border included, as close together as looks go.
+fn places(footprint: &Footprint, margin_m: f64) -> impl Iterator<Item = (f64, f64)> {
+    let (length, width) = (footprint.length_m + 2.0 * margin_m, footprint.width_m + 2.0 * margin_m);
+    let (sin, cos) = footprint.heading_rad.sin_cos();
+    let (x, y) = (footprint.x_m, footprint.y_m);
+    let looks = |side: f64| (side / LOOK_M).ceil().max(1.0) as i32;
+    let at = move |i: i32, side: f64| side * (f64::from(i) / f64::from(looks(side)) - 0.5);
+    (0..=looks(length)).flat_map(move |i| {
+        (0..=looks(width)).map(move |j| {
+            let (ahead, left) = (at(i, length), at(j, width));
+            (x + ahead * cos - left * sin, y + ahead * sin + left * cos)
+        })
+    })
+}
+
+fn geometries() -> impl Strategy<Value = (Geometry, usize)> {
+    prop_oneof![
+        (1_u32..9).prop_map(|columns| (radial(columns), BENCHES.len() * columns as usize)),
+        (-4.0..4.0).prop_map(|yaw| (cartesian(yaw), (SIDE * SIDE) as usize)),
+        Just((cartesian(0.0), (SIDE * SIDE) as usize)),
+    ]
+}
+
+/// Mostly drivable, so that both answers occur.
+fn maps() -> impl Strategy<Value = MapView> {
+    let class = prop_oneof![12 => Just(1_u8), 1 => Just(0_u8), 1 => Just(2_u8), 1 => Just(3_u8)];
+    geometries().prop_flat_map(move |(geometry, cells)| {
+        proptest::collection::vec(class.clone(), cells).prop_map(move |classes| view(geometry.clone(), &classes))
+    })
+}
+
+fn footprints() -> impl Strategy<Value = Footprint> {
+    (-1.5..1.5, -1.5..1.5, -PI..PI, 0.0..1.2, 0.0..0.8)
+        .prop_map(|(x_m, y_m, heading_rad, length_m, width_m)| Footprint { x_m, y_m, heading_rad, length_m, width_m })
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(200))]
+
+    #[test]
+    fn a_footprint_is_free_exactly_where_every_place_of_it_is(map in maps(), footprint in footprints()) {
+        let layer = map.layer("drivability").unwrap();
+        let drivable = |(x, y): (f64, f64)| layer.class_at(x, y).0 == 1;
+        let free = map.is_free("drivability", &footprint).unwrap();
+        if free {
+            prop_assert!(places(&footprint, 0.0).all(drivable), "called free, but a place of it is not");
+        } else {
+            prop_assert!(!places(&footprint, 1.5 * LOOK_M).all(drivable), "called not free, but all of it is");
+        }
+    }
+
+    #[test]
+    fn the_nearest_obstacle_is_no_farther_than_any_place_of_one(map in maps(), x in -3.0_f64..3.0, y in -3.0_f64..3.0) {
+        let layer = map.layer("drivability").unwrap();
+        let grid = Footprint { x_m: 0.0, y_m: 0.0, heading_rad: 0.0, length_m: 7.0, width_m: 7.0 };
+        let seen = places(&grid, 0.0).filter(|&(x, y)| layer.class_at(x, y).0 == 3);
+        let seen = seen.map(|(ox, oy): (f64, f64)| (ox - x).hypot(oy - y)).min_by(f64::total_cmp);
+        let Some(obstacle) = map.nearest_obstacle("drivability", x, y).unwrap() else {
+            prop_assert_eq!(seen, None);
+            return Ok(());
+        };
+        let seen = seen.expect("cells are larger than the looks are apart");
+        prop_assert!(obstacle.distance_m <= seen + 1e-9 && obstacle.distance_m > seen - 2.0 * LOOK_M, "{obstacle:?}, {seen}");
+        let (sin, cos) = obstacle.bearing_rad.sin_cos();
+        let place = (x + obstacle.distance_m * cos, y + obstacle.distance_m * sin);
+        prop_assert!((place.0 - obstacle.x_m).hypot(place.1 - obstacle.y_m) < 1e-9, "{obstacle:?}");
+        // On the border of its cell at most.
+        let nudges = [-1e-7, 0.0, 1e-7];
+        let (ox, oy) = (obstacle.x_m, obstacle.y_m);
+        let is_obstacle = |(dx, dy): (f64, f64)| layer.class_at(ox + dx, oy + dy).0 == 3;
+        prop_assert!(nudges.iter().any(|&dx| nudges.iter().any(|&dy| is_obstacle((dx, dy)))), "{obstacle:?}");
+    }
+}
+
+#[test]
+fn unknown_is_never_free_and_neither_is_what_lies_outside_or_nowhere() {
+    let known = view(cartesian(0.0), &[1; (SIDE * SIDE) as usize]);
+    let footprint = Footprint { x_m: 0.0, y_m: 0.0, heading_rad: 0.3, length_m: 1.0, width_m: 0.5 };
+    assert!(known.is_free("drivability", &footprint).unwrap());
+    let unknown = view(cartesian(0.0), &[0; (SIDE * SIDE) as usize]);
+    assert!(!unknown.is_free("drivability", &footprint).unwrap());
+    assert_eq!(unknown.nearest_obstacle("drivability", 0.0, 0.0).unwrap(), None);
+    for x_m in [1.3, 100.0, f64::NAN, f64::INFINITY] {
+        assert!(!known.is_free("drivability", &Footprint { x_m, ..footprint }).unwrap(), "{x_m}");
+    }
+    assert!(known.is_free("speed", &footprint).is_err() && known.nearest_obstacle("speed", 0.0, 0.0).is_err());
+}
+
+#[test]
+fn distance_and_bearing_are_to_the_cells_border_as_the_vehicle_sees_it() {
+    let map = MapView::decode(common::map(5, common::CAPTURE_END_NS)).unwrap();
+    // From 10 to 20 m, ahead and to the right: the nearest of it is the bench's inner border.
+    let obstacle = map.nearest_obstacle("drivability", 0.0, -4.0).unwrap().unwrap();
+    assert!(
+        (obstacle.distance_m - 6.0).abs() < 1e-9 && (obstacle.bearing_rad + FRAC_PI_2).abs() < 1e-9,
+        "{obstacle:?}"
+    );
+    assert_eq!(map.nearest_obstacle("drivability", 10.0, -10.0).unwrap().unwrap().distance_m, 0.0);
+}

@@ -1,0 +1,120 @@
+//! Channels told by class: shorter, and the same cells.
+
+mod common;
+
+use bytes::Bytes;
+use clearway_proto::codec::{Cells, CellsRef, Limits, encode_grid};
+use clearway_proto::delta::encode_delta;
+use clearway_proto::map::{Map, decode_map, decode_map_on, encode_header, encode_layer};
+use clearway_proto::predicted::encode_beside;
+use clearway_proto::v1;
+use common::assert_golden;
+use proptest::collection::vec;
+use proptest::prelude::*;
+use prost::Message;
+
+const CLASSES: [&str; 4] = ["unknown", "clear", "occupied", "hidden"];
+
+/// The bytes of a map of one layer: these channels beside these classes, told by class or not.
+fn bytes(class: &[u8], columns: u32, channels: &[(&str, Cells)], by_class: bool) -> Bytes {
+    let beside = |cells: CellsRef<'_>| match by_class {
+        true => encode_beside(cells, class, CLASSES.len(), columns as usize),
+        false => encode_grid(cells, columns as usize),
+    };
+    let told = channels.iter().map(|(name, cells)| beside(cells.as_ref()).into_channel(name, "", 1.0, 0));
+    let of_class = encode_grid(CellsRef::U8(class), columns as usize).into_channel("class", "", 1.0, 0);
+    let layer = v1::Layer {
+        name: "occupancy".into(),
+        geometry: Some(v1::layer::Geometry::Cartesian(v1::CartesianGrid {
+            width: columns,
+            height: class.len() as u32 / columns,
+            cell_m: 0.25,
+            ..Default::default()
+        })),
+        legend: CLASSES.map(String::from).to_vec(),
+        channels: std::iter::once(of_class).chain(told).collect(),
+        ..Default::default()
+    };
+    let header = v1::Header { vehicle: "alpha".into(), boot_id: 7, sequence: 3, ..Default::default() };
+    [encode_header(&header), encode_layer(&layer)].concat().into()
+}
+
+fn open(bytes: &Bytes) -> Map {
+    decode_map(bytes.clone(), &Limits::default()).unwrap()
+}
+
+/// Arcs of classes; each channel has one value a class but in few cells.
+fn golden_channels() -> (Vec<u8>, Vec<(&'static str, Cells)>) {
+    let class: Vec<u8> = (0..1200).map(|cell| (((cell / 40) * (cell / 40) + (cell % 40) * 7) / 60 % 4) as u8).collect();
+    let other = |cell: usize| cell.is_multiple_of(97);
+    let of = |table: [i32; 4]| {
+        let cell = move |(cell, class): (usize, &u8)| table[usize::from(*class)] + if other(cell) { 5 } else { 0 };
+        class.iter().enumerate().map(cell).collect::<Vec<i32>>()
+    };
+    let channels = vec![
+        ("hits", Cells::U8(of([0, 3, 250, 255]).iter().map(|value| *value as u8).collect())),
+        ("unit_height", Cells::I8(of([-128, 2, -7, 125]).iter().map(|value| *value as i8).collect())),
+        ("difference", Cells::U16(of([65_535, 0, 300, 40_000]).iter().map(|value| *value as u16).collect())),
+    ];
+    (class, channels)
+}
+
+#[test]
+fn the_golden_map_told_by_class_is_the_one_told_cell_by_cell() {
+    let (class, channels) = golden_channels();
+    let [told, plain] = [true, false].map(|by_class| bytes(&class, 40, &channels, by_class));
+    assert_golden("by_class.bin", &told);
+    assert_golden("by_class_plain.bin", &plain);
+    let map = open(&told);
+    assert_eq!(map, open(&plain));
+    channels.iter().for_each(|(name, cells)| assert_eq!(&map.layers[0].channel(name).unwrap().cells, cells, "{name}"));
+    let told_by_class = v1::Map::decode(&told[..]).unwrap().layers.remove(0).channels;
+    let lengths: Vec<usize> = told_by_class.iter().map(|channel| channel.by_class.len()).collect();
+    assert_eq!(lengths, [0, 4, 4, 8]);
+    assert!(told.len() * 10 < plain.len() * 9, "{} bytes, and {} cell by cell", told.len(), plain.len());
+}
+
+#[test]
+fn a_delta_between_layers_told_by_class_is_not_told_by_class() {
+    let (class, channels) = golden_channels();
+    let mut later = class.clone();
+    later[500] = 1;
+    let [before, after] = [&class, &later].map(|class| bytes(class, 40, &channels, true));
+    let layer = |bytes: &Bytes| v1::Map::decode(&bytes[..]).unwrap().layers.remove(0);
+    let delta = encode_delta(&layer(&before), 3, &layer(&after), &Limits::default()).expect("one cell has changed");
+    assert!(delta.channels.iter().all(|channel| channel.by_class.is_empty()));
+    let header = v1::Header { vehicle: "alpha".into(), boot_id: 7, sequence: 4, ..Default::default() };
+    let on = |delta: &v1::Layer| {
+        let bytes = [encode_header(&header), encode_layer(delta)].concat().into();
+        decode_map_on(bytes, Some(&open(&before)), &Limits::default())
+    };
+    assert_eq!(on(&delta).unwrap().layers, open(&after).layers);
+    let mut both = delta;
+    both.channels[1].by_class = vec![0; 4].into();
+    assert_eq!(on(&both).unwrap_err().name(), "base_shape");
+}
+
+proptest! {
+    #[test]
+    fn whatever_the_classes_cells_come_back_in_no_more_bytes(
+        columns in 1..20_u32,
+        stretches in vec((0..4_u8, 1..60_usize), 1..30),
+        values in vec(any::<u16>(), 4),
+        noise in vec((any::<prop::sample::Index>(), any::<u16>()), 0..40),
+    ) {
+        let mut class: Vec<u8> = stretches.iter().flat_map(|&(class, length)| vec![class; length]).collect();
+        class.resize(class.len().next_multiple_of(columns as usize), 0);
+        let mut cells: Vec<u16> = class.iter().map(|&class| values[usize::from(class)]).collect();
+        noise.iter().for_each(|(at, value)| *at.get_mut(&mut cells) = *value);
+        let channels = [
+            ("u16", Cells::U16(cells.clone())),
+            ("u8", Cells::U8(cells.iter().map(|cell| *cell as u8).collect())),
+            ("i8", Cells::I8(cells.iter().map(|cell| *cell as i8).collect())),
+        ];
+        let [told, plain] = [true, false].map(|by_class| bytes(&class, columns, &channels, by_class));
+        prop_assert_eq!(open(&told), open(&plain));
+        // Two bytes a channel say that it is told by class, and how long the table is.
+        prop_assert!(told.len() <= plain.len() + 2 * channels.len());
+        prop_assert_eq!(&told, &bytes(&class, columns, &channels, true));
+    }
+}

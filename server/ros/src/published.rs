@@ -1,0 +1,51 @@
+//! The types that are published: their names, what rmw_zenoh calls them, and their definitions for MCAP files.
+//!
+//! Hashes are RIHS01 (REP-2016), the same from Iron to Jazzy; definitions are those of `common_interfaces` and `geometry2`
+//! without their comments, each followed by those it is made of (MCAP's `ros2msg`).
+
+/// A message type.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Published {
+    package: &'static str,
+    message: &'static str,
+    /// `RIHS01_` and 64 hexadecimal digits.
+    pub hash: &'static str,
+    /// `ros2msg`.
+    pub definition: &'static str,
+}
+
+impl Published {
+    /// `nav_msgs/msg/OccupancyGrid`.
+    pub fn name(&self) -> String {
+        format!("{}/msg/{}", self.package, self.message)
+    }
+
+    /// As DDS and rmw_zenoh spell it: `nav_msgs::msg::dds_::OccupancyGrid_`.
+    pub fn dds_name(&self) -> String {
+        format!("{}::msg::dds_::{}_", self.package, self.message)
+    }
+}
+
+/// `nav_msgs/msg/OccupancyGrid`.
+pub const OCCUPANCY_GRID: Published = Published {
+    package: "nav_msgs",
+    message: "OccupancyGrid",
+    hash: "RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7",
+    definition: include_str!("definitions/OccupancyGrid.msg"),
+};
+
+/// `tf2_msgs/msg/TFMessage`.
+pub const TF_MESSAGE: Published = Published {
+    package: "tf2_msgs",
+    message: "TFMessage",
+    hash: "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    definition: include_str!("definitions/TFMessage.msg"),
+};
+
+/// `nav_msgs/msg/Odometry`.
+pub const ODOMETRY: Published = Published {
+    package: "nav_msgs",
+    message: "Odometry",
+    hash: "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+    definition: include_str!("definitions/Odometry.msg"),
+};

@@ -1,0 +1,118 @@
+//! `[zenoh]`: the session maps are published in, and `[zenoh.ros2]`: the ROS 2 topics they become.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use super::Vehicle;
+use super::ros::{DOMAIN_MAX, is_topic};
+
+/// `[zenoh]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Zenoh {
+    /// Whether it is published at all.
+    pub enabled: bool,
+    /// Part played in the zenoh network.
+    pub mode: ZenohMode,
+    /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
+    pub listen: Vec<String>,
+    /// Endpoints of routers or peers to connect to.
+    pub connect: Vec<String>,
+    /// Look for peers by multicast.
+    pub scouting: bool,
+    /// Maps as ROS 2 topics.
+    pub ros2: Ros2,
+    /// A zenoh configuration (JSON5) to begin with: TLS, access control; the keys above stand over it. Empty: zenoh's own
+    /// defaults.
+    pub file: PathBuf,
+}
+
+impl Default for Zenoh {
+    fn default() -> Self {
+        Self {
+            enabled: true,
+            mode: ZenohMode::Peer,
+            listen: vec!["tcp/127.0.0.1:7447".into()],
+            connect: Vec::new(),
+            scouting: false,
+            ros2: Ros2::default(),
+            file: PathBuf::new(),
+        }
+    }
+}
+
+/// Part played in the zenoh network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ZenohMode {
+    /// Talks to whoever connects, and to the endpoints of `connect`.
+    Peer,
+    /// Hangs on one router.
+    Client,
+    /// Is itself a router.
+    Router,
+}
+
+impl ZenohMode {
+    /// As the zenoh configuration spells it.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Peer => "peer",
+            Self::Client => "client",
+            Self::Router => "router",
+        }
+    }
+}
+
+/// `[zenoh.ros2]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Ros2 {
+    /// Whether maps are published to ROS 2 at all.
+    pub enabled: bool,
+    /// `ROS_DOMAIN_ID`.
+    pub domain: u32,
+    /// What stands before `/<vehicle>/<layer>`; may be empty.
+    pub namespace: String,
+}
+
+impl Default for Ros2 {
+    fn default() -> Self {
+        Self { enabled: false, domain: 0, namespace: "/clearway".into() }
+    }
+}
+
+impl Ros2 {
+    /// Checks every value; `Err` has the key, the value and what is allowed.
+    pub(super) fn check(
+        &self,
+        zenoh_enabled: bool,
+        vehicles: &[Vehicle],
+    ) -> Result<(), (&'static str, String, String)> {
+        if self.domain > DOMAIN_MAX {
+            return Err(("zenoh.ros2.domain", self.domain.to_string(), format!("0 to {DOMAIN_MAX}")));
+        }
+        if !self.enabled {
+            return Ok(());
+        }
+        if !zenoh_enabled {
+            let allowed = "only with zenoh.enabled = true: it goes through zenoh";
+            return Err(("zenoh.ros2.enabled", "true".into(), allowed.into()));
+        }
+        // ROS 2 takes no name that begins with a digit.
+        let is_name = |topic: &str| {
+            is_topic(topic) && !topic.split('/').any(|part| part.starts_with(|c: char| c.is_ascii_digit()))
+        };
+        if !self.namespace.is_empty() && !is_name(&self.namespace) {
+            return Err(("zenoh.ros2.namespace", self.namespace.clone(), "such as \"/clearway\", or empty".into()));
+        }
+        match vehicles.iter().find(|vehicle| !is_name(&format!("/{}", vehicle.name))) {
+            None => Ok(()),
+            Some(vehicle) => {
+                let allowed = "with zenoh.ros2.enabled: letters, digits and underscores, no digit first";
+                Err(("vehicle.name", vehicle.name.clone(), allowed.into()))
+            }
+        }
+    }
+}

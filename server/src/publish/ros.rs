@@ -1,0 +1,185 @@
+//! Maps as ROS 2 topics in rmw_zenoh's key space, with no bridge between.
+//!
+//! Of each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`, reliable, transient local, keep last 1)
+//! and its place in `map` on `/tf` (reliable, volatile). A topic is published under `<domain>/<topic>/<type>/<hash>`, the
+//! payload CDR, with an attachment: sequence, time of sending, length 16, the publisher's 16 bytes. Liveliness tokens under
+//! `@ros2_lv` tell of the node and its publishers. A grid is made while somebody subscribes; whoever comes gets the newest
+//! map at once, whoever comes later has it from the publisher's cache.
+
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::time::Duration;
+
+use clearway_client::MapView;
+use clearway_client::viewer::raster::Rasters;
+use clearway_client::viewer::ros;
+use clearway_ros::published::{OCCUPANCY_GRID, Published, TF_MESSAGE};
+use tokio::task::JoinSet;
+use zenoh::Session;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::qos::CongestionControl;
+use zenoh::sample::Locality;
+use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
+
+use super::Served;
+use super::zenoh::{ZenohError, failed};
+use crate::config::Ros2;
+use crate::ingest::now_ns;
+use crate::wire::EncodedMap;
+
+/// The node's name.
+const NODE: &str = "clearway";
+/// reliability 1 reliable; durability 1 transient local; history 1 keep last, depth 1; deadline, lifespan and liveliness as
+/// they are by default.
+const LATCHED: &str = "1:1:1,1:,:,:,,";
+/// The same, but durability 2 volatile, depth 100: what tf's broadcaster has.
+const MOVING: &str = "1:2:1,100:,:,:,,";
+/// How often a quiet publisher tells its last sequence, so that a lost last map is noticed.
+const HEARTBEAT: Duration = Duration::from_secs(1);
+
+/// The node that all vehicles' topics belong to.
+pub(super) struct Node<'a> {
+    session: &'a Session,
+    options: &'a Ros2,
+    /// Of the node and its publishers so far.
+    tokens: Vec<LivelinessToken>,
+}
+
+impl<'a> Node<'a> {
+    /// Declares the node.
+    pub async fn declare(session: &'a Session, options: &'a Ros2) -> Result<Self, ZenohError> {
+        let mut node = Self { session, options, tokens: Vec::new() };
+        node.declare_token(&format!("0/NN/%/%/{NODE}")).await?;
+        Ok(node)
+    }
+
+    /// Publishes a vehicle's layers and pose.
+    pub async fn publish(&mut self, served: &Served, tasks: &mut JoinSet<()>) -> Result<(), ZenohError> {
+        let vehicle = &served.status.name;
+        for &layer in &served.status.layers {
+            let topic = format!("{}/{vehicle}/{layer}", self.options.namespace);
+            let topic = self.topic(&topic, &OCCUPANCY_GRID, LATCHED).await?;
+            let mut rasters = Rasters::default();
+            let grid = move |map: &EncodedMap| {
+                let (_, chunk) = map.layers.iter().find(|(name, _)| *name == layer)?;
+                let map = MapView::decode(map.layer(chunk)).inspect_err(not_ours).ok()?;
+                let layer = map.layers().first()?;
+                Some(ros::occupancy_grid(&map, layer, rasters.of(layer)))
+            };
+            tasks.spawn(topic.publish(served.clone(), Some(layer), grid));
+        }
+        let tf = self.topic("/tf", &TF_MESSAGE, MOVING).await?;
+        let transform = |map: &EncodedMap| {
+            let map = MapView::decode(map.header.clone()).inspect_err(not_ours).ok()?;
+            ros::tf(&map)
+        };
+        tasks.spawn(tf.publish(served.clone(), None, transform));
+        Ok(())
+    }
+
+    /// The tokens; the node is there until they are dropped.
+    pub fn into_tokens(self) -> Vec<LivelinessToken> {
+        self.tokens
+    }
+
+    async fn declare_token(&mut self, entity: &str) -> Result<String, ZenohError> {
+        // The node is entity 0 of its session.
+        let key = format!("@ros2_lv/{}/{}/0/{entity}", self.options.domain, self.session.zid());
+        let token = self.session.liveliness().declare_token(key.clone());
+        self.tokens.push(token.await.map_err(failed(format!("liveliness {key}")))?);
+        Ok(key)
+    }
+
+    async fn topic(&mut self, topic: &str, kind: &Published, qos: &str) -> Result<Topic, ZenohError> {
+        let (name, hash) = (kind.dds_name(), kind.hash);
+        let key = format!("{}/{}/{name}/{hash}", self.options.domain, topic.trim_start_matches('/'));
+        // Not to ourselves: a vehicle may take its own poses from the same /tf.
+        let publisher = self.session.declare_publisher(key.clone()).allowed_destination(Locality::Remote);
+        let publisher = publisher.congestion_control(CongestionControl::Drop);
+        let publisher = match qos {
+            LATCHED => publisher
+                .cache(CacheConfig::default().max_samples(1))
+                .sample_miss_detection(MissDetectionConfig::default().sporadic_heartbeat(HEARTBEAT))
+                .publisher_detection(),
+            _ => publisher.advanced(),
+        };
+        let publisher = publisher.await.map_err(failed(format!("publisher {key}")))?;
+        let (id, mangled) = (self.tokens.len(), topic.replace('/', "%"));
+        let token = self.declare_token(&format!("{id}/MP/%/%/{NODE}/{mangled}/{name}/{hash}/{qos}")).await?;
+        Ok(Topic { publisher, gid: gid(&token), sent: 0 })
+    }
+}
+
+/// Sixteen bytes that are this publisher's alone: they follow from its token, which has the session's id.
+fn gid(token: &str) -> [u8; 16] {
+    let half = |half: u8| {
+        let mut hasher = DefaultHasher::new();
+        (half, token).hash(&mut hasher);
+        hasher.finish().to_le_bytes()
+    };
+    let mut gid = [0; 16];
+    gid[..8].copy_from_slice(&half(0));
+    gid[8..].copy_from_slice(&half(1));
+    gid
+}
+
+fn not_ours(error: &clearway_client::ClientError) {
+    tracing::error!(%error, "ros: a map of our own");
+}
+
+/// A publisher of one topic.
+struct Topic {
+    publisher: AdvancedPublisher<'static>,
+    gid: [u8; 16],
+    sent: i64,
+}
+
+impl Topic {
+    /// Sends what is made of each newest map while somebody subscribes, and takes the layer meanwhile.
+    async fn publish(
+        mut self,
+        served: Served,
+        layer: Option<&'static str>,
+        mut make: impl FnMut(&EncodedMap) -> Option<Vec<u8>> + Send,
+    ) {
+        let Ok(matching) = self.publisher.matching_listener().await else { return };
+        let mut newest = served.newest.clone();
+        loop {
+            // Asked again, as the first subscriber may be older than the listener.
+            if !self.publisher.matching_status().await.is_ok_and(|status| status.matching()) {
+                match matching.recv_async().await {
+                    Ok(_) => continue,
+                    Err(_) => return,
+                }
+            }
+            let _taken = layer.map(|layer| served.status.demand.take(&[layer.to_owned()]));
+            newest.mark_changed();
+            loop {
+                tokio::select! {
+                    changed = newest.changed() => match changed {
+                        Ok(()) => {
+                            let map = newest.borrow_and_update().clone();
+                            if let Some(message) = map.and_then(|map| make(&map)) {
+                                self.put(message).await;
+                            }
+                        }
+                        // The engine has stopped; the newest map stays in the cache until the session ends.
+                        Err(_) => return std::future::pending().await,
+                    },
+                    status = matching.recv_async() => match status {
+                        Ok(status) if status.matching() => {}
+                        Ok(_) => break,
+                        Err(_) => return,
+                    },
+                }
+            }
+        }
+    }
+
+    async fn put(&mut self, message: Vec<u8>) {
+        self.sent += 1;
+        let attachment = [&self.sent.to_le_bytes()[..], &now_ns().to_le_bytes(), &[16], &self.gid].concat();
+        if let Err(error) = self.publisher.put(message).attachment(attachment).await {
+            tracing::warn!(%error, key = %self.publisher.key_expr(), "ros: put");
+        }
+    }
+}

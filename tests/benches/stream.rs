@@ -1,0 +1,482 @@
+//! What the stream costs: a real server in a process of its own, a simulated HDL-64E sending datagrams to it in real time,
+//! and readers of one layer over gRPC, over zenoh, and over plain TCP, which is the floor for the same bytes.
+//!
+//!   cargo bench -p clearway-tests --bench stream                                  1, 10, 100 and 1,000 readers
+//!   cargo bench -p clearway-tests --bench stream -- --readers 1,10 --seconds 30 --layer occupancy --json
+//!
+//! Age: from the last packet of a turn sent to its map in a reader's hands. Carried: from the server's hand-over to the
+//! transport until then. The first reader decodes every map, as a planner does; the others take the bytes, and on gRPC
+//! acknowledge them. Memory: growth of the server's resident set, divided by the readers. Clocks: one machine's.
+
+use std::io::{BufRead, BufReader};
+use std::net::{SocketAddr, TcpListener, UdpSocket};
+use std::process::{Child, Command, ExitCode, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use clap::Parser;
+use clearway_client::{MapView, now_ns, v1};
+use clearway_proto::v1::map_service_client::MapServiceClient;
+use clearway_server::config::{Config, Udp};
+use clearway_server::server::{Server, Setup};
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes::town;
+use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
+use serde_json::json;
+use tokio::io::AsyncReadExt;
+use tokio::task::JoinSet;
+use tonic::transport::Endpoint;
+
+/// Readers of a gRPC connection: a thousand of them would not get a connection each.
+const STREAMS: usize = 8;
+/// The drive is cast beforehand, so much longer than what is measured: readers come in the meantime.
+const BEFORE_S: u64 = 30;
+/// Packets that are due this soon leave at once.
+const BURST: Duration = Duration::from_millis(1);
+/// Readers have begun, and their memory is taken, after this.
+const SETTLE: Duration = Duration::from_secs(3);
+
+#[derive(Parser)]
+struct Arguments {
+    /// How many readers, one row each.
+    #[arg(long, value_delimiter = ',', default_values_t = [1, 10, 100, 1000])]
+    readers: Vec<usize>,
+    /// Of each row.
+    #[arg(long, default_value_t = 20)]
+    seconds: u64,
+    /// What they read.
+    #[arg(long, default_value = "drivability")]
+    layer: String,
+    /// One object instead of a table.
+    #[arg(long)]
+    json: bool,
+    /// Be the server: what this program starts itself as.
+    #[arg(long, hide = true)]
+    serve: bool,
+    /// Cargo's.
+    #[arg(long, hide = true)]
+    bench: bool,
+}
+
+/// How maps are carried.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Carrier {
+    Tcp,
+    Grpc,
+    Zenoh,
+}
+
+/// What readers have seen, all of them together.
+#[derive(Debug, Default)]
+struct Seen {
+    /// ms, of every map of every reader.
+    ages: Vec<f64>,
+    carried: Vec<f64>,
+    /// ms, of the one that decodes.
+    planner: Vec<f64>,
+    bytes: u64,
+}
+
+/// Stamps of the last packets of turns, device and host clock, ns.
+type Cuts = Arc<Mutex<Vec<(i64, i64)>>>;
+
+/// One carrier's readers.
+#[derive(Clone)]
+struct Readers {
+    seen: Arc<Mutex<Seen>>,
+    counts: Arc<AtomicBool>,
+    cuts: Cuts,
+}
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().expect("a runtime");
+    if arguments.serve {
+        runtime.block_on(serve());
+        return ExitCode::SUCCESS;
+    }
+    let turns = cast(10 * (arguments.seconds + BEFORE_S) as usize);
+    let mut rows = Vec::new();
+    if !arguments.json {
+        println!(
+            "{:<6} {:>7} {:>22} {:>22} {:>22} {:>9} {:>10} {:>11}",
+            "",
+            "readers",
+            "age p50/p99 ms",
+            "planner's p50/p99 ms",
+            "carried p50/p99 ms",
+            "maps/s",
+            "bytes/map",
+            "KiB/reader"
+        );
+    }
+    for &readers in &arguments.readers {
+        let mut bytes = 10_000;
+        // Last the floor, for as many bytes as a map had.
+        for carrier in [Carrier::Grpc, Carrier::Zenoh, Carrier::Tcp] {
+            let row = runtime.block_on(measure(&arguments, &turns, carrier, readers, bytes));
+            bytes = row["bytes_per_map"].as_u64().unwrap_or(bytes);
+            if !arguments.json {
+                print_row(&row);
+            }
+            rows.push(row);
+        }
+    }
+    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
+    let load = load.split_whitespace().take(3).collect::<Vec<_>>().join(" ");
+    match arguments.json {
+        true => println!("{}", json!({ "layer": arguments.layer, "load_average": load, "rows": rows })),
+        false => println!("layer {}, load average in the end {load}", arguments.layer),
+    }
+    ExitCode::SUCCESS
+}
+
+fn print_row(row: &serde_json::Value) {
+    let pair = |key: &str| match row[key][0].as_f64().zip(row[key][1].as_f64()) {
+        Some((p50, p99)) => format!("{p50:.2} / {p99:.2}"),
+        None => "-".into(),
+    };
+    println!(
+        "{:<6} {:>7} {:>22} {:>22} {:>22} {:>9.0} {:>10} {:>11.1}",
+        row["carrier"].as_str().unwrap_or_default(),
+        row["readers"],
+        pair("age_ms"),
+        pair("planner_age_ms"),
+        pair("carried_ms"),
+        row["maps_per_s"].as_f64().unwrap_or_default(),
+        row["bytes_per_map"],
+        row["kib_per_reader"].as_f64().unwrap_or_default(),
+    );
+}
+
+/// One row: a server of its own, this many readers, so many seconds.
+async fn measure(
+    arguments: &Arguments,
+    turns: &Arc<Vec<Vec<Datagram>>>,
+    carrier: Carrier,
+    count: usize,
+    bytes: u64,
+) -> serde_json::Value {
+    let mut server = Process::start();
+    let (seen, counts, cuts) = (Arc::default(), Arc::default(), Cuts::default());
+    let readers = Readers { seen, counts, cuts };
+    let (stop, sender) = (Arc::new(AtomicBool::new(false)), server.data);
+    let car = std::thread::spawn({
+        let (stop, cuts, turns) = (stop.clone(), readers.cuts.clone(), turns.clone());
+        move || send(&turns, sender, &cuts, &stop)
+    });
+    // With one reader first, so that what the first costs the server once is none of the others'.
+    let mut tasks = JoinSet::new();
+    readers.join(&mut tasks, &server, carrier, &arguments.layer, 1, bytes).await;
+    tokio::time::sleep(SETTLE).await;
+    let alone_kib = server.resident_kib();
+    readers.join(&mut tasks, &server, carrier, &arguments.layer, count - 1, bytes).await;
+    tokio::time::sleep(SETTLE).await;
+    readers.counts.store(true, Ordering::Relaxed);
+    tokio::time::sleep(Duration::from_secs(arguments.seconds)).await;
+    readers.counts.store(false, Ordering::Relaxed);
+    let grown_kib = server.resident_kib() - alone_kib;
+    stop.store(true, Ordering::Relaxed);
+    car.join().expect("the car drives");
+    tasks.shutdown().await;
+    server.stop();
+    let mut seen = readers.seen.lock().expect("nobody panics");
+    let seen = &mut *seen;
+    let maps = seen.carried.len() as u64;
+    json!({
+        "carrier": format!("{carrier:?}").to_lowercase(),
+        "readers": count,
+        "age_ms": percentiles(&mut seen.ages),
+        "planner_age_ms": percentiles(&mut seen.planner),
+        "carried_ms": percentiles(&mut seen.carried),
+        "maps_per_s": maps as f64 / arguments.seconds as f64,
+        "bytes_per_map": seen.bytes.checked_div(maps),
+        "kib_per_reader": if count > 1 { grown_kib as f64 / (count - 1) as f64 } else { 0.0 },
+    })
+}
+
+fn percentiles(values: &mut [f64]) -> Option<[f64; 2]> {
+    values.sort_by(f64::total_cmp);
+    let at = |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
+    (!values.is_empty()).then(|| [at(0.5), at(0.99)])
+}
+
+impl Readers {
+    /// Adds readers that read until they are stopped.
+    async fn join(
+        &self,
+        tasks: &mut JoinSet<()>,
+        server: &Process,
+        carrier: Carrier,
+        layer: &str,
+        count: usize,
+        bytes: u64,
+    ) {
+        let is_first = tasks.is_empty();
+        match carrier {
+            Carrier::Tcp => {
+                for _ in 0..count {
+                    let stream = tokio::net::TcpStream::connect(server.floor).await.expect("the floor answers");
+                    tasks.spawn(self.clone().over_tcp(stream, bytes as usize));
+                }
+            }
+            Carrier::Grpc => {
+                // Connections of a stream each as far as that goes.
+                let streams = if count > 128 { STREAMS } else { 1 };
+                let mut left = count;
+                while left > 0 {
+                    let endpoint = Endpoint::from_shared(format!("http://{}", server.grpc)).expect("an address");
+                    let channel = endpoint
+                        .tcp_nodelay(true)
+                        .initial_stream_window_size(65_535)
+                        .connect()
+                        .await
+                        .expect("gRPC answers");
+                    for _ in 0..streams.min(left) {
+                        let service = MapServiceClient::new(channel.clone());
+                        tasks.spawn(self.clone().over_grpc(service, layer.to_owned(), is_first));
+                    }
+                    left -= streams.min(left);
+                }
+            }
+            Carrier::Zenoh => {
+                for _ in 0..count {
+                    let mut config = zenoh::Config::default();
+                    let settings = [
+                        ("mode", "\"client\"".to_owned()),
+                        ("connect/endpoints", format!("[{:?}]", server.zenoh)),
+                        ("scouting/multicast/enabled", "false".to_owned()),
+                        ("scouting/gossip/enabled", "false".to_owned()),
+                    ];
+                    settings.iter().for_each(|(key, value)| config.insert_json5(key, value).expect("a setting"));
+                    let session = zenoh::open(config).await.expect("zenoh answers");
+                    tasks.spawn(self.clone().over_zenoh(session, layer.to_owned(), is_first));
+                }
+            }
+        }
+    }
+
+    async fn over_grpc(
+        self,
+        mut service: MapServiceClient<tonic::transport::Channel>,
+        layer: String,
+        is_planner: bool,
+    ) {
+        let (acknowledge, mut requests) = tokio::sync::mpsc::channel(8);
+        let selection =
+            v1::Selection { vehicle: String::new(), layers: vec![layer], max_in_flight: 2, ..Default::default() };
+        let first = v1::WatchRequest { selection: Some(selection), ..Default::default() };
+        acknowledge.send(first).await.expect("room");
+        let requests = futures::stream::poll_fn(move |context| requests.poll_recv(context));
+        let mut updates = service.watch(requests).await.expect("the server streams").into_inner();
+        while let Ok(Some(update)) = updates.message().await {
+            let arrived_ns = now_ns();
+            let sequence = self.take(&update.map, update.sent_ns, arrived_ns, is_planner);
+            let acknowledged = v1::WatchRequest { acknowledged: Some(sequence), ..Default::default() };
+            if acknowledge.send(acknowledged).await.is_err() {
+                return;
+            }
+        }
+    }
+
+    async fn over_zenoh(self, session: zenoh::Session, layer: String, is_planner: bool) {
+        let key = format!("clearway/car/map/{layer}");
+        let subscriber = session.declare_subscriber(key).await.expect("a subscriber");
+        while let Ok(sample) = subscriber.recv_async().await {
+            let arrived_ns = now_ns();
+            let sent = sample.timestamp().expect("the server stamps").get_time().to_duration();
+            self.take(
+                &Bytes::from(sample.payload().to_bytes().into_owned()),
+                sent.as_nanos() as i64,
+                arrived_ns,
+                is_planner,
+            );
+        }
+    }
+
+    /// Asks for messages of so many bytes, the first eight of which are the server's clock.
+    async fn over_tcp(self, mut stream: tokio::net::TcpStream, bytes: usize) {
+        use tokio::io::AsyncWriteExt;
+        stream.set_nodelay(true).expect("an option");
+        stream.write_all(&(bytes as u64).to_le_bytes()).await.expect("the floor takes it");
+        let mut message = vec![0; bytes.max(8)];
+        while stream.read_exact(&mut message).await.is_ok() {
+            let arrived_ns = now_ns();
+            let sent_ns = i64::from_le_bytes(message[..8].try_into().expect("eight bytes"));
+            self.count(message.len(), sent_ns, arrived_ns);
+        }
+    }
+
+    fn count(&self, bytes: usize, sent_ns: i64, arrived_ns: i64) -> bool {
+        let counts = self.counts.load(Ordering::Relaxed);
+        if counts {
+            let mut seen = self.seen.lock().expect("nobody panics");
+            seen.carried.push((arrived_ns - sent_ns) as f64 * 1e-6);
+            seen.bytes += bytes as u64;
+        }
+        counts
+    }
+
+    /// Counts a map; gives its sequence.
+    fn take(&self, map: &Bytes, sent_ns: i64, arrived_ns: i64, is_planner: bool) -> u64 {
+        use prost::Message;
+        let header = v1::Map::decode(map.clone()).expect("a map").header.expect("a header");
+        if is_planner {
+            MapView::decode(map.clone()).expect("a map");
+        }
+        let in_hands_ns = now_ns();
+        if self.count(map.len(), sent_ns, arrived_ns) {
+            // The turn's last packet is the first that was stamped after the capture's end.
+            let cut = self
+                .cuts
+                .lock()
+                .expect("nobody panics")
+                .iter()
+                .rev()
+                .take_while(|(stamp, _)| *stamp >= header.capture_end_ns)
+                .last()
+                .copied();
+            if let Some((_, cut_ns)) = cut {
+                let mut seen = self.seen.lock().expect("nobody panics");
+                seen.ages.push((arrived_ns - cut_ns) as f64 * 1e-6);
+                if is_planner {
+                    seen.planner.push((in_hands_ns - cut_ns) as f64 * 1e-6);
+                }
+            }
+        }
+        header.sequence
+    }
+}
+
+/// The server's process, and where it is met.
+struct Process {
+    child: Child,
+    data: SocketAddr,
+    grpc: SocketAddr,
+    floor: SocketAddr,
+    zenoh: String,
+}
+
+impl Process {
+    fn start() -> Self {
+        let own = std::env::current_exe().expect("this program");
+        let mut child =
+            Command::new(own).arg("--serve").stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("a process");
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().expect("piped")).read_line(&mut line).expect("a line");
+        let places: Vec<&str> = line.split_whitespace().collect();
+        let [data, grpc, floor, zenoh] = places[..] else { panic!("the server says {line:?}") };
+        let at = |address: &str| address.parse().expect("an address");
+        Self { data: at(data), grpc: at(grpc), floor: at(floor), zenoh: zenoh.into(), child }
+    }
+
+    /// What the kernel holds in memory for it, KiB.
+    fn resident_kib(&self) -> i64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("Linux");
+        let line = status.lines().find(|line| line.starts_with("VmRSS")).expect("VmRSS");
+        line.split_whitespace().nth(1).and_then(|kib| kib.parse().ok()).expect("a number")
+    }
+
+    /// Ends with its standard input.
+    fn stop(&mut self) {
+        drop(self.child.stdin.take());
+        self.child.wait().expect("it ends");
+    }
+}
+
+/// The server: until standard input ends.
+async fn serve() {
+    let mut config = Config::of_one_vehicle("car", "top");
+    let any: SocketAddr = "127.0.0.1:0".parse().expect("an address");
+    config.grpc.listen = any;
+    config.page.enabled = false;
+    config.zenoh.enabled = true;
+    config.zenoh.listen = vec!["tcp/127.0.0.1:0".into()];
+    let vehicle = &mut config.vehicles[0];
+    vehicle.udp = Some(Udp { data: any, telemetry: any, ..Udp::default() });
+    vehicle.sensors[0].extrinsics.z_m = ScannerConfig::default().ego_from_sensor.translation.z;
+    // The drive is older than its arrival.
+    vehicle.sensors[0].gps_late_days_max = 36_525.0;
+    let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
+    let (data, _) = running.doors[0].udp.expect("a socket");
+    let floor = TcpListener::bind(any).expect("a free port");
+    let floor_at = floor.local_addr().expect("bound");
+    tokio::spawn(serve_floor(floor));
+    let zenoh = running.zenoh.iter().find(|endpoint| endpoint.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
+    println!("{data} {} {floor_at} {zenoh}", running.grpc.expect("gRPC is served"));
+    let ended = tokio::task::spawn_blocking(|| std::io::copy(&mut std::io::stdin(), &mut std::io::sink()));
+    ended.await.expect("no panic").expect("standard input");
+}
+
+/// Ten messages a second to every connection, as long as each asks for, each with the stamp of its making.
+async fn serve_floor(listener: TcpListener) {
+    use tokio::io::AsyncWriteExt;
+    listener.set_nonblocking(true).expect("an option");
+    let listener = tokio::net::TcpListener::from_std(listener).expect("a listener");
+    let (tick, made) = tokio::sync::watch::channel(0);
+    tokio::spawn(async move {
+        let mut every = tokio::time::interval(Duration::from_millis(100));
+        loop {
+            every.tick().await;
+            tick.send_replace(now_ns());
+        }
+    });
+    while let Ok((mut stream, _)) = listener.accept().await {
+        let mut made = made.clone();
+        tokio::spawn(async move {
+            stream.set_nodelay(true)?;
+            let bytes = stream.read_u64_le().await?.clamp(8, 1 << 20);
+            let mut message = vec![0; bytes as usize];
+            while made.changed().await.is_ok() {
+                let made_ns: i64 = *made.borrow_and_update();
+                message[..8].copy_from_slice(&made_ns.to_le_bytes());
+                stream.write_all(&message).await?;
+            }
+            Ok::<(), std::io::Error>(())
+        });
+    }
+}
+
+/// What the sensor sends in so many turns of the town; each ends with the packet at which the server cuts it.
+fn cast(count: usize) -> Arc<Vec<Vec<Datagram>>> {
+    let mut vehicle = SimulatedVehicle::new(town(), ScannerConfig::default());
+    let (mut turns, mut turn, mut before) = (Vec::new(), Vec::new(), u16::MAX);
+    while turns.len() < count {
+        let datagram = vehicle.next().expect("datagrams do not end");
+        if datagram.kind == Kind::Telemetry {
+            continue;
+        }
+        // Of the last block; behind the vehicle turns are cut.
+        let azimuth = u16::from_le_bytes([datagram.payload[1102], datagram.payload[1103]]);
+        turn.push(datagram);
+        if before < 18_000 && azimuth >= 18_000 {
+            turns.push(std::mem::take(&mut turn));
+        }
+        before = azimuth;
+    }
+    turns.into()
+}
+
+/// Sends the turns in real time, and notes when the last packet of each left.
+fn send(turns: &[Vec<Datagram>], to: SocketAddr, cuts: &Cuts, stop: &AtomicBool) {
+    let socket = UdpSocket::bind("127.0.0.1:0").expect("a free port");
+    let (began, first_ns) = (Instant::now(), turns[0][0].stamp_ns);
+    for turn in turns {
+        for (index, datagram) in turn.iter().enumerate() {
+            let due = Duration::from_nanos((datagram.stamp_ns - first_ns).unsigned_abs());
+            let early = due.saturating_sub(began.elapsed());
+            if early > BURST {
+                std::thread::sleep(early);
+            }
+            if stop.load(Ordering::Relaxed) {
+                return;
+            }
+            if index + 1 == turn.len() {
+                cuts.lock().expect("nobody panics").push((datagram.stamp_ns, now_ns()));
+            }
+            socket.send_to(&datagram.payload, to).expect("loopback takes datagrams");
+        }
+    }
+}

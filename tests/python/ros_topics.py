@@ -1,0 +1,93 @@
+"""A stranger to Clearway that knows rmw_zenoh's key space and ROS 2's messages: finds the topics by their liveliness tokens,
+subscribes late, twice, and prints what it got as one JSON object.
+
+Usage: ros_topics.py ENDPOINT DOMAIN
+"""
+
+import json
+import queue
+import sys
+
+import zenoh
+from rosbags.typesys import Stores, get_typestore
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+def ros_type(dds_name):
+    package, message = dds_name.split("::msg::dds_::")
+    return f"{package}/msg/{message.removesuffix('_')}"
+
+
+def publishers(session, domain):
+    """Topic -> what its token says."""
+    found = {}
+    for reply in session.liveliness().get(f"@ros2_lv/{domain}/**"):
+        parts = str(reply.ok.key_expr).split("/")
+        if parts[5] == "MP":
+            topic, dds_name, type_hash, qos = parts[9:]
+            found[topic.replace("%", "/")] = {"node": parts[8], "type": dds_name, "hash": type_hash, "qos": qos}
+        else:
+            assert parts[5] == "NN" and parts[3] == parts[4], parts
+    return found
+
+
+def message(sample, name):
+    payload = sample.payload.to_bytes()
+    decoded = STORE.deserialize_cdr(payload, name)
+    assert bytes(STORE.serialize_cdr(decoded, name)) == payload, f"{name}: other bytes when written again"
+    attachment = sample.attachment.to_bytes()
+    assert len(attachment) == 33 and attachment[16] == 16, attachment
+    sequence, stamp = (int.from_bytes(attachment[i : i + 8], "little") for i in (0, 8))
+    assert stamp > 1_600_000_000_000_000_000
+    return decoded, sequence, attachment[17:].hex()
+
+
+def grid(sample):
+    decoded, sequence, gid = message(sample, "nav_msgs/msg/OccupancyGrid")
+    position, orientation = decoded.info.origin.position, decoded.info.origin.orientation
+    return {
+        "sequence": sequence,
+        "gid": gid,
+        "stamp_ns": decoded.header.stamp.sec * 10**9 + decoded.header.stamp.nanosec,
+        "frame_id": decoded.header.frame_id,
+        "resolution": decoded.info.resolution,
+        "size": [decoded.info.width, decoded.info.height],
+        "origin": [position.x, position.y, orientation.z, orientation.w],
+        "data": decoded.data.tolist(),
+    }
+
+
+def main(endpoint, domain):
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as session:
+        topics, told = publishers(session, domain), {}
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+        for topic, says in topics.items():
+            name = ros_type(says["type"])
+            assert says["hash"] == STORE.hash_rihs01(name), name
+            key = f"{domain}/{topic.strip('/')}/{says['type']}/{says['hash']}"
+            if name == "tf2_msgs/msg/TFMessage":
+                samples = queue.Queue()
+                subscriber = session.declare_subscriber(key, samples.put)
+                transform = message(samples.get(timeout=60), name)[0].transforms[0]
+                at, q = transform.transform.translation, transform.transform.rotation
+                frames = [transform.header.frame_id, transform.child_frame_id]
+                told[topic] = {"frames": frames, "pose": [at.x, at.y, at.z, q.x, q.y, q.z, q.w]}
+                subscriber.undeclare()
+                continue
+            # The second comes while the first is there: nothing is published for it, so it has the map from the cache.
+            early, late = queue.Queue(), queue.Queue()
+            first = zenoh.ext.declare_advanced_subscriber(session, key, early.put, history=history)
+            told[topic] = grid(early.get(timeout=60))
+            second = zenoh.ext.declare_advanced_subscriber(session, key, late.put, history=history)
+            assert grid(late.get(timeout=60)) == told[topic], topic
+            first.undeclare()
+            second.undeclare()
+    print(json.dumps({"topics": topics, "told": told}))
+
+
+main(*sys.argv[1:])

@@ -1,0 +1,159 @@
+//! Strangers who know ROS 2 and Foxglove and nothing of Clearway: they find the maps, decode them by what they are told, and
+//! have what the maps say.
+
+mod house;
+
+use std::f64::consts::FRAC_PI_4;
+use std::io::{BufRead, BufReader};
+use std::process::Stdio;
+
+use clearway_client::MapView;
+use clearway_client::viewer::Raster;
+use clearway_mapping::event::{Body, EgoPose};
+use clearway_server::config::{Config, Foxglove, Ros2};
+use clearway_server::ingest::Reading;
+use clearway_server::server::{Running, Server, Setup};
+use house::{LAYERS, config, feed, readings, start, venv, within};
+use nalgebra::{Isometry3, Vector3};
+use serde_json::{Value, json};
+
+/// Poses of a vehicle that heads north-east, at rest, for as long as the readings last and some more.
+async fn place(running: &Running, readings: &[Reading]) {
+    let (first_ns, last_ns) = (readings[0].arrival_ns, readings[readings.len() - 1].arrival_ns);
+    let map_from_ego = Isometry3::new(Vector3::new(7.0, -3.0, 0.5), Vector3::z() * FRAC_PI_4);
+    let pose = |stamp_ns| {
+        let body = Body::EgoPose(EgoPose { stamp_ns, map_from_ego, speed_mps: 0.0 });
+        Reading { arrival_ns: first_ns, source: 0, body }
+    };
+    let poses: Vec<_> = (first_ns - 200_000_000..last_ns + 200_000_000).step_by(50_000_000).map(pose).collect();
+    let door = running.doors[0].door.clone();
+    let entered = tokio::task::spawn_blocking(move || poses.into_iter().try_for_each(|pose| door.enter_captured(pose)));
+    entered.await.unwrap().unwrap();
+}
+
+fn newest(running: &Running) -> MapView {
+    let map = running.vehicles.0[0].newest.borrow().clone().expect("a map");
+    MapView::decode(map.select(&[])).unwrap()
+}
+
+fn ros2() -> Config {
+    let mut config = config();
+    config.zenoh.enabled = true;
+    config.zenoh.ros2 = Ros2 { enabled: true, domain: 7, ..Ros2::default() };
+    config
+}
+
+/// Compares to a billionth.
+#[track_caller]
+fn assert_near(found: &Value, expected: &[f64]) {
+    let found: Vec<f64> = found.as_array().unwrap().iter().map(|value| value.as_f64().unwrap()).collect();
+    let near = found.len() == expected.len() && found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9);
+    assert!(near, "{found:?} is not {expected:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_ros_2_subscriber_who_comes_late_finds_every_layer_and_the_vehicle_on_the_map() {
+    let running = start(ros2()).await;
+    let readings = readings(4);
+    place(&running, &readings).await;
+    feed(&running, readings).await;
+    let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens").clone();
+    let told = tokio::task::spawn_blocking(move || {
+        venv::run(venv::script("ros_topics.py").args([&endpoint, "7"]), "the script names what it missed")
+    });
+    let told: Value = serde_json::from_str(&told.await.unwrap()).unwrap();
+
+    let map = newest(&running);
+    assert_eq!(map.layers().len() as u64, LAYERS);
+    assert_eq!(told["topics"].as_object().unwrap().len() as u64, LAYERS + 1);
+    let mut gids = Vec::new();
+    for layer in map.layers() {
+        let topic = format!("/clearway/car/{}", layer.name);
+        assert_eq!(told["topics"][&topic]["qos"], "1:1:1,1:,:,:,,", "{topic}");
+        let (grid, raster) = (&told["told"][&topic], Raster::of(&layer.grid));
+        assert_eq!(grid["frame_id"], "car/base_link", "{topic}");
+        assert_eq!(grid["stamp_ns"], map.header().capture_end_ns, "{topic}");
+        assert_eq!(grid["size"], json!([raster.width, raster.height]), "{topic}");
+        assert_eq!(grid["sequence"], 1, "{topic}: who comes second has it from the cache");
+        assert_eq!(grid["data"], json!(raster.occupancies(layer)), "{topic}");
+        assert!(
+            grid["data"].as_array().unwrap().contains(&json!(0)),
+            "{topic}: ground is seen about a vehicle on a plain"
+        );
+        gids.push(grid["gid"].as_str().unwrap());
+    }
+    gids.sort_unstable();
+    gids.dedup();
+    assert_eq!(gids.len() as u64, LAYERS, "each publisher has its own");
+    // The occupancy grid's axes are the world's, so they are turned in the vehicle's frame.
+    let (sin, cos) = (-FRAC_PI_4 / 2.0).sin_cos();
+    let origin = told["told"]["/clearway/car/occupancy"]["origin"].as_array().unwrap();
+    assert_near(&json!(origin[2..]), &[sin, cos]);
+    assert_eq!(told["told"]["/tf"]["frames"], json!(["map", "car/base_link"]));
+    assert_near(&told["told"]["/tf"]["pose"], &[7.0, -3.0, 0.5, 0.0, 0.0, -sin, cos]);
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn no_layer_is_made_for_topics_and_channels_nobody_subscribes_to() {
+    let mut config = ros2();
+    config.foxglove = Foxglove { enabled: true, listen: "127.0.0.1:0".parse().unwrap() };
+    let running = Server::start(Setup { config, ..Setup::default() }).await.unwrap();
+    assert!(feed(&running, readings(4)).await >= 3);
+    assert_eq!(newest(&running).layers(), []);
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_foxglove_client_is_shown_the_current_map_at_once_and_points_from_then_on() {
+    let mut config = config();
+    config.foxglove = Foxglove { enabled: true, listen: "127.0.0.1:0".parse().unwrap() };
+    let running = start(config).await;
+    let mut readings = readings(8);
+    place(&running, &readings).await;
+    let rest = readings.split_off(readings.len() / 2);
+    feed(&running, readings).await;
+    let address = format!("ws://{}", running.foxglove.expect("Foxglove is served"));
+    let map = newest(&running);
+
+    let (mut client, mut lines) = tokio::task::spawn_blocking(move || {
+        let mut client = venv::script("foxglove_live.py").arg(address).stdout(Stdio::piped()).spawn().unwrap();
+        let lines = BufReader::new(client.stdout.take().unwrap()).lines();
+        (client, lines)
+    })
+    .await
+    .unwrap();
+    let (told, lines) =
+        tokio::task::spawn_blocking(move || (lines.next().expect("a line").unwrap(), lines)).await.unwrap();
+    let told: Value = serde_json::from_str(&told).unwrap();
+    assert_eq!(told["name"], "clearway");
+    assert_eq!(told["channels"].as_object().unwrap().len() as u64, LAYERS + 2);
+    for name in ["drivability", "occupancy"] {
+        let (layer, grid) = (map.layer(name).unwrap(), &told[format!("/car/map/{name}")]);
+        let (raster, schema) = (Raster::of(&layer.grid), &told["channels"][format!("/car/map/{name}")]);
+        let data = raster.rgba(layer);
+        assert_eq!((schema.as_str(), grid["frame_id"].as_str()), (Some("foxglove.Grid"), Some("car/base_link")));
+        assert_eq!(grid["log_ns"], map.header().capture_end_ns);
+        assert_eq!((&grid["column_count"], &grid["row_stride"]), (&json!(raster.width), &json!(4 * raster.width)));
+        assert_eq!(grid["data"], json!({"length": data.len(), "crc32": crc32fast::hash(&data)}), "{name}");
+    }
+    let turned = &told["/car/map/occupancy"]["pose"]["orientation"];
+    let (sin, cos) = (-FRAC_PI_4 / 2.0).sin_cos();
+    assert_near(&json!([turned["z"], turned["w"]]), &[sin, cos]);
+    let transform = &told["/tf"]["transforms"][0];
+    assert_eq!((&transform["parent_frame_id"], &transform["child_frame_id"]), (&json!("map"), &json!("car/base_link")));
+    assert_near(&json!([transform["translation"]["x"], transform["rotation"]["z"]]), &[7.0, -sin]);
+
+    feed(&running, rest).await;
+    let points = tokio::task::spawn_blocking(move || {
+        let mut lines = lines;
+        let points = lines.next().expect("a line").unwrap();
+        assert!(client.wait().unwrap().success());
+        points
+    });
+    let points: Value = serde_json::from_str(&points.await.unwrap()).unwrap();
+    assert_eq!((&points["frame_id"], &points["point_stride"]), (&json!("car/base_link"), &json!(12)));
+    assert!(points["data"]["length"].as_u64().unwrap() > 12 * 10_000, "{points}");
+    assert!(points["log_ns"].as_i64().unwrap() > map.header().capture_end_ns);
+    within("shutdown", running.shutdown()).await.unwrap();
+}
