@@ -9,6 +9,7 @@ import pytest
 
 import clearway
 from clearway import codec
+from clearway.map import Map
 from clearway.v1 import map_pb2
 
 GOLDEN = Path(__file__).resolve().parents[3] / "proto" / "golden"
