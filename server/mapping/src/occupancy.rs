@@ -85,17 +85,8 @@ impl Occupancy {
 
 impl LayerMaker for Occupancy {
     fn layer(&self) -> Layer {
-        let channel =
-            |name| Channel { name, unit: "", scale: 1.0, unknown: i32::from(UNKNOWN), cells: Cells::U8(Vec::new()) };
-        Layer {
-            name: "occupancy",
-            geometry: self.geometry(),
-            legend: LEGEND,
-            channels: vec![channel("class"), channel("hits")],
-            planes: Vec::new(),
-            figures: Vec::new(),
-            points: Vec::new(),
-        }
+        let channels = vec![Channel::class(), Channel::u8("hits", "", 1.0, UNKNOWN)];
+        Layer::new("occupancy", self.geometry(), LEGEND, channels)
     }
 
     fn wants_no_returns(&self) -> bool {
@@ -117,6 +108,7 @@ impl LayerMaker for Occupancy {
     /// From the rays taken since the last map, where the vehicle was then.
     fn make(&mut self, _sweep: &Sweep, layer: &mut Layer) {
         let needed = Self::hits_needed(&self.config, self.speed_mps);
+        layer.clear_lists();
         let [class, hits] = &mut layer.channels[..] else { unreachable!("layer() gives two channels") };
         let (Cells::U8(class), Cells::U8(hits)) = (&mut class.cells, &mut hits.cells) else {
             unreachable!("layer() gives u8 and u8")
@@ -128,7 +120,6 @@ impl LayerMaker for Occupancy {
         let any = self.fan.tell(&self.config, &self.window, class);
         self.window.judge([needed, self.config.hold_maps], any, class, hits);
         let share = |state: u8| class.iter().filter(|class| **class == state).count() as f64 / cells as f64;
-        layer.figures.clear();
         layer.figures.extend([
             ("clear_share", share(CLEAR)),
             ("occupied_share", share(OCCUPIED)),
@@ -136,8 +127,6 @@ impl LayerMaker for Occupancy {
             ("world_aligned", f64::from(u8::from(self.window.anchored()))),
         ]);
         layer.geometry = self.geometry();
-        layer.planes.clear();
-        layer.points.clear();
     }
 
     fn make_with(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {

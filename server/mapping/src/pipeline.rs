@@ -336,8 +336,7 @@ pub fn layer_names(maps: &MapsConfig) -> Vec<&'static str> {
 
 /// The model that [`model_name`] spells so.
 pub fn model_of_name(name: &str) -> Option<Model> {
-    let models = [Model::Hdl64eS1, Model::Hdl64eS2, Model::Hdl64eS3, Model::Hdl32e, Model::Vlp16, Model::PuckHiRes];
-    models.into_iter().chain([Model::Vlp32c, Model::Vls128]).find(|model| model_name(*model) == name)
+    Model::ALL.into_iter().find(|model| model_name(*model) == name)
 }
 
 /// The model as the configuration and the wire spell it.

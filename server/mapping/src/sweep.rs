@@ -85,7 +85,8 @@ impl Sweep {
         let at_rest = Transform::new(&mount.ego_from_sensor);
         let moving = transforms(mount, end_from_ego);
         let slots: usize = revolution.echoes.iter().map(|echo| echo.range_m.len()).sum();
-        let mut kept = self.open(slots);
+        self.open(slots);
+        let mut kept = 0;
         let mut returns = 0;
         let mut dropped = Dropped::default();
         for echo in &revolution.echoes {
@@ -179,7 +180,8 @@ impl Sweep {
         let moving = transforms(mount, end_from_ego);
         let knots = ScanKnots::of(scan);
         let hides = screen.map(|screen| hides(mount, screen));
-        let mut kept = self.open(scan.x.len());
+        self.open(scan.x.len());
+        let mut kept = 0;
         let mut returns = 0;
         let mut dropped = Dropped::default();
         for (index, ((&x, &y), &z)) in scan.x.iter().zip(&scan.y).zip(&scan.z).enumerate() {
@@ -250,12 +252,11 @@ impl Sweep {
         self.deviation_m.clear();
     }
 
-    /// Room for `slots` points and one more to write what is not kept; gives the first free index.
-    fn open(&mut self, slots: usize) -> usize {
+    /// Room for `slots` points and one more to write what is not kept.
+    fn open(&mut self, slots: usize) {
         for axis in [&mut self.x, &mut self.y, &mut self.z] {
             axis.resize(slots + 1, 0.0);
         }
-        0
     }
 
     fn close(&mut self, kept: usize) {
