@@ -4,12 +4,12 @@
 //! everything before it allocates anything.
 //!
 //! Runs are canonical, so that equal cells have equal bytes: for each run varint(value) varint(length - 1), signed
-//! values zigzag, neighbours differ, lengths sum to the cell count, no overlong varint. [`crate::rows`] predicts every row
-//! by the one before. A channel is sent as what is smallest; of equals, raw before runs before rows.
+//! values zigzag, neighbours differ, lengths sum to the cell count, no overlong varint. [`crate::rows`] predicts every
+//! row by the one before. A channel is sent as what is smallest; of equals, raw before runs before rows.
 //!
-//! There is no general compression on top. Over 29 maps of recorded scans (348 channels) rows take 46 % of what runs take; runs
-//! with zstd (level 3) take 7 % less than rows, but for classes 6 % more, which are half of a map. That is not worth a library
-//! in every client, nor stored bytes that follow its version.
+//! There is no general compression on top. Over 29 maps of recorded scans (348 channels) rows take 46 % of what runs
+//! take; runs with zstd (level 3) take 7 % less than rows, but for classes 6 % more, which are half of a map. That is
+//! not worth a library in every client, nor stored bytes that follow its version.
 
 use std::borrow::Cow;
 

@@ -81,7 +81,8 @@ pub(crate) fn civil_time(stamp_ns: i64) -> ([i64; 3], [i64; 3]) {
     ([year, month, day], [of_day / 3600, of_day / 60 % 60, of_day % 60])
 }
 
-/// Year, month and day of a day counted from 1970-01-01 (the Gregorian rule, in eras of 400 years from 1 March of year 0).
+/// Year, month and day of a day counted from 1970-01-01 (the Gregorian rule, in eras of 400 years from 1 March of year
+/// 0).
 fn civil_date(day: i64) -> (i64, i64, i64) {
     let from_march_0 = day + 719_468;
     let (era, of_era) = (from_march_0.div_euclid(146_097), from_march_0.rem_euclid(146_097));

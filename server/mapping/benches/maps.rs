@@ -172,7 +172,8 @@ fn safe_path(bencher: Bencher) {
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make_with(&sweep, &context, &mut layer));
 }
 
-/// What six units of four planes send in 100 ms from a vehicle in traffic: 52,800 rays, those without a return among them.
+/// What six units of four planes send in 100 ms from a vehicle in traffic: 52,800 rays, those without a return among
+/// them.
 fn six_units() -> Vec<(Sweep, [f32; 3])> {
     let scene = traffic::street(0.0);
     let scan = |unit: &PlaneUnit, number| {

@@ -1,8 +1,8 @@
 //! The thesis' baseline (§V), on the same r-θ grid: a cell whose highest and lowest points differ by more than a
 //! threshold is an obstacle.
 //!
-//! In: a [`Sweep`], ego frame, metres. Out: the layer `height_difference`. Kept for comparison: it takes a steep road, or
-//! one under branches, for an obstacle, and calls ground behind a fence drivable, as the thesis shows.
+//! In: a [`Sweep`], ego frame, metres. Out: the layer `height_difference`. Kept for comparison: it takes a steep road,
+//! or one under branches, for an obstacle, and calls ground behind a fence drivable, as the thesis shows.
 
 use crate::config::HeightDifferenceConfig;
 use crate::map::{Cells, Channel, Geometry, Layer, LayerMaker};

@@ -1,4 +1,5 @@
-//! What a map is: a header, and layers of channels over one grid each. Class 0 is unknown everywhere, and is never free.
+//! What a map is: a header, and layers of channels over one grid each. Class 0 is unknown everywhere, and is never
+//! free.
 
 use clearway_lidar::blocked::Blocked;
 use nalgebra::Isometry3;
@@ -55,7 +56,8 @@ pub struct SensorState {
     pub partial: &'static str,
     /// Where the sensor used to see and did not in this revolution.
     pub blocked: Blocked,
-    /// The clock the stamps follow, as [`clearway_lidar::Clock::as_str`] spells it; `sender` where a scan brings its stamp.
+    /// The clock the stamps follow, as [`clearway_lidar::Clock::as_str`] spells it; `sender` where a scan brings its
+    /// stamp.
     pub clock: &'static str,
     /// By how much the host's clock is ahead of the stamps, ms.
     pub clock_offset_ms: i64,
@@ -235,9 +237,9 @@ pub enum Geometry {
         /// Number of columns.
         columns: u16,
     },
-    /// Square cells: index = iy * width + ix; cell (ix, iy) spans `origin + i * cell_m` to `origin + (i + 1) * cell_m` along
-    /// the grid's axes, which begin at the ego frame's origin: `(x cos yaw - y sin yaw, x sin yaw + y cos yaw)` are the
-    /// grid's coordinates of the ego frame's (x, y).
+    /// Square cells: index = iy * width + ix; cell (ix, iy) spans `origin + i * cell_m` to `origin + (i + 1) * cell_m`
+    /// along the grid's axes, which begin at the ego frame's origin: `(x cos yaw - y sin yaw, x sin yaw + y cos yaw)`
+    /// are the grid's coordinates of the ego frame's (x, y).
     Cartesian {
         /// Corner of cell (0, 0), metres along the grid's x axis.
         origin_x_m: f64,

@@ -1,7 +1,8 @@
 //! Conducts one vehicle: events in, maps out, nothing but the events deciding.
 //!
-//! In: [`Event`]s in the order the door took them. Out: a [`Map`] for every turn that makes one. The hops: datagram or scan
-//! -> its sensor's [`Intake`] -> that sensor's newest turn -> [`Fusion`] -> the map's [`Sweep`] -> one layer a map -> [`Map`].
+//! In: [`Event`]s in the order the door took them. Out: a [`Map`] for every turn that makes one. The hops: datagram or
+//! scan -> its sensor's [`Intake`] -> that sensor's newest turn -> [`Fusion`] -> the map's [`Sweep`] -> one layer a map
+//! -> [`Map`].
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
@@ -287,9 +288,9 @@ impl Pipeline {
         makes_map
     }
 
-    /// Makes the newest map once more, under the next sequence, where it was made for nobody and somebody has come since: a
-    /// late reader need not wait for a sensor that may be silent. `None` where there is nothing to make, and where another
-    /// sensor's turn has ended since. Layers that gather evidence have seen one turn.
+    /// Makes the newest map once more, under the next sequence, where it was made for nobody and somebody has come
+    /// since: a late reader need not wait for a sensor that may be silent. `None` where there is nothing to make, and
+    /// where another sensor's turn has ended since. Layers that gather evidence have seen one turn.
     pub fn make_late(&mut self) -> Option<&Map> {
         let was_for_nobody = self.maps_made > 0 && self.map.layers.is_empty();
         if !was_for_nobody || !self.layers.are_wanted() || self.turn_since_map {

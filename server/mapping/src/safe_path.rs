@@ -1,19 +1,19 @@
 //! Safe points (thesis §VI): places as far as can be from the obstacles on both sides, linked into paths that start at
 //! the vehicle.
 //!
-//! In: the layer `drivability` of the same map, and its sweep. Out: the layer `safe_path`: points with radii and links, and the
-//! Cartesian grid they were found on. The steps:
+//! In: the layer `drivability` of the same map, and its sweep. Out: the layer `safe_path`: points with radii and links,
+//! and the Cartesian grid they were found on. The steps:
 //!
 //! | step | where |
 //! |---|---|
 //! | which cells are free: drivable ones, and those the sensor cannot see under the vehicle | [`free`] |
 //! | exact distance to the nearest cell that is not free, and which one that is | [`distance`] |
-//! | ridge: neighbouring cells whose nearest obstacles are two; its exact radii; thinned to one-cell lines | [`ridge`] |
+//! | ridge: neighbouring cells with two nearest obstacles; its exact radii; thinned to one-cell lines | [`ridge`] |
 //! | links between neighbours on the lines, from the vehicle on | [`links`] |
 //!
-//! Unknown ground is no way through: it counts like an obstacle, but for the blind zone and narrow holes ([`free`]). The thesis keeps no more than the picture; here each
-//! point knows its radius (the thesis' safety radius), and is kept where the vehicle fits: twice the radius is at least
-//! its width. What lies beyond the grid is not known to this map.
+//! Unknown ground is no way through: it counts like an obstacle, but for the blind zone and narrow holes ([`free`]).
+//! The thesis keeps no more than the picture; here each point knows its radius (the thesis' safety radius), and is kept
+//! where the vehicle fits: twice the radius is at least its width. What lies beyond the grid is not known to this map.
 
 pub mod distance;
 pub mod free;

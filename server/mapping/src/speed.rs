@@ -1,7 +1,8 @@
-//! The speed each place allows (Lindström 2005): from the ground's bumps and steps, with the road painted in as a bonus.
+//! The speed each place allows (Lindström 2005): from the ground's bumps and steps, with the road painted in as a
+//! bonus.
 //!
-//! In: a [`Sweep`], ego frame, metres; the newest road and route, if any. Out: the layer `speed`, a Cartesian grid about
-//! the vehicle. The steps:
+//! In: a [`Sweep`], ego frame, metres; the newest road and route, if any. Out: the layer `speed`, a Cartesian grid
+//! about the vehicle. The steps:
 //!
 //! | step | paper | where |
 //! |---|---|---|

@@ -1,8 +1,9 @@
 //! The points of one turn in the ego frame.
 //!
-//! In: a [`Revolution`] or [`Scan`] in the sensor's frame, how the sensor is mounted, how the vehicle moved, and where the
-//! vehicle itself is. Out: a [`Sweep`], only returns of the surroundings, ego frame at the turn's last firing, metres, with
-//! what the grid's rows follow from. Compaction, motion and transform are one pass; each firing has one rigid transform.
+//! In: a [`Revolution`] or [`Scan`] in the sensor's frame, how the sensor is mounted, how the vehicle moved, and where
+//! the vehicle itself is. Out: a [`Sweep`], only returns of the surroundings, ego frame at the turn's last firing,
+//! metres, with what the grid's rows follow from. Compaction, motion and transform are one pass; each firing has one
+//! rigid transform.
 
 use std::sync::Arc;
 
@@ -42,7 +43,8 @@ pub struct Sweep {
     pub deviation_m: Vec<f32>,
     /// Returns of the turn before those of the vehicle itself were dropped.
     pub returns: u32,
-    /// Elevations of the lasers the rows of radial maps come from; `None` where nobody knows them: those maps are unknown.
+    /// Elevations of the lasers the rows of radial maps come from; `None` where nobody knows them: those maps are
+    /// unknown.
     pub calibration: Option<Arc<Calibration>>,
     /// Height of the sensor over the ground.
     pub mount_height_m: f32,
@@ -98,7 +100,8 @@ impl Sweep {
                     let range = range_m[i];
                     let [ex, ey, ez] = transform.apply(x[i], y[i], z[i]);
                     (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
-                    // Not fired is NaN and no return is 0: neither passes. Written always, kept by moving on: no branch.
+                    // Not fired is NaN and no return is 0: neither passes. Written always, kept by moving on: no
+                    // branch.
                     returns += u32::from(range > 0.0);
                     let far = range > 0.0 && range >= mount.range_m_min;
                     let hidden = hides([x[i], y[i], z[i]]).filter(|_| far);
@@ -117,8 +120,8 @@ impl Sweep {
         dropped
     }
 
-    /// Adds one deviation a point, in step with the points that [`Sweep::take_revolution`] took from the same revolution;
-    /// a second echo has no series.
+    /// Adds one deviation a point, in step with the points that [`Sweep::take_revolution`] took from the same
+    /// revolution; a second echo has no series.
     pub fn take_deviations(&mut self, revolution: &Revolution, mount: &Mount, series: &mut Series) {
         self.take_deviations_around(revolution, mount, series, None);
     }
@@ -165,8 +168,9 @@ impl Sweep {
         self.take_scan_around(scan, Some(calibration), mount, &[], None).no_position
     }
 
-    /// The same of a sensor whose elevations may not be known, each point moved from when it was seen (`end_from_ego` is
-    /// [`crate::motion::Moved::end_from_ego`] of this scan, or empty), without what the vehicle's own body or a blind sector hides.
+    /// The same of a sensor whose elevations may not be known, each point moved from when it was seen (`end_from_ego`
+    /// is [`crate::motion::Moved::end_from_ego`] of this scan, or empty), without what the vehicle's own body or a
+    /// blind sector hides.
     pub fn take_scan_around(
         &mut self,
         scan: &Scan,

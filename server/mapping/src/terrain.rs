@@ -1,5 +1,5 @@
-//! Neuhaus' terrain map (Neuhaus 2009 §2): where the ground is flat, by hierarchical principal component analysis, and how
-//! rough it is there.
+//! Neuhaus' terrain map (Neuhaus 2009 §2): where the ground is flat, by hierarchical principal component analysis, and
+//! how rough it is there.
 //!
 //! In: a [`Sweep`], ego frame, metres. Out: the layer `terrain`, square cells about the vehicle. The steps:
 //!
@@ -13,9 +13,9 @@
 //! | roughness of flat cells | §2.4, §2.5, eq. 3 and 4 | [`crate::series`], [`roughness`] |
 //!
 //! Three forms stand side by side ([`Form`]). `paper`: as published; car roofs are flat, and cells far beyond the last
-//! point are inferred. `grounded`: a flat region holds no point that stands out of its plane, joins the ground under the
-//! vehicle without a step, by ways the vehicle fits through, and speaks only for holes in seen ground. `grid`: each cell for itself, with the shape of its
-//! points.
+//! point are inferred. `grounded`: a flat region holds no point that stands out of its plane, joins the ground under
+//! the vehicle without a step, by ways the vehicle fits through, and speaks only for holes in seen ground. `grid`: each
+//! cell for itself, with the shape of its points.
 //!
 //! Nothing depends on the order of the points: all sums are over whole numbers.
 

@@ -268,7 +268,8 @@ fn with_device_us(mut packet: Vec<u8>, device_us: u32) -> Vec<u8> {
     packet
 }
 
-/// The turn a packet completes. The first packet of another time is refused until the next one confirms it, and copies are.
+/// The turn a packet completes. The first packet of another time is refused until the next one confirms it, and copies
+/// are.
 fn take<'a>(sensor: &'a mut Sensor, packet: &[u8], arrival_ns: i64) -> Option<&'a Revolution> {
     match sensor.push(packet, arrival_ns) {
         Ok(turn) => turn,
@@ -478,7 +479,8 @@ fn jitter_bursts_and_wild_device_times_change_no_stamp() {
         let burst = |index: usize| if (400..500).contains(&index) { (500 - index as i64) * 300_000 } else { 0 };
         assert_eq!(stamps(jitter, |_| false), clean, "{model:?}");
         assert_eq!(stamps(burst, |_| false), clean, "{model:?}");
-        // A packet whose device time is damaged is refused: where it would have begun or ended a turn, the next one does.
+        // A packet whose device time is damaged is refused: where it would have begun or ended a turn, the next one
+        // does.
         let packet_ns = model.spec().packet_period_ns(stream.mode) as u64;
         for (wild, clean) in stamps(|_| 0, |index| index % 90 == 60).iter().zip(&clean) {
             assert!(
