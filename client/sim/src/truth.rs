@@ -27,13 +27,6 @@ pub enum Truth {
     Obstacle,
 }
 
-impl Truth {
-    /// Whether a map must never call this drivable.
-    pub fn is_forbidden(self) -> bool {
-        matches!(self, Truth::Unreachable | Truth::Steep | Truth::Obstacle)
-    }
-}
-
 /// What a vehicle can do.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {

@@ -240,7 +240,7 @@ impl SimulatedVehicle {
         let (x, y, heading) = self.scene.drive.at(self.time(fix_ns));
         let (latitude_deg, longitude_deg) = self.datum.globe(x, y);
         let course_deg = (90.0 - heading.to_degrees()).rem_euclid(360.0);
-        let fix = Fix { stamp_ns: fix_ns, latitude_deg, longitude_deg, speed_m_s: self.speed_at(fix_ns), course_deg };
+        let fix = Fix { stamp_ns: fix_ns, latitude_deg, longitude_deg, speed_mps: self.speed_at(fix_ns), course_deg };
         Datagram { stamp_ns, kind: Kind::Telemetry, payload: telemetry(stamp_ns, &fix).to_vec() }
     }
 }

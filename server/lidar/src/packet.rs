@@ -194,12 +194,6 @@ impl<'a> Packet<'a> {
         self.bytes[at..at + RETURNS_LENGTH].try_into().expect("a slice of that length")
     }
 
-    /// Raw distance and intensity of one return.
-    pub fn raw_return(&self, block: usize, index: usize) -> (u16, u8) {
-        let at = block * BLOCK_LENGTH + 4 + 3 * index;
-        (self.u16_at(at), self.bytes[at + 2])
-    }
-
     /// Microseconds past the hour; garbage in an HDL-64E S1's packet.
     pub fn device_us(&self) -> u32 {
         u32::from_le_bytes(self.bytes[1200..1204].try_into().expect("four bytes"))

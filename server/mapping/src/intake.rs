@@ -194,7 +194,7 @@ impl Intake {
         motion.through(revolution, &mut self.moved);
         let dropped = turn.sweep.take_revolution_around(revolution, mount, &self.moved.end_from_ego, screen);
         if let Some(series) = &mut self.series {
-            turn.sweep.take_deviations_around(revolution, mount, series, screen);
+            turn.sweep.take_deviations(revolution, mount, series, screen);
         }
         if self.wants_no_returns {
             look_for_no_returns(revolution, mount, &self.moved, screen, &mut turn.no_returns);

@@ -53,16 +53,12 @@ pub struct Sweep {
 impl Sweep {
     /// Fills the sweep from a revolution of a vehicle at rest, in place of what it held.
     pub fn take_revolution(&mut self, revolution: &Revolution, mount: &Mount) {
-        self.take_moving_revolution(revolution, mount, &[]);
+        self.take_revolution_around(revolution, mount, &[], None);
     }
 
     /// Fills the sweep from a revolution, in place of what it held; `end_from_ego` is
     /// [`crate::motion::Moved::end_from_ego`] of this revolution, or empty to leave the points where they were seen.
-    pub fn take_moving_revolution(&mut self, revolution: &Revolution, mount: &Mount, end_from_ego: &[Isometry3<f64>]) {
-        self.take_revolution_around(revolution, mount, end_from_ego, None);
-    }
-
-    /// The same without the returns that the vehicle's own body or a blind sector hides; gives how many those are.
+    /// Returns that the vehicle's own body or a blind sector hides are left out; gives how many those are.
     pub fn take_revolution_around(
         &mut self,
         revolution: &Revolution,
@@ -120,14 +116,9 @@ impl Sweep {
         dropped
     }
 
-    /// Adds one deviation a point, in step with the points that [`Sweep::take_revolution`] took from the same
-    /// revolution; a second echo has no series.
-    pub fn take_deviations(&mut self, revolution: &Revolution, mount: &Mount, series: &mut Series) {
-        self.take_deviations_around(revolution, mount, series, None);
-    }
-
-    /// The same in step with [`Sweep::take_revolution_around`].
-    pub fn take_deviations_around(
+    /// Adds one deviation a point, in step with the points that [`Sweep::take_revolution_around`] took from the same
+    /// revolution with the same screen; a second echo has no series.
+    pub fn take_deviations(
         &mut self,
         revolution: &Revolution,
         mount: &Mount,

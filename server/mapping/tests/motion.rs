@@ -327,7 +327,7 @@ fn a_vlp16_in_dual_return_moves_both_echoes() {
     let mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
     let (mut rest, mut sweep) = (Sweep::default(), Sweep::default());
     rest.take_revolution(&revolution, &mount);
-    sweep.take_moving_revolution(&revolution, &mount, &moved.end_from_ego);
+    sweep.take_revolution_around(&revolution, &mount, &moved.end_from_ego, None);
     assert_eq!((sweep.returns, sweep.x.len()), (rest.returns, rest.x.len()));
     // By hand, firing by firing: a point of the turn's first firing lies 1.5 m farther back, one of the last where it
     // was.
@@ -406,7 +406,7 @@ fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
             echo.range_m[drop].fill(0.0);
         }
         let mut sweep = Sweep::default();
-        sweep.take_moving_revolution(&half, &mount, &moved.end_from_ego);
+        sweep.take_revolution_around(&half, &mount, &moved.end_from_ego, None);
         let since = (to_ns - revolution.end_ns) as f64 * 1e-9 * speed_mps;
         let place = |i: usize| [f64::from(sweep.x[i]) - since, f64::from(sweep.y[i]), f64::from(sweep.z[i])];
         let places: Vec<[f64; 3]> = (0..sweep.x.len()).map(place).collect();
