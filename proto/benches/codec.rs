@@ -1,5 +1,5 @@
-//! Cells to payload and back: 160,000 cells (400 x 400) of a drivability-like map, and of noise; a layer of them as a delta to
-//! the one before, from which it has scrolled by 3 cells.
+//! Cells to payload and back: 160,000 cells (400 x 400) of a drivability-like map, and of noise; a layer of them as a
+//! delta to the one before, from which it has scrolled by 3 cells.
 
 use clearway_proto::codec::{self, Cells, Limits};
 use clearway_proto::delta;

@@ -1,7 +1,7 @@
 //! A channel's payload back to its cells.
 //!
-//! In: a `Channel` from anywhere, hostile or not. Out: its cells, or what is wrong with it, by name and numbers. Counts,
-//! canonical form and CRC are checked in a first pass that allocates nothing; the second makes the cells.
+//! In: a `Channel` from anywhere, hostile or not. Out: its cells, or what is wrong with it, by name and numbers.
+//! Counts, canonical form and CRC are checked in a first pass that allocates nothing; the second makes the cells.
 
 use crate::codec::{Cells, unzigzag};
 use crate::rows::for_each_stretch;

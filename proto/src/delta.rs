@@ -2,10 +2,10 @@
 //!
 //! In: two whole layers, or a delta and the map it stands on. Out: the delta, or the cells it leads to.
 //!
-//! Every cell is predicted to be what the cell of the same place was: in a radial grid the one of the same row and column,
-//! in a Cartesian one the one of the same number, so that a grid may scroll by whole cells, grow and shrink; `unknown` where
-//! the base has none. The differences go through the same encodings as cells do: mostly 0, they make long runs. The CRC is
-//! of the cells that come out, so what is put on a wrong base is refused and never a wrong cell.
+//! Every cell is predicted to be what the cell of the same place was: in a radial grid the one of the same row and
+//! column, in a Cartesian one the one of the same number, so that a grid may scroll by whole cells, grow and shrink;
+//! `unknown` where the base has none. The differences go through the same encodings as cells do: mostly 0, they make
+//! long runs. The CRC is of the cells that come out, so what is put on a wrong base is refused and never a wrong cell.
 
 use crate::codec::{Cells, encode_grid};
 use crate::decode::{Limits, check_crc, decode_differences};
@@ -15,11 +15,11 @@ use crate::predicted::{differences, sums};
 use crate::v1;
 use prost::Message;
 
-/// `new` as its difference from `base`, a layer of the map `base_sequence` of the same vehicle and boot id; both whole. The
-/// same layers make the same bytes.
+/// `new` as its difference from `base`, a layer of the map `base_sequence` of the same vehicle and boot id; both whole.
+/// The same layers make the same bytes.
 ///
-/// `None` where `new` has to be sent whole: the grids or channels are not of one kind, a layer is not whole or not within the
-/// limits, or the delta is not smaller.
+/// `None` where `new` has to be sent whole: the grids or channels are not of one kind, a layer is not whole or not
+/// within the limits, or the delta is not smaller.
 pub fn encode_delta(base: &v1::Layer, base_sequence: u64, new: &v1::Layer, limits: &Limits) -> Option<v1::Layer> {
     let old = decode_layer(base.clone(), None, limits).ok()?;
     let decoded = decode_layer(new.clone(), None, limits).ok()?;
@@ -51,8 +51,8 @@ pub(crate) fn base_of<'a>(layer: &v1::Layer, id: MapId, base: Option<&'a Map>) -
     base.layer(&layer.name).map(Some).ok_or_else(|| MapError::NoBase { layer: name(), base_sequence })
 }
 
-/// The cells of one channel of a delta. Whether the base fits is known before any cell is made; the CRC, of the cells that
-/// come out, after.
+/// The cells of one channel of a delta. Whether the base fits is known before any cell is made; the CRC, of the cells
+/// that come out, after.
 pub(crate) fn decode_on(
     base: &Layer,
     grid: &Grid,

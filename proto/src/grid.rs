@@ -19,8 +19,8 @@ pub enum Grid {
         /// At least 1.
         columns: u32,
     },
-    /// Cell index = iy * width + ix; cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m) along the grid's
-    /// axes, which begin at the ego frame's origin.
+    /// Cell index = iy * width + ix; cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m) along the
+    /// grid's axes, which begin at the ego frame's origin.
     Cartesian {
         /// Metres.
         origin_x_m: f64,

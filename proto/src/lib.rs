@@ -2,8 +2,9 @@
 //!
 //! [`v1`] holds the generated protobuf and gRPC types, [`DESCRIPTORS`] their descriptor set (for reflection and for
 //! the schemas in recordings), [`codec`] the cells of a channel to bytes and back, [`grid`] where cells lie, [`map`] a
-//! whole map's bytes to checked values, [`delta`] a layer as what changed, [`region`] the part of a layer about a place, [`packed`] a scan's lists of numbers to bytes and back, [`safe_points`] a layer's
-//! points.
+//! whole map's bytes to checked values, [`delta`] a layer as what changed, [`predicted`] cells as what differs from a
+//! prediction, [`region`] the part of a layer about a place, [`packed`] a scan's lists of numbers to bytes and back,
+//! [`safe_points`] a layer's points.
 
 pub mod codec;
 mod decode;

@@ -1,9 +1,9 @@
 //! Cells as differences from a prediction: the map before ([`crate::delta`]), or what cells of their class mostly are
 //! (`Channel.by_class` of map.proto).
 //!
-//! In: cells and what is predicted of them. Out: the differences, which go through the same encodings as cells do: mostly 0,
-//! they make long runs. Differences wrap, and those of unsigned cells zigzag. A channel beside the classes changes where they
-//! do: told by class, these borders are not told again.
+//! In: cells and what is predicted of them. Out: the differences, which go through the same encodings as cells do:
+//! mostly 0, they make long runs. Differences wrap, and those of unsigned cells zigzag. A channel beside the classes
+//! changes where they do: told by class, these borders are not told again.
 
 use bytes::Bytes;
 
@@ -53,8 +53,8 @@ fn unzigzag_wide(value: u16) -> i16 {
     ((value >> 1) as i16) ^ -((value & 1) as i16)
 }
 
-/// Encodes the cells of a grid with rows of `columns` cells whose classes are known, `class` of `classes`: by class where
-/// that is shorter than [`encode_grid`].
+/// Encodes the cells of a grid with rows of `columns` cells whose classes are known, `class` of `classes`: by class
+/// where that is shorter than [`encode_grid`].
 ///
 /// # Panics
 /// As [`encode_grid`]; with another number of classes than cells, or a class that is none of `classes`.
@@ -88,8 +88,8 @@ fn of_classes<T: Copy + PartialEq + Default>(
     classes: usize,
     wrap: impl Fn(Vec<T>) -> Cells,
 ) -> (Cells, Cells) {
-    // A value that more than half of the cells have outlasts all others' votes (Boyer and Moore 1991); where there is none
-    // any will do.
+    // A value that more than half of the cells have outlasts all others' votes (Boyer and Moore 1991); where there is
+    // none any will do.
     let mut most = vec![(T::default(), 0_u32); classes];
     for (&cell, &class) in cells.iter().zip(class) {
         let (value, votes) = &mut most[usize::from(class)];

@@ -2,9 +2,9 @@
 //!
 //! In: a whole layer and a `Region`. Out: a layer like it with fewer cells, its channels encoded anew.
 //!
-//! A Cartesian grid keeps the smallest rectangle of its cells that holds the region; where it turns under the vehicle, that
-//! of the turned region. A radial grid keeps the rows from the vehicle to the region's farthest corner, with all columns.
-//! Planes, figures, legend and safe points stay whole: they tell of the layer, not of its cells.
+//! A Cartesian grid keeps the smallest rectangle of its cells that holds the region; where it turns under the vehicle,
+//! that of the turned region. A radial grid keeps the rows from the vehicle to the region's farthest corner, with all
+//! columns. Planes, figures, legend and safe points stay whole: they tell of the layer, not of its cells.
 
 use crate::codec::{Cells, CellsRef, Limits, encode_grid};
 use crate::grid::{Grid, turned};

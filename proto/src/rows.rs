@@ -1,7 +1,7 @@
 //! Cells as rows predicted by the rows before: `ENCODING_ROWS` of map.proto.
 //!
-//! In: little-endian cells and the columns of their grid. Out: columns, then bits: how many cells are equal to those a row
-//! before, then a run of another value, and so on. Maps are patches, so most of a row is the row before it. The way
+//! In: little-endian cells and the columns of their grid. Out: columns, then bits: how many cells are equal to those a
+//! row before, then a run of another value, and so on. Maps are patches, so most of a row is the row before it. The way
 //! back holds no more than one row until the CRC is known to be right.
 
 use crate::codec::{cell_bits, put_varint, run_end};
@@ -97,8 +97,8 @@ impl BitWriter {
     }
 }
 
-/// Calls `take(value on the wire, length)` for stretches of equal cells, in order, and checks all there is to check but the
-/// CRC: counts, canonical form, range, no trailing byte.
+/// Calls `take(value on the wire, length)` for stretches of equal cells, in order, and checks all there is to check but
+/// the CRC: counts, canonical form, range, no trailing byte.
 pub(crate) fn for_each_stretch(
     payload: &[u8],
     cell_count: u32,

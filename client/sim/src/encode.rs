@@ -1,7 +1,7 @@
 //! Firings to data packets: the decoder's inverse.
 //!
-//! In: firings of raw returns, in time order. Out: 1206 bytes (clearway-lidar's `packet.rs` has the layout). Which block
-//! holds what is read from the model's [`ModelSpec`], the same that the decoder reads.
+//! In: firings of raw returns, in time order. Out: 1206 bytes (clearway-lidar's `packet.rs` has the layout). Which
+//! block holds what is read from the model's [`ModelSpec`], the same that the decoder reads.
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::calibration::unit_table::status_bytes;
@@ -98,8 +98,8 @@ impl Encoder {
         bytes
     }
 
-    /// What an HDL-64E under GPS says of the time: binary, the second before this one, as its GPRMC tells it (HDL-64E S3
-    /// manual, appendix E). All of a cycle is said as its first packet finds it.
+    /// What an HDL-64E under GPS says of the time: binary, the second before this one, as its GPRMC tells it (HDL-64E
+    /// S3 manual, appendix E). All of a cycle is said as its first packet finds it.
     fn clock_value(&self, kind: u8) -> Option<u8> {
         const CYCLE: i64 = 16;
         if !b"HMSDNYG".contains(&kind) {

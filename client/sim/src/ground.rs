@@ -110,7 +110,8 @@ impl Terrace {
         inside != self.outside
     }
 
-    /// Whether the outline may lie between two places: not if both are inside it (it is convex), or both beyond one side.
+    /// Whether the outline may lie between two places: not if both are inside it (it is convex), or both beyond one
+    /// side.
     fn may_be_crossed(&self, ends: [[f64; 2]; 2]) -> bool {
         let inside = |[x, y]: [f64; 2]| self.holds(x, y) != self.outside;
         let beyond = (0..2).any(|axis| {

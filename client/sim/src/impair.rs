@@ -1,7 +1,7 @@
 //! A bad network between sensor and server.
 //!
-//! In: datagrams in the order in which the sensor sent them. Out: what arrives of them, in the order and at the stamps of
-//! their arrival, and [`Counts`] of what was done. The same seed does the same.
+//! In: datagrams in the order in which the sensor sent them. Out: what arrives of them, in the order and at the stamps
+//! of their arrival, and [`Counts`] of what was done. The same seed does the same.
 
 use std::collections::BTreeMap;
 

@@ -9,7 +9,7 @@
 //! |---|---|
 //! | [`ground`], [`object`], [`course`] | the parts a world is made of |
 //! | [`world`] | a description -> [`world::World`] |
-//! | [`scenes`] | the thesis' four scenes and a town |
+//! | [`scenes`] | the thesis' four scenes, a dirt track and a town |
 //! | [`truth`] | world, pose, time -> which ground is drivable |
 //! | [`plan`] | the same as text, seen from above |
 //! | [`pose`] | scene, time -> where the vehicle is |

@@ -201,7 +201,8 @@ fn entry(from: f64, to: f64) -> Option<f64> {
 pub struct Object {
     /// What it is.
     pub kind: Kind,
-    /// Its shape: in the world frame, or for one that drives in the driver's frame (x forward, y left, z over the ground).
+    /// Its shape: in the world frame, or for one that drives in the driver's frame (x forward, y left, z over the
+    /// ground).
     pub shape: Shape,
     /// What a return from it weighs, 0 to 255.
     pub reflectivity: u8,

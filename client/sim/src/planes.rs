@@ -1,7 +1,7 @@
 //! A LIDAR of a few planes, as built into bumpers (Seo 2014 §2, §3): whole scans of one field of view.
 //!
-//! In: a world, the vehicle's pose at any time, the unit's figures. Out: [`PlaneScan`]s, sensor frame (x forward, y left,
-//! z up), each point where it was seen from at its own time; rays that met nothing are told by their directions.
+//! In: a world, the vehicle's pose at any time, the unit's figures. Out: [`PlaneScan`]s, sensor frame (x forward, y
+//! left, z up), each point where it was seen from at its own time; rays that met nothing are told by their directions.
 
 use nalgebra::{Isometry3, Point3, Vector3};
 
@@ -37,8 +37,8 @@ pub struct PlaneUnit {
 
 impl Default for PlaneUnit {
     /// Four planes, 110 degrees in quarters of a degree, 50 scans a second, 200 m (§3). The paper prints 8 degrees from
-    /// plane to plane; the units of its time with such figures have 0.8, and with 8 two of four planes would look over or
-    /// under every car beyond 10 m.
+    /// plane to plane; the units of its time with such figures have 0.8, and with 8 two of four planes would look over
+    /// or under every car beyond 10 m.
     fn default() -> Self {
         Self {
             elevations: [-1.2, -0.4, 0.4, 1.2].map(f64::to_radians).to_vec(),

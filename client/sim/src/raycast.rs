@@ -105,7 +105,8 @@ impl<W: Deref<Target = World>> Caster<W> {
         }
     }
 
-    /// The nearest thing a ray from `origin` in `direction` (length 1) meets; `draw` is the ray's own chance, for leaves.
+    /// The nearest thing a ray from `origin` in `direction` (length 1) meets; `draw` is the ray's own chance, for
+    /// leaves.
     pub fn cast(&self, origin: [f64; 3], direction: [f64; 3], draw: u64) -> Option<Hit> {
         self.cast_through(origin, direction, Some(draw))
     }

@@ -1,4 +1,5 @@
-//! One sensor: firings at their own times, each ray along its laser's true line, raw returns as the sensor would report.
+//! One sensor: firings at their own times, each ray along its laser's true line, raw returns as the sensor would
+//! report.
 //!
 //! In: a world, the sensor's pose at a firing, the sensor's figures. Out: [`RawFiring`]s. The per-laser corrections are
 //! applied backwards, so that the decoder's point lies where the ray met the world.
@@ -141,7 +142,8 @@ impl Scanner {
         0..self.spec.lasers
     }
 
-    /// The ray of `laser` in firing `index`, in the sensor's frame: where it begins, its direction, and its encoder angle.
+    /// The ray of `laser` in firing `index`, in the sensor's frame: where it begins, its direction, and its encoder
+    /// angle.
     ///
     /// A point that the decoder gives range `r` lies `r` metres along it.
     pub fn ray(&self, index: i64, laser: usize) -> ([f64; 3], [f64; 3]) {

@@ -79,7 +79,8 @@ pub fn slopes_with_obstacles() -> Scene {
     standing("slopes with obstacles", world, 63.4)
 }
 
-/// A road that bends between fences and trees, branches high over it, open ground behind the fences (figure 7): 78.30 %.
+/// A road that bends between fences and trees, branches high over it, open ground behind the fences (figure 7):
+/// 78.30 %.
 pub fn fenced_road_under_canopy() -> Scene {
     standing("fenced road under canopy", fenced_road(), 78.3)
 }
@@ -138,7 +139,8 @@ const BEHIND: i32 = -2;
 /// Half the width of the dirt track, metres.
 pub const TRACK_HALF_M: f64 = 3.0;
 
-/// A smooth dirt track along x between ploughed fields, whose furrows, 5 cm deep, run along it (Neuhaus 2009, figure 4).
+/// A smooth dirt track along x between ploughed fields, whose furrows, 5 cm deep, run along it (Neuhaus 2009, figure
+/// 4).
 pub fn dirt_track_between_fields() -> Scene {
     // A ridge 0.5 m wide every 1.5 m, with sides of 0.1 m.
     let ridge = |from: f64| [(from, 0.0), (from + 0.1, 0.05), (from + 0.4, 0.05), (from + 0.5, 0.0)];

@@ -44,7 +44,7 @@ pub struct Fix {
     /// Degrees, east positive.
     pub longitude_deg: f64,
     /// m/s.
-    pub speed_m_s: f64,
+    pub speed_mps: f64,
     /// Degrees clockwise from north, in [0, 360).
     pub course_deg: f64,
 }
@@ -61,7 +61,7 @@ impl Fix {
         let ((lat, lat_minute), (lon, lon_minute)) = (angle(self.latitude_deg), angle(self.longitude_deg));
         let (north, east) =
             (if self.latitude_deg < 0.0 { 'S' } else { 'N' }, if self.longitude_deg < 0.0 { 'W' } else { 'E' });
-        let knots = self.speed_m_s * 3600.0 / 1852.0;
+        let knots = self.speed_mps * 3600.0 / 1852.0;
         let body = format!(
             "GPRMC,{hour:02}{minute:02}{second:02},A,{lat:02}{lat_minute:07.4},{north},{lon:03}{lon_minute:07.4},{east},\
              {knots:05.1},{:05.1},{day:02}{month:02}{:02},000.0,E,A",
@@ -81,7 +81,8 @@ pub(crate) fn civil_time(stamp_ns: i64) -> ([i64; 3], [i64; 3]) {
     ([year, month, day], [of_day / 3600, of_day / 60 % 60, of_day % 60])
 }
 
-/// Year, month and day of a day counted from 1970-01-01 (the Gregorian rule, in eras of 400 years from 1 March of year 0).
+/// Year, month and day of a day counted from 1970-01-01 (the Gregorian rule, in eras of 400 years from 1 March of year
+/// 0).
 fn civil_date(day: i64) -> (i64, i64, i64) {
     let from_march_0 = day + 719_468;
     let (era, of_era) = (from_march_0.div_euclid(146_097), from_march_0.rem_euclid(146_097));
@@ -127,7 +128,7 @@ mod tests {
             stamp_ns: 764_426_119 * 1_000_000_000,
             latitude_deg: 48.0 + 7.038 / 60.0,
             longitude_deg: -(11.0 + 31.0 / 60.0),
-            speed_m_s: 22.4 * 1852.0 / 3600.0,
+            speed_mps: 22.4 * 1852.0 / 3600.0,
             course_deg: 84.4,
         };
         assert_eq!(fix.gprmc(), "$GPRMC,123519,A,4807.0380,N,01131.0000,W,022.4,084.4,230394,000.0,E,A*05\r\n");

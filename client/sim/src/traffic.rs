@@ -1,6 +1,7 @@
 //! A car with six units of four planes (Seo 2014, figure 2) in traffic, and what each object covers of the ground.
 //!
-//! In: the ego vehicle's speed. Out: a [`Scene`], the six [`PlaneUnit`]s, and for any time which places lie inside a thing.
+//! In: the ego vehicle's speed. Out: a [`Scene`], the six [`PlaneUnit`]s, and for any time which places lie inside a
+//! thing.
 
 use std::f64::consts::PI;
 use std::sync::Arc;
@@ -14,8 +15,8 @@ use crate::planes::PlaneUnit;
 use crate::scenes::Scene;
 use crate::world::World;
 
-/// A street along x with two lanes each way: parked cars, walls, poles and houses beside it, cars ahead, behind and coming
-/// the other way. The vehicle drives in the right-hand lane at `speed_mps`, or stands there.
+/// A street along x with two lanes each way: parked cars, walls, poles and houses beside it, cars ahead, behind and
+/// coming the other way. The vehicle drives in the right-hand lane at `speed_mps`, or stands there.
 pub fn street(speed_mps: f64) -> Scene {
     let course = Arc::new(Course::from(-400.0, 0.0, 0.0).straight(1200.0));
     let mut world = World::on(Ground { reflectivity: 15, ..Ground::default() })
@@ -53,7 +54,8 @@ pub fn street(speed_mps: f64) -> Scene {
     Scene { name: "street", world: Arc::new(world), drive, paper_share: None }
 }
 
-/// The six units about the vehicle, 110 degrees each: ahead, behind, and to each side one before and one behind the middle.
+/// The six units about the vehicle, 110 degrees each: ahead, behind, and to each side one before and one behind the
+/// middle.
 pub fn six_units() -> [PlaneUnit; 6] {
     let at = [
         (2.2, 0.0, 0.0),
@@ -88,8 +90,8 @@ impl Footprints {
         self.0.iter().any(|(_, shape)| shape.column(x, y, margin_m).is_some())
     }
 
-    /// The thing that covers all these places (metres, world), if one does; a thing that covers corners covers what lies
-    /// between them.
+    /// The thing that covers all these places (metres, world), if one does; a thing that covers corners covers what
+    /// lies between them.
     pub fn covering(&self, places: &[[f64; 2]]) -> Option<Kind> {
         let covers = |shape: &Shape| places.iter().all(|[x, y]| shape.column(*x, *y, 0.0).is_some());
         self.0.iter().find(|(_, shape)| covers(shape)).map(|(kind, _)| *kind)

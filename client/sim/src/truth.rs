@@ -1,7 +1,7 @@
 //! What is drivable in a world, known from the world itself: the truth the maps are held against.
 //!
-//! In: a world, the vehicle's pose, a time. Out: a raster in the ego frame (x forward, y left, metres). The limits are the
-//! thesis' §IV: a step of one unit (0.25 m), a clearance of 2.5 m, gates 3 m wide (criterion 3).
+//! In: a world, the vehicle's pose, a time. Out: a raster in the ego frame (x forward, y left, metres). The limits are
+//! the thesis' §IV: a step of one unit (0.25 m), a clearance of 2.5 m, gates 3 m wide (criterion 3).
 
 use nalgebra::{Isometry3, Point3};
 
@@ -25,13 +25,6 @@ pub enum Truth {
     Steep,
     /// Something stands or hangs within the clearance.
     Obstacle,
-}
-
-impl Truth {
-    /// Whether a map must never call this drivable.
-    pub fn is_forbidden(self) -> bool {
-        matches!(self, Truth::Unreachable | Truth::Steep | Truth::Obstacle)
-    }
 }
 
 /// What a vehicle can do.
@@ -63,7 +56,8 @@ pub struct TruthGrid {
     pub cell_m: f64,
     /// Cells a side.
     pub side: usize,
-    /// Row by row: cell (i, j) at index `j * side + i` has its middle at x = (i + 0.5) * cell_m - half_extent_m, y alike.
+    /// Row by row: cell (i, j) at index `j * side + i` has its middle at x = (i + 0.5) * cell_m - half_extent_m, y
+    /// alike.
     pub classes: Vec<Truth>,
     /// Height of the ground in the ego frame in each cell, metres, in the same order.
     pub heights: Vec<f32>,

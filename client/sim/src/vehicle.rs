@@ -1,7 +1,7 @@
 //! A simulated vehicle: a scene driven, a sensor turning on the roof, datagrams without end.
 //!
-//! In: scene, sensor, start. Out: [`Datagram`]s in device-time order, the pose at any time, whole decoded turns with the
-//! truth beside them.
+//! In: scene, sensor, start. Out: [`Datagram`]s in device-time order, the pose at any time, whole decoded turns with
+//! the truth beside them.
 
 use std::sync::Arc;
 
@@ -126,7 +126,8 @@ impl SimulatedVehicle {
         TruthGrid::about(&self.scene.world, &pose, time, (half_extent_m, cell_m), limits)
     }
 
-    /// Whether the ground in each cell of a truth raster made for `stamp_ns` can be seen by the sensor then, in its order.
+    /// Whether the ground in each cell of a truth raster made for `stamp_ns` can be seen by the sensor then, in its
+    /// order.
     pub fn sees(&self, stamp_ns: i64, truth: &TruthGrid) -> Vec<bool> {
         let (map_from_ego, time) = (self.pose_at(stamp_ns), self.time(stamp_ns));
         let eye: [f64; 3] = (map_from_ego * self.scanner.config().ego_from_sensor).translation.vector.into();
@@ -139,7 +140,8 @@ impl SimulatedVehicle {
         (0..truth.classes.len()).map(sees).collect()
     }
 
-    /// The datagrams from the beginning of turn `number` on (0 starts at the scene's beginning; turns before exist too).
+    /// The datagrams from the beginning of turn `number` on (0 starts at the scene's beginning; turns before exist
+    /// too).
     pub fn from_turn(mut self, number: i64) -> Self {
         let per_packet = self.scanner.spec().firings_per_packet(self.scanner.config().return_mode) as i64;
         let packet = self.scanner.first_firing_of(number).div_euclid(per_packet);
@@ -151,7 +153,8 @@ impl SimulatedVehicle {
         self
     }
 
-    /// Turn `number`, whole, through real datagrams and the decoder, and the truth 60 m around in cells of 0.2 m at its end.
+    /// Turn `number`, whole, through real datagrams and the decoder, and the truth 60 m around in cells of 0.2 m at its
+    /// end.
     ///
     /// # Panics
     /// If the decoder refuses a datagram of the encoder's or finds no whole turn: a fault of this project.
@@ -162,8 +165,8 @@ impl SimulatedVehicle {
         Turn { revolution, map_from_ego, truth }
     }
 
-    /// Turn `number`, whole, through real datagrams and the decoder: the one whose middle is the encoder's zero, ahead of
-    /// the vehicle, at time `number * 60 / rpm`.
+    /// Turn `number`, whole, through real datagrams and the decoder: the one whose middle is the encoder's zero, ahead
+    /// of the vehicle, at time `number * 60 / rpm`.
     ///
     /// # Panics
     /// As [`SimulatedVehicle::turn`].
@@ -176,8 +179,8 @@ impl SimulatedVehicle {
             ..SensorConfig::default()
         };
         let mut sensor = Sensor::new(config);
-        // The decoder cuts turns behind the vehicle, half a turn before the encoder's zero. An angle that rounds to that
-        // begins a turn one firing early.
+        // The decoder cuts turns behind the vehicle, half a turn before the encoder's zero. An angle that rounds to
+        // that begins a turn one firing early.
         let half_turn_ns = (30e9 / self.scanner.config().rpm) as i64;
         let slack_ns = self.scanner.firing_ns(2);
         let begins_ns =
@@ -195,8 +198,8 @@ impl SimulatedVehicle {
     }
 
     /// From the next firing on, which this gives the stamp of, the vehicle follows an arc of this curvature (1/m, left
-    /// positive) from where it is, at `speed` m/s. What is asked about the time before is from then on told as if it had
-    /// always done so.
+    /// positive) from where it is, at `speed` m/s. What is asked about the time before is from then on told as if it
+    /// had always done so.
     pub fn steer(&mut self, curvature: f64, speed: f64) -> i64 {
         let offset_ns = self.scanner.firing_ns(self.next_firing);
         let time = offset_ns as f64 * 1e-9;
@@ -237,7 +240,7 @@ impl SimulatedVehicle {
         let (x, y, heading) = self.scene.drive.at(self.time(fix_ns));
         let (latitude_deg, longitude_deg) = self.datum.globe(x, y);
         let course_deg = (90.0 - heading.to_degrees()).rem_euclid(360.0);
-        let fix = Fix { stamp_ns: fix_ns, latitude_deg, longitude_deg, speed_m_s: self.speed_at(fix_ns), course_deg };
+        let fix = Fix { stamp_ns: fix_ns, latitude_deg, longitude_deg, speed_mps: self.speed_at(fix_ns), course_deg };
         Datagram { stamp_ns, kind: Kind::Telemetry, payload: telemetry(stamp_ns, &fix).to_vec() }
     }
 }

@@ -26,8 +26,8 @@ fn crooked(model: Model, seed: u64) -> Calibration {
     calibration
 }
 
-/// The largest differences between a turn and the world: azimuth (degrees), range (counts), point (degrees at the sensor,
-/// quantised range left out), stamp (µs).
+/// The largest differences between a turn and the world: azimuth (degrees), range (counts), point (degrees at the
+/// sensor, quantised range left out), stamp (µs).
 #[derive(Debug, Default, PartialEq)]
 struct Differences {
     azimuth_deg: f64,

@@ -38,7 +38,8 @@ fn decode(bencher: Bencher<'_, '_>, model: Model, config: SensorConfig) {
     let mut sensor = Sensor::new(SensorConfig { model: Some(model), ..config });
     bencher.counter(ItemsCount::new(PACKETS)).bench_local(|| {
         for (index, packet) in packets.iter().enumerate() {
-            // Where the stream begins again its time falls back: the first packet is refused until the second confirms it.
+            // Where the stream begins again its time falls back: the first packet is refused until the second confirms
+            // it.
             divan::black_box(sensor.push(packet, index as i64).ok());
         }
     });

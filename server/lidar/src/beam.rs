@@ -1,9 +1,9 @@
 //! Raw returns to corrected points, a block of 32 at a time.
 //!
-//! In: the 96 bytes of a block's returns, its azimuth and how fast the sensor turns. Out: 32 slots of range, x, y, z (m,
-//! sensor frame) and intensity. Loops run over separate arrays without branches, so that the compiler vectorises them.
-//! Formula: HDL-64E S3 manual rev K, appendix F (the same with zero offsets for every other model), with the sensor's
-//! y axis as our x and its x axis as our -y. VeloView computes the same.
+//! In: the 96 bytes of a block's returns, its azimuth and how fast the sensor turns. Out: 32 slots of range, x, y, z
+//! (m, sensor frame) and intensity. Loops run over separate arrays without branches, so that the compiler vectorises
+//! them. Formula: HDL-64E S3 manual rev K, appendix F (the same with zero offsets for every other model), with the
+//! sensor's y axis as our x and its x axis as our -y. VeloView computes the same.
 
 use std::sync::LazyLock;
 

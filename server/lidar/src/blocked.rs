@@ -1,7 +1,7 @@
 //! Where the sensor's window is covered.
 //!
-//! In: finished revolutions. Out: [`Blocked`]: sectors and lasers that used to bring returns and now bring none, or only
-//! such as lie on the window itself. One turn tells; until a return comes from there again, every turn does.
+//! In: finished revolutions. Out: [`Blocked`]: sectors and lasers that used to bring returns and now bring none, or
+//! only such as lie on the window itself. One turn tells; until a return comes from there again, every turn does.
 
 use crate::revolution::Revolution;
 
@@ -41,8 +41,8 @@ impl Blocked {
         self.sectors.is_empty() && self.lasers.is_empty()
     }
 
-    /// Whether what `laser` does not see at `azimuth_rad` (its encoder angle less its own offset) may be hidden rather than
-    /// absent; the sectors' edges count as hidden for another degree.
+    /// Whether what `laser` does not see at `azimuth_rad` (its encoder angle less its own offset) may be hidden rather
+    /// than absent; the sectors' edges count as hidden for another degree.
     pub fn hides(&self, laser: usize, azimuth_rad: f32) -> bool {
         let azimuth_deg = azimuth_rad.to_degrees();
         let inside = |sector: &BlockedSector| {

@@ -47,7 +47,8 @@ pub struct LaserCalibration {
     /// Added to the range 1.93 m ahead of or behind the sensor, m.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub dist_correction_y: Option<f64>,
-    /// Range of the greatest intensity, m as files give it. Kept, not applied: intensities stay as the sensor sent them.
+    /// Range of the greatest intensity, m as files give it. Kept, not applied: intensities stay as the sensor sent
+    /// them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub focal_distance: Option<f64>,
     /// Kept, not applied.

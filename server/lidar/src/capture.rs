@@ -1,8 +1,8 @@
 //! pcap and pcapng captures to UDP payloads.
 //!
 //! In: the bytes of a capture (Ethernet with or without VLAN tags, Linux cooked, raw IP). Out: [`Datagram`]s in file
-//! order. What is no whole UDP datagram is passed over and counted; a file that ends inside a packet gives all that came
-//! before, then an error that says where.
+//! order. What is no whole UDP datagram is passed over and counted; a file that ends inside a packet gives all that
+//! came before, then an error that says where.
 
 use std::io::Read;
 use std::net::{IpAddr, SocketAddr};

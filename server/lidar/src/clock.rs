@@ -1,31 +1,31 @@
 //! When a sensor's firings were, and which clock says so.
 //!
-//! In: device time and arrival of every data packet, telemetry. Out: the stamps of each turn, [`Clock`], and by how much
-//! the host's clock disagrees. A pure function of the datagrams and their arrivals.
+//! In: device time and arrival of every data packet, telemetry. Out: the stamps of each turn, [`Clock`], and by how
+//! much the host's clock disagrees. A pure function of the datagrams and their arrivals.
 //!
 //! Device time runs on one [`Timeline`]; Unix time is that plus an *offset*, one a turn, chosen when the turn ends:
 //!
-//! - From GPRMC (an HDL-64E S2 or S3: from its status bytes), where the receiver calls it valid, the device's own minutes
-//!   and seconds follow it, and it is older than its arrival by no more than
-//!   [`crate::SensorConfig::gps_late_ns_max`].
-//!   The offset is then a whole number of hours and the same to the nanosecond whatever the arrivals are. It stays in
-//!   force when GPS or the pulse is lost, over a restart, and against a host that says otherwise. An older GPRMC is an old
-//!   capture's, played live, or a receiver's that has lost count of the weeks: then arrival tells the time, as the planners'
-//!   clocks do. A GPRMC later than its arrival is believed: nothing comes before it was sent, so the host was never set.
-//! - Else from arrival, by the packet of a turn that came quickest: a late packet is late by any amount, none comes before
-//!   it was sent. The offset is held, not averaged: it changes when a turn's quickest packet is later by more than
-//!   [`STEP_NS_MAX`] (the host's clock was set, or the first turn came from a full socket buffer), or when those of ten
-//!   seconds agree on a difference above [`DRIFT_NS_MAX`]. Below that, arrivals change no stamp.
-//! - Where that puts the device's own minutes and seconds within [`HOUR_ERROR_NS_MAX`] of UTC's, somebody has set them (GPS
-//!   without telemetry, PTP), and the offset is the whole hours.
+//! - From GPRMC (an HDL-64E S2 or S3: from its status bytes), where the receiver calls it valid, the device's own
+//!   minutes and seconds follow it, and it is older than its arrival by no more than
+//!   [`crate::SensorConfig::gps_late_ns_max`]. The offset is then a whole number of hours and the same to the
+//!   nanosecond whatever the arrivals are. It stays in force when GPS or the pulse is lost, over a restart, and against
+//!   a host that says otherwise. An older GPRMC is an old capture's, played live, or a receiver's that has lost count
+//!   of the weeks: then arrival tells the time, as the planners' clocks do. A GPRMC later than its arrival is believed:
+//!   nothing comes before it was sent, so the host was never set.
+//! - Else from arrival, by the packet of a turn that came quickest: a late packet is late by any amount, none comes
+//!   before it was sent. The offset is held, not averaged: it changes when a turn's quickest packet is later by more
+//!   than [`STEP_NS_MAX`] (the host's clock was set, or the first turn came from a full socket buffer), or when those
+//!   of ten seconds agree on a difference above [`DRIFT_NS_MAX`]. Below that, arrivals change no stamp.
+//! - Where that puts the device's own minutes and seconds within [`HOUR_ERROR_NS_MAX`] of UTC's, somebody has set them
+//!   (GPS without telemetry, PTP), and the offset is the whole hours.
 //!
-//! A host's clock that is set while a device is silent is not believed about the silence (`timeline.rs`). One that is set between
-//! the two packets between which the device's own clock jumps is: nobody else tells how long that took. Stamps that went
-//! ahead by that are held until GPS, or the host, has caught up with them.
+//! A host's clock that is set while a device is silent is not believed about the silence (`timeline.rs`). One that is
+//! set between the two packets between which the device's own clock jumps is: nobody else tells how long that took.
+//! Stamps that went ahead by that are held until GPS, or the host, has caught up with them.
 //!
-//! GPS time that lies farther behind the stamps given than they catch up with ([`CATCH_UP_NS_MAX`]) is not waited for: arrival
-//! goes on. Stamps always rise. A correction forward is made at once; one backward by running at half speed, up to
-//! [`CATCH_UP_NS_MAX`]; beyond that it is not made. Host clocks that fall behind the device at once (set back, or a
+//! GPS time that lies farther behind the stamps given than they catch up with ([`CATCH_UP_NS_MAX`]) is not waited for:
+//! arrival goes on. Stamps always rise. A correction forward is made at once; one backward by running at half speed, up
+//! to [`CATCH_UP_NS_MAX`]; beyond that it is not made. Host clocks that fall behind the device at once (set back, or a
 //! capture played too fast) are not followed. [`Clock::Held`] says so while it lasts.
 
 use crate::revolution::Firing;

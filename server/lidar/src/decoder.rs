@@ -1,7 +1,7 @@
 //! Packets of a known model to revolutions.
 //!
-//! In: [`Packet`]s that were found to fit. Out: a finished [`Revolution`] whenever a cut is crossed. Two revolutions take
-//! turns: one is filled while the caller reads the other, so that nothing is allocated once both have grown.
+//! In: [`Packet`]s that were found to fit. Out: a finished [`Revolution`] whenever a cut is crossed. Two revolutions
+//! take turns: one is filled while the caller reads the other, so that nothing is allocated once both have grown.
 
 use std::sync::Arc;
 
@@ -130,8 +130,8 @@ impl Decoder {
         SensorStatus { packets_lost: self.loss.lost(), blocked: self.done.blocked.clone(), ..self.status.clone() }
     }
 
-    /// Decodes a packet that [`Decoder::check`] let through and that comes after `gap`; whether it completed a turn, which
-    /// it does only if it `may_cut`.
+    /// Decodes a packet that [`Decoder::check`] let through and that comes after `gap`; whether it completed a turn,
+    /// which it does only if it `may_cut`.
     pub fn take(&mut self, packet: &Packet<'_>, mode: ReturnMode, arrival_ns: i64, gap: Gap, may_cut: bool) -> bool {
         let mut done = self.change_mode(mode) && may_cut;
         self.status.packets += 1;
@@ -239,8 +239,8 @@ impl Decoder {
         self.expected() * self.spec.firings_per_packet(self.mode) as u32
     }
 
-    /// Adds the packet's firings to the current turn and finds the one at which to cut: the first, if the turn is `torn`
-    /// before it.
+    /// Adds the packet's firings to the current turn and finds the one at which to cut: the first, if the turn is
+    /// `torn` before it.
     fn follow(&mut self, firings: &PacketFirings, time_ns: i64, torn: bool, may_cut: bool) -> Option<Cut> {
         let (period_ns, expected) = (i64::from(self.spec.period_ns(self.mode)), self.expected());
         let overlong = self.current.firings.len() + MAX_FIRINGS > MAX_FIRINGS_PER_TURN;

@@ -1,8 +1,8 @@
 //! Which of the packets that did not come were lost.
 //!
-//! In: every packet's azimuth, and how many were missing before it. Out: an estimate of the packets lost. A sensor with a
-//! field of view set sends nothing from its dark sector, turn after turn: a long gap is loss unless the next turn has it
-//! too. So a long gap is counted when the sensor has come round, and a short one at once.
+//! In: every packet's azimuth, and how many were missing before it. Out: an estimate of the packets lost. A sensor with
+//! a field of view set sends nothing from its dark sector, turn after turn: a long gap is loss unless the next turn has
+//! it too. So a long gap is counted when the sensor has come round, and a short one at once.
 
 use crate::firing::forward;
 use crate::model::AZIMUTHS_PER_TURN;
@@ -34,8 +34,8 @@ pub(crate) struct Loss {
 }
 
 impl Loss {
-    /// Takes a packet with firings at these azimuths that turns `span` counts, and what is missing before it; gives how many
-    /// packets may have been lost.
+    /// Takes a packet with firings at these azimuths that turns `span` counts, and what is missing before it; gives how
+    /// many packets may have been lost.
     pub fn take(&mut self, gap: Gap, azimuths: &[u32], span: u32) -> u32 {
         let missing = gap.missing;
         let (Some(&azimuth), Some(&last)) = (azimuths.first(), azimuths.last()) else { return 0 };

@@ -1,8 +1,8 @@
 //! Packets in the order in which the sensor sent them.
 //!
 //! In: packets as they arrive. Out: the same without copies, in the order of their device time (HDL-64E S1: of their
-//! azimuth), each with what is missing before it. A packet that follows the one before passes at once; only behind a gap
-//! packets wait, until it fills or the network cannot fill it any more ([`REORDER_PACKETS`]). Where a stream begins
+//! azimuth), each with what is missing before it. A packet that follows the one before passes at once; only behind a
+//! gap packets wait, until it fills or the network cannot fill it any more ([`REORDER_PACKETS`]). Where a stream begins
 //! nothing tells whether its first packet has come, so that the first ones wait as behind a gap.
 //!
 //! A packet's place counts packet periods of device time. A gap of more periods than the network puts out of order is
@@ -132,8 +132,8 @@ impl Order {
         Ok(Way::Held)
     }
 
-    /// Gives the next packet that need not wait any longer (at the stream's `end`: the next one that waits) to `decode`,
-    /// with its arrival; what that says.
+    /// Gives the next packet that need not wait any longer (at the stream's `end`: the next one that waits) to
+    /// `decode`, with its arrival; what that says.
     pub fn due<T>(&mut self, end: bool, decode: impl FnOnce(&Packet<'_>, i64, Gap) -> T) -> Option<T> {
         let first = self.waiting.front()?;
         let (_, newest, _) = self.newest?;

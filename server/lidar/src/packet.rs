@@ -6,6 +6,7 @@
 //! HDL-64E's status type and value.
 
 use crate::model::{AZIMUTHS_PER_TURN, BLOCK_FLAGS, BLOCKS_PER_PACKET, Model, RETURNS_PER_BLOCK, ReturnMode};
+use crate::order::REORDER_PACKETS;
 
 /// Bytes of a data packet.
 pub const PACKET_LENGTH: usize = 1206;
@@ -62,7 +63,10 @@ pub enum Refusal {
         azimuth: u32,
     },
     /// A packet that came when the ones after it had long been decoded.
-    #[error("the packet of {}, azimuth {azimuth} is {packets} packets late; {} are allowed", at(.device_us), crate::order::REORDER_PACKETS)]
+    #[error(
+        "the packet of {}, azimuth {azimuth} is {packets} packets late; {REORDER_PACKETS} are allowed",
+        at(.device_us)
+    )]
     Late {
         /// Microseconds past the hour; `None`: the sensor sends none.
         device_us: Option<u32>,
@@ -72,7 +76,10 @@ pub enum Refusal {
         packets: i64,
     },
     /// A time far from the packet's before, which nothing confirms yet: the next packet may.
-    #[error("the packet of {}, azimuth {azimuth} does not follow the one of {}: the next packet must confirm it", at(.device_us), at(.newest_us))]
+    #[error(
+        "the packet of {}, azimuth {azimuth} does not follow the one of {}: the next packet must confirm it",
+        at(.device_us), at(.newest_us)
+    )]
     DeviceTime {
         /// Microseconds past the hour; `None`: the sensor sends none.
         device_us: Option<u32>,
@@ -185,12 +192,6 @@ impl<'a> Packet<'a> {
     pub fn returns(&self, block: usize) -> &'a [u8; RETURNS_LENGTH] {
         let at = block * BLOCK_LENGTH + 4;
         self.bytes[at..at + RETURNS_LENGTH].try_into().expect("a slice of that length")
-    }
-
-    /// Raw distance and intensity of one return.
-    pub fn raw_return(&self, block: usize, index: usize) -> (u16, u8) {
-        let at = block * BLOCK_LENGTH + 4 + 3 * index;
-        (self.u16_at(at), self.bytes[at + 2])
     }
 
     /// Microseconds past the hour; garbage in an HDL-64E S1's packet.

@@ -36,8 +36,8 @@ pub struct Revolution {
     pub end_ns: i64,
     /// The clock the stamps follow.
     pub clock: Clock,
-    /// By how much the host's clock is ahead of the stamps, ms: arrival of the turn's quickest packet less its stamp, so
-    /// that the way from the sensor counts too.
+    /// By how much the host's clock is ahead of the stamps, ms: arrival of the turn's quickest packet less its stamp,
+    /// so that the way from the sensor counts too.
     pub clock_offset_ms: i64,
     /// Measured turning rate.
     pub rpm: f32,
@@ -45,12 +45,12 @@ pub struct Revolution {
     pub partial: Option<Partial>,
     /// Data packets that contributed.
     pub packets: u32,
-    /// The same and those that were missing before them, ±1 a gap; where a field of view is set, without its dark sector
-    /// (from the second turn on). A gap that goes over the cut counts in the turn in which it begins.
+    /// The same and those that were missing before them, ±1 a gap; where a field of view is set, without its dark
+    /// sector (from the second turn on). A gap that goes over the cut counts in the turn in which it begins.
     pub packets_expected: u32,
-    /// Encoder angles (as in [`Firing::azimuth_rad`]) between which the sensor fires nothing: the dark side of the field of
-    /// view it was set to. Learnt: a gap of 15 degrees or more that the next turn has too, in which device time shows
-    /// nothing but a pause. It is no gap of the turn and no packet of it is expected.
+    /// Encoder angles (as in [`Firing::azimuth_rad`]) between which the sensor fires nothing: the dark side of the
+    /// field of view it was set to. Learnt: a gap of 15 degrees or more that the next turn has too, in which device
+    /// time shows nothing but a pause. It is no gap of the turn and no packet of it is expected.
     pub dark_rad: Option<[f32; 2]>,
     /// Where the sensor used to see and does no more.
     pub blocked: Blocked,

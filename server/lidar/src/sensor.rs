@@ -1,7 +1,7 @@
 //! One sensor behind one door: datagram in, revolution out.
 //!
-//! In: UDP payloads of one sensor, data and telemetry alike, in the order of their arrival. Out: [`Revolution`]s, in the
-//! sensor's frame. A datagram that is refused leaves everything as it was.
+//! In: UDP payloads of one sensor, data and telemetry alike, in the order of their arrival. Out: [`Revolution`]s, in
+//! the sensor's frame. A datagram that is refused leaves everything as it was.
 
 use crate::blocked::Blocked;
 use crate::calibration::Calibration;
@@ -78,9 +78,9 @@ pub struct SensorStatus {
     pub packets_held: usize,
     /// Data packets that were held, and then did not fit the model found: taken and not decoded.
     pub packets_unfit: u64,
-    /// Data packets that never came, or too late, ±1 a gap. A long gap is counted a turn later, when it has not come back
-    /// at the same place as the dark side of a field of view does. Of an HDL-64E S1, whose packets carry no time, gaps of
-    /// less than half a turn.
+    /// Data packets that never came, or too late, ±1 a gap. A long gap is counted a turn later, when it has not come
+    /// back at the same place as the dark side of a field of view does. Of an HDL-64E S1, whose packets carry no time,
+    /// gaps of less than half a turn.
     pub packets_lost: u64,
     /// Telemetry datagrams read.
     pub telemetry: u64,
@@ -119,9 +119,9 @@ impl Sensor {
     /// Takes one UDP payload that arrived at `arrival_ns` (ns since the Unix epoch); gives the revolution it completed,
     /// if any. At most one turn is cut a datagram.
     ///
-    /// Copies of packets and packets out of order by up to 32 leave no trace in the revolutions: a packet that follows the
-    /// one before is decoded at once; behind a gap, and where the stream begins, packets are held until the missing one
-    /// has come or 32 packet periods have passed.
+    /// Copies of packets and packets out of order by up to 32 leave no trace in the revolutions: a packet that follows
+    /// the one before is decoded at once; behind a gap, and where the stream begins, packets are held until the missing
+    /// one has come or 32 packet periods have passed.
     ///
     /// # Errors
     /// [`Refusal`] with the value that was wrong; the sensor's state is as if the datagram had not come.

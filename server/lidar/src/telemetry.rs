@@ -216,8 +216,10 @@ fn utc_ns(time: &str, date: &str) -> Result<Option<i64>, NmeaError> {
     }
     let whole_ns = utc_ns_of([year, month, day], [hour, minute, second]);
     let whole_ns = whole_ns.ok_or_else(|| wrong("date", date, "a day of a month"))?;
-    let fraction = time.split_once('.').map_or(Ok(0.0), |(_, digits)| format!("0.{digits}").parse());
-    let fraction: f64 = fraction.map_err(|_| wrong("time", time, "hhmmss or hhmmss.s"))?;
+    // Digits alone: what else a float may be spelled with, such as an exponent, is no part of a second.
+    let digits = time.split_once('.').map_or("0", |(_, digits)| digits);
+    let fraction = format!("0.{digits}").parse().ok().filter(|_| digits.bytes().all(|digit| digit.is_ascii_digit()));
+    let fraction: f64 = fraction.ok_or_else(|| wrong("time", time, "hhmmss or hhmmss.s"))?;
     Ok(Some(whole_ns + (fraction * 1e9).round() as i64))
 }
 

@@ -1,11 +1,12 @@
 //! Device microseconds past the hour to one timeline that goes on whatever happens to the device.
 //!
-//! In: device time and arrival of every packet, in order. Out: nanoseconds since some packet of the past, which run with
-//! the device's oscillator: over the hour, over a silence, over a restart, and when a GPS receiver sets the counter.
+//! In: device time and arrival of every packet, in order. Out: nanoseconds since some packet of the past, which run
+//! with the device's oscillator: over the hour, over a silence, over a restart, and when a GPS receiver sets the
+//! counter.
 //!
 //! The counter is an oscillator's, zero at power-on, until minutes and seconds come from GPRMC and the part of a second
-//! from the pulse (VLP-32C manual, appendix G.2: two counters, set apart from each other); so it may jump by less than a
-//! second, by minutes, or to 0. Unset it drifts by 5 s a day, 58 ppm (HDL-64E S3 manual 63-HDL64ES3, "Timestamp
+//! from the pulse (VLP-32C manual, appendix G.2: two counters, set apart from each other); so it may jump by less than
+//! a second, by minutes, or to 0. Unset it drifts by 5 s a day, 58 ppm (HDL-64E S3 manual 63-HDL64ES3, "Timestamp
 //! Accuracy Rules").
 
 pub(crate) const NS_PER_SECOND: i64 = 1_000_000_000;
@@ -14,10 +15,11 @@ const NS_PER_US: i64 = 1_000;
 
 /// A step that needs no arrival to bear it out: 75 packets of a VLP-16 lost, or the blind half of a turn at 300 rpm.
 const STEP_NS_MAX: i64 = 100_000_000;
-/// A longer silence: device time and arrival tell of the same one if they differ by less than this and a hundredth of it.
+/// A longer silence: device time and arrival tell of the same one if they differ by less than this and a hundredth of
+/// it.
 const SILENCE_ERROR_NS_MAX: i64 = 100_000_000;
-/// A device starts up for longer than this: one whose count went on by less was silent, whatever a host's clock that was
-/// set meanwhile says.
+/// A device starts up for longer than this: one whose count went on by less was silent, whatever a host's clock that
+/// was set meanwhile says.
 const START_UP_NS_MIN: i64 = 10 * NS_PER_SECOND;
 /// Longer silences are not measured by arrival: a host's clock that steps by years is no silence.
 const SILENCE_NS_MAX: i64 = 24 * NS_PER_HOUR;

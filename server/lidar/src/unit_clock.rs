@@ -1,8 +1,8 @@
 //! The time an HDL-64E S2 or S3 tells of itself, one byte a packet.
 //!
-//! In: the status type and value that end every packet. Out: what [`crate::telemetry`] would say of the same: time and date
-//! of the last GPRMC, and whether the pulse is there. Source: HDL-64E S3 manual rev K, "Packet Format and Status Byte for
-//! GPS Time Stamping" and appendix E: types H M S D N Y G begin each cycle of 16 packets, values are binary.
+//! In: the status type and value that end every packet. Out: what [`crate::telemetry`] would say of the same: time and
+//! date of the last GPRMC, and whether the pulse is there. Source: HDL-64E S3 manual rev K, "Packet Format and Status
+//! Byte for GPS Time Stamping" and appendix E: types H M S D N Y G begin each cycle of 16 packets, values are binary.
 
 use crate::telemetry::{Gprmc, Pps, Telemetry, utc_ns_of};
 
@@ -17,9 +17,9 @@ pub(crate) struct UnitClock {
 }
 
 impl UnitClock {
-    /// Takes the status of the next packet, whose device time is `device_us`; gives what the unit says if it has said the
-    /// same in the cycle before, so that no hour of one second stands beside the minute of the next, and if its receiver
-    /// tells the time at all.
+    /// Takes the status of the next packet, whose device time is `device_us`; gives what the unit says if it has said
+    /// the same in the cycle before, so that no hour of one second stands beside the minute of the next, and if its
+    /// receiver tells the time at all.
     pub fn push(&mut self, (status_type, value): (u8, u8), device_us: u32) -> Option<Telemetry> {
         if status_type != TYPES[self.position] {
             self.position = 0;

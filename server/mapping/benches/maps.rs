@@ -109,7 +109,7 @@ fn sweep_of_a_moving_revolution(bencher: Bencher) {
     let slots = revolution.echoes[0].range_m.len();
     bencher.counter(ItemsCount::new(slots)).bench_local(|| {
         motion.through(&revolution, &mut moved);
-        sweep.take_moving_revolution(&revolution, &mount, &moved.end_from_ego);
+        sweep.take_revolution_around(&revolution, &mount, &moved.end_from_ego, None);
     });
 }
 
@@ -127,7 +127,7 @@ fn terrain_with_roughness(bencher: Bencher) {
     let (revolution, mount) = (turn(), mount(1.9));
     let mut sweep = Sweep::default();
     sweep.take_revolution(&revolution, &mount);
-    sweep.take_deviations(&revolution, &mount, &mut Series::default());
+    sweep.take_deviations(&revolution, &mount, &mut Series::default(), None);
     let mut map = Terrain::new(&TerrainConfig::default());
     let mut layer = map.layer();
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
@@ -138,7 +138,9 @@ fn deviations_of_a_revolution(bencher: Bencher) {
     let (revolution, mount) = (turn(), mount(1.9));
     let (mut sweep, mut series) = (Sweep::default(), Series::default());
     let slots = revolution.echoes[0].range_m.len();
-    bencher.counter(ItemsCount::new(slots)).bench_local(|| sweep.take_deviations(&revolution, &mount, &mut series));
+    bencher
+        .counter(ItemsCount::new(slots))
+        .bench_local(|| sweep.take_deviations(&revolution, &mount, &mut series, None));
 }
 
 /// With a road of 20 points, 6 m wide.
@@ -172,7 +174,8 @@ fn safe_path(bencher: Bencher) {
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make_with(&sweep, &context, &mut layer));
 }
 
-/// What six units of four planes send in 100 ms from a vehicle in traffic: 52,800 rays, those without a return among them.
+/// What six units of four planes send in 100 ms from a vehicle in traffic: 52,800 rays, those without a return among
+/// them.
 fn six_units() -> Vec<(Sweep, [f32; 3])> {
     let scene = traffic::street(0.0);
     let scan = |unit: &PlaneUnit, number| {

@@ -1,4 +1,5 @@
-//! What one sensor sees that is none of the surroundings: the vehicle's own box, what is seen through it, blind sectors.
+//! What one sensor sees that is none of the surroundings: the vehicle's own box, what is seen through it, blind
+//! sectors.
 //!
 //! In: a return and the sensor's place, ego frame at the moment of the firing, metres. Out: what hides it. A ray that
 //! crosses the vehicle cannot have come straight: it was thrown back by its own paint or glass, and what it shows is a
@@ -25,8 +26,8 @@ pub struct Screen {
 }
 
 impl Screen {
-    /// For a sensor at `sensor_m`, ego frame, with these blind sectors ([`crate::config::SensorConfig::blind_deg`]); `None` where
-    /// nothing hides anything.
+    /// For a sensor at `sensor_m`, ego frame, with these blind sectors ([`crate::config::SensorConfig::blind_deg`]);
+    /// `None` where nothing hides anything.
     pub fn new(body: Option<&BodyConfig>, sensor_m: [f32; 3], blind_deg: &[[f32; 2]]) -> Option<Self> {
         let body = body.map(|body| Body::new(body, sensor_m));
         let blind: Vec<_> = blind_deg.iter().map(|ends| Sector::new(*ends)).collect();

@@ -1,8 +1,8 @@
 //! One vehicle's sensors and maps, as the configuration file spells them. Units in keys; unknown keys refused.
 //!
-//! In: the tables `[vehicle]`, `[[vehicle.sensor]]`, `[vehicle.fusion]`, `[vehicle.body]` and `[vehicle.maps.*]`. Out: the same as values, checked by
-//! [`VehicleConfig::validate`], whose errors name the key, its value and what is allowed. Lengths are metres, angles
-//! degrees here and radians everywhere behind.
+//! In: the tables `[vehicle]`, `[[vehicle.sensor]]`, `[vehicle.fusion]`, `[vehicle.body]` and `[vehicle.maps.*]`. Out:
+//! the same as values, checked by [`VehicleConfig::validate`], whose errors name the key, its value and what is
+//! allowed. Lengths are metres, angles degrees here and radians everywhere behind.
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
@@ -61,8 +61,8 @@ pub struct SensorConfig {
     /// Found from the data where absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rpm: Option<f32>,
-    /// The sensor's own table: path of a ROS YAML or Velodyne XML file (of a declared sensor: the text of a ROS YAML one);
-    /// the factory's where absent.
+    /// The sensor's own table: path of a ROS YAML or Velodyne XML file (of a declared sensor: the text of a ROS YAML
+    /// one); the factory's where absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub calibration: Option<String>,
     /// Encoder angle at which turns are cut; 180 is behind the vehicle.
@@ -71,12 +71,13 @@ pub struct SensorConfig {
     /// Returns nearer to the sensor than this are the vehicle itself and are dropped.
     #[serde(default = "own_body")]
     pub range_m_min: f32,
-    /// Sectors in which the sensor sees nothing but the vehicle or its own mount: `[from, to]` in degrees clockwise from the
-    /// sensor's x axis seen from above; `to` below `from` goes over 0. Returns there are dropped, and stay unknown.
+    /// Sectors in which the sensor sees nothing but the vehicle or its own mount: `[from, to]` in degrees clockwise
+    /// from the sensor's x axis seen from above; `to` below `from` goes over 0. Returns there are dropped, and stay
+    /// unknown.
     #[serde(default)]
     pub blind_deg: Vec<[f32; 2]>,
-    /// GPS time older than its arrival by more days is not believed, and the sensor's stamps follow the host's clock: then a
-    /// capture is played live, or the receiver has lost count of the weeks.
+    /// GPS time older than its arrival by more days is not believed, and the sensor's stamps follow the host's clock:
+    /// then a capture is played live, or the receiver has lost count of the weeks.
     #[serde(default = "a_day")]
     pub gps_late_days_max: f64,
     /// For scans of a sensor that is no [`Model`]: elevation of each laser, degrees. Where this is empty too, they are
@@ -188,8 +189,8 @@ impl VehicleConfig {
     }
 
     /// Takes a sensor that the file does not name as the vehicle's sensor number `index`: the next one. The same again
-    /// changes nothing, so that whoever declares it may do so whenever he connects. Gives the new one's table, if it brings
-    /// one: its `calibration` is no path but the table's text, so that a replay needs no file.
+    /// changes nothing, so that whoever declares it may do so whenever he connects. Gives the new one's table, if it
+    /// brings one: its `calibration` is no path but the table's text, so that a replay needs no file.
     ///
     /// # Errors
     /// A wrong index, a name already taken, a value that cannot be used, or a calibration that is none.
@@ -305,6 +306,20 @@ fn check(
 ) -> Result<(), ConfigError> {
     // NaN is in no range, so it is refused too.
     if allowed.contains(&value) { Ok(()) } else { Err(ConfigError::new(key(), value, said)) }
+}
+
+type Allowed = (std::ops::RangeInclusive<f64>, &'static str);
+
+/// Checks the values of one table.
+fn check_each<const N: usize>(at: &str, values: [(&str, f32, Allowed); N]) -> Result<(), ConfigError> {
+    values
+        .into_iter()
+        .try_for_each(|(key, value, (allowed, said))| check(f64::from(value), allowed, || format!("{at}.{key}"), said))
+}
+
+/// Checks how a value stands to another one of its table.
+fn check_fits(at: &str, key: &str, value: f32, fits: bool, said: &'static str) -> Result<(), ConfigError> {
+    if fits { Ok(()) } else { Err(ConfigError::new(format!("{at}.{key}"), value, said)) }
 }
 
 fn check_name(key: &str, name: &str) -> Result<(), ConfigError> {

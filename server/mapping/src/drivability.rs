@@ -68,6 +68,7 @@ impl Drivability {
 
     fn write(&self, layer: &mut Layer) {
         self.grid.describe(&mut layer.geometry);
+        layer.clear_lists();
         let [class, unit_height, segment] = &mut layer.channels[..] else { unreachable!("layer() gives three") };
         let (Cells::U8(class), Cells::I8(unit_height), Cells::U16(segment)) =
             (&mut class.cells, &mut unit_height.cells, &mut segment.cells)
@@ -88,36 +89,19 @@ impl Drivability {
         }));
         let known = class.iter().filter(|c| **c != UNKNOWN).count();
         let drivable = class.iter().filter(|c| **c == DRIVABLE).count();
-        layer.planes.clear();
         layer.planes.extend_from_slice(self.planes.of_segment());
-        layer.figures.clear();
-        layer.points.clear();
         layer.figures.push(("drivable_share", if known == 0 { 0.0 } else { drivable as f64 / known as f64 }));
     }
 }
 
 impl LayerMaker for Drivability {
     fn layer(&self) -> Layer {
-        let unit = |name, unit, scale, unknown, cells| Channel { name, unit, scale, unknown, cells };
-        Layer {
-            name: "drivability",
-            geometry: Geometry::Radial { r_bench_m: Vec::new(), columns: self.config.columns },
-            legend: LEGEND,
-            channels: vec![
-                unit("class", "", 1.0, i32::from(UNKNOWN), Cells::U8(Vec::new())),
-                unit(
-                    "unit_height",
-                    "m",
-                    self.config.unit_height_m,
-                    i32::from(UNIT_HEIGHT_UNKNOWN),
-                    Cells::I8(Vec::new()),
-                ),
-                unit("segment", "", 1.0, i32::from(SEGMENT_UNKNOWN), Cells::U16(Vec::new())),
-            ],
-            planes: Vec::new(),
-            figures: Vec::new(),
-            points: Vec::new(),
-        }
+        let channels = vec![
+            Channel::class(),
+            Channel::i8("unit_height", "m", self.config.unit_height_m, UNIT_HEIGHT_UNKNOWN),
+            Channel::u16("segment", "", 1.0, SEGMENT_UNKNOWN),
+        ];
+        Layer::new("drivability", Geometry::radial(self.config.columns), LEGEND, channels)
     }
 
     fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {

@@ -1,4 +1,5 @@
-//! What enters the core. Only the door (live) and the recording's reader make these; nothing behind can tell them apart.
+//! What enters the core. Only the door (live) and the recording's reader make these; nothing behind can tell them
+//! apart.
 
 use bytes::Bytes;
 use nalgebra::Isometry3;
@@ -12,7 +13,8 @@ pub struct Event {
     pub sequence: u64,
     /// When the door read it, ns since the Unix epoch.
     pub arrival_ns: i64,
-    /// Index of the sensor: those of the configuration first, then those declared; 0 where the body concerns the whole vehicle.
+    /// Index of the sensor: those of the configuration first, then those declared; 0 where the body concerns the whole
+    /// vehicle.
     pub source: u16,
     /// What happened.
     pub body: Body,
@@ -85,7 +87,8 @@ pub struct Scan {
     pub ring: Vec<u16>,
     /// When each point was seen, ns after `stamp_ns` (so at most 0); empty where all were seen at once.
     pub offset_ns: Vec<i32>,
-    /// Directions (unit vectors, sensor's frame) of rays that came back with nothing; empty where the sensor does not tell.
+    /// Directions (unit vectors, sensor's frame) of rays that came back with nothing; empty where the sensor does not
+    /// tell.
     pub no_returns: Vec<[f32; 3]>,
 }
 

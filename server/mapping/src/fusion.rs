@@ -1,18 +1,20 @@
 //! Several sensors, one map: whose turn makes it, and what the others bring.
 //!
-//! In: the newest turn of each sensor, ego frame at its own end; the event that completed one. Out: whether that turn makes
-//! a map, and the map's sweep: the maker's points and every other sensor's newest ones, carried rigidly by the vehicle's
-//! motion from their own end to the map's stamp. Everything is decided by events:
+//! In: the newest turn of each sensor, ego frame at its own end; the event that completed one. Out: whether that turn
+//! makes a map, and the map's sweep: the maker's points and every other sensor's newest ones, carried rigidly by the
+//! vehicle's motion from their own end to the map's stamp. Everything is decided by events:
 //!
-//! - Sensors lead in this order: the configured lead, then the others as they are configured. A sensor that gives no turn
-//!   for `deadline_ms` of event time, or whose turns come that much later after their stamps (or that much before them)
-//!   than the timeliest sensor's, does not lead; the next one's turns make the maps until it is back.
-//! - `deadline_ms` after the last map (`period_ms` where that is more) any sensor's turn makes one: nobody holds the map.
-//! - The rows of radial maps are the lead's, once it has given a turn, whoever makes the map: to a sensor of few planes a row
-//!   may be all there is, and one return in it would make all of it drivable.
+//! - Sensors lead in this order: the configured lead, then the others as they are configured. A sensor that gives no
+//!   turn for `deadline_ms` of event time, or whose turns come that much later after their stamps (or that much before
+//!   them) than the timeliest sensor's, does not lead; the next one's turns make the maps until it is back.
+//! - `deadline_ms` after the last map (`period_ms` where that is more) any sensor's turn makes one: nobody holds the
+//!   map.
+//! - The rows of radial maps are the lead's, once it has given a turn, whoever makes the map: to a sensor of few planes
+//!   a row may be all there is, and one return in it would make all of it drivable.
 //! - A turn farther than `deadline_ms` from the map's stamp is not in it, and its sensor is named with its age.
 //!
-//! Between two maps the order in which different sensors' turns come makes no difference to the layers made of the sweep.
+//! Between two maps the order in which different sensors' turns come makes no difference to the layers made of the
+//! sweep.
 
 use crate::config::FusionConfig;
 use crate::intake::{Intake, Moment};
@@ -93,10 +95,10 @@ impl Fusion {
         })
     }
 
-    /// Whether the turn ended after the last map's stamp: where another sensor takes over, its newest turn may be the older
-    /// one. The same sensor's stamps rise by themselves, unless its clock was set back; all clocks may have been, once a map
-    /// is overdue and the turn older by more than the deadline. A turn that ended long before it was completed is none of
-    /// another clock: its sensor was silent until now.
+    /// Whether the turn ended after the last map's stamp: where another sensor takes over, its newest turn may be the
+    /// older one. The same sensor's stamps rise by themselves, unless its clock was set back; all clocks may have been,
+    /// once a map is overdue and the turn older by more than the deadline. A turn that ended long before it was
+    /// completed is none of another clock: its sensor was silent until now.
     fn is_newer(&self, source: usize, intake: &Intake, overdue: bool) -> bool {
         self.last.is_none_or(|made| {
             let newer_ns = intake.turn.end_ns.saturating_sub(made.stamp_ns);
@@ -117,8 +119,8 @@ impl Fusion {
         std::iter::once(lead).chain((0..sensors).filter(move |index| *index != lead))
     }
 
-    /// Whether the sensor gave a turn within the deadline. One that gave none yet has until the deadline of the vehicle's
-    /// first event.
+    /// Whether the sensor gave a turn within the deadline. One that gave none yet has until the deadline of the
+    /// vehicle's first event.
     fn is_fresh(&self, intake: &Intake, now: Moment) -> bool {
         now.event_ns.saturating_sub(intake.turn.completed.event_ns) <= self.deadline_ns
     }

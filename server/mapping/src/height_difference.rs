@@ -1,8 +1,8 @@
 //! The thesis' baseline (§V), on the same r-θ grid: a cell whose highest and lowest points differ by more than a
 //! threshold is an obstacle.
 //!
-//! In: a [`Sweep`], ego frame, metres. Out: the layer `height_difference`. Kept for comparison: it takes a steep road, or
-//! one under branches, for an obstacle, and calls ground behind a fence drivable, as the thesis shows.
+//! In: a [`Sweep`], ego frame, metres. Out: the layer `height_difference`. Kept for comparison: it takes a steep road,
+//! or one under branches, for an obstacle, and calls ground behind a fence drivable, as the thesis shows.
 
 use crate::config::HeightDifferenceConfig;
 use crate::map::{Cells, Channel, Geometry, Layer, LayerMaker};
@@ -37,30 +37,8 @@ impl HeightDifference {
 
 impl LayerMaker for HeightDifference {
     fn layer(&self) -> Layer {
-        Layer {
-            name: "height_difference",
-            geometry: Geometry::Radial { r_bench_m: Vec::new(), columns: self.config.columns },
-            legend: LEGEND,
-            channels: vec![
-                Channel {
-                    name: "class",
-                    unit: "",
-                    scale: 1.0,
-                    unknown: i32::from(UNKNOWN),
-                    cells: Cells::U8(Vec::new()),
-                },
-                Channel {
-                    name: "difference",
-                    unit: "m",
-                    scale: 0.01,
-                    unknown: i32::from(DIFFERENCE_UNKNOWN),
-                    cells: Cells::U16(Vec::new()),
-                },
-            ],
-            planes: Vec::new(),
-            figures: Vec::new(),
-            points: Vec::new(),
-        }
+        let channels = vec![Channel::class(), Channel::u16("difference", "m", 0.01, DIFFERENCE_UNKNOWN)];
+        Layer::new("height_difference", Geometry::radial(self.config.columns), LEGEND, channels)
     }
 
     fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
@@ -77,6 +55,7 @@ impl LayerMaker for HeightDifference {
         });
 
         self.grid.describe(&mut layer.geometry);
+        layer.clear_lists();
         let [class, difference] = &mut layer.channels[..] else { unreachable!("layer() gives two channels") };
         let (Cells::U8(class), Cells::U16(difference)) = (&mut class.cells, &mut difference.cells) else {
             unreachable!("layer() gives u8 and u16")
@@ -96,9 +75,6 @@ impl LayerMaker for HeightDifference {
         }));
         let known = class.iter().filter(|c| **c != UNKNOWN).count();
         let drivable = class.iter().filter(|c| **c == DRIVABLE).count();
-        layer.planes.clear();
-        layer.figures.clear();
-        layer.points.clear();
         layer.figures.push(("drivable_share", if known == 0 { 0.0 } else { drivable as f64 / known as f64 }));
     }
 }

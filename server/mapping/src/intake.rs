@@ -1,7 +1,7 @@
 //! One sensor: from its events to its newest turn in the ego frame.
 //!
-//! In: datagrams and scans of one sensor, what is known of the vehicle's motion. Out: [`Turn`], the newest revolution or
-//! scan as a [`Sweep`] at its own end, with the rays that came back with nothing where a map asks for them.
+//! In: datagrams and scans of one sensor, what is known of the vehicle's motion. Out: [`Turn`], the newest revolution
+//! or scan as a [`Sweep`] at its own end, with the rays that came back with nothing where a map asks for them.
 
 use std::sync::Arc;
 
@@ -194,7 +194,7 @@ impl Intake {
         motion.through(revolution, &mut self.moved);
         let dropped = turn.sweep.take_revolution_around(revolution, mount, &self.moved.end_from_ego, screen);
         if let Some(series) = &mut self.series {
-            turn.sweep.take_deviations_around(revolution, mount, series, screen);
+            turn.sweep.take_deviations(revolution, mount, series, screen);
         }
         if self.wants_no_returns {
             look_for_no_returns(revolution, mount, &self.moved, screen, &mut turn.no_returns);
@@ -220,8 +220,8 @@ impl Intake {
         Some(dropped)
     }
 
-    /// Takes a scan. One not newer than the newest is refused, unless none came for `deadline_ns` of event time: then the
-    /// sensor has begun anew, or its clock was set back.
+    /// Takes a scan. One not newer than the newest is refused, unless none came for `deadline_ns` of event time: then
+    /// the sensor has begun anew, or its clock was set back.
     pub fn take_scan(
         &mut self,
         scan: &Scan,
@@ -299,8 +299,8 @@ fn check(scan: &Scan) -> Result<(), Rejected> {
     }
 }
 
-/// Directions of the firings' lasers that came back with nothing, but for those that are hidden, in place of what `no_returns` held. A laser is taken to
-/// fire with the first of its firing, 0.2 degrees off at most.
+/// Directions of the firings' lasers that came back with nothing, but for those that are hidden, in place of what
+/// `no_returns` held. A laser is taken to fire with the first of its firing, 0.2 degrees off at most.
 fn look_for_no_returns(
     revolution: &Revolution,
     mount: &Mount,

@@ -69,8 +69,8 @@ impl Layers {
         Wanted { deviations: any(|maker| maker.wants_deviations()), no_returns: any(|maker| maker.wants_no_returns()) }
     }
 
-    /// Wants these layers and those they are made from, and no other. One that was not wanted begins anew. Tells whether
-    /// these are others than before.
+    /// Wants these layers and those they are made from, and no other. One that was not wanted begins anew. Tells
+    /// whether these are others than before.
     pub fn want(&mut self, maps: &MapsConfig, is_wanted: impl Fn(&str) -> bool) -> bool {
         let mut changed = false;
         for slot in &mut self.0 {

@@ -55,15 +55,17 @@ impl Ledger {
 
     /// Counts readings that never became events: lost, or refused at the door.
     pub fn stayed_outside(&mut self, cause: Cause, count: u64) {
+        // The count is a recording's to claim.
+        let add = |sum: &mut u64, count: u64| *sum = sum.saturating_add(count);
         let reason = match cause {
-            Cause::Queue => return self.lost += count,
-            Cause::Kernel => return self.kernel_drops += count,
+            Cause::Queue => return add(&mut self.lost, count),
+            Cause::Kernel => return add(&mut self.kernel_drops, count),
             Cause::Sender => "source",
             Cause::Length => "length",
             Cause::Observation => "observation",
         };
-        self.received += count;
-        *self.refused.entry(reason).or_default() += count;
+        add(&mut self.received, count);
+        add(self.refused.entry(reason).or_default(), count);
     }
 
     pub(crate) fn add_dropped(&mut self, dropped: Dropped) {

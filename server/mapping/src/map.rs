@@ -1,4 +1,5 @@
-//! What a map is: a header, and layers of channels over one grid each. Class 0 is unknown everywhere, and is never free.
+//! What a map is: a header, and layers of channels over one grid each. Class 0 is unknown everywhere, and is never
+//! free.
 
 use clearway_lidar::blocked::Blocked;
 use nalgebra::Isometry3;
@@ -55,7 +56,8 @@ pub struct SensorState {
     pub partial: &'static str,
     /// Where the sensor used to see and did not in this revolution.
     pub blocked: Blocked,
-    /// The clock the stamps follow, as [`clearway_lidar::Clock::as_str`] spells it; `sender` where a scan brings its stamp.
+    /// The clock the stamps follow, as [`clearway_lidar::Clock::as_str`] spells it; `sender` where a scan brings its
+    /// stamp.
     pub clock: &'static str,
     /// By how much the host's clock is ahead of the stamps, ms.
     pub clock_offset_ms: i64,
@@ -116,6 +118,25 @@ pub struct Layer {
     pub figures: Vec<(&'static str, f64)>,
     /// Safe points, the vehicle's own place first; empty for layers without.
     pub points: Vec<SafePoint>,
+}
+
+impl Layer {
+    /// A layer without cells.
+    pub fn new(
+        name: &'static str,
+        geometry: Geometry,
+        legend: &'static [&'static str],
+        channels: Vec<Channel>,
+    ) -> Self {
+        Self { name, geometry, legend, channels, planes: Vec::new(), figures: Vec::new(), points: Vec::new() }
+    }
+
+    /// Empties what stands beside the cells: planes, figures and points.
+    pub fn clear_lists(&mut self) {
+        self.planes.clear();
+        self.figures.clear();
+        self.points.clear();
+    }
 }
 
 /// A place that is as far as can be from the obstacles on both sides.
@@ -216,9 +237,9 @@ pub enum Geometry {
         /// Number of columns.
         columns: u16,
     },
-    /// Square cells: index = iy * width + ix; cell (ix, iy) spans `origin + i * cell_m` to `origin + (i + 1) * cell_m` along
-    /// the grid's axes, which begin at the ego frame's origin: `(x cos yaw - y sin yaw, x sin yaw + y cos yaw)` are the
-    /// grid's coordinates of the ego frame's (x, y).
+    /// Square cells: index = iy * width + ix; cell (ix, iy) spans `origin + i * cell_m` to `origin + (i + 1) * cell_m`
+    /// along the grid's axes, which begin at the ego frame's origin: `(x cos yaw - y sin yaw, x sin yaw + y cos yaw)`
+    /// are the grid's coordinates of the ego frame's (x, y).
     Cartesian {
         /// Corner of cell (0, 0), metres along the grid's x axis.
         origin_x_m: f64,
@@ -237,6 +258,27 @@ pub enum Geometry {
     },
 }
 
+impl Geometry {
+    /// An r-θ grid of so many columns, without rows.
+    pub fn radial(columns: u16) -> Self {
+        Self::Radial { r_bench_m: Vec::new(), columns }
+    }
+
+    /// A square of `side` x `side` cells (an even number) with the vehicle in its middle, along the vehicle's own axes.
+    pub fn about_vehicle(side: u32, cell_m: f32) -> Self {
+        let corner_m = -f64::from(side / 2) * f64::from(cell_m);
+        Self::Cartesian {
+            origin_x_m: corner_m,
+            origin_y_m: corner_m,
+            width: side,
+            height: side,
+            cell_m,
+            yaw_rad: 0.0,
+            first_cell: [0, 0],
+        }
+    }
+}
+
 /// One value a cell.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Channel {
@@ -250,6 +292,28 @@ pub struct Channel {
     pub unknown: i32,
     /// Raw values.
     pub cells: Cells,
+}
+
+impl Channel {
+    /// The channel `class`, without cells: 0 is unknown.
+    pub fn class() -> Self {
+        Self::u8("class", "", 1.0, 0)
+    }
+
+    /// Without cells, which are 0 to 255.
+    pub fn u8(name: &'static str, unit: &'static str, scale: f32, unknown: u8) -> Self {
+        Self { name, unit, scale, unknown: unknown.into(), cells: Cells::U8(Vec::new()) }
+    }
+
+    /// Without cells, which are -128 to 127.
+    pub fn i8(name: &'static str, unit: &'static str, scale: f32, unknown: i8) -> Self {
+        Self { name, unit, scale, unknown: unknown.into(), cells: Cells::I8(Vec::new()) }
+    }
+
+    /// Without cells, which are 0 to 65535.
+    pub fn u16(name: &'static str, unit: &'static str, scale: f32, unknown: u16) -> Self {
+        Self { name, unit, scale, unknown: unknown.into(), cells: Cells::U16(Vec::new()) }
+    }
 }
 
 /// Raw cell values.

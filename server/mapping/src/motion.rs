@@ -3,11 +3,11 @@
 //! In: ego poses and the sensor's own GPRMC speed, as events brought them. Out: the ego pose at a stamp, and for a
 //! revolution [`Moved`]: `end_from_ego` along its firings, ego frame at the firing -> ego frame at the last firing.
 //!
-//! Between two poses translation is linear and rotation a slerp; beyond the newest pose the motion of its last 50 ms goes
-//! on unchanged, for at most `extrapolation_ms`. Where poses do not reach, or jump within the revolution, the vehicle is
-//! taken to go straight ahead with the newest speed known; where none is known, nothing is moved. All of it is a pure
-//! function of the events so far: no map waits for a pose that may yet come, so a replay moves each firing as the drive
-//! did. A pose that arrives after the revolution it belongs to serves the next one.
+//! Between two poses translation is linear and rotation a slerp; beyond the newest pose the motion of its last 50 ms
+//! goes on unchanged, for at most `extrapolation_ms`. Where poses do not reach, or jump within the revolution, the
+//! vehicle is taken to go straight ahead with the newest speed known; where none is known, nothing is moved. All of it
+//! is a pure function of the events so far: no map waits for a pose that may yet come, so a replay moves each firing as
+//! the drive did. A pose that arrives after the revolution it belongs to serves the next one.
 
 use std::collections::VecDeque;
 
@@ -20,8 +20,8 @@ use crate::event::{EgoPose, Scan};
 
 /// Poses kept: a second at 1 kHz, and more than one revolution of any sensor at any rate.
 const POSES_MAX: usize = 1024;
-/// Poses farther apart say too little of what was between: at 15 m/s a vehicle in a bend of 50 m is 0.6 m beside the chord
-/// of one second.
+/// Poses farther apart say too little of what was between: at 15 m/s a vehicle in a bend of 50 m is 0.6 m beside the
+/// chord of one second.
 const GAP_NS_MAX: i64 = 1_000_000_000;
 /// The velocity beyond the newest pose is measured over at least this long: a millimetre of noise then makes 2 cm/s.
 const BASELINE_NS: i64 = 50_000_000;
@@ -29,8 +29,8 @@ const BASELINE_NS: i64 = 50_000_000;
 const SPEED_MPS_MAX: f64 = 100.0;
 /// What a pose may be off by beside its neighbour without having jumped.
 const JUMP_M_MAX: f64 = 0.5;
-/// Firings from one exact pose to the next; between, the matrices are interpolated. A turn of 1 rad/s errs by less than a
-/// tenth of a millimetre at 100 m in the millisecond of 16 firings.
+/// Firings from one exact pose to the next; between, the matrices are interpolated. A turn of 1 rad/s errs by less than
+/// a tenth of a millimetre at 100 m in the millisecond of 16 firings.
 pub(crate) const KNOT_FIRINGS: usize = 16;
 
 /// What moved a sweep's firings to one stamp.
@@ -65,8 +65,8 @@ pub struct Moved {
     pub compensation: Compensation,
     /// Forward speed at the end, m/s, where known.
     pub speed_mps: Option<f64>,
-    /// `end_from_ego` at firings 0, 16, 32, … and at the last one (of a scan: at 2 to 257 moments, evenly spaced); empty
-    /// where nothing is moved.
+    /// `end_from_ego` at firings 0, 16, 32, … and at the last one (of a scan: at 2 to 257 moments, evenly spaced);
+    /// empty where nothing is moved.
     pub end_from_ego: Vec<Isometry3<f64>>,
 }
 
@@ -116,9 +116,9 @@ impl Motion {
         self.poses.push_back(pose.clone());
     }
 
-    /// Takes the speed over ground of a GPRMC that came after the turn of its sensor that ended at `stamp_ns` (`None`: before
-    /// its first), if the receiver calls it valid. It is a speed without a sign: who drives backwards for long switches the
-    /// fall-back off or sends poses.
+    /// Takes the speed over ground of a GPRMC that came after the turn of its sensor that ended at `stamp_ns` (`None`:
+    /// before its first), if the receiver calls it valid. It is a speed without a sign: who drives backwards for long
+    /// switches the fall-back off or sends poses.
     pub fn take_gprmc(&mut self, gprmc: &Gprmc, stamp_ns: Option<i64>) {
         let repeated = self.told.is_some_and(|told| told.utc_ns.is_some() && told.utc_ns == gprmc.utc_ns);
         if let (true, false, Some(speed_mps)) = (gprmc.valid, repeated, gprmc.speed_mps()) {
@@ -233,7 +233,8 @@ impl Motion {
         }
     }
 
-    /// `to_from_from`: carries points of the ego frame at one stamp into the one at another, and what is known of the way.
+    /// `to_from_from`: carries points of the ego frame at one stamp into the one at another, and what is known of the
+    /// way.
     pub fn carry(&self, from_ns: i64, to_ns: i64) -> (Isometry3<f64>, Compensation) {
         let by_poses = || self.carry_by_poses(&self.map_from_ego(to_ns)?.inverse(), from_ns, to_ns);
         let by_speed = || Some(straight_ahead(self.newest_speed_mps(to_ns)?, from_ns, to_ns));

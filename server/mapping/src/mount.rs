@@ -1,9 +1,9 @@
 //! How a sensor is mounted when nobody measured it: height, pitch and roll from the ground around the vehicle.
 //!
-//! In: the points of the first revolutions, sensor frame, metres. Out: a [`MountEstimate`], or an error where no ground is
-//! found. The ground is the plane that most of the low points near the vehicle share: candidates through three points
-//! drawn from a fixed seed, the best one refined by least squares. Position over the ground plan and yaw cannot be
-//! seen this way and stay 0.
+//! In: the points of the first revolutions, sensor frame, metres. Out: a [`MountEstimate`], or an error where no ground
+//! is found. The ground is the plane that most of the low points near the vehicle share: candidates through three
+//! points drawn from a fixed seed, the best one refined by least squares. Position over the ground plan and yaw cannot
+//! be seen this way and stay 0.
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 
@@ -20,13 +20,14 @@ const TILT_RAD_MAX: f64 = 0.35;
 /// The ground is sampled by its lowest point a cell, so that near rings do not outvote far ones.
 const CELL_M: f32 = 0.5;
 const CELLS_ACROSS: usize = (2.0 * RADIUS_M_MAX / CELL_M) as usize;
-/// Points this near to a plane are on it: twice a Velodyne's noise on asphalt. Twice as much lets the plane lean onto kerbs
-/// and verges, half a degree in a street with pavements 0.12 m high.
+/// Points this near to a plane are on it: twice a Velodyne's noise on asphalt. Twice as much lets the plane lean onto
+/// kerbs and verges, half a degree in a street with pavements 0.12 m high.
 const INLIER_M: f64 = 0.03;
 /// Candidates; with 40 % ground among the samples, all of them fail once in 10^14 estimates.
 const CANDIDATES: usize = 500;
 /// Cells of a revolution whose lowest point a plane must hold, and the directions (of 12) it must be seen in, to be the
-/// ground. A VLP-16 on a road gives some 500 cells; indoors, or with half its view blocked, floors and chance stay under 60.
+/// ground. A VLP-16 on a road gives some 500 cells; indoors, or with half its view blocked, floors and chance stay
+/// under 60.
 const INLIERS_MIN: usize = 100;
 const SECTORS_MIN: u32 = 4;
 /// Revolutions read at most: a second at 10 Hz.
@@ -56,7 +57,8 @@ pub struct MountEstimate {
 pub enum MountError {
     /// Nothing to look at.
     #[error(
-        "{samples} places with points from 2.5 to 20 m around the sensor in {revolutions} revolution(s); 100 a revolution are needed"
+        "{samples} places with points from 2.5 to 20 m around the sensor in {revolutions} revolution(s); 100 a revolution \
+         are needed"
     )]
     TooFewPoints {
         /// Cells of 0.5 m that hold points.
@@ -112,8 +114,8 @@ where
     let no_ground = |inliers, sectors| MountError::NoGround { inliers, samples: samples.len(), sectors };
     let mut plane = best_candidate(&samples).ok_or(no_ground(0, 0))?;
     let mut on_plane = Vec::new();
-    // The lowest points lie under the ground by the noise, so the mean of each cell's points on the plane stands for it.
-    // Each fit moves the plane by less than the last; eight settle it to a fraction of a millimetre.
+    // The lowest points lie under the ground by the noise, so the mean of each cell's points on the plane stands for
+    // it. Each fit moves the plane by less than the last; eight settle it to a fraction of a millimetre.
     for _ in 0..8 {
         on_plane = around.iter().flat_map(|points| points_on(&plane, points)).collect();
         plane = match Plane::through(&on_plane) {

@@ -1,8 +1,8 @@
-//! Omni-directional view of what is about the vehicle (Seo 2014 §2): which cells are free, taken, hidden or out of sight,
-//! from every scan of any number of LIDARs at their own rates.
+//! Omni-directional view of what is about the vehicle (Seo 2014 §2): which cells are free, taken, hidden or out of
+//! sight, from every scan of any number of LIDARs at their own rates.
 //!
-//! In: [`Rays`], one sensor's turn or scan after the other. Out: the layer `occupancy`, 400 x 400 cells of 0.25 m about the
-//! vehicle, their axes the world's. The steps:
+//! In: [`Rays`], one sensor's turn or scan after the other. Out: the layer `occupancy`, 400 x 400 cells of 0.25 m about
+//! the vehicle, their axes the world's. The steps:
 //!
 //! | step | paper | where |
 //! |---|---|---|
@@ -11,16 +11,17 @@
 //! | evidence to states; hits fade | figure 4 | [`states`] |
 //! | how many hits make a cell occupied | figure 5 | [`Occupancy::hits_needed`] |
 //!
-//! Three readings go beyond the paper's words. (1) A ray proves a cell free only where it is low over it, so that a sensor
-//! on the roof, whose rays pass over cars, serves like one in the bumper ([`fan`]). (2) Cells are judged when the map is
-//! written: a scan costs its points, a map one set of lines a sensor and one pass over the grid. (3) A
-//! vehicle whose speed nobody knows is taken to be fast, where two hits suffice: the other way an obstacle would wait for
-//! twenty.
+//! Three readings go beyond the paper's words. (1) A ray proves a cell free only where it is low over it, so that a
+//! sensor on the roof, whose rays pass over cars, serves like one in the bumper ([`fan`]). (2) Cells are judged when
+//! the map is written: a scan costs its points, a map one set of lines a sensor and one pass over the grid. (3) A
+//! vehicle whose speed nobody knows is taken to be fast, where two hits suffice: the other way an obstacle would wait
+//! for twenty.
 //!
-//! Hits add up over maps, so a single Velodyne at 10 Hz on a standing vehicle names near cars at once and far ones after
-//! some turns; until then their cells are unknown, with the power of two that their hits reach beside, or occluded where
-//! something hides them as well. Heights of returns are over the plane under the vehicle, or over the ground about them
-//! where that dips; those of rays that come back from the ground, over the line from there to the return.
+//! Hits add up over maps, so a single Velodyne at 10 Hz on a standing vehicle names near cars at once and far ones
+//! after some turns; until then their cells are unknown, with the power of two that their hits reach beside, or
+//! occluded where something hides them as well. Heights of returns are over the plane under the vehicle, or over the
+//! ground about them where that dips; those of rays that come back from the ground, over the line from there to the
+//! return.
 //!
 //! Without an ego pose nobody can say where last map's cells are now: the grid is then the vehicle's own and holds only
 //! what was seen since the last map (`world_aligned` is 0).
@@ -85,17 +86,8 @@ impl Occupancy {
 
 impl LayerMaker for Occupancy {
     fn layer(&self) -> Layer {
-        let channel =
-            |name| Channel { name, unit: "", scale: 1.0, unknown: i32::from(UNKNOWN), cells: Cells::U8(Vec::new()) };
-        Layer {
-            name: "occupancy",
-            geometry: self.geometry(),
-            legend: LEGEND,
-            channels: vec![channel("class"), channel("hits")],
-            planes: Vec::new(),
-            figures: Vec::new(),
-            points: Vec::new(),
-        }
+        let channels = vec![Channel::class(), Channel::u8("hits", "", 1.0, UNKNOWN)];
+        Layer::new("occupancy", self.geometry(), LEGEND, channels)
     }
 
     fn wants_no_returns(&self) -> bool {
@@ -117,6 +109,7 @@ impl LayerMaker for Occupancy {
     /// From the rays taken since the last map, where the vehicle was then.
     fn make(&mut self, _sweep: &Sweep, layer: &mut Layer) {
         let needed = Self::hits_needed(&self.config, self.speed_mps);
+        layer.clear_lists();
         let [class, hits] = &mut layer.channels[..] else { unreachable!("layer() gives two channels") };
         let (Cells::U8(class), Cells::U8(hits)) = (&mut class.cells, &mut hits.cells) else {
             unreachable!("layer() gives u8 and u8")
@@ -128,7 +121,6 @@ impl LayerMaker for Occupancy {
         let any = self.fan.tell(&self.config, &self.window, class);
         self.window.judge([needed, self.config.hold_maps], any, class, hits);
         let share = |state: u8| class.iter().filter(|class| **class == state).count() as f64 / cells as f64;
-        layer.figures.clear();
         layer.figures.extend([
             ("clear_share", share(CLEAR)),
             ("occupied_share", share(OCCUPIED)),
@@ -136,8 +128,6 @@ impl LayerMaker for Occupancy {
             ("world_aligned", f64::from(u8::from(self.window.anchored()))),
         ]);
         layer.geometry = self.geometry();
-        layer.planes.clear();
-        layer.points.clear();
     }
 
     fn make_with(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {

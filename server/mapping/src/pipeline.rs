@@ -1,7 +1,8 @@
 //! Conducts one vehicle: events in, maps out, nothing but the events deciding.
 //!
-//! In: [`Event`]s in the order the door took them. Out: a [`Map`] for every turn that makes one. The hops: datagram or scan
-//! -> its sensor's [`Intake`] -> that sensor's newest turn -> [`Fusion`] -> the map's [`Sweep`] -> one layer a map -> [`Map`].
+//! In: [`Event`]s in the order the door took them. Out: a [`Map`] for every turn that makes one. The hops: datagram or
+//! scan -> its sensor's [`Intake`] -> that sensor's newest turn -> [`Fusion`] -> the map's [`Sweep`] -> one layer a map
+//! -> [`Map`].
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
@@ -287,9 +288,9 @@ impl Pipeline {
         makes_map
     }
 
-    /// Makes the newest map once more, under the next sequence, where it was made for nobody and somebody has come since: a
-    /// late reader need not wait for a sensor that may be silent. `None` where there is nothing to make, and where another
-    /// sensor's turn has ended since. Layers that gather evidence have seen one turn.
+    /// Makes the newest map once more, under the next sequence, where it was made for nobody and somebody has come
+    /// since: a late reader need not wait for a sensor that may be silent. `None` where there is nothing to make, and
+    /// where another sensor's turn has ended since. Layers that gather evidence have seen one turn.
     pub fn make_late(&mut self) -> Option<&Map> {
         let was_for_nobody = self.maps_made > 0 && self.map.layers.is_empty();
         if !was_for_nobody || !self.layers.are_wanted() || self.turn_since_map {
@@ -336,8 +337,7 @@ pub fn layer_names(maps: &MapsConfig) -> Vec<&'static str> {
 
 /// The model that [`model_name`] spells so.
 pub fn model_of_name(name: &str) -> Option<Model> {
-    let models = [Model::Hdl64eS1, Model::Hdl64eS2, Model::Hdl64eS3, Model::Hdl32e, Model::Vlp16, Model::PuckHiRes];
-    models.into_iter().chain([Model::Vlp32c, Model::Vls128]).find(|model| model_name(*model) == name)
+    Model::ALL.into_iter().find(|model| model_name(*model) == name)
 }
 
 /// The model as the configuration and the wire spell it.

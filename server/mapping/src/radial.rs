@@ -66,7 +66,7 @@ impl RadialGrid {
     /// Sees to it that the rows are those of the sensor that made `sweep`.
     pub fn follow(&mut self, sweep: &Sweep, range_m_max: f32, columns: u16) {
         let Some(calibration) = &sweep.calibration else {
-            // Nobody's sweep: one row to the largest range.
+            // Nobody knows its rings: one row to the largest range.
             *self = Self::new(vec![range_m_max], columns);
             return;
         };
@@ -117,9 +117,9 @@ impl RadialGrid {
         (row < self.rows()).then(|| row * self.columns() + self.quadrants.column(x, y) as usize)
     }
 
-    /// Calls `take(first_point, cells)` for every chunk of the sweep. A point beyond the last row falls into the row after
-    /// it: its cell is `self.cells()` or more, and less than `self.cells() + self.columns()`.
-    /// A sweep of nobody knows whose rings has no rows to fall into.
+    /// Calls `take(first_point, cells)` for every chunk of the sweep. A point beyond the last row falls into the row
+    /// after it: its cell is `self.cells()` or more, and less than `self.cells() + self.columns()`. Where nobody knows
+    /// the sweep's rings there are no rows to fall into, and no call.
     pub fn for_each_chunk(&self, sweep: &Sweep, mut take: impl FnMut(usize, &[u32])) {
         if sweep.calibration.is_none() {
             return;
@@ -165,9 +165,9 @@ impl RadialGrid {
 
 /// From position to column, counter-clockwise from the x axis.
 ///
-/// The position is first turned into the first quadrant by whole quarter turns, which is exact; so where a quarter turn is
-/// whole columns, a world turned by 90 degrees gives the same columns, a quarter further. Within the quadrant the angle is
-/// off by less than 2 µrad, a tenth of a millimetre at 60 m.
+/// The position is first turned into the first quadrant by whole quarter turns, which is exact; so where a quarter turn
+/// is whole columns, a world turned by 90 degrees gives the same columns, a quarter further. Within the quadrant the
+/// angle is off by less than 2 µrad, a tenth of a millimetre at 60 m.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Quadrants {
     columns: u16,

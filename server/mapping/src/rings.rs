@@ -1,6 +1,7 @@
 //! The lasers of a sensor that sends scans, as far as the rows of radial maps need them: their elevations.
 //!
-//! In: elevations as configured, or a scan with rings, sensor's frame. Out: a [`Calibration`] with nothing but elevations.
+//! In: elevations as configured, or a scan with rings, sensor's frame. Out: a [`Calibration`] with nothing but
+//! elevations.
 
 use std::collections::BTreeMap;
 

@@ -1,19 +1,19 @@
 //! Safe points (thesis §VI): places as far as can be from the obstacles on both sides, linked into paths that start at
 //! the vehicle.
 //!
-//! In: the layer `drivability` of the same map, and its sweep. Out: the layer `safe_path`: points with radii and links, and the
-//! Cartesian grid they were found on. The steps:
+//! In: the layer `drivability` of the same map, and its sweep. Out: the layer `safe_path`: points with radii and links,
+//! and the Cartesian grid they were found on. The steps:
 //!
 //! | step | where |
 //! |---|---|
 //! | which cells are free: drivable ones, and those the sensor cannot see under the vehicle | [`free`] |
 //! | exact distance to the nearest cell that is not free, and which one that is | [`distance`] |
-//! | ridge: neighbouring cells whose nearest obstacles are two; its exact radii; thinned to one-cell lines | [`ridge`] |
+//! | ridge: neighbouring cells with two nearest obstacles; its exact radii; thinned to one-cell lines | [`ridge`] |
 //! | links between neighbours on the lines, from the vehicle on | [`links`] |
 //!
-//! Unknown ground is no way through: it counts like an obstacle, but for the blind zone and narrow holes ([`free`]). The thesis keeps no more than the picture; here each
-//! point knows its radius (the thesis' safety radius), and is kept where the vehicle fits: twice the radius is at least
-//! its width. What lies beyond the grid is not known to this map.
+//! Unknown ground is no way through: it counts like an obstacle, but for the blind zone and narrow holes ([`free`]).
+//! The thesis keeps no more than the picture; here each point knows its radius (the thesis' safety radius), and is kept
+//! where the vehicle fits: twice the radius is at least its width. What lies beyond the grid is not known to this map.
 
 pub mod distance;
 pub mod free;
@@ -63,6 +63,7 @@ impl SafePath {
     }
 
     fn write(&self, layer: &mut Layer) {
+        layer.clear_lists();
         let [class] = &mut layer.channels[..] else { unreachable!("layer() gives one channel") };
         let Cells::U8(class) = &mut class.cells else { unreachable!("layer() gives u8") };
         class.clear();
@@ -73,12 +74,9 @@ impl SafePath {
         }));
         let side = self.free.side();
         let cell_m = f64::from(self.config.cell_m);
-        layer.points.clear();
         layer.points.extend(self.links.points().iter().map(|point| point.in_metres(side, cell_m)));
         // The vehicle's own place lies between four cells.
         self.links.points().iter().skip(1).for_each(|point| class[point.cell] = PATH);
-        layer.planes.clear();
-        layer.figures.clear();
         layer.figures.extend([
             ("points", self.links.points().len() as f64),
             ("points_not_reached", self.links.not_reached() as f64),
@@ -88,31 +86,8 @@ impl SafePath {
 
 impl LayerMaker for SafePath {
     fn layer(&self) -> Layer {
-        let side = self.free.side() as u32;
-        let corner = -f64::from(side / 2) * f64::from(self.config.cell_m);
-        Layer {
-            name: "safe_path",
-            geometry: Geometry::Cartesian {
-                origin_x_m: corner,
-                origin_y_m: corner,
-                width: side,
-                height: side,
-                cell_m: self.config.cell_m,
-                yaw_rad: 0.0,
-                first_cell: [0, 0],
-            },
-            legend: LEGEND,
-            channels: vec![Channel {
-                name: "class",
-                unit: "",
-                scale: 1.0,
-                unknown: i32::from(UNKNOWN),
-                cells: Cells::U8(Vec::new()),
-            }],
-            planes: Vec::new(),
-            figures: Vec::new(),
-            points: Vec::new(),
-        }
+        let geometry = Geometry::about_vehicle(self.free.side() as u32, self.config.cell_m);
+        Layer::new("safe_path", geometry, LEGEND, vec![Channel::class()])
     }
 
     fn needs(&self) -> &'static [&'static str] {

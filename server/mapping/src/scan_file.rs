@@ -1,5 +1,5 @@
-//! Scans as files hold them -> [`Scan`]: KITTI `.bin` (float32 x y z intensity) and `.pcd` (binary or ASCII, with fields
-//! x y z and, where present, intensity). Such files carry no stamps: the scan's is 0.
+//! Scans as files hold them -> [`Scan`]: KITTI `.bin` (float32 x y z intensity) and `.pcd` (binary or ASCII, with
+//! fields x y z and, where present, intensity). Such files carry no stamps: the scan's is 0.
 
 use crate::event::Scan;
 
@@ -46,60 +46,14 @@ pub fn read_bin(bytes: &[u8]) -> Result<Scan, ScanFileError> {
     Ok(scan)
 }
 
-/// Where one field of a PCD point lies.
-#[derive(Clone, Copy)]
-struct Field {
-    /// Index of the field among the numbers of an ASCII line.
-    column: usize,
-    /// First byte of the field in a binary point.
-    offset: usize,
-}
-
 /// Reads a `.pcd`.
 ///
 /// # Errors
 /// [`ScanFileError::Pcd`], which names the header's entry, its value and what is allowed.
 pub fn read_pcd(bytes: &[u8]) -> Result<Scan, ScanFileError> {
-    let wrong = |what, value: &str, allowed| ScanFileError::Pcd { what, value: value.into(), allowed };
-    let (mut fields, mut sizes, mut types, mut counts) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-    let (mut points, mut rest) = (None, bytes);
-    let data = loop {
-        let Some(end) = rest.iter().position(|&byte| byte == b'\n') else {
-            return Err(wrong("DATA", "(missing)", "a header that ends with DATA binary or DATA ascii"));
-        };
-        let line = String::from_utf8_lossy(&rest[..end]).into_owned();
-        rest = &rest[end + 1..];
-        let mut words = line.split_whitespace().map(str::to_owned);
-        let numbers =
-            |words: &mut dyn Iterator<Item = String>| words.map(|w| w.parse().unwrap_or(0)).collect::<Vec<usize>>();
-        match words.next().as_deref() {
-            Some("FIELDS") => fields = words.collect(),
-            Some("SIZE") => sizes = numbers(&mut words),
-            Some("TYPE") => types = words.collect(),
-            Some("COUNT") => counts = numbers(&mut words),
-            Some("POINTS") => points = numbers(&mut words).first().copied(),
-            Some("DATA") => break words.next().unwrap_or_default(),
-            _ => {}
-        }
-    };
-    let points = points.filter(|&points| points <= POINTS_MAX);
-    let points = points.ok_or_else(|| wrong("POINTS", "(missing or too many)", "0 to 4000000"))?;
-    if counts.is_empty() {
-        counts = vec![1; fields.len()];
-    }
-    if sizes.len() != fields.len() || types.len() != fields.len() || counts.len() != fields.len() {
-        return Err(wrong("FIELDS", &fields.join(" "), "one SIZE, TYPE and COUNT each"));
-    }
-    let find = |name: &str| {
-        let index = fields.iter().position(|field| field == name)?;
-        let float = sizes[index] == 4 && types[index] == "F" && counts[index] == 1;
-        let column = counts[..index].iter().sum();
-        let offset = counts[..index].iter().zip(&sizes).map(|(count, size)| count.saturating_mul(*size)).sum();
-        float.then_some(Field { column, offset })
-    };
-    let position = |name| find(name).ok_or_else(|| wrong("FIELDS", &fields.join(" "), "x y z as 4-byte floats"));
-    let places = [Some(position("x")?), Some(position("y")?), Some(position("z")?), find("intensity")];
-
+    let (header, rest) = Header::read(bytes)?;
+    let points = header.points()?;
+    let places = header.places()?;
     let mut scan = Scan::default();
     let mut push = |value: &dyn Fn(Field) -> Option<f32>| {
         let [x, y, z, intensity] = places.map(|place| place.map_or(Some(0.0), value));
@@ -110,16 +64,16 @@ pub fn read_pcd(bytes: &[u8]) -> Result<Scan, ScanFileError> {
             scan.intensity.push(intensity);
         }
     };
-    match data.as_str() {
+    match header.data.as_str() {
         "binary" => {
-            let stride: usize = counts.iter().zip(&sizes).map(|(count, size)| count.saturating_mul(*size)).sum();
+            let stride = header.bytes_before(header.fields.len());
             if stride == 0 || rest.len() / stride < points {
-                return Err(wrong("POINTS", &points.to_string(), "as many as the file has bytes for"));
+                return Err(wrong("POINTS", &header.points, "as many as the file has bytes for"));
             }
             for point in rest.chunks_exact(stride).take(points) {
                 push(&|field| {
-                    let bytes = point.get(field.offset..field.offset + 4)?;
-                    Some(f32::from_le_bytes(bytes.try_into().ok()?))
+                    let bytes = point.get(field.offset..)?.first_chunk()?;
+                    Some(f32::from_le_bytes(*bytes))
                 });
             }
         }
@@ -132,9 +86,94 @@ pub fn read_pcd(bytes: &[u8]) -> Result<Scan, ScanFileError> {
         other => return Err(wrong("DATA", other, "binary, ascii")),
     }
     if scan.x.len() != points {
-        return Err(wrong("POINTS", &points.to_string(), "as many as there are lines of numbers"));
+        return Err(wrong("POINTS", &header.points, "as many as there are lines of numbers"));
     }
     Ok(scan)
+}
+
+fn wrong(what: &'static str, value: &str, allowed: &'static str) -> ScanFileError {
+    ScanFileError::Pcd { what, value: value.into(), allowed }
+}
+
+/// Where one field of a PCD point lies.
+#[derive(Clone, Copy)]
+struct Field {
+    /// Index of the field among the numbers of an ASCII line.
+    column: usize,
+    /// First byte of the field in a binary point.
+    offset: usize,
+}
+
+/// The entries of a PCD file's header.
+#[derive(Default)]
+struct Header {
+    fields: Vec<String>,
+    sizes: Vec<usize>,
+    types: Vec<String>,
+    counts: Vec<usize>,
+    /// As written; empty where it is missing.
+    points: String,
+    data: String,
+}
+
+impl Header {
+    /// The header, and the bytes behind it. What is no number is 0, which no field may have.
+    fn read(bytes: &[u8]) -> Result<(Self, &[u8]), ScanFileError> {
+        let (mut header, mut rest) = (Self::default(), bytes);
+        loop {
+            let Some(end) = rest.iter().position(|&byte| byte == b'\n') else {
+                return Err(wrong("DATA", "(missing)", "a header that ends with DATA binary or DATA ascii"));
+            };
+            let line = String::from_utf8_lossy(&rest[..end]).into_owned();
+            rest = &rest[end + 1..];
+            let mut words = line.split_whitespace().map(str::to_owned);
+            let entry = words.next();
+            let numbers = || line.split_whitespace().skip(1).map(|word| word.parse().unwrap_or(0)).collect();
+            match entry.as_deref() {
+                Some("FIELDS") => header.fields = words.collect(),
+                Some("SIZE") => header.sizes = numbers(),
+                Some("TYPE") => header.types = words.collect(),
+                Some("COUNT") => header.counts = numbers(),
+                Some("POINTS") => header.points = words.next().unwrap_or_default(),
+                Some("DATA") => {
+                    header.data = words.next().unwrap_or_default();
+                    break;
+                }
+                _ => {}
+            }
+        }
+        if header.counts.is_empty() {
+            header.counts = vec![1; header.fields.len()];
+        }
+        if [header.sizes.len(), header.types.len(), header.counts.len()] != [header.fields.len(); 3] {
+            return Err(wrong("FIELDS", &header.fields.join(" "), "one SIZE, TYPE and COUNT each"));
+        }
+        Ok((header, rest))
+    }
+
+    fn points(&self) -> Result<usize, ScanFileError> {
+        let points = self.points.parse().ok().filter(|&points| points <= POINTS_MAX);
+        points.ok_or_else(|| wrong("POINTS", &self.points, "0 to 4000000"))
+    }
+
+    /// Bytes of a binary point before field `index`.
+    fn bytes_before(&self, index: usize) -> usize {
+        let lengths = self.counts.iter().zip(&self.sizes).map(|(count, size)| count.saturating_mul(*size));
+        lengths.take(index).fold(0, usize::saturating_add)
+    }
+
+    /// Where x, y, z and, if it is there, intensity lie.
+    fn places(&self) -> Result<[Option<Field>; 4], ScanFileError> {
+        let find = |name: &str| {
+            let index = self.fields.iter().position(|field| field == name)?;
+            let float = self.sizes[index] == 4 && self.types[index] == "F" && self.counts[index] == 1;
+            let column = self.counts[..index].iter().copied().fold(0, usize::saturating_add);
+            float.then_some(Field { column, offset: self.bytes_before(index) })
+        };
+        let required = || wrong("FIELDS", &self.fields.join(" "), "x y z as 4-byte floats");
+        let position = |name| find(name).ok_or_else(required);
+        Ok([Some(position("x")?), Some(position("y")?), Some(position("z")?), find("intensity")])
+    }
 }
 
 #[cfg(test)]
@@ -169,5 +208,9 @@ mod tests {
         let claim = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 3999999\nDATA binary\n";
         let error = read_pcd(claim.as_bytes()).unwrap_err().to_string();
         assert!(error.contains("POINTS = 3999999"), "{error}");
+        let error = read_pcd(claim.replace("3999999", "4000001").as_bytes()).unwrap_err().to_string();
+        assert_eq!(error, "POINTS = 4000001: allowed: 0 to 4000000");
+        let huge = claim.replace("COUNT 1 1 1", &format!("COUNT {0} {0} 1", u64::MAX));
+        assert!(read_pcd(huge.as_bytes()).unwrap_err().to_string().contains("FIELDS = x y z"));
     }
 }

@@ -1,9 +1,9 @@
 //! The distance series of each laser, and how far every measurement lies from its neighbours' (Neuhaus 2009 §2.5).
 //!
-//! In: one echo of a [`Revolution`]. Out: by slot, smoothed minus measured range, metres. A laser's series is its ranges of
-//! the revolution in time order; a missing return takes the last valid one's place, as the paper has it; smoothed is the mean of
-//! nine. Firings in which a laser had no turn (HDL-64E S1) are not part of its series. At the turn's two ends the mean is
-//! over what there is.
+//! In: one echo of a [`Revolution`]. Out: by slot, smoothed minus measured range, metres. A laser's series is its
+//! ranges of the revolution in time order; a missing return takes the last valid one's place, as the paper has it;
+//! smoothed is the mean of nine. Firings in which a laser had no turn (HDL-64E S1) are not part of its series. At the
+//! turn's two ends the mean is over what there is.
 
 use clearway_lidar::revolution::Revolution;
 
@@ -23,8 +23,8 @@ pub struct Series {
 }
 
 impl Series {
-    /// Deviation of every slot of the first echo, `firing * lasers + laser`; NaN where there was no return, or where the
-    /// laser had none in the whole turn.
+    /// Deviation of every slot of the first echo, `firing * lasers + laser`; NaN where there was no return, or where
+    /// the laser had none in the whole turn.
     pub fn take(&mut self, revolution: &Revolution) -> &[f32] {
         let range_m = revolution.echoes.first().map_or(&[][..], |echo| &echo.range_m[..]);
         self.take_ranges(range_m, revolution.lasers);

@@ -1,7 +1,8 @@
-//! The speed each place allows (Lindström 2005): from the ground's bumps and steps, with the road painted in as a bonus.
+//! The speed each place allows (Lindström 2005): from the ground's bumps and steps, with the road painted in as a
+//! bonus.
 //!
-//! In: a [`Sweep`], ego frame, metres; the newest road and route, if any. Out: the layer `speed`, a Cartesian grid about
-//! the vehicle. The steps:
+//! In: a [`Sweep`], ego frame, metres; the newest road and route, if any. Out: the layer `speed`, a Cartesian grid
+//! about the vehicle. The steps:
 //!
 //! | step | paper | where |
 //! |---|---|---|
@@ -70,6 +71,7 @@ impl Speed {
     }
 
     fn write(&self, layer: &mut Layer) {
+        layer.clear_lists();
         let [class, speed] = &mut layer.channels[..] else { unreachable!("layer() gives two channels") };
         let (Cells::U8(class), Cells::U8(speed)) = (&mut class.cells, &mut speed.cells) else {
             unreachable!("layer() gives u8 and u8")
@@ -94,9 +96,6 @@ impl Speed {
         let share = |part: u32| if known == 0 { 0.0 } else { f64::from(part) / f64::from(known) };
         let flag = |set: bool| f64::from(u8::from(set));
         let gates = &self.gates;
-        layer.planes.clear();
-        layer.points.clear();
-        layer.figures.clear();
         layer.figures.extend([
             ("passable_share", share(passable)),
             ("road_share", share(road)),
@@ -113,35 +112,9 @@ impl Speed {
 
 impl LayerMaker for Speed {
     fn layer(&self) -> Layer {
-        let side = self.heights.side() as u32;
-        let corner = -f64::from(side / 2) * f64::from(self.config.cell_m);
-        let channel = |name, unit, scale, unknown: u8| Channel {
-            name,
-            unit,
-            scale,
-            unknown: i32::from(unknown),
-            cells: Cells::U8(Vec::new()),
-        };
-        Layer {
-            name: "speed",
-            geometry: Geometry::Cartesian {
-                origin_x_m: corner,
-                origin_y_m: corner,
-                width: side,
-                height: side,
-                cell_m: self.config.cell_m,
-                yaw_rad: 0.0,
-                first_cell: [0, 0],
-            },
-            legend: LEGEND,
-            channels: vec![
-                channel("class", "", 1.0, UNKNOWN),
-                channel("speed", "m/s", SPEED_SCALE_MPS, self.unknown()),
-            ],
-            planes: Vec::new(),
-            figures: Vec::new(),
-            points: Vec::new(),
-        }
+        let geometry = Geometry::about_vehicle(self.heights.side() as u32, self.config.cell_m);
+        let speed = Channel::u8("speed", "m/s", SPEED_SCALE_MPS, self.unknown());
+        Layer::new("speed", geometry, LEGEND, vec![Channel::class(), speed])
     }
 
     /// Without a road.

@@ -1,8 +1,9 @@
 //! The points of one turn in the ego frame.
 //!
-//! In: a [`Revolution`] or [`Scan`] in the sensor's frame, how the sensor is mounted, how the vehicle moved, and where the
-//! vehicle itself is. Out: a [`Sweep`], only returns of the surroundings, ego frame at the turn's last firing, metres, with
-//! what the grid's rows follow from. Compaction, motion and transform are one pass; each firing has one rigid transform.
+//! In: a [`Revolution`] or [`Scan`] in the sensor's frame, how the sensor is mounted, how the vehicle moved, and where
+//! the vehicle itself is. Out: a [`Sweep`], only returns of the surroundings, ego frame at the turn's last firing,
+//! metres, with what the grid's rows follow from. Compaction, motion and transform are one pass; each firing has one
+//! rigid transform.
 
 use std::sync::Arc;
 
@@ -42,7 +43,8 @@ pub struct Sweep {
     pub deviation_m: Vec<f32>,
     /// Returns of the turn before those of the vehicle itself were dropped.
     pub returns: u32,
-    /// Elevations of the lasers the rows of radial maps come from; `None` where nobody knows them: those maps are unknown.
+    /// Elevations of the lasers the rows of radial maps come from; `None` where nobody knows them: those maps are
+    /// unknown.
     pub calibration: Option<Arc<Calibration>>,
     /// Height of the sensor over the ground.
     pub mount_height_m: f32,
@@ -51,16 +53,12 @@ pub struct Sweep {
 impl Sweep {
     /// Fills the sweep from a revolution of a vehicle at rest, in place of what it held.
     pub fn take_revolution(&mut self, revolution: &Revolution, mount: &Mount) {
-        self.take_moving_revolution(revolution, mount, &[]);
+        self.take_revolution_around(revolution, mount, &[], None);
     }
 
     /// Fills the sweep from a revolution, in place of what it held; `end_from_ego` is
     /// [`crate::motion::Moved::end_from_ego`] of this revolution, or empty to leave the points where they were seen.
-    pub fn take_moving_revolution(&mut self, revolution: &Revolution, mount: &Mount, end_from_ego: &[Isometry3<f64>]) {
-        self.take_revolution_around(revolution, mount, end_from_ego, None);
-    }
-
-    /// The same without the returns that the vehicle's own body or a blind sector hides; gives how many those are.
+    /// Returns that the vehicle's own body or a blind sector hides are left out; gives how many those are.
     pub fn take_revolution_around(
         &mut self,
         revolution: &Revolution,
@@ -85,7 +83,8 @@ impl Sweep {
         let at_rest = Transform::new(&mount.ego_from_sensor);
         let moving = transforms(mount, end_from_ego);
         let slots: usize = revolution.echoes.iter().map(|echo| echo.range_m.len()).sum();
-        let mut kept = self.open(slots);
+        self.open(slots);
+        let mut kept = 0;
         let mut returns = 0;
         let mut dropped = Dropped::default();
         for echo in &revolution.echoes {
@@ -97,7 +96,8 @@ impl Sweep {
                     let range = range_m[i];
                     let [ex, ey, ez] = transform.apply(x[i], y[i], z[i]);
                     (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
-                    // Not fired is NaN and no return is 0: neither passes. Written always, kept by moving on: no branch.
+                    // Not fired is NaN and no return is 0: neither passes. Written always, kept by moving on: no
+                    // branch.
                     returns += u32::from(range > 0.0);
                     let far = range > 0.0 && range >= mount.range_m_min;
                     let hidden = hides([x[i], y[i], z[i]]).filter(|_| far);
@@ -116,14 +116,9 @@ impl Sweep {
         dropped
     }
 
-    /// Adds one deviation a point, in step with the points that [`Sweep::take_revolution`] took from the same revolution;
-    /// a second echo has no series.
-    pub fn take_deviations(&mut self, revolution: &Revolution, mount: &Mount, series: &mut Series) {
-        self.take_deviations_around(revolution, mount, series, None);
-    }
-
-    /// The same in step with [`Sweep::take_revolution_around`].
-    pub fn take_deviations_around(
+    /// Adds one deviation a point, in step with the points that [`Sweep::take_revolution_around`] took from the same
+    /// revolution with the same screen; a second echo has no series.
+    pub fn take_deviations(
         &mut self,
         revolution: &Revolution,
         mount: &Mount,
@@ -164,8 +159,9 @@ impl Sweep {
         self.take_scan_around(scan, Some(calibration), mount, &[], None).no_position
     }
 
-    /// The same of a sensor whose elevations may not be known, each point moved from when it was seen (`end_from_ego` is
-    /// [`crate::motion::Moved::end_from_ego`] of this scan, or empty), without what the vehicle's own body or a blind sector hides.
+    /// The same of a sensor whose elevations may not be known, each point moved from when it was seen (`end_from_ego`
+    /// is [`crate::motion::Moved::end_from_ego`] of this scan, or empty), without what the vehicle's own body or a
+    /// blind sector hides.
     pub fn take_scan_around(
         &mut self,
         scan: &Scan,
@@ -179,7 +175,8 @@ impl Sweep {
         let moving = transforms(mount, end_from_ego);
         let knots = ScanKnots::of(scan);
         let hides = screen.map(|screen| hides(mount, screen));
-        let mut kept = self.open(scan.x.len());
+        self.open(scan.x.len());
+        let mut kept = 0;
         let mut returns = 0;
         let mut dropped = Dropped::default();
         for (index, ((&x, &y), &z)) in scan.x.iter().zip(&scan.y).zip(&scan.z).enumerate() {
@@ -250,12 +247,11 @@ impl Sweep {
         self.deviation_m.clear();
     }
 
-    /// Room for `slots` points and one more to write what is not kept; gives the first free index.
-    fn open(&mut self, slots: usize) -> usize {
+    /// Room for `slots` points and one more to write what is not kept.
+    fn open(&mut self, slots: usize) {
         for axis in [&mut self.x, &mut self.y, &mut self.z] {
             axis.resize(slots + 1, 0.0);
         }
-        0
     }
 
     fn close(&mut self, kept: usize) {

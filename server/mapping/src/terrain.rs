@@ -1,5 +1,5 @@
-//! Neuhaus' terrain map (Neuhaus 2009 §2): where the ground is flat, by hierarchical principal component analysis, and how
-//! rough it is there.
+//! Neuhaus' terrain map (Neuhaus 2009 §2): where the ground is flat, by hierarchical principal component analysis, and
+//! how rough it is there.
 //!
 //! In: a [`Sweep`], ego frame, metres. Out: the layer `terrain`, square cells about the vehicle. The steps:
 //!
@@ -13,9 +13,9 @@
 //! | roughness of flat cells | §2.4, §2.5, eq. 3 and 4 | [`crate::series`], [`roughness`] |
 //!
 //! Three forms stand side by side ([`Form`]). `paper`: as published; car roofs are flat, and cells far beyond the last
-//! point are inferred. `grounded`: a flat region holds no point that stands out of its plane, joins the ground under the
-//! vehicle without a step, by ways the vehicle fits through, and speaks only for holes in seen ground. `grid`: each cell for itself, with the shape of its
-//! points.
+//! point are inferred. `grounded`: a flat region holds no point that stands out of its plane, joins the ground under
+//! the vehicle without a step, by ways the vehicle fits through, and speaks only for holes in seen ground. `grid`: each
+//! cell for itself, with the shape of its points.
 //!
 //! Nothing depends on the order of the points: all sums are over whole numbers.
 
@@ -209,40 +209,19 @@ impl Terrain {
 
 impl LayerMaker for Terrain {
     fn layer(&self) -> Layer {
-        let channel = |name, unit, scale, unknown, cells| Channel { name, unit, scale, unknown, cells };
-        let mut channels = vec![channel("class", "", 1.0, i32::from(UNKNOWN), Raw::U8(Vec::new()))];
+        let mut channels = vec![Channel::class()];
         if self.config.form == Form::Grid {
-            channels.push(channel("shape", "", 1.0, i32::from(SHAPE_UNKNOWN), Raw::U8(Vec::new())));
+            channels.push(Channel::u8("shape", "", 1.0, SHAPE_UNKNOWN));
         }
-        channels.push(channel("roughness", "", roughness::SCALE, i32::from(ROUGHNESS_UNKNOWN), Raw::U8(Vec::new())));
+        channels.push(Channel::u8("roughness", "", roughness::SCALE, ROUGHNESS_UNKNOWN));
         if self.config.planes {
-            for (name, unit, scale) in
-                [("height", "m", PLANE_SCALES[0]), ("slope_x", "", PLANE_SCALES[1]), ("slope_y", "", PLANE_SCALES[2])]
-            {
-                channels.push(channel(name, unit, scale, i32::from(PLANE_UNKNOWN), Raw::I8(Vec::new())));
-            }
+            let named = [("height", "m"), ("slope_x", ""), ("slope_y", "")];
+            let plane = |((name, unit), scale)| Channel::i8(name, unit, scale, PLANE_UNKNOWN);
+            channels.extend(named.into_iter().zip(PLANE_SCALES).map(plane));
         }
-        let cell_m = self.config.cell_m;
-        let half = half_width(self.config.range_m_max, cell_m);
-        let origin = -f64::from(half) * f64::from(cell_m);
-        let side = 2 * half as u32;
-        Layer {
-            name: "terrain",
-            geometry: Geometry::Cartesian {
-                origin_x_m: origin,
-                origin_y_m: origin,
-                width: side,
-                height: side,
-                cell_m,
-                yaw_rad: 0.0,
-                first_cell: [0, 0],
-            },
-            legend: LEGEND,
-            channels,
-            planes: Vec::new(),
-            points: Vec::new(),
-            figures: Vec::new(),
-        }
+        let TerrainConfig { cell_m, range_m_max, .. } = self.config;
+        let side = 2 * half_width(range_m_max, cell_m) as u32;
+        Layer::new("terrain", Geometry::about_vehicle(side, cell_m), LEGEND, channels)
     }
 
     fn wants_deviations(&self) -> bool {
@@ -259,6 +238,7 @@ impl LayerMaker for Terrain {
             self.ground.find(&self.cells, &self.regions, &self.seen, &self.config);
         }
 
+        layer.clear_lists();
         let mut channels = layer.channels.iter_mut();
         let mut next = || match &mut channels.next().expect("a channel of layer()").cells {
             Raw::U8(cells) => cells,
@@ -275,9 +255,6 @@ impl LayerMaker for Terrain {
         let count = |of: u8| class.iter().filter(|class| **class == of).count() as f64;
         let [flat, inferred] = [FLAT, FLAT_INFERRED].map(count);
         let judged = flat + [FLAT_ELEVATED, OBSTACLE, FLAT_UNREACHABLE].map(count).iter().sum::<f64>();
-        layer.planes.clear();
-        layer.points.clear();
-        layer.figures.clear();
         layer.figures.push(("drivable_share", if judged == 0.0 { 0.0 } else { flat / judged }));
         layer.figures.push(("inferred_share", if flat == 0.0 { 0.0 } else { inferred / flat }));
         layer.figures.push(("flat_regions", self.regions.planes().len() as f64));

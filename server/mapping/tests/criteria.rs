@@ -13,7 +13,8 @@ use clearway_mapping::radial::{r_bench_m, ring_radii_m};
 use clearway_mapping::sweep::Sweep;
 use common::*;
 
-/// A grid for one point a cell: the middle of every cell, at the height `z(row, column, x, y)` says; no point for `None`.
+/// A grid for one point a cell: the middle of every cell, at the height `z(row, column, x, y)` says; no point for
+/// `None`.
 fn painted(z: impl Fn(usize, usize, f32, f32) -> Option<f32>) -> Sweep {
     let mut sweep = empty(Model::Hdl64eS2);
     let rings = ring_radii_m(sweep.calibration.as_ref().unwrap(), HEIGHT_M, 60.0);

@@ -124,7 +124,8 @@ fn a_packet_held_that_fits_no_model_found_is_refused_in_the_ledger() {
     assert_eq!((ledger.refused.get("model"), ledger.received), (Some(&1), ledger.decoded + 1));
 }
 
-/// Covers the window from one degree of encoder angle to another: nothing comes back from there, or what the cover sends.
+/// Covers the window from one degree of encoder angle to another: nothing comes back from there, or what the cover
+/// sends.
 fn covered(
     model: Model,
     mut datagram: Datagram,
@@ -165,8 +166,9 @@ fn middle(geometry: &Geometry, cell: usize) -> (f64, f64) {
     }
 }
 
-/// Cells at least 2 m inside a sector of encoder angles: how many, and how many of them claim knowledge. `occupancy` has a
-/// name of its own for what nobody looks at, and lets what was occupied a moment ago stay so: neither is seen now.
+/// Cells at least 2 m inside a sector of encoder angles: how many, and how many of them claim knowledge. `occupancy`
+/// has a name of its own for what nobody looks at, and lets what was occupied a moment ago stay so: neither is seen
+/// now.
 fn inside(layer: &Layer, (from_deg, to_deg): (f64, f64)) -> (usize, usize) {
     let Cells::U8(classes) = &layer.channels[0].cells else { panic!("{}: a class is a byte", layer.name) };
     let far_inside = |cell: &usize| {

@@ -1,4 +1,5 @@
-//! Motion compensation: walls stay straight where poses or a speed are known, bend where not; what moved a map stands in it.
+//! Motion compensation: walls stay straight where poses or a speed are known, bend where not; what moved a map stands
+//! in it.
 
 mod common;
 
@@ -120,8 +121,8 @@ fn second(motion: MotionConfig, events: &[Event]) -> (Map, Sweep) {
     panic!("the drive holds two revolutions");
 }
 
-/// How far points lie from the walls they belong to, metres: the root mean square and the largest. `map_from_ego` is the
-/// simulator's own, so this is not only straightness but the right place too.
+/// How far points lie from the walls they belong to, metres: the root mean square and the largest. `map_from_ego` is
+/// the simulator's own, so this is not only straightness but the right place too.
 fn off_the_walls(sweep: &Sweep, map_from_ego: &Isometry3<f64>) -> (f64, f64) {
     let world = vehicle().scene().world.clone();
     let shapes = world.shapes_at(0.0);
@@ -326,9 +327,10 @@ fn a_vlp16_in_dual_return_moves_both_echoes() {
     let mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
     let (mut rest, mut sweep) = (Sweep::default(), Sweep::default());
     rest.take_revolution(&revolution, &mount);
-    sweep.take_moving_revolution(&revolution, &mount, &moved.end_from_ego);
+    sweep.take_revolution_around(&revolution, &mount, &moved.end_from_ego, None);
     assert_eq!((sweep.returns, sweep.x.len()), (rest.returns, rest.x.len()));
-    // By hand, firing by firing: a point of the turn's first firing lies 1.5 m farther back, one of the last where it was.
+    // By hand, firing by firing: a point of the turn's first firing lies 1.5 m farther back, one of the last where it
+    // was.
     let mut index = 0;
     for echo in &revolution.echoes {
         for slot in (0..echo.range_m.len()).filter(|slot| echo.range_m[*slot] >= 2.0) {
@@ -342,7 +344,8 @@ fn a_vlp16_in_dual_return_moves_both_echoes() {
     assert_eq!(index, sweep.x.len());
 }
 
-/// Median and mean distance over the ground plan from the points of `a` to the nearest of `b`; more than 1 m counts as 1 m.
+/// Median and mean distance over the ground plan from the points of `a` to the nearest of `b`; more than 1 m counts as
+/// 1 m.
 fn apart(a: &[[f64; 3]], b: &[[f64; 3]]) -> (f64, f64) {
     let key = |point: &[f64; 3]| [0, 1].map(|axis| point[axis].floor() as i64);
     let mut cells: std::collections::HashMap<[i64; 2], Vec<[f64; 3]>> = Default::default();
@@ -376,9 +379,9 @@ fn hdl32e(cut_azimuth_deg: f32, motion: &mut Motion) -> Vec<Revolution> {
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
-    // Turns cut at 90 and at 270 degrees: the half they share by direction, one saw a whole turn before the other, and in
-    // between the car moved by 1.3 m. Each sweep lies in the ego frame at its own end; the car's own speed carries one into
-    // the other. Only a sweep without motion in it can lie on another that was cut elsewhere.
+    // Turns cut at 90 and at 270 degrees: the half they share by direction, one saw a whole turn before the other, and
+    // in between the car moved by 1.3 m. Each sweep lies in the ego frame at its own end; the car's own speed carries
+    // one into the other. Only a sweep without motion in it can lie on another that was cut elsewhere.
     let mut motion = Motion::new(&MotionConfig::default());
     let (right, left) = (hdl32e(90.0, &mut motion), hdl32e(270.0, &mut motion));
     let mount = Mount {
@@ -403,7 +406,7 @@ fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
             echo.range_m[drop].fill(0.0);
         }
         let mut sweep = Sweep::default();
-        sweep.take_moving_revolution(&half, &mount, &moved.end_from_ego);
+        sweep.take_revolution_around(&half, &mount, &moved.end_from_ego, None);
         let since = (to_ns - revolution.end_ns) as f64 * 1e-9 * speed_mps;
         let place = |i: usize| [f64::from(sweep.x[i]) - since, f64::from(sweep.y[i]), f64::from(sweep.z[i])];
         let places: Vec<[f64; 3]> = (0..sweep.x.len()).map(place).collect();

@@ -184,7 +184,8 @@ fn rays_that_meet_nothing_clear_as_far_as_configured_and_never_mark() {
 
 #[test]
 fn a_ray_that_passes_under_or_over_a_thing_does_not_clear_it() {
-    // A car's side from 9 m on, seen from the roof; a ray comes back from the ground 1 m under it, another from behind it.
+    // A car's side from 9 m on, seen from the roof; a ray comes back from the ground 1 m under it, another from behind
+    // it.
     let mut sweep = Sweep { mount_height_m: 1.8, ..Sweep::default() };
     for step in -8..=8 {
         let y = step as f32 * 0.04;

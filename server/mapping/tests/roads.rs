@@ -208,7 +208,8 @@ fn a_vehicle_on_a_real_lane_has_that_lane_painted_as_wide_as_the_file_says() {
             (0..rows).filter(|iy| common::classes(&layer)[iy * columns + columns / 2] == ROAD).collect();
         let painted_m = across.len() as f64 * 0.25;
         let width_m = lane.width_m.unwrap();
-        // Where the lane bends at the next waypoint, its edge points lie nearer to the pair's own line; a cell each way.
+        // Where the lane bends at the next waypoint, its edge points lie nearer to the pair's own line; a cell each
+        // way.
         assert!(
             (0.85 * width_m - 0.25..=width_m + 0.25).contains(&painted_m),
             "lane {}: {painted_m} m of {width_m} m",

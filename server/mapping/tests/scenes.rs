@@ -1,11 +1,11 @@
-//! The thesis' four scenes in the simulator: shares beside its table, precision and recall against the simulator's truth,
-//! and the baseline failing where the thesis says it fails.
+//! The thesis' four scenes in the simulator: shares beside its table, precision and recall against the simulator's
+//! truth, and the baseline failing where the thesis says it fails.
 //!
-//! How a cell's truth is voted: each point of the sweep within the grid and under the overhang cut-off votes in its cell.
-//! A point more than 0.3 m over the true ground makes the cell an obstacle. Otherwise the truth at the points' places is
-//! counted and the most frequent class wins; the truth is a raster of 0.2 m, so ground seen within a raster cell that
-//! something stands in counts as `Tight`: either answer is right. Precision is the share of the cells called drivable
-//! that are not forbidden (obstacle, steep, unreachable); recall the share of the drivable cells called so.
+//! How a cell's truth is voted: each point of the sweep within the grid and under the overhang cut-off votes in its
+//! cell. A point more than 0.3 m over the true ground makes the cell an obstacle. Otherwise the truth at the points'
+//! places is counted and the most frequent class wins; the truth is a raster of 0.2 m, so ground seen within a raster
+//! cell that something stands in counts as `Tight`: either answer is right. Precision is the share of the cells called
+//! drivable that are not forbidden (obstacle, steep, unreachable); recall the share of the drivable cells called so.
 
 mod common;
 
@@ -114,8 +114,8 @@ fn wrong(score: &Score, class: Truth) -> usize {
 
 /// What holds, by scene and columns: least precision and recall. Targets: 99.9 % and 98 %.
 ///
-/// Short of the target is the precision on slopes, by 0.1 to 0.3 %: cells on the rim of a ditch or a retaining step, most of
-/// whose points lie on the face while the highest, the only one the thesis keeps, lies on the level ground.
+/// Short of the target is the precision on slopes, by 0.1 to 0.3 %: cells on the rim of a ditch or a retaining step,
+/// most of whose points lie on the face while the highest, the only one the thesis keeps, lies on the level ground.
 fn promised(scene: &str) -> (f64, f64) {
     match scene {
         "slopes with obstacles" => (0.996, 0.985),
@@ -158,8 +158,8 @@ fn the_overhang_takes_a_third_of_the_map_as_in_the_thesis() {
 
 #[test]
 fn the_baseline_fails_where_the_thesis_says_it_fails() {
-    // On an upward slope of 10 %, 16 % at its steepest: a row is metres deep there, and the road within it rises by more
-    // than the threshold.
+    // On an upward slope of 10 %, 16 % at its steepest: a row is metres deep there, and the road within it rises by
+    // more than the threshold.
     let ground = Ground { along: Profile::default().ramp(14.0, 40.0, 26.0 * 0.1), ..Ground::default() };
     let slope = turn(Scene { world: Arc::new(World::on(ground)), ..scenes::flat() });
     let (ours, theirs) = (drivability(&slope.sweep, 360), height_difference(&slope.sweep));
@@ -179,7 +179,8 @@ fn the_baseline_fails_where_the_thesis_says_it_fails() {
     assert!(ours > 0.95 && theirs < 0.8);
 
     // Under the canopy it calls the road an obstacle, behind the fence it calls ground drivable.
-    // An HDL-64E looks up by 2 degrees at most, so the branches hang 30 m ahead, 2.6 m over the road, where it sees them.
+    // An HDL-64E looks up by 2 degrees at most, so the branches hang 30 m ahead, 2.6 m over the road, where it sees
+    // them.
     let scene = scenes::fenced_road_under_canopy();
     let world = World::clone(&scene.world).canopy(29.7, 3.4, 4.0, 2.6);
     let canopy = turn(Scene { world: Arc::new(world), ..scene });

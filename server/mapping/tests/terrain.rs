@@ -233,7 +233,7 @@ fn turn(scene: Scene) -> Sweep {
     let revolution = SimulatedVehicle::new(scene, config).turn(1).revolution;
     let mut sweep = Sweep::default();
     sweep.take_revolution(&revolution, &mount);
-    sweep.take_deviations(&revolution, &mount, &mut Series::default());
+    sweep.take_deviations(&revolution, &mount, &mut Series::default(), None);
     assert_eq!(sweep.deviation_m.len(), sweep.x.len());
     sweep
 }

@@ -1,8 +1,8 @@
 //! ROS 2 messages to values, and back.
 //!
 //! In: the bytes of one message as ROS 2 writes them (CDR, XCDR1, either byte order), from an MCAP file or out of
-//! rmw_zenoh's key space. Out: values, frames as the message names them, metres, radians, ns since the Unix epoch. Nothing
-//! is allocated that the message has no bytes for, and whatever is wrong is named.
+//! rmw_zenoh's key space. Out: values, frames as the message names them, metres, radians, ns since the Unix epoch.
+//! Nothing is allocated that the message has no bytes for, and whatever is wrong is named.
 //!
 //! | file | in -> out |
 //! |---|---|

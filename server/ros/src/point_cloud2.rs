@@ -1,8 +1,8 @@
 //! One `sensor_msgs/msg/PointCloud2` message.
 //!
-//! In: the bytes of a message. Out: header, layout and the points' bytes, read in place; [`crate::points`] makes numbers
-//! of them. Layout: header; height, width; fields (name, offset, datatype, count); is_bigendian; point_step, row_step;
-//! data; is_dense.
+//! In: the bytes of a message. Out: header, layout and the points' bytes, read in place; [`crate::points`] makes
+//! numbers of them. Layout: header; height, width; fields (name, offset, datatype, count); is_bigendian; point_step,
+//! row_step; data; is_dense.
 
 use crate::cdr::{Header, MessageError, Reader, Writer, length};
 
@@ -11,8 +11,8 @@ const FIELDS_MAX: usize = 256;
 /// Bytes the shortest field takes: name 4 + 1, padding 3, offset 4, datatype 1, and count 4 after padding 3.
 const FIELD_LENGTH: usize = 20;
 
-/// A message, read in place. `data` holds all its points: `height` rows of `width` points, and each field lies within its
-/// point.
+/// A message, read in place. `data` holds all its points: `height` rows of `width` points, and each field lies within
+/// its point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PointCloud2<'a> {
     /// Stamp, and the frame of the points.

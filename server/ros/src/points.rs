@@ -3,13 +3,18 @@
 //! | value | fields | taken as |
 //! |---|---|---|
 //! | position | `x` `y` `z`, float32 or float64 | metres; not a number, or all three 0, is a ray without a return |
-//! | intensity | `intensity`, else `reflectivity`, any type | integers over their type's range; floats as they are, or over 255 where one is above 1; 0 to 1 |
-//! | ring | `ring`, `channel` (nebula), `laser_id`, `line` (Livox), integers | rank by elevation; drivers that number from the top (Ouster, Hesai) are turned round |
-//! | time | `time` (Velodyne), `t` (Ouster), `timestamp` (Hesai, RoboSense, Livox), `time_stamp` (nebula, Autoware), `offset_time` | see below |
+//! | intensity | `intensity`, else `reflectivity`, any type | 0 to 1, see below |
+//! | ring | `ring`, `channel` (nebula), `laser_id`, `line` (Livox), integers | rank by elevation |
+//! | time | `time`, `t`, `timestamp`, `time_stamp`, `offset_time` | see below |
 //!
+//! Intensities: integers over their type's range; floats as they are, or over 255 where one is above 1. Rings of drivers
+//! that number from the top (Ouster, Hesai) are turned round.
+//!
+//! Times are called `time` by Velodyne's driver, `t` by Ouster's, `timestamp` by those of Hesai, RoboSense and Livox,
+//! `time_stamp` by nebula and Autoware.
 //! Times: 32-bit integers are ns after the header's stamp. Floats are seconds after it where all lie within 2 s, else
-//! seconds since the epoch from 10^9 on, else ns since the epoch from 10^18 on (float64 only). Every time must lie within
-//! 2 s of the header's stamp: times of another clock are refused, not guessed at.
+//! seconds since the epoch from 10^9 on, else ns since the epoch from 10^18 on (float64 only). Every time must lie
+//! within 2 s of the header's stamp: times of another clock are refused, not guessed at.
 
 use crate::cdr::MessageError;
 use crate::point_cloud2::{Datatype, Field, PointCloud2, described};
@@ -45,8 +50,8 @@ impl Points {
     /// Reads the points of a cloud.
     ///
     /// # Errors
-    /// [`MessageError::Value`] for a field that is missing, of a wrong type, twice there or over another one, for a ring
-    /// beyond 16 bits and for a time that is none.
+    /// [`MessageError::Value`] for a field that is missing, of a wrong type, twice there or over another one, for a
+    /// ring beyond 16 bits and for a time that is none.
     pub fn of(cloud: &PointCloud2) -> Result<Self, MessageError> {
         let mut points = Self { stamp_ns: cloud.header.stamp_ns, ..Self::default() };
         if cloud.is_empty() {
@@ -250,9 +255,9 @@ fn scale(intensity: &mut [f32]) {
     }
 }
 
-/// Where rings fall with elevation, numbers them from the bottom. The highest number is then the lowest ring, which sees
-/// the ground and is in nearly every scan; sensors have 2, 4 or a multiple of 8 rings, so the others keep their number
-/// without it too.
+/// Where rings fall with elevation, numbers them from the bottom. The highest number is then the lowest ring, which
+/// sees the ground and is in nearly every scan; sensors have 2, 4 or a multiple of 8 rings, so the others keep their
+/// number without it too.
 fn turn_upwards(points: &mut Points) {
     let Some(highest) = points.ring.iter().max() else { return };
     let rings = match u32::from(*highest) + 1 {

@@ -1,7 +1,7 @@
 //! Poses: `nav_msgs/msg/Odometry`, `geometry_msgs/msg/PoseStamped`, `tf2_msgs/msg/TFMessage`.
 //!
-//! In: the bytes of a message. Out: rigid transforms, each with the frames it joins. A quaternion within a thousandth of
-//! unit length is made one; any other, as the all-zero one of a message nobody filled, is refused.
+//! In: the bytes of a message. Out: rigid transforms, each with the frames it joins. A quaternion within a thousandth
+//! of unit length is made one; any other, as the all-zero one of a message nobody filled, is refused.
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
@@ -12,8 +12,8 @@ const TRANSFORM_LENGTH: usize = 74;
 /// A robot with more joints is no vehicle.
 const TRANSFORMS_MAX: usize = 4096;
 
-/// Where a frame lies in another one at a moment. An odometry's, a stamped pose's (without a child), or one transform of
-/// a tf message.
+/// Where a frame lies in another one at a moment. An odometry's, a stamped pose's (without a child), or one transform
+/// of a tf message.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StampedTransform<'a> {
     /// Stamp and parent frame.

@@ -1,7 +1,7 @@
 //! The types that are published: their names, what rmw_zenoh calls them, and their definitions for MCAP files.
 //!
-//! Hashes are RIHS01 (REP-2016), the same from Iron to Jazzy; definitions are those of `common_interfaces` and `geometry2`
-//! without their comments, each followed by those it is made of (MCAP's `ros2msg`).
+//! Hashes are RIHS01 (REP-2016), the same from Iron to Jazzy; definitions are those of `common_interfaces` and
+//! `geometry2` without their comments, each followed by those it is made of (MCAP's `ros2msg`).
 
 /// A message type.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,7 +1,7 @@
 //! One `velodyne_msgs/msg/VelodyneScan` message.
 //!
-//! In: the bytes of a message. Out: header and packets, read in place. Layout: header; packets (count u32, each stamp and
-//! 1,206 bytes).
+//! In: the bytes of a message. Out: header and packets, read in place. Layout: header; packets (count u32, each stamp
+//! and 1,206 bytes).
 
 use crate::cdr::{Header, MessageError, Reader};
 

@@ -4,6 +4,7 @@ mod bad_datagrams;
 mod blocked;
 mod calibration;
 mod capture;
+mod clock_scripts;
 mod clocks;
 mod corpora;
 mod models;

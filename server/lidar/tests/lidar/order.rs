@@ -130,7 +130,8 @@ fn a_sensor_that_changes_its_rate_loses_nothing_and_turns_go_on() {
                 continue;
             }
             let stream = Stream { mode, ..stream };
-            // 300 to 1200 and back within two seconds, and at once: what an S1 cannot do without seeming to lose a packet.
+            // 300 to 1200 and back within two seconds, and at once: what an S1 cannot do without seeming to lose a
+            // packet.
             let smooth = |seconds: f64| 750.0 - 450.0 * (seconds * std::f64::consts::PI).cos();
             let sudden = |seconds: f64| if seconds % 1.0 < 0.5 { 300.0 } else { 1200.0 };
             let mut streams = vec![(stream.turning(stream.packets(20.0), smooth, |_| true), 0)];

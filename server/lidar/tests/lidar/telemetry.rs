@@ -56,6 +56,7 @@ fn damaged_sentences_are_refused_as_nmea_with_what_was_wrong() {
         ("GPRMC,214106,A,3707.8178,Q", "latitude: `3707.8178,Q`"),
         ("GPRMC,214106,A,,,,,fast", "speed: `fast`"),
         ("GPRMC,2141,A,,,,,,,230715", "time: `2141`"),
+        ("GPRMC,214106.5e300,A,,,,,,,230715", "time: `214106.5e300`"),
     ] {
         let (_, shown) = refusal(&with_sum(text));
         assert!(shown.contains(named), "{text}: {shown}");

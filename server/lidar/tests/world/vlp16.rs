@@ -81,7 +81,8 @@ fn revolutions_of_a_car_are_whole_between_the_first_and_the_last() {
     assert!(revolutions.windows(2).all(|pair| pair[0].end_ns < pair[1].start_ns));
     // GPRMC 21:41:06 on 23 July 2015.
     assert_eq!(sensor.status().gprmc.unwrap().utc_ns, Some(1_437_687_666_000_000_000));
-    // The first packet says 2,467,108,343 µs past 21 h; the pulse is locked, and the host that recorded it 1.4 s behind.
+    // The first packet says 2,467,108,343 µs past 21 h; the pulse is locked, and the host that recorded it 1.4 s
+    // behind.
     assert_eq!(revolutions[0].start_ns, 1_437_685_200_000_000_000 + 2_467_108_343_000);
     assert!(revolutions.iter().all(|revolution| revolution.clock == Clock::Gps));
     let offsets: Vec<_> = revolutions.iter().map(|revolution| revolution.clock_offset_ms).collect();

@@ -10,8 +10,8 @@ use super::{ConfigError, check};
 pub struct FusionConfig {
     /// Name of the sensor whose turns make the maps; empty: the first.
     pub lead: String,
-    /// Farther apart from the map's stamp than this, a sensor's newest turn contributes nothing; and a sensor that gives
-    /// no turn for so long no longer leads. More than the slowest sensor's turn.
+    /// Farther apart from the map's stamp than this, a sensor's newest turn contributes nothing; and a sensor that
+    /// gives no turn for so long no longer leads. More than the slowest sensor's turn.
     pub deadline_ms: u32,
     /// Least time between two maps of one lead (a tenth of it is forgiven), for leads that scan faster than maps are
     /// wanted; 0: every turn makes a map.

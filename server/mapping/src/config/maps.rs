@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{ConfigError, OccupancyConfig, SpeedConfig, check};
+use super::{Allowed, ConfigError, OccupancyConfig, SpeedConfig, check, check_each};
 
 /// Which maps are made, each in its own table. A map that is switched off costs nothing.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -293,37 +293,9 @@ impl MapsConfig {
     /// The first value that cannot be used.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check(f64::from(self.valid_ms), 1.0..=60_000.0, || "vehicle.maps.valid_ms".into(), "1 to 60000")?;
-        let motion = &self.motion;
-        let at = "vehicle.maps.motion";
-        let reach = f64::from(motion.extrapolation_ms);
-        check(reach, 0.0..=1000.0, || format!("{at}.extrapolation_ms"), "0 to 1000")?;
-        let age = f64::from(motion.speed_age_ms);
-        check(age, 0.0..=10_000.0, || format!("{at}.speed_age_ms"), "0 to 10000")?;
-        let at = "vehicle.maps.drivability";
-        let drivability = &self.drivability;
-        let metres = [
-            ("range_m_max", drivability.range_m_max, RANGE),
-            ("overhang_m", drivability.overhang_m, (0.5..=20.0, "0.5 to 20")),
-            ("unit_height_m", drivability.unit_height_m, (0.05..=1.0, "0.05 to 1")),
-            ("offset_m", drivability.offset_m, (0.0..=1.0, "0 to 1")),
-            ("blind_zone_m", drivability.blind_zone_m, (0.0..=60.0, "0 to 60")),
-            ("step_m_max", drivability.step_m_max, (0.0..=10.0, "0 to 10")),
-            ("grade_max", drivability.grade_max, (0.0..=1.0, "0 to 1")),
-            ("plane_error_m_max", drivability.plane_error_m_max, (0.0..=10.0, "0 to 10")),
-            ("gate_m_min", drivability.gate_m_min, (0.0..=20.0, "0 to 20")),
-        ];
-        for (key, value, (allowed, said)) in metres {
-            check(f64::from(value), allowed, || format!("{at}.{key}"), said)?;
-        }
-        check(f64::from(drivability.bridge_rows), 0.0..=8.0, || format!("{at}.bridge_rows"), "0 to 8")?;
-        check_columns(at, drivability.columns)?;
-        let at = "vehicle.maps.height_difference";
-        let difference = &self.height_difference;
-        let (allowed, said) = RANGE;
-        check(f64::from(difference.range_m_max), allowed, || format!("{at}.range_m_max"), said)?;
-        let key = || format!("{at}.difference_m_max");
-        check(f64::from(difference.difference_m_max), 0.01..=10.0, key, "0.01 to 10")?;
-        check_columns(at, difference.columns)?;
+        self.motion.validate("vehicle.maps.motion")?;
+        self.drivability.validate("vehicle.maps.drivability")?;
+        self.height_difference.validate("vehicle.maps.height_difference")?;
         self.terrain.validate("vehicle.maps.terrain")?;
         self.occupancy.validate("vehicle.maps.occupancy")?;
         self.speed.validate("vehicle.maps.speed")?;
@@ -331,9 +303,47 @@ impl MapsConfig {
     }
 }
 
+impl MotionConfig {
+    fn validate(&self, at: &str) -> Result<(), ConfigError> {
+        let reach = f64::from(self.extrapolation_ms);
+        check(reach, 0.0..=1000.0, || format!("{at}.extrapolation_ms"), "0 to 1000")?;
+        check(f64::from(self.speed_age_ms), 0.0..=10_000.0, || format!("{at}.speed_age_ms"), "0 to 10000")
+    }
+}
+
+impl DrivabilityConfig {
+    fn validate(&self, at: &str) -> Result<(), ConfigError> {
+        let values = [
+            ("range_m_max", self.range_m_max, RANGE),
+            ("overhang_m", self.overhang_m, (0.5..=20.0, "0.5 to 20")),
+            ("unit_height_m", self.unit_height_m, (0.05..=1.0, "0.05 to 1")),
+            ("offset_m", self.offset_m, (0.0..=1.0, "0 to 1")),
+            ("blind_zone_m", self.blind_zone_m, (0.0..=60.0, "0 to 60")),
+            ("bridge_rows", self.bridge_rows.into(), (0.0..=8.0, "0 to 8")),
+            ("step_m_max", self.step_m_max, (0.0..=10.0, "0 to 10")),
+            ("grade_max", self.grade_max, (0.0..=1.0, "0 to 1")),
+            ("plane_error_m_max", self.plane_error_m_max, (0.0..=10.0, "0 to 10")),
+            ("gate_m_min", self.gate_m_min, (0.0..=20.0, "0 to 20")),
+        ];
+        check_each(at, values)?;
+        check_columns(at, self.columns)
+    }
+}
+
+impl HeightDifferenceConfig {
+    fn validate(&self, at: &str) -> Result<(), ConfigError> {
+        let values = [
+            ("range_m_max", self.range_m_max, RANGE),
+            ("difference_m_max", self.difference_m_max, (0.01..=10.0, "0.01 to 10")),
+        ];
+        check_each(at, values)?;
+        check_columns(at, self.columns)
+    }
+}
+
 impl TerrainConfig {
     fn validate(&self, at: &str) -> Result<(), ConfigError> {
-        let metres = [
+        let values = [
             // 2000 cells a side at most.
             ("range_m_max", self.range_m_max, (5.0..=100.0, "5 to 100")),
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
@@ -349,14 +359,10 @@ impl TerrainConfig {
             ("inference_m_max", self.inference_m_max, (0.0..=20.0, "0 to 20")),
             // The plane of a stretch of one ring needs some.
             ("noise_m", self.noise_m, (0.001..=1.0, "0.001 to 1")),
+            ("points_min", self.points_min.into(), (1.0..=1000.0, "1 to 1000")),
+            ("roughness_points_min", self.roughness_points_min.into(), (1.0..=1000.0, "1 to 1000")),
         ];
-        for (key, value, (allowed, said)) in metres {
-            check(f64::from(value), allowed, || format!("{at}.{key}"), said)?;
-        }
-        for (key, value) in [("points_min", self.points_min), ("roughness_points_min", self.roughness_points_min)] {
-            check(f64::from(value), 1.0..=1000.0, || format!("{at}.{key}"), "1 to 1000")?;
-        }
-        Ok(())
+        check_each(at, values)
     }
 }
 
@@ -372,9 +378,7 @@ impl SafePathConfig {
             ("hole_m_max", self.hole_m_max, (0.0..=5.0, "0 to 5")),
             ("join_m_max", self.join_m_max, (0.0..=100.0, "0 to 100")),
         ];
-        for (key, value, (allowed, said)) in values {
-            check(f64::from(value), allowed, || format!("{at}.{key}"), said)?;
-        }
+        check_each(at, values)?;
         check_cells(at, self.extent_m, self.cell_m)
     }
 }
@@ -387,7 +391,6 @@ pub(super) fn check_cells(at: &str, extent_m: f32, cell_m: f32) -> Result<(), Co
     Err(ConfigError::new(format!("{at}.cell_m"), cell_m, "at least extent_m / 500"))
 }
 
-type Allowed = (std::ops::RangeInclusive<f64>, &'static str);
 const RANGE: Allowed = (5.0..=200.0, "5 to 200");
 
 fn check_columns(at: &str, columns: u16) -> Result<(), ConfigError> {

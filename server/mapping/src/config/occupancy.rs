@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{ConfigError, check};
+use super::{ConfigError, check_each, check_fits};
 
 /// Parameters of [`crate::occupancy`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -18,7 +18,8 @@ pub struct OccupancyConfig {
     pub clearance_m: f32,
     /// Returns from here on up are not counted: the vehicle passes under them.
     pub overhang_m: f32,
-    /// A ray proves a cell clear where it is at least as high as this over it: it could be under a car's body, if lower.
+    /// A ray proves a cell clear where it is at least as high as this over it: it could be under a car's body, if
+    /// lower.
     pub clear_height_m_min: f32,
     /// And no higher than this: what is lower than the ray stays unnoticed.
     pub clear_height_m_max: f32,
@@ -78,19 +79,14 @@ impl OccupancyConfig {
             ("hits_fast", self.hits_fast.into(), (1.0..=255.0, "1 to 255")),
             ("hold_maps", self.hold_maps.into(), (0.0..=100.0, "0 to 100")),
         ];
-        for (key, value, (allowed, said)) in values {
-            check(f64::from(value), allowed, || format!("{at}.{key}"), said)?;
-        }
-        let ordered = |key: &str, value: f32, fits: bool, said| {
-            if fits { Ok(()) } else { Err(ConfigError::new(format!("{at}.{key}"), value, said)) }
-        };
-        ordered("overhang_m", self.overhang_m, self.overhang_m > self.clearance_m, "more than clearance_m")?;
+        check_each(at, values)?;
+        check_fits(at, "overhang_m", self.overhang_m, self.overhang_m > self.clearance_m, "more than clearance_m")?;
         let band = self.clear_height_m_max > self.clear_height_m_min;
-        ordered("clear_height_m_max", self.clear_height_m_max, band, "more than clear_height_m_min")?;
+        check_fits(at, "clear_height_m_max", self.clear_height_m_max, band, "more than clear_height_m_min")?;
         let lower = self.clear_height_m_min < self.clearance_m;
-        ordered("clear_height_m_min", self.clear_height_m_min, lower, "less than clearance_m")?;
+        check_fits(at, "clear_height_m_min", self.clear_height_m_min, lower, "less than clearance_m")?;
         let faster = self.speed_mps_fast > self.speed_mps_slow;
-        ordered("speed_mps_fast", self.speed_mps_fast, faster, "more than speed_mps_slow")?;
+        check_fits(at, "speed_mps_fast", self.speed_mps_fast, faster, "more than speed_mps_slow")?;
         super::maps::check_cells(at, self.extent_m, self.cell_m)
     }
 }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{ConfigError, check};
+use super::{ConfigError, check_each, check_fits};
 
 /// Parameters of [`crate::speed`]; the paper states no figures but the 30 m.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -104,16 +104,11 @@ impl SpeedConfig {
             ("route_ahead_m", self.route_ahead_m, (1.0..=500.0, "1 to 500")),
             ("curvature_per_m_max", self.curvature_per_m_max, (0.0..=10.0, "0 to 10")),
         ];
-        for (key, value, (allowed, said)) in values {
-            check(f64::from(value), allowed, || format!("{at}.{key}"), said)?;
-        }
+        check_each(at, values)?;
         super::maps::check_cells(at, self.extent_m, self.cell_m)?;
-        let ordered = |key: &str, value: f32, fits: bool, said| {
-            if fits { Ok(()) } else { Err(ConfigError::new(format!("{at}.{key}"), value, said)) }
-        };
-        ordered("rough_m", self.rough_m, self.rough_m > self.smooth_m, "more than smooth_m")?;
+        check_fits(at, "rough_m", self.rough_m, self.rough_m > self.smooth_m, "more than smooth_m")?;
         let above_unknown = self.crawl_mps >= self.unknown_mps + 0.25;
-        ordered("crawl_mps", self.crawl_mps, above_unknown, "at least 0.25 more than unknown_mps")?;
-        ordered("off_road_mps", self.off_road_mps, self.off_road_mps >= self.crawl_mps, "at least crawl_mps")
+        check_fits(at, "crawl_mps", self.crawl_mps, above_unknown, "at least 0.25 more than unknown_mps")?;
+        check_fits(at, "off_road_mps", self.off_road_mps, self.off_road_mps >= self.crawl_mps, "at least crawl_mps")
     }
 }

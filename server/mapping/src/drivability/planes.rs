@@ -1,8 +1,8 @@
 //! Plane fitting (thesis §IV.4): z = ax + by + c through the highest points of each segment's cells.
 //!
 //! In: highest points and segments. Out: a, b, c of each segment, ego frame. The thesis' normal equations, solved about
-//! the segment's centroid: there the sums of x and y vanish, two unknowns remain, and no digits are lost to the distance
-//! from the origin.
+//! the segment's centroid: there the sums of x and y vanish, two unknowns remain, and no digits are lost to the
+//! distance from the origin.
 
 use super::SEGMENT_UNKNOWN;
 use super::heights::Heights;

@@ -2,14 +2,14 @@
 //! segment 0.
 //!
 //! In: highest points, segments, planes. Out: which segments the vehicle can get to. Two segments are drivable from one
-//! another when they share a contiguous boundary, at least `gate_m_min` wide, on which (1) their boundary cells are level
-//! and (2) the plane of one, carried to the boundary cells of the other, is off by at most `plane_error_m_max`.
+//! another when they share a contiguous boundary, at least `gate_m_min` wide, on which (1) their boundary cells are
+//! level and (2) the plane of one, carried to the boundary cells of the other, is off by at most `plane_error_m_max`.
 //!
-//! The reading of (1): the thesis compares unit heights, and one unit apart may be 0.5 m apart. Cut into units, a low wall
-//! at 20 m whose foot rises from grass became ground (14 of 9,886 drivable cells of the labelled frame held an obstacle,
-//! 1 of 9,865 with this reading). So the highest points of boundary cells may differ by no more than a step the vehicle
-//! takes, `step_m_max`, or by what a slope of `grade_max` makes of the distance between them, which matters where rings lie
-//! metres apart. A step of two units is the thesis' own criterion.
+//! The reading of (1): the thesis compares unit heights, and one unit apart may be 0.5 m apart. Cut into units, a low
+//! wall at 20 m whose foot rises from grass became ground (14 of 9,886 drivable cells of the labelled frame held an
+//! obstacle, 1 of 9,865 with this reading). So the highest points of boundary cells may differ by no more than a step
+//! the vehicle takes, `step_m_max`, or by what a slope of `grade_max` makes of the distance between them, which matters
+//! where rings lie metres apart. A step of two units is the thesis' own criterion.
 
 use std::collections::VecDeque;
 
@@ -126,10 +126,10 @@ impl Search {
         start..start + self.sides[start..].partition_point(|side| side.segment == segment)
     }
 
-    /// Criterion 3: the sides between `segment`, drivable, and `neighbor`, not yet, hold a contiguous piece at least a gate
-    /// wide. Unless the thesis' own reading is asked for, sides with all ground found drivable so far count alike: where the
-    /// ground crosses from unit to unit along a ring, noise frays it into pieces, and none of their borders alone is wide
-    /// enough although a vehicle notices nothing.
+    /// Criterion 3: the sides between `segment`, drivable, and `neighbor`, not yet, hold a contiguous piece at least a
+    /// gate wide. Unless the thesis' own reading is asked for, sides with all ground found drivable so far count alike:
+    /// where the ground crosses from unit to unit along a ring, noise frays it into pieces, and none of their borders
+    /// alone is wide enough although a vehicle notices nothing.
     fn is_gate(&mut self, grid: &RadialGrid, config: &DrivabilityConfig, segment: u16, neighbor: u16) -> bool {
         let boundary = self.sides_of(neighbor);
         self.crossings += 1;
@@ -185,8 +185,8 @@ fn planes_agree(
     (pa * x + pb * y + pc - z).abs() <= f64::from(config.plane_error_m_max)
 }
 
-/// Corners of the grid that a side touches; corner (row, column) is the inner clockwise one of cell (row, column). A side
-/// across empty rows touches the corners of all of them.
+/// Corners of the grid that a side touches; corner (row, column) is the inner clockwise one of cell (row, column). A
+/// side across empty rows touches the corners of all of them.
 fn corners(grid: &RadialGrid, side: &Side) -> impl Iterator<Item = usize> {
     let columns = grid.columns();
     let (cell, other) = (side.cell as usize, side.other as usize);

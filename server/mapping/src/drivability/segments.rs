@@ -102,8 +102,8 @@ impl Segments {
 }
 
 /// Whether two adjacent cells differ by at most one unit; across empty rows by one for each row, if the ground between
-/// them can be a slope of `grade_max`: on a hill the rings lie metres apart, and the cells that would have shown the units
-/// between are the empty ones.
+/// them can be a slope of `grade_max`: on a hill the rings lie metres apart, and the cells that would have shown the
+/// units between are the empty ones.
 pub fn is_step(grid: &RadialGrid, heights: &Heights, config: &DrivabilityConfig, cell: usize, other: usize) -> bool {
     let apart = usize::from(heights.units()[cell].abs_diff(heights.units()[other]));
     let rows = (cell / grid.columns()).abs_diff(other / grid.columns());
@@ -146,10 +146,10 @@ fn ground_unit(seeds: &[u32], units: &[i8], config: &DrivabilityConfig) -> Optio
 /// The up to eight cells next to `cell` that hold points: inward, outward, clockwise, counter-clockwise, and across the
 /// corners where a ring slips from row to row.
 ///
-/// Slopes stretch rings apart and leave rows empty, so inward and outward reach across up to `bridge_rows` of them; and a
-/// ring that climbs crosses from a row to the next between two columns, where it is the same ring although its cells share
-/// a corner only. That is so when the other two cells at the corner are empty. Nothing else is bridged between columns: a
-/// revolution leaves no gap there that is not a blocked view or a lost packet.
+/// Slopes stretch rings apart and leave rows empty, so inward and outward reach across up to `bridge_rows` of them; and
+/// a ring that climbs crosses from a row to the next between two columns, where it is the same ring although its cells
+/// share a corner only. That is so when the other two cells at the corner are empty. Nothing else is bridged between
+/// columns: a revolution leaves no gap there that is not a blocked view or a lost packet.
 fn adjacent(grid: &RadialGrid, units: &[i8], bridge_rows: u8, cell: usize) -> [Option<usize>; 8] {
     let columns = grid.columns();
     let row = cell / columns;
@@ -176,8 +176,8 @@ fn adjacent(grid: &RadialGrid, units: &[i8], bridge_rows: u8, cell: usize) -> [O
 ///
 /// Fences are seen through their slats, and a wall seen edge-on falls between two rays; so a barrier has holes one cell
 /// wide, and through one of them the ground behind would join the ground before. A column is never wider than a vehicle
-/// within 60 m, so nothing that could be driven through is closed sideways; what is lost is the ground between two things
-/// one row apart, most of which the nearer one hides anyway.
+/// within 60 m, so nothing that could be driven through is closed sideways; what is lost is the ground between two
+/// things one row apart, most of which the nearer one hides anyway.
 fn is_gap(grid: &RadialGrid, units: &[i8], cell: usize) -> bool {
     let columns = grid.columns();
     let higher = |other: usize| units.get(other).is_some_and(|unit| i16::from(*unit) > i16::from(units[cell]) + 1);

@@ -1,25 +1,26 @@
-//! The rays of each sensor's newest scan about that sensor: in each direction, how far the view goes and where it proves the
-//! ground free.
+//! The rays of each sensor's newest scan about that sensor: in each direction, how far the view goes and where it
+//! proves the ground free.
 //!
-//! In: [`Rays`], ego frame, metres. Out: hits counted in the [`Window`] as scans come, and, when the map is made, what each
-//! cell is told by one trace for each direction that has rays.
+//! In: [`Rays`], ego frame, metres. Out: hits counted in the [`Window`] as scans come, and, when the map is made, what
+//! each cell is told by one trace for each direction that has rays.
 //!
-//! A ray proves a cell free where it passes low over it: at the height of a bumper, `clear_height_m_min` to `_max`. From the
-//! roof over a car it proves nothing of the car's cells, and neither does it under the car's body. So every direction (a
-//! quarter of a degree) keeps a row of bits, one for each step of a cell's side outward, of where some ray of it is low; rays
-//! only set bits, and their order says nothing.
+//! A ray proves a cell free where it passes low over it: at the height of a bumper, `clear_height_m_min` to `_max`.
+//! From the roof over a car it proves nothing of the car's cells, and neither does it under the car's body. So every
+//! direction (a quarter of a degree) keeps a row of bits, one for each step of a cell's side outward, of where some ray
+//! of it is low; rays only set bits, and their order says nothing.
 //!
-//! A trace ends at the nearest return from above the ground, of its own direction or of the two to either side: rays of one
-//! direction differ by part of its width, some get lost, and the trace must not run along a thing just inside its edge.
-//! Behind it the cells are hidden, but for those where a ray comes down on the ground: there from where it is under the
-//! vehicle's clearance, if nothing stands on its way from there to its end, so that it has passed beneath nothing.
+//! A trace ends at the nearest return from above the ground, of its own direction or of the two to either side: rays of
+//! one direction differ by part of its width, some get lost, and the trace must not run along a thing just inside its
+//! edge. Behind it the cells are hidden, but for those where a ray comes down on the ground: there from where it is
+//! under the vehicle's clearance, if nothing stands on its way from there to its end, so that it has passed beneath
+//! nothing.
 //!
-//! Heights are over the plane under the vehicle. Where the ground dips under it, what stands there may not reach over the
-//! plane: there a return counts that is higher by the clearance than the lowest about it, a metre along its direction and a
-//! degree across.
+//! Heights are over the plane under the vehicle. Where the ground dips under it, what stands there may not reach over
+//! the plane: there a return counts that is higher by the clearance than the lowest about it, a metre along its
+//! direction and a degree across.
 //!
-//! Only a sensor's newest scan says what is clear and what is hidden now. So lines are drawn once a map, however many scans
-//! came since the last one.
+//! Only a sensor's newest scan says what is clear and what is hidden now. So lines are drawn once a map, however many
+//! scans came since the last one.
 
 use std::ops::Range;
 
@@ -37,8 +38,8 @@ const DIRECTIONS: usize = 1440;
 const BESIDE: isize = 2;
 /// Steps after which a direction goes on as two lines: 112 cells out it is half a cell wide.
 const FORK: usize = 112;
-/// A return so far under the plane, and under the steepest road from the vehicle to it, is a mirror image: its ray proves
-/// nothing.
+/// A return so far under the plane, and under the steepest road from the vehicle to it, is a mirror image: its ray
+/// proves nothing.
 const BELOW_M: f32 = 0.3;
 const GRADE_MAX: f32 = 0.1;
 /// Directions and steps of a patch of ground.
@@ -84,8 +85,8 @@ pub struct Fan {
 /// Directions about a sensor.
 struct Compass {
     directions: Quadrants,
-    /// Each direction's middle, and the middles of its halves: far out a direction is wider than the spacing of lines that
-    /// leave no cell between them.
+    /// Each direction's middle, and the middles of its halves: far out a direction is wider than the spacing of lines
+    /// that leave no cell between them.
     lines: Vec<[[f64; 2]; 3]>,
     steps: usize,
     words: usize,

@@ -1,4 +1,5 @@
-//! The life of a cell (Seo 2014, figure 4): which state follows from the state it had and what one map's rays tell of it.
+//! The life of a cell (Seo 2014, figure 4): which state follows from the state it had and what one map's rays tell of
+//! it.
 //!
 //! In: a [`Cell`] and its [`Evidence`] since the last map. Out: the cell as it is published.
 
@@ -68,8 +69,8 @@ use Next::{Go, Hold};
 /// `TRANSITIONS[whether the cell is occupied][evidence]`.
 ///
 /// Figure 4 says that a cell is first unobserved, and then occupied or occluded as sensors look; here every arrow is
-/// named. A cell loses its name the moment nobody confirms it; only an occupied one keeps its name for a few maps, because
-/// what hides it, or a sensor's pause, does not make it go away.
+/// named. A cell loses its name the moment nobody confirms it; only an occupied one keeps its name for a few maps,
+/// because what hides it, or a sensor's pause, does not make it go away.
 #[rustfmt::skip]
 pub const TRANSITIONS: [[Next; 8]; 2] = [
     // Silence       Nothing             Overhead       Hidden          Through    ThroughDoubted FewHits      Hits
@@ -89,8 +90,8 @@ pub struct Cell {
 }
 
 impl Cell {
-    /// The hits as published: 255 in an occupied cell, in an unknown one the power of two they reach (what tells 20 returns
-    /// from 23 is chance, and would be half of the layer's bytes), 0 in any other.
+    /// The hits as published: 255 in an occupied cell, in an unknown one the power of two they reach (what tells 20
+    /// returns from 23 is chance, and would be half of the layer's bytes), 0 in any other.
     pub fn level(self) -> u8 {
         match (self.state, self.hits) {
             (OCCUPIED, hits) => hits,
@@ -113,8 +114,8 @@ impl Cell {
                 _ => Evidence::FewHits,
             };
         } else if told == Evidence::Through {
-            // No longer enough at once, so that nothing leaves a trail; not forgotten at once, so that a thin thing that
-            // rays miss now and then is never clear.
+            // No longer enough at once, so that nothing leaves a trail; not forgotten at once, so that a thin thing
+            // that rays miss now and then is never clear.
             hits = (hits >> 2).min(hits_needed - 1);
             evidence = if hits > 0 { Evidence::ThroughDoubted } else { Evidence::Through };
         }

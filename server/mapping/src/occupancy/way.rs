@@ -1,7 +1,7 @@
 //! A straight way through the window, from a sensor outward.
 //!
-//! In: a place and a direction, cells from the window's corner. Out: what a direction tells, step by step, added to the cells
-//! in the middles of the steps.
+//! In: a place and a direction, cells from the window's corner. Out: what a direction tells, step by step, added to the
+//! cells in the middles of the steps.
 
 use std::ops::Range;
 

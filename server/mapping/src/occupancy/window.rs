@@ -170,8 +170,8 @@ impl Window {
         }
     }
 
-    /// Judges every cell. In: in `class` what was told of it since the last map ([`super::states::LOOKED_AT`] and so on), and
-    /// whether any sensor sent anything. Out: the states in `class`, the returns in `hits`.
+    /// Judges every cell. In: in `class` what was told of it since the last map ([`super::states::LOOKED_AT`] and so
+    /// on), and whether any sensor sent anything. Out: the states in `class`, the returns in `hits`.
     pub fn judge(&mut self, [needed, hold_maps]: [u8; 2], any: bool, class: &mut [u8], hits: &mut [u8]) {
         hits.fill(0);
         let mut listed = std::mem::take(&mut self.listed);

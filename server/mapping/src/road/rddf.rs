@@ -1,8 +1,8 @@
 //! RDDF, the route definition data file of DARPA's Grand Challenges.
 //!
 //! In: text, a row a line: `number, latitude, longitude, lateral offset, speed limit[, hour, minute, second]`, degrees,
-//! feet, miles an hour. Out: [`Rddf`], and from it the centre line as a [`Road`] in the map frame. A row that is none is
-//! left out and named; the others stand. `#` begins a comment.
+//! feet, miles an hour. Out: [`Rddf`], and from it the centre line as a [`Road`] in the map frame. A row that is none
+//! is left out and named; the others stand. `#` begins a comment.
 
 use super::{FOOT_M, LineRefused, LocalFrame, latitude, longitude, number};
 use crate::event::{Road, RoadFrame, RoadPurpose};

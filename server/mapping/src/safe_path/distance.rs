@@ -67,8 +67,8 @@ impl Distances {
         }
     }
 
-    /// A cell that is not free is its own site, and hides those beyond it: each stretch of free cells is measured with the
-    /// two beside it alone.
+    /// A cell that is not free is its own site, and hides those beyond it: each stretch of free cells is measured with
+    /// the two beside it alone.
     fn along_row(&mut self, iy: usize) {
         let mut from = 0;
         for ix in 0..self.side {
@@ -138,8 +138,9 @@ impl Distances {
         Some([i32::from(column), i32::from(self.row_of_site[row + usize::from(column)])])
     }
 
-    /// Squared distance from a place to the nearest square of a cell that is not free; place and distance in half cells,
-    /// the middle of cell (ix, iy) at (2 ix, 2 iy). `None` where every cell is free. The place lies within the grid.
+    /// Squared distance from a place to the nearest square of a cell that is not free; place and distance in half
+    /// cells, the middle of cell (ix, iy) at (2 ix, 2 iy). `None` where every cell is free. The place lies within the
+    /// grid.
     pub fn clearance_squared(&self, [hx, hy]: [i32; 2]) -> Option<i32> {
         let side = self.side as i32;
         let (row, between_rows) = ((hy / 2) as usize, hy % 2 == 1);

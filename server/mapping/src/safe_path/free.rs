@@ -1,11 +1,12 @@
 //! Which cells of a Cartesian grid about the vehicle are free.
 //!
-//! In: the layer `drivability`, radial, and the sweep it was made from. Out: a [`State`] a cell, that of the radial cell its
-//! middle lies in. A radial cell that holds nothing but returns of the vehicle's own outline (its bonnet) says nothing. Ground
-//! nobody saw is not free, but for the blind zone: in a column whose innermost seen cell is drivable and begins within
-//! it, the ground nearer to the vehicle, which no laser meets, is taken to be like it, as the thesis does when segments
-//! grow from the vehicle (§IV.3); and for holes in drivable ground too narrow to matter, a cell or two where a laser's
-//! return was lost. Neither is called drivable, and no safe point lies in one: they only are no obstacles.
+//! In: the layer `drivability`, radial, and the sweep it was made from. Out: a [`State`] a cell, that of the radial
+//! cell its middle lies in. A radial cell that holds nothing but returns of the vehicle's own outline (its bonnet) says
+//! nothing. Ground nobody saw is not free, but for the blind zone: in a column whose innermost seen cell is drivable
+//! and begins within it, the ground nearer to the vehicle, which no laser meets, is taken to be like it, as the thesis
+//! does when segments grow from the vehicle (§IV.3); and for holes in drivable ground too narrow to matter, a cell or
+//! two where a laser's return was lost. Neither is called drivable, and no safe point lies in one: they only are no
+//! obstacles.
 
 use crate::config::SafePathConfig;
 use crate::drivability;

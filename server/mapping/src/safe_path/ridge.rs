@@ -1,11 +1,11 @@
 //! The ridge of the distances: where two obstacles are equally far.
 //!
-//! In: states and distances. Out: safe points on lines one cell wide. Two neighbouring cells whose nearest sites are two
-//! obstacles have the place that is equally far from both between them; the one nearer to that place is on the ridge
-//! (the integer medial axis of Hesselink and Roerdink 2008). Sites nearer to one another than the vehicle is wide count
-//! as one obstacle: nothing passes between them, and every dent of a wall would draw a line. A ridge cell's point is its
-//! middle or the middle between it and that neighbour, whichever has more room, so that a gate an even number of cells
-//! wide has its true width.
+//! In: states and distances. Out: safe points on lines one cell wide. Two neighbouring cells whose nearest sites are
+//! two obstacles have the place that is equally far from both between them; the one nearer to that place is on the
+//! ridge (the integer medial axis of Hesselink and Roerdink 2008). Sites nearer to one another than the vehicle is wide
+//! count as one obstacle: nothing passes between them, and every dent of a wall would draw a line. A ridge cell's point
+//! is its middle or the middle between it and that neighbour, whichever has more room, so that a gate an even number of
+//! cells wide has its true width.
 
 use super::distance::Distances;
 use super::free::State;

@@ -3,12 +3,13 @@
 //! In: the sweep's points, ego frame, metres. Out: a figure a cell, metres. The paper leaves the measure open ("methods
 //! similar to image processing methods"); the reading here:
 //!
-//! - the floor about a block of 4 × 4 cells is the lowest height in the 3 × 3 blocks, unless it lies further under a few
-//!   cells more than the ground may fall there: mirrored returns lie metres under the ground, a few cells of them side by
-//!   side, and are outvoted. What lies under the floor is forgotten, and the rest of such a cell is its highest point;
+//! - the floor about a block of 4 × 4 cells is the lowest height in the 3 × 3 blocks, unless it lies further under a
+//!   few cells more than the ground may fall there: mirrored returns lie metres under the ground, a few cells of them
+//!   side by side, and are outvoted. What lies under the floor is forgotten, and the rest of such a cell is its highest
+//!   point;
 //! - a cell is an obstacle if its highest point rises by more than a step and what the grade explains over the lowest
-//!   point of the 3 × 3 cells around it, or over the floor, so that a roof is not taken for ground because no ground was
-//!   seen right beside it;
+//!   point of the 3 × 3 cells around it, or over the floor, so that a roof is not taken for ground because no ground
+//!   was seen right beside it;
 //! - its bumpiness is the larger of the heights' standard deviation within it, less what the slope of its neighbours
 //!   explains, and half the second difference of the heights across it.
 //!

@@ -2,8 +2,8 @@
 //!
 //! In: the newest road and route with the newest ego pose. Out: [`Gates`]: the road in the ego frame, and which gates
 //! are closed. The paper's two: (1) the orientations that dominate the detector's image are as good as random; (2) the
-//! route bends more than the detector can follow. Two more that any system with clocks and frames needs: (3) the road was
-//! seen too long ago; (4) it lies in the map frame and no pose is known.
+//! route bends more than the detector can follow. Two more that any system with clocks and frames needs: (3) the road
+//! was seen too long ago; (4) it lies in the map frame and no pose is known.
 
 use crate::config::SpeedConfig;
 use crate::event::RoadFrame;

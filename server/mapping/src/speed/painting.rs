@@ -1,7 +1,7 @@
 //! The road as a polygon, scan-converted into the grid as a speed bonus (§3.2).
 //!
-//! In: the road's points (ego frame, metres) and widths. Out: the bonus of every cell whose middle lies on the road. The
-//! direction at a point is that from the point before to the one after; the edge points lie half the width to each
+//! In: the road's points (ego frame, metres) and widths. Out: the bonus of every cell whose middle lies on the road.
+//! The direction at a point is that from the point before to the one after; the edge points lie half the width to each
 //! side; each pair of points with its four edge points is one convex piece, painted row by row (§3.2.1). Where pieces
 //! overlap, in bends, the larger bonus stays, whatever their order.
 

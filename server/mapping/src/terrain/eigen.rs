@@ -6,8 +6,8 @@
 //! whose last bits differ from machine to machine. The vertical share of an eigenvector follows from the eigenvalues of
 //! the matrix and those of its horizontal part, so no eigenvector is computed.
 
-/// Eigenvalues nearer to one another than this share of the largest entry are one double eigenvalue: beneath, the closed
-/// form's rounding decides which eigenvector is which.
+/// Eigenvalues nearer to one another than this share of the largest entry are one double eigenvalue: beneath, the
+/// closed form's rounding decides which eigenvector is which.
 const DOUBLE: f64 = 1e-6;
 
 /// What principal component analysis says of some points.
@@ -52,15 +52,16 @@ fn eigenvalues([xx, yy, zz, xy, xz, yz]: [f64; 6]) -> [f64; 3] {
     }
     let determinant = ((x * y) * z + 2.0 * (xy * (xz * yz))) - (x * (yz * yz) + y * (xz * xz)) - z * (xy * xy);
     let cosine = (determinant / (2.0 * radius * radius * radius)).clamp(-1.0, 1.0);
-    // In units of twice the radius from the mean the single one of the outer eigenvalues is the cosine of a third of the
-    // angle, on the side of the cosine's sign; the two others solve what is left, a square equation.
+    // In units of twice the radius from the mean the single one of the outer eigenvalues is the cosine of a third of
+    // the angle, on the side of the cosine's sign; the two others solve what is left, a square equation.
     let single = cosine_of_third(cosine.abs());
     let (middle, spread) = (-single / 2.0, (3.0 * (1.0 - single * single)).max(0.0).sqrt() / 2.0);
     let own = [single, middle + spread, middle - spread].map(|value| 2.0 * radius * value);
     if cosine < 0.0 { [mean - own[2], mean - own[1], mean - own[0]] } else { own.map(|value| mean + value) }
 }
 
-/// cos(acos(cosine) / 3) for 0 <= cosine <= 1: the root of 4c³ - 3c = cosine between 0.86 and 1, where the slope is 6 to 9.
+/// cos(acos(cosine) / 3) for 0 <= cosine <= 1: the root of 4c³ - 3c = cosine between 0.86 and 1, where the slope is 6
+/// to 9.
 fn cosine_of_third(cosine: f64) -> f64 {
     // The chord is nearer than 0.006; three steps square that to less than rounding.
     let mut c = 0.866_025_403_784_438_6 + 0.133_974_596_215_561_4 * cosine;

@@ -1,9 +1,9 @@
 //! Beyond the paper: which flat regions are ground the vehicle stands on, and how far seen ground speaks for holes.
 //!
 //! In: flat regions with their planes, cells that hold points. Out: by region whether it joins the ground under the
-//! vehicle without a step; by cell whether it is a hole narrow enough to be filled. A car's roof is as flat as a road; what tells
-//! them apart is the step between. A region of the division may reach far beyond the last point in it; what lies
-//! between two seen cells a short way apart is inferred, what lies beyond is unknown.
+//! vehicle without a step; by cell whether it is a hole narrow enough to be filled. A car's roof is as flat as a road;
+//! what tells them apart is the step between. A region of the division may reach far beyond the last point in it; what
+//! lies between two seen cells a short way apart is inferred, what lies beyond is unknown.
 
 use crate::config::TerrainConfig;
 
@@ -102,8 +102,8 @@ impl Ground {
         self.parent[a.max(b) as usize] = a.min(b);
     }
 
-    /// Along every row and every column: flat regions with nothing but unseen cells between them, as the rings of far ground
-    /// are, whose planes meet half-way without a step.
+    /// Along every row and every column: flat regions with nothing but unseen cells between them, as the rings of far
+    /// ground are, whose planes meet half-way without a step.
     fn join_over_gaps(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
         let seen_cells = std::mem::take(&mut self.seen_cells);
         self.bridged.clear();
@@ -124,8 +124,8 @@ impl Ground {
         self.seen_cells = seen_cells;
     }
 
-    /// Along every row and every column, between two seen cells of the ground: unseen cells of its regions, and seen ones
-    /// of too few points that lie on it.
+    /// Along every row and every column, between two seen cells of the ground: unseen cells of its regions, and seen
+    /// ones of too few points that lie on it.
     fn fill_holes(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
         let view = View { cells, regions, seen, seen_cells: &self.seen_cells, config };
         let (joined, of_cell) = (&self.joined, regions.of_cell());
@@ -184,8 +184,9 @@ struct View<'a> {
 }
 
 impl View<'_> {
-    /// Calls `take` for every pair of neighbouring seen cells of a row or column whose regions are `of_ground`, with at most
-    /// `span` cells between, in which nothing stands: those are unseen, or their few points lie on the ground of both.
+    /// Calls `take` for every pair of neighbouring seen cells of a row or column whose regions are `of_ground`, with at
+    /// most `span` cells between, in which nothing stands: those are unseen, or their few points lie on the ground of
+    /// both.
     fn for_each_hole(&self, span: usize, of_ground: impl Fn(u32) -> bool, mut take: impl FnMut(&Hole)) {
         const NONE: u32 = u32::MAX;
         let width = self.cells.width();

@@ -1,8 +1,9 @@
 //! Beyond the paper: which ground the vehicle gets to.
 //!
-//! In: by cell of the square grid whether it may be driven over and whether something stands in it. Out: by cell whether
-//! the vehicle gets there, from the middle of the grid on, as a disc that nothing may stand in. Ground behind a closed
-//! fence is as flat as the road, and joins it where the sensor looks between two slats; no vehicle fits through there.
+//! In: by cell of the square grid whether it may be driven over and whether something stands in it. Out: by cell
+//! whether the vehicle gets there, from the middle of the grid on, as a disc that nothing may stand in. Ground behind a
+//! closed fence is as flat as the road, and joins it where the sensor looks between two slats; no vehicle fits through
+//! there.
 //!
 //! A row of the grid is a row of bits: widening what stands by the disc, and the flood, take 64 cells at a time.
 
@@ -28,8 +29,8 @@ pub struct Reach {
 }
 
 impl Reach {
-    /// Floods a grid of `width` × `width` cells, `cell(ix, iy)` telling what each is, with a disc of `radius` cells about its
-    /// middle one.
+    /// Floods a grid of `width` × `width` cells, `cell(ix, iy)` telling what each is, with a disc of `radius` cells
+    /// about its middle one.
     pub fn find(&mut self, width: usize, radius: usize, cell: impl Fn(usize, usize) -> Passage) {
         for bits in [&mut self.open, &mut self.closed, &mut self.widened, &mut self.reached] {
             bits.clear(width);
@@ -123,8 +124,8 @@ impl Bits {
         }
     }
 
-    /// From one row to the next, and along it; whether it grew. A word holds all that its own bits spread to, before and
-    /// after, so one that gains nothing is left alone.
+    /// From one row to the next, and along it; whether it grew. A word holds all that its own bits spread to, before
+    /// and after, so one that gains nothing is left alone.
     fn spread(&mut self, open: &Self, iy: usize, from: usize) -> bool {
         let mut grown = false;
         let (row, from) = (iy * self.stride, from * self.stride);

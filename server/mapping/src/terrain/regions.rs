@@ -1,9 +1,9 @@
 //! Which regions are flat (Neuhaus 2009 §2.2 and §2.3).
 //!
-//! In: [`Cells`] with their sums. Out: flat regions with a plane each, and for every cell of the grid the region it lies
-//! in, or that it is an obstacle, or that nothing is known. Hierarchical: start with everything; a region whose local
-//! height disturbance h is under the threshold is flat, another one is split, down to one cell, where not flat means
-//! obstacle. The paper splits along the longest axis; a square has none, so it is cut along both: four quarters.
+//! In: [`Cells`] with their sums. Out: flat regions with a plane each, and for every cell of the grid the region it
+//! lies in, or that it is an obstacle, or that nothing is known. Hierarchical: start with everything; a region whose
+//! local height disturbance h is under the threshold is flat, another one is split, down to one cell, where not flat
+//! means obstacle. The paper splits along the longest axis; a square has none, so it is cut along both: four quarters.
 
 use crate::config::{Form, TerrainConfig};
 
@@ -34,8 +34,8 @@ impl Plane {
         (a * a + b * b).sqrt()
     }
 
-    /// The plane that misses the points' heights least, over a ground whose position is known to `noise_m2` only: a stretch of
-    /// one ring says nothing of the slope across it, and then has none.
+    /// The plane that misses the points' heights least, over a ground whose position is known to `noise_m2` only: a
+    /// stretch of one ring says nothing of the slope across it, and then has none.
     fn fit(moments: &Moments, noise_m2: f64) -> Self {
         let [mut xx, mut yy, _, xy, xz, yz] = moments.covariance();
         (xx, yy) = (xx + noise_m2, yy + noise_m2);
@@ -177,7 +177,8 @@ impl Regions {
 
 /// Whether h is under the threshold; most regions are told without their eigenvalues.
 fn is_flat(moments: &Moments, flatness_m2_max: f64) -> bool {
-    // The most vertical of three axes holds a third of the vertical at least, so h is at most three times the variance of z.
+    // The most vertical of three axes holds a third of the vertical at least, so h is at most three times the variance
+    // of z.
     if 3.0 * moments.variance_z() < flatness_m2_max {
         return true;
     }
@@ -193,7 +194,8 @@ fn is_flat(moments: &Moments, flatness_m2_max: f64) -> bool {
     Principal::of(covariance).height_disturbance() < flatness_m2_max
 }
 
-/// Beyond the paper: no point of a flat region may stand out of its plane, and the plane must be one that can be driven.
+/// Beyond the paper: no point of a flat region may stand out of its plane, and the plane must be one that can be
+/// driven.
 fn is_ground_like(plane: &Plane, cells: &Cells, slots: std::ops::Range<usize>, config: &TerrainConfig) -> bool {
     if plane.grade() > config.grade_max {
         return false;

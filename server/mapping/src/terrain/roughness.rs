@@ -1,8 +1,8 @@
 //! How rough flat ground is (Neuhaus 2009 §2.4 and §2.5, eq. 3 and 4).
 //!
-//! In: the points' range deviations ([`crate::series`]) and cells. Out: by slot the square root of the paper's r: standard
-//! deviation of the ranges over the distance, without the sensor's own noise. The root is as fine for smooth ground as for rough; a planner that sums
-//! r squares it.
+//! In: the points' range deviations ([`crate::series`]) and cells. Out: by slot the square root of the paper's r:
+//! standard deviation of the ranges over the distance, without the sensor's own noise. The root is as fine for smooth
+//! ground as for rough; a planner that sums r squares it.
 
 use crate::config::TerrainConfig;
 use crate::sweep::Sweep;

@@ -174,16 +174,7 @@ pub fn data(path: &str) -> std::path::PathBuf {
 
 /// A KITTI scan: x, y, z, intensity a point, sensor frame.
 pub fn kitti(path: &str) -> clearway_mapping::event::Scan {
-    let bytes = std::fs::read(data(path)).unwrap();
-    let mut scan = clearway_mapping::event::Scan::default();
-    for point in bytes.chunks_exact(16) {
-        let value = |i: usize| f32::from_le_bytes(point[4 * i..4 * i + 4].try_into().unwrap());
-        scan.x.push(value(0));
-        scan.y.push(value(1));
-        scan.z.push(value(2));
-        scan.intensity.push(value(3));
-    }
-    scan
+    clearway_mapping::scan_file::read_bin(&std::fs::read(data(path)).unwrap()).unwrap()
 }
 
 /// Datagrams of a capture, up to where it is cut off.

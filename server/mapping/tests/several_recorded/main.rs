@@ -134,7 +134,8 @@ fn opencalibs_side_units_show_ground_where_the_top_unit_is_blind() {
         let returns: u32 = fused.sensors.iter().map(|sensor| sensor.returns).sum();
         assert_eq!(returns as usize, sum, "{scene}");
         assert!(pipeline.newest_sweep().x.len() * 1000 >= sum * 999, "{scene}: of the vehicle itself there is little");
-        // Terrain's class 1 is flat ground that was seen. The top unit sees none within 3 m, its first ring lies at 5 m.
+        // Terrain's class 1 is flat ground that was seen. The top unit sees none within 3 m, its first ring lies at 5
+        // m.
         let flat = |map: &Map| near(&map.layers[2], 3.0).iter().filter(|class| **class == 1).count();
         println!("{scene}: flat ground seen within 3 m, cells: {} -> {}", flat(&top), flat(&fused));
         assert!(flat(&top) == 0 && flat(&fused) >= 250, "{scene}");

@@ -1,0 +1,261 @@
+//! What happens to clocks, one script a story: what the device, the host and the receiver say, and when stamps are right.
+
+use clearway_lidar::Clock;
+
+use crate::telemetry::with_sum;
+
+pub(crate) const S: i64 = 1_000_000_000;
+pub(crate) const HOUR: i64 = 3_600 * S;
+pub(crate) const TURN: i64 = S / 10;
+/// 18 May 2033, 0 h UTC.
+pub(crate) const MIDNIGHT: i64 = 1_999_987_200 * S;
+/// When it happens, in most scripts: inside a turn.
+pub(crate) const EVENT: i64 = 1_033_000_000;
+
+/// One script; all functions take ns since its beginning.
+#[derive(Clone, Copy)]
+pub(crate) struct Script {
+    pub(crate) name: &'static str,
+    /// UTC at its beginning.
+    pub(crate) utc_ns: i64,
+    pub(crate) lasts_ns: i64,
+    /// Device time, ns; taken past the hour.
+    pub(crate) device_ns: fn(i64) -> i64,
+    /// How far the host's clock is ahead of UTC.
+    pub(crate) host_ns: fn(i64) -> i64,
+    /// PPS state and what the receiver says: time and date, valid.
+    pub(crate) telemetry: fn(i64) -> Option<(u8, String)>,
+    /// How far right stamps are ahead of UTC.
+    pub(crate) right_ns: fn(i64) -> i64,
+    pub(crate) event_ns: i64,
+    /// For so long after the event nothing is sent.
+    pub(crate) silence_ns: i64,
+    /// From the event until stamps must be right.
+    pub(crate) healed_ns: i64,
+    pub(crate) tolerance_ns: i64,
+    pub(crate) last: Clock,
+}
+
+pub(crate) const BASE: Script = Script {
+    name: "",
+    utc_ns: NOON,
+    lasts_ns: 2 * S,
+    device_ns: |t| NOON + t,
+    host_ns: |_| 0,
+    telemetry: |t| gps(NOON + t),
+    right_ns: |_| 0,
+    event_ns: EVENT,
+    silence_ns: 0,
+    healed_ns: TURN,
+    tolerance_ns: 200_000,
+    last: Clock::Gps,
+};
+pub(crate) const NOON: i64 = MIDNIGHT + 12 * HOUR + 1_234 * S;
+/// A second before the day, and an hour, ends.
+pub(crate) const LATE: i64 = MIDNIGHT + 24 * HOUR - S;
+/// A free-running device, 500 s after it was switched on.
+pub(crate) const FREE: fn(i64) -> i64 = |t| 500 * S + t;
+pub(crate) const SILENT: fn(i64) -> Option<(u8, String)> = |_| None;
+
+pub(crate) fn rmc(second: i64, status: char, date: &str) -> String {
+    let of_day = second % 86_400;
+    let (hour, minute) = (of_day / 3_600, of_day / 60 % 60);
+    with_sum(&format!(
+        "GPRMC,{hour:02}{minute:02}{:02},{status},3707.8178,N,12139.2690,W,010.3,188.2,{date}",
+        of_day % 60
+    ))
+}
+
+/// The sentence of 0.3 s ago, pulse locked.
+pub(crate) fn gps(utc_ns: i64) -> Option<(u8, String)> {
+    let second = (utc_ns - MIDNIGHT - 300_000_000) / S;
+    Some((2, rmc(second, 'A', if second < 86_400 { "180533" } else { "190533" })))
+}
+
+pub(crate) fn dated(t: i64, date: &str) -> Option<(u8, String)> {
+    Some((2, rmc((NOON + t - MIDNIGHT) / S, 'A', date)))
+}
+
+pub(crate) fn restarted(t: i64) -> bool {
+    (EVENT - TURN..EVENT).contains(&t)
+}
+
+pub(crate) fn after<T>(t: i64, then: T, before: T) -> T {
+    if t >= EVENT { then } else { before }
+}
+
+pub(crate) fn scripts() -> Vec<Script> {
+    let late = Script { utc_ns: LATE, device_ns: |t| LATE + t, telemetry: |t| gps(LATE + t), ..BASE };
+    let free = Script { device_ns: FREE, telemetry: SILENT, last: Clock::Arrival, ..BASE };
+    let silent = Script { silence_ns: 3 * TURN, healed_ns: 4 * TURN, ..BASE };
+    vec![
+        Script { name: "the hour and the day end, and telemetry comes at that microsecond", event_ns: S, ..late },
+        Script { name: "the hour ends without telemetry", telemetry: SILENT, last: Clock::Device, event_ns: S, ..late },
+        Script {
+            name: "GPS is gained: the device jumps to UTC; the host was 20 s behind",
+            device_ns: |t| after(t, NOON, 500 * S) + t,
+            telemetry: |t| after(t, gps(NOON + t), Some((1, rmc(0, 'V', "010100")))),
+            host_ns: |_| -20 * S,
+            right_ns: |t| after(t, 0, -20 * S),
+            ..BASE
+        },
+        Script {
+            name: "GPS is gained a little ahead of the host: slower until it is right",
+            device_ns: |t| after(t, NOON, 500 * S) + t,
+            telemetry: |t| after(t, gps(NOON + t), None),
+            host_ns: |_| 40_000_000,
+            right_ns: |t| after(t, 0, 40_000_000),
+            healed_ns: 2 * TURN,
+            ..BASE
+        },
+        Script {
+            name: "GPS is lost, the host 7 s off: nothing changes",
+            telemetry: |t| after(t, Some((0, rmc(0, 'V', ""))), gps(NOON + t)),
+            host_ns: |_| 7 * S,
+            last: Clock::GpsUnlocked,
+            ..BASE
+        },
+        Script {
+            name: "telemetry ends",
+            telemetry: |t| after(t, None, gps(NOON + t)),
+            lasts_ns: 5 * S,
+            last: Clock::GpsUnlocked,
+            ..BASE
+        },
+        Script {
+            name: "the pulse is lost",
+            telemetry: |t| gps(NOON + t).map(|(pps, text)| (after(t, 3, pps), text)),
+            last: Clock::GpsUnlocked,
+            ..BASE
+        },
+        Script { name: "the host steps an hour on, under GPS", host_ns: |t| after(t, HOUR, 0), ..BASE },
+        Script { name: "the host steps an hour back, under GPS", host_ns: |t| after(t, -HOUR, 0), ..BASE },
+        Script {
+            name: "restarted while the host is an hour back, and GPS is gained and the host set between the same two packets",
+            device_ns: |t| if restarted(t) { 1_034 * S + t } else { NOON + t },
+            telemetry: |t| if restarted(t) { None } else { gps(NOON + t) },
+            host_ns: |t| if restarted(t) { -HOUR } else { 0 },
+            event_ns: EVENT - TURN,
+            healed_ns: 2 * TURN,
+            ..BASE
+        },
+        Script { name: "the host steps 2 s on during a silence, under GPS", host_ns: |t| after(t, 2 * S, 0), ..silent },
+        Script {
+            name: "the host steps 2 s back during a silence, under GPS",
+            host_ns: |t| after(t, -2 * S, 0),
+            ..silent
+        },
+        Script { name: "the host steps an hour back during a silence", host_ns: |t| after(t, -HOUR, 0), ..silent },
+        Script {
+            name: "the host steps 2 s on during a silence and nobody else knows the time",
+            host_ns: |t| after(t, 2 * S, 0),
+            right_ns: |t| after(t, 2 * S, 0),
+            silence_ns: silent.silence_ns,
+            healed_ns: silent.healed_ns,
+            ..free
+        },
+        Script {
+            name: "the host steps 2 s back during a silence and nobody else knows the time: stamps go on as they did",
+            host_ns: |t| after(t, -2 * S, 0),
+            silence_ns: silent.silence_ns,
+            healed_ns: silent.healed_ns,
+            last: Clock::Held,
+            ..free
+        },
+        Script {
+            name: "the host steps an hour on and nobody else knows the time",
+            host_ns: |t| after(t, HOUR, 0),
+            right_ns: |t| after(t, HOUR, 0),
+            ..free
+        },
+        Script {
+            name: "the host steps an hour back: stamps go on as they did",
+            host_ns: |t| after(t, -HOUR, 0),
+            last: Clock::Held,
+            ..free
+        },
+        Script {
+            name: "the sensor is restarted",
+            device_ns: |t| after(t, t - EVENT, 500 * S + t),
+            tolerance_ns: 11_000_000,
+            ..free
+        },
+        Script {
+            name: "the sensor is restarted and finds no GPS; the host is 7 s off",
+            device_ns: |t| after(t, t - EVENT, NOON + t),
+            telemetry: |t| after(t, None, gps(NOON + t)),
+            host_ns: |_| 7 * S,
+            tolerance_ns: 2_000_000,
+            last: Clock::GpsUnlocked,
+            ..BASE
+        },
+        Script {
+            name: "the pulse alone sets the part of a second 0.7 s back",
+            device_ns: |t| after(t, 499_300_000_000, 500 * S) + t,
+            tolerance_ns: 11_000_000,
+            ..free
+        },
+        Script {
+            name: "a capture played at ten times its speed",
+            host_ns: |t| -t / 10 * 9,
+            tolerance_ns: TURN,
+            last: Clock::Held,
+            ..free
+        },
+        Script {
+            name: "all arrivals equal",
+            host_ns: |t| -t,
+            tolerance_ns: TURN + 2_000_000,
+            last: Clock::Held,
+            ..free
+        },
+        Script { name: "the receiver says 1980", telemetry: |t| dated(t, "060180"), last: Clock::Device, ..BASE },
+        Script {
+            name: "the receiver is 1024 weeks late",
+            telemetry: |t| dated(t, "021013"),
+            last: Clock::Device,
+            ..BASE
+        },
+        Script {
+            name: "an old capture played live, its telemetry after its data",
+            telemetry: |t| after(t, gps(NOON + t), None),
+            host_ns: |_| 20_000 * HOUR + 1_000 * S,
+            right_ns: |_| 20_000 * HOUR + 1_000 * S,
+            last: Clock::Arrival,
+            ..BASE
+        },
+        Script {
+            name: "an old capture played live, its device's counter set inside it",
+            device_ns: |t| after(t, NOON, 500 * S) + t,
+            telemetry: |t| after(t, gps(NOON + t), None),
+            host_ns: |_| 20_000 * HOUR + 1_000 * S,
+            right_ns: |_| 20_000 * HOUR + 1_000 * S,
+            tolerance_ns: 11_000_000,
+            last: Clock::Arrival,
+            ..BASE
+        },
+        Script {
+            name: "a host whose clock nobody set, under GPS",
+            host_ns: |_| -MIDNIGHT,
+            telemetry: |t| after(t, gps(NOON + t), None),
+            right_ns: |t| after(t, 0, -MIDNIGHT),
+            ..BASE
+        },
+        Script { name: "the device does not follow its receiver", telemetry: |t| gps(NOON + t), ..free },
+        Script {
+            name: "a leap second, counted past the hour; Unix time repeats it",
+            device_ns: |t| t + if t < 2 * S { HOUR - S } else { -2 * S },
+            telemetry: |t| match t - 300_000_000 {
+                0..S => Some((2, rmc(86_399, 'A', "180533"))),
+                S..2_000_000_000 => Some((2, with_sum("GPRMC,235960,A,,,,,,,180533"))),
+                _ => gps(LATE + t - S),
+            },
+            host_ns: |t| if t < 2 * S { 0 } else { -S },
+            right_ns: |t| if t < 2 * S { 0 } else { -S },
+            event_ns: 2 * S,
+            lasts_ns: 5 * S,
+            healed_ns: 2 * S + TURN,
+            ..late
+        },
+    ]
+}
