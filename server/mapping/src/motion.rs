@@ -107,6 +107,11 @@ impl Motion {
         self.poses.back()
     }
 
+    /// Forgets where the vehicle was.
+    pub fn forget_poses(&mut self) {
+        self.poses.clear();
+    }
+
     /// Takes a pose, newer than those before; the oldest makes room.
     pub fn take_pose(&mut self, pose: &EgoPose) {
         debug_assert!(self.newest_pose().is_none_or(|newest| newest.stamp_ns < pose.stamp_ns), "poses in order");

@@ -32,6 +32,8 @@ pub struct Pipeline {
     fusion: Fusion,
     ledger: Ledger,
     now: Option<Moment>,
+    /// When the newest pose was taken, event time.
+    pose_event_ns: Option<i64>,
     maps_made: u64,
     /// Whether a turn has ended that is in no map.
     turn_since_map: bool,
@@ -75,6 +77,7 @@ impl Pipeline {
             fusion: Fusion::new(&config.fusion, lead),
             ledger: Ledger::default(),
             now: None,
+            pose_event_ns: None,
             maps_made: 0,
             turn_since_map: false,
             map: Map {
@@ -192,8 +195,8 @@ impl Pipeline {
     /// What was left out of the turn that the event completed, if it completed one.
     fn take(&mut self, event: &Event, now: Moment) -> Result<Option<Dropped>, Rejected> {
         match &event.body {
-            Body::EgoPose(pose) => self.take_ego_pose(pose).map(|()| None),
-            Body::Road(road) => self.take_road(road).map(|()| None),
+            Body::EgoPose(pose) => self.take_ego_pose(pose, now).map(|()| None),
+            Body::Road(road) => self.take_road(road, now).map(|()| None),
             Body::Sensor(sensor) => self.take_sensor(event.source, sensor).map(|()| None),
             Body::Lost { .. } => Ok(None),
             Body::Datagram(payload) => self.take_datagram(event.source, payload, now),
@@ -237,7 +240,9 @@ impl Pipeline {
         Ok(dropped)
     }
 
-    fn take_ego_pose(&mut self, pose: &EgoPose) -> Result<(), Rejected> {
+    /// One not newer than the newest is refused, unless none was taken for the deadline: then its sender has begun anew, or its
+    /// clock was set back.
+    fn take_ego_pose(&mut self, pose: &EgoPose, now: Moment) -> Result<(), Rejected> {
         Rejected::unless_in_range(pose.stamp_ns)?;
         let rotation = pose.map_from_ego.rotation.coords;
         let position = pose.map_from_ego.translation.vector;
@@ -246,16 +251,25 @@ impl Pipeline {
         if !possible || !(1.0 - 1e-6..=1.0 + 1e-6).contains(&rotation.norm()) {
             return Err(Rejected::Pose { stamp_ns: pose.stamp_ns });
         }
+        if self.pose_event_ns.is_some_and(|taken_ns| now.event_ns.saturating_sub(taken_ns) > self.fusion.deadline_ns)
+            && self.motion.newest_pose().is_some_and(|newest| pose.stamp_ns <= newest.stamp_ns)
+        {
+            self.motion.forget_poses();
+        }
         Rejected::unless_newer(pose.stamp_ns, self.motion.newest_pose().map(|p| p.stamp_ns))?;
         self.motion.take_pose(pose);
+        self.pose_event_ns = Some(now.event_ns);
         self.ledger.poses += 1;
         Ok(())
     }
 
-    fn take_road(&mut self, road: &Road) -> Result<(), Rejected> {
+    fn take_road(&mut self, road: &Road, now: Moment) -> Result<(), Rejected> {
         Rejected::unless_in_range(road.stamp_ns)?;
         road::check(road)?;
-        Rejected::unless_newer(road.stamp_ns, self.roads.newest_stamp_ns(road.purpose))?;
+        // One stamped later than now, by the host's clock, was stamped by a clock that was set back since, or is wrong.
+        let latest_ns = now.arrival_ns.saturating_add(self.fusion.deadline_ns);
+        let newest_ns = self.roads.newest_stamp_ns(road.purpose).filter(|newest_ns| *newest_ns <= latest_ns);
+        Rejected::unless_newer(road.stamp_ns, newest_ns)?;
         self.roads.take(road, self.motion.map_from_ego(road.stamp_ns));
         self.ledger.roads += 1;
         Ok(())

@@ -58,6 +58,27 @@ fn scan(stamp_ns: i64) -> Scan {
 }
 
 #[test]
+fn a_pose_of_the_future_locks_out_those_of_the_present_for_no_longer_than_the_deadline() {
+    const MS: i64 = 1_000_000;
+    let mut pipeline = pipeline(Some(Model::Vlp16));
+    let mut pose = |arrival_ms: i64, stamp_ms: i64| {
+        let map_from_ego = Isometry3::translation(1.0, 2.0, 0.0);
+        let body = Body::EgoPose(EgoPose { stamp_ns: stamp_ms * MS, map_from_ego, speed_mps: 3.0 });
+        pipeline.step(&Event { sequence: 0, arrival_ns: arrival_ms * MS, source: 0, body }).map(|_| ())
+    };
+    let year_ms = 31_536_000_000;
+    pose(10_000, 10_000).unwrap();
+    pose(10_010, 10_010 + year_ms).unwrap();
+    for arrival_ms in (10_020..=10_210).step_by(10) {
+        assert!(matches!(pose(arrival_ms, arrival_ms), Err(Rejected::Stamp { .. })), "{arrival_ms}");
+    }
+    for arrival_ms in (10_220..10_400).step_by(10) {
+        pose(arrival_ms, arrival_ms).unwrap();
+    }
+    assert!(pose(10_400, 10_300).is_err(), "an old one is refused as before");
+}
+
+#[test]
 fn a_host_clock_that_steps_changes_no_map_of_a_sensor_on_gps_but_what_is_said_of_the_host() {
     const HOUR_NS: i64 = 3_600_000_000_000;
     let run = |step_ns: i64| {

@@ -21,15 +21,29 @@ fn good() -> Road {
     }
 }
 
-#[test]
-fn a_road_that_is_none_is_refused_by_name_and_counted_and_the_one_before_stays() {
+fn pipeline() -> Pipeline {
     let extrinsics = Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.9, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
     let config = VehicleConfig::new("car", vec![SensorConfig::new("top", extrinsics)]);
-    let mut pipeline = Pipeline::new(&config, vec![None]).unwrap();
-    let step = |pipeline: &mut Pipeline, body| {
-        let event = Event { sequence: 0, arrival_ns: 0, source: 0, body };
-        pipeline.step(&event).map(|_| ()).map_err(|rejected| (rejected.reason(), rejected.to_string()))
-    };
+    Pipeline::new(&config, vec![None]).unwrap()
+}
+
+fn step(pipeline: &mut Pipeline, body: Body) -> Result<(), (&'static str, String)> {
+    let event = Event { sequence: 0, arrival_ns: 0, source: 0, body };
+    pipeline.step(&event).map(|_| ()).map_err(|rejected| (rejected.reason(), rejected.to_string()))
+}
+
+#[test]
+fn a_road_of_the_future_gives_way_to_one_of_the_present() {
+    let mut pipeline = pipeline();
+    let road = |stamp_ns| Body::Road(Road { stamp_ns, ..good() });
+    assert_eq!(step(&mut pipeline, road(i64::MAX / 4)), Ok(()));
+    assert_eq!(step(&mut pipeline, road(2)), Ok(()));
+    assert_eq!(step(&mut pipeline, road(1)).unwrap_err().0, "stamp");
+}
+
+#[test]
+fn a_road_that_is_none_is_refused_by_name_and_counted_and_the_one_before_stays() {
+    let mut pipeline = pipeline();
     assert_eq!(step(&mut pipeline, Body::Road(good())), Ok(()));
 
     type Spoil = fn(&mut Road);

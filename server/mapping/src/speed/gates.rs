@@ -52,7 +52,8 @@ impl Gates {
 
         let age_ns = context.stamp_ns.saturating_sub(taken.road.stamp_ns);
         let ages = taken.road.frame == RoadFrame::Ego;
-        self.close(Gate::Age, ages && age_ns > i64::from(config.road_age_ms_max) * 1_000_000);
+        // One of the future is as little this moment's as an old one.
+        self.close(Gate::Age, ages && age_ns.unsigned_abs() > u64::from(config.road_age_ms_max) * 1_000_000);
 
         let pose = context.map_from_ego.as_ref();
         let road_placed = taken.points_in_ego(pose, &mut self.road_m);
