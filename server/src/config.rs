@@ -93,7 +93,7 @@ pub struct Access {
     pub readers: Vec<String>,
     /// May send scans, poses, roads and packets.
     pub ingesters: Vec<String>,
-    /// May do both, and control recordings.
+    /// May do both.
     pub operators: Vec<String>,
 }
 

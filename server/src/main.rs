@@ -64,8 +64,8 @@ enum Command {
     /// Drive a simulated vehicle at a server of its own, over real UDP.
     Demo {
         /// End after so many seconds; without, at Ctrl-C.
-        #[arg(long)]
-        seconds: Option<f64>,
+        #[arg(long, value_parser = seconds)]
+        seconds: Option<Duration>,
         /// Where to record; a temporary file where absent.
         #[arg(long)]
         record: Option<PathBuf>,
@@ -165,6 +165,11 @@ struct EvaluateArguments {
 fn columns(text: &str) -> Result<u16, String> {
     let degrees = text.parse().ok().filter(|degrees| evaluate::columns(*degrees).is_some());
     degrees.ok_or_else(|| "1, 2 or 4 degrees are allowed".into())
+}
+
+fn seconds(text: &str) -> Result<Duration, String> {
+    let duration = text.parse().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    duration.ok_or_else(|| "0 or more seconds are allowed".into())
 }
 
 fn extrinsics(text: &str) -> Result<Extrinsics, String> {
@@ -351,8 +356,7 @@ async fn draw(progress: Arc<Progress>, shown: bool) {
     }
 }
 
-async fn run_demo(seconds: Option<f64>, record: Option<PathBuf>, many_sensors: bool, json: bool) -> Result<ExitCode> {
-    let duration = seconds.map(Duration::try_from_secs_f64).transpose().context("--seconds: a time is needed")?;
+async fn run_demo(duration: Option<Duration>, record: Option<PathBuf>, many_sensors: bool, json: bool) -> Result<ExitCode> {
     let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
     let record = record.unwrap_or_else(|| folder.join("demo.mcap"));
     let picture = record.with_extension("png");

@@ -183,8 +183,8 @@ fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) 
     while let Some(reading) = readings.next() {
         let reading = reading?;
         if let Speed::Times(times) = speed {
-            let passed = reading.arrival_ns - *first_ns.get_or_insert(reading.arrival_ns);
-            let due = Duration::from_nanos(u64::try_from(passed).unwrap_or(0)).div_f64(times);
+            let passed_ns = reading.arrival_ns.saturating_sub(*first_ns.get_or_insert(reading.arrival_ns));
+            let due = Duration::try_from_secs_f64(passed_ns.max(0) as f64 * 1e-9 / times).unwrap_or(Duration::MAX);
             std::thread::sleep(due.saturating_sub(began.elapsed()));
         }
         progress.bytes_read.store(readings.bytes_read(), Ordering::Relaxed);

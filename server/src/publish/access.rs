@@ -29,7 +29,7 @@ pub enum Role {
     Reader,
     /// Sends scans, poses, roads and packets.
     Ingester,
-    /// Does both, and controls recordings.
+    /// Does both.
     Operator,
 }
 
