@@ -356,7 +356,12 @@ async fn draw(progress: Arc<Progress>, shown: bool) {
     }
 }
 
-async fn run_demo(duration: Option<Duration>, record: Option<PathBuf>, many_sensors: bool, json: bool) -> Result<ExitCode> {
+async fn run_demo(
+    duration: Option<Duration>,
+    record: Option<PathBuf>,
+    many_sensors: bool,
+    json: bool,
+) -> Result<ExitCode> {
     let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
     let record = record.unwrap_or_else(|| folder.join("demo.mcap"));
     let picture = record.with_extension("png");
