@@ -9,7 +9,7 @@ use clearway_client::{Channel, Layer, MapView};
 
 use self::viewer_file::{Dialect, ViewerFile};
 use super::recording::{Message, Recording};
-use super::{document, npy, progress_bar};
+use super::{document, npy, progress_bar, say};
 use clearway_client::picture::{self, Style};
 
 mod turns;
@@ -169,7 +169,7 @@ pub fn run(options: &Options) -> Result<()> {
     if maps == 0 {
         bail!("{}", nothing_exported(file, &recording, layer.as_deref(), vehicle.as_deref()));
     }
-    println!("{maps} maps of {} in {}", layer.as_deref().unwrap_or("all layers"), out.display());
+    say(&format!("{maps} maps of {} in {}", layer.as_deref().unwrap_or("all layers"), out.display()))?;
     Ok(())
 }
 

@@ -11,6 +11,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use clearway_client::footprint::FREE;
 use clearway_mapping::map::{Cells, Geometry, Layer};
 use clearway_mapping::radial::RadialGrid;
 
@@ -20,9 +21,6 @@ pub const OBSTACLE_M_MIN: f32 = 0.3;
 pub const OBSTACLE_M_MAX: f32 = 2.5;
 /// A point higher over its cell's lowest is not ground.
 pub const GROUND_OVER_LOWEST_M: f32 = 0.3;
-
-/// Names of the classes, over all maps, that let a vehicle pass; in no map does one of them mean anything else.
-const DRIVABLE: [&str; 8] = ["drivable", "flat", "flat_inferred", "clear", "passable", "road", "free", "path"];
 
 /// What a point says of its cell.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -240,7 +238,7 @@ impl Ballot {
 
 /// Whether each cell is called drivable; `None` where the layer has no such class.
 fn called(layer: &Layer) -> Option<Vec<bool>> {
-    let passes: Vec<bool> = layer.legend.iter().map(|name| DRIVABLE.contains(name)).collect();
+    let passes: Vec<bool> = layer.legend.iter().map(|name| FREE.contains(name)).collect();
     let class = layer.channels.iter().find(|channel| channel.name == "class")?;
     if !passes.contains(&true) {
         return None;
