@@ -19,7 +19,7 @@ use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity
 use crate::ClientError;
 use crate::freshness::Clock;
 use crate::ingest::{Deliver, Ear, Ingester};
-use crate::stream::{Feed, MapStream};
+use crate::stream::{Between, Feed, MapStream};
 use crate::view::MapView;
 
 /// No map of ours is longer than 64 KiB, so this holds one in flight and no heap of old ones.
@@ -236,7 +236,8 @@ async fn follow(
             Ok(map) => {
                 let sequence = map.sequence();
                 let last = base.replace(map.clone()).map_or(sequence, |last| last.sequence() + 1);
-                feed.put(map, sequence.saturating_sub(last).saturating_sub(left_out), left_out);
+                let skipped = sequence.saturating_sub(last).saturating_sub(left_out);
+                feed.put(map, Between { skipped, left_out, ..Between::default() });
                 (asked, left_out) = (false, 0);
                 v1::WatchRequest { acknowledged: Some(sequence), ..Default::default() }
             }

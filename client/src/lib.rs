@@ -29,7 +29,7 @@
 //! | [`ingest`] | observations -> the server, and what became of them |
 //! | `picture` | a layer -> a PNG from above (feature `picture`) |
 //! | `viewer` | a map -> ROS 2 and Foxglove messages (feature `viewers`) |
-//! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`) |
+//! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`); its `tap`: one key -> the newest map |
 
 pub mod footprint;
 mod freshness;

@@ -20,6 +20,9 @@ pub struct Update {
     pub map: MapView,
     /// Maps made since the previous look and not seen by this reader: it, or its link, was slow.
     pub skipped: u64,
+    /// Those of the skipped ones that got lost on the link (zenoh drops what a congested or cut link does not take); over gRPC
+    /// the server skips instead, and this is 0.
+    pub lost: u64,
     /// Maps made since the previous look that [`crate::Subscription::max_rate_hz`] left out.
     pub left_out: u64,
 }
@@ -38,8 +41,8 @@ pub enum Sight {
 #[derive(Debug)]
 pub struct MapStream {
     slot: watch::Receiver<Slot>,
-    /// `Slot::made` and `Slot::left_out` at the previous look; `None` before the first.
-    seen: Option<(u64, u64)>,
+    /// `Slot::made` at the previous look; `None` before the first.
+    seen: Option<Made>,
     /// The map given last, until it is told as stale.
     fresh: Option<MapView>,
     task: JoinHandle<()>,
@@ -48,11 +51,30 @@ pub struct MapStream {
 #[derive(Debug, Default)]
 struct Slot {
     newest: Option<MapView>,
-    /// Maps since the start of the stream, those that were skipped included.
-    made: u64,
-    /// Maps left out since then at the reader's wish.
-    left_out: u64,
+    made: Made,
     ended: Option<ClientError>,
+}
+
+/// Maps since the start of the stream.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Made {
+    /// Those given and those skipped.
+    maps: u64,
+    /// Of the skipped ones, those that the link lost.
+    lost: u64,
+    /// Those left out at the reader's wish.
+    left_out: u64,
+}
+
+/// Maps between one map and the one before.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Between {
+    /// Not seen by this reader.
+    pub skipped: u64,
+    /// Those of them that the link lost.
+    pub lost: u64,
+    /// Not wanted by this reader.
+    pub left_out: u64,
 }
 
 impl MapStream {
@@ -79,13 +101,14 @@ impl MapStream {
         loop {
             {
                 let slot = self.slot.borrow_and_update();
-                let made = (slot.made, slot.left_out);
+                let made = slot.made;
                 if let Some(map) = slot.newest.as_ref().filter(|_| self.seen != Some(made)) {
                     // The first look has missed nothing: the reader was not there before.
-                    let before = self.seen.unwrap_or((made.0 - 1, made.1));
+                    let before = self.seen.unwrap_or(Made { maps: made.maps - 1, ..made });
                     (self.seen, self.fresh) = (Some(made), Some(map.clone()));
-                    let (skipped, left_out) = (made.0 - before.0 - 1, made.1 - before.1);
-                    return Ok(Update { map: map.clone(), skipped, left_out });
+                    let skipped = made.maps - before.maps - 1;
+                    let (lost, left_out) = (made.lost - before.lost, made.left_out - before.left_out);
+                    return Ok(Update { map: map.clone(), skipped, lost, left_out });
                 }
                 if let Some(reason) = &slot.ended {
                     return Err(reason.clone());
@@ -116,7 +139,7 @@ impl MapStream {
             }
             map = gone_stale(given) => {
                 self.fresh = None;
-                Ok(Sight::Stale(Update { map, skipped: 0, left_out: 0 }))
+                Ok(Sight::Stale(Update { map, skipped: 0, lost: 0, left_out: 0 }))
             }
         }
     }
@@ -157,9 +180,9 @@ pub(crate) struct Feed {
 }
 
 impl Feed {
-    /// Makes a map the newest; between it and the one before lie `skipped` maps, and `left_out` ones that the reader did not
-    /// want. A map that is no newer than the newest of the same run of the server (a replayed one) is passed over.
-    pub(crate) fn put(&self, map: MapView, skipped: u64, left_out: u64) {
+    /// Makes a map the newest, with what lies between it and the one before. A map that is no newer than the newest of the
+    /// same run of the server (a replayed one) is passed over.
+    pub(crate) fn put(&self, map: MapView, between: Between) {
         let map = map.arrived(&self.clock);
         self.slot.send_if_modified(|slot| {
             let of = |map: &MapView| (map.header().boot_id, map.sequence());
@@ -169,8 +192,9 @@ impl Feed {
                 .map(of)
                 .is_some_and(|(boot_id, newest)| boot_id == map.header().boot_id && newest >= map.sequence());
             if !is_old {
-                slot.made += 1 + skipped;
-                slot.left_out += left_out;
+                slot.made.maps += 1 + between.skipped;
+                slot.made.lost += between.lost;
+                slot.made.left_out += between.left_out;
                 slot.newest = Some(map);
             }
             !is_old
@@ -246,7 +270,7 @@ mod tests {
                 valid_until_ns: capture_end_ns + VALID_MS * MS,
                 ..Default::default()
             };
-            self.feed.put(MapView::decode(encode_header(&header)).expect("a map"), 0, 0);
+            self.feed.put(MapView::decode(encode_header(&header)).expect("a map"), Between::default());
         }
 
         /// What the stream says, waiting for it: (stale, sequence, age in ns).

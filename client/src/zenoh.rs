@@ -2,26 +2,52 @@
 //!
 //! In: a router's or server's endpoint. Out: the same [`MapView`], [`MapStream`] and [`Ingester`] as over gRPC. Needs tokio's
 //! multi-thread runtime: zenoh panics in a current-thread one.
+//!
+//! A session that loses its router or server looks for it until it is there again; streams go on then, and tell meanwhile that
+//! their map is stale. One layer a stream: each key is dropped and delivered by itself, and layers that must be of one
+//! moment come together over gRPC.
 
 use std::hash::{BuildHasher, Hasher};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bytes::Bytes;
 use clearway_proto::v1;
 use prost::Message;
-use zenoh::handlers::RingChannel;
+use zenoh::bytes::ZBytes;
 use zenoh::qos::CongestionControl;
-use zenoh::sample::SampleKind;
 use zenoh::{Config, Session};
 
 use crate::ClientError;
 use crate::freshness::Clock;
 use crate::ingest::{Deliver, Ear, Ingester};
-use crate::stream::{Feed, MapStream};
+use crate::stream::MapStream;
 use crate::view::MapView;
 
+mod tap;
+
+use tap::Tap;
+
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// What every session of ours has, whatever else its file says.
+const SETTINGS: [(&str, &str); 11] = [
+    ("mode", "'client'"),
+    ("listen/endpoints", "[]"),
+    ("scouting/multicast/enabled", "false"),
+    ("scouting/gossip/enabled", "false"),
+    ("connect/timeout_ms", "5000"),
+    // A planner has maps again a second after its router, at the latest.
+    ("connect/retry", "{ period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2 }"),
+    ("transport/unicast/open_timeout", "2000"),
+    // Who is gone without a word (a pulled cable) is noticed after 2 s, as over gRPC. Each side tells the other its own.
+    ("transport/link/tx/lease", "2000"),
+    // Far more than a map may have; what is longer is dropped before it is put together.
+    ("transport/link/rx/max_message_size", "16777216"),
+    // Some thirty maps: when a planner's machine halts, old maps wait here, and it reads through them when it goes on.
+    ("transport/link/tcp", "{ so_rcvbuf: 262144 }"),
+    ("transport/link/tls/so_rcvbuf", "262144"),
+];
 
 /// A session that reads maps.
 #[derive(Clone, Debug)]
@@ -41,17 +67,25 @@ impl ZenohClient {
     /// # Errors
     /// [`ClientError::Zenoh`] for what is no endpoint and where nobody answers.
     pub async fn connect(endpoint: &str) -> Result<Self, ClientError> {
-        let mut config = Config::default();
-        let settings = [
-            ("mode", "\"client\"".to_owned()),
-            ("connect/endpoints", format!("[{endpoint:?}]")),
-            ("connect/timeout_ms", ANSWER_TIMEOUT.as_millis().to_string()),
-            ("scouting/multicast/enabled", "false".to_owned()),
-            ("scouting/gossip/enabled", "false".to_owned()),
-        ];
-        for (key, value) in settings {
-            config.insert_json5(key, &value).map_err(failed(format!("endpoint {endpoint:?}")))?;
+        Self::open(endpoint, Config::default()).await
+    }
+
+    /// As [`ZenohClient::connect`], with a zenoh configuration (JSON5) to begin with: certificates for `tls/HOST:PORT`, as in
+    /// `deploy/zenoh/client.json5`.
+    ///
+    /// # Errors
+    /// [`ClientError::Zenoh`] also for a file that is none or cannot be read.
+    pub async fn connect_with(endpoint: &str, file: &Path) -> Result<Self, ClientError> {
+        let config = Config::from_file(file).map_err(failed(format!("configuration {}", file.display())))?;
+        Self::open(endpoint, config).await
+    }
+
+    async fn open(endpoint: &str, mut config: Config) -> Result<Self, ClientError> {
+        for (key, value) in SETTINGS {
+            config.insert_json5(key, value).map_err(failed(format!("{key} = {value}")))?;
         }
+        let endpoints = format!("[{endpoint:?}]");
+        config.insert_json5("connect/endpoints", &endpoints).map_err(failed(format!("endpoint {endpoint:?}")))?;
         let session = zenoh::open(config).await.map_err(failed(format!("connect to {endpoint}")))?;
         Ok(Self { session, endpoint: endpoint.into() })
     }
@@ -81,38 +115,24 @@ impl ZenohClient {
     /// What zenoh says, or what is wrong with the map.
     pub async fn newest(&self, vehicle: &str, layer: &str) -> Result<Option<MapView>, ClientError> {
         let key = format!("clearway/{vehicle}/map/{layer}");
-        let map = query(&self.session, &key).await?.map(MapView::decode).transpose()?;
+        let map = query(&self.session, &key).await?.map(|map| decode(&map)).transpose()?;
         Ok(map.map(|map| map.arrived(&Clock::default())))
     }
 
-    /// Streams one layer of one vehicle, beginning with the newest map there is.
+    /// Streams one layer of one vehicle, beginning with the newest map there is (or the next one, where there is none yet).
+    /// It does not end with the server: [`MapStream::next_or_stale`] tells that its map is stale, and goes on with the maps
+    /// of the next server.
     ///
     /// # Errors
     /// What zenoh says.
     pub async fn subscribe(&self, vehicle: &str, layer: &str) -> Result<MapStream, ClientError> {
         let key = format!("clearway/{vehicle}/map/{layer}");
-        // Of one: the default queue of 256 would hand a slow planner maps that are seconds old.
-        let subscriber = self.session.declare_subscriber(key.clone()).with(RingChannel::new(1));
-        let subscriber = subscriber.await.map_err(failed(format!("subscribe to {key}")))?;
-        let first = query(&self.session, &key).await?;
-        // The session closes with its last clone, and takes the subscriber along: the stream keeps one.
+        let tap = Tap::open(&self.session, &key).await.map_err(failed(format!("subscribe to {key}")))?;
+        // The session closes with its last clone, and takes the tap along: the stream keeps one.
         let Self { session, endpoint: address } = self.clone();
         Ok(MapStream::spawn(move |feed| async move {
             let _session = session;
-            let mut last = None;
-            if let Some(bytes) = first
-                && let Err(error) = offer(&feed, &mut last, bytes)
-            {
-                return error;
-            }
-            loop {
-                let Ok(sample) = subscriber.recv_async().await else { return ClientError::Ended { address } };
-                if sample.kind() == SampleKind::Put
-                    && let Err(error) = offer(&feed, &mut last, sample.payload().to_bytes().into_owned().into())
-                {
-                    return error;
-                }
-            }
+            tap.run(feed).await.err().unwrap_or(ClientError::Ended { address })
         }))
     }
 }
@@ -151,6 +171,8 @@ impl ZenohClient {
             Box::pin(async move {
                 // Held until the last observation is on its way.
                 let _reports = reports;
+                // Blocks, for no observation may be lost; who waits is the sender alone. All of one priority, zenoh's
+                // ordinary one: it keeps the order only within one, and the server counts holes in the numbers.
                 let put = session.put(&key, bytes).congestion_control(CongestionControl::Block);
                 put.await.map_err(failed(format!("put {key}")))
             })
@@ -174,27 +196,16 @@ fn key_of(prefix: &str, observation: &v1::Observation) -> String {
     key.trim_end_matches('/').to_owned()
 }
 
-/// Puts a map that is newer than the last; the holes in the sequence are the skipped ones. Another boot id is another
-/// run of the server, whose sequence begins anew.
-fn offer(feed: &Feed, last: &mut Option<(u64, u64)>, bytes: Bytes) -> Result<(), ClientError> {
-    let map = MapView::decode(bytes)?;
-    let (boot_id, sequence) = (map.header().boot_id, map.sequence());
-    let skipped = match *last {
-        Some((boot, seen)) if boot == boot_id && sequence <= seen => return Ok(()),
-        Some((boot, seen)) if boot == boot_id => sequence - seen - 1,
-        _ => 0,
-    };
-    *last = Some((boot_id, sequence));
-    feed.put(map, skipped, 0);
-    Ok(())
-}
-
-async fn query(session: &Session, key: &str) -> Result<Option<Bytes>, ClientError> {
+async fn query(session: &Session, key: &str) -> Result<Option<ZBytes>, ClientError> {
     let replies = session.get(key).timeout(ANSWER_TIMEOUT).await.map_err(failed(format!("get {key}")))?;
     while let Ok(reply) = replies.recv_async().await {
         if let Ok(sample) = reply.result() {
-            return Ok(Some(sample.payload().to_bytes().into_owned().into()));
+            return Ok(Some(sample.payload().clone()));
         }
     }
     Ok(None)
+}
+
+fn decode(payload: &ZBytes) -> Result<MapView, ClientError> {
+    MapView::decode(payload.to_bytes().into_owned().into())
 }

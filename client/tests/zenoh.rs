@@ -2,26 +2,63 @@
 
 mod common;
 
-use clearway_client::ZenohClient;
-use common::{CAPTURE_END_NS, map};
+use std::sync::Arc;
 
-#[tokio::test(flavor = "multi_thread")]
-async fn a_stream_begins_with_the_newest_map_goes_on_and_outlives_its_client() {
+use bytes::Bytes;
+use clearway_client::{MapStream, Sight, Update, ZenohClient, now_ns, v1};
+use common::{CAPTURE_END_NS, map};
+use prost::Message;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{RwLock, watch};
+use zenoh::Session;
+use zenoh::sample::SourceInfo;
+use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig, z_serialize};
+
+const KEY: &str = "clearway/alpha/map/drivability";
+
+async fn server() -> (Session, String) {
     let mut config = zenoh::Config::default();
     config.insert_json5("listen/endpoints", "[\"tcp/127.0.0.1:0\"]").unwrap();
     config.insert_json5("scouting/multicast/enabled", "false").unwrap();
     config.insert_json5("scouting/gossip/enabled", "false").unwrap();
+    config.insert_json5("transport/link/tx/lease", "2000").unwrap();
     let server = zenoh::open(config).await.unwrap();
     let endpoint = server.info().locators().await.first().unwrap().to_string();
-    let key = "clearway/alpha/map/drivability";
+    (server, endpoint)
+}
+
+/// As the server publishes.
+async fn publisher(server: &Session) -> AdvancedPublisher<'static> {
+    let publisher = server.declare_publisher(KEY).cache(CacheConfig::default().max_samples(1));
+    let misses = publisher.sample_miss_detection(MissDetectionConfig::default());
+    misses.publisher_detection().await.unwrap()
+}
+
+/// Waits until somebody subscribes.
+async fn matched(publisher: &zenoh::pubsub::Publisher<'_>) {
+    let matching = publisher.matching_listener().await.unwrap();
+    while !publisher.matching_status().await.unwrap().matching() {
+        matching.recv_async().await.unwrap();
+    }
+}
+
+async fn next(maps: &mut MapStream) -> (u64, u64, u64) {
+    let Update { map, skipped, lost, .. } = maps.next().await.unwrap();
+    (map.sequence(), skipped, lost)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stream_begins_with_the_newest_map_goes_on_and_outlives_its_client() {
+    let (server, endpoint) = server().await;
     let _token = server.liveliness().declare_token("clearway/alpha").await.unwrap();
-    let queries = server.declare_queryable(key).await.unwrap();
+    let queries = server.declare_queryable(KEY).await.unwrap();
     tokio::spawn(async move {
         while let Ok(query) = queries.recv_async().await {
-            query.reply(key, map(41, CAPTURE_END_NS)).await.unwrap();
+            query.reply(KEY, map(41, CAPTURE_END_NS)).await.unwrap();
         }
     });
-    let publisher = server.declare_publisher(key).await.unwrap();
+    let publisher = publisher(&server).await;
+    publisher.put(map(41, CAPTURE_END_NS)).await.unwrap();
 
     let client = ZenohClient::connect(&endpoint).await.unwrap();
     assert_eq!(client.vehicles().await.unwrap(), ["alpha"]);
@@ -29,8 +66,7 @@ async fn a_stream_begins_with_the_newest_map_goes_on_and_outlives_its_client() {
     assert!(client.newest("alpha", "roughness").await.unwrap().is_none());
     let mut maps = client.subscribe("alpha", "drivability").await.unwrap();
     drop(client);
-    let first = maps.next().await.unwrap();
-    assert_eq!((first.map.sequence(), first.skipped), (41, 0));
+    assert_eq!(next(&mut maps).await, (41, 0, 0));
 
     // The subscription may reach the publisher after the answer did.
     let matching = publisher.matching_listener().await.unwrap();
@@ -39,6 +75,149 @@ async fn a_stream_begins_with_the_newest_map_goes_on_and_outlives_its_client() {
     }
     publisher.put(map(40, CAPTURE_END_NS)).await.unwrap();
     publisher.put(map(44, CAPTURE_END_NS)).await.unwrap();
-    let second = maps.next().await.unwrap();
-    assert_eq!((second.map.sequence(), second.skipped), (44, 2), "an old map is passed over, holes are counted");
+    assert_eq!(next(&mut maps).await, (44, 2, 0), "an old map is passed over, holes are counted");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn of_the_skipped_maps_those_the_link_lost_are_told_and_a_lost_last_one_is_asked_for() {
+    let (server, endpoint) = server().await;
+    let queries = server.declare_queryable(KEY).await.unwrap();
+    let maps = server.declare_publisher(KEY).await.unwrap();
+    let heartbeat = format!("{KEY}/@adv/pub/{}/{}/_", maps.id().zid(), maps.id().eid());
+    let heartbeats = server.declare_publisher(heartbeat).await.unwrap();
+    let client = ZenohClient::connect(&endpoint).await.unwrap();
+    let mut stream = client.subscribe("alpha", "drivability").await.unwrap();
+    matched(&maps).await;
+    matched(&heartbeats).await;
+
+    // What a publisher numbers; the numbers that are left out were lost.
+    let put = async |number: u32, sequence: u64| {
+        let put = maps.put(map(sequence, CAPTURE_END_NS)).source_info(SourceInfo::new(maps.id(), number));
+        put.await.unwrap();
+    };
+    put(0, 41).await;
+    assert_eq!(next(&mut stream).await, (41, 0, 0));
+    put(2, 43).await;
+    assert_eq!(next(&mut stream).await, (43, 1, 1), "lost is one of those skipped");
+    put(3, 46).await;
+    assert_eq!(next(&mut stream).await, (46, 2, 0), "two were never put");
+
+    heartbeats.put(z_serialize(&3_u32)).await.unwrap();
+    heartbeats.put(z_serialize(&4_u32)).await.unwrap();
+    let query = queries.recv_async().await.unwrap();
+    query.reply(KEY, map(47, CAPTURE_END_NS)).await.unwrap();
+    drop(query);
+    assert_eq!(next(&mut stream).await, (47, 0, 0), "the last map came late, and is not lost");
+    put(5, 48).await;
+    assert_eq!(next(&mut stream).await, (48, 0, 0));
+    assert!(matches!(queries.try_recv(), Ok(None)), "nobody asks without a reason");
+}
+
+/// A wire between client and server that the test cuts, and lays to another server.
+struct Wire {
+    endpoint: String,
+    /// Where it leads; `None` while it is cut: then nothing passes, and nobody is told.
+    to: watch::Sender<Option<String>>,
+    /// Read while something may pass.
+    passing: Arc<RwLock<()>>,
+}
+
+impl Wire {
+    async fn lay(to: &str) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let endpoint = format!("tcp/{}", listener.local_addr().unwrap());
+        let (to, leads) = watch::channel(Some(to.replace("tcp/", "")));
+        let passing = Arc::new(RwLock::new(()));
+        tokio::spawn({
+            let passing = passing.clone();
+            async move {
+                while let Ok((near, _)) = listener.accept().await {
+                    tokio::spawn(pass(near, leads.clone(), passing.clone()));
+                }
+            }
+        });
+        Self { endpoint, to, passing }
+    }
+
+    async fn cut(&self) {
+        self.to.send_replace(None);
+        let _nothing_passes = self.passing.write().await;
+    }
+
+    fn lay_to(&self, to: &str) {
+        self.to.send_replace(Some(to.replace("tcp/", "")));
+    }
+}
+
+/// Carries one connection until it is cut.
+async fn pass(mut near: TcpStream, mut leads: watch::Receiver<Option<String>>, passing: Arc<RwLock<()>>) {
+    let to = leads.borrow_and_update().clone();
+    if let Some(to) = to {
+        let _passing = passing.read().await;
+        let Ok(mut far) = TcpStream::connect(to).await else { return };
+        tokio::select! {
+            _ = tokio::io::copy_bidirectional(&mut near, &mut far) => return,
+            _ = leads.changed() => {}
+        }
+    }
+    // Cut: held, and never read, until the test ends. Only the silence tells.
+    while leads.changed().await.is_ok() {}
+}
+
+/// Waits until the stream says that this map is stale; it must not end, and no other map may come.
+async fn goes_stale(maps: &mut MapStream, sequence: u64) {
+    loop {
+        match maps.next_or_stale().await.expect("a stream does not end with its server") {
+            Sight::Fresh(update) => assert_eq!(update.map.sequence(), sequence),
+            Sight::Stale(update) => {
+                assert_eq!(update.map.sequence(), sequence);
+                assert!(update.map.is_stale(now_ns()));
+                return;
+            }
+        }
+    }
+}
+
+/// A map of now that is fresh for a minute, however slow the machine.
+fn lasting(sequence: u64) -> Bytes {
+    let mut map = v1::Map::decode(map(sequence, now_ns())).unwrap();
+    map.header.as_mut().unwrap().valid_until_ns += 60_000_000_000;
+    map.encode_to_vec().into()
+}
+
+async fn is_fresh(maps: &mut MapStream) -> (u64, u64, u64) {
+    match maps.next_or_stale().await.expect("a stream does not end with its server") {
+        Sight::Fresh(Update { map, skipped, lost, .. }) => (map.sequence(), skipped, lost),
+        Sight::Stale(update) => panic!("map {} is told as stale", update.map.sequence()),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_cut_link_and_a_stopped_server_make_a_map_stale_and_the_stream_goes_on_when_they_are_back() {
+    let (first, endpoint) = server().await;
+    let published = publisher(&first).await;
+    let wire = Wire::lay(&endpoint).await;
+    let client = ZenohClient::connect(&wire.endpoint).await.unwrap();
+    let mut maps = client.subscribe("alpha", "drivability").await.unwrap();
+    published.put(map(0, now_ns())).await.unwrap();
+    goes_stale(&mut maps, 0).await;
+
+    wire.cut().await;
+    for sequence in 1..5 {
+        published.put(lasting(sequence)).await.unwrap();
+    }
+    wire.lay_to(&endpoint);
+    assert_eq!(is_fresh(&mut maps).await, (4, 3, 3), "the newest at once, and what was lost");
+
+    published.put(map(5, now_ns())).await.unwrap();
+    goes_stale(&mut maps, 5).await;
+    wire.cut().await;
+    first.close().await.unwrap();
+    let (second, endpoint) = server().await;
+    let published = publisher(&second).await;
+    published.put(lasting(9)).await.unwrap();
+    wire.lay_to(&endpoint);
+    assert_eq!(is_fresh(&mut maps).await, (9, 3, 0), "another publisher counts anew");
+    published.put(lasting(10)).await.unwrap();
+    assert_eq!(is_fresh(&mut maps).await, (10, 0, 0));
 }

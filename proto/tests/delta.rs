@@ -353,9 +353,16 @@ fn a_part_is_a_base_for_the_same_part_of_the_next_map() {
 
 #[test]
 fn the_fuzz_corpus_of_deltas_decodes_on_the_golden_base_or_is_refused() {
-    let base = decode_map(std::fs::read(golden("delta_base.bin")).unwrap().into(), &LIMITS()).unwrap();
+    let corpus = concat!(env!("CARGO_MANIFEST_DIR"), "/fuzz/corpus/decode_delta");
+    let read = |file: &str| std::fs::read(golden(file)).unwrap();
+    if std::env::var_os("CLEARWAY_BLESS").is_some() {
+        let delta = read("delta.bin");
+        let seeds = [("golden", &delta[..]), ("whole", &read("delta_whole.bin")), ("cut", &delta[..300])];
+        seeds.iter().for_each(|(name, seed)| std::fs::write(format!("{corpus}/{name}"), seed).unwrap());
+    }
+    let base = decode_map(read("delta_base.bin").into(), &LIMITS()).unwrap();
     let mut maps = Vec::new();
-    for entry in std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/fuzz/corpus/decode_delta")).unwrap() {
+    for entry in std::fs::read_dir(corpus).unwrap() {
         let path = entry.unwrap().path();
         if decode_map_on(std::fs::read(&path).unwrap().into(), Some(&base), &LIMITS()).is_ok() {
             maps.push(path.file_name().unwrap().to_owned());

@@ -71,8 +71,9 @@ impl Engine {
     /// Takes one event, without a thread: what [`Engine::start`] does with each.
     pub fn take(&mut self, Queued { event, ticket }: Queued) {
         let outcome = self.step(&event);
-        // Behind everything else: whoever hears that an event was taken finds its map.
+        // Behind everything else: whoever hears that an event was taken finds its map, and finds it counted.
         if let Some(ticket) = ticket {
+            self.rest();
             ticket.tell(Verdict::of(outcome));
         }
     }

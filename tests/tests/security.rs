@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::{Arc, OnceLock};
 
-use clearway_client::{Client, ClientError, Subscription, Tls};
+use clearway_client::{Client, ClientError, Subscription, Tls, ZenohClient};
 use clearway_server::config::{Access, Config, Tls as TlsConfig, ZenohMode};
 use clearway_server::replay::{Options, Summary, replay};
 use clearway_server::server::{Running, Server, Setup};
@@ -246,6 +246,10 @@ async fn behind_the_router_of_deploy_each_certificate_does_what_its_rules_allow(
 
     let key = "clearway/car/map/drivability";
     let maps = reader.declare_subscriber(key).await.unwrap();
+    let file = folder.path().join("client.json5");
+    std::fs::write(&file, zenoh_file("client.json5", &ours)).unwrap();
+    let planner = within("zenoh", ZenohClient::connect_with(&at, &file)).await.expect("a planner's session");
+    let mut planned = planner.subscribe("car", "drivability").await.unwrap();
     let nothing = unlisted.declare_subscriber(key).await.unwrap();
     // A certificate of the server's name may see everything: it is the judge of what the others put.
     let judge = zenoh_client(&at, "ours", "server").await.expect("a session");
@@ -260,6 +264,8 @@ async fn behind_the_router_of_deploy_each_certificate_does_what_its_rules_allow(
     .await;
     feed(&running, rest).await;
     within("the next map", maps.recv_async().into_future()).await.expect("a map");
+    within("the planner's map", planned.next()).await.expect("a map");
+    assert_eq!(planner.vehicles().await.unwrap(), ["car"]);
     ingester.put("clearway/car/map/drivability", "a false map").await.unwrap();
     ingester.put("clearway/car/ingest/pose", "something to refuse").await.unwrap();
     within("what the ingester may put", async {

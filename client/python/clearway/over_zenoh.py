@@ -31,6 +31,9 @@ def _session(endpoint: str) -> zenoh.Session:
     config.insert_json5("connect/timeout_ms", str(int(_ANSWER_S * 1000)))
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("scouting/gossip/enabled", "false")
+    # A session that loses its router has maps again a second after it, and notices within 2 s.
+    config.insert_json5("connect/retry", "{ period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2 }")
+    config.insert_json5("transport/link/tx/lease", "2000")
     try:
         return zenoh.open(config)
     except Exception as error:

@@ -9,6 +9,7 @@ import pytest
 
 import clearway
 from clearway import codec
+from clearway.map import Map
 from clearway.v1 import map_pb2
 
 GOLDEN = Path(__file__).resolve().parents[3] / "proto" / "golden"
@@ -51,7 +52,7 @@ def test_a_bad_map_is_refused_by_name(vector):
 
 
 def test_the_golden_map_told_by_class_is_the_one_told_cell_by_cell():
-    told, plain = (Map((GOLDEN / f"{name}.bin").read_bytes()) for name in ("by_class", "by_class_plain"))
+    told, plain = (clearway.Map((GOLDEN / f"{name}.bin").read_bytes()) for name in ("by_class", "by_class_plain"))
     channels = told["occupancy"].channels
     assert list(channels) == ["class", "hits", "unit_height", "difference"]
     for name, channel in channels.items():

@@ -67,7 +67,7 @@ fn line(update: &Update, as_json: bool) -> String {
         let document = json!({
             "vehicle": map.vehicle(), "sequence": map.sequence(), "age_ms": map.age_ms(now), "stale": map.is_stale(now),
             "drivable_share": share, "bytes": map.bytes().len(), "skipped": skipped,
-            "left_out": update.left_out,
+            "lost": update.lost, "left_out": update.left_out,
             "layers": map.layers().iter().map(|layer| &layer.name).collect::<Vec<_>>(),
         });
         return document.to_string();

@@ -23,8 +23,8 @@ pub struct Zenoh {
     pub scouting: bool,
     /// Maps as ROS 2 topics.
     pub ros2: Ros2,
-    /// A zenoh configuration (JSON5) to begin with: TLS, access control; the keys above stand over it. Empty: zenoh's own
-    /// defaults.
+    /// A zenoh configuration (JSON5) to begin with: TLS, access control; the keys above stand over it. Empty: zenoh's
+    /// defaults, with limits for what one peer may cost.
     pub file: PathBuf,
 }
 
