@@ -1,7 +1,7 @@
 //! A map as one reader asked for it: some layers, cut to a region, as deltas against the map the reader has.
 //!
-//! In: an [`EncodedMap`], a region in the ego frame, the map sent before. Out: the bytes of one `clearway.v1.Map`. Each layer
-//! is cut and compared once, for all readers that ask for the same, and never when nobody asks.
+//! In: an [`EncodedMap`], a region in the ego frame, the map sent before. Out: the bytes of one `clearway.v1.Map`. Each
+//! layer is cut and compared once, for all readers that ask for the same, and never when nobody asks.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, OnceLock};
@@ -55,8 +55,8 @@ impl PartialEq for Cuts {
 }
 
 impl EncodedMap {
-    /// The encoded map with these layers (every layer where none is named), cut to `region`, each as a delta against that of
-    /// `base` where that is shorter.
+    /// The encoded map with these layers (every layer where none is named), cut to `region`, each as a delta against
+    /// that of `base` where that is shorter.
     ///
     /// # Errors
     /// The region lies outside a layer's grid.

@@ -132,7 +132,8 @@ struct ReplayArguments {
     /// Overrides a key of the configuration.
     #[arg(long, value_name = "KEY=VALUE", requires = "config")]
     set: Vec<String>,
-    /// Publish the maps, until SIGINT or SIGTERM. They keep the stamps of their capture, so readers call old ones stale.
+    /// Publish the maps, until SIGINT or SIGTERM. They keep the stamps of their capture, so readers call old ones
+    /// stale.
     #[arg(long)]
     serve: bool,
     /// Whose journal (of a recording) or configuration is used, where there are several.
@@ -142,7 +143,8 @@ struct ReplayArguments {
 
 #[derive(clap::Args)]
 struct EvaluateArguments {
-    /// Folders with .bin and .label files of the same names, or sim:flat, sim:slopes, sim:canopy, sim:overhang, sim:town.
+    /// Folders with .bin and .label files of the same names, or sim:flat, sim:slopes, sim:canopy, sim:overhang,
+    /// sim:town.
     #[arg(required = true, value_name = "PATH")]
     paths: Vec<String>,
     /// One object on stdout.

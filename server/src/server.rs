@@ -351,7 +351,8 @@ impl Running {
         self.recorder.as_ref().map(|recorder| recorder.counts().to_proto().file)
     }
 
-    /// Ends it all: no more readings, every event taken processed and recorded, the recording finished, the readers told.
+    /// Ends it all: no more readings, every event taken processed and recorded, the recording finished, the readers
+    /// told.
     ///
     /// # Errors
     /// [`EndError`] where an engine had died or the recording is not whole; everything has ended all the same.

@@ -1,13 +1,14 @@
 //! A map's layer against points whose truth is known: counts that add up over frames, and the shares they make.
 //!
-//! In: a [`Layer`] and [`Point`]s, both in the ego frame of one stamp. Out: a [`Tally`]. Pure: where the truth comes from
-//! (labels, a simulated world) is not known here.
+//! In: a [`Layer`] and [`Point`]s, both in the ego frame of one stamp. Out: a [`Tally`]. Pure: where the truth comes
+//! from (labels, a simulated world) is not known here.
 //!
 //! A cell's truth is voted by the points in it, those higher than 2.5 m over the ground left out: an obstacle's point
 //! makes it an obstacle; else the most frequent of forbidden, either and drivable wins; a tie goes to the former.
-//! Precision is the share of the cells called drivable, and seen by a point, that are neither obstacle nor forbidden; recall
-//! the share of the drivable cells that are called so. A point is called ground where its cell is called drivable and it
-//! lies at most [`GROUND_OVER_LOWEST_M`] over the cell's lowest point; points beyond the layer's grid are not scored.
+//! Precision is the share of the cells called drivable, and seen by a point, that are neither obstacle nor forbidden;
+//! recall the share of the drivable cells that are called so. A point is called ground where its cell is called
+//! drivable and it lies at most [`GROUND_OVER_LOWEST_M`] over the cell's lowest point; points beyond the layer's grid
+//! are not scored.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -135,8 +136,8 @@ impl Tally {
         share(self.road.1, self.road.0)
     }
 
-    /// Adds what `layer` does with the points of its frame; `false`, and nothing added, where none of its classes lets a
-    /// vehicle pass.
+    /// Adds what `layer` does with the points of its frame; `false`, and nothing added, where none of its classes lets
+    /// a vehicle pass.
     pub fn add(&mut self, layer: &Layer, points: &[Point]) -> bool {
         let Some(called) = called(layer) else { return false };
         let cell_of = locate(&layer.geometry);

@@ -135,8 +135,8 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
 
 type Configured = (Config, Calibrations, Option<u64>, bool);
 
-/// The configuration, the calibration tables, the boot id to keep, and whether the extrinsics are known: from `--config`,
-/// else from the recording itself, else plain.
+/// The configuration, the calibration tables, the boot id to keep, and whether the extrinsics are known: from
+/// `--config`, else from the recording itself, else plain.
 fn configured(options: &Options, recorded: Option<&Path>) -> Result<Configured, ReplayError> {
     let pick = |config: &mut Config, tables: &mut Calibrations| {
         let index = match &options.vehicle {
@@ -190,7 +190,8 @@ fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
     }
 }
 
-/// The vehicle's sensors as the transforms of a ROS bag place them. An only one is `top`, several are named by their frames.
+/// The vehicle's sensors as the transforms of a ROS bag place them. An only one is `top`, several are named by their
+/// frames.
 fn sensors_of(choice: &Choice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
     let mut sensors: Vec<SensorConfig> = Vec::new();
     for (index, sensor) in choice.sensors.iter().enumerate() {

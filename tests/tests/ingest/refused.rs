@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use bytes::Bytes;
-use clearway_client::{ClientError, Ingester, Observation};
 use clearway_client::observation::by_reason;
+use clearway_client::{ClientError, Ingester, Observation};
 use clearway_proto::packed::pack;
 use clearway_proto::v1;
 use clearway_server::verify::verify;
