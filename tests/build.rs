@@ -1,7 +1,8 @@
 //! Finds the recorded drives, for the tests of every crate that names this file as its build script.
 //!
 //! `$CLEARWAY_DATA`, else `shared/data` beside the repository, if it holds an `INDEX.md`. Then `cfg(clearway_data)` is
-//! set and `env!("CLEARWAY_DATA")` is the path; else that is empty, and the tests that need it report themselves ignored.
+//! set and `env!("CLEARWAY_DATA")` is the path; else that is empty, and the tests that need it report themselves
+//! ignored.
 
 use std::env;
 use std::path::{Path, PathBuf};

@@ -1,16 +1,16 @@
 //! How old a map is, by two clocks.
 //!
-//! In: this machine's wall clock, which the server's stamps are compared with, and a steady one that only goes forward. Out:
-//! the least age a map can have. Age counts from the end of the capture, which only the wall clock can tell; but a wall
-//! clock can be set back. So a map is at least as old as it was when it came, and the time since by the steady clock: no step
-//! of the wall clock makes a stale map fresh.
+//! In: this machine's wall clock, which the server's stamps are compared with, and a steady one that only goes forward.
+//! Out: the least age a map can have. Age counts from the end of the capture, which only the wall clock can tell; but a
+//! wall clock can be set back. So a map is at least as old as it was when it came, and the time since by the steady
+//! clock: no step of the wall clock makes a stale map fresh.
 
 use std::fmt;
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-/// How often a stream that waits looks at its clocks: a map is told as stale at most this late, and no step of the wall clock
-/// goes unseen for longer. A fraction of the 50 ms that planners are promised.
+/// How often a stream that waits looks at its clocks: a map is told as stale at most this late, and no step of the wall
+/// clock goes unseen for longer. A fraction of the 50 ms that planners are promised.
 pub(crate) const LOOK: Duration = Duration::from_millis(20);
 
 static START: LazyLock<Instant> = LazyLock::new(Instant::now);

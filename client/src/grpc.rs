@@ -89,8 +89,9 @@ impl Client {
     /// Connects to `HOST:PORT` or `https://HOST:PORT` with certificates.
     ///
     /// # Errors
-    /// [`ClientError::Address`] for what is no address or no certificate, [`ClientError::Unreachable`] where nobody answers
-    /// or one side does not believe the other; a client the server does not know may hear of it at its first call only.
+    /// [`ClientError::Address`] for what is no address or no certificate, [`ClientError::Unreachable`] where nobody
+    /// answers or one side does not believe the other; a client the server does not know may hear of it at its first
+    /// call only.
     pub async fn connect_tls(address: &str, tls: &Tls) -> Result<Self, ClientError> {
         Self::open(address, Some(tls)).await
     }
@@ -214,9 +215,9 @@ impl Tls {
     }
 }
 
-/// Takes every update, acknowledges it, and says in the end why there are no more. A delta against a map that is not here (an
-/// update was lost) is not shown: a whole map is asked for. All that was not shown counts as skipped, but for what the reader
-/// did not want.
+/// Takes every update, acknowledges it, and says in the end why there are no more. A delta against a map that is not
+/// here (an update was lost) is not shown: a whole map is asked for. All that was not shown counts as skipped, but for
+/// what the reader did not want.
 async fn follow(
     feed: Feed,
     address: String,

@@ -89,8 +89,8 @@ impl Ingester {
     /// Sends an observation and gives its number; waits while too many are on their way.
     ///
     /// # Errors
-    /// How the stream has ended: [`ClientError::Refused`] for a sensor nobody knows, listing the known ones, or a message
-    /// that is too long; [`ClientError::Unreachable`], or [`ClientError::Silent`] where no report comes.
+    /// How the stream has ended: [`ClientError::Refused`] for a sensor nobody knows, listing the known ones, or a
+    /// message that is too long; [`ClientError::Unreachable`], or [`ClientError::Silent`] where no report comes.
     pub async fn send(&mut self, observation: Observation) -> Result<u64, ClientError> {
         let number = self.sent + 1;
         self.acknowledged(number.saturating_sub(IN_FLIGHT_MAX)).await?;

@@ -1,5 +1,5 @@
-//! What a planner uses: the newest map with its age, and what lies at a point in metres; and what a vehicle uses to send
-//! its scans, poses and roads.
+//! What a planner uses: the newest map with its age, and what lies at a point in metres; and what a vehicle uses to
+//! send its scans, poses and roads.
 //!
 //! ```no_run
 //! use clearway_client::{Client, Subscription, now_ns};

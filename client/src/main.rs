@@ -1,5 +1,5 @@
-//! The command `clearway`: watch, get and export maps, look into recordings and captures, send captures, scans, poses and
-//! roads.
+//! The command `clearway`: watch, get and export maps, look into recordings and captures, send captures, scans, poses
+//! and roads.
 //!
 //! Exit codes: 0 fine, 1 failure, 2 usage.
 

@@ -7,9 +7,9 @@ use clearway_proto::v1;
 
 pub use clearway_proto::v1::{RoadFrame, RoadPurpose, Sensor};
 
-/// One scan, ego pose, road, or handful of packets, ready to be sent. Stamps are ns since the Unix epoch, frames REP-103
-/// (x forward, y left, z up), lengths metres. Lists are not checked here: the server refuses what does not fit together,
-/// and says why.
+/// One scan, ego pose, road, or handful of packets, ready to be sent. Stamps are ns since the Unix epoch, frames
+/// REP-103 (x forward, y left, z up), lengths metres. Lists are not checked here: the server refuses what does not fit
+/// together, and says why.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Observation(pub(crate) v1::Observation);
 
@@ -47,7 +47,8 @@ impl Observation {
         self.with_scan(|scan| scan.offset_ns = pack(offsets_ns))
     }
 
-    /// When each column was seen, ns after the scan's stamp, and how many points it has: the points lie column by column.
+    /// When each column was seen, ns after the scan's stamp, and how many points it has: the points lie column by
+    /// column.
     pub fn columns(mut self, offsets_ns: &[i32], points: &[u16]) -> Self {
         if let Some(v1::observation::Body::Scan(_)) = self.0.body {
             self.0.columns = Some(v1::Columns { offset_ns: pack(offsets_ns), points: pack(points) });
@@ -93,8 +94,8 @@ impl Observation {
         Self::of(sensor, v1::observation::Body::Packets(packets))
     }
 
-    /// A sensor that the server's configuration does not name; from here on it is known by its name. The same again changes
-    /// nothing.
+    /// A sensor that the server's configuration does not name; from here on it is known by its name. The same again
+    /// changes nothing.
     pub fn declare(sensor: Sensor) -> Self {
         Self::of("", v1::observation::Body::Declaration(sensor))
     }

@@ -1,8 +1,8 @@
 //! Updates, as fast as they come, to the newest map, as fast as it is asked for.
 //!
 //! In: maps from a background task. Out: the newest one, with the number of those in between. A reader that is
-//! slow, or that only looks now and then, never gets an old map from a queue: there is none. And a reader that waits is told
-//! when the map it has becomes stale, also where nothing comes any more.
+//! slow, or that only looks now and then, never gets an old map from a queue: there is none. And a reader that waits is
+//! told when the map it has becomes stale, also where nothing comes any more.
 
 use std::time::Duration;
 
@@ -20,8 +20,8 @@ pub struct Update {
     pub map: MapView,
     /// Maps made since the previous look and not seen by this reader: it, or its link, was slow.
     pub skipped: u64,
-    /// Those of the skipped ones that got lost on the link (zenoh drops what a congested or cut link does not take); over gRPC
-    /// the server skips instead, and this is 0.
+    /// Those of the skipped ones that got lost on the link (zenoh drops what a congested or cut link does not take);
+    /// over gRPC the server skips instead, and this is 0.
     pub lost: u64,
     /// Maps made since the previous look that [`crate::Subscription::max_rate_hz`] left out.
     pub left_out: u64,
@@ -32,8 +32,8 @@ pub struct Update {
 pub enum Sight {
     /// A new map, which may be used.
     Fresh(Update),
-    /// A map that must not be used: the one given last has become too old and no newer one is there, or a new one came too
-    /// late.
+    /// A map that must not be used: the one given last has become too old and no newer one is there, or a new one came
+    /// too late.
     Stale(Update),
 }
 
@@ -120,8 +120,8 @@ impl MapStream {
         }
     }
 
-    /// Waits for a map newer than the one given last, or until that one is stale, which is told once, at most 20 ms late, by
-    /// this machine's clocks and whether or not anything comes.
+    /// Waits for a map newer than the one given last, or until that one is stale, which is told once, at most 20 ms
+    /// late, by this machine's clocks and whether or not anything comes.
     ///
     /// # Errors
     /// As [`MapStream::next`].
@@ -180,8 +180,8 @@ pub(crate) struct Feed {
 }
 
 impl Feed {
-    /// Makes a map the newest, with what lies between it and the one before. A map that is no newer than the newest of the
-    /// same run of the server (a replayed one) is passed over.
+    /// Makes a map the newest, with what lies between it and the one before. A map that is no newer than the newest of
+    /// the same run of the server (a replayed one) is passed over.
     pub(crate) fn put(&self, map: MapView, between: Between) {
         let map = map.arrived(&self.clock);
         self.slot.send_if_modified(|slot| {
@@ -289,8 +289,8 @@ mod tests {
             self.stream.next_or_stale().now_or_never().is_none()
         }
 
-        /// Nothing comes any more; the map that was captured 40 ms before it came is told as stale after its last nanosecond,
-        /// and once.
+        /// Nothing comes any more; the map that was captured 40 ms before it came is told as stale after its last
+        /// nanosecond, and once.
         async fn goes_stale(&mut self, sequence: u64) {
             self.pass(260 * MS);
             assert!(self.is_silent(), "in its last nanosecond it may be used");

@@ -82,8 +82,8 @@ impl MapView {
         })
     }
 
-    /// Age at `now_ns`, ns, from the end of the capture. Of a map from a server at least its age when it came and the time
-    /// since, so that no step of the clock makes it younger; else negative where `now_ns` is before the capture.
+    /// Age at `now_ns`, ns, from the end of the capture. Of a map from a server at least its age when it came and the
+    /// time since, so that no step of the clock makes it younger; else negative where `now_ns` is before the capture.
     pub fn age_ns(&self, now_ns: i64) -> i64 {
         let by_wall_ns = now_ns.saturating_sub(self.map.header.capture_end_ns);
         self.arrival.as_ref().map_or(by_wall_ns, |arrival| arrival.age_ns_min().max(by_wall_ns))

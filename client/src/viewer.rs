@@ -1,7 +1,7 @@
 //! Maps for other people's planners and viewers: ROS 2 and Foxglove messages of one [`MapView`].
 //!
-//! Frames: grids and points in `<vehicle>/base_link`, the ego frame; where poses are known, that frame in `map`. Every stamp
-//! is the end of the capture.
+//! Frames: grids and points in `<vehicle>/base_link`, the ego frame; where poses are known, that frame in `map`. Every
+//! stamp is the end of the capture.
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 

@@ -174,8 +174,8 @@ fn files_of_no_kind_known_are_refused_and_wrong_usage_is_another_exit_code() {
 const CONFIG: &str = "[[vehicle]]\nname = 'alpha'\nqueue = 16\n[[vehicle.sensor]]\nname = 'top'\nmodel = 'hdl64e_s2'\n\
     [vehicle.sensor.extrinsics]\nx_m = 0.5\ny_m = 0.0\nz_m = 1.9\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n";
 
-/// A journal of some turns of a simulated vehicle and three maps of a vehicle at rest that looks to its left, as the server
-/// lays them out. Gives the bytes of the points of each turn.
+/// A journal of some turns of a simulated vehicle and three maps of a vehicle at rest that looks to its left, as the
+/// server lays them out. Gives the bytes of the points of each turn.
 fn record_drive(path: &Path) -> Vec<usize> {
     let mut writer = mcap::WriteOptions::new().compression_threads(0).create(File::create(path).unwrap()).unwrap();
     let (name, data) = ("config.toml".to_owned(), CONFIG.as_bytes().into());

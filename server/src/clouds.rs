@@ -1,8 +1,8 @@
 //! Revolutions -> one binary PCD file (v0.7) each, `<revolution>.pcd`, points in the sensor's frame, metres.
 //!
 //! Fields, little-endian and without padding: x y z intensity (f32; intensity 0 to 255 as the sensor reports it), ring
-//! (u16, 0 lowest), laser (u16, firing order), time (f32, seconds since the revolution's first firing), return_type (u8,
-//! 1 strongest, 2 last, 3 both in one). Points in firing order, within a firing by laser, strongest before last.
+//! (u16, 0 lowest), laser (u16, firing order), time (f32, seconds since the revolution's first firing), return_type
+//! (u8, 1 strongest, 2 last, 3 both in one). Points in firing order, within a firing by laser, strongest before last.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};

@@ -84,8 +84,8 @@ pub struct Tls {
     pub client_ca: Option<PathBuf>,
 }
 
-/// `[grpc.access]`: names in client certificates (common name or DNS name), by what their bearers may do. Whoever is in no
-/// list may do nothing.
+/// `[grpc.access]`: names in client certificates (common name or DNS name), by what their bearers may do. Whoever is in
+/// no list may do nothing.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Access {
@@ -93,7 +93,7 @@ pub struct Access {
     pub readers: Vec<String>,
     /// May send scans, poses, roads and packets.
     pub ingesters: Vec<String>,
-    /// May do both, and control recordings.
+    /// May do both.
     pub operators: Vec<String>,
 }
 
@@ -396,8 +396,8 @@ impl Config {
         Ok(())
     }
 
-    /// Reads the files of `[grpc.tls]`; `None` where there is no such table. Relative paths start at the configuration's
-    /// folder, `file`'s parent.
+    /// Reads the files of `[grpc.tls]`; `None` where there is no such table. Relative paths start at the
+    /// configuration's folder, `file`'s parent.
     ///
     /// # Errors
     /// [`ConfigError::File`] with what is wrong.

@@ -1,10 +1,10 @@
 //! A map as one reader asked for it: some layers, cut to a region, as deltas against the map the reader has.
 //!
-//! In: an [`EncodedMap`], a region in the ego frame, the map sent before. Out: the bytes of one `clearway.v1.Map`. Each layer
-//! is cut and compared once, for all readers that ask for the same, and never when nobody asks.
+//! In: an [`EncodedMap`], a region in the ego frame, the map sent before. Out: the bytes of one `clearway.v1.Map`. Each
+//! layer is cut and compared once, for all readers that ask for the same, and never when nobody asks.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock};
 
 use bytes::{Bytes, BytesMut};
 use clearway_proto::codec::Limits;
@@ -14,6 +14,7 @@ use clearway_proto::region::{RegionError, crop};
 use clearway_proto::v1;
 use prost::Message;
 
+use crate::ingest::locked;
 use crate::wire::EncodedMap;
 
 /// What readers with regions of their own may keep in memory, beside the map: more are made again for each.
@@ -31,7 +32,7 @@ type Made = OnceLock<Result<Bytes, RegionError>>;
 
 impl Cuts {
     fn slot(&self, key: Key) -> Arc<Made> {
-        let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut kept = locked(&self.0);
         match kept.get(&key) {
             Some(slot) => slot.clone(),
             None if kept.len() >= KEPT_MAX => Arc::default(),
@@ -54,8 +55,8 @@ impl PartialEq for Cuts {
 }
 
 impl EncodedMap {
-    /// The encoded map with these layers (every layer where none is named), cut to `region`, each as a delta against that of
-    /// `base` where that is shorter.
+    /// The encoded map with these layers (every layer where none is named), cut to `region`, each as a delta against
+    /// that of `base` where that is shorter.
     ///
     /// # Errors
     /// The region lies outside a layer's grid.

@@ -1,8 +1,8 @@
-//! Which layers of a vehicle somebody takes, over gRPC, zenoh or the page.
+//! Which layers of a vehicle somebody takes, over gRPC, zenoh, ROS 2, Foxglove or the page.
 //!
 //! In: readers that come and go. Out: a set the engine looks at before each event. A map that nobody takes and nobody
-//! records is not made ([`clearway_mapping::pipeline::Pipeline::want`]); one that is taken from now on comes with the next
-//! map, and at once where the newest was made for nobody.
+//! records is not made ([`clearway_mapping::pipeline::Pipeline::want`]); one that is taken from now on comes with the
+//! next map, and at once where the newest was made for nobody.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};

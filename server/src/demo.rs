@@ -1,5 +1,5 @@
-//! The whole house in one process, on loopback: a simulated vehicle sends real UDP datagrams in real time at a server of
-//! its own, and with many sensors scans, poses and roads over real gRPC; a line a second says what comes of them.
+//! The whole house in one process, on loopback: a simulated vehicle sends real UDP datagrams in real time at a server
+//! of its own, and with many sensors scans, poses and roads over real gRPC; a line a second says what comes of them.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
@@ -152,8 +152,8 @@ impl Summary {
     }
 }
 
-/// Drives until the duration has passed or `stop` resolves. `begun` is told where to look, `second` sees the newest map's
-/// server once a second. Needs a multi-thread tokio runtime.
+/// Drives until the duration has passed or `stop` resolves. `begun` is told where to look, `second` sees the newest
+/// map's server once a second. Needs a multi-thread tokio runtime.
 ///
 /// # Errors
 /// [`DemoError`]; nothing is left running.

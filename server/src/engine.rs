@@ -25,7 +25,8 @@ const LOOK_AROUND: Duration = Duration::from_millis(20);
 /// The newest map of one vehicle; `None` before the first.
 pub type Newest = Option<Arc<EncodedMap>>;
 
-/// The points of the newest map of one vehicle, ego frame, with their stamp; `None` before the first that somebody took.
+/// The points of the newest map of one vehicle, ego frame, with their stamp; `None` before the first that somebody
+/// took.
 pub type NewestSweep = Option<Arc<(i64, Sweep)>>;
 
 /// Sees the pipeline after each event that completed a revolution.
@@ -158,8 +159,8 @@ impl Engine {
         }
     }
 
-    /// Tells the pipeline which layers somebody takes. With a journal all are made: a replay knows nothing of the readers
-    /// there were.
+    /// Tells the pipeline which layers somebody takes. With a journal all are made: a replay knows nothing of the
+    /// readers there were.
     fn want(&mut self) {
         let (all, demand) = (self.journal.is_some(), &self.status.demand);
         self.pipeline.want(|layer| all || demand.is_taken(layer));

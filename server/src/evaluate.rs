@@ -1,7 +1,7 @@
 //! `clearway-server evaluate`: every map against the truth, of labelled scans and of simulated scenes.
 //!
-//! In: SemanticKITTI-style folders or files, or `sim:NAME`. Out: a [`Report`]. The scans and datagrams go through the real
-//! [`Pipeline`]; what its maps say is judged point by point and cell by cell.
+//! In: SemanticKITTI-style folders or files, or `sim:NAME`. Out: a [`Report`]. The scans and datagrams go through the
+//! real [`Pipeline`]; what its maps say is judged point by point and cell by cell.
 //!
 //! | file | in -> out |
 //! |---|---|
@@ -33,8 +33,8 @@ use judge::{Point, Tally};
 use pairs::Pair;
 use report::{Report, Source};
 
-/// How the sensor sits on KITTI's car, as its makers publish it. Published figures were measured with it, and an estimate
-/// from one scan leans with the road under it.
+/// How the sensor sits on KITTI's car, as its makers publish it. Published figures were measured with it, and an
+/// estimate from one scan leans with the road under it.
 const KITTI_EXTRINSICS: Extrinsics =
     Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.73, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
 /// A sensor that stands so much higher or lower over the ground it sees is another car's.

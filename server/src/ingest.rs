@@ -1,9 +1,9 @@
 //! The door: readings in, numbered [`Event`]s out, on one bounded queue a vehicle.
 //!
 //! Only this file (live and captured readings) and the recording's reader make an [`Event`]; nothing behind the queue
-//! can tell them apart. A live reading gets the clock's stamp here; a captured one brings its own. What does not become an
-//! event (the queue or the kernel's buffer was full, the sender is nobody's, the datagram too long) is counted, and the
-//! counts become [`Body::Lost`] events: the journal, and every replay of it, knows all that stayed outside.
+//! can tell them apart. A live reading gets the clock's stamp here; a captured one brings its own. What does not become
+//! an event (the queue or the kernel's buffer was full, the sender is nobody's, the datagram too long) is counted, and
+//! the counts become [`Body::Lost`] events: the journal, and every replay of it, knows all that stayed outside.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
@@ -158,8 +158,8 @@ impl Outside {
         }
     }
 
-    /// Counts messages that are no observations of a sensor, or of [`clearway_mapping::event::NOBODY`]: the ledger has one word
-    /// for them, here each keeps its `reason`.
+    /// Counts messages that are no observations of a sensor, or of [`clearway_mapping::event::NOBODY`]: the ledger has
+    /// one word for them, here each keeps its `reason`.
     pub(crate) fn leave_observations(&self, source: u16, reason: &'static str, count: u64) {
         self.leave(source, Cause::Observation, count);
         *locked(&self.observations).entry(reason).or_default() += count;
@@ -212,8 +212,8 @@ impl Door {
         self.enter_with(None, readings.into_iter().map(|(source, body)| (source, body, None))).map(drop)
     }
 
-    /// Takes an observation whose sender hears by `ticket` what becomes of it, be it that the queue was full. Stamped now
-    /// unless it brings its own stamp; never waits. Gives whether it is on the queue.
+    /// Takes an observation whose sender hears by `ticket` what becomes of it, be it that the queue was full. Stamped
+    /// now unless it brings its own stamp; never waits. Gives whether it is on the queue.
     ///
     /// # Errors
     /// [`Closed`] when the engine has stopped; the ticket says so too.
@@ -287,7 +287,8 @@ impl Door {
         strangers.push_back(Stranger { address, datagrams, newest_ns: self.clock.now_ns() });
     }
 
-    /// Tells the engine of all that stayed outside, waiting for space. For the end, when nothing will follow that would bring it along.
+    /// Tells the engine of all that stayed outside, waiting for space. For the end, when nothing will follow that would
+    /// bring it along.
     ///
     /// # Errors
     /// [`Closed`] when the engine has stopped.

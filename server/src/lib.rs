@@ -1,17 +1,17 @@
-//! The shell around Clearway's core: doors, engines, publishers, recorder, replay. All clocks, sockets, threads and logs
-//! of the house are in here.
+//! The shell around Clearway's core: doors, engines, publishers, recorder, replay. All clocks, sockets, threads and
+//! logs of the house are in here.
 //!
 //! The files, in the order a datagram meets them:
 //!
 //! | file | in -> out |
 //! |---|---|
 //! | [`config`] | one TOML -> what is served where, recorded, and which vehicles there are |
-//! | [`ingest`] | datagrams, captures, scans -> numbered events on one queue a vehicle: the door |
+//! | [`ingest`] | datagrams, observations, ROS 2 messages, files -> numbered events on one queue a vehicle: the door |
 //! | [`demand`] | readers -> which layers are to be made |
 //! | [`engine`] | events -> journal, step, encoded maps |
-//! | [`wire`] | map -> bytes, once |
+//! | [`wire`] | map -> bytes, once; event <-> the journal's bytes |
 //! | [`cuts`] | those bytes -> a region of them, a delta, once |
-//! | [`publish`] | newest map -> gRPC, zenoh, page |
+//! | [`publish`] | newest map -> gRPC, zenoh, ROS 2, Foxglove, page |
 //! | [`record`] | every event and every map -> MCAP |
 //! | [`recording`] | MCAP -> events and maps |
 //! | [`replay`] | files -> maps, as live |

@@ -64,8 +64,8 @@ enum Command {
     /// Drive a simulated vehicle at a server of its own, over real UDP.
     Demo {
         /// End after so many seconds; without, at Ctrl-C.
-        #[arg(long)]
-        seconds: Option<f64>,
+        #[arg(long, value_parser = seconds)]
+        seconds: Option<Duration>,
         /// Where to record; a temporary file where absent.
         #[arg(long)]
         record: Option<PathBuf>,
@@ -132,7 +132,8 @@ struct ReplayArguments {
     /// Overrides a key of the configuration.
     #[arg(long, value_name = "KEY=VALUE", requires = "config")]
     set: Vec<String>,
-    /// Publish the maps, until SIGINT or SIGTERM. They keep the stamps of their capture, so readers call old ones stale.
+    /// Publish the maps, until SIGINT or SIGTERM. They keep the stamps of their capture, so readers call old ones
+    /// stale.
     #[arg(long)]
     serve: bool,
     /// Whose journal (of a recording) or configuration is used, where there are several.
@@ -142,7 +143,8 @@ struct ReplayArguments {
 
 #[derive(clap::Args)]
 struct EvaluateArguments {
-    /// Folders with .bin and .label files of the same names, or sim:flat, sim:slopes, sim:canopy, sim:overhang, sim:town.
+    /// Folders with .bin and .label files of the same names, or sim:flat, sim:slopes, sim:canopy, sim:overhang,
+    /// sim:town.
     #[arg(required = true, value_name = "PATH")]
     paths: Vec<String>,
     /// One object on stdout.
@@ -165,6 +167,11 @@ struct EvaluateArguments {
 fn columns(text: &str) -> Result<u16, String> {
     let degrees = text.parse().ok().filter(|degrees| evaluate::columns(*degrees).is_some());
     degrees.ok_or_else(|| "1, 2 or 4 degrees are allowed".into())
+}
+
+fn seconds(text: &str) -> Result<Duration, String> {
+    let duration = text.parse().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    duration.ok_or_else(|| "0 or more seconds are allowed".into())
 }
 
 fn extrinsics(text: &str) -> Result<Extrinsics, String> {
@@ -351,8 +358,12 @@ async fn draw(progress: Arc<Progress>, shown: bool) {
     }
 }
 
-async fn run_demo(seconds: Option<f64>, record: Option<PathBuf>, many_sensors: bool, json: bool) -> Result<ExitCode> {
-    let duration = seconds.map(Duration::try_from_secs_f64).transpose().context("--seconds: a time is needed")?;
+async fn run_demo(
+    duration: Option<Duration>,
+    record: Option<PathBuf>,
+    many_sensors: bool,
+    json: bool,
+) -> Result<ExitCode> {
     let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
     let record = record.unwrap_or_else(|| folder.join("demo.mcap"));
     let picture = record.with_extension("png");

@@ -2,8 +2,8 @@
 //!
 //! Layout: metadata `clearway` (boot id, version, vehicles, where each calibration came from), attachments
 //! `config.toml` (effective) and `calibration/<vehicle>/<sensor>.yaml` (the configured tables), then the channels
-//! `/<vehicle>/journal` (`clearway.v1.Event`) and `/<vehicle>/map/<layer>` (`clearway.v1.Map`, the very bytes that zenoh
-//! carries). Log time is the arrival. Chunks are closed by time, so that a crash costs no more than `flush_ms`.
+//! `/<vehicle>/journal` (`clearway.v1.Event`) and `/<vehicle>/map/<layer>` (`clearway.v1.Map`, the very bytes that
+//! zenoh carries). Log time is the arrival. Chunks are closed by time, so that a crash costs no more than `flush_ms`.
 //! A disk that fails ends the recording with a stated reason; maps go on being made and served.
 
 use std::collections::BTreeMap;
@@ -202,8 +202,8 @@ impl Disk for File {
     }
 }
 
-/// A disk that has failed once is not written again: the library closes what it drops, and a disk that has recovered would
-/// then hold a file that ends in order and lacks the rest.
+/// A disk that has failed once is not written again: the library closes what it drops, and a disk that has recovered
+/// would then hold a file that ends in order and lacks the rest.
 struct OnceFailed<D: Disk> {
     disk: D,
     failed: Option<io::ErrorKind>,
@@ -231,8 +231,8 @@ impl<D: Disk> Write for OnceFailed<D> {
     }
 }
 
-/// What writes a recording, without thread and clock: whoever has it says when. A failing disk ends the writing, not the
-/// listening.
+/// What writes a recording, without thread and clock: whoever has it says when. A failing disk ends the writing, not
+/// the listening.
 pub struct Scribe<D: Disk> {
     tape: Option<Tape<D>>,
     entries: Receiver<Entry>,

@@ -190,7 +190,8 @@ impl Recording {
         self.ended && !self.whole
     }
 
-    /// The configuration the recording was made with, and its calibration tables as [`Config::calibrations`] gives them.
+    /// The configuration the recording was made with, and its calibration tables as [`Config::calibrations`] gives
+    /// them.
     ///
     /// # Errors
     /// [`RecordingError`] where either is missing or unreadable.

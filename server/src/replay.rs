@@ -1,9 +1,9 @@
-//! Files -> maps, through the same door, engine, recorder and publishers as live data, with the capture's own stamps: the
-//! same files always make the same maps.
+//! Files -> maps, through the same door, engine, recorder and publishers as live data, with the capture's own stamps:
+//! the same files always make the same maps.
 //!
 //! A capture rarely says how its sensor was mounted. Without extrinsics a first pass over the first revolutions finds
-//! height, pitch and roll from the ground around the vehicle; the figures are said, and recorded. Where there is no ground to
-//! find, nothing is guessed: the files are decoded and no map is made, and that is said too.
+//! height, pitch and roll from the ground around the vehicle; the figures are said, and recorded. Where there is no
+//! ground to find, nothing is guessed: the files are decoded and no map is made, and that is said too.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -124,8 +124,8 @@ pub struct Progress {
     pub bytes_read: AtomicU64,
 }
 
-/// Replays the files to their end; `started` sees the running server, and with [`Options::serve`] the replay returns only
-/// after `stop` has resolved. Needs a multi-thread tokio runtime.
+/// Replays the files to their end; `started` sees the running server, and with [`Options::serve`] the replay returns
+/// only after `stop` has resolved. Needs a multi-thread tokio runtime.
 ///
 /// # Errors
 /// [`ReplayError`]; nothing is left running.
@@ -183,8 +183,8 @@ fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) 
     while let Some(reading) = readings.next() {
         let reading = reading?;
         if let Speed::Times(times) = speed {
-            let passed = reading.arrival_ns - *first_ns.get_or_insert(reading.arrival_ns);
-            let due = Duration::from_nanos(u64::try_from(passed).unwrap_or(0)).div_f64(times);
+            let passed_ns = reading.arrival_ns.saturating_sub(*first_ns.get_or_insert(reading.arrival_ns));
+            let due = Duration::try_from_secs_f64(passed_ns.max(0) as f64 * 1e-9 / times).unwrap_or(Duration::MAX);
             std::thread::sleep(due.saturating_sub(began.elapsed()));
         }
         progress.bytes_read.store(readings.bytes_read(), Ordering::Relaxed);

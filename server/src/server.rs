@@ -14,13 +14,13 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-use crate::config::{Calibrations, Certificates, Config, Foxglove};
+use crate::config::{Calibrations, Certificates, Config, Foxglove, Grpc, Vehicle};
 use crate::demand::Taken;
 use crate::engine::{Engine, Observer};
 use crate::ingest::entrance::{Entrance, Entrances};
 use crate::ingest::{Door, door, udp};
 use crate::publish::{Served, Vehicles, grpc, page};
-use crate::record::{Preface, RecordError, Recorder};
+use crate::record::{Journal, Preface, RecordError, Recorder, RecorderCounts};
 use crate::status::VehicleStatus;
 
 /// A stalled peer may not keep the server from ending.
@@ -33,7 +33,7 @@ pub struct Setup {
     pub config: Config,
     /// Of every sensor, as [`Config::calibrations`] gives them.
     pub calibrations: Calibrations,
-    /// As [`Config::certificates`] gives them; gRPC is plain text without.
+    /// As [`Config::certificates`] gives them; gRPC is plain text where there are none.
     pub certificates: Option<Certificates>,
     /// Names this run in maps and recordings; drawn where absent.
     pub boot_id: Option<u64>,
@@ -175,9 +175,10 @@ impl Server {
             tables.resize(vehicle.sensors.len(), None);
             pipelines.push(Pipeline::new(&vehicle.core(), tables.clone())?);
         }
-        // Listeners before the recorder: a port in use must not cost an earlier recording its file.
+        // Before the recorder: a port in use must not cost an earlier recording its file.
         let grpc = listen("grpc.listen", config.grpc.enabled.then_some(config.grpc.listen)).await?;
         let page = listen("page.listen", config.page.enabled.then_some(config.page.listen)).await?;
+        let security = security(certificates, &config.grpc)?;
         let sockets = udp::Sockets::bind(&config.vehicles).map_err(|source| StartError::Udp {
             vehicle: config.vehicles[source.vehicle].name.as_str().into(),
             source,
@@ -192,113 +193,155 @@ impl Server {
                 (Some(recorder), journals)
             }
         };
+        let (mut served, mut doors, mut engines) = (Vec::new(), Vec::new(), Vec::new());
         let mut journals = journals.into_iter();
-
-        let (mut served, mut doors, mut engines, mut taken) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        for ((vehicle, name), pipeline) in config.vehicles.iter().zip(&names).zip(pipelines) {
-            let (door, events) = door(vehicle.queue);
-            let counts = recorder.as_ref().map(Recorder::counts);
-            let status =
-                Arc::new(VehicleStatus::new(name.clone(), boot_id, layer_names(&vehicle.maps), door.outside(), counts));
-            let (newest, receiver) = watch::channel(None);
-            // Files are read for their maps: who comes late finds the last one, and the summary knows its figures.
-            taken.extend(from_files.then(|| status.demand.take(&[])));
-            let engine = Engine {
-                pipeline,
-                valid_ms: vehicle.maps.valid_ms,
-                newest,
-                journal: journals.next(),
-                status: status.clone(),
-                observer: observer.take(),
-            };
-            let thread = engine.start(events).map_err(|source| StartError::Thread { vehicle: name.clone(), source })?;
+        for ((vehicle, name), pipeline) in config.vehicles.iter().zip(names).zip(pipelines) {
+            let (journal, counts) = (journals.next(), recorder.as_ref().map(Recorder::counts));
+            let ready = Ready { vehicle, boot_id, pipeline, journal, counts, observer: observer.take() };
+            let (of_vehicle, door, thread) = ready.start(name.clone())?;
             engines.push((name.clone(), thread));
-            served.push(Served { status, newest: receiver });
-            doors.push(RunningVehicle { name: name.clone(), door, udp: None });
+            served.push(of_vehicle);
+            doors.push(RunningVehicle { name, door, udp: None });
         }
-        let vehicles = Vehicles(served.into());
-
-        let (stop, stopped) = watch::channel(false);
-        let open = config.vehicles.iter().zip(&doors).filter(|(vehicle, _)| vehicle.ingest.enabled);
-        let entrances =
-            Entrances::new(open.map(|(vehicle, running)| Entrance::new(vehicle, &running.door)), stopped.clone());
-        let stopped = move || {
-            let mut stopped = stopped.clone();
-            async move {
-                // An error means that the sender is gone, which is a stop too.
-                let _ = stopped.wait_for(|stop| *stop).await;
-            }
-        };
-        let mut publishers = JoinSet::new();
-        let address = |listener: &TcpListener| listener.local_addr().ok();
-        let (grpc_at, page_at) = (grpc.as_ref().and_then(address), page.as_ref().and_then(address));
-        if let Some(listener) = grpc {
-            let security = grpc::Security::new(certificates, &config.grpc.access);
-            let security = security.map_err(|error| StartError::Certificates(sources(&error)))?;
-            let (vehicles, entrances, stopped) = (vehicles.clone(), entrances.clone(), stopped());
-            let connections_max = config.grpc.connections_max;
-            publishers.spawn(async move {
-                if let Err(error) = grpc::serve(listener, security, connections_max, vehicles, entrances, stopped).await
-                {
-                    tracing::error!(%error, "grpc ended");
-                }
-            });
-        }
-        if let Some(listener) = page {
-            let (vehicles, stopped) = (vehicles.clone(), stopped());
-            publishers.spawn(async move {
-                if let Err(error) = page::serve(listener, vehicles, stopped).await {
-                    tracing::error!(%error, "page ended");
-                }
-            });
-        }
-        let viewers = match config.foxglove {
-            Foxglove { enabled: false, .. } => None,
-            Foxglove { listen: at, .. } => {
-                let started = crate::publish::foxglove::Publisher::start(&config.foxglove, &vehicles).await;
-                Some(started.map_err(|source| StartError::Foxglove { at, source })?)
-            }
-        };
-        #[cfg(feature = "zenoh")]
-        let publisher = match config.zenoh.enabled {
-            true => Some(crate::publish::zenoh::Publisher::start(&config.zenoh, &vehicles, &entrances).await?),
-            false => None,
-        };
+        // Files are read for their maps: who comes late finds the last one, and the summary knows its figures.
+        let taken = served.iter().filter(|_| from_files).map(|served| served.status.demand.take(&[])).collect();
         let mut running = Running {
-            vehicles,
+            vehicles: Vehicles(served.into()),
             doors,
-            grpc: grpc_at,
-            page: page_at,
+            grpc: None,
+            page: None,
             zenoh: Vec::new(),
-            foxglove: viewers.as_ref().map(|viewers| SocketAddr::new(config.foxglove.listen.ip(), viewers.port())),
+            foxglove: None,
             engines,
             recorder,
             udp: None,
-            publishers,
-            stop,
+            publishers: JoinSet::new(),
+            stop: watch::Sender::new(false),
             _taken: taken,
-            viewers,
+            viewers: None,
             #[cfg(feature = "zenoh")]
-            publisher,
+            publisher: None,
             #[cfg(feature = "zenoh")]
             ros: Vec::new(),
         };
-        #[cfg(feature = "zenoh")]
-        if let Some(publisher) = &running.publisher {
-            running.zenoh = publisher.endpoints().await;
-            for (vehicle, running_vehicle) in config.vehicles.iter().zip(&running.doors) {
-                let Some(ros) = &vehicle.ros else { continue };
-                let sensors = vehicle.sensors.iter().map(|sensor| &sensor.name);
-                let door = running_vehicle.door.clone();
-                running.ros.push(crate::ingest::ros::live::listen(publisher.session(), ros, sensors, door).await?);
-            }
+        let entrances = running.entrances(&config);
+        if let Some(listener) = grpc {
+            running.serve_grpc(listener, security, config.grpc.connections_max, entrances.clone());
         }
-        let doors: Vec<Door> = running.doors.iter().map(|vehicle| vehicle.door.clone()).collect();
-        for (index, vehicle) in running.doors.iter_mut().enumerate() {
+        if let Some(listener) = page {
+            running.serve_page(listener);
+        }
+        if config.foxglove.enabled {
+            running.serve_foxglove(&config.foxglove).await?;
+        }
+        #[cfg(feature = "zenoh")]
+        if config.zenoh.enabled {
+            running.open_zenoh(&config, &entrances).await?;
+        }
+        running.hear(sockets)?;
+        Ok(running)
+    }
+}
+
+/// One vehicle, before its engine runs.
+struct Ready<'a> {
+    vehicle: &'a Vehicle,
+    boot_id: u64,
+    pipeline: Pipeline,
+    journal: Option<Journal>,
+    counts: Option<Arc<RecorderCounts>>,
+    observer: Option<Observer>,
+}
+
+impl Ready<'_> {
+    /// Starts the engine; gives what publishers see of it, and its door.
+    fn start(self, name: Arc<str>) -> Result<(Served, Door, JoinHandle<()>), StartError> {
+        let Self { vehicle, boot_id, pipeline, journal, counts, observer } = self;
+        let (door, events) = door(vehicle.queue);
+        let layers = layer_names(&vehicle.maps);
+        let status = Arc::new(VehicleStatus::new(name.clone(), boot_id, layers, door.outside(), counts));
+        let (newest, receiver) = watch::channel(None);
+        let valid_ms = vehicle.maps.valid_ms;
+        let engine = Engine { pipeline, valid_ms, newest, journal, status: status.clone(), observer };
+        let thread = engine.start(events).map_err(|source| StartError::Thread { vehicle: name, source })?;
+        Ok((Served { status, newest: receiver }, door, thread))
+    }
+}
+
+/// What [`Server::start`] adds to a server whose engines run.
+impl Running {
+    /// The ways in for observations, of the vehicles that take them.
+    fn entrances(&self, config: &Config) -> Entrances {
+        let open = config.vehicles.iter().zip(&self.doors).filter(|(vehicle, _)| vehicle.ingest.enabled);
+        Entrances::new(open.map(|(vehicle, running)| Entrance::new(vehicle, &running.door)), self.stop.subscribe())
+    }
+
+    /// Resolves when the server stops.
+    fn stopped(&self) -> impl Future<Output = ()> + Send + use<> {
+        let mut stopped = self.stop.subscribe();
+        async move {
+            // An error means that the sender is gone, which is a stop too.
+            let _ = stopped.wait_for(|stop| *stop).await;
+        }
+    }
+
+    fn serve_grpc(
+        &mut self,
+        listener: TcpListener,
+        security: grpc::Security,
+        connections_max: usize,
+        entrances: Entrances,
+    ) {
+        self.grpc = listener.local_addr().ok();
+        let (vehicles, stopped) = (self.vehicles.clone(), self.stopped());
+        self.publishers.spawn(async move {
+            if let Err(error) = grpc::serve(listener, security, connections_max, vehicles, entrances, stopped).await {
+                tracing::error!(%error, "grpc ended");
+            }
+        });
+    }
+
+    fn serve_page(&mut self, listener: TcpListener) {
+        self.page = listener.local_addr().ok();
+        let (vehicles, stopped) = (self.vehicles.clone(), self.stopped());
+        self.publishers.spawn(async move {
+            if let Err(error) = page::serve(listener, vehicles, stopped).await {
+                tracing::error!(%error, "page ended");
+            }
+        });
+    }
+
+    async fn serve_foxglove(&mut self, options: &Foxglove) -> Result<(), StartError> {
+        let started = crate::publish::foxglove::Publisher::start(options, &self.vehicles).await;
+        let viewers = started.map_err(|source| StartError::Foxglove { at: options.listen, source })?;
+        self.foxglove = Some(SocketAddr::new(options.listen.ip(), viewers.port()));
+        self.viewers = Some(viewers);
+        Ok(())
+    }
+
+    /// Publishes over zenoh, and hears what comes over it.
+    #[cfg(feature = "zenoh")]
+    async fn open_zenoh(&mut self, config: &Config, entrances: &Entrances) -> Result<(), StartError> {
+        let publisher = crate::publish::zenoh::Publisher::start(&config.zenoh, &self.vehicles, entrances).await?;
+        self.zenoh = publisher.endpoints().await;
+        for (vehicle, running) in config.vehicles.iter().zip(&self.doors) {
+            let Some(ros) = &vehicle.ros else { continue };
+            let sensors = vehicle.sensors.iter().map(|sensor| &sensor.name);
+            let door = running.door.clone();
+            self.ros.push(crate::ingest::ros::live::listen(publisher.session(), ros, sensors, door).await?);
+        }
+        self.publisher = Some(publisher);
+        Ok(())
+    }
+
+    /// Reads the sockets: last, when everything behind them is there.
+    fn hear(&mut self, sockets: udp::Sockets) -> Result<(), StartError> {
+        for (index, vehicle) in self.doors.iter_mut().enumerate() {
             vehicle.udp = sockets.addresses(index);
         }
-        running.udp = Some(sockets.read(&doors).map_err(StartError::UdpThread)?);
-        Ok(running)
+        let doors: Vec<Door> = self.doors.iter().map(|vehicle| vehicle.door.clone()).collect();
+        self.udp = Some(sockets.read(&doors).map_err(StartError::UdpThread)?);
+        Ok(())
     }
 }
 
@@ -308,7 +351,8 @@ impl Running {
         self.recorder.as_ref().map(|recorder| recorder.counts().to_proto().file)
     }
 
-    /// Ends it all: no more readings, every event taken processed and recorded, the recording finished, the readers told.
+    /// Ends it all: no more readings, every event taken processed and recorded, the recording finished, the readers
+    /// told.
     ///
     /// # Errors
     /// [`EndError`] where an engine had died or the recording is not whole; everything has ended all the same.
@@ -355,6 +399,15 @@ impl Running {
         }
         outcome
     }
+}
+
+/// How gRPC's peers are met. Where the configuration names certificates, never without them.
+fn security(certificates: Option<Certificates>, grpc: &Grpc) -> Result<grpc::Security, StartError> {
+    if grpc.enabled && grpc.tls.is_some() && certificates.is_none() {
+        return Err(StartError::Certificates("its files were not read".into()));
+    }
+    let security = grpc::Security::new(certificates, &grpc.access);
+    security.map_err(|error| StartError::Certificates(sources(&error)))
 }
 
 /// An error and all that caused it: "transport error" says little.

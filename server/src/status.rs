@@ -2,12 +2,10 @@
 //! engine, read by gRPC, zenoh, the page, `/metrics` and the command line.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::fmt::Write as _;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use clearway_lidar::sensor::SensorStatus;
 use clearway_mapping::pipeline::{Ledger, NamedStatus};
 use clearway_proto::v1;
 use serde_json::{Value, json};
@@ -18,6 +16,10 @@ use crate::engine::NewestSweep;
 use crate::ingest::{Outside, Stranger, locked, now_ns};
 use crate::record::RecorderCounts;
 use crate::wire::EncodedMap;
+
+mod prometheus;
+
+pub use prometheus::prometheus;
 
 /// Durations kept for the percentiles: seven minutes of a 10 Hz sensor.
 const LATENCIES: usize = 4096;
@@ -183,30 +185,41 @@ impl VehicleStatus {
     /// The status now.
     pub fn snapshot(&self) -> Snapshot {
         let inside = locked(&self.inside);
-        let mut ledger = inside.ledger.clone();
-        let mut sensors = inside.sensors.clone();
-        self.outside.add_to(&mut ledger, sensors.iter_mut().map(|sensor| &mut sensor.ledger));
         let mut latencies: Vec<u64> = inside.latencies_ns.iter().copied().collect();
-        latencies.sort_unstable();
         let (maps_hz, packets_hz) = rates(&inside.paces);
-        Snapshot {
-            ledger,
-            sensors,
-            observations_refused: self.outside.observations_refused(),
+        let mut snapshot = Snapshot {
+            ledger: inside.ledger.clone(),
+            sensors: inside.sensors.clone(),
             maps: inside.maps,
             newest_capture_end_ns: inside.newest_capture_end_ns,
             drivable_share: inside.drivable_share,
-            latency_ms_p50: percentile_ms(&latencies, 50),
-            latency_ms_p99: percentile_ms(&latencies, 99),
             maps_hz,
             packets_hz,
-        }
+            ..Snapshot::default()
+        };
+        let sensors = snapshot.sensors.iter_mut().map(|sensor| &mut sensor.ledger);
+        self.outside.add_to(&mut snapshot.ledger, sensors);
+        // The engine waits for this lock: what takes longer comes after it.
+        drop(inside);
+        snapshot.observations_refused = self.outside.observations_refused();
+        latencies.sort_unstable();
+        snapshot.latency_ms_p50 = percentile_ms(&latencies, 50);
+        snapshot.latency_ms_p99 = percentile_ms(&latencies, 99);
+        snapshot
+    }
+
+    /// Readers of its maps, by the way they come.
+    fn readers(&self) -> [(&'static str, u32); 2] {
+        [("grpc", &self.grpc_readers), ("page", &self.page_readers)]
+            .map(|(transport, readers)| (transport, readers.load(Ordering::Relaxed)))
     }
 
     /// The status as the wire carries it.
     pub fn to_proto(&self) -> v1::Vehicle {
-        let snapshot = self.snapshot();
-        let readers = [("grpc", &self.grpc_readers), ("page", &self.page_readers)];
+        self.proto_of(&self.snapshot())
+    }
+
+    fn proto_of(&self, snapshot: &Snapshot) -> v1::Vehicle {
         v1::Vehicle {
             name: self.name.to_string(),
             boot_id: self.boot_id,
@@ -217,10 +230,7 @@ impl VehicleStatus {
             ledger: Some(ledger(&snapshot.ledger)),
             sensor_ledgers: snapshot.sensors.iter().map(|s| (s.name.clone(), ledger(&s.ledger))).collect(),
             recorder: Some(self.recorder.as_ref().map(|counts| counts.to_proto()).unwrap_or_default()),
-            readers: readers
-                .map(|(name, count)| (name.to_owned(), count.load(Ordering::Relaxed)))
-                .into_iter()
-                .collect(),
+            readers: self.readers().map(|(transport, readers)| (transport.to_owned(), readers)).into(),
             strangers: self.outside.strangers().iter().map(stranger).collect(),
             observations_refused: by_name(&snapshot.observations_refused),
         }
@@ -229,10 +239,9 @@ impl VehicleStatus {
     /// The status as JSON: what [`VehicleStatus::to_proto`] has, and rates, latency and age. 64-bit numbers that a
     /// browser's doubles cannot hold (boot id, stamps) are strings.
     pub fn to_json(&self) -> Value {
-        let proto = self.to_proto();
         let snapshot = self.snapshot();
+        let proto = self.proto_of(&snapshot);
         let (ledger, recorder) = (proto.ledger.unwrap_or_default(), proto.recorder.unwrap_or_default());
-        let ledger_json = self::ledger_json(&ledger);
         let sensors = proto.sensors.iter().map(|s| {
             json!({
                 "name": s.name, "model": s.model, "packets": s.packets, "packets_expected": s.packets_expected,
@@ -242,7 +251,7 @@ impl VehicleStatus {
                 "blocked_lasers": s.blocked_lasers,
                 "clock": s.clock, "clock_offset_ms": s.clock_offset_ms,
                 "state": s.state, "age_ms": s.age_ms,
-                "ledger": proto.sensor_ledgers.get(&s.name).map(self::ledger_json),
+                "ledger": proto.sensor_ledgers.get(&s.name).map(ledger_json),
             })
         });
         json!({
@@ -254,7 +263,7 @@ impl VehicleStatus {
             "now_ns": now_ns().to_string(),
             "drivable_share": snapshot.drivable_share,
             "sensors": sensors.collect::<Vec<_>>(),
-            "ledger": ledger_json,
+            "ledger": ledger_json(&ledger),
             "observations_refused": proto.observations_refused,
             "recorder": {
                 "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
@@ -279,8 +288,8 @@ fn stranger(stranger: &Stranger) -> v1::Stranger {
 fn ledger_json(ledger: &v1::Ledger) -> Value {
     json!({
         "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
-        "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops, "points_dropped": ledger.points_dropped,
-        "own_body": ledger.own_body, "through_body": ledger.through_body, "blind": ledger.blind,
+        "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
+        "points_dropped": ledger.points_dropped, "own_body": ledger.own_body, "through_body": ledger.through_body, "blind": ledger.blind,
         "poses": ledger.poses, "poses_refused": ledger.poses_refused,
         "roads": ledger.roads, "roads_refused": ledger.roads_refused,
     })
@@ -323,121 +332,6 @@ fn rates(paces: &VecDeque<(Instant, u64)>) -> (f64, f64) {
 fn percentile_ms(ascending_ns: &[u64], percent: usize) -> Option<f64> {
     let rank = (ascending_ns.len() * percent).div_ceil(100).max(1);
     ascending_ns.get(rank - 1).map(|&ns| ns as f64 / 1e6)
-}
-
-fn labels(vehicle: &str, sensor: &str) -> String {
-    format!("vehicle=\"{vehicle}\",sensor=\"{sensor}\"")
-}
-
-/// The status of all vehicles in Prometheus' text format.
-pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {
-    let mut text = String::new();
-    let all: Vec<_> = vehicles.iter().map(|v| (v, v.snapshot(), v.to_proto())).collect();
-    let mut family = |name: &str, kind: &str, help: &str, samples: &[(String, f64)]| {
-        if samples.is_empty() {
-            return;
-        }
-        // Writing to a string cannot fail.
-        let _ = writeln!(text, "# HELP {name} {help}\n# TYPE {name} {kind}");
-        for (labels, value) in samples {
-            let _ = writeln!(text, "{name}{{{labels}}} {value}");
-        }
-    };
-    let each = |value: &dyn Fn(&Snapshot, &v1::Vehicle) -> f64| -> Vec<(String, f64)> {
-        all.iter().map(|(v, s, p)| (format!("vehicle=\"{}\"", v.name), value(s, p))).collect()
-    };
-    let received = each(&|s, _| s.ledger.received as f64);
-    family("clearway_packets_received_total", "counter", "Datagrams and scans received.", &received);
-    let decoded = each(&|s, _| s.ledger.decoded as f64);
-    family("clearway_packets_decoded_total", "counter", "Data packets and scans decoded.", &decoded);
-    let telemetry = each(&|s, _| s.ledger.telemetry as f64);
-    family("clearway_telemetry_total", "counter", "Telemetry datagrams read.", &telemetry);
-    let refused: Vec<_> = all
-        .iter()
-        .flat_map(|(v, s, _)| s.ledger.refused.iter().map(move |(r, n)| (v.name.clone(), r, *n as f64)))
-        .map(|(vehicle, reason, n)| (format!("vehicle=\"{vehicle}\",reason=\"{reason}\""), n))
-        .collect();
-    family("clearway_packets_refused_total", "counter", "Datagrams and scans refused, by reason.", &refused);
-    let refused: Vec<_> = all
-        .iter()
-        .flat_map(|(v, s, _)| s.observations_refused.iter().map(move |(r, n)| (v.name.clone(), r, *n as f64)))
-        .map(|(vehicle, reason, n)| (format!("vehicle=\"{vehicle}\",reason=\"{reason}\""), n))
-        .collect();
-    let help = "Messages that are no observations, which the ledger calls observation, by their own reason.";
-    family("clearway_observations_refused_total", "counter", help, &refused);
-    let lost = each(&|s, _| s.ledger.lost as f64);
-    family("clearway_events_lost_total", "counter", "Readings that found the door's queue full.", &lost);
-    let of_sensors = |value: &dyn Fn(&SensorStatus) -> f64| -> Vec<(String, f64)> {
-        let labels = |vehicle: &str, sensor: &str| format!("vehicle=\"{vehicle}\",sensor=\"{sensor}\"");
-        let of = |(v, s, _): &(&Arc<VehicleStatus>, Snapshot, v1::Vehicle)| -> Vec<(String, f64)> {
-            s.sensors.iter().map(|sensor| (labels(&v.name, &sensor.name), value(&sensor.status))).collect()
-        };
-        all.iter().flat_map(of).collect()
-    };
-    let missing = of_sensors(&|status| status.packets_lost as f64);
-    let help = "Data packets that never came, by device time and azimuth, +-1 a gap.";
-    family("clearway_packets_missing_total", "counter", help, &missing);
-    let blocked = of_sensors(&|status| {
-        status.blocked.sectors.iter().map(|sector| f64::from(sector.to_deg - sector.from_deg)).sum()
-    });
-    family("clearway_blocked_degrees", "gauge", "Degrees in which a sensor used to see and does no more.", &blocked);
-    let drops = each(&|s, _| s.ledger.kernel_drops as f64);
-    family("clearway_kernel_drops_total", "counter", "Datagrams the kernel dropped at the vehicle's sockets.", &drops);
-    let of_sensors = |value: &dyn Fn(&Ledger) -> u64| -> Vec<(String, f64)> {
-        let sensors = all.iter().flat_map(|(v, s, _)| s.sensors.iter().map(move |sensor| (v, sensor)));
-        sensors.map(|(v, s)| (labels(&v.name, &s.name), value(&s.ledger) as f64)).collect()
-    };
-    let received = of_sensors(&|ledger| ledger.received);
-    family("clearway_sensor_received_total", "counter", "Datagrams and scans received from a sensor.", &received);
-    let decoded = of_sensors(&|ledger| ledger.decoded);
-    family("clearway_sensor_decoded_total", "counter", "A sensor's data packets and scans decoded.", &decoded);
-    let telemetry = of_sensors(&|ledger| ledger.telemetry);
-    family("clearway_sensor_telemetry_total", "counter", "A sensor's telemetry datagrams read.", &telemetry);
-    let lost = of_sensors(&|ledger| ledger.lost);
-    family("clearway_sensor_lost_total", "counter", "A sensor's readings that found the queue full.", &lost);
-    let refused: Vec<_> = all
-        .iter()
-        .flat_map(|(v, s, _)| s.sensors.iter().map(move |sensor| (v, sensor)))
-        .flat_map(|(v, s)| {
-            s.ledger.refused.iter().map(move |(reason, n)| (labels(&v.name, &s.name), reason, *n as f64))
-        })
-        .map(|(labels, reason, n)| (format!("{labels},reason=\"{reason}\""), n))
-        .collect();
-    family("clearway_sensor_refused_total", "counter", "A sensor's datagrams and scans refused, by reason.", &refused);
-    let poses = each(&|s, _| s.ledger.poses as f64);
-    family("clearway_poses_total", "counter", "Ego poses taken.", &poses);
-    let poses = each(&|s, _| s.ledger.poses_refused as f64);
-    family("clearway_poses_refused_total", "counter", "Ego poses refused.", &poses);
-    let roads = each(&|s, _| s.ledger.roads as f64);
-    family("clearway_roads_total", "counter", "Roads taken.", &roads);
-    let roads = each(&|s, _| s.ledger.roads_refused.values().sum::<u64>() as f64);
-    family("clearway_roads_refused_total", "counter", "Roads refused.", &roads);
-    let maps = each(&|_, p| p.maps as f64);
-    family("clearway_maps_total", "counter", "Maps made.", &maps);
-    let revolutions = each(&|s, _| s.revolutions() as f64);
-    family("clearway_revolutions_total", "counter", "Revolutions completed.", &revolutions);
-    let now = now_ns();
-    let ages: Vec<_> = all
-        .iter()
-        .filter(|(_, _, p)| p.maps > 0)
-        .map(|(v, s, _)| (format!("vehicle=\"{}\"", v.name), (now - s.newest_capture_end_ns) as f64 / 1e9))
-        .collect();
-    family("clearway_map_age_seconds", "gauge", "Age of the newest map, from its capture's end.", &ages);
-    let latencies: Vec<_> = all
-        .iter()
-        .flat_map(|(v, s, _)| [(v, "0.5", s.latency_ms_p50), (v, "0.99", s.latency_ms_p99)])
-        .filter_map(|(v, q, ms)| ms.map(|ms| (format!("vehicle=\"{}\",quantile=\"{q}\"", v.name), ms / 1e3)))
-        .collect();
-    family("clearway_map_latency_seconds", "gauge", "Step and encode of a map.", &latencies);
-    let readers: Vec<_> = all
-        .iter()
-        .flat_map(|(v, _, p)| p.readers.iter().map(move |(t, n)| (v.name.clone(), t, f64::from(*n))))
-        .map(|(vehicle, transport, n)| (format!("vehicle=\"{vehicle}\",transport=\"{transport}\""), n))
-        .collect();
-    family("clearway_readers", "gauge", "Readers of the vehicle's maps.", &readers);
-    let recorder_lost = each(&|_, p| p.recorder.as_ref().map_or(0, |r| r.lost) as f64);
-    family("clearway_recorder_lost_total", "counter", "Events and maps the recording does not hold.", &recorder_lost);
-    text
 }
 
 #[cfg(test)]

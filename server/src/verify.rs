@@ -196,7 +196,7 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
                 if event.sequence != remaker.next_event {
                     report.add(&vehicle, remaker.next_event, "", What::Hole { found: event.sequence });
                 }
-                remaker.next_event = event.sequence + 1;
+                remaker.next_event = event.sequence.saturating_add(1);
                 if let Ok(Some(map)) = remaker.pipeline.step(&event) {
                     let map = EncodedMap::new(map, remaker.name.clone(), boot_id, remaker.valid_ms);
                     report.maps += 1;

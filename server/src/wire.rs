@@ -2,24 +2,24 @@
 //!
 //! Protobuf messages concatenate: header and layer chunks put behind each other are the message, so any selection of
 //! layers costs one copy and no encoding, and the bytes of one layer are the same over zenoh, gRPC and in a recording.
-//! No clock goes into the bytes: the same events give the same bytes.
+//! No clock goes into the bytes: the same events give the same bytes. [`event`] is the way of events, in and out.
 
 use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
-use clearway_mapping::config::{Extrinsics, SensorConfig};
-use clearway_mapping::event::{Body, Cause, EgoPose, Event, Road, RoadFrame, RoadPurpose, Scan};
 use clearway_mapping::map::{Cells, Geometry, Layer, Map, SafePoint, SensorState};
-use clearway_mapping::pipeline::{model_name, model_of_name};
 use clearway_proto::codec::{self, CellsRef};
 use clearway_proto::map::{encode_header, encode_layer};
-use clearway_proto::packed::{pack, unpack};
 use clearway_proto::predicted::encode_beside;
 use clearway_proto::v1;
-use nalgebra::{Isometry3, Quaternion, Translation3, Unit};
-use prost::Message;
+use nalgebra::Isometry3;
 
 use crate::cuts::Cuts;
+
+mod event;
+
+pub use event::{EventError, event_from_bytes, event_to_proto};
+pub(crate) use event::{ego_pose_from_proto, road_from_proto, scan_from_proto, sensor_from_proto};
 
 /// One map, ready for any reader. Cloning it costs reference counts.
 #[derive(Clone, Debug, PartialEq)]
@@ -190,299 +190,12 @@ fn safe_points(layer: &Layer) -> Option<v1::SafePoints> {
     (!points.is_empty()).then(|| clearway_proto::safe_points::pack(&points, cell_m / 2.0))
 }
 
-fn road(road: &Road) -> v1::Road {
-    let purpose = match road.purpose {
-        RoadPurpose::Paint => v1::RoadPurpose::Paint,
-        RoadPurpose::Route => v1::RoadPurpose::Route,
-    };
-    let frame = match road.frame {
-        RoadFrame::Ego => v1::RoadFrame::Ego,
-        RoadFrame::Map => v1::RoadFrame::Map,
-    };
-    v1::Road {
-        stamp_ns: road.stamp_ns,
-        purpose: purpose.into(),
-        frame: frame.into(),
-        x: road.points.iter().map(|[x, _]| *x).collect(),
-        y: road.points.iter().map(|[_, y]| *y).collect(),
-        width: road.widths_m.clone(),
-        orientations: road.orientations.clone(),
-    }
-}
-
-/// What the core would refuse stays as it is: the journal holds it too. `Err` names what has no counterpart.
-pub(crate) fn road_from_proto(road: v1::Road) -> Result<Road, &'static str> {
-    let purpose = match road.purpose() {
-        v1::RoadPurpose::Paint => RoadPurpose::Paint,
-        v1::RoadPurpose::Route => RoadPurpose::Route,
-        v1::RoadPurpose::Unspecified => return Err("known road purpose"),
-    };
-    let frame = match road.frame() {
-        v1::RoadFrame::Ego => RoadFrame::Ego,
-        v1::RoadFrame::Map => RoadFrame::Map,
-        v1::RoadFrame::Unspecified => return Err("known road frame"),
-    };
-    if road.x.len() != road.y.len() {
-        return Err("y for every x of the road");
-    }
-    Ok(Road {
-        stamp_ns: road.stamp_ns,
-        purpose,
-        frame,
-        points: road.x.into_iter().zip(road.y).map(|(x, y)| [x, y]).collect(),
-        widths_m: road.width,
-        orientations: road.orientations,
-    })
-}
-
-/// `None` where the pose is missing.
-pub(crate) fn ego_pose_from_proto(ego: &v1::EgoPose) -> Option<EgoPose> {
-    let pose = ego.map_from_ego.as_ref()?;
-    // Not normalised again: a rounding would make another pose of it than the one that was processed.
-    let rotation = Unit::new_unchecked(Quaternion::new(pose.qw, pose.qx, pose.qy, pose.qz));
-    let map_from_ego = Isometry3::from_parts(Translation3::new(pose.x, pose.y, pose.z), rotation);
-    Some(EgoPose { stamp_ns: ego.stamp_ns, map_from_ego, speed_mps: ego.speed_mps })
-}
-
-fn sensor_config(sensor: &SensorConfig) -> v1::Sensor {
-    let Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg } = sensor.extrinsics;
-    v1::Sensor {
-        name: sensor.name.clone(),
-        model: sensor.model.map(|model| model_name(model).to_owned()),
-        rpm: sensor.rpm,
-        cut_azimuth_deg: Some(sensor.cut_azimuth_deg),
-        range_m_min: Some(sensor.range_m_min),
-        elevations_deg: sensor.elevations_deg.clone(),
-        x_m,
-        y_m,
-        z_m,
-        roll_deg,
-        pitch_deg,
-        yaw_deg,
-        calibration: sensor.calibration.clone(),
-        blind_deg: sensor.blind_deg.as_flattened().to_vec(),
-        gps_late_days_max: Some(sensor.gps_late_days_max),
-    }
-}
-
-/// `Err` names what has no counterpart.
-pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, &'static str> {
-    let v1::Sensor { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, .. } = sensor;
-    let plain = SensorConfig::new(sensor.name, Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg });
-    let (blind_deg, []) = sensor.blind_deg.as_chunks() else { return Err("pairs in blind_deg") };
-    let model = sensor.model.map(|name| model_of_name(&name).ok_or("known sensor model")).transpose()?;
-    Ok(SensorConfig {
-        model,
-        rpm: sensor.rpm,
-        calibration: sensor.calibration,
-        cut_azimuth_deg: sensor.cut_azimuth_deg.unwrap_or(plain.cut_azimuth_deg),
-        range_m_min: sensor.range_m_min.unwrap_or(plain.range_m_min),
-        blind_deg: blind_deg.to_vec(),
-        gps_late_days_max: sensor.gps_late_days_max.unwrap_or(plain.gps_late_days_max),
-        elevations_deg: sensor.elevations_deg,
-        ..plain
-    })
-}
-
-fn scan(scan: &Scan) -> v1::Scan {
-    v1::Scan {
-        stamp_ns: scan.stamp_ns,
-        x: pack(&scan.x),
-        y: pack(&scan.y),
-        z: pack(&scan.z),
-        intensity: pack(&scan.intensity),
-        ring: pack(&scan.ring),
-        offset_ns: pack(&scan.offset_ns),
-        no_returns: pack(scan.no_returns.as_flattened()),
-    }
-}
-
-/// What the core would refuse stays as it is: the journal holds it too. `Err` names what has no counterpart.
-pub(crate) fn scan_from_proto(scan: v1::Scan) -> Result<Scan, &'static str> {
-    const PART: &str = "whole number at the end of a scan's list";
-    let floats = |bytes: &[u8]| unpack(bytes).ok_or(PART);
-    let no_returns = floats(&scan.no_returns)?;
-    let (directions, []) = no_returns.as_chunks::<3>() else { return Err("z for every x and y of no_returns") };
-    Ok(Scan {
-        stamp_ns: scan.stamp_ns,
-        x: floats(&scan.x)?,
-        y: floats(&scan.y)?,
-        z: floats(&scan.z)?,
-        intensity: floats(&scan.intensity)?,
-        ring: unpack(&scan.ring).ok_or(PART)?,
-        offset_ns: unpack(&scan.offset_ns).ok_or(PART)?,
-        no_returns: directions.to_vec(),
-    })
-}
-
-/// An event as the journal holds it.
-pub fn event_to_proto(event: &Event) -> v1::Event {
-    let lost_cause = match event.body {
-        Body::Lost { cause, .. } => loss_cause(cause),
-        _ => v1::LossCause::Queue,
-    };
-    let body = match &event.body {
-        Body::Datagram(payload) => v1::event::Body::Datagram(payload.clone()),
-        Body::Scan(scan) => v1::event::Body::Scan(self::scan(scan)),
-        Body::EgoPose(ego) => v1::event::Body::EgoPose(v1::EgoPose {
-            stamp_ns: ego.stamp_ns,
-            map_from_ego: Some(pose(&ego.map_from_ego)),
-            speed_mps: ego.speed_mps,
-        }),
-        Body::Road(road) => v1::event::Body::Road(self::road(road)),
-        Body::Sensor(sensor) => v1::event::Body::Sensor(sensor_config(sensor)),
-        Body::Lost { count, .. } => v1::event::Body::Lost(*count),
-        Body::End => v1::event::Body::End(v1::End {}),
-    };
-    v1::Event {
-        sequence: event.sequence,
-        arrival_ns: event.arrival_ns,
-        source: u32::from(event.source),
-        body: Some(body),
-        lost_cause: lost_cause.into(),
-    }
-}
-
-fn loss_cause(cause: Cause) -> v1::LossCause {
-    match cause {
-        Cause::Queue => v1::LossCause::Queue,
-        Cause::Kernel => v1::LossCause::Kernel,
-        Cause::Sender => v1::LossCause::Sender,
-        Cause::Length => v1::LossCause::Length,
-        Cause::Observation => v1::LossCause::Observation,
-    }
-}
-
-/// An event of a journal that is none.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum EventError {
-    /// Not protobuf.
-    #[error("not a clearway.v1.Event: {0}")]
-    Decode(#[from] prost::DecodeError),
-    /// A source no vehicle has.
-    #[error("event {sequence}: source {source_index}: 0 to 65535 is allowed")]
-    Source {
-        /// The event's.
-        sequence: u64,
-        /// What was found.
-        source_index: u32,
-    },
-    /// A body this version does not know, an ego pose without a pose, a loss without a cause, a road without frame or
-    /// purpose, a scan with half a direction, a sensor of an unknown model.
-    #[error("event {sequence}: no {what}")]
-    Missing {
-        /// The event's.
-        sequence: u64,
-        /// `body`, `pose`, or what of a loss, road, scan or sensor.
-        what: &'static str,
-    },
-}
-
-/// An event out of a journal, exactly as it was.
-///
-/// # Errors
-/// [`EventError`] where the bytes are no event.
-pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventError> {
-    let event = v1::Event::decode(bytes)?;
-    let sequence = event.sequence;
-    let source =
-        u16::try_from(event.source).map_err(|_| EventError::Source { sequence, source_index: event.source })?;
-    let body = match event.body.ok_or(EventError::Missing { sequence, what: "body" })? {
-        v1::event::Body::Datagram(payload) => Body::Datagram(payload),
-        v1::event::Body::Scan(scan) => {
-            Body::Scan(scan_from_proto(scan).map_err(|what| EventError::Missing { sequence, what })?)
-        }
-        v1::event::Body::EgoPose(ego) => {
-            Body::EgoPose(ego_pose_from_proto(&ego).ok_or(EventError::Missing { sequence, what: "pose" })?)
-        }
-        v1::event::Body::Road(road) => {
-            Body::Road(road_from_proto(road).map_err(|what| EventError::Missing { sequence, what })?)
-        }
-        v1::event::Body::Sensor(sensor) => {
-            let sensor = sensor_from_proto(sensor).map_err(|what| EventError::Missing { sequence, what })?;
-            Body::Sensor(Box::new(sensor))
-        }
-        v1::event::Body::Lost(count) => {
-            let causes = [Cause::Queue, Cause::Kernel, Cause::Sender, Cause::Length, Cause::Observation];
-            let cause = causes.into_iter().find(|cause| i32::from(loss_cause(*cause)) == event.lost_cause);
-            let cause = cause.ok_or(EventError::Missing { sequence, what: "known cause of a loss" })?;
-            Body::Lost { cause, count }
-        }
-        v1::event::Body::End(v1::End {}) => Body::End,
-    };
-    Ok(Event { sequence, arrival_ns: event.arrival_ns, source, body })
-}
-
 #[cfg(test)]
 mod tests {
     use clearway_mapping::map::Part;
+    use prost::Message;
 
     use super::*;
-
-    #[test]
-    fn an_event_comes_out_of_the_journal_as_it_went_in() {
-        let pose = Isometry3::new(nalgebra::vector![1.0, 2.0, 3.0], nalgebra::vector![0.1, 0.2, 0.3]);
-        let bodies = [
-            Body::Datagram(Bytes::from_static(b"anything")),
-            Body::Scan(Scan {
-                stamp_ns: 7,
-                x: vec![1.0],
-                y: vec![2.0],
-                z: vec![f32::MIN],
-                intensity: vec![0.5],
-                ring: vec![u16::MAX],
-                offset_ns: vec![-20_000_000],
-                no_returns: vec![[0.0, 0.6, -0.8]],
-            }),
-            Body::EgoPose(EgoPose { stamp_ns: -1, map_from_ego: pose, speed_mps: 15.0 }),
-            Body::Road(Road {
-                stamp_ns: 5,
-                purpose: RoadPurpose::Route,
-                frame: RoadFrame::Map,
-                points: vec![[0.0, -1.5], [1e9, 2.0]],
-                widths_m: vec![3.5],
-                orientations: vec![1.0, 0.25],
-            }),
-            Body::Sensor(Box::new(SensorConfig {
-                model: Some(clearway_lidar::model::Model::PuckHiRes),
-                rpm: Some(600.0),
-                elevations_deg: vec![-15.0, 1.5],
-                blind_deg: vec![[350.0, 10.0], [80.0, 100.0]],
-                gps_late_days_max: 0.5,
-                ..SensorConfig::new(
-                    "left-2",
-                    Extrinsics { x_m: 1.0, y_m: -2.0, z_m: 0.5, roll_deg: 3.0, pitch_deg: 4.0, yaw_deg: -90.0 },
-                )
-            })),
-            Body::Lost { cause: Cause::Queue, count: 12 },
-            Body::Lost { cause: Cause::Kernel, count: 3 },
-            Body::End,
-        ];
-        for (sequence, body) in (0..).zip(bodies) {
-            let event = Event { sequence, arrival_ns: i64::MIN + 1, source: 3, body };
-            assert_eq!(event_from_bytes(event_to_proto(&event).encode_to_vec().into()), Ok(event));
-        }
-    }
-
-    #[test]
-    fn bytes_that_are_no_event_are_named() {
-        assert!(matches!(event_from_bytes(Bytes::from_static(b"\xff")), Err(EventError::Decode(_))));
-        let missing = Err(EventError::Missing { sequence: 0, what: "body" });
-        assert_eq!(event_from_bytes(Bytes::new()), missing);
-        for (road, what) in [
-            (v1::Road { frame: 1, ..Default::default() }, "known road purpose"),
-            (v1::Road { purpose: 9, frame: 1, ..Default::default() }, "known road purpose"),
-            (v1::Road { purpose: 1, frame: 3, ..Default::default() }, "known road frame"),
-            (v1::Road { purpose: 1, frame: 1, x: vec![0.0], ..Default::default() }, "y for every x of the road"),
-        ] {
-            let event = v1::Event { body: Some(v1::event::Body::Road(road)), ..Default::default() };
-            let missing = Err(EventError::Missing { sequence: 0, what });
-            assert_eq!(event_from_bytes(event.encode_to_vec().into()), missing);
-        }
-        let far = v1::Event { source: 70_000, ..v1::Event::default() };
-        let source = Err(EventError::Source { sequence: 0, source_index: 70_000 });
-        assert_eq!(event_from_bytes(far.encode_to_vec().into()), source);
-    }
 
     fn map() -> Map {
         let layer = |name| Layer {

@@ -1,5 +1,5 @@
-//! What the stream costs: a real server in a process of its own, a simulated HDL-64E sending datagrams to it in real time,
-//! and readers of one layer over gRPC, over zenoh, and over plain TCP, which is the floor for the same bytes.
+//! What the stream costs: a real server in a process of its own, a simulated HDL-64E sending datagrams to it in real
+//! time, and readers of one layer over gRPC, over zenoh, and over plain TCP, which is the floor for the same bytes.
 //!
 //!   cargo bench -p clearway-tests --bench stream                                  1, 10, 100 and 1,000 readers
 //!   cargo bench -p clearway-tests --bench stream -- --readers 1,10 --seconds 30 --layer occupancy --json

@@ -8,8 +8,8 @@ pub mod simulation;
 
 /// The folder of the binaries, brought up to date once for all tests of this process.
 ///
-/// `cargo test --workspace` has just built them, beside the tests of their packages; after a `cargo test` of this package
-/// alone they may be old.
+/// `cargo test --workspace` has just built them, beside the tests of their packages; after a `cargo test` of this
+/// package alone they may be old.
 ///
 /// # Panics
 /// When cargo cannot build them.

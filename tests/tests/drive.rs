@@ -1,7 +1,7 @@
-//! A closed loop: the simulated vehicle scans the town, its datagrams and ego poses go through real sockets into the real
-//! server, the map comes back over gRPC and over zenoh, the example planner plans on each, and the vehicle makes the move
-//! they agree on. One turn, one map, one move: the loop waits for each and never for the clock, so that every run drives
-//! the same way.
+//! A closed loop: the simulated vehicle scans the town, its datagrams and ego poses go through real sockets into the
+//! real server, the map comes back over gRPC and over zenoh, the example planner plans on each, and the vehicle makes
+//! the move they agree on. One turn, one map, one move: the loop waits for each and never for the clock, so that every
+//! run drives the same way.
 
 #[allow(dead_code, reason = "the example shows pictures")]
 #[path = "../../client/examples/planner/astar.rs"]
@@ -75,8 +75,8 @@ impl Loop {
         Self { vehicle, socket, running, ingester, maps, sent: 0 }
     }
 
-    /// Drives so until the sensor's head has turned past the vehicle's back, where the server cuts turns; then waits for
-    /// the map of that turn. Gives when that was, and the map.
+    /// Drives so until the sensor's head has turned past the vehicle's back, where the server cuts turns; then waits
+    /// for the map of that turn. Gives when that was, and the map.
     async fn turn(&mut self, next: Move) -> (Range<i64>, [MapView; 2]) {
         let begin_ns = self.vehicle.steer(next.curvature_per_m, next.mps);
         let datagrams = cast(&mut self.vehicle);

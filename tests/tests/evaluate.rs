@@ -1,4 +1,5 @@
-//! `clearway-server evaluate` on the labelled SemanticKITTI frame: the targets, and what it says of files that do not fit.
+//! `clearway-server evaluate` on the labelled SemanticKITTI frame: the targets, and what it says of files that do not
+//! fit.
 
 use std::path::Path;
 

@@ -1,5 +1,5 @@
-//! A car of two turning LIDARs and six that scan, through real sockets and a real stream: one map of all of them, and it is
-//! the world's.
+//! A car of two turning LIDARs and six that scan, through real sockets and a real stream: one map of all of them, and
+//! it is the world's.
 
 mod house;
 

@@ -1,4 +1,5 @@
-//! Readers of `Watch` over real sockets: what they ask for, what they are told, and that the bad ones cost nobody anything.
+//! Readers of `Watch` over real sockets: what they ask for, what they are told, and that the bad ones cost nobody
+//! anything.
 
 mod house;
 

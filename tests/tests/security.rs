@@ -4,10 +4,11 @@ mod house;
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 use clearway_client::{Client, ClientError, Subscription, Tls, ZenohClient};
 use clearway_server::config::{Access, Config, Tls as TlsConfig, ZenohMode};
+use clearway_server::replay::{Options, Summary, replay};
 use clearway_server::server::{Running, Server, Setup};
 use house::{config, feed, grpc, readings, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -125,6 +126,34 @@ async fn a_recording_holds_the_path_of_the_key_and_nothing_of_the_key() {
     let secret = key.lines().nth(1).expect("base64").as_bytes();
     let bytes = std::fs::read(&record).unwrap();
     assert!(!bytes.windows(secret.len()).any(|window| window == secret));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_replay_that_serves_asks_for_the_certificates_that_its_configuration_asks_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let (file, scan) = (folder.path().join("clearway.toml"), folder.path().join("0.bin"));
+    std::fs::write(&file, secured(true).to_toml()).unwrap();
+    std::fs::write(&scan, [0; 16]).unwrap();
+    let (told, address) = tokio::sync::oneshot::channel();
+    let started = |running: &Running, _: &Summary| told.send(running.grpc).expect("the test listens");
+    let asked = async {
+        let address = address.await.expect("it starts").expect("gRPC is served").to_string();
+        let plain = async { Client::connect(&address).await?.vehicles().await }.await;
+        assert!(plain.is_err(), "{plain:?}");
+        for (name, may_ask) in [("reader", true), ("server", false)] {
+            let client = Client::connect_tls(&address, &tls("ours", Some(("ours", name)))).await.expect("a handshake");
+            assert_eq!(client.vehicles().await.is_ok(), may_ask, "{name}");
+        }
+    };
+    let options = Options { files: vec![scan], config: Some(file), serve: true, ..Options::default() };
+    within("a replay", replay(options, Arc::default(), started, asked)).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn certificates_that_nobody_read_are_no_reason_to_serve_in_plain_text() {
+    let setup = Setup { config: secured(false), ..Setup::default() };
+    let error = Server::start(setup).await.err().expect("no server").to_string();
+    assert!(error.starts_with("grpc.tls: "), "{error}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -235,8 +235,8 @@ fn heard_at(name: &str, at: SocketAddr, from: &str) -> clearway_server::config::
     vehicle
 }
 
-/// A copy of a capture that begins with its first telemetry datagram. These captures are years old: sent today, their sensors'
-/// own clocks must be known before the first turn is stamped, as stamps never go back.
+/// A copy of a capture that begins with its first telemetry datagram. These captures are years old: sent today, their
+/// sensors' own clocks must be known before the first turn is stamped, as stamps never go back.
 fn with_its_clock_first(capture: &Path, copy: PathBuf) -> PathBuf {
     const FILE_HEADER: usize = 24;
     const RECORD_HEADER: usize = 16;

@@ -1,5 +1,5 @@
-//! Strangers who know ROS 2 and Foxglove and nothing of Clearway: they find the maps, decode them by what they are told, and
-//! have what the maps say.
+//! Strangers who know ROS 2 and Foxglove and nothing of Clearway: they find the maps, decode them by what they are
+//! told, and have what the maps say.
 
 mod house;
 

@@ -1,8 +1,8 @@
 //! `speed` maps to a way and a move: A* by travel time over ground that was seen to be passable.
 //!
-//! In: maps, a goal. Out: the next [`Move`]. Frame: the maps' world ("map") where the vehicle tells its ego poses; what was
-//! seen is then remembered for a while, since a sensor sees nothing close by. Without poses each map stands alone, in the
-//! ego frame. Ground that nobody saw is never entered, but for where the vehicle stands at first.
+//! In: maps, a goal. Out: the next [`Move`]. Frame: the maps' world ("map") where the vehicle tells its ego poses; what
+//! was seen is then remembered for a while, since a sensor sees nothing close by. Without poses each map stands alone,
+//! in the ego frame. Ground that nobody saw is never entered, but for where the vehicle stands at first.
 
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, HashMap};
@@ -15,7 +15,8 @@ const CELL_M: f64 = 0.5;
 const REACH_M: f64 = 16.0;
 /// Three discs about these places of the vehicle, metres ahead of its middle, cover it; each has a radius of 1.16 m.
 const DISCS_M: [f64; 3] = [1.45, 0.0, -1.45];
-/// From the middle of a disc to an obstacle's: its radius, and half a cell. Where that is not to be had, less at a crawl.
+/// From the middle of a disc to an obstacle's: its radius, and half a cell. Where that is not to be had, less at a
+/// crawl.
 const CLEARANCES_M: [(f64, f64); 2] = [(1.5, MPS_MAX), (1.2, 1.0)];
 /// Where it begins, the ground about it that its sensor cannot see is taken on trust, metres.
 const STAND_M: f64 = 5.0;
@@ -121,8 +122,8 @@ impl Planner {
         self.in_map([metres, 0.0])
     }
 
-    /// The next move towards a goal, or to where the way ends nearest to it: the arc to the farthest place of the way that
-    /// can be followed up to there.
+    /// The next move towards a goal, or to where the way ends nearest to it: the arc to the farthest place of the way
+    /// that can be followed up to there.
     pub fn next_move(&self, goal: Place) -> Move {
         let mut way_m = 0.0;
         for (clearance_m, mps) in CLEARANCES_M {

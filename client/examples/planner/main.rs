@@ -1,5 +1,6 @@
 //! A toy planner: A* on `speed`, and the move it would make at each map.
-//! `cargo run -p clearway-client --example planner -- [ADDRESS]`; over zenoh with an endpoint such as tcp/localhost:7447.
+//! `cargo run -p clearway-client --example planner -- [ADDRESS]`; over zenoh with an endpoint such as
+//! tcp/localhost:7447.
 
 mod astar;
 

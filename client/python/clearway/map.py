@@ -194,12 +194,17 @@ class Layer:
         return math.nan if cell < 0 else float(self.channels[channel].values.flat[cell])
 
     def is_free(self, footprint: Sequence[tuple[float, float]], step_m: float = 0.1) -> bool:
-        """Whether every cell under a polygon (corners x, y in metres) is known and free; looked at every `step_m`."""
+        """Whether every cell under a polygon (corners x, y in metres) is known and free; looked at every `step_m`, and at
+        the middle of every cell."""
         corners = np.asarray(footprint, dtype=np.float64)
         if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
             raise ClearwayError("footprint", f"footprint {footprint!r}: three or more finite corners (x, y) are needed")
         points = _inside(corners, step_m)
         cells = self.grid.cells_at(points[:, 0], points[:, 1])
+        # Cells smaller than a step, as those of a radial grid near the vehicle, would fall between the points.
+        middles = self.grid.centres().reshape(-1, 2)
+        near = np.flatnonzero(((middles >= corners.min(axis=0)) & (middles <= corners.max(axis=0))).all(axis=1))
+        cells = np.concatenate([cells, near[_within(corners, middles[near])]])
         return bool((cells >= 0).all() and self.free.ravel()[cells].all())
 
     def nearest_obstacle(self, x_m: float = 0.0, y_m: float = 0.0) -> Obstacle | None:
@@ -458,12 +463,18 @@ def _inside(corners: np.ndarray, step_m: float) -> np.ndarray:
     low, high = corners.min(axis=0), corners.max(axis=0)
     axes = [np.linspace(a, b, max(2, math.ceil((b - a) / step_m) + 1)) for a, b in zip(low, high)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    within = np.zeros(len(grid), dtype=bool)
     edges = []
     for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0)):
-        crosses = (ay > grid[:, 1]) != (by > grid[:, 1])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            within ^= crosses & (grid[:, 0] < (bx - ax) * (grid[:, 1] - ay) / (by - ay) + ax)
         parts = max(2, math.ceil(math.hypot(bx - ax, by - ay) / step_m) + 1)
         edges.append(np.linspace((ax, ay), (bx, by), parts))
-    return np.concatenate([grid[within], *edges])
+    return np.concatenate([grid[_within(corners, grid)], *edges])
+
+
+def _within(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Which points lie in a polygon."""
+    within = np.zeros(len(points), dtype=bool)
+    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0)):
+        crosses = (ay > points[:, 1]) != (by > points[:, 1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            within ^= crosses & (points[:, 0] < (bx - ax) * (points[:, 1] - ay) / (by - ay) + ax)
+    return within

@@ -2,6 +2,7 @@
 
 import json
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 import clearway
 from clearway import codec
-from clearway.map import Map
+from clearway.map import Map, RadialGrid
 from clearway.v1 import map_pb2
 
 GOLDEN = Path(__file__).resolve().parents[3] / "proto" / "golden"
@@ -122,3 +123,17 @@ def test_a_footprint_is_free_only_where_all_of_it_is_known_and_free():
     assert nearest is not None and layer.class_at(nearest.x_m, nearest.y_m) == "obstacle"
     with pytest.raises(clearway.ClearwayError, match="three or more finite corners"):
         layer.is_free([(0, 0), (1, float("nan")), (2, 2)])
+
+
+def test_no_cell_narrower_than_a_step_falls_between_the_points_of_a_footprint():
+    layer = clearway.Map((GOLDEN / "map.bin").read_bytes())["drivability"]
+    layer.grid = RadialGrid(np.arange(1.0, 6.0), 360)
+    raw = np.full(layer.grid.shape, layer.legend.index("drivable"), np.uint8)
+    layer.channels["class"] = replace(layer.channels["class"], raw=raw)
+    x, y = np.moveaxis(layer.grid.centres(), -1, 0)
+    footprint = [(1, -1), (4, -1), (4, 1), (1, 1)]
+    assert layer.is_free(footprint)
+    for cell in np.argwhere((1 < x) & (x < 4) & (abs(y) < 1)):
+        raw[tuple(cell)] = 0
+        assert not layer.is_free(footprint), f"cell {cell} is unknown"
+        raw[tuple(cell)] = layer.legend.index("drivable")

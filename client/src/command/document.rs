@@ -1,8 +1,8 @@
-//! One layer of a map -> JSON: geometry, pose, stamps, legend, figures, and the cells where asked for.
+//! One layer of a map -> JSON: geometry, pose, stamps, sensors, legend, figures, and the cells where asked for.
 
 use clearway_client::codec::Cells;
 use clearway_client::grid::Grid;
-use clearway_client::{Channel, Layer, MapView};
+use clearway_client::{Channel, Layer, MapView, v1};
 use serde_json::{Value, json};
 
 /// The document. Arrays are row by row, in the order of the grid's cell index.
@@ -21,15 +21,6 @@ pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
         .map_from_ego
         .as_ref()
         .map(|p| json!({"x": p.x, "y": p.y, "z": p.z, "qx": p.qx, "qy": p.qy, "qz": p.qz, "qw": p.qw}));
-    let sensors = header.sensors.iter().map(|s| {
-        json!({
-            "name": s.name, "model": s.model, "packets": s.packets, "packets_expected": s.packets_expected, "refused": s.refused, "returns": s.returns,
-            "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
-            "blocked_deg": s.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
-            "blocked_lasers": s.blocked_lasers,
-            "clock": s.clock, "clock_offset_ms": s.clock_offset_ms,
-        })
-    });
     let (rows, columns) = layer.grid.shape();
     json!({
         "vehicle": header.vehicle,
@@ -42,7 +33,7 @@ pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
         "map_from_ego": pose,
         "speed_mps": header.speed_mps,
         "compensation": header.compensation,
-        "sensors": sensors.collect::<Vec<_>>(),
+        "sensors": header.sensors.iter().map(sensor).collect::<Vec<_>>(),
         "layer": layer.name,
         "geometry": geometry,
         "shape": [rows, columns],
@@ -50,6 +41,19 @@ pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
         "planes": layer.planes,
         "figures": layer.figures,
         "channels": layer.channels.iter().map(|c| channel(c, with_cells)).collect::<Vec<_>>(),
+    })
+}
+
+/// What a sensor gave to a map.
+pub fn sensor(state: &v1::SensorState) -> Value {
+    json!({
+        "name": state.name, "model": state.model, "packets": state.packets, "packets_expected": state.packets_expected,
+        "refused": state.refused, "returns": state.returns,
+        "rpm": state.rpm, "completeness": state.completeness, "partial": state.partial,
+        "blocked_deg": state.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
+        "blocked_lasers": state.blocked_lasers,
+        "clock": state.clock, "clock_offset_ms": state.clock_offset_ms,
+        "state": state.state, "age_ms": state.age_ms,
     })
 }
 

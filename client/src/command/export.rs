@@ -9,7 +9,7 @@ use clearway_client::{Channel, Layer, MapView};
 
 use self::viewer_file::{Dialect, ViewerFile};
 use super::recording::{Message, Recording};
-use super::{document, npy, progress_bar};
+use super::{document, npy, progress_bar, say};
 use clearway_client::picture::{self, Style};
 
 mod turns;
@@ -21,8 +21,8 @@ mod viewer_file;
 /// `<sequence>_<layer>_<channel>.npy` (NumPy 1.0, shape (rows, columns)) and one `<sequence>_<layer>.json` with
 /// geometry, pose, stamps and class legend. Pictures look from above: vehicle in the middle, forward up, left left.
 ///
-/// foxglove and ros2 write one new MCAP file with every layer, of every vehicle: coloured grids, transforms and the sensors'
-/// points; or occupancy grids (0 free, 100 occupied, -1 unknown), tf and odometry.
+/// foxglove and ros2 write one new MCAP file with every layer, of every vehicle: coloured grids, transforms and the
+/// sensors' points; or occupancy grids (0 free, 100 occupied, -1 unknown), tf and odometry.
 #[derive(Args)]
 pub struct Options {
     /// The MCAP file; one cut by a crash gives what it holds.
@@ -169,7 +169,7 @@ pub fn run(options: &Options) -> Result<()> {
     if maps == 0 {
         bail!("{}", nothing_exported(file, &recording, layer.as_deref(), vehicle.as_deref()));
     }
-    println!("{maps} maps of {} in {}", layer.as_deref().unwrap_or("all layers"), out.display());
+    say(&format!("{maps} maps of {} in {}", layer.as_deref().unwrap_or("all layers"), out.display()))?;
     Ok(())
 }
 

@@ -10,6 +10,8 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use clearway_client::MapView;
 use clearway_lidar::capture::Capture;
+use clearway_lidar::packet::PACKET_LENGTH;
+use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use clearway_lidar::{Sensor, SensorConfig};
 use serde_json::{Map, Value, json};
 
@@ -155,8 +157,8 @@ fn capture(file: &Path) -> Result<Value> {
         span = Some(span.map_or((at, at), |(first, last)| (first.min(at), last.max(at))));
         *ports.entry(datagram.destination_port.to_string()).or_default() += 1;
         match datagram.payload.len() {
-            1206 => packets += 1,
-            512 => telemetry += 1,
+            PACKET_LENGTH => packets += 1,
+            TELEMETRY_LENGTH => telemetry += 1,
             _ => other += 1,
         }
         // One sensor sends both kinds, each from its own port.

@@ -10,6 +10,8 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use clearway_lidar::capture::Capture;
+use clearway_lidar::packet::PACKET_LENGTH;
+use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_sim::impair::{Counts, Impairment};
 use clearway_sim::vehicle::{Datagram, Kind};
@@ -19,9 +21,6 @@ use super::network;
 use super::progress_bar;
 use super::recording::Recording;
 
-/// Bytes of a Velodyne data packet and of a telemetry datagram; nothing else is sent.
-const PACKET_BYTES: usize = 1206;
-const TELEMETRY_BYTES: usize = 512;
 /// A capture with a hole of hours is not a reason to sit and wait.
 const PAUSE_MAX: Duration = Duration::from_secs(60);
 
@@ -159,10 +158,10 @@ struct Through {
 impl Through {
     fn send(&mut self, stamp_ns: i64, payload: &[u8]) -> Result<()> {
         let kind = match payload.len() {
-            PACKET_BYTES => Kind::Data,
-            TELEMETRY_BYTES => Kind::Telemetry,
+            PACKET_LENGTH => Kind::Data,
+            TELEMETRY_LENGTH => Kind::Telemetry,
             length => {
-                self.sender.skip(&format!("{length} bytes; 1206 and 512 are sent"), 1);
+                self.sender.skip(&format!("{length} bytes; {PACKET_LENGTH} and {TELEMETRY_LENGTH} are sent"), 1);
                 return Ok(());
             }
         };

@@ -48,14 +48,9 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
     let ledger = vehicle.ledger.clone().unwrap_or_default();
     let recorder = vehicle.recorder.clone().unwrap_or_default();
     let sensors = vehicle.sensors.iter().map(|s| {
-        json!({
-            "name": s.name, "model": s.model, "packets": s.packets, "packets_expected": s.packets_expected, "refused": s.refused, "returns": s.returns,
-            "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
-            "blocked_deg": s.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
-            "blocked_lasers": s.blocked_lasers,
-            "clock": s.clock, "clock_offset_ms": s.clock_offset_ms,
-            "ledger": vehicle.sensor_ledgers.get(&s.name).map(ledger_document),
-        })
+        let mut sensor = super::document::sensor(s);
+        sensor["ledger"] = vehicle.sensor_ledgers.get(&s.name).map(ledger_document).into();
+        sensor
     });
     json!({
         "name": vehicle.name,
@@ -65,6 +60,7 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
         "newest_age_ms": age_ms(vehicle, now),
         "sensors": sensors.collect::<Vec<_>>(),
         "ledger": ledger_document(&ledger),
+        "observations_refused": vehicle.observations_refused,
         "recorder": {"file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost},
         "readers": vehicle.readers,
         "strangers": vehicle.strangers.iter().map(|s| {
@@ -77,6 +73,8 @@ fn ledger_document(ledger: &v1::Ledger) -> Value {
     json!({
         "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
         "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
+        "points_dropped": ledger.points_dropped, "own_body": ledger.own_body, "through_body": ledger.through_body,
+        "blind": ledger.blind,
         "poses": ledger.poses, "poses_refused": ledger.poses_refused,
         "roads": ledger.roads, "roads_refused": ledger.roads_refused,
     })

@@ -1,4 +1,5 @@
-//! A map -> Foxglove messages: `foxglove.Grid` a layer, `foxglove.FrameTransforms`, and `foxglove.PointCloud` of points.
+//! A map -> Foxglove messages: `foxglove.Grid` a layer, `foxglove.FrameTransforms`, and `foxglove.PointCloud` of
+//! points.
 
 use clearway_proto::map::Layer;
 use foxglove::messages::packed_element_field::NumericType;

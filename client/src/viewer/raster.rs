@@ -1,10 +1,10 @@
 //! A layer -> square cells, as occupancies and as a picture.
 //!
-//! In: a layer, Cartesian or radial. Out: row by row, x first, an occupancy (0 free to 100 occupied, -1 unknown) or red,
-//! green, blue, alpha a cell; and where the cells lie in the ego frame. A Cartesian layer keeps its cells and its axes. A
-//! radial one is resampled: a square cell has the worst of the radial cell at its middle and those whose middles lie in it,
-//! so that near the vehicle, where radial cells are the smaller ones, no obstacle falls between; and unknown is worse than
-//! free.
+//! In: a layer, Cartesian or radial. Out: row by row, x first, an occupancy (0 free to 100 occupied, -1 unknown) or
+//! red, green, blue, alpha a cell; and where the cells lie in the ego frame. A Cartesian layer keeps its cells and its
+//! axes. A radial one is resampled: a square cell has the worst of the radial cell at its middle and those whose
+//! middles lie in it, so that near the vehicle, where radial cells are the smaller ones, no obstacle falls between; and
+//! unknown is worse than free.
 //!
 //! | occupancy | classes |
 //! |---|---|
@@ -110,8 +110,8 @@ impl Raster {
         }
     }
 
-    /// Red, green, blue and alpha a cell, of a layer of this grid, in the colours of [`crate::picture`]; what lies outside
-    /// of a radial grid is transparent.
+    /// Red, green, blue and alpha a cell, of a layer of this grid, in the colours of [`crate::picture`]; what lies
+    /// outside of a radial grid is transparent.
     pub fn rgba(&self, layer: &Layer) -> Vec<u8> {
         let colours = Colours::of(layer);
         let colour = |cell: u32| match cell {

@@ -1,4 +1,5 @@
-//! A map -> ROS 2 messages, CDR: `nav_msgs/msg/OccupancyGrid` a layer, `tf2_msgs/msg/TFMessage` and `nav_msgs/msg/Odometry`.
+//! A map -> ROS 2 messages, CDR: `nav_msgs/msg/OccupancyGrid` a layer, `tf2_msgs/msg/TFMessage` and
+//! `nav_msgs/msg/Odometry`.
 
 use clearway_proto::map::Layer;
 use clearway_ros::OccupancyGrid;

@@ -54,7 +54,7 @@ impl Ros {
             return Err(("ros", "(set)".into(), allowed.into()));
         }
         if self.domain > DOMAIN_MAX {
-            return Err(("ros.domain", self.domain.to_string(), "0 to 232".into()));
+            return Err(("ros.domain", self.domain.to_string(), format!("0 to {DOMAIN_MAX}")));
         }
         if let Some(unknown) = self.sensors.keys().find(|name| !sensors.iter().any(|sensor| sensor.name == **name)) {
             let known: Vec<_> = sensors.iter().map(|sensor| sensor.name.as_str()).collect();

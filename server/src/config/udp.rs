@@ -22,8 +22,8 @@ pub struct Udp {
     pub groups: Vec<IpAddr>,
     /// Name of the network interface the groups are joined on; empty: the system's choice.
     pub interface: String,
-    /// Sender of each sensor, by sensor name: `"192.168.1.201"`, or with its port. Datagrams of anyone else are refused.
-    /// Empty: whatever arrives is the one sensor's.
+    /// Sender of each sensor, by sensor name: `"192.168.1.201"`, or with its port. Datagrams of anyone else are
+    /// refused. Empty: whatever arrives is the one sensor's.
     pub from: BTreeMap<String, Sender>,
     /// Ports of sensors that have their own, by sensor name.
     pub ports: BTreeMap<String, Ports>,

@@ -1,5 +1,5 @@
-//! A [`Rig`] at work, in real time: each turning sensor sends datagrams from an address of its own, and what the car tells
-//! goes over gRPC.
+//! A [`Rig`] at work, in real time: each turning sensor sends datagrams from an address of its own, and what the car
+//! tells goes over gRPC.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
@@ -27,7 +27,8 @@ pub fn address(index: usize) -> Ipv4Addr {
 }
 
 impl Car {
-    /// Starts it: datagrams go to `data` and `telemetry`, and where it has units that scan, they, poses and roads to `grpc`.
+    /// Starts it: datagrams go to `data` and `telemetry`, and where it has units that scan, they, poses and roads to
+    /// `grpc`.
     ///
     /// # Errors
     /// What the system says where it has no thread to give.

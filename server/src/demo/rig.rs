@@ -1,7 +1,7 @@
 //! A simulated car with several sensors: what its vehicle's configuration says of them, and what they send.
 //!
-//! Out: datagrams of each turning sensor ([`Rig::vehicle`]), and as observations what comes over the network instead: scans
-//! of the units with a few planes, ego poses and the road ahead ([`Rig::told`]).
+//! Out: datagrams of each turning sensor ([`Rig::vehicle`]), and as observations what comes over the network instead:
+//! scans of the units with a few planes, ego poses and the road ahead ([`Rig::told`]).
 
 use clearway_client::Observation;
 use clearway_client::observation::{RoadFrame, RoadPurpose};
@@ -22,7 +22,8 @@ const ROAD_PERIOD_NS: i64 = 100_000_000;
 /// Nothing of the car itself is in the simulated world; nearer returns would be rain on the window.
 const RANGE_M_MIN: f32 = 0.5;
 
-/// A car in a scene, and its sensors by name. The turning ones come first in the configuration, and the first of them leads.
+/// A car in a scene, and its sensors by name. The turning ones come first in the configuration, and the first of them
+/// leads.
 #[derive(Clone, Debug)]
 pub struct Rig {
     /// Where it drives, and how.

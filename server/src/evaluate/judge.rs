@@ -1,16 +1,18 @@
 //! A map's layer against points whose truth is known: counts that add up over frames, and the shares they make.
 //!
-//! In: a [`Layer`] and [`Point`]s, both in the ego frame of one stamp. Out: a [`Tally`]. Pure: where the truth comes from
-//! (labels, a simulated world) is not known here.
+//! In: a [`Layer`] and [`Point`]s, both in the ego frame of one stamp. Out: a [`Tally`]. Pure: where the truth comes
+//! from (labels, a simulated world) is not known here.
 //!
 //! A cell's truth is voted by the points in it, those higher than 2.5 m over the ground left out: an obstacle's point
 //! makes it an obstacle; else the most frequent of forbidden, either and drivable wins; a tie goes to the former.
-//! Precision is the share of the cells called drivable, and seen by a point, that are neither obstacle nor forbidden; recall
-//! the share of the drivable cells that are called so. A point is called ground where its cell is called drivable and it
-//! lies at most [`GROUND_OVER_LOWEST_M`] over the cell's lowest point; points beyond the layer's grid are not scored.
+//! Precision is the share of the cells called drivable, and seen by a point, that are neither obstacle nor forbidden;
+//! recall the share of the drivable cells that are called so. A point is called ground where its cell is called
+//! drivable and it lies at most [`GROUND_OVER_LOWEST_M`] over the cell's lowest point; points beyond the layer's grid
+//! are not scored.
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use clearway_client::footprint::FREE;
 use clearway_mapping::map::{Cells, Geometry, Layer};
 use clearway_mapping::radial::RadialGrid;
 
@@ -20,9 +22,6 @@ pub const OBSTACLE_M_MIN: f32 = 0.3;
 pub const OBSTACLE_M_MAX: f32 = 2.5;
 /// A point higher over its cell's lowest is not ground.
 pub const GROUND_OVER_LOWEST_M: f32 = 0.3;
-
-/// Names of the classes, over all maps, that let a vehicle pass; in no map does one of them mean anything else.
-const DRIVABLE: [&str; 8] = ["drivable", "flat", "flat_inferred", "clear", "passable", "road", "free", "path"];
 
 /// What a point says of its cell.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -137,8 +136,8 @@ impl Tally {
         share(self.road.1, self.road.0)
     }
 
-    /// Adds what `layer` does with the points of its frame; `false`, and nothing added, where none of its classes lets a
-    /// vehicle pass.
+    /// Adds what `layer` does with the points of its frame; `false`, and nothing added, where none of its classes lets
+    /// a vehicle pass.
     pub fn add(&mut self, layer: &Layer, points: &[Point]) -> bool {
         let Some(called) = called(layer) else { return false };
         let cell_of = locate(&layer.geometry);
@@ -240,7 +239,7 @@ impl Ballot {
 
 /// Whether each cell is called drivable; `None` where the layer has no such class.
 fn called(layer: &Layer) -> Option<Vec<bool>> {
-    let passes: Vec<bool> = layer.legend.iter().map(|name| DRIVABLE.contains(name)).collect();
+    let passes: Vec<bool> = layer.legend.iter().map(|name| FREE.contains(name)).collect();
     let class = layer.channels.iter().find(|channel| channel.name == "class")?;
     if !passes.contains(&true) {
         return None;

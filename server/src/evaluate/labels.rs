@@ -1,8 +1,9 @@
 //! SemanticKITTI labels -> the truth about a scan's points.
 //!
 //! In: a `.label` file (u32 a point, the class in the lower 16 bits), the points in the ego frame. Out: [`Point`]s. An
-//! obstacle is a point of anything but ground, 0.3 to 2.5 m over the labelled ground about it; ground is drivable where it
-//! can be reached over cells without obstacles (1° by the sensor's rings, two empty rows bridged) from the blind zone.
+//! obstacle is a point of anything but ground, 0.3 to 2.5 m over the labelled ground about it; ground is drivable where
+//! it can be reached over cells without obstacles (1° by the sensor's rings, two empty rows bridged) from the blind
+//! zone.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -51,7 +52,8 @@ const CLASSES: [(u32, &str); 34] = [
 ];
 const VEGETATION: u32 = 70;
 
-/// Patchwork's low vegetation reaches down to three quarters of the sensor's height under the sensor (1.3 m on KITTI's car).
+/// Patchwork's low vegetation reaches down to three quarters of the sensor's height under the sensor (1.3 m on KITTI's
+/// car).
 const LOW_VEGETATION: f32 = 0.25;
 
 /// The truth's own grid.

@@ -1,8 +1,8 @@
 //! Files and folders -> scans with their labels.
 //!
 //! A scan `STEM.bin` and its labels `STEM.label` belong together in one folder, in `velodyne/` beside `labels/` as
-//! SemanticKITTI lays them out, or in any two folders side by side. Labels without a scan are an error; scans without labels
-//! are counted, for a drive is often labelled in part.
+//! SemanticKITTI lays them out, or in any two folders side by side. Labels without a scan are an error; scans without
+//! labels are counted, for a drive is often labelled in part.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -168,8 +168,8 @@ fn scan_of(labels: &Path) -> Result<PathBuf, PairsError> {
     }
 }
 
-/// The files that may be the other half of `path`: the one beside it, else the one in the folder SemanticKITTI has it in,
-/// else all in folders beside its own.
+/// The files that may be the other half of `path`: the one beside it, else the one in the folder SemanticKITTI has it
+/// in, else all in folders beside its own.
 fn others(path: &Path, folder: &str, extension: &str) -> Result<Vec<PathBuf>, PairsError> {
     let beside = path.with_extension(extension);
     if beside.is_file() {

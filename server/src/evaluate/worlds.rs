@@ -1,7 +1,7 @@
 //! Simulated scenes -> maps through the real pipeline, with the truth of the world about every point.
 //!
-//! In: a scene's name. Out: frame after frame, a map and its [`Point`]s. The vehicle's datagrams, and its poses every 10 ms,
-//! enter as events; the truth is the simulator's, of the moment the map's capture ended.
+//! In: a scene's name. Out: frame after frame, a map and its [`Point`]s. The vehicle's datagrams, and its poses every
+//! 10 ms, enter as events; the truth is the simulator's, of the moment the map's capture ended.
 
 use bytes::Bytes;
 use clearway_mapping::event::{Body, EgoPose, Event};
@@ -19,7 +19,8 @@ pub const SCENES: [(&str, u64); 5] = [("flat", 1), ("slopes", 1), ("canopy", 1),
 
 /// The truth's raster: 60 m to each side in cells of 0.2 m.
 const RASTER_M: (f64, f64) = (60.0, 0.2);
-/// Lower points of a simulated turn are ground: ten times the sensor's noise, and the ground's own rise within a raster cell.
+/// Lower points of a simulated turn are ground: ten times the sensor's noise, and the ground's own rise within a raster
+/// cell.
 const GROUND_M_MAX: f32 = 0.15;
 const POSE_PERIOD_NS: i64 = 10_000_000;
 
@@ -40,7 +41,8 @@ pub fn scanner() -> ScannerConfig {
     ScannerConfig::default()
 }
 
-/// Drives through the scene until `judge` has seen so many whole revolutions, each as the pipeline left it, and its points.
+/// Drives through the scene until `judge` has seen so many whole revolutions, each as the pipeline left it, and its
+/// points.
 pub fn drive(scene: Scene, pipeline: &mut Pipeline, revolutions: u64, mut judge: impl FnMut(&Pipeline, Vec<Point>)) {
     let vehicle = SimulatedVehicle::new(scene, scanner());
     let mut next_pose_ns = vehicle.start_ns();

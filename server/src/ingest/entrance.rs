@@ -21,8 +21,8 @@ pub struct Entrance {
     pub vehicle: Arc<str>,
     /// What one observation may be.
     pub limits: Limits,
-    /// Events of one client that may wait for their verdict: all streams together fill half the vehicle's queue, so that
-    /// the other half is the UDP door's.
+    /// Events of one client that may wait for their verdict: all streams together fill half the vehicle's queue, so
+    /// that the other half is the UDP door's.
     pub in_flight_max: usize,
     /// With the sensors that were declared: what the engine will have made of the events sent so far.
     config: Mutex<VehicleConfig>,
@@ -132,8 +132,8 @@ impl Entrance {
         }
     }
 
-    /// Declares a sensor as the next one, or one that is there already. The engine will judge it as it is judged here, so
-    /// that its name can be used at once.
+    /// Declares a sensor as the next one, or one that is there already. The engine will judge it as it is judged here,
+    /// so that its name can be used at once.
     fn declare(&self, captured_ns: Option<i64>, sensor: Box<SensorConfig>, ticket: Ticket) {
         let mut config = locked(&self.config);
         let before = config.sensors.len();

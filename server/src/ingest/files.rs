@@ -1,5 +1,5 @@
-//! Files and folders, in the order given -> readings. What a file is, its first bytes tell, else its name: pcap, pcapng,
-//! MCAP, KITTI `.bin`, `.pcd`. A folder stands for the files in it, by name.
+//! Files and folders, in the order given -> readings. What a file is, its first bytes tell, else its name: pcap,
+//! pcapng, MCAP, KITTI `.bin`, `.pcd`. A folder stands for the files in it, by name.
 
 use std::collections::{BTreeSet, VecDeque};
 use std::io::Read;

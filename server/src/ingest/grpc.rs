@@ -1,8 +1,8 @@
 //! Observations over gRPC: `clearway.v1.IngestService`.
 //!
 //! A stream reads its next observation only while the events before it are within the vehicle's limits and the peer
-//! takes its reports: a fast ingester waits, and holds no more than that. What becomes of the events comes back from the
-//! engine by [`Ticket`](super::ticket::Ticket) and is told in as few reports as the transport takes.
+//! takes its reports: a fast ingester waits, and holds no more than that. What becomes of the events comes back from
+//! the engine by [`Ticket`](super::ticket::Ticket) and is told in as few reports as the transport takes.
 
 use std::pin::Pin;
 use std::sync::Arc;

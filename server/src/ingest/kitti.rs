@@ -1,7 +1,7 @@
 //! Scans somebody else has assembled -> readings: KITTI `.bin` and `.pcd`, read by [`clearway_mapping::scan_file`].
 //!
-//! Such files carry no stamps: the scans are given those of a 10 Hz sensor from a fixed moment on ([`EPOCH_NS`]), so that
-//! the same files always make the same maps.
+//! Such files carry no stamps: the scans are given those of a 10 Hz sensor from a fixed moment on ([`EPOCH_NS`]), so
+//! that the same files always make the same maps.
 
 use std::path::{Path, PathBuf};
 

@@ -1,5 +1,5 @@
-//! One MCAP file -> readings: the journal of one vehicle where the file is a recording of ours, else the ROS 2 messages of
-//! the topics that [`super::ros`] chooses.
+//! One MCAP file -> readings: the journal of one vehicle where the file is a recording of ours, else the ROS 2 messages
+//! of the topics that [`super::ros`] chooses.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::Path;

@@ -2,8 +2,8 @@
 //!
 //! Scans come in the sensor's frame, which its extrinsics place. Poses come from an odometry, a stamped pose, or the tf
 //! chain from a fixed frame down to the vehicle's own; where a message speaks of another frame than the vehicle's, the
-//! tf tree carries it over, and a chain that is not there is an error. tf and stamped poses tell no speed: it is the way
-//! forward since the pose before, so that the first of them only begins.
+//! tf tree carries it over, and a chain that is not there is an error. tf and stamped poses tell no speed: it is the
+//! way forward since the pose before, so that the first of them only begins.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -109,8 +109,8 @@ impl Intake {
         matches!(&self.pose, Some(PoseFrom::Topic(of)) if of == topic)
     }
 
-    /// Takes one message of a wanted topic; its readings go to the end of `readings`. Packets arrive at their own stamps,
-    /// everything else at `arrival_ns`.
+    /// Takes one message of a wanted topic; its readings go to the end of `readings`. Packets arrive at their own
+    /// stamps, everything else at `arrival_ns`.
     ///
     /// # Errors
     /// [`Refused`]; then nothing of the message was taken.
@@ -179,8 +179,8 @@ impl Intake {
         Some(EgoPose { stamp_ns, map_from_ego, speed_mps: forward_m / seconds })
     }
 
-    /// Keeps the transforms; where they move the vehicle, gives its pose. The nearest moving transform above the vehicle's
-    /// frame stamps it: those farther up (a localisation's) come seldom, and are stamped ahead by some.
+    /// Keeps the transforms; where they move the vehicle, gives its pose. The nearest moving transform above the
+    /// vehicle's frame stamps it: those farther up (a localisation's) come seldom, and are stamped ahead by some.
     fn take_transforms(
         &mut self,
         transforms: &[StampedTransform],

@@ -1,5 +1,5 @@
-//! UDP sockets -> the vehicles' doors. One named OS thread a socket; several sensors and several vehicles can share a socket
-//! and are told apart by their senders.
+//! UDP sockets -> the vehicles' doors. One named OS thread a socket; several sensors and several vehicles can share a
+//! socket and are told apart by their senders.
 //!
 //! The threads do nothing else and wait for nobody: where an engine does not keep up, readings are lost in its door's
 //! queue and counted there, not in the kernel's buffer.
@@ -188,8 +188,8 @@ impl Heard<'_> {
     }
 }
 
-/// Gives a datagram to its vehicle. A stranger's is counted by the first vehicle of the socket, so that each datagram is in
-/// one ledger.
+/// Gives a datagram to its vehicle. A stranger's is counted by the first vehicle of the socket, so that each datagram
+/// is in one ledger.
 fn sort(datagram: Received, listener: &Listener, heard: &mut [Heard<'_>]) {
     let Some(route) = listener.route(datagram.peer) else {
         if let Some(first) = heard.first() {

@@ -1,8 +1,8 @@
 //! Who may call what over gRPC: the names in a peer's certificate -> its roles -> the RPCs it may call.
 //!
 //! Off while no client certificates are asked for (`grpc.tls.client_ca`): then everybody who reaches the port may do
-//! everything. On, everything is denied that [`RPCS`] and `[grpc.access]` do not allow; a test holds [`RPCS`] equal to the
-//! wire contract.
+//! everything. On, everything is denied that [`RPCS`] and `[grpc.access]` do not allow; a test holds [`RPCS`] equal to
+//! the wire contract.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::future::{Ready, ready};
@@ -29,7 +29,7 @@ pub enum Role {
     Reader,
     /// Sends scans, poses, roads and packets.
     Ingester,
-    /// Does both, and controls recordings.
+    /// Does both.
     Operator,
 }
 
@@ -44,7 +44,8 @@ impl Role {
     }
 }
 
-/// Every RPC there is, and who may call it; operators may call all. Whoever has a role may ask for health and reflection.
+/// Every RPC there is, and who may call it; operators may call all. Whoever has a role may ask for health and
+/// reflection.
 pub const RPCS: &[(&str, &[Role])] = &[
     ("/clearway.v1.MapService/Watch", &[Role::Reader]),
     ("/clearway.v1.MapService/GetMap", &[Role::Reader]),
@@ -150,7 +151,8 @@ fn has_place<B>(request: &Request<B>) -> Result<(), Status> {
     }
 }
 
-/// The names in the peer's own certificate, which the handshake has checked against `client_ca`: common name and DNS names.
+/// The names in the peer's own certificate, which the handshake has checked against `client_ca`: common name and DNS
+/// names.
 fn names<B>(request: &Request<B>) -> Vec<String> {
     let certificates = request.extensions().get::<TlsConnectInfo<Place>>().and_then(TlsConnectInfo::peer_certs);
     let Some(certificate) = certificates.as_ref().and_then(|chain| chain.first()) else { return Vec::new() };

@@ -1,8 +1,9 @@
 //! A listener -> connections, so many at once and none that stays silent: what gRPC and the page accept from.
 //!
 //! A peer that opens connections by the thousand would use up the process' file handles, with which recordings are
-//! opened too; one that connects and says nothing would hold its place for ever. Whoever finds no place can be let into a small
-//! lobby for a short while, to be told so; beyond it, connections are closed at once: nobody waits behind a thousand idle ones.
+//! opened too; one that connects and says nothing would hold its place for ever. Whoever finds no place can be let into
+//! a small lobby for a short while, to be told so; beyond it, connections are closed at once: nobody waits behind a
+//! thousand idle ones.
 
 use std::io;
 use std::net::SocketAddr;

@@ -1,8 +1,9 @@
 //! Maps, points and poses to Foxglove and whoever else speaks its WebSocket protocol (`foxglove.sdk.v1`).
 //!
-//! Channels: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/points` (`foxglove.PointCloud`: what the newest map was
-//! made from) and `/tf` (`foxglove.FrameTransforms`: `<vehicle>/base_link` in `map`). What nobody subscribes to is not made.
-//! Whoever comes gets the newest map at once. A stalled client holds [`BACKLOG`] messages, then the oldest are dropped.
+//! Channels: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/points` (`foxglove.PointCloud`: what the newest
+//! map was made from) and `/tf` (`foxglove.FrameTransforms`: `<vehicle>/base_link` in `map`). What nobody subscribes to
+//! is not made. Whoever comes gets the newest map at once. A stalled client holds [`BACKLOG`] messages, then the oldest
+//! are dropped.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};

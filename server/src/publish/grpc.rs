@@ -1,7 +1,8 @@
 //! Maps over gRPC: `clearway.v1.MapService`, standard health and reflection, and beside them what vehicles send
 //! ([`crate::ingest::grpc`]).
 //!
-//! What a peer may cost is set here, explicitly, each limit with its reason; what one reader gets is [`super::reader`]'s.
+//! What a peer may cost is set here, explicitly, each limit with its reason; what one reader gets is
+//! [`super::reader`]'s.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -31,8 +32,8 @@ const REQUEST_BYTES_MAX: usize = 64 << 10;
 const WINDOW_BYTES: u32 = 1 << 20;
 /// Streams a connection: a fleet page watches some vehicles' layers, nobody a hundred.
 const STREAMS_MAX: u32 = 128;
-/// Streams of one connection that were reset before anybody looked at them, and those the server had to reset for the peer's
-/// mistakes. A planner that restarts resets its few; whoever goes on opening and resetting loses its connection.
+/// Streams of one connection that were reset before anybody looked at them, and those the server had to reset for the
+/// peer's mistakes. A planner that restarts resets its few; whoever goes on opening and resetting loses its connection.
 const RESETS_PENDING_MAX: usize = 20;
 const RESETS_FOR_MISTAKES_MAX: usize = 128;
 /// A reader that opens `Watch` says what it wants at once.

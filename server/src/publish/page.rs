@@ -1,7 +1,7 @@
 //! The page, embedded, with its WebSocket `/live?vehicle=V`, `/vehicles`, `/healthz` and `/metrics`.
 //!
-//! The WebSocket sends each newest map as a binary `clearway.v1.MapUpdate` with all layers, and the status once a second
-//! as a JSON text. A browser that takes nothing for a while is dropped.
+//! The WebSocket sends each newest map as a binary `clearway.v1.MapUpdate` with all layers, and the status once a
+//! second as a JSON text. A browser that takes nothing for a while is dropped.
 
 use std::time::Duration;
 

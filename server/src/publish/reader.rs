@@ -1,8 +1,8 @@
 //! One reader of `Watch`: its requests and the newest maps -> its updates.
 //!
-//! The stream is asked for its next update when the transport has room for one, and looks at the newest-map slot only then: a
-//! slow reader skips maps and is told how many, and costs the engine nothing. Credits bound what is on the way: without them
-//! HTTP/2 windows alone hold about half a minute of maps.
+//! The stream is asked for its next update when the transport has room for one, and looks at the newest-map slot only
+//! then: a slow reader skips maps and is told how many, and costs the engine nothing. Credits bound what is on the way:
+//! without them HTTP/2 windows alone hold about half a minute of maps.
 
 use std::sync::Arc;
 

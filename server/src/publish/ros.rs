@@ -1,10 +1,11 @@
 //! Maps as ROS 2 topics in rmw_zenoh's key space, with no bridge between.
 //!
-//! Of each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`, reliable, transient local, keep last 1)
-//! and its place in `map` on `/tf` (reliable, volatile). A topic is published under `<domain>/<topic>/<type>/<hash>`, the
-//! payload CDR, with an attachment: sequence, time of sending, length 16, the publisher's 16 bytes. Liveliness tokens under
-//! `@ros2_lv` tell of the node and its publishers. A grid is made while somebody subscribes; whoever comes gets the newest
-//! map at once, whoever comes later has it from the publisher's cache.
+//! Of each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`, reliable, transient local, depth 1)
+//! and its place in `map` on `/tf` (reliable, volatile). A topic is published under
+//! `<domain>/<topic>/<type>/<hash>`, the payload CDR, with an attachment: sequence, time of sending, length 16, the
+//! publisher's 16 bytes. Liveliness tokens under `@ros2_lv` tell of the node and its publishers. A grid is made while
+//! somebody subscribes; whoever comes gets the newest map at once, whoever comes later has it from the publisher's
+//! cache.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
@@ -28,8 +29,8 @@ use crate::wire::EncodedMap;
 
 /// The node's name.
 const NODE: &str = "clearway";
-/// reliability 1 reliable; durability 1 transient local; history 1 keep last, depth 1; deadline, lifespan and liveliness as
-/// they are by default.
+/// reliability 1 reliable; durability 1 transient local; history 1 keep last, depth 1; deadline, lifespan and
+/// liveliness as they are by default.
 const LATCHED: &str = "1:1:1,1:,:,:,,";
 /// The same, but durability 2 volatile, depth 100: what tf's broadcaster has.
 const MOVING: &str = "1:2:1,100:,:,:,,";

@@ -1,8 +1,8 @@
 //! What one reader of `Watch` asked for: checked, then applied to the newest maps as they come.
 //!
-//! In: a [`v1::Selection`], the newest maps' capture stamps, acknowledgements. Out: whether a map may go now, and of the maps
-//! in between how many the reader missed and how many were left out at its wish. Pure: no clock is read, so the same maps and
-//! the same acknowledgements give the same updates.
+//! In: a [`v1::Selection`], the newest maps' capture stamps, acknowledgements. Out: whether a map may go now, and of
+//! the maps in between how many the reader missed and how many were left out at its wish. Pure: no clock is read, so
+//! the same maps and the same acknowledgements give the same updates.
 
 use std::collections::VecDeque;
 
@@ -98,9 +98,9 @@ impl Rate {
         self.period_ns == 0 || self.due_ns.is_none_or(|due_ns| stamp_ns >= due_ns)
     }
 
-    /// A map captured then is sent. The next is due a period after this one was, however late it came, so that a rate is kept
-    /// of which the maps' own is no multiple; but a reader that was away does not catch up. A quarter of a period keeps turns
-    /// that are not quite even on their side of it.
+    /// A map captured then is sent. The next is due a period after this one was, however late it came, so that a rate
+    /// is kept of which the maps' own is no multiple; but a reader that was away does not catch up. A quarter of a
+    /// period keeps turns that are not quite even on their side of it.
     pub fn send(&mut self, stamp_ns: i64) {
         let quarter_ns = self.period_ns / 4;
         self.due_ns = match self.due_ns {

@@ -79,7 +79,10 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     }
     if let Some(file) = &options.calibration {
         sensor.calibration = Some(file.display().to_string());
-        tables = config.calibrations(Path::new(""))?;
+        // The others have their tables, read from where their own configuration lies.
+        let mut first = config.clone();
+        first.vehicles[0].sensors.truncate(1);
+        tables[0][0] = first.calibrations(Path::new(""))?.remove(0).remove(0);
     }
     let sensor = &mut config.vehicles[0].sensors[0];
     let mount = match options.extrinsics {
@@ -107,9 +110,12 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     let extrinsics = config.vehicles[0].sensors[0].extrinsics;
     config.recorder.file = options.record.clone().unwrap_or_default();
     if !options.serve {
-        (config.grpc.enabled, config.page.enabled, config.zenoh.enabled) = (false, false, false);
+        (config.grpc.enabled, config.page.enabled, config.foxglove.enabled) = (false, false, false);
+        (config.zenoh.enabled, config.zenoh.ros2.enabled) = (false, false);
     }
-    config.check(options.config.as_deref().unwrap_or(Path::new("(replay)")))?;
+    let file = options.config.as_deref().unwrap_or(Path::new("(replay)"));
+    config.check(file)?;
+    let certificates = if options.serve { config.certificates(file)? } else { None };
     // The same files and settings name the same run; served maps need a name of their own, or a reader that saw them
     // before would take them for old ones.
     let altered = options.extrinsics.is_some() || options.model.is_some() || options.rpm.is_some();
@@ -123,14 +129,14 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     let clouds = options.clouds.as_deref().map(Clouds::create).transpose()?;
     let (observer, clouds) = clouds.map(Clouds::observer).unzip();
     let setup =
-        Setup { config, calibrations: tables, boot_id, from_files: true, remarks, notes, observer, ..Setup::default() };
+        Setup { config, calibrations: tables, certificates, boot_id, from_files: true, remarks, notes, observer };
     Ok(Plan { setup, mount, extrinsics, readings, clouds })
 }
 
 type Configured = (Config, Calibrations, Option<u64>, bool);
 
-/// The configuration, the calibration tables, the boot id to keep, and whether the extrinsics are known: from `--config`,
-/// else from the recording itself, else plain.
+/// The configuration, the calibration tables, the boot id to keep, and whether the extrinsics are known: from
+/// `--config`, else from the recording itself, else plain.
 fn configured(options: &Options, recorded: Option<&Path>) -> Result<Configured, ReplayError> {
     let pick = |config: &mut Config, tables: &mut Calibrations| {
         let index = match &options.vehicle {
@@ -184,7 +190,8 @@ fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
     }
 }
 
-/// The vehicle's sensors as the transforms of a ROS bag place them. An only one is `top`, several are named by their frames.
+/// The vehicle's sensors as the transforms of a ROS bag place them. An only one is `top`, several are named by their
+/// frames.
 fn sensors_of(choice: &Choice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
     let mut sensors: Vec<SensorConfig> = Vec::new();
     for (index, sensor) in choice.sensors.iter().enumerate() {

@@ -111,8 +111,7 @@ impl Summary {
 
     /// A few lines for people.
     pub fn to_text(&self) -> String {
-        let summary = self;
-        let snapshot = &summary.snapshot;
+        let snapshot = &self.snapshot;
         let ledger = &snapshot.ledger;
         let mut lines = vec![format!(
             "{} received, {} decoded, {} telemetry, {} refused, {} lost",
@@ -135,11 +134,11 @@ impl Summary {
         if let (Some(p50), Some(p99)) = (snapshot.latency_ms_p50, snapshot.latency_ms_p99) {
             lines.push(format!("a map took {p50:.2} ms in the median, {p99:.2} ms at the 99th percentile"));
         }
-        if let Some(record) = &summary.record {
+        if let Some(record) = &self.record {
             lines.push(format!("recorded {}", record.display()));
         }
-        if summary.clouds > 0 {
-            lines.push(format!("{} point clouds written", summary.clouds));
+        if self.clouds > 0 {
+            lines.push(format!("{} point clouds written", self.clouds));
         }
         lines.join("\n") + "\n"
     }

@@ -1,7 +1,7 @@
 //! Many runs of the whole-house simulation, or one of them again.
 //!
-//! `cargo run --release -p clearway-tests --bin campaign -- --seeds 10000` prints figures and every seed that fails, and
-//! then ends with 1; `--seed 17` runs one seed and prints what it has in store.
+//! `cargo run --release -p clearway-tests --bin campaign -- --seeds 10000` prints figures and every seed that fails,
+//! and then ends with 1; `--seed 17` runs one seed and prints what it has in store.
 
 use std::process::ExitCode;
 use std::sync::Mutex;

@@ -13,8 +13,9 @@ pub const HEAL_NS: i64 = 18 * TURN_NS;
 /// The run ends here.
 pub const END_NS: i64 = HEAL_NS + 10 * TURN_NS;
 
-/// Where a device's counter jumps between the same two packets as the host's clock is set, nobody tells how much time has
-/// passed, and stamps that went ahead are held (`clearway_lidar::clock`). The longest burst of loss lasts less than this.
+/// Where a device's counter jumps between the same two packets as the host's clock is set, nobody tells how much time
+/// has passed, and stamps that went ahead are held (`clearway_lidar::clock`). The longest burst of loss lasts less than
+/// this.
 const APART_NS: i64 = 3 * TURN_NS;
 
 /// Chance, draw after draw.

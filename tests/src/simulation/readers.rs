@@ -1,6 +1,6 @@
-//! Readers of every kind at the server's own `Watch`, driven by hand: each looks when it pleases, and what it gets is held
-//! against the map the engine made. Readers over zenoh are not among them: its sessions have threads and clocks of their own,
-//! which nobody can step by hand.
+//! Readers of every kind at the server's own `Watch`, driven by hand: each looks when it pleases, and what it gets is
+//! held against the map the engine made. Readers over zenoh are not among them: its sessions have threads and clocks of
+//! their own, which nobody can step by hand.
 
 use std::collections::VecDeque;
 use std::ops::Range;

@@ -20,8 +20,8 @@ pub fn run(command: &mut Command, hint: &str) -> String {
     said
 }
 
-/// The interpreter of an environment with the packages that `packages` names for its folder; `wanted` tells when they are
-/// others.
+/// The interpreter of an environment with the packages that `packages` names for its folder; `wanted` tells when they
+/// are others.
 pub fn environment(name: &str, wanted: &str, packages: impl FnOnce(&Path) -> Vec<OsString>) -> PathBuf {
     // Tests of one process run side by side.
     static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());

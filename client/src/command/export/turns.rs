@@ -1,7 +1,7 @@
 //! A recording's journal -> the turns of each sensor, decoded again: points in the sensor's own frame, as it saw them.
 //!
-//! The recorded configuration and calibrations say how. Points are not moved to the turn's end, and what the maps leave out
-//! (the vehicle itself, blind sectors) is there.
+//! The recorded configuration and calibrations say how. Points are not moved to the turn's end, and what the maps leave
+//! out (the vehicle itself, blind sectors) is there.
 
 use std::collections::BTreeMap;
 

@@ -2,8 +2,8 @@
 //!
 //! foxglove: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf`
 //! (`foxglove.FrameTransforms`). ros2: `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`),
-//! `/clearway/<vehicle>/odometry` (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages are logged
-//! when the recording has them, and stamped with the capture's end.
+//! `/clearway/<vehicle>/odometry` (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages are
+//! logged when the recording has them, and stamped with the capture's end.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;

@@ -16,7 +16,8 @@ use crate::recording::{Entry, Recording, RecordingError};
 const LOOK_NS: i64 = 10_000_000_000;
 /// The vehicle's own frame, the first of these that tf knows; REP-105 puts `base_footprint` on the ground (REP-120).
 const EGO_FRAMES: [&str; 2] = ["base_footprint", "base_link"];
-/// Heights over the ground that a sensor may be mounted at; tf's of another was told in a frame that is not on the ground.
+/// Heights over the ground that a sensor may be mounted at; tf's of another was told in a frame that is not on the
+/// ground.
 const HEIGHTS_M: std::ops::RangeInclusive<f64> = 0.1..=20.0;
 /// Frames that do not move, best first (REP-105).
 const FIXED_FRAMES: [&str; 2] = ["map", "odom"];
@@ -132,10 +133,10 @@ impl Offered {
         }
     }
 
-    /// Chooses. Of `wanted` topics the sensors are taken in this order, and of theirs the first with poses; where none of
-    /// a sort is named, the choice is made here. Sensors: one topic a frame, packets before points, then the cloud with
-    /// most points; clouds in the vehicle's own or a fixed frame have been put together by somebody and are left. Poses:
-    /// an odometry, else the tf chain from `map`, else from `odom`, else stamped poses.
+    /// Chooses. Of `wanted` topics the sensors are taken in this order, and of theirs the first with poses; where none
+    /// of a sort is named, the choice is made here. Sensors: one topic a frame, packets before points, then the cloud
+    /// with most points; clouds in the vehicle's own or a fixed frame have been put together by somebody and are left.
+    /// Poses: an odometry, else the tf chain from `map`, else from `odom`, else stamped poses.
     ///
     /// # Errors
     /// [`ChoiceError::Topic`] for a wanted topic that is not there.

@@ -1,9 +1,10 @@
 //! ROS 2 messages in rmw_zenoh's key space -> the door, with no bridge between.
 //!
 //! rmw_zenoh publishes a topic under `<domain>/<topic>/<type>/<hash>`, the type as DDS spells it, the payload CDR. Any
-//! hash is taken (Humble writes none, and a type that has changed shape is refused by its bytes). The attachment carries
-//! sequence, stamp and publisher: a number missing from a publisher's row is a message lost on the way, and counted; where
-//! the attachment is older, newer or absent nothing can be told of losses, and the message is taken all the same.
+//! hash is taken (Humble writes none, and a type that has changed shape is refused by its bytes). The attachment
+//! carries sequence, stamp and publisher: a number missing from a publisher's row is a message lost on the way, and
+//! counted; where the attachment is older, newer or absent nothing can be told of losses, and the message is taken all
+//! the same.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex};

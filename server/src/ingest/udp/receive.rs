@@ -1,9 +1,9 @@
 //! One socket -> batches of datagrams, and what the kernel dropped.
 //!
-//! The first datagram of a batch is read alone (`recvmsg`) with the socket's drop counter (`SO_RXQ_OVFL`), whatever waits
-//! behind it in one call (`recvmmsg`); both through nix, so that no `unsafe` is needed here. nix' `recvmmsg` cannot carry
-//! the counter: it never gives a control buffer back its length. Datagrams lie in slots of one slab, which lives as long
-//! as the last of them; each costs no allocation of its own.
+//! The first datagram of a batch is read alone (`recvmsg`) with the socket's drop counter (`SO_RXQ_OVFL`), whatever
+//! waits behind it in one call (`recvmmsg`); both through nix, so that no `unsafe` is needed here. nix' `recvmmsg`
+//! cannot carry the counter: it never gives a control buffer back its length. Datagrams lie in slots of one slab, which
+//! lives as long as the last of them; each costs no allocation of its own.
 
 use std::io::{self, IoSliceMut};
 use std::net::{IpAddr, SocketAddr};
@@ -58,8 +58,8 @@ impl Receiver {
         &self.socket
     }
 
-    /// Appends what waits, at most [`BATCH`] datagrams; gives the number the kernel has dropped before the first of them
-    /// and was not asked for yet.
+    /// Appends what waits, at most [`BATCH`] datagrams; gives the number the kernel has dropped before the first of
+    /// them and was not asked for yet.
     ///
     /// # Errors
     /// What the kernel says; `WouldBlock` where nothing waits.

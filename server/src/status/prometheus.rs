@@ -1,0 +1,141 @@
+//! The status of all vehicles -> Prometheus' text format. What ends in `_total` only counts up; all else is a gauge.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::sync::Arc;
+
+use clearway_mapping::pipeline::NamedStatus;
+
+use super::{Snapshot, VehicleStatus};
+use crate::ingest::now_ns;
+
+/// What `/metrics` shows of these vehicles.
+pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {
+    let all = vehicles.iter().map(|status| (&**status, status.snapshot())).collect();
+    let mut metrics = Metrics { all, text: String::new() };
+    metrics.tell_arrivals();
+    metrics.tell_sensors();
+    metrics.tell_maps();
+    metrics.text
+}
+
+struct Metrics<'a> {
+    all: Vec<(&'a VehicleStatus, Snapshot)>,
+    text: String,
+}
+
+impl Metrics<'_> {
+    fn tell_arrivals(&mut self) {
+        self.each("clearway_packets_received_total", "Datagrams and scans received.", |s| s.ledger.received);
+        self.each("clearway_packets_decoded_total", "Data packets and scans decoded.", |s| s.ledger.decoded);
+        self.each("clearway_telemetry_total", "Telemetry datagrams read.", |s| s.ledger.telemetry);
+        let help = "Datagrams and scans refused, by reason.";
+        self.each_reason("clearway_packets_refused_total", help, |s| &s.ledger.refused);
+        let help = "Messages that are no observations, which the ledger calls observation, by their own reason.";
+        self.each_reason("clearway_observations_refused_total", help, |s| &s.observations_refused);
+        self.each("clearway_events_lost_total", "Readings that found the door's queue full.", |s| s.ledger.lost);
+        let help = "Datagrams the kernel dropped at the vehicle's sockets.";
+        self.each("clearway_kernel_drops_total", help, |s| s.ledger.kernel_drops);
+        self.each("clearway_poses_total", "Ego poses taken.", |s| s.ledger.poses);
+        self.each("clearway_poses_refused_total", "Ego poses refused.", |s| s.ledger.poses_refused);
+        self.each("clearway_roads_total", "Roads taken.", |s| s.ledger.roads);
+        self.each("clearway_roads_refused_total", "Roads refused.", |s| s.ledger.roads_refused.values().sum());
+    }
+
+    fn tell_sensors(&mut self) {
+        let help = "Datagrams and scans received from a sensor.";
+        self.each_sensor("clearway_sensor_received_total", help, |s| s.ledger.received as f64);
+        let help = "A sensor's data packets and scans decoded.";
+        self.each_sensor("clearway_sensor_decoded_total", help, |s| s.ledger.decoded as f64);
+        let help = "A sensor's telemetry datagrams read.";
+        self.each_sensor("clearway_sensor_telemetry_total", help, |s| s.ledger.telemetry as f64);
+        let help = "A sensor's readings that found the queue full.";
+        self.each_sensor("clearway_sensor_lost_total", help, |s| s.ledger.lost as f64);
+        let refused = self.sensors().flat_map(|(of, sensor)| {
+            sensor.ledger.refused.iter().map(move |(reason, n)| (format!("{of},reason=\"{reason}\""), *n as f64))
+        });
+        let refused = refused.collect();
+        let help = "A sensor's datagrams and scans refused, by reason.";
+        self.family("clearway_sensor_refused_total", help, refused);
+        let help = "Data packets that never came, by device time and azimuth, +-1 a gap.";
+        self.each_sensor("clearway_packets_missing_total", help, |s| s.status.packets_lost as f64);
+        let help = "Degrees in which a sensor used to see and does no more.";
+        self.each_sensor("clearway_blocked_degrees", help, |s| {
+            s.status.blocked.sectors.iter().map(|sector| f64::from(sector.to_deg - sector.from_deg)).sum()
+        });
+    }
+
+    fn tell_maps(&mut self) {
+        self.each("clearway_maps_total", "Maps made.", |s| s.maps);
+        self.each("clearway_revolutions_total", "Revolutions completed.", Snapshot::revolutions);
+        let now_ns = now_ns();
+        let age = |(of, s): &(&VehicleStatus, Snapshot)| {
+            let age_ns = now_ns.saturating_sub(s.newest_capture_end_ns);
+            (s.maps > 0).then(|| (vehicle(of), age_ns as f64 / 1e9))
+        };
+        let ages = self.all.iter().filter_map(age).collect();
+        self.family("clearway_map_age_seconds", "Age of the newest map, from its capture's end.", ages);
+        let latency = |(of, s): &(&VehicleStatus, Snapshot)| {
+            let of = vehicle(of);
+            let quantiles = [("0.5", s.latency_ms_p50), ("0.99", s.latency_ms_p99)];
+            quantiles.map(|(q, ms)| Some((format!("{of},quantile=\"{q}\""), ms? / 1e3))).into_iter().flatten()
+        };
+        let latencies = self.all.iter().flat_map(latency).collect();
+        self.family("clearway_map_latency_seconds", "Step and encode of a map.", latencies);
+        let readers = |(of, _): &(&VehicleStatus, Snapshot)| {
+            let of = vehicle(of);
+            move |(transport, n)| (format!("{of},transport=\"{transport}\""), f64::from(n))
+        };
+        let readers = self.all.iter().flat_map(|at| at.0.readers().map(readers(at))).collect();
+        self.family("clearway_readers", "Readers of the vehicle's maps.", readers);
+        let lost = |(of, _): &(&VehicleStatus, Snapshot)| {
+            (vehicle(of), of.recorder.as_ref().map_or(0, |counts| counts.lost()) as f64)
+        };
+        let lost = self.all.iter().map(lost).collect();
+        self.family("clearway_recorder_lost_total", "Events and maps the recording does not hold.", lost);
+    }
+
+    /// The sensors of all vehicles, each with its labels.
+    fn sensors(&self) -> impl Iterator<Item = (String, &NamedStatus)> {
+        self.all.iter().flat_map(|(of, s)| {
+            let vehicle = vehicle(of);
+            s.sensors.iter().map(move |sensor| (format!("{vehicle},sensor=\"{}\"", sensor.name), sensor))
+        })
+    }
+
+    fn each(&mut self, name: &str, help: &str, value: impl Fn(&Snapshot) -> u64) {
+        let samples = self.all.iter().map(|(of, s)| (vehicle(of), value(s) as f64)).collect();
+        self.family(name, help, samples);
+    }
+
+    fn each_sensor(&mut self, name: &str, help: &str, value: impl Fn(&NamedStatus) -> f64) {
+        let samples = self.sensors().map(|(labels, sensor)| (labels, value(sensor))).collect();
+        self.family(name, help, samples);
+    }
+
+    fn each_reason(&mut self, name: &str, help: &str, counts: impl Fn(&Snapshot) -> &BTreeMap<&'static str, u64>) {
+        let samples = self.all.iter().flat_map(|(of, s)| {
+            let of = vehicle(of);
+            counts(s).iter().map(move |(reason, n)| (format!("{of},reason=\"{reason}\""), *n as f64))
+        });
+        let samples = samples.collect();
+        self.family(name, help, samples);
+    }
+
+    /// One metric: its samples by their labels. Without samples there is none.
+    fn family(&mut self, name: &str, help: &str, samples: Vec<(String, f64)>) {
+        if samples.is_empty() {
+            return;
+        }
+        let kind = if name.ends_with("_total") { "counter" } else { "gauge" };
+        // Writing to a string cannot fail.
+        let _ = writeln!(self.text, "# HELP {name} {help}\n# TYPE {name} {kind}");
+        for (labels, value) in samples {
+            let _ = writeln!(self.text, "{name}{{{labels}}} {value}");
+        }
+    }
+}
+
+fn vehicle(status: &VehicleStatus) -> String {
+    format!("vehicle=\"{}\"", status.name)
+}
