@@ -305,7 +305,7 @@ async fn the_same_session_over_zenoh_makes_the_same_maps_and_hears_the_same_refu
     let mut zenoh = within("a way", client.ingest("car")).await.unwrap();
     assert_eq!(told(&mut zenoh, scanned(2, false)).await, []);
 
-    let stale = Observation::pose(5, [0.0; 3], [0.0, 0.0, 0.0, 1.0], 0.0);
+    let stale = Observation::pose(5, [0.0; 3], [0.0, 0.0, 0.0, 1.0], 0.0).captured_at(1_000_000_000);
     let strange = Observation::scan("bottom", 5, &[1.0], &[1.0], &[1.0]);
     let crooked = Observation::scan("top", i64::MAX, &[1.0], &[1.0, 2.0], &[1.0]);
     let refusals = told(&mut zenoh, vec![stale, strange, crooked]).await;
