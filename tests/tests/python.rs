@@ -74,7 +74,16 @@ async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording
     let halt = Arc::new(AtomicBool::new(false));
     let car = std::thread::spawn({
         let halt = halt.clone();
-        move || drive(vehicle(), data, telemetry, Pace::RealTime, Until { stop: Some(&halt), device_time: None })
+        move || {
+            drive(
+                house::anywhere(),
+                vehicle(),
+                data,
+                telemetry,
+                Pace::RealTime,
+                Until { stop: Some(&halt), device_time: None },
+            )
+        }
     });
     let status = running.vehicles.0[0].status.clone();
     until("a map", || status.snapshot().maps > 0).await;

@@ -14,6 +14,7 @@ use clearway_proto::v1;
 use clearway_proto::v1::map_service_client::MapServiceClient;
 use clearway_proto::v1::map_service_server::{MapService, MapServiceServer};
 use clearway_server::ingest::Reading;
+use clearway_server::server::Running;
 use clearway_server::wire::EncodedMap;
 use futures::{Stream, StreamExt};
 use house::{config, feed, readings, sequence, start, until, within};
@@ -71,6 +72,18 @@ async fn plain(address: SocketAddr) -> MapServiceClient<Channel> {
 /// Less than a turn each (some 350 datagrams): a reader that keeps up misses no map of it.
 fn portions(tenths: i64) -> Vec<Vec<Reading>> {
     readings(tenths).chunks(300).map(<[_]>::to_vec).collect()
+}
+
+/// The reader gets every map of three tenths of a second, the first of this server.
+async fn keeps_up(reader: &mut Reader, running: &Running) {
+    let mut next = 0;
+    for portion in portions(3) {
+        let maps = feed(running, portion).await;
+        for expected in next..maps {
+            assert_eq!(reader.take().await, (expected, 0, 0));
+        }
+        next = maps;
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -410,14 +423,7 @@ async fn a_thousand_idle_connections_take_no_more_than_their_places_and_the_next
         let _ = connection.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").await;
         idle.push(connection);
     }
-    let mut next = 0;
-    for portion in portions(3) {
-        let maps = feed(&running, portion).await;
-        for expected in next..maps {
-            assert_eq!(healthy.take().await, (expected, 0, 0));
-        }
-        next = maps;
-    }
+    keeps_up(&mut healthy, &running).await;
     // The lobby is full of them too; as soon as it is not, whoever comes hears why there is no place.
     let status = within("an answer", async {
         loop {
@@ -477,14 +483,7 @@ async fn who_opens_and_resets_streams_in_a_loop_loses_its_connection_and_nobody_
     for _ in 0..300 {
         drop(Reader::open(&mut hasty, of_layer(0)).await);
     }
-    let mut next = 0;
-    for portion in portions(3) {
-        let maps = feed(&running, portion).await;
-        for expected in next..maps {
-            assert_eq!(healthy.take().await, (expected, 0, 0));
-        }
-        next = maps;
-    }
+    keeps_up(&mut healthy, &running).await;
     let readers = || running.vehicles.0[0].status.to_proto().readers["grpc"];
     until("only the healthy reader is left", || readers() == 1).await;
     within("shutdown", running.shutdown()).await.unwrap();

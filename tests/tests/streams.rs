@@ -65,7 +65,16 @@ async fn a_live_drive_over_udp_reaches_grpc_and_zenoh_with_the_bytes_of_the_reco
     let halt = Arc::new(AtomicBool::new(false));
     let car = std::thread::spawn({
         let halt = halt.clone();
-        move || drive(vehicle(), data, telemetry, Pace::RealTime, Until { stop: Some(&halt), device_time: None })
+        move || {
+            drive(
+                house::anywhere(),
+                vehicle(),
+                data,
+                telemetry,
+                Pace::RealTime,
+                Until { stop: Some(&halt), device_time: None },
+            )
+        }
     });
     let mut over_grpc = BTreeMap::new();
     let mut over_zenoh = BTreeMap::new();
@@ -375,7 +384,7 @@ async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
     let (data, _) = running.doors[1].udp.unwrap();
     let halt = Duration::from_millis(250);
     let until_then = Until { stop: None, device_time: Some(halt) };
-    tokio::task::spawn_blocking(move || drive(vehicle(), data, data, Pace::RealTime, until_then))
+    tokio::task::spawn_blocking(move || drive(house::anywhere(), vehicle(), data, data, Pace::RealTime, until_then))
         .await
         .unwrap()
         .unwrap();

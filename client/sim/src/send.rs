@@ -3,7 +3,7 @@
 //! In: datagrams in device-time order. Out: UDP to a data port and a telemetry port, and a count of what was sent.
 
 use std::io;
-use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
+use std::net::{SocketAddr, UdpSocket};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -44,27 +44,11 @@ pub struct Sent {
 /// burst is measured from the beginning, the long-run rate is exact.
 const BURST: Duration = Duration::from_millis(1);
 
-/// Sends datagrams until there are no more or `until` says so; blocks.
+/// Sends datagrams from an address of the sensor's own until there are no more or `until` says so; blocks.
 ///
 /// # Errors
 /// The operating system's, from opening the socket or sending.
 pub fn drive(
-    datagrams: impl IntoIterator<Item = Datagram>,
-    data: SocketAddr,
-    telemetry: SocketAddr,
-    pace: Pace,
-    until: Until<'_>,
-) -> io::Result<Sent> {
-    let own: SocketAddr =
-        if data.is_ipv4() { (Ipv4Addr::UNSPECIFIED, 0).into() } else { (Ipv6Addr::UNSPECIFIED, 0).into() };
-    drive_from(own, datagrams, data, telemetry, pace, until)
-}
-
-/// [`drive`] from an address of the sensor's own.
-///
-/// # Errors
-/// The operating system's, from opening the socket or sending.
-pub fn drive_from(
     own: SocketAddr,
     datagrams: impl IntoIterator<Item = Datagram>,
     data: SocketAddr,
@@ -121,7 +105,8 @@ mod tests {
         });
         let ends = (data.local_addr().unwrap(), telemetry.local_addr().unwrap());
         let until = Until { device_time: Some(Duration::from_millis(31)), ..Until::default() };
-        let sent = drive(datagrams, ends.0, ends.1, Pace::AsFastAsPossible, until).unwrap();
+        let sent =
+            drive("127.0.0.1:0".parse().unwrap(), datagrams, ends.0, ends.1, Pace::AsFastAsPossible, until).unwrap();
         assert_eq!(sent, Sent { packets: 24, telemetry: 8, device_time: Duration::from_millis(31) });
         let mut buffer = [0; 64];
         for number in 0..32 {

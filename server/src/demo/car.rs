@@ -8,7 +8,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use clearway_client::{Client, ClientError};
-use clearway_sim::send::{Pace, Sent, Until, drive_from};
+use clearway_sim::send::{Pace, Sent, Until, drive};
 
 use super::DemoError;
 use super::rig::{Rig, Told};
@@ -46,7 +46,7 @@ impl Car {
             let own = if several { address(index) } else { Ipv4Addr::UNSPECIFIED };
             std::thread::Builder::new().name(format!("simulated {name}")).spawn(move || {
                 let until = Until { stop: Some(&halt), device_time: None };
-                drive_from((own, 0).into(), vehicle, data, telemetry, Pace::RealTime, until)
+                drive((own, 0).into(), vehicle, data, telemetry, Pace::RealTime, until)
             })
         };
         let sensors = rig.scanners.iter().enumerate().map(start).collect::<Result<_, _>>()?;

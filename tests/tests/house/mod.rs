@@ -45,6 +45,11 @@ pub async fn start(config: Config) -> Running {
     Server::start(Setup { config, from_files: true, ..Setup::default() }).await.expect("the server starts")
 }
 
+/// Any port of any address, to send from.
+pub fn anywhere() -> std::net::SocketAddr {
+    (std::net::Ipv4Addr::UNSPECIFIED, 0).into()
+}
+
 /// A vehicle on a plain.
 pub fn vehicle() -> SimulatedVehicle {
     SimulatedVehicle::new(flat(), ScannerConfig::default())
