@@ -2,57 +2,17 @@
 
 mod house;
 
-use std::path::{Path, PathBuf};
-use std::process::Command;
-use std::sync::{Arc, OnceLock};
+use std::path::Path;
+use std::sync::Arc;
 
 use clearway_client::{Client, ClientError, Subscription, Tls, ZenohClient};
-use clearway_server::config::{Access, Config, Tls as TlsConfig, ZenohMode};
+use clearway_server::config::ZenohMode;
 use clearway_server::replay::{Options, Summary, replay};
 use clearway_server::server::{Running, Server, Setup};
+use house::certificates::{certificates, secured, start, zenoh_file};
 use house::{config, feed, grpc, readings, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
-
-/// Certificates of a CA, and of another one, as the script makes them.
-fn certificates(ca: &str) -> PathBuf {
-    static MADE: OnceLock<tempfile::TempDir> = OnceLock::new();
-    let folder = MADE.get_or_init(|| {
-        let folder = tempfile::tempdir().unwrap();
-        for ca in ["ours", "theirs"] {
-            let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/make-test-ca.sh");
-            let made = Command::new("sh").arg(script).arg(folder.path().join(ca)).output().expect("a shell");
-            let said = String::from_utf8_lossy(&made.stderr).into_owned();
-            assert!(made.status.success(), "deploy/make-test-ca.sh needs Debian's openssl: {said}");
-        }
-        folder
-    });
-    folder.path().join(ca)
-}
-
-fn secured(ask_clients: bool) -> Config {
-    let folder = certificates("ours");
-    let mut config = config();
-    config.grpc.tls = Some(TlsConfig {
-        certificate: folder.join("server.pem"),
-        key: folder.join("server.key"),
-        client_ca: ask_clients.then(|| folder.join("ca.pem")),
-    });
-    if ask_clients {
-        config.grpc.access = Access {
-            readers: vec!["reader".into()],
-            ingesters: vec!["ingester".into()],
-            operators: vec!["operator".into()],
-        };
-    }
-    config
-}
-
-async fn start(config: Config) -> Running {
-    let certificates = config.certificates(Path::new("")).expect("the certificates are there");
-    let setup = Setup { config, certificates, from_files: true, ..Setup::default() };
-    Server::start(setup).await.expect("the server starts")
-}
 
 fn tls(ca: &str, identity: Option<(&str, &str)>) -> Tls {
     let read = |folder: &Path, file: String| std::fs::read_to_string(folder.join(file)).expect("a certificate");
@@ -185,13 +145,6 @@ async fn peers_that_shake_no_hand_reset_or_say_too_much_leave_the_others_served(
     assert!(!map.map.is_empty());
     assert_eq!(running.vehicles.0[0].status.snapshot().maps, 2);
     within("shutdown", running.shutdown()).await.unwrap();
-}
-
-/// A file of deploy/zenoh with these certificates instead of those in `certificates/`.
-fn zenoh_file(name: &str, certificates: &Path) -> String {
-    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/zenoh").join(name);
-    let text = std::fs::read_to_string(file).expect("a file of the repository");
-    text.replace("\"certificates/", &format!("\"{}/", certificates.display()))
 }
 
 /// A session of a client that hangs on the router and shows this certificate.
