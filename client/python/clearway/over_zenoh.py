@@ -8,6 +8,7 @@ and it is asked for. zenoh keeps one sample a key for this process, the newest: 
 
 from __future__ import annotations
 
+import atexit
 import json
 import threading
 from collections.abc import Sequence
@@ -95,13 +96,23 @@ def get(endpoint: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -> 
 def watch(endpoint: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -> MapStream:
     session = _session(endpoint, tls)
     stream = MapStream()
-    stream.on_close(session.close)
     into = _Into(stream, layers)
+    threads: list[threading.Thread] = []
+
+    def close() -> None:
+        atexit.unregister(close)
+        session.close()
+        for thread in threads:
+            thread.join(_ANSWER_S)
+
+    # A thread that comes back from zenoh while Python ends would abort the process.
+    atexit.register(close)
+    stream.on_close(close)
     try:
         for layer in into.layers:
-            _Tap(session, f"clearway/{vehicle}/map/{layer}", layer, into)
+            threads += _Tap(session, f"clearway/{vehicle}/map/{layer}", layer, into).threads
     except Exception as error:
-        session.close()
+        close()
         raise ClearwayError("zenoh", f"subscribe to the layers of {vehicle!r}: {error}") from None
     return stream
 
@@ -120,10 +131,14 @@ class _Tap:
         ring = zenoh.handlers.RingChannel
         self._samples = ext.declare_advanced_subscriber(session, key, ring(1), history=history)
         self._misses = self._samples.sample_miss_listener(ring(_MISSES_KEPT))
-        self._heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", self._hear)
-        threading.Thread(target=self._run, name=f"clearway watch {layer}", daemon=True).start()
+        self._heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", ring(1))
+        # Not zenoh's own threads for callbacks: a process that leaves its stream open could not end for them.
+        name = f"clearway watch {layer}"
+        self.threads = [threading.Thread(target=run, name=name, daemon=True) for run in (self._listen, self._hear)]
+        for thread in self.threads:
+            thread.start()
 
-    def _run(self) -> None:
+    def _listen(self) -> None:
         import zenoh
 
         for sample in self._samples:
@@ -136,21 +151,20 @@ class _Tap:
                 self._number = sample.source_info.source_sn
             self._into.take(sample.payload.to_bytes())
 
-    def _hear(self, heartbeat: zenoh.Sample) -> None:
+    def _hear(self) -> None:
         import zenoh
         from zenoh import ext
 
-        try:
-            told = int(ext.z_deserialize(ext.UInt32, heartbeat.payload))
-            if told == self._number:
-                return
+        for heartbeat in self._heartbeats:
+            try:
+                told = int(ext.z_deserialize(ext.UInt32, heartbeat.payload))
+                part = _newest(self._session, self._key) if told != self._number else None
+            except (ext.ZDeserializeError, zenoh.ZError):
+                # No heartbeat, or the session is being closed.
+                continue
             self._number = told
-            part = _newest(self._session, self._key)
-        except (ext.ZDeserializeError, zenoh.ZError):
-            # No heartbeat, or the session is being closed.
-            return
-        if part is not None:
-            self._into.take(part)
+            if part is not None:
+                self._into.take(part)
 
 
 class _Into:

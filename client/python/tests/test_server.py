@@ -100,6 +100,12 @@ def test_a_closed_stream_ends_its_loop():
     assert len(seen) == 2
 
 
+def test_a_program_may_end_without_closing_its_stream():
+    program = f"import clearway; maps = clearway.watch({GRPC!r}); next(maps)"
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (run.returncode, run.stderr) == (0, "")
+
+
 def test_nobody_at_an_address_is_named():
     with pytest.raises(clearway.ClearwayError, match="127.0.0.1:9: .*[Cc]onnect"):
         clearway.vehicles("127.0.0.1:9")

@@ -1,6 +1,8 @@
 """A stream over zenoh against a session in this process that publishes as the server does (see the Rust client's zenoh.rs)."""
 
 import socket
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -99,6 +101,15 @@ def test_of_the_skipped_maps_those_the_link_lost_are_told_and_a_lost_last_one_is
         put(5, 48)
         assert told(next(stream)) == (48, 0, 0)
         assert asked.try_recv() is None, "nobody asks without a reason"
+
+
+@pytest.mark.parametrize("ending", ["", "maps.close()", "raise SystemExit(3)"], ids=["end", "close", "exit"])
+def test_a_program_may_end_without_closing_its_stream(server, endpoint, ending):
+    publisher = published(server)
+    publisher.put(part(3))
+    program = f"import clearway; maps = clearway.watch('zenoh:{endpoint}', vehicle='alpha', layers=['drivability']); next(maps); "
+    run = subprocess.run([sys.executable, "-c", program + ending], capture_output=True, text=True, timeout=60)
+    assert (run.returncode, run.stderr) == (3 if "raise" in ending else 0, "")
 
 
 class Wire:

@@ -43,7 +43,10 @@ enum Flow {
 pub async fn measure(arguments: &Arguments, turns: &Turns) -> Vec<Value> {
     let mut rows = Vec::new();
     if !arguments.json {
-        println!("{:<8} {:>18} {:>8} {:>12} {:>22}", "", "age p50/p99 ms", "missed", "grown KiB", "resumed, age ms");
+        println!(
+            "{:<8} {:>6} {:>7} {:>18} {:>10} {:>16}",
+            "", "maps", "missed", "age p50/p99 ms", "grown KiB", "resumed, age ms"
+        );
     }
     for with in [false, true].into_iter().cycle().take(2 * ROUNDS) {
         let row = part(arguments, turns, with).await;
@@ -51,7 +54,8 @@ pub async fn measure(arguments: &Arguments, turns: &Turns) -> Vec<Value> {
             let [p50, p99] = [0, 1].map(|at| row["age_ms"][at].as_f64().unwrap_or(f64::NAN));
             let resumed = row["resumed_age_ms"].as_f64().map_or("-".into(), |ms| format!("{ms:.1}"));
             let (name, ages) = (row["slow_readers"].as_str().unwrap_or_default(), format!("{p50:.2} / {p99:.2}"));
-            println!("{name:<8} {ages:>18} {:>8} {:>12} {resumed:>22}", row["missed"], row["grown_kib"]);
+            let (maps, missed) = (&row["maps"], &row["missed"]);
+            println!("{name:<8} {maps:>6} {missed:>7} {ages:>18} {:>10} {resumed:>16}", row["grown_kib"]);
         }
         rows.push(row);
     }
