@@ -2,8 +2,9 @@
 //!
 //! In: the turns, seconds of each part. Out, of each part: age in the healthy ones' hands and maps they missed, growth of
 //! the server's resident set, and, when the stopped one goes on, how old the first map is that was not on its way already.
-//! Slow is a link: the readers themselves have the windows that tonic gives any client, the credits that ours ask for, and
-//! look all the time.
+//! One looks no more, as a planner that hangs (its connection lives: whoever does not even answer pings is dropped after
+//! 20 s); the other looks all the time over a slow link. Both have the windows that tonic gives any client, and the credits
+//! that ours ask for.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -29,15 +30,6 @@ const BYTES_A_SECOND: u64 = 10_000;
 const IN_FLIGHT: u32 = 2;
 /// Parts without slow readers and with them, in turn.
 const ROUNDS: usize = 2;
-
-/// How much a link lets through.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Flow {
-    Free,
-    /// Bytes a second, from the server.
-    Slow(u64),
-    Stopped,
-}
 
 /// Measures and prints; gives the rows.
 pub async fn measure(arguments: &Arguments, turns: &Turns) -> Vec<Value> {
@@ -73,9 +65,10 @@ async fn part(arguments: &Arguments, turns: &Turns, with: bool) -> Value {
     let alone_kib = server.resident_kib();
     let mut slow = Vec::new();
     if with {
-        for flow in [Flow::Stopped, Flow::Slow(BYTES_A_SECOND)] {
-            slow.push(Slow::join(&server, &arguments.layer, flow).await);
-        }
+        let link = lay(server.grpc).await;
+        slow.push(Slow::join(server.grpc, &arguments.layer).await);
+        slow.push(Slow::join(link, &arguments.layer).await);
+        slow[0].looks.send_replace(false);
     }
     readers.count_for(Duration::from_secs(arguments.seconds)).await;
     let grown_kib = server.resident_kib() - alone_kib;
@@ -99,9 +92,9 @@ async fn part(arguments: &Arguments, turns: &Turns, with: bool) -> Value {
     })
 }
 
-/// A reader behind a link.
+/// A reader that stops, or is behind a slow link.
 struct Slow {
-    flow: watch::Sender<Flow>,
+    looks: watch::Sender<bool>,
     heard: watch::Receiver<Heard>,
     task: tokio::task::JoinHandle<()>,
 }
@@ -115,10 +108,8 @@ struct Heard {
 }
 
 impl Slow {
-    /// Opens a stream freely and has its first map; then its link is what it is.
-    async fn join(server: &Process, layer: &str, flow: Flow) -> Self {
-        let (set_flow, flows) = watch::channel(Flow::Free);
-        let address = lay(server.grpc, flows).await;
+    /// Opens a stream and has its first map.
+    async fn join(address: SocketAddr, layer: &str) -> Self {
         let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
         let mut service = MapServiceClient::new(endpoint.connect().await.expect("gRPC answers"));
         let selection =
@@ -128,16 +119,16 @@ impl Slow {
         let said = futures::stream::poll_fn(move |context| said.poll_recv(context));
         let updates = service.watch(said).await.expect("the server streams").into_inner();
         let (tell, mut heard) = watch::channel(Heard::default());
-        let task = tokio::spawn(read(updates, requests, tell));
+        let (looks, may_look) = watch::channel(true);
+        let task = tokio::spawn(read(updates, requests, may_look, tell));
         heard.changed().await.expect("a first map");
-        set_flow.send_replace(flow);
-        Self { flow: set_flow, heard, task }
+        Self { looks, heard, task }
     }
 
-    /// Lets everything through again; gives the age, ms, of the first map that was not on its way before.
+    /// Looks again; gives the age, ms, of the first map that was not on its way before.
     async fn resume(&mut self, readers: &Readers) -> f64 {
         let before = self.heard.borrow_and_update().updates;
-        self.flow.send_replace(Flow::Free);
+        self.looks.send_replace(true);
         loop {
             self.heard.changed().await.expect("the stream goes on");
             let heard = *self.heard.borrow_and_update();
@@ -151,9 +142,12 @@ impl Slow {
 async fn read(
     mut updates: Streaming<v1::MapUpdate>,
     requests: tokio::sync::mpsc::Sender<v1::WatchRequest>,
+    mut may_look: watch::Receiver<bool>,
     tell: watch::Sender<Heard>,
 ) {
-    while let Ok(Some(update)) = updates.message().await {
+    while may_look.wait_for(|looks| *looks).await.is_ok()
+        && let Ok(Some(update)) = updates.message().await
+    {
         let arrived_ns = now_ns();
         let header = v1::Map::decode(update.map).expect("a map").header.expect("a header");
         tell.send_modify(|heard| {
@@ -166,8 +160,8 @@ async fn read(
     }
 }
 
-/// A link to the server, for one connection.
-async fn lay(server: SocketAddr, mut flow: watch::Receiver<Flow>) -> SocketAddr {
+/// A slow link to the server, for one connection.
+async fn lay(server: SocketAddr) -> SocketAddr {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
     let address = listener.local_addr().expect("bound");
     tokio::spawn(async move {
@@ -175,23 +169,14 @@ async fn lay(server: SocketAddr, mut flow: watch::Receiver<Flow>) -> SocketAddr 
         let (mut from_reader, mut to_reader) = near.into_split();
         let (mut from_server, mut to_server) = TcpStream::connect(server).await?.into_split();
         tokio::spawn(async move { tokio::io::copy(&mut from_reader, &mut to_server).await });
-        let mut bytes = vec![0; 16 << 10];
+        let mut bytes = [0; BYTES_A_SECOND as usize / 10];
         loop {
-            flow.wait_for(|flow| *flow != Flow::Stopped).await.map_err(std::io::Error::other)?;
-            let now = *flow.borrow();
-            let room = if let Flow::Slow(a_second) = now { (a_second / 10) as usize } else { bytes.len() };
-            let count = tokio::select! {
-                count = from_server.read(&mut bytes[..room]) => count?,
-                // As it is now.
-                _ = flow.changed() => continue,
-            };
+            let count = from_server.read(&mut bytes).await?;
             if count == 0 {
                 return Ok::<(), std::io::Error>(());
             }
             to_reader.write_all(&bytes[..count]).await?;
-            if let Flow::Slow(a_second) = now {
-                tokio::time::sleep(Duration::from_secs_f64(count as f64 / a_second as f64)).await;
-            }
+            tokio::time::sleep(Duration::from_secs_f64(count as f64 / BYTES_A_SECOND as f64)).await;
         }
     });
     address
