@@ -335,8 +335,9 @@ impl Pipeline {
     fn make_layers(&mut self) {
         let (map, sweep) = (&mut self.map, self.fusion.sweep(&self.intakes));
         let (road, route) = (self.roads.to_paint(), self.roads.route());
-        let context =
-            Context { earlier: &[], stamp_ns: map.capture_end_ns, map_from_ego: map.map_from_ego, road, route };
+        let stamp_ns = map.capture_end_ns;
+        let earliest_ns = stamp_ns.saturating_sub(self.fusion.deadline_ns);
+        let context = Context { earlier: &[], stamp_ns, earliest_ns, map_from_ego: map.map_from_ego, road, route };
         self.layers.make(sweep, &context, &mut map.layers);
     }
 }
