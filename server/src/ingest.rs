@@ -5,17 +5,16 @@
 //! an event (the queue or the kernel's buffer was full, the sender is nobody's, the datagram too long) is counted, and
 //! the counts become [`Body::Lost`] events: the journal, and every replay of it, knows all that stayed outside.
 
-use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use clearway_mapping::event::{Body, Cause, Event};
-use clearway_mapping::pipeline::Ledger;
 use futures::executor::block_on;
 use tokio::sync::{OwnedSemaphorePermit as Place, Semaphore};
 
+use outside::{Untold, next_told};
 use ticket::{Ticket, Verdict};
 
 pub mod capture;
@@ -25,11 +24,14 @@ pub mod grpc;
 pub mod kitti;
 pub mod mcap;
 pub mod observation;
+mod outside;
 pub mod ros;
 pub mod ticket;
 pub mod udp;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
+
+pub use outside::{Outside, Stranger};
 
 /// What a file source yields: an event without its number.
 #[derive(Clone, Debug, PartialEq)]
@@ -119,68 +121,6 @@ impl WeakDoor {
 /// A full queue is told of as soon as there is space, other causes this often: a flood from strangers must not fill the
 /// journal.
 const TELL_NS: u64 = 100_000_000;
-/// Strangers remembered, newest last.
-const STRANGERS: usize = 8;
-
-/// What stayed outside a door; outlives its queue.
-#[derive(Debug, Default)]
-pub struct Outside {
-    untold: Mutex<Untold>,
-    strangers: Mutex<VecDeque<Stranger>>,
-    /// What the ledger calls `observation`, by its own name.
-    observations: Mutex<BTreeMap<&'static str, u64>>,
-}
-
-/// Readings that stayed outside and that the engine has not been told of yet; a full queue comes first.
-type Untold = BTreeMap<(Cause, u16), u64>;
-
-/// A sender that is none of the vehicle's sensors.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Stranger {
-    /// Whence its datagrams came.
-    pub address: SocketAddr,
-    /// How many, since it is remembered.
-    pub datagrams: u64,
-    /// When the newest came, ns since the Unix epoch.
-    pub newest_ns: i64,
-}
-
-impl Outside {
-    /// Adds what the engine has not been told of yet to its ledger, and to those of its sensors.
-    pub fn add_to<'a>(&self, ledger: &mut Ledger, sensors: impl IntoIterator<Item = &'a mut Ledger>) {
-        let mut sensors: Vec<_> = sensors.into_iter().collect();
-        for (&(cause, source), &count) in &*locked(&self.untold) {
-            ledger.stayed_outside(cause, count);
-            if let Some(sensor) = sensors.get_mut(usize::from(source)).filter(|_| cause.has_source()) {
-                sensor.stayed_outside(cause, count);
-            }
-        }
-    }
-
-    /// Counts readings that stay outside.
-    pub(crate) fn leave(&self, source: u16, cause: Cause, count: u64) {
-        if count > 0 {
-            *locked(&self.untold).entry((cause, source)).or_default() += count;
-        }
-    }
-
-    /// Counts messages that are no observations of a sensor, or of [`clearway_mapping::event::NOBODY`]: the ledger has
-    /// one word for them, here each keeps its `reason`.
-    pub(crate) fn leave_observations(&self, source: u16, reason: &'static str, count: u64) {
-        self.leave(source, Cause::Observation, count);
-        *locked(&self.observations).entry(reason).or_default() += count;
-    }
-
-    /// The observations refused since the server's start, by reason.
-    pub fn observations_refused(&self) -> BTreeMap<&'static str, u64> {
-        locked(&self.observations).clone()
-    }
-
-    /// The last few strangers, newest last.
-    pub fn strangers(&self) -> Vec<Stranger> {
-        locked(&self.strangers).iter().copied().collect()
-    }
-}
 
 /// What numbers the events. Whoever holds its lock does not wait: a place on the queue is there before.
 #[derive(Debug)]
@@ -311,14 +251,7 @@ impl Door {
     /// Refuses a datagram whose sender is none of the vehicle's sensors, and remembers the sender.
     pub fn refuse_stranger(&self, address: SocketAddr) {
         self.leave_outside(0, Cause::Sender, 1);
-        let mut strangers = locked(&self.outside.strangers);
-        let known = strangers.iter().position(|stranger| stranger.address == address);
-        let known = known.and_then(|index| strangers.remove(index));
-        if known.is_none() && strangers.len() == STRANGERS {
-            strangers.pop_front();
-        }
-        let datagrams = known.map_or(0, |stranger| stranger.datagrams) + 1;
-        strangers.push_back(Stranger { address, datagrams, newest_ns: self.clock.now_ns() });
+        self.outside.meet(address, self.clock.now_ns());
     }
 
     /// Tells the engine of all that stayed outside, waiting for space; at the stamp of a capture where there is one,
@@ -347,11 +280,6 @@ impl Door {
 /// Nothing under these locks panics between two related writes, so a poisoned lock still guards whole values.
 pub(crate) fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// What is told next: a full queue at once, all else when it `is_due`.
-fn next_told(untold: &Untold, is_due: bool) -> Option<(Cause, u16)> {
-    untold.keys().next().copied().filter(|(cause, _)| is_due || *cause == Cause::Queue)
 }
 
 impl Inside {
@@ -391,6 +319,8 @@ pub(crate) fn now_ns() -> i64 {
 
 #[cfg(test)]
 mod tests {
+    use clearway_mapping::pipeline::Ledger;
+
     use super::*;
 
     fn untold(door: &Door) -> Ledger {
