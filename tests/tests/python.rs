@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clearway_server::server::Running;
 use clearway_sim::send::{Pace, Until, drive};
-use house::certificates::{certificates, secured, zenoh_file};
+use house::certificates::{behind, certificates, router, secured};
 use house::venv::{environment, run};
 use house::{config, feed, readings, start, until, vehicle, within};
 
@@ -57,24 +57,14 @@ fn python() -> PathBuf {
     })
 }
 
-/// A server that asks everybody for a certificate, with some maps.
-async fn asking(folder: &Path) -> Running {
-    let ours = certificates("ours");
-    let file = folder.join("server.json5");
-    std::fs::write(&file, zenoh_file("server.json5", &ours)).expect("a file of ours");
-    let mut config = secured(true);
-    (config.zenoh.enabled, config.zenoh.file) = (true, file);
-    config.zenoh.listen = vec!["tls/127.0.0.1:0".into()];
+/// A server that asks everybody for a certificate, with some maps, behind such a router.
+async fn asking(folder: &Path, router: &str) -> Running {
+    let mut config = behind(router, folder, secured(true));
     // All layers are made, whether or not somebody reads them yet.
     config.recorder.file = folder.join("asking.mcap");
     let running = house::certificates::start(config).await;
     feed(&running, readings(3)).await;
     running
-}
-
-fn zenoh_of(running: &Running, protocol: &str) -> String {
-    let at = format!("{protocol}/127.0.0.1");
-    running.zenoh.iter().find(|endpoint| endpoint.starts_with(&at)).expect("zenoh listens").clone()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
@@ -110,13 +100,15 @@ async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording
     let status = running.vehicles.0[0].status.clone();
     until("a map", || status.snapshot().maps > 0).await;
 
-    let asking = asking(folder.path()).await;
+    let (router, routed) = router().await;
+    let asking = asking(folder.path(), &routed).await;
+    let zenoh = running.zenoh.iter().find(|endpoint| endpoint.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
     let grpc = |running: &Running| running.grpc.expect("gRPC is served").to_string();
     let places = [
         ("CLEARWAY_GRPC", grpc(&running)),
-        ("CLEARWAY_ZENOH", zenoh_of(&running, "tcp")),
+        ("CLEARWAY_ZENOH", zenoh.clone()),
         ("CLEARWAY_SECURED_GRPC", grpc(&asking)),
-        ("CLEARWAY_SECURED_ZENOH", zenoh_of(&asking, "tls")),
+        ("CLEARWAY_SECURED_ZENOH", routed),
         ("CLEARWAY_CERTIFICATES", certificates("ours").display().to_string()),
         ("CLEARWAY_RECORDING", recording.display().to_string()),
     ];
@@ -133,5 +125,6 @@ async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording
     car.join().unwrap().unwrap();
     within("shutdown", running.shutdown()).await.unwrap();
     within("shutdown", asking.shutdown()).await.unwrap();
+    router.close().await.unwrap();
     outcome.expect("the Python client's tests pass");
 }

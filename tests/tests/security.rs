@@ -6,10 +6,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 use clearway_client::{Client, ClientError, Subscription, Tls, ZenohClient};
-use clearway_server::config::ZenohMode;
 use clearway_server::replay::{Options, Summary, replay};
 use clearway_server::server::{Running, Server, Setup};
-use house::certificates::{certificates, secured, start, zenoh_file};
+use house::certificates::{behind, certificates, router, secured, start, zenoh_file};
 use house::{config, feed, grpc, readings, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -177,20 +176,8 @@ async fn zenoh_client(router: &str, ca: &str, name: &str) -> zenoh::Result<zenoh
 async fn behind_the_router_of_deploy_each_certificate_does_what_its_rules_allow() {
     let folder = tempfile::tempdir().unwrap();
     let ours = certificates("ours");
-    let text = zenoh_file("router.json5", &ours).replace("tls/0.0.0.0:7447", "tls/127.0.0.1:0");
-    let router =
-        within("a router", zenoh::open(zenoh::Config::from_json5(&text).unwrap()).into_future()).await.unwrap();
-    let locators = router.info().locators().await;
-    let port = locators.iter().find_map(|at| at.to_string().rsplit_once(':').map(|(_, port)| port.to_owned()));
-    let at = format!("tls/localhost:{}", port.expect("the router listens"));
-
-    let mut config = config();
-    let file = folder.path().join("server.json5");
-    std::fs::write(&file, zenoh_file("server.json5", &ours)).unwrap();
-    config.zenoh.enabled = true;
-    (config.zenoh.mode, config.zenoh.listen, config.zenoh.connect) = (ZenohMode::Client, Vec::new(), vec![at.clone()]);
-    config.zenoh.file = file;
-    let running = house::start(config).await;
+    let (router, at) = router().await;
+    let running = house::start(behind(&at, folder.path(), config())).await;
 
     let reader = zenoh_client(&at, "ours", "reader").await.expect("a session");
     let unlisted = zenoh_client(&at, "ours", "operator").await.expect("a session");
