@@ -27,17 +27,17 @@ fn scene(noise: u32) -> Cells {
 #[divan::bench(args = [0, 20, 500])]
 fn encode(bencher: Bencher, noise: u32) {
     let cells = scene(noise);
-    bencher.counter(ItemsCount::new(cells.len())).bench(|| codec::encode(divan::black_box(cells.as_ref())));
+    bencher.counter(ItemsCount::new(cells.len())).bench(|| codec::encode_grid(divan::black_box(cells.as_ref()), SIDE));
 }
 
 #[divan::bench(args = [0, 20, 500])]
 fn decode(bencher: Bencher, noise: u32) {
     let cells = scene(noise);
-    let channel = codec::encode(cells.as_ref()).into_channel("class", "", 1.0, 0);
+    let channel = codec::encode_grid(cells.as_ref(), SIDE).into_channel("class", "", 1.0, 0);
     println!("noise {noise} per thousand: {} bytes", channel.payload.len());
     bencher
         .counter(ItemsCount::new(cells.len()))
-        .bench(|| codec::decode(divan::black_box(&channel), &Limits::default()));
+        .bench(|| codec::decode(divan::black_box(&channel), SIDE, &Limits::default()));
 }
 
 /// The scene as a layer whose first cell is cell (`first_ix`, 0) of the world.

@@ -6,10 +6,10 @@
 //! that of the turned region. A radial grid keeps the rows from the vehicle to the region's farthest corner, with all
 //! columns. Planes, figures, legend and safe points stay whole: they tell of the layer, not of its cells.
 
+use crate::by_class::encode_beside;
 use crate::codec::{Cells, CellsRef, Limits, encode_grid};
 use crate::grid::{Grid, turned};
 use crate::map::{MapError, decode_layer};
-use crate::predicted::encode_beside;
 use crate::v1;
 
 /// Why a layer has no such part.

@@ -9,13 +9,20 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use clearway_mapping::event::{Body, EgoPose, Event};
+use clearway_mapping::config::MapsConfig;
+use clearway_mapping::map::Map;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::codec::Limits;
 use clearway_proto::delta::encode_delta;
 use clearway_proto::v1;
+use clearway_server::config::Config;
+use clearway_server::demo::rig::Rig;
+use clearway_server::ingest::observation::{self, bodies};
 use clearway_server::recording::{Entry, Recording};
 use clearway_server::replay::{Options, replay};
 use clearway_server::wire::EncodedMap;
+use clearway_sim::scenes::{Scene, town};
+use clearway_sim::traffic::street;
 use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion, Vector3};
 use prost::Message;
 
@@ -50,6 +57,13 @@ struct Sized {
     layers: Vec<v1::Layer>,
 }
 
+impl Sized {
+    fn of(map: &Map) -> Self {
+        let bytes = EncodedMap::new(map, "car".into(), 7, 300).select(&[]);
+        Self { message: bytes.len(), layers: v1::Map::decode(bytes).unwrap().layers }
+    }
+}
+
 /// Replays a drive once to learn its events and how its sensor is mounted, then makes its maps with the poses added.
 async fn maps(drive: &Drive) -> Vec<Sized> {
     let folder = tempfile::tempdir().unwrap();
@@ -75,12 +89,37 @@ async fn maps(drive: &Drive) -> Vec<Sized> {
     for (sequence, event) in (0..).zip(with_poses(drive, &file, ahead_ns.expect("a map"), events)) {
         let event = Event { sequence, ..event };
         if let Ok(Some(map)) = pipeline.step(&event) {
-            let encoded = EncodedMap::new(map, "car".into(), 7, 300);
-            let bytes = encoded.select(&[]);
-            made.push(Sized { message: bytes.len(), layers: v1::Map::decode(bytes).unwrap().layers });
+            made.push(Sized::of(map));
         }
     }
     assert!(!made.is_empty(), "{} makes no map", drive.name);
+    made
+}
+
+/// Maps of six units of four planes at 50 Hz on a car that drives through a simulated scene, with its poses.
+fn simulated(scene: Scene, maps: usize) -> Vec<Sized> {
+    const START_NS: i64 = 1_767_270_000_000_000_000;
+    let mut rig = Rig::many(scene, START_NS);
+    rig.scanners.clear();
+    let mut config = Config::of_one_vehicle("car", "ahead");
+    config.vehicles[0].sensors = rig.sensors();
+    let mut vehicle = config.vehicles[0].core();
+    vehicle.maps = MapsConfig { occupancy: vehicle.maps.occupancy, ..MapsConfig::none() };
+    let mut pipeline = Pipeline::new(&vehicle, vec![None; rig.units.len()]).unwrap();
+    let source = |sensor: &str| rig.units.iter().position(|(name, _)| name == sensor).unwrap_or(0) as u16;
+    let mut made = Vec::new();
+    for (sequence, told) in (0..).zip(rig.told()) {
+        let observation = v1::Observation::from(told.observation);
+        let source = source(&observation.sensor);
+        let (_, body) = bodies(observation, &observation::Limits::of_points(1 << 16)).unwrap().remove(0);
+        let event = Event { sequence, arrival_ns: told.stamp_ns + 1_000_000, source, body };
+        if let Ok(Some(map)) = pipeline.step(&event) {
+            made.push(Sized::of(map));
+            if made.len() == maps {
+                break;
+            }
+        }
+    }
     made
 }
 
@@ -178,4 +217,22 @@ async fn maps_of_recorded_scans_are_as_small_as_promised() {
     }
     println!("class of occupancy, all maps: {:.0} bytes", classes.mean("all"));
     assert!(classes.mean("hdl64e kitti") <= 7500.0 && classes.mean("all") <= 7500.0);
+}
+
+fn dump(name: &str, maps: &[Sized]) {
+    let dir = format!("/tmp/deltas_dump/{name}");
+    std::fs::create_dir_all(&dir).unwrap();
+    for (n, m) in maps.iter().enumerate() {
+        let map = v1::Map { header: None, layers: m.layers.clone() };
+        std::fs::write(format!("{dir}/{n:04}.bin"), map.encode_to_vec()).unwrap();
+    }
+}
+#[tokio::test(flavor = "multi_thread")]
+async fn dump_all() {
+    for drive in &DRIVES {
+        dump(&drive.name.replace(' ', "_"), &maps(drive).await);
+    }
+    dump("town", &simulated(town(), 150));
+    dump("street8", &simulated(street(8.0), 150));
+    dump("street0", &simulated(street(0.0), 100));
 }
