@@ -152,7 +152,7 @@ pub(crate) fn decode_changes<T: Cell>(payload: &[u8], base: Vec<T>, columns: usi
     let mut above = vec![0; columns];
     for at in 0..cells.len() {
         let before = if at % columns == 0 { 0 } else { above[at % columns - 1] };
-        let context = borders[at] | above[at % columns] * CHANGED_ABOVE | before * CHANGED_BEFORE;
+        let context = borders[at] + above[at % columns] * CHANGED_ABOVE + before * CHANGED_BEFORE;
         let is_changed = turns.next(context.into(), &mut bits)?;
         above[at % columns] = u8::from(is_changed);
         if is_changed {

@@ -427,7 +427,6 @@ pub(crate) fn decode_layer(layer: v1::Layer, base: Option<&Layer>, limits: &Limi
         Some(packed) => safe_points::unpack(&layer.name, packed, limits.map_parts)?,
         None => Vec::new(),
     };
-    drop(shift);
     let layer = Layer { name: layer.name, grid, legend: layer.legend, channels, planes, figures, points };
     check_classes(&layer)?;
     Ok(layer)

@@ -79,7 +79,7 @@ fn long_runs_of_many_channels_are_refused_before_their_cells_are_made() {
         cell_type: v1::CellType::U16.into(),
         encoding: v1::Encoding::Rows.into(),
         cell_count: 4 << 20,
-        payload: Bytes::from_static(&[0, 0, 2, 0, 0, 2]),
+        payload: Bytes::from_static(&[0, 0, 2, 0, 0, 8]),
         ..Default::default()
     };
     let layer = v1::Layer { channels: (0..10).map(channel).collect(), ..Default::default() };

@@ -56,7 +56,7 @@ fn good_grids() -> Vec<(&'static str, Cells, usize)> {
         ("rows_of_ones", Cells::U8(vec![1; 4000]), 40),
         ("rows_patch", Cells::U8((0..400).map(patch).collect()), 20),
         ("rows_arcs_signed", Cells::I8((0..400).map(|cell| 3 - arcs(cell) as i8).collect()), 20),
-        ("rows_arcs_u16", Cells::U16((0..390).map(|cell| 300 * arcs(cell) as u16).collect()), 20),
+        ("rows_arcs_u16", Cells::U16((0..400).map(|cell| 300 * arcs(cell) as u16).collect()), 20),
         ("rows_one_column", Cells::U8((0..100).map(|cell| cell / 30).collect()), 1),
     ]
 }
@@ -140,7 +140,7 @@ fn bad_vectors() -> Vec<Bad> {
         ("rows_with_a_byte_after", "TrailingBytes", u8_, rows, 9, vec![0b0001_0100, 0]),
         ("rows_with_a_wrong_crc", "Crc", u8_, rows, 9, vec![0b0001_0100]),
         // Copy 0, value 1, a run of 4 Mi.
-        ("largest_channel_with_a_wrong_crc", "Crc", u16_, rows, 4 << 20, vec![0x90, 0, 0, 0x80, 0, 0]),
+        ("largest_channel_with_a_wrong_crc", "Crc", u16_, rows, 4 << 20, vec![0x90, 0, 0, 0x10, 0, 0, 0]),
     ]
 }
 
