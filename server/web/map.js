@@ -2,7 +2,7 @@
 // was wrong. A map is taken whole or not at all.
 
 import { byClass, decodeChannel, Refused } from "./codec.js";
-import { baseOf, predictor } from "./delta.js";
+import { baseOf, beforehand } from "./delta.js";
 import { gridOf } from "./grid.js";
 import { readMap, readMapUpdate } from "./protobuf.js";
 
@@ -29,10 +29,8 @@ function openLayer(layer, before) {
   const grid = gridOf(layer);
   let classes = null;
   const channels = layer.channels.map((channel) => {
-    const told = channel.by_class.length > 0;
-    if (told && before) throw new Refused("base_shape", `layer ${layer.name}: ${channel.name} is told by class too`);
-    const predict = told ? byClass(channel, classes, layer.legend) : before && predictor(layer.name, grid, before, channel);
-    const cells = decodeChannel(channel, grid.cells, predict);
+    const told = channel.by_class.length > 0, base = before && beforehand(layer.name, grid, before, channel);
+    const cells = decodeChannel(channel, grid.shape, told ? byClass(channel, classes, layer.legend) : base);
     if (channel.name === "class") {
       const unnamed = cells.find((cell) => cell < 0 || cell >= layer.legend.length);
       if (unnamed !== undefined) {

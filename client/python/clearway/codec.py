@@ -77,10 +77,7 @@ def _rows(bits: _Bits, rows: int, columns: int, dtype: np.dtype) -> np.ndarray:
     cells, at = np.zeros((rows + 1) * columns, dtype), columns
     while at < len(cells):
         end = min(at + bits.number(), len(cells))
-        while at < end:
-            step = min(columns, end - at)
-            cells[at : at + step] = cells[at - columns : at - columns + step]
-            at += step
+        cells[at:end], at = np.resize(cells[at - columns : at], end - at), end
         if at < len(cells):
             value = cells[at - 1] if bits.bit() else bits.cell(bits.number())
             end = at + bits.number() + 1
