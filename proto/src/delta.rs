@@ -29,6 +29,9 @@ pub fn encode_delta(base: &v1::Layer, base_sequence: u64, new: &v1::Layer, limit
     let shift = Shift::new(&old, &decoded.grid).ok()?;
     let columns = decoded.grid.shape().1 as usize;
     let mut delta = v1::Layer { base_sequence: Some(base_sequence), ..new.clone() };
+    if old.legend == new.legend {
+        delta.legend.clear();
+    }
     for (channel, now) in delta.channels.iter_mut().zip(&decoded.channels) {
         let before =
             old.channel(&now.name).filter(|before| (before.scale, before.unknown) == (now.scale, now.unknown))?;
@@ -38,7 +41,8 @@ pub fn encode_delta(base: &v1::Layer, base_sequence: u64, new: &v1::Layer, limit
             channel.by_class.clear();
         }
     }
-    (delta.encoded_len() < new.encoded_len()).then_some(delta)
+    let stands_on_base = delta.channels.iter().zip(&new.channels).any(|(channel, whole)| channel != whole);
+    (stands_on_base && delta.encoded_len() < new.encoded_len()).then_some(delta)
 }
 
 /// `None` for cells of two types.

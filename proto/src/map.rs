@@ -384,13 +384,16 @@ fn check_unique<'a>(what: &'static str, names: impl Iterator<Item = &'a String>)
 }
 
 /// `base`: the layer that a delta stands on.
-pub(crate) fn decode_layer(layer: v1::Layer, base: Option<&Layer>, limits: &Limits) -> Result<Layer, MapError> {
+pub(crate) fn decode_layer(mut layer: v1::Layer, base: Option<&Layer>, limits: &Limits) -> Result<Layer, MapError> {
     let grid = Grid::from_wire(&layer)?;
     check_unique("channel", layer.channels.iter().map(|channel| &channel.name))?;
     let shift = match (layer.base_sequence, base) {
         (None, _) => None,
         (Some(base_sequence), None) => return Err(MapError::NoBase { layer: layer.name, base_sequence }),
         (Some(_), Some(base)) => {
+            if layer.legend.is_empty() {
+                layer.legend.clone_from(&base.legend);
+            }
             let misfit = |what| MapError::BaseShape { layer: layer.name.clone(), what };
             Some(Shift::new(base, &grid).map_err(misfit)?)
         }

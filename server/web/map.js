@@ -26,15 +26,15 @@ export function openMap(bytes, base = null) {
 }
 
 function openLayer(layer, before) {
-  const grid = gridOf(layer);
+  const grid = gridOf(layer), legend = layer.legend.length || !before ? layer.legend : before.legend;
   let classes = null;
   const channels = layer.channels.map((channel) => {
     const told = channel.by_class.length > 0, base = before && beforehand(layer.name, grid, before, channel);
-    const cells = decodeChannel(channel, grid.shape, told ? byClass(channel, classes, layer.legend) : base);
+    const cells = decodeChannel(channel, grid.shape, told ? byClass(channel, classes, legend) : base);
     if (channel.name === "class") {
-      const unnamed = cells.find((cell) => cell < 0 || cell >= layer.legend.length);
+      const unnamed = cells.find((cell) => cell < 0 || cell >= legend.length);
       if (unnamed !== undefined) {
-        throw new Refused("class", `layer ${layer.name}: ${unnamed}; the legend names ${layer.legend.length}`);
+        throw new Refused("class", `layer ${layer.name}: ${unnamed}; the legend names ${legend.length}`);
       }
       classes = cells;
     }
@@ -42,5 +42,5 @@ function openLayer(layer, before) {
     return { name, unit, scale, unknown, cells };
   });
   if (channels.length === 0) throw new Refused("channels", `layer ${layer.name} has none`);
-  return { name: layer.name, legend: layer.legend, grid, channels, figures: layer.figures };
+  return { name: layer.name, legend, grid, channels, figures: layer.figures };
 }

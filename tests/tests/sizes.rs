@@ -1,4 +1,5 @@
-//! How many bytes the maps of recorded scans take: of each layer and channel, whole and as a delta to the map before.
+//! How many bytes the maps of recorded and simulated drives take: of each layer and channel, whole and as a delta to the
+//! map before.
 //! `cargo test -p clearway-tests --test sizes -- --nocapture` prints the table.
 
 #![cfg_attr(not(clearway_data), allow(unused))]
@@ -8,8 +9,8 @@ mod house;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use clearway_mapping::event::{Body, EgoPose, Event};
 use clearway_mapping::config::MapsConfig;
+use clearway_mapping::event::{Body, EgoPose, Event};
 use clearway_mapping::map::Map;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::codec::Limits;
@@ -173,6 +174,37 @@ impl Table {
         (*sum, *maps) = (*sum + bytes, *maps + 1);
     }
 
+    /// Of each layer and channel, whole and as it is sent to who has the map before.
+    fn of(maps: &[Sized]) -> Self {
+        let mut table = Self::default();
+        for (number, map) in maps.iter().enumerate() {
+            table.add("message".into(), map.message);
+            for layer in &map.layers {
+                table.add_layer(layer, layer, "whole");
+                let Some(before) = number.checked_sub(1) else { continue };
+                let before = maps[before].layers.iter().find(|before| before.name == layer.name).unwrap();
+                let delta = encode_delta(before, 1, layer, &Limits::default());
+                table.add_layer(layer, delta.as_ref().unwrap_or(layer), "sent");
+                table.add(format!("{} sent as a delta, of 1", layer.name), usize::from(delta.is_some()));
+            }
+        }
+        table
+    }
+
+    fn add_layer(&mut self, layer: &v1::Layer, sent: &v1::Layer, how: &str) {
+        self.add(format!("{} {how}", layer.name), sent.encoded_len());
+        for channel in &sent.channels {
+            let bytes = channel.payload.len() + channel.by_class.len();
+            self.add(format!("{}.{} {how}", layer.name, channel.name), bytes);
+        }
+    }
+
+    fn print(&self) {
+        for what in self.0.keys() {
+            println!("    {what}: {:.1}", self.mean(what));
+        }
+    }
+
     fn mean(&self, what: &str) -> f64 {
         self.0.get(what).map_or(f64::NAN, |(sum, maps)| *sum as f64 / *maps as f64)
     }
@@ -184,29 +216,10 @@ async fn maps_of_recorded_scans_are_as_small_as_promised() {
     let mut classes = Table::default();
     for drive in &DRIVES {
         let maps = maps(drive).await;
-        let mut table = Table::default();
-        for (number, map) in maps.iter().enumerate() {
-            table.add("message".into(), map.message);
-            for layer in &map.layers {
-                table.add(format!("{} whole", layer.name), layer.encoded_len());
-                for channel in &layer.channels {
-                    table.add(format!("{}.{} whole", layer.name, channel.name), channel.payload.len());
-                }
-                let Some(before) = number.checked_sub(1) else { continue };
-                let before = maps[before].layers.iter().find(|before| before.name == layer.name).unwrap();
-                let delta = encode_delta(before, 1, layer, &Limits::default());
-                table.add(format!("{} sent", layer.name), delta.as_ref().unwrap_or(layer).encoded_len());
-                table.add(format!("{} sent as a delta, of 1", layer.name), usize::from(delta.is_some()));
-                for channel in &delta.as_ref().unwrap_or(layer).channels {
-                    table.add(format!("{}.{} sent", layer.name, channel.name), channel.payload.len());
-                }
-            }
-        }
+        let table = Table::of(&maps);
         let largest = maps.iter().map(|map| map.message).max().unwrap();
         println!("{}: {} maps, largest message {largest} bytes", drive.name, maps.len());
-        for what in table.0.keys() {
-            println!("    {what}: {:.1}", table.mean(what));
-        }
+        table.print();
         for map in &maps {
             let occupancy = map.layers.iter().find(|layer| layer.name == "occupancy").unwrap();
             let class = occupancy.channels.iter().find(|channel| channel.name == "class").unwrap();
@@ -219,20 +232,18 @@ async fn maps_of_recorded_scans_are_as_small_as_promised() {
     assert!(classes.mean("hdl64e kitti") <= 7500.0 && classes.mean("all") <= 7500.0);
 }
 
-fn dump(name: &str, maps: &[Sized]) {
-    let dir = format!("/tmp/deltas_dump/{name}");
-    std::fs::create_dir_all(&dir).unwrap();
-    for (n, m) in maps.iter().enumerate() {
-        let map = v1::Map { header: None, layers: m.layers.clone() };
-        std::fs::write(format!("{dir}/{n:04}.bin"), map.encode_to_vec()).unwrap();
+#[test]
+fn deltas_of_a_simulated_drive_take_no_more_than_half_of_the_maps() {
+    // The first maps, of a car that has seen nothing yet, are no drive.
+    const SEEN: usize = 25;
+    for scene in [street(8.0), town()] {
+        let name = scene.name;
+        let maps = simulated(scene, SEEN + 75);
+        let table = Table::of(&maps[SEEN..]);
+        println!("{name}: {} maps", maps.len() - SEEN);
+        table.print();
+        let share = table.mean("occupancy sent") / table.mean("occupancy whole");
+        println!("{name}: occupancy is sent in {:.1} % of what it takes whole", 100.0 * share);
+        assert!(share <= 0.5, "{name}: {share}");
     }
-}
-#[tokio::test(flavor = "multi_thread")]
-async fn dump_all() {
-    for drive in &DRIVES {
-        dump(&drive.name.replace(' ', "_"), &maps(drive).await);
-    }
-    dump("town", &simulated(town(), 150));
-    dump("street8", &simulated(street(8.0), 150));
-    dump("street0", &simulated(street(0.0), 100));
 }

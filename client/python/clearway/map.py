@@ -154,7 +154,7 @@ class Layer:
         #: Cell (row, column) of a delta changes cell (row, column) + shift of the base.
         self._shift = _shift(message.name, base.grid, self.grid) if base else (0, 0)
         #: Names of the values of the channel `class`; entry 0 is `unknown`.
-        self.legend: tuple[str, ...] = tuple(message.legend)
+        self.legend: tuple[str, ...] = tuple(message.legend) or (base.legend if base else ())
         self.channels: dict[str, Channel] = {}
         for channel in message.channels:
             if channel.name in self.channels:
