@@ -12,8 +12,9 @@ use clearway_proto::map::Layer;
 use crate::ClientError;
 use crate::view::MapView;
 
-/// Classes a vehicle may drive on, over all layers.
-pub const FREE: [&str; 8] = ["drivable", "flat", "flat_inferred", "clear", "passable", "road", "free", "path"];
+/// Classes a vehicle may drive on, over all layers: what was seen to be free. `flat_inferred` is not among them, for
+/// nobody saw it, and neither is it free in the ROS grids.
+pub const FREE: [&str; 7] = ["drivable", "flat", "clear", "passable", "road", "free", "path"];
 /// Classes that hold something to keep away from, over all layers.
 pub const OBSTACLES: [&str; 2] = ["obstacle", "occupied"];
 
@@ -42,7 +43,9 @@ pub struct Obstacle {
     pub x_m: f64,
     /// Metres to the left.
     pub y_m: f64,
-    /// From the point asked about; 0 where that lies in such a cell.
+    /// From the point asked about; 0 where that lies in such a cell. No obstacle of the layer is nearer; this one may be
+    /// farther, by as much as its cell is long: a map does not tell where in a cell something stands. The innermost
+    /// cells of a radial grid begin in the middle of the vehicle, so that an obstacle in one is 0 m from there.
     pub distance_m: f64,
     /// From there, counter-clockwise from the ego x axis, -π to π.
     pub bearing_rad: f64,

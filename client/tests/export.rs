@@ -250,7 +250,7 @@ fn schemas(told: &Value) -> Vec<(&str, &str, u64)> {
 
 #[test]
 fn a_file_for_ros_2_has_occupancy_grids_tf_and_odometry_that_a_stranger_reads() {
-    let (told, _) = exported("ros2", &[]);
+    let (told, _) = exported("ros2", &["--no-points"]);
     let expected = [
         ("/clearway/alpha/drivability", "nav_msgs/msg/OccupancyGrid", 3),
         ("/clearway/alpha/odometry", "nav_msgs/msg/Odometry", 3),
@@ -280,6 +280,34 @@ fn a_file_for_ros_2_has_occupancy_grids_tf_and_odometry_that_a_stranger_reads() 
     let odometry = &told["/clearway/alpha/odometry"]["last"];
     assert_eq!(odometry["twist"]["twist"]["linear"]["x"], 3.5);
     assert_eq!(odometry["pose"]["pose"]["orientation"]["z"], json!(std::f64::consts::FRAC_1_SQRT_2));
+}
+
+#[test]
+fn a_file_for_ros_2_has_the_points_of_every_turn_and_where_their_sensor_sits() {
+    let (told, turns) = exported("ros2", &["--layer", "second"]);
+    let clouds = turns.len() as u64;
+    let expected = [
+        ("/clearway/alpha/odometry", "nav_msgs/msg/Odometry", 3),
+        ("/clearway/alpha/points/top", "sensor_msgs/msg/PointCloud2", clouds),
+        ("/clearway/alpha/second", "nav_msgs/msg/OccupancyGrid", 3),
+        ("/tf", "tf2_msgs/msg/TFMessage", 3 + clouds),
+    ];
+    assert_eq!(schemas(&told), expected);
+    let cloud = &told["/clearway/alpha/points/top"]["last"];
+    let bytes = turns[turns.len() - 1];
+    assert_eq!(
+        (&cloud["header"]["frame_id"], &cloud["width"], &cloud["data"]["length"]),
+        (&json!("alpha/top"), &json!(bytes / 12), &json!(bytes))
+    );
+    let names: Vec<&Value> = cloud["fields"].as_array().unwrap().iter().map(|field| &field["name"]).collect();
+    assert_eq!(names, ["x", "y", "z"]);
+    // The simulated vehicle drives later than the maps were made: the last is the sensor's mount.
+    let transform = &told["/tf"]["last"]["transforms"][0];
+    assert_eq!(
+        (&transform["header"]["frame_id"], &transform["child_frame_id"]),
+        (&json!("alpha/base_link"), &json!("alpha/top"))
+    );
+    assert_eq!(transform["transform"]["translation"], json!({"x": 0.5, "y": 0.0, "z": 1.9}));
 }
 
 #[test]

@@ -6,7 +6,9 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 use bytes::Bytes;
 use clearway_client::codec::{CellsRef, encode_grid};
+use clearway_client::footprint::{FREE, OBSTACLES};
 use clearway_client::v1::layer::Geometry;
+use clearway_client::viewer::raster;
 use clearway_client::{Footprint, MapView, v1};
 use clearway_proto::map::{encode_header, encode_layer};
 use proptest::prelude::*;
@@ -136,6 +138,28 @@ fn unknown_is_never_free_and_neither_is_what_lies_outside_or_nowhere() {
         assert!(!known.is_free("drivability", &Footprint { x_m, ..footprint }).unwrap(), "{x_m}");
     }
     assert!(known.is_free("speed", &footprint).is_err() && known.nearest_obstacle("speed", 0.0, 0.0).is_err());
+}
+
+#[test]
+fn rust_python_and_ros_call_the_same_classes_free_and_none_that_nobody_saw() {
+    let python = include_str!("../python/clearway/map.py");
+    for (name, ours) in [("FREE", &FREE[..]), ("OBSTACLES", &OBSTACLES[..])] {
+        let line = python.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(" = frozenset({"));
+        let theirs = line.expect(name).trim_end_matches("})").split(", ").map(|class| class.trim_matches('"'));
+        assert!(theirs.eq(ours.iter().copied()), "{name}: {line:?}");
+    }
+    for class in ["unknown", "flat_inferred", "occluded", "out_of_range"] {
+        assert!(!FREE.contains(&class) && raster::occupancy(class) == -1, "{class}");
+    }
+    assert!(FREE.iter().all(|class| raster::occupancy(class) == 0));
+    assert!(OBSTACLES.iter().all(|class| raster::occupancy(class) == 100));
+}
+
+#[test]
+fn an_obstacle_beside_the_vehicle_is_never_told_farther_than_its_cell_begins() {
+    let map = view(radial(8), &[[0, 0, 0, 0, 0, 0, 0, 3], [0; 8], [0; 8]].concat());
+    let obstacle = map.nearest_obstacle("drivability", 0.0, 0.0).unwrap().unwrap();
+    assert_eq!(obstacle.distance_m, 0.0, "the innermost cells begin in the middle: {obstacle:?}");
 }
 
 #[test]

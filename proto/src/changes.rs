@@ -23,6 +23,8 @@ const BORDER_BEHIND: u8 = 32;
 /// The context in which turns tell whether a changed cell has become something other than its neighbour.
 const OTHER: usize = 64;
 const CONTEXTS: usize = 65;
+/// Contexts of cells that are passed over together where none has changed.
+const CALM: [u8; 32] = [0; 32];
 
 /// For each cell, which of its neighbours are other than it.
 fn borders<T: Cell>(base: &[T], columns: usize) -> Vec<u8> {
@@ -56,31 +58,31 @@ fn neighbour<T: Cell>(cells: &[T], columns: usize, at: usize) -> Option<T> {
     [before, above, behind, below].into_iter().flatten().find(|cell| *cell != cells[at])
 }
 
+/// Tells the cells beside one that it has changed.
+fn mark(contexts: &mut [u8], columns: usize, changed: usize) {
+    if let Some(below) = contexts.get_mut(changed + columns) {
+        *below |= CHANGED_ABOVE;
+    }
+    if let Some(behind) = contexts.get_mut(changed + 1).filter(|_| !(changed + 1).is_multiple_of(columns)) {
+        *behind |= CHANGED_BEFORE;
+    }
+}
+
 /// `cells` as what differs from `base`, as many cells, in rows of `columns`.
 pub(crate) fn encode_changes<T: Cell>(cells: &[T], base: Vec<T>, columns: usize) -> Vec<u8> {
-    // So many calm cells are passed over at once.
-    const STEP: usize = 32;
-    let changed: Vec<u8> = cells.iter().zip(&base).map(|(cell, base)| u8::from(cell != base)).collect();
     let mut contexts = borders(&base, columns);
-    for (row, contexts) in contexts.chunks_mut(columns).enumerate() {
-        let here = &changed[row * columns..];
-        contexts[1..].iter_mut().zip(here).for_each(|(context, changed)| *context |= changed * CHANGED_BEFORE);
-        if let Some(above) = row.checked_sub(1) {
-            let above = &changed[above * columns..];
-            contexts.iter_mut().zip(above).for_each(|(context, changed)| *context |= changed * CHANGED_ABOVE);
-        }
-    }
     let mut told = Told { tokens: Vec::new(), newest: [None; CONTEXTS] };
     let (mut now, mut at) = (base, 0);
     while at < cells.len() {
-        if at + STEP <= cells.len() && contexts[at..at + STEP] == [0; STEP] && changed[at..at + STEP] == [0; STEP] {
-            told.turn(0, false, STEP as u64);
-            at += STEP;
+        if contexts[at..].starts_with(&CALM) && cells[at..at + CALM.len()] == now[at..at + CALM.len()] {
+            told.turn(0, false, CALM.len() as u64);
+            at += CALM.len();
             continue;
         }
-        let is_changed = changed[at] != 0;
+        let is_changed = cells[at] != now[at];
         told.turn(contexts[at].into(), is_changed, 1);
         if is_changed {
+            mark(&mut contexts, columns, at);
             let likely = neighbour(&now, columns, at);
             let is_other = likely != Some(cells[at]);
             if likely.is_some() {
@@ -144,18 +146,18 @@ impl Told {
 
 /// The way back: `base` becomes the cells. Refuses what [`encode_changes`] would not have written.
 pub(crate) fn decode_changes<T: Cell>(payload: &[u8], base: Vec<T>, columns: usize) -> Result<Vec<T>, DecodeError> {
-    let borders = borders(&base, columns);
+    let mut contexts = borders(&base, columns);
     let (mut bits, mut values) = (BitReader::new(payload), Mean::default());
     let mut turns =
         Turns { means: [[Mean::default(); 2]; CONTEXTS], is_changed: [None; CONTEXTS], left: [0; CONTEXTS] };
-    let mut cells = base;
-    let mut above = vec![0; columns];
-    for at in 0..cells.len() {
-        let before = if at % columns == 0 { 0 } else { above[at % columns - 1] };
-        let context = borders[at] + above[at % columns] * CHANGED_ABOVE + before * CHANGED_BEFORE;
-        let is_changed = turns.next(context.into(), &mut bits)?;
-        above[at % columns] = u8::from(is_changed);
-        if is_changed {
+    let (mut cells, mut at) = (base, 0);
+    while at < cells.len() {
+        if contexts[at..].starts_with(&CALM) && turns.pass(CALM.len() as u64) {
+            at += CALM.len();
+            continue;
+        }
+        if turns.next(contexts[at].into(), &mut bits)? {
+            mark(&mut contexts, columns, at);
             let likely = neighbour(&cells, columns, at);
             cells[at] = match likely {
                 Some(likely) if !turns.next(OTHER, &mut bits)? => likely,
@@ -169,6 +171,7 @@ pub(crate) fn decode_changes<T: Cell>(payload: &[u8], base: Vec<T>, columns: usi
                 }
             };
         }
+        at += 1;
     }
     // A last run is as long as it was asked for.
     if let Some(&left) = turns.left.iter().find(|left| **left > 0) {
@@ -187,6 +190,15 @@ struct Turns {
 }
 
 impl Turns {
+    /// Whether so many cells in context 0 are unchanged; then they have had their turn.
+    fn pass(&mut self, cells: u64) -> bool {
+        let passes = self.is_changed[0] == Some(false) && self.left[0] >= cells;
+        if passes {
+            self.left[0] -= cells;
+        }
+        passes
+    }
+
     fn next(&mut self, context: usize, bits: &mut BitReader<'_>) -> Result<bool, DecodeError> {
         let is_changed = match self.is_changed[context] {
             Some(is_changed) if self.left[context] > 0 => is_changed,

@@ -9,15 +9,19 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 
 use clearway_lidar::calibration::Calibration;
-use clearway_mapping::config::{BodyConfig, FusionConfig, MapsConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::config::SensorConfig;
 use serde::{Deserialize, Serialize};
 
+mod grpc;
 mod ros;
 mod udp;
+mod vehicle;
 mod zenoh;
 
+pub use grpc::{Access, Certificates, Grpc, Tls};
 pub use ros::Ros;
 pub use udp::{Listener, Ports, Route, Sender, Udp, listeners};
+pub use vehicle::{Ingest, Vehicle};
 pub use zenoh::{Ros2, Zenoh, ZenohMode};
 
 /// The configured tables by vehicle and sensor, in the order of the configuration; `None` where the factory's serves.
@@ -45,67 +49,6 @@ pub struct Config {
     /// One or more vehicles.
     #[serde(default, rename = "vehicle")]
     pub vehicles: Vec<Vehicle>,
-}
-
-/// `[grpc]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Grpc {
-    /// Whether it is served at all.
-    pub enabled: bool,
-    /// Address and port; port 0 takes a free one.
-    pub listen: SocketAddr,
-    /// Peers connected at once; more are told so.
-    pub connections_max: usize,
-    /// Certificates; plain text without.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub tls: Option<Tls>,
-    /// Who may do what, once client certificates are asked for.
-    pub access: Access,
-}
-
-impl Default for Grpc {
-    fn default() -> Self {
-        let listen = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 50051);
-        Self { enabled: true, listen, connections_max: 256, tls: None, access: Access::default() }
-    }
-}
-
-/// `[grpc.tls]`: PEM files; relative paths start at the configuration's folder.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Tls {
-    /// The server's certificate, and those between it and the CA.
-    pub certificate: PathBuf,
-    /// Its private key. Only the path is ever recorded.
-    pub key: PathBuf,
-    /// Whose certificates clients must have; without, no client is asked who it is.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub client_ca: Option<PathBuf>,
-}
-
-/// `[grpc.access]`: names in client certificates (common name or DNS name), by what their bearers may do. Whoever is in
-/// no list may do nothing.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Access {
-    /// May read maps and status.
-    pub readers: Vec<String>,
-    /// May send scans, poses, roads and packets.
-    pub ingesters: Vec<String>,
-    /// May do both.
-    pub operators: Vec<String>,
-}
-
-/// The files of `[grpc.tls]`, read. The key never leaves this value.
-#[derive(Clone)]
-pub struct Certificates {
-    /// PEM.
-    pub certificate: String,
-    /// PEM.
-    pub key: String,
-    /// PEM.
-    pub client_ca: Option<String>,
 }
 
 /// `[page]`.
@@ -144,7 +87,7 @@ impl Default for Foxglove {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Recorder {
-    /// MCAP file to write; empty: nothing is recorded.
+    /// MCAP file to write, relative paths from the configuration's folder; empty: nothing is recorded.
     pub file: PathBuf,
     /// How much a crash may cost.
     pub flush_ms: u64,
@@ -158,70 +101,29 @@ impl Default for Recorder {
     }
 }
 
-/// One `[[vehicle]]`: its sensors and maps, and the doors its events come through.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Vehicle {
-    /// Names the vehicle in keys and topics: `[a-z0-9_-]+`.
-    pub name: String,
-    /// Events that may wait for the engine; more are counted as lost.
-    #[serde(default = "queue")]
-    pub queue: usize,
-    /// The UDP door; a vehicle without one is fed by other doors.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub udp: Option<Udp>,
-    /// The ROS 2 door, through rmw_zenoh's key space.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub ros: Option<Ros>,
-    /// Observations over gRPC and zenoh.
-    #[serde(default)]
-    pub ingest: Ingest,
-    /// How one map is made of several sensors.
-    #[serde(default)]
-    pub fusion: FusionConfig,
-    /// Where the vehicle itself is; nothing is taken for it where absent.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub body: Option<BodyConfig>,
-    /// Which maps are made, and how.
-    #[serde(default)]
-    pub maps: MapsConfig,
-    /// The sensors.
-    #[serde(rename = "sensor")]
-    pub sensors: Vec<SensorConfig>,
-}
-
-fn queue() -> usize {
-    8192
-}
-
-impl Vehicle {
-    /// What the core needs of it.
-    pub fn core(&self) -> VehicleConfig {
-        VehicleConfig {
-            name: self.name.clone(),
-            sensors: self.sensors.clone(),
-            fusion: self.fusion.clone(),
-            body: self.body,
-            maps: self.maps.clone(),
+impl Recorder {
+    fn check(&self) -> Result<(), Wrong> {
+        if !(10..=60_000).contains(&self.flush_ms) {
+            return Err(Wrong::new("recorder.flush_ms", self.flush_ms, "10 to 60000 ms"));
         }
+        if !(16..=1 << 20).contains(&self.queue) {
+            return Err(Wrong::new("recorder.queue", self.queue, "16 to 1048576 events"));
+        }
+        Ok(())
     }
 }
 
-/// `[vehicle.ingest]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Ingest {
-    /// Whether anybody may send scans, poses, roads and packets.
-    pub enabled: bool,
-    /// Points of one scan; the longest message follows from it.
-    pub points_max: usize,
-    /// Streams at once; each may have its share of half the queue on the way.
-    pub streams_max: usize,
+/// A value that makes no sense.
+struct Wrong {
+    /// Path of the key.
+    key: String,
+    value: String,
+    allowed: String,
 }
 
-impl Default for Ingest {
-    fn default() -> Self {
-        Self { enabled: true, points_max: 2_000_000, streams_max: 8 }
+impl Wrong {
+    fn new(key: impl Into<String>, value: impl ToString, allowed: impl Into<String>) -> Self {
+        Self { key: key.into(), value: value.to_string(), allowed: allowed.into() }
     }
 }
 
@@ -325,100 +227,38 @@ impl Config {
     /// # Errors
     /// [`ConfigError::Value`] for the first value that makes no sense.
     pub fn check(&self, file: &Path) -> Result<(), ConfigError> {
-        let wrong = |key: String, value: &dyn ToString, allowed: &str| {
-            Err(ConfigError::Value {
-                file: file.to_owned(),
-                key,
-                value: value.to_string(),
-                allowed: allowed.to_owned(),
-            })
-        };
-        if self.vehicles.is_empty() {
-            return wrong("vehicle".into(), &"[]", "at least one [[vehicle]]");
-        }
-        let Access { readers, ingesters, operators } = &self.grpc.access;
-        let asked = self.grpc.tls.as_ref().is_some_and(|tls| tls.client_ca.is_some());
-        if let Some(name) = readers.iter().chain(ingesters).chain(operators).next().filter(|_| !asked) {
-            return wrong(
-                "grpc.access".into(),
-                name,
-                "nobody, unless grpc.tls.client_ca says whose certificates to ask for",
-            );
-        }
-        if !(1..=65_536).contains(&self.grpc.connections_max) {
-            return wrong("grpc.connections_max".into(), &self.grpc.connections_max, "1 to 65536 connections");
-        }
-        if !(10..=60_000).contains(&self.recorder.flush_ms) {
-            return wrong("recorder.flush_ms".into(), &self.recorder.flush_ms, "10 to 60000 ms");
-        }
-        if !(16..=1 << 20).contains(&self.recorder.queue) {
-            return wrong("recorder.queue".into(), &self.recorder.queue, "16 to 1048576 events");
-        }
-        for (key, endpoints) in [("zenoh.listen", &self.zenoh.listen), ("zenoh.connect", &self.zenoh.connect)] {
-            if let Some(endpoint) = endpoints.iter().find(|e| !e.starts_with("tcp/") && !e.starts_with("tls/")) {
-                return wrong(
-                    key.into(),
-                    endpoint,
-                    "endpoints such as \"tcp/127.0.0.1:7447\" or \"tls/localhost:7447\"",
-                );
-            }
-        }
-        if let Err((key, value, allowed)) = self.zenoh.ros2.check(self.zenoh.enabled, &self.vehicles) {
-            return wrong(key.into(), &value, &allowed);
-        }
-        let mut names = BTreeSet::new();
-        for vehicle in &self.vehicles {
-            if let Err(error) = vehicle.core().validate() {
-                return wrong(format!("{} (of {})", error.key, vehicle.name), &error.value, error.allowed);
-            }
-            if !names.insert(&vehicle.name) {
-                return wrong("vehicle.name".into(), &vehicle.name, "each vehicle its own");
-            }
-            let at = |key: &str| format!("vehicle.{key} (of {})", vehicle.name);
-            if !(16..=1 << 20).contains(&vehicle.queue) {
-                return wrong(at("queue"), &vehicle.queue, "16 to 1048576 events");
-            }
-            if let Some(ros) = &vehicle.ros
-                && let Err((key, value, allowed)) = ros.check(self.zenoh.enabled, &vehicle.sensors)
-            {
-                return wrong(at(key), &value, &allowed);
-            }
-            if !(1000..=20_000_000).contains(&vehicle.ingest.points_max) {
-                return wrong(at("ingest.points_max"), &vehicle.ingest.points_max, "1000 to 20000000 points");
-            }
-            if !(1..=64).contains(&vehicle.ingest.streams_max) {
-                return wrong(at("ingest.streams_max"), &vehicle.ingest.streams_max, "1 to 64 streams");
-            }
-        }
-        if let Err((key, value, allowed)) = udp::check(&self.vehicles) {
-            return wrong(key, &value, &allowed);
-        }
-        Ok(())
+        self.check_values().map_err(|Wrong { key, value, allowed }| {
+            let file = file.to_owned();
+            ConfigError::Value { file, key, value, allowed }
+        })
     }
 
-    /// Reads the files of `[grpc.tls]`; `None` where there is no such table. Relative paths start at the
-    /// configuration's folder, `file`'s parent.
-    ///
-    /// # Errors
-    /// [`ConfigError::File`] with what is wrong.
-    pub fn certificates(&self, file: &Path) -> Result<Option<Certificates>, ConfigError> {
-        let Some(tls) = &self.grpc.tls else { return Ok(None) };
-        let read = |key: &str, path: &PathBuf| {
-            let named = file.parent().unwrap_or(Path::new("")).join(path);
-            let wrong = |reason: String| ConfigError::File {
-                file: file.to_owned(),
-                key: format!("grpc.tls.{key}"),
-                named: named.clone(),
-                reason,
-            };
-            let text = std::fs::read_to_string(&named).map_err(|error| wrong(error.to_string()))?;
-            let what = if key == "key" { "PRIVATE KEY-----" } else { "BEGIN CERTIFICATE-----" };
-            let found = text.contains(what);
-            if found { Ok(text) } else { Err(wrong(format!("no PEM block \"{what}\" in it"))) }
-        };
-        let client_ca = tls.client_ca.as_ref().map(|path| read("client_ca", path)).transpose()?;
-        let (certificate, key) = (read("certificate", &tls.certificate)?, read("key", &tls.key)?);
-        Ok(Some(Certificates { certificate, key, client_ca }))
+    fn check_values(&self) -> Result<(), Wrong> {
+        if self.vehicles.is_empty() {
+            return Err(Wrong::new("vehicle", "[]", "at least one [[vehicle]]"));
+        }
+        self.grpc.check()?;
+        self.recorder.check()?;
+        self.zenoh.check(&self.vehicles)?;
+        let mut names = BTreeSet::new();
+        for vehicle in &self.vehicles {
+            vehicle.check(self.zenoh.enabled)?;
+            if !names.insert(&vehicle.name) {
+                return Err(Wrong::new("vehicle.name", &vehicle.name, "each vehicle its own"));
+            }
+        }
+        udp::check(&self.vehicles)
+    }
+
+    /// The configuration as it is served: relative paths of `recorder.file` and `zenoh.file` start at the
+    /// configuration's folder, `file`'s parent, as do those of the files that are read beforehand.
+    pub fn located(mut self, file: &Path) -> Self {
+        for path in [&mut self.recorder.file, &mut self.zenoh.file] {
+            if !path.as_os_str().is_empty() {
+                *path = beside(file, path);
+            }
+        }
+        self
     }
 
     /// Reads the calibration files of all sensors: by vehicle and sensor, in the order of the configuration; `None`
@@ -429,7 +269,7 @@ impl Config {
     pub fn calibrations(&self, file: &Path) -> Result<Calibrations, ConfigError> {
         let of = |vehicle: &Vehicle, sensor: &SensorConfig| {
             let Some(path) = &sensor.calibration else { return Ok(None) };
-            let path = file.parent().unwrap_or(Path::new("")).join(path);
+            let path = beside(file, Path::new(path));
             let wrong = |reason: String| ConfigError::File {
                 file: file.to_owned(),
                 key: format!("vehicle.sensor.calibration (of {}/{})", vehicle.name, sensor.name),
@@ -445,6 +285,11 @@ impl Config {
         };
         self.vehicles.iter().map(|v| v.sensors.iter().map(|s| of(v, s)).collect()).collect()
     }
+}
+
+/// A path that stands in the configuration `file`, seen from the working directory.
+fn beside(file: &Path, path: &Path) -> PathBuf {
+    file.parent().unwrap_or(Path::new("")).join(path)
 }
 
 /// `a.b=value`: the value is TOML, or a bare string.

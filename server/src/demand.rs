@@ -2,7 +2,8 @@
 //!
 //! In: readers that come and go. Out: a set the engine looks at before each event. A map that nobody takes and nobody
 //! records is not made ([`clearway_mapping::pipeline::Pipeline::want`]); one that is taken from now on comes with the
-//! next map, and at once where the newest was made for nobody.
+//! next map, and at once where the newest was made for nobody. Where others read other layers it is not made at once:
+//! they would be given the same turn a second time, under another number, for each who comes.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};

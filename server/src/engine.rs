@@ -70,7 +70,7 @@ impl Engine {
     }
 
     /// Takes one event, without a thread: what [`Engine::start`] does with each.
-    pub fn take(&mut self, Queued { event, ticket }: Queued) {
+    pub fn take(&mut self, Queued { event, ticket, .. }: Queued) {
         let outcome = self.step(&event);
         // Behind everything else: whoever hears that an event was taken finds its map, and finds it counted.
         if let Some(ticket) = ticket {

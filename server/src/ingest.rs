@@ -5,15 +5,16 @@
 //! an event (the queue or the kernel's buffer was full, the sender is nobody's, the datagram too long) is counted, and
 //! the counts become [`Body::Lost`] events: the journal, and every replay of it, knows all that stayed outside.
 
-use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
-use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use clearway_mapping::event::{Body, Cause, Event};
-use clearway_mapping::pipeline::Ledger;
+use futures::executor::block_on;
+use tokio::sync::{OwnedSemaphorePermit as Place, Semaphore};
 
+use outside::{Untold, next_told};
 use ticket::{Ticket, Verdict};
 
 pub mod capture;
@@ -23,11 +24,14 @@ pub mod grpc;
 pub mod kitti;
 pub mod mcap;
 pub mod observation;
+mod outside;
 pub mod ros;
 pub mod ticket;
 pub mod udp;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
+
+pub use outside::{Outside, Stranger};
 
 /// What a file source yields: an event without its number.
 #[derive(Clone, Debug, PartialEq)]
@@ -52,6 +56,8 @@ pub struct Queued {
     pub event: Event,
     /// Who wants to hear what became of it; the recording does not see this.
     pub ticket: Option<Ticket>,
+    /// Free again when this is dropped.
+    _place: Place,
 }
 
 /// Gives the time, ns since the Unix epoch: the system's by default, a simulation's own.
@@ -85,6 +91,7 @@ impl std::fmt::Debug for Clock {
 #[derive(Clone, Debug)]
 pub struct Door {
     shared: Arc<Mutex<Inside>>,
+    places: Arc<Semaphore>,
     outside: Arc<Outside>,
     clock: Clock,
 }
@@ -93,6 +100,7 @@ pub struct Door {
 #[derive(Clone, Debug)]
 pub struct WeakDoor {
     shared: Weak<Mutex<Inside>>,
+    places: Arc<Semaphore>,
     outside: Arc<Outside>,
     clock: Clock,
 }
@@ -100,8 +108,8 @@ pub struct WeakDoor {
 impl WeakDoor {
     /// The door, while somebody else keeps it open.
     pub fn door(&self) -> Option<Door> {
-        let (outside, clock) = (self.outside.clone(), self.clock.clone());
-        Some(Door { shared: self.shared.upgrade()?, outside, clock })
+        let (places, outside, clock) = (self.places.clone(), self.outside.clone(), self.clock.clone());
+        Some(Door { shared: self.shared.upgrade()?, places, outside, clock })
     }
 
     /// What stayed outside, also when the door is gone.
@@ -113,69 +121,8 @@ impl WeakDoor {
 /// A full queue is told of as soon as there is space, other causes this often: a flood from strangers must not fill the
 /// journal.
 const TELL_NS: u64 = 100_000_000;
-/// Strangers remembered, newest last.
-const STRANGERS: usize = 8;
 
-/// What stayed outside a door; outlives its queue.
-#[derive(Debug, Default)]
-pub struct Outside {
-    untold: Mutex<Untold>,
-    strangers: Mutex<VecDeque<Stranger>>,
-    /// What the ledger calls `observation`, by its own name.
-    observations: Mutex<BTreeMap<&'static str, u64>>,
-}
-
-/// Readings that stayed outside and that the engine has not been told of yet; a full queue comes first.
-type Untold = BTreeMap<(Cause, u16), u64>;
-
-/// A sender that is none of the vehicle's sensors.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Stranger {
-    /// Whence its datagrams came.
-    pub address: SocketAddr,
-    /// How many, since it is remembered.
-    pub datagrams: u64,
-    /// When the newest came, ns since the Unix epoch.
-    pub newest_ns: i64,
-}
-
-impl Outside {
-    /// Adds what the engine has not been told of yet to its ledger, and to those of its sensors.
-    pub fn add_to<'a>(&self, ledger: &mut Ledger, sensors: impl IntoIterator<Item = &'a mut Ledger>) {
-        let mut sensors: Vec<_> = sensors.into_iter().collect();
-        for (&(cause, source), &count) in &*locked(&self.untold) {
-            ledger.stayed_outside(cause, count);
-            if let Some(sensor) = sensors.get_mut(usize::from(source)).filter(|_| cause.has_source()) {
-                sensor.stayed_outside(cause, count);
-            }
-        }
-    }
-
-    /// Counts readings that stay outside.
-    pub(crate) fn leave(&self, source: u16, cause: Cause, count: u64) {
-        if count > 0 {
-            *locked(&self.untold).entry((cause, source)).or_default() += count;
-        }
-    }
-
-    /// Counts messages that are no observations of a sensor, or of [`clearway_mapping::event::NOBODY`]: the ledger has
-    /// one word for them, here each keeps its `reason`.
-    pub(crate) fn leave_observations(&self, source: u16, reason: &'static str, count: u64) {
-        self.leave(source, Cause::Observation, count);
-        *locked(&self.observations).entry(reason).or_default() += count;
-    }
-
-    /// The observations refused since the server's start, by reason.
-    pub fn observations_refused(&self) -> BTreeMap<&'static str, u64> {
-        locked(&self.observations).clone()
-    }
-
-    /// The last few strangers, newest last.
-    pub fn strangers(&self) -> Vec<Stranger> {
-        locked(&self.strangers).iter().copied().collect()
-    }
-}
-
+/// What numbers the events. Whoever holds its lock does not wait: a place on the queue is there before.
 #[derive(Debug)]
 struct Inside {
     queue: SyncSender<Queued>,
@@ -192,7 +139,8 @@ pub fn door(capacity: usize) -> (Door, Receiver<Queued>) {
 pub fn door_by(clock: Clock, capacity: usize) -> (Door, Receiver<Queued>) {
     let (queue, events) = sync_channel(capacity);
     let inside = Inside { queue, next_sequence: 0, told_ns: 0 };
-    (Door { shared: Arc::new(Mutex::new(inside)), outside: Arc::default(), clock }, events)
+    let (shared, places) = (Arc::new(Mutex::new(inside)), Arc::new(Semaphore::new(capacity)));
+    (Door { shared, places, outside: Arc::default(), clock }, events)
 }
 
 impl Door {
@@ -238,18 +186,23 @@ impl Door {
         // Losses are told at the same stamp: a captured drive's time does not jump to the clock's and back.
         let arrival_ns = captured_ns.unwrap_or_else(|| self.clock.now_ns());
         // Behind a loss that is not told yet nothing enters, so that the journal has it where it happened.
-        let mut has_space = inside.tell(&mut untold, arrival_ns)?;
+        let (is_due, mut has_space) = (inside.is_due(arrival_ns), true);
+        while let Some(whose) = next_told(&untold, is_due).filter(|_| has_space) {
+            match self.place() {
+                Some(place) => inside.tell(place, &mut untold, whose, arrival_ns)?,
+                None => has_space = false,
+            }
+        }
         for (source, body, ticket) in readings {
-            let turned_away = match has_space {
-                true => inside.offer(arrival_ns, source, body, ticket)?,
-                false => Some(ticket),
-            };
-            if let Some(ticket) = turned_away {
-                has_space = false;
-                *untold.entry((Cause::Queue, source)).or_default() += 1;
-                if let Some(ticket) = ticket {
-                    let message = "the vehicle's queue is full: the engine does not keep up".to_owned();
-                    ticket.tell(Verdict::Refused { reason: "queue", message });
+            match has_space.then(|| self.place()).flatten() {
+                Some(place) => inside.put(place, Reading { arrival_ns, source, body }, ticket)?,
+                None => {
+                    has_space = false;
+                    *untold.entry((Cause::Queue, source)).or_default() += 1;
+                    if let Some(ticket) = ticket {
+                        let message = "the vehicle's queue is full: the engine does not keep up".to_owned();
+                        ticket.tell(Verdict::Refused { reason: "queue", message });
+                    }
                 }
             }
         }
@@ -258,15 +211,36 @@ impl Door {
 
     /// A way to this door that does not keep it open.
     pub fn weak(&self) -> WeakDoor {
-        WeakDoor { shared: Arc::downgrade(&self.shared), outside: self.outside.clone(), clock: self.clock.clone() }
+        let (places, outside, clock) = (self.places.clone(), self.outside.clone(), self.clock.clone());
+        WeakDoor { shared: Arc::downgrade(&self.shared), places, outside, clock }
     }
 
-    /// Takes a captured reading with its own stamp; waits while the queue is full, so that a file loses nothing.
+    /// Takes a captured reading with its own stamp, behind what stayed outside and is due; waits while the queue is
+    /// full, so that a file loses nothing.
     ///
     /// # Errors
     /// [`Closed`] when the engine has stopped.
     pub fn enter_captured(&self, reading: Reading) -> Result<(), Closed> {
-        locked(&self.shared).wait(reading)
+        let arrival_ns = reading.arrival_ns;
+        let is_due = locked(&self.shared).is_due(arrival_ns);
+        loop {
+            let place = self.wait_for_place()?;
+            let (mut inside, mut untold) = (locked(&self.shared), locked(&self.outside.untold));
+            match next_told(&untold, is_due) {
+                Some(whose) => inside.tell(place, &mut untold, whose, arrival_ns)?,
+                None => return inside.put(place, reading, None),
+            }
+        }
+    }
+
+    /// A place on the queue, where there is one.
+    fn place(&self) -> Option<Place> {
+        self.places.clone().try_acquire_owned().ok()
+    }
+
+    /// A place on the queue, once there is one. Holds no lock meanwhile: the live doors go on.
+    fn wait_for_place(&self) -> Result<Place, Closed> {
+        block_on(self.places.clone().acquire_owned()).map_err(|_| Closed)
     }
 
     /// Counts readings that stay outside.
@@ -277,28 +251,22 @@ impl Door {
     /// Refuses a datagram whose sender is none of the vehicle's sensors, and remembers the sender.
     pub fn refuse_stranger(&self, address: SocketAddr) {
         self.leave_outside(0, Cause::Sender, 1);
-        let mut strangers = locked(&self.outside.strangers);
-        let known = strangers.iter().position(|stranger| stranger.address == address);
-        let known = known.and_then(|index| strangers.remove(index));
-        if known.is_none() && strangers.len() == STRANGERS {
-            strangers.pop_front();
-        }
-        let datagrams = known.map_or(0, |stranger| stranger.datagrams) + 1;
-        strangers.push_back(Stranger { address, datagrams, newest_ns: self.clock.now_ns() });
+        self.outside.meet(address, self.clock.now_ns());
     }
 
-    /// Tells the engine of all that stayed outside, waiting for space. For the end, when nothing will follow that would
-    /// bring it along.
+    /// Tells the engine of all that stayed outside, waiting for space; at the stamp of a capture where there is one,
+    /// else now. For the end, when nothing will follow that would bring it along.
     ///
     /// # Errors
     /// [`Closed`] when the engine has stopped.
-    pub fn close(&self) -> Result<(), Closed> {
-        let mut inside = locked(&self.shared);
-        let next = || locked(&self.outside.untold).pop_first();
-        while let Some(((cause, source), count)) = next() {
-            let arrival_ns = self.clock.now_ns();
-            let told = inside.wait(Reading { arrival_ns, source, body: Body::Lost { cause, count } });
-            told.inspect_err(|_| self.leave_outside(source, cause, count))?;
+    pub fn close(&self, captured_ns: Option<i64>) -> Result<(), Closed> {
+        let arrival_ns = captured_ns.unwrap_or_else(|| self.clock.now_ns());
+        while !locked(&self.outside.untold).is_empty() {
+            let place = self.wait_for_place()?;
+            let (mut inside, mut untold) = (locked(&self.shared), locked(&self.outside.untold));
+            if let Some(whose) = next_told(&untold, true) {
+                inside.tell(place, &mut untold, whose, arrival_ns)?;
+            }
         }
         Ok(())
     }
@@ -315,50 +283,29 @@ pub(crate) fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Inside {
-    /// Puts one event on the queue; gives its ticket back where the queue is full.
-    fn offer(
-        &mut self,
-        arrival_ns: i64,
-        source: u16,
-        body: Body,
-        ticket: Option<Ticket>,
-    ) -> Result<Option<Option<Ticket>>, Closed> {
-        let event = Event { sequence: self.next_sequence, arrival_ns, source, body };
-        match self.queue.try_send(Queued { event, ticket }) {
-            Ok(()) => {
-                self.next_sequence += 1;
-                Ok(None)
-            }
-            Err(TrySendError::Full(queued)) => Ok(Some(queued.ticket)),
-            Err(TrySendError::Disconnected(_)) => Err(Closed),
-        }
+    /// Whether what stayed outside for other causes than a full queue may be told again.
+    fn is_due(&self, arrival_ns: i64) -> bool {
+        self.told_ns.abs_diff(arrival_ns) >= TELL_NS
     }
 
-    /// Puts one event on the queue once there is space.
-    fn wait(&mut self, reading: Reading) -> Result<(), Closed> {
-        let Reading { arrival_ns, source, body } = reading;
-        let sequence = self.next_sequence;
-        let event = Event { sequence, arrival_ns, source, body };
-        self.queue.send(Queued { event, ticket: None }).map_err(|_| Closed)?;
-        self.next_sequence += 1;
+    /// Turns what stayed outside for one cause into an event.
+    fn tell(&mut self, place: Place, untold: &mut Untold, whose: (Cause, u16), arrival_ns: i64) -> Result<(), Closed> {
+        let (cause, source) = whose;
+        let body = Body::Lost { cause, count: untold.get(&whose).copied().unwrap_or_default() };
+        self.put(place, Reading { arrival_ns, source, body }, None)?;
+        untold.remove(&whose);
+        self.told_ns = arrival_ns;
         Ok(())
     }
 
-    /// Turns what stayed outside so far, and is due, into events; `false` when there is no space for all of it.
-    fn tell(&mut self, untold: &mut Untold, arrival_ns: i64) -> Result<bool, Closed> {
-        let is_due = self.told_ns.abs_diff(arrival_ns) >= TELL_NS;
-        while let Some(entry) = untold.first_entry() {
-            let ((cause, source), count) = (*entry.key(), *entry.get());
-            if cause != Cause::Queue && !is_due {
-                break;
-            }
-            if self.offer(arrival_ns, source, Body::Lost { cause, count }, None)?.is_some() {
-                return Ok(false);
-            }
-            entry.remove();
-            self.told_ns = arrival_ns;
-        }
-        Ok(true)
+    /// Puts one event in its place on the queue.
+    fn put(&mut self, place: Place, reading: Reading, ticket: Option<Ticket>) -> Result<(), Closed> {
+        let Reading { arrival_ns, source, body } = reading;
+        let event = Event { sequence: self.next_sequence, arrival_ns, source, body };
+        // As many places as the queue is long, so that this does not wait.
+        self.queue.send(Queued { event, ticket, _place: place }).map_err(|_| Closed)?;
+        self.next_sequence += 1;
+        Ok(())
     }
 }
 
@@ -372,6 +319,8 @@ pub(crate) fn now_ns() -> i64 {
 
 #[cfg(test)]
 mod tests {
+    use clearway_mapping::pipeline::Ledger;
+
     use super::*;
 
     fn untold(door: &Door) -> Ledger {
@@ -411,7 +360,7 @@ mod tests {
         assert_eq!(bodies(&events), [lost(Cause::Sender, 9), lost(Cause::Length, 2), Body::End]);
         flood(&door);
         door.leave_outside(0, Cause::Kernel, 5);
-        door.close().unwrap();
+        door.close(None).unwrap();
         assert_eq!(bodies(&events), [lost(Cause::Kernel, 5), lost(Cause::Sender, 9)]);
         assert_eq!(untold(&door), Ledger::default());
         let strangers = door.outside().strangers();
@@ -433,7 +382,7 @@ mod tests {
         assert_eq!(untold(&door).lost, 1, "the engine is told too");
 
         let weak = door.weak();
-        let Queued { event, ticket: waiting } = events.recv().unwrap();
+        let Queued { event, ticket: waiting, .. } = events.recv().unwrap();
         assert_eq!(event.arrival_ns, 42, "captured then");
         waiting.unwrap().tell(Verdict::Taken);
         assert_eq!(told.try_recv().unwrap().1, Verdict::Taken);
@@ -445,10 +394,50 @@ mod tests {
     }
 
     #[test]
-    fn a_captured_reading_keeps_its_stamp() {
-        let (door, events) = door(2);
-        door.enter_captured(Reading { arrival_ns: 42, source: 0, body: Body::End }).unwrap();
-        assert_eq!(events.recv().unwrap().event.arrival_ns, 42);
+    fn a_captured_reading_comes_behind_what_was_refused_before_it_all_at_its_own_stamp() {
+        let (door, events) = door(4);
+        let reading = |arrival_ns| Reading { arrival_ns, source: 0, body: Body::End };
+        let captured = |arrival_ns| door.enter_captured(reading(arrival_ns)).unwrap();
+        let mut told = events.iter().map(|queued| (queued.event.arrival_ns, queued.event.body));
+        let refused = |count| Body::Lost { cause: Cause::Observation, count };
+        door.outside().leave_observations(1, "ros_message", 2);
+        captured(TELL_NS as i64);
+        assert_eq!(told.next(), Some((TELL_NS as i64, refused(2))));
+        assert_eq!(told.next(), Some((TELL_NS as i64, Body::End)));
+        door.outside().leave_observations(1, "ros_message", 3);
+        captured(TELL_NS as i64 + 42);
+        assert_eq!(told.next(), Some((TELL_NS as i64 + 42, Body::End)), "others than a full queue are told seldom");
+        door.close(Some(7)).unwrap();
+        assert_eq!(told.next(), Some((7, refused(3))));
+        assert_eq!(untold(&door), Ledger::default());
+    }
+
+    #[test]
+    fn while_a_captured_reading_waits_for_a_place_the_live_door_is_open_and_counts() {
+        let (door, events) = door(1);
+        door.enter(0, Body::End).unwrap();
+        let waits = std::thread::spawn({
+            let door = door.clone();
+            move || door.enter_captured(Reading { arrival_ns: 42, source: 0, body: Body::End })
+        });
+        // Whether the other has begun to wait or not.
+        for _ in 0..3 {
+            door.enter(1, Body::End).unwrap();
+        }
+        assert_eq!(untold(&door).lost, 3);
+        let taken: Vec<_> = events.iter().take(3).map(|queued| queued.event).collect();
+        assert_eq!(waits.join().unwrap(), Ok(()));
+        assert_eq!(taken[1].body, Body::Lost { cause: Cause::Queue, count: 3 });
+        assert_eq!(taken.iter().map(|event| event.sequence).collect::<Vec<_>>(), [0, 1, 2]);
+        assert_eq!(taken[2].arrival_ns, 42);
+
+        door.enter(0, Body::End).unwrap();
+        let waits = std::thread::spawn({
+            let door = door.clone();
+            move || door.enter_captured(Reading { arrival_ns: 43, source: 0, body: Body::End })
+        });
+        drop(events);
+        assert_eq!(waits.join().unwrap(), Err(Closed), "nobody waits for an engine that is gone");
     }
 
     #[test]

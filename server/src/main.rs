@@ -8,187 +8,19 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use anyhow::{Context, Result};
-use clap::{Parser, Subcommand, ValueEnum};
-use clearway_lidar::model::Model;
-use clearway_mapping::config::Extrinsics;
+use clap::Parser;
 use clearway_server::config::Config;
 use clearway_server::demo::{self, Places, Second};
 use clearway_server::evaluate;
-use clearway_server::replay::{self, Progress, Speed, Summary};
+use clearway_server::replay::{self, Progress, Summary};
 use clearway_server::server::{Running, Server, Setup};
 use clearway_server::verify::verify;
 use indicatif::{ProgressBar, ProgressStyle};
 use tracing_subscriber::EnvFilter;
 
-/// Turns LIDAR packets into maps of where a vehicle may drive.
-#[derive(Parser)]
-#[command(name = "clearway-server", version)]
-struct Arguments {
-    /// How logs look on stderr; RUST_LOG selects them.
-    #[arg(long, value_enum, default_value = "text", global = true)]
-    log_format: LogFormat,
-    #[command(subcommand)]
-    command: Command,
-}
+mod arguments;
 
-#[derive(Clone, Copy, ValueEnum)]
-enum LogFormat {
-    Text,
-    Json,
-}
-
-#[derive(Subcommand)]
-enum Command {
-    /// Listen for datagrams, make maps and publish them, until SIGINT or SIGTERM.
-    Serve {
-        #[command(flatten)]
-        config: ConfigArguments,
-    },
-    /// Make maps of pcap, pcapng, MCAP and KITTI files or folders, in the order given.
-    Replay(Box<ReplayArguments>),
-    /// Recompute every map of a recording from its events; exit 1 and name the first difference if there is one.
-    Verify {
-        /// The recording.
-        file: PathBuf,
-        /// One object on stdout.
-        #[arg(long)]
-        json: bool,
-    },
-    /// Judge every map against labelled scans (SemanticKITTI's .bin and .label) or simulated scenes.
-    Evaluate(EvaluateArguments),
-    /// Check a configuration and print it with every default.
-    Check {
-        #[command(flatten)]
-        config: ConfigArguments,
-    },
-    /// Drive a simulated vehicle at a server of its own, over real UDP.
-    Demo {
-        /// End after so many seconds; without, at Ctrl-C.
-        #[arg(long, value_parser = seconds)]
-        seconds: Option<Duration>,
-        /// Where to record; a temporary file where absent.
-        #[arg(long)]
-        record: Option<PathBuf>,
-        /// One turning LIDAR in a town; or two of them and six that scan, poses and roads over gRPC, in traffic.
-        #[arg(long, value_enum, default_value = "one")]
-        sensors: Sensors,
-        /// One object a second on stdout, and a summary.
-        #[arg(long)]
-        json: bool,
-    },
-}
-
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Sensors {
-    One,
-    Many,
-}
-
-#[derive(clap::Args)]
-struct ConfigArguments {
-    /// The configuration file; deploy/clearway.toml shows every key.
-    #[arg(short, long, env = "CLEARWAY_CONFIG", default_value = "clearway.toml")]
-    config: PathBuf,
-    /// Overrides a key: KEY=VALUE, such as grpc.listen=0.0.0.0:50051.
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
-}
-
-#[derive(clap::Args)]
-struct ReplayArguments {
-    /// pcap, pcapng, MCAP, KITTI .bin, .pcd, or folders of them.
-    #[arg(required = true)]
-    files: Vec<PathBuf>,
-    /// Record events and maps to this MCAP file.
-    #[arg(long, value_name = "OUT.mcap")]
-    record: Option<PathBuf>,
-    /// as-recorded, max, or a factor [default: max; as-recorded with --serve].
-    #[arg(long)]
-    speed: Option<Speed>,
-    /// One object on stdout.
-    #[arg(long)]
-    json: bool,
-    /// Write each revolution's points, sensor frame, as binary PCD into this folder.
-    #[arg(long, value_name = "DIR")]
-    clouds: Option<PathBuf>,
-    /// The sensor's own table: ROS YAML or Velodyne XML.
-    #[arg(long, value_name = "FILE")]
-    calibration: Option<PathBuf>,
-    /// How the sensor is mounted: x,y,z in metres, roll,pitch,yaw in degrees; estimated from the ground where absent.
-    #[arg(long, value_name = "x,y,z,roll,pitch,yaw", value_parser = extrinsics, allow_hyphen_values = true)]
-    extrinsics: Option<Extrinsics>,
-    /// The sensor's model, where the data lies about it.
-    #[arg(long, value_parser = model)]
-    model: Option<Model>,
-    /// The sensor's turning rate, where the data lies about it.
-    #[arg(long)]
-    rpm: Option<f32>,
-    /// A ROS topic of an MCAP file, several times for several; sensors and poses are chosen where absent.
-    #[arg(long = "topic", value_name = "TOPIC")]
-    topics: Vec<String>,
-    /// Take vehicle, maps and publishers from this configuration.
-    #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
-    /// Overrides a key of the configuration.
-    #[arg(long, value_name = "KEY=VALUE", requires = "config")]
-    set: Vec<String>,
-    /// Publish the maps, until SIGINT or SIGTERM. They keep the stamps of their capture, so readers call old ones
-    /// stale.
-    #[arg(long)]
-    serve: bool,
-    /// Whose journal (of a recording) or configuration is used, where there are several.
-    #[arg(long)]
-    vehicle: Option<String>,
-}
-
-#[derive(clap::Args)]
-struct EvaluateArguments {
-    /// Folders with .bin and .label files of the same names, or sim:flat, sim:slopes, sim:canopy, sim:overhang,
-    /// sim:town.
-    #[arg(required = true, value_name = "PATH")]
-    paths: Vec<String>,
-    /// One object on stdout.
-    #[arg(long)]
-    json: bool,
-    /// Degrees a column of the radial maps spans.
-    #[arg(long, value_name = "1|2|4", value_parser = columns)]
-    columns: Option<u16>,
-    /// How the scans' sensor is mounted, as for replay; as on KITTI's car where absent.
-    #[arg(long, value_name = "x,y,z,roll,pitch,yaw", value_parser = extrinsics, allow_hyphen_values = true)]
-    extrinsics: Option<Extrinsics>,
-    /// Judge the maps of this configuration's first vehicle.
-    #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
-    /// Overrides a key of the configuration.
-    #[arg(long, value_name = "KEY=VALUE", requires = "config")]
-    set: Vec<String>,
-}
-
-fn columns(text: &str) -> Result<u16, String> {
-    let degrees = text.parse().ok().filter(|degrees| evaluate::columns(*degrees).is_some());
-    degrees.ok_or_else(|| "1, 2 or 4 degrees are allowed".into())
-}
-
-fn seconds(text: &str) -> Result<Duration, String> {
-    let duration = text.parse().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
-    duration.ok_or_else(|| "0 or more seconds are allowed".into())
-}
-
-fn extrinsics(text: &str) -> Result<Extrinsics, String> {
-    let numbers: Vec<f64> = text.split(',').filter_map(|number| number.trim().parse().ok()).collect();
-    match numbers[..] {
-        [x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg] if text.split(',').count() == 6 => {
-            Ok(Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg })
-        }
-        _ => Err("six numbers are needed: x,y,z in metres, roll,pitch,yaw in degrees".into()),
-    }
-}
-
-fn model(text: &str) -> Result<Model, String> {
-    let all: Vec<&str> = Model::ALL.into_iter().map(clearway_mapping::pipeline::model_name).collect();
-    let found = all.iter().position(|name| *name == text);
-    found.map(|index| Model::ALL[index]).ok_or_else(|| format!("known: {}", all.join(", ")))
-}
+use arguments::{Arguments, Command, ConfigArguments, EvaluateArguments, LogFormat, ReplayArguments, Sensors};
 
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
@@ -239,9 +71,10 @@ fn load(arguments: &ConfigArguments) -> Result<Config> {
 }
 
 async fn serve(arguments: &ConfigArguments) -> Result<ExitCode> {
-    let mut config = load(arguments)?;
+    let config = load(arguments)?;
     let calibrations = config.calibrations(&arguments.config)?;
     let certificates = config.certificates(&arguments.config)?;
+    let mut config = config.located(&arguments.config);
     if let Some(file) = clearway_server::record::wanted(&config.recorder) {
         config.recorder.file = clearway_server::record::unused(file);
     }
@@ -436,31 +269,4 @@ fn evaluate_maps(arguments: EvaluateArguments) -> Result<ExitCode> {
 /// Prints; a reader that has gone (`| head`) is no error.
 fn say(text: &str) {
     let _ = std::io::stdout().write_all(text.as_bytes());
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn extrinsics_are_six_numbers_in_metres_and_degrees() {
-        let given = extrinsics("1,-0.5,1.9,0,-2.5,90").unwrap();
-        assert_eq!((given.x_m, given.y_m, given.z_m), (1.0, -0.5, 1.9));
-        assert_eq!((given.roll_deg, given.pitch_deg, given.yaw_deg), (0.0, -2.5, 90.0));
-        for wrong in ["", "1,2,3", "1,2,3,4,5,6,7", "1,2,3,4,5,x,6"] {
-            assert!(extrinsics(wrong).is_err(), "{wrong}");
-        }
-    }
-
-    #[test]
-    fn a_model_nobody_knows_is_answered_with_those_that_are() {
-        assert_eq!(model("vls128"), Ok(Model::Vls128));
-        assert!(model("ouster").unwrap_err().contains("hdl64e_s2"));
-    }
-
-    #[test]
-    fn the_command_line_is_sound() {
-        use clap::CommandFactory;
-        Arguments::command().debug_assert();
-    }
 }

@@ -30,7 +30,7 @@ pub struct Served {
 }
 
 /// All vehicles, in the order of the configuration.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Vehicles(pub Arc<[Served]>);
 
 /// A reader asked for something that is not there.

@@ -179,7 +179,7 @@ pub async fn replay(
 /// Puts every reading through the door at its time.
 fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) -> Result<Readings, ReplayError> {
     let began = Instant::now();
-    let mut first_ns = None;
+    let (mut first_ns, mut newest_ns) = (None, None);
     while let Some(reading) = readings.next() {
         let reading = reading?;
         if let Speed::Times(times) = speed {
@@ -188,15 +188,17 @@ fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) 
             std::thread::sleep(due.saturating_sub(began.elapsed()));
         }
         progress.bytes_read.store(readings.bytes_read(), Ordering::Relaxed);
-        tell(&mut readings, door);
+        leave_refused(&mut readings, door);
+        newest_ns = Some(reading.arrival_ns);
         door.enter_captured(reading).map_err(|_| ReplayError::Engine)?;
     }
-    tell(&mut readings, door);
+    leave_refused(&mut readings, door);
+    door.close(newest_ns).map_err(|_| ReplayError::Engine)?;
     Ok(readings)
 }
 
-/// Has the door count the messages that were refused.
-fn tell(readings: &mut Readings, door: &Door) {
+/// Leaves the messages that were refused outside the door, which counts and tells them.
+fn leave_refused(readings: &mut Readings, door: &Door) {
     for ((source, reason), count) in readings.untold() {
         door.outside().leave_observations(source, reason, count);
     }

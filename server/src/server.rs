@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use std::hash::{BuildHasher, Hasher};
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::sync::mpsc::Receiver;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -18,9 +19,9 @@ use crate::config::{Calibrations, Certificates, Config, Foxglove, Grpc, Vehicle}
 use crate::demand::Taken;
 use crate::engine::{Engine, Observer};
 use crate::ingest::entrance::{Entrance, Entrances};
-use crate::ingest::{Door, door, udp};
+use crate::ingest::{Door, Queued, door, udp};
 use crate::publish::{Served, Vehicles, grpc, page};
-use crate::record::{Journal, Preface, RecordError, Recorder, RecorderCounts};
+use crate::record::{Preface, RecordError, Recorder};
 use crate::status::VehicleStatus;
 
 /// A stalled peer may not keep the server from ending.
@@ -116,6 +117,7 @@ pub struct RunningVehicle {
 }
 
 /// A running server. Dropping it without [`Running::shutdown`] leaves an unfinished recording.
+#[derive(Default)]
 pub struct Running {
     /// The newest maps and the status of all vehicles.
     pub vehicles: Vehicles,
@@ -134,8 +136,8 @@ pub struct Running {
     udp: Option<udp::Readers>,
     publishers: JoinSet<()>,
     stop: watch::Sender<bool>,
-    /// What is made whether or not somebody else takes it.
-    _taken: Vec<Taken>,
+    /// What is made whether or not somebody else takes it; only held.
+    taken: Vec<Taken>,
     viewers: Option<crate::publish::foxglove::Publisher>,
     #[cfg(feature = "zenoh")]
     publisher: Option<crate::publish::zenoh::Publisher>,
@@ -158,8 +160,8 @@ pub enum EndError {
 pub struct Server;
 
 impl Server {
-    /// Starts everything the configuration asks for: recorder, engines, publishers, and the sockets last. Needs a
-    /// multi-thread tokio runtime.
+    /// Starts everything the configuration asks for: first all that another may hold already (addresses and ports), then
+    /// recorder and engines, and what fills their queues last. Needs a multi-thread tokio runtime.
     ///
     /// # Errors
     /// [`StartError`], after which nothing is left running.
@@ -170,11 +172,56 @@ impl Server {
         }
         let boot_id = boot_id.unwrap_or_else(random);
         calibrations.resize_with(config.vehicles.len(), Vec::new);
-        let mut pipelines = Vec::new();
+        let mut running = Running::default();
+        let mut ready = Vec::new();
         for (vehicle, tables) in config.vehicles.iter().zip(&mut calibrations) {
             tables.resize(vehicle.sensors.len(), None);
-            pipelines.push(Pipeline::new(&vehicle.core(), tables.clone())?);
+            let pipeline = Pipeline::new(&vehicle.core(), tables.clone())?;
+            ready.push(running.prepare(vehicle, boot_id, pipeline, observer.take()));
         }
+        running.vehicles = Vehicles(ready.iter().map(|ready| ready.served.clone()).collect());
+        let preface = || preface(&config, &calibrations, boot_id, &remarks, notes);
+        match running.begin(&config, certificates, ready, from_files, preface).await {
+            Ok(()) => Ok(running),
+            Err(error) => {
+                // What did not end well is nothing beside what did not begin.
+                let _ = running.shutdown().await;
+                Err(error)
+            }
+        }
+    }
+}
+
+/// One vehicle, before its engine runs.
+struct Ready {
+    served: Served,
+    engine: Engine,
+    events: Receiver<Queued>,
+}
+
+/// What [`Server::start`] does, in order.
+impl Running {
+    /// Makes what publishers see of a vehicle, its door, and the engine behind it.
+    fn prepare(&mut self, vehicle: &Vehicle, boot_id: u64, pipeline: Pipeline, observer: Option<Observer>) -> Ready {
+        let name: Arc<str> = vehicle.name.as_str().into();
+        let (door, events) = door(vehicle.queue);
+        let layers = layer_names(&vehicle.maps);
+        let status = Arc::new(VehicleStatus::new(name.clone(), boot_id, layers, door.outside()));
+        let (newest, receiver) = watch::channel(None);
+        let valid_ms = vehicle.maps.valid_ms;
+        let engine = Engine { pipeline, valid_ms, newest, journal: None, status: status.clone(), observer };
+        self.doors.push(RunningVehicle { name, door, udp: None });
+        Ready { served: Served { status, newest: receiver }, engine, events }
+    }
+
+    async fn begin(
+        &mut self,
+        config: &Config,
+        certificates: Option<Certificates>,
+        ready: Vec<Ready>,
+        from_files: bool,
+        preface: impl FnOnce() -> Preface,
+    ) -> Result<(), StartError> {
         // Before the recorder: a port in use must not cost an earlier recording its file.
         let grpc = listen("grpc.listen", config.grpc.enabled.then_some(config.grpc.listen)).await?;
         let page = listen("page.listen", config.page.enabled.then_some(config.page.listen)).await?;
@@ -183,93 +230,49 @@ impl Server {
             vehicle: config.vehicles[source.vehicle].name.as_str().into(),
             source,
         })?;
-
-        let names: Vec<Arc<str>> = config.vehicles.iter().map(|v| v.name.as_str().into()).collect();
-        let (recorder, journals) = match crate::record::wanted(&config.recorder) {
-            None => (None, Vec::new()),
-            Some(_) => {
-                let preface = preface(&config, &calibrations, boot_id, &names, &remarks, notes);
-                let (recorder, journals) = Recorder::start(&config.recorder, &preface, from_files)?;
-                (Some(recorder), journals)
-            }
-        };
-        let (mut served, mut doors, mut engines) = (Vec::new(), Vec::new(), Vec::new());
-        let mut journals = journals.into_iter();
-        for ((vehicle, name), pipeline) in config.vehicles.iter().zip(names).zip(pipelines) {
-            let (journal, counts) = (journals.next(), recorder.as_ref().map(Recorder::counts));
-            let ready = Ready { vehicle, boot_id, pipeline, journal, counts, observer: observer.take() };
-            let (of_vehicle, door, thread) = ready.start(name.clone())?;
-            engines.push((name.clone(), thread));
-            served.push(of_vehicle);
-            doors.push(RunningVehicle { name, door, udp: None });
-        }
-        // Files are read for their maps: who comes late finds the last one, and the summary knows its figures.
-        let taken = served.iter().filter(|_| from_files).map(|served| served.status.demand.take(&[])).collect();
-        let mut running = Running {
-            vehicles: Vehicles(served.into()),
-            doors,
-            grpc: None,
-            page: None,
-            zenoh: Vec::new(),
-            foxglove: None,
-            engines,
-            recorder,
-            udp: None,
-            publishers: JoinSet::new(),
-            stop: watch::Sender::new(false),
-            _taken: taken,
-            viewers: None,
-            #[cfg(feature = "zenoh")]
-            publisher: None,
-            #[cfg(feature = "zenoh")]
-            ros: Vec::new(),
-        };
-        let entrances = running.entrances(&config);
-        if let Some(listener) = grpc {
-            running.serve_grpc(listener, security, config.grpc.connections_max, entrances.clone());
-        }
-        if let Some(listener) = page {
-            running.serve_page(listener);
-        }
+        let entrances = self.entrances(config);
         if config.foxglove.enabled {
-            running.serve_foxglove(&config.foxglove).await?;
+            self.serve_foxglove(&config.foxglove).await?;
         }
         #[cfg(feature = "zenoh")]
         if config.zenoh.enabled {
-            running.open_zenoh(&config, &entrances).await?;
+            self.open_zenoh(config, &entrances).await?;
         }
-        running.hear(sockets)?;
-        Ok(running)
+        self.run_engines(config, ready, from_files, preface)?;
+        if let Some(listener) = grpc {
+            self.serve_grpc(listener, security, config.grpc.connections_max, entrances);
+        }
+        if let Some(listener) = page {
+            self.serve_page(listener);
+        }
+        self.hear(sockets)
     }
-}
 
-/// One vehicle, before its engine runs.
-struct Ready<'a> {
-    vehicle: &'a Vehicle,
-    boot_id: u64,
-    pipeline: Pipeline,
-    journal: Option<Journal>,
-    counts: Option<Arc<RecorderCounts>>,
-    observer: Option<Observer>,
-}
-
-impl Ready<'_> {
-    /// Starts the engine; gives what publishers see of it, and its door.
-    fn start(self, name: Arc<str>) -> Result<(Served, Door, JoinHandle<()>), StartError> {
-        let Self { vehicle, boot_id, pipeline, journal, counts, observer } = self;
-        let (door, events) = door(vehicle.queue);
-        let layers = layer_names(&vehicle.maps);
-        let status = Arc::new(VehicleStatus::new(name.clone(), boot_id, layers, door.outside(), counts));
-        let (newest, receiver) = watch::channel(None);
-        let valid_ms = vehicle.maps.valid_ms;
-        let engine = Engine { pipeline, valid_ms, newest, journal, status: status.clone(), observer };
-        let thread = engine.start(events).map_err(|source| StartError::Thread { vehicle: name, source })?;
-        Ok((Served { status, newest: receiver }, door, thread))
+    /// Begins the recording, if one is wanted, and starts the engines.
+    fn run_engines(
+        &mut self,
+        config: &Config,
+        ready: Vec<Ready>,
+        from_files: bool,
+        preface: impl FnOnce() -> Preface,
+    ) -> Result<(), StartError> {
+        let mut journals = Vec::new().into_iter();
+        if crate::record::wanted(&config.recorder).is_some() {
+            let (recorder, ways) = Recorder::start(&config.recorder, &preface(), from_files)?;
+            (self.recorder, journals) = (Some(recorder), ways.into_iter());
+        }
+        for Ready { served: Served { status, .. }, mut engine, events } in ready {
+            self.recorder.iter().for_each(|recorder| status.show_recorder(recorder.counts()));
+            // Files are read for their maps: who comes late finds the last one, and the summary knows its figures.
+            self.taken.extend(from_files.then(|| status.demand.take(&[])));
+            engine.journal = journals.next();
+            let name = status.name.clone();
+            let thread = engine.start(events).map_err(|source| StartError::Thread { vehicle: name.clone(), source })?;
+            self.engines.push((name, thread));
+        }
+        Ok(())
     }
-}
 
-/// What [`Server::start`] adds to a server whose engines run.
-impl Running {
     /// The ways in for observations, of the vehicles that take them.
     fn entrances(&self, config: &Config) -> Entrances {
         let open = config.vehicles.iter().zip(&self.doors).filter(|(vehicle, _)| vehicle.ingest.enabled);
@@ -365,7 +368,10 @@ impl Running {
         for listener in self.ros {
             listener.stop().await;
         }
-        self.doors.clear();
+        let doors = std::mem::take(&mut self.doors);
+        // With the last door the engines end, once their queues are empty. Fails only where an engine is gone already.
+        let closed = move || doors.into_iter().for_each(|vehicle| _ = vehicle.door.close(None));
+        let _ = tokio::task::spawn_blocking(closed).await;
         let (engines, recorder) = (self.engines, self.recorder);
         let ended = tokio::task::spawn_blocking(move || {
             let mut outcome = Ok(());
@@ -426,7 +432,6 @@ fn preface(
     config: &Config,
     calibrations: &[Vec<Option<Calibration>>],
     boot_id: u64,
-    names: &[Arc<str>],
     remarks: &[String],
     mut notes: BTreeMap<String, String>,
 ) -> Preface {
@@ -445,7 +450,7 @@ fn preface(
         }
     }
     let remarks: String = remarks.iter().map(|remark| format!("# {remark}\n")).collect();
-    let vehicles = names.iter().zip(&config.vehicles).map(|(name, v)| (name.clone(), layer_names(&v.maps))).collect();
+    let vehicles = config.vehicles.iter().map(|v| (v.name.as_str().into(), layer_names(&v.maps))).collect();
     Preface { boot_id, config: remarks + &config.to_toml(), vehicles, calibrations: tables, notes }
 }
 

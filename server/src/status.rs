@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 use clearway_mapping::pipeline::{Ledger, NamedStatus};
@@ -46,7 +46,7 @@ pub struct VehicleStatus {
     /// Open pages.
     pub page_readers: Arc<AtomicU32>,
     outside: Arc<Outside>,
-    recorder: Option<Arc<RecorderCounts>>,
+    recorder: OnceLock<Arc<RecorderCounts>>,
     engine_stopped: AtomicBool,
     inside: Mutex<Inside>,
 }
@@ -128,13 +128,7 @@ impl Snapshot {
 
 impl VehicleStatus {
     /// The status of a vehicle that has seen nothing.
-    pub fn new(
-        name: Arc<str>,
-        boot_id: u64,
-        layers: Vec<&'static str>,
-        outside: Arc<Outside>,
-        recorder: Option<Arc<RecorderCounts>>,
-    ) -> Self {
+    pub fn new(name: Arc<str>, boot_id: u64, layers: Vec<&'static str>, outside: Arc<Outside>) -> Self {
         Self {
             name,
             boot_id,
@@ -144,10 +138,15 @@ impl VehicleStatus {
             grpc_readers: Arc::default(),
             page_readers: Arc::default(),
             outside,
-            recorder,
+            recorder: OnceLock::new(),
             engine_stopped: AtomicBool::new(false),
             inside: Mutex::default(),
         }
+    }
+
+    /// From now on shows what the recording holds; the first one's, where there are two.
+    pub fn show_recorder(&self, counts: Arc<RecorderCounts>) {
+        self.recorder.get_or_init(|| counts);
     }
 
     /// Whether the vehicle's engine still takes events.
@@ -229,7 +228,7 @@ impl VehicleStatus {
             sensors: locked(&self.inside).states.clone(),
             ledger: Some(ledger(&snapshot.ledger)),
             sensor_ledgers: snapshot.sensors.iter().map(|s| (s.name.clone(), ledger(&s.ledger))).collect(),
-            recorder: Some(self.recorder.as_ref().map(|counts| counts.to_proto()).unwrap_or_default()),
+            recorder: Some(self.recorder.get().map(|counts| counts.to_proto()).unwrap_or_default()),
             readers: self.readers().map(|(transport, readers)| (transport.to_owned(), readers)).into(),
             strangers: self.outside.strangers().iter().map(stranger).collect(),
             observations_refused: by_name(&snapshot.observations_refused),
@@ -267,7 +266,7 @@ impl VehicleStatus {
             "observations_refused": proto.observations_refused,
             "recorder": {
                 "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
-                "stopped": self.recorder.as_ref().and_then(|counts| counts.stopped()),
+                "stopped": self.recorder.get().and_then(|counts| counts.stopped()),
             },
             "readers": proto.readers,
             "strangers": proto.strangers.iter().map(|s| {
@@ -352,7 +351,7 @@ mod tests {
         let (door, _events) = crate::ingest::door(4);
         door.refuse_stranger(([10, 0, 0, 9], 2368).into());
         door.refuse_stranger(([10, 0, 0, 9], 2368).into());
-        let status = VehicleStatus::new("car".into(), 1, vec!["drivability"], door.outside(), None);
+        let status = VehicleStatus::new("car".into(), 1, vec!["drivability"], door.outside());
         let ledger = Ledger { received: 3, decoded: 2, telemetry: 1, ..Ledger::default() };
         status.stepped(&ledger, Vec::new());
         let shown = status.snapshot().ledger;

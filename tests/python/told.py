@@ -8,5 +8,10 @@ from google.protobuf import json_format
 def protobuf(message):
     told = json_format.MessageToDict(message, preserving_proto_field_name=True)
     if "data" in told:
-        told["data"] = {"length": len(message.data), "crc32": zlib.crc32(message.data)}
+        told["data"] = of_bytes(message.data)
     return told
+
+
+def of_bytes(data):
+    """Their length and CRC-32."""
+    return {"length": len(data), "crc32": zlib.crc32(data)}

@@ -17,6 +17,8 @@ def plain(value):
     """A decoded ROS 2 message as JSON has it."""
     if hasattr(value, "__slots__"):
         return {name: plain(getattr(value, name)) for name in value.__slots__}
+    if isinstance(value, bytes):
+        return told.of_bytes(value)
     return [plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 

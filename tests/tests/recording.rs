@@ -5,15 +5,18 @@ mod house;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::BufWriter;
+use std::net::SocketAddr;
 use std::path::Path;
 
 use clearway_mapping::event::Body;
 use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
 use clearway_proto::v1;
+use clearway_server::config::Config;
 use clearway_server::ingest::Reading;
 use clearway_server::recording::{Recording, RecordingError};
+use clearway_server::server::{Server, Setup};
 use clearway_server::verify::{What, verify};
-use house::{config, readings, start};
+use house::{config, readings, start, within};
 use mcap::records::Record;
 use prost::Message;
 
@@ -212,12 +215,13 @@ async fn whatever_bytes_are_changed_the_reader_answers_and_invents_no_event() {
 }
 
 /// A server of its own process, recording to `file`; and where it listens for data.
-fn serving(folder: &Path, file: &Path) -> (std::process::Child, std::net::SocketAddr) {
+fn serving(folder: &Path, file: &Path) -> (std::process::Child, SocketAddr) {
     let free = || std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let data = free();
     let mut config = config();
     (config.grpc.enabled, config.page.enabled, config.zenoh.enabled) = (false, false, false);
-    config.recorder.file = file.to_owned();
+    // Found beside the configuration, wherever the server was started.
+    config.recorder.file = file.file_name().unwrap().into();
     config.recorder.flush_ms = 50;
     let udp = config.vehicles[0].udp.as_mut().unwrap();
     (udp.data, udp.telemetry) = (data, free());
@@ -233,7 +237,7 @@ fn serving(folder: &Path, file: &Path) -> (std::process::Child, std::net::Socket
 }
 
 /// Sends the vehicle's data until the recording has grown to `bytes`.
-fn drive_until(file: &Path, bytes: u64, data: std::net::SocketAddr) {
+fn drive_until(file: &Path, bytes: u64, data: SocketAddr) {
     let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
     let payloads = readings(10).into_iter().filter_map(|reading| match reading.body {
         Body::Datagram(payload) if payload.len() == 1206 => Some(payload),
@@ -263,6 +267,39 @@ fn sigterm_leaves_a_whole_recording_and_sigkill_one_that_can_be_read_to_its_cut(
         assert_eq!(ended.success(), !cut, "{signal}: {ended}");
         let report = verify(&file).unwrap();
         assert!(report.is_good() && report.events > 0 && report.cut == cut, "{signal}: {report:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_address_in_use_is_named_by_its_key_and_costs_no_earlier_recording_its_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("earlier.mcap");
+    std::fs::write(&file, b"what was recorded before").unwrap();
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let heard = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    let (tcp, udp) = (taken.local_addr().unwrap(), heard.local_addr().unwrap());
+    // Held only until the others come to their turn.
+    let free = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    type Take = fn(&mut Config, SocketAddr);
+    let wrong: [(&str, SocketAddr, Take); 5] = [
+        ("grpc.listen", tcp, |config, at| config.grpc.listen = at),
+        ("page.listen", tcp, |config, at| (config.page.enabled, config.page.listen) = (true, at)),
+        ("vehicle car", udp, |config, at| config.vehicles[0].udp.as_mut().unwrap().data = at),
+        ("foxglove.listen", tcp, |config, at| config.foxglove.listen = at),
+        ("zenoh", tcp, |config, at| {
+            (config.zenoh.enabled, config.zenoh.listen) = (true, vec![format!("tcp/{at}")]);
+        }),
+    ];
+    for (key, at, take) in wrong {
+        let mut config = config();
+        (config.foxglove.enabled, config.foxglove.listen) = (true, free);
+        config.recorder.file.clone_from(&file);
+        take(&mut config, at);
+        let setup = Setup { config, from_files: true, ..Setup::default() };
+        let error = within("a refusal", Server::start(setup)).await.err().expect(key).to_string();
+        assert!(error.contains(key) && error.contains(&at.port().to_string()), "{key}: {error}");
+        assert_eq!(std::fs::read(&file).unwrap(), b"what was recorded before", "{key}");
+        std::net::TcpListener::bind(free).expect("nothing is left running");
     }
 }
 

@@ -149,6 +149,9 @@ async fn a_bag_of_clouds_odometry_and_tf_is_mapped_where_tf_puts_the_sensor_reco
     }
     let report = verify(&record).unwrap();
     assert!(report.is_good() && report.maps == turns, "{:?}", report.differences);
+    let again = replayed(options(&record)).await.unwrap();
+    assert_eq!(again.snapshot.ledger, *ledger, "what was refused is in the recording too");
+    assert_eq!(again.snapshot.sensors[0].ledger, summary.snapshot.sensors[0].ledger);
 }
 
 #[tokio::test(flavor = "multi_thread")]

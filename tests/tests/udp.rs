@@ -209,7 +209,7 @@ fn a_million_datagrams_add_up_exactly() {
         }
     }
     events.try_iter().for_each(|queued| drop(pipeline.step(&queued.event)));
-    door.close().unwrap();
+    door.close(None).unwrap();
     events.try_iter().for_each(|queued| drop(pipeline.step(&queued.event)));
 
     let ledger = pipeline.ledger();

@@ -20,10 +20,12 @@ from google.protobuf.message import DecodeError as ProtobufError
 from . import codec
 from .errors import ClearwayError, DecodeError
 from .freshness import Arrival, Clock, now_ns
+from .grid import CartesianGrid, Grid, RadialGrid
 from .v1 import map_pb2
 
-#: Classes a vehicle may drive on, over all layers.
-FREE = frozenset({"drivable", "flat", "flat_inferred", "clear", "passable", "road", "free", "path"})
+#: Classes a vehicle may drive on, over all layers: what was seen to be free. `flat_inferred` is not among them, for nobody
+#: saw it, and neither is it free in the ROS grids.
+FREE = frozenset({"drivable", "flat", "clear", "passable", "road", "free", "path"})
 #: Classes that hold something to keep away from, over all layers.
 OBSTACLES = frozenset({"obstacle", "occupied"})
 
@@ -35,75 +37,6 @@ BYTES_MAX = 4 << 20
 POINTS_MAX = 1 << 16
 #: Steps a safe point may lie away: beyond, single precision is not exact.
 STEPS_MAX = 1 << 24
-
-
-@dataclass(frozen=True)
-class RadialGrid:
-    """Array shape (rows, columns): row j spans (r_bench_m[j-1], r_bench_m[j]], column c the azimuths
-    [c, c+1) * 2 pi / columns, counter-clockwise from the ego x axis."""
-
-    r_bench_m: np.ndarray
-    columns: int
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return len(self.r_bench_m), self.columns
-
-    def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-        """Cell index of each point, -1 outside the grid."""
-        row = np.searchsorted(self.r_bench_m, np.hypot(x_m, y_m), side="left")
-        turn = np.mod(np.arctan2(y_m, x_m) / math.tau, 1.0)
-        column = np.minimum((turn * self.columns).astype(np.int64), self.columns - 1)
-        return np.where(row < len(self.r_bench_m), row * self.columns + column, -1)
-
-    def centres(self) -> np.ndarray:
-        """Middle of every cell, shape (rows, columns, 2)."""
-        outer = self.r_bench_m
-        range_m = 0.5 * (np.concatenate(([0.0], outer[:-1])) + outer)
-        azimuth = (np.arange(self.columns) + 0.5) / self.columns * math.tau
-        return range_m[:, None, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
-
-
-@dataclass(frozen=True)
-class CartesianGrid:
-    """Array shape (height, width), indexed [iy, ix]: cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m).
-
-    Along the grid's axes, which begin at the ego frame's origin and in which that frame has the heading `yaw_rad`.
-    """
-
-    origin_x_m: float
-    origin_y_m: float
-    width: int
-    height: int
-    cell_m: float
-    yaw_rad: float = 0.0
-    #: Number of cell (0, 0) among all there could be: the world's where the axes are the world's.
-    first_ix: int = 0
-    first_iy: int = 0
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.height, self.width
-
-    def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-        """Cell index of each point, -1 outside the grid."""
-        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        ix = np.floor((x_m * cos - y_m * sin - self.origin_x_m) / self.cell_m).astype(np.int64)
-        iy = np.floor((x_m * sin + y_m * cos - self.origin_y_m) / self.cell_m).astype(np.int64)
-        inside = (ix >= 0) & (ix < self.width) & (iy >= 0) & (iy < self.height)
-        return np.where(inside, iy * self.width + ix, -1)
-
-    def centres(self) -> np.ndarray:
-        """Middle of every cell in the ego frame, shape (height, width, 2)."""
-        x, y = np.meshgrid(
-            self.origin_x_m + (np.arange(self.width) + 0.5) * self.cell_m,
-            self.origin_y_m + (np.arange(self.height) + 0.5) * self.cell_m,
-        )
-        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        return np.stack([x * cos + y * sin, y * cos - x * sin], axis=-1)
-
-
-Grid = RadialGrid | CartesianGrid
 
 
 @dataclass(frozen=True)
@@ -138,10 +71,13 @@ class SafePoint(NamedTuple):
 
 
 class Obstacle(NamedTuple):
-    """A cell with something in it."""
+    """The nearest part of a cell with something in it."""
 
     x_m: float
     y_m: float
+    #: From the point asked about; 0 where that lies in such a cell. No obstacle of the layer is nearer; this one may be
+    #: farther, by as much as its cell is long: a map does not tell where in a cell something stands. The innermost cells of
+    #: a radial grid begin in the middle of the vehicle, so that an obstacle in one is 0 m from there.
     distance_m: float
 
 
@@ -208,13 +144,14 @@ class Layer:
         return bool((cells >= 0).all() and self.free.ravel()[cells].all())
 
     def nearest_obstacle(self, x_m: float = 0.0, y_m: float = 0.0) -> Obstacle | None:
-        """The obstacle cell whose middle is nearest to a point; `None` where the layer knows of none."""
-        centres = self.grid.centres()[self.obstacles]
-        if not len(centres):
+        """The obstacle of the layer nearest to a point; `None` where the layer knows of none: what is unknown may hide one."""
+        cells = np.flatnonzero(self.obstacles)
+        if not len(cells):
             return None
-        distances = np.hypot(centres[:, 0] - x_m, centres[:, 1] - y_m)
+        places = self.grid.nearest(cells, x_m, y_m)
+        distances = np.hypot(places[:, 0] - x_m, places[:, 1] - y_m)
         nearest = int(distances.argmin())
-        return Obstacle(*map(float, centres[nearest]), float(distances[nearest]))
+        return Obstacle(*map(float, places[nearest]), float(distances[nearest]))
 
     def _channel(self, message: map_pb2.Channel, base: Layer | None) -> Channel:
         rows, columns = self.grid.shape

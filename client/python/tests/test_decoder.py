@@ -1,6 +1,7 @@
 """The decoder against the golden vectors in proto/golden, which every client language reads."""
 
 import json
+import math
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,8 @@ import pytest
 
 import clearway
 from clearway import codec
-from clearway.map import Map, RadialGrid
+from clearway.grid import CartesianGrid, RadialGrid
+from clearway.map import Map
 from clearway.v1 import map_pb2
 
 GOLDEN = Path(__file__).resolve().parents[3] / "proto" / "golden"
@@ -119,10 +121,29 @@ def test_a_footprint_is_free_only_where_all_of_it_is_known_and_free():
 
     assert layer.is_free(square(free)) and not layer.is_free(square(other))
     assert not layer.is_free(square(free, half=100.0)), "what lies outside the grid is not known"
-    nearest = layer.nearest_obstacle()
-    assert nearest is not None and layer.class_at(nearest.x_m, nearest.y_m) == "obstacle"
     with pytest.raises(clearway.ClearwayError, match="three or more finite corners"):
         layer.is_free([(0, 0), (1, float("nan")), (2, 2)])
+
+
+@pytest.mark.parametrize("yaw_rad", [None, 0.0, 0.7], ids=["radial", "square", "turned"])
+def test_the_nearest_obstacle_is_no_farther_than_any_place_of_one(yaw_rad):
+    layer = clearway.Map((GOLDEN / "map.bin").read_bytes())["drivability"]
+    layer.grid = RadialGrid(np.array([0.6, 1.3, 2.5]), 8) if yaw_rad is None else CartesianGrid(-1.4, -1.7, 6, 6, 0.5, yaw_rad)
+    looks = np.stack(np.meshgrid(*2 * [np.arange(-3.5, 3.5, 0.02)]), axis=-1).reshape(-1, 2)
+    cells = layer.grid.cells_at(looks[:, 0], looks[:, 1])
+    random = np.random.default_rng(7)
+    for x_m, y_m in [(0.0, 0.0), *random.uniform(-3, 3, (30, 2))]:
+        raw = np.where(random.random(layer.grid.shape) < 0.1, layer.legend.index("obstacle"), 0).astype(np.uint8)
+        raw.flat[-1] = layer.legend.index("obstacle")
+        layer.channels["class"] = replace(layer.channels["class"], raw=raw)
+        nearest = layer.nearest_obstacle(x_m, y_m)
+        assert nearest is not None
+        places = looks[(cells >= 0) & layer.obstacles.ravel()[cells]]
+        seen = np.hypot(places[:, 0] - x_m, places[:, 1] - y_m).min()
+        assert seen - 0.04 < nearest.distance_m <= seen + 1e-9, (x_m, y_m)
+        assert math.isclose(math.hypot(nearest.x_m - x_m, nearest.y_m - y_m), nearest.distance_m, abs_tol=1e-9)
+    layer.channels["class"] = replace(layer.channels["class"], raw=np.zeros(layer.grid.shape, np.uint8))
+    assert layer.nearest_obstacle() is None
 
 
 def test_no_cell_narrower_than_a_step_falls_between_the_points_of_a_footprint():

@@ -21,8 +21,8 @@ mod viewer_file;
 /// `<sequence>_<layer>_<channel>.npy` (NumPy 1.0, shape (rows, columns)) and one `<sequence>_<layer>.json` with
 /// geometry, pose, stamps and class legend. Pictures look from above: vehicle in the middle, forward up, left left.
 ///
-/// foxglove and ros2 write one new MCAP file with every layer, of every vehicle: coloured grids, transforms and the
-/// sensors' points; or occupancy grids (0 free, 100 occupied, -1 unknown), tf and odometry.
+/// foxglove and ros2 write one new MCAP file with every layer, of every vehicle, and the sensors' points: coloured grids
+/// and transforms; or occupancy grids (0 free, 100 occupied, -1 unknown), tf and odometry.
 #[derive(Args)]
 pub struct Options {
     /// The MCAP file; one cut by a crash gives what it holds.
@@ -38,7 +38,7 @@ pub struct Options {
     /// The vehicle, where the recording has several.
     #[arg(long)]
     vehicle: Option<String>,
-    /// foxglove: leave out the sensors' points, which are most of the file.
+    /// foxglove and ros2: leave out the sensors' points, which are most of the file.
     #[arg(long)]
     no_points: bool,
     #[command(flatten)]

@@ -21,6 +21,7 @@ use clearway_proto::grid::Grid;
 use clearway_proto::map::Layer;
 use nalgebra::{Isometry3, Vector3};
 
+use crate::footprint;
 use crate::picture::Colours;
 
 /// Cells that radial layers are resampled to, metres: as those of the other layers.
@@ -170,7 +171,7 @@ fn occupancies(layer: &Layer) -> Vec<i8> {
 /// The occupancy of a class, by its name in the legend.
 pub fn occupancy(class: &str) -> i8 {
     match class {
-        "drivable" | "flat" | "passable" | "road" | "clear" | "free" | "path" => FREE,
+        free if footprint::FREE.contains(&free) => FREE,
         "not_drivable" | "flat_elevated" | "flat_unreachable" | "obstacle" | "occupied" => OCCUPIED,
         _ => UNKNOWN,
     }

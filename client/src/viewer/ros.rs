@@ -1,10 +1,12 @@
 //! A map -> ROS 2 messages, CDR: `nav_msgs/msg/OccupancyGrid` a layer, `tf2_msgs/msg/TFMessage` and
-//! `nav_msgs/msg/Odometry`.
+//! `nav_msgs/msg/Odometry`. A sensor's points -> `sensor_msgs/msg/PointCloud2`.
 
 use clearway_proto::map::Layer;
 use clearway_ros::OccupancyGrid;
 use clearway_ros::cdr::Header;
+use clearway_ros::point_cloud2::{Datatype, Field, PointCloud2};
 use clearway_ros::pose::{Odometry, StampedTransform, tf_message_to_cdr};
+use nalgebra::Isometry3;
 
 use super::{MAP_FRAME, Raster, base_frame, map_from_ego};
 use crate::MapView;
@@ -33,6 +35,30 @@ pub fn odometry(map: &MapView) -> Option<Vec<u8>> {
     with_transform(map, |transform| {
         Odometry { transform, linear_mps: [forward_mps, 0.0, 0.0], angular_rps: [0.0; 3] }.to_cdr()
     })
+}
+
+/// Where a frame lies in its parent, as tf tells it.
+pub fn transform(stamp_ns: i64, parent: &str, child: &str, parent_from_child: &Isometry3<f64>) -> Vec<u8> {
+    let header = Header { stamp_ns, frame_id: parent };
+    tf_message_to_cdr(&[StampedTransform { header, child_frame_id: child, parent_from_child: *parent_from_child }])
+}
+
+/// Points of a frame, metres, in one row.
+pub fn points(stamp_ns: i64, frame_id: &str, points: &[[f32; 3]]) -> Vec<u8> {
+    let data: Vec<u8> = points.iter().flatten().flat_map(|metres| metres.to_le_bytes()).collect();
+    let field = |(name, offset)| Field { name, offset, datatype: Datatype::Float32 as u8, count: 1 };
+    PointCloud2 {
+        header: Header { stamp_ns, frame_id },
+        height: 1,
+        width: points.len() as u32,
+        fields: [("x", 0), ("y", 4), ("z", 8)].map(field).to_vec(),
+        big_endian: false,
+        point_step: 12,
+        row_step: data.len() as u32,
+        data: &data,
+        dense: true,
+    }
+    .to_cdr()
 }
 
 fn with_transform(map: &MapView, write: impl FnOnce(StampedTransform) -> Vec<u8>) -> Option<Vec<u8>> {

@@ -167,7 +167,8 @@ impl DeviceClock {
     /// `span_ns`: from the packet's first firing to its sending.
     pub fn packet(&mut self, device_us: Option<u32>, elapsed_ns: i64, arrival_ns: i64, span_ns: i64) -> i64 {
         let sent_ns = arrival_ns.clamp(0, ARRIVAL_NS_MAX) - span_ns;
-        let (time_ns, went) = self.timeline.follow(device_us, elapsed_ns, sent_ns);
+        let due_ns = self.anchor.map(|(offset_ns, _)| sent_ns.saturating_sub(offset_ns));
+        let (time_ns, went) = self.timeline.follow(device_us, elapsed_ns, sent_ns, due_ns);
         if went == Went::Jumped {
             self.gps.iter_mut().for_each(|gps| gps.locked = false);
             (self.quickest, self.jumped) = (Quickest::default(), true);

@@ -65,8 +65,15 @@ struct Suspect {
 
 impl Timeline {
     /// The time of a packet. `device_us`: past the hour, if the sensor sends one; `elapsed_ns`: since the packet before
-    /// as far as packets tell; `sent_ns`: arrival, less what the packet took to fill.
-    pub fn follow(&mut self, device_us: Option<u32>, elapsed_ns: i64, sent_ns: i64) -> (i64, Went) {
+    /// as far as packets tell; `sent_ns`: arrival, less what the packet took to fill; `due_ns`: what the
+    /// timeline shows at `sent_ns` if host and device have gone on as before.
+    pub fn follow(
+        &mut self,
+        device_us: Option<u32>,
+        elapsed_ns: i64,
+        sent_ns: i64,
+        due_ns: Option<i64>,
+    ) -> (i64, Went) {
         let past_hour_ns = device_us.filter(|us| *us < US_MAX).map(|us| i64::from(us) * NS_PER_US % NS_PER_HOUR);
         let Some(last) = self.last else {
             let time_ns = past_hour_ns.unwrap_or(0);
@@ -76,7 +83,10 @@ impl Timeline {
         let host_ns = sent_ns - last.sent_ns;
         let arrived_ns = host_ns.clamp(0, SILENCE_NS_MAX);
         let (step_ns, went) = match (past_hour_ns, last.past_hour_ns) {
-            (Some(now), Some(before)) => self.step_ns(now, before, elapsed_ns, host_ns),
+            (Some(now), Some(before)) => {
+                let due_in_ns = due_ns.map_or(host_ns, |due_ns| due_ns.saturating_sub(last.time_ns));
+                self.step_ns([now, before], elapsed_ns, host_ns, due_in_ns)
+            }
             (_, None) if arrived_ns > STEP_NS_MAX => (elapsed_ns, Went::Jumped),
             _ => (elapsed_ns, Went::On),
         };
@@ -91,15 +101,15 @@ impl Timeline {
         (time_ns, went)
     }
 
-    fn step_ns(&mut self, now_ns: i64, before_ns: i64, elapsed_ns: i64, host_ns: i64) -> (i64, Went) {
+    fn step_ns(&mut self, [now_ns, before_ns]: [i64; 2], elapsed_ns: i64, host_ns: i64, due_in_ns: i64) -> (i64, Went) {
         let arrived_ns = host_ns.clamp(0, SILENCE_NS_MAX);
         let ahead_ns = nearest_hour(now_ns - before_ns, 0);
         if ahead_ns.abs() <= STEP_NS_MAX {
             self.suspect = None;
             return (ahead_ns, Went::On);
         }
-        let silence_ns = nearest_hour(ahead_ns, arrived_ns);
-        if silence_ns > 0 && (silence_ns - arrived_ns).abs() < SILENCE_ERROR_NS_MAX + arrived_ns / 100 {
+        // A host that was set just before the silence, and back during it, tells of whole hours nobody was silent for.
+        if let Some(silence_ns) = [host_ns, due_in_ns].into_iter().filter_map(|told| silence_ns(ahead_ns, told)).min() {
             self.suspect = None;
             return (silence_ns, Went::On);
         }
@@ -132,6 +142,15 @@ impl Timeline {
         let last = self.last?;
         Some(nearest_hour(last.past_hour_ns? - last.time_ns, zero_ns))
     }
+}
+
+/// How long a device was silent that counts `ahead_ns`, give or take hours; `None` where the host tells of no silence
+/// like that.
+fn silence_ns(ahead_ns: i64, told_ns: i64) -> Option<i64> {
+    let told_ns = told_ns.clamp(0, SILENCE_NS_MAX);
+    let silence_ns = nearest_hour(ahead_ns, told_ns);
+    let differ_ns = (silence_ns - told_ns).abs();
+    (silence_ns > 0 && differ_ns < SILENCE_ERROR_NS_MAX + told_ns / 100).then_some(silence_ns)
 }
 
 /// `ns` and whole hours more or less, as near to `to_ns` as can be.

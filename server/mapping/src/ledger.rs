@@ -13,13 +13,13 @@ use crate::road::RoadError;
 /// refused`, exactly, for each. What no sensor sent (of an unknown source, poses, roads) is the vehicle's alone.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Ledger {
-    /// Datagrams and scans.
+    /// Datagrams and scans, and ends of sensors that are not there.
     pub received: u64,
     /// Data packets and scans taken.
     pub decoded: u64,
     /// Telemetry datagrams read.
     pub telemetry: u64,
-    /// Datagrams and scans not taken, by [`Rejected::reason`].
+    /// Datagrams, scans and ends not taken, by [`Rejected::reason`].
     pub refused: BTreeMap<&'static str, u64>,
     /// Readings that found the door's queue full.
     pub lost: u64,

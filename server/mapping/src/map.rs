@@ -159,6 +159,8 @@ pub struct Context<'a> {
     pub earlier: &'a [Layer],
     /// The map's `capture_end_ns`.
     pub stamp_ns: i64,
+    /// What was seen before this is in no map, ns since the Unix epoch.
+    pub earliest_ns: i64,
     /// Newest ego pose; `None` while no pose is known.
     pub map_from_ego: Option<Isometry3<f64>>,
     /// Newest road to paint.

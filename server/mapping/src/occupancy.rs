@@ -82,6 +82,30 @@ impl Occupancy {
             first_cell: self.window.corner(),
         }
     }
+
+    /// The layer of the rays taken since the last map and since `earliest_ns`, where the window is now.
+    fn write(&mut self, earliest_ns: i64, layer: &mut Layer) {
+        let needed = Self::hits_needed(&self.config, self.speed_mps);
+        layer.clear_lists();
+        let [class, hits] = &mut layer.channels[..] else { unreachable!("layer() gives two channels") };
+        let (Cells::U8(class), Cells::U8(hits)) = (&mut class.cells, &mut hits.cells) else {
+            unreachable!("layer() gives u8 and u8")
+        };
+        let cells = self.window.side() * self.window.side();
+        class.clear();
+        class.resize(cells, 0);
+        hits.resize(cells, 0);
+        let any = self.fan.tell(&self.config, earliest_ns, &self.window, class);
+        self.window.judge([needed, self.config.hold_maps], any, class, hits);
+        let share = |state: u8| class.iter().filter(|class| **class == state).count() as f64 / cells as f64;
+        layer.figures.extend([
+            ("clear_share", share(CLEAR)),
+            ("occupied_share", share(OCCUPIED)),
+            ("hits_needed", f64::from(needed)),
+            ("world_aligned", f64::from(u8::from(self.window.anchored()))),
+        ]);
+        layer.geometry = self.geometry();
+    }
 }
 
 impl LayerMaker for Occupancy {
@@ -108,33 +132,14 @@ impl LayerMaker for Occupancy {
 
     /// From the rays taken since the last map, where the vehicle was then.
     fn make(&mut self, _sweep: &Sweep, layer: &mut Layer) {
-        let needed = Self::hits_needed(&self.config, self.speed_mps);
-        layer.clear_lists();
-        let [class, hits] = &mut layer.channels[..] else { unreachable!("layer() gives two channels") };
-        let (Cells::U8(class), Cells::U8(hits)) = (&mut class.cells, &mut hits.cells) else {
-            unreachable!("layer() gives u8 and u8")
-        };
-        let cells = self.window.side() * self.window.side();
-        class.clear();
-        class.resize(cells, 0);
-        hits.resize(cells, 0);
-        let any = self.fan.tell(&self.config, &self.window, class);
-        self.window.judge([needed, self.config.hold_maps], any, class, hits);
-        let share = |state: u8| class.iter().filter(|class| **class == state).count() as f64 / cells as f64;
-        layer.figures.extend([
-            ("clear_share", share(CLEAR)),
-            ("occupied_share", share(OCCUPIED)),
-            ("hits_needed", f64::from(needed)),
-            ("world_aligned", f64::from(u8::from(self.window.anchored()))),
-        ]);
-        layer.geometry = self.geometry();
+        self.write(i64::MIN, layer);
     }
 
-    fn make_with(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
+    fn make_with(&mut self, _sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         // The map may be some way on from the last rays. Where no pose says so, the grid stays where they were taken.
         if let Some(pose) = context.map_from_ego.as_ref().filter(|_| self.window.anchored()) {
             self.window.follow(Some(pose));
         }
-        self.make(sweep, layer);
+        self.write(context.earliest_ns, layer);
     }
 }

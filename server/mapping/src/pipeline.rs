@@ -11,7 +11,7 @@ use clearway_lidar::sensor::SensorStatus;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
 use crate::config::{ConfigError, MapsConfig, SensorConfig, VehicleConfig};
-use crate::event::{Body, EgoPose, Event, Road, Scan};
+use crate::event::{Body, Cause, EgoPose, Event, Road, Scan};
 use crate::fusion::Fusion;
 use crate::intake::{Intake, Moment, Wanted};
 use crate::layers::Layers;
@@ -128,7 +128,9 @@ impl Pipeline {
                     Body::EgoPose(_) => self.ledger.poses_refused += 1,
                     Body::Road(_) => *self.ledger.roads_refused.entry(reason).or_default() += 1,
                     Body::Sensor(_) => self.ledger.sensors_refused += 1,
-                    Body::Lost { .. } | Body::End => {}
+                    // One that is taken is no reading; one of a sensor that is not there stands for one.
+                    Body::End => self.ledger.stayed_outside(Cause::Sender, 1),
+                    Body::Lost { .. } => {}
                 }
                 Err(rejected)
             }
@@ -333,8 +335,9 @@ impl Pipeline {
     fn make_layers(&mut self) {
         let (map, sweep) = (&mut self.map, self.fusion.sweep(&self.intakes));
         let (road, route) = (self.roads.to_paint(), self.roads.route());
-        let context =
-            Context { earlier: &[], stamp_ns: map.capture_end_ns, map_from_ego: map.map_from_ego, road, route };
+        let stamp_ns = map.capture_end_ns;
+        let earliest_ns = stamp_ns.saturating_sub(self.fusion.deadline_ns);
+        let context = Context { earlier: &[], stamp_ns, earliest_ns, map_from_ego: map.map_from_ego, road, route };
         self.layers.make(sweep, &context, &mut map.layers);
     }
 }

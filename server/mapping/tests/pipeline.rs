@@ -151,9 +151,11 @@ fn the_ledger_is_exact_and_a_refused_datagram_leaves_no_trace_in_the_maps() {
             let short = Event { body: Body::Datagram(Bytes::from(vec![0; index % 1000])), ..event.clone() };
             let rejected = pipeline.step(&short).unwrap_err();
             assert_eq!(rejected.reason(), "length", "{rejected}");
-            let stranger = Event { source: 3, ..event.clone() };
-            let rejected = pipeline.step(&stranger).unwrap_err();
-            assert_eq!(rejected, Rejected::Source { source_index: 3, sensors: 1 });
+            for body in [event.body.clone(), Body::End] {
+                let stranger = Event { source: 3, body, ..event.clone() };
+                let rejected = pipeline.step(&stranger).unwrap_err();
+                assert_eq!(rejected, Rejected::Source { source_index: 3, sensors: 1 });
+            }
             assert_eq!(
                 pipeline.step(&Event { body: Body::Lost { cause: Cause::Queue, count: 2 }, ..event.clone() }),
                 Ok(None)
@@ -169,9 +171,9 @@ fn the_ledger_is_exact_and_a_refused_datagram_leaves_no_trace_in_the_maps() {
     }
     let bad = clean.len().div_ceil(10) as u64;
     let ledger = pipeline.ledger();
-    assert_eq!(ledger.received, clean.len() as u64 + 2 * bad);
+    assert_eq!(ledger.received, clean.len() as u64 + 3 * bad);
     assert_eq!((ledger.decoded, ledger.telemetry), (data, telemetry));
-    assert_eq!(ledger.refused, [("length", bad), ("source", bad)].into());
+    assert_eq!(ledger.refused, [("length", bad), ("source", 2 * bad)].into());
     assert_eq!(ledger.lost, 2 * bad);
     assert_eq!(ledger.received, ledger.decoded + ledger.telemetry + ledger.refused.values().sum::<u64>());
 

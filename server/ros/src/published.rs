@@ -49,3 +49,11 @@ pub const ODOMETRY: Published = Published {
     hash: "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
     definition: include_str!("definitions/Odometry.msg"),
 };
+
+/// `sensor_msgs/msg/PointCloud2`.
+pub const POINT_CLOUD2: Published = Published {
+    package: "sensor_msgs",
+    message: "PointCloud2",
+    hash: "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
+    definition: include_str!("definitions/PointCloud2.msg"),
+};

@@ -5,6 +5,8 @@ use std::collections::BTreeMap;
 use clearway_mapping::config::SensorConfig;
 use serde::{Deserialize, Serialize};
 
+use super::Wrong;
+
 /// What `ROS_DOMAIN_ID` may be.
 pub(super) const DOMAIN_MAX: u32 = 232;
 
@@ -43,32 +45,28 @@ impl Default for Ros {
 }
 
 impl Ros {
-    /// Checks every value; `Err` has the key, the value and what is allowed.
-    pub(super) fn check(
-        &self,
-        zenoh_enabled: bool,
-        sensors: &[SensorConfig],
-    ) -> Result<(), (&'static str, String, String)> {
+    /// Keys as behind `vehicle.`.
+    pub(super) fn check(&self, zenoh_enabled: bool, sensors: &[SensorConfig]) -> Result<(), Wrong> {
         if !zenoh_enabled {
             let allowed = "only with zenoh.enabled = true: it comes through zenoh";
-            return Err(("ros", "(set)".into(), allowed.into()));
+            return Err(Wrong::new("ros", "(set)", allowed));
         }
         if self.domain > DOMAIN_MAX {
-            return Err(("ros.domain", self.domain.to_string(), format!("0 to {DOMAIN_MAX}")));
+            return Err(Wrong::new("ros.domain", self.domain, format!("0 to {DOMAIN_MAX}")));
         }
         if let Some(unknown) = self.sensors.keys().find(|name| !sensors.iter().any(|sensor| sensor.name == **name)) {
             let known: Vec<_> = sensors.iter().map(|sensor| sensor.name.as_str()).collect();
             let allowed = format!("the vehicle's sensors: {}", known.join(", "));
-            return Err(("ros.sensors", unknown.clone(), allowed));
+            return Err(Wrong::new("ros.sensors", unknown, allowed));
         }
         let topics = self.sensors.values().chain([&self.pose, &self.tf, &self.tf_static]);
         let mut named: Vec<_> = topics.filter(|topic| !topic.is_empty()).collect();
         if let Some(topic) = named.iter().find(|topic| !is_topic(topic)) {
-            return Err(("ros", (*topic).clone(), "topics such as \"/sensing/top/points\"".into()));
+            return Err(Wrong::new("ros", topic, "topics such as \"/sensing/top/points\""));
         }
         named.sort_unstable();
         match named.windows(2).find(|pair| pair[0] == pair[1]) {
-            Some(pair) => Err(("ros", pair[0].clone(), "each topic once".into())),
+            Some(pair) => Err(Wrong::new("ros", pair[0], "each topic once")),
             None => Ok(()),
         }
     }

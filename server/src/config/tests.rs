@@ -96,6 +96,18 @@ fn a_calibration_that_is_none_is_named_before_anything_starts() {
 }
 
 #[test]
+fn relative_paths_start_where_the_configuration_lies_and_absolute_ones_where_they_say() {
+    let text = format!("[zenoh]\nfile = \"zenoh/server.json5\"\n[recorder]\nfile = \"/var/drive.mcap\"\n{NEEDED}");
+    let config = parse(&text).unwrap();
+    let located = config.clone().located(Path::new("/etc/clearway/clearway.toml"));
+    assert_eq!(located.zenoh.file, Path::new("/etc/clearway/zenoh/server.json5"));
+    assert_eq!(located.recorder.file, Path::new("/var/drive.mcap"));
+    assert_eq!(config.clone().located(Path::new("clearway.toml")), config, "in the working directory");
+    let none = parse(NEEDED).unwrap().located(Path::new("/etc/clearway/clearway.toml"));
+    assert_eq!((none.zenoh.file, none.recorder.file), (PathBuf::new(), PathBuf::new()), "none is none");
+}
+
+#[test]
 fn an_override_sets_what_the_file_says_otherwise() {
     let set = |text: &str| Config::parse(NEEDED, Path::new("clearway.toml"), &[text.to_owned()]);
     assert_eq!(set("grpc.listen=0.0.0.0:9").unwrap().grpc.listen.port(), 9);

@@ -6,7 +6,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use serde::{Deserialize, Serialize};
 
-use super::Vehicle;
+use super::{Vehicle, Wrong};
 
 /// `[vehicle.udp]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -174,12 +174,12 @@ pub fn listeners(vehicles: &[Vehicle]) -> Vec<Listener> {
     listeners
 }
 
-/// What is wrong with the vehicles' UDP tables: the key, with its vehicle, the value, and what is allowed.
-pub(super) fn check(vehicles: &[Vehicle]) -> Result<(), (String, String, String)> {
+/// What is wrong with the vehicles' UDP tables, and where they share addresses.
+pub(super) fn check(vehicles: &[Vehicle]) -> Result<(), Wrong> {
     for vehicle in vehicles {
         let Some(udp) = &vehicle.udp else { continue };
         let wrong = |key: &str, value: &dyn ToString, allowed: &str| {
-            Err((format!("vehicle.udp.{key} (of {})", vehicle.name), value.to_string(), allowed.to_owned()))
+            Err(Wrong::new(format!("vehicle.udp.{key} (of {})", vehicle.name), value.to_string(), allowed))
         };
         let known: Vec<_> = vehicle.sensors.iter().map(|sensor| sensor.name.as_str()).collect();
         let unknown = |names: Vec<&String>| names.into_iter().find(|n| !known.contains(&n.as_str())).cloned();
@@ -211,7 +211,7 @@ pub(super) fn check(vehicles: &[Vehicle]) -> Result<(), (String, String, String)
                 vehicle(b)
             );
             let value = b.from.or(a.from).map_or("(nothing)".to_owned(), |from| format!("{from:?}"));
-            return Err((format!("vehicle.udp.from (of {})", vehicle(b)), value, allowed));
+            return Err(Wrong::new(format!("vehicle.udp.from (of {})", vehicle(b)), value, allowed));
         }
     }
     Ok(())

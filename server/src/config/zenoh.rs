@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::Vehicle;
 use super::ros::{DOMAIN_MAX, is_topic};
+use super::{Vehicle, Wrong};
 
 /// `[zenoh]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -23,8 +23,8 @@ pub struct Zenoh {
     pub scouting: bool,
     /// Maps as ROS 2 topics.
     pub ros2: Ros2,
-    /// A zenoh configuration (JSON5) to begin with: TLS, access control; the keys above stand over it. Empty: zenoh's
-    /// defaults, with limits for what one peer may cost.
+    /// A zenoh configuration (JSON5) to begin with: TLS, access control; the keys above stand over it. A relative path
+    /// starts at the configuration's folder. Empty: zenoh's defaults, with limits for what one peer may cost.
     pub file: PathBuf,
 }
 
@@ -39,6 +39,18 @@ impl Default for Zenoh {
             ros2: Ros2::default(),
             file: PathBuf::new(),
         }
+    }
+}
+
+impl Zenoh {
+    pub(super) fn check(&self, vehicles: &[Vehicle]) -> Result<(), Wrong> {
+        for (key, endpoints) in [("zenoh.listen", &self.listen), ("zenoh.connect", &self.connect)] {
+            if let Some(endpoint) = endpoints.iter().find(|e| !e.starts_with("tcp/") && !e.starts_with("tls/")) {
+                let allowed = "endpoints such as \"tcp/127.0.0.1:7447\" or \"tls/localhost:7447\"";
+                return Err(Wrong::new(key, endpoint, allowed));
+            }
+        }
+        self.ros2.check(self.enabled, vehicles)
     }
 }
 
@@ -84,34 +96,29 @@ impl Default for Ros2 {
 }
 
 impl Ros2 {
-    /// Checks every value; `Err` has the key, the value and what is allowed.
-    pub(super) fn check(
-        &self,
-        zenoh_enabled: bool,
-        vehicles: &[Vehicle],
-    ) -> Result<(), (&'static str, String, String)> {
+    fn check(&self, zenoh_enabled: bool, vehicles: &[Vehicle]) -> Result<(), Wrong> {
         if self.domain > DOMAIN_MAX {
-            return Err(("zenoh.ros2.domain", self.domain.to_string(), format!("0 to {DOMAIN_MAX}")));
+            return Err(Wrong::new("zenoh.ros2.domain", self.domain, format!("0 to {DOMAIN_MAX}")));
         }
         if !self.enabled {
             return Ok(());
         }
         if !zenoh_enabled {
             let allowed = "only with zenoh.enabled = true: it goes through zenoh";
-            return Err(("zenoh.ros2.enabled", "true".into(), allowed.into()));
+            return Err(Wrong::new("zenoh.ros2.enabled", "true", allowed));
         }
         // ROS 2 takes no name that begins with a digit.
         let is_name = |topic: &str| {
             is_topic(topic) && !topic.split('/').any(|part| part.starts_with(|c: char| c.is_ascii_digit()))
         };
         if !self.namespace.is_empty() && !is_name(&self.namespace) {
-            return Err(("zenoh.ros2.namespace", self.namespace.clone(), "such as \"/clearway\", or empty".into()));
+            return Err(Wrong::new("zenoh.ros2.namespace", &self.namespace, "such as \"/clearway\", or empty"));
         }
         match vehicles.iter().find(|vehicle| !is_name(&format!("/{}", vehicle.name))) {
             None => Ok(()),
             Some(vehicle) => {
                 let allowed = "with zenoh.ros2.enabled: letters, digits and underscores, no digit first";
-                Err(("vehicle.name", vehicle.name.clone(), allowed.into()))
+                Err(Wrong::new("vehicle.name", &vehicle.name, allowed))
             }
         }
     }

@@ -237,9 +237,10 @@ impl Ballot {
     }
 }
 
-/// Whether each cell is called drivable; `None` where the layer has no such class.
+/// Whether each cell is called drivable, be it by inference; `None` where the layer has no such class.
 fn called(layer: &Layer) -> Option<Vec<bool>> {
-    let passes: Vec<bool> = layer.legend.iter().map(|name| FREE.contains(name)).collect();
+    let passes = |name: &&str| FREE.contains(name) || *name == "flat_inferred";
+    let passes: Vec<bool> = layer.legend.iter().map(passes).collect();
     let class = layer.channels.iter().find(|channel| channel.name == "class")?;
     if !passes.contains(&true) {
         return None;

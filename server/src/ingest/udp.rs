@@ -169,7 +169,7 @@ fn read(socket: Socket, listener: &Listener, doors: &[Door], stopped: &PipeReade
     }
     for heard in heard {
         // A closed door has nobody to tell.
-        let _ = heard.door.close();
+        let _ = heard.door.close(None);
     }
     Ok(())
 }

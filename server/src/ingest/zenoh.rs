@@ -26,7 +26,8 @@ use crate::publish::zenoh::{ZenohError, failed};
 
 /// Samples put aside for one vehicle; their bytes are no more than its longest message, twice.
 const WAITING_MAX: usize = 256;
-/// Clients remembered for each vehicle; the one heard of longest ago makes room for another.
+/// Clients remembered for each vehicle; of those with nothing on the way the one heard of longest ago makes room for
+/// another.
 const CLIENTS_MAX: usize = 64;
 /// How often, and how many times, the newest acknowledgement is repeated.
 const REPEAT: (Duration, u32) = (Duration::from_secs(1), 10);
@@ -185,8 +186,9 @@ impl Clients {
         let client = match at {
             Some(at) => self.0.remove(at),
             None => {
-                if self.0.len() == CLIENTS_MAX {
-                    self.0.remove(0);
+                let is_full = self.0.len() >= CLIENTS_MAX;
+                if let Some(settled) = self.settled().filter(|_| is_full) {
+                    self.0.remove(settled);
                 }
                 Client { id, account: Account::new(id), repetitions: 0, is_due: false }
             }
@@ -198,8 +200,16 @@ impl Clients {
         self.0.iter_mut().find(|client| client.id == id)
     }
 
-    /// Whether all of them together may have another observation on the way.
+    /// Where the one heard of longest ago stands that has nothing on the way.
+    fn settled(&self) -> Option<usize> {
+        self.0.iter().position(|client| client.account.is_settled())
+    }
+
+    /// Whether another observation may be read, be it a newcomer's: all of them together may have so much on the way.
     fn have_room(&self, events_max: usize, bytes_max: usize) -> bool {
+        if self.0.len() >= CLIENTS_MAX && self.settled().is_none() {
+            return false;
+        }
         let (events, bytes) =
             self.0.iter().map(|client| client.account.in_flight()).fold((0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
         events == 0 || (events < events_max && bytes < bytes_max)
@@ -223,5 +233,37 @@ impl Clients {
             news.or_else(|| is_due.then(|| client.account.newest_report()))
         };
         self.0.iter_mut().filter_map(report).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::ticket::Verdict;
+    use super::*;
+
+    #[test]
+    fn a_newcomer_takes_the_place_of_a_client_with_nothing_on_the_way_or_waits_for_one() {
+        let mut clients = Clients::default();
+        let roomy = |clients: &Clients| clients.have_room(usize::MAX, usize::MAX);
+        for id in 1..=CLIENTS_MAX as u64 {
+            assert!(roomy(&clients), "client {id}");
+            clients.of(id).account.enter(1, 1, 10);
+        }
+        assert!(!roomy(&clients), "each has an event on the way");
+        for id in [7, 3] {
+            clients.known(id).unwrap().account.tell(1, Verdict::Taken);
+        }
+        assert!(roomy(&clients));
+        assert_eq!(clients.reports().len(), CLIENTS_MAX, "told before anybody else is heard");
+        clients.of(1000).account.enter(1, 1, 10);
+        assert!(clients.known(3).is_none() && clients.known(7).is_some(), "3 was heard of longer ago");
+        assert_eq!(clients.reports().len(), 1, "the newcomer's");
+        for id in (1..=CLIENTS_MAX as u64).filter(|id| ![3, 7].contains(id)) {
+            clients.known(id).expect("it has an event on the way").account.tell(1, Verdict::Taken);
+        }
+        let told: Vec<_> = clients.reports().iter().map(|report| (report.client, report.acknowledged)).collect();
+        let expected: Vec<_> = (1..=CLIENTS_MAX as u64).filter(|id| ![3, 7].contains(id)).map(|id| (id, 1)).collect();
+        assert_eq!(told, expected, "each hears its verdict");
+        assert_eq!(clients.0.len(), CLIENTS_MAX);
     }
 }

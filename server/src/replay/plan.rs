@@ -38,106 +38,142 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     let files = Readings::open(&options.files, Wanted::default())?;
     let recorded = files.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
     let scans = files.files().all(|(_, kind)| kind == Kind::Scan);
-    let (mut config, mut tables, boot_id, given) = configured(options, recorded.as_deref())?;
-    let vehicle = &mut config.vehicles[0];
+    let mut known = configured(options, recorded.as_deref())?;
+    let vehicle = &mut known.config.vehicles[0];
     (vehicle.udp, vehicle.ros) = (None, None);
     let mut wanted = Wanted {
         vehicle: options.vehicle.clone(),
         topics: options.topics.clone(),
-        sensors_max: if given { vehicle.sensors.len() } else { SENSORS_MAX },
+        sensors_max: if known.is_mounted { vehicle.sensors.len() } else { SENSORS_MAX },
     };
-    let mut remarks = Vec::new();
-    let mut placed = None;
-    if let Some(bag) = recorded.as_deref().filter(|_| !given) {
-        let mut choice = choice(bag, &wanted)?;
-        keep_placed(&mut choice.sensors, options.extrinsics.is_some());
+    let placed = match recorded.filter(|_| !known.is_mounted) {
+        Some(bag) => known.take_bag(&bag, &mut wanted, options.extrinsics.is_some())?,
+        None => None,
+    };
+    known.tell_sensors(options, scans)?;
+    let open = || Readings::open(&options.files, wanted.clone());
+    let readings = open()?;
+    let mount = match options.extrinsics {
+        Some(extrinsics) => {
+            known.config.vehicles[0].sensors[0].extrinsics = extrinsics;
+            Mount::Given
+        }
+        None if known.is_mounted => Mount::Given,
+        None if let Some(mount) = placed => mount,
+        None => known.find_mount(open()?)?,
+    };
+    let extrinsics = known.config.vehicles[0].sensors[0].extrinsics;
+    let setup = known.setup(options)?;
+    let clouds = options.clouds.as_deref().map(Clouds::create).transpose()?;
+    let (observer, clouds) = clouds.map(Clouds::observer).unzip();
+    Ok(Plan { setup: Setup { observer, ..setup }, mount, extrinsics, readings, clouds })
+}
+
+/// What is known of the vehicle so far.
+struct Known {
+    /// Of one vehicle.
+    config: Config,
+    tables: Calibrations,
+    /// Of the recording whose maps are made again.
+    boot_id: Option<u64>,
+    /// Whether the extrinsics are known.
+    is_mounted: bool,
+    remarks: Vec<String>,
+}
+
+impl Known {
+    /// Takes the sensors a ROS bag has, and `wanted` their topics; gives the first one's mount where tf tells it.
+    fn take_bag(&mut self, bag: &Path, wanted: &mut Wanted, is_given: bool) -> Result<Option<Mount>, ReplayError> {
+        let mut choice = choice(bag, wanted)?;
+        keep_placed(&mut choice.sensors, is_given);
         // Named, the same are chosen again when the bag is read.
         wanted.topics = choice.sensors.iter().map(|sensor| sensor.topic.clone()).collect();
         if let Some(PoseFrom::Topic(topic)) = &choice.pose {
             wanted.topics.push(topic.clone());
         }
-        if !choice.sensors.is_empty() {
-            (wanted.sensors_max, tables) = (choice.sensors.len(), vec![vec![None; choice.sensors.len()]]);
-            let mounts;
-            (vehicle.sensors, mounts) = sensors_of(&choice);
-            for (sensor, mount) in vehicle.sensors.iter().zip(&mounts) {
-                let said = mount.as_ref().and_then(describe);
-                remarks.extend(said.map(|said| format!("extrinsics of {}: {said}", sensor.name)));
-            }
-            placed = mounts.into_iter().next().flatten();
+        if choice.sensors.is_empty() {
+            return Ok(None);
         }
+        (wanted.sensors_max, self.tables) = (choice.sensors.len(), vec![vec![None; choice.sensors.len()]]);
+        let (sensors, mounts) = sensors_of(&choice);
+        sensors.iter().zip(&mounts).for_each(|(sensor, mount)| self.remark(&sensor.name, mount.as_ref()));
+        self.config.vehicles[0].sensors = sensors;
+        Ok(mounts.into_iter().next().flatten())
     }
-    let open = || Readings::open(&options.files, wanted.clone());
-    let readings = open()?;
-    for sensor in &mut vehicle.sensors {
-        (sensor.model, sensor.rpm) = (options.model.or(sensor.model), options.rpm.or(sensor.rpm));
+
+    fn remark(&mut self, sensor: &str, mount: Option<&Mount>) {
+        self.remarks.extend(mount.and_then(describe).map(|said| format!("extrinsics of {sensor}: {said}")));
     }
-    let sensor = &mut vehicle.sensors[0];
-    // Scans do not tell who made them, and KITTI's were made by this one.
-    if scans && sensor.model.is_none() && tables[0][0].is_none() {
-        sensor.model = Some(Model::Hdl64eS2);
-    }
-    if let Some(file) = &options.calibration {
-        sensor.calibration = Some(file.display().to_string());
-        // The others have their tables, read from where their own configuration lies.
-        let mut first = config.clone();
-        first.vehicles[0].sensors.truncate(1);
-        tables[0][0] = first.calibrations(Path::new(""))?.remove(0).remove(0);
-    }
-    let sensor = &mut config.vehicles[0].sensors[0];
-    let mount = match options.extrinsics {
-        Some(extrinsics) => {
-            sensor.extrinsics = extrinsics;
-            Mount::Given
+
+    /// What the options, and files that hold nothing but scans, tell of the sensors.
+    fn tell_sensors(&mut self, options: &Options, scans: bool) -> Result<(), ReplayError> {
+        let sensors = &mut self.config.vehicles[0].sensors;
+        for sensor in sensors.iter_mut() {
+            (sensor.model, sensor.rpm) = (options.model.or(sensor.model), options.rpm.or(sensor.rpm));
         }
-        None if given => Mount::Given,
-        None if let Some(mount) = placed => mount,
-        None => {
-            let revolutions = first_revolutions(open()?, sensor, tables[0][0].clone())?;
-            if revolutions.is_empty() {
-                Mount::Unneeded
-            } else {
-                let mount = estimate(&revolutions).map_or_else(Mount::Unknown, Mount::Estimated);
-                remarks.extend(describe(&mount).map(|said| format!("extrinsics of {}: {said}", sensor.name)));
-                match &mount {
-                    Mount::Estimated(estimate) => sensor.extrinsics = estimate.extrinsics(),
-                    _ => config.vehicles[0].maps = MapsConfig::none(),
-                }
-                mount
-            }
+        // Scans do not tell who made them, and KITTI's were made by this one.
+        if scans && sensors[0].model.is_none() && self.tables[0][0].is_none() {
+            sensors[0].model = Some(Model::Hdl64eS2);
         }
-    };
-    let extrinsics = config.vehicles[0].sensors[0].extrinsics;
-    config.recorder.file = options.record.clone().unwrap_or_default();
-    if !options.serve {
-        (config.grpc.enabled, config.page.enabled, config.foxglove.enabled) = (false, false, false);
-        (config.zenoh.enabled, config.zenoh.ros2.enabled) = (false, false);
+        if let Some(file) = &options.calibration {
+            sensors[0].calibration = Some(file.display().to_string());
+            // The others have their tables, read from where their own configuration lies.
+            let mut first = self.config.clone();
+            first.vehicles[0].sensors.truncate(1);
+            self.tables[0][0] = first.calibrations(Path::new(""))?.remove(0).remove(0);
+        }
+        Ok(())
     }
-    let file = options.config.as_deref().unwrap_or(Path::new("(replay)"));
-    config.check(file)?;
-    let certificates = if options.serve { config.certificates(file)? } else { None };
-    // The same files and settings name the same run; served maps need a name of their own, or a reader that saw them
-    // before would take them for old ones.
-    let altered = options.extrinsics.is_some() || options.model.is_some() || options.rpm.is_some();
-    let same_maps = !altered && options.calibration.is_none();
-    let boot_id =
-        boot_id.filter(|_| same_maps).or_else(|| (!options.serve).then(|| fingerprint(&config, &options.files)));
-    let mut notes = BTreeMap::new();
-    if !remarks.is_empty() {
-        notes.insert("mount".to_owned(), remarks.join("\n"));
+
+    /// Mounts the first sensor as the ground in the first revolutions tells; where it tells nothing, no map is made.
+    fn find_mount(&mut self, readings: Readings) -> Result<Mount, ReplayError> {
+        let vehicle = &mut self.config.vehicles[0];
+        let sensor = &mut vehicle.sensors[0];
+        let revolutions = first_revolutions(readings, sensor, self.tables[0][0].clone())?;
+        if revolutions.is_empty() {
+            return Ok(Mount::Unneeded);
+        }
+        let mount = estimate(&revolutions).map_or_else(Mount::Unknown, Mount::Estimated);
+        match &mount {
+            Mount::Estimated(estimate) => sensor.extrinsics = estimate.extrinsics(),
+            _ => vehicle.maps = MapsConfig::none(),
+        }
+        let name = sensor.name.clone();
+        self.remark(&name, Some(&mount));
+        Ok(mount)
     }
-    let clouds = options.clouds.as_deref().map(Clouds::create).transpose()?;
-    let (observer, clouds) = clouds.map(Clouds::observer).unzip();
-    let setup =
-        Setup { config, calibrations: tables, certificates, boot_id, from_files: true, remarks, notes, observer };
-    Ok(Plan { setup, mount, extrinsics, readings, clouds })
+
+    /// What the server is started with.
+    fn setup(self, options: &Options) -> Result<Setup, ReplayError> {
+        let Self { config, tables: calibrations, boot_id, remarks, .. } = self;
+        let file = options.config.as_deref().unwrap_or(Path::new("(replay)"));
+        // The paths of a run that serves nothing are not opened, and name no other run than they would elsewhere.
+        let mut config = if options.serve { config.located(file) } else { config };
+        config.recorder.file = options.record.clone().unwrap_or_default();
+        if !options.serve {
+            (config.grpc.enabled, config.page.enabled, config.foxglove.enabled) = (false, false, false);
+            (config.zenoh.enabled, config.zenoh.ros2.enabled) = (false, false);
+        }
+        config.check(file)?;
+        let certificates = if options.serve { config.certificates(file)? } else { None };
+        // The same files and settings name the same run; served maps need a name of their own, or a reader that saw them
+        // before would take them for old ones.
+        let altered = options.extrinsics.is_some() || options.model.is_some() || options.rpm.is_some();
+        let same_maps = !altered && options.calibration.is_none();
+        let boot_id =
+            boot_id.filter(|_| same_maps).or_else(|| (!options.serve).then(|| fingerprint(&config, &options.files)));
+        let mut notes = BTreeMap::new();
+        if !remarks.is_empty() {
+            notes.insert("mount".to_owned(), remarks.join("\n"));
+        }
+        Ok(Setup { config, calibrations, certificates, boot_id, from_files: true, remarks, notes, observer: None })
+    }
 }
 
-type Configured = (Config, Calibrations, Option<u64>, bool);
-
-/// The configuration, the calibration tables, the boot id to keep, and whether the extrinsics are known: from
-/// `--config`, else from the recording itself, else plain.
-fn configured(options: &Options, recorded: Option<&Path>) -> Result<Configured, ReplayError> {
+/// From `--config`, else from the recording itself, else plain.
+fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, ReplayError> {
+    let known =
+        |config, tables, boot_id, is_mounted| Known { config, tables, boot_id, is_mounted, remarks: Vec::new() };
     let pick = |config: &mut Config, tables: &mut Calibrations| {
         let index = match &options.vehicle {
             None => 0,
@@ -154,7 +190,7 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Configured, 
         let mut config = Config::load(file, &options.set)?;
         let mut tables = config.calibrations(file)?;
         pick(&mut config, &mut tables)?;
-        return Ok((config, tables, None, true));
+        return Ok(known(config, tables, None, true));
     }
     if let Some(file) = recorded {
         let recording = Recording::open(file)?;
@@ -163,10 +199,10 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Configured, 
             pick(&mut config, &mut tables)?;
             // What the recording says of its own publishers and files is not for this run.
             let config = Config { vehicles: config.vehicles, ..Config::default() };
-            return Ok((config, tables, Some(recording.preface().boot_id), true));
+            return Ok(known(config, tables, Some(recording.preface().boot_id), true));
         }
     }
-    Ok((Config::of_one_vehicle("car", "top"), vec![vec![None]], None, false))
+    Ok(known(Config::of_one_vehicle("car", "top"), vec![vec![None]], None, false))
 }
 
 /// What is taken of a ROS bag.

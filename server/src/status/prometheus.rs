@@ -89,7 +89,7 @@ impl Metrics<'_> {
         let readers = self.all.iter().flat_map(|at| at.0.readers().map(readers(at))).collect();
         self.family("clearway_readers", "Readers of the vehicle's maps.", readers);
         let lost = |(of, _): &(&VehicleStatus, Snapshot)| {
-            (vehicle(of), of.recorder.as_ref().map_or(0, |counts| counts.lost()) as f64)
+            (vehicle(of), of.recorder.get().map_or(0, |counts| counts.lost()) as f64)
         };
         let lost = self.all.iter().map(lost).collect();
         self.family("clearway_recorder_lost_total", "Events and maps the recording does not hold.", lost);

@@ -29,6 +29,9 @@ struct Arguments {
     threads: Option<usize>,
 }
 
+/// Where there is no terminal, so many seeds make a line.
+const SEEDS_A_LINE: u64 = 500;
+
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let (first, end) = match arguments.seed {
@@ -65,6 +68,10 @@ fn main() -> ExitCode {
                         }
                     }
                     bar.inc(1);
+                    // Who redirects the output sees no bar.
+                    if bar.is_hidden() && bar.position().is_multiple_of(SEEDS_A_LINE) {
+                        eprintln!("{} of {} seeds, {} s", bar.position(), end - first, began.elapsed().as_secs());
+                    }
                 }
             });
         }

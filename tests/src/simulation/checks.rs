@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use clearway_mapping::config::SensorConfig;
 use clearway_mapping::map::{Cells, Geometry, Layer, Map, SensorState};
 use clearway_mapping::pipeline::{Ledger, NamedStatus};
 use nalgebra::Point3;
@@ -23,10 +24,13 @@ pub fn breach(check: &'static str, found: impl Into<String>) -> Breach {
     Breach { check, found: found.into() }
 }
 
-/// Nearer cells can be seen past the edge of the covered sector, from where the car was a turn ago.
+/// Nearer cells can be seen past the edge of the covered sector, from where the car was within a turn.
 const COVERED_M_MIN: f64 = 8.0;
 /// And so can the outermost degrees of the sector.
 const COVERED_EDGE_DEG: i64 = 15;
+/// What is in a map was seen from where the car is, and from where it was so long ago: a turn, and the deadline of those
+/// who bring one to another's map.
+const SEEN_S_MAX: f64 = 0.3;
 
 /// Received = decoded + telemetry + refused by reason.
 pub fn adds_up(whose: &str, ledger: &Ledger) -> Result<(), Breach> {
@@ -61,6 +65,7 @@ pub fn accounts(offered: u64, ledger: &Ledger, sensors: &[NamedStatus]) -> Resul
 /// Nothing is free where every sensor's window is covered.
 pub fn nothing_free(drive: &Drive, covered_deg: &Range<i64>, map: &Map) -> Result<(), Breach> {
     let sensors = &drive.config.vehicles[0].sensors;
+    let back_m = [0.0, map.speed_mps.unwrap_or(0.0) * SEEN_S_MAX];
     let hidden = covered_deg.start + COVERED_EDGE_DEG..covered_deg.end - COVERED_EDGE_DEG;
     for layer in &map.layers {
         let free: Vec<u8> = (layer.legend.iter().enumerate())
@@ -72,11 +77,12 @@ pub fn nothing_free(drive: &Drive, covered_deg: &Range<i64>, map: &Map) -> Resul
         let Cells::U8(classes) = &layer.channels[0].cells else { continue };
         for (cell, _) in classes.iter().enumerate().filter(|(_, class)| free.contains(class)) {
             let [x, y] = centre(layer, cell);
-            let from = |sensor: &clearway_mapping::config::SensorConfig| {
+            let from = |sensor: &SensorConfig, back_m: f64| {
                 let at = sensor.extrinsics.ego_from_sensor().translation;
-                (y - at.y).atan2(x - at.x).to_degrees()
+                (y - at.y).atan2(x + back_m - at.x).to_degrees()
             };
-            if x.hypot(y) >= COVERED_M_MIN && sensors.iter().all(|sensor| inside(&hidden, from(sensor))) {
+            let is_hidden = |sensor| back_m.iter().all(|back_m| inside(&hidden, from(sensor, *back_m)));
+            if x.hypot(y) >= COVERED_M_MIN && sensors.iter().all(is_hidden) {
                 let class = layer.legend[usize::from(classes[cell])];
                 let found = format!("map {}: {} at ({x:.1}, {y:.1}) is {class}", map.sequence, layer.name);
                 return Err(breach("covered", found));

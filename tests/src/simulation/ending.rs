@@ -23,7 +23,7 @@ impl House<'_> {
         if self.clock.load(Ordering::Relaxed) - newest_ns > 2 * TURN_NS {
             return Err(breach("converge", format!("no map for two turns: {last}")));
         }
-        self.door.close().map_err(|closed| breach("ledger", closed.to_string()))?;
+        self.door.close(None).map_err(|closed| breach("ledger", closed.to_string()))?;
         self.step()?;
         self.engine.rest();
         let snapshot = self.vehicles.0[0].status.snapshot();

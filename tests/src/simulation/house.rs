@@ -98,8 +98,8 @@ impl<'a> House<'a> {
             // The disk is full before the first event; a server would not start, and one that does not record does.
             Err(_) => (None, None),
         };
-        let counts = scribe.as_ref().map(Scribe::counts);
-        let status = Arc::new(VehicleStatus::new("car".into(), 1, layers.clone(), door.outside(), counts));
+        let status = Arc::new(VehicleStatus::new("car".into(), 1, layers.clone(), door.outside()));
+        scribe.iter().for_each(|scribe| status.show_recorder(scribe.counts()));
         let (newest, receiver) = watch::channel(None);
         let pipeline = Pipeline::new(&vehicle.core(), vec![None; vehicle.sensors.len()]).expect("a car that can be");
         let valid_ms = vehicle.maps.valid_ms;

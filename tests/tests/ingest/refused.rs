@@ -5,8 +5,10 @@ use std::path::Path;
 use bytes::Bytes;
 use clearway_client::observation::by_reason;
 use clearway_client::{ClientError, Ingester, Observation};
+use clearway_mapping::event::{Body, Cause, Event};
 use clearway_proto::packed::pack;
 use clearway_proto::v1;
+use clearway_server::recording::{Entry, Recording};
 use clearway_server::verify::verify;
 use prost::Message;
 use tonic::Code;
@@ -148,7 +150,8 @@ async fn strangers_crowds_and_giants_are_told_what_is_allowed() {
     let folder = tempfile::tempdir().unwrap();
     let mut config = scanned_config();
     (config.vehicles[0].ingest.points_max, config.vehicles[0].ingest.streams_max) = (1000, 1);
-    let running = start(config, &folder.path().join("r.mcap")).await;
+    let file = folder.path().join("r.mcap");
+    let running = start(config, &file).await;
     let client = client(&running).await;
     let refused = |outcome: Result<Ingester, ClientError>| match outcome {
         Err(ClientError::Refused { reason, code, .. }) => (code, reason),
@@ -203,4 +206,9 @@ async fn strangers_crowds_and_giants_are_told_what_is_allowed() {
     assert!(status.code() == Code::OutOfRange && status.message().contains("97536"), "{status:?}");
     assert_eq!(running.vehicles.0[0].status.snapshot().ledger.refused.get("observation"), Some(&1));
     within("shutdown", running.shutdown()).await.unwrap();
+    let told = Recording::open(&file).unwrap().map(|entry| match entry.unwrap() {
+        Entry::Event { event: Event { body: Body::Lost { cause: Cause::Observation, count }, .. }, .. } => count,
+        _ => 0,
+    });
+    assert_eq!(told.sum::<u64>(), 1, "the journal knows of it, though no event came after");
 }

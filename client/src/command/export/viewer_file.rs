@@ -2,8 +2,9 @@
 //!
 //! foxglove: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf`
 //! (`foxglove.FrameTransforms`). ros2: `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`),
-//! `/clearway/<vehicle>/odometry` (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages are
-//! logged when the recording has them, and stamped with the capture's end.
+//! `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`), `/clearway/<vehicle>/odometry`
+//! (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages are logged when the recording has
+//! them, and stamped with the capture's end, or the turn's.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
@@ -14,7 +15,7 @@ use anyhow::{Context, Result};
 use clearway_client::viewer::raster::Rasters;
 use clearway_client::viewer::{base_frame, foxglove as messages, ros};
 use clearway_client::{Layer, MapView};
-use clearway_ros::published::{OCCUPANCY_GRID, ODOMETRY, Published, TF_MESSAGE};
+use clearway_ros::published::{OCCUPANCY_GRID, ODOMETRY, POINT_CLOUD2, Published, TF_MESSAGE};
 use foxglove::Encode;
 use foxglove::messages::FrameTransforms;
 use mcap::records::MessageHeader;
@@ -60,7 +61,7 @@ impl ViewerFile {
             rasters: BTreeMap::new(),
             placed: HashMap::new(),
             turns: None,
-            with_points: with_points && dialect == Dialect::Foxglove,
+            with_points,
         })
     }
 
@@ -132,10 +133,21 @@ impl ViewerFile {
 
     fn write_turn(&mut self, vehicle: &str, turn: &Turn, log_ns: u64) -> Result<()> {
         let frame = format!("{vehicle}/{}", turn.sensor);
-        let mount = messages::transform(turn.stamp_ns, &base_frame(vehicle), &frame, turn.ego_from_sensor);
-        self.write_foxglove("/tf", &FrameTransforms { transforms: vec![mount] }, log_ns)?;
-        let cloud = messages::points(turn.stamp_ns, &frame, turn.points.iter().copied());
-        self.write_foxglove(&format!("/{vehicle}/points/{}", turn.sensor), &cloud, log_ns)
+        let (stamp_ns, base, mount) = (turn.stamp_ns, base_frame(vehicle), turn.ego_from_sensor);
+        match self.dialect {
+            Dialect::Foxglove => {
+                let mount = messages::transform(stamp_ns, &base, &frame, mount);
+                self.write_foxglove("/tf", &FrameTransforms { transforms: vec![mount] }, log_ns)?;
+                let cloud = messages::points(stamp_ns, &frame, turn.points.iter().copied());
+                self.write_foxglove(&format!("/{vehicle}/points/{}", turn.sensor), &cloud, log_ns)
+            }
+            Dialect::Ros2 => {
+                self.write_ros("/tf", &TF_MESSAGE, &ros::transform(stamp_ns, &base, &frame, mount), log_ns)?;
+                let cloud = ros::points(stamp_ns, &frame, &turn.points);
+                let topic = format!("/clearway/{vehicle}/points/{}", turn.sensor);
+                self.write_ros(&topic, &POINT_CLOUD2, &cloud, log_ns)
+            }
+        }
     }
 
     fn write_foxglove<T: Encode>(&mut self, topic: &str, message: &T, log_ns: u64) -> Result<()> {

@@ -163,6 +163,13 @@ pub(crate) fn scripts() -> Vec<Script> {
             ..free
         },
         Script {
+            name: "the host steps an hour back just before a silence and forth during it, and nobody else knows the time",
+            host_ns: |t| if (EVENT - 4_000_000..EVENT + TURN).contains(&t) { -HOUR } else { 0 },
+            silence_ns: silent.silence_ns,
+            healed_ns: silent.healed_ns,
+            ..free
+        },
+        Script {
             name: "the host steps an hour on and nobody else knows the time",
             host_ns: |t| after(t, HOUR, 0),
             right_ns: |t| after(t, HOUR, 0),

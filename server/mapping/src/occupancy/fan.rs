@@ -97,6 +97,8 @@ struct View {
     sensor: u16,
     /// Whether the scan came since the last map.
     fresh: bool,
+    /// When it ended.
+    stamp_ns: i64,
     /// The sensor's place, cells of the world.
     at: [f64; 2],
     /// Heading of the ego frame in the window's axes, rad.
@@ -140,8 +142,10 @@ impl Fan {
         self.views.iter_mut().for_each(|view| view.fresh = false);
     }
 
-    /// Adds what the scans since the last map tell to each cell of the window, row by row; whether there were any.
-    pub fn tell(&mut self, config: &OccupancyConfig, window: &Window, told: &mut [u8]) -> bool {
+    /// Adds what the scans since the last map, and since `earliest_ns`, tell to each cell of the window, row by row;
+    /// whether there were any.
+    pub fn tell(&mut self, config: &OccupancyConfig, earliest_ns: i64, window: &Window, told: &mut [u8]) -> bool {
+        self.views.iter_mut().filter(|view| view.stamp_ns < earliest_ns).for_each(|view| view.fresh = false);
         let mut any = false;
         for view in self.views.iter_mut().filter(|view| view.fresh) {
             view.prove_ground(&self.compass);
@@ -188,6 +192,7 @@ impl View {
         Self {
             sensor,
             fresh: false,
+            stamp_ns: 0,
             at: [0.0; 2],
             yaw_rad: 0.0,
             present: vec![false; DIRECTIONS],
@@ -222,7 +227,7 @@ impl View {
         let [x, y] = [rays.origin_m[0], rays.origin_m[1]].map(|metres| f64::from(metres / config.cell_m));
         let from = [place.cells[0] + x * cos - y * sin, place.cells[1] + x * sin + y * cos];
         self.at = [0, 1].map(|i| corner[i] as f64 + from[i]);
-        (self.yaw_rad, self.fresh) = (place.yaw_rad, true);
+        (self.yaw_rad, self.fresh, self.stamp_ns) = (place.yaw_rad, true, rays.stamp_ns);
     }
 
     fn take_returns(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, compass: &Compass, window: &mut Window) {

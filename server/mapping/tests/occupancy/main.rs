@@ -237,6 +237,19 @@ fn a_silent_sensor_leaves_nothing_clear() {
     assert_eq!(class_at(&after, 10.1, 0.1), OCCUPIED, "what stood there a moment ago may still stand there");
 }
 
+#[test]
+fn what_a_sensor_saw_before_a_long_silence_clears_nothing_in_the_map_after_it() {
+    let sweep = wall();
+    for (earliest_ns, expected) in [(999, CLEAR), (1000, CLEAR), (1001, UNKNOWN)] {
+        let mut occupancy = occupancy();
+        occupancy.take(&Rays { stamp_ns: 1000, ..rays(&sweep) });
+        let mut layer = occupancy.layer();
+        let context = Context { stamp_ns: 5000, earliest_ns, ..Context::default() };
+        occupancy.make_with(&Sweep::default(), &context, &mut layer);
+        assert_eq!(class_at(&layer, 5.0, 0.1), expected, "seen at 1000, {earliest_ns} is the earliest that counts");
+    }
+}
+
 /// What a map says against the simulator's truth.
 fn hold_against_truth(layer: &Layer, map_from_ego: &Isometry3<f64>, world: &clearway_sim::world::World, time: f64) {
     let now = Footprints::at(world, time);

@@ -1,12 +1,13 @@
 //! Readers of `Watch` over real sockets: what they ask for, what they are told, and that the bad ones cost nobody
 //! anything.
 
+mod bad;
+#[path = "../house/mod.rs"]
 mod house;
 
 use std::future::ready;
 use std::net::SocketAddr;
 use std::pin::Pin;
-use std::sync::{Arc, Weak};
 
 use clearway_proto::codec::Limits;
 use clearway_proto::map::{Map, decode_map, decode_map_on};
@@ -15,12 +16,10 @@ use clearway_proto::v1::map_service_client::MapServiceClient;
 use clearway_proto::v1::map_service_server::{MapService, MapServiceServer};
 use clearway_server::ingest::Reading;
 use clearway_server::server::Running;
-use clearway_server::wire::EncodedMap;
 use futures::{Stream, StreamExt};
-use house::{config, feed, readings, sequence, start, until, within};
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{Semaphore, mpsc};
+use house::{config, feed, readings, sequence, start, within};
+use tokio::net::TcpListener;
+use tokio::sync::mpsc;
 use tonic::transport::Channel;
 use tonic::{Code, Request, Response, Status, Streaming};
 
@@ -308,183 +307,5 @@ async fn our_client_shows_the_cells_of_whole_maps_also_when_an_update_is_lost_be
     }
     assert!(shown.len() > 4 && shown.contains(&3), "{shown:?}");
     drop(maps);
-    within("shutdown", running.shutdown()).await.unwrap();
-}
-
-/// A link to the server that lets through as many of its bytes as it is allowed to.
-struct Link {
-    address: SocketAddr,
-    allowed: Arc<Semaphore>,
-}
-
-impl Link {
-    async fn to(server: SocketAddr) -> Self {
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let (address, allowed) = (listener.local_addr().unwrap(), Arc::new(Semaphore::new(0)));
-        let rate = allowed.clone();
-        tokio::spawn(async move {
-            let (mut near, _) = listener.accept().await.unwrap();
-            let (mut far_reads, mut far_writes) = TcpStream::connect(server).await.unwrap().into_split();
-            let (mut near_reads, mut near_writes) = near.split();
-            let up = tokio::io::copy(&mut near_reads, &mut far_writes);
-            let down = async {
-                let mut byte = [0];
-                while far_reads.read_exact(&mut byte).await.is_ok() {
-                    rate.acquire().await.expect("open").forget();
-                    if near_writes.write_all(&byte).await.is_err() {
-                        break;
-                    }
-                }
-            };
-            tokio::join!(up, down)
-        });
-        Self { address, allowed }
-    }
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_stopped_and_a_slow_reader_cost_eight_healthy_ones_nothing_and_resume_with_the_newest_map() {
-    /// What the wire's greetings take, and 10 kB/s of a server of ten maps a second.
-    const GREETING_BYTES: usize = 1000;
-    const BYTES_A_TURN: usize = 1000;
-    let running = start(config()).await;
-    let server = running.grpc.unwrap();
-    let [link, wall] = [Link::to(server).await, Link::to(server).await];
-    [&link, &wall].iter().for_each(|link| link.allowed.add_permits(GREETING_BYTES));
-    // With small windows as our own client has, and with a plain client's, which hold minutes of maps.
-    let mut slow = Reader::open(&mut plain(link.address).await, of_layer(2)).await.unwrap();
-    let mut deaf = Reader::open(&mut plain(wall.address).await, of_layer(0)).await.unwrap();
-    let deltas = v1::Selection { deltas: true, ..of_layer(2) };
-    let mut stopped = Reader::open(&mut plain(server).await, deltas).await.unwrap();
-    let mut small = Reader::open(&mut house::grpc(&running).await, of_layer(2)).await.unwrap();
-    let mut healthy = Vec::new();
-    for index in 0..8 {
-        let mut client = if index % 2 == 0 { plain(server).await } else { house::grpc(&running).await };
-        healthy.push(Reader::open(&mut client, of_layer(1 + index % 3)).await.unwrap());
-    }
-
-    let mut made: Vec<Weak<EncodedMap>> = Vec::new();
-    let mut next = 0;
-    for portion in portions(20) {
-        let maps = feed(&running, portion).await;
-        for expected in next..maps {
-            made.push(Arc::downgrade(running.vehicles.0[0].newest.borrow().as_ref().unwrap()));
-            for reader in &mut healthy {
-                assert_eq!(reader.take().await, (expected, 0, 0));
-            }
-            link.allowed.add_permits(BYTES_A_TURN);
-        }
-        next = maps;
-    }
-    assert!(next >= 18, "{next} maps");
-    // The slot holds the newest, the stopped reader of deltas the map they are put on; nothing else keeps one.
-    let alive = made.iter().filter(|map| map.upgrade().is_some()).count();
-    assert!(alive <= 2, "{alive} of {next} maps are kept");
-
-    for reader in [&mut stopped, &mut small] {
-        let on_the_way =
-            [reader.next().await.unwrap(), reader.next().await.unwrap()].map(|update| sequence(&update.map));
-        assert_eq!(on_the_way[0], 0);
-        reader.acknowledge(on_the_way[1]).await;
-        let (sequence, skipped, _) = reader.take().await;
-        assert_eq!((sequence, skipped), (next - 1, next - 2 - on_the_way[1]), "the first new map is the newest");
-    }
-    // The slow one had no more than its credits on the way: after those, the newest comes.
-    link.allowed.add_permits(Semaphore::MAX_PERMITS / 2);
-    let (mut before, mut seen) = (slow.take().await, 1);
-    while before.0 < next - 1 {
-        let update = slow.take().await;
-        assert_eq!(update.0, before.0 + 1 + update.1, "what it missed is counted");
-        (before, seen) = (update, seen + 1);
-    }
-    assert!(seen <= 3, "{seen} maps over a link of 10 kB/s, of which all but two were on the way");
-    // Who never acknowledges at all gets what was on the way, and no gap is untold.
-    wall.allowed.add_permits(Semaphore::MAX_PERMITS / 2);
-    let mut expected = 0;
-    while expected < next {
-        let update = deaf.next().await.unwrap();
-        assert_eq!(sequence(&update.map), expected + update.skipped);
-        expected += update.skipped + 1;
-    }
-    within("shutdown", running.shutdown()).await.unwrap();
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_thousand_idle_connections_take_no_more_than_their_places_and_the_next_peer_is_told() {
-    let mut config = config();
-    config.grpc.connections_max = 32;
-    let running = start(config).await;
-    let server = running.grpc.unwrap();
-    let mut healthy = Reader::open(&mut plain(server).await, of_layer(1)).await.unwrap();
-    let mut idle = Vec::new();
-    for _ in 0..1000 {
-        let mut connection = TcpStream::connect(server).await.unwrap();
-        // A greeting, so that it counts as alive; some are closed before it.
-        let _ = connection.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").await;
-        idle.push(connection);
-    }
-    keeps_up(&mut healthy, &running).await;
-    // The lobby is full of them too; as soon as it is not, whoever comes hears why there is no place.
-    let status = within("an answer", async {
-        loop {
-            let channel = Channel::from_shared(format!("http://{server}")).unwrap().connect_lazy();
-            let request = v1::ListVehiclesRequest {};
-            match MapServiceClient::new(channel).list_vehicles(request).await {
-                Err(status) if status.code() == Code::ResourceExhausted => return status,
-                // Closed without a word.
-                Err(_) => {}
-                Ok(_) => panic!("there is no place"),
-            }
-        }
-    })
-    .await;
-    assert!(status.message().starts_with("32 connections are open, which grpc.connections_max allows"), "{status}");
-    drop(idle);
-    within("a place", async {
-        let connect = || Channel::from_shared(format!("http://{server}")).unwrap().connect_lazy();
-        while MapServiceClient::new(connect()).list_vehicles(v1::ListVehiclesRequest {}).await.is_err() {}
-    })
-    .await;
-    within("shutdown", running.shutdown()).await.unwrap();
-}
-
-/// An HTTP/2 frame.
-fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
-    let length = u32::try_from(payload.len()).unwrap().to_be_bytes();
-    [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
-}
-
-/// Opens a `Watch`, and resets it.
-fn open_and_reset(stream: u32) -> Vec<u8> {
-    let path = b"/clearway.v1.MapService/Watch";
-    let kind = b"application/grpc";
-    // POST, http; path, authority and content-type as literals.
-    let headers =
-        [&[0x83, 0x86, 0x04, path.len() as u8], &path[..], b"\x01\x01x\x0f\x10", &[kind.len() as u8], kind].concat();
-    [frame(1, 4, stream, &headers), frame(3, 0, stream, &8u32.to_be_bytes())].concat()
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn who_opens_and_resets_streams_in_a_loop_loses_its_connection_and_nobody_else_does() {
-    let running = start(config()).await;
-    let server = running.grpc.unwrap();
-    let mut healthy = Reader::open(&mut plain(server).await, of_layer(1)).await.unwrap();
-    let mut hostile = TcpStream::connect(server).await.unwrap();
-    let mut said = [&b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"[..], &frame(4, 0, 0, &[])].concat();
-    (0..20_000).for_each(|index| said.extend(open_and_reset(2 * index + 1)));
-    // The server may close before all of it is said.
-    let _ = hostile.write_all(&said).await;
-    let mut heard = Vec::new();
-    let _ = within("the end", hostile.read_to_end(&mut heard)).await;
-    drop(hostile);
-
-    // A client that means no harm but gives up at once each time, over one connection.
-    let mut hasty = plain(server).await;
-    for _ in 0..300 {
-        drop(Reader::open(&mut hasty, of_layer(0)).await);
-    }
-    keeps_up(&mut healthy, &running).await;
-    let readers = || running.vehicles.0[0].status.to_proto().readers["grpc"];
-    until("only the healthy reader is left", || readers() == 1).await;
     within("shutdown", running.shutdown()).await.unwrap();
 }

@@ -1,0 +1,106 @@
+"""The two grids of a layer: points to cells, cells to places.
+
+In: points and cell indices (row by row) as numpy arrays. Frames are REP-103: x forward, y left, metres, ego frame.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class RadialGrid:
+    """Array shape (rows, columns): row j spans (r_bench_m[j-1], r_bench_m[j]], column c the azimuths
+    [c, c+1) * 2 pi / columns, counter-clockwise from the ego x axis."""
+
+    r_bench_m: np.ndarray
+    columns: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return len(self.r_bench_m), self.columns
+
+    def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        """Cell index of each point, -1 outside the grid."""
+        row = np.searchsorted(self.r_bench_m, np.hypot(x_m, y_m), side="left")
+        turn = np.mod(np.arctan2(y_m, x_m) / math.tau, 1.0)
+        column = np.minimum((turn * self.columns).astype(np.int64), self.columns - 1)
+        return np.where(row < len(self.r_bench_m), row * self.columns + column, -1)
+
+    def nearest(self, cells: np.ndarray, x_m: float, y_m: float) -> np.ndarray:
+        """The place in each of these cells (indices) that is nearest to a point, shape (n, 2)."""
+        row, column = np.divmod(cells, self.columns)
+        inner, outer = np.concatenate(([0.0], self.r_bench_m[:-1]))[row], self.r_bench_m[row]
+
+        def along(turn: np.ndarray) -> np.ndarray:
+            way = np.stack([np.cos(turn * math.tau), np.sin(turn * math.tau)], axis=-1)
+            return np.clip(way @ (x_m, y_m), inner, outer)[:, None] * way
+
+        turn = math.atan2(y_m, x_m) / math.tau % 1.0
+        abreast = (column <= turn * self.columns) & (turn * self.columns <= column + 1)
+        # Beside the column, one of its two sides is nearest: an arc comes nearer towards its ends.
+        first, last = along(column / self.columns), along((column + 1) / self.columns)
+        is_first = np.hypot(*(first - (x_m, y_m)).T) <= np.hypot(*(last - (x_m, y_m)).T)
+        beside = np.where(is_first[:, None], first, last)
+        return np.where(abreast[:, None], along(np.full(len(cells), turn)), beside)
+
+    def centres(self) -> np.ndarray:
+        """Middle of every cell, shape (rows, columns, 2)."""
+        outer = self.r_bench_m
+        range_m = 0.5 * (np.concatenate(([0.0], outer[:-1])) + outer)
+        azimuth = (np.arange(self.columns) + 0.5) / self.columns * math.tau
+        return range_m[:, None, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
+
+
+@dataclass(frozen=True)
+class CartesianGrid:
+    """Array shape (height, width), indexed [iy, ix]: cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m).
+
+    Along the grid's axes, which begin at the ego frame's origin and in which that frame has the heading `yaw_rad`.
+    """
+
+    origin_x_m: float
+    origin_y_m: float
+    width: int
+    height: int
+    cell_m: float
+    yaw_rad: float = 0.0
+    #: Number of cell (0, 0) among all there could be: the world's where the axes are the world's.
+    first_ix: int = 0
+    first_iy: int = 0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.height, self.width
+
+    def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        """Cell index of each point, -1 outside the grid."""
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        ix = np.floor((x_m * cos - y_m * sin - self.origin_x_m) / self.cell_m).astype(np.int64)
+        iy = np.floor((x_m * sin + y_m * cos - self.origin_y_m) / self.cell_m).astype(np.int64)
+        inside = (ix >= 0) & (ix < self.width) & (iy >= 0) & (iy < self.height)
+        return np.where(inside, iy * self.width + ix, -1)
+
+    def nearest(self, cells: np.ndarray, x_m: float, y_m: float) -> np.ndarray:
+        """The place in each of these cells (indices) that is nearest to a point, ego frame, shape (n, 2)."""
+        iy, ix = np.divmod(cells, self.width)
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        left, bottom = self.origin_x_m + ix * self.cell_m, self.origin_y_m + iy * self.cell_m
+        x = np.clip(x_m * cos - y_m * sin, left, left + self.cell_m)
+        y = np.clip(x_m * sin + y_m * cos, bottom, bottom + self.cell_m)
+        return np.stack([x * cos + y * sin, y * cos - x * sin], axis=-1)
+
+    def centres(self) -> np.ndarray:
+        """Middle of every cell in the ego frame, shape (height, width, 2)."""
+        x, y = np.meshgrid(
+            self.origin_x_m + (np.arange(self.width) + 0.5) * self.cell_m,
+            self.origin_y_m + (np.arange(self.height) + 0.5) * self.cell_m,
+        )
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        return np.stack([x * cos + y * sin, y * cos - x * sin], axis=-1)
+
+
+Grid = RadialGrid | CartesianGrid
