@@ -38,11 +38,9 @@ fn borders<T: Cell>(base: &[T], columns: usize) -> Vec<u8> {
         }
     }
     for (borders, base) in borders.chunks_mut(columns).zip(base.chunks(columns)) {
-        for column in 1..base.len() {
-            let differs = u8::from(base[column - 1] != base[column]);
-            borders[column - 1] |= differs * BORDER_BEHIND;
-            borders[column] |= differs * BORDER_BEFORE;
-        }
+        let differs = base.iter().zip(&base[1..]).map(|(cell, behind)| u8::from(cell != behind));
+        borders.iter_mut().zip(differs.clone()).for_each(|(borders, differs)| *borders |= differs * BORDER_BEHIND);
+        borders[1..].iter_mut().zip(differs).for_each(|(borders, differs)| *borders |= differs * BORDER_BEFORE);
     }
     borders
 }

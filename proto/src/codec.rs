@@ -7,9 +7,9 @@
 //! from what cells of a class mostly are. A channel is sent as what is smallest; of equals, raw before rows before
 //! changes. All are canonical: equal cells (and bases) have equal bytes.
 //!
-//! There is no general compression on top: what zstd (level 3) makes of runs of equal cells is 7 % less than rows in
-//! the mean of 348 recorded channels, but 6 % more for classes, and far more than changes. That is not worth a library
-//! in every client, nor stored bytes that follow its version.
+//! There is no general compression on top: over 348 recorded channels, runs of equal cells under zstd (level 3) take 7 %
+//! less than rows, but 6 % more for classes, and changes take 20 to 39 % less again where rows would tell a channel by
+//! class. That is not worth a library in every client, nor stored bytes that follow its version.
 
 use std::borrow::Cow;
 

@@ -9,9 +9,9 @@ use std::sync::Arc;
 use bytes::Bytes;
 use clearway_mapping::config::ConfigError;
 use clearway_mapping::pipeline::Pipeline;
-use clearway_proto::codec::{Cells, DecodeError, Limits};
+use clearway_proto::codec::{DecodeError, Limits};
 use clearway_proto::grid::Grid;
-use clearway_proto::map::{Layer, MapError, decode_map};
+use clearway_proto::map::{Channel, Layer, MapError, decode_map};
 use clearway_proto::v1;
 use prost::Message;
 use serde_json::{Value, json};
@@ -278,37 +278,47 @@ fn first_difference(recorded: &Bytes, made: &Bytes) -> What {
         return field("geometry", &was.geometry, &is.geometry);
     }
     let columns = Grid::from_wire(is).map_or(1, |grid| grid.shape().1.max(1));
-    let cells = match (decoded(recorded), decoded(made)) {
-        (Ok(recorded), Ok(made)) => recorded.channels.into_iter().zip(made.channels),
+    let (recorded, made) = match (decoded(recorded), decoded(made)) {
+        (Ok(recorded), Ok(made)) => (recorded, made),
         (was, is) => return field("cells", &was.err(), &is.err()),
     };
-    for ((a, b), (recorded, made)) in was.channels.iter().zip(&is.channels).zip(cells) {
+    for (a, b) in was.channels.iter().zip(&is.channels) {
         if a == b {
             continue;
         }
-        let (recorded, made) = (recorded.cells, made.cells);
-        let differs = (0..recorded.len().min(made.len())).find(|&cell| recorded.get(cell) != made.get(cell));
-        let Some(cell) = differs else { return field(&format!("channel {}", b.name), a, b) };
-        let (row, column) = (cell as u32 / columns, cell as u32 % columns);
-        let value = |cells: &Cells| cells.get(cell).unwrap_or_default();
-        return What::Cell { row, column, channel: b.name.clone(), recorded: value(&recorded), made: value(&made) };
+        if let (Some(recorded), Some(made)) = (recorded.channel(&a.name), made.channel(&b.name)) {
+            let cells = 0..recorded.cells.len().min(made.cells.len());
+            let value = |of: &Channel, cell: usize| of.cells.get(cell).unwrap_or_default();
+            if let Some(cell) = cells.into_iter().find(|&cell| value(recorded, cell) != value(made, cell)) {
+                let (row, column) = (cell as u32 / columns, cell as u32 % columns);
+                let (recorded, made) = (value(recorded, cell), value(made, cell));
+                return What::Cell { row, column, channel: b.name.clone(), recorded, made };
+            }
+        }
+        return field(&format!("channel {}", b.name), a, b);
     }
     field("layer", &was, &is)
 }
 
-/// The first layer, even where a checksum says that its cells are not those that were encoded.
+/// The first layer, even where a checksum says that its cells are not those that were encoded, and without the channels
+/// that cannot be decoded.
 fn decoded(bytes: &Bytes) -> Result<Layer, MapError> {
     let mut bytes = bytes.clone();
     loop {
-        match decode_map(bytes.clone(), &Limits::default()) {
-            Err(MapError::Cells { layer: of, channel: name, source: DecodeError::Crc { computed, .. } }) => {
-                let mut map = v1::Map::decode(bytes)?;
-                let layers = map.layers.iter_mut().filter(|layer| layer.name == of);
-                let channels = layers.flat_map(|layer| &mut layer.channels).filter(|channel| channel.name == name);
-                channels.for_each(|channel| channel.crc32 = computed);
-                bytes = map.encode_to_vec().into();
-            }
+        let (of, name, source) = match decode_map(bytes.clone(), &Limits::default()) {
+            Err(MapError::Cells { layer, channel, source }) => (layer, channel, source),
             map => return map.map(|mut map| map.layers.swap_remove(0)),
+        };
+        let mut map = v1::Map::decode(bytes)?;
+        for layer in map.layers.iter_mut().filter(|layer| layer.name == of) {
+            match source {
+                DecodeError::Crc { computed, .. } => {
+                    let channels = layer.channels.iter_mut().filter(|channel| channel.name == name);
+                    channels.for_each(|channel| channel.crc32 = computed);
+                }
+                _ => layer.channels.retain(|channel| channel.name != name),
+            }
         }
+        bytes = map.encode_to_vec().into();
     }
 }
