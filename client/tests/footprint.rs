@@ -5,7 +5,7 @@ mod common;
 use std::f64::consts::{FRAC_PI_2, PI};
 
 use bytes::Bytes;
-use clearway_client::codec::{CellsRef, encode};
+use clearway_client::codec::{CellsRef, encode_grid};
 use clearway_client::footprint::{FREE, OBSTACLES};
 use clearway_client::v1::layer::Geometry;
 use clearway_client::viewer::raster;
@@ -38,11 +38,15 @@ fn cartesian(yaw_rad: f64) -> Geometry {
 
 /// A map of one layer `drivability` with these classes.
 fn view(geometry: Geometry, classes: &[u8]) -> MapView {
+    let columns = match &geometry {
+        Geometry::Radial(grid) => grid.columns,
+        Geometry::Cartesian(grid) => grid.width,
+    };
     let layer = v1::Layer {
         name: "drivability".into(),
         geometry: Some(geometry),
         legend: ["unknown", "drivable", "not_drivable", "obstacle"].map(String::from).to_vec(),
-        channels: vec![encode(CellsRef::U8(classes)).into_channel("class", "", 1.0, 0)],
+        channels: vec![encode_grid(CellsRef::U8(classes), columns as usize).into_channel("class", "", 1.0, 0)],
         ..Default::default()
     };
     MapView::decode(Bytes::from([encode_header(&v1::Header::default()), encode_layer(&layer)].concat())).unwrap()

@@ -1,6 +1,7 @@
 //! Cells to payload and back: 160,000 cells (400 x 400) of a drivability-like map, and of noise; a layer of them as a
 //! delta to the one before, from which it has scrolled by 3 cells.
 
+use clearway_proto::by_class::encode_beside;
 use clearway_proto::codec::{self, Cells, Limits};
 use clearway_proto::delta;
 use clearway_proto::map::{decode_map, decode_map_on, encode_header, encode_layer};
@@ -27,17 +28,27 @@ fn scene(noise: u32) -> Cells {
 #[divan::bench(args = [0, 20, 500])]
 fn encode(bencher: Bencher, noise: u32) {
     let cells = scene(noise);
-    bencher.counter(ItemsCount::new(cells.len())).bench(|| codec::encode(divan::black_box(cells.as_ref())));
+    bencher.counter(ItemsCount::new(cells.len())).bench(|| codec::encode_grid(divan::black_box(cells.as_ref()), SIDE));
 }
 
 #[divan::bench(args = [0, 20, 500])]
 fn decode(bencher: Bencher, noise: u32) {
     let cells = scene(noise);
-    let channel = codec::encode(cells.as_ref()).into_channel("class", "", 1.0, 0);
+    let channel = codec::encode_grid(cells.as_ref(), SIDE).into_channel("class", "", 1.0, 0);
     println!("noise {noise} per thousand: {} bytes", channel.payload.len());
     bencher
         .counter(ItemsCount::new(cells.len()))
-        .bench(|| codec::decode(divan::black_box(&channel), &Limits::default()));
+        .bench(|| codec::decode(divan::black_box(&channel), SIDE, &Limits::default()));
+}
+
+/// A channel that goes with the classes but in `noise` per thousand of the cells.
+#[divan::bench(args = [0, 20])]
+fn encode_by_class(bencher: Bencher, noise: u32) {
+    let (Cells::U8(class), Cells::U8(noisy)) = (scene(0), scene(noise)) else { unreachable!("scene() gives u8") };
+    let hits: Vec<u8> = noisy.iter().map(|class| 40 * class).collect();
+    let hits = codec::CellsRef::U8(&hits);
+    println!("noise {noise} per thousand: {} bytes", encode_beside(hits, &class, 4, SIDE).payload.len());
+    bencher.counter(ItemsCount::new(SIDE * SIDE)).bench(|| encode_beside(divan::black_box(hits), &class, 4, SIDE));
 }
 
 /// The scene as a layer whose first cell is cell (`first_ix`, 0) of the world.

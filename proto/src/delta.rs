@@ -2,21 +2,21 @@
 //!
 //! In: two whole layers, or a delta and the map it stands on. Out: the delta, or the cells it leads to.
 //!
-//! Every cell is predicted to be what the cell of the same place was: in a radial grid the one of the same row and
-//! column, in a Cartesian one the one of the same number, so that a grid may scroll by whole cells, grow and shrink;
-//! `unknown` where the base has none. The differences go through the same encodings as cells do: mostly 0, they make
-//! long runs. The CRC is of the cells that come out, so what is put on a wrong base is refused and never a wrong cell.
+//! The base of a cell is what the cell of the same place was: in a radial grid the one of the same row and column, in a
+//! Cartesian one the one of the same number, so that a grid may scroll by whole cells, grow and shrink; `unknown` where
+//! there was none. Channels whose changes from that are no smaller are as in a whole layer. The CRC is of the cells that
+//! come out, so what is put on a wrong base is refused and never a wrong cell.
 
-use crate::codec::{Cells, encode_grid};
-use crate::decode::{Limits, check_crc, decode_differences};
+use crate::changes::encode_changes;
+use crate::codec::Cells;
+use crate::decode::Limits;
 use crate::grid::Grid;
 use crate::map::{Layer, Map, MapError, MapId, decode_layer};
-use crate::predicted::{differences, sums};
 use crate::v1;
 use prost::Message;
 
-/// `new` as its difference from `base`, a layer of the map `base_sequence` of the same vehicle and boot id; both whole.
-/// The same layers make the same bytes.
+/// `new` as what has changed since `base`, a layer of the map `base_sequence` of the same vehicle and boot id; both
+/// whole. The same layers make the same bytes.
 ///
 /// `None` where `new` has to be sent whole: the grids or channels are not of one kind, a layer is not whole or not
 /// within the limits, or the delta is not smaller.
@@ -27,16 +27,32 @@ pub fn encode_delta(base: &v1::Layer, base_sequence: u64, new: &v1::Layer, limit
         return None;
     }
     let shift = Shift::new(&old, &decoded.grid).ok()?;
+    let columns = decoded.grid.shape().1 as usize;
     let mut delta = v1::Layer { base_sequence: Some(base_sequence), ..new.clone() };
+    if old.legend == new.legend {
+        delta.legend.clear();
+    }
     for (channel, now) in delta.channels.iter_mut().zip(&decoded.channels) {
         let before =
             old.channel(&now.name).filter(|before| (before.scale, before.unknown) == (now.scale, now.unknown))?;
-        let differences = differences(shift.predicted(&before.cells, now.unknown), &now.cells)?;
-        let encoded = encode_grid(differences.as_ref(), decoded.grid.shape().1 as usize);
-        (channel.encoding, channel.payload) = (encoded.encoding.into(), encoded.payload);
-        channel.by_class.clear();
+        let changes = changes(shift.shifted(&before.cells, now.unknown), &now.cells, columns)?;
+        if changes.len() < channel.payload.len() + channel.by_class.len() {
+            (channel.encoding, channel.payload) = (v1::Encoding::Changes.into(), changes.into());
+            channel.by_class.clear();
+        }
     }
-    (delta.encoded_len() < new.encoded_len()).then_some(delta)
+    let stands_on_base = delta.channels.iter().zip(&new.channels).any(|(channel, whole)| channel != whole);
+    (stands_on_base && delta.encoded_len() < new.encoded_len()).then_some(delta)
+}
+
+/// `None` for cells of two types.
+fn changes(base: Cells, cells: &Cells, columns: usize) -> Option<Vec<u8>> {
+    Some(match (base, cells) {
+        (Cells::U8(base), Cells::U8(cells)) => encode_changes(cells, base, columns),
+        (Cells::I8(base), Cells::I8(cells)) => encode_changes(cells, base, columns),
+        (Cells::U16(base), Cells::U16(cells)) => encode_changes(cells, base, columns),
+        _ => return None,
+    })
 }
 
 /// The layer of `base` that a layer of the map `id` stands on; `None` for a whole layer.
@@ -51,36 +67,9 @@ pub(crate) fn base_of<'a>(layer: &v1::Layer, id: MapId, base: Option<&'a Map>) -
     base.layer(&layer.name).map(Some).ok_or_else(|| MapError::NoBase { layer: name(), base_sequence })
 }
 
-/// The cells of one channel of a delta. Whether the base fits is known before any cell is made; the CRC, of the cells
-/// that come out, after.
-pub(crate) fn decode_on(
-    base: &Layer,
-    grid: &Grid,
-    layer: &str,
-    channel: &v1::Channel,
-    limits: &Limits,
-) -> Result<Cells, MapError> {
-    let misfit = |what: String| MapError::BaseShape { layer: layer.to_owned(), what };
-    let wrong = |source| MapError::Cells { layer: layer.to_owned(), channel: channel.name.clone(), source };
-    let shift = Shift::new(base, grid).map_err(misfit)?;
-    let name = &channel.name;
-    let before = base.channel(name).ok_or_else(|| misfit(format!("channel {name:?} is not in the base")))?;
-    let [here, there] = [channel.cell_type, before.cells.as_ref().cell_type().into()];
-    if here != there {
-        return Err(misfit(format!("channel {name:?} has cell type {here}; in the base {there}")));
-    }
-    if !channel.by_class.is_empty() {
-        return Err(misfit(format!("channel {name:?} is told by class too")));
-    }
-    let differences = decode_differences(channel, limits).map_err(wrong)?;
-    let cells = sums(shift.predicted(&before.cells, channel.unknown), &differences);
-    let cells = cells.ok_or_else(|| misfit(format!("channel {name:?} has cells of another type in the base")))?;
-    check_crc(channel, &cells).map_err(wrong)?;
-    Ok(cells)
-}
-
 /// Where the cells of a grid lie in the grid of its base.
-struct Shift {
+pub(crate) struct Shift<'a> {
+    base: &'a Layer,
     /// (rows, columns) of the base.
     from: [i128; 2],
     /// (rows, columns) of the grid.
@@ -89,9 +78,9 @@ struct Shift {
     by: [i128; 2],
 }
 
-impl Shift {
+impl<'a> Shift<'a> {
     /// `Err` says why no cell of the base tells anything of a cell of the grid.
-    fn new(base: &Layer, grid: &Grid) -> Result<Self, String> {
+    pub(crate) fn new(base: &'a Layer, grid: &Grid) -> Result<Self, String> {
         let by = match (&base.grid, grid) {
             (
                 Grid::Radial { r_bench_m: before, columns: columns_before },
@@ -114,19 +103,29 @@ impl Shift {
             _ => return Err("one grid is radial, the other Cartesian".into()),
         };
         let shape = |grid: &Grid| <[u32; 2]>::from(grid.shape()).map(i128::from);
-        Ok(Self { from: shape(&base.grid), to: shape(grid), by })
+        Ok(Self { base, from: shape(&base.grid), to: shape(grid), by })
     }
 
-    /// What the base predicts of every cell.
-    fn predicted(&self, base: &Cells, unknown: i32) -> Cells {
+    /// What the changes of a channel change. `Err` says what the base has not.
+    pub(crate) fn base_of(&self, channel: &v1::Channel) -> Result<Cells, String> {
+        let name = &channel.name;
+        let before = self.base.channel(name).ok_or_else(|| format!("channel {name:?} is not in the base"))?;
+        let [here, there] = [channel.cell_type, before.cells.as_ref().cell_type().into()];
+        if here != there {
+            return Err(format!("channel {name:?} has cell type {here}; in the base {there}"));
+        }
+        Ok(self.shifted(&before.cells, channel.unknown))
+    }
+
+    fn shifted(&self, base: &Cells, unknown: i32) -> Cells {
         match base {
-            Cells::U8(base) => Cells::U8(self.shifted(base, unknown as u8)),
-            Cells::I8(base) => Cells::I8(self.shifted(base, unknown as i8)),
-            Cells::U16(base) => Cells::U16(self.shifted(base, unknown as u16)),
+            Cells::U8(base) => Cells::U8(self.cells(base, unknown as u8)),
+            Cells::I8(base) => Cells::I8(self.cells(base, unknown as i8)),
+            Cells::U16(base) => Cells::U16(self.cells(base, unknown as u16)),
         }
     }
 
-    fn shifted<T: Copy>(&self, base: &[T], unknown: T) -> Vec<T> {
+    fn cells<T: Copy>(&self, base: &[T], unknown: T) -> Vec<T> {
         let [rows, columns] = self.to.map(|cells| cells as usize);
         let mut cells = vec![unknown; rows * columns];
         // The rows and columns of the grid that the base has too.

@@ -2,10 +2,13 @@
 //!
 //! [`v1`] holds the generated protobuf and gRPC types, [`DESCRIPTORS`] their descriptor set (for reflection and for
 //! the schemas in recordings), [`codec`] the cells of a channel to bytes and back, [`grid`] where cells lie, [`map`] a
-//! whole map's bytes to checked values, [`delta`] a layer as what changed, [`predicted`] cells as what differs from a
-//! prediction, [`region`] the part of a layer about a place, [`packed`] a scan's lists of numbers to bytes and back,
+//! whole map's bytes to checked values, [`delta`] a layer as what changed, [`by_class`] a channel as what is otherwise than
+//! its class says, [`region`] the part of a layer about a place, [`packed`] a scan's lists of numbers to bytes and back,
 //! [`safe_points`] a layer's points.
 
+mod bits;
+pub mod by_class;
+mod changes;
 pub mod codec;
 mod decode;
 pub mod delta;
@@ -13,7 +16,6 @@ pub mod grid;
 pub mod map;
 pub mod packed;
 mod parts;
-pub mod predicted;
 pub mod region;
 mod rows;
 pub mod safe_points;

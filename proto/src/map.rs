@@ -11,10 +11,11 @@ use std::collections::BTreeMap;
 use bytes::Bytes;
 use prost::Message;
 
-use crate::codec::{Cells, DecodeError, Limits, decode};
+use crate::codec::{Cells, DecodeError, Limits};
+use crate::decode::{check_count, decode_on};
+use crate::delta::{self, Shift};
 use crate::grid::Grid;
-use crate::predicted::{Misfit, decode_beside};
-use crate::{delta, parts, safe_points, v1};
+use crate::{by_class, parts, safe_points, v1};
 
 /// The bytes of a map with this header and no layer yet.
 pub fn encode_header(header: &v1::Header) -> Bytes {
@@ -383,32 +384,43 @@ fn check_unique<'a>(what: &'static str, names: impl Iterator<Item = &'a String>)
 }
 
 /// `base`: the layer that a delta stands on.
-pub(crate) fn decode_layer(layer: v1::Layer, base: Option<&Layer>, limits: &Limits) -> Result<Layer, MapError> {
+pub(crate) fn decode_layer(mut layer: v1::Layer, base: Option<&Layer>, limits: &Limits) -> Result<Layer, MapError> {
     let grid = Grid::from_wire(&layer)?;
     check_unique("channel", layer.channels.iter().map(|channel| &channel.name))?;
-    let expected = grid.cell_count();
-    let classes = layer.legend.len();
-    let mut channels = Vec::with_capacity(layer.channels.len());
+    let shift = match (layer.base_sequence, base) {
+        (None, _) => None,
+        (Some(base_sequence), None) => return Err(MapError::NoBase { layer: layer.name, base_sequence }),
+        (Some(_), Some(base)) => {
+            if layer.legend.is_empty() {
+                layer.legend.clone_from(&base.legend);
+            }
+            let misfit = |what| MapError::BaseShape { layer: layer.name.clone(), what };
+            Some(Shift::new(base, &grid).map_err(misfit)?)
+        }
+    };
+    let (expected, columns) = (grid.cell_count(), grid.shape().1 as usize);
+    let mut channels: Vec<Channel> = Vec::with_capacity(layer.channels.len());
     for channel in &layer.channels {
-        let (base_sequence, layer, name) = (layer.base_sequence, layer.name.clone(), channel.name.clone());
+        let names = || (layer.name.clone(), channel.name.clone());
+        let wrong = |source| MapError::Cells { layer: layer.name.clone(), channel: channel.name.clone(), source };
         if u64::from(channel.cell_count) != expected {
+            let (layer, name) = names();
             return Err(MapError::CellCount { layer, channel: name, cell_count: channel.cell_count, expected });
         }
-        let cells = match (base_sequence, base) {
-            (None, _) if channel.by_class.is_empty() => {
-                decode(channel, limits).map_err(|source| MapError::Cells { layer, channel: name.clone(), source })?
-            }
-            (None, _) => {
-                let class = channels.iter().find(|channel: &&Channel| channel.name == "class");
-                let told = decode_beside(channel, class.map(|class| &class.cells), classes, limits);
-                told.map_err(|misfit| match misfit {
-                    Misfit::Classes(what) => MapError::ByClass { layer, channel: name.clone(), what },
-                    Misfit::Cells(source) => MapError::Cells { layer, channel: name.clone(), source },
-                })?
-            }
-            (Some(_), Some(base)) => delta::decode_on(base, &grid, &layer, channel, limits)?,
-            (Some(base_sequence), None) => return Err(MapError::NoBase { layer, base_sequence }),
+        check_count(channel, limits).map_err(wrong)?;
+        let base = if !channel.by_class.is_empty() {
+            let class = channels.iter().find(|channel| channel.name == "class").map(|class| &class.cells);
+            Some(by_class::base(channel, class, layer.legend.len()).map_err(|what| {
+                let (layer, channel) = names();
+                MapError::ByClass { layer, channel, what }
+            })?)
+        } else if let (Some(shift), v1::Encoding::Changes) = (&shift, channel.encoding()) {
+            let misfit = |what| MapError::BaseShape { layer: layer.name.clone(), what };
+            Some(shift.base_of(channel).map_err(misfit)?)
+        } else {
+            None
         };
+        let (name, cells) = (channel.name.clone(), decode_on(channel, columns, base).map_err(wrong)?);
         let v1::Channel { unit, scale, unknown, .. } = channel;
         channels.push(Channel { name, unit: unit.clone(), scale: *scale, unknown: *unknown, cells });
     }

@@ -9,10 +9,10 @@
 
 use std::f64::consts::{PI, TAU};
 
+use crate::by_class::encode_beside;
 use crate::codec::{Cells, CellsRef, Limits, encode_grid};
 use crate::grid::{Grid, turned};
 use crate::map::{Channel, MapError, decode_layer};
-use crate::predicted::encode_beside;
 use crate::v1;
 
 /// Why a layer has no such part.

@@ -10,7 +10,7 @@ use clearway_proto::map::{self, Map, MapError, decode_map, decode_map_on};
 use clearway_proto::region::{self, RegionError};
 use clearway_proto::v1;
 use clearway_proto::v1::layer::Geometry;
-use common::{assert_golden, golden, hex, pretty};
+use common::{assert_golden, bless, hex, pretty};
 use proptest::prelude::*;
 use prost::Message;
 use serde_json::json;
@@ -118,11 +118,11 @@ proptest! {
                 Ok(map) => prop_assert!(given == stands_on && map == whole),
                 Err(refused) => prop_assert!(given != stands_on && refused.name() == "other_base", "{refused}"),
             }
-            // The same under a false name: the CRC tells.
+            // The same under a false name: its cells tell.
             let foreign = open(stands_on, &at(given), None).unwrap();
             match open(6, &delta, Some(&foreign)) {
                 Ok(map) => prop_assert_eq!(&map, &whole),
-                Err(refused) => prop_assert!(given != stands_on && ["crc", "class"].contains(&refused.name()), "{refused}"),
+                Err(refused) => prop_assert!(given != stands_on && ["cells", "class"].contains(&refused.name()), "{refused}"),
             }
         }
     }
@@ -236,6 +236,25 @@ fn the_golden_delta_on_its_base_is_the_golden_whole() {
     assert_eq!(opened, decode_map(whole.into(), &LIMITS()).unwrap());
 }
 
+/// (name, expected error, bytes): the golden delta with one thing wrong.
+fn spoilt_deltas() -> [(&'static str, &'static str, Vec<u8>); 4] {
+    type Spoil = fn(&mut v1::Layer);
+    let spoils: [(&str, &str, Spoil); 4] = [
+        ("more_cells_than_the_grid", "cell_count", |layer| layer.channels[0].cell_count += 1),
+        ("of_2_32_cells", "too_many_cells", |layer| {
+            (cartesian(layer).width, cartesian(layer).height) = (u32::MAX, 1);
+            layer.channels.iter_mut().for_each(|channel| channel.cell_count = u32::MAX);
+        }),
+        ("payload_cut", "cells", |layer| layer.channels[1].payload.truncate(9)),
+        ("crc_of_something_else", "cells", |layer| layer.channels[2].crc32 ^= 1),
+    ];
+    spoils.map(|(name, error, spoil)| {
+        let mut layers = golden_delta();
+        spoil(&mut layers[0]);
+        (name, error, golden_map(42, &layers))
+    })
+}
+
 #[test]
 fn a_delta_without_its_base_or_on_one_that_does_not_fit_is_refused_by_name() {
     type Spoil = fn(&mut v1::Header, &mut [v1::Layer; 2]);
@@ -245,22 +264,24 @@ fn a_delta_without_its_base_or_on_one_that_does_not_fit_is_refused_by_name() {
         ("base_of_another_vehicle", "other_base", |header, _| header.vehicle = "beta".into()),
         ("base_without_the_layer", "no_base", |_, [layer, _]| layer.name = "terrain".into()),
         ("base_of_smaller_cells", "base_shape", |_, [layer, _]| cartesian(layer).cell_m = 0.25),
-        ("base_of_another_kind", "base_shape", |_, [layer, rings]| {
-            layer.geometry = radial(layer.clone(), benches(rings)).geometry
+        ("base_of_another_kind", "base_shape", |_, [layer, _]| {
+            let r_bench_m = (1..21).map(|bench| bench as f32).collect();
+            layer.geometry = radial(layer.clone(), r_bench_m).geometry
         }),
         ("base_of_other_benches", "base_shape", |_, [_, rings]| {
             *rings = radial(rings.clone(), vec![1.0, 5.0, 6.0, 9.0, 11.0])
         }),
         ("base_of_other_columns", "base_shape", |_, [_, rings]| {
-            *rings = radial(rings.clone(), vec![2.0, 5.0, 6.0, 9.0])
+            let wider = layer(6, 1, [0, 0], [30, 5]);
+            *rings = v1::Layer { name: "drivability".into(), ..radial(wider, benches(rings)) };
         }),
         ("base_without_the_channel", "base_shape", |_, [layer, _]| layer.channels.truncate(1)),
         ("base_of_another_type", "base_shape", |_, [layer, _]| {
             layer.channels[2] = v1::Channel { name: "hits".into(), ..layer.channels[0].clone() };
         }),
-        ("base_scrolled", "crc", |_, [layer, _]| cartesian(layer).first_ix += 1),
-        ("base_far_away", "crc", |_, [layer, _]| cartesian(layer).first_iy = i64::MIN),
-        ("base_of_other_cells", "crc", |_, [layer, _]| layer.channels[1] = golden_layers(4)[0].channels[1].clone()),
+        ("base_scrolled", "cells", |_, [layer, _]| cartesian(layer).first_ix += 1),
+        ("base_far_away", "cells", |_, [layer, _]| cartesian(layer).first_iy = i64::MIN),
+        ("base_of_other_cells", "cells", |_, [layer, _]| layer.channels[1] = golden_layers(4)[0].channels[1].clone()),
     ];
     let delta = golden_map(42, &golden_delta());
     let mut vectors = Vec::new();
@@ -278,20 +299,8 @@ fn a_delta_without_its_base_or_on_one_that_does_not_fit_is_refused_by_name() {
         refuse(name, error, Some(&base.encode_to_vec()), &delta);
     }
     let base = golden_map(41, &golden_layers(1));
-    type SpoilDelta = fn(&mut v1::Layer);
-    let spoils: [(&str, &str, SpoilDelta); 4] = [
-        ("more_cells_than_the_grid", "cell_count", |layer| layer.channels[0].cell_count += 1),
-        ("of_2_32_cells", "too_many_cells", |layer| {
-            (cartesian(layer).width, cartesian(layer).height) = (u32::MAX, 1);
-            layer.channels.iter_mut().for_each(|channel| channel.cell_count = u32::MAX);
-        }),
-        ("payload_cut", "truncated", |layer| layer.channels[1].payload.truncate(9)),
-        ("crc_of_something_else", "crc", |layer| layer.channels[2].crc32 ^= 1),
-    ];
-    for (name, error, spoil) in spoils {
-        let mut layers = golden_delta();
-        spoil(&mut layers[0]);
-        refuse(name, error, Some(&base), &golden_map(42, &layers));
+    for (name, error, delta) in spoilt_deltas() {
+        refuse(name, error, Some(&base), &delta);
     }
     assert_eq!(decode_map(delta.into(), &LIMITS()).unwrap_err().name(), "no_base");
     assert_golden("bad_deltas.json", &pretty(&json!(vectors)));
@@ -325,9 +334,9 @@ fn what_has_no_smaller_delta_or_is_not_comparable_is_sent_whole() {
     let mut finer = at(1);
     finer.channels[1].scale *= 0.5;
     assert_eq!(delta(&finer, &at(2)), None, "steps of another height say something else");
-    let rings = |layer: v1::Layer, last| radial(layer, vec![2.0, 5.0, 6.0, 9.0, last]);
-    assert!(delta(&rings(at(1), 11.0), &rings(at(2), 11.0)).is_some());
-    assert_eq!(delta(&rings(at(1), 11.0), &rings(at(2), 12.0)), None);
+    let rings = |time, last| radial(layer(9, time, [0, 0], [120, 5]), vec![2.0, 5.0, 6.0, 9.0, last]);
+    assert!(delta(&rings(1, 11.0), &rings(2, 11.0)).is_some());
+    assert_eq!(delta(&rings(1, 11.0), &rings(2, 12.0)), None);
 }
 
 #[test]
@@ -390,13 +399,12 @@ fn a_part_is_a_base_for_the_same_part_of_the_next_map() {
 #[test]
 fn the_fuzz_corpus_of_deltas_decodes_on_the_golden_base_or_is_refused() {
     let corpus = concat!(env!("CARGO_MANIFEST_DIR"), "/fuzz/corpus/decode_delta");
-    let read = |file: &str| std::fs::read(golden(file)).unwrap();
-    if std::env::var_os("CLEARWAY_BLESS").is_some() {
-        let delta = read("delta.bin");
-        let seeds = [("golden", &delta[..]), ("whole", &read("delta_whole.bin")), ("cut", &delta[..300])];
-        seeds.iter().for_each(|(name, seed)| std::fs::write(format!("{corpus}/{name}"), seed).unwrap());
-    }
-    let base = decode_map(read("delta_base.bin").into(), &LIMITS()).unwrap();
+    let delta = golden_map(42, &golden_delta());
+    let cut = delta[..delta.len() / 2].to_vec();
+    let seeds = [("cut", cut), ("whole", golden_map(42, &golden_layers(2))), ("golden", delta)];
+    bless(corpus, seeds.into_iter().chain(spoilt_deltas().map(|(name, _, delta)| (name, delta))));
+    let base = golden_map(41, &golden_layers(1)).into();
+    let base = decode_map(base, &LIMITS()).unwrap();
     let mut maps = Vec::new();
     for entry in std::fs::read_dir(corpus).unwrap() {
         let path = entry.unwrap().path();

@@ -9,8 +9,9 @@ use std::sync::Arc;
 use bytes::Bytes;
 use clearway_mapping::config::ConfigError;
 use clearway_mapping::pipeline::Pipeline;
-use clearway_proto::codec::{Cells, DecodeError, Limits, decode};
+use clearway_proto::codec::{DecodeError, Limits};
 use clearway_proto::grid::Grid;
+use clearway_proto::map::{Channel, Layer, MapError, decode_map};
 use clearway_proto::v1;
 use prost::Message;
 use serde_json::{Value, json};
@@ -277,33 +278,47 @@ fn first_difference(recorded: &Bytes, made: &Bytes) -> What {
         return field("geometry", &was.geometry, &is.geometry);
     }
     let columns = Grid::from_wire(is).map_or(1, |grid| grid.shape().1.max(1));
+    let (recorded, made) = match (decoded(recorded), decoded(made)) {
+        (Ok(recorded), Ok(made)) => (recorded, made),
+        (was, is) => return field("cells", &was.err(), &is.err()),
+    };
     for (a, b) in was.channels.iter().zip(&is.channels) {
         if a == b {
             continue;
         }
-        match (cells(a), cells(b)) {
-            (Ok(recorded), Ok(made)) => {
-                let differs = (0..recorded.len().min(made.len())).find(|&cell| recorded.get(cell) != made.get(cell));
-                if let Some(cell) = differs {
-                    let (row, column) = (cell as u32 / columns, cell as u32 % columns);
-                    let value = |cells: &Cells| cells.get(cell).unwrap_or_default();
-                    let (recorded, made) = (value(&recorded), value(&made));
-                    return What::Cell { row, column, channel: b.name.clone(), recorded, made };
-                }
-                return field(&format!("channel {}", b.name), a, b);
+        if let (Some(recorded), Some(made)) = (recorded.channel(&a.name), made.channel(&b.name)) {
+            let cells = 0..recorded.cells.len().min(made.cells.len());
+            let value = |of: &Channel, cell: usize| of.cells.get(cell).unwrap_or_default();
+            if let Some(cell) = cells.into_iter().find(|&cell| value(recorded, cell) != value(made, cell)) {
+                let (row, column) = (cell as u32 / columns, cell as u32 % columns);
+                let (recorded, made) = (value(recorded, cell), value(made, cell));
+                return What::Cell { row, column, channel: b.name.clone(), recorded, made };
             }
-            (was, is) => return field(&format!("channel {}", b.name), &was.err(), &is.err()),
         }
+        return field(&format!("channel {}", b.name), a, b);
     }
     field("layer", &was, &is)
 }
 
-/// The cells of a channel, even where its checksum says that they are not those that were encoded.
-fn cells(channel: &v1::Channel) -> Result<Cells, DecodeError> {
-    match decode(channel, &Limits::default()) {
-        Err(DecodeError::Crc { computed, .. }) => {
-            decode(&v1::Channel { crc32: computed, ..channel.clone() }, &Limits::default())
+/// The first layer, even where a checksum says that its cells are not those that were encoded, and without the channels
+/// that cannot be decoded.
+fn decoded(bytes: &Bytes) -> Result<Layer, MapError> {
+    let mut bytes = bytes.clone();
+    loop {
+        let (of, name, source) = match decode_map(bytes.clone(), &Limits::default()) {
+            Err(MapError::Cells { layer, channel, source }) => (layer, channel, source),
+            map => return map.map(|mut map| map.layers.swap_remove(0)),
+        };
+        let mut map = v1::Map::decode(bytes)?;
+        for layer in map.layers.iter_mut().filter(|layer| layer.name == of) {
+            match source {
+                DecodeError::Crc { computed, .. } => {
+                    let channels = layer.channels.iter_mut().filter(|channel| channel.name == name);
+                    channels.for_each(|channel| channel.crc32 = computed);
+                }
+                _ => layer.channels.retain(|channel| channel.name != name),
+            }
         }
-        other => other,
+        bytes = map.encode_to_vec().into();
     }
 }

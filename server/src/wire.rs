@@ -8,9 +8,9 @@ use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
 use clearway_mapping::map::{Cells, Geometry, Layer, Map, SafePoint, SensorState};
+use clearway_proto::by_class::encode_beside;
 use clearway_proto::codec::{self, CellsRef};
 use clearway_proto::map::{encode_header, encode_layer};
-use clearway_proto::predicted::encode_beside;
 use clearway_proto::v1;
 use nalgebra::Isometry3;
 

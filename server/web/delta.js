@@ -1,5 +1,5 @@
-// In: a layer that is a delta, and the opened map it stands on. Out: what predicts its cells, or a Refused error that names
-// why this map is not its base. Format: proto/clearway/v1/map.proto, Layer.base_sequence.
+// In: a layer that is a delta, and the opened map it stands on. Out: what its channels change, or a Refused error that
+// names why this map is not its base. Format: proto/clearway/v1/map.proto, Layer.base_sequence.
 
 import { Refused } from "./codec.js";
 
@@ -15,25 +15,22 @@ export function baseOf(layer, header, base) {
   return before;
 }
 
-// For one channel of a grid: (type of array) -> predicted cells, those of the same place in the base, else unknown.
-export function predictor(layer, grid, before, channel) {
+// What the changes of a channel change: (type of array) -> the cells of the same place in the base, else unknown.
+export function beforehand(layer, grid, before, { name, unknown }) {
   const misfit = (what) => new Refused("base_shape", `layer ${layer}: ${what} than its base has`);
   if (before.grid.kind !== grid.kind) throw misfit("another grid");
   // A number so far from its base's that the grids share nothing is as good as any other.
   const far = 2n ** 32n, clamp = (by) => Number(by > far ? far : by < -far ? -far : by);
-  const by = [0, 1].map((i) => clamp(grid.first[i] - before.grid.first[i]));
-  const spans = [0, 1].map((i) => {
-    const start = Math.min(Math.max(0, -by[i]), grid.shape[i]);
-    return [start, Math.max(start, Math.min(grid.shape[i], before.grid.shape[i] - by[i]))];
-  });
-  const cells_before = before.channels.find(({ name }) => name === channel.name)?.cells;
+  const [down, along] = [0, 1].map((i) => clamp(grid.first[i] - before.grid.first[i]));
+  const [rows, columns] = grid.shape, [rows_before, columns_before] = before.grid.shape;
+  const start = Math.max(0, -along), end = Math.min(columns, columns_before - along);
+  const cells_before = before.channels.find((channel) => channel.name === name)?.cells;
   return (Cells) => {
-    if (!(cells_before instanceof Cells)) throw misfit(`another channel ${channel.name}`);
-    const cells = new Cells(grid.cells).fill(channel.unknown);
-    const [[row_start, row_end], [column_start, column_end]] = spans;
-    for (let row = row_start; row < row_end && column_start < column_end; row++) {
-      const from = (row + by[0]) * before.grid.shape[1] + by[1];
-      cells.set(cells_before.subarray(from + column_start, from + column_end), row * grid.shape[1] + column_start);
+    if (!(cells_before instanceof Cells)) throw misfit(`another channel ${name}`);
+    const cells = new Cells(rows * columns).fill(unknown);
+    for (let row = Math.max(0, -down); row < Math.min(rows, rows_before - down) && start < end; row++) {
+      const from = (row + down) * columns_before + along;
+      cells.set(cells_before.subarray(from + start, from + end), row * columns + start);
     }
     return cells;
   };

@@ -2,7 +2,7 @@
 // was wrong. A map is taken whole or not at all.
 
 import { byClass, decodeChannel, Refused } from "./codec.js";
-import { baseOf, predictor } from "./delta.js";
+import { baseOf, beforehand } from "./delta.js";
 import { gridOf } from "./grid.js";
 import { readMap, readMapUpdate } from "./protobuf.js";
 
@@ -26,17 +26,15 @@ export function openMap(bytes, base = null) {
 }
 
 function openLayer(layer, before) {
-  const grid = gridOf(layer);
+  const grid = gridOf(layer), legend = layer.legend.length || !before ? layer.legend : before.legend;
   let classes = null;
   const channels = layer.channels.map((channel) => {
-    const told = channel.by_class.length > 0;
-    if (told && before) throw new Refused("base_shape", `layer ${layer.name}: ${channel.name} is told by class too`);
-    const predict = told ? byClass(channel, classes, layer.legend) : before && predictor(layer.name, grid, before, channel);
-    const cells = decodeChannel(channel, grid.cells, predict);
+    const told = channel.by_class.length > 0, base = before && beforehand(layer.name, grid, before, channel);
+    const cells = decodeChannel(channel, grid.shape, told ? byClass(channel, classes, legend) : base);
     if (channel.name === "class") {
-      const unnamed = cells.find((cell) => cell < 0 || cell >= layer.legend.length);
+      const unnamed = cells.find((cell) => cell < 0 || cell >= legend.length);
       if (unnamed !== undefined) {
-        throw new Refused("class", `layer ${layer.name}: ${unnamed}; the legend names ${layer.legend.length}`);
+        throw new Refused("class", `layer ${layer.name}: ${unnamed}; the legend names ${legend.length}`);
       }
       classes = cells;
     }
@@ -44,5 +42,5 @@ function openLayer(layer, before) {
     return { name, unit, scale, unknown, cells };
   });
   if (channels.length === 0) throw new Refused("channels", `layer ${layer.name} has none`);
-  return { name: layer.name, legend: layer.legend, grid, channels, figures: layer.figures };
+  return { name: layer.name, legend, grid, channels, figures: layer.figures };
 }

@@ -9,7 +9,7 @@ use std::net::SocketAddr;
 use std::path::Path;
 
 use clearway_mapping::event::Body;
-use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode};
+use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
 use clearway_proto::v1;
 use clearway_server::config::Config;
 use clearway_server::ingest::Reading;
@@ -77,13 +77,15 @@ async fn a_planted_change_is_named_by_sequence_layer_and_cell() {
         }
         let mut map = v1::Map::decode(&data[..]).unwrap();
         let channel = &mut map.layers[0].channels[0];
-        let Cells::U8(mut cells) = decode(channel, &Limits::default()).unwrap() else { panic!("classes are u8") };
+        let Cells::U8(mut cells) = decode(channel, columns, &Limits::default()).unwrap() else {
+            panic!("classes are u8")
+        };
         let cell = &mut cells[row * columns + column];
         let was = *cell;
         *cell = if was == 3 { 1 } else { 3 };
         was_and_is = Some((i32::from(*cell), i32::from(was)));
         let v1::Channel { name, unit, scale, unknown, .. } = channel.clone();
-        *channel = encode(CellsRef::U8(&cells)).into_channel(&name, &unit, scale, unknown);
+        *channel = encode_grid(CellsRef::U8(&cells), columns).into_channel(&name, &unit, scale, unknown);
         Some(map.encode_to_vec())
     });
     let report = verify(&planted).unwrap();

@@ -1,4 +1,5 @@
-//! How many bytes the maps of recorded scans take: of each layer and channel, whole and as a delta to the map before.
+//! How many bytes the maps of recorded and simulated drives take: of each layer and channel, whole and as a delta to the
+//! map before.
 //! `cargo test -p clearway-tests --test sizes -- --nocapture` prints the table.
 
 #![cfg_attr(not(clearway_data), allow(unused))]
@@ -8,14 +9,21 @@ mod house;
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use clearway_mapping::config::MapsConfig;
 use clearway_mapping::event::{Body, EgoPose, Event};
+use clearway_mapping::map::Map;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::codec::Limits;
 use clearway_proto::delta::encode_delta;
 use clearway_proto::v1;
+use clearway_server::config::Config;
+use clearway_server::demo::rig::Rig;
+use clearway_server::ingest::observation::{self, bodies};
 use clearway_server::recording::{Entry, Recording};
 use clearway_server::replay::{Options, replay};
 use clearway_server::wire::EncodedMap;
+use clearway_sim::scenes::{Scene, town};
+use clearway_sim::traffic::street;
 use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion, Vector3};
 use prost::Message;
 
@@ -50,6 +58,13 @@ struct Sized {
     layers: Vec<v1::Layer>,
 }
 
+impl Sized {
+    fn of(map: &Map) -> Self {
+        let bytes = EncodedMap::new(map, "car".into(), 7, 300).select(&[]);
+        Self { message: bytes.len(), layers: v1::Map::decode(bytes).unwrap().layers }
+    }
+}
+
 /// Replays a drive once to learn its events and how its sensor is mounted, then makes its maps with the poses added.
 async fn maps(drive: &Drive) -> Vec<Sized> {
     let folder = tempfile::tempdir().unwrap();
@@ -75,12 +90,37 @@ async fn maps(drive: &Drive) -> Vec<Sized> {
     for (sequence, event) in (0..).zip(with_poses(drive, &file, ahead_ns.expect("a map"), events)) {
         let event = Event { sequence, ..event };
         if let Ok(Some(map)) = pipeline.step(&event) {
-            let encoded = EncodedMap::new(map, "car".into(), 7, 300);
-            let bytes = encoded.select(&[]);
-            made.push(Sized { message: bytes.len(), layers: v1::Map::decode(bytes).unwrap().layers });
+            made.push(Sized::of(map));
         }
     }
     assert!(!made.is_empty(), "{} makes no map", drive.name);
+    made
+}
+
+/// Maps of six units of four planes at 50 Hz on a car that drives through a simulated scene, with its poses.
+fn simulated(scene: Scene, maps: usize) -> Vec<Sized> {
+    const START_NS: i64 = 1_767_270_000_000_000_000;
+    let mut rig = Rig::many(scene, START_NS);
+    rig.scanners.clear();
+    let mut config = Config::of_one_vehicle("car", "ahead");
+    config.vehicles[0].sensors = rig.sensors();
+    let mut vehicle = config.vehicles[0].core();
+    vehicle.maps = MapsConfig { occupancy: vehicle.maps.occupancy, ..MapsConfig::none() };
+    let mut pipeline = Pipeline::new(&vehicle, vec![None; rig.units.len()]).unwrap();
+    let source = |sensor: &str| rig.units.iter().position(|(name, _)| name == sensor).unwrap_or(0) as u16;
+    let mut made = Vec::new();
+    for (sequence, told) in (0..).zip(rig.told()) {
+        let observation = v1::Observation::from(told.observation);
+        let source = source(&observation.sensor);
+        let (_, body) = bodies(observation, &observation::Limits::of_points(1 << 16)).unwrap().remove(0);
+        let event = Event { sequence, arrival_ns: told.stamp_ns + 1_000_000, source, body };
+        if let Ok(Some(map)) = pipeline.step(&event) {
+            made.push(Sized::of(map));
+            if made.len() == maps {
+                break;
+            }
+        }
+    }
     made
 }
 
@@ -134,6 +174,37 @@ impl Table {
         (*sum, *maps) = (*sum + bytes, *maps + 1);
     }
 
+    /// Of each layer and channel, whole and as it is sent to who has the map before.
+    fn of(maps: &[Sized]) -> Self {
+        let mut table = Self::default();
+        for (number, map) in maps.iter().enumerate() {
+            table.add("message".into(), map.message);
+            for layer in &map.layers {
+                table.add_layer(layer, layer, "whole");
+                let Some(before) = number.checked_sub(1) else { continue };
+                let before = maps[before].layers.iter().find(|before| before.name == layer.name).unwrap();
+                let delta = encode_delta(before, 1, layer, &Limits::default());
+                table.add_layer(layer, delta.as_ref().unwrap_or(layer), "sent");
+                table.add(format!("{} sent as a delta, of 1", layer.name), usize::from(delta.is_some()));
+            }
+        }
+        table
+    }
+
+    fn add_layer(&mut self, layer: &v1::Layer, sent: &v1::Layer, how: &str) {
+        self.add(format!("{} {how}", layer.name), sent.encoded_len());
+        for channel in &sent.channels {
+            let bytes = channel.payload.len() + channel.by_class.len();
+            self.add(format!("{}.{} {how}", layer.name, channel.name), bytes);
+        }
+    }
+
+    fn print(&self) {
+        for what in self.0.keys() {
+            println!("    {what}: {:.1}", self.mean(what));
+        }
+    }
+
     fn mean(&self, what: &str) -> f64 {
         self.0.get(what).map_or(f64::NAN, |(sum, maps)| *sum as f64 / *maps as f64)
     }
@@ -145,29 +216,10 @@ async fn maps_of_recorded_scans_are_as_small_as_promised() {
     let mut classes = Table::default();
     for drive in &DRIVES {
         let maps = maps(drive).await;
-        let mut table = Table::default();
-        for (number, map) in maps.iter().enumerate() {
-            table.add("message".into(), map.message);
-            for layer in &map.layers {
-                table.add(format!("{} whole", layer.name), layer.encoded_len());
-                for channel in &layer.channels {
-                    table.add(format!("{}.{} whole", layer.name, channel.name), channel.payload.len());
-                }
-                let Some(before) = number.checked_sub(1) else { continue };
-                let before = maps[before].layers.iter().find(|before| before.name == layer.name).unwrap();
-                let delta = encode_delta(before, 1, layer, &Limits::default());
-                table.add(format!("{} sent", layer.name), delta.as_ref().unwrap_or(layer).encoded_len());
-                table.add(format!("{} sent as a delta, of 1", layer.name), usize::from(delta.is_some()));
-                for channel in &delta.as_ref().unwrap_or(layer).channels {
-                    table.add(format!("{}.{} sent", layer.name, channel.name), channel.payload.len());
-                }
-            }
-        }
+        let table = Table::of(&maps);
         let largest = maps.iter().map(|map| map.message).max().unwrap();
         println!("{}: {} maps, largest message {largest} bytes", drive.name, maps.len());
-        for what in table.0.keys() {
-            println!("    {what}: {:.1}", table.mean(what));
-        }
+        table.print();
         for map in &maps {
             let occupancy = map.layers.iter().find(|layer| layer.name == "occupancy").unwrap();
             let class = occupancy.channels.iter().find(|channel| channel.name == "class").unwrap();
@@ -178,4 +230,20 @@ async fn maps_of_recorded_scans_are_as_small_as_promised() {
     }
     println!("class of occupancy, all maps: {:.0} bytes", classes.mean("all"));
     assert!(classes.mean("hdl64e kitti") <= 7500.0 && classes.mean("all") <= 7500.0);
+}
+
+#[test]
+fn deltas_of_a_simulated_drive_take_no_more_than_half_of_the_maps() {
+    // The first maps, of a car that has seen nothing yet, are no drive.
+    const SEEN: usize = 25;
+    for scene in [street(8.0), town()] {
+        let name = scene.name;
+        let maps = simulated(scene, SEEN + 75);
+        let table = Table::of(&maps[SEEN..]);
+        println!("{name}: {} maps", maps.len() - SEEN);
+        table.print();
+        let share = table.mean("occupancy sent") / table.mean("occupancy whole");
+        println!("{name}: occupancy is sent in {:.1} % of what it takes whole", 100.0 * share);
+        assert!(share <= 0.5, "{name}: {share}");
+    }
 }

@@ -87,10 +87,10 @@ class Layer:
     def __init__(self, message: map_pb2.Layer, base: Layer | None = None) -> None:
         self.name: str = message.name
         self.grid: Grid = _grid(message)
-        #: Cell (row, column) of a delta is predicted by cell (row, column) + shift of the base.
+        #: Cell (row, column) of a delta changes cell (row, column) + shift of the base.
         self._shift = _shift(message.name, base.grid, self.grid) if base else (0, 0)
         #: Names of the values of the channel `class`; entry 0 is `unknown`.
-        self.legend: tuple[str, ...] = tuple(message.legend)
+        self.legend: tuple[str, ...] = tuple(message.legend) or (base.legend if base else ())
         self.channels: dict[str, Channel] = {}
         for channel in message.channels:
             if channel.name in self.channels:
@@ -158,40 +158,24 @@ class Layer:
         if message.cell_count != rows * columns:
             text = f"channel {message.name!r} has {message.cell_count} cells; the grid has {rows * columns}"
             raise DecodeError("cell_count", text)
-        predict = None if base is None else lambda dtype: self._predicted(message, base, dtype)
+        make_base = None
         if message.by_class:
-            if base is not None:
-                raise DecodeError("base_shape", f"layer {self.name!r}: {message.name!r} is told by class too")
-            predict = lambda dtype: self._by_class(message, dtype)  # noqa: E731
-        raw = codec.decode(message, predict=predict).reshape(rows, columns)
+            if message.encoding != map_pb2.ENCODING_CHANGES or "class" not in self.channels:
+                text = f"layer {self.name!r}: {message.name!r} without changes, or without a channel 'class' before it"
+                raise DecodeError("by_class", text)
+            classes = self.channels["class"].raw
+            make_base = lambda dtype: codec.by_class(message, classes, len(self.legend), dtype)  # noqa: E731
+        elif base is not None:
+            make_base = lambda dtype: self._before(message, base, dtype)  # noqa: E731
+        raw = codec.decode(message, columns, make_base)
         raw.flags.writeable = False
         return Channel(message.name, message.unit, message.scale, message.unknown, raw)
 
-    def _by_class(self, message: map_pb2.Channel, dtype: np.dtype) -> np.ndarray:
-        classes = self.channels.get("class")
-        if classes is None or classes.raw.dtype != np.uint8:
-            raise DecodeError("by_class", f"layer {self.name!r}: no channel 'class' of u8 before {message.name!r}")
-        length = len(self.legend) * dtype.itemsize
-        if len(message.by_class) != length or classes.raw.max(initial=0) >= len(self.legend):
-            text = f"{len(message.by_class)} bytes by class; {length} are needed, and no class beyond"
-            raise DecodeError("by_class", f"layer {self.name!r}, channel {message.name!r}: {text}")
-        return np.frombuffer(message.by_class, dtype)[classes.raw].reshape(-1)
-
-    def _predicted(self, message: map_pb2.Channel, base: Layer, dtype: np.dtype) -> np.ndarray:
+    def _before(self, message: map_pb2.Channel, base: Layer, dtype: np.dtype) -> np.ndarray:
         before = base.channels.get(message.name)
         if before is None or before.raw.dtype != dtype:
             raise DecodeError("base_shape", f"layer {self.name!r}: the base has no such channel {message.name!r}")
-        cells = np.full(self.grid.shape, np.int64(message.unknown).astype(dtype), dtype)
-        # The rows and columns of this grid that the base has too.
-        spans = []
-        for size, size_before, by in zip(self.grid.shape, base.grid.shape, self._shift):
-            start = min(max(0, -by), size)
-            spans.append((start, max(start, min(size, size_before - by)), by))
-        here = tuple(slice(start, end) for start, end, _ in spans)
-        there = tuple(slice(start + by, end + by) for start, end, by in spans)
-        if all(start < end for start, end, _ in spans):
-            cells[here] = before.raw[there]
-        return cells.ravel()
+        return codec.shifted(before.raw, self.grid.shape, self._shift, message.unknown)
 
     def _points(self, packed: map_pb2.SafePoints) -> Iterator[SafePoint]:
         """The differences summed up; at most `POINTS_MAX` points."""

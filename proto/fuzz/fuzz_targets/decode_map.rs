@@ -2,7 +2,7 @@
 #![no_main]
 
 use bytes::Bytes;
-use clearway_proto::codec::{Limits, encode};
+use clearway_proto::codec::{Limits, encode_grid};
 use clearway_proto::map::decode_map;
 use libfuzzer_sys::fuzz_target;
 
@@ -11,7 +11,7 @@ fuzz_target!(|bytes: &[u8]| {
         for layer in &map.layers {
             layer.class_at(3.0, -4.0);
             for channel in &layer.channels {
-                let encoded = encode(channel.cells.as_ref());
+                let encoded = encode_grid(channel.cells.as_ref(), layer.grid.shape().1 as usize);
                 assert_eq!(u64::from(encoded.cell_count), layer.grid.cell_count());
             }
         }

@@ -19,6 +19,13 @@ pub fn assert_golden(file: &str, made: &[u8]) {
     assert!(stored == made, "{file} differs from what the encoder makes; CLEARWAY_BLESS=1 writes it anew");
 }
 
+/// Writes seeds of a fuzz corpus, when asked to bless.
+pub fn bless(corpus: &str, seeds: impl IntoIterator<Item = (&'static str, Vec<u8>)>) {
+    if std::env::var_os("CLEARWAY_BLESS").is_some() {
+        seeds.into_iter().for_each(|(name, seed)| std::fs::write(format!("{corpus}/{name}"), seed).unwrap());
+    }
+}
+
 pub fn pretty(value: &Value) -> Vec<u8> {
     let mut text = serde_json::to_string_pretty(value).unwrap();
     text.push('\n');
