@@ -50,8 +50,10 @@ fn equal<T: Cell>(cells: &[T], others: &[T]) -> usize {
     at + cells[at..].iter().zip(&others[at..]).take_while(|(cell, other)| cell == other).count()
 }
 
-/// The way back, which refuses what [`encode_rows`] would not have written.
+/// The way back, which refuses what [`encode_rows`] would not have written. A payload that does not tell `count` cells
+/// is refused before there is room for one.
 pub(crate) fn decode_rows<T: Cell>(payload: &[u8], count: usize, columns: usize) -> Result<Vec<T>, DecodeError> {
+    check_lengths::<T>(payload, count)?;
     let mut bits = BitReader::new(payload);
     let mut cells: Vec<T> = Vec::with_capacity(count);
     let above = |cells: &[T]| cells.len().checked_sub(columns).map_or(T::default(), |above| cells[above]);
@@ -97,6 +99,24 @@ pub(crate) fn decode_rows<T: Cell>(payload: &[u8], count: usize, columns: usize)
     }
     bits.finish()?;
     Ok(cells)
+}
+
+/// Whether a payload holds numbers and values of so many cells, and nothing else.
+fn check_lengths<T: Cell>(payload: &[u8], count: usize) -> Result<(), DecodeError> {
+    let (mut bits, mut cells) = (BitReader::new(payload), 0);
+    while cells < count {
+        let offset = bits.offset();
+        cells += fits(bits.number()?, count - cells, offset)?;
+        if cells == count {
+            break;
+        }
+        if !bits.bit()? {
+            bits.cell::<T>(None)?;
+        }
+        let offset = bits.offset();
+        cells += fits(bits.number()? + 1, count - cells, offset)?;
+    }
+    bits.finish()
 }
 
 fn fits(length: u64, left: usize, offset: usize) -> Result<usize, DecodeError> {

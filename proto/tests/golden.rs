@@ -125,12 +125,12 @@ fn bad_vectors() -> Vec<Bad> {
         ("rows_i8_zigzag_256", "ValueTooLarge", i8_, rows, 9, vec![0b1000_0000, 0b0010_0000, 0b0010_0010, 0b0100_0000]),
         // The same with 65536.
         ("rows_u16_65536", "ValueTooLarge", u16_, rows, 9, vec![0x80, 0, 0x20, 0, 0x60]),
-        // Copy 0 (1), another value (0), which is 0 (1): the same as before the first row.
-        ("rows_value_as_a_row_before", "Repeated", u8_, rows, 9, vec![0b1011_0000, 0]),
-        // Copy 0, value 1 (0 010), a run of 1 (1); copy 0, value 1.
-        ("rows_run_goes_on", "Repeated", u8_, rows, 9, vec![0b1001_0110, 0b0101_0000]),
-        // Copy 0, as the cell before: there is none.
-        ("rows_first_cell_as_the_one_before", "NothingBefore", u8_, rows, 9, vec![0b1100_0000]),
+        // Copy 0 (1), another value (0), which is 0 (1): the same as before the first row; a run of 9 (0001001).
+        ("rows_value_as_a_row_before", "Repeated", u8_, rows, 9, vec![0b1010_0010, 0b0100_0000]),
+        // Copy 0, value 1 (0 010), a run of 1 (1); copy 0, value 1, a run of 8 (0001000).
+        ("rows_run_goes_on", "Repeated", u8_, rows, 9, vec![0b1001_0110, 0b0100_0010, 0]),
+        // Copy 0, as the cell before: there is none; a run of 9.
+        ("rows_first_cell_as_the_one_before", "NothingBefore", u8_, rows, 9, vec![0b1100_0100, 0b1000_0000]),
         // Copy 10 (0001011) of 9 cells.
         ("rows_copy_too_long", "RunTooLong", u8_, rows, 9, vec![0b0001_0110]),
         // Copy 0, value 1 (0 010), a run of 10 (0001010).
