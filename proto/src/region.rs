@@ -4,12 +4,15 @@
 //!
 //! A Cartesian grid keeps the smallest rectangle of its cells that holds the region; where it turns under the vehicle,
 //! that of the turned region. A radial grid keeps the rows from the vehicle to the region's farthest corner, with all
-//! columns. Planes, figures, legend and safe points stay whole: they tell of the layer, not of its cells.
+//! columns: those cells of them are unknown whose ring or sector has nothing of the region. Planes, figures, legend and
+//! safe points stay whole: they tell of the layer, not of its cells.
+
+use std::f64::consts::{PI, TAU};
 
 use crate::by_class::encode_beside;
 use crate::codec::{Cells, CellsRef, Limits, encode_grid};
 use crate::grid::{Grid, turned};
-use crate::map::{MapError, decode_layer};
+use crate::map::{Channel, MapError, decode_layer};
 use crate::v1;
 
 /// Why a layer has no such part.
@@ -53,15 +56,16 @@ pub fn check(region: &v1::Region) -> Result<(), RegionError> {
 pub fn crop(layer: &v1::Layer, region: &v1::Region, limits: &Limits) -> Result<v1::Layer, RegionError> {
     check(region)?;
     let decoded = decode_layer(layer.clone(), None, limits)?;
-    let [rows, columns] = part(&decoded.grid, region).ok_or_else(|| RegionError::Outside {
+    let part = Part::of(&decoded.grid, region).ok_or_else(|| RegionError::Outside {
         layer: layer.name.clone(),
         region: *region,
         range_m_max: decoded.grid.range_m_max(),
     })?;
-    let columns_before = decoded.grid.shape().1 as usize;
-    if rows.len() * columns.len() == decoded.grid.cell_count() as usize {
+    let shape = <[u32; 2]>::from(decoded.grid.shape()).map(|cells| cells as usize);
+    if part.is_all_of(shape) {
         return Ok(layer.clone());
     }
+    let Part { rows, columns, .. } = &part;
     let mut cropped = layer.clone();
     match &mut cropped.geometry {
         Some(v1::layer::Geometry::Radial(grid)) => grid.r_bench_m.truncate(rows.len()),
@@ -74,9 +78,9 @@ pub fn crop(layer: &v1::Layer, region: &v1::Region, limits: &Limits) -> Result<v
         }
         None => {}
     }
-    let class = decoded.channel("class").map(|class| kept(&class.cells, columns_before, &rows, &columns));
+    let class = decoded.channel("class").map(|class| part.cells(class, shape[1]));
     for (channel, whole) in cropped.channels.iter_mut().zip(&decoded.channels) {
-        let cells = kept(&whole.cells, columns_before, &rows, &columns);
+        let cells = part.cells(whole, shape[1]);
         let encoded = match &class {
             Some(Cells::U8(class)) if channel.name != "class" => {
                 encode_beside(cells.as_ref(), class, layer.legend.len(), columns.len())
@@ -91,39 +95,85 @@ pub fn crop(layer: &v1::Layer, region: &v1::Region, limits: &Limits) -> Result<v
 
 type Span = std::ops::Range<usize>;
 
-/// The rows and columns of a grid that hold a region; `None` where there are none.
-fn part(grid: &Grid, region: &v1::Region) -> Option<[Span; 2]> {
-    let corners = [region.x_from_m, region.x_to_m].map(|x| [region.y_from_m, region.y_to_m].map(|y| (x, y)));
-    let corners = corners.as_flattened();
-    match grid {
-        Grid::Radial { r_bench_m, columns } => {
-            let nearest =
-                region.x_from_m.max(0.0).max(-region.x_to_m).hypot(region.y_from_m.max(0.0).max(-region.y_to_m));
-            let farthest = corners.iter().map(|(x, y)| x.hypot(*y)).fold(0.0, f64::max);
-            let row_at = |range_m: f64| r_bench_m.partition_point(|&outer| f64::from(outer) < range_m);
-            let rows = r_bench_m.len();
-            (row_at(nearest) < rows).then(|| [0..rows.min(row_at(farthest) + 1), 0..*columns as usize])
+/// Where in a grid a region lies.
+struct Part {
+    /// What is kept.
+    rows: Span,
+    columns: Span,
+    /// Of what is kept, what is told: these rows, and these columns, counted on from 0 behind the last.
+    told_rows: Span,
+    told_columns: Span,
+}
+
+impl Part {
+    /// The smallest that holds the region; `None` where it lies outside the grid.
+    fn of(grid: &Grid, region: &v1::Region) -> Option<Self> {
+        let corners = [region.x_from_m, region.x_to_m].map(|x| [region.y_from_m, region.y_to_m].map(|y| (x, y)));
+        let corners = corners.as_flattened();
+        match grid {
+            Grid::Radial { r_bench_m, columns } => {
+                let nearest =
+                    region.x_from_m.max(0.0).max(-region.x_to_m).hypot(region.y_from_m.max(0.0).max(-region.y_to_m));
+                let farthest = corners.iter().map(|(x, y)| x.hypot(*y)).fold(0.0, f64::max);
+                let row_at = |range_m: f64| r_bench_m.partition_point(|&outer| f64::from(outer) < range_m);
+                let rows = r_bench_m.len().min(row_at(farthest) + 1);
+                let told_rows = row_at(nearest)..rows;
+                let told_columns = sectors(region, corners, *columns);
+                let all = Self { rows: 0..rows, columns: 0..*columns as usize, told_rows, told_columns };
+                (!all.told_rows.is_empty()).then_some(all)
+            }
+            Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
+                let along = corners.iter().map(|&(x, y)| <[f64; 2]>::from(turned(x, y, *yaw_rad)));
+                let span = |axis: usize, origin_m: f64, cells: u32| {
+                    let places = along.clone().map(|at| (at[axis] - origin_m) / f64::from(*cell_m));
+                    let (from, to) = places.fold((f64::MAX, f64::MIN), |(from, to), at| (from.min(at), to.max(at)));
+                    let [from, to] = [from.floor(), to.ceil()].map(|at| at.clamp(0.0, f64::from(cells)) as usize);
+                    (from < to).then_some(from..to)
+                };
+                let (rows, columns) = (span(1, *origin_y_m, *height)?, span(0, *origin_x_m, *width)?);
+                Some(Self { told_rows: rows.clone(), told_columns: columns.clone(), rows, columns })
+            }
         }
-        Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
-            let along = corners.iter().map(|&(x, y)| <[f64; 2]>::from(turned(x, y, *yaw_rad)));
-            let span = |axis: usize, origin_m: f64, cells: u32| {
-                let places = along.clone().map(|at| (at[axis] - origin_m) / f64::from(*cell_m));
-                let (from, to) = places.fold((f64::MAX, f64::MIN), |(from, to), at| (from.min(at), to.max(at)));
-                let [from, to] = [from.floor(), to.ceil()].map(|at| at.clamp(0.0, f64::from(cells)) as usize);
-                (from < to).then_some(from..to)
-            };
-            Some([span(1, *origin_y_m, *height)?, span(0, *origin_x_m, *width)?])
+    }
+
+    fn is_all_of(&self, [rows, columns]: [usize; 2]) -> bool {
+        self.told_rows.len() == rows && self.told_columns.len() == columns
+    }
+
+    /// A channel's cells in the part, of a grid with so many columns.
+    fn cells(&self, channel: &Channel, columns_before: usize) -> Cells {
+        match channel.cells.as_ref() {
+            CellsRef::U8(cells) => Cells::U8(self.of_type(cells, columns_before, channel.unknown as u8)),
+            CellsRef::I8(cells) => Cells::I8(self.of_type(cells, columns_before, channel.unknown as i8)),
+            CellsRef::U16(cells) => Cells::U16(self.of_type(cells, columns_before, channel.unknown as u16)),
         }
+    }
+
+    fn of_type<T: Copy>(&self, cells: &[T], columns_before: usize, unknown: T) -> Vec<T> {
+        let told = |row: usize, column: usize| {
+            let columns = &self.told_columns;
+            self.told_rows.contains(&row) && (columns.contains(&column) || columns.contains(&(column + columns_before)))
+        };
+        let all = self.rows.clone().flat_map(|row| self.columns.clone().map(move |column| (row, column)));
+        all.map(|(row, column)| if told(row, column) { cells[row * columns_before + column] } else { unknown })
+            .collect()
     }
 }
 
-fn kept(cells: &Cells, columns_before: usize, rows: &Span, columns: &Span) -> Cells {
-    fn of<T: Copy>(cells: &[T], columns_before: usize, rows: &Span, columns: &Span) -> Vec<T> {
-        rows.clone().flat_map(|row| &cells[row * columns_before..][columns.clone()]).copied().collect()
+/// The columns of a radial grid that have something of a region; those behind the last are counted on.
+fn sectors(region: &v1::Region, corners: &[(f64, f64)], columns: u32) -> Span {
+    let v1::Region { x_from_m, x_to_m, y_from_m, y_to_m } = *region;
+    let count = columns as usize;
+    if x_from_m < 0.0 && x_to_m > 0.0 && y_from_m < 0.0 && y_to_m > 0.0 {
+        return 0..count;
     }
-    match cells.as_ref() {
-        CellsRef::U8(cells) => Cells::U8(of(cells, columns_before, rows, columns)),
-        CellsRef::I8(cells) => Cells::I8(of(cells, columns_before, rows, columns)),
-        CellsRef::U16(cells) => Cells::U16(of(cells, columns_before, rows, columns)),
-    }
+    // The vehicle is not in it, so it lies within half a turn: to both sides of its middle.
+    let middle = (0.5 * (y_from_m + y_to_m)).atan2(0.5 * (x_from_m + x_to_m));
+    let aside = corners.iter().map(|(x, y)| (y.atan2(*x) - middle + PI).rem_euclid(TAU) - PI);
+    let (right, left) = aside.fold((0.0_f64, 0.0_f64), |(right, left), at| (right.min(at), left.max(at)));
+    // What lies on the edge of a sector may be counted to either side: half a nanoradian is nothing, and is enough.
+    let at = |azimuth: f64| (azimuth.rem_euclid(TAU) / TAU * f64::from(columns)) as usize;
+    let from = at(middle + right - 5e-10);
+    let length = (at(middle + left + 5e-10) + count - from) % count + 1;
+    from..from + length
 }

@@ -173,6 +173,31 @@ proptest! {
             }
         }
     }
+
+    #[test]
+    fn a_radial_part_tells_the_region_as_the_whole_does_and_what_lies_beside_it_as_the_whole_or_as_unknown(
+        seed in any::<u64>(), columns in 1..40_u32, from in [-12.0..9.0_f64, -12.0..9.0_f64], size in [0.1..14.0_f64, 0.1..14.0_f64],
+        on_axis in 0..4,
+    ) {
+        // Some with an edge, some with a corner at the vehicle.
+        let from = [0, 1].map(|axis| if on_axis & (1 << axis) == 0 { from[axis] } else { 0.0 });
+        let whole = radial(layer(seed, 1, [0, 0], [columns, 5]), vec![2.0, 5.0, 6.0, 9.0, 11.0]);
+        let wanted = v1::Region { x_from_m: from[0], x_to_m: from[0] + size[0], y_from_m: from[1], y_to_m: from[1] + size[1] };
+        let Ok(part) = region::crop(&whole, &wanted, &LIMITS()) else { return Ok(()) };
+        let (part, all) = (open(1, &part, None).unwrap(), open(1, &whole, None).unwrap());
+        let (part, all) = (&part.layers[0], &all.layers[0]);
+        for step in 0..1000 {
+            let along = |axis: usize, by: i32| from[axis] + size[axis] * f64::from(by) / 39.0;
+            let (x, y) = (along(0, step % 40), along(1, step / 40 * 39 / 24));
+            prop_assert_eq!(part.class_at(x, y), all.class_at(x, y), "at ({}, {})", x, y);
+            prop_assert_eq!(part.value_at("unit_height", x, y), all.value_at("unit_height", x, y));
+        }
+        for (told, known) in part.channels.iter().zip(&all.channels) {
+            for cell in 0..told.cells.len() {
+                prop_assert!(told.value(cell).is_none() || told.value(cell) == known.value(cell), "cell {}", cell);
+            }
+        }
+    }
 }
 
 /// `layer` in rings.
@@ -315,7 +340,7 @@ fn what_has_no_smaller_delta_or_is_not_comparable_is_sent_whole() {
 }
 
 #[test]
-fn a_radial_part_has_the_rows_to_the_farthest_corner_and_all_columns() {
+fn a_radial_part_has_the_rows_to_the_farthest_corner_and_all_columns_of_which_those_beside_it_are_unknown() {
     let rings = radial(layer(2, 1, [0, 0], [24, 5]), vec![2.0, 5.0, 6.0, 9.0, 11.0]);
     let corner = |x_to_m, y_to_m| v1::Region { x_from_m: -1.0, x_to_m, y_from_m: -1.0, y_to_m };
     let part = open(1, &region::crop(&rings, &corner(3.0, 4.0), &LIMITS()).unwrap(), None).unwrap();
@@ -325,6 +350,13 @@ fn a_radial_part_has_the_rows_to_the_farthest_corner_and_all_columns() {
     };
     assert_eq!(whole.layers[0].channels[0].cells, Cells::U8([&class[..], &rest(&whole, 48)].concat()));
     assert_eq!((&part.layers[0].planes, &part.layers[0].figures), (&whole.layers[0].planes, &whole.layers[0].figures));
+    // To the left, from the third ring on: of 24 columns those from 45 to 135 degrees, and nothing of the first two rings.
+    let left = v1::Region { x_from_m: -5.4, x_to_m: 5.4, y_from_m: 5.5, y_to_m: 7.0 };
+    let part = open(1, &region::crop(&rings, &left, &LIMITS()).unwrap(), None).unwrap();
+    let Cells::U8(told) = &part.layers[0].channels[0].cells else { panic!("class of u8") };
+    let all = rest(&whole, 0);
+    let expected = (0..96).map(|cell| if cell / 24 >= 2 && (3..9).contains(&(cell % 24)) { all[cell] } else { 0 });
+    assert_eq!(*told, expected.collect::<Vec<u8>>());
     // All of it: not encoded anew.
     assert_eq!(region::crop(&rings, &corner(99.0, 1.0), &LIMITS()), Ok(rings.clone()));
     let beyond = v1::Region { x_from_m: 8.0, x_to_m: 9.0, y_from_m: -12.0, y_to_m: -8.0 };
@@ -345,18 +377,22 @@ fn rest(map: &Map, from: usize) -> Vec<u8> {
 fn a_part_is_a_base_for_the_same_part_of_the_next_map() {
     // The vehicle turns: the part grows and shrinks by cells, and scrolls.
     let ahead = v1::Region { x_from_m: 0.0, x_to_m: 6.0, y_from_m: -3.0, y_to_m: 3.0 };
-    let mut parts = (0..8).map(|time| {
+    let scrolling = |time: u64| {
         let mut whole = layer(4, time, [time as i64, -3], [60, 60]);
         (cartesian(&mut whole).origin_x_m, cartesian(&mut whole).origin_y_m) = (-15.1, -15.2);
-        region::crop(&whole, &ahead, &LIMITS()).unwrap()
-    });
-    let mut before = parts.next().unwrap();
-    let mut base = open(0, &before, None).unwrap();
-    for (sequence, now) in (1..).zip(parts) {
-        let delta = encode_delta(&before, sequence - 1, &now, &LIMITS()).expect("a smaller delta");
-        let opened = open(sequence, &delta, Some(&base)).unwrap();
-        assert_eq!(opened, open(sequence, &now, None).unwrap());
-        (before, base) = (now, opened);
+        whole
+    };
+    let rings = |time: u64| radial(layer(4, time, [0, 0], [60, 20]), (1..=20).map(|row| row as f32).collect());
+    for whole in [&scrolling as &dyn Fn(u64) -> v1::Layer, &rings] {
+        let mut parts = (0..8).map(|time| region::crop(&whole(time), &ahead, &LIMITS()).unwrap());
+        let mut before = parts.next().unwrap();
+        let mut base = open(0, &before, None).unwrap();
+        for (sequence, now) in (1..).zip(parts) {
+            let delta = encode_delta(&before, sequence - 1, &now, &LIMITS()).expect("a smaller delta");
+            let opened = open(sequence, &delta, Some(&base)).unwrap();
+            assert_eq!(opened, open(sequence, &now, None).unwrap());
+            (before, base) = (now, opened);
+        }
     }
 }
 

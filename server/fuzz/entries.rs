@@ -1,27 +1,68 @@
-//! What the fuzzer, and `cargo test` with its corpus, do with bytes that somebody sends. Nothing here may panic.
+//! What the fuzzer, and `cargo test` with its corpora, do with bytes that somebody sends or a file holds. Nothing here
+//! may panic.
 
-use bytes::Bytes;
+use std::io::Cursor;
+use std::path::Path;
+
+use bytes::{Buf, Bytes};
+use clearway_lidar::model::Model;
 use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
 use clearway_server::config::Config;
 use clearway_server::ingest::observation::{Limits, bodies};
+use clearway_server::recording::{Entry, Recording};
+use clearway_server::wire::{event_from_bytes, event_to_proto};
 use prost::Message;
 
 /// One observation, as far as the maps.
 pub fn observation(bytes: &[u8]) {
     let Ok(observation) = v1::Observation::decode(Bytes::copy_from_slice(bytes)) else { return };
     let Ok(bodies) = bodies(observation, &Limits::of_points(1000)) else { return };
+    let mut pipeline = pipeline();
+    for (sequence, (captured_ns, body)) in (0..).zip(bodies) {
+        step(&mut pipeline, &Event { sequence, arrival_ns: captured_ns.unwrap_or_default(), source: 0, body });
+    }
+}
+
+/// A journal, as far as the maps: events as protobuf writes them one behind the other, each behind its length.
+pub fn event(bytes: &[u8]) {
+    let mut rest = Bytes::copy_from_slice(bytes);
+    let mut pipeline = pipeline();
+    while let Ok(length) = prost::decode_length_delimiter(&mut rest) {
+        let Ok(event) = event_from_bytes(rest.split_to(length.min(rest.remaining()))) else { continue };
+        let written = event_to_proto(&event).encode_to_vec();
+        let read = event_from_bytes(written.clone().into()).expect("an event that was written");
+        assert_eq!(event_to_proto(&read).encode_to_vec(), written, "an event comes out as it went in");
+        step(&mut pipeline, &event);
+    }
+}
+
+/// A recording's file.
+pub fn recording(bytes: &[u8]) {
+    let Ok(mut recording) = Recording::of(Path::new("any.mcap"), Cursor::new(bytes.to_vec())) else { return };
+    drop(recording.config());
+    let mut pipeline = pipeline();
+    for entry in &mut recording {
+        if let Ok(Entry::Event { event, .. }) = entry {
+            step(&mut pipeline, &event);
+        }
+    }
+    assert!(recording.next().is_none() && recording.bytes_read() <= bytes.len() as u64);
+}
+
+fn pipeline() -> Pipeline {
     let mut vehicle = Config::of_one_vehicle("car", "top").vehicles.remove(0);
     vehicle.maps.speed.enabled = true;
     vehicle.maps.safe_path.enabled = true;
-    vehicle.sensors[0].model = Some(clearway_lidar::model::Model::Hdl32e);
-    let mut pipeline = Pipeline::new(&vehicle.core(), vec![None]).expect("the defaults are allowed");
-    for (sequence, (captured_ns, body)) in (0..).zip(bodies) {
-        let arrival_ns = captured_ns.unwrap_or_default();
-        // A refusal is as good as a map.
-        let _ = pipeline.step(&Event { sequence, arrival_ns, source: 0, body });
-    }
+    vehicle.sensors[0].model = Some(Model::Hdl32e);
+    Pipeline::new(&vehicle.core(), vec![None]).expect("the defaults are allowed")
+}
+
+fn step(pipeline: &mut Pipeline, event: &Event) {
+    // A refusal is as good as a map.
+    let _ = pipeline.step(event);
     let ledger = pipeline.ledger();
     assert_eq!(ledger.received, ledger.decoded + ledger.telemetry + ledger.refused.values().sum::<u64>());
+    assert!(ledger.refused_sum() <= ledger.received);
 }

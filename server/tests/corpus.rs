@@ -1,39 +1,229 @@
-//! The fuzzer's corpus, replayed. It holds only bytes made here; with `CLEARWAY_BLESS=1` they are written anew.
+//! The fuzzers' corpora, replayed. They hold bytes made here, written anew with `CLEARWAY_BLESS=1`, and what the fuzzers
+//! made of those (named by their hash).
 
 #[path = "../fuzz/entries.rs"]
 mod entries;
 
-use std::path::PathBuf;
+use std::collections::BTreeMap;
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
 
+use clearway_mapping::config::{Extrinsics, SensorConfig};
+use clearway_mapping::event::{self as core, Event};
 use clearway_proto::packed::pack;
 use clearway_proto::v1;
+use clearway_server::config::Config;
+use clearway_server::recording::{Entry, Recording};
+use clearway_server::wire::event_to_proto;
+use mcap::WriteOptions;
 use prost::Message;
 use v1::observation::Body;
 
-fn folder() -> PathBuf {
-    [env!("CARGO_MANIFEST_DIR"), "fuzz", "corpus", "observation"].iter().collect()
+fn folder(target: &str) -> PathBuf {
+    [env!("CARGO_MANIFEST_DIR"), "fuzz", "corpus", target].iter().collect()
+}
+
+fn write(target: &str, name: &str, bytes: &[u8]) {
+    std::fs::create_dir_all(folder(target)).unwrap();
+    std::fs::write(folder(target).join(name), bytes).unwrap();
 }
 
 #[test]
 fn every_seed_is_taken_or_refused_without_a_panic() {
     if std::env::var_os("CLEARWAY_BLESS").is_some() {
-        write_seeds();
+        write_observations();
+        write_journals();
+        RECORDINGS.iter().for_each(|(name, options)| write("recording", name, &mcap(options())));
+        write("recording", "attachment_without_crc", &attachment_without_crc());
+        write("recording", "record_beyond_its_chunk", &record_beyond_its_chunk());
     }
-    let mut replayed = 0;
-    for file in std::fs::read_dir(folder()).unwrap() {
-        let bytes = std::fs::read(file.unwrap().path()).unwrap();
-        entries::observation(&bytes);
-        // And every message that was cut off.
-        (0..bytes.len()).step_by(1 + bytes.len() / 64).for_each(|end| entries::observation(&bytes[..end]));
-        replayed += 1;
+    for (target, entry, least) in [
+        ("observation", entries::observation as fn(&[u8]), 12),
+        ("event", entries::event, 3),
+        ("recording", entries::recording, 4),
+    ] {
+        let mut replayed = 0;
+        for file in std::fs::read_dir(folder(target)).unwrap() {
+            let bytes = std::fs::read(file.unwrap().path()).unwrap();
+            entry(&bytes);
+            // And every one that was cut off.
+            (0..bytes.len()).step_by(1 + bytes.len() / 64).for_each(|end| entry(&bytes[..end]));
+            replayed += 1;
+        }
+        assert!(replayed >= least, "{target}: {replayed} seeds");
     }
-    assert!(replayed >= 12, "{replayed} seeds");
 }
 
-fn write_seeds() {
-    std::fs::create_dir_all(folder()).unwrap();
+#[test]
+fn a_record_that_reaches_beyond_its_chunk_is_damage_and_what_came_before_it_is_given() {
+    let read = entries_of(record_beyond_its_chunk());
+    assert_eq!(read[0], "event 0");
+    assert_eq!(read[1..], ["any.mcap: damaged after 1 messages: Chunk ended in the middle of a record"]);
+}
+
+#[test]
+fn an_attachment_that_ends_before_its_crc_is_damage() {
+    assert_eq!(
+        entries_of(attachment_without_crc()),
+        ["any.mcap: damaged after 0 messages: MCAP file ended in the middle of a record"]
+    );
+}
+
+#[test]
+fn a_chunk_that_claims_more_than_any_has_is_refused_before_it_is_unpacked() {
+    let whole = mcap(ours());
+    let claimed = |at: usize, claim: u64| {
+        let mut bytes = whole.clone();
+        let chunk = chunk_at(&bytes);
+        bytes[chunk + at..chunk + at + 8].copy_from_slice(&claim.to_le_bytes());
+        entries_of(bytes).pop().unwrap()
+    };
+    // A record's head is nine bytes; the chunk's stamps come first, then its unpacked size.
+    assert!(claimed(9 + 16, u64::MAX).contains("damaged after 0 messages"), "{}", claimed(9 + 16, u64::MAX));
+    assert!(claimed(9 + 16, 1).contains("damaged after 0 messages"), "{}", claimed(9 + 16, 1));
+    assert!(claimed(1, u64::MAX).contains("damaged after 0 messages"), "{}", claimed(1, u64::MAX));
+    assert_eq!(entries_of(whole), ["event 0", "event 1", "end"]);
+}
+
+/// What a recording gives: its events, then `end`, `cut`, or the error.
+fn entries_of(bytes: Vec<u8>) -> Vec<String> {
+    let mut recording = match Recording::of(Path::new("any.mcap"), Cursor::new(bytes)) {
+        Ok(recording) => recording,
+        Err(error) => return vec![error.to_string()],
+    };
+    let mut read = Vec::new();
+    for entry in &mut recording {
+        match entry {
+            Ok(Entry::Event { event, .. }) => read.push(format!("event {}", event.sequence)),
+            Ok(other) => panic!("{other:?}"),
+            Err(error) => return [read, vec![error.to_string()]].concat(),
+        }
+    }
+    read.push(if recording.is_cut() { "cut" } else { "end" }.into());
+    read
+}
+
+type Options = fn() -> WriteOptions;
+const RECORDINGS: [(&str, Options); 3] =
+    [("ours", ours), ("plain_chunk", plain), ("no_chunk", || plain().use_chunks(false))];
+
+fn ours() -> WriteOptions {
+    WriteOptions::new().library("").compression(Some(mcap::Compression::Zstd)).compression_threads(0)
+}
+
+/// No checksums, so that a fuzzer gets beyond them.
+fn plain() -> WriteOptions {
+    let options = WriteOptions::new().library("").compression(None);
+    options.calculate_chunk_crcs(false).calculate_data_section_crc(false).calculate_summary_section_crc(false)
+}
+
+/// A recording of two events, as small as can be.
+fn mcap(options: WriteOptions) -> Vec<u8> {
+    let mut bytes = Cursor::new(Vec::new());
+    let mut writer = options.create(&mut bytes).unwrap();
+    let config = Config::of_one_vehicle("car", "top").to_toml();
+    let attachment = mcap::Attachment {
+        log_time: 0,
+        create_time: 0,
+        name: "config.toml".into(),
+        media_type: "application/toml".into(),
+        data: config.as_bytes().into(),
+    };
+    writer.attach(&attachment).unwrap();
+    let schema = writer.add_schema("clearway.v1.Event", "protobuf", &[]).unwrap();
+    let channel_id = writer.add_channel(schema, "/car/journal", "protobuf", &BTreeMap::new()).unwrap();
+    for (sequence, event) in (0..).zip(journal().into_iter().take(2)) {
+        let header = mcap::records::MessageHeader { channel_id, sequence, log_time: 1, publish_time: 1 };
+        writer.write_to_known_channel(&header, &event.encode_to_vec()).unwrap();
+    }
+    writer.finish().unwrap();
+    drop(writer);
+    bytes.into_inner()
+}
+
+/// Where the first record of a kind begins, among those that are not in a chunk.
+fn record_at(bytes: &[u8], kind: u8) -> usize {
+    let mut at = 8;
+    while bytes[at] != kind {
+        at += 9 + u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap()) as usize;
+    }
+    at
+}
+
+fn chunk_at(bytes: &[u8]) -> usize {
+    record_at(bytes, mcap::records::op::CHUNK)
+}
+
+fn record_beyond_its_chunk() -> Vec<u8> {
+    let mut bytes = mcap(plain());
+    // The second message is the chunk's last record, and ends with the bytes of its event.
+    let event = journal()[1].encode_to_vec();
+    let last = bytes.windows(event.len()).rposition(|window| *window == event).unwrap() - 22 - 9;
+    assert_eq!(bytes[last], mcap::records::op::MESSAGE);
+    bytes[last + 1] += 1;
+    bytes
+}
+
+fn attachment_without_crc() -> Vec<u8> {
+    let mut bytes = mcap(plain());
+    let at = record_at(&bytes, mcap::records::op::ATTACHMENT);
+    // Two stamps, two empty texts, no data, no CRC.
+    bytes.truncate(at + 1);
+    bytes.extend(32_u64.to_le_bytes());
+    bytes.extend([0; 32]);
+    bytes
+}
+
+/// Every kind of event, in an order that a vehicle may meet.
+fn journal() -> Vec<v1::Event> {
+    use v1::event::Body;
+    let ring = |of: &dyn Fn(f32) -> f32| pack(&(0..60_u8).map(|i| of(f32::from(i) * 0.105)).collect::<Vec<f32>>());
+    let scan = |stamp_ns| {
+        let (x, y) = (ring(&|angle| 9.0 * angle.cos()), ring(&|angle| 9.0 * angle.sin()));
+        Body::Scan(v1::Scan { stamp_ns, x, y, z: ring(&|_| -1.9), ..Default::default() })
+    };
+    let pose = v1::Pose { x: 1.0, qw: 1.0, ..Default::default() };
+    let mounted = Extrinsics { x_m: 1.0, y_m: 0.0, z_m: 1.9, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
+    let side = SensorConfig::new("side", mounted);
+    let side = Event { sequence: 0, arrival_ns: 0, source: 1, body: core::Body::Sensor(Box::new(side)) };
+    let bodies = [
+        Body::Lost(3),
+        Body::EgoPose(v1::EgoPose { stamp_ns: 100_000_000, map_from_ego: Some(pose), speed_mps: 3.0 }),
+        scan(100_000_000),
+        event_to_proto(&side).body.unwrap(),
+        Body::Datagram(vec![0xff; 1206].into()),
+        Body::Datagram(vec![0; 512].into()),
+        scan(200_000_000),
+        Body::Lost(u64::MAX),
+        Body::End(v1::End {}),
+    ];
+    let event = |(sequence, body)| v1::Event {
+        sequence,
+        arrival_ns: 100_000_000 + sequence as i64 * 20_000_000,
+        source: u32::from(sequence == 3),
+        body: Some(body),
+        lost_cause: v1::LossCause::Length.into(),
+    };
+    (0..).zip(bodies).map(event).collect()
+}
+
+fn write_journals() {
+    let write = |name: &str, events: &[v1::Event]| {
+        let stream: Vec<u8> = events.iter().flat_map(Message::encode_length_delimited_to_vec).collect();
+        write("event", name, &stream);
+    };
+    write("all", &journal());
+    let lost =
+        |cause| v1::Event { body: Some(v1::event::Body::Lost(u64::MAX)), lost_cause: cause % 6, ..Default::default() };
+    write("lost_beyond_counting", &(0..12).map(lost).collect::<Vec<_>>());
+    let clocks = [i64::MIN, i64::MAX, 0, -1, i64::MIN, 1 << 62].into_iter().cycle();
+    let clocks = journal().into_iter().zip(clocks).map(|(event, arrival_ns)| v1::Event { arrival_ns, ..event });
+    write("clocks", &clocks.collect::<Vec<_>>());
+}
+
+fn write_observations() {
     let write = |name: &str, observation: v1::Observation| {
-        std::fs::write(folder().join(name), observation.encode_to_vec()).unwrap();
+        write("observation", name, &observation.encode_to_vec());
     };
     let of = |body| v1::Observation { number: 1, sensor: "top".into(), body: Some(body), ..Default::default() };
     let ring = |of: &dyn Fn(f32) -> f32| pack(&(0..60_u8).map(|i| of(f32::from(i) * 0.105)).collect::<Vec<f32>>());

@@ -8,7 +8,9 @@ use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use clearway_server::server::Running;
 use clearway_sim::send::{Pace, Until, drive};
+use house::certificates::{behind, certificates, router, secured};
 use house::venv::{environment, run};
 use house::{config, feed, readings, start, until, vehicle, within};
 
@@ -55,6 +57,16 @@ fn python() -> PathBuf {
     })
 }
 
+/// A server that asks everybody for a certificate, with some maps, behind such a router.
+async fn asking(folder: &Path, router: &str) -> Running {
+    let mut config = behind(router, folder, secured(true));
+    // All layers are made, whether or not somebody reads them yet.
+    config.recorder.file = folder.join("asking.mcap");
+    let running = house::certificates::start(config).await;
+    feed(&running, readings(3)).await;
+    running
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording() {
     let interpreter = tokio::task::spawn_blocking(python).await.expect("the Python client installs");
@@ -88,18 +100,31 @@ async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording
     let status = running.vehicles.0[0].status.clone();
     until("a map", || status.snapshot().maps > 0).await;
 
-    let zenoh = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens").clone();
-    let grpc = running.grpc.expect("gRPC is served").to_string();
+    let (router, routed) = router().await;
+    let asking = asking(folder.path(), &routed).await;
+    let zenoh = running.zenoh.iter().find(|endpoint| endpoint.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
+    let grpc = |running: &Running| running.grpc.expect("gRPC is served").to_string();
+    let places = [
+        ("CLEARWAY_GRPC", grpc(&running)),
+        ("CLEARWAY_ZENOH", zenoh.clone()),
+        ("CLEARWAY_SECURED_GRPC", grpc(&asking)),
+        ("CLEARWAY_SECURED_ZENOH", routed),
+        ("CLEARWAY_CERTIFICATES", certificates("ours").display().to_string()),
+        ("CLEARWAY_RECORDING", recording.display().to_string()),
+    ];
     let tests = tokio::task::spawn_blocking(move || {
         let tests = Path::new(REPOSITORY).join("client/python/tests");
         let mut pytest = Command::new(interpreter);
         pytest.args(["-B", "-m", "pytest", "-q", "-p", "no:cacheprovider"]).arg(tests);
-        pytest.env("CLEARWAY_GRPC", grpc).env("CLEARWAY_ZENOH", zenoh).env("CLEARWAY_RECORDING", recording);
-        run(&mut pytest, "pytest names what failed");
+        let said = run(pytest.envs(places), "pytest names what failed");
+        assert!(!said.contains("skipped"), "{said}");
+        println!("{said}");
     });
     let outcome = tests.await;
     halt.store(true, Ordering::Relaxed);
     car.join().unwrap().unwrap();
     within("shutdown", running.shutdown()).await.unwrap();
+    within("shutdown", asking.shutdown()).await.unwrap();
+    router.close().await.unwrap();
     outcome.expect("the Python client's tests pass");
 }

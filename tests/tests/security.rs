@@ -2,57 +2,16 @@
 
 mod house;
 
-use std::path::{Path, PathBuf};
-use std::process::Command;
-use std::sync::{Arc, OnceLock};
+use std::path::Path;
+use std::sync::Arc;
 
 use clearway_client::{Client, ClientError, Subscription, Tls, ZenohClient};
-use clearway_server::config::{Access, Config, Tls as TlsConfig, ZenohMode};
 use clearway_server::replay::{Options, Summary, replay};
 use clearway_server::server::{Running, Server, Setup};
+use house::certificates::{behind, certificates, router, secured, start, zenoh_file};
 use house::{config, feed, grpc, readings, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
-
-/// Certificates of a CA, and of another one, as the script makes them.
-fn certificates(ca: &str) -> PathBuf {
-    static MADE: OnceLock<tempfile::TempDir> = OnceLock::new();
-    let folder = MADE.get_or_init(|| {
-        let folder = tempfile::tempdir().unwrap();
-        for ca in ["ours", "theirs"] {
-            let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/make-test-ca.sh");
-            let made = Command::new("sh").arg(script).arg(folder.path().join(ca)).output().expect("a shell");
-            let said = String::from_utf8_lossy(&made.stderr).into_owned();
-            assert!(made.status.success(), "deploy/make-test-ca.sh needs Debian's openssl: {said}");
-        }
-        folder
-    });
-    folder.path().join(ca)
-}
-
-fn secured(ask_clients: bool) -> Config {
-    let folder = certificates("ours");
-    let mut config = config();
-    config.grpc.tls = Some(TlsConfig {
-        certificate: folder.join("server.pem"),
-        key: folder.join("server.key"),
-        client_ca: ask_clients.then(|| folder.join("ca.pem")),
-    });
-    if ask_clients {
-        config.grpc.access = Access {
-            readers: vec!["reader".into()],
-            ingesters: vec!["ingester".into()],
-            operators: vec!["operator".into()],
-        };
-    }
-    config
-}
-
-async fn start(config: Config) -> Running {
-    let certificates = config.certificates(Path::new("")).expect("the certificates are there");
-    let setup = Setup { config, certificates, from_files: true, ..Setup::default() };
-    Server::start(setup).await.expect("the server starts")
-}
 
 fn tls(ca: &str, identity: Option<(&str, &str)>) -> Tls {
     let read = |folder: &Path, file: String| std::fs::read_to_string(folder.join(file)).expect("a certificate");
@@ -187,13 +146,6 @@ async fn peers_that_shake_no_hand_reset_or_say_too_much_leave_the_others_served(
     within("shutdown", running.shutdown()).await.unwrap();
 }
 
-/// A file of deploy/zenoh with these certificates instead of those in `certificates/`.
-fn zenoh_file(name: &str, certificates: &Path) -> String {
-    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/zenoh").join(name);
-    let text = std::fs::read_to_string(file).expect("a file of the repository");
-    text.replace("\"certificates/", &format!("\"{}/", certificates.display()))
-}
-
 /// A session of a client that hangs on the router and shows this certificate.
 async fn zenoh_client(router: &str, ca: &str, name: &str) -> zenoh::Result<zenoh::Session> {
     let folder = certificates(ca);
@@ -224,20 +176,8 @@ async fn zenoh_client(router: &str, ca: &str, name: &str) -> zenoh::Result<zenoh
 async fn behind_the_router_of_deploy_each_certificate_does_what_its_rules_allow() {
     let folder = tempfile::tempdir().unwrap();
     let ours = certificates("ours");
-    let text = zenoh_file("router.json5", &ours).replace("tls/0.0.0.0:7447", "tls/127.0.0.1:0");
-    let router =
-        within("a router", zenoh::open(zenoh::Config::from_json5(&text).unwrap()).into_future()).await.unwrap();
-    let locators = router.info().locators().await;
-    let port = locators.iter().find_map(|at| at.to_string().rsplit_once(':').map(|(_, port)| port.to_owned()));
-    let at = format!("tls/localhost:{}", port.expect("the router listens"));
-
-    let mut config = config();
-    let file = folder.path().join("server.json5");
-    std::fs::write(&file, zenoh_file("server.json5", &ours)).unwrap();
-    config.zenoh.enabled = true;
-    (config.zenoh.mode, config.zenoh.listen, config.zenoh.connect) = (ZenohMode::Client, Vec::new(), vec![at.clone()]);
-    config.zenoh.file = file;
-    let running = house::start(config).await;
+    let (router, at) = router().await;
+    let running = house::start(behind(&at, folder.path(), config())).await;
 
     let reader = zenoh_client(&at, "ours", "reader").await.expect("a session");
     let unlisted = zenoh_client(&at, "ours", "operator").await.expect("a session");

@@ -241,6 +241,9 @@ class Map:
         self.header: map_pb2.Header = message.header
         #: Maps made since the one looked at before and not seen by this reader.
         self.skipped = skipped
+        #: Those of them that got lost on the link: zenoh drops what a congested or cut one does not take. 0 over gRPC, where the
+        #: server skips instead.
+        self.lost = 0
         #: Maps made since then that `max_rate_hz` left out.
         self.left_out = 0
         #: When the map came to this process; `None` where it came from no server.
@@ -258,10 +261,10 @@ class Map:
         self._arrival = Arrival.of(self.header.capture_end_ns, clock)
         return self
 
-    def again(self, skipped: int = 0, left_out: int = 0) -> Map:
+    def again(self, skipped: int = 0, lost: int = 0, left_out: int = 0) -> Map:
         """The same map, for another look at the stream."""
         other = copy.copy(self)
-        other.skipped, other.left_out = skipped, left_out
+        other.skipped, other.lost, other.left_out = skipped, lost, left_out
         return other
 
     @property

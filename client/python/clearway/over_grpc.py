@@ -12,6 +12,7 @@ import grpc
 from .errors import ClearwayError, DecodeError
 from .map import BYTES_MAX, Map
 from .stream import MapStream
+from .tls import Tls
 from .v1 import map_pb2, service_pb2, service_pb2_grpc
 
 _OPTIONS = [
@@ -22,17 +23,20 @@ _OPTIONS = [
     ("grpc.http2.bdp_probe", 0),
     ("grpc.max_receive_message_length", BYTES_MAX + 65_536),
     ("grpc.use_local_subchannel_pool", 1),
+    # How long it is tried to connect.
+    ("grpc.min_reconnect_backoff_ms", 5000),
 ]
 _ANSWER_S = 5.0
 
 
-def _service(address: str) -> tuple[grpc.Channel, service_pb2_grpc.MapServiceStub]:
-    channel = grpc.insecure_channel(address, options=_OPTIONS)
-    try:
-        grpc.channel_ready_future(channel).result(timeout=_ANSWER_S)
-    except grpc.FutureTimeoutError:
-        channel.close()
-        raise ClearwayError("UNAVAILABLE", f"{address}: nobody answers within {_ANSWER_S:g} s") from None
+def _service(address: str, tls: Tls | None) -> tuple[grpc.Channel, service_pb2_grpc.MapServiceStub]:
+    """Connects with the first call, which tells of a server that is not there, or not believed."""
+    if tls is None:
+        channel = grpc.insecure_channel(address, options=_OPTIONS)
+    else:
+        pem = tls.read()
+        shown = grpc.ssl_channel_credentials(pem["ca"], pem.get("key"), pem.get("cert"))
+        channel = grpc.secure_channel(address, shown, options=_OPTIONS)
     return channel, service_pb2_grpc.MapServiceStub(channel)
 
 
@@ -40,8 +44,8 @@ def _refused(address: str, error: grpc.RpcError) -> ClearwayError:
     return ClearwayError(error.code().name, f"{address}: {error.details()}")
 
 
-def vehicles(address: str) -> list[service_pb2.Vehicle]:
-    channel, service = _service(address)
+def vehicles(address: str, tls: Tls | None) -> list[service_pb2.Vehicle]:
+    channel, service = _service(address, tls)
     with channel:
         try:
             return list(service.ListVehicles(service_pb2.ListVehiclesRequest(), timeout=_ANSWER_S).vehicles)
@@ -49,8 +53,8 @@ def vehicles(address: str) -> list[service_pb2.Vehicle]:
             raise _refused(address, error) from None
 
 
-def get(address: str, vehicle: str, layers: Sequence[str]) -> Map:
-    channel, service = _service(address)
+def get(address: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -> Map:
+    channel, service = _service(address, tls)
     with channel:
         try:
             request = service_pb2.GetMapRequest(vehicle=vehicle, layers=layers)
@@ -59,8 +63,8 @@ def get(address: str, vehicle: str, layers: Sequence[str]) -> Map:
             raise _refused(address, error) from None
 
 
-def watch(address: str, selection: service_pb2.Selection) -> MapStream:
-    channel, service = _service(address)
+def watch(address: str, selection: service_pb2.Selection, tls: Tls | None) -> MapStream:
+    channel, service = _service(address, tls)
     requests: queue.SimpleQueue[service_pb2.WatchRequest | None] = queue.SimpleQueue()
     requests.put(service_pb2.WatchRequest(selection=selection))
 
@@ -112,7 +116,7 @@ def _follow(
         try:
             m = Map(update.map, base=base)
             between = 0 if base is None else m.sequence - base.sequence - 1
-            stream.put(m, max(between - left_out, 0), left_out)
+            stream.put(m, max(between - left_out, 0), left_out=left_out)
             base, asked, left_out = m, False, 0
         except DecodeError:
             if not any(layer.HasField("base_sequence") for layer in message.layers):

@@ -9,10 +9,22 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 from .errors import ClearwayError
 from .freshness import LOOK_S, Clock
 from .map import Map
+
+
+class _Made(NamedTuple):
+    """Maps since the start of the stream."""
+
+    #: Those given and those skipped.
+    maps: int = 0
+    #: Of the skipped ones, those that the link lost.
+    lost: int = 0
+    #: Those left out at the reader's wish.
+    left_out: int = 0
 
 
 class MapStream:
@@ -22,10 +34,9 @@ class MapStream:
         self._clock = clock
         self._changed = threading.Condition()
         self._newest: Map | None = None
-        #: Maps since the start of the stream: all but those left out, and those left out at the reader's wish.
-        self._made, self._left_out = 0, 0
-        #: `_made` and `_left_out` at the previous look; `None` before the first.
-        self._seen: tuple[int, int] | None = None
+        self._made = _Made()
+        #: `_made` at the previous look; `None` before the first.
+        self._seen: _Made | None = None
         #: The map given last, until it is told as stale.
         self._fresh: Map | None = None
         self._ended: ClearwayError | None = None
@@ -61,9 +72,9 @@ class MapStream:
                 assert self._ended is not None
                 raise self._ended
             # The first look has missed nothing: the reader was not there before.
-            before = self._seen or (self._made - 1, self._left_out)
-            self._seen = (self._made, self._left_out)
-            given = newest.again(self._made - before[0] - 1, self._left_out - before[1])
+            made, before = self._made, self._seen or self._made._replace(maps=self._made.maps - 1)
+            self._seen = made
+            given = newest.again(made.maps - before.maps - 1, made.lost - before.lost, made.left_out - before.left_out)
             self._fresh = None if given.stale else given
             return given
 
@@ -88,16 +99,16 @@ class MapStream:
     def __del__(self) -> None:
         self._close()
 
-    def put(self, m: Map, skipped: int, left_out: int = 0) -> None:
-        """Makes a map the newest; between it and the one before lie `skipped` maps, and `left_out` ones that the reader did
-        not want. One that is no newer than the newest of the same run of the server (a replayed one) is passed over. For the
-        background thread."""
+    def put(self, m: Map, skipped: int, *, lost: int = 0, left_out: int = 0) -> None:
+        """Makes a map the newest; between it and the one before lie `skipped` maps, `lost` of them by the link, and `left_out`
+        ones that the reader did not want. One that is no newer than the newest of the same run of the server (a replayed one)
+        is passed over. For the background thread."""
         m.arrived(self._clock)
         with self._changed:
             newest = self._newest
             if newest is None or newest.header.boot_id != m.header.boot_id or newest.sequence < m.sequence:
-                self._made += 1 + skipped
-                self._left_out += left_out
+                made = self._made
+                self._made = _Made(made.maps + 1 + skipped, made.lost + lost, made.left_out + left_out)
                 self._newest = m
                 self._changed.notify_all()
 
@@ -112,4 +123,4 @@ class MapStream:
         self._close = close
 
     def _is_unseen(self) -> bool:
-        return self._newest is not None and self._seen != (self._made, self._left_out)
+        return self._newest is not None and self._seen != self._made

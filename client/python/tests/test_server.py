@@ -23,7 +23,8 @@ def test_the_newest_map_comes_as_arrays(transport):
     layer = m["drivability"]
     assert layer.classes.shape == layer.grid.shape and layer.classes.dtype == "uint8"
     assert layer.free.any() and layer.class_at(10.0, 0.0) == "drivable"
-    assert m["terrain"].is_free([(9, -1), (12, -1), (12, 1), (9, 1)])
+    assert layer.is_free([(9, -1), (12, -1), (12, 1), (9, 1)])
+    assert m["terrain"].class_at(10.0, 0.0).startswith("flat")
     assert m.header.sensors[0].returns > 1000
     with pytest.raises(ValueError, match="read-only"):
         layer.classes[0, 0] = 1
@@ -100,8 +101,14 @@ def test_a_closed_stream_ends_its_loop():
     assert len(seen) == 2
 
 
+def test_a_program_may_end_without_closing_its_stream():
+    program = f"import clearway; maps = clearway.watch({GRPC!r}); next(maps)"
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (run.returncode, run.stderr) == (0, "")
+
+
 def test_nobody_at_an_address_is_named():
-    with pytest.raises(clearway.ClearwayError, match="nobody answers"):
+    with pytest.raises(clearway.ClearwayError, match="127.0.0.1:9: .*[Cc]onnect"):
         clearway.vehicles("127.0.0.1:9")
 
 

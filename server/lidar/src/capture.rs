@@ -78,6 +78,7 @@ pub enum CaptureError {
 pub struct Capture<'a> {
     blocks: Box<dyn PcapReaderIterator + Send + 'a>,
     interfaces: Interfaces,
+    is_pcapng: bool,
     skipped: Skipped,
     offset: u64,
     ended: bool,
@@ -93,13 +94,15 @@ impl<'a> Capture<'a> {
         let mut head = Vec::new();
         reader.by_ref().take(HEAD_LENGTH as u64).read_to_end(&mut head).map_err(read)?;
         let start = head[..head.len().min(4)].to_vec();
+        let is_pcapng = start == [0x0A, 0x0D, 0x0D, 0x0A];
         let blocks = pcap_parser::create_reader(BLOCK_LENGTH_MAX, std::io::Cursor::new(head).chain(reader));
         let blocks = blocks.map_err(|error| match error {
             PcapError::Incomplete(_) if start.len() == 4 => CaptureError::Truncated { offset: 0 },
             PcapError::ReadError => CaptureError::Read { offset: 0, what: "a read failed".into() },
             _ => CaptureError::Format { start },
         })?;
-        Ok(Self { blocks, interfaces: Interfaces::default(), skipped: Skipped::default(), offset: 0, ended: false })
+        let (interfaces, skipped) = Default::default();
+        Ok(Self { blocks, interfaces, is_pcapng, skipped, offset: 0, ended: false })
     }
 
     /// What was passed over so far.
@@ -116,6 +119,12 @@ impl<'a> Capture<'a> {
     fn read(&mut self) -> Result<Option<Datagram>, CaptureError> {
         let offset = self.offset;
         loop {
+            if self.is_pcapng && is_too_short(self.blocks.data()) {
+                return Err(CaptureError::Damaged {
+                    offset: self.offset,
+                    what: "a block shorter than its head".into(),
+                });
+            }
             let (length, found) = match self.blocks.next() {
                 Ok((length, block)) => (length, self.interfaces.take(&block, &mut self.skipped)),
                 Err(PcapError::Eof) => return Ok(None),
@@ -148,6 +157,17 @@ impl Iterator for Capture<'_> {
         let item = self.read().transpose();
         self.ended = !matches!(item, Some(Ok(_)));
         item
+    }
+}
+
+/// Whether a process information block is shorter than any block, by its own length: pcap-parser would subtract the
+/// head's from it. Its kind is told in the order of its bytes.
+fn is_too_short(block: &[u8]) -> bool {
+    const LEAST: u32 = 12;
+    match *block {
+        [1, 0, 0, 0x80, a, b, c, d, ..] => u32::from_le_bytes([a, b, c, d]) < LEAST,
+        [0x80, 0, 0, 1, a, b, c, d, ..] => u32::from_be_bytes([a, b, c, d]) < LEAST,
+        _ => false,
     }
 }
 

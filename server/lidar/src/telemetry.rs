@@ -190,15 +190,16 @@ fn angle(
     (positive, negative): (&str, &str),
     limit_deg: f64,
 ) -> Result<Option<f64>, NmeaError> {
-    const ALLOWED: &str = "degrees and minutes, such as 3707.8178, and a hemisphere";
+    const ALLOWED: &str = "degrees and minutes below 60, such as 3707.8178, and a hemisphere";
     let Some(run_together) = number(field, value, 0.0..=18_060.0, ALLOWED)? else { return Ok(None) };
-    let degrees = (run_together / 100.0).floor() + run_together % 100.0 / 60.0;
+    let minutes = run_together % 100.0;
+    let degrees = (run_together / 100.0).floor() + minutes / 60.0;
     let sign = match hemisphere {
         h if h == positive => 1.0,
         h if h == negative => -1.0,
         other => return Err(wrong(field, &format!("{value},{other}"), ALLOWED)),
     };
-    if degrees > limit_deg {
+    if minutes >= 60.0 || degrees > limit_deg {
         return Err(wrong(field, value, ALLOWED));
     }
     Ok(Some(sign * degrees))
@@ -227,13 +228,14 @@ fn utc_ns(time: &str, date: &str) -> Result<Option<i64>, NmeaError> {
 /// there is no such moment.
 pub(crate) fn utc_ns_of([year, month, day]: [i64; 3], [hour, minute, second]: [i64; 3]) -> Option<i64> {
     let is_time = hour <= 23 && minute <= 59 && second <= 60;
-    if !is_time || year > 99 || !(1..=12).contains(&month) || !(1..=31).contains(&day) {
+    if !is_time || !(0..=99).contains(&year) || !(1..=12).contains(&month) || day < 1 {
         return None;
     }
     // Two digits: receivers that begin at GPS's first day, 6 January 1980, write 80.
-    let century = if year >= 80 { 1900 } else { 2000 };
-    let seconds = days_since_1970(century + year, month, day) * 86_400 + hour * 3_600 + minute * 60 + second;
-    Some(seconds * 1_000_000_000)
+    let year = if year >= 80 { 1900 + year } else { 2000 + year };
+    let days = days_since_1970(year, month, day);
+    let next_month = days_since_1970(year + month / 12, month % 12 + 1, 1);
+    (days < next_month).then_some((days * 86_400 + hour * 3_600 + minute * 60 + second) * 1_000_000_000)
 }
 
 /// The first three pairs of digits.

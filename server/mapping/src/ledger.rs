@@ -47,6 +47,9 @@ pub struct Ledger {
     pub blind: u64,
 }
 
+/// The count of what stayed outside is a recording's to claim; each cause ends here, so that no sum of them overflows.
+const OUTSIDE_MAX: u64 = 1 << 60;
+
 impl Ledger {
     /// Datagrams and scans refused, but for copies of packets: those leave no trace in a map.
     pub fn refused_sum(&self) -> u64 {
@@ -55,17 +58,16 @@ impl Ledger {
 
     /// Counts readings that never became events: lost, or refused at the door.
     pub fn stayed_outside(&mut self, cause: Cause, count: u64) {
-        // The count is a recording's to claim.
-        let add = |sum: &mut u64, count: u64| *sum = sum.saturating_add(count);
-        let reason = match cause {
-            Cause::Queue => return add(&mut self.lost, count),
-            Cause::Kernel => return add(&mut self.kernel_drops, count),
-            Cause::Sender => "source",
-            Cause::Length => "length",
-            Cause::Observation => "observation",
+        let (sum, is_received) = match cause {
+            Cause::Queue => (&mut self.lost, false),
+            Cause::Kernel => (&mut self.kernel_drops, false),
+            Cause::Sender => (self.refused.entry("source").or_default(), true),
+            Cause::Length => (self.refused.entry("length").or_default(), true),
+            Cause::Observation => (self.refused.entry("observation").or_default(), true),
         };
-        add(&mut self.received, count);
-        add(self.refused.entry(reason).or_default(), count);
+        let count = count.min(OUTSIDE_MAX.saturating_sub(*sum));
+        *sum += count;
+        self.received += if is_received { count } else { 0 };
     }
 
     pub(crate) fn add_dropped(&mut self, dropped: Dropped) {

@@ -185,6 +185,19 @@ fn the_ledger_is_exact_and_a_refused_datagram_leaves_no_trace_in_the_maps() {
 }
 
 #[test]
+fn losses_beyond_all_counting_keep_the_ledger_exact() {
+    let mut pipeline = pipeline(None);
+    let causes = [Cause::Queue, Cause::Kernel, Cause::Sender, Cause::Length, Cause::Observation];
+    let lost = causes.iter().cycle().take(15).map(|&cause| Body::Lost { cause, count: u64::MAX });
+    for (sequence, body) in (0..).zip(lost.chain([Body::Scan(Scan::default())])) {
+        let _ = pipeline.step(&event(sequence, body));
+    }
+    let ledger = pipeline.ledger();
+    assert_eq!(ledger.received, ledger.decoded + ledger.refused.values().sum::<u64>());
+    assert!(ledger.received > ledger.lost && ledger.refused_sum() == ledger.received - ledger.decoded, "{ledger:?}");
+}
+
+#[test]
 fn a_scan_enters_at_the_sweep() {
     let mut pipeline = pipeline(Some(Model::Hdl64eS2));
     let map = pipeline.step(&event(0, Body::Scan(scan(50)))).unwrap().unwrap();

@@ -188,12 +188,14 @@ impl Heard<'_> {
     }
 }
 
-/// Gives a datagram to its vehicle. A stranger's is counted by the first vehicle of the socket, so that each datagram
-/// is in one ledger.
+/// Gives a datagram to its vehicle. One of a stranger, or of nobody, is counted by the first vehicle of the socket, so
+/// that each datagram is in one ledger.
 fn sort(datagram: Received, listener: &Listener, heard: &mut [Heard<'_>]) {
-    let Some(route) = listener.route(datagram.peer) else {
-        if let Some(first) = heard.first() {
-            first.door.refuse_stranger(datagram.peer);
+    let Some(route) = datagram.peer.and_then(|peer| listener.route(peer)) else {
+        match (heard.first(), datagram.peer) {
+            (Some(first), Some(peer)) => first.door.refuse_stranger(peer),
+            (Some(first), None) => first.door.leave_outside(0, Cause::Sender, 1),
+            (None, _) => {}
         }
         return;
     };
@@ -213,5 +215,31 @@ fn wait(socket: &Socket, stopped: &PipeReader) -> io::Result<bool> {
         // A signal.
         Err(nix::Error::EINTR) => Ok(true),
         Err(error) => Err(error.into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clearway_mapping::pipeline::Ledger;
+
+    use super::*;
+    use crate::config::{Config, Udp};
+    use crate::ingest::door;
+
+    #[test]
+    fn a_datagram_without_a_sender_is_refused_and_counted() {
+        let mut config = Config::of_one_vehicle("car", "top");
+        config.vehicles[0].udp = Some(Udp::default());
+        let listener = &listeners(&config.vehicles)[0];
+        let (door, _events) = door(4);
+        let mut heard = [Heard { vehicle: 0, door: &door, readings: Vec::new() }];
+        let of = |peer| Received { peer, length: 3, payload: "abc".into() };
+        sort(of(None), listener, &mut heard);
+        sort(of(Some(([10, 0, 0, 1], 2368).into())), listener, &mut heard);
+        assert_eq!(heard[0].readings, [(0, Body::Datagram("abc".into()))]);
+        let mut ledger = Ledger::default();
+        door.outside().add_to(&mut ledger, []);
+        assert_eq!((ledger.received, ledger.refused), (1, [("source", 1)].into()));
+        assert!(door.outside().strangers().is_empty());
     }
 }

@@ -1,6 +1,7 @@
 //! A server on ports of the system's choice, and what a simulated vehicle sends.
 #![allow(dead_code, reason = "each test file uses its part")]
 
+pub mod certificates;
 pub mod venv;
 
 use std::future::Future;

@@ -10,6 +10,9 @@ use super::{
 
 /// `distLSB_` is centimetres a count; every other length is centimetres, every angle degrees.
 const M_PER_CM: f64 = 0.01;
+/// The greatest number of a list, and what is allowed in it.
+const ENABLED: (u8, &str) = (1, "1 or 0, for each laser of points_");
+const BYTE: (u8, &str) = (255, "a whole number, 0 to 255");
 
 pub(super) fn read(text: &str) -> Result<Calibration, CalibrationError> {
     // The archives open with a (bare) document type, which roxmltree refuses unless told.
@@ -17,19 +20,24 @@ pub(super) fn read(text: &str) -> Result<Calibration, CalibrationError> {
     let document = Document::parse_with_options(text, options).map_err(|e| CalibrationError::Xml(e.to_string()))?;
     let db = child(document.root_element(), "DB", "the calibration database")?;
     let points = child(db, "points_", "a list of lasers")?;
-    let enabled = list(db, "enabled_");
-    let min_intensity = list(db, "minIntensity_");
-    let max_intensity = list(db, "maxIntensity_");
+    let enabled = list(db, "enabled_", ENABLED)?;
+    let min_intensity = list(db, "minIntensity_", BYTE)?;
+    let max_intensity = list(db, "maxIntensity_", BYTE)?;
     let resolution = number(db, "DB", "distLSB_", M_PER_CM, RESOLUTION_M)?;
 
     let mut lasers = Vec::new();
-    for (index, item) in points.children().filter(|node| node.has_tag_name("item")).enumerate() {
-        if enabled.get(index).is_some_and(|flag| *flag == 0.0) {
-            continue;
+    for (index, item) in items(points).enumerate() {
+        match enabled.as_ref().map(|flags| flags.get(index)) {
+            None | Some(Some(1)) => {}
+            Some(Some(_)) => continue,
+            Some(None) => {
+                let key = format!("enabled_.item[{index}]");
+                return Err(CalibrationError::Missing { key, allowed: ENABLED.1 });
+            }
         }
         let mut laser = laser(&format!("points_.item[{index}].px"), child(item, "px", "one laser")?)?;
-        let byte = |list: &[f64]| list.get(usize::from(laser.laser_id)).map(|v| v.clamp(0.0, 255.0) as u8);
-        (laser.min_intensity, laser.max_intensity) = (byte(&min_intensity), byte(&max_intensity));
+        let of_laser = |list: &Option<Vec<u8>>| list.as_ref()?.get(usize::from(laser.laser_id)).copied();
+        (laser.min_intensity, laser.max_intensity) = (of_laser(&min_intensity), of_laser(&max_intensity));
         lasers.push(laser);
     }
     complete(resolution, lasers)
@@ -64,10 +72,26 @@ fn child<'a, 'i>(node: Node<'a, 'i>, name: &str, allowed: &'static str) -> Resul
         .ok_or_else(|| CalibrationError::Missing { key: format!("{}.{name}", node.tag_name().name()), allowed })
 }
 
-/// The numbers of a list such as `enabled_`; empty if it is missing (older files have none).
-fn list(db: Node<'_, '_>, name: &str) -> Vec<f64> {
-    let items = db.children().find(|n| n.has_tag_name(name)).into_iter().flat_map(|n| n.children());
-    items.filter(|n| n.has_tag_name("item")).map(|n| text(n).parse().unwrap_or(0.0)).collect()
+fn items<'a, 'i>(list: Node<'a, 'i>) -> impl Iterator<Item = Node<'a, 'i>> {
+    list.children().filter(|node| node.has_tag_name("item"))
+}
+
+/// The numbers of a list such as `enabled_`; `None` if it is missing (older files have none).
+fn list(
+    db: Node<'_, '_>,
+    name: &str,
+    (most, allowed): (u8, &'static str),
+) -> Result<Option<Vec<u8>>, CalibrationError> {
+    let Some(list) = db.children().find(|node| node.has_tag_name(name)) else { return Ok(None) };
+    let byte = |(index, item)| {
+        let written = text(item);
+        written.parse().ok().filter(|value| *value <= most).ok_or_else(|| CalibrationError::Value {
+            key: format!("{name}.item[{index}]"),
+            value: format!("`{written}`"),
+            allowed,
+        })
+    };
+    items(list).enumerate().map(byte).collect::<Result<_, _>>().map(Some)
 }
 
 fn number(

@@ -126,6 +126,33 @@ fn xml_is_degrees_and_centimetres_and_its_errors_name_the_element() {
 }
 
 #[test]
+fn a_list_of_enabled_lasers_leaves_out_those_of_zero_and_is_refused_where_it_does_not_say() {
+    let sound = xml("<id_>0</id_><vertCorrection_>2</vertCorrection_>");
+    let with = |name: &str, items: &[&str]| {
+        let items: String = items.iter().map(|item| format!("<item>{item}</item>")).collect();
+        Calibration::load_str(&sound.replace("<points_>", &format!("<{name}>{items}</{name}><points_>")))
+    };
+    let shown = |name: &str, items: &[&str]| with(name, items).unwrap_err().to_string();
+    let mut enabled = ["1"; 16];
+    assert_eq!(with("enabled_", &enabled), Calibration::load_str(&sound));
+    enabled[15] = "0";
+    // A table of fifteen is no sensor's: the last laser is left out, as the list says.
+    assert!(shown("enabled_", &enabled).contains("15 of them"), "{}", shown("enabled_", &enabled));
+    for bad in ["yes", "", "-1", "2", "NaN", "0.5"] {
+        enabled[3] = bad;
+        let expected =
+            format!("enabled_.item[3]: `{bad}` is not allowed; it must be 1 or 0, for each laser of points_");
+        assert_eq!(shown("enabled_", &enabled), expected);
+    }
+    let expected = "enabled_.item[3]: missing; it must be 1 or 0, for each laser of points_";
+    assert_eq!(shown("enabled_", &enabled[..3]), expected);
+    assert_eq!(
+        shown("maxIntensity_", &["255", "256"]),
+        "maxIntensity_.item[1]: `256` is not allowed; it must be a whole number, 0 to 255"
+    );
+}
+
+#[test]
 fn a_padded_table_is_cut_and_a_short_one_named() {
     let padded = Calibration::factory(Model::Hdl64eS2);
     assert_eq!(padded.clone().cut_to(Model::Vlp16).unwrap().lasers.len(), 16);

@@ -144,6 +144,24 @@ fn a_truncated_capture_yields_what_it_holds_and_says_so() {
 }
 
 #[test]
+fn a_process_information_block_shorter_than_its_head_is_damage() {
+    let frames = vec![ethernet(&ip_packet(&[7; 1206], 0), false); 2];
+    let whole = pcapng(&frames, 6, 0);
+    for length in [0_u32, 4, 8, 11] {
+        let bytes = [&whole[..], &0x8000_0001_u32.to_le_bytes(), &length.to_le_bytes(), &[0; 32]].concat();
+        let (datagrams, error, _) = read(&bytes);
+        assert_eq!(datagrams.len(), 2, "{length}");
+        let what = "a block shorter than its head".into();
+        assert_eq!(error, Some(CaptureError::Damaged { offset: whole.len() as u64, what }), "{length}");
+    }
+    // A packet of a classic capture may begin with the same bytes: its stamp's.
+    let mut classic = pcap(1, &frames, false, false);
+    classic[24..28].copy_from_slice(&0x8000_0001_u32.to_le_bytes());
+    let (datagrams, error, _) = read(&classic);
+    assert_eq!((datagrams.len(), error), (2, None));
+}
+
+#[test]
 fn what_is_no_whole_datagram_is_counted() {
     let mut tcp = ip_packet(&[0; 40], 0);
     tcp[9] = 6;

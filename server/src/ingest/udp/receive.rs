@@ -26,8 +26,8 @@ const SLOTS: usize = 2 * BATCH;
 /// One datagram.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Received {
-    /// Whence it came; an IPv4 address as such, whatever kind of socket heard it.
-    pub peer: SocketAddr,
+    /// Whence it came; an IPv4 address as such, whatever kind of socket heard it. `None` where the kernel does not say.
+    pub peer: Option<SocketAddr>,
     /// How long it was.
     pub length: usize,
     /// Its bytes, the first [`DATAGRAM_BYTES_MAX`] of them.
@@ -87,10 +87,7 @@ impl Receiver {
         for (peer, length) in found {
             let mut slot = self.slab.split_to(DATAGRAM_BYTES_MAX);
             slot.truncate(length);
-            // A datagram without a sender is no datagram.
-            if let Some(peer) = peer {
-                batch.push(Received { peer, length, payload: slot.freeze() });
-            }
+            batch.push(Received { peer, length, payload: slot.freeze() });
         }
         Ok(u64::from(drops.wrapping_sub(std::mem::replace(&mut self.drops, drops))))
     }

@@ -3,38 +3,37 @@
 //!
 //!   cargo bench -p clearway-tests --bench stream                                  1, 10, 100 and 1,000 readers
 //!   cargo bench -p clearway-tests --bench stream -- --readers 1,10 --seconds 30 --layer occupancy --json
+//!   cargo bench -p clearway-tests --bench stream -- --slow --seconds 60           what slow readers cost the others
 //!
 //! Age: from the last packet of a turn sent to its map in a reader's hands. Carried: from the server's hand-over to the
 //! transport until then. The first reader decodes every map, as a planner does; the others take the bytes, and on gRPC
 //! acknowledge them. Memory: growth of the server's resident set, divided by the readers. Clocks: one machine's.
 
-use std::io::{BufRead, BufReader};
-use std::net::{SocketAddr, TcpListener, UdpSocket};
-use std::process::{Child, Command, ExitCode, Stdio};
+mod drive;
+mod server;
+mod slow;
+
+use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
 use clap::Parser;
 use clearway_client::{MapView, now_ns, v1};
 use clearway_proto::v1::map_service_client::MapServiceClient;
-use clearway_server::config::{Config, Udp};
-use clearway_server::server::{Server, Setup};
-use clearway_sim::scanner::ScannerConfig;
-use clearway_sim::scenes::town;
-use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
 use serde_json::json;
 use tokio::io::AsyncReadExt;
 use tokio::task::JoinSet;
-use tonic::transport::Endpoint;
+use tonic::transport::{Channel, Endpoint};
+
+use drive::{Car, Cuts, Turns, cast};
+use server::{Process, serve};
 
 /// Readers of a gRPC connection: a thousand of them would not get a connection each.
 const STREAMS: usize = 8;
 /// The drive is cast beforehand, so much longer than what is measured: readers come in the meantime.
 const BEFORE_S: u64 = 30;
-/// Packets that are due this soon leave at once.
-const BURST: Duration = Duration::from_millis(1);
 /// Readers have begun, and their memory is taken, after this.
 const SETTLE: Duration = Duration::from_secs(3);
 
@@ -49,6 +48,9 @@ struct Arguments {
     /// What they read.
     #[arg(long, default_value = "drivability")]
     layer: String,
+    /// Instead, what a stopped and a slow reader cost eight others, and how old the first map of a resumed one is.
+    #[arg(long)]
+    slow: bool,
     /// One object instead of a table.
     #[arg(long)]
     json: bool,
@@ -77,13 +79,12 @@ struct Seen {
     /// ms, of the one that decodes.
     planner: Vec<f64>,
     bytes: u64,
+    /// Maps that the server says it left out because their reader, or its link, was slow.
+    skipped: u64,
 }
 
-/// Stamps of the last packets of turns, device and host clock, ns.
-type Cuts = Arc<Mutex<Vec<(i64, i64)>>>;
-
 /// One carrier's readers.
-#[derive(Clone)]
+#[derive(Clone, Default)]
 struct Readers {
     seen: Arc<Mutex<Seen>>,
     counts: Arc<AtomicBool>,
@@ -98,6 +99,13 @@ fn main() -> ExitCode {
         return ExitCode::SUCCESS;
     }
     let turns = cast(10 * (arguments.seconds + BEFORE_S) as usize);
+    if arguments.slow {
+        let rows = runtime.block_on(slow::measure(&arguments, &turns));
+        if arguments.json {
+            println!("{}", json!({ "layer": arguments.layer, "load_average": load_average(), "rows": rows }));
+        }
+        return ExitCode::SUCCESS;
+    }
     let mut rows = Vec::new();
     if !arguments.json {
         println!(
@@ -124,13 +132,17 @@ fn main() -> ExitCode {
             rows.push(row);
         }
     }
-    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
-    let load = load.split_whitespace().take(3).collect::<Vec<_>>().join(" ");
+    let load = load_average();
     match arguments.json {
         true => println!("{}", json!({ "layer": arguments.layer, "load_average": load, "rows": rows })),
         false => println!("layer {}, load average in the end {load}", arguments.layer),
     }
     ExitCode::SUCCESS
+}
+
+fn load_average() -> String {
+    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
+    load.split_whitespace().take(3).collect::<Vec<_>>().join(" ")
 }
 
 fn print_row(row: &serde_json::Value) {
@@ -154,19 +166,14 @@ fn print_row(row: &serde_json::Value) {
 /// One row: a server of its own, this many readers, so many seconds.
 async fn measure(
     arguments: &Arguments,
-    turns: &Arc<Vec<Vec<Datagram>>>,
+    turns: &Turns,
     carrier: Carrier,
     count: usize,
     bytes: u64,
 ) -> serde_json::Value {
     let mut server = Process::start();
-    let (seen, counts, cuts) = (Arc::default(), Arc::default(), Cuts::default());
-    let readers = Readers { seen, counts, cuts };
-    let (stop, sender) = (Arc::new(AtomicBool::new(false)), server.data);
-    let car = std::thread::spawn({
-        let (stop, cuts, turns) = (stop.clone(), readers.cuts.clone(), turns.clone());
-        move || send(&turns, sender, &cuts, &stop)
-    });
+    let readers = Readers::default();
+    let car = Car::drive(turns, server.data, &readers.cuts);
     // With one reader first, so that what the first costs the server once is none of the others'.
     let mut tasks = JoinSet::new();
     readers.join(&mut tasks, &server, carrier, &arguments.layer, 1, bytes).await;
@@ -174,12 +181,9 @@ async fn measure(
     let alone_kib = server.resident_kib();
     readers.join(&mut tasks, &server, carrier, &arguments.layer, count - 1, bytes).await;
     tokio::time::sleep(SETTLE).await;
-    readers.counts.store(true, Ordering::Relaxed);
-    tokio::time::sleep(Duration::from_secs(arguments.seconds)).await;
-    readers.counts.store(false, Ordering::Relaxed);
+    readers.count_for(Duration::from_secs(arguments.seconds)).await;
     let grown_kib = server.resident_kib() - alone_kib;
-    stop.store(true, Ordering::Relaxed);
-    car.join().expect("the car drives");
+    car.stop();
     tasks.shutdown().await;
     server.stop();
     let mut seen = readers.seen.lock().expect("nobody panics");
@@ -258,12 +262,7 @@ impl Readers {
         }
     }
 
-    async fn over_grpc(
-        self,
-        mut service: MapServiceClient<tonic::transport::Channel>,
-        layer: String,
-        is_planner: bool,
-    ) {
+    async fn over_grpc(self, mut service: MapServiceClient<Channel>, layer: String, is_planner: bool) {
         let (acknowledge, mut requests) = tokio::sync::mpsc::channel(8);
         let selection =
             v1::Selection { vehicle: String::new(), layers: vec![layer], max_in_flight: 2, ..Default::default() };
@@ -274,6 +273,9 @@ impl Readers {
         while let Ok(Some(update)) = updates.message().await {
             let arrived_ns = now_ns();
             let sequence = self.take(&update.map, update.sent_ns, arrived_ns, is_planner);
+            if self.counts.load(Ordering::Relaxed) {
+                self.seen.lock().expect("nobody panics").skipped += update.skipped;
+            }
             let acknowledged = v1::WatchRequest { acknowledged: Some(sequence), ..Default::default() };
             if acknowledge.send(acknowledged).await.is_err() {
                 return;
@@ -309,6 +311,13 @@ impl Readers {
         }
     }
 
+    /// What comes in the meantime counts.
+    async fn count_for(&self, time: Duration) {
+        self.counts.store(true, Ordering::Relaxed);
+        tokio::time::sleep(time).await;
+        self.counts.store(false, Ordering::Relaxed);
+    }
+
     fn count(&self, bytes: usize, sent_ns: i64, arrived_ns: i64) -> bool {
         let counts = self.counts.load(Ordering::Relaxed);
         if counts {
@@ -327,156 +336,23 @@ impl Readers {
             MapView::decode(map.clone()).expect("a map");
         }
         let in_hands_ns = now_ns();
-        if self.count(map.len(), sent_ns, arrived_ns) {
-            // The turn's last packet is the first that was stamped after the capture's end.
-            let cut = self
-                .cuts
-                .lock()
-                .expect("nobody panics")
-                .iter()
-                .rev()
-                .take_while(|(stamp, _)| *stamp >= header.capture_end_ns)
-                .last()
-                .copied();
-            if let Some((_, cut_ns)) = cut {
-                let mut seen = self.seen.lock().expect("nobody panics");
-                seen.ages.push((arrived_ns - cut_ns) as f64 * 1e-6);
-                if is_planner {
-                    seen.planner.push((in_hands_ns - cut_ns) as f64 * 1e-6);
-                }
+        if self.count(map.len(), sent_ns, arrived_ns)
+            && let Some(age_ms) = self.age_ms(header.capture_end_ns, arrived_ns)
+        {
+            let mut seen = self.seen.lock().expect("nobody panics");
+            seen.ages.push(age_ms);
+            if is_planner {
+                seen.planner.push(age_ms + (in_hands_ns - arrived_ns) as f64 * 1e-6);
             }
         }
         header.sequence
     }
-}
 
-/// The server's process, and where it is met.
-struct Process {
-    child: Child,
-    data: SocketAddr,
-    grpc: SocketAddr,
-    floor: SocketAddr,
-    zenoh: String,
-}
-
-impl Process {
-    fn start() -> Self {
-        let own = std::env::current_exe().expect("this program");
-        let mut child =
-            Command::new(own).arg("--serve").stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("a process");
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().expect("piped")).read_line(&mut line).expect("a line");
-        let places: Vec<&str> = line.split_whitespace().collect();
-        let [data, grpc, floor, zenoh] = places[..] else { panic!("the server says {line:?}") };
-        let at = |address: &str| address.parse().expect("an address");
-        Self { data: at(data), grpc: at(grpc), floor: at(floor), zenoh: zenoh.into(), child }
-    }
-
-    /// What the kernel holds in memory for it, KiB.
-    fn resident_kib(&self) -> i64 {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("Linux");
-        let line = status.lines().find(|line| line.starts_with("VmRSS")).expect("VmRSS");
-        line.split_whitespace().nth(1).and_then(|kib| kib.parse().ok()).expect("a number")
-    }
-
-    /// Ends with its standard input.
-    fn stop(&mut self) {
-        drop(self.child.stdin.take());
-        self.child.wait().expect("it ends");
-    }
-}
-
-/// The server: until standard input ends.
-async fn serve() {
-    let mut config = Config::of_one_vehicle("car", "top");
-    let any: SocketAddr = "127.0.0.1:0".parse().expect("an address");
-    config.grpc.listen = any;
-    config.page.enabled = false;
-    config.zenoh.enabled = true;
-    config.zenoh.listen = vec!["tcp/127.0.0.1:0".into()];
-    let vehicle = &mut config.vehicles[0];
-    vehicle.udp = Some(Udp { data: any, telemetry: any, ..Udp::default() });
-    vehicle.sensors[0].extrinsics.z_m = ScannerConfig::default().ego_from_sensor.translation.z;
-    // The drive is older than its arrival.
-    vehicle.sensors[0].gps_late_days_max = 36_525.0;
-    let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
-    let (data, _) = running.doors[0].udp.expect("a socket");
-    let floor = TcpListener::bind(any).expect("a free port");
-    let floor_at = floor.local_addr().expect("bound");
-    tokio::spawn(serve_floor(floor));
-    let zenoh = running.zenoh.iter().find(|endpoint| endpoint.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
-    println!("{data} {} {floor_at} {zenoh}", running.grpc.expect("gRPC is served"));
-    let ended = tokio::task::spawn_blocking(|| std::io::copy(&mut std::io::stdin(), &mut std::io::sink()));
-    ended.await.expect("no panic").expect("standard input");
-}
-
-/// Ten messages a second to every connection, as long as each asks for, each with the stamp of its making.
-async fn serve_floor(listener: TcpListener) {
-    use tokio::io::AsyncWriteExt;
-    listener.set_nonblocking(true).expect("an option");
-    let listener = tokio::net::TcpListener::from_std(listener).expect("a listener");
-    let (tick, made) = tokio::sync::watch::channel(0);
-    tokio::spawn(async move {
-        let mut every = tokio::time::interval(Duration::from_millis(100));
-        loop {
-            every.tick().await;
-            tick.send_replace(now_ns());
-        }
-    });
-    while let Ok((mut stream, _)) = listener.accept().await {
-        let mut made = made.clone();
-        tokio::spawn(async move {
-            stream.set_nodelay(true)?;
-            let bytes = stream.read_u64_le().await?.clamp(8, 1 << 20);
-            let mut message = vec![0; bytes as usize];
-            while made.changed().await.is_ok() {
-                let made_ns: i64 = *made.borrow_and_update();
-                message[..8].copy_from_slice(&made_ns.to_le_bytes());
-                stream.write_all(&message).await?;
-            }
-            Ok::<(), std::io::Error>(())
-        });
-    }
-}
-
-/// What the sensor sends in so many turns of the town; each ends with the packet at which the server cuts it.
-fn cast(count: usize) -> Arc<Vec<Vec<Datagram>>> {
-    let mut vehicle = SimulatedVehicle::new(town(), ScannerConfig::default());
-    let (mut turns, mut turn, mut before) = (Vec::new(), Vec::new(), u16::MAX);
-    while turns.len() < count {
-        let datagram = vehicle.next().expect("datagrams do not end");
-        if datagram.kind == Kind::Telemetry {
-            continue;
-        }
-        // Of the last block; behind the vehicle turns are cut.
-        let azimuth = u16::from_le_bytes([datagram.payload[1102], datagram.payload[1103]]);
-        turn.push(datagram);
-        if before < 18_000 && azimuth >= 18_000 {
-            turns.push(std::mem::take(&mut turn));
-        }
-        before = azimuth;
-    }
-    turns.into()
-}
-
-/// Sends the turns in real time, and notes when the last packet of each left.
-fn send(turns: &[Vec<Datagram>], to: SocketAddr, cuts: &Cuts, stop: &AtomicBool) {
-    let socket = UdpSocket::bind("127.0.0.1:0").expect("a free port");
-    let (began, first_ns) = (Instant::now(), turns[0][0].stamp_ns);
-    for turn in turns {
-        for (index, datagram) in turn.iter().enumerate() {
-            let due = Duration::from_nanos((datagram.stamp_ns - first_ns).unsigned_abs());
-            let early = due.saturating_sub(began.elapsed());
-            if early > BURST {
-                std::thread::sleep(early);
-            }
-            if stop.load(Ordering::Relaxed) {
-                return;
-            }
-            if index + 1 == turn.len() {
-                cuts.lock().expect("nobody panics").push((datagram.stamp_ns, now_ns()));
-            }
-            socket.send_to(&datagram.payload, to).expect("loopback takes datagrams");
-        }
+    /// From the last packet of a capture to then, ms.
+    fn age_ms(&self, capture_end_ns: i64, then_ns: i64) -> Option<f64> {
+        let cuts = self.cuts.lock().expect("nobody panics");
+        // The turn's last packet is the first that was stamped after the capture's end.
+        let (_, cut_ns) = cuts.iter().rev().take_while(|(stamp, _)| *stamp >= capture_end_ns).last()?;
+        Some((then_ns - cut_ns) as f64 * 1e-6)
     }
 }

@@ -1,0 +1,184 @@
+"""A stream over zenoh against a session in this process that publishes as the server does (see the Rust client's zenoh.rs)."""
+
+import socket
+import subprocess
+import sys
+import threading
+
+import pytest
+
+import clearway
+from clearway.v1 import map_pb2
+
+zenoh = pytest.importorskip("zenoh")
+from zenoh import ext  # noqa: E402
+
+KEY = "clearway/alpha/map/{}"
+LASTS_NS = 60_000_000_000
+
+
+@pytest.fixture
+def endpoint():
+    # zenoh for Python does not tell the port that the system chose.
+    with socket.create_server(("127.0.0.1", 0)) as chosen:
+        return f"tcp/127.0.0.1:{chosen.getsockname()[1]}"
+
+
+@pytest.fixture
+def server(endpoint):
+    config = zenoh.Config()
+    for key, value in [("listen/endpoints", f'["{endpoint}"]'), ("scouting/multicast/enabled", "false"),
+                       ("scouting/gossip/enabled", "false"), ("transport/link/tx/lease", "2000")]:  # fmt: skip
+        config.insert_json5(key, value)
+    with zenoh.open(config) as session:
+        yield session
+
+
+def part(sequence, layer="drivability", valid_ns=LASTS_NS):
+    now_ns = clearway.now_ns()
+    header = map_pb2.Header(vehicle="alpha", boot_id=7, sequence=sequence, capture_start_ns=now_ns,
+                            capture_end_ns=now_ns, valid_until_ns=now_ns + valid_ns)  # fmt: skip
+    return map_pb2.Map(header=header, layers=[map_pb2.Layer(name=layer)]).SerializeToString()
+
+
+def published(session, layer="drivability"):
+    """As the server publishes."""
+    misses = ext.MissDetectionConfig(heartbeat=0.5, sporadic_heartbeat=None)
+    return ext.declare_advanced_publisher(session, KEY.format(layer), cache=ext.CacheConfig(1), publisher_detection=True,
+                                          sample_miss_detection=misses)  # fmt: skip
+
+
+def watch(at, *layers):
+    return clearway.watch(f"zenoh:{at}", vehicle="alpha", layers=layers or ["drivability"])
+
+
+def told(m):
+    return m.sequence, m.skipped, m.lost
+
+
+def matched(publisher):
+    """Waits until somebody subscribes."""
+    changes = publisher.declare_matching_listener()
+    while not publisher.matching_status.matching:
+        changes.recv()
+
+
+def test_who_comes_late_has_the_current_map_of_every_layer_at_once(server, endpoint):
+    layers = ["drivability", "terrain"]
+    publishers = [published(server, layer) for layer in layers]
+    for sequence in (40, 41):
+        for publisher, layer in zip(publishers, layers):
+            publisher.put(part(sequence, layer))
+    with watch(endpoint, *layers) as maps:
+        m = next(maps)
+    assert told(m) == (41, 0, 0) and [layer.name for layer in m._message.layers] == layers
+
+
+def test_of_the_skipped_maps_those_the_link_lost_are_told_and_a_lost_last_one_is_asked_for(server, endpoint):
+    key = KEY.format("drivability")
+    asked = server.declare_queryable(key)
+    maps = server.declare_publisher(key)
+    heartbeats = server.declare_publisher(f"{key}/@adv/pub/{maps.id.zid}/{maps.id.eid}/_")
+
+    def put(number, sequence):
+        """What a publisher numbers; the numbers that are left out were lost."""
+        maps.put(part(sequence), source_info=zenoh.SourceInfo(maps.id, number))
+
+    with watch(endpoint) as stream:
+        matched(maps)
+        matched(heartbeats)
+        put(0, 41)
+        assert told(next(stream)) == (41, 0, 0)
+        put(2, 43)
+        assert told(next(stream)) == (43, 1, 1), "lost is one of those skipped"
+        put(3, 46)
+        assert told(next(stream)) == (46, 2, 0), "two were never put"
+        heartbeats.put(ext.z_serialize(ext.UInt32(3)))
+        heartbeats.put(ext.z_serialize(ext.UInt32(4)))
+        with asked.recv() as query:
+            query.reply(key, part(47))
+        assert told(next(stream)) == (47, 0, 0), "the last map came late, and is not lost"
+        put(5, 48)
+        assert told(next(stream)) == (48, 0, 0)
+        assert asked.try_recv() is None, "nobody asks without a reason"
+
+
+@pytest.mark.parametrize("ending", ["", "maps.close()", "raise SystemExit(3)"], ids=["end", "close", "exit"])
+def test_a_program_may_end_without_closing_its_stream(server, endpoint, ending):
+    publisher = published(server)
+    publisher.put(part(3))
+    program = f"import clearway; maps = clearway.watch('zenoh:{endpoint}', vehicle='alpha', layers=['drivability']); next(maps); "
+    run = subprocess.run([sys.executable, "-c", program + ending], capture_output=True, text=True, timeout=60)
+    assert (run.returncode, run.stderr) == (3 if "raise" in ending else 0, "")
+
+
+class Wire:
+    """Between client and server; while it is cut nothing passes, and nobody is told."""
+
+    def __init__(self, to):
+        self._to = self._address(to)
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        self._whole = threading.Event()
+        self._whole.set()
+        self._held = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    @staticmethod
+    def _address(endpoint):
+        host, port = endpoint.removeprefix("tcp/").rsplit(":", 1)
+        return host, int(port)
+
+    def _accept(self):
+        while True:
+            near, _ = self._listener.accept()
+            self._held.append(near)
+            if self._whole.is_set():
+                far = socket.create_connection(self._to)
+                self._held.append(far)
+                laid = self._whole
+                for ends in ((near, far), (far, near)):
+                    threading.Thread(target=self._carry, args=(*ends, laid), daemon=True).start()
+
+    @staticmethod
+    def _carry(of, to, laid):
+        # What comes after the cut is read by nobody.
+        while laid.is_set() and (said := of.recv(65_536)) and laid.is_set():
+            to.sendall(said)
+
+    def cut(self):
+        self._whole.clear()
+
+    def lay_anew(self):
+        self._whole = threading.Event()
+        self._whole.set()
+
+
+def test_a_cut_link_makes_a_map_stale_and_the_stream_goes_on_with_what_was_lost_told(server, endpoint):
+    publisher = published(server)
+    wire = Wire(endpoint)
+    publisher.put(part(0, valid_ns=1))
+    with watch(wire.endpoint) as maps:
+        m = maps.next_or_stale()
+        assert m.stale and m.sequence == 0
+        wire.cut()
+        for sequence in range(1, 5):
+            publisher.put(part(sequence))
+        wire.lay_anew()
+        m = maps.next_or_stale()
+        assert not m.stale and told(m) == (4, 3, 3), "the newest at once, and what was lost"
+        publisher.put(part(5))
+        assert told(maps.next_or_stale()) == (5, 0, 0)
+
+
+def test_certificates_are_not_left_unused_without_a_word(tmp_path):
+    for name in ("ca.pem", "reader.pem"):
+        (tmp_path / name).write_text("")
+    tls = clearway.Tls(tmp_path / "ca.pem")
+    with pytest.raises(clearway.ClearwayError, match="zenoh:tls/HOST:PORT"):
+        clearway.vehicles("zenoh:tcp/127.0.0.1:7447", tls=tls)
+    for address in ("127.0.0.1:9", "zenoh:tls/127.0.0.1:7447"):
+        with pytest.raises(clearway.ClearwayError, match="absent.pem"):
+            clearway.vehicles(address, tls=clearway.Tls(tmp_path / "absent.pem"))
+    with pytest.raises(clearway.ClearwayError, match="of no use without the other"):
+        clearway.Tls(tmp_path / "ca.pem", cert=tmp_path / "reader.pem")

@@ -1,0 +1,101 @@
+//! The server in a process of its own, whose memory nobody shares, and beside it the floor: plain TCP with as many bytes.
+
+use std::io::{BufRead, BufReader};
+use std::net::{SocketAddr, TcpListener};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use clearway_client::now_ns;
+use clearway_server::config::{Config, Udp};
+use clearway_server::server::{Server, Setup};
+use clearway_sim::scanner::ScannerConfig;
+use tokio::io::AsyncReadExt;
+
+/// The server's process, and where it is met.
+pub struct Process {
+    child: Child,
+    pub data: SocketAddr,
+    pub grpc: SocketAddr,
+    pub floor: SocketAddr,
+    pub zenoh: String,
+}
+
+impl Process {
+    pub fn start() -> Self {
+        let own = std::env::current_exe().expect("this program");
+        let mut child =
+            Command::new(own).arg("--serve").stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("a process");
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().expect("piped")).read_line(&mut line).expect("a line");
+        let places: Vec<&str> = line.split_whitespace().collect();
+        let [data, grpc, floor, zenoh] = places[..] else { panic!("the server says {line:?}") };
+        let at = |address: &str| address.parse().expect("an address");
+        Self { data: at(data), grpc: at(grpc), floor: at(floor), zenoh: zenoh.into(), child }
+    }
+
+    /// What the kernel holds in memory for it, KiB.
+    pub fn resident_kib(&self) -> i64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("Linux");
+        let line = status.lines().find(|line| line.starts_with("VmRSS")).expect("VmRSS");
+        line.split_whitespace().nth(1).and_then(|kib| kib.parse().ok()).expect("a number")
+    }
+
+    /// Ends with its standard input.
+    pub fn stop(&mut self) {
+        drop(self.child.stdin.take());
+        self.child.wait().expect("it ends");
+    }
+}
+
+/// The server: until standard input ends.
+pub async fn serve() {
+    let mut config = Config::of_one_vehicle("car", "top");
+    let any: SocketAddr = "127.0.0.1:0".parse().expect("an address");
+    config.grpc.listen = any;
+    config.page.enabled = false;
+    config.zenoh.enabled = true;
+    config.zenoh.listen = vec!["tcp/127.0.0.1:0".into()];
+    let vehicle = &mut config.vehicles[0];
+    vehicle.udp = Some(Udp { data: any, telemetry: any, ..Udp::default() });
+    vehicle.sensors[0].extrinsics.z_m = ScannerConfig::default().ego_from_sensor.translation.z;
+    // The drive is older than its arrival.
+    vehicle.sensors[0].gps_late_days_max = 36_525.0;
+    let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
+    let (data, _) = running.doors[0].udp.expect("a socket");
+    let floor = TcpListener::bind(any).expect("a free port");
+    let floor_at = floor.local_addr().expect("bound");
+    tokio::spawn(serve_floor(floor));
+    let zenoh = running.zenoh.iter().find(|endpoint| endpoint.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
+    println!("{data} {} {floor_at} {zenoh}", running.grpc.expect("gRPC is served"));
+    let ended = tokio::task::spawn_blocking(|| std::io::copy(&mut std::io::stdin(), &mut std::io::sink()));
+    ended.await.expect("no panic").expect("standard input");
+}
+
+/// Ten messages a second to every connection, as long as each asks for, each with the stamp of its making.
+async fn serve_floor(listener: TcpListener) {
+    use tokio::io::AsyncWriteExt;
+    listener.set_nonblocking(true).expect("an option");
+    let listener = tokio::net::TcpListener::from_std(listener).expect("a listener");
+    let (tick, made) = tokio::sync::watch::channel(0);
+    tokio::spawn(async move {
+        let mut every = tokio::time::interval(Duration::from_millis(100));
+        loop {
+            every.tick().await;
+            tick.send_replace(now_ns());
+        }
+    });
+    while let Ok((mut stream, _)) = listener.accept().await {
+        let mut made = made.clone();
+        tokio::spawn(async move {
+            stream.set_nodelay(true)?;
+            let bytes = stream.read_u64_le().await?.clamp(8, 1 << 20);
+            let mut message = vec![0; bytes as usize];
+            while made.changed().await.is_ok() {
+                let made_ns: i64 = *made.borrow_and_update();
+                message[..8].copy_from_slice(&made_ns.to_le_bytes());
+                stream.write_all(&message).await?;
+            }
+            Ok::<(), std::io::Error>(())
+        });
+    }
+}

@@ -1,0 +1,183 @@
+//! What slow readers cost the others: eight healthy readers, without and with a stopped and a slow one beside them, in turn.
+//!
+//! In: the turns, seconds of each part. Out, of each part: age in the healthy ones' hands and maps they missed, growth of
+//! the server's resident set, and, when the stopped one goes on, how old the first map is that was not on its way already.
+//! One looks no more, as a planner that hangs (its connection lives: whoever does not even answer pings is dropped after
+//! 20 s); the other looks all the time over a slow link. Both have the windows that tonic gives any client, and the credits
+//! that ours ask for.
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use clearway_client::{now_ns, v1};
+use clearway_proto::v1::map_service_client::MapServiceClient;
+use prost::Message;
+use serde_json::{Value, json};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+use tonic::Streaming;
+use tonic::transport::Endpoint;
+
+use crate::drive::{Car, Turns};
+use crate::server::Process;
+use crate::{Arguments, Carrier, Readers, SETTLE, percentiles};
+
+const HEALTHY: usize = 8;
+const BYTES_A_SECOND: u64 = 10_000;
+/// Maps that may be on their way to a reader without an acknowledgement.
+const IN_FLIGHT: u32 = 2;
+/// Parts without slow readers and with them, in turn.
+const ROUNDS: usize = 2;
+
+/// Measures and prints; gives the rows.
+pub async fn measure(arguments: &Arguments, turns: &Turns) -> Vec<Value> {
+    let mut rows = Vec::new();
+    if !arguments.json {
+        println!(
+            "{:<8} {:>6} {:>7} {:>18} {:>10} {:>16}",
+            "", "maps", "missed", "age p50/p99 ms", "grown KiB", "resumed, age ms"
+        );
+    }
+    for with in [false, true].into_iter().cycle().take(2 * ROUNDS) {
+        let row = part(arguments, turns, with).await;
+        if !arguments.json {
+            let [p50, p99] = [0, 1].map(|at| row["age_ms"][at].as_f64().unwrap_or(f64::NAN));
+            let resumed = row["resumed_age_ms"].as_f64().map_or("-".into(), |ms| format!("{ms:.1}"));
+            let (name, ages) = (row["slow_readers"].as_str().unwrap_or_default(), format!("{p50:.2} / {p99:.2}"));
+            let (maps, missed) = (&row["maps"], &row["missed"]);
+            println!("{name:<8} {maps:>6} {missed:>7} {ages:>18} {:>10} {resumed:>16}", row["grown_kib"]);
+        }
+        rows.push(row);
+    }
+    rows
+}
+
+/// A server of its own, and so many seconds.
+async fn part(arguments: &Arguments, turns: &Turns, with: bool) -> Value {
+    let mut server = Process::start();
+    let readers = Readers::default();
+    let car = Car::drive(turns, server.data, &readers.cuts);
+    let mut tasks = JoinSet::new();
+    readers.join(&mut tasks, &server, Carrier::Grpc, &arguments.layer, HEALTHY, 0).await;
+    tokio::time::sleep(SETTLE).await;
+    let alone_kib = server.resident_kib();
+    let mut slow = Vec::new();
+    if with {
+        let link = lay(server.grpc).await;
+        slow.push(Slow::join(server.grpc, &arguments.layer).await);
+        slow.push(Slow::join(link, &arguments.layer).await);
+        slow[0].looks.send_replace(false);
+    }
+    readers.count_for(Duration::from_secs(arguments.seconds)).await;
+    let grown_kib = server.resident_kib() - alone_kib;
+    let resumed_age_ms = match slow.first_mut() {
+        Some(stopped) => Some(stopped.resume(&readers).await),
+        None => None,
+    };
+    slow.iter().for_each(|reader| reader.task.abort());
+    car.stop();
+    tasks.shutdown().await;
+    server.stop();
+    let mut seen = readers.seen.lock().expect("nobody panics");
+    let seen = &mut *seen;
+    json!({
+        "slow_readers": if with { "with" } else { "without" },
+        "maps": seen.carried.len(),
+        "age_ms": percentiles(&mut seen.ages),
+        "missed": seen.skipped,
+        "grown_kib": grown_kib,
+        "resumed_age_ms": resumed_age_ms,
+    })
+}
+
+/// A reader that stops, or is behind a slow link.
+struct Slow {
+    looks: watch::Sender<bool>,
+    heard: watch::Receiver<Heard>,
+    task: tokio::task::JoinHandle<()>,
+}
+
+/// How many updates came, and when the newest did.
+#[derive(Clone, Copy, Debug, Default)]
+struct Heard {
+    updates: u64,
+    capture_end_ns: i64,
+    arrived_ns: i64,
+}
+
+impl Slow {
+    /// Opens a stream and has its first map.
+    async fn join(address: SocketAddr, layer: &str) -> Self {
+        let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
+        let mut service = MapServiceClient::new(endpoint.connect().await.expect("gRPC answers"));
+        let selection =
+            v1::Selection { layers: vec![layer.to_owned()], max_in_flight: IN_FLIGHT, ..Default::default() };
+        let (requests, mut said) = tokio::sync::mpsc::channel(8);
+        requests.send(v1::WatchRequest { selection: Some(selection), ..Default::default() }).await.expect("room");
+        let said = futures::stream::poll_fn(move |context| said.poll_recv(context));
+        let updates = service.watch(said).await.expect("the server streams").into_inner();
+        let (tell, mut heard) = watch::channel(Heard::default());
+        let (looks, may_look) = watch::channel(true);
+        let task = tokio::spawn(read(updates, requests, may_look, tell));
+        heard.changed().await.expect("a first map");
+        Self { looks, heard, task }
+    }
+
+    /// Looks again; gives the age, ms, of the first map that was not on its way before.
+    async fn resume(&mut self, readers: &Readers) -> f64 {
+        let before = self.heard.borrow_and_update().updates;
+        self.looks.send_replace(true);
+        loop {
+            self.heard.changed().await.expect("the stream goes on");
+            let heard = *self.heard.borrow_and_update();
+            if heard.updates > before + u64::from(IN_FLIGHT) {
+                return readers.age_ms(heard.capture_end_ns, heard.arrived_ns).expect("a turn that was sent");
+            }
+        }
+    }
+}
+
+async fn read(
+    mut updates: Streaming<v1::MapUpdate>,
+    requests: tokio::sync::mpsc::Sender<v1::WatchRequest>,
+    mut may_look: watch::Receiver<bool>,
+    tell: watch::Sender<Heard>,
+) {
+    while may_look.wait_for(|looks| *looks).await.is_ok()
+        && let Ok(Some(update)) = updates.message().await
+    {
+        let arrived_ns = now_ns();
+        let header = v1::Map::decode(update.map).expect("a map").header.expect("a header");
+        tell.send_modify(|heard| {
+            *heard = Heard { updates: heard.updates + 1, capture_end_ns: header.capture_end_ns, arrived_ns };
+        });
+        let acknowledged = v1::WatchRequest { acknowledged: Some(header.sequence), ..Default::default() };
+        if requests.send(acknowledged).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// A slow link to the server, for one connection.
+async fn lay(server: SocketAddr) -> SocketAddr {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
+    let address = listener.local_addr().expect("bound");
+    tokio::spawn(async move {
+        let (near, _) = listener.accept().await?;
+        let (mut from_reader, mut to_reader) = near.into_split();
+        let (mut from_server, mut to_server) = TcpStream::connect(server).await?.into_split();
+        tokio::spawn(async move { tokio::io::copy(&mut from_reader, &mut to_server).await });
+        let mut bytes = [0; BYTES_A_SECOND as usize / 10];
+        loop {
+            let count = from_server.read(&mut bytes).await?;
+            if count == 0 {
+                return Ok::<(), std::io::Error>(());
+            }
+            to_reader.write_all(&bytes[..count]).await?;
+            tokio::time::sleep(Duration::from_secs_f64(count as f64 / BYTES_A_SECOND as f64)).await;
+        }
+    });
+    address
+}
