@@ -6,7 +6,7 @@
 use std::process::{Command, Output};
 
 use bytes::Bytes;
-use clearway_client::codec::{CellsRef, encode};
+use clearway_client::codec::{CellsRef, encode_grid};
 use clearway_client::v1;
 use clearway_proto::map::{encode_header, encode_layer};
 
@@ -38,9 +38,9 @@ pub fn map(sequence: u64, capture_end_ns: i64) -> Bytes {
         geometry: Some(v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m: vec![10.0, 20.0, 30.0], columns: 4 })),
         legend: ["unknown", "drivable", "not_drivable", "obstacle"].map(String::from).to_vec(),
         channels: vec![
-            encode(CellsRef::U8(&CLASSES)).into_channel("class", "", 1.0, 0),
-            encode(CellsRef::I8(&heights)).into_channel("unit_height", "m", 0.5, -128),
-            encode(CellsRef::U16(&[400; 12])).into_channel("segment", "", 1.0, 65_535),
+            encode_grid(CellsRef::U8(&CLASSES), 4).into_channel("class", "", 1.0, 0),
+            encode_grid(CellsRef::I8(&heights), 4).into_channel("unit_height", "m", 0.5, -128),
+            encode_grid(CellsRef::U16(&[400; 12]), 4).into_channel("segment", "", 1.0, 65_535),
         ],
         figures: [("drivable_share".to_string(), 0.625)].into(),
         ..Default::default()
