@@ -1,4 +1,5 @@
-//! The fuzzers' corpora, replayed. They hold only bytes made here; with `CLEARWAY_BLESS=1` they are written anew.
+//! The fuzzers' corpora, replayed. They hold bytes made here, written anew with `CLEARWAY_BLESS=1`, and what the fuzzers
+//! made of those (named by their hash).
 
 #[path = "../../fuzz/entries.rs"]
 pub mod entries;
