@@ -172,8 +172,8 @@ fn sectors(region: &v1::Region, corners: &[(f64, f64)], columns: u32) -> Span {
     let aside = corners.iter().map(|(x, y)| (y.atan2(*x) - middle + PI).rem_euclid(TAU) - PI);
     let (right, left) = aside.fold((0.0_f64, 0.0_f64), |(right, left), at| (right.min(at), left.max(at)));
     // What lies on the edge of a sector may be counted to either side: half a nanoradian is nothing, and is enough.
-    let at = |azimuth: f64| (azimuth.rem_euclid(TAU) / TAU * f64::from(columns)) as usize;
-    let from = at(middle + right - 5e-10);
-    let length = (at(middle + left + 5e-10) + count - from) % count + 1;
+    let at = |azimuth: f64| (azimuth / TAU * f64::from(columns)).floor();
+    let (first, last) = (at(middle + right - 5e-10), at(middle + left + 5e-10));
+    let (from, length) = (first.rem_euclid(f64::from(columns)) as usize, count.min((last - first) as usize + 1));
     from..from + length
 }
