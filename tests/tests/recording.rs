@@ -278,8 +278,8 @@ async fn an_address_in_use_is_named_by_its_key_and_costs_no_earlier_recording_it
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let heard = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
     let (tcp, udp) = (taken.local_addr().unwrap(), heard.local_addr().unwrap());
-    // Held only until the others come to their turn.
-    let free = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    // Of an address that no other test is given ports of: free until it is taken here.
+    let free = std::net::TcpListener::bind("127.0.0.77:0").unwrap().local_addr().unwrap();
     type Take = fn(&mut Config, SocketAddr);
     let wrong: [(&str, SocketAddr, Take); 5] = [
         ("grpc.listen", tcp, |config, at| config.grpc.listen = at),
