@@ -5,14 +5,11 @@ mod house;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use clearway_server::server::Running;
-use clearway_sim::send::{Pace, Until, drive};
 use house::certificates::{behind, certificates, router, secured};
 use house::venv::{environment, run};
-use house::{config, feed, readings, start, until, vehicle, within};
+use house::{config, feed, readings, start, until, within};
 
 const REPOSITORY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
 
@@ -82,21 +79,7 @@ async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording
     let mut live = config();
     live.zenoh.enabled = true;
     let running = start(live).await;
-    let (data, telemetry) = running.doors[0].udp.unwrap();
-    let halt = Arc::new(AtomicBool::new(false));
-    let car = std::thread::spawn({
-        let halt = halt.clone();
-        move || {
-            drive(
-                house::anywhere(),
-                vehicle(),
-                data,
-                telemetry,
-                Pace::RealTime,
-                Until { stop: Some(&halt), device_time: None },
-            )
-        }
-    });
+    let car = house::Driving::to(&running);
     let status = running.vehicles.0[0].status.clone();
     until("a map", || status.snapshot().maps > 0).await;
 
@@ -121,8 +104,7 @@ async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording
         println!("{said}");
     });
     let outcome = tests.await;
-    halt.store(true, Ordering::Relaxed);
-    car.join().unwrap().unwrap();
+    car.halt();
     within("shutdown", running.shutdown()).await.unwrap();
     within("shutdown", asking.shutdown()).await.unwrap();
     router.close().await.unwrap();

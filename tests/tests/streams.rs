@@ -3,8 +3,6 @@
 mod house;
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -56,26 +54,12 @@ async fn a_live_drive_over_udp_reaches_grpc_and_zenoh_with_the_bytes_of_the_reco
     config.zenoh.enabled = true;
     config.recorder.file = record.clone();
     let running = start(config).await;
-    let (data, telemetry) = running.doors[0].udp.unwrap();
 
     let session = session(&running).await;
     let subscriber = session.declare_subscriber(format!("clearway/car/map/{LAYER}")).await.unwrap();
     let (_requests, mut updates) = watch(&running, 0).await;
 
-    let halt = Arc::new(AtomicBool::new(false));
-    let car = std::thread::spawn({
-        let halt = halt.clone();
-        move || {
-            drive(
-                house::anywhere(),
-                vehicle(),
-                data,
-                telemetry,
-                Pace::RealTime,
-                Until { stop: Some(&halt), device_time: None },
-            )
-        }
-    });
+    let car = house::Driving::to(&running);
     let mut over_grpc = BTreeMap::new();
     let mut over_zenoh = BTreeMap::new();
     within("three maps over gRPC and zenoh", async {
@@ -93,8 +77,7 @@ async fn a_live_drive_over_udp_reaches_grpc_and_zenoh_with_the_bytes_of_the_reco
         }
     })
     .await;
-    halt.store(true, Ordering::Relaxed);
-    let sent = car.join().unwrap().unwrap();
+    let sent = car.halt();
     let status = running.vehicles.0[0].status.clone();
     session.close().await.unwrap();
     within("shutdown", running.shutdown()).await.unwrap();

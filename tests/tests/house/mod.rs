@@ -5,7 +5,11 @@ pub mod certificates;
 pub mod venv;
 
 use std::future::Future;
+use std::io;
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -18,6 +22,7 @@ use clearway_server::recording::{Entry, Recording};
 use clearway_server::server::{Running, Server, Setup};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::flat;
+use clearway_sim::send::{Pace, Sent, Until, drive};
 use clearway_sim::vehicle::SimulatedVehicle;
 use prost::Message;
 use tonic::transport::Channel;
@@ -44,6 +49,32 @@ pub fn config() -> Config {
 pub async fn start(config: Config) -> Running {
     // Nothing here may be lost to a slow test machine's disk.
     Server::start(Setup { config, from_files: true, ..Setup::default() }).await.expect("the server starts")
+}
+
+/// A vehicle that drives, in real time, until it is told to halt.
+pub struct Driving {
+    halt: Arc<AtomicBool>,
+    thread: JoinHandle<io::Result<Sent>>,
+}
+
+impl Driving {
+    /// The vehicle on a plain, to a running server's first vehicle.
+    pub fn to(running: &Running) -> Self {
+        let (data, telemetry) = running.doors[0].udp.expect("the vehicle has a socket");
+        let halt = Arc::new(AtomicBool::new(false));
+        let until = halt.clone();
+        let thread = std::thread::spawn(move || {
+            let until = Until { stop: Some(&until), device_time: None };
+            drive(anywhere(), vehicle(), data, telemetry, Pace::RealTime, until)
+        });
+        Self { halt, thread }
+    }
+
+    /// What it has sent.
+    pub fn halt(self) -> Sent {
+        self.halt.store(true, Ordering::Relaxed);
+        self.thread.join().unwrap().unwrap()
+    }
 }
 
 /// Any port of any address, to send from.
