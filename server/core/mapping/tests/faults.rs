@@ -181,7 +181,7 @@ fn inside(layer: &Layer, (from_deg, to_deg): (f64, f64)) -> (usize, usize) {
     };
     let cells: Vec<usize> = (0..classes.len()).filter(far_inside).collect();
     let unseen = ["unknown", "out_of_range", "occupied"];
-    let known = |cell: &&usize| !unseen.contains(&layer.legend[usize::from(classes[**cell])]);
+    let known = |cell: &&usize| !unseen.contains(&layer.legend[usize::from(classes[**cell])].name);
     (cells.len(), cells.iter().filter(known).count())
 }
 
