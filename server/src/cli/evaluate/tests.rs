@@ -75,7 +75,7 @@ fn options_set_the_column_width_and_disable_maps() {
     assert_eq!(columns(3), None);
     let folder = written(&street());
     let config = folder.path().join("clearway.toml");
-    let all = include_str!("../../../deploy/clearway.toml");
+    let all = include_str!("../../../../deploy/clearway.toml");
     let judged = |columns_deg, text: &str| {
         std::fs::write(&config, text).unwrap();
         let options = Options { columns_deg, config: Some(config.clone()), ..options(folder.path()) };
