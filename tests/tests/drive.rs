@@ -6,7 +6,7 @@
 #[allow(dead_code, reason = "the example shows pictures")]
 #[path = "../../client/examples/planner/astar.rs"]
 mod astar;
-mod house;
+mod fixture;
 
 use std::net::UdpSocket;
 use std::ops::Range;
@@ -21,7 +21,7 @@ use clearway_sim::course::{Course, Drive};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::{Scene, town};
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
-use house::{config, until, within};
+use fixture::{config, until, within};
 
 /// A saloon; the simulated cars have the same.
 const SIZE_M: [f64; 3] = [4.4, 1.8, 1.5];

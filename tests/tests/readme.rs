@@ -1,6 +1,6 @@
 //! The README's commands do what the README says.
 
-#[path = "house/venv.rs"]
+#[path = "fixture/venv.rs"]
 mod venv;
 
 use std::fs;

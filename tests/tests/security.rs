@@ -1,6 +1,6 @@
 //! Certificates and roles: who is let in, who is told what they may not do, and what of it is recorded.
 
-mod house;
+mod fixture;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -8,8 +8,8 @@ use std::sync::Arc;
 use clearway_client::{Client, ClientError, Subscription, Tls, ZenohClient};
 use clearway::cli::replay::{Options, Summary, replay};
 use clearway::server::{Running, Server, Setup};
-use house::certificates::{behind, certificates, router, secured, start, zenoh_file};
-use house::{config, feed, grpc, readings, within};
+use fixture::certificates::{behind, certificates, router, secured, start, zenoh_file};
+use fixture::{config, feed, grpc, readings, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
@@ -134,7 +134,7 @@ async fn peers_that_shake_no_hand_reset_or_say_too_much_leave_the_others_served(
     let mut client = grpc(&running).await;
     for _ in 0..100 {
         // A stream begun and dropped at once.
-        let begun = client.watch(tokio_stream::once(house::selection("car", &[], 1))).await;
+        let begun = client.watch(tokio_stream::once(fixture::selection("car", &[], 1))).await;
         drop(begun.expect("a stream"));
     }
     let long = clearway_proto::v1::GetMapRequest { vehicle: "x".repeat(1 << 20), layers: Vec::new() };
@@ -184,7 +184,7 @@ async fn behind_the_router_of_deploy_each_certificate_does_what_its_rules_allow(
     let folder = tempfile::tempdir().unwrap();
     let ours = certificates("ours");
     let (router, at) = router().await;
-    let running = house::start(behind(&at, folder.path(), config())).await;
+    let running = fixture::start(behind(&at, folder.path(), config())).await;
 
     let reader = zenoh_client(&at, "ours", "reader").await.expect("a session");
     let unlisted = zenoh_client(&at, "ours", "operator").await.expect("a session");

@@ -4,7 +4,7 @@
 
 #![cfg_attr(not(clearway_data), allow(unused))]
 
-mod house;
+mod fixture;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -70,7 +70,7 @@ async fn maps(drive: &Drive) -> Vec<Sized> {
     let folder = tempfile::tempdir().unwrap();
     let (file, record) = (Path::new(env!("CLEARWAY_DATA")).join(drive.path), folder.path().join("drive.mcap"));
     let options = Options { files: vec![file.clone()], record: Some(record.clone()), ..Options::default() };
-    house::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
+    fixture::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
     let mut recording = Recording::open(&record).unwrap();
     let (config, tables) = recording.config().unwrap();
     // By how much the arrivals are ahead of the sensor's own clock, which the poses are to follow.

@@ -1,7 +1,7 @@
 //! Strangers who know ROS 2 and Foxglove and nothing of Clearway: they find the maps, decode them by what they are
 //! told, and have what the maps say.
 
-mod house;
+mod fixture;
 
 use std::f64::consts::FRAC_PI_4;
 use std::io::{BufRead, BufReader};
@@ -13,7 +13,7 @@ use clearway_mapping::event::{Body, EgoPose};
 use clearway::config::{Config, Foxglove, Ros2};
 use clearway::ingest::Reading;
 use clearway::server::{Running, Server, Setup};
-use house::{LAYERS, config, feed, readings, start, venv, within};
+use fixture::{LAYERS, config, feed, readings, start, venv, within};
 use nalgebra::{Isometry3, Vector3};
 use serde_json::{Value, json};
 

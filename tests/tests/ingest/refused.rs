@@ -13,7 +13,7 @@ use clearway::record::verify::verify;
 use prost::Message;
 use tonic::Code;
 
-use super::house::{recorded, within};
+use super::fixture::{recorded, within};
 use super::{client, ingester, plain, reports, scan, scanned_config, start};
 
 /// Every list of `scan` with its last number replaced.

@@ -3,7 +3,7 @@
 
 mod bad;
 #[path = "../house/mod.rs"]
-mod house;
+mod fixture;
 
 use std::future::ready;
 use std::net::SocketAddr;
@@ -17,7 +17,7 @@ use clearway_proto::v1::map_service_server::{MapService, MapServiceServer};
 use clearway::ingest::Reading;
 use clearway::server::Running;
 use futures::{Stream, StreamExt};
-use house::{config, feed, readings, sequence, start, within};
+use fixture::{config, feed, readings, sequence, start, within};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 use tonic::transport::Channel;
