@@ -1,7 +1,7 @@
 //! Scans, poses, roads and tunnelled packets over the network: the same maps as by any other door, and for everything
 //! that is not taken a reason.
 
-#[path = "../house/mod.rs"]
+#[path = "../fixture/mod.rs"]
 mod fixture;
 mod refused;
 

@@ -2,7 +2,7 @@
 //! anything.
 
 mod bad;
-#[path = "../house/mod.rs"]
+#[path = "../fixture/mod.rs"]
 mod fixture;
 
 use std::future::ready;
