@@ -6,7 +6,7 @@
 use crate::config::MapsConfig;
 use crate::layer::drivability::Drivability;
 use crate::layer::height_difference::HeightDifference;
-use crate::sensor::pipeline::Wanted;
+use crate::sensor::scan::ScanExtras;
 use crate::map::{Context, Layer, LayerMaker, Rays};
 use crate::layer::occupancy::Occupancy;
 use crate::layer::safe_path::SafePath;
@@ -57,21 +57,21 @@ impl Layers {
     }
 
     /// Whether any layer is wanted.
-    pub fn are_wanted(&self) -> bool {
+    pub fn any_active(&self) -> bool {
         self.0.iter().any(|slot| slot.wanted.is_some())
     }
 
     /// What the wanted layers want of every turn.
-    pub fn wanted(&self) -> Wanted {
+    pub fn uses(&self) -> ScanExtras {
         let any = |asks: fn(&dyn LayerMaker) -> bool| {
             self.0.iter().filter_map(|slot| slot.wanted.as_ref()).any(|(maker, _)| asks(&**maker))
         };
-        Wanted { deviations: any(|maker| maker.wants_deviations()), no_returns: any(|maker| maker.wants_no_returns()) }
+        ScanExtras { deviations: any(|maker| maker.wants_deviations()), no_returns: any(|maker| maker.wants_no_returns()) }
     }
 
     /// Wants these layers and those they are made from, and no other. One that was not wanted begins anew. Tells
     /// whether these are others than before.
-    pub fn want(&mut self, maps: &MapsConfig, is_wanted: impl Fn(&str) -> bool) -> bool {
+    pub fn set_active(&mut self, maps: &MapsConfig, is_wanted: impl Fn(&str) -> bool) -> bool {
         let mut changed = false;
         for slot in &mut self.0 {
             let asked = is_wanted(slot.name);
@@ -103,7 +103,7 @@ impl Layers {
     }
 
     /// Shows a sensor's turn to the layers that gather evidence.
-    pub fn take(&mut self, rays: &Rays<'_>) {
+    pub fn integrate(&mut self, rays: &Rays<'_>) {
         self.0.iter_mut().filter_map(|slot| slot.wanted.as_mut()).for_each(|(maker, _)| maker.take(rays));
     }
 

@@ -170,8 +170,8 @@ pub struct Roads {
 }
 
 impl Roads {
-    /// Takes a road that [`check`] has passed, in place of the one before.
-    pub fn take(&mut self, road: &Road, map_from_ego: Option<Isometry3<f64>>) {
+    /// Replaces the newest road of the same purpose by a road that [`check`] has accepted.
+    pub fn insert(&mut self, road: &Road, map_from_ego: Option<Isometry3<f64>>) {
         let taken = Some(TakenRoad { road: road.clone(), map_from_ego });
         match road.purpose {
             RoadPurpose::Paint => self.paint = taken,
