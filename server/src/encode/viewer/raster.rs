@@ -218,7 +218,7 @@ mod tests {
 
     #[test]
     fn every_class_of_every_layer_has_an_occupancy_that_was_chosen_and_unknown_is_never_free() {
-        use clearway_mapping::{drivability, height_difference, safe_path, speed, terrain};
+        use clearway_mapping::layer::{drivability, height_difference, safe_path, speed, terrain};
         let of = |legend: &[&str]| legend.iter().map(|class| occupancy(class)).collect::<Vec<_>>();
         assert_eq!(of(drivability::LEGEND), [-1, 0, 100, 100]);
         assert_eq!(of(height_difference::LEGEND), [-1, 0, 100]);
