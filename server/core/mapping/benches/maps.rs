@@ -14,7 +14,7 @@ use clearway_mapping::layer::height_difference::HeightDifference;
 use clearway_mapping::map::{Context, LayerMaker, Rays};
 use clearway_mapping::sensor::motion::{Motion, EgoTrajectory};
 use clearway_mapping::layer::occupancy::Occupancy;
-use clearway_mapping::road::TakenRoad;
+use clearway_mapping::road::StoredRoad;
 use clearway_mapping::layer::safe_path::SafePath;
 use clearway_mapping::sensor::distance_series::DistanceSeries;
 use clearway_mapping::layer::speed::Speed;
@@ -155,7 +155,7 @@ fn speed(bencher: Bencher) {
         widths_m: vec![6.0; 20],
         orientations: Vec::new(),
     };
-    let taken = TakenRoad { road, map_from_ego: None };
+    let taken = StoredRoad { road, map_from_ego: None };
     let mut map = Speed::new(&SpeedConfig::default());
     let mut layer = map.layer();
     let context = Context { road: Some(&taken), ..Context::default() };

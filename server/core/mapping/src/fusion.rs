@@ -25,8 +25,8 @@ use crate::sensor::scan::SensorScan;
 use crate::sensor::sweep::Sweep;
 
 const NS_PER_MS: i64 = 1_000_000;
-/// A scan of the same source makes a map once `period_ms` less one part in this many has passed. Ours: sensors jitter by
-/// some per cent of their own period, and a scan that comes a little early must not halve the rate of maps.
+/// A scan of the same source makes a map once `period_ms` less one part in this many has passed. Ours: sensors jitter
+/// by some per cent of their own period, and a scan that comes a little early must not halve the rate of maps.
 const PERIOD_TOLERANCE_PARTS: i64 = 10;
 
 /// The newest map, as far as the next one depends on it.
@@ -108,8 +108,7 @@ impl Fusion {
     /// True if the sensor's scans arrive no later after their stamps, nor earlier before them, than those of the
     /// timeliest fresh sensor, with the deadline as tolerance. A scan that is not timely no longer describes the scene.
     pub fn is_timely(&self, source: usize, scans: &[SensorScan], now: EventTime) -> bool {
-        let delay_ns =
-            |scan: &SensorScan| scan.completed_at.arrival_ns.saturating_sub(scan.end_ns).saturating_abs();
+        let delay_ns = |scan: &SensorScan| scan.completed_at.arrival_ns.saturating_sub(scan.end_ns).saturating_abs();
         let fresh = scans.iter().filter(|other| other.completed > 0 && self.is_fresh(other, now));
         let least_ns = fresh.map(delay_ns).min();
         let scan = &scans[source];
@@ -121,9 +120,9 @@ impl Fusion {
     fn makes_map(&self, source: usize, scans: &[SensorScan], now: EventTime) -> bool {
         let since_ns = now.event_ns.saturating_sub(self.newest.map_or(0, |newest| newest.event_ns));
         let is_overdue = since_ns > self.deadline_ns.max(self.period_ns);
-        let first_usable = self.order(scans.len()).find(|&index| {
-            index == source || (self.is_fresh(&scans[index], now) && self.is_timely(index, scans, now))
-        });
+        let first_usable = self
+            .order(scans.len())
+            .find(|&index| index == source || (self.is_fresh(&scans[index], now) && self.is_timely(index, scans, now)));
         self.is_timely(source, scans, now)
             && (is_overdue || first_usable == Some(source))
             && self.is_newer(source, &scans[source], is_overdue)

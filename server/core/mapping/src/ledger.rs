@@ -16,9 +16,9 @@ use crate::sensor::self_filter::RemovedPoints;
 /// source: the limit keeps every sum of them within 64 bits.
 const LOST_MAX: u64 = 1 << 60;
 
-/// Counts of what became of everything that reached a vehicle, or one of its sensors. For each ledger
-/// `received = decoded + telemetry + the sum of refused`, exactly. The ledger of the vehicle alone counts what belongs to
-/// no sensor: poses, roads, declarations of sensors, and readings of unknown senders.
+/// Counts of what became of everything that reached a vehicle, or one of its sensors. For each ledger `received =
+/// decoded + telemetry + the sum of refused`, exactly. The ledger of the vehicle alone counts what belongs to no
+/// sensor: poses, roads, declarations of sensors, and readings of unknown senders.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Ledger {
     /// Number of datagrams and scans, and of `End` events for unknown sensors.

@@ -1,11 +1,11 @@
-//! What a map is: a header, the state of every sensor, and layers. Class 0 of every layer means unknown; an unknown cell
-//! is never free.
+//! What a map is: a header, the state of every sensor, and layers. Class 0 of every layer means unknown; an unknown
+//! cell is never free.
 
 use clearway_lidar::blocked::Blocked;
 use nalgebra::Isometry3;
 
 use crate::sensor::motion::Compensation;
-use crate::road::TakenRoad;
+use crate::road::StoredRoad;
 use crate::sensor::sweep::Sweep;
 
 /// The map of one vehicle, made from the scan of one sensor (its source) and the newest scans of the others.
@@ -164,9 +164,9 @@ pub struct Context<'a> {
     /// Newest ego pose; `None` while no pose is known.
     pub map_from_ego: Option<Isometry3<f64>>,
     /// Newest road to paint.
-    pub road: Option<&'a TakenRoad>,
+    pub road: Option<&'a StoredRoad>,
     /// Newest route.
-    pub route: Option<&'a TakenRoad>,
+    pub route: Option<&'a StoredRoad>,
 }
 
 /// One sensor's turn or scan, as the maps that gather evidence between two maps see it.

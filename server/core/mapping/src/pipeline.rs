@@ -50,7 +50,8 @@ impl Pipeline {
     /// `config.sensors[i].calibration`; `None` selects the factory's table, or the one in the sensor's status bytes.
     ///
     /// # Errors
-    /// [`ConfigValueError`] for the first value that is not allowed, or if there are not as many calibrations as sensors.
+    /// [`ConfigValueError`] for the first value that is not allowed, or if there are not as many calibrations as
+    /// sensors.
     pub fn new(config: &VehicleConfig, calibrations: Vec<Option<Calibration>>) -> Result<Self, ConfigValueError> {
         config.validate()?;
         if calibrations.len() != config.sensors.len() {
@@ -71,8 +72,8 @@ impl Pipeline {
         })
     }
 
-    /// Applies one event and returns the map that it completed, if it completed one. The same events give the same maps,
-    /// byte for byte.
+    /// Applies one event and returns the map that it completed, if it completed one. The same events give the same
+    /// maps, byte for byte.
     ///
     /// # Errors
     /// [`EventError`] if the event is refused; then it changes nothing but the ledgers.
@@ -104,9 +105,9 @@ impl Pipeline {
     }
 
     /// Makes the newest map again with the layers that became active after it was made without any, so that the first
-    /// reader need not wait for a sensor that may be silent. The map gets the next sequence; layers that gather evidence
-    /// have seen one scan. `None` if no layer is active, if the newest map has layers, or if a sensor has completed a
-    /// scan since.
+    /// reader need not wait for a sensor that may be silent. The map gets the next sequence; layers that gather
+    /// evidence have seen one scan. `None` if no layer is active, if the newest map has layers, or if a sensor has
+    /// completed a scan since.
     pub fn remake_newest_map(&mut self) -> Option<&Map> {
         let is_empty = self.maps_made > 0 && self.map.layers.is_empty();
         if !is_empty || !self.layers.any_active() || !self.fusion.is_current() {

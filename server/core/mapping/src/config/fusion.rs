@@ -10,11 +10,12 @@ use crate::config::check::{ConfigValueError, check};
 pub struct FusionConfig {
     /// Name of the sensor whose scans make the maps; if it is empty, the first sensor.
     pub reference_sensor: String,
-    /// Greatest time between a sensor's newest scan and the map's stamp, ms; an older scan contributes nothing. A sensor
-    /// that completes no scan for so long makes no maps until it is back. More than the longest scan of any sensor.
+    /// Greatest time between a sensor's newest scan and the map's stamp, ms; an older scan contributes nothing. A
+    /// sensor that completes no scan for so long makes no maps until it is back. More than the longest scan of any
+    /// sensor.
     pub deadline_ms: u32,
-    /// Least time between two maps of one source, ms, with a tolerance of a tenth; for sensors that scan faster than maps
-    /// are needed. 0: every scan of the source makes a map.
+    /// Least time between two maps of one source, ms, with a tolerance of a tenth; for sensors that scan faster than
+    /// maps are needed. 0: every scan of the source makes a map.
     pub period_ms: u32,
 }
 

@@ -62,7 +62,8 @@ impl Default for MotionConfig {
     }
 }
 
-/// Parameters of [`crate::layer::drivability`]; the thesis' value, or the reading's where the thesis has none, is the default.
+/// Parameters of [`crate::layer::drivability`]; the thesis' value, or the reading's where the thesis has none, is the
+/// default.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DrivabilityConfig {

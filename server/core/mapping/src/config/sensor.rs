@@ -8,8 +8,8 @@ use clearway_lidar::model::Model;
 
 use crate::config::check::{ConfigValueError, check, check_name};
 
-/// Greatest length of a calibration that a declared sensor brings, bytes. Ours: half as much again as the longest table of
-/// any model, that of a VLS-128.
+/// Greatest length of a calibration that a declared sensor brings, bytes. Ours: half as much again as the longest table
+/// of any model, that of a VLS-128.
 const CALIBRATION_BYTES_MAX: usize = 64 << 10;
 /// Greatest number of blind sectors of one sensor. Ours.
 pub const BLIND_MAX: usize = 16;
@@ -44,13 +44,13 @@ pub struct SensorConfig {
     /// and the cells there stay unknown.
     #[serde(default)]
     pub blind_deg: Vec<[f32; 2]>,
-    /// Greatest difference between GPS time and arrival, days. If GPS time is older, the stamps of the sensor follow the
-    /// host's clock: then a capture is played live, or the receiver has miscounted the weeks.
+    /// Greatest difference between GPS time and arrival, days. If GPS time is older, the stamps of the sensor follow
+    /// the host's clock: then a capture is played live, or the receiver has miscounted the weeks.
     #[serde(default = "default_gps_late_days_max")]
     pub gps_late_days_max: f64,
     /// Elevation of each laser, degrees; for a sensor that sends scans and has no [`Model`]. If it is empty too, the
-    /// elevations are measured from the rings of the first scan; if that has no rings, radial maps whose rows this sensor
-    /// defines are unknown.
+    /// elevations are measured from the rings of the first scan; if that has no rings, radial maps whose rows this
+    /// sensor defines are unknown.
     #[serde(default)]
     pub elevations_deg: Vec<f32>,
     /// Position and orientation of the sensor on the vehicle.
@@ -62,8 +62,8 @@ fn default_cut_azimuth_deg() -> f32 {
     180.0
 }
 
-/// Default least range, metres. Ours: within it a roof-mounted sensor sees roof, rails and bonnet, and no ground, because it
-/// is mounted higher than 1 m.
+/// Default least range, metres. Ours: within it a roof-mounted sensor sees roof, rails and bonnet, and no ground,
+/// because it is mounted higher than 1 m.
 fn default_range_m_min() -> f32 {
     2.0
 }
@@ -73,7 +73,8 @@ fn default_gps_late_days_max() -> f64 {
     1.0
 }
 
-/// Position and orientation of a sensor on its vehicle: `ego_from_sensor`, with the rotation Rz(yaw) Ry(pitch) Rx(roll).
+/// Position and orientation of a sensor on its vehicle: `ego_from_sensor`, with the rotation Rz(yaw) Ry(pitch)
+/// Rx(roll).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Extrinsics {

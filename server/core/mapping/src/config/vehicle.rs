@@ -10,7 +10,8 @@ use crate::config::fusion::FusionConfig;
 use crate::config::maps::MapsConfig;
 use crate::config::sensor::SensorConfig;
 
-/// Greatest number of sensors of one vehicle, declared ones included. Ours: the newest scan of each takes some megabytes.
+/// Greatest number of sensors of one vehicle, declared ones included. Ours: the newest scan of each takes some
+/// megabytes.
 pub const SENSORS_MAX: usize = 32;
 
 /// One vehicle: all that the core needs to make maps from its events.
@@ -71,13 +72,13 @@ impl VehicleConfig {
     }
 
     /// Adds a sensor that the file does not contain, as sensor number `index`, which is the next one. A repeated
-    /// declaration changes nothing, so that a sender may declare its sensor whenever it connects. Returns the calibration
-    /// of a new sensor, if it brings one: its `calibration` is the text of a table and not a path, so that a replay needs
-    /// no file.
+    /// declaration changes nothing, so that a sender may declare its sensor whenever it connects. Returns the
+    /// calibration of a new sensor, if it brings one: its `calibration` is the text of a table and not a path, so that
+    /// a replay needs no file.
     ///
     /// # Errors
-    /// [`ConfigValueError`] if the index is not the next one, if the name is in use, if a value is not allowed, or if the
-    /// calibration cannot be read.
+    /// [`ConfigValueError`] if the index is not the next one, if the name is in use, if a value is not allowed, or if
+    /// the calibration cannot be read.
     pub fn declare(&mut self, index: usize, sensor: &SensorConfig) -> Result<Option<Calibration>, ConfigValueError> {
         if self.sensors.get(index) == Some(sensor) {
             return Ok(None);

@@ -1,9 +1,9 @@
 //! The distance series of each laser, and how far each range deviates from its neighbours (Neuhaus 2009, section 2.5).
 //!
 //! In: one echo of a [`Revolution`]. Out: by slot, smoothed range minus measured range, metres. The series of a laser
-//! holds its ranges of the revolution in time order. A missing return is replaced by the last valid one, as in the paper.
-//! The smoothed range is the mean of nine ranges; at the two ends of the revolution it is the mean of those that exist.
-//! Firings in which a laser does not fire (HDL-64E S1) are not part of its series.
+//! holds its ranges of the revolution in time order. A missing return is replaced by the last valid one, as in the
+//! paper. The smoothed range is the mean of nine ranges; at the two ends of the revolution it is the mean of those that
+//! exist. Firings in which a laser does not fire (HDL-64E S1) are not part of its series.
 
 use clearway_lidar::revolution::Revolution;
 
@@ -24,7 +24,8 @@ pub struct DistanceSeries {
 }
 
 impl DistanceSeries {
-    /// Deviation of every slot of the first echo, metres, by `firing * lasers + laser`; NaN for a slot without a return.
+    /// Deviation of every slot of the first echo, metres, by `firing * lasers + laser`; NaN for a slot without a
+    /// return.
     pub fn deviations(&mut self, revolution: &Revolution) -> &[f32] {
         let range_m = revolution.echoes.first().map_or(&[][..], |echo| &echo.range_m[..]);
         self.compute(range_m, revolution.lasers);

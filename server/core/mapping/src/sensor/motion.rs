@@ -1,8 +1,8 @@
 //! How the vehicle moved through a scan, so that each firing can be expressed at the scan's end.
 //!
 //! In: ego poses, and the speed in the sensor's own GPRMC sentences, in the order of the events. Out: the ego pose at a
-//! stamp, and for each revolution or scan an [`EgoTrajectory`]: `end_from_ego` along its firings, which transforms the ego
-//! frame at a firing into the ego frame at the last firing.
+//! stamp, and for each revolution or scan an [`EgoTrajectory`]: `end_from_ego` along its firings, which transforms the
+//! ego frame at a firing into the ego frame at the last firing.
 //!
 //! | case | motion |
 //! |---|---|
@@ -25,19 +25,20 @@ use crate::event::{EgoPose, Scan};
 
 /// Number of poses that are kept. Ours: a second at 1 kHz, which is longer than a revolution of any sensor.
 const POSES_MAX: usize = 1024;
-/// Greatest time between two poses that are interpolated, ns. Ours: at 15 m/s in a bend of 50 m the path is 0.6 m beside
-/// the chord of one second.
+/// Greatest time between two poses that are interpolated, ns. Ours: at 15 m/s in a bend of 50 m the path is 0.6 m
+/// beside the chord of one second.
 const GAP_NS_MAX: i64 = 1_000_000_000;
-/// Least time over which the velocity beyond the newest pose is measured, ns. Ours: a millimetre of noise then makes 2 cm/s.
+/// Least time over which the velocity beyond the newest pose is measured, ns. Ours: a millimetre of noise then makes 2
+/// cm/s.
 const BASELINE_NS: i64 = 50_000_000;
-/// Greatest speed between two poses, m/s. Ours: no vehicle on wheels is faster; poses that are farther apart have jumped,
-/// as they do when a receiver finds its satellites again.
+/// Greatest speed between two poses, m/s. Ours: no vehicle on wheels is faster; poses that are farther apart have
+/// jumped, as they do when a receiver finds its satellites again.
 const SPEED_MPS_MAX: f64 = 100.0;
 /// Distance that two poses may be apart at any speed without counting as a jump, metres. Ours: the step of a receiver
 /// that changes its set of satellites.
 const JUMP_M_MAX: f64 = 0.5;
-/// Number of firings from one exact pose to the next; between them the matrices are interpolated. Ours: at a yaw rate of
-/// 1 rad/s the error within the millisecond of 16 firings is less than a tenth of a millimetre at 100 m.
+/// Number of firings from one exact pose to the next; between them the matrices are interpolated. Ours: at a yaw rate
+/// of 1 rad/s the error within the millisecond of 16 firings is less than a tenth of a millimetre at 100 m.
 pub(crate) const KNOT_FIRINGS: usize = 16;
 
 /// What moved the points of a sweep to one stamp. Ordered from least to most accurate.
@@ -84,8 +85,9 @@ pub(crate) fn knots(firings: usize) -> impl ExactSizeIterator<Item = usize> + Cl
 /// The newest speed from a sensor's telemetry.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct SpeedMeasurement {
-    /// End of the sensor's newest scan when the sentence arrived, ns since the Unix epoch; `None` until a scan has ended.
-    /// The age of the speed counts from it and not from the host's clock, so that a step of that clock does not age it.
+    /// End of the sensor's newest scan when the sentence arrived, ns since the Unix epoch; `None` until a scan has
+    /// ended. The age of the speed counts from it and not from the host's clock, so that a step of that clock does not
+    /// age it.
     stamp_ns: Option<i64>,
     /// UTC of the sentence; repeats of the sentence are ignored.
     utc_ns: Option<i64>,
@@ -275,7 +277,8 @@ fn straight_ahead(speed_mps: f64, from_ns: i64, to_ns: i64) -> Isometry3<f64> {
     Isometry3::translation(from_ns.saturating_sub(to_ns) as f64 * 1e-9 * speed_mps, 0.0, 0.0)
 }
 
-/// The times of a scan at which [`EgoTrajectory::end_from_ego`] is exact: evenly spaced from its first point to its stamp.
+/// The times of a scan at which [`EgoTrajectory::end_from_ego`] is exact: evenly spaced from its first point to its
+/// stamp.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct ScanKnots {
     /// Time from the first point to the stamp, ns; `None` if the scan does not state the times of its points.
@@ -283,8 +286,8 @@ pub(crate) struct ScanKnots {
 }
 
 impl ScanKnots {
-    /// Least time between two knots, ns. Ours: within a millisecond a straight line is as good as the arc, as between the
-    /// knots of a revolution.
+    /// Least time between two knots, ns. Ours: within a millisecond a straight line is as good as the arc, as between
+    /// the knots of a revolution.
     const STEP_NS: i64 = 1_000_000;
     /// Greatest number of steps. Ours: a scan of any length takes little memory.
     const STEPS_MAX: i64 = 256;
@@ -331,8 +334,8 @@ fn interpolate(from: &EgoPose, to: &EgoPose, stamp_ns: i64) -> Isometry3<f64> {
     Isometry3::from_parts(Translation3::from(translation), rotation)
 }
 
-/// The pose at a stamp beyond `pose`, with the motion between it and `other`; straight ahead with its own speed if there
-/// is no other pose near enough.
+/// The pose at a stamp beyond `pose`, with the motion between it and `other`; straight ahead with its own speed if
+/// there is no other pose near enough.
 fn extrapolate(pose: &EgoPose, other: Option<&EgoPose>, stamp_ns: i64) -> Isometry3<f64> {
     match other {
         Some(other) if (1..=GAP_NS_MAX).contains(&other.stamp_ns.saturating_sub(pose.stamp_ns).saturating_abs()) => {

@@ -11,8 +11,8 @@ use crate::sensor::self_filter::SelfFilter;
 use crate::sensor::sweep::Mount;
 
 /// Writes the directions of all firings' lasers without a return to `no_returns`, in place of what it held. Blind
-/// sectors and blocked parts of the window are left out: a ray there shows nothing. The direction of a laser is taken at
-/// the azimuth of its firing's first laser, which is off by 0.2 degrees at most.
+/// sectors and blocked parts of the window are left out: a ray there shows nothing. The direction of a laser is taken
+/// at the azimuth of its firing's first laser, which is off by 0.2 degrees at most.
 pub(crate) fn find_no_returns(
     revolution: &Revolution,
     mount: &Mount,

@@ -162,12 +162,13 @@ impl SensorPipeline {
     }
 
     /// Writes a scan event to `newest` and returns what was removed from it. A scan that is not newer than the newest
-    /// one is refused, unless no scan was accepted for `deadline_ns` of event time: then the sender has restarted, or its
-    /// clock was set back. A repeated scan is always refused.
+    /// one is refused, unless no scan was accepted for `deadline_ns` of event time: then the sender has restarted, or
+    /// its clock was set back. A repeated scan is always refused.
     ///
     /// # Errors
     /// [`EventError::ScanLengths`], [`EventError::ScanList`], [`EventError::ScanOffset`], [`EventError::NoReturn`] or
-    /// [`EventError::StampRange`] if a value of the scan is not allowed; [`EventError::Stamp`] if the scan is not newer.
+    /// [`EventError::StampRange`] if a value of the scan is not allowed; [`EventError::Stamp`] if the scan is not
+    /// newer.
     pub fn apply_scan(
         &mut self,
         scan: &Scan,

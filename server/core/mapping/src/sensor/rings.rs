@@ -17,8 +17,8 @@ pub fn table(elevations_rad: impl Iterator<Item = f64>) -> Calibration {
     Calibration { distance_m_per_count: 0.002, lasers: (0..).zip(elevations_rad).map(laser).collect() }
 }
 
-/// A calibration with the elevation of each ring of a scan: the median of its points, whatever their order. `None` if the
-/// scan states no rings, or more than [`RINGS_MAX`].
+/// A calibration with the elevation of each ring of a scan: the median of its points, whatever their order. `None` if
+/// the scan states no rings, or more than [`RINGS_MAX`].
 pub fn measured(scan: &Scan) -> Option<Calibration> {
     let mut by_ring: BTreeMap<u16, Vec<f32>> = BTreeMap::new();
     for (((&x, &y), &z), &ring) in scan.x.iter().zip(&scan.y).zip(&scan.z).zip(&scan.ring) {

@@ -56,7 +56,8 @@ impl SelfFilter {
         (body.is_some() || !blind.is_empty()).then_some(Self { body, blind })
     }
 
-    /// The reason to remove a return at `point_m`, sensor frame, which is `in_ego()` in the ego frame; `None` if it stays.
+    /// The reason to remove a return at `point_m`, sensor frame, which is `in_ego()` in the ego frame; `None` if it
+    /// stays.
     #[inline(always)]
     pub fn check(&self, point_m: [f32; 3], in_ego: impl FnOnce() -> [f32; 3]) -> Option<FilterReason> {
         if self.is_blind(point_m) {

@@ -1,8 +1,8 @@
 //! The points of one scan in the ego frame.
 //!
 //! In: a [`Revolution`] or [`Scan`] in the sensor frame, how the sensor is mounted, how the vehicle moved, and the self
-//! filter. Out: a [`Sweep`]: the returns of the surroundings, ego frame at the last firing, metres, and what the rows of
-//! radial maps depend on. Compaction, motion compensation and transform are one pass; each firing has one rigid
+//! filter. Out: a [`Sweep`]: the returns of the surroundings, ego frame at the last firing, metres, and what the rows
+//! of radial maps depend on. Compaction, motion compensation and transform are one pass; each firing has one rigid
 //! transform.
 
 use std::sync::Arc;
@@ -50,8 +50,8 @@ pub struct Sweep {
     pub deviation_m: Vec<f32>,
     /// Number of returns before the vehicle's own were removed.
     pub returns: u32,
-    /// Elevations of the lasers that define the rows of radial maps; `None` if they are unknown. Then all cells of radial
-    /// maps are unknown.
+    /// Elevations of the lasers that define the rows of radial maps; `None` if they are unknown. Then all cells of
+    /// radial maps are unknown.
     pub calibration: Option<Arc<Calibration>>,
     /// Height of the sensor over the ground, metres.
     pub mount_height_m: f32,
@@ -103,8 +103,8 @@ impl Sweep {
                     let range = range_m[i];
                     let [ex, ey, ez] = transform.apply(x[i], y[i], z[i]);
                     (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
-                    // A slot that has not fired is NaN, one without a return is 0: neither is kept. Every slot is written,
-                    // and `kept` advances past those that are kept, so that the loop has no branch.
+                    // A slot that has not fired is NaN, one without a return is 0: neither is kept. Every slot is
+                    // written, and `kept` advances past those that are kept, so that the loop has no branch.
                     returns += u32::from(range > 0.0);
                     let is_far = range > 0.0 && range >= mount.range_m_min;
                     let reason = check([x[i], y[i], z[i]]).filter(|_| is_far);
@@ -123,8 +123,8 @@ impl Sweep {
         removed
     }
 
-    /// Fills in the deviation of each point that [`Sweep::set_moving_revolution`] kept of the same revolution with the same
-    /// filter. The deviations of a second echo are NaN: it has no series.
+    /// Fills in the deviation of each point that [`Sweep::set_moving_revolution`] kept of the same revolution with the
+    /// same filter. The deviations of a second echo are NaN: it has no series.
     pub fn set_deviations(
         &mut self,
         revolution: &Revolution,
@@ -161,15 +161,15 @@ impl Sweep {
     }
 
     /// Replaces the points by those of a scan of a vehicle at rest, without a self filter. Returns the number of points
-    /// that were removed because a coordinate is not finite or beyond 1 km. The four arrays of the scan must have the same
-    /// length.
+    /// that were removed because a coordinate is not finite or beyond 1 km. The four arrays of the scan must have the
+    /// same length.
     pub fn set_scan(&mut self, scan: &Scan, calibration: &Arc<Calibration>, mount: &Mount) -> u64 {
         self.set_moving_scan(scan, Some(calibration), mount, &[], None).no_position
     }
 
-    /// Replaces the points by those of a scan and returns the number of points that were removed. `calibration` is `None`
-    /// if the elevations are unknown; `end_from_ego` is [`crate::sensor::motion::EgoTrajectory::end_from_ego`] of this scan;
-    /// if it is empty, the points are not moved.
+    /// Replaces the points by those of a scan and returns the number of points that were removed. `calibration` is
+    /// `None` if the elevations are unknown; `end_from_ego` is [`crate::sensor::motion::EgoTrajectory::end_from_ego`]
+    /// of this scan; if it is empty, the points are not moved.
     pub fn set_moving_scan(
         &mut self,
         scan: &Scan,
@@ -219,8 +219,8 @@ impl Sweep {
         (self.returns, self.mount_height_m) = (other.returns, other.mount_height_m);
     }
 
-    /// Adds another sensor's points after transforming them; their deviations are NaN. If this sweep has no rows of radial
-    /// maps, those of the other sweep are used.
+    /// Adds another sensor's points after transforming them; their deviations are NaN. If this sweep has no rows of
+    /// radial maps, those of the other sweep are used.
     pub(crate) fn append(&mut self, other: &Sweep, self_from_other: &Isometry3<f64>) {
         let transform = Transform::new(self_from_other);
         for ((&x, &y), &z) in other.x.iter().zip(&other.y).zip(&other.z) {
