@@ -11,10 +11,11 @@ use crate::config::{SensorConfig, VehicleConfig};
 use crate::error::{EventError, check_newer, check_stamp_range};
 use crate::event::{Body, EgoPose, Event, Road};
 use crate::event_time::EventTime;
+use crate::layer::ScanExtras;
 use crate::road::{self, Roads};
 use crate::sensor::motion::Motion;
 use crate::sensor::pipeline::SensorPipeline;
-use crate::sensor::scan::{ScanExtras, SensorScan};
+use crate::sensor::scan::SensorScan;
 use crate::sensor::self_filter::RemovedPoints;
 
 /// Greatest distance of an ego pose from the world's origin along one axis, metres. Ours: far beyond every local map

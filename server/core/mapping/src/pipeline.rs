@@ -14,9 +14,10 @@ use crate::event::Event;
 use crate::event_time::{EventClock, EventTime};
 use crate::fusion::{Fusion, MergedScans};
 use crate::inputs::Inputs;
+use crate::layer::Context;
 use crate::layer::registry::Layers;
 use crate::ledger::{Ledger, Ledgers};
-use crate::map::{Context, Map};
+use crate::map::Map;
 use crate::sensor::sweep::Sweep;
 
 /// The maps of one vehicle, made from its events.

@@ -14,12 +14,13 @@ use crate::config::{BodyConfig, SensorConfig};
 use crate::error::{EventError, check_newer, check_stamp_range};
 use crate::event::Scan;
 use crate::event_time::EventTime;
+use crate::layer::ScanExtras;
 use crate::map::{Contribution, SensorState};
 use crate::sensor::distance_series::DistanceSeries;
 use crate::sensor::motion::{EgoTrajectory, Motion};
 use crate::sensor::no_returns::{find_no_returns, rotated};
 use crate::sensor::rings;
-use crate::sensor::scan::{ScanExtras, SensorScan};
+use crate::sensor::scan::SensorScan;
 use crate::sensor::self_filter::{RemovedPoints, SelfFilter};
 use crate::sensor::sweep::Mount;
 

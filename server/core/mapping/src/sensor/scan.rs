@@ -5,7 +5,8 @@
 use nalgebra::Isometry3;
 
 use crate::event_time::EventTime;
-use crate::map::{Rays, SensorState};
+use crate::layer::Rays;
+use crate::map::SensorState;
 use crate::sensor::motion::Compensation;
 use crate::sensor::sweep::Sweep;
 
@@ -56,13 +57,4 @@ impl SensorScan {
             speed_mps: self.speed_mps,
         }
     }
-}
-
-/// Optional data of a sensor's scan. The pipeline computes it only if an active layer uses it.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ScanExtras {
-    /// Range deviations of the reference sensor's distance series.
-    pub deviations: bool,
-    /// Directions of the rays without a return.
-    pub no_returns: bool,
 }
