@@ -5,10 +5,10 @@ mod fixture;
 use std::path::Path;
 use std::sync::{Arc, Mutex, mpsc};
 
-use clearway_client::{MapStream, Sight, ZenohClient};
 use clearway::config::ZenohMode;
 use clearway::ingest::Reading;
 use clearway::server::{Running, Server, Setup};
+use clearway_client::{MapStream, Sight, ZenohClient};
 use fixture::{config, feed, readings, sequence, start, within};
 use zenoh::Session;
 use zenoh::sample::SampleKind;

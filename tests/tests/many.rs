@@ -7,12 +7,12 @@ use std::collections::BTreeMap;
 use std::iter::Peekable;
 use std::net::UdpSocket;
 
+use clearway::cli::demo::car::address;
+use clearway::cli::demo::rig::{Rig, Told};
+use clearway::config::{Sender, Udp};
 use clearway_client::{Client, MapView};
 use clearway_mapping::config::BodyConfig;
 use clearway_proto::v1;
-use clearway::config::{Sender, Udp};
-use clearway::cli::demo::car::address;
-use clearway::cli::demo::rig::{Rig, Told};
 use clearway_sim::traffic::{Footprints, street};
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
 use fixture::{config, start, until, within};

@@ -8,14 +8,14 @@ use std::io::BufWriter;
 use std::net::SocketAddr;
 use std::path::Path;
 
-use clearway_mapping::event::Body;
-use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
-use clearway_proto::v1;
 use clearway::config::Config;
 use clearway::ingest::Reading;
 use clearway::record::reader::{Recording, RecordingError};
-use clearway::server::{Server, Setup};
 use clearway::record::verify::{What, verify};
+use clearway::server::{Server, Setup};
+use clearway_mapping::event::Body;
+use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
+use clearway_proto::v1;
 use fixture::{config, readings, start, until, within};
 use mcap::records::Record;
 use prost::Message;

@@ -5,9 +5,9 @@ mod fixture;
 use std::path::Path;
 use std::sync::Arc;
 
-use clearway_client::{Client, ClientError, Subscription, Tls, ZenohClient};
 use clearway::cli::replay::{Options, Summary, replay};
 use clearway::server::{Running, Server, Setup};
+use clearway_client::{Client, ClientError, Subscription, Tls, ZenohClient};
 use fixture::certificates::{behind, certificates, router, secured, start, zenoh_file};
 use fixture::{config, feed, grpc, readings, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};

@@ -3,7 +3,7 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use clearway_tests::simulation::{Failure, Outcome, InjectedFault, run};
+use clearway_tests::simulation::{Failure, InjectedFault, Outcome, run};
 
 const SEEDS: u64 = 100;
 /// Seeds among which an injected fault must be found.

@@ -6,8 +6,8 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use bytes::Bytes;
-use clearway_proto::v1;
 use clearway::server::{Server, Setup};
+use clearway_proto::v1;
 use clearway_sim::send::{Pace, Until, drive};
 use fixture::{config, feed, grpc, readings, recorded, selection, sequence, start, until, vehicle, within};
 use tokio::net::UdpSocket;

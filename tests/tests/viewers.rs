@@ -7,12 +7,12 @@ use std::f64::consts::FRAC_PI_4;
 use std::io::{BufRead, BufReader};
 use std::process::Stdio;
 
-use clearway_client::MapView;
-use clearway::encode::viewer::Raster;
-use clearway_mapping::event::{Body, EgoPose};
 use clearway::config::{Config, Foxglove, Ros2};
+use clearway::encode::viewer::Raster;
 use clearway::ingest::Reading;
 use clearway::server::{Running, Server, Setup};
+use clearway_client::MapView;
+use clearway_mapping::event::{Body, EgoPose};
 use fixture::{LAYERS, config, feed, readings, start, venv, within};
 use nalgebra::{Isometry3, Vector3};
 use serde_json::{Value, json};

@@ -17,13 +17,13 @@ use tokio::sync::{OwnedSemaphorePermit as Place, Semaphore};
 use drops::{Untold, next_told};
 use receipt::{Ticket, Verdict};
 
-pub mod gateway;
+mod drops;
 pub mod files;
+pub mod gateway;
 pub mod grpc;
 pub mod observation;
-mod drops;
-pub mod ros;
 pub mod receipt;
+pub mod ros;
 pub mod udp;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;

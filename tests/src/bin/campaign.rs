@@ -77,7 +77,8 @@ fn main() -> ExitCode {
         }
     });
     bar.finish_and_clear();
-    let (sum, failures) = (sum.into_inner().expect("all threads have ended"), failures.into_inner().expect("all threads have ended"));
+    let (sum, failures) =
+        (sum.into_inner().expect("all threads have ended"), failures.into_inner().expect("all threads have ended"));
     report(end - first, &sum, &failures, began.elapsed().as_secs_f64());
     if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }

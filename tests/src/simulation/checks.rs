@@ -56,7 +56,10 @@ pub fn accounts(offered: u64, ledger: &Ledger, sensors: &[NamedStatus]) -> Resul
     let known = ledger.received + ledger.lost + ledger.poses + ledger.poses_refused + roads;
     let sum: u64 = sensors.iter().map(|sensor| sensor.ledger.received + sensor.ledger.lost).sum();
     if known != offered {
-        return Err(violation("ledger", format!("{offered} readings were offered, {known} are in the ledger: {ledger:?}")));
+        return Err(violation(
+            "ledger",
+            format!("{offered} readings were offered, {known} are in the ledger: {ledger:?}"),
+        ));
     }
     if sum > ledger.received + ledger.lost {
         return Err(violation("ledger", format!("the sensors have {sum}, the vehicle {ledger:?}")));

@@ -2,9 +2,9 @@
 
 use std::sync::OnceLock;
 
-use clearway_proto::v1;
-use clearway::config::Config;
 use clearway::cli::demo::rig::Rig;
+use clearway::config::Config;
+use clearway_proto::v1;
 use clearway_sim::scenes::{self, Scene};
 use clearway_sim::traffic;
 use clearway_sim::vehicle::Datagram;
@@ -61,7 +61,9 @@ impl Drive {
         let mut sent = Vec::new();
         for index in 0..rig.scanners.len() {
             let datagrams = rig.vehicle(index).take_while(|datagram| datagram.stamp_ns < end_ns);
-            sent.extend(datagrams.map(|d| Sent { offset_ns: d.stamp_ns - START_NS, reading: Reading::Datagram(index, d) }));
+            sent.extend(
+                datagrams.map(|d| Sent { offset_ns: d.stamp_ns - START_NS, reading: Reading::Datagram(index, d) }),
+            );
         }
         let told = rig.told().take_while(|told| told.stamp_ns < end_ns);
         sent.extend(told.map(|told| Sent {

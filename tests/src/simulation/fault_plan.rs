@@ -169,9 +169,10 @@ impl FaultPlan {
         let host_clock = host_clock.filter(|(when, _)| !when.is_empty() && is_apart(when.start) && is_apart(when.end));
         let disk = match rng.within(0..10) {
             0..5 => DiskFault::Sound,
-            5..7 => {
-                DiskFault::Crash(rng.within(REVOLUTION_NS..END_NS), if rng.happens(0.5) { rng.within(0..5000) as usize } else { 0 })
-            }
+            5..7 => DiskFault::Crash(
+                rng.within(REVOLUTION_NS..END_NS),
+                if rng.happens(0.5) { rng.within(0..5000) as usize } else { 0 },
+            ),
             7..9 => DiskFault::Full(rng.within(20_000..3_000_000) as usize),
             _ => DiskFault::Hiccup(rng.within(20_000..3_000_000) as usize),
         };

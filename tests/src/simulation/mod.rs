@@ -20,8 +20,8 @@ use std::fmt;
 
 use checks::Violation;
 use drive::drives;
-pub use fault_plan::InjectedFault;
 use fault_plan::FaultPlan;
+pub use fault_plan::InjectedFault;
 pub use shutdown_check::{Outcome, REVOLUTIONS_TO_HEAL};
 use test_bed::TestBed;
 

@@ -1,16 +1,16 @@
 //! The networks between the car's sensors and the server: what the sensors send, with their faults, until it arrives.
 
 use bytes::Bytes;
-use clearway_mapping::event::{Body, Cause};
 use clearway::ingest::udp::DATAGRAM_BYTES_MAX;
+use clearway_mapping::event::{Body, Cause};
 use clearway_sim::vehicle::Datagram;
 use prost::Message;
 use std::sync::atomic::Ordering;
 
 use super::drive::Reading;
 use super::fault_plan::{END_NS, HEAL_NS, InjectedFault, SensorFault, TICK_NS};
-use super::test_bed::{TestBed, during};
 use super::sensor_fault;
+use super::test_bed::{TestBed, during};
 
 impl TestBed<'_> {
     /// Puts everything that leaves a sensor in this tick into its network.

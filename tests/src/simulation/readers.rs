@@ -8,10 +8,10 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 
-use clearway_proto::v1;
+use clearway::encode::EncodedMap;
 use clearway::publish::Vehicles;
 use clearway::publish::grpc::reader::watch;
-use clearway::encode::EncodedMap;
+use clearway_proto::v1;
 use futures::Stream;
 use futures::channel::mpsc::{UnboundedSender, unbounded};
 use prost::Message;
@@ -129,7 +129,8 @@ impl Reader {
         let layers = self.layers.clone();
         let selection = v1::Selection { vehicle: "car".into(), layers, max_in_flight, ..Default::default() };
         let updates = watch(vehicles, selection, received);
-        let updates = updates.map_err(|status| violation("reader", format!("{:?} is refused: {status}", self.habit)))?;
+        let updates =
+            updates.map_err(|status| violation("reader", format!("{:?} is refused: {status}", self.habit)))?;
         self.open = Some((Box::pin(updates), requests));
         (self.last, self.in_flight) = (None, VecDeque::new());
         Ok(())
@@ -173,7 +174,12 @@ impl Reader {
     }
 
     /// Checks that an update is the newest map, whole, and that the skipped maps before it are counted.
-    fn check(&mut self, update: v1::MapUpdate, maps: &[Arc<EncodedMap>], injected: Option<InjectedFault>) -> Result<(), Violation> {
+    fn check(
+        &mut self,
+        update: v1::MapUpdate,
+        maps: &[Arc<EncodedMap>],
+        injected: Option<InjectedFault>,
+    ) -> Result<(), Violation> {
         let v1::MapUpdate { mut map, mut skipped, .. } = update;
         match injected {
             Some(InjectedFault::CorruptMap) if self.updates == 3 => map = map.slice(..map.len() - 1),

@@ -3,8 +3,8 @@
 use std::io::{self, Write};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use clearway::record::writer::{Disk, RecorderCounts};
 use clearway::record::verify::{VerifyError, verify};
+use clearway::record::writer::{Disk, RecorderCounts};
 
 use super::checks::{Violation, violation};
 use super::fault_plan::DiskFault;
@@ -81,7 +81,9 @@ impl Recorded {
         let report = match verify(file.path()) {
             Ok(report) => report,
             // The machine crashed or the disk failed before the header was written.
-            Err(VerifyError::Recording(_)) if self.confirmed == 0 && (self.crashed || self.counts.stopped().is_some()) => {
+            Err(VerifyError::Recording(_))
+                if self.confirmed == 0 && (self.crashed || self.counts.stopped().is_some()) =>
+            {
                 return Ok(false);
             }
             Err(error) => return wrong(error.to_string()),

@@ -3,11 +3,11 @@
 use std::hash::{DefaultHasher, Hasher};
 use std::sync::atomic::Ordering;
 
-use super::checks::{Violation, accounts, adds_up, violation, describe};
+use super::checks::{Violation, accounts, adds_up, describe, violation};
 use super::fault_plan::{DiskFault, FLUSH_MS, HEAL_NS, InjectedFault, REVOLUTION_NS, TICK_NS};
-use super::test_bed::TestBed;
 use super::readers::Reader;
 use super::recording_check::Recorded;
+use super::test_bed::TestBed;
 
 /// After the faults have ended, every sensor must be whole and in the map within this many revolutions.
 pub const REVOLUTIONS_TO_HEAL: i64 = 4;
@@ -42,7 +42,10 @@ impl TestBed<'_> {
         let healed_in = revolutions(self.unhealthy_ns);
         let last = self.engine.pipeline.newest_map().map(describe).unwrap_or_default();
         if healed_in > REVOLUTIONS_TO_HEAL {
-            return Err(violation("converge", format!("not whole {healed_in} revolutions after the end of the faults: {last}")));
+            return Err(violation(
+                "converge",
+                format!("not whole {healed_in} revolutions after the end of the faults: {last}"),
+            ));
         }
         let newest_ns = self.engine.pipeline.newest_map().map_or(0, |map| map.completed_ns);
         if self.clock.load(Ordering::Relaxed) - newest_ns > 2 * REVOLUTION_NS {
@@ -100,7 +103,8 @@ impl TestBed<'_> {
         {
             // A flush follows at most FLUSH_MS after what it flushes, in the next tick.
             let ticks = (at_ns - FLUSH_MS as i64 * 1_000_000).div_euclid(TICK_NS) - 2;
-            confirmed = usize::try_from(ticks).ok().and_then(|tick| self.recorded_by_tick.get(tick)).copied().unwrap_or(0);
+            confirmed =
+                usize::try_from(ticks).ok().and_then(|tick| self.recorded_by_tick.get(tick)).copied().unwrap_or(0);
         }
         hasher.write(&bytes);
         let expected = (self.taken, outcome.maps * layers);

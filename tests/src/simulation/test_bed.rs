@@ -7,9 +7,8 @@ use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
-use clearway_mapping::pipeline::{Pipeline, layer_names};
-use clearway_proto::v1;
 use clearway::config::Config;
+use clearway::encode::EncodedMap;
 use clearway::engine::Engine;
 use clearway::ingest::gateway::Entrance;
 use clearway::ingest::receipt::{Account, Mark, Verdict, Verdicts};
@@ -17,16 +16,15 @@ use clearway::ingest::{Clock, Door, Queued, door_by};
 use clearway::publish::{Served, Vehicles};
 use clearway::record::writer::{Preface, Scribe};
 use clearway::status::VehicleStatus;
-use clearway::encode::EncodedMap;
+use clearway_mapping::pipeline::{Pipeline, layer_names};
+use clearway_proto::v1;
 use clearway_sim::impair::Impairment;
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
 use tokio::sync::watch;
 
-use super::checks::{Violation, accounts, adds_up, violation, describe, freed, is_healthy, nothing_free};
+use super::checks::{Violation, accounts, adds_up, describe, freed, is_healthy, nothing_free, violation};
 use super::drive::{Drive, drives};
-use super::fault_plan::{
-    DiskFault, END_NS, FLUSH_MS, FaultPlan, HEAL_NS, InjectedFault, REVOLUTION_NS, Rng, TICK_NS,
-};
+use super::fault_plan::{DiskFault, END_NS, FLUSH_MS, FaultPlan, HEAL_NS, InjectedFault, REVOLUTION_NS, Rng, TICK_NS};
 use super::readers::{Reader, readers};
 use super::recording_check::MemoryDisk;
 
@@ -170,8 +168,8 @@ impl<'a> TestBed<'a> {
     pub fn step(&mut self) -> Result<(), Violation> {
         while let Ok(queued) = self.events.try_recv() {
             self.taken += 1;
-            let journal =
-                (self.injected == Some(InjectedFault::UnrecordedEvent) && self.taken == 300).then(|| self.engine.journal.take());
+            let journal = (self.injected == Some(InjectedFault::UnrecordedEvent) && self.taken == 300)
+                .then(|| self.engine.journal.take());
             self.engine.take(queued);
             if let Some(journal) = journal {
                 self.engine.journal = journal;
@@ -186,7 +184,9 @@ impl<'a> TestBed<'a> {
     }
 
     fn check_map(&mut self, encoded: Arc<EncodedMap>) -> Result<(), Violation> {
-        let Some(map) = self.engine.pipeline.newest_map() else { return Err(violation("map", "encoded, but not made")) };
+        let Some(map) = self.engine.pipeline.newest_map() else {
+            return Err(violation("map", "encoded, but not made"));
+        };
         if encoded.sequence != self.maps.len() as u64 || encoded.sequence != map.sequence {
             return Err(violation("map", format!("number {} after {} maps", encoded.sequence, self.maps.len())));
         }

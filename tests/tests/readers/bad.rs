@@ -3,9 +3,9 @@
 use std::net::SocketAddr;
 use std::sync::{Arc, Weak};
 
+use clearway::encode::EncodedMap;
 use clearway_proto::v1;
 use clearway_proto::v1::map_service_client::MapServiceClient;
-use clearway::encode::EncodedMap;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;

@@ -12,12 +12,12 @@ use tokio::sync::watch;
 use tonic::Status;
 
 use super::selection::{Selection, Sent};
-use crate::publish::{Served, Vehicles};
-use crate::subscriptions::Taken;
+use crate::encode::EncodedMap;
 use crate::engine::Newest;
 use crate::ingest::now_ns;
+use crate::publish::{Served, Vehicles};
 use crate::status::Reader;
-use crate::encode::EncodedMap;
+use crate::subscriptions::Taken;
 
 /// The updates of one reader: what it selected of the newest maps, as far as what it acknowledges allows. Any executor
 /// drives it.
