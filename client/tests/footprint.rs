@@ -5,10 +5,10 @@ mod common;
 use std::f64::consts::{FRAC_PI_2, PI};
 
 use bytes::Bytes;
-use clearway::encode::viewer::raster;
 use clearway_client::codec::{CellsRef, encode_grid};
 use clearway_client::footprint::{FREE, OBSTACLES};
 use clearway_client::v1::layer::Geometry;
+use clearway::encode::viewer::raster;
 use clearway_client::{Footprint, MapView, v1};
 use clearway_proto::map::{encode_header, encode_layer};
 use proptest::prelude::*;

@@ -8,10 +8,10 @@
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
-use clearway::config::{Config, Udp};
-use clearway::ingest::{door, udp};
 use clearway_mapping::event::Body;
 use clearway_mapping::ledger::Ledger;
+use clearway::config::{Config, Udp};
+use clearway::ingest::{door, udp};
 use nix::sys::socket::setsockopt;
 use nix::sys::socket::sockopt::UdpGsoSegment;
 

@@ -5,14 +5,14 @@ use std::io::Cursor;
 use std::path::Path;
 
 use bytes::{Buf, Bytes};
-use clearway::config::Config;
-use clearway::encode::{event_from_bytes, event_to_proto};
-use clearway::ingest::observation::{Limits, bodies};
-use clearway::record::reader::{Entry, Recording};
 use clearway_lidar::model::Model;
 use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
+use clearway::config::Config;
+use clearway::ingest::observation::{Limits, bodies};
+use clearway::record::reader::{Entry, Recording};
+use clearway::encode::{event_from_bytes, event_to_proto};
 use prost::Message;
 
 /// One observation, as far as the maps.

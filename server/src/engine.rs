@@ -8,17 +8,17 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use clearway_mapping::error::EventError;
 use clearway_mapping::event::Event;
+use clearway_mapping::error::EventError;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::sweep::Sweep;
 use tokio::sync::watch;
 
-use crate::encode::{self, EncodedMap};
 use crate::ingest::Queued;
 use crate::ingest::receipt::Verdict;
 use crate::record::writer::Journal;
 use crate::status::VehicleStatus;
+use crate::encode::{self, EncodedMap};
 
 /// How often an engine without events looks whether somebody has come who wants the newest map.
 const LOOK_AROUND: Duration = Duration::from_millis(20);

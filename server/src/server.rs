@@ -16,13 +16,13 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use crate::config::{Calibrations, Certificates, Config, Foxglove, Grpc, Vehicle};
+use crate::subscriptions::Taken;
 use crate::engine::{Engine, Observer};
 use crate::ingest::gateway::{Entrance, Entrances};
 use crate::ingest::{Door, Queued, door, udp};
 use crate::publish::{Served, Vehicles, grpc, page};
 use crate::record::writer::{Preface, RecordError, Recorder};
 use crate::status::VehicleStatus;
-use crate::subscriptions::Taken;
 
 /// A stalled peer may not keep the server from ending.
 const PUBLISHERS_STOP: Duration = Duration::from_secs(2);

@@ -11,8 +11,8 @@ use std::time::Duration;
 
 use tokio::sync::watch;
 
-use crate::encode::EncodedMap;
 use crate::engine::Newest;
+use crate::encode::EncodedMap;
 
 /// For a layer that was not made so far: some revolutions of the slowest sensor.
 pub const PATIENCE: Duration = Duration::from_secs(1);

@@ -8,7 +8,8 @@ fn clearway(arguments: &[&str]) -> Output {
 
 #[test]
 fn check_prints_the_default_configuration_as_one_that_check_accepts() {
-    let output = clearway(&["check", "--config", concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/clearway.toml")]);
+    let output =
+        clearway(&["check", "--config", concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/clearway.toml")]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let folder = tempfile::tempdir().unwrap();
     let printed = folder.path().join("effective.toml");

@@ -3,11 +3,11 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use crate::cli::evaluate;
-use crate::cli::replay::Speed;
 use clap::{Parser, Subcommand, ValueEnum};
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
+use crate::cli::evaluate;
+use crate::cli::replay::Speed;
 
 /// Turns LIDAR packets into maps of where a vehicle may drive.
 #[derive(Parser)]

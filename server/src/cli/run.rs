@@ -9,13 +9,13 @@ use std::time::Duration;
 
 use anyhow::{Context, Result};
 
+use clap::Parser;
+use crate::config::Config;
 use crate::cli::demo::{self, Places, Second};
 use crate::cli::evaluate;
 use crate::cli::replay::{self, Progress, Summary};
-use crate::config::Config;
-use crate::record::verify::verify;
 use crate::server::{Running, Server, Setup};
-use clap::Parser;
+use crate::record::verify::verify;
 use indicatif::{ProgressBar, ProgressStyle};
 use tracing_subscriber::EnvFilter;
 

@@ -14,8 +14,8 @@ use clearway_proto::region::{RegionError, crop};
 use clearway_proto::v1;
 use prost::Message;
 
-use crate::encode::EncodedMap;
 use crate::ingest::locked;
+use crate::encode::EncodedMap;
 
 /// What readers with regions of their own may keep in memory, beside the map: more are made again for each.
 const KEPT_MAX: usize = 64;

@@ -17,13 +17,13 @@ use tokio::sync::{OwnedSemaphorePermit as Place, Semaphore};
 use drops::{Untold, next_told};
 use receipt::{Ticket, Verdict};
 
-mod drops;
-pub mod files;
 pub mod gateway;
+pub mod files;
 pub mod grpc;
 pub mod observation;
-pub mod receipt;
+mod drops;
 pub mod ros;
+pub mod receipt;
 pub mod udp;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;

@@ -10,9 +10,9 @@
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
 
+use clearway_client::MapView;
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::ros;
-use clearway_client::MapView;
 use clearway_ros::published::{OCCUPANCY_GRID, Published, TF_MESSAGE};
 use tokio::task::JoinSet;
 use zenoh::Session;
@@ -24,8 +24,8 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 use super::Served;
 use super::zenoh::{ZenohError, failed};
 use crate::config::Ros2;
-use crate::encode::EncodedMap;
 use crate::ingest::now_ns;
+use crate::encode::EncodedMap;
 
 /// The node's name.
 const NODE: &str = "clearway";

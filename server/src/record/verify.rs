@@ -16,8 +16,8 @@ use clearway_proto::v1;
 use prost::Message;
 use serde_json::{Value, json};
 
-use crate::encode::EncodedMap;
 use crate::record::reader::{Entry, Recording, RecordingError};
+use crate::encode::EncodedMap;
 
 /// Differences kept in a report; all are counted.
 const DIFFERENCES_MAX: usize = 20;

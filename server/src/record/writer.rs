@@ -25,8 +25,8 @@ use mcap::{Attachment, Compression, McapError, WriteOptions};
 use prost::Message;
 
 use crate::config::Recorder as Options;
-use crate::encode::{self, EncodedMap};
 use crate::ingest::locked;
+use crate::encode::{self, EncodedMap};
 
 /// What a recording says before its first event.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -12,11 +12,11 @@ use clearway_proto::v1;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
-use crate::encode::EncodedMap;
+use crate::subscriptions::Demand;
 use crate::engine::NewestSweep;
 use crate::ingest::{Outside, Stranger, locked, now_ns};
 use crate::record::writer::RecorderCounts;
-use crate::subscriptions::Demand;
+use crate::encode::EncodedMap;
 
 mod prometheus;
 

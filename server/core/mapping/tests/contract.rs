@@ -8,13 +8,13 @@ use clearway_mapping::config::{
 };
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::height_difference::HeightDifference;
+use clearway_mapping::layer::{Cells, Context, Layer, LayerMaker, Meaning, SafePoint};
 use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::layer::safe_path::SafePath;
 use clearway_mapping::layer::safe_path::class::SafePathClass;
 use clearway_mapping::layer::speed::Speed;
-use clearway_mapping::layer::terrain::Terrain;
-use clearway_mapping::layer::{Cells, Context, Layer, LayerMaker, Meaning, SafePoint};
 use clearway_mapping::sensor::sweep::Sweep;
+use clearway_mapping::layer::terrain::Terrain;
 use common::*;
 
 /// Safe paths and the drivability they come from.
@@ -153,12 +153,8 @@ fn the_order_of_the_points_says_nothing() {
 
 /// A channel's values; path counts as free, because lines two cells wide are thinned from one end.
 fn ends_of_paths_aside(layer: &Layer, name: &str) -> Vec<i32> {
-    let is_path =
-        |value: i32| layer.name == "safe_path" && name == "class" && value == i32::from(SafePathClass::Path.value());
-    values(layer, name)
-        .into_iter()
-        .map(|v| if is_path(v) { i32::from(SafePathClass::Free.value()) } else { v })
-        .collect()
+    let is_path = |value: i32| layer.name == "safe_path" && name == "class" && value == i32::from(SafePathClass::Path.value());
+    values(layer, name).into_iter().map(|v| if is_path(v) { i32::from(SafePathClass::Free.value()) } else { v }).collect()
 }
 
 #[test]

@@ -12,8 +12,8 @@ use clearway_mapping::config::{Extrinsics, MapsConfig, MotionConfig, SensorConfi
 use clearway_mapping::error::EventError;
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
 use clearway_mapping::map::Map;
+use clearway_mapping::sensor::motion::{Compensation, Motion, EgoTrajectory};
 use clearway_mapping::pipeline::Pipeline;
-use clearway_mapping::sensor::motion::{Compensation, EgoTrajectory, Motion};
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::course::{Course, Drive};
 use clearway_sim::ground::Ground;

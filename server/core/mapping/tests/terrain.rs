@@ -6,11 +6,11 @@ mod common;
 
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Form, TerrainConfig};
-use clearway_mapping::layer::terrain::Terrain;
-use clearway_mapping::layer::terrain::class::{ROUGHNESS, Shape, TerrainClass};
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::sensor::distance_series::DistanceSeries;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
+use clearway_mapping::layer::terrain::Terrain;
+use clearway_mapping::layer::terrain::class::{ROUGHNESS, Shape, TerrainClass};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::{self, Scene};
 use clearway_sim::truth::Truth;

@@ -16,10 +16,10 @@ use serde_json::{Value, json};
 use tokio::time::MissedTickBehavior;
 
 use crate::config::{Config, Sender, Udp};
-use crate::encode::EncodedMap;
 use crate::ingest::now_ns;
 use crate::server::{Running, Server, Setup, StartError};
 use crate::status::Snapshot;
+use crate::encode::EncodedMap;
 
 use car::Car;
 use rig::Rig;

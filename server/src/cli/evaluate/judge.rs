@@ -12,8 +12,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::layer::{Cells, ClassInfo, Geometry, Layer, Meaning};
+use clearway_mapping::layer::radial_grid::RadialGrid;
 
 /// From here on a thing over the ground is an obstacle.
 pub const OBSTACLE_M_MIN: f32 = 0.3;

@@ -15,10 +15,10 @@ use std::path::{Path, PathBuf};
 
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig};
-use clearway_mapping::error::EventError;
 use clearway_mapping::event::{Body, Event, Scan};
-use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::mount::{MountError, estimate};
+use clearway_mapping::error::EventError;
+use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 
 use crate::config::{Config, ConfigError};

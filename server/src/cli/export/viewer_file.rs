@@ -11,9 +11,9 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
+use anyhow::{Context, Result};
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::{base_frame, foxglove as messages, ros};
-use anyhow::{Context, Result};
 use clearway_client::{Layer, MapView};
 use clearway_ros::published::{OCCUPANCY_GRID, ODOMETRY, POINT_CLOUD2, Published, TF_MESSAGE};
 use foxglove::Encode;

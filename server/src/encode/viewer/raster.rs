@@ -21,8 +21,8 @@ use clearway_proto::grid::Grid;
 use clearway_proto::map::Layer;
 use nalgebra::{Isometry3, Vector3};
 
-use crate::encode::picture::Colours;
 use clearway_client::footprint;
+use crate::encode::picture::Colours;
 
 /// Cells that radial layers are resampled to, metres: as those of the other layers.
 const CELL_M: f64 = 0.25;

@@ -11,11 +11,11 @@ use std::path::{Path, PathBuf};
 
 use clearway_mapping::event::Body;
 
-use super::Reading;
-use super::ros::Intake;
 use capture::CaptureError;
 use kitti::ScanError;
 use mcap::{McapError, Untold, Wanted};
+use super::ros::Intake;
+use super::Reading;
 
 /// What a file holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

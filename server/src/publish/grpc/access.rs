@@ -19,8 +19,8 @@ use tower_service::Service;
 use x509_parser::extensions::GeneralName;
 use x509_parser::prelude::{FromDer, X509Certificate};
 
-use crate::config;
 use crate::publish::connections::Place;
+use crate::config;
 
 /// What a peer may be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

@@ -18,14 +18,14 @@ use tokio::net::TcpListener;
 use tonic::transport::{Certificate, Identity, Server, ServerTlsConfig};
 use tonic::{Request, Response, Status, Streaming};
 
+use access::{Access, Guard};
 use super::connections::Connections;
+use reader::watch;
 use super::{Unknown, Vehicles};
 use crate::config::{self, Certificates};
 use crate::ingest::gateway::Entrances;
 use crate::ingest::grpc::Ingest;
 use crate::ingest::now_ns;
-use access::{Access, Guard};
-use reader::watch;
 
 use v1::ingest_service_server::IngestServiceServer;
 use v1::map_service_server::{MapService, MapServiceServer};

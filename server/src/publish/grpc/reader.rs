@@ -12,12 +12,12 @@ use tokio::sync::watch;
 use tonic::Status;
 
 use super::selection::{Selection, Sent};
-use crate::encode::EncodedMap;
+use crate::publish::{Served, Vehicles};
+use crate::subscriptions::Taken;
 use crate::engine::Newest;
 use crate::ingest::now_ns;
-use crate::publish::{Served, Vehicles};
 use crate::status::Reader;
-use crate::subscriptions::Taken;
+use crate::encode::EncodedMap;
 
 /// The updates of one reader: what it selected of the newest maps, as far as what it acknowledges allows. Any executor
 /// drives it.

@@ -11,8 +11,8 @@ use clearway_proto::region::{self, RegionError};
 use clearway_proto::v1;
 use tonic::Status;
 
-use crate::encode::EncodedMap;
 use crate::publish::Served;
+use crate::encode::EncodedMap;
 
 /// What a reader may ask to have on its way: more would only be older.
 const IN_FLIGHT_MAX: u32 = 64;

@@ -9,8 +9,8 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::layer::{Cells, Geometry, Layer, Rays};
+use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::sensor::sweep::Sweep;
 
 /// Height of the sensor in all synthetic worlds, metres.

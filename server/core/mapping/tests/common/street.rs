@@ -1,7 +1,7 @@
 //! The simulated six-unit vehicle, its scans put into the ego frame of their ends, as the pipeline does.
 
-use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::layer::{Context, Geometry, Layer, LayerMaker, Rays};
+use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::sensor::sweep::Sweep;
 use clearway_sim::planes::PlaneUnit;
 use clearway_sim::scenes::Scene;

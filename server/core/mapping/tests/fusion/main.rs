@@ -12,10 +12,10 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::{BodyConfig, Extrinsics, FusionConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::error::EventError;
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
-use clearway_mapping::ledger::Ledger;
 use clearway_mapping::map::{Contribution, Map};
-use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::motion::Compensation;
+use clearway_mapping::ledger::Ledger;
+use clearway_mapping::pipeline::Pipeline;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
 use clearway_sim::vehicle::SimulatedVehicle;
@@ -100,12 +100,7 @@ fn a_sensor_that_stops_is_left_out_after_the_deadline_and_named_with_its_age() {
     let left: Vec<_> = made.iter().map(|map| parts(map)[1]).collect();
     assert_eq!(
         left,
-        [
-            (Contribution::Ok, Some(90)),
-            (Contribution::Ok, Some(190)),
-            (Contribution::Silent, Some(290)),
-            (Contribution::Silent, Some(390))
-        ]
+        [(Contribution::Ok, Some(90)), (Contribution::Ok, Some(190)), (Contribution::Silent, Some(290)), (Contribution::Silent, Some(390))]
     );
     assert_eq!(made[2].sensors[1].returns, 0, "nothing of it is in the map");
     assert_eq!(pipeline.newest_sweep().x.len(), 2);

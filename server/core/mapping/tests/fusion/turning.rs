@@ -58,13 +58,9 @@ fn half_a_field_of_view_is_complete_and_half_a_turn_lost_is_not() {
         maps.map(|map| (map.sensors[0].completeness, map.sensors[0].contribution)).collect()
     };
     let half = made(&is_ahead);
-    assert!(
-        half.len() > 15 && half[5..].iter().all(|(share, part)| *share > 0.98 && *part == Contribution::Ok),
-        "{half:?}"
-    );
+    assert!(half.len() > 15 && half[5..].iter().all(|(share, part)| *share > 0.98 && *part == Contribution::Ok), "{half:?}");
     let once = made(&|event| is_ahead(event) || !lost_ns.contains(&event.arrival_ns));
-    let partial: Vec<f32> =
-        once.iter().filter(|(_, part)| *part == Contribution::Partial).map(|(share, _)| *share).collect();
+    let partial: Vec<f32> = once.iter().filter(|(_, part)| *part == Contribution::Partial).map(|(share, _)| *share).collect();
     let lost: f32 = partial[1..].iter().map(|share| 1.0 - share).sum();
     assert!((0.45..0.55).contains(&lost), "the first turn begins somewhere; then half a turn is missing: {once:?}");
 }
@@ -88,10 +84,7 @@ fn two_turning_sensors_have_a_decoder_and_a_ledger_each_and_their_order_between_
     assert!(made.len() >= 3 && made.iter().all(|map| map.source == 0));
     let last = made.last().unwrap();
     let contributing: Vec<_> = last.sensors.iter().map(|s| (s.model.as_str(), s.contribution, s.packets > 0)).collect();
-    assert_eq!(
-        contributing,
-        [("vlp16", Contribution::Ok, true), ("hdl32e", Contribution::Ok, true), ("scan", Contribution::Ok, false)]
-    );
+    assert_eq!(contributing, [("vlp16", Contribution::Ok, true), ("hdl32e", Contribution::Ok, true), ("scan", Contribution::Ok, false)]);
     assert_eq!(last.sensors[0].packets_expected, last.sensors[0].packets);
     let (sensors, sum) = (pipeline.sensors(), pipeline.ledger());
     assert!(sensors.iter().all(|sensor| balanced(&sensor.ledger)) && balanced(sum));

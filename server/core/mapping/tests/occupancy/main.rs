@@ -7,11 +7,11 @@ mod laws;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig, OccupancyConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
+use clearway_mapping::layer::{Context, Layer, LayerMaker, Rays};
+use clearway_mapping::map::Map;
 use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::layer::occupancy::class::OccupancyClass;
 use clearway_mapping::layer::occupancy::states::{Cell, Evidence};
-use clearway_mapping::layer::{Context, Layer, LayerMaker, Rays};
-use clearway_mapping::map::Map;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::planes::{PlaneScan, PlaneUnit};
@@ -119,15 +119,7 @@ fn hits_add_up_saturate_and_fade() {
         .take(4)
         .map(|cell| (cell.state, cell.hits))
         .collect();
-    assert_eq!(
-        states,
-        [
-            (OccupancyClass::Unknown, 19),
-            (OccupancyClass::Unknown, 4),
-            (OccupancyClass::Unknown, 1),
-            (OccupancyClass::Clear, 0)
-        ]
-    );
+    assert_eq!(states, [(OccupancyClass::Unknown, 19), (OccupancyClass::Unknown, 4), (OccupancyClass::Unknown, 1), (OccupancyClass::Clear, 0)]);
     assert_eq!(hit(passed(cell), 1).state, OccupancyClass::Occupied, "missed once, it is back with one return");
     // The stronger evidence wins within one map.
     assert_eq!(Cell::default().judged(20, Evidence::Through, 20, 2).state, OccupancyClass::Occupied);

@@ -8,8 +8,8 @@ use clearway_mapping::config::{Extrinsics, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, Event, Scan};
 use clearway_mapping::layer::Layer;
 use clearway_mapping::map::{Contribution, Map};
-use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::mount::estimate;
+use clearway_mapping::pipeline::Pipeline;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
 
 const STAMP_NS: i64 = 1_644_917_764_449_000_000;

@@ -98,8 +98,7 @@ impl Occupancy {
         hits.resize(cells, 0);
         let any = self.fan.tell(&self.config, earliest_ns, &self.window, &mut class);
         self.window.judge([needed, self.config.hold_maps], any, &mut class, &mut hits);
-        let share =
-            |of: OccupancyClass| class.iter().filter(|class| **class == of.value()).count() as f64 / cells as f64;
+        let share = |of: OccupancyClass| class.iter().filter(|class| **class == of.value()).count() as f64 / cells as f64;
         layer.metrics.extend([
             ("clear_share", share(OccupancyClass::Clear)),
             ("occupied_share", share(OccupancyClass::Occupied)),

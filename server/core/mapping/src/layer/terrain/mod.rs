@@ -114,12 +114,8 @@ impl Terrain {
         let TerrainConfig { gate_m_min, blind_zone_m, cell_m, .. } = self.config;
         let (cells, seen, bridged) = (&self.cells, &self.seen, self.ground.bridged());
         self.shadow.clear(class.len(), |cell| cells.middle_m(cell));
-        for (slot, &cell) in self
-            .regions
-            .cell_of_slot()
-            .iter()
-            .enumerate()
-            .filter(|(_, cell)| class[**cell as usize] == TerrainClass::Obstacle)
+        for (slot, &cell) in
+            self.regions.cell_of_slot().iter().enumerate().filter(|(_, cell)| class[**cell as usize] == TerrainClass::Obstacle)
         {
             let [lowest_m, highest_m] = cells.span_m(slot);
             if highest_m - lowest_m >= STANDS_M_MIN {
@@ -147,11 +143,7 @@ impl Terrain {
         for (iy, row) in class.chunks_exact_mut(width).enumerate() {
             for (ix, class) in row.iter_mut().enumerate() {
                 if matches!(*class, TerrainClass::Flat | TerrainClass::FlatInferred) && !self.reach.reached(ix, iy) {
-                    *class = if *class == TerrainClass::Flat {
-                        TerrainClass::FlatUnreachable
-                    } else {
-                        TerrainClass::Unknown
-                    };
+                    *class = if *class == TerrainClass::Flat { TerrainClass::FlatUnreachable } else { TerrainClass::Unknown };
                 }
             }
         }
