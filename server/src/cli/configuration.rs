@@ -6,7 +6,6 @@ use anyhow::{Context, Result};
 use clap::Args;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
-use clearway_mapping::pipeline::model_name;
 
 use crate::config::Config;
 
@@ -57,8 +56,8 @@ pub fn extrinsics(text: &str) -> Result<Extrinsics, String> {
 /// # Errors
 /// If no model has that name: the names of all models.
 pub fn model(text: &str) -> Result<Model, String> {
-    let names = || Model::ALL.map(model_name).join(", ");
-    let found = Model::ALL.into_iter().find(|model| model_name(*model) == text);
+    let names = || Model::ALL.map(Model::as_str).join(", ");
+    let found = Model::ALL.into_iter().find(|model| model.as_str() == text);
     found.ok_or_else(|| format!("allowed: {}", names()))
 }
 

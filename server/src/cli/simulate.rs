@@ -11,7 +11,6 @@ use clap::Args;
 use clap::builder::PossibleValuesParser;
 use clearway_client::now_ns;
 use clearway_lidar::model::Model;
-use clearway_mapping::pipeline::model_name;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::{self, Scene};
 use clearway_sim::traffic;
@@ -97,7 +96,7 @@ pub fn run(options: &Options) -> Result<()> {
         "{:.1} s of {} with the sensor {}: {packets} data packets and {telemetry} telemetry datagrams {target}",
         options.seconds.as_secs_f64(),
         options.scene,
-        model_name(options.sensor),
+        options.sensor.as_str(),
     ))?;
     Ok(())
 }

@@ -17,8 +17,9 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig};
+use clearway_mapping::error::EventError;
 use clearway_mapping::event::{Body, Event, Scan};
-use clearway_mapping::pipeline::{Pipeline, Rejected};
+use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::mount::{MountError, estimate};
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use indicatif::ProgressBar;
@@ -124,14 +125,14 @@ pub enum EvaluateError {
     Config(#[from] ConfigError),
     /// A value of the maps' configuration cannot be used.
     #[error(transparent)]
-    Maps(#[from] clearway_mapping::config::ConfigError),
+    Maps(#[from] clearway_mapping::config::ConfigValueError),
     /// The pipeline refused a scan.
     #[error("{}: {source}", scan.display())]
     Rejected {
         /// File of the scan.
         scan: PathBuf,
         /// Why it was refused.
-        source: Rejected,
+        source: EventError,
     },
 }
 

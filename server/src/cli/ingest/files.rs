@@ -12,7 +12,7 @@ use clearway_lidar::capture::{Capture, CaptureError};
 use clearway_mapping::event::{Road, RoadPurpose as Purpose};
 use clearway_mapping::road::rddf::Rddf;
 use clearway_mapping::road::rndf::Rndf;
-use clearway_mapping::road::{FOOT_M, LineRefused, LocalFrame};
+use clearway_mapping::road::{FOOT_M, LineError, LocalFrame};
 use clearway_mapping::scan_file::{read_bin, read_pcd};
 
 /// Most datagrams of a drive in one observation: 50 ms of an HDL-64E.
@@ -185,9 +185,9 @@ fn read_poses(text: &str) -> Result<Vec<(i64, Item)>> {
 }
 
 /// Reads the route of an RDDF, or one lane of an RNDF to paint; returns also the lines that are left out.
-fn read_road(text: &str, ending: &str, options: &FileOptions) -> (Result<Road>, Vec<LineRefused>) {
+fn read_road(text: &str, ending: &str, options: &FileOptions) -> (Result<Road>, Vec<LineError>) {
     let frame = |frame_of_file: Option<LocalFrame>| match options.origin {
-        Some([latitude, longitude]) => Some(LocalFrame::about(latitude, longitude)),
+        Some([latitude, longitude]) => Some(LocalFrame::new(latitude, longitude)),
         None => frame_of_file,
     };
     if ending == "rddf" {
