@@ -10,7 +10,7 @@ use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
 use clearway::config::Config;
-use clearway::ingest::observation::{Limits, bodies};
+use clearway::ingest::observation::{Limits, decode};
 use clearway::record::reader::{Entry, Recording};
 use clearway::encode::{event_from_bytes, event_to_proto};
 use prost::Message;
@@ -18,7 +18,7 @@ use prost::Message;
 /// One observation, as far as the maps.
 pub fn observation(bytes: &[u8]) {
     let Ok(observation) = v1::Observation::decode(Bytes::copy_from_slice(bytes)) else { return };
-    let Ok(bodies) = bodies(observation, &Limits::of_points(1000)) else { return };
+    let Ok(bodies) = decode(observation, &Limits::from_points_max(1000)) else { return };
     let mut pipeline = pipeline();
     for (sequence, (captured_ns, body)) in (0..).zip(bodies) {
         step(&mut pipeline, &Event { sequence, arrival_ns: captured_ns.unwrap_or_default(), source: 0, body });

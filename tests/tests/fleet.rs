@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, mpsc};
 
 use clearway_client::{MapStream, Sight, ZenohClient};
 use clearway::config::ZenohMode;
-use clearway::ingest::Reading;
+use clearway::ingest::queue::Reading;
 use clearway::server::{Running, Server, Setup};
 use house::{config, feed, readings, sequence, start, within};
 use zenoh::Session;

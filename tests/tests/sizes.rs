@@ -18,7 +18,7 @@ use clearway_proto::delta::encode_delta;
 use clearway_proto::v1;
 use clearway::config::Config;
 use clearway::cli::demo::rig::Rig;
-use clearway::ingest::observation::{self, bodies};
+use clearway::ingest::observation;
 use clearway::record::reader::{Entry, Recording};
 use clearway::cli::replay::{Options, replay};
 use clearway::encode::EncodedMap;
@@ -112,7 +112,7 @@ fn simulated(scene: Scene, maps: usize) -> Vec<Sized> {
     for (sequence, told) in (0..).zip(rig.told()) {
         let observation = v1::Observation::from(told.observation);
         let source = source(&observation.sensor);
-        let (_, body) = bodies(observation, &observation::Limits::of_points(1 << 16)).unwrap().remove(0);
+        let (_, body) = observation::decode(observation, &observation::Limits::from_points_max(1 << 16)).unwrap().remove(0);
         let event = Event { sequence, arrival_ns: told.stamp_ns + 1_000_000, source, body };
         if let Ok(Some(map)) = pipeline.step(&event) {
             made.push(Sized::of(map));

@@ -23,14 +23,14 @@ impl House<'_> {
         if self.clock.load(Ordering::Relaxed) - newest_ns > 2 * TURN_NS {
             return Err(breach("converge", format!("no map for two turns: {last}")));
         }
-        self.door.close(None).map_err(|closed| breach("ledger", closed.to_string()))?;
+        self.door.report_drops(None).map_err(|closed| breach("ledger", closed.to_string()))?;
         self.step()?;
-        self.engine.rest();
+        self.engine.update_status();
         let snapshot = self.vehicles.0[0].status.snapshot();
         accounts(self.offered, &snapshot.ledger, &snapshot.sensors)?;
         adds_up("in the end, the core", self.engine.pipeline.ledger())?;
         self.observe();
-        if !self.account.is_settled() || !self.waiting.is_empty() {
+        if !self.account.is_idle() || !self.waiting.is_empty() {
             let (events, _) = self.account.in_flight();
             let found = format!("{events} events without a verdict, {} observations still wait", self.waiting.len());
             return Err(breach("verdicts", found));
@@ -59,7 +59,7 @@ impl House<'_> {
         let layers = self.maps.first().map_or(0, |map| map.layers.len() as u64);
         let Some(mut scribe) = self.scribe else { return Ok(Outcome { digest: hasher.finish(), ..outcome }) };
         drop(self.engine);
-        while scribe.take(now) {}
+        while scribe.write_next(now) {}
         let counts = scribe.counts();
         scribe.finish();
         let died = self.left.is_some();

@@ -52,7 +52,7 @@ impl Write for MemoryDisk {
 }
 
 impl Disk for MemoryDisk {
-    fn keep(&mut self) -> io::Result<()> {
+    fn sync(&mut self) -> io::Result<()> {
         Ok(())
     }
 }
@@ -80,7 +80,7 @@ impl Recorded {
         let report = match verify(file.path()) {
             Ok(report) => report,
             // Died or failed before its preface was written.
-            Err(VerifyError::Recording(_)) if self.confirmed == 0 && (self.died || self.counts.stopped().is_some()) => {
+            Err(VerifyError::Recording(_)) if self.confirmed == 0 && (self.died || self.counts.stop_reason().is_some()) => {
                 return Ok(false);
             }
             Err(error) => return wrong(error.to_string()),
@@ -95,13 +95,13 @@ impl Recorded {
             self.given.1,
             report.different,
             report.cut,
-            self.counts.stopped(),
+            self.counts.stop_reason(),
             report.differences.first(),
         );
         if report.events < self.confirmed {
             return wrong(format!("{} events were confirmed: {says}", self.confirmed));
         }
-        let good = match (self.died, self.counts.stopped(), lost) {
+        let good = match (self.died, self.counts.stop_reason(), lost) {
             (true, _, 0) => report.is_good() && report.cut,
             (false, Some(_), _) => report.cut || !report.is_good(),
             (false, None, 0) => report.is_good() && !report.cut && complete,

@@ -17,7 +17,7 @@ use clearway_mapping::event::Body;
 use clearway_proto::v1;
 use clearway_proto::v1::map_service_client::MapServiceClient;
 use clearway::config::{Config, Udp};
-use clearway::ingest::Reading;
+use clearway::ingest::queue::Reading;
 use clearway::record::reader::{Entry, Recording};
 use clearway::server::{Running, Server, Setup};
 use clearway_sim::scanner::ScannerConfig;
@@ -60,7 +60,7 @@ pub struct Driving {
 impl Driving {
     /// The vehicle on a plain, to a running server's first vehicle.
     pub fn to(running: &Running) -> Self {
-        let (data, telemetry) = running.doors[0].udp.expect("the vehicle has a socket");
+        let (data, telemetry) = running.inputs[0].udp.expect("the vehicle has a socket");
         let halt = Arc::new(AtomicBool::new(false));
         let until = halt.clone();
         let thread = std::thread::spawn(move || {
@@ -104,10 +104,10 @@ pub fn readings(tenths: i64) -> Vec<Reading> {
 
 /// Puts datagrams through the door of the first vehicle, losing nothing; gives the number of maps made so far.
 pub async fn feed(running: &Running, readings: Vec<Reading>) -> u64 {
-    let door = running.doors[0].door.clone();
+    let door = running.inputs[0].queue.clone();
     let status = &running.vehicles.0[0].status;
     let received = status.snapshot().ledger.received + readings.len() as u64;
-    tokio::task::spawn_blocking(move || readings.into_iter().try_for_each(|reading| door.enter_captured(reading)))
+    tokio::task::spawn_blocking(move || readings.into_iter().try_for_each(|reading| door.push_captured(reading)))
         .await
         .expect("no panic")
         .expect("the engine runs");

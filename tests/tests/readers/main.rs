@@ -14,7 +14,7 @@ use clearway_proto::map::{Map, decode_map, decode_map_on};
 use clearway_proto::v1;
 use clearway_proto::v1::map_service_client::MapServiceClient;
 use clearway_proto::v1::map_service_server::{MapService, MapServiceServer};
-use clearway::ingest::Reading;
+use clearway::ingest::queue::Reading;
 use clearway::server::Running;
 use futures::{Stream, StreamExt};
 use house::{config, feed, readings, sequence, start, within};

@@ -166,7 +166,7 @@ impl Known {
         if !remarks.is_empty() {
             notes.insert("mount".to_owned(), remarks.join("\n"));
         }
-        Ok(Setup { config, calibrations, certificates, boot_id, from_files: true, remarks, notes, observer: None })
+        Ok(Setup { config, calibrations, certificates, boot_id, from_files: true, config_comments: remarks, metadata: notes, observer: None })
     }
 }
 

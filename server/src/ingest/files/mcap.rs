@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::Path;
 
-use super::Reading;
+use crate::ingest::queue::Reading;
 use crate::ingest::ros::{ChoiceError, Intake, Offered};
 use crate::record::reader::{Entry, Recording, RecordingError};
 
