@@ -11,7 +11,7 @@ use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
 use clearway::config::Config;
 use clearway::ingest::observation::{Limits, decode};
-use clearway::record::reader::{Entry, Recording};
+use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::encode::{event_from_bytes, event_to_proto};
 use prost::Message;
 
@@ -40,11 +40,11 @@ pub fn event(bytes: &[u8]) {
 
 /// A recording's file.
 pub fn recording(bytes: &[u8]) {
-    let Ok(mut recording) = Recording::of(Path::new("any.mcap"), Cursor::new(bytes.to_vec())) else { return };
+    let Ok(mut recording) = RecordingReader::from_source(Path::new("any.mcap"), Cursor::new(bytes.to_vec())) else { return };
     drop(recording.config());
     let mut pipeline = pipeline();
     for entry in &mut recording {
-        if let Ok(Entry::Event { event, .. }) = entry {
+        if let Ok(RecordedMessage::Event { event, .. }) = entry {
             step(&mut pipeline, &event);
         }
     }

@@ -19,7 +19,7 @@ use clearway_proto::v1;
 use clearway::config::Config;
 use clearway::cli::demo::rig::Rig;
 use clearway::ingest::observation;
-use clearway::record::reader::{Entry, Recording};
+use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::cli::replay::{Options, replay};
 use clearway::encode::EncodedMap;
 use clearway_sim::scenes::{Scene, town};
@@ -71,14 +71,14 @@ async fn maps(drive: &Drive) -> Vec<Sized> {
     let (file, record) = (Path::new(env!("CLEARWAY_DATA")).join(drive.path), folder.path().join("drive.mcap"));
     let options = Options { files: vec![file.clone()], record: Some(record.clone()), ..Options::default() };
     house::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
-    let mut recording = Recording::open(&record).unwrap();
+    let mut recording = RecordingReader::open(&record).unwrap();
     let (config, tables) = recording.config().unwrap();
     // By how much the arrivals are ahead of the sensor's own clock, which the poses are to follow.
     let (mut events, mut ahead_ns) = (Vec::new(), None);
     for entry in recording.by_ref() {
         match entry.unwrap() {
-            Entry::Event { event, .. } => events.push(event),
-            Entry::Map { bytes, .. } if ahead_ns.is_none() => {
+            RecordedMessage::Event { event, .. } => events.push(event),
+            RecordedMessage::Map { bytes, .. } if ahead_ns.is_none() => {
                 let header = v1::Map::decode(bytes).unwrap().header.unwrap();
                 ahead_ns = Some(header.completed_ns - header.capture_end_ns);
             }

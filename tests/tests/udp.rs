@@ -14,7 +14,7 @@ use clearway_mapping::pipeline::{Ledger, Pipeline};
 use clearway_proto::v1;
 use clearway::config::{Config, Sender, Udp};
 use clearway::ingest::queue::event_queue;
-use clearway::record::reader::{Entry, Recording};
+use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::cli::replay::{Options, replay};
 use clearway::server::Running;
 use clearway::record::verify::verify;
@@ -52,12 +52,12 @@ fn datagrams() -> (Vec<Vec<u8>>, Vec<u8>) {
 
 /// The ledger a recording's events add up to.
 fn replayed(record: &Path, vehicle: &str) -> Ledger {
-    let mut recording = Recording::open(record).unwrap();
+    let mut recording = RecordingReader::open(record).unwrap();
     let (config, tables) = recording.config().unwrap();
     let index = config.vehicles.iter().position(|v| v.name == vehicle).unwrap();
     let mut pipeline = Pipeline::new(&config.vehicles[index].core(), tables[index].clone()).unwrap();
     for entry in &mut recording {
-        if let Entry::Event { vehicle: of, event } = entry.unwrap()
+        if let RecordedMessage::Event { vehicle: of, event } = entry.unwrap()
             && of == vehicle
         {
             let _ = pipeline.step(&event);
@@ -325,9 +325,9 @@ async fn two_captures_sent_to_one_port_at_once_give_both_vehicles_the_maps_of_th
 
 /// The recorded bytes by vehicle, sequence and layer.
 fn recorded_of(file: &Path) -> BTreeMap<(String, u64, String), bytes::Bytes> {
-    let entries = Recording::open(file).unwrap().map(|entry| entry.unwrap());
+    let entries = RecordingReader::open(file).unwrap().map(|entry| entry.unwrap());
     let maps = entries.filter_map(|entry| match entry {
-        Entry::Map { vehicle, layer, bytes } => Some(((vehicle, house::sequence(&bytes), layer), bytes)),
+        RecordedMessage::Map { vehicle, layer, bytes } => Some(((vehicle, house::sequence(&bytes), layer), bytes)),
         _ => None,
     });
     maps.collect()

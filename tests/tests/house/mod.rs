@@ -18,7 +18,7 @@ use clearway_proto::v1;
 use clearway_proto::v1::map_service_client::MapServiceClient;
 use clearway::config::{Config, Udp};
 use clearway::ingest::queue::Reading;
-use clearway::record::reader::{Entry, Recording};
+use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::server::{Running, Server, Setup};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::flat;
@@ -150,8 +150,8 @@ pub fn sequence(map: &Bytes) -> u64 {
 /// The recorded bytes of each map and layer.
 pub fn recorded(file: &Path) -> std::collections::BTreeMap<(u64, String), Bytes> {
     let mut maps = std::collections::BTreeMap::new();
-    for entry in Recording::open(file).expect("a recording") {
-        if let Entry::Map { layer, bytes, .. } = entry.expect("whole") {
+    for entry in RecordingReader::open(file).expect("a recording") {
+        if let RecordedMessage::Map { layer, bytes, .. } = entry.expect("whole") {
             assert!(maps.insert((sequence(&bytes), layer), bytes).is_none(), "each map once");
         }
     }
