@@ -9,7 +9,8 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use clearway_mapping::event::Event;
-use clearway_mapping::pipeline::{Pipeline, Rejected};
+use clearway_mapping::error::EventError;
+use clearway_mapping::pipeline::Pipeline;
 use tokio::sync::watch;
 
 use crate::encode::{self, EncodedMap};
@@ -100,12 +101,12 @@ impl Engine {
     fn complete_newest_map(&mut self) {
         let started = Instant::now();
         self.update_layers();
-        if self.pipeline.make_late().is_some() {
+        if self.pipeline.remake_newest_map().is_some() {
             self.publish(started);
         }
     }
 
-    fn step_event(&mut self, event: &Event) -> Result<(), Rejected> {
+    fn step_event(&mut self, event: &Event) -> Result<(), EventError> {
         if let Some(recording) = &self.recording {
             recording.record_event(event);
         }
@@ -114,9 +115,9 @@ impl Engine {
         match self.pipeline.step(event) {
             Ok(Some(_)) => self.publish(started),
             Ok(None) => {}
-            Err(rejected) => {
-                tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %rejected, "refused");
-                return Err(rejected);
+            Err(error) => {
+                tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %error, "refused");
+                return Err(error);
             }
         }
         Ok(())
@@ -154,6 +155,6 @@ impl Engine {
     /// replay does not have the readers of the recorded run.
     fn update_layers(&mut self) {
         let (all, subscriptions) = (self.recording.is_some(), &self.status.subscriptions);
-        self.pipeline.want(|layer| all || subscriptions.is_subscribed(layer));
+        self.pipeline.set_active_layers(|layer| all || subscriptions.is_subscribed(layer));
     }
 }

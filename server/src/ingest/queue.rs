@@ -257,7 +257,7 @@ impl State {
 
 #[cfg(test)]
 mod tests {
-    use clearway_mapping::pipeline::Ledger;
+    use clearway_mapping::ledger::Ledger;
 
     use super::*;
     use crate::ingest::receipt::ObservationId;

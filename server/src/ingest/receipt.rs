@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use clearway_mapping::pipeline::Rejected;
+use clearway_mapping::error::EventError;
 use clearway_proto::v1;
 use tokio::sync::mpsc::UnboundedSender;
 
@@ -21,11 +21,11 @@ pub enum Outcome {
     },
 }
 
-impl From<Result<(), Rejected>> for Outcome {
-    fn from(result: Result<(), Rejected>) -> Self {
+impl From<Result<(), EventError>> for Outcome {
+    fn from(result: Result<(), EventError>) -> Self {
         match result {
             Ok(()) => Self::Accepted,
-            Err(rejected) => Self::Refused { reason: rejected.reason(), message: rejected.to_string() },
+            Err(error) => Self::Refused { reason: error.reason(), message: error.to_string() },
         }
     }
 }

@@ -35,7 +35,7 @@ pub struct Setup {
 pub enum StartError {
     /// The configuration of a vehicle is invalid.
     #[error(transparent)]
-    Vehicle(#[from] clearway_mapping::config::ConfigError),
+    Vehicle(#[from] clearway_mapping::config::ConfigValueError),
     /// The recording cannot be created.
     #[error(transparent)]
     Record(#[from] RecordError),

@@ -221,7 +221,7 @@ fn wait_readable(socket: &Socket, stopped: &PipeReader) -> io::Result<bool> {
 
 #[cfg(test)]
 mod tests {
-    use clearway_mapping::pipeline::Ledger;
+    use clearway_mapping::ledger::Ledger;
 
     use super::*;
     use crate::config::{Config, Udp};
