@@ -33,7 +33,7 @@ fn main() {
     let sockets = udp::Sockets::bind(&config.vehicles).expect("free ports");
     let (data, _) = sockets.addresses(0).expect("a socket");
     let (door, events) = event_queue(config.vehicles[0].queue);
-    let readers = sockets.read(std::slice::from_ref(&door)).expect("threads");
+    let readers = sockets.start(std::slice::from_ref(&door)).expect("threads");
     let outside = door.drops();
     drop(door);
 

@@ -104,7 +104,7 @@ impl<'a> House<'a> {
         let (newest, receiver) = watch::channel(None);
         let pipeline = Pipeline::new(&vehicle.core(), vec![None; vehicle.sensors.len()]).expect("a car that can be");
         let valid_ms = vehicle.maps.valid_ms;
-        let engine = Engine { pipeline, valid_ms, newest, journal, status: status.clone(), observer: None };
+        let engine = Engine { pipeline, valid_ms, newest, recording: journal, status: status.clone(), observer: None };
         let mut dice = Dice::new(!fate.seed);
         let (verdicts, told) = unbounded_channel();
         Self {
