@@ -96,7 +96,7 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
         speed_mps: map.speed_mps,
         sensors: map.sensors.iter().map(sensor).collect(),
         compensation: map.compensation.as_str().to_owned(),
-        made_by: map.sensors.get(usize::from(map.made_by)).map_or(String::new(), |sensor| sensor.name.clone()),
+        source_sensor: map.sensors.get(usize::from(map.made_by)).map_or(String::new(), |sensor| sensor.name.clone()),
     }
 }
 
@@ -133,7 +133,10 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
 fn layer(layer: &Layer) -> v1::Layer {
     let geometry = match &layer.geometry {
         Geometry::Radial { r_bench_m, columns } => {
-            v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m: r_bench_m.clone(), columns: u32::from(*columns) })
+            v1::layer::Geometry::Radial(v1::RadialGrid {
+                row_radius_m: r_bench_m.clone(),
+                columns: u32::from(*columns),
+            })
         }
         &Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_cell } => {
             let [first_ix, first_iy] = first_cell;
@@ -172,11 +175,31 @@ fn layer(layer: &Layer) -> v1::Layer {
         name: layer.name.to_owned(),
         geometry: Some(geometry),
         legend: layer.legend.iter().map(|&class| class.to_owned()).collect(),
+        legend_meanings: layer.legend.iter().map(|class| meaning_and_colour(class).0.into()).collect(),
+        legend_rgb: layer.legend.iter().map(|class| meaning_and_colour(class).1).collect(),
         channels: layer.channels.iter().map(channel).collect(),
         planes: layer.planes.iter().map(|&[a, b, c]| v1::Plane { a, b, c }).collect(),
-        figures: layer.figures.iter().map(|&(name, value)| (name.to_owned(), value)).collect(),
+        metrics: layer.figures.iter().map(|&(name, value)| (name.to_owned(), value)).collect(),
         safe_points: safe_points(layer),
         base_sequence: None,
+    }
+}
+
+/// Meaning and colour of a class of the core's layers.
+fn meaning_and_colour(class: &str) -> (v1::ClassMeaning, u32) {
+    use v1::ClassMeaning::{Free, Hidden, Inferred, NotReached, Occupied, Unknown};
+    match class {
+        "drivable" | "flat" | "passable" | "clear" => (Free, 0x1c9e96),
+        "free" => (Free, 0x166e6a),
+        "road" => (Free, 0x78bef0),
+        "path" => (Free, 0xfafaf0),
+        "flat_inferred" => (Inferred, 0x166e6a),
+        "not_drivable" | "flat_elevated" => (NotReached, 0xf4b842),
+        "flat_unreachable" => (NotReached, 0xaa803c),
+        "obstacle" | "occupied" => (Occupied, 0xc42638),
+        "occluded" => (Hidden, 0x5c5c80),
+        "out_of_range" => (Unknown, 0x181a1e),
+        _ => (Unknown, 0x3a3f46),
     }
 }
 
@@ -240,7 +263,7 @@ mod tests {
         assert_eq!(whole.layers.len(), 2);
         let header = whole.header.unwrap();
         assert_eq!((header.sequence, header.boot_id, header.valid_until_ns), (9, 7, 300_000_100));
-        assert_eq!((header.compensation.as_str(), header.made_by.as_str()), ("speed", "left"));
+        assert_eq!((header.compensation.as_str(), header.source_sensor.as_str()), ("speed", "left"));
         let sensors: Vec<_> = header.sensors.iter().map(|s| (s.state.as_str(), s.age_ms, s.packets_expected)).collect();
         assert_eq!(sensors, [("late", Some(250.5), 0), ("ok", None, 75)]);
         let one = encoded.select(&["height_difference".into()]);

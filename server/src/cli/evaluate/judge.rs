@@ -12,10 +12,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use clearway_client::footprint::FREE;
 use clearway_mapping::map::{Cells, Geometry, Layer};
 use clearway_mapping::layer::radial_grid::RadialGrid;
 
+/// Classes that mean free.
+const FREE: [&str; 7] = ["drivable", "flat", "clear", "passable", "road", "free", "path"];
 /// From here on a thing over the ground is an obstacle.
 pub const OBSTACLE_M_MIN: f32 = 0.3;
 /// Higher things are passed under.
