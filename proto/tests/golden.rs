@@ -147,6 +147,43 @@ fn bad_vectors() -> Vec<Bad> {
 }
 
 #[test]
+fn the_examples_in_map_proto_are_what_the_encoder_writes() {
+    let specification = include_str!("../clearway/v1/map.proto");
+    let has_payload = |payload: &[u8]| {
+        let bits: Vec<_> = payload.iter().map(|byte| format!("{byte:08b}")).collect();
+        let bytes: Vec<_> = payload.iter().map(|byte| format!("{byte:02x}")).collect();
+        let line = format!("Payload: {} = {}", bits.join(" "), bytes.join(" "));
+        assert!(specification.contains(&line), "{line}");
+    };
+    let rows = codec::encode_grid(codec::CellsRef::U8(&[1, 1, 0, 0, 1, 1, 1, 0]), 4);
+    assert_eq!(rows.encoding, v1::Encoding::Rows);
+    has_payload(&rows.payload);
+
+    // One class: its table makes a base of zeros.
+    let cells = [0, 0, 5, 5, 0, 0, 0, 0];
+    let payload = vec![0x29, 0xb5, 0x10];
+    has_payload(&payload);
+    let class = codec::encode_grid(codec::CellsRef::U8(&[0; 8]), 4).into_channel("class", "", 1.0, 0);
+    let hits = v1::Channel {
+        name: "hits".into(),
+        cell_type: v1::CellType::U8.into(),
+        encoding: v1::Encoding::Changes.into(),
+        cell_count: 8,
+        crc32: codec::encode_grid(codec::CellsRef::U8(&cells), 4).crc32,
+        payload: payload.into(),
+        by_class: vec![0].into(),
+        ..Default::default()
+    };
+    let grid = v1::CartesianGrid { width: 4, height: 2, cell_m: 1.0, ..Default::default() };
+    let geometry = Some(v1::layer::Geometry::Cartesian(grid));
+    let layer = v1::Layer { geometry, channels: vec![class, hits], ..Default::default() };
+    let layer = with_legend(layer, &CLASSES[..1]);
+    let bytes = [map::encode_header(&v1::Header::default()), map::encode_layer(&layer)].concat();
+    let map = map::decode_map(bytes.into(), &Limits::default()).unwrap();
+    assert_eq!(map.layers[0].channels[1].cells, Cells::U8(cells.to_vec()));
+}
+
+#[test]
 fn every_bad_channel_is_refused_under_its_name() {
     let bad = bad_vectors();
     assert!(bad.len() >= 40, "{}", bad.len());

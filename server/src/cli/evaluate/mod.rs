@@ -1,4 +1,4 @@
-//! `clearway-server evaluate`: every map against the truth, of labelled scans and of simulated scenes.
+//! `clearway evaluate`: every map against the truth, of labelled scans and of simulated scenes.
 //!
 //! In: SemanticKITTI-style folders or files, or `sim:NAME`. Out: a [`Report`]. The scans and datagrams go through the
 //! real [`Pipeline`]; what its maps say is judged point by point and cell by cell.
