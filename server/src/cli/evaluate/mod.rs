@@ -192,7 +192,7 @@ fn pipeline(maps: &MapsConfig, model: Model, extrinsics: Extrinsics) -> Result<(
 }
 
 impl Source {
-    fn judge(&mut self, layers: &[clearway_mapping::map::Layer], points: &[Point]) {
+    fn judge(&mut self, layers: &[clearway_mapping::layer::Layer], points: &[Point]) {
         self.frames += 1;
         for layer in layers {
             let at = self.layers.iter().position(|(name, _)| name == layer.name);

@@ -219,15 +219,21 @@ mod tests {
 
     #[test]
     fn every_class_of_every_layer_has_its_occupancy() {
-        use clearway_mapping::layer::{drivability, height_difference, safe_path, speed, terrain};
-        use crate::encode::meaning_and_colour;
-        let of = |legend: &[&str]| legend.iter().map(|class| occupancy(meaning_and_colour(class).0)).collect::<Vec<_>>();
-        assert_eq!(of(drivability::LEGEND), [-1, 0, 100, 100]);
-        assert_eq!(of(height_difference::LEGEND), [-1, 0, 100]);
-        assert_eq!(of(terrain::LEGEND), [-1, 0, -1, 100, 100, 100]);
-        assert_eq!(of(&["unknown", "clear", "occupied", "occluded", "out_of_range"]), [-1, 0, 100, -1, -1]);
-        assert_eq!(of(speed::LEGEND), [-1, 0, 100, 0]);
-        assert_eq!(of(safe_path::LEGEND), [-1, 0, 100, 0]);
+        use crate::encode::meaning;
+        use clearway_mapping::layer::ClassInfo;
+        use clearway_mapping::layer::drivability::class::DrivabilityClass;
+        use clearway_mapping::layer::height_difference::class::HeightDifferenceClass;
+        use clearway_mapping::layer::occupancy::class::OccupancyClass;
+        use clearway_mapping::layer::safe_path::class::SafePathClass;
+        use clearway_mapping::layer::speed::class::SpeedClass;
+        use clearway_mapping::layer::terrain::class::TerrainClass;
+        let of = |legend: &[ClassInfo]| legend.iter().map(|class| occupancy(meaning(class.meaning))).collect::<Vec<_>>();
+        assert_eq!(of(DrivabilityClass::LEGEND), [-1, 0, 100, 100]);
+        assert_eq!(of(HeightDifferenceClass::LEGEND), [-1, 0, 100]);
+        assert_eq!(of(TerrainClass::LEGEND), [-1, 0, -1, 100, 100, 100]);
+        assert_eq!(of(OccupancyClass::LEGEND), [-1, 0, 100, -1, -1]);
+        assert_eq!(of(SpeedClass::LEGEND), [-1, 0, 100, 0]);
+        assert_eq!(of(SafePathClass::LEGEND), [-1, 0, 100, 0]);
     }
 
     #[test]
