@@ -93,7 +93,7 @@ async fn eight_sensors_through_real_doors_make_one_map_and_its_occupancy_is_the_
     let header = map.header();
     let states: Vec<_> = header.sensors.iter().map(|sensor| (&*sensor.name, &*sensor.state)).collect();
     assert!(states.len() == 8 && states.iter().all(|(_, state)| *state == "ok"), "{states:?}");
-    assert_eq!((&*header.made_by, &*header.compensation), ("top", "poses"));
+    assert_eq!((&*header.source_sensor, &*header.compensation), ("top", "poses"));
     hold_against_truth(&map, &rig);
     within("shutdown", running.shutdown()).await.unwrap();
 }

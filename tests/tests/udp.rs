@@ -130,7 +130,7 @@ async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording()
     let metrics = clearway::status::prometheus(std::slice::from_ref(&status));
     let line = "clearway_sensor_refused_total{vehicle=\"car\",sensor=\"side\",reason=\"length\"} 3\n";
     assert!(metrics.contains(line), "{metrics}");
-    let strangers = status.to_proto().strangers;
+    let strangers = status.to_proto().unknown_senders;
     let known = strangers.iter().find(|s| s.address == stranger.local_addr().unwrap().to_string());
     assert_eq!(known.expect("the stranger is shown").datagrams, 6);
     assert_eq!(strangers.len(), 4, "{strangers:?}");

@@ -233,7 +233,7 @@ impl VehicleStatus {
             sensor_ledgers: snapshot.sensors.iter().map(|s| (s.name.clone(), ledger(&s.ledger))).collect(),
             recorder: Some(self.recorder.get().map(|counts| counts.to_proto()).unwrap_or_default()),
             readers: self.readers().map(|(transport, readers)| (transport.to_owned(), readers)).into(),
-            strangers: self.drops.unknown_senders().iter().map(stranger).collect(),
+            unknown_senders: self.drops.unknown_senders().iter().map(unknown_sender).collect(),
             observations_refused: by_name(&snapshot.observations_refused),
         }
     }
@@ -272,7 +272,7 @@ impl VehicleStatus {
                 "stopped": self.recorder.get().and_then(|counts| counts.stop_reason()),
             },
             "readers": proto.readers,
-            "strangers": proto.strangers.iter().map(|s| {
+            "unknown_senders": proto.unknown_senders.iter().map(|s| {
                 json!({ "address": s.address, "datagrams": s.datagrams, "newest_ns": s.newest_ns.to_string() })
             }).collect::<Vec<_>>(),
             "rates": { "maps_hz": snapshot.maps_hz, "packets_hz": snapshot.packets_hz },
@@ -282,9 +282,9 @@ impl VehicleStatus {
     }
 }
 
-fn stranger(sender: &UnknownSender) -> v1::Stranger {
+fn unknown_sender(sender: &UnknownSender) -> v1::UnknownSender {
     let UnknownSender { address, datagrams, newest_ns } = *sender;
-    v1::Stranger { address: address.to_string(), datagrams, newest_ns }
+    v1::UnknownSender { address: address.to_string(), datagrams, newest_ns }
 }
 
 fn ledger_json(ledger: &v1::Ledger) -> Value {
