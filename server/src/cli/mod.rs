@@ -38,7 +38,6 @@ mod get;
 mod info;
 mod ingest;
 mod output;
-mod recording;
 pub mod replay;
 mod send;
 mod serve;

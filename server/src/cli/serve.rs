@@ -22,7 +22,7 @@ pub struct Options {
 ///
 /// # Errors
 /// [`ConfigError`](crate::config::ConfigError), [`StartError`](crate::server::StartError), and
-/// [`EndError`](crate::server::EndError) at the end.
+/// [`ShutdownError`](crate::server::ShutdownError) at the end.
 pub fn run(options: &Options) -> Result<()> {
     block_on(serve(&options.configuration))
 }
@@ -33,8 +33,8 @@ async fn serve(configuration: &ConfigurationOptions) -> Result<()> {
     let calibrations = config.calibrations(file)?;
     let certificates = config.certificates(file)?;
     let mut config = config.located(file);
-    if let Some(recording) = writer::wanted(&config.recorder) {
-        config.recorder.file = writer::unused(recording);
+    if let Some(recording) = writer::recording_path(&config.recorder) {
+        config.recorder.file = writer::next_free_name(recording);
     }
     // Before the server starts, so that a signal during the start ends it in order.
     let stop = stop_signal()?;
@@ -48,7 +48,7 @@ async fn serve(configuration: &ConfigurationOptions) -> Result<()> {
 
 /// Logs every address at which the server listens, and the recording.
 pub fn log_endpoints(running: &Running) {
-    for vehicle in &running.doors {
+    for vehicle in &running.inputs {
         if let Some((data, telemetry)) = vehicle.udp {
             tracing::info!(vehicle = %vehicle.name, %data, %telemetry, "listening for datagrams");
         }

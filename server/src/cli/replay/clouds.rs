@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex};
 use clearway_lidar::revolution::Revolution;
 
 use crate::engine::Observer;
-use crate::ingest::locked;
+use crate::sync::locked;
 
 /// A folder to which point clouds are written.
 #[derive(Clone, Debug)]

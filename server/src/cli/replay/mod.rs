@@ -22,8 +22,9 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::output::{block_on, print, print_line, stop_signal};
 use super::serve::log_endpoints;
 use crate::ingest::files::Readings;
-use crate::ingest::{Door, locked};
+use crate::ingest::queue::EventQueue;
 use crate::server::{Running, Server};
+use crate::sync::locked;
 
 pub mod clouds;
 pub mod options;
@@ -129,8 +130,8 @@ pub async fn replay(
     started(&running, &summary);
 
     let speed = options.speed.unwrap_or(if options.serve { Speed::Times(1.0) } else { Speed::Max });
-    let door = running.doors[0].door.clone();
-    let read = tokio::task::spawn_blocking(move || feed(readings, &door, speed, &progress)).await;
+    let queue = running.inputs[0].queue.clone();
+    let read = tokio::task::spawn_blocking(move || feed(readings, &queue, speed, &progress)).await;
     let status = running.vehicles.0[0].status.clone();
     let outcome = match read {
         Ok(outcome) => outcome,
@@ -153,7 +154,7 @@ pub async fn replay(
 }
 
 /// Pushes every reading to the event queue, at its time if the speed is not [`Speed::Max`].
-fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) -> Result<Readings, ReplayError> {
+fn feed(mut readings: Readings, queue: &EventQueue, speed: Speed, progress: &Progress) -> Result<Readings, ReplayError> {
     let began = Instant::now();
     let (mut first_ns, mut newest_ns) = (None, None);
     while let Some(reading) = readings.next() {
@@ -164,18 +165,18 @@ fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) 
             std::thread::sleep(due.saturating_sub(began.elapsed()));
         }
         progress.bytes_read.store(readings.bytes_read(), Ordering::Relaxed);
-        leave_refused(&mut readings, door);
+        leave_refused(&mut readings, queue);
         newest_ns = Some(reading.arrival_ns);
-        door.enter_captured(reading).map_err(|_| ReplayError::Engine)?;
+        queue.push_captured(reading).map_err(|_| ReplayError::Engine)?;
     }
-    leave_refused(&mut readings, door);
-    door.close(newest_ns).map_err(|_| ReplayError::Engine)?;
+    leave_refused(&mut readings, queue);
+    queue.report_drops(newest_ns).map_err(|_| ReplayError::Engine)?;
     Ok(readings)
 }
 
 /// Reports the messages that the files' readers have refused to the drop counters.
-fn leave_refused(readings: &mut Readings, door: &Door) {
+fn leave_refused(readings: &mut Readings, queue: &EventQueue) {
     for ((source, reason), count) in readings.untold() {
-        door.outside().leave_observations(source, reason, count);
+        queue.drops().record_refused_messages(source, reason, count);
     }
 }

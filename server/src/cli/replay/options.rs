@@ -11,7 +11,7 @@ use crate::cli::configuration::{extrinsics, model};
 use crate::config::ConfigError;
 use crate::ingest::files::FilesError;
 use crate::record::reader::RecordingError;
-use crate::server::{EndError, StartError};
+use crate::server::{ShutdownError, StartError};
 
 /// Make maps from recorded drives: pcap, pcapng, MCAP, KITTI and PCD files or folders, in the order given.
 ///
@@ -121,7 +121,7 @@ pub enum ReplayError {
     Start(#[from] StartError),
     /// The server did not end in order.
     #[error(transparent)]
-    End(#[from] EndError),
+    End(#[from] ShutdownError),
     /// The engine stopped before the end of the files.
     #[error("the vehicle's engine has stopped")]
     Engine,

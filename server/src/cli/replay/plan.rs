@@ -20,7 +20,7 @@ use crate::config::{Calibrations, Config, Recorder};
 use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::files::mcap::{McapError, Wanted};
 use crate::ingest::ros::{Choice, Offered, PoseFrom, SensorTopic};
-use crate::record::reader::Recording;
+use crate::record::reader::RecordingReader;
 use crate::server::Setup;
 
 /// Number of revolutions from which the mount is estimated: one second of a sensor at 600 rpm.
@@ -177,7 +177,7 @@ impl Known {
         if !remarks.is_empty() {
             notes.insert("mount".to_owned(), remarks.join("\n"));
         }
-        Ok(Setup { config, calibrations, certificates, boot_id, from_files: true, remarks, notes, observer: None })
+        Ok(Setup { config, calibrations, certificates, boot_id, from_files: true, config_comments: remarks, metadata: notes, observer: None })
     }
 }
 
@@ -204,13 +204,13 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, Repla
         return Ok(known(config, tables, None, true));
     }
     if let Some(file) = recorded {
-        let recording = Recording::open(file)?;
-        if recording.preface().config.is_some() {
+        let recording = RecordingReader::open(file)?;
+        if recording.header().config.is_some() {
             let (mut config, mut tables) = recording.config()?;
             pick(&mut config, &mut tables)?;
             // The publishers and files of the recorded run are not those of this run.
             let config = Config { vehicles: config.vehicles, ..Config::default() };
-            return Ok(known(config, tables, Some(recording.preface().boot_id), true));
+            return Ok(known(config, tables, Some(recording.header().boot_id), true));
         }
     }
     Ok(known(Config::of_one_vehicle("car", "top"), vec![vec![None]], None, false))

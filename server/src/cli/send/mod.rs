@@ -20,7 +20,7 @@ use clearway_ros::velodyne_scan::VelodyneScan;
 use serde_json::{Value, json};
 
 use super::output::{print_line, progress_bar};
-use super::recording::Recording;
+use crate::record::mcap_reader::McapReader;
 use udp::{Kind, Sender, Speed};
 
 #[cfg(feature = "sim")]
@@ -86,22 +86,22 @@ pub fn run(options: &Options) -> Result<()> {
 /// Sends the packets of the VelodyneScan messages of an MCAP file; returns why the file is not whole.
 fn send_mcap(options: &Options, route: &mut Route, length: u64) -> Result<Option<String>> {
     let progress = progress_bar(length);
-    let mut recording = Recording::open(&options.file)?;
+    let mut recording = McapReader::salvage(&options.file)?;
     while let Some(message) = recording.next() {
-        let message = message.with_context(|| options.file.display().to_string())?;
-        progress.set_position(recording.bytes_read);
+        let message = message?;
+        progress.set_position(recording.bytes_read());
         if !message.is_velodyne_scan() {
             route.skip("not a VelodyneScan", 1);
             continue;
         }
-        let scan = VelodyneScan::new(&message.data).with_context(|| message.topic.clone())?;
+        let scan = VelodyneScan::new(&message.data).with_context(|| message.channel.topic.clone())?;
         for packet in scan.packets() {
-            let (stamp_ns, packet) = packet.with_context(|| message.topic.clone())?;
+            let (stamp_ns, packet) = packet.with_context(|| message.channel.topic.clone())?;
             route.send(stamp_ns, packet)?;
         }
     }
     progress.finish_and_clear();
-    Ok(recording.cut)
+    Ok(recording.incomplete())
 }
 
 /// Sends the datagrams of a pcap or pcapng file; returns why the file is not whole.
