@@ -7,7 +7,7 @@ use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
 use clearway_lidar::model::Model;
-use clearway_lidar::sensor::{Sensor, SensorConfig};
+use clearway_lidar::{Sensor, SensorConfig};
 use clearway_mapping::config::Extrinsics;
 use clearway_mapping::event::Body;
 use clearway_ros::PointCloud2;

@@ -73,15 +73,15 @@ pub struct ModelSpec {
     pub lasers: usize,
     /// Number of firings of one block: 2 with 16 lasers, else 1.
     pub firings_per_block: usize,
-    /// Number of blocks of one firing and one echo: 2 (HDL-64E S2, S3), 4 (VLS-128), else 1. Each block of an HDL-64E S1
-    /// has its own azimuth, so each is a firing that fills 32 of the 64 slots.
+    /// Number of blocks of one firing and one echo: 2 (HDL-64E S2, S3), 4 (VLS-128), else 1. Each block of an HDL-64E
+    /// S1 has its own azimuth, so each is a firing that fills 32 of the 64 slots.
     pub blocks_per_firing: usize,
     /// Time from one firing to the next, in ns.
     pub firing_period_ns: u32,
     /// Time from one firing to the next in dual-return mode, in ns.
     pub firing_period_dual_ns: u32,
-    /// Values of byte 1205 that sensors of this model send; the first is that of the manual. Empty for an HDL-64E, whose
-    /// last two bytes are status bytes.
+    /// Values of byte 1205 that sensors of this model send; the first is that of the manual. Empty for an HDL-64E,
+    /// whose last two bytes are status bytes.
     pub model_bytes: &'static [u8],
     /// True if the model has a dual-return mode.
     pub dual_return: bool,
@@ -218,8 +218,8 @@ impl ModelSpec {
         }
     }
 
-    /// Counts by which the sensor turns from the azimuth of its block until return `index` of that block is fired, if it
-    /// turns by `step` counts per block (VLS-128: per firing). It is rounded half up, as in VeloView. It is 0 for an
+    /// Counts by which the sensor turns from the azimuth of its block until return `index` of that block is fired, if
+    /// it turns by `step` counts per block (VLS-128: per firing). It is rounded half up, as in VeloView. It is 0 for an
     /// HDL-64E, whose calibration refers to the azimuth of the block.
     ///
     /// `index` is the index of the return in its block, plus 32, 64 or 96 for the later blocks of a VLS-128.

@@ -1,7 +1,7 @@
 //! One sensor: datagrams in, revolutions out.
 //!
-//! In: UDP payloads of one sensor, data and telemetry, in order of arrival. Out: [`Revolution`]s in the sensor's frame. A
-//! datagram that is refused changes nothing.
+//! In: UDP payloads of one sensor, data and telemetry, in order of arrival. Out: [`Revolution`]s in the sensor's frame.
+//! A datagram that is refused changes nothing.
 
 use crate::config::SensorConfig;
 use crate::datagram::DatagramError;
@@ -72,17 +72,17 @@ impl Sensor {
     /// Adds one UDP payload that arrived at `arrival_ns` (ns since the Unix epoch), and returns the revolution that it
     /// completes, if any. A datagram ends at most one revolution.
     ///
-    /// Copies of packets, and packets that are late by up to 32 packets, change no revolution: a packet that follows the
-    /// packet before is decoded at once. Behind a gap, and at the start of a stream, packets wait until the missing
+    /// Copies of packets, and packets that are late by up to 32 packets, change no revolution: a packet that follows
+    /// the packet before is decoded at once. Behind a gap, and at the start of a stream, packets wait until the missing
     /// packet has arrived or 32 packet periods have passed.
     ///
     /// # Errors
     /// The state of the sensor is then as if the datagram had not arrived.
-    /// - [`DatagramError::Length`], [`DatagramError::BlockFlag`], [`DatagramError::Azimuth`] or [`DatagramError::Nmea`] if
-    ///   the datagram cannot be parsed.
+    /// - [`DatagramError::Length`], [`DatagramError::BlockFlag`], [`DatagramError::Azimuth`] or [`DatagramError::Nmea`]
+    ///   if the datagram cannot be parsed.
     /// - [`DatagramError::BlockFlag`] or [`DatagramError::Model`] if it is of no model, or of another one.
-    /// - [`DatagramError::Duplicate`], [`DatagramError::Late`] or [`DatagramError::DeviceTime`] if it is a copy, too late, or
-    ///   its device time does not follow.
+    /// - [`DatagramError::Duplicate`], [`DatagramError::Late`] or [`DatagramError::DeviceTime`] if it is a copy, too
+    ///   late, or its device time does not follow.
     /// - [`DatagramError::Calibration`] if the configured calibration does not fit the model.
     pub fn push(&mut self, payload: &[u8], arrival_ns: i64) -> Result<Option<&Revolution>, DatagramError> {
         // Parse.

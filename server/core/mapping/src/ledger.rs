@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use clearway_lidar::sensor::Refusal;
+use clearway_lidar::DatagramError;
 
 use crate::sensor::self_filter::Hidden;
 use crate::config::ConfigError;
@@ -108,7 +108,7 @@ pub const STAMP_NS_MAX: i64 = 1 << 62;
 pub enum Rejected {
     /// The decoder refused the datagram.
     #[error(transparent)]
-    Datagram(#[from] Refusal),
+    Datagram(#[from] DatagramError),
     /// No such sensor.
     #[error("source {source_index}: the vehicle has {sensors} sensor(s), counted from 0")]
     Source {

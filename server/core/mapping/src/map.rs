@@ -1,7 +1,7 @@
 //! What a map is: a header, and layers of channels over one grid each. Class 0 is unknown everywhere, and is never
 //! free.
 
-use clearway_lidar::blocked::Blocked;
+use clearway_lidar::Blocked;
 use nalgebra::Isometry3;
 
 use crate::layer::Layer;

@@ -7,7 +7,7 @@
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::sensor::SensorStatus;
+use clearway_lidar::SensorStatus;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
 use crate::config::{ConfigError, MapsConfig, SensorConfig, VehicleConfig};
@@ -351,23 +351,4 @@ fn intake_of(intakes: &mut [Intake], source_index: u16) -> Result<&mut Intake, R
 /// Names of the layers of a vehicle's maps, in order.
 pub fn layer_names(maps: &MapsConfig) -> Vec<&'static str> {
     Layers::new(maps).made().into_iter().map(|(name, _)| name).collect()
-}
-
-/// The model that [`model_name`] spells so.
-pub fn model_of_name(name: &str) -> Option<Model> {
-    Model::ALL.into_iter().find(|model| model_name(*model) == name)
-}
-
-/// The model as the configuration and the wire spell it.
-pub fn model_name(model: Model) -> &'static str {
-    match model {
-        Model::Hdl64eS1 => "hdl64e_s1",
-        Model::Hdl64eS2 => "hdl64e_s2",
-        Model::Hdl64eS3 => "hdl64e_s3",
-        Model::Hdl32e => "hdl32e",
-        Model::Vlp16 => "vlp16",
-        Model::PuckHiRes => "puck_hi_res",
-        Model::Vlp32c => "vlp32c",
-        Model::Vls128 => "vls128",
-    }
 }

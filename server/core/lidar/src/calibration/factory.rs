@@ -32,8 +32,8 @@ fn interleaved(laser: usize, lowest: f64, step: f64) -> f64 {
     lowest + step * (laser / 2 + laser % 2 * 8) as f64
 }
 
-/// Elevation of a laser, in degrees: -30.67, -9.33, -29.33, -8.00, … 10.67. The steps are thirds of four degrees, rounded
-/// to two decimals as in the manual.
+/// Elevation of a laser, in degrees: -30.67, -9.33, -29.33, -8.00, … 10.67. The steps are thirds of four degrees,
+/// rounded to two decimals as in the manual.
 fn hdl32e_elevation(laser: usize) -> f64 {
     let rank = laser / 2 + laser % 2 * 16;
     let thirds = 4.0 * rank as f64 - 92.0;

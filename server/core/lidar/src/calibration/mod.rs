@@ -36,8 +36,8 @@ impl Calibration {
     /// Reads ROS YAML or Velodyne XML.
     ///
     /// # Errors
-    /// [`CalibrationError`] with the key, its value and what is allowed: as [`Calibration::from_xml`] if the text begins
-    /// with `<`, else as [`Calibration::from_yaml`]; [`CalibrationError::Format`] if it is empty.
+    /// [`CalibrationError`] with the key, its value and what is allowed: as [`Calibration::from_xml`] if the text
+    /// begins with `<`, else as [`Calibration::from_yaml`]; [`CalibrationError::Format`] if it is empty.
     pub fn load_str(text: &str) -> Result<Self, CalibrationError> {
         match text.trim_start_matches('\u{feff}').trim_start().chars().next() {
             Some('<') => Self::from_xml(text),

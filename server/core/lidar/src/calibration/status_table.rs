@@ -1,10 +1,10 @@
 //! The calibration table that an HDL-64E S2 or S3 sends in its status bytes, one byte per packet.
 //!
-//! In: the status type and value at the end of every packet. Out: the [`Calibration`], after 4,160 packets (about 1.2 s)
-//! without a loss. Source: HDL-64E S3 manual 63-HDL64ES3 rev K, appendix E. A cycle is 16 packets: the types
-//! H M S D N Y G T V with clock, GPS, temperature and firmware, then seven bytes of the table. The table is 260 cycles,
-//! 1,820 bytes: `UNIT#` and two thresholds; 28 bytes per laser, of which 21 are used; 21 bytes about the unit. It ends
-//! with a CRC-16 over the lasers (S3, which also marks every fourth cycle with W) or with its own length (S2).
+//! In: the status type and value at the end of every packet. Out: the [`Calibration`], after 4,160 packets (about 1.2
+//! s) without a loss. Source: HDL-64E S3 manual 63-HDL64ES3 rev K, appendix E. A cycle is 16 packets: the types H M S D
+//! N Y G T V with clock, GPS, temperature and firmware, then seven bytes of the table. The table is 260 cycles, 1,820
+//! bytes: `UNIT#` and two thresholds; 28 bytes per laser, of which 21 are used; 21 bytes about the unit. It ends with a
+//! CRC-16 over the lasers (S3, which also marks every fourth cycle with W) or with its own length (S2).
 
 use super::table::{Calibration, LaserCalibration};
 use crate::model::Model;
@@ -83,8 +83,8 @@ impl StatusTable {
     }
 }
 
-/// True if a status type may be at that position of a cycle: the first nine types are fixed, the other seven are digits,
-/// W, or above F0.
+/// True if a status type may be at that position of a cycle: the first nine types are fixed, the other seven are
+/// digits, W, or above F0.
 fn fits(position: usize, status_type: u8) -> bool {
     match CLOCK_TYPES.get(position) {
         Some(expected) => status_type == *expected,

@@ -1,7 +1,7 @@
 //! ROS `velodyne_pointcloud` YAML, in all variants in use.
 //!
-//! In: text. Out: [`Calibration`]. Keys may be missing, unknown keys are ignored, and `num_lasers` is checked. A key that
-//! occurs twice (as in `angles-calibrated.yaml` of the driver) is an error only if the values differ.
+//! In: text. Out: [`Calibration`]. Keys may be missing, unknown keys are ignored, and `num_lasers` is checked. A key
+//! that occurs twice (as in `angles-calibrated.yaml` of the driver) is an error only if the values differ.
 
 use serde::Deserialize;
 use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};

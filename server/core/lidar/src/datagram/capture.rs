@@ -257,8 +257,8 @@ impl Interfaces {
     }
 }
 
-/// Ticks per second of a pcapng interface. `if_tsresol` is a negative power of ten, or of two if its highest bit is set;
-/// a value too large for 64 bits is read as microseconds, the default of the format.
+/// Ticks per second of a pcapng interface. `if_tsresol` is a negative power of ten, or of two if its highest bit is
+/// set; a value too large for 64 bits is read as microseconds, the default of the format.
 fn ticks_per_second(if_tsresol: u8) -> u64 {
     let (base, power) = if if_tsresol & 0x80 == 0 { (10_u64, if_tsresol) } else { (2, if_tsresol & 0x7F) };
     base.checked_pow(power.into()).unwrap_or(1_000_000)

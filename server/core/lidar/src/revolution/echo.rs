@@ -5,7 +5,8 @@ use crate::model::RETURNS_PER_BLOCK;
 /// One range image: the returns of one echo. Each array has `firings * lasers` slots.
 #[derive(Clone, Debug, Default)]
 pub struct Echo {
-    /// Corrected range, in m; 0 if the laser fired without a return; NaN if it did not fire in this firing (HDL-64E S1).
+    /// Corrected range, in m; 0 if the laser fired without a return; NaN if it did not fire in this firing (HDL-64E
+    /// S1).
     pub range_m: Vec<f32>,
     /// Coordinate x, in m in the sensor's frame; unspecified without a return.
     pub x: Vec<f32>,
@@ -44,8 +45,8 @@ impl Echo {
         }
     }
 
-    /// Removes from the slots from `first` on the returns that are also in `strongest`: their distance and intensity are
-    /// equal.
+    /// Removes from the slots from `first` on the returns that are also in `strongest`: their distance and intensity
+    /// are equal.
     pub(crate) fn remove_repeats(&mut self, strongest: &Echo, first: usize) {
         for slot in first..self.range_m.len() {
             let same =

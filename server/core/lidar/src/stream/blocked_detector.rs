@@ -10,8 +10,8 @@ use crate::revolution::{BlockedSector, Revolution};
 const DEGREES: usize = 360;
 /// Least width of a blocked sector, in degrees. Ours: a narrower one is the space between two objects.
 const SECTOR_DEG_MIN: usize = 5;
-/// Number of consecutive revolutions in which a direction or laser must have had returns before it can be blocked. Ours:
-/// half a second at 600 rpm.
+/// Number of consecutive revolutions in which a direction or laser must have had returns before it can be blocked.
+/// Ours: half a second at 600 rpm.
 const REVOLUTIONS_MIN: u8 = 5;
 /// Least range of a return that counts, in m. Ours: nearer returns are from the window or the vehicle.
 const RANGE_M_MIN: f32 = 1.0;

@@ -15,8 +15,9 @@
 //!
 //! # States of a revolution
 //!
-//! The decoder keeps the state: no firings (*empty*), [`Revolution::partial`](crate::Revolution) is `None` (*complete so
-//! far*), or it is a reason (*partial*). The first reason stays.
+//! The decoder keeps the state: no firings (*empty*), [`Revolution::partial`](crate::Revolution) is `None` (*complete
+//! so far*), or it is a reason (*partial*). The first reason stays. A firing before which a revolution ends begins the
+//! next one.
 //!
 //! | state | event | action | next state |
 //! |---|---|---|---|
@@ -25,10 +26,10 @@
 //! | any other | even step | add the firing | the same |
 //! | any other | gap | add the firing | partial: `gap` |
 //! | any other | reversal | add the firing | partial: `reversal` |
-//! | any other | the step passes the cut | end before the firing, begin with it | complete so far; `gap` if it is a gap |
+//! | any other | the step passes the cut | end before the firing | complete so far; partial: `gap` if it is a gap |
 //! | any other | the step passes the cut again in the same datagram | add the firing | partial: `reversal` |
-//! | any other | device time jumps, or a revolution or 1 s is missing | end before the packet as partial: `gap` | partial: `gap` |
-//! | any other | 12,500 firings | end before the packet as partial: `overlong` | partial: `overlong` |
+//! | any other | device time jumps; a revolution or 1 s is missing | end as partial: `gap` | partial: `gap` |
+//! | any other | 12,500 firings | end as partial: `overlong` | partial: `overlong` |
 //! | any other | the return mode changes | end as partial: `end` | empty |
 //! | any other | the stream ends within 1.5 steps before the cut | end | empty |
 //! | any other | the stream ends elsewhere | end as partial: `end` | empty |
@@ -43,11 +44,11 @@ pub(super) const MAX_FIRINGS_PER_REVOLUTION: usize = 12_500;
 /// Greatest forward step, in counts: 324 degrees. A longer step is a step backward: packets are out of order. Ours: a
 /// sensor with a field of view of less than 36 degrees is not supported.
 pub(super) const FORWARD_MAX: u32 = AZIMUTHS_PER_REVOLUTION - AZIMUTHS_PER_REVOLUTION / 10;
-/// Backward step, in counts, below which it is jitter of the encoder: 0.2 degrees, which is about one step of a sensor at
-/// 600 rpm (ours).
+/// Backward step, in counts, below which it is jitter of the encoder: 0.2 degrees, which is about one step of a sensor
+/// at 600 rpm (ours).
 const JITTER: u32 = 20;
-/// Counts, besides one and a half steps, above which a step is a gap. Ours: at low rates half a step is only four counts,
-/// which jitter and the rounding of azimuths to whole counts can reach.
+/// Counts, besides one and a half steps, above which a step is a gap. Ours: at low rates half a step is only four
+/// counts, which jitter and the rounding of azimuths to whole counts can reach.
 const GAP_SLACK: u32 = 8;
 
 /// The longest step, in counts, between two firings of which `expected` is the usual step. The loss of a packet with a

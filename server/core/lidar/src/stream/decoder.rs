@@ -1,7 +1,8 @@
 //! The decoder of a known model: from packets in order to revolutions.
 //!
-//! In: [`OrderedPacket`]s. Out: a finished [`Revolution`] whenever the azimuth passes the cut. There are two revolutions:
-//! one is filled while the caller reads the other, so that nothing is allocated once both have their full size.
+//! In: [`OrderedPacket`]s. Out: a finished [`Revolution`] whenever the azimuth passes the cut. There are two
+//! revolutions: one is filled while the caller reads the other, so that nothing is allocated once both have their full
+//! size.
 
 use std::sync::Arc;
 
@@ -251,8 +252,8 @@ impl Decoder {
         self.firing_step() * self.spec.firings_per_packet(self.mode) as u32
     }
 
-    /// Adds the firings of a packet to the current revolution and finds the firing at which to cut: the first one if the
-    /// revolution is torn before the packet.
+    /// Adds the firings of a packet to the current revolution and finds the firing at which to cut: the first one if
+    /// the revolution is torn before the packet.
     fn add_firings(&mut self, firings: &PacketFirings, time_ns: i64, is_torn: bool, may_cut: bool) -> Option<Cut> {
         let (period_ns, expected) = (i64::from(self.spec.period_ns(self.mode)), self.firing_step());
         let is_overlong = self.current.firings.len() + MAX_FIRINGS > MAX_FIRINGS_PER_REVOLUTION;

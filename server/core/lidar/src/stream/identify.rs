@@ -1,15 +1,15 @@
 //! The model that sent a packet, and the check that a packet is of a known model.
 //!
-//! In: a [`Packet`]. Out: a [`Finding`], or the [`ReturnMode`] of a packet of the model. Block flags identify an HDL-64E
-//! and a VLS-128, and the model byte identifies the others. But a VLP-16 of 2014 sends the model byte of the HDL-32E, so
-//! that 0x21 needs two packets: an HDL-32E sends one every 553 µs of device time, a VLP-16 every 1,327 µs.
+//! In: a [`Packet`]. Out: a [`Finding`], or the [`ReturnMode`] of a packet of the model. Block flags identify an
+//! HDL-64E and a VLS-128, and the model byte identifies the others. But a VLP-16 of 2014 sends the model byte of the
+//! HDL-32E, so that 0x21 needs two packets: an HDL-32E sends one every 553 µs of device time, a VLP-16 every 1,327 µs.
 
 use crate::datagram::DatagramError;
 use crate::datagram::packet::Packet;
 use crate::model::{BLOCKS_PER_PACKET, FLAG_LASERS_0, FLAG_LASERS_64, FLAG_LASERS_96, Model, ReturnMode};
 
-/// Number of packets that wait while their rate may decide between two models. After them the model is that of the byte.
-/// Ours: at 1,327 µs a packet they are 21 ms, less than a revolution.
+/// Number of packets that wait while their rate may decide between two models. After them the model is that of the
+/// byte. Ours: at 1,327 µs a packet they are 21 ms, less than a revolution.
 pub(crate) const PACKETS_WAITING_MAX: usize = 16;
 
 /// Model byte of an HDL-32E and of a VLP-16 of 2014.

@@ -1,7 +1,7 @@
 //! The number of lost packets, and the field-of-view gap.
 //!
-//! In: the azimuths of every packet, and the number of packets missing before it. Out: an estimate of the lost packets. A
-//! sensor with a field of view sends nothing from the rest of its revolution, so a long gap is loss only if the next
+//! In: the azimuths of every packet, and the number of packets missing before it. Out: an estimate of the lost packets.
+//! A sensor with a field of view sends nothing from the rest of its revolution, so a long gap is loss only if the next
 //! revolution does not repeat it. A long gap is therefore counted after the next revolution, a short one at once.
 
 use super::azimuth::forward;
@@ -95,8 +95,8 @@ impl Loss {
         self.fov_gap.map(|sector| [sector.from, sector.to])
     }
 
-    /// True if the field-of-view gap, and nothing else, lies between firings at two azimuths. `span`: counts by which the
-    /// sensor turns during a packet.
+    /// True if the field-of-view gap, and nothing else, lies between firings at two azimuths. `span`: counts by which
+    /// the sensor turns during a packet.
     pub fn is_fov_gap(&self, from: u32, to: u32, span: u32) -> bool {
         let step = EmptySector { from, to, packets: 0 };
         self.fov_gap.is_some_and(|sector| sector.is_about(&step, FOV_GAP_ERROR_PACKETS * span))

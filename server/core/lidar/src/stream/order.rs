@@ -4,8 +4,8 @@
 //! azimuth), each with what is missing before it.
 //!
 //! A packet that follows the packet before passes at once. Behind a gap, packets wait until the gap is filled or the
-//! network can no longer fill it ([`REORDER_PACKETS`]). At the start of a stream it is unknown whether an earlier packet
-//! will arrive, so the first packets wait as if behind a gap.
+//! network can no longer fill it ([`REORDER_PACKETS`]). At the start of a stream it is unknown whether an earlier
+//! packet will arrive, so the first packets wait as if behind a gap.
 //!
 //! The position of a packet is counted in packet periods of device time. A gap of more periods than the network can
 //! reorder is loss, or a field-of-view gap; packets do not wait for it.
@@ -31,8 +31,8 @@ const PAUSE_US_MAX: i64 = 1_000_000;
 /// fraction of it; otherwise the device's clock was set. Ours: faster playback is not supported.
 const PLAYED_FASTEST: i64 = 20;
 const US_PER_HOUR: i64 = 3_600_000_000;
-/// Uncertainty of the length of a field-of-view gap inside a packet, in packet periods: the span of a packet is known to
-/// 1 %, and a gap is at most a revolution, which has up to 350 packets (HDL-64E at 600 rpm).
+/// Uncertainty of the length of a field-of-view gap inside a packet, in packet periods: the span of a packet is known
+/// to 1 %, and a gap is at most a revolution, which has up to 350 packets (HDL-64E at 600 rpm).
 const FOV_GAP_SLACK: i64 = 3;
 /// Counts between two blocks that no sensor reaches: 4 degrees. The largest step is 0.8 degrees (VLP-16 at 1,200 rpm).
 const STEP_MAX: u32 = 400;
@@ -41,8 +41,8 @@ const SPAN_FRACTION: u32 = 256;
 /// Number of packets of the running mean of the span. Counts are whole, so a single packet shows its span to 5 %; the
 /// mean of 16 shows it to about 1 %.
 const SPAN_MEAN_PACKETS: u32 = 16;
-/// Fraction of the mean (one quarter) by which the span of a packet may differ from it. If it differs by more, the rate of
-/// rotation has changed, and the mean starts again. It is five times the error of a single packet.
+/// Fraction of the mean (one quarter) by which the span of a packet may differ from it. If it differs by more, the rate
+/// of rotation has changed, and the mean starts again. It is five times the error of a single packet.
 const SPAN_CHANGE: u32 = 4;
 
 /// What is missing between a packet and the packet before.

@@ -14,7 +14,8 @@ pub(super) const MAX_FIRINGS: usize = 2 * BLOCKS_PER_PACKET;
 pub(super) struct PacketFirings {
     azimuths: [u32; MAX_FIRINGS],
     count: usize,
-    /// Counts by which the sensor turns from block to block (VLS-128: from firing to firing): the median, as in VeloView.
+    /// Counts by which the sensor turns from block to block (VLS-128: from firing to firing): the median, as in
+    /// VeloView.
     pub step: Option<u32>,
 }
 

@@ -1,9 +1,9 @@
 //! Raw returns to corrected points, one block of 32 at a time.
 //!
-//! In: the 96 bytes of the returns of a block, its azimuth, and the step of the sensor from block to block. Out: 32 slots
-//! of range, x, y, z (m, sensor frame) and intensity. The loops run over separate arrays without branches, so that the
-//! compiler vectorises them. Formula: HDL-64E S3 manual 63-HDL64ES3 rev K, appendix F, with zero offsets for all other
-//! models. The manual's y axis is our x, and its x axis is our -y. VeloView computes the same.
+//! In: the 96 bytes of the returns of a block, its azimuth, and the step of the sensor from block to block. Out: 32
+//! slots of range, x, y, z (m, sensor frame) and intensity. The loops run over separate arrays without branches, so
+//! that the compiler vectorises them. Formula: HDL-64E S3 manual 63-HDL64ES3 rev K, appendix F, with zero offsets for
+//! all other models. The manual's y axis is our x, and its x axis is our -y. VeloView computes the same.
 
 use std::sync::LazyLock;
 
@@ -86,7 +86,8 @@ impl PointCorrection {
         }
     }
 
-    /// Converts the returns of one block of bank `bank`, at `azimuth`, of a sensor that turns by `step` counts per block.
+    /// Converts the returns of one block of bank `bank`, at `azimuth`, of a sensor that turns by `step` counts per
+    /// block.
     pub fn convert(
         &mut self,
         returns: &[u8; RETURNS_LENGTH],

@@ -3,8 +3,8 @@
 //! In: device time and arrival of every data packet, and telemetry. Out: the [`Stamp`] of each revolution. The stamps
 //! are a pure function of the datagrams and their arrivals.
 //!
-//! Device time runs on one timeline (`timeline.rs`). Unix time is that timeline plus an *offset*. There is one offset per
-//! revolution; it is chosen when the revolution ends.
+//! Device time runs on one timeline (`timeline.rs`). Unix time is that timeline plus an *offset*. There is one offset
+//! per revolution; it is chosen when the revolution ends.
 //!
 //! # States
 //!
@@ -12,14 +12,14 @@
 //!
 //! | condition when a revolution ends | state | offset |
 //! |---|---|---|
-//! | A GPRMC is known, and its offset is within reach; the pulse is locked, and the GPRMC is at most 3 s old. | `gps` | the offset of the GPRMC |
-//! | A GPRMC is known, and its offset is within reach. | `gps_unlocked` | the offset of the GPRMC |
-//! | An offset by arrival is within reach; the device's minutes and seconds are within 250 ms of UTC. | `device` | whole hours |
-//! | An offset by arrival is within reach. | `arrival` | the least delay of a revolution |
-//! | No offset can be followed. | `holdover` | unchanged |
-//! | The stamps are ahead of the offset during the whole revolution (in any state). | `holdover` | chosen as above |
+//! | A GPRMC is within reach, at most 3 s old, and the pulse is locked. | `gps` | that of the GPRMC |
+//! | A GPRMC is within reach. | `gps_unlocked` | that of the GPRMC |
+//! | Arrival is within reach, and agrees with the device's minutes to 250 ms. | `device` | whole hours |
+//! | Arrival is within reach. | `arrival` | the least delay of a revolution |
+//! | None of these, or arrival must not be followed. | `holdover` | unchanged |
 //!
-//! An offset is *within reach* if it lies at most 60 s behind the stamps already given.
+//! A clock is *within reach* if it is at most 60 s behind the stamps already given. If it is behind them during the
+//! whole revolution, the stamps run at half speed, and the state is `holdover` with the offset of that clock.
 //!
 //! # Transitions
 //!
@@ -38,13 +38,13 @@
 //!
 //! # Why
 //!
-//! - A GPRMC counts as valid if the receiver reports a valid fix, the device's minutes and seconds agree with it, and it
-//!   is at most [`crate::SensorConfig::gps_late_ns_max`] older than its arrival. An older one is that of an old capture,
-//!   or of a receiver that has lost count of its weeks; arrival then gives the time, as for the planner. A GPRMC later
-//!   than its arrival is valid: no packet arrives before it is sent, so the host's clock is wrong.
-//! - The offset of a GPRMC is a whole number of hours. It is the same to the nanosecond for all arrivals, and it stays in
-//!   force if GPS or the pulse is lost, over a restart, and if the host disagrees. If it is not within reach, the stamps
-//!   go on by arrival.
+//! - A GPRMC counts as valid if the receiver reports a valid fix, the device's minutes and seconds agree with it, and
+//!   it is at most [`crate::SensorConfig::gps_late_ns_max`] older than its arrival. An older one is that of an old
+//!   capture, or of a receiver that has lost count of its weeks; arrival then gives the time, as for the planner. A
+//!   GPRMC later than its arrival is valid: no packet arrives before it is sent, so the host's clock is wrong.
+//! - The offset of a GPRMC is a whole number of hours. It is the same to the nanosecond for all arrivals, and it stays
+//!   in force if GPS or the pulse is lost, over a restart, and if the host disagrees. If it is not within reach, the
+//!   stamps go on by arrival.
 //! - The offset by arrival is held and not averaged. A rise of the delay means that the host's clock was set, or that
 //!   the first revolution was read from a full socket buffer.
 //! - If the device's minutes and seconds agree with UTC, a receiver without telemetry, or PTP, has set them.
@@ -67,11 +67,11 @@ const GPRMC_AGE_NS: std::ops::RangeInclusive<i64> = -500_000_000..=2_900_000_000
 const GPS_SILENCE_NS_MAX: i64 = 3 * NS_PER_SECOND;
 /// 1 January 2005, in ns since the Unix epoch: none of these sensors is older. A receiver without a fix sends 1980.
 const EARLIEST_NS: i64 = 1_104_537_600 * NS_PER_SECOND;
-/// Default of [`crate::SensorConfig::gps_late_ns_max`], in ns: 24 hours. The clock of a host may be wrong by hours (time
-/// zone, battery) but not by days, while the error of a receiver is 1024 weeks.
+/// Default of [`crate::SensorConfig::gps_late_ns_max`], in ns: 24 hours. The clock of a host may be wrong by hours
+/// (time zone, battery) but not by days, while the error of a receiver is 1024 weeks.
 pub const GPS_LATE_NS_MAX: i64 = 24 * NS_PER_HOUR;
-/// Latest arrival, in ns since the Unix epoch: the year 2096. Later arrivals are replaced by it, because stamps near the
-/// end of 64 bits would overflow.
+/// Latest arrival, in ns since the Unix epoch: the year 2096. Later arrivals are replaced by it, because stamps near
+/// the end of 64 bits would overflow.
 const ARRIVAL_NS_MAX: i64 = 4_000_000_000 * NS_PER_SECOND;
 /// Drift, in ns, above which the offset by arrival is chosen again. At 100 ppm it is reached in 100 s; at 15 m/s it is
 /// 15 cm.
@@ -86,8 +86,8 @@ const CATCH_UP_NS_MAX: i64 = 60 * NS_PER_SECOND;
 /// The clock that the stamps of a revolution follow.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Clock {
-    /// The host's clock at the arrival of the packets with the least delay, and between them the device's oscillator (of
-    /// an HDL-64E S1: the nominal packet rate).
+    /// The host's clock at the arrival of the packets with the least delay, and between them the device's oscillator
+    /// (of an HDL-64E S1: the nominal packet rate).
     #[default]
     Arrival,
     /// The device's minutes and seconds, which agree with those of the host; the hour is the host's.

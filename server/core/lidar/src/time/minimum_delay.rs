@@ -1,7 +1,7 @@
 //! The minimum-delay filter: the packet of a revolution that the network delayed least.
 //!
-//! In: the delay of every packet, which is its arrival less its time on the device's timeline. Out: the least delay of a
-//! revolution, and the least of ten seconds if the revolutions agree. The network delays a packet by any time, and no
+//! In: the delay of every packet, which is its arrival less its time on the device's timeline. Out: the least delay of
+//! a revolution, and the least of ten seconds if the revolutions agree. The network delays a packet by any time, and no
 //! packet arrives before it was sent: so the least delay is the best estimate of the offset between both clocks.
 
 use super::timeline::NS_PER_SECOND;
@@ -9,7 +9,8 @@ use super::timeline::NS_PER_SECOND;
 /// Greatest difference, in ns, between the least delays of two revolutions that agree. Networks and schedulers do not
 /// delay all packets of a revolution by more.
 pub(super) const STEP_NS_MAX: i64 = 500_000_000;
-/// Time, in ns, over which drift is measured: at 100 ppm (twice the drift that the HDL-64E S3 manual states) it is 1 ms.
+/// Time, in ns, over which drift is measured: at 100 ppm (twice the drift that the HDL-64E S3 manual states) it is 1
+/// ms.
 const DRIFT_WINDOW_NS: i64 = 10 * NS_PER_SECOND;
 
 /// Least delays of the current revolution and of the current window. Delays are in ns.
@@ -35,7 +36,8 @@ impl MinimumDelay {
         self.revolution_ns = Some(self.revolution_ns.map_or(delay_ns, |least| least.min(delay_ns)));
     }
 
-    /// Ends the revolution that began at `first_ns` on the timeline and returns its least delay; `None` without packets.
+    /// Ends the revolution that began at `first_ns` on the timeline and returns its least delay; `None` without
+    /// packets.
     pub fn end_revolution(&mut self, first_ns: i64) -> Option<i64> {
         let delay_ns = self.revolution_ns.take()?;
         let window = Window { start_ns: first_ns, least_ns: delay_ns, greatest_ns: delay_ns };

@@ -1,7 +1,7 @@
 //! The time that an HDL-64E S2 or S3 sends in its status bytes, one byte per packet.
 //!
-//! In: the status type and value at the end of every packet. Out: [`Telemetry`] with time and date of the last GPRMC and
-//! the state of the pulse. Source: HDL-64E S3 manual 63-HDL64ES3 rev K, "Packet Format and Status Byte for GPS Time
+//! In: the status type and value at the end of every packet. Out: [`Telemetry`] with time and date of the last GPRMC
+//! and the state of the pulse. Source: HDL-64E S3 manual 63-HDL64ES3 rev K, "Packet Format and Status Byte for GPS Time
 //! Stamping" and appendix E: the types H M S D N Y G begin each cycle of 16 packets, and the values are binary.
 
 use crate::datagram::nmea::{Gprmc, unix_ns};

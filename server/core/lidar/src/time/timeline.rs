@@ -1,18 +1,19 @@
-//! The timeline of a device: its microseconds past the hour, continued over every hour, silence, restart and correction.
+//! The timeline of a device: its microseconds past the hour, continued over every hour, silence, restart and
+//! correction.
 //!
 //! In: device time and arrival of every packet, in order. Out: nanoseconds since an arbitrary zero. They advance with
 //! the oscillator of the device.
 //!
 //! The device's counter starts at zero at power-on and counts an oscillator. A GPRMC sentence sets its minutes and
 //! seconds, and the pulse sets its fraction of a second: two counters that are set separately (VLP-32C manual 63-9325,
-//! appendix G.2). So the counter may jump by less than a second, by minutes, or to 0. If it is not set, it drifts by 5 s
-//! a day, 58 ppm (HDL-64E S3 manual 63-HDL64ES3, "Timestamp Accuracy Rules").
+//! appendix G.2). So the counter may jump by less than a second, by minutes, or to 0. If it is not set, it drifts by 5
+//! s a day, 58 ppm (HDL-64E S3 manual 63-HDL64ES3, "Timestamp Accuracy Rules").
 //!
 //! | device time since the packet before | arrival since the packet before | step |
 //! |---|---|---|
 //! | within ±100 ms | any | the device's |
 //! | any | the same, give or take whole hours, 100 ms and 1 % | the device's: the sensor was silent |
-//! | forward by less than 10 s | backward by 100 ms or more, or by more than the device's | the device's: the host's clock was set |
+//! | forward by less than 10 s | back by over 100 ms, or more than device time | the device's: the host was set |
 //! | other, and the packet before was the first such | any | arrival's: the device's counter jumped |
 //! | other | any | one packet period; the next packet must confirm the jump |
 
@@ -20,11 +21,11 @@ pub(super) const NS_PER_SECOND: i64 = 1_000_000_000;
 pub(super) const NS_PER_HOUR: i64 = 3_600 * NS_PER_SECOND;
 const NS_PER_US: i64 = 1_000;
 
-/// Greatest step of device time, in ns, that no arrival needs to confirm: 75 lost packets of a VLP-16, or the blind half
-/// of a revolution at 300 rpm.
+/// Greatest step of device time, in ns, that no arrival needs to confirm: 75 lost packets of a VLP-16, or the blind
+/// half of a revolution at 300 rpm.
 const STEP_NS_MAX: i64 = 100_000_000;
-/// Greatest difference, in ns, between device time and arrival over the same silence, besides 1 % of it. Ours: a network
-/// delays a packet by less, and 1 % is far above the drift of an oscillator.
+/// Greatest difference, in ns, between device time and arrival over the same silence, besides 1 % of it. Ours: a
+/// network delays a packet by less, and 1 % is far above the drift of an oscillator.
 const SILENCE_ERROR_NS_MAX: i64 = 100_000_000;
 /// Least time, in ns, that a device takes to start (ours: real devices take longer). If the counter advances by less,
 /// the device was silent and did not restart, even if the clock of the host was set meanwhile.
@@ -33,8 +34,8 @@ const START_UP_NS_MIN: i64 = 10 * NS_PER_SECOND;
 const SILENCE_NS_MAX: i64 = 24 * NS_PER_HOUR;
 /// Greatest valid device time, in microseconds: during a leap second the counter may go one second past the hour.
 const US_MAX: u32 = 3_601_000_000;
-/// Greatest difference, in ns, between telemetry and data packets of the same counter. Telemetry that differs by more was
-/// sent before or after a jump.
+/// Greatest difference, in ns, between telemetry and data packets of the same counter. Telemetry that differs by more
+/// was sent before or after a jump.
 const TELEMETRY_NS_MAX: i64 = NS_PER_SECOND;
 
 /// How the time of a packet follows from that of the packet before.
@@ -163,8 +164,8 @@ impl Timeline {
     }
 }
 
-/// Length of a silence over which the device counted `ahead_ns`, give or take whole hours, and the host `host_ns`; `None`
-/// if they do not agree.
+/// Length of a silence over which the device counted `ahead_ns`, give or take whole hours, and the host `host_ns`;
+/// `None` if they do not agree.
 fn silence_ns(ahead_ns: i64, host_ns: i64) -> Option<i64> {
     let host_ns = host_ns.clamp(0, SILENCE_NS_MAX);
     let silence_ns = nearest_hour(ahead_ns, host_ns);

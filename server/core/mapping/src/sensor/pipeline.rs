@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::{Partial, Revolution};
-use clearway_lidar::sensor::{Sensor, SensorStatus};
+use clearway_lidar::{Sensor, SensorStatus};
 use nalgebra::{Isometry3, Vector3};
 
 use crate::sensor::self_filter::Screen;
@@ -194,7 +194,7 @@ impl Intake {
         }
         turn.state = SensorState {
             name: self.name.clone(),
-            model: crate::pipeline::model_name(revolution.model).to_owned(),
+            model: revolution.model.as_str().to_owned(),
             packets: revolution.packets,
             packets_expected: revolution.packets_expected,
             refused: 0,
@@ -350,7 +350,7 @@ fn completeness(revolution: &Revolution) -> f32 {
         seen[(degree as usize).min(359)] = true;
     }
     let dark = |degree: usize| {
-        revolution.dark_rad.is_some_and(|ends| {
+        revolution.fov_gap_rad.is_some_and(|ends| {
             let [from_deg, to_deg] = ends.map(f32::to_degrees);
             (degree as f32 - from_deg).rem_euclid(360.0) + 1.0 <= (to_deg - from_deg).rem_euclid(360.0)
         })
