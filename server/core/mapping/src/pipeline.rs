@@ -5,7 +5,6 @@
 //! -> [`Map`].
 
 use clearway_lidar::calibration::Calibration;
-use clearway_lidar::model::Model;
 use clearway_lidar::revolution::Revolution;
 use clearway_lidar::SensorStatus;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
