@@ -10,7 +10,8 @@ use std::path::{Path, PathBuf};
 
 use clearway_lidar::capture::Capture;
 use clearway_mapping::event::{Body, Cause};
-use clearway_mapping::pipeline::{Ledger, Pipeline};
+use clearway_mapping::ledger::Ledger;
+use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
 use clearway::config::{Config, Sender, Udp};
 use clearway::ingest::door;

@@ -4,8 +4,9 @@ use std::ops::Range;
 
 use clearway_mapping::config::SensorConfig;
 use clearway_mapping::layer::{Cells, Geometry, Layer, Meaning};
+use clearway_mapping::ledger::Ledger;
 use clearway_mapping::map::{Map, SensorState};
-use clearway_mapping::pipeline::{Ledger, NamedStatus};
+use clearway_mapping::pipeline::NamedStatus;
 use nalgebra::Point3;
 
 use super::drive::Drive;
@@ -115,7 +116,7 @@ pub fn centre(layer: &Layer, cell: usize) -> [f64; 2] {
 pub fn is_healthy(map: &Map) -> bool {
     map.sensors
         .iter()
-        .all(|sensor| sensor.state.as_str() == "ok" && sensor.partial.is_empty() && sensor.blocked.is_empty())
+        .all(|sensor| sensor.contribution.as_str() == "ok" && sensor.partial.is_empty() && sensor.blocked.is_empty())
 }
 
 /// The map with every cell called by the second class of its layer, the one that is free.
@@ -132,12 +133,12 @@ pub fn freed(map: &Map) -> Map {
 /// A map's sensors in a line.
 pub fn describe(map: &Map) -> String {
     let sensor = |sensor: &SensorState| {
-        let (name, state, age) = (&sensor.name, sensor.state.as_str(), sensor.age_ms.unwrap_or(f32::NAN));
+        let (name, state, age) = (&sensor.name, sensor.contribution.as_str(), sensor.age_ms.unwrap_or(f32::NAN));
         format!(
             "{name} {state} {age:.0} ms, clock {} {} ms, partial {:?}, blocked {:?}",
             sensor.clock, sensor.clock_offset_ms, sensor.partial, sensor.blocked
         )
     };
     let sensors: Vec<String> = map.sensors.iter().map(sensor).collect();
-    format!("map {} by {}: {}", map.sequence, map.made_by, sensors.join("; "))
+    format!("map {} by {}: {}", map.sequence, map.source, sensors.join("; "))
 }
