@@ -103,9 +103,10 @@ fn recording(file: &Path) -> Result<Value> {
                 let found = map.layer(layer)?;
                 let (rows, columns) = found.grid.shape();
                 let channels: Vec<_> = found.channels.iter().map(|channel| &channel.name).collect();
+                let legend: Vec<_> = found.legend.iter().map(|class| &class.name).collect();
                 grids.insert(
                     layer.into(),
-                    json!({"rows": rows, "columns": columns, "legend": found.legend, "channels": channels}),
+                    json!({"rows": rows, "columns": columns, "legend": legend, "channels": channels}),
                 );
             }
         }

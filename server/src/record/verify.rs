@@ -263,7 +263,7 @@ fn first_difference(recorded: &Bytes, made: &Bytes) -> What {
         ("header speed_mps", &head.speed_mps, &new.speed_mps),
         ("header sensors", &head.sensors, &new.sensors),
         ("header compensation", &head.compensation, &new.compensation),
-        ("header made_by", &head.made_by, &new.made_by),
+        ("header source_sensor", &head.source_sensor, &new.source_sensor),
     ];
     for (name, a, b) in fields {
         // Debug prints every bit that matters: floats in full, and -0 apart from 0.

@@ -231,7 +231,7 @@ impl VehicleStatus {
             sensor_ledgers: snapshot.sensors.iter().map(|s| (s.name.clone(), ledger(&s.ledger))).collect(),
             recorder: Some(self.recorder.get().map(|counts| counts.to_proto()).unwrap_or_default()),
             readers: self.readers().map(|(transport, readers)| (transport.to_owned(), readers)).into(),
-            strangers: self.outside.strangers().iter().map(stranger).collect(),
+            unknown_senders: self.outside.strangers().iter().map(stranger).collect(),
             observations_refused: by_name(&snapshot.observations_refused),
         }
     }
@@ -270,7 +270,7 @@ impl VehicleStatus {
                 "stopped": self.recorder.get().and_then(|counts| counts.stopped()),
             },
             "readers": proto.readers,
-            "strangers": proto.strangers.iter().map(|s| {
+            "unknown_senders": proto.unknown_senders.iter().map(|s| {
                 json!({ "address": s.address, "datagrams": s.datagrams, "newest_ns": s.newest_ns.to_string() })
             }).collect::<Vec<_>>(),
             "rates": { "maps_hz": snapshot.maps_hz, "packets_hz": snapshot.packets_hz },
@@ -280,9 +280,9 @@ impl VehicleStatus {
     }
 }
 
-fn stranger(stranger: &Stranger) -> v1::Stranger {
+fn stranger(stranger: &Stranger) -> v1::UnknownSender {
     let Stranger { address, datagrams, newest_ns } = *stranger;
-    v1::Stranger { address: address.to_string(), datagrams, newest_ns }
+    v1::UnknownSender { address: address.to_string(), datagrams, newest_ns }
 }
 
 fn ledger_json(ledger: &v1::Ledger) -> Value {

@@ -108,7 +108,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         if let Some(sequence) = request.acknowledged {
             self.selection.credits.acknowledge(sequence)?;
         }
-        if request.want_full {
+        if request.request_keyframe {
             self.want_full = true;
             self.newest.mark_changed();
         }
