@@ -1,6 +1,6 @@
 //! The list of the layers, their configuration, and which of them are active.
 //!
-//! In: the configuration, the names of the layers somebody subscribes to, scans and map sweeps. Out: the active layers,
+//! In: the configuration, the names of the layers with subscribers, scans and map sweeps. Out: the active layers,
 //! in the order of the list. A layer that is not active has no maker: it costs no time and no memory.
 
 use serde::{Deserialize, Serialize};
@@ -96,7 +96,7 @@ pub(crate) struct Layers(Vec<EnabledLayer>);
 struct EnabledLayer {
     name: &'static str,
     create: Create,
-    /// True if somebody subscribes to the layer itself.
+    /// True if the layer itself has a subscriber.
     subscribed: bool,
     /// How often the layer was made.
     made: u64,
