@@ -1,10 +1,9 @@
-//! Options that several subcommands share: the configuration file, how a sensor is mounted, which model it is.
+//! Options that several subcommands share: the configuration file, how a sensor is mounted.
 
 use std::path::PathBuf;
 
 use anyhow::{Context, Result};
 use clap::Args;
-use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
 
 use crate::config::Config;
@@ -51,16 +50,6 @@ pub fn extrinsics(text: &str) -> Result<Extrinsics, String> {
     }
 }
 
-/// Reads the name of a sensor model from the command line.
-///
-/// # Errors
-/// If no model has that name: the names of all models.
-pub fn model(text: &str) -> Result<Model, String> {
-    let names = || Model::ALL.map(Model::as_str).join(", ");
-    let found = Model::ALL.into_iter().find(|model| model.as_str() == text);
-    found.ok_or_else(|| format!("allowed: {}", names()))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -73,11 +62,5 @@ mod tests {
         for wrong in ["", "1,2,3", "1,2,3,4,5,6,7", "1,2,3,4,5,x,6"] {
             assert!(extrinsics(wrong).is_err(), "{wrong}");
         }
-    }
-
-    #[test]
-    fn an_unknown_model_is_refused_with_the_names_of_all_models() {
-        assert_eq!(model("vls128"), Ok(Model::Vls128));
-        assert!(model("ouster").unwrap_err().contains("hdl64e_s2"));
     }
 }

@@ -22,7 +22,7 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | `configuration` | options -> a configuration, extrinsics, a sensor model |
+//! | `configuration` | options -> a configuration, extrinsics |
 //! | `connection` | options -> a connected client |
 //! | `output` | text -> stdout; progress bar, runtime, signals |
 

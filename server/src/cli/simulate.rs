@@ -16,7 +16,6 @@ use clearway_sim::scenes::{self, Scene};
 use clearway_sim::traffic;
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
 
-use super::configuration::model;
 use super::output::{print_line, progress_bar};
 use super::send::udp::{self, Sender, Speed};
 
@@ -47,7 +46,7 @@ pub struct Options {
     #[arg(value_parser = PossibleValuesParser::new(SCENES.map(|(name, _)| name)))]
     scene: String,
     /// Model of the sensor.
-    #[arg(long, value_name = "MODEL", default_value = "hdl64e_s2", value_parser = model)]
+    #[arg(long, value_name = "MODEL", default_value = "hdl64e_s2")]
     sensor: Model,
     /// Duration of the drive, in seconds.
     #[arg(long, default_value = "10", value_parser = seconds)]

@@ -7,7 +7,7 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
 
 use super::clouds::CloudError;
-use crate::cli::configuration::{extrinsics, model};
+use crate::cli::configuration::extrinsics;
 use crate::config::ConfigError;
 use crate::ingest::files::FilesError;
 use crate::record::reader::RecordingError;
@@ -46,7 +46,7 @@ pub struct Options {
     #[arg(long, value_name = "x,y,z,roll,pitch,yaw", value_parser = extrinsics, allow_hyphen_values = true)]
     pub extrinsics: Option<Extrinsics>,
     /// The sensor's model, if the data names the wrong one or none.
-    #[arg(long, value_parser = model)]
+    #[arg(long)]
     pub model: Option<Model>,
     /// Rotation rate of the sensor, in revolutions per minute, if the data gives the wrong one or none.
     #[arg(long)]
