@@ -55,7 +55,7 @@ impl Outside {
         }
     }
 
-    /// Counts messages that are no observations of a sensor, or of [`clearway_mapping::event::NOBODY`]: the ledger has
+    /// Counts messages that are no observations of a sensor, or of [`clearway_mapping::event::UNKNOWN_SOURCE`]: the ledger has
     /// one word for them, here each keeps its `reason`.
     pub(crate) fn leave_observations(&self, source: u16, reason: &'static str, count: u64) {
         self.leave(source, Cause::Observation, count);

@@ -4,7 +4,7 @@
 use std::sync::{Arc, Mutex};
 
 use clearway_mapping::config::{SensorConfig, VehicleConfig};
-use clearway_mapping::event::{Body, Cause, NOBODY};
+use clearway_mapping::event::{Body, Cause, UNKNOWN_SOURCE};
 use clearway_proto::v1;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
@@ -82,7 +82,7 @@ impl Entrance {
         match observation::bodies(observation, &self.limits) {
             Err(error) => {
                 account.enter(number, 0, 0);
-                self.leave(if of_vehicle { NOBODY } else { source }, error.reason());
+                self.leave(if of_vehicle { UNKNOWN_SOURCE } else { source }, error.reason());
                 account.refuse(number, error.reason(), error.to_string(), 1);
             }
             Ok(bodies) => {
@@ -112,7 +112,7 @@ impl Entrance {
 
     /// Counts what did not become an event, where nobody can be told.
     pub fn count(&self, reason: &'static str) {
-        self.leave(NOBODY, reason);
+        self.leave(UNKNOWN_SOURCE, reason);
     }
 
     fn leave(&self, source: u16, reason: &'static str) {

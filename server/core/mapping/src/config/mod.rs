@@ -11,15 +11,18 @@
 //! | `sensor` | `[[vehicle.sensor]]` |
 //! | `fusion` | `[vehicle.fusion]` |
 //! | `body` | `[vehicle.body]` |
-//! | `maps` | `[vehicle.maps]`, and one table a layer, which stands in the folder of the layer |
+//! | `maps` | `[vehicle.maps]`, and one table a layer, in the folder of the layer |
 //! | `check` | checks of single values, and their error |
+//!
+//! This module names what other crates use. The files of this crate import from the files of the table, so that none of
+//! them depends on a file that uses it.
 
-mod body;
+pub(crate) mod body;
 pub(crate) mod check;
-mod fusion;
+pub(crate) mod fusion;
 mod maps;
-mod sensor;
-mod vehicle;
+pub(crate) mod sensor;
+pub(crate) mod vehicle;
 
 pub use body::BodyConfig;
 pub use check::ConfigValueError;
