@@ -61,7 +61,7 @@ fn points_that_are_not_finite_give_an_error() {
 }
 
 fn recorded(path: &str, model: Option<Model>) -> Vec<Vec<[f32; 3]>> {
-    use clearway_lidar::sensor::{Sensor, SensorConfig};
+    use clearway_lidar::{Sensor, SensorConfig};
     let mut sensor = Sensor::new(SensorConfig { model, ..SensorConfig::default() });
     let mut revolutions = Vec::new();
     for datagram in common::datagrams(path) {
