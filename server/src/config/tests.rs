@@ -122,8 +122,8 @@ fn a_sender_is_an_address_or_a_socket() {
     let from =
         |text: &str| parse(&NEEDED.replace("[vehicle.udp]", &format!("[vehicle.udp]\nfrom = {{ top = {text:?} }}")));
     let sender = |text: &str| from(text).unwrap().vehicles[0].udp.clone().unwrap().from["top"];
-    assert!(sender("10.0.0.1").is("10.0.0.1:77".parse().unwrap()));
-    assert!(!sender("10.0.0.1:78").is("10.0.0.1:77".parse().unwrap()));
+    assert!(sender("10.0.0.1").matches("10.0.0.1:77".parse().unwrap()));
+    assert!(!sender("10.0.0.1:78").matches("10.0.0.1:77".parse().unwrap()));
     assert!(from("the roof").unwrap_err().to_string().contains("192.168.1.201"));
 }
 
