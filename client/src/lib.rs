@@ -27,8 +27,6 @@
 //! | [`grpc`] | a server's address -> [`Client`] |
 //! | [`observation`] | scans, poses, roads, packets -> [`Observation`] |
 //! | [`ingest`] | observations -> the server, and what became of them |
-//! | `picture` | a layer -> a PNG from above (feature `picture`) |
-//! | `viewer` | a map -> ROS 2 and Foxglove messages (feature `viewers`) |
 //! | `zenoh` | a router's endpoint -> `ZenohClient` (feature `zenoh`); its `tap`: one key -> the newest map |
 
 pub mod footprint;
@@ -36,12 +34,8 @@ mod freshness;
 pub mod grpc;
 pub mod ingest;
 pub mod observation;
-#[cfg(feature = "picture")]
-pub mod picture;
 pub mod stream;
 pub mod view;
-#[cfg(feature = "viewers")]
-pub mod viewer;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
 
@@ -74,7 +68,7 @@ pub enum ClientError {
         reason: String,
     },
     /// Nobody answers there.
-    #[error("no clearway-server answers at {address}: {reason}")]
+    #[error("no clearway server answers at {address}: {reason}")]
     Unreachable {
         /// As dialled.
         address: String,

@@ -8,7 +8,7 @@ use bytes::Bytes;
 use clearway_client::codec::{CellsRef, encode_grid};
 use clearway_client::footprint::{FREE, OBSTACLES};
 use clearway_client::v1::layer::Geometry;
-use clearway_client::viewer::raster;
+use clearway::encode::viewer::raster;
 use clearway_client::{Footprint, MapView, v1};
 use clearway_proto::map::{encode_header, encode_layer};
 use proptest::prelude::*;

@@ -177,5 +177,5 @@ async fn bad_addresses_are_named_with_what_is_allowed() {
     }
     let closed = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
     let error = Client::connect(&closed.to_string()).await.unwrap_err();
-    assert!(error.to_string().starts_with("no clearway-server answers at http://127.0.0.1:"), "{error}");
+    assert!(error.to_string().starts_with("no clearway server answers at http://127.0.0.1:"), "{error}");
 }

@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 
 use clearway_mapping::event::Body;
 use clearway_mapping::pipeline::Ledger;
-use clearway_server::config::{Config, Udp};
-use clearway_server::ingest::{door, udp};
+use clearway::config::{Config, Udp};
+use clearway::ingest::{door, udp};
 use nix::sys::socket::setsockopt;
 use nix::sys::socket::sockopt::UdpGsoSegment;
 

@@ -9,10 +9,10 @@ use clearway_lidar::model::Model;
 use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
-use clearway_server::config::Config;
-use clearway_server::ingest::observation::{Limits, bodies};
-use clearway_server::recording::{Entry, Recording};
-use clearway_server::wire::{event_from_bytes, event_to_proto};
+use clearway::config::Config;
+use clearway::ingest::observation::{Limits, bodies};
+use clearway::record::reader::{Entry, Recording};
+use clearway::encode::{event_from_bytes, event_to_proto};
 use prost::Message;
 
 /// One observation, as far as the maps.

@@ -10,14 +10,14 @@ use std::time::{Duration, Instant};
 
 use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::{Pipeline, Rejected};
-use clearway_mapping::sweep::Sweep;
+use clearway_mapping::sensor::sweep::Sweep;
 use tokio::sync::watch;
 
 use crate::ingest::Queued;
-use crate::ingest::ticket::Verdict;
-use crate::record::Journal;
+use crate::ingest::receipt::Verdict;
+use crate::record::writer::Journal;
 use crate::status::VehicleStatus;
-use crate::wire::{self, EncodedMap};
+use crate::encode::{self, EncodedMap};
 
 /// How often an engine without events looks whether somebody has come who wants the newest map.
 const LOOK_AROUND: Duration = Duration::from_millis(20);
@@ -136,7 +136,7 @@ impl Engine {
         let Some(map) = self.pipeline.newest_map() else { return };
         // Where every map is switched off, a revolution makes none; where nobody takes one, a header.
         let made = (!self.status.layers.is_empty()).then(|| {
-            let states = map.sensors.iter().map(wire::sensor).collect();
+            let states = map.sensors.iter().map(encode::sensor).collect();
             (Arc::new(EncodedMap::new(map, self.status.name.clone(), self.status.boot_id, self.valid_ms)), states)
         });
         let latency = started.elapsed();

@@ -22,19 +22,13 @@
 //! | [`status`] | ledger, rates, latency of each vehicle |
 //! | [`server`] | all of it, put together |
 
-pub mod clouds;
+pub mod cli;
 pub mod config;
-pub mod cuts;
-pub mod demand;
-pub mod demo;
+pub mod encode;
 pub mod engine;
-pub mod evaluate;
 pub mod ingest;
 pub mod publish;
 pub mod record;
-pub mod recording;
-pub mod replay;
 pub mod server;
 pub mod status;
-pub mod verify;
-pub mod wire;
+pub mod subscriptions;

@@ -16,12 +16,12 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use crate::config::{Calibrations, Certificates, Config, Foxglove, Grpc, Vehicle};
-use crate::demand::Taken;
+use crate::subscriptions::Taken;
 use crate::engine::{Engine, Observer};
-use crate::ingest::entrance::{Entrance, Entrances};
+use crate::ingest::gateway::{Entrance, Entrances};
 use crate::ingest::{Door, Queued, door, udp};
 use crate::publish::{Served, Vehicles, grpc, page};
-use crate::record::{Preface, RecordError, Recorder};
+use crate::record::writer::{Preface, RecordError, Recorder};
 use crate::status::VehicleStatus;
 
 /// A stalled peer may not keep the server from ending.
@@ -257,7 +257,7 @@ impl Running {
         preface: impl FnOnce() -> Preface,
     ) -> Result<(), StartError> {
         let mut journals = Vec::new().into_iter();
-        if crate::record::wanted(&config.recorder).is_some() {
+        if crate::record::writer::wanted(&config.recorder).is_some() {
             let (recorder, ways) = Recorder::start(&config.recorder, &preface(), from_files)?;
             (self.recorder, journals) = (Some(recorder), ways.into_iter());
         }

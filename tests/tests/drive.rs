@@ -15,7 +15,7 @@ use astar::{Move, Planner};
 use clearway_client::ingest::Ingester;
 use clearway_client::stream::MapStream;
 use clearway_client::{Client, MapView, Observation, Subscription, ZenohClient};
-use clearway_server::server::{Running, Server, Setup};
+use clearway::server::{Running, Server, Setup};
 use clearway_sim::contact::Hull;
 use clearway_sim::course::{Course, Drive};
 use clearway_sim::scanner::ScannerConfig;

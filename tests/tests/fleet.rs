@@ -6,9 +6,9 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, mpsc};
 
 use clearway_client::{MapStream, Sight, ZenohClient};
-use clearway_server::config::ZenohMode;
-use clearway_server::ingest::Reading;
-use clearway_server::server::{Running, Server, Setup};
+use clearway::config::ZenohMode;
+use clearway::ingest::Reading;
+use clearway::server::{Running, Server, Setup};
 use house::{config, feed, readings, sequence, start, within};
 use zenoh::Session;
 use zenoh::sample::SampleKind;

@@ -6,7 +6,7 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use clearway_server::server::Running;
+use clearway::server::Running;
 use house::certificates::{behind, certificates, router, secured};
 use house::venv::{environment, run};
 use house::{config, feed, readings, start, until, within};

@@ -11,11 +11,11 @@ use std::path::Path;
 use clearway_mapping::event::Body;
 use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
 use clearway_proto::v1;
-use clearway_server::config::Config;
-use clearway_server::ingest::Reading;
-use clearway_server::recording::{Recording, RecordingError};
-use clearway_server::server::{Server, Setup};
-use clearway_server::verify::{What, verify};
+use clearway::config::Config;
+use clearway::ingest::Reading;
+use clearway::record::reader::{Recording, RecordingError};
+use clearway::server::{Server, Setup};
+use clearway::record::verify::{What, verify};
 use house::{config, readings, start, until, within};
 use mcap::records::Record;
 use prost::Message;
@@ -143,7 +143,7 @@ async fn a_recording_cut_by_a_crash_is_read_to_its_last_whole_chunk_and_says_so(
         most = most.max(events);
     }
     assert!(most > 0, "whole chunks before the cut are read");
-    assert!(matches!(events_in(3), Err(clearway_server::verify::VerifyError::Recording(_))));
+    assert!(matches!(events_in(3), Err(clearway::record::verify::VerifyError::Recording(_))));
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -181,7 +181,7 @@ fn a_foreign_mcap_file_is_no_recording() {
     mcap::Writer::new(BufWriter::new(File::create(&file).unwrap())).unwrap().finish().unwrap();
     let error = verify(&file).unwrap_err();
     assert!(
-        matches!(error, clearway_server::verify::VerifyError::Recording(RecordingError::NoConfig { .. })),
+        matches!(error, clearway::record::verify::VerifyError::Recording(RecordingError::NoConfig { .. })),
         "{error}"
     );
 }

@@ -5,8 +5,8 @@ mod house;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use clearway_server::replay::{Mount, Options, ReplayError, Summary, describe, replay};
-use clearway_server::verify::verify;
+use clearway::cli::replay::{Mount, Options, ReplayError, Summary, describe, replay};
+use clearway::record::verify::verify;
 
 async fn replayed(options: Options) -> Result<Summary, ReplayError> {
     house::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await

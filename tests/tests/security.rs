@@ -6,8 +6,8 @@ use std::path::Path;
 use std::sync::Arc;
 
 use clearway_client::{Client, ClientError, Subscription, Tls, ZenohClient};
-use clearway_server::replay::{Options, Summary, replay};
-use clearway_server::server::{Running, Server, Setup};
+use clearway::cli::replay::{Options, Summary, replay};
+use clearway::server::{Running, Server, Setup};
 use house::certificates::{behind, certificates, router, secured, start, zenoh_file};
 use house::{config, feed, grpc, readings, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -78,7 +78,7 @@ async fn a_recording_holds_the_path_of_the_key_and_nothing_of_the_key() {
     let running = start(config).await;
     feed(&running, readings(1)).await;
     within("shutdown", running.shutdown()).await.unwrap();
-    let recording = clearway_server::recording::Recording::open(&record).unwrap();
+    let recording = clearway::record::reader::Recording::open(&record).unwrap();
     let text = recording.preface().config.clone().unwrap();
     assert!(text.contains("server.key") && !text.contains("PRIVATE"), "{text}");
     let key = std::fs::read_to_string(certificates("ours").join("server.key")).unwrap();

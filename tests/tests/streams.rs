@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use clearway_proto::v1;
-use clearway_server::server::{Server, Setup};
+use clearway::server::{Server, Setup};
 use clearway_sim::send::{Pace, Until, drive};
 use house::{config, feed, grpc, readings, recorded, selection, sequence, start, until, vehicle, within};
 use tokio::net::UdpSocket;
@@ -28,7 +28,7 @@ impl Requests {
     }
 }
 
-async fn watch(running: &clearway_server::server::Running, max_in_flight: u32) -> (Requests, Streaming<v1::MapUpdate>) {
+async fn watch(running: &clearway::server::Running, max_in_flight: u32) -> (Requests, Streaming<v1::MapUpdate>) {
     let (sender, mut requests) = mpsc::channel(16);
     sender.send(selection("car", &[LAYER], max_in_flight)).await.unwrap();
     let requests = futures::stream::poll_fn(move |context| requests.poll_recv(context));
@@ -37,7 +37,7 @@ async fn watch(running: &clearway_server::server::Running, max_in_flight: u32) -
 }
 
 /// A zenoh session connected to the server and to nobody else.
-async fn session(running: &clearway_server::server::Running) -> Session {
+async fn session(running: &clearway::server::Running) -> Session {
     let mut config = zenoh::Config::default();
     let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
     config.insert_json5("mode", "\"client\"").unwrap();
@@ -88,7 +88,7 @@ async fn a_live_drive_over_udp_reaches_grpc_and_zenoh_with_the_bytes_of_the_reco
     for (sequence, map) in over_grpc.iter().chain(&over_zenoh) {
         assert_eq!(recorded[&(*sequence, LAYER.to_owned())], map, "sequence {sequence}");
     }
-    let report = clearway_server::verify::verify(&record).unwrap();
+    let report = clearway::record::verify::verify(&record).unwrap();
     assert!(report.is_good() && report.maps >= 3, "{report:?}");
 }
 
@@ -120,7 +120,7 @@ async fn refused_datagrams_are_counted_by_reason_and_the_ledger_adds_up() {
 async fn a_sender_nobody_configured_is_refused_for_its_source() {
     let mut config = config();
     let udp = config.vehicles[0].udp.as_mut().unwrap();
-    udp.from.insert("top".into(), clearway_server::config::Sender::Address("127.0.0.2".parse().unwrap()));
+    udp.from.insert("top".into(), clearway::config::Sender::Address("127.0.0.2".parse().unwrap()));
     let running = start(config).await;
     let (data, _) = running.doors[0].udp.unwrap();
     let packet = readings(1).into_iter().find_map(|reading| match reading.body {
@@ -385,7 +385,7 @@ async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
     let status = client.get_map(get("")).await.unwrap_err();
     assert!(status.message().contains("car, truck"), "of several vehicles one must be named: {status}");
     within("shutdown", running.shutdown()).await.unwrap();
-    let report = clearway_server::verify::verify(&record).unwrap();
+    let report = clearway::record::verify::verify(&record).unwrap();
     assert!(report.is_good() && report.maps > maps, "{report:?}");
 }
 

@@ -12,12 +12,12 @@ use clearway_lidar::capture::Capture;
 use clearway_mapping::event::{Body, Cause};
 use clearway_mapping::pipeline::{Ledger, Pipeline};
 use clearway_proto::v1;
-use clearway_server::config::{Config, Sender, Udp};
-use clearway_server::ingest::door;
-use clearway_server::recording::{Entry, Recording};
-use clearway_server::replay::{Options, replay};
-use clearway_server::server::Running;
-use clearway_server::verify::verify;
+use clearway::config::{Config, Sender, Udp};
+use clearway::ingest::door;
+use clearway::record::reader::{Entry, Recording};
+use clearway::cli::replay::{Options, replay};
+use clearway::server::Running;
+use clearway::record::verify::verify;
 use house::{config, recorded, start, until, within};
 use proptest::prelude::Rng;
 use proptest::test_runner::{RngAlgorithm, TestRng};
@@ -126,7 +126,7 @@ async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording()
     assert_eq!((sensors[0].ledger.decoded, sensors[0].ledger.telemetry), (packets.len() as u64, 1));
     assert_eq!(sensors[0].ledger.refused, [("block_flag", 3), ("length", 15)].into());
     assert_eq!((sensors[1].ledger.received, sensors[1].ledger.decoded, sensors[1].ledger.refused["length"]), (6, 1, 3));
-    let metrics = clearway_server::status::prometheus(std::slice::from_ref(&status));
+    let metrics = clearway::status::prometheus(std::slice::from_ref(&status));
     let line = "clearway_sensor_refused_total{vehicle=\"car\",sensor=\"side\",reason=\"length\"} 3\n";
     assert!(metrics.contains(line), "{metrics}");
     let strangers = status.to_proto().strangers;
@@ -225,7 +225,7 @@ fn drive(path: &str) -> PathBuf {
 }
 
 /// The vehicle `name` with a level sensor 1.9 m up, heard at `at` from `from`.
-fn heard_at(name: &str, at: SocketAddr, from: &str) -> clearway_server::config::Vehicle {
+fn heard_at(name: &str, at: SocketAddr, from: &str) -> clearway::config::Vehicle {
     let mut vehicle = Config::of_one_vehicle(name, "top").vehicles.remove(0);
     vehicle.sensors[0].extrinsics.z_m = 1.9;
     // These captures are years old: their own time is believed all the same.

@@ -8,11 +8,11 @@ use std::io::{BufRead, BufReader};
 use std::process::Stdio;
 
 use clearway_client::MapView;
-use clearway_client::viewer::Raster;
+use clearway::encode::viewer::Raster;
 use clearway_mapping::event::{Body, EgoPose};
-use clearway_server::config::{Config, Foxglove, Ros2};
-use clearway_server::ingest::Reading;
-use clearway_server::server::{Running, Server, Setup};
+use clearway::config::{Config, Foxglove, Ros2};
+use clearway::ingest::Reading;
+use clearway::server::{Running, Server, Setup};
 use house::{LAYERS, config, feed, readings, start, venv, within};
 use nalgebra::{Isometry3, Vector3};
 use serde_json::{Value, json};

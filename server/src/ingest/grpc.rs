@@ -2,7 +2,7 @@
 //!
 //! A stream reads its next observation only while the events before it are within the vehicle's limits and the peer
 //! takes its reports: a fast ingester waits, and holds no more than that. What becomes of the events comes back from
-//! the engine by [`Ticket`](super::ticket::Ticket) and is told in as few reports as the transport takes.
+//! the engine by [`Ticket`](super::receipt::Ticket) and is told in as few reports as the transport takes.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -15,8 +15,8 @@ use tokio::sync::OwnedSemaphorePermit;
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
 use tonic::{Code, Request, Response, Status, Streaming};
 
-use super::entrance::{Entrance, Entrances};
-use super::ticket::{Account, Mark, Verdict, Verdicts};
+use super::gateway::{Entrance, Entrances};
+use super::receipt::{Account, Mark, Verdict, Verdicts};
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
 

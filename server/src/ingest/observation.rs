@@ -9,7 +9,7 @@ use clearway_mapping::event::Body;
 use clearway_proto::packed::unpack;
 use clearway_proto::v1;
 
-use crate::wire::{ego_pose_from_proto, road_from_proto, scan_from_proto, sensor_from_proto};
+use crate::encode::{ego_pose_from_proto, road_from_proto, scan_from_proto, sensor_from_proto};
 
 /// What one observation may be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -19,9 +19,9 @@ use zenoh::pubsub::{Publisher, Subscriber};
 use zenoh::qos::CongestionControl;
 use zenoh::sample::{Locality, SampleKind};
 
-use super::entrance::Entrance;
+use super::gateway::Entrance;
 use super::observation::ObservationError;
-use super::ticket::{Account, Verdicts};
+use super::receipt::{Account, Verdicts};
 use crate::publish::zenoh::{ZenohError, failed};
 
 /// Samples put aside for one vehicle; their bytes are no more than its longest message, twice.
@@ -238,7 +238,7 @@ impl Clients {
 
 #[cfg(test)]
 mod tests {
-    use super::super::ticket::Verdict;
+    use super::super::receipt::Verdict;
     use super::*;
 
     #[test]

@@ -9,8 +9,8 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
 use clearway_client::MapView;
-use clearway_client::viewer::raster::Rasters;
-use clearway_client::viewer::{base_frame, foxglove as messages};
+use crate::encode::viewer::raster::Rasters;
+use crate::encode::viewer::{base_frame, foxglove as messages};
 use foxglove::messages::{FrameTransforms, Grid, PointCloud};
 use foxglove::websocket::{ChannelView, Client, ServerListener};
 use foxglove::{Channel, ChannelId, Context, Encode, FoxgloveError, PartialMetadata, SinkId, WebSocketServerHandle};
@@ -19,10 +19,10 @@ use tokio::task::JoinSet;
 
 use super::{Served, Vehicles};
 use crate::config::Foxglove as Options;
-use crate::demand::Taken;
+use crate::subscriptions::Taken;
 use crate::engine::NewestSweep;
 use crate::ingest::locked;
-use crate::wire::EncodedMap;
+use crate::encode::EncodedMap;
 
 /// Messages on the way to one client: some revolutions of every layer; the largest, a grid, has about 1 MB.
 const BACKLOG: usize = 32;

@@ -11,8 +11,8 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
 
 use clearway_client::MapView;
-use clearway_client::viewer::raster::Rasters;
-use clearway_client::viewer::ros;
+use crate::encode::viewer::raster::Rasters;
+use crate::encode::viewer::ros;
 use clearway_ros::published::{OCCUPANCY_GRID, Published, TF_MESSAGE};
 use tokio::task::JoinSet;
 use zenoh::Session;
@@ -25,7 +25,7 @@ use super::Served;
 use super::zenoh::{ZenohError, failed};
 use crate::config::Ros2;
 use crate::ingest::now_ns;
-use crate::wire::EncodedMap;
+use crate::encode::EncodedMap;
 
 /// The node's name.
 const NODE: &str = "clearway";

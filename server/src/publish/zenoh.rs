@@ -22,7 +22,7 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 use super::ros::Node;
 use super::{Served, Vehicles};
 use crate::config::Zenoh as Options;
-use crate::ingest::entrance::Entrances;
+use crate::ingest::gateway::Entrances;
 use crate::ingest::zenoh::Ingest;
 
 const STATUS_PERIOD: Duration = Duration::from_secs(1);

@@ -6,8 +6,8 @@ use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use clearway_client::now_ns;
-use clearway_server::config::{Config, Udp};
-use clearway_server::server::{Server, Setup};
+use clearway::config::{Config, Udp};
+use clearway::server::{Server, Setup};
 use clearway_sim::scanner::ScannerConfig;
 use tokio::io::AsyncReadExt;
 

@@ -3,8 +3,8 @@
 use std::sync::OnceLock;
 
 use clearway_proto::v1;
-use clearway_server::config::Config;
-use clearway_server::demo::rig::Rig;
+use clearway::config::Config;
+use clearway::cli::demo::rig::Rig;
 use clearway_sim::scenes::{self, Scene};
 use clearway_sim::traffic;
 use clearway_sim::vehicle::Datagram;

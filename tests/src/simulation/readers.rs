@@ -9,9 +9,9 @@ use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 
 use clearway_proto::v1;
-use clearway_server::publish::Vehicles;
-use clearway_server::publish::reader::watch;
-use clearway_server::wire::EncodedMap;
+use clearway::publish::Vehicles;
+use clearway::publish::reader::watch;
+use clearway::encode::EncodedMap;
 use futures::Stream;
 use futures::channel::mpsc::{UnboundedSender, unbounded};
 use prost::Message;

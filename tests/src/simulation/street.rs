@@ -2,7 +2,7 @@
 
 use bytes::Bytes;
 use clearway_mapping::event::{Body, Cause};
-use clearway_server::ingest::udp::DATAGRAM_BYTES_MAX;
+use clearway::ingest::udp::DATAGRAM_BYTES_MAX;
 use clearway_sim::vehicle::Datagram;
 use prost::Message;
 use std::sync::atomic::Ordering;

@@ -3,8 +3,8 @@
 use std::io::{self, Write};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use clearway_server::record::{Disk, RecorderCounts};
-use clearway_server::verify::{VerifyError, verify};
+use clearway::record::{Disk, RecorderCounts};
+use clearway::record::verify::{VerifyError, verify};
 
 use super::checks::{Breach, breach};
 use super::fate::DiskFate;

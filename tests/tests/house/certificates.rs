@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
 
-use clearway_server::config::{Access, Config, Tls, ZenohMode};
-use clearway_server::server::{Running, Server, Setup};
+use clearway::config::{Access, Config, Tls, ZenohMode};
+use clearway::server::{Running, Server, Setup};
 
 /// The folder of `ours` or `theirs`, which lie beside each other.
 pub fn certificates(ca: &str) -> PathBuf {

@@ -16,10 +16,10 @@ use clearway_mapping::event::Body;
 use clearway_proto::packed::{pack, unpack};
 use clearway_proto::v1;
 use clearway_proto::v1::ingest_service_client::IngestServiceClient;
-use clearway_server::config::Config;
-use clearway_server::ingest::Reading;
-use clearway_server::server::{Running, Server, Setup};
-use clearway_server::verify::verify;
+use clearway::config::Config;
+use clearway::ingest::Reading;
+use clearway::server::{Running, Server, Setup};
+use clearway::record::verify::verify;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
 use clearway_sim::vehicle::SimulatedVehicle;
@@ -130,7 +130,7 @@ async fn a_drive_tunnelled_over_grpc_makes_the_maps_of_the_file_door() {
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 async fn a_recorded_drive_tunnelled_over_grpc_makes_the_maps_of_the_file_door() {
     let file = Path::new(env!("CLEARWAY_DATA")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
-    let drive = clearway_server::ingest::capture::Source::open(&file).unwrap();
+    let drive = clearway::ingest::capture::Source::open(&file).unwrap();
     let readings: Vec<Reading> = drive.map(Result::unwrap).collect();
     assert_eq!(readings.len(), 976);
     let maps = assert_tunnelled_makes_the_maps_of_the_file_door(config(), readings).await;

@@ -8,8 +8,8 @@ use clearway_client::{ClientError, Ingester, Observation};
 use clearway_mapping::event::{Body, Cause, Event};
 use clearway_proto::packed::pack;
 use clearway_proto::v1;
-use clearway_server::recording::{Entry, Recording};
-use clearway_server::verify::verify;
+use clearway::record::reader::{Entry, Recording};
+use clearway::record::verify::verify;
 use prost::Message;
 use tonic::Code;
 

@@ -5,7 +5,7 @@ use std::sync::{Arc, Weak};
 
 use clearway_proto::v1;
 use clearway_proto::v1::map_service_client::MapServiceClient;
-use clearway_server::wire::EncodedMap;
+use clearway::encode::EncodedMap;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;

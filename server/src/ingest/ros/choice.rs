@@ -10,7 +10,7 @@ use clearway_ros::{Frames, Kind, PointCloud2};
 use nalgebra::Isometry3;
 
 use super::{Intake, PoseFrom};
-use crate::recording::{Entry, Recording, RecordingError};
+use crate::record::reader::{Entry, Recording, RecordingError};
 
 /// How much of a file is looked at before its topics are chosen: latched transforms come first, everything else often.
 const LOOK_NS: i64 = 10_000_000_000;

@@ -1,0 +1,265 @@
+//! Maps from one sweep of an HDL-64E, one thread: points a second beside the time.
+//!
+//! The sweep is KITTI's first scan where the recorded drives are, else a simulated turn.
+
+use clearway_lidar::calibration::Calibration;
+use clearway_lidar::model::Model;
+use clearway_mapping::config::{
+    DrivabilityConfig, Form, HeightDifferenceConfig, MotionConfig, OccupancyConfig, SafePathConfig, SpeedConfig,
+    TerrainConfig,
+};
+use clearway_mapping::layer::drivability::Drivability;
+use clearway_mapping::event::{EgoPose, Road, RoadFrame, RoadPurpose, Scan};
+use clearway_mapping::layer::height_difference::HeightDifference;
+use clearway_mapping::map::{Context, LayerMaker, Rays};
+use clearway_mapping::sensor::motion::{Motion, Moved};
+use clearway_mapping::layer::occupancy::Occupancy;
+use clearway_mapping::road::TakenRoad;
+use clearway_mapping::layer::safe_path::SafePath;
+use clearway_mapping::sensor::distance_series::Series;
+use clearway_mapping::layer::speed::Speed;
+use clearway_mapping::sensor::sweep::{Mount, Sweep};
+use clearway_mapping::layer::terrain::Terrain;
+use clearway_sim::planes::PlaneUnit;
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::traffic;
+use clearway_sim::vehicle::SimulatedVehicle;
+use divan::Bencher;
+use divan::counter::ItemsCount;
+use std::sync::Arc;
+
+fn main() {
+    divan::main();
+}
+
+fn mount(height_m: f64) -> Mount {
+    Mount { ego_from_sensor: nalgebra::Isometry3::translation(0.0, 0.0, height_m), range_m_min: 2.0 }
+}
+
+/// KITTI's first scan, x y z intensity a point.
+fn kitti() -> Option<Scan> {
+    let bytes = std::fs::read(concat!(env!("CLEARWAY_DATA"), "/kitti/patchwork-plusplus/000000.bin")).ok()?;
+    let mut scan = Scan::default();
+    for point in bytes.chunks_exact(16) {
+        let value = |i: usize| f32::from_le_bytes([point[4 * i], point[4 * i + 1], point[4 * i + 2], point[4 * i + 3]]);
+        scan.x.push(value(0));
+        scan.y.push(value(1));
+        scan.z.push(value(2));
+        scan.intensity.push(value(3));
+    }
+    Some(scan)
+}
+
+fn sweep() -> Sweep {
+    let mut sweep = Sweep::default();
+    match kitti() {
+        Some(scan) => {
+            sweep.take_scan(&scan, &Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount(1.73));
+        }
+        None => sweep.take_revolution(&turn(), &mount(1.9)),
+    }
+    sweep
+}
+
+fn turn() -> clearway_lidar::revolution::Revolution {
+    SimulatedVehicle::new(clearway_sim::scenes::town(), ScannerConfig::default()).revolution(1)
+}
+
+#[divan::bench(args = [360, 180, 90])]
+fn drivability(bencher: Bencher, columns: u16) {
+    let sweep = sweep();
+    let mut map = Drivability::new(&DrivabilityConfig { columns, ..DrivabilityConfig::default() });
+    let mut layer = map.layer();
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
+}
+
+#[divan::bench]
+fn height_difference(bencher: Bencher) {
+    let sweep = sweep();
+    let mut map = HeightDifference::new(&HeightDifferenceConfig::default());
+    let mut layer = map.layer();
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
+}
+
+#[divan::bench]
+fn sweep_of_a_revolution(bencher: Bencher) {
+    let revolution = turn();
+    let mount = mount(1.9);
+    let mut sweep = Sweep::default();
+    let slots = revolution.echoes[0].range_m.len();
+    bencher.counter(ItemsCount::new(slots)).bench_local(|| sweep.take_revolution(&revolution, &mount));
+}
+
+/// The same with a pose each 10 ms: finding the motion, and moving every firing.
+#[divan::bench]
+fn sweep_of_a_moving_revolution(bencher: Bencher) {
+    let revolution = turn();
+    let mount = mount(1.9);
+    let mut motion = Motion::new(&MotionConfig::default());
+    for step in 0..=20 {
+        let seconds = f64::from(step) * 0.01;
+        let map_from_ego = nalgebra::Isometry3::new(
+            nalgebra::vector![15.0 * seconds, 0.0, 0.0],
+            nalgebra::vector![0.0, 0.0, 0.3 * seconds],
+        );
+        let stamp_ns = revolution.end_ns + i64::from(step - 15) * 10_000_000;
+        motion.take_pose(&EgoPose { stamp_ns, map_from_ego, speed_mps: 15.0 });
+    }
+    let (mut sweep, mut moved) = (Sweep::default(), Moved::default());
+    let slots = revolution.echoes[0].range_m.len();
+    bencher.counter(ItemsCount::new(slots)).bench_local(|| {
+        motion.through(&revolution, &mut moved);
+        sweep.take_revolution_around(&revolution, &mount, &moved.end_from_ego, None);
+    });
+}
+
+#[divan::bench(args = [Form::Grounded, Form::Paper, Form::Grid])]
+fn terrain(bencher: Bencher, form: Form) {
+    let sweep = sweep();
+    let mut map = Terrain::new(&TerrainConfig { form, ..TerrainConfig::default() });
+    let mut layer = map.layer();
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
+}
+
+/// The same with roughness: a simulated turn, whose distance series are known.
+#[divan::bench]
+fn terrain_with_roughness(bencher: Bencher) {
+    let (revolution, mount) = (turn(), mount(1.9));
+    let mut sweep = Sweep::default();
+    sweep.take_revolution(&revolution, &mount);
+    sweep.take_deviations(&revolution, &mount, &mut Series::default(), None);
+    let mut map = Terrain::new(&TerrainConfig::default());
+    let mut layer = map.layer();
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
+}
+
+#[divan::bench]
+fn deviations_of_a_revolution(bencher: Bencher) {
+    let (revolution, mount) = (turn(), mount(1.9));
+    let (mut sweep, mut series) = (Sweep::default(), Series::default());
+    let slots = revolution.echoes[0].range_m.len();
+    bencher
+        .counter(ItemsCount::new(slots))
+        .bench_local(|| sweep.take_deviations(&revolution, &mount, &mut series, None));
+}
+
+/// With a road of 20 points, 6 m wide.
+#[divan::bench]
+fn speed(bencher: Bencher) {
+    let sweep = sweep();
+    let road = Road {
+        stamp_ns: 0,
+        purpose: RoadPurpose::Paint,
+        frame: RoadFrame::Ego,
+        points: (0..20).map(|i| [2.0 * f64::from(i), 0.05 * f64::from(i * i)]).collect(),
+        widths_m: vec![6.0; 20],
+        orientations: Vec::new(),
+    };
+    let taken = TakenRoad { road, map_from_ego: None };
+    let mut map = Speed::new(&SpeedConfig::default());
+    let mut layer = map.layer();
+    let context = Context { road: Some(&taken), ..Context::default() };
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make_with(&sweep, &context, &mut layer));
+}
+
+#[divan::bench]
+fn safe_path(bencher: Bencher) {
+    let sweep = sweep();
+    let mut drivability = Drivability::new(&DrivabilityConfig::default());
+    let mut earlier = [drivability.layer()];
+    drivability.make(&sweep, &mut earlier[0]);
+    let mut map = SafePath::new(&SafePathConfig::default());
+    let mut layer = map.layer();
+    let context = Context { earlier: &earlier, ..Context::default() };
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make_with(&sweep, &context, &mut layer));
+}
+
+/// What six units of four planes send in 100 ms from a vehicle in traffic: 52,800 rays, those without a return among
+/// them.
+fn six_units() -> Vec<(Sweep, [f32; 3])> {
+    let scene = traffic::street(0.0);
+    let scan = |unit: &PlaneUnit, number| {
+        let scan = unit.scan(&scene, number);
+        let mut sweep = Sweep::default();
+        for i in 0..scan.x.len() {
+            let point = nalgebra::Point3::new(scan.x[i], scan.y[i], scan.z[i]).cast::<f64>();
+            let point = (unit.ego_from_sensor * point).cast::<f32>();
+            sweep.x.push(point.x);
+            sweep.y.push(point.y);
+            sweep.z.push(point.z);
+        }
+        (sweep, unit.ego_from_sensor.translation.vector.cast::<f32>().into())
+    };
+    let units = traffic::six_units();
+    (1..=5).flat_map(|number| units.iter().map(move |unit| (unit, number))).map(|(u, n)| scan(u, n)).collect()
+}
+
+/// All scans of 100 ms and the layer written.
+#[divan::bench]
+fn occupancy_of_six_units(bencher: Bencher) {
+    let scans = six_units();
+    let mut map = Occupancy::new(&OccupancyConfig::default());
+    let mut layer = map.layer();
+    let pose = Some(nalgebra::Isometry3::identity());
+    let context = Context { map_from_ego: pose, ..Context::default() };
+    bencher.counter(ItemsCount::new(52_800_usize)).bench_local(|| {
+        for (number, (returns, origin_m)) in scans.iter().enumerate() {
+            let rays = Rays {
+                sensor: (number % 6) as u16,
+                stamp_ns: 0,
+                returns,
+                origin_m: *origin_m,
+                no_returns: &[],
+                map_from_ego: pose,
+                speed_mps: Some(0.0),
+            };
+            map.take(&rays);
+        }
+        map.make_with(&Sweep::default(), &context, &mut layer);
+    });
+}
+
+/// The floor beside it: a plain Bresenham line for each return, from its sensor to the border, one store a cell.
+#[divan::bench]
+fn bresenham_of_six_units(bencher: Bencher) {
+    const SIDE: i32 = 400;
+    let scans = six_units();
+    let mut cells = vec![0_u8; (SIDE * SIDE) as usize];
+    bencher.counter(ItemsCount::new(52_800_usize)).bench_local(|| {
+        for (sweep, [ox, oy, _]) in &scans {
+            let cell = |metres: f32| (metres * 4.0).floor() as i32 + SIDE / 2;
+            let (x0, y0) = (cell(*ox), cell(*oy));
+            for (x, y) in sweep.x.iter().zip(&sweep.y) {
+                let (hit_x, hit_y) = (cell(*x), cell(*y));
+                let far = 100.0 / ((x - ox).hypot(y - oy)).max(0.1);
+                let (x1, y1) = (cell(ox + (x - ox) * far), cell(oy + (y - oy) * far));
+                let (dx, dy) = ((x1 - x0).abs(), -(y1 - y0).abs());
+                let (sx, sy) = ((x1 - x0).signum(), (y1 - y0).signum());
+                let (mut x, mut y, mut error, mut state) = (x0, y0, dx + dy, 1);
+                while (0..SIDE).contains(&x) && (0..SIDE).contains(&y) {
+                    state = if (x, y) == (hit_x, hit_y) { 3 } else { state };
+                    cells[(y * SIDE + x) as usize] = state;
+                    let twice = 2 * error;
+                    (x, error) = if twice >= dy { (x + sx, error + dy) } else { (x, error) };
+                    (y, error) = if twice <= dx { (y + sy, error + dx) } else { (y, error) };
+                }
+            }
+        }
+        divan::black_box(&cells);
+    });
+}
+
+/// One turn of an HDL-64E and the layer written.
+#[divan::bench]
+fn occupancy_of_a_turn(bencher: Bencher) {
+    let sweep = sweep();
+    let mut map = Occupancy::new(&OccupancyConfig::default());
+    let mut layer = map.layer();
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| {
+        let origin_m = [0.0, 0.0, sweep.mount_height_m];
+        let returns = &sweep;
+        let (map_from_ego, speed_mps) = (Some(nalgebra::Isometry3::identity()), Some(0.0));
+        map.take(&Rays { sensor: 0, stamp_ns: 0, returns, origin_m, no_returns: &[], map_from_ego, speed_mps });
+        map.make(&sweep, &mut layer);
+    });
+}

@@ -1,0 +1,235 @@
+//! The thesis' steps one by one, on worlds of a few cells.
+
+mod common;
+
+use std::sync::Arc;
+
+use clearway_lidar::calibration::Calibration;
+use clearway_lidar::model::Model;
+use clearway_mapping::config::{DrivabilityConfig, Seed};
+use clearway_mapping::layer::drivability::{DRIVABLE, Drivability, NOT_DRIVABLE, OBSTACLE, UNKNOWN};
+use clearway_mapping::map::{Layer, LayerMaker};
+use clearway_mapping::layer::radial_grid::{r_bench_m, ring_radii_m};
+use clearway_mapping::sensor::sweep::Sweep;
+use common::*;
+
+/// A grid for one point a cell: the middle of every cell, at the height `z(row, column, x, y)` says; no point for
+/// `None`.
+fn painted(z: impl Fn(usize, usize, f32, f32) -> Option<f32>) -> Sweep {
+    let mut sweep = empty(Model::Hdl64eS2);
+    let rings = ring_radii_m(sweep.calibration.as_ref().unwrap(), HEIGHT_M, 60.0);
+    for (row, ring) in rings.iter().enumerate() {
+        for column in 0..360 {
+            let azimuth = (column as f32 + 0.5).to_radians();
+            let (x, y) = (ring * azimuth.cos(), ring * azimuth.sin());
+            if let Some(z) = z(row, column, x, y) {
+                add(&mut sweep, [x, y, z]);
+            }
+        }
+    }
+    sweep
+}
+
+/// Rows of the painted grid whose ring lies in a range of radii.
+fn row_at(radius_m: f32) -> usize {
+    let rings = ring_radii_m(&Calibration::factory(Model::Hdl64eS2), HEIGHT_M, 60.0);
+    rings.iter().position(|r| *r >= radius_m).unwrap()
+}
+
+fn map(config: &DrivabilityConfig, sweep: &Sweep) -> Layer {
+    let mut drivability = Drivability::new(config);
+    let mut layer = drivability.layer();
+    drivability.make(sweep, &mut layer);
+    layer
+}
+
+fn class(layer: &Layer, row: usize, column: usize) -> u8 {
+    classes(layer)[row * size(layer).1 + column]
+}
+
+#[test]
+fn rows_follow_the_rings_and_end_at_60_m() {
+    let calibration = Calibration::factory(Model::Vlp16);
+    let rings = ring_radii_m(&calibration, 2.0, 60.0);
+    // -15 to -3 degrees meet the ground within 60 m; -1 degree meets it at 115 m.
+    assert_eq!(rings.len(), 7);
+    assert!((rings[0] - 2.0 / 15f32.to_radians().tan()).abs() < 0.05, "{rings:?}");
+    let benches = r_bench_m(&rings, 60.0);
+    assert_eq!(benches.len(), 7);
+    assert_eq!(benches[6], 60.0);
+    for (bench, pair) in benches.iter().zip(rings.windows(2)) {
+        assert!((bench - (pair[0] + pair[1]) / 2.0).abs() < 1e-6);
+    }
+}
+
+#[test]
+fn no_sensor_has_more_rows_than_lasers_and_rows_ascend() {
+    let models = [
+        Model::Hdl64eS1,
+        Model::Hdl64eS2,
+        Model::Hdl64eS3,
+        Model::Hdl32e,
+        Model::Vlp16,
+        Model::PuckHiRes,
+        Model::Vlp32c,
+        Model::Vls128,
+    ];
+    for model in models {
+        let calibration = Calibration::factory(model);
+        for height in [0.3, 1.0, 1.73, 4.0] {
+            let benches = r_bench_m(&ring_radii_m(&calibration, height, 60.0), 60.0);
+            assert!(benches.len() <= calibration.lasers.len(), "{model:?}");
+            assert!(benches.is_sorted_by(|a, b| a < b), "{model:?} at {height} m: {benches:?}");
+        }
+    }
+}
+
+#[test]
+fn points_beyond_60_m_or_above_the_overhang_are_not_there() {
+    let mut sweep = painted(|_, _, _, _| Some(0.0));
+    let before = map(&DrivabilityConfig::default(), &sweep);
+    add(&mut sweep, [61.0, 0.0, 0.0]);
+    add(&mut sweep, [10.0, 0.0, 2.51]);
+    let after = map(&DrivabilityConfig::default(), &sweep);
+    assert_eq!(before, after);
+    add(&mut sweep, [10.0, 0.0, 2.49]);
+    assert_ne!(map(&DrivabilityConfig::default(), &sweep), before);
+}
+
+#[test]
+fn the_offset_keeps_noise_about_level_ground_in_one_unit() {
+    let noisy = painted(|row, column, _, _| Some(if (row + column) % 2 == 0 { 0.01 } else { -0.01 }));
+    let middle = map(&DrivabilityConfig::default(), &noisy);
+    assert_eq!(middle.planes.len(), 2, "segment 0 and the unreachable one");
+    let thesis = map(&DrivabilityConfig { offset_m: 0.0, ..DrivabilityConfig::default() }, &noisy);
+    assert!(thesis.planes.len() > 1000, "with offset 0 the ground falls apart: {} segments", thesis.planes.len());
+}
+
+#[test]
+fn a_cell_never_reached_is_an_obstacle_and_an_empty_one_is_unknown() {
+    let row = row_at(10.0);
+    let sweep = painted(|r, column, _, _| match (r == row, column) {
+        (true, 90) => Some(1.0),
+        (true, 180) => None,
+        _ => Some(0.0),
+    });
+    let layer = map(&DrivabilityConfig::default(), &sweep);
+    assert_eq!(class(&layer, row, 90), OBSTACLE);
+    assert_eq!(class(&layer, row, 180), UNKNOWN);
+    assert_eq!(class(&layer, row, 270), DRIVABLE);
+}
+
+#[test]
+fn criterion_1_a_step_of_one_unit_that_no_vehicle_takes_is_not_crossed() {
+    // Half the world lies 0.2 m higher: one unit, but a step.
+    let terrace = |step: f32| painted(move |_, _, x, _| Some(if x > 10.0 { step } else { 0.0 }));
+    let ahead = row_at(20.0);
+    let layer = map(&DrivabilityConfig::default(), &terrace(0.2));
+    assert_eq!(class(&layer, ahead, 0), NOT_DRIVABLE);
+    let layer = map(&DrivabilityConfig::default(), &terrace(0.14));
+    assert_eq!(class(&layer, ahead, 0), DRIVABLE);
+    // The thesis allows one unit height, whatever the metres.
+    let thesis = DrivabilityConfig { step_m_max: 0.5, plane_error_m_max: 0.25, ..DrivabilityConfig::default() };
+    assert_eq!(class(&map(&thesis, &terrace(0.2)), ahead, 0), DRIVABLE);
+}
+
+#[test]
+fn criterion_2_a_plane_that_misses_the_boundary_is_not_crossed() {
+    let terrace = painted(|_, _, x, _| Some(if x > 10.0 { 0.3 } else { 0.0 }));
+    let ahead = row_at(20.0);
+    let without = DrivabilityConfig { step_m_max: 0.5, plane_error_m_max: 10.0, ..DrivabilityConfig::default() };
+    assert_eq!(class(&map(&without, &terrace), ahead, 0), DRIVABLE);
+    let with = DrivabilityConfig { plane_error_m_max: 0.25, ..without };
+    assert_eq!(class(&map(&with, &terrace), ahead, 0), NOT_DRIVABLE);
+}
+
+#[test]
+fn criterion_3_a_gate_narrower_than_3_m_is_not_crossed() {
+    // A bank 0.14 m high behind a wall 15 m ahead, with a gap in the wall.
+    let gate = |half_width: f32| {
+        painted(move |_, _, x, y| {
+            let wall = (15.0..17.0).contains(&x.hypot(y)) && (y.abs() > half_width || x < 0.0);
+            Some(if wall {
+                1.0
+            } else if x.hypot(y) >= 15.0 {
+                0.14
+            } else {
+                0.0
+            })
+        })
+    };
+    let behind = row_at(25.0);
+    assert_eq!(class(&map(&DrivabilityConfig::default(), &gate(2.0)), behind, 0), DRIVABLE);
+    assert_eq!(class(&map(&DrivabilityConfig::default(), &gate(1.0)), behind, 0), NOT_DRIVABLE);
+    let open = DrivabilityConfig { gate_m_min: 0.0, ..DrivabilityConfig::default() };
+    assert_eq!(class(&map(&open, &gate(1.0)), behind, 0), DRIVABLE);
+}
+
+#[test]
+fn empty_rows_are_bridged_as_far_as_configured() {
+    let (near, far) = (row_at(15.0), row_at(25.0));
+    let gap = |rows: usize| painted(move |row, _, _, _| (!(near..near + rows).contains(&row)).then_some(0.0));
+    for (bridge_rows, empty_rows, reached) in [(0, 1, false), (1, 1, true), (1, 2, false), (2, 2, true), (2, 3, false)]
+    {
+        let config = DrivabilityConfig { bridge_rows, ..DrivabilityConfig::default() };
+        let layer = map(&config, &gap(empty_rows));
+        let expected = if reached { DRIVABLE } else { OBSTACLE };
+        assert_eq!(class(&layer, far, 7), expected, "{bridge_rows} bridged, {empty_rows} empty");
+        assert_eq!(class(&layer, near, 7), UNKNOWN, "a bridged cell is still unknown");
+    }
+}
+
+#[test]
+fn the_thesis_single_seed_needs_a_point_in_cell_0_0() {
+    let config = DrivabilityConfig { seed: Seed::FirstCell, ..DrivabilityConfig::default() };
+    let whole = painted(|_, _, _, _| Some(0.0));
+    assert_eq!(figure(&map(&config, &whole), "drivable_share"), 1.0);
+    let without = painted(|row, column, _, _| (row + column > 0).then_some(0.0));
+    assert_eq!(figure(&map(&config, &without), "drivable_share"), 0.0);
+    assert_eq!(figure(&map(&DrivabilityConfig::default(), &without), "drivable_share"), 1.0);
+}
+
+#[test]
+fn a_high_thing_beside_the_vehicle_is_no_seed() {
+    // A wall fills the innermost rows of the left side, as a neighbour at a traffic light does.
+    let (first, last) = (0, row_at(6.0));
+    let sweep = painted(move |row, column, _, _| {
+        Some(if (60..120).contains(&column) && (first..last).contains(&row) { 1.5 } else { 0.0 })
+    });
+    let layer = map(&DrivabilityConfig::default(), &sweep);
+    assert_eq!(class(&layer, 0, 90), OBSTACLE);
+    assert_eq!(class(&layer, 0, 0), DRIVABLE);
+}
+
+#[test]
+fn a_plane_is_found_through_sloping_ground() {
+    let sweep = painted(|_, _, x, y| Some(0.001 * x - 0.0005 * y + 0.01));
+    let layer = map(&DrivabilityConfig::default(), &sweep);
+    assert_eq!(layer.planes.len(), 2);
+    let [a, b, c] = layer.planes[0];
+    assert!((a - 0.001).abs() < 1e-6 && (b + 0.0005).abs() < 1e-6 && (c - 0.01).abs() < 1e-5, "{a} {b} {c}");
+    assert_eq!(layer.planes[1], [0.0; 3], "the unreachable segment has none");
+}
+
+#[test]
+fn a_blocked_sector_is_unknown_and_never_drivable() {
+    let sweep = painted(|_, column, _, _| (!(30..60).contains(&column)).then_some(0.0));
+    let layer = map(&DrivabilityConfig::default(), &sweep);
+    let (rows, _) = size(&layer);
+    for row in 0..rows {
+        for column in 30..60 {
+            assert_eq!(class(&layer, row, column), UNKNOWN);
+        }
+    }
+}
+
+#[test]
+fn one_table_shared_by_all_revolutions_or_an_equal_one_makes_the_same_rows() {
+    let sweep = painted(|_, _, _, _| Some(0.0));
+    let mut drivability = Drivability::new(&DrivabilityConfig::default());
+    let (mut one, mut two) = (drivability.layer(), drivability.layer());
+    drivability.make(&sweep, &mut one);
+    let equal = Arc::new(Calibration::clone(sweep.calibration.as_ref().unwrap()));
+    drivability.make(&Sweep { calibration: Some(equal), ..sweep }, &mut two);
+    assert_eq!(one, two);
+}

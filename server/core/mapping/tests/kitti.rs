@@ -1,0 +1,106 @@
+//! Real HDL-64E scans: the labelled SemanticKITTI frame against its labels.
+
+#![cfg_attr(not(clearway_data), allow(unused))]
+
+mod common;
+
+use clearway_mapping::config::{DrivabilityConfig, Gate};
+use clearway_mapping::layer::drivability::{DRIVABLE, Drivability, UNKNOWN};
+use clearway_mapping::map::{Layer, LayerMaker};
+use clearway_mapping::layer::radial_grid::RadialGrid;
+use clearway_mapping::sensor::sweep::Sweep;
+use common::labels::*;
+use common::*;
+
+/// What the labels say of the frame, cell by cell.
+struct Labelled {
+    /// Cells with road or lane marking, and without an obstacle.
+    road: Vec<bool>,
+    /// Cells with an obstacle: a point of anything but ground, 0.3 to 2.5 m over the ground about it.
+    obstacle: Vec<bool>,
+    /// Ground without obstacle that can be reached over such cells from the blind zone, empty rows bridged.
+    reachable: Vec<bool>,
+}
+
+fn by_cell(sweep: &Sweep, labels: &[u32], layer: &Layer) -> Labelled {
+    let (rows, columns) = size(layer);
+    let grid = RadialGrid::new(benches(layer).to_vec(), columns as u16);
+    let cells = rows * columns;
+    let TruthByCell { road, free, obstacle } = truth_by_cell(sweep, labels, cells, |x, y| grid.cell(x, y));
+
+    let known = |cell: &usize| classes(layer)[*cell] != UNKNOWN;
+    let mut reachable = vec![false; cells];
+    let mut waiting = Vec::new();
+    for column in 0..columns {
+        let innermost = (0..rows).take_while(|row| grid.row_span_m(*row).0 < 7.0).map(|row| row * columns + column);
+        waiting.extend(innermost.into_iter().find(known).filter(|cell| free[*cell]));
+    }
+    while let Some(cell) = waiting.pop() {
+        if std::mem::replace(&mut reachable[cell], true) {
+            continue;
+        }
+        let (row, column) = (cell / columns, cell % columns);
+        let outward = (1..=3).map(|step| cell + step * columns).take_while(|c| *c < cells).find(known);
+        let inward = (1..=3).take_while(|step| *step <= row).map(|step| cell - step * columns).find(known);
+        let sideways = [1, columns - 1].map(|step| Some(row * columns + (column + step) % columns));
+        let next = [outward, inward].into_iter().chain(sideways).flatten();
+        waiting.extend(next.filter(|next| free[*next] && !reachable[*next]));
+    }
+    Labelled { road, obstacle, reachable }
+}
+
+fn shares(config: &DrivabilityConfig) -> [f64; 3] {
+    let (sweep, labels) = labelled_frame();
+    let mut map = Drivability::new(config);
+    let mut layer = map.layer();
+    map.make(&sweep, &mut layer);
+    let truth = by_cell(&sweep, &labels, &layer);
+    let drivable: Vec<bool> = classes(&layer).iter().map(|class| *class == DRIVABLE).collect();
+    let free = share(&drivable, |cell| !truth.obstacle[cell]);
+    let road = share(&truth.road, |cell| drivable[cell]);
+    let reachable = share(&truth.reachable, |cell| drivable[cell]);
+    println!(
+        "{:>3} columns, {} bridged, close_gaps {:<5}: share {:.4}; of drivable cells free of obstacles {:.3} %; drivable of \
+         road {:.2} %, of reachable ground {:.2} %",
+        config.columns,
+        config.bridge_rows,
+        config.close_gaps,
+        figure(&layer, "drivable_share"),
+        100.0 * free,
+        100.0 * road,
+        100.0 * reachable
+    );
+    [free, road, reachable]
+}
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn the_labelled_frame_reaches_its_targets() {
+    let [free, road, reachable] = shares(&DrivabilityConfig::default());
+    assert!(free >= 0.9995, "{free}");
+    assert!(road >= 0.99, "{road}");
+    assert!(reachable >= 0.95, "{reachable}");
+}
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn wider_columns_and_the_thesis_own_reading_stay_useful() {
+    let own = DrivabilityConfig::default();
+    let thesis = DrivabilityConfig {
+        bridge_rows: 0,
+        close_gaps: false,
+        step_m_max: 0.5,
+        gate: Gate::BetweenSegments,
+        ..own.clone()
+    };
+    let readings = [
+        DrivabilityConfig { columns: 180, ..own.clone() },
+        DrivabilityConfig { columns: 90, ..own.clone() },
+        thesis.clone(),
+        DrivabilityConfig { offset_m: 0.0, ..thesis },
+    ];
+    for config in readings {
+        let [free, road, reachable] = shares(&config);
+        assert!(free >= 0.997 && road >= 0.97 && reachable >= 0.95, "{config:?}");
+    }
+}

@@ -1,0 +1,73 @@
+//! Whatever the rays: every cell is written, and their order says nothing.
+
+use clearway_mapping::config::OccupancyConfig;
+use clearway_mapping::map::{LayerMaker, Rays};
+use clearway_mapping::layer::occupancy::Occupancy;
+use clearway_mapping::layer::occupancy::states::{CLEAR, LEGEND, OCCLUDED};
+use clearway_mapping::sensor::sweep::Sweep;
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use proptest::prelude::*;
+
+use crate::common::*;
+use crate::made;
+
+/// Positions near the vehicle, and all the floats there are but NaN.
+fn coordinate() -> impl Strategy<Value = f32> {
+    prop_oneof![8 => -70f32..70.0, 1 => -0.5f32..0.5, 1 => any::<f32>().prop_filter("NaN", |v| !v.is_nan())]
+}
+
+fn any_pose() -> impl Strategy<Value = Option<Isometry3<f64>>> {
+    let place = || prop_oneof![4 => -60f64..60.0, 1 => -1e9f64..1e9];
+    let turn = (-4f64..4.0, -0.2f64..0.2, -0.2f64..0.2);
+    prop::option::of((place(), place(), turn).prop_map(|(x, y, (yaw, pitch, roll))| {
+        let rotation = UnitQuaternion::from_euler_angles(roll, pitch, yaw);
+        Isometry3::from_parts(Translation3::from(Vector3::new(x, y, 0.0)), rotation)
+    }))
+}
+
+/// Returns, rays without, the sensor's place, its number, the vehicle's pose.
+type AnyScan = (Vec<[f32; 3]>, Vec<[f32; 3]>, [f32; 3], u16, Option<Isometry3<f64>>);
+
+fn any_scan() -> impl Strategy<Value = AnyScan> {
+    let height = prop_oneof![4 => -0.6f32..6.0, 1 => coordinate()];
+    let points = prop::collection::vec((coordinate(), coordinate(), height).prop_map(|(x, y, z)| [x, y, z]), 0..300);
+    let unit = || -1f32..1.0;
+    let none = prop::collection::vec((unit(), unit(), unit()).prop_map(|(x, y, z)| [x, y, z]), 0..20);
+    let origin = (coordinate(), coordinate(), 0.0f32..4.0).prop_map(|(x, y, z)| [x, y, z]);
+    (points, none, origin, any::<u16>(), any_pose())
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn whatever_the_rays_every_cell_is_written_and_their_order_says_nothing(
+        scans in prop::collection::vec(any_scan(), 1..4), cell_m in 0.2f32..1.0, range_m_max in 5f32..200.0,
+        no_return_m in 0f32..100.0, hits_slow in 1u8..40, hits_fast in 1u8..3, seed in any::<u64>(),
+    ) {
+        let config = OccupancyConfig { cell_m, range_m_max, no_return_m, hits_slow, hits_fast, ..OccupancyConfig::default() };
+        let [mut map, mut again] = [Occupancy::new(&config), Occupancy::new(&config)];
+        for (points, no_returns, origin_m, sensor, map_from_ego) in &scans {
+            let mut sweep = Sweep::default();
+            points.iter().for_each(|point| add(&mut sweep, *point));
+            let other = shuffled(&sweep, seed);
+            let rays = |returns| Rays {
+                sensor: *sensor, stamp_ns: 0, returns, origin_m: *origin_m, no_returns, map_from_ego: *map_from_ego,
+                speed_mps: Some(3.0),
+            };
+            map.take(&rays(&sweep));
+            again.take(&rays(&other));
+            let layer = made(&mut map, *map_from_ego);
+            let (rows, columns) = size(&layer);
+            let hits = values(&layer, "hits");
+            prop_assert_eq!((classes(&layer).len(), hits.len()), (rows * columns, rows * columns));
+            for (class, hits) in classes(&layer).iter().zip(&hits) {
+                prop_assert!(usize::from(*class) < LEGEND.len() && (*class != CLEAR || *hits == 0));
+            }
+            if points.is_empty() && no_returns.is_empty() {
+                prop_assert!(classes(&layer).iter().all(|class| *class != CLEAR && *class != OCCLUDED));
+            }
+            prop_assert_eq!(layer, made(&mut again, *map_from_ego));
+        }
+    }
+}

@@ -1,0 +1,276 @@
+//! Safe points: as far from two obstacles, with exact radii, through every gate the vehicle fits and no other.
+
+mod common;
+
+use clearway_lidar::model::Model;
+use clearway_mapping::config::{DrivabilityConfig, SafePathConfig};
+use clearway_mapping::layer::drivability::{self, Drivability};
+use clearway_mapping::map::{Context, Layer, LayerMaker};
+use clearway_mapping::layer::safe_path::distance::Distances;
+use clearway_mapping::layer::safe_path::free::State;
+use clearway_mapping::layer::safe_path::links::Links;
+use clearway_mapping::layer::safe_path::ridge::{Point, Ridge};
+use clearway_mapping::layer::safe_path::{FREE, OBSTACLE, PATH, SafePath, UNKNOWN};
+use clearway_mapping::sensor::sweep::Sweep;
+use common::*;
+use proptest::prelude::*;
+
+/// Ridge and links of a grid.
+fn paths(side: usize, states: &[State], width_cells: f64) -> (Ridge, Links) {
+    let mut distances = Distances::new(side);
+    distances.measure(states);
+    let (mut ridge, mut links) = (Ridge::new(side), Links::default());
+    ridge.find(states, &distances, width_cells);
+    links.link(&ridge, states, &distances, width_cells, side as f64);
+    (ridge, links)
+}
+
+fn closed(side: usize, states: &[State]) -> Vec<[i32; 2]> {
+    let cells = (0..side * side).filter(|cell| !states[*cell].is_free());
+    cells.map(|cell| [(cell % side) as i32, (cell / side) as i32]).collect()
+}
+
+/// Squared distance from a place to a cell's square, half cells.
+fn to_square(place: [i32; 2], cell: [i32; 2]) -> i32 {
+    let along = |i: usize| ((place[i] - 2 * cell[i]).abs() - 1).max(0);
+    along(0) * along(0) + along(1) * along(1)
+}
+
+/// A court of free cells with a wall one cell thick across it, and a gate of that many cells in the wall. The vehicle
+/// stands in the middle; the wall is five cells before it.
+fn court_with_gate(side: usize, gate_from: usize, gate_cells: usize, across_x: bool) -> Vec<State> {
+    let mut states = vec![State::Drivable; side * side];
+    for k in 0..side {
+        for border in [k, (side - 1) * side + k, k * side, k * side + side - 1] {
+            states[border] = State::Obstacle;
+        }
+    }
+    let wall = side / 2 + 12;
+    for k in (0..side).filter(|k| !(gate_from..gate_from + gate_cells).contains(k)) {
+        states[if across_x { k * side + wall } else { wall * side + k }] = State::Obstacle;
+    }
+    states
+}
+
+#[test]
+fn a_gate_exactly_as_wide_as_the_vehicle_is_a_way_through_and_a_narrower_one_is_not() {
+    let side = 80;
+    for width in [5, 6, 7, 8, 9, 12] {
+        for gate_from in [20, 33, 34, 47] {
+            for (gate, across_x) in
+                [(width - 1, true), (width - 1, false), (width, true), (width, false), (width + 1, true)]
+            {
+                let states = court_with_gate(side, gate_from, gate, across_x);
+                let (_, links) = paths(side, &states, width as f64);
+                let beyond = |point: &&Point| point.place[usize::from(!across_x)] > 2 * (side as i32 / 2 + 13);
+                let through = links.points().iter().any(|point| beyond(&point));
+                assert!(links.points().len() > 20, "there are paths on the vehicle's side");
+                assert_eq!(through, gate >= width, "vehicle {width}, gate {gate} from {gate_from}, x {across_x}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_corridor_has_its_middle_line_with_half_its_width_as_radius() {
+    let side = 60;
+    for free in [7usize, 8] {
+        let inside = |cell: usize| (26..26 + free).contains(&(cell / side));
+        let states: Vec<State> =
+            (0..side * side).map(|cell| if inside(cell) { State::Drivable } else { State::Unknown }).collect();
+        let (_, links) = paths(side, &states, 4.0);
+        let line: Vec<_> = links.points().iter().skip(1).collect();
+        assert_eq!(line.len(), side, "{free} cells");
+        for point in line {
+            assert_eq!(point.clearance_squared, (free * free) as i32);
+            // The middle of 7 cells is a cell's, that of 8 lies between two.
+            assert_eq!(point.place[1], 2 * 26 + free as i32 - 1);
+        }
+    }
+}
+
+#[test]
+fn open_ground_has_no_safe_points_and_closed_ground_neither() {
+    for state in [State::Drivable, State::Obstacle, State::Unknown, State::Blind] {
+        let (ridge, links) = paths(20, &[state; 400], 4.0);
+        assert_eq!((ridge.points().len(), links.points().len()), (0, 0));
+    }
+}
+
+/// Rectangles of obstacles and of unknown cells on drivable ground, with a few blind cells.
+fn worlds() -> impl Strategy<Value = (usize, Vec<State>)> {
+    let rectangle = (0usize..48, 0usize..48, 1usize..14, 1usize..5, 0u8..4);
+    (prop::collection::vec(rectangle, 0..14), prop::sample::select(vec![24usize, 40, 48])).prop_map(
+        |(rectangles, side)| {
+            let mut states = vec![State::Drivable; side * side];
+            for (x, y, long, wide, kind) in rectangles {
+                let (dx, dy) = if kind % 2 == 0 { (long, wide) } else { (wide, long) };
+                for iy in y..(y + dy).min(side) {
+                    for ix in x..(x + dx).min(side) {
+                        states[iy * side + ix] =
+                            [State::Obstacle, State::Unknown, State::Obstacle, State::Blind][usize::from(kind)];
+                    }
+                }
+            }
+            (side, states)
+        },
+    )
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(150))]
+
+    #[test]
+    fn every_cells_nearest_obstacle_is_the_nearest((side, states) in worlds()) {
+        let mut distances = Distances::new(side);
+        distances.measure(&states);
+        let closed = closed(side, &states);
+        for cell in 0..side * side {
+            let [x, y] = [(cell % side) as i32, (cell / side) as i32];
+            let squared = |[sx, sy]: [i32; 2]| (sx - x) * (sx - x) + (sy - y) * (sy - y);
+            let nearest = closed.iter().map(|site| squared(*site)).min();
+            prop_assert_eq!(distances.site(cell % side, cell / side).map(squared), nearest, "{} {}", x, y);
+        }
+    }
+
+    #[test]
+    fn safe_points_lie_on_drivable_ground_as_far_from_two_obstacles_with_exact_radii(
+        (side, states) in worlds(), width in 2f64..9.0,
+    ) {
+        let (ridge, links) = paths(side, &states, width);
+        let closed = closed(side, &states);
+        for point in ridge.points() {
+            prop_assert_eq!(states[point.cell], State::Drivable);
+            let exact = closed.iter().map(|cell| to_square(point.place, *cell)).min();
+            prop_assert_eq!(Some(point.clearance_squared), exact, "{:?}", point);
+            prop_assert!(f64::from(point.clearance_squared).sqrt() >= width, "{:?}", point);
+            // Two obstacles the vehicle fits between, as far away within a cell, from middle to middle.
+            let away = |cell: &[i32; 2]| {
+                f64::from(point.place[0] - 2 * cell[0]).hypot(f64::from(point.place[1] - 2 * cell[1])) / 2.0
+            };
+            let nearest = closed.iter().map(away).fold(f64::INFINITY, f64::min);
+            let near: Vec<_> = closed.iter().filter(|cell| away(cell) <= nearest + 1.0 + 1e-9).collect();
+            let apart = |a: &[i32; 2], b: &[i32; 2]| f64::from(a[0] - b[0]).hypot(f64::from(a[1] - b[1]));
+            prop_assert!(near.iter().any(|a| near.iter().any(|b| apart(a, b) >= width)), "{:?}", point);
+        }
+        // Lines one cell wide: no two by two cells of them, but where four lines meet, one at each cell.
+        let held = |[ix, iy]: [i32; 2]| ridge.point_in(ix, iy).is_some();
+        for [ix, iy] in (0..side as i32 - 1).flat_map(|iy| (0..side as i32 - 1).map(move |ix| [ix, iy])) {
+            let block = [[ix, iy], [ix + 1, iy], [ix, iy + 1], [ix + 1, iy + 1]];
+            let around = |[x, y]: [i32; 2]| (y - 1..=y + 1).flat_map(move |y| (x - 1..=x + 1).map(move |x| [x, y]));
+            let goes_on = |cell: [i32; 2]| around(cell).any(|beside| !block.contains(&beside) && held(beside));
+            prop_assert!(!block.iter().all(|cell| held(*cell)) || block.iter().all(|cell| goes_on(*cell)), "{:?}", block);
+        }
+        // Links lead back, and on to where the vehicle is.
+        for (index, point) in links.points().iter().enumerate() {
+            prop_assert_eq!(point.links.is_empty(), index == 0, "{:?}", point);
+            prop_assert!(point.links.is_sorted_by(|a, b| a < b));
+            for &link in &point.links {
+                prop_assert!((link as usize) < index);
+                let other = &links.points()[link as usize];
+                let apart = [0, 1].map(|i| (point.place[i] - other.place[i]).abs());
+                prop_assert!(link == 0 || apart.iter().all(|half_cells| *half_cells <= 4), "{:?} {:?}", point, other);
+            }
+        }
+        let reached = links.points().len().saturating_sub(1);
+        prop_assert_eq!(reached + links.not_reached(), ridge.points().len());
+    }
+}
+
+/// Drivability and safe paths of a sweep.
+fn make(sweep: &Sweep, config: &SafePathConfig) -> (Layer, Layer) {
+    let mut drivability = Drivability::new(&DrivabilityConfig::default());
+    let mut earlier = [drivability.layer()];
+    drivability.make(sweep, &mut earlier[0]);
+    let mut map = SafePath::new(config);
+    let mut layer = map.layer();
+    map.make_with(sweep, &Context { earlier: &earlier, ..Context::default() }, &mut layer);
+    let [drivability] = earlier;
+    (drivability, layer)
+}
+
+#[test]
+fn a_courts_paths_start_at_the_vehicle_and_stay_on_its_drivable_ground() {
+    let config = SafePathConfig::default();
+    let (drivability, layer) = make(&cast(Model::Hdl64eS2, court), &config);
+    assert_eq!((layer.points[0].x_m, layer.points[0].y_m), (0.0, 0.0));
+    // The court is 16 m wide: its middle line runs past the vehicle, forward and back.
+    assert!(layer.points.len() > 60, "{} points", layer.points.len());
+    let reach = |most: fn(f64, f64) -> f64| layer.points.iter().map(|point| point.x_m).fold(0.0, most);
+    assert!(reach(f64::max) > 6.0 && reach(f64::min) < -10.0, "{} {}", reach(f64::min), reach(f64::max));
+    for point in &layer.points[1..] {
+        let cell = cell_at(&layer, point.x_m as f32 - 1e-3, point.y_m as f32 - 1e-3).unwrap();
+        assert!(point.radius_m >= 1.0, "{point:?}");
+        // The point lies in its cell or on its border.
+        let (_, columns) = size(&layer);
+        let near = [cell, cell + 1, cell + columns, cell + columns + 1];
+        assert!(near.iter().any(|cell| classes(&layer)[*cell] == PATH), "{point:?}");
+    }
+    for (cell, class) in classes(&layer).iter().enumerate() {
+        let (_, columns) = size(&layer);
+        let middle = |i: usize| (i as f32 + 0.5) * 0.25 - 30.0;
+        let there =
+            classes(&drivability)[cell_at(&drivability, middle(cell % columns), middle(cell / columns)).unwrap()];
+        let expected = match there {
+            drivability::UNKNOWN => UNKNOWN,
+            drivability::DRIVABLE if *class == PATH => PATH,
+            drivability::DRIVABLE => FREE,
+            _ => OBSTACLE,
+        };
+        assert_eq!(*class, expected);
+    }
+}
+
+#[test]
+fn the_vehicles_own_bonnet_is_no_obstacle_and_a_box_before_it_is() {
+    // 1.6 m wide and 0.9 m high, from `front` back by 0.7 m: it hides the ground behind it.
+    let with_box = |front: f32, vehicle_front_m: f32| {
+        let inside = |x: f32, y: f32, z: f32| {
+            court(x, y, z) || ((front - 0.7..front).contains(&x) && y.abs() < 0.8 && (0.3..0.9).contains(&z))
+        };
+        make(&cast(Model::Hdl64eS2, inside), &SafePathConfig { vehicle_front_m, ..SafePathConfig::default() }).1
+    };
+    // The way the vehicle drives at first: right before it.
+    let ahead = |layer: &Layer| {
+        let near = |x: f64, y: f64| (3.0..6.0).contains(&x) && y.abs() < 1.0;
+        layer.points.iter().filter(|point| near(point.x_m, point.y_m)).count()
+    };
+    let room = |layer: &Layer| layer.points[0].radius_m;
+    let (own, before) = (with_box(2.9, 3.0), with_box(4.2, 3.0));
+    let unknown_outline = with_box(2.9, 0.0);
+    assert!(room(&own) > 2.0 && room(&unknown_outline) < 1.5, "{} {}", room(&own), room(&unknown_outline));
+    let reach = |layer: &Layer| layer.points.iter().map(|point| point.x_m).fold(0.0, f64::max);
+    assert!(reach(&own) > 6.0, "{}", reach(&own));
+    assert_eq!(ahead(&before), 0);
+    // What it hides is not free either, but for the blind zone.
+    let free = |layer: &Layer| classes(layer)[cell_at(layer, 3.4, 0.1).unwrap()];
+    assert_eq!((free(&own), free(&before)), (UNKNOWN, OBSTACLE));
+}
+
+#[test]
+fn without_drivability_nothing_is_known() {
+    let mut map = SafePath::new(&SafePathConfig::default());
+    let mut layer = map.layer();
+    map.make(&cast(Model::Vlp16, plain), &mut layer);
+    assert!(classes(&layer).iter().all(|class| *class == UNKNOWN));
+    assert_eq!(layer.points, []);
+}
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn real_streets_have_paths_both_ways() {
+    for frame in 0..3 {
+        use clearway_lidar::calibration::Calibration;
+        use clearway_mapping::sensor::sweep::Mount;
+
+        let scan = kitti(&format!("kitti/patchwork-plusplus/00000{frame}.bin"));
+        // The vehicle's own bonnet returns from (2.5, ±0.5, 0.8) m in these scans: it is no obstacle.
+        let mount = Mount { ego_from_sensor: nalgebra::Isometry3::translation(0.0, 0.0, 1.73), range_m_min: 2.0 };
+        let mut sweep = Sweep::default();
+        sweep.take_scan(&scan, &std::sync::Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount);
+        let (_, layer) = make(&sweep, &SafePathConfig::default());
+        let reach = |most: fn(f64, f64) -> f64| layer.points.iter().map(|point| point.x_m).fold(0.0, most);
+        println!("{frame}: {:?} x {} to {} m", layer.figures, reach(f64::min), reach(f64::max));
+        assert!(reach(f64::max) > 25.0 && reach(f64::min) < -25.0, "frame {frame}");
+    }
+}

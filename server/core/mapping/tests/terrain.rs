@@ -1,0 +1,349 @@
+//! Neuhaus' terrain map against labels, against its paper's figures and against the simulator.
+
+#![cfg_attr(not(clearway_data), allow(unused))]
+
+mod common;
+
+use clearway_lidar::model::Model;
+use clearway_mapping::config::{Form, TerrainConfig};
+use clearway_mapping::map::{Layer, LayerMaker};
+use clearway_mapping::sensor::distance_series::Series;
+use clearway_mapping::sensor::sweep::{Mount, Sweep};
+use clearway_mapping::layer::terrain::{
+    FLAT, FLAT_ELEVATED, FLAT_INFERRED, FLAT_UNREACHABLE, OBSTACLE, ROUGHNESS_UNKNOWN, SHAPE_LINE, SHAPE_PLANE,
+    SHAPE_SCATTER, SHAPE_UNKNOWN, Terrain,
+};
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes::{self, Scene};
+use clearway_sim::truth::Truth;
+use clearway_sim::vehicle::SimulatedVehicle;
+use common::labels::*;
+use common::*;
+
+fn terrain(sweep: &Sweep, config: &TerrainConfig) -> Layer {
+    let mut map = Terrain::new(config);
+    let mut layer = map.layer();
+    map.make(sweep, &mut layer);
+    layer
+}
+
+fn form(form: Form) -> TerrainConfig {
+    TerrainConfig { form, ..TerrainConfig::default() }
+}
+
+/// Cells by class, in the order of the legend.
+fn counts(layer: &Layer) -> Vec<usize> {
+    (0..5).map(|class| classes(layer).iter().filter(|held| **held == class).count()).collect()
+}
+
+fn is_drivable(class: u8) -> bool {
+    matches!(class, FLAT | FLAT_INFERRED)
+}
+
+/// Bytes of a channel in the wire's runs: value and length, a varint each.
+fn run_bytes(layer: &Layer, channel: &str) -> usize {
+    let varint = |v: usize| (1..10).find(|bytes| v < 1 << (7 * bytes)).unwrap();
+    let runs = values(layer, channel);
+    runs.chunk_by(|a, b| a == b).map(|run| varint(run[0].unsigned_abs() as usize) + varint(run.len() - 1)).sum()
+}
+
+/// Share of the flat cells, seen or inferred, that are free of obstacles; share of the road's that are flat.
+fn against_the_labels(config: &TerrainConfig) -> [f64; 2] {
+    let (sweep, labels) = labelled_frame();
+    let layer = terrain(&sweep, config);
+    let (rows, columns) = size(&layer);
+    let truth = truth_by_cell(&sweep, &labels, rows * columns, |x, y| cell_at(&layer, x, y));
+    let flat: Vec<bool> = classes(&layer).iter().map(|class| is_drivable(*class)).collect();
+    let leaks = (0..flat.len()).filter(|cell| flat[*cell] && truth.obstacle[*cell]).count();
+    let [free, road] = [share(&flat, |cell| !truth.obstacle[cell]), share(&truth.road, |cell| flat[cell])];
+    let seen_flat: Vec<bool> = classes(&layer).iter().map(|class| *class == FLAT).collect();
+    println!(
+        "{:?}: of flat cells free of obstacles {:.3} % ({leaks} are not), of those seen {:.3} %; of road flat {:.2} %; cells {:?}",
+        config.form,
+        100.0 * free,
+        100.0 * share(&seen_flat, |cell| !truth.obstacle[cell]),
+        100.0 * road,
+        counts(&layer)
+    );
+    [free, road]
+}
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn the_labelled_frame_reaches_its_targets_beside_the_paper_and_the_plain_grid() {
+    let [grid_free, grid_road] = against_the_labels(&form(Form::Grid));
+    let [paper_free, paper_road] = against_the_labels(&form(Form::Paper));
+    let [free, road] = against_the_labels(&form(Form::Grounded));
+    assert!(free >= 0.998, "{free}");
+    assert!(road >= 0.99, "{road}");
+    // What the paper's hierarchy is for, and what it lets through.
+    assert!(paper_road > 0.99 && grid_road < 0.8, "{paper_road} {grid_road}");
+    assert!(paper_free < 0.99 && grid_free < 0.99, "{paper_free} {grid_free}");
+}
+
+/// Cells between two flat ones of a row or column at most 3 m apart that the plain grid knows nothing of.
+fn holes(grid: &Layer) -> Vec<usize> {
+    let (_, width) = size(grid);
+    let class = classes(grid);
+    let mut holes = vec![false; class.len()];
+    for line in 0..width {
+        for (first, stride) in [(line * width, 1), (line, width)] {
+            let mut last: Option<usize> = None;
+            for cell in (0..width).map(|place| first + place * stride) {
+                match class[cell] {
+                    FLAT => {
+                        if let Some(last) = last.filter(|last| (cell - last) / stride <= 13) {
+                            (last + stride..cell).step_by(stride).for_each(|cell| holes[cell] = true);
+                        }
+                        last = Some(cell);
+                    }
+                    OBSTACLE => last = None,
+                    _ => {}
+                }
+            }
+        }
+    }
+    (0..class.len()).filter(|cell| holes[*cell]).collect()
+}
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn merging_closes_the_holes_of_the_plain_grid_on_real_scans() {
+    for number in 0..3 {
+        let sweep = kitti_sweep(&format!("kitti/patchwork-plusplus/00000{number}.bin"));
+        let [grid, paper, grounded] = [Form::Grid, Form::Paper, Form::Grounded].map(|f| terrain(&sweep, &form(f)));
+        let holes = holes(&grid);
+        let closed = |layer: &Layer| {
+            let closed = holes.iter().filter(|cell| is_drivable(classes(layer)[**cell])).count();
+            closed as f64 / holes.len() as f64
+        };
+        let (paper, grounded) = (closed(&paper), closed(&grounded));
+        println!(
+            "scan {number}: {} holes in figure 5's grid; figure 6 closes {:.1} %, grounded {:.1} %",
+            holes.len(),
+            100.0 * paper,
+            100.0 * grounded
+        );
+        assert!(holes.len() > 5_000 && paper > 0.9 && grounded > 0.85, "{paper} {grounded}");
+    }
+}
+
+#[test]
+fn a_town_and_an_open_plain_fit_a_message_of_64_kib() {
+    for scene in [scenes::flat(), scenes::town(), scenes::dirt_track_between_fields()] {
+        let layer = terrain(&turn(scene), &TerrainConfig::default());
+        let [class, roughness] = ["class", "roughness"].map(|channel| run_bytes(&layer, channel));
+        println!("{class} bytes of class, {roughness} of roughness");
+        assert!(class + roughness < 65_000);
+    }
+}
+
+#[test]
+fn an_evenly_sloping_plane_is_flat() {
+    for (grade, forms) in [(0.15, &[Form::Grounded, Form::Paper, Form::Grid][..]), (0.5, &[Form::Paper, Form::Grid])] {
+        let sweep = cast(Model::Hdl64eS2, |x, y, z| z <= grade * (0.8 * x + 0.6 * y));
+        for &form in forms {
+            let layer = terrain(&sweep, &TerrainConfig { form, overhang_m: 100.0, ..TerrainConfig::default() });
+            let [_, flat, _, elevated, obstacle] = counts(&layer)[..] else { unreachable!() };
+            println!("{grade} {form:?}: {flat} flat, {elevated} elevated, {obstacle} obstacles");
+            assert!(flat > 1000 && elevated == 0 && obstacle == 0, "{form:?} {grade}");
+        }
+    }
+    // Beyond what can be driven the paper still calls it flat.
+    let steep = cast(Model::Hdl64eS2, |x, _, z| z <= 0.5 * x);
+    let layer = terrain(&steep, &TerrainConfig { overhang_m: 100.0, ..TerrainConfig::default() });
+    assert_eq!(counts(&layer)[usize::from(FLAT)], 0);
+}
+
+#[test]
+fn a_roof_is_flat_to_the_paper_and_elevated_to_the_grounded_form() {
+    // A low flat-topped block, 4 m by 6 m, whose top the sensor looks down on.
+    let block = |x: f32, y: f32, z: f32| z <= 0.0 || (z <= 1.2 && (8.03..12.03).contains(&x) && y.abs() <= 3.03);
+    let sweep = cast(Model::Hdl64eS2, block);
+    let top = |layer: &Layer| {
+        let cells = (0..12).flat_map(|i| (0..16).map(move |j| (8.6 + 0.25 * i as f32, -1.9 + 0.25 * j as f32)));
+        let mut seen = [0; 5];
+        cells.for_each(|(x, y)| seen[usize::from(classes(layer)[cell_at(layer, x, y).unwrap()])] += 1);
+        seen
+    };
+    let paper = top(&terrain(&sweep, &form(Form::Paper)));
+    let grounded = top(&terrain(&sweep, &form(Form::Grounded)));
+    println!("on top: paper {paper:?}, grounded {grounded:?}");
+    assert!(paper[usize::from(FLAT)] > 20 && paper[usize::from(FLAT_INFERRED)] > 20);
+    assert!(grounded[usize::from(FLAT_ELEVATED)] > 20);
+    assert_eq!(grounded[usize::from(FLAT)] + grounded[usize::from(FLAT_INFERRED)], 0);
+}
+
+#[test]
+fn nothing_is_inferred_beyond_the_last_point_or_across_a_wide_hole() {
+    // Level ground ahead only, from 4 to 10 m and from 14 m on: a hole of 4 m is wider than the configured 3 m.
+    let mut sweep = empty(Model::Hdl64eS2);
+    for i in 0..80 {
+        for j in -40..40 {
+            let x = 4.1 + 0.2 * i as f32;
+            if !(10.0..14.0).contains(&x) {
+                add(&mut sweep, [x, 0.05 + 0.1 * j as f32, 0.0]);
+            }
+        }
+    }
+    let at = |layer: &Layer, x: f32, y: f32| layer.legend[usize::from(classes(layer)[cell_at(layer, x, y).unwrap()])];
+    let grounded = terrain(&sweep, &form(Form::Grounded));
+    assert_eq!(at(&grounded, 6.1, 0.1), "flat");
+    assert_eq!(at(&grounded, 17.1, 0.1), "flat");
+    for (x, y) in [(12.1, 0.1), (6.1, 8.1), (-6.1, 0.1), (40.0, 40.0)] {
+        assert_eq!(at(&grounded, x, y), "unknown", "{x} {y}");
+        assert_eq!(at(&terrain(&sweep, &form(Form::Paper)), x, y), "flat_inferred", "{x} {y}");
+    }
+    let wide = TerrainConfig { inference_m_max: 5.0, ..TerrainConfig::default() };
+    assert_eq!(at(&terrain(&sweep, &wide), 12.1, 0.1), "flat_inferred");
+}
+
+#[test]
+fn the_plain_grid_tells_scatter_line_and_plane_apart() {
+    let mut sweep = empty(Model::Hdl64eS2);
+    for k in 0..64 {
+        let (i, j) = (0.03 * (k % 8) as f32, 0.03 * (k / 8) as f32);
+        add(&mut sweep, [5.01 + i, 5.01 + j, 0.0]);
+        add(&mut sweep, [10.01 + 0.5 * i, 5.1, 0.01 * k as f32]);
+        let quarter = |place: i32| 0.06 * (place % 4) as f32;
+        add(&mut sweep, [15.02 + quarter(k), 5.02 + quarter(k / 4), quarter(k / 16)]);
+    }
+    add(&mut sweep, [20.1, 5.1, 0.0]);
+    let layer = terrain(&sweep, &form(Form::Grid));
+    let shape = |x: f32| values(&layer, "shape")[cell_at(&layer, x, 5.1).unwrap()];
+    let found = [5.1, 10.1, 15.1, 20.1].map(shape);
+    assert_eq!(found, [SHAPE_PLANE, SHAPE_LINE, SHAPE_SCATTER, SHAPE_UNKNOWN].map(i32::from));
+}
+
+#[test]
+fn the_plane_of_a_cell_is_the_ground_under_it() {
+    let sweep = cast(Model::Hdl64eS2, |x, y, z| z <= 0.04 * x - 0.08 * y);
+    let layer = terrain(&sweep, &TerrainConfig { planes: true, ..TerrainConfig::default() });
+    let (height, slope_x, slope_y) = (values(&layer, "height"), values(&layer, "slope_x"), values(&layer, "slope_y"));
+    for (x, y) in [(6.1f32, 2.1f32), (-8.4, 6.6), (5.1, -9.9)] {
+        let cell = cell_at(&layer, x, y).unwrap();
+        assert!((height[cell] as f32 * 0.05 - (0.04 * x - 0.08 * y)).abs() < 0.05, "{x} {y}: {}", height[cell]);
+        assert_eq!((slope_x[cell], slope_y[cell]), (2, -4));
+    }
+}
+
+fn turn(scene: Scene) -> Sweep {
+    let config = ScannerConfig::default();
+    let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
+    let revolution = SimulatedVehicle::new(scene, config).turn(1).revolution;
+    let mut sweep = Sweep::default();
+    sweep.take_revolution(&revolution, &mount);
+    sweep.take_deviations(&revolution, &mount, &mut Series::default(), None);
+    assert_eq!(sweep.deviation_m.len(), sweep.x.len());
+    sweep
+}
+
+/// Root of the mean r (eq. 4) of the cells with a roughness that `wanted(x, y)`, and their number.
+fn roughness(layer: &Layer, wanted: impl Fn(f32, f32) -> bool) -> (f64, usize) {
+    let (_, columns) = size(layer);
+    let channel = layer.channels.iter().find(|channel| channel.name == "roughness").unwrap();
+    let of_cell = values(layer, "roughness");
+    let centre = |place: usize| (place as f32 + 0.5 - columns as f32 / 2.0) * 0.25;
+    let cells: Vec<f64> = (0..of_cell.len())
+        .filter(|cell| of_cell[*cell] != i32::from(ROUGHNESS_UNKNOWN))
+        .filter(|cell| wanted(centre(cell % columns), centre(cell / columns)))
+        .map(|cell| (f64::from(of_cell[cell]) * f64::from(channel.scale)).powi(2))
+        .collect();
+    ((cells.iter().sum::<f64>() / cells.len() as f64).sqrt(), cells.len())
+}
+
+#[test]
+fn a_dirt_track_is_smoother_than_the_fields_beside_it_near_and_far_alike() {
+    let sweep = turn(scenes::dirt_track_between_fields());
+    // At 30 m a cell holds three points of one ring.
+    let layer = terrain(&sweep, &TerrainConfig { roughness_points_min: 3, ..TerrainConfig::default() });
+    assert_eq!(figure(&layer, "drivable_share"), 1.0);
+    let [near, far] = [10.0f32, 30.0].map(|distance| {
+        let ring = |x: f32, y: f32| (x.hypot(y) - distance).abs() < 0.15 * distance;
+        let half = scenes::TRACK_HALF_M as f32;
+        let (track, tracks) = roughness(&layer, |x, y| ring(x, y) && y.abs() < half - 0.5);
+        let (field, fields) = roughness(&layer, |x, y| ring(x, y) && (half + 0.5..8.0).contains(&y.abs()));
+        println!(
+            "at {distance} m: track {track:.5} ({tracks} cells), fields {field:.5} ({fields} cells): {:.1} times",
+            field / track
+        );
+        assert!(tracks > 50 && fields > 50);
+        assert!(field > 5.0 * track, "{track} {field}");
+        field
+    });
+    assert!((0.7..1.4).contains(&(near / far)), "{near} near, {far} far");
+}
+
+#[test]
+fn a_turn_without_series_has_flat_cells_of_unknown_roughness() {
+    let sweep = Sweep { deviation_m: Vec::new(), ..turn(scenes::flat()) };
+    let layer = terrain(&sweep, &TerrainConfig::default());
+    assert!(counts(&layer)[usize::from(FLAT)] > 10_000);
+    assert!(values(&layer, "roughness").iter().all(|raw| *raw == i32::from(ROUGHNESS_UNKNOWN)));
+}
+
+#[test]
+fn no_flat_cell_of_the_simulated_worlds_holds_an_object() {
+    for scene in scenes::of_the_thesis().into_iter().chain([scenes::town()]) {
+        let name = scene.name;
+        let config = ScannerConfig::default();
+        let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
+        let turn = SimulatedVehicle::new(scene, config).turn(1);
+        let mut sweep = Sweep::default();
+        sweep.take_revolution(&turn.revolution, &mount);
+        let [wrong, flat, found] = [Form::Grid, Form::Paper, Form::Grounded].map(|f| {
+            let layer = terrain(&sweep, &form(f));
+            let mut high = vec![false; classes(&layer).len()];
+            let mut free = vec![false; classes(&layer).len()];
+            for ((&x, &y), &z) in sweep.x.iter().zip(&sweep.y).zip(&sweep.z) {
+                let (Some(cell), Some(ground)) = (cell_at(&layer, x, y), turn.truth.height_at(x.into(), y.into()))
+                else {
+                    continue;
+                };
+                high[cell] |= z - ground > 0.3 && z <= 2.5;
+                free[cell] |= turn.truth.class_at(x.into(), y.into()) == Truth::Drivable && z - ground < 0.1;
+            }
+            let of = |held: &dyn Fn(usize) -> bool| (0..high.len()).filter(|cell| held(*cell)).count();
+            let drivable = |cell: usize| is_drivable(classes(&layer)[cell]);
+            let wrong = of(&|cell| drivable(cell) && high[cell]);
+            let is = of(&|cell| free[cell] && !high[cell]);
+            let found = of(&|cell| free[cell] && !high[cell] && drivable(cell));
+            [wrong as f64, of(&drivable) as f64, found as f64 / is as f64]
+        });
+        println!(
+            "{name}: grid {wrong:?}, paper {flat:?}, grounded {found:?} (flat cells with an object, flat, recall)"
+        );
+        assert!(found[0] <= 0.001 * found[1], "{name}: {found:?}");
+        assert!(found[2] >= 0.95, "{name}: {found:?}");
+    }
+}
+
+#[test]
+fn ground_behind_a_closed_fence_or_a_low_beam_is_flat_but_not_reached() {
+    for (scene, behind_min) in
+        [(scenes::fenced_road_under_canopy(), 1500), (scenes::fenced_road_with_low_overhang(), 2000)]
+    {
+        let name = scene.name;
+        let config = ScannerConfig::default();
+        let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
+        let turn = SimulatedVehicle::new(scene, config).turn(1);
+        let mut sweep = Sweep::default();
+        sweep.take_revolution(&turn.revolution, &mount);
+        let layer = terrain(&sweep, &TerrainConfig::default());
+        let unreachable = |cell: usize| {
+            let middle = |i: usize| (i as f64 + 0.5) * 0.25 - 50.0;
+            turn.truth.class_at(middle(cell % 400), middle(cell / 400)) == Truth::Unreachable
+        };
+        let count = |wanted: &dyn Fn(u8) -> bool| {
+            let cells = classes(&layer).iter().enumerate();
+            cells.filter(|(cell, class)| wanted(**class) && unreachable(*cell)).count()
+        };
+        let (reached, behind) = (count(&is_drivable), count(&|class| class == FLAT_UNREACHABLE));
+        println!("{name}: {reached} cells behind are drivable, {behind} are not");
+        // A cell of the fence's own line may hold ground of both sides.
+        assert!(reached <= 10 && behind >= behind_min, "{name}: {reached} {behind}");
+        // The paper's form knows no gate.
+        let open = terrain(&sweep, &TerrainConfig { form: Form::Paper, ..TerrainConfig::default() });
+        assert!(!classes(&open).contains(&FLAT_UNREACHABLE));
+    }
+}

@@ -1,0 +1,104 @@
+//! Simulated scenes -> maps through the real pipeline, with the truth of the world about every point.
+//!
+//! In: a scene's name. Out: frame after frame, a map and its [`Point`]s. The vehicle's datagrams, and its poses every
+//! 10 ms, enter as events; the truth is the simulator's, of the moment the map's capture ended.
+
+use bytes::Bytes;
+use clearway_mapping::event::{Body, EgoPose, Event};
+use clearway_mapping::pipeline::Pipeline;
+use clearway_mapping::sensor::sweep::Sweep;
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes::{self, Scene};
+use clearway_sim::truth::{Limits, Truth, TruthGrid};
+use clearway_sim::vehicle::SimulatedVehicle;
+
+use super::judge::{OBSTACLE_M_MAX, OBSTACLE_M_MIN, Point, Scored, Vote};
+
+/// Names a scene goes by, with how many revolutions of it are judged: in the thesis' scenes nothing moves.
+pub const SCENES: [(&str, u64); 5] = [("flat", 1), ("slopes", 1), ("canopy", 1), ("overhang", 1), ("town", 10)];
+
+/// The truth's raster: 60 m to each side in cells of 0.2 m.
+const RASTER_M: (f64, f64) = (60.0, 0.2);
+/// Lower points of a simulated turn are ground: ten times the sensor's noise, and the ground's own rise within a raster
+/// cell.
+const GROUND_M_MAX: f32 = 0.15;
+const POSE_PERIOD_NS: i64 = 10_000_000;
+
+/// The scene of that name.
+pub fn scene(name: &str) -> Option<Scene> {
+    Some(match name {
+        "flat" => scenes::flat(),
+        "slopes" => scenes::slopes_with_obstacles(),
+        "canopy" => scenes::fenced_road_under_canopy(),
+        "overhang" => scenes::fenced_road_with_low_overhang(),
+        "town" => scenes::town(),
+        _ => return None,
+    })
+}
+
+/// The sensor on the simulated vehicle's roof.
+pub fn scanner() -> ScannerConfig {
+    ScannerConfig::default()
+}
+
+/// Drives through the scene until `judge` has seen so many whole revolutions, each as the pipeline left it, and its
+/// points.
+pub fn drive(scene: Scene, pipeline: &mut Pipeline, revolutions: u64, mut judge: impl FnMut(&Pipeline, Vec<Point>)) {
+    let vehicle = SimulatedVehicle::new(scene, scanner());
+    let mut next_pose_ns = vehicle.start_ns();
+    let mut judged = 0;
+    for datagram in vehicle.clone() {
+        while next_pose_ns <= datagram.stamp_ns {
+            let (map_from_ego, speed_mps) = (vehicle.pose_at(next_pose_ns), vehicle.speed_at(next_pose_ns));
+            let pose = Body::EgoPose(EgoPose { stamp_ns: next_pose_ns, map_from_ego, speed_mps });
+            step(pipeline, next_pose_ns, pose);
+            next_pose_ns += POSE_PERIOD_NS;
+        }
+        let Some(end_ns) = step(pipeline, datagram.stamp_ns, Body::Datagram(Bytes::from(datagram.payload))) else {
+            continue;
+        };
+        let truth = vehicle.truth_at(end_ns, RASTER_M.0, RASTER_M.1, &Limits::default());
+        judge(pipeline, points(pipeline.newest_sweep(), &truth));
+        judged += 1;
+        if judged == revolutions {
+            return;
+        }
+    }
+}
+
+/// Stamp of the whole map the event made.
+fn step(pipeline: &mut Pipeline, arrival_ns: i64, body: Body) -> Option<i64> {
+    let made = pipeline.step(&Event { sequence: 0, arrival_ns, source: 0, body });
+    let map = made.expect("the pipeline takes what the simulator makes")?;
+    map.sensors.iter().all(|sensor| sensor.partial.is_empty()).then_some(map.capture_end_ns)
+}
+
+/// The truth about the points of a sweep.
+fn points(sweep: &Sweep, truth: &TruthGrid) -> Vec<Point> {
+    let place = |i: usize| [sweep.x[i], sweep.y[i], sweep.z[i]];
+    (0..sweep.x.len()).map(|i| point(place(i), truth)).collect()
+}
+
+fn point(place: [f32; 3], truth: &TruthGrid) -> Point {
+    let [x, y] = [place[0], place[1]].map(f64::from);
+    let Some(ground) = truth.height_at(x, y) else {
+        return Point { place, class: "outside", vote: Vote::Nothing, road: false, ground: [Scored::Not; 2] };
+    };
+    let over = place[2] - ground;
+    let here = truth.class_at(x, y);
+    let (class, vote) = match here {
+        _ if over > OBSTACLE_M_MAX => ("object", Vote::Nothing),
+        _ if over > OBSTACLE_M_MIN => ("object", Vote::Obstacle),
+        Truth::Steep => ("steep", Vote::Forbidden),
+        Truth::Unreachable => ("unreachable", Vote::Forbidden),
+        Truth::Drivable => ("ground", Vote::Drivable),
+        // Ground seen within a raster cell that something stands in: either answer is right.
+        Truth::Obstacle | Truth::Tight | Truth::Outside => ("ground", Vote::Either),
+    };
+    let scored = match here {
+        _ if over > GROUND_M_MAX => Scored::Other,
+        Truth::Obstacle | Truth::Outside => Scored::Not,
+        _ => Scored::Ground,
+    };
+    Point { place, class, vote, road: false, ground: [scored; 2] }
+}

@@ -1,0 +1,218 @@
+//! A recording -> one picture, array or document a map, or one file for viewers.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use clap::{Args, ValueEnum};
+use clearway_client::{Channel, Layer, MapView};
+
+use self::viewer_file::{Dialect, ViewerFile};
+use super::recording::{Message, Recording};
+use super::{document, npy, progress_bar, say};
+use crate::encode::picture::{self, Style};
+
+mod scans;
+mod viewer_file;
+
+/// Export the maps of a recording: one file a map, or one MCAP file for viewers.
+///
+/// Files are named by the map's sequence in six digits: png and json `<sequence>_<layer>.<format>`; npy
+/// `<sequence>_<layer>_<channel>.npy` (NumPy 1.0, shape (rows, columns)) and one `<sequence>_<layer>.json` with
+/// geometry, pose, stamps and class legend. Pictures look from above: vehicle in the middle, forward up, left left.
+///
+/// foxglove and ros2 write one new MCAP file with every layer, of every vehicle, and the sensors' points: coloured grids
+/// and transforms; or occupancy grids (0 free, 100 occupied, -1 unknown), tf and odometry.
+#[derive(Args)]
+pub struct Options {
+    /// The MCAP file; one cut by a crash gives what it holds.
+    recording: PathBuf,
+    /// The layer, such as drivability; foxglove and ros2 take all unless told.
+    #[arg(long, required_if_eq_any([("format", "png"), ("format", "npy"), ("format", "json")]))]
+    layer: Option<String>,
+    #[arg(long, value_enum)]
+    format: Format,
+    /// The folder to write to, made if absent; foxglove and ros2: the file, which must not be there yet.
+    #[arg(long)]
+    out: PathBuf,
+    /// The vehicle, where the recording has several.
+    #[arg(long)]
+    vehicle: Option<String>,
+    /// foxglove and ros2: leave out the sensors' points, which are most of the file.
+    #[arg(long)]
+    no_points: bool,
+    #[command(flatten)]
+    drawing: Drawing,
+}
+
+/// What a map is written as.
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Format {
+    /// A picture from above.
+    Png,
+    /// NumPy arrays, one a channel, and a document.
+    Npy,
+    /// One document, cells included.
+    Json,
+    /// An MCAP file of Foxglove's messages.
+    Foxglove,
+    /// An MCAP file of ROS 2 messages.
+    Ros2,
+}
+
+/// Makes one map's files: what is put behind its name, and the bytes.
+type Files = fn(&MapView, &Layer, &Style) -> Result<Vec<(String, Vec<u8>)>>;
+
+/// Where maps go.
+enum Output {
+    Files(Files),
+    Viewer(Box<ViewerFile>),
+}
+
+impl Output {
+    fn new(options: &Options) -> Result<Self> {
+        let viewer = |dialect| ViewerFile::create(&options.out, dialect, !options.no_points).map(Box::new);
+        Ok(match options.format {
+            Format::Png => Self::Files(png),
+            Format::Npy => Self::Files(npy),
+            Format::Json => Self::Files(json),
+            Format::Foxglove => Self::Viewer(viewer(Dialect::Foxglove)?),
+            Format::Ros2 => Self::Viewer(viewer(Dialect::Ros2)?),
+        })
+    }
+}
+
+/// How pictures are drawn.
+#[derive(Args)]
+pub struct Drawing {
+    /// Edge of a picture, pixels.
+    #[arg(long, default_value_t = 800, value_parser = clap::value_parser!(u32).range(16..=8192))]
+    pixels: u32,
+    /// Show the ground this far around, metres; the whole grid unless given.
+    #[arg(long, value_parser = metres)]
+    range: Option<f64>,
+    /// Draw a ring every so many metres.
+    #[arg(long, value_name = "METRES", value_parser = metres)]
+    rings: Option<f64>,
+    /// Leave out the mark where the vehicle stands.
+    #[arg(long)]
+    no_vehicle: bool,
+}
+
+impl Drawing {
+    /// As the painter takes it.
+    pub fn style(&self) -> Style {
+        let Self { pixels, range, rings, no_vehicle } = *self;
+        Style { pixels, range_m: range, rings_m: rings, vehicle: !no_vehicle }
+    }
+}
+
+fn metres(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| "not a number of metres".to_owned())?;
+    if (0.1..=10_000.0).contains(&value) { Ok(value) } else { Err("0.1 to 10000 m is allowed".into()) }
+}
+
+/// Exports.
+///
+/// # Errors
+/// What cannot be read or written; an unknown layer or vehicle, with those there are.
+pub fn run(options: &Options) -> Result<()> {
+    let Options { recording: file, layer, out, vehicle, .. } = options;
+    let length = fs::metadata(file).with_context(|| format!("open {}", file.display()))?.len();
+    let mut recording = Recording::open(file)?;
+    let mut output = Output::new(options)?;
+    let style = options.drawing.style();
+    let progress = progress_bar(length);
+    let mut maps = 0_u64;
+    let mut vehicles: Vec<String> = Vec::new();
+    while let Some(message) = recording.next() {
+        let message = message.with_context(|| file.display().to_string())?;
+        progress.set_position(recording.bytes_read);
+        let Some(of_vehicle) = message.vehicle() else { continue };
+        if vehicle.as_ref().is_some_and(|only| only != of_vehicle) {
+            continue;
+        }
+        if let Output::Viewer(viewer) = &mut output {
+            viewer.take_event(&message, &recording.attachments)?;
+        }
+        let Some((_, of_layer)) = message.map_of() else { continue };
+        if layer.as_ref().is_some_and(|only| only != of_layer) {
+            continue;
+        }
+        if !vehicles.iter().any(|known| known == of_vehicle) {
+            vehicles.push(of_vehicle.to_owned());
+        }
+        let map = decode(&message, file)?;
+        let of_layer = map.layer(of_layer)?;
+        match &mut output {
+            Output::Viewer(viewer) => viewer.take_map(&map, of_layer, message.log_time_ns)?,
+            Output::Files(_) if vehicles.len() > 1 => {
+                bail!("{} has maps of {}: name one with --vehicle", file.display(), vehicles.join(" and "))
+            }
+            Output::Files(files) => {
+                if maps == 0 {
+                    fs::create_dir_all(out).with_context(|| format!("make the folder {}", out.display()))?;
+                }
+                write(&format!("{:06}_{}", map.sequence(), of_layer.name), files(&map, of_layer, &style)?, out)?;
+            }
+        }
+        maps += 1;
+        progress.set_message(format!("{maps} maps"));
+    }
+    progress.finish_and_clear();
+    if let Output::Viewer(viewer) = output {
+        viewer.finish().with_context(|| format!("write {}", out.display()))?;
+    }
+    if let Some(cut) = &recording.cut {
+        eprintln!("clearway: {} is {cut}; exported what it holds", file.display());
+    }
+    if maps == 0 {
+        bail!("{}", nothing_exported(file, &recording, layer.as_deref(), vehicle.as_deref()));
+    }
+    say(&format!("{maps} maps of {} in {}", layer.as_deref().unwrap_or("all layers"), out.display()))?;
+    Ok(())
+}
+
+fn decode(message: &Message, file: &Path) -> Result<MapView> {
+    MapView::decode(message.data.clone()).with_context(|| format!("{}, {}", file.display(), message.topic))
+}
+
+/// Why there was no map, and what there is instead.
+fn nothing_exported(file: &Path, recording: &Recording, layer: Option<&str>, vehicle: Option<&str>) -> String {
+    let (file, layers, vehicles) = (file.display(), recording.layers(), recording.vehicles());
+    let absent = |name: Option<&str>, of: &[String]| {
+        name.filter(|name| !of.iter().any(|known| known == name)).map(str::to_owned)
+    };
+    if layers.is_empty() {
+        return format!("{file} has no maps");
+    }
+    if let Some(name) = absent(layer, &layers) {
+        return format!("{file} has no layer {name:?}; it has {}", layers.join(", "));
+    }
+    match absent(vehicle, &vehicles) {
+        Some(name) => format!("{file} has no vehicle {name:?} with maps; it has {}", vehicles.join(", ")),
+        None => format!("{file} has these layers, but no map in them"),
+    }
+}
+
+/// Writes one map's files.
+fn write(stem: &str, files: Vec<(String, Vec<u8>)>, out: &Path) -> Result<()> {
+    files.into_iter().try_for_each(|(rest, bytes)| {
+        let path = out.join(format!("{stem}{rest}"));
+        fs::write(&path, bytes).with_context(|| format!("write {}", path.display()))
+    })
+}
+
+fn png(_: &MapView, layer: &Layer, style: &Style) -> Result<Vec<(String, Vec<u8>)>> {
+    Ok(vec![(".png".into(), picture::png(layer, style)?)])
+}
+
+fn json(map: &MapView, layer: &Layer, _: &Style) -> Result<Vec<(String, Vec<u8>)>> {
+    Ok(vec![(".json".into(), serde_json::to_vec(&document::layer(map, layer, true))?)])
+}
+
+fn npy(map: &MapView, layer: &Layer, _: &Style) -> Result<Vec<(String, Vec<u8>)>> {
+    let array = |channel: &Channel| (format!("_{}.npy", channel.name), npy::encode(&channel.cells, layer.grid.shape()));
+    let document = serde_json::to_vec_pretty(&document::layer(map, layer, false))?;
+    Ok(layer.channels.iter().map(array).chain([(".json".into(), document)]).collect())
+}

@@ -1,0 +1,189 @@
+//! A recording -> one MCAP file that viewers open with nothing installed.
+//!
+//! foxglove: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf`
+//! (`foxglove.FrameTransforms`). ros2: `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`),
+//! `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`), `/clearway/<vehicle>/odometry`
+//! (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages are logged when the recording has
+//! them, and stamped with the capture's end, or the turn's.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use crate::encode::viewer::raster::Rasters;
+use crate::encode::viewer::{base_frame, foxglove as messages, ros};
+use clearway_client::{Layer, MapView};
+use clearway_ros::published::{OCCUPANCY_GRID, ODOMETRY, POINT_CLOUD2, Published, TF_MESSAGE};
+use foxglove::Encode;
+use foxglove::messages::FrameTransforms;
+use mcap::records::MessageHeader;
+
+use super::scans::{Turn, Turns};
+use crate::cli::recording::Message;
+
+/// Whose messages the file has.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Dialect {
+    /// Foxglove's schemas, protobuf.
+    Foxglove,
+    /// ROS 2's, CDR.
+    Ros2,
+}
+
+/// A file being written.
+pub struct ViewerFile {
+    dialect: Dialect,
+    writer: mcap::Writer<BufWriter<File>>,
+    /// Channel and newest sequence by topic.
+    channels: HashMap<String, (u16, u32)>,
+    rasters: BTreeMap<String, Rasters>,
+    /// By vehicle: stamp of the newest map whose pose is written.
+    placed: HashMap<String, i64>,
+    turns: Option<Turns>,
+    with_points: bool,
+}
+
+impl ViewerFile {
+    /// Creates the file.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    pub fn create(file: &Path, dialect: Dialect, with_points: bool) -> Result<Self> {
+        let open = File::create_new(file).with_context(|| format!("create {}", file.display()))?;
+        let profile = if dialect == Dialect::Ros2 { "ros2" } else { "" };
+        let options = mcap::WriteOptions::new().profile(profile).compression_threads(0);
+        Ok(Self {
+            dialect,
+            writer: options.create(BufWriter::new(open))?,
+            channels: HashMap::new(),
+            rasters: BTreeMap::new(),
+            placed: HashMap::new(),
+            turns: None,
+            with_points,
+        })
+    }
+
+    /// Takes an event of a journal, for the points in it; `attachments` are the recording's.
+    ///
+    /// # Errors
+    /// What is wrong with the recording, or where the file cannot be written.
+    pub fn take_event(&mut self, message: &Message, attachments: &BTreeMap<String, Vec<u8>>) -> Result<()> {
+        let Some(vehicle) = message.journal_of().filter(|_| self.with_points) else { return Ok(()) };
+        let mut turns = match self.turns.take() {
+            Some(turns) => turns,
+            None => Turns::new(attachments)?,
+        };
+        if let Some(turn) = turns.take(vehicle, &message.data)? {
+            self.write_turn(vehicle, &turn, message.log_time_ns)?;
+        }
+        self.turns = Some(turns);
+        Ok(())
+    }
+
+    /// Takes a map's layer, and where the vehicle was.
+    ///
+    /// # Errors
+    /// Where the file cannot be written.
+    pub fn take_map(&mut self, map: &MapView, layer: &Layer, log_ns: u64) -> Result<()> {
+        let (vehicle, name) = (map.vehicle(), &layer.name);
+        let mut rasters = self.rasters.remove(vehicle).unwrap_or_default();
+        let raster = rasters.of(layer);
+        match self.dialect {
+            Dialect::Foxglove => {
+                let grid = messages::grid(map, layer, raster);
+                self.write_foxglove(&format!("/{vehicle}/map/{name}"), &grid, log_ns)?;
+            }
+            Dialect::Ros2 => {
+                let grid = ros::occupancy_grid(map, layer, raster);
+                self.write_ros(&format!("/clearway/{vehicle}/{name}"), &OCCUPANCY_GRID, &grid, log_ns)?;
+            }
+        }
+        self.rasters.insert(vehicle.to_owned(), rasters);
+        // A map's layers are messages of their own, each with the same header.
+        let stamp_ns = map.header().capture_end_ns;
+        let is_new = self.placed.insert(vehicle.to_owned(), stamp_ns) != Some(stamp_ns);
+        if is_new { self.write_pose(map, log_ns) } else { Ok(()) }
+    }
+
+    /// Closes the file.
+    ///
+    /// # Errors
+    /// Where it cannot be written.
+    pub fn finish(mut self) -> Result<()> {
+        self.writer.finish()?;
+        Ok(())
+    }
+
+    fn write_pose(&mut self, map: &MapView, log_ns: u64) -> Result<()> {
+        match self.dialect {
+            Dialect::Foxglove => match messages::transforms(map) {
+                Some(transforms) => self.write_foxglove("/tf", &transforms, log_ns),
+                None => Ok(()),
+            },
+            Dialect::Ros2 => {
+                let (Some(tf), Some(odometry)) = (ros::tf(map), ros::odometry(map)) else { return Ok(()) };
+                self.write_ros("/tf", &TF_MESSAGE, &tf, log_ns)?;
+                let topic = format!("/clearway/{}/odometry", map.vehicle());
+                self.write_ros(&topic, &ODOMETRY, &odometry, log_ns)
+            }
+        }
+    }
+
+    fn write_turn(&mut self, vehicle: &str, turn: &Turn, log_ns: u64) -> Result<()> {
+        let frame = format!("{vehicle}/{}", turn.sensor);
+        let (stamp_ns, base, mount) = (turn.stamp_ns, base_frame(vehicle), turn.ego_from_sensor);
+        match self.dialect {
+            Dialect::Foxglove => {
+                let mount = messages::transform(stamp_ns, &base, &frame, mount);
+                self.write_foxglove("/tf", &FrameTransforms { transforms: vec![mount] }, log_ns)?;
+                let cloud = messages::points(stamp_ns, &frame, turn.points.iter().copied());
+                self.write_foxglove(&format!("/{vehicle}/points/{}", turn.sensor), &cloud, log_ns)
+            }
+            Dialect::Ros2 => {
+                self.write_ros("/tf", &TF_MESSAGE, &ros::transform(stamp_ns, &base, &frame, mount), log_ns)?;
+                let cloud = ros::points(stamp_ns, &frame, &turn.points);
+                let topic = format!("/clearway/{vehicle}/points/{}", turn.sensor);
+                self.write_ros(&topic, &POINT_CLOUD2, &cloud, log_ns)
+            }
+        }
+    }
+
+    fn write_foxglove<T: Encode>(&mut self, topic: &str, message: &T, log_ns: u64) -> Result<()> {
+        let mut bytes = Vec::new();
+        message.encode(&mut bytes).map_err(|error| anyhow::anyhow!("encode for {topic}: {error}"))?;
+        let schema = T::get_schema().context("a Foxglove message has a schema")?;
+        let schema = (schema.name.as_str(), schema.encoding.as_str(), &*schema.data);
+        self.write(topic, schema, &T::get_message_encoding(), log_ns, &bytes)
+    }
+
+    fn write_ros(&mut self, topic: &str, kind: &Published, message: &[u8], log_ns: u64) -> Result<()> {
+        self.write(topic, (&kind.name(), "ros2msg", kind.definition.as_bytes()), "cdr", log_ns, message)
+    }
+
+    fn write(
+        &mut self,
+        topic: &str,
+        (schema, schema_encoding, definition): (&str, &str, &[u8]),
+        encoding: &str,
+        log_time: u64,
+        message: &[u8],
+    ) -> Result<()> {
+        let (channel_id, sequence) = match self.channels.get_mut(topic) {
+            Some((channel, sequence)) => {
+                *sequence = sequence.wrapping_add(1);
+                (*channel, *sequence)
+            }
+            None => {
+                let schema = self.writer.add_schema(schema, schema_encoding, definition)?;
+                let channel = self.writer.add_channel(schema, topic, encoding, &BTreeMap::new())?;
+                self.channels.insert(topic.to_owned(), (channel, 0));
+                (channel, 0)
+            }
+        };
+        let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
+        self.writer.write_to_known_channel(&header, message)?;
+        Ok(())
+    }
+}

@@ -1,0 +1,312 @@
+//! Everything a replay knows before its first event: which files, whose configuration, how the sensor is mounted.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use clearway_lidar::calibration::Calibration;
+use clearway_lidar::model::Model;
+use clearway_lidar::revolution::{Echo, Revolution};
+use clearway_lidar::sensor::Sensor;
+use clearway_mapping::config::{Extrinsics, MapsConfig, SENSORS_MAX, SensorConfig};
+use clearway_mapping::event::{Body, Scan};
+use clearway_mapping::sensor::mount::estimate;
+use nalgebra::Isometry3;
+
+use super::{Mount, Options, ReplayError, describe};
+use crate::cli::replay::clouds::{Clouds, Written};
+use crate::config::{Calibrations, Config, Recorder};
+use crate::ingest::files::{FilesError, Kind, Readings};
+use crate::ingest::files::mcap::{McapError, Wanted};
+use crate::ingest::ros::{Choice, Offered, PoseFrom, SensorTopic};
+use crate::record::reader::Recording;
+use crate::server::Setup;
+
+/// Revolutions the mount is estimated from.
+const MOUNT_REVOLUTIONS: usize = 10;
+
+/// Everything known before the first event.
+pub(super) struct Plan {
+    pub(super) setup: Setup,
+    pub(super) mount: Mount,
+    pub(super) extrinsics: Extrinsics,
+    pub(super) readings: Readings,
+    /// How many clouds were written, or why no more.
+    pub(super) clouds: Option<Written>,
+}
+
+pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
+    let files = Readings::open(&options.files, Wanted::default())?;
+    let recorded = files.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
+    let scans = files.files().all(|(_, kind)| kind == Kind::Scan);
+    let mut known = configured(options, recorded.as_deref())?;
+    let vehicle = &mut known.config.vehicles[0];
+    (vehicle.udp, vehicle.ros) = (None, None);
+    let mut wanted = Wanted {
+        vehicle: options.vehicle.clone(),
+        topics: options.topics.clone(),
+        sensors_max: if known.is_mounted { vehicle.sensors.len() } else { SENSORS_MAX },
+    };
+    let placed = match recorded.filter(|_| !known.is_mounted) {
+        Some(bag) => known.take_bag(&bag, &mut wanted, options.extrinsics.is_some())?,
+        None => None,
+    };
+    known.tell_sensors(options, scans)?;
+    let open = || Readings::open(&options.files, wanted.clone());
+    let readings = open()?;
+    let mount = match options.extrinsics {
+        Some(extrinsics) => {
+            known.config.vehicles[0].sensors[0].extrinsics = extrinsics;
+            Mount::Given
+        }
+        None if known.is_mounted => Mount::Given,
+        None if let Some(mount) = placed => mount,
+        None => known.find_mount(open()?)?,
+    };
+    let extrinsics = known.config.vehicles[0].sensors[0].extrinsics;
+    let setup = known.setup(options)?;
+    let clouds = options.clouds.as_deref().map(Clouds::create).transpose()?;
+    let (observer, clouds) = clouds.map(Clouds::observer).unzip();
+    Ok(Plan { setup: Setup { observer, ..setup }, mount, extrinsics, readings, clouds })
+}
+
+/// What is known of the vehicle so far.
+struct Known {
+    /// Of one vehicle.
+    config: Config,
+    tables: Calibrations,
+    /// Of the recording whose maps are made again.
+    boot_id: Option<u64>,
+    /// Whether the extrinsics are known.
+    is_mounted: bool,
+    remarks: Vec<String>,
+}
+
+impl Known {
+    /// Takes the sensors a ROS bag has, and `wanted` their topics; gives the first one's mount where tf tells it.
+    fn take_bag(&mut self, bag: &Path, wanted: &mut Wanted, is_given: bool) -> Result<Option<Mount>, ReplayError> {
+        let mut choice = choice(bag, wanted)?;
+        keep_placed(&mut choice.sensors, is_given);
+        // Named, the same are chosen again when the bag is read.
+        wanted.topics = choice.sensors.iter().map(|sensor| sensor.topic.clone()).collect();
+        if let Some(PoseFrom::Topic(topic)) = &choice.pose {
+            wanted.topics.push(topic.clone());
+        }
+        if choice.sensors.is_empty() {
+            return Ok(None);
+        }
+        (wanted.sensors_max, self.tables) = (choice.sensors.len(), vec![vec![None; choice.sensors.len()]]);
+        let (sensors, mounts) = sensors_of(&choice);
+        sensors.iter().zip(&mounts).for_each(|(sensor, mount)| self.remark(&sensor.name, mount.as_ref()));
+        self.config.vehicles[0].sensors = sensors;
+        Ok(mounts.into_iter().next().flatten())
+    }
+
+    fn remark(&mut self, sensor: &str, mount: Option<&Mount>) {
+        self.remarks.extend(mount.and_then(describe).map(|said| format!("extrinsics of {sensor}: {said}")));
+    }
+
+    /// What the options, and files that hold nothing but scans, tell of the sensors.
+    fn tell_sensors(&mut self, options: &Options, scans: bool) -> Result<(), ReplayError> {
+        let sensors = &mut self.config.vehicles[0].sensors;
+        for sensor in sensors.iter_mut() {
+            (sensor.model, sensor.rpm) = (options.model.or(sensor.model), options.rpm.or(sensor.rpm));
+        }
+        // Scans do not tell who made them, and KITTI's were made by this one.
+        if scans && sensors[0].model.is_none() && self.tables[0][0].is_none() {
+            sensors[0].model = Some(Model::Hdl64eS2);
+        }
+        if let Some(file) = &options.calibration {
+            sensors[0].calibration = Some(file.display().to_string());
+            // The others have their tables, read from where their own configuration lies.
+            let mut first = self.config.clone();
+            first.vehicles[0].sensors.truncate(1);
+            self.tables[0][0] = first.calibrations(Path::new(""))?.remove(0).remove(0);
+        }
+        Ok(())
+    }
+
+    /// Mounts the first sensor as the ground in the first revolutions tells; where it tells nothing, no map is made.
+    fn find_mount(&mut self, readings: Readings) -> Result<Mount, ReplayError> {
+        let vehicle = &mut self.config.vehicles[0];
+        let sensor = &mut vehicle.sensors[0];
+        let revolutions = first_revolutions(readings, sensor, self.tables[0][0].clone())?;
+        if revolutions.is_empty() {
+            return Ok(Mount::Unneeded);
+        }
+        let mount = estimate(&revolutions).map_or_else(Mount::Unknown, Mount::Estimated);
+        match &mount {
+            Mount::Estimated(estimate) => sensor.extrinsics = estimate.extrinsics(),
+            _ => vehicle.maps = MapsConfig::none(),
+        }
+        let name = sensor.name.clone();
+        self.remark(&name, Some(&mount));
+        Ok(mount)
+    }
+
+    /// What the server is started with.
+    fn setup(self, options: &Options) -> Result<Setup, ReplayError> {
+        let Self { config, tables: calibrations, boot_id, remarks, .. } = self;
+        let file = options.config.as_deref().unwrap_or(Path::new("(replay)"));
+        // The paths of a run that serves nothing are not opened, and name no other run than they would elsewhere.
+        let mut config = if options.serve { config.located(file) } else { config };
+        config.recorder.file = options.record.clone().unwrap_or_default();
+        if !options.serve {
+            (config.grpc.enabled, config.page.enabled, config.foxglove.enabled) = (false, false, false);
+            (config.zenoh.enabled, config.zenoh.ros2.enabled) = (false, false);
+        }
+        config.check(file)?;
+        let certificates = if options.serve { config.certificates(file)? } else { None };
+        // The same files and settings name the same run; served maps need a name of their own, or a reader that saw them
+        // before would take them for old ones.
+        let altered = options.extrinsics.is_some() || options.model.is_some() || options.rpm.is_some();
+        let same_maps = !altered && options.calibration.is_none();
+        let boot_id =
+            boot_id.filter(|_| same_maps).or_else(|| (!options.serve).then(|| fingerprint(&config, &options.files)));
+        let mut notes = BTreeMap::new();
+        if !remarks.is_empty() {
+            notes.insert("mount".to_owned(), remarks.join("\n"));
+        }
+        Ok(Setup { config, calibrations, certificates, boot_id, from_files: true, remarks, notes, observer: None })
+    }
+}
+
+/// From `--config`, else from the recording itself, else plain.
+fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, ReplayError> {
+    let known =
+        |config, tables, boot_id, is_mounted| Known { config, tables, boot_id, is_mounted, remarks: Vec::new() };
+    let pick = |config: &mut Config, tables: &mut Calibrations| {
+        let index = match &options.vehicle {
+            None => 0,
+            Some(name) => config.vehicles.iter().position(|v| v.name == *name).ok_or_else(|| ReplayError::Vehicle {
+                name: name.clone(),
+                known: config.vehicles.iter().map(|v| v.name.as_str()).collect::<Vec<_>>().join(", "),
+            })?,
+        };
+        config.vehicles = vec![config.vehicles.swap_remove(index)];
+        *tables = vec![tables.swap_remove(index)];
+        Ok::<_, ReplayError>(())
+    };
+    if let Some(file) = &options.config {
+        let mut config = Config::load(file, &options.set)?;
+        let mut tables = config.calibrations(file)?;
+        pick(&mut config, &mut tables)?;
+        return Ok(known(config, tables, None, true));
+    }
+    if let Some(file) = recorded {
+        let recording = Recording::open(file)?;
+        if recording.preface().config.is_some() {
+            let (mut config, mut tables) = recording.config()?;
+            pick(&mut config, &mut tables)?;
+            // What the recording says of its own publishers and files is not for this run.
+            let config = Config { vehicles: config.vehicles, ..Config::default() };
+            return Ok(known(config, tables, Some(recording.preface().boot_id), true));
+        }
+    }
+    Ok(known(Config::of_one_vehicle("car", "top"), vec![vec![None]], None, false))
+}
+
+/// What is taken of a ROS bag.
+fn choice(bag: &Path, wanted: &Wanted) -> Result<Choice, ReplayError> {
+    let offered = Offered::look(bag).map_err(McapError::from).map_err(FilesError::from)?;
+    let choice = offered.choose(bag, &wanted.topics, wanted.sensors_max).map_err(McapError::from);
+    Ok(choice.map_err(FilesError::from)?)
+}
+
+/// Of several sensors those are taken that tf places; where it places none the first, whose place is to be found or
+/// `is_given`.
+fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
+    let mut number = 0;
+    let mut known = |sensor: &SensorTopic| {
+        number += 1;
+        sensor.ego_from_sensor.is_some() || (number == 1 && is_given)
+    };
+    match sensors.iter().any(|sensor| sensor.ego_from_sensor.is_some()) {
+        true => sensors.retain(&mut known),
+        false => sensors.truncate(1),
+    }
+}
+
+/// The vehicle's sensors as the transforms of a ROS bag place them. An only one is `top`, several are named by their
+/// frames.
+fn sensors_of(choice: &Choice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
+    let mut sensors: Vec<SensorConfig> = Vec::new();
+    for (index, sensor) in choice.sensors.iter().enumerate() {
+        let mut name = name_of_frame(&sensor.frame_id);
+        if choice.sensors.len() == 1 {
+            name = "top".to_owned();
+        } else if sensors.iter().any(|before| before.name == name) {
+            name = format!("{name}-{index}");
+        }
+        // Where tf tells nothing the place is given or estimated hereafter.
+        let ego_from_sensor = sensor.ego_from_sensor.unwrap_or_else(|| Isometry3::translation(0.0, 0.0, 2.0));
+        sensors.push(SensorConfig::new(name, extrinsics_of(&ego_from_sensor)));
+    }
+    let mount = |sensor: &SensorTopic| {
+        let tf = Mount::Tf { ego_frame: choice.ego_frame.clone(), frame_id: sensor.frame_id.clone() };
+        sensor.ego_from_sensor.map(|_| tf)
+    };
+    (sensors, choice.sensors.iter().map(mount).collect())
+}
+
+/// A frame's id in the letters of a sensor's name.
+fn name_of_frame(frame_id: &str) -> String {
+    let letter = |c: char| if c.is_ascii_alphanumeric() || c == '-' { c.to_ascii_lowercase() } else { '_' };
+    let name: String = frame_id.chars().map(letter).take(48).collect();
+    if name.is_empty() { "sensor".to_owned() } else { name }
+}
+
+fn extrinsics_of(ego_from_sensor: &Isometry3<f64>) -> Extrinsics {
+    let (roll, pitch, yaw) = ego_from_sensor.rotation.euler_angles();
+    let [x_m, y_m, z_m] = ego_from_sensor.translation.vector.into();
+    let [roll_deg, pitch_deg, yaw_deg] = [roll, pitch, yaw].map(f64::to_degrees);
+    Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg }
+}
+
+/// The points of the first revolutions (or scans), sensor frame, metres.
+fn first_revolutions(
+    readings: Readings,
+    config: &SensorConfig,
+    calibration: Option<Calibration>,
+) -> Result<Vec<Vec<[f32; 3]>>, ReplayError> {
+    let mut sensor = Sensor::new(config.lidar(calibration));
+    let mut clouds = Vec::new();
+    for reading in readings {
+        let reading = reading?;
+        match &reading.body {
+            // What is refused is counted and named on the real pass.
+            Body::Datagram(payload) => {
+                if let Ok(Some(revolution)) = sensor.push(payload, reading.arrival_ns) {
+                    clouds.push(points_of(revolution));
+                }
+            }
+            Body::Scan(scan) => clouds.push(points_of_scan(scan)),
+            Body::End => clouds.extend(sensor.finish().map(points_of)),
+            Body::EgoPose(_) | Body::Road(_) | Body::Sensor(_) | Body::Lost { .. } => {}
+        }
+        if clouds.len() >= MOUNT_REVOLUTIONS {
+            break;
+        }
+    }
+    Ok(clouds)
+}
+
+fn points_of(revolution: &Revolution) -> Vec<[f32; 3]> {
+    let echo = revolution.echoes.first();
+    let returned = |echo: &Echo| {
+        let slots = (0..echo.range_m.len()).filter(|&slot| echo.range_m[slot] > 0.0);
+        slots.map(|slot| [echo.x[slot], echo.y[slot], echo.z[slot]]).collect()
+    };
+    echo.map(returned).unwrap_or_default()
+}
+
+fn points_of_scan(scan: &Scan) -> Vec<[f32; 3]> {
+    scan.x.iter().zip(&scan.y).zip(&scan.z).map(|((&x, &y), &z)| [x, y, z]).collect()
+}
+
+/// FNV-1a over settings and file names.
+fn fingerprint(config: &Config, files: &[PathBuf]) -> u64 {
+    let settings = Config { recorder: Recorder::default(), ..config.clone() }.to_toml();
+    let names = files.iter().filter_map(|file| file.file_name()).flat_map(|name| name.as_encoded_bytes());
+    let bytes = settings.as_bytes().iter().chain(names);
+    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
+}

@@ -1,0 +1,172 @@
+//! What came of a replay, for programs and for people.
+
+use std::path::PathBuf;
+
+use clearway_mapping::config::Extrinsics;
+use clearway_mapping::sensor::mount::{MountError, MountEstimate};
+use clearway_mapping::pipeline::model_name;
+use serde_json::{Value, json};
+
+use crate::ingest::files::Truncated;
+use crate::status::Snapshot;
+
+/// Where the mount came from.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Mount {
+    /// Options, configuration or recording.
+    Given,
+    /// The transforms of a ROS bag.
+    Tf {
+        /// The vehicle's frame.
+        ego_frame: String,
+        /// The sensor's.
+        frame_id: String,
+    },
+    /// The ground in the first revolutions.
+    Estimated(MountEstimate),
+    /// The ground could not be found; no map was made.
+    Unknown(MountError),
+    /// Nowhere: the files hold no revolution.
+    Unneeded,
+}
+
+/// What came of a replay.
+#[derive(Clone, Debug)]
+pub struct Summary {
+    /// Ledger, sensors, maps, latency.
+    pub snapshot: Snapshot,
+    /// The extrinsics used.
+    pub extrinsics: Extrinsics,
+    /// Where they came from.
+    pub mount: Mount,
+    /// Files that ended in the middle of something.
+    pub truncated: Vec<Truncated>,
+    /// What else is worth knowing.
+    pub notes: Vec<String>,
+    /// Point clouds written.
+    pub clouds: u64,
+    /// Wall time.
+    pub seconds: f64,
+    /// The recording written.
+    pub record: Option<PathBuf>,
+}
+
+impl Summary {
+    /// One object with all of it.
+    pub fn to_json(&self) -> Value {
+        let Snapshot { ledger, sensors, .. } = &self.snapshot;
+        let sensors = sensors.iter().map(|sensor| {
+            let model = sensor.status.model.map(model_name);
+            json!({
+                "name": sensor.name, "model": model, "returns": sensor.status.returns, "rpm": sensor.status.rpm,
+                "revolutions": sensor.status.revolutions,
+            })
+        });
+        let truncated = self.truncated.iter().map(|t| json!({ "file": t.file, "reason": t.reason }));
+        json!({
+            "packets": self.snapshot.packets_json(),
+            "telemetry": ledger.telemetry,
+            "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
+            "revolutions": self.snapshot.revolutions(),
+            "maps": self.snapshot.maps,
+            "sensors": sensors.collect::<Vec<_>>(),
+            "latency_ms": { "p50": self.snapshot.latency_ms_p50, "p99": self.snapshot.latency_ms_p99 },
+            "drivable_share": self.snapshot.drivable_share,
+            "mount": self.mount_json(),
+            "truncated": truncated.collect::<Vec<_>>(),
+            "notes": self.notes,
+            "clouds": self.clouds,
+            "record": self.record,
+            "seconds": self.seconds,
+        })
+    }
+
+    fn mount_json(&self) -> Value {
+        let e = &self.extrinsics;
+        let mut known = json!({
+            "source": "given",
+            "x_m": e.x_m, "y_m": e.y_m, "z_m": e.z_m,
+            "roll_deg": e.roll_deg, "pitch_deg": e.pitch_deg, "yaw_deg": e.yaw_deg,
+        });
+        match &self.mount {
+            Mount::Given => known,
+            Mount::Tf { ego_frame, frame_id } => {
+                known["source"] = "tf".into();
+                known["ego_frame"] = ego_frame.clone().into();
+                known["frame_id"] = frame_id.clone().into();
+                known
+            }
+            Mount::Estimated(estimate) => {
+                known["source"] = "estimated".into();
+                known["revolutions"] = estimate.revolutions.into();
+                known["residual_m"] = estimate.residual_m.into();
+                known["inliers"] = estimate.inliers.into();
+                known["samples"] = estimate.samples.into();
+                known
+            }
+            Mount::Unknown(why) => json!({ "source": "unknown", "reason": why.to_string() }),
+            Mount::Unneeded => json!({ "source": "none" }),
+        }
+    }
+
+    /// A few lines for people.
+    pub fn to_text(&self) -> String {
+        let snapshot = &self.snapshot;
+        let ledger = &snapshot.ledger;
+        let mut lines = vec![format!(
+            "{} received, {} decoded, {} telemetry, {} refused, {} lost",
+            ledger.received,
+            ledger.decoded,
+            ledger.telemetry,
+            snapshot.refused(),
+            ledger.lost
+        )];
+        lines.extend(ledger.refused.iter().map(|(reason, n)| format!("  refused for {reason}: {n}")));
+        for sensor in &snapshot.sensors {
+            let model = sensor.status.model.map_or("unknown model", model_name);
+            let rpm = sensor.status.rpm.map_or(String::new(), |rpm| format!(", {rpm:.0} rpm"));
+            let (revolutions, returns) = (sensor.status.revolutions, sensor.status.returns);
+            lines.push(format!("{}: {model}{rpm}, {revolutions} revolutions, {returns} returns", sensor.name));
+        }
+        let share =
+            snapshot.drivable_share.map_or(String::new(), |share| format!(", newest {:.1} % drivable", 100.0 * share));
+        lines.push(format!("{} maps{share}", snapshot.maps));
+        if let (Some(p50), Some(p99)) = (snapshot.latency_ms_p50, snapshot.latency_ms_p99) {
+            lines.push(format!("a map took {p50:.2} ms in the median, {p99:.2} ms at the 99th percentile"));
+        }
+        if let Some(record) = &self.record {
+            lines.push(format!("recorded {}", record.display()));
+        }
+        if self.clouds > 0 {
+            lines.push(format!("{} point clouds written", self.clouds));
+        }
+        lines.join("\n") + "\n"
+    }
+}
+
+/// What was found out about the mount, in one line; nothing where it was not looked for.
+pub fn describe(mount: &Mount) -> Option<String> {
+    match mount {
+        Mount::Estimated(estimate) => Some(format!(
+            "estimated from the ground in {} revolutions: height {:.3} m, pitch {:.2} deg, roll {:.2} deg ({} of {} places \
+             on one plane, residual {:.3} m)",
+            estimate.revolutions,
+            estimate.height_m,
+            estimate.pitch_rad.to_degrees(),
+            estimate.roll_rad.to_degrees(),
+            estimate.inliers,
+            estimate.samples,
+            estimate.residual_m,
+        )),
+        Mount::Tf { ego_frame, frame_id } => Some(format!(
+            "tf's transform from {frame_id} to {ego_frame}; the origin of {ego_frame} is taken to be on the ground, else give \
+             --extrinsics"
+        )),
+        Mount::Unknown(why) => Some(format!(
+            "unknown, so no map is made: the files do not say how the sensor is mounted, and it cannot be estimated: {why}; \
+             give it with --extrinsics x,y,z,roll,pitch,yaw (metres and degrees, such as 0,0,1.9,0,0,0), or with --config \
+             FILE"
+        )),
+        Mount::Given | Mount::Unneeded => None,
+    }
+}

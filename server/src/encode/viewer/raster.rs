@@ -1,0 +1,284 @@
+//! A layer -> square cells, as occupancies and as a picture.
+//!
+//! In: a layer, Cartesian or radial. Out: row by row, x first, an occupancy (0 free to 100 occupied, -1 unknown) or
+//! red, green, blue, alpha a cell; and where the cells lie in the ego frame. A Cartesian layer keeps its cells and its
+//! axes. A radial one is resampled: a square cell has the worst of the radial cell at its middle and those whose
+//! middles lie in it, so that near the vehicle, where radial cells are the smaller ones, no obstacle falls between; and
+//! unknown is worse than free.
+//!
+//! | occupancy | classes |
+//! |---|---|
+//! | 0 | drivable, flat, passable, road, clear, free, path |
+//! | 100 | not_drivable, flat_elevated, flat_unreachable, obstacle, occupied |
+//! | -1 | unknown, flat_inferred (nobody saw it), occluded, out_of_range, and any class not named here |
+//!
+//! There is nothing between: planners that cut at a threshold take less than 100 for free.
+
+use std::collections::BTreeMap;
+
+use clearway_proto::codec::Cells;
+use clearway_proto::grid::Grid;
+use clearway_proto::map::Layer;
+use nalgebra::{Isometry3, Vector3};
+
+use clearway_client::footprint;
+use crate::encode::picture::Colours;
+
+/// Cells that radial layers are resampled to, metres: as those of the other layers.
+const CELL_M: f64 = 0.25;
+/// Square cells from the vehicle to the edge at most; farther grids have larger cells.
+const CELLS_MAX: f64 = 1000.0;
+/// No cell of the layer lies there.
+const NOWHERE: u32 = u32::MAX;
+
+/// Nothing is known.
+pub const UNKNOWN: i8 = -1;
+const FREE: i8 = 0;
+const OCCUPIED: i8 = 100;
+
+/// Where the square cells of a grid lie, and which cells of the grid they show.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Raster {
+    grid: Grid,
+    /// Cells along the raster's x axis.
+    pub width: u32,
+    /// Cells along its y axis.
+    pub height: u32,
+    /// Edge of a cell, metres.
+    pub cell_m: f32,
+    /// The corner of cell (0, 0) and the raster's axes, in the ego frame.
+    pub ego_from_raster: Isometry3<f64>,
+    /// `None`: the grid's own cells.
+    samples: Option<Samples>,
+}
+
+/// Cells of a radial grid by square cell.
+#[derive(Clone, Debug, PartialEq)]
+struct Samples {
+    /// The one at the middle of each, or [`NOWHERE`].
+    at_middle: Vec<u32>,
+    /// Square cell and radial cell whose middle lies in it.
+    inside: Vec<(u32, u32)>,
+}
+
+impl Raster {
+    /// The raster of a grid; worth keeping while the grid stays the same ([`Rasters`]).
+    pub fn of(grid: &Grid) -> Self {
+        match *grid {
+            Grid::Radial { .. } => Self::of_radial(grid),
+            Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
+                let ego_from_axes = Isometry3::rotation(Vector3::z() * -yaw_rad);
+                let ego_from_raster = ego_from_axes * Isometry3::translation(origin_x_m, origin_y_m, 0.0);
+                Self { grid: grid.clone(), width, height, cell_m, ego_from_raster, samples: None }
+            }
+        }
+    }
+
+    fn of_radial(grid: &Grid) -> Self {
+        let range_m = grid.range_m_max();
+        let cell_m = CELL_M.max(range_m / CELLS_MAX) as f32;
+        let edge = f64::from(cell_m);
+        let half = (range_m / edge).ceil();
+        let (side, corner_m) = (2 * half as usize, -half * edge);
+        let middle = |index: usize| corner_m + (index as f64 + 0.5) * edge;
+        let at_middle = (0..side * side)
+            .map(|index| grid.cell_at(middle(index % side), middle(index / side)).map_or(NOWHERE, |cell| cell as u32));
+        let of_middle = |cell: u32| {
+            let (x_m, y_m) = grid.centre_of(cell as usize)?;
+            let [column, row] = [x_m, y_m].map(|m| (((m - corner_m) / edge) as usize).min(side - 1));
+            Some(((row * side + column) as u32, cell))
+        };
+        let samples = Samples {
+            at_middle: at_middle.collect(),
+            inside: (0..grid.cell_count() as u32).filter_map(of_middle).collect(),
+        };
+        Self {
+            grid: grid.clone(),
+            width: side as u32,
+            height: side as u32,
+            cell_m,
+            ego_from_raster: Isometry3::translation(corner_m, corner_m, 0.0),
+            samples: Some(samples),
+        }
+    }
+
+    /// An occupancy a cell, of a layer of this grid.
+    pub fn occupancies(&self, layer: &Layer) -> Vec<i8> {
+        let occupancies = occupancies(layer);
+        match &self.samples {
+            None => occupancies,
+            Some(samples) => samples.worst(&occupancies).map(|cell| at(&occupancies, cell)).collect(),
+        }
+    }
+
+    /// Red, green, blue and alpha a cell, of a layer of this grid, in the colours of [`crate::picture`]; what lies
+    /// outside of a radial grid is transparent.
+    pub fn rgba(&self, layer: &Layer) -> Vec<u8> {
+        let colours = Colours::of(layer);
+        let colour = |cell: u32| match cell {
+            NOWHERE => [0; 4],
+            cell => {
+                let [red, green, blue] = colours.of_cell(layer, cell as usize);
+                [red, green, blue, u8::MAX]
+            }
+        };
+        match &self.samples {
+            None => (0..self.width * self.height).flat_map(colour).collect(),
+            Some(samples) => samples.worst(&occupancies(layer)).flat_map(colour).collect(),
+        }
+    }
+}
+
+impl Samples {
+    /// By square cell, the radial one that it shows.
+    fn worst(&self, occupancies: &[i8]) -> impl Iterator<Item = u32> + use<> {
+        // Unknown is worse than free, and better than an obstacle.
+        let rank = |cell: u32| match cell {
+            NOWHERE => 0,
+            cell => match at(occupancies, cell) {
+                FREE => 1,
+                UNKNOWN => 2,
+                occupied => 2 + i16::from(occupied),
+            },
+        };
+        let mut shown = self.at_middle.clone();
+        for &(square, cell) in &self.inside {
+            let shown = &mut shown[square as usize];
+            if rank(cell) > rank(*shown) {
+                *shown = cell;
+            }
+        }
+        shown.into_iter()
+    }
+}
+
+fn at(occupancies: &[i8], cell: u32) -> i8 {
+    occupancies.get(cell as usize).copied().unwrap_or(UNKNOWN)
+}
+
+/// An occupancy for each of the layer's own cells; unknown where it has no classes.
+fn occupancies(layer: &Layer) -> Vec<i8> {
+    let of_class: Vec<i8> = layer.legend.iter().map(|class| occupancy(class)).collect();
+    let of = |class: i32| usize::try_from(class).ok().and_then(|class| of_class.get(class).copied()).unwrap_or(UNKNOWN);
+    match layer.channel("class").map(|channel| &channel.cells) {
+        None => vec![UNKNOWN; layer.grid.cell_count() as usize],
+        Some(Cells::U8(cells)) => cells.iter().map(|&class| of(class.into())).collect(),
+        Some(Cells::I8(cells)) => cells.iter().map(|&class| of(class.into())).collect(),
+        Some(Cells::U16(cells)) => cells.iter().map(|&class| of(class.into())).collect(),
+    }
+}
+
+/// The occupancy of a class, by its name in the legend.
+pub fn occupancy(class: &str) -> i8 {
+    match class {
+        free if footprint::FREE.contains(&free) => FREE,
+        "not_drivable" | "flat_elevated" | "flat_unreachable" | "obstacle" | "occupied" => OCCUPIED,
+        _ => UNKNOWN,
+    }
+}
+
+/// The raster of each layer, made anew where its grid has changed.
+#[derive(Debug, Default)]
+pub struct Rasters(BTreeMap<String, Raster>);
+
+impl Rasters {
+    /// That of a layer.
+    pub fn of(&mut self, layer: &Layer) -> &Raster {
+        let raster = self.0.entry(layer.name.clone()).or_insert_with(|| Raster::of(&layer.grid));
+        if raster.grid != layer.grid {
+            *raster = Raster::of(&layer.grid);
+        }
+        raster
+    }
+}
+
+// The legends are those of the core, which the command knows.
+#[cfg(test)]
+mod tests {
+    use clearway_proto::codec::Cells;
+    use clearway_proto::map::Channel;
+
+    use super::*;
+
+    const LEGEND: [&str; 4] = ["unknown", "drivable", "not_drivable", "obstacle"];
+
+    fn layer(grid: Grid, classes: Vec<u8>) -> Layer {
+        let class =
+            Channel { name: "class".into(), unit: String::new(), scale: 1.0, unknown: 0, cells: Cells::U8(classes) };
+        Layer {
+            name: "drivability".into(),
+            grid,
+            legend: LEGEND.map(String::from).to_vec(),
+            channels: vec![class],
+            planes: Vec::new(),
+            figures: BTreeMap::new(),
+            points: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn every_class_of_every_layer_has_an_occupancy_that_was_chosen_and_unknown_is_never_free() {
+        use clearway_mapping::{drivability, height_difference, safe_path, speed, terrain};
+        let of = |legend: &[&str]| legend.iter().map(|class| occupancy(class)).collect::<Vec<_>>();
+        assert_eq!(of(drivability::LEGEND), [-1, 0, 100, 100]);
+        assert_eq!(of(height_difference::LEGEND), [-1, 0, 100]);
+        assert_eq!(of(terrain::LEGEND), [-1, 0, -1, 100, 100, 100]);
+        assert_eq!(of(&["unknown", "clear", "occupied", "occluded", "out_of_range"]), [-1, 0, 100, -1, -1]);
+        assert_eq!(of(speed::LEGEND), [-1, 0, 100, 0]);
+        assert_eq!(of(safe_path::LEGEND), [-1, 0, 100, 0]);
+        assert_eq!(occupancy("a class of a later version"), -1);
+    }
+
+    #[test]
+    fn no_radial_cell_that_is_not_free_falls_between_square_ones() {
+        let r_bench_m: Vec<f32> = (1..=40).map(|row| 0.02 * (row * row) as f32).collect();
+        let grid = Grid::Radial { r_bench_m, columns: 360 };
+        // Any mixture of classes.
+        let class = |cell: u64| (cell.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 61).saturating_sub(4) as u8;
+        let classes: Vec<u8> = (0..grid.cell_count()).map(class).collect();
+        let layer = layer(grid.clone(), classes.clone());
+        let raster = Raster::of(&grid);
+        let (occupancies, rgba) = (raster.occupancies(&layer), raster.rgba(&layer));
+        let half_m = 0.5 * f64::from(raster.cell_m) * f64::from(raster.width);
+        let square = |x_m: f64, y_m: f64| {
+            let [column, row] = [x_m, y_m].map(|m| ((m + half_m) / f64::from(raster.cell_m)) as usize);
+            row * raster.width as usize + column
+        };
+        for (cell, class) in classes.iter().enumerate() {
+            let (x_m, y_m) = grid.centre_of(cell).unwrap();
+            let shown = occupancies[square(x_m, y_m)];
+            match class {
+                0 => assert_ne!(shown, FREE, "unknown cell {cell}"),
+                1 => {}
+                _ => assert_eq!(shown, OCCUPIED, "obstacle cell {cell}"),
+            }
+        }
+        let free = occupancies.iter().filter(|&&occupancy| occupancy == FREE).count();
+        assert!(free > 1000, "{free} free cells of {}", occupancies.len());
+        assert_eq!((occupancies[0], &rgba[..4]), (UNKNOWN, &[0; 4][..]), "the corner lies outside");
+        assert_eq!(rgba.len(), 4 * occupancies.len());
+    }
+
+    #[test]
+    fn a_turned_grid_keeps_its_cells_and_says_where_they_lie() {
+        let grid = Grid::Cartesian {
+            origin_x_m: -1.5,
+            origin_y_m: -0.5,
+            width: 4,
+            height: 3,
+            cell_m: 0.5,
+            yaw_rad: 0.7,
+            first_ix: 0,
+            first_iy: 0,
+        };
+        let layer = layer(grid.clone(), (0..12).map(|cell| cell % 4).collect());
+        let raster = Raster::of(&grid);
+        assert_eq!(raster.occupancies(&layer), [-1, 0, 100, 100].repeat(3));
+        for cell in 0..12_usize {
+            let (column, row) = ((cell % 4) as f64, (cell / 4) as f64);
+            let middle = raster.ego_from_raster * nalgebra::Point3::new(0.5 * column + 0.25, 0.5 * row + 0.25, 0.0);
+            let (x_m, y_m) = grid.centre_of(cell).unwrap();
+            assert!((middle.x - x_m).abs() < 1e-9 && (middle.y - y_m).abs() < 1e-9, "{middle} is not {x_m}, {y_m}");
+        }
+    }
+}

@@ -1,0 +1,68 @@
+//! A map -> ROS 2 messages, CDR: `nav_msgs/msg/OccupancyGrid` a layer, `tf2_msgs/msg/TFMessage` and
+//! `nav_msgs/msg/Odometry`. A sensor's points -> `sensor_msgs/msg/PointCloud2`.
+
+use clearway_proto::map::Layer;
+use clearway_ros::OccupancyGrid;
+use clearway_ros::cdr::Header;
+use clearway_ros::point_cloud2::{Datatype, Field, PointCloud2};
+use clearway_ros::pose::{Odometry, StampedTransform, tf_message_to_cdr};
+use nalgebra::Isometry3;
+
+use super::{MAP_FRAME, Raster, base_frame, map_from_ego};
+use clearway_client::MapView;
+
+/// A layer as an occupancy grid, its origin in the vehicle's frame; a grid that turns under the vehicle keeps its axes.
+pub fn occupancy_grid(map: &MapView, layer: &Layer, raster: &Raster) -> Vec<u8> {
+    OccupancyGrid {
+        header: Header { stamp_ns: map.header().capture_end_ns, frame_id: &base_frame(map.vehicle()) },
+        resolution_m: raster.cell_m,
+        width: raster.width,
+        height: raster.height,
+        origin: raster.ego_from_raster,
+        data: raster.occupancies(layer),
+    }
+    .to_cdr()
+}
+
+/// Where the vehicle is on the map, as tf tells it; `None` where no pose is known.
+pub fn tf(map: &MapView) -> Option<Vec<u8>> {
+    with_transform(map, |transform| tf_message_to_cdr(&[transform]))
+}
+
+/// Where the vehicle is on the map and how fast it goes forward; `None` where no pose is known.
+pub fn odometry(map: &MapView) -> Option<Vec<u8>> {
+    let forward_mps = map.header().speed_mps.unwrap_or_default();
+    with_transform(map, |transform| {
+        Odometry { transform, linear_mps: [forward_mps, 0.0, 0.0], angular_rps: [0.0; 3] }.to_cdr()
+    })
+}
+
+/// Where a frame lies in its parent, as tf tells it.
+pub fn transform(stamp_ns: i64, parent: &str, child: &str, parent_from_child: &Isometry3<f64>) -> Vec<u8> {
+    let header = Header { stamp_ns, frame_id: parent };
+    tf_message_to_cdr(&[StampedTransform { header, child_frame_id: child, parent_from_child: *parent_from_child }])
+}
+
+/// Points of a frame, metres, in one row.
+pub fn points(stamp_ns: i64, frame_id: &str, points: &[[f32; 3]]) -> Vec<u8> {
+    let data: Vec<u8> = points.iter().flatten().flat_map(|metres| metres.to_le_bytes()).collect();
+    let field = |(name, offset)| Field { name, offset, datatype: Datatype::Float32 as u8, count: 1 };
+    PointCloud2 {
+        header: Header { stamp_ns, frame_id },
+        height: 1,
+        width: points.len() as u32,
+        fields: [("x", 0), ("y", 4), ("z", 8)].map(field).to_vec(),
+        big_endian: false,
+        point_step: 12,
+        row_step: data.len() as u32,
+        data: &data,
+        dense: true,
+    }
+    .to_cdr()
+}
+
+fn with_transform(map: &MapView, write: impl FnOnce(StampedTransform) -> Vec<u8>) -> Option<Vec<u8>> {
+    let parent_from_child = map_from_ego(map)?;
+    let header = Header { stamp_ns: map.header().capture_end_ns, frame_id: MAP_FRAME };
+    Some(write(StampedTransform { header, child_frame_id: &base_frame(map.vehicle()), parent_from_child }))
+}

@@ -1,0 +1,290 @@
+//! What one reader of `Watch` asked for: checked, then applied to the newest maps as they come.
+//!
+//! In: a [`v1::Selection`], the newest maps' capture stamps, acknowledgements. Out: whether a map may go now, and of
+//! the maps in between how many the reader missed and how many were left out at its wish. Pure: no clock is read, so
+//! the same maps and the same acknowledgements give the same updates.
+
+use std::collections::VecDeque;
+
+use bytes::Bytes;
+use clearway_proto::region::{self, RegionError};
+use clearway_proto::v1;
+use tonic::Status;
+
+use crate::publish::Served;
+use crate::encode::EncodedMap;
+
+/// What a reader may ask to have on its way: more would only be older.
+const IN_FLIGHT_MAX: u32 = 64;
+
+/// A selection that can be served.
+#[derive(Clone, Debug)]
+pub struct Selection {
+    /// All of them where empty.
+    pub layers: Vec<String>,
+    /// The part of each layer that is sent; all of it where absent.
+    pub region: Option<v1::Region>,
+    /// Whether layers may come as deltas.
+    pub deltas: bool,
+    /// Which maps are picked.
+    pub rate: Rate,
+    /// How many may be on their way.
+    pub credits: Credits,
+}
+
+impl Selection {
+    /// Checks what a reader of this vehicle asks for.
+    ///
+    /// # Errors
+    /// The first thing that cannot be had, with its value and what is allowed.
+    pub fn new(served: &Served, selection: v1::Selection) -> Result<Self, Status> {
+        let v1::Selection { vehicle: _, layers, max_in_flight, max_rate_hz, region, deltas } = selection;
+        served.check_layers(&layers)?;
+        if max_in_flight > IN_FLIGHT_MAX {
+            let text = format!("max_in_flight {max_in_flight}: 0 to {IN_FLIGHT_MAX} is allowed");
+            return Err(Status::invalid_argument(text));
+        }
+        let selection = Self {
+            layers,
+            region,
+            deltas,
+            rate: Rate::new(max_rate_hz)?,
+            credits: Credits::new(max_in_flight as usize),
+        };
+        let refused = |error: RegionError| Status::invalid_argument(error.to_string());
+        selection.region.as_ref().map_or(Ok(()), region::check).map_err(refused)?;
+        // Where there is a map already, a region that it does not reach is refused before the stream begins.
+        if let Some(newest) = served.newest.borrow().clone().filter(|_| selection.region.is_some()) {
+            selection.bytes(&newest, None)?;
+        }
+        Ok(selection)
+    }
+
+    /// What is sent of a map, as a delta against `base` where there is one.
+    ///
+    /// # Errors
+    /// The region lies outside a layer's grid.
+    pub fn bytes(&self, map: &EncodedMap, base: Option<&EncodedMap>) -> Result<Bytes, Status> {
+        let bytes = map.cut(&self.layers, self.region.as_ref(), base);
+        bytes.map_err(|error| Status::invalid_argument(error.to_string()))
+    }
+}
+
+/// Picks maps by their capture stamps: on average no more than so many a second.
+#[derive(Clone, Debug)]
+pub struct Rate {
+    /// 0: every map.
+    period_ns: i64,
+    /// Stamp from which on the next map is sent; `None` before the first.
+    due_ns: Option<i64>,
+}
+
+impl Rate {
+    fn new(max_rate_hz: Option<f64>) -> Result<Self, Status> {
+        let period_ns = match max_rate_hz {
+            None => 0,
+            // Saturates: a rate so small picks one map.
+            Some(hz) if hz.is_finite() && hz > 0.0 => (1e9 / hz) as i64,
+            Some(hz) => {
+                let text = format!("max_rate_hz {hz}: more than 0 and finite is allowed; absent, every map is sent");
+                return Err(Status::invalid_argument(text));
+            }
+        };
+        Ok(Self { period_ns, due_ns: None })
+    }
+
+    /// Whether a map captured at `stamp_ns` is to be sent.
+    pub fn is_due(&self, stamp_ns: i64) -> bool {
+        self.period_ns == 0 || self.due_ns.is_none_or(|due_ns| stamp_ns >= due_ns)
+    }
+
+    /// A map captured then is sent. The next is due a period after this one was, however late it came, so that a rate
+    /// is kept of which the maps' own is no multiple; but a reader that was away does not catch up. A quarter of a
+    /// period keeps turns that are not quite even on their side of it.
+    pub fn send(&mut self, stamp_ns: i64) {
+        let quarter_ns = self.period_ns / 4;
+        self.due_ns = match self.due_ns {
+            None => Some(stamp_ns.saturating_add(3 * quarter_ns)),
+            // A whole map that was asked for comes between two that are due.
+            Some(due_ns) if stamp_ns < due_ns => Some(due_ns),
+            Some(due_ns) => Some(due_ns.saturating_add(self.period_ns).max(stamp_ns.saturating_add(quarter_ns))),
+        };
+    }
+
+    /// Of `between` maps captured between two that were sent, how many there was room for.
+    fn room(&self, between: u64, sent_ns: [i64; 2]) -> u64 {
+        if self.period_ns == 0 {
+            return between;
+        }
+        let periods = sent_ns[1].saturating_sub(sent_ns[0]) / self.period_ns;
+        between.min(u64::try_from(periods - 1).unwrap_or(0))
+    }
+
+    /// Of the maps between two that were sent: (missed, left out at the reader's wish).
+    pub fn between(&self, last: Sent, next: Sent) -> (u64, u64) {
+        let all = next.sequence.saturating_sub(last.sequence.saturating_add(1));
+        let missed = self.room(all, [last.stamp_ns, next.stamp_ns]);
+        (missed, all - missed)
+    }
+}
+
+/// A map that was sent, as far as those between it and the next are counted.
+#[derive(Clone, Copy, Debug)]
+pub struct Sent {
+    /// The map's.
+    pub sequence: u64,
+    /// Of the end of its capture.
+    pub stamp_ns: i64,
+}
+
+/// What is on its way to a reader without an acknowledgement.
+#[derive(Clone, Debug)]
+pub struct Credits {
+    max_in_flight: usize,
+    in_flight: VecDeque<u64>,
+    /// The last map sent, and the last one of which the reader has told that it has finished with it.
+    sent: Option<u64>,
+    acknowledged: Option<u64>,
+}
+
+impl Credits {
+    fn new(max_in_flight: usize) -> Self {
+        Self { max_in_flight, in_flight: VecDeque::new(), sent: None, acknowledged: None }
+    }
+
+    /// Whether one more map may go; always, for readers that never acknowledge.
+    pub fn left(&self) -> bool {
+        self.max_in_flight == 0 || self.in_flight.len() < self.max_in_flight
+    }
+
+    /// A map goes.
+    pub fn send(&mut self, sequence: u64) {
+        self.sent = Some(sequence);
+        if self.max_in_flight > 0 {
+            self.in_flight.push_back(sequence);
+        }
+    }
+
+    /// The reader has finished with this map, and so with all before it. Saying so again changes nothing.
+    ///
+    /// # Errors
+    /// The map was never sent.
+    pub fn acknowledge(&mut self, sequence: u64) -> Result<(), Status> {
+        let known = if self.max_in_flight == 0 {
+            self.sent.is_some_and(|sent| sequence <= sent)
+        } else {
+            self.in_flight.contains(&sequence) || self.acknowledged.is_some_and(|last| sequence <= last)
+        };
+        if !known {
+            let last = self.sent.map_or("none was sent yet".to_owned(), |sent| format!("the last one sent is {sent}"));
+            let text = format!("acknowledged {sequence}: this map was never sent on this stream; {last}");
+            return Err(Status::invalid_argument(text));
+        }
+        while self.in_flight.front().is_some_and(|&sent| sent <= sequence) {
+            self.in_flight.pop_front();
+        }
+        self.acknowledged = self.acknowledged.max(Some(sequence));
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: i64 = 1_000_000;
+
+    #[test]
+    fn no_more_maps_are_on_their_way_than_the_reader_allows() {
+        let mut credits = Credits::new(2);
+        credits.send(10);
+        assert!(credits.left());
+        credits.send(14);
+        assert!(!credits.left());
+        credits.acknowledge(10).unwrap();
+        assert!(credits.left());
+        credits.send(15);
+        credits.acknowledge(10).unwrap();
+        assert!(!credits.left(), "an old acknowledgement frees nothing");
+        credits.acknowledge(15).unwrap();
+        assert!(credits.in_flight.is_empty());
+    }
+
+    #[test]
+    fn a_map_that_was_never_sent_cannot_be_acknowledged() {
+        for max_in_flight in [0, 2] {
+            let mut credits = Credits::new(max_in_flight);
+            let refused = credits.acknowledge(0).unwrap_err();
+            assert!(refused.message().contains("acknowledged 0") && refused.message().contains("none was sent yet"));
+            credits.send(10);
+            credits.send(14);
+            let refused = credits.acknowledge(15).unwrap_err();
+            assert_eq!(refused.code(), tonic::Code::InvalidArgument);
+            assert!(refused.message().ends_with("the last one sent is 14"), "{refused}");
+            assert!(credits.acknowledge(u64::MAX).is_err());
+        }
+        let mut credits = Credits::new(2);
+        credits.send(10);
+        credits.send(14);
+        assert!(
+            credits.acknowledge(9).is_err() && credits.acknowledge(12).is_err(),
+            "skipped maps were not sent either"
+        );
+        credits.acknowledge(14).unwrap();
+    }
+
+    #[test]
+    fn a_reader_that_never_acknowledges_is_not_held_up() {
+        let mut credits = Credits::new(0);
+        (0..1000).for_each(|sequence| credits.send(sequence));
+        assert!(credits.left() && credits.in_flight.is_empty());
+    }
+
+    /// Stamps of the maps that are sent of those made at `stamps`.
+    fn picked(hz: f64, stamps: impl IntoIterator<Item = i64>) -> Vec<i64> {
+        let mut rate = Rate::new(Some(hz)).unwrap();
+        let due = |stamp: &i64| {
+            let due = rate.is_due(*stamp);
+            if due {
+                rate.send(*stamp);
+            }
+            due
+        };
+        stamps.into_iter().filter(due).collect()
+    }
+
+    #[test]
+    fn maps_are_picked_by_their_stamps_at_the_rate_asked_for_and_no_faster() {
+        // 10 Hz with 8 ms of unrest.
+        let stamps = || (0..600).map(|turn| turn * 100 * MS + (turn * 37 % 17 - 8) * MS);
+        for (hz, expected) in [(100.0, 600), (10.0, 600), (7.0, 420), (5.0, 300), (3.0, 180), (0.5, 30), (1e-300, 1)] {
+            let got = picked(hz, stamps());
+            assert!(got.len().abs_diff(expected) <= 1, "{hz} Hz: {} of {expected}", got.len());
+            assert_eq!(got[0], stamps().next().unwrap(), "the first map is there at once");
+            let mut rate = Rate::new(Some(hz)).unwrap();
+            rate.send(0);
+            for pair in got.windows(2) {
+                let between = stamps().filter(|stamp| (pair[0] + 1..pair[1]).contains(stamp)).count() as u64;
+                assert_eq!(rate.room(between, [pair[0], pair[1]]), 0, "{hz} Hz: a reader that keeps up misses nothing");
+            }
+        }
+    }
+
+    #[test]
+    fn what_the_rate_left_out_is_told_from_what_was_lost() {
+        let rate = Rate::new(Some(5.0)).unwrap();
+        // Away for 2 s of 10 Hz maps: 19 in between, for 9 of which 5 Hz had room.
+        assert_eq!(rate.room(19, [0, 2000 * MS]), 9);
+        assert_eq!(Rate::new(None).unwrap().room(19, [0, 2000 * MS]), 19);
+        assert_eq!(rate.room(2, [0, 2000 * MS]), 2, "no more than there were");
+    }
+
+    #[test]
+    fn a_rate_that_is_none_is_refused_by_name() {
+        for hz in [0.0, -0.0, -1.0, f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            let refused = Rate::new(Some(hz)).unwrap_err();
+            assert_eq!(refused.code(), tonic::Code::InvalidArgument);
+            assert!(refused.message().starts_with(&format!("max_rate_hz {hz}: more than 0")), "{refused}");
+        }
+    }
+}
