@@ -18,7 +18,7 @@ export class ServerClock {
   #is_new_connection = true;
   #in_time_ms = 0;
 
-  // Starts a new connection: the next sample replaces the offset. Until then the shown map goes on ageing by the old one.
+  // Starts a new connection: the next sample replaces the offset, by which the shown map ages until then.
   restart() {
     this.#is_new_connection = true;
   }

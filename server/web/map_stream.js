@@ -1,6 +1,6 @@
-// In: the updates of one vehicle, as they arrive. Out: the newest map that was not drawn yet, and counts of what happened
-// to all others. Only the header of an update is read here; the cells of a map that is replaced before it was drawn are
-// never decoded.
+// In: the updates of one vehicle, as they arrive. Out: the newest map that was not drawn yet, and counts of what
+// happened to all others. Only the header of an update is read here; the cells of a map that is replaced before it was
+// drawn are never decoded.
 
 import { openUpdate } from "./wire/map.js";
 

@@ -69,7 +69,8 @@ function paintScale({ unit, scale, unknown }, cells, range) {
   }
   if (unknown_count > 0) colours[unknown - low] = word(UNKNOWN);
   const stop = (t) => [scaleColour(t), `${(from + t * (to - from)).toFixed(2)} ${unit}`];
-  return { colours, legend: [unknownEntry(unknown_count, cells), ...(range ? [0, 0.25, 0.5, 0.75, 1].map(stop) : [])], range };
+  const stops = range ? [0, 0.25, 0.5, 0.75, 1].map(stop) : [];
+  return { colours, legend: [unknownEntry(unknown_count, cells), ...stops], range };
 }
 
 const unknownEntry = (unknown_count, cells) => [UNKNOWN, "unknown", unknown_count / cells.length];

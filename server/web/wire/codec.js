@@ -29,7 +29,8 @@ export function decodeChannel(channel, [rows, columns], base = null) {
   const bytes_saved = Cells ? cell_count * Cells.BYTES_PER_ELEMENT - payload.length : -1;
   const allowed = { [RAW]: bytes_saved === 0, [ROWS]: bytes_saved > 0, [CHANGES]: bytes_saved > 0 && base !== null };
   if (!allowed[encoding]) {
-    throw error("cells", `${payload.length} bytes of encoding ${encoding} for ${cell_count} cells of type ${cell_type}`);
+    const what = `${payload.length} bytes of encoding ${encoding} for ${cell_count} cells of type ${cell_type}`;
+    throw error("cells", what);
   }
   const bits = new BitReader(payload, error);
   let cells;
@@ -48,7 +49,8 @@ export function decodeChannel(channel, [rows, columns], base = null) {
 export function baseByClass({ name, cell_type, encoding, by_class }, classes, legend) {
   const fits = by_class.length === legend.length * (TYPES[cell_type]?.BYTES_PER_ELEMENT ?? 1);
   if (encoding !== CHANGES || !fits || !(classes instanceof Uint8Array)) {
-    throw new DecodeError("by_class", `channel ${name}: ${by_class.length} bytes, ${legend.length} classes of u8 before it`);
+    const what = `${by_class.length} bytes, ${legend.length} classes of u8 before it`;
+    throw new DecodeError("by_class", `channel ${name}: ${what}`);
   }
   return (Cells) => {
     const value_of = littleEndian(by_class, Cells), cells = new Cells(classes.length);

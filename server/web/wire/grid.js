@@ -1,5 +1,5 @@
-// In: the geometry of a layer, radial or Cartesian (ego frame: x forward, y left, metres). Out: the cell at a point, and
-// a table from pixels to cells for a square canvas that has the vehicle in its middle, forward up and left on the left.
+// In: the geometry of a layer, radial or Cartesian (ego frame: x forward, y left, metres). Out: the cell at a point,
+// and a table from pixels to cells for a square canvas that has the vehicle in its middle, forward up, left on the left.
 // The table is computed once for each geometry and size; then a map costs one look-up a pixel.
 
 import { DecodeError } from "./limits.js";
@@ -16,7 +16,9 @@ export function gridOf(layer) {
 
 function radial({ row_radius_m, columns }) {
   const rows = row_radius_m.length;
-  if (rows === 0 || columns === 0) throw new DecodeError("geometry", `${rows} rows of ${columns} columns; at least 1 each`);
+  if (rows === 0 || columns === 0) {
+    throw new DecodeError("geometry", `${rows} rows of ${columns} columns; at least 1 of each is needed`);
+  }
   row_radius_m.forEach((outer, row) => {
     const inner = row ? row_radius_m[row - 1] : 0;
     if (!(outer > inner && outer < Infinity)) {
@@ -45,10 +47,11 @@ function radial({ row_radius_m, columns }) {
 }
 
 function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix = 0n, first_iy = 0n }) {
-  if (width === 0 || height === 0) throw new DecodeError("geometry", `${width} x ${height} cells; at least 1 each`);
+  if (width === 0 || height === 0) throw new DecodeError("geometry", `${width} x ${height} cells; at least 1 x 1`);
   if (!(cell_m > 0 && cell_m < Infinity)) throw new DecodeError("geometry", `cell_m is ${cell_m}; it must be over 0`);
   if (!Number.isFinite(origin_x_m + origin_y_m + yaw_rad)) {
-    throw new DecodeError("geometry", `origin is (${origin_x_m}, ${origin_y_m}) m, yaw ${yaw_rad} rad; they must be finite`);
+    const what = `origin is (${origin_x_m}, ${origin_y_m}) m, yaw ${yaw_rad} rad; they must be finite`;
+    throw new DecodeError("geometry", what);
   }
   const cos = Math.cos(yaw_rad), sin = Math.sin(yaw_rad);
   const cellAt = (x, y) => {
@@ -69,8 +72,8 @@ export function egoAt(px, py, size, view_m) {
   return { x: (size / 2 - py - 0.5) * metres, y: (size / 2 - px - 0.5) * metres };
 }
 
-// Layers of one map mostly share a geometry, so their panels share a table. A change of the view makes new tables, and so
-// does each map of a grid that turns under the vehicle; the table that was not used for the longest time is dropped.
+// Layers of one map mostly share a geometry, so their panels share a table. A change of the view makes new tables, and
+// so does each map of a grid that turns under the vehicle; the table that was not used for the longest time is dropped.
 const TABLES_MAX = 4;
 const tables = new Map();
 

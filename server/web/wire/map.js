@@ -1,5 +1,5 @@
-// In: the bytes of a MapUpdate or of a Map. Out: the map, whose layers and channels are decoded when they are asked for,
-// or a DecodeError or WireError that says what is wrong.
+// In: the bytes of a MapUpdate or of a Map. Out: the map, whose layers and channels are decoded when they are first
+// needed, or a DecodeError or WireError that says what is wrong.
 
 import { baseByClass, decodeChannel } from "./codec.js";
 import { baseCells, baseLayer } from "./delta.js";
@@ -28,7 +28,9 @@ export class LiveMap {
       throw new DecodeError("too_long", `${this.length} bytes; at most ${MAP_BYTES_MAX} are allowed`);
     }
     const parts = countParts(bytes);
-    if (parts > MAP_PARTS_MAX) throw new DecodeError("too_many_parts", `${parts}; at most ${MAP_PARTS_MAX} are allowed`);
+    if (parts > MAP_PARTS_MAX) {
+      throw new DecodeError("too_many_parts", `${parts} parts; at most ${MAP_PARTS_MAX} are allowed`);
+    }
     const { header, layers } = readMap(bytes);
     if (!header) throw new DecodeError("header", "the map has none");
     this.header = header;

@@ -150,7 +150,8 @@ const CARTESIAN = {
 };
 const CHANNEL = {
   1: ["name", string], 2: ["unit", string], 3: ["scale", float], 4: ["cell_type", uint32], 5: ["unknown", sint32],
-  6: ["encoding", uint32], 7: ["cell_count", uint32], 8: ["crc32", fixed32], 9: ["payload", bytes], 10: ["by_class", bytes],
+  6: ["encoding", uint32], 7: ["cell_count", uint32], 8: ["crc32", fixed32], 9: ["payload", bytes],
+  10: ["by_class", bytes],
 };
 const LAYER = {
   1: ["name", string], 2: ["radial", message(RADIAL)], 3: ["cartesian", message(CARTESIAN)],

@@ -174,7 +174,7 @@ test("columns run counter-clockwise from ahead, and an outer radius belongs to i
   assert.equal(grid.cellAt(2, 0), 4);
   assert.equal(grid.cellAt(3, -1e-18), 11);
   assert.equal(grid.cellAt(4.01, 0), -1);
-  assert.throws(() => gridOf({ radial: { row_radius_m: [2, 1], columns: 4 } }), /bench 1 is 1 m/);
+  assert.throws(() => gridOf({ radial: { row_radius_m: [2, 1], columns: 4 } }), /row radius 1 is 1 m/);
 });
 
 test("a Cartesian cell contains its lower edge", () => {
