@@ -18,7 +18,7 @@ fn a_turn_in_town(bencher: divan::Bencher, model: Model) {
     bencher.bench_local(|| {
         turn += 1;
         let end_ns = vehicle.start_ns() + (turn + 1) * 100_000_000;
-        vehicle.clone().from_turn(turn).take_while(|datagram| datagram.stamp_ns < end_ns).count()
+        vehicle.clone().from_revolution(turn).take_while(|datagram| datagram.stamp_ns < end_ns).count()
     });
 }
 

@@ -53,11 +53,10 @@ impl Encoder {
         Self { spec: model.spec(), mode, status, firings: Vec::new(), packets: 0 }
     }
 
-    /// The same encoder with `number` as its next packet and nothing begun.
-    pub fn at_packet(mut self, number: i64) -> Self {
+    /// Drops the firings of an unfinished packet; the next packet is packet `number`.
+    pub fn begin_packet(&mut self, number: i64) {
         self.firings.clear();
         self.packets = number;
-        self
     }
 
     /// Takes the next firing; gives the packet it completed, if any.

@@ -21,6 +21,7 @@
 //! | [`encode`] | firings -> 1206-byte data packets |
 //! | [`telemetry`] | place, speed, time -> 512-byte telemetry datagrams |
 //! | [`vehicle`] | all of the above: datagrams without end |
+//! | [`real_time`] | a vehicle and a clock -> its datagrams, but for what a slow machine skips |
 //! | [`impair`] | datagrams -> what a bad network leaves of them |
 //! | [`send`] | datagrams -> UDP, paced by the clock |
 //! | [`noise`] | chance by key, for all of them |
@@ -36,6 +37,7 @@ pub mod plan;
 pub mod planes;
 pub mod pose;
 pub mod raycast;
+pub mod real_time;
 pub mod scanner;
 pub mod scenes;
 pub mod send;

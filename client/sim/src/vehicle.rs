@@ -4,6 +4,7 @@
 //! the truth beside them.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::Revolution;
@@ -105,6 +106,11 @@ impl SimulatedVehicle {
         self.start_ns
     }
 
+    /// The stamp of the next firing, ns since the Unix epoch.
+    pub fn next_stamp_ns(&self) -> i64 {
+        self.start_ns + self.scanner.firing_ns(self.next_firing)
+    }
+
     /// The place on the globe of the world's origin.
     pub fn datum(&self) -> Datum {
         self.datum
@@ -140,17 +146,53 @@ impl SimulatedVehicle {
         (0..truth.classes.len()).map(sees).collect()
     }
 
-    /// The datagrams from the beginning of turn `number` on (0 starts at the scene's beginning; turns before exist
-    /// too).
-    pub fn from_turn(mut self, number: i64) -> Self {
-        let per_packet = self.scanner.spec().firings_per_packet(self.scanner.config().return_mode) as i64;
-        let packet = self.scanner.first_firing_of(number).div_euclid(per_packet);
-        self.next_firing = packet * per_packet;
-        self.encoder = self.encoder.at_packet(packet);
+    /// The vehicle moved to the beginning of revolution `number`. Revolution 0 starts at the scene's beginning; numbers
+    /// below 0 exist too.
+    pub fn from_revolution(mut self, number: i64) -> Self {
+        self.move_to(self.scanner.first_firing_of(number));
+        self
+    }
+
+    /// True if the next packet is the last one before the angle at which a decoder ends a revolution by default: behind
+    /// the vehicle, half a revolution from the encoder's zero.
+    pub fn is_at_revolution_end(&self) -> bool {
+        let next = self.next_firing + self.firings_per_packet();
+        let [first, next] = [self.next_firing, next].map(|firing| self.scanner.encoder_turns(firing));
+        self.waiting.is_none() && first < 0.5 && next >= 0.5
+    }
+
+    /// Skips as many whole revolutions as lie between the next packet and `stamp_ns`, without simulating them, and the
+    /// packet in which a revolution ends. The scene goes on meanwhile. Returns the skipped time, 0 if `stamp_ns` is less
+    /// than a revolution ahead.
+    ///
+    /// At [`SimulatedVehicle::is_at_revolution_end`], a decoder then sees one revolution end and the next one begin, both
+    /// without a few firings. Elsewhere it sees two parts of revolutions.
+    pub fn skip_to(&mut self, stamp_ns: i64) -> Duration {
+        let revolution_ns = 60e9 / self.scanner.config().rpm;
+        let revolutions = ((stamp_ns - self.next_stamp_ns()) as f64 / revolution_ns).floor();
+        if revolutions < 1.0 {
+            return Duration::ZERO;
+        }
+        let firings = revolutions * revolution_ns / self.scanner.firing_ns(1) as f64;
+        let before = self.next_firing;
+        // One packet after the first one that begins no earlier than this angle: that may still hold the end.
+        self.move_to(before + firings as i64 + 2 * self.firings_per_packet());
+        let skipped_ns = self.scanner.firing_ns(self.next_firing - before);
+        Duration::from_nanos(skipped_ns.unsigned_abs())
+    }
+
+    fn firings_per_packet(&self) -> i64 {
+        self.scanner.spec().firings_per_packet(self.scanner.config().return_mode) as i64
+    }
+
+    /// Makes the packet that holds `firing` the next one.
+    fn move_to(&mut self, firing: i64) {
+        let packet = firing.div_euclid(self.firings_per_packet());
+        self.next_firing = packet * self.firings_per_packet();
+        self.encoder.begin_packet(packet);
         let stamp_ns = self.start_ns + self.scanner.firing_ns(self.next_firing);
         self.next_telemetry_ns = stamp_ns - stamp_ns.rem_euclid(TELEMETRY_PERIOD_NS);
         self.waiting = None;
-        self
     }
 
     /// Turn `number`, whole, through real datagrams and the decoder, and the truth 60 m around in cells of 0.2 m at its
@@ -185,7 +227,7 @@ impl SimulatedVehicle {
         let slack_ns = self.scanner.firing_ns(2);
         let begins_ns =
             self.start_ns + self.scanner.firing_ns(self.scanner.first_firing_of(number)) - half_turn_ns - slack_ns;
-        for datagram in self.clone().from_turn(number - 1) {
+        for datagram in self.clone().from_revolution(number - 1) {
             let revolution = sensor.push(&datagram.payload, datagram.stamp_ns);
             if let Some(revolution) = revolution.expect("the decoder takes what the encoder makes")
                 && revolution.partial.is_none()

@@ -45,12 +45,12 @@ fn datagrams_come_in_the_order_of_their_stamps_and_have_their_lengths() {
 #[test]
 fn the_same_seed_sends_the_same_bytes_from_wherever_it_begins() {
     let config = ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() };
-    let late = town(config.clone()).from_turn(4);
+    let late = town(config.clone()).from_revolution(4);
     let packets = |vehicle: SimulatedVehicle| vehicle.filter(|datagram| datagram.kind == Kind::Data);
     let expected: Vec<Datagram> = packets(late).take(50).collect();
     let whole = packets(town(config.clone())).skip_while(|datagram| datagram.stamp_ns < expected[0].stamp_ns);
     assert_eq!(whole.take(50).collect::<Vec<_>>(), expected);
-    let other = packets(town(ScannerConfig { seed: 2, ..config }).from_turn(4)).take(50).collect::<Vec<_>>();
+    let other = packets(town(ScannerConfig { seed: 2, ..config }).from_revolution(4)).take(50).collect::<Vec<_>>();
     assert_ne!(other, expected, "another seed, other noise");
 }
 

@@ -57,27 +57,8 @@ pub enum Command {
     Export(super::export::Options),
     Send(super::send::Options),
     Ingest(super::ingest::Options),
-    /// Drive a simulated vehicle at a server of its own, over real UDP.
-    Demo {
-        /// End after so many seconds; without, at Ctrl-C.
-        #[arg(long, value_parser = seconds)]
-        seconds: Option<Duration>,
-        /// Where to record; a temporary file where absent.
-        #[arg(long)]
-        record: Option<PathBuf>,
-        /// One turning LIDAR in a town; or two of them and six that scan, poses and roads over gRPC, in traffic.
-        #[arg(long, value_enum, default_value = "one")]
-        sensors: Sensors,
-        /// One object a second on stdout, and a summary.
-        #[arg(long)]
-        json: bool,
-    },
-}
-
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum Sensors {
-    One,
-    Many,
+    #[cfg(feature = "sim")]
+    Demo(super::demo::command::Options),
 }
 
 #[derive(clap::Args)]
@@ -165,7 +146,7 @@ fn columns(text: &str) -> Result<u16, String> {
     degrees.ok_or_else(|| "1, 2 or 4 degrees are allowed".into())
 }
 
-fn seconds(text: &str) -> Result<Duration, String> {
+pub(super) fn seconds(text: &str) -> Result<Duration, String> {
     let duration = text.parse().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
     duration.ok_or_else(|| "0 or more seconds are allowed".into())
 }

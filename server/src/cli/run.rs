@@ -1,7 +1,7 @@
 //! The command `clearway`: serve, replay, verify, evaluate, check, demo.
 
 use std::io::{IsTerminal, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -11,7 +11,6 @@ use anyhow::{Context, Result};
 
 use clap::Parser;
 use crate::config::Config;
-use crate::cli::demo::{self, Places, Second};
 use crate::cli::evaluate;
 use crate::cli::replay::{self, Progress, Summary};
 use crate::server::{Running, Server, Setup};
@@ -19,7 +18,7 @@ use crate::record::verify::verify;
 use indicatif::{ProgressBar, ProgressStyle};
 use tracing_subscriber::EnvFilter;
 
-use super::arguments::{Arguments, Command, ConfigArguments, EvaluateArguments, LogFormat, ReplayArguments, Sensors};
+use super::arguments::{Arguments, Command, ConfigArguments, EvaluateArguments, LogFormat, ReplayArguments};
 
 /// Runs the command line.
 pub fn main() -> ExitCode {
@@ -60,9 +59,8 @@ fn run(command: Command) -> Result<ExitCode> {
         Command::Export(options) => done(super::export::run(&options)),
         Command::Send(options) => done(super::send::run(&options)),
         Command::Ingest(options) => done(super::block_on(super::ingest::run(options))),
-        Command::Demo { seconds, record, sensors, json } => {
-            runtime()?.block_on(run_demo(seconds, record, sensors == Sensors::Many, json))
-        }
+        #[cfg(feature = "sim")]
+        Command::Demo(options) => runtime()?.block_on(super::demo::command::run(options)),
     }
 }
 
@@ -124,7 +122,7 @@ fn tell(running: &Running) {
 }
 
 /// Resolves at SIGINT or SIGTERM.
-fn stop_signal() -> Result<impl Future<Output = ()>> {
+pub(super) fn stop_signal() -> Result<impl Future<Output = ()>> {
     use tokio::signal::unix::{SignalKind, signal};
     let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
     Ok(async move {
@@ -200,49 +198,6 @@ async fn draw(progress: Arc<Progress>, shown: bool) {
         bar.0.set_position(progress.bytes_read.load(Ordering::Relaxed));
         tokio::time::sleep(Duration::from_millis(100)).await;
     }
-}
-
-async fn run_demo(
-    duration: Option<Duration>,
-    record: Option<PathBuf>,
-    many_sensors: bool,
-    json: bool,
-) -> Result<ExitCode> {
-    let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
-    let record = record.unwrap_or_else(|| folder.join("demo.mcap"));
-    let picture = record.with_extension("png");
-    let options = demo::Options { duration, record, picture, many_sensors, any_port: false };
-    let begun = |places: &Places| {
-        if json {
-            return;
-        }
-        places.notes.iter().for_each(|note| say(&format!("{note}\n")));
-        say(&format!(
-            "A simulated car drives through a simulated town.\n  page       http://{}/\n  gRPC       {}   (clearway watch \
-             --server http://{})\n  zenoh      {}   (clearway/car/map/drivability)\n  recording  {}\n  newest map {}   (drawn each second)\n",
-            places.page,
-            places.grpc,
-            places.grpc,
-            places.zenoh.join(", "),
-            places.record.display(),
-            places.picture.display(),
-        ));
-    };
-    let second = |second: &Second| {
-        say(&if json { format!("{}\n", second.to_json()) } else { format!("{}\n", second.line()) });
-    };
-    let stop = stop_signal()?;
-    let summary = demo::demo(options, begun, second, stop).await?;
-    if json {
-        say(&format!("{}\n", summary.to_json()));
-    } else {
-        let (sent, last) = (summary.sent, &summary.last.snapshot);
-        say(&format!(
-            "The car sent {} data packets and {} telemetry datagrams; {} were received, {} maps made.\n",
-            sent.packets, sent.telemetry, last.ledger.received, last.maps
-        ));
-    }
-    Ok(ExitCode::SUCCESS)
 }
 
 fn verify_file(file: &Path, json: bool) -> Result<ExitCode> {

@@ -63,7 +63,7 @@ impl Drive {
             let datagrams = rig.vehicle(index).take_while(|datagram| datagram.stamp_ns < end_ns);
             sent.extend(datagrams.map(|d| Sent { offset_ns: d.stamp_ns - START_NS, what: What::Datagram(index, d) }));
         }
-        let told = rig.told().take_while(|told| told.stamp_ns < end_ns);
+        let told = rig.observations().take_while(|told| told.stamp_ns < end_ns);
         sent.extend(told.map(|told| Sent {
             offset_ns: told.stamp_ns - START_NS,
             what: What::Observation(Box::new(told.observation.into())),

@@ -1,182 +1,126 @@
-//! The whole house in one process, on loopback: a simulated vehicle sends real UDP datagrams in real time at a server
-//! of its own, and with many sensors scans, poses and roads over real gRPC; a line a second says what comes of them.
+//! Clearway in one process, on loopback: a simulated car sends real UDP datagrams in real time to a server of its own,
+//! and with many sensors scans, poses and roads over real gRPC. Once a second the state is reported.
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | [`command`] | command line -> [`Options`], reports -> stdout |
+//! | [`sensors`] | the choice of sensors, this machine -> the model on the roof |
+//! | [`rig`] | scene, sensors -> the vehicle's configuration, datagrams, observations |
+//! | [`car`] | rig, clock -> UDP and gRPC in real time |
+//! | [`report`] | status -> a line, or JSON |
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use crate::encode::picture::{self, Style};
 use clearway_proto::codec::Limits;
 use clearway_proto::map::decode_map;
-use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
-use clearway_sim::send::Sent;
 use clearway_sim::traffic::street;
-use serde_json::{Value, json};
 use tokio::time::MissedTickBehavior;
 
 use crate::config::{Config, Sender, Udp};
+use crate::encode::EncodedMap;
+use crate::encode::picture::{self, Style};
 use crate::ingest::now_ns;
 use crate::server::{Running, Server, Setup, StartError};
-use crate::status::Snapshot;
-use crate::encode::EncodedMap;
 
 use car::Car;
+use report::{Report, Summary};
 use rig::Rig;
+use sensors::{Choice, Sensors};
 
 pub mod car;
+pub mod command;
+pub mod report;
 pub mod rig;
+pub mod sensors;
 
-/// The last datagrams are through the sockets long before this.
+/// How long the demo waits at its end for the last datagrams, which take far less to pass through the sockets.
 const SETTLE: Duration = Duration::from_millis(500);
 
-/// What a demo is asked for.
+/// What the demo does.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
-    /// Ends after so long; without, when `stop` resolves.
+    /// How long the demo runs; `None`: until `stop` resolves.
     pub duration: Option<Duration>,
-    /// Where to record.
-    pub record: PathBuf,
-    /// Where to draw the newest map, each second anew.
+    /// The file that events and maps are recorded to; `None`: nothing is recorded.
+    pub record: Option<PathBuf>,
+    /// The file that the newest map is drawn to every second.
     pub picture: PathBuf,
-    /// Two turning LIDARs and six that scan, poses and roads, in traffic; else one on the roof, in the town.
-    pub many_sensors: bool,
-    /// Ports of the operating system's choice everywhere, for tests that run beside each other.
+    /// The car's sensors.
+    pub sensors: Sensors,
+    /// True if the operating system chooses every port, for tests that run beside each other.
     pub any_port: bool,
 }
 
-/// Where to look, as the demo begins.
+/// Where a running demo can be watched.
 #[derive(Clone, Debug)]
-pub struct Places {
-    /// The page.
+pub struct Endpoints {
+    /// The address of the page.
     pub page: SocketAddr,
-    /// gRPC.
+    /// The address of gRPC.
     pub grpc: SocketAddr,
     /// zenoh's endpoints.
     pub zenoh: Vec<String>,
-    /// The recording.
-    pub record: PathBuf,
-    /// The newest map, drawn from above.
-    pub picture: PathBuf,
-    /// What had to be chosen otherwise than usual.
+    /// The sensors, and why they were chosen.
+    pub sensors: String,
+    /// Ports that differ from the usual ones, and why.
     pub notes: Vec<String>,
 }
 
-/// One second of it.
-#[derive(Clone, Debug)]
-pub struct Second {
-    /// Since the beginning.
-    pub elapsed: Duration,
-    /// Ledger, rates, latency.
-    pub snapshot: Snapshot,
-    /// Age of the newest map, from its capture's end.
-    pub age_ms: Option<f64>,
-}
-
-/// Why a demo did not come to its end.
+/// The errors that end a demo.
 #[derive(Debug, thiserror::Error)]
 pub enum DemoError {
     /// The server did not start.
     #[error(transparent)]
     Start(#[from] StartError),
-    /// The server did not end as it should have.
+    /// The server did not shut down as it should.
     #[error(transparent)]
     End(#[from] crate::server::EndError),
-    /// The picture could not be drawn.
+    /// The picture could not be drawn or written.
     #[error("picture {}: {reason}", file.display())]
     Picture {
         /// The file.
         file: PathBuf,
-        /// Why.
+        /// The cause.
         reason: String,
     },
-    /// The simulated vehicle could not send.
-    #[error("the simulated vehicle: {0}")]
+    /// The simulated car could not send datagrams.
+    #[error("the simulated car: {0}")]
     Vehicle(#[from] std::io::Error),
-    /// The simulated vehicle's scans, poses or roads could not be told.
-    #[error("the simulated vehicle: {0}")]
-    Told(#[from] clearway_client::ClientError),
+    /// The simulated car could not send scans, poses or roads.
+    #[error("the simulated car: {0}")]
+    Observation(#[from] clearway_client::ClientError),
 }
 
-/// What came of it.
-#[derive(Clone, Debug)]
-pub struct Summary {
-    /// The last second.
-    pub last: Second,
-    /// What the vehicle sent.
-    pub sent: Sent,
-}
-
-impl Second {
-    /// In one line.
-    pub fn line(&self) -> String {
-        let Self { elapsed, snapshot, age_ms } = self;
-        let figure = |value: Option<f64>, unit: &str| value.map_or("-".into(), |value| format!("{value:.1} {unit}"));
-        format!(
-            "{:>4} s  {:>6} revolutions  {:>8} packets  {} refused  {} lost  age {}  latency {}  drivable {}",
-            elapsed.as_secs(),
-            snapshot.revolutions(),
-            snapshot.ledger.received,
-            snapshot.refused(),
-            snapshot.ledger.lost + snapshot.ledger.kernel_drops,
-            figure(*age_ms, "ms"),
-            figure(snapshot.latency_ms_p50, "ms"),
-            figure(snapshot.drivable_share.map(|share| 100.0 * share), "%"),
-        )
-    }
-
-    /// As an object.
-    pub fn to_json(&self) -> Value {
-        let Self { elapsed, snapshot, age_ms } = self;
-        json!({
-            "seconds": elapsed.as_secs_f64(),
-            "revolutions": snapshot.revolutions(),
-            "maps": snapshot.maps,
-            "packets": snapshot.packets_json(),
-            "telemetry": snapshot.ledger.telemetry,
-            "lost": snapshot.ledger.lost,
-            "kernel_drops": snapshot.ledger.kernel_drops,
-            "age_ms": age_ms,
-            "latency_ms": { "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 },
-            "drivable_share": snapshot.drivable_share,
-        })
-    }
-}
-
-impl Summary {
-    /// As an object.
-    pub fn to_json(&self) -> Value {
-        let mut object = self.last.to_json();
-        object["sent"] = json!({ "packets": self.sent.packets, "telemetry": self.sent.telemetry });
-        object
-    }
-}
-
-/// Drives until the duration has passed or `stop` resolves. `begun` is told where to look, `second` sees the newest
-/// map's server once a second. Needs a multi-thread tokio runtime.
+/// Drives until the duration has passed or `stop` resolves. Calls `begun` when the server runs, and `report` once a
+/// second. Needs a multi-thread tokio runtime.
 ///
 /// # Errors
-/// [`DemoError`]; nothing is left running.
+/// [`DemoError`], which names the part that failed; nothing is left running.
 pub async fn demo(
     options: Options,
-    begun: impl FnOnce(&Places),
-    mut second: impl FnMut(&Second),
+    begun: impl FnOnce(&Endpoints),
+    mut report: impl FnMut(&Report),
     stop: impl Future<Output = ()>,
 ) -> Result<Summary, DemoError> {
-    let (config, notes) = configuration(&options);
+    let choice = tokio::task::block_in_place(|| Choice::new(options.sensors));
+    let rig = |start_ns| rig(options.sensors, &choice, start_ns);
+    let (config, notes) = configuration(&options, &rig(0));
+    let validity = Duration::from_millis(config.vehicles[0].maps.valid_ms.into());
     let running = Server::start(Setup { config, ..Setup::default() }).await?;
     let nowhere = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
-    begun(&Places {
+    begun(&Endpoints {
         page: running.page.unwrap_or(nowhere),
         grpc: running.grpc.unwrap_or(nowhere),
         zenoh: running.zenoh.clone(),
-        record: options.record.clone(),
-        picture: options.picture.clone(),
+        sensors: describe(options.sensors, &choice),
         notes,
     });
-    let doors = running.doors[0].udp.unwrap_or((nowhere, nowhere));
-    // Last of all, so that the vehicle's first firing is now.
-    let car = Car::start(vehicle(&options, now_ns()), doors, running.grpc.unwrap_or(nowhere))?;
+    let udp = running.doors[0].udp.unwrap_or((nowhere, nowhere));
+    // The car starts after everything else, so that its first firing is now.
+    let car = Car::start(rig(now_ns()), udp, running.grpc.unwrap_or(nowhere))?;
 
     let began = tokio::time::Instant::now();
     let end = async {
@@ -186,10 +130,12 @@ pub async fn demo(
         }
     };
     tokio::pin!(stop, end);
-    let now = |running: &Running| {
+    let sensors = if options.sensors == Sensors::Many { "eight sensors" } else { sensors::name(choice.model) };
+    let mut last = Report { validity, sensors, ..Report::default() };
+    let now = |running: &Running, last: &Report| {
         let snapshot = running.vehicles.0[0].status.snapshot();
         let age_ms = (snapshot.maps > 0).then(|| (now_ns() - snapshot.newest_capture_end_ns) as f64 / 1e6);
-        Second { elapsed: began.elapsed(), snapshot, age_ms }
+        last.next(began.elapsed(), snapshot, age_ms, car.skipped())
     };
     let mut every = tokio::time::interval_at(began + Duration::from_secs(1), Duration::from_secs(1));
     every.set_missed_tick_behavior(MissedTickBehavior::Skip);
@@ -199,7 +145,8 @@ pub async fn demo(
             () = &mut stop => break,
             () = &mut end => break,
             _ = every.tick() => {
-                second(&now(&running));
+                last = now(&running, &last);
+                report(&last);
                 let newest = running.vehicles.0[0].newest.borrow().clone();
                 if let Some(map) = newest {
                     tokio::task::block_in_place(|| draw(&map, &options.picture))?;
@@ -210,46 +157,53 @@ pub async fn demo(
             break;
         }
     }
-    let last = now(&running);
+    last = now(&running, &last);
     let sent = car.stop().await;
     let status = running.vehicles.0[0].status.clone();
-    let on_their_way = || {
+    let some_are_on_the_way = || {
         let ledger = status.snapshot().ledger;
         let accounted = ledger.received + ledger.lost + ledger.kernel_drops;
         sent.as_ref().is_ok_and(|sent| accounted < sent.packets + sent.telemetry)
     };
     let settled = tokio::time::Instant::now() + SETTLE;
-    while on_their_way() && tokio::time::Instant::now() < settled {
+    while some_are_on_the_way() && tokio::time::Instant::now() < settled {
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
     running.shutdown().await?;
     let sent = sent?;
-    // Complete only now.
-    Ok(Summary { last: Second { snapshot: status.snapshot(), ..last }, sent })
+    // The counts are complete only now.
+    Ok(Summary { last: Report { snapshot: status.snapshot(), ..last }, sent })
 }
 
-/// Draws a map's drivability; whoever looks at the file sees a whole picture, the old or the new one.
+/// Draws a map's drivability. A reader of the file sees a whole picture, either the old or the new one.
 fn draw(map: &EncodedMap, file: &Path) -> Result<(), DemoError> {
-    let wrong = |reason: String| DemoError::Picture { file: file.to_owned(), reason };
-    let map = decode_map(map.select(&["drivability".into()]), &Limits::default()).map_err(|e| wrong(e.to_string()))?;
+    let error = |reason: String| DemoError::Picture { file: file.to_owned(), reason };
+    let map = decode_map(map.select(&["drivability".into()]), &Limits::default()).map_err(|e| error(e.to_string()))?;
     let Some(layer) = map.layer("drivability") else { return Ok(()) };
     let style = Style { pixels: 640, range_m: None, rings_m: Some(10.0), vehicle: true };
-    let bytes = picture::png(layer, &style).map_err(|error| wrong(error.to_string()))?;
+    let bytes = picture::png(layer, &style).map_err(|e| error(e.to_string()))?;
     let unfinished = file.with_extension("png.part");
-    std::fs::write(&unfinished, bytes).map_err(|error| wrong(error.to_string()))?;
-    std::fs::rename(&unfinished, file).map_err(|error| wrong(error.to_string()))
+    std::fs::write(&unfinished, bytes).map_err(|e| error(e.to_string()))?;
+    std::fs::rename(&unfinished, file).map_err(|e| error(e.to_string()))
 }
 
-/// The car, its scene beginning at `start_ns`.
-fn vehicle(options: &Options, start_ns: i64) -> Rig {
-    if options.many_sensors {
-        return Rig::many(street(8.0), start_ns);
+/// The car; its scene begins at `start_ns`.
+fn rig(sensors: Sensors, choice: &Choice, start_ns: i64) -> Rig {
+    match sensors {
+        Sensors::Many => Rig::many(street(8.0), start_ns),
+        _ => Rig::one(choice.model, town(), start_ns),
     }
-    Rig { scene: town(), start_ns, scanners: vec![("top".into(), ScannerConfig::default())], units: Vec::new() }
 }
 
-/// The usual ports where they are free, any where they are not.
-fn configuration(options: &Options) -> (Config, Vec<String>) {
+fn describe(sensors: Sensors, choice: &Choice) -> String {
+    match sensors {
+        Sensors::Many => "two VLP-16 and six LIDARs of four planes".into(),
+        _ => choice.to_string(),
+    }
+}
+
+/// The server's configuration: the usual ports if they are free, else any; and a note on each port that is not free.
+fn configuration(options: &Options, rig: &Rig) -> (Config, Vec<String>) {
     let mut config = Config::of_one_vehicle("car", "top");
     let mut notes = Vec::new();
     let mut port = |what: &str, at: SocketAddr| {
@@ -269,17 +223,19 @@ fn configuration(options: &Options) -> (Config, Vec<String>) {
     let zenoh = port("zenoh", SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 7447));
     config.zenoh.enabled = cfg!(feature = "zenoh");
     config.zenoh.listen = vec![format!("tcp/{zenoh}")];
-    config.recorder.file = options.record.clone();
+    if let Some(file) = &options.record {
+        config.recorder.file = file.clone();
+    }
     let any = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
-    let rig = self::vehicle(options, 0);
+    let many = options.sensors == Sensors::Many;
     let vehicle = &mut config.vehicles[0];
     let sender =
         |(index, (name, _)): (usize, &(String, _))| (name.clone(), Sender::Address(car::address(index).into()));
-    let from = rig.scanners.iter().enumerate().map(sender).filter(|_| options.many_sensors).collect();
+    let from = rig.scanners.iter().enumerate().map(sender).filter(|_| many).collect();
     vehicle.udp = Some(Udp { data: any, telemetry: any, from, ..Udp::default() });
-    vehicle.maps.speed.enabled |= options.many_sensors;
-    // The simulated vehicle knows where its sensors are.
-    if options.many_sensors {
+    vehicle.maps.speed.enabled |= many;
+    // The rig states where its sensors are.
+    if many {
         vehicle.sensors = rig.sensors();
     } else {
         vehicle.sensors[0].extrinsics = rig::extrinsics(&rig.scanners[0].1.ego_from_sensor);
