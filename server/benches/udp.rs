@@ -1,7 +1,7 @@
 //! What the UDP door takes: datagrams over loopback, from a thread that sends them, to an engine that only counts them.
 //!
-//!   cargo bench -p clearway-server --bench udp                       flat out, 2,000,000 datagrams
-//!   cargo bench -p clearway-server --bench udp -- 6254 60            6,254 a second for 60 seconds, nothing may be lost
+//!   cargo bench -p clearway --bench udp                       flat out, 2,000,000 datagrams
+//!   cargo bench -p clearway --bench udp -- 6254 60            6,254 a second for 60 seconds, nothing may be lost
 //!
 //! Every datagram is accounted for: sent = taken + lost in the queue + dropped by the kernel.
 

@@ -102,7 +102,7 @@ pub enum StartError {
     #[error(transparent)]
     Zenoh(#[from] crate::publish::zenoh::ZenohError),
     /// zenoh is asked for, but not built in.
-    #[error("zenoh.enabled = true: this clearway-server was built without the feature zenoh; allowed: false")]
+    #[error("zenoh.enabled = true: this clearway was built without the feature zenoh; allowed: false")]
     NoZenoh,
 }
 

@@ -1,9 +1,9 @@
-//! The command `clearway-server`, as a person meets it.
+//! The command `clearway`, as a person meets it.
 
 use std::process::{Command, Output};
 
 fn clearway(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_clearway-server")).args(arguments).output().expect("the binary starts")
+    Command::new(env!("CARGO_BIN_EXE_clearway")).args(arguments).output().expect("the binary starts")
 }
 
 #[test]
@@ -33,5 +33,5 @@ fn an_unknown_key_is_named_with_its_file_and_line_and_nothing_is_served() {
 fn a_wrong_use_is_answered_with_how_to_use_it() {
     let output = clearway(&["replay"]);
     assert_eq!(output.status.code(), Some(2));
-    assert!(String::from_utf8_lossy(&output.stderr).contains("Usage: clearway-server replay"));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("Usage: clearway replay"));
 }

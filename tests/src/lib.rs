@@ -36,7 +36,7 @@ pub fn workspace() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the repository").to_path_buf()
 }
 
-/// Runs `clearway-server` or `clearway` in `folder` to its end.
+/// Runs `clearway` or `clearway` in `folder` to its end.
 ///
 /// # Panics
 /// When the binary cannot be started.

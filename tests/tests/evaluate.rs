@@ -1,4 +1,4 @@
-//! `clearway-server evaluate` on the labelled SemanticKITTI frame: the targets, and what it says of files that do not
+//! `clearway evaluate` on the labelled SemanticKITTI frame: the targets, and what it says of files that do not
 //! fit.
 
 use std::path::Path;
@@ -12,7 +12,7 @@ fn kitti() -> String {
 
 fn judged(arguments: &[&str]) -> Value {
     let folder = tempfile::tempdir().expect("a folder");
-    let output = run(folder.path(), "clearway-server", &[&["evaluate", "--json"], arguments].concat());
+    let output = run(folder.path(), "clearway", &[&["evaluate", "--json"], arguments].concat());
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     serde_json::from_slice(&output.stdout).expect("one object")
 }
@@ -53,13 +53,13 @@ fn labels_without_their_scan_are_named_and_end_in_failure() {
     std::fs::copy(Path::new(&kitti()).join("mmdet3d/000000.label"), folder.path().join("000000.label"))
         .expect("labels");
     let place = folder.path().display().to_string();
-    let output = run(folder.path(), "clearway-server", &["evaluate", &place]);
+    let output = run(folder.path(), "clearway", &["evaluate", &place]);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(!output.status.success() && said.contains("000000.label: no 000000.bin"), "{said}");
     // The scan of another frame.
     let scan = Path::new(&kitti()).join("patchwork-plusplus/000001.bin");
     std::fs::copy(scan, folder.path().join("000000.bin")).expect("a scan");
-    let output = run(folder.path(), "clearway-server", &["evaluate", &place]);
+    let output = run(folder.path(), "clearway", &["evaluate", &place]);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(!output.status.success() && said.contains("000000.label: ") && said.contains(" points of "), "{said}");
 }

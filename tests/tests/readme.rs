@@ -58,7 +58,7 @@ fn the_first_command_is_the_demo_and_the_second_runs_all_tests() {
 fn the_demo_runs_and_ends_cleanly() {
     let _ports = DEFAULT_PORTS.lock().unwrap_or_else(PoisonError::into_inner);
     let folder = tempfile::tempdir().expect("a folder");
-    let output = run(folder.path(), "clearway-server", &["demo", "--seconds", "3"]);
+    let output = run(folder.path(), "clearway", &["demo", "--seconds", "3"]);
     let said = String::from_utf8_lossy(&output.stdout);
     assert!(output.status.success(), "{}\n{said}\n{}", output.status, String::from_utf8_lossy(&output.stderr));
     for place in ["http://", "gRPC", "zenoh", ".mcap", ".png"] {
@@ -104,7 +104,7 @@ fn the_maps_are_judged_as_the_readme_says() {
         let from = data.join(file);
         fs::copy(&from, to.join(from.file_name().expect("a name"))).expect("the labelled frame");
     }
-    let evaluations: Vec<_> = commands().into_iter().filter(|c| c.starts_with("clearway-server evaluate")).collect();
+    let evaluations: Vec<_> = commands().into_iter().filter(|c| c.starts_with("clearway evaluate")).collect();
     assert_eq!(evaluations.len(), 2, "{evaluations:?}");
     for command in &evaluations {
         succeeds(folder.path(), command);
@@ -119,18 +119,18 @@ fn the_default_configuration_serves_what_send_sends_to_the_readers() {
     let capture = Path::new(env!("CLEARWAY_DATA")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
     fs::copy(&capture, folder.path().join("drive.pcap")).expect("the HDL-32E capture");
     let config = workspace().join("deploy/clearway.toml");
-    let server = Command::new(binaries().join("clearway-server"))
+    let server = Command::new(binaries().join("clearway"))
         .args(["serve", "--config"])
         .arg(config)
         .current_dir(folder.path())
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn()
-        .expect("clearway-server starts");
+        .expect("clearway starts");
     let mut server = Stopped(server);
     while !run(folder.path(), "clearway", &["vehicles"]).status.success() {
         let ended = server.0.try_wait().expect("the server's state");
-        assert!(ended.is_none(), "clearway-server serve ended: {ended:?}");
+        assert!(ended.is_none(), "clearway serve ended: {ended:?}");
     }
     for command in commands().iter().filter(|c| c.starts_with("clearway send") || c.starts_with("clearway vehicles")) {
         succeeds(folder.path(), command);

@@ -227,7 +227,7 @@ fn serving(folder: &Path, file: &Path) -> (std::process::Child, SocketAddr) {
     (udp.data, udp.telemetry) = (data, free());
     let path = folder.join("clearway.toml");
     std::fs::write(&path, config.to_toml()).unwrap();
-    let server = std::process::Command::new(clearway_tests::binaries().join("clearway-server"))
+    let server = std::process::Command::new(clearway_tests::binaries().join("clearway"))
         .args(["serve", "--config"])
         .arg(&path)
         .stderr(std::process::Stdio::null())
@@ -312,7 +312,7 @@ fn a_disk_that_fails_ends_the_recording_with_its_reason_and_maps_go_on() {
     let limited = "trap '' XFSZ; ulimit -f 1024; exec \"$0\" demo --seconds 4 --json --record \"$1\"";
     let output = std::process::Command::new("sh")
         .args(["-c", limited])
-        .arg(clearway_tests::binaries().join("clearway-server"))
+        .arg(clearway_tests::binaries().join("clearway"))
         .arg(&file)
         .output()
         .unwrap();

@@ -1,9 +1,7 @@
-//! A map whose every class is known by heart, and the binary.
+//! A map whose every class is known.
 
 // Each test takes what it needs of this.
 #![allow(dead_code)]
-
-use std::process::{Command, Output};
 
 use bytes::Bytes;
 use clearway_client::codec::{CellsRef, encode_grid};
@@ -46,12 +44,4 @@ pub fn map(sequence: u64, capture_end_ns: i64) -> Bytes {
         ..Default::default()
     };
     [encode_header(&header), encode_layer(&layer)].concat().into()
-}
-
-pub fn clearway(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_clearway")).args(arguments).output().unwrap()
-}
-
-pub fn text(bytes: &[u8]) -> String {
-    String::from_utf8(bytes.to_vec()).unwrap()
 }

@@ -7,7 +7,8 @@
 use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
-use clearway_mapping::map::{Cells, Geometry, Layer, Map, SafePoint, SensorState};
+use clearway_mapping::layer::{Cells, Geometry, Layer, SafePoint};
+use clearway_mapping::map::{Map, SensorState};
 use clearway_proto::by_class::encode_beside;
 use clearway_proto::codec::{self, CellsRef};
 use clearway_proto::map::{encode_header, encode_layer};
@@ -50,7 +51,7 @@ impl EncodedMap {
     pub fn new(map: &Map, vehicle: Arc<str>, boot_id: u64, valid_ms: u32) -> Self {
         let header = encode_header(&header(map, &vehicle, boot_id, valid_ms));
         let encode = |layer: &Layer| (layer.name, encode_layer(&self::layer(layer)));
-        let share = |layer: &Layer| layer.figures.iter().find(|(name, _)| *name == "drivable_share").map(|(_, v)| *v);
+        let share = |layer: &Layer| layer.metrics.iter().find(|(name, _)| *name == "drivable_share").map(|(_, v)| *v);
         Self {
             vehicle,
             sequence: map.sequence,
@@ -132,8 +133,8 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
 
 fn layer(layer: &Layer) -> v1::Layer {
     let geometry = match &layer.geometry {
-        Geometry::Radial { r_bench_m, columns } => {
-            v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m: r_bench_m.clone(), columns: u32::from(*columns) })
+        Geometry::Radial { row_radius_m, columns } => {
+            v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m: row_radius_m.clone(), columns: u32::from(*columns) })
         }
         &Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_cell } => {
             let [first_ix, first_iy] = first_cell;
@@ -154,7 +155,7 @@ fn layer(layer: &Layer) -> v1::Layer {
         Geometry::Cartesian { width, .. } => *width as usize,
     };
     let class = layer.channels.iter().find(|channel| channel.name == "class");
-    let channel = |channel: &clearway_mapping::map::Channel| {
+    let channel = |channel: &clearway_mapping::layer::Channel| {
         let cells = match &channel.cells {
             Cells::U8(cells) => CellsRef::U8(cells),
             Cells::I8(cells) => CellsRef::I8(cells),
@@ -171,10 +172,10 @@ fn layer(layer: &Layer) -> v1::Layer {
     v1::Layer {
         name: layer.name.to_owned(),
         geometry: Some(geometry),
-        legend: layer.legend.iter().map(|&class| class.to_owned()).collect(),
+        legend: layer.legend.iter().map(|class| class.name.to_owned()).collect(),
         channels: layer.channels.iter().map(channel).collect(),
         planes: layer.planes.iter().map(|&[a, b, c]| v1::Plane { a, b, c }).collect(),
-        figures: layer.figures.iter().map(|&(name, value)| (name.to_owned(), value)).collect(),
+        figures: layer.metrics.iter().map(|&(name, value)| (name.to_owned(), value)).collect(),
         safe_points: safe_points(layer),
         base_sequence: None,
     }
@@ -195,6 +196,7 @@ fn safe_points(layer: &Layer) -> Option<v1::SafePoints> {
 
 #[cfg(test)]
 mod tests {
+    use clearway_mapping::layer::{ClassInfo, Meaning};
     use clearway_mapping::map::Part;
     use prost::Message;
 
@@ -203,9 +205,9 @@ mod tests {
     fn map() -> Map {
         let layer = |name| Layer {
             name,
-            geometry: Geometry::Radial { r_bench_m: vec![5.0, 60.0], columns: 4 },
-            legend: &["unknown", "drivable"],
-            channels: vec![clearway_mapping::map::Channel {
+            geometry: Geometry::Radial { row_radius_m: vec![5.0, 60.0], columns: 4 },
+            legend: &[ClassInfo::UNKNOWN, ClassInfo { name: "drivable", meaning: Meaning::Free, rgb: 0 }],
+            channels: vec![clearway_mapping::layer::Channel {
                 name: "class",
                 unit: "",
                 scale: 1.0,
@@ -213,7 +215,7 @@ mod tests {
                 cells: Cells::U8(vec![1, 1, 0, 0, 1, 1, 1, 0]),
             }],
             planes: vec![[0.0, 0.0, 1.0]],
-            figures: vec![("drivable_share", 0.5), ("cells", 5.0)],
+            metrics: vec![("drivable_share", 0.5), ("cells", 5.0)],
             points: Vec::new(),
         };
         Map {

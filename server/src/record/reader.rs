@@ -107,7 +107,7 @@ pub enum RecordingError {
         source: EventError,
     },
     /// The file has no configuration: it is not one of our recordings, or was cut before anything was in it.
-    #[error("{}: no attachment config.toml: not a recording of clearway-server, or cut at its very start", file.display())]
+    #[error("{}: no attachment config.toml: not a recording of clearway, or cut at its very start", file.display())]
     NoConfig {
         /// The recording.
         file: PathBuf,

@@ -3,7 +3,8 @@
 use std::ops::Range;
 
 use clearway_mapping::config::SensorConfig;
-use clearway_mapping::map::{Cells, Geometry, Layer, Map, SensorState};
+use clearway_mapping::layer::{Cells, Geometry, Layer, Meaning};
+use clearway_mapping::map::{Map, SensorState};
 use clearway_mapping::pipeline::{Ledger, NamedStatus};
 use nalgebra::Point3;
 
@@ -69,9 +70,7 @@ pub fn nothing_free(drive: &Drive, covered_deg: &Range<i64>, map: &Map) -> Resul
     let hidden = covered_deg.start + COVERED_EDGE_DEG..covered_deg.end - COVERED_EDGE_DEG;
     for layer in &map.layers {
         let free: Vec<u8> = (layer.legend.iter().enumerate())
-            .filter(|(_, class)| {
-                matches!(**class, "drivable" | "clear" | "flat" | "passable" | "road" | "free" | "path")
-            })
+            .filter(|(_, class)| class.meaning == Meaning::Free)
             .map(|(value, _)| value as u8)
             .collect();
         let Cells::U8(classes) = &layer.channels[0].cells else { continue };
@@ -83,7 +82,7 @@ pub fn nothing_free(drive: &Drive, covered_deg: &Range<i64>, map: &Map) -> Resul
             };
             let is_hidden = |sensor| back_m.iter().all(|back_m| inside(&hidden, from(sensor, *back_m)));
             if x.hypot(y) >= COVERED_M_MIN && sensors.iter().all(is_hidden) {
-                let class = layer.legend[usize::from(classes[cell])];
+                let class = layer.legend[usize::from(classes[cell])].name;
                 let found = format!("map {}: {} at ({x:.1}, {y:.1}) is {class}", map.sequence, layer.name);
                 return Err(breach("covered", found));
             }
@@ -95,10 +94,10 @@ pub fn nothing_free(drive: &Drive, covered_deg: &Range<i64>, map: &Map) -> Resul
 /// The middle of a cell, ego frame.
 pub fn centre(layer: &Layer, cell: usize) -> [f64; 2] {
     match &layer.geometry {
-        Geometry::Radial { r_bench_m, columns } => {
+        Geometry::Radial { row_radius_m, columns } => {
             let (row, column) = (cell / usize::from(*columns), cell % usize::from(*columns));
-            let inner = if row == 0 { 0.0 } else { f64::from(r_bench_m[row - 1]) };
-            let range = (inner + f64::from(r_bench_m[row])) / 2.0;
+            let inner = if row == 0 { 0.0 } else { f64::from(row_radius_m[row - 1]) };
+            let range = (inner + f64::from(row_radius_m[row])) / 2.0;
             let angle = (column as f64 + 0.5) * std::f64::consts::TAU / f64::from(*columns);
             [range * angle.cos(), range * angle.sin()]
         }

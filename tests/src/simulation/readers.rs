@@ -10,7 +10,7 @@ use std::task::{Context, Poll, Waker};
 
 use clearway_proto::v1;
 use clearway::publish::Vehicles;
-use clearway::publish::reader::watch;
+use clearway::publish::grpc::reader::watch;
 use clearway::encode::EncodedMap;
 use futures::Stream;
 use futures::channel::mpsc::{UnboundedSender, unbounded};

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use clearway::record::{Disk, RecorderCounts};
+use clearway::record::writer::{Disk, RecorderCounts};
 use clearway::record::verify::{VerifyError, verify};
 
 use super::checks::{Breach, breach};

@@ -11,7 +11,7 @@ use clearway_mapping::config::{
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::event::{EgoPose, Road, RoadFrame, RoadPurpose, Scan};
 use clearway_mapping::layer::height_difference::HeightDifference;
-use clearway_mapping::map::{Context, LayerMaker, Rays};
+use clearway_mapping::layer::{Context, LayerMaker, Rays};
 use clearway_mapping::sensor::motion::{Motion, Moved};
 use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::road::TakenRoad;
@@ -70,7 +70,7 @@ fn drivability(bencher: Bencher, columns: u16) {
     let sweep = sweep();
     let mut map = Drivability::new(&DrivabilityConfig { columns, ..DrivabilityConfig::default() });
     let mut layer = map.layer();
-    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &Context::default(), &mut layer));
 }
 
 #[divan::bench]
@@ -78,7 +78,7 @@ fn height_difference(bencher: Bencher) {
     let sweep = sweep();
     let mut map = HeightDifference::new(&HeightDifferenceConfig::default());
     let mut layer = map.layer();
-    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &Context::default(), &mut layer));
 }
 
 #[divan::bench]
@@ -118,7 +118,7 @@ fn terrain(bencher: Bencher, form: Form) {
     let sweep = sweep();
     let mut map = Terrain::new(&TerrainConfig { form, ..TerrainConfig::default() });
     let mut layer = map.layer();
-    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &Context::default(), &mut layer));
 }
 
 /// The same with roughness: a simulated turn, whose distance series are known.
@@ -130,7 +130,7 @@ fn terrain_with_roughness(bencher: Bencher) {
     sweep.take_deviations(&revolution, &mount, &mut Series::default(), None);
     let mut map = Terrain::new(&TerrainConfig::default());
     let mut layer = map.layer();
-    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &mut layer));
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &Context::default(), &mut layer));
 }
 
 #[divan::bench]
@@ -159,7 +159,7 @@ fn speed(bencher: Bencher) {
     let mut map = Speed::new(&SpeedConfig::default());
     let mut layer = map.layer();
     let context = Context { road: Some(&taken), ..Context::default() };
-    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make_with(&sweep, &context, &mut layer));
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &context, &mut layer));
 }
 
 #[divan::bench]
@@ -167,11 +167,11 @@ fn safe_path(bencher: Bencher) {
     let sweep = sweep();
     let mut drivability = Drivability::new(&DrivabilityConfig::default());
     let mut earlier = [drivability.layer()];
-    drivability.make(&sweep, &mut earlier[0]);
+    drivability.make(&sweep, &Context::default(), &mut earlier[0]);
     let mut map = SafePath::new(&SafePathConfig::default());
     let mut layer = map.layer();
     let context = Context { earlier: &earlier, ..Context::default() };
-    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make_with(&sweep, &context, &mut layer));
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &context, &mut layer));
 }
 
 /// What six units of four planes send in 100 ms from a vehicle in traffic: 52,800 rays, those without a return among
@@ -213,9 +213,9 @@ fn occupancy_of_six_units(bencher: Bencher) {
                 map_from_ego: pose,
                 speed_mps: Some(0.0),
             };
-            map.take(&rays);
+            map.integrate(&rays);
         }
-        map.make_with(&Sweep::default(), &context, &mut layer);
+        map.make(&Sweep::default(), &context, &mut layer);
     });
 }
 
@@ -259,7 +259,7 @@ fn occupancy_of_a_turn(bencher: Bencher) {
         let origin_m = [0.0, 0.0, sweep.mount_height_m];
         let returns = &sweep;
         let (map_from_ego, speed_mps) = (Some(nalgebra::Isometry3::identity()), Some(0.0));
-        map.take(&Rays { sensor: 0, stamp_ns: 0, returns, origin_m, no_returns: &[], map_from_ego, speed_mps });
-        map.make(&sweep, &mut layer);
+        map.integrate(&Rays { sensor: 0, stamp_ns: 0, returns, origin_m, no_returns: &[], map_from_ego, speed_mps });
+        map.make(&sweep, &Context::default(), &mut layer);
     });
 }

@@ -13,11 +13,12 @@ use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use crate::config::{ConfigError, MapsConfig, SensorConfig, VehicleConfig};
 use crate::event::{Body, Cause, EgoPose, Event, Road, Scan};
 use crate::fusion::Fusion;
-use crate::sensor::pipeline::{Intake, Moment, Wanted};
+use crate::sensor::pipeline::{Intake, Moment};
 use crate::layer::registry::Layers;
+use crate::layer::{Context, ScanExtras};
 use crate::ledger::Dropped;
 pub use crate::ledger::{Ledger, Rejected};
-use crate::map::{Context, Map};
+use crate::map::Map;
 use crate::sensor::motion::{Compensation, Motion};
 use crate::road::{self, Roads};
 use crate::sensor::sweep::Sweep;
@@ -65,9 +66,9 @@ impl Pipeline {
         }
         let layers = Layers::new(&config.maps);
         let lead = config.lead().expect("validate() finds the lead");
-        let wanted = layers.wanted();
+        let wanted = layers.uses();
         let intake = |(index, (sensor, calibration)): (usize, (&SensorConfig, _))| {
-            let wanted = Wanted { deviations: wanted.deviations && index == lead, ..wanted };
+            let wanted = ScanExtras { deviations: wanted.deviations && index == lead, ..wanted };
             Intake::new(sensor, calibration, config.body.as_ref(), wanted)
         };
         Ok(Self {
@@ -141,13 +142,13 @@ impl Pipeline {
     /// map. All are wanted before the first call. Layers that gather evidence begin from unknown when they are wanted
     /// again, so only where all are wanted throughout do the same events give the same bytes of every layer.
     pub fn want(&mut self, is_wanted: impl Fn(&str) -> bool) {
-        if !self.layers.want(&self.config.maps, is_wanted) {
+        if !self.layers.set_active(&self.config.maps, is_wanted) {
             return;
         }
-        let wanted = self.layers.wanted();
+        let wanted = self.layers.uses();
         let lead = self.config.lead();
         for (index, intake) in self.intakes.iter_mut().enumerate() {
-            intake.want(Wanted { deviations: wanted.deviations && lead == Some(index), ..wanted });
+            intake.want(ScanExtras { deviations: wanted.deviations && lead == Some(index), ..wanted });
         }
     }
 
@@ -280,7 +281,7 @@ impl Pipeline {
     fn take_sensor(&mut self, source: u16, sensor: &SensorConfig) -> Result<(), Rejected> {
         let calibration = self.config.declare(usize::from(source), sensor)?;
         if self.intakes.len() < self.config.sensors.len() {
-            let wanted = Wanted { deviations: false, ..self.layers.wanted() };
+            let wanted = ScanExtras { deviations: false, ..self.layers.uses() };
             self.intakes.push(Intake::new(sensor, calibration, self.config.body.as_ref(), wanted));
         }
         self.ledger.sensors += 1;
@@ -294,7 +295,7 @@ impl Pipeline {
         // What comes that much too late is evidence of a world that has moved on.
         if self.fusion.is_timely(&self.intakes[index], &self.intakes, now) {
             let rays = self.intakes[index].rays(source);
-            self.layers.take(&rays);
+            self.layers.integrate(&rays);
         }
         let makes_map = self.fusion.makes_map(index, &self.intakes, now);
         if makes_map {
@@ -309,11 +310,11 @@ impl Pipeline {
     /// where another sensor's turn has ended since. Layers that gather evidence have seen one turn.
     pub fn make_late(&mut self) -> Option<&Map> {
         let was_for_nobody = self.maps_made > 0 && self.map.layers.is_empty();
-        if !was_for_nobody || !self.layers.are_wanted() || self.turn_since_map {
+        if !was_for_nobody || !self.layers.any_active() || self.turn_since_map {
             return None;
         }
         let source = self.map.made_by;
-        self.layers.take(&self.intakes[usize::from(source)].rays(source));
+        self.layers.integrate(&self.intakes[usize::from(source)].rays(source));
         self.map.sequence = self.maps_made;
         self.maps_made += 1;
         self.make_layers();

@@ -8,9 +8,10 @@ use clearway_mapping::config::{
 };
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::height_difference::HeightDifference;
-use clearway_mapping::map::{Cells, Context, Layer, LayerMaker, SafePoint};
+use clearway_mapping::layer::{Cells, Context, Layer, LayerMaker, Meaning, SafePoint};
 use clearway_mapping::layer::occupancy::Occupancy;
-use clearway_mapping::layer::safe_path::{self, SafePath};
+use clearway_mapping::layer::safe_path::SafePath;
+use clearway_mapping::layer::safe_path::class::SafePathClass;
 use clearway_mapping::layer::speed::Speed;
 use clearway_mapping::sensor::sweep::Sweep;
 use clearway_mapping::layer::terrain::Terrain;
@@ -27,10 +28,10 @@ impl LayerMaker for Behind {
         self.safe_path.layer()
     }
 
-    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
+    fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         let mut earlier = [self.drivability.layer()];
-        self.drivability.make(sweep, &mut earlier[0]);
-        self.safe_path.make_with(sweep, &Context { earlier: &earlier, ..Context::default() }, layer);
+        self.drivability.make(sweep, context, &mut earlier[0]);
+        self.safe_path.make(sweep, &Context { earlier: &earlier, ..*context }, layer);
     }
 }
 
@@ -42,16 +43,16 @@ impl LayerMaker for Taken {
         self.0.layer()
     }
 
-    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
-        self.0.take(&rays(sweep));
-        self.0.make(sweep, layer);
+    fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
+        self.0.integrate(&rays(sweep));
+        self.0.make(sweep, context, layer);
     }
 }
 
 /// Share of the judged cells that are drivable, or passable; `None` in maps that do not judge cells.
 fn share(layer: &Layer) -> Option<f64> {
     let named = |(name, _): &&(&str, f64)| ["drivable_share", "passable_share"].contains(name);
-    layer.figures.iter().find(named).map(|(_, share)| *share)
+    layer.metrics.iter().find(named).map(|(_, share)| *share)
 }
 
 fn makers() -> Vec<Box<dyn LayerMaker>> {
@@ -74,7 +75,7 @@ fn makers() -> Vec<Box<dyn LayerMaker>> {
 
 fn make(maker: &mut dyn LayerMaker, sweep: &Sweep) -> Layer {
     let mut layer = maker.layer();
-    maker.make(sweep, &mut layer);
+    maker.make(sweep, &Context::default(), &mut layer);
     layer
 }
 
@@ -119,8 +120,8 @@ fn a_wall_is_an_obstacle_to_every_map() {
     for mut maker in makers() {
         let layer = make(maker.as_mut(), &sweep);
         // A wall within a cell may show in the cell before or behind where grids are turned into one another.
-        let name = |x| layer.legend[usize::from(classes(&layer)[cell_at(&layer, x, 0.01).unwrap()])];
-        let stands = |x: &f32| ["obstacle", "occupied"].contains(&name(*x));
+        let class = |x| layer.legend[usize::from(classes(&layer)[cell_at(&layer, x, 0.01).unwrap()])];
+        let stands = |x: &f32| class(*x).meaning == Meaning::Occupied;
         assert!([14.76, 15.01, 15.26].iter().any(stands), "{} straight ahead, 15 m", layer.name);
     }
 }
@@ -152,8 +153,8 @@ fn the_order_of_the_points_says_nothing() {
 
 /// A channel's values; path counts as free, because lines two cells wide are thinned from one end.
 fn ends_of_paths_aside(layer: &Layer, name: &str) -> Vec<i32> {
-    let is_path = |value: i32| layer.name == "safe_path" && name == "class" && value == i32::from(safe_path::PATH);
-    values(layer, name).into_iter().map(|v| if is_path(v) { i32::from(safe_path::FREE) } else { v }).collect()
+    let is_path = |value: i32| layer.name == "safe_path" && name == "class" && value == i32::from(SafePathClass::Path.value());
+    values(layer, name).into_iter().map(|v| if is_path(v) { i32::from(SafePathClass::Free.value()) } else { v }).collect()
 }
 
 #[test]
@@ -195,8 +196,8 @@ fn buffers_used_before_leave_no_trace() {
         }
         garbage.points = vec![SafePoint::default(); 3];
         garbage.planes = vec![[9.0; 3]; 70];
-        garbage.figures = vec![("drivable_share", -1.0), ("left_over", 1.0)];
-        maker.make(&sweep, &mut garbage);
+        garbage.metrics = vec![("drivable_share", -1.0), ("left_over", 1.0)];
+        maker.make(&sweep, &Context::default(), &mut garbage);
         assert_eq!(garbage, fresh);
     }
 }

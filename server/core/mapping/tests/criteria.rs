@@ -7,11 +7,17 @@ use std::sync::Arc;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{DrivabilityConfig, Seed};
-use clearway_mapping::layer::drivability::{DRIVABLE, Drivability, NOT_DRIVABLE, OBSTACLE, UNKNOWN};
-use clearway_mapping::map::{Layer, LayerMaker};
+use clearway_mapping::layer::drivability::Drivability;
+use clearway_mapping::layer::drivability::class::DrivabilityClass;
+use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::layer::radial_grid::{r_bench_m, ring_radii_m};
 use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
+
+const UNKNOWN: u8 = DrivabilityClass::Unknown.value();
+const DRIVABLE: u8 = DrivabilityClass::Drivable.value();
+const NOT_DRIVABLE: u8 = DrivabilityClass::NotDrivable.value();
+const OBSTACLE: u8 = DrivabilityClass::Obstacle.value();
 
 /// A grid for one point a cell: the middle of every cell, at the height `z(row, column, x, y)` says; no point for
 /// `None`.
@@ -39,7 +45,7 @@ fn row_at(radius_m: f32) -> usize {
 fn map(config: &DrivabilityConfig, sweep: &Sweep) -> Layer {
     let mut drivability = Drivability::new(config);
     let mut layer = drivability.layer();
-    drivability.make(sweep, &mut layer);
+    drivability.make(sweep, &Context::default(), &mut layer);
     layer
 }
 
@@ -228,8 +234,8 @@ fn one_table_shared_by_all_revolutions_or_an_equal_one_makes_the_same_rows() {
     let sweep = painted(|_, _, _, _| Some(0.0));
     let mut drivability = Drivability::new(&DrivabilityConfig::default());
     let (mut one, mut two) = (drivability.layer(), drivability.layer());
-    drivability.make(&sweep, &mut one);
+    drivability.make(&sweep, &Context::default(), &mut one);
     let equal = Arc::new(Calibration::clone(sweep.calibration.as_ref().unwrap()));
-    drivability.make(&Sweep { calibration: Some(equal), ..sweep }, &mut two);
+    drivability.make(&Sweep { calibration: Some(equal), ..sweep }, &Context::default(), &mut two);
     assert_eq!(one, two);
 }

@@ -6,7 +6,8 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::{Model, ReturnMode};
 use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, Event};
-use clearway_mapping::map::{Cells, Geometry, Layer, Map};
+use clearway_mapping::layer::{Cells, Geometry, Layer};
+use clearway_mapping::map::Map;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_sim::impair::{Faults, Impaired};
 use clearway_sim::noise::{mixed, uniform};
@@ -151,10 +152,10 @@ fn covered(
 /// Middle of a cell, ego frame.
 fn middle(geometry: &Geometry, cell: usize) -> (f64, f64) {
     match geometry {
-        Geometry::Radial { r_bench_m, columns } => {
+        Geometry::Radial { row_radius_m, columns } => {
             let (row, column) = (cell / usize::from(*columns), cell % usize::from(*columns));
-            let inner = if row == 0 { 0.0 } else { f64::from(r_bench_m[row - 1]) };
-            let (r, angle) = ((inner + f64::from(r_bench_m[row])) / 2.0, (column as f64 + 0.5) / f64::from(*columns));
+            let inner = if row == 0 { 0.0 } else { f64::from(row_radius_m[row - 1]) };
+            let (r, angle) = ((inner + f64::from(row_radius_m[row])) / 2.0, (column as f64 + 0.5) / f64::from(*columns));
             let (sin, cos) = (angle * std::f64::consts::TAU).sin_cos();
             (r * cos, r * sin)
         }
@@ -180,7 +181,7 @@ fn inside(layer: &Layer, (from_deg, to_deg): (f64, f64)) -> (usize, usize) {
     };
     let cells: Vec<usize> = (0..classes.len()).filter(far_inside).collect();
     let unseen = ["unknown", "out_of_range", "occupied"];
-    let known = |cell: &&usize| !unseen.contains(&layer.legend[usize::from(classes[**cell])]);
+    let known = |cell: &&usize| !unseen.contains(&layer.legend[usize::from(classes[**cell])].name);
     (cells.len(), cells.iter().filter(known).count())
 }
 

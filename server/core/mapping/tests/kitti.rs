@@ -5,12 +5,16 @@
 mod common;
 
 use clearway_mapping::config::{DrivabilityConfig, Gate};
-use clearway_mapping::layer::drivability::{DRIVABLE, Drivability, UNKNOWN};
-use clearway_mapping::map::{Layer, LayerMaker};
+use clearway_mapping::layer::drivability::Drivability;
+use clearway_mapping::layer::drivability::class::DrivabilityClass;
+use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::sensor::sweep::Sweep;
 use common::labels::*;
 use common::*;
+
+const UNKNOWN: u8 = DrivabilityClass::Unknown.value();
+const DRIVABLE: u8 = DrivabilityClass::Drivable.value();
 
 /// What the labels say of the frame, cell by cell.
 struct Labelled {
@@ -53,7 +57,7 @@ fn shares(config: &DrivabilityConfig) -> [f64; 3] {
     let (sweep, labels) = labelled_frame();
     let mut map = Drivability::new(config);
     let mut layer = map.layer();
-    map.make(&sweep, &mut layer);
+    map.make(&sweep, &Context::default(), &mut layer);
     let truth = by_cell(&sweep, &labels, &layer);
     let drivable: Vec<bool> = classes(&layer).iter().map(|class| *class == DRIVABLE).collect();
     let free = share(&drivable, |cell| !truth.obstacle[cell]);

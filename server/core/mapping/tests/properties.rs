@@ -7,16 +7,20 @@ use std::sync::Arc;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{DrivabilityConfig, Form, HeightDifferenceConfig, Seed, TerrainConfig};
-use clearway_mapping::layer::drivability::{Drivability, UNKNOWN};
+use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::event::Scan;
 use clearway_mapping::layer::height_difference::HeightDifference;
-use clearway_mapping::map::LayerMaker;
+use clearway_mapping::layer::{Context, LayerMaker};
 use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
-use clearway_mapping::layer::terrain::{self, Terrain};
+use clearway_mapping::layer::terrain::Terrain;
+use clearway_mapping::layer::terrain::class::TerrainClass;
 use common::*;
 use nalgebra::Isometry3;
 use proptest::prelude::*;
+
+/// Class 0 of every layer.
+const UNKNOWN: u8 = 0;
 
 fn models() -> impl Strategy<Value = Model> {
     prop::sample::select(vec![Model::Hdl64eS1, Model::Hdl64eS2, Model::Hdl32e, Model::Vlp16, Model::Vls128])
@@ -59,7 +63,7 @@ proptest! {
         points.iter().for_each(|point| add(&mut sweep, *point));
         let mut map = Drivability::new(&config);
         let mut layer = map.layer();
-        map.make(&sweep, &mut layer);
+        map.make(&sweep, &Context::default(), &mut layer);
 
         let (rows, columns) = size(&layer);
         let grid = RadialGrid::new(benches(&layer).to_vec(), columns as u16);
@@ -78,7 +82,7 @@ proptest! {
         }
 
         let mut again = map.layer();
-        map.make(&shuffled(&sweep, seed), &mut again);
+        map.make(&shuffled(&sweep, seed), &Context::default(), &mut again);
         prop_assert_eq!(layer, again);
     }
 
@@ -88,7 +92,7 @@ proptest! {
         points.iter().for_each(|point| add(&mut sweep, *point));
         let mut map = HeightDifference::new(&HeightDifferenceConfig::default());
         let mut layer = map.layer();
-        map.make(&sweep, &mut layer);
+        map.make(&sweep, &Context::default(), &mut layer);
         let (rows, columns) = size(&layer);
         prop_assert_eq!(classes(&layer).len(), rows * columns);
         prop_assert_eq!(values(&layer, "difference").len(), rows * columns);
@@ -108,25 +112,25 @@ proptest! {
         };
         let mut map = Terrain::new(&config);
         let mut layer = map.layer();
-        map.make(&sweep, &mut layer);
+        map.make(&sweep, &Context::default(), &mut layer);
 
         let (rows, columns) = size(&layer);
         // Not by cell_at: whether a border falls to one side or the other is rounding.
-        let held = classes(&layer).iter().filter(|c| matches!(**c, terrain::FLAT | terrain::OBSTACLE)).count();
+        let held = classes(&layer).iter().filter(|c| [TerrainClass::Flat.value(), TerrainClass::Obstacle.value()].contains(c)).count();
         prop_assert!(held <= points.len());
         for channel in &layer.channels {
             let written = values(&layer, channel.name);
             prop_assert_eq!(written.len(), rows * columns);
             for (value, class) in written.iter().zip(classes(&layer)) {
-                let known = *class != terrain::UNKNOWN || channel.name == "shape";
+                let known = *class != UNKNOWN || channel.name == "shape";
                 prop_assert!(known || *value == channel.unknown, "{} {}", channel.name, value);
             }
         }
 
         sweep.deviation_m.clear();
-        map.make(&sweep, &mut layer);
+        map.make(&sweep, &Context::default(), &mut layer);
         let mut again = map.layer();
-        map.make(&shuffled(&sweep, seed), &mut again);
+        map.make(&shuffled(&sweep, seed), &Context::default(), &mut again);
         prop_assert_eq!(layer, again);
     }
 

@@ -191,9 +191,10 @@ fn the_lanes_of_real_networks_are_read_whole() {
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn a_vehicle_on_a_real_lane_has_that_lane_painted_as_wide_as_the_file_says() {
     use clearway_mapping::config::{Bonus, SpeedConfig};
-    use clearway_mapping::map::{Context, LayerMaker};
+    use clearway_mapping::layer::{Context, LayerMaker};
     use clearway_mapping::road::TakenRoad;
-    use clearway_mapping::layer::speed::{ROAD, Speed};
+    use clearway_mapping::layer::speed::Speed;
+    use clearway_mapping::layer::speed::class::SpeedClass;
 
     let mut sweep = common::empty(clearway_lidar::model::Model::Hdl64eS2);
     for ix in -240..240 {
@@ -216,10 +217,10 @@ fn a_vehicle_on_a_real_lane_has_that_lane_painted_as_wide_as_the_file_says() {
         );
         let taken = TakenRoad { road, map_from_ego: None };
         let context = Context { road: Some(&taken), map_from_ego: Some(pose), ..Context::default() };
-        map.make_with(&sweep, &context, &mut layer);
+        map.make(&sweep, &context, &mut layer);
         let (rows, columns) = common::size(&layer);
         let across: Vec<usize> =
-            (0..rows).filter(|iy| common::classes(&layer)[iy * columns + columns / 2] == ROAD).collect();
+            (0..rows).filter(|iy| common::classes(&layer)[iy * columns + columns / 2] == SpeedClass::Road.value()).collect();
         let painted_m = across.len() as f64 * 0.25;
         let width_m = lane.width_m.unwrap();
         // Where the lane bends at the next waypoint, its edge points lie nearer to the pair's own line; a cell each

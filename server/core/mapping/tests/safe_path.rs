@@ -4,16 +4,25 @@ mod common;
 
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{DrivabilityConfig, SafePathConfig};
-use clearway_mapping::layer::drivability::{self, Drivability};
-use clearway_mapping::map::{Context, Layer, LayerMaker};
+use clearway_mapping::layer::drivability::Drivability;
+use clearway_mapping::layer::drivability::class::DrivabilityClass;
+use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::layer::safe_path::distance::Distances;
 use clearway_mapping::layer::safe_path::free::State;
 use clearway_mapping::layer::safe_path::links::Links;
 use clearway_mapping::layer::safe_path::ridge::{Point, Ridge};
-use clearway_mapping::layer::safe_path::{FREE, OBSTACLE, PATH, SafePath, UNKNOWN};
+use clearway_mapping::layer::safe_path::SafePath;
+use clearway_mapping::layer::safe_path::class::SafePathClass;
 use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
 use proptest::prelude::*;
+
+const UNKNOWN: u8 = SafePathClass::Unknown.value();
+const FREE: u8 = SafePathClass::Free.value();
+const OBSTACLE: u8 = SafePathClass::Obstacle.value();
+const PATH: u8 = SafePathClass::Path.value();
+const NOT_SEEN: u8 = DrivabilityClass::Unknown.value();
+const DRIVABLE: u8 = DrivabilityClass::Drivable.value();
 
 /// Ridge and links of a grid.
 fn paths(side: usize, states: &[State], width_cells: f64) -> (Ridge, Links) {
@@ -181,10 +190,10 @@ proptest! {
 fn make(sweep: &Sweep, config: &SafePathConfig) -> (Layer, Layer) {
     let mut drivability = Drivability::new(&DrivabilityConfig::default());
     let mut earlier = [drivability.layer()];
-    drivability.make(sweep, &mut earlier[0]);
+    drivability.make(sweep, &Context::default(), &mut earlier[0]);
     let mut map = SafePath::new(config);
     let mut layer = map.layer();
-    map.make_with(sweep, &Context { earlier: &earlier, ..Context::default() }, &mut layer);
+    map.make(sweep, &Context { earlier: &earlier, ..Context::default() }, &mut layer);
     let [drivability] = earlier;
     (drivability, layer)
 }
@@ -212,9 +221,9 @@ fn a_courts_paths_start_at_the_vehicle_and_stay_on_its_drivable_ground() {
         let there =
             classes(&drivability)[cell_at(&drivability, middle(cell % columns), middle(cell / columns)).unwrap()];
         let expected = match there {
-            drivability::UNKNOWN => UNKNOWN,
-            drivability::DRIVABLE if *class == PATH => PATH,
-            drivability::DRIVABLE => FREE,
+            NOT_SEEN => UNKNOWN,
+            DRIVABLE if *class == PATH => PATH,
+            DRIVABLE => FREE,
             _ => OBSTACLE,
         };
         assert_eq!(*class, expected);
@@ -251,7 +260,7 @@ fn the_vehicles_own_bonnet_is_no_obstacle_and_a_box_before_it_is() {
 fn without_drivability_nothing_is_known() {
     let mut map = SafePath::new(&SafePathConfig::default());
     let mut layer = map.layer();
-    map.make(&cast(Model::Vlp16, plain), &mut layer);
+    map.make(&cast(Model::Vlp16, plain), &Context::default(), &mut layer);
     assert!(classes(&layer).iter().all(|class| *class == UNKNOWN));
     assert_eq!(layer.points, []);
 }
@@ -270,7 +279,7 @@ fn real_streets_have_paths_both_ways() {
         sweep.take_scan(&scan, &std::sync::Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount);
         let (_, layer) = make(&sweep, &SafePathConfig::default());
         let reach = |most: fn(f64, f64) -> f64| layer.points.iter().map(|point| point.x_m).fold(0.0, most);
-        println!("{frame}: {:?} x {} to {} m", layer.figures, reach(f64::min), reach(f64::max));
+        println!("{frame}: {:?} x {} to {} m", layer.metrics, reach(f64::min), reach(f64::max));
         assert!(reach(f64::max) > 25.0 && reach(f64::min) < -25.0, "frame {frame}");
     }
 }

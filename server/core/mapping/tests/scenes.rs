@@ -10,9 +10,11 @@
 mod common;
 
 use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig};
-use clearway_mapping::layer::drivability::{self, Drivability};
-use clearway_mapping::layer::height_difference::{self, HeightDifference};
-use clearway_mapping::map::{Layer, LayerMaker};
+use clearway_mapping::layer::drivability::Drivability;
+use clearway_mapping::layer::drivability::class::DrivabilityClass;
+use clearway_mapping::layer::height_difference::HeightDifference;
+use clearway_mapping::layer::height_difference::class::HeightDifferenceClass;
+use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::ground::{Ground, Profile};
@@ -42,14 +44,14 @@ fn turn(scene: Scene) -> Turn {
 fn drivability(sweep: &Sweep, columns: u16) -> Layer {
     let mut map = Drivability::new(&DrivabilityConfig { columns, ..DrivabilityConfig::default() });
     let mut layer = map.layer();
-    map.make(sweep, &mut layer);
+    map.make(sweep, &Context::default(), &mut layer);
     layer
 }
 
 fn height_difference(sweep: &Sweep) -> Layer {
     let mut map = HeightDifference::new(&HeightDifferenceConfig::default());
     let mut layer = map.layer();
-    map.make(sweep, &mut layer);
+    map.make(sweep, &Context::default(), &mut layer);
     layer
 }
 
@@ -130,7 +132,7 @@ fn the_four_scenes_of_the_thesis_come_out_as_the_simulator_knows_them() {
         let (name, paper) = (scene.name, scene.paper_share.unwrap());
         let turn = turn(scene);
         for columns in [360, 180, 90] {
-            let score = score(&turn, &drivability(&turn.sweep, columns), drivability::DRIVABLE);
+            let score = score(&turn, &drivability(&turn.sweep, columns), DrivabilityClass::Drivable.value());
             let percent = [score.share, score.precision, score.recall].map(|share| 100.0 * share);
             let [share, precision, recall] = percent;
             println!(
@@ -174,7 +176,7 @@ fn the_baseline_fails_where_the_thesis_says_it_fails() {
     let share = |layer: &Layer, class: u8| {
         road.iter().filter(|cell| classes(layer)[**cell] == class).count() as f64 / road.len() as f64
     };
-    let (ours, theirs) = (share(&ours, drivability::DRIVABLE), share(&theirs, height_difference::DRIVABLE));
+    let (ours, theirs) = (share(&ours, DrivabilityClass::Drivable.value()), share(&theirs, HeightDifferenceClass::Drivable.value()));
     println!("upward slope, {} cells: drivability calls {ours:.3} drivable, height_difference {theirs:.3}", road.len());
     assert!(ours > 0.95 && theirs < 0.8);
 
@@ -189,12 +191,12 @@ fn the_baseline_fails_where_the_thesis_says_it_fails() {
     let count = |layer: &Layer, class: u8, is: Truth| {
         classes(layer).iter().zip(&truth).filter(|(c, t)| **c == class && **t == Some(is)).count()
     };
-    let under = count(&theirs, height_difference::OBSTACLE, Truth::Drivable);
-    let under_ours = count(&ours, drivability::OBSTACLE, Truth::Drivable);
+    let under = count(&theirs, HeightDifferenceClass::Obstacle.value(), Truth::Drivable);
+    let under_ours = count(&ours, DrivabilityClass::Obstacle.value(), Truth::Drivable);
     println!("canopy: drivable cells called obstacle: drivability {under_ours}, height_difference {under}");
     assert!(under >= 20 && under_ours == 0);
-    let behind = count(&theirs, height_difference::DRIVABLE, Truth::Unreachable);
-    let behind_ours = count(&ours, drivability::DRIVABLE, Truth::Unreachable);
+    let behind = count(&theirs, HeightDifferenceClass::Drivable.value(), Truth::Unreachable);
+    let behind_ours = count(&ours, DrivabilityClass::Drivable.value(), Truth::Unreachable);
     println!("behind the fence: cells called drivable: drivability {behind_ours}, height_difference {behind}");
     assert!(behind > 500 && behind_ours == 0);
 }

@@ -5,13 +5,19 @@ mod common;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Bonus, SpeedConfig};
 use clearway_mapping::event::{Road, RoadFrame, RoadPurpose};
-use clearway_mapping::map::{Context, Layer, LayerMaker};
+use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::road::{self, TakenRoad};
 use clearway_mapping::layer::speed::painting::{NO_ROAD, Painter, edge_points};
-use clearway_mapping::layer::speed::{OBSTACLE, PASSABLE, ROAD, SPEED_SCALE_MPS, Speed, UNKNOWN, gates};
+use clearway_mapping::layer::speed::class::{SPEED_SCALE_MPS, SpeedClass};
+use clearway_mapping::layer::speed::{Speed, gates};
 use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
 use proptest::prelude::*;
+
+const UNKNOWN: u8 = SpeedClass::Unknown.value();
+const PASSABLE: u8 = SpeedClass::Passable.value();
+const OBSTACLE: u8 = SpeedClass::Obstacle.value();
+const ROAD: u8 = SpeedClass::Road.value();
 
 /// Level ground, a point every 10 cm over 20 m to each side.
 fn level() -> Sweep {
@@ -50,7 +56,7 @@ fn fine(bonus: Bonus) -> SpeedConfig {
 fn make(config: &SpeedConfig, sweep: &Sweep, context: &Context<'_>) -> Layer {
     let mut map = Speed::new(config);
     let mut layer = map.layer();
-    map.make_with(sweep, context, &mut layer);
+    map.make(sweep, context, &mut layer);
     layer
 }
 
@@ -211,7 +217,7 @@ fn painting_stops_the_moment_the_orientations_are_random_and_says_so() {
     let random = vec![10.0; 36];
     for (votes, painting) in [(&clear, 1.0), (&random, 0.0), (&clear, 1.0), (&random, 0.0)] {
         let road = taken(Road { orientations: votes.clone(), ..straight(6.0) });
-        map.make_with(&sweep, &Context { road: Some(&road), ..Context::default() }, &mut layer);
+        map.make(&sweep, &Context { road: Some(&road), ..Context::default() }, &mut layer);
         assert_eq!(figure(&layer, "painting"), painting);
         assert_eq!(figure(&layer, "stopped_by_divergence"), 1.0 - painting);
         assert_eq!(figure(&layer, "stopped_by_curvature"), 0.0);
@@ -233,7 +239,7 @@ fn painting_stops_the_moment_the_route_bends_within_30_m_and_says_so() {
     for (corner_m, painting) in [(60.0, 1.0), (36.0, 1.0), (30.0, 0.0), (12.0, 0.0), (1.0, 0.0), (0.0, 0.0)] {
         let route = route(vec![[corner_m - 100.0, 0.5], [corner_m, 0.5], [corner_m, 100.0]]);
         let context = Context { road: Some(&road), route: Some(&route), ..Context::default() };
-        map.make_with(&sweep, &context, &mut layer);
+        map.make(&sweep, &context, &mut layer);
         assert_eq!(figure(&layer, "painting"), painting, "corner {corner_m} m ahead");
         assert_eq!(figure(&layer, "stopped_by_curvature"), 1.0 - painting, "corner {corner_m} m ahead");
         assert_eq!(figure(&layer, "stopped_by_divergence"), 0.0);
@@ -242,7 +248,7 @@ fn painting_stops_the_moment_the_route_bends_within_30_m_and_says_so() {
     // The corner lies behind: 6 m, more than the base the curvature is measured over.
     let behind = route(vec![[-6.0, -100.0], [-6.0, 0.5], [100.0, 0.5]]);
     let context = Context { road: Some(&road), route: Some(&behind), ..Context::default() };
-    map.make_with(&sweep, &context, &mut layer);
+    map.make(&sweep, &context, &mut layer);
     assert_eq!((figure(&layer, "painting"), figure(&layer, "route_curvature_per_m")), (1.0, 0.0));
 }
 

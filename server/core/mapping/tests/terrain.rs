@@ -6,13 +6,11 @@ mod common;
 
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Form, TerrainConfig};
-use clearway_mapping::map::{Layer, LayerMaker};
+use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::sensor::distance_series::Series;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
-use clearway_mapping::layer::terrain::{
-    FLAT, FLAT_ELEVATED, FLAT_INFERRED, FLAT_UNREACHABLE, OBSTACLE, ROUGHNESS_UNKNOWN, SHAPE_LINE, SHAPE_PLANE,
-    SHAPE_SCATTER, SHAPE_UNKNOWN, Terrain,
-};
+use clearway_mapping::layer::terrain::Terrain;
+use clearway_mapping::layer::terrain::class::{ROUGHNESS, Shape, TerrainClass};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::{self, Scene};
 use clearway_sim::truth::Truth;
@@ -20,10 +18,16 @@ use clearway_sim::vehicle::SimulatedVehicle;
 use common::labels::*;
 use common::*;
 
+const FLAT: u8 = TerrainClass::Flat.value();
+const FLAT_INFERRED: u8 = TerrainClass::FlatInferred.value();
+const FLAT_ELEVATED: u8 = TerrainClass::FlatElevated.value();
+const OBSTACLE: u8 = TerrainClass::Obstacle.value();
+const FLAT_UNREACHABLE: u8 = TerrainClass::FlatUnreachable.value();
+
 fn terrain(sweep: &Sweep, config: &TerrainConfig) -> Layer {
     let mut map = Terrain::new(config);
     let mut layer = map.layer();
-    map.make(sweep, &mut layer);
+    map.make(sweep, &Context::default(), &mut layer);
     layer
 }
 
@@ -186,7 +190,7 @@ fn nothing_is_inferred_beyond_the_last_point_or_across_a_wide_hole() {
             }
         }
     }
-    let at = |layer: &Layer, x: f32, y: f32| layer.legend[usize::from(classes(layer)[cell_at(layer, x, y).unwrap()])];
+    let at = |layer: &Layer, x: f32, y: f32| class_name(layer, cell_at(layer, x, y).unwrap());
     let grounded = terrain(&sweep, &form(Form::Grounded));
     assert_eq!(at(&grounded, 6.1, 0.1), "flat");
     assert_eq!(at(&grounded, 17.1, 0.1), "flat");
@@ -212,7 +216,7 @@ fn the_plain_grid_tells_scatter_line_and_plane_apart() {
     let layer = terrain(&sweep, &form(Form::Grid));
     let shape = |x: f32| values(&layer, "shape")[cell_at(&layer, x, 5.1).unwrap()];
     let found = [5.1, 10.1, 15.1, 20.1].map(shape);
-    assert_eq!(found, [SHAPE_PLANE, SHAPE_LINE, SHAPE_SCATTER, SHAPE_UNKNOWN].map(i32::from));
+    assert_eq!(found, [Shape::Plane, Shape::Line, Shape::Scatter, Shape::Unknown].map(|shape| shape as i32));
 }
 
 #[test]
@@ -245,7 +249,7 @@ fn roughness(layer: &Layer, wanted: impl Fn(f32, f32) -> bool) -> (f64, usize) {
     let of_cell = values(layer, "roughness");
     let centre = |place: usize| (place as f32 + 0.5 - columns as f32 / 2.0) * 0.25;
     let cells: Vec<f64> = (0..of_cell.len())
-        .filter(|cell| of_cell[*cell] != i32::from(ROUGHNESS_UNKNOWN))
+        .filter(|cell| of_cell[*cell] != i32::from(ROUGHNESS.unknown))
         .filter(|cell| wanted(centre(cell % columns), centre(cell / columns)))
         .map(|cell| (f64::from(of_cell[cell]) * f64::from(channel.scale)).powi(2))
         .collect();
@@ -279,7 +283,7 @@ fn a_turn_without_series_has_flat_cells_of_unknown_roughness() {
     let sweep = Sweep { deviation_m: Vec::new(), ..turn(scenes::flat()) };
     let layer = terrain(&sweep, &TerrainConfig::default());
     assert!(counts(&layer)[usize::from(FLAT)] > 10_000);
-    assert!(values(&layer, "roughness").iter().all(|raw| *raw == i32::from(ROUGHNESS_UNKNOWN)));
+    assert!(values(&layer, "roughness").iter().all(|raw| *raw == i32::from(ROUGHNESS.unknown)));
 }
 
 #[test]

@@ -12,8 +12,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use clearway_client::footprint::FREE;
-use clearway_mapping::map::{Cells, Geometry, Layer};
+use clearway_mapping::layer::{Cells, ClassInfo, Geometry, Layer, Meaning};
 use clearway_mapping::layer::radial_grid::RadialGrid;
 
 /// From here on a thing over the ground is an obstacle.
@@ -239,7 +238,7 @@ impl Ballot {
 
 /// Whether each cell is called drivable, be it by inference; `None` where the layer has no such class.
 fn called(layer: &Layer) -> Option<Vec<bool>> {
-    let passes = |name: &&str| FREE.contains(name) || *name == "flat_inferred";
+    let passes = |class: &ClassInfo| matches!(class.meaning, Meaning::Free | Meaning::Inferred);
     let passes: Vec<bool> = layer.legend.iter().map(passes).collect();
     let class = layer.channels.iter().find(|channel| channel.name == "class")?;
     if !passes.contains(&true) {
@@ -256,8 +255,8 @@ fn called(layer: &Layer) -> Option<Vec<bool>> {
 /// Finds the cell of a place, ego frame, metres.
 fn locate(geometry: &Geometry) -> Box<dyn Fn([f32; 3]) -> Option<usize>> {
     match *geometry {
-        Geometry::Radial { ref r_bench_m, columns } => {
-            let grid = RadialGrid::new(r_bench_m.clone(), columns);
+        Geometry::Radial { ref row_radius_m, columns } => {
+            let grid = RadialGrid::new(row_radius_m.clone(), columns);
             Box::new(move |[x, y, _]| grid.cell(x, y))
         }
         Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
@@ -277,7 +276,8 @@ fn locate(geometry: &Geometry) -> Box<dyn Fn([f32; 3]) -> Option<usize>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clearway_mapping::map::Channel;
+    use clearway_mapping::layer::Channel;
+    use clearway_mapping::layer::height_difference::class::HeightDifferenceClass;
 
     /// Four cells of 1 m in a row: drivable, drivable, obstacle, unknown.
     fn layer() -> Layer {
@@ -292,7 +292,7 @@ mod tests {
                 yaw_rad: 0.0,
                 first_cell: [0, 0],
             },
-            legend: &["unknown", "drivable", "obstacle"],
+            legend: HeightDifferenceClass::LEGEND,
             channels: vec![Channel {
                 name: "class",
                 unit: "",
@@ -302,7 +302,7 @@ mod tests {
             }],
             planes: Vec::new(),
             points: Vec::new(),
-            figures: Vec::new(),
+            metrics: Vec::new(),
         }
     }
 
@@ -364,7 +364,7 @@ mod tests {
     #[test]
     fn a_layer_without_a_passable_class_is_left_out() {
         let mut tally = Tally::default();
-        assert!(!tally.add(&Layer { legend: &["unknown", "thing", "other"], ..layer() }, &[]));
+        assert!(!tally.add(&Layer { legend: &[ClassInfo::UNKNOWN; 3], ..layer() }, &[]));
         assert_eq!(tally, Tally::default());
         assert_eq!((tally.precision(), tally.recall(), tally.f1()), (None, None, None));
     }
@@ -372,7 +372,7 @@ mod tests {
     #[test]
     fn a_radial_layer_is_judged_in_its_own_cells() {
         let radial = Layer {
-            geometry: Geometry::Radial { r_bench_m: vec![1.0], columns: 8 },
+            geometry: Geometry::Radial { row_radius_m: vec![1.0], columns: 8 },
             channels: vec![Channel { cells: Cells::U8(vec![1, 0, 0, 0, 0, 0, 0, 0]), ..layer().channels.remove(0) }],
             ..layer()
         };

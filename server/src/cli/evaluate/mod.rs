@@ -1,4 +1,4 @@
-//! `clearway-server evaluate`: every map against the truth, of labelled scans and of simulated scenes.
+//! `clearway evaluate`: every map against the truth, of labelled scans and of simulated scenes.
 //!
 //! In: SemanticKITTI-style folders or files, or `sim:NAME`. Out: a [`Report`]. The scans and datagrams go through the
 //! real [`Pipeline`]; what its maps say is judged point by point and cell by cell.
@@ -192,7 +192,7 @@ fn pipeline(maps: &MapsConfig, model: Model, extrinsics: Extrinsics) -> Result<(
 }
 
 impl Source {
-    fn judge(&mut self, layers: &[clearway_mapping::map::Layer], points: &[Point]) {
+    fn judge(&mut self, layers: &[clearway_mapping::layer::Layer], points: &[Point]) {
         self.frames += 1;
         for layer in layers {
             let at = self.layers.iter().position(|(name, _)| name == layer.name);

@@ -74,7 +74,7 @@ fn columns_and_maps_switched_off_follow_the_options() {
     assert_eq!(columns(3), None);
     let folder = written(&street());
     let config = folder.path().join("clearway.toml");
-    let all = include_str!("../../../deploy/clearway.toml");
+    let all = include_str!("../../../../deploy/clearway.toml");
     let judged = |columns_deg, text: &str| {
         std::fs::write(&config, text).unwrap();
         let options = Options { columns_deg, config: Some(config.clone()), ..options(folder.path()) };

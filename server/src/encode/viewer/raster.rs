@@ -218,14 +218,20 @@ mod tests {
 
     #[test]
     fn every_class_of_every_layer_has_an_occupancy_that_was_chosen_and_unknown_is_never_free() {
-        use clearway_mapping::{drivability, height_difference, safe_path, speed, terrain};
-        let of = |legend: &[&str]| legend.iter().map(|class| occupancy(class)).collect::<Vec<_>>();
-        assert_eq!(of(drivability::LEGEND), [-1, 0, 100, 100]);
-        assert_eq!(of(height_difference::LEGEND), [-1, 0, 100]);
-        assert_eq!(of(terrain::LEGEND), [-1, 0, -1, 100, 100, 100]);
-        assert_eq!(of(&["unknown", "clear", "occupied", "occluded", "out_of_range"]), [-1, 0, 100, -1, -1]);
-        assert_eq!(of(speed::LEGEND), [-1, 0, 100, 0]);
-        assert_eq!(of(safe_path::LEGEND), [-1, 0, 100, 0]);
+        use clearway_mapping::layer::ClassInfo;
+        use clearway_mapping::layer::drivability::class::DrivabilityClass;
+        use clearway_mapping::layer::height_difference::class::HeightDifferenceClass;
+        use clearway_mapping::layer::occupancy::class::OccupancyClass;
+        use clearway_mapping::layer::safe_path::class::SafePathClass;
+        use clearway_mapping::layer::speed::class::SpeedClass;
+        use clearway_mapping::layer::terrain::class::TerrainClass;
+        let of = |legend: &[ClassInfo]| legend.iter().map(|class| occupancy(class.name)).collect::<Vec<_>>();
+        assert_eq!(of(DrivabilityClass::LEGEND), [-1, 0, 100, 100]);
+        assert_eq!(of(HeightDifferenceClass::LEGEND), [-1, 0, 100]);
+        assert_eq!(of(TerrainClass::LEGEND), [-1, 0, -1, 100, 100, 100]);
+        assert_eq!(of(OccupancyClass::LEGEND), [-1, 0, 100, -1, -1]);
+        assert_eq!(of(SpeedClass::LEGEND), [-1, 0, 100, 0]);
+        assert_eq!(of(SafePathClass::LEGEND), [-1, 0, 100, 0]);
         assert_eq!(occupancy("a class of a later version"), -1);
     }
 

@@ -1,10 +1,34 @@
-//! The six maps side by side, and the registry that makes them.
+//! The six maps, one folder each, and what they share.
+//!
+//! | file | content |
+//! |---|---|
+//! | `maker` | [`Layer`], and the trait [`LayerMaker`] that makes it |
+//! | `class` | what each class of a layer is called, means and looks like |
+//! | `channel` | one value a cell, typed |
+//! | `grid` | where the cells lie |
+//! | [`radial_grid`] | r-θ grid: position -> cell |
+//! | `registry` | the list of the six; which of them are active |
+//! | [`drivability`] | UT Austin thesis, section IV |
+//! | [`height_difference`] | UT Austin thesis, section V: the baseline |
+//! | [`terrain`] | Neuhaus 2009, section 2 |
+//! | [`occupancy`] | Seo 2014, section 2 |
+//! | [`speed`] | Lindström 2005 |
+//! | [`safe_path`] | UT Austin thesis, section VI |
 
+mod channel;
+mod class;
 pub mod drivability;
+mod grid;
 pub mod height_difference;
+mod maker;
 pub mod occupancy;
 pub mod radial_grid;
 pub(crate) mod registry;
 pub mod safe_path;
 pub mod speed;
 pub mod terrain;
+
+pub use channel::{CellType, Cells, Channel, TypedChannel};
+pub use class::{ClassInfo, Meaning};
+pub use grid::Geometry;
+pub use maker::{Context, Layer, LayerMaker, Rays, SafePoint, ScanExtras};

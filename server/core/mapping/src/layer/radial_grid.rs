@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::{Calibration, LaserCalibration};
 
-use crate::map::Geometry;
+use crate::layer::grid::Geometry;
 use crate::sensor::sweep::Sweep;
 
 /// Points are taken in chunks of this many, so that their cells stay in the first cache level.
@@ -106,9 +106,16 @@ impl RadialGrid {
 
     /// Writes where the cells lie into `geometry`, keeping its buffer.
     pub fn describe(&self, geometry: &mut Geometry) {
-        let Geometry::Radial { r_bench_m, columns } = geometry else { unreachable!("the layer of a radial grid") };
-        r_bench_m.clone_from(&self.r_bench_m);
-        *columns = self.quadrants.columns;
+        match geometry {
+            Geometry::Radial { row_radius_m, columns } => {
+                row_radius_m.clone_from(&self.r_bench_m);
+                *columns = self.quadrants.columns;
+            }
+            other => {
+                let columns = self.quadrants.columns;
+                *other = Geometry::Radial { row_radius_m: self.r_bench_m.clone(), columns };
+            }
+        }
     }
 
     /// The cell that holds a position; `None` beyond the last row.

@@ -1,126 +1,143 @@
-//! The layers of a vehicle's maps: which are switched on, which are wanted, and who makes them.
+//! The list of the layers, and which of them are active.
 //!
-//! In: the configuration, what readers want, turns and map sweeps. Out: the wanted layers, in the order of the
-//! configuration, each behind those it is made from. What nobody wants has no maker: it takes no time and no memory.
+//! In: the configuration, the names of the layers somebody subscribes to, scans and map sweeps. Out: the active layers,
+//! in the order of the list. A layer that is not active has no maker: it costs no time and no memory.
 
 use crate::config::MapsConfig;
 use crate::layer::drivability::Drivability;
 use crate::layer::height_difference::HeightDifference;
-use crate::sensor::pipeline::Wanted;
-use crate::map::{Context, Layer, LayerMaker, Rays};
+use crate::layer::maker::{Context, Layer, LayerMaker, Rays, ScanExtras};
 use crate::layer::occupancy::Occupancy;
 use crate::layer::safe_path::SafePath;
 use crate::layer::speed::Speed;
-use crate::sensor::sweep::Sweep;
 use crate::layer::terrain::Terrain;
+use crate::sensor::sweep::Sweep;
 
-/// Makes the maker of one layer.
-type New = fn(&MapsConfig) -> Box<dyn LayerMaker>;
+/// Creates the maker of one layer; `None` if the configuration disables the layer.
+type Create = fn(&MapsConfig) -> Option<Box<dyn LayerMaker>>;
 
-/// All layers that are switched on.
-pub(crate) struct Layers(Vec<Slot>);
+/// All layers. A layer that is made from others comes after them.
+const LAYERS: [Create; 6] = [
+    |maps| created(maps.drivability.enabled, || Drivability::new(&maps.drivability)),
+    |maps| created(maps.height_difference.enabled, || HeightDifference::new(&maps.height_difference)),
+    |maps| created(maps.terrain.enabled, || Terrain::new(&maps.terrain)),
+    |maps| created(maps.occupancy.enabled, || Occupancy::new(&maps.occupancy)),
+    |maps| created(maps.speed.enabled, || Speed::new(&maps.speed)),
+    |maps| created(maps.safe_path.enabled, || SafePath::new(&maps.safe_path)),
+];
 
-/// One layer that is switched on.
-struct Slot {
+fn created<M: LayerMaker + 'static>(enabled: bool, create: impl FnOnce() -> M) -> Option<Box<dyn LayerMaker>> {
+    if enabled { Some(Box::new(create())) } else { None }
+}
+
+/// The enabled layers, active or not.
+pub(crate) struct Layers(Vec<EnabledLayer>);
+
+/// One layer that the configuration enables.
+struct EnabledLayer {
     name: &'static str,
-    new: New,
-    /// Whether somebody wants it for itself.
-    asked: bool,
+    create: Create,
+    /// True if somebody subscribes to the layer itself.
+    subscribed: bool,
+    /// How often the layer was made.
     made: u64,
-    /// While it is wanted: its maker, and its cells while they are in no map.
-    wanted: Option<(Box<dyn LayerMaker>, Option<Layer>)>,
+    /// The layer's maker; `None` while the layer is not active.
+    active: Option<Active>,
+}
+
+/// The maker of an active layer.
+struct Active {
+    maker: Box<dyn LayerMaker>,
+    /// The layer's memory while it is in no map.
+    spare: Option<Layer>,
+}
+
+impl Active {
+    fn new(maker: Box<dyn LayerMaker>) -> Self {
+        Self { spare: Some(maker.layer()), maker }
+    }
 }
 
 impl Layers {
-    /// All wanted.
+    /// All enabled layers, all active.
     pub fn new(maps: &MapsConfig) -> Self {
-        let all: [(bool, New); 6] = [
-            (maps.drivability.enabled, |maps| Box::new(Drivability::new(&maps.drivability))),
-            (maps.height_difference.enabled, |maps| Box::new(HeightDifference::new(&maps.height_difference))),
-            (maps.terrain.enabled, |maps| Box::new(Terrain::new(&maps.terrain))),
-            (maps.occupancy.enabled, |maps| Box::new(Occupancy::new(&maps.occupancy))),
-            (maps.speed.enabled, |maps| Box::new(Speed::new(&maps.speed))),
-            // Behind the layers whose obstacles it keeps away from.
-            (maps.safe_path.enabled, |maps| Box::new(SafePath::new(&maps.safe_path))),
-        ];
-        let slot = |(_, new): (bool, New)| {
-            let maker = new(maps);
-            let layer = maker.layer();
-            Slot { name: layer.name, new, asked: true, made: 0, wanted: Some((maker, Some(layer))) }
+        let enabled = |&create: &Create| {
+            let maker = create(maps)?;
+            let name = maker.layer().name;
+            Some(EnabledLayer { name, create, subscribed: true, made: 0, active: Some(Active::new(maker)) })
         };
-        Self(all.into_iter().filter(|(enabled, _)| *enabled).map(slot).collect())
+        Self(LAYERS.iter().filter_map(enabled).collect())
     }
 
-    /// By layer: how often it was made.
+    /// Name of each enabled layer, and how often it was made.
     pub fn made(&self) -> Vec<(&'static str, u64)> {
-        self.0.iter().map(|slot| (slot.name, slot.made)).collect()
+        self.0.iter().map(|layer| (layer.name, layer.made)).collect()
     }
 
-    /// Whether any layer is wanted.
-    pub fn are_wanted(&self) -> bool {
-        self.0.iter().any(|slot| slot.wanted.is_some())
+    /// True if any layer is active.
+    pub fn any_active(&self) -> bool {
+        self.0.iter().any(|layer| layer.active.is_some())
     }
 
-    /// What the wanted layers want of every turn.
-    pub fn wanted(&self) -> Wanted {
-        let any = |asks: fn(&dyn LayerMaker) -> bool| {
-            self.0.iter().filter_map(|slot| slot.wanted.as_ref()).any(|(maker, _)| asks(&**maker))
-        };
-        Wanted { deviations: any(|maker| maker.wants_deviations()), no_returns: any(|maker| maker.wants_no_returns()) }
+    /// The optional data of each scan that the active layers use.
+    pub fn uses(&self) -> ScanExtras {
+        let active = self.0.iter().filter_map(|layer| layer.active.as_ref());
+        active.map(|active| active.maker.uses()).fold(ScanExtras::default(), |all, uses| ScanExtras {
+            deviations: all.deviations || uses.deviations,
+            no_returns: all.no_returns || uses.no_returns,
+        })
     }
 
-    /// Wants these layers and those they are made from, and no other. One that was not wanted begins anew. Tells
-    /// whether these are others than before.
-    pub fn want(&mut self, maps: &MapsConfig, is_wanted: impl Fn(&str) -> bool) -> bool {
+    /// Activates the layers for which `is_subscribed` is true and those they are made from, and deactivates all others.
+    /// A layer that was not active starts without evidence. Returns true if the subscriptions changed.
+    pub fn set_active(&mut self, maps: &MapsConfig, is_subscribed: impl Fn(&str) -> bool) -> bool {
         let mut changed = false;
-        for slot in &mut self.0 {
-            let asked = is_wanted(slot.name);
-            changed |= slot.asked != asked;
-            slot.asked = asked;
+        for layer in &mut self.0 {
+            let subscribed = is_subscribed(layer.name);
+            changed |= layer.subscribed != subscribed;
+            layer.subscribed = subscribed;
         }
         if changed {
-            self.assign(maps);
+            self.assign_makers(maps);
         }
         changed
     }
 
-    /// A maker for each layer that is asked for or needed by one that is, and for no other.
-    fn assign(&mut self, maps: &MapsConfig) {
+    /// Gives a maker to each layer that is subscribed to, or that an active layer is made from, and to no other.
+    fn assign_makers(&mut self, maps: &MapsConfig) {
         let mut needed: Vec<&str> = Vec::new();
-        // A layer is made from earlier ones only.
-        for slot in self.0.iter_mut().rev() {
-            if !slot.asked && !needed.contains(&slot.name) {
-                slot.wanted = None;
+        // Backwards, because a layer is made from earlier ones only.
+        for layer in self.0.iter_mut().rev() {
+            if !layer.subscribed && !needed.contains(&layer.name) {
+                layer.active = None;
                 continue;
             }
-            let (maker, _) = slot.wanted.get_or_insert_with(|| {
-                let maker = (slot.new)(maps);
-                let layer = maker.layer();
-                (maker, Some(layer))
-            });
-            needed.extend(maker.needs());
+            if layer.active.is_none() {
+                layer.active = (layer.create)(maps).map(Active::new);
+            }
+            needed.extend(layer.active.iter().flat_map(|active| active.maker.needs()));
         }
     }
 
-    /// Shows a sensor's turn to the layers that gather evidence.
-    pub fn take(&mut self, rays: &Rays<'_>) {
-        self.0.iter_mut().filter_map(|slot| slot.wanted.as_mut()).for_each(|(maker, _)| maker.take(rays));
+    /// Adds the evidence of one sensor's scan to the active layers.
+    pub fn integrate(&mut self, rays: &Rays<'_>) {
+        self.0.iter_mut().filter_map(|layer| layer.active.as_mut()).for_each(|active| active.maker.integrate(rays));
     }
 
-    /// Makes the wanted layers of one sweep, in place of those in `layers`, whose cells are used again.
+    /// Makes the active layers of one map, in place of those in `layers`, whose memory is used again.
     pub fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layers: &mut Vec<Layer>) {
-        for layer in layers.drain(..) {
-            let slot = self.0.iter_mut().find(|slot| slot.name == layer.name);
-            if let Some((_, cells)) = slot.and_then(|slot| slot.wanted.as_mut()) {
-                *cells = Some(layer);
+        for made in layers.drain(..) {
+            let layer = self.0.iter_mut().find(|layer| layer.name == made.name);
+            if let Some(active) = layer.and_then(|layer| layer.active.as_mut()) {
+                active.spare = Some(made);
             }
         }
-        for slot in &mut self.0 {
-            let Some((maker, cells)) = &mut slot.wanted else { continue };
-            let mut layer = cells.take().unwrap_or_else(|| maker.layer());
-            maker.make_with(sweep, &Context { earlier: layers, ..*context }, &mut layer);
-            layers.push(layer);
-            slot.made += 1;
+        for layer in &mut self.0 {
+            let Some(Active { maker, spare }) = &mut layer.active else { continue };
+            let mut made = spare.take().unwrap_or_else(|| maker.layer());
+            maker.make(sweep, &Context { earlier: layers, ..*context }, &mut made);
+            layers.push(made);
+            layer.made += 1;
         }
     }
 }

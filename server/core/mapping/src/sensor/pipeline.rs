@@ -14,7 +14,8 @@ use crate::sensor::self_filter::Screen;
 use crate::config::{BodyConfig, SensorConfig};
 use crate::event::Scan;
 use crate::ledger::{Dropped, Ledger, Rejected};
-use crate::map::{Part, Rays, SensorState};
+use crate::layer::{Rays, ScanExtras};
+use crate::map::{Part, SensorState};
 use crate::sensor::motion::{Compensation, KNOT_FIRINGS, Motion, Moved};
 use crate::sensor::rings;
 use crate::sensor::distance_series::Series;
@@ -57,14 +58,6 @@ pub(crate) struct Turn {
     pub state: SensorState,
 }
 
-/// What the maps want of every turn beside its points.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Wanted {
-    /// Deviations of the lead's distance series.
-    pub deviations: bool,
-    pub no_returns: bool,
-}
-
 /// One sensor of the vehicle.
 pub(crate) struct Intake {
     name: String,
@@ -92,7 +85,7 @@ impl Intake {
         config: &SensorConfig,
         calibration: Option<Calibration>,
         body: Option<&BodyConfig>,
-        wanted: Wanted,
+        wanted: ScanExtras,
     ) -> Self {
         let ego_from_sensor = config.extrinsics.ego_from_sensor();
         let place = ego_from_sensor.translation;
@@ -123,7 +116,7 @@ impl Intake {
     }
 
     /// What the maps want of the turns from now on.
-    pub fn want(&mut self, wanted: Wanted) {
+    pub fn want(&mut self, wanted: ScanExtras) {
         match (&self.series, wanted.deviations) {
             (None, true) => self.series = Some(Series::default()),
             (Some(_), false) => self.series = None,

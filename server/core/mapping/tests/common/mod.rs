@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::map::{Cells, Geometry, Layer, Rays};
+use clearway_mapping::layer::{Cells, Geometry, Layer, Rays};
 use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::sensor::sweep::Sweep;
 
@@ -100,7 +100,7 @@ pub fn off_borders(sweep: &Sweep) -> Sweep {
 /// Rows and columns of a layer.
 pub fn size(layer: &Layer) -> (usize, usize) {
     match &layer.geometry {
-        Geometry::Radial { r_bench_m, columns } => (r_bench_m.len(), usize::from(*columns)),
+        Geometry::Radial { row_radius_m, columns } => (row_radius_m.len(), usize::from(*columns)),
         Geometry::Cartesian { width, height, .. } => (*height as usize, *width as usize),
     }
 }
@@ -108,7 +108,7 @@ pub fn size(layer: &Layer) -> (usize, usize) {
 /// The cell of a layer that holds a position, if any does.
 pub fn cell_at(layer: &Layer, x: f32, y: f32) -> Option<usize> {
     match &layer.geometry {
-        Geometry::Radial { r_bench_m, columns } => RadialGrid::new(r_bench_m.clone(), *columns).cell(x, y),
+        Geometry::Radial { row_radius_m, columns } => RadialGrid::new(row_radius_m.clone(), *columns).cell(x, y),
         Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
             let ((x, y), (sin, cos)) = ((f64::from(x), f64::from(y)), yaw_rad.sin_cos());
             let place = |v: f64, origin: f64| ((v - origin) / f64::from(*cell_m)).floor();
@@ -141,8 +141,8 @@ pub fn quarter_turned(layer: &Layer, values: &[i32]) -> Vec<i32> {
 
 /// Outer radii of a layer's rows.
 pub fn benches(layer: &Layer) -> &[f32] {
-    let Geometry::Radial { r_bench_m, .. } = &layer.geometry else { panic!("{} is no radial grid", layer.name) };
-    r_bench_m
+    let Geometry::Radial { row_radius_m, .. } = &layer.geometry else { panic!("{} is no radial grid", layer.name) };
+    row_radius_m
 }
 
 /// Values of the channel `class`.
@@ -151,6 +151,11 @@ pub fn classes(layer: &Layer) -> &[u8] {
         Cells::U8(cells) => cells,
         other => panic!("class is u8, not {other:?}"),
     }
+}
+
+/// Name of a cell's class.
+pub fn class_name(layer: &Layer, cell: usize) -> &'static str {
+    layer.legend[usize::from(classes(layer)[cell])].name
 }
 
 /// A channel's values, whatever their type.
@@ -164,7 +169,7 @@ pub fn values(layer: &Layer, name: &str) -> Vec<i32> {
 
 /// A figure of the layer.
 pub fn figure(layer: &Layer, name: &str) -> f64 {
-    layer.figures.iter().find(|(n, _)| *n == name).unwrap().1
+    layer.metrics.iter().find(|(n, _)| *n == name).unwrap().1
 }
 
 /// Folder of the recorded drives.

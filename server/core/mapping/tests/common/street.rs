@@ -1,6 +1,6 @@
 //! The simulated six-unit vehicle, its scans put into the ego frame of their ends, as the pipeline does.
 
-use clearway_mapping::map::{Context, Geometry, Layer, LayerMaker, Rays};
+use clearway_mapping::layer::{Context, Geometry, Layer, LayerMaker, Rays};
 use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::sensor::sweep::Sweep;
 use clearway_sim::planes::PlaneUnit;
@@ -69,7 +69,7 @@ impl Street {
         for number in number * SCANS + 1..=(number + 1) * SCANS {
             for (sensor, unit) in self.units.iter().enumerate() {
                 let taken = scan(&self.scene, unit, number);
-                self.occupancy.take(&Rays {
+                self.occupancy.integrate(&Rays {
                     sensor: sensor as u16,
                     stamp_ns: number * unit.period_ns,
                     returns: &taken.sweep,
@@ -84,7 +84,7 @@ impl Street {
         let map_from_ego = self.scene.pose_at(time);
         let mut layer = self.occupancy.layer();
         let context = Context { map_from_ego: Some(map_from_ego), ..Context::default() };
-        self.occupancy.make_with(&Sweep::default(), &context, &mut layer);
+        self.occupancy.make(&Sweep::default(), &context, &mut layer);
         (layer, map_from_ego, time)
     }
 }

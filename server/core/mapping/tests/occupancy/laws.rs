@@ -1,15 +1,15 @@
 //! Whatever the rays: every cell is written, and their order says nothing.
 
 use clearway_mapping::config::OccupancyConfig;
-use clearway_mapping::map::{LayerMaker, Rays};
+use clearway_mapping::layer::{LayerMaker, Rays};
 use clearway_mapping::layer::occupancy::Occupancy;
-use clearway_mapping::layer::occupancy::states::{CLEAR, LEGEND, OCCLUDED};
+use clearway_mapping::layer::occupancy::class::OccupancyClass;
 use clearway_mapping::sensor::sweep::Sweep;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use proptest::prelude::*;
 
 use crate::common::*;
-use crate::made;
+use crate::{CLEAR, OCCLUDED, made};
 
 /// Positions near the vehicle, and all the floats there are but NaN.
 fn coordinate() -> impl Strategy<Value = f32> {
@@ -55,14 +55,14 @@ proptest! {
                 sensor: *sensor, stamp_ns: 0, returns, origin_m: *origin_m, no_returns, map_from_ego: *map_from_ego,
                 speed_mps: Some(3.0),
             };
-            map.take(&rays(&sweep));
-            again.take(&rays(&other));
+            map.integrate(&rays(&sweep));
+            again.integrate(&rays(&other));
             let layer = made(&mut map, *map_from_ego);
             let (rows, columns) = size(&layer);
             let hits = values(&layer, "hits");
             prop_assert_eq!((classes(&layer).len(), hits.len()), (rows * columns, rows * columns));
             for (class, hits) in classes(&layer).iter().zip(&hits) {
-                prop_assert!(usize::from(*class) < LEGEND.len() && (*class != CLEAR || *hits == 0));
+                prop_assert!(usize::from(*class) < OccupancyClass::LEGEND.len() && (*class != CLEAR || *hits == 0));
             }
             if points.is_empty() && no_returns.is_empty() {
                 prop_assert!(classes(&layer).iter().all(|class| *class != CLEAR && *class != OCCLUDED));

@@ -7,9 +7,11 @@ mod laws;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig, OccupancyConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
-use clearway_mapping::map::{Context, Layer, LayerMaker, Map, Rays};
+use clearway_mapping::layer::{Context, Layer, LayerMaker, Rays};
+use clearway_mapping::map::Map;
 use clearway_mapping::layer::occupancy::Occupancy;
-use clearway_mapping::layer::occupancy::states::*;
+use clearway_mapping::layer::occupancy::class::OccupancyClass;
+use clearway_mapping::layer::occupancy::states::{Cell, Evidence};
 use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::planes::{PlaneScan, PlaneUnit};
@@ -21,6 +23,12 @@ use common::street::{Street, cell_corners};
 use common::*;
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 
+const UNKNOWN: u8 = OccupancyClass::Unknown.value();
+const CLEAR: u8 = OccupancyClass::Clear.value();
+const OCCUPIED: u8 = OccupancyClass::Occupied.value();
+const OCCLUDED: u8 = OccupancyClass::Occluded.value();
+const OUT_OF_RANGE: u8 = OccupancyClass::OutOfRange.value();
+
 fn occupancy() -> Occupancy {
     Occupancy::new(&OccupancyConfig::default())
 }
@@ -28,7 +36,7 @@ fn occupancy() -> Occupancy {
 /// The map of rays taken so far.
 fn made(occupancy: &mut Occupancy, map_from_ego: Option<Isometry3<f64>>) -> Layer {
     let mut layer = occupancy.layer();
-    occupancy.make_with(&Sweep::default(), &Context { map_from_ego, ..Context::default() }, &mut layer);
+    occupancy.make(&Sweep::default(), &Context { map_from_ego, ..Context::default() }, &mut layer);
     layer
 }
 
@@ -57,37 +65,37 @@ fn each_arrow_of_a_cells_life_goes_where_the_table_says() {
     ];
     // A capital: the state is held for `hold_maps` first.
     let expected = [
-        (UNKNOWN, "u o u h c u h x"),
-        (CLEAR, "u o u h c u h x"),
-        (OCCUPIED, "U O U H u x x x"),
-        (OCCLUDED, "u o u h c u h x"),
-        (OUT_OF_RANGE, "u o u h c u h x"),
+        (OccupancyClass::Unknown, "u o u h c u h x"),
+        (OccupancyClass::Clear, "u o u h c u h x"),
+        (OccupancyClass::Occupied, "U O U H u x x x"),
+        (OccupancyClass::Occluded, "u o u h c u h x"),
+        (OccupancyClass::OutOfRange, "u o u h c u h x"),
     ];
     let state_of = |letter: char| match letter.to_ascii_lowercase() {
-        'u' => UNKNOWN,
-        'c' => CLEAR,
-        'x' => OCCUPIED,
-        'h' => OCCLUDED,
-        _ => OUT_OF_RANGE,
+        'u' => OccupancyClass::Unknown,
+        'c' => OccupancyClass::Clear,
+        'x' => OccupancyClass::Occupied,
+        'h' => OccupancyClass::Occluded,
+        _ => OccupancyClass::OutOfRange,
     };
     for (state, row) in expected {
-        let hits = if state == OCCUPIED { u8::MAX } else { 0 };
+        let hits = if state == OccupancyClass::Occupied { u8::MAX } else { 0 };
         for ((name, told, fresh), letter) in evidence.into_iter().zip(row.split(' ')) {
             let letter = letter.chars().next().unwrap();
             let mut cell = Cell { state, hits, age: 0 };
             for held in 0..HOLD {
                 let next = cell.judged(fresh, told, NEEDED, HOLD);
                 if !letter.is_uppercase() {
-                    assert_eq!(next.state, state_of(letter), "{} when {name}", LEGEND[usize::from(state)]);
+                    assert_eq!(next.state, state_of(letter), "{state:?} when {name}");
                     break;
                 }
-                assert_eq!(next.state, state, "{} when {name}, map {held}", LEGEND[usize::from(state)]);
+                assert_eq!(next.state, state, "{state:?} when {name}, map {held}");
                 cell = next;
             }
             if letter.is_uppercase() {
                 let next = cell.judged(fresh, told, NEEDED, HOLD);
                 let expected = Cell { state: state_of(letter), hits: 0, age: HOLD + 1 };
-                assert_eq!(next, expected, "{} when {name}, in the end", LEGEND[usize::from(state)]);
+                assert_eq!(next, expected, "{state:?} when {name}, in the end");
             }
         }
     }
@@ -101,20 +109,20 @@ fn hits_add_up_saturate_and_fade() {
     let mut cell = Cell::default();
     for turn in 1..=3 {
         cell = hit(cell, 6);
-        assert_eq!((cell.state, cell.hits), (UNKNOWN, 6 * turn), "turn {turn}");
+        assert_eq!((cell.state, cell.hits), (OccupancyClass::Unknown, 6 * turn), "turn {turn}");
     }
     cell = hit(cell, 6);
-    assert_eq!((cell.state, cell.hits), (OCCUPIED, u8::MAX));
+    assert_eq!((cell.state, cell.hits), (OccupancyClass::Occupied, u8::MAX));
     assert_eq!(hit(cell, 1), cell, "one more return keeps it");
     // Gone: not occupied at once, clear some maps later, and never in between for a thing that rays miss once.
-    let states: Vec<(u8, u8)> = std::iter::successors(Some(passed(cell)), |cell| Some(passed(*cell)))
+    let states: Vec<(OccupancyClass, u8)> = std::iter::successors(Some(passed(cell)), |cell| Some(passed(*cell)))
         .take(4)
         .map(|cell| (cell.state, cell.hits))
         .collect();
-    assert_eq!(states, [(UNKNOWN, 19), (UNKNOWN, 4), (UNKNOWN, 1), (CLEAR, 0)]);
-    assert_eq!(hit(passed(cell), 1).state, OCCUPIED, "missed once, it is back with one return");
+    assert_eq!(states, [(OccupancyClass::Unknown, 19), (OccupancyClass::Unknown, 4), (OccupancyClass::Unknown, 1), (OccupancyClass::Clear, 0)]);
+    assert_eq!(hit(passed(cell), 1).state, OccupancyClass::Occupied, "missed once, it is back with one return");
     // The stronger evidence wins within one map.
-    assert_eq!(Cell::default().judged(20, Evidence::Through, 20, 2).state, OCCUPIED);
+    assert_eq!(Cell::default().judged(20, Evidence::Through, 20, 2).state, OccupancyClass::Occupied);
 }
 
 #[test]
@@ -141,7 +149,7 @@ fn wall() -> Sweep {
 fn before_a_wall_is_clear_behind_it_hidden_and_what_nobody_looks_at_out_of_range() {
     let sweep = wall();
     let mut occupancy = occupancy();
-    occupancy.take(&rays(&sweep));
+    occupancy.integrate(&rays(&sweep));
     let layer = made(&mut occupancy, None);
     for (x, y, expected) in [
         (5.0, 0.1, CLEAR),
@@ -164,7 +172,7 @@ fn before_a_wall_is_clear_behind_it_hidden_and_what_nobody_looks_at_out_of_range
 fn beyond_the_reliable_range_nothing_is_judged() {
     let sweep = wall();
     let mut occupancy = Occupancy::new(&OccupancyConfig { range_m_max: 20.0, ..OccupancyConfig::default() });
-    occupancy.take(&rays(&sweep));
+    occupancy.integrate(&rays(&sweep));
     let layer = made(&mut occupancy, None);
     assert_eq!([19.0, 21.0].map(|x| class_at(&layer, x, 0.1)), [OCCLUDED, OUT_OF_RANGE]);
 }
@@ -176,7 +184,7 @@ fn rays_that_meet_nothing_clear_as_far_as_configured_and_never_mark() {
         (-20..=20).map(|step| (step as f32 * 0.00436).sin_cos()).map(|(y, x)| [x, y, 0.0]).collect();
     for (no_return_m, expected) in [(0.0, [UNKNOWN, UNKNOWN]), (30.0, [CLEAR, UNKNOWN])] {
         let mut occupancy = Occupancy::new(&OccupancyConfig { no_return_m, ..OccupancyConfig::default() });
-        occupancy.take(&Rays { no_returns: &ahead, ..rays(&empty) });
+        occupancy.integrate(&Rays { no_returns: &ahead, ..rays(&empty) });
         let layer = made(&mut occupancy, None);
         assert_eq!([29.0, 31.0].map(|x| class_at(&layer, x, 0.1)), expected, "{no_return_m}");
         assert!(values(&layer, "hits").iter().all(|hits| *hits == 0));
@@ -196,7 +204,7 @@ fn a_ray_that_passes_under_or_over_a_thing_does_not_clear_it() {
         add(&mut sweep, [8.0, y * 0.9, 0.0]);
     }
     let mut occupancy = occupancy();
-    occupancy.take(&rays(&sweep));
+    occupancy.integrate(&rays(&sweep));
     let layer = made(&mut occupancy, None);
     let seen = [6.5, 9.1, 10.1, 12.0, 15.9].map(|x| class_at(&layer, x, 0.1));
     assert_eq!(seen, [CLEAR, OCCUPIED, OCCLUDED, OCCLUDED, CLEAR]);
@@ -211,7 +219,7 @@ fn the_grid_scrolls_under_a_vehicle_that_drives_and_turns_and_the_world_stays() 
         add(&mut sweep, [29.9, 5.1, 0.5]);
     }
     let start = pose(0.0, 0.0, 0.0);
-    occupancy.take(&Rays { map_from_ego: Some(start), speed_mps: Some(0.0), ..rays(&sweep) });
+    occupancy.integrate(&Rays { map_from_ego: Some(start), speed_mps: Some(0.0), ..rays(&sweep) });
     let first = made(&mut occupancy, Some(start));
     assert_eq!(class_at(&first, 29.9, 5.1), OCCUPIED);
     for (number, ego) in [pose(3.3, -7.9, 2.0), pose(6.6, -15.8, -1.0)].into_iter().enumerate() {
@@ -230,7 +238,7 @@ fn a_silent_sensor_leaves_nothing_clear() {
     let sweep = wall();
     let ego = Some(pose(4.0, 2.0, 0.3));
     let mut occupancy = occupancy();
-    occupancy.take(&Rays { map_from_ego: ego, ..rays(&sweep) });
+    occupancy.integrate(&Rays { map_from_ego: ego, ..rays(&sweep) });
     assert_eq!(class_at(&made(&mut occupancy, ego), 5.0, 0.1), CLEAR);
     let after = made(&mut occupancy, ego);
     assert!(classes(&after).iter().all(|class| *class != CLEAR && *class != OCCLUDED));
@@ -242,10 +250,10 @@ fn what_a_sensor_saw_before_a_long_silence_clears_nothing_in_the_map_after_it() 
     let sweep = wall();
     for (earliest_ns, expected) in [(999, CLEAR), (1000, CLEAR), (1001, UNKNOWN)] {
         let mut occupancy = occupancy();
-        occupancy.take(&Rays { stamp_ns: 1000, ..rays(&sweep) });
+        occupancy.integrate(&Rays { stamp_ns: 1000, ..rays(&sweep) });
         let mut layer = occupancy.layer();
         let context = Context { stamp_ns: 5000, earliest_ns, ..Context::default() };
-        occupancy.make_with(&Sweep::default(), &context, &mut layer);
+        occupancy.make(&Sweep::default(), &context, &mut layer);
         assert_eq!(class_at(&layer, 5.0, 0.1), expected, "seen at 1000, {earliest_ns} is the earliest that counts");
     }
 }
@@ -337,7 +345,7 @@ fn a_turning_sensor_on_the_roof_clears_no_cell_of_a_car_it_looks_over() {
             sweep.take_revolution(&revolution, &mount);
             let map_from_ego = vehicle.pose_at(revolution.end_ns);
             let time = (revolution.end_ns - vehicle.start_ns()) as f64 * 1e-9;
-            occupancy.take(&Rays { map_from_ego: Some(map_from_ego), speed_mps: Some(0.0), ..rays(&sweep) });
+            occupancy.integrate(&Rays { map_from_ego: Some(map_from_ego), speed_mps: Some(0.0), ..rays(&sweep) });
             let layer = made(&mut occupancy, Some(map_from_ego));
             let (now, before) = (time, time - 0.1);
             let world = &vehicle.scene().world;
@@ -416,7 +424,7 @@ fn six_sensors_go_through_the_pipeline_as_events_and_the_same_events_give_the_sa
 fn hardly_a_clear_cell_of_the_labelled_frame_holds_an_obstacle() {
     let (sweep, labels) = labels::labelled_frame();
     let mut occupancy = occupancy();
-    occupancy.take(&rays(&sweep));
+    occupancy.integrate(&rays(&sweep));
     let layer = made(&mut occupancy, None);
     let cells = classes(&layer).len();
     let truth = labels::truth_by_cell(&sweep, &labels, cells, |x, y| cell_at(&layer, x, y));
@@ -445,7 +453,7 @@ fn three_lidars_on_one_roof_see_together_what_none_sees_alone() {
             let mut occupancy = occupancy();
             for (number, sensor) in sensors.iter().enumerate() {
                 let origin_m = sensor.origin_m;
-                occupancy.take(&Rays { sensor: number as u16, origin_m, ..rays(&sensor.sweep) });
+                occupancy.integrate(&Rays { sensor: number as u16, origin_m, ..rays(&sensor.sweep) });
             }
             made(&mut occupancy, None)
         };

@@ -6,7 +6,8 @@ mod common;
 
 use clearway_mapping::config::{Extrinsics, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, Event, Scan};
-use clearway_mapping::map::{Layer, Map, Part};
+use clearway_mapping::layer::Layer;
+use clearway_mapping::map::{Map, Part};
 use clearway_mapping::sensor::mount::estimate;
 use clearway_mapping::pipeline::Pipeline;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};

@@ -7,7 +7,7 @@ use crate::config::DrivabilityConfig;
 use crate::layer::radial_grid::RadialGrid;
 use crate::sensor::sweep::Sweep;
 
-use super::UNIT_HEIGHT_UNKNOWN;
+use super::class::UNIT_HEIGHT_UNKNOWN;
 
 /// A cell as the points fall into it: height and index of its highest point.
 #[derive(Clone, Copy, Debug)]

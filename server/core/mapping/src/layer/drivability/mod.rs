@@ -13,35 +13,25 @@
 //! Nothing depends on the order of the points: a cell keeps its highest point, and of equally high ones the one with
 //! the largest x, then y; everything after runs over cells in the order of the grid.
 
+pub mod class;
 pub mod heights;
 pub mod planes;
 pub mod search;
 pub mod segments;
 
 use crate::config::DrivabilityConfig;
-use crate::map::{Cells, Channel, Geometry, Layer, LayerMaker};
+use crate::layer::channel::TypedChannel;
+use crate::layer::class::drivable_share;
+use crate::layer::grid::Geometry;
+use crate::layer::maker::{Context, Layer, LayerMaker};
 use crate::layer::radial_grid::RadialGrid;
 use crate::sensor::sweep::Sweep;
 
+use class::{DrivabilityClass, SEGMENT, UNIT_HEIGHT_UNKNOWN};
 use heights::Heights;
 use planes::Planes;
 use search::Search;
 use segments::Segments;
-
-/// No point fell into the cell: nothing is known of it.
-pub const UNKNOWN: u8 = 0;
-/// The vehicle can drive there from where it stands.
-pub const DRIVABLE: u8 = 1;
-/// Reached step by step, but over an edge, a slope or a gap that the vehicle cannot take.
-pub const NOT_DRIVABLE: u8 = 2;
-/// Not reached: too high, or behind something that is.
-pub const OBSTACLE: u8 = 3;
-/// Names of the classes, by value.
-pub const LEGEND: &[&str] = &["unknown", "drivable", "not_drivable", "obstacle"];
-/// Raw `unit_height` of a cell without points.
-pub const UNIT_HEIGHT_UNKNOWN: i8 = i8::MIN;
-/// Raw `segment` of a cell without points.
-pub const SEGMENT_UNKNOWN: u16 = u16::MAX;
 
 /// Makes the layer from sweep after sweep, reusing its buffers.
 pub struct Drivability {
@@ -69,42 +59,42 @@ impl Drivability {
     fn write(&self, layer: &mut Layer) {
         self.grid.describe(&mut layer.geometry);
         layer.clear_lists();
-        let [class, unit_height, segment] = &mut layer.channels[..] else { unreachable!("layer() gives three") };
-        let (Cells::U8(class), Cells::I8(unit_height), Cells::U16(segment)) =
-            (&mut class.cells, &mut unit_height.cells, &mut segment.cells)
-        else {
-            unreachable!("layer() gives u8, i8 and u16")
-        };
-        segment.clear();
-        segment.extend_from_slice(self.segments.of_cell());
-        unit_height.clear();
+        let mut unit_height = self.unit_height().reuse(&mut layer.channels);
+        let mut segment = SEGMENT.reuse(&mut layer.channels);
+        let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
         unit_height.extend_from_slice(self.heights.units());
+        segment.extend_from_slice(self.segments.of_cell());
         let (unreachable, drivable) = (self.segments.unreachable(), self.search.drivable());
-        class.clear();
-        class.extend(segment.iter().map(|&segment| match segment {
-            SEGMENT_UNKNOWN => UNKNOWN,
-            segment if segment == unreachable => OBSTACLE,
-            segment if drivable[usize::from(segment)] => DRIVABLE,
-            _ => NOT_DRIVABLE,
+        class.extend(segment.iter().map(|&segment| {
+            let class = match segment {
+                _ if segment == SEGMENT.unknown => DrivabilityClass::Unknown,
+                _ if segment == unreachable => DrivabilityClass::Obstacle,
+                _ if drivable[usize::from(segment)] => DrivabilityClass::Drivable,
+                _ => DrivabilityClass::NotDrivable,
+            };
+            class.value()
         }));
-        let known = class.iter().filter(|c| **c != UNKNOWN).count();
-        let drivable = class.iter().filter(|c| **c == DRIVABLE).count();
         layer.planes.extend_from_slice(self.planes.of_segment());
-        layer.figures.push(("drivable_share", if known == 0 { 0.0 } else { drivable as f64 / known as f64 }));
+        layer.metrics.push(("drivable_share", drivable_share(layer.legend, &class)));
+        TypedChannel::CLASS.store(&mut layer.channels, class);
+        self.unit_height().store(&mut layer.channels, unit_height);
+        SEGMENT.store(&mut layer.channels, segment);
+    }
+
+    /// Height of a cell's highest point, in units of the configured height.
+    fn unit_height(&self) -> TypedChannel<i8> {
+        let scale = self.config.unit_height_m;
+        TypedChannel { name: "unit_height", unit: "m", scale, unknown: UNIT_HEIGHT_UNKNOWN }
     }
 }
 
 impl LayerMaker for Drivability {
     fn layer(&self) -> Layer {
-        let channels = vec![
-            Channel::class(),
-            Channel::i8("unit_height", "m", self.config.unit_height_m, UNIT_HEIGHT_UNKNOWN),
-            Channel::u16("segment", "", 1.0, SEGMENT_UNKNOWN),
-        ];
-        Layer::new("drivability", Geometry::radial(self.config.columns), LEGEND, channels)
+        let channels = vec![TypedChannel::CLASS.empty(), self.unit_height().empty(), SEGMENT.empty()];
+        Layer::new("drivability", Geometry::radial(self.config.columns), DrivabilityClass::LEGEND, channels)
     }
 
-    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
+    fn make(&mut self, sweep: &Sweep, _: &Context<'_>, layer: &mut Layer) {
         self.grid.follow(sweep, self.config.range_m_max, self.config.columns);
         self.heights.set_up(&self.grid, sweep, &self.config);
         self.segments.grow(&self.grid, &self.heights, &self.config);

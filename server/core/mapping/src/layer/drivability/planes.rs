@@ -4,7 +4,7 @@
 //! the segment's centroid: there the sums of x and y vanish, two unknowns remain, and no digits are lost to the
 //! distance from the origin.
 
-use super::SEGMENT_UNKNOWN;
+use super::class::SEGMENT;
 use super::heights::Heights;
 use super::segments::Segments;
 
@@ -35,7 +35,7 @@ impl Planes {
         let unreachable = usize::from(segments.unreachable());
         self.moments.clear();
         self.moments.resize(unreachable + 1, Moments::default());
-        let cells = || segments.of_cell().iter().zip(heights.points()).filter(|(s, _)| **s != SEGMENT_UNKNOWN);
+        let cells = || segments.of_cell().iter().zip(heights.points()).filter(|(s, _)| **s != SEGMENT.unknown);
         for (segment, point) in cells() {
             let moments = &mut self.moments[usize::from(*segment)];
             moments.cells += 1;

@@ -16,7 +16,7 @@ use std::collections::VecDeque;
 use crate::config::{DrivabilityConfig, Gate};
 use crate::layer::radial_grid::RadialGrid;
 
-use super::SEGMENT_UNKNOWN;
+use super::class::SEGMENT;
 use super::heights::Heights;
 use super::planes::Planes;
 use super::segments::{Segments, counter_clockwise, is_step, outward};
@@ -75,7 +75,7 @@ impl Search {
     ) {
         let units = heights.units();
         let of_cell = segments.of_cell();
-        let reached = |cell: usize| of_cell[cell] != SEGMENT_UNKNOWN && of_cell[cell] != segments.unreachable();
+        let reached = |cell: usize| of_cell[cell] != SEGMENT.unknown && of_cell[cell] != segments.unreachable();
         self.sides.clear();
         for cell in (0..units.len()).filter(|cell| reached(*cell)) {
             let counter_clockwise = counter_clockwise(grid.columns(), cell);

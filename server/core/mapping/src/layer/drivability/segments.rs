@@ -9,8 +9,8 @@ use std::collections::VecDeque;
 use crate::config::{DrivabilityConfig, Seed};
 use crate::layer::radial_grid::RadialGrid;
 
+use super::class::{SEGMENT, UNIT_HEIGHT_UNKNOWN};
 use super::heights::{Heights, unit_height};
-use super::{SEGMENT_UNKNOWN, UNIT_HEIGHT_UNKNOWN};
 
 /// Cells with points that no segment has taken yet.
 const UNREACHED: u16 = u16::MAX - 1;
@@ -30,7 +30,7 @@ impl Segments {
     pub fn grow(&mut self, grid: &RadialGrid, heights: &Heights, config: &DrivabilityConfig) {
         let units = heights.units();
         self.of_cell.clear();
-        self.of_cell.extend(units.iter().map(|u| if *u == UNIT_HEIGHT_UNKNOWN { SEGMENT_UNKNOWN } else { UNREACHED }));
+        self.of_cell.extend(units.iter().map(|u| if *u == UNIT_HEIGHT_UNKNOWN { SEGMENT.unknown } else { UNREACHED }));
         self.neighbor_list.clear();
         self.growing.clear();
 
@@ -90,7 +90,7 @@ impl Segments {
         }
     }
 
-    /// Segment of each cell; [`SEGMENT_UNKNOWN`] where it is empty.
+    /// Segment of each cell; [`SEGMENT`]`.unknown` where it is empty.
     pub fn of_cell(&self) -> &[u16] {
         &self.of_cell
     }

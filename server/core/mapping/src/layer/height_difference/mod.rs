@@ -4,21 +4,17 @@
 //! In: a [`Sweep`], ego frame, metres. Out: the layer `height_difference`. Kept for comparison: it takes a steep road,
 //! or one under branches, for an obstacle, and calls ground behind a fence drivable, as the thesis shows.
 
+pub mod class;
+
 use crate::config::HeightDifferenceConfig;
-use crate::map::{Cells, Channel, Geometry, Layer, LayerMaker};
+use crate::layer::channel::TypedChannel;
+use crate::layer::class::drivable_share;
+use crate::layer::grid::Geometry;
+use crate::layer::maker::{Context, Layer, LayerMaker};
 use crate::layer::radial_grid::RadialGrid;
 use crate::sensor::sweep::Sweep;
 
-/// No point fell into the cell.
-pub const UNKNOWN: u8 = 0;
-/// Highest and lowest point differ by no more than the threshold. Says nothing of whether the vehicle can get there.
-pub const DRIVABLE: u8 = 1;
-/// They differ by more.
-pub const OBSTACLE: u8 = 2;
-/// Names of the classes, by value.
-pub const LEGEND: &[&str] = &["unknown", "drivable", "obstacle"];
-/// Raw `difference` of a cell without points.
-pub const DIFFERENCE_UNKNOWN: u16 = u16::MAX;
+use class::{DIFFERENCE, HeightDifferenceClass};
 
 /// Makes the layer from sweep after sweep, reusing its buffers.
 pub struct HeightDifference {
@@ -37,11 +33,12 @@ impl HeightDifference {
 
 impl LayerMaker for HeightDifference {
     fn layer(&self) -> Layer {
-        let channels = vec![Channel::class(), Channel::u16("difference", "m", 0.01, DIFFERENCE_UNKNOWN)];
-        Layer::new("height_difference", Geometry::radial(self.config.columns), LEGEND, channels)
+        let channels = vec![TypedChannel::CLASS.empty(), DIFFERENCE.empty()];
+        let geometry = Geometry::radial(self.config.columns);
+        Layer::new("height_difference", geometry, HeightDifferenceClass::LEGEND, channels)
     }
 
-    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
+    fn make(&mut self, sweep: &Sweep, _: &Context<'_>, layer: &mut Layer) {
         self.grid.follow(sweep, self.config.range_m_max, self.config.columns);
         self.span.clear();
         self.span.resize(self.grid.cells() + self.grid.columns(), [f32::NEG_INFINITY, f32::INFINITY]);
@@ -56,25 +53,24 @@ impl LayerMaker for HeightDifference {
 
         self.grid.describe(&mut layer.geometry);
         layer.clear_lists();
-        let [class, difference] = &mut layer.channels[..] else { unreachable!("layer() gives two channels") };
-        let (Cells::U8(class), Cells::U16(difference)) = (&mut class.cells, &mut difference.cells) else {
-            unreachable!("layer() gives u8 and u16")
-        };
+        let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
+        let mut difference = DIFFERENCE.reuse(&mut layer.channels);
         let spans = &self.span[..self.grid.cells()];
-        class.clear();
-        class.extend(spans.iter().map(|[highest, lowest]| match highest - lowest {
-            apart if apart > self.config.difference_m_max => OBSTACLE,
-            // Without points highest is -∞ and lowest +∞.
-            apart if apart >= 0.0 => DRIVABLE,
-            _ => UNKNOWN,
+        class.extend(spans.iter().map(|[highest, lowest]| {
+            let class = match highest - lowest {
+                apart if apart > self.config.difference_m_max => HeightDifferenceClass::Obstacle,
+                // Without points highest is -∞ and lowest +∞.
+                apart if apart >= 0.0 => HeightDifferenceClass::Drivable,
+                _ => HeightDifferenceClass::Unknown,
+            };
+            class.value()
         }));
-        difference.clear();
         difference.extend(spans.iter().map(|[highest, lowest]| match highest - lowest {
-            apart if apart >= 0.0 => ((apart * 100.0).round() as u16).min(DIFFERENCE_UNKNOWN - 1),
-            _ => DIFFERENCE_UNKNOWN,
+            apart if apart >= 0.0 => ((apart * 100.0).round() as u16).min(DIFFERENCE.unknown - 1),
+            _ => DIFFERENCE.unknown,
         }));
-        let known = class.iter().filter(|c| **c != UNKNOWN).count();
-        let drivable = class.iter().filter(|c| **c == DRIVABLE).count();
-        layer.figures.push(("drivable_share", if known == 0 { 0.0 } else { drivable as f64 / known as f64 }));
+        layer.metrics.push(("drivable_share", drivable_share(layer.legend, &class)));
+        TypedChannel::CLASS.store(&mut layer.channels, class);
+        DIFFERENCE.store(&mut layer.channels, difference);
     }
 }

@@ -28,7 +28,7 @@ use super::states::{HIDDEN, LOOKED_AT, THROUGH};
 use super::way::Way;
 use super::window::Window;
 use crate::config::OccupancyConfig;
-use crate::map::Rays;
+use crate::layer::maker::Rays;
 use crate::layer::radial_grid::{Quadrants, nearest_whole, whole};
 use crate::sensor::sweep::Sweep;
 

@@ -26,6 +26,7 @@
 //! Without an ego pose nobody can say where last map's cells are now: the grid is then the vehicle's own and holds only
 //! what was seen since the last map (`world_aligned` is 0).
 
+pub mod class;
 pub mod config;
 pub mod fan;
 pub mod states;
@@ -33,11 +34,13 @@ pub mod way;
 pub mod window;
 
 use crate::config::OccupancyConfig;
-use crate::map::{Cells, Channel, Context, Geometry, Layer, LayerMaker, Rays};
+use crate::layer::channel::TypedChannel;
+use crate::layer::grid::Geometry;
+use crate::layer::maker::{Context, Layer, LayerMaker, Rays, ScanExtras};
 use crate::sensor::sweep::Sweep;
 
+use class::{HITS, OccupancyClass};
 use fan::Fan;
-use states::{CLEAR, LEGEND, OCCUPIED, UNKNOWN};
 use window::Window;
 
 /// Gathers rays, makes the layer.
@@ -88,39 +91,38 @@ impl Occupancy {
     fn write(&mut self, earliest_ns: i64, layer: &mut Layer) {
         let needed = Self::hits_needed(&self.config, self.speed_mps);
         layer.clear_lists();
-        let [class, hits] = &mut layer.channels[..] else { unreachable!("layer() gives two channels") };
-        let (Cells::U8(class), Cells::U8(hits)) = (&mut class.cells, &mut hits.cells) else {
-            unreachable!("layer() gives u8 and u8")
-        };
+        let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
+        let mut hits = HITS.reuse(&mut layer.channels);
         let cells = self.window.side() * self.window.side();
-        class.clear();
         class.resize(cells, 0);
         hits.resize(cells, 0);
-        let any = self.fan.tell(&self.config, earliest_ns, &self.window, class);
-        self.window.judge([needed, self.config.hold_maps], any, class, hits);
-        let share = |state: u8| class.iter().filter(|class| **class == state).count() as f64 / cells as f64;
-        layer.figures.extend([
-            ("clear_share", share(CLEAR)),
-            ("occupied_share", share(OCCUPIED)),
+        let any = self.fan.tell(&self.config, earliest_ns, &self.window, &mut class);
+        self.window.judge([needed, self.config.hold_maps], any, &mut class, &mut hits);
+        let share = |of: OccupancyClass| class.iter().filter(|class| **class == of.value()).count() as f64 / cells as f64;
+        layer.metrics.extend([
+            ("clear_share", share(OccupancyClass::Clear)),
+            ("occupied_share", share(OccupancyClass::Occupied)),
             ("hits_needed", f64::from(needed)),
             ("world_aligned", f64::from(u8::from(self.window.anchored()))),
         ]);
+        TypedChannel::CLASS.store(&mut layer.channels, class);
+        HITS.store(&mut layer.channels, hits);
         layer.geometry = self.geometry();
     }
 }
 
 impl LayerMaker for Occupancy {
     fn layer(&self) -> Layer {
-        let channels = vec![Channel::class(), Channel::u8("hits", "", 1.0, UNKNOWN)];
-        Layer::new("occupancy", self.geometry(), LEGEND, channels)
+        let channels = vec![TypedChannel::CLASS.empty(), HITS.empty()];
+        Layer::new("occupancy", self.geometry(), OccupancyClass::LEGEND, channels)
     }
 
-    fn wants_no_returns(&self) -> bool {
-        self.config.no_return_m > 0.0
+    fn uses(&self) -> ScanExtras {
+        ScanExtras { no_returns: self.config.no_return_m > 0.0, ..ScanExtras::default() }
     }
 
-    fn take(&mut self, rays: &Rays<'_>) {
-        // Who sees nothing at all has not looked.
+    fn integrate(&mut self, rays: &Rays<'_>) {
+        // An empty scan is no evidence of free space.
         if rays.returns.x.is_empty() && rays.no_returns.is_empty() {
             return;
         }
@@ -131,12 +133,7 @@ impl LayerMaker for Occupancy {
         self.fan.take(rays, &self.config, &mut self.window);
     }
 
-    /// From the rays taken since the last map, where the vehicle was then.
-    fn make(&mut self, _sweep: &Sweep, layer: &mut Layer) {
-        self.write(i64::MIN, layer);
-    }
-
-    fn make_with(&mut self, _sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
+    fn make(&mut self, _: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         // The map may be some way on from the last rays. Where no pose says so, the grid stays where they were taken.
         if let Some(pose) = context.map_from_ego.as_ref().filter(|_| self.window.anchored()) {
             self.window.follow(Some(pose));

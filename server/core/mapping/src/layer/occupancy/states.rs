@@ -3,18 +3,7 @@
 //!
 //! In: a [`Cell`] and its [`Evidence`] since the last map. Out: the cell as it is published.
 
-/// Nobody has looked at the cell, or those who did could not tell (the paper's "unobserved").
-pub const UNKNOWN: u8 = 0;
-/// Rays passed through the cell low over the ground and met nothing in it.
-pub const CLEAR: u8 = 1;
-/// As many returns came from the cell as its speed asks for.
-pub const OCCUPIED: u8 = 2;
-/// Something nearer hides the cell.
-pub const OCCLUDED: u8 = 3;
-/// Beyond the reliable range, or outside every field of view since the last map.
-pub const OUT_OF_RANGE: u8 = 4;
-/// Names of the states, by value.
-pub const LEGEND: &[&str] = &["unknown", "clear", "occupied", "occluded", "out_of_range"];
+use super::class::OccupancyClass::{self, Clear, Occluded, Occupied, OutOfRange, Unknown};
 
 /// Told of a cell: a sensor looks there, over it or through it.
 pub const LOOKED_AT: u8 = 1;
@@ -59,9 +48,9 @@ pub fn evidence(told: u8, any: bool) -> Evidence {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next {
     /// This state, now.
-    Go(u8),
+    Go(OccupancyClass),
     /// The state it has, until it has not been confirmed for longer than `hold_maps`; then this one.
-    Hold(u8),
+    Hold(OccupancyClass),
 }
 
 use Next::{Go, Hold};
@@ -74,15 +63,15 @@ use Next::{Go, Hold};
 #[rustfmt::skip]
 pub const TRANSITIONS: [[Next; 8]; 2] = [
     // Silence       Nothing             Overhead       Hidden          Through    ThroughDoubted FewHits      Hits
-    [Go(UNKNOWN),   Go(OUT_OF_RANGE),   Go(UNKNOWN),   Go(OCCLUDED),   Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // any other
-    [Hold(UNKNOWN), Hold(OUT_OF_RANGE), Hold(UNKNOWN), Hold(OCCLUDED), Go(CLEAR), Go(UNKNOWN),   Go(UNKNOWN), Go(OCCUPIED)], // occupied
+    [Go(Unknown),   Go(OutOfRange),   Go(Unknown),   Go(Occluded),   Go(Clear), Go(Unknown),   Go(Unknown), Go(Occupied)], // any other
+    [Hold(Unknown), Hold(OutOfRange), Hold(Unknown), Hold(Occluded), Go(Clear), Go(Unknown),   Go(Unknown), Go(Occupied)], // occupied
 ];
 
 /// What is kept of a cell from map to map.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Cell {
-    /// [`UNKNOWN`] … [`OUT_OF_RANGE`].
-    pub state: u8,
+    /// The state as published.
+    pub state: OccupancyClass,
     /// Returns counted, faded by rays that went through; 255 in an occupied cell that nothing has gone through.
     pub hits: u8,
     /// Maps since a ray came back from here or went through.
@@ -94,8 +83,8 @@ impl Cell {
     /// returns from 23 is chance, and would be half of the layer's bytes), 0 in any other.
     pub fn level(self) -> u8 {
         match (self.state, self.hits) {
-            (OCCUPIED, hits) => hits,
-            (UNKNOWN, hits) if hits > 0 => 1 << hits.ilog2(),
+            (Occupied, hits) => hits,
+            (Unknown, hits) if hits > 0 => 1 << hits.ilog2(),
             _ => 0,
         }
     }
@@ -121,7 +110,7 @@ impl Cell {
         }
         let age = if fresh > 0 || told == Evidence::Through { 0 } else { self.age.saturating_add(1) };
         let over = age > hold_maps;
-        let state = match TRANSITIONS[usize::from(self.state == OCCUPIED)][evidence as usize] {
+        let state = match TRANSITIONS[usize::from(self.state == Occupied)][evidence as usize] {
             Go(state) => state,
             Hold(later) => {
                 if over {

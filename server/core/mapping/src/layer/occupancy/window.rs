@@ -179,14 +179,14 @@ impl Window {
             let ([x, y], index) = (self.cell(*index), *index as usize);
             let (at, fresh) = (y * self.side + x, std::mem::take(&mut self.fresh[index]));
             let cell = self.cells[index].judged(fresh, evidence(class[at], any), needed, hold_maps);
-            (class[at], hits[at]) = (JUDGED | cell.state, cell.level());
+            (class[at], hits[at]) = (JUDGED | cell.state.value(), cell.level());
             self.cells[index] = if cell.hits > 0 { cell } else { Cell::default() };
             cell.hits > 0
         });
         self.listed = listed;
         let states: [u8; 16] = std::array::from_fn(|told| match told as u8 {
             told if told & JUDGED != 0 => told & !JUDGED,
-            told => Cell::default().judged(0, evidence(told, any), needed, hold_maps).state,
+            told => Cell::default().judged(0, evidence(told, any), needed, hold_maps).state.value(),
         });
         class.iter_mut().for_each(|class| *class = states[usize::from(*class & 15)]);
         if !self.anchored {

@@ -9,8 +9,10 @@
 //! obstacles.
 
 use crate::config::SafePathConfig;
-use crate::layer::drivability;
-use crate::map::{Cells, Geometry, Layer};
+use crate::layer::channel::TypedChannel;
+use crate::layer::drivability::class::DrivabilityClass;
+use crate::layer::grid::Geometry;
+use crate::layer::maker::Layer;
 use crate::layer::radial_grid::RadialGrid;
 use crate::sensor::sweep::Sweep;
 
@@ -87,17 +89,21 @@ impl Free {
 
     /// Takes the newest drivability, in place of the one before; without it nothing is known.
     pub fn fill(&mut self, drivability: Option<&Layer>, sweep: &Sweep, config: &SafePathConfig) {
-        let Some(layer) = drivability else { return self.states.fill(State::Unknown) };
-        let Geometry::Radial { r_bench_m, columns } = &layer.geometry else { unreachable!("drivability is radial") };
-        let Cells::U8(class) = &layer.channels[0].cells else { unreachable!("drivability's class is u8") };
+        let class = drivability.and_then(|layer| TypedChannel::CLASS.values(&layer.channels));
+        let (Some(layer), Some(class)) = (drivability, class) else { return self.states.fill(State::Unknown) };
+        let Geometry::Radial { row_radius_m: r_bench_m, columns } = &layer.geometry else {
+            return self.states.fill(State::Unknown);
+        };
         if self.made_for.as_ref() != Some(&layer.geometry) {
             self.look_up(r_bench_m, *columns);
             self.made_for = Some(layer.geometry.clone());
         }
         self.of_radial_cell.clear();
+        const UNKNOWN: u8 = DrivabilityClass::Unknown.value();
+        const DRIVABLE: u8 = DrivabilityClass::Drivable.value();
         self.of_radial_cell.extend(class.iter().map(|&class| match class {
-            drivability::UNKNOWN => State::Unknown,
-            drivability::DRIVABLE => State::Drivable,
+            UNKNOWN => State::Unknown,
+            DRIVABLE => State::Drivable,
             _ => State::Obstacle,
         }));
         self.forget_the_vehicle(sweep, config);

@@ -15,30 +15,23 @@
 //! The thesis keeps no more than the picture; here each point knows its radius (the thesis' safety radius), and is kept
 //! where the vehicle fits: twice the radius is at least its width. What lies beyond the grid is not known to this map.
 
+pub mod class;
 pub mod distance;
 pub mod free;
 pub mod links;
 pub mod ridge;
 
 use crate::config::SafePathConfig;
-use crate::map::{Cells, Channel, Context, Geometry, Layer, LayerMaker};
+use crate::layer::channel::TypedChannel;
+use crate::layer::grid::Geometry;
+use crate::layer::maker::{Context, Layer, LayerMaker};
 use crate::sensor::sweep::Sweep;
 
+use class::SafePathClass;
 use distance::Distances;
 use free::{Free, State};
 use links::Links;
 use ridge::Ridge;
-
-/// Nothing is known of the cell.
-pub const UNKNOWN: u8 = 0;
-/// Drivable, says `drivability`.
-pub const FREE: u8 = 1;
-/// Seen, and not drivable.
-pub const OBSTACLE: u8 = 2;
-/// Drivable, and a safe point the vehicle gets to lies in it.
-pub const PATH: u8 = 3;
-/// Names of the classes, by value.
-pub const LEGEND: &[&str] = &["unknown", "free", "obstacle", "path"];
 
 /// Makes the layer from map after map, reusing its buffers.
 pub struct SafePath {
@@ -64,20 +57,22 @@ impl SafePath {
 
     fn write(&self, layer: &mut Layer) {
         layer.clear_lists();
-        let [class] = &mut layer.channels[..] else { unreachable!("layer() gives one channel") };
-        let Cells::U8(class) = &mut class.cells else { unreachable!("layer() gives u8") };
-        class.clear();
-        class.extend(self.free.states().iter().map(|state| match state {
-            State::Unknown | State::Blind | State::Hole => UNKNOWN,
-            State::Drivable => FREE,
-            State::Obstacle => OBSTACLE,
+        let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
+        class.extend(self.free.states().iter().map(|state| {
+            let class = match state {
+                State::Unknown | State::Blind | State::Hole => SafePathClass::Unknown,
+                State::Drivable => SafePathClass::Free,
+                State::Obstacle => SafePathClass::Obstacle,
+            };
+            class.value()
         }));
         let side = self.free.side();
         let cell_m = f64::from(self.config.cell_m);
         layer.points.extend(self.links.points().iter().map(|point| point.in_metres(side, cell_m)));
         // The vehicle's own place lies between four cells.
-        self.links.points().iter().skip(1).for_each(|point| class[point.cell] = PATH);
-        layer.figures.extend([
+        self.links.points().iter().skip(1).for_each(|point| class[point.cell] = SafePathClass::Path.value());
+        TypedChannel::CLASS.store(&mut layer.channels, class);
+        layer.metrics.extend([
             ("points", self.links.points().len() as f64),
             ("points_not_reached", self.links.not_reached() as f64),
         ]);
@@ -87,19 +82,14 @@ impl SafePath {
 impl LayerMaker for SafePath {
     fn layer(&self) -> Layer {
         let geometry = Geometry::about_vehicle(self.free.side() as u32, self.config.cell_m);
-        Layer::new("safe_path", geometry, LEGEND, vec![Channel::class()])
+        Layer::new("safe_path", geometry, SafePathClass::LEGEND, vec![TypedChannel::CLASS.empty()])
     }
 
     fn needs(&self) -> &'static [&'static str] {
         &["drivability"]
     }
 
-    /// Without another layer nothing is known.
-    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
-        self.make_with(sweep, &Context::default(), layer);
-    }
-
-    fn make_with(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
+    fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         let drivability = context.earlier.iter().find(|layer| layer.name == "drivability");
         self.free.fill(drivability, sweep, &self.config);
         self.distances.measure(self.free.states());

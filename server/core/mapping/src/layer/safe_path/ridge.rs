@@ -9,7 +9,7 @@
 
 use super::distance::Distances;
 use super::free::State;
-use crate::map::SafePoint;
+use crate::layer::maker::SafePoint;
 
 /// Neighbours in turning order: right, then counter-clockwise.
 pub const AROUND: [[i32; 2]; 8] = [[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1], [1, -1]];

@@ -7,7 +7,7 @@
 
 use crate::config::SpeedConfig;
 use crate::event::RoadFrame;
-use crate::map::Context;
+use crate::layer::maker::Context;
 
 /// Half the base over which the route's curvature is measured: RDDF rows are metres to hundreds of metres apart, so a
 /// corner is a circle through the points this far before and behind it.

@@ -14,31 +14,22 @@
 //! nobody saw changes nothing there. The speed of an unknown cell is low, as configured, and its raw value is the
 //! channel's `unknown`: no known cell has it.
 
-pub mod config;
 pub mod bumpiness;
+pub mod class;
+pub mod config;
 pub mod gates;
 pub mod painting;
 
 use crate::config::SpeedConfig;
-use crate::map::{Cells, Channel, Context, Geometry, Layer, LayerMaker};
+use crate::layer::channel::TypedChannel;
+use crate::layer::grid::Geometry;
+use crate::layer::maker::{Context, Layer, LayerMaker};
 use crate::sensor::sweep::Sweep;
 
 use bumpiness::{HeightMap, OBSTACLE_BUMPINESS};
+use class::{SPEED_SCALE_MPS, SpeedClass};
 use gates::{Gate, Gates};
 use painting::{NO_ROAD, Painter};
-
-/// No point fell into the cell: nothing is known of it.
-pub const UNKNOWN: u8 = 0;
-/// Seen, and even enough to drive over at the cell's speed.
-pub const PASSABLE: u8 = 1;
-/// A step or an object: speed 0.
-pub const OBSTACLE: u8 = 2;
-/// Passable, and on the painted road.
-pub const ROAD: u8 = 3;
-/// Names of the classes, by value.
-pub const LEGEND: &[&str] = &["unknown", "passable", "obstacle", "road"];
-/// Speed of one raw step, metres a second: steps coarser than a planner's choices would be, so that runs stay long.
-pub const SPEED_SCALE_MPS: f32 = 0.25;
 
 /// Makes the layer from sweep after sweep, reusing its buffers.
 pub struct Speed {
@@ -60,6 +51,11 @@ impl Speed {
         }
     }
 
+    /// Speed of a cell.
+    fn channel(&self) -> TypedChannel<u8> {
+        TypedChannel { name: "speed", unit: "m/s", scale: SPEED_SCALE_MPS, unknown: self.unknown() }
+    }
+
     fn unknown(&self) -> u8 {
         (self.config.unknown_mps / SPEED_SCALE_MPS) as u8
     }
@@ -73,31 +69,30 @@ impl Speed {
 
     fn write(&self, layer: &mut Layer) {
         layer.clear_lists();
-        let [class, speed] = &mut layer.channels[..] else { unreachable!("layer() gives two channels") };
-        let (Cells::U8(class), Cells::U8(speed)) = (&mut class.cells, &mut speed.cells) else {
-            unreachable!("layer() gives u8 and u8")
-        };
+        let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
+        let mut speed = self.channel().reuse(&mut layer.channels);
         let (mut passable, mut road) = (0u32, 0u32);
-        class.clear();
-        class.resize(self.heights.bumpiness_m().len(), UNKNOWN);
-        speed.clear();
+        class.resize(self.heights.bumpiness_m().len(), SpeedClass::Unknown.value());
         speed.resize(class.len(), self.unknown());
         for cell in self.heights.known() {
             let (bumpiness, bonus) = (self.heights.bumpiness_m()[cell], self.painter.bonus_mps()[cell]);
             if bumpiness == OBSTACLE_BUMPINESS {
-                (class[cell], speed[cell]) = (OBSTACLE, 0);
+                (class[cell], speed[cell]) = (SpeedClass::Obstacle.value(), 0);
                 continue;
             }
             let on_road = bonus != NO_ROAD;
             let mps = self.off_road_mps(bumpiness) + if on_road { bonus } else { 0.0 };
-            (class[cell], speed[cell]) = (if on_road { ROAD } else { PASSABLE }, (mps / SPEED_SCALE_MPS) as u8);
+            class[cell] = if on_road { SpeedClass::Road.value() } else { SpeedClass::Passable.value() };
+            speed[cell] = (mps / SPEED_SCALE_MPS) as u8;
             (passable, road) = (passable + 1, road + u32::from(on_road));
         }
+        TypedChannel::CLASS.store(&mut layer.channels, class);
+        self.channel().store(&mut layer.channels, speed);
         let known = self.heights.known().len() as u32;
         let share = |part: u32| if known == 0 { 0.0 } else { f64::from(part) / f64::from(known) };
         let flag = |set: bool| f64::from(u8::from(set));
         let gates = &self.gates;
-        layer.figures.extend([
+        layer.metrics.extend([
             ("passable_share", share(passable)),
             ("road_share", share(road)),
             ("painting", flag(gates.painting())),
@@ -106,24 +101,19 @@ impl Speed {
             ("stopped_by_divergence", flag(gates.closed(Gate::Divergence))),
             ("stopped_by_curvature", flag(gates.closed(Gate::Curvature))),
         ]);
-        layer.figures.extend(gates.divergence.map(|value| ("orientation_divergence", value)));
-        layer.figures.extend(gates.curvature_per_m.map(|value| ("route_curvature_per_m", value)));
+        layer.metrics.extend(gates.divergence.map(|value| ("orientation_divergence", value)));
+        layer.metrics.extend(gates.curvature_per_m.map(|value| ("route_curvature_per_m", value)));
     }
 }
 
 impl LayerMaker for Speed {
     fn layer(&self) -> Layer {
         let geometry = Geometry::about_vehicle(self.heights.side() as u32, self.config.cell_m);
-        let speed = Channel::u8("speed", "m/s", SPEED_SCALE_MPS, self.unknown());
-        Layer::new("speed", geometry, LEGEND, vec![Channel::class(), speed])
+        let channels = vec![TypedChannel::CLASS.empty(), self.channel().empty()];
+        Layer::new("speed", geometry, SpeedClass::LEGEND, channels)
     }
 
-    /// Without a road.
-    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
-        self.make_with(sweep, &Context::default(), layer);
-    }
-
-    fn make_with(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
+    fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         self.heights.fill(sweep, &self.config);
         self.heights.judge(&self.config);
         self.gates.judge(context, &self.config);

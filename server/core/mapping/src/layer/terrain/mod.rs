@@ -19,6 +19,7 @@
 //!
 //! Nothing depends on the order of the points: all sums are over whole numbers.
 
+pub mod class;
 pub mod eigen;
 pub mod ground;
 pub mod moments;
@@ -28,9 +29,13 @@ pub mod roughness;
 pub mod shadow;
 
 use crate::config::{Form, TerrainConfig};
-use crate::map::{Cells as Raw, Channel, Geometry, Layer, LayerMaker};
+use crate::layer::channel::TypedChannel;
+use crate::layer::class::drivable_share;
+use crate::layer::grid::Geometry;
+use crate::layer::maker::{Context, Layer, LayerMaker, ScanExtras};
 use crate::sensor::sweep::Sweep;
 
+use class::{PLANE, ROUGHNESS, SHAPE, TerrainClass};
 use ground::Ground;
 use moments::{Cells, half_width};
 use reach::{Passage, Reach};
@@ -38,40 +43,8 @@ use regions::{FIRST_FLAT, OBSTACLE as NOT_FLAT, Plane, Regions};
 use roughness::Roughness;
 use shadow::Shadow;
 
-/// No point fell into the cell, or too few to judge it by, and no flat region speaks for it.
-pub const UNKNOWN: u8 = 0;
-/// Points fell into the cell, and it is part of flat ground.
-pub const FLAT: u8 = 1;
-/// No point fell into the cell; the flat region about it speaks for it.
-pub const FLAT_INFERRED: u8 = 2;
-/// Flat, but not joined to the ground under the vehicle: a car's roof, a wall's top, a far bank.
-pub const FLAT_ELEVATED: u8 = 3;
-/// Not flat even by itself.
-pub const OBSTACLE: u8 = 4;
-/// Flat and as high as the ground under the vehicle, but no way the vehicle fits through leads there.
-pub const FLAT_UNREACHABLE: u8 = 5;
-/// Names of the classes, by value.
-pub const LEGEND: &[&str] = &["unknown", "flat", "flat_inferred", "flat_elevated", "obstacle", "flat_unreachable"];
-
-/// Raw `roughness` of a cell that is not flat, or has too few points with a distance series.
-pub const ROUGHNESS_UNKNOWN: u8 = u8::MAX;
-/// Raw `height` and slopes of a cell without a plane.
-pub const PLANE_UNKNOWN: i8 = i8::MIN;
-
-/// Raw `shape` of a cell that was not judged.
-pub const SHAPE_UNKNOWN: u8 = 0;
-/// Points without a direction.
-pub const SHAPE_SCATTER: u8 = 1;
-/// Points along a line.
-pub const SHAPE_LINE: u8 = 2;
-/// Points of a plane.
-pub const SHAPE_PLANE: u8 = 3;
-
 /// What stands lower than this hides no more than itself: a kerb is no fence.
 const STANDS_M_MIN: f32 = 0.5;
-
-/// Metres of a raw unit of `height`, and rise over run of one of `slope_x` and `slope_y`.
-const PLANE_SCALES: [f32; 3] = [0.05, 0.02, 0.02];
 
 /// Makes the layer from sweep after sweep, reusing its buffers.
 pub struct Terrain {
@@ -83,6 +56,7 @@ pub struct Terrain {
     reach: Reach,
     roughness: Roughness,
     seen: Vec<bool>,
+    class: Vec<TerrainClass>,
 }
 
 impl Terrain {
@@ -97,48 +71,51 @@ impl Terrain {
             reach: Reach::default(),
             roughness: Roughness::default(),
             seen: Vec::new(),
+            class: Vec::new(),
         }
     }
 
-    fn classify(&mut self, sensor_m: f32, class: &mut Vec<u8>) {
+    fn classify(&mut self, sensor_m: f32) {
+        let mut class = std::mem::take(&mut self.class);
         class.clear();
         let region_of = self.regions.of_cell();
         if self.config.form == Form::Grounded {
             let joined = self.ground.joined();
             // What is neither seen nor filled stays unknown.
-            class.resize(region_of.len(), UNKNOWN);
+            class.resize(region_of.len(), TerrainClass::Unknown);
             for &cell in self.regions.cell_of_slot() {
                 class[cell as usize] = match region_of[cell as usize] {
-                    NOT_FLAT => OBSTACLE,
-                    region @ FIRST_FLAT.. if joined[(region - FIRST_FLAT) as usize] => FLAT,
-                    FIRST_FLAT.. => FLAT_ELEVATED,
-                    _ => UNKNOWN,
+                    NOT_FLAT => TerrainClass::Obstacle,
+                    region @ FIRST_FLAT.. if joined[(region - FIRST_FLAT) as usize] => TerrainClass::Flat,
+                    FIRST_FLAT.. => TerrainClass::FlatElevated,
+                    _ => TerrainClass::Unknown,
                 };
             }
             for &cell in self.ground.filled() {
                 let class = &mut class[cell as usize];
-                if *class == UNKNOWN {
-                    *class = if self.seen[cell as usize] { FLAT } else { FLAT_INFERRED };
+                if *class == TerrainClass::Unknown {
+                    *class = if self.seen[cell as usize] { TerrainClass::Flat } else { TerrainClass::FlatInferred };
                 }
             }
-            self.gate(class, sensor_m);
+            self.gate(&mut class, sensor_m);
         } else {
             class.extend(region_of.iter().zip(&self.seen).map(|(&region, &seen)| match (region, seen) {
-                (NOT_FLAT, _) => OBSTACLE,
-                (FIRST_FLAT.., true) => FLAT,
-                (FIRST_FLAT.., false) => FLAT_INFERRED,
-                _ => UNKNOWN,
+                (NOT_FLAT, _) => TerrainClass::Obstacle,
+                (FIRST_FLAT.., true) => TerrainClass::Flat,
+                (FIRST_FLAT.., false) => TerrainClass::FlatInferred,
+                _ => TerrainClass::Unknown,
             }));
         }
+        self.class = class;
     }
 
     /// Takes back ground the vehicle does not get to; what is only inferred there is not known.
-    fn gate(&mut self, class: &mut [u8], sensor_m: f32) {
+    fn gate(&mut self, class: &mut [TerrainClass], sensor_m: f32) {
         let TerrainConfig { gate_m_min, blind_zone_m, cell_m, .. } = self.config;
         let (cells, seen, bridged) = (&self.cells, &self.seen, self.ground.bridged());
         self.shadow.clear(class.len(), |cell| cells.middle_m(cell));
         for (slot, &cell) in
-            self.regions.cell_of_slot().iter().enumerate().filter(|(_, cell)| class[**cell as usize] == OBSTACLE)
+            self.regions.cell_of_slot().iter().enumerate().filter(|(_, cell)| class[**cell as usize] == TerrainClass::Obstacle)
         {
             let [lowest_m, highest_m] = cells.span_m(slot);
             if highest_m - lowest_m >= STANDS_M_MIN {
@@ -152,10 +129,10 @@ impl Terrain {
         let blind = (blind_zone_m / cell_m).ceil() as usize;
         let is_near = |ix: usize| ix + blind >= width / 2 && ix < width / 2 + blind;
         let passage = |ix: usize, iy: usize| match (iy * width + ix, class[iy * width + ix]) {
-            (_, FLAT) => Passage::Open,
-            (_, OBSTACLE | FLAT_ELEVATED) => Passage::Closed,
+            (_, TerrainClass::Flat) => Passage::Open,
+            (_, TerrainClass::Obstacle | TerrainClass::FlatElevated) => Passage::Closed,
             (cell, _) if seen[cell] => Passage::None,
-            (_, FLAT_INFERRED) => Passage::Open,
+            (_, TerrainClass::FlatInferred) => Passage::Open,
             (cell, _) if (bridged[cell] || is_ground(regions[cell])) && !shadow.hides(cell) => Passage::Open,
             (cell, _) if is_near(ix) && is_near(iy) && shadow.distance_m(cell) <= blind_zone_m => Passage::Open,
             _ => Passage::None,
@@ -165,24 +142,23 @@ impl Terrain {
         self.reach.find(width, radius, passage);
         for (iy, row) in class.chunks_exact_mut(width).enumerate() {
             for (ix, class) in row.iter_mut().enumerate() {
-                if matches!(*class, FLAT | FLAT_INFERRED) && !self.reach.reached(ix, iy) {
-                    *class = if *class == FLAT { FLAT_UNREACHABLE } else { UNKNOWN };
+                if matches!(*class, TerrainClass::Flat | TerrainClass::FlatInferred) && !self.reach.reached(ix, iy) {
+                    *class = if *class == TerrainClass::Flat { TerrainClass::FlatUnreachable } else { TerrainClass::Unknown };
                 }
             }
         }
     }
 
     /// Roughness of the flat cells (drivable regions are examined further, §2.4).
-    fn write_roughness(&mut self, sweep: &Sweep, class: &[u8], raw: &mut Vec<u8>) {
-        raw.clear();
-        raw.resize(class.len(), ROUGHNESS_UNKNOWN);
+    fn write_roughness(&mut self, sweep: &Sweep, raw: &mut Vec<u8>) {
+        raw.resize(self.class.len(), ROUGHNESS.unknown);
         if sweep.deviation_m.is_empty() {
             return;
         }
         self.roughness.take(sweep, &self.cells);
         for (slot, &cell) in self.regions.cell_of_slot().iter().enumerate() {
             let cell = cell as usize;
-            if class[cell] == FLAT {
+            if self.class[cell] == TerrainClass::Flat {
                 let [x, y] = self.cells.middle_m(cell);
                 let distance_m = (x * x + y * y + sweep.mount_height_m * sweep.mount_height_m).sqrt();
                 raw[cell] = self.roughness.raw(slot, distance_m, &self.config);
@@ -190,45 +166,64 @@ impl Terrain {
         }
     }
 
-    fn write_planes(&self, class: &[u8], channels: &mut [Channel]) {
-        for (axis, channel) in channels.iter_mut().enumerate() {
-            let Raw::I8(raw) = &mut channel.cells else { unreachable!("layer() gives i8") };
-            raw.clear();
-            raw.extend(class.iter().zip(self.regions.of_cell()).enumerate().map(|(cell, (&class, &region))| {
-                if region < FIRST_FLAT || class == UNKNOWN {
-                    return PLANE_UNKNOWN;
-                }
-                let plane @ Plane([a, b, _]) = &self.regions.planes()[(region - FIRST_FLAT) as usize];
-                let [x, y] = self.cells.middle_m(cell);
-                let value = [plane.height_m(x, y), *a, *b][axis] / PLANE_SCALES[axis];
-                value.round().clamp(f32::from(i8::MIN + 1), f32::from(i8::MAX)) as i8
-            }));
+    fn write_plane(&self, axis: usize, raw: &mut Vec<i8>) {
+        raw.extend(self.class.iter().zip(self.regions.of_cell()).enumerate().map(|(cell, (&class, &region))| {
+            if region < FIRST_FLAT || class == TerrainClass::Unknown {
+                return PLANE[axis].unknown;
+            }
+            let plane @ Plane([a, b, _]) = &self.regions.planes()[(region - FIRST_FLAT) as usize];
+            let [x, y] = self.cells.middle_m(cell);
+            let value = [plane.height_m(x, y), *a, *b][axis] / PLANE[axis].scale;
+            value.round().clamp(f32::from(i8::MIN + 1), f32::from(i8::MAX)) as i8
+        }));
+    }
+
+    fn write(&mut self, sweep: &Sweep, layer: &mut Layer) {
+        layer.clear_lists();
+        let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
+        class.extend(self.class.iter().map(|class| class.value()));
+        let count = |of: TerrainClass| class.iter().filter(|class| **class == of.value()).count() as f64;
+        let [flat, inferred] = [TerrainClass::Flat, TerrainClass::FlatInferred].map(count);
+        layer.metrics.push(("drivable_share", drivable_share(layer.legend, &class)));
+        layer.metrics.push(("inferred_share", if flat == 0.0 { 0.0 } else { inferred / flat }));
+        layer.metrics.push(("flat_regions", self.regions.planes().len() as f64));
+        TypedChannel::CLASS.store(&mut layer.channels, class);
+        if self.config.form == Form::Grid {
+            let mut shape = SHAPE.reuse(&mut layer.channels);
+            shape.extend(self.regions.shape_of_cell().iter().map(|shape| *shape as u8));
+            SHAPE.store(&mut layer.channels, shape);
+        }
+        let mut roughness = ROUGHNESS.reuse(&mut layer.channels);
+        self.write_roughness(sweep, &mut roughness);
+        ROUGHNESS.store(&mut layer.channels, roughness);
+        for (axis, channel) in PLANE.iter().enumerate().filter(|_| self.config.planes) {
+            let mut raw = channel.reuse(&mut layer.channels);
+            self.write_plane(axis, &mut raw);
+            channel.store(&mut layer.channels, raw);
         }
     }
 }
 
 impl LayerMaker for Terrain {
     fn layer(&self) -> Layer {
-        let mut channels = vec![Channel::class()];
+        let mut channels = vec![TypedChannel::CLASS.empty()];
         if self.config.form == Form::Grid {
-            channels.push(Channel::u8("shape", "", 1.0, SHAPE_UNKNOWN));
+            channels.push(SHAPE.empty());
         }
-        channels.push(Channel::u8("roughness", "", roughness::SCALE, ROUGHNESS_UNKNOWN));
+        channels.push(ROUGHNESS.empty());
         if self.config.planes {
-            let named = [("height", "m"), ("slope_x", ""), ("slope_y", "")];
-            let plane = |((name, unit), scale)| Channel::i8(name, unit, scale, PLANE_UNKNOWN);
-            channels.extend(named.into_iter().zip(PLANE_SCALES).map(plane));
+            channels.extend(PLANE.iter().map(TypedChannel::empty));
         }
         let TerrainConfig { cell_m, range_m_max, .. } = self.config;
         let side = 2 * half_width(range_m_max, cell_m) as u32;
-        Layer::new("terrain", Geometry::about_vehicle(side, cell_m), LEGEND, channels)
+        Layer::new("terrain", Geometry::about_vehicle(side, cell_m), TerrainClass::LEGEND, channels)
     }
 
-    fn wants_deviations(&self) -> bool {
-        true
+    fn uses(&self) -> ScanExtras {
+        ScanExtras { deviations: true, ..ScanExtras::default() }
     }
 
-    fn make(&mut self, sweep: &Sweep, layer: &mut Layer) {
+    fn make(&mut self, sweep: &Sweep, _: &Context<'_>, layer: &mut Layer) {
         self.cells.take(sweep, self.config.overhang_m);
         self.regions.find(&self.cells, &self.config);
         self.seen.clear();
@@ -237,26 +232,7 @@ impl LayerMaker for Terrain {
         if self.config.form == Form::Grounded {
             self.ground.find(&self.cells, &self.regions, &self.seen, &self.config);
         }
-
-        layer.clear_lists();
-        let mut channels = layer.channels.iter_mut();
-        let mut next = || match &mut channels.next().expect("a channel of layer()").cells {
-            Raw::U8(cells) => cells,
-            other => unreachable!("layer() gives u8, not {other:?}"),
-        };
-        let class = next();
-        self.classify(sweep.mount_height_m, class);
-        if self.config.form == Form::Grid {
-            next().clone_from(self.regions.shape_of_cell());
-        }
-        self.write_roughness(sweep, class, next());
-        self.write_planes(class, channels.into_slice());
-
-        let count = |of: u8| class.iter().filter(|class| **class == of).count() as f64;
-        let [flat, inferred] = [FLAT, FLAT_INFERRED].map(count);
-        let judged = flat + [FLAT_ELEVATED, OBSTACLE, FLAT_UNREACHABLE].map(count).iter().sum::<f64>();
-        layer.figures.push(("drivable_share", if judged == 0.0 { 0.0 } else { flat / judged }));
-        layer.figures.push(("inferred_share", if flat == 0.0 { 0.0 } else { inferred / flat }));
-        layer.figures.push(("flat_regions", self.regions.planes().len() as f64));
+        self.classify(sweep.mount_height_m);
+        self.write(sweep, layer);
     }
 }

@@ -7,6 +7,7 @@
 
 use crate::config::{Form, TerrainConfig};
 
+use super::class::Shape;
 use super::eigen::Principal;
 use super::moments::{Cells, Moments, places};
 
@@ -56,7 +57,7 @@ pub struct Regions {
     of_cell: Vec<u32>,
     /// By slot: the cell's place in the grid.
     cell_of_slot: Vec<u32>,
-    shape_of_cell: Vec<u8>,
+    shape_of_cell: Vec<Shape>,
     /// Regions still to be judged: code of the corner, side in cells.
     waiting: Vec<(u32, u32)>,
 }
@@ -83,7 +84,7 @@ impl Regions {
 
     /// §2.2: every cell for itself, with its shape.
     fn judge_cells(&mut self, cells: &Cells, config: &TerrainConfig) {
-        self.shape_of_cell.resize(self.of_cell.len(), super::SHAPE_UNKNOWN);
+        self.shape_of_cell.resize(self.of_cell.len(), Shape::Unknown);
         for slot in 0..cells.slots() {
             let moments = cells.moments(slot, slot + 1);
             if moments.points() < f64::from(config.points_min) {
@@ -170,7 +171,7 @@ impl Regions {
     }
 
     /// By cell of the grid; empty unless the form is [`Form::Grid`].
-    pub fn shape_of_cell(&self) -> &Vec<u8> {
+    pub fn shape_of_cell(&self) -> &[Shape] {
         &self.shape_of_cell
     }
 }
@@ -211,13 +212,13 @@ fn is_ground_like(plane: &Plane, cells: &Cells, slots: std::ops::Range<usize>, c
 }
 
 /// Figure 1 of the paper: one value much larger than the two others is a line, one much smaller a plane.
-fn shape([largest, middle, smallest]: [f64; 3]) -> u8 {
+fn shape([largest, middle, smallest]: [f64; 3]) -> Shape {
     const MUCH: f64 = 10.0;
     if largest > MUCH * middle {
-        super::SHAPE_LINE
+        Shape::Line
     } else if middle > MUCH * smallest {
-        super::SHAPE_PLANE
+        Shape::Plane
     } else {
-        super::SHAPE_SCATTER
+        Shape::Scatter
     }
 }

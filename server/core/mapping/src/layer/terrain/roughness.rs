@@ -7,15 +7,13 @@
 use crate::config::TerrainConfig;
 use crate::sensor::sweep::Sweep;
 
-use super::ROUGHNESS_UNKNOWN;
+use super::class::ROUGHNESS;
 use super::moments::Cells;
 
 /// Deviations are summed in whole tenths of a millimetre: exact in any order.
 const STEPS_A_METRE: f32 = 1e4;
 /// A larger deviation is an edge, not ground, metres; it bounds the sums.
 const DEVIATION_M_MAX: f32 = 10.0;
-/// Value of one raw unit: a fifth of a millimetre of range a metre of distance.
-pub const SCALE: f32 = 2e-4;
 
 /// Roughness of every slot.
 #[derive(Clone, Debug, Default)]
@@ -37,17 +35,17 @@ impl Roughness {
         }
     }
 
-    /// Raw roughness of a slot whose middle is `distance_m` from the sensor; [`ROUGHNESS_UNKNOWN`] of too few points.
+    /// Raw roughness of a slot whose middle is `distance_m` from the sensor; [`ROUGHNESS`]`.unknown` of too few points.
     pub fn raw(&self, slot: usize, distance_m: f32, config: &TerrainConfig) -> u8 {
         let (n, sum, squares) = self.sums[slot];
         if n < i64::from(config.roughness_points_min) {
-            return ROUGHNESS_UNKNOWN;
+            return ROUGHNESS.unknown;
         }
         // Whole numbers: n Σδ² - (Σδ)² cannot turn negative.
         let steps2 = (n * squares - sum * sum) as f64 / (n * n) as f64;
         let variance = steps2 / f64::from(STEPS_A_METRE).powi(2);
         let own = f64::from(config.noise_m).powi(2);
         let root = (variance - own).max(0.0).sqrt() / f64::from(distance_m);
-        ((root / f64::from(SCALE)).round() as u32).min(u32::from(ROUGHNESS_UNKNOWN) - 1) as u8
+        ((root / f64::from(ROUGHNESS.scale)).round() as u32).min(u32::from(ROUGHNESS.unknown) - 1) as u8
     }
 }

@@ -1,0 +1,135 @@
+//! What a layer is, what it is made from, and the trait that makes it.
+//!
+//! In: the points of one map ([`Sweep`] and [`Context`]), and between two maps the scan of each sensor ([`Rays`]).
+//! Out: a [`Layer`]: channels over one grid.
+
+use nalgebra::Isometry3;
+
+use crate::layer::channel::Channel;
+use crate::layer::class::ClassInfo;
+use crate::layer::grid::Geometry;
+use crate::road::TakenRoad;
+use crate::sensor::sweep::Sweep;
+
+/// One named grid of a map, with its channels.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Layer {
+    /// `drivability`, `height_difference`, …
+    pub name: &'static str,
+    /// Where the cells lie.
+    pub geometry: Geometry,
+    /// The classes by value of the channel `class`; entry 0 is [`ClassInfo::UNKNOWN`].
+    pub legend: &'static [ClassInfo],
+    /// The channels; the first is `class`.
+    pub channels: Vec<Channel>,
+    /// Planes z = ax + by + c, ego frame, metres, by segment id; empty for layers without segments.
+    pub planes: Vec<[f64; 3]>,
+    /// Named numbers about the whole layer (`drivable_share`, …).
+    pub metrics: Vec<(&'static str, f64)>,
+    /// Safe points; the first is the vehicle's own position. Empty for layers without safe points.
+    pub points: Vec<SafePoint>,
+}
+
+impl Layer {
+    /// A layer whose channels have no cells.
+    pub fn new(
+        name: &'static str,
+        geometry: Geometry,
+        legend: &'static [ClassInfo],
+        channels: Vec<Channel>,
+    ) -> Self {
+        Self { name, geometry, legend, channels, planes: Vec::new(), metrics: Vec::new(), points: Vec::new() }
+    }
+
+    /// Empties the lists beside the cells: planes, metrics and points.
+    pub fn clear_lists(&mut self) {
+        self.planes.clear();
+        self.metrics.clear();
+        self.points.clear();
+    }
+}
+
+/// A position with the greatest distance to the obstacles on both sides of it, ego frame.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct SafePoint {
+    /// Distance forward of the ego origin, metres.
+    pub x_m: f64,
+    /// Distance to the left of the ego origin, metres.
+    pub y_m: f64,
+    /// Distance to the nearest cell that is not free, metres.
+    pub radius_m: f64,
+    /// Indices of the points the vehicle can drive to from here. All come before this point in the list, so that each
+    /// link is listed once.
+    pub links: Vec<u32>,
+}
+
+/// What a layer may use beside the points of the map.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Context<'a> {
+    /// The layers of the same map that were made before this one, in the map's order.
+    pub earlier: &'a [Layer],
+    /// The map's `capture_end_ns`, ns since the Unix epoch.
+    pub stamp_ns: i64,
+    /// Scans that ended before this stamp no longer count, ns since the Unix epoch.
+    pub earliest_ns: i64,
+    /// Ego frame in the world frame at `stamp_ns`; `None` if no pose is near enough.
+    pub map_from_ego: Option<Isometry3<f64>>,
+    /// Newest road to paint.
+    pub road: Option<&'a TakenRoad>,
+    /// Newest route.
+    pub route: Option<&'a TakenRoad>,
+}
+
+/// The rays of one sensor's scan, for layers that collect evidence between two maps.
+#[derive(Clone, Copy, Debug)]
+pub struct Rays<'a> {
+    /// Index of the sensor in the vehicle's configuration.
+    pub sensor: u16,
+    /// End of the scan, ns since the Unix epoch. "Ego frame" below means the ego frame at this stamp.
+    pub stamp_ns: i64,
+    /// The returns, ego frame.
+    pub returns: &'a Sweep,
+    /// Position of the sensor, ego frame, metres.
+    pub origin_m: [f32; 3],
+    /// Directions (unit vectors, ego frame) of rays without a return; empty if the sensor does not report them.
+    pub no_returns: &'a [[f32; 3]],
+    /// Ego frame in the world frame at `stamp_ns`; `None` if no pose is near enough.
+    pub map_from_ego: Option<Isometry3<f64>>,
+    /// Forward speed, m/s, if known.
+    pub speed_mps: Option<f64>,
+}
+
+/// Optional data of a sensor's scan. The pipeline computes it only if an active layer uses it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ScanExtras {
+    /// Range deviations of the reference sensor's distance series ([`Sweep::deviation_m`]).
+    pub deviations: bool,
+    /// Directions of the rays without a return ([`Rays::no_returns`]).
+    pub no_returns: bool,
+}
+
+/// Makes one layer for map after map, reusing its buffers.
+pub trait LayerMaker: Send {
+    /// The layer without cells.
+    fn layer(&self) -> Layer;
+
+    /// Names of the earlier layers this one is made from.
+    fn needs(&self) -> &'static [&'static str] {
+        &[]
+    }
+
+    /// The optional data of a scan this layer uses.
+    fn uses(&self) -> ScanExtras {
+        ScanExtras::default()
+    }
+
+    /// Adds the evidence of one sensor's scan. The pipeline calls it for each scan when the scan ends, in the order of
+    /// the events. Layers that are made from the map's points alone ignore it.
+    fn integrate(&mut self, rays: &Rays<'_>) {
+        let _ = rays;
+    }
+
+    /// Makes the layer of one map in `layer`, which [`LayerMaker::layer`] created, in place of its former content.
+    /// Every cell is written.
+    fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer);
+}

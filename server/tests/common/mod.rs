@@ -1,0 +1,57 @@
+//! A map whose every class is known by heart, and the binary.
+
+// Each test takes what it needs of this.
+#![allow(dead_code)]
+
+use std::process::{Command, Output};
+
+use bytes::Bytes;
+use clearway_client::codec::{CellsRef, encode_grid};
+use clearway_client::v1;
+use clearway_proto::map::{encode_header, encode_layer};
+
+pub const CAPTURE_END_NS: i64 = 1_700_000_000_100_000_000;
+
+/// Three benches of 10 m, four columns of a quarter turn: ahead and to the left drivable, behind and to the left not,
+/// behind and to the right unknown, ahead and to the right drivable with an obstacle from 10 to 20 m.
+#[rustfmt::skip]
+pub const CLASSES: [u8; 12] = [
+    1, 2, 0, 1,
+    1, 2, 0, 3,
+    1, 2, 0, 1,
+];
+
+pub fn map(sequence: u64, capture_end_ns: i64) -> Bytes {
+    let header = v1::Header {
+        vehicle: "alpha".into(),
+        boot_id: 7,
+        sequence,
+        capture_start_ns: capture_end_ns - 100_000_000,
+        capture_end_ns,
+        completed_ns: capture_end_ns + 1_000_000,
+        valid_until_ns: capture_end_ns + 300_000_000,
+        ..Default::default()
+    };
+    let heights: Vec<i8> = (0..12).map(|i| if i == 2 { -128 } else { i }).collect();
+    let layer = v1::Layer {
+        name: "drivability".into(),
+        geometry: Some(v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m: vec![10.0, 20.0, 30.0], columns: 4 })),
+        legend: ["unknown", "drivable", "not_drivable", "obstacle"].map(String::from).to_vec(),
+        channels: vec![
+            encode_grid(CellsRef::U8(&CLASSES), 4).into_channel("class", "", 1.0, 0),
+            encode_grid(CellsRef::I8(&heights), 4).into_channel("unit_height", "m", 0.5, -128),
+            encode_grid(CellsRef::U16(&[400; 12]), 4).into_channel("segment", "", 1.0, 65_535),
+        ],
+        figures: [("drivable_share".to_string(), 0.625)].into(),
+        ..Default::default()
+    };
+    [encode_header(&header), encode_layer(&layer)].concat().into()
+}
+
+pub fn clearway(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_clearway")).args(arguments).output().unwrap()
+}
+
+pub fn text(bytes: &[u8]) -> String {
+    String::from_utf8(bytes.to_vec()).unwrap()
+}
