@@ -1,8 +1,8 @@
 //! A simulated vehicle in real time, on a machine that may be too slow for it.
 //!
 //! In: a vehicle whose stamps are times of a clock, and that clock. Out: the vehicle's datagrams, but for whole
-//! revolutions that are skipped, without being simulated, when the vehicle is late. So stamps never fall behind the clock
-//! for long. Between two skips the datagrams are those that the vehicle gives by itself.
+//! revolutions that are skipped, without being simulated, when the vehicle is late. So stamps never fall behind the
+//! clock for long. Between two skips the datagrams are those that the vehicle gives by itself.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};

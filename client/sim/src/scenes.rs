@@ -1,7 +1,7 @@
-//! The scenes: the thesis' four (§V, figures 5 to 8), a dirt track, and a town to drive in for ever.
+//! The scenes: the four of the UT Austin thesis (section V, figures 5 to 8), a dirt track, and a town without end.
 //!
-//! Each is a [`World`] and the [`Drive`] of the vehicle in it. In the thesis' scenes the vehicle stands at the world's
-//! origin and looks along x.
+//! Each is a [`World`] and the [`Drive`] of the vehicle in it. In the scenes of the thesis the vehicle stands at the
+//! world's origin and faces along x.
 
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::sync::Arc;
@@ -10,16 +10,16 @@ use crate::course::{Course, Drive};
 use crate::ground::{Ground, Profile, Terrace};
 use crate::world::{SLATS, World};
 
-/// A world and the way a vehicle takes through it.
+/// A world, and the drive of a vehicle through it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
-    /// What it is called.
+    /// Name of the scene.
     pub name: &'static str,
-    /// The ground and what is on it.
+    /// Ground and objects.
     pub world: Arc<World>,
-    /// The vehicle's way.
+    /// Drive of the vehicle.
     pub drive: Drive,
-    /// The drivable share the thesis reports for it (table of §V), percent.
+    /// Drivable share that the UT Austin thesis reports for the scene (section V, table), percent.
     pub paper_share: Option<f64>,
 }
 
@@ -30,7 +30,7 @@ fn standing(name: &'static str, world: World, paper_share: f64) -> Scene {
     Scene { name, world: Arc::new(world), drive: Drive::steady(course, 0.0, 0.0, 0.0), paper_share: Some(paper_share) }
 }
 
-/// All the thesis' scenes, in the order of its table.
+/// The scenes of the UT Austin thesis, in the order of its table.
 pub fn of_the_thesis() -> [Scene; 4] {
     [flat(), slopes_with_obstacles(), fenced_road_under_canopy(), fenced_road_with_low_overhang()]
 }
@@ -85,7 +85,7 @@ pub fn fenced_road_under_canopy() -> Scene {
     standing("fenced road under canopy", fenced_road(), 78.3)
 }
 
-/// The same with something hanging too low over the road just ahead (figure 8): 37.00 %.
+/// The same scene with a beam that hangs too low over the road just ahead (figure 8): 37.00 %.
 pub fn fenced_road_with_low_overhang() -> Scene {
     let (left, right) = (on_the_bend(4.0, ROAD_HALF_M), on_the_bend(4.0, -ROAD_HALF_M));
     let world = fenced_road().beam(left, right, 1.5, 2.2);
@@ -111,7 +111,8 @@ fn fenced_road() -> World {
         .fence(&line(ROAD_HALF_M, BEHIND, 17), 1.4, Some(SLATS))
         .wall(&line(-ROAD_HALF_M, BEHIND, 4), 2.0)
         .fence(&line(-ROAD_HALF_M, 4, 17), 1.4, Some(SLATS));
-    // The road's ends are closed, by a wall close behind and a fence far ahead, so that nothing is reached round them.
+    // The road's ends are closed, by a wall close behind and a fence far ahead, so that no ground behind them can be
+    // reached.
     let across = |step: i32| [ROAD_HALF_M, -ROAD_HALF_M].map(|left| on_the_bend(4.0 * f64::from(step), left));
     world = world.wall(&across(BEHIND), 2.0).fence(&across(17), 1.4, Some(SLATS));
     for step in 0..8 {
@@ -159,7 +160,7 @@ const LOOP_CORNER_M: f64 = 18.0;
 
 /// A town: a street round a block of houses and gardens, more houses outside, cars parked and driving.
 ///
-/// The vehicle drives round it counter-clockwise in the right-hand lane, at 8 m/s give or take 2, for ever.
+/// The vehicle drives round the block counter-clockwise in the right-hand lane, at 6 to 10 m/s, without end.
 pub fn town() -> Scene {
     let street = |left: f64| {
         let radius = LOOP_CORNER_M;
@@ -231,7 +232,7 @@ fn town_houses(mut world: World) -> World {
         let corner = [[sx * 54.0, sy * y], [sx * (x - 6.0), sy * y], [sx * x, sy * (y - 6.0)], [sx * x, sy * 17.0]];
         world = world.wall(&corner, 1.6);
     }
-    // So are those of the houses beyond the street.
+    // Garden walls close the corners of the houses beyond the street too.
     let (x, y) = (LOOP_HALF_M[0] + front, LOOP_HALF_M[1] + front);
     for (sx, sy) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
         world = world.wall(&[[sx * 78.0, sy * y], [sx * x, sy * y], [sx * x, sy * 39.0]], 1.6);
@@ -239,7 +240,7 @@ fn town_houses(mut world: World) -> World {
     world
 }
 
-/// What lines the street: parked cars, trees, lamps, a gantry.
+/// Adds what stands along the street: parked cars, trees, lamps, gantries.
 fn town_street(mut world: World, course: &Course) -> World {
     let kerb = STREET_HALF_M;
     let spots = (course.length() / 7.0) as usize;

@@ -1,7 +1,7 @@
 //! A car with six units of four planes (Seo 2014, figure 2) in traffic, and what each object covers of the ground.
 //!
-//! In: the ego vehicle's speed. Out: a [`Scene`], the six [`PlaneUnit`]s, and for any time which places lie inside a
-//! thing.
+//! In: the ego vehicle's speed. Out: a [`Scene`], the six [`PlaneUnit`]s, and for any time the ground that objects
+//! cover.
 
 use std::f64::consts::PI;
 use std::sync::Arc;

@@ -7,12 +7,12 @@ use crate::course::Drive;
 use crate::ground::Ground;
 use crate::object::{Kind, Object, Shape};
 
-/// Everything a simulated vehicle can meet.
+/// Ground and objects.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct World {
-    /// The ground.
+    /// Ground.
     pub ground: Ground,
-    /// What is on it.
+    /// Objects on the ground.
     pub objects: Vec<Object>,
 }
 

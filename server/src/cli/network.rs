@@ -62,7 +62,7 @@ impl Network {
 /// What was done, for a server's ledger to be held against.
 pub fn document(counts: &Counts) -> Value {
     json!({
-        "taken": counts.taken, "arrived": counts.arrived, "packets_lost": counts.packets_lost, "gaps": counts.gaps,
+        "taken": counts.sent, "arrived": counts.arrived, "packets_lost": counts.packets_lost, "gaps": counts.gaps,
         "telemetry_lost": counts.telemetry_lost, "duplicated": counts.duplicated, "reordered": counts.reordered,
         "truncated": counts.truncated, "flipped": counts.flipped,
     })
@@ -70,7 +70,7 @@ pub fn document(counts: &Counts) -> Value {
 
 /// The same as a line.
 pub fn line(counts: &Counts) -> String {
-    let Counts { taken, arrived, packets_lost, telemetry_lost, gaps, duplicated, reordered, truncated, flipped } =
+    let Counts { sent: taken, arrived, packets_lost, telemetry_lost, gaps, duplicated, reordered, truncated, flipped } =
         counts;
     format!(
         "the network took {taken} and delivered {arrived}: {packets_lost} data packets lost in {gaps} gaps, {telemetry_lost} \

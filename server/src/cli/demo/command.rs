@@ -42,25 +42,30 @@ pub async fn run(options: Options) -> Result<ExitCode> {
             print(&introduction(endpoints, record.as_deref(), &picture));
         }
     };
-    let report = |report: &Report| print(&if json { format!("{}\n", report.to_json()) } else { report.line() + "\n" });
+    let report = |report: &Report| print(&if json { report.to_json().to_string() } else { report.line() });
     let stop = stop_signal()?;
-    let options =
-        super::Options { duration: seconds, record: record.clone(), picture: picture.clone(), sensors, any_port: false };
+    let options = super::Options {
+        duration: seconds,
+        record: record.clone(),
+        picture: picture.clone(),
+        sensors,
+        any_port: false,
+    };
     let summary = demo(options, begun, report, stop).await?;
-    print(&if json { format!("{}\n", summary.to_json()) } else { summary.text() });
+    print(&if json { summary.to_json().to_string() } else { summary.text() });
     Ok(ExitCode::SUCCESS)
 }
 
-/// Prints. A reader that has gone, such as `head`, does not end the demo.
-fn print(text: &str) {
-    let _ = say(text);
+/// Prints lines. A reader that has gone, such as `head`, does not end the demo.
+fn print(lines: &str) {
+    let _ = say(lines);
 }
 
 fn introduction(endpoints: &Endpoints, record: Option<&Path>, picture: &Path) -> String {
     let Endpoints { page, grpc, zenoh, sensors, notes } = endpoints;
     let record = record.map_or("none (--record OUT.mcap makes one)".into(), |file| file.display().to_string());
     let mut text: String = notes.iter().map(|note| format!("{note}\n")).collect();
-    text += "A simulated car drives through a simulated world.\n";
+    text += "A simulated car drives through a simulated world.";
     for (name, value) in [
         ("page", format!("http://{page}/")),
         ("gRPC", format!("{grpc}   (clearway watch --server http://{grpc})")),
@@ -69,7 +74,7 @@ fn introduction(endpoints: &Endpoints, record: Option<&Path>, picture: &Path) ->
         ("recording", record),
         ("newest map", format!("{}   (drawn every second)", picture.display())),
     ] {
-        text += &format!("  {name:<10} {value}\n");
+        text += &format!("\n  {name:<10} {value}");
     }
     text
 }

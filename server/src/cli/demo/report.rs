@@ -110,12 +110,12 @@ impl Summary {
     pub fn text(&self) -> String {
         let (sent, last) = (&self.sent, &self.last.snapshot);
         let mut text = format!(
-            "The car sent {} data packets and {} telemetry datagrams; {} were received, {} maps made.\n",
+            "The car sent {} data packets and {} telemetry datagrams; {} were received, {} maps made.",
             sent.packets, sent.telemetry, last.ledger.received, last.maps
         );
         if !self.last.skipped.is_zero() {
             let (skipped, all) = (self.last.skipped.as_secs_f64(), self.last.elapsed.as_secs_f64());
-            text += &format!("The simulation skipped {skipped:.1} s of {all:.1} s: this machine was too slow.\n");
+            text += &format!("\nThe simulation skipped {skipped:.1} s of {all:.1} s: this machine was too slow.");
         }
         text
     }

@@ -24,8 +24,8 @@ const ROAD_PERIOD_NS: i64 = 100_000_000;
 /// sensor's window would return from nearer.
 const RANGE_M_MIN: f32 = 0.5;
 
-/// A car in a scene, and its sensors by name. The rotating ones come first in the configuration, and the first of them is
-/// the reference sensor.
+/// A car in a scene, and its sensors by name. The rotating ones come first in the configuration, and the first of them
+/// is the reference sensor.
 #[derive(Clone, Debug)]
 pub struct Rig {
     /// The world, and the car's course through it.
@@ -133,8 +133,8 @@ impl Observations<'_> {
         self.rig.start_ns + self.due.iter().map(|(offset_ns, _)| *offset_ns).min().unwrap_or(0)
     }
 
-    /// Skips the scans before `stamp_ns`, without simulating them; returns the longest time that a unit skips. Poses and
-    /// roads stay, because they cost next to nothing.
+    /// Skips the scans before `stamp_ns`, without simulating them; returns the longest time that a unit skips. Poses
+    /// and roads stay, because they cost next to nothing.
     pub fn skip_scans_to(&mut self, stamp_ns: i64) -> Duration {
         let mut longest_ns = 0;
         for (offset_ns, kind) in &mut self.due {

@@ -40,9 +40,9 @@ pub struct Choice {
 
 /// Models that are tried, from the most lasers to the fewest.
 const MODELS: [Model; 3] = [Model::Hdl64eS2, Model::Hdl32e, Model::Vlp16];
-/// Share of all cores that the simulation may take. The rest is for the server and for a browser, which draws a map with
-/// the processor if the machine has no graphics card. Ours, because on two cores a page beside the demo stays fresh
-/// with it.
+/// Share of all cores that the simulation may take. The rest is for the server and for a browser, which draws a map
+/// with the processor if the machine has no graphics card. Ours, because on two cores a page beside the demo stays
+/// fresh with it.
 const SHARE_MAX: f64 = 0.25;
 /// How much simulated time is measured: two revolutions, as the scene is not equally dense all around.
 const MEASURED: Duration = Duration::from_millis(200);
@@ -96,8 +96,8 @@ pub fn name(model: Model) -> &'static str {
     }
 }
 
-/// Share of one core that simulating `model` in real time takes, measured now. Above 1 it is too slow. Whatever else runs
-/// on the machine makes it greater.
+/// Share of one core that simulating `model` in real time takes, measured now. Above 1 it is too slow. Whatever else
+/// runs on the machine makes it greater.
 fn core_share(model: Model) -> f64 {
     let vehicle = SimulatedVehicle::new(town(), ScannerConfig { model, ..ScannerConfig::default() });
     let end_ns = vehicle.start_ns() + MEASURED.as_nanos() as i64;
