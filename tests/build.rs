@@ -1,44 +1,50 @@
-//! Finds what some tests need and not every machine has: the recorded drives and Chromium. Every crate whose tests need
-//! them names this file as its build script. Without them these tests report themselves ignored.
+//! Finds what some tests need beside Rust, for every crate that names this file as its build script. A test whose need
+//! is not met reports itself ignored, with the line that installs it.
 //!
-//! Recorded drives: `$CLEARWAY_DATA`, else `shared/data` beside the repository, if it holds an `INDEX.md`. Then
-//! `cfg(clearway_data)` is set and `env!("CLEARWAY_DATA")` is the path; else that is empty.
+//! | `cfg` | what was found |
+//! |---|---|
+//! | `clearway_data` | recorded drives, with an `INDEX.md`: `$CLEARWAY_DATA`, else `shared/data` beside the repository |
+//! | `clearway_python` | `python3` with the modules `venv` and `ensurepip` |
+//! | `clearway_openssl` | `openssl`, with which `deploy/make-test-ca.sh` makes certificates |
+//! | `clearway_browser` | `chromium` and `chromedriver` |
 //!
-//! Chromium: if `chromium` and `chromedriver` are in the PATH, `cfg(clearway_chromium)` is set.
+//! `env!("CLEARWAY_DATA")` is the path of the recorded drives, or empty. After installing one of them, `touch tests/build.rs` lets cargo look again.
 
 use std::env;
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 
 fn main() {
-    find_drives();
-    find_chromium();
-}
-
-fn find_drives() {
     println!("cargo::rerun-if-env-changed=CLEARWAY_DATA");
-    println!("cargo::rustc-check-cfg=cfg(clearway_data)");
+    println!("cargo::rerun-if-env-changed=PATH");
     let package = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("set by cargo"));
-    let data = env::var_os("CLEARWAY_DATA").map(PathBuf::from).or_else(|| beside(&package));
+    let repository = package.ancestors().find(|folder| folder.join("ARCHITECTURE.md").is_file());
+    if let Some(repository) = repository {
+        println!("cargo::rerun-if-changed={}", repository.join("tests/build.rs").display());
+    }
+    let data = env::var_os("CLEARWAY_DATA").map(PathBuf::from);
+    let data = data.or_else(|| repository.and_then(Path::parent).map(|beside| beside.join("shared/data")));
     let data = data.filter(|data| data.join("INDEX.md").is_file()).and_then(|data| data.canonicalize().ok());
     if let Some(data) = &data {
         println!("cargo::rerun-if-changed={}", data.join("INDEX.md").display());
-        println!("cargo::rustc-cfg=clearway_data");
     }
+    set("clearway_data", data.is_some());
     println!("cargo::rustc-env=CLEARWAY_DATA={}", data.unwrap_or_default().display());
+    set("clearway_python", succeeds("python3", &["-c", "import venv, ensurepip"]));
+    set("clearway_openssl", succeeds("openssl", &["version"]));
+    set("clearway_browser", succeeds("chromium", &["--version"]) && succeeds("chromedriver", &["--version"]));
 }
 
-fn find_chromium() {
-    println!("cargo::rerun-if-env-changed=PATH");
-    println!("cargo::rustc-check-cfg=cfg(clearway_chromium)");
-    let path = env::var_os("PATH").unwrap_or_default();
-    let has = |program: &str| env::split_paths(&path).any(|folder| folder.join(program).is_file());
-    if has("chromium") && has("chromedriver") {
-        println!("cargo::rustc-cfg=clearway_chromium");
+/// Declares a `cfg`, and sets it if its need is met.
+fn set(cfg: &str, is_met: bool) {
+    println!("cargo::rustc-check-cfg=cfg({cfg})");
+    if is_met {
+        println!("cargo::rustc-cfg={cfg}");
     }
 }
 
-/// `shared/data` beside the repository that holds `package`.
-fn beside(package: &Path) -> Option<PathBuf> {
-    let repository = package.ancestors().find(|folder| folder.join("ARCHITECTURE.md").is_file())?;
-    Some(repository.parent()?.join("shared/data"))
+/// True if the program is there and exits with success.
+fn succeeds(program: &str, arguments: &[&str]) -> bool {
+    let output = Command::new(program).args(arguments).stdin(Stdio::null()).output();
+    output.is_ok_and(|output| output.status.success())
 }

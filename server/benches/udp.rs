@@ -9,7 +9,7 @@ use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
 use clearway_mapping::event::Body;
-use clearway_mapping::pipeline::Ledger;
+use clearway_mapping::ledger::Ledger;
 use clearway::config::{Config, Udp};
 use clearway::ingest::{door, udp};
 use nix::sys::socket::setsockopt;
@@ -62,7 +62,7 @@ fn main() {
     let began = Instant::now();
     for queued in &events {
         match queued.event.body {
-            Body::Lost { cause, count } => ledger.stayed_outside(cause, count),
+            Body::Lost { cause, count } => ledger.record_lost(cause, count),
             Body::Datagram(payload) if payload.is_empty() => break,
             _ => {
                 taken += 1;

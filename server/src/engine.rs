@@ -9,7 +9,8 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use clearway_mapping::event::Event;
-use clearway_mapping::pipeline::{Pipeline, Rejected};
+use clearway_mapping::error::EventError;
+use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::sweep::Sweep;
 use tokio::sync::watch;
 
@@ -104,7 +105,7 @@ impl Engine {
     fn make_late(&mut self) {
         let started = Instant::now();
         self.want();
-        if self.pipeline.make_late().is_some() {
+        if self.pipeline.remake_newest_map().is_some() {
             self.publish(started);
         }
     }
@@ -114,7 +115,7 @@ impl Engine {
         None
     }
 
-    fn step(&mut self, event: &Event) -> Result<(), Rejected> {
+    fn step(&mut self, event: &Event) -> Result<(), EventError> {
         if let Some(journal) = &self.journal {
             journal.event(event);
         }
@@ -163,6 +164,6 @@ impl Engine {
     /// readers there were.
     fn want(&mut self) {
         let (all, demand) = (self.journal.is_some(), &self.status.demand);
-        self.pipeline.want(|layer| all || demand.is_taken(layer));
+        self.pipeline.set_active_layers(|layer| all || demand.is_taken(layer));
     }
 }

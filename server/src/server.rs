@@ -53,7 +53,7 @@ pub struct Setup {
 pub enum StartError {
     /// A vehicle cannot be as configured.
     #[error(transparent)]
-    Vehicle(#[from] clearway_mapping::config::ConfigError),
+    Vehicle(#[from] clearway_mapping::config::ConfigValueError),
     /// The recording cannot be created.
     #[error(transparent)]
     Record(#[from] RecordError),

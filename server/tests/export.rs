@@ -1,7 +1,7 @@
 //! A recording written here goes through `clearway export` and `clearway info`.
 
 mod common;
-#[path = "../../tests/tests/house/venv.rs"]
+#[path = "../../tests/tests/fixture/venv.rs"]
 mod venv;
 
 use std::collections::BTreeMap;

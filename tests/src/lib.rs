@@ -1,4 +1,4 @@
-//! What the whole-house tests share: the two binaries, a place to run them in, and the simulation of it all.
+//! What the whole-system tests share: the built command, a way to run it, and the simulation of the whole system.
 
 use std::path::PathBuf;
 use std::process::{Command, Output};
@@ -6,13 +6,13 @@ use std::sync::OnceLock;
 
 pub mod simulation;
 
-/// The folder of the binaries, brought up to date once for all tests of this process.
+/// The folder of the built command, brought up to date once for all tests of this process.
 ///
 /// `cargo test --workspace` has just built them, beside the tests of their packages; after a `cargo test` of this
 /// package alone they may be old.
 ///
 /// # Panics
-/// When cargo cannot build them.
+/// If cargo cannot build it.
 pub fn binaries() -> &'static PathBuf {
     static BINARIES: OnceLock<PathBuf> = OnceLock::new();
     BINARIES.get_or_init(|| {
@@ -31,15 +31,15 @@ pub fn binaries() -> &'static PathBuf {
     })
 }
 
-/// The repository.
+/// The folder of the repository.
 pub fn workspace() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the repository").to_path_buf()
 }
 
-/// Runs `clearway` or `clearway` in `folder` to its end.
+/// Runs a command of this workspace in `folder` to its end.
 ///
 /// # Panics
-/// When the binary cannot be started.
+/// If the command cannot be started.
 pub fn run(folder: &std::path::Path, program: &str, arguments: &[&str]) -> Output {
     Command::new(binaries().join(program)).args(arguments).current_dir(folder).output().expect("the binary starts")
 }

@@ -6,22 +6,22 @@
 #[allow(dead_code, reason = "the example shows pictures")]
 #[path = "../../client/examples/planner/astar.rs"]
 mod astar;
-mod house;
+mod fixture;
 
 use std::net::UdpSocket;
 use std::ops::Range;
 
 use astar::{Move, Planner};
+use clearway::server::{Running, Server, Setup};
 use clearway_client::ingest::Ingester;
 use clearway_client::stream::MapStream;
 use clearway_client::{Client, MapView, Observation, Subscription, ZenohClient};
-use clearway::server::{Running, Server, Setup};
 use clearway_sim::contact::Hull;
 use clearway_sim::course::{Course, Drive};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::{Scene, town};
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
-use house::{config, until, within};
+use fixture::{config, until, within};
 
 /// A saloon; the simulated cars have the same.
 const SIZE_M: [f64; 3] = [4.4, 1.8, 1.5];

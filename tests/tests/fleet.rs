@@ -1,15 +1,15 @@
 //! Maps over zenoh as a fleet has them: through a router that comes and goes, and beside a reader that has stopped.
 
-mod house;
+mod fixture;
 
 use std::path::Path;
 use std::sync::{Arc, Mutex, mpsc};
 
-use clearway_client::{MapStream, Sight, ZenohClient};
 use clearway::config::ZenohMode;
 use clearway::ingest::Reading;
 use clearway::server::{Running, Server, Setup};
-use house::{config, feed, readings, sequence, start, within};
+use clearway_client::{MapStream, Sight, ZenohClient};
+use fixture::{config, feed, readings, sequence, start, within};
 use zenoh::Session;
 use zenoh::sample::SampleKind;
 

@@ -1,21 +1,21 @@
 //! A car of two turning LIDARs and six that scan, through real sockets and a real stream: one map of all of them, and
 //! it is the world's.
 
-mod house;
+mod fixture;
 
 use std::collections::BTreeMap;
 use std::iter::Peekable;
 use std::net::UdpSocket;
 
+use clearway::cli::demo::car::address;
+use clearway::cli::demo::rig::{Rig, TimedObservation};
+use clearway::config::{Sender, Udp};
 use clearway_client::{Client, MapView};
 use clearway_mapping::config::BodyConfig;
 use clearway_proto::v1;
-use clearway::config::{Sender, Udp};
-use clearway::cli::demo::car::address;
-use clearway::cli::demo::rig::{Rig, TimedObservation};
 use clearway_sim::traffic::{Footprints, street};
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
-use house::{config, start, until, within};
+use fixture::{config, start, until, within};
 use nalgebra::{Isometry3, Point3, Quaternion, Translation3, Unit};
 
 const START_NS: i64 = 1_767_270_000_000_000_000;

@@ -1,15 +1,15 @@
 //! The Python client's own tests, against a running server: installed from the tree into an environment of its own.
 
-mod house;
+mod fixture;
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use clearway::server::Running;
-use house::certificates::{behind, certificates, router, secured};
-use house::venv::{environment, run};
-use house::{config, feed, readings, start, until, within};
+use fixture::certificates::{behind, certificates, router, secured};
+use fixture::venv::{environment, run};
+use fixture::{config, feed, readings, start, until, within};
 
 const REPOSITORY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
 
@@ -59,12 +59,14 @@ async fn asking(folder: &Path, router: &str) -> Running {
     let mut config = behind(router, folder, secured(true));
     // All layers are made, whether or not somebody reads them yet.
     config.recorder.file = folder.join("asking.mcap");
-    let running = house::certificates::start(config).await;
+    let running = fixture::certificates::start(config).await;
     feed(&running, readings(3)).await;
     running
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
+#[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
 async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording() {
     let interpreter = tokio::task::spawn_blocking(python).await.expect("the Python client installs");
 
@@ -79,7 +81,7 @@ async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording
     let mut live = config();
     live.zenoh.enabled = true;
     let running = start(live).await;
-    let car = house::Driving::to(&running);
+    let car = fixture::Driving::to(&running);
     let status = running.vehicles.0[0].status.clone();
     until("a map", || status.snapshot().maps > 0).await;
 

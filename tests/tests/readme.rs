@@ -1,6 +1,6 @@
 //! The README's commands do what the README says.
 
-#[path = "house/venv.rs"]
+#[path = "fixture/venv.rs"]
 mod venv;
 
 use std::fs;
@@ -67,6 +67,7 @@ fn the_demo_runs_and_ends_cleanly() {
 }
 
 #[test]
+#[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn a_capture_is_replayed_verified_exported_and_described_as_the_readme_says() {
     let folder = tempfile::tempdir().expect("a folder");

@@ -1,6 +1,6 @@
 //! Recordings are the maps of their events, and where one is not, it is said which map, layer and cell.
 
-mod house;
+mod fixture;
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -8,15 +8,15 @@ use std::io::BufWriter;
 use std::net::SocketAddr;
 use std::path::Path;
 
-use clearway_mapping::event::Body;
-use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
-use clearway_proto::v1;
 use clearway::config::Config;
 use clearway::ingest::Reading;
 use clearway::record::reader::{Recording, RecordingError};
-use clearway::server::{Server, Setup};
 use clearway::record::verify::{What, verify};
-use house::{config, readings, start, until, within};
+use clearway::server::{Server, Setup};
+use clearway_mapping::event::Body;
+use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
+use clearway_proto::v1;
+use fixture::{config, readings, start, until, within};
 use mcap::records::Record;
 use prost::Message;
 
@@ -66,7 +66,7 @@ async fn a_planted_change_is_named_by_sequence_layer_and_cell() {
     let (whole, planted) = (folder.path().join("whole.mcap"), folder.path().join("planted.mcap"));
     recording(&whole).await;
     let report = verify(&whole).unwrap();
-    assert!(report.is_good() && report.maps >= 5 && report.equal == house::LAYERS * report.maps, "{report:?}");
+    assert!(report.is_good() && report.maps >= 5 && report.equal == fixture::LAYERS * report.maps, "{report:?}");
 
     // One cell of the third map's class goes from whatever it is to an obstacle or back.
     let (row, column, columns) = (3, 17, 360);
@@ -170,7 +170,7 @@ async fn a_recording_holds_what_it_takes_to_make_its_maps_again() {
     assert_eq!(notes["boot_id"], recording.preface().boot_id.to_string());
     assert!(notes["calibration/car/top"].contains("factory"), "{notes:?}");
     let (config, tables) = recording.config().unwrap();
-    assert_eq!(config.vehicles, house::config().vehicles);
+    assert_eq!(config.vehicles, fixture::config().vehicles);
     assert_eq!(tables, [[None]]);
 }
 

@@ -1,6 +1,6 @@
 //! Recorded drives through the whole house: the counts are exact, and what is wrong with a file is said.
 
-mod house;
+mod fixture;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use clearway::cli::replay::{Mount, Options, ReplayError, Summary, describe, repl
 use clearway::record::verify::verify;
 
 async fn replayed(options: Options) -> Result<Summary, ReplayError> {
-    house::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await
+    fixture::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await
 }
 
 fn drive(path: &str) -> PathBuf {
@@ -39,7 +39,7 @@ async fn every_packet_of_the_hdl32_drive_is_decoded_mapped_recorded_and_verified
 
     let report = verify(&record).unwrap();
     assert!(report.is_good(), "{:?}", report.differences);
-    assert_eq!((report.events, report.maps, report.equal), (977, 6, 6 * house::LAYERS));
+    assert_eq!((report.events, report.maps, report.equal), (977, 6, 6 * fixture::LAYERS));
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -52,10 +52,10 @@ async fn the_same_drive_makes_the_same_bytes_from_the_capture_and_from_its_recor
     replayed(options(drive(HDL32), "a.mcap")).await.unwrap();
     replayed(options(drive(HDL32), "b.mcap")).await.unwrap();
     replayed(options(at("a.mcap"), "c.mcap")).await.unwrap();
-    let maps = house::recorded(&at("a.mcap"));
-    assert_eq!(maps.len(), 6 * house::LAYERS as usize);
-    assert_eq!(house::recorded(&at("b.mcap")), maps);
-    assert_eq!(house::recorded(&at("c.mcap")), maps);
+    let maps = fixture::recorded(&at("a.mcap"));
+    assert_eq!(maps.len(), 6 * fixture::LAYERS as usize);
+    assert_eq!(fixture::recorded(&at("b.mcap")), maps);
+    assert_eq!(fixture::recorded(&at("c.mcap")), maps);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -144,7 +144,7 @@ async fn a_map_of_all_default_layers_is_at_most_64_kib_but_for_a_vls128() {
         let options = Options { files: vec![drive(file)], record: Some(record.clone()), ..Options::default() };
         replayed(options).await.unwrap();
         let (mut whole, mut most) = (BTreeMap::<u64, usize>::new(), BTreeMap::<String, usize>::new());
-        for ((sequence, layer), bytes) in house::recorded(&record) {
+        for ((sequence, layer), bytes) in fixture::recorded(&record) {
             // Each with the header, which a whole map has once.
             *whole.entry(sequence).or_default() += bytes.len();
             let most = most.entry(layer).or_default();

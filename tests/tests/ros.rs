@@ -1,11 +1,14 @@
 //! ROS 2 users: bags and live topics become the maps that the sensor's own packets make, and what is wrong is counted.
 
-mod house;
+mod fixture;
 
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
+use clearway::cli::replay::{Mount, Options, ReplayError, Summary, replay};
+use clearway::config::Ros;
+use clearway::record::verify::verify;
 use clearway_lidar::model::Model;
 use clearway_lidar::sensor::{Sensor, SensorConfig};
 use clearway_mapping::config::Extrinsics;
@@ -14,10 +17,7 @@ use clearway_ros::PointCloud2;
 use clearway_ros::cdr::Header;
 use clearway_ros::point_cloud2::Field;
 use clearway_ros::pose::{Odometry, StampedTransform, tf_message_to_cdr};
-use clearway::config::Ros;
-use clearway::cli::replay::{Mount, Options, ReplayError, Summary, replay};
-use clearway::record::verify::verify;
-use house::{readings, until, within};
+use fixture::{readings, until, within};
 use mcap::records::MessageHeader;
 use nalgebra::{Isometry3, Vector3};
 use zenoh::qos::CongestionControl;
@@ -184,7 +184,7 @@ async fn a_bag_of_several_sensors_makes_one_map_of_all_that_tf_places() {
     assert!(notes.contains("/lost_points (sensor_msgs/msg/PointCloud2) was left alone"), "{notes}");
     let report = verify(&record).unwrap();
     assert!(report.is_good() && report.maps >= n, "{:?}", report.differences);
-    let maps = house::recorded(&record);
+    let maps = fixture::recorded(&record);
     let header = |bytes: &bytes::Bytes| <clearway_proto::v1::Map as prost::Message>::decode(&bytes[..]).unwrap().header;
     let last = header(maps.last_key_value().unwrap().1).unwrap();
     assert!(last.sensors.len() == 2 && last.sensors.iter().all(|sensor| sensor.returns > 1000), "{:?}", last.sensors);
@@ -212,8 +212,8 @@ async fn a_cloud_of_the_points_makes_nearly_the_map_of_the_packets() {
     let file = folder.path().join("bag.mcap");
     bag(&file, &drive());
     let summary = replayed(options(&file)).await.unwrap();
-    let running = house::start(house::config()).await;
-    house::feed(&running, readings(4)).await;
+    let running = fixture::start(fixture::config()).await;
+    fixture::feed(&running, readings(4)).await;
     let packets = running.vehicles.0[0].status.snapshot().drivable_share.unwrap();
     running.shutdown().await.unwrap();
     let clouds = summary.snapshot.drivable_share.unwrap();
@@ -276,14 +276,14 @@ async fn without_an_odometry_the_chain_of_tf_gives_poses_and_speed_and_a_bag_in_
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn live_topics_of_rmw_zenoh_reach_the_map_and_strangers_are_counted() {
-    let mut config = house::config();
+    let mut config = fixture::config();
     config.zenoh.enabled = true;
     config.vehicles[0].udp = None;
     config.vehicles[0].sensors[0].model = Some(Model::Hdl64eS2);
     let sensors = [("top".to_owned(), "/velodyne_points".to_owned())].into();
     config.vehicles[0].ros = Some(Ros { domain: 7, pose: "/odom".into(), sensors, ..Ros::default() });
     config.check(Path::new("test")).unwrap();
-    let running = house::start(config).await;
+    let running = fixture::start(config).await;
     let status = running.vehicles.0[0].status.clone();
 
     let mut peer = zenoh::Config::default();

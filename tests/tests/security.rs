@@ -1,15 +1,15 @@
 //! Certificates and roles: who is let in, who is told what they may not do, and what of it is recorded.
 
-mod house;
+mod fixture;
 
 use std::path::Path;
 use std::sync::Arc;
 
-use clearway_client::{Client, ClientError, Subscription, Tls, ZenohClient};
 use clearway::cli::replay::{Options, Summary, replay};
 use clearway::server::{Running, Server, Setup};
-use house::certificates::{behind, certificates, router, secured, start, zenoh_file};
-use house::{config, feed, grpc, readings, within};
+use clearway_client::{Client, ClientError, Subscription, Tls, ZenohClient};
+use fixture::certificates::{behind, certificates, router, secured, start, zenoh_file};
+use fixture::{config, feed, grpc, readings, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
@@ -29,6 +29,7 @@ async fn vehicles(running: &Running, tls: &Tls) -> Result<usize, ClientError> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
 async fn with_a_servers_certificate_alone_everybody_reads_over_tls_and_nobody_in_plain_text() {
     let running = start(secured(false)).await;
     assert_eq!(vehicles(&running, &tls("ours", None)).await.unwrap(), 1);
@@ -41,6 +42,7 @@ async fn with_a_servers_certificate_alone_everybody_reads_over_tls_and_nobody_in
 }
 
 #[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
 async fn a_certificate_opens_what_its_roles_allow_and_nothing_else() {
     let running = start(secured(true)).await;
     feed(&running, readings(2)).await;
@@ -70,6 +72,7 @@ async fn a_certificate_opens_what_its_roles_allow_and_nothing_else() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
 async fn a_recording_holds_the_path_of_the_key_and_nothing_of_the_key() {
     let folder = tempfile::tempdir().unwrap();
     let record = folder.path().join("secured.mcap");
@@ -88,6 +91,7 @@ async fn a_recording_holds_the_path_of_the_key_and_nothing_of_the_key() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
 async fn a_replay_that_serves_asks_for_the_certificates_that_its_configuration_asks_for() {
     let folder = tempfile::tempdir().unwrap();
     let (file, scan) = (folder.path().join("clearway.toml"), folder.path().join("0.bin"));
@@ -109,6 +113,7 @@ async fn a_replay_that_serves_asks_for_the_certificates_that_its_configuration_a
 }
 
 #[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
 async fn certificates_that_nobody_read_are_no_reason_to_serve_in_plain_text() {
     let setup = Setup { config: secured(false), ..Setup::default() };
     let error = Server::start(setup).await.err().expect("no server").to_string();
@@ -116,6 +121,7 @@ async fn certificates_that_nobody_read_are_no_reason_to_serve_in_plain_text() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
 async fn peers_that_shake_no_hand_reset_or_say_too_much_leave_the_others_served() {
     let running = start(config()).await;
     feed(&running, readings(2)).await;
@@ -128,7 +134,7 @@ async fn peers_that_shake_no_hand_reset_or_say_too_much_leave_the_others_served(
     let mut client = grpc(&running).await;
     for _ in 0..100 {
         // A stream begun and dropped at once.
-        let begun = client.watch(tokio_stream::once(house::selection("car", &[], 1))).await;
+        let begun = client.watch(tokio_stream::once(fixture::selection("car", &[], 1))).await;
         drop(begun.expect("a stream"));
     }
     let long = clearway_proto::v1::GetMapRequest { vehicle: "x".repeat(1 << 20), layers: Vec::new() };
@@ -173,11 +179,12 @@ async fn zenoh_client(router: &str, ca: &str, name: &str) -> zenoh::Result<zenoh
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
 async fn behind_the_router_of_deploy_each_certificate_does_what_its_rules_allow() {
     let folder = tempfile::tempdir().unwrap();
     let ours = certificates("ours");
     let (router, at) = router().await;
-    let running = house::start(behind(&at, folder.path(), config())).await;
+    let running = fixture::start(behind(&at, folder.path(), config())).await;
 
     let reader = zenoh_client(&at, "ours", "reader").await.expect("a session");
     let unlisted = zenoh_client(&at, "ours", "operator").await.expect("a session");

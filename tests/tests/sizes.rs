@@ -4,11 +4,17 @@
 
 #![cfg_attr(not(clearway_data), allow(unused))]
 
-mod house;
+mod fixture;
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use clearway::cli::demo::rig::Rig;
+use clearway::cli::replay::{Options, replay};
+use clearway::config::Config;
+use clearway::encode::EncodedMap;
+use clearway::ingest::observation::{self, bodies};
+use clearway::record::reader::{Entry, Recording};
 use clearway_mapping::config::MapsConfig;
 use clearway_mapping::event::{Body, EgoPose, Event};
 use clearway_mapping::map::Map;
@@ -16,12 +22,6 @@ use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::codec::Limits;
 use clearway_proto::delta::encode_delta;
 use clearway_proto::v1;
-use clearway::config::Config;
-use clearway::cli::demo::rig::Rig;
-use clearway::ingest::observation::{self, bodies};
-use clearway::record::reader::{Entry, Recording};
-use clearway::cli::replay::{Options, replay};
-use clearway::encode::EncodedMap;
 use clearway_sim::scenes::{Scene, town};
 use clearway_sim::traffic::street;
 use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion, Vector3};
@@ -70,7 +70,7 @@ async fn maps(drive: &Drive) -> Vec<Sized> {
     let folder = tempfile::tempdir().unwrap();
     let (file, record) = (Path::new(env!("CLEARWAY_DATA")).join(drive.path), folder.path().join("drive.mcap"));
     let options = Options { files: vec![file.clone()], record: Some(record.clone()), ..Options::default() };
-    house::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
+    fixture::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
     let mut recording = Recording::open(&record).unwrap();
     let (config, tables) = recording.config().unwrap();
     // By how much the arrivals are ahead of the sensor's own clock, which the poses are to follow.

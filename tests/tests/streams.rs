@@ -1,15 +1,15 @@
 //! Maps on their way to readers: the same bytes everywhere, and no reader can slow another.
 
-mod house;
+mod fixture;
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use bytes::Bytes;
-use clearway_proto::v1;
 use clearway::server::{Server, Setup};
+use clearway_proto::v1;
 use clearway_sim::send::{Pace, Until, drive};
-use house::{config, feed, grpc, readings, recorded, selection, sequence, start, until, vehicle, within};
+use fixture::{config, feed, grpc, readings, recorded, selection, sequence, start, until, vehicle, within};
 use tokio::net::UdpSocket;
 use tokio::sync::mpsc;
 use tonic::{Code, Streaming};
@@ -59,7 +59,7 @@ async fn a_live_drive_over_udp_reaches_grpc_and_zenoh_with_the_bytes_of_the_reco
     let subscriber = session.declare_subscriber(format!("clearway/car/map/{LAYER}")).await.unwrap();
     let (_requests, mut updates) = watch(&running, 0).await;
 
-    let car = house::Driving::to(&running);
+    let car = fixture::Driving::to(&running);
     let mut over_grpc = BTreeMap::new();
     let mut over_zenoh = BTreeMap::new();
     within("three maps over gRPC and zenoh", async {
@@ -161,7 +161,7 @@ async fn an_unknown_vehicle_or_layer_is_answered_with_the_known_ones() {
 
     let vehicles = client.list_vehicles(v1::ListVehiclesRequest {}).await.unwrap().into_inner().vehicles;
     assert_eq!(vehicles.iter().map(|v| v.name.as_str()).collect::<Vec<_>>(), ["car"]);
-    assert_eq!(vehicles[0].layers.len() as u64, house::LAYERS);
+    assert_eq!(vehicles[0].layers.len() as u64, fixture::LAYERS);
     running.shutdown().await.unwrap();
 }
 
@@ -367,7 +367,7 @@ async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
     let (data, _) = running.doors[1].udp.unwrap();
     let halt = Duration::from_millis(250);
     let until_then = Until { stop: None, device_time: Some(halt) };
-    tokio::task::spawn_blocking(move || drive(house::anywhere(), vehicle(), data, data, Pace::RealTime, until_then))
+    tokio::task::spawn_blocking(move || drive(fixture::anywhere(), vehicle(), data, data, Pace::RealTime, until_then))
         .await
         .unwrap()
         .unwrap();
@@ -379,9 +379,9 @@ async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
         (map.header.unwrap().vehicle, map.layers.len())
     };
     let car = client.get_map(get("car")).await.unwrap().into_inner().map;
-    assert_eq!((sequence(&car), layers(&car)), (maps - 1, ("car".to_owned(), house::LAYERS as usize)));
+    assert_eq!((sequence(&car), layers(&car)), (maps - 1, ("car".to_owned(), fixture::LAYERS as usize)));
     let truck = client.get_map(get("truck")).await.unwrap().into_inner().map;
-    assert_eq!(layers(&truck), ("truck".to_owned(), house::LAYERS as usize - 1));
+    assert_eq!(layers(&truck), ("truck".to_owned(), fixture::LAYERS as usize - 1));
     let status = client.get_map(get("")).await.unwrap_err();
     assert!(status.message().contains("car, truck"), "of several vehicles one must be named: {status}");
     within("shutdown", running.shutdown()).await.unwrap();

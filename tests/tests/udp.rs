@@ -1,6 +1,6 @@
 //! Datagrams over real sockets: nothing is lost without being counted, and maps do not tell a socket from a file.
 
-mod house;
+mod fixture;
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -8,17 +8,18 @@ use std::io::BufReader;
 use std::net::{SocketAddr, UdpSocket};
 use std::path::{Path, PathBuf};
 
-use clearway_lidar::capture::Capture;
-use clearway_mapping::event::{Body, Cause};
-use clearway_mapping::pipeline::{Ledger, Pipeline};
-use clearway_proto::v1;
+use clearway::cli::replay::{Options, replay};
 use clearway::config::{Config, Sender, Udp};
 use clearway::ingest::door;
 use clearway::record::reader::{Entry, Recording};
-use clearway::cli::replay::{Options, replay};
-use clearway::server::Running;
 use clearway::record::verify::verify;
-use house::{config, recorded, start, until, within};
+use clearway::server::Running;
+use clearway_lidar::capture::Capture;
+use clearway_mapping::event::{Body, Cause};
+use clearway_mapping::ledger::Ledger;
+use clearway_mapping::pipeline::Pipeline;
+use clearway_proto::v1;
+use fixture::{config, recorded, start, until, within};
 use proptest::prelude::Rng;
 use proptest::test_runner::{RngAlgorithm, TestRng};
 use prost::Message;
@@ -45,7 +46,7 @@ fn port_at(address: &str) -> SocketAddr {
 
 /// Data packets of the simulated vehicle, and a telemetry datagram.
 fn datagrams() -> (Vec<Vec<u8>>, Vec<u8>) {
-    let all: Vec<Vec<u8>> = house::vehicle().take(1500).map(|datagram| datagram.payload).collect();
+    let all: Vec<Vec<u8>> = fixture::vehicle().take(1500).map(|datagram| datagram.payload).collect();
     let telemetry = all.iter().find(|payload| payload.len() == 512).expect("one a turn").clone();
     (all.into_iter().filter(|payload| payload.len() == 1206).collect(), telemetry)
 }
@@ -311,7 +312,7 @@ async fn two_captures_sent_to_one_port_at_once_give_both_vehicles_the_maps_of_th
         // The file's end gives the last, unfinished turn; a socket has no end.
         let last = file.last().unwrap().0.0;
         file.retain(|((sequence, _), _)| *sequence < last);
-        assert!(file.len() >= 3 * house::LAYERS as usize, "{} maps", file.len());
+        assert!(file.len() >= 3 * fixture::LAYERS as usize, "{} maps", file.len());
         let live: Vec<_> = live.iter().filter(|((of, ..), _)| of == vehicle).collect();
         assert_eq!(live.len(), file.len(), "{vehicle}");
         for (((_, sequence, layer), live), (key, file)) in live.into_iter().zip(file) {
@@ -327,7 +328,7 @@ async fn two_captures_sent_to_one_port_at_once_give_both_vehicles_the_maps_of_th
 fn recorded_of(file: &Path) -> BTreeMap<(String, u64, String), bytes::Bytes> {
     let entries = Recording::open(file).unwrap().map(|entry| entry.unwrap());
     let maps = entries.filter_map(|entry| match entry {
-        Entry::Map { vehicle, layer, bytes } => Some(((vehicle, house::sequence(&bytes), layer), bytes)),
+        Entry::Map { vehicle, layer, bytes } => Some(((vehicle, fixture::sequence(&bytes), layer), bytes)),
         _ => None,
     });
     maps.collect()

@@ -1,19 +1,19 @@
 //! Strangers who know ROS 2 and Foxglove and nothing of Clearway: they find the maps, decode them by what they are
 //! told, and have what the maps say.
 
-mod house;
+mod fixture;
 
 use std::f64::consts::FRAC_PI_4;
 use std::io::{BufRead, BufReader};
 use std::process::Stdio;
 
-use clearway_client::MapView;
-use clearway::encode::viewer::Raster;
-use clearway_mapping::event::{Body, EgoPose};
 use clearway::config::{Config, Foxglove, Ros2};
+use clearway::encode::viewer::Raster;
 use clearway::ingest::Reading;
 use clearway::server::{Running, Server, Setup};
-use house::{LAYERS, config, feed, readings, start, venv, within};
+use clearway_client::MapView;
+use clearway_mapping::event::{Body, EgoPose};
+use fixture::{LAYERS, config, feed, readings, start, venv, within};
 use nalgebra::{Isometry3, Vector3};
 use serde_json::{Value, json};
 
@@ -52,6 +52,7 @@ fn assert_near(found: &Value, expected: &[f64]) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
 async fn a_ros_2_subscriber_who_comes_late_finds_every_layer_and_the_vehicle_on_the_map() {
     let running = start(ros2()).await;
     let readings = readings(4);
@@ -105,6 +106,7 @@ async fn no_layer_is_made_for_topics_and_channels_nobody_subscribes_to() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
 async fn a_foxglove_client_is_shown_the_current_map_at_once_and_points_from_then_on() {
     let mut config = config();
     config.foxglove = Foxglove { enabled: true, listen: "127.0.0.1:0".parse().unwrap() };

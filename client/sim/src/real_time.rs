@@ -1,8 +1,9 @@
 //! A simulated vehicle in real time, on a machine that may be too slow for it.
 //!
-//! In: a vehicle whose stamps are times of a clock, and that clock. Out: the vehicle's datagrams, but for whole
-//! revolutions that are skipped, without being simulated, when the vehicle is late. So stamps never fall behind the
-//! clock for long. Between two skips the datagrams are those that the vehicle gives by itself.
+//! In: a vehicle whose stamps are times of a clock, that clock, and how far the server has come. Out: the vehicle's
+//! datagrams, but for whole revolutions that are skipped, without being simulated, when the vehicle or the server is
+//! late. So the age of the maps stays bounded. Between two skips the datagrams are those that the vehicle gives by
+//! itself.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -10,9 +11,14 @@ use std::time::Duration;
 
 use crate::vehicle::{Datagram, SimulatedVehicle};
 
-/// How late a simulation may be before it skips time: one revolution at 10 Hz. Less is made up for by a machine that is
-/// fast enough; more would show as age in every map.
-pub const LATE_MAX: Duration = Duration::from_millis(100);
+/// Greatest lateness of a simulation that does not skip: one revolution at 10 Hz. A machine that is fast enough makes up
+/// for less; more would be part of the age of every map.
+const LATE_NS_MAX: i64 = 100_000_000;
+/// Greatest backlog of a server for which the simulation does not wait: more than two revolutions at 10 Hz, because the
+/// maps of two may be under way in a server that is in time.
+const BACKLOG_NS_MAX: i64 = 250_000_000;
+/// Longest wait for a server, so that the vehicle stops soon if it is stopped meanwhile.
+const WAIT_NS_MAX: i64 = 1_000_000_000;
 
 /// The simulated time that was skipped so far. Clones count together.
 #[derive(Clone, Debug, Default)]
@@ -30,31 +36,55 @@ impl Skipped {
     }
 }
 
-/// A vehicle that skips revolutions when it is later than [`LATE_MAX`] by the clock `now_ns` (ns since the Unix epoch).
-#[derive(Clone, Debug)]
-pub struct RealTimeVehicle<C> {
-    vehicle: SimulatedVehicle,
-    now_ns: C,
-    skipped: Skipped,
+/// The present time, and how far the server has come.
+#[derive(Clone, Copy, Debug)]
+pub struct Progress {
+    /// Time of the clock, ns since the Unix epoch.
+    pub now_ns: i64,
+    /// End of the capture of the newest map, ns since the Unix epoch; `None` before the first map.
+    pub mapped_ns: Option<i64>,
 }
 
-impl<C: FnMut() -> i64> RealTimeVehicle<C> {
-    /// A vehicle that counts in `skipped` what it skips.
-    pub fn new(vehicle: SimulatedVehicle, now_ns: C, skipped: Skipped) -> Self {
-        Self { vehicle, now_ns, skipped }
+impl Progress {
+    /// The stamp to which a simulation skips, or `None` if it goes on. `next_ns`: its next stamp. `sent_ns`: the end of
+    /// the last revolution or scan that it has sent.
+    pub fn skip_target_ns(&self, next_ns: i64, sent_ns: Option<i64>) -> Option<i64> {
+        let backlog_ns = sent_ns.zip(self.mapped_ns).map_or(0, |(sent_ns, mapped_ns)| sent_ns - mapped_ns);
+        if backlog_ns > BACKLOG_NS_MAX {
+            return Some(self.now_ns + backlog_ns.min(WAIT_NS_MAX));
+        }
+        (self.now_ns - next_ns > LATE_NS_MAX).then_some(self.now_ns)
     }
 }
 
-impl<C: FnMut() -> i64> Iterator for RealTimeVehicle<C> {
+/// A vehicle that skips revolutions when it, or the server, is late.
+#[derive(Clone, Debug)]
+pub struct RealTimeVehicle<P> {
+    vehicle: SimulatedVehicle,
+    progress: P,
+    skipped: Skipped,
+    /// Stamp of the last packet of the newest whole revolution.
+    sent_ns: Option<i64>,
+}
+
+impl<P: FnMut() -> Progress> RealTimeVehicle<P> {
+    /// A vehicle that adds to `skipped` the time that it skips. It calls `progress` once a revolution.
+    pub fn new(vehicle: SimulatedVehicle, progress: P, skipped: Skipped) -> Self {
+        Self { vehicle, progress, skipped, sent_ns: None }
+    }
+}
+
+impl<P: FnMut() -> Progress> Iterator for RealTimeVehicle<P> {
     type Item = Datagram;
 
     fn next(&mut self) -> Option<Datagram> {
         // A skip inside a revolution would tear it.
         if self.vehicle.is_at_revolution_end() {
-            let now_ns = (self.now_ns)();
-            if now_ns - self.vehicle.next_stamp_ns() > LATE_MAX.as_nanos() as i64 {
-                self.skipped.add(self.vehicle.skip_to(now_ns));
+            let next_ns = self.vehicle.next_stamp_ns();
+            if let Some(target_ns) = (self.progress)().skip_target_ns(next_ns, self.sent_ns) {
+                self.skipped.add(self.vehicle.skip_to(target_ns));
             }
+            self.sent_ns = Some(next_ns);
         }
         self.vehicle.next()
     }
@@ -75,11 +105,15 @@ mod tests {
         SimulatedVehicle::new(flat(), ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() })
     }
 
+    fn at(now_ns: i64) -> Progress {
+        Progress { now_ns, mapped_ns: None }
+    }
+
     #[test]
     fn a_vehicle_in_time_gives_all_its_datagrams() {
         let clock = vehicle().start_ns();
         let skipped = Skipped::default();
-        let in_time = RealTimeVehicle::new(vehicle(), || clock, skipped.clone());
+        let in_time = RealTimeVehicle::new(vehicle(), || at(clock), skipped.clone());
         assert!(in_time.take(1_000).eq(vehicle().take(1_000)));
         assert_eq!(skipped.time(), Duration::ZERO);
     }
@@ -91,7 +125,7 @@ mod tests {
         let clock = Cell::new(start_ns);
         let skipped = Skipped::default();
         let mut stamp_ns = start_ns;
-        let late = RealTimeVehicle::new(vehicle(), || clock.get(), skipped.clone());
+        let late = RealTimeVehicle::new(vehicle(), || at(clock.get()), skipped.clone());
         for datagram in late.take_while(|datagram| datagram.stamp_ns < start_ns + 3_000_000_000) {
             let step_ns = datagram.stamp_ns - stamp_ns;
             // A step is a packet, or whole revolutions and a packet.
@@ -108,7 +142,7 @@ mod tests {
     fn the_revolutions_around_a_skip_are_nearly_whole() {
         let start_ns = vehicle().start_ns();
         let clock = Cell::new(start_ns);
-        let late = RealTimeVehicle::new(vehicle(), || clock.get(), Skipped::default());
+        let late = RealTimeVehicle::new(vehicle(), || at(clock.get()), Skipped::default());
         let mut sensor = Sensor::new(SensorConfig { model: Some(Model::Vlp16), ..SensorConfig::default() });
         let mut firings = Vec::new();
         for datagram in late.take(2_000) {
@@ -123,5 +157,15 @@ mod tests {
         let (first, whole) = firings.split_first().expect("revolutions");
         assert!(*first < 1_000 && whole.len() > 10, "{firings:?}");
         assert!(whole.iter().all(|firings| firings.abs_diff(1_808) <= 48), "{firings:?}");
+    }
+
+    #[test]
+    fn a_simulation_waits_for_a_server_that_is_two_revolutions_late() {
+        let late = |mapped_ns| Progress { now_ns: 5_000_000_000, mapped_ns };
+        let target = |progress: Progress| progress.skip_target_ns(5_000_000_000, Some(4_900_000_000));
+        assert_eq!(target(late(None)), None);
+        assert_eq!(target(late(Some(4_700_000_000))), None);
+        assert_eq!(target(late(Some(4_600_000_000))), Some(5_300_000_000));
+        assert_eq!(target(late(Some(1_000_000_000))), Some(6_000_000_000), "no longer than a second at once");
     }
 }

@@ -162,7 +162,7 @@ fn extrinsics(text: &str) -> Result<Extrinsics, String> {
 }
 
 fn model(text: &str) -> Result<Model, String> {
-    let all: Vec<&str> = Model::ALL.into_iter().map(clearway_mapping::pipeline::model_name).collect();
+    let all: Vec<&str> = Model::ALL.into_iter().map(Model::as_str).collect();
     let found = all.iter().position(|name| *name == text);
     found.map(|index| Model::ALL[index]).ok_or_else(|| format!("known: {}", all.join(", ")))
 }

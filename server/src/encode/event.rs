@@ -3,9 +3,9 @@
 //! An event comes out of a journal exactly as it went in, also one that the core refuses.
 
 use bytes::Bytes;
+use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, SensorConfig};
 use clearway_mapping::event::{Body, Cause, EgoPose, Event, Road, RoadFrame, RoadPurpose, Scan};
-use clearway_mapping::pipeline::{model_name, model_of_name};
 use clearway_proto::packed::{pack, unpack};
 use clearway_proto::v1;
 use nalgebra::{Isometry3, Quaternion, Translation3, Unit};
@@ -71,7 +71,7 @@ fn sensor_config(sensor: &SensorConfig) -> v1::Sensor {
     let Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg } = sensor.extrinsics;
     v1::Sensor {
         name: sensor.name.clone(),
-        model: sensor.model.map(|model| model_name(model).to_owned()),
+        model: sensor.model.map(|model| model.as_str().to_owned()),
         rpm: sensor.rpm,
         cut_azimuth_deg: Some(sensor.cut_azimuth_deg),
         range_m_min: Some(sensor.range_m_min),
@@ -93,7 +93,7 @@ pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, &'st
     let v1::Sensor { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, .. } = sensor;
     let plain = SensorConfig::new(sensor.name, Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg });
     let (blind_deg, []) = sensor.blind_deg.as_chunks() else { return Err("pairs in blind_deg") };
-    let model = sensor.model.map(|name| model_of_name(&name).ok_or("known sensor model")).transpose()?;
+    let model = sensor.model.map(|name| Model::from_name(&name).ok_or("known sensor model")).transpose()?;
     Ok(SensorConfig {
         model,
         rpm: sensor.rpm,
@@ -265,7 +265,7 @@ mod tests {
                 orientations: vec![1.0, 0.25],
             }),
             Body::Sensor(Box::new(SensorConfig {
-                model: Some(clearway_lidar::model::Model::PuckHiRes),
+                model: Some(Model::PuckHiRes),
                 rpm: Some(600.0),
                 elevations_deg: vec![-15.0, 1.5],
                 blind_deg: vec![[350.0, 10.0], [80.0, 100.0]],

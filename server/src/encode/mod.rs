@@ -97,7 +97,7 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
         speed_mps: map.speed_mps,
         sensors: map.sensors.iter().map(sensor).collect(),
         compensation: map.compensation.as_str().to_owned(),
-        made_by: map.sensors.get(usize::from(map.made_by)).map_or(String::new(), |sensor| sensor.name.clone()),
+        made_by: map.sensors.get(usize::from(map.source)).map_or(String::new(), |sensor| sensor.name.clone()),
     }
 }
 
@@ -126,7 +126,7 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
             .map(|sector| v1::BlockedSector { from_deg: sector.from_deg.into(), to_deg: sector.to_deg.into() })
             .collect(),
         blocked_lasers: state.blocked.lasers.iter().map(|&laser| laser.into()).collect(),
-        state: state.state.as_str().to_owned(),
+        state: state.contribution.as_str().to_owned(),
         age_ms: state.age_ms,
     }
 }
@@ -197,7 +197,7 @@ fn safe_points(layer: &Layer) -> Option<v1::SafePoints> {
 #[cfg(test)]
 mod tests {
     use clearway_mapping::layer::{ClassInfo, Meaning};
-    use clearway_mapping::map::Part;
+    use clearway_mapping::map::Contribution;
     use prost::Message;
 
     use super::*;
@@ -226,10 +226,10 @@ mod tests {
             map_from_ego: None,
             speed_mps: None,
             compensation: clearway_mapping::sensor::motion::Compensation::Speed,
-            made_by: 1,
+            source: 1,
             sensors: vec![
-                SensorState { name: "top".into(), state: Part::Late, age_ms: Some(250.5), ..SensorState::default() },
-                SensorState { name: "left".into(), packets_expected: 75, state: Part::Ok, ..SensorState::default() },
+                SensorState { name: "top".into(), contribution: Contribution::Late, age_ms: Some(250.5), ..SensorState::default() },
+                SensorState { name: "left".into(), packets_expected: 75, contribution: Contribution::Ok, ..SensorState::default() },
             ],
             layers: vec![layer("drivability"), layer("height_difference")],
         }

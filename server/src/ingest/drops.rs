@@ -6,7 +6,7 @@ use std::net::SocketAddr;
 use std::sync::Mutex;
 
 use clearway_mapping::event::Cause;
-use clearway_mapping::pipeline::Ledger;
+use clearway_mapping::ledger::Ledger;
 
 use super::locked;
 
@@ -41,9 +41,9 @@ impl Outside {
     pub fn add_to<'a>(&self, ledger: &mut Ledger, sensors: impl IntoIterator<Item = &'a mut Ledger>) {
         let mut sensors: Vec<_> = sensors.into_iter().collect();
         for (&(cause, source), &count) in &*locked(&self.untold) {
-            ledger.stayed_outside(cause, count);
+            ledger.record_lost(cause, count);
             if let Some(sensor) = sensors.get_mut(usize::from(source)).filter(|_| cause.has_source()) {
-                sensor.stayed_outside(cause, count);
+                sensor.record_lost(cause, count);
             }
         }
     }

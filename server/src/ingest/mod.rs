@@ -316,7 +316,7 @@ pub(crate) fn now_ns() -> i64 {
 
 #[cfg(test)]
 mod tests {
-    use clearway_mapping::pipeline::Ledger;
+    use clearway_mapping::ledger::Ledger;
 
     use super::*;
 

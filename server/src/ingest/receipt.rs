@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use clearway_mapping::pipeline::Rejected;
+use clearway_mapping::error::EventError;
 use clearway_proto::v1;
 use tokio::sync::mpsc::UnboundedSender;
 
@@ -23,7 +23,7 @@ pub enum Verdict {
 
 impl Verdict {
     /// Of a step of the pipeline.
-    pub fn of(outcome: Result<(), Rejected>) -> Self {
+    pub fn of(outcome: Result<(), EventError>) -> Self {
         match outcome {
             Ok(()) => Self::Taken,
             Err(rejected) => Self::Refused { reason: rejected.reason(), message: rejected.to_string() },

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use clearway_mapping::config::ConfigError;
+use clearway_mapping::config::ConfigValueError;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::codec::{DecodeError, Limits};
 use clearway_proto::grid::Grid;
@@ -98,7 +98,7 @@ pub enum VerifyError {
     Recording(#[from] RecordingError),
     /// The recorded configuration cannot be used.
     #[error(transparent)]
-    Config(#[from] ConfigError),
+    Config(#[from] ConfigValueError),
 }
 
 impl Report {

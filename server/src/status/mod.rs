@@ -6,7 +6,8 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
-use clearway_mapping::pipeline::{Ledger, NamedStatus};
+use clearway_mapping::ledger::Ledger;
+use clearway_mapping::pipeline::NamedStatus;
 use clearway_proto::v1;
 use serde_json::{Value, json};
 use tokio::sync::watch;

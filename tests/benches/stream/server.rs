@@ -5,9 +5,9 @@ use std::net::{SocketAddr, TcpListener};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use clearway_client::now_ns;
 use clearway::config::{Config, Udp};
 use clearway::server::{Server, Setup};
+use clearway_client::now_ns;
 use clearway_sim::scanner::ScannerConfig;
 use tokio::io::AsyncReadExt;
 

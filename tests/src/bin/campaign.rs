@@ -1,7 +1,7 @@
-//! Many runs of the whole-house simulation, or one of them again.
+//! Runs many simulations of the whole system, or one of them again.
 //!
-//! `cargo run --release -p clearway-tests --bin campaign -- --seeds 10000` prints figures and every seed that fails,
-//! and then ends with 1; `--seed 17` runs one seed and prints what it has in store.
+//! `cargo run --release -p clearway-tests --bin campaign -- --seeds 10000` prints counts and every seed that fails;
+//! the exit code is 1 if one fails. `--seed 17` runs one seed and prints its faults.
 
 use std::process::ExitCode;
 use std::sync::Mutex;
@@ -12,24 +12,24 @@ use clap::Parser;
 use clearway_tests::simulation::{self, Failure, Outcome};
 use indicatif::{ProgressBar, ProgressStyle};
 
-/// Runs the whole house on a simulated clock, under faults drawn from seeds.
+/// Simulates the whole system on a clock of its own, with faults drawn from seeds.
 #[derive(Parser)]
 struct Arguments {
-    /// How many seeds.
+    /// Number of seeds.
     #[arg(long, default_value_t = 10_000)]
     seeds: u64,
-    /// The first of them.
+    /// First seed.
     #[arg(long, default_value_t = 0)]
     from: u64,
-    /// This seed alone, and what it has in store.
+    /// Runs this seed alone and prints its faults.
     #[arg(long)]
     seed: Option<u64>,
-    /// Runs at once; as many as there are cores where absent.
+    /// Simulations at once; by default one for each core.
     #[arg(long)]
     threads: Option<usize>,
 }
 
-/// Where there is no terminal, so many seeds make a line.
+/// Seeds between two lines of progress where there is no terminal.
 const SEEDS_A_LINE: u64 = 500;
 
 fn main() -> ExitCode {
@@ -39,7 +39,7 @@ fn main() -> ExitCode {
         None => (arguments.from, arguments.from + arguments.seeds),
     };
     if let Some(seed) = arguments.seed {
-        println!("{:#?}", simulation::fate(seed));
+        println!("{:#?}", simulation::fault_plan(seed));
     }
     // Cast before the clock starts.
     simulation::drive::drives();
@@ -59,16 +59,16 @@ fn main() -> ExitCode {
                         break;
                     }
                     match run(seed) {
-                        Ok(outcome) => add(&mut sum.lock().expect("nobody panics here"), &outcome),
+                        Ok(outcome) => add(&mut sum.lock().expect("no thread panics here"), &outcome),
                         Err(failure) => {
                             bar.suspend(|| println!("{failure}"));
-                            let mut failures = failures.lock().expect("nobody panics here");
+                            let mut failures = failures.lock().expect("no thread panics here");
                             failures.push(failure);
                             bar.set_message(format!("({} fail)", failures.len()));
                         }
                     }
                     bar.inc(1);
-                    // Who redirects the output sees no bar.
+                    // Redirected output has no bar.
                     if bar.is_hidden() && bar.position().is_multiple_of(SEEDS_A_LINE) {
                         eprintln!("{} of {} seeds, {} s", bar.position(), end - first, began.elapsed().as_secs());
                     }
@@ -77,17 +77,18 @@ fn main() -> ExitCode {
         }
     });
     bar.finish_and_clear();
-    let (sum, failures) = (sum.into_inner().expect("all have ended"), failures.into_inner().expect("all have ended"));
+    let (sum, failures) =
+        (sum.into_inner().expect("all threads have ended"), failures.into_inner().expect("all threads have ended"));
     report(end - first, &sum, &failures, began.elapsed().as_secs_f64());
     if failures.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// A panic is a failure like any other.
+/// Runs one seed; a panic is a failure like any other.
 fn run(seed: u64) -> Result<Outcome, Failure> {
     std::panic::catch_unwind(|| simulation::run(seed, None)).unwrap_or_else(|panic| {
         let said = panic.downcast_ref::<String>().cloned();
         let said = said.or_else(|| panic.downcast_ref::<&str>().map(|said| (*said).to_owned()));
-        Err(Failure { seed, at_ns: 0, breach: simulation::checks::breach("panic", said.unwrap_or_default()) })
+        Err(Failure { seed, at_ns: 0, violation: simulation::checks::violation("panic", said.unwrap_or_default()) })
     })
 }
 
@@ -112,9 +113,9 @@ fn report(seeds: u64, sum: &Outcome, failures: &[Failure], seconds: f64) {
         simulated / seconds
     );
     println!(
-        "{events} events, {refused} refused, {lost} lost, {maps} maps; readers got {read} and were told of {skipped} they missed"
+        "{events} events, {refused} refused, {lost} lost, {maps} maps; readers received {read} and skipped {skipped}"
     );
-    println!("whole again {healed_in} turns after the faults at the latest");
+    println!("recovered at most {healed_in} revolutions after the faults");
     if !failures.is_empty() {
         let seeds: Vec<String> = failures.iter().map(|failure| failure.seed.to_string()).collect();
         println!("failing seeds: {}", seeds.join(" "));

@@ -1,52 +1,53 @@
-//! What must be true of a run, at every step and in the end.
+//! What must be true of a run, at every step and at its end.
 
 use std::ops::Range;
 
 use clearway_mapping::config::SensorConfig;
 use clearway_mapping::layer::{Cells, Geometry, Layer, Meaning};
+use clearway_mapping::ledger::Ledger;
 use clearway_mapping::map::{Map, SensorState};
-use clearway_mapping::pipeline::{Ledger, NamedStatus};
+use clearway_mapping::pipeline::NamedStatus;
 use nalgebra::Point3;
 
 use super::drive::Drive;
-use super::trouble::inside;
+use super::sensor_fault::inside;
 
-/// A check that found something.
+/// A check that failed.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Breach {
-    /// Which one.
+pub struct Violation {
+    /// Name of the check.
     pub check: &'static str,
-    /// What it found.
+    /// What the check found.
     pub found: String,
 }
 
-/// Of this check.
-pub fn breach(check: &'static str, found: impl Into<String>) -> Breach {
-    Breach { check, found: found.into() }
+/// A violation of the named check.
+pub fn violation(check: &'static str, found: impl Into<String>) -> Violation {
+    Violation { check, found: found.into() }
 }
 
-/// Nearer cells can be seen past the edge of the covered sector, from where the car was within a turn.
+/// Least distance of a checked cell, in metres: nearer cells were visible past the edge of the covered sector from where
+/// the car was earlier in the revolution.
 const COVERED_M_MIN: f64 = 8.0;
-/// And so can the outermost degrees of the sector.
+/// Outermost degrees of the sector that are not checked, for the same reason.
 const COVERED_EDGE_DEG: i64 = 15;
-/// What is in a map was seen from where the car is, and from where it was so long ago: a turn, and the deadline of those
-/// who bring one to another's map.
+/// Age of the oldest points in a map, in seconds: one revolution, and the deadline of contributing sensors.
 const SEEN_S_MAX: f64 = 0.3;
 
-/// Received = decoded + telemetry + refused by reason.
-pub fn adds_up(whose: &str, ledger: &Ledger) -> Result<(), Breach> {
+/// Checks that received = decoded + telemetry + refused by reason.
+pub fn adds_up(whose: &str, ledger: &Ledger) -> Result<(), Violation> {
     let sum = ledger.decoded + ledger.telemetry + ledger.refused.values().sum::<u64>();
     match ledger.received == sum {
         true => Ok(()),
-        false => Err(breach(
+        false => Err(violation(
             "ledger",
             format!("{whose}: received {}, and the parts make {sum}: {ledger:?}", ledger.received),
         )),
     }
 }
 
-/// Every reading that came to the door is in the vehicle's ledger, and the sensors' ledgers are parts of it.
-pub fn accounts(offered: u64, ledger: &Ledger, sensors: &[NamedStatus]) -> Result<(), Breach> {
+/// Checks that every offered reading is in the vehicle's ledger, and that the ledgers of its sensors add up to no more.
+pub fn accounts(offered: u64, ledger: &Ledger, sensors: &[NamedStatus]) -> Result<(), Violation> {
     adds_up("the vehicle", ledger)?;
     for sensor in sensors {
         adds_up(&sensor.name, &sensor.ledger)?;
@@ -55,16 +56,19 @@ pub fn accounts(offered: u64, ledger: &Ledger, sensors: &[NamedStatus]) -> Resul
     let known = ledger.received + ledger.lost + ledger.poses + ledger.poses_refused + roads;
     let sum: u64 = sensors.iter().map(|sensor| sensor.ledger.received + sensor.ledger.lost).sum();
     if known != offered {
-        return Err(breach("ledger", format!("{offered} came to the door, {known} are known: {ledger:?}")));
+        return Err(violation(
+            "ledger",
+            format!("{offered} readings were offered, {known} are in the ledger: {ledger:?}"),
+        ));
     }
     if sum > ledger.received + ledger.lost {
-        return Err(breach("ledger", format!("the sensors have {sum}, the vehicle {ledger:?}")));
+        return Err(violation("ledger", format!("the sensors have {sum}, the vehicle {ledger:?}")));
     }
     Ok(())
 }
 
-/// Nothing is free where every sensor's window is covered.
-pub fn nothing_free(drive: &Drive, covered_deg: &Range<i64>, map: &Map) -> Result<(), Breach> {
+/// Checks that no cell is free where the windows of all sensors are covered.
+pub fn nothing_free(drive: &Drive, covered_deg: &Range<i64>, map: &Map) -> Result<(), Violation> {
     let sensors = &drive.config.vehicles[0].sensors;
     let back_m = [0.0, map.speed_mps.unwrap_or(0.0) * SEEN_S_MAX];
     let hidden = covered_deg.start + COVERED_EDGE_DEG..covered_deg.end - COVERED_EDGE_DEG;
@@ -84,14 +88,14 @@ pub fn nothing_free(drive: &Drive, covered_deg: &Range<i64>, map: &Map) -> Resul
             if x.hypot(y) >= COVERED_M_MIN && sensors.iter().all(is_hidden) {
                 let class = layer.legend[usize::from(classes[cell])].name;
                 let found = format!("map {}: {} at ({x:.1}, {y:.1}) is {class}", map.sequence, layer.name);
-                return Err(breach("covered", found));
+                return Err(violation("covered", found));
             }
         }
     }
     Ok(())
 }
 
-/// The middle of a cell, ego frame.
+/// Centre of a cell, ego frame, in metres.
 pub fn centre(layer: &Layer, cell: usize) -> [f64; 2] {
     match &layer.geometry {
         Geometry::Radial { row_radius_m, columns } => {
@@ -111,14 +115,14 @@ pub fn centre(layer: &Layer, cell: usize) -> [f64; 2] {
     }
 }
 
-/// Whether every sensor is whole and in this map.
+/// True if every sensor is whole and contributes to this map.
 pub fn is_healthy(map: &Map) -> bool {
     map.sensors
         .iter()
-        .all(|sensor| sensor.state.as_str() == "ok" && sensor.partial.is_empty() && sensor.blocked.is_empty())
+        .all(|sensor| sensor.contribution.as_str() == "ok" && sensor.partial.is_empty() && sensor.blocked.is_empty())
 }
 
-/// The map with every cell called by the second class of its layer, the one that is free.
+/// The map with every cell set to class 1, which is free in every layer.
 pub fn freed(map: &Map) -> Map {
     let mut map = map.clone();
     for layer in &mut map.layers {
@@ -129,15 +133,15 @@ pub fn freed(map: &Map) -> Map {
     map
 }
 
-/// A map's sensors in a line.
+/// The sensors of a map in one line.
 pub fn describe(map: &Map) -> String {
     let sensor = |sensor: &SensorState| {
-        let (name, state, age) = (&sensor.name, sensor.state.as_str(), sensor.age_ms.unwrap_or(f32::NAN));
+        let (name, state, age) = (&sensor.name, sensor.contribution.as_str(), sensor.age_ms.unwrap_or(f32::NAN));
         format!(
             "{name} {state} {age:.0} ms, clock {} {} ms, partial {:?}, blocked {:?}",
             sensor.clock, sensor.clock_offset_ms, sensor.partial, sensor.blocked
         )
     };
     let sensors: Vec<String> = map.sensors.iter().map(sensor).collect();
-    format!("map {} by {}: {}", map.sequence, map.made_by, sensors.join("; "))
+    format!("map {} by {}: {}", map.sequence, map.source, sensors.join("; "))
 }

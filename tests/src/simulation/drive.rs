@@ -1,49 +1,49 @@
-//! What a simulated car with several sensors sends while nothing is wrong, cast once and driven in every run.
+//! What a simulated car with several sensors sends without faults; cast once, used in every run.
 
 use std::sync::OnceLock;
 
-use clearway_proto::v1;
-use clearway::config::Config;
 use clearway::cli::demo::rig::Rig;
+use clearway::config::Config;
+use clearway_proto::v1;
 use clearway_sim::scenes::{self, Scene};
 use clearway_sim::traffic;
 use clearway_sim::vehicle::Datagram;
 
-use super::fate::{END_NS, TURN_NS};
+use super::fault_plan::{END_NS, REVOLUTION_NS};
 
-/// Noon of a day, UTC: not near a full hour's end.
+/// Start of the drive, in ns since the Unix epoch: noon UTC, far from the end of an hour.
 const START_NS: i64 = 1_767_270_000_000_000_000;
 
-/// One reading, as its sensor sends it.
+/// One reading, and when its sensor sends it.
 #[derive(Clone, Debug)]
 pub struct Sent {
-    /// ns after the drive's beginning.
+    /// Time after the beginning of the drive, in ns.
     pub offset_ns: i64,
-    /// What is sent.
-    pub what: What,
+    /// The reading.
+    pub reading: Reading,
 }
 
 /// Kinds of readings.
 #[derive(Clone, Debug)]
-pub enum What {
-    /// Of a turning sensor, by its index.
+pub enum Reading {
+    /// A datagram of a rotating sensor, and the index of the sensor.
     Datagram(usize, Datagram),
-    /// Of the whole car, or of the sensor it names.
+    /// An observation of the car, or of the sensor that it names.
     Observation(Box<v1::Observation>),
 }
 
-/// A drive, and the configuration of the car.
+/// A simulated drive.
 #[derive(Debug)]
 pub struct Drive {
-    /// The car.
+    /// The car and its sensors.
     pub rig: Rig,
-    /// Its configuration.
+    /// Configuration of the car's server.
     pub config: Config,
-    /// All it sends, in the order in which it does.
+    /// Everything that the car sends, in order of time.
     pub sent: Vec<Sent>,
 }
 
-/// The drives there are.
+/// All drives, cast at the first call.
 pub fn drives() -> &'static [Drive] {
     static DRIVES: OnceLock<Vec<Drive>> = OnceLock::new();
     DRIVES.get_or_init(|| vec![Drive::through(traffic::street(8.0)), Drive::through(scenes::town())])
@@ -52,21 +52,23 @@ pub fn drives() -> &'static [Drive] {
 impl Drive {
     fn through(scene: Scene) -> Self {
         let mut rig = Rig::many(scene, START_NS);
-        // Two units that look ahead and back, coarse and slow: what they do wrong is the same, and cheap.
+        // Two units, ahead and behind, coarse and slow: they fail in the same ways, and are cheap to cast.
         rig.units.retain(|(name, _)| name == "ahead" || name == "behind");
         for (_, unit) in &mut rig.units {
             (unit.azimuths, unit.period_ns) = (110, 50_000_000);
         }
-        let end_ns = START_NS + TURN_NS + END_NS + TURN_NS;
+        let end_ns = START_NS + REVOLUTION_NS + END_NS + REVOLUTION_NS;
         let mut sent = Vec::new();
         for index in 0..rig.scanners.len() {
             let datagrams = rig.vehicle(index).take_while(|datagram| datagram.stamp_ns < end_ns);
-            sent.extend(datagrams.map(|d| Sent { offset_ns: d.stamp_ns - START_NS, what: What::Datagram(index, d) }));
+            sent.extend(
+                datagrams.map(|d| Sent { offset_ns: d.stamp_ns - START_NS, reading: Reading::Datagram(index, d) }),
+            );
         }
         let told = rig.observations().take_while(|told| told.stamp_ns < end_ns);
         sent.extend(told.map(|told| Sent {
             offset_ns: told.stamp_ns - START_NS,
-            what: What::Observation(Box::new(told.observation.into())),
+            reading: Reading::Observation(Box::new(told.observation.into())),
         }));
         sent.sort_by_key(|sent| sent.offset_ns);
         let mut config = Config::of_one_vehicle("car", "top");

@@ -1,14 +1,18 @@
 //! Scans, poses, roads and tunnelled packets over the network: the same maps as by any other door, and for everything
 //! that is not taken a reason.
 
-#[path = "../house/mod.rs"]
-mod house;
+#[path = "../fixture/mod.rs"]
+mod fixture;
 mod refused;
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use bytes::Bytes;
+use clearway::config::Config;
+use clearway::ingest::Reading;
+use clearway::record::verify::verify;
+use clearway::server::{Running, Server, Setup};
 use clearway_client::observation::{RoadFrame, RoadPurpose, Sensor, by_reason};
 use clearway_client::{Client, ClientError, Ingester, Observation, Refusal, ZenohClient};
 use clearway_lidar::model::Model;
@@ -16,14 +20,10 @@ use clearway_mapping::event::Body;
 use clearway_proto::packed::{pack, unpack};
 use clearway_proto::v1;
 use clearway_proto::v1::ingest_service_client::IngestServiceClient;
-use clearway::config::Config;
-use clearway::ingest::Reading;
-use clearway::server::{Running, Server, Setup};
-use clearway::record::verify::verify;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
 use clearway_sim::vehicle::SimulatedVehicle;
-use house::{config, feed, readings, recorded, within};
+use fixture::{config, feed, readings, recorded, within};
 use prost::Message;
 
 /// A server with a boot id that two runs have in common, recording to `file`.
@@ -123,7 +123,7 @@ async fn assert_tunnelled_makes_the_maps_of_the_file_door(config: Config, readin
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn a_drive_tunnelled_over_grpc_makes_the_maps_of_the_file_door() {
     let maps = assert_tunnelled_makes_the_maps_of_the_file_door(config(), readings(5)).await;
-    assert!(maps as u64 >= 5 * house::LAYERS, "{maps}");
+    assert!(maps as u64 >= 5 * fixture::LAYERS, "{maps}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
@@ -134,7 +134,7 @@ async fn a_recorded_drive_tunnelled_over_grpc_makes_the_maps_of_the_file_door() 
     let readings: Vec<Reading> = drive.map(Result::unwrap).collect();
     assert_eq!(readings.len(), 976);
     let maps = assert_tunnelled_makes_the_maps_of_the_file_door(config(), readings).await;
-    assert_eq!(maps as u64, 6 * house::LAYERS);
+    assert_eq!(maps as u64, 6 * fixture::LAYERS);
 }
 
 /// A car in the town whose sensor's turns come as scans; the speed map is on.

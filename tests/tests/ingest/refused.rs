@@ -3,17 +3,17 @@
 use std::path::Path;
 
 use bytes::Bytes;
+use clearway::record::reader::{Entry, Recording};
+use clearway::record::verify::verify;
 use clearway_client::observation::by_reason;
 use clearway_client::{ClientError, Ingester, Observation};
 use clearway_mapping::event::{Body, Cause, Event};
 use clearway_proto::packed::pack;
 use clearway_proto::v1;
-use clearway::record::reader::{Entry, Recording};
-use clearway::record::verify::verify;
 use prost::Message;
 use tonic::Code;
 
-use super::house::{recorded, within};
+use super::fixture::{recorded, within};
 use super::{client, ingester, plain, reports, scan, scanned_config, start};
 
 /// Every list of `scan` with its last number replaced.

@@ -3,20 +3,20 @@
 //! `CLEARWAY_PAGE_SECONDS=300 cargo test --release -p clearway-tests --test page -- --nocapture` looks for five
 //! minutes, 100 times.
 
-#[cfg(clearway_chromium)]
+#[cfg(clearway_browser)]
 mod webdriver;
 
 #[test]
 #[cfg_attr(
-    not(clearway_chromium),
+    not(clearway_browser),
     ignore = "needs Chromium: apt-get install chromium chromium-driver, then touch tests/build.rs"
 )]
 fn the_page_beside_the_demo_shows_a_fresh_map() {
-    #[cfg(clearway_chromium)]
+    #[cfg(clearway_browser)]
     fresh::the_page_shows_a_fresh_map();
 }
 
-#[cfg(clearway_chromium)]
+#[cfg(clearway_browser)]
 mod fresh {
     use std::net::SocketAddr;
     use std::sync::mpsc;

@@ -3,16 +3,16 @@
 use std::net::SocketAddr;
 use std::sync::{Arc, Weak};
 
+use clearway::encode::EncodedMap;
 use clearway_proto::v1;
 use clearway_proto::v1::map_service_client::MapServiceClient;
-use clearway::encode::EncodedMap;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tonic::Code;
 use tonic::transport::Channel;
 
-use super::house::{self, config, feed, sequence, start, until, within};
+use super::fixture::{self, config, feed, sequence, start, until, within};
 use super::{Reader, keeps_up, of_layer, plain, portions};
 
 /// A link to the server that lets through as many of its bytes as it is allowed to.
@@ -60,10 +60,10 @@ async fn a_stopped_and_a_slow_reader_cost_eight_healthy_ones_nothing_and_resume_
     let mut deaf = Reader::open(&mut plain(wall.address).await, of_layer(0)).await.unwrap();
     let deltas = v1::Selection { deltas: true, ..of_layer(2) };
     let mut stopped = Reader::open(&mut plain(server).await, deltas).await.unwrap();
-    let mut small = Reader::open(&mut house::grpc(&running).await, of_layer(2)).await.unwrap();
+    let mut small = Reader::open(&mut fixture::grpc(&running).await, of_layer(2)).await.unwrap();
     let mut healthy = Vec::new();
     for index in 0..8 {
-        let mut client = if index % 2 == 0 { plain(server).await } else { house::grpc(&running).await };
+        let mut client = if index % 2 == 0 { plain(server).await } else { fixture::grpc(&running).await };
         healthy.push(Reader::open(&mut client, of_layer(1 + index % 3)).await.unwrap());
     }
 

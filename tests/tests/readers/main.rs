@@ -2,22 +2,22 @@
 //! anything.
 
 mod bad;
-#[path = "../house/mod.rs"]
-mod house;
+#[path = "../fixture/mod.rs"]
+mod fixture;
 
 use std::future::ready;
 use std::net::SocketAddr;
 use std::pin::Pin;
 
+use clearway::ingest::Reading;
+use clearway::server::Running;
 use clearway_proto::codec::Limits;
 use clearway_proto::map::{Map, decode_map, decode_map_on};
 use clearway_proto::v1;
 use clearway_proto::v1::map_service_client::MapServiceClient;
 use clearway_proto::v1::map_service_server::{MapService, MapServiceServer};
-use clearway::ingest::Reading;
-use clearway::server::Running;
+use fixture::{config, feed, readings, sequence, start, within};
 use futures::{Stream, StreamExt};
-use house::{config, feed, readings, sequence, start, within};
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 use tonic::transport::Channel;

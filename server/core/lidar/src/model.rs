@@ -105,6 +105,25 @@ impl Model {
         Model::Vls128,
     ];
 
+    /// Name of the model in configurations, messages and logs: `hdl64e_s1`, `vlp16`, and so on.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Model::Hdl64eS1 => "hdl64e_s1",
+            Model::Hdl64eS2 => "hdl64e_s2",
+            Model::Hdl64eS3 => "hdl64e_s3",
+            Model::Hdl32e => "hdl32e",
+            Model::Vlp16 => "vlp16",
+            Model::PuckHiRes => "puck_hi_res",
+            Model::Vlp32c => "vlp32c",
+            Model::Vls128 => "vls128",
+        }
+    }
+
+    /// The model whose [`Model::as_str`] is `name`; `None` if there is no such model.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|model| model.as_str() == name)
+    }
+
     /// The model's figures.
     pub const fn spec(self) -> &'static ModelSpec {
         match self {

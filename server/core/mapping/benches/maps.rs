@@ -12,11 +12,11 @@ use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::event::{EgoPose, Road, RoadFrame, RoadPurpose, Scan};
 use clearway_mapping::layer::height_difference::HeightDifference;
 use clearway_mapping::layer::{Context, LayerMaker, Rays};
-use clearway_mapping::sensor::motion::{Motion, Moved};
+use clearway_mapping::sensor::motion::{Motion, EgoTrajectory};
 use clearway_mapping::layer::occupancy::Occupancy;
-use clearway_mapping::road::TakenRoad;
+use clearway_mapping::road::StoredRoad;
 use clearway_mapping::layer::safe_path::SafePath;
-use clearway_mapping::sensor::distance_series::Series;
+use clearway_mapping::sensor::distance_series::DistanceSeries;
 use clearway_mapping::layer::speed::Speed;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_mapping::layer::terrain::Terrain;
@@ -54,9 +54,9 @@ fn sweep() -> Sweep {
     let mut sweep = Sweep::default();
     match kitti() {
         Some(scan) => {
-            sweep.take_scan(&scan, &Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount(1.73));
+            sweep.set_scan(&scan, &Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount(1.73));
         }
-        None => sweep.take_revolution(&turn(), &mount(1.9)),
+        None => sweep.set_revolution(&turn(), &mount(1.9)),
     }
     sweep
 }
@@ -87,7 +87,7 @@ fn sweep_of_a_revolution(bencher: Bencher) {
     let mount = mount(1.9);
     let mut sweep = Sweep::default();
     let slots = revolution.echoes[0].range_m.len();
-    bencher.counter(ItemsCount::new(slots)).bench_local(|| sweep.take_revolution(&revolution, &mount));
+    bencher.counter(ItemsCount::new(slots)).bench_local(|| sweep.set_revolution(&revolution, &mount));
 }
 
 /// The same with a pose each 10 ms: finding the motion, and moving every firing.
@@ -103,13 +103,13 @@ fn sweep_of_a_moving_revolution(bencher: Bencher) {
             nalgebra::vector![0.0, 0.0, 0.3 * seconds],
         );
         let stamp_ns = revolution.end_ns + i64::from(step - 15) * 10_000_000;
-        motion.take_pose(&EgoPose { stamp_ns, map_from_ego, speed_mps: 15.0 });
+        motion.push_pose(&EgoPose { stamp_ns, map_from_ego, speed_mps: 15.0 });
     }
-    let (mut sweep, mut moved) = (Sweep::default(), Moved::default());
+    let (mut sweep, mut moved) = (Sweep::default(), EgoTrajectory::default());
     let slots = revolution.echoes[0].range_m.len();
     bencher.counter(ItemsCount::new(slots)).bench_local(|| {
-        motion.through(&revolution, &mut moved);
-        sweep.take_revolution_around(&revolution, &mount, &moved.end_from_ego, None);
+        motion.follow_revolution(&revolution, &mut moved);
+        sweep.set_moving_revolution(&revolution, &mount, &moved.end_from_ego, None);
     });
 }
 
@@ -126,8 +126,8 @@ fn terrain(bencher: Bencher, form: Form) {
 fn terrain_with_roughness(bencher: Bencher) {
     let (revolution, mount) = (turn(), mount(1.9));
     let mut sweep = Sweep::default();
-    sweep.take_revolution(&revolution, &mount);
-    sweep.take_deviations(&revolution, &mount, &mut Series::default(), None);
+    sweep.set_revolution(&revolution, &mount);
+    sweep.set_deviations(&revolution, &mount, &mut DistanceSeries::default(), None);
     let mut map = Terrain::new(&TerrainConfig::default());
     let mut layer = map.layer();
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &Context::default(), &mut layer));
@@ -136,11 +136,11 @@ fn terrain_with_roughness(bencher: Bencher) {
 #[divan::bench]
 fn deviations_of_a_revolution(bencher: Bencher) {
     let (revolution, mount) = (turn(), mount(1.9));
-    let (mut sweep, mut series) = (Sweep::default(), Series::default());
+    let (mut sweep, mut series) = (Sweep::default(), DistanceSeries::default());
     let slots = revolution.echoes[0].range_m.len();
     bencher
         .counter(ItemsCount::new(slots))
-        .bench_local(|| sweep.take_deviations(&revolution, &mount, &mut series, None));
+        .bench_local(|| sweep.set_deviations(&revolution, &mount, &mut series, None));
 }
 
 /// With a road of 20 points, 6 m wide.
@@ -155,7 +155,7 @@ fn speed(bencher: Bencher) {
         widths_m: vec![6.0; 20],
         orientations: Vec::new(),
     };
-    let taken = TakenRoad { road, map_from_ego: None };
+    let taken = StoredRoad { road, map_from_ego: None };
     let mut map = Speed::new(&SpeedConfig::default());
     let mut layer = map.layer();
     let context = Context { road: Some(&taken), ..Context::default() };

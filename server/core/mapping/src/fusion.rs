@@ -1,205 +1,244 @@
-//! Several sensors, one map: whose turn makes it, and what the others bring.
+//! Several sensors, one map: which sensor's scan makes the map, and what the others contribute.
 //!
-//! In: the newest turn of each sensor, ego frame at its own end; the event that completed one. Out: whether that turn
-//! makes a map, and the map's sweep: the maker's points and every other sensor's newest ones, carried rigidly by the
-//! vehicle's motion from their own end to the map's stamp. Everything is decided by events:
+//! In: the newest scan of each sensor, ego frame at its own end, and the event that completed one of them. Out: whether
+//! that scan makes a map, and the map's [`Sweep`]: the points of that scan and the newest points of every other sensor,
+//! propagated rigidly by the vehicle's motion from their own end to the map's stamp. The events alone decide:
 //!
-//! - Sensors lead in this order: the configured lead, then the others as they are configured. A sensor that gives no
-//!   turn for `deadline_ms` of event time, or whose turns come that much later after their stamps (or that much before
-//!   them) than the timeliest sensor's, does not lead; the next one's turns make the maps until it is back.
-//! - `deadline_ms` after the last map (`period_ms` where that is more) any sensor's turn makes one: nobody holds the
-//!   map.
-//! - The rows of radial maps are the lead's, once it has given a turn, whoever makes the map: to a sensor of few planes
-//!   a row may be all there is, and one return in it would make all of it drivable.
-//! - A turn farther than `deadline_ms` from the map's stamp is not in it, and its sensor is named with its age.
+//! - The source of a map is the first usable sensor in this order: the reference sensor, then the others as they are
+//!   configured. A sensor is not usable while it completes no scan for `deadline_ms` of event time, or while its scans
+//!   arrive that much later after their stamps (or that much earlier before them) than those of the timeliest sensor.
+//! - If no map was made for `deadline_ms` (for `period_ms` if that is more), the next timely scan of any sensor makes
+//!   one: no silent sensor holds back the maps.
+//! - The rows of radial maps are those of the reference sensor once it has completed a scan, whichever sensor is the
+//!   source. If a sensor has few lasers, a row may cover all the ground, and one return would make all of it drivable.
+//! - A scan whose end is more than `deadline_ms` away from the map's stamp is not in the map. The map names its sensor
+//!   with the age of the scan.
 //!
-//! Between two maps the order in which different sensors' turns come makes no difference to the layers made of the
-//! sweep.
+//! The order in which the scans of different sensors arrive between two maps does not change the layers that are made
+//! from the sweep.
 
 use crate::config::FusionConfig;
-use crate::sensor::pipeline::{Intake, Moment};
-use crate::map::{Part, SensorState};
+use crate::event_time::EventTime;
+use crate::map::{Contribution, SensorState};
 use crate::sensor::motion::{Compensation, Motion};
+use crate::sensor::scan::SensorScan;
 use crate::sensor::sweep::Sweep;
 
-const NS_A_MS: i64 = 1_000_000;
+const NS_PER_MS: i64 = 1_000_000;
+/// A scan of the same source makes a map once `period_ms` less one part in this many has passed. Ours: sensors jitter
+/// by some per cent of their own period, and a scan that comes a little early must not halve the rate of maps.
+const PERIOD_TOLERANCE_PARTS: i64 = 10;
 
-/// The last map made.
+/// The newest map, as far as the next one depends on it.
 #[derive(Clone, Copy, Debug)]
-struct Made {
-    maker: usize,
+struct NewestMap {
+    source: usize,
     stamp_ns: i64,
     event_ns: i64,
 }
 
-/// One vehicle's fusion, with the buffer it reuses.
+/// The fusion of one vehicle.
 pub(crate) struct Fusion {
-    lead: usize,
-    pub deadline_ns: i64,
+    reference_sensor: usize,
+    deadline_ns: i64,
     period_ns: i64,
-    last: Option<Made>,
-    /// The map's sweep where more than one sensor is in it.
+    newest: Option<NewestMap>,
+    /// True if the newest scan of any sensor made the newest map.
+    is_current: bool,
+    /// The newest map's points if they are not the points of its source alone.
     sweep: Sweep,
-    fused: bool,
+    is_merged: bool,
 }
 
-/// What a map says of its sensors.
-pub(crate) struct Gathered {
-    /// The earliest first firing of those in it.
+/// What a map states about the scans in it.
+pub(crate) struct MergedScans {
+    /// Index of the sensor whose scan made the map.
+    pub source: usize,
+    /// Stamp of the earliest first firing of the contributing scans, ns since the Unix epoch.
     pub start_ns: i64,
-    /// The least known of the motion of any of them.
+    /// Weakest motion compensation among the contributing sensors.
     pub compensation: Compensation,
+    /// State of every sensor, by source; `refused` is 0.
     pub sensors: Vec<SensorState>,
 }
 
 impl Fusion {
-    pub fn new(config: &FusionConfig, lead: usize) -> Self {
+    /// A fusion before the first map. `reference_sensor` is an index.
+    pub fn new(config: &FusionConfig, reference_sensor: usize) -> Self {
         Self {
-            lead,
-            deadline_ns: i64::from(config.deadline_ms) * NS_A_MS,
-            period_ns: i64::from(config.period_ms) * NS_A_MS,
-            last: None,
+            reference_sensor,
+            deadline_ns: config.deadline_ns(),
+            period_ns: i64::from(config.period_ms) * NS_PER_MS,
+            newest: None,
+            is_current: false,
             sweep: Sweep::default(),
-            fused: false,
+            is_merged: false,
         }
     }
 
-    /// Index of the sensor whose turn made the newest map.
-    pub fn maker(&self) -> Option<usize> {
-        self.last.map(|made| made.maker)
+    /// Index of the sensor whose scan made the newest map; `None` before the first map.
+    pub fn source(&self) -> Option<usize> {
+        self.newest.map(|newest| newest.source)
     }
 
-    /// The newest map's points; those of the lead's newest turn before the first map.
-    pub fn sweep<'a>(&'a self, intakes: &'a [Intake]) -> &'a Sweep {
-        let maker = self.maker().unwrap_or(self.lead);
-        if self.fused { &self.sweep } else { &intakes[maker].turn.sweep }
+    /// True if no sensor has completed a scan since the newest map was made.
+    pub fn is_current(&self) -> bool {
+        self.is_current
     }
 
-    /// Whether the turn that sensor `source` has just completed makes a map.
-    pub fn makes_map(&self, source: usize, intakes: &[Intake], now: Moment) -> bool {
-        let since_ns = now.event_ns.saturating_sub(self.last.map_or(0, |made| made.event_ns));
-        let overdue = since_ns > self.deadline_ns.max(self.period_ns);
-        let leads = self.order(intakes.len()).find(|&index| {
-            index == source || (self.is_fresh(&intakes[index], now) && self.is_timely(&intakes[index], intakes, now))
-        });
-        let may = self.is_timely(&intakes[source], intakes, now) && (overdue || leads == Some(source));
-        let newer = self.is_newer(source, &intakes[source], overdue);
-        may && newer && (overdue || self.is_due(source, &intakes[source]))
+    /// Points of the newest map; before the first map those of the reference sensor's newest scan.
+    pub fn sweep<'a>(&'a self, scans: &'a [SensorScan]) -> &'a Sweep {
+        let source = self.source().unwrap_or(self.reference_sensor);
+        if self.is_merged { &self.sweep } else { &scans[source].sweep }
     }
 
-    /// Whether `period_ms` has passed since this sensor made the last map. A clock set back is due at once.
-    fn is_due(&self, source: usize, intake: &Intake) -> bool {
-        self.last.is_none_or(|made| {
-            let since_ns = intake.turn.end_ns.saturating_sub(made.stamp_ns);
-            made.maker != source || since_ns < 0 || since_ns >= self.period_ns - self.period_ns / 10
+    /// Merges the newest scans to the points of a map if the scan that sensor `source` has just completed makes one;
+    /// `None` if it makes none. [`Fusion::sweep`] then returns the points.
+    pub fn merge(
+        &mut self,
+        source: usize,
+        scans: &[SensorScan],
+        motion: &Motion,
+        now: EventTime,
+    ) -> Option<MergedScans> {
+        self.is_current = self.makes_map(source, scans, now);
+        self.is_current.then(|| self.merge_scans(source, scans, motion, now))
+    }
+
+    /// True if the sensor's scans arrive no later after their stamps, nor earlier before them, than those of the
+    /// timeliest fresh sensor, with the deadline as tolerance. A scan that is not timely no longer describes the scene.
+    pub fn is_timely(&self, source: usize, scans: &[SensorScan], now: EventTime) -> bool {
+        let delay_ns = |scan: &SensorScan| scan.completed_at.arrival_ns.saturating_sub(scan.end_ns).saturating_abs();
+        let fresh = scans.iter().filter(|other| other.completed > 0 && self.is_fresh(other, now));
+        let least_ns = fresh.map(delay_ns).min();
+        let scan = &scans[source];
+        scan.completed == 0
+            || least_ns.is_none_or(|least_ns| delay_ns(scan).saturating_sub(least_ns) <= self.deadline_ns)
+    }
+
+    /// True if the scan that sensor `source` has just completed makes a map.
+    fn makes_map(&self, source: usize, scans: &[SensorScan], now: EventTime) -> bool {
+        let since_ns = now.event_ns.saturating_sub(self.newest.map_or(0, |newest| newest.event_ns));
+        let is_overdue = since_ns > self.deadline_ns.max(self.period_ns);
+        let first_usable = self
+            .order(scans.len())
+            .find(|&index| index == source || (self.is_fresh(&scans[index], now) && self.is_timely(index, scans, now)));
+        self.is_timely(source, scans, now)
+            && (is_overdue || first_usable == Some(source))
+            && self.is_newer(source, &scans[source], is_overdue)
+            && (is_overdue || self.is_due(source, &scans[source]))
+    }
+
+    /// Indices of the sensors, the reference sensor first.
+    fn order(&self, sensors: usize) -> impl Iterator<Item = usize> {
+        let reference = self.reference_sensor;
+        std::iter::once(reference).chain((0..sensors).filter(move |index| *index != reference))
+    }
+
+    /// True if the sensor has completed a scan within the deadline. A sensor without a scan counts as fresh until the
+    /// deadline after the vehicle's first event.
+    fn is_fresh(&self, scan: &SensorScan, now: EventTime) -> bool {
+        now.event_ns.saturating_sub(scan.completed_at.event_ns) <= self.deadline_ns
+    }
+
+    /// True if `period_ms` has passed since the same sensor made the newest map, if another sensor made it, or if the
+    /// sensor's clock was set back.
+    fn is_due(&self, source: usize, scan: &SensorScan) -> bool {
+        self.newest.is_none_or(|newest| {
+            let since_ns = scan.end_ns.saturating_sub(newest.stamp_ns);
+            let tolerance_ns = self.period_ns / PERIOD_TOLERANCE_PARTS;
+            newest.source != source || since_ns < 0 || since_ns >= self.period_ns - tolerance_ns
         })
     }
 
-    /// Whether the turn ended after the last map's stamp: where another sensor takes over, its newest turn may be the
-    /// older one. The same sensor's stamps rise by themselves, unless its clock was set back; all clocks may have been,
-    /// once a map is overdue and the turn older by more than the deadline. A turn that ended long before it was
-    /// completed is none of another clock: its sensor was silent until now.
-    fn is_newer(&self, source: usize, intake: &Intake, overdue: bool) -> bool {
-        self.last.is_none_or(|made| {
-            let newer_ns = intake.turn.end_ns.saturating_sub(made.stamp_ns);
-            let set_back = overdue && newer_ns < -self.deadline_ns && !self.came_late(intake);
-            made.maker == source || newer_ns > 0 || set_back
+    /// True if the scan ended after the newest map's stamp, so that the stamps of maps rise. Three cases:
+    ///
+    /// - The same sensor made the newest map: true. Its stamps rise unless its clock was set back.
+    /// - Another sensor made it: the scan must have a later stamp.
+    /// - A map is overdue and the scan is older by more than the deadline: true if all clocks were set back, which is
+    ///   assumed unless the scan arrived long after its end. A scan that arrives long after its end means a silent
+    ///   sensor, not a clock that was set back.
+    fn is_newer(&self, source: usize, scan: &SensorScan, is_overdue: bool) -> bool {
+        self.newest.is_none_or(|newest| {
+            let newer_ns = scan.end_ns.saturating_sub(newest.stamp_ns);
+            let is_set_back = is_overdue && newer_ns < -self.deadline_ns && !self.came_late(scan);
+            newest.source == source || newer_ns > 0 || is_set_back
         })
     }
 
-    /// Whether the turn was completed later than the deadline after its end, as the host's clock had it then.
-    fn came_late(&self, intake: &Intake) -> bool {
-        let host_ns = intake.turn.state.clock_offset_ms.saturating_mul(NS_A_MS);
-        let since_ns = intake.turn.completed.arrival_ns.saturating_sub(intake.turn.end_ns).saturating_sub(host_ns);
+    /// True if the scan was completed later than the deadline after its end, both on the host's clock of that time.
+    fn came_late(&self, scan: &SensorScan) -> bool {
+        let offset_ns = scan.state.clock_offset_ms.saturating_mul(NS_PER_MS);
+        let since_ns = scan.completed_at.arrival_ns.saturating_sub(scan.end_ns).saturating_sub(offset_ns);
         since_ns.saturating_abs() > self.deadline_ns
     }
 
-    fn order(&self, sensors: usize) -> impl Iterator<Item = usize> {
-        let lead = self.lead;
-        std::iter::once(lead).chain((0..sensors).filter(move |index| *index != lead))
-    }
-
-    /// Whether the sensor gave a turn within the deadline. One that gave none yet has until the deadline of the
-    /// vehicle's first event.
-    fn is_fresh(&self, intake: &Intake, now: Moment) -> bool {
-        now.event_ns.saturating_sub(intake.turn.completed.event_ns) <= self.deadline_ns
-    }
-
-    /// Whether the sensor's turns come no later after their stamps, nor earlier before them, than the timeliest fresh
-    /// sensor's, give or take the deadline.
-    pub fn is_timely(&self, intake: &Intake, intakes: &[Intake], now: Moment) -> bool {
-        let off_ns =
-            |intake: &Intake| intake.turn.completed.arrival_ns.saturating_sub(intake.turn.end_ns).saturating_abs();
-        let fresh = intakes.iter().filter(|other| other.turns > 0 && self.is_fresh(other, now));
-        let least_ns = fresh.map(off_ns).min();
-        intake.turns == 0 || least_ns.is_none_or(|least_ns| off_ns(intake).saturating_sub(least_ns) <= self.deadline_ns)
-    }
-
-    /// The map's sweep and sensors, made by the newest turn of sensor `source`.
-    pub fn gather(&mut self, source: usize, intakes: &[Intake], motion: &Motion, now: Moment) -> Gathered {
-        let maker = &intakes[source].turn;
-        self.last = Some(Made { maker: source, stamp_ns: maker.end_ns, event_ns: now.event_ns });
-        self.fused = false;
-        let mut gathered = Gathered {
-            start_ns: maker.start_ns,
-            compensation: maker.compensation,
-            sensors: Vec::with_capacity(intakes.len()),
+    fn merge_scans(&mut self, source: usize, scans: &[SensorScan], motion: &Motion, now: EventTime) -> MergedScans {
+        let own = &scans[source];
+        let stamp_ns = own.end_ns;
+        self.newest = Some(NewestMap { source, stamp_ns, event_ns: now.event_ns });
+        self.is_merged = false;
+        let mut merged = MergedScans {
+            source,
+            start_ns: own.start_ns,
+            compensation: own.compensation,
+            sensors: Vec::with_capacity(scans.len()),
         };
-        for (index, intake) in intakes.iter().enumerate() {
-            let part = if index == source { maker.state.state } else { self.part(intake, maker.end_ns, now) };
-            if index != source && part.contributes() {
-                let (carried, compensation) = motion.carry(intake.turn.end_ns, maker.end_ns);
-                self.fuse(&maker.sweep);
-                self.sweep.append(&intake.turn.sweep, &carried);
-                gathered.start_ns = gathered.start_ns.min(intake.turn.start_ns);
-                gathered.compensation = gathered.compensation.min(compensation).min(intake.turn.compensation);
+        for (index, scan) in scans.iter().enumerate() {
+            let contribution =
+                if index == source { own.state.contribution } else { self.contribution(scan, stamp_ns, now) };
+            if index != source && contribution.is_in_map() {
+                let (stamp_from_end, compensation) = motion.propagate(scan.end_ns, stamp_ns);
+                self.copy_once(&own.sweep);
+                self.sweep.append(&scan.sweep, &stamp_from_end);
+                merged.start_ns = merged.start_ns.min(scan.start_ns);
+                merged.compensation = merged.compensation.min(compensation).min(scan.compensation);
             }
-            gathered.sensors.push(state(intake, part, maker.end_ns));
+            merged.sensors.push(sensor_state(scan, contribution, stamp_ns));
         }
-        let lead = &intakes[self.lead].turn.sweep;
-        if source != self.lead && lead.calibration.is_some() {
-            self.fuse(&maker.sweep);
-            self.sweep.take_rows(lead);
+        let reference = &scans[self.reference_sensor].sweep;
+        if source != self.reference_sensor && reference.calibration.is_some() {
+            self.copy_once(&own.sweep);
+            self.sweep.copy_rows(reference);
         }
-        gathered
+        merged
     }
 
-    /// The map's sweep is no sensor's own.
-    fn fuse(&mut self, maker: &Sweep) {
-        if !self.fused {
-            self.sweep.copy(maker);
-            self.fused = true;
+    /// Begins the map's own sweep with a copy of its source's sweep, unless it has begun.
+    fn copy_once(&mut self, source: &Sweep) {
+        if !self.is_merged {
+            self.sweep.copy_from(source);
+            self.is_merged = true;
         }
     }
 
-    fn part(&self, intake: &Intake, stamp_ns: i64, now: Moment) -> Part {
-        let age_ns = stamp_ns.saturating_sub(intake.turn.end_ns);
-        if intake.turns == 0 {
-            Part::Silent
+    /// What the newest scan of a sensor that is not the source contributes to a map.
+    fn contribution(&self, scan: &SensorScan, stamp_ns: i64, now: EventTime) -> Contribution {
+        let age_ns = stamp_ns.saturating_sub(scan.end_ns);
+        if scan.completed == 0 {
+            Contribution::Silent
         } else if age_ns.saturating_abs() <= self.deadline_ns {
-            intake.turn.state.state
-        } else if !self.is_fresh(intake, now) {
-            Part::Silent
+            scan.state.contribution
+        } else if !self.is_fresh(scan, now) {
+            Contribution::Silent
         } else if age_ns > 0 {
-            Part::Late
+            Contribution::Late
         } else {
-            Part::Ahead
+            Contribution::Ahead
         }
     }
 }
 
-fn state(intake: &Intake, part: Part, stamp_ns: i64) -> SensorState {
-    let turn = &intake.turn;
-    let seen = if part.contributes() { turn.state.clone() } else { SensorState::default() };
-    let age_ns = stamp_ns.saturating_sub(turn.end_ns);
+fn sensor_state(scan: &SensorScan, contribution: Contribution, stamp_ns: i64) -> SensorState {
+    let age_ns = stamp_ns.saturating_sub(scan.end_ns);
+    let counts = if contribution.is_in_map() { scan.state.clone() } else { SensorState::default() };
     SensorState {
-        name: intake.name().to_owned(),
-        model: turn.state.model.clone(),
-        refused: intake.ledger.refused_sum(),
-        state: part,
-        clock: turn.state.clock,
-        clock_offset_ms: turn.state.clock_offset_ms,
-        age_ms: (intake.turns > 0).then(|| (age_ns as f64 / NS_A_MS as f64) as f32),
-        ..seen
+        name: scan.state.name.clone(),
+        model: scan.state.model.clone(),
+        contribution,
+        clock: scan.state.clock,
+        clock_offset_ms: scan.state.clock_offset_ms,
+        age_ms: (scan.completed > 0).then(|| (age_ns as f64 / NS_PER_MS as f64) as f32),
+        ..counts
     }
 }

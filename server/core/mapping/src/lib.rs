@@ -2,32 +2,26 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | [`event`] | what enters: datagrams, scans, ego poses, roads, losses |
-//! | [`config`] | one vehicle's sensors and maps |
-//! | [`pipeline`] | `step(&Event)` conducts the hops below |
-//! | [`ledger`] | what came of every event, and why not |
-//! | `intake` | one sensor's events -> its newest turn |
-//! | `rings` | a scan's rings -> elevations of the lasers that drew them |
-//! | [`body`] | returns on or behind the vehicle itself |
-//! | [`fusion`] | whose turn makes a map, and the newest turns of all sensors in it |
-//! | [`mount`] | first revolutions -> height, pitch and roll of a sensor nobody measured |
-//! | [`motion`] | ego poses, speed + revolution -> where the vehicle was at each firing |
-//! | [`sweep`] | revolution or scan + extrinsics -> [`sweep::Sweep`] in the ego frame |
-//! | [`map`] | what a map is: geometry, legend, channels |
-//! | [`radial`] | the thesis' r-θ grid: position -> cell |
-//! | [`drivability`] | thesis §IV |
-//! | [`height_difference`] | the thesis' baseline |
+//! | [`event`] | what enters: datagrams, scans, ego poses, roads, declared sensors, losses |
+//! | [`config`] | the configuration of one vehicle: its sensors and maps |
+//! | [`pipeline`] | `step(&Event)` -> map; names the hops below in the order of the data |
+//! | `event_time` | arrivals of events -> a time that does not run backwards |
+//! | `inputs` | event -> what it changes: sensors, motion, roads |
+//! | [`sensor`] | one sensor's events -> its newest scan, ego frame at one stamp |
+//! | [`road`] | RDDF and RNDF files, road events -> the newest checked roads |
+//! | [`ledger`] | every event and its outcome -> counts |
+//! | [`error`] | why an event is refused |
+//! | `fusion` | the newest scans of all sensors -> the points of one map |
+//! | [`layer`] | the points of one map -> one layer for each of the six maps |
+//! | [`map`] | what a map contains |
 //! | [`scan_file`] | KITTI `.bin`, `.pcd` -> scan |
-//! | [`series`] | revolution -> how far each range lies from its laser's neighbouring ones |
-//! | [`terrain`] | Neuhaus 2009 §2 |
-//! | [`occupancy`] | Seo 2014 §2 |
-//! | [`road`] | RDDF and RNDF files, checked roads |
-//! | [`speed`] | Lindström 2005 |
-//! | [`safe_path`] | thesis §VI |
 
 pub mod config;
+pub mod error;
 pub mod event;
-pub mod fusion;
+mod event_time;
+mod fusion;
+mod inputs;
 pub mod layer;
 pub mod ledger;
 pub mod map;

@@ -1,5 +1,5 @@
-//! What a map is: a header, and layers of channels over one grid each. Class 0 is unknown everywhere, and is never
-//! free.
+//! What a map is: a header, the state of every sensor, and layers. Class 0 of every layer means unknown; an unknown
+//! cell is never free.
 
 use clearway_lidar::blocked::Blocked;
 use nalgebra::Isometry3;
@@ -7,83 +7,83 @@ use nalgebra::Isometry3;
 use crate::layer::Layer;
 use crate::sensor::motion::Compensation;
 
-/// Everything made from one revolution (or scan) of one vehicle's lead, and the newest ones of its other sensors.
-#[derive(Clone, Debug, PartialEq)]
+/// The map of one vehicle, made from the scan of one sensor (its source) and the newest scans of the others.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Map {
-    /// Counts from 0 without a hole for each vehicle.
+    /// Number of the map: the first of a vehicle is 0, the next ones count up without gaps.
     pub sequence: u64,
-    /// First firing, ns since the Unix epoch.
+    /// Stamp of the earliest first firing of all contributing scans, ns since the Unix epoch.
     pub capture_start_ns: i64,
-    /// Last firing; the stamp all points are expressed at, and the one age is measured from.
+    /// Stamp of the source's last firing, ns since the Unix epoch. All points are expressed in the ego frame of this
+    /// stamp, and the age of the map counts from it.
     pub capture_end_ns: i64,
-    /// Arrival of the event that completed the map.
+    /// Arrival of the event that completed the map, ns since the Unix epoch, host clock.
     pub completed_ns: i64,
-    /// Ego frame in the world frame at `capture_end_ns`, interpolated; `None` where no pose is near enough.
+    /// Ego frame in the world frame at `capture_end_ns`, interpolated; `None` if no pose is near enough.
     pub map_from_ego: Option<Isometry3<f64>>,
-    /// Forward speed, where known.
+    /// Forward speed at `capture_end_ns`; `None` if it is unknown.
     pub speed_mps: Option<f64>,
-    /// What moved the points to `capture_end_ns`.
+    /// What moved the points to `capture_end_ns`; the weakest of all contributing sensors.
     pub compensation: Compensation,
-    /// Index of the sensor whose turn made the map: the lead, or one that stands in for it.
-    pub made_by: u16,
-    /// Every sensor of the vehicle, in the order of the configuration, whether it contributed or not.
+    /// Index of the sensor whose scan made the map: the reference sensor, or one that replaces it.
+    pub source: u16,
+    /// Every sensor of the vehicle, in the order of the configuration, whether it contributes or not.
     pub sensors: Vec<SensorState>,
-    /// Those that are wanted, and those they are made from, in the order of the configuration.
+    /// The active layers, in the order of the configuration.
     pub layers: Vec<Layer>,
 }
 
-/// One sensor's part in a map; what counts one turn is 0 where it has none in it.
+/// One sensor's state in a map. Values that describe its scan are 0 or empty if the scan is not in the map.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SensorState {
-    /// From the configuration.
+    /// Name of the sensor in the configuration.
     pub name: String,
-    /// `hdl32e`, …; `scan` where the turn was assembled elsewhere.
+    /// Name of the model (`hdl32e`, and so on); `scan` if the sensor sends scans.
     pub model: String,
-    /// Data packets of this revolution.
+    /// Number of data packets of the revolution; 0 for scans.
     pub packets: u32,
-    /// The same and those that were missing before them, ±1 a gap; 0 for scans.
+    /// Number of data packets of the revolution and of those that are missing before them, ±1 a gap; 0 for scans.
     pub packets_expected: u32,
-    /// Datagrams and scans refused since the start, but for copies of packets.
+    /// Number of datagrams and scans that were refused since the start, without copies of packets.
     pub refused: u64,
-    /// Returns in this revolution.
+    /// Number of returns in the scan.
     pub returns: u32,
-    /// Measured turning rate; 0 where unknown.
+    /// Measured rotation rate, revolutions a minute; 0 if it is unknown.
     pub rpm: f32,
-    /// Share of the turn's azimuths that have firings, 0 to 1.
+    /// Share of the field of view's azimuths that have firings, 0 to 1.
     pub completeness: f32,
-    /// `start`, `end`, `gap`, `reversal`, `overlong`, or empty for a whole turn.
+    /// Why the revolution is not whole: `start`, `end`, `gap`, `reversal`, `overlong`; empty if it is whole.
     pub partial: &'static str,
-    /// Where the sensor used to see and did not in this revolution.
+    /// Where the sensor returned points before and returned none in this revolution.
     pub blocked: Blocked,
-    /// The clock the stamps follow, as [`clearway_lidar::Clock::as_str`] spells it; `sender` where a scan brings its
-    /// stamp.
+    /// Name of the clock the stamps follow ([`clearway_lidar::Clock::as_str`]); `sender` if a scan brings its stamp.
     pub clock: &'static str,
-    /// By how much the host's clock is ahead of the stamps, ms.
+    /// Offset of the host's clock from the stamps, ms; positive if the host's clock is ahead.
     pub clock_offset_ms: i64,
-    /// Whether its newest turn is in the map.
-    pub state: Part,
-    /// From its newest turn's end to the map's stamp; `None` before its first turn.
+    /// Whether the newest scan is in the map.
+    pub contribution: Contribution,
+    /// Time from the end of the newest scan to the map's stamp, ms; `None` before the first scan.
     pub age_ms: Option<f32>,
 }
 
-/// Whether a sensor's newest turn is in a map, and why not.
+/// What the newest scan of a sensor contributes to a map, and why it contributes nothing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Part {
-    /// Whole.
+pub enum Contribution {
+    /// The scan is in the map, and it is whole.
     Ok,
-    /// A turn that is not whole.
+    /// The scan is in the map, and it is not whole.
     Partial,
-    /// No: it is too old, or its clock is behind.
+    /// The scan is not in the map: it is too old, or the sensor's clock is behind.
     Late,
-    /// No: its clock is ahead.
+    /// The scan is not in the map: the sensor's clock is ahead.
     Ahead,
-    /// No: the sensor gives none.
+    /// The sensor has completed no scan within the deadline.
     #[default]
     Silent,
 }
 
-impl Part {
-    /// As the wire spells it.
+impl Contribution {
+    /// Name of the value on the wire.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Ok => "ok",
@@ -94,8 +94,8 @@ impl Part {
         }
     }
 
-    /// Whether the map holds points of the turn.
-    pub fn contributes(self) -> bool {
+    /// True if the map contains points of the scan.
+    pub fn is_in_map(self) -> bool {
         matches!(self, Self::Ok | Self::Partial)
     }
 }

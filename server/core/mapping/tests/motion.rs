@@ -9,10 +9,11 @@ use clearway_lidar::revolution::Revolution;
 use clearway_lidar::sensor::{Sensor, SensorConfig as LidarConfig};
 use clearway_lidar::telemetry::Telemetry;
 use clearway_mapping::config::{Extrinsics, MapsConfig, MotionConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::error::EventError;
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
 use clearway_mapping::map::Map;
-use clearway_mapping::sensor::motion::{Compensation, Motion, Moved};
-use clearway_mapping::pipeline::{Pipeline, Rejected};
+use clearway_mapping::sensor::motion::{Compensation, Motion, EgoTrajectory};
+use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::course::{Course, Drive};
 use clearway_sim::ground::Ground;
@@ -36,8 +37,8 @@ fn at(x: f64, y: f64, yaw: f64) -> Isometry3<f64> {
 fn between_poses_translation_is_linear_and_rotation_a_slerp() {
     let mut motion = Motion::new(&MotionConfig::default());
     assert_eq!(motion.map_from_ego(0), None);
-    motion.take_pose(&pose(0, at(10.0, 0.0, 3.0)));
-    motion.take_pose(&pose(100_000_000, at(11.0, 2.0, -3.0)));
+    motion.push_pose(&pose(0, at(10.0, 0.0, 3.0)));
+    motion.push_pose(&pose(100_000_000, at(11.0, 2.0, -3.0)));
     assert_eq!(motion.map_from_ego(0), Some(at(10.0, 0.0, 3.0)), "a pose's own stamp gives the pose, to the bit");
     let quarter = motion.map_from_ego(25_000_000).unwrap();
     // From 3 to -3 rad the shorter way leads over π.
@@ -49,10 +50,10 @@ fn between_poses_translation_is_linear_and_rotation_a_slerp() {
 #[test]
 fn beyond_the_poses_the_motion_goes_on_within_its_bound_and_no_farther() {
     let mut motion = Motion::new(&MotionConfig::default());
-    motion.take_pose(&pose(0, at(0.0, 0.0, 0.0)));
+    motion.push_pose(&pose(0, at(0.0, 0.0, 0.0)));
     let alone = motion.map_from_ego(100_000_000).unwrap();
     assert!((alone.translation.x - 1.5).abs() < 1e-12, "one pose goes on with its speed: {alone}");
-    motion.take_pose(&pose(100_000_000, at(1.0, 0.5, 0.1)));
+    motion.push_pose(&pose(100_000_000, at(1.0, 0.5, 0.1)));
     let later = motion.map_from_ego(300_000_000).unwrap();
     assert!((later.translation.vector - Vector3::new(3.0, 1.5, 0.0)).norm() < 1e-12, "{later}");
     assert!((later.rotation.euler_angles().2 - 0.3).abs() < 1e-12);
@@ -60,14 +61,14 @@ fn beyond_the_poses_the_motion_goes_on_within_its_bound_and_no_farther() {
     let earlier = motion.map_from_ego(-200_000_000).unwrap();
     assert!((earlier.translation.vector - Vector3::new(-2.0, -1.0, 0.0)).norm() < 1e-12, "{earlier}");
     assert_eq!(motion.map_from_ego(-200_000_001), None);
-    motion.take_pose(&pose(1_200_000_001, at(9.0, 9.0, 0.0)));
+    motion.push_pose(&pose(1_200_000_001, at(9.0, 9.0, 0.0)));
     assert_eq!(motion.map_from_ego(700_000_000), None, "more than a second between two poses says too little");
 }
 
 #[test]
 fn only_the_newest_thousand_poses_are_kept() {
     let mut motion = Motion::new(&MotionConfig::default());
-    (0..5000).for_each(|i| motion.take_pose(&pose(i * 1_000_000, at(i as f64, 0.0, 0.0))));
+    (0..5000).for_each(|i| motion.push_pose(&pose(i * 1_000_000, at(i as f64, 0.0, 0.0))));
     assert_eq!(motion.map_from_ego(3_975_000_000 - 200_000_000), None);
     assert!((motion.map_from_ego(4_500_500_000).unwrap().translation.x - 4500.5).abs() < 1e-9);
 }
@@ -229,7 +230,7 @@ fn poses_out_of_order_are_refused_and_leave_the_walls_alone() {
             }
             Ok(_) => {}
             Err(rejected) => {
-                assert!(matches!(rejected, Rejected::Stamp { .. }), "{rejected}");
+                assert!(matches!(rejected, EventError::Stamp { .. }), "{rejected}");
                 refused += 1;
             }
         }
@@ -268,7 +269,7 @@ fn stamps_and_places_at_the_ends_of_their_types_move_nothing_and_break_nothing()
     for stamp_ns in [i64::MIN, -1, (1 << 62) + 1, i64::MAX] {
         let body = Body::EgoPose(far(stamp_ns, 0.0));
         let rejected = step(&Event { sequence: 0, arrival_ns: 0, source: 0, body }).unwrap_err();
-        assert_eq!((&rejected, rejected.reason()), (&Rejected::StampRange { stamp_ns }, "stamp_range"));
+        assert_eq!((&rejected, rejected.reason()), (&EventError::StampRange { stamp_ns }, "stamp_range"));
     }
     for pose in [far(2, 1.1e9), EgoPose { speed_mps: 1e300, ..far(2, 0.0) }] {
         let rejected = step(&Event { sequence: 0, arrival_ns: 0, source: 0, body: Body::EgoPose(pose) }).unwrap_err();
@@ -279,7 +280,7 @@ fn stamps_and_places_at_the_ends_of_their_types_move_nothing_and_break_nothing()
     assert!(made.len() >= 2 && made.iter().all(|compensation| *compensation == Compensation::None));
     let motion = |stamps: [i64; 2]| {
         let mut motion = Motion::new(&MotionConfig::default());
-        stamps.into_iter().for_each(|stamp_ns| motion.take_pose(&far(stamp_ns, 1.0)));
+        stamps.into_iter().for_each(|stamp_ns| motion.push_pose(&far(stamp_ns, 1.0)));
         motion
     };
     for stamps in [[i64::MIN, i64::MAX], [i64::MIN, 0], [0, i64::MAX]] {
@@ -300,13 +301,13 @@ fn a_speed_grows_old() {
     let mut motion = Motion::new(&MotionConfig::default());
     let known = |motion: &Motion, stamp_ms: i64| motion.at(stamp_ms * 1_000_000).1.is_some();
     assert!(!known(&motion, 0));
-    motion.take_gprmc(&gprmc, None);
+    motion.apply_gprmc(&gprmc, None);
     // Before the first turn has ended nobody can say when that was.
     assert_eq!([0, 100_000].map(|stamp_ms| known(&motion, stamp_ms)), [true, true]);
     for turn_ms in [100, 200, 300] {
-        motion.take_turn(turn_ms * 1_000_000);
+        motion.note_scan_end(turn_ms * 1_000_000);
         // The receiver repeats its first sentence for ever.
-        motion.take_gprmc(&gprmc, Some(turn_ms * 1_000_000));
+        motion.apply_gprmc(&gprmc, Some(turn_ms * 1_000_000));
     }
     assert_eq!([400, 2_100, 2_101].map(|stamp_ms| known(&motion, stamp_ms)), [true, true, false]);
 }
@@ -320,14 +321,14 @@ fn a_vlp16_in_dual_return_moves_both_echoes() {
     };
     let revolution = SimulatedVehicle::new(vehicle().scene().clone(), config).revolution(1);
     let mut motion = Motion::new(&MotionConfig::default());
-    motion.take_pose(&pose(revolution.start_ns, at(0.0, 0.0, 0.0)));
-    motion.take_pose(&pose(revolution.end_ns, at(1.5, 0.0, 0.0)));
-    let mut moved = Moved::default();
-    motion.through(&revolution, &mut moved);
+    motion.push_pose(&pose(revolution.start_ns, at(0.0, 0.0, 0.0)));
+    motion.push_pose(&pose(revolution.end_ns, at(1.5, 0.0, 0.0)));
+    let mut moved = EgoTrajectory::default();
+    motion.follow_revolution(&revolution, &mut moved);
     let mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
     let (mut rest, mut sweep) = (Sweep::default(), Sweep::default());
-    rest.take_revolution(&revolution, &mount);
-    sweep.take_revolution_around(&revolution, &mount, &moved.end_from_ego, None);
+    rest.set_revolution(&revolution, &mount);
+    sweep.set_moving_revolution(&revolution, &mount, &moved.end_from_ego, None);
     assert_eq!((sweep.returns, sweep.x.len()), (rest.returns, rest.x.len()));
     // By hand, firing by firing: a point of the turn's first firing lies 1.5 m farther back, one of the last where it
     // was.
@@ -370,7 +371,7 @@ fn hdl32e(cut_azimuth_deg: f32, motion: &mut Motion) -> Vec<Revolution> {
             revolutions.extend(revolution.partial.is_none().then(|| revolution.clone()));
         }
         if let Some(gprmc) = sensor.gprmc() {
-            motion.take_gprmc(gprmc, sensor.newest().map(|revolution| revolution.end_ns));
+            motion.apply_gprmc(gprmc, sensor.newest().map(|revolution| revolution.end_ns));
         }
     }
     revolutions
@@ -391,8 +392,8 @@ fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
     };
     // Standing things at the side the sweeps share by direction but not by firing, metres, as of the end of `at_ns`.
     let street = |revolution: &Revolution, compensate: bool, first_half: bool, to_ns: i64| {
-        let mut moved = Moved::default();
-        motion.through(revolution, &mut moved);
+        let mut moved = EgoTrajectory::default();
+        motion.follow_revolution(revolution, &mut moved);
         assert_eq!(moved.compensation, Compensation::Speed);
         let speed_mps = moved.speed_mps.unwrap();
         if !compensate {
@@ -406,7 +407,7 @@ fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
             echo.range_m[drop].fill(0.0);
         }
         let mut sweep = Sweep::default();
-        sweep.take_revolution_around(&half, &mount, &moved.end_from_ego, None);
+        sweep.set_moving_revolution(&half, &mount, &moved.end_from_ego, None);
         let since = (to_ns - revolution.end_ns) as f64 * 1e-9 * speed_mps;
         let place = |i: usize| [f64::from(sweep.x[i]) - since, f64::from(sweep.y[i]), f64::from(sweep.z[i])];
         let places: Vec<[f64; 3]> = (0..sweep.x.len()).map(place).collect();

@@ -4,10 +4,11 @@ mod common;
 
 use bytes::Bytes;
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{BodyConfig, ConfigError, Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::config::{BodyConfig, ConfigValueError, Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::error::EventError;
 use clearway_mapping::event::{Body, Cause, EgoPose, Event, Scan};
 use clearway_mapping::map::Map;
-use clearway_mapping::pipeline::{Pipeline, Rejected};
+use clearway_mapping::pipeline::Pipeline;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
 use clearway_sim::vehicle::SimulatedVehicle;
@@ -70,7 +71,7 @@ fn a_pose_of_the_future_locks_out_those_of_the_present_for_no_longer_than_the_de
     pose(10_000, 10_000).unwrap();
     pose(10_010, 10_010 + year_ms).unwrap();
     for arrival_ms in (10_020..=10_210).step_by(10) {
-        assert!(matches!(pose(arrival_ms, arrival_ms), Err(Rejected::Stamp { .. })), "{arrival_ms}");
+        assert!(matches!(pose(arrival_ms, arrival_ms), Err(EventError::Stamp { .. })), "{arrival_ms}");
     }
     for arrival_ms in (10_220..10_400).step_by(10) {
         pose(arrival_ms, arrival_ms).unwrap();
@@ -154,7 +155,7 @@ fn the_ledger_is_exact_and_a_refused_datagram_leaves_no_trace_in_the_maps() {
             for body in [event.body.clone(), Body::End] {
                 let stranger = Event { source: 3, body, ..event.clone() };
                 let rejected = pipeline.step(&stranger).unwrap_err();
-                assert_eq!(rejected, Rejected::Source { source_index: 3, sensors: 1 });
+                assert_eq!(rejected, EventError::Source { source_index: 3, sensors: 1 });
             }
             assert_eq!(
                 pipeline.step(&Event { body: Body::Lost { cause: Cause::Queue, count: 2 }, ..event.clone() }),
@@ -233,10 +234,10 @@ fn scans_that_cannot_be_taken_say_why() {
         "scan with 6280 x, 6280 y, 6279 z and 6280 intensities: the four lengths must be equal"
     );
     let rejected = known.step(&event(2, Body::Scan(scan(50)))).unwrap_err();
-    assert_eq!(rejected, Rejected::Stamp { stamp_ns: 50, newest_ns: 50 });
+    assert_eq!(rejected, EventError::Stamp { stamp_ns: 50, newest_ns: 50 });
     for stamp_ns in [i64::MIN, -1, (1 << 62) + 1, i64::MAX] {
         let rejected = known.step(&event(2, Body::Scan(scan(stamp_ns)))).unwrap_err();
-        assert_eq!(rejected, Rejected::StampRange { stamp_ns });
+        assert_eq!(rejected, EventError::StampRange { stamp_ns });
     }
     assert_eq!(known.ledger().refused, [("scan_lengths", 1), ("stamp", 1), ("stamp_range", 4)].into());
     assert_eq!((known.ledger().received, known.ledger().decoded), (7, 1));
@@ -254,12 +255,12 @@ fn the_newest_pose_goes_with_the_map_and_bad_poses_do_not() {
     assert_eq!(pipeline.step(&event(0, Body::Scan(scan(10)))).unwrap().unwrap().map_from_ego, None);
     pipeline.step(&event(1, pose(20, 1.0, 5.0))).unwrap();
     for bad in [pose(30, f64::NAN, 5.0), pose(30, 1.0, f64::INFINITY)] {
-        assert_eq!(pipeline.step(&event(2, bad)), Err(Rejected::Pose { stamp_ns: 30 }));
+        assert_eq!(pipeline.step(&event(2, bad)), Err(EventError::Pose { stamp_ns: 30 }));
     }
     let mut squashed = EgoPose { stamp_ns: 30, map_from_ego: Isometry3::identity(), speed_mps: 0.0 };
     squashed.map_from_ego.rotation = UnitQuaternion::new_unchecked(Quaternion::new(0.5, 0.0, 0.0, 0.0));
-    assert_eq!(pipeline.step(&event(3, Body::EgoPose(squashed))), Err(Rejected::Pose { stamp_ns: 30 }));
-    assert_eq!(pipeline.step(&event(4, pose(20, 9.0, 9.0))), Err(Rejected::Stamp { stamp_ns: 20, newest_ns: 20 }));
+    assert_eq!(pipeline.step(&event(3, Body::EgoPose(squashed))), Err(EventError::Pose { stamp_ns: 30 }));
+    assert_eq!(pipeline.step(&event(4, pose(20, 9.0, 9.0))), Err(EventError::Stamp { stamp_ns: 20, newest_ns: 20 }));
     let map = pipeline.step(&event(5, Body::Scan(scan(25)))).unwrap().unwrap();
     // 5 ns on at 5 m/s.
     assert!((map.map_from_ego.unwrap().translation.x - 1.0 - 25e-9).abs() < 1e-12);
@@ -286,7 +287,7 @@ type Change<'a> = &'a dyn Fn(&mut VehicleConfig);
 
 #[test]
 fn a_configuration_that_cannot_work_names_key_value_and_what_is_allowed() {
-    let refuse = |change: Change| -> ConfigError {
+    let refuse = |change: Change| -> ConfigValueError {
         let mut config = config(None);
         change(&mut config);
         let calibrations = vec![None; config.sensors.len()];
@@ -304,7 +305,7 @@ fn a_configuration_that_cannot_work_names_key_value_and_what_is_allowed() {
     let others: [(&str, Change); 20] = [
         ("vehicle.sensor", &|c| c.sensors = vec![c.sensors[0].clone(); 33]),
         ("vehicle.sensor[0].elevations_deg", &|c| c.sensors[0].elevations_deg = vec![f32::NAN]),
-        ("vehicle.fusion.lead", &|c| c.fusion.lead = "roof".into()),
+        ("vehicle.fusion.reference_sensor", &|c| c.fusion.reference_sensor = "roof".into()),
         ("vehicle.fusion.deadline_ms", &|c| c.fusion.deadline_ms = 0),
         ("vehicle.body.x_m_max", &|c| c.body = body(-1.0, 1.5)),
         ("vehicle.body.z_m_max", &|c| c.body = body(3.0, f32::NAN)),
@@ -406,7 +407,7 @@ fn a_layer_that_nobody_wants_is_neither_made_nor_in_a_map_and_comes_with_the_nex
     for (number, (want, has)) in (1..).zip(steps) {
         let event = event(number, Body::Scan(scan(100_000_000 * number as i64)));
         let expected = everything.step(&event).unwrap().unwrap();
-        wanted.want(|layer| want.contains(&layer));
+        wanted.set_active_layers(|layer| want.contains(&layer));
         let map = wanted.step(&event).unwrap().unwrap();
         assert_eq!(names(map), has);
         assert_eq!((map.sequence, &map.sensors), (expected.sequence, &expected.sensors));
@@ -426,10 +427,10 @@ fn roughness_is_measured_again_when_terrain_is_wanted_again() {
     let events = drive();
     let roughness = |maps: &[Map]| maps.last().unwrap().layers.iter().find(|layer| layer.name == "terrain").cloned();
     let mut late = pipeline(Some(Model::Vlp16));
-    late.want(|_| false);
+    late.set_active_layers(|_| false);
     let half = events.len() / 2;
     assert!(maps(&mut late, &events[..half]).iter().all(|map| map.layers.is_empty()));
-    late.want(|layer| layer == "terrain");
+    late.set_active_layers(|layer| layer == "terrain");
     let made = roughness(&maps(&mut late, &events[half..]));
     assert!(made.is_some());
     assert_eq!(made, roughness(&maps(&mut pipeline(Some(Model::Vlp16)), &events)));

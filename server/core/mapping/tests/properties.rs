@@ -141,7 +141,7 @@ proptest! {
         let scan = Scan { x, y, z, intensity: vec![0.0; points.len()], ..Scan::default() };
         let mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
         let mut sweep = Sweep::default();
-        let dropped = sweep.take_scan(&scan, &Arc::new(Calibration::factory(Model::Vlp16)), &mount);
+        let dropped = sweep.set_scan(&scan, &Arc::new(Calibration::factory(Model::Vlp16)), &mount);
         let is_position = |p: &&[f32; 3]| p.iter().all(|v| v.abs() <= 1000.0);
         prop_assert_eq!(dropped as usize, points.len() - points.iter().filter(is_position).count());
         prop_assert!(sweep.x.iter().chain(&sweep.y).chain(&sweep.z).all(|v| v.is_finite()));

@@ -153,12 +153,12 @@ fn lines_of_a_lane_that_are_none_are_left_out_by_name_and_the_others_stand() {
 #[test]
 fn degrees_become_metres_as_on_the_ellipsoid() {
     // Lengths of a minute of latitude and longitude at 45° (Bowditch, table 7): 1852.2 m and 1314.2 m, to a decimetre.
-    let frame = LocalFrame::about(45.0, 7.0);
-    let [east, north] = frame.metres(45.0 + 0.5 / 60.0, 7.0);
+    let frame = LocalFrame::new(45.0, 7.0);
+    let [east, north] = frame.position_m(45.0 + 0.5 / 60.0, 7.0);
     assert!(east == 0.0 && (2.0 * north - 1852.2).abs() < 0.2, "{north}");
-    let [east, north] = frame.metres(45.0, 7.0 + 1.0 / 60.0);
+    let [east, north] = frame.position_m(45.0, 7.0 + 1.0 / 60.0);
     assert!(north == 0.0 && (east - 1314.2).abs() < 0.2, "{east}");
-    assert_eq!(LocalFrame::about(-33.0, 151.0).metres(-33.0, 151.0), [0.0, 0.0]);
+    assert_eq!(LocalFrame::new(-33.0, 151.0).position_m(-33.0, 151.0), [0.0, 0.0]);
 }
 
 fn network(path: &str) -> Rndf {
@@ -192,7 +192,7 @@ fn the_lanes_of_real_networks_are_read_whole() {
 fn a_vehicle_on_a_real_lane_has_that_lane_painted_as_wide_as_the_file_says() {
     use clearway_mapping::config::{Bonus, SpeedConfig};
     use clearway_mapping::layer::{Context, LayerMaker};
-    use clearway_mapping::road::TakenRoad;
+    use clearway_mapping::road::StoredRoad;
     use clearway_mapping::layer::speed::Speed;
     use clearway_mapping::layer::speed::class::SpeedClass;
 
@@ -215,7 +215,7 @@ fn a_vehicle_on_a_real_lane_has_that_lane_painted_as_wide_as_the_file_says() {
             nalgebra::vector![(ax + bx) / 2.0, (ay + by) / 2.0, 200.0],
             nalgebra::vector![0.0, 0.0, (by - ay).atan2(bx - ax)],
         );
-        let taken = TakenRoad { road, map_from_ego: None };
+        let taken = StoredRoad { road, map_from_ego: None };
         let context = Context { road: Some(&taken), map_from_ego: Some(pose), ..Context::default() };
         map.make(&sweep, &context, &mut layer);
         let (rows, columns) = common::size(&layer);

@@ -276,7 +276,7 @@ fn real_streets_have_paths_both_ways() {
         // The vehicle's own bonnet returns from (2.5, ±0.5, 0.8) m in these scans: it is no obstacle.
         let mount = Mount { ego_from_sensor: nalgebra::Isometry3::translation(0.0, 0.0, 1.73), range_m_min: 2.0 };
         let mut sweep = Sweep::default();
-        sweep.take_scan(&scan, &std::sync::Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount);
+        sweep.set_scan(&scan, &std::sync::Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount);
         let (_, layer) = make(&sweep, &SafePathConfig::default());
         let reach = |most: fn(f64, f64) -> f64| layer.points.iter().map(|point| point.x_m).fold(0.0, most);
         println!("{frame}: {:?} x {} to {} m", layer.metrics, reach(f64::min), reach(f64::max));

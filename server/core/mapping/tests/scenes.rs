@@ -37,7 +37,7 @@ fn turn(scene: Scene) -> Turn {
     let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
     let turn = SimulatedVehicle::new(scene, config).true_revolution(1);
     let mut sweep = Sweep::default();
-    sweep.take_revolution(&turn.revolution, &mount);
+    sweep.set_revolution(&turn.revolution, &mount);
     Turn { sweep, truth: turn.truth }
 }
 

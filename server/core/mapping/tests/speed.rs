@@ -6,7 +6,7 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::{Bonus, SpeedConfig};
 use clearway_mapping::event::{Road, RoadFrame, RoadPurpose};
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
-use clearway_mapping::road::{self, TakenRoad};
+use clearway_mapping::road::{self, StoredRoad};
 use clearway_mapping::layer::speed::painting::{NO_ROAD, Painter, edge_points};
 use clearway_mapping::layer::speed::class::{SPEED_SCALE_MPS, SpeedClass};
 use clearway_mapping::layer::speed::{Speed, gates};
@@ -39,14 +39,14 @@ fn road(points: Vec<[f64; 2]>, widths_m: Vec<f64>) -> Road {
     Road { stamp_ns: 0, purpose, frame, points, widths_m, orientations: Vec::new() }
 }
 
-fn route(points: Vec<[f64; 2]>) -> TakenRoad {
+fn route(points: Vec<[f64; 2]>) -> StoredRoad {
     let widths_m = vec![10.0; points.len()];
     taken(Road { purpose: RoadPurpose::Route, ..road(points, widths_m) })
 }
 
-fn taken(road: Road) -> TakenRoad {
+fn taken(road: Road) -> StoredRoad {
     road::check(&road).unwrap();
-    TakenRoad { road, map_from_ego: None }
+    StoredRoad { road, map_from_ego: None }
 }
 
 fn fine(bonus: Bonus) -> SpeedConfig {
@@ -287,7 +287,7 @@ fn a_road_stays_where_it_was_seen_while_the_vehicle_drives_on() {
     let (sweep, config) = (level(), fine(Bonus::Uniform));
     let pose = |x, y, yaw| nalgebra::Isometry3::new(nalgebra::vector![x, y, 0.0], nalgebra::vector![0.0, 0.0, yaw]);
     let across = road(vec![[6.0, -15.0], [6.0, 15.0]], vec![2.0; 2]);
-    let seen = TakenRoad { road: across, map_from_ego: Some(pose(100.0, 50.0, 0.0)) };
+    let seen = StoredRoad { road: across, map_from_ego: Some(pose(100.0, 50.0, 0.0)) };
     let now = |pose| {
         let context = Context { road: Some(&seen), map_from_ego: Some(pose), ..Context::default() };
         let layer = make(&config, &sweep, &context);

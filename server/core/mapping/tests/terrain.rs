@@ -7,7 +7,7 @@ mod common;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Form, TerrainConfig};
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
-use clearway_mapping::sensor::distance_series::Series;
+use clearway_mapping::sensor::distance_series::DistanceSeries;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_mapping::layer::terrain::Terrain;
 use clearway_mapping::layer::terrain::class::{ROUGHNESS, Shape, TerrainClass};
@@ -236,8 +236,8 @@ fn turn(scene: Scene) -> Sweep {
     let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
     let revolution = SimulatedVehicle::new(scene, config).true_revolution(1).revolution;
     let mut sweep = Sweep::default();
-    sweep.take_revolution(&revolution, &mount);
-    sweep.take_deviations(&revolution, &mount, &mut Series::default(), None);
+    sweep.set_revolution(&revolution, &mount);
+    sweep.set_deviations(&revolution, &mount, &mut DistanceSeries::default(), None);
     assert_eq!(sweep.deviation_m.len(), sweep.x.len());
     sweep
 }
@@ -294,7 +294,7 @@ fn no_flat_cell_of_the_simulated_worlds_holds_an_object() {
         let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
         let turn = SimulatedVehicle::new(scene, config).true_revolution(1);
         let mut sweep = Sweep::default();
-        sweep.take_revolution(&turn.revolution, &mount);
+        sweep.set_revolution(&turn.revolution, &mount);
         let [wrong, flat, found] = [Form::Grid, Form::Paper, Form::Grounded].map(|f| {
             let layer = terrain(&sweep, &form(f));
             let mut high = vec![false; classes(&layer).len()];
@@ -332,7 +332,7 @@ fn ground_behind_a_closed_fence_or_a_low_beam_is_flat_but_not_reached() {
         let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
         let turn = SimulatedVehicle::new(scene, config).true_revolution(1);
         let mut sweep = Sweep::default();
-        sweep.take_revolution(&turn.revolution, &mount);
+        sweep.set_revolution(&turn.revolution, &mount);
         let layer = terrain(&sweep, &TerrainConfig::default());
         let unreachable = |cell: usize| {
             let middle = |i: usize| (i as f64 + 0.5) * 0.25 - 50.0;

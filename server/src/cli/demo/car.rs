@@ -11,11 +11,14 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use clearway_client::{Client, ClientError};
-use clearway_sim::real_time::{LATE_MAX, RealTimeVehicle, Skipped};
+use clearway_sim::real_time::{Progress, RealTimeVehicle, Skipped};
 use clearway_sim::send::{Pace, Sent, Until, drive};
+
+use tokio::sync::watch;
 
 use super::DemoError;
 use super::rig::Rig;
+use crate::engine::Newest;
 use crate::ingest::now_ns;
 
 /// A car that drives until it is stopped.
@@ -34,11 +37,16 @@ pub fn address(index: usize) -> Ipv4Addr {
 
 impl Car {
     /// Starts the car. Datagrams go to `data` and `telemetry`; if the rig has plane units, their scans, poses and roads
-    /// go to `grpc`.
+    /// go to `grpc`. The car waits for a server whose `newest` map is late.
     ///
     /// # Errors
     /// The operating system's error if it starts no thread.
-    pub fn start(rig: Rig, (data, telemetry): (SocketAddr, SocketAddr), grpc: SocketAddr) -> std::io::Result<Self> {
+    pub fn start(
+        rig: Rig,
+        (data, telemetry): (SocketAddr, SocketAddr),
+        grpc: SocketAddr,
+        newest: &watch::Receiver<Newest>,
+    ) -> std::io::Result<Self> {
         let halt = Arc::new(AtomicBool::new(false));
         let mut skipped = Vec::new();
         let mut new_skipped = || {
@@ -48,14 +56,14 @@ impl Car {
         let observer = if rig.units.is_empty() {
             None
         } else {
-            let (rig, halt, skipped) = (rig.clone(), halt.clone(), new_skipped());
+            let (rig, halt, skipped, progress) = (rig.clone(), halt.clone(), new_skipped(), progress(newest));
             let runtime = tokio::runtime::Handle::current();
-            let observe = move || runtime.block_on(observe(rig, grpc, halt, skipped));
+            let observe = move || runtime.block_on(observe(rig, grpc, halt, progress, skipped));
             Some(std::thread::Builder::new().name("simulated car".into()).spawn(observe)?)
         };
         let several = rig.scanners.len() > 1;
         let mut start = |(index, (name, _)): (usize, &(String, _))| {
-            let vehicle = RealTimeVehicle::new(rig.vehicle(index), now_ns, new_skipped());
+            let vehicle = RealTimeVehicle::new(rig.vehicle(index), progress(newest), new_skipped());
             let own = if several { address(index) } else { Ipv4Addr::UNSPECIFIED };
             let halt = halt.clone();
             std::thread::Builder::new().name(format!("simulated {name}")).spawn(move || {
@@ -100,18 +108,31 @@ impl Car {
     }
 }
 
+/// The clock, and the newest map's time.
+fn progress(newest: &watch::Receiver<Newest>) -> impl Fn() -> Progress + Send + 'static {
+    let newest = newest.clone();
+    move || Progress { now_ns: now_ns(), mapped_ns: newest.borrow().as_ref().map(|map| map.capture_end_ns) }
+}
+
 /// Sends each observation at the time of its stamp. Scans that are too late are skipped, not simulated.
-async fn observe(rig: Rig, grpc: SocketAddr, halt: Arc<AtomicBool>, skipped: Skipped) -> Result<(), ClientError> {
+async fn observe(
+    rig: Rig,
+    grpc: SocketAddr,
+    halt: Arc<AtomicBool>,
+    progress: impl Fn() -> Progress,
+    skipped: Skipped,
+) -> Result<(), ClientError> {
     let mut ingester = Client::connect(&grpc.to_string()).await?.ingest("car").await?;
     let mut observations = rig.observations();
+    let mut sent_ns = None;
     while !halt.load(Ordering::Relaxed) {
-        let now_ns = now_ns();
-        if now_ns - observations.next_stamp_ns() > LATE_MAX.as_nanos() as i64 {
-            skipped.add(observations.skip_scans_to(now_ns));
+        if let Some(target_ns) = progress().skip_target_ns(observations.next_stamp_ns(), sent_ns) {
+            skipped.add(observations.skip_scans_to(target_ns));
         }
         let Some(observation) = observations.next() else { break };
-        let early_ns = u64::try_from(observation.stamp_ns - crate::ingest::now_ns()).unwrap_or(0);
+        let early_ns = u64::try_from(observation.stamp_ns - now_ns()).unwrap_or(0);
         tokio::time::sleep(Duration::from_nanos(early_ns)).await;
+        sent_ns = Some(observation.stamp_ns);
         ingester.send(observation.observation).await?;
     }
     Ok(())

@@ -119,8 +119,11 @@ pub async fn demo(
         notes,
     });
     let udp = running.doors[0].udp.unwrap_or((nowhere, nowhere));
+    let served = running.vehicles.0[0].clone();
+    // The picture and the line need this layer, whether anyone else reads it or not.
+    let _subscription = served.status.demand.take(&["drivability".to_owned()]);
     // The car starts after everything else, so that its first firing is now.
-    let car = Car::start(rig(now_ns()), udp, running.grpc.unwrap_or(nowhere))?;
+    let car = Car::start(rig(now_ns()), udp, running.grpc.unwrap_or(nowhere), &served.newest)?;
 
     let began = tokio::time::Instant::now();
     let end = async {

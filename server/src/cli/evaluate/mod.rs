@@ -17,7 +17,8 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig};
 use clearway_mapping::event::{Body, Event, Scan};
 use clearway_mapping::sensor::mount::{MountError, estimate};
-use clearway_mapping::pipeline::{Pipeline, Rejected};
+use clearway_mapping::error::EventError;
+use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 
 use crate::config::{Config, ConfigError};
@@ -101,14 +102,14 @@ pub enum EvaluateError {
     Config(#[from] ConfigError),
     /// A value of the maps' configuration cannot be used.
     #[error(transparent)]
-    Maps(#[from] clearway_mapping::config::ConfigError),
+    Maps(#[from] clearway_mapping::config::ConfigValueError),
     /// The pipeline does not take a scan.
     #[error("{}: {source}", scan.display())]
     Rejected {
         /// The scan.
         scan: PathBuf,
         /// Why.
-        source: Rejected,
+        source: EventError,
     },
 }
 

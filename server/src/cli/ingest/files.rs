@@ -11,7 +11,7 @@ use clearway_lidar::capture::{Capture, CaptureError};
 use clearway_mapping::event::{Road, RoadPurpose as Purpose};
 use clearway_mapping::road::rddf::Rddf;
 use clearway_mapping::road::rndf::Rndf;
-use clearway_mapping::road::{FOOT_M, LineRefused, LocalFrame};
+use clearway_mapping::road::{FOOT_M, LineError, LocalFrame};
 use clearway_mapping::scan_file::{read_bin, read_pcd};
 
 /// Datagrams of a drive in one observation, at most: 50 ms of an HDL-64E.
@@ -149,9 +149,9 @@ fn read_poses(text: &str) -> Result<Vec<(i64, Item)>> {
 }
 
 /// The route of an RDDF, or one lane of an RNDF to paint; and the lines that were left out.
-fn read_road(text: &str, ending: &str, options: &super::Options) -> (Result<Road>, Vec<LineRefused>) {
+fn read_road(text: &str, ending: &str, options: &super::Options) -> (Result<Road>, Vec<LineError>) {
     let frame = |of_file: Option<LocalFrame>| match options.origin {
-        Some([latitude, longitude]) => Some(LocalFrame::about(latitude, longitude)),
+        Some([latitude, longitude]) => Some(LocalFrame::new(latitude, longitude)),
         None => of_file,
     };
     if ending == "rddf" {

@@ -4,7 +4,6 @@ use std::path::PathBuf;
 
 use clearway_mapping::config::Extrinsics;
 use clearway_mapping::sensor::mount::{MountError, MountEstimate};
-use clearway_mapping::pipeline::model_name;
 use serde_json::{Value, json};
 
 use crate::ingest::files::Truncated;
@@ -56,7 +55,7 @@ impl Summary {
     pub fn to_json(&self) -> Value {
         let Snapshot { ledger, sensors, .. } = &self.snapshot;
         let sensors = sensors.iter().map(|sensor| {
-            let model = sensor.status.model.map(model_name);
+            let model = sensor.status.model.map(clearway_lidar::model::Model::as_str);
             json!({
                 "name": sensor.name, "model": model, "returns": sensor.status.returns, "rpm": sensor.status.rpm,
                 "revolutions": sensor.status.revolutions,
@@ -123,7 +122,7 @@ impl Summary {
         )];
         lines.extend(ledger.refused.iter().map(|(reason, n)| format!("  refused for {reason}: {n}")));
         for sensor in &snapshot.sensors {
-            let model = sensor.status.model.map_or("unknown model", model_name);
+            let model = sensor.status.model.map_or("unknown model", clearway_lidar::model::Model::as_str);
             let rpm = sensor.status.rpm.map_or(String::new(), |rpm| format!(", {rpm:.0} rpm"));
             let (revolutions, returns) = (sensor.status.revolutions, sensor.status.returns);
             lines.push(format!("{}: {model}{rpm}, {revolutions} revolutions, {returns} returns", sensor.name));

@@ -220,7 +220,7 @@ fn wait(socket: &Socket, stopped: &PipeReader) -> io::Result<bool> {
 
 #[cfg(test)]
 mod tests {
-    use clearway_mapping::pipeline::Ledger;
+    use clearway_mapping::ledger::Ledger;
 
     use super::*;
     use crate::config::{Config, Udp};

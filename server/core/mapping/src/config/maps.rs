@@ -2,7 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Allowed, ConfigError, OccupancyConfig, SpeedConfig, check, check_each};
+use crate::config::check::{Allowed, ConfigValueError, check, check_cells, check_columns, check_each};
+use crate::layer::occupancy::config::OccupancyConfig;
+use crate::layer::speed::config::SpeedConfig;
 
 /// Which maps are made, each in its own table. A map that is switched off costs nothing.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -60,7 +62,8 @@ impl Default for MotionConfig {
     }
 }
 
-/// Parameters of [`crate::layer::drivability`]; the thesis' value, or the reading's where the thesis has none, is the default.
+/// Parameters of [`crate::layer::drivability`]; the thesis' value, or the reading's where the thesis has none, is the
+/// default.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DrivabilityConfig {
@@ -291,7 +294,7 @@ impl MapsConfig {
     ///
     /// # Errors
     /// The first value that cannot be used.
-    pub fn validate(&self) -> Result<(), ConfigError> {
+    pub fn validate(&self) -> Result<(), ConfigValueError> {
         check(f64::from(self.valid_ms), 1.0..=60_000.0, || "vehicle.maps.valid_ms".into(), "1 to 60000")?;
         self.motion.validate("vehicle.maps.motion")?;
         self.drivability.validate("vehicle.maps.drivability")?;
@@ -304,7 +307,7 @@ impl MapsConfig {
 }
 
 impl MotionConfig {
-    fn validate(&self, at: &str) -> Result<(), ConfigError> {
+    fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
         let reach = f64::from(self.extrapolation_ms);
         check(reach, 0.0..=1000.0, || format!("{at}.extrapolation_ms"), "0 to 1000")?;
         check(f64::from(self.speed_age_ms), 0.0..=10_000.0, || format!("{at}.speed_age_ms"), "0 to 10000")
@@ -312,7 +315,7 @@ impl MotionConfig {
 }
 
 impl DrivabilityConfig {
-    fn validate(&self, at: &str) -> Result<(), ConfigError> {
+    fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
         let values = [
             ("range_m_max", self.range_m_max, RANGE),
             ("overhang_m", self.overhang_m, (0.5..=20.0, "0.5 to 20")),
@@ -331,7 +334,7 @@ impl DrivabilityConfig {
 }
 
 impl HeightDifferenceConfig {
-    fn validate(&self, at: &str) -> Result<(), ConfigError> {
+    fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
         let values = [
             ("range_m_max", self.range_m_max, RANGE),
             ("difference_m_max", self.difference_m_max, (0.01..=10.0, "0.01 to 10")),
@@ -342,7 +345,7 @@ impl HeightDifferenceConfig {
 }
 
 impl TerrainConfig {
-    fn validate(&self, at: &str) -> Result<(), ConfigError> {
+    fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
         let values = [
             // 2000 cells a side at most.
             ("range_m_max", self.range_m_max, (5.0..=100.0, "5 to 100")),
@@ -367,7 +370,7 @@ impl TerrainConfig {
 }
 
 impl SafePathConfig {
-    fn validate(&self, at: &str) -> Result<(), ConfigError> {
+    fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
         let values = [
             ("extent_m", self.extent_m, (5.0..=200.0, "5 to 200")),
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
@@ -383,20 +386,4 @@ impl SafePathConfig {
     }
 }
 
-/// 1000 cells a side keep a message of one-byte cells under 1 MB.
-pub(crate) fn check_cells(at: &str, extent_m: f32, cell_m: f32) -> Result<(), ConfigError> {
-    if extent_m / cell_m <= 500.0 {
-        return Ok(());
-    }
-    Err(ConfigError::new(format!("{at}.cell_m"), cell_m, "at least extent_m / 500"))
-}
-
 const RANGE: Allowed = (5.0..=200.0, "5 to 200");
-
-fn check_columns(at: &str, columns: u16) -> Result<(), ConfigError> {
-    if (8..=1440).contains(&columns) {
-        Ok(())
-    } else {
-        Err(ConfigError::new(format!("{at}.columns"), columns, "8 to 1440"))
-    }
-}

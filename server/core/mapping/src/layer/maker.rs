@@ -8,7 +8,7 @@ use nalgebra::Isometry3;
 use crate::layer::channel::Channel;
 use crate::layer::class::ClassInfo;
 use crate::layer::grid::Geometry;
-use crate::road::TakenRoad;
+use crate::road::StoredRoad;
 use crate::sensor::sweep::Sweep;
 
 /// One named grid of a map, with its channels.
@@ -75,9 +75,9 @@ pub struct Context<'a> {
     /// Ego frame in the world frame at `stamp_ns`; `None` if no pose is near enough.
     pub map_from_ego: Option<Isometry3<f64>>,
     /// Newest road to paint.
-    pub road: Option<&'a TakenRoad>,
+    pub road: Option<&'a StoredRoad>,
     /// Newest route.
-    pub route: Option<&'a TakenRoad>,
+    pub route: Option<&'a StoredRoad>,
 }
 
 /// The rays of one sensor's scan, for layers that collect evidence between two maps.

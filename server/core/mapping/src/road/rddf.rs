@@ -1,36 +1,37 @@
 //! RDDF, the route definition data file of DARPA's Grand Challenges.
 //!
-//! In: text, a row a line: `number, latitude, longitude, lateral offset, speed limit[, hour, minute, second]`, degrees,
-//! feet, miles an hour. Out: [`Rddf`], and from it the centre line as a [`Road`] in the map frame. A row that is none
-//! is left out and named; the others stand. `#` begins a comment.
+//! In: text with one row a line: `number, latitude, longitude, lateral offset, speed limit[, hour, minute, second]`, in
+//! degrees, feet and miles an hour. Out: [`Rddf`], and from it the centre line as a [`Road`] in the map frame. A row
+//! that cannot be read is left out and reported; the other rows are used. `#` begins a comment.
 
-use super::{FOOT_M, LineRefused, LocalFrame, latitude, longitude, number};
 use crate::event::{Road, RoadFrame, RoadPurpose};
+use crate::road::line::{FOOT_M, LineError, latitude, longitude, number};
+use crate::road::local_frame::LocalFrame;
 
-/// A mile an hour, metres a second.
+/// One mile an hour in metres a second.
 const MPH_MPS: f64 = 0.447_04;
 
 /// A route file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Rddf {
-    /// In the file's order.
+    /// The rows, in the order of the file.
     pub rows: Vec<Row>,
-    /// Rows left out.
-    pub refused: Vec<LineRefused>,
+    /// The rows that are left out.
+    pub refused: Vec<LineError>,
 }
 
 /// One waypoint of a route.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Row {
-    /// The file's number.
+    /// Number of the row in the file.
     pub number: u32,
-    /// Degrees.
+    /// Latitude, degrees.
     pub latitude_deg: f64,
-    /// Degrees.
+    /// Longitude, degrees.
     pub longitude_deg: f64,
-    /// From the centre line to the corridor's edge.
+    /// Distance from the centre line to the edge of the corridor, metres.
     pub lateral_offset_m: f64,
-    /// Speed limit; 0 where the file sets none.
+    /// Speed limit, m/s; 0 if the file sets none.
     pub speed_mps: f64,
 }
 
@@ -51,29 +52,29 @@ impl Rddf {
         rddf
     }
 
-    /// A map frame about the first row.
+    /// A local frame whose origin is the first row; `None` without rows.
     pub fn local_frame(&self) -> Option<LocalFrame> {
-        self.rows.first().map(|row| LocalFrame::about(row.latitude_deg, row.longitude_deg))
+        self.rows.first().map(|row| LocalFrame::new(row.latitude_deg, row.longitude_deg))
     }
 
-    /// The centre line with the corridor's widths, in a map frame about a place on Earth.
+    /// The centre line with the widths of the corridor, in a local frame.
     pub fn road(&self, frame: &LocalFrame, purpose: RoadPurpose, stamp_ns: i64) -> Road {
         Road {
             stamp_ns,
             purpose,
             frame: RoadFrame::Map,
-            points: self.rows.iter().map(|row| frame.metres(row.latitude_deg, row.longitude_deg)).collect(),
+            points: self.rows.iter().map(|row| frame.position_m(row.latitude_deg, row.longitude_deg)).collect(),
             widths_m: self.rows.iter().map(|row| 2.0 * row.lateral_offset_m).collect(),
             orientations: Vec::new(),
         }
     }
 }
 
-fn read_row(line: usize, row: &str, before: Option<&Row>) -> Result<Row, LineRefused> {
+fn read_row(line: usize, row: &str, before: Option<&Row>) -> Result<Row, LineError> {
     let mut fields = row.split(',');
     let at = |what| (line, what);
     let number_field = fields.next().unwrap_or("").trim();
-    let refused = |what, found: &str, allowed| LineRefused { line, what, found: found.to_owned(), allowed };
+    let refused = |what, found: &str, allowed| LineError { line, what, found: found.to_owned(), allowed };
     let count = number_field
         .parse::<u32>()
         .map_err(|_| refused("number", number_field, "a whole number from 0 to 4294967295"))?;
@@ -85,7 +86,7 @@ fn read_row(line: usize, row: &str, before: Option<&Row>) -> Result<Row, LineRef
             * number(at("lateral offset"), fields.next(), f64::MIN_POSITIVE..=1640.0, "more than 0, up to 1640 ft")?,
         speed_mps: MPH_MPS * number(at("speed"), fields.next(), 0.0..=300.0, "0 to 300 mph")?,
     };
-    // Both to the last digit: two rows at one place give the line no direction.
+    // Two rows at the same position give the line no direction.
     if before.is_some_and(|b| (b.latitude_deg, b.longitude_deg) == (row.latitude_deg, row.longitude_deg)) {
         return Err(refused("place", &format!("{}, {}", row.latitude_deg, row.longitude_deg), "not the row's before"));
     }

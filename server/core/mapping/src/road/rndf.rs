@@ -1,27 +1,29 @@
-//! RNDF, the route network definition file of DARPA's Urban Challenge: its lanes.
+//! The lanes of an RNDF, the route network definition file of DARPA's Urban Challenge.
 //!
-//! In: text, a keyword or waypoint a line, `/* comments */`, widths in feet. Out: [`Rndf`], and from each lane a
-//! [`Road`] in the map frame. A waypoint that is none, or a lane without two of them, is left out and named; the others
-//! stand. Exits, stops, checkpoints and zones are no part of a lane's shape and are passed over.
+//! In: text with one keyword or waypoint a line, `/* comments */`, and widths in feet. Out: [`Rndf`], and from each
+//! lane a [`Road`] in the map frame. A waypoint that cannot be read and a lane without two waypoints are left out and
+//! reported; the others are used. Exits, stops, checkpoints and zones do not change the shape of a lane and are
+//! ignored.
 
-use super::{FOOT_M, LineRefused, LocalFrame, latitude, longitude, number};
 use crate::event::{Road, RoadFrame, RoadPurpose};
+use crate::road::line::{FOOT_M, LineError, latitude, longitude, number};
+use crate::road::local_frame::LocalFrame;
 
-/// A network's lanes.
+/// The lanes of a road network.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Rndf {
-    /// In the file's order.
+    /// The lanes, in the order of the file.
     pub lanes: Vec<Lane>,
-    /// Lines left out; a lane left out stands under its first line.
-    pub refused: Vec<LineRefused>,
+    /// The lines that are left out. A lane that is left out is reported by its first line.
+    pub refused: Vec<LineError>,
 }
 
 /// One lane.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lane {
-    /// `segment.lane`, as in the file.
+    /// Name of the lane in the file: `segment.lane`.
     pub name: String,
-    /// Whole width; `None` where the file states none.
+    /// Whole width, metres; `None` if the file states none.
     pub width_m: Option<f64>,
     /// Latitude and longitude, degrees, in driving order.
     pub waypoints_deg: Vec<[f64; 2]>,
@@ -31,13 +33,13 @@ impl Rndf {
     /// Reads a whole file.
     pub fn read(text: &str) -> Self {
         let mut rndf = Self::default();
-        // The lane being read, and its first line.
+        // The lane that is being read, and the number of its first line.
         let mut open: Option<(usize, Lane)> = None;
         for (index, line) in without_comments(text).lines().enumerate() {
             let line_number = index + 1;
             let mut words = line.split_whitespace();
             let Some(keyword) = words.next() else { continue };
-            let taken = match (keyword, &mut open) {
+            let result = match (keyword, &mut open) {
                 ("lane", _) => {
                     rndf.close(open.take());
                     let name = words.next().unwrap_or("").to_owned();
@@ -54,12 +56,13 @@ impl Rndf {
                 }
                 _ => Ok(()),
             };
-            rndf.refused.extend(taken.err());
+            rndf.refused.extend(result.err());
         }
         rndf.close(open.take());
         rndf
     }
 
+    /// Adds a lane that has ended, or reports it if it has fewer than two waypoints.
     fn close(&mut self, lane: Option<(usize, Lane)>) {
         let Some((line, lane)) = lane else { return };
         if lane.waypoints_deg.len() >= 2 {
@@ -67,33 +70,37 @@ impl Rndf {
             return;
         }
         let found = format!("{} waypoint(s) of lane {}", lane.waypoints_deg.len(), lane.name);
-        self.refused.push(LineRefused { line, what: "lane", found, allowed: "2 waypoints or more" });
+        self.refused.push(LineError { line, what: "lane", found, allowed: "2 waypoints or more" });
     }
 
-    /// A map frame about the first lane's first waypoint.
+    /// A local frame whose origin is the first waypoint of the first lane; `None` without lanes.
     pub fn local_frame(&self) -> Option<LocalFrame> {
         let &[latitude_deg, longitude_deg] = self.lanes.first()?.waypoints_deg.first()?;
-        Some(LocalFrame::about(latitude_deg, longitude_deg))
+        Some(LocalFrame::new(latitude_deg, longitude_deg))
     }
 }
 
 impl Lane {
-    /// The lane as a road to paint, in a map frame about a place on Earth; as wide as the file says, else
-    /// `width_m_default`. `None` where neither is known.
+    /// The lane as a road to paint, in a local frame. Its width is that of the file, or else `width_m_default`; `None`
+    /// if neither is known.
     pub fn road(&self, frame: &LocalFrame, width_m_default: Option<f64>, stamp_ns: i64) -> Option<Road> {
         let width_m = self.width_m.or(width_m_default)?;
         Some(Road {
             stamp_ns,
             purpose: RoadPurpose::Paint,
             frame: RoadFrame::Map,
-            points: self.waypoints_deg.iter().map(|&[latitude, longitude]| frame.metres(latitude, longitude)).collect(),
+            points: self
+                .waypoints_deg
+                .iter()
+                .map(|&[latitude, longitude]| frame.position_m(latitude, longitude))
+                .collect(),
             widths_m: vec![width_m; self.waypoints_deg.len()],
             orientations: Vec::new(),
         })
     }
 }
 
-fn read_width(line: usize, field: Option<&str>, lane: &mut Lane) -> Result<(), LineRefused> {
+fn read_width(line: usize, field: Option<&str>, lane: &mut Lane) -> Result<(), LineError> {
     let feet = number((line, "lane_width"), field, f64::MIN_POSITIVE..=330.0, "more than 0, up to 330 ft")?;
     lane.width_m = Some(feet * FOOT_M);
     Ok(())
@@ -105,22 +112,22 @@ fn read_waypoint(
     latitude_field: Option<&str>,
     longitude_field: Option<&str>,
     lane: &mut Lane,
-) -> Result<(), LineRefused> {
-    // 1.2.3 is waypoint 3 of lane 1.2.
-    if id.rsplit_once('.').is_none_or(|(of, _)| of != lane.name) {
+) -> Result<(), LineError> {
+    // Waypoint 3 of lane 1.2 is written 1.2.3.
+    if id.rsplit_once('.').is_none_or(|(lane_name, _)| lane_name != lane.name) {
         let allowed = "a waypoint of the lane it stands in";
-        return Err(LineRefused { line, what: "waypoint", found: id.to_owned(), allowed });
+        return Err(LineError { line, what: "waypoint", found: id.to_owned(), allowed });
     }
-    let place = [latitude(line, latitude_field)?, longitude(line, longitude_field)?];
-    if lane.waypoints_deg.last() == Some(&place) {
-        let found = format!("{} {}", place[0], place[1]);
-        return Err(LineRefused { line, what: "place", found, allowed: "not the waypoint's before" });
+    let position = [latitude(line, latitude_field)?, longitude(line, longitude_field)?];
+    if lane.waypoints_deg.last() == Some(&position) {
+        let found = format!("{} {}", position[0], position[1]);
+        return Err(LineError { line, what: "place", found, allowed: "not the waypoint's before" });
     }
-    lane.waypoints_deg.push(place);
+    lane.waypoints_deg.push(position);
     Ok(())
 }
 
-/// The text with comments blanked; lines keep their numbers. A comment that is not closed ends with its line.
+/// The text without its comments; lines keep their numbers. A comment that is not closed ends with its line.
 fn without_comments(text: &str) -> String {
     let mut kept = String::with_capacity(text.len());
     for line in text.lines() {

@@ -1,37 +1,38 @@
-//! The distance series of each laser, and how far every measurement lies from its neighbours' (Neuhaus 2009 §2.5).
+//! The distance series of each laser, and how far each range deviates from its neighbours (Neuhaus 2009, section 2.5).
 //!
-//! In: one echo of a [`Revolution`]. Out: by slot, smoothed minus measured range, metres. A laser's series is its
-//! ranges of the revolution in time order; a missing return takes the last valid one's place, as the paper has it;
-//! smoothed is the mean of nine. Firings in which a laser had no turn (HDL-64E S1) are not part of its series. At the
-//! turn's two ends the mean is over what there is.
+//! In: one echo of a [`Revolution`]. Out: by slot, smoothed range minus measured range, metres. The series of a laser
+//! holds its ranges of the revolution in time order. A missing return is replaced by the last valid one, as in the
+//! paper. The smoothed range is the mean of nine ranges; at the two ends of the revolution it is the mean of those that
+//! exist. Firings in which a laser does not fire (HDL-64E S1) are not part of its series.
 
 use clearway_lidar::revolution::Revolution;
 
-/// Measurements to each side of the one that is smoothed: the paper's mean of nine.
+/// Number of ranges on each side of the smoothed one: Neuhaus 2009, section 2.5, takes the mean of nine.
 const REACH: usize = 4;
-/// Lasers that fire together: a block of a data packet has 32 returns.
+/// Number of lasers that fire together: a block of a data packet has 32 returns.
 const BANK: usize = 32;
 
-/// Series of one revolution after the other, reusing its buffers.
+/// Computes the distance series of one revolution after the other and reuses its buffers.
 #[derive(Clone, Debug, Default)]
-pub struct Series {
-    /// First slots of the firings of one bank.
+pub struct DistanceSeries {
+    /// First slots of the firings of one bank of lasers.
     firings: Vec<u32>,
-    /// Their ranges without a hole, firing by firing.
+    /// Ranges of these firings with missing returns replaced, firing by firing, metres.
     ranges: Vec<f32>,
+    /// Deviation by slot, metres.
     deviation_m: Vec<f32>,
 }
 
-impl Series {
-    /// Deviation of every slot of the first echo, `firing * lasers + laser`; NaN where there was no return, or where
-    /// the laser had none in the whole turn.
-    pub fn take(&mut self, revolution: &Revolution) -> &[f32] {
+impl DistanceSeries {
+    /// Deviation of every slot of the first echo, metres, by `firing * lasers + laser`; NaN for a slot without a
+    /// return.
+    pub fn deviations(&mut self, revolution: &Revolution) -> &[f32] {
         let range_m = revolution.echoes.first().map_or(&[][..], |echo| &echo.range_m[..]);
-        self.take_ranges(range_m, revolution.lasers);
+        self.compute(range_m, revolution.lasers);
         &self.deviation_m
     }
 
-    fn take_ranges(&mut self, range_m: &[f32], lasers: usize) {
+    fn compute(&mut self, range_m: &[f32], lasers: usize) {
         self.deviation_m.clear();
         self.deviation_m.resize(range_m.len(), f32::NAN);
         for first in (0..lasers).step_by(BANK) {
@@ -41,7 +42,7 @@ impl Series {
         }
     }
 
-    /// Every missing return takes the value of the last valid one of its laser; those before the first, its value.
+    /// Replaces each missing return by the last valid one of its laser; those before the first valid one by that one.
     fn fill_holes(&mut self, range_m: &[f32], lasers: usize, first: usize, width: usize) {
         self.firings.clear();
         self.ranges.clear();
@@ -83,13 +84,13 @@ mod tests {
     use super::*;
 
     fn deviations(range_m: &[f32], lasers: usize) -> Vec<f32> {
-        let mut series = Series::default();
-        series.take_ranges(range_m, lasers);
+        let mut series = DistanceSeries::default();
+        series.compute(range_m, lasers);
         series.deviation_m
     }
 
     #[test]
-    fn a_bump_deviates_from_the_mean_of_nine_and_a_missing_return_repeats_the_last() {
+    fn a_bump_deviates_from_the_mean_and_a_missing_return_repeats_the_last() {
         let mut ranges = vec![10.0f32; 20];
         ranges[10] = 9.1;
         ranges[14] = 0.0;
@@ -97,14 +98,14 @@ mod tests {
         assert!((found[10] - 0.8).abs() < 1e-5, "{found:?}");
         assert!((found[6] - -0.1).abs() < 1e-5 && found[5].abs() < 1e-5, "{found:?}");
         assert!(found[14].is_nan() && found[15].abs() < 1e-5, "{found:?}");
-        // At the end the mean is over five: 9.5 + 4 * 10.
+        // At the end the mean is that of five ranges: 9.5 and four times 10.
         ranges[19] = 9.5;
         assert!((deviations(&ranges, 1)[19] - 0.4).abs() < 1e-5);
     }
 
     #[test]
-    fn each_laser_has_its_own_series_and_firings_without_it_are_no_part_of_it() {
-        // 64 lasers; the upper bank fires in every third firing only, as an HDL-64E S1 does.
+    fn each_laser_has_a_series_of_the_firings_in_which_it_fires() {
+        // 64 lasers; the upper bank fires only in every third firing, as in an HDL-64E S1.
         let (lasers, firings) = (64, 30);
         let range = |firing: usize, laser: usize| 5.0 + laser as f32 + 0.01 * ((firing * 7 + laser * 3) % 11) as f32;
         let ranges: Vec<f32> = (0..lasers * firings)

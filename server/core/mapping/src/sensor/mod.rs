@@ -2,18 +2,22 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | [`pipeline`] | one sensor's events -> its newest scan |
-//! | [`rings`] | a scan's rings -> elevations of the lasers that drew them |
-//! | [`self_filter`] | returns on or behind the vehicle itself |
-//! | [`mount`] | first revolutions -> height, pitch and roll of a sensor nobody measured |
-//! | [`motion`] | ego poses, speed + revolution -> where the vehicle was at each firing |
-//! | [`sweep`] | revolution or scan + extrinsics -> [`sweep::Sweep`] in the ego frame |
-//! | [`distance_series`] | revolution -> how far each range lies from its laser's neighbouring ones |
+//! | `pipeline` | one sensor's events -> its newest scan |
+//! | `scan` | the newest scan of one sensor, as fusion and layers read it |
+//! | [`motion`] | ego poses, speed + revolution -> how the ego frame moved through it |
+//! | [`self_filter`] | return -> the reason to remove it, if it does not belong to the surroundings |
+//! | [`sweep`] | revolution or scan + mount -> [`sweep::Sweep`] in the ego frame |
+//! | [`distance_series`] | revolution -> how far each range deviates from its laser's neighbouring ranges |
+//! | `no_returns` | revolution -> directions of the rays without a return |
+//! | `rings` | scan with rings -> elevations of the lasers |
+//! | [`mount`] | first revolutions -> height, pitch and roll of a sensor whose mount is not measured |
 
 pub mod distance_series;
 pub mod motion;
 pub mod mount;
+mod no_returns;
 pub(crate) mod pipeline;
-pub(crate) mod rings;
+mod rings;
+pub(crate) mod scan;
 pub mod self_filter;
 pub mod sweep;

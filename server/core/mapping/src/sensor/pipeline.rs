@@ -1,401 +1,290 @@
-//! One sensor: from its events to its newest turn in the ego frame.
+//! One sensor: from its events to its newest scan in the ego frame.
 //!
-//! In: datagrams and scans of one sensor, what is known of the vehicle's motion. Out: [`Turn`], the newest revolution
-//! or scan as a [`Sweep`] at its own end, with the rays that came back with nothing where a map asks for them.
+//! In: the datagrams and scans of one sensor, and the motion of the vehicle. Out: [`SensorScan`], the newest revolution
+//! or scan with its points, and, if a layer needs them, with the directions of the rays without a return. The hops:
+//! datagram -> decoder -> revolution -> motion compensation and self filter -> [`SensorScan`].
 
 use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::{Partial, Revolution};
 use clearway_lidar::sensor::{Sensor, SensorStatus};
-use nalgebra::{Isometry3, Vector3};
 
-use crate::sensor::self_filter::Screen;
 use crate::config::{BodyConfig, SensorConfig};
+use crate::error::{EventError, check_newer, check_stamp_range};
 use crate::event::Scan;
-use crate::ledger::{Dropped, Ledger, Rejected};
-use crate::layer::{Rays, ScanExtras};
-use crate::map::{Part, SensorState};
-use crate::sensor::motion::{Compensation, KNOT_FIRINGS, Motion, Moved};
+use crate::event_time::EventTime;
+use crate::layer::ScanExtras;
+use crate::map::{Contribution, SensorState};
+use crate::sensor::distance_series::DistanceSeries;
+use crate::sensor::motion::{EgoTrajectory, Motion};
+use crate::sensor::no_returns::{find_no_returns, rotated};
 use crate::sensor::rings;
-use crate::sensor::distance_series::Series;
-use crate::sensor::sweep::{Mount, Sweep};
+use crate::sensor::scan::SensorScan;
+use crate::sensor::self_filter::{RemovedPoints, SelfFilter};
+use crate::sensor::sweep::Mount;
 
-/// When an event arrived.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Moment {
-    /// As the door read it.
-    pub arrival_ns: i64,
-    /// Event time of the vehicle: the sum of all steps forward from arrival to arrival. A host clock that is set back
-    /// does not turn it back.
-    pub event_ns: i64,
-}
-
-impl Moment {
-    /// The moment of the next event.
-    pub fn next(self, arrival_ns: i64) -> Self {
-        let step_ns = arrival_ns.saturating_sub(self.arrival_ns).max(0);
-        Self { arrival_ns, event_ns: self.event_ns.saturating_add(step_ns) }
-    }
-}
-
-/// A sensor's newest revolution or scan.
-#[derive(Default)]
-pub(crate) struct Turn {
-    pub start_ns: i64,
-    pub end_ns: i64,
-    /// When its last event came.
-    pub completed: Moment,
-    pub is_revolution: bool,
-    /// Ego frame at `end_ns`.
-    pub sweep: Sweep,
-    /// Directions, ego frame at `end_ns`.
-    pub no_returns: Vec<[f32; 3]>,
-    pub compensation: Compensation,
-    pub map_from_ego: Option<Isometry3<f64>>,
-    pub speed_mps: Option<f64>,
-    /// Its part in a map it contributes to.
-    pub state: SensorState,
-}
+/// Squared length of a no-return direction. Ours: senders round to single precision or coarser, and an error of a
+/// thousandth is one of length alone, which no layer uses.
+const SQUARED_UNIT: std::ops::RangeInclusive<f32> = 0.998..=1.002;
 
 /// One sensor of the vehicle.
-pub(crate) struct Intake {
+pub(crate) struct SensorPipeline {
     name: String,
-    sensor: Sensor,
+    decoder: Sensor,
     mount: Mount,
-    screen: Option<Screen>,
-    /// Of the lasers behind scans; `None` while nobody tells.
+    filter: Option<SelfFilter>,
+    /// Elevations of the lasers behind scan events; `None` until they are known.
     scan_calibration: Option<Arc<Calibration>>,
+    /// Stamp and event time of the newest accepted scan event, ns.
     newest_scan: Option<(i64, i64)>,
+    /// Number of accepted scan events.
     scans: u64,
+    /// Number of returns in all accepted scan events.
     scan_returns: u64,
-    /// Where a map asks for it.
-    series: Option<Series>,
-    wants_no_returns: bool,
-    moved: Moved,
-    unfit: u64,
-    pub ledger: Ledger,
-    /// Turns completed so far.
-    pub turns: u64,
-    pub turn: Turn,
+    /// `None` unless a layer needs the deviations.
+    series: Option<DistanceSeries>,
+    finds_no_returns: bool,
+    /// How the vehicle moved through the newest scan.
+    trajectory: EgoTrajectory,
+    /// Number of packets that [`SensorPipeline::drain_unfit`] has returned.
+    unfit_drained: u64,
 }
 
-impl Intake {
+impl SensorPipeline {
+    /// A sensor without events; `body` is the vehicle's own box.
     pub fn new(
         config: &SensorConfig,
         calibration: Option<Calibration>,
         body: Option<&BodyConfig>,
-        wanted: ScanExtras,
+        extras: ScanExtras,
     ) -> Self {
-        let ego_from_sensor = config.extrinsics.ego_from_sensor();
-        let place = ego_from_sensor.translation;
         let configured = (!config.elevations_deg.is_empty())
             .then(|| rings::table(config.elevations_deg.iter().map(|degrees| f64::from(*degrees).to_radians())));
         let factory = || config.model.map(Calibration::factory);
+        let mount = Mount { ego_from_sensor: config.extrinsics.ego_from_sensor(), range_m_min: config.range_m_min };
         Self {
             name: config.name.clone(),
             scan_calibration: calibration.clone().or_else(factory).or(configured).map(Arc::new),
-            sensor: Sensor::new(config.lidar(calibration)),
-            screen: Screen::new(body, [place.x, place.y, place.z].map(|metres| metres as f32), &config.blind_deg),
-            mount: Mount { ego_from_sensor, range_m_min: config.range_m_min },
+            decoder: Sensor::new(config.lidar(calibration)),
+            filter: SelfFilter::new(body, mount.origin_m(), &config.blind_deg),
+            mount,
             newest_scan: None,
             scans: 0,
             scan_returns: 0,
-            series: wanted.deviations.then(Series::default),
-            wants_no_returns: wanted.no_returns,
-            moved: Moved::default(),
-            unfit: 0,
-            ledger: Ledger::default(),
-            turns: 0,
-            turn: Turn::default(),
+            series: extras.deviations.then(DistanceSeries::default),
+            finds_no_returns: extras.no_returns,
+            trajectory: EgoTrajectory::default(),
+            unfit_drained: 0,
         }
     }
 
-    pub fn name(&self) -> &str {
-        &self.name
+    /// Position of the sensor, ego frame, metres.
+    pub fn origin_m(&self) -> [f32; 3] {
+        self.mount.origin_m()
     }
 
-    /// What the maps want of the turns from now on.
-    pub fn want(&mut self, wanted: ScanExtras) {
-        match (&self.series, wanted.deviations) {
-            (None, true) => self.series = Some(Series::default()),
-            (Some(_), false) => self.series = None,
-            (None, false) | (Some(_), true) => {}
+    /// Sets what the layers need of the sensor's scans from now on; `scan` is its newest one.
+    pub fn set_extras(&mut self, extras: ScanExtras, scan: &mut SensorScan) {
+        if extras.deviations != self.series.is_some() {
+            self.series = extras.deviations.then(DistanceSeries::default);
         }
-        self.wants_no_returns = wanted.no_returns;
-        if !wanted.no_returns {
-            self.turn.no_returns.clear();
+        self.finds_no_returns = extras.no_returns;
+        if !extras.no_returns {
+            scan.no_returns.clear();
         }
     }
 
-    /// What the sensor has shown of itself; a scan counts as a revolution.
+    /// Status of the sensor, found from its data. A scan event counts as a revolution.
     pub fn status(&self) -> SensorStatus {
-        let mut status = self.sensor.status();
+        let mut status = self.decoder.status();
         status.revolutions += self.scans;
         status.returns += self.scan_returns;
         status
     }
 
-    /// The revolution behind the newest turn; `None` where that was a scan.
+    /// The newest revolution; `None` before the first.
     pub fn revolution(&self) -> Option<&Revolution> {
-        if self.turn.is_revolution { self.sensor.newest() } else { None }
+        self.decoder.newest()
     }
 
-    /// The newest turn as maps that gather evidence see it.
-    pub fn rays(&self, sensor: u16) -> Rays<'_> {
-        let place = self.mount.ego_from_sensor.translation;
-        Rays {
-            sensor,
-            stamp_ns: self.turn.end_ns,
-            returns: &self.turn.sweep,
-            origin_m: [place.x, place.y, place.z].map(|metres| metres as f32),
-            no_returns: &self.turn.no_returns,
-            map_from_ego: self.turn.map_from_ego,
-            speed_mps: self.turn.speed_mps,
-        }
+    /// Decodes a datagram. If it completes a revolution, writes the revolution to `scan` and returns what was removed
+    /// from it.
+    ///
+    /// # Errors
+    /// [`EventError::Datagram`] if the decoder refuses the datagram.
+    pub fn apply_datagram(
+        &mut self,
+        payload: &[u8],
+        scan: &mut SensorScan,
+        motion: &Motion,
+        now: EventTime,
+    ) -> Result<Option<RemovedPoints>, EventError> {
+        let is_complete = self.decoder.push(payload, now.arrival_ns)?.is_some();
+        Ok(if is_complete { self.apply_revolution(scan, motion, now) } else { None })
     }
 
-    /// Takes a datagram; the points left out of the turn it completed, if it completed one.
-    pub fn take_datagram(&mut self, payload: &[u8], motion: &Motion, now: Moment) -> Result<Option<Dropped>, Rejected> {
-        let completed = self.sensor.push(payload, now.arrival_ns)?.is_some();
-        Ok(if completed { self.take_revolution(motion, now) } else { None })
+    /// Ends the source: writes what is left of its revolution to `scan`, if anything is left.
+    pub fn finish(&mut self, scan: &mut SensorScan, motion: &Motion, now: EventTime) -> Option<RemovedPoints> {
+        self.decoder.finish()?;
+        self.apply_revolution(scan, motion, now)
     }
 
-    /// Packets that counted as decoded while they were held, and then were not of the model found.
-    pub fn count_unfit(&mut self) -> u64 {
-        let unfit = self.sensor.packets_unfit() - self.unfit;
-        self.unfit += unfit;
+    /// Number of packets that do not fit the model the decoder has found, although they were accepted before it was
+    /// found; since the last call.
+    pub fn drain_unfit(&mut self) -> u64 {
+        let unfit = self.decoder.packets_unfit() - self.unfit_drained;
+        self.unfit_drained += unfit;
         unfit
     }
 
-    /// The newest telemetry's GPRMC.
-    pub fn tell_speed(&self, motion: &mut Motion) {
-        if let Some(gprmc) = self.sensor.gprmc() {
-            motion.take_gprmc(gprmc, self.sensor.newest().map(|revolution| revolution.end_ns));
+    /// Passes the speed of the newest telemetry to the vehicle's motion.
+    pub fn apply_speed(&self, motion: &mut Motion) {
+        if let Some(gprmc) = self.decoder.gprmc() {
+            motion.apply_gprmc(gprmc, self.decoder.newest().map(|revolution| revolution.end_ns));
         }
     }
 
-    /// The source has ended: what is left of its turn.
-    pub fn finish(&mut self, motion: &Motion, now: Moment) -> Option<Dropped> {
-        self.sensor.finish()?;
-        self.take_revolution(motion, now)
-    }
-
-    fn take_revolution(&mut self, motion: &Motion, now: Moment) -> Option<Dropped> {
-        let revolution = self.sensor.newest()?;
-        let (turn, mount, screen) = (&mut self.turn, &self.mount, self.screen.as_ref());
-        motion.through(revolution, &mut self.moved);
-        let dropped = turn.sweep.take_revolution_around(revolution, mount, &self.moved.end_from_ego, screen);
+    fn apply_revolution(&mut self, scan: &mut SensorScan, motion: &Motion, now: EventTime) -> Option<RemovedPoints> {
+        let revolution = self.decoder.newest()?;
+        let (mount, filter) = (&self.mount, self.filter.as_ref());
+        motion.follow_revolution(revolution, &mut self.trajectory);
+        let removed = scan.sweep.set_moving_revolution(revolution, mount, &self.trajectory.end_from_ego, filter);
         if let Some(series) = &mut self.series {
-            turn.sweep.take_deviations(revolution, mount, series, screen);
+            scan.sweep.set_deviations(revolution, mount, series, filter);
         }
-        if self.wants_no_returns {
-            look_for_no_returns(revolution, mount, &self.moved, screen, &mut turn.no_returns);
+        if self.finds_no_returns {
+            find_no_returns(revolution, mount, &self.trajectory, filter, &mut scan.no_returns);
         }
-        turn.state = SensorState {
-            name: self.name.clone(),
-            model: crate::pipeline::model_name(revolution.model).to_owned(),
-            packets: revolution.packets,
-            packets_expected: revolution.packets_expected,
-            refused: 0,
-            returns: turn.sweep.returns,
-            rpm: revolution.rpm,
-            completeness: completeness(revolution),
-            partial: revolution.partial.map_or("", Partial::as_str),
-            state: if revolution.partial.is_some() { Part::Partial } else { Part::Ok },
-            age_ms: None,
-            blocked: revolution.blocked.clone(),
-            clock: revolution.clock.as_str(),
-            clock_offset_ms: revolution.clock_offset_ms,
-        };
-        (turn.start_ns, turn.end_ns, turn.is_revolution) = (revolution.start_ns, revolution.end_ns, true);
-        self.end_turn(motion, now);
-        Some(dropped)
+        scan.state = revolution_state(&self.name, revolution, scan.sweep.returns);
+        (scan.start_ns, scan.end_ns, scan.is_revolution) = (revolution.start_ns, revolution.end_ns, true);
+        self.complete(scan, motion, now);
+        Some(removed)
     }
 
-    /// Takes a scan. One not newer than the newest is refused, unless none came for `deadline_ns` of event time: then
-    /// the sensor has begun anew, or its clock was set back.
-    pub fn take_scan(
+    /// Writes a scan event to `newest` and returns what was removed from it. A scan that is not newer than the newest
+    /// one is refused, unless no scan was accepted for `deadline_ns` of event time: then the sender has restarted, or
+    /// its clock was set back. A repeated scan is always refused.
+    ///
+    /// # Errors
+    /// [`EventError::ScanLengths`], [`EventError::ScanList`], [`EventError::ScanOffset`], [`EventError::NoReturn`] or
+    /// [`EventError::StampRange`] if a value of the scan is not allowed; [`EventError::Stamp`] if the scan is not
+    /// newer.
+    pub fn apply_scan(
         &mut self,
         scan: &Scan,
+        newest: &mut SensorScan,
         motion: &Motion,
-        now: Moment,
+        now: EventTime,
         deadline_ns: i64,
-    ) -> Result<Dropped, Rejected> {
-        check(scan)?;
-        if let Some((newest_ns, taken_ns)) = self.newest_scan
-            && (scan.stamp_ns == newest_ns || now.event_ns.saturating_sub(taken_ns) <= deadline_ns)
+    ) -> Result<RemovedPoints, EventError> {
+        check_scan(scan)?;
+        if let Some((newest_ns, accepted_ns)) = self.newest_scan
+            && (scan.stamp_ns == newest_ns || now.event_ns.saturating_sub(accepted_ns) <= deadline_ns)
         {
-            Rejected::unless_newer(scan.stamp_ns, Some(newest_ns))?;
+            check_newer(scan.stamp_ns, Some(newest_ns))?;
         }
         self.newest_scan = Some((scan.stamp_ns, now.event_ns));
         if self.scan_calibration.is_none() {
             self.scan_calibration = rings::measured(scan).map(Arc::new);
         }
-        let turn = &mut self.turn;
-        motion.through_scan(scan, &mut self.moved);
-        let (calibration, moved) = (self.scan_calibration.as_ref(), &self.moved.end_from_ego);
-        let dropped = turn.sweep.take_scan_around(scan, calibration, &self.mount, moved, self.screen.as_ref());
-        turn.no_returns.clear();
-        if self.wants_no_returns {
-            let into_ego = |ray: &[f32; 3]| turned(&self.mount.ego_from_sensor, *ray);
-            let blind = |ray: &[f32; 3]| self.screen.as_ref().is_some_and(|screen| screen.blinds(*ray));
-            turn.no_returns.extend(scan.no_returns.iter().filter(|ray| !blind(ray)).map(into_ego));
+        motion.follow_scan(scan, &mut self.trajectory);
+        let (calibration, end_from_ego) = (self.scan_calibration.as_ref(), &self.trajectory.end_from_ego);
+        let removed = newest.sweep.set_moving_scan(scan, calibration, &self.mount, end_from_ego, self.filter.as_ref());
+        newest.no_returns.clear();
+        if self.finds_no_returns {
+            let to_ego = |ray: &[f32; 3]| rotated(&self.mount.ego_from_sensor, *ray);
+            let is_blind = |ray: &[f32; 3]| self.filter.as_ref().is_some_and(|filter| filter.is_blind(*ray));
+            newest.no_returns.extend(scan.no_returns.iter().filter(|ray| !is_blind(ray)).map(to_ego));
         }
-        turn.state = SensorState {
-            name: self.name.clone(),
-            model: "scan".to_owned(),
-            returns: turn.sweep.returns,
-            // Whoever assembled it knows its field of view.
-            completeness: 1.0,
-            state: Part::Ok,
-            clock: "sender",
-            clock_offset_ms: now.arrival_ns.saturating_sub(scan.stamp_ns) / 1_000_000,
-            ..SensorState::default()
-        };
-        let first = scan.offset_ns.iter().min().copied().unwrap_or(0);
-        (turn.start_ns, turn.end_ns) = (scan.stamp_ns.saturating_add(i64::from(first)), scan.stamp_ns);
-        turn.is_revolution = false;
-        (self.scans, self.scan_returns) = (self.scans + 1, self.scan_returns + u64::from(turn.sweep.returns));
-        self.end_turn(motion, now);
-        Ok(dropped)
+        newest.state = scan_state(&self.name, scan, newest.sweep.returns, now);
+        let first_ns = scan.offset_ns.iter().min().copied().unwrap_or(0);
+        newest.start_ns = scan.stamp_ns.saturating_add(i64::from(first_ns));
+        (newest.end_ns, newest.is_revolution) = (scan.stamp_ns, false);
+        (self.scans, self.scan_returns) = (self.scans + 1, self.scan_returns + u64::from(newest.sweep.returns));
+        self.complete(newest, motion, now);
+        Ok(removed)
     }
 
-    fn end_turn(&mut self, motion: &Motion, now: Moment) {
-        self.turn.completed = now;
-        self.turn.compensation = self.moved.compensation;
-        self.turn.speed_mps = self.moved.speed_mps;
-        self.turn.map_from_ego = motion.map_from_ego(self.turn.end_ns);
-        self.turns += 1;
+    fn complete(&self, scan: &mut SensorScan, motion: &Motion, now: EventTime) {
+        scan.completed_at = now;
+        scan.compensation = self.trajectory.compensation;
+        scan.speed_mps = self.trajectory.speed_mps;
+        scan.map_from_ego = motion.map_from_ego(scan.end_ns);
+        scan.completed += 1;
     }
 }
 
-fn check(scan: &Scan) -> Result<(), Rejected> {
+/// What a map states about the sensor of a revolution.
+fn revolution_state(name: &str, revolution: &Revolution, returns: u32) -> SensorState {
+    SensorState {
+        name: name.to_owned(),
+        model: revolution.model.as_str().to_owned(),
+        packets: revolution.packets,
+        packets_expected: revolution.packets_expected,
+        refused: 0,
+        returns,
+        rpm: revolution.rpm,
+        completeness: completeness(revolution),
+        partial: revolution.partial.map_or("", Partial::as_str),
+        contribution: if revolution.partial.is_some() { Contribution::Partial } else { Contribution::Ok },
+        age_ms: None,
+        blocked: revolution.blocked.clone(),
+        clock: revolution.clock.as_str(),
+        clock_offset_ms: revolution.clock_offset_ms,
+    }
+}
+
+/// What a map states about the sensor of a scan event.
+fn scan_state(name: &str, scan: &Scan, returns: u32, now: EventTime) -> SensorState {
+    SensorState {
+        name: name.to_owned(),
+        model: "scan".to_owned(),
+        returns,
+        // The sender alone can tell which part of its field of view is missing.
+        completeness: 1.0,
+        contribution: Contribution::Ok,
+        clock: "sender",
+        clock_offset_ms: now.arrival_ns.saturating_sub(scan.stamp_ns) / 1_000_000,
+        ..SensorState::default()
+    }
+}
+
+fn check_scan(scan: &Scan) -> Result<(), EventError> {
     let (x, y, z, intensity) = (scan.x.len(), scan.y.len(), scan.z.len(), scan.intensity.len());
     if x != y || x != z || x != intensity {
-        return Err(Rejected::ScanLengths { x, y, z, intensity });
+        return Err(EventError::ScanLengths { x, y, z, intensity });
     }
     for (list, length) in [("ring", scan.ring.len()), ("offset_ns", scan.offset_ns.len())] {
         if length != 0 && length != x {
-            return Err(Rejected::ScanList { list, length, points: x });
+            return Err(EventError::ScanList { list, length, points: x });
         }
     }
     if let Some(&offset_ns) = scan.offset_ns.iter().max().filter(|offset_ns| **offset_ns > 0) {
-        return Err(Rejected::ScanOffset { offset_ns });
+        return Err(EventError::ScanOffset { offset_ns });
     }
-    // Single precision, and whoever rounds it: a thousandth is 0.06 degrees of a direction's length alone. NaN is in no
-    // range.
-    let unit = |ray: &[f32; 3]| (0.998..=1.002).contains(&ray.iter().map(|v| v * v).sum::<f32>());
-    match scan.no_returns.iter().find(|ray| !unit(ray)) {
-        Some(&direction) => Err(Rejected::NoReturn { direction }),
-        None => Rejected::unless_in_range(scan.stamp_ns),
-    }
-}
-
-/// Directions of the firings' lasers that came back with nothing, but for those that are hidden, in place of what
-/// `no_returns` held. A laser is taken to fire with the first of its firing, 0.2 degrees off at most.
-fn look_for_no_returns(
-    revolution: &Revolution,
-    mount: &Mount,
-    moved: &Moved,
-    screen: Option<&Screen>,
-    no_returns: &mut Vec<[f32; 3]>,
-) {
-    no_returns.clear();
-    let Some(echo) = revolution.echoes.first() else { return };
-    let lasers: Vec<(f32, [f32; 2])> = (revolution.calibration.lasers.iter())
-        .map(|laser| {
-            (laser.rot_correction as f32, [laser.vert_correction.sin() as f32, laser.vert_correction.cos() as f32])
-        })
-        .collect();
-    for (number, (firing, range_m)) in revolution.firings.iter().zip(echo.range_m.chunks(revolution.lasers)).enumerate()
-    {
-        if !range_m.contains(&0.0) {
-            continue;
-        }
-        // The knot before: a turn of 1 rad/s errs by a milliradian.
-        let ego_from_sensor = moved
-            .end_from_ego
-            .get(number / KNOT_FIRINGS)
-            .map_or(mount.ego_from_sensor, |end_from_ego| end_from_ego * mount.ego_from_sensor);
-        let nothing = range_m.iter().zip(&lasers).enumerate().filter(|(_, (range, _))| **range == 0.0);
-        for (laser, (_, &(rotation, [up, flat]))) in nothing {
-            let azimuth_rad = firing.azimuth_rad - rotation;
-            let ray = direction(azimuth_rad, [up, flat]);
-            let blind = screen.is_some_and(|screen| screen.blinds(ray));
-            if !blind && !revolution.blocked.hides(laser, azimuth_rad) {
-                no_returns.push(turned(&ego_from_sensor, ray));
-            }
-        }
+    // NaN is in no range.
+    let is_unit = |ray: &[f32; 3]| SQUARED_UNIT.contains(&ray.iter().map(|v| v * v).sum::<f32>());
+    match scan.no_returns.iter().find(|ray| !is_unit(ray)) {
+        Some(&direction) => Err(EventError::NoReturn { direction }),
+        None => check_stamp_range(scan.stamp_ns),
     }
 }
 
-/// Of a laser with this sine and cosine of its elevation, sensor's frame; azimuths run clockwise.
-fn direction(azimuth_rad: f32, [up, flat]: [f32; 2]) -> [f32; 3] {
-    let (sin, cos) = azimuth_rad.sin_cos();
-    [flat * cos, -flat * sin, up]
-}
-
-fn turned(by: &Isometry3<f64>, direction: [f32; 3]) -> [f32; 3] {
-    let turned = by.rotation * Vector3::from(direction.map(f64::from));
-    [turned.x, turned.y, turned.z].map(|metres| metres as f32)
-}
-
-/// Share of the field of view's degrees in which a firing lies.
+/// Share of the degrees of the field of view in which a firing lies, 0 to 1.
 fn completeness(revolution: &Revolution) -> f32 {
     let mut seen = [false; 360];
     for firing in &revolution.firings {
         let degree = firing.azimuth_rad.to_degrees();
-        // `as` saturates, so an azimuth of exactly 2π (or a wild one) falls into the last degree.
+        // `as` saturates, so an azimuth of exactly 2π (or beyond) falls into the last degree.
         seen[(degree as usize).min(359)] = true;
     }
-    let dark = |degree: usize| {
+    let is_in_gap = |degree: usize| {
         revolution.dark_rad.is_some_and(|ends| {
             let [from_deg, to_deg] = ends.map(f32::to_degrees);
             (degree as f32 - from_deg).rem_euclid(360.0) + 1.0 <= (to_deg - from_deg).rem_euclid(360.0)
         })
     };
-    let lit = (0..360).filter(|&degree| seen[degree] || !dark(degree)).count();
-    seen.iter().filter(|s| **s).count() as f32 / lit.max(1) as f32
-}
-
-#[cfg(test)]
-mod tests {
-    use clearway_lidar::model::Model;
-    use clearway_sim::scanner::ScannerConfig;
-    use clearway_sim::scenes;
-    use clearway_sim::vehicle::SimulatedVehicle;
-
-    use super::*;
-
-    #[test]
-    fn a_ray_without_a_return_points_where_its_laser_did() {
-        let config = ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() };
-        let revolution = SimulatedVehicle::new(scenes::flat(), config).revolution(1);
-        let echo = &revolution.echoes[0];
-        let at = |slot: usize| (slot / revolution.lasers, slot % revolution.lasers);
-        let mut checked = 0;
-        for slot in (0..echo.range_m.len()).filter(|slot| echo.range_m[*slot] > 5.0) {
-            let (firing, laser) = at(slot);
-            let laser = &revolution.calibration.lasers[laser];
-            let elevation = [laser.vert_correction.sin() as f32, laser.vert_correction.cos() as f32];
-            let ray = direction(revolution.firings[firing].azimuth_rad - laser.rot_correction as f32, elevation);
-            let along = [echo.x[slot], echo.y[slot], echo.z[slot]].iter().zip(ray).map(|(p, r)| p * r).sum::<f32>();
-            // Half a degree.
-            assert!(along / echo.range_m[slot] > 0.99996, "slot {slot}");
-            checked += 1;
-        }
-        assert!(checked > 5000);
-        let turned = Isometry3::new(Vector3::new(0.0, 0.0, 1.9), Vector3::new(0.0, 0.0, std::f64::consts::FRAC_PI_2));
-        let (mut level, mut left) = (Vec::new(), Vec::new());
-        let mut mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
-        look_for_no_returns(&revolution, &mount, &Moved::default(), None, &mut level);
-        mount.ego_from_sensor = turned;
-        look_for_no_returns(&revolution, &mount, &Moved::default(), None, &mut left);
-        assert_eq!(level.len(), echo.range_m.iter().filter(|range| **range == 0.0).count());
-        assert!(level.len() > 10_000 && level.iter().any(|ray| ray[2] > 0.2), "the sky gives nothing back");
-        for (level, left) in level.iter().zip(&left) {
-            assert!((level[0] - left[1]).abs() < 1e-5 && (level[1] + left[0]).abs() < 1e-5 && level[2] == left[2]);
-        }
-    }
+    let in_view = (0..360).filter(|&degree| seen[degree] || !is_in_gap(degree)).count();
+    seen.iter().filter(|seen| **seen).count() as f32 / in_view.max(1) as f32
 }

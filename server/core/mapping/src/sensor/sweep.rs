@@ -1,9 +1,9 @@
-//! The points of one turn in the ego frame.
+//! The points of one scan in the ego frame.
 //!
-//! In: a [`Revolution`] or [`Scan`] in the sensor's frame, how the sensor is mounted, how the vehicle moved, and where
-//! the vehicle itself is. Out: a [`Sweep`], only returns of the surroundings, ego frame at the turn's last firing,
-//! metres, with what the grid's rows follow from. Compaction, motion and transform are one pass; each firing has one
-//! rigid transform.
+//! In: a [`Revolution`] or [`Scan`] in the sensor frame, how the sensor is mounted, how the vehicle moved, and the self
+//! filter. Out: a [`Sweep`]: the returns of the surroundings, ego frame at the last firing, metres, and what the rows
+//! of radial maps depend on. Compaction, motion compensation and transform are one pass; each firing has one rigid
+//! transform.
 
 use std::sync::Arc;
 
@@ -11,64 +11,71 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
 use nalgebra::Isometry3;
 
-use crate::sensor::self_filter::{Hidden, Screen};
 use crate::event::Scan;
-use crate::ledger::Dropped;
+use crate::sensor::distance_series::DistanceSeries;
 use crate::sensor::motion::{ScanKnots, knots};
-use crate::sensor::distance_series::Series;
+use crate::sensor::self_filter::{FilterReason, RemovedPoints, SelfFilter};
 
-/// No sensor of the family reaches half as far; a coordinate beyond is not a position.
+/// Greatest coordinate of a position, metres. Ours: no sensor of the family reaches half as far.
 const POSITION_M_MAX: f32 = 1000.0;
 
-/// How a sensor sits on its vehicle.
+/// How a sensor is mounted on its vehicle.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mount {
-    /// Carries points of the sensor's frame into the ego frame.
+    /// Transform from the sensor frame to the ego frame.
     pub ego_from_sensor: Isometry3<f64>,
-    /// Returns nearer to the sensor are the vehicle itself and are dropped.
+    /// Least range of a return, metres. Nearer returns are the vehicle itself and are removed.
     pub range_m_min: f32,
 }
 
-/// Points of one turn, ego frame, metres; both echoes of a dual return. Same index, same point.
+impl Mount {
+    /// Position of the sensor, ego frame, metres.
+    pub fn origin_m(&self) -> [f32; 3] {
+        let origin = self.ego_from_sensor.translation;
+        [origin.x, origin.y, origin.z].map(|metres| metres as f32)
+    }
+}
+
+/// Points of one scan or of one map, ego frame; both echoes of a dual return. The arrays have one entry a point.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Sweep {
-    /// Forward.
+    /// Distance forward of the ego origin, metres.
     pub x: Vec<f32>,
-    /// Left.
+    /// Distance to the left of the ego origin, metres.
     pub y: Vec<f32>,
-    /// Up, over the ground under the vehicle.
+    /// Height over the ground under the vehicle, metres.
     pub z: Vec<f32>,
-    /// How far each range lies from the mean of its laser's neighbouring ones, metres (NaN: not known); empty unless
-    /// [`Sweep::take_deviations`] filled it.
+    /// Deviation of each range from the mean of its laser's neighbouring ranges, metres; NaN if it is unknown. Empty
+    /// until [`Sweep::set_deviations`] fills it.
     pub deviation_m: Vec<f32>,
-    /// Returns of the turn before those of the vehicle itself were dropped.
+    /// Number of returns before the vehicle's own were removed.
     pub returns: u32,
-    /// Elevations of the lasers the rows of radial maps come from; `None` where nobody knows them: those maps are
-    /// unknown.
+    /// Elevations of the lasers that define the rows of radial maps; `None` if they are unknown. Then all cells of
+    /// radial maps are unknown.
     pub calibration: Option<Arc<Calibration>>,
-    /// Height of the sensor over the ground.
+    /// Height of the sensor over the ground, metres.
     pub mount_height_m: f32,
 }
 
 impl Sweep {
-    /// Fills the sweep from a revolution of a vehicle at rest, in place of what it held.
-    pub fn take_revolution(&mut self, revolution: &Revolution, mount: &Mount) {
-        self.take_revolution_around(revolution, mount, &[], None);
+    /// Replaces the points by those of a revolution of a vehicle at rest, without a self filter.
+    pub fn set_revolution(&mut self, revolution: &Revolution, mount: &Mount) {
+        self.set_moving_revolution(revolution, mount, &[], None);
     }
 
-    /// Fills the sweep from a revolution, in place of what it held; `end_from_ego` is
-    /// [`crate::sensor::motion::Moved::end_from_ego`] of this revolution, or empty to leave the points where they were seen.
-    /// Returns that the vehicle's own body or a blind sector hides are left out; gives how many those are.
-    pub fn take_revolution_around(
+    /// Replaces the points by those of a revolution and returns the number of points that the filter removed.
+    /// `end_from_ego` is [`crate::sensor::motion::EgoTrajectory::end_from_ego`] of this revolution; if it is empty, the
+    /// points are not moved.
+    pub fn set_moving_revolution(
         &mut self,
         revolution: &Revolution,
         mount: &Mount,
         end_from_ego: &[Isometry3<f64>],
-        screen: Option<&Screen>,
-    ) -> Dropped {
-        match screen {
+        filter: Option<&SelfFilter>,
+    ) -> RemovedPoints {
+        match filter {
             None => self.fill(revolution, mount, end_from_ego, |_| None),
-            Some(screen) => self.fill(revolution, mount, end_from_ego, hides(mount, screen)),
+            Some(filter) => self.fill(revolution, mount, end_from_ego, check(mount, filter)),
         }
     }
 
@@ -77,18 +84,18 @@ impl Sweep {
         revolution: &Revolution,
         mount: &Mount,
         end_from_ego: &[Isometry3<f64>],
-        hides: impl Fn([f32; 3]) -> Option<Hidden>,
-    ) -> Dropped {
+        check: impl Fn([f32; 3]) -> Option<FilterReason>,
+    ) -> RemovedPoints {
         self.prepare(Some(&revolution.calibration), mount);
         let at_rest = Transform::new(&mount.ego_from_sensor);
         let moving = transforms(mount, end_from_ego);
         let slots: usize = revolution.echoes.iter().map(|echo| echo.range_m.len()).sum();
-        self.open(slots);
+        self.reserve(slots);
         let mut kept = 0;
         let mut returns = 0;
-        let mut dropped = Dropped::default();
+        let mut removed = RemovedPoints::default();
         for echo in &revolution.echoes {
-            let mut take = |slots: std::ops::Range<usize>, transform: Transform| {
+            let mut push = |slots: std::ops::Range<usize>, transform: Transform| {
                 let n = slots.len();
                 let range_m = &echo.range_m[slots.clone()][..n];
                 let (x, y, z) = (&echo.x[slots.clone()][..n], &echo.y[slots.clone()][..n], &echo.z[slots][..n]);
@@ -96,39 +103,39 @@ impl Sweep {
                     let range = range_m[i];
                     let [ex, ey, ez] = transform.apply(x[i], y[i], z[i]);
                     (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
-                    // Not fired is NaN and no return is 0: neither passes. Written always, kept by moving on: no
-                    // branch.
+                    // A slot that has not fired is NaN, one without a return is 0: neither is kept. Every slot is
+                    // written, and `kept` advances past those that are kept, so that the loop has no branch.
                     returns += u32::from(range > 0.0);
-                    let far = range > 0.0 && range >= mount.range_m_min;
-                    let hidden = hides([x[i], y[i], z[i]]).filter(|_| far);
-                    dropped.count(hidden);
-                    kept += usize::from(far && hidden.is_none());
+                    let is_far = range > 0.0 && range >= mount.range_m_min;
+                    let reason = check([x[i], y[i], z[i]]).filter(|_| is_far);
+                    removed.count(reason);
+                    kept += usize::from(is_far && reason.is_none());
                 }
             };
             if moving.is_empty() {
-                take(0..echo.range_m.len(), at_rest);
+                push(0..echo.range_m.len(), at_rest);
             } else {
-                for_each_firing(revolution, &moving, &mut take);
+                for_each_firing(revolution, &moving, &mut push);
             }
         }
         self.returns = returns;
-        self.close(kept);
-        dropped
+        self.truncate(kept);
+        removed
     }
 
-    /// Adds one deviation a point, in step with the points that [`Sweep::take_revolution_around`] took from the same
-    /// revolution with the same screen; a second echo has no series.
-    pub fn take_deviations(
+    /// Fills in the deviation of each point that [`Sweep::set_moving_revolution`] kept of the same revolution with the
+    /// same filter. The deviations of a second echo are NaN: it has no series.
+    pub fn set_deviations(
         &mut self,
         revolution: &Revolution,
         mount: &Mount,
-        series: &mut Series,
-        screen: Option<&Screen>,
+        series: &mut DistanceSeries,
+        filter: Option<&SelfFilter>,
     ) {
-        let first = series.take(revolution);
-        match screen {
+        let first = series.deviations(revolution);
+        match filter {
             None => self.fill_deviations(revolution, mount, first, |_| None),
-            Some(screen) => self.fill_deviations(revolution, mount, first, hides(mount, screen)),
+            Some(filter) => self.fill_deviations(revolution, mount, first, check(mount, filter)),
         }
     }
 
@@ -137,84 +144,85 @@ impl Sweep {
         revolution: &Revolution,
         mount: &Mount,
         first: &[f32],
-        hides: impl Fn([f32; 3]) -> Option<Hidden>,
+        check: impl Fn([f32; 3]) -> Option<FilterReason>,
     ) {
-        // As the points: written always, kept by moving on.
+        // Without a branch, as in `fill`.
         self.deviation_m.resize(revolution.echoes.iter().map(|echo| echo.range_m.len()).sum::<usize>() + 1, f32::NAN);
         let mut kept = 0;
         for (number, echo) in revolution.echoes.iter().enumerate() {
             let slots = echo.range_m.iter().zip(first).zip(&echo.x).zip(&echo.y).zip(&echo.z);
             for ((((&range, &deviation), &x), &y), &z) in slots {
                 self.deviation_m[kept] = if number == 0 { deviation } else { f32::NAN };
-                let far = range > 0.0 && range >= mount.range_m_min;
-                kept += usize::from(far && hides([x, y, z]).is_none());
+                let is_far = range > 0.0 && range >= mount.range_m_min;
+                kept += usize::from(is_far && check([x, y, z]).is_none());
             }
         }
         self.deviation_m.truncate(kept);
     }
 
-    /// Fills the sweep from a scan, in place of what it held; gives the number of points left out because a coordinate
-    /// is not finite or lies beyond 1 km. The four arrays must be equally long.
-    pub fn take_scan(&mut self, scan: &Scan, calibration: &Arc<Calibration>, mount: &Mount) -> u64 {
-        self.take_scan_around(scan, Some(calibration), mount, &[], None).no_position
+    /// Replaces the points by those of a scan of a vehicle at rest, without a self filter. Returns the number of points
+    /// that were removed because a coordinate is not finite or beyond 1 km. The four arrays of the scan must have the
+    /// same length.
+    pub fn set_scan(&mut self, scan: &Scan, calibration: &Arc<Calibration>, mount: &Mount) -> u64 {
+        self.set_moving_scan(scan, Some(calibration), mount, &[], None).no_position
     }
 
-    /// The same of a sensor whose elevations may not be known, each point moved from when it was seen (`end_from_ego`
-    /// is [`crate::sensor::motion::Moved::end_from_ego`] of this scan, or empty), without what the vehicle's own body or a
-    /// blind sector hides.
-    pub fn take_scan_around(
+    /// Replaces the points by those of a scan and returns the number of points that were removed. `calibration` is
+    /// `None` if the elevations are unknown; `end_from_ego` is [`crate::sensor::motion::EgoTrajectory::end_from_ego`]
+    /// of this scan; if it is empty, the points are not moved.
+    pub fn set_moving_scan(
         &mut self,
         scan: &Scan,
         calibration: Option<&Arc<Calibration>>,
         mount: &Mount,
         end_from_ego: &[Isometry3<f64>],
-        screen: Option<&Screen>,
-    ) -> Dropped {
+        filter: Option<&SelfFilter>,
+    ) -> RemovedPoints {
         self.prepare(calibration, mount);
         let at_rest = Transform::new(&mount.ego_from_sensor);
         let moving = transforms(mount, end_from_ego);
-        let knots = ScanKnots::of(scan);
-        let hides = screen.map(|screen| hides(mount, screen));
-        self.open(scan.x.len());
+        let knots = ScanKnots::from_scan(scan);
+        let check = filter.map(|filter| check(mount, filter));
+        self.reserve(scan.x.len());
         let mut kept = 0;
         let mut returns = 0;
-        let mut dropped = Dropped::default();
+        let mut removed = RemovedPoints::default();
         for (index, ((&x, &y), &z)) in scan.x.iter().zip(&scan.y).zip(&scan.z).enumerate() {
             let transform = if moving.is_empty() {
                 at_rest
             } else {
-                let (knot, share) = knots.place(scan.offset_ns[index]);
+                let (knot, share) = knots.position(scan.offset_ns[index]);
                 moving[knot].towards(&moving[knot + 1], share)
             };
             let [ex, ey, ez] = transform.apply(x, y, z);
             (self.x[kept], self.y[kept], self.z[kept]) = (ex, ey, ez);
-            let (position, seen) = is_return(x, y, z);
-            let far = seen && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min;
-            let hidden = hides.as_ref().and_then(|hides| hides([x, y, z])).filter(|_| far);
-            dropped.no_position += u64::from(!position);
-            dropped.count(hidden);
-            returns += u32::from(seen);
-            kept += usize::from(far && hidden.is_none());
+            let (is_position, is_return) = classify(x, y, z);
+            let is_far = is_return && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min;
+            let reason = check.as_ref().and_then(|check| check([x, y, z])).filter(|_| is_far);
+            removed.no_position += u64::from(!is_position);
+            removed.count(reason);
+            returns += u32::from(is_return);
+            kept += usize::from(is_far && reason.is_none());
         }
         self.returns = returns;
-        self.close(kept);
-        dropped
+        self.truncate(kept);
+        removed
     }
 
-    /// Becomes a copy of another sweep, keeping its memory.
-    pub(crate) fn copy(&mut self, other: &Sweep) {
-        for (axis, of) in [(&mut self.x, &other.x), (&mut self.y, &other.y), (&mut self.z, &other.z)] {
-            axis.clone_from(of);
+    /// Replaces all values by those of another sweep; the memory is reused.
+    pub(crate) fn copy_from(&mut self, other: &Sweep) {
+        for (axis, from) in [(&mut self.x, &other.x), (&mut self.y, &other.y), (&mut self.z, &other.z)] {
+            axis.clone_from(from);
         }
         self.deviation_m.clone_from(&other.deviation_m);
         self.calibration.clone_from(&other.calibration);
         (self.returns, self.mount_height_m) = (other.returns, other.mount_height_m);
     }
 
-    /// Adds another sensor's points, carried by `carried`; their distance series are not known here. The rows of radial
-    /// maps become the other's where this sweep has none.
-    pub(crate) fn append(&mut self, other: &Sweep, carried: &Isometry3<f64>) {
-        let transform = Transform::new(carried);
+    /// Adds another sensor's points after transforming them; their deviations are NaN. If this sweep has no rows of
+    /// radial maps, those of the other sweep are used.
+    pub(crate) fn append(&mut self, other: &Sweep, self_from_other: &Isometry3<f64>) {
+        let transform = Transform::new(self_from_other);
         for ((&x, &y), &z) in other.x.iter().zip(&other.y).zip(&other.z) {
             let [x, y, z] = transform.apply(x, y, z);
             self.x.push(x);
@@ -226,19 +234,19 @@ impl Sweep {
             self.deviation_m.resize(self.x.len(), f32::NAN);
         }
         if self.calibration.is_none() && other.calibration.is_some() {
-            self.take_rows(other);
+            self.copy_rows(other);
         }
     }
 
-    /// Takes over whose rows radial maps have.
-    pub(crate) fn take_rows(&mut self, other: &Sweep) {
+    /// Copies what defines the rows of radial maps: the elevations and the height of the sensor.
+    pub(crate) fn copy_rows(&mut self, other: &Sweep) {
         self.calibration.clone_from(&other.calibration);
         self.mount_height_m = other.mount_height_m;
     }
 
-    /// Whether [`Sweep::take_scan`] keeps this point (sensor frame, metres) of a sensor so mounted.
+    /// True if [`Sweep::set_scan`] keeps a point at this position, sensor frame, metres.
     pub fn keeps(mount: &Mount, [x, y, z]: [f32; 3]) -> bool {
-        is_return(x, y, z).1 && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min
+        classify(x, y, z).1 && squared_range(x, y, z) >= mount.range_m_min * mount.range_m_min
     }
 
     fn prepare(&mut self, calibration: Option<&Arc<Calibration>>, mount: &Mount) {
@@ -247,24 +255,25 @@ impl Sweep {
         self.deviation_m.clear();
     }
 
-    /// Room for `slots` points and one more to write what is not kept.
-    fn open(&mut self, slots: usize) {
+    /// Makes the arrays long enough for `slots` points, and for one more that is written and not kept.
+    fn reserve(&mut self, slots: usize) {
         for axis in [&mut self.x, &mut self.y, &mut self.z] {
             axis.resize(slots + 1, 0.0);
         }
     }
 
-    fn close(&mut self, kept: usize) {
+    /// Shortens the arrays to the points that were kept.
+    fn truncate(&mut self, kept: usize) {
         for axis in [&mut self.x, &mut self.y, &mut self.z] {
             axis.truncate(kept);
         }
     }
 }
 
-/// What hides a point of the sensor's frame, at the moment it was seen.
-fn hides(mount: &Mount, screen: &Screen) -> impl Fn([f32; 3]) -> Option<Hidden> {
+/// A function that applies the filter to a point of the sensor frame at the time of its firing.
+fn check(mount: &Mount, filter: &SelfFilter) -> impl Fn([f32; 3]) -> Option<FilterReason> {
     let at_rest = Transform::new(&mount.ego_from_sensor);
-    move |[x, y, z]| screen.hides([x, y, z], || at_rest.apply(x, y, z))
+    move |[x, y, z]| filter.check([x, y, z], || at_rest.apply(x, y, z))
 }
 
 /// `end_from_sensor` at each knot.
@@ -272,12 +281,12 @@ fn transforms(mount: &Mount, end_from_ego: &[Isometry3<f64>]) -> Vec<Transform> 
     end_from_ego.iter().map(|moved| Transform::new(&(moved * mount.ego_from_sensor))).collect()
 }
 
-/// Whether a scan's point is a position at all, and whether it is one with a return.
+/// Whether a point of a scan is a position, and whether it is a return: a position other than the sensor's own.
 #[inline(always)]
-pub(crate) fn is_return(x: f32, y: f32, z: f32) -> (bool, bool) {
+pub(crate) fn classify(x: f32, y: f32, z: f32) -> (bool, bool) {
     // NaN fails every comparison.
-    let position = x.abs() <= POSITION_M_MAX && y.abs() <= POSITION_M_MAX && z.abs() <= POSITION_M_MAX;
-    (position, position && squared_range(x, y, z) > 0.0)
+    let is_position = x.abs() <= POSITION_M_MAX && y.abs() <= POSITION_M_MAX && z.abs() <= POSITION_M_MAX;
+    (is_position, is_position && squared_range(x, y, z) > 0.0)
 }
 
 #[inline(always)]
@@ -285,29 +294,29 @@ fn squared_range(x: f32, y: f32, z: f32) -> f32 {
     x * x + y * y + z * z
 }
 
-/// Calls `take` for each firing with its slots and its transform, interpolated between the knots.
+/// Calls `push` for each firing with its slots and its transform, which is interpolated between the knots.
 #[inline(always)]
 fn for_each_firing(
     revolution: &Revolution,
     moving: &[Transform],
-    take: &mut impl FnMut(std::ops::Range<usize>, Transform),
+    push: &mut impl FnMut(std::ops::Range<usize>, Transform),
 ) {
     let (firings, lasers) = (&revolution.firings, revolution.lasers);
     let mut knot = knots(firings.len()).zip(moving);
     let Some(mut from) = knot.next() else { return };
-    take(0..lasers, *from.1);
+    push(0..lasers, *from.1);
     for to in knot {
         let (start, end) = (firings[from.0].offset_ns, firings[to.0].offset_ns);
         let per_ns = 1.0 / end.saturating_sub(start).max(1) as f32;
         for (firing, slots) in (from.0 + 1..=to.0).map(|firing| (firing, firing * lasers..(firing + 1) * lasers)) {
             let share = firings[firing].offset_ns.saturating_sub(start) as f32 * per_ns;
-            take(slots, from.1.towards(to.1, share));
+            push(slots, from.1.towards(to.1, share));
         }
         from = to;
     }
 }
 
-/// `ego_from_sensor` in single precision: 8 µm at 120 m, where the sensor's own step is 2 mm.
+/// A rigid transform in single precision. It rounds by 8 µm at 120 m, where the sensor's own step is 2 mm.
 #[derive(Clone, Copy)]
 struct Transform {
     rotation: [[f32; 3]; 3],
@@ -325,7 +334,7 @@ impl Transform {
         }
     }
 
-    /// Between two transforms that differ by the motion of a millisecond, where a line serves for the arc.
+    /// A transform between two that differ by the motion of a millisecond; linear, which is as good as the arc there.
     #[inline(always)]
     fn towards(&self, to: &Self, share: f32) -> Self {
         let mix = |a: f32, b: f32| a + share * (b - a);

@@ -61,7 +61,7 @@ fn sweep_of(scan: &Scan) -> Sweep {
         Extrinsics { x_m: 0.0, y_m: 0.0, z_m: KITTI_HEIGHT_M, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
     let mount = Mount { ego_from_sensor: extrinsics.ego_from_sensor(), range_m_min: 2.0 };
     let mut sweep = Sweep::default();
-    sweep.take_scan(scan, &Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount);
+    sweep.set_scan(scan, &Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount);
     sweep
 }
 

@@ -33,7 +33,7 @@ fn a_sensor_is_declared_by_an_event_and_what_cannot_be_one_is_refused_by_name() 
         )
     };
     let rear = scan(3, 10 * MS);
-    assert_eq!(pipeline.step(&rear).unwrap_err(), Rejected::Source { source_index: 3, sensors: 3 });
+    assert_eq!(pipeline.step(&rear).unwrap_err(), EventError::Source { source_index: 3, sensors: 3 });
     for (wrong, said) in [
         (declare(4, "rear", at(-1.0, 0.0, 1.0, 180.0)), "vehicle.sensor = 4: allowed is the next index, under 32"),
         (declare(0, "rear", at(-1.0, 0.0, 1.0, 180.0)), "vehicle.sensor = 0: allowed is the next index, under 32"),
@@ -69,7 +69,7 @@ fn a_sensor_is_declared_by_an_event_and_what_cannot_be_one_is_refused_by_name() 
     assert_eq!((pipeline.ledger().sensors, pipeline.ledger().sensors_refused), (2, 7));
     assert_eq!(pipeline.step(&rear), Ok(None));
     let map = step(&mut pipeline, &scan(0, 20 * MS)).unwrap();
-    assert_eq!((map.sensors[3].name.as_str(), map.sensors[3].state), ("rear", Part::Ok));
+    assert_eq!((map.sensors[3].name.as_str(), map.sensors[3].contribution), ("rear", Contribution::Ok));
     assert!((pipeline.newest_sweep().x[2] + 6.0).abs() < 1e-5, "5 m behind the rear");
     assert_eq!(pipeline.sensors().len(), 4);
 }

@@ -10,10 +10,12 @@ use bytes::Bytes;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{BodyConfig, Extrinsics, FusionConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::error::EventError;
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
-use clearway_mapping::map::{Map, Part};
+use clearway_mapping::map::{Contribution, Map};
 use clearway_mapping::sensor::motion::Compensation;
-use clearway_mapping::pipeline::{Ledger, Pipeline, Rejected};
+use clearway_mapping::ledger::Ledger;
+use clearway_mapping::pipeline::Pipeline;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
 use clearway_sim::vehicle::SimulatedVehicle;
@@ -66,8 +68,8 @@ fn step(pipeline: &mut Pipeline, event: &Event) -> Option<Map> {
     pipeline.step(event).unwrap().cloned()
 }
 
-fn parts(map: &Map) -> Vec<(Part, Option<i64>)> {
-    map.sensors.iter().map(|sensor| (sensor.state, sensor.age_ms.map(|ms| ms.round() as i64))).collect()
+fn parts(map: &Map) -> Vec<(Contribution, Option<i64>)> {
+    map.sensors.iter().map(|sensor| (sensor.contribution, sensor.age_ms.map(|ms| ms.round() as i64))).collect()
 }
 
 fn balanced(ledger: &Ledger) -> bool {
@@ -80,8 +82,8 @@ fn the_leads_scan_makes_the_map_and_the_others_bring_their_newest() {
     assert_eq!(step(&mut pipeline, &scan(1, 10 * MS)), None);
     assert_eq!(step(&mut pipeline, &scan(1, 60 * MS)), None);
     let map = step(&mut pipeline, &scan(0, 100 * MS)).unwrap();
-    assert_eq!((map.made_by, map.capture_start_ns, map.capture_end_ns), (0, 60 * MS, 100 * MS));
-    assert_eq!(parts(&map), [(Part::Ok, Some(0)), (Part::Ok, Some(40)), (Part::Silent, None)]);
+    assert_eq!((map.source, map.capture_start_ns, map.capture_end_ns), (0, 60 * MS, 100 * MS));
+    assert_eq!(parts(&map), [(Contribution::Ok, Some(0)), (Contribution::Ok, Some(40)), (Contribution::Silent, None)]);
     assert_eq!(map.sensors.iter().map(|sensor| sensor.returns).collect::<Vec<_>>(), [2, 2, 0]);
     assert_eq!(map.sensors[1].completeness, 1.0, "a field of view is no loss");
     let sweep = pipeline.newest_sweep();
@@ -98,7 +100,7 @@ fn a_sensor_that_stops_is_left_out_after_the_deadline_and_named_with_its_age() {
     let left: Vec<_> = made.iter().map(|map| parts(map)[1]).collect();
     assert_eq!(
         left,
-        [(Part::Ok, Some(90)), (Part::Ok, Some(190)), (Part::Silent, Some(290)), (Part::Silent, Some(390))]
+        [(Contribution::Ok, Some(90)), (Contribution::Ok, Some(190)), (Contribution::Silent, Some(290)), (Contribution::Silent, Some(390))]
     );
     assert_eq!(made[2].sensors[1].returns, 0, "nothing of it is in the map");
     assert_eq!(pipeline.newest_sweep().x.len(), 2);
@@ -120,13 +122,13 @@ fn a_lead_that_stops_never_holds_the_map_and_leads_again_when_it_is_back() {
     }
     let away: Vec<i64> = made.windows(2).map(|pair| pair[1].completed_ns - pair[0].completed_ns).collect();
     assert!(away.iter().all(|gap_ns| *gap_ns <= 301 * MS), "deadline and one turn: {away:?}");
-    let makers: Vec<u16> = made.iter().map(|map| map.made_by).collect();
+    let makers: Vec<u16> = made.iter().map(|map| map.source).collect();
     assert_eq!(makers[..3], [0, 0, 1], "the next in order stands in");
     let back = made.iter().find(|map| map.capture_end_ns == 1300 * MS).unwrap();
-    assert_eq!(back.made_by, 0);
-    assert!(made.iter().filter(|map| map.capture_end_ns > 1300 * MS).all(|map| map.made_by == 0));
-    let alone = made.iter().find(|map| map.made_by == 1 && map.capture_end_ns > 500 * MS).unwrap();
-    assert_eq!(parts(alone)[0].0, Part::Silent);
+    assert_eq!(back.source, 0);
+    assert!(made.iter().filter(|map| map.capture_end_ns > 1300 * MS).all(|map| map.source == 0));
+    let alone = made.iter().find(|map| map.source == 1 && map.capture_end_ns > 500 * MS).unwrap();
+    assert_eq!(parts(alone)[0].0, Contribution::Silent);
     // One sensor's turn makes each map: ten of the lead's are missing, and no two stand in for one of them.
     assert!((17..=19).contains(&made.len()), "{}", made.len());
 }
@@ -138,7 +140,7 @@ fn the_rows_of_radial_maps_stay_the_leads_whoever_makes_the_map() {
     coarse.sensors[1].elevations_deg = vec![-5.0];
     let rows = |pipeline: &mut Pipeline, event: &Event| {
         let map = step(pipeline, event)?;
-        Some((map.made_by, common::benches(&map.layers[0]).to_vec()))
+        Some((map.source, common::benches(&map.layers[0]).to_vec()))
     };
     let mut alone = pipeline(&coarse);
     assert_eq!(rows(&mut alone, &scan(1, 10 * MS)), None);
@@ -153,9 +155,9 @@ fn the_rows_of_radial_maps_stay_the_leads_whoever_makes_the_map() {
 #[test]
 fn a_lead_that_lags_or_jumps_does_not_lead_and_is_named_with_its_age() {
     for (name, off_ns, part) in [
-        ("lags", -700 * MS, Part::Late),
-        ("jumps ahead", 3_600_000 * MS, Part::Ahead),
-        ("jumps back", -3_600_000 * MS, Part::Late),
+        ("lags", -700 * MS, Contribution::Late),
+        ("jumps ahead", 3_600_000 * MS, Contribution::Ahead),
+        ("jumps back", -3_600_000 * MS, Contribution::Late),
     ] {
         let mut pipeline = pipeline(&config());
         let start_ns = 1_700_000_000_000 * MS;
@@ -171,8 +173,8 @@ fn a_lead_that_lags_or_jumps_does_not_lead_and_is_named_with_its_age() {
         let gaps = made.windows(2).map(|pair| pair[1].completed_ns - pair[0].completed_ns);
         assert!(gaps.max().unwrap() <= 300 * MS, "{name}");
         let last = made.last().unwrap();
-        assert_eq!(last.made_by, 1, "{name}");
-        assert_eq!(last.sensors[0].state, part, "{name}");
+        assert_eq!(last.source, 1, "{name}");
+        assert_eq!(last.sensors[0].contribution, part, "{name}");
         let age_ms = last.sensors[0].age_ms.unwrap();
         assert!((f64::from(age_ms) + off_ns as f64 / MS as f64 - 99.0).abs() < 1.0, "{name}: {age_ms}");
         assert!(made.windows(2).all(|pair| pair[0].capture_end_ns < pair[1].capture_end_ns), "{name}: stamps rise");
@@ -185,7 +187,7 @@ fn a_sensor_that_restarts_with_an_older_clock_is_taken_again_after_the_deadline(
     step(&mut pipeline, &scan(1, 5_000 * MS));
     let restarted = |arrival_ms: i64| event(1, arrival_ms * MS, Body::Scan(ahead(arrival_ms, &[5.0], -1.0)));
     let refused = pipeline.step(&restarted(5_100)).unwrap_err();
-    assert_eq!(refused, Rejected::Stamp { stamp_ns: 5_100, newest_ns: 5_000 * MS });
+    assert_eq!(refused, EventError::Stamp { stamp_ns: 5_100, newest_ns: 5_000 * MS });
     pipeline.step(&restarted(5_300)).unwrap();
     pipeline.step(&restarted(5_400)).unwrap();
     // The very scan again is refused at any time.
@@ -207,10 +209,10 @@ fn a_fast_lead_makes_a_map_a_period() {
 #[test]
 fn the_configured_lead_leads() {
     let mut config = config();
-    config.fusion.lead = "right".into();
+    config.fusion.reference_sensor = "right".into();
     let mut pipeline = pipeline(&config);
     assert_eq!(step(&mut pipeline, &scan(0, 10 * MS)), None);
-    assert_eq!(step(&mut pipeline, &scan(2, 20 * MS)).unwrap().made_by, 2);
+    assert_eq!(step(&mut pipeline, &scan(2, 20 * MS)).unwrap().source, 2);
 }
 
 #[test]

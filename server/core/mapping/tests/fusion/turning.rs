@@ -52,15 +52,15 @@ fn half_a_field_of_view_is_complete_and_half_a_turn_lost_is_not() {
         }
         _ => true,
     };
-    let made = |keep: &dyn Fn(&Event) -> bool| -> Vec<(f32, Part)> {
+    let made = |keep: &dyn Fn(&Event) -> bool| -> Vec<(f32, Contribution)> {
         let mut pipeline = pipeline(&config());
         let maps = events.iter().filter(|event| keep(event)).filter_map(|event| step(&mut pipeline, event));
-        maps.map(|map| (map.sensors[0].completeness, map.sensors[0].state)).collect()
+        maps.map(|map| (map.sensors[0].completeness, map.sensors[0].contribution)).collect()
     };
     let half = made(&is_ahead);
-    assert!(half.len() > 15 && half[5..].iter().all(|(share, part)| *share > 0.98 && *part == Part::Ok), "{half:?}");
+    assert!(half.len() > 15 && half[5..].iter().all(|(share, part)| *share > 0.98 && *part == Contribution::Ok), "{half:?}");
     let once = made(&|event| is_ahead(event) || !lost_ns.contains(&event.arrival_ns));
-    let partial: Vec<f32> = once.iter().filter(|(_, part)| *part == Part::Partial).map(|(share, _)| *share).collect();
+    let partial: Vec<f32> = once.iter().filter(|(_, part)| *part == Contribution::Partial).map(|(share, _)| *share).collect();
     let lost: f32 = partial[1..].iter().map(|share| 1.0 - share).sum();
     assert!((0.45..0.55).contains(&lost), "the first turn begins somewhere; then half a turn is missing: {once:?}");
 }
@@ -81,10 +81,10 @@ fn two_turning_sensors_have_a_decoder_and_a_ledger_each_and_their_order_between_
         (made, pipeline)
     };
     let (made, pipeline) = run(&events);
-    assert!(made.len() >= 3 && made.iter().all(|map| map.made_by == 0));
+    assert!(made.len() >= 3 && made.iter().all(|map| map.source == 0));
     let last = made.last().unwrap();
-    let contributing: Vec<_> = last.sensors.iter().map(|s| (s.model.as_str(), s.state, s.packets > 0)).collect();
-    assert_eq!(contributing, [("vlp16", Part::Ok, true), ("hdl32e", Part::Ok, true), ("scan", Part::Ok, false)]);
+    let contributing: Vec<_> = last.sensors.iter().map(|s| (s.model.as_str(), s.contribution, s.packets > 0)).collect();
+    assert_eq!(contributing, [("vlp16", Contribution::Ok, true), ("hdl32e", Contribution::Ok, true), ("scan", Contribution::Ok, false)]);
     assert_eq!(last.sensors[0].packets_expected, last.sensors[0].packets);
     let (sensors, sum) = (pipeline.sensors(), pipeline.ledger());
     assert!(sensors.iter().all(|sensor| balanced(&sensor.ledger)) && balanced(sum));

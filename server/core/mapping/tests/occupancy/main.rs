@@ -342,7 +342,7 @@ fn a_turning_sensor_on_the_roof_clears_no_cell_of_a_car_it_looks_over() {
         let mut sweep = Sweep::default();
         for turn in 1..=4 {
             let revolution = vehicle.revolution(turn);
-            sweep.take_revolution(&revolution, &mount);
+            sweep.set_revolution(&revolution, &mount);
             let map_from_ego = vehicle.pose_at(revolution.end_ns);
             let time = (revolution.end_ns - vehicle.start_ns()) as f64 * 1e-9;
             occupancy.integrate(&Rays { map_from_ego: Some(map_from_ego), speed_mps: Some(0.0), ..rays(&sweep) });

@@ -7,7 +7,7 @@ mod common;
 use clearway_mapping::config::{Extrinsics, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, Event, Scan};
 use clearway_mapping::layer::Layer;
-use clearway_mapping::map::{Map, Part};
+use clearway_mapping::map::{Contribution, Map};
 use clearway_mapping::sensor::mount::estimate;
 use clearway_mapping::pipeline::Pipeline;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
@@ -130,7 +130,7 @@ fn opencalibs_side_units_show_ground_where_the_top_unit_is_blind() {
         let alone = VehicleConfig::new("car", sensors[..1].to_vec());
         let (fused, pipeline) = map(&three, &scans);
         let (top, _) = map(&alone, &scans[..1]);
-        assert!(fused.sensors.iter().all(|sensor| sensor.state == Part::Ok), "{:?}", fused.sensors);
+        assert!(fused.sensors.iter().all(|sensor| sensor.contribution == Contribution::Ok), "{:?}", fused.sensors);
         let sum: usize = scans.iter().map(|scan| scan.x.len()).sum();
         let returns: u32 = fused.sensors.iter().map(|sensor| sensor.returns).sum();
         assert_eq!(returns as usize, sum, "{scene}");
@@ -192,7 +192,7 @@ fn argoverses_second_vlp32c_shows_ground_where_the_first_is_blind() {
     let sensors = ["up", "down"].map(|name| SensorConfig::new(name, axle));
     let (fused, pipeline) = map(&VehicleConfig::new("car", sensors.to_vec()), &scans);
     let (up, _) = map(&VehicleConfig::new("car", sensors[..1].to_vec()), &scans[..1]);
-    assert!(fused.sensors.iter().all(|sensor| sensor.state == Part::Ok), "{:?}", fused.sensors);
+    assert!(fused.sensors.iter().all(|sensor| sensor.contribution == Contribution::Ok), "{:?}", fused.sensors);
     assert!(fused.sensors[1].age_ms.unwrap().abs() < 100.0, "{:?}", fused.sensors[1]);
     assert_eq!(pipeline.ledger().decoded, 2);
     assert!(newly_drivable(&up, &fused) >= 20);

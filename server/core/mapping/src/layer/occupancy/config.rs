@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::{ConfigError, check_each, check_fits};
+use crate::config::check::{ConfigValueError, check_each, check_fits};
 
 /// Parameters of [`crate::layer::occupancy`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -62,7 +62,7 @@ impl Default for OccupancyConfig {
 }
 
 impl OccupancyConfig {
-    pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigError> {
+    pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
         let values = [
             ("extent_m", self.extent_m, (5.0..=100.0, "5 to 100")),
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
@@ -87,6 +87,6 @@ impl OccupancyConfig {
         check_fits(at, "clear_height_m_min", self.clear_height_m_min, lower, "less than clearance_m")?;
         let faster = self.speed_mps_fast > self.speed_mps_slow;
         check_fits(at, "speed_mps_fast", self.speed_mps_fast, faster, "more than speed_mps_slow")?;
-        crate::config::check_cells(at, self.extent_m, self.cell_m)
+        crate::config::check::check_cells(at, self.extent_m, self.cell_m)
     }
 }

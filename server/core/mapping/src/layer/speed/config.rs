@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::{ConfigError, check_each, check_fits};
+use crate::config::check::{ConfigValueError, check_each, check_fits};
 
 /// Parameters of [`crate::layer::speed`]; the paper states no figures but the 30 m.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -84,7 +84,7 @@ pub enum Bonus {
 }
 
 impl SpeedConfig {
-    pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigError> {
+    pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
         let values = [
             ("extent_m", self.extent_m, (5.0..=200.0, "5 to 200")),
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
@@ -105,7 +105,7 @@ impl SpeedConfig {
             ("curvature_per_m_max", self.curvature_per_m_max, (0.0..=10.0, "0 to 10")),
         ];
         check_each(at, values)?;
-        crate::config::check_cells(at, self.extent_m, self.cell_m)?;
+        crate::config::check::check_cells(at, self.extent_m, self.cell_m)?;
         check_fits(at, "rough_m", self.rough_m, self.rough_m > self.smooth_m, "more than smooth_m")?;
         let above_unknown = self.crawl_mps >= self.unknown_mps + 0.25;
         check_fits(at, "crawl_mps", self.crawl_mps, above_unknown, "at least 0.25 more than unknown_mps")?;

@@ -1,4 +1,4 @@
-//! What goes wrong before a network is reached: silent sensors, restarts, covered windows, senders of nonsense.
+//! Faults of the sensors themselves: silence, restarts, covered windows, and senders of invalid messages.
 
 use std::ops::Range;
 
@@ -8,19 +8,19 @@ use clearway_proto::v1;
 use clearway_sim::vehicle::{Datagram, Kind};
 use nalgebra::{Isometry3, Vector3};
 
-use super::fate::{Dice, Trouble};
+use super::fault_plan::{Rng, SensorFault};
 
 const HOUR_US: u32 = 3_600_000_000;
-/// A data packet's blocks: flag, azimuth, 32 returns of 3 bytes.
+/// Bytes of one block of a data packet: flag, azimuth, 32 returns of 3 bytes.
 const BLOCK_BYTES: usize = 100;
 const BLOCKS: usize = 12;
 
-/// What a turning sensor sends in trouble; `None`: nothing.
-pub fn troubled(mut datagram: Datagram, now_ns: i64, trouble: &Trouble) -> Option<Datagram> {
-    if trouble.silent.as_ref().is_some_and(|silent| silent.contains(&now_ns)) {
+/// Applies a fault to a datagram of a rotating sensor; `None` if the sensor sends nothing.
+pub fn apply(mut datagram: Datagram, now_ns: i64, fault: &SensorFault) -> Option<Datagram> {
+    if fault.silent.as_ref().is_some_and(|silent| silent.contains(&now_ns)) {
         return None;
     }
-    if let Some((from_ns, ahead_us)) = trouble.restart
+    if let Some((from_ns, ahead_us)) = fault.restart
         && now_ns >= from_ns
     {
         if datagram.kind == Kind::Telemetry {
@@ -33,12 +33,12 @@ pub fn troubled(mut datagram: Datagram, now_ns: i64, trouble: &Trouble) -> Optio
     Some(datagram)
 }
 
-/// Whether a direction (ego frame, degrees counter-clockwise) lies in a sector.
+/// True if a direction (ego frame, degrees counter-clockwise) lies in a sector.
 pub fn inside(sector_deg: &Range<i64>, direction_deg: f64) -> bool {
     (direction_deg - sector_deg.start as f64).rem_euclid(360.0) < (sector_deg.end - sector_deg.start) as f64
 }
 
-/// Takes a turning sensor's returns from a sector of directions; its lasers look where its encoder says.
+/// Removes the returns in a sector of directions from a data packet. The encoder's angle is the direction of its lasers.
 pub fn cover_datagram(datagram: &mut Datagram, sector_deg: &Range<i64>, ego_from_sensor: &Isometry3<f64>) {
     if datagram.kind != Kind::Data {
         return;
@@ -52,7 +52,7 @@ pub fn cover_datagram(datagram: &mut Datagram, sector_deg: &Range<i64>, ego_from
     }
 }
 
-/// Takes a scan's points from a sector of directions.
+/// Removes the points in a sector of directions from a scan.
 pub fn cover_scan(observation: &mut v1::Observation, sector_deg: &Range<i64>, ego_from_sensor: &Isometry3<f64>) {
     let Some(v1::observation::Body::Scan(scan)) = &mut observation.body else { return };
     let list = |bytes: &Bytes| unpack::<f32>(bytes).expect("the car packs whole numbers");
@@ -61,8 +61,8 @@ pub fn cover_scan(observation: &mut v1::Observation, sector_deg: &Range<i64>, eg
         .iter()
         .zip(&y)
         .map(|(x, y)| {
-            let way = ego_from_sensor.rotation * Vector3::new(f64::from(*x), f64::from(*y), 0.0);
-            !inside(sector_deg, way.y.atan2(way.x).to_degrees())
+            let direction = ego_from_sensor.rotation * Vector3::new(f64::from(*x), f64::from(*y), 0.0);
+            !inside(sector_deg, direction.y.atan2(direction.x).to_degrees())
         })
         .collect();
     let keep = |bytes: &Bytes, width: usize| -> Bytes {
@@ -76,21 +76,21 @@ pub fn cover_scan(observation: &mut v1::Observation, sector_deg: &Range<i64>, eg
     scan.no_returns = Bytes::new();
 }
 
-/// A datagram that no sensor sends.
-pub fn garbage(dice: &mut Dice) -> Vec<u8> {
+/// A random datagram that no sensor sends.
+pub fn invalid_datagram(rng: &mut Rng) -> Vec<u8> {
     let lengths = [0, 1, 42, 511, 512, 513, 1205, 1206, 1206, 1206, 1207, 1535];
-    let length = lengths[dice.of(0..lengths.len() as i64) as usize];
-    (0..length).map(|_| dice.draw() as u8).collect()
+    let length = lengths[rng.within(0..lengths.len() as i64) as usize];
+    (0..length).map(|_| rng.draw() as u8).collect()
 }
 
-/// An observation that cannot be one, of a sensor that there is or is not.
-pub fn nonsense(stamp_ns: i64, dice: &mut Dice) -> v1::Observation {
+/// An invalid observation, of a known or an unknown sensor.
+pub fn invalid_observation(stamp_ns: i64, rng: &mut Rng) -> v1::Observation {
     use v1::observation::Body;
     let scan = |x: &[f32], y: &[f32]| v1::Scan { stamp_ns, x: pack(x), y: pack(y), z: pack(y), ..Default::default() };
     let level = Some(v1::Pose { qw: 1.0, ..Default::default() });
-    let (sensor, body) = match dice.of(0..9) {
+    let (sensor, body) = match rng.within(0..9) {
         0 => ("ahead", None),
-        1 => ("nobody", Some(Body::Scan(scan(&[1.0], &[2.0])))),
+        1 => ("unknown", Some(Body::Scan(scan(&[1.0], &[2.0])))),
         2 => ("ahead", Some(Body::Scan(scan(&[1.0, 2.0], &[2.0])))),
         3 => ("ahead", Some(Body::Scan(v1::Scan { x: Bytes::from_static(&[1, 2, 3]), ..scan(&[], &[]) }))),
         4 => ("ahead", Some(Body::Scan(v1::Scan { ring: pack(&[1_u16, 2]), ..scan(&[3.0], &[4.0]) }))),

@@ -1,29 +1,29 @@
-//! The recording of one run: a disk in memory that fails as told, and what must be found on it.
+//! The recording of one run: a disk in memory that fails as planned, and what it must hold.
 
 use std::io::{self, Write};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use clearway::record::writer::{Disk, RecorderCounts};
 use clearway::record::verify::{VerifyError, verify};
+use clearway::record::writer::{Disk, RecorderCounts};
 
-use super::checks::{Breach, breach};
-use super::fate::DiskFate;
+use super::checks::{Violation, violation};
+use super::fault_plan::DiskFault;
 
-/// A disk whose bytes outlive it.
+/// A disk in memory; clones share its bytes.
 #[derive(Clone, Debug)]
 pub struct MemoryDisk {
     bytes: Arc<Mutex<Vec<u8>>>,
-    fate: DiskFate,
+    fault: DiskFault,
     failed: bool,
 }
 
 impl MemoryDisk {
-    /// An empty one.
-    pub fn new(fate: DiskFate) -> Self {
-        Self { bytes: Arc::default(), fate, failed: false }
+    /// An empty disk with a planned fault.
+    pub fn new(fault: DiskFault) -> Self {
+        Self { bytes: Arc::default(), fault, failed: false }
     }
 
-    /// What is on it.
+    /// The content of the disk.
     pub fn bytes(&self) -> Vec<u8> {
         self.bytes.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
@@ -32,9 +32,9 @@ impl MemoryDisk {
 impl Write for MemoryDisk {
     fn write(&mut self, data: &[u8]) -> io::Result<usize> {
         let mut bytes = self.bytes.lock().unwrap_or_else(PoisonError::into_inner);
-        let room = match self.fate {
-            DiskFate::Full(most) => most.saturating_sub(bytes.len()),
-            DiskFate::Hiccup(at) if !self.failed => at.saturating_sub(bytes.len()),
+        let room = match self.fault {
+            DiskFault::Full(most) => most.saturating_sub(bytes.len()),
+            DiskFault::Hiccup(at) if !self.failed => at.saturating_sub(bytes.len()),
             _ => data.len(),
         };
         if room == 0 && !data.is_empty() {
@@ -57,58 +57,61 @@ impl Disk for MemoryDisk {
     }
 }
 
-/// What the engine told the recorder, and what came of it.
+/// A finished recording, and what it is expected to hold.
 pub struct Recorded {
-    /// On the disk, as it was left.
+    /// Content of the disk.
     pub bytes: Vec<u8>,
-    /// The recorder's own word.
+    /// Counts of the recorder.
     pub counts: Arc<RecorderCounts>,
-    /// Events and maps of one layer that it was given.
-    pub given: (u64, u64),
-    /// Events that must be there whatever happened: those older than the recorder's flush when the machine died.
+    /// Events, and maps of one layer, that were passed to the recorder.
+    pub expected: (u64, u64),
+    /// Events that must be recorded in any case: those older than one flush interval when the machine crashed.
     pub confirmed: u64,
-    /// Whether the machine died.
-    pub died: bool,
+    /// True if the machine crashed.
+    pub crashed: bool,
 }
 
 impl Recorded {
-    /// The recording is the maps of its events, byte for byte, or what it lacks is named. Gives whether it is whole.
-    pub fn check(&self) -> Result<bool, Breach> {
-        let wrong = |what: String| Err(breach("recording", what));
+    /// Checks that the recorded maps are the maps of the recorded events, byte for byte, and that every loss is reported.
+    /// Returns true if the recording is complete.
+    pub fn check(&self) -> Result<bool, Violation> {
+        let wrong = |what: String| Err(violation("recording", what));
         let file = tempfile::NamedTempFile::new().and_then(|mut file| file.write_all(&self.bytes).map(|()| file));
-        let file = file.map_err(|error| breach("recording", format!("no temporary file: {error}")))?;
+        let file = file.map_err(|error| violation("recording", format!("no temporary file: {error}")))?;
         let report = match verify(file.path()) {
             Ok(report) => report,
-            // Died or failed before its preface was written.
-            Err(VerifyError::Recording(_)) if self.confirmed == 0 && (self.died || self.counts.stopped().is_some()) => {
+            // The machine crashed or the disk failed before the header was written.
+            Err(VerifyError::Recording(_))
+                if self.confirmed == 0 && (self.crashed || self.counts.stopped().is_some()) =>
+            {
                 return Ok(false);
             }
             Err(error) => return wrong(error.to_string()),
         };
         let lost = self.counts.lost();
-        let complete = (report.events, report.equal) == self.given;
-        let says = format!(
+        let complete = (report.events, report.equal) == self.expected;
+        let summary = format!(
             "{} of {} events, {} of {} layers are equal, {} differ, cut {}; lost {lost}, stopped {:?}: {:?}",
             report.events,
-            self.given.0,
+            self.expected.0,
             report.equal,
-            self.given.1,
+            self.expected.1,
             report.different,
             report.cut,
             self.counts.stopped(),
             report.differences.first(),
         );
         if report.events < self.confirmed {
-            return wrong(format!("{} events were confirmed: {says}", self.confirmed));
+            return wrong(format!("{} events were confirmed: {summary}", self.confirmed));
         }
-        let good = match (self.died, self.counts.stopped(), lost) {
+        let good = match (self.crashed, self.counts.stopped(), lost) {
             (true, _, 0) => report.is_good() && report.cut,
             (false, Some(_), _) => report.cut || !report.is_good(),
             (false, None, 0) => report.is_good() && !report.cut && complete,
-            // What the recorder's queue had no room for is missed in the file.
+            // Events lost because the recorder's queue was full are missing in the file.
             (false, None, _) => !report.is_good() && !report.cut,
             (true, _, _) => report.cut,
         };
-        if good { Ok(complete) } else { wrong(says) }
+        if good { Ok(complete) } else { wrong(summary) }
     }
 }

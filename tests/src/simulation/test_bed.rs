@@ -1,4 +1,4 @@
-//! The house: from what arrives at its doors to maps, readers and a recording, in ticks of a simulated clock.
+//! The test bed: from arriving readings to maps, readers and a recording, in ticks of a simulated clock.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::Range;
@@ -7,9 +7,8 @@ use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
-use clearway_mapping::pipeline::{Pipeline, layer_names};
-use clearway_proto::v1;
 use clearway::config::Config;
+use clearway::encode::EncodedMap;
 use clearway::engine::Engine;
 use clearway::ingest::gateway::Entrance;
 use clearway::ingest::receipt::{Account, Mark, Verdict, Verdicts};
@@ -17,28 +16,28 @@ use clearway::ingest::{Clock, Door, Queued, door_by};
 use clearway::publish::{Served, Vehicles};
 use clearway::record::writer::{Preface, Scribe};
 use clearway::status::VehicleStatus;
-use clearway::encode::EncodedMap;
+use clearway_mapping::pipeline::{Pipeline, layer_names};
+use clearway_proto::v1;
 use clearway_sim::impair::Impairment;
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
 use tokio::sync::watch;
 
-use super::checks::{Breach, accounts, adds_up, breach, describe, freed, is_healthy, nothing_free};
+use super::checks::{Violation, accounts, adds_up, describe, freed, is_healthy, nothing_free, violation};
 use super::drive::{Drive, drives};
-use super::fate::{Dice, DiskFate, END_NS, Fate, HEAL_NS, TURN_NS};
+use super::fault_plan::{DiskFault, END_NS, FLUSH_MS, FaultPlan, HEAL_NS, InjectedFault, REVOLUTION_NS, Rng, TICK_NS};
 use super::readers::{Reader, readers};
-use super::tape::MemoryDisk;
-use super::{FLUSH_MS, Plant, TICK_NS};
+use super::recording_check::MemoryDisk;
 
-/// Turns with a covered window until maps must show it: the one it happened in, another, and what a stopped sensor's
-/// newest turn may still contribute.
-const TURNS_TO_COVER: i64 = 4;
+/// Revolutions with a covered window until maps must show it: the one in which it was covered, another, and those in
+/// which the newest scan of a stopped sensor may still contribute.
+const REVOLUTIONS_TO_COVER: i64 = 4;
 
-/// The house, and the street outside.
-pub(super) struct House<'a> {
-    pub(super) fate: &'a Fate,
-    pub(super) plant: Option<Plant>,
+/// The whole system, and the networks of its sensors.
+pub(super) struct TestBed<'a> {
+    pub(super) plan: &'a FaultPlan,
+    pub(super) injected: Option<InjectedFault>,
     pub(super) drive: &'static Drive,
-    pub(super) dice: Dice,
+    pub(super) rng: Rng,
     pub(super) now_ns: i64,
 
     pub(super) clock: Arc<AtomicI64>,
@@ -48,11 +47,11 @@ pub(super) struct House<'a> {
     pub(super) vehicles: Vehicles,
     pub(super) maps: Vec<Arc<EncodedMap>>,
     pub(super) taken: u64,
-    /// When the newest map came that was not whole.
-    pub(super) unwhole_ns: i64,
+    /// Completion of the newest map in which a sensor was not whole.
+    pub(super) unhealthy_ns: i64,
 
     pub(super) networks: Vec<Impairment>,
-    /// Datagrams on their way, by when they arrive.
+    /// Datagrams on their way, by arrival time and number.
     pub(super) arriving: BTreeMap<(i64, u64), (u16, Vec<u8>)>,
     pub(super) datagrams: u64,
     pub(super) next_sent: usize,
@@ -70,16 +69,16 @@ pub(super) struct House<'a> {
     pub(super) began: Instant,
     pub(super) disk: MemoryDisk,
     pub(super) scribe: Option<Scribe<MemoryDisk>>,
-    /// Events given to the recorder by the end of each tick.
-    pub(super) given: Vec<u64>,
-    /// What was on the disk when the machine died.
-    pub(super) left: Option<Vec<u8>>,
+    /// Events passed to the recorder by the end of each tick.
+    pub(super) recorded_by_tick: Vec<u64>,
+    /// Content of the disk when the machine crashed.
+    pub(super) disk_at_crash: Option<Vec<u8>>,
 }
 
-impl<'a> House<'a> {
-    pub fn new(fate: &'a Fate, plant: Option<Plant>) -> Self {
-        let drive = &drives()[fate.drive];
-        let config = config(drive, fate);
+impl<'a> TestBed<'a> {
+    pub fn new(plan: &'a FaultPlan, injected: Option<InjectedFault>) -> Self {
+        let drive = &drives()[plan.drive];
+        let config = config(drive, plan);
         let vehicle = &config.vehicles[0];
         let layers = layer_names(&vehicle.maps);
         let clock = Arc::new(AtomicI64::new(0));
@@ -92,23 +91,23 @@ impl<'a> House<'a> {
         );
         let vehicles = vec![("car".into(), layers.clone())];
         let preface = Preface { boot_id: 1, config: config.to_toml(), vehicles, ..Preface::default() };
-        let disk = MemoryDisk::new(fate.disk.clone());
+        let disk = MemoryDisk::new(plan.disk.clone());
         let (scribe, journal) = match Scribe::new(disk.clone(), &config.recorder, &preface, false) {
             Ok((scribe, mut journals)) => (Some(scribe), journals.pop()),
-            // The disk is full before the first event; a server would not start, and one that does not record does.
+            // The disk is full before the first event: the run goes on without a recording.
             Err(_) => (None, None),
         };
         let status = Arc::new(VehicleStatus::new("car".into(), 1, layers.clone(), door.outside()));
         scribe.iter().for_each(|scribe| status.show_recorder(scribe.counts()));
         let (newest, receiver) = watch::channel(None);
-        let pipeline = Pipeline::new(&vehicle.core(), vec![None; vehicle.sensors.len()]).expect("a car that can be");
+        let pipeline = Pipeline::new(&vehicle.core(), vec![None; vehicle.sensors.len()]).expect("a valid car");
         let valid_ms = vehicle.maps.valid_ms;
         let engine = Engine { pipeline, valid_ms, newest, journal, status: status.clone(), observer: None };
-        let mut dice = Dice::new(!fate.seed);
+        let mut rng = Rng::new(!plan.seed);
         let (verdicts, told) = unbounded_channel();
         Self {
-            fate,
-            plant,
+            plan,
+            injected,
             drive,
             now_ns: 0,
             clock,
@@ -119,58 +118,58 @@ impl<'a> House<'a> {
             vehicles: Vehicles(vec![Served { status, newest: receiver }].into()),
             maps: Vec::new(),
             taken: 0,
-            unwhole_ns: 0,
-            networks: fate.networks.iter().map(|faults| Impairment::new(*faults)).collect(),
+            unhealthy_ns: 0,
+            networks: plan.networks.iter().map(|faults| Impairment::new(*faults)).collect(),
             arriving: BTreeMap::new(),
             datagrams: 0,
-            next_sent: drive.sent.partition_point(|sent| sent.offset_ns < fate.offset_ns),
+            next_sent: drive.sent.partition_point(|sent| sent.offset_ns < plan.offset_ns),
             offered: 0,
             waiting: VecDeque::new(),
             account: Account::new(0),
             observations: 0,
             verdicts,
             told,
-            readers: readers(&mut dice, &layers),
-            dice,
+            readers: readers(&mut rng, &layers),
+            rng,
             began: Instant::now(),
             disk,
             scribe,
-            given: Vec::new(),
-            left: None,
+            recorded_by_tick: Vec::new(),
+            disk_at_crash: None,
         }
     }
 
-    pub fn run(&mut self) -> Result<(), Breach> {
+    pub fn run(&mut self) -> Result<(), Violation> {
         while self.now_ns < END_NS {
             self.now_ns += TICK_NS;
             self.send();
             self.arrive();
             self.observe();
-            if !during(&self.fate.engine_stall, self.now_ns) {
+            if !during(&self.plan.engine_stall, self.now_ns) {
                 self.step()?;
                 self.engine.rest();
                 let snapshot = self.vehicles.0[0].status.snapshot();
                 accounts(self.offered, &snapshot.ledger, &snapshot.sensors)?;
             }
             for reader in &mut self.readers {
-                reader.look(self.now_ns, &self.vehicles, &self.maps, self.plant)?;
+                reader.poll_at(self.now_ns, &self.vehicles, &self.maps, self.injected)?;
             }
             let open = self.readers.iter().filter(|reader| reader.is_open()).count() as u32;
             let counted = self.vehicles.0[0].status.grpc_readers.load(Ordering::Relaxed);
             if counted != open {
-                return Err(breach("reader", format!("{open} readers are there, {counted} are counted")));
+                return Err(violation("reader", format!("{open} readers are open, {counted} are counted")));
             }
             self.record();
         }
         Ok(())
     }
 
-    /// The engine takes everything that waits.
-    pub fn step(&mut self) -> Result<(), Breach> {
+    /// Lets the engine process everything that waits.
+    pub fn step(&mut self) -> Result<(), Violation> {
         while let Ok(queued) = self.events.try_recv() {
             self.taken += 1;
-            let journal =
-                (self.plant == Some(Plant::UnrecordedEvent) && self.taken == 300).then(|| self.engine.journal.take());
+            let journal = (self.injected == Some(InjectedFault::UnrecordedEvent) && self.taken == 300)
+                .then(|| self.engine.journal.take());
             self.engine.take(queued);
             if let Some(journal) = journal {
                 self.engine.journal = journal;
@@ -184,29 +183,31 @@ impl<'a> House<'a> {
         Ok(())
     }
 
-    fn check_map(&mut self, encoded: Arc<EncodedMap>) -> Result<(), Breach> {
-        let Some(map) = self.engine.pipeline.newest_map() else { return Err(breach("map", "encoded, and never made")) };
+    fn check_map(&mut self, encoded: Arc<EncodedMap>) -> Result<(), Violation> {
+        let Some(map) = self.engine.pipeline.newest_map() else {
+            return Err(violation("map", "encoded, but not made"));
+        };
         if encoded.sequence != self.maps.len() as u64 || encoded.sequence != map.sequence {
-            return Err(breach("map", format!("number {} after {} maps", encoded.sequence, self.maps.len())));
+            return Err(violation("map", format!("number {} after {} maps", encoded.sequence, self.maps.len())));
         }
-        let stuck = self.plant == Some(Plant::StuckStamp);
+        let stuck = self.injected == Some(InjectedFault::StuckStamp);
         if let Some(before) = self.maps.last().filter(|before| stuck || before.capture_end_ns >= encoded.capture_end_ns)
         {
             let back_ms = before.capture_end_ns.saturating_sub(encoded.capture_end_ns) / 1_000_000;
             let found = format!("{back_ms} ms before map {}: {}", before.sequence, describe(map));
-            return Err(breach("stamps", found));
+            return Err(violation("stamps", found));
         }
-        if let Some((sector, when)) = &self.fate.covered {
-            let at_ns = map.completed_ns - self.drive.rig.start_ns - self.fate.offset_ns;
-            if (when.start + TURNS_TO_COVER * TURN_NS..when.end).contains(&at_ns) {
-                match self.plant {
-                    Some(Plant::FreedCells) => nothing_free(self.drive, sector, &freed(map))?,
+        if let Some((sector, when)) = &self.plan.covered {
+            let at_ns = map.completed_ns - self.drive.rig.start_ns - self.plan.offset_ns;
+            if (when.start + REVOLUTIONS_TO_COVER * REVOLUTION_NS..when.end).contains(&at_ns) {
+                match self.injected {
+                    Some(InjectedFault::FreedCells) => nothing_free(self.drive, sector, &freed(map))?,
                     _ => nothing_free(self.drive, sector, map)?,
                 }
             }
         }
         if !is_healthy(map) {
-            self.unwhole_ns = self.now_ns;
+            self.unhealthy_ns = self.now_ns;
         }
         self.maps.push(encoded);
         Ok(())
@@ -216,40 +217,40 @@ impl<'a> House<'a> {
         self.began + Duration::from_nanos(self.now_ns.unsigned_abs())
     }
 
-    /// The recorder writes everything that waits.
+    /// Lets the recorder write everything that waits.
     fn record(&mut self) {
         let now = self.instant();
-        if !during(&self.fate.recorder_stall, self.now_ns)
+        if !during(&self.plan.recorder_stall, self.now_ns)
             && let Some(scribe) = &mut self.scribe
         {
             while scribe.take(now) {}
         }
-        self.given.push(self.taken);
-        if let DiskFate::Crash(at_ns, torn) = self.fate.disk
-            && self.left.is_none()
+        self.recorded_by_tick.push(self.taken);
+        if let DiskFault::Crash(at_ns, torn) = self.plan.disk
+            && self.disk_at_crash.is_none()
             && self.now_ns >= at_ns
         {
             let mut bytes = self.disk.bytes();
             bytes.truncate(bytes.len() - torn.min(bytes.len()));
-            self.left = Some(bytes);
+            self.disk_at_crash = Some(bytes);
         }
     }
 }
 
-/// Whether a fault lasts.
+/// True while a fault lasts.
 pub(super) fn during(when: &Option<Range<i64>>, now_ns: i64) -> bool {
     now_ns < HEAL_NS && when.as_ref().is_some_and(|when| when.contains(&now_ns))
 }
 
-/// The drive's car, as this run has it.
-fn config(drive: &Drive, fate: &Fate) -> Config {
+/// The configuration of the drive's car in this run.
+fn config(drive: &Drive, plan: &FaultPlan) -> Config {
     let mut config = drive.config.clone();
     config.recorder.flush_ms = FLUSH_MS;
-    config.recorder.queue = fate.recorder_queue;
+    config.recorder.queue = plan.recorder_queue;
     let vehicle = &mut config.vehicles[0];
-    vehicle.queue = fate.queue;
+    vehicle.queue = plan.queue;
     let maps = &mut vehicle.maps;
-    if fate.all_maps {
+    if plan.all_maps {
         maps.speed.enabled = true;
     } else {
         for enabled in [&mut maps.height_difference.enabled, &mut maps.terrain.enabled, &mut maps.safe_path.enabled] {

@@ -1,0 +1,127 @@
+//! Why the core refuses an event.
+
+use clearway_lidar::sensor::Refusal;
+
+use crate::config::ConfigValueError;
+use crate::road::RoadError;
+
+/// Latest stamp that is accepted: the year 2116, in ns since the Unix epoch. Ours: half of what an `i64` holds, so that
+/// differences and sums of two stamps do not overflow. The earliest is 0.
+pub const STAMP_NS_MAX: i64 = 1 << 62;
+
+/// An event that was refused. It changes nothing but the ledgers.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum EventError {
+    /// The decoder refused the datagram.
+    #[error(transparent)]
+    Datagram(#[from] Refusal),
+    /// The vehicle has no sensor of this index.
+    #[error("source {source_index}: the vehicle has {sensors} sensor(s), counted from 0")]
+    Source {
+        /// Source of the event.
+        source_index: u16,
+        /// Number of sensors of the vehicle.
+        sensors: usize,
+    },
+    /// A declared sensor has a value that is not allowed.
+    #[error("declared sensor: {0}")]
+    Sensor(#[from] ConfigValueError),
+    /// The coordinate and intensity arrays of a scan differ in length.
+    #[error("scan with {x} x, {y} y, {z} z and {intensity} intensities: the four lengths must be equal")]
+    ScanLengths {
+        /// Length of `x`.
+        x: usize,
+        /// Length of `y`.
+        y: usize,
+        /// Length of `z`.
+        z: usize,
+        /// Length of `intensity`.
+        intensity: usize,
+    },
+    /// An optional array of a scan is neither empty nor as long as the scan has points.
+    #[error("scan of {points} points with {length} {list}: none or one a point is allowed")]
+    ScanList {
+        /// Name of the array: `ring` or `offset_ns`.
+        list: &'static str,
+        /// Length of the array.
+        length: usize,
+        /// Number of points of the scan.
+        points: usize,
+    },
+    /// A point of a scan is later than the scan's stamp.
+    #[error("scan with a point {offset_ns} ns after its stamp: at most 0 is allowed")]
+    ScanOffset {
+        /// Greatest offset of the scan.
+        offset_ns: i32,
+    },
+    /// A no-return direction of a scan is not a unit vector.
+    #[error("scan with the no-return direction {direction:?}: a unit vector is allowed")]
+    NoReturn {
+        /// The direction: x, y, z.
+        direction: [f32; 3],
+    },
+    /// A scan, ego pose or road is not newer than the newest one.
+    #[error("stamp {stamp_ns} ns: later than {newest_ns} ns is allowed")]
+    Stamp {
+        /// Stamp of the refused one.
+        stamp_ns: i64,
+        /// Stamp of the newest one.
+        newest_ns: i64,
+    },
+    /// The stamp of a scan, ego pose or road is out of range.
+    #[error("stamp {stamp_ns} ns: 0 to {STAMP_NS_MAX} ns since the epoch is allowed")]
+    StampRange {
+        /// The stamp.
+        stamp_ns: i64,
+    },
+    /// A road has a value that is not allowed.
+    #[error(transparent)]
+    Road(#[from] RoadError),
+    /// An ego pose has a value that is not allowed.
+    #[error(
+        "ego pose of {stamp_ns} ns: position within 10^9 m, a unit quaternion and speed within 1000 m/s are allowed"
+    )]
+    Pose {
+        /// Stamp of the pose.
+        stamp_ns: i64,
+    },
+}
+
+impl EventError {
+    /// The key under which a ledger counts the error: the decoder's own key (`length`, `block_flag`, and so on), or
+    /// `source`, `sensor`, `scan_lengths`, `scan_offset`, `no_returns`, `stamp`, `stamp_range`, `pose`, or the key of a
+    /// road error ([`RoadError::reason`]).
+    pub fn reason(&self) -> &'static str {
+        match self {
+            Self::Datagram(refusal) => refusal.reason(),
+            Self::Source { .. } => "source",
+            Self::Sensor(_) => "sensor",
+            Self::ScanLengths { .. } | Self::ScanList { .. } => "scan_lengths",
+            Self::ScanOffset { .. } => "scan_offset",
+            Self::NoReturn { .. } => "no_returns",
+            Self::Stamp { .. } => "stamp",
+            Self::StampRange { .. } => "stamp_range",
+            Self::Pose { .. } => "pose",
+            Self::Road(error) => error.reason(),
+        }
+    }
+}
+
+/// Checks that a stamp is in range.
+///
+/// # Errors
+/// [`EventError::StampRange`] if the stamp is negative or later than [`STAMP_NS_MAX`].
+pub(crate) fn check_stamp_range(stamp_ns: i64) -> Result<(), EventError> {
+    if (0..=STAMP_NS_MAX).contains(&stamp_ns) { Ok(()) } else { Err(EventError::StampRange { stamp_ns }) }
+}
+
+/// Checks that a stamp is newer than the newest one before it; `newest_ns` is `None` if there is none.
+///
+/// # Errors
+/// [`EventError::Stamp`] if the stamp is not newer.
+pub(crate) fn check_newer(stamp_ns: i64, newest_ns: Option<i64>) -> Result<(), EventError> {
+    match newest_ns {
+        Some(newest_ns) if stamp_ns <= newest_ns => Err(EventError::Stamp { stamp_ns, newest_ns }),
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,60 @@
+//! The newest scan of one sensor.
+//!
+//! [`crate::sensor::pipeline`] writes it; fusion and the layers read it.
+
+use nalgebra::Isometry3;
+
+use crate::event_time::EventTime;
+use crate::layer::Rays;
+use crate::map::SensorState;
+use crate::sensor::motion::Compensation;
+use crate::sensor::sweep::Sweep;
+
+/// The newest scan of one sensor, made from a revolution of its firings or from a scan event.
+#[derive(Default)]
+pub(crate) struct SensorScan {
+    /// Number of scans that the sensor has completed. While it is 0, all but the origin and the name are defaults.
+    pub completed: u64,
+    /// Stamp of the first firing or point, ns since the Unix epoch.
+    pub start_ns: i64,
+    /// Stamp of the last firing or point, ns since the Unix epoch.
+    pub end_ns: i64,
+    /// When the event arrived that completed the scan.
+    pub completed_at: EventTime,
+    /// True if the scan was made from a revolution, false if it came as a scan event.
+    pub is_revolution: bool,
+    /// Position of the sensor, ego frame, metres.
+    pub origin_m: [f32; 3],
+    /// Points, ego frame at `end_ns`.
+    pub sweep: Sweep,
+    /// Directions (unit vectors) of the rays without a return, ego frame at `end_ns`; empty unless a layer needs them.
+    pub no_returns: Vec<[f32; 3]>,
+    /// What moved the points to `end_ns`.
+    pub compensation: Compensation,
+    /// Ego frame in the world frame at `end_ns`; `None` if no pose is near enough.
+    pub map_from_ego: Option<Isometry3<f64>>,
+    /// Forward speed at `end_ns`; `None` if it is unknown.
+    pub speed_mps: Option<f64>,
+    /// What a map that contains this scan states about the sensor.
+    pub state: SensorState,
+}
+
+impl SensorScan {
+    /// The scan of a sensor that has completed none yet.
+    pub fn new(name: &str, origin_m: [f32; 3]) -> Self {
+        Self { origin_m, state: SensorState { name: name.to_owned(), ..SensorState::default() }, ..Self::default() }
+    }
+
+    /// The scan as the input of layers that gather evidence; `sensor` is the index of the sensor.
+    pub fn rays(&self, sensor: u16) -> Rays<'_> {
+        Rays {
+            sensor,
+            stamp_ns: self.end_ns,
+            returns: &self.sweep,
+            origin_m: self.origin_m,
+            no_returns: &self.no_returns,
+            map_from_ego: self.map_from_ego,
+            speed_mps: self.speed_mps,
+        }
+    }
+}
