@@ -17,8 +17,9 @@ const LATE_NS_MAX: i64 = 100_000_000;
 /// Greatest backlog of a server for which the simulation does not wait: more than two revolutions at 10 Hz, because the
 /// maps of two may be under way in a server that is in time.
 const BACKLOG_NS_MAX: i64 = 250_000_000;
-/// Longest wait for a server, so that the vehicle stops soon if it is stopped meanwhile.
-const WAIT_NS_MAX: i64 = 1_000_000_000;
+/// Longest gap between two stamps for a server that is late. A decoder takes a gap of a second or more for a sensor whose
+/// clock was set, and refuses a packet; and a vehicle that waits is stopped only after the wait.
+const WAIT_NS_MAX: i64 = 900_000_000;
 
 /// The simulated time that was skipped so far. Clones count together.
 #[derive(Clone, Debug, Default)]
@@ -51,7 +52,7 @@ impl Progress {
     pub fn skip_target_ns(&self, next_ns: i64, sent_ns: Option<i64>) -> Option<i64> {
         let backlog_ns = sent_ns.zip(self.mapped_ns).map_or(0, |(sent_ns, mapped_ns)| sent_ns - mapped_ns);
         if backlog_ns > BACKLOG_NS_MAX {
-            return Some(self.now_ns + backlog_ns.min(WAIT_NS_MAX));
+            return Some((self.now_ns + backlog_ns).min(next_ns + WAIT_NS_MAX).max(self.now_ns));
         }
         (self.now_ns - next_ns > LATE_NS_MAX).then_some(self.now_ns)
     }
@@ -166,6 +167,6 @@ mod tests {
         assert_eq!(target(late(None)), None);
         assert_eq!(target(late(Some(4_700_000_000))), None);
         assert_eq!(target(late(Some(4_600_000_000))), Some(5_300_000_000));
-        assert_eq!(target(late(Some(1_000_000_000))), Some(6_000_000_000), "no longer than a second at once");
+        assert_eq!(target(late(Some(1_000_000_000))), Some(5_900_000_000), "less than a second at once");
     }
 }
