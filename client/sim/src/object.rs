@@ -9,8 +9,8 @@ use crate::noise::mixed;
 /// Kind of an object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Kind {
-    /// A house or another solid block.
-    House,
+    /// A building or another solid block.
+    Building,
     /// A free-standing wall.
     Wall,
     /// A parked car.

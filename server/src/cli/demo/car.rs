@@ -16,10 +16,10 @@ use clearway_sim::send::{Pace, Sent, Until, drive};
 
 use tokio::sync::watch;
 
-use super::DemoError;
+use super::error::DemoError;
 use super::rig::Rig;
-use crate::engine::Newest;
-use crate::ingest::now_ns;
+use crate::clock::now_ns;
+use crate::newest::Newest;
 
 /// A car that drives until it is stopped.
 pub struct Car {

@@ -7,10 +7,10 @@ use std::time::Duration;
 use anyhow::Result;
 
 use super::report::Report;
+use super::run::{Endpoints, Options as DemoOptions, demo};
 use super::sensors::Sensors;
-use super::{Endpoints, demo};
+use crate::cli::connect::say;
 use crate::cli::run::stop_signal;
-use crate::cli::say;
 
 /// Drive a simulated car at a server of its own, over real UDP, and serve its maps.
 ///
@@ -44,13 +44,8 @@ pub async fn run(options: Options) -> Result<ExitCode> {
     };
     let report = |report: &Report| print(&if json { report.to_json().to_string() } else { report.line() });
     let stop = stop_signal()?;
-    let options = super::Options {
-        duration: seconds,
-        record: record.clone(),
-        picture: picture.clone(),
-        sensors,
-        any_port: false,
-    };
+    let options =
+        DemoOptions { duration: seconds, record: record.clone(), picture: picture.clone(), sensors, any_port: false };
     let summary = demo(options, begun, report, stop).await?;
     print(&if json { summary.to_json().to_string() } else { summary.text() });
     Ok(ExitCode::SUCCESS)
