@@ -101,14 +101,22 @@ test("a server that starts again is counted, and its sequence starts again", () 
 
 test("a scale keeps its range from map to map and unknown cells stay out of it", () => {
   const channel = { name: "height", unit: "m", scale: 0.5, unknown: -128 };
-  const range = (cells, before) => paintChannel({}, channel, Int8Array.from(cells), before).range;
+  const layer = { legend: [{ name: "unknown", meaning: "unknown", colour: [1, 2, 3] }] };
+  const range = (cells, before) => paintChannel(layer, channel, Int8Array.from(cells), before).range;
   assert.deepEqual(range([-128, -128], null), null);
   assert.deepEqual(range([-128, 2, 4], null), [1, 2]);
   assert.deepEqual(range([-2, 3], [1, 2]), [-1, 2]);
 });
 
-test("a legend gives each class its share of the cells", () => {
-  const cells = Uint8Array.of(0, 1, 1, 1);
-  const { legend } = paintChannel({ legend: ["unknown", "not_drivable"] }, { name: "class" }, cells, null);
-  assert.deepEqual(legend.map(([, text, share]) => [text, share]), [["unknown", 0.25], ["not drivable", 0.75]]);
+test("a legend gives each class its colour, its share of the cells and its meaning", () => {
+  const legend = [
+    { name: "unknown", meaning: "unknown", colour: [1, 2, 3] },
+    { name: "not_drivable", meaning: "not reached", colour: [4, 5, 6] },
+  ];
+  const painted = paintChannel({ legend }, { name: "class" }, Uint8Array.of(0, 1, 1, 1), null);
+  assert.deepEqual(painted.legend, [
+    [[1, 2, 3], "unknown", 0.25, "unknown"],
+    [[4, 5, 6], "not drivable", 0.75, "not reached"],
+  ]);
+  assert.deepEqual([...painted.colours.slice(0, 3)], [0xff030201, 0xff060504, 0]);
 });

@@ -137,9 +137,10 @@ export class Panel {
     const texts = entries.map(([, text]) => text).join();
     if (texts !== this.#legend_texts) {
       this.#legend_texts = texts;
-      this.part.legend.replaceChildren(...entries.map(([colour, text]) => {
+      this.part.legend.replaceChildren(...entries.map(([colour, text, , meaning]) => {
         const [entry, swatch, share] = ["li", "i", "b"].map((tag) => document.createElement(tag));
         if (colour) swatch.style.background = css(colour);
+        if (meaning) entry.title = `Means ${meaning} to a planner`;
         entry.append(...(colour ? [swatch] : []), text, share);
         return entry;
       }));
@@ -195,7 +196,7 @@ export class Panel {
 
 function cellText(layer, { name, unit, scale, unknown }, cell) {
   const raw = layer.cells(name)[cell];
-  if (name === "class") return words(layer.legend[raw]);
+  if (name === "class") return words(layer.legend[raw].name);
   const value = raw === unknown ? "unknown" : unit === "" ? count(raw) : `${(raw * scale).toFixed(2)} ${unit}`;
   return `${words(name)} ${value}`;
 }

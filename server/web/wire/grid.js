@@ -1,5 +1,5 @@
 // In: the geometry of a layer, radial or Cartesian (ego frame: x forward, y left, metres). Out: the cell at a point,
-// and a table from pixels to cells for a square canvas that has the vehicle in its middle, forward up, left on the left.
+// and a table from pixels to cells for a square canvas with the vehicle in its middle, forward up and left on the left.
 // The table is computed once for each geometry and size; then a map costs one look-up a pixel.
 
 import { DecodeError } from "./limits.js";

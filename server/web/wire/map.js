@@ -4,6 +4,7 @@
 import { baseByClass, decodeChannel } from "./codec.js";
 import { baseCells, baseLayer } from "./delta.js";
 import { gridOf } from "./grid.js";
+import { isWithoutLegend, readLegend } from "./legend.js";
 import { DecodeError, MAP_BYTES_MAX, MAP_CELLS_MAX, MAP_PARTS_MAX } from "./limits.js";
 import { countParts, readLayer, readLayerName, readMap, readMapUpdate } from "./protobuf.js";
 
@@ -64,7 +65,7 @@ export class LiveMap {
   }
 }
 
-// One layer: { name, legend, grid, metrics, channels: [{ name, unit, scale, unknown }] }.
+// One layer: { name, legend: [{ name, meaning, colour }], grid, metrics, channels: [{ name, unit, scale, unknown }] }.
 class Layer {
   #channels = new Map();
   #cells = new Map();
@@ -74,7 +75,7 @@ class Layer {
   constructor(message, before) {
     this.name = message.name;
     this.grid = gridOf(message);
-    this.legend = message.legend.length > 0 || !before ? message.legend : before.legend;
+    this.legend = before && isWithoutLegend(message) ? before.legend : readLegend(message);
     this.metrics = message.metrics;
     this.#before = before;
     for (const channel of message.channels) {

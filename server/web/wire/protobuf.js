@@ -158,6 +158,7 @@ const LAYER = {
   4: ["legend", repeated(string)],
   5: ["channels", repeated(message(CHANNEL))], 7: ["metrics", map(double)],
   10: ["base_sequence", optional(uint64)],
+  11: ["legend_meanings", repeated(uint32)], 12: ["legend_rgb", repeated(fixed32)],
 };
 // The layers stay bytes until they are needed.
 const MAP = { 1: ["header", message(HEADER)], 2: ["layers", repeated(bytes)] };
