@@ -17,7 +17,7 @@
 use std::collections::VecDeque;
 
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::telemetry::Gprmc;
+use clearway_lidar::nmea::Gprmc;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
 use crate::config::motion::MotionConfig;
