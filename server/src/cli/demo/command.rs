@@ -1,59 +1,66 @@
-//! `clearway demo`.
+//! The options of `clearway demo`, and how its reports are printed.
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::Result;
+use clap::Args;
 
 use super::report::Report;
 use super::run::{Endpoints, Options as DemoOptions, demo};
 use super::sensors::Sensors;
-use crate::cli::connect::say;
-use crate::cli::run::stop_signal;
+use crate::cli::output::{block_on, print_line, stop_signal};
 
-/// Drive a simulated car at a server of its own, over real UDP, and serve its maps.
+/// Drive a simulated car against a server of its own, over real UDP, and serve its maps.
 ///
 /// A simulation that is too slow for this machine skips time and reports it. Only --record and a picture of the newest
-/// map, target/demo.png or demo.png in the temporary folder, are written to the disk.
-#[derive(clap::Args)]
+/// map (target/demo.png, or demo.png in the temporary folder) write to the disk.
+#[derive(Args)]
 pub struct Options {
-    /// End after this many seconds; without it, at Ctrl-C.
-    #[arg(long, value_parser = crate::cli::arguments::seconds)]
+    /// End after this many seconds; at Ctrl-C if absent.
+    #[arg(long, value_parser = seconds)]
     seconds: Option<Duration>,
-    /// Record events and maps to this MCAP file. It grows by about 115 MB a minute with an HDL-64E.
+    /// Record events and maps to this MCAP file, which grows by about 115 MB a minute with an HDL-64E.
     #[arg(long, value_name = "OUT.mcap")]
     record: Option<PathBuf>,
     /// The car's sensors.
     #[arg(long, value_enum, default_value_t, visible_alias = "sensor")]
     sensors: Sensors,
-    /// Print one JSON object a second on stdout, and a summary.
+    /// Print one JSON object a second, and a summary.
     #[arg(long)]
     json: bool,
 }
 
-/// Runs the demo until its time is over or a signal ends it.
-pub async fn run(options: Options) -> Result<ExitCode> {
-    let Options { seconds, record, sensors, json } = options;
-    let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
-    let picture = record.as_ref().map_or_else(|| folder.join("demo.png"), |record| record.with_extension("png"));
-    let begun = |endpoints: &Endpoints| {
-        if !json {
-            print(&introduction(endpoints, record.as_deref(), &picture));
-        }
-    };
-    let report = |report: &Report| print(&if json { report.to_json().to_string() } else { report.line() });
-    let stop = stop_signal()?;
-    let options =
-        DemoOptions { duration: seconds, record: record.clone(), picture: picture.clone(), sensors, any_port: false };
-    let summary = demo(options, begun, report, stop).await?;
-    print(&if json { summary.to_json().to_string() } else { summary.text() });
-    Ok(ExitCode::SUCCESS)
+fn seconds(text: &str) -> Result<Duration, String> {
+    let duration = text.parse().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    duration.ok_or_else(|| "0 or more seconds are allowed".into())
 }
 
-/// Prints lines. A reader that has gone, such as `head`, does not end the demo.
-fn print(lines: &str) {
-    let _ = say(lines);
+/// Runs the demo and prints a line a second.
+///
+/// # Errors
+/// [`DemoError`](super::error::DemoError).
+pub fn run(options: Options) -> Result<()> {
+    block_on(demo_and_print(options))
+}
+
+async fn demo_and_print(options: Options) -> Result<()> {
+    let Options { seconds: duration, record, sensors, json } = options;
+    let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
+    let picture = record.as_ref().map_or_else(|| folder.join("demo.png"), |record| record.with_extension("png"));
+    let options = DemoOptions { duration, record, picture, sensors, any_port: false };
+    let (record, picture) = (options.record.clone(), options.picture.clone());
+    let begun = |endpoints: &Endpoints| {
+        if !json {
+            let _ = print_line(&introduction(endpoints, record.as_deref(), &picture));
+        }
+    };
+    let report = |report: &Report| {
+        let _ = print_line(&if json { report.to_json().to_string() } else { report.line() });
+    };
+    let summary = demo(options, begun, report, stop_signal()?).await?;
+    print_line(&if json { summary.to_json().to_string() } else { summary.text() })?;
+    Ok(())
 }
 
 fn introduction(endpoints: &Endpoints, record: Option<&Path>, picture: &Path) -> String {
