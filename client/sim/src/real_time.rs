@@ -17,8 +17,8 @@ const LATE_NS_MAX: i64 = 100_000_000;
 /// Greatest backlog of a server for which the simulation does not wait: more than two revolutions at 10 Hz, because the
 /// maps of two may be under way in a server that is in time.
 const BACKLOG_NS_MAX: i64 = 250_000_000;
-/// Longest gap between two stamps for a server that is late. A decoder takes a gap of a second or more for a sensor whose
-/// clock was set, and refuses a packet; and a vehicle that waits is stopped only after the wait.
+/// Longest gap between two stamps for a server that is late. After a gap of a second or more a decoder assumes that the
+/// sensor's clock was set, and refuses a packet; and a vehicle that waits is stopped only after the wait.
 const WAIT_NS_MAX: i64 = 900_000_000;
 
 /// The simulated time that was skipped so far. Clones count together.

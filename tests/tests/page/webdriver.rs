@@ -1,8 +1,8 @@
 //! A headless Chromium, driven through ChromeDriver by the W3C WebDriver protocol: JSON over HTTP on loopback.
 
-use std::io::{self, BufRead, BufReader, Read, Write};
+use std::io::{self, BufRead, BufReader, Lines, Read, Write};
 use std::net::TcpStream;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Stdio};
 use std::time::Duration;
 
 use serde_json::{Value, json};
@@ -30,7 +30,9 @@ pub struct Browser {
     port: u16,
     session: String,
     /// The browser's profile, new and empty.
-    _profile: TempDir,
+    profile: TempDir,
+    /// The output of ChromeDriver, which a closed pipe would end.
+    _output: Lines<BufReader<ChildStdout>>,
 }
 
 impl Browser {
@@ -42,12 +44,13 @@ impl Browser {
             .stderr(Stdio::null())
             .spawn()
             .expect("chromedriver starts");
-        let lines = BufReader::new(driver.stdout.take().expect("stdout is piped")).lines();
-        let port = lines.map_while(Result::ok).find_map(|line| port_of(&line)).expect("chromedriver prints its port");
+        let mut output = BufReader::new(driver.stdout.take().expect("stdout is piped")).lines();
+        let port = output.by_ref().map_while(Result::ok).find_map(|line| port_of(&line));
+        let port = port.expect("chromedriver prints its port");
         let profile = tempfile::tempdir().expect("a folder");
-        let mut browser = Self { driver, port, session: String::new(), _profile: profile };
+        let mut browser = Self { driver, port, session: String::new(), profile, _output: output };
         let mut flags = FLAGS.map(str::to_owned).to_vec();
-        flags.push(format!("--user-data-dir={}", browser._profile.path().display()));
+        flags.push(format!("--user-data-dir={}", browser.profile.path().display()));
         flags.push(format!("--window-size={width},{height}"));
         let session = browser.post(
             "/session",
