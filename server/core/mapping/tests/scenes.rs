@@ -35,7 +35,7 @@ struct Turn {
 fn turn(scene: Scene) -> Turn {
     let config = ScannerConfig::default();
     let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
-    let turn = SimulatedVehicle::new(scene, config).turn(1);
+    let turn = SimulatedVehicle::new(scene, config).true_revolution(1);
     let mut sweep = Sweep::default();
     sweep.set_revolution(&turn.revolution, &mount);
     Turn { sweep, truth: turn.truth }

@@ -238,7 +238,7 @@ fn the_plane_of_a_cell_is_the_ground_under_it() {
 fn turn(scene: Scene) -> Sweep {
     let config = ScannerConfig::default();
     let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
-    let revolution = SimulatedVehicle::new(scene, config).turn(1).revolution;
+    let revolution = SimulatedVehicle::new(scene, config).true_revolution(1).revolution;
     let mut sweep = Sweep::default();
     sweep.set_revolution(&revolution, &mount);
     sweep.set_deviations(&revolution, &mount, &mut DistanceSeries::default(), None);
@@ -296,7 +296,7 @@ fn no_flat_cell_of_the_simulated_worlds_holds_an_object() {
         let name = scene.name;
         let config = ScannerConfig::default();
         let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
-        let turn = SimulatedVehicle::new(scene, config).turn(1);
+        let turn = SimulatedVehicle::new(scene, config).true_revolution(1);
         let mut sweep = Sweep::default();
         sweep.set_revolution(&turn.revolution, &mount);
         let [wrong, flat, found] = [Variant::Grid, Variant::Paper, Variant::Grounded].map(|f| {
@@ -334,7 +334,7 @@ fn ground_behind_a_closed_fence_or_a_low_beam_is_flat_but_not_reached() {
         let name = scene.name;
         let config = ScannerConfig::default();
         let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
-        let turn = SimulatedVehicle::new(scene, config).turn(1);
+        let turn = SimulatedVehicle::new(scene, config).true_revolution(1);
         let mut sweep = Sweep::default();
         sweep.set_revolution(&turn.revolution, &mount);
         let layer = terrain(&sweep, &TerrainConfig::default());
