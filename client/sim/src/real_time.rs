@@ -100,7 +100,7 @@ mod tests {
     use crate::scenes::flat;
 
     use clearway_lidar::model::Model;
-    use clearway_lidar::sensor::{Sensor, SensorConfig};
+    use clearway_lidar::{Sensor, SensorConfig};
 
     fn vehicle() -> SimulatedVehicle {
         SimulatedVehicle::new(flat(), ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() })

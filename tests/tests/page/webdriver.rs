@@ -1,6 +1,6 @@
 //! A headless Chromium, driven through ChromeDriver by the W3C WebDriver protocol: JSON over HTTP on loopback.
 
-use std::io::{self, BufRead, BufReader, Lines, Read, Write};
+use std::io::{self, BufRead, BufReader, Lines, Write};
 use std::net::TcpStream;
 use std::process::{Child, ChildStdout, Command, Stdio};
 use std::time::Duration;
