@@ -153,8 +153,9 @@ fn the_order_of_the_points_says_nothing() {
 
 /// A channel's values; path counts as free, because lines two cells wide are thinned from one end.
 fn ends_of_paths_aside(layer: &Layer, name: &str) -> Vec<i32> {
-    let is_path = |value: i32| layer.name == "safe_path" && name == "class" && value == i32::from(SafePathClass::Path.value());
-    values(layer, name).into_iter().map(|v| if is_path(v) { i32::from(SafePathClass::Free.value()) } else { v }).collect()
+    let [free, path] = [SafePathClass::Free, SafePathClass::Path].map(|class| i32::from(class.value()));
+    let is_path = |value: i32| layer.name == "safe_path" && name == "class" && value == path;
+    values(layer, name).into_iter().map(|value| if is_path(value) { free } else { value }).collect()
 }
 
 #[test]

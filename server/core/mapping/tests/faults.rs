@@ -155,7 +155,8 @@ fn middle(geometry: &Geometry, cell: usize) -> (f64, f64) {
         Geometry::Radial { row_radius_m, columns } => {
             let (row, column) = (cell / usize::from(*columns), cell % usize::from(*columns));
             let inner = if row == 0 { 0.0 } else { f64::from(row_radius_m[row - 1]) };
-            let (r, angle) = ((inner + f64::from(row_radius_m[row])) / 2.0, (column as f64 + 0.5) / f64::from(*columns));
+            let r = (inner + f64::from(row_radius_m[row])) / 2.0;
+            let angle = (column as f64 + 0.5) / f64::from(*columns);
             let (sin, cos) = (angle * std::f64::consts::TAU).sin_cos();
             (r * cos, r * sin)
         }

@@ -220,7 +220,9 @@ fn a_vehicle_on_a_real_lane_has_that_lane_painted_as_wide_as_the_file_says() {
         map.make(&sweep, &context, &mut layer);
         let (rows, columns) = common::size(&layer);
         let across: Vec<usize> =
-            (0..rows).filter(|iy| common::classes(&layer)[iy * columns + columns / 2] == SpeedClass::Road.value()).collect();
+            (0..rows)
+                .filter(|iy| common::classes(&layer)[iy * columns + columns / 2] == SpeedClass::Road.value())
+                .collect();
         let painted_m = across.len() as f64 * 0.25;
         let width_m = lane.width_m.unwrap();
         // Where the lane bends at the next waypoint, its edge points lie nearer to the pair's own line; a cell each
