@@ -8,15 +8,10 @@ use std::f64::consts::TAU;
 
 use clearway_proto::grid::Grid;
 use clearway_proto::map::Layer;
+use clearway_proto::v1::ClassMeaning;
 
 use crate::ClientError;
 use crate::view::MapView;
-
-/// Classes a vehicle may drive on, over all layers: what was seen to be free. `flat_inferred` is not among them, for
-/// nobody saw it, and neither is it free in the ROS grids.
-pub const FREE: [&str; 7] = ["drivable", "flat", "clear", "passable", "road", "free", "path"];
-/// Classes that hold something to keep away from, over all layers.
-pub const OBSTACLES: [&str; 2] = ["obstacle", "occupied"];
 
 /// What is nearer than this to a cell touches it, metres: far more than the rounding of any place on a map.
 const TOUCH_M: f64 = 1e-9;
@@ -59,7 +54,7 @@ impl MapView {
     /// [`ClientError::NoLayer`] with the names of those there are.
     pub fn is_free(&self, layer: &str, footprint: &Footprint) -> Result<bool, ClientError> {
         let layer = self.layer(layer)?;
-        Ok(covers_only(&layer.grid, &footprint.corners(), &cells_of(layer, &FREE)))
+        Ok(covers_only(&layer.grid, &footprint.corners(), &cells_that_mean(layer, ClassMeaning::Free)))
     }
 
     /// The obstacle of a layer nearest to a point; `None` where the layer knows of none: what is unknown may hide one.
@@ -68,7 +63,7 @@ impl MapView {
     /// [`ClientError::NoLayer`] with the names of those there are.
     pub fn nearest_obstacle(&self, layer: &str, x_m: f64, y_m: f64) -> Result<Option<Obstacle>, ClientError> {
         let layer = self.layer(layer)?;
-        let obstacles = cells_of(layer, &OBSTACLES);
+        let obstacles = cells_that_mean(layer, ClassMeaning::Occupied);
         let found = (0..layer.grid.cell_count() as usize).filter(|&cell| obstacles(cell)).map(|cell| {
             let [x, y] = nearest_in(&layer.grid, cell, [x_m, y_m]);
             let (dx, dy) = (x - x_m, y - y_m);
@@ -88,13 +83,13 @@ impl Footprint {
     }
 }
 
-/// Whether a cell is of one of these classes.
-fn cells_of<'a>(layer: &'a Layer, names: &[&str]) -> impl Fn(usize) -> bool + use<'a> {
-    let wanted: Vec<bool> = layer.legend.iter().map(|name| names.contains(&name.as_str())).collect();
+/// Returns a predicate on cell indices: true if the class of the cell has this meaning.
+fn cells_that_mean(layer: &Layer, meaning: ClassMeaning) -> impl Fn(usize) -> bool {
+    let has_meaning: Vec<bool> = layer.legend.iter().map(|class| class.meaning == meaning).collect();
     let classes = layer.channel("class").map(|channel| &channel.cells);
     move |cell| {
         let class = classes.and_then(|classes| classes.get(cell)).and_then(|raw| usize::try_from(raw).ok());
-        class.and_then(|class| wanted.get(class).copied()).unwrap_or(false)
+        class.and_then(|class| has_meaning.get(class).copied()).unwrap_or(false)
     }
 }
 
@@ -104,8 +99,8 @@ fn covers_only(grid: &Grid, corners: &[[f64; 2]], is_fit: &dyn Fn(usize) -> bool
         return false;
     }
     match grid {
-        Grid::Radial { r_bench_m, columns } => {
-            (0..*columns).all(|column| column_fits(r_bench_m, (column, *columns), corners, is_fit))
+        Grid::Radial { row_radius_m, columns } => {
+            (0..*columns).all(|column| column_fits(row_radius_m, (column, *columns), corners, is_fit))
         }
         Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
             let (sin, cos) = yaw_rad.sin_cos();
@@ -128,7 +123,7 @@ fn covers_only(grid: &Grid, corners: &[[f64; 2]], is_fit: &dyn Fn(usize) -> bool
 
 /// Whether the part of a polygon that lies in one column of a radial grid touches only cells of this kind.
 fn column_fits(
-    r_bench_m: &[f32],
+    row_radius_m: &[f32],
     (column, columns): (u32, u32),
     corners: &[[f64; 2]],
     is_fit: &dyn Fn(usize) -> bool,
@@ -147,9 +142,9 @@ fn column_fits(
     let to_border = edges(&part).map(|edge| gap([0.0, 0.0], edge)).fold(f64::INFINITY, f64::min);
     let nearest = if contains(&part, [0.0, 0.0]) { 0.0 } else { to_border };
     let farthest = part.iter().map(|[x, y]| x.hypot(*y)).fold(0.0, f64::max);
-    let row = |range_m: f64| r_bench_m.partition_point(|&outer| f64::from(outer) < range_m);
+    let row = |range_m: f64| row_radius_m.partition_point(|&outer| f64::from(outer) < range_m);
     let rows = row(nearest - TOUCH_M)..=row(farthest + TOUCH_M);
-    *rows.end() < r_bench_m.len() && rows.into_iter().all(|row| is_fit(row * columns as usize + column as usize))
+    *rows.end() < row_radius_m.len() && rows.into_iter().all(|row| is_fit(row * columns as usize + column as usize))
 }
 
 /// The part of a convex polygon where `normal · p >= offset`.
@@ -217,10 +212,10 @@ fn nearest_in(grid: &Grid, cell: usize, [x, y]: [f64; 2]) -> [f64; 2] {
             let near_y = (x * sin + y * cos).clamp(origin_y_m + iy * edge, origin_y_m + (iy + 1.0) * edge);
             [near_x * cos + near_y * sin, near_y * cos - near_x * sin]
         }
-        Grid::Radial { r_bench_m, columns } => {
+        Grid::Radial { row_radius_m, columns } => {
             let (row, column) = (cell / *columns as usize, (cell % *columns as usize) as f64);
             let (inner, outer) =
-                (if row == 0 { 0.0 } else { f64::from(r_bench_m[row - 1]) }, f64::from(r_bench_m[row]));
+                (if row == 0 { 0.0 } else { f64::from(row_radius_m[row - 1]) }, f64::from(row_radius_m[row]));
             let turn = (y.atan2(x) / TAU).rem_euclid(1.0) * f64::from(*columns);
             if (column..=column + 1.0).contains(&turn) {
                 let range_m = x.hypot(y).clamp(inner, outer);

@@ -246,8 +246,8 @@ async fn follow(
                 let Some(acknowledged) = sequence_of_delta(update.map) else { return error };
                 tracing::debug!(sequence = acknowledged, %error, "a delta is of no use, a whole map is asked for");
                 // More deltas may be on the way already; one question is enough for them all.
-                let want_full = !std::mem::replace(&mut asked, true);
-                v1::WatchRequest { acknowledged: Some(acknowledged), want_full, selection: None }
+                let request_keyframe = !std::mem::replace(&mut asked, true);
+                v1::WatchRequest { acknowledged: Some(acknowledged), request_keyframe, selection: None }
             }
         };
         if requests.send(request).await.is_err() {

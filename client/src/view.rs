@@ -114,6 +114,6 @@ impl MapView {
 
     /// A figure of the first layer that states it, such as `drivable_share`.
     pub fn figure(&self, name: &str) -> Option<f64> {
-        self.map.layers.iter().find_map(|layer| layer.figures.get(name).copied())
+        self.map.layers.iter().find_map(|layer| layer.metrics.get(name).copied())
     }
 }

@@ -6,11 +6,11 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 use bytes::Bytes;
 use clearway_client::codec::{CellsRef, encode_grid};
-use clearway_client::footprint::{FREE, OBSTACLES};
 use clearway_client::v1::layer::Geometry;
-use clearway::encode::viewer::raster;
 use clearway_client::{Footprint, MapView, v1};
+use clearway_proto::legend::encode_legend;
 use clearway_proto::map::{encode_header, encode_layer};
+use clearway_proto::v1::ClassMeaning;
 use proptest::prelude::*;
 
 const SIDE: u32 = 6;
@@ -19,7 +19,7 @@ const BENCHES: [f32; 3] = [0.6, 1.3, 2.5];
 const LOOK_M: f64 = 0.02;
 
 fn radial(columns: u32) -> Geometry {
-    Geometry::Radial(v1::RadialGrid { r_bench_m: BENCHES.to_vec(), columns })
+    Geometry::Radial(v1::RadialGrid { row_radius_m: BENCHES.to_vec(), columns })
 }
 
 fn cartesian(yaw_rad: f64) -> Geometry {
@@ -38,17 +38,22 @@ fn cartesian(yaw_rad: f64) -> Geometry {
 
 /// A map of one layer `drivability` with these classes.
 fn view(geometry: Geometry, classes: &[u8]) -> MapView {
+    view_of(geometry, classes, &common::LEGEND)
+}
+
+/// A map of one layer `drivability` with these classes and this legend.
+fn view_of(geometry: Geometry, classes: &[u8], legend: &[(&str, ClassMeaning, u32)]) -> MapView {
     let columns = match &geometry {
         Geometry::Radial(grid) => grid.columns,
         Geometry::Cartesian(grid) => grid.width,
     };
-    let layer = v1::Layer {
+    let mut layer = v1::Layer {
         name: "drivability".into(),
         geometry: Some(geometry),
-        legend: ["unknown", "drivable", "not_drivable", "obstacle"].map(String::from).to_vec(),
         channels: vec![encode_grid(CellsRef::U8(classes), columns as usize).into_channel("class", "", 1.0, 0)],
         ..Default::default()
     };
+    encode_legend(&mut layer, legend.iter().copied());
     MapView::decode(Bytes::from([encode_header(&v1::Header::default()), encode_layer(&layer)].concat())).unwrap()
 }
 
@@ -141,18 +146,17 @@ fn unknown_is_never_free_and_neither_is_what_lies_outside_or_nowhere() {
 }
 
 #[test]
-fn rust_python_and_ros_call_the_same_classes_free_and_none_that_nobody_saw() {
-    let python = include_str!("../python/clearway/map.py");
-    for (name, ours) in [("FREE", &FREE[..]), ("OBSTACLES", &OBSTACLES[..])] {
-        let line = python.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(" = frozenset({"));
-        let theirs = line.expect(name).trim_end_matches("})").split(", ").map(|class| class.trim_matches('"'));
-        assert!(theirs.eq(ours.iter().copied()), "{name}: {line:?}");
+fn only_the_meaning_free_is_free_and_only_occupied_is_an_obstacle() {
+    use ClassMeaning::{Free, Hidden, Inferred, NotReached, Occupied, Unknown};
+    let footprint = Footprint { x_m: 0.0, y_m: 0.0, heading_rad: 0.3, length_m: 1.0, width_m: 0.5 };
+    for meaning in [Unknown, Free, Inferred, Occupied, Hidden, NotReached] {
+        // The name of the class has no influence.
+        let classes = [("unknown", Unknown, 0), ("drivable", meaning, 0)];
+        let map = view_of(cartesian(0.0), &[1; (SIDE * SIDE) as usize], &classes);
+        assert_eq!(map.is_free("drivability", &footprint).unwrap(), meaning == Free, "{meaning:?}");
+        let obstacle = map.nearest_obstacle("drivability", 0.0, 0.0).unwrap();
+        assert_eq!(obstacle.is_some(), meaning == Occupied, "{meaning:?}");
     }
-    for class in ["unknown", "flat_inferred", "occluded", "out_of_range"] {
-        assert!(!FREE.contains(&class) && raster::occupancy(class) == -1, "{class}");
-    }
-    assert!(FREE.iter().all(|class| raster::occupancy(class) == 0));
-    assert!(OBSTACLES.iter().all(|class| raster::occupancy(class) == 100));
 }
 
 #[test]

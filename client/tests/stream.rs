@@ -118,9 +118,9 @@ async fn a_lost_update_leads_to_a_whole_map_and_never_to_a_wrong_cell() {
     let client = Client::connect(&address).await.unwrap();
     let mut maps = client.subscribe(Subscription { deltas: true, ..Default::default() }).await.unwrap();
     assert!(told.recv().await.unwrap().selection.unwrap().deltas);
-    for (sequence, want_full) in [(0, false), (2, true), (3, false), (4, false), (5, false)] {
+    for (sequence, request_keyframe) in [(0, false), (2, true), (3, false), (4, false), (5, false)] {
         let request = told.recv().await.unwrap();
-        assert_eq!((request.acknowledged, request.want_full), (Some(sequence), want_full));
+        assert_eq!((request.acknowledged, request.request_keyframe), (Some(sequence), request_keyframe));
     }
     let (mut given, mut skipped) = (Vec::new(), 0);
     while let Ok(update) = maps.next().await {
@@ -140,7 +140,7 @@ async fn a_delta_nobody_asked_for_is_not_shown_either() {
     let client = Client::connect(&address).await.unwrap();
     let mut maps = client.subscribe(Subscription::default()).await.unwrap();
     told.recv().await.unwrap();
-    assert!(told.recv().await.unwrap().want_full);
+    assert!(told.recv().await.unwrap().request_keyframe);
     assert_eq!(maps.next().await.unwrap().map.sequence(), 3);
 }
 

@@ -4,6 +4,7 @@
 use clearway_proto::by_class::encode_beside;
 use clearway_proto::codec::{self, Cells, Limits};
 use clearway_proto::delta;
+use clearway_proto::legend::encode_legend;
 use clearway_proto::map::{decode_map, decode_map_on, encode_header, encode_layer};
 use clearway_proto::v1;
 use divan::{Bencher, counter::ItemsCount};
@@ -62,13 +63,20 @@ fn layer(first_ix: i64) -> v1::Layer {
     let cells: Vec<u8> = (0..SIDE * SIDE).map(class).collect();
     let side = SIDE as u32;
     let grid = v1::CartesianGrid { width: side, height: side, cell_m: 0.25, first_ix, ..Default::default() };
-    v1::Layer {
+    let mut layer = v1::Layer {
         name: "occupancy".into(),
         geometry: Some(v1::layer::Geometry::Cartesian(grid)),
-        legend: ["unknown", "clear", "occupied", "occluded"].map(String::from).to_vec(),
         channels: vec![codec::encode_grid(codec::CellsRef::U8(&cells), SIDE).into_channel("class", "", 1.0, 0)],
         ..Default::default()
-    }
+    };
+    let classes = [
+        ("unknown", v1::ClassMeaning::Unknown, 0x3a3f46),
+        ("clear", v1::ClassMeaning::Free, 0x1c9e96),
+        ("occupied", v1::ClassMeaning::Occupied, 0xc42638),
+        ("occluded", v1::ClassMeaning::Hidden, 0x5c5c80),
+    ];
+    encode_legend(&mut layer, classes);
+    layer
 }
 
 #[divan::bench]

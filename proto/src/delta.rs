@@ -11,6 +11,7 @@ use crate::changes::encode_changes;
 use crate::codec::Cells;
 use crate::decode::Limits;
 use crate::grid::Grid;
+use crate::legend::{encode_legend, is_same_legend};
 use crate::map::{Layer, Map, MapError, MapId, decode_layer};
 use crate::v1;
 use prost::Message;
@@ -29,8 +30,8 @@ pub fn encode_delta(base: &v1::Layer, base_sequence: u64, new: &v1::Layer, limit
     let shift = Shift::new(&old, &decoded.grid).ok()?;
     let columns = decoded.grid.shape().1 as usize;
     let mut delta = v1::Layer { base_sequence: Some(base_sequence), ..new.clone() };
-    if old.legend == new.legend {
-        delta.legend.clear();
+    if is_same_legend(base, new) {
+        encode_legend(&mut delta, []);
     }
     for (channel, now) in delta.channels.iter_mut().zip(&decoded.channels) {
         let before =
@@ -83,8 +84,8 @@ impl<'a> Shift<'a> {
     pub(crate) fn new(base: &'a Layer, grid: &Grid) -> Result<Self, String> {
         let by = match (&base.grid, grid) {
             (
-                Grid::Radial { r_bench_m: before, columns: columns_before },
-                Grid::Radial { r_bench_m: now, columns: columns_now },
+                Grid::Radial { row_radius_m: before, columns: columns_before },
+                Grid::Radial { row_radius_m: now, columns: columns_now },
             ) => {
                 if before != now || columns_before != columns_now {
                     return Err("other benches or columns than the base has".into());

@@ -11,11 +11,11 @@ use crate::v1;
 /// The geometry of one layer, checked: no look-up panics.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Grid {
-    /// r-θ: cell index = row * columns + column. Row j spans (r_bench_m\[j-1\], r_bench_m\[j\]], row 0 starts at the
+    /// r-θ: cell index = row * columns + column. Row j spans (row_radius_m\[j-1\], row_radius_m\[j\]], row 0 starts at the
     /// origin; column c spans azimuths [c, c+1) * 2π / columns, counter-clockwise from the ego x axis.
     Radial {
         /// Outer radius of each row, metres, ascending.
-        r_bench_m: Vec<f32>,
+        row_radius_m: Vec<f32>,
         /// At least 1.
         columns: u32,
     },
@@ -50,15 +50,15 @@ impl Grid {
         let wrong = |what: String| MapError::Geometry { layer: layer.name.clone(), what };
         match &layer.geometry {
             None => Err(wrong("none given; radial or cartesian is needed".into())),
-            Some(v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m, columns })) => {
-                if *columns == 0 || r_bench_m.is_empty() {
+            Some(v1::layer::Geometry::Radial(v1::RadialGrid { row_radius_m, columns })) => {
+                if *columns == 0 || row_radius_m.is_empty() {
                     return Err(wrong(format!(
                         "{} benches and {columns} columns; at least 1 of each is needed",
-                        r_bench_m.len()
+                        row_radius_m.len()
                     )));
                 }
                 let mut inner = 0.0;
-                for (row, &outer) in r_bench_m.iter().enumerate() {
+                for (row, &outer) in row_radius_m.iter().enumerate() {
                     if !outer.is_finite() || outer <= inner {
                         return Err(wrong(format!(
                             "bench {row} is {outer} m; a finite value above {inner} m is needed"
@@ -66,7 +66,7 @@ impl Grid {
                     }
                     inner = outer;
                 }
-                Ok(Self::Radial { r_bench_m: r_bench_m.clone(), columns: *columns })
+                Ok(Self::Radial { row_radius_m: row_radius_m.clone(), columns: *columns })
             }
             Some(v1::layer::Geometry::Cartesian(grid)) => {
                 let v1::CartesianGrid { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix, first_iy } =
@@ -91,7 +91,7 @@ impl Grid {
     /// (rows, columns) of the array that the cells make: (benches, columns) or (height, width).
     pub fn shape(&self) -> (u32, u32) {
         match self {
-            Self::Radial { r_bench_m, columns } => (r_bench_m.len() as u32, *columns),
+            Self::Radial { row_radius_m, columns } => (row_radius_m.len() as u32, *columns),
             Self::Cartesian { width, height, .. } => (*height, *width),
         }
     }
@@ -108,10 +108,10 @@ impl Grid {
             return None;
         }
         match self {
-            Self::Radial { r_bench_m, columns } => {
+            Self::Radial { row_radius_m, columns } => {
                 let range_m = x_m.hypot(y_m);
-                let row = r_bench_m.partition_point(|&outer| f64::from(outer) < range_m);
-                if row == r_bench_m.len() {
+                let row = row_radius_m.partition_point(|&outer| f64::from(outer) < range_m);
+                if row == row_radius_m.len() {
                     return None;
                 }
                 let turn = (y_m.atan2(x_m) / TAU).rem_euclid(1.0);
@@ -135,10 +135,10 @@ impl Grid {
             return None;
         }
         Some(match self {
-            Self::Radial { r_bench_m, columns } => {
+            Self::Radial { row_radius_m, columns } => {
                 let (row, column) = (index / *columns as usize, index % *columns as usize);
-                let inner = if row == 0 { 0.0 } else { f64::from(r_bench_m[row - 1]) };
-                let range_m = 0.5 * (inner + f64::from(r_bench_m[row]));
+                let inner = if row == 0 { 0.0 } else { f64::from(row_radius_m[row - 1]) };
+                let range_m = 0.5 * (inner + f64::from(row_radius_m[row]));
                 let (sin, cos) = ((column as f64 + 0.5) / f64::from(*columns) * TAU).sin_cos();
                 (range_m * cos, range_m * sin)
             }
@@ -153,7 +153,7 @@ impl Grid {
     /// How far the grid reaches from the vehicle along its own axes, metres.
     pub fn range_m_max(&self) -> f64 {
         match self {
-            Self::Radial { r_bench_m, .. } => r_bench_m.last().map_or(0.0, |&r| f64::from(r)),
+            Self::Radial { row_radius_m, .. } => row_radius_m.last().map_or(0.0, |&r| f64::from(r)),
             Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, .. } => {
                 let end_x = origin_x_m + f64::from(*width) * f64::from(*cell_m);
                 let end_y = origin_y_m + f64::from(*height) * f64::from(*cell_m);

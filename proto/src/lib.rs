@@ -13,6 +13,7 @@ pub mod codec;
 mod decode;
 pub mod delta;
 pub mod grid;
+pub mod legend;
 pub mod map;
 pub mod packed;
 mod parts;

@@ -15,7 +15,9 @@ use crate::codec::{Cells, DecodeError, Limits};
 use crate::decode::{check_count, decode_on};
 use crate::delta::{self, Shift};
 use crate::grid::Grid;
-use crate::{by_class, parts, safe_points, v1};
+use crate::legend::{self, Class, LegendError};
+use crate::v1::{self, ClassMeaning};
+use crate::{by_class, parts, safe_points};
 
 /// The bytes of a map with this header and no layer yet.
 pub fn encode_header(header: &v1::Header) -> Bytes {
@@ -43,14 +45,14 @@ pub struct Layer {
     pub name: String,
     /// Where the cells lie.
     pub grid: Grid,
-    /// Names of the values of channel `class`; entry 0 is `unknown`.
-    pub legend: Vec<String>,
+    /// The classes, by value of channel `class`; class 0 is `unknown`.
+    pub legend: Vec<Class>,
     /// In the order on the wire; each has [`Grid::cell_count`] cells.
     pub channels: Vec<Channel>,
     /// Planes z = ax + by + c in the ego frame, by segment id.
     pub planes: Vec<[f64; 3]>,
     /// Figures of the whole layer, such as `drivable_share`.
-    pub figures: BTreeMap<String, f64>,
+    pub metrics: BTreeMap<String, f64>,
     /// Safe points, the vehicle's own place first; empty in layers without.
     pub points: Vec<SafePoint>,
 }
@@ -96,16 +98,28 @@ impl Layer {
         self.channels.iter().find(|channel| channel.name == name)
     }
 
-    /// The class at a point, ego frame, metres: its value and its name in the legend. What lies outside the grid, or
-    /// in a layer without classes, is unknown: class 0.
+    /// Value and name of the class at a point (ego frame, metres): (0, "unknown") outside the grid and in a layer without
+    /// classes.
     pub fn class_at(&self, x_m: f64, y_m: f64) -> (u16, &str) {
-        let class = self
-            .grid
-            .cell_at(x_m, y_m)
-            .and_then(|index| self.channel("class")?.cells.get(index))
-            .and_then(|raw| u16::try_from(raw).ok())
-            .unwrap_or(0);
-        (class, self.legend.get(usize::from(class)).map_or("unknown", String::as_str))
+        match self.grid.cell_at(x_m, y_m).and_then(|cell| self.class_of(cell)) {
+            Some((value, class)) => (value, &class.name),
+            None => (0, "unknown"),
+        }
+    }
+
+    /// Meaning of the class at a point (ego frame, metres): unknown outside the grid and in a layer without classes.
+    pub fn meaning_at(&self, x_m: f64, y_m: f64) -> ClassMeaning {
+        self.grid.cell_at(x_m, y_m).map_or(ClassMeaning::Unknown, |cell| self.meaning_of(cell))
+    }
+
+    /// Meaning of the class of a cell, by the cell's index: unknown past the last cell and in a layer without classes.
+    pub fn meaning_of(&self, cell: usize) -> ClassMeaning {
+        self.class_of(cell).map_or(ClassMeaning::Unknown, |(_, class)| class.meaning)
+    }
+
+    fn class_of(&self, cell: usize) -> Option<(u16, &Class)> {
+        let value = u16::try_from(self.channel("class")?.cells.get(cell)?).ok()?;
+        Some((value, self.legend.get(usize::from(value))?))
     }
 
     /// A channel's value at a point, ego frame, metres, in the channel's unit. `None` where nothing is known: outside
@@ -267,13 +281,13 @@ pub enum MapError {
         /// What is wrong, the value and what is needed.
         what: String,
     },
-    /// The legend does not start with `unknown`.
-    #[error("layer {layer:?}: legend starts with {first:?}; class 0 is \"unknown\" in every legend")]
+    /// The legend was refused.
+    #[error("layer {layer:?}, legend: {source}")]
     Legend {
         /// The layer's name.
         layer: String,
-        /// Entry 0, empty if there is none.
-        first: String,
+        /// What is wrong with the legend.
+        source: LegendError,
     },
     /// A class without a name.
     #[error("layer {layer:?}: class {class} in cell {cell}; the legend has {legend} entries")]
@@ -384,19 +398,21 @@ fn check_unique<'a>(what: &'static str, names: impl Iterator<Item = &'a String>)
 }
 
 /// `base`: the layer that a delta stands on.
-pub(crate) fn decode_layer(mut layer: v1::Layer, base: Option<&Layer>, limits: &Limits) -> Result<Layer, MapError> {
+pub(crate) fn decode_layer(layer: v1::Layer, base: Option<&Layer>, limits: &Limits) -> Result<Layer, MapError> {
     let grid = Grid::from_wire(&layer)?;
     check_unique("channel", layer.channels.iter().map(|channel| &channel.name))?;
     let shift = match (layer.base_sequence, base) {
         (None, _) => None,
         (Some(base_sequence), None) => return Err(MapError::NoBase { layer: layer.name, base_sequence }),
         (Some(_), Some(base)) => {
-            if layer.legend.is_empty() {
-                layer.legend.clone_from(&base.legend);
-            }
             let misfit = |what| MapError::BaseShape { layer: layer.name.clone(), what };
             Some(Shift::new(base, &grid).map_err(misfit)?)
         }
+    };
+    let legend = match base {
+        // A delta without a legend has that of its base.
+        Some(base) if legend::is_empty(&layer) => base.legend.clone(),
+        _ => legend::decode_legend(&layer).map_err(|source| MapError::Legend { layer: layer.name.clone(), source })?,
     };
     let (expected, columns) = (grid.cell_count(), grid.shape().1 as usize);
     let mut channels: Vec<Channel> = Vec::with_capacity(layer.channels.len());
@@ -410,7 +426,7 @@ pub(crate) fn decode_layer(mut layer: v1::Layer, base: Option<&Layer>, limits: &
         check_count(channel, limits).map_err(wrong)?;
         let base = if !channel.by_class.is_empty() {
             let class = channels.iter().find(|channel| channel.name == "class").map(|class| &class.cells);
-            Some(by_class::base(channel, class, layer.legend.len()).map_err(|what| {
+            Some(by_class::base(channel, class, legend.len()).map_err(|what| {
                 let (layer, channel) = names();
                 MapError::ByClass { layer, channel, what }
             })?)
@@ -425,12 +441,12 @@ pub(crate) fn decode_layer(mut layer: v1::Layer, base: Option<&Layer>, limits: &
         channels.push(Channel { name, unit: unit.clone(), scale: *scale, unknown: *unknown, cells });
     }
     let planes = layer.planes.iter().map(|plane| [plane.a, plane.b, plane.c]).collect();
-    let figures = layer.figures.into_iter().collect();
+    let metrics = layer.metrics.into_iter().collect();
     let points = match &layer.safe_points {
         Some(packed) => safe_points::unpack(&layer.name, packed, limits.map_parts)?,
         None => Vec::new(),
     };
-    let layer = Layer { name: layer.name, grid, legend: layer.legend, channels, planes, figures, points };
+    let layer = Layer { name: layer.name, grid, legend, channels, planes, metrics, points };
     check_classes(&layer)?;
     Ok(layer)
 }
@@ -439,9 +455,9 @@ pub(crate) fn decode_layer(mut layer: v1::Layer, base: Option<&Layer>, limits: &
 fn check_classes(layer: &Layer) -> Result<(), MapError> {
     let Some(channel) = layer.channel("class") else { return Ok(()) };
     let (name, legend) = (layer.name.clone(), layer.legend.len());
-    if layer.legend.first().is_none_or(|first| first != "unknown") {
-        let first = layer.legend.first().cloned().unwrap_or_default();
-        return Err(MapError::Legend { layer: name, first });
+    if layer.legend.first().is_none_or(|first| first.name != "unknown") {
+        let first = layer.legend.first().map(|class| class.name.clone()).unwrap_or_default();
+        return Err(MapError::Legend { layer: name, source: LegendError::FirstName { name: first } });
     }
     let nameless = |class: i32| usize::try_from(class).map_or(true, |class| class >= legend);
     let found = match &channel.cells {

@@ -4,7 +4,7 @@
 //!
 //! A Cartesian grid keeps the smallest rectangle of its cells that holds the region; where it turns under the vehicle,
 //! that of the turned region. A radial grid keeps the rows from the vehicle to the region's farthest corner, with all
-//! columns: those cells of them are unknown whose ring or sector has nothing of the region. Planes, figures, legend and
+//! columns: those cells of them are unknown whose ring or sector has nothing of the region. Planes, metrics, legend and
 //! safe points stay whole: they tell of the layer, not of its cells.
 
 use std::f64::consts::{PI, TAU};
@@ -68,7 +68,7 @@ pub fn crop(layer: &v1::Layer, region: &v1::Region, limits: &Limits) -> Result<v
     let Part { rows, columns, .. } = &part;
     let mut cropped = layer.clone();
     match &mut cropped.geometry {
-        Some(v1::layer::Geometry::Radial(grid)) => grid.r_bench_m.truncate(rows.len()),
+        Some(v1::layer::Geometry::Radial(grid)) => grid.row_radius_m.truncate(rows.len()),
         Some(v1::layer::Geometry::Cartesian(grid)) => {
             grid.origin_x_m += columns.start as f64 * f64::from(grid.cell_m);
             grid.origin_y_m += rows.start as f64 * f64::from(grid.cell_m);
@@ -111,12 +111,12 @@ impl Part {
         let corners = [region.x_from_m, region.x_to_m].map(|x| [region.y_from_m, region.y_to_m].map(|y| (x, y)));
         let corners = corners.as_flattened();
         match grid {
-            Grid::Radial { r_bench_m, columns } => {
+            Grid::Radial { row_radius_m, columns } => {
                 let nearest =
                     region.x_from_m.max(0.0).max(-region.x_to_m).hypot(region.y_from_m.max(0.0).max(-region.y_to_m));
                 let farthest = corners.iter().map(|(x, y)| x.hypot(*y)).fold(0.0, f64::max);
-                let row_at = |range_m: f64| r_bench_m.partition_point(|&outer| f64::from(outer) < range_m);
-                let rows = r_bench_m.len().min(row_at(farthest) + 1);
+                let row_at = |range_m: f64| row_radius_m.partition_point(|&outer| f64::from(outer) < range_m);
+                let rows = row_radius_m.len().min(row_at(farthest) + 1);
                 let told_rows = row_at(nearest)..rows;
                 let told_columns = sectors(region, corners, *columns);
                 let all = Self { rows: 0..rows, columns: 0..*columns as usize, told_rows, told_columns };

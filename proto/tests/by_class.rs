@@ -7,13 +7,18 @@ use clearway_proto::by_class::encode_beside;
 use clearway_proto::codec::{Cells, CellsRef, Limits, encode_grid};
 use clearway_proto::delta::encode_delta;
 use clearway_proto::map::{Map, decode_map, decode_map_on, encode_header, encode_layer};
-use clearway_proto::v1;
-use common::assert_golden;
+use clearway_proto::v1::{self, ClassMeaning};
+use common::{assert_golden, with_legend};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use prost::Message;
 
-const CLASSES: [&str; 4] = ["unknown", "clear", "occupied", "hidden"];
+const CLASSES: [(&str, ClassMeaning, u32); 4] = [
+    ("unknown", ClassMeaning::Unknown, 0x3a3f46),
+    ("clear", ClassMeaning::Free, 0x1c9e96),
+    ("occupied", ClassMeaning::Occupied, 0xc42638),
+    ("hidden", ClassMeaning::Hidden, 0x5c5c80),
+];
 
 /// The bytes of a map of one layer: these channels beside these classes, told by class or not.
 fn bytes(class: &[u8], columns: u32, channels: &[(&str, Cells)], by_class: bool) -> Bytes {
@@ -31,12 +36,11 @@ fn bytes(class: &[u8], columns: u32, channels: &[(&str, Cells)], by_class: bool)
             cell_m: 0.25,
             ..Default::default()
         })),
-        legend: CLASSES.map(String::from).to_vec(),
         channels: std::iter::once(of_class).chain(told).collect(),
         ..Default::default()
     };
     let header = v1::Header { vehicle: "alpha".into(), boot_id: 7, sequence: 3, ..Default::default() };
-    [encode_header(&header), encode_layer(&layer)].concat().into()
+    [encode_header(&header), encode_layer(&with_legend(layer, &CLASSES))].concat().into()
 }
 
 fn open(bytes: &Bytes) -> Map {

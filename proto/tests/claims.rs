@@ -3,6 +3,7 @@
 
 use bytes::Bytes;
 use clearway_proto::codec::{self, Limits};
+use clearway_proto::legend::encode_legend;
 use clearway_proto::{map, v1};
 use peak_alloc::PeakAlloc;
 use prost::Message;
@@ -94,9 +95,8 @@ fn channels() -> Vec<v1::Channel> {
 /// A map of one layer with a grid of so many cells.
 fn map_of(geometry: v1::layer::Geometry, channels: Vec<v1::Channel>) -> Vec<u8> {
     let header = v1::Header { vehicle: "car".into(), ..Default::default() };
-    let legend = vec!["unknown".into(), "clear".into()];
-    let layer =
-        v1::Layer { name: "occupancy".into(), geometry: Some(geometry), legend, channels, ..Default::default() };
+    let mut layer = v1::Layer { name: "occupancy".into(), geometry: Some(geometry), channels, ..Default::default() };
+    encode_legend(&mut layer, [("unknown", v1::ClassMeaning::Unknown, 0), ("clear", v1::ClassMeaning::Free, 0)]);
     v1::Map { header: Some(header), layers: vec![layer] }.encode_to_vec()
 }
 
@@ -105,7 +105,7 @@ fn maps() -> Vec<Vec<u8>> {
     let square = |width, height| {
         v1::layer::Geometry::Cartesian(v1::CartesianGrid { width, height, cell_m: 0.25, ..Default::default() })
     };
-    let radial = |columns| v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m: vec![1.0, 2.0], columns });
+    let radial = |columns| v1::layer::Geometry::Radial(v1::RadialGrid { row_radius_m: vec![1.0, 2.0], columns });
     let rows = |count: u32, payload: Vec<u8>| channel(v1::CellType::U8, v1::Encoding::Rows, count, payload);
     let mut maps: Vec<_> = channels().into_iter().map(|channel| map_of(square(2048, 2048), vec![channel])).collect();
     for (width, height) in [(u32::MAX, u32::MAX), (u32::MAX, 1), (65_536, 65_536), (4096, 4096)] {

@@ -63,8 +63,8 @@ proptest! {
 
     #[test]
     fn the_middle_of_a_cell_lies_in_that_cell(benches in vec(0.01_f32..3.0, 1..60), columns in 1..720_u32, at in any::<prop::sample::Index>()) {
-        let r_bench_m = benches.iter().scan(0.0, |r, step| { *r += step; Some(*r) }).collect();
-        let grid = clearway_proto::grid::Grid::Radial { r_bench_m, columns };
+        let row_radius_m = benches.iter().scan(0.0, |r, step| { *r += step; Some(*r) }).collect();
+        let grid = clearway_proto::grid::Grid::Radial { row_radius_m, columns };
         let index = at.index(grid.cell_count() as usize);
         let (x, y) = grid.centre_of(index).unwrap();
         prop_assert_eq!(grid.cell_at(x, y), Some(index));

@@ -8,9 +8,9 @@ use clearway_proto::delta::encode_delta;
 use clearway_proto::grid::Grid;
 use clearway_proto::map::{self, Map, MapError, decode_map, decode_map_on};
 use clearway_proto::region::{self, RegionError};
-use clearway_proto::v1;
+use clearway_proto::v1::{self, ClassMeaning};
 use clearway_proto::v1::layer::Geometry;
-use common::{assert_golden, bless, hex, pretty};
+use common::{assert_golden, bless, hex, pretty, with_legend};
 use proptest::prelude::*;
 use prost::Message;
 use serde_json::json;
@@ -54,7 +54,7 @@ fn layer(seed: u64, time: u64, first: [i64; 2], [width, height]: [u32; 2]) -> v1
     let class: Vec<u8> = cells.iter().map(|cell| (cell / 13_007) as u8).collect();
     let height_raw: Vec<i8> = cells.iter().map(|cell| (cell >> 6) as i8).collect();
     let encode = |cells: CellsRef<'_>| encode_grid(cells, width as usize);
-    v1::Layer {
+    let layer = v1::Layer {
         name: "occupancy".into(),
         geometry: Some(Geometry::Cartesian(v1::CartesianGrid {
             origin_x_m: -1.5,
@@ -66,16 +66,25 @@ fn layer(seed: u64, time: u64, first: [i64; 2], [width, height]: [u32; 2]) -> v1
             first_ix: first[0],
             first_iy: first[1],
         })),
-        legend: ["unknown", "flat", "clear", "occupied", "hidden"].map(String::from).to_vec(),
         channels: vec![
             encode(CellsRef::U8(&class)).into_channel("class", "", 1.0, 0),
             encode(CellsRef::I8(&height_raw)).into_channel("unit_height", "m", 0.02, -128),
             encode(CellsRef::U16(&cells)).into_channel("hits", "", 1.0, 65_535),
         ],
         planes: vec![v1::Plane { a: 0.5, b: time as f64, c: 0.0 }],
-        figures: [("share".to_owned(), time as f64)].into(),
+        metrics: [("share".to_owned(), time as f64)].into(),
         ..Default::default()
-    }
+    };
+    with_legend(
+        layer,
+        &[
+            ("unknown", ClassMeaning::Unknown, 0x3a3f46),
+            ("flat", ClassMeaning::Inferred, 0x166e6a),
+            ("clear", ClassMeaning::Free, 0x1c9e96),
+            ("occupied", ClassMeaning::Occupied, 0xc42638),
+            ("hidden", ClassMeaning::Hidden, 0x5c5c80),
+        ],
+    )
 }
 
 fn cartesian(layer: &mut v1::Layer) -> &mut v1::CartesianGrid {
@@ -201,9 +210,9 @@ proptest! {
 }
 
 /// `layer` in rings.
-fn radial(mut layer: v1::Layer, r_bench_m: Vec<f32>) -> v1::Layer {
-    let columns = layer.channels[0].cell_count / r_bench_m.len() as u32;
-    layer.geometry = Some(Geometry::Radial(v1::RadialGrid { r_bench_m, columns }));
+fn radial(mut layer: v1::Layer, row_radius_m: Vec<f32>) -> v1::Layer {
+    let columns = layer.channels[0].cell_count / row_radius_m.len() as u32;
+    layer.geometry = Some(Geometry::Radial(v1::RadialGrid { row_radius_m, columns }));
     layer
 }
 
@@ -265,8 +274,8 @@ fn a_delta_without_its_base_or_on_one_that_does_not_fit_is_refused_by_name() {
         ("base_without_the_layer", "no_base", |_, [layer, _]| layer.name = "terrain".into()),
         ("base_of_smaller_cells", "base_shape", |_, [layer, _]| cartesian(layer).cell_m = 0.25),
         ("base_of_another_kind", "base_shape", |_, [layer, _]| {
-            let r_bench_m = (1..21).map(|bench| bench as f32).collect();
-            layer.geometry = radial(layer.clone(), r_bench_m).geometry
+            let row_radius_m = (1..21).map(|bench| bench as f32).collect();
+            layer.geometry = radial(layer.clone(), row_radius_m).geometry
         }),
         ("base_of_other_benches", "base_shape", |_, [_, rings]| {
             *rings = radial(rings.clone(), vec![1.0, 5.0, 6.0, 9.0, 11.0])
@@ -308,7 +317,7 @@ fn a_delta_without_its_base_or_on_one_that_does_not_fit_is_refused_by_name() {
 
 fn benches(layer: &v1::Layer) -> Vec<f32> {
     match &layer.geometry {
-        Some(Geometry::Radial(grid)) => grid.r_bench_m.clone(),
+        Some(Geometry::Radial(grid)) => grid.row_radius_m.clone(),
         other => panic!("{other:?}"),
     }
 }
@@ -344,12 +353,12 @@ fn a_radial_part_has_the_rows_to_the_farthest_corner_and_all_columns_of_which_th
     let rings = radial(layer(2, 1, [0, 0], [24, 5]), vec![2.0, 5.0, 6.0, 9.0, 11.0]);
     let corner = |x_to_m, y_to_m| v1::Region { x_from_m: -1.0, x_to_m, y_from_m: -1.0, y_to_m };
     let part = open(1, &region::crop(&rings, &corner(3.0, 4.0), &LIMITS()).unwrap(), None).unwrap();
-    assert_eq!(part.layers[0].grid, Grid::Radial { r_bench_m: vec![2.0, 5.0], columns: 24 });
+    assert_eq!(part.layers[0].grid, Grid::Radial { row_radius_m: vec![2.0, 5.0], columns: 24 });
     let (whole, Cells::U8(class)) = (open(1, &rings, None).unwrap(), &part.layers[0].channels[0].cells) else {
         panic!("class of u8")
     };
     assert_eq!(whole.layers[0].channels[0].cells, Cells::U8([&class[..], &rest(&whole, 48)].concat()));
-    assert_eq!((&part.layers[0].planes, &part.layers[0].figures), (&whole.layers[0].planes, &whole.layers[0].figures));
+    assert_eq!((&part.layers[0].planes, &part.layers[0].metrics), (&whole.layers[0].planes, &whole.layers[0].metrics));
     // To the left, from the third ring on: of 24 columns those from 45 to 135 degrees, and nothing of the first two rings.
     let left = v1::Region { x_from_m: -5.4, x_to_m: 5.4, y_from_m: 5.5, y_to_m: 7.0 };
     let part = open(1, &region::crop(&rings, &left, &LIMITS()).unwrap(), None).unwrap();

@@ -5,8 +5,10 @@ mod common;
 
 use bytes::Bytes;
 use clearway_proto::codec::{self, Cells, Limits};
+use clearway_proto::legend::encode_legend;
+use clearway_proto::v1::ClassMeaning;
 use clearway_proto::{map, safe_points, v1};
-use common::{assert_golden, bless, golden, hex, pretty};
+use common::{assert_golden, bless, golden, hex, pretty, with_legend};
 use prost::Message;
 use serde_json::{Value, json};
 
@@ -145,6 +147,43 @@ fn bad_vectors() -> Vec<Bad> {
 }
 
 #[test]
+fn the_examples_in_map_proto_are_what_the_encoder_writes() {
+    let specification = include_str!("../clearway/v1/map.proto");
+    let has_payload = |payload: &[u8]| {
+        let bits: Vec<_> = payload.iter().map(|byte| format!("{byte:08b}")).collect();
+        let bytes: Vec<_> = payload.iter().map(|byte| format!("{byte:02x}")).collect();
+        let line = format!("Payload: {} = {}", bits.join(" "), bytes.join(" "));
+        assert!(specification.contains(&line), "{line}");
+    };
+    let rows = codec::encode_grid(codec::CellsRef::U8(&[1, 1, 0, 0, 1, 1, 1, 0]), 4);
+    assert_eq!(rows.encoding, v1::Encoding::Rows);
+    has_payload(&rows.payload);
+
+    // One class: its table makes a base of zeros.
+    let cells = [0, 0, 5, 5, 0, 0, 0, 0];
+    let payload = vec![0x29, 0xb5, 0x10];
+    has_payload(&payload);
+    let class = codec::encode_grid(codec::CellsRef::U8(&[0; 8]), 4).into_channel("class", "", 1.0, 0);
+    let hits = v1::Channel {
+        name: "hits".into(),
+        cell_type: v1::CellType::U8.into(),
+        encoding: v1::Encoding::Changes.into(),
+        cell_count: 8,
+        crc32: codec::encode_grid(codec::CellsRef::U8(&cells), 4).crc32,
+        payload: payload.into(),
+        by_class: vec![0].into(),
+        ..Default::default()
+    };
+    let grid = v1::CartesianGrid { width: 4, height: 2, cell_m: 1.0, ..Default::default() };
+    let geometry = Some(v1::layer::Geometry::Cartesian(grid));
+    let layer = v1::Layer { geometry, channels: vec![class, hits], ..Default::default() };
+    let layer = with_legend(layer, &CLASSES[..1]);
+    let bytes = [map::encode_header(&v1::Header::default()), map::encode_layer(&layer)].concat();
+    let map = map::decode_map(bytes.into(), &Limits::default()).unwrap();
+    assert_eq!(map.layers[0].channels[1].cells, Cells::U8(cells.to_vec()));
+}
+
+#[test]
 fn every_bad_channel_is_refused_under_its_name() {
     let bad = bad_vectors();
     assert!(bad.len() >= 40, "{}", bad.len());
@@ -181,6 +220,13 @@ fn the_stored_channels_decode_to_their_stored_cells() {
     }
 }
 
+const CLASSES: [(&str, ClassMeaning, u32); 4] = [
+    ("unknown", ClassMeaning::Unknown, 0x3a3f46),
+    ("drivable", ClassMeaning::Free, 0x1c9e96),
+    ("not_drivable", ClassMeaning::NotReached, 0xf4b842),
+    ("obstacle", ClassMeaning::Occupied, 0xc42638),
+];
+
 fn golden_map() -> (v1::Header, v1::Layer, v1::Layer) {
     let header = v1::Header {
         vehicle: "alpha".into(),
@@ -206,21 +252,21 @@ fn golden_map() -> (v1::Header, v1::Layer, v1::Layer) {
         compensation: "poses".into(),
         ..Default::default()
     };
-    let radial = v1::RadialGrid { r_bench_m: vec![4.0, 8.0, 12.0], columns: 8 };
+    let radial = v1::RadialGrid { row_radius_m: vec![4.0, 8.0, 12.0], columns: 8 };
     let class: Vec<u8> = [[1; 8], [1, 1, 1, 1, 2, 2, 1, 1], [0, 0, 1, 1, 3, 3, 0, 0]].concat();
     let height: Vec<i8> = (0..24).map(|i| if i < 16 { -2 } else { i }).collect();
     let drivability = v1::Layer {
         name: "drivability".into(),
         geometry: Some(v1::layer::Geometry::Radial(radial)),
-        legend: ["unknown", "drivable", "not_drivable", "obstacle"].map(String::from).to_vec(),
         channels: vec![
             codec::encode_grid(codec::CellsRef::U8(&class), 8).into_channel("class", "", 1.0, 0),
             codec::encode_grid(codec::CellsRef::I8(&height), 8).into_channel("unit_height", "m", 0.02, -128),
         ],
         planes: vec![v1::Plane { a: 0.01, b: -0.02, c: 0.0 }],
-        figures: [("drivable_share".to_string(), 0.8), ("judged_share".to_string(), 0.75)].into(),
+        metrics: [("drivable_share".to_string(), 0.8), ("judged_share".to_string(), 0.75)].into(),
         ..Default::default()
     };
+    let drivability = with_legend(drivability, &CLASSES);
     let grid = v1::CartesianGrid {
         origin_x_m: -1.0,
         origin_y_m: -0.5,
@@ -274,12 +320,21 @@ fn the_golden_map_is_its_header_and_its_layers_behind_each_other() {
             let (rows, columns) = layer.grid.shape();
             let points: Vec<_> =
                 layer.points.iter().map(|p| json!({"x_m": p.x_m, "y_m": p.y_m, "radius_m": p.radius_m, "links": p.links})).collect();
-            json!({"name": layer.name, "shape": [rows, columns], "legend": layer.legend, "channels": channels, "figures": layer.figures, "points": points})
+            let names: Vec<_> = layer.legend.iter().map(|class| &class.name).collect();
+            let meanings: Vec<_> = layer.legend.iter().map(|class| class.meaning.as_str_name()).collect();
+            let colours: Vec<_> = layer.legend.iter().map(|class| class.rgb).collect();
+            json!({
+                "name": layer.name, "shape": [rows, columns],
+                "legend": names, "legend_meanings": meanings, "legend_rgb": colours,
+                "channels": channels, "metrics": layer.metrics, "points": points,
+            })
         })
         .collect();
     let layer = map.layer("drivability").unwrap();
     let looks: Vec<_> =
-        looks.iter().map(|&(x, y)| json!({"x_m": x, "y_m": y, "class": layer.class_at(x, y).1})).collect();
+        looks.iter().map(|&(x, y)| json!({
+        "x_m": x, "y_m": y, "class": layer.class_at(x, y).1, "meaning": layer.meaning_at(x, y).as_str_name(),
+    })).collect();
     let described = json!({
         "vehicle": map.header.vehicle,
         "sequence": map.header.sequence,
@@ -294,7 +349,7 @@ fn the_golden_map_is_its_header_and_its_layers_behind_each_other() {
 /// (name, expected error, what is done to the golden map).
 type Spoil = (&'static str, &'static str, fn(&mut v1::Map));
 
-fn spoils() -> [Spoil; 36] {
+fn spoils() -> [Spoil; 42] {
     [
         ("by_class_of_too_few", "by_class", |map| map.layers[0].channels[1].by_class = vec![1; 3].into()),
         ("by_class_of_classes", "by_class", |map| map.layers[0].channels[0].by_class = vec![0; 4].into()),
@@ -313,15 +368,23 @@ fn spoils() -> [Spoil; 36] {
         ("two_channels_with_one_name", "twice", |map| map.layers[0].channels[1].name = "class".into()),
         ("no_geometry", "geometry", |map| map.layers[0].geometry = None),
         ("no_columns", "geometry", |map| radial(map).columns = 0),
-        ("no_benches", "geometry", |map| radial(map).r_bench_m.clear()),
-        ("benches_descending", "geometry", |map| radial(map).r_bench_m[2] = 7.0),
-        ("bench_not_finite", "geometry", |map| radial(map).r_bench_m[2] = f32::INFINITY),
-        ("bench_at_0", "geometry", |map| radial(map).r_bench_m[0] = 0.0),
+        ("no_benches", "geometry", |map| radial(map).row_radius_m.clear()),
+        ("benches_descending", "geometry", |map| radial(map).row_radius_m[2] = 7.0),
+        ("bench_not_finite", "geometry", |map| radial(map).row_radius_m[2] = f32::INFINITY),
+        ("bench_at_0", "geometry", |map| radial(map).row_radius_m[0] = 0.0),
         ("cell_edge_negative", "geometry", |map| cartesian(map).cell_m = -0.5),
         ("origin_not_finite", "geometry", |map| cartesian(map).origin_x_m = f64::NAN),
         ("more_columns_than_cells", "cell_count", |map| radial(map).columns = 0x2000_0000),
         ("legend_without_unknown", "legend", |map| map.layers[0].legend[0] = "free".into()),
-        ("class_without_a_name", "class", |map| map.layers[0].legend.truncate(3)),
+        ("legend_without_meanings", "legend", |map| map.layers[0].legend_meanings.clear()),
+        ("legend_of_fewer_meanings", "legend", |map| map.layers[0].legend_meanings.truncate(3)),
+        ("legend_of_more_colours", "legend", |map| map.layers[0].legend_rgb.push(0)),
+        ("legend_of_other_names", "legend", |map| map.layers[0].legend.truncate(3)),
+        ("legend_whose_class_0_is_free", "legend", |map| {
+            map.layers[0].legend_meanings[0] = ClassMeaning::Free.into();
+        }),
+        ("legend_colour_of_25_bits", "legend", |map| map.layers[0].legend_rgb[1] = 1 << 24),
+        ("class_without_a_name", "class", |map| encode_legend(&mut map.layers[0], CLASSES[..3].iter().copied())),
         ("safe_points_of_infinite_steps", "safe_point", |map| points(map).step_m = f32::INFINITY),
         ("safe_points_in_no_steps", "safe_point", |map| points(map).step_m = 0.0),
         ("safe_point_too_far", "safe_point", |map| points(map).x[1] = i32::MIN),

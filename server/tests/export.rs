@@ -70,7 +70,7 @@ fn a_picture_has_the_colour_of_each_class_where_it_lies() {
         let start = (row * 120 + column) * 3;
         [pixels[start], pixels[start + 1], pixels[start + 2]]
     };
-    let [unknown, drivable, not_drivable, obstacle] = [[38, 40, 44], [64, 176, 128], [232, 176, 64], [176, 40, 48]];
+    let [unknown, drivable, not_drivable, obstacle] = [[58, 63, 70], [28, 158, 150], [244, 184, 66], [196, 38, 56]];
     assert_eq!(at(6.1, 6.1), drivable, "ahead and to the left");
     assert_eq!(at(-6.1, 6.1), not_drivable, "behind and to the left");
     assert_eq!(at(-6.1, -6.1), unknown, "behind and to the right");
@@ -107,8 +107,10 @@ fn arrays_have_numpys_header_and_the_cells_and_come_with_a_document() {
     let document: Value = serde_json::from_slice(&std::fs::read(out.join("000002_drivability.json")).unwrap()).unwrap();
     assert_eq!(document["sequence"], 2);
     assert_eq!(document["capture_end_ns"], CAPTURE_END_NS + 200_000_000);
-    assert_eq!(document["geometry"]["r_bench_m"], serde_json::json!([10.0, 20.0, 30.0]));
+    assert_eq!(document["geometry"]["row_radius_m"], serde_json::json!([10.0, 20.0, 30.0]));
     assert_eq!(document["legend"][3], "obstacle");
+    assert_eq!(document["legend_meanings"][3], "CLASS_MEANING_OCCUPIED");
+    assert_eq!(document["legend_rgb"][3], "#c42638");
     assert_eq!(document["channels"][1]["scale"], 0.5);
     assert_eq!(document["channels"][0].get("cells"), None);
 }

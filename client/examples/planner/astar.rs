@@ -7,6 +7,7 @@
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, HashMap};
 
+use clearway_client::v1::ClassMeaning;
 use clearway_client::{ClientError, MapView};
 
 /// Edge of a cell of the planner's own grid, metres.
@@ -84,17 +85,16 @@ impl Planner {
         });
         for cell in about(self.cell_of_ego(), REACH_M) {
             let [x, y] = self.in_ego(middle(cell));
-            let mps = match layer.class_at(x, y).1 {
-                "passable" | "road" => layer.value_at("speed", x, y).unwrap_or(0.0),
-                "unknown" if begins && x.hypot(y) < STAND_M => STAND_MPS,
+            let mps = match layer.meaning_at(x, y) {
+                ClassMeaning::Free => layer.value_at("speed", x, y).unwrap_or(0.0),
+                ClassMeaning::Unknown if begins && x.hypot(y) < STAND_M => STAND_MPS,
                 _ => continue,
             };
             self.seen.insert(cell, Seen { mps, stamp_ns });
         }
         // By the obstacles' own cells: none falls between two of the planner's.
-        let Some(classes) = layer.channel("class").map(|channel| &channel.cells) else { return Ok(()) };
-        let obstacle = layer.legend.iter().position(|name| name == "obstacle").map(|class| class as i32);
-        for index in (0..layer.grid.cell_count() as usize).filter(|&index| classes.get(index) == obstacle) {
+        let occupied = |index: &usize| layer.meaning_of(*index) == ClassMeaning::Occupied;
+        for index in (0..layer.grid.cell_count() as usize).filter(occupied) {
             let Some((x, y)) = layer.grid.centre_of(index).filter(|(x, y)| x.hypot(*y) < REACH_M) else { continue };
             self.seen.insert(cell_of(self.in_map([x, y])), Seen { mps: 0.0, stamp_ns });
         }

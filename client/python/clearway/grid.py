@@ -13,27 +13,27 @@ import numpy as np
 
 @dataclass(frozen=True)
 class RadialGrid:
-    """Array shape (rows, columns): row j spans (r_bench_m[j-1], r_bench_m[j]], column c the azimuths
+    """Array shape (rows, columns): row j spans (row_radius_m[j-1], row_radius_m[j]], column c the azimuths
     [c, c+1) * 2 pi / columns, counter-clockwise from the ego x axis."""
 
-    r_bench_m: np.ndarray
+    row_radius_m: np.ndarray
     columns: int
 
     @property
     def shape(self) -> tuple[int, int]:
-        return len(self.r_bench_m), self.columns
+        return len(self.row_radius_m), self.columns
 
     def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Cell index of each point, -1 outside the grid."""
-        row = np.searchsorted(self.r_bench_m, np.hypot(x_m, y_m), side="left")
+        row = np.searchsorted(self.row_radius_m, np.hypot(x_m, y_m), side="left")
         turn = np.mod(np.arctan2(y_m, x_m) / math.tau, 1.0)
         column = np.minimum((turn * self.columns).astype(np.int64), self.columns - 1)
-        return np.where(row < len(self.r_bench_m), row * self.columns + column, -1)
+        return np.where(row < len(self.row_radius_m), row * self.columns + column, -1)
 
     def nearest(self, cells: np.ndarray, x_m: float, y_m: float) -> np.ndarray:
         """The place in each of these cells (indices) that is nearest to a point, shape (n, 2)."""
         row, column = np.divmod(cells, self.columns)
-        inner, outer = np.concatenate(([0.0], self.r_bench_m[:-1]))[row], self.r_bench_m[row]
+        inner, outer = np.concatenate(([0.0], self.row_radius_m[:-1]))[row], self.row_radius_m[row]
 
         def along(turn: np.ndarray) -> np.ndarray:
             way = np.stack([np.cos(turn * math.tau), np.sin(turn * math.tau)], axis=-1)
@@ -49,7 +49,7 @@ class RadialGrid:
 
     def centres(self) -> np.ndarray:
         """Middle of every cell, shape (rows, columns, 2)."""
-        outer = self.r_bench_m
+        outer = self.row_radius_m
         range_m = 0.5 * (np.concatenate(([0.0], outer[:-1])) + outer)
         azimuth = (np.arange(self.columns) + 0.5) / self.columns * math.tau
         return range_m[:, None, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)

@@ -10,6 +10,7 @@ import copy
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cached_property
 from itertools import accumulate
 from typing import NamedTuple
@@ -22,12 +23,6 @@ from .errors import ClearwayError, DecodeError
 from .freshness import Arrival, Clock, now_ns
 from .grid import CartesianGrid, Grid, RadialGrid
 from .v1 import map_pb2
-
-#: Classes a vehicle may drive on, over all layers: what was seen to be free. `flat_inferred` is not among them, for nobody
-#: saw it, and neither is it free in the ROS grids.
-FREE = frozenset({"drivable", "flat", "clear", "passable", "road", "free", "path"})
-#: Classes that hold something to keep away from, over all layers.
-OBSTACLES = frozenset({"obstacle", "occupied"})
 
 #: Cells of all channels of a map that are accepted.
 CELLS_MAX = 16 << 20
@@ -57,6 +52,28 @@ class Channel:
     def values(self) -> np.ndarray:
         """Values in `unit`, NaN where nothing is known."""
         return np.where(self.raw == self.unknown, np.nan, self.raw * np.float64(self.scale))
+
+
+class Meaning(IntEnum):
+    """What a class means to a planner; `ClassMeaning` of map.proto defines each of them."""
+
+    UNKNOWN = map_pb2.CLASS_MEANING_UNKNOWN
+    FREE = map_pb2.CLASS_MEANING_FREE
+    INFERRED = map_pb2.CLASS_MEANING_INFERRED
+    OCCUPIED = map_pb2.CLASS_MEANING_OCCUPIED
+    HIDDEN = map_pb2.CLASS_MEANING_HIDDEN
+    NOT_REACHED = map_pb2.CLASS_MEANING_NOT_REACHED
+
+
+class ClassInfo(NamedTuple):
+    """One class of a layer."""
+
+    #: Name, such as `drivable`; `unknown` for class 0.
+    name: str
+    #: What a planner may conclude about a cell of this class.
+    meaning: Meaning
+    #: Colour in which viewers draw the class: 0xRRGGBB.
+    rgb: int
 
 
 class SafePoint(NamedTuple):
@@ -89,8 +106,10 @@ class Layer:
         self.grid: Grid = _grid(message)
         #: Cell (row, column) of a delta changes cell (row, column) + shift of the base.
         self._shift = _shift(message.name, base.grid, self.grid) if base else (0, 0)
-        #: Names of the values of the channel `class`; entry 0 is `unknown`.
-        self.legend: tuple[str, ...] = tuple(message.legend) or (base.legend if base else ())
+        #: The classes, by value of the channel `class`; class 0 is `unknown`.
+        self.classes_info: tuple[ClassInfo, ...] = _legend(message, base)
+        #: Names of the classes.
+        self.legend: tuple[str, ...] = tuple(entry.name for entry in self.classes_info)
         self.channels: dict[str, Channel] = {}
         for channel in message.channels:
             if channel.name in self.channels:
@@ -99,7 +118,7 @@ class Layer:
         #: Planes z = ax + by + c in the ego frame, by segment id, shape (n, 3).
         self.planes = np.array([(p.a, p.b, p.c) for p in message.planes], dtype=np.float64).reshape(-1, 3)
         #: Figures of the whole layer, such as `drivable_share`.
-        self.figures: dict[str, float] = dict(message.figures)
+        self.metrics: dict[str, float] = dict(message.metrics)
         #: Safe points, the vehicle's own place first.
         self.points: tuple[SafePoint, ...] = tuple(self._points(message.safe_points))
         self._check_classes()
@@ -111,18 +130,23 @@ class Layer:
 
     @property
     def free(self) -> np.ndarray:
-        """Whether each cell is of a class a vehicle may drive on."""
-        return self._is_one_of(FREE)
+        """True for each cell whose class means free, in the shape of the grid."""
+        return self._means(Meaning.FREE)
 
     @property
     def obstacles(self) -> np.ndarray:
-        """Whether each cell holds something to keep away from."""
-        return self._is_one_of(OBSTACLES)
+        """True for each cell whose class means occupied, in the shape of the grid."""
+        return self._means(Meaning.OCCUPIED)
 
     def class_at(self, x_m: float, y_m: float) -> str:
         """Name of the class at a point; what lies outside the grid is unknown."""
         cell = int(self.grid.cells_at(np.float64(x_m), np.float64(y_m)))
         return "unknown" if cell < 0 else self.legend[int(self.classes.flat[cell])]
+
+    def meaning_at(self, x_m: float, y_m: float) -> Meaning:
+        """Meaning of the class at a point (ego frame, metres); `Meaning.UNKNOWN` outside the grid."""
+        cell = int(self.grid.cells_at(np.float64(x_m), np.float64(y_m)))
+        return Meaning.UNKNOWN if cell < 0 else self.classes_info[int(self.classes.flat[cell])].meaning
 
     def value_at(self, channel: str, x_m: float, y_m: float) -> float:
         """A channel's value at a point in the channel's unit; NaN where nothing is known."""
@@ -221,8 +245,8 @@ class Layer:
             raise ClearwayError("class", f"layer {self.name!r} has no classes; its channels: {list(self.channels)}")
         return self.channels["class"]
 
-    def _is_one_of(self, names: frozenset[str]) -> np.ndarray:
-        return np.array([name in names for name in self.legend])[self.classes]
+    def _means(self, meaning: Meaning) -> np.ndarray:
+        return np.array([entry.meaning == meaning for entry in self.classes_info])[self.classes]
 
 
 class Map:
@@ -333,7 +357,7 @@ class Map:
 def _grid(message: map_pb2.Layer) -> Grid:
     kind = message.WhichOneof("geometry")
     if kind == "radial":
-        benches = np.array(message.radial.r_bench_m, dtype=np.float64)
+        benches = np.array(message.radial.row_radius_m, dtype=np.float64)
         rising = np.isfinite(benches).all() and (np.diff(benches, prepend=0.0) > 0).all()
         if message.radial.columns and len(benches) and rising:
             return RadialGrid(benches, message.radial.columns)
@@ -366,9 +390,29 @@ def _shift(layer: str, before: Grid, now: Grid) -> tuple[int, int]:
     if isinstance(before, CartesianGrid) and isinstance(now, CartesianGrid) and before.cell_m == now.cell_m:
         return now.first_iy - before.first_iy, now.first_ix - before.first_ix
     if isinstance(before, RadialGrid) and isinstance(now, RadialGrid):
-        if before.columns == now.columns and np.array_equal(before.r_bench_m, now.r_bench_m):
+        if before.columns == now.columns and np.array_equal(before.row_radius_m, now.row_radius_m):
             return 0, 0
     raise DecodeError("base_shape", f"layer {layer!r} is a delta to a grid that is not comparable")
+
+
+def _legend(message: map_pb2.Layer, base: Layer | None) -> tuple[ClassInfo, ...]:
+    """The legend of a layer; that of the base in a delta without one. A meaning that this version does not know becomes
+    `Meaning.UNKNOWN`, so that a planner does not enter cells of that class."""
+    lists = (message.legend, message.legend_meanings, message.legend_rgb)
+    if base is not None and not any(lists):
+        return base.classes_info
+    names, meanings, colours = map(len, lists)
+    if not names == meanings == colours:
+        text = f"layer {message.name!r}: {names} names, {meanings} meanings and {colours} colours; one of each per class is needed"
+        raise DecodeError("legend", text)
+    if names and message.legend_meanings[0] != Meaning.UNKNOWN:
+        text = f"layer {message.name!r}: class 0 has the meaning {message.legend_meanings[0]}; 0 (unknown) is needed"
+        raise DecodeError("legend", text)
+    if names and max(message.legend_rgb) > 0xFFFFFF:
+        text = f"layer {message.name!r}: a colour {max(message.legend_rgb):#x}; at most 0xffffff is allowed"
+        raise DecodeError("legend", text)
+    known = {int(meaning) for meaning in Meaning}
+    return tuple(ClassInfo(name, Meaning(meaning if meaning in known else 0), rgb) for name, meaning, rgb in zip(*lists))
 
 
 def _check_header(message: map_pb2.Map) -> None:

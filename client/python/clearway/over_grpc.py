@@ -122,6 +122,6 @@ def _follow(
             if not any(layer.HasField("base_sequence") for layer in message.layers):
                 raise
             # More deltas may be on the way already; one question is enough for them all.
-            answer.want_full, asked = not asked, True
-        if answer.want_full or acknowledges:
+            answer.request_keyframe, asked = not asked, True
+        if answer.request_keyframe or acknowledges:
             request(answer)

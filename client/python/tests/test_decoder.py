@@ -69,7 +69,7 @@ def test_the_golden_delta_on_its_base_is_the_golden_whole():
     for name, layer in expected.layers.items():
         for channel, values in layer.channels.items():
             assert np.array_equal(opened[name].channels[channel].raw, values.raw), (name, channel)
-        assert opened[name].figures == layer.figures and opened[name].legend == layer.legend
+        assert opened[name].metrics == layer.metrics and opened[name].legend == layer.legend
     grid, whole_grid = opened["occupancy"].grid, expected["occupancy"].grid
     assert (grid.first_ix, grid.first_iy) == (whole_grid.first_ix, whole_grid.first_iy) != (0, 0)
 
@@ -90,7 +90,9 @@ def test_the_golden_map_says_what_every_other_client_reads_in_it():
     for expected in told["layers"]:
         layer = m[expected["name"]]
         assert list(layer.grid.shape) == expected["shape"] and list(layer.legend) == expected["legend"]
-        assert layer.figures == expected["figures"]
+        assert layer.metrics == expected["metrics"]
+        assert [f"CLASS_MEANING_{entry.meaning.name}" for entry in layer.classes_info] == expected["legend_meanings"]
+        assert [entry.rgb for entry in layer.classes_info] == expected["legend_rgb"]
         for values in expected["channels"]:
             cells = [value for value, length in values["cells_value_length"] for _ in range(length)]
             assert layer.channels[values["name"]].raw.ravel().tolist() == cells
@@ -99,6 +101,7 @@ def test_the_golden_map_says_what_every_other_client_reads_in_it():
         ]
     for at in told["classes_of_drivability"]:
         assert m["drivability"].class_at(at["x_m"], at["y_m"]) == at["class"]
+        assert f"CLASS_MEANING_{m['drivability'].meaning_at(at['x_m'], at['y_m']).name}" == at["meaning"]
 
 
 def test_a_map_is_stale_after_its_validity_and_when_its_age_cannot_be_known():

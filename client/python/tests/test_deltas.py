@@ -26,7 +26,7 @@ def follow(*updates):
                 shown.append(next(stream))
 
     _follow(stream, coming(), requests.append, acknowledges=True)
-    return [(m.sequence, m.skipped) for m in shown], [(r.acknowledged, r.want_full) for r in requests]
+    return [(m.sequence, m.skipped) for m in shown], [(r.acknowledged, r.request_keyframe) for r in requests]
 
 
 def test_a_lost_update_leads_to_a_whole_map_and_is_not_shown():

@@ -3,7 +3,15 @@
 
 use std::path::PathBuf;
 
+use clearway_proto::legend::encode_legend;
+use clearway_proto::v1::{self, ClassMeaning};
 use serde_json::Value;
+
+/// `layer` with a legend of these classes.
+pub fn with_legend(mut layer: v1::Layer, classes: &[(&str, ClassMeaning, u32)]) -> v1::Layer {
+    encode_legend(&mut layer, classes.iter().copied());
+    layer
+}
 
 pub fn golden(file: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("golden").join(file)

@@ -15,7 +15,7 @@ use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use clearway_lidar::{Sensor, SensorConfig};
 use serde_json::{Map, Value, json};
 
-use super::recording::Recording;
+use crate::record::mcap_reader::McapReader;
 use super::say;
 
 /// Tell what a file holds: an MCAP recording, a pcap or pcapng capture, a KITTI .bin or a .pcd scan.
@@ -84,28 +84,29 @@ fn describe(object: &Map<String, Value>, indent: &str, lines: &mut Vec<String>) 
 }
 
 fn recording(file: &Path) -> Result<Value> {
-    let mut recording = Recording::open(file)?;
+    let mut recording = McapReader::salvage(file)?;
     let mut messages: BTreeMap<String, u64> = BTreeMap::new();
     let (mut events, mut maps, mut scans) = (0_u64, BTreeMap::<(String, String), u64>::new(), 0_u64);
     let mut grids: BTreeMap<String, Value> = BTreeMap::new();
     let mut span: Option<(u64, u64)> = None;
     for message in recording.by_ref() {
         let message = message?;
-        *messages.entry(message.topic.clone()).or_default() += 1;
-        let at = message.log_time_ns;
+        *messages.entry(message.channel.topic.clone()).or_default() += 1;
+        let at = message.log_ns;
         span = Some(span.map_or((at, at), |(first, last)| (first.min(at), last.max(at))));
-        events += u64::from(message.schema == "clearway.v1.Event");
+        events += u64::from(message.channel.schema == "clearway.v1.Event");
         scans += u64::from(message.is_velodyne_scan());
         if let Some((vehicle, layer)) = message.map_of() {
             *maps.entry((vehicle.to_owned(), layer.to_owned())).or_default() += 1;
             if !grids.contains_key(layer) {
-                let map = MapView::decode(message.data.clone()).with_context(|| message.topic.clone())?;
+                let map = MapView::decode(message.data.clone()).with_context(|| message.channel.topic.clone())?;
                 let found = map.layer(layer)?;
                 let (rows, columns) = found.grid.shape();
                 let channels: Vec<_> = found.channels.iter().map(|channel| &channel.name).collect();
+                let legend: Vec<_> = found.legend.iter().map(|class| &class.name).collect();
                 grids.insert(
                     layer.into(),
-                    json!({"rows": rows, "columns": columns, "legend": found.legend, "channels": channels}),
+                    json!({"rows": rows, "columns": columns, "legend": legend, "channels": channels}),
                 );
             }
         }
@@ -114,20 +115,20 @@ fn recording(file: &Path) -> Result<Value> {
     for ((vehicle, layer), count) in maps {
         vehicles.entry(vehicle).or_default().insert(layer, count);
     }
-    let text = |name: &str| recording.attachments.get(name).map(|bytes| String::from_utf8_lossy(bytes).into_owned());
+    let header = recording.header();
     Ok(json!({
         "kind": "recording",
-        "state": recording.cut.clone().unwrap_or_else(|| "complete".into()),
-        "complete": recording.cut.is_none(),
+        "state": recording.incomplete().unwrap_or_else(|| "complete".into()),
+        "complete": recording.incomplete().is_none(),
         "duration_s": span.map(|(first, last)| (last - first) as f64 * 1e-9),
-        "run": recording.notes,
+        "run": header.metadata,
         "events": events,
         "maps": vehicles,
         "layers": grids,
         "velodyne_scans": scans,
         "messages": messages,
-        "calibrations": recording.attachments.keys().filter(|name| name.starts_with("calibration/")).collect::<Vec<_>>(),
-        "config": text("config.toml"),
+        "calibrations": header.calibrations.keys().collect::<Vec<_>>(),
+        "config": header.config,
     }))
 }
 

@@ -13,7 +13,6 @@ mod info;
 mod ingest;
 mod network;
 mod npy;
-mod recording;
 pub mod replay;
 mod run;
 mod send;

@@ -86,8 +86,8 @@ async fn serve(arguments: &ConfigArguments) -> Result<ExitCode> {
     let calibrations = config.calibrations(&arguments.config)?;
     let certificates = config.certificates(&arguments.config)?;
     let mut config = config.located(&arguments.config);
-    if let Some(file) = crate::record::writer::wanted(&config.recorder) {
-        config.recorder.file = crate::record::writer::unused(file);
+    if let Some(file) = crate::record::writer::recording_path(&config.recorder) {
+        config.recorder.file = crate::record::writer::next_free_name(file);
     }
     // Asked for before anything starts, so that no signal can fall between.
     let stop = stop_signal()?;
@@ -101,7 +101,7 @@ async fn serve(arguments: &ConfigArguments) -> Result<ExitCode> {
 
 /// Logs where to look.
 fn tell(running: &Running) {
-    for vehicle in &running.doors {
+    for vehicle in &running.inputs {
         if let Some((data, telemetry)) = vehicle.udp {
             tracing::info!(vehicle = %vehicle.name, %data, %telemetry, "listening for datagrams");
         }

@@ -19,7 +19,7 @@ use serde_json::json;
 
 use super::network;
 use super::progress_bar;
-use super::recording::Recording;
+use crate::record::mcap_reader::McapReader;
 
 /// A capture with a hole of hours is not a reason to sit and wait.
 const PAUSE_MAX: Duration = Duration::from_secs(60);
@@ -89,21 +89,21 @@ pub fn run(options: &Options) -> Result<()> {
     let progress = progress_bar(length);
     let mut cut = None;
     if options.file.extension().is_some_and(|extension| extension == "mcap") {
-        let mut recording = Recording::open(&options.file)?;
+        let mut recording = McapReader::salvage(&options.file)?;
         while let Some(message) = recording.next() {
-            let message = message.with_context(|| options.file.display().to_string())?;
-            progress.set_position(recording.bytes_read);
+            let message = message?;
+            progress.set_position(recording.bytes_read());
             if !message.is_velodyne_scan() {
                 sender.sender.skip("not a VelodyneScan", 1);
                 continue;
             }
-            let scan = VelodyneScan::new(&message.data).with_context(|| message.topic.clone())?;
+            let scan = VelodyneScan::new(&message.data).with_context(|| message.channel.topic.clone())?;
             for packet in scan.packets() {
-                let (stamp_ns, packet) = packet.with_context(|| message.topic.clone())?;
+                let (stamp_ns, packet) = packet.with_context(|| message.channel.topic.clone())?;
                 sender.send(stamp_ns, packet)?;
             }
         }
-        cut = recording.cut.clone();
+        cut = recording.incomplete();
     } else {
         let file = File::open(&options.file).with_context(|| format!("open {}", options.file.display()))?;
         let mut capture = Capture::new(BufReader::new(file)).with_context(|| options.file.display().to_string())?;

@@ -1,4 +1,4 @@
-//! One layer of a map -> JSON: geometry, pose, stamps, sensors, legend, figures, and the cells where asked for.
+//! One layer of a map -> JSON: geometry, pose, stamps, sensors, legend, metrics, and the cells where asked for.
 
 use clearway_client::codec::Cells;
 use clearway_client::grid::Grid;
@@ -9,8 +9,8 @@ use serde_json::{Value, json};
 pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
     let header = map.header();
     let geometry = match &layer.grid {
-        Grid::Radial { r_bench_m, columns } => {
-            json!({"kind": "radial", "r_bench_m": r_bench_m, "columns": columns})
+        Grid::Radial { row_radius_m, columns } => {
+            json!({"kind": "radial", "row_radius_m": row_radius_m, "columns": columns})
         }
         Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix, first_iy } => json!({
             "kind": "cartesian", "origin_x_m": origin_x_m, "origin_y_m": origin_y_m, "width": width,
@@ -37,9 +37,11 @@ pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
         "layer": layer.name,
         "geometry": geometry,
         "shape": [rows, columns],
-        "legend": layer.legend,
+        "legend": layer.legend.iter().map(|class| &class.name).collect::<Vec<_>>(),
+        "legend_meanings": layer.legend.iter().map(|class| class.meaning.as_str_name()).collect::<Vec<_>>(),
+        "legend_rgb": layer.legend.iter().map(|class| format!("#{:06x}", class.rgb)).collect::<Vec<_>>(),
         "planes": layer.planes,
-        "figures": layer.figures,
+        "metrics": layer.metrics,
         "channels": layer.channels.iter().map(|c| channel(c, with_cells)).collect::<Vec<_>>(),
     })
 }

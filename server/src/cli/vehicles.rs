@@ -63,7 +63,7 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
         "observations_refused": vehicle.observations_refused,
         "recorder": {"file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost},
         "readers": vehicle.readers,
-        "strangers": vehicle.strangers.iter().map(|s| {
+        "unknown_senders": vehicle.unknown_senders.iter().map(|s| {
             json!({"address": s.address, "datagrams": s.datagrams, "newest_age_ms": (now - s.newest_ns) as f64 * 1e-6})
         }).collect::<Vec<_>>(),
     })
@@ -124,7 +124,7 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
             ));
         }
     }
-    for s in &vehicle.strangers {
+    for s in &vehicle.unknown_senders {
         let age = (now - s.newest_ns) as f64 * 1e-9;
         lines.push(format!("  unknown sender {}: {} datagrams, the newest {age:.0} s ago", s.address, s.datagrams));
     }

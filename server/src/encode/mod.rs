@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
-use clearway_mapping::layer::{Cells, Geometry, Layer, SafePoint};
+use clearway_mapping::layer::{Cells, Geometry, Layer, Meaning, SafePoint};
 use clearway_mapping::map::{Map, SensorState};
 use clearway_proto::by_class::encode_beside;
 use clearway_proto::codec::{self, CellsRef};
@@ -97,7 +97,7 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
         speed_mps: map.speed_mps,
         sensors: map.sensors.iter().map(sensor).collect(),
         compensation: map.compensation.as_str().to_owned(),
-        made_by: map.sensors.get(usize::from(map.source)).map_or(String::new(), |sensor| sensor.name.clone()),
+        source_sensor: map.sensors.get(usize::from(map.source)).map_or(String::new(), |sensor| sensor.name.clone()),
     }
 }
 
@@ -134,7 +134,10 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
 fn layer(layer: &Layer) -> v1::Layer {
     let geometry = match &layer.geometry {
         Geometry::Radial { row_radius_m, columns } => {
-            v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m: row_radius_m.clone(), columns: u32::from(*columns) })
+            v1::layer::Geometry::Radial(v1::RadialGrid {
+                row_radius_m: row_radius_m.clone(),
+                columns: u32::from(*columns),
+            })
         }
         &Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_cell } => {
             let [first_ix, first_iy] = first_cell;
@@ -173,11 +176,25 @@ fn layer(layer: &Layer) -> v1::Layer {
         name: layer.name.to_owned(),
         geometry: Some(geometry),
         legend: layer.legend.iter().map(|class| class.name.to_owned()).collect(),
+        legend_meanings: layer.legend.iter().map(|class| meaning(class.meaning).into()).collect(),
+        legend_rgb: layer.legend.iter().map(|class| class.rgb).collect(),
         channels: layer.channels.iter().map(channel).collect(),
         planes: layer.planes.iter().map(|&[a, b, c]| v1::Plane { a, b, c }).collect(),
-        figures: layer.metrics.iter().map(|&(name, value)| (name.to_owned(), value)).collect(),
+        metrics: layer.metrics.iter().map(|&(name, value)| (name.to_owned(), value)).collect(),
         safe_points: safe_points(layer),
         base_sequence: None,
+    }
+}
+
+/// Translates the core's meaning of a class to the wire's.
+pub(crate) fn meaning(meaning: Meaning) -> v1::ClassMeaning {
+    match meaning {
+        Meaning::Unknown => v1::ClassMeaning::Unknown,
+        Meaning::Free => v1::ClassMeaning::Free,
+        Meaning::Inferred => v1::ClassMeaning::Inferred,
+        Meaning::Occupied => v1::ClassMeaning::Occupied,
+        Meaning::Hidden => v1::ClassMeaning::Hidden,
+        Meaning::NotReached => v1::ClassMeaning::NotReached,
     }
 }
 
@@ -242,7 +259,7 @@ mod tests {
         assert_eq!(whole.layers.len(), 2);
         let header = whole.header.unwrap();
         assert_eq!((header.sequence, header.boot_id, header.valid_until_ns), (9, 7, 300_000_100));
-        assert_eq!((header.compensation.as_str(), header.made_by.as_str()), ("speed", "left"));
+        assert_eq!((header.compensation.as_str(), header.source_sensor.as_str()), ("speed", "left"));
         let sensors: Vec<_> = header.sensors.iter().map(|s| (s.state.as_str(), s.age_ms, s.packets_expected)).collect();
         assert_eq!(sensors, [("late", Some(250.5), 0), ("ok", None, 75)]);
         let one = encoded.select(&["height_difference".into()]);

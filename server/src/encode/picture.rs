@@ -1,23 +1,13 @@
 //! One layer of a map -> a PNG: from above, the vehicle in the middle, its forward axis up, its left on the left.
 //!
-//! The picture turns with the vehicle: up is ahead, not north. Classes have colours by name; a layer without classes is
-//! drawn from its first channel, dark to light.
+//! The picture turns with the vehicle: up is ahead, not north. Classes have the colours of the layer's legend; a layer
+//! without classes is drawn from its first channel, dark to light.
 
+use clearway_proto::legend::Class;
 use clearway_proto::map::Layer;
 
-/// Colours told apart also by those who see no red and green: the lightness differs too.
-const UNKNOWN: [u8; 3] = [38, 40, 44];
-const DRIVABLE: [u8; 3] = [64, 176, 128];
-/// Filled in, or free without a judgement of the ground.
-const WEAKLY_DRIVABLE: [u8; 3] = [44, 112, 88];
-const NOT_DRIVABLE: [u8; 3] = [232, 176, 64];
-const OBSTACLE: [u8; 3] = [176, 40, 48];
-const HIDDEN: [u8; 3] = [92, 92, 128];
-const OUT_OF_RANGE: [u8; 3] = [14, 15, 17];
-const ROAD: [u8; 3] = [120, 190, 240];
-const PATH: [u8; 3] = [250, 250, 240];
-/// For classes this version has no colour for.
-const OTHERS: [[u8; 3]; 4] = [[96, 144, 224], [168, 120, 208], [120, 200, 216], [216, 144, 176]];
+/// Colour of the ground outside the grid, and of cells without a value: the colour of class `unknown` in every legend.
+const UNKNOWN: [u8; 3] = [58, 63, 70];
 const RING: [u8; 3] = [112, 116, 124];
 const VEHICLE: [u8; 3] = [244, 244, 248];
 /// Half of a car's length and breadth, metres.
@@ -81,19 +71,7 @@ pub(crate) enum Colours {
 impl Colours {
     pub(crate) fn of(layer: &Layer) -> Self {
         if let Some(channel) = layer.channels.iter().position(|channel| channel.name == "class") {
-            let colour = |(class, name): (usize, &String)| match name.as_str() {
-                "unknown" => UNKNOWN,
-                "drivable" | "flat" | "passable" | "clear" => DRIVABLE,
-                "flat_inferred" | "free" => WEAKLY_DRIVABLE,
-                "not_drivable" | "flat_elevated" | "flat_unreachable" => NOT_DRIVABLE,
-                "road" => ROAD,
-                "path" => PATH,
-                "obstacle" | "occupied" => OBSTACLE,
-                "occluded" => HIDDEN,
-                "out_of_range" => OUT_OF_RANGE,
-                _ => OTHERS[class % OTHERS.len()],
-            };
-            return Self::Classes(channel, layer.legend.iter().enumerate().map(colour).collect());
+            return Self::Classes(channel, layer.legend.iter().map(Class::colour).collect());
         }
         let (mut least, mut greatest) = (f64::INFINITY, f64::NEG_INFINITY);
         if let Some(channel) = layer.channels.first() {

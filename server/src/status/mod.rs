@@ -12,9 +12,11 @@ use clearway_proto::v1;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
-use crate::subscriptions::Demand;
-use crate::engine::NewestSweep;
-use crate::ingest::{Outside, Stranger, locked, now_ns};
+use crate::subscriptions::LayerSubscriptions;
+use crate::newest::NewestSweep;
+use crate::clock::now_ns;
+use crate::ingest::drops::{DropCounters, UnknownSender};
+use crate::sync::locked;
 use crate::record::writer::RecorderCounts;
 use crate::encode::EncodedMap;
 
@@ -39,14 +41,14 @@ pub struct VehicleStatus {
     /// The layers of its maps, in order.
     pub layers: Vec<&'static str>,
     /// Which of the layers somebody takes.
-    pub demand: Demand,
+    pub subscriptions: LayerSubscriptions,
     /// Where the newest map's points go while somebody takes them.
     pub sweeps: watch::Sender<NewestSweep>,
     /// Readers over gRPC.
     pub grpc_readers: Arc<AtomicU32>,
     /// Open pages.
     pub page_readers: Arc<AtomicU32>,
-    outside: Arc<Outside>,
+    drops: Arc<DropCounters>,
     recorder: OnceLock<Arc<RecorderCounts>>,
     engine_stopped: AtomicBool,
     inside: Mutex<Inside>,
@@ -129,16 +131,16 @@ impl Snapshot {
 
 impl VehicleStatus {
     /// The status of a vehicle that has seen nothing.
-    pub fn new(name: Arc<str>, boot_id: u64, layers: Vec<&'static str>, outside: Arc<Outside>) -> Self {
+    pub fn new(name: Arc<str>, boot_id: u64, layers: Vec<&'static str>, drops: Arc<DropCounters>) -> Self {
         Self {
             name,
             boot_id,
-            demand: Demand::new(&layers),
+            subscriptions: LayerSubscriptions::new(&layers),
             sweeps: watch::Sender::new(None),
             layers,
             grpc_readers: Arc::default(),
             page_readers: Arc::default(),
-            outside,
+            drops,
             recorder: OnceLock::new(),
             engine_stopped: AtomicBool::new(false),
             inside: Mutex::default(),
@@ -198,10 +200,10 @@ impl VehicleStatus {
             ..Snapshot::default()
         };
         let sensors = snapshot.sensors.iter_mut().map(|sensor| &mut sensor.ledger);
-        self.outside.add_to(&mut snapshot.ledger, sensors);
+        self.drops.add_unreported_to(&mut snapshot.ledger, sensors);
         // The engine waits for this lock: what takes longer comes after it.
         drop(inside);
-        snapshot.observations_refused = self.outside.observations_refused();
+        snapshot.observations_refused = self.drops.refused_messages();
         latencies.sort_unstable();
         snapshot.latency_ms_p50 = percentile_ms(&latencies, 50);
         snapshot.latency_ms_p99 = percentile_ms(&latencies, 99);
@@ -231,7 +233,7 @@ impl VehicleStatus {
             sensor_ledgers: snapshot.sensors.iter().map(|s| (s.name.clone(), ledger(&s.ledger))).collect(),
             recorder: Some(self.recorder.get().map(|counts| counts.to_proto()).unwrap_or_default()),
             readers: self.readers().map(|(transport, readers)| (transport.to_owned(), readers)).into(),
-            strangers: self.outside.strangers().iter().map(stranger).collect(),
+            unknown_senders: self.drops.unknown_senders().iter().map(unknown_sender).collect(),
             observations_refused: by_name(&snapshot.observations_refused),
         }
     }
@@ -267,10 +269,10 @@ impl VehicleStatus {
             "observations_refused": proto.observations_refused,
             "recorder": {
                 "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
-                "stopped": self.recorder.get().and_then(|counts| counts.stopped()),
+                "stopped": self.recorder.get().and_then(|counts| counts.stop_reason()),
             },
             "readers": proto.readers,
-            "strangers": proto.strangers.iter().map(|s| {
+            "unknown_senders": proto.unknown_senders.iter().map(|s| {
                 json!({ "address": s.address, "datagrams": s.datagrams, "newest_ns": s.newest_ns.to_string() })
             }).collect::<Vec<_>>(),
             "rates": { "maps_hz": snapshot.maps_hz, "packets_hz": snapshot.packets_hz },
@@ -280,9 +282,9 @@ impl VehicleStatus {
     }
 }
 
-fn stranger(stranger: &Stranger) -> v1::Stranger {
-    let Stranger { address, datagrams, newest_ns } = *stranger;
-    v1::Stranger { address: address.to_string(), datagrams, newest_ns }
+fn unknown_sender(sender: &UnknownSender) -> v1::UnknownSender {
+    let UnknownSender { address, datagrams, newest_ns } = *sender;
+    v1::UnknownSender { address: address.to_string(), datagrams, newest_ns }
 }
 
 fn ledger_json(ledger: &v1::Ledger) -> Value {
@@ -349,10 +351,10 @@ mod tests {
 
     #[test]
     fn what_the_door_turned_away_is_in_the_ledger_and_the_ledger_adds_up() {
-        let (door, _events) = crate::ingest::door(4);
-        door.refuse_stranger(([10, 0, 0, 9], 2368).into());
-        door.refuse_stranger(([10, 0, 0, 9], 2368).into());
-        let status = VehicleStatus::new("car".into(), 1, vec!["drivability"], door.outside());
+        let (door, _events) = crate::ingest::queue::event_queue(4);
+        door.refuse_unknown_sender(([10, 0, 0, 9], 2368).into());
+        door.refuse_unknown_sender(([10, 0, 0, 9], 2368).into());
+        let status = VehicleStatus::new("car".into(), 1, vec!["drivability"], door.drops());
         let ledger = Ledger { received: 3, decoded: 2, telemetry: 1, ..Ledger::default() };
         status.stepped(&ledger, Vec::new());
         let shown = status.snapshot().ledger;

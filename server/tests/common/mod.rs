@@ -8,7 +8,9 @@ use std::process::{Command, Output};
 use bytes::Bytes;
 use clearway_client::codec::{CellsRef, encode_grid};
 use clearway_client::v1;
+use clearway_proto::legend::encode_legend;
 use clearway_proto::map::{encode_header, encode_layer};
+use clearway_proto::v1::ClassMeaning;
 
 pub const CAPTURE_END_NS: i64 = 1_700_000_000_100_000_000;
 
@@ -33,18 +35,24 @@ pub fn map(sequence: u64, capture_end_ns: i64) -> Bytes {
         ..Default::default()
     };
     let heights: Vec<i8> = (0..12).map(|i| if i == 2 { -128 } else { i }).collect();
-    let layer = v1::Layer {
+    let mut layer = v1::Layer {
         name: "drivability".into(),
-        geometry: Some(v1::layer::Geometry::Radial(v1::RadialGrid { r_bench_m: vec![10.0, 20.0, 30.0], columns: 4 })),
-        legend: ["unknown", "drivable", "not_drivable", "obstacle"].map(String::from).to_vec(),
+        geometry: Some(v1::layer::Geometry::Radial(v1::RadialGrid { row_radius_m: vec![10.0, 20.0, 30.0], columns: 4 })),
         channels: vec![
             encode_grid(CellsRef::U8(&CLASSES), 4).into_channel("class", "", 1.0, 0),
             encode_grid(CellsRef::I8(&heights), 4).into_channel("unit_height", "m", 0.5, -128),
             encode_grid(CellsRef::U16(&[400; 12]), 4).into_channel("segment", "", 1.0, 65_535),
         ],
-        figures: [("drivable_share".to_string(), 0.625)].into(),
+        metrics: [("drivable_share".to_string(), 0.625)].into(),
         ..Default::default()
     };
+    let classes = [
+        ("unknown", ClassMeaning::Unknown, 0x3a3f46),
+        ("drivable", ClassMeaning::Free, 0x1c9e96),
+        ("not_drivable", ClassMeaning::NotReached, 0xf4b842),
+        ("obstacle", ClassMeaning::Occupied, 0xc42638),
+    ];
+    encode_legend(&mut layer, classes);
     [encode_header(&header), encode_layer(&layer)].concat().into()
 }
 

@@ -9,7 +9,7 @@ use std::future::ready;
 use std::net::SocketAddr;
 use std::pin::Pin;
 
-use clearway::ingest::Reading;
+use clearway::ingest::queue::Reading;
 use clearway::server::Running;
 use clearway_proto::codec::Limits;
 use clearway_proto::map::{Map, decode_map, decode_map_on};
@@ -221,7 +221,7 @@ async fn deltas_lead_to_the_cells_of_whole_maps_and_a_reader_that_lost_one_gets_
             }
             if expected == 3 {
                 // This one is lost on its way, says the reader, which has acknowledged nothing yet.
-                let lost = v1::WatchRequest { acknowledged: Some(expected), want_full: true, selection: None };
+                let lost = v1::WatchRequest { acknowledged: Some(expected), request_keyframe: true, selection: None };
                 reader.requests.send(lost).await.unwrap();
                 let again = reader.next().await.unwrap();
                 assert_eq!((again.map, again.skipped, again.left_out), (update.map, 0, 0), "whole, and at once");

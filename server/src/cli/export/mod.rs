@@ -8,8 +8,8 @@ use clap::{Args, ValueEnum};
 use clearway_client::{Channel, Layer, MapView};
 
 use self::viewer_file::{Dialect, ViewerFile};
-use super::recording::{Message, Recording};
 use super::{document, npy, progress_bar, say};
+use crate::record::mcap_reader::{McapReader, Message};
 use crate::encode::picture::{self, Style};
 
 mod scans;
@@ -119,21 +119,21 @@ fn metres(text: &str) -> Result<f64, String> {
 pub fn run(options: &Options) -> Result<()> {
     let Options { recording: file, layer, out, vehicle, .. } = options;
     let length = fs::metadata(file).with_context(|| format!("open {}", file.display()))?.len();
-    let mut recording = Recording::open(file)?;
+    let mut recording = McapReader::salvage(file)?;
     let mut output = Output::new(options)?;
     let style = options.drawing.style();
     let progress = progress_bar(length);
     let mut maps = 0_u64;
     let mut vehicles: Vec<String> = Vec::new();
     while let Some(message) = recording.next() {
-        let message = message.with_context(|| file.display().to_string())?;
-        progress.set_position(recording.bytes_read);
+        let message = message?;
+        progress.set_position(recording.bytes_read());
         let Some(of_vehicle) = message.vehicle() else { continue };
         if vehicle.as_ref().is_some_and(|only| only != of_vehicle) {
             continue;
         }
         if let Output::Viewer(viewer) = &mut output {
-            viewer.take_event(&message, &recording.attachments)?;
+            viewer.take_event(&message, recording.header())?;
         }
         let Some((_, of_layer)) = message.map_of() else { continue };
         if layer.as_ref().is_some_and(|only| only != of_layer) {
@@ -145,7 +145,7 @@ pub fn run(options: &Options) -> Result<()> {
         let map = decode(&message, file)?;
         let of_layer = map.layer(of_layer)?;
         match &mut output {
-            Output::Viewer(viewer) => viewer.take_map(&map, of_layer, message.log_time_ns)?,
+            Output::Viewer(viewer) => viewer.take_map(&map, of_layer, message.log_ns)?,
             Output::Files(_) if vehicles.len() > 1 => {
                 bail!("{} has maps of {}: name one with --vehicle", file.display(), vehicles.join(" and "))
             }
@@ -163,7 +163,7 @@ pub fn run(options: &Options) -> Result<()> {
     if let Output::Viewer(viewer) = output {
         viewer.finish().with_context(|| format!("write {}", out.display()))?;
     }
-    if let Some(cut) = &recording.cut {
+    if let Some(cut) = recording.incomplete() {
         eprintln!("clearway: {} is {cut}; exported what it holds", file.display());
     }
     if maps == 0 {
@@ -174,11 +174,11 @@ pub fn run(options: &Options) -> Result<()> {
 }
 
 fn decode(message: &Message, file: &Path) -> Result<MapView> {
-    MapView::decode(message.data.clone()).with_context(|| format!("{}, {}", file.display(), message.topic))
+    MapView::decode(message.data.clone()).with_context(|| format!("{}, {}", file.display(), message.channel.topic))
 }
 
 /// Why there was no map, and what there is instead.
-fn nothing_exported(file: &Path, recording: &Recording, layer: Option<&str>, vehicle: Option<&str>) -> String {
+fn nothing_exported(file: &Path, recording: &McapReader, layer: Option<&str>, vehicle: Option<&str>) -> String {
     let (file, layers, vehicles) = (file.display(), recording.layers(), recording.vehicles());
     let absent = |name: Option<&str>, of: &[String]| {
         name.filter(|name| !of.iter().any(|known| known == name)).map(str::to_owned)

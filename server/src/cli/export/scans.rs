@@ -13,6 +13,7 @@ use clearway_lidar::sensor::Sensor;
 use clearway_mapping::config::{Extrinsics, SensorConfig};
 use clearway_proto::packed::unpack;
 use nalgebra::Isometry3;
+use crate::record::mcap_reader::Header;
 use prost::Message;
 use serde::Deserialize;
 
@@ -52,17 +53,17 @@ struct Vehicle {
 }
 
 impl Turns {
-    /// The sensors of a recording, by its attachments; none where it has no configuration.
+    /// The sensors of a recording, by its header; none where it has no configuration.
     ///
     /// # Errors
     /// What is wrong with the configuration or a calibration.
-    pub fn new(attachments: &BTreeMap<String, Vec<u8>>) -> Result<Self> {
-        let Some(config) = attachments.get("config.toml") else { return Ok(Self(BTreeMap::new())) };
-        let config: Config = toml::from_str(&String::from_utf8_lossy(config)).context("attachment config.toml")?;
+    pub fn new(header: &Header) -> Result<Self> {
+        let Some(config) = &header.config else { return Ok(Self(BTreeMap::new())) };
+        let config: Config = toml::from_str(config).context("attachment config.toml")?;
         let sensors = |vehicle: Vehicle| {
             let one = |sensor: &SensorConfig| {
                 let name = format!("calibration/{}/{}.yaml", vehicle.name, sensor.name);
-                let table = attachments.get(&name).map(|table| Calibration::load_str(&String::from_utf8_lossy(table)));
+                let table = header.calibrations.get(&name).map(|table| Calibration::load_str(table));
                 let table = table.transpose().with_context(|| format!("attachment {name}"))?;
                 Ok(OneSensor::new(sensor, table))
             };

@@ -11,7 +11,7 @@ use std::sync::{Arc, Mutex};
 use clearway_lidar::revolution::Revolution;
 
 use crate::engine::Observer;
-use crate::ingest::locked;
+use crate::sync::locked;
 
 /// The folder the clouds go to.
 #[derive(Clone, Debug)]

@@ -16,9 +16,10 @@ use clearway_mapping::config::Extrinsics;
 use crate::cli::replay::clouds::CloudError;
 use crate::config::ConfigError;
 use crate::ingest::files::{FilesError, Readings};
-use crate::ingest::{Door, locked};
+use crate::ingest::queue::EventQueue;
+use crate::sync::locked;
 use crate::record::reader::RecordingError;
-use crate::server::{EndError, Running, Server, StartError};
+use crate::server::{ShutdownError, Running, Server, StartError};
 
 pub mod clouds;
 mod plan;
@@ -110,7 +111,7 @@ pub enum ReplayError {
     Start(#[from] StartError),
     /// The server did not end as it should have.
     #[error(transparent)]
-    End(#[from] EndError),
+    End(#[from] ShutdownError),
     /// The engine stopped in the middle.
     #[error("the vehicle's engine has stopped")]
     Engine,
@@ -154,7 +155,7 @@ pub async fn replay(
     started(&running, &summary);
 
     let speed = options.speed.unwrap_or(if options.serve { Speed::Times(1.0) } else { Speed::Max });
-    let door = running.doors[0].door.clone();
+    let door = running.inputs[0].queue.clone();
     let read = tokio::task::spawn_blocking(move || feed(readings, &door, speed, &progress)).await;
     let status = running.vehicles.0[0].status.clone();
     let outcome = match read {
@@ -178,7 +179,7 @@ pub async fn replay(
 }
 
 /// Puts every reading through the door at its time.
-fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) -> Result<Readings, ReplayError> {
+fn feed(mut readings: Readings, door: &EventQueue, speed: Speed, progress: &Progress) -> Result<Readings, ReplayError> {
     let began = Instant::now();
     let (mut first_ns, mut newest_ns) = (None, None);
     while let Some(reading) = readings.next() {
@@ -191,17 +192,17 @@ fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) 
         progress.bytes_read.store(readings.bytes_read(), Ordering::Relaxed);
         leave_refused(&mut readings, door);
         newest_ns = Some(reading.arrival_ns);
-        door.enter_captured(reading).map_err(|_| ReplayError::Engine)?;
+        door.push_captured(reading).map_err(|_| ReplayError::Engine)?;
     }
     leave_refused(&mut readings, door);
-    door.close(newest_ns).map_err(|_| ReplayError::Engine)?;
+    door.report_drops(newest_ns).map_err(|_| ReplayError::Engine)?;
     Ok(readings)
 }
 
 /// Leaves the messages that were refused outside the door, which counts and tells them.
-fn leave_refused(readings: &mut Readings, door: &Door) {
+fn leave_refused(readings: &mut Readings, door: &EventQueue) {
     for ((source, reason), count) in readings.untold() {
-        door.outside().leave_observations(source, reason, count);
+        door.drops().record_refused_messages(source, reason, count);
     }
 }
 

@@ -18,7 +18,7 @@ use crate::config::{Calibrations, Config, Recorder};
 use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::files::mcap::{McapError, Wanted};
 use crate::ingest::ros::{Choice, Offered, PoseFrom, SensorTopic};
-use crate::record::reader::Recording;
+use crate::record::reader::RecordingReader;
 use crate::server::Setup;
 
 /// Revolutions the mount is estimated from.
@@ -166,7 +166,7 @@ impl Known {
         if !remarks.is_empty() {
             notes.insert("mount".to_owned(), remarks.join("\n"));
         }
-        Ok(Setup { config, calibrations, certificates, boot_id, from_files: true, remarks, notes, observer: None })
+        Ok(Setup { config, calibrations, certificates, boot_id, from_files: true, config_comments: remarks, metadata: notes, observer: None })
     }
 }
 
@@ -193,13 +193,13 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, Repla
         return Ok(known(config, tables, None, true));
     }
     if let Some(file) = recorded {
-        let recording = Recording::open(file)?;
-        if recording.preface().config.is_some() {
+        let recording = RecordingReader::open(file)?;
+        if recording.header().config.is_some() {
             let (mut config, mut tables) = recording.config()?;
             pick(&mut config, &mut tables)?;
             // What the recording says of its own publishers and files is not for this run.
             let config = Config { vehicles: config.vehicles, ..Config::default() };
-            return Ok(known(config, tables, Some(recording.preface().boot_id), true));
+            return Ok(known(config, tables, Some(recording.header().boot_id), true));
         }
     }
     Ok(known(Config::of_one_vehicle("car", "top"), vec![vec![None]], None, false))

@@ -6,11 +6,11 @@
 //! middles lie in it, so that near the vehicle, where radial cells are the smaller ones, no obstacle falls between; and
 //! unknown is worse than free.
 //!
-//! | occupancy | classes |
+//! | occupancy | meaning of the class |
 //! |---|---|
-//! | 0 | drivable, flat, passable, road, clear, free, path |
-//! | 100 | not_drivable, flat_elevated, flat_unreachable, obstacle, occupied |
-//! | -1 | unknown, flat_inferred (nobody saw it), occluded, out_of_range, and any class not named here |
+//! | 0 | free |
+//! | 100 | occupied, not reached |
+//! | -1 | unknown, inferred, hidden |
 //!
 //! There is nothing between: planners that cut at a threshold take less than 100 for free.
 
@@ -19,9 +19,9 @@ use std::collections::BTreeMap;
 use clearway_proto::codec::Cells;
 use clearway_proto::grid::Grid;
 use clearway_proto::map::Layer;
+use clearway_proto::v1::ClassMeaning;
 use nalgebra::{Isometry3, Vector3};
 
-use clearway_client::footprint;
 use crate::encode::picture::Colours;
 
 /// Cells that radial layers are resampled to, metres: as those of the other layers.
@@ -158,7 +158,7 @@ fn at(occupancies: &[i8], cell: u32) -> i8 {
 
 /// An occupancy for each of the layer's own cells; unknown where it has no classes.
 fn occupancies(layer: &Layer) -> Vec<i8> {
-    let of_class: Vec<i8> = layer.legend.iter().map(|class| occupancy(class)).collect();
+    let of_class: Vec<i8> = layer.legend.iter().map(|class| occupancy(class.meaning)).collect();
     let of = |class: i32| usize::try_from(class).ok().and_then(|class| of_class.get(class).copied()).unwrap_or(UNKNOWN);
     match layer.channel("class").map(|channel| &channel.cells) {
         None => vec![UNKNOWN; layer.grid.cell_count() as usize],
@@ -168,12 +168,12 @@ fn occupancies(layer: &Layer) -> Vec<i8> {
     }
 }
 
-/// The occupancy of a class, by its name in the legend.
-pub fn occupancy(class: &str) -> i8 {
-    match class {
-        free if footprint::FREE.contains(&free) => FREE,
-        "not_drivable" | "flat_elevated" | "flat_unreachable" | "obstacle" | "occupied" => OCCUPIED,
-        _ => UNKNOWN,
+/// The occupancy of a class with this meaning.
+pub fn occupancy(meaning: ClassMeaning) -> i8 {
+    match meaning {
+        ClassMeaning::Free => FREE,
+        ClassMeaning::Occupied | ClassMeaning::NotReached => OCCUPIED,
+        ClassMeaning::Unknown | ClassMeaning::Inferred | ClassMeaning::Hidden => UNKNOWN,
     }
 }
 
@@ -192,15 +192,16 @@ impl Rasters {
     }
 }
 
-// The legends are those of the core, which the command knows.
 #[cfg(test)]
 mod tests {
     use clearway_proto::codec::Cells;
+    use clearway_proto::legend::Class;
     use clearway_proto::map::Channel;
 
     use super::*;
 
-    const LEGEND: [&str; 4] = ["unknown", "drivable", "not_drivable", "obstacle"];
+    const MEANINGS: [ClassMeaning; 4] =
+        [ClassMeaning::Unknown, ClassMeaning::Free, ClassMeaning::NotReached, ClassMeaning::Occupied];
 
     fn layer(grid: Grid, classes: Vec<u8>) -> Layer {
         let class =
@@ -208,16 +209,17 @@ mod tests {
         Layer {
             name: "drivability".into(),
             grid,
-            legend: LEGEND.map(String::from).to_vec(),
+            legend: MEANINGS.map(|meaning| Class { name: "any".into(), meaning, rgb: 0x00ff_8000 }).to_vec(),
             channels: vec![class],
             planes: Vec::new(),
-            figures: BTreeMap::new(),
+            metrics: BTreeMap::new(),
             points: Vec::new(),
         }
     }
 
     #[test]
-    fn every_class_of_every_layer_has_an_occupancy_that_was_chosen_and_unknown_is_never_free() {
+    fn every_class_of_every_layer_has_its_occupancy() {
+        use crate::encode::meaning;
         use clearway_mapping::layer::ClassInfo;
         use clearway_mapping::layer::drivability::class::DrivabilityClass;
         use clearway_mapping::layer::height_difference::class::HeightDifferenceClass;
@@ -225,20 +227,19 @@ mod tests {
         use clearway_mapping::layer::safe_path::class::SafePathClass;
         use clearway_mapping::layer::speed::class::SpeedClass;
         use clearway_mapping::layer::terrain::class::TerrainClass;
-        let of = |legend: &[ClassInfo]| legend.iter().map(|class| occupancy(class.name)).collect::<Vec<_>>();
+        let of = |legend: &[ClassInfo]| legend.iter().map(|class| occupancy(meaning(class.meaning))).collect::<Vec<_>>();
         assert_eq!(of(DrivabilityClass::LEGEND), [-1, 0, 100, 100]);
         assert_eq!(of(HeightDifferenceClass::LEGEND), [-1, 0, 100]);
         assert_eq!(of(TerrainClass::LEGEND), [-1, 0, -1, 100, 100, 100]);
         assert_eq!(of(OccupancyClass::LEGEND), [-1, 0, 100, -1, -1]);
         assert_eq!(of(SpeedClass::LEGEND), [-1, 0, 100, 0]);
         assert_eq!(of(SafePathClass::LEGEND), [-1, 0, 100, 0]);
-        assert_eq!(occupancy("a class of a later version"), -1);
     }
 
     #[test]
     fn no_radial_cell_that_is_not_free_falls_between_square_ones() {
-        let r_bench_m: Vec<f32> = (1..=40).map(|row| 0.02 * (row * row) as f32).collect();
-        let grid = Grid::Radial { r_bench_m, columns: 360 };
+        let row_radius_m: Vec<f32> = (1..=40).map(|row| 0.02 * (row * row) as f32).collect();
+        let grid = Grid::Radial { row_radius_m, columns: 360 };
         // Any mixture of classes.
         let class = |cell: u64| (cell.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 61).saturating_sub(4) as u8;
         let classes: Vec<u8> = (0..grid.cell_count()).map(class).collect();

@@ -14,7 +14,7 @@ use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, MessageError, PointCloud2, Points};
 use nalgebra::{Isometry3, Vector3};
 
-use super::Reading;
+use crate::ingest::queue::Reading;
 
 mod choice;
 #[cfg(feature = "zenoh")]
