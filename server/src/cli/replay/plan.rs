@@ -4,10 +4,10 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use clearway_lidar::Sensor;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::{Echo, Revolution};
-use clearway_lidar::Sensor;
 use clearway_mapping::config::{Extrinsics, MapsConfig, SENSORS_MAX, SensorConfig};
 use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::sensor::mount::estimate;
@@ -17,8 +17,8 @@ use super::clouds::{Clouds, Written};
 use super::options::{Options, ReplayError};
 use super::summary::{Mount, describe};
 use crate::config::{Calibrations, Config, Recorder};
-use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::files::mcap::{McapError, Wanted};
+use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::ros::{Choice, Offered, PoseFrom, SensorTopic};
 use crate::record::reader::RecordingReader;
 use crate::server::Setup;
@@ -92,8 +92,8 @@ struct Known {
 }
 
 impl Known {
-    /// Configures the sensors of a ROS bag and puts their topics into `wanted`. Returns the mount of the first sensor if
-    /// tf has it.
+    /// Configures the sensors of a ROS bag and puts their topics into `wanted`. Returns the mount of the first sensor
+    /// if tf has it.
     fn apply_bag(&mut self, bag: &Path, wanted: &mut Wanted, is_given: bool) -> Result<Option<Mount>, ReplayError> {
         let mut choice = choice(bag, wanted)?;
         keep_placed(&mut choice.sensors, is_given);
@@ -113,7 +113,8 @@ impl Known {
     }
 
     fn remark(&mut self, sensor: &str, mount: Option<&Mount>) {
-        self.remarks.extend(mount.and_then(describe).map(|said| format!("extrinsics of {sensor}: {said}")));
+        self.remarks
+            .extend(mount.and_then(describe).map(|description| format!("extrinsics of {sensor}: {description}")));
     }
 
     /// Applies the sensor options; `scans` is true if the files hold nothing but scans.
@@ -177,7 +178,16 @@ impl Known {
         if !remarks.is_empty() {
             notes.insert("mount".to_owned(), remarks.join("\n"));
         }
-        Ok(Setup { config, calibrations, certificates, boot_id, from_files: true, config_comments: remarks, metadata: notes, observer: None })
+        Ok(Setup {
+            config,
+            calibrations,
+            certificates,
+            boot_id,
+            from_files: true,
+            config_comments: remarks,
+            metadata: notes,
+            observer: None,
+        })
     }
 }
 
@@ -223,8 +233,8 @@ fn choice(bag: &Path, wanted: &Wanted) -> Result<Choice, ReplayError> {
     Ok(choice.map_err(FilesError::from)?)
 }
 
-/// Keeps the sensors that tf places. If tf places none, keeps the first, whose mount is estimated or given. If the mount
-/// `is_given`, the first sensor counts as placed.
+/// Keeps the sensors that tf places. If tf places none, keeps the first, whose mount is estimated or given. If the
+/// mount `is_given`, the first sensor counts as placed.
 fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
     let mut number = 0;
     let mut known = |sensor: &SensorTopic| {
