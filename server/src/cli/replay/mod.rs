@@ -201,7 +201,7 @@ fn feed(mut readings: Readings, door: &EventQueue, speed: Speed, progress: &Prog
 
 /// Leaves the messages that were refused outside the door, which counts and tells them.
 fn leave_refused(readings: &mut Readings, door: &EventQueue) {
-    for ((source, reason), count) in readings.untold() {
+    for ((source, reason), count) in readings.drain_refused() {
         door.drops().record_refused_messages(source, reason, count);
     }
 }
