@@ -10,7 +10,7 @@ use clearway::cli::replay::{Mount, Options, ReplayError, Summary, replay};
 use clearway::config::Ros;
 use clearway::record::verify::verify;
 use clearway_lidar::model::Model;
-use clearway_lidar::sensor::{Sensor, SensorConfig};
+use clearway_lidar::{Sensor, SensorConfig};
 use clearway_mapping::config::Extrinsics;
 use clearway_mapping::event::Body;
 use clearway_ros::PointCloud2;

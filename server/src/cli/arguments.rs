@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Parser, Subcommand, ValueEnum};
-use clearway_lidar::model::Model;
+use clearway_lidar::model::{Model, UnknownModelError};
 use clearway_mapping::config::Extrinsics;
 use crate::cli::evaluate;
 use crate::cli::replay::Speed;
@@ -180,10 +180,8 @@ fn extrinsics(text: &str) -> Result<Extrinsics, String> {
     }
 }
 
-fn model(text: &str) -> Result<Model, String> {
-    let all: Vec<&str> = Model::ALL.into_iter().map(Model::as_str).collect();
-    let found = all.iter().position(|name| *name == text);
-    found.map(|index| Model::ALL[index]).ok_or_else(|| format!("known: {}", all.join(", ")))
+fn model(text: &str) -> Result<Model, UnknownModelError> {
+    text.parse()
 }
 
 #[cfg(test)]
@@ -203,7 +201,7 @@ mod tests {
     #[test]
     fn a_model_nobody_knows_is_answered_with_those_that_are() {
         assert_eq!(model("vls128"), Ok(Model::Vls128));
-        assert!(model("ouster").unwrap_err().contains("hdl64e_s2"));
+        assert!(model("ouster").unwrap_err().to_string().contains("hdl64e_s2"));
     }
 
     #[test]

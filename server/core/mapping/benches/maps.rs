@@ -5,7 +5,7 @@
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{
-    DrivabilityConfig, Form, HeightDifferenceConfig, MotionConfig, OccupancyConfig, SafePathConfig, SpeedConfig,
+    DrivabilityConfig, Variant, HeightDifferenceConfig, MotionConfig, OccupancyConfig, SafePathConfig, SpeedConfig,
     TerrainConfig,
 };
 use clearway_mapping::layer::drivability::Drivability;
@@ -113,10 +113,10 @@ fn sweep_of_a_moving_revolution(bencher: Bencher) {
     });
 }
 
-#[divan::bench(args = [Form::Grounded, Form::Paper, Form::Grid])]
-fn terrain(bencher: Bencher, form: Form) {
+#[divan::bench(args = [Variant::Grounded, Variant::Paper, Variant::Grid])]
+fn terrain(bencher: Bencher, form: Variant) {
     let sweep = sweep();
-    let mut map = Terrain::new(&TerrainConfig { form, ..TerrainConfig::default() });
+    let mut map = Terrain::new(&TerrainConfig { variant: form, ..TerrainConfig::default() });
     let mut layer = map.layer();
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &Context::default(), &mut layer));
 }

@@ -4,7 +4,7 @@
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::sensor::SensorStatus;
+use clearway_lidar::SensorStatus;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
 use crate::config::{SensorConfig, VehicleConfig};

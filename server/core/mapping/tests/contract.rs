@@ -4,7 +4,7 @@ mod common;
 
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{
-    DrivabilityConfig, Form, HeightDifferenceConfig, OccupancyConfig, SafePathConfig, SpeedConfig, TerrainConfig,
+    DrivabilityConfig, Variant, HeightDifferenceConfig, OccupancyConfig, SafePathConfig, SpeedConfig, TerrainConfig,
 };
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::height_difference::HeightDifference;
@@ -63,8 +63,8 @@ fn makers() -> Vec<Box<dyn LayerMaker>> {
         makers.push(Box::new(Drivability::new(&DrivabilityConfig { bridge_rows: 0, ..drivability })));
         makers.push(Box::new(HeightDifference::new(&HeightDifferenceConfig { columns, ..Default::default() })));
     }
-    for form in [Form::Grounded, Form::Paper, Form::Grid] {
-        makers.push(Box::new(Terrain::new(&TerrainConfig { form, planes: true, ..TerrainConfig::default() })));
+    for form in [Variant::Grounded, Variant::Paper, Variant::Grid] {
+        makers.push(Box::new(Terrain::new(&TerrainConfig { variant: form, planes: true, ..TerrainConfig::default() })));
     }
     makers.push(Box::new(Speed::new(&SpeedConfig::default())));
     let drivability = Drivability::new(&DrivabilityConfig::default());

@@ -1,7 +1,7 @@
 //! Maps from a bad network and through a dirty window.
 
 use bytes::Bytes;
-use clearway_lidar::blocked::BlockedSector;
+use clearway_lidar::BlockedSector;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::{Model, ReturnMode};
 use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig, VehicleConfig};

@@ -6,7 +6,7 @@ mod common;
 use bytes::Bytes;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::sensor::{Sensor, SensorConfig as LidarConfig};
+use clearway_lidar::{Sensor, SensorConfig as LidarConfig};
 use clearway_lidar::telemetry::Telemetry;
 use clearway_mapping::config::{Extrinsics, MapsConfig, MotionConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::error::EventError;

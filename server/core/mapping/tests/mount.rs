@@ -61,7 +61,7 @@ fn wild_points_are_no_harm() {
 }
 
 fn recorded(path: &str, model: Option<Model>) -> Vec<Vec<[f32; 3]>> {
-    use clearway_lidar::sensor::{Sensor, SensorConfig};
+    use clearway_lidar::{Sensor, SensorConfig};
     let mut sensor = Sensor::new(SensorConfig { model, ..SensorConfig::default() });
     let mut revolutions = Vec::new();
     for datagram in common::datagrams(path) {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{DrivabilityConfig, Form, HeightDifferenceConfig, Seed, TerrainConfig};
+use clearway_mapping::config::{DrivabilityConfig, Variant, HeightDifferenceConfig, Seed, TerrainConfig};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::event::Scan;
 use clearway_mapping::layer::height_difference::HeightDifference;
@@ -40,12 +40,12 @@ fn points() -> impl Strategy<Value = Vec<[f32; 3]>> {
 fn config() -> impl Strategy<Value = DrivabilityConfig> {
     let columns = prop::sample::select(vec![8u16, 90, 180, 360, 1440]);
     (columns, 0u8..9, any::<bool>(), any::<bool>(), 0f32..1.0, 0f32..4.0).prop_map(
-        |(columns, bridge_rows, close_gaps, first, offset_m, gate_m_min)| DrivabilityConfig {
+        |(columns, bridge_rows, close_gaps, first, offset_m, passage_m_min)| DrivabilityConfig {
             columns,
             bridge_rows,
             close_gaps,
             offset_m,
-            gate_m_min,
+            passage_m_min,
             seed: if first { Seed::FirstCell } else { Seed::BlindZone },
             ..DrivabilityConfig::default()
         },
@@ -100,7 +100,7 @@ proptest! {
 
     #[test]
     fn terrain_is_known_from_points_alone_whatever_they_are(
-        points in points(), form in prop::sample::select(vec![Form::Grounded, Form::Paper, Form::Grid]),
+        points in points(), form in prop::sample::select(vec![Variant::Grounded, Variant::Paper, Variant::Grid]),
         cell_m in 0.1f32..2.0, range_m_max in 5f32..100.0, points_min in 1u16..6, planes in any::<bool>(),
         deviations in prop::collection::vec(any::<f32>(), 400), seed in any::<u64>(),
     ) {
@@ -108,7 +108,7 @@ proptest! {
         points.iter().for_each(|point| add(&mut sweep, *point));
         sweep.deviation_m = deviations[..points.len()].to_vec();
         let config = TerrainConfig {
-            form, cell_m, range_m_max, points_min, planes, roughness_points_min: 1, ..TerrainConfig::default()
+            variant: form, cell_m, range_m_max, points_min, planes, roughness_points_min: 1, ..TerrainConfig::default()
         };
         let mut map = Terrain::new(&config);
         let mut layer = map.layer();

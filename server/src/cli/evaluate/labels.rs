@@ -200,7 +200,7 @@ fn median(mut values: Vec<f32>) -> f32 {
 /// Ground that can be reached is drivable.
 fn mark_reachable(sweep: &Sweep, points: &mut [Point]) {
     let mut grid = RadialGrid::default();
-    grid.follow(sweep, RANGE_M_MAX, COLUMNS);
+    grid.update_rows(sweep, RANGE_M_MAX, COLUMNS);
     let (rows, columns) = (grid.rows(), grid.columns());
     let (mut seen, mut ground, mut obstacle) =
         (vec![false; grid.cells()], vec![false; grid.cells()], vec![false; grid.cells()]);

@@ -9,7 +9,7 @@ use anyhow::{Context, Result};
 use clearway_client::v1;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::sensor::Sensor;
+use clearway_lidar::Sensor;
 use clearway_mapping::config::{Extrinsics, SensorConfig};
 use clearway_proto::packed::unpack;
 use nalgebra::Isometry3;
@@ -125,7 +125,7 @@ fn declared(sensor: &v1::Sensor) -> SensorConfig {
     let &v1::Sensor { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, .. } = sensor;
     let plain = SensorConfig::new(&sensor.name, Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg });
     SensorConfig {
-        model: sensor.model.as_deref().and_then(clearway_lidar::model::Model::from_name),
+        model: sensor.model.as_deref().and_then(|name| name.parse().ok()),
         rpm: sensor.rpm,
         cut_azimuth_deg: sensor.cut_azimuth_deg.unwrap_or(plain.cut_azimuth_deg),
         gps_late_days_max: sensor.gps_late_days_max.unwrap_or(plain.gps_late_days_max),

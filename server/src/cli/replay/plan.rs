@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::{Echo, Revolution};
-use clearway_lidar::sensor::Sensor;
+use clearway_lidar::Sensor;
 use clearway_mapping::config::{Extrinsics, MapsConfig, SENSORS_MAX, SensorConfig};
 use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::sensor::mount::estimate;

@@ -17,10 +17,10 @@
 use std::collections::VecDeque;
 
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::telemetry::Gprmc;
+use clearway_lidar::nmea::Gprmc;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
-use crate::config::MotionConfig;
+use crate::config::motion::MotionConfig;
 use crate::event::{EgoPose, Scan};
 
 /// Number of poses that are kept. Ours: a second at 1 kHz, which is longer than a revolution of any sensor.

@@ -27,9 +27,9 @@ use std::ops::Range;
 use super::states::{HIDDEN, LOOKED_AT, THROUGH};
 use super::way::Way;
 use super::window::Window;
-use crate::config::OccupancyConfig;
+use crate::layer::occupancy::config::OccupancyConfig;
 use crate::layer::maker::Rays;
-use crate::layer::radial_grid::{Quadrants, nearest_whole, whole};
+use crate::layer::radial_grid::{AzimuthColumns, floor_to_whole, round_to_whole};
 use crate::sensor::sweep::Sweep;
 
 /// Directions about a sensor; a quarter of a degree each, as finely as the paper's units look.
@@ -84,7 +84,7 @@ pub struct Fan {
 
 /// Directions about a sensor.
 struct Compass {
-    directions: Quadrants,
+    directions: AzimuthColumns,
     /// Each direction's middle, and the middles of its halves: far out a direction is wider than the spacing of lines
     /// that leave no cell between them.
     lines: Vec<[[f64; 2]; 3]>,
@@ -167,7 +167,7 @@ impl Compass {
             [[x, y], [-y, x], [-x, -y], [y, -x]][direction / (DIRECTIONS / 4)]
         };
         let lines = (0..DIRECTIONS).map(|direction| [0.5, 0.25, 0.75].map(|within| line(direction, within)));
-        let directions = Quadrants::new(DIRECTIONS as u16);
+        let directions = AzimuthColumns::new(DIRECTIONS as u16);
         Self { directions, lines: lines.collect(), steps: words * 64, words }
     }
 
@@ -305,7 +305,7 @@ impl View {
             let height = |height_m: f32| (height_m - rays.origin_m[2]) * steps_a_m;
             let (from, to) = between(height(config.clear_height_m_min), height(config.clear_height_m_max));
             let steps = compass.steps as f32;
-            let (first, end) = (nearest_whole(least(from, steps)), nearest_whole(least(to, least(farthest, steps))));
+            let (first, end) = (round_to_whole(least(from, steps)), round_to_whole(least(to, least(farthest, steps))));
             set_bits(&mut self.low[compass.row(direction)], first as usize, end as usize);
         }
     }
@@ -412,11 +412,11 @@ impl Chunk {
             let (under, low) = between(lowest * steps_a_m, clearance * steps_a_m);
             direction[i] = compass.directions.column(dx, dy);
             range_of[i] = range;
-            step[i] = whole(least(range, STEPS_MAX));
-            first[i] = nearest_whole(least(from, steps));
-            end[i] = nearest_whole(least(to, least(least(reliable, range), steps)));
-            under_of[i] = nearest_whole(least(under, least(range, steps)));
-            low_of[i] = nearest_whole(least(low, least(range, steps)));
+            step[i] = floor_to_whole(least(range, STEPS_MAX));
+            first[i] = round_to_whole(least(from, steps));
+            end[i] = round_to_whole(least(to, least(least(reliable, range), steps)));
+            under_of[i] = round_to_whole(least(under, least(range, steps)));
+            low_of[i] = round_to_whole(least(low, least(range, steps)));
         }
     }
 }

@@ -33,7 +33,7 @@ pub mod states;
 pub mod way;
 pub mod window;
 
-use crate::config::OccupancyConfig;
+use crate::layer::occupancy::config::OccupancyConfig;
 use crate::layer::channel::TypedChannel;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker, Rays, ScanExtras};

@@ -8,7 +8,7 @@
 use nalgebra::Isometry3;
 
 use super::states::{Cell, evidence};
-use crate::layer::radial_grid::whole;
+use crate::layer::radial_grid::floor_to_whole;
 
 /// Beside a state: it stands already. Beyond all that can be told of a cell.
 const JUDGED: u8 = 8;
@@ -160,7 +160,7 @@ impl Window {
         // NaN fails every comparison.
         if x >= 0.0 && y >= 0.0 && x < side && y < side {
             let mask = (1 << self.bits) - 1;
-            let [x, y] = [(x, 0), (y, 1)].map(|(at, i)| (self.corner[i] + i64::from(whole(at))) & mask);
+            let [x, y] = [(x, 0), (y, 1)].map(|(at, i)| (self.corner[i] + i64::from(floor_to_whole(at))) & mask);
             let index = (y << self.bits | x) as usize;
             let fresh = &mut self.fresh[index];
             if *fresh == 0 && self.cells[index].hits == 0 {

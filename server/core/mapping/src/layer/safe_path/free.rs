@@ -8,7 +8,7 @@
 //! two where a laser's return was lost. Neither is called drivable, and no safe point lies in one: they only are no
 //! obstacles.
 
-use crate::config::SafePathConfig;
+use crate::layer::safe_path::config::SafePathConfig;
 use crate::layer::channel::TypedChannel;
 use crate::layer::drivability::class::DrivabilityClass;
 use crate::layer::grid::Geometry;
@@ -91,11 +91,11 @@ impl Free {
     pub fn fill(&mut self, drivability: Option<&Layer>, sweep: &Sweep, config: &SafePathConfig) {
         let class = drivability.and_then(|layer| TypedChannel::CLASS.values(&layer.channels));
         let (Some(layer), Some(class)) = (drivability, class) else { return self.states.fill(State::Unknown) };
-        let Geometry::Radial { row_radius_m: r_bench_m, columns } = &layer.geometry else {
+        let Geometry::Radial { row_radius_m, columns } = &layer.geometry else {
             return self.states.fill(State::Unknown);
         };
         if self.made_for.as_ref() != Some(&layer.geometry) {
-            self.look_up(r_bench_m, *columns);
+            self.look_up(row_radius_m, *columns);
             self.made_for = Some(layer.geometry.clone());
         }
         self.of_radial_cell.clear();
@@ -108,8 +108,8 @@ impl Free {
         }));
         self.forget_the_vehicle(sweep, config);
         let columns = usize::from(*columns);
-        see_blind_zone(&mut self.of_radial_cell, r_bench_m, columns, config.blind_zone_m);
-        close_holes(&mut self.of_radial_cell, r_bench_m, columns, config.hole_m_max);
+        see_blind_zone(&mut self.of_radial_cell, row_radius_m, columns, config.blind_zone_m);
+        close_holes(&mut self.of_radial_cell, row_radius_m, columns, config.hole_m_max);
         // Beyond the radial grid.
         self.of_radial_cell.push(State::Unknown);
         for (state, &cell) in self.states.iter_mut().zip(&self.radial_cell) {
@@ -156,8 +156,8 @@ impl Free {
         }
     }
 
-    fn look_up(&mut self, r_bench_m: &[f32], columns: u16) {
-        self.grid = RadialGrid::new(r_bench_m.to_vec(), columns);
+    fn look_up(&mut self, row_radius_m: &[f32], columns: u16) {
+        self.grid = RadialGrid::new(row_radius_m.to_vec(), columns);
         let middle = |i: usize| ((i as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32;
         let cell = |index: usize| self.grid.cell(middle(index % self.side), middle(index / self.side));
         let cells = 0..self.side * self.side;
@@ -170,20 +170,20 @@ fn is_within_the_vehicle(x: f32, y: f32, config: &SafePathConfig) -> bool {
     (-config.vehicle_rear_m..=config.vehicle_front_m).contains(&x) && y.abs() <= config.vehicle_width_m / 2.0
 }
 
-fn see_blind_zone(of_radial_cell: &mut [State], r_bench_m: &[f32], columns: usize, blind_zone_m: f32) {
+fn see_blind_zone(of_radial_cell: &mut [State], row_radius_m: &[f32], columns: usize, blind_zone_m: f32) {
     for column in 0..columns {
-        let seen = (0..r_bench_m.len()).find(|row| of_radial_cell[row * columns + column] != State::Unknown);
+        let seen = (0..row_radius_m.len()).find(|row| of_radial_cell[row * columns + column] != State::Unknown);
         let Some(seen) = seen else { continue };
-        let begins_m = if seen == 0 { 0.0 } else { r_bench_m[seen - 1] };
+        let begins_m = if seen == 0 { 0.0 } else { row_radius_m[seen - 1] };
         if begins_m <= blind_zone_m && of_radial_cell[seen * columns + column] == State::Drivable {
             (0..seen).for_each(|row| of_radial_cell[row * columns + column] = State::Blind);
         }
     }
 }
 
-fn close_holes(of_radial_cell: &mut [State], r_bench_m: &[f32], columns: usize, hole_m_max: f32) {
-    let rows = r_bench_m.len();
-    for (row, &r) in r_bench_m.iter().enumerate() {
+fn close_holes(of_radial_cell: &mut [State], row_radius_m: &[f32], columns: usize, hole_m_max: f32) {
+    let rows = row_radius_m.len();
+    for (row, &r) in row_radius_m.iter().enumerate() {
         let column_m = r * std::f32::consts::TAU / columns as f32;
         let ring = &mut of_radial_cell[row * columns..][..columns];
         let Some(first) = ring.iter().position(|state| state.is_free()) else { continue };
@@ -193,7 +193,7 @@ fn close_holes(of_radial_cell: &mut [State], r_bench_m: &[f32], columns: usize, 
         close_along(columns + 1, around, |from, to| width_m(from, to) <= hole_m_max, ring);
     }
     for column in 0..columns {
-        let width_m = |from: usize, to: usize| r_bench_m[to - 1] - r_bench_m[from];
+        let width_m = |from: usize, to: usize| row_radius_m[to - 1] - row_radius_m[from];
         close_along(rows, |row| row * columns + column, |from, to| width_m(from, to) <= hole_m_max, of_radial_cell);
     }
 }

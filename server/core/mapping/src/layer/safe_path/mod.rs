@@ -16,12 +16,13 @@
 //! where the vehicle fits: twice the radius is at least its width. What lies beyond the grid is not known to this map.
 
 pub mod class;
+pub mod config;
 pub mod distance;
 pub mod free;
 pub mod links;
 pub mod ridge;
 
-use crate::config::SafePathConfig;
+use crate::layer::safe_path::config::SafePathConfig;
 use crate::layer::channel::TypedChannel;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker};

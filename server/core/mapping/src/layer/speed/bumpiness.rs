@@ -15,8 +15,8 @@
 //!
 //! Heights are summed in whole millimetres, so their order says nothing.
 
-use crate::config::SpeedConfig;
-use crate::layer::radial_grid::whole;
+use crate::layer::speed::config::SpeedConfig;
+use crate::layer::radial_grid::floor_to_whole;
 use crate::sensor::sweep::Sweep;
 
 /// Bumpiness of an obstacle.
@@ -168,7 +168,7 @@ impl HeightMap {
             // NaN fails every comparison.
             let within = (ix >= 0.0) & (ix < side) & (iy >= 0.0) & (iy < side);
             let inside = within & (z > LOWEST_M) & (z <= config.overhang_m);
-            let [ix, iy, z] = [ix, iy, z * 1000.0 + OFFSET_MM].map(|value| whole(if inside { value } else { 0.0 }));
+            let [ix, iy, z] = [ix, iy, z * 1000.0 + OFFSET_MM].map(|value| floor_to_whole(if inside { value } else { 0.0 }));
             cells[i] = if inside { iy * self.side as u32 + ix } else { NOWHERE };
             // Positive first, so that cutting off rounds.
             millimetres[i] = z as i32 - OFFSET_MM as i32;

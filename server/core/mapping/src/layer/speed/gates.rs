@@ -5,7 +5,7 @@
 //! route bends more than the detector can follow. Two more that any system with clocks and frames needs: (3) the road
 //! was seen too long ago; (4) it lies in the map frame and no pose is known.
 
-use crate::config::SpeedConfig;
+use crate::layer::speed::config::SpeedConfig;
 use crate::event::RoadFrame;
 use crate::layer::maker::Context;
 

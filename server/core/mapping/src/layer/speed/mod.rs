@@ -20,7 +20,7 @@ pub mod config;
 pub mod gates;
 pub mod painting;
 
-use crate::config::SpeedConfig;
+use crate::layer::speed::config::SpeedConfig;
 use crate::layer::channel::TypedChannel;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker};

@@ -5,7 +5,7 @@
 //! side; each pair of points with its four edge points is one convex piece, painted row by row (§3.2.1). Where pieces
 //! overlap, in bends, the larger bonus stays, whatever their order.
 
-use crate::config::{Bonus, SpeedConfig};
+use crate::layer::speed::config::{Bonus, SpeedConfig};
 
 /// Bonus of a cell that is not on the road.
 pub const NO_ROAD: f32 = -1.0;

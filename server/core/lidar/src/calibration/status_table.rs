@@ -1,15 +1,15 @@
-//! The calibration table an HDL-64E S2 or S3 sends of itself, one byte a packet.
+//! The calibration table that an HDL-64E S2 or S3 sends in its status bytes, one byte per packet.
 //!
-//! In: the status type and value that end every packet. Out: the [`Calibration`], once 4,160 packets (about 1.2 s) in a
-//! row have been seen. Source: HDL-64E S3 manual rev K, appendix E. 16 packets make a cycle: types H M S D N Y G T V
-//! with clock, GPS, temperature and firmware, then seven bytes of the table. 260 cycles make the table, 1,820 bytes:
-//! `UNIT#` and two thresholds; 28 bytes a laser (21 used); 21 of the unit. It ends with a CRC-16 over the lasers (S3,
-//! which also marks every fourth cycle with W) or with its own length (S2).
+//! In: the status type and value at the end of every packet. Out: the [`Calibration`], after 4,160 packets (about 1.2
+//! s) without a loss. Source: HDL-64E S3 manual 63-HDL64ES3 rev K, appendix E. A cycle is 16 packets: the types H M S D
+//! N Y G T V with clock, GPS, temperature and firmware, then seven bytes of the table. The table is 260 cycles, 1,820
+//! bytes: `UNIT#` and two thresholds; 28 bytes per laser, of which 21 are used; 21 bytes about the unit. It ends with a
+//! CRC-16 over the lasers (S3, which also marks every fourth cycle with W) or with its own length (S2).
 
-use super::{Calibration, LaserCalibration};
+use super::table::{Calibration, LaserCalibration};
 use crate::model::Model;
 
-/// Packets one whole table takes.
+/// Number of packets of one complete table.
 pub const PACKETS_PER_TABLE: usize = CYCLES * CYCLE;
 const CYCLE: usize = 16;
 const CYCLES: usize = 260;
@@ -20,25 +20,27 @@ const BYTES_PER_LASER: usize = 28;
 const HEADER: &[u8; 5] = b"UNIT#";
 const CLOCK_TYPES: &[u8; 9] = b"HMSDNYGTV";
 const WARNING_TYPE: u8 = b'W';
-/// Degrees and thousandths of a metre a count.
+/// Angle of one count, in degrees.
 const DEG_PER_COUNT: f64 = 0.01;
+/// Length of one count, in metres.
 const M_PER_COUNT: f64 = 0.001;
+/// Focal slope of one count.
 const SLOPE_PER_COUNT: f64 = 0.1;
 
-/// Collects status bytes until they make a table.
+/// Collector of status bytes until they are a complete table.
 #[derive(Clone, Debug, Default)]
-pub struct UnitTable {
-    /// Where in the cycle the next status must stand; `None` until a cycle's start is seen.
+pub struct StatusTable {
+    /// Position of the next status in its cycle; `None` before the first start of a cycle.
     position: Option<usize>,
-    /// The bytes so far, from `UNIT#` on.
+    /// Bytes of the table so far, from `UNIT#` on.
     bytes: Vec<u8>,
-    /// Whether a W was among them.
+    /// True if one of the cycles so far was marked with W.
     warned: bool,
 }
 
-impl UnitTable {
-    /// Takes the status of the next packet; gives model and table when it completes one. A lost packet, or a sum that
-    /// is not right, throws the table away and waits for the next.
+impl StatusTable {
+    /// Adds the status of the next packet and returns the model and its table when that status completes the table.
+    /// A lost packet or a wrong checksum discards the table.
     pub fn push(&mut self, (status_type, value): (u8, u8)) -> Option<(Model, Calibration)> {
         let position = match self.position {
             Some(position) if fits(position, status_type) => position,
@@ -57,7 +59,7 @@ impl UnitTable {
             return None;
         }
         self.bytes.push(value);
-        self.find_start();
+        self.discard_without_header();
         if self.bytes.len() < TABLE {
             return None;
         }
@@ -67,13 +69,13 @@ impl UnitTable {
         read
     }
 
-    /// Whether the unit has marked its warnings, which an S3 does and an S2 does not.
+    /// True if the sensor has marked a cycle with W, which an S3 does and an S2 does not.
     pub fn is_s3(&self) -> bool {
         self.warned
     }
 
-    /// The bytes must begin with `UNIT#` at the start of a cycle.
-    fn find_start(&mut self) {
+    /// Discards the bytes unless they begin with `UNIT#`.
+    fn discard_without_header(&mut self) {
         let seen = self.bytes.len().min(HEADER.len());
         if self.bytes[..seen] != HEADER[..seen] {
             self.bytes.clear();
@@ -81,7 +83,8 @@ impl UnitTable {
     }
 }
 
-/// The first nine types of a cycle are fixed; the other seven are digits, W, or above F0.
+/// True if a status type may be at that position of a cycle: the first nine types are fixed, the other seven are
+/// digits, W, or above F0.
 fn fits(position: usize, status_type: u8) -> bool {
     match CLOCK_TYPES.get(position) {
         Some(expected) => status_type == *expected,
@@ -97,7 +100,7 @@ fn read(table: &[u8], warned: bool) -> Option<(Model, Calibration)> {
         _ => return None,
     };
     let lasers = lasers_of(table).map(laser).collect::<Vec<_>>();
-    let calibration = super::complete(Some(model.spec().distance_m_per_count), lasers).ok()?;
+    let calibration = Calibration::from_lasers(Some(model.spec().distance_m_per_count), lasers).ok()?;
     calibration.fits(model).ok()?;
     Some((model, calibration))
 }
@@ -125,7 +128,7 @@ fn laser(record: &[u8]) -> LaserCalibration {
     }
 }
 
-/// CRC-16 with polynomial 8005 over bytes 2 to 21 of every laser's record.
+/// CRC-16 with polynomial 8005 over bytes 2 to 21 of the record of every laser.
 fn crc(table: &[u8]) -> u16 {
     let bytes = lasers_of(table).flat_map(|record| &record[1..21]);
     bytes.fold(0, |crc, byte| {
@@ -136,19 +139,20 @@ fn crc(table: &[u8]) -> u16 {
     })
 }
 
-/// The status type and value of [`PACKETS_PER_TABLE`] packets in a row that carry `calibration`, rounded to hundredths
-/// of a degree and millimetres; an encoder sends them over and over. `Hdl64eS3` marks W and ends with the CRC, any
-/// other model sends an S2's. Missing near-range corrections are sent as the far one.
+/// Status type and value of [`PACKETS_PER_TABLE`] packets with the bytes of `calibration`, rounded to hundredths of a
+/// degree and millimetres. An encoder sends them again and again. The status bytes are those of an HDL-64E S3 (W and
+/// CRC) for `Hdl64eS3`, and those of an S2 for every other model. A missing near-range correction is sent as
+/// `dist_correction`.
 ///
 /// # Panics
-/// If the table has not 64 lasers.
+/// If the table does not have 64 lasers.
 pub fn status_bytes(model: Model, calibration: &Calibration) -> Vec<(u8, u8)> {
     let s3 = model == Model::Hdl64eS3;
     let table = write(calibration, s3);
     let digits = table.iter().enumerate().map(|(at, value)| (b'1' + (at % BYTES_PER_CYCLE) as u8, *value));
     let mut sent = Vec::with_capacity(PACKETS_PER_TABLE);
     for (cycle, seven) in digits.collect::<Vec<_>>().chunks(BYTES_PER_CYCLE).enumerate() {
-        // A made-up clock: noon on 1 January 2020, no GPS, 25 degrees, version 4.07.
+        // The clock is invented: noon on 1 January 2020, no GPS, 25 degrees Celsius, version 4.07.
         sent.extend(CLOCK_TYPES.iter().copied().zip([12, 0, 0, 1, 1, 20, 0, 25, 0x47]));
         sent.extend_from_slice(seven);
         if s3 && cycle % 4 == 0 && cycle > 0 {

@@ -1,126 +1,71 @@
-//! One telemetry datagram: 512 bytes.
+//! One GPRMC sentence (NMEA 0183): position, time and speed of a GPS receiver.
 //!
-//! In: a UDP payload (port 8308). Out: [`Telemetry`]: device time, PPS state and the GPRMC sentence. Layout (HDL-32E
-//! application note 63-9277, VLP-16 manual 9.3.3): microseconds past the hour u32 at 198, PPS state at 202, NMEA text
-//! from 206 to the first line's end.
+//! In: the bytes of the sentence, from `$` to the checksum. Out: [`Gprmc`], or an [`NmeaError`].
 
-use crate::packet::Refusal;
-
-/// Bytes of a telemetry datagram.
-pub const TELEMETRY_LENGTH: usize = 512;
-const DEVICE_US: usize = 198;
-const PPS: usize = 202;
-const NMEA: std::ops::Range<usize> = 206..334;
 const METRES_PER_SECOND_PER_KNOT: f64 = 1852.0 / 3600.0;
-
-/// What a telemetry datagram says.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Telemetry {
-    /// Microseconds past the hour, on the clock of the data packets.
-    pub device_us: u32,
-    /// State of the pulse per second.
-    pub pps: Pps,
-    /// `None` when no receiver is connected.
-    pub gprmc: Option<Gprmc>,
-}
-
-/// State of the pulse per second (VLP-16 manual 9.3.3).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Pps {
-    /// No pulse seen (and what an HDL-32E always sends).
-    Absent,
-    /// Being locked to.
-    Attempting,
-    /// Locked.
-    Locked,
-    /// It was there once.
-    Error,
-    /// Another value.
-    Unknown(u8),
-}
 
 /// A GPRMC sentence: recommended minimum of position, time and speed.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Gprmc {
-    /// Whether the receiver calls its fix valid (`A`).
+    /// True if the receiver reports a valid fix (`A`).
     pub valid: bool,
-    /// Time and date, ns since the Unix epoch, of 1980 to 2079; `None` if either is empty.
+    /// Time and date, in ns since the Unix epoch, of 1980 to 2079; `None` if either is empty.
     pub utc_ns: Option<i64>,
-    /// Degrees, north positive.
+    /// Latitude in degrees, north positive.
     pub latitude_deg: Option<f64>,
-    /// Degrees, east positive.
+    /// Longitude in degrees, east positive.
     pub longitude_deg: Option<f64>,
-    /// Speed over ground, knots.
+    /// Speed over ground, in knots.
     pub speed_knots: Option<f64>,
-    /// Course over ground, degrees clockwise from true north.
+    /// Course over ground, in degrees clockwise from true north.
     pub course_deg: Option<f64>,
 }
 
-/// What is wrong with a sentence.
+/// The reason for which a sentence is refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NmeaError {
-    /// Bytes that are not printable ASCII.
+    /// A byte is not printable ASCII.
     #[error("byte {byte:#04x} at {at} of the sentence; printable ASCII is allowed")]
     Byte {
         /// The byte.
         byte: u8,
-        /// Counted from the sentence's start.
+        /// Index of the byte in the sentence, from 0.
         at: usize,
     },
-    /// Not `$..RMC`.
+    /// The sentence is not `$..RMC`.
     #[error("sentence starts with `{start}`; $GPRMC, or RMC of another system, is allowed")]
     Sentence {
-        /// At most eight characters of it.
+        /// At most the first eight characters of the sentence.
         start: String,
     },
-    /// Sum missing or wrong.
+    /// The checksum is missing or wrong.
     #[error("checksum `{written}`; {computed:02X} is right")]
     Checksum {
-        /// As sent; empty if there is none.
+        /// Checksum of the sentence as it was sent; empty if there is none.
         written: String,
-        /// Of the text as it arrived.
+        /// Checksum that follows from the text.
         computed: u8,
     },
-    /// A field that cannot be read.
+    /// A field cannot be parsed or is out of bounds.
     #[error("{field}: `{value}`; it must be {allowed}")]
     Field {
-        /// Its name.
+        /// Name of the field.
         field: &'static str,
-        /// As it was sent.
+        /// Text of the field as it was sent.
         value: String,
-        /// What it must be.
+        /// Values that are allowed.
         allowed: &'static str,
     },
 }
 
-impl Telemetry {
-    /// Reads a datagram.
-    ///
-    /// # Errors
-    /// [`Refusal::Length`]; [`Refusal::Nmea`] if there is a sentence and it is damaged.
-    pub fn new(payload: &[u8]) -> Result<Self, Refusal> {
-        if payload.len() != TELEMETRY_LENGTH {
-            return Err(Refusal::Length { length: payload.len() });
-        }
-        let device_us = u32::from_le_bytes(payload[DEVICE_US..DEVICE_US + 4].try_into().expect("four bytes"));
-        let pps = match payload[PPS] {
-            0 => Pps::Absent,
-            1 => Pps::Attempting,
-            2 => Pps::Locked,
-            3 => Pps::Error,
-            other => Pps::Unknown(other),
-        };
-        let text = payload[NMEA].split(|byte| matches!(byte, 0 | b'\r' | b'\n')).next().unwrap_or_default();
-        let gprmc = if text.is_empty() { None } else { Some(Gprmc::parse(text).map_err(Refusal::Nmea)?) };
-        Ok(Self { device_us, pps, gprmc })
-    }
-}
-
 impl Gprmc {
-    /// Reads one sentence, `$` to checksum, without its line end.
+    /// Parses one sentence, from `$` to the checksum, without the end of its line.
     ///
     /// # Errors
-    /// [`NmeaError`].
+    /// - [`NmeaError::Byte`] if a byte is not printable ASCII.
+    /// - [`NmeaError::Sentence`] if the sentence is not `$..RMC`.
+    /// - [`NmeaError::Checksum`] if the checksum is missing or wrong.
+    /// - [`NmeaError::Field`] if a field cannot be parsed or is out of bounds.
     pub fn parse(sentence: &[u8]) -> Result<Self, NmeaError> {
         if let Some(at) = sentence.iter().position(|byte| !(0x20..0x7F).contains(byte)) {
             return Err(NmeaError::Byte { byte: sentence[at], at });
@@ -142,13 +87,13 @@ impl Gprmc {
         })
     }
 
-    /// Speed over ground, m/s.
+    /// Speed over ground, in m/s.
     pub fn speed_mps(&self) -> Option<f64> {
         self.speed_knots.map(|knots| knots * METRES_PER_SECOND_PER_KNOT)
     }
 }
 
-/// The comma-separated fields, after the sum was found right.
+/// The fields between the commas, after the checksum is verified.
 fn checked_fields(sentence: &str) -> Result<Vec<&str>, NmeaError> {
     let not_rmc = || NmeaError::Sentence { start: sentence.chars().take(8).collect() };
     let body = sentence.strip_prefix('$').ok_or_else(not_rmc)?;
@@ -182,7 +127,7 @@ fn number(
     number.map(Some).ok_or_else(|| wrong(field, value, allowed))
 }
 
-/// `3707.8178` and `N`: degrees and decimal minutes run together.
+/// Degrees from a text such as `3707.8178` (degrees and decimal minutes without a separator) and a hemisphere.
 fn angle(
     field: &'static str,
     value: &str,
@@ -191,9 +136,9 @@ fn angle(
     limit_deg: f64,
 ) -> Result<Option<f64>, NmeaError> {
     const ALLOWED: &str = "degrees and minutes below 60, such as 3707.8178, and a hemisphere";
-    let Some(run_together) = number(field, value, 0.0..=18_060.0, ALLOWED)? else { return Ok(None) };
-    let minutes = run_together % 100.0;
-    let degrees = (run_together / 100.0).floor() + minutes / 60.0;
+    let Some(joined) = number(field, value, 0.0..=18_060.0, ALLOWED)? else { return Ok(None) };
+    let minutes = joined % 100.0;
+    let degrees = (joined / 100.0).floor() + minutes / 60.0;
     let sign = match hemisphere {
         h if h == positive => 1.0,
         h if h == negative => -1.0,
@@ -205,7 +150,7 @@ fn angle(
     Ok(Some(sign * degrees))
 }
 
-/// `214106.5` and `230715`: ns since the Unix epoch.
+/// Nanoseconds since the Unix epoch, from a time such as `214106.5` and a date such as `230715`.
 fn utc_ns(time: &str, date: &str) -> Result<Option<i64>, NmeaError> {
     if time.is_empty() || date.is_empty() {
         return Ok(None);
@@ -215,30 +160,30 @@ fn utc_ns(time: &str, date: &str) -> Result<Option<i64>, NmeaError> {
     if hour > 23 || minute > 59 || second > 60 {
         return Err(wrong("time", time, "000000 to 235960"));
     }
-    let whole_ns = utc_ns_of([year, month, day], [hour, minute, second]);
+    let whole_ns = unix_ns([year, month, day], [hour, minute, second]);
     let whole_ns = whole_ns.ok_or_else(|| wrong("date", date, "a day of a month"))?;
-    // Digits alone: what else a float may be spelled with, such as an exponent, is no part of a second.
+    // A float may also have an exponent, which a second may not: only digits are accepted.
     let digits = time.split_once('.').map_or("0", |(_, digits)| digits);
     let fraction = format!("0.{digits}").parse().ok().filter(|_| digits.bytes().all(|digit| digit.is_ascii_digit()));
     let fraction: f64 = fraction.ok_or_else(|| wrong("time", time, "hhmmss or hhmmss.s"))?;
     Ok(Some(whole_ns + (fraction * 1e9).round() as i64))
 }
 
-/// ns since the Unix epoch of a year of two digits, a month and a day, and an hour, a minute and a second; `None` where
-/// there is no such moment.
-pub(crate) fn utc_ns_of([year, month, day]: [i64; 3], [hour, minute, second]: [i64; 3]) -> Option<i64> {
+/// Nanoseconds since the Unix epoch of a date (year of two digits, month, day) and a time (hour, minute, second);
+/// `None` if there is no such date or time.
+pub(crate) fn unix_ns([year, month, day]: [i64; 3], [hour, minute, second]: [i64; 3]) -> Option<i64> {
     let is_time = hour <= 23 && minute <= 59 && second <= 60;
     if !is_time || !(0..=99).contains(&year) || !(1..=12).contains(&month) || day < 1 {
         return None;
     }
-    // Two digits: receivers that begin at GPS's first day, 6 January 1980, write 80.
+    // A receiver without a fix counts from the first day of GPS, 6 January 1980, and sends the year 80.
     let year = if year >= 80 { 1900 + year } else { 2000 + year };
     let days = days_since_1970(year, month, day);
     let next_month = days_since_1970(year + month / 12, month % 12 + 1, 1);
     (days < next_month).then_some((days * 86_400 + hour * 3_600 + minute * 60 + second) * 1_000_000_000)
 }
 
-/// The first three pairs of digits.
+/// The first three pairs of digits of a text.
 fn pairs(text: &str) -> Option<[i64; 3]> {
     let digits = text.as_bytes().get(..6)?;
     let whole = digits.iter().all(u8::is_ascii_digit) && matches!(text.as_bytes().get(6), None | Some(b'.'));

@@ -1,8 +1,8 @@
 //! pcap and pcapng captures to UDP payloads.
 //!
 //! In: the bytes of a capture (Ethernet with or without VLAN tags, Linux cooked, raw IP). Out: [`Datagram`]s in file
-//! order. What is no whole UDP datagram is passed over and counted; a file that ends inside a packet gives all that
-//! came before, then an error that says where.
+//! order. Packets that are not a complete UDP datagram are skipped and counted. A file that ends inside a packet gives
+//! all datagrams before that packet, then an error with the position in the file.
 
 use std::io::Read;
 use std::net::{IpAddr, SocketAddr};
@@ -11,70 +11,72 @@ use etherparse::{EtherType, LaxNetSlice, LaxSlicedPacket, TransportSlice};
 use pcap_parser::traits::PcapReaderIterator;
 use pcap_parser::{Block, Linktype, PcapBlockOwned, PcapError};
 
-/// No packet, and so no block, of a usable capture is longer (the snapshot length has been 65,535 or 262,144).
+/// Greatest length of a block, in bytes. The snapshot length of captures is 65,535 or 262,144, so no packet, and hence
+/// no block, of a usable capture is longer.
 const BLOCK_LENGTH_MAX: usize = 512 * 1024;
-/// A pcapng file's first block is read at once; it holds a few comments.
+/// Number of bytes that are read before the format is known. The first block of a pcapng file must fit in; it contains
+/// a few comments.
 const HEAD_LENGTH: usize = 16 * 1024;
 const NS_PER_SECOND: i128 = 1_000_000_000;
 
 /// One UDP datagram of a capture.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Datagram {
-    /// When it was captured, ns since the Unix epoch.
+    /// Time of capture, in ns since the Unix epoch.
     pub stamp_ns: i64,
-    /// Who sent it.
+    /// Address and port of the sender.
     pub source: SocketAddr,
-    /// The port it was sent to: 2368 for data, 8308 for telemetry, out of the box.
+    /// Port of the receiver: 2368 for data, 8308 for telemetry in the factory settings.
     pub destination_port: u16,
-    /// The UDP payload.
+    /// UDP payload.
     pub payload: Vec<u8>,
 }
 
-/// Packets of a capture that were passed over.
+/// Numbers of packets of a capture that were skipped, by reason.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Skipped {
-    /// ARP, TCP and the like.
+    /// Packets of other protocols, such as ARP or TCP.
     pub not_udp: u64,
-    /// Pieces of fragmented datagrams.
+    /// Fragments of datagrams.
     pub fragmented: u64,
-    /// Cut off at capture, damaged, or of a link type not known here.
+    /// Packets that were cut off at capture, are damaged, or have an unknown link type.
     pub unreadable: u64,
 }
 
-/// Why a capture cannot be read (further).
+/// The reason for which a capture cannot be read, or not to its end.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CaptureError {
-    /// Neither pcap nor pcapng.
+    /// The file is neither pcap nor pcapng.
     #[error("not a capture: it starts with {start:02x?}; pcap or pcapng is allowed")]
     Format {
-        /// At most four bytes.
+        /// At most the first four bytes of the file.
         start: Vec<u8>,
     },
     /// The file ends inside a packet.
     #[error("the capture is cut off inside the packet that starts at byte {offset}")]
     Truncated {
-        /// From the start of the file.
+        /// Position in the file, in bytes from its start.
         offset: u64,
     },
-    /// A block that makes no sense.
+    /// A block is invalid.
     #[error("the capture is damaged at byte {offset}: {what}")]
     Damaged {
-        /// From the start of the file.
+        /// Position in the file, in bytes from its start.
         offset: u64,
-        /// What the reader says.
+        /// Description of the damage.
         what: String,
     },
     /// The file cannot be read.
     #[error("reading the capture at byte {offset}: {what}")]
     Read {
-        /// From the start of the file.
+        /// Position in the file, in bytes from its start.
         offset: u64,
-        /// What the system says.
+        /// Message of the operating system.
         what: String,
     },
 }
 
-/// Reads a capture: an iterator over [`Datagram`]s that ends after the first error.
+/// Reader of a capture: an iterator over its [`Datagram`]s that ends after the first error.
 pub struct Capture<'a> {
     blocks: Box<dyn PcapReaderIterator + Send + 'a>,
     interfaces: Interfaces,
@@ -88,7 +90,9 @@ impl<'a> Capture<'a> {
     /// Opens a capture.
     ///
     /// # Errors
-    /// [`CaptureError::Format`], [`CaptureError::Truncated`] within the file's header, [`CaptureError::Read`].
+    /// - [`CaptureError::Format`] if the file is neither pcap nor pcapng.
+    /// - [`CaptureError::Truncated`] if the file ends inside its header.
+    /// - [`CaptureError::Read`] if the reader fails.
     pub fn new(mut reader: impl Read + Send + 'a) -> Result<Self, CaptureError> {
         let read = |e: std::io::Error| CaptureError::Read { offset: 0, what: e.to_string() };
         let mut head = Vec::new();
@@ -105,17 +109,17 @@ impl<'a> Capture<'a> {
         Ok(Self { blocks, interfaces, is_pcapng, skipped, offset: 0, ended: false })
     }
 
-    /// What was passed over so far.
+    /// Packets that were skipped so far.
     pub fn skipped(&self) -> Skipped {
         self.skipped
     }
 
-    /// Bytes of the file read so far, in whole packets.
+    /// Position behind the last packet that was read, in bytes from the start of the file.
     pub fn offset(&self) -> u64 {
         self.offset
     }
 
-    /// Reads on to the next datagram; `None` at a clean end.
+    /// Reads the next datagram; `None` if the file ends behind a complete packet.
     fn read(&mut self) -> Result<Option<Datagram>, CaptureError> {
         let offset = self.offset;
         loop {
@@ -126,7 +130,7 @@ impl<'a> Capture<'a> {
                 });
             }
             let (length, found) = match self.blocks.next() {
-                Ok((length, block)) => (length, self.interfaces.take(&block, &mut self.skipped)),
+                Ok((length, block)) => (length, self.interfaces.apply(&block, &mut self.skipped)),
                 Err(PcapError::Eof) => return Ok(None),
                 Err(PcapError::Incomplete(_)) => {
                     refill(self.blocks.as_mut(), self.offset)?;
@@ -160,8 +164,8 @@ impl Iterator for Capture<'_> {
     }
 }
 
-/// Whether a process information block is shorter than any block, by its own length: pcap-parser would subtract the
-/// head's from it. Its kind is told in the order of its bytes.
+/// True if the data begin with a process information block whose length field is less than the 12 bytes of every block.
+/// pcap-parser would subtract 12 from that length. The block type is written in the byte order of the section.
 fn is_too_short(block: &[u8]) -> bool {
     const LEAST: u32 = 12;
     match *block {
@@ -197,7 +201,7 @@ fn damaged(error: &PcapError<&[u8]>, offset: u64) -> CaptureError {
     CaptureError::Damaged { offset, what }
 }
 
-/// What the headers of a capture say of the packets after them.
+/// Properties of the capture's interfaces, from its headers.
 #[derive(Default)]
 struct Interfaces {
     list: Vec<Interface>,
@@ -211,8 +215,8 @@ struct Interface {
 }
 
 impl Interfaces {
-    /// Takes one block; gives the datagram, if it holds one.
-    fn take(&mut self, block: &PcapBlockOwned<'_>, skipped: &mut Skipped) -> Option<Datagram> {
+    /// Applies one block: a header changes the interfaces, a packet gives its datagram, if it contains one.
+    fn apply(&mut self, block: &PcapBlockOwned<'_>, skipped: &mut Skipped) -> Option<Datagram> {
         match block {
             PcapBlockOwned::LegacyHeader(header) => {
                 let ticks_per_second = if header.is_nanosecond_precision() { 1_000_000_000 } else { 1_000_000 };
@@ -224,11 +228,11 @@ impl Interfaces {
                 let ticks = u64::from(packet.ts_sec) * interface.ticks_per_second + u64::from(packet.ts_usec);
                 interface.datagram(ticks, packet.data, skipped)
             }
-            PcapBlockOwned::NG(block) => self.take_ng(block, skipped),
+            PcapBlockOwned::NG(block) => self.apply_ng(block, skipped),
         }
     }
 
-    fn take_ng(&mut self, block: &Block<'_>, skipped: &mut Skipped) -> Option<Datagram> {
+    fn apply_ng(&mut self, block: &Block<'_>, skipped: &mut Skipped) -> Option<Datagram> {
         match block {
             Block::SectionHeader(_) => self.list.clear(),
             Block::InterfaceDescription(description) => self.list.push(Interface {
@@ -245,7 +249,7 @@ impl Interfaces {
                 };
                 return interface.datagram(ticks, data, skipped);
             }
-            // A simple packet has no stamp.
+            // A simple packet block has no stamp.
             Block::SimplePacket(_) => skipped.unreadable += 1,
             _ => {}
         }
@@ -253,16 +257,17 @@ impl Interfaces {
     }
 }
 
-/// pcapng's if_tsresol: a power of ten, or of two with the highest bit; what does not fit is the usual microsecond.
+/// Ticks per second of a pcapng interface. `if_tsresol` is a negative power of ten, or of two if its highest bit is
+/// set; a value too large for 64 bits is read as microseconds, the default of the format.
 fn ticks_per_second(if_tsresol: u8) -> u64 {
     let (base, power) = if if_tsresol & 0x80 == 0 { (10_u64, if_tsresol) } else { (2, if_tsresol & 0x7F) };
     base.checked_pow(power.into()).unwrap_or(1_000_000)
 }
 
-/// `LINKTYPE_LINUX_SLL2`, which pcap-parser has no name for.
+/// `LINKTYPE_LINUX_SLL2`; pcap-parser has no name for it.
 const LINUX_SLL2: Linktype = Linktype(276);
 
-/// A Linux cooked packet: the ethertype stands at `ether_type`, the network header follows at `header`.
+/// Slices a Linux cooked packet: its ethertype is at `ether_type`, its network header begins at `header`.
 fn cooked(data: &[u8], ether_type: usize, header: usize) -> Option<LaxSlicedPacket<'_>> {
     let payload = data.get(header..)?;
     let ether_type = EtherType(u16::from_be_bytes([data[ether_type], data[ether_type + 1]]));
@@ -271,7 +276,7 @@ fn cooked(data: &[u8], ether_type: usize, header: usize) -> Option<LaxSlicedPack
 
 impl Interface {
     fn datagram(self, ticks: u64, data: &[u8], skipped: &mut Skipped) -> Option<Datagram> {
-        // Lax: a VLP-16's telemetry has the IP length of its data packets.
+        // The lax parser is needed because a VLP-16 sends telemetry with the IP length of its data packets.
         let sliced = match self.link {
             Linktype::ETHERNET => LaxSlicedPacket::from_ethernet(data).ok(),
             Linktype::LINUX_SLL => cooked(data, 14, 16),

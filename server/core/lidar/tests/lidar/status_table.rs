@@ -1,11 +1,11 @@
-//! The table an HDL-64E S2 or S3 sends of itself.
+//! The calibration table in the status bytes of an HDL-64E S2 or S3.
 
-use clearway_lidar::calibration::unit_table::{PACKETS_PER_TABLE, UnitTable, status_bytes};
+use clearway_lidar::calibration::status_table::{PACKETS_PER_TABLE, StatusTable, status_bytes};
 use clearway_lidar::{Calibration, CalibrationSource, Model, Sensor, SensorConfig};
 
 use crate::stream::Stream;
 
-/// A unit's table, to hundredths of a degree and millimetres.
+/// A table that differs from the factory table, rounded to hundredths of a degree and millimetres.
 fn own_table() -> Calibration {
     let mut calibration = Calibration::factory(Model::Hdl64eS2);
     for (index, laser) in calibration.lasers.iter_mut().enumerate() {
@@ -18,16 +18,16 @@ fn own_table() -> Calibration {
         (laser.min_intensity, laser.max_intensity) = (Some(40), Some(255));
     }
     let sent = status_bytes(Model::Hdl64eS2, &calibration);
-    read(&sent).expect("a whole table").1
+    read(&sent).expect("a complete table").1
 }
 
 fn read(sent: &[(u8, u8)]) -> Option<(Model, Calibration)> {
-    let mut table = UnitTable::default();
+    let mut table = StatusTable::default();
     sent.iter().chain(&sent[..16]).find_map(|status| table.push(*status))
 }
 
 #[test]
-fn a_table_sent_comes_back_and_tells_s2_from_s3() {
+fn a_table_in_status_bytes_is_read_as_sent_with_its_model() {
     let calibration = own_table();
     assert!((calibration.lasers[63].dist_correction - 1.263).abs() < 1e-9);
     assert!(calibration.lasers.iter().all(|laser| laser.two_pt_correction_available));
@@ -56,7 +56,7 @@ fn a_table_with_a_lost_packet_or_a_wrong_byte_is_not_used() {
 }
 
 #[test]
-fn the_sensor_uses_the_units_table_from_the_next_turn_on() {
+fn the_table_in_the_status_bytes_applies_from_the_next_revolution() {
     let calibration = own_table();
     for (model, start) in [(Model::Hdl64eS2, 0), (Model::Hdl64eS3, 1_234)] {
         let stream = Stream::of(model);
@@ -67,19 +67,21 @@ fn the_sensor_uses_the_units_table_from_the_next_turn_on() {
             packet
         };
         let mut sensor = Sensor::new(SensorConfig::default());
-        let mut turns = Vec::new();
+        let mut revolutions = Vec::new();
         for index in 0..2 * PACKETS_PER_TABLE + stream.packets(2.0) {
-            turns.extend(sensor.push(&with_status(index), stream.arrival_ns(index)).unwrap().cloned());
+            revolutions.extend(sensor.push(&with_status(index), stream.arrival_ns(index)).unwrap().cloned());
         }
         let status = sensor.status();
-        assert_eq!((status.model, status.calibration), (Some(model), CalibrationSource::Unit));
-        let (first, last) = (turns.first().unwrap(), turns.last().unwrap());
+        assert_eq!((status.model, status.calibration), (Some(model), CalibrationSource::StatusBytes));
+        let (first, last) = (revolutions.first().unwrap(), revolutions.last().unwrap());
         assert_eq!(*first.calibration, Calibration::factory(Model::Hdl64eS2));
         assert_eq!(*last.calibration, calibration);
-        // Within a turn all points come from one table.
-        for turn in &turns {
-            let expected = turn.calibration.lasers[7].dist_correction as f32 + 10.0;
-            assert!(turn.echoes[0].range_m.iter().skip(7).step_by(64).all(|range| (range - expected).abs() < 1e-4));
+        // All points of a revolution are from one table.
+        for revolution in &revolutions {
+            let expected = revolution.calibration.lasers[7].dist_correction as f32 + 10.0;
+            assert!(
+                revolution.echoes[0].range_m.iter().skip(7).step_by(64).all(|range| (range - expected).abs() < 1e-4)
+            );
         }
 
         let configured = Some(Calibration::factory(model));

@@ -1,44 +1,48 @@
-//! Raw returns to corrected points, a block of 32 at a time.
+//! Raw returns to corrected points, one block of 32 at a time.
 //!
-//! In: the 96 bytes of a block's returns, its azimuth and how fast the sensor turns. Out: 32 slots of range, x, y, z
-//! (m, sensor frame) and intensity. Loops run over separate arrays without branches, so that the compiler vectorises
-//! them. Formula: HDL-64E S3 manual rev K, appendix F (the same with zero offsets for every other model), with the
-//! sensor's y axis as our x and its x axis as our -y. VeloView computes the same.
+//! In: the 96 bytes of the returns of a block, its azimuth, and the step of the sensor from block to block. Out: 32
+//! slots of range, x, y, z (m, sensor frame) and intensity. The loops run over separate arrays without branches, so
+//! that the compiler vectorises them. Formula: HDL-64E S3 manual 63-HDL64ES3 rev K, appendix F, with zero offsets for
+//! all other models. The manual's y axis is our x, and its x axis is our -y. VeloView computes the same.
 
 use std::sync::LazyLock;
 
 use crate::calibration::Calibration;
-use crate::model::{AZIMUTHS_PER_TURN, ModelSpec, RETURNS_PER_BLOCK};
-use crate::packet::{BOGUS_DISTANCE, RETURNS_LENGTH};
+use crate::datagram::packet::{BOGUS_DISTANCE, RETURNS_LENGTH};
+use crate::model::{AZIMUTHS_PER_REVOLUTION, ModelSpec, RETURNS_PER_BLOCK};
+use crate::revolution::echo::{Lanes, Slots};
 
-type Lanes = [f32; RETURNS_PER_BLOCK];
 const ZERO: Lanes = [0.0; RETURNS_PER_BLOCK];
 
-/// Where the near-range corrections of the sensor's x and y axis are measured, and the far one; m.
+/// Distance along the manual's x axis at which the near-range correction is measured, in m (HDL-64E S3 manual rev K,
+/// appendix F).
 const NEAR_X_M: f64 = 2.4;
+/// Distance along the manual's y axis at which the near-range correction is measured, in m.
 const NEAR_Y_M: f64 = 1.93;
+/// Distance at which the far correction is measured, in m.
 const FAR_M: f64 = 25.04;
 
-/// Sine and cosine of every azimuth the wire can carry.
+/// Sine and cosine of every azimuth, by its count.
 static AZIMUTHS: LazyLock<Vec<[f32; 2]>> = LazyLock::new(|| {
-    let of = |count: u32| (f64::from(count) * std::f64::consts::TAU / f64::from(AZIMUTHS_PER_TURN)).sin_cos();
-    (0..AZIMUTHS_PER_TURN).map(of).map(|(sin, cos)| [sin as f32, cos as f32]).collect()
+    let sin_cos =
+        |count: u32| (f64::from(count) * std::f64::consts::TAU / f64::from(AZIMUTHS_PER_REVOLUTION)).sin_cos();
+    (0..AZIMUTHS_PER_REVOLUTION).map(sin_cos).map(|(sin, cos)| [sin as f32, cos as f32]).collect()
 });
 
-/// What turns one sensor's returns into points.
+/// The corrections of one sensor, prepared for blocks of 32 lasers.
 #[derive(Clone, Debug)]
-pub(crate) struct Beams {
+pub(super) struct PointCorrection {
     spec: &'static ModelSpec,
     metres_per_count: f32,
-    /// Whether any laser has offsets or near-range corrections.
+    /// True if any laser has offsets or near-range corrections.
     corrected: bool,
-    /// Blocks 0, 1, … of a firing.
+    /// Lasers of blocks 0, 1, … of a firing.
     banks: Vec<Bank>,
-    /// Turned corrections for the rates of turn seen lately, at `step % TURNS`.
-    turns: Vec<Turn>,
+    /// Rotations of the last steps, at index `step % ROTATIONS`.
+    rotations: Vec<Rotation>,
 }
 
-/// The 32 lasers of one block. With 16 lasers they come twice.
+/// The corrections of the 32 lasers of one block. 16 lasers are there twice.
 #[derive(Clone, Debug)]
 struct Bank {
     rotation_rad: [f64; RETURNS_PER_BLOCK],
@@ -47,34 +51,29 @@ struct Bank {
     far_m: Lanes,
     vertical_m: Lanes,
     horizontal_m: Lanes,
-    /// What the correction at range 0 along x, y differs from the far one, and how it falls with every metre.
+    /// Correction at distance 0 along x, less the far correction.
     x_near_m: Lanes,
+    /// Change of that difference per metre.
     x_slope: Lanes,
+    /// Correction at distance 0 along y, less the far correction.
     y_near_m: Lanes,
     y_slope: Lanes,
 }
 
-/// Sine and cosine of what is added to a block's azimuth at one rate of turn: the turn until the laser fires, less the
-/// laser's own azimuth offset.
+/// Sine and cosine of the angle between the azimuth of a block and the direction of each laser: the rotation until the
+/// laser fires, less the azimuth offset of the laser.
 #[derive(Clone, Debug)]
-struct Turn {
+struct Rotation {
+    /// Counts by which the sensor turns from block to block.
     step: u32,
     sin: Vec<Lanes>,
     cos: Vec<Lanes>,
 }
 
-const TURNS: usize = 32;
+/// Number of rotations that are kept. Ours: the step of a sensor varies by a few counts, so that each is computed once.
+const ROTATIONS: usize = 32;
 
-/// 32 slots of each array of an image.
-pub(crate) struct Slots<'a> {
-    pub range_m: &'a mut Lanes,
-    pub x: &'a mut Lanes,
-    pub y: &'a mut Lanes,
-    pub z: &'a mut Lanes,
-    pub intensity: &'a mut [u8; RETURNS_PER_BLOCK],
-}
-
-impl Beams {
+impl PointCorrection {
     pub fn new(spec: &'static ModelSpec, calibration: &Calibration) -> Self {
         let banks: Vec<Bank> =
             (0..spec.lasers.div_ceil(RETURNS_PER_BLOCK)).map(|bank| Bank::new(calibration, bank)).collect();
@@ -82,13 +81,14 @@ impl Beams {
             spec,
             metres_per_count: calibration.distance_m_per_count as f32,
             corrected: banks.iter().any(Bank::has_offsets),
-            turns: vec![Turn { step: u32::MAX, sin: Vec::new(), cos: Vec::new() }; TURNS],
+            rotations: vec![Rotation { step: u32::MAX, sin: Vec::new(), cos: Vec::new() }; ROTATIONS],
             banks,
         }
     }
 
-    /// Decodes one block of bank `bank`, sent at `azimuth`, by a sensor that turns `step` counts a block.
-    pub fn decode(
+    /// Converts the returns of one block of bank `bank`, at `azimuth`, of a sensor that turns by `step` counts per
+    /// block.
+    pub fn convert(
         &mut self,
         returns: &[u8; RETURNS_LENGTH],
         bank: usize,
@@ -96,17 +96,17 @@ impl Beams {
         step: u32,
         out: &mut Slots<'_>,
     ) {
-        let turn = &mut self.turns[step as usize % TURNS];
-        if turn.step != step {
-            *turn = Turn::new(self.spec, &self.banks, step);
+        let rotation = &mut self.rotations[step as usize % ROTATIONS];
+        if rotation.step != step {
+            *rotation = Rotation::new(self.spec, &self.banks, step);
         }
         let lasers = &self.banks[bank];
-        let [sin, cos] = AZIMUTHS[azimuth as usize % AZIMUTHS_PER_TURN as usize];
+        let [sin, cos] = AZIMUTHS[azimuth as usize % AZIMUTHS_PER_REVOLUTION as usize];
         ranges(returns, self.metres_per_count, &lasers.far_m, out);
         let (mut sines, mut cosines) = (ZERO, ZERO);
         for i in 0..RETURNS_PER_BLOCK {
-            sines[i] = sin * turn.cos[bank][i] + cos * turn.sin[bank][i];
-            cosines[i] = cos * turn.cos[bank][i] - sin * turn.sin[bank][i];
+            sines[i] = sin * rotation.cos[bank][i] + cos * rotation.sin[bank][i];
+            cosines[i] = cos * rotation.cos[bank][i] - sin * rotation.sin[bank][i];
         }
         if self.corrected {
             corrected_points(lasers, &sines, &cosines, out);
@@ -116,7 +116,7 @@ impl Beams {
     }
 }
 
-/// Range 0 where there is no echo, as a select that vectorises.
+/// Writes ranges and intensities. The range is 0 without a return; the selection has no branch, so that it vectorises.
 fn ranges(returns: &[u8; RETURNS_LENGTH], metres_per_count: f32, far_m: &Lanes, out: &mut Slots<'_>) {
     let mut counts = [0_i32; RETURNS_PER_BLOCK];
     for i in 0..RETURNS_PER_BLOCK {
@@ -161,7 +161,7 @@ impl Bank {
         let near = |near: Option<f64>, i: usize, near_m: f64| {
             let used = laser(i).two_pt_correction_available;
             let excess = near.filter(|_| used).map_or(0.0, |c| c - laser(i).dist_correction);
-            // Linear from `excess` at `near_m` to 0 at `FAR_M`.
+            // The difference is linear, from `excess` at `near_m` to 0 at `FAR_M`.
             let slope = -excess / (FAR_M - near_m);
             ((-slope * FAR_M) as f32, slope as f32)
         };
@@ -186,11 +186,11 @@ impl Bank {
     }
 }
 
-impl Turn {
+impl Rotation {
     fn new(spec: &ModelSpec, banks: &[Bank], step: u32) -> Self {
         let angle = |bank: usize, i: usize| {
             let offset = spec.azimuth_offset(bank * RETURNS_PER_BLOCK + i, step);
-            f64::from(offset) * std::f64::consts::TAU / f64::from(AZIMUTHS_PER_TURN) - banks[bank].rotation_rad[i]
+            f64::from(offset) * std::f64::consts::TAU / f64::from(AZIMUTHS_PER_REVOLUTION) - banks[bank].rotation_rad[i]
         };
         let all = |f: fn(f64) -> f64| {
             (0..banks.len()).map(|bank| std::array::from_fn(|i| f(angle(bank, i)) as f32)).collect::<Vec<Lanes>>()
