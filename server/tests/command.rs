@@ -1,4 +1,4 @@
-//! The command `clearway`, as a person meets it.
+//! The command `clearway`: configuration and usage errors.
 
 use std::process::{Command, Output};
 
@@ -7,7 +7,7 @@ fn clearway(arguments: &[&str]) -> Output {
 }
 
 #[test]
-fn check_prints_the_default_configuration_as_one_that_check_accepts() {
+fn check_accepts_the_effective_configuration_that_it_prints() {
     let output =
         clearway(&["check", "--config", concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/clearway.toml")]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -19,18 +19,18 @@ fn check_prints_the_default_configuration_as_one_that_check_accepts() {
 }
 
 #[test]
-fn an_unknown_key_is_named_with_its_file_and_line_and_nothing_is_served() {
+fn an_unknown_key_is_refused_with_its_file_and_line() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("clearway.toml");
     std::fs::write(&file, "[grpc]\nlisten = \"127.0.0.1:0\"\nlissten = 1\n").unwrap();
     let output = clearway(&["serve", "--config", file.to_str().unwrap()]);
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("clearway.toml") && said.contains("line 3") && said.contains("lissten"), "{said}");
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{message}");
+    assert!(message.contains("clearway.toml") && message.contains("line 3") && message.contains("lissten"), "{message}");
 }
 
 #[test]
-fn a_wrong_use_is_answered_with_how_to_use_it() {
+fn wrong_arguments_are_answered_with_the_usage() {
     let output = clearway(&["replay"]);
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).contains("Usage: clearway replay"));

@@ -1,4 +1,4 @@
-//! A recording written here goes through `clearway export` and `clearway info`.
+//! `clearway export` and `clearway info` with recordings that these tests write.
 
 mod common;
 #[path = "../../tests/tests/fixture/venv.rs"]
@@ -19,7 +19,8 @@ use common::{CAPTURE_END_NS, CLASSES, clearway, map, text};
 use prost::Message;
 use serde_json::{Value, json};
 
-/// Three maps of alpha, as the server lays them out; unfinished: as a crash leaves it.
+/// Writes a recording of three maps of the vehicle `alpha`, in the layout of the server; without `finished`, as a crash
+/// leaves it.
 fn record(path: &Path, finished: bool) {
     let mut writer = mcap::WriteOptions::new().compression_threads(0).create(File::create(path).unwrap()).unwrap();
     let metadata = BTreeMap::from([("boot_id".to_string(), "7".to_string())]);
@@ -37,7 +38,7 @@ fn record(path: &Path, finished: bool) {
         writer.finish().unwrap();
     } else {
         let length = std::fs::metadata(path).unwrap().len();
-        // Dropping the writer would finish the file.
+        // Without this the writer would finish the file when it is dropped.
         std::mem::forget(writer);
         File::options().write(true).open(path).unwrap().set_len(length - 1).unwrap();
     }
@@ -48,7 +49,7 @@ fn folder() -> tempfile::TempDir {
 }
 
 #[test]
-fn a_picture_has_the_colour_of_each_class_where_it_lies() {
+fn a_picture_shows_each_class_in_its_colour_and_place() {
     let folder = folder();
     let file = folder.path().join("run.mcap");
     record(&file, true);
@@ -64,7 +65,7 @@ fn a_picture_has_the_colour_of_each_class_where_it_lies() {
     let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
     let info = reader.next_frame(&mut pixels).unwrap();
     assert_eq!((info.width, info.height, info.color_type), (120, 120, png::ColorType::Rgb));
-    // Half a metre a pixel: forward is up, left is left.
+    // A pixel is half a metre; forward is up, left is left.
     let at = |x_m: f64, y_m: f64| {
         let (row, column) = (((30.0 - x_m) * 2.0) as usize, ((30.0 - y_m) * 2.0) as usize);
         let start = (row * 120 + column) * 3;
@@ -81,7 +82,7 @@ fn a_picture_has_the_colour_of_each_class_where_it_lies() {
 }
 
 #[test]
-fn arrays_have_numpys_header_and_the_cells_and_come_with_a_document() {
+fn a_numpy_file_has_a_valid_header_and_the_cells() {
     let folder = folder();
     let file = folder.path().join("run.mcap");
     record(&file, true);
@@ -116,7 +117,7 @@ fn arrays_have_numpys_header_and_the_cells_and_come_with_a_document() {
 }
 
 #[test]
-fn a_document_has_the_cells_inline() {
+fn a_json_document_contains_the_cells() {
     let folder = folder();
     let file = folder.path().join("run.mcap");
     record(&file, true);
@@ -130,7 +131,7 @@ fn a_document_has_the_cells_inline() {
 }
 
 #[test]
-fn a_recording_cut_by_a_crash_is_exported_as_far_as_it_goes_and_says_so() {
+fn a_recording_cut_by_a_crash_is_exported_up_to_the_cut() {
     let folder = folder();
     let file = folder.path().join("cut.mcap");
     record(&file, false);
@@ -140,15 +141,15 @@ fn a_recording_cut_by_a_crash_is_exported_as_far_as_it_goes_and_says_so() {
     assert!(text(&done.stderr).contains("cut after"), "{}", text(&done.stderr));
     assert!(folder.path().join("000001_drivability.json").exists());
 
-    let told = clearway(&["info", paths[0], "--json"]);
-    let document: Value = serde_json::from_slice(&told.stdout).unwrap();
+    let info = clearway(&["info", paths[0], "--json"]);
+    let document: Value = serde_json::from_slice(&info.stdout).unwrap();
     assert_eq!(document["complete"], false);
     assert_eq!(document["run"]["boot_id"], "7");
     assert!(document["maps"]["alpha"]["drivability"].as_u64().unwrap() >= 2);
 }
 
 #[test]
-fn an_unknown_layer_is_refused_with_the_layers_there_are() {
+fn an_unknown_layer_is_refused_with_the_known_layers() {
     let folder = folder();
     let file = folder.path().join("run.mcap");
     record(&file, true);
@@ -159,14 +160,14 @@ fn an_unknown_layer_is_refused_with_the_layers_there_are() {
 }
 
 #[test]
-fn files_of_no_kind_known_are_refused_and_wrong_usage_is_another_exit_code() {
+fn a_file_of_unknown_kind_exits_with_1_and_wrong_usage_with_2() {
     let folder = folder();
     let file = folder.path().join("note.txt");
     std::fs::write(&file, "dear reader").unwrap();
     let path = file.to_str().unwrap();
-    let told = clearway(&["info", path]);
-    assert_eq!(told.status.code(), Some(1));
-    assert!(text(&told.stderr).contains("not a capture"), "{}", text(&told.stderr));
+    let info = clearway(&["info", path]);
+    assert_eq!(info.status.code(), Some(1));
+    assert!(text(&info.stderr).contains("not a capture"), "{}", text(&info.stderr));
     let exported = clearway(&["export", path, "--layer", "x", "--format", "png", "--out", path]);
     assert_eq!(exported.status.code(), Some(1));
     assert!(text(&exported.stderr).contains("not an MCAP file"), "{}", text(&exported.stderr));
@@ -176,8 +177,8 @@ fn files_of_no_kind_known_are_refused_and_wrong_usage_is_another_exit_code() {
 const CONFIG: &str = "[[vehicle]]\nname = 'alpha'\nqueue = 16\n[[vehicle.sensor]]\nname = 'top'\nmodel = 'hdl64e_s2'\n\
     [vehicle.sensor.extrinsics]\nx_m = 0.5\ny_m = 0.0\nz_m = 1.9\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n";
 
-/// A journal of some turns of a simulated vehicle and three maps of a vehicle at rest that looks to its left, as the
-/// server lays them out. Gives the bytes of the points of each turn.
+/// Writes a recording in the layout of the server: a journal of some revolutions of a simulated vehicle, and three maps of
+/// a resting vehicle that is rotated to the left. Returns the number of bytes of the points of each revolution.
 fn record_drive(path: &Path) -> Vec<usize> {
     let mut writer = mcap::WriteOptions::new().compression_threads(0).create(File::create(path).unwrap()).unwrap();
     let (name, data) = ("config.toml".to_owned(), CONFIG.as_bytes().into());
@@ -189,7 +190,7 @@ fn record_drive(path: &Path) -> Vec<usize> {
     };
     let journal = channel("clearway.v1.Event", "/alpha/journal");
     let layers = ["drivability", "second"].map(|layer| channel("clearway.v1.Map", &format!("/alpha/map/{layer}")));
-    let mut put = |channel_id: u16, log_ns: i64, bytes: &[u8]| {
+    let mut write = |channel_id: u16, log_ns: i64, bytes: &[u8]| {
         let header = mcap::records::MessageHeader {
             channel_id,
             sequence: 0,
@@ -200,22 +201,22 @@ fn record_drive(path: &Path) -> Vec<usize> {
     };
     let mut event = |arrival_ns: i64, body: v1::event::Body| {
         let event = v1::Event { arrival_ns, body: Some(body), ..Default::default() };
-        put(journal, arrival_ns, &event.encode_to_vec());
+        write(journal, arrival_ns, &event.encode_to_vec());
     };
     let mut sensor = Sensor::new(SensorConfig { model: Some(Model::Hdl64eS2), ..SensorConfig::default() });
-    let (mut turns, mut last_ns) = (Vec::new(), 0);
-    // Tunnelled by somebody who knows of a second sensor: of no sensor here.
+    let (mut bytes, mut last_ns) = (Vec::new(), 0);
+    // An event of a sensor that the configuration does not have.
     let stray = v1::Event { source: 3, body: Some(v1::event::Body::End(v1::End {})), ..Default::default() };
     for datagram in SimulatedVehicle::new(flat(), ScannerConfig::default()).take(1200) {
-        if let Ok(Some(turn)) = sensor.push(&datagram.payload, datagram.stamp_ns) {
-            turns.push(12 * turn.returns());
+        if let Ok(Some(revolution)) = sensor.push(&datagram.payload, datagram.stamp_ns) {
+            bytes.push(12 * revolution.returns());
         }
         last_ns = datagram.stamp_ns;
         event(last_ns, v1::event::Body::Datagram(datagram.payload.into()));
     }
-    turns.extend(sensor.finish().map(|turn| 12 * turn.returns()));
+    bytes.extend(sensor.finish().map(|revolution| 12 * revolution.returns()));
     event(last_ns, v1::event::Body::End(v1::End {}));
-    put(journal, last_ns, &stray.encode_to_vec());
+    write(journal, last_ns, &stray.encode_to_vec());
     for sequence in 0..3 {
         let end_ns = CAPTURE_END_NS + 100_000_000 * sequence;
         let mut map = v1::Map::decode(map(sequence as u64, end_ns)).unwrap();
@@ -223,44 +224,46 @@ fn record_drive(path: &Path) -> Vec<usize> {
         let half = std::f64::consts::FRAC_1_SQRT_2;
         header.map_from_ego = Some(v1::Pose { x: 4.0, y: 2.0, qz: half, qw: half, ..Default::default() });
         header.speed_mps = Some(3.5);
-        put(layers[0], end_ns + 1_000_000, &map.encode_to_vec());
+        write(layers[0], end_ns + 1_000_000, &map.encode_to_vec());
         map.layers[0].name = "second".into();
-        put(layers[1], end_ns + 1_000_000, &map.encode_to_vec());
+        write(layers[1], end_ns + 1_000_000, &map.encode_to_vec());
     }
     writer.finish().unwrap();
-    turns
+    bytes
 }
 
-/// Exports, and has a stranger read what came of it.
+/// Exports a recording and reads the result with the Python package `mcap`. Returns its topics, and the number of bytes
+/// of the points of each revolution.
 fn exported(format: &str, more: &[&str]) -> (Value, Vec<usize>) {
     let folder = folder();
     let [file, out] = ["run.mcap", "out.mcap"].map(|name| folder.path().join(name));
-    let turns = record_drive(&file);
+    let bytes = record_drive(&file);
     let paths = [file.to_str().unwrap(), out.to_str().unwrap()];
     let arguments = [&["export", paths[0], "--format", format, "--out", paths[1]], more].concat();
     let done = clearway(&arguments);
     assert!(done.status.success(), "{}", text(&done.stderr));
     let again = clearway(&arguments);
     assert!(!again.status.success() && text(&again.stderr).contains("exists"), "{}", text(&again.stderr));
-    (serde_json::from_str(&venv::run(venv::script("viewer_file.py").arg(&out), "mcap")).unwrap(), turns)
+    (serde_json::from_str(&venv::run(venv::script("viewer_file.py").arg(&out), "mcap")).unwrap(), bytes)
 }
 
-fn schemas(told: &Value) -> Vec<(&str, &str, u64)> {
-    let topics = told.as_object().unwrap().iter();
+/// Topic, schema and number of messages of each topic.
+fn schemas(topics: &Value) -> Vec<(&str, &str, u64)> {
+    let topics = topics.as_object().unwrap().iter();
     topics.map(|(topic, of)| (&**topic, of["schema"].as_str().unwrap(), of["count"].as_u64().unwrap())).collect()
 }
 
 #[test]
-fn a_file_for_ros_2_has_occupancy_grids_tf_and_odometry_that_a_stranger_reads() {
-    let (told, _) = exported("ros2", &["--no-points"]);
+fn a_file_for_ros_2_has_occupancy_grids_tf_and_odometry() {
+    let (topics, _) = exported("ros2", &["--no-points"]);
     let expected = [
         ("/clearway/alpha/drivability", "nav_msgs/msg/OccupancyGrid", 3),
         ("/clearway/alpha/odometry", "nav_msgs/msg/Odometry", 3),
         ("/clearway/alpha/second", "nav_msgs/msg/OccupancyGrid", 3),
         ("/tf", "tf2_msgs/msg/TFMessage", 3),
     ];
-    assert_eq!(schemas(&told), expected);
-    let grid = &told["/clearway/alpha/drivability"]["last"];
+    assert_eq!(schemas(&topics), expected);
+    let grid = &topics["/clearway/alpha/drivability"]["last"];
     assert_eq!(
         grid["header"],
         json!({"stamp": {"sec": 1_700_000_000, "nanosec": 300_000_000}, "frame_id": "alpha/base_link"})
@@ -273,38 +276,38 @@ fn a_file_for_ros_2_has_occupancy_grids_tf_and_odometry_that_a_stranger_reads() 
     assert_eq!(at(-6.1, -6.1), Some(-1), "behind and to the right: unknown");
     assert_eq!(at(10.1, -10.1), Some(100), "ahead and to the right, 14 m off: an obstacle");
     assert_eq!(at(29.1, 29.1), Some(-1), "outside of the grid");
-    let transform = &told["/tf"]["last"]["transforms"][0];
+    let transform = &topics["/tf"]["last"]["transforms"][0];
     assert_eq!(
         (&transform["header"]["frame_id"], &transform["child_frame_id"]),
         (&json!("map"), &json!("alpha/base_link"))
     );
     assert_eq!(transform["transform"]["translation"], json!({"x": 4.0, "y": 2.0, "z": 0.0}));
-    let odometry = &told["/clearway/alpha/odometry"]["last"];
+    let odometry = &topics["/clearway/alpha/odometry"]["last"];
     assert_eq!(odometry["twist"]["twist"]["linear"]["x"], 3.5);
     assert_eq!(odometry["pose"]["pose"]["orientation"]["z"], json!(std::f64::consts::FRAC_1_SQRT_2));
 }
 
 #[test]
-fn a_file_for_ros_2_has_the_points_of_every_turn_and_where_their_sensor_sits() {
-    let (told, turns) = exported("ros2", &["--layer", "second"]);
-    let clouds = turns.len() as u64;
+fn a_file_for_ros_2_has_the_points_of_every_revolution() {
+    let (topics, bytes) = exported("ros2", &["--layer", "second"]);
+    let clouds = bytes.len() as u64;
     let expected = [
         ("/clearway/alpha/odometry", "nav_msgs/msg/Odometry", 3),
         ("/clearway/alpha/points/top", "sensor_msgs/msg/PointCloud2", clouds),
         ("/clearway/alpha/second", "nav_msgs/msg/OccupancyGrid", 3),
         ("/tf", "tf2_msgs/msg/TFMessage", 3 + clouds),
     ];
-    assert_eq!(schemas(&told), expected);
-    let cloud = &told["/clearway/alpha/points/top"]["last"];
-    let bytes = turns[turns.len() - 1];
+    assert_eq!(schemas(&topics), expected);
+    let cloud = &topics["/clearway/alpha/points/top"]["last"];
+    let last = bytes[bytes.len() - 1];
     assert_eq!(
         (&cloud["header"]["frame_id"], &cloud["width"], &cloud["data"]["length"]),
-        (&json!("alpha/top"), &json!(bytes / 12), &json!(bytes))
+        (&json!("alpha/top"), &json!(last / 12), &json!(last))
     );
     let names: Vec<&Value> = cloud["fields"].as_array().unwrap().iter().map(|field| &field["name"]).collect();
     assert_eq!(names, ["x", "y", "z"]);
-    // The simulated vehicle drives later than the maps were made: the last is the sensor's mount.
-    let transform = &told["/tf"]["last"]["transforms"][0];
+    // The simulated drive is later than the maps, so the last transform is the sensor's mount.
+    let transform = &topics["/tf"]["last"]["transforms"][0];
     assert_eq!(
         (&transform["header"]["frame_id"], &transform["child_frame_id"]),
         (&json!("alpha/base_link"), &json!("alpha/top"))
@@ -313,25 +316,25 @@ fn a_file_for_ros_2_has_the_points_of_every_turn_and_where_their_sensor_sits() {
 }
 
 #[test]
-fn a_file_for_foxglove_has_coloured_grids_transforms_and_the_points_of_every_turn() {
-    let (told, turns) = exported("foxglove", &[]);
-    let clouds = turns.len() as u64;
-    assert!(clouds >= 3, "{turns:?}");
+fn a_file_for_foxglove_has_grids_transforms_and_points() {
+    let (topics, bytes) = exported("foxglove", &[]);
+    let clouds = bytes.len() as u64;
+    assert!(clouds >= 3, "{bytes:?}");
     let expected = [
         ("/alpha/map/drivability", "foxglove.Grid", 3),
         ("/alpha/map/second", "foxglove.Grid", 3),
         ("/alpha/points/top", "foxglove.PointCloud", clouds),
         ("/tf", "foxglove.FrameTransforms", 3 + clouds),
     ];
-    assert_eq!(schemas(&told), expected);
-    let grid = &told["/alpha/map/drivability"]["last"];
+    assert_eq!(schemas(&topics), expected);
+    let grid = &topics["/alpha/map/drivability"]["last"];
     assert_eq!(grid["timestamp"], "2023-11-14T22:13:20.300Z");
     assert_eq!((&grid["frame_id"], &grid["column_count"]), (&json!("alpha/base_link"), &json!(240)));
     assert_eq!(grid["data"]["length"], 240 * 240 * 4);
-    let cloud = &told["/alpha/points/top"]["last"];
-    assert_eq!((&cloud["frame_id"], &cloud["data"]["length"]), (&json!("alpha/top"), &json!(turns[turns.len() - 1])));
-    // The simulated vehicle drives later than the maps were made: the last is the sensor's mount.
-    let transform = &told["/tf"]["last"]["transforms"][0];
+    let cloud = &topics["/alpha/points/top"]["last"];
+    assert_eq!((&cloud["frame_id"], &cloud["data"]["length"]), (&json!("alpha/top"), &json!(bytes[bytes.len() - 1])));
+    // The simulated drive is later than the maps, so the last transform is the sensor's mount.
+    let transform = &topics["/tf"]["last"]["transforms"][0];
     assert_eq!(
         (&transform["parent_frame_id"], &transform["child_frame_id"]),
         (&json!("alpha/base_link"), &json!("alpha/top"))
@@ -340,7 +343,7 @@ fn a_file_for_foxglove_has_coloured_grids_transforms_and_the_points_of_every_tur
 }
 
 #[test]
-fn a_file_for_foxglove_has_one_layer_and_no_points_where_that_is_asked_for() {
-    let (told, _) = exported("foxglove", &["--layer", "second", "--no-points"]);
-    assert_eq!(schemas(&told), [("/alpha/map/second", "foxglove.Grid", 3), ("/tf", "foxglove.FrameTransforms", 3)]);
+fn a_file_for_foxglove_can_have_one_layer_and_no_points() {
+    let (topics, _) = exported("foxglove", &["--layer", "second", "--no-points"]);
+    assert_eq!(schemas(&topics), [("/alpha/map/second", "foxglove.Grid", 3), ("/tf", "foxglove.FrameTransforms", 3)]);
 }

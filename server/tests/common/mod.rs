@@ -1,6 +1,6 @@
-//! A map whose every class is known by heart, and the binary.
+//! A map with known classes, and the command `clearway`.
 
-// Each test takes what it needs of this.
+// Each test file uses only a part of this file.
 #![allow(dead_code)]
 
 use std::process::{Command, Output};
@@ -12,10 +12,12 @@ use clearway_proto::legend::encode_legend;
 use clearway_proto::map::{encode_header, encode_layer};
 use clearway_proto::v1::ClassMeaning;
 
+/// End of the capture of the first map, ns since the Unix epoch.
 pub const CAPTURE_END_NS: i64 = 1_700_000_000_100_000_000;
 
-/// Three benches of 10 m, four columns of a quarter turn: ahead and to the left drivable, behind and to the left not,
-/// behind and to the right unknown, ahead and to the right drivable with an obstacle from 10 to 20 m.
+/// The classes of a radial grid: three rows of 10 m, four columns of 90 degrees. Ahead and to the left is drivable, behind
+/// and to the left is not, behind and to the right is unknown, ahead and to the right is drivable with an obstacle from
+/// 10 to 20 m.
 #[rustfmt::skip]
 pub const CLASSES: [u8; 12] = [
     1, 2, 0, 1,
@@ -23,6 +25,7 @@ pub const CLASSES: [u8; 12] = [
     1, 2, 0, 1,
 ];
 
+/// An encoded map of the vehicle `alpha` with the layer `drivability`.
 pub fn map(sequence: u64, capture_end_ns: i64) -> Bytes {
     let header = v1::Header {
         vehicle: "alpha".into(),
@@ -56,10 +59,12 @@ pub fn map(sequence: u64, capture_end_ns: i64) -> Bytes {
     [encode_header(&header), encode_layer(&layer)].concat().into()
 }
 
+/// Runs `clearway` to its end.
 pub fn clearway(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_clearway")).args(arguments).output().unwrap()
 }
 
+/// The output of a command as text.
 pub fn text(bytes: &[u8]) -> String {
     String::from_utf8(bytes.to_vec()).unwrap()
 }
