@@ -21,8 +21,10 @@ use crate::record::writer::RecorderCounts;
 use crate::encode::EncodedMap;
 
 mod prometheus;
+mod sensor_json;
 
 pub use prometheus::prometheus;
+pub use sensor_json::{ledger_json, sensor_json};
 
 /// Durations kept for the percentiles: seven minutes of a 10 Hz sensor.
 const LATENCIES: usize = 4096;
@@ -244,17 +246,10 @@ impl VehicleStatus {
         let snapshot = self.snapshot();
         let proto = self.proto_of(&snapshot);
         let (ledger, recorder) = (proto.ledger.unwrap_or_default(), proto.recorder.unwrap_or_default());
-        let sensors = proto.sensors.iter().map(|s| {
-            json!({
-                "name": s.name, "model": s.model, "packets": s.packets, "packets_expected": s.packets_expected,
-                "refused": s.refused, "returns": s.returns,
-                "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
-                "blocked_deg": s.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
-                "blocked_lasers": s.blocked_lasers,
-                "clock": s.clock, "clock_offset_ms": s.clock_offset_ms,
-                "state": s.state, "age_ms": s.age_ms,
-                "ledger": proto.sensor_ledgers.get(&s.name).map(ledger_json),
-            })
+        let sensors = proto.sensors.iter().map(|state| {
+            let mut sensor = sensor_json(state);
+            sensor["ledger"] = proto.sensor_ledgers.get(&state.name).map(ledger_json).into();
+            sensor
         });
         json!({
             "name": proto.name,
@@ -285,16 +280,6 @@ impl VehicleStatus {
 fn unknown_sender(sender: &UnknownSender) -> v1::UnknownSender {
     let UnknownSender { address, datagrams, newest_ns } = *sender;
     v1::UnknownSender { address: address.to_string(), datagrams, newest_ns }
-}
-
-fn ledger_json(ledger: &v1::Ledger) -> Value {
-    json!({
-        "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
-        "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
-        "points_dropped": ledger.points_dropped, "own_body": ledger.own_body, "through_body": ledger.through_body, "blind": ledger.blind,
-        "poses": ledger.poses, "poses_refused": ledger.poses_refused,
-        "roads": ledger.roads, "roads_refused": ledger.roads_refused,
-    })
 }
 
 fn ledger(ledger: &Ledger) -> v1::Ledger {

@@ -25,6 +25,7 @@ use car::Car;
 use rig::Rig;
 
 pub mod car;
+pub mod command;
 pub mod rig;
 
 /// The last datagrams are through the sockets long before this.

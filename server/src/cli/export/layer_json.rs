@@ -1,11 +1,14 @@
-//! One layer of a map -> JSON: geometry, pose, stamps, sensors, legend, metrics, and the cells where asked for.
+//! One layer of a map -> JSON: geometry, pose, stamps, sensors, legend, metrics, and the cells if they are wanted.
 
 use clearway_client::codec::Cells;
 use clearway_client::grid::Grid;
-use clearway_client::{Channel, Layer, MapView, v1};
+use clearway_client::{Channel, Layer, MapView};
 use serde_json::{Value, json};
 
-/// The document. Arrays are row by row, in the order of the grid's cell index.
+use crate::status::sensor_json;
+
+/// The layer and the header of its map as one JSON object. Arrays of cells are row by row, in the order of the grid's
+/// cell index.
 pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
     let header = map.header();
     let geometry = match &layer.grid {
@@ -33,7 +36,7 @@ pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
         "map_from_ego": pose,
         "speed_mps": header.speed_mps,
         "compensation": header.compensation,
-        "sensors": header.sensors.iter().map(sensor).collect::<Vec<_>>(),
+        "sensors": header.sensors.iter().map(sensor_json).collect::<Vec<_>>(),
         "layer": layer.name,
         "geometry": geometry,
         "shape": [rows, columns],
@@ -43,19 +46,6 @@ pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
         "planes": layer.planes,
         "metrics": layer.metrics,
         "channels": layer.channels.iter().map(|c| channel(c, with_cells)).collect::<Vec<_>>(),
-    })
-}
-
-/// What a sensor gave to a map.
-pub fn sensor(state: &v1::SensorState) -> Value {
-    json!({
-        "name": state.name, "model": state.model, "packets": state.packets, "packets_expected": state.packets_expected,
-        "refused": state.refused, "returns": state.returns,
-        "rpm": state.rpm, "completeness": state.completeness, "partial": state.partial,
-        "blocked_deg": state.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
-        "blocked_lasers": state.blocked_lasers,
-        "clock": state.clock, "clock_offset_ms": state.clock_offset_ms,
-        "state": state.state, "age_ms": state.age_ms,
     })
 }
 

@@ -1,8 +1,8 @@
-//! A channel's cells -> a NumPy file, format 1.0: an array (rows, columns) in C order, little-endian.
+//! The cells of a channel -> a NumPy file (format 1.0): an array (rows, columns) in C order, little-endian.
 
 use clearway_client::codec::Cells;
 
-/// The file's bytes. The header ends at a multiple of 64, as the format asks for.
+/// Encodes the cells as a NumPy file. The header is padded to a multiple of 64 bytes, as the format requires.
 pub fn encode(cells: &Cells, (rows, columns): (u32, u32)) -> Vec<u8> {
     let dtype = match cells {
         Cells::U8(_) => "|u1",
