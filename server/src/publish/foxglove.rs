@@ -17,7 +17,7 @@ use foxglove::{Channel, ChannelId, Context, Encode, FoxgloveError, PartialMetada
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 
-use super::{Served, Vehicles};
+use super::served::{Served, Vehicles};
 use crate::config::Foxglove as Options;
 use crate::subscriptions::LayerSubscription;
 use crate::newest::NewestSweep;

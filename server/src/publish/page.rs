@@ -19,7 +19,7 @@ use serde_json::Value;
 use tokio::net::TcpListener;
 
 use super::connections::Connections;
-use super::{Served, Vehicles};
+use super::served::{Served, Vehicles};
 use crate::clock::now_ns;
 use crate::status::{Reader, prometheus};
 

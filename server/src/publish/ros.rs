@@ -21,7 +21,7 @@ use zenoh::qos::CongestionControl;
 use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
 
-use super::Served;
+use super::served::Served;
 use crate::config::Ros2;
 use crate::clock::now_ns;
 use crate::zenoh_session::ZenohError;

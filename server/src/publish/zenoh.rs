@@ -20,7 +20,7 @@ use zenoh::Session;
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig, RepliesConfig};
 
 use super::ros::Node;
-use super::{Served, Vehicles};
+use super::served::{Served, Vehicles};
 use crate::config::Zenoh as Options;
 use crate::zenoh_session::ZenohError;
 

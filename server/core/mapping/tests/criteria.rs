@@ -9,8 +9,8 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::{DrivabilityConfig, Seed};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
+use clearway_mapping::layer::radial_grid::{ring_radii_m, row_radii_m};
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
-use clearway_mapping::layer::radial_grid::{row_radii_m, ring_radii_m};
 use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
 

@@ -5,12 +5,12 @@
 mod common;
 
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{Variant, TerrainConfig};
+use clearway_mapping::config::{TerrainConfig, Variant};
+use clearway_mapping::layer::terrain::Terrain;
+use clearway_mapping::layer::terrain::class::{ROUGHNESS, Shape, TerrainClass};
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::sensor::distance_series::DistanceSeries;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
-use clearway_mapping::layer::terrain::Terrain;
-use clearway_mapping::layer::terrain::class::{ROUGHNESS, Shape, TerrainClass};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::{self, Scene};
 use clearway_sim::truth::Truth;
@@ -115,7 +115,8 @@ fn holes(grid: &Layer) -> Vec<usize> {
 fn merging_closes_the_holes_of_the_plain_grid_on_real_scans() {
     for number in 0..3 {
         let sweep = kitti_sweep(&format!("kitti/patchwork-plusplus/00000{number}.bin"));
-        let [grid, paper, grounded] = [Variant::Grid, Variant::Paper, Variant::Grounded].map(|f| terrain(&sweep, &form(f)));
+        let [grid, paper, grounded] =
+            [Variant::Grid, Variant::Paper, Variant::Grounded].map(|f| terrain(&sweep, &form(f)));
         let holes = holes(&grid);
         let closed = |layer: &Layer| {
             let closed = holes.iter().filter(|cell| is_drivable(classes(layer)[**cell])).count();
@@ -144,10 +145,13 @@ fn a_town_and_an_open_plain_fit_a_message_of_64_kib() {
 
 #[test]
 fn an_evenly_sloping_plane_is_flat() {
-    for (grade, forms) in [(0.15, &[Variant::Grounded, Variant::Paper, Variant::Grid][..]), (0.5, &[Variant::Paper, Variant::Grid])] {
+    for (grade, forms) in
+        [(0.15, &[Variant::Grounded, Variant::Paper, Variant::Grid][..]), (0.5, &[Variant::Paper, Variant::Grid])]
+    {
         let sweep = cast(Model::Hdl64eS2, |x, y, z| z <= grade * (0.8 * x + 0.6 * y));
         for &form in forms {
-            let layer = terrain(&sweep, &TerrainConfig { variant: form, overhang_m: 100.0, ..TerrainConfig::default() });
+            let layer =
+                terrain(&sweep, &TerrainConfig { variant: form, overhang_m: 100.0, ..TerrainConfig::default() });
             let [_, flat, _, elevated, obstacle] = counts(&layer)[..] else { unreachable!() };
             println!("{grade} {form:?}: {flat} flat, {elevated} elevated, {obstacle} obstacles");
             assert!(flat > 1000 && elevated == 0 && obstacle == 0, "{form:?} {grade}");

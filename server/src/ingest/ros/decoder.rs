@@ -8,7 +8,7 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use bytes::Bytes;
-use clearway_mapping::event::{Body, EgoPose, NOBODY, Scan};
+use clearway_mapping::event::{Body, EgoPose, UNKNOWN_SOURCE, Scan};
 use clearway_ros::pose::{Odometry, StampedTransform, pose_stamped, tf_message};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, MessageError, PointCloud2, Points};
@@ -95,9 +95,9 @@ impl TopicDecoder {
         kind == Kind::TfMessage || self.sensors.contains_key(topic) || self.is_pose(topic)
     }
 
-    /// Index of the topic's sensor; [`NOBODY`] if the topic concerns the whole vehicle.
+    /// Index of the topic's sensor; [`UNKNOWN_SOURCE`] if the topic concerns the whole vehicle.
     pub fn source(&self, topic: &str) -> u16 {
-        self.sensors.get(topic).copied().unwrap_or(NOBODY)
+        self.sensors.get(topic).copied().unwrap_or(UNKNOWN_SOURCE)
     }
 
     fn is_pose(&self, topic: &str) -> bool {

@@ -110,7 +110,7 @@ pub async fn serve<I: IngestService>(
         .add_service(reflection().build_v1()?)
         // Older grpcurl knows only this one.
         .add_service(reflection().build_v1alpha()?)
-        .serve_with_incoming_shutdown(Connections::new(listener, connections_max).with_lobby().stream(), stop)
+        .serve_with_incoming_shutdown(Connections::new(listener, connections_max).with_errors_over_limit().stream(), stop)
         .await?;
     Ok(())
 }

@@ -12,7 +12,7 @@ use tokio::sync::watch;
 use tonic::Status;
 
 use super::selection::{Selection, Sent};
-use crate::publish::{Served, Vehicles};
+use crate::publish::served::{Served, Vehicles};
 use crate::subscriptions::LayerSubscription;
 use crate::newest::Newest;
 use crate::clock::now_ns;

@@ -11,7 +11,7 @@ use clearway_proto::region::{self, RegionError};
 use clearway_proto::v1;
 use tonic::Status;
 
-use crate::publish::Served;
+use crate::publish::served::Served;
 use crate::encode::EncodedMap;
 
 /// What a reader may ask to have on its way: more would only be older.
@@ -65,7 +65,7 @@ impl Selection {
     /// # Errors
     /// The region lies outside a layer's grid.
     pub fn bytes(&self, map: &EncodedMap, base: Option<&EncodedMap>) -> Result<Bytes, Status> {
-        let bytes = map.cut(&self.layers, self.region.as_ref(), base);
+        let bytes = map.encode_for(&self.layers, self.region.as_ref(), base);
         bytes.map_err(|error| Status::invalid_argument(error.to_string()))
     }
 }

@@ -62,7 +62,15 @@ impl RadialGrid {
         let row_of_bucket = (0..buckets).map(|bucket| first_row(bucket) as u16).collect();
         row_radius_squared.push(f32::INFINITY);
         let azimuths = AzimuthColumns::new(columns);
-        Self { row_radius_m, row_radius_squared, row_of_bucket, first_bucket, borders_a_bucket, azimuths, made_from: None }
+        Self {
+            row_radius_m,
+            row_radius_squared,
+            row_of_bucket,
+            first_bucket,
+            borders_a_bucket,
+            azimuths,
+            made_from: None,
+        }
     }
 
     /// Computes the rows again if the sensor of `sweep` differs from the last one.
@@ -164,7 +172,8 @@ impl RadialGrid {
     /// number of rows if there is none.
     #[inline(always)]
     fn row(&self, range_squared: f32) -> usize {
-        let mut row = usize::from(self.row_of_bucket[((range_squared.to_bits() >> BUCKET_SHIFT) - self.first_bucket) as usize]);
+        let mut row =
+            usize::from(self.row_of_bucket[((range_squared.to_bits() >> BUCKET_SHIFT) - self.first_bucket) as usize]);
         for _ in 0..self.borders_a_bucket {
             row += usize::from(range_squared > self.row_radius_squared[row]);
         }

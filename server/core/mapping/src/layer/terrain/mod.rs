@@ -119,8 +119,12 @@ impl Terrain {
         let TerrainConfig { passage_m_min, blind_zone_m, cell_m, .. } = self.config;
         let (cells, seen, bridged) = (&self.cells, &self.seen, self.ground.bridged());
         self.shadow.clear(class.len(), |cell| cells.cell_centre_m(cell));
-        for (slot, &cell) in
-            self.regions.cell_of_slot().iter().enumerate().filter(|(_, cell)| class[**cell as usize] == TerrainClass::Obstacle)
+        for (slot, &cell) in self
+            .regions
+            .cell_of_slot()
+            .iter()
+            .enumerate()
+            .filter(|(_, cell)| class[**cell as usize] == TerrainClass::Obstacle)
         {
             let [lowest_m, highest_m] = cells.span_m(slot);
             if highest_m - lowest_m >= SHADOW_HEIGHT_M_MIN {
@@ -148,7 +152,11 @@ impl Terrain {
         for (iy, row) in class.chunks_exact_mut(width).enumerate() {
             for (ix, class) in row.iter_mut().enumerate() {
                 if matches!(*class, TerrainClass::Flat | TerrainClass::FlatInferred) && !self.reach.reached(ix, iy) {
-                    *class = if *class == TerrainClass::Flat { TerrainClass::FlatUnreachable } else { TerrainClass::Unknown };
+                    *class = if *class == TerrainClass::Flat {
+                        TerrainClass::FlatUnreachable
+                    } else {
+                        TerrainClass::Unknown
+                    };
                 }
             }
         }

@@ -238,8 +238,7 @@ mod tests {
         let mut reach = Reach::default();
         reach.flood(width, 0, |ix, iy| kind(iy * width + ix));
         assert!(
-            (0..width * width)
-                .all(|cell| reach.reached(cell % width, cell / width) == (kind(cell) == CellKind::Open))
+            (0..width * width).all(|cell| reach.reached(cell % width, cell / width) == (kind(cell) == CellKind::Open))
         );
     }
 }

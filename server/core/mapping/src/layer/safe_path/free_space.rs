@@ -1,14 +1,15 @@
-//! Which cells of a Cartesian grid about the vehicle are free.
+//! Free space: which cells of a Cartesian grid about the vehicle are free.
 //!
-//! In: the layer `drivability`, radial, and the sweep it was made from. Out: a [`State`] a cell, that of the radial
-//! cell its middle lies in. A radial cell that holds nothing but returns of the vehicle's own outline (its bonnet) says
-//! nothing. Ground nobody saw is not free, but for the blind zone: in a column whose innermost seen cell is drivable
-//! and begins within it, the ground nearer to the vehicle, which no laser meets, is taken to be like it, as the thesis
-//! does when segments grow from the vehicle (§IV.3); and for holes in drivable ground too narrow to matter, a cell or
-//! two where a laser's return was lost. Neither is called drivable, and no safe point lies in one: they only are no
-//! obstacles.
+//! In: the layer `drivability`, radial, and the sweep it was made from. Out: a [`State`] for each cell: the state of
+//! the radial cell in which the cell's centre lies. A radial cell with returns only from the vehicle's own outline (its
+//! bonnet) is unknown. Unseen ground is not free, with two exceptions:
+//! - The blind zone: if the innermost seen cell of a column is drivable and begins within the zone, the ground nearer
+//!   to the vehicle, which no laser reaches, is assumed to be free too, as the UT Austin thesis assumes when segments
+//!   grow from the vehicle (section IV.3).
+//! - Narrow holes in drivable ground: a cell or two in which a return was lost.
+//!
+//! Cells of the two exceptions are not called drivable, and no safe point lies in them. They are only no obstacles.
 
-use crate::layer::safe_path::config::SafePathConfig;
 use crate::layer::channel::TypedChannel;
 use crate::layer::drivability::class::DrivabilityClass;
 use crate::layer::grid::Geometry;
@@ -16,54 +17,58 @@ use crate::layer::maker::Layer;
 use crate::layer::radial_grid::RadialGrid;
 use crate::sensor::sweep::Sweep;
 
-/// What a cell is to the vehicle.
+use super::config::SafePathConfig;
+
+/// State of a cell.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum State {
     /// Not seen.
     #[default]
     Unknown,
-    /// The vehicle gets there.
+    /// The vehicle can get there.
     Drivable,
     /// Seen, and not drivable.
     Obstacle,
-    /// Too near to the vehicle to be seen, before drivable ground.
+    /// Not seen, in the blind zone before drivable ground.
     Blind,
     /// Not seen, between drivable or blind cells of one ring or one azimuth.
     Hole,
 }
 
 impl State {
-    /// Whether the vehicle may pass.
+    /// True if the vehicle may drive over the cell.
     pub fn is_free(self) -> bool {
         matches!(self, Self::Drivable | Self::Blind | Self::Hole)
     }
 }
 
-/// What the points of a radial cell are.
+/// Which returns a radial cell has.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Returns {
+    /// From within the vehicle's outline.
     own: bool,
+    /// From outside it.
     other: bool,
 }
 
-/// States row by row, `side` cells along x and y; the vehicle stands in the middle.
+/// States of a grid of `side` cells along x and y with the vehicle in the middle: index = iy * side + ix.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Free {
+pub struct FreeSpace {
     side: usize,
     cell_m: f64,
     states: Vec<State>,
     of_radial_cell: Vec<State>,
     grid: RadialGrid,
-    /// By radial cell in reach of the vehicle's outline: what its points are.
+    /// By radial cell near the vehicle's outline.
     returns: Vec<Returns>,
-    /// Radial cell of each cell's middle; past the last where the radial grid does not reach.
+    /// Radial cell of each cell's centre; one past the last if the centre lies beyond the radial grid.
     radial_cell: Vec<u32>,
-    /// What `radial_cell` was made for.
+    /// The radial grid for which `radial_cell` was computed.
     made_for: Option<Geometry>,
 }
 
-impl Free {
-    /// A grid of which nothing is known.
+impl FreeSpace {
+    /// A grid of unknown cells.
     pub fn new(side: usize, cell_m: f64) -> Self {
         Self {
             side,
@@ -77,25 +82,25 @@ impl Free {
         }
     }
 
-    /// Cells along x, and along y.
+    /// Number of cells along x, and along y.
     pub fn side(&self) -> usize {
         self.side
     }
 
-    /// By cell.
+    /// States by cell.
     pub fn states(&self) -> &[State] {
         &self.states
     }
 
-    /// Takes the newest drivability, in place of the one before; without it nothing is known.
-    pub fn fill(&mut self, drivability: Option<&Layer>, sweep: &Sweep, config: &SafePathConfig) {
+    /// Computes the states from a map's layer `drivability`; without that layer all cells are unknown.
+    pub fn update(&mut self, drivability: Option<&Layer>, sweep: &Sweep, config: &SafePathConfig) {
         let class = drivability.and_then(|layer| TypedChannel::CLASS.values(&layer.channels));
         let (Some(layer), Some(class)) = (drivability, class) else { return self.states.fill(State::Unknown) };
         let Geometry::Radial { row_radius_m, columns } = &layer.geometry else {
             return self.states.fill(State::Unknown);
         };
         if self.made_for.as_ref() != Some(&layer.geometry) {
-            self.look_up(row_radius_m, *columns);
+            self.find_radial_cells(row_radius_m, *columns);
             self.made_for = Some(layer.geometry.clone());
         }
         self.of_radial_cell.clear();
@@ -106,23 +111,23 @@ impl Free {
             DRIVABLE => State::Drivable,
             _ => State::Obstacle,
         }));
-        self.forget_the_vehicle(sweep, config);
+        self.remove_own_returns(sweep, config);
         let columns = usize::from(*columns);
-        see_blind_zone(&mut self.of_radial_cell, row_radius_m, columns, config.blind_zone_m);
-        close_holes(&mut self.of_radial_cell, row_radius_m, columns, config.hole_m_max);
-        // Beyond the radial grid.
+        mark_blind_zone(&mut self.of_radial_cell, row_radius_m, columns, config.blind_zone_m);
+        mark_holes(&mut self.of_radial_cell, row_radius_m, columns, config.hole_m_max);
+        // State of the cells beyond the radial grid.
         self.of_radial_cell.push(State::Unknown);
         for (state, &cell) in self.states.iter_mut().zip(&self.radial_cell) {
             *state = self.of_radial_cell[cell as usize];
         }
-        self.stand(config);
+        self.free_outline(config);
     }
 
-    /// Takes back what the vehicle's own returns said, where a cell holds no other.
-    fn forget_the_vehicle(&mut self, sweep: &Sweep, config: &SafePathConfig) {
+    /// Makes radial cells unknown that have returns only from the vehicle itself.
+    fn remove_own_returns(&mut self, sweep: &Sweep, config: &SafePathConfig) {
         let SafePathConfig { vehicle_front_m, vehicle_rear_m, vehicle_width_m, .. } = *config;
         let corner_m = vehicle_front_m.max(vehicle_rear_m).hypot(vehicle_width_m / 2.0);
-        // Up to the end of the last row that reaches the outline.
+        // Rows up to the end of the last one that touches the outline.
         let rows = (0..self.grid.rows()).take_while(|row| self.grid.row_span_m(*row).0 < corner_m).count();
         let reach_m = rows.checked_sub(1).map_or(0.0, |last| self.grid.row_span_m(last).1);
         self.returns.clear();
@@ -140,37 +145,39 @@ impl Free {
         }
     }
 
-    /// Where the vehicle stands nothing else can, whatever was seen of the vehicle itself.
-    fn stand(&mut self, config: &SafePathConfig) {
-        let middle = |i: usize| ((i as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32;
+    /// Makes the cells under the vehicle free: nothing else can stand there.
+    fn free_outline(&mut self, config: &SafePathConfig) {
+        let centre_m = |i: usize| ((i as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32;
         let longest_m = config.vehicle_front_m.max(config.vehicle_rear_m).max(config.vehicle_width_m);
         let reach = (f64::from(longest_m) / self.cell_m).ceil() as usize;
         let near = (self.side / 2).saturating_sub(reach)..(self.side / 2 + reach).min(self.side);
         for iy in near.clone() {
             for ix in near.clone() {
                 let state = &mut self.states[iy * self.side + ix];
-                if is_within_the_vehicle(middle(ix), middle(iy), config) && !state.is_free() {
+                if is_within_the_vehicle(centre_m(ix), centre_m(iy), config) && !state.is_free() {
                     *state = State::Blind;
                 }
             }
         }
     }
 
-    fn look_up(&mut self, row_radius_m: &[f32], columns: u16) {
+    /// Computes the radial cell of each cell.
+    fn find_radial_cells(&mut self, row_radius_m: &[f32], columns: u16) {
         self.grid = RadialGrid::new(row_radius_m.to_vec(), columns);
-        let middle = |i: usize| ((i as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32;
-        let cell = |index: usize| self.grid.cell(middle(index % self.side), middle(index / self.side));
+        let centre_m = |i: usize| ((i as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32;
+        let cell = |index: usize| self.grid.cell(centre_m(index % self.side), centre_m(index / self.side));
         let cells = 0..self.side * self.side;
         self.radial_cell = cells.map(|index| cell(index).unwrap_or(self.grid.cells()) as u32).collect();
     }
 }
 
-/// Whether a place lies within the vehicle's outline.
+/// True if a position lies within the vehicle's outline.
 fn is_within_the_vehicle(x: f32, y: f32, config: &SafePathConfig) -> bool {
     (-config.vehicle_rear_m..=config.vehicle_front_m).contains(&x) && y.abs() <= config.vehicle_width_m / 2.0
 }
 
-fn see_blind_zone(of_radial_cell: &mut [State], row_radius_m: &[f32], columns: usize, blind_zone_m: f32) {
+/// Marks unseen cells nearer to the vehicle than drivable ground that begins within the blind zone.
+fn mark_blind_zone(of_radial_cell: &mut [State], row_radius_m: &[f32], columns: usize, blind_zone_m: f32) {
     for column in 0..columns {
         let seen = (0..row_radius_m.len()).find(|row| of_radial_cell[row * columns + column] != State::Unknown);
         let Some(seen) = seen else { continue };
@@ -181,44 +188,45 @@ fn see_blind_zone(of_radial_cell: &mut [State], row_radius_m: &[f32], columns: u
     }
 }
 
-fn close_holes(of_radial_cell: &mut [State], row_radius_m: &[f32], columns: usize, hole_m_max: f32) {
+/// Marks narrow holes along rings and along azimuths.
+fn mark_holes(of_radial_cell: &mut [State], row_radius_m: &[f32], columns: usize, hole_m_max: f32) {
     let rows = row_radius_m.len();
     for (row, &r) in row_radius_m.iter().enumerate() {
         let column_m = r * std::f32::consts::TAU / columns as f32;
         let ring = &mut of_radial_cell[row * columns..][..columns];
         let Some(first) = ring.iter().position(|state| state.is_free()) else { continue };
-        // Once around, from one drivable cell to itself.
+        // The walk goes once around the ring, from one free cell to itself.
         let around = |i: usize| if first + i < columns { first + i } else { first + i - columns };
         let width_m = |from: usize, to: usize| (to - from - 1) as f32 * column_m;
-        close_along(columns + 1, around, |from, to| width_m(from, to) <= hole_m_max, ring);
+        mark_along(columns + 1, around, |from, to| width_m(from, to) <= hole_m_max, ring);
     }
     for column in 0..columns {
         let width_m = |from: usize, to: usize| row_radius_m[to - 1] - row_radius_m[from];
-        close_along(rows, |row| row * columns + column, |from, to| width_m(from, to) <= hole_m_max, of_radial_cell);
+        mark_along(rows, |row| row * columns + column, |from, to| width_m(from, to) <= hole_m_max, of_radial_cell);
     }
 }
 
-/// Closes what is not seen between drivable cells along a way of `length` cells, where it is narrow enough.
-fn close_along(
+/// Marks unseen cells between free ones along a line of `length` cells, if the hole is narrow enough.
+fn mark_along(
     length: usize,
     cell: impl Fn(usize) -> usize,
     is_narrow: impl Fn(usize, usize) -> bool,
     states: &mut [State],
 ) {
-    let mut drivable = None;
+    let mut last_free = None;
     for i in 0..length {
         match states[cell(i)] {
             State::Unknown | State::Hole => continue,
             State::Drivable | State::Blind => {
-                if let Some(before) = drivable
+                if let Some(before) = last_free
                     && i - before > 1
                     && is_narrow(before, i)
                 {
                     (before + 1..i).for_each(|hole| states[cell(hole)] = State::Hole);
                 }
-                drivable = Some(i);
+                last_free = Some(i);
             }
-            State::Obstacle => drivable = None,
+            State::Obstacle => last_free = None,
         }
     }
 }
