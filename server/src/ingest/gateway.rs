@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex};
 
 use clearway_mapping::config::{SensorConfig, VehicleConfig};
-use clearway_mapping::event::{Body, Cause, NOBODY};
+use clearway_mapping::event::{Body, Cause, UNKNOWN_SOURCE};
 use clearway_proto::v1;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
@@ -94,7 +94,7 @@ impl Gateway {
         match observation::decode(observation, &self.limits) {
             Err(error) => {
                 session.begin(number, 0, 0);
-                self.record_drop(if concerns_vehicle { NOBODY } else { source }, error.reason());
+                self.record_drop(if concerns_vehicle { UNKNOWN_SOURCE } else { source }, error.reason());
                 session.refuse(number, error.reason(), error.to_string(), 1);
             }
             Ok(bodies) => {
@@ -124,7 +124,7 @@ impl Gateway {
 
     /// Counts a refused message of a client that cannot get a report.
     pub fn record_refusal(&self, reason: &'static str) {
-        self.record_drop(NOBODY, reason);
+        self.record_drop(UNKNOWN_SOURCE, reason);
     }
 
     fn record_drop(&self, source: u16, reason: &'static str) {

@@ -2,7 +2,7 @@
 
 use clearway_lidar::DatagramError;
 
-use crate::config::ConfigValueError;
+use crate::config::check::ConfigValueError;
 use crate::road::RoadError;
 
 /// Latest stamp that is accepted: the year 2116, in ns since the Unix epoch. Ours: half of what an `i64` holds, so that

@@ -14,13 +14,16 @@
 //! | `motion` | `[vehicle.maps.motion]` |
 //! | [`crate::layer`] | `[vehicle.maps]`, and one table for each layer, in the layer's folder |
 //! | `check` | checks of single values, and their error |
+//!
+//! This module names what other crates use. The files of this crate import from the files of the table, so that none of
+//! them depends on a file that uses it.
 
-mod body;
+pub(crate) mod body;
 pub(crate) mod check;
-mod fusion;
+pub(crate) mod fusion;
 pub(crate) mod motion;
-mod sensor;
-mod vehicle;
+pub(crate) mod sensor;
+pub(crate) mod vehicle;
 
 pub use body::BodyConfig;
 pub use check::ConfigValueError;

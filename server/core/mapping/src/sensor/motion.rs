@@ -160,7 +160,8 @@ impl Motion {
             Some(after) if after.stamp_ns == stamp_ns => Some(after.map_from_ego),
             Some(after) => {
                 let before = &self.poses[next - 1];
-                (after.stamp_ns.saturating_sub(before.stamp_ns) <= GAP_NS_MAX).then(|| interpolate(before, after, stamp_ns))
+                (after.stamp_ns.saturating_sub(before.stamp_ns) <= GAP_NS_MAX)
+                    .then(|| interpolate(before, after, stamp_ns))
             }
             None => {
                 let is_near = stamp_ns.saturating_sub(last.stamp_ns) <= reach_ns;

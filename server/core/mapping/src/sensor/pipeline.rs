@@ -10,7 +10,8 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::{Partial, Revolution};
 use clearway_lidar::{Sensor, SensorStatus};
 
-use crate::config::{BodyConfig, SensorConfig};
+use crate::config::body::BodyConfig;
+use crate::config::sensor::SensorConfig;
 use crate::error::{EventError, check_newer, check_stamp_range};
 use crate::event::Scan;
 use crate::event_time::EventTime;

@@ -1,13 +1,13 @@
-//! Turning sensors: half a turn, two of them at once, the vehicle in their way, host clocks that step.
+//! Rotating sensors: self filter, half a revolution, two sensors at once, steps of the host's clock.
 
 use super::*;
 
 #[test]
-fn what_the_vehicle_hides_is_left_out_and_counted_by_sensor() {
+fn the_self_filter_removes_returns_and_counts_them_by_sensor() {
     let mut config = config();
     config.body = Some(BodyConfig { x_m_min: -1.0, x_m_max: 3.5, y_m_min: -0.95, y_m_max: 0.95, z_m_max: 1.6 });
     let mut pipeline = pipeline(&config);
-    // The left one sees its own door, the ground beside, and through the vehicle to the other side.
+    // The left sensor returns a point on the vehicle, one on the ground, and one on the other side of the vehicle.
     let left = Scan {
         x: vec![-0.5, 5.0, -8.0],
         y: vec![0.0; 3],
@@ -17,14 +17,14 @@ fn what_the_vehicle_hides_is_left_out_and_counted_by_sensor() {
     };
     pipeline.step(&event(1, 10 * MS, Body::Scan(left))).unwrap();
     let map = step(&mut pipeline, &scan(0, 20 * MS)).unwrap();
-    assert_eq!(map.sensors[1].returns, 3, "they are returns all the same");
-    assert_eq!(pipeline.newest_sweep().x.len(), 1, "and the bonnet hides the lead's");
+    assert_eq!(map.sensors[1].returns, 3, "removed returns count as returns");
+    assert_eq!(pipeline.newest_sweep().x.len(), 1, "the returns of the reference sensor lie behind the bonnet");
     let sensors = pipeline.sensors();
-    let hidden: Vec<_> = sensors.iter().map(|s| (s.ledger.own_body, s.ledger.through_body)).collect();
-    assert_eq!(hidden, [(0, 2), (1, 1), (0, 0)]);
+    let removed: Vec<_> = sensors.iter().map(|s| (s.ledger.own_body, s.ledger.through_body)).collect();
+    assert_eq!(removed, [(0, 2), (1, 1), (0, 0)]);
     assert_eq!((pipeline.ledger().own_body, pipeline.ledger().through_body), (1, 3));
 
-    // A turning sensor over a flat street: what the box hides is gone, the rest is as without a box, series and all.
+    // A rotating sensor over a flat street: the returns behind the box are removed, and all others stay.
     let datagrams = velodyne(Model::Vlp16, 1.9, 260);
     let mut alone = VehicleConfig::new("car", vec![SensorConfig { range_m_min: 0.0, ..config.sensors[0].clone() }]);
     let sweep = |config: &VehicleConfig| {
@@ -37,13 +37,13 @@ fn what_the_vehicle_hides_is_left_out_and_counted_by_sensor() {
     alone.body = Some(BodyConfig { x_m_min: -1.0, x_m_max: 3.5, y_m_min: -0.95, y_m_max: 0.95, z_m_max: 1.85 });
     let (boxed, ledger) = sweep(&alone);
     assert_eq!((none.own_body, none.through_body), (0, 0));
-    assert!(ledger.through_body > 1000, "the roof hides the ground before the bonnet: {ledger:?}");
+    assert!(ledger.through_body > 1000, "rays to the ground in front of the bonnet cross the roof: {ledger:?}");
     assert!(boxed.x.len() < open.x.len() && boxed.deviation_m.len() == boxed.x.len());
     assert_eq!(boxed.returns, open.returns);
 }
 
 #[test]
-fn half_a_field_of_view_is_complete_and_half_a_turn_lost_is_not() {
+fn half_a_field_of_view_is_complete_and_half_a_lost_revolution_is_not() {
     let events = velodyne(Model::Vlp16, 1.9, 2000);
     let lost_ns = events[0].arrival_ns + 1000 * MS..events[0].arrival_ns + 1100 * MS;
     let is_ahead = |event: &Event| match &event.body {
@@ -58,22 +58,30 @@ fn half_a_field_of_view_is_complete_and_half_a_turn_lost_is_not() {
         maps.map(|map| (map.sensors[0].completeness, map.sensors[0].contribution)).collect()
     };
     let half = made(&is_ahead);
-    assert!(half.len() > 15 && half[5..].iter().all(|(share, part)| *share > 0.98 && *part == Contribution::Ok), "{half:?}");
+    assert!(
+        half.len() > 15
+            && half[5..].iter().all(|(share, contribution)| *share > 0.98 && *contribution == Contribution::Ok),
+        "{half:?}"
+    );
     let once = made(&|event| is_ahead(event) || !lost_ns.contains(&event.arrival_ns));
-    let partial: Vec<f32> = once.iter().filter(|(_, part)| *part == Contribution::Partial).map(|(share, _)| *share).collect();
+    let partial: Vec<f32> = once
+        .iter()
+        .filter(|(_, contribution)| *contribution == Contribution::Partial)
+        .map(|(share, _)| *share)
+        .collect();
     let lost: f32 = partial[1..].iter().map(|share| 1.0 - share).sum();
-    assert!((0.45..0.55).contains(&lost), "the first turn begins somewhere; then half a turn is missing: {once:?}");
+    assert!((0.45..0.55).contains(&lost), "after the first partial revolution half a revolution is missing: {once:?}");
 }
 
 #[test]
-fn two_turning_sensors_have_a_decoder_and_a_ledger_each_and_their_order_between_two_maps_is_free() {
+fn two_rotating_sensors_have_a_decoder_and_a_ledger_each() {
     let mut config = config();
     let low = SensorConfig { model: Some(Model::Hdl32e), ..SensorConfig::new("low", at(0.0, 0.0, 1.5, 0.0)) };
     config.sensors = vec![config.sensors[0].clone(), low, config.sensors[1].clone()];
-    let lead = velodyne(Model::Vlp16, 1.9, 430);
+    let reference = velodyne(Model::Vlp16, 1.9, 430);
     let low = velodyne(Model::Hdl32e, 1.5, 430).into_iter().map(|event| Event { source: 1, ..event });
-    let mut events: Vec<Event> = lead.iter().cloned().chain(low).collect();
-    events.extend((0..8).map(|n| scan(2, lead[0].arrival_ns + 7 * MS + n * 50 * MS)));
+    let mut events: Vec<Event> = reference.iter().cloned().chain(low).collect();
+    events.extend((0..8).map(|n| scan(2, reference[0].arrival_ns + 7 * MS + n * 50 * MS)));
     events.sort_by_key(|event| (event.arrival_ns, event.source));
     let run = |events: &[Event]| {
         let mut pipeline = pipeline(&config);
@@ -84,26 +92,29 @@ fn two_turning_sensors_have_a_decoder_and_a_ledger_each_and_their_order_between_
     assert!(made.len() >= 3 && made.iter().all(|map| map.source == 0));
     let last = made.last().unwrap();
     let contributing: Vec<_> = last.sensors.iter().map(|s| (s.model.as_str(), s.contribution, s.packets > 0)).collect();
-    assert_eq!(contributing, [("vlp16", Contribution::Ok, true), ("hdl32e", Contribution::Ok, true), ("scan", Contribution::Ok, false)]);
+    assert_eq!(
+        contributing,
+        [("vlp16", Contribution::Ok, true), ("hdl32e", Contribution::Ok, true), ("scan", Contribution::Ok, false)]
+    );
     assert_eq!(last.sensors[0].packets_expected, last.sensors[0].packets);
     let (sensors, sum) = (pipeline.sensors(), pipeline.ledger());
     assert!(sensors.iter().all(|sensor| balanced(&sensor.ledger)) && balanced(sum));
     assert_eq!(sensors.iter().map(|sensor| sensor.ledger.received).sum::<u64>(), sum.received);
     assert_eq!(sum.received, events.len() as u64);
-    assert_eq!(run(&events).0, made, "the same events, the same maps");
+    assert_eq!(run(&events).0, made, "the same events give the same maps");
 
-    // The lead alone gives the same maps as a vehicle that has no other sensor.
-    let only: Vec<_> = run(&lead).0;
+    // Without events of other sensors the maps are those of a vehicle with one sensor.
+    let only: Vec<_> = run(&reference).0;
     let mut single =
         Pipeline::new(&VehicleConfig { sensors: vec![config.sensors[0].clone()], ..config.clone() }, vec![None])
             .unwrap();
-    let expected: Vec<_> = lead.iter().filter_map(|event| step(&mut single, event)).collect();
+    let expected: Vec<_> = reference.iter().filter_map(|event| step(&mut single, event)).collect();
     assert_eq!(only.len(), expected.len());
     for (only, expected) in only.iter().zip(&expected) {
         assert_eq!((&only.layers, only.capture_end_ns), (&expected.layers, expected.capture_end_ns));
     }
 
-    // Between two of the lead's datagrams the others may come in any order.
+    // The order of the other sensors' events between two maps has no effect.
     let mut swapped = events.clone();
     for pair in 0..swapped.len() - 1 {
         if swapped[pair].source == 1 && swapped[pair + 1].source == 2 {
@@ -116,14 +127,14 @@ fn two_turning_sensors_have_a_decoder_and_a_ledger_each_and_their_order_between_
 }
 
 #[test]
-fn a_host_clock_that_steps_holds_no_map() {
+fn a_step_of_the_host_clock_holds_no_map_back() {
     for step_ns in [-3_600_000 * MS, 3_600_000 * MS] {
         let mut pipeline = pipeline(&config());
         let mut made = 0;
         for n in 0..40i64 {
             let stamp_ns = 1_700_000_000_000 * MS + n * 50 * MS;
             let arrival_ns = stamp_ns + if n < 10 { 0 } else { step_ns };
-            // The lead stops a second after the step.
+            // The reference sensor stops a second after the step.
             if n < 30 && n % 2 == 0 {
                 made += usize::from(step(&mut pipeline, &event(0, arrival_ns, scan(0, stamp_ns).body)).is_some());
             }
@@ -134,7 +145,7 @@ fn a_host_clock_that_steps_holds_no_map() {
 }
 
 #[test]
-fn a_turn_that_a_silence_held_back_makes_no_map_older_than_the_last_though_the_host_steps_as_it_ends() {
+fn a_revolution_that_ends_after_a_silence_makes_no_map_older_than_the_last() {
     let mut events = velodyne(Model::Vlp16, 1.9, 2000);
     let start_ns = events[0].arrival_ns;
     let silent = start_ns + 550 * MS..start_ns + 1300 * MS;
@@ -145,8 +156,8 @@ fn a_turn_that_a_silence_held_back_makes_no_map_older_than_the_last_though_the_h
         let mut pipeline = pipeline(&config());
         let made: Vec<i64> = (events.iter())
             .filter_map(|event| {
-                let ahead_ns = if event.arrival_ns < silent.end { 0 } else { host_ns };
-                step(&mut pipeline, &Event { arrival_ns: event.arrival_ns + ahead_ns, ..event.clone() })
+                let step_ns = if event.arrival_ns < silent.end { 0 } else { host_ns };
+                step(&mut pipeline, &Event { arrival_ns: event.arrival_ns + step_ns, ..event.clone() })
             })
             .map(|map| map.capture_end_ns)
             .collect();
