@@ -62,7 +62,7 @@ pub async fn run(options: Options) -> Result<()> {
 
 fn line(update: &Update, as_json: bool) -> String {
     let (map, skipped, now) = (&update.map, update.skipped, now_ns());
-    let share = map.figure("drivable_share");
+    let share = map.metric("drivable_share");
     if as_json {
         let document = json!({
             "vehicle": map.vehicle(), "sequence": map.sequence(), "age_ms": map.age_ms(now), "stale": map.is_stale(now),
