@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use clearway_mapping::event::Body;
 use clearway_mapping::ledger::Ledger;
 use clearway::config::{Config, Udp};
-use clearway::ingest::{door, udp};
+use clearway::ingest::{queue::event_queue, udp};
 use nix::sys::socket::setsockopt;
 use nix::sys::socket::sockopt::UdpGsoSegment;
 
@@ -32,9 +32,9 @@ fn main() {
     config.vehicles[0].udp = Some(Udp { data: any, telemetry: any, ..Udp::default() });
     let sockets = udp::Sockets::bind(&config.vehicles).expect("free ports");
     let (data, _) = sockets.addresses(0).expect("a socket");
-    let (door, events) = door(config.vehicles[0].queue);
-    let readers = sockets.read(std::slice::from_ref(&door)).expect("threads");
-    let outside = door.outside();
+    let (door, events) = event_queue(config.vehicles[0].queue);
+    let readers = sockets.start(std::slice::from_ref(&door)).expect("threads");
+    let outside = door.drops();
     drop(door);
 
     let sender = std::thread::spawn(move || {
@@ -73,7 +73,7 @@ fn main() {
     let sending = sender.join().expect("no panic");
     drop(events);
     readers.stop();
-    outside.add_to(&mut ledger, []);
+    outside.add_unreported_to(&mut ledger, []);
     let per_second = |n: u64, took: Duration| n as f64 / took.as_secs_f64();
     println!("sent    {count:>9} in {:.2} s, {:.0} a second", sending.as_secs_f64(), per_second(count, sending));
     println!("taken   {taken:>9} in {:.2} s, {:.0} a second", took.as_secs_f64(), per_second(taken, took));

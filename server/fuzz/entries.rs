@@ -10,15 +10,15 @@ use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
 use clearway::config::Config;
-use clearway::ingest::observation::{Limits, bodies};
-use clearway::record::reader::{Entry, Recording};
+use clearway::ingest::observation::{Limits, decode};
+use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::encode::{event_from_bytes, event_to_proto};
 use prost::Message;
 
 /// One observation, as far as the maps.
 pub fn observation(bytes: &[u8]) {
     let Ok(observation) = v1::Observation::decode(Bytes::copy_from_slice(bytes)) else { return };
-    let Ok(bodies) = bodies(observation, &Limits::of_points(1000)) else { return };
+    let Ok(bodies) = decode(observation, &Limits::from_points_max(1000)) else { return };
     let mut pipeline = pipeline();
     for (sequence, (captured_ns, body)) in (0..).zip(bodies) {
         step(&mut pipeline, &Event { sequence, arrival_ns: captured_ns.unwrap_or_default(), source: 0, body });
@@ -40,11 +40,11 @@ pub fn event(bytes: &[u8]) {
 
 /// A recording's file.
 pub fn recording(bytes: &[u8]) {
-    let Ok(mut recording) = Recording::of(Path::new("any.mcap"), Cursor::new(bytes.to_vec())) else { return };
+    let Ok(mut recording) = RecordingReader::from_source(Path::new("any.mcap"), Cursor::new(bytes.to_vec())) else { return };
     drop(recording.config());
     let mut pipeline = pipeline();
     for entry in &mut recording {
-        if let Ok(Entry::Event { event, .. }) = entry {
+        if let Ok(RecordedMessage::Event { event, .. }) = entry {
             step(&mut pipeline, &event);
         }
     }

@@ -1,7 +1,7 @@
-//! One named OS thread a vehicle: events in, encoded maps out.
+//! The engine of one vehicle, on one named OS thread: events in, encoded maps out.
 //!
-//! The journal comes first, then the step: what was recorded is what was processed. The newest map goes into a
-//! latest-value slot that every reader looks at in its own time; the recorder gets every map.
+//! Each event is journaled before the pipeline steps, so the journal contains what was processed. The newest map goes
+//! into a latest-value slot that every reader looks at in its own time; the recorder gets every map.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
@@ -11,52 +11,45 @@ use std::time::{Duration, Instant};
 use clearway_mapping::event::Event;
 use clearway_mapping::error::EventError;
 use clearway_mapping::pipeline::Pipeline;
-use clearway_mapping::sensor::sweep::Sweep;
 use tokio::sync::watch;
 
-use crate::ingest::Queued;
-use crate::ingest::receipt::Verdict;
-use crate::record::writer::Journal;
-use crate::status::VehicleStatus;
 use crate::encode::{self, EncodedMap};
+use crate::ingest::queue::QueuedEvent;
+use crate::ingest::receipt::Outcome;
+use crate::newest::Newest;
+use crate::record::writer::RecordingHandle;
+use crate::status::VehicleStatus;
 
-/// How often an engine without events looks whether somebody has come who wants the newest map.
-const LOOK_AROUND: Duration = Duration::from_millis(20);
+/// Period at which an engine without events checks for new subscribers. Ours: short beside a revolution of 50 to 200 ms.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
-/// The newest map of one vehicle; `None` before the first.
-pub type Newest = Option<Arc<EncodedMap>>;
-
-/// The points of the newest map of one vehicle, ego frame, with their stamp; `None` before the first that somebody
-/// took.
-pub type NewestSweep = Option<Arc<(i64, Sweep)>>;
-
-/// Sees the pipeline after each event that completed a revolution.
+/// A function that is called with the pipeline after each event that completed a revolution.
 pub type Observer = Box<dyn FnMut(&Pipeline) + Send>;
 
-/// One vehicle's engine, before it runs.
+/// One vehicle's engine before its thread runs.
 pub struct Engine {
     /// The vehicle's core.
     pub pipeline: Pipeline,
-    /// Age after capture at which a map is stale.
+    /// Age after the end of capture at which a map is stale, in milliseconds.
     pub valid_ms: u32,
-    /// Where the newest map goes.
+    /// The latest-value slot of the map.
     pub newest: watch::Sender<Newest>,
-    /// The vehicle's part of the recording.
-    pub journal: Option<Journal>,
-    /// Where ledger, rates and latency go.
+    /// The vehicle's handle of the recording, if there is one.
+    pub recording: Option<RecordingHandle>,
+    /// The status that shows ledger, rates and latency.
     pub status: Arc<VehicleStatus>,
-    /// Looks at what the maps were made from.
+    /// Is called after each revolution.
     pub observer: Option<Observer>,
 }
 
 impl Engine {
-    /// Runs until the last door of the vehicle is gone and its queue is empty.
+    /// Starts the thread. It ends when the vehicle's queue is closed and empty.
     ///
     /// # Errors
-    /// What the system says where it has no thread to give.
-    pub fn start(mut self, events: Receiver<Queued>) -> std::io::Result<JoinHandle<()>> {
+    /// [`std::io::Error`] if the system cannot create a thread.
+    pub fn start(mut self, events: Receiver<QueuedEvent>) -> std::io::Result<JoinHandle<()>> {
         std::thread::Builder::new().name(format!("engine {}", self.status.name)).spawn(move || {
-            // Marks the end however it comes, so that a dead engine is seen as one.
+            // Marks the engine as stopped also if the thread panics.
             struct Stopped(Arc<VehicleStatus>);
             impl Drop for Stopped {
                 fn drop(&mut self) {
@@ -65,94 +58,92 @@ impl Engine {
             }
             let _stopped = Stopped(self.status.clone());
             while let Some(queued) = self.next(&events) {
-                self.take(queued);
+                self.step(queued);
             }
         })
     }
 
-    /// Takes one event, without a thread: what [`Engine::start`] does with each.
-    pub fn take(&mut self, Queued { event, ticket, .. }: Queued) {
-        let outcome = self.step(&event);
-        // Behind everything else: whoever hears that an event was taken finds its map, and finds it counted.
-        if let Some(ticket) = ticket {
-            self.rest();
-            ticket.tell(Verdict::of(outcome));
+    /// Handles one event in the calling thread; the thread of [`Engine::start`] calls it for each.
+    pub fn step(&mut self, QueuedEvent { event, receipt, .. }: QueuedEvent) {
+        let outcome = self.step_event(&event);
+        // After everything else: a client that receives the outcome finds the map published and counted.
+        if let Some(receipt) = receipt {
+            self.update_status();
+            receipt.deliver(Outcome::from(outcome));
         }
     }
 
-    /// Brings the status up to date: what [`Engine::start`] does whenever nothing waits.
-    pub fn rest(&self) {
+    /// Copies the ledger and the sensors into the status; the thread of [`Engine::start`] does so whenever no event
+    /// waits.
+    pub fn update_status(&self) {
         self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors());
     }
 
-    /// The next event; the status is brought up to date whenever there is nothing else to do.
-    fn next(&mut self, events: &Receiver<Queued>) -> Option<Queued> {
+    /// Waits for the next event; `None` once the queue is closed and empty. Updates the status before it waits.
+    fn next(&mut self, events: &Receiver<QueuedEvent>) -> Option<QueuedEvent> {
         match events.try_recv() {
             Ok(queued) => return Some(queued),
-            Err(TryRecvError::Empty) => self.rest(),
-            Err(TryRecvError::Disconnected) => return self.last(),
+            Err(TryRecvError::Empty | TryRecvError::Disconnected) => self.update_status(),
         }
         loop {
-            match events.recv_timeout(LOOK_AROUND) {
+            match events.recv_timeout(POLL_INTERVAL) {
                 Ok(queued) => return Some(queued),
-                Err(RecvTimeoutError::Timeout) => self.make_late(),
-                Err(RecvTimeoutError::Disconnected) => return self.last(),
+                Err(RecvTimeoutError::Timeout) => self.complete_newest_map(),
+                Err(RecvTimeoutError::Disconnected) => {
+                    self.update_status();
+                    return None;
+                }
             }
         }
     }
 
-    /// A map for whoever came after the last event, where the newest was made for nobody.
-    fn make_late(&mut self) {
+    /// Computes the newest map again for readers that came after the last event, if it was computed without any reader.
+    fn complete_newest_map(&mut self) {
         let started = Instant::now();
-        self.want();
+        self.update_layers();
         if self.pipeline.remake_newest_map().is_some() {
             self.publish(started);
         }
     }
 
-    fn last(&self) -> Option<Queued> {
-        self.rest();
-        None
-    }
-
-    fn step(&mut self, event: &Event) -> Result<(), EventError> {
-        if let Some(journal) = &self.journal {
-            journal.event(event);
+    fn step_event(&mut self, event: &Event) -> Result<(), EventError> {
+        if let Some(recording) = &self.recording {
+            recording.record_event(event);
         }
         let started = Instant::now();
-        self.want();
+        self.update_layers();
         match self.pipeline.step(event) {
             Ok(Some(_)) => self.publish(started),
             Ok(None) => {}
-            Err(rejected) => {
-                tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %rejected, "refused");
-                return Err(rejected);
+            Err(error) => {
+                tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %error, "refused");
+                return Err(error);
             }
         }
         Ok(())
     }
 
-    /// Encodes the newest map and puts it where readers and recorder find it.
+    /// Encodes the newest map and gives it to readers, recorder and observer.
     fn publish(&mut self, started: Instant) {
         let Some(map) = self.pipeline.newest_map() else { return };
-        // Where every map is switched off, a revolution makes none; where nobody takes one, a header.
-        let made = (!self.status.layers.is_empty()).then(|| {
+        // Without any configured layer a revolution makes no map; without any subscriber it makes a header.
+        let encoded = (!self.status.layers.is_empty()).then(|| {
             let states = map.sensors.iter().map(encode::sensor).collect();
             (Arc::new(EncodedMap::new(map, self.status.name.clone(), self.status.boot_id, self.valid_ms)), states)
         });
         let latency = started.elapsed();
-        // Before its map: whoever has that finds them.
+        // The points come before the map, so that a reader of the map finds its points.
         if self.status.sweeps.receiver_count() > 0 {
             let sweep = self.pipeline.newest_sweep().clone();
             self.status.sweeps.send_replace(Some(Arc::new((map.capture_end_ns, sweep))));
         }
-        // The status first: whoever has seen a map finds it counted.
-        self.rest();
-        if let Some((encoded, states)) = made {
+        // The status comes before the map too, so that a reader of the map finds it counted.
+        self.update_status();
+        if let Some((encoded, states)) = encoded {
             self.status.mapped(&encoded, states, latency);
             self.newest.send_replace(Some(encoded.clone()));
-            if let Some(journal) = &self.journal {
-                journal.map(encoded);
+            if let Some(recording) = &self.recording {
+                recording.record_map(encoded);
             }
         }
         if let Some(observer) = &mut self.observer {
@@ -160,10 +151,10 @@ impl Engine {
         }
     }
 
-    /// Tells the pipeline which layers somebody takes. With a journal all are made: a replay knows nothing of the
-    /// readers there were.
-    fn want(&mut self) {
-        let (all, demand) = (self.journal.is_some(), &self.status.demand);
-        self.pipeline.set_active_layers(|layer| all || demand.is_taken(layer));
+    /// Makes the pipeline compute the layers that have subscribers. With a recorder it computes all layers, because a
+    /// replay does not have the readers of the recorded run.
+    fn update_layers(&mut self) {
+        let (all, subscriptions) = (self.recording.is_some(), &self.status.subscriptions);
+        self.pipeline.set_active_layers(|layer| all || subscriptions.is_subscribed(layer));
     }
 }

@@ -1,34 +1,37 @@
-//! The shell around Clearway's core: doors, engines, publishers, recorder, replay. All clocks, sockets, threads and
-//! logs of the house are in here.
+//! The server around Clearway's core: everything with a clock, socket, thread, file or log. The core is
+//! `clearway-lidar` and `clearway-mapping`.
 //!
-//! The files, in the order a datagram meets them:
+//! The files, in the order in which a datagram passes them:
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | [`config`] | one TOML -> what is served where, recorded, and which vehicles there are |
-//! | [`ingest`] | datagrams, observations, ROS 2 messages, files -> numbered events on one queue a vehicle: the door |
-//! | [`demand`] | readers -> which layers are to be made |
-//! | [`engine`] | events -> journal, step, encoded maps |
-//! | [`wire`] | map -> bytes, once; event <-> the journal's bytes |
-//! | [`cuts`] | those bytes -> a region of them, a delta, once |
+//! | [`config`] | one TOML file -> vehicles, sources, publishers, recorder |
+//! | [`ingest`] | datagrams, observations, ROS 2 messages, files -> numbered events on one queue a vehicle |
+//! | [`engine`] | events -> journal, step of the pipeline, encoded maps |
+//! | [`subscriptions`] | readers -> layers to compute |
+//! | [`encode`] | map -> bytes, once; regions and deltas of them; event <-> bytes of the journal |
+//! | [`newest`] | contents of the latest-value slots between engine and readers |
 //! | [`publish`] | newest map -> gRPC, zenoh, ROS 2, Foxglove, page |
-//! | [`record`] | every event and every map -> MCAP |
-//! | [`recording`] | MCAP -> events and maps |
-//! | [`replay`] | files -> maps, as live |
-//! | [`clouds`] | revolutions -> PCD files |
-//! | [`verify`] | recording -> are these the maps of these events? |
-//! | [`evaluate`] | labelled scans, simulated scenes -> how right each map is |
-//! | [`demo`] | a simulated vehicle against the whole of it |
-//! | [`status`] | ledger, rates, latency of each vehicle |
-//! | [`server`] | all of it, put together |
+//! | [`record`] | events and maps -> MCAP file, and back; verification |
+//! | [`status`] | ledger, rates and latency of each vehicle |
+//! | [`server`] | starts and stops all of these |
+//! | [`cli`] | the subcommands of `clearway` |
+//!
+//! At the ground, used by all: [`clock`], `sync`, [`directory`], `zenoh_session`.
 
 pub mod cli;
+pub mod clock;
 pub mod config;
+pub mod directory;
 pub mod encode;
 pub mod engine;
 pub mod ingest;
+pub mod newest;
 pub mod publish;
 pub mod record;
 pub mod server;
 pub mod status;
 pub mod subscriptions;
+mod sync;
+#[cfg(feature = "zenoh")]
+pub mod zenoh_session;

@@ -1,9 +1,9 @@
-//! Which layers of a vehicle somebody takes, over gRPC, zenoh, ROS 2, Foxglove or the page.
+//! The layers of one vehicle that readers subscribe to, over gRPC, zenoh, ROS 2, Foxglove or the page.
 //!
-//! In: readers that come and go. Out: a set the engine looks at before each event. A map that nobody takes and nobody
-//! records is not made ([`clearway_mapping::pipeline::Pipeline::want`]); one that is taken from now on comes with the
-//! next map, and at once where the newest was made for nobody. Where others read other layers it is not made at once:
-//! they would be given the same turn a second time, under another number, for each who comes.
+//! In: readers that come and go. Out: the set of subscribed layers, which the engine reads before each event. A layer
+//! without a subscriber is not computed, unless a recorder runs. A new subscriber gets its layer with the next map. If
+//! the newest map was computed for no reader at all, the engine computes it at once with the new layer; it does not do
+//! so while other readers read other layers, because they would get the same scan again under another sequence number.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -11,61 +11,62 @@ use std::time::Duration;
 
 use tokio::sync::watch;
 
-use crate::engine::Newest;
 use crate::encode::EncodedMap;
+use crate::newest::Newest;
 
-/// For a layer that was not made so far: some revolutions of the slowest sensor.
-pub const PATIENCE: Duration = Duration::from_secs(1);
+/// Longest wait for a map with a layer that was not computed so far. Ours: some revolutions of the slowest sensor.
+pub const LAYER_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Readers of each layer of one vehicle.
+/// The number of subscribers of each layer of one vehicle. Clones share the counts.
 #[derive(Clone, Debug)]
-pub struct Demand(Arc<[(&'static str, AtomicU32)]>);
+pub struct LayerSubscriptions(Arc<[(&'static str, AtomicU32)]>);
 
-impl Demand {
-    /// Nobody takes any of these layers yet.
+impl LayerSubscriptions {
+    /// The counts for `layers`, all 0.
     pub fn new(layers: &[&'static str]) -> Self {
         Self(layers.iter().map(|&layer| (layer, AtomicU32::new(0))).collect())
     }
 
-    /// Takes these layers, all where none is named, until what it gives is dropped. Names nobody knows are left out.
-    pub fn take(&self, layers: &[String]) -> Taken {
-        let named = |name: &str| layers.is_empty() || layers.iter().any(|layer| layer == name);
-        let taken: Vec<usize> = (0..self.0.len()).filter(|&index| named(self.0[index].0)).collect();
-        taken.iter().for_each(|&index| _ = self.0[index].1.fetch_add(1, Ordering::Relaxed));
-        Taken { demand: self.clone(), taken }
+    /// Subscribes to the named layers until the return value is dropped; to all layers if `layers` is empty. Unknown
+    /// names are ignored.
+    pub fn subscribe(&self, layers: &[String]) -> LayerSubscription {
+        let is_named = |name: &str| layers.is_empty() || layers.iter().any(|layer| layer == name);
+        let indices: Vec<usize> = (0..self.0.len()).filter(|&index| is_named(self.0[index].0)).collect();
+        indices.iter().for_each(|&index| _ = self.0[index].1.fetch_add(1, Ordering::Relaxed));
+        LayerSubscription { all: self.clone(), indices }
     }
 
-    /// Whether somebody takes the layer.
-    pub fn is_taken(&self, layer: &str) -> bool {
+    /// True if the layer has a subscriber.
+    pub fn is_subscribed(&self, layer: &str) -> bool {
         self.0.iter().any(|(name, readers)| *name == layer && readers.load(Ordering::Relaxed) > 0)
     }
 }
 
-/// One reader's layers; they are made while it lives.
+/// One reader's subscription to layers; it ends when it is dropped.
 #[derive(Debug)]
-pub struct Taken {
-    demand: Demand,
-    taken: Vec<usize>,
+pub struct LayerSubscription {
+    all: LayerSubscriptions,
+    indices: Vec<usize>,
 }
 
-impl Taken {
-    /// Whether the map has all of them.
-    pub fn are_in(&self, map: &EncodedMap) -> bool {
-        let held = |index: &usize| map.layers.iter().any(|(name, _)| *name == self.demand.0[*index].0);
-        self.taken.iter().all(held)
+impl LayerSubscription {
+    /// True if `map` has all layers of the subscription.
+    pub fn is_covered_by(&self, map: &EncodedMap) -> bool {
+        let is_in_map = |index: &usize| map.layers.iter().any(|(name, _)| *name == self.all.0[*index].0);
+        self.indices.iter().all(is_in_map)
     }
 
-    /// The newest map as soon as it has all of them; `None` where the engine stops, or gives none for
-    /// [`PATIENCE`].
-    pub async fn newest(&self, newest: &watch::Receiver<Newest>) -> Newest {
+    /// Waits for the newest map with all layers of the subscription. `None` if the engine stops, or if no such map
+    /// comes within [`LAYER_TIMEOUT`].
+    pub async fn newest_map(&self, newest: &watch::Receiver<Newest>) -> Newest {
         let mut newest = newest.clone();
-        let has = newest.wait_for(|map| map.as_ref().is_some_and(|map| self.are_in(map)));
-        tokio::time::timeout(PATIENCE, has).await.ok()?.ok()?.clone()
+        let covering = newest.wait_for(|map| map.as_ref().is_some_and(|map| self.is_covered_by(map)));
+        tokio::time::timeout(LAYER_TIMEOUT, covering).await.ok()?.ok()?.clone()
     }
 }
 
-impl Drop for Taken {
+impl Drop for LayerSubscription {
     fn drop(&mut self) {
-        self.taken.iter().for_each(|&index| _ = self.demand.0[index].1.fetch_sub(1, Ordering::Relaxed));
+        self.indices.iter().for_each(|&index| _ = self.all.0[index].1.fetch_sub(1, Ordering::Relaxed));
     }
 }

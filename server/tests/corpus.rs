@@ -13,7 +13,7 @@ use clearway_mapping::event::{self as core, Event};
 use clearway_proto::packed::pack;
 use clearway_proto::v1;
 use clearway::config::Config;
-use clearway::record::reader::{Entry, Recording};
+use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::encode::event_to_proto;
 use mcap::WriteOptions;
 use prost::Message;
@@ -87,14 +87,14 @@ fn a_chunk_that_claims_more_than_any_has_is_refused_before_it_is_unpacked() {
 
 /// What a recording gives: its events, then `end`, `cut`, or the error.
 fn entries_of(bytes: Vec<u8>) -> Vec<String> {
-    let mut recording = match Recording::of(Path::new("any.mcap"), Cursor::new(bytes)) {
+    let mut recording = match RecordingReader::from_source(Path::new("any.mcap"), Cursor::new(bytes)) {
         Ok(recording) => recording,
         Err(error) => return vec![error.to_string()],
     };
     let mut read = Vec::new();
     for entry in &mut recording {
         match entry {
-            Ok(Entry::Event { event, .. }) => read.push(format!("event {}", event.sequence)),
+            Ok(RecordedMessage::Event { event, .. }) => read.push(format!("event {}", event.sequence)),
             Ok(other) => panic!("{other:?}"),
             Err(error) => return [read, vec![error.to_string()]].concat(),
         }

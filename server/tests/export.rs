@@ -10,7 +10,7 @@ use std::io::BufReader;
 use std::path::Path;
 
 use clearway_lidar::model::Model;
-use clearway_lidar::sensor::{Sensor, SensorConfig};
+use clearway_lidar::{Sensor, SensorConfig};
 use clearway_proto::v1;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::flat;

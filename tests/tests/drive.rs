@@ -86,7 +86,7 @@ impl Loop {
             within("room", self.ingester.send(pose)).await.unwrap();
         }
         assert_eq!(within("verdicts", self.ingester.settled()).await.unwrap(), []);
-        let (data, telemetry) = self.running.doors[0].udp.unwrap();
+        let (data, telemetry) = self.running.inputs[0].udp.unwrap();
         let status = self.running.vehicles.0[0].status.clone();
         for datagram in datagrams {
             let to = if datagram.kind == Kind::Data { data } else { telemetry };

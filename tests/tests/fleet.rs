@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, mpsc};
 
 use clearway::config::ZenohMode;
-use clearway::ingest::Reading;
+use clearway::ingest::queue::Reading;
 use clearway::server::{Running, Server, Setup};
 use clearway_client::{MapStream, StreamEvent, ZenohClient};
 use fixture::{config, feed, readings, sequence, start, within};

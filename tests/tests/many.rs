@@ -57,7 +57,7 @@ async fn eight_sensors_through_real_doors_make_one_map_and_its_occupancy_is_the_
     vehicle.udp = Some(Udp { data: any, telemetry: any, from, ..Udp::default() });
     let running = start(config).await;
     let status = running.vehicles.0[0].status.clone();
-    let (data, telemetry) = running.doors[0].udp.unwrap();
+    let (data, telemetry) = running.inputs[0].udp.unwrap();
     let client = Client::connect(&running.grpc.unwrap().to_string()).await.unwrap();
     let mut ingester = within("a stream", client.ingest("car")).await.unwrap();
 

@@ -9,8 +9,8 @@ use std::net::SocketAddr;
 use std::path::Path;
 
 use clearway::config::Config;
-use clearway::ingest::Reading;
-use clearway::record::reader::{Recording, RecordingError};
+use clearway::ingest::queue::Reading;
+use clearway::record::reader::{RecordingError, RecordingReader};
 use clearway::record::verify::{What, verify};
 use clearway::server::{Server, Setup};
 use clearway_mapping::event::Body;
@@ -29,8 +29,8 @@ async fn recording(file: &Path) {
     let mut readings = readings(5);
     let arrival_ns = readings.last().unwrap().arrival_ns;
     readings.push(Reading { arrival_ns, source: 0, body: Body::End });
-    let door = running.doors[0].door.clone();
-    let fed = move || readings.into_iter().try_for_each(|reading| door.enter_captured(reading));
+    let door = running.inputs[0].queue.clone();
+    let fed = move || readings.into_iter().try_for_each(|reading| door.push_captured(reading));
     tokio::task::spawn_blocking(fed).await.unwrap().unwrap();
     running.shutdown().await.unwrap();
 }
@@ -164,10 +164,10 @@ async fn a_recording_holds_what_it_takes_to_make_its_maps_again() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("whole.mcap");
     recording(&file).await;
-    let recording = Recording::open(&file).unwrap();
-    let notes: &BTreeMap<String, String> = &recording.preface().notes;
+    let recording = RecordingReader::open(&file).unwrap();
+    let notes: &BTreeMap<String, String> = &recording.header().metadata;
     assert_eq!(notes["vehicles"], "car");
-    assert_eq!(notes["boot_id"], recording.preface().boot_id.to_string());
+    assert_eq!(notes["boot_id"], recording.header().boot_id.to_string());
     assert!(notes["calibration/car/top"].contains("factory"), "{notes:?}");
     let (config, tables) = recording.config().unwrap();
     assert_eq!(config.vehicles, fixture::config().vehicles);
@@ -318,7 +318,7 @@ fn a_disk_that_fails_ends_the_recording_with_its_reason_and_maps_go_on() {
         .unwrap();
     let (said, complained) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(!output.status.success(), "an incomplete recording is no success");
-    assert!(complained.contains("the recording is not whole") && complained.contains("File too large"), "{complained}");
+    assert!(complained.contains("the recording is incomplete") && complained.contains("File too large"), "{complained}");
     let seconds: Vec<serde_json::Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let maps: Vec<u64> = seconds.iter().map(|second| second["maps"].as_u64().unwrap()).collect();
     assert!(maps.len() > 2 && maps.last() > maps.get(1), "maps are made after the disk has failed: {said}");

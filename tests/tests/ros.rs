@@ -10,7 +10,7 @@ use clearway::cli::replay::{Mount, Options, ReplayError, Summary, replay};
 use clearway::config::Ros;
 use clearway::record::verify::verify;
 use clearway_lidar::model::Model;
-use clearway_lidar::sensor::{Sensor, SensorConfig};
+use clearway_lidar::{Sensor, SensorConfig};
 use clearway_mapping::config::Extrinsics;
 use clearway_mapping::event::Body;
 use clearway_ros::PointCloud2;
@@ -189,13 +189,13 @@ async fn a_bag_of_several_sensors_makes_one_map_of_all_that_tf_places() {
     let last = header(maps.last_key_value().unwrap().1).unwrap();
     assert!(last.sensors.len() == 2 && last.sensors.iter().all(|sensor| sensor.returns > 1000), "{:?}", last.sensors);
     // Each has its own place, and its own end.
-    let entries = clearway::record::reader::Recording::open(&record).unwrap().map(|entry| entry.unwrap());
+    let entries = clearway::record::reader::RecordingReader::open(&record).unwrap().map(|entry| entry.unwrap());
     let ends = entries.filter_map(|entry| match entry {
-        clearway::record::reader::Entry::Event { event, .. } if event.body == Body::End => Some(event.source),
+        clearway::record::reader::RecordedMessage::Event { event, .. } if event.body == Body::End => Some(event.source),
         _ => None,
     });
     assert_eq!(ends.collect::<Vec<_>>(), [0, 1]);
-    let (config, _) = clearway::record::reader::Recording::open(&record).unwrap().config().unwrap();
+    let (config, _) = clearway::record::reader::RecordingReader::open(&record).unwrap().config().unwrap();
     let places = config.vehicles[0].sensors.iter().map(|sensor| (sensor.name.as_str(), sensor.extrinsics.y_m));
     assert!(places.clone().any(|place| place == ("lidar_left", 1.0)), "{:?}", places.collect::<Vec<_>>());
 }
@@ -266,8 +266,8 @@ async fn without_an_odometry_the_chain_of_tf_gives_poses_and_speed_and_a_bag_in_
     assert_eq!((ledger.poses, ledger.poses_refused), (stamps.len() as u64 - 1, 0));
     assert_eq!(summary.snapshot.maps, stamps.len() as u64);
     assert!(summary.notes.join("\n").contains("tf was taken for poses of base_link in map"), "{:?}", summary.notes);
-    for entry in clearway::record::reader::Recording::open(&record).unwrap() {
-        let clearway::record::reader::Entry::Event { event, .. } = entry.unwrap() else { continue };
+    for entry in clearway::record::reader::RecordingReader::open(&record).unwrap() {
+        let clearway::record::reader::RecordedMessage::Event { event, .. } = entry.unwrap() else { continue };
         let Body::EgoPose(pose) = event.body else { continue };
         assert!((pose.speed_mps - 12.0).abs() < 1e-6, "{pose:?}");
         assert!(stamps.contains(&pose.stamp_ns) && pose.map_from_ego.translation.x >= 100.0, "{pose:?}");

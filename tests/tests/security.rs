@@ -81,8 +81,8 @@ async fn a_recording_holds_the_path_of_the_key_and_nothing_of_the_key() {
     let running = start(config).await;
     feed(&running, readings(1)).await;
     within("shutdown", running.shutdown()).await.unwrap();
-    let recording = clearway::record::reader::Recording::open(&record).unwrap();
-    let text = recording.preface().config.clone().unwrap();
+    let recording = clearway::record::reader::RecordingReader::open(&record).unwrap();
+    let text = recording.header().config.clone().unwrap();
     assert!(text.contains("server.key") && !text.contains("PRIVATE"), "{text}");
     let key = std::fs::read_to_string(certificates("ours").join("server.key")).unwrap();
     let secret = key.lines().nth(1).expect("base64").as_bytes();

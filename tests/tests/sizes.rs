@@ -13,8 +13,8 @@ use clearway::cli::demo::rig::Rig;
 use clearway::cli::replay::{Options, replay};
 use clearway::config::Config;
 use clearway::encode::EncodedMap;
-use clearway::ingest::observation::{self, bodies};
-use clearway::record::reader::{Entry, Recording};
+use clearway::ingest::observation;
+use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway_mapping::config::MapsConfig;
 use clearway_mapping::event::{Body, EgoPose, Event};
 use clearway_mapping::map::Map;
@@ -71,14 +71,14 @@ async fn maps(drive: &Drive) -> Vec<Sized> {
     let (file, record) = (Path::new(env!("CLEARWAY_DATA")).join(drive.path), folder.path().join("drive.mcap"));
     let options = Options { files: vec![file.clone()], record: Some(record.clone()), ..Options::default() };
     fixture::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
-    let mut recording = Recording::open(&record).unwrap();
+    let mut recording = RecordingReader::open(&record).unwrap();
     let (config, tables) = recording.config().unwrap();
     // By how much the arrivals are ahead of the sensor's own clock, which the poses are to follow.
     let (mut events, mut ahead_ns) = (Vec::new(), None);
     for entry in recording.by_ref() {
         match entry.unwrap() {
-            Entry::Event { event, .. } => events.push(event),
-            Entry::Map { bytes, .. } if ahead_ns.is_none() => {
+            RecordedMessage::Event { event, .. } => events.push(event),
+            RecordedMessage::Map { bytes, .. } if ahead_ns.is_none() => {
                 let header = v1::Map::decode(bytes).unwrap().header.unwrap();
                 ahead_ns = Some(header.completed_ns - header.capture_end_ns);
             }
@@ -112,7 +112,7 @@ fn simulated(scene: Scene, maps: usize) -> Vec<Sized> {
     for (sequence, told) in (0..).zip(rig.told()) {
         let observation = v1::Observation::from(told.observation);
         let source = source(&observation.sensor);
-        let (_, body) = bodies(observation, &observation::Limits::of_points(1 << 16)).unwrap().remove(0);
+        let (_, body) = observation::decode(observation, &observation::Limits::from_points_max(1 << 16)).unwrap().remove(0);
         let event = Event { sequence, arrival_ns: told.stamp_ns + 1_000_000, source, body };
         if let Ok(Some(map)) = pipeline.step(&event) {
             made.push(Sized::of(map));

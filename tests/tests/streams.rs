@@ -95,7 +95,7 @@ async fn a_live_drive_over_udp_reaches_grpc_and_zenoh_with_the_bytes_of_the_reco
 #[tokio::test(flavor = "multi_thread")]
 async fn refused_datagrams_are_counted_by_reason_and_the_ledger_adds_up() {
     let running = start(config()).await;
-    let (data, _) = running.doors[0].udp.unwrap();
+    let (data, _) = running.inputs[0].udp.unwrap();
     let socket = UdpSocket::bind("127.0.0.1:0").await.unwrap();
     let flags = vec![0x11; 1206];
     let mut azimuth = vec![0; 1206];
@@ -122,7 +122,7 @@ async fn a_sender_nobody_configured_is_refused_for_its_source() {
     let udp = config.vehicles[0].udp.as_mut().unwrap();
     udp.from.insert("top".into(), clearway::config::Sender::Address("127.0.0.2".parse().unwrap()));
     let running = start(config).await;
-    let (data, _) = running.doors[0].udp.unwrap();
+    let (data, _) = running.inputs[0].udp.unwrap();
     let packet = readings(1).into_iter().find_map(|reading| match reading.body {
         clearway_mapping::event::Body::Datagram(payload) if payload.len() == 1206 => Some(payload),
         _ => None,
@@ -364,7 +364,7 @@ async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
 
     // The car hears two turns, the truck one.
     let maps = feed(&running, readings(2)).await;
-    let (data, _) = running.doors[1].udp.unwrap();
+    let (data, _) = running.inputs[1].udp.unwrap();
     let halt = Duration::from_millis(250);
     let until_then = Until { stop: None, device_time: Some(halt) };
     tokio::task::spawn_blocking(move || drive(fixture::anywhere(), vehicle(), data, data, Pace::RealTime, until_then))
@@ -405,9 +405,9 @@ async fn layers_are_made_while_somebody_takes_them_and_a_late_joiner_gets_his_of
 
     let made_for_nobody = newest();
     let (requests, mut updates) = watch(&running, 0).await;
-    let demand = running.vehicles.0[0].status.demand.clone();
-    until("the reader's layer is taken", || demand.is_taken(LAYER)).await;
-    assert!(!demand.is_taken("terrain"));
+    let subscriptions = running.vehicles.0[0].status.subscriptions.clone();
+    until("the reader's layer is taken", || subscriptions.is_subscribed(LAYER)).await;
+    assert!(!subscriptions.is_subscribed("terrain"));
     let update = within("the newest turn's map", updates.message()).await.unwrap().unwrap();
     assert_eq!(sequence(&update.map), made_for_nobody.sequence + 1, "no map without the layer is sent");
     assert_eq!(newest().capture_end_ns, made_for_nobody.capture_end_ns);
@@ -417,10 +417,10 @@ async fn layers_are_made_while_somebody_takes_them_and_a_late_joiner_gets_his_of
     assert_eq!(layers(), [LAYER]);
 
     drop((requests, updates));
-    until("the reader is gone", || !demand.is_taken(LAYER)).await;
-    let taken = demand.take(&["safe_path".into()]);
+    until("the reader is gone", || !subscriptions.is_subscribed(LAYER)).await;
+    let taken = subscriptions.subscribe(&["safe_path".into()]);
     feed(&running, part(2)).await;
     assert_eq!(layers(), ["drivability", "safe_path"], "what it is made from comes along");
-    assert!(taken.are_in(&newest()));
+    assert!(taken.is_covered_by(&newest()));
     within("shutdown", running.shutdown()).await.unwrap();
 }

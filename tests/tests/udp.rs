@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 
 use clearway::cli::replay::{Options, replay};
 use clearway::config::{Config, Sender, Udp};
-use clearway::ingest::door;
-use clearway::record::reader::{Entry, Recording};
+use clearway::ingest::queue::event_queue;
+use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::record::verify::verify;
 use clearway::server::Running;
 use clearway_lidar::capture::Capture;
@@ -53,12 +53,12 @@ fn datagrams() -> (Vec<Vec<u8>>, Vec<u8>) {
 
 /// The ledger a recording's events add up to.
 fn replayed(record: &Path, vehicle: &str) -> Ledger {
-    let mut recording = Recording::open(record).unwrap();
+    let mut recording = RecordingReader::open(record).unwrap();
     let (config, tables) = recording.config().unwrap();
     let index = config.vehicles.iter().position(|v| v.name == vehicle).unwrap();
     let mut pipeline = Pipeline::new(&config.vehicles[index].core(), tables[index].clone()).unwrap();
     for entry in &mut recording {
-        if let Entry::Event { vehicle: of, event } = entry.unwrap()
+        if let RecordedMessage::Event { vehicle: of, event } = entry.unwrap()
             && of == vehicle
         {
             let _ = pipeline.step(&event);
@@ -83,7 +83,7 @@ async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording()
     let from = BTreeMap::from([sender("top", "127.0.0.2"), sender("side", "127.0.0.4")]);
     vehicle.udp = Some(Udp { data, telemetry, from, ..Udp::default() });
     let running = start(config).await;
-    let (data, telemetry) = running.doors[0].udp.unwrap();
+    let (data, telemetry) = running.inputs[0].udp.unwrap();
     let telemetry = SocketAddr::new("127.0.0.1".parse().unwrap(), telemetry.port());
 
     let (packets, position) = datagrams();
@@ -148,7 +148,7 @@ async fn a_group_is_heard_on_its_interface() {
     let any = "0.0.0.0:0".parse().unwrap();
     config.vehicles[0].udp = Some(Udp { data: any, telemetry: any, groups, interface: "lo".into(), ..Udp::default() });
     let running = start(config).await;
-    let (data, _) = running.doors[0].udp.unwrap();
+    let (data, _) = running.inputs[0].udp.unwrap();
     let sender = socket2::Socket::from(socket("127.0.0.1"));
     sender.set_multicast_if_v4(&"127.0.0.1".parse().unwrap()).unwrap();
     let sender = UdpSocket::from(sender);
@@ -169,7 +169,7 @@ fn a_million_datagrams_add_up_exactly() {
     let maps = &mut config.vehicles[0].maps;
     (maps.drivability.enabled, maps.height_difference.enabled, maps.terrain.enabled) = (false, false, false);
     let mut pipeline = Pipeline::new(&config.vehicles[0].core(), vec![None]).unwrap();
-    let (door, events) = door(256);
+    let (door, events) = event_queue(256);
 
     let (packets, position) = datagrams();
     let mut broken = packets[0].clone();
@@ -185,15 +185,15 @@ fn a_million_datagrams_add_up_exactly() {
         for _ in 0..size {
             match random.next_u32() % 16 {
                 0 => {
-                    door.refuse_stranger(([10, 0, 0, (random.next_u32() % 16) as u8], 2368).into());
+                    door.refuse_unknown_sender(([10, 0, 0, (random.next_u32() % 16) as u8], 2368).into());
                     outside[0] += 1;
                 }
                 1 => {
-                    door.leave_outside(0, Cause::Length, 1);
+                    door.record_drop(0, Cause::Length, 1);
                     outside[1] += 1;
                 }
                 2 => {
-                    door.leave_outside(0, Cause::Kernel, 1);
+                    door.record_drop(0, Cause::Kernel, 1);
                     outside[2] += 1;
                 }
                 kind @ 3..8 => readings.push((0, Body::Datagram(kinds[kind as usize - 3].clone()))),
@@ -203,14 +203,14 @@ fn a_million_datagrams_add_up_exactly() {
                 }
             }
         }
-        door.enter_all(readings).unwrap();
+        door.push_batch(readings).unwrap();
         // An engine that stalls now and then.
         if random.next_u32().is_multiple_of(8) {
             events.try_iter().for_each(|queued| drop(pipeline.step(&queued.event)));
         }
     }
     events.try_iter().for_each(|queued| drop(pipeline.step(&queued.event)));
-    door.close(None).unwrap();
+    door.report_drops(None).unwrap();
     events.try_iter().for_each(|queued| drop(pipeline.step(&queued.event)));
 
     let ledger = pipeline.ledger();
@@ -326,9 +326,9 @@ async fn two_captures_sent_to_one_port_at_once_give_both_vehicles_the_maps_of_th
 
 /// The recorded bytes by vehicle, sequence and layer.
 fn recorded_of(file: &Path) -> BTreeMap<(String, u64, String), bytes::Bytes> {
-    let entries = Recording::open(file).unwrap().map(|entry| entry.unwrap());
+    let entries = RecordingReader::open(file).unwrap().map(|entry| entry.unwrap());
     let maps = entries.filter_map(|entry| match entry {
-        Entry::Map { vehicle, layer, bytes } => Some(((vehicle, fixture::sequence(&bytes), layer), bytes)),
+        RecordedMessage::Map { vehicle, layer, bytes } => Some(((vehicle, fixture::sequence(&bytes), layer), bytes)),
         _ => None,
     });
     maps.collect()

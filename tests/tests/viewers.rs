@@ -9,7 +9,7 @@ use std::process::Stdio;
 
 use clearway::config::{Config, Foxglove, Ros2};
 use clearway::encode::viewer::Raster;
-use clearway::ingest::Reading;
+use clearway::ingest::queue::Reading;
 use clearway::server::{Running, Server, Setup};
 use clearway_client::MapView;
 use clearway_mapping::event::{Body, EgoPose};
@@ -26,8 +26,8 @@ async fn place(running: &Running, readings: &[Reading]) {
         Reading { arrival_ns: first_ns, source: 0, body }
     };
     let poses: Vec<_> = (first_ns - 200_000_000..last_ns + 200_000_000).step_by(50_000_000).map(pose).collect();
-    let door = running.doors[0].door.clone();
-    let entered = tokio::task::spawn_blocking(move || poses.into_iter().try_for_each(|pose| door.enter_captured(pose)));
+    let door = running.inputs[0].queue.clone();
+    let entered = tokio::task::spawn_blocking(move || poses.into_iter().try_for_each(|pose| door.push_captured(pose)));
     entered.await.unwrap().unwrap();
 }
 

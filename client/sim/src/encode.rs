@@ -4,7 +4,7 @@
 //! block holds what is read from the model's [`ModelSpec`], the same that the decoder reads.
 
 use clearway_lidar::calibration::Calibration;
-use clearway_lidar::calibration::unit_table::status_bytes;
+use clearway_lidar::calibration::status_table::status_bytes;
 use clearway_lidar::model::{Model, ModelSpec, RETURNS_PER_BLOCK, ReturnMode, S1_FLAGS};
 use clearway_lidar::packet::{BLOCK_LENGTH, PACKET_LENGTH};
 
@@ -75,7 +75,7 @@ impl Encoder {
         let mut bytes = [0; PACKET_LENGTH];
         let used = self.spec.blocks_used(self.mode);
         for (block, bytes) in bytes.chunks_exact_mut(BLOCK_LENGTH).take(used).enumerate() {
-            let place = self.spec.place(block, self.mode);
+            let place = self.spec.block_position(block, self.mode);
             let flag = self.spec.flag(block, self.mode).unwrap_or(S1_FLAGS[block % S1_FLAGS.len()]);
             bytes[..2].copy_from_slice(&flag.to_le_bytes());
             bytes[2..4].copy_from_slice(&self.firings[place.firing].azimuth.to_le_bytes());

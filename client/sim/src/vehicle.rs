@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::sensor::{Sensor, SensorConfig};
+use clearway_lidar::{Sensor, SensorConfig};
 use nalgebra::{Isometry3, Point3};
 
 use crate::course::{Course, Drive};

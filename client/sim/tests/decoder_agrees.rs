@@ -110,7 +110,7 @@ fn holds(model: Model, return_mode: ReturnMode, rpm: f64, turn: i64, seed: u64) 
     let worst = compare(&vehicle, &revolution);
     println!("{model:?} {return_mode:?} {rpm:.0} rpm: {} firings, {worst:?}", revolution.firings.len());
     assert_eq!((revolution.model, revolution.echoes.len()), (model, 1 + usize::from(return_mode == ReturnMode::Dual)));
-    let firings = model.spec().firings_per_turn(return_mode, rpm as f32);
+    let firings = model.spec().firings_per_revolution(return_mode, rpm as f32);
     assert!(revolution.firings.len().abs_diff(firings) <= 1, "{} of {firings} firings", revolution.firings.len());
     assert!(worst.range_counts <= 0.51, "half a count, and the decoder's single precision");
     // A block's azimuth is rounded once; the second firing of a 16-laser block is rounded again.

@@ -2,7 +2,7 @@
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::{Model, ReturnMode};
-use clearway_lidar::sensor::{CalibrationSource, Sensor, SensorConfig};
+use clearway_lidar::{CalibrationSource, Sensor, SensorConfig};
 use clearway_lidar::telemetry::Telemetry;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
@@ -123,7 +123,7 @@ fn an_hdl_64e_tells_its_own_table_in_its_status_bytes() {
             told = Some(revolution.calibration.clone());
         }
     }
-    assert_eq!(sensor.status().calibration, CalibrationSource::Unit);
+    assert_eq!(sensor.status().calibration, CalibrationSource::StatusBytes);
     assert_eq!(
         (sensor.status().model, sensor.status().return_mode),
         (Some(Model::Hdl64eS2), Some(ReturnMode::Strongest))

@@ -2,7 +2,7 @@
 
 use clearway_lidar::model::{Model, ReturnMode};
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::sensor::{Sensor, SensorConfig, SensorStatus};
+use clearway_lidar::{Sensor, SensorConfig, SensorStatus};
 use clearway_sim::impair::{Faults, Impaired};
 use clearway_sim::noise::{mixed, uniform};
 use clearway_sim::scanner::ScannerConfig;

@@ -1,37 +1,42 @@
-//! What a file holds: a recording, a capture or a scan.
+//! `clearway info`: a recording, a capture or a scan -> a description of its contents.
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufReader, Read};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use clap::Args;
 use clearway_client::MapView;
 use clearway_lidar::capture::Capture;
 use clearway_lidar::packet::PACKET_LENGTH;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use clearway_lidar::{Sensor, SensorConfig};
+use clearway_mapping::event::Scan;
+use clearway_mapping::scan_file::{read_bin, read_pcd};
 use serde_json::{Map, Value, json};
 
-use super::recording::Recording;
-use super::say;
+use super::output::print_line;
+use crate::record::mcap_reader::McapReader;
 
-/// Tell what a file holds: an MCAP recording, a pcap or pcapng capture, a KITTI .bin or a .pcd scan.
+/// Describe a file: an MCAP recording, a pcap or pcapng capture, a KITTI .bin or a .pcd scan.
 #[derive(Args)]
+#[command(after_help = "Examples:
+  clearway info drive.mcap
+  clearway info drive.pcap --json")]
 pub struct Options {
     /// The file.
     file: PathBuf,
-    /// One JSON object.
+    /// Print one JSON object.
     #[arg(long)]
     json: bool,
 }
 
-/// Tells.
+/// Prints the description of the file.
 ///
 /// # Errors
-/// What cannot be read, and files of no kind known here.
+/// If the file cannot be read or its kind is not known.
 pub fn run(options: &Options) -> Result<()> {
     let file = &options.file;
     let mut start = Vec::new();
@@ -47,18 +52,18 @@ pub fn run(options: &Options) -> Result<()> {
     }
     .with_context(|| file.display().to_string())?;
     if options.json {
-        say(&serde_json::to_string_pretty(&document)?)?;
+        print_line(&serde_json::to_string_pretty(&document)?)?;
         return Ok(());
     }
     for line in lines(&document) {
-        if !say(&line)? {
+        if !print_line(&line)? {
             break;
         }
     }
     Ok(())
 }
 
-/// `key: value` lines, nested ones indented.
+/// The document as `key: value` lines; nested objects are indented.
 fn lines(document: &Value) -> Vec<String> {
     let mut lines = Vec::new();
     describe(document.as_object().unwrap_or(&Map::new()), "", &mut lines);
@@ -83,23 +88,28 @@ fn describe(object: &Map<String, Value>, indent: &str, lines: &mut Vec<String>) 
     }
 }
 
+/// The value to a thousandth, which is all that is printed of seconds and metres.
+fn rounded(value: f64) -> f64 {
+    (value * 1e3).round() / 1e3
+}
+
 fn recording(file: &Path) -> Result<Value> {
-    let mut recording = Recording::open(file)?;
+    let mut recording = McapReader::salvage(file)?;
     let mut messages: BTreeMap<String, u64> = BTreeMap::new();
     let (mut events, mut maps, mut scans) = (0_u64, BTreeMap::<(String, String), u64>::new(), 0_u64);
     let mut grids: BTreeMap<String, Value> = BTreeMap::new();
     let mut span: Option<(u64, u64)> = None;
     for message in recording.by_ref() {
         let message = message?;
-        *messages.entry(message.topic.clone()).or_default() += 1;
-        let at = message.log_time_ns;
+        *messages.entry(message.channel.topic.clone()).or_default() += 1;
+        let at = message.log_ns;
         span = Some(span.map_or((at, at), |(first, last)| (first.min(at), last.max(at))));
-        events += u64::from(message.schema == "clearway.v1.Event");
+        events += u64::from(message.channel.schema == "clearway.v1.Event");
         scans += u64::from(message.is_velodyne_scan());
         if let Some((vehicle, layer)) = message.map_of() {
             *maps.entry((vehicle.to_owned(), layer.to_owned())).or_default() += 1;
             if !grids.contains_key(layer) {
-                let map = MapView::decode(message.data.clone()).with_context(|| message.topic.clone())?;
+                let map = MapView::decode(message.data.clone()).with_context(|| message.channel.topic.clone())?;
                 let found = map.layer(layer)?;
                 let (rows, columns) = found.grid.shape();
                 let channels: Vec<_> = found.channels.iter().map(|channel| &channel.name).collect();
@@ -115,26 +125,27 @@ fn recording(file: &Path) -> Result<Value> {
     for ((vehicle, layer), count) in maps {
         vehicles.entry(vehicle).or_default().insert(layer, count);
     }
-    let text = |name: &str| recording.attachments.get(name).map(|bytes| String::from_utf8_lossy(bytes).into_owned());
+    let header = recording.header();
     Ok(json!({
         "kind": "recording",
-        "state": recording.cut.clone().unwrap_or_else(|| "complete".into()),
-        "complete": recording.cut.is_none(),
-        "duration_s": span.map(|(first, last)| (last - first) as f64 * 1e-9),
-        "run": recording.notes,
-        "events": events,
+        "complete": recording.incomplete().is_none(),
+        "state": recording.incomplete().unwrap_or_else(|| "complete".into()),
+        "duration_s": span.map(|(first, last)| rounded((last - first) as f64 * 1e-9)),
+        "run": header.metadata,
         "maps": vehicles,
         "layers": grids,
+        "events": events,
         "velodyne_scans": scans,
         "messages": messages,
-        "calibrations": recording.attachments.keys().filter(|name| name.starts_with("calibration/")).collect::<Vec<_>>(),
-        "config": text("config.toml"),
+        "calibrations": header.calibrations.keys().collect::<Vec<_>>(),
+        "config": header.config,
     }))
 }
 
 /// One sender of a capture.
 struct Source {
     sensor: Sensor,
+    /// Number of refused datagrams, by reason.
     refused: BTreeMap<&'static str, u64>,
 }
 
@@ -162,7 +173,7 @@ fn capture(file: &Path) -> Result<Value> {
             TELEMETRY_LENGTH => telemetry += 1,
             _ => other += 1,
         }
-        // One sensor sends both kinds, each from its own port.
+        // A sensor sends data and telemetry from two ports.
         let sender = SocketAddr::new(datagram.source.ip(), 0);
         let source = sources
             .entry(sender)
@@ -175,83 +186,62 @@ fn capture(file: &Path) -> Result<Value> {
         .into_iter()
         .map(|(sender, mut source)| {
             source.sensor.finish();
-            let status = source.sensor.status();
-            let sensor = json!({
-                "model": status.model.map(|model| model.spec().name),
-                "return_mode": status.return_mode.map(|mode| format!("{mode:?}").to_lowercase()),
-                "rpm": status.rpm,
-                "clock": status.clock.map(|clock| clock.as_str()),
-                "clock_offset_ms": status.clock_offset_ms,
-                "packets": status.packets,
-                "packets_lost": status.packets_lost,
-                "telemetry": status.telemetry,
-                "returns": status.returns,
-                "revolutions": status.revolutions,
-                "refused": source.refused,
-            });
-            (sender.ip().to_string(), sensor)
+            (sender.ip().to_string(), sensor(&source))
         })
         .collect();
     let skipped = capture.skipped();
     Ok(json!({
         "kind": "capture",
-        "state": cut.clone().unwrap_or_else(|| "complete".into()),
         "complete": cut.is_none(),
+        "state": cut.clone().unwrap_or_else(|| "complete".into()),
+        "duration_s": span.map(|(first, last)| rounded((last - first) as f64 * 1e-9)),
         "packets": packets,
         "telemetry": telemetry,
         "other_datagrams": other,
         "passed_over": {"not_udp": skipped.not_udp, "fragmented": skipped.fragmented, "unreadable": skipped.unreadable},
-        "duration_s": span.map(|(first, last)| (last - first) as f64 * 1e-9),
         "ports": ports,
         "sensors": sensors,
     }))
 }
 
-/// float32 x y z intensity, one after the other.
-fn kitti(file: &Path) -> Result<Value> {
-    let bytes = std::fs::read(file)?;
-    if bytes.is_empty() || !bytes.len().is_multiple_of(16) {
-        bail!("{} bytes; a scan has 16 (float32 x y z intensity) a point", bytes.len());
-    }
-    let coordinate = |at: &[u8; 4]| f64::from(f32::from_le_bytes(*at));
-    let mut bounds = [[f64::INFINITY, f64::NEG_INFINITY]; 3];
-    let mut not_finite = 0_u64;
-    for point in bytes.as_chunks::<16>().0 {
-        let xyz: Vec<_> = point.as_chunks::<4>().0.iter().take(3).map(coordinate).collect();
-        if xyz.iter().any(|v| !v.is_finite()) {
-            not_finite += 1;
-            continue;
-        }
-        for (bound, value) in bounds.iter_mut().zip(xyz) {
-            *bound = [bound[0].min(value), bound[1].max(value)];
-        }
-    }
-    let [x, y, z] = bounds;
-    Ok(json!({
-        "kind": "scan", "format": "KITTI .bin", "points": bytes.len() / 16, "not_finite": not_finite,
-        "bounds_m": {"x": x, "y": y, "z": z},
-    }))
+fn sensor(source: &Source) -> Value {
+    let status = source.sensor.status();
+    json!({
+        "model": status.model.map(|model| model.spec().name),
+        "return_mode": status.return_mode.map(|mode| format!("{mode:?}").to_lowercase()),
+        "rpm": status.rpm,
+        "clock": status.clock.map(|clock| clock.as_str()),
+        "clock_offset_ms": status.clock_offset_ms,
+        "packets": status.packets,
+        "packets_lost": status.packets_lost,
+        "telemetry": status.telemetry,
+        "returns": status.returns,
+        "revolutions": status.revolutions,
+        "refused": source.refused,
+    })
 }
 
-/// The header of a PCD file.
+fn kitti(file: &Path) -> Result<Value> {
+    Ok(scan("KITTI .bin", &read_bin(&std::fs::read(file)?)?))
+}
+
 fn pcd(file: &Path) -> Result<Value> {
-    let mut header = BTreeMap::new();
-    let mut reader = BufReader::new(File::open(file)?).take(64 << 10);
-    loop {
-        let mut line = Vec::new();
-        if reader.read_until(b'\n', &mut line)? == 0 {
-            bail!("no PCD header: a line DATA is needed within the first 64 KiB");
-        }
-        let line = String::from_utf8_lossy(&line).trim().to_owned();
-        if let Some((key, value)) = line.split_once(' ').filter(|_| !line.starts_with('#')) {
-            header.insert(key.to_lowercase(), value.to_owned());
-        }
-        if line.starts_with("DATA") {
-            break;
-        }
-    }
-    let points: Option<u64> = header.get("points").and_then(|points| points.parse().ok());
-    Ok(
-        json!({"kind": "scan", "format": "PCD", "points": points, "fields": header.get("fields"), "data": header.get("data"), "viewpoint": header.get("viewpoint")}),
-    )
+    Ok(scan("PCD", &read_pcd(&std::fs::read(file)?)?))
+}
+
+/// The number of points of a scan and the box around those that are finite.
+fn scan(format: &str, scan: &Scan) -> Value {
+    let points = || scan.x.iter().zip(&scan.y).zip(&scan.z).map(|((&x, &y), &z)| [x, y, z]);
+    let finite = || points().filter(|point| point.iter().all(|value| value.is_finite()));
+    let bounds = |axis: usize| {
+        let values = finite().map(|point| f64::from(point[axis]));
+        let least_and_greatest = values.fold(None, |bounds: Option<[f64; 2]>, value| {
+            Some(bounds.map_or([value; 2], |[least, greatest]| [least.min(value), greatest.max(value)]))
+        });
+        least_and_greatest.map(|bounds| bounds.map(rounded))
+    };
+    json!({
+        "kind": "scan", "format": format, "points": scan.x.len(), "not_finite": scan.x.len() - finite().count(),
+        "bounds_m": {"x": bounds(0), "y": bounds(1), "z": bounds(2)},
+    })
 }

@@ -1,9 +1,35 @@
-//! The subcommands of `clearway`, and what they share.
+//! The command `clearway`: the list of its subcommands and the function that runs each.
 //!
-//! Exit codes: 0 success, 1 failure, 2 wrong usage.
+//! Each subcommand is one file or folder with its `Options` (as clap reads them from the command line) and its `run`:
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | [`demo`] | a simulated vehicle -> a server of its own, over real UDP |
+//! | `serve` | a configuration -> a server that runs until a signal |
+//! | [`replay`] | recorded drives -> maps, a recording |
+//! | `verify` | a recording -> true if each map is the map of its events |
+//! | [`evaluate`] | labelled scans, simulated scenes -> precision and recall of each map |
+//! | `check` | a configuration -> the same with every default |
+//! | `watch`, `get` | a server -> a line for each map; the newest map as a file |
+//! | `vehicles` | a server -> the state of its vehicles |
+//! | `export` | a recording -> pictures, arrays, documents, files for viewers |
+//! | `info` | a file -> a description of its contents |
+//! | `send`, `ingest` | files -> a server: as datagrams over UDP; as observations over gRPC or zenoh |
+//! | `simulate` | a simulated scene -> a capture, or datagrams over UDP |
+//! | `completions` | a shell's name -> its completion script |
+//!
+//! They share:
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | `configuration` | options -> a configuration, extrinsics |
+//! | `connection` | options -> a connected client |
+//! | `output` | text -> stdout; progress bar, runtime, signals |
 
-mod arguments;
-mod connect;
+mod check;
+mod completions;
+mod configuration;
+mod connection;
 #[cfg(feature = "sim")]
 pub mod demo;
 pub mod evaluate;
@@ -11,17 +37,171 @@ mod export;
 mod get;
 mod info;
 mod ingest;
-mod network;
-mod npy;
-mod recording;
+mod output;
 pub mod replay;
-mod run;
 mod send;
-mod sensor_json;
+mod serve;
+#[cfg(feature = "sim")]
+mod simulate;
 mod vehicles;
+mod verify;
 mod watch;
 
-pub use run::main;
+use std::fmt::Write as _;
+use std::io::IsTerminal;
+use std::process::ExitCode;
 
-use connect::{Server, block_on, progress_bar, say};
-use sensor_json as document;
+use anyhow::Result;
+use clap::builder::StyledStr;
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
+use tracing_subscriber::EnvFilter;
+
+/// Clearway turns LIDAR packets into maps of where a vehicle may drive.
+#[derive(Parser)]
+#[command(name = "clearway", version, after_help = EXIT_CODES)]
+struct Arguments {
+    /// Format of the log lines on stderr; the environment variable RUST_LOG selects which lines are logged.
+    #[arg(long, value_enum, default_value = "text", global = true)]
+    log_format: LogFormat,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum LogFormat {
+    Text,
+    Json,
+}
+
+/// The subcommands, in the order of the help text.
+#[derive(Subcommand)]
+enum Command {
+    #[cfg(feature = "sim")]
+    Demo(demo::command::Options),
+    Serve(serve::Options),
+    Replay(Box<replay::Options>),
+    Verify(verify::Options),
+    Evaluate(evaluate::Options),
+    Check(check::Options),
+    Watch(watch::Options),
+    Get(get::Options),
+    Vehicles(vehicles::Options),
+    Export(export::Options),
+    Info(info::Options),
+    Send(send::Options),
+    Ingest(ingest::Options),
+    #[cfg(feature = "sim")]
+    Simulate(simulate::Options),
+    Completions(completions::Options),
+}
+
+/// The subcommands by purpose, as `clearway --help` lists them.
+const GROUPS: [(&str, &[&str]); 6] = [
+    ("Make maps", &["demo", "serve", "replay"]),
+    ("Check maps and configurations", &["verify", "evaluate", "check"]),
+    ("Read maps from a server", &["watch", "get", "vehicles"]),
+    ("Read files", &["export", "info"]),
+    ("Send sensor data", &["send", "ingest", "simulate"]),
+    ("Shell", &["completions"]),
+];
+
+#[cfg(feature = "sim")]
+const EXIT_CODES: &str = "Exit codes: 0 success, 1 failure, 2 wrong usage.";
+#[cfg(not(feature = "sim"))]
+const EXIT_CODES: &str = "Exit codes: 0 success, 1 failure, 2 wrong usage.\n\nThis build is without the feature `sim`: \
+    `demo`, `simulate`, `evaluate sim:NAME` and the bad network of `send` are not in it.";
+
+/// Runs the command line of this process.
+pub fn main() -> ExitCode {
+    let matches = command().get_matches();
+    let arguments = Arguments::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
+    start_logs(arguments.log_format);
+    match run(arguments.command) {
+        Ok(code) => code,
+        Err(error) => {
+            eprintln!("clearway: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn start_logs(format: LogFormat) {
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,zenoh=error"));
+    let logs = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    match format {
+        LogFormat::Text => logs.with_ansi(std::io::stderr().is_terminal()).init(),
+        LogFormat::Json => logs.json().init(),
+    }
+}
+
+fn run(command: Command) -> Result<ExitCode> {
+    match command {
+        #[cfg(feature = "sim")]
+        Command::Demo(options) => demo::command::run(options)?,
+        Command::Serve(options) => serve::run(&options)?,
+        Command::Replay(options) => replay::run(*options)?,
+        Command::Verify(options) => return verify::run(&options),
+        Command::Evaluate(options) => evaluate::run(&options)?,
+        Command::Check(options) => check::run(&options)?,
+        Command::Watch(options) => watch::run(&options)?,
+        Command::Get(options) => get::run(&options)?,
+        Command::Vehicles(options) => vehicles::run(&options)?,
+        Command::Export(options) => export::run(&options)?,
+        Command::Info(options) => info::run(&options)?,
+        Command::Send(options) => send::run(&options)?,
+        Command::Ingest(options) => ingest::run(&options)?,
+        #[cfg(feature = "sim")]
+        Command::Simulate(options) => simulate::run(&options)?,
+        Command::Completions(options) => completions::run(&options, self::command())?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The command line as clap reads it; its help lists the subcommands by purpose.
+fn command() -> clap::Command {
+    let command = Arguments::command();
+    let list = grouped_subcommands(&command);
+    let template = format!("{{about}}\n\n{{usage-heading}} {{usage}}\n{list}\nOptions:\n{{options}}{{after-help}}\n");
+    command.help_template(StyledStr::from(template))
+}
+
+/// The list of subcommands under the headings of [`GROUPS`]. clap lists them under one heading only.
+fn grouped_subcommands(command: &clap::Command) -> String {
+    let styles = clap::builder::Styles::styled();
+    let (header, literal) = (styles.get_header(), styles.get_literal());
+    let mut list = String::new();
+    for (purpose, names) in GROUPS {
+        // Writing to a string cannot fail.
+        let _ = writeln!(list, "\n{header}{purpose}:{header:#}");
+        for subcommand in names.iter().filter_map(|name| command.find_subcommand(name)) {
+            let about = subcommand.get_about().map(ToString::to_string).unwrap_or_default();
+            let _ = writeln!(list, "  {literal}{:<11}{literal:#}  {about}", subcommand.get_name());
+        }
+    }
+    list
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_sound() {
+        command().debug_assert();
+    }
+
+    #[test]
+    fn help_lists_every_subcommand_once_and_in_the_order_of_its_definition() {
+        let command = command();
+        let defined: Vec<&str> = command.get_subcommands().map(clap::Command::get_name).collect();
+        let grouped = GROUPS.iter().flat_map(|(_, names)| *names).copied();
+        let listed: Vec<&str> = grouped.filter(|name| command.find_subcommand(name).is_some()).collect();
+        assert_eq!(listed, defined);
+    }
+
+    #[test]
+    fn every_line_of_the_help_fits_a_terminal_of_120_columns() {
+        let help = command().render_help().to_string();
+        assert!(help.lines().all(|line| line.chars().count() <= 120), "{help}");
+    }
+}

@@ -1,41 +1,48 @@
-//! What a server knows of its vehicles.
+//! `clearway vehicles`: a server -> the state of its vehicles.
 
 use anyhow::Result;
 use clap::Args;
 use clearway_client::{now_ns, v1};
 use serde_json::{Value, json};
 
-use super::{Server, say};
+use super::connection::{ServerOptions, explain};
+use super::output::{block_on, print_line};
+use crate::status::{ledger_json, sensor_json};
 
-/// List a server's vehicles: maps, sensors, what was refused or lost, readers, recorder.
+/// List the vehicles of a server: maps, sensors, refused and lost datagrams, readers, recording.
 #[derive(Args)]
+#[command(after_help = "Examples:
+  clearway vehicles
+  clearway vehicles --server vehicle.local:50051 --json")]
 pub struct Options {
     #[command(flatten)]
-    server: Server,
-    /// One JSON array.
+    server: ServerOptions,
+    /// Print one JSON array.
     #[arg(long)]
     json: bool,
 }
 
-/// Lists.
+/// Prints the state of every vehicle.
 ///
 /// # Errors
-/// What the server says.
-pub async fn run(options: Options) -> Result<()> {
-    let vehicles = options.server.connect().await?.vehicles().await?;
+/// [`ClientError`](clearway_client::ClientError) if the server refuses or does not answer.
+pub fn run(options: &Options) -> Result<()> {
+    block_on(list(options))
+}
+
+async fn list(options: &Options) -> Result<()> {
+    let vehicles = options.server.connect().await?.vehicles().await.map_err(explain)?;
     let now = now_ns();
     if options.json {
         let documents: Vec<_> = vehicles.iter().map(|vehicle| document(vehicle, now)).collect();
-        say(&serde_json::to_string_pretty(&documents)?)?;
+        print_line(&serde_json::to_string_pretty(&documents)?)?;
         return Ok(());
     }
-    for vehicle in &vehicles {
-        for line in lines(vehicle, now) {
-            say(&line)?;
-        }
+    for line in vehicles.iter().flat_map(|vehicle| lines(vehicle, now)) {
+        print_line(&line)?;
     }
     if vehicles.is_empty() {
-        say("the server has no vehicles")?;
+        print_line("the server has no vehicles")?;
     }
     Ok(())
 }
@@ -47,9 +54,9 @@ fn age_ms(vehicle: &v1::Vehicle, now: i64) -> Option<f64> {
 fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
     let ledger = vehicle.ledger.clone().unwrap_or_default();
     let recorder = vehicle.recorder.clone().unwrap_or_default();
-    let sensors = vehicle.sensors.iter().map(|s| {
-        let mut sensor = super::document::sensor(s);
-        sensor["ledger"] = vehicle.sensor_ledgers.get(&s.name).map(ledger_document).into();
+    let sensors = vehicle.sensors.iter().map(|state| {
+        let mut sensor = sensor_json(state);
+        sensor["ledger"] = vehicle.sensor_ledgers.get(&state.name).map(ledger_json).into();
         sensor
     });
     json!({
@@ -59,7 +66,7 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
         "maps": vehicle.maps,
         "newest_age_ms": age_ms(vehicle, now),
         "sensors": sensors.collect::<Vec<_>>(),
-        "ledger": ledger_document(&ledger),
+        "ledger": ledger_json(&ledger),
         "observations_refused": vehicle.observations_refused,
         "recorder": {"file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost},
         "readers": vehicle.readers,
@@ -69,57 +76,21 @@ fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
     })
 }
 
-fn ledger_document(ledger: &v1::Ledger) -> Value {
-    json!({
-        "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
-        "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
-        "points_dropped": ledger.points_dropped, "own_body": ledger.own_body, "through_body": ledger.through_body,
-        "blind": ledger.blind,
-        "poses": ledger.poses, "poses_refused": ledger.poses_refused,
-        "roads": ledger.roads, "roads_refused": ledger.roads_refused,
-    })
-}
-
-fn ledger_line(ledger: &v1::Ledger) -> String {
-    let refused: Vec<_> = ledger.refused.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
-    let refused = if refused.is_empty() { "0".into() } else { refused.join(", ") };
-    format!(
-        "datagrams: {} received, {} decoded, {} telemetry, refused {refused}; lost {}",
-        ledger.received, ledger.decoded, ledger.telemetry, ledger.lost
-    )
-}
-
+/// The lines for one vehicle.
 fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
     let age = age_ms(vehicle, now).map_or("none yet".to_owned(), |age| format!("newest {age:.0} ms old"));
     let mut lines =
         vec![format!("{}: {} maps, {age}; layers {}", vehicle.name, vehicle.maps, vehicle.layers.join(", "))];
-    for s in &vehicle.sensors {
-        let partial = if s.partial.is_empty() { String::new() } else { format!(", partial ({})", s.partial) };
-        let sectors: Vec<_> = s.blocked_sectors.iter().map(|b| format!("{} to {} deg", b.from_deg, b.to_deg)).collect();
-        let lasers: Vec<_> = s.blocked_lasers.iter().map(|laser| format!("laser {laser}")).collect();
-        let blocked = [sectors, lasers].concat().join(", ");
-        let blocked = if blocked.is_empty() { blocked } else { format!(", BLOCKED: {blocked}") };
-        lines.push(format!(
-            "  sensor {} ({}): {:.0} rpm, {} of {} packets and {} returns a turn, {:.1} % of the turn{partial}{blocked}, clock {} \
-             (host {:+} ms)",
-            s.name,
-            s.model,
-            s.rpm,
-            s.packets,
-            s.packets_expected,
-            s.returns,
-            100.0 * s.completeness,
-            s.clock,
-            s.clock_offset_ms
-        ));
-        lines.extend(vehicle.sensor_ledgers.get(&s.name).map(|ledger| format!("    {}", ledger_line(ledger))));
+    for state in &vehicle.sensors {
+        lines.push(sensor_line(state));
+        lines.extend(vehicle.sensor_ledgers.get(&state.name).map(|ledger| format!("    {}", ledger_line(ledger))));
     }
     if let Some(ledger) = &vehicle.ledger {
         lines.push(format!("  {}, dropped by the kernel {}", ledger_line(ledger), ledger.kernel_drops));
         let roads_refused: u64 = ledger.roads_refused.values().sum();
         if ledger.poses + ledger.poses_refused + ledger.roads + roads_refused > 0 {
             lines.push(format!(
-                "  poses: {} taken, {} refused; roads: {} taken, {roads_refused} refused",
+                "  poses: {} accepted, {} refused; roads: {} accepted, {roads_refused} refused",
                 ledger.poses, ledger.poses_refused, ledger.roads
             ));
         }
@@ -132,7 +103,37 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
         Some(r) => lines.push(format!("  recording {}: {} events, {} maps, lost {}", r.file, r.events, r.maps, r.lost)),
         None => lines.push("  not recording".into()),
     }
-    let readers: Vec<_> = vehicle.readers.iter().map(|(way, n)| format!("{way} {n}")).collect();
+    let readers: Vec<_> = vehicle.readers.iter().map(|(transport, n)| format!("{transport} {n}")).collect();
     lines.push(format!("  readers: {}", if readers.is_empty() { "none".into() } else { readers.join(", ") }));
     lines
+}
+
+fn sensor_line(state: &v1::SensorState) -> String {
+    let partial = if state.partial.is_empty() { String::new() } else { format!(", partial ({})", state.partial) };
+    let sectors = state.blocked_sectors.iter().map(|sector| format!("{} to {} deg", sector.from_deg, sector.to_deg));
+    let lasers = state.blocked_lasers.iter().map(|laser| format!("laser {laser}"));
+    let blocked = sectors.chain(lasers).collect::<Vec<_>>().join(", ");
+    let blocked = if blocked.is_empty() { blocked } else { format!(", BLOCKED: {blocked}") };
+    format!(
+        "  sensor {} ({}): {:.0} rpm, {} of {} packets and {} returns a revolution, {:.1} % of the revolution{partial}\
+         {blocked}, clock {} (host {:+} ms)",
+        state.name,
+        state.model,
+        state.rpm,
+        state.packets,
+        state.packets_expected,
+        state.returns,
+        100.0 * state.completeness,
+        state.clock,
+        state.clock_offset_ms
+    )
+}
+
+fn ledger_line(ledger: &v1::Ledger) -> String {
+    let refused: Vec<_> = ledger.refused.iter().map(|(reason, n)| format!("{reason} {n}")).collect();
+    let refused = if refused.is_empty() { "0".into() } else { refused.join(", ") };
+    format!(
+        "datagrams: {} received, {} decoded, {} telemetry, refused {refused}; lost {}",
+        ledger.received, ledger.decoded, ledger.telemetry, ledger.lost
+    )
 }

@@ -93,7 +93,7 @@ pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, &'st
     let v1::Sensor { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, .. } = sensor;
     let plain = SensorConfig::new(sensor.name, Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg });
     let (blind_deg, []) = sensor.blind_deg.as_chunks() else { return Err("pairs in blind_deg") };
-    let model = sensor.model.map(|name| Model::from_name(&name).ok_or("known sensor model")).transpose()?;
+    let model = sensor.model.map(|name| name.parse::<Model>().map_err(|_| "known sensor model")).transpose()?;
     Ok(SensorConfig {
         model,
         rpm: sensor.rpm,

@@ -14,7 +14,7 @@ use clearway_proto::region::{RegionError, crop};
 use clearway_proto::v1;
 use prost::Message;
 
-use crate::ingest::locked;
+use crate::sync::locked;
 use crate::encode::EncodedMap;
 
 /// What readers with regions of their own may keep in memory, beside the map: more are made again for each.

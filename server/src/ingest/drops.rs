@@ -1,5 +1,6 @@
-//! What stayed outside a door: readings by cause, strangers, refused messages by their own names. The door tells the
-//! engine of it as [`Body::Lost`](clearway_mapping::event::Body::Lost); until then the status adds it to the ledger.
+//! Counts of the readings that did not become events: by cause, by unknown sender, by the reason of a refused message.
+//! The event queue reports the counts to the engine as [`Body::Lost`](clearway_mapping::event::Body::Lost); until then
+//! the status adds them to the ledger.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
@@ -8,39 +9,40 @@ use std::sync::Mutex;
 use clearway_mapping::event::Cause;
 use clearway_mapping::ledger::Ledger;
 
-use super::locked;
+use crate::sync::locked;
 
-/// Strangers remembered, newest last.
-const STRANGERS: usize = 8;
+/// Number of unknown senders that are remembered. Ours: enough to find a sensor with a wrong address.
+const UNKNOWN_SENDERS_MAX: usize = 8;
 
-/// What stayed outside a door; outlives its queue.
+/// The drop counters of one vehicle; they outlive its queue.
 #[derive(Debug, Default)]
-pub struct Outside {
-    pub(super) untold: Mutex<Untold>,
-    strangers: Mutex<VecDeque<Stranger>>,
-    /// What the ledger calls `observation`, by its own name.
-    observations: Mutex<BTreeMap<&'static str, u64>>,
+pub struct DropCounters {
+    pub(super) unreported: Mutex<Unreported>,
+    /// The newest last.
+    unknown_senders: Mutex<VecDeque<UnknownSender>>,
+    /// Refused messages by reason; the ledger counts all of them as `observation`.
+    refused_messages: Mutex<BTreeMap<&'static str, u64>>,
 }
 
-/// Readings that stayed outside and that the engine has not been told of yet; a full queue comes first.
-pub(super) type Untold = BTreeMap<(Cause, u16), u64>;
+/// Number of dropped readings that are not reported to the engine yet, by cause and sensor. A full queue comes first.
+pub(super) type Unreported = BTreeMap<(Cause, u16), u64>;
 
-/// A sender that is none of the vehicle's sensors.
+/// A sender of datagrams that is none of the vehicle's sensors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Stranger {
-    /// Whence its datagrams came.
+pub struct UnknownSender {
+    /// Source address of its datagrams.
     pub address: SocketAddr,
-    /// How many, since it is remembered.
+    /// Number of its datagrams since it is remembered.
     pub datagrams: u64,
-    /// When the newest came, ns since the Unix epoch.
+    /// Arrival of its newest datagram, ns since the Unix epoch.
     pub newest_ns: i64,
 }
 
-impl Outside {
-    /// Adds what the engine has not been told of yet to its ledger, and to those of its sensors.
-    pub fn add_to<'a>(&self, ledger: &mut Ledger, sensors: impl IntoIterator<Item = &'a mut Ledger>) {
+impl DropCounters {
+    /// Adds the drops that are not reported to the engine yet to the vehicle's ledger and to the ledgers of its sensors.
+    pub fn add_unreported_to<'a>(&self, ledger: &mut Ledger, sensors: impl IntoIterator<Item = &'a mut Ledger>) {
         let mut sensors: Vec<_> = sensors.into_iter().collect();
-        for (&(cause, source), &count) in &*locked(&self.untold) {
+        for (&(cause, source), &count) in &*locked(&self.unreported) {
             ledger.record_lost(cause, count);
             if let Some(sensor) = sensors.get_mut(usize::from(source)).filter(|_| cause.has_source()) {
                 sensor.record_lost(cause, count);
@@ -48,44 +50,44 @@ impl Outside {
         }
     }
 
-    /// Counts readings that stay outside.
-    pub(crate) fn leave(&self, source: u16, cause: Cause, count: u64) {
+    /// Counts `count` dropped readings of a sensor.
+    pub(crate) fn record(&self, source: u16, cause: Cause, count: u64) {
         if count > 0 {
-            *locked(&self.untold).entry((cause, source)).or_default() += count;
+            *locked(&self.unreported).entry((cause, source)).or_default() += count;
         }
     }
 
-    /// Counts messages that are no observations of a sensor, or of [`clearway_mapping::event::NOBODY`]: the ledger has
-    /// one word for them, here each keeps its `reason`.
-    pub(crate) fn leave_observations(&self, source: u16, reason: &'static str, count: u64) {
-        self.leave(source, Cause::Observation, count);
-        *locked(&self.observations).entry(reason).or_default() += count;
+    /// Counts `count` messages that were refused for `reason`. `source` is the index of a sensor, or
+    /// [`clearway_mapping::event::UNKNOWN_SOURCE`].
+    pub(crate) fn record_refused_messages(&self, source: u16, reason: &'static str, count: u64) {
+        self.record(source, Cause::Observation, count);
+        *locked(&self.refused_messages).entry(reason).or_default() += count;
     }
 
-    /// Remembers a stranger's datagram.
-    pub(super) fn meet(&self, address: SocketAddr, newest_ns: i64) {
-        let mut strangers = locked(&self.strangers);
-        let known = strangers.iter().position(|stranger| stranger.address == address);
-        let known = known.and_then(|index| strangers.remove(index));
-        if known.is_none() && strangers.len() == STRANGERS {
-            strangers.pop_front();
+    /// Remembers the sender of a datagram that arrived at `newest_ns`.
+    pub(super) fn record_unknown_sender(&self, address: SocketAddr, newest_ns: i64) {
+        let mut senders = locked(&self.unknown_senders);
+        let known = senders.iter().position(|sender| sender.address == address);
+        let known = known.and_then(|index| senders.remove(index));
+        if known.is_none() && senders.len() == UNKNOWN_SENDERS_MAX {
+            senders.pop_front();
         }
-        let datagrams = known.map_or(0, |stranger| stranger.datagrams) + 1;
-        strangers.push_back(Stranger { address, datagrams, newest_ns });
+        let datagrams = known.map_or(0, |sender| sender.datagrams) + 1;
+        senders.push_back(UnknownSender { address, datagrams, newest_ns });
     }
 
-    /// The observations refused since the server's start, by reason.
-    pub fn observations_refused(&self) -> BTreeMap<&'static str, u64> {
-        locked(&self.observations).clone()
+    /// Number of refused messages since the server's start, by reason.
+    pub fn refused_messages(&self) -> BTreeMap<&'static str, u64> {
+        locked(&self.refused_messages).clone()
     }
 
-    /// The last few strangers, newest last.
-    pub fn strangers(&self) -> Vec<Stranger> {
-        locked(&self.strangers).iter().copied().collect()
+    /// The most recent unknown senders, the newest last.
+    pub fn unknown_senders(&self) -> Vec<UnknownSender> {
+        locked(&self.unknown_senders).iter().copied().collect()
     }
 }
 
-/// What is told next: a full queue at once, all else when it `is_due`.
-pub(super) fn next_told(untold: &Untold, is_due: bool) -> Option<(Cause, u16)> {
-    untold.keys().next().copied().filter(|(cause, _)| is_due || *cause == Cause::Queue)
+/// The cause and sensor to report next: drops by a full queue at once, all others only if the report `is_due`.
+pub(super) fn next_unreported(unreported: &Unreported, is_due: bool) -> Option<(Cause, u16)> {
+    unreported.keys().next().copied().filter(|(cause, _)| is_due || *cause == Cause::Queue)
 }

@@ -1,97 +1,109 @@
-//! One vehicle as those who send observations see it: its sensors, its limits, and the way to its door. gRPC and zenoh
-//! come in here alike.
+//! The gateway of one vehicle: one observation of a client -> events on the vehicle's queue. gRPC and zenoh both use it.
 
 use std::sync::{Arc, Mutex};
 
 use clearway_mapping::config::{SensorConfig, VehicleConfig};
-use clearway_mapping::event::{Body, Cause, NOBODY};
+use clearway_mapping::event::{Body, Cause, UNKNOWN_SOURCE};
 use clearway_proto::v1;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
 use super::observation::{self, Limits, ObservationError};
-use super::receipt::{Account, Mark, Ticket, Verdict, Verdicts};
-use super::{Door, WeakDoor, locked};
+use super::queue::EventQueue;
+use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender, Receipt};
 use crate::config::Vehicle;
-use crate::publish::Unknown;
+use crate::directory::{UnknownNameError, find_vehicle};
+use crate::sync::locked;
 
-/// Where one vehicle's observations enter.
+/// The gateway of one vehicle.
 #[derive(Debug)]
-pub struct Entrance {
+pub struct Gateway {
     /// The vehicle's name.
     pub vehicle: Arc<str>,
-    /// What one observation may be.
+    /// Limits of one observation.
     pub limits: Limits,
-    /// Events of one client that may wait for their verdict: all streams together fill half the vehicle's queue, so
-    /// that the other half is the UDP door's.
+    /// Greatest number of events in flight of one client. All streams together fill half the vehicle's queue; the other
+    /// half is for UDP.
     pub in_flight_max: usize,
-    /// With the sensors that were declared: what the engine will have made of the events sent so far.
+    /// With the declared sensors: the configuration that the engine will have after the events pushed so far.
     config: Mutex<VehicleConfig>,
     streams: Arc<Semaphore>,
     streams_max: usize,
-    door: WeakDoor,
+    queue: EventQueue,
 }
 
-impl Entrance {
-    /// To a vehicle's door.
-    pub fn new(vehicle: &Vehicle, door: &Door) -> Self {
+/// All streams that a vehicle allows are open.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("vehicle {vehicle} has {streams_max} streams, as many as are allowed")]
+pub struct StreamLimitError {
+    /// The vehicle's name.
+    pub vehicle: Arc<str>,
+    /// Number of streams allowed.
+    pub streams_max: usize,
+}
+
+impl Gateway {
+    /// The gateway to a vehicle's queue.
+    pub fn new(vehicle: &Vehicle, queue: &EventQueue) -> Self {
         let streams_max = vehicle.ingest.streams_max;
         Self {
             vehicle: vehicle.name.as_str().into(),
-            limits: Limits::of_points(vehicle.ingest.points_max),
+            limits: Limits::from_points_max(vehicle.ingest.points_max),
             in_flight_max: (vehicle.queue / (2 * streams_max)).max(1),
             config: Mutex::new(vehicle.core()),
             streams: Arc::new(Semaphore::new(streams_max)),
             streams_max,
-            door: door.weak(),
+            queue: queue.clone(),
         }
     }
 
-    /// A place among the vehicle's streams; `Err` with how many there are.
+    /// A permit for one stream of this vehicle; the stream holds it while it is open.
     ///
     /// # Errors
-    /// The number of streams allowed, all of which are taken.
-    pub fn stream(&self) -> Result<OwnedSemaphorePermit, usize> {
-        self.streams.clone().try_acquire_owned().map_err(|_| self.streams_max)
+    /// [`StreamLimitError`] if all streams that the vehicle allows are open.
+    pub fn acquire_stream(&self) -> Result<OwnedSemaphorePermit, StreamLimitError> {
+        let permit = self.streams.clone().try_acquire_owned();
+        permit.map_err(|_| StreamLimitError { vehicle: self.vehicle.clone(), streams_max: self.streams_max })
     }
 
-    /// Takes one observation, as far as the door: `account` and, by and by, `verdicts` hear what becomes of it.
+    /// Checks one observation of `bytes` bytes and pushes its events. An immediate refusal goes to `session`; the
+    /// outcome of each event goes to `outcomes`.
     ///
     /// # Errors
-    /// [`Unknown::Sensor`], listing the known ones; the account has it already.
-    pub fn take(
+    /// [`UnknownNameError::Sensor`] if the vehicle has no such sensor; `session` has the refusal already.
+    pub fn push(
         &self,
         observation: v1::Observation,
         bytes: usize,
-        account: &mut Account,
-        verdicts: &Verdicts,
-    ) -> Result<(), Unknown> {
+        session: &mut ClientSession,
+        outcomes: &OutcomeSender,
+    ) -> Result<(), UnknownNameError> {
         let (client, number) = (observation.client, observation.number);
-        let of_vehicle = is_of_vehicle(&observation);
-        if let Err(message) = account.count(number) {
-            self.refuse(account, number, "number", message);
+        let concerns_vehicle = concerns_vehicle(&observation);
+        if let Err(error) = session.check_number(number) {
+            self.refuse(session, number, "number", error.to_string());
             return Ok(());
         }
-        let source = match self.source(&observation) {
+        let source = match self.source_of(&observation) {
             Ok(source) => source,
             Err(unknown) => {
-                account.enter(number, 0, 0);
-                self.refuse(account, number, "source", unknown.to_string());
+                session.begin(number, 0, 0);
+                self.refuse(session, number, "source", unknown.to_string());
                 return Err(unknown);
             }
         };
-        match observation::bodies(observation, &self.limits) {
+        match observation::decode(observation, &self.limits) {
             Err(error) => {
-                account.enter(number, 0, 0);
-                self.leave(if of_vehicle { NOBODY } else { source }, error.reason());
-                account.refuse(number, error.reason(), error.to_string(), 1);
+                session.begin(number, 0, 0);
+                self.record_drop(if concerns_vehicle { UNKNOWN_SOURCE } else { source }, error.reason());
+                session.refuse(number, error.reason(), error.to_string(), 1);
             }
             Ok(bodies) => {
-                account.enter(number, bodies.len(), bytes);
+                session.begin(number, bodies.len(), bytes);
                 for (captured_ns, body) in bodies {
-                    let ticket = Ticket::new(Mark { client, number }, verdicts);
+                    let receipt = Receipt::new(ObservationId { client, number }, outcomes);
                     match body {
-                        Body::Sensor(sensor) => self.declare(captured_ns, sensor, ticket),
-                        body => _ = self.enter(captured_ns, source, body, ticket),
+                        Body::Sensor(sensor) => self.push_declaration(captured_ns, sensor, receipt),
+                        body => _ = self.push_event(captured_ns, source, body, receipt),
                     }
                 }
             }
@@ -99,68 +111,65 @@ impl Entrance {
         Ok(())
     }
 
-    /// Counts and reports what did not become an event.
-    pub fn refuse(&self, account: &mut Account, number: u64, reason: &'static str, message: String) {
-        self.count(reason);
-        account.refuse(number, reason, message, 1);
+    /// Counts a refused observation and adds the refusal to the client's next report.
+    pub fn refuse(&self, session: &mut ClientSession, number: u64, reason: &'static str, message: String) {
+        self.record_refusal(reason);
+        session.refuse(number, reason, message, 1);
     }
 
-    /// [`Entrance::refuse`] of an error.
-    pub fn refuse_error(&self, account: &mut Account, number: u64, error: &ObservationError) {
-        self.refuse(account, number, error.reason(), error.to_string());
+    /// Counts a message that is not an observation and adds the refusal to the client's next report.
+    pub fn refuse_message(&self, session: &mut ClientSession, number: u64, error: &ObservationError) {
+        self.refuse(session, number, error.reason(), error.to_string());
     }
 
-    /// Counts what did not become an event, where nobody can be told.
-    pub fn count(&self, reason: &'static str) {
-        self.leave(NOBODY, reason);
+    /// Counts a refused message of a client that cannot get a report.
+    pub fn record_refusal(&self, reason: &'static str) {
+        self.record_drop(UNKNOWN_SOURCE, reason);
     }
 
-    fn leave(&self, source: u16, reason: &'static str) {
-        let outside = self.door.outside();
+    fn record_drop(&self, source: u16, reason: &'static str) {
+        let drops = self.queue.drops();
         match reason {
-            "queue" => outside.leave(source, Cause::Queue, 1),
-            "source" => outside.leave(source, Cause::Sender, 1),
-            _ => outside.leave_observations(source, reason, 1),
+            "queue" => drops.record(source, Cause::Queue, 1),
+            "source" => drops.record(source, Cause::Sender, 1),
+            _ => drops.record_refused_messages(source, reason, 1),
         }
     }
 
-    /// Whether it is on the queue; the ticket knows where it is not.
-    fn enter(&self, captured_ns: Option<i64>, source: u16, body: Body, ticket: Ticket) -> bool {
-        match self.door.door() {
-            Some(door) => door.enter_observed(captured_ns, source, body, ticket).unwrap_or(false),
-            None => false,
-        }
+    /// Returns true if the event is on the queue; otherwise the receipt delivers the refusal.
+    fn push_event(&self, captured_ns: Option<i64>, source: u16, body: Body, receipt: Receipt) -> bool {
+        self.queue.push_observation(captured_ns, source, body, receipt).unwrap_or(false)
     }
 
-    /// Declares a sensor as the next one, or one that is there already. The engine will judge it as it is judged here,
-    /// so that its name can be used at once.
-    fn declare(&self, captured_ns: Option<i64>, sensor: Box<SensorConfig>, ticket: Ticket) {
+    /// Pushes the declaration of a new sensor, or of one that exists already. The configuration here changes as the
+    /// engine's will, so that the next observation can name the sensor.
+    fn push_declaration(&self, captured_ns: Option<i64>, sensor: Box<SensorConfig>, receipt: Receipt) {
         let mut config = locked(&self.config);
         let before = config.sensors.len();
         let index = config.sensors.iter().position(|known| *known == *sensor).unwrap_or(before);
         let declared = config.declare(index, &sensor).map_err(|error| error.to_string());
         match declared.and_then(|_| u16::try_from(index).map_err(|error| error.to_string())) {
             Ok(source) => {
-                if !self.enter(captured_ns, source, Body::Sensor(sensor), ticket) {
+                if !self.push_event(captured_ns, source, Body::Sensor(sensor), receipt) {
                     config.sensors.truncate(before);
                 }
             }
             Err(message) => {
-                self.count("sensor");
-                ticket.tell(Verdict::Refused { reason: "sensor", message });
+                self.record_refusal("sensor");
+                receipt.deliver(Outcome::Refused { reason: "sensor", message });
             }
         }
     }
 
-    /// The sensor an observation is of; 0 where it concerns the whole vehicle.
-    fn source(&self, observation: &v1::Observation) -> Result<u16, Unknown> {
+    /// Index of the observation's sensor; 0 if the observation concerns the whole vehicle.
+    fn source_of(&self, observation: &v1::Observation) -> Result<u16, UnknownNameError> {
         let name = &observation.sensor;
         let sensors = &locked(&self.config).sensors;
-        if is_of_vehicle(observation) || (name.is_empty() && sensors.len() == 1) {
+        if concerns_vehicle(observation) || (name.is_empty() && sensors.len() == 1) {
             return Ok(0);
         }
         let index = sensors.iter().position(|sensor| sensor.name == *name);
-        index.and_then(|index| u16::try_from(index).ok()).ok_or_else(|| Unknown::Sensor {
+        index.and_then(|index| u16::try_from(index).ok()).ok_or_else(|| UnknownNameError::Sensor {
             name: name.clone(),
             vehicle: self.vehicle.to_string(),
             known: sensors.iter().map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", "),
@@ -168,61 +177,55 @@ impl Entrance {
     }
 }
 
-/// Whether an observation is of no sensor but of the whole vehicle.
-fn is_of_vehicle(observation: &v1::Observation) -> bool {
+/// True if an observation concerns no sensor but the whole vehicle.
+fn concerns_vehicle(observation: &v1::Observation) -> bool {
     use v1::observation::Body::{Declaration, EgoPose, Road};
     matches!(observation.body, Some(EgoPose(_) | Road(_) | Declaration(_)) | None)
 }
 
-/// The entrances of all vehicles that have one, in the order of the configuration.
+/// The gateways of all vehicles that allow observations, in the order of the configuration.
 #[derive(Clone, Debug)]
-pub struct Entrances {
-    all: Arc<[Arc<Entrance>]>,
-    /// Places for the streams of all vehicles: one that has not said yet whose it is takes one too.
+pub struct Gateways {
+    all: Arc<[Arc<Gateway>]>,
+    /// One permit for each stream of any vehicle, also for a stream that has not named its vehicle yet.
     streams: Arc<Semaphore>,
     stop: watch::Receiver<bool>,
 }
 
-impl Entrances {
-    /// Of these vehicles; streams end once `stop` is true.
-    pub fn new(all: impl IntoIterator<Item = Entrance>, stop: watch::Receiver<bool>) -> Self {
-        let all: Arc<[Arc<Entrance>]> = all.into_iter().map(Arc::new).collect();
-        let streams = Arc::new(Semaphore::new(all.iter().map(|entrance| entrance.streams_max).sum()));
+impl Gateways {
+    /// The gateways `all`; their streams end once `stop` is true.
+    pub fn new(all: impl IntoIterator<Item = Gateway>, stop: watch::Receiver<bool>) -> Self {
+        let all: Arc<[Arc<Gateway>]> = all.into_iter().map(Arc::new).collect();
+        let streams = Arc::new(Semaphore::new(all.iter().map(|gateway| gateway.streams_max).sum()));
         Self { all, streams, stop }
     }
 
-    /// One a vehicle.
-    pub fn all(&self) -> &[Arc<Entrance>] {
+    /// One gateway a vehicle.
+    pub fn all(&self) -> &[Arc<Gateway>] {
         &self.all
     }
 
-    /// The vehicle of this name; the only one where `name` is empty.
+    /// The gateway of the vehicle `name`; of the only vehicle if `name` is empty.
     ///
     /// # Errors
-    /// [`Unknown::Vehicle`], listing the known ones.
-    pub fn find(&self, name: &str) -> Result<&Arc<Entrance>, Unknown> {
-        if let ("", [only]) = (name, &self.all[..]) {
-            return Ok(only);
-        }
-        self.all.iter().find(|entrance| &*entrance.vehicle == name).ok_or_else(|| {
-            let known: Vec<&str> = self.all.iter().map(|entrance| &*entrance.vehicle).collect();
-            Unknown::Vehicle { name: name.to_owned(), known: known.join(", ") }
-        })
+    /// [`UnknownNameError::Vehicle`] if no vehicle has the name, or if it is empty and there is not exactly one vehicle.
+    pub fn find(&self, name: &str) -> Result<&Arc<Gateway>, UnknownNameError> {
+        find_vehicle(&self.all, name, |gateway| &gateway.vehicle)
     }
 
-    /// A place for one more stream, where there is one.
-    pub fn stream(&self) -> Option<OwnedSemaphorePermit> {
+    /// A permit for one stream of any vehicle; `None` if all are in use.
+    pub fn acquire_stream(&self) -> Option<OwnedSemaphorePermit> {
         self.streams.clone().try_acquire_owned().ok()
     }
 
-    /// The longest message any vehicle takes.
+    /// Length of the longest message that any vehicle allows, in bytes.
     pub fn message_bytes_max(&self) -> usize {
-        self.all.iter().map(|entrance| entrance.limits.message_bytes_max).max().unwrap_or_default()
+        self.all.iter().map(|gateway| gateway.limits.message_bytes_max).max().unwrap_or_default()
     }
 
     /// Resolves when the server stops.
     pub async fn stopped(&mut self) {
-        // An error means that the sender is gone, which is a stop too.
+        // An error means that the sender is gone, so the server stops as well.
         let _ = self.stop.wait_for(|stop| *stop).await;
     }
 }

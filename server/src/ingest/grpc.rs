@@ -1,8 +1,9 @@
 //! Observations over gRPC: `clearway.v1.IngestService`.
 //!
-//! A stream reads its next observation only while the events before it are within the vehicle's limits and the peer
-//! takes its reports: a fast ingester waits, and holds no more than that. What becomes of the events comes back from
-//! the engine by [`Ticket`](super::receipt::Ticket) and is told in as few reports as the transport takes.
+//! A stream reads its next observation only while its events in flight are within the vehicle's limits and the peer
+//! receives its reports. A fast client therefore waits, and the server holds no more than the limits. The engine returns
+//! the outcome of each event by its [`Receipt`](super::receipt::Receipt); the stream collects outcomes into as few
+//! reports as the transport can send.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -15,28 +16,28 @@ use tokio::sync::OwnedSemaphorePermit;
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
 use tonic::{Code, Request, Response, Status, Streaming};
 
-use super::gateway::{Entrance, Entrances};
-use super::receipt::{Account, Mark, Verdict, Verdicts};
+use super::gateway::{Gateway, Gateways};
+use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
 
-/// Whoever opens a stream says at once which vehicle it is for.
+/// A new stream must name its vehicle within this time. Ours: no client has a reason to wait.
 const OPENING_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// The service.
+/// The implementation of `clearway.v1.IngestService`.
 pub struct Ingest {
-    entrances: Entrances,
+    gateways: Gateways,
 }
 
 impl Ingest {
-    /// For these vehicles.
-    pub fn new(entrances: Entrances) -> Self {
-        Self { entrances }
+    /// The service for the vehicles of these gateways.
+    pub fn new(gateways: Gateways) -> Self {
+        Self { gateways }
     }
 
-    /// As tonic serves it. A message's length is checked before room is made for it.
-    pub fn service(self) -> IngestServiceServer<Self> {
-        let message_bytes_max = self.entrances.message_bytes_max();
+    /// The service as tonic serves it. It refuses a message that is too long before it allocates memory for it.
+    pub fn into_service(self) -> IngestServiceServer<Self> {
+        let message_bytes_max = self.gateways.message_bytes_max();
         IngestServiceServer::new(self).max_decoding_message_size(message_bytes_max)
     }
 }
@@ -50,135 +51,135 @@ impl IngestService for Ingest {
         request: Request<Streaming<v1::Observation>>,
     ) -> Result<Response<Self::StreamStream>, Status> {
         let full = |what: &str| Status::resource_exhausted(format!("{what}; close one first"));
-        let place = self.entrances.stream().ok_or_else(|| full("every stream the server allows is open"))?;
+        let permit = self.gateways.acquire_stream().ok_or_else(|| full("every stream the server allows is open"))?;
         let mut observations = request.into_inner();
         let first = tokio::time::timeout(OPENING_TIMEOUT, observations.message())
             .await
             .map_err(|_| Status::deadline_exceeded(format!("no observation within {OPENING_TIMEOUT:?}")))?;
-        // Nobody can read which vehicle it was for: the first one counts it, so that it is in one ledger.
+        // The vehicle of an unreadable observation is unknown: the first vehicle counts it, so that one ledger has it.
         let first = first.inspect_err(|status| {
-            self.entrances.all().first().filter(|_| is_refusal(status)).inspect(|first| first.count("message"));
+            let gateway = self.gateways.all().first().filter(|_| is_refusal(status));
+            gateway.inspect(|gateway| gateway.record_refusal("message"));
         })?;
         let first = first.ok_or_else(|| Status::invalid_argument("a stream without an observation"))?;
-        let entrance = self.entrances.find(&first.vehicle)?.clone();
-        let own_place = entrance.stream().map_err(|streams_max| {
-            full(&format!("vehicle {} has {streams_max} streams, as many as are allowed", entrance.vehicle))
-        })?;
-        let mut ingester = Ingester::new(observations, entrance, self.entrances.clone(), [place, own_place]);
+        let gateway = self.gateways.find(&first.vehicle)?.clone();
+        let vehicle_permit = gateway.acquire_stream().map_err(|error| full(&error.to_string()))?;
+        let permits = [permit, vehicle_permit];
+        let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), permits);
         if first.body.is_none() {
-            ingester.greet(&first);
+            stream.acknowledge_opening(&first);
         } else {
-            ingester.take(first);
+            stream.push(first);
         }
-        Ok(Response::new(Box::pin(ingester.reports())))
+        Ok(Response::new(Box::pin(stream.reports())))
     }
 }
 
 /// One open stream.
-struct Ingester {
-    /// `None` when no more will come.
+struct IngestStream {
+    /// `None` once the stream reads no more observations.
     observations: Option<Streaming<v1::Observation>>,
-    entrance: Arc<Entrance>,
-    entrances: Entrances,
-    account: Account,
-    verdicts: Verdicts,
-    told: UnboundedReceiver<(Mark, Verdict)>,
-    /// How the stream ends, once everything in flight is reported.
+    gateway: Arc<Gateway>,
+    gateways: Gateways,
+    session: ClientSession,
+    outcome_sender: OutcomeSender,
+    outcomes: UnboundedReceiver<(ObservationId, Outcome)>,
+    /// The status that ends the stream, after everything in flight is reported.
     end: Option<Status>,
-    over: bool,
-    // Last, and only held.
-    _places: [OwnedSemaphorePermit; 2],
+    is_over: bool,
+    // The last field, so that it is dropped last.
+    _permits: [OwnedSemaphorePermit; 2],
 }
 
-impl Ingester {
+impl IngestStream {
     fn new(
         observations: Streaming<v1::Observation>,
-        entrance: Arc<Entrance>,
-        entrances: Entrances,
-        places: [OwnedSemaphorePermit; 2],
+        gateway: Arc<Gateway>,
+        gateways: Gateways,
+        permits: [OwnedSemaphorePermit; 2],
     ) -> Self {
-        let (verdicts, told) = unbounded_channel();
+        let (outcome_sender, outcomes) = unbounded_channel();
         Self {
             observations: Some(observations),
-            entrance,
-            entrances,
-            account: Account::new(0),
-            verdicts,
-            told,
+            gateway,
+            gateways,
+            session: ClientSession::new(0),
+            outcome_sender,
+            outcomes,
             end: None,
-            over: false,
-            _places: places,
+            is_over: false,
+            _permits: permits,
         }
     }
 
     fn reports(self) -> impl Stream<Item = Result<v1::IngestReport, Status>> {
-        stream::unfold(self, |mut ingester| async move {
-            if ingester.over {
+        stream::unfold(self, |mut stream| async move {
+            if stream.is_over {
                 return None;
             }
-            let report = ingester.next().await.transpose()?;
-            ingester.over = report.is_err();
-            Some((report, ingester))
+            let report = stream.next().await.transpose()?;
+            stream.is_over = report.is_err();
+            Some((report, stream))
         })
     }
 
-    /// The next report; when there is something to tell. `None` when all is told and no more will come.
+    /// Waits for the next report. `None` once everything is reported and no more observations will come.
     async fn next(&mut self) -> Result<Option<v1::IngestReport>, Status> {
         loop {
-            while let Ok((mark, verdict)) = self.told.try_recv() {
-                self.account.tell(mark.number, verdict);
+            while let Ok((id, outcome)) = self.outcomes.try_recv() {
+                self.session.record_outcome(id.number, outcome);
             }
-            if let Some(report) = self.account.report() {
+            if let Some(report) = self.session.next_report() {
                 return Ok(Some(report));
             }
-            if self.observations.is_none() && self.account.is_settled() {
+            if self.observations.is_none() && self.session.is_idle() {
                 return self.end.take().map_or(Ok(None), Err);
             }
-            let (events_max, bytes_max) = (self.entrance.in_flight_max, self.entrance.limits.message_bytes_max);
-            let room = self.account.has_room(events_max, bytes_max);
+            let (events_max, bytes_max) = (self.gateway.in_flight_max, self.gateway.limits.message_bytes_max);
+            let has_credit = self.session.has_credit(events_max, bytes_max);
             tokio::select! {
-                // Verdicts first: they make room.
+                // Outcomes first, because they give credit.
                 biased;
-                Some((mark, verdict)) = self.told.recv() => self.account.tell(mark.number, verdict),
-                () = self.entrances.stopped(), if self.observations.is_some() => {
-                    self.finish(Some(Status::unavailable("the server stops")));
+                Some((id, outcome)) = self.outcomes.recv() => self.session.record_outcome(id.number, outcome),
+                () = self.gateways.stopped(), if self.observations.is_some() => {
+                    self.stop_reading(Some(Status::unavailable("the server stops")));
                 }
-                observation = next_observation(&mut self.observations), if room => match observation {
-                    Ok(Some(observation)) => self.take(observation),
-                    Ok(None) => self.finish(None),
+                observation = next_observation(&mut self.observations), if has_credit => match observation {
+                    Ok(Some(observation)) => self.push(observation),
+                    Ok(None) => self.stop_reading(None),
                     Err(status) => {
                         if is_refusal(&status) {
-                            self.entrance.count("message");
+                            self.gateway.record_refusal("message");
                         }
-                        self.finish(Some(status));
+                        self.stop_reading(Some(status));
                     }
                 },
             }
         }
     }
 
-    /// An observation that only opens the stream.
-    fn greet(&mut self, first: &v1::Observation) {
-        // The first number is greater than none.
-        let _ = self.account.count(first.number);
-        self.account.enter(first.number, 0, 0);
+    /// Acknowledges an observation without a body, which only opens the stream.
+    fn acknowledge_opening(&mut self, first: &v1::Observation) {
+        // A first number is always valid.
+        let _ = self.session.check_number(first.number);
+        self.session.begin(first.number, 0, 0);
     }
 
-    fn take(&mut self, mut observation: v1::Observation) {
+    fn push(&mut self, mut observation: v1::Observation) {
         observation.client = 0;
         let bytes = observation.encoded_len();
-        if let Err(unknown) = self.entrance.take(observation, bytes, &mut self.account, &self.verdicts) {
-            self.finish(Some(unknown.into()));
+        if let Err(unknown) = self.gateway.push(observation, bytes, &mut self.session, &self.outcome_sender) {
+            self.stop_reading(Some(unknown.into()));
         }
     }
 
-    fn finish(&mut self, end: Option<Status>) {
+    fn stop_reading(&mut self, end: Option<Status>) {
         self.observations = None;
         self.end = end;
     }
 }
 
-/// Whether a message was too long, or no observation: not the network's doing.
+/// True if the message was too long or not an observation, false for a failure of the network.
 fn is_refusal(status: &Status) -> bool {
     matches!(status.code(), Code::OutOfRange | Code::Internal)
 }

@@ -1,8 +1,8 @@
-//! One `clearway.v1.Observation` -> what the core takes of it. Pure: nothing here reads a clock or waits.
+//! One `clearway.v1.Observation` -> the bodies of its events. Pure: this file reads no clock and never waits.
 //!
-//! Everything is bytes somebody sent: lengths are compared before anything is allocated, and what is allocated is no
-//! longer than what came. What the core can judge itself (stamps, poses, roads, lists of different lengths) is left to
-//! it: then the journal holds it too.
+//! An observation is bytes of a client. All lengths are compared before any allocation, and an allocation is no longer
+//! than the message. The core checks the rest (stamps, poses, roads, lists of different lengths), so that the journal
+//! contains those refusals.
 
 use bytes::Bytes;
 use clearway_mapping::event::Body;
@@ -11,25 +11,27 @@ use clearway_proto::v1;
 
 use crate::encode::{ego_pose_from_proto, road_from_proto, scan_from_proto, sensor_from_proto};
 
-/// What one observation may be.
+/// The limits of one observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// Points, and rays without a return, of one scan.
+    /// Greatest number of points of one scan, and of rays without a return.
     pub points_max: usize,
-    /// Bytes of one message; above what `points_max` points with all their fields take.
+    /// Greatest length of one message in bytes; more than `points_max` points with all their fields need.
     pub message_bytes_max: usize,
 }
 
-/// A third of a second of an HDL-64E: who tunnels more at once has waited too long.
+/// Greatest number of datagrams in one observation. Ours: a third of a second of an HDL-64E; a client that collects
+/// more has waited too long.
 pub const PACKETS_MAX: usize = 1024;
-/// x y z intensity ring offset_ns of a point, and a ray without a return for each second one, with something to spare.
+/// Bytes of one point in a message: x, y, z, intensity, ring and offset_ns have 22, half a ray without a return has 6,
+/// and 4 are spare.
 const POINT_BYTES: usize = 32;
-/// What a message may have beside its points.
+/// Bytes of a message beside its points. Ours: ample for the other fields.
 const MESSAGE_BYTES: usize = 64 << 10;
 
 impl Limits {
-    /// For scans of up to so many points.
-    pub fn of_points(points_max: usize) -> Self {
+    /// The limits for scans of at most `points_max` points.
+    pub fn from_points_max(points_max: usize) -> Self {
         Self { points_max, message_bytes_max: points_max.saturating_mul(POINT_BYTES).saturating_add(MESSAGE_BYTES) }
     }
 }
@@ -37,85 +39,87 @@ impl Limits {
 /// Why an observation did not become events.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ObservationError {
-    /// Bytes that are no observation.
+    /// The bytes do not decode as an observation.
     #[error("not a clearway.v1.Observation: {reason}")]
     Message {
-        /// What the decoder says.
+        /// The decoder's reason.
         reason: String,
     },
-    /// A message longer than any scan that is allowed.
+    /// The message is longer than any allowed scan.
     #[error("message of {bytes} bytes: up to {bytes_max} are allowed")]
     Length {
-        /// Its length.
+        /// The message's length.
         bytes: usize,
         /// [`Limits::message_bytes_max`].
         bytes_max: usize,
     },
-    /// Nothing in it, or something this version does not know.
+    /// The observation has no body, or one that this version does not have.
     #[error("observation without a body: scan, ego_pose, road, packets, end or declaration is allowed")]
     Body,
-    /// A list with part of a number.
-    #[error("{list} of {bytes} bytes: {number_bytes} a number are allowed")]
+    /// A packed list ends within a number.
+    #[error("{list} of {bytes} bytes: a multiple of {number_bytes} bytes is allowed")]
     Part {
-        /// Which list.
+        /// The list's field.
         list: &'static str,
-        /// Its length.
+        /// The list's length in bytes.
         bytes: usize,
-        /// Bytes of one number.
+        /// Length of one number in bytes.
         number_bytes: usize,
     },
-    /// A scan with too many points.
+    /// A scan has too many points.
     #[error("scan with {count} {what}: up to {points_max} are allowed")]
     Points {
-        /// Points or rays.
+        /// The kind of element: points, rays, ...
         what: &'static str,
-        /// How many.
+        /// Number of elements.
         count: usize,
         /// [`Limits::points_max`].
         points_max: usize,
     },
-    /// Columns that are not those of the scan.
+    /// The columns do not match the points of the scan.
     #[error(
-        "{columns} columns with {points} points together and {offsets} offsets, of a scan of {of} points{also}: one offset a column and all points are allowed"
+        "{columns} columns with {points} points together and {offsets} offsets, of a scan of {of} points{also}: one offset \
+         a column and all points are allowed"
     )]
     Columns {
-        /// How many.
+        /// Number of columns.
         columns: usize,
-        /// Their points.
+        /// Number of points of all columns.
         points: usize,
-        /// How many offsets.
+        /// Number of offsets.
         offsets: usize,
-        /// Points of the scan.
+        /// Number of points of the scan.
         of: usize,
-        /// Whether the points have offsets too, or there is no scan.
+        /// A further fault: the points have offsets of their own, or there is no scan.
         also: &'static str,
     },
-    /// Datagrams that are not where they are said to be.
+    /// The lengths or stamps of the datagrams do not match their bytes.
     #[error(
-        "{lengths} datagrams of {claimed} bytes together and {stamps} stamps, in {bytes} bytes: 1 to {PACKETS_MAX} datagrams, a stamp each and all bytes are allowed"
+        "{lengths} datagrams of {claimed} bytes together and {stamps} stamps, in {bytes} bytes: 1 to {PACKETS_MAX} \
+         datagrams, a stamp each and all bytes are allowed"
     )]
     Packets {
-        /// How many lengths.
+        /// Number of lengths.
         lengths: usize,
-        /// Their sum.
+        /// Sum of the lengths.
         claimed: usize,
-        /// How many stamps.
+        /// Number of stamps.
         stamps: usize,
-        /// What there is.
+        /// Length of all payloads in bytes.
         bytes: usize,
     },
-    /// A pose without a pose, a road or sensor that lacks something.
+    /// A required field is missing.
     #[error("{body} without {what}")]
     Missing {
         /// `ego_pose`, `road`, `scan` or `declaration`.
         body: &'static str,
-        /// What is allowed and not there.
+        /// The missing field.
         what: &'static str,
     },
 }
 
 impl ObservationError {
-    /// The ledger's key.
+    /// The key by which the refusal is counted.
     pub fn reason(&self) -> &'static str {
         match self {
             Self::Message { .. } => "message",
@@ -130,27 +134,28 @@ impl ObservationError {
     }
 }
 
-/// What one observation is to the core, with the stamps of their capture; `None`: now.
+/// The event bodies of one observation, each with the stamp of its capture, ns since the Unix epoch; `None` stands for
+/// the time at which the queue receives it.
 pub type Bodies = Vec<(Option<i64>, Body)>;
 
-/// Reads an observation.
+/// Decodes an observation into the bodies of its events.
 ///
 /// # Errors
-/// [`ObservationError`] with what was found and what is allowed.
-pub fn bodies(observation: v1::Observation, limits: &Limits) -> Result<Bodies, ObservationError> {
+/// Every variant of [`ObservationError`] except `Message` and `Length`, which concern the undecoded bytes.
+pub fn decode(observation: v1::Observation, limits: &Limits) -> Result<Bodies, ObservationError> {
     let v1::Observation { captured_ns, body, columns, .. } = observation;
     let captured_ns = (captured_ns != 0).then_some(captured_ns);
     let missing = |body| move |what| ObservationError::Missing { body, what };
     let body = body.ok_or(ObservationError::Body)?;
     if let (Some(columns), false) = (&columns, matches!(body, v1::observation::Body::Scan(_))) {
-        return Err(wrong_columns(columns, 0, " (there is none)"));
+        return Err(columns_error(columns, 0, " (there is none)"));
     }
     let body = match body {
         v1::observation::Body::Packets(packets) => return datagrams(packets),
         v1::observation::Body::Scan(mut scan) => {
-            check(&scan, limits)?;
+            check_lists(&scan, limits)?;
             if let Some(columns) = &columns {
-                scan.offset_ns = expand(columns, &scan)?;
+                scan.offset_ns = expand_columns(columns, &scan)?;
             }
             let mut scan = scan_from_proto(scan).map_err(missing("scan"))?;
             if scan.intensity.is_empty() {
@@ -170,8 +175,8 @@ pub fn bodies(observation: v1::Observation, limits: &Limits) -> Result<Bodies, O
     Ok(vec![(captured_ns, body)])
 }
 
-/// Whether every list of a scan is whole and none is too long.
-fn check(scan: &v1::Scan, limits: &Limits) -> Result<(), ObservationError> {
+/// Checks that every list of a scan consists of whole numbers and that none is too long.
+fn check_lists(scan: &v1::Scan, limits: &Limits) -> Result<(), ObservationError> {
     let points_max = limits.points_max;
     let lists = [
         ("x", &scan.x, 4, "points"),
@@ -194,7 +199,7 @@ fn check(scan: &v1::Scan, limits: &Limits) -> Result<(), ObservationError> {
     Ok(())
 }
 
-fn wrong_columns(columns: &v1::Columns, of: usize, also: &'static str) -> ObservationError {
+fn columns_error(columns: &v1::Columns, of: usize, also: &'static str) -> ObservationError {
     let points: Vec<u16> = unpack(&columns.points).unwrap_or_default();
     ObservationError::Columns {
         columns: points.len(),
@@ -205,11 +210,11 @@ fn wrong_columns(columns: &v1::Columns, of: usize, also: &'static str) -> Observ
     }
 }
 
-/// Each column's offset, once a point, packed.
-fn expand(columns: &v1::Columns, scan: &v1::Scan) -> Result<Bytes, ObservationError> {
+/// The offset of each point, packed: the offset of its column.
+fn expand_columns(columns: &v1::Columns, scan: &v1::Scan) -> Result<Bytes, ObservationError> {
     let of = scan.x.len() / 4;
     if !scan.offset_ns.is_empty() {
-        return Err(wrong_columns(columns, of, " that have offsets of their own"));
+        return Err(columns_error(columns, of, " that have offsets of their own"));
     }
     let part = |list, bytes: &Bytes, number_bytes| ObservationError::Part { list, bytes: bytes.len(), number_bytes };
     let points: Vec<u16> = unpack(&columns.points).ok_or_else(|| part("columns.points", &columns.points, 2))?;
@@ -218,7 +223,7 @@ fn expand(columns: &v1::Columns, scan: &v1::Scan) -> Result<Bytes, ObservationEr
     }
     let total: usize = points.iter().copied().map(usize::from).sum();
     if columns.offset_ns.len() / 4 != points.len() || total != of {
-        return Err(wrong_columns(columns, of, ""));
+        return Err(columns_error(columns, of, ""));
     }
     let mut expanded = Vec::with_capacity(total * 4);
     for (offset_ns, &points) in columns.offset_ns.chunks_exact(4).zip(&points) {
@@ -227,7 +232,7 @@ fn expand(columns: &v1::Columns, scan: &v1::Scan) -> Result<Bytes, ObservationEr
     Ok(expanded.into())
 }
 
-/// Datagrams, each a piece of the message it came in.
+/// The datagrams of one observation; each shares the bytes of the message.
 fn datagrams(packets: v1::Packets) -> Result<Bodies, ObservationError> {
     let v1::Packets { captured_ns, lengths, payloads: mut rest } = packets;
     let part = |list, bytes: &Bytes, number_bytes| ObservationError::Part { list, bytes: bytes.len(), number_bytes };
@@ -258,7 +263,7 @@ mod tests {
     }
 
     fn read(body: v1::observation::Body, columns: Option<v1::Columns>) -> Result<Bodies, ObservationError> {
-        bodies(v1::Observation { body: Some(body), columns, ..Default::default() }, &LIMITS)
+        decode(v1::Observation { body: Some(body), columns, ..Default::default() }, &LIMITS)
     }
 
     fn read_scan(scan: v1::Scan, columns: Option<v1::Columns>) -> Result<Scan, ObservationError> {
@@ -272,43 +277,43 @@ mod tests {
     }
 
     #[test]
-    fn columns_give_each_of_their_points_their_offset() {
+    fn each_point_gets_the_offset_of_its_column() {
         let read = read_scan(scan(), columns(&[-20, -10, 0], &[2, 0, 1])).unwrap();
         assert_eq!(read.offset_ns, [-20, -20, 0]);
-        assert_eq!((read.x, read.intensity), (vec![1.0, 2.0, 3.0], vec![0.0; 3]), "no intensity is none");
+        assert_eq!((read.x, read.intensity), (vec![1.0, 2.0, 3.0], vec![0.0; 3]), "without intensities all are 0");
     }
 
     #[test]
-    fn a_scan_that_is_not_what_it_claims_is_refused_with_its_numbers() {
-        let said = |outcome: Result<Scan, ObservationError>| {
+    fn a_scan_with_inconsistent_lists_is_refused_with_its_numbers() {
+        let refusal = |outcome: Result<Scan, ObservationError>| {
             let error = outcome.unwrap_err();
             (error.reason(), error.to_string())
         };
-        let (reason, message) = said(read_scan(v1::Scan { y: Bytes::from_static(&[0; 13]), ..scan() }, None));
-        assert_eq!((reason, &*message), ("packed", "y of 13 bytes: 4 a number are allowed"));
-        let (reason, message) = said(read_scan(v1::Scan { x: vec![0; 20].into(), ..scan() }, None));
+        let (reason, message) = refusal(read_scan(v1::Scan { y: Bytes::from_static(&[0; 13]), ..scan() }, None));
+        assert_eq!((reason, &*message), ("packed", "y of 13 bytes: a multiple of 4 bytes is allowed"));
+        let (reason, message) = refusal(read_scan(v1::Scan { x: vec![0; 20].into(), ..scan() }, None));
         assert_eq!((reason, &*message), ("points", "scan with 5 points: up to 4 are allowed"));
-        let (reason, _) = said(read_scan(v1::Scan { no_returns: vec![0; 60].into(), ..scan() }, None));
+        let (reason, _) = refusal(read_scan(v1::Scan { no_returns: vec![0; 60].into(), ..scan() }, None));
         assert_eq!(reason, "points");
-        let (reason, message) = said(read_scan(scan(), columns(&[0, 0], &[1, 65_535])));
+        let (reason, message) = refusal(read_scan(scan(), columns(&[0, 0], &[1, 65_535])));
         assert!(reason == "columns" && message.contains("65536 points"), "{message}");
         for wrong in [columns(&[0], &[1, 2]), columns(&[], &[]), columns(&[0; 9], &[1; 9])] {
-            assert_eq!(said(read_scan(scan(), wrong)).0, "columns");
+            assert_eq!(refusal(read_scan(scan(), wrong)).0, "columns");
         }
         let both = v1::Scan { offset_ns: pack(&[0, 0, 0]), ..scan() };
-        assert_eq!(said(read_scan(both, columns(&[0], &[3]))).0, "columns");
+        assert_eq!(refusal(read_scan(both, columns(&[0], &[3]))).0, "columns");
         let half = v1::Columns { offset_ns: pack(&[0]), points: Bytes::from_static(&[3]) };
-        assert_eq!(said(read_scan(scan(), Some(half))).0, "packed");
+        assert_eq!(refusal(read_scan(scan(), Some(half))).0, "packed");
     }
 
     #[test]
-    fn lists_of_different_lengths_and_numbers_that_are_none_are_left_to_the_core() {
+    fn lists_of_different_lengths_and_not_finite_numbers_are_left_to_the_core() {
         let read = read_scan(v1::Scan { z: pack(&[f32::NAN, f32::INFINITY, 1e9, 0.0]), ..scan() }, None).unwrap();
         assert_eq!((read.x.len(), read.z.len()), (3, 4));
     }
 
     #[test]
-    fn datagrams_come_out_as_they_lie_in_the_message() {
+    fn datagrams_are_cut_from_the_message_by_their_lengths() {
         let packets = v1::Packets {
             captured_ns: pack(&[5_i64, -7, 0]),
             lengths: pack(&[2_u16, 0, 1]),
@@ -337,17 +342,17 @@ mod tests {
     }
 
     #[test]
-    fn what_lacks_something_is_named() {
-        let said = |outcome: Result<Bodies, ObservationError>| {
+    fn a_missing_field_is_named() {
+        let refusal = |outcome: Result<Bodies, ObservationError>| {
             let error = outcome.unwrap_err();
             (error.reason(), error.to_string())
         };
-        let (reason, message) = said(bodies(v1::Observation::default(), &LIMITS));
+        let (reason, message) = refusal(decode(v1::Observation::default(), &LIMITS));
         assert!(reason == "body" && message.contains("ego_pose"), "{message}");
-        let (reason, message) = said(read(v1::observation::Body::EgoPose(v1::EgoPose::default()), None));
+        let (reason, message) = refusal(read(v1::observation::Body::EgoPose(v1::EgoPose::default()), None));
         assert_eq!((reason, &*message), ("missing", "ego_pose without map_from_ego"));
-        let (reason, message) = said(read(v1::observation::Body::Road(v1::Road::default()), None));
+        let (reason, message) = refusal(read(v1::observation::Body::Road(v1::Road::default()), None));
         assert_eq!((reason, &*message), ("missing", "road without known road purpose"));
-        assert_eq!(said(read(v1::observation::Body::End(v1::End {}), columns(&[], &[]))).0, "columns");
+        assert_eq!(refusal(read(v1::observation::Body::End(v1::End {}), columns(&[], &[]))).0, "columns");
     }
 }

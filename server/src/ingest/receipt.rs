@@ -1,5 +1,5 @@
-//! What becomes of an event -> whoever sent it. The ticket lies beside the event on the queue; the recording, and so a
-//! replay, knows nothing of it.
+//! The outcome of an event -> a report to the client that sent it. The receipt lies beside the event on the queue; it is
+//! not recorded, so a replay has none.
 
 use std::collections::VecDeque;
 
@@ -7,87 +7,98 @@ use clearway_mapping::error::EventError;
 use clearway_proto::v1;
 use tokio::sync::mpsc::UnboundedSender;
 
-/// What became of one event.
+/// The outcome of one event.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Verdict {
-    /// The core took it; the map it completed, if any, is there.
-    Taken,
-    /// It was not taken.
+pub enum Outcome {
+    /// The core accepted it, and the map that it completed, if any, is published.
+    Accepted,
+    /// It was refused.
     Refused {
         /// The ledger's key.
         reason: &'static str,
-        /// What was wrong, and what is allowed.
+        /// The wrong value, and what is allowed.
         message: String,
     },
 }
 
-impl Verdict {
-    /// Of a step of the pipeline.
-    pub fn of(outcome: Result<(), EventError>) -> Self {
-        match outcome {
-            Ok(()) => Self::Taken,
-            Err(rejected) => Self::Refused { reason: rejected.reason(), message: rejected.to_string() },
+impl From<Result<(), EventError>> for Outcome {
+    fn from(result: Result<(), EventError>) -> Self {
+        match result {
+            Ok(()) => Self::Accepted,
+            Err(error) => Self::Refused { reason: error.reason(), message: error.to_string() },
         }
     }
 }
 
-/// Which observation of which client (0 where there is only one).
+/// Identifies an observation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Mark {
-    /// As the client names itself.
+pub struct ObservationId {
+    /// The client's id; 0 on a stream of a single client.
     pub client: u64,
-    /// As the client counts.
+    /// The client's number of the observation.
     pub number: u64,
 }
 
-/// Where verdicts arrive. Unbounded, but no fuller than the events that are in flight.
-pub type Verdicts = UnboundedSender<(Mark, Verdict)>;
+/// Where outcomes are sent. Unbounded, but it holds no more outcomes than there are events in flight.
+pub type OutcomeSender = UnboundedSender<(ObservationId, Outcome)>;
 
-/// Tells exactly once what became of an event: a ticket that is dropped untold, as with a queue whose engine has
-/// stopped, says that.
+/// Delivers the outcome of one event exactly once. A receipt that is dropped undelivered, for example with the queue of
+/// a stopped engine, delivers a refusal with the reason `stopped`.
 #[derive(Debug)]
-pub struct Ticket {
-    mark: Mark,
-    verdicts: Option<Verdicts>,
+pub struct Receipt {
+    id: ObservationId,
+    outcomes: Option<OutcomeSender>,
 }
 
-impl Ticket {
-    /// For one event of an observation.
-    pub fn new(mark: Mark, verdicts: &Verdicts) -> Self {
-        Self { mark, verdicts: Some(verdicts.clone()) }
+impl Receipt {
+    /// A receipt for one event of the observation `id`.
+    pub fn new(id: ObservationId, outcomes: &OutcomeSender) -> Self {
+        Self { id, outcomes: Some(outcomes.clone()) }
     }
 
-    /// Tells it.
-    pub fn tell(mut self, verdict: Verdict) {
-        self.send(verdict);
+    /// Delivers the outcome.
+    pub fn deliver(mut self, outcome: Outcome) {
+        self.send(outcome);
     }
 
-    fn send(&mut self, verdict: Verdict) {
-        if let Some(verdicts) = self.verdicts.take() {
-            // A sender that has gone does not care any more.
-            let _ = verdicts.send((self.mark, verdict));
+    fn send(&mut self, outcome: Outcome) {
+        if let Some(outcomes) = self.outcomes.take() {
+            // An error means that the client has gone; then the outcome has no receiver.
+            let _ = outcomes.send((self.id, outcome));
         }
     }
 }
 
-impl Drop for Ticket {
+impl Drop for Receipt {
     fn drop(&mut self) {
         let message = "the vehicle's engine has stopped".to_owned();
-        self.send(Verdict::Refused { reason: "stopped", message });
+        self.send(Outcome::Refused { reason: "stopped", message });
     }
 }
 
-/// One client's observations on their way, and what there is to report to it.
+/// The number of an observation is not greater than all numbers before it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("number {number}: more than {newest} is allowed")]
+pub struct NumberError {
+    /// The observation's number.
+    pub number: u64,
+    /// The greatest number before it.
+    pub newest: u64,
+}
+
+/// One client's observations in flight, and the report that is due to it.
 #[derive(Debug, Default)]
-pub struct Account {
+pub struct ClientSession {
     client: u64,
-    /// Greatest number seen.
+    /// Greatest number received.
     newest: Option<u64>,
     in_flight: VecDeque<InFlight>,
+    /// Events in flight.
     events: usize,
+    /// Bytes of the observations in flight.
     bytes: usize,
     acknowledged: u64,
-    /// What the last report acknowledged.
+    /// The acknowledgement of the last report.
     reported: Option<u64>,
     refused: Vec<v1::Refused>,
 }
@@ -99,45 +110,47 @@ struct InFlight {
     bytes: usize,
 }
 
-impl Account {
-    /// Of a client that has sent nothing.
+impl ClientSession {
+    /// The session of a client that has sent nothing yet.
     pub fn new(client: u64) -> Self {
         Self { client, ..Self::default() }
     }
 
-    /// Observations whose fate is not known yet.
-    pub fn is_settled(&self) -> bool {
+    /// True if no observation is in flight.
+    pub fn is_idle(&self) -> bool {
         self.in_flight.is_empty()
     }
 
-    /// Whether another observation may be read: so many events and bytes may be in flight, and one observation always.
-    pub fn has_room(&self, events_max: usize, bytes_max: usize) -> bool {
-        self.is_settled() || (self.events < events_max && self.bytes < bytes_max)
+    /// True if another observation may be read: fewer than `events_max` events and `bytes_max` bytes are in flight, or
+    /// no observation at all.
+    pub fn has_credit(&self, events_max: usize, bytes_max: usize) -> bool {
+        self.is_idle() || (self.events < events_max && self.bytes < bytes_max)
     }
 
-    /// Takes note of a number; gives the one before, or what is wrong with a number that does not rise.
+    /// Checks the number of the next observation and remembers it.
     ///
     /// # Errors
-    /// The refusal's message.
-    pub fn count(&mut self, number: u64) -> Result<Option<u64>, String> {
+    /// [`NumberError`] if it is not greater than all numbers before it.
+    pub fn check_number(&mut self, number: u64) -> Result<(), NumberError> {
         match self.newest {
-            Some(newest) if number <= newest => Err(format!("number {number}: more than {newest} is allowed")),
-            before => {
+            Some(newest) if number <= newest => Err(NumberError { number, newest }),
+            _ => {
                 self.newest = Some(number);
-                Ok(before)
+                Ok(())
             }
         }
     }
 
-    /// An observation is about to enter as so many events; [`Account::tell`] will hear of each.
-    pub fn enter(&mut self, number: u64, events: usize, bytes: usize) {
+    /// Puts an observation of so many events and bytes in flight. [`ClientSession::record_outcome`] follows for each
+    /// event.
+    pub fn begin(&mut self, number: u64, events: usize, bytes: usize) {
         self.events += events;
         self.bytes += bytes;
         self.in_flight.push_back(InFlight { number, events_left: events, bytes });
-        self.settle();
+        self.acknowledge_finished();
     }
 
-    /// An observation, or so many, did not become an event.
+    /// Adds a refusal of `count` observations, or events of one observation, to the next report.
     pub fn refuse(&mut self, number: u64, reason: &'static str, message: String, count: u64) {
         match self.refused.iter_mut().rev().find(|refused| refused.number == number && refused.reason == reason) {
             Some(refused) => refused.count += count,
@@ -145,33 +158,33 @@ impl Account {
         }
     }
 
-    /// What became of one event.
-    pub fn tell(&mut self, number: u64, verdict: Verdict) {
-        if let Verdict::Refused { reason, message } = verdict {
+    /// Records the outcome of one event of the observation `number`.
+    pub fn record_outcome(&mut self, number: u64, outcome: Outcome) {
+        if let Outcome::Refused { reason, message } = outcome {
             self.refuse(number, reason, message, 1);
         }
-        // A vehicle's events end in the order they entered, so it is the first or near it.
+        // Outcomes arrive in the order of the events, so it is the first observation or near it.
         if let Some(observation) = self.in_flight.iter_mut().find(|observation| observation.number == number) {
             observation.events_left = observation.events_left.saturating_sub(1);
             self.events = self.events.saturating_sub(1);
         }
-        self.settle();
+        self.acknowledge_finished();
     }
 
-    fn settle(&mut self) {
+    fn acknowledge_finished(&mut self) {
         while let Some(first) = self.in_flight.pop_front_if(|observation| observation.events_left == 0) {
             self.bytes -= first.bytes;
             self.acknowledged = first.number;
         }
     }
 
-    /// Events and bytes whose fate is not known yet.
+    /// Number of events and of bytes in flight.
     pub fn in_flight(&self) -> (usize, usize) {
         (self.events, self.bytes)
     }
 
-    /// Takes note of the numbers between the newest one and this, which no observation had.
-    pub fn miss(&mut self, number: u64) {
+    /// Refuses the numbers between the newest one and `number` as `missed`: no observation with them arrived.
+    pub fn refuse_missed(&mut self, number: u64) {
         if let Some(first) = self.newest.and_then(|newest| newest.checked_add(1))
             && number > first
         {
@@ -182,13 +195,13 @@ impl Account {
         }
     }
 
-    /// What the last report acknowledged, once more.
-    pub fn newest_report(&self) -> v1::IngestReport {
+    /// The acknowledgement of the last report, to repeat it.
+    pub fn repeated_report(&self) -> v1::IngestReport {
         v1::IngestReport { acknowledged: self.acknowledged, refused: Vec::new(), client: self.client }
     }
 
-    /// What has not been told yet, if anything.
-    pub fn report(&mut self) -> Option<v1::IngestReport> {
+    /// A report of everything that is not reported yet, if there is anything.
+    pub fn next_report(&mut self) -> Option<v1::IngestReport> {
         if self.reported == Some(self.acknowledged) && self.refused.is_empty() {
             return None;
         }
@@ -202,56 +215,64 @@ impl Account {
 mod tests {
     use super::*;
 
-    fn refused(reason: &'static str) -> Verdict {
-        Verdict::Refused { reason, message: reason.to_owned() }
+    fn refused(reason: &'static str) -> Outcome {
+        Outcome::Refused { reason, message: reason.to_owned() }
     }
 
     #[test]
-    fn an_observation_is_acknowledged_when_its_last_event_and_all_before_it_are_known() {
-        let mut account = Account::new(7);
-        account.enter(1, 2, 100);
-        account.enter(4, 1, 50);
-        account.tell(4, refused("stamp"));
-        account.tell(1, Verdict::Taken);
-        let report = account.report().unwrap();
+    fn an_observation_is_acknowledged_after_its_last_event_and_all_before_it() {
+        let mut session = ClientSession::new(7);
+        session.begin(1, 2, 100);
+        session.begin(4, 1, 50);
+        session.record_outcome(4, refused("stamp"));
+        session.record_outcome(1, Outcome::Accepted);
+        let report = session.next_report().unwrap();
         assert_eq!((report.acknowledged, report.client, report.refused.len()), (0, 7, 1));
         assert_eq!((report.refused[0].number, &*report.refused[0].reason), (4, "stamp"));
-        assert!(account.report().is_none(), "told once");
-        account.tell(1, Verdict::Taken);
-        assert_eq!(account.report().unwrap().acknowledged, 4);
-        assert!(account.is_settled() && account.bytes == 0 && account.events == 0);
+        assert!(session.next_report().is_none(), "nothing is reported twice");
+        session.record_outcome(1, Outcome::Accepted);
+        assert_eq!(session.next_report().unwrap().acknowledged, 4);
+        assert!(session.is_idle() && session.bytes == 0 && session.events == 0);
     }
 
     #[test]
-    fn datagrams_refused_for_one_reason_are_one_refusal_with_their_number() {
-        let mut account = Account::new(0);
-        account.enter(1, 3, 9);
+    fn datagrams_refused_for_one_reason_become_one_refusal_with_their_count() {
+        let mut session = ClientSession::new(0);
+        session.begin(1, 3, 9);
         for reason in ["length", "azimuth", "length"] {
-            account.tell(1, refused(reason));
+            session.record_outcome(1, refused(reason));
         }
-        let report = account.report().unwrap();
-        let told: Vec<_> = report.refused.iter().map(|r| (&*r.reason, r.count)).collect();
-        assert_eq!(told, [("length", 2), ("azimuth", 1)]);
+        let report = session.next_report().unwrap();
+        let refused: Vec<_> = report.refused.iter().map(|r| (&*r.reason, r.count)).collect();
+        assert_eq!(refused, [("length", 2), ("azimuth", 1)]);
         assert_eq!(report.acknowledged, 1);
     }
 
     #[test]
-    fn there_is_room_for_one_observation_always_and_for_more_within_the_limits() {
-        let mut account = Account::new(0);
-        account.enter(1, 100, 1000);
-        assert!(!account.has_room(100, 10_000) && !account.has_room(1000, 1000) && account.has_room(101, 1001));
-        (0..100).for_each(|_| account.tell(1, Verdict::Taken));
-        assert!(account.has_room(1, 1));
+    fn one_observation_always_has_credit_and_more_have_it_within_the_limits() {
+        let mut session = ClientSession::new(0);
+        session.begin(1, 100, 1000);
+        assert!(!session.has_credit(100, 10_000) && !session.has_credit(1000, 1000) && session.has_credit(101, 1001));
+        (0..100).for_each(|_| session.record_outcome(1, Outcome::Accepted));
+        assert!(session.has_credit(1, 1));
     }
 
     #[test]
-    fn a_ticket_nobody_answered_says_that_the_engine_has_stopped() {
-        let (verdicts, mut told) = tokio::sync::mpsc::unbounded_channel();
-        let mark = Mark { client: 1, number: 2 };
-        drop(Ticket::new(mark, &verdicts));
-        Ticket::new(mark, &verdicts).tell(Verdict::Taken);
-        assert!(matches!(told.try_recv(), Ok((m, Verdict::Refused { reason: "stopped", .. })) if m == mark));
-        assert_eq!(told.try_recv(), Ok((mark, Verdict::Taken)));
-        assert!(told.try_recv().is_err(), "once each");
+    fn a_number_that_does_not_rise_is_refused_with_what_is_allowed() {
+        let mut session = ClientSession::new(0);
+        assert_eq!(session.check_number(3), Ok(()));
+        assert_eq!(session.check_number(3).unwrap_err().to_string(), "number 3: more than 3 is allowed");
+        assert_eq!(session.check_number(4), Ok(()));
+    }
+
+    #[test]
+    fn a_receipt_that_is_dropped_delivers_that_the_engine_has_stopped() {
+        let (sender, mut outcomes) = tokio::sync::mpsc::unbounded_channel();
+        let id = ObservationId { client: 1, number: 2 };
+        drop(Receipt::new(id, &sender));
+        Receipt::new(id, &sender).deliver(Outcome::Accepted);
+        assert!(matches!(outcomes.try_recv(), Ok((of, Outcome::Refused { reason: "stopped", .. })) if of == id));
+        assert_eq!(outcomes.try_recv(), Ok((id, Outcome::Accepted)));
+        assert!(outcomes.try_recv().is_err(), "each is delivered once");
     }
 }

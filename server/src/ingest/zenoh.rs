@@ -1,9 +1,10 @@
-//! Observations over zenoh: `clearway/<vehicle>/ingest/{scan,packet,end,sensor}/<sensor>`, `…/{pose,road}`; what becomes of them
-//! goes to `clearway/<vehicle>/ingest/report`.
+//! Observations over zenoh: `clearway/<vehicle>/ingest/{scan,packet,end,sensor}/<sensor>` and `.../{pose,road}`; reports
+//! go to `clearway/<vehicle>/ingest/report`.
 //!
-//! zenoh's callbacks only put a sample aside, as many as there is room for; one task a vehicle reads them. Samples that
-//! find no room are counted as `queue`, and their client is told by the holes in its numbers. Reports drop under
-//! congestion, because a stopped peer may not hold up the others; so the newest acknowledgement is repeated for a while.
+//! zenoh's callback only queues a sample, within two bounds; one task a vehicle decodes the queued samples. A sample that
+//! exceeds a bound is counted as `queue`, and its client learns of it because its numbers then have a gap. Reports are
+//! dropped under congestion, so that a stopped peer does not delay the others; the newest acknowledgement is therefore
+//! repeated for a while.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -19,102 +20,102 @@ use zenoh::pubsub::{Publisher, Subscriber};
 use zenoh::qos::CongestionControl;
 use zenoh::sample::{Locality, SampleKind};
 
-use super::gateway::Entrance;
+use super::gateway::Gateway;
 use super::observation::ObservationError;
-use super::receipt::{Account, Verdicts};
-use crate::publish::zenoh::{ZenohError, failed};
+use super::receipt::{ClientSession, OutcomeSender};
+use crate::zenoh_session::ZenohError;
 
-/// Samples put aside for one vehicle; their bytes are no more than its longest message, twice.
-const WAITING_MAX: usize = 256;
-/// Clients remembered for each vehicle; of those with nothing on the way the one heard of longest ago makes room for
-/// another.
+/// Greatest number of queued samples of one vehicle. Together they have at most twice the bytes of its longest message.
+const QUEUED_MAX: usize = 256;
+/// Greatest number of clients of one vehicle that are remembered. A new client replaces the idle client that was silent
+/// longest.
 const CLIENTS_MAX: usize = 64;
-/// How often, and how many times, the newest acknowledgement is repeated.
+/// Period and number of the repetitions of the newest acknowledgement.
 const REPEAT: (Duration, u32) = (Duration::from_secs(1), 10);
 
-/// A sample put aside.
-struct Waiting {
-    /// Key behind `clearway/<vehicle>/ingest/`.
+/// A sample that is not decoded yet.
+struct QueuedSample {
+    /// The key after `clearway/<vehicle>/ingest/`.
     key: String,
     payload: ZBytes,
 }
 
-/// The samples of one vehicle, and whoever puts them aside.
+/// The subscription to the observations of one vehicle, and the publisher of its reports.
 pub struct Ingest {
-    entrance: Arc<Entrance>,
-    waiting: Receiver<Waiting>,
-    bytes_waiting: Arc<AtomicUsize>,
+    gateway: Arc<Gateway>,
+    samples: Receiver<QueuedSample>,
+    bytes_queued: Arc<AtomicUsize>,
     reports: Publisher<'static>,
-    // Last, and only held.
+    // The last field, so that it is dropped last.
     _subscriber: Subscriber<()>,
 }
 
 impl Ingest {
-    /// Subscribes to a vehicle's keys.
+    /// Subscribes to the keys of a vehicle.
     ///
     /// # Errors
-    /// What zenoh says.
-    pub async fn subscribe(session: &Session, entrance: Arc<Entrance>) -> Result<Self, ZenohError> {
-        let prefix = format!("clearway/{}/ingest/", entrance.vehicle);
+    /// [`ZenohError`] if the publisher or the subscriber cannot be declared.
+    pub async fn subscribe(session: &Session, gateway: Arc<Gateway>) -> Result<Self, ZenohError> {
+        let prefix = format!("clearway/{}/ingest/", gateway.vehicle);
         let key = format!("{prefix}report");
         let reports = session.declare_publisher(key.clone()).congestion_control(CongestionControl::Drop);
         let reports = reports.encoding(Encoding::APPLICATION_PROTOBUF.with_schema("clearway.v1.IngestReport"));
-        let reports = reports.await.map_err(failed(format!("publisher {key}")))?;
+        let reports = reports.await.map_err(ZenohError::of(format!("publisher {key}")))?;
 
-        let (put_aside, waiting) = channel(WAITING_MAX);
-        let bytes_waiting = Arc::new(AtomicUsize::new(0));
+        let (sender, samples) = channel(QUEUED_MAX);
+        let bytes_queued = Arc::new(AtomicUsize::new(0));
         let keys = format!("{prefix}**");
         let subscriber = session.declare_subscriber(keys.clone()).allowed_origin(Locality::Remote).callback({
-            let (entrance, bytes_waiting) = (entrance.clone(), bytes_waiting.clone());
+            let (gateway, bytes_queued) = (gateway.clone(), bytes_queued.clone());
             move |sample| {
                 let key = sample.key_expr().as_str().strip_prefix(&prefix).unwrap_or_default();
                 if key == "report" || sample.kind() != SampleKind::Put {
                     return;
                 }
                 let bytes = sample.payload().len();
-                let before = bytes_waiting.fetch_add(bytes, Ordering::Relaxed);
-                let fits = before <= entrance.limits.message_bytes_max;
-                let sample = Waiting { key: key.to_owned(), payload: sample.payload().clone() };
-                if !fits || matches!(put_aside.try_send(sample), Err(TrySendError::Full(_))) {
-                    bytes_waiting.fetch_sub(bytes, Ordering::Relaxed);
-                    entrance.count("queue");
+                let before = bytes_queued.fetch_add(bytes, Ordering::Relaxed);
+                let fits = before <= gateway.limits.message_bytes_max;
+                let sample = QueuedSample { key: key.to_owned(), payload: sample.payload().clone() };
+                if !fits || matches!(sender.try_send(sample), Err(TrySendError::Full(_))) {
+                    bytes_queued.fetch_sub(bytes, Ordering::Relaxed);
+                    gateway.record_refusal("queue");
                 }
             }
         });
-        let subscriber = subscriber.await.map_err(failed(format!("subscribe to {keys}")))?;
-        Ok(Self { entrance, waiting, bytes_waiting, reports, _subscriber: subscriber })
+        let subscriber = subscriber.await.map_err(ZenohError::of(format!("subscribe to {keys}")))?;
+        Ok(Self { gateway, samples, bytes_queued, reports, _subscriber: subscriber })
     }
 
-    /// Reads and reports until it is dropped.
+    /// Decodes samples and sends reports until the future is dropped.
     pub async fn run(mut self) {
-        let (verdicts, mut told): (Verdicts, _) = unbounded_channel();
+        let (outcome_sender, mut outcomes): (OutcomeSender, _) = unbounded_channel();
         let mut clients = Clients::default();
         let mut repeat = tokio::time::interval(REPEAT.0);
         loop {
-            let (events_max, bytes_max) = (self.entrance.in_flight_max, self.entrance.limits.message_bytes_max);
+            let (events_max, bytes_max) = (self.gateway.in_flight_max, self.gateway.limits.message_bytes_max);
             tokio::select! {
-                // Verdicts first: they make room.
+                // Outcomes first, because they give credit.
                 biased;
-                Some((mark, verdict)) = told.recv() => {
-                    if let Some(client) = clients.known(mark.client) {
-                        client.account.tell(mark.number, verdict);
+                Some((id, outcome)) = outcomes.recv() => {
+                    if let Some(client) = clients.get_mut(id.client) {
+                        client.session.record_outcome(id.number, outcome);
                     }
                 }
-                sample = self.waiting.recv(), if clients.have_room(events_max, bytes_max) => {
-                    // The subscriber is held here, so there is always a sender.
-                    let Some(Waiting { key, payload }) = sample else { return };
+                sample = self.samples.recv(), if clients.have_credit(events_max, bytes_max) => {
+                    // The channel cannot end, because `self` holds the subscriber with the sender.
+                    let Some(QueuedSample { key, payload }) = sample else { return };
                     let bytes = Bytes::from(payload.to_bytes().into_owned());
-                    self.bytes_waiting.fetch_sub(bytes.len(), Ordering::Relaxed);
-                    self.take(&key, bytes, &mut clients, &verdicts);
+                    self.bytes_queued.fetch_sub(bytes.len(), Ordering::Relaxed);
+                    self.push(&key, bytes, &mut clients, &outcome_sender);
                 }
-                _ = repeat.tick() => clients.repeat(),
+                _ = repeat.tick() => clients.request_repetitions(),
             }
-            while let Ok((mark, verdict)) = told.try_recv() {
-                if let Some(client) = clients.known(mark.client) {
-                    client.account.tell(mark.number, verdict);
+            while let Ok((id, outcome)) = outcomes.try_recv() {
+                if let Some(client) = clients.get_mut(id.client) {
+                    client.session.record_outcome(id.number, outcome);
                 }
             }
-            for report in clients.reports() {
+            for report in clients.next_reports() {
                 if let Err(error) = self.reports.put(report.encode_to_vec()).await {
                     tracing::debug!(%error, "zenoh: report");
                 }
@@ -122,40 +123,41 @@ impl Ingest {
         }
     }
 
-    fn take(&self, key: &str, bytes: Bytes, clients: &mut Clients, verdicts: &Verdicts) {
-        let (length, bytes_max) = (bytes.len(), self.entrance.limits.message_bytes_max);
-        let read = match length <= bytes_max {
+    fn push(&self, key: &str, bytes: Bytes, clients: &mut Clients, outcomes: &OutcomeSender) {
+        let (length, bytes_max) = (bytes.len(), self.gateway.limits.message_bytes_max);
+        let decoded = match length <= bytes_max {
             false => Err(ObservationError::Length { bytes: length, bytes_max }),
             true => v1::Observation::decode(bytes)
                 .map_err(|reason| ObservationError::Message { reason: reason.to_string() }),
         };
-        let mut observation = match read {
+        let mut observation = match decoded {
             Ok(observation) => observation,
-            // Nobody knows whose it was.
-            Err(error) => return self.entrance.refuse_error(&mut clients.of(0).account, 0, &error),
+            // Its client is unknown; client 0 gets the report.
+            Err(error) => return self.gateway.refuse_message(&mut clients.get_or_insert(0).session, 0, &error),
         };
-        let account = &mut clients.of(observation.client).account;
+        let session = &mut clients.get_or_insert(observation.client).session;
         let number = observation.number;
-        account.miss(number);
-        match sensor_of(key, observation.body.as_ref()) {
+        session.refuse_missed(number);
+        match sensor_of_key(key, observation.body.as_ref()) {
             Some(sensor) => sensor.clone_into(&mut observation.sensor),
             None => {
                 let message = format!(
-                    "key ingest/{key} with another body: scan/<sensor>, packet/<sensor>, end/<sensor>, sensor/<sensor>, pose and road are allowed"
+                    "key ingest/{key} with another body: scan/<sensor>, packet/<sensor>, end/<sensor>, \
+                     sensor/<sensor>, pose and road are allowed"
                 );
-                return self.entrance.refuse(account, number, "key", message);
+                return self.gateway.refuse(session, number, "key", message);
             }
         }
-        // Refused and reported there.
-        let _ = self.entrance.take(observation, length, account, verdicts);
+        // The gateway counts and reports an unknown sensor itself.
+        let _ = self.gateway.push(observation, length, session, outcomes);
     }
 }
 
-/// The sensor a key names, empty for none; `None` where the key is none of ours or does not tell of such a body.
-fn sensor_of<'k>(key: &'k str, body: Option<&v1::observation::Body>) -> Option<&'k str> {
+/// The sensor that `key` names, empty if it names none; `None` if the key is unknown or does not match the body.
+fn sensor_of_key<'k>(key: &'k str, body: Option<&v1::observation::Body>) -> Option<&'k str> {
     use v1::observation::Body;
     let (kind, sensor) = key.split_once('/').unwrap_or((key, ""));
-    let fits = match body? {
+    let matches = match body? {
         Body::Scan(_) => kind == "scan",
         Body::Packets(_) => kind == "packet",
         Body::End(_) => kind == "end",
@@ -163,74 +165,75 @@ fn sensor_of<'k>(key: &'k str, body: Option<&v1::observation::Body>) -> Option<&
         Body::Road(_) => key == "road",
         Body::Declaration(declared) => kind == "sensor" && sensor == declared.name,
     };
-    fits.then_some(sensor)
+    matches.then_some(sensor)
 }
 
-/// The clients heard of, the one heard of longest ago first.
+/// The remembered clients of one vehicle, ordered from the longest silent to the most recent.
 #[derive(Default)]
 struct Clients(Vec<Client>);
 
 struct Client {
     id: u64,
-    account: Account,
-    /// Repetitions of its newest acknowledgement still to come.
+    session: ClientSession,
+    /// Number of repetitions of its newest acknowledgement that are left.
     repetitions: u32,
-    /// Whether one is to come now.
+    /// True if a repetition is due now.
     is_due: bool,
 }
 
 impl Clients {
-    /// The client of this name, now the newest.
-    fn of(&mut self, id: u64) -> &mut Client {
+    /// The client `id`, which becomes the most recent one.
+    fn get_or_insert(&mut self, id: u64) -> &mut Client {
         let at = self.0.iter().position(|client| client.id == id);
         let client = match at {
             Some(at) => self.0.remove(at),
             None => {
                 let is_full = self.0.len() >= CLIENTS_MAX;
-                if let Some(settled) = self.settled().filter(|_| is_full) {
-                    self.0.remove(settled);
+                if let Some(idle) = self.longest_idle().filter(|_| is_full) {
+                    self.0.remove(idle);
                 }
-                Client { id, account: Account::new(id), repetitions: 0, is_due: false }
+                Client { id, session: ClientSession::new(id), repetitions: 0, is_due: false }
             }
         };
         self.0.push_mut(client)
     }
 
-    fn known(&mut self, id: u64) -> Option<&mut Client> {
+    fn get_mut(&mut self, id: u64) -> Option<&mut Client> {
         self.0.iter_mut().find(|client| client.id == id)
     }
 
-    /// Where the one heard of longest ago stands that has nothing on the way.
-    fn settled(&self) -> Option<usize> {
-        self.0.iter().position(|client| client.account.is_settled())
+    /// Index of the longest silent client without observations in flight.
+    fn longest_idle(&self) -> Option<usize> {
+        self.0.iter().position(|client| client.session.is_idle())
     }
 
-    /// Whether another observation may be read, be it a newcomer's: all of them together may have so much on the way.
-    fn have_room(&self, events_max: usize, bytes_max: usize) -> bool {
-        if self.0.len() >= CLIENTS_MAX && self.settled().is_none() {
+    /// True if another observation of any client, also of a new one, may be decoded: fewer than `events_max` events and
+    /// `bytes_max` bytes of all clients are in flight, and a new client has space.
+    fn have_credit(&self, events_max: usize, bytes_max: usize) -> bool {
+        if self.0.len() >= CLIENTS_MAX && self.longest_idle().is_none() {
             return false;
         }
         let (events, bytes) =
-            self.0.iter().map(|client| client.account.in_flight()).fold((0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
+            self.0.iter().map(|client| client.session.in_flight()).fold((0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
         events == 0 || (events < events_max && bytes < bytes_max)
     }
 
-    fn repeat(&mut self) {
+    fn request_repetitions(&mut self) {
         for client in self.0.iter_mut().filter(|client| client.repetitions > 0) {
             client.repetitions -= 1;
             client.is_due = true;
         }
     }
 
-    /// What each is to be told now.
-    fn reports(&mut self) -> Vec<v1::IngestReport> {
+    /// The reports that are due now, one a client at most.
+    fn next_reports(&mut self) -> Vec<v1::IngestReport> {
         let report = |client: &mut Client| {
             let is_due = std::mem::take(&mut client.is_due);
-            let news = client.account.report();
-            if news.is_some() {
+            let report = client.session.next_report();
+            if report.is_some() {
                 client.repetitions = REPEAT.1;
             }
-            news.or_else(|| is_due.then(|| client.account.newest_report()))
+            report.or_else(|| is_due.then(|| client.session.repeated_report()))
         };
         self.0.iter_mut().filter_map(report).collect()
     }
@@ -238,32 +241,34 @@ impl Clients {
 
 #[cfg(test)]
 mod tests {
-    use super::super::receipt::Verdict;
+    use super::super::receipt::Outcome;
     use super::*;
 
     #[test]
-    fn a_newcomer_takes_the_place_of_a_client_with_nothing_on_the_way_or_waits_for_one() {
+    fn a_new_client_replaces_the_longest_silent_idle_client_or_waits() {
         let mut clients = Clients::default();
-        let roomy = |clients: &Clients| clients.have_room(usize::MAX, usize::MAX);
+        let has_space = |clients: &Clients| clients.have_credit(usize::MAX, usize::MAX);
         for id in 1..=CLIENTS_MAX as u64 {
-            assert!(roomy(&clients), "client {id}");
-            clients.of(id).account.enter(1, 1, 10);
+            assert!(has_space(&clients), "client {id}");
+            clients.get_or_insert(id).session.begin(1, 1, 10);
         }
-        assert!(!roomy(&clients), "each has an event on the way");
+        assert!(!has_space(&clients), "each has an event in flight");
         for id in [7, 3] {
-            clients.known(id).unwrap().account.tell(1, Verdict::Taken);
+            clients.get_mut(id).unwrap().session.record_outcome(1, Outcome::Accepted);
         }
-        assert!(roomy(&clients));
-        assert_eq!(clients.reports().len(), CLIENTS_MAX, "told before anybody else is heard");
-        clients.of(1000).account.enter(1, 1, 10);
-        assert!(clients.known(3).is_none() && clients.known(7).is_some(), "3 was heard of longer ago");
-        assert_eq!(clients.reports().len(), 1, "the newcomer's");
+        assert!(has_space(&clients));
+        assert_eq!(clients.next_reports().len(), CLIENTS_MAX, "all reports are sent before another client comes");
+        clients.get_or_insert(1000).session.begin(1, 1, 10);
+        assert!(clients.get_mut(3).is_none() && clients.get_mut(7).is_some(), "3 was silent longer");
+        assert_eq!(clients.next_reports().len(), 1, "the report of the new client");
         for id in (1..=CLIENTS_MAX as u64).filter(|id| ![3, 7].contains(id)) {
-            clients.known(id).expect("it has an event on the way").account.tell(1, Verdict::Taken);
+            let client = clients.get_mut(id).expect("it has an event in flight");
+            client.session.record_outcome(1, Outcome::Accepted);
         }
-        let told: Vec<_> = clients.reports().iter().map(|report| (report.client, report.acknowledged)).collect();
+        let reported: Vec<_> =
+            clients.next_reports().iter().map(|report| (report.client, report.acknowledged)).collect();
         let expected: Vec<_> = (1..=CLIENTS_MAX as u64).filter(|id| ![3, 7].contains(id)).map(|id| (id, 1)).collect();
-        assert_eq!(told, expected, "each hears its verdict");
+        assert_eq!(reported, expected, "each client gets its acknowledgement");
         assert_eq!(clients.0.len(), CLIENTS_MAX);
     }
 }

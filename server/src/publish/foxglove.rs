@@ -19,9 +19,9 @@ use tokio::task::JoinSet;
 
 use super::{Served, Vehicles};
 use crate::config::Foxglove as Options;
-use crate::subscriptions::Taken;
-use crate::engine::NewestSweep;
-use crate::ingest::locked;
+use crate::subscriptions::LayerSubscription;
+use crate::newest::NewestSweep;
+use crate::sync::locked;
 use crate::encode::EncodedMap;
 
 /// Messages on the way to one client: some revolutions of every layer; the largest, a grid, has about 1 MB.
@@ -97,7 +97,7 @@ struct Seat {
     /// Has not been shown the newest map yet.
     is_new: bool,
     /// What is made for it.
-    _taken: Option<Taken>,
+    _taken: Option<LayerSubscription>,
     points: Option<watch::Receiver<NewestSweep>>,
 }
 
@@ -123,7 +123,7 @@ impl Stage {
             return;
         }
         let status = &self.served.status;
-        let taken = layer.map(|(name, _)| status.demand.take(&[(*name).to_owned()]));
+        let taken = layer.map(|(name, _)| status.subscriptions.subscribe(&[(*name).to_owned()]));
         let points = is_points.then(|| status.sweeps.subscribe());
         locked(&self.seats).insert((channel, sink), Seat { is_new: true, _taken: taken, points });
         self.came.notify_one();

@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use tokio::sync::watch;
 
-use crate::engine::Newest;
+use crate::directory::{UnknownNameError, find_vehicle};
+use crate::newest::Newest;
 use crate::status::VehicleStatus;
 
 pub mod connections;
@@ -30,52 +31,13 @@ pub struct Served {
 #[derive(Clone, Debug, Default)]
 pub struct Vehicles(pub Arc<[Served]>);
 
-/// A reader asked for something that is not there.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Unknown {
-    /// No vehicle of this name, or none named where there are several.
-    #[error("vehicle {name:?} is not known; known: {known}")]
-    Vehicle {
-        /// What was asked for.
-        name: String,
-        /// What there is.
-        known: String,
-    },
-    /// No sensor of this name, or none named where there are several.
-    #[error("sensor {name:?} is not known; vehicle {vehicle} has: {known}")]
-    Sensor {
-        /// What was named.
-        name: String,
-        /// Whose.
-        vehicle: String,
-        /// What there is.
-        known: String,
-    },
-    /// No layer of this name.
-    #[error("layer {name:?} is not known; vehicle {vehicle} has: {known}")]
-    Layer {
-        /// What was asked for.
-        name: String,
-        /// Whose.
-        vehicle: String,
-        /// What there is.
-        known: String,
-    },
-}
-
 impl Vehicles {
     /// The vehicle of this name; the only one where `name` is empty.
     ///
     /// # Errors
-    /// [`Unknown::Vehicle`], listing the known ones.
-    pub fn find(&self, name: &str) -> Result<&Served, Unknown> {
-        if let ("", [only]) = (name, &self.0[..]) {
-            return Ok(only);
-        }
-        self.0.iter().find(|served| &*served.status.name == name).ok_or_else(|| {
-            let known: Vec<&str> = self.0.iter().map(|served| &*served.status.name).collect();
-            Unknown::Vehicle { name: name.to_owned(), known: known.join(", ") }
-        })
+    /// [`UnknownNameError::Vehicle`], listing the known ones.
+    pub fn find(&self, name: &str) -> Result<&Served, UnknownNameError> {
+        find_vehicle(&self.0, name, |served| &served.status.name)
     }
 
     /// The status of every vehicle.
@@ -88,12 +50,12 @@ impl Served {
     /// Whether the vehicle's maps have all these layers.
     ///
     /// # Errors
-    /// [`Unknown::Layer`] for the first that they have not, listing the known ones.
-    pub fn check_layers(&self, layers: &[String]) -> Result<(), Unknown> {
+    /// [`UnknownNameError::Layer`] for the first that they have not, listing the known ones.
+    pub fn check_layers(&self, layers: &[String]) -> Result<(), UnknownNameError> {
         let known = &self.status.layers;
         match layers.iter().find(|layer| !known.contains(&layer.as_str())) {
             None => Ok(()),
-            Some(name) => Err(Unknown::Layer {
+            Some(name) => Err(UnknownNameError::Layer {
                 name: name.clone(),
                 vehicle: self.status.name.to_string(),
                 known: known.join(", "),

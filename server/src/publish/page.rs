@@ -20,7 +20,7 @@ use tokio::net::TcpListener;
 
 use super::connections::Connections;
 use super::{Served, Vehicles};
-use crate::ingest::now_ns;
+use crate::clock::now_ns;
 use crate::status::{Reader, prometheus};
 
 /// A browser that has not taken a frame for this long shows nothing true any more.
@@ -108,7 +108,7 @@ async fn live(State(vehicles): State<Vehicles>, Query(wanted): Query<Wanted>, up
 /// Sends until the browser goes, stalls, or the engine stops.
 async fn stream(mut socket: WebSocket, served: Served) {
     let _reader = Reader::new(&served.status.page_readers);
-    let taken = served.status.demand.take(&[]);
+    let taken = served.status.subscriptions.subscribe(&[]);
     let mut newest = served.newest.clone();
     newest.mark_changed();
     let mut every = tokio::time::interval(STATUS_PERIOD);
@@ -118,7 +118,7 @@ async fn stream(mut socket: WebSocket, served: Served) {
             changed = newest.changed() => {
                 let Ok(()) = changed else { break };
                 let map = newest.borrow_and_update().clone();
-                let Some(map) = map.filter(|map| taken.are_in(map)) else { continue };
+                let Some(map) = map.filter(|map| taken.is_covered_by(map)) else { continue };
                 let skipped = last_sequence.map_or(0, |last: u64| map.sequence.saturating_sub(last + 1));
                 last_sequence = Some(map.sequence);
                 let update = v1::MapUpdate { map: map.select(&[]), skipped, sent_ns: now_ns(), left_out: 0 };

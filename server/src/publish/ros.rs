@@ -22,9 +22,9 @@ use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
 
 use super::Served;
-use super::zenoh::{ZenohError, failed};
 use crate::config::Ros2;
-use crate::ingest::now_ns;
+use crate::clock::now_ns;
+use crate::zenoh_session::ZenohError;
 use crate::encode::EncodedMap;
 
 /// The node's name.
@@ -86,7 +86,7 @@ impl<'a> Node<'a> {
         // The node is entity 0 of its session.
         let key = format!("@ros2_lv/{}/{}/0/{entity}", self.options.domain, self.session.zid());
         let token = self.session.liveliness().declare_token(key.clone());
-        self.tokens.push(token.await.map_err(failed(format!("liveliness {key}")))?);
+        self.tokens.push(token.await.map_err(ZenohError::of(format!("liveliness {key}")))?);
         Ok(key)
     }
 
@@ -103,7 +103,7 @@ impl<'a> Node<'a> {
                 .publisher_detection(),
             _ => publisher.advanced(),
         };
-        let publisher = publisher.await.map_err(failed(format!("publisher {key}")))?;
+        let publisher = publisher.await.map_err(ZenohError::of(format!("publisher {key}")))?;
         let (id, mangled) = (self.tokens.len(), topic.replace('/', "%"));
         let token = self.declare_token(&format!("{id}/MP/%/%/{NODE}/{mangled}/{name}/{hash}/{qos}")).await?;
         Ok(Topic { publisher, gid: gid(&token), sent: 0 })
@@ -152,7 +152,7 @@ impl Topic {
                     Err(_) => return,
                 }
             }
-            let _taken = layer.map(|layer| served.status.demand.take(&[layer.to_owned()]));
+            let _taken = layer.map(|layer| served.status.subscriptions.subscribe(&[layer.to_owned()]));
             newest.mark_changed();
             loop {
                 tokio::select! {

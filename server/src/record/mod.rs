@@ -2,10 +2,13 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | [`writer`] | events and maps -> MCAP |
-//! | [`reader`] | MCAP -> events and maps |
-//! | [`verify`] | recording -> are these the maps of these events? |
+//! | [`writer`] | events and maps -> MCAP file |
+//! | [`mcap_reader`] | any MCAP file -> its header and its messages |
+//! | [`reader`] | those messages -> events, maps, ROS 2 messages |
+//! | [`verify`] | recording -> differences between the recorded maps and the maps of the recorded events |
 
+mod chunk;
+pub mod mcap_reader;
 pub mod reader;
 pub mod verify;
 pub mod writer;

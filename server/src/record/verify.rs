@@ -16,7 +16,7 @@ use clearway_proto::v1;
 use prost::Message;
 use serde_json::{Value, json};
 
-use crate::record::reader::{Entry, Recording, RecordingError};
+use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 use crate::encode::EncodedMap;
 
 /// Differences kept in a report; all are counted.
@@ -175,8 +175,8 @@ struct Remaker {
 /// # Errors
 /// [`VerifyError`] where the file cannot be read as a recording; a map that differs is no error but in the [`Report`].
 pub fn verify(file: &Path) -> Result<Report, VerifyError> {
-    let mut recording = Recording::open(file)?;
-    let boot_id = recording.preface().boot_id;
+    let mut recording = RecordingReader::open(file)?;
+    let boot_id = recording.header().boot_id;
     let (config, tables) = recording.config()?;
     let mut remakers = Vec::new();
     for (vehicle, tables) in config.vehicles.iter().zip(tables) {
@@ -191,7 +191,7 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     let mut report = Report::default();
     for entry in recording.by_ref() {
         match entry? {
-            Entry::Event { vehicle, event } => {
+            RecordedMessage::Event { vehicle, event } => {
                 let Some(remaker) = remakers.iter_mut().find(|r| *r.name == *vehicle) else { continue };
                 report.events += 1;
                 if event.sequence != remaker.next_event {
@@ -206,7 +206,7 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
                     }
                 }
             }
-            Entry::Map { vehicle, layer, bytes } => {
+            RecordedMessage::Map { vehicle, layer, bytes } => {
                 let sequence = sequence_of(&bytes);
                 let remaker = remakers.iter_mut().find(|r| *r.name == *vehicle);
                 match remaker.and_then(|remaker| remaker.made.remove(&(sequence, layer.clone()))) {
@@ -215,7 +215,7 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
                     Some(made) => report.add(&vehicle, sequence, &layer, first_difference(&bytes, &made)),
                 }
             }
-            Entry::Ros { .. } => {}
+            RecordedMessage::Ros { .. } => {}
         }
     }
     report.cut = recording.is_cut();

@@ -1,10 +1,11 @@
 //! Every event and every map -> one MCAP file, on its own thread behind its own queue.
 //!
-//! Layout: metadata `clearway` (boot id, version, vehicles, where each calibration came from), attachments
-//! `config.toml` (effective) and `calibration/<vehicle>/<sensor>.yaml` (the configured tables), then the channels
-//! `/<vehicle>/journal` (`clearway.v1.Event`) and `/<vehicle>/map/<layer>` (`clearway.v1.Map`, the very bytes that
-//! zenoh carries). Log time is the arrival. Chunks are closed by time, so that a crash costs no more than `flush_ms`.
-//! A disk that fails ends the recording with a stated reason; maps go on being made and served.
+//! Layout: metadata `clearway` (boot id, version, vehicles, source of each calibration), attachments `config.toml` (the
+//! effective configuration) and `calibration/<vehicle>/<sensor>.yaml` (the configured tables), then the channels
+//! `/<vehicle>/journal` (`clearway.v1.Event`) and `/<vehicle>/map/<layer>` (`clearway.v1.Map`, the same bytes that zenoh
+//! carries). Log time is the arrival of the event, or of the event that completed the map. Chunks are closed by time, so
+//! that a crash loses at most `flush_ms`. A disk that fails ends the recording with a reason; maps are still computed
+//! and served.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -25,67 +26,75 @@ use mcap::{Attachment, Compression, McapError, WriteOptions};
 use prost::Message;
 
 use crate::config::Recorder as Options;
-use crate::ingest::locked;
 use crate::encode::{self, EncodedMap};
+use crate::sync::locked;
 
-/// What a recording says before its first event.
+/// The contents of a recording before its first event.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Preface {
-    /// Names the run of the server whose maps these are.
+pub struct Header {
+    /// Identifies the run of the server.
     pub boot_id: u64,
     /// The effective configuration, TOML.
     pub config: String,
-    /// The vehicles, in the order of the configuration, with the layers of their maps.
+    /// The vehicles with the layers of their maps, in the order of the configuration.
     pub vehicles: Vec<(Arc<str>, Vec<&'static str>)>,
     /// The configured calibration tables: vehicle, sensor, ROS YAML.
     pub calibrations: Vec<(String, String, String)>,
-    /// Anything else worth knowing, by name.
-    pub notes: BTreeMap<String, String>,
+    /// Further metadata, by name.
+    pub metadata: BTreeMap<String, String>,
 }
 
-/// Why nothing is recorded.
+/// A recording cannot begin.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// The file cannot be created.
+    /// The file or the recorder's thread cannot be created.
     #[error("recording {}: {source}", file.display())]
     Create {
         /// The recording.
         file: PathBuf,
-        /// Why.
+        /// The system's reason.
         source: std::io::Error,
     },
-    /// The preface cannot be written.
+    /// The header cannot be written.
     #[error("recording {}: {source}", file.display())]
     Write {
         /// The recording.
         file: PathBuf,
-        /// Why.
+        /// The reason.
         source: McapError,
     },
 }
 
-/// What the recording holds so far.
+/// A recording ended before the last event or map.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the recording is incomplete: {reason}")]
+pub struct IncompleteRecordingError {
+    /// The failure that ended the recording.
+    pub reason: String,
+}
+
+/// The counts of one recording.
 #[derive(Debug, Default)]
 pub struct RecorderCounts {
     file: String,
     events: AtomicU64,
     maps: AtomicU64,
     lost: AtomicU64,
-    stopped: Mutex<Option<String>>,
+    stop_reason: Mutex<Option<String>>,
 }
 
 impl RecorderCounts {
-    /// Why the recording ended before its time; `None` while all is well.
-    pub fn stopped(&self) -> Option<String> {
-        locked(&self.stopped).clone()
+    /// The failure that ended the recording; `None` while it goes on.
+    pub fn stop_reason(&self) -> Option<String> {
+        locked(&self.stop_reason).clone()
     }
 
-    /// Events and maps the recording does not hold: its queue was full, or its disk failed.
+    /// Number of events and maps that the recording lacks, because its queue was full or its disk failed.
     pub fn lost(&self) -> u64 {
         self.lost.load(Ordering::Relaxed)
     }
 
-    /// As the wire carries it.
+    /// The counts as the wire carries them.
     pub fn to_proto(&self) -> v1::RecorderStatus {
         v1::RecorderStatus {
             file: self.file.clone(),
@@ -95,49 +104,50 @@ impl RecorderCounts {
         }
     }
 
-    fn lose(&self) {
+    fn record_loss(&self) {
         if self.lost.fetch_add(1, Ordering::Relaxed) == 0 {
-            tracing::error!(file = %self.file, "the recording has begun to lose events or maps");
+            tracing::error!(file = %self.file, "the recording begins to lose events or maps");
         }
     }
 }
 
-enum Entry {
+/// One element of the recorder's queue: the vehicle's index, and its event or map.
+enum Item {
     Event(usize, Event),
     Map(usize, Arc<EncodedMap>),
 }
 
-/// One vehicle's way into the recording.
+/// One vehicle's handle of the recording: sends its events and maps to the recorder's queue.
 #[derive(Clone)]
-pub struct Journal {
+pub struct RecordingHandle {
     vehicle: usize,
-    queue: SyncSender<Entry>,
+    queue: SyncSender<Item>,
     counts: Arc<RecorderCounts>,
-    wait: bool,
+    waits: bool,
 }
 
-impl Journal {
+impl RecordingHandle {
     /// Records an event.
-    pub fn event(&self, event: &Event) {
-        self.enter(Entry::Event(self.vehicle, event.clone()));
+    pub fn record_event(&self, event: &Event) {
+        self.push(Item::Event(self.vehicle, event.clone()));
     }
 
     /// Records a map.
-    pub fn map(&self, map: Arc<EncodedMap>) {
-        self.enter(Entry::Map(self.vehicle, map));
+    pub fn record_map(&self, map: Arc<EncodedMap>) {
+        self.push(Item::Map(self.vehicle, map));
     }
 
-    fn enter(&self, entry: Entry) {
-        let taken = if self.wait {
-            self.queue.send(entry).is_ok()
+    fn push(&self, item: Item) {
+        let is_queued = if self.waits {
+            self.queue.send(item).is_ok()
         } else {
-            match self.queue.try_send(entry) {
+            match self.queue.try_send(item) {
                 Ok(()) => true,
                 Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => false,
             }
         };
-        if !taken {
-            self.counts.lose();
+        if !is_queued {
+            self.counts.record_loss();
         }
     }
 }
@@ -150,70 +160,74 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Creates the file, writes the preface, and gives each vehicle its way in, in the order of the preface. With
-    /// `wait` a full queue holds its writer up instead of losing anything: for files, never for live data.
+    /// Creates the file, writes the header and starts the thread. Returns a handle for each vehicle, in the order of the
+    /// header. With `waits` a full queue delays its sender and loses nothing: right for files, wrong for live data.
     ///
     /// # Errors
-    /// [`RecordError`] when the file cannot be created or written.
-    pub fn start(options: &Options, preface: &Preface, wait: bool) -> Result<(Self, Vec<Journal>), RecordError> {
+    /// [`RecordError::Create`] if the file or the thread cannot be created, [`RecordError::Write`] if the header cannot
+    /// be written.
+    pub fn start(
+        options: &Options,
+        header: &Header,
+        waits: bool,
+    ) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
         let path = options.file.clone();
         if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
             std::fs::create_dir_all(folder).map_err(|source| RecordError::Create { file: path.clone(), source })?;
         }
         let file = File::create(&path).map_err(|source| RecordError::Create { file: path.clone(), source })?;
-        let (scribe, journals) = Scribe::new(file, options, preface, wait)?;
-        let counts = scribe.counts();
+        let (writer, handles) = RecordingWriter::new(file, options, header, waits)?;
+        let counts = writer.counts();
         let thread = std::thread::Builder::new()
             .name("recorder".into())
-            .spawn(move || scribe.run())
+            .spawn(move || writer.run())
             .map_err(|source| RecordError::Create { file: path, source })?;
-        Ok((Self { counts, thread }, journals))
+        Ok((Self { counts, thread }, handles))
     }
 
-    /// What the recording holds so far.
+    /// The counts of the recording.
     pub fn counts(&self) -> Arc<RecorderCounts> {
         self.counts.clone()
     }
 
-    /// Waits until all journals are dropped and everything is in the file; gives the reason where it is not.
+    /// Waits until all handles are dropped and everything is in the file.
     ///
     /// # Errors
-    /// Why the recording is not whole.
-    pub fn finish(self) -> Result<(), String> {
-        if self.thread.join().is_err() {
-            return Err("the recorder's thread panicked".into());
-        }
-        self.counts.stopped().map_or(Ok(()), Err)
+    /// [`IncompleteRecordingError`] if the disk failed or the recorder's thread panicked.
+    pub fn finish(self) -> Result<(), IncompleteRecordingError> {
+        let panicked = self.thread.join().is_err().then(|| "the recorder's thread panicked".to_owned());
+        let reason = panicked.or_else(|| self.counts.stop_reason());
+        reason.map_or(Ok(()), |reason| Err(IncompleteRecordingError { reason }))
     }
 }
 
-/// Where a recording's bytes go.
+/// The disk that receives the bytes of a recording: a file, or a simulated disk in tests.
 pub trait Disk: Write + Send {
-    /// Makes sure that what was written outlives a crash of the machine.
+    /// Makes everything written so far survive a crash of the machine.
     ///
     /// # Errors
-    /// What the disk says.
-    fn keep(&mut self) -> io::Result<()>;
+    /// [`io::Error`] if the disk fails.
+    fn sync(&mut self) -> io::Result<()>;
 }
 
 impl Disk for File {
-    fn keep(&mut self) -> io::Result<()> {
+    fn sync(&mut self) -> io::Result<()> {
         self.sync_all()
     }
 }
 
-/// A disk that has failed once is not written again: the library closes what it drops, and a disk that has recovered
-/// would then hold a file that ends in order and lacks the rest.
-struct OnceFailed<D: Disk> {
+/// A disk that is never written again after its first failure. The MCAP library finishes a file when its writer is
+/// dropped; a disk that has recovered by then would hold a file that looks complete but lacks its end.
+struct StopAtFailure<D: Disk> {
     disk: D,
     failed: Option<io::ErrorKind>,
 }
 
-impl<D: Disk> OnceFailed<D> {
+impl<D: Disk> StopAtFailure<D> {
     fn unless_failed<T>(&mut self, act: impl FnOnce(&mut D) -> io::Result<T>) -> io::Result<T> {
         match self.failed {
             Some(kind) => Err(kind.into()),
-            // An interrupted call is made again, and has failed nothing.
+            // The caller repeats an interrupted call, so it is not a failure.
             None => act(&mut self.disk).inspect_err(|error| {
                 self.failed = Some(error.kind()).filter(|kind| *kind != io::ErrorKind::Interrupted);
             }),
@@ -221,7 +235,7 @@ impl<D: Disk> OnceFailed<D> {
     }
 }
 
-impl<D: Disk> Write for OnceFailed<D> {
+impl<D: Disk> Write for StopAtFailure<D> {
     fn write(&mut self, data: &[u8]) -> io::Result<usize> {
         self.unless_failed(|disk| disk.write(data))
     }
@@ -231,45 +245,52 @@ impl<D: Disk> Write for OnceFailed<D> {
     }
 }
 
-/// What writes a recording, without thread and clock: whoever has it says when. A failing disk ends the writing, not
-/// the listening.
-pub struct Scribe<D: Disk> {
-    tape: Option<Tape<D>>,
-    entries: Receiver<Entry>,
-    flush: Duration,
+/// Writes a recording, without a thread or clock of its own: its owner passes the time. After a failure of the disk it
+/// still empties its queue, and counts the elements as lost.
+pub struct RecordingWriter<D: Disk> {
+    /// `None` after a failure.
+    file: Option<McapFile<D>>,
+    items: Receiver<Item>,
+    flush_period: Duration,
     flush_at: Option<Instant>,
     counts: Arc<RecorderCounts>,
 }
 
-impl<D: Disk> Scribe<D> {
-    /// Writes the preface to `disk`, and gives each vehicle its way in, as [`Recorder::start`] does.
+impl<D: Disk> RecordingWriter<D> {
+    /// Writes the header to `disk`. Returns a handle for each vehicle, as [`Recorder::start`] does.
     ///
     /// # Errors
-    /// [`RecordError::Write`] when the preface cannot be written.
-    pub fn new(disk: D, options: &Options, preface: &Preface, wait: bool) -> Result<(Self, Vec<Journal>), RecordError> {
-        let wrong = |source| RecordError::Write { file: options.file.clone(), source };
-        let tape = Some(Tape::new(disk, preface).map_err(wrong)?);
-        let (queue, entries) = sync_channel(options.queue);
+    /// [`RecordError::Write`] if the header cannot be written.
+    pub fn new(
+        disk: D,
+        options: &Options,
+        header: &Header,
+        waits: bool,
+    ) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
+        let failed = |source| RecordError::Write { file: options.file.clone(), source };
+        let file = Some(McapFile::create(disk, header).map_err(failed)?);
+        let (queue, items) = sync_channel(options.queue);
         let counts = Arc::new(RecorderCounts { file: options.file.display().to_string(), ..RecorderCounts::default() });
-        let journal = |vehicle| Journal { vehicle, queue: queue.clone(), counts: counts.clone(), wait };
-        let journals = (0..preface.vehicles.len()).map(journal).collect();
-        Ok((Self { tape, entries, flush: Duration::from_millis(options.flush_ms), flush_at: None, counts }, journals))
+        let handle = |vehicle| RecordingHandle { vehicle, queue: queue.clone(), counts: counts.clone(), waits };
+        let handles = (0..header.vehicles.len()).map(handle).collect();
+        let flush_period = Duration::from_millis(options.flush_ms);
+        Ok((Self { file, items, flush_period, flush_at: None, counts }, handles))
     }
 
-    /// What the recording holds so far.
+    /// The counts of the recording.
     pub fn counts(&self) -> Arc<RecorderCounts> {
         self.counts.clone()
     }
 
-    /// Writes what comes until nobody is left to send.
+    /// Writes events and maps until all handles are dropped.
     fn run(mut self) {
         loop {
-            let entry = match self.flush_at {
-                None => self.entries.recv().map_err(|_| RecvTimeoutError::Disconnected),
-                Some(at) => self.entries.recv_timeout(at.saturating_duration_since(Instant::now())),
+            let item = match self.flush_at {
+                None => self.items.recv().map_err(|_| RecvTimeoutError::Disconnected),
+                Some(at) => self.items.recv_timeout(at.saturating_duration_since(Instant::now())),
             };
-            match entry {
-                Ok(entry) => self.write(&entry, Instant::now()),
+            match item {
+                Ok(item) => self.write(&item, Instant::now()),
                 Err(RecvTimeoutError::Timeout) => self.flush_if_due(Instant::now()),
                 Err(RecvTimeoutError::Disconnected) => break,
             }
@@ -277,30 +298,30 @@ impl<D: Disk> Scribe<D> {
         self.finish();
     }
 
-    /// Writes one of the events and maps that wait, if any, as at `now`; gives whether there was one.
-    pub fn take(&mut self, now: Instant) -> bool {
-        let entry = self.entries.try_recv();
-        match &entry {
-            Ok(entry) => self.write(entry, now),
+    /// Writes the first queued event or map, if there is one, at the time `now`. Returns true if there was one.
+    pub fn write_next(&mut self, now: Instant) -> bool {
+        let item = self.items.try_recv();
+        match &item {
+            Ok(item) => self.write(item, now),
             Err(_) => self.flush_if_due(now),
         }
-        entry.is_ok()
+        item.is_ok()
     }
 
-    /// Ends the recording, once all journals are dropped.
+    /// Ends the recording.
     pub fn finish(mut self) {
-        if let Some(Err(error)) = self.tape.take().map(Tape::finish) {
+        if let Some(Err(error)) = self.file.take().map(McapFile::finish) {
             self.stop(&error);
         }
     }
 
-    fn write(&mut self, entry: &Entry, now: Instant) {
-        let Some(tape) = &mut self.tape else { return self.counts.lose() };
-        if let Err(error) = tape.write(entry, &self.counts) {
+    fn write(&mut self, item: &Item, now: Instant) {
+        let Some(file) = &mut self.file else { return self.counts.record_loss() };
+        if let Err(error) = file.write(item, &self.counts) {
             return self.stop(&error);
         }
-        self.flush_at.get_or_insert(now + self.flush);
-        // Looked at after each: a queue that never runs dry must not put the flush off.
+        self.flush_at.get_or_insert(now + self.flush_period);
+        // Checked after each element, so that a queue that is never empty does not postpone the flush.
         self.flush_if_due(now);
     }
 
@@ -309,23 +330,23 @@ impl<D: Disk> Scribe<D> {
             return;
         }
         self.flush_at = None;
-        if let Some(Err(error)) = self.tape.as_mut().map(Tape::flush) {
+        if let Some(Err(error)) = self.file.as_mut().map(McapFile::flush) {
             self.stop(&error);
         }
     }
 
     fn stop(&mut self, error: &McapError) {
-        // The library says that writing failed, and only its source says why.
+        // The library's error says that writing failed; its source has the reason.
         let reason = std::error::Error::source(error).map_or(error.to_string(), |source| format!("{error}: {source}"));
         tracing::error!(file = %self.counts.file, %reason, "the recording stops here; maps are still served");
-        *locked(&self.counts.stopped) = Some(reason);
-        (self.tape, self.flush_at) = (None, None);
+        *locked(&self.counts.stop_reason) = Some(reason);
+        (self.file, self.flush_at) = (None, None);
     }
 }
 
-/// The open file.
-struct Tape<D: Disk> {
-    writer: mcap::Writer<NoSeek<BufWriter<OnceFailed<D>>>>,
+/// An open MCAP file with the channels of all vehicles.
+struct McapFile<D: Disk> {
+    writer: mcap::Writer<NoSeek<BufWriter<StopAtFailure<D>>>>,
     vehicles: Vec<VehicleChannels>,
 }
 
@@ -334,21 +355,21 @@ struct VehicleChannels {
     maps: BTreeMap<&'static str, u16>,
 }
 
-impl<D: Disk> Tape<D> {
-    fn new(disk: D, preface: &Preface) -> Result<Self, McapError> {
+impl<D: Disk> McapFile<D> {
+    fn create(disk: D, header: &Header) -> Result<Self, McapError> {
         let mut writer = WriteOptions::new()
             .profile("")
             .library(concat!("clearway/", env!("CARGO_PKG_VERSION")))
             .compression(Some(Compression::Zstd))
-            // In the recorder's own thread: by default each writer starts a thread a core.
+            // Compresses in the recorder's thread; by default the library starts one thread a core.
             .compression_threads(0)
-            // A chunk goes to the file whole, its length first: else a crash would leave one with a length of 0, which
-            // no reader can tell from damage.
+            // Writes each chunk at once, with its length first. Otherwise a crash leaves a chunk with length 0, which a
+            // reader cannot distinguish from damage.
             .disable_seeking(true)
-            .create(NoSeek::new(BufWriter::new(OnceFailed { disk, failed: None })))?;
-        let names: Vec<&str> = preface.vehicles.iter().map(|(name, _)| &**name).collect();
-        let mut metadata = preface.notes.clone();
-        metadata.insert("boot_id".into(), preface.boot_id.to_string());
+            .create(NoSeek::new(BufWriter::new(StopAtFailure { disk, failed: None })))?;
+        let names: Vec<&str> = header.vehicles.iter().map(|(name, _)| &**name).collect();
+        let mut metadata = header.metadata.clone();
+        metadata.insert("boot_id".into(), header.boot_id.to_string());
         metadata.insert("version".into(), env!("CARGO_PKG_VERSION").into());
         metadata.insert("vehicles".into(), names.join(","));
         writer.write_metadata(&Metadata { name: "clearway".into(), metadata })?;
@@ -356,14 +377,14 @@ impl<D: Disk> Tape<D> {
             let data = text.as_bytes().into();
             writer.attach(&Attachment { log_time: 0, create_time: 0, name, media_type: media_type.into(), data })
         };
-        attach("config.toml".into(), "application/toml", &preface.config)?;
-        for (vehicle, sensor, yaml) in &preface.calibrations {
+        attach("config.toml".into(), "application/toml", &header.config)?;
+        for (vehicle, sensor, yaml) in &header.calibrations {
             attach(format!("calibration/{vehicle}/{sensor}.yaml"), "application/yaml", yaml)?;
         }
         let event = writer.add_schema("clearway.v1.Event", "protobuf", DESCRIPTORS)?;
         let map = writer.add_schema("clearway.v1.Map", "protobuf", DESCRIPTORS)?;
         let mut vehicles = Vec::new();
-        for (vehicle, layers) in &preface.vehicles {
+        for (vehicle, layers) in &header.vehicles {
             let mut channel = |schema, topic: String| writer.add_channel(schema, &topic, "protobuf", &BTreeMap::new());
             let journal = channel(event, format!("/{vehicle}/journal"))?;
             let maps = layers
@@ -376,18 +397,18 @@ impl<D: Disk> Tape<D> {
         Ok(Self { writer, vehicles })
     }
 
-    fn write(&mut self, entry: &Entry, counts: &RecorderCounts) -> Result<(), McapError> {
-        match entry {
-            Entry::Event(vehicle, event) => {
+    fn write(&mut self, item: &Item, counts: &RecorderCounts) -> Result<(), McapError> {
+        match item {
+            Item::Event(vehicle, event) => {
                 let bytes = encode::event_to_proto(event).encode_to_vec();
-                self.message(self.vehicles[*vehicle].journal, event.sequence, event.arrival_ns, &bytes)?;
+                self.write_message(self.vehicles[*vehicle].journal, event.sequence, event.arrival_ns, &bytes)?;
                 counts.events.fetch_add(1, Ordering::Relaxed);
             }
-            Entry::Map(vehicle, map) => {
+            Item::Map(vehicle, map) => {
                 for (layer, chunk) in &map.layers {
                     let Some(&channel) = self.vehicles[*vehicle].maps.get(layer) else { continue };
                     let bytes: Bytes = map.layer(chunk);
-                    self.message(channel, map.sequence, map.completed_ns, &bytes)?;
+                    self.write_message(channel, map.sequence, map.completed_ns, &bytes)?;
                 }
                 counts.maps.fetch_add(1, Ordering::Relaxed);
             }
@@ -395,8 +416,8 @@ impl<D: Disk> Tape<D> {
         Ok(())
     }
 
-    fn message(&mut self, channel_id: u16, sequence: u64, arrival_ns: i64, data: &[u8]) -> Result<(), McapError> {
-        // MCAP counts in 32 bits and from 1970 on; the message itself has the whole figures.
+    fn write_message(&mut self, channel_id: u16, sequence: u64, arrival_ns: i64, data: &[u8]) -> Result<(), McapError> {
+        // MCAP has 32-bit sequences and no time before 1970; the message itself has the full values.
         let sequence = sequence as u32;
         let log_time = u64::try_from(arrival_ns).unwrap_or(0);
         let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
@@ -409,21 +430,21 @@ impl<D: Disk> Tape<D> {
 
     fn finish(mut self) -> Result<(), McapError> {
         self.writer.finish()?;
-        // `finish` leaves the last bytes to the file's own buffer.
+        // `finish` leaves the last bytes in the buffer.
         let buffer = self.writer.into_inner().into_inner();
-        let mut whole = buffer.into_inner().map_err(|error| McapError::Io(error.into_error()))?;
-        whole.disk.keep().map_err(McapError::Io)
+        let mut complete = buffer.into_inner().map_err(|error| McapError::Io(error.into_error()))?;
+        complete.disk.sync().map_err(McapError::Io)
     }
 }
 
-/// The recording's path, or nothing where nothing is to be recorded.
-pub fn wanted(options: &Options) -> Option<&Path> {
+/// The path of the recording; `None` if the configuration names no file.
+pub fn recording_path(options: &Options) -> Option<&Path> {
     (!options.file.as_os_str().is_empty()).then_some(options.file.as_path())
 }
 
-/// `file`, or where that exists, the first of `name-1.mcap`, `name-2.mcap`, … that does not: a server that starts again
-/// must not write over what it recorded before.
-pub fn unused(file: &Path) -> PathBuf {
+/// `file`, or if it exists, the first of `name-1.mcap`, `name-2.mcap`, ... that does not exist, so that a server that
+/// starts again does not overwrite an earlier recording.
+pub fn next_free_name(file: &Path) -> PathBuf {
     let stem = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let extension = file.extension().map_or("mcap".into(), |extension| extension.to_string_lossy().into_owned());
     let numbered = (1_u64..).map(|number| file.with_file_name(format!("{stem}-{number}.{extension}")));
@@ -435,11 +456,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_new_run_never_writes_over_an_earlier_recording() {
+    fn a_new_run_never_overwrites_an_earlier_recording() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("car.mcap");
         for expected in ["car.mcap", "car-1.mcap", "car-2.mcap"] {
-            let found = unused(&file);
+            let found = next_free_name(&file);
             assert_eq!(found, folder.path().join(expected));
             File::create(found).unwrap();
         }
@@ -448,7 +469,7 @@ mod tests {
     #[test]
     fn a_file_that_cannot_be_created_is_named() {
         let options = Options { file: "/proc/no/such.mcap".into(), ..Options::default() };
-        let error = Recorder::start(&options, &Preface::default(), false).map(|_| ()).unwrap_err().to_string();
+        let error = Recorder::start(&options, &Header::default(), false).map(|_| ()).unwrap_err().to_string();
         assert!(error.contains("/proc/no"), "{error}");
     }
 }

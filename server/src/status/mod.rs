@@ -12,15 +12,19 @@ use clearway_proto::v1;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
-use crate::subscriptions::Demand;
-use crate::engine::NewestSweep;
-use crate::ingest::{Outside, Stranger, locked, now_ns};
+use crate::subscriptions::LayerSubscriptions;
+use crate::newest::NewestSweep;
+use crate::clock::now_ns;
+use crate::ingest::drops::{DropCounters, UnknownSender};
+use crate::sync::locked;
 use crate::record::writer::RecorderCounts;
 use crate::encode::EncodedMap;
 
 mod prometheus;
+mod sensor_json;
 
 pub use prometheus::prometheus;
+pub use sensor_json::{ledger_json, sensor_json};
 
 /// Durations kept for the percentiles: seven minutes of a 10 Hz sensor.
 const LATENCIES: usize = 4096;
@@ -39,14 +43,14 @@ pub struct VehicleStatus {
     /// The layers of its maps, in order.
     pub layers: Vec<&'static str>,
     /// Which of the layers somebody takes.
-    pub demand: Demand,
+    pub subscriptions: LayerSubscriptions,
     /// Where the newest map's points go while somebody takes them.
     pub sweeps: watch::Sender<NewestSweep>,
     /// Readers over gRPC.
     pub grpc_readers: Arc<AtomicU32>,
     /// Open pages.
     pub page_readers: Arc<AtomicU32>,
-    outside: Arc<Outside>,
+    drops: Arc<DropCounters>,
     recorder: OnceLock<Arc<RecorderCounts>>,
     engine_stopped: AtomicBool,
     inside: Mutex<Inside>,
@@ -129,16 +133,16 @@ impl Snapshot {
 
 impl VehicleStatus {
     /// The status of a vehicle that has seen nothing.
-    pub fn new(name: Arc<str>, boot_id: u64, layers: Vec<&'static str>, outside: Arc<Outside>) -> Self {
+    pub fn new(name: Arc<str>, boot_id: u64, layers: Vec<&'static str>, drops: Arc<DropCounters>) -> Self {
         Self {
             name,
             boot_id,
-            demand: Demand::new(&layers),
+            subscriptions: LayerSubscriptions::new(&layers),
             sweeps: watch::Sender::new(None),
             layers,
             grpc_readers: Arc::default(),
             page_readers: Arc::default(),
-            outside,
+            drops,
             recorder: OnceLock::new(),
             engine_stopped: AtomicBool::new(false),
             inside: Mutex::default(),
@@ -198,10 +202,10 @@ impl VehicleStatus {
             ..Snapshot::default()
         };
         let sensors = snapshot.sensors.iter_mut().map(|sensor| &mut sensor.ledger);
-        self.outside.add_to(&mut snapshot.ledger, sensors);
+        self.drops.add_unreported_to(&mut snapshot.ledger, sensors);
         // The engine waits for this lock: what takes longer comes after it.
         drop(inside);
-        snapshot.observations_refused = self.outside.observations_refused();
+        snapshot.observations_refused = self.drops.refused_messages();
         latencies.sort_unstable();
         snapshot.latency_ms_p50 = percentile_ms(&latencies, 50);
         snapshot.latency_ms_p99 = percentile_ms(&latencies, 99);
@@ -231,7 +235,7 @@ impl VehicleStatus {
             sensor_ledgers: snapshot.sensors.iter().map(|s| (s.name.clone(), ledger(&s.ledger))).collect(),
             recorder: Some(self.recorder.get().map(|counts| counts.to_proto()).unwrap_or_default()),
             readers: self.readers().map(|(transport, readers)| (transport.to_owned(), readers)).into(),
-            unknown_senders: self.outside.strangers().iter().map(stranger).collect(),
+            unknown_senders: self.drops.unknown_senders().iter().map(unknown_sender).collect(),
             observations_refused: by_name(&snapshot.observations_refused),
         }
     }
@@ -242,17 +246,10 @@ impl VehicleStatus {
         let snapshot = self.snapshot();
         let proto = self.proto_of(&snapshot);
         let (ledger, recorder) = (proto.ledger.unwrap_or_default(), proto.recorder.unwrap_or_default());
-        let sensors = proto.sensors.iter().map(|s| {
-            json!({
-                "name": s.name, "model": s.model, "packets": s.packets, "packets_expected": s.packets_expected,
-                "refused": s.refused, "returns": s.returns,
-                "rpm": s.rpm, "completeness": s.completeness, "partial": s.partial,
-                "blocked_deg": s.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
-                "blocked_lasers": s.blocked_lasers,
-                "clock": s.clock, "clock_offset_ms": s.clock_offset_ms,
-                "state": s.state, "age_ms": s.age_ms,
-                "ledger": proto.sensor_ledgers.get(&s.name).map(ledger_json),
-            })
+        let sensors = proto.sensors.iter().map(|state| {
+            let mut sensor = sensor_json(state);
+            sensor["ledger"] = proto.sensor_ledgers.get(&state.name).map(ledger_json).into();
+            sensor
         });
         json!({
             "name": proto.name,
@@ -267,7 +264,7 @@ impl VehicleStatus {
             "observations_refused": proto.observations_refused,
             "recorder": {
                 "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
-                "stopped": self.recorder.get().and_then(|counts| counts.stopped()),
+                "stopped": self.recorder.get().and_then(|counts| counts.stop_reason()),
             },
             "readers": proto.readers,
             "unknown_senders": proto.unknown_senders.iter().map(|s| {
@@ -280,19 +277,9 @@ impl VehicleStatus {
     }
 }
 
-fn stranger(stranger: &Stranger) -> v1::UnknownSender {
-    let Stranger { address, datagrams, newest_ns } = *stranger;
+fn unknown_sender(sender: &UnknownSender) -> v1::UnknownSender {
+    let UnknownSender { address, datagrams, newest_ns } = *sender;
     v1::UnknownSender { address: address.to_string(), datagrams, newest_ns }
-}
-
-fn ledger_json(ledger: &v1::Ledger) -> Value {
-    json!({
-        "received": ledger.received, "decoded": ledger.decoded, "telemetry": ledger.telemetry,
-        "refused": ledger.refused, "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
-        "points_dropped": ledger.points_dropped, "own_body": ledger.own_body, "through_body": ledger.through_body, "blind": ledger.blind,
-        "poses": ledger.poses, "poses_refused": ledger.poses_refused,
-        "roads": ledger.roads, "roads_refused": ledger.roads_refused,
-    })
 }
 
 fn ledger(ledger: &Ledger) -> v1::Ledger {
@@ -349,10 +336,10 @@ mod tests {
 
     #[test]
     fn what_the_door_turned_away_is_in_the_ledger_and_the_ledger_adds_up() {
-        let (door, _events) = crate::ingest::door(4);
-        door.refuse_stranger(([10, 0, 0, 9], 2368).into());
-        door.refuse_stranger(([10, 0, 0, 9], 2368).into());
-        let status = VehicleStatus::new("car".into(), 1, vec!["drivability"], door.outside());
+        let (door, _events) = crate::ingest::queue::event_queue(4);
+        door.refuse_unknown_sender(([10, 0, 0, 9], 2368).into());
+        door.refuse_unknown_sender(([10, 0, 0, 9], 2368).into());
+        let status = VehicleStatus::new("car".into(), 1, vec!["drivability"], door.drops());
         let ledger = Ledger { received: 3, decoded: 2, telemetry: 1, ..Ledger::default() };
         status.stepped(&ledger, Vec::new());
         let shown = status.snapshot().ledger;

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use clearway_mapping::pipeline::NamedStatus;
 
 use super::{Snapshot, VehicleStatus};
-use crate::ingest::now_ns;
+use crate::clock::now_ns;
 
 /// What `/metrics` shows of these vehicles.
 pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {

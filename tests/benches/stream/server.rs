@@ -61,7 +61,7 @@ pub async fn serve() {
     // The drive is older than its arrival.
     vehicle.sensors[0].gps_late_days_max = 36_525.0;
     let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
-    let (data, _) = running.doors[0].udp.expect("a socket");
+    let (data, _) = running.inputs[0].udp.expect("a socket");
     let floor = TcpListener::bind(any).expect("a free port");
     let floor_at = floor.local_addr().expect("bound");
     tokio::spawn(serve_floor(floor));

@@ -95,8 +95,8 @@ impl TestBed<'_> {
         let source = self.rng.within(0..self.networks.len() as i64) as u16;
         self.offered += 1;
         match self.rng.within(0..4) {
-            0 => self.door.leave_outside(source, Cause::Length, 1),
-            1 => self.door.refuse_stranger(([10, 0, 0, self.rng.within(1..99) as u8], 2368).into()),
+            0 => self.door.record_drop(source, Cause::Length, 1),
+            1 => self.door.refuse_unknown_sender(([10, 0, 0, self.rng.within(1..99) as u8], 2368).into()),
             2 => {
                 self.offered -= 1;
                 let stamp_ns = self.drive.rig.start_ns + self.plan.offset_ns + self.now_ns;
@@ -127,7 +127,7 @@ impl TestBed<'_> {
                 continue;
             }
             assert!(payload.len() <= DATAGRAM_BYTES_MAX, "the network does not lengthen datagrams");
-            self.door.enter(source, Body::Datagram(Bytes::from(payload))).expect("the engine is there");
+            self.door.push(source, Body::Datagram(Bytes::from(payload))).expect("the engine is there");
         }
         self.set_clock(self.now_ns);
     }
@@ -136,18 +136,18 @@ impl TestBed<'_> {
     pub fn observe(&mut self) {
         while let Ok((mark, verdict)) = self.told.try_recv() {
             if self.injected != Some(InjectedFault::LostOutcome) || mark.number != 100 {
-                self.account.tell(mark.number, verdict);
+                self.account.record_outcome(mark.number, verdict);
             }
         }
         let limits = &self.entrance.limits;
-        while self.account.has_room(self.entrance.in_flight_max, limits.message_bytes_max) {
+        while self.account.has_credit(self.entrance.in_flight_max, limits.message_bytes_max) {
             let Some(mut observation) = self.waiting.pop_front() else { break };
             self.observations += 1;
             observation.number = self.observations;
             self.offered += 1;
             let bytes = observation.encoded_len();
             // An unknown sensor ends a real stream; its car connects again.
-            let _ = self.entrance.take(observation, bytes, &mut self.account, &self.verdicts);
+            let _ = self.entrance.push(observation, bytes, &mut self.account, &self.verdicts);
         }
     }
 }

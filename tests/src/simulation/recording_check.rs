@@ -52,7 +52,7 @@ impl Write for MemoryDisk {
 }
 
 impl Disk for MemoryDisk {
-    fn keep(&mut self) -> io::Result<()> {
+    fn sync(&mut self) -> io::Result<()> {
         Ok(())
     }
 }
@@ -82,7 +82,7 @@ impl Recorded {
             Ok(report) => report,
             // The machine crashed or the disk failed before the header was written.
             Err(VerifyError::Recording(_))
-                if self.confirmed == 0 && (self.crashed || self.counts.stopped().is_some()) =>
+                if self.confirmed == 0 && (self.crashed || self.counts.stop_reason().is_some()) =>
             {
                 return Ok(false);
             }
@@ -98,13 +98,13 @@ impl Recorded {
             self.expected.1,
             report.different,
             report.cut,
-            self.counts.stopped(),
+            self.counts.stop_reason(),
             report.differences.first(),
         );
         if report.events < self.confirmed {
             return wrong(format!("{} events were confirmed: {summary}", self.confirmed));
         }
-        let good = match (self.crashed, self.counts.stopped(), lost) {
+        let good = match (self.crashed, self.counts.stop_reason(), lost) {
             (true, _, 0) => report.is_good() && report.cut,
             (false, Some(_), _) => report.cut || !report.is_good(),
             (false, None, 0) => report.is_good() && !report.cut && complete,

@@ -51,14 +51,14 @@ impl TestBed<'_> {
         if self.clock.load(Ordering::Relaxed) - newest_ns > 2 * REVOLUTION_NS {
             return Err(violation("converge", format!("no map for two revolutions: {last}")));
         }
-        self.door.close(None).map_err(|closed| violation("ledger", closed.to_string()))?;
+        self.door.report_drops(None).map_err(|closed| violation("ledger", closed.to_string()))?;
         self.step()?;
-        self.engine.rest();
+        self.engine.update_status();
         let snapshot = self.vehicles.0[0].status.snapshot();
         accounts(self.offered, &snapshot.ledger, &snapshot.sensors)?;
         adds_up("at the end, the core", self.engine.pipeline.ledger())?;
         self.observe();
-        if !self.account.is_settled() || !self.waiting.is_empty() {
+        if !self.account.is_idle() || !self.waiting.is_empty() {
             let (events, _) = self.account.in_flight();
             let found = format!("{events} events without an outcome, {} observations still wait", self.waiting.len());
             return Err(violation("outcomes", found));
@@ -87,7 +87,7 @@ impl TestBed<'_> {
         let layers = self.maps.first().map_or(0, |map| map.layers.len() as u64);
         let Some(mut scribe) = self.scribe else { return Ok(Outcome { digest: hasher.finish(), ..outcome }) };
         drop(self.engine);
-        while scribe.take(now) {}
+        while scribe.write_next(now) {}
         let counts = scribe.counts();
         scribe.finish();
         let crashed = self.disk_at_crash.is_some();

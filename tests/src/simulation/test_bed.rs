@@ -10,11 +10,12 @@ use std::time::{Duration, Instant};
 use clearway::config::Config;
 use clearway::encode::EncodedMap;
 use clearway::engine::Engine;
-use clearway::ingest::gateway::Entrance;
-use clearway::ingest::receipt::{Account, Mark, Verdict, Verdicts};
-use clearway::ingest::{Clock, Door, Queued, door_by};
+use clearway::ingest::gateway::Gateway;
+use clearway::ingest::receipt::{ClientSession, ObservationId, Outcome as EventOutcome, OutcomeSender};
+use clearway::clock::Clock;
+use clearway::ingest::queue::{EventQueue, QueuedEvent, event_queue_with_clock};
 use clearway::publish::{Served, Vehicles};
-use clearway::record::writer::{Preface, Scribe};
+use clearway::record::writer::{Header, RecordingWriter};
 use clearway::status::VehicleStatus;
 use clearway_mapping::pipeline::{Pipeline, layer_names};
 use clearway_proto::v1;
@@ -41,8 +42,8 @@ pub(super) struct TestBed<'a> {
     pub(super) now_ns: i64,
 
     pub(super) clock: Arc<AtomicI64>,
-    pub(super) door: Door,
-    pub(super) events: Receiver<Queued>,
+    pub(super) door: EventQueue,
+    pub(super) events: Receiver<QueuedEvent>,
     pub(super) engine: Engine,
     pub(super) vehicles: Vehicles,
     pub(super) maps: Vec<Arc<EncodedMap>>,
@@ -57,18 +58,18 @@ pub(super) struct TestBed<'a> {
     pub(super) next_sent: usize,
     pub(super) offered: u64,
 
-    pub(super) entrance: Entrance,
+    pub(super) entrance: Gateway,
     pub(super) waiting: VecDeque<v1::Observation>,
-    pub(super) account: Account,
+    pub(super) account: ClientSession,
     pub(super) observations: u64,
-    pub(super) verdicts: Verdicts,
-    pub(super) told: UnboundedReceiver<(Mark, Verdict)>,
+    pub(super) verdicts: OutcomeSender,
+    pub(super) told: UnboundedReceiver<(ObservationId, EventOutcome)>,
 
     pub(super) readers: Vec<Reader>,
 
     pub(super) began: Instant,
     pub(super) disk: MemoryDisk,
-    pub(super) scribe: Option<Scribe<MemoryDisk>>,
+    pub(super) scribe: Option<RecordingWriter<MemoryDisk>>,
     /// Events passed to the recorder by the end of each tick.
     pub(super) recorded_by_tick: Vec<u64>,
     /// Content of the disk when the machine crashed.
@@ -82,7 +83,7 @@ impl<'a> TestBed<'a> {
         let vehicle = &config.vehicles[0];
         let layers = layer_names(&vehicle.maps);
         let clock = Arc::new(AtomicI64::new(0));
-        let (door, events) = door_by(
+        let (door, events) = event_queue_with_clock(
             Clock::new({
                 let clock = clock.clone();
                 move || clock.load(Ordering::Relaxed)
@@ -90,19 +91,19 @@ impl<'a> TestBed<'a> {
             vehicle.queue,
         );
         let vehicles = vec![("car".into(), layers.clone())];
-        let preface = Preface { boot_id: 1, config: config.to_toml(), vehicles, ..Preface::default() };
+        let header = Header { boot_id: 1, config: config.to_toml(), vehicles, ..Header::default() };
         let disk = MemoryDisk::new(plan.disk.clone());
-        let (scribe, journal) = match Scribe::new(disk.clone(), &config.recorder, &preface, false) {
+        let (scribe, journal) = match RecordingWriter::new(disk.clone(), &config.recorder, &header, false) {
             Ok((scribe, mut journals)) => (Some(scribe), journals.pop()),
             // The disk is full before the first event: the run goes on without a recording.
             Err(_) => (None, None),
         };
-        let status = Arc::new(VehicleStatus::new("car".into(), 1, layers.clone(), door.outside()));
+        let status = Arc::new(VehicleStatus::new("car".into(), 1, layers.clone(), door.drops()));
         scribe.iter().for_each(|scribe| status.show_recorder(scribe.counts()));
         let (newest, receiver) = watch::channel(None);
         let pipeline = Pipeline::new(&vehicle.core(), vec![None; vehicle.sensors.len()]).expect("a valid car");
         let valid_ms = vehicle.maps.valid_ms;
-        let engine = Engine { pipeline, valid_ms, newest, journal, status: status.clone(), observer: None };
+        let engine = Engine { pipeline, valid_ms, newest, recording: journal, status: status.clone(), observer: None };
         let mut rng = Rng::new(!plan.seed);
         let (verdicts, told) = unbounded_channel();
         Self {
@@ -111,7 +112,7 @@ impl<'a> TestBed<'a> {
             drive,
             now_ns: 0,
             clock,
-            entrance: Entrance::new(vehicle, &door),
+            entrance: Gateway::new(vehicle, &door),
             door,
             events,
             engine,
@@ -125,7 +126,7 @@ impl<'a> TestBed<'a> {
             next_sent: drive.sent.partition_point(|sent| sent.offset_ns < plan.offset_ns),
             offered: 0,
             waiting: VecDeque::new(),
-            account: Account::new(0),
+            account: ClientSession::new(0),
             observations: 0,
             verdicts,
             told,
@@ -147,7 +148,7 @@ impl<'a> TestBed<'a> {
             self.observe();
             if !during(&self.plan.engine_stall, self.now_ns) {
                 self.step()?;
-                self.engine.rest();
+                self.engine.update_status();
                 let snapshot = self.vehicles.0[0].status.snapshot();
                 accounts(self.offered, &snapshot.ledger, &snapshot.sensors)?;
             }
@@ -169,10 +170,10 @@ impl<'a> TestBed<'a> {
         while let Ok(queued) = self.events.try_recv() {
             self.taken += 1;
             let journal = (self.injected == Some(InjectedFault::UnrecordedEvent) && self.taken == 300)
-                .then(|| self.engine.journal.take());
-            self.engine.take(queued);
+                .then(|| self.engine.recording.take());
+            self.engine.step(queued);
             if let Some(journal) = journal {
-                self.engine.journal = journal;
+                self.engine.recording = journal;
             }
             adds_up("the vehicle", self.engine.pipeline.ledger())?;
             let newest = self.engine.newest.borrow().clone();
@@ -223,7 +224,7 @@ impl<'a> TestBed<'a> {
         if !during(&self.plan.recorder_stall, self.now_ns)
             && let Some(scribe) = &mut self.scribe
         {
-            while scribe.take(now) {}
+            while scribe.write_next(now) {}
         }
         self.recorded_by_tick.push(self.taken);
         if let DiskFault::Crash(at_ns, torn) = self.plan.disk

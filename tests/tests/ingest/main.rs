@@ -10,7 +10,7 @@ use std::path::Path;
 
 use bytes::Bytes;
 use clearway::config::Config;
-use clearway::ingest::Reading;
+use clearway::ingest::queue::Reading;
 use clearway::record::verify::verify;
 use clearway::server::{Running, Server, Setup};
 use clearway_client::observation::{RoadFrame, RoadPurpose, Sensor, by_reason};
@@ -102,8 +102,8 @@ async fn assert_tunnelled_makes_the_maps_of_the_file_door(config: Config, readin
 
     let running = start(config.clone(), &by_file).await;
     feed(&running, readings.clone()).await;
-    let door = running.doors[0].door.clone();
-    tokio::task::spawn_blocking(move || door.enter_captured(end)).await.unwrap().unwrap();
+    let door = running.inputs[0].queue.clone();
+    tokio::task::spawn_blocking(move || door.push_captured(end)).await.unwrap().unwrap();
     within("shutdown", running.shutdown()).await.unwrap();
 
     let running = start(config, &by_grpc).await;

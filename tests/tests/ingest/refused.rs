@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use bytes::Bytes;
-use clearway::record::reader::{Entry, Recording};
+use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::record::verify::verify;
 use clearway_client::observation::by_reason;
 use clearway_client::{ClientError, Ingester, Observation};
@@ -206,8 +206,8 @@ async fn strangers_crowds_and_giants_are_told_what_is_allowed() {
     assert!(status.code() == Code::OutOfRange && status.message().contains("97536"), "{status:?}");
     assert_eq!(running.vehicles.0[0].status.snapshot().ledger.refused.get("observation"), Some(&1));
     within("shutdown", running.shutdown()).await.unwrap();
-    let told = Recording::open(&file).unwrap().map(|entry| match entry.unwrap() {
-        Entry::Event { event: Event { body: Body::Lost { cause: Cause::Observation, count }, .. }, .. } => count,
+    let told = RecordingReader::open(&file).unwrap().map(|entry| match entry.unwrap() {
+        RecordedMessage::Event { event: Event { body: Body::Lost { cause: Cause::Observation, count }, .. }, .. } => count,
         _ => 0,
     });
     assert_eq!(told.sum::<u64>(), 1, "the journal knows of it, though no event came after");

@@ -9,7 +9,7 @@ use std::future::ready;
 use std::net::SocketAddr;
 use std::pin::Pin;
 
-use clearway::ingest::Reading;
+use clearway::ingest::queue::Reading;
 use clearway::server::Running;
 use clearway_proto::codec::Limits;
 use clearway_proto::map::{Map, decode_map, decode_map_on};

@@ -1,8 +1,7 @@
-//! How long a packet takes, from bytes to corrected points in a revolution.
+//! Time to decode a packet, from bytes to corrected points of a revolution.
 //!
-//! Streams are made here: one turn of an HDL-64E S2 (with a table of its own that uses every correction) and of a
-//! VLP-16, pushed over and over with their device time going on. Targets: 2.6 µs an HDL-64E packet, 2.7 µs a VLP-16's.
-//! Points a second are 384 over the time shown.
+//! The streams are generated: packets of an HDL-64E S2 (with and without a table that uses all corrections) and of a
+//! VLP-16. Targets: 2.6 µs per packet of an HDL-64E, 2.7 µs per packet of a VLP-16. A packet has 384 points.
 
 use clearway_lidar::model::{BLOCK_FLAGS, BLOCKS_PER_PACKET};
 use clearway_lidar::{Calibration, Model, ReturnMode, Sensor, SensorConfig};
@@ -13,7 +12,7 @@ fn main() {
     divan::main();
 }
 
-/// Packets a measurement, so that cutting a turn is in the figure as often as in life.
+/// Number of packets of a measurement, so that it contains as many cuts per packet as a real stream.
 const PACKETS: usize = 2_000;
 
 #[divan::bench(args = [false, true])]
@@ -38,20 +37,19 @@ fn decode(bencher: Bencher<'_, '_>, model: Model, config: SensorConfig) {
     let mut sensor = Sensor::new(SensorConfig { model: Some(model), ..config });
     bencher.counter(ItemsCount::new(PACKETS)).bench_local(|| {
         for (index, packet) in packets.iter().enumerate() {
-            // Where the stream begins again its time falls back: the first packet is refused until the second confirms
-            // it.
+            // When the stream begins again, its device time jumps back, and the first packet is refused.
             divan::black_box(sensor.push(packet, index as i64).ok());
         }
     });
 }
 
-/// The packet of that index of a stream at 10 turns a second: walls at 3 to 60 m, one return in eight without echo.
+/// Packet `index` of a stream at 10 revolutions per second: returns at 3 to 60 m, one in eight without an echo.
 fn packet(model: Model, index: usize) -> Vec<u8> {
     let spec = model.spec();
     let mut bytes = Vec::with_capacity(1206);
     let firing = index * spec.firings_per_packet(ReturnMode::Strongest);
     for block in 0..BLOCKS_PER_PACKET {
-        let place = spec.place(block, ReturnMode::Strongest);
+        let place = spec.block_position(block, ReturnMode::Strongest);
         let time_ns = (firing + place.firing) as u64 * u64::from(spec.firing_period_ns);
         let azimuth = time_ns * 36_000 / 100_000_000 % 36_000;
         bytes.extend(BLOCK_FLAGS[place.bank].to_le_bytes());

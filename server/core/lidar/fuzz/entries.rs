@@ -1,33 +1,36 @@
-//! What the fuzzer, and `cargo test` with its corpora, do with a file's bytes. Nothing here may panic.
+//! The entry points of the fuzzers, which `cargo test` also runs with the corpora. None of them may panic.
 
-use clearway_lidar::calibration::unit_table::UnitTable;
+use clearway_lidar::calibration::status_table::StatusTable;
 use clearway_lidar::capture::Capture;
 use clearway_lidar::telemetry::Telemetry;
 use clearway_lidar::{Calibration, Model, Sensor, SensorConfig};
 
-/// A stream: a byte that names the model or none, then datagrams of 1206 bytes.
+/// Decodes a stream: a byte that is the index of the model, or none, then datagrams of 1206 bytes.
 pub fn packet(bytes: &[u8]) {
     let Some((first, datagrams)) = bytes.split_first() else { return };
     let model = Model::ALL.get(usize::from(*first)).copied();
     let mut sensor = Sensor::new(SensorConfig { model, ..SensorConfig::default() });
     for (index, datagram) in datagrams.chunks(1206).enumerate() {
         let before = sensor.status();
-        match sensor.push(datagram, index as i64 * 500_000).map(|turn| turn.map(|turn| turn.points().count())) {
+        match sensor
+            .push(datagram, index as i64 * 500_000)
+            .map(|revolution| revolution.map(|revolution| revolution.points().count()))
+        {
             Ok(_) => {}
-            Err(refusal) => {
-                assert_eq!(sensor.status(), before, "{refusal}");
+            Err(error) => {
+                assert_eq!(sensor.status(), before, "{error}");
             }
         }
     }
-    if let Some(turn) = sensor.finish() {
-        assert_eq!(turn.echoes[0].range_m.len(), turn.firings.len() * turn.lasers);
-        assert_eq!(turn.points().count(), turn.returns());
+    if let Some(revolution) = sensor.finish() {
+        assert_eq!(revolution.echoes[0].range_m.len(), revolution.firings.len() * revolution.lasers);
+        assert_eq!(revolution.points().count(), revolution.returns());
     }
-    let mut table = UnitTable::default();
+    let mut table = StatusTable::default();
     datagrams.chunks_exact(2).for_each(|pair| drop(table.push((pair[0], pair[1]))));
 }
 
-/// One telemetry datagram: the bytes, cut or padded to its length.
+/// Parses the bytes as telemetry, and again cut or padded to its length.
 pub fn telemetry(bytes: &[u8]) {
     let mut datagram = bytes.to_vec();
     drop(Telemetry::new(&datagram));
@@ -35,14 +38,14 @@ pub fn telemetry(bytes: &[u8]) {
     drop(Telemetry::new(&datagram));
 }
 
-/// A capture file.
+/// Reads a capture file.
 pub fn capture(bytes: &[u8]) {
     if let Ok(capture) = Capture::new(bytes) {
         capture.for_each(drop);
     }
 }
 
-/// A calibration text; one that is read comes back as it was.
+/// Reads a calibration text. If it is valid, it is written and read again.
 pub fn calibration(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     if let Ok(calibration) = Calibration::load_str(text) {

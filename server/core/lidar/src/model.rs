@@ -1,8 +1,11 @@
-//! The Velodyne models and what their manuals say of them: lasers, blocks, timing, resolution.
+//! The Velodyne models and their properties: lasers, blocks, timing, resolution.
 //!
-//! Nothing here is measured: a decoder reads these figures forwards, an encoder backwards. Sources: HDL-64E S2/S3
-//! manual (63-HDL64ES3 rev K, appendices E to G), HDL-32E application note 63-9277, VLP-16 manual 63-9243 rev E,
-//! VLP-32C manual 63-9325, VLS-128 manual 63-9480, and VeloView for the VLS-128's pauses between groups of lasers.
+//! All values are those of the manuals, none is measured here. The decoder uses them, and so does the encoder of a
+//! simulated sensor. Sources: HDL-64E S2/S3 manual (63-HDL64ES3 rev K, appendices E to G), HDL-32E application note
+//! 63-9277, VLP-16 manual 63-9243 rev E, VLP-32C manual 63-9325, VLS-128 manual 63-9480, and VeloView for the pauses
+//! between groups of lasers of a VLS-128.
+
+use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
@@ -28,24 +31,24 @@ pub enum Model {
     Vls128,
 }
 
-/// Which echoes the sensor reports.
+/// The echoes that a sensor reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ReturnMode {
-    /// The strongest echo.
+    /// The strongest echo of each laser.
     Strongest,
-    /// The last echo.
+    /// The last echo of each laser.
     Last,
-    /// Both, in pairs of blocks.
+    /// The strongest and the last echo, in pairs of blocks.
     Dual,
 }
 
-/// Blocks a data packet.
+/// Number of blocks of a data packet.
 pub const BLOCKS_PER_PACKET: usize = 12;
-/// Returns a block.
+/// Number of returns of a block.
 pub const RETURNS_PER_BLOCK: usize = 32;
-/// Azimuth counts a turn: hundredths of a degree.
-pub const AZIMUTHS_PER_TURN: u32 = 36_000;
+/// Azimuth counts of a revolution: hundredths of a degree.
+pub const AZIMUTHS_PER_REVOLUTION: u32 = 36_000;
 /// Flag of the block of lasers 0 to 31, the upper block of an HDL-64E (bytes FF EE on the wire).
 pub const FLAG_LASERS_0: u16 = 0xEEFF;
 /// Flag of the block of lasers 32 to 63, the lower block of an HDL-64E.
@@ -54,46 +57,46 @@ pub const FLAG_LASERS_32: u16 = 0xDDFF;
 pub const FLAG_LASERS_64: u16 = 0xCCFF;
 /// Flag of the block of lasers 96 to 127 (VLS-128).
 pub const FLAG_LASERS_96: u16 = 0xBBFF;
-/// The flags in the order in which a firing's blocks are sent.
+/// The flags in the order in which the blocks of a firing are sent.
 pub const BLOCK_FLAGS: [u16; 4] = [FLAG_LASERS_0, FLAG_LASERS_32, FLAG_LASERS_64, FLAG_LASERS_96];
-/// The blocks of an HDL-64E S1, over and over: three upper blocks a lower one.
+/// The flags of an HDL-64E S1, repeated: one lower block, then three upper blocks.
 pub const S1_FLAGS: [u16; 4] = [FLAG_LASERS_32, FLAG_LASERS_0, FLAG_LASERS_0, FLAG_LASERS_0];
 
-/// What a model's manual says of it.
+/// The properties of a model, from its manual.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ModelSpec {
     /// The model.
     pub model: Model,
-    /// As Velodyne writes it.
+    /// Name as Velodyne writes it.
     pub name: &'static str,
-    /// Lasers, and so slots a firing.
+    /// Number of lasers, and so of slots of a firing.
     pub lasers: usize,
-    /// Firings in one block: 2 with 16 lasers, else 1.
+    /// Number of firings of one block: 2 with 16 lasers, else 1.
     pub firings_per_block: usize,
-    /// Blocks of one firing and one echo: 2 (HDL-64E S2, S3), 4 (VLS-128), else 1. An HDL-64E S1 gives each block its
-    /// own azimuth, so each is a firing that fills 32 of the 64 slots.
+    /// Number of blocks of one firing and one echo: 2 (HDL-64E S2, S3), 4 (VLS-128), else 1. Each block of an HDL-64E
+    /// S1 has its own azimuth, so each is a firing that fills 32 of the 64 slots.
     pub blocks_per_firing: usize,
-    /// Time from one firing to the next, ns.
+    /// Time from one firing to the next, in ns.
     pub firing_period_ns: u32,
-    /// The same in dual-return mode.
+    /// Time from one firing to the next in dual-return mode, in ns.
     pub firing_period_dual_ns: u32,
-    /// Values of byte 1205 this model has been seen with; the first is the one it should send. Empty: an HDL-64E, whose
-    /// last two bytes are status.
+    /// Values of byte 1205 that sensors of this model send; the first is that of the manual. Empty for an HDL-64E,
+    /// whose last two bytes are status bytes.
     pub model_bytes: &'static [u8],
-    /// Whether two echoes can be asked for.
+    /// True if the model has a dual-return mode.
     pub dual_return: bool,
-    /// Metres a raw distance count.
+    /// Length of one raw distance count, in metres.
     pub distance_m_per_count: f64,
-    /// Turning rate out of the box.
+    /// Rate of rotation in the factory settings, in revolutions per minute.
     pub rpm_nominal: f32,
-    /// Farthest range the manual promises.
+    /// Greatest range in the manual, in m.
     pub range_m_max: f32,
-    /// Lowest and highest nominal elevation, degrees.
+    /// Lowest and highest nominal elevation, in degrees.
     pub elevation_deg: (f32, f32),
 }
 
 impl Model {
-    /// Every model.
+    /// All models.
     pub const ALL: [Model; 8] = [
         Model::Hdl64eS1,
         Model::Hdl64eS2,
@@ -105,26 +108,7 @@ impl Model {
         Model::Vls128,
     ];
 
-    /// Name of the model in configurations, messages and logs: `hdl64e_s1`, `vlp16`, and so on.
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Model::Hdl64eS1 => "hdl64e_s1",
-            Model::Hdl64eS2 => "hdl64e_s2",
-            Model::Hdl64eS3 => "hdl64e_s3",
-            Model::Hdl32e => "hdl32e",
-            Model::Vlp16 => "vlp16",
-            Model::PuckHiRes => "puck_hi_res",
-            Model::Vlp32c => "vlp32c",
-            Model::Vls128 => "vls128",
-        }
-    }
-
-    /// The model whose [`Model::as_str`] is `name`; `None` if there is no such model.
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|model| model.as_str() == name)
-    }
-
-    /// The model's figures.
+    /// Properties of the model.
     pub const fn spec(self) -> &'static ModelSpec {
         match self {
             Model::Hdl64eS1 => &HDL64E_S1,
@@ -138,19 +122,52 @@ impl Model {
         }
     }
 
-    /// Whether the last six bytes are an HDL-64E's (no return mode, no model byte).
+    /// Name of the model in configuration, maps and logs, such as `vlp16`; [`Model::from_str`] reads it.
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Model::Hdl64eS1 => "hdl64e_s1",
+            Model::Hdl64eS2 => "hdl64e_s2",
+            Model::Hdl64eS3 => "hdl64e_s3",
+            Model::Hdl32e => "hdl32e",
+            Model::Vlp16 => "vlp16",
+            Model::PuckHiRes => "puck_hi_res",
+            Model::Vlp32c => "vlp32c",
+            Model::Vls128 => "vls128",
+        }
+    }
+
+    /// True if the last two bytes of a packet are status bytes of an HDL-64E, instead of return mode and model.
     pub const fn is_hdl64e(self) -> bool {
         matches!(self, Model::Hdl64eS1 | Model::Hdl64eS2 | Model::Hdl64eS3)
     }
 }
 
+/// The text is not the name of a sensor model.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("unknown sensor model `{name}`; known: {}", Model::ALL.map(Model::as_str).join(", "))]
+pub struct UnknownModelError {
+    /// Text that is not the name of a model.
+    pub name: String,
+}
+
+impl FromStr for Model {
+    type Err = UnknownModelError;
+
+    /// Finds the model with that name.
+    fn from_str(name: &str) -> Result<Self, UnknownModelError> {
+        let found = Self::ALL.into_iter().find(|model| model.as_str() == name);
+        found.ok_or_else(|| UnknownModelError { name: name.to_owned() })
+    }
+}
+
 impl ModelSpec {
-    /// Returns of one echo that one firing has: less than `lasers` on the HDL-64E S1 alone.
+    /// Number of returns of one firing and one echo. It is less than `lasers` only for the HDL-64E S1.
     pub const fn returns_per_firing(&self) -> usize {
         self.blocks_per_firing * RETURNS_PER_BLOCK / self.firings_per_block
     }
 
-    /// Firings in one packet. In dual-return mode half as many; the VLS-128 then leaves its last four blocks unused.
+    /// Number of firings of one packet. In dual-return mode it is half; the VLS-128 then leaves its last four blocks
+    /// unused.
     pub const fn firings_per_packet(&self, mode: ReturnMode) -> usize {
         match mode {
             ReturnMode::Dual => BLOCKS_PER_PACKET / (2 * self.blocks_per_firing) * self.firings_per_block,
@@ -158,13 +175,13 @@ impl ModelSpec {
         }
     }
 
-    /// Blocks of a packet that hold data: 8 in a VLS-128's dual-return packet, else 12.
+    /// Number of blocks of a packet with data: 8 of a VLS-128 in dual-return mode, else 12.
     pub const fn blocks_used(&self, mode: ReturnMode) -> usize {
         let echoes = if matches!(mode, ReturnMode::Dual) { 2 } else { 1 };
         self.firings_per_packet(mode) / self.firings_per_block * self.blocks_per_firing * echoes
     }
 
-    /// Time from one firing to the next, ns.
+    /// Time from one firing to the next, in ns.
     pub const fn period_ns(&self, mode: ReturnMode) -> u32 {
         match mode {
             ReturnMode::Dual => self.firing_period_dual_ns,
@@ -172,17 +189,23 @@ impl ModelSpec {
         }
     }
 
-    /// Time from one packet to the next, ns.
+    /// Time from one packet to the next, in ns.
     pub const fn packet_period_ns(&self, mode: ReturnMode) -> u32 {
         self.period_ns(mode) * self.firings_per_packet(mode) as u32
     }
 
-    /// Firings in a whole turn at `rpm`, rounded.
-    pub fn firings_per_turn(&self, mode: ReturnMode, rpm: f32) -> usize {
+    /// Number of firings of a revolution at `rpm`, rounded.
+    pub fn firings_per_revolution(&self, mode: ReturnMode, rpm: f32) -> usize {
         (60e9 / (f64::from(rpm) * f64::from(self.period_ns(mode)))).round() as usize
     }
 
-    /// When `laser` fires, ns after its firing's stamp.
+    /// Azimuth counts from one firing to the next at `rpm`, rounded.
+    pub fn firing_step(&self, mode: ReturnMode, rpm: f32) -> u32 {
+        let per_ns = f64::from(rpm) / 60e9 * f64::from(AZIMUTHS_PER_REVOLUTION);
+        (per_ns * f64::from(self.period_ns(mode))).round() as u32
+    }
+
+    /// Time from the stamp of a firing until `laser` fires, in ns.
     pub fn laser_offset_ns(&self, laser: usize) -> u32 {
         match self.model {
             Model::Hdl64eS1 => 0,
@@ -195,11 +218,11 @@ impl ModelSpec {
         }
     }
 
-    /// How far the sensor turns from its block's azimuth until return `index` of that block is fired, in counts, when
-    /// it turns `step` counts a block (a firing, on the VLS-128): rounded half up, as VeloView does. Always 0 on an
-    /// HDL-64E, whose factory tables are made for the block's azimuth.
+    /// Counts by which the sensor turns from the azimuth of its block until return `index` of that block is fired, if
+    /// it turns by `step` counts per block (VLS-128: per firing). It is rounded half up, as in VeloView. It is 0 for an
+    /// HDL-64E, whose calibration refers to the azimuth of the block.
     ///
-    /// `index` is the return's place in its block, plus 32, 64 or 96 for the VLS-128's later blocks.
+    /// `index` is the index of the return in its block, plus 32, 64 or 96 for the later blocks of a VLS-128.
     pub fn azimuth_offset(&self, index: usize, step: u32) -> u32 {
         let (share, whole) = match self.model {
             Model::Hdl64eS1 | Model::Hdl64eS2 | Model::Hdl64eS3 => return 0,
@@ -213,43 +236,44 @@ impl ModelSpec {
 
     /// The first laser of the blocks with this flag; `None` if the model has no such block.
     pub fn first_laser(&self, flag: u16) -> Option<usize> {
-        let place = BLOCK_FLAGS.iter().position(|f| *f == flag)?;
-        (place * RETURNS_PER_BLOCK < self.lasers).then_some(place * RETURNS_PER_BLOCK)
+        let rank = BLOCK_FLAGS.iter().position(|f| *f == flag)?;
+        (rank * RETURNS_PER_BLOCK < self.lasers).then_some(rank * RETURNS_PER_BLOCK)
     }
 
-    /// Where block `block` of a packet belongs.
-    pub fn place(&self, block: usize, mode: ReturnMode) -> BlockPlace {
+    /// Position of block `block` of a packet.
+    pub fn block_position(&self, block: usize, mode: ReturnMode) -> BlockPosition {
         let banks = self.blocks_per_firing;
         let (group, bank, echo) = match (mode, self.model.is_hdl64e()) {
             (ReturnMode::Dual, true) => (block / (2 * banks), block % banks, block / banks % 2),
-            // The last echo comes first (VLP-16 manual, 9.3.1: even blocks).
+            // The last echo precedes the strongest (VLP-16 manual 63-9243, section 9.3.1: even blocks).
             (ReturnMode::Dual, false) => (block / (2 * banks), block / 2 % banks, 1 - block % 2),
             _ => (block / banks, block % banks, 0),
         };
-        BlockPlace { firing: group * self.firings_per_block, bank, echo }
+        BlockPosition { firing: group * self.firings_per_block, bank, echo }
     }
 
-    /// The flag block `block` of a packet must carry; `None`: either flag of an HDL-64E S1.
+    /// Flag that block `block` of a packet must have; `None` for an HDL-64E S1, whose blocks may have either flag.
     pub fn flag(&self, block: usize, mode: ReturnMode) -> Option<u16> {
         match self.model {
             Model::Hdl64eS1 => None,
-            _ => Some(BLOCK_FLAGS[self.place(block, mode).bank]),
+            _ => Some(BLOCK_FLAGS[self.block_position(block, mode).bank]),
         }
     }
 }
 
-/// Where the returns of one block belong.
+/// The position of the returns of one block.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct BlockPlace {
-    /// The first of its firings, counted from the start of the packet.
+pub struct BlockPosition {
+    /// Index of its first firing in the packet.
     pub firing: usize,
-    /// Its place among the blocks of that firing: its first laser is `32 * bank`.
+    /// Index of the block in that firing: its first laser is `32 * bank`.
     pub bank: usize,
-    /// 0 for the strongest echo (or the only one), 1 for the last.
+    /// Index of the range image: 0 for the strongest or only echo, 1 for the last.
     pub echo: usize,
 }
 
-/// The slot of time, 2.665 µs long, in which a VLS-128 laser fires: eight at once, a pause of two after the eighth.
+/// Time slot of 2.665 µs in which a laser of a VLS-128 fires: eight lasers per slot, and a pause of two slots after the
+/// eighth slot.
 fn group_of_vls128(laser: usize) -> u32 {
     (laser / 8 + laser / 64 * 2) as u32
 }
@@ -272,7 +296,7 @@ const HDL64E_S2: ModelSpec = ModelSpec {
 
 const HDL64E_S3: ModelSpec = ModelSpec { model: Model::Hdl64eS3, name: "HDL-64E S3", dual_return: true, ..HDL64E_S2 };
 
-/// A million points a second in blocks of 32.
+/// An HDL-64E S1 measures a million points per second, in blocks of 32.
 const HDL64E_S1: ModelSpec = ModelSpec {
     model: Model::Hdl64eS1,
     name: "HDL-64E S1",
@@ -303,7 +327,7 @@ const VLP16: ModelSpec = ModelSpec {
     firings_per_block: 2,
     firing_period_ns: 55_296,
     firing_period_dual_ns: 55_296,
-    // Units of 2014 carry the HDL-32E's byte.
+    // Sensors of 2014 send the byte of the HDL-32E.
     model_bytes: &[0x22, 0x21],
     elevation_deg: (-15.0, 15.0),
     ..HDL32E

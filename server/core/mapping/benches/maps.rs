@@ -5,21 +5,21 @@
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{
-    DrivabilityConfig, Form, HeightDifferenceConfig, MotionConfig, OccupancyConfig, SafePathConfig, SpeedConfig,
-    TerrainConfig,
+    DrivabilityConfig, HeightDifferenceConfig, MotionConfig, OccupancyConfig, SafePathConfig, SpeedConfig,
+    TerrainConfig, Variant,
 };
-use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::event::{EgoPose, Road, RoadFrame, RoadPurpose, Scan};
+use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::height_difference::HeightDifference;
-use clearway_mapping::layer::{Context, LayerMaker, Rays};
-use clearway_mapping::sensor::motion::{Motion, EgoTrajectory};
 use clearway_mapping::layer::occupancy::Occupancy;
-use clearway_mapping::road::StoredRoad;
 use clearway_mapping::layer::safe_path::SafePath;
-use clearway_mapping::sensor::distance_series::DistanceSeries;
 use clearway_mapping::layer::speed::Speed;
-use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_mapping::layer::terrain::Terrain;
+use clearway_mapping::layer::{Context, LayerMaker, Rays};
+use clearway_mapping::road::StoredRoad;
+use clearway_mapping::sensor::distance_series::DistanceSeries;
+use clearway_mapping::sensor::motion::{EgoTrajectory, Motion};
+use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::planes::PlaneUnit;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::traffic;
@@ -113,10 +113,10 @@ fn sweep_of_a_moving_revolution(bencher: Bencher) {
     });
 }
 
-#[divan::bench(args = [Form::Grounded, Form::Paper, Form::Grid])]
-fn terrain(bencher: Bencher, form: Form) {
+#[divan::bench(args = [Variant::Grounded, Variant::Paper, Variant::Grid])]
+fn terrain(bencher: Bencher, form: Variant) {
     let sweep = sweep();
-    let mut map = Terrain::new(&TerrainConfig { form, ..TerrainConfig::default() });
+    let mut map = Terrain::new(&TerrainConfig { variant: form, ..TerrainConfig::default() });
     let mut layer = map.layer();
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &Context::default(), &mut layer));
 }

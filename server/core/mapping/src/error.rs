@@ -1,8 +1,8 @@
 //! Why the core refuses an event.
 
-use clearway_lidar::sensor::Refusal;
+use clearway_lidar::DatagramError;
 
-use crate::config::ConfigValueError;
+use crate::config::check::ConfigValueError;
 use crate::road::RoadError;
 
 /// Latest stamp that is accepted: the year 2116, in ns since the Unix epoch. Ours: half of what an `i64` holds, so that
@@ -14,7 +14,7 @@ pub const STAMP_NS_MAX: i64 = 1 << 62;
 pub enum EventError {
     /// The decoder refused the datagram.
     #[error(transparent)]
-    Datagram(#[from] Refusal),
+    Datagram(#[from] DatagramError),
     /// The vehicle has no sensor of this index.
     #[error("source {source_index}: the vehicle has {sensors} sensor(s), counted from 0")]
     Source {

@@ -1,139 +1,140 @@
-//! What enters the core. Only the door (live) and the recording's reader make these; nothing behind can tell them
-//! apart.
+//! What enters the core. Only the event queue (live) and the recording's reader create events; no module behind them
+//! can tell a live event from a recorded one.
 
 use bytes::Bytes;
 use nalgebra::Isometry3;
 
-use crate::config::SensorConfig;
+use crate::config::sensor::SensorConfig;
 
-/// One thing that happened to one vehicle, in the order the door took it.
+/// One reading or message of one vehicle, in the order in which the event queue accepted it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Event {
-    /// Counts from 0 without a hole.
+    /// Number of the event: the first of a vehicle is 0, the next ones count up without gaps.
     pub sequence: u64,
-    /// When the door read it, ns since the Unix epoch.
+    /// Time at which the event queue accepted the event, ns since the Unix epoch, host clock.
     pub arrival_ns: i64,
-    /// Index of the sensor: those of the configuration first, then those declared; 0 where the body concerns the whole
+    /// Index of the sensor: first those of the configuration, then the declared ones. 0 if the body concerns the whole
     /// vehicle.
     pub source: u16,
-    /// What happened.
+    /// The reading or message.
     pub body: Body,
 }
 
 /// The kinds of events.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Body {
-    /// One UDP payload as it came: data packet, telemetry, or something to refuse.
+    /// The payload of one UDP datagram: a data packet, telemetry, or something that the decoder refuses.
     Datagram(Bytes),
-    /// A turn assembled elsewhere.
+    /// One scan that the sender has assembled.
     Scan(Scan),
-    /// Where the vehicle was.
+    /// Pose and speed of the vehicle.
     EgoPose(EgoPose),
-    /// Where a road lies.
+    /// Shape of a road.
     Road(Road),
-    /// A sensor that the configuration does not name; the event's source is its index, the next one. The same again
-    /// changes nothing.
+    /// Declaration of a sensor that the configuration does not contain. The event's source is its index, which is the
+    /// next one. A repeated declaration changes nothing.
     Sensor(Box<SensorConfig>),
-    /// So many readings never became events.
+    /// Readings that were dropped before they became events.
     Lost {
-        /// Why.
+        /// Why they were dropped.
         cause: Cause,
-        /// How many.
+        /// Number of readings.
         count: u64,
     },
-    /// The source has ended: an unfinished revolution becomes a partial one.
+    /// The source has ended: its unfinished revolution becomes a partial one.
     End,
 }
 
-/// The source of a reading that is no sensor's, or of which nobody knows whose it was.
-pub const NOBODY: u16 = u16::MAX;
+/// Source of readings that belong to no known sensor.
+pub const UNKNOWN_SOURCE: u16 = u16::MAX;
 
 /// Why a reading never became an event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Cause {
-    /// The door's queue was full.
+    /// The event queue was full.
     Queue,
-    /// The kernel's receive buffer was full: nobody knows whose these were.
+    /// The kernel's receive buffer was full. The source of these readings is unknown.
     Kernel,
-    /// The sender is none of the vehicle's sensors.
+    /// The sender is not a sensor of the vehicle.
     Sender,
-    /// A datagram longer than any the door takes.
+    /// The datagram was longer than any that is accepted.
     Length,
-    /// A message that is no observation, or none of the ROS 2 messages that are read.
+    /// The message was not a valid observation, or not one of the ROS 2 messages that are read.
     Observation,
 }
 
 impl Cause {
-    /// Whether it may be known which sensor's the reading was; [`NOBODY`] where it is not.
+    /// True if the source of the readings may be known; if it is not, the source is [`UNKNOWN_SOURCE`].
     pub fn has_source(self) -> bool {
         !matches!(self, Self::Kernel | Self::Sender)
     }
 }
 
-/// Points of one turn, or of one pass over a field of view, in the sensor's frame (REP-103), metres.
+/// Points of one revolution, or of one pass over a field of view, in the sensor frame (REP-103). The arrays have one
+/// entry a point, except `no_returns`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scan {
     /// Stamp of the scan's end, ns since the Unix epoch.
     pub stamp_ns: i64,
-    /// Metres.
+    /// Distance forward of the sensor, metres.
     pub x: Vec<f32>,
-    /// Metres.
+    /// Distance to the left of the sensor, metres.
     pub y: Vec<f32>,
-    /// Metres.
+    /// Distance above the sensor, metres.
     pub z: Vec<f32>,
-    /// 0 to 1.
+    /// Intensity, 0 to 1.
     pub intensity: Vec<f32>,
-    /// Rank of each point's laser by elevation, 0 lowest; empty where the sensor does not tell.
+    /// Rank of each point's laser by elevation, 0 the lowest; empty if the sensor does not state it.
     pub ring: Vec<u16>,
-    /// When each point was seen, ns after `stamp_ns` (so at most 0); empty where all were seen at once.
+    /// Time of each point, ns after `stamp_ns` and so at most 0; empty if all points have the time of the stamp.
     pub offset_ns: Vec<i32>,
-    /// Directions (unit vectors, sensor's frame) of rays that came back with nothing; empty where the sensor does not
-    /// tell.
+    /// Directions (unit vectors, sensor frame) of rays without a return; empty if the sensor does not state them.
     pub no_returns: Vec<[f32; 3]>,
 }
 
-/// Where the vehicle was and how fast.
+/// Pose and speed of the vehicle at one time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EgoPose {
-    /// ns since the Unix epoch.
+    /// Time of the pose, ns since the Unix epoch.
     pub stamp_ns: i64,
     /// Ego frame in the locally fixed world frame.
     pub map_from_ego: Isometry3<f64>,
-    /// Forward speed.
+    /// Forward speed, m/s; negative when the vehicle drives backwards.
     pub speed_mps: f64,
 }
 
-/// A road as points along its middle and its width there. Checked by [`crate::road::check`] when it is taken.
+/// A road: points along its middle, and its width at each. [`crate::road::check`] states what is allowed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Road {
-    /// When it was seen or read, ns since the Unix epoch; in the ego frame, the frame of that stamp.
+    /// Time at which the road was seen or read, ns since the Unix epoch. The ego frame of the points is the one of this
+    /// stamp.
     pub stamp_ns: i64,
-    /// What it is for.
+    /// What the road is used for.
     pub purpose: RoadPurpose,
-    /// What the points are relative to.
+    /// Frame of the points.
     pub frame: RoadFrame,
-    /// x, y in metres, in the order they are driven.
+    /// Points x, y, metres, in driving order.
     pub points: Vec<[f64; 2]>,
-    /// Whole width at each point.
+    /// Whole width at each point, metres.
     pub widths_m: Vec<f64>,
-    /// Votes for each dominant orientation in the detector's image; empty where no image told of the road.
+    /// Votes for each dominant orientation in the detector's image; empty if the road was not found in an image.
     pub orientations: Vec<f32>,
 }
 
-/// What a road is for.
+/// What a road is used for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RoadPurpose {
-    /// A road that was detected, or a lane: painted into the speed map, in place of the one before.
+    /// A detected road or a lane: it is painted into the speed map, and replaces the one before.
     Paint,
-    /// The centre line of the route (RDDF): never painted; its curvature says where a detector cannot follow.
+    /// The centre line of the route (RDDF): it is never painted. Its curvature shows where a detector fails.
     Route,
 }
 
-/// What a road's points are relative to.
+/// Frame of a road's points.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RoadFrame {
-    /// The vehicle when the road was seen.
+    /// The ego frame at the road's stamp.
     Ego,
-    /// The locally fixed world frame; needs an ego pose to be used.
+    /// The locally fixed world frame. The road is not used until an ego pose is known.
     Map,
 }

@@ -17,7 +17,7 @@
 //! The order in which the scans of different sensors arrive between two maps does not change the layers that are made
 //! from the sweep.
 
-use crate::config::FusionConfig;
+use crate::config::fusion::FusionConfig;
 use crate::event_time::EventTime;
 use crate::map::{Contribution, SensorState};
 use crate::sensor::motion::{Compensation, Motion};

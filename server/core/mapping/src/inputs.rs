@@ -4,10 +4,11 @@
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::sensor::SensorStatus;
+use clearway_lidar::SensorStatus;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
-use crate::config::{SensorConfig, VehicleConfig};
+use crate::config::sensor::SensorConfig;
+use crate::config::vehicle::VehicleConfig;
 use crate::error::{EventError, check_newer, check_stamp_range};
 use crate::event::{Body, EgoPose, Event, Road};
 use crate::event_time::EventTime;

@@ -1,7 +1,7 @@
 //! What a map is: a header, the state of every sensor, and layers. Class 0 of every layer means unknown; an unknown
 //! cell is never free.
 
-use clearway_lidar::blocked::Blocked;
+use clearway_lidar::Blocked;
 use nalgebra::Isometry3;
 
 use crate::layer::Layer;

@@ -6,7 +6,7 @@
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::sensor::SensorStatus;
+use clearway_lidar::SensorStatus;
 
 use crate::config::{ConfigValueError, MapsConfig, VehicleConfig};
 use crate::error::EventError;

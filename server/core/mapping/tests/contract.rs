@@ -1,29 +1,29 @@
-//! What every map owes, held against each of them.
+//! What every layer guarantees, checked for each of them.
 
 mod common;
 
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{
-    DrivabilityConfig, Form, HeightDifferenceConfig, OccupancyConfig, SafePathConfig, SpeedConfig, TerrainConfig,
+    DrivabilityConfig, Variant, HeightDifferenceConfig, OccupancyConfig, SafePathConfig, SpeedConfig, TerrainConfig,
 };
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::height_difference::HeightDifference;
-use clearway_mapping::layer::{Cells, Context, Layer, LayerMaker, Meaning, SafePoint};
 use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::layer::safe_path::SafePath;
 use clearway_mapping::layer::safe_path::class::SafePathClass;
 use clearway_mapping::layer::speed::Speed;
-use clearway_mapping::sensor::sweep::Sweep;
 use clearway_mapping::layer::terrain::Terrain;
+use clearway_mapping::layer::{Cells, Context, Layer, LayerMaker, Meaning, SafePoint};
+use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
 
-/// Safe paths and the drivability they come from.
-struct Behind {
+/// Safe paths, and the drivability they are made from.
+struct SafePathFromDrivability {
     drivability: Drivability,
     safe_path: SafePath,
 }
 
-impl LayerMaker for Behind {
+impl LayerMaker for SafePathFromDrivability {
     fn layer(&self) -> Layer {
         self.safe_path.layer()
     }
@@ -35,10 +35,10 @@ impl LayerMaker for Behind {
     }
 }
 
-/// The occupancy of one turn.
-struct Taken(Occupancy);
+/// The occupancy of one scan.
+struct OccupancyOfOneScan(Occupancy);
 
-impl LayerMaker for Taken {
+impl LayerMaker for OccupancyOfOneScan {
     fn layer(&self) -> Layer {
         self.0.layer()
     }
@@ -49,7 +49,7 @@ impl LayerMaker for Taken {
     }
 }
 
-/// Share of the judged cells that are drivable, or passable; `None` in maps that do not judge cells.
+/// Share of the known cells that are drivable or passable; `None` for layers without such a metric.
 fn share(layer: &Layer) -> Option<f64> {
     let named = |(name, _): &&(&str, f64)| ["drivable_share", "passable_share"].contains(name);
     layer.metrics.iter().find(named).map(|(_, share)| *share)
@@ -63,13 +63,14 @@ fn makers() -> Vec<Box<dyn LayerMaker>> {
         makers.push(Box::new(Drivability::new(&DrivabilityConfig { bridge_rows: 0, ..drivability })));
         makers.push(Box::new(HeightDifference::new(&HeightDifferenceConfig { columns, ..Default::default() })));
     }
-    for form in [Form::Grounded, Form::Paper, Form::Grid] {
-        makers.push(Box::new(Terrain::new(&TerrainConfig { form, planes: true, ..TerrainConfig::default() })));
+    for form in [Variant::Grounded, Variant::Paper, Variant::Grid] {
+        makers.push(Box::new(Terrain::new(&TerrainConfig { variant: form, planes: true, ..TerrainConfig::default() })));
     }
     makers.push(Box::new(Speed::new(&SpeedConfig::default())));
     let drivability = Drivability::new(&DrivabilityConfig::default());
-    makers.push(Box::new(Taken(Occupancy::new(&OccupancyConfig::default()))));
-    makers.push(Box::new(Behind { drivability, safe_path: SafePath::new(&SafePathConfig::default()) }));
+    makers.push(Box::new(OccupancyOfOneScan(Occupancy::new(&OccupancyConfig::default()))));
+    makers
+        .push(Box::new(SafePathFromDrivability { drivability, safe_path: SafePath::new(&SafePathConfig::default()) }));
     makers
 }
 
@@ -115,11 +116,11 @@ fn level_ground_is_drivable_wherever_a_point_fell() {
 }
 
 #[test]
-fn a_wall_is_an_obstacle_to_every_map() {
+fn a_wall_is_an_obstacle_in_every_layer() {
     let sweep = cast(Model::Hdl64eS2, court);
     for mut maker in makers() {
         let layer = make(maker.as_mut(), &sweep);
-        // A wall within a cell may show in the cell before or behind where grids are turned into one another.
+        // A wall at the edge of a cell may be in the cell before or behind it if the layer resamples another grid.
         let class = |x| layer.legend[usize::from(classes(&layer)[cell_at(&layer, x, 0.01).unwrap()])];
         let stands = |x: &f32| class(*x).meaning == Meaning::Occupied;
         assert!([14.76, 15.01, 15.26].iter().any(stands), "{} straight ahead, 15 m", layer.name);
@@ -127,7 +128,7 @@ fn a_wall_is_an_obstacle_to_every_map() {
 }
 
 #[test]
-fn the_same_sweep_gives_the_same_bytes_again() {
+fn the_same_sweep_gives_the_same_bytes() {
     let sweep = cast(Model::Hdl64eS2, court);
     for mut maker in makers() {
         assert_eq!(make(maker.as_mut(), &sweep), make(maker.as_mut(), &sweep));
@@ -135,9 +136,9 @@ fn the_same_sweep_gives_the_same_bytes_again() {
 }
 
 #[test]
-fn the_order_of_the_points_says_nothing() {
+fn the_order_of_the_points_has_no_effect() {
     let mut sweep = cast(Model::Hdl64eS2, court);
-    // Equally high points of one cell, so that ties are met too.
+    // Points of one cell with equal heights, so that ties occur.
     for k in 0..200 {
         let angle = k as f32 * 0.031;
         add(&mut sweep, [9.0 * angle.cos(), 9.0 * angle.sin(), 0.5]);
@@ -153,25 +154,29 @@ fn the_order_of_the_points_says_nothing() {
 
 /// A channel's values; path counts as free, because lines two cells wide are thinned from one end.
 fn ends_of_paths_aside(layer: &Layer, name: &str) -> Vec<i32> {
-    let is_path = |value: i32| layer.name == "safe_path" && name == "class" && value == i32::from(SafePathClass::Path.value());
-    values(layer, name).into_iter().map(|v| if is_path(v) { i32::from(SafePathClass::Free.value()) } else { v }).collect()
+    let is_path =
+        |value: i32| layer.name == "safe_path" && name == "class" && value == i32::from(SafePathClass::Path.value());
+    values(layer, name)
+        .into_iter()
+        .map(|v| if is_path(v) { i32::from(SafePathClass::Free.value()) } else { v })
+        .collect()
 }
 
 #[test]
-fn a_world_turned_by_90_degrees_gives_the_map_a_quarter_further() {
+fn a_world_rotated_by_90_degrees_gives_a_rotated_layer() {
     let sweep = off_borders(&cast(Model::Hdl64eS2, court));
     for mut maker in makers() {
-        let (layer, quarter) = (make(maker.as_mut(), &sweep), make(maker.as_mut(), &turned(&sweep)));
+        let (layer, quarter) = (make(maker.as_mut(), &sweep), make(maker.as_mut(), &rotated(&sweep)));
         let (_, columns) = size(&layer);
-        // A quarter of 90 columns ends within one.
+        // A quarter of 90 columns is not a whole number.
         if columns % 4 != 0 {
             continue;
         }
-        // Segments are counted in the order they are found, which begins at column 0; slopes turn with the world.
-        let stays = |name: &str| !matches!(name, "segment" | "slope_x" | "slope_y");
-        for channel in layer.channels.iter().filter(|c| stays(c.name)) {
+        // Segments are numbered in the order they are found, which begins at column 0; slopes rotate with the world.
+        let is_invariant = |name: &str| !matches!(name, "segment" | "slope_x" | "slope_y");
+        for channel in layer.channels.iter().filter(|c| is_invariant(c.name)) {
             let [before, after] = [&layer, &quarter].map(|layer| ends_of_paths_aside(layer, channel.name));
-            let before = quarter_turned(&layer, &before);
+            let before = quarter_rotated(&layer, &before);
             for (row, (before, after)) in before.chunks(columns).zip(after.chunks(columns)).enumerate() {
                 assert_eq!(before, after, "{} {} row {row}", layer.name, channel.name);
             }
@@ -180,11 +185,11 @@ fn a_world_turned_by_90_degrees_gives_the_map_a_quarter_further() {
 }
 
 #[test]
-fn buffers_used_before_leave_no_trace() {
+fn buffers_that_were_used_before_have_no_effect() {
     let sweep = cast(Model::Hdl64eS2, court);
     for mut maker in makers() {
         let fresh = make(maker.as_mut(), &sweep);
-        // The maker has seen another sensor's world, and the layer holds garbage of another size.
+        // The maker has made a layer of another sensor's sweep, and the layer contains garbage of another size.
         make(maker.as_mut(), &cast(Model::Vlp16, plain));
         let mut garbage = maker.layer();
         for channel in &mut garbage.channels {

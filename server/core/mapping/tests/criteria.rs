@@ -9,8 +9,8 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::{DrivabilityConfig, Seed};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
+use clearway_mapping::layer::radial_grid::{ring_radii_m, row_radii_m};
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
-use clearway_mapping::layer::radial_grid::{r_bench_m, ring_radii_m};
 use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
 
@@ -60,7 +60,7 @@ fn rows_follow_the_rings_and_end_at_60_m() {
     // -15 to -3 degrees meet the ground within 60 m; -1 degree meets it at 115 m.
     assert_eq!(rings.len(), 7);
     assert!((rings[0] - 2.0 / 15f32.to_radians().tan()).abs() < 0.05, "{rings:?}");
-    let benches = r_bench_m(&rings, 60.0);
+    let benches = row_radii_m(&rings, 60.0);
     assert_eq!(benches.len(), 7);
     assert_eq!(benches[6], 60.0);
     for (bench, pair) in benches.iter().zip(rings.windows(2)) {
@@ -83,7 +83,7 @@ fn no_sensor_has_more_rows_than_lasers_and_rows_ascend() {
     for model in models {
         let calibration = Calibration::factory(model);
         for height in [0.3, 1.0, 1.73, 4.0] {
-            let benches = r_bench_m(&ring_radii_m(&calibration, height, 60.0), 60.0);
+            let benches = row_radii_m(&ring_radii_m(&calibration, height, 60.0), 60.0);
             assert!(benches.len() <= calibration.lasers.len(), "{model:?}");
             assert!(benches.is_sorted_by(|a, b| a < b), "{model:?} at {height} m: {benches:?}");
         }
@@ -167,7 +167,7 @@ fn criterion_3_a_gate_narrower_than_3_m_is_not_crossed() {
     let behind = row_at(25.0);
     assert_eq!(class(&map(&DrivabilityConfig::default(), &gate(2.0)), behind, 0), DRIVABLE);
     assert_eq!(class(&map(&DrivabilityConfig::default(), &gate(1.0)), behind, 0), NOT_DRIVABLE);
-    let open = DrivabilityConfig { gate_m_min: 0.0, ..DrivabilityConfig::default() };
+    let open = DrivabilityConfig { passage_m_min: 0.0, ..DrivabilityConfig::default() };
     assert_eq!(class(&map(&open, &gate(1.0)), behind, 0), DRIVABLE);
 }
 

@@ -1,7 +1,7 @@
-//! Maps from a bad network and through a dirty window.
+//! Maps with faults of the network and with a dirty window.
 
 use bytes::Bytes;
-use clearway_lidar::blocked::BlockedSector;
+use clearway_lidar::BlockedSector;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::{Model, ReturnMode};
 use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
@@ -42,15 +42,15 @@ fn pipeline(model: Model) -> Pipeline {
     Pipeline::new(&config(model), vec![None]).unwrap()
 }
 
-fn datagrams(model: Model, turns: f64, with_telemetry: bool) -> Vec<Datagram> {
+fn datagrams(model: Model, revolutions: f64, with_telemetry: bool) -> Vec<Datagram> {
     let config = ScannerConfig { model, return_mode: ReturnMode::Strongest, ..ScannerConfig::default() };
     let vehicle = SimulatedVehicle::new(scenes::flat(), config);
-    let end_ns = vehicle.start_ns() + (turns * 1e8) as i64;
+    let end_ns = vehicle.start_ns() + (revolutions * 1e8) as i64;
     let sent = vehicle.filter(|datagram| with_telemetry || datagram.kind == Kind::Data);
     sent.take_while(|datagram| datagram.stamp_ns < end_ns).collect()
 }
 
-/// Takes a datagram; the map it completes, if any.
+/// Applies a datagram and returns the map that it completes, if it completes one.
 fn step(pipeline: &mut Pipeline, datagram: Datagram) -> Option<Map> {
     let body = Body::Datagram(Bytes::from(datagram.payload));
     let event = Event { sequence: 0, arrival_ns: datagram.stamp_ns, source: 0, body };
@@ -58,7 +58,7 @@ fn step(pipeline: &mut Pipeline, datagram: Datagram) -> Option<Map> {
 }
 
 #[test]
-fn copies_and_packets_out_of_order_leave_maps_as_they_were_but_for_when_they_were_made() {
+fn copies_and_reordering_of_packets_change_no_map() {
     let streams = [Model::Vlp16, Model::Hdl32e, Model::Hdl64eS2].map(|model| (model, datagrams(model, 3.2, false)));
     let maps = |model: Model, datagrams: &mut dyn Iterator<Item = Datagram>| {
         let mut pipeline = pipeline(model);
@@ -84,7 +84,7 @@ fn copies_and_packets_out_of_order_leave_maps_as_they_were_but_for_when_they_wer
 }
 
 #[test]
-fn whatever_the_network_does_the_ledger_is_exact_and_nothing_breaks() {
+fn the_ledger_is_exact_for_any_fault_of_the_network() {
     let streams = [Model::Vlp16, Model::Hdl32e].map(|model| (model, datagrams(model, 4.0, true)));
     for seed in 0..100 {
         let share = |what: u64, most: f64| uniform(mixed(seed ^ what << 8)) * most;
@@ -113,7 +113,7 @@ fn whatever_the_network_does_the_ledger_is_exact_and_nothing_breaks() {
 }
 
 #[test]
-fn a_packet_held_that_fits_no_model_found_is_refused_in_the_ledger() {
+fn a_packet_that_does_not_fit_the_model_found_later_counts_as_refused() {
     let mut config = config(Model::Vlp16);
     config.sensors[0].model = None;
     let mut pipeline = Pipeline::new(&config, vec![None]).unwrap();
@@ -125,8 +125,8 @@ fn a_packet_held_that_fits_no_model_found_is_refused_in_the_ledger() {
     assert_eq!((ledger.refused.get("model"), ledger.received), (Some(&1), ledger.decoded + 1));
 }
 
-/// Covers the window from one degree of encoder angle to another: nothing comes back from there, or what the cover
-/// sends.
+/// Covers the window between two encoder angles, degrees: each return there gets the distance that `cover` gives, or is
+/// removed if that is 0.
 fn covered(
     model: Model,
     mut datagram: Datagram,
@@ -149,13 +149,14 @@ fn covered(
     datagram
 }
 
-/// Middle of a cell, ego frame.
+/// Middle of a cell, ego frame, metres.
 fn middle(geometry: &Geometry, cell: usize) -> (f64, f64) {
     match geometry {
         Geometry::Radial { row_radius_m, columns } => {
             let (row, column) = (cell / usize::from(*columns), cell % usize::from(*columns));
             let inner = if row == 0 { 0.0 } else { f64::from(row_radius_m[row - 1]) };
-            let (r, angle) = ((inner + f64::from(row_radius_m[row])) / 2.0, (column as f64 + 0.5) / f64::from(*columns));
+            let (r, angle) =
+                ((inner + f64::from(row_radius_m[row])) / 2.0, (column as f64 + 0.5) / f64::from(*columns));
             let (sin, cos) = (angle * std::f64::consts::TAU).sin_cos();
             (r * cos, r * sin)
         }
@@ -167,9 +168,8 @@ fn middle(geometry: &Geometry, cell: usize) -> (f64, f64) {
     }
 }
 
-/// Cells at least 2 m inside a sector of encoder angles: how many, and how many of them claim knowledge. `occupancy`
-/// has a name of its own for what nobody looks at, and lets what was occupied a moment ago stay so: neither is seen
-/// now.
+/// Number of cells at least 2 m inside a sector of encoder angles, and how many of them are known. `occupancy` has a
+/// class of its own for cells that no ray reaches, and keeps cells occupied for some maps: neither counts as known now.
 fn inside(layer: &Layer, (from_deg, to_deg): (f64, f64)) -> (usize, usize) {
     let Cells::U8(classes) = &layer.channels[0].cells else { panic!("{}: a class is a byte", layer.name) };
     let far_inside = |cell: &usize| {
@@ -186,15 +186,15 @@ fn inside(layer: &Layer, (from_deg, to_deg): (f64, f64)) -> (usize, usize) {
 }
 
 #[test]
-fn a_covered_sector_is_flagged_within_two_turns_and_unknown_in_every_map() {
+fn a_covered_sector_is_reported_and_unknown_in_every_map() {
     let (from_deg, to_deg) = (30, 110);
     let dark_deg = (f64::from(from_deg), f64::from(to_deg));
-    // Nothing; dirt that sends light back from the window, as near as a sensor reports; both, laser by laser.
+    // No return; dirt that reflects at the least distance a sensor reports; both, laser by laser.
     let covers: [fn(usize) -> u16; 3] = [|_| 0, |index| 250 + index as u16, |index| [0, 300][index % 2]];
     for model in [Model::Vlp16, Model::Hdl64eS2] {
         for cover in covers {
             let mut pipeline = pipeline(model);
-            let mut turns = Vec::new();
+            let mut revolutions = Vec::new();
             let sent = datagrams(model, 12.2, false);
             let dirty_ns = sent[0].stamp_ns + 800_000_000;
             for datagram in sent {
@@ -204,18 +204,18 @@ fn a_covered_sector_is_flagged_within_two_turns_and_unknown_in_every_map() {
                     datagram
                 };
                 if let Some(map) = step(&mut pipeline, datagram) {
-                    turns.push((map, pipeline.newest_revolution().unwrap().blocked.clone()));
+                    revolutions.push((map, pipeline.newest_revolution().unwrap().blocked.clone()));
                 }
             }
-            // The vehicle started in the middle of a turn, and the window was covered in the middle of another.
-            let clean = turns.iter().filter(|(map, _)| map.capture_end_ns < dirty_ns).count();
-            assert!(turns[..clean].iter().all(|(_, blocked)| blocked.is_empty()), "{model:?}");
-            let (map, blocked) = &turns[clean + 1];
+            // The first revolution is partial, and the window is covered in the middle of another one.
+            let clean = revolutions.iter().filter(|(map, _)| map.capture_end_ns < dirty_ns).count();
+            assert!(revolutions[..clean].iter().all(|(_, blocked)| blocked.is_empty()), "{model:?}");
+            let (map, blocked) = &revolutions[clean + 1];
             let [BlockedSector { from_deg: from, to_deg: to }] = blocked.sectors[..] else {
                 panic!("{model:?}: {blocked:?}")
             };
             assert!(from.abs_diff(from_deg) <= 1 && to.abs_diff(to_deg) <= 1, "{model:?}: {blocked:?}");
-            for (layer, before) in map.layers.iter().zip(&turns[clean - 1].0.layers) {
+            for (layer, before) in map.layers.iter().zip(&revolutions[clean - 1].0.layers) {
                 let (cells, known_before) = inside(before, dark_deg);
                 assert!(known_before * 50 > cells, "{model:?} {}: {known_before} of {cells}", layer.name);
                 let (cells, known) = inside(layer, dark_deg);

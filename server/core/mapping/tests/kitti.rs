@@ -4,11 +4,11 @@
 
 mod common;
 
-use clearway_mapping::config::{DrivabilityConfig, Gate};
+use clearway_mapping::config::{DrivabilityConfig, Passage};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
-use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::layer::radial_grid::RadialGrid;
+use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::sensor::sweep::Sweep;
 use common::labels::*;
 use common::*;
@@ -94,7 +94,7 @@ fn wider_columns_and_the_thesis_own_reading_stay_useful() {
         bridge_rows: 0,
         close_gaps: false,
         step_m_max: 0.5,
-        gate: Gate::BetweenSegments,
+        passage: Passage::BetweenSegments,
         ..own.clone()
     };
     let readings = [

@@ -1,19 +1,19 @@
-//! Motion compensation: walls stay straight where poses or a speed are known, bend where not; what moved a map stands
-//! in it.
+//! Motion compensation: walls stay straight if poses or a speed are known, and bend if not; the map states what moved
+//! its points.
 
 mod common;
 
 use bytes::Bytes;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::sensor::{Sensor, SensorConfig as LidarConfig};
+use clearway_lidar::{Sensor, SensorConfig as LidarConfig};
 use clearway_lidar::telemetry::Telemetry;
 use clearway_mapping::config::{Extrinsics, MapsConfig, MotionConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::error::EventError;
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
 use clearway_mapping::map::Map;
-use clearway_mapping::sensor::motion::{Compensation, Motion, EgoTrajectory};
 use clearway_mapping::pipeline::Pipeline;
+use clearway_mapping::sensor::motion::{Compensation, EgoTrajectory, Motion};
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::course::{Course, Drive};
 use clearway_sim::ground::Ground;
@@ -41,18 +41,18 @@ fn between_poses_translation_is_linear_and_rotation_a_slerp() {
     motion.push_pose(&pose(100_000_000, at(11.0, 2.0, -3.0)));
     assert_eq!(motion.map_from_ego(0), Some(at(10.0, 0.0, 3.0)), "a pose's own stamp gives the pose, to the bit");
     let quarter = motion.map_from_ego(25_000_000).unwrap();
-    // From 3 to -3 rad the shorter way leads over π.
+    // From 3 to -3 rad the shorter rotation passes π.
     let expected = at(10.25, 0.5, 3.0 + 0.25 * (std::f64::consts::TAU - 6.0));
     assert!((quarter.translation.vector - expected.translation.vector).norm() < 1e-12);
     assert!(quarter.rotation.angle_to(&expected.rotation) < 1e-9, "{quarter}");
 }
 
 #[test]
-fn beyond_the_poses_the_motion_goes_on_within_its_bound_and_no_farther() {
+fn beyond_the_poses_the_motion_continues_for_a_limited_time() {
     let mut motion = Motion::new(&MotionConfig::default());
     motion.push_pose(&pose(0, at(0.0, 0.0, 0.0)));
     let alone = motion.map_from_ego(100_000_000).unwrap();
-    assert!((alone.translation.x - 1.5).abs() < 1e-12, "one pose goes on with its speed: {alone}");
+    assert!((alone.translation.x - 1.5).abs() < 1e-12, "one pose continues with its own speed: {alone}");
     motion.push_pose(&pose(100_000_000, at(1.0, 0.5, 0.1)));
     let later = motion.map_from_ego(300_000_000).unwrap();
     assert!((later.translation.vector - Vector3::new(3.0, 1.5, 0.0)).norm() < 1e-12, "{later}");
@@ -62,7 +62,7 @@ fn beyond_the_poses_the_motion_goes_on_within_its_bound_and_no_farther() {
     assert!((earlier.translation.vector - Vector3::new(-2.0, -1.0, 0.0)).norm() < 1e-12, "{earlier}");
     assert_eq!(motion.map_from_ego(-200_000_001), None);
     motion.push_pose(&pose(1_200_000_001, at(9.0, 9.0, 0.0)));
-    assert_eq!(motion.map_from_ego(700_000_000), None, "more than a second between two poses says too little");
+    assert_eq!(motion.map_from_ego(700_000_000), None, "poses more than a second apart are not interpolated");
 }
 
 #[test]
@@ -73,7 +73,7 @@ fn only_the_newest_thousand_poses_are_kept() {
     assert!((motion.map_from_ego(4_500_500_000).unwrap().translation.x - 4500.5).abs() < 1e-9);
 }
 
-/// Walls all round a car that drives a bend of 60 m at 15 m/s; without noise.
+/// A car among walls, without noise, that drives a bend of 60 m at 15 m/s.
 fn vehicle() -> SimulatedVehicle {
     let world = World::on(Ground::default())
         .wall(&[[18.0, -14.0], [18.0, 14.0]], 2.5)
@@ -93,7 +93,7 @@ fn config(motion: MotionConfig) -> VehicleConfig {
     VehicleConfig { maps, ..VehicleConfig::new("car", vec![sensor]) }
 }
 
-/// What comes in of 300 ms: datagrams, telemetry unless `silent`, and a pose every `pose_ns` where that is given.
+/// Events of 300 ms: datagrams, telemetry unless `silent`, and a pose every `pose_ns` if it is given.
 fn drive(pose_ns: Option<i64>, silent: bool) -> Vec<Event> {
     let vehicle = vehicle();
     let (start_ns, mut next_ns) = (vehicle.start_ns(), vehicle.start_ns());
@@ -122,8 +122,8 @@ fn second(motion: MotionConfig, events: &[Event]) -> (Map, Sweep) {
     panic!("the drive holds two revolutions");
 }
 
-/// How far points lie from the walls they belong to, metres: the root mean square and the largest. `map_from_ego` is
-/// the simulator's own, so this is not only straightness but the right place too.
+/// Distances of points from the walls they belong to, metres: the root mean square and the largest. `map_from_ego` is
+/// the simulator's own, so the distances show position errors as well as bends.
 fn off_the_walls(sweep: &Sweep, map_from_ego: &Isometry3<f64>) -> (f64, f64) {
     let world = vehicle().scene().world.clone();
     let shapes = world.shapes_at(0.0);
@@ -132,13 +132,13 @@ fn off_the_walls(sweep: &Sweep, map_from_ego: &Isometry3<f64>) -> (f64, f64) {
         if !(0.5..2.2).contains(&z) {
             continue;
         }
-        let place = map_from_ego * Point3::new(f64::from(x), f64::from(y), f64::from(z));
-        // The narrowest margin within which some wall stands there.
-        let stands = |margin: f64| shapes.iter().any(|shape| shape.column(place.x, place.y, margin).is_some());
+        let point = map_from_ego * Point3::new(f64::from(x), f64::from(y), f64::from(z));
+        // The least margin at which a wall contains the point.
+        let is_wall = |margin: f64| shapes.iter().any(|shape| shape.column(point.x, point.y, margin).is_some());
         let (mut near, mut far) = (0.0, 4.0);
         for _ in 0..14 {
             let middle = (near + far) / 2.0;
-            if stands(middle) { far = middle } else { near = middle }
+            if is_wall(middle) { far = middle } else { near = middle }
         }
         sum += far * far;
         largest = largest.max(far);
@@ -149,11 +149,11 @@ fn off_the_walls(sweep: &Sweep, map_from_ego: &Isometry3<f64>) -> (f64, f64) {
 }
 
 #[test]
-fn at_15_mps_walls_stay_in_their_place_with_poses_and_bend_without() {
+fn at_15_mps_walls_are_straight_with_poses_and_bent_without() {
     let vehicle = vehicle();
     let mut measured = Vec::new();
     let off = MotionConfig { enabled: false, ..MotionConfig::default() };
-    for (said, motion, events) in [
+    for (name, motion, events) in [
         ("poses at 100 Hz", MotionConfig::default(), drive(Some(10_000_000), true)),
         ("poses at 10 Hz", MotionConfig::default(), drive(Some(100_000_000), true)),
         ("GPRMC speed alone", MotionConfig::default(), drive(None, false)),
@@ -161,7 +161,7 @@ fn at_15_mps_walls_stay_in_their_place_with_poses_and_bend_without() {
     ] {
         let (map, sweep) = second(motion, &events);
         let (rms, largest) = off_the_walls(&sweep, &vehicle.pose_at(map.capture_end_ns));
-        println!("{said:<18}: {:<5} walls off by {rms:.3} m rms, {largest:.3} m at most", map.compensation.as_str());
+        println!("{name:<18}: {:<5} walls off by {rms:.3} m rms, {largest:.3} m at most", map.compensation.as_str());
         measured.push((map, rms, largest));
     }
     let [(often, often_rms, often_max), (seldom, seldom_rms, _), (speed, speed_rms, _), (off, off_rms, off_max)] =
@@ -173,11 +173,11 @@ fn at_15_mps_walls_stay_in_their_place_with_poses_and_bend_without() {
     assert_eq!((speed.compensation, off.compensation), (Compensation::Speed, Compensation::None));
     assert!(*often_rms < 0.01 && *often_max < 0.03, "{often_rms} {often_max}");
     assert!(*seldom_rms < 0.05, "{seldom_rms}");
-    // Straight ahead is not round the bend, but the better half of it.
+    // The speed alone does not know the bend, but removes the larger part of the error.
     assert!(*speed_rms < 0.7 * off_rms, "{speed_rms} {off_rms}");
     assert!(*off_rms > 0.3 && *off_max > 1.0, "{off_rms} {off_max}");
 
-    // The pose of the header is the one at the capture's end, whether points were moved or not.
+    // The pose of the map is the one at the capture's end, whether points are moved or not.
     for map in [often, off] {
         let (given, truth) = (map.map_from_ego.unwrap(), vehicle.pose_at(map.capture_end_ns));
         assert!((given.translation.vector - truth.translation.vector).norm() < 0.01);
@@ -185,11 +185,11 @@ fn at_15_mps_walls_stay_in_their_place_with_poses_and_bend_without() {
         assert_eq!(map.speed_mps, Some(SPEED_MPS));
     }
     assert_eq!(speed.map_from_ego, None);
-    assert!((speed.speed_mps.unwrap() - SPEED_MPS).abs() < 0.1, "GPRMC has tenths of a knot: {:?}", speed.speed_mps);
+    assert!((speed.speed_mps.unwrap() - SPEED_MPS).abs() < 0.1, "GPRMC states tenths of a knot: {:?}", speed.speed_mps);
 }
 
 #[test]
-fn where_nothing_is_known_nothing_is_moved_and_the_map_says_so() {
+fn without_poses_and_speed_no_point_is_moved() {
     let events = drive(None, true);
     let (map, sweep) = second(MotionConfig::default(), &events);
     assert_eq!((map.compensation, map.speed_mps, map.map_from_ego), (Compensation::None, None, None));
@@ -200,22 +200,22 @@ fn where_nothing_is_known_nothing_is_moved_and_the_map_says_so() {
 }
 
 #[test]
-fn the_same_events_move_every_point_alike_and_later_poses_change_nothing() {
+fn the_same_events_move_each_point_equally() {
     let events = drive(Some(20_000_000), false);
     let (map, sweep) = second(MotionConfig::default(), &events);
     assert_eq!(second(MotionConfig::default(), &events), (map.clone(), sweep.clone()));
-    // Cut off right behind the event that completed the map.
+    // Without the events after the one that completed the map.
     let last = events.iter().position(|event| event.arrival_ns > map.completed_ns).unwrap();
     assert_eq!(second(MotionConfig::default(), &events[..last]), (map, sweep));
 }
 
 #[test]
-fn poses_out_of_order_are_refused_and_leave_the_walls_alone() {
+fn poses_out_of_order_are_refused_and_change_no_map() {
     let mut events = drive(Some(10_000_000), true);
     let (expected, points) = second(MotionConfig::default(), &events);
-    let wrong: Vec<usize> =
+    let repeated: Vec<usize> =
         (0..events.len()).filter(|i| matches!(events[*i].body, Body::EgoPose(_)) && i % 3 == 0).collect();
-    for index in wrong.iter().rev() {
+    for index in repeated.iter().rev() {
         let Body::EgoPose(mut late) = events[*index].body.clone() else { unreachable!() };
         late.map_from_ego.translation.x += 100.0;
         events.insert(index + 1, Event { body: Body::EgoPose(late), ..events[*index].clone() });
@@ -241,7 +241,7 @@ fn poses_out_of_order_are_refused_and_leave_the_walls_alone() {
 }
 
 #[test]
-fn a_pose_that_jumps_tears_no_wall() {
+fn poses_that_jump_within_a_revolution_are_not_used_for_it() {
     let mut events = drive(Some(10_000_000), false);
     let expected = second(MotionConfig::default(), &drive(None, false));
     let middle = events.len() / 2;
@@ -254,11 +254,11 @@ fn a_pose_that_jumps_tears_no_wall() {
     assert_eq!(map.compensation, Compensation::Speed, "the jump lies in the second revolution");
     assert_eq!(sweep.x.len(), expected.1.x.len());
     let off = sweep.x.iter().zip(&expected.1.x).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-    assert!(off < 0.05, "{off}: as by GPRMC alone, but for the tenths of its knots");
+    assert!(off < 0.05, "{off}: as with GPRMC alone, up to its resolution of a tenth of a knot");
 }
 
 #[test]
-fn stamps_and_places_at_the_ends_of_their_types_move_nothing_and_break_nothing() {
+fn extreme_stamps_and_positions_move_no_point() {
     let mut pipeline = Pipeline::new(&config(MotionConfig::default()), vec![None]).unwrap();
     let mut step = |event: &Event| pipeline.step(event).map(|map| map.map(|map| map.compensation));
     let far = |stamp_ns, x| EgoPose { stamp_ns, map_from_ego: at(x, 0.0, 0.0), speed_mps: 0.0 };
@@ -292,7 +292,7 @@ fn stamps_and_places_at_the_ends_of_their_types_move_nothing_and_break_nothing()
 }
 
 #[test]
-fn a_speed_grows_old() {
+fn a_speed_is_not_used_when_it_is_too_old() {
     let telemetry = drive(None, false).into_iter().find_map(|event| match event.body {
         Body::Datagram(payload) => Telemetry::new(&payload).ok(),
         _ => None,
@@ -302,12 +302,12 @@ fn a_speed_grows_old() {
     let known = |motion: &Motion, stamp_ms: i64| motion.at(stamp_ms * 1_000_000).1.is_some();
     assert!(!known(&motion, 0));
     motion.apply_gprmc(&gprmc, None);
-    // Before the first turn has ended nobody can say when that was.
+    // Until the first scan has ended the time of the speed is unknown, and it is used.
     assert_eq!([0, 100_000].map(|stamp_ms| known(&motion, stamp_ms)), [true, true]);
-    for turn_ms in [100, 200, 300] {
-        motion.note_scan_end(turn_ms * 1_000_000);
-        // The receiver repeats its first sentence for ever.
-        motion.apply_gprmc(&gprmc, Some(turn_ms * 1_000_000));
+    for end_ms in [100, 200, 300] {
+        motion.note_scan_end(end_ms * 1_000_000);
+        // The receiver repeats its first sentence.
+        motion.apply_gprmc(&gprmc, Some(end_ms * 1_000_000));
     }
     assert_eq!([400, 2_100, 2_101].map(|stamp_ms| known(&motion, stamp_ms)), [true, true, false]);
 }
@@ -323,15 +323,14 @@ fn a_vlp16_in_dual_return_moves_both_echoes() {
     let mut motion = Motion::new(&MotionConfig::default());
     motion.push_pose(&pose(revolution.start_ns, at(0.0, 0.0, 0.0)));
     motion.push_pose(&pose(revolution.end_ns, at(1.5, 0.0, 0.0)));
-    let mut moved = EgoTrajectory::default();
-    motion.follow_revolution(&revolution, &mut moved);
+    let mut trajectory = EgoTrajectory::default();
+    motion.follow_revolution(&revolution, &mut trajectory);
     let mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
     let (mut rest, mut sweep) = (Sweep::default(), Sweep::default());
     rest.set_revolution(&revolution, &mount);
-    sweep.set_moving_revolution(&revolution, &mount, &moved.end_from_ego, None);
+    sweep.set_moving_revolution(&revolution, &mount, &trajectory.end_from_ego, None);
     assert_eq!((sweep.returns, sweep.x.len()), (rest.returns, rest.x.len()));
-    // By hand, firing by firing: a point of the turn's first firing lies 1.5 m farther back, one of the last where it
-    // was.
+    // A point of the first firing is moved back by 1.5 m, one of the last firing is not moved.
     let mut index = 0;
     for echo in &revolution.echoes {
         for slot in (0..echo.range_m.len()).filter(|slot| echo.range_m[*slot] >= 2.0) {
@@ -345,8 +344,7 @@ fn a_vlp16_in_dual_return_moves_both_echoes() {
     assert_eq!(index, sweep.x.len());
 }
 
-/// Median and mean distance over the ground plan from the points of `a` to the nearest of `b`; more than 1 m counts as
-/// 1 m.
+/// Median and mean horizontal distance from the points of `a` to the nearest of `b`, metres; at most 1 m each.
 fn apart(a: &[[f64; 3]], b: &[[f64; 3]]) -> (f64, f64) {
     let key = |point: &[f64; 3]| [0, 1].map(|axis| point[axis].floor() as i64);
     let mut cells: std::collections::HashMap<[i64; 2], Vec<[f64; 3]>> = Default::default();
@@ -362,7 +360,7 @@ fn apart(a: &[[f64; 3]], b: &[[f64; 3]]) -> (f64, f64) {
     (distances[distances.len() / 2], distances.iter().sum::<f64>() / distances.len() as f64)
 }
 
-/// Revolutions of the HDL-32E capture cut at an azimuth and what GPRMC had said.
+/// Revolutions of the HDL-32E capture, cut at an azimuth; `motion` gets the speeds of its telemetry.
 fn hdl32e(cut_azimuth_deg: f32, motion: &mut Motion) -> Vec<Revolution> {
     let mut sensor = Sensor::new(LidarConfig { cut_azimuth_deg, ..LidarConfig::default() });
     let mut revolutions = Vec::new();
@@ -379,10 +377,10 @@ fn hdl32e(cut_azimuth_deg: f32, motion: &mut Motion) -> Vec<Revolution> {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
-    // Turns cut at 90 and at 270 degrees: the half they share by direction, one saw a whole turn before the other, and
-    // in between the car moved by 1.3 m. Each sweep lies in the ego frame at its own end; the car's own speed carries
-    // one into the other. Only a sweep without motion in it can lie on another that was cut elsewhere.
+fn a_recorded_street_is_the_same_wherever_its_revolutions_are_cut() {
+    // Revolutions cut at 90 and at 270 degrees. They share half of the directions; one of them scans these a whole
+    // revolution before the other, and the car moves by 1.3 m in between. Each sweep is expressed in the ego frame at
+    // its own end, and the car's speed propagates one to the other. They match only if motion is compensated in both.
     let mut motion = Motion::new(&MotionConfig::default());
     let (right, left) = (hdl32e(90.0, &mut motion), hdl32e(270.0, &mut motion));
     let mount = Mount {
@@ -390,14 +388,14 @@ fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
             .ego_from_sensor(),
         range_m_min: 2.5,
     };
-    // Standing things at the side the sweeps share by direction but not by firing, metres, as of the end of `at_ns`.
+    // Upright objects in the directions that both sweeps share, ego frame at `to_ns`, metres.
     let street = |revolution: &Revolution, compensate: bool, first_half: bool, to_ns: i64| {
-        let mut moved = EgoTrajectory::default();
-        motion.follow_revolution(revolution, &mut moved);
-        assert_eq!(moved.compensation, Compensation::Speed);
-        let speed_mps = moved.speed_mps.unwrap();
+        let mut trajectory = EgoTrajectory::default();
+        motion.follow_revolution(revolution, &mut trajectory);
+        assert_eq!(trajectory.compensation, Compensation::Speed);
+        let speed_mps = trajectory.speed_mps.unwrap();
         if !compensate {
-            moved.end_from_ego.clear();
+            trajectory.end_from_ego.clear();
         }
         let mut half = revolution.clone();
         let middle = half.firings.len() / 2;
@@ -407,7 +405,7 @@ fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
             echo.range_m[drop].fill(0.0);
         }
         let mut sweep = Sweep::default();
-        sweep.set_moving_revolution(&half, &mount, &moved.end_from_ego, None);
+        sweep.set_moving_revolution(&half, &mount, &trajectory.end_from_ego, None);
         let since = (to_ns - revolution.end_ns) as f64 * 1e-9 * speed_mps;
         let place = |i: usize| [f64::from(sweep.x[i]) - since, f64::from(sweep.y[i]), f64::from(sweep.z[i])];
         let places: Vec<[f64; 3]> = (0..sweep.x.len()).map(place).collect();
@@ -416,7 +414,8 @@ fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
     };
     let mut pairs = 0;
     for early in &right {
-        // The one that ends half a turn later: its second half looks where the first half of this one did.
+        // The revolution that ends half a revolution later: its second half has the directions of the first half of
+        // this one.
         let period_ns = early.end_ns - early.start_ns;
         let later = left.iter().find(|later| {
             let since = later.end_ns - early.end_ns;
@@ -446,7 +445,7 @@ fn the_hdl32e_at_15_mps_sees_the_same_street_whichever_way_its_turns_are_cut() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn kittis_scans_lie_on_one_another_in_the_map_frame_of_their_headers() {
+fn recorded_scans_of_kitti_match_in_the_world_frame() {
     let text = std::fs::read_to_string(common::data("kitti/patchwork-plusplus/icp_poses_DERIVED.json")).unwrap();
     let numbers = |pose: &str| -> Vec<f64> {
         let matrix = &pose[..pose.find("]\n  ]").unwrap()];
@@ -464,15 +463,15 @@ fn kittis_scans_lie_on_one_another_in_the_map_frame_of_their_headers() {
         let rotation = nalgebra::Matrix3::new(p[0], p[1], p[2], p[4], p[5], p[6], p[8], p[9], p[10]);
         let first_from_this =
             Isometry3::from_parts(Translation3::new(p[3], p[7], p[11]), UnitQuaternion::from_matrix(&rotation));
-        // The derived poses are the sensor's; the map frame is the first ego frame.
+        // The derived poses are those of the sensor; the world frame is the first ego frame.
         let map_from_ego = ego_from_sensor * first_from_this * ego_from_sensor.inverse();
         let event = |body| Event { sequence: 0, arrival_ns: stamp_ns, source: 0, body };
         pipeline.step(&event(Body::EgoPose(pose(stamp_ns, map_from_ego)))).unwrap();
         let scan = Scan { stamp_ns, ..common::kitti(&format!("kitti/patchwork-plusplus/00000{index}.bin")) };
         let map = pipeline.step(&event(Body::Scan(scan))).unwrap().unwrap();
-        assert_eq!(map.compensation, Compensation::None, "KITTI has moved its points already");
+        assert_eq!(map.compensation, Compensation::None, "the points of KITTI are compensated already");
         let from_header = map.map_from_ego.unwrap();
-        assert_eq!(from_header, map_from_ego, "a pose of the scan's own stamp, to the bit");
+        assert_eq!(from_header, map_from_ego, "a pose of the scan's own stamp is used unchanged");
         let sweep = pipeline.newest_sweep();
         let near = |i: &usize| sweep.z[*i] > 0.4 && sweep.x[*i].hypot(sweep.y[*i]) < 25.0;
         let point = |i: usize| Point3::new(sweep.x[i], sweep.y[i], sweep.z[i]).cast::<f64>();

@@ -1,4 +1,4 @@
-//! Mounts estimated from the ground, against simulated ones, recorded drives, and places without ground.
+//! Mounts estimated from the ground, compared with simulated mounts and recorded drives, and scenes without ground.
 
 mod common;
 
@@ -38,11 +38,11 @@ fn a_simulated_mount_is_found_within_2_cm_and_a_fifth_of_a_degree() {
 }
 
 #[test]
-fn without_ground_there_is_no_guess() {
+fn without_ground_the_estimate_is_an_error() {
     assert!(matches!(estimate([Vec::new()]), Err(MountError::TooFewPoints { samples: 0, revolutions: 1 })));
     let none: [Vec<[f32; 3]>; 0] = [];
     assert!(matches!(estimate(none), Err(MountError::TooFewPoints { revolutions: 0, .. })));
-    // A tunnel's walls, and nothing under the sensor.
+    // Walls of a tunnel, and no point under the sensor.
     let wall = |i: i32| [(i % 300) as f32 * 0.1 - 15.0, if i % 2 == 0 { 4.0 } else { -4.0 }, (i / 300) as f32 * 0.1];
     let refused = estimate([(0..9000).map(wall).collect::<Vec<_>>()]);
     assert!(refused.is_err(), "{refused:?}");
@@ -55,13 +55,13 @@ fn without_ground_there_is_no_guess() {
 }
 
 #[test]
-fn wild_points_are_no_harm() {
+fn points_that_are_not_finite_give_an_error() {
     let wild = [[f32::NAN; 3], [f32::INFINITY, 0.0, 0.0], [1e30; 3], [0.0; 3]];
     assert!(estimate([wild.repeat(1000)]).is_err());
 }
 
 fn recorded(path: &str, model: Option<Model>) -> Vec<Vec<[f32; 3]>> {
-    use clearway_lidar::sensor::{Sensor, SensorConfig};
+    use clearway_lidar::{Sensor, SensorConfig};
     let mut sensor = Sensor::new(SensorConfig { model, ..SensorConfig::default() });
     let mut revolutions = Vec::new();
     for datagram in common::datagrams(path) {
@@ -76,7 +76,7 @@ fn recorded(path: &str, model: Option<Model>) -> Vec<Vec<[f32; 3]>> {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn recorded_drives_give_the_mount_their_ground_shows() {
+fn recorded_drives_give_the_mount_that_their_ground_shows() {
     // 1.73 m is published; the labelled road of frame 0 itself lies on a plane 1.795 m under the sensor, tilted 0.5
     // degrees in pitch and 1.5 in roll.
     for frame in 0..3 {

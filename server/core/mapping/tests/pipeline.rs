@@ -1,4 +1,4 @@
-//! Events in, maps out: what is counted, what is refused, and that the same events give the same maps.
+//! The pipeline: what it counts, what it refuses, and that the same events give the same maps.
 
 mod common;
 
@@ -27,7 +27,7 @@ fn event(sequence: u64, body: Body) -> Event {
     Event { sequence, arrival_ns: 1_000 + sequence as i64, source: 0, body }
 }
 
-/// Datagrams of a standing simulated vehicle, two turns and a bit.
+/// Datagrams of a standing simulated vehicle: a little more than two revolutions.
 fn drive() -> Vec<Event> {
     let vehicle = SimulatedVehicle::new(scenes::flat(), ScannerConfig { model: Model::Vlp16, ..Default::default() });
     let until_ns = vehicle.start_ns() + 260_000_000;
@@ -59,7 +59,7 @@ fn scan(stamp_ns: i64) -> Scan {
 }
 
 #[test]
-fn a_pose_of_the_future_locks_out_those_of_the_present_for_no_longer_than_the_deadline() {
+fn a_pose_of_the_future_blocks_others_for_no_longer_than_the_deadline() {
     const MS: i64 = 1_000_000;
     let mut pipeline = pipeline(Some(Model::Vlp16));
     let mut pose = |arrival_ms: i64, stamp_ms: i64| {
@@ -76,11 +76,11 @@ fn a_pose_of_the_future_locks_out_those_of_the_present_for_no_longer_than_the_de
     for arrival_ms in (10_220..10_400).step_by(10) {
         pose(arrival_ms, arrival_ms).unwrap();
     }
-    assert!(pose(10_400, 10_300).is_err(), "an old one is refused as before");
+    assert!(pose(10_400, 10_300).is_err(), "an older pose is still refused");
 }
 
 #[test]
-fn a_host_clock_that_steps_changes_no_map_of_a_sensor_on_gps_but_what_is_said_of_the_host() {
+fn a_step_of_the_host_clock_changes_no_map_of_a_sensor_on_gps_time() {
     const HOUR_NS: i64 = 3_600_000_000_000;
     let run = |step_ns: i64| {
         let mut events = drive();
@@ -102,14 +102,14 @@ fn a_host_clock_that_steps_changes_no_map_of_a_sensor_on_gps_but_what_is_said_of
 }
 
 #[test]
-fn a_drive_becomes_a_map_a_turn_and_the_end_gives_the_rest_as_partial() {
+fn each_revolution_gives_a_map_and_the_end_gives_a_partial_one() {
     let events = drive();
     let mut pipeline = pipeline(Some(Model::Vlp16));
     assert!(pipeline.newest_revolution().is_none());
     let mut made = maps(&mut pipeline, &events);
     let end = Event { sequence: events.len() as u64, arrival_ns: 7, source: 0, body: Body::End };
     made.push(pipeline.step(&end).unwrap().unwrap().clone());
-    assert_eq!(pipeline.step(&end), Ok(None), "nothing is left");
+    assert_eq!(pipeline.step(&end), Ok(None), "no revolution is unfinished");
 
     assert_eq!(made.iter().map(|map| map.sequence).collect::<Vec<_>>(), [0, 1, 2, 3][..made.len()]);
     assert!(made.len() >= 3, "{} maps", made.len());
@@ -117,7 +117,7 @@ fn a_drive_becomes_a_map_a_turn_and_the_end_gives_the_rest_as_partial() {
     assert_eq!(whole.sensors[0].partial, "");
     assert_eq!(whole.sensors[0].model, "vlp16");
     assert_eq!(whole.sensors[0].completeness, 1.0);
-    // The vehicle's device time is UTC's and its telemetry says so; the stream comes without delay.
+    // The device time is UTC, as the telemetry states, and the datagrams arrive without delay.
     assert_eq!((whole.sensors[0].clock, whole.sensors[0].clock_offset_ms), ("gps", 0));
     assert!((whole.sensors[0].rpm - 600.0).abs() < 5.0);
     assert!(whole.capture_end_ns - whole.capture_start_ns > 95_000_000);
@@ -141,7 +141,7 @@ fn the_same_events_give_the_same_maps() {
 }
 
 #[test]
-fn the_ledger_is_exact_and_a_refused_datagram_leaves_no_trace_in_the_maps() {
+fn the_ledger_is_exact_and_a_refused_datagram_changes_no_map() {
     let clean = drive();
     let expected = maps(&mut pipeline(Some(Model::Vlp16)), &clean);
     let mut pipeline = pipeline(Some(Model::Vlp16));
@@ -153,8 +153,8 @@ fn the_ledger_is_exact_and_a_refused_datagram_leaves_no_trace_in_the_maps() {
             let rejected = pipeline.step(&short).unwrap_err();
             assert_eq!(rejected.reason(), "length", "{rejected}");
             for body in [event.body.clone(), Body::End] {
-                let stranger = Event { source: 3, body, ..event.clone() };
-                let rejected = pipeline.step(&stranger).unwrap_err();
+                let unknown = Event { source: 3, body, ..event.clone() };
+                let rejected = pipeline.step(&unknown).unwrap_err();
                 assert_eq!(rejected, EventError::Source { source_index: 3, sensors: 1 });
             }
             assert_eq!(
@@ -186,7 +186,7 @@ fn the_ledger_is_exact_and_a_refused_datagram_leaves_no_trace_in_the_maps() {
 }
 
 #[test]
-fn losses_beyond_all_counting_keep_the_ledger_exact() {
+fn the_largest_counts_of_losses_keep_the_ledger_exact() {
     let mut pipeline = pipeline(None);
     let causes = [Cause::Queue, Cause::Kernel, Cause::Sender, Cause::Length, Cause::Observation];
     let lost = causes.iter().cycle().take(15).map(|&cause| Body::Lost { cause, count: u64::MAX });
@@ -199,7 +199,7 @@ fn losses_beyond_all_counting_keep_the_ledger_exact() {
 }
 
 #[test]
-fn a_scan_enters_at_the_sweep() {
+fn a_scan_event_makes_a_map_without_a_revolution() {
     let mut pipeline = pipeline(Some(Model::Hdl64eS2));
     let map = pipeline.step(&event(0, Body::Scan(scan(50)))).unwrap().unwrap();
     assert_eq!((map.capture_start_ns, map.capture_end_ns, map.completed_ns), (50, 50, 1_000));
@@ -210,7 +210,7 @@ fn a_scan_enters_at_the_sweep() {
 }
 
 #[test]
-fn points_of_a_scan_that_are_no_positions_are_left_out_and_counted() {
+fn points_of_a_scan_that_are_not_positions_are_removed_and_counted() {
     let mut wild = scan(50);
     for (index, value) in [(0, f32::NAN), (1, f32::INFINITY), (2, -f32::INFINITY), (3, 1e9)] {
         wild.x[index] = value;
@@ -223,12 +223,12 @@ fn points_of_a_scan_that_are_no_positions_are_left_out_and_counted() {
 }
 
 #[test]
-fn scans_that_cannot_be_taken_say_why() {
-    let mut torn = scan(60);
-    torn.z.pop();
+fn a_refused_scan_gives_an_error_that_names_the_value() {
+    let mut uneven = scan(60);
+    uneven.z.pop();
     let mut known = pipeline(Some(Model::Hdl64eS2));
     known.step(&event(0, Body::Scan(scan(50)))).unwrap();
-    let rejected = known.step(&event(1, Body::Scan(torn))).unwrap_err();
+    let rejected = known.step(&event(1, Body::Scan(uneven))).unwrap_err();
     assert_eq!(
         rejected.to_string(),
         "scan with 6280 x, 6280 y, 6279 z and 6280 intensities: the four lengths must be equal"
@@ -242,11 +242,11 @@ fn scans_that_cannot_be_taken_say_why() {
     assert_eq!(known.ledger().refused, [("scan_lengths", 1), ("stamp", 1), ("stamp_range", 4)].into());
     assert_eq!((known.ledger().received, known.ledger().decoded), (7, 1));
     let map = known.step(&event(3, Body::Scan(scan(51)))).unwrap().unwrap();
-    assert_eq!(map.sequence, 1, "rejected scans take no number");
+    assert_eq!(map.sequence, 1, "a refused scan uses no sequence number");
 }
 
 #[test]
-fn the_newest_pose_goes_with_the_map_and_bad_poses_do_not() {
+fn a_map_has_the_newest_pose_and_invalid_poses_are_refused() {
     let pose = |stamp_ns, x, speed_mps| {
         let map_from_ego = Isometry3::from_parts(Translation3::new(x, 2.0, 3.0), UnitQuaternion::identity());
         Body::EgoPose(EgoPose { stamp_ns, map_from_ego, speed_mps })
@@ -257,12 +257,12 @@ fn the_newest_pose_goes_with_the_map_and_bad_poses_do_not() {
     for bad in [pose(30, f64::NAN, 5.0), pose(30, 1.0, f64::INFINITY)] {
         assert_eq!(pipeline.step(&event(2, bad)), Err(EventError::Pose { stamp_ns: 30 }));
     }
-    let mut squashed = EgoPose { stamp_ns: 30, map_from_ego: Isometry3::identity(), speed_mps: 0.0 };
-    squashed.map_from_ego.rotation = UnitQuaternion::new_unchecked(Quaternion::new(0.5, 0.0, 0.0, 0.0));
-    assert_eq!(pipeline.step(&event(3, Body::EgoPose(squashed))), Err(EventError::Pose { stamp_ns: 30 }));
+    let mut not_unit = EgoPose { stamp_ns: 30, map_from_ego: Isometry3::identity(), speed_mps: 0.0 };
+    not_unit.map_from_ego.rotation = UnitQuaternion::new_unchecked(Quaternion::new(0.5, 0.0, 0.0, 0.0));
+    assert_eq!(pipeline.step(&event(3, Body::EgoPose(not_unit))), Err(EventError::Pose { stamp_ns: 30 }));
     assert_eq!(pipeline.step(&event(4, pose(20, 9.0, 9.0))), Err(EventError::Stamp { stamp_ns: 20, newest_ns: 20 }));
     let map = pipeline.step(&event(5, Body::Scan(scan(25)))).unwrap().unwrap();
-    // 5 ns on at 5 m/s.
+    // 5 ns after the pose at 5 m/s.
     assert!((map.map_from_ego.unwrap().translation.x - 1.0 - 25e-9).abs() < 1e-12);
     assert_eq!(map.speed_mps, Some(5.0));
     let ledger = pipeline.ledger();
@@ -270,7 +270,7 @@ fn the_newest_pose_goes_with_the_map_and_bad_poses_do_not() {
 }
 
 #[test]
-fn maps_switched_off_are_not_made() {
+fn a_disabled_layer_is_not_made() {
     let mut off = config(Some(Model::Hdl64eS2));
     off.maps = MapsConfig::none();
     off.maps.height_difference.enabled = true;
@@ -282,11 +282,11 @@ fn maps_switched_off_are_not_made() {
     assert!(pipeline.step(&event(0, Body::Scan(scan(10)))).unwrap().unwrap().layers.is_empty());
 }
 
-/// One value of a configuration made wrong.
+/// A change that makes one value of a configuration invalid.
 type Change<'a> = &'a dyn Fn(&mut VehicleConfig);
 
 #[test]
-fn a_configuration_that_cannot_work_names_key_value_and_what_is_allowed() {
+fn an_invalid_configuration_names_the_key_the_value_and_what_is_allowed() {
     let refuse = |change: Change| -> ConfigValueError {
         let mut config = config(None);
         change(&mut config);
@@ -363,13 +363,13 @@ fn recorded_drives_become_maps_with_the_road_drivable() {
         let ledger = pipeline.ledger();
         println!("{path}: {} maps, {ledger:?}", made.len());
         assert_eq!(ledger.received, read);
-        assert_eq!(ledger.decoded + ledger.telemetry, read, "nothing refused");
+        assert_eq!(ledger.decoded + ledger.telemetry, read, "no datagram is refused");
         assert_eq!((ledger.decoded, ledger.telemetry), (data, telemetry));
         assert!(made.iter().filter(|map| map.sensors[0].partial.is_empty()).count() >= whole);
         for map in made.iter().filter(|map| map.sensors[0].partial.is_empty()) {
             let layer = &map.layers[0];
             let (_, columns) = common::size(layer);
-            // The lane ahead, 2 degrees to either side.
+            // The cells straight ahead, 2 degrees to either side.
             let lane = (0..).zip(common::benches(layer)).take_while(|(_, bench)| **bench <= ahead_m);
             let cells: Vec<u8> = lane
                 .flat_map(|(row, _)| {
@@ -390,12 +390,12 @@ fn recorded_drives_become_maps_with_the_road_drivable() {
 }
 
 #[test]
-fn a_layer_that_nobody_wants_is_neither_made_nor_in_a_map_and_comes_with_the_next_when_somebody_does() {
+fn an_inactive_layer_is_not_made_until_the_next_map_after_its_activation() {
     let all = ["drivability", "height_difference", "terrain", "occupancy", "speed", "safe_path"];
     let names = |map: &Map| map.layers.iter().map(|layer| layer.name).collect::<Vec<_>>();
-    let (mut everything, mut wanted) = (pipeline(None), pipeline(None));
-    assert_eq!(everything.layers_made(), all.map(|layer| (layer, 0)));
-    // What is wanted, and what the map then holds: safe_path is made from drivability.
+    let (mut all_active, mut some_active) = (pipeline(None), pipeline(None));
+    assert_eq!(all_active.layers_made(), all.map(|layer| (layer, 0)));
+    // The layers that are activated, and those in the next map: safe_path is made from drivability.
     let steps: [(&[&str], &[&str]); 6] = [
         (&[], &[]),
         (&["terrain"], &["terrain"]),
@@ -404,26 +404,26 @@ fn a_layer_that_nobody_wants_is_neither_made_nor_in_a_map_and_comes_with_the_nex
         (&[], &[]),
         (&all, &all),
     ];
-    for (number, (want, has)) in (1..).zip(steps) {
+    for (number, (active, expected_names)) in (1..).zip(steps) {
         let event = event(number, Body::Scan(scan(100_000_000 * number as i64)));
-        let expected = everything.step(&event).unwrap().unwrap();
-        wanted.set_active_layers(|layer| want.contains(&layer));
-        let map = wanted.step(&event).unwrap().unwrap();
-        assert_eq!(names(map), has);
+        let expected = all_active.step(&event).unwrap().unwrap();
+        some_active.set_active_layers(|layer| active.contains(&layer));
+        let map = some_active.step(&event).unwrap().unwrap();
+        assert_eq!(names(map), expected_names);
         assert_eq!((map.sequence, &map.sensors), (expected.sequence, &expected.sensors));
-        // Occupancy gathers hits over maps, and begins anew: all others are the same, cell by cell.
+        // Occupancy gathers evidence and starts again without it; all other layers are equal, cell by cell.
         for layer in map.layers.iter().filter(|layer| layer.name != "occupancy") {
             let same = expected.layers.iter().find(|other| other.name == layer.name).unwrap();
             assert_eq!(layer, same);
         }
     }
-    assert_eq!(everything.layers_made(), all.map(|layer| (layer, 6)));
-    let made: Vec<u64> = wanted.layers_made().iter().map(|(_, made)| *made).collect();
+    assert_eq!(all_active.layers_made(), all.map(|layer| (layer, 6)));
+    let made: Vec<u64> = some_active.layers_made().iter().map(|(_, made)| *made).collect();
     assert_eq!(made, [2, 1, 2, 2, 2, 2]);
 }
 
 #[test]
-fn roughness_is_measured_again_when_terrain_is_wanted_again() {
+fn roughness_is_measured_again_when_terrain_is_activated_again() {
     let events = drive();
     let roughness = |maps: &[Map]| maps.last().unwrap().layers.iter().find(|layer| layer.name == "terrain").cloned();
     let mut late = pipeline(Some(Model::Vlp16));

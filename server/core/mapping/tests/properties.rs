@@ -1,4 +1,4 @@
-//! Whatever the points: no panic, every cell written, nothing known without a point.
+//! Properties that hold for any points: no panic, every cell is written, and no cell without a point is known.
 
 mod common;
 
@@ -6,15 +6,15 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{DrivabilityConfig, Form, HeightDifferenceConfig, Seed, TerrainConfig};
-use clearway_mapping::layer::drivability::Drivability;
+use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig, Seed, TerrainConfig, Variant};
 use clearway_mapping::event::Scan;
+use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::height_difference::HeightDifference;
-use clearway_mapping::layer::{Context, LayerMaker};
 use clearway_mapping::layer::radial_grid::RadialGrid;
-use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_mapping::layer::terrain::Terrain;
 use clearway_mapping::layer::terrain::class::TerrainClass;
+use clearway_mapping::layer::{Context, LayerMaker};
+use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use common::*;
 use nalgebra::Isometry3;
 use proptest::prelude::*;
@@ -26,7 +26,7 @@ fn models() -> impl Strategy<Value = Model> {
     prop::sample::select(vec![Model::Hdl64eS1, Model::Hdl64eS2, Model::Hdl32e, Model::Vlp16, Model::Vls128])
 }
 
-/// Coordinates near the vehicle, and all the floats there are.
+/// Coordinates near the vehicle, and any other float.
 fn coordinate() -> impl Strategy<Value = f32> {
     prop_oneof![8 => -70f32..70.0, 1 => -0.5f32..0.5, 1 => any::<f32>()]
 }
@@ -40,12 +40,12 @@ fn points() -> impl Strategy<Value = Vec<[f32; 3]>> {
 fn config() -> impl Strategy<Value = DrivabilityConfig> {
     let columns = prop::sample::select(vec![8u16, 90, 180, 360, 1440]);
     (columns, 0u8..9, any::<bool>(), any::<bool>(), 0f32..1.0, 0f32..4.0).prop_map(
-        |(columns, bridge_rows, close_gaps, first, offset_m, gate_m_min)| DrivabilityConfig {
+        |(columns, bridge_rows, close_gaps, first, offset_m, passage_m_min)| DrivabilityConfig {
             columns,
             bridge_rows,
             close_gaps,
             offset_m,
-            gate_m_min,
+            passage_m_min,
             seed: if first { Seed::FirstCell } else { Seed::BlindZone },
             ..DrivabilityConfig::default()
         },
@@ -56,7 +56,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
 
     #[test]
-    fn a_cell_is_known_where_a_point_fell_and_nowhere_else(
+    fn a_cell_is_known_exactly_if_it_contains_a_point(
         model in models(), height in 0.1f32..4.0, points in points(), config in config(), seed in any::<u64>(),
     ) {
         let mut sweep = Sweep { mount_height_m: height, ..empty(model) };
@@ -99,8 +99,8 @@ proptest! {
     }
 
     #[test]
-    fn terrain_is_known_from_points_alone_whatever_they_are(
-        points in points(), form in prop::sample::select(vec![Form::Grounded, Form::Paper, Form::Grid]),
+    fn terrain_knows_no_more_cells_than_there_are_points(
+        points in points(), variant in prop::sample::select(vec![Variant::Grounded, Variant::Paper, Variant::Grid]),
         cell_m in 0.1f32..2.0, range_m_max in 5f32..100.0, points_min in 1u16..6, planes in any::<bool>(),
         deviations in prop::collection::vec(any::<f32>(), 400), seed in any::<u64>(),
     ) {
@@ -108,14 +108,14 @@ proptest! {
         points.iter().for_each(|point| add(&mut sweep, *point));
         sweep.deviation_m = deviations[..points.len()].to_vec();
         let config = TerrainConfig {
-            form, cell_m, range_m_max, points_min, planes, roughness_points_min: 1, ..TerrainConfig::default()
+            variant, cell_m, range_m_max, points_min, planes, roughness_points_min: 1, ..TerrainConfig::default()
         };
         let mut map = Terrain::new(&config);
         let mut layer = map.layer();
         map.make(&sweep, &Context::default(), &mut layer);
 
         let (rows, columns) = size(&layer);
-        // Not by cell_at: whether a border falls to one side or the other is rounding.
+        // Not by cell_at: rounding decides to which cell a point on a border belongs.
         let held = classes(&layer).iter().filter(|c| [TerrainClass::Flat.value(), TerrainClass::Obstacle.value()].contains(c)).count();
         prop_assert!(held <= points.len());
         for channel in &layer.channels {
@@ -135,15 +135,15 @@ proptest! {
     }
 
     #[test]
-    fn a_scan_keeps_positions_and_drops_the_rest(points in points()) {
+    fn a_scan_keeps_the_points_that_are_positions(points in points()) {
         let column = |axis: usize| points.iter().map(|p| p[axis]).collect::<Vec<_>>();
         let (x, y, z) = (column(0), column(1), column(2));
         let scan = Scan { x, y, z, intensity: vec![0.0; points.len()], ..Scan::default() };
         let mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
         let mut sweep = Sweep::default();
-        let dropped = sweep.set_scan(&scan, &Arc::new(Calibration::factory(Model::Vlp16)), &mount);
+        let removed = sweep.set_scan(&scan, &Arc::new(Calibration::factory(Model::Vlp16)), &mount);
         let is_position = |p: &&[f32; 3]| p.iter().all(|v| v.abs() <= 1000.0);
-        prop_assert_eq!(dropped as usize, points.len() - points.iter().filter(is_position).count());
+        prop_assert_eq!(removed as usize, points.len() - points.iter().filter(is_position).count());
         prop_assert!(sweep.x.iter().chain(&sweep.y).chain(&sweep.z).all(|v| v.is_finite()));
         prop_assert!(sweep.x.len() == sweep.y.len() && sweep.x.len() == sweep.z.len());
         prop_assert!(sweep.x.len() <= sweep.returns as usize);

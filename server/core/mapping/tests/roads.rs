@@ -1,4 +1,4 @@
-//! Roads as events and as files: what is taken, what is refused by name, and real networks' lanes on the map.
+//! Roads in events and in files: what is accepted, what is refused, and lanes of real networks on the map.
 
 mod common;
 
@@ -33,7 +33,7 @@ fn step(pipeline: &mut Pipeline, body: Body) -> Result<(), (&'static str, String
 }
 
 #[test]
-fn a_road_of_the_future_gives_way_to_one_of_the_present() {
+fn a_road_of_the_future_does_not_block_one_of_the_present() {
     let mut pipeline = pipeline();
     let road = |stamp_ns| Body::Road(Road { stamp_ns, ..good() });
     assert_eq!(step(&mut pipeline, road(i64::MAX / 4)), Ok(()));
@@ -42,12 +42,12 @@ fn a_road_of_the_future_gives_way_to_one_of_the_present() {
 }
 
 #[test]
-fn a_road_that_is_none_is_refused_by_name_and_counted_and_the_one_before_stays() {
+fn an_invalid_road_is_refused_and_counted_and_the_one_before_stays() {
     let mut pipeline = pipeline();
     assert_eq!(step(&mut pipeline, Body::Road(good())), Ok(()));
 
-    type Spoil = fn(&mut Road);
-    let spoils: [(&str, Spoil); 16] = [
+    type Change = fn(&mut Road);
+    let changes: [(&str, Change); 16] = [
         ("road_points", |road| road.points.clear()),
         ("road_points", |road| road.points.truncate(1)),
         ("road_points", |road| road.points = vec![[0.0; 2]; 65_537]),
@@ -65,14 +65,14 @@ fn a_road_that_is_none_is_refused_by_name_and_counted_and_the_one_before_stays()
         ("road_orientations", |road| road.orientations = vec![0.0; 9]),
         ("stamp", |road| road.stamp_ns = 0),
     ];
-    for (reason, spoil) in spoils {
+    for (reason, change) in changes {
         let mut road = Road { stamp_ns: 2, ..good() };
-        spoil(&mut road);
-        let (found, said) = step(&mut pipeline, Body::Road(road)).unwrap_err();
-        assert_eq!(found, reason, "{said}");
-        assert!(said.contains("allowed"), "{said}");
+        change(&mut road);
+        let (found, message) = step(&mut pipeline, Body::Road(road)).unwrap_err();
+        assert_eq!(found, reason, "{message}");
+        assert!(message.contains("allowed"), "{message}");
     }
-    // The rest is unharmed: another purpose has its own stamps, other events go on.
+    // A road of another purpose has its own stamps, and other events are accepted as before.
     assert_eq!(step(&mut pipeline, Body::Road(Road { purpose: RoadPurpose::Route, ..good() })), Ok(()));
     assert_eq!(step(&mut pipeline, Body::Road(Road { stamp_ns: 2, ..good() })), Ok(()));
     let pose = EgoPose { stamp_ns: 1, map_from_ego: nalgebra::Isometry3::identity(), speed_mps: 0.0 };
@@ -89,14 +89,14 @@ fn a_road_that_is_none_is_refused_by_name_and_counted_and_the_one_before_stays()
         ("stamp", 1),
     ];
     assert_eq!((ledger.roads, &ledger.roads_refused), (3, &refused.into()));
-    assert_eq!((ledger.received, ledger.poses), (1, 1), "roads are no datagrams");
+    assert_eq!((ledger.received, ledger.poses), (1, 1), "roads are not counted as received datagrams");
 }
 
 const RDDF: &str = "1,34.7607233,-117.0107599,90,10\n732,34.9313317,-116.7157473,13,15,13,30,0\n\
                     2557,35.6626488,-115.369351,800,60\n2586,35.6162012,-115.3821023,12,0\n";
 
 #[test]
-fn rows_of_a_route_file_become_its_centre_line() {
+fn the_rows_of_a_route_file_give_its_centre_line() {
     let rddf = Rddf::read(RDDF);
     assert_eq!((rddf.rows.len(), rddf.refused.len()), (4, 0));
     let row = rddf.rows[1];
@@ -109,7 +109,7 @@ fn rows_of_a_route_file_become_its_centre_line() {
 }
 
 #[test]
-fn a_row_with_missing_or_impossible_fields_is_left_out_by_name_and_the_others_stand() {
+fn a_row_with_missing_or_invalid_fields_is_left_out_and_reported() {
     let text = "1,34.76,-117.01,90,10\n2,34.77,-117.02\n3,34.78\n4\n,34.7,-117.0,90,10\n5,94.0,-117.03,90,10\n\
                 6,34.79,-217.0,90,10\n7,34.79,-117.0,-90,10\n8,34.79,-117.0,NaN,10\n9,34.79,-117.0,90\n\
                 10,34.79,-117.0,90,fast\n# a comment\n\n11,34.80,-117.04,90,10\n12,34.80,-117.04,90,10\r\n";
@@ -136,7 +136,7 @@ fn a_row_with_missing_or_impossible_fields_is_left_out_by_name_and_the_others_st
 }
 
 #[test]
-fn lines_of_a_lane_that_are_none_are_left_out_by_name_and_the_others_stand() {
+fn invalid_lines_of_a_lane_are_left_out_and_reported() {
     let text = "lane 1.1 /* first */\nlane_width -12\n1.1.1 38.1 -77.1\n1.1.2 38.2\n1.2.3 38.2 -77.1\n1.1.4 38.2 -77.1\n\
                 1.1.5 38.2 -77.1\nend_lane\nlane 1.2\nlane_width 12\n1.2.1 38.1 -77.2\nend_lane\nlane 1.3\n\
                 lane_width 10\n1.3.1 38.1 -77.3\n1.3.2 38.2 -77.3\nend_lane\nzone 14\n14.0.1 38.0 -77.0\nend_zone\n";
@@ -151,7 +151,7 @@ fn lines_of_a_lane_that_are_none_are_left_out_by_name_and_the_others_stand() {
 }
 
 #[test]
-fn degrees_become_metres_as_on_the_ellipsoid() {
+fn degrees_become_metres_on_the_ellipsoid() {
     // Lengths of a minute of latitude and longitude at 45° (Bowditch, table 7): 1852.2 m and 1314.2 m, to a decimetre.
     let frame = LocalFrame::new(45.0, 7.0);
     let [east, north] = frame.position_m(45.0 + 0.5 / 60.0, 7.0);
@@ -162,14 +162,14 @@ fn degrees_become_metres_as_on_the_ellipsoid() {
 }
 
 fn network(path: &str) -> Rndf {
-    // One of them holds Latin-1.
+    // One of the files contains Latin-1.
     Rndf::read(&String::from_utf8_lossy(&std::fs::read(common::data(path)).unwrap()))
 }
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn the_lanes_of_real_networks_are_read_whole() {
-    // Lanes, those with a width, waypoints.
+    // Number of lanes, of lanes with a width, and of waypoints.
     let whole = |path: &str| {
         let rndf = network(path);
         assert_eq!(rndf.refused, [], "{path}");
@@ -189,12 +189,12 @@ fn the_lanes_of_real_networks_are_read_whole() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn a_vehicle_on_a_real_lane_has_that_lane_painted_as_wide_as_the_file_says() {
+fn a_real_lane_is_painted_with_the_width_of_its_file() {
     use clearway_mapping::config::{Bonus, SpeedConfig};
-    use clearway_mapping::layer::{Context, LayerMaker};
-    use clearway_mapping::road::StoredRoad;
     use clearway_mapping::layer::speed::Speed;
     use clearway_mapping::layer::speed::class::SpeedClass;
+    use clearway_mapping::layer::{Context, LayerMaker};
+    use clearway_mapping::road::StoredRoad;
 
     let mut sweep = common::empty(clearway_lidar::model::Model::Hdl64eS2);
     for ix in -240..240 {
@@ -209,22 +209,22 @@ fn a_vehicle_on_a_real_lane_has_that_lane_painted_as_wide_as_the_file_says() {
     let mut layer = map.layer();
     for lane in &rndf.lanes {
         let road = lane.road(&frame, None, 0).unwrap();
-        // Half-way along the lane's first pair of waypoints, heading along it.
+        // The vehicle is half-way between the first two waypoints of the lane and heads along it.
         let ([ax, ay], [bx, by]) = (road.points[0], road.points[1]);
         let pose = nalgebra::Isometry3::new(
             nalgebra::vector![(ax + bx) / 2.0, (ay + by) / 2.0, 200.0],
             nalgebra::vector![0.0, 0.0, (by - ay).atan2(bx - ax)],
         );
-        let taken = StoredRoad { road, map_from_ego: None };
-        let context = Context { road: Some(&taken), map_from_ego: Some(pose), ..Context::default() };
+        let stored = StoredRoad { road, map_from_ego: None };
+        let context = Context { road: Some(&stored), map_from_ego: Some(pose), ..Context::default() };
         map.make(&sweep, &context, &mut layer);
         let (rows, columns) = common::size(&layer);
-        let across: Vec<usize> =
-            (0..rows).filter(|iy| common::classes(&layer)[iy * columns + columns / 2] == SpeedClass::Road.value()).collect();
+        let across: Vec<usize> = (0..rows)
+            .filter(|iy| common::classes(&layer)[iy * columns + columns / 2] == SpeedClass::Road.value())
+            .collect();
         let painted_m = across.len() as f64 * 0.25;
         let width_m = lane.width_m.unwrap();
-        // Where the lane bends at the next waypoint, its edge points lie nearer to the pair's own line; a cell each
-        // way.
+        // The tolerance is a cell on each side, and more inwards: a bend at the next waypoint narrows the painted lane.
         assert!(
             (0.85 * width_m - 0.25..=width_m + 0.25).contains(&painted_m),
             "lane {}: {painted_m} m of {width_m} m",

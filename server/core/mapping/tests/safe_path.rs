@@ -6,13 +6,13 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::{DrivabilityConfig, SafePathConfig};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
-use clearway_mapping::layer::{Context, Layer, LayerMaker};
-use clearway_mapping::layer::safe_path::distance::Distances;
-use clearway_mapping::layer::safe_path::free::State;
-use clearway_mapping::layer::safe_path::links::Links;
-use clearway_mapping::layer::safe_path::ridge::{Point, Ridge};
 use clearway_mapping::layer::safe_path::SafePath;
 use clearway_mapping::layer::safe_path::class::SafePathClass;
+use clearway_mapping::layer::safe_path::distance::Distances;
+use clearway_mapping::layer::safe_path::free_space::State;
+use clearway_mapping::layer::safe_path::links::Links;
+use clearway_mapping::layer::safe_path::medial_axis::{MedialAxis, Point};
+use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
 use proptest::prelude::*;
@@ -24,14 +24,14 @@ const PATH: u8 = SafePathClass::Path.value();
 const NOT_SEEN: u8 = DrivabilityClass::Unknown.value();
 const DRIVABLE: u8 = DrivabilityClass::Drivable.value();
 
-/// Ridge and links of a grid.
-fn paths(side: usize, states: &[State], width_cells: f64) -> (Ridge, Links) {
+/// MedialAxis and links of a grid.
+fn paths(side: usize, states: &[State], width_cells: f64) -> (MedialAxis, Links) {
     let mut distances = Distances::new(side);
-    distances.measure(states);
-    let (mut ridge, mut links) = (Ridge::new(side), Links::default());
-    ridge.find(states, &distances, width_cells);
-    links.link(&ridge, states, &distances, width_cells, side as f64);
-    (ridge, links)
+    distances.compute(states);
+    let (mut axis, mut links) = (MedialAxis::new(side), Links::default());
+    axis.find(states, &distances, width_cells);
+    links.link(&axis, states, &distances, width_cells, side as f64);
+    (axis, links)
 }
 
 fn closed(side: usize, states: &[State]) -> Vec<[i32; 2]> {
@@ -39,9 +39,9 @@ fn closed(side: usize, states: &[State]) -> Vec<[i32; 2]> {
     cells.map(|cell| [(cell % side) as i32, (cell / side) as i32]).collect()
 }
 
-/// Squared distance from a place to a cell's square, half cells.
-fn to_square(place: [i32; 2], cell: [i32; 2]) -> i32 {
-    let along = |i: usize| ((place[i] - 2 * cell[i]).abs() - 1).max(0);
+/// Squared distance from a position to the square of a cell, in half cells.
+fn to_square(position: [i32; 2], cell: [i32; 2]) -> i32 {
+    let along = |i: usize| ((position[i] - 2 * cell[i]).abs() - 1).max(0);
     along(0) * along(0) + along(1) * along(1)
 }
 
@@ -71,7 +71,7 @@ fn a_gate_exactly_as_wide_as_the_vehicle_is_a_way_through_and_a_narrower_one_is_
             {
                 let states = court_with_gate(side, gate_from, gate, across_x);
                 let (_, links) = paths(side, &states, width as f64);
-                let beyond = |point: &&Point| point.place[usize::from(!across_x)] > 2 * (side as i32 / 2 + 13);
+                let beyond = |point: &&Point| point.position[usize::from(!across_x)] > 2 * (side as i32 / 2 + 13);
                 let through = links.points().iter().any(|point| beyond(&point));
                 assert!(links.points().len() > 20, "there are paths on the vehicle's side");
                 assert_eq!(through, gate >= width, "vehicle {width}, gate {gate} from {gate_from}, x {across_x}");
@@ -93,7 +93,7 @@ fn a_corridor_has_its_middle_line_with_half_its_width_as_radius() {
         for point in line {
             assert_eq!(point.clearance_squared, (free * free) as i32);
             // The middle of 7 cells is a cell's, that of 8 lies between two.
-            assert_eq!(point.place[1], 2 * 26 + free as i32 - 1);
+            assert_eq!(point.position[1], 2 * 26 + free as i32 - 1);
         }
     }
 }
@@ -101,8 +101,8 @@ fn a_corridor_has_its_middle_line_with_half_its_width_as_radius() {
 #[test]
 fn open_ground_has_no_safe_points_and_closed_ground_neither() {
     for state in [State::Drivable, State::Obstacle, State::Unknown, State::Blind] {
-        let (ridge, links) = paths(20, &[state; 400], 4.0);
-        assert_eq!((ridge.points().len(), links.points().len()), (0, 0));
+        let (axis, links) = paths(20, &[state; 400], 4.0);
+        assert_eq!((axis.points().len(), links.points().len()), (0, 0));
     }
 }
 
@@ -132,7 +132,7 @@ proptest! {
     #[test]
     fn every_cells_nearest_obstacle_is_the_nearest((side, states) in worlds()) {
         let mut distances = Distances::new(side);
-        distances.measure(&states);
+        distances.compute(&states);
         let closed = closed(side, &states);
         for cell in 0..side * side {
             let [x, y] = [(cell % side) as i32, (cell / side) as i32];
@@ -146,16 +146,16 @@ proptest! {
     fn safe_points_lie_on_drivable_ground_as_far_from_two_obstacles_with_exact_radii(
         (side, states) in worlds(), width in 2f64..9.0,
     ) {
-        let (ridge, links) = paths(side, &states, width);
+        let (axis, links) = paths(side, &states, width);
         let closed = closed(side, &states);
-        for point in ridge.points() {
+        for point in axis.points() {
             prop_assert_eq!(states[point.cell], State::Drivable);
-            let exact = closed.iter().map(|cell| to_square(point.place, *cell)).min();
+            let exact = closed.iter().map(|cell| to_square(point.position, *cell)).min();
             prop_assert_eq!(Some(point.clearance_squared), exact, "{:?}", point);
             prop_assert!(f64::from(point.clearance_squared).sqrt() >= width, "{:?}", point);
             // Two obstacles the vehicle fits between, as far away within a cell, from middle to middle.
             let away = |cell: &[i32; 2]| {
-                f64::from(point.place[0] - 2 * cell[0]).hypot(f64::from(point.place[1] - 2 * cell[1])) / 2.0
+                f64::from(point.position[0] - 2 * cell[0]).hypot(f64::from(point.position[1] - 2 * cell[1])) / 2.0
             };
             let nearest = closed.iter().map(away).fold(f64::INFINITY, f64::min);
             let near: Vec<_> = closed.iter().filter(|cell| away(cell) <= nearest + 1.0 + 1e-9).collect();
@@ -163,7 +163,7 @@ proptest! {
             prop_assert!(near.iter().any(|a| near.iter().any(|b| apart(a, b) >= width)), "{:?}", point);
         }
         // Lines one cell wide: no two by two cells of them, but where four lines meet, one at each cell.
-        let held = |[ix, iy]: [i32; 2]| ridge.point_in(ix, iy).is_some();
+        let held = |[ix, iy]: [i32; 2]| axis.point_in(ix, iy).is_some();
         for [ix, iy] in (0..side as i32 - 1).flat_map(|iy| (0..side as i32 - 1).map(move |ix| [ix, iy])) {
             let block = [[ix, iy], [ix + 1, iy], [ix, iy + 1], [ix + 1, iy + 1]];
             let around = |[x, y]: [i32; 2]| (y - 1..=y + 1).flat_map(move |y| (x - 1..=x + 1).map(move |x| [x, y]));
@@ -177,12 +177,12 @@ proptest! {
             for &link in &point.links {
                 prop_assert!((link as usize) < index);
                 let other = &links.points()[link as usize];
-                let apart = [0, 1].map(|i| (point.place[i] - other.place[i]).abs());
+                let apart = [0, 1].map(|i| (point.position[i] - other.position[i]).abs());
                 prop_assert!(link == 0 || apart.iter().all(|half_cells| *half_cells <= 4), "{:?} {:?}", point, other);
             }
         }
         let reached = links.points().len().saturating_sub(1);
-        prop_assert_eq!(reached + links.not_reached(), ridge.points().len());
+        prop_assert_eq!(reached + links.not_reached(), axis.points().len());
     }
 }
 

@@ -14,8 +14,8 @@ use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
 use clearway_mapping::layer::height_difference::HeightDifference;
 use clearway_mapping::layer::height_difference::class::HeightDifferenceClass;
-use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::layer::radial_grid::RadialGrid;
+use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::ground::{Ground, Profile};
 use clearway_sim::scanner::ScannerConfig;
@@ -176,7 +176,8 @@ fn the_baseline_fails_where_the_thesis_says_it_fails() {
     let share = |layer: &Layer, class: u8| {
         road.iter().filter(|cell| classes(layer)[**cell] == class).count() as f64 / road.len() as f64
     };
-    let (ours, theirs) = (share(&ours, DrivabilityClass::Drivable.value()), share(&theirs, HeightDifferenceClass::Drivable.value()));
+    let (ours, theirs) =
+        (share(&ours, DrivabilityClass::Drivable.value()), share(&theirs, HeightDifferenceClass::Drivable.value()));
     println!("upward slope, {} cells: drivability calls {ours:.3} drivable, height_difference {theirs:.3}", road.len());
     assert!(ours > 0.95 && theirs < 0.8);
 

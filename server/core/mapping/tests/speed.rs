@@ -5,11 +5,11 @@ mod common;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Bonus, SpeedConfig};
 use clearway_mapping::event::{Road, RoadFrame, RoadPurpose};
+use clearway_mapping::layer::speed::class::{SPEED_SCALE_MPS, SpeedClass};
+use clearway_mapping::layer::speed::painting::{NO_ROAD, Painter, edge_points};
+use clearway_mapping::layer::speed::{Speed, painting_conditions};
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::road::{self, StoredRoad};
-use clearway_mapping::layer::speed::painting::{NO_ROAD, Painter, edge_points};
-use clearway_mapping::layer::speed::class::{SPEED_SCALE_MPS, SpeedClass};
-use clearway_mapping::layer::speed::{Speed, gates};
 use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
 use proptest::prelude::*;
@@ -223,10 +223,10 @@ fn painting_stops_the_moment_the_orientations_are_random_and_says_so() {
         assert_eq!(figure(&layer, "stopped_by_curvature"), 0.0);
         assert_eq!(classes(&layer).contains(&ROAD), painting == 1.0);
     }
-    assert_eq!(gates::divergence(&[1.0; 8]), Some(0.0));
-    let one = gates::divergence(&[0.0, 5.0, 0.0, 0.0]).unwrap();
+    assert_eq!(painting_conditions::divergence(&[1.0; 8]), Some(0.0));
+    let one = painting_conditions::divergence(&[0.0, 5.0, 0.0, 0.0]).unwrap();
     assert!((one - 4f64.ln()).abs() < 1e-12, "{one}");
-    assert_eq!(gates::divergence(&[]), None);
+    assert_eq!(painting_conditions::divergence(&[]), None);
 }
 
 #[test]
@@ -261,11 +261,11 @@ fn the_curvature_of_a_circle_is_one_over_its_radius_however_dense_its_points() {
                 .map(|i| [radius * angle(i).sin(), radius * (1.0 - angle(i).cos())])
                 .filter(|[_, y]| *y < 1.9 * radius)
                 .collect();
-            let curvature = gates::curvature_ahead_per_m(&points, 30.0);
+            let curvature = painting_conditions::curvature_ahead_per_m(&points, 30.0);
             assert!((curvature * radius - 1.0).abs() < 0.05, "{radius} m, {step_m} m: {curvature}");
         }
     }
-    assert_eq!(gates::curvature_ahead_per_m(&[[-5.0, 0.0], [200.0, 0.0]], 30.0), 0.0);
+    assert_eq!(painting_conditions::curvature_ahead_per_m(&[[-5.0, 0.0], [200.0, 0.0]], 30.0), 0.0);
 }
 
 #[test]

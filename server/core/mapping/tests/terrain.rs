@@ -5,12 +5,12 @@
 mod common;
 
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{Form, TerrainConfig};
+use clearway_mapping::config::{TerrainConfig, Variant};
+use clearway_mapping::layer::terrain::Terrain;
+use clearway_mapping::layer::terrain::class::{ROUGHNESS, Shape, TerrainClass};
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::sensor::distance_series::DistanceSeries;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
-use clearway_mapping::layer::terrain::Terrain;
-use clearway_mapping::layer::terrain::class::{ROUGHNESS, Shape, TerrainClass};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::{self, Scene};
 use clearway_sim::truth::Truth;
@@ -31,8 +31,8 @@ fn terrain(sweep: &Sweep, config: &TerrainConfig) -> Layer {
     layer
 }
 
-fn form(form: Form) -> TerrainConfig {
-    TerrainConfig { form, ..TerrainConfig::default() }
+fn form(form: Variant) -> TerrainConfig {
+    TerrainConfig { variant: form, ..TerrainConfig::default() }
 }
 
 /// Cells by class, in the order of the legend.
@@ -63,7 +63,7 @@ fn against_the_labels(config: &TerrainConfig) -> [f64; 2] {
     let seen_flat: Vec<bool> = classes(&layer).iter().map(|class| *class == FLAT).collect();
     println!(
         "{:?}: of flat cells free of obstacles {:.3} % ({leaks} are not), of those seen {:.3} %; of road flat {:.2} %; cells {:?}",
-        config.form,
+        config.variant,
         100.0 * free,
         100.0 * share(&seen_flat, |cell| !truth.obstacle[cell]),
         100.0 * road,
@@ -75,9 +75,9 @@ fn against_the_labels(config: &TerrainConfig) -> [f64; 2] {
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn the_labelled_frame_reaches_its_targets_beside_the_paper_and_the_plain_grid() {
-    let [grid_free, grid_road] = against_the_labels(&form(Form::Grid));
-    let [paper_free, paper_road] = against_the_labels(&form(Form::Paper));
-    let [free, road] = against_the_labels(&form(Form::Grounded));
+    let [grid_free, grid_road] = against_the_labels(&form(Variant::Grid));
+    let [paper_free, paper_road] = against_the_labels(&form(Variant::Paper));
+    let [free, road] = against_the_labels(&form(Variant::Grounded));
     assert!(free >= 0.998, "{free}");
     assert!(road >= 0.99, "{road}");
     // What the paper's hierarchy is for, and what it lets through.
@@ -115,7 +115,8 @@ fn holes(grid: &Layer) -> Vec<usize> {
 fn merging_closes_the_holes_of_the_plain_grid_on_real_scans() {
     for number in 0..3 {
         let sweep = kitti_sweep(&format!("kitti/patchwork-plusplus/00000{number}.bin"));
-        let [grid, paper, grounded] = [Form::Grid, Form::Paper, Form::Grounded].map(|f| terrain(&sweep, &form(f)));
+        let [grid, paper, grounded] =
+            [Variant::Grid, Variant::Paper, Variant::Grounded].map(|f| terrain(&sweep, &form(f)));
         let holes = holes(&grid);
         let closed = |layer: &Layer| {
             let closed = holes.iter().filter(|cell| is_drivable(classes(layer)[**cell])).count();
@@ -144,10 +145,13 @@ fn a_town_and_an_open_plain_fit_a_message_of_64_kib() {
 
 #[test]
 fn an_evenly_sloping_plane_is_flat() {
-    for (grade, forms) in [(0.15, &[Form::Grounded, Form::Paper, Form::Grid][..]), (0.5, &[Form::Paper, Form::Grid])] {
+    for (grade, forms) in
+        [(0.15, &[Variant::Grounded, Variant::Paper, Variant::Grid][..]), (0.5, &[Variant::Paper, Variant::Grid])]
+    {
         let sweep = cast(Model::Hdl64eS2, |x, y, z| z <= grade * (0.8 * x + 0.6 * y));
         for &form in forms {
-            let layer = terrain(&sweep, &TerrainConfig { form, overhang_m: 100.0, ..TerrainConfig::default() });
+            let layer =
+                terrain(&sweep, &TerrainConfig { variant: form, overhang_m: 100.0, ..TerrainConfig::default() });
             let [_, flat, _, elevated, obstacle] = counts(&layer)[..] else { unreachable!() };
             println!("{grade} {form:?}: {flat} flat, {elevated} elevated, {obstacle} obstacles");
             assert!(flat > 1000 && elevated == 0 && obstacle == 0, "{form:?} {grade}");
@@ -170,8 +174,8 @@ fn a_roof_is_flat_to_the_paper_and_elevated_to_the_grounded_form() {
         cells.for_each(|(x, y)| seen[usize::from(classes(layer)[cell_at(layer, x, y).unwrap()])] += 1);
         seen
     };
-    let paper = top(&terrain(&sweep, &form(Form::Paper)));
-    let grounded = top(&terrain(&sweep, &form(Form::Grounded)));
+    let paper = top(&terrain(&sweep, &form(Variant::Paper)));
+    let grounded = top(&terrain(&sweep, &form(Variant::Grounded)));
     println!("on top: paper {paper:?}, grounded {grounded:?}");
     assert!(paper[usize::from(FLAT)] > 20 && paper[usize::from(FLAT_INFERRED)] > 20);
     assert!(grounded[usize::from(FLAT_ELEVATED)] > 20);
@@ -191,12 +195,12 @@ fn nothing_is_inferred_beyond_the_last_point_or_across_a_wide_hole() {
         }
     }
     let at = |layer: &Layer, x: f32, y: f32| class_name(layer, cell_at(layer, x, y).unwrap());
-    let grounded = terrain(&sweep, &form(Form::Grounded));
+    let grounded = terrain(&sweep, &form(Variant::Grounded));
     assert_eq!(at(&grounded, 6.1, 0.1), "flat");
     assert_eq!(at(&grounded, 17.1, 0.1), "flat");
     for (x, y) in [(12.1, 0.1), (6.1, 8.1), (-6.1, 0.1), (40.0, 40.0)] {
         assert_eq!(at(&grounded, x, y), "unknown", "{x} {y}");
-        assert_eq!(at(&terrain(&sweep, &form(Form::Paper)), x, y), "flat_inferred", "{x} {y}");
+        assert_eq!(at(&terrain(&sweep, &form(Variant::Paper)), x, y), "flat_inferred", "{x} {y}");
     }
     let wide = TerrainConfig { inference_m_max: 5.0, ..TerrainConfig::default() };
     assert_eq!(at(&terrain(&sweep, &wide), 12.1, 0.1), "flat_inferred");
@@ -213,7 +217,7 @@ fn the_plain_grid_tells_scatter_line_and_plane_apart() {
         add(&mut sweep, [15.02 + quarter(k), 5.02 + quarter(k / 4), quarter(k / 16)]);
     }
     add(&mut sweep, [20.1, 5.1, 0.0]);
-    let layer = terrain(&sweep, &form(Form::Grid));
+    let layer = terrain(&sweep, &form(Variant::Grid));
     let shape = |x: f32| values(&layer, "shape")[cell_at(&layer, x, 5.1).unwrap()];
     let found = [5.1, 10.1, 15.1, 20.1].map(shape);
     assert_eq!(found, [Shape::Plane, Shape::Line, Shape::Scatter, Shape::Unknown].map(|shape| shape as i32));
@@ -295,7 +299,7 @@ fn no_flat_cell_of_the_simulated_worlds_holds_an_object() {
         let turn = SimulatedVehicle::new(scene, config).turn(1);
         let mut sweep = Sweep::default();
         sweep.set_revolution(&turn.revolution, &mount);
-        let [wrong, flat, found] = [Form::Grid, Form::Paper, Form::Grounded].map(|f| {
+        let [wrong, flat, found] = [Variant::Grid, Variant::Paper, Variant::Grounded].map(|f| {
             let layer = terrain(&sweep, &form(f));
             let mut high = vec![false; classes(&layer).len()];
             let mut free = vec![false; classes(&layer).len()];
@@ -347,7 +351,7 @@ fn ground_behind_a_closed_fence_or_a_low_beam_is_flat_but_not_reached() {
         // A cell of the fence's own line may hold ground of both sides.
         assert!(reached <= 10 && behind >= behind_min, "{name}: {reached} {behind}");
         // The paper's form knows no gate.
-        let open = terrain(&sweep, &TerrainConfig { form: Form::Paper, ..TerrainConfig::default() });
+        let open = terrain(&sweep, &TerrainConfig { variant: Variant::Paper, ..TerrainConfig::default() });
         assert!(!classes(&open).contains(&FLAT_UNREACHABLE));
     }
 }

@@ -12,7 +12,7 @@ use clearway_sim::send::{Pace, Sent, Until, drive};
 
 use super::DemoError;
 use super::rig::{Rig, Told};
-use crate::ingest::now_ns;
+use crate::clock::now_ns;
 
 /// A car that drives until it is stopped.
 pub struct Car {

@@ -16,7 +16,7 @@ use serde_json::{Value, json};
 use tokio::time::MissedTickBehavior;
 
 use crate::config::{Config, Sender, Udp};
-use crate::ingest::now_ns;
+use crate::clock::now_ns;
 use crate::server::{Running, Server, Setup, StartError};
 use crate::status::Snapshot;
 use crate::encode::EncodedMap;
@@ -25,6 +25,7 @@ use car::Car;
 use rig::Rig;
 
 pub mod car;
+pub mod command;
 pub mod rig;
 
 /// The last datagrams are through the sockets long before this.
@@ -81,7 +82,7 @@ pub enum DemoError {
     Start(#[from] StartError),
     /// The server did not end as it should have.
     #[error(transparent)]
-    End(#[from] crate::server::EndError),
+    End(#[from] crate::server::ShutdownError),
     /// The picture could not be drawn.
     #[error("picture {}: {reason}", file.display())]
     Picture {
@@ -174,7 +175,7 @@ pub async fn demo(
         picture: options.picture.clone(),
         notes,
     });
-    let doors = running.doors[0].udp.unwrap_or((nowhere, nowhere));
+    let doors = running.inputs[0].udp.unwrap_or((nowhere, nowhere));
     // Last of all, so that the vehicle's first firing is now.
     let car = Car::start(vehicle(&options, now_ns()), doors, running.grpc.unwrap_or(nowhere))?;
 

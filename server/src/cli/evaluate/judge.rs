@@ -1,142 +1,142 @@
-//! A map's layer against points whose truth is known: counts that add up over frames, and the shares they make.
+//! A layer of a map, and points whose truth is known -> counts that can be summed over frames, and precision and recall.
 //!
-//! In: a [`Layer`] and [`Point`]s, both in the ego frame of one stamp. Out: a [`Tally`]. Pure: where the truth comes
-//! from (labels, a simulated world) is not known here.
+//! In: a [`Layer`] and [`Point`]s, both in the ego frame of one stamp. Out: a [`Tally`]. This file does not depend on
+//! where the truth comes from (labels or a simulated world).
 //!
-//! A cell's truth is voted by the points in it, those higher than 2.5 m over the ground left out: an obstacle's point
-//! makes it an obstacle; else the most frequent of forbidden, either and drivable wins; a tie goes to the former.
-//! Precision is the share of the cells called drivable, and seen by a point, that are neither obstacle nor forbidden;
-//! recall the share of the drivable cells that are called so. A point is called ground where its cell is called
-//! drivable and it lies at most [`GROUND_OVER_LOWEST_M`] over the cell's lowest point; points beyond the layer's grid
-//! are not scored.
+//! The points in a cell vote for its truth; points more than 2.5 m above the ground do not vote. A point of an obstacle
+//! makes the cell an obstacle. Otherwise the most frequent of forbidden, either and drivable wins, and in a tie the one
+//! named first here. Precision is the share of the cells called drivable, and seen by a point, that are neither obstacle
+//! nor forbidden. Recall is the share of the drivable cells that are called drivable. A point is called ground if its
+//! cell is called drivable and it lies at most [`GROUND_OVER_LOWEST_M`] above the cell's lowest point. Points outside
+//! the layer's grid are not scored.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use clearway_mapping::layer::{Cells, ClassInfo, Geometry, Layer, Meaning};
 use clearway_mapping::layer::radial_grid::RadialGrid;
 
-/// From here on a thing over the ground is an obstacle.
+/// Least height of an obstacle above the ground, in metres.
 pub const OBSTACLE_M_MIN: f32 = 0.3;
-/// Higher things are passed under.
+/// Greatest height of an obstacle above the ground, in metres; a vehicle passes under higher things.
 pub const OBSTACLE_M_MAX: f32 = 2.5;
-/// A point higher over its cell's lowest is not ground.
+/// Greatest height of a ground point above the lowest point of its cell, in metres.
 pub const GROUND_OVER_LOWEST_M: f32 = 0.3;
 
-/// What a point says of its cell.
+/// The vote of a point for the truth of its cell.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Vote {
-    /// Nothing: too high, or nobody knows what it is.
+    /// No vote: the point is too high, or its class is not known.
     Nothing,
-    /// Somebody looked here; what the ground is stays open.
+    /// The cell was seen; the point does not decide what its ground is.
     Seen,
-    /// Ground no vehicle may be sent to: too steep, or behind something closed.
+    /// Ground where no vehicle may drive: too steep, or not reachable.
     Forbidden,
-    /// Ground of which either answer can be defended.
+    /// Ground for which both answers count as correct.
     Either,
-    /// Ground that can be driven to.
+    /// Ground that a vehicle can reach and drive on.
     Drivable,
-    /// Something stands here.
+    /// An obstacle.
     Obstacle,
 }
 
-/// Whether a point is ground, as one protocol scores it.
+/// True class of a point (ground or not), as one protocol scores it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scored {
-    /// It is.
+    /// The point is ground.
     Ground,
-    /// It is not.
+    /// The point is not ground.
     Other,
-    /// It does not count.
+    /// The protocol does not score the point.
     Not,
 }
 
-/// One point and its truth.
+/// A point and its truth.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
-    /// Ego frame, metres.
+    /// Position in the ego frame, in metres.
     pub place: [f32; 3],
-    /// What it is, where it leaks: `car`, `unreachable`, …
+    /// Name of its class, under which its leaks are counted: `car`, `unreachable`, ...
     pub class: &'static str,
-    /// What it says of its cell.
+    /// Its vote for the truth of its cell.
     pub vote: Vote,
-    /// Road or lane marking.
+    /// True if it is on a road or a lane marking.
     pub road: bool,
-    /// By [`super::report::PROTOCOLS`].
+    /// Its true class, by the protocols of [`super::report::PROTOCOLS`] in their order.
     pub ground: [Scored; 2],
 }
 
-/// Right, wrong and missed.
+/// Counts of correct and wrong answers to one yes-or-no question.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Confusion {
-    /// Called so, and so.
+    /// Number of true positives.
     pub right: u64,
-    /// Called so, and not so.
+    /// Number of false positives.
     pub wrong: u64,
-    /// So, and not called so.
+    /// Number of false negatives.
     pub missed: u64,
 }
 
-/// Counts of one layer over any number of frames.
+/// Counts of one layer, summed over frames.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Tally {
-    /// Layers judged.
+    /// Number of frames judged.
     pub frames: u64,
-    /// Cells called drivable and seen.
+    /// Number of cells called drivable that a point has seen.
     pub called: u64,
-    /// Of these, cells that are obstacle or forbidden.
+    /// Number of cells called drivable that are obstacle or forbidden.
     pub called_wrongly: u64,
-    /// Of these, cells with an obstacle's point.
+    /// Number of cells called drivable that have a point of an obstacle.
     pub leaking: u64,
-    /// Drivable cells, and those of them called so.
+    /// Number of drivable cells, and of those among them that are called drivable.
     pub drivable: (u64, u64),
-    /// Cells of road without obstacle, and those of them called drivable.
+    /// Number of road cells without obstacle, and of those among them that are called drivable.
     pub road: (u64, u64),
-    /// Cells called drivable that hold a point of a class that forbids it, by class.
+    /// Number of cells called drivable that have a point of an obstacle or of forbidden ground, by class of the point.
     pub leaks: BTreeMap<&'static str, u64>,
-    /// Ground points, by protocol.
+    /// Counts of ground points, by protocol.
     pub points: [Confusion; 2],
 }
 
 impl Confusion {
-    /// Of what was called so, what is so; `None` of nothing.
+    /// Precision = TP / (TP + FP); `None` without positives.
     pub fn precision(&self) -> Option<f64> {
         share(self.right, self.right + self.wrong)
     }
 
-    /// Of what is so, what was called so.
+    /// Recall = TP / (TP + FN); `None` if nothing is true.
     pub fn recall(&self) -> Option<f64> {
         share(self.right, self.right + self.missed)
     }
 
-    /// Harmonic mean of both.
+    /// F1 = harmonic mean of precision and recall; `None` without one of them.
     pub fn f1(&self) -> Option<f64> {
         f1(self.precision(), self.recall())
     }
 }
 
 impl Tally {
-    /// Of the cells called drivable, those that are neither obstacle nor forbidden.
+    /// Share of the cells called drivable that are neither obstacle nor forbidden; `None` if no cell is called drivable.
     pub fn precision(&self) -> Option<f64> {
         share(self.called - self.called_wrongly, self.called)
     }
 
-    /// Of the drivable cells, those called so.
+    /// Share of the drivable cells that are called drivable; `None` if no cell is drivable.
     pub fn recall(&self) -> Option<f64> {
         share(self.drivable.1, self.drivable.0)
     }
 
-    /// Harmonic mean of both.
+    /// F1 = harmonic mean of precision and recall; `None` without one of them.
     pub fn f1(&self) -> Option<f64> {
         f1(self.precision(), self.recall())
     }
 
-    /// Of the road's cells, those called drivable.
+    /// Share of the road cells that are called drivable; `None` without road cells.
     pub fn road_recall(&self) -> Option<f64> {
         share(self.road.1, self.road.0)
     }
 
-    /// Adds what `layer` does with the points of its frame; `false`, and nothing added, where none of its classes lets
-    /// a vehicle pass.
+    /// Adds the counts of `layer` against the points of its frame. Returns `false` and adds nothing if none of its
+    /// classes is free.
     pub fn add(&mut self, layer: &Layer, points: &[Point]) -> bool {
         let Some(called) = called(layer) else { return false };
         let cell_of = locate(&layer.geometry);
@@ -158,7 +158,7 @@ impl Tally {
                 confusion.wrong += u64::from(ground && scored == Scored::Other);
                 confusion.missed += u64::from(!ground && scored == Scored::Ground);
             }
-            // Forbidden ground leaks only where it is what the cell is; a thing that stands there always.
+            // Forbidden ground is a leak only if the cell is forbidden by vote; an obstacle always is one.
             let forbidden = point.vote == Vote::Forbidden && ballots[cell].verdict() == Some(Vote::Forbidden);
             if called[cell] && (point.vote == Vote::Obstacle || forbidden) {
                 leaking.insert((point.class, cell));
@@ -192,14 +192,15 @@ fn f1(precision: Option<f64>, recall: Option<f64>) -> Option<f64> {
     Some(if precision + recall > 0.0 { 2.0 * precision * recall / (precision + recall) } else { 0.0 })
 }
 
-/// What the points in one cell say.
+/// The votes of the points in one cell.
 #[derive(Clone, Copy, Debug)]
 struct Ballot {
     seen: bool,
     road: bool,
     obstacle: bool,
-    /// Forbidden, either, drivable.
+    /// Number of votes for forbidden, either and drivable.
     votes: [u32; 3],
+    /// z of the lowest point, in metres.
     lowest: f32,
 }
 
@@ -223,7 +224,7 @@ impl Ballot {
         }
     }
 
-    /// `None` where nobody voted.
+    /// The truth of the cell; `None` without votes.
     fn verdict(&self) -> Option<Vote> {
         let [forbidden, either, drivable] = self.votes;
         match () {
@@ -236,7 +237,7 @@ impl Ballot {
     }
 }
 
-/// Whether each cell is called drivable, be it by inference; `None` where the layer has no such class.
+/// For each cell, true if its class is free or inferred to be free; `None` if the layer has no such class.
 fn called(layer: &Layer) -> Option<Vec<bool>> {
     let passes = |class: &ClassInfo| matches!(class.meaning, Meaning::Free | Meaning::Inferred);
     let passes: Vec<bool> = layer.legend.iter().map(passes).collect();
@@ -252,7 +253,7 @@ fn called(layer: &Layer) -> Option<Vec<bool>> {
     })
 }
 
-/// Finds the cell of a place, ego frame, metres.
+/// A function that finds the cell of a position in the ego frame, in metres.
 fn locate(geometry: &Geometry) -> Box<dyn Fn([f32; 3]) -> Option<usize>> {
     match *geometry {
         Geometry::Radial { ref row_radius_m, columns } => {
@@ -316,9 +317,9 @@ mod tests {
     }
 
     #[test]
-    fn a_tiny_scene_gives_the_figures_counted_by_hand() {
+    fn a_tiny_scene_gets_the_counts_made_by_hand() {
         let points = [
-            // Cell 0: road, and grass nobody scores.
+            // Cell 0: road, and grass that is not scored.
             point(0.2, 0.0, "road", Vote::Drivable),
             point(0.4, 0.1, "vegetation", Vote::Seen),
             // Cell 1: road, and a person in it whose feet are near the ground.
@@ -327,18 +328,18 @@ mod tests {
             point(1.3, 1.1, "person", Vote::Obstacle),
             // Cell 2: road called obstacle.
             point(2.5, 0.0, "road", Vote::Drivable),
-            // Cell 3: terrain nobody judged, and a leaf high over it.
+            // Cell 3: terrain in a cell called unknown, and a leaf high above it.
             point(3.5, 0.0, "terrain", Vote::Drivable),
             point(3.5, 4.0, "vegetation", Vote::Nothing),
-            // Beyond the grid.
+            // Outside the grid.
             point(9.0, 0.0, "road", Vote::Drivable),
         ];
         let mut tally = Tally::default();
         assert!(tally.add(&layer(), &points));
         assert_eq!((tally.called, tally.called_wrongly, tally.leaking), (2, 1, 1));
         assert_eq!((tally.drivable, tally.road), ((3, 1), (2, 1)));
-        assert_eq!(tally.leaks, BTreeMap::from([("person", 1)]), "a cell leaks a class once");
-        // Both road points of called cells are ground; the person is too high for it; two ground points are missed.
+        assert_eq!(tally.leaks, BTreeMap::from([("person", 1)]), "a cell counts once for a class");
+        // Both road points of called cells are ground; the person is too high to be; two ground points are missed.
         assert_eq!(tally.points[0], Confusion { right: 2, wrong: 0, missed: 2 });
         assert_eq!(tally.points[1], Confusion::default());
         assert_eq!((tally.precision(), tally.recall(), tally.road_recall()), (Some(0.5), Some(1.0 / 3.0), Some(0.5)));
@@ -362,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn a_layer_without_a_passable_class_is_left_out() {
+    fn a_layer_without_a_free_class_is_left_out() {
         let mut tally = Tally::default();
         assert!(!tally.add(&Layer { legend: &[ClassInfo::UNKNOWN; 3], ..layer() }, &[]));
         assert_eq!(tally, Tally::default());

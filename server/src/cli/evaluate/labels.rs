@@ -1,9 +1,9 @@
 //! SemanticKITTI labels -> the truth about a scan's points.
 //!
-//! In: a `.label` file (u32 a point, the class in the lower 16 bits), the points in the ego frame. Out: [`Point`]s. An
-//! obstacle is a point of anything but ground, 0.3 to 2.5 m over the labelled ground about it; ground is drivable where
-//! it can be reached over cells without obstacles (1° by the sensor's rings, two empty rows bridged) from the blind
-//! zone.
+//! In: a `.label` file (one u32 a point, the class in the lower 16 bits), the points in the ego frame. Out: [`Point`]s.
+//! A point that is not ground is an obstacle if it is 0.3 to 2.5 m above the labelled ground around it. Ground is
+//! drivable if it can be reached from the blind zone over cells without obstacles. The cells are 1 degree wide and one
+//! sensor ring deep; up to two rows without points are bridged.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,7 +13,8 @@ use clearway_mapping::sensor::sweep::Sweep;
 
 use super::judge::{OBSTACLE_M_MAX, OBSTACLE_M_MIN, Point, Scored, Vote};
 
-/// Classes by number, as the data set's own list has them; what moves is named as what stands.
+/// Name of each class by its number, from SemanticKITTI's list (semantic-kitti.yaml). A moving class has the name of the
+/// same class at rest.
 const CLASSES: [(u32, &str); 34] = [
     (0, "unlabeled"),
     (1, "outlier"),
@@ -52,14 +53,17 @@ const CLASSES: [(u32, &str); 34] = [
 ];
 const VEGETATION: u32 = 70;
 
-/// Patchwork's low vegetation reaches down to three quarters of the sensor's height under the sensor (1.3 m on KITTI's
-/// car).
+/// Greatest height of low vegetation above the vehicle's ground, as a share of the sensor's height. From Patchwork: its
+/// low vegetation is 1.3 m or more below the sensor on KITTI's car, which is three quarters of the sensor's height.
 const LOW_VEGETATION: f32 = 0.25;
 
-/// The truth's own grid.
+/// Radius of the truth's grid, in metres.
 const RANGE_M_MAX: f32 = 60.0;
+/// Number of columns of the truth's grid.
 const COLUMNS: u16 = 360;
+/// Radius around the vehicle from which ground is reached, in metres.
 const BLIND_ZONE_M: f32 = 7.0;
+/// Number of rows without points over which ground is reached.
 const BRIDGE_ROWS: usize = 2;
 
 /// Why labels cannot be used.
@@ -68,41 +72,45 @@ pub enum LabelError {
     /// The file cannot be read.
     #[error("{}: {source}", file.display())]
     Read {
-        /// The labels.
+        /// File of the labels.
         file: PathBuf,
-        /// Why.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Labels of another scan.
-    #[error("{}: {labels} label(s) of 4 bytes and {bytes_over} byte(s) over for the {points} points of {}", file.display(), scan.display())]
+    /// The number of labels is not the number of points.
+    #[error(
+        "{}: {labels} label(s) of 4 bytes and {bytes_over} byte(s) over for the {points} points of {}",
+        file.display(), scan.display()
+    )]
     Count {
-        /// The labels.
+        /// File of the labels.
         file: PathBuf,
-        /// The scan.
+        /// File of the scan.
         scan: PathBuf,
-        /// Whole labels.
+        /// Number of whole labels.
         labels: usize,
-        /// Bytes after them.
+        /// Number of bytes after the last whole label.
         bytes_over: usize,
-        /// Points of the scan.
+        /// Number of points of the scan.
         points: usize,
     },
-    /// A class nobody knows.
+    /// A number that is no class of SemanticKITTI.
     #[error("{}: point {point} has class {class}: SemanticKITTI has none of that number", file.display())]
     Class {
-        /// The labels.
+        /// File of the labels.
         file: PathBuf,
-        /// Index from 0.
+        /// Index of the point, from 0.
         point: usize,
-        /// What was found.
+        /// The number found.
         class: u32,
     },
 }
 
-/// Reads the class of each of the `points` of `scan`.
+/// Reads the class of each of the `points` points of `scan`.
 ///
 /// # Errors
-/// [`LabelError`], which names the file.
+/// [`LabelError::Read`] if the file cannot be read, [`LabelError::Count`] if it has another number of labels,
+/// [`LabelError::Class`] if a label is no class.
 pub fn read(file: &Path, scan: &Path, points: usize) -> Result<Vec<u32>, LabelError> {
     let bytes = std::fs::read(file).map_err(|source| LabelError::Read { file: file.to_owned(), source })?;
     if bytes.len() != 4 * points {
@@ -127,7 +135,7 @@ fn is_ground(class: u32) -> bool {
     matches!(class, 40 | 44 | 48 | 49 | 60 | 72)
 }
 
-/// The truth about the points of a sweep, `classes[i]` being that of its point i.
+/// The truth about the points of a sweep; `classes[i]` is the class of point i.
 pub fn truth(sweep: &Sweep, classes: &[u32]) -> Vec<Point> {
     let places: Vec<[f32; 3]> = (0..sweep.x.len()).map(|i| [sweep.x[i], sweep.y[i], sweep.z[i]]).collect();
     let height = GroundHeight::new(places.iter().zip(classes));
@@ -152,7 +160,8 @@ pub fn truth(sweep: &Sweep, classes: &[u32]) -> Vec<Point> {
     points
 }
 
-/// As the protocols of [`super::report::PROTOCOLS`] score a class; `low` is Patchwork's height for vegetation.
+/// How the protocols of [`super::report::PROTOCOLS`] score a class; `low` is true if the point is low enough for
+/// Patchwork's low vegetation.
 fn scored(class: u32, low: bool) -> [Scored; 2] {
     match class {
         0 | 1 => [Scored::Not, Scored::Not],
@@ -162,7 +171,8 @@ fn scored(class: u32, low: bool) -> [Scored; 2] {
     }
 }
 
-/// Height of the labelled ground about a place: the median of a square of 2 m, or of the nearest squares that hold any.
+/// Height of the labelled ground around a position: the median of its square of 2 m, or of the nearest squares that have
+/// ground, in metres.
 struct GroundHeight(BTreeMap<(i32, i32), f32>);
 
 impl GroundHeight {
@@ -187,7 +197,7 @@ impl GroundHeight {
                 return median(medians);
             }
         }
-        // Nobody labelled ground within 8 m: the ground the vehicle stands on.
+        // No ground is labelled within 8 m: the ground under the vehicle is at 0.
         0.0
     }
 }
@@ -197,10 +207,10 @@ fn median(mut values: Vec<f32>) -> f32 {
     values[values.len() / 2]
 }
 
-/// Ground that can be reached is drivable.
+/// Turns the vote of each ground point that can be reached from [`Vote::Either`] to [`Vote::Drivable`].
 fn mark_reachable(sweep: &Sweep, points: &mut [Point]) {
     let mut grid = RadialGrid::default();
-    grid.follow(sweep, RANGE_M_MAX, COLUMNS);
+    grid.update_rows(sweep, RANGE_M_MAX, COLUMNS);
     let (rows, columns) = (grid.rows(), grid.columns());
     let (mut seen, mut ground, mut obstacle) =
         (vec![false; grid.cells()], vec![false; grid.cells()], vec![false; grid.cells()]);
@@ -243,7 +253,7 @@ mod tests {
     use clearway_lidar::calibration::Calibration;
     use clearway_lidar::model::Model;
 
-    /// Road all round within 12 m, a ring of fence at 12 m, road behind it.
+    /// Road in every direction out to 24 m, with a fence in a circle at 12 m.
     fn fenced() -> (Sweep, Vec<u32>) {
         let calibration = Some(std::sync::Arc::new(Calibration::factory(Model::Hdl64eS2)));
         let mut sweep = Sweep { calibration, mount_height_m: 1.73, ..Sweep::default() };
@@ -264,13 +274,13 @@ mod tests {
     }
 
     #[test]
-    fn ground_behind_a_closed_fence_is_not_drivable_and_the_fence_is_an_obstacle() {
+    fn a_closed_fence_is_an_obstacle_and_the_ground_behind_it_is_not_drivable() {
         let (sweep, classes) = fenced();
         for point in truth(&sweep, &classes) {
             let range = point.place[0].hypot(point.place[1]);
             match point.class {
                 "fence" => assert_eq!(point.vote, Vote::Obstacle),
-                "vegetation" => assert_eq!(point.vote, Vote::Nothing, "4 m over the road"),
+                "vegetation" => assert_eq!(point.vote, Vote::Nothing, "4 m above the road"),
                 _ if range < 11.0 => assert_eq!(point.vote, Vote::Drivable, "{range}"),
                 _ if range > 13.0 => assert_eq!(point.vote, Vote::Either, "{range}"),
                 _ => {}
@@ -279,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn the_protocols_differ_in_vegetation_alone() {
+    fn the_protocols_differ_only_in_vegetation() {
         assert_eq!(scored(72, false), [Scored::Ground; 2]);
         assert_eq!(scored(10, true), [Scored::Other; 2]);
         assert_eq!(scored(1, true), [Scored::Not; 2]);
@@ -288,7 +298,7 @@ mod tests {
     }
 
     #[test]
-    fn labels_that_do_not_fit_their_scan_are_named() {
+    fn labels_that_do_not_match_their_scan_are_refused_with_the_file() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("0.label");
         let read = |labels: &[u32], bytes_over: usize| {
@@ -297,7 +307,7 @@ mod tests {
             std::fs::write(&file, bytes).unwrap();
             super::read(&file, Path::new("0.bin"), 2)
         };
-        // The upper half numbers instances.
+        // The upper 16 bits number instances.
         assert_eq!(read(&[40, 0x0007_000a], 0).unwrap(), [40, 10]);
         assert!(read(&[40], 0).unwrap_err().to_string().contains("1 label(s) of 4 bytes and 0 byte(s) over for the 2"));
         assert!(read(&[40, 40], 3).unwrap_err().to_string().contains("and 3 byte(s) over"));
@@ -306,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn the_list_of_classes_is_in_order() {
+    fn the_list_of_classes_is_sorted_for_the_binary_search() {
         assert!(CLASSES.is_sorted_by(|a, b| a.0 < b.0));
     }
 }

@@ -1,7 +1,7 @@
 //! `clearway evaluate`: every map against the truth, of labelled scans and of simulated scenes.
 //!
-//! In: SemanticKITTI-style folders or files, or `sim:NAME`. Out: a [`Report`]. The scans and datagrams go through the
-//! real [`Pipeline`]; what its maps say is judged point by point and cell by cell.
+//! In: folders or files as SemanticKITTI has them, or `sim:NAME`. Out: a [`Report`]. The scans and datagrams go through
+//! the same [`Pipeline`] as live data; its maps are judged point by point and cell by cell.
 //!
 //! | file | in -> out |
 //! |---|---|
@@ -11,16 +11,21 @@
 //! | [`judge`] | a layer and points of known truth -> counts |
 //! | [`report`] | counts -> table, JSON |
 
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
+use clap::Args;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig};
-use clearway_mapping::event::{Body, Event, Scan};
-use clearway_mapping::sensor::mount::{MountError, estimate};
 use clearway_mapping::error::EventError;
+use clearway_mapping::event::{Body, Event, Scan};
 use clearway_mapping::pipeline::Pipeline;
+use clearway_mapping::sensor::mount::{MountError, estimate};
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
+use indicatif::ProgressBar;
 
+use super::configuration::extrinsics;
+use super::output::{print, print_line};
 use crate::config::{Config, ConfigError};
 use crate::ingest::files::kitti::{self, ScanError};
 
@@ -28,40 +33,58 @@ pub mod judge;
 pub mod labels;
 pub mod pairs;
 pub mod report;
+#[cfg(feature = "sim")]
 pub mod worlds;
 
 use judge::{Point, Tally};
 use pairs::Pair;
 use report::{Report, Source};
 
-/// How the sensor sits on KITTI's car, as its makers publish it. Published figures were measured with it, and an
-/// estimate from one scan leans with the road under it.
+/// How the sensor is mounted on KITTI's car, from KITTI's published sensor setup. The published metrics of other methods
+/// use it, and an estimate from one scan tilts with the road under it.
 const KITTI_EXTRINSICS: Extrinsics =
     Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.73, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
-/// A sensor that stands so much higher or lower over the ground it sees is another car's.
+/// Largest difference between the estimated height of the sensor and KITTI's, in metres; beyond it the scans are from
+/// another car. Ours.
 const MOUNT_M_OFF_MAX: f64 = 0.3;
-/// Scans that are asked for the ground under them.
+/// Number of scans from which the height of the sensor is estimated.
 const MOUNT_SCANS: usize = 10;
 
-/// What to evaluate, and how.
-#[derive(Clone, Debug, Default)]
+/// Judge every map against labelled scans (.bin and .label as SemanticKITTI has them) or simulated scenes.
+///
+/// Prints, for each map, precision, recall and F1 of the drivable cells and of the ground points, and the leaks: cells
+/// called drivable with a car, person, pole or fence in them.
+#[derive(Args, Clone, Debug, Default)]
+#[command(after_help = "Examples:
+  clearway evaluate sequences/00
+  clearway evaluate sim:town --json
+  clearway evaluate scans --extrinsics 0,0,1.9,0,0,0 --config car.toml")]
 pub struct Options {
-    /// Folders, files, or `sim:NAME`.
+    /// Folders with .bin and .label files of the same names, or sim:flat, sim:slopes, sim:canopy, sim:overhang,
+    /// sim:town.
+    #[arg(required = true, value_name = "PATH")]
     pub paths: Vec<String>,
-    /// Columns of the radial maps, in degrees: 1, 2 or 4; the configuration's where absent.
+    /// Print one JSON object.
+    #[arg(long)]
+    pub json: bool,
+    /// Width of a column of the radial maps, in degrees; the configuration's if absent.
+    #[arg(long = "columns", value_name = "1|2|4", value_parser = columns_deg)]
     pub columns_deg: Option<u16>,
-    /// How the scans' sensor is mounted; as on KITTI's car where absent.
+    /// Position and orientation of the sensor in the ego frame, in metres and degrees; as on KITTI's car if absent.
+    #[arg(long, value_name = "x,y,z,roll,pitch,yaw", value_parser = extrinsics, allow_hyphen_values = true)]
     pub extrinsics: Option<Extrinsics>,
-    /// Configuration whose first vehicle's maps are judged; the defaults where absent.
+    /// Judge the maps of the first vehicle of this configuration; of the default configuration if absent.
+    #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// Overrides of the configuration.
+    /// Override a key of the configuration; may be given several times.
+    #[arg(long, value_name = "KEY=VALUE", requires = "config")]
     pub set: Vec<String>,
 }
 
-/// Why an evaluation did not come to its end.
+/// Why an evaluation failed.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluateError {
-    /// Scans and labels do not belong together.
+    /// The scans and labels do not match.
     #[error(transparent)]
     Pairs(#[from] pairs::PairsError),
     /// A scan cannot be read.
@@ -70,31 +93,31 @@ pub enum EvaluateError {
     /// Labels cannot be used.
     #[error(transparent)]
     Labels(#[from] labels::LabelError),
-    /// No such scene.
+    /// No simulated scene has that name.
     #[error("sim:{name}: the scenes are {known}")]
     Scene {
-        /// As it was given.
+        /// Name of the scene, as given.
         name: String,
-        /// What there is.
+        /// Names of the scenes, separated by commas.
         known: String,
     },
-    /// The scans do not show how their sensor is mounted.
+    /// The estimate of the sensor's mount failed.
     #[error("{}: {source}; give --extrinsics", folder.display())]
     Mount {
-        /// Where they lie.
+        /// Folder of the scans.
         folder: PathBuf,
-        /// Why.
+        /// Why the estimate failed.
         source: MountError,
     },
     /// The scans are not from KITTI's car.
     #[error(
-        "{}: the sensor stands {height_m:.2} m over the ground, on KITTI's car 1.73 m; give --extrinsics",
+        "{}: the sensor is {height_m:.2} m above the ground, on KITTI's car 1.73 m; give --extrinsics",
         folder.display()
     )]
     OtherMount {
-        /// Where they lie.
+        /// Folder of the scans.
         folder: PathBuf,
-        /// As estimated from the ground.
+        /// Height of the sensor, estimated from the ground, in metres.
         height_m: f64,
     },
     /// The configuration cannot be used.
@@ -103,28 +126,51 @@ pub enum EvaluateError {
     /// A value of the maps' configuration cannot be used.
     #[error(transparent)]
     Maps(#[from] clearway_mapping::config::ConfigValueError),
-    /// The pipeline does not take a scan.
+    /// The pipeline refused a scan.
     #[error("{}: {source}", scan.display())]
     Rejected {
-        /// The scan.
+        /// File of the scan.
         scan: PathBuf,
-        /// Why.
+        /// Why it was refused.
         source: EventError,
     },
 }
 
-/// How many degrees a radial map's column may span, and how many columns that makes.
+/// Judges the maps and prints the report.
+///
+/// # Errors
+/// [`EvaluateError`].
+pub fn run(options: &Options) -> anyhow::Result<()> {
+    let shown = !options.json && std::io::stderr().is_terminal();
+    let bar = if shown { ProgressBar::new(0) } else { ProgressBar::hidden() };
+    let outcome = evaluate(options, |done, total| {
+        bar.set_length(total);
+        bar.set_position(done);
+    });
+    bar.finish_and_clear();
+    let report = outcome?;
+    if options.json { print_line(&format!("{:#}", report.to_json()))? } else { print(&report.to_text())? };
+    Ok(())
+}
+
+fn columns_deg(text: &str) -> Result<u16, String> {
+    let degrees = text.parse().ok().filter(|degrees| columns(*degrees).is_some());
+    degrees.ok_or_else(|| "1, 2 or 4 degrees are allowed".into())
+}
+
+/// The number of columns of a radial map whose columns are `degrees` wide; `None` if that width is not allowed.
 pub fn columns(degrees: u16) -> Option<u16> {
     matches!(degrees, 1 | 2 | 4).then(|| 360 / degrees)
 }
 
-/// Judges every map that is switched on; `progress` is told of frames done and frames known of.
+/// Judges every map that the configuration enables. `progress` is called with the number of frames judged and of all
+/// frames.
 ///
 /// # Errors
 /// [`EvaluateError`] for the first path that cannot be judged.
 pub fn evaluate(options: &Options, mut progress: impl FnMut(u64, u64)) -> Result<Report, EvaluateError> {
     let maps = maps(options)?;
-    // All paths are looked at before the first is judged, so that a wrong one costs no waiting.
+    // Every path is checked before the first is judged, so that an error appears at once.
     let sources = options.paths.iter().map(|path| Input::new(path)).collect::<Result<Vec<_>, _>>()?;
     let total = sources.iter().map(Input::frames).sum();
     let (mut done, mut report) = (0, Report::default());
@@ -135,6 +181,7 @@ pub fn evaluate(options: &Options, mut progress: impl FnMut(u64, u64)) -> Result
             progress(done, total);
         };
         match input {
+            #[cfg(feature = "sim")]
             Input::World(name, revolutions) => judge_world(name, revolutions, &maps, &mut source, &mut judged)?,
             Input::Labelled(found) => {
                 source.unlabelled = found.unlabelled;
@@ -148,22 +195,40 @@ pub fn evaluate(options: &Options, mut progress: impl FnMut(u64, u64)) -> Result
     Ok(report)
 }
 
+/// What one path stands for.
 enum Input {
+    /// A simulated scene, and how many revolutions of it are judged.
+    #[cfg(feature = "sim")]
     World(&'static str, u64),
+    /// Labelled scans.
     Labelled(pairs::Pairs),
 }
 
 impl Input {
     fn new(path: &str) -> Result<Self, EvaluateError> {
-        let Some(name) = path.strip_prefix("sim:") else { return Ok(Self::Labelled(pairs::find(Path::new(path))?)) };
+        match path.strip_prefix("sim:") {
+            Some(name) => Self::world(name),
+            None => Ok(Self::Labelled(pairs::find(Path::new(path))?)),
+        }
+    }
+
+    #[cfg(feature = "sim")]
+    fn world(name: &str) -> Result<Self, EvaluateError> {
         let known = || worlds::SCENES.map(|(name, _)| name).join(", ");
         let found = worlds::SCENES.iter().find(|(known, _)| *known == name);
         let (name, revolutions) = found.ok_or_else(|| EvaluateError::Scene { name: name.into(), known: known() })?;
         Ok(Self::World(name, *revolutions))
     }
 
+    #[cfg(not(feature = "sim"))]
+    fn world(name: &str) -> Result<Self, EvaluateError> {
+        let known = "not in this build, which is without the feature sim; folders and files are allowed".into();
+        Err(EvaluateError::Scene { name: name.into(), known })
+    }
+
     fn frames(&self) -> u64 {
         match self {
+            #[cfg(feature = "sim")]
             Self::World(_, revolutions) => *revolutions,
             Self::Labelled(found) => found.pairs.len() as u64,
         }
@@ -182,7 +247,7 @@ fn maps(options: &Options) -> Result<MapsConfig, EvaluateError> {
     Ok(maps)
 }
 
-/// The core of a vehicle with one sensor.
+/// The pipeline of a vehicle with one sensor, and the sensor's mount.
 fn pipeline(maps: &MapsConfig, model: Model, extrinsics: Extrinsics) -> Result<(Pipeline, Mount), EvaluateError> {
     let mut config = Config::of_one_vehicle("car", "top").vehicles.remove(0).core();
     config.maps = maps.clone();
@@ -213,6 +278,7 @@ impl Source {
     }
 }
 
+#[cfg(feature = "sim")]
 fn judge_world(
     name: &str,
     revolutions: u64,
@@ -220,10 +286,10 @@ fn judge_world(
     source: &mut Source,
     judged: &mut impl FnMut(),
 ) -> Result<(), EvaluateError> {
-    let scene = worlds::scene(name).expect("a scene of the list");
+    let scene = super::simulate::scene(name).expect("the list has only names of scenes");
     let scanner = worlds::scanner();
     let at = scanner.ego_from_sensor.translation;
-    // The simulated sensor stands upright.
+    // The simulated sensor is upright.
     let extrinsics = Extrinsics { x_m: at.x, y_m: at.y, z_m: at.z, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
     let (mut pipeline, _) = pipeline(maps, scanner.model, extrinsics)?;
     worlds::drive(scene, &mut pipeline, revolutions, |pipeline, points| {
@@ -234,7 +300,7 @@ fn judge_world(
     Ok(())
 }
 
-/// The labelled scans of one folder, in order, through one pipeline.
+/// Judges the labelled scans of one folder, in order, with one pipeline.
 fn judge_folder(
     pairs: &[Pair],
     extrinsics: Option<Extrinsics>,
@@ -243,14 +309,14 @@ fn judge_folder(
     judged: &mut impl FnMut(),
 ) -> Result<(), EvaluateError> {
     let folder = pairs[0].scan.parent().unwrap_or(Path::new("")).to_owned();
-    let (extrinsics, said) = match extrinsics {
+    let (extrinsics, origin) = match extrinsics {
         Some(extrinsics) => (extrinsics, "as given".to_owned()),
         None => (KITTI_EXTRINSICS, kitti_mount(&folder, pairs)?),
     };
     let Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg } = extrinsics;
     let numbers = format!("{x_m},{y_m},{z_m},{roll_deg},{pitch_deg},{yaw_deg}");
-    source.mounts.push(format!("{numbers} in {}: {said}", folder.display()));
-    // SemanticKITTI's sensor.
+    source.mounts.push(format!("{numbers} in {}: {origin}", folder.display()));
+    // The sensor of SemanticKITTI.
     let (mut pipeline, mount) = pipeline(maps, Model::Hdl64eS2, extrinsics)?;
     for (index, pair) in (0..).zip(pairs) {
         let scan = read_scan(&pair.scan, index)?;
@@ -267,7 +333,7 @@ fn judge_folder(
     Ok(())
 }
 
-/// Why KITTI's mounting is taken for these scans; the ground in them must not contradict.
+/// Checks KITTI's mount against the ground in the scans; returns the reason for using it, for the report.
 fn kitti_mount(folder: &Path, pairs: &[Pair]) -> Result<String, EvaluateError> {
     let points = |scan: Scan| scan.x.iter().zip(&scan.y).zip(&scan.z).map(|((&x, &y), &z)| [x, y, z]).collect();
     let first = pairs.iter().zip(0..).take(MOUNT_SCANS).map(|(pair, index)| read_scan(&pair.scan, index).map(points));
@@ -278,7 +344,8 @@ fn kitti_mount(folder: &Path, pairs: &[Pair]) -> Result<String, EvaluateError> {
         return Err(EvaluateError::OtherMount { folder: folder.to_owned(), height_m: z_m });
     }
     Ok(format!(
-        "KITTI's car as published; the ground in {} scan(s) says {z_m:.2} m, pitch {pitch_deg:.1}°, roll {roll_deg:.1}°",
+        "KITTI's car as published; estimated from the ground in {} scan(s): {z_m:.2} m, pitch {pitch_deg:.1}°, roll \
+         {roll_deg:.1}°",
         scans.len()
     ))
 }
@@ -286,7 +353,7 @@ fn kitti_mount(folder: &Path, pairs: &[Pair]) -> Result<String, EvaluateError> {
 fn read_scan(file: &Path, index: u64) -> Result<Scan, EvaluateError> {
     match kitti::read(file, index)?.body {
         Body::Scan(scan) => Ok(scan),
-        _ => unreachable!("a scan's reading is a scan"),
+        _ => unreachable!("the reading of a scan file is a scan"),
     }
 }
 

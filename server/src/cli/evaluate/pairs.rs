@@ -1,92 +1,92 @@
 //! Files and folders -> scans with their labels.
 //!
-//! A scan `STEM.bin` and its labels `STEM.label` belong together in one folder, in `velodyne/` beside `labels/` as
-//! SemanticKITTI lays them out, or in any two folders side by side. Labels without a scan are an error; scans without
-//! labels are counted, for a drive is often labelled in part.
+//! A scan `STEM.bin` and its labels `STEM.label` form a pair in one folder, in `velodyne/` beside `labels/` as
+//! SemanticKITTI has them, or in any two folders of one parent. Labels without a scan are an error. Scans without labels
+//! are counted, because a drive is often labelled in part.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Deeper folders are not looked into: a whole data set has `sequences/00/velodyne`.
+/// Greatest depth of the folders that are searched; a whole data set has `sequences/00/velodyne`.
 const DEPTH_MAX: usize = 5;
 
 /// One labelled scan.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Pair {
-    /// float32 x y z intensity a point.
+    /// File of the scan: float32 x y z intensity for each point.
     pub scan: PathBuf,
-    /// u32 a point.
+    /// File of the labels: u32 for each point.
     pub labels: PathBuf,
 }
 
 /// The labelled scans of one path.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Pairs {
-    /// In the order of their scans' names, folder by folder.
+    /// The pairs, sorted by the path of the scan.
     pub pairs: Vec<Pair>,
-    /// Scans nobody labelled.
+    /// Number of scans without labels.
     pub unlabelled: usize,
 }
 
-/// Why a path gives no pairs.
+/// Why a path has no pairs.
 #[derive(Debug, thiserror::Error)]
 pub enum PairsError {
-    /// It cannot be read.
+    /// A file or folder cannot be read.
     #[error("{}: {source}", path.display())]
     Read {
         /// The file or folder.
         path: PathBuf,
-        /// Why.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Neither a scan nor labels.
+    /// A file that is neither a scan nor labels.
     #[error("{}: a folder, a scan (.bin) or labels (.label) are needed", path.display())]
     Kind {
         /// The file.
         path: PathBuf,
     },
-    /// Labels whose scan is missing.
-    #[error("{}: no {stem}.bin beside it, in ../velodyne or in a folder beside its own", labels.display())]
+    /// Labels without a scan.
+    #[error("{}: no {stem}.bin in its folder, in ../velodyne or in another folder of the same parent", labels.display())]
     NoScan {
-        /// The labels.
+        /// File of the labels.
         labels: PathBuf,
-        /// Name of the scan without its extension.
+        /// Name of the scan's file without its extension.
         stem: String,
     },
-    /// Labels that several scans could have.
+    /// Labels with several possible scans.
     #[error("{}: {} and {} could both be its scan", labels.display(), first.display(), second.display())]
     Ambiguous {
-        /// The labels.
+        /// File of the labels.
         labels: PathBuf,
-        /// A scan of its name.
+        /// One scan of that name.
         first: PathBuf,
-        /// Another.
+        /// Another scan of that name.
         second: PathBuf,
     },
     /// Two files of labels for one scan.
     #[error("{}: {} and {} both label it", scan.display(), first.display(), second.display())]
     TwoLabels {
-        /// The scan.
+        /// File of the scan.
         scan: PathBuf,
-        /// Labels.
+        /// One file of labels.
         first: PathBuf,
-        /// Others.
+        /// Another file of labels.
         second: PathBuf,
     },
-    /// Nothing is labelled.
+    /// No scan is labelled.
     #[error("{}: no labelled scan: {scans} scan(s) (.bin), no labels (.label) of their names", path.display())]
     NoPair {
-        /// The path.
+        /// The path, as given.
         path: PathBuf,
-        /// Scans found.
+        /// Number of scans found.
         scans: usize,
     },
 }
 
-/// Looks for the labelled scans of a folder, or for the other half of a file.
+/// Finds the labelled scans of a folder, or the labels of a scan, or the scan of labels.
 ///
 /// # Errors
-/// [`PairsError`], which names the file that stands alone.
+/// [`PairsError`], which names the file without a counterpart.
 pub fn find(path: &Path) -> Result<Pairs, PairsError> {
     let (mut scans, mut labels) = (BTreeSet::new(), BTreeSet::new());
     let metadata = path.metadata().map_err(|source| PairsError::Read { path: path.to_owned(), source })?;
@@ -168,14 +168,14 @@ fn scan_of(labels: &Path) -> Result<PathBuf, PairsError> {
     }
 }
 
-/// The files that may be the other half of `path`: the one beside it, else the one in the folder SemanticKITTI has it
-/// in, else all in folders beside its own.
+/// The files that may form a pair with `path`: the one in the same folder, else the one in SemanticKITTI's folder for
+/// it, else all of that name in the other folders of the same parent.
 fn others(path: &Path, folder: &str, extension: &str) -> Result<Vec<PathBuf>, PairsError> {
     let beside = path.with_extension(extension);
     if beside.is_file() {
         return Ok(vec![beside]);
     }
-    // A bare file name has the parent "", whose parent is nowhere.
+    // A path without a folder has the parent "", which has no parent.
     let absolute = std::path::absolute(path).map_err(|source| PairsError::Read { path: path.to_owned(), source })?;
     let (Some(name), Some(above)) = (beside.file_name(), absolute.parent().and_then(Path::parent)) else {
         return Ok(Vec::new());
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn scans_and_labels_are_paired_beside_each_other_in_a_sequence_and_in_sibling_folders() {
+    fn scans_and_labels_pair_in_one_folder_in_a_sequence_and_in_two_folders() {
         let pair = |scan: &str, labels: &str| (scan.to_owned(), labels.to_owned());
         assert_eq!(
             names(&["0.bin", "0.label", "1.label", "1.bin"]),
@@ -219,11 +219,11 @@ mod tests {
         let sequences = ["s/00/velodyne/0.bin", "s/00/labels/0.label", "s/01/velodyne/0.bin", "s/01/labels/0.label"];
         let expected = [pair(sequences[0], sequences[1]), pair(sequences[2], sequences[3])];
         assert_eq!(names(&sequences), expected);
-        assert_eq!(names(&["scans/7.bin", "said/7.label", "notes.txt"]), [pair("scans/7.bin", "said/7.label")]);
+        assert_eq!(names(&["scans/7.bin", "truth/7.label", "notes.txt"]), [pair("scans/7.bin", "truth/7.label")]);
     }
 
     #[test]
-    fn scans_nobody_labelled_are_counted() {
+    fn scans_without_labels_are_counted() {
         let folder = folder(&["a/0.bin", "a/1.bin", "a/2.bin", "b/1.label"]);
         let found = find(folder.path()).unwrap();
         assert_eq!((found.pairs.len(), found.unlabelled), (1, 2));
@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn files_that_stand_alone_are_named() {
+    fn a_file_without_its_counterpart_is_named() {
         let error = |files: &[&str]| find(folder(files).path()).unwrap_err().to_string();
         assert!(error(&["labels/3.label"]).contains("3.label: no 3.bin"));
         assert!(error(&["a/3.bin", "b/3.bin", "c/3.label"]).contains("could both be its scan"));

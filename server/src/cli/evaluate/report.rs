@@ -1,4 +1,4 @@
-//! What an evaluation found: a table to read, an object to compute with.
+//! The result of an evaluation, as a table and as JSON.
 
 use std::fmt::Write as _;
 
@@ -6,47 +6,48 @@ use serde_json::{Value, json};
 
 use super::judge::{Confusion, Tally};
 
-/// How ground points are scored, by name and in words. Both leave out what nobody labelled (unlabeled, outlier) and the
-/// vehicle itself, and count road, parking, sidewalk, other-ground, lane-marking and terrain as ground.
+/// The protocols by which ground points are scored: name and description. Both leave out points without a class
+/// (unlabeled, outlier) and the vehicle itself, and count road, parking, sidewalk, other-ground, lane-marking and terrain
+/// as ground.
 pub const PROTOCOLS: [(&str, &str); 2] = [
     (
         "vegetation_excluded",
-        "Patchwork++ (§IV.A) and GroundGrid's published script: ground is road, parking, sidewalk, other-ground, \
-         lane-marking and terrain; vegetation is not scored; all else is not ground",
+        "as in Patchwork++ (Lee 2022, section IV.A) and GroundGrid's published script: ground is road, parking, sidewalk, \
+         other-ground, lane-marking and terrain; vegetation is not scored; everything else is not ground",
     ),
     (
         "low_vegetation_ground",
-        "Patchwork: the same, but vegetation lower than a quarter of the sensor's height over the vehicle's ground \
-         (z < -1.3 m from KITTI's sensor) is ground, and higher vegetation is not",
+        "as in Patchwork (Lim 2021): the same, except that vegetation lower than a quarter of the sensor's height above the \
+         vehicle's ground (z < -1.3 m from KITTI's sensor) is ground, and higher vegetation is not",
     ),
 ];
 
-/// One path's figures.
+/// The result for one path.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Source {
-    /// As it was given.
+    /// The path, as given.
     pub path: String,
-    /// Frames judged.
+    /// Number of frames judged.
     pub frames: u64,
-    /// Scans without labels, left alone.
+    /// Number of scans without labels, which are left out.
     pub unlabelled: usize,
-    /// How the sensor was taken to be mounted, folder by folder, and why.
+    /// For each folder the extrinsics of the sensor, and where they come from.
     pub mounts: Vec<String>,
-    /// By layer, in the order of the maps.
+    /// Name and counts of each layer, in the order of the map.
     pub layers: Vec<(String, Tally)>,
-    /// Layers none of whose classes lets a vehicle pass.
+    /// Names of the layers without a free class.
     pub left_out: Vec<String>,
 }
 
-/// Everything that was asked for.
+/// The result for all paths.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Report {
-    /// In the order given.
+    /// The result for each path, in the order given.
     pub sources: Vec<Source>,
 }
 
 impl Report {
-    /// As a table.
+    /// The report as a table.
     pub fn to_text(&self) -> String {
         let mut text = String::new();
         // Writing into a string cannot fail.
@@ -87,19 +88,19 @@ impl Report {
                 let _ = writeln!(text, "  leaks of {layer}: {of}: {by_class}");
             }
             for layer in &source.left_out {
-                let _ = writeln!(text, "  {layer}: no class of it says where to drive; left out");
+                let _ = writeln!(text, "  {layer}: left out, because none of its classes is free");
             }
         }
         let _ = writeln!(
             text,
-            "A leak is a cell called drivable with a point 0.3 to 2.5 m over the ground in it, or (simulated) ground that is \
-             steep or cannot be reached."
+            "A leak is a cell called drivable that has a point 0.3 to 2.5 m above the ground, or (simulated) ground that is \
+             too steep or cannot be reached."
         );
         PROTOCOLS.iter().for_each(|(name, words)| _ = writeln!(text, "{name}: {words}."));
         text
     }
 
-    /// As an object; a share of nothing is null.
+    /// The report as a JSON object; a share of zero cells or points is null.
     pub fn to_json(&self) -> Value {
         let points = |points: &Confusion| {
             json!({

@@ -1,48 +1,38 @@
-//! Simulated scenes -> maps through the real pipeline, with the truth of the world about every point.
+//! Simulated scenes -> maps of the pipeline, with the simulator's truth about every point.
 //!
-//! In: a scene's name. Out: frame after frame, a map and its [`Point`]s. The vehicle's datagrams, and its poses every
-//! 10 ms, enter as events; the truth is the simulator's, of the moment the map's capture ended.
+//! In: a scene's name. Out: for each frame a map and its [`Point`]s. The vehicle's datagrams, and its pose every 10 ms,
+//! are the events; the truth is that of the end of the map's capture.
 
 use bytes::Bytes;
 use clearway_mapping::event::{Body, EgoPose, Event};
 use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::sweep::Sweep;
 use clearway_sim::scanner::ScannerConfig;
-use clearway_sim::scenes::{self, Scene};
+use clearway_sim::scenes::Scene;
 use clearway_sim::truth::{Limits, Truth, TruthGrid};
 use clearway_sim::vehicle::SimulatedVehicle;
 
 use super::judge::{OBSTACLE_M_MAX, OBSTACLE_M_MIN, Point, Scored, Vote};
 
-/// Names a scene goes by, with how many revolutions of it are judged: in the thesis' scenes nothing moves.
+/// Name of each scene, and how many of its revolutions are judged: one of the UT Austin thesis' scenes, because nothing
+/// moves in them.
 pub const SCENES: [(&str, u64); 5] = [("flat", 1), ("slopes", 1), ("canopy", 1), ("overhang", 1), ("town", 10)];
 
-/// The truth's raster: 60 m to each side in cells of 0.2 m.
+/// Half the edge of the truth's grid and the edge of its cells, in metres.
 const RASTER_M: (f64, f64) = (60.0, 0.2);
-/// Lower points of a simulated turn are ground: ten times the sensor's noise, and the ground's own rise within a raster
-/// cell.
+/// Greatest height of a ground point above the true ground, in metres: ten times the sensor's noise, which also covers
+/// the rise of the ground within a cell of the truth.
 const GROUND_M_MAX: f32 = 0.15;
+/// Time between two poses, in nanoseconds.
 const POSE_PERIOD_NS: i64 = 10_000_000;
 
-/// The scene of that name.
-pub fn scene(name: &str) -> Option<Scene> {
-    Some(match name {
-        "flat" => scenes::flat(),
-        "slopes" => scenes::slopes_with_obstacles(),
-        "canopy" => scenes::fenced_road_under_canopy(),
-        "overhang" => scenes::fenced_road_with_low_overhang(),
-        "town" => scenes::town(),
-        _ => return None,
-    })
-}
-
-/// The sensor on the simulated vehicle's roof.
+/// The sensor on the roof of the simulated vehicle.
 pub fn scanner() -> ScannerConfig {
     ScannerConfig::default()
 }
 
-/// Drives through the scene until `judge` has seen so many whole revolutions, each as the pipeline left it, and its
-/// points.
+/// Drives through the scene until `revolutions` whole revolutions have become maps, and calls `judge` after each with the
+/// pipeline and the points of the map.
 pub fn drive(scene: Scene, pipeline: &mut Pipeline, revolutions: u64, mut judge: impl FnMut(&Pipeline, Vec<Point>)) {
     let vehicle = SimulatedVehicle::new(scene, scanner());
     let mut next_pose_ns = vehicle.start_ns();
@@ -66,10 +56,10 @@ pub fn drive(scene: Scene, pipeline: &mut Pipeline, revolutions: u64, mut judge:
     }
 }
 
-/// Stamp of the whole map the event made.
+/// The stamp of the map that the event completed; `None` without a map or if a sensor's revolution in it is partial.
 fn step(pipeline: &mut Pipeline, arrival_ns: i64, body: Body) -> Option<i64> {
     let made = pipeline.step(&Event { sequence: 0, arrival_ns, source: 0, body });
-    let map = made.expect("the pipeline takes what the simulator makes")?;
+    let map = made.expect("the pipeline accepts the simulator's datagrams and poses")?;
     map.sensors.iter().all(|sensor| sensor.partial.is_empty()).then_some(map.capture_end_ns)
 }
 
@@ -92,7 +82,7 @@ fn point(place: [f32; 3], truth: &TruthGrid) -> Point {
         Truth::Steep => ("steep", Vote::Forbidden),
         Truth::Unreachable => ("unreachable", Vote::Forbidden),
         Truth::Drivable => ("ground", Vote::Drivable),
-        // Ground seen within a raster cell that something stands in: either answer is right.
+        // Ground in a cell of the truth that also has an object: both answers are correct.
         Truth::Obstacle | Truth::Tight | Truth::Outside => ("ground", Vote::Either),
     };
     let scored = match here {

@@ -9,10 +9,11 @@ use anyhow::{Context, Result};
 use clearway_client::v1;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::sensor::Sensor;
+use clearway_lidar::Sensor;
 use clearway_mapping::config::{Extrinsics, SensorConfig};
 use clearway_proto::packed::unpack;
 use nalgebra::Isometry3;
+use crate::record::mcap_reader::Header;
 use prost::Message;
 use serde::Deserialize;
 
@@ -52,17 +53,17 @@ struct Vehicle {
 }
 
 impl Turns {
-    /// The sensors of a recording, by its attachments; none where it has no configuration.
+    /// The sensors of a recording, by its header; none where it has no configuration.
     ///
     /// # Errors
     /// What is wrong with the configuration or a calibration.
-    pub fn new(attachments: &BTreeMap<String, Vec<u8>>) -> Result<Self> {
-        let Some(config) = attachments.get("config.toml") else { return Ok(Self(BTreeMap::new())) };
-        let config: Config = toml::from_str(&String::from_utf8_lossy(config)).context("attachment config.toml")?;
+    pub fn new(header: &Header) -> Result<Self> {
+        let Some(config) = &header.config else { return Ok(Self(BTreeMap::new())) };
+        let config: Config = toml::from_str(config).context("attachment config.toml")?;
         let sensors = |vehicle: Vehicle| {
             let one = |sensor: &SensorConfig| {
                 let name = format!("calibration/{}/{}.yaml", vehicle.name, sensor.name);
-                let table = attachments.get(&name).map(|table| Calibration::load_str(&String::from_utf8_lossy(table)));
+                let table = header.calibrations.get(&name).map(|table| Calibration::load_str(table));
                 let table = table.transpose().with_context(|| format!("attachment {name}"))?;
                 Ok(OneSensor::new(sensor, table))
             };
@@ -124,7 +125,7 @@ fn declared(sensor: &v1::Sensor) -> SensorConfig {
     let &v1::Sensor { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, .. } = sensor;
     let plain = SensorConfig::new(&sensor.name, Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg });
     SensorConfig {
-        model: sensor.model.as_deref().and_then(clearway_lidar::model::Model::from_name),
+        model: sensor.model.as_deref().and_then(|name| name.parse().ok()),
         rpm: sensor.rpm,
         cut_azimuth_deg: sensor.cut_azimuth_deg.unwrap_or(plain.cut_azimuth_deg),
         gps_late_days_max: sensor.gps_late_days_max.unwrap_or(plain.gps_late_days_max),

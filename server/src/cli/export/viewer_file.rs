@@ -21,7 +21,7 @@ use foxglove::messages::FrameTransforms;
 use mcap::records::MessageHeader;
 
 use super::scans::{Turn, Turns};
-use crate::cli::recording::Message;
+use crate::record::mcap_reader::{Header, Message};
 
 /// Whose messages the file has.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -65,18 +65,18 @@ impl ViewerFile {
         })
     }
 
-    /// Takes an event of a journal, for the points in it; `attachments` are the recording's.
+    /// Takes an event of a journal, for the points in it; `header` is the recording's.
     ///
     /// # Errors
     /// What is wrong with the recording, or where the file cannot be written.
-    pub fn take_event(&mut self, message: &Message, attachments: &BTreeMap<String, Vec<u8>>) -> Result<()> {
+    pub fn take_event(&mut self, message: &Message, header: &Header) -> Result<()> {
         let Some(vehicle) = message.journal_of().filter(|_| self.with_points) else { return Ok(()) };
         let mut turns = match self.turns.take() {
             Some(turns) => turns,
-            None => Turns::new(attachments)?,
+            None => Turns::new(header)?,
         };
         if let Some(turn) = turns.take(vehicle, &message.data)? {
-            self.write_turn(vehicle, &turn, message.log_time_ns)?;
+            self.write_turn(vehicle, &turn, message.log_ns)?;
         }
         self.turns = Some(turns);
         Ok(())

@@ -1,10 +1,11 @@
-//! Files, by their names' endings -> what is sent when.
+//! Files, by the endings of their names -> observations and the stamps at which they are sent.
 
 use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
+use clap::Args;
 use clearway_client::observation::{RoadFrame, RoadPurpose};
 use clearway_client::{Observation, now_ns};
 use clearway_lidar::capture::{Capture, CaptureError};
@@ -14,38 +15,73 @@ use clearway_mapping::road::rndf::Rndf;
 use clearway_mapping::road::{FOOT_M, LineError, LocalFrame};
 use clearway_mapping::scan_file::{read_bin, read_pcd};
 
-/// Datagrams of a drive in one observation, at most: 50 ms of an HDL-64E.
+/// Most datagrams of a drive in one observation: 50 ms of an HDL-64E.
 const PACKETS: usize = 175;
-/// A drive's datagrams do not wait longer for others.
+/// Longest time between the first and the last datagram of one observation, in nanoseconds; ours, because it delays
+/// each packet by as much.
 const PACKETS_NS: i64 = 20_000_000;
-/// An RNDF lane without a width is as wide as most.
+/// Width of an RNDF lane without a width, in metres: 12 feet, the width of most lanes.
 const LANE_M: f64 = 12.0 * FOOT_M;
 
-/// What is sent when.
+/// The options that say which files are sent, and how they are read.
+#[derive(Args)]
+pub struct FileOptions {
+    /// The files. Each scan is sent with the stamp of a pose, or from now on at --hz if there are no poses.
+    #[arg(required = true)]
+    files: Vec<PathBuf>,
+    /// Scans a second, if there are no poses.
+    #[arg(long, default_value_t = 10.0, value_parser = hz)]
+    hz: f64,
+    /// Position on the Earth, in degrees, of the map frame's origin, for roads; their first point if absent.
+    #[arg(long, value_name = "LATITUDE,LONGITUDE", allow_hyphen_values = true, value_parser = origin)]
+    origin: Option<[f64; 2]>,
+    /// The lane of an .rndf to paint; the first if absent.
+    #[arg(long, value_name = "SEGMENT.LANE")]
+    lane: Option<String>,
+}
+
+fn hz(text: &str) -> Result<f64, String> {
+    let found = text.parse().ok().filter(|hz| (0.1..=100.0).contains(hz));
+    found.ok_or_else(|| "0.1 to 100 is allowed".into())
+}
+
+fn origin(text: &str) -> Result<[f64; 2], String> {
+    let parts = text.split_once(',').map(|(latitude, longitude)| (latitude.trim().parse(), longitude.trim().parse()));
+    match parts {
+        Some((Ok(latitude), Ok(longitude)))
+            if (-90.0..=90.0).contains(&latitude) && (-180.0..=180.0).contains(&longitude) =>
+        {
+            Ok([latitude, longitude])
+        }
+        _ => Err("two numbers of degrees are needed, such as 30.39,-97.73".into()),
+    }
+}
+
+/// What is sent, and when.
 pub struct Plan {
-    /// Scans, poses and roads, by stamp.
+    /// Scans, poses and roads, ordered by stamp.
     pub items: Vec<(i64, Item)>,
-    /// Captures, with stamps of their own.
+    /// Captures, whose datagrams have stamps of their own.
     pub drives: Vec<PathBuf>,
-    /// Lines that were left out.
+    /// Lines of road files that are left out, and why.
     pub notes: Vec<String>,
 }
 
-/// One thing to be sent.
+/// One observation to send.
 pub enum Item {
-    /// Position, quaternion x y z w, forward speed.
+    /// Position in the map frame in metres, quaternion x y z w, forward speed in m/s.
     Pose([f64; 3], [f64; 4], f64),
     /// A road in the map frame.
     Road(Road),
-    /// A file with a scan.
+    /// The file of a scan.
     Scan(PathBuf),
 }
 
 impl Item {
-    /// What it is, and how it is sent.
+    /// The kind of the item, and its observation.
     ///
     /// # Errors
-    /// A scan that cannot be read.
+    /// If the file of a scan cannot be read.
     pub fn read(&self, sensor: &str, stamp_ns: i64) -> Result<(&'static str, Observation)> {
         Ok(match self {
             Self::Pose(at, turned, speed_mps) => ("poses", Observation::pose(stamp_ns, *at, *turned, *speed_mps)),
@@ -74,11 +110,11 @@ fn ending(file: &Path) -> &str {
 }
 
 impl Plan {
-    /// Of the files named.
+    /// Reads poses and roads, and orders what is sent.
     ///
     /// # Errors
-    /// A file that cannot be read or is of no known kind; scans that are more than the poses.
-    pub fn of(options: &super::Options) -> Result<Self> {
+    /// If a file cannot be read, its kind is not known, or there are more scans than poses.
+    pub fn new(options: &FileOptions) -> Result<Self> {
         let (mut scans, mut poses, mut roads) = (Vec::new(), Vec::new(), Vec::new());
         let (mut drives, mut notes) = (Vec::new(), Vec::new());
         for file in &options.files {
@@ -96,7 +132,7 @@ impl Plan {
             }
         }
         if !poses.is_empty() && scans.len() > poses.len() {
-            bail!("{} scans and {} poses: a pose for each scan stamps it, or none", scans.len(), poses.len());
+            bail!("{} scans and {} poses: each scan needs a pose for its stamp, or there must be no poses", scans.len(), poses.len());
         }
         let first_ns = poses.first().map_or_else(now_ns, |(stamp_ns, _)| *stamp_ns);
         let stamp_ns = |index: usize| match poses.get(index) {
@@ -104,17 +140,17 @@ impl Plan {
             None => first_ns.saturating_add((index as f64 * 1e9 / options.hz) as i64),
         };
         let scans = scans.into_iter().enumerate().map(|(index, file)| (stamp_ns(index), Item::Scan(file)));
-        // Each road its own stamp: the newest counts.
+        // Each road has a stamp of its own, because the server uses the newest.
         let roads = (0..).zip(roads).map(|(index, road)| (first_ns.saturating_add(index), Item::Road(road)));
         let mut items: Vec<_> = roads.chain(scans).collect();
         items.extend(poses);
-        // What a map needs comes before its scan.
+        // Poses and roads come before the scan of the same stamp, whose map uses them.
         items.sort_by_key(|(stamp_ns, item)| (*stamp_ns, matches!(item, Item::Scan(_))));
         Ok(Self { items, drives, notes })
     }
 }
 
-/// Lines of "seconds x y z qx qy qz qw"; speeds follow from the distance to the line before.
+/// Reads lines of "seconds x y z qx qy qz qw". The speed of each pose is that from the pose before it.
 fn read_poses(text: &str) -> Result<Vec<(i64, Item)>> {
     let mut poses: Vec<(i64, [f64; 7])> = Vec::new();
     for (index, line) in text.lines().enumerate() {
@@ -135,7 +171,7 @@ fn read_poses(text: &str) -> Result<Vec<(i64, Item)>> {
         let [dx, dy, dz] = [0, 1, 2].map(|axis| to.1[axis] - from.1[axis]);
         let seconds = to.0.saturating_sub(from.0) as f64 * 1e-9;
         let [qx, qy, qz, qw] = [3, 4, 5, 6].map(|axis| to.1[axis]);
-        // The way driven, along the vehicle's x axis: backwards is negative.
+        // The distance driven along the vehicle's x axis; backwards is negative.
         let forward = [1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy + qw * qz), 2.0 * (qx * qz - qw * qy)];
         let driven_m = dx * forward[0] + dy * forward[1] + dz * forward[2];
         if seconds > 0.0 { driven_m / seconds } else { 0.0 }
@@ -148,11 +184,11 @@ fn read_poses(text: &str) -> Result<Vec<(i64, Item)>> {
     Ok((0..poses.len()).map(item).collect())
 }
 
-/// The route of an RDDF, or one lane of an RNDF to paint; and the lines that were left out.
-fn read_road(text: &str, ending: &str, options: &super::Options) -> (Result<Road>, Vec<LineError>) {
-    let frame = |of_file: Option<LocalFrame>| match options.origin {
+/// Reads the route of an RDDF, or one lane of an RNDF to paint; returns also the lines that are left out.
+fn read_road(text: &str, ending: &str, options: &FileOptions) -> (Result<Road>, Vec<LineError>) {
+    let frame = |frame_of_file: Option<LocalFrame>| match options.origin {
         Some([latitude, longitude]) => Some(LocalFrame::new(latitude, longitude)),
-        None => of_file,
+        None => frame_of_file,
     };
     if ending == "rddf" {
         let rddf = Rddf::read(text);
@@ -171,13 +207,14 @@ fn read_road(text: &str, ending: &str, options: &super::Options) -> (Result<Road
     (road, std::mem::take(&mut rndf.refused))
 }
 
-/// Some datagrams with their stamps.
+/// Datagrams with their stamps, in nanoseconds since the Unix epoch.
 type Packets = Vec<(i64, Vec<u8>)>;
 
-/// A capture's datagrams, some at a time. One that was cut off gives what it holds.
+/// The datagrams of a capture, in groups that make one observation each. A capture that is cut off gives those before
+/// the cut.
 ///
 /// # Errors
-/// A file that cannot be read.
+/// If the file cannot be read.
 pub fn chunks(file: &Path) -> Result<impl Iterator<Item = Result<Packets, CaptureError>>> {
     let open = File::open(file).with_context(|| format!("open {}", file.display()))?;
     let capture = Capture::new(BufReader::new(open)).with_context(|| file.display().to_string())?;
@@ -207,7 +244,7 @@ mod tests {
     #[derive(Parser)]
     struct Arguments {
         #[command(flatten)]
-        options: super::super::Options,
+        options: FileOptions,
     }
 
     fn plan(folder: &Path, files: &[(&str, &[u8])]) -> Result<Plan> {
@@ -216,11 +253,11 @@ mod tests {
             std::fs::write(folder.join(name), bytes).unwrap();
             arguments.push(folder.join(name).display().to_string());
         }
-        Plan::of(&Arguments::parse_from(arguments).options)
+        Plan::new(&Arguments::parse_from(arguments).options)
     }
 
     #[test]
-    fn scans_are_stamped_by_poses_and_sent_behind_them() {
+    fn scans_get_the_stamps_of_poses_and_are_sent_after_them() {
         let folder = tempfile::tempdir().unwrap();
         let poses = b"# seconds x y z qx qy qz qw\n1.5 0 0 0 0 0 1 0\n2.0 -4 0 0 0 0 1 0\n2.5 -3 0 0 0 0 1 0\n";
         let rddf = b"1,30.0,-97.0,10,20\n2,30.001,-97.0,10,20\nthree,1,2\n";
@@ -240,21 +277,21 @@ mod tests {
             Item::Pose(_, _, speed_mps) => Some(*speed_mps),
             _ => None,
         });
-        // The vehicle looks the other way: it drove ahead, and then backed.
+        // The vehicle faces -x: it drives forward to -4 m, and then backward to -3 m.
         assert_eq!(speeds.collect::<Vec<_>>(), [8.0, 8.0, -2.0]);
         assert!(plan.notes.len() == 1 && plan.notes[0].contains("line 3"), "{:?}", plan.notes);
     }
 
     #[test]
-    fn files_that_do_not_belong_are_named() {
+    fn files_that_cannot_be_sent_are_refused_with_the_reason() {
         let folder = tempfile::tempdir().unwrap();
-        let said = |files: &[(&str, &[u8])]| format!("{:#}", plan(folder.path(), files).err().unwrap());
-        assert!(said(&[("a.txt", b"")]).contains(".txt"));
-        assert!(said(&[("a.tum", b"1 2 3\n")]).contains("eight numbers"));
-        assert!(said(&[("a.rddf", b"")]).contains("no row"));
-        assert!(said(&[("a.rndf", b"RNDF_name x\n")]).contains("no such lane"));
+        let error = |files: &[(&str, &[u8])]| format!("{:#}", plan(folder.path(), files).err().unwrap());
+        assert!(error(&[("a.txt", b"")]).contains(".txt"));
+        assert!(error(&[("a.tum", b"1 2 3\n")]).contains("eight numbers"));
+        assert!(error(&[("a.rddf", b"")]).contains("no row"));
+        assert!(error(&[("a.rndf", b"RNDF_name x\n")]).contains("no such lane"));
         assert!(
-            said(&[("a.bin", b""), ("b.bin", b""), ("a.tum", b"1 0 0 0 0 0 0 1\n")]).contains("2 scans and 1 poses")
+            error(&[("a.bin", b""), ("b.bin", b""), ("a.tum", b"1 0 0 0 0 0 0 1\n")]).contains("2 scans and 1 poses")
         );
     }
 }

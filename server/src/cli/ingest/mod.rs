@@ -1,7 +1,10 @@
-//! Files -> observations -> a server: drives as tunnelled packets, scans, poses, roads.
+//! `clearway ingest`: files -> observations (scans, poses, roads, tunnelled packets) -> a server.
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | `files` | files -> observations and their stamps |
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
@@ -9,38 +12,35 @@ use clap::Args;
 use clearway_client::{Ingester, Observation, Refusal};
 use serde_json::json;
 
-use super::{Server, say};
+use super::connection::{ServerOptions, explain};
+use super::output::{block_on, print_line};
+use files::{FileOptions, Plan};
 
 mod files;
 
-/// Send scans (KITTI .bin, .pcd), ego poses (.tum: "seconds x y z qx qy qz qw" lines), roads (.rddf, .rndf) and drives
-/// (.pcap, .pcapng, as tunnelled packets with their own stamps) to a server, which says what it refused.
+/// Send observations from files to a server: scans, poses, roads and the packets of drives.
+///
+/// Reads scans (KITTI .bin, .pcd), ego poses (.tum: lines of "seconds x y z qx qy qz qw"), roads (.rddf, .rndf) and drives
+/// (.pcap, .pcapng: their packets with their own stamps). Prints what the server has refused, and why.
 #[derive(Args)]
+#[command(after_help = "Examples:
+  clearway ingest scans/*.bin poses.tum --sensor top
+  clearway ingest drive.pcap --zenoh tcp/localhost:7447 --vehicle car --sensor top")]
 pub struct Options {
-    /// The files. Scans are stamped as the poses are, one each, or from now on at --hz where there are none.
-    #[arg(required = true)]
-    files: Vec<PathBuf>,
     #[command(flatten)]
-    server: Server,
-    /// Over zenoh instead, by this endpoint, such as tcp/localhost:7447.
+    files: FileOptions,
+    #[command(flatten)]
+    server: ServerOptions,
+    /// Send over zenoh instead of gRPC, to this endpoint, such as tcp/localhost:7447.
     #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
     zenoh: Option<String>,
-    /// The vehicle; over zenoh, and where there are several, it must be given.
-    #[arg(long, default_value = "")]
+    /// The vehicle; needed over zenoh, and if the server has several.
+    #[arg(long, default_value = "", hide_default_value = true)]
     vehicle: String,
-    /// Whose scans or packets; over zenoh, and where there are several, it must be given.
-    #[arg(long, default_value = "")]
+    /// The sensor of the scans or packets; needed over zenoh, and if the vehicle has several.
+    #[arg(long, default_value = "", hide_default_value = true)]
     sensor: String,
-    /// Scans a second, where no poses stamp them.
-    #[arg(long, default_value_t = 10.0, value_parser = hz)]
-    hz: f64,
-    /// Place on Earth that is 0, 0 of the map frame, for roads; their first point unless given.
-    #[arg(long, value_name = "LATITUDE,LONGITUDE", allow_hyphen_values = true, value_parser = origin)]
-    origin: Option<[f64; 2]>,
-    /// The lane of an .rndf that is painted; the first unless given.
-    #[arg(long, value_name = "SEGMENT.LANE")]
-    lane: Option<String>,
-    /// As fast as the server takes it, instead of at the recorded pace.
+    /// Send as fast as the server accepts, instead of at the recorded pace.
     #[arg(long)]
     fast: bool,
     /// Print one JSON object at the end.
@@ -48,35 +48,23 @@ pub struct Options {
     json: bool,
 }
 
-fn hz(text: &str) -> Result<f64, String> {
-    let found = text.parse().ok().filter(|hz| (0.1..=100.0).contains(hz));
-    found.ok_or_else(|| "0.1 to 100 is allowed".into())
-}
-
-fn origin(text: &str) -> Result<[f64; 2], String> {
-    let parts = text.split_once(',').map(|(latitude, longitude)| (latitude.trim().parse(), longitude.trim().parse()));
-    match parts {
-        Some((Ok(latitude), Ok(longitude)))
-            if (-90.0..=90.0).contains(&latitude) && (-180.0..=180.0).contains(&longitude) =>
-        {
-            Ok([latitude, longitude])
-        }
-        _ => Err("two numbers of degrees are needed, such as 30.39,-97.73".into()),
-    }
-}
-
-/// Sends.
+/// Sends the observations.
 ///
 /// # Errors
-/// What cannot be read, and what the server or the transport says; a refusal is no error, but is said.
-pub async fn run(options: Options) -> Result<()> {
-    let plan = files::Plan::of(&options)?;
+/// If a file cannot be read, or as [`ClientError`](clearway_client::ClientError). A refused observation is not an error;
+/// the output says so.
+pub fn run(options: &Options) -> Result<()> {
+    block_on(ingest(options))
+}
+
+async fn ingest(options: &Options) -> Result<()> {
+    let plan = Plan::new(&options.files)?;
     let ingester = match &options.zenoh {
-        Some(endpoint) => over_zenoh(endpoint, &options.vehicle).await?,
-        None => options.server.connect().await?.ingest(&options.vehicle).await?,
+        Some(endpoint) => ingest_over_zenoh(endpoint, &options.vehicle).await?,
+        None => options.server.connect().await?.ingest(&options.vehicle).await.map_err(explain)?,
     };
     let mut sender =
-        Sender { ingester, paced: !options.fast, begun: None, sent: BTreeMap::new(), refusals: Vec::new() };
+        Sender { ingester, paced: !options.fast, started: None, sent: BTreeMap::new(), refusals: Vec::new() };
     for (stamp_ns, item) in &plan.items {
         let (kind, observation) = item.read(&options.sensor, *stamp_ns)?;
         sender.send(kind, *stamp_ns, observation).await?;
@@ -93,34 +81,38 @@ pub async fn run(options: Options) -> Result<()> {
 }
 
 #[cfg(feature = "zenoh")]
-async fn over_zenoh(endpoint: &str, vehicle: &str) -> Result<Ingester> {
+async fn ingest_over_zenoh(endpoint: &str, vehicle: &str) -> Result<Ingester> {
     Ok(clearway_client::ZenohClient::connect(endpoint).await?.ingest(vehicle).await?)
 }
 
 #[cfg(not(feature = "zenoh"))]
-async fn over_zenoh(endpoint: &str, _: &str) -> Result<Ingester> {
-    bail!("--zenoh {endpoint}: this clearway was built without zenoh")
+async fn ingest_over_zenoh(endpoint: &str, _: &str) -> Result<Ingester> {
+    bail!("--zenoh {endpoint}: this clearway was built without the feature zenoh")
 }
 
+/// A stream of observations to a server, and the counts of what was sent and refused.
 struct Sender {
     ingester: Ingester,
+    /// True if each observation is sent at the time of its stamp.
     paced: bool,
-    /// When the first observation went, and its stamp.
-    begun: Option<(Instant, i64)>,
+    /// When the first observation was sent, and its stamp.
+    started: Option<(Instant, i64)>,
+    /// Number of observations sent, by kind.
     sent: BTreeMap<&'static str, u64>,
     refusals: Vec<Refusal>,
 }
 
 impl Sender {
     async fn send(&mut self, kind: &'static str, stamp_ns: i64, observation: Observation) -> Result<()> {
-        let (begun, first_ns) = *self.begun.get_or_insert((Instant::now(), stamp_ns));
+        let (started, first_ns) = *self.started.get_or_insert((Instant::now(), stamp_ns));
         if self.paced {
             let due = Duration::from_nanos(u64::try_from(stamp_ns.saturating_sub(first_ns)).unwrap_or(0));
-            tokio::time::sleep(due.saturating_sub(begun.elapsed())).await;
+            tokio::time::sleep(due.saturating_sub(started.elapsed())).await;
         }
         if let Err(error) = self.ingester.send(observation).await {
-            let told = self.ingester.refusals();
-            told.iter().for_each(|refusal| eprintln!("refused {}: {}", refusal.reason, refusal.message));
+            for refusal in self.ingester.refusals() {
+                eprintln!("refused {}: {}", refusal.reason, refusal.message);
+            }
             bail!(error);
         }
         *self.sent.entry(kind).or_default() += 1;
@@ -132,17 +124,17 @@ impl Sender {
 fn report(sender: &Sender, notes: &[String], as_json: bool) -> Result<()> {
     let reasons = clearway_client::observation::by_reason(&sender.refusals);
     if as_json {
-        say(&json!({ "sent": sender.sent, "refused": reasons, "notes": notes }).to_string())?;
+        print_line(&json!({ "sent": sender.sent, "refused": reasons, "notes": notes }).to_string())?;
         return Ok(());
     }
     let sent: Vec<String> = sender.sent.iter().map(|(kind, n)| format!("{n} {kind}")).collect();
-    say(&format!("sent {}; every one was acknowledged", sent.join(", ")))?;
+    print_line(&format!("sent {}; all of them were acknowledged", sent.join(", ")))?;
     for (reason, count) in &reasons {
         let first = sender.refusals.iter().find(|refusal| refusal.reason == **reason);
-        say(&format!("refused {count}: {reason}: {}", first.map_or("", |refusal| &refusal.message)))?;
+        print_line(&format!("refused {count}: {reason}: {}", first.map_or("", |refusal| &refusal.message)))?;
     }
     for note in notes {
-        say(note)?;
+        print_line(note)?;
     }
     Ok(())
 }

@@ -1,8 +1,9 @@
-//! Revolutions -> one binary PCD file (v0.7) each, `<revolution>.pcd`, points in the sensor's frame, metres.
+//! Revolutions -> one binary PCD file (v0.7) each, `<revolution>.pcd`, with points in the sensor frame, in metres.
 //!
 //! Fields, little-endian and without padding: x y z intensity (f32; intensity 0 to 255 as the sensor reports it), ring
 //! (u16, 0 lowest), laser (u16, firing order), time (f32, seconds since the revolution's first firing), return_type
-//! (u8, 1 strongest, 2 last, 3 both in one). Points in firing order, within a firing by laser, strongest before last.
+//! (u8, 1 strongest, 2 last, 3 both in one). The points are in firing order; within a firing they are ordered by laser,
+//! and of one laser the strongest return comes before the last.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -11,39 +12,40 @@ use std::sync::{Arc, Mutex};
 use clearway_lidar::revolution::Revolution;
 
 use crate::engine::Observer;
-use crate::ingest::locked;
+use crate::sync::locked;
 
-/// The folder the clouds go to.
+/// A folder to which point clouds are written.
 #[derive(Clone, Debug)]
 pub struct Clouds {
     folder: PathBuf,
 }
 
-/// Why a cloud cannot be written.
+/// Why a point cloud cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("point cloud {}: {source}", file.display())]
 pub struct CloudError {
-    /// The folder or file.
+    /// The folder or file that cannot be written.
     pub file: PathBuf,
-    /// Why.
+    /// The system's error.
     pub source: std::io::Error,
 }
 
-/// How many clouds were written, or why no more.
+/// Number of clouds written, or the error that ended the writing.
 pub type Written = Arc<Mutex<Result<u64, CloudError>>>;
 
 impl Clouds {
-    /// Makes the folder.
+    /// Creates the folder, unless it exists.
     ///
     /// # Errors
-    /// [`CloudError`] where it cannot be made.
+    /// [`CloudError`] if it cannot be created.
     pub fn create(folder: &Path) -> Result<Self, CloudError> {
         let made = std::fs::create_dir_all(folder);
         made.map_err(|source| CloudError { file: folder.to_owned(), source })?;
         Ok(Self { folder: folder.to_owned() })
     }
 
-    /// Looks at each revolution and writes it; scans that came assembled are not written again.
+    /// An observer of the engine that writes each revolution, and the number of clouds written. Scans that arrive
+    /// assembled are not written.
     pub fn observer(self) -> (Observer, Written) {
         let written: Written = Arc::new(Mutex::new(Ok(0)));
         let count = written.clone();
@@ -59,7 +61,7 @@ impl Clouds {
     }
 }
 
-/// A revolution as a PCD file.
+/// Encodes the points of a revolution as a PCD file.
 pub fn pcd(revolution: &Revolution) -> Vec<u8> {
     let (mut points, mut data) = (0_u32, Vec::new());
     for point in revolution.points() {

@@ -1,132 +1,108 @@
-//! Files -> maps, through the same door, engine, recorder and publishers as live data, with the capture's own stamps:
-//! the same files always make the same maps.
+//! `clearway replay`: recorded drives -> maps, through the same event queue, engine, recorder and publishers as live
+//! data, with the stamps of the recording. The same files always make the same maps.
 //!
-//! A capture rarely says how its sensor was mounted. Without extrinsics a first pass over the first revolutions finds
-//! height, pitch and roll from the ground around the vehicle; the figures are said, and recorded. Where there is no
-//! ground to find, nothing is guessed: the files are decoded and no map is made, and that is said too.
+//! | file | in -> out |
+//! |---|---|
+//! | [`options`] | the command line -> [`Options`] |
+//! | `plan` | options, files -> configuration, mount, readings |
+//! | [`clouds`] | revolutions -> PCD files |
+//! | [`summary`] | the state at the end -> text, JSON |
+//!
+//! A capture rarely contains how its sensor was mounted. Without extrinsics, a first pass over the first revolutions
+//! estimates height, pitch and roll from the ground around the vehicle; the estimate is printed and recorded. If there is
+//! no ground to estimate from, the files are decoded and no map is made, and the summary says so.
 
-use std::path::PathBuf;
+use std::io::IsTerminal;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use clearway_lidar::model::Model;
-use clearway_mapping::config::Extrinsics;
+use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::cli::replay::clouds::CloudError;
-use crate::config::ConfigError;
-use crate::ingest::files::{FilesError, Readings};
-use crate::ingest::{Door, locked};
-use crate::record::reader::RecordingError;
-use crate::server::{EndError, Running, Server, StartError};
+use super::output::{block_on, print, print_line, stop_signal};
+use super::serve::log_endpoints;
+use crate::ingest::files::Readings;
+use crate::ingest::queue::EventQueue;
+use crate::server::{Running, Server};
+use crate::sync::locked;
 
 pub mod clouds;
+pub mod options;
 mod plan;
-mod summary;
+pub mod summary;
 
+pub use options::{Options, ReplayError, Speed};
 use plan::{Plan, plan};
 pub use summary::{Mount, Summary, describe};
 
-/// How fast a capture's time passes.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Speed {
-    /// So many times as fast as recorded.
-    Times(f64),
-    /// As fast as the machine can.
-    Max,
+/// Interval at which the progress bar is drawn again.
+const DRAW_INTERVAL: Duration = Duration::from_millis(100);
+
+/// Replays the files and prints the summary.
+///
+/// # Errors
+/// [`ReplayError`].
+pub fn run(options: Options) -> anyhow::Result<()> {
+    block_on(replay_and_print(options))
 }
 
-impl std::str::FromStr for Speed {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "as-recorded" => Ok(Self::Times(1.0)),
-            "max" => Ok(Self::Max),
-            factor => match factor.parse() {
-                Ok(times) if times > 0.0 && f64::is_finite(times) => Ok(Self::Times(times)),
-                _ => Err("as-recorded, max, or a factor above 0 is allowed".into()),
-            },
+async fn replay_and_print(options: Options) -> anyhow::Result<()> {
+    let json = options.json;
+    let progress = Arc::new(Progress::default());
+    let mut bar = None;
+    let started = |running: &Running, summary: &Summary| {
+        if let Some(description) = describe(&summary.mount) {
+            eprintln!("extrinsics {description}");
         }
+        log_endpoints(running);
+        // Only now: a bar drawn before these lines would stay above them.
+        bar = (!json && std::io::stderr().is_terminal()).then(|| tokio::spawn(draw(progress.clone())));
+    };
+    let outcome = replay(options, progress.clone(), started, stop_signal()?).await;
+    if let Some(bar) = bar {
+        bar.abort();
+        // The task ends with a cancellation, which is its normal end.
+        let _ = bar.await;
     }
+    let summary = outcome?;
+    for truncated in &summary.truncated {
+        eprintln!("warning: {}: {}; what came before was used", truncated.file.display(), truncated.reason);
+    }
+    for note in &summary.notes {
+        eprintln!("note: {note}");
+    }
+    if json { print_line(&format!("{:#}", summary.to_json()))? } else { print(&summary.to_text())? };
+    Ok(())
 }
 
-/// What to replay, and how.
-#[derive(Clone, Debug, Default)]
-pub struct Options {
-    /// Files and folders, in order.
-    pub files: Vec<PathBuf>,
-    /// Recording to write.
-    pub record: Option<PathBuf>,
-    /// Pace; as fast as possible where absent, as recorded while serving.
-    pub speed: Option<Speed>,
-    /// Folder for a PCD a revolution.
-    pub clouds: Option<PathBuf>,
-    /// The sensor's own table.
-    pub calibration: Option<PathBuf>,
-    /// How the sensor is mounted; estimated where neither this nor the configuration says it.
-    pub extrinsics: Option<Extrinsics>,
-    /// The sensor's model; found from the data where absent.
-    pub model: Option<Model>,
-    /// ROS topics of an MCAP file; chosen where none is named.
-    pub topics: Vec<String>,
-    /// Its turning rate; found from the data where absent.
-    pub rpm: Option<f32>,
-    /// Configuration whose vehicle and publishers are used.
-    pub config: Option<PathBuf>,
-    /// Overrides of the configuration.
-    pub set: Vec<String>,
-    /// Publish the maps, and go on serving the last one.
-    pub serve: bool,
-    /// Whose journal is replayed out of a recording of several vehicles; whose configuration is used.
-    pub vehicle: Option<String>,
-}
-
-/// Why a replay did not come to its end.
-#[derive(Debug, thiserror::Error)]
-pub enum ReplayError {
-    /// A file cannot be read.
-    #[error(transparent)]
-    Files(#[from] FilesError),
-    /// A recording cannot be used.
-    #[error(transparent)]
-    Recording(#[from] RecordingError),
-    /// The configuration cannot be used.
-    #[error(transparent)]
-    Config(#[from] ConfigError),
-    /// No vehicle of that name is configured.
-    #[error("--vehicle {name}: the configuration has: {known}")]
-    Vehicle {
-        /// As it was given.
-        name: String,
-        /// What there is.
-        known: String,
-    },
-    /// The point clouds cannot be written.
-    #[error(transparent)]
-    Clouds(#[from] CloudError),
-    /// The server did not start.
-    #[error(transparent)]
-    Start(#[from] StartError),
-    /// The server did not end as it should have.
-    #[error(transparent)]
-    End(#[from] EndError),
-    /// The engine stopped in the middle.
-    #[error("the vehicle's engine has stopped")]
-    Engine,
-}
-
-/// How far a replay has come, for a progress bar.
+/// How many bytes of the files a replay has read, for a progress bar.
 #[derive(Debug, Default)]
 pub struct Progress {
     /// Bytes of all files.
     pub bytes: AtomicU64,
-    /// Bytes read.
+    /// Bytes read so far.
     pub bytes_read: AtomicU64,
 }
 
-/// Replays the files to their end; `started` sees the running server, and with [`Options::serve`] the replay returns
-/// only after `stop` has resolved. Needs a multi-thread tokio runtime.
+/// Draws the progress bar until the task is aborted, and then clears it.
+async fn draw(progress: Arc<Progress>) {
+    struct Cleared(ProgressBar);
+    impl Drop for Cleared {
+        fn drop(&mut self) {
+            self.0.finish_and_clear();
+        }
+    }
+    let template = "{bar:40} {bytes}/{total_bytes} {bytes_per_sec} {eta}";
+    let style = ProgressStyle::with_template(template).expect("the template is a constant");
+    let bar = Cleared(ProgressBar::new(progress.bytes.load(Ordering::Relaxed)).with_style(style));
+    loop {
+        bar.0.set_position(progress.bytes_read.load(Ordering::Relaxed));
+        tokio::time::sleep(DRAW_INTERVAL).await;
+    }
+}
+
+/// Replays the files to their end. `started` is called with the running server before the first event; with
+/// [`Options::serve`] the replay returns only after `stop` has resolved. Needs a multi-thread tokio runtime.
 ///
 /// # Errors
 /// [`ReplayError`]; nothing is left running.
@@ -154,8 +130,8 @@ pub async fn replay(
     started(&running, &summary);
 
     let speed = options.speed.unwrap_or(if options.serve { Speed::Times(1.0) } else { Speed::Max });
-    let door = running.doors[0].door.clone();
-    let read = tokio::task::spawn_blocking(move || feed(readings, &door, speed, &progress)).await;
+    let queue = running.inputs[0].queue.clone();
+    let read = tokio::task::spawn_blocking(move || feed(readings, &queue, speed, &progress)).await;
     let status = running.vehicles.0[0].status.clone();
     let outcome = match read {
         Ok(outcome) => outcome,
@@ -177,8 +153,8 @@ pub async fn replay(
     Ok(summary)
 }
 
-/// Puts every reading through the door at its time.
-fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) -> Result<Readings, ReplayError> {
+/// Pushes every reading to the event queue, at its time if the speed is not [`Speed::Max`].
+fn feed(mut readings: Readings, queue: &EventQueue, speed: Speed, progress: &Progress) -> Result<Readings, ReplayError> {
     let began = Instant::now();
     let (mut first_ns, mut newest_ns) = (None, None);
     while let Some(reading) = readings.next() {
@@ -189,33 +165,18 @@ fn feed(mut readings: Readings, door: &Door, speed: Speed, progress: &Progress) 
             std::thread::sleep(due.saturating_sub(began.elapsed()));
         }
         progress.bytes_read.store(readings.bytes_read(), Ordering::Relaxed);
-        leave_refused(&mut readings, door);
+        leave_refused(&mut readings, queue);
         newest_ns = Some(reading.arrival_ns);
-        door.enter_captured(reading).map_err(|_| ReplayError::Engine)?;
+        queue.push_captured(reading).map_err(|_| ReplayError::Engine)?;
     }
-    leave_refused(&mut readings, door);
-    door.close(newest_ns).map_err(|_| ReplayError::Engine)?;
+    leave_refused(&mut readings, queue);
+    queue.report_drops(newest_ns).map_err(|_| ReplayError::Engine)?;
     Ok(readings)
 }
 
-/// Leaves the messages that were refused outside the door, which counts and tells them.
-fn leave_refused(readings: &mut Readings, door: &Door) {
+/// Reports the messages that the files' readers have refused to the drop counters.
+fn leave_refused(readings: &mut Readings, queue: &EventQueue) {
     for ((source, reason), count) in readings.untold() {
-        door.outside().leave_observations(source, reason, count);
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_speed_is_a_word_or_a_factor_above_nothing() {
-        assert_eq!("as-recorded".parse(), Ok(Speed::Times(1.0)));
-        assert_eq!("max".parse(), Ok(Speed::Max));
-        assert_eq!("2.5".parse(), Ok(Speed::Times(2.5)));
-        for wrong in ["0", "-1", "inf", "NaN", "fast"] {
-            assert!(wrong.parse::<Speed>().unwrap_err().contains("as-recorded, max"), "{wrong}");
-        }
+        queue.drops().record_refused_messages(source, reason, count);
     }
 }

@@ -1,4 +1,5 @@
-//! Everything a replay knows before its first event: which files, whose configuration, how the sensor is mounted.
+//! The options and files of a replay -> everything that is known before its first event: the configuration, how the
+//! sensors are mounted, the readings.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -6,34 +7,42 @@ use std::path::{Path, PathBuf};
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::{Echo, Revolution};
-use clearway_lidar::sensor::Sensor;
+use clearway_lidar::Sensor;
 use clearway_mapping::config::{Extrinsics, MapsConfig, SENSORS_MAX, SensorConfig};
 use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::sensor::mount::estimate;
 use nalgebra::Isometry3;
 
-use super::{Mount, Options, ReplayError, describe};
-use crate::cli::replay::clouds::{Clouds, Written};
+use super::clouds::{Clouds, Written};
+use super::options::{Options, ReplayError};
+use super::summary::{Mount, describe};
 use crate::config::{Calibrations, Config, Recorder};
 use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::files::mcap::{McapError, Wanted};
 use crate::ingest::ros::{Choice, Offered, PoseFrom, SensorTopic};
-use crate::record::reader::Recording;
+use crate::record::reader::RecordingReader;
 use crate::server::Setup;
 
-/// Revolutions the mount is estimated from.
+/// Number of revolutions from which the mount is estimated: one second of a sensor at 600 rpm.
 const MOUNT_REVOLUTIONS: usize = 10;
+/// Height of a sensor above the ego frame's origin until its mount is given or estimated, in metres; ours, about the
+/// roof of a car.
+const MOUNT_HEIGHT_M: f64 = 2.0;
 
-/// Everything known before the first event.
+/// What is known before the first event.
 pub(super) struct Plan {
     pub(super) setup: Setup,
     pub(super) mount: Mount,
     pub(super) extrinsics: Extrinsics,
     pub(super) readings: Readings,
-    /// How many clouds were written, or why no more.
+    /// The number of point clouds written, or the error that ended the writing.
     pub(super) clouds: Option<Written>,
 }
 
+/// Finds the configuration, the mounts and the readings of a replay.
+///
+/// # Errors
+/// [`ReplayError`] if a file, a recording or the configuration cannot be used.
 pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     let files = Readings::open(&options.files, Wanted::default())?;
     let recorded = files.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
@@ -46,11 +55,11 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
         topics: options.topics.clone(),
         sensors_max: if known.is_mounted { vehicle.sensors.len() } else { SENSORS_MAX },
     };
-    let placed = match recorded.filter(|_| !known.is_mounted) {
-        Some(bag) => known.take_bag(&bag, &mut wanted, options.extrinsics.is_some())?,
+    let mount_from_tf = match recorded.filter(|_| !known.is_mounted) {
+        Some(bag) => known.apply_bag(&bag, &mut wanted, options.extrinsics.is_some())?,
         None => None,
     };
-    known.tell_sensors(options, scans)?;
+    known.apply_options(options, scans)?;
     let open = || Readings::open(&options.files, wanted.clone());
     let readings = open()?;
     let mount = match options.extrinsics {
@@ -59,8 +68,8 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
             Mount::Given
         }
         None if known.is_mounted => Mount::Given,
-        None if let Some(mount) = placed => mount,
-        None => known.find_mount(open()?)?,
+        None if let Some(mount) = mount_from_tf => mount,
+        None => known.estimate_mount(open()?)?,
     };
     let extrinsics = known.config.vehicles[0].sensors[0].extrinsics;
     let setup = known.setup(options)?;
@@ -69,24 +78,26 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     Ok(Plan { setup: Setup { observer, ..setup }, mount, extrinsics, readings, clouds })
 }
 
-/// What is known of the vehicle so far.
+/// What is known about the vehicle so far.
 struct Known {
-    /// Of one vehicle.
+    /// The configuration, with one vehicle.
     config: Config,
     tables: Calibrations,
-    /// Of the recording whose maps are made again.
+    /// Boot id of the recording whose maps are made again.
     boot_id: Option<u64>,
-    /// Whether the extrinsics are known.
+    /// True if the extrinsics of the sensors are known.
     is_mounted: bool,
+    /// Lines about the mounts, for the recording.
     remarks: Vec<String>,
 }
 
 impl Known {
-    /// Takes the sensors a ROS bag has, and `wanted` their topics; gives the first one's mount where tf tells it.
-    fn take_bag(&mut self, bag: &Path, wanted: &mut Wanted, is_given: bool) -> Result<Option<Mount>, ReplayError> {
+    /// Configures the sensors of a ROS bag and puts their topics into `wanted`. Returns the mount of the first sensor if
+    /// tf has it.
+    fn apply_bag(&mut self, bag: &Path, wanted: &mut Wanted, is_given: bool) -> Result<Option<Mount>, ReplayError> {
         let mut choice = choice(bag, wanted)?;
         keep_placed(&mut choice.sensors, is_given);
-        // Named, the same are chosen again when the bag is read.
+        // With names, the same topics are chosen again when the bag is read.
         wanted.topics = choice.sensors.iter().map(|sensor| sensor.topic.clone()).collect();
         if let Some(PoseFrom::Topic(topic)) = &choice.pose {
             wanted.topics.push(topic.clone());
@@ -105,19 +116,19 @@ impl Known {
         self.remarks.extend(mount.and_then(describe).map(|said| format!("extrinsics of {sensor}: {said}")));
     }
 
-    /// What the options, and files that hold nothing but scans, tell of the sensors.
-    fn tell_sensors(&mut self, options: &Options, scans: bool) -> Result<(), ReplayError> {
+    /// Applies the sensor options; `scans` is true if the files hold nothing but scans.
+    fn apply_options(&mut self, options: &Options, scans: bool) -> Result<(), ReplayError> {
         let sensors = &mut self.config.vehicles[0].sensors;
         for sensor in sensors.iter_mut() {
             (sensor.model, sensor.rpm) = (options.model.or(sensor.model), options.rpm.or(sensor.rpm));
         }
-        // Scans do not tell who made them, and KITTI's were made by this one.
+        // Scans do not name their sensor, and KITTI's scans are from this one.
         if scans && sensors[0].model.is_none() && self.tables[0][0].is_none() {
             sensors[0].model = Some(Model::Hdl64eS2);
         }
         if let Some(file) = &options.calibration {
             sensors[0].calibration = Some(file.display().to_string());
-            // The others have their tables, read from where their own configuration lies.
+            // The tables of the other sensors have been read from the folder of their own configuration.
             let mut first = self.config.clone();
             first.vehicles[0].sensors.truncate(1);
             self.tables[0][0] = first.calibrations(Path::new(""))?.remove(0).remove(0);
@@ -125,8 +136,8 @@ impl Known {
         Ok(())
     }
 
-    /// Mounts the first sensor as the ground in the first revolutions tells; where it tells nothing, no map is made.
-    fn find_mount(&mut self, readings: Readings) -> Result<Mount, ReplayError> {
+    /// Estimates the mount of the first sensor from the ground in the first revolutions. If that fails, no map is made.
+    fn estimate_mount(&mut self, readings: Readings) -> Result<Mount, ReplayError> {
         let vehicle = &mut self.config.vehicles[0];
         let sensor = &mut vehicle.sensors[0];
         let revolutions = first_revolutions(readings, sensor, self.tables[0][0].clone())?;
@@ -143,11 +154,11 @@ impl Known {
         Ok(mount)
     }
 
-    /// What the server is started with.
+    /// The setup with which the server starts.
     fn setup(self, options: &Options) -> Result<Setup, ReplayError> {
         let Self { config, tables: calibrations, boot_id, remarks, .. } = self;
         let file = options.config.as_deref().unwrap_or(Path::new("(replay)"));
-        // The paths of a run that serves nothing are not opened, and name no other run than they would elsewhere.
+        // A run that serves nothing opens none of these paths, and its boot id must not depend on the folder.
         let mut config = if options.serve { config.located(file) } else { config };
         config.recorder.file = options.record.clone().unwrap_or_default();
         if !options.serve {
@@ -156,8 +167,8 @@ impl Known {
         }
         config.check(file)?;
         let certificates = if options.serve { config.certificates(file)? } else { None };
-        // The same files and settings name the same run; served maps need a name of their own, or a reader that saw them
-        // before would take them for old ones.
+        // The same files and settings get the same boot id. Served maps need a new one, because a reader that has seen
+        // these maps before would drop them as old.
         let altered = options.extrinsics.is_some() || options.model.is_some() || options.rpm.is_some();
         let same_maps = !altered && options.calibration.is_none();
         let boot_id =
@@ -166,11 +177,11 @@ impl Known {
         if !remarks.is_empty() {
             notes.insert("mount".to_owned(), remarks.join("\n"));
         }
-        Ok(Setup { config, calibrations, certificates, boot_id, from_files: true, remarks, notes, observer: None })
+        Ok(Setup { config, calibrations, certificates, boot_id, from_files: true, config_comments: remarks, metadata: notes, observer: None })
     }
 }
 
-/// From `--config`, else from the recording itself, else plain.
+/// The configuration of `--config`, else of the recording, else the default one.
 fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, ReplayError> {
     let known =
         |config, tables, boot_id, is_mounted| Known { config, tables, boot_id, is_mounted, remarks: Vec::new() };
@@ -193,27 +204,27 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, Repla
         return Ok(known(config, tables, None, true));
     }
     if let Some(file) = recorded {
-        let recording = Recording::open(file)?;
-        if recording.preface().config.is_some() {
+        let recording = RecordingReader::open(file)?;
+        if recording.header().config.is_some() {
             let (mut config, mut tables) = recording.config()?;
             pick(&mut config, &mut tables)?;
-            // What the recording says of its own publishers and files is not for this run.
+            // The publishers and files of the recorded run are not those of this run.
             let config = Config { vehicles: config.vehicles, ..Config::default() };
-            return Ok(known(config, tables, Some(recording.preface().boot_id), true));
+            return Ok(known(config, tables, Some(recording.header().boot_id), true));
         }
     }
     Ok(known(Config::of_one_vehicle("car", "top"), vec![vec![None]], None, false))
 }
 
-/// What is taken of a ROS bag.
+/// The topics of a ROS bag to read.
 fn choice(bag: &Path, wanted: &Wanted) -> Result<Choice, ReplayError> {
     let offered = Offered::look(bag).map_err(McapError::from).map_err(FilesError::from)?;
     let choice = offered.choose(bag, &wanted.topics, wanted.sensors_max).map_err(McapError::from);
     Ok(choice.map_err(FilesError::from)?)
 }
 
-/// Of several sensors those are taken that tf places; where it places none the first, whose place is to be found or
-/// `is_given`.
+/// Keeps the sensors that tf places. If tf places none, keeps the first, whose mount is estimated or given. If the mount
+/// `is_given`, the first sensor counts as placed.
 fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
     let mut number = 0;
     let mut known = |sensor: &SensorTopic| {
@@ -226,8 +237,8 @@ fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
     }
 }
 
-/// The vehicle's sensors as the transforms of a ROS bag place them. An only one is `top`, several are named by their
-/// frames.
+/// The configuration of each sensor of a ROS bag, and its mount if tf has it. A single sensor is named `top`, several
+/// are named after their frames.
 fn sensors_of(choice: &Choice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
     let mut sensors: Vec<SensorConfig> = Vec::new();
     for (index, sensor) in choice.sensors.iter().enumerate() {
@@ -237,8 +248,9 @@ fn sensors_of(choice: &Choice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
         } else if sensors.iter().any(|before| before.name == name) {
             name = format!("{name}-{index}");
         }
-        // Where tf tells nothing the place is given or estimated hereafter.
-        let ego_from_sensor = sensor.ego_from_sensor.unwrap_or_else(|| Isometry3::translation(0.0, 0.0, 2.0));
+        // Without a transform the mount is given or estimated later.
+        let unknown = || Isometry3::translation(0.0, 0.0, MOUNT_HEIGHT_M);
+        let ego_from_sensor = sensor.ego_from_sensor.unwrap_or_else(unknown);
         sensors.push(SensorConfig::new(name, extrinsics_of(&ego_from_sensor)));
     }
     let mount = |sensor: &SensorTopic| {
@@ -248,7 +260,7 @@ fn sensors_of(choice: &Choice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
     (sensors, choice.sensors.iter().map(mount).collect())
 }
 
-/// A frame's id in the letters of a sensor's name.
+/// A frame's id, with each character that a sensor's name cannot have replaced by `_`.
 fn name_of_frame(frame_id: &str) -> String {
     let letter = |c: char| if c.is_ascii_alphanumeric() || c == '-' { c.to_ascii_lowercase() } else { '_' };
     let name: String = frame_id.chars().map(letter).take(48).collect();
@@ -262,7 +274,7 @@ fn extrinsics_of(ego_from_sensor: &Isometry3<f64>) -> Extrinsics {
     Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg }
 }
 
-/// The points of the first revolutions (or scans), sensor frame, metres.
+/// The points of the first revolutions or scans, in the sensor frame, in metres.
 fn first_revolutions(
     readings: Readings,
     config: &SensorConfig,
@@ -273,7 +285,7 @@ fn first_revolutions(
     for reading in readings {
         let reading = reading?;
         match &reading.body {
-            // What is refused is counted and named on the real pass.
+            // Refused datagrams are counted in the second pass, which makes the maps.
             Body::Datagram(payload) => {
                 if let Ok(Some(revolution)) = sensor.push(payload, reading.arrival_ns) {
                     clouds.push(points_of(revolution));
@@ -303,7 +315,7 @@ fn points_of_scan(scan: &Scan) -> Vec<[f32; 3]> {
     scan.x.iter().zip(&scan.y).zip(&scan.z).map(|((&x, &y), &z)| [x, y, z]).collect()
 }
 
-/// FNV-1a over settings and file names.
+/// FNV-1a hash of the settings and the file names.
 fn fingerprint(config: &Config, files: &[PathBuf]) -> u64 {
     let settings = Config { recorder: Recorder::default(), ..config.clone() }.to_toml();
     let names = files.iter().filter_map(|file| file.file_name()).flat_map(|name| name.as_encoded_bytes());

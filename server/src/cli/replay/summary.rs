@@ -1,4 +1,4 @@
-//! What came of a replay, for programs and for people.
+//! The result of a replay, as text and as JSON.
 
 use std::path::PathBuf;
 
@@ -9,49 +9,49 @@ use serde_json::{Value, json};
 use crate::ingest::files::Truncated;
 use crate::status::Snapshot;
 
-/// Where the mount came from.
+/// Where the extrinsics of the first sensor come from.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Mount {
-    /// Options, configuration or recording.
+    /// The options, the configuration or the recording.
     Given,
     /// The transforms of a ROS bag.
     Tf {
-        /// The vehicle's frame.
+        /// Name of the vehicle's frame.
         ego_frame: String,
-        /// The sensor's.
+        /// Name of the sensor's frame.
         frame_id: String,
     },
-    /// The ground in the first revolutions.
+    /// An estimate from the ground in the first revolutions.
     Estimated(MountEstimate),
-    /// The ground could not be found; no map was made.
+    /// Nowhere: no ground was found to estimate them from, so no map was made.
     Unknown(MountError),
-    /// Nowhere: the files hold no revolution.
+    /// Nowhere: the files hold no revolution, so none are needed.
     Unneeded,
 }
 
-/// What came of a replay.
+/// The result of a replay.
 #[derive(Clone, Debug)]
 pub struct Summary {
-    /// Ledger, sensors, maps, latency.
+    /// Counters, sensors, maps and latency of the vehicle.
     pub snapshot: Snapshot,
-    /// The extrinsics used.
+    /// Extrinsics of the first sensor.
     pub extrinsics: Extrinsics,
-    /// Where they came from.
+    /// Where the extrinsics come from.
     pub mount: Mount,
-    /// Files that ended in the middle of something.
+    /// Files that are cut off.
     pub truncated: Vec<Truncated>,
-    /// What else is worth knowing.
+    /// Remarks about the files, one a line.
     pub notes: Vec<String>,
-    /// Point clouds written.
+    /// Number of point clouds written.
     pub clouds: u64,
-    /// Wall time.
+    /// Duration of the replay, in seconds.
     pub seconds: f64,
-    /// The recording written.
+    /// The recording that was written.
     pub record: Option<PathBuf>,
 }
 
 impl Summary {
-    /// One object with all of it.
+    /// The summary as one JSON object.
     pub fn to_json(&self) -> Value {
         let Snapshot { ledger, sensors, .. } = &self.snapshot;
         let sensors = sensors.iter().map(|sensor| {
@@ -108,7 +108,7 @@ impl Summary {
         }
     }
 
-    /// A few lines for people.
+    /// The summary as a few lines of text.
     pub fn to_text(&self) -> String {
         let snapshot = &self.snapshot;
         let ledger = &snapshot.ledger;
@@ -131,7 +131,7 @@ impl Summary {
             snapshot.drivable_share.map_or(String::new(), |share| format!(", newest {:.1} % drivable", 100.0 * share));
         lines.push(format!("{} maps{share}", snapshot.maps));
         if let (Some(p50), Some(p99)) = (snapshot.latency_ms_p50, snapshot.latency_ms_p99) {
-            lines.push(format!("a map took {p50:.2} ms in the median, {p99:.2} ms at the 99th percentile"));
+            lines.push(format!("time to make a map: median {p50:.2} ms, 99th percentile {p99:.2} ms"));
         }
         if let Some(record) = &self.record {
             lines.push(format!("recorded {}", record.display()));
@@ -143,12 +143,12 @@ impl Summary {
     }
 }
 
-/// What was found out about the mount, in one line; nothing where it was not looked for.
+/// How the sensor is mounted and how that is known, in one line; `None` if it was given or is not needed.
 pub fn describe(mount: &Mount) -> Option<String> {
     match mount {
         Mount::Estimated(estimate) => Some(format!(
-            "estimated from the ground in {} revolutions: height {:.3} m, pitch {:.2} deg, roll {:.2} deg ({} of {} places \
-             on one plane, residual {:.3} m)",
+            "estimated from the ground in {} revolutions: height {:.3} m, pitch {:.2} deg, roll {:.2} deg ({} of {} \
+             lowest points on one plane, residual {:.3} m)",
             estimate.revolutions,
             estimate.height_m,
             estimate.pitch_rad.to_degrees(),
@@ -158,13 +158,13 @@ pub fn describe(mount: &Mount) -> Option<String> {
             estimate.residual_m,
         )),
         Mount::Tf { ego_frame, frame_id } => Some(format!(
-            "tf's transform from {frame_id} to {ego_frame}; the origin of {ego_frame} is taken to be on the ground, else give \
-             --extrinsics"
+            "from tf, from {frame_id} to {ego_frame}; this assumes that the origin of {ego_frame} is on the ground; if it is \
+             not, give --extrinsics"
         )),
         Mount::Unknown(why) => Some(format!(
-            "unknown, so no map is made: the files do not say how the sensor is mounted, and it cannot be estimated: {why}; \
-             give it with --extrinsics x,y,z,roll,pitch,yaw (metres and degrees, such as 0,0,1.9,0,0,0), or with --config \
-             FILE"
+            "unknown, so no map is made: the files do not contain how the sensor is mounted, and it cannot be estimated: \
+             {why}; give it with --extrinsics x,y,z,roll,pitch,yaw (metres and degrees, such as 0,0,1.9,0,0,0), or with \
+             --config FILE"
         )),
         Mount::Given | Mount::Unneeded => None,
     }

@@ -16,7 +16,7 @@ use clearway_lidar::packet::PACKET_LENGTH;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use clearway_mapping::event::Body;
 
-use super::Reading;
+use crate::ingest::queue::Reading;
 
 /// Why a capture cannot be read on.
 #[derive(Debug, thiserror::Error)]

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use clearway_mapping::event::Body;
 use clearway_mapping::scan_file::{ScanFileError, read_bin, read_pcd};
 
-use super::Reading;
+use crate::ingest::queue::Reading;
 
 /// Stamp of the first scan: 2011-09-26 00:00:00 UTC, the day of KITTI's first drives.
 pub const EPOCH_NS: i64 = 1_316_995_200_000_000_000;

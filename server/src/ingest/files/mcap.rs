@@ -4,9 +4,9 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::Path;
 
-use super::Reading;
+use crate::ingest::queue::Reading;
 use crate::ingest::ros::{ChoiceError, Intake, Offered};
-use crate::record::reader::{Entry, Recording, RecordingError};
+use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 
 /// Messages refused that the door has not been told of yet, by sensor and reason.
 pub type Untold = BTreeMap<(u16, &'static str), u64>;
@@ -24,7 +24,7 @@ pub struct Wanted {
 
 /// An open MCAP file; an iterator over its readings.
 pub struct Source {
-    recording: Recording,
+    recording: RecordingReader,
     vehicle: Option<String>,
     /// What takes the ROS messages; `None` where the file is a recording of ours.
     intake: Option<Intake>,
@@ -55,9 +55,9 @@ impl Source {
     /// # Errors
     /// [`McapError`] where the file cannot be read, is no MCAP, or has not the topics wanted.
     pub fn open(file: &Path, wanted: &Wanted, intake: Option<Intake>) -> Result<Self, McapError> {
-        let recording = Recording::open(file)?;
+        let recording = RecordingReader::open(file)?;
         let (mut intake, mut notes) = (intake, Vec::new());
-        if recording.preface().config.is_some() {
+        if recording.header().config.is_some() {
             intake = None;
         } else if intake.is_none() {
             let choice = Offered::look(file)?.choose(file, &wanted.topics, wanted.sensors_max)?;
@@ -78,7 +78,7 @@ impl Source {
     }
 
     /// The recording underneath.
-    pub fn recording(&self) -> &Recording {
+    pub fn recording(&self) -> &RecordingReader {
         &self.recording
     }
 
@@ -105,9 +105,9 @@ impl Source {
         self.intake
     }
 
-    fn take(&mut self, entry: Entry) {
+    fn take(&mut self, entry: RecordedMessage) {
         match entry {
-            Entry::Event { vehicle, event } => {
+            RecordedMessage::Event { vehicle, event } => {
                 if *self.vehicle.get_or_insert_with(|| vehicle.clone()) == vehicle {
                     self.is_journal = true;
                     let (arrival_ns, source, body) = (event.arrival_ns, event.source, event.body);
@@ -116,7 +116,7 @@ impl Source {
                     self.ignored.insert(format!("/{vehicle}/journal"));
                 }
             }
-            Entry::Ros { topic, kind, log_ns, bytes } => {
+            RecordedMessage::Ros { topic, kind, log_ns, bytes } => {
                 let Some(intake) = self.intake.as_mut().filter(|intake| intake.wants(&topic, kind)) else {
                     return;
                 };
@@ -125,7 +125,7 @@ impl Source {
                     self.refused.entry(topic).or_insert_with(|| (0, refused.to_string())).0 += 1;
                 }
             }
-            Entry::Map { .. } => {}
+            RecordedMessage::Map { .. } => {}
         }
     }
 }

@@ -15,7 +15,7 @@ use capture::CaptureError;
 use kitti::ScanError;
 use mcap::{McapError, Untold, Wanted};
 use super::ros::Intake;
-use super::Reading;
+use crate::ingest::queue::Reading;
 
 /// What a file holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

@@ -10,7 +10,7 @@ use clearway_ros::{Frames, Kind, PointCloud2};
 use nalgebra::Isometry3;
 
 use super::{Intake, PoseFrom};
-use crate::record::reader::{Entry, Recording, RecordingError};
+use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 
 /// How much of a file is looked at before its topics are chosen: latched transforms come first, everything else often.
 const LOOK_NS: i64 = 10_000_000_000;
@@ -93,8 +93,8 @@ impl Offered {
     pub fn look(file: &Path) -> Result<Self, RecordingError> {
         let mut offered = Self::default();
         let mut first_ns = None;
-        for entry in Recording::open(file)? {
-            let Entry::Ros { topic, kind, log_ns, bytes } = entry? else { continue };
+        for entry in RecordingReader::open(file)? {
+            let RecordedMessage::Ros { topic, kind, log_ns, bytes } = entry? else { continue };
             if log_ns.saturating_sub(*first_ns.get_or_insert(log_ns)) > LOOK_NS {
                 break;
             }

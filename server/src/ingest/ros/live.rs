@@ -16,10 +16,11 @@ use zenoh::pubsub::Subscriber;
 use zenoh::sample::Sample;
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, HistoryConfig};
 
-use super::super::{Door, locked};
+use crate::ingest::queue::EventQueue;
+use crate::sync::locked;
 use super::{Intake, PoseFrom};
 use crate::config::Ros;
-use crate::publish::zenoh::{ZenohError, failed};
+use crate::zenoh_session::ZenohError;
 
 /// Publishers whose sequences are followed; more are taken, but not followed.
 const PUBLISHERS_MAX: usize = 256;
@@ -28,12 +29,12 @@ const MISSING_MAX: u64 = 1000;
 
 /// What a vehicle listens to.
 #[derive(Default)]
-pub struct Listener {
+pub struct LiveTopics {
     topics: Vec<Subscriber<()>>,
     latched: Vec<AdvancedSubscriber<()>>,
 }
 
-impl Listener {
+impl LiveTopics {
     /// Ends listening; after this no message enters, and the door is let go.
     pub async fn stop(self) {
         for subscriber in self.topics {
@@ -52,7 +53,7 @@ impl Listener {
 /// Where the messages of a vehicle's topics meet.
 struct Ear {
     intake: Intake,
-    door: Door,
+    door: EventQueue,
     /// Newest sequence by publisher.
     sequences: BTreeMap<[u8; 16], i64>,
 }
@@ -61,12 +62,12 @@ struct Ear {
 ///
 /// # Errors
 /// [`ZenohError`] with what zenoh says.
-pub async fn listen<'a>(
+pub async fn subscribe<'a>(
     session: &Session,
     ros: &Ros,
     sensors: impl Iterator<Item = &'a String>,
-    door: Door,
-) -> Result<Listener, ZenohError> {
+    door: EventQueue,
+) -> Result<LiveTopics, ZenohError> {
     let of = |(name, index): (&String, u16)| ros.sensors.get(name).map(|topic| (topic.clone(), index));
     let sensors: BTreeMap<String, u16> = sensors.zip(0..).filter_map(of).collect();
     let pose = match (ros.pose.as_str(), ros.fixed_frame.as_str()) {
@@ -78,12 +79,12 @@ pub async fn listen<'a>(
     let topics: Vec<String> = sensors.keys().cloned().chain(pose_topic).chain([ros.tf.clone()]).collect();
     let intake = Intake::new(sensors, pose, &ros.ego_frame, Frames::default());
     let ear = Arc::new(Mutex::new(Ear { intake, door, sequences: BTreeMap::new() }));
-    let mut listener = Listener::default();
+    let mut listener = LiveTopics::default();
     for topic in topics.into_iter().filter(|topic| !topic.is_empty()) {
         let (key, ear) = (key(ros.domain, &topic), ear.clone());
         let subscriber = session.declare_subscriber(key.clone());
         let subscriber = subscriber.callback(move |sample| locked(&ear).hear(&topic, &sample));
-        listener.topics.push(subscriber.await.map_err(failed(format!("subscriber {key}")))?);
+        listener.topics.push(subscriber.await.map_err(ZenohError::of(format!("subscriber {key}")))?);
     }
     if !ros.tf_static.is_empty() {
         // Latched: what was said before we came is asked for.
@@ -91,7 +92,7 @@ pub async fn listen<'a>(
         let subscriber = session.declare_subscriber(key.clone());
         let subscriber = subscriber.callback(move |sample| locked(&ear).hear(&topic, &sample));
         let subscriber = subscriber.history(HistoryConfig::default().detect_late_publishers());
-        listener.latched.push(subscriber.await.map_err(failed(format!("subscriber {key}")))?);
+        listener.latched.push(subscriber.await.map_err(ZenohError::of(format!("subscriber {key}")))?);
     }
     Ok(listener)
 }
@@ -104,7 +105,7 @@ impl Ear {
     /// Takes one sample, or counts why not. Never waits for the engine.
     fn hear(&mut self, topic: &str, sample: &Sample) {
         let missing = sample.attachment().map_or(0, |attachment| self.missing(&attachment.to_bytes()));
-        self.door.leave_outside(self.intake.source(topic), Cause::Queue, missing);
+        self.door.record_drop(self.intake.source(topic), Cause::Queue, missing);
         let name = sample.key_expr().as_str().rsplit('/').nth(1).unwrap_or_default();
         let Some(kind) = Kind::of(name) else {
             tracing::info!(topic, name, "ros: not a type that is read");
@@ -117,14 +118,14 @@ impl Ear {
             return self.refuse(topic, refused.reason());
         }
         for reading in readings {
-            if self.door.enter(reading.source, reading.body).is_err() {
+            if self.door.push(reading.source, reading.body).is_err() {
                 return;
             }
         }
     }
 
     fn refuse(&self, topic: &str, reason: &'static str) {
-        self.door.outside().leave_observations(self.intake.source(topic), reason, 1);
+        self.door.drops().record_refused_messages(self.intake.source(topic), reason, 1);
     }
 
     /// How many messages of its publisher are missing before this one.

@@ -8,13 +8,13 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use bytes::Bytes;
-use clearway_mapping::event::{Body, EgoPose, NOBODY, Scan};
+use clearway_mapping::event::{Body, EgoPose, UNKNOWN_SOURCE, Scan};
 use clearway_ros::pose::{Odometry, StampedTransform, pose_stamped, tf_message};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, MessageError, PointCloud2, Points};
 use nalgebra::{Isometry3, Vector3};
 
-use super::Reading;
+use crate::ingest::queue::Reading;
 
 mod choice;
 #[cfg(feature = "zenoh")]
@@ -100,9 +100,9 @@ impl Intake {
         kind == Kind::TfMessage || self.sensors.contains_key(topic) || self.is_pose(topic)
     }
 
-    /// The sensor this topic is taken for; [`NOBODY`] for what concerns the whole vehicle.
+    /// The sensor this topic is taken for; [`UNKNOWN_SOURCE`] for what concerns the whole vehicle.
     pub fn source(&self, topic: &str) -> u16 {
-        self.sensors.get(topic).copied().unwrap_or(NOBODY)
+        self.sensors.get(topic).copied().unwrap_or(UNKNOWN_SOURCE)
     }
 
     fn is_pose(&self, topic: &str) -> bool {

@@ -1,8 +1,8 @@
-//! UDP sockets -> the vehicles' doors. One named OS thread a socket; several sensors and several vehicles can share a
-//! socket and are told apart by their senders.
+//! UDP sockets -> the event queues of the vehicles. One named OS thread a socket. Several sensors and several vehicles
+//! can share a socket; the sender's address identifies the sensor.
 //!
-//! The threads do nothing else and wait for nobody: where an engine does not keep up, readings are lost in its door's
-//! queue and counted there, not in the kernel's buffer.
+//! The threads do nothing else and never wait for an engine. If an engine does not keep up, readings are lost at its
+//! event queue, which counts them, and not in the kernel's buffer.
 
 use std::io::{self, PipeReader, PipeWriter};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -14,8 +14,8 @@ use nix::net::if_::if_nametoindex;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
 
-use super::{Closed, Door};
 use crate::config::{Listener, Vehicle, listeners};
+use crate::ingest::queue::{EventQueue, QueueClosedError};
 
 mod receive;
 
@@ -25,23 +25,24 @@ pub use receive::{BATCH, DATAGRAM_BYTES_MAX, Received, Receiver};
 #[derive(Debug, Default)]
 pub struct Sockets(Vec<(Socket, SocketAddr, Listener)>);
 
-/// A socket that cannot be had.
+/// A socket cannot be bound.
 #[derive(Debug, thiserror::Error)]
 #[error("udp {at}: {source}")]
 pub struct BindError {
-    /// Index of the first vehicle that asks for it.
+    /// Index of the first vehicle that is configured with the socket.
     pub vehicle: usize,
-    /// Where it was to be bound.
+    /// The configured address.
     pub at: SocketAddr,
-    /// Why.
+    /// The system's reason.
     pub source: io::Error,
 }
 
 impl Sockets {
-    /// Binds what the vehicles ask for, with the receive buffers asked for; says so when the kernel gives less.
+    /// Binds the configured sockets of all vehicles. Logs a warning if the kernel allows a smaller receive buffer than
+    /// configured.
     ///
     /// # Errors
-    /// [`BindError`] for the first socket that cannot be had.
+    /// [`BindError`] for the first socket that cannot be bound.
     pub fn bind(vehicles: &[Vehicle]) -> Result<Self, BindError> {
         let bound = listeners(vehicles).into_iter().map(|listener| match bind(&listener) {
             Ok((socket, at)) => Ok((socket, at, listener)),
@@ -50,46 +51,45 @@ impl Sockets {
         Ok(Self(bound.collect::<Result<_, _>>()?))
     }
 
-    /// Where a vehicle's first sensor that sends datagrams is heard: data, telemetry.
+    /// The bound addresses of a vehicle's first UDP sensor: for data packets, for telemetry.
     pub fn addresses(&self, vehicle: usize) -> Option<(SocketAddr, SocketAddr)> {
         let source = self.0.iter().flat_map(|(.., l)| &l.routes).find(|route| route.vehicle == vehicle)?.source;
-        let hears = |l: &Listener| l.routes.iter().any(|route| (route.vehicle, route.source) == (vehicle, source));
-        let mut at = self.0.iter().filter(|(.., listener)| hears(listener)).map(|(_, at, _)| *at);
+        let has_route = |l: &Listener| l.routes.iter().any(|route| (route.vehicle, route.source) == (vehicle, source));
+        let mut at = self.0.iter().filter(|(.., listener)| has_route(listener)).map(|(_, at, _)| *at);
         // Data comes before telemetry in `listeners`; both may arrive at one socket.
         let data = at.next()?;
         Some((data, at.next().unwrap_or(data)))
     }
 
-    /// Reads all sockets, each on a thread of its own, until the [`Readers`] are stopped; `doors` in the order of the
-    /// vehicles.
+    /// Starts one thread a socket, which reads until [`UdpThreads::stop`]. `queues` are in the order of the vehicles.
     ///
     /// # Errors
-    /// What the system says where it has no thread or pipe to give.
-    pub fn read(self, doors: &[Door]) -> io::Result<Readers> {
+    /// [`io::Error`] if the system cannot create a thread or pipe.
+    pub fn start(self, queues: &[EventQueue]) -> io::Result<UdpThreads> {
         let (stopped, stop) = io::pipe()?;
         let mut threads = Vec::new();
         for (socket, at, listener) in self.0 {
-            let (doors, stopped) = (doors.to_vec(), stopped.try_clone()?);
-            let read = move || {
-                if let Err(error) = read(socket, &listener, &doors, &stopped) {
+            let (queues, stopped) = (queues.to_vec(), stopped.try_clone()?);
+            let run = move || {
+                if let Err(error) = receive(socket, &listener, &queues, &stopped) {
                     tracing::error!(%at, %error, "udp ended");
                 }
             };
-            threads.push(std::thread::Builder::new().name(format!("udp {}", at.port())).spawn(read)?);
+            threads.push(std::thread::Builder::new().name(format!("udp {}", at.port())).spawn(run)?);
         }
-        Ok(Readers { stop, threads })
+        Ok(UdpThreads { stop, threads })
     }
 }
 
-/// The running threads; they end when this is dropped.
+/// The threads that read the sockets; they end when this is dropped.
 #[derive(Debug)]
-pub struct Readers {
+pub struct UdpThreads {
     stop: PipeWriter,
     threads: Vec<JoinHandle<()>>,
 }
 
-impl Readers {
-    /// Ends all threads, and has their doors tell what stayed outside. Blocks until that is done.
+impl UdpThreads {
+    /// Ends all threads; each reports its queues' drops to the engines first. Blocks until all have ended.
     pub fn stop(self) {
         drop(self.stop);
         for thread in self.threads {
@@ -104,19 +104,19 @@ fn bind(listener: &Listener) -> io::Result<(Socket, SocketAddr)> {
     let Listener { at, receive_buffer_bytes, groups, .. } = listener;
     let socket = Socket::new(Domain::for_address(*at), Type::DGRAM, Some(Protocol::UDP))?;
     socket.set_recv_buffer_size(*receive_buffer_bytes)?;
-    // Linux reports twice what it was asked for: half of it is its own bookkeeping.
-    let given = socket.recv_buffer_size()? / 2;
-    if given < *receive_buffer_bytes {
-        tracing::warn!(%at, asked = receive_buffer_bytes, given, "receive buffer clamped: raise net.core.rmem_max");
+    // Linux reports twice the requested size, because it adds as much for its own bookkeeping.
+    let granted = socket.recv_buffer_size()? / 2;
+    if granted < *receive_buffer_bytes {
+        tracing::warn!(%at, requested = receive_buffer_bytes, granted, "receive buffer clamped: raise net.core.rmem_max");
     }
     socket.set_nonblocking(true)?;
     if at.is_ipv6() {
-        // [::] hears IPv4 too, whatever net.ipv6.bindv6only says.
+        // An IPv6 socket at [::] receives IPv4 too, with any setting of net.ipv6.bindv6only.
         socket.set_only_v6(false)?;
     }
     socket.bind(&(*at).into())?;
     for (group, interface) in groups {
-        join(&socket, *group, interface).map_err(|error| {
+        join_group(&socket, *group, interface).map_err(|error| {
             io::Error::new(error.kind(), format!("join {group} on interface {interface:?}: {error}"))
         })?;
     }
@@ -124,14 +124,14 @@ fn bind(listener: &Listener) -> io::Result<(Socket, SocketAddr)> {
     Ok((socket, at))
 }
 
-fn join(socket: &Socket, group: IpAddr, interface: &str) -> io::Result<()> {
+fn join_group(socket: &Socket, group: IpAddr, interface: &str) -> io::Result<()> {
     let index = if interface.is_empty() { None } else { Some(if_nametoindex(interface)?) };
     match group {
         IpAddr::V4(group) => {
             let any = InterfaceIndexOrAddress::Address(Ipv4Addr::UNSPECIFIED);
             let on = index.map_or(any, InterfaceIndexOrAddress::Index);
             socket.join_multicast_v4_n(&group, &on)?;
-            // Otherwise every group that anybody on this host has joined is heard.
+            // Otherwise the socket receives every group that any program of this host has joined.
             socket.set_multicast_all_v4(false)
         }
         IpAddr::V6(group) => {
@@ -141,78 +141,79 @@ fn join(socket: &Socket, group: IpAddr, interface: &str) -> io::Result<()> {
     }
 }
 
-/// Reads one socket until `stopped` has no other end any more, or every engine behind it has stopped.
-fn read(socket: Socket, listener: &Listener, doors: &[Door], stopped: &PipeReader) -> io::Result<()> {
+/// Reads one socket until the other end of `stopped` is closed, or until all engines behind the socket have stopped.
+fn receive(socket: Socket, listener: &Listener, queues: &[EventQueue], stopped: &PipeReader) -> io::Result<()> {
     let mut receiver = Receiver::new(socket)?;
-    let mut heard: Vec<Heard> = Vec::new();
+    let mut batches: Vec<VehicleBatch> = Vec::new();
     for route in &listener.routes {
-        if !heard.iter().any(|heard| heard.vehicle == route.vehicle) {
-            heard.push(Heard { vehicle: route.vehicle, door: &doors[route.vehicle], readings: Vec::new() });
+        if !batches.iter().any(|batch| batch.vehicle == route.vehicle) {
+            let queue = &queues[route.vehicle];
+            batches.push(VehicleBatch { vehicle: route.vehicle, queue, readings: Vec::new() });
         }
     }
-    let mut batch = Vec::with_capacity(BATCH);
-    while wait(receiver.socket(), stopped)? {
-        match receiver.receive(&mut batch) {
-            // Any of them may have been meant.
-            Ok(drops) => heard.iter().for_each(|heard| heard.door.leave_outside(0, Cause::Kernel, drops)),
+    let mut datagrams = Vec::with_capacity(BATCH);
+    while wait_readable(receiver.socket(), stopped)? {
+        match receiver.receive(&mut datagrams) {
+            // The destination of a datagram that the kernel dropped is unknown, so every vehicle counts it.
+            Ok(drops) => batches.iter().for_each(|batch| batch.queue.record_drop(0, Cause::Kernel, drops)),
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => continue,
-            // It belongs to one datagram (an ICMP answer, say); the socket goes on.
+            // The error concerns one datagram (an ICMP reply, for example), not the socket.
             Err(error) => tracing::warn!(at = %listener.at, %error, "udp receive"),
         }
-        for datagram in batch.drain(..) {
-            sort(datagram, listener, &mut heard);
+        for datagram in datagrams.drain(..) {
+            route(datagram, listener, &mut batches);
         }
-        heard.retain_mut(|heard| heard.enter().is_ok());
-        if heard.is_empty() {
+        batches.retain_mut(|batch| batch.push().is_ok());
+        if batches.is_empty() {
             return Ok(());
         }
     }
-    for heard in heard {
-        // A closed door has nobody to tell.
-        let _ = heard.door.close(None);
+    for batch in batches {
+        // A closed queue has no engine that could count the drops.
+        let _ = batch.queue.report_drops(None);
     }
     Ok(())
 }
 
-/// One vehicle that is heard at a socket.
-struct Heard<'a> {
+/// The datagrams of one receive call for one vehicle.
+struct VehicleBatch<'a> {
     vehicle: usize,
-    door: &'a Door,
-    /// What came for it in one batch.
+    queue: &'a EventQueue,
+    /// Index of the sensor, and the datagram.
     readings: Vec<(u16, Body)>,
 }
 
-impl Heard<'_> {
-    fn enter(&mut self) -> Result<(), Closed> {
-        if self.readings.is_empty() { Ok(()) } else { self.door.enter_all(self.readings.drain(..)) }
+impl VehicleBatch<'_> {
+    fn push(&mut self) -> Result<(), QueueClosedError> {
+        if self.readings.is_empty() { Ok(()) } else { self.queue.push_batch(self.readings.drain(..)) }
     }
 }
 
-/// Gives a datagram to its vehicle. One of a stranger, or of nobody, is counted by the first vehicle of the socket, so
-/// that each datagram is in one ledger.
-fn sort(datagram: Received, listener: &Listener, heard: &mut [Heard<'_>]) {
+/// Adds a datagram to the batch of its vehicle. The first vehicle of the socket counts a datagram of an unknown sender
+/// or without sender, so that exactly one ledger has each datagram.
+fn route(datagram: Received, listener: &Listener, batches: &mut [VehicleBatch<'_>]) {
     let Some(route) = datagram.peer.and_then(|peer| listener.route(peer)) else {
-        match (heard.first(), datagram.peer) {
-            (Some(first), Some(peer)) => first.door.refuse_stranger(peer),
-            (Some(first), None) => first.door.leave_outside(0, Cause::Sender, 1),
+        match (batches.first(), datagram.peer) {
+            (Some(first), Some(peer)) => first.queue.refuse_unknown_sender(peer),
+            (Some(first), None) => first.queue.record_drop(0, Cause::Sender, 1),
             (None, _) => {}
         }
         return;
     };
-    let Some(heard) = heard.iter_mut().find(|heard| heard.vehicle == route.vehicle) else { return };
+    let Some(batch) = batches.iter_mut().find(|batch| batch.vehicle == route.vehicle) else { return };
     if datagram.length > DATAGRAM_BYTES_MAX {
-        heard.door.leave_outside(route.source, Cause::Length, 1);
+        batch.queue.record_drop(route.source, Cause::Length, 1);
     } else {
-        heard.readings.push((route.source, Body::Datagram(datagram.payload)));
+        batch.readings.push((route.source, Body::Datagram(datagram.payload)));
     }
 }
 
-/// Waits for a datagram; `false` when there is nothing more to wait for.
-fn wait(socket: &Socket, stopped: &PipeReader) -> io::Result<bool> {
+/// Waits for a datagram. Returns false once the other end of `stopped` is closed.
+fn wait_readable(socket: &Socket, stopped: &PipeReader) -> io::Result<bool> {
     let mut ends = [PollFd::new(socket.as_fd(), PollFlags::POLLIN), PollFd::new(stopped.as_fd(), PollFlags::POLLIN)];
     match poll(&mut ends, PollTimeout::NONE) {
-        Ok(_) => Ok(ends[1].revents().is_none_or(|happened| happened.is_empty())),
-        // A signal.
+        Ok(_) => Ok(ends[1].revents().is_none_or(|events| events.is_empty())),
+        // A signal interrupted the wait.
         Err(nix::Error::EINTR) => Ok(true),
         Err(error) => Err(error.into()),
     }
@@ -224,22 +225,22 @@ mod tests {
 
     use super::*;
     use crate::config::{Config, Udp};
-    use crate::ingest::door;
+    use crate::ingest::queue::event_queue;
 
     #[test]
     fn a_datagram_without_a_sender_is_refused_and_counted() {
         let mut config = Config::of_one_vehicle("car", "top");
         config.vehicles[0].udp = Some(Udp::default());
         let listener = &listeners(&config.vehicles)[0];
-        let (door, _events) = door(4);
-        let mut heard = [Heard { vehicle: 0, door: &door, readings: Vec::new() }];
-        let of = |peer| Received { peer, length: 3, payload: "abc".into() };
-        sort(of(None), listener, &mut heard);
-        sort(of(Some(([10, 0, 0, 1], 2368).into())), listener, &mut heard);
-        assert_eq!(heard[0].readings, [(0, Body::Datagram("abc".into()))]);
+        let (queue, _events) = event_queue(4);
+        let mut batches = [VehicleBatch { vehicle: 0, queue: &queue, readings: Vec::new() }];
+        let datagram = |peer| Received { peer, length: 3, payload: "abc".into() };
+        route(datagram(None), listener, &mut batches);
+        route(datagram(Some(([10, 0, 0, 1], 2368).into())), listener, &mut batches);
+        assert_eq!(batches[0].readings, [(0, Body::Datagram("abc".into()))]);
         let mut ledger = Ledger::default();
-        door.outside().add_to(&mut ledger, []);
+        queue.drops().add_unreported_to(&mut ledger, []);
         assert_eq!((ledger.received, ledger.refused), (1, [("source", 1)].into()));
-        assert!(door.outside().strangers().is_empty());
+        assert!(queue.drops().unknown_senders().is_empty());
     }
 }

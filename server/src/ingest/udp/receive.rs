@@ -1,9 +1,9 @@
-//! One socket -> batches of datagrams, and what the kernel dropped.
+//! One socket -> batches of datagrams, and the number of datagrams that the kernel dropped.
 //!
-//! The first datagram of a batch is read alone (`recvmsg`) with the socket's drop counter (`SO_RXQ_OVFL`), whatever
-//! waits behind it in one call (`recvmmsg`); both through nix, so that no `unsafe` is needed here. nix' `recvmmsg`
-//! cannot carry the counter: it never gives a control buffer back its length. Datagrams lie in slots of one slab, which
-//! lives as long as the last of them; each costs no allocation of its own.
+//! One call (`recvmsg`) reads the first datagram of a batch with the socket's drop counter (`SO_RXQ_OVFL`); a second
+//! call (`recvmmsg`) reads all datagrams that wait behind it. Both go through nix, so that no `unsafe` is needed here.
+//! nix' `recvmmsg` cannot return the counter, because it does not restore the length of a control buffer. The datagrams
+//! of a slab share one allocation, which lives as long as the last of them.
 
 use std::io::{self, IoSliceMut};
 use std::net::{IpAddr, SocketAddr};
@@ -16,38 +16,39 @@ use nix::sys::socket::{
 };
 use socket2::Socket;
 
-/// More than an Ethernet frame carries, and than any sensor sends: only fragmented datagrams are longer.
+/// Greatest length of a datagram in bytes. Ours: longer than an Ethernet frame and than the packets of all sensors, so
+/// only fragmented datagrams are longer.
 pub const DATAGRAM_BYTES_MAX: usize = 1536;
-/// At most so many datagrams a batch: what an HDL-64E sends in 18 ms.
+/// Greatest number of datagrams in a batch. Ours: an HDL-64E sends as many in 18 ms.
 pub const BATCH: usize = 64;
-/// A slab is used by so many datagrams, of one batch or of many.
+/// Number of datagrams in a slab, of one batch or of several.
 const SLOTS: usize = 2 * BATCH;
 
 /// One datagram.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Received {
-    /// Whence it came; an IPv4 address as such, whatever kind of socket heard it. `None` where the kernel does not say.
+    /// The sender's address; an IPv4 address also if an IPv6 socket received it. `None` if the kernel gives none.
     pub peer: Option<SocketAddr>,
-    /// How long it was.
+    /// The datagram's length in bytes.
     pub length: usize,
-    /// Its bytes, the first [`DATAGRAM_BYTES_MAX`] of them.
+    /// The first [`DATAGRAM_BYTES_MAX`] bytes of the datagram.
     pub payload: Bytes,
 }
 
-/// Reads one non-blocking socket.
+/// Receives from one non-blocking socket.
 pub struct Receiver {
     socket: Socket,
     slab: BytesMut,
     headers: MultiHeaders<SockaddrStorage>,
-    /// The kernel's counter, as it was last; it wraps.
+    /// The kernel's drop counter at the last call; it wraps around.
     drops: u32,
 }
 
 impl Receiver {
-    /// Has the socket's drops counted from now on.
+    /// A receiver for `socket`; the kernel counts the socket's drops from now on.
     ///
     /// # Errors
-    /// What the kernel says.
+    /// [`io::Error`] if the kernel does not allow the drop counter.
     pub fn new(socket: Socket) -> io::Result<Self> {
         setsockopt(&socket, RxqOvfl, &1)?;
         Ok(Self { socket, slab: BytesMut::new(), headers: MultiHeaders::preallocate(BATCH, None), drops: 0 })
@@ -58,17 +59,17 @@ impl Receiver {
         &self.socket
     }
 
-    /// Appends what waits, at most [`BATCH`] datagrams; gives the number the kernel has dropped before the first of
-    /// them and was not asked for yet.
+    /// Appends the waiting datagrams, at most [`BATCH`], to `batch`. Returns the number of datagrams that the kernel
+    /// dropped since the last call and before the first of them.
     ///
     /// # Errors
-    /// What the kernel says; `WouldBlock` where nothing waits.
+    /// [`io::Error`] of the kind `WouldBlock` if no datagram waits; of another kind if the kernel reports an error.
     pub fn receive(&mut self, batch: &mut Vec<Received>) -> io::Result<u64> {
         if self.slab.is_empty() {
             self.slab = BytesMut::zeroed(SLOTS * DATAGRAM_BYTES_MAX);
         }
         let fd = self.socket.as_raw_fd();
-        // With MSG_TRUNC a datagram's true length is told, whatever the slot holds of it.
+        // With MSG_TRUNC the kernel returns the true length of a datagram that is longer than its slot.
         let flags = MsgFlags::MSG_DONTWAIT | MsgFlags::MSG_TRUNC;
         let (first, rest) = self.slab.split_at_mut(DATAGRAM_BYTES_MAX);
         let mut control = nix::cmsg_space!(u32);
@@ -80,7 +81,7 @@ impl Receiver {
 
         let mut slots: Vec<_> =
             rest.chunks_exact_mut(DATAGRAM_BYTES_MAX).take(BATCH - 1).map(|slot| [IoSliceMut::new(slot)]).collect();
-        // An error belongs to a later datagram than the first: the next call meets it again, or what comes after it.
+        // An error here concerns a later datagram than the first; the next call returns it.
         if let Ok(messages) = recvmmsg(fd, &mut self.headers, &mut slots, flags, None) {
             found.extend(messages.map(|message| (peer_of(&message), message.bytes)));
         }

@@ -21,13 +21,11 @@ use tonic::{Request, Response, Status, Streaming};
 use access::{Access, Guard};
 use super::connections::Connections;
 use reader::watch;
-use super::{Unknown, Vehicles};
+use super::Vehicles;
 use crate::config::{self, Certificates};
-use crate::ingest::gateway::Entrances;
-use crate::ingest::grpc::Ingest;
-use crate::ingest::now_ns;
+use crate::clock::now_ns;
 
-use v1::ingest_service_server::IngestServiceServer;
+use v1::ingest_service_server::{IngestService, IngestServiceServer};
 use v1::map_service_server::{MapService, MapServiceServer};
 
 /// Requests are names and numbers; anything longer is not meant for us.
@@ -71,24 +69,23 @@ impl Security {
     }
 }
 
-/// Serves until `stop` resolves and all streams have ended.
+/// Serves maps, and `ingest` if the server takes observations, until `stop` resolves and all streams have ended.
 ///
 /// # Errors
 /// What the transport says.
-pub async fn serve(
+pub async fn serve<I: IngestService>(
     listener: TcpListener,
     security: Security,
     connections_max: usize,
     vehicles: Vehicles,
-    entrances: Entrances,
+    ingest: Option<IngestServiceServer<I>>,
     stop: impl Future<Output = ()>,
 ) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
     let Security { builder, guard } = security;
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<MapServiceServer<Maps>>().await;
-    let ingest = (!entrances.all().is_empty()).then(|| Ingest::new(entrances).service());
     if ingest.is_some() {
-        health.set_serving::<IngestServiceServer<Ingest>>().await;
+        health.set_serving::<IngestServiceServer<I>>().await;
     }
     let reflection = || {
         tonic_reflection::server::Builder::configure()
@@ -122,14 +119,6 @@ struct Maps {
     vehicles: Vehicles,
 }
 
-impl From<Unknown> for Status {
-    fn from(unknown: Unknown) -> Self {
-        match unknown {
-            Unknown::Vehicle { .. } | Unknown::Sensor { .. } => Status::not_found(unknown.to_string()),
-            Unknown::Layer { .. } => Status::invalid_argument(unknown.to_string()),
-        }
-    }
-}
 
 #[tonic::async_trait]
 impl MapService for Maps {
@@ -156,7 +145,7 @@ impl MapService for Maps {
         if served.newest.borrow().is_none() {
             return Err(Status::unavailable(format!("vehicle {name} has no map yet")));
         }
-        let newest = served.status.demand.take(&layers).newest(&served.newest).await;
+        let newest = served.status.subscriptions.subscribe(&layers).newest_map(&served.newest).await;
         let map = newest.ok_or_else(|| Status::unavailable(format!("vehicle {name} makes no map at present")))?;
         Ok(Response::new(v1::MapUpdate { map: map.select(&layers), skipped: 0, sent_ns: now_ns(), left_out: 0 }))
     }

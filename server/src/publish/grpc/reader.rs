@@ -13,9 +13,9 @@ use tonic::Status;
 
 use super::selection::{Selection, Sent};
 use crate::publish::{Served, Vehicles};
-use crate::subscriptions::Taken;
-use crate::engine::Newest;
-use crate::ingest::now_ns;
+use crate::subscriptions::LayerSubscription;
+use crate::newest::Newest;
+use crate::clock::now_ns;
 use crate::status::Reader;
 use crate::encode::EncodedMap;
 
@@ -48,7 +48,7 @@ struct Watch<R> {
     want_full: bool,
     over: bool,
     /// Until it goes, its layers are made.
-    taken: Taken,
+    taken: LayerSubscription,
     // Last, and only held: the reader is counted while this lives.
     _reader: Reader,
 }
@@ -61,7 +61,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         Self {
             requests: Some(requests),
             newest,
-            taken: served.status.demand.take(&selection.layers),
+            taken: served.status.subscriptions.subscribe(&selection.layers),
             selection,
             last: None,
             base: None,
@@ -117,7 +117,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
 
     /// A map without one of the layers was made before this reader came.
     fn is_due(&self, map: &EncodedMap) -> bool {
-        (self.want_full || self.selection.rate.is_due(map.capture_end_ns)) && self.taken.are_in(map)
+        (self.want_full || self.selection.rate.is_due(map.capture_end_ns)) && self.taken.is_covered_by(map)
     }
 
     fn send(&mut self, map: Arc<EncodedMap>) -> Result<v1::MapUpdate, Status> {

@@ -1,10 +1,10 @@
 //! The factory tables: nominal angles of every model, in firing order.
 //!
 //! Sources: the tables of elevations (and azimuth offsets) in the manuals of HDL-32E, VLP-16, Puck Hi-Res, VLP-32C and
-//! VLS-128. Every HDL-64E is measured by itself; its table here is nominal: evenly spaced elevations as the manual
-//! states them, lasers in the order real units have them, azimuth offsets rounded from published units.
+//! VLS-128. Each HDL-64E is measured individually; its table here is nominal: evenly spaced elevations between those of
+//! the manual, the order of lasers of real units, and azimuth offsets that are rounded from published units.
 
-use super::{Calibration, LaserCalibration};
+use super::table::{Calibration, LaserCalibration};
 use crate::model::Model;
 
 /// The nominal table of a model.
@@ -26,22 +26,25 @@ pub(super) fn factory(model: Model) -> Calibration {
     Calibration { distance_m_per_count: model.spec().distance_m_per_count, lasers: lasers.collect() }
 }
 
-/// Even lasers climb from the lowest, odd ones from the middle (VLP-16: -15, 1, -13, 3, …).
+/// Elevation of a laser, in degrees: even lasers rise from the lowest one, odd lasers from the middle (VLP-16: -15, 1,
+/// -13, 3, …).
 fn interleaved(laser: usize, lowest: f64, step: f64) -> f64 {
     lowest + step * (laser / 2 + laser % 2 * 8) as f64
 }
 
-/// -30.67, -9.33, -29.33, -8.00, … 10.67: thirds of four degrees, written with two decimals.
+/// Elevation of a laser, in degrees: -30.67, -9.33, -29.33, -8.00, … 10.67. The steps are thirds of four degrees,
+/// rounded to two decimals as in the manual.
 fn hdl32e_elevation(laser: usize) -> f64 {
     let rank = laser / 2 + laser % 2 * 16;
     let thirds = 4.0 * rank as f64 - 92.0;
     (thirds / 3.0 * 100.0).round() / 100.0
 }
 
+/// Elevations of a Puck Hi-Res, in degrees.
 const PUCK_HI_RES: [f64; 16] =
     [-10.0, 0.667, -8.667, 2.0, -7.333, 3.333, -6.0, 4.667, -4.667, 6.0, -3.333, 7.333, -2.0, 8.667, -0.667, 10.0];
 
-/// Elevation, azimuth offset; degrees.
+/// Elevation and azimuth offset of each laser of a VLP-32C, in degrees.
 const VLP32C: [(f64, f64); 32] = [
     (-25.0, -1.4),
     (-1.0, 4.2),
@@ -77,7 +80,7 @@ const VLP32C: [(f64, f64); 32] = [
     (-1.333, 1.4),
 ];
 
-/// Elevation, degrees; the azimuth offsets repeat every eight lasers.
+/// Elevation of each laser of a VLS-128, in degrees.
 #[expect(clippy::approx_constant, reason = "-6.28 is an elevation")]
 const VLS128_ELEVATION: [f64; 128] = [
     -11.742, -1.99, 3.4, -5.29, -0.78, 4.61, -4.08, 1.31, -6.5, -1.11, 4.28, -4.41, 0.1, 6.48, -3.2, 2.19, -3.86, 1.53,
@@ -89,19 +92,22 @@ const VLS128_ELEVATION: [f64; 128] = [
     2.3, -6.39, -1.0, 4.39, -5.18, 0.21, 6.98, -3.09, 4.98, -3.75, 1.64, -8.352, -2.54, 2.85, -5.84, -0.45, 8.43,
     -2.87, 2.52, -6.17, -1.66, 3.73, -4.96, 0.43,
 ];
+/// Azimuth offsets of a VLS-128, in degrees; they repeat every eight lasers.
 const VLS128_ROTATION: [f64; 8] = [-6.354, -4.548, -2.732, -0.911, 0.911, 2.732, 4.548, 6.354];
 
 fn vls128() -> Vec<(f64, f64)> {
     VLS128_ELEVATION.iter().enumerate().map(|(laser, elevation)| (*elevation, VLS128_ROTATION[laser % 8])).collect()
 }
 
-/// Lasers of one HDL-64E block from the lowest to the highest (the same in both blocks).
+/// Lasers of one HDL-64E block from the lowest to the highest. The order is the same in both blocks.
 const HDL64E_FROM_LOWEST: [usize; 32] = [
     6, 7, 10, 11, 0, 1, 4, 5, 8, 9, 14, 15, 18, 19, 22, 23, 12, 13, 16, 17, 20, 21, 26, 27, 30, 31, 2, 3, 24, 25, 28,
     29,
 ];
-/// Azimuth offset of the first laser of each pair, repeating from the lowest pair up, and of the second to the first.
+/// Azimuth offsets of the upper block of an HDL-64E, in degrees: that of the first laser of each pair, from the lowest
+/// pair up, repeated after six pairs; and the difference from the first to the second laser of a pair.
 const HDL64E_UPPER_ROTATION: ([f64; 6], f64) = ([-1.0, 3.25, -4.5, -0.25, 4.0, -5.25], 2.25);
+/// Azimuth offsets of the lower block of an HDL-64E, in degrees, as those of the upper block.
 const HDL64E_LOWER_ROTATION: ([f64; 6], f64) = ([-1.75, 5.25, -7.5, -0.5, 6.25, -8.5], 3.5);
 
 fn hdl64e() -> Vec<(f64, f64)> {

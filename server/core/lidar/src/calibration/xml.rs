@@ -1,21 +1,23 @@
-//! Velodyne's `db.xml`: a Boost serialisation archive, degrees and centimetres.
+//! Velodyne `db.xml`: a Boost serialisation archive in degrees and centimetres.
 //!
-//! In: text. Out: [`Calibration`] of the enabled lasers, radians and metres.
+//! In: text. Out: [`Calibration`] of the enabled lasers, in radians and metres.
 
 use roxmltree::{Document, Node, ParsingOptions};
 
-use super::{
-    ANGLE_RAD, Calibration, CalibrationError, FOCAL, LENGTH_M, LaserCalibration, RESOLUTION_M, bounded, complete,
-};
+use super::bounds::{ANGLE_RAD, FOCAL, LENGTH_M, RESOLUTION_M, bounded};
+use super::error::CalibrationError;
+use super::table::{Calibration, LaserCalibration};
 
-/// `distLSB_` is centimetres a count; every other length is centimetres, every angle degrees.
+/// Metres per centimetre. `distLSB_` is in centimetres per count; all other lengths are in centimetres, all angles in
+/// degrees.
 const M_PER_CM: f64 = 0.01;
-/// The greatest number of a list, and what is allowed in it.
+/// Greatest number in the list of enabled lasers, and a description of the allowed numbers.
 const ENABLED: (u8, &str) = (1, "1 or 0, for each laser of points_");
+/// Greatest number in a list of intensities, and a description of the allowed numbers.
 const BYTE: (u8, &str) = (255, "a whole number, 0 to 255");
 
 pub(super) fn read(text: &str) -> Result<Calibration, CalibrationError> {
-    // The archives open with a (bare) document type, which roxmltree refuses unless told.
+    // The archives begin with a document type without content, which roxmltree refuses by default.
     let options = ParsingOptions { allow_dtd: true, nodes_limit: 100_000, ..ParsingOptions::default() };
     let document = Document::parse_with_options(text, options).map_err(|e| CalibrationError::Xml(e.to_string()))?;
     let db = child(document.root_element(), "DB", "the calibration database")?;
@@ -40,7 +42,7 @@ pub(super) fn read(text: &str) -> Result<Calibration, CalibrationError> {
         (laser.min_intensity, laser.max_intensity) = (of_laser(&min_intensity), of_laser(&max_intensity));
         lasers.push(laser);
     }
-    complete(resolution, lasers)
+    Calibration::from_lasers(resolution, lasers)
 }
 
 fn laser(path: &str, px: Node<'_, '_>) -> Result<LaserCalibration, CalibrationError> {
@@ -76,7 +78,7 @@ fn items<'a, 'i>(list: Node<'a, 'i>) -> impl Iterator<Item = Node<'a, 'i>> {
     list.children().filter(|node| node.has_tag_name("item"))
 }
 
-/// The numbers of a list such as `enabled_`; `None` if it is missing (older files have none).
+/// The numbers of a list such as `enabled_`; `None` if the list is missing, as in older files.
 fn list(
     db: Node<'_, '_>,
     name: &str,

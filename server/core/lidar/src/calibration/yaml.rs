@@ -1,14 +1,14 @@
-//! ROS `velodyne_pointcloud` YAML, in all the forms in which it is found.
+//! ROS `velodyne_pointcloud` YAML, in all variants in use.
 //!
-//! In: text. Out: [`Calibration`]. Keys may be missing, unknown ones are passed over, `num_lasers` is checked, and a
-//! key given twice (the driver's own `angles-calibrated.yaml` does) is an error only if the values differ.
+//! In: text. Out: [`Calibration`]. Keys may be missing, unknown keys are ignored, and `num_lasers` is checked. A key
+//! that occurs twice (as in `angles-calibrated.yaml` of the driver) is an error only if the values differ.
 
 use serde::Deserialize;
 use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 
-use super::{
-    ANGLE_RAD, Calibration, CalibrationError, FOCAL, LENGTH_M, LaserCalibration, RESOLUTION_M, bounded, complete,
-};
+use super::bounds::{ANGLE_RAD, FOCAL, LENGTH_M, RESOLUTION_M, bounded};
+use super::error::CalibrationError;
+use super::table::{Calibration, LaserCalibration};
 
 pub(super) fn read(text: &str) -> Result<Calibration, CalibrationError> {
     let root: Node = serde_yaml_ng::from_str(text).map_err(|e| CalibrationError::Yaml(e.to_string()))?;
@@ -24,7 +24,7 @@ pub(super) fn read(text: &str) -> Result<Calibration, CalibrationError> {
     {
         return Err(root.wrong("num_lasers", node, "the number of lasers listed"));
     }
-    complete(root.number("distance_resolution", RESOLUTION_M)?, lasers)
+    Calibration::from_lasers(root.number("distance_resolution", RESOLUTION_M)?, lasers)
 }
 
 pub(super) fn write(calibration: &Calibration) -> String {
@@ -58,7 +58,7 @@ fn laser(index: usize, node: &Node) -> Result<LaserCalibration, CalibrationError
 
 const BYTE: ((f64, f64), &str) = ((0.0, 255.0), "a whole number, 0 to 255");
 
-/// A map and where it stands in the document.
+/// A map and its path in the document.
 struct Map<'a> {
     path: String,
     entries: &'a [(String, Node)],
@@ -84,7 +84,7 @@ impl<'a> Map<'a> {
         let first = found.next();
         match (first, found.find(|node| Some(*node) != first)) {
             (Some(first), Some(second)) => {
-                Err(CalibrationError::Twice { key: self.path(key), first: first.shown(), second: second.shown() })
+                Err(CalibrationError::Duplicate { key: self.path(key), first: first.shown(), second: second.shown() })
             }
             _ => Ok(first),
         }
@@ -116,7 +116,7 @@ impl<'a> Map<'a> {
     }
 }
 
-/// A YAML document that keeps keys given twice.
+/// A node of a YAML document. A map keeps keys that occur twice.
 #[derive(Debug, PartialEq)]
 enum Node {
     Nothing,

@@ -1,4 +1,4 @@
-//! The table of bad datagrams: each refused by name, or taken for a stated reason, with the stream beside it unharmed.
+//! The table of bad datagrams. Each is refused with a reason, or accepted for a stated one, and changes nothing else.
 
 use clearway_lidar::model::BLOCK_FLAGS;
 use clearway_lidar::{Echo, Model, ReturnMode, Revolution, Sensor, SensorConfig};
@@ -6,14 +6,15 @@ use clearway_lidar::{Echo, Model, ReturnMode, Revolution, Sensor, SensorConfig};
 use crate::stream::{START_NS, Stream};
 use crate::telemetry::{datagram, with_sum};
 
-/// Packets of the stream before the bad one and in all.
+/// Number of packets of the stream before the bad datagram.
 const BEFORE: usize = 100;
+/// Number of packets of the stream.
 const PACKETS: usize = 400;
 
 struct Bad {
     name: String,
     bytes: Vec<u8>,
-    /// The refusal's reason, or `taken`: why is in the name.
+    /// Reason of the error, or `accepted`; the name then states why.
     outcome: &'static str,
 }
 
@@ -21,7 +22,7 @@ fn bad(name: impl Into<String>, bytes: Vec<u8>, outcome: &'static str) -> Bad {
     Bad { name: name.into(), bytes, outcome }
 }
 
-/// What a VLP-32C must never choke on when packet `BEFORE` is due.
+/// The bad datagrams that a stream of a VLP-32C receives before packet `BEFORE`.
 fn table(stream: &Stream) -> Vec<Bad> {
     let good = stream.packet(BEFORE);
     let with = |at: usize, bytes: &[u8]| {
@@ -39,7 +40,7 @@ fn table(stream: &Stream) -> Vec<Bad> {
     table.push(bad("a packet with its UDP header before it", [&[0; 8], &good[..]].concat(), "length"));
 
     for block in 0..12 {
-        table.push(bad(format!("flag of nobody in block {block}"), with(100 * block, &[0x12, 0x34]), "block_flag"));
+        table.push(bad(format!("unknown flag in block {block}"), with(100 * block, &[0x12, 0x34]), "block_flag"));
     }
     table.push(bad("flag with its bytes swapped", with(0, &[0xEE, 0xFF]), "block_flag"));
     table.push(bad("lower block of an HDL-64E", with(700, &BLOCK_FLAGS[1].to_le_bytes()), "block_flag"));
@@ -68,9 +69,9 @@ fn table(stream: &Stream) -> Vec<Bad> {
         ));
     }
 
-    table.push(bad("the packet before, once more", stream.packet(BEFORE - 1), "duplicate"));
-    table.push(bad("a packet of long ago, once more", stream.packet(BEFORE - 40), "duplicate"));
-    table.push(bad("a packet forgotten, once more", stream.packet(0), "device_time"));
+    table.push(bad("the packet before, again", stream.packet(BEFORE - 1), "duplicate"));
+    table.push(bad("a packet of 40 packets before, again", stream.packet(BEFORE - 40), "duplicate"));
+    table.push(bad("a packet that is no longer remembered, again", stream.packet(0), "device_time"));
     table.push(bad(
         "the same time and azimuth, other returns",
         {
@@ -92,16 +93,16 @@ fn table(stream: &Stream) -> Vec<Bad> {
     table.push(nmea("checksum no number", format!("${rmc}*XY\r\n")));
     table.push(nmea("checksum missing", format!("${rmc}\r\n")));
     table.push(nmea("no dollar", with_sum(rmc)[1..].to_owned()));
-    table.push(nmea("another sentence", with_sum("GPGGA,214106,3707.8178,N,12139.2690,W,1,08,0.9,545.4,M,46.9,M,,")));
+    table.push(nmea("GPGGA sentence", with_sum("GPGGA,214106,3707.8178,N,12139.2690,W,1,08,0.9,545.4,M,46.9,M,,")));
     table.push(nmea("no sentence", "hello\r\n".to_owned()));
     table.push(nmea("latitude 91 degrees", changed("3707.8178", "9107.8178")));
     table.push(nmea("latitude negative", changed("3707.8178", "-3707.8178")));
     table.push(nmea("latitude NaN", changed("3707.8178", "NaN")));
     table.push(nmea("longitude 181 degrees", changed("12139.2690", "18139.2690")));
     table.push(nmea("longitude infinite", changed("12139.2690", "inf")));
-    table.push(nmea("hemisphere of nobody", changed(",N,", ",Q,")));
+    table.push(nmea("unknown hemisphere", changed(",N,", ",Q,")));
     table.push(nmea("hemisphere missing", changed(",W,", ",,")));
-    table.push(nmea("status of nobody", changed(",A,", ",Z,")));
+    table.push(nmea("unknown status", changed(",A,", ",Z,")));
     table.push(nmea("hour 24", changed("214106", "244106")));
     table.push(nmea("minute 60", changed("214106", "216006")));
     table.push(nmea("second 61", changed("214106", "214161")));
@@ -114,83 +115,86 @@ fn table(stream: &Stream) -> Vec<Bad> {
     table.push(nmea("course 400 degrees", changed("188.2", "400.0")));
     let mut not_ascii = datagram(5, &with_sum(rmc));
     not_ascii[220] = 0xC3;
-    table.push(bad("a byte that is no ASCII", not_ascii, "nmea"));
+    table.push(bad("a byte that is not ASCII", not_ascii, "nmea"));
     let mut noise = vec![0xAA; 512];
     noise[206] = b'$';
     table.push(bad("noise of a telemetry datagram's length", noise, "nmea"));
 
-    table.push(bad("telemetry without a sentence: no receiver is connected", datagram(5, ""), "taken"));
-    table.push(bad(
-        "a fix the receiver calls void: it says so",
-        datagram(5, &with_sum("GPRMC,,V,,,,,,,,,,N")),
-        "taken",
-    ));
+    table.push(bad("telemetry without a sentence, because no receiver is connected", datagram(5, ""), "accepted"));
+    table.push(bad("a fix that the receiver marks as void", datagram(5, &with_sum("GPRMC,,V,,,,,,,,,,N")), "accepted"));
     let mut pps = datagram(5, "");
     pps[202] = 77;
-    table.push(bad("a PPS state of nobody: shown as unknown", pps, "taken"));
+    table.push(bad("an unknown PPS state, which is shown as unknown", pps, "accepted"));
     table
 }
 
-/// The stream with a datagram before packet `BEFORE`: what came of it, the turns and all the status tells of them.
+/// Decodes the stream with a datagram before packet `BEFORE`, and returns the outcome of that datagram, the
+/// revolutions, and the number of packets.
 fn decode(stream: &Stream, bad: Option<&[u8]>) -> (&'static str, Vec<impl PartialEq + use<>>, u64) {
     let mut sensor = Sensor::new(SensorConfig::default());
-    let mut turns = stream.push(&mut sensor, 0..BEFORE);
+    let mut revolutions = stream.push(&mut sensor, 0..BEFORE);
     let before = sensor.status();
     let arrival_ns = stream.arrival_ns(BEFORE) - 1_000;
-    let outcome = match bad.map(|bad| sensor.push(bad, arrival_ns).map(|turn| turn.cloned())) {
+    let outcome = match bad.map(|bad| sensor.push(bad, arrival_ns).map(|revolution| revolution.cloned())) {
         None => "",
-        Some(Ok(turn)) => {
-            assert!(turn.is_none());
-            "taken"
+        Some(Ok(revolution)) => {
+            assert!(revolution.is_none());
+            "accepted"
         }
-        Some(Err(refusal)) => {
-            assert_eq!(sensor.status(), before, "{refusal}");
-            refusal.reason()
+        Some(Err(error)) => {
+            assert_eq!(sensor.status(), before, "{error}");
+            error.reason()
         }
     };
-    turns.extend(stream.push(&mut sensor, BEFORE..PACKETS));
-    turns.extend(sensor.finish().cloned());
-    // Every laser fires: there is no NaN to compare.
-    let whole = |turn: Revolution| {
+    revolutions.extend(stream.push(&mut sensor, BEFORE..PACKETS));
+    revolutions.extend(sensor.finish().cloned());
+    // Every laser fires, so there is no NaN to compare.
+    let whole = |revolution: Revolution| {
         let echo = |echo: Echo| (echo.range_m, echo.x, echo.y, echo.z, echo.intensity);
-        let echoes: Vec<_> = turn.echoes.into_iter().map(echo).collect();
-        let counts = (turn.sequence, turn.packets, turn.packets_expected, turn.firings_expected, turn.partial);
-        (counts, turn.start_ns, turn.end_ns, turn.rpm, turn.firings, echoes)
+        let echoes: Vec<_> = revolution.echoes.into_iter().map(echo).collect();
+        let counts = (
+            revolution.sequence,
+            revolution.packets,
+            revolution.packets_expected,
+            revolution.firings_expected,
+            revolution.partial,
+        );
+        (counts, revolution.start_ns, revolution.end_ns, revolution.rpm, revolution.firings, echoes)
     };
-    (outcome, turns.into_iter().map(whole).collect(), sensor.status().packets)
+    (outcome, revolutions.into_iter().map(whole).collect(), sensor.status().packets)
 }
 
 #[test]
-fn every_bad_datagram_is_refused_by_name_and_the_stream_goes_on_as_if_it_had_not_come() {
+fn a_bad_datagram_is_refused_with_its_reason_and_changes_nothing() {
     let stream = Stream::of(Model::Vlp32c);
     let (_, expected, packets) = decode(&stream, None);
     assert!(expected.len() >= 2 && packets == PACKETS as u64);
     let table = table(&stream);
     assert!(table.len() >= 60, "{}", table.len());
     for Bad { name, bytes, outcome } in &table {
-        let (found, turns, packets) = decode(&stream, Some(bytes));
+        let (found, revolutions, packets) = decode(&stream, Some(bytes));
         assert_eq!(found, *outcome, "{name}");
-        assert!(turns == expected, "{name} changed the turns");
+        assert!(revolutions == expected, "{name} changes the revolutions");
         assert_eq!(packets, PACKETS as u64, "{name}");
     }
 }
 
 #[test]
-fn what_cannot_be_told_from_a_good_packet_is_taken_and_does_no_more_than_it_says() {
-    // Intensities, distances, an azimuth in range, a return mode of nobody: no byte guards them.
+fn damage_that_no_check_can_find_changes_only_the_damaged_values() {
+    // No check protects intensities, distances, azimuths in range, and unknown return modes.
     let stream = Stream::of(Model::Hdl32e);
     let config = SensorConfig { model: Some(Model::Hdl32e), ..SensorConfig::default() };
     for (name, at, byte) in
         [("distance", 4, 0xFF), ("intensity", 6, 0xFF), ("azimuth", 502, 0x01), ("mode", 1204, 0x77)]
     {
         let mut sensor = Sensor::new(config.clone());
-        let mut turns = stream.push(&mut sensor, 0..BEFORE);
+        let mut revolutions = stream.push(&mut sensor, 0..BEFORE);
         let mut packet = stream.packet(BEFORE);
         packet[at] = byte;
         assert!(sensor.push(&packet, stream.arrival_ns(BEFORE)).is_ok(), "{name}");
-        turns.extend(stream.push(&mut sensor, BEFORE + 1..PACKETS));
-        assert!(turns.iter().all(|turn| turn.return_mode == ReturnMode::Strongest), "{name}");
-        assert!(turns.windows(2).all(|pair| pair[0].end_ns < pair[1].start_ns), "{name}");
+        revolutions.extend(stream.push(&mut sensor, BEFORE + 1..PACKETS));
+        assert!(revolutions.iter().all(|revolution| revolution.return_mode == ReturnMode::Strongest), "{name}");
+        assert!(revolutions.windows(2).all(|pair| pair[0].end_ns < pair[1].start_ns), "{name}");
         assert_eq!(sensor.status().packets_lost, 0, "{name}");
     }
     let mut fresh = Sensor::new(config);

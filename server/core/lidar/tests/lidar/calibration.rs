@@ -1,9 +1,9 @@
-//! Calibration texts: factory tables, round trips, errors that name key and value, and every recorded file.
+//! Calibrations: factory tables, round trips of texts, errors with key and value, and all recorded files.
 
 use clearway_lidar::{Calibration, CalibrationError, LaserCalibration, Model};
 
 #[test]
-fn factory_tables_have_a_laser_each_within_the_models_field_of_view() {
+fn factory_tables_have_all_lasers_within_the_elevations_of_the_model() {
     for model in Model::ALL {
         let calibration = Calibration::factory(model);
         calibration.fits(model).unwrap();
@@ -21,7 +21,7 @@ fn factory_tables_have_a_laser_each_within_the_models_field_of_view() {
 }
 
 #[test]
-fn yaml_comes_back_to_the_last_bit() {
+fn yaml_is_read_as_written_to_the_last_bit() {
     for model in Model::ALL {
         let mut calibration = Calibration::factory(model);
         for (index, laser) in calibration.lasers.iter_mut().enumerate() {
@@ -102,7 +102,7 @@ fn xml(first: &str) -> String {
 }
 
 #[test]
-fn xml_is_degrees_and_centimetres_and_its_errors_name_the_element() {
+fn xml_is_in_degrees_and_centimetres_and_errors_name_the_element() {
     let sound = "<id_>0</id_><vertCorrection_>-90</vertCorrection_><distCorrection_>106</distCorrection_>\
                  <distCorrectionX_>108</distCorrectionX_><distCorrectionY_>111</distCorrectionY_>";
     let calibration = Calibration::load_str(&xml(sound)).unwrap();
@@ -126,7 +126,7 @@ fn xml_is_degrees_and_centimetres_and_its_errors_name_the_element() {
 }
 
 #[test]
-fn a_list_of_enabled_lasers_leaves_out_those_of_zero_and_is_refused_where_it_does_not_say() {
+fn the_list_of_enabled_lasers_removes_lasers_and_must_be_complete() {
     let sound = xml("<id_>0</id_><vertCorrection_>2</vertCorrection_>");
     let with = |name: &str, items: &[&str]| {
         let items: String = items.iter().map(|item| format!("<item>{item}</item>")).collect();
@@ -136,7 +136,7 @@ fn a_list_of_enabled_lasers_leaves_out_those_of_zero_and_is_refused_where_it_doe
     let mut enabled = ["1"; 16];
     assert_eq!(with("enabled_", &enabled), Calibration::load_str(&sound));
     enabled[15] = "0";
-    // A table of fifteen is no sensor's: the last laser is left out, as the list says.
+    // The list disables the last laser; no sensor has fifteen lasers.
     assert!(shown("enabled_", &enabled).contains("15 of them"), "{}", shown("enabled_", &enabled));
     for bad in ["yes", "", "-1", "2", "NaN", "0.5"] {
         enabled[3] = bad;
@@ -153,7 +153,7 @@ fn a_list_of_enabled_lasers_leaves_out_those_of_zero_and_is_refused_where_it_doe
 }
 
 #[test]
-fn a_padded_table_is_cut_and_a_short_one_named() {
+fn a_padded_table_is_cut_and_a_short_one_is_refused() {
     let padded = Calibration::factory(Model::Hdl64eS2);
     assert_eq!(padded.clone().cut_to(Model::Vlp16).unwrap().lasers.len(), 16);
     let error = padded.cut_to(Model::Vls128).unwrap_err();
@@ -179,7 +179,7 @@ fn every_recorded_calibration_is_read() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn factory_tables_are_veloviews() {
+fn factory_tables_equal_those_of_veloview() {
     for (model, file) in [
         (Model::Hdl32e, "HDL-32E.yml"),
         (Model::Vlp16, "VLP-16.yml"),

@@ -1,8 +1,8 @@
-//! Captures of every kind, whole, cut off and damaged.
+//! Captures of all formats: complete, truncated and damaged.
 
 use clearway_lidar::capture::{Capture, CaptureError, Datagram, Skipped};
 
-/// An IPv4 UDP packet from 192.168.1.201:443 to port 2368; `fragment`: the flags and offset field.
+/// An IPv4 UDP packet from 192.168.1.201:443 to port 2368. `fragment`: the field of flags and offset.
 pub fn ip_packet(payload: &[u8], fragment: u16) -> Vec<u8> {
     let udp = 8 + payload.len();
     let mut bytes = vec![0x45, 0];
@@ -28,7 +28,7 @@ pub fn ethernet(packet: &[u8], vlan: bool) -> Vec<u8> {
     bytes
 }
 
-/// A pcap with one packet a millisecond from 100 s on.
+/// A pcap file with one packet per millisecond, from 100 s on.
 pub fn pcap(link: u32, frames: &[Vec<u8>], big_endian: bool, nanoseconds: bool) -> Vec<u8> {
     let u32_of = |value: u32| if big_endian { value.to_be_bytes() } else { value.to_le_bytes() };
     let mut bytes = Vec::new();
@@ -44,7 +44,7 @@ pub fn pcap(link: u32, frames: &[Vec<u8>], big_endian: bool, nanoseconds: bool) 
     bytes
 }
 
-/// A pcapng section with one Ethernet interface of that resolution.
+/// A pcapng file with one Ethernet interface of that resolution.
 pub fn pcapng(frames: &[Vec<u8>], if_tsresol: u8, ticks: u64) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut block = |kind: u32, body: &[u8]| {
@@ -124,7 +124,7 @@ fn pcapng_stamps_follow_the_interfaces_resolution() {
 }
 
 #[test]
-fn a_truncated_capture_yields_what_it_holds_and_says_so() {
+fn a_truncated_capture_gives_its_datagrams_then_an_error() {
     let frames = vec![ethernet(&ip_packet(&[7; 1206], 0), false); 4];
     let whole = pcap(1, &frames, false, false);
     let record = 16 + frames[0].len();
@@ -154,7 +154,7 @@ fn a_process_information_block_shorter_than_its_head_is_damage() {
         let what = "a block shorter than its head".into();
         assert_eq!(error, Some(CaptureError::Damaged { offset: whole.len() as u64, what }), "{length}");
     }
-    // A packet of a classic capture may begin with the same bytes: its stamp's.
+    // A packet of a pcap file may begin with the same bytes, which are then its stamp.
     let mut classic = pcap(1, &frames, false, false);
     classic[24..28].copy_from_slice(&0x8000_0001_u32.to_le_bytes());
     let (datagrams, error, _) = read(&classic);
@@ -162,7 +162,7 @@ fn a_process_information_block_shorter_than_its_head_is_damage() {
 }
 
 #[test]
-fn what_is_no_whole_datagram_is_counted() {
+fn packets_without_a_complete_datagram_are_counted() {
     let mut tcp = ip_packet(&[0; 40], 0);
     tcp[9] = 6;
     let mut arp = ethernet(&[0; 46], false);
@@ -184,7 +184,7 @@ fn what_is_no_whole_datagram_is_counted() {
 }
 
 #[test]
-fn other_files_are_no_captures() {
+fn other_files_are_refused() {
     for bytes in [&b""[..], b"MZ", b"\x89MCAP0\r\n and so on, and on, and on", &[0; 100]] {
         assert!(matches!(Capture::new(bytes).err(), Some(CaptureError::Format { .. })), "{bytes:?}");
     }

@@ -1,4 +1,4 @@
-//! What happens to clocks, one script a story: what the device, the host and the receiver say, and when stamps are right.
+//! Scripts of events of clocks: the times of device, host and receiver, and the time at which stamps are right again.
 
 use clearway_lidar::Clock;
 
@@ -6,31 +6,31 @@ use crate::telemetry::with_sum;
 
 pub(crate) const S: i64 = 1_000_000_000;
 pub(crate) const HOUR: i64 = 3_600 * S;
-pub(crate) const TURN: i64 = S / 10;
+pub(crate) const REVOLUTION: i64 = S / 10;
 /// 18 May 2033, 0 h UTC.
 pub(crate) const MIDNIGHT: i64 = 1_999_987_200 * S;
-/// When it happens, in most scripts: inside a turn.
+/// Time of the event in most scripts, in ns: inside a revolution.
 pub(crate) const EVENT: i64 = 1_033_000_000;
 
-/// One script; all functions take ns since its beginning.
+/// One script. The argument of all functions is the time since its beginning, in ns.
 #[derive(Clone, Copy)]
 pub(crate) struct Script {
     pub(crate) name: &'static str,
-    /// UTC at its beginning.
+    /// UTC at the beginning.
     pub(crate) utc_ns: i64,
     pub(crate) lasts_ns: i64,
-    /// Device time, ns; taken past the hour.
+    /// Device time, in ns; the sensor sends it past the hour.
     pub(crate) device_ns: fn(i64) -> i64,
-    /// How far the host's clock is ahead of UTC.
+    /// Time by which the host's clock is ahead of UTC.
     pub(crate) host_ns: fn(i64) -> i64,
-    /// PPS state and what the receiver says: time and date, valid.
+    /// State of the pulse, and GPRMC sentence.
     pub(crate) telemetry: fn(i64) -> Option<(u8, String)>,
-    /// How far right stamps are ahead of UTC.
+    /// Time by which right stamps are ahead of UTC.
     pub(crate) right_ns: fn(i64) -> i64,
     pub(crate) event_ns: i64,
-    /// For so long after the event nothing is sent.
+    /// Time after the event during which the sensor sends nothing.
     pub(crate) silence_ns: i64,
-    /// From the event until stamps must be right.
+    /// Time from the event until stamps must be right.
     pub(crate) healed_ns: i64,
     pub(crate) tolerance_ns: i64,
     pub(crate) last: Clock,
@@ -46,14 +46,14 @@ pub(crate) const BASE: Script = Script {
     right_ns: |_| 0,
     event_ns: EVENT,
     silence_ns: 0,
-    healed_ns: TURN,
+    healed_ns: REVOLUTION,
     tolerance_ns: 200_000,
     last: Clock::Gps,
 };
 pub(crate) const NOON: i64 = MIDNIGHT + 12 * HOUR + 1_234 * S;
-/// A second before the day, and an hour, ends.
+/// One second before the end of a day.
 pub(crate) const LATE: i64 = MIDNIGHT + 24 * HOUR - S;
-/// A free-running device, 500 s after it was switched on.
+/// Time of a device without GPS, 500 s after power-on.
 pub(crate) const FREE: fn(i64) -> i64 = |t| 500 * S + t;
 pub(crate) const SILENT: fn(i64) -> Option<(u8, String)> = |_| None;
 
@@ -66,7 +66,7 @@ pub(crate) fn rmc(second: i64, status: char, date: &str) -> String {
     ))
 }
 
-/// The sentence of 0.3 s ago, pulse locked.
+/// Telemetry with a locked pulse and the GPRMC of 0.3 s before.
 pub(crate) fn gps(utc_ns: i64) -> Option<(u8, String)> {
     let second = (utc_ns - MIDNIGHT - 300_000_000) / S;
     Some((2, rmc(second, 'A', if second < 86_400 { "180533" } else { "190533" })))
@@ -77,7 +77,7 @@ pub(crate) fn dated(t: i64, date: &str) -> Option<(u8, String)> {
 }
 
 pub(crate) fn restarted(t: i64) -> bool {
-    (EVENT - TURN..EVENT).contains(&t)
+    (EVENT - REVOLUTION..EVENT).contains(&t)
 }
 
 pub(crate) fn after<T>(t: i64, then: T, before: T) -> T {
@@ -87,12 +87,12 @@ pub(crate) fn after<T>(t: i64, then: T, before: T) -> T {
 pub(crate) fn scripts() -> Vec<Script> {
     let late = Script { utc_ns: LATE, device_ns: |t| LATE + t, telemetry: |t| gps(LATE + t), ..BASE };
     let free = Script { device_ns: FREE, telemetry: SILENT, last: Clock::Arrival, ..BASE };
-    let silent = Script { silence_ns: 3 * TURN, healed_ns: 4 * TURN, ..BASE };
+    let silent = Script { silence_ns: 3 * REVOLUTION, healed_ns: 4 * REVOLUTION, ..BASE };
     vec![
-        Script { name: "the hour and the day end, and telemetry comes at that microsecond", event_ns: S, ..late },
+        Script { name: "hour and day end, and telemetry arrives in that microsecond", event_ns: S, ..late },
         Script { name: "the hour ends without telemetry", telemetry: SILENT, last: Clock::Device, event_ns: S, ..late },
         Script {
-            name: "GPS is gained: the device jumps to UTC; the host was 20 s behind",
+            name: "GPS is found: the device jumps to UTC; the host is 20 s behind",
             device_ns: |t| after(t, NOON, 500 * S) + t,
             telemetry: |t| after(t, gps(NOON + t), Some((1, rmc(0, 'V', "010100")))),
             host_ns: |_| -20 * S,
@@ -100,16 +100,16 @@ pub(crate) fn scripts() -> Vec<Script> {
             ..BASE
         },
         Script {
-            name: "GPS is gained a little ahead of the host: slower until it is right",
+            name: "GPS is found 40 ms behind the host: stamps run at half speed until they are right",
             device_ns: |t| after(t, NOON, 500 * S) + t,
             telemetry: |t| after(t, gps(NOON + t), None),
             host_ns: |_| 40_000_000,
             right_ns: |t| after(t, 0, 40_000_000),
-            healed_ns: 2 * TURN,
+            healed_ns: 2 * REVOLUTION,
             ..BASE
         },
         Script {
-            name: "GPS is lost, the host 7 s off: nothing changes",
+            name: "GPS is lost, while the host is 7 s off: nothing changes",
             telemetry: |t| after(t, Some((0, rmc(0, 'V', ""))), gps(NOON + t)),
             host_ns: |_| 7 * S,
             last: Clock::GpsUnlocked,
@@ -128,26 +128,30 @@ pub(crate) fn scripts() -> Vec<Script> {
             last: Clock::GpsUnlocked,
             ..BASE
         },
-        Script { name: "the host steps an hour on, under GPS", host_ns: |t| after(t, HOUR, 0), ..BASE },
-        Script { name: "the host steps an hour back, under GPS", host_ns: |t| after(t, -HOUR, 0), ..BASE },
+        Script { name: "the host steps an hour forward, with GPS", host_ns: |t| after(t, HOUR, 0), ..BASE },
+        Script { name: "the host steps an hour back, with GPS", host_ns: |t| after(t, -HOUR, 0), ..BASE },
         Script {
-            name: "restarted while the host is an hour back, and GPS is gained and the host set between the same two packets",
+            name: "a restart while the host is an hour back; between two packets GPS is found and the host is set",
             device_ns: |t| if restarted(t) { 1_034 * S + t } else { NOON + t },
             telemetry: |t| if restarted(t) { None } else { gps(NOON + t) },
             host_ns: |t| if restarted(t) { -HOUR } else { 0 },
-            event_ns: EVENT - TURN,
-            healed_ns: 2 * TURN,
+            event_ns: EVENT - REVOLUTION,
+            healed_ns: 2 * REVOLUTION,
             ..BASE
         },
-        Script { name: "the host steps 2 s on during a silence, under GPS", host_ns: |t| after(t, 2 * S, 0), ..silent },
         Script {
-            name: "the host steps 2 s back during a silence, under GPS",
+            name: "the host steps 2 s forward during a silence, with GPS",
+            host_ns: |t| after(t, 2 * S, 0),
+            ..silent
+        },
+        Script {
+            name: "the host steps 2 s back during a silence, with GPS",
             host_ns: |t| after(t, -2 * S, 0),
             ..silent
         },
         Script { name: "the host steps an hour back during a silence", host_ns: |t| after(t, -HOUR, 0), ..silent },
         Script {
-            name: "the host steps 2 s on during a silence and nobody else knows the time",
+            name: "the host steps 2 s forward during a silence, without GPS",
             host_ns: |t| after(t, 2 * S, 0),
             right_ns: |t| after(t, 2 * S, 0),
             silence_ns: silent.silence_ns,
@@ -155,30 +159,30 @@ pub(crate) fn scripts() -> Vec<Script> {
             ..free
         },
         Script {
-            name: "the host steps 2 s back during a silence and nobody else knows the time: stamps go on as they did",
+            name: "the host steps 2 s back during a silence, without GPS: stamps continue",
             host_ns: |t| after(t, -2 * S, 0),
             silence_ns: silent.silence_ns,
             healed_ns: silent.healed_ns,
-            last: Clock::Held,
+            last: Clock::Holdover,
             ..free
         },
         Script {
-            name: "the host steps an hour back just before a silence and forth during it, and nobody else knows the time",
-            host_ns: |t| if (EVENT - 4_000_000..EVENT + TURN).contains(&t) { -HOUR } else { 0 },
+            name: "the host steps an hour back before a silence and forward during it, without GPS",
+            host_ns: |t| if (EVENT - 4_000_000..EVENT + REVOLUTION).contains(&t) { -HOUR } else { 0 },
             silence_ns: silent.silence_ns,
             healed_ns: silent.healed_ns,
             ..free
         },
         Script {
-            name: "the host steps an hour on and nobody else knows the time",
+            name: "the host steps an hour forward, without GPS",
             host_ns: |t| after(t, HOUR, 0),
             right_ns: |t| after(t, HOUR, 0),
             ..free
         },
         Script {
-            name: "the host steps an hour back: stamps go on as they did",
+            name: "the host steps an hour back, without GPS: stamps continue",
             host_ns: |t| after(t, -HOUR, 0),
-            last: Clock::Held,
+            last: Clock::Holdover,
             ..free
         },
         Script {
@@ -188,7 +192,7 @@ pub(crate) fn scripts() -> Vec<Script> {
             ..free
         },
         Script {
-            name: "the sensor is restarted and finds no GPS; the host is 7 s off",
+            name: "the sensor is restarted without GPS; the host is 7 s off",
             device_ns: |t| after(t, t - EVENT, NOON + t),
             telemetry: |t| after(t, None, gps(NOON + t)),
             host_ns: |_| 7 * S,
@@ -197,26 +201,31 @@ pub(crate) fn scripts() -> Vec<Script> {
             ..BASE
         },
         Script {
-            name: "the pulse alone sets the part of a second 0.7 s back",
+            name: "only the pulse sets the fraction of a second, 0.7 s back",
             device_ns: |t| after(t, 499_300_000_000, 500 * S) + t,
             tolerance_ns: 11_000_000,
             ..free
         },
         Script {
-            name: "a capture played at ten times its speed",
+            name: "a capture that is played at ten times its speed",
             host_ns: |t| -t / 10 * 9,
-            tolerance_ns: TURN,
-            last: Clock::Held,
+            tolerance_ns: REVOLUTION,
+            last: Clock::Holdover,
             ..free
         },
         Script {
             name: "all arrivals equal",
             host_ns: |t| -t,
-            tolerance_ns: TURN + 2_000_000,
-            last: Clock::Held,
+            tolerance_ns: REVOLUTION + 2_000_000,
+            last: Clock::Holdover,
             ..free
         },
-        Script { name: "the receiver says 1980", telemetry: |t| dated(t, "060180"), last: Clock::Device, ..BASE },
+        Script {
+            name: "the receiver sends the year 1980",
+            telemetry: |t| dated(t, "060180"),
+            last: Clock::Device,
+            ..BASE
+        },
         Script {
             name: "the receiver is 1024 weeks late",
             telemetry: |t| dated(t, "021013"),
@@ -224,7 +233,7 @@ pub(crate) fn scripts() -> Vec<Script> {
             ..BASE
         },
         Script {
-            name: "an old capture played live, its telemetry after its data",
+            name: "an old capture, whose telemetry begins after its data",
             telemetry: |t| after(t, gps(NOON + t), None),
             host_ns: |_| 20_000 * HOUR + 1_000 * S,
             right_ns: |_| 20_000 * HOUR + 1_000 * S,
@@ -232,7 +241,7 @@ pub(crate) fn scripts() -> Vec<Script> {
             ..BASE
         },
         Script {
-            name: "an old capture played live, its device's counter set inside it",
+            name: "an old capture, in which the device's counter is set",
             device_ns: |t| after(t, NOON, 500 * S) + t,
             telemetry: |t| after(t, gps(NOON + t), None),
             host_ns: |_| 20_000 * HOUR + 1_000 * S,
@@ -242,15 +251,15 @@ pub(crate) fn scripts() -> Vec<Script> {
             ..BASE
         },
         Script {
-            name: "a host whose clock nobody set, under GPS",
+            name: "a host whose clock was never set, with GPS",
             host_ns: |_| -MIDNIGHT,
             telemetry: |t| after(t, gps(NOON + t), None),
             right_ns: |t| after(t, 0, -MIDNIGHT),
             ..BASE
         },
-        Script { name: "the device does not follow its receiver", telemetry: |t| gps(NOON + t), ..free },
+        Script { name: "the device's time does not agree with its receiver", telemetry: |t| gps(NOON + t), ..free },
         Script {
-            name: "a leap second, counted past the hour; Unix time repeats it",
+            name: "a leap second, which the device counts past the hour and Unix time repeats",
             device_ns: |t| t + if t < 2 * S { HOUR - S } else { -2 * S },
             telemetry: |t| match t - 300_000_000 {
                 0..S => Some((2, rmc(86_399, 'A', "180533"))),
@@ -261,7 +270,7 @@ pub(crate) fn scripts() -> Vec<Script> {
             right_ns: |t| if t < 2 * S { 0 } else { -S },
             event_ns: 2 * S,
             lasts_ns: 5 * S,
-            healed_ns: 2 * S + TURN,
+            healed_ns: 2 * S + REVOLUTION,
             ..late
         },
     ]

@@ -1,12 +1,12 @@
-//! The fuzzers' corpora, replayed. They hold bytes made here, written anew with `CLEARWAY_BLESS=1`, and what the fuzzers
-//! made of those (named by their hash).
+//! Replay of the corpora of the fuzzers. They contain seeds that are generated here (`CLEARWAY_BLESS=1` writes them
+//! again) and inputs that the fuzzers found (named by their hash).
 
 #[path = "../../fuzz/entries.rs"]
 pub mod entries;
 
 use std::path::PathBuf;
 
-use clearway_lidar::calibration::unit_table::status_bytes;
+use clearway_lidar::calibration::status_table::status_bytes;
 use clearway_lidar::{Calibration, Model, ReturnMode};
 
 use crate::stream::Stream;
@@ -26,7 +26,7 @@ fn replay(target: &str, entry: fn(&[u8])) {
 }
 
 #[test]
-fn every_seed_is_taken_without_a_panic() {
+fn no_seed_causes_a_panic() {
     if std::env::var_os("CLEARWAY_BLESS").is_some() {
         write_seeds();
     }
@@ -57,7 +57,7 @@ fn write_seeds() {
             Calibration::factory(model).to_yaml().as_bytes(),
         );
     }
-    // What a network does to a few packets: late, twice, lost, from another time.
+    // Packets that are late, duplicated, lost, or from another time.
     let streams = Stream::of(Model::Vlp16);
     let orders: [(&str, Vec<usize>); 4] = [
         ("out_of_order", (0..40).map(|index| index ^ 5).collect()),
@@ -75,7 +75,7 @@ fn write_seeds() {
     write("packet", "model_unknown", &found);
     let status = status_bytes(Model::Hdl64eS3, &Calibration::factory(Model::Hdl64eS3));
     let status: Vec<u8> = status.into_iter().flat_map(|(kind, value)| [kind, value]).collect();
-    write("packet", "unit_table", &[&[0xFF], status.as_slice()].concat());
+    write("packet", "status_table", &[&[0xFF], status.as_slice()].concat());
 
     let sentence = "$GPRMC,120000,A,4807.0380,N,01131.0000,E,022.4,084.4,010120,003.1,W*";
     write("telemetry", "unfinished", &telemetry::datagram(5, sentence));

@@ -1,16 +1,16 @@
-//! What the decoder does with streams made here, sound and damaged.
+//! Tests of the decoder with generated streams, valid and damaged.
 
 mod bad_datagrams;
 mod blocked;
 mod calibration;
 mod capture;
+mod clock;
 mod clock_scripts;
-mod clocks;
 mod corpora;
+mod cut;
 mod models;
 mod order;
 mod properties;
+mod status_table;
 mod stream;
 mod telemetry;
-mod turns;
-mod unit_table;

@@ -1,4 +1,5 @@
-//! Packets late, twice, lost, from a sensor that pauses, restarts, sees half its turn or changes its rate.
+//! Packets that are late, duplicated or lost, and sensors that pause, restart, have a field of view or change their
+//! rate.
 
 use clearway_lidar::{Model, Partial, ReturnMode, Revolution, Sensor, SensorConfig, SensorStatus};
 
@@ -8,22 +9,22 @@ fn sensor(model: Model) -> Sensor {
     Sensor::new(SensorConfig { model: Some(model), ..SensorConfig::default() })
 }
 
-/// Revolutions of packets of which none is refused, and the status at the end.
+/// Decodes packets of which none is refused, and returns the revolutions and the status at the end.
 fn decode(model: Model, packets: &[(Vec<u8>, i64)]) -> (Vec<Revolution>, SensorStatus) {
     let mut sensor = sensor(model);
     let push = |(packet, arrival_ns): &(Vec<u8>, i64)| sensor.push(packet, *arrival_ns).unwrap().cloned();
-    let mut turns: Vec<Revolution> = packets.iter().filter_map(push).collect();
-    turns.extend(sensor.finish().cloned());
-    (turns, sensor.status())
+    let mut revolutions: Vec<Revolution> = packets.iter().filter_map(push).collect();
+    revolutions.extend(sensor.finish().cloned());
+    (revolutions, sensor.status())
 }
 
 #[test]
-fn a_packet_in_order_waits_for_nothing_and_one_behind_a_gap_until_it_is_filled() {
+fn a_packet_waits_only_behind_a_gap_and_until_it_is_filled() {
     let stream = Stream::of(Model::Vlp16);
     let mut sensor = sensor(Model::Vlp16);
-    let held = |sensor: &Sensor| sensor.status().packets_held;
+    let held = |sensor: &Sensor| sensor.status().packets_waiting;
     stream.push(&mut sensor, 0..32);
-    assert_eq!(held(&sensor), 32, "nobody knows yet whether packet 0 was the first");
+    assert_eq!(held(&sensor), 32, "it is unknown whether packet 0 is the first");
     for index in 32..60 {
         stream.push(&mut sensor, [index]);
         assert_eq!(held(&sensor), 0, "{index}");
@@ -32,11 +33,11 @@ fn a_packet_in_order_waits_for_nothing_and_one_behind_a_gap_until_it_is_filled()
     assert_eq!(held(&sensor), 9);
     stream.push(&mut sensor, [60]);
     assert_eq!((held(&sensor), sensor.status().packets), (0, 70));
-    // Packet 70 never comes: after 32 more the others go on.
+    // Packet 70 never arrives: after 32 more packets the others pass.
     stream.push(&mut sensor, 71..103);
     assert_eq!(held(&sensor), 32);
     stream.push(&mut sensor, 103..104);
-    assert!(held(&sensor) < 32, "one revolution a packet: what lies behind its cut goes on with the next");
+    assert!(held(&sensor) < 32, "a packet ends one revolution; packets behind its cut pass with the next packet");
     stream.push(&mut sensor, 104..105);
     assert_eq!((held(&sensor), sensor.status().packets_lost), (0, 1));
     let late = sensor.push(&stream.packet(70), stream.arrival_ns(104)).unwrap_err();
@@ -52,7 +53,7 @@ fn a_packet_in_order_waits_for_nothing_and_one_behind_a_gap_until_it_is_filled()
 #[test]
 fn an_hdl64e_s1_without_time_is_put_in_order_by_azimuth() {
     let stream = Stream::of(Model::Hdl64eS1);
-    // The S1's last bytes are text, not time.
+    // The last bytes of an S1 are text, not time.
     let packet = |index: usize| {
         let mut packet = stream.packet(index);
         packet[1200..].copy_from_slice(if index.is_multiple_of(2) { b"\x58\x02v25c" } else { b"\x00\x19DegC" });
@@ -62,13 +63,16 @@ fn an_hdl64e_s1_without_time_is_put_in_order_by_azimuth() {
     let (expected, _) = decode(Model::Hdl64eS1, &clean);
     let mut shuffled = clean.clone();
     shuffled.chunks_mut(20).for_each(|packets| packets.reverse());
-    let (turns, status) = decode(Model::Hdl64eS1, &shuffled);
-    assert_eq!((turns.len(), status.packets_lost), (expected.len(), 0));
-    for (turn, expected) in turns.iter().zip(&expected) {
+    let (revolutions, status) = decode(Model::Hdl64eS1, &shuffled);
+    assert_eq!((revolutions.len(), status.packets_lost), (expected.len(), 0));
+    for (revolution, expected) in revolutions.iter().zip(&expected) {
         assert!(
-            turn.points().map(|p| (p.x, p.y, p.z, p.firing)).eq(expected.points().map(|p| (p.x, p.y, p.z, p.firing)))
+            revolution
+                .points()
+                .map(|p| (p.x, p.y, p.z, p.firing))
+                .eq(expected.points().map(|p| (p.x, p.y, p.z, p.firing)))
         );
-        assert_eq!((turn.partial, turn.packets), (expected.partial, expected.packets));
+        assert_eq!((revolution.partial, revolution.packets), (expected.partial, expected.packets));
     }
     let mut lossy = clean.clone();
     lossy.drain(300..340);
@@ -82,25 +86,31 @@ fn an_hdl64e_s1_without_time_is_put_in_order_by_azimuth() {
 }
 
 #[test]
-fn a_field_of_view_is_no_loss_whether_it_ends_inside_a_packet_or_between_two() {
+fn a_field_of_view_gap_inside_or_between_packets_is_not_loss() {
     for model in [Model::Hdl64eS2, Model::Hdl32e, Model::Vlp16, Model::Vls128] {
         for (from, to) in [(9_000, 27_000), (4_000, 6_500), (30_000, 12_000)] {
             let stream = Stream::of(model);
-            let lit =
+            let visible =
                 |azimuth: u32| if from < to { !(from..to).contains(&azimuth) } else { (to..from).contains(&azimuth) };
-            let inside = stream.turning(stream.packets(4.0), |_| 600.0, lit);
-            let (turns, status) = decode(model, &inside);
+            let inside = stream.rotating(stream.packets(4.0), |_| 600.0, visible);
+            let (revolutions, status) = decode(model, &inside);
             assert_eq!(status.packets_lost, 0, "{model:?} {from} {to}");
-            assert!(turns[2..].iter().all(|turn| turn.packets_expected == turn.packets), "{model:?} {from} {to}");
+            assert!(
+                revolutions[2..].iter().all(|revolution| revolution.packets_expected == revolution.packets),
+                "{model:?} {from} {to}"
+            );
 
-            let all = stream.turning(stream.packets(7.0), |_| 600.0, |_| true);
+            let all = stream.rotating(stream.packets(7.0), |_| 600.0, |_| true);
             let azimuth = |packet: &[u8]| u32::from(u16::from_le_bytes([packet[2], packet[3]]));
-            let mut between: Vec<_> = all.into_iter().filter(|(packet, _)| lit(azimuth(packet))).collect();
-            let (turns, status) = decode(model, &between);
+            let mut between: Vec<_> = all.into_iter().filter(|(packet, _)| visible(azimuth(packet))).collect();
+            let (revolutions, status) = decode(model, &between);
             assert_eq!(status.packets_lost, 0, "{model:?} {from} {to}");
-            assert!(turns[2..].iter().all(|turn| turn.packets_expected == turn.packets), "{model:?} {from} {to}");
+            assert!(
+                revolutions[2..].iter().all(|revolution| revolution.packets_expected == revolution.packets),
+                "{model:?} {from} {to}"
+            );
 
-            // Loss beside it is still loss.
+            // Loss beside the gap is still loss.
             let seen = between.len() / 2;
             between.drain(seen..seen + 3);
             let (_, status) = decode(model, &between);
@@ -110,19 +120,20 @@ fn a_field_of_view_is_no_loss_whether_it_ends_inside_a_packet_or_between_two() {
 }
 
 #[test]
-fn a_gap_that_does_not_come_back_was_loss() {
+fn a_gap_that_the_next_revolution_does_not_repeat_is_loss() {
     let stream = Stream::of(Model::Vlp16);
     let mut sensor = sensor(Model::Vlp16);
-    let mut turns = stream.push(&mut sensor, (0..150).filter(|index| !(90..120).contains(index)));
-    assert_eq!(sensor.status().packets_lost, 0, "it may be a field of view");
-    turns.extend(stream.push(&mut sensor, 150..250));
+    let mut revolutions = stream.push(&mut sensor, (0..150).filter(|index| !(90..120).contains(index)));
+    assert_eq!(sensor.status().packets_lost, 0, "it may be a field-of-view gap");
+    revolutions.extend(stream.push(&mut sensor, 150..250));
     assert_eq!(sensor.status().packets_lost, 30);
-    let missing = turns.iter().map(|turn| turn.packets_expected - turn.packets).collect::<Vec<_>>();
+    let missing =
+        revolutions.iter().map(|revolution| revolution.packets_expected - revolution.packets).collect::<Vec<_>>();
     assert_eq!(missing, [0, 30, 0]);
 }
 
 #[test]
-fn a_sensor_that_changes_its_rate_loses_nothing_and_turns_go_on() {
+fn a_change_of_the_rate_of_rotation_loses_no_packet() {
     for model in Model::ALL {
         let stream = Stream::of(model);
         for mode in [ReturnMode::Strongest, ReturnMode::Dual] {
@@ -130,57 +141,66 @@ fn a_sensor_that_changes_its_rate_loses_nothing_and_turns_go_on() {
                 continue;
             }
             let stream = Stream { mode, ..stream };
-            // 300 to 1200 and back within two seconds, and at once: what an S1 cannot do without seeming to lose a
-            // packet.
+            // The rate changes from 300 to 1,200 rpm and back within two seconds, or at once. An S1 has no time, so
+            // that a sudden change looks like a lost packet.
             let smooth = |seconds: f64| 750.0 - 450.0 * (seconds * std::f64::consts::PI).cos();
             let sudden = |seconds: f64| if seconds % 1.0 < 0.5 { 300.0 } else { 1200.0 };
-            let mut streams = vec![(stream.turning(stream.packets(20.0), smooth, |_| true), 0)];
+            let mut streams = vec![(stream.rotating(stream.packets(20.0), smooth, |_| true), 0)];
             if model != Model::Hdl64eS1 {
-                streams.push((stream.turning(stream.packets(20.0), sudden, |_| true), 6));
+                streams.push((stream.rotating(stream.packets(20.0), sudden, |_| true), 6));
             }
             for (packets, broken_max) in streams {
-                let (turns, status) = decode(model, &packets);
+                let (revolutions, status) = decode(model, &packets);
                 assert_eq!(status.packets_lost, 0, "{model:?} {mode:?}");
                 assert_eq!(
-                    turns[1..turns.len() - 1].iter().filter(|turn| turn.packets_expected > turn.packets).count(),
+                    revolutions[1..revolutions.len() - 1]
+                        .iter()
+                        .filter(|revolution| revolution.packets_expected > revolution.packets)
+                        .count(),
                     0
                 );
-                // 750 a minute in the mean.
-                assert!((24..=27).contains(&turns.len()), "{model:?} {mode:?}: {}", turns.len());
-                let broken = turns[1..turns.len() - 1].iter().filter(|turn| turn.partial.is_some()).count();
-                assert!(broken <= broken_max, "{model:?} {mode:?}: {broken} turns broken, {broken_max} allowed");
+                // The mean rate is 750 rpm.
+                assert!((24..=27).contains(&revolutions.len()), "{model:?} {mode:?}: {}", revolutions.len());
+                let broken = revolutions[1..revolutions.len() - 1]
+                    .iter()
+                    .filter(|revolution| revolution.partial.is_some())
+                    .count();
+                assert!(
+                    broken <= broken_max,
+                    "{model:?} {mode:?}: {broken} revolutions are partial, {broken_max} are allowed"
+                );
             }
         }
     }
 }
 
 #[test]
-fn a_restart_costs_one_packet_and_cuts_the_turn() {
+fn a_restart_loses_one_packet_and_cuts_the_revolution() {
     for model in Model::ALL.into_iter().filter(|model| *model != Model::Hdl64eS1) {
         let before = Stream { device_us: 3_000_000_000, ..Stream::of(model) };
         let after = Stream { device_us: 0, start_azimuth: 1_234, ..before };
         let mut sensor = sensor(model);
         let half = before.packets(1.5);
-        let mut turns = before.push(&mut sensor, 0..half);
-        let refusal = sensor.push(&after.packet(0), before.arrival_ns(half)).unwrap_err();
-        assert_eq!(refusal.reason(), "device_time", "{model:?}");
+        let mut revolutions = before.push(&mut sensor, 0..half);
+        let error = sensor.push(&after.packet(0), before.arrival_ns(half)).unwrap_err();
+        assert_eq!(error.reason(), "device_time", "{model:?}");
         let arrival_ns = |index| before.arrival_ns(half + index);
         for index in 1..after.packets(2.5) {
-            turns.extend(sensor.push(&after.packet(index), arrival_ns(index)).unwrap().cloned());
+            revolutions.extend(sensor.push(&after.packet(index), arrival_ns(index)).unwrap().cloned());
         }
         assert_eq!(sensor.status().packets_lost, 0, "{model:?}");
-        let partials: Vec<_> = turns.iter().map(|turn| turn.partial).collect();
+        let partials: Vec<_> = revolutions.iter().map(|revolution| revolution.partial).collect();
         assert_eq!(partials[..4], [None, Some(Partial::Gap), Some(Partial::Gap), None], "{model:?}");
-        assert!(turns.windows(2).all(|pair| pair[0].end_ns <= pair[1].start_ns), "{model:?}");
+        assert!(revolutions.windows(2).all(|pair| pair[0].end_ns <= pair[1].start_ns), "{model:?}");
     }
 }
 
 #[test]
-fn a_pause_of_the_network_is_loss_and_a_clock_that_was_set_is_not() {
+fn a_pause_of_the_network_is_loss_and_a_set_clock_is_not() {
     let stream = Stream::of(Model::Hdl32e);
     let mut sensor = sensor(Model::Hdl32e);
     stream.push(&mut sensor, 0..300);
-    // 10,000 packets, 5.5 s.
+    // The pause is 10,000 packets, 5.5 s.
     assert_eq!(sensor.push(&stream.packet(10_300), stream.arrival_ns(10_300)).unwrap_err().reason(), "device_time");
     stream.push(&mut sensor, 10_301..10_900);
     assert_eq!(sensor.status().packets_lost, 10_001);
@@ -194,38 +214,38 @@ fn a_pause_of_the_network_is_loss_and_a_clock_that_was_set_is_not() {
 }
 
 #[test]
-fn one_packet_from_another_time_is_refused_and_the_stream_goes_on() {
+fn a_single_packet_from_another_time_is_refused() {
     for device_us in [0, 1, 900_000_000, 1_990_000_000, 2_001_200_000, 3_599_999_999] {
         let stream = Stream::of(Model::Hdl64eS2);
         let mut sensor = sensor(Model::Hdl64eS2);
-        let mut turns = stream.push(&mut sensor, 0..500);
+        let mut revolutions = stream.push(&mut sensor, 0..500);
         let stray = Stream { device_us, ..stream }.packet(0);
         assert_eq!(sensor.push(&stray, stream.arrival_ns(500)).unwrap_err().reason(), "device_time", "{device_us}");
-        turns.extend(stream.push(&mut sensor, 500..1100));
-        assert!(turns.iter().all(|turn| turn.partial.is_none()), "{device_us}");
+        revolutions.extend(stream.push(&mut sensor, 500..1100));
+        assert!(revolutions.iter().all(|revolution| revolution.partial.is_none()), "{device_us}");
         assert_eq!(sensor.status().packets_lost, 0);
     }
 }
 
 #[test]
-fn the_hours_end_is_no_jump_even_out_of_order() {
+fn the_end_of_the_hour_is_not_a_jump() {
     let stream = Stream { device_us: 3_599_990_000, ..Stream::of(Model::Vlp16) };
     let mut sensor = sensor(Model::Vlp16);
     let mut order: Vec<usize> = (0..300).collect();
     order.chunks_mut(16).for_each(|packets| packets.reverse());
-    let turns = stream.push(&mut sensor, order);
-    assert!(turns.iter().all(|turn| turn.partial.is_none()));
+    let revolutions = stream.push(&mut sensor, order);
+    assert!(revolutions.iter().all(|revolution| revolution.partial.is_none()));
     assert_eq!((sensor.status().packets, sensor.status().packets_lost), (300, 0));
 }
 
 #[test]
-fn whole_turns_lost_leave_no_turn_made_of_two() {
+fn a_lost_revolution_does_not_join_its_neighbours() {
     let stream = Stream::of(Model::Vlp16);
     let mut sensor = sensor(Model::Vlp16);
-    // 79 packets are one turn and 19 degrees: the azimuth alone would say that three were lost.
-    let turns = stream.push(&mut sensor, (0..400).filter(|index| !(100..179).contains(index)));
-    assert_eq!(turns[1].partial, Some(Partial::Gap));
-    assert_eq!(turns[1].packets_expected - turns[1].packets, 79);
-    assert!(turns.iter().all(|turn| turn.end_ns - turn.start_ns < 100_000_000));
-    assert!(turns.iter().all(|turn| (turn.rpm - 600.0).abs() < 3.0));
+    // 79 packets are one revolution and 19 degrees: by azimuth alone, three packets were lost.
+    let revolutions = stream.push(&mut sensor, (0..400).filter(|index| !(100..179).contains(index)));
+    assert_eq!(revolutions[1].partial, Some(Partial::Gap));
+    assert_eq!(revolutions[1].packets_expected - revolutions[1].packets, 79);
+    assert!(revolutions.iter().all(|revolution| revolution.end_ns - revolution.start_ns < 100_000_000));
+    assert!(revolutions.iter().all(|revolution| (revolution.rpm - 600.0).abs() < 3.0));
 }

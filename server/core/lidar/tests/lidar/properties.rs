@@ -1,4 +1,4 @@
-//! Whatever the bytes: no panic, and a refused datagram leaves the sensor as it was.
+//! Properties that hold for all bytes: no panic, and a refused datagram changes nothing.
 
 use clearway_lidar::{Model, ReturnMode, Revolution, Sensor, SensorConfig};
 use proptest::collection::vec;
@@ -12,7 +12,7 @@ fn models() -> impl Strategy<Value = Model> {
     proptest::sample::select(Model::ALL.to_vec())
 }
 
-/// Bytes to overwrite: where, and with what.
+/// Bytes to overwrite, as position and value.
 fn damage() -> impl Strategy<Value = Vec<(prop::sample::Index, u8)>> {
     vec((any::<prop::sample::Index>(), any::<u8>()), 0..8)
 }
@@ -22,7 +22,7 @@ fn damaged(mut bytes: Vec<u8>, damage: &[(prop::sample::Index, u8)]) -> Vec<u8> 
     bytes
 }
 
-/// What a hostile or broken network does to a stream.
+/// An event of a hostile or faulty network.
 #[derive(Clone, Debug)]
 enum Event {
     Sent { skip: usize },
@@ -52,7 +52,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 96, ..ProptestConfig::default() })]
 
     #[test]
-    fn any_bytes_are_taken_or_refused(bytes in vec(any::<u8>(), 0..4000)) {
+    fn no_bytes_cause_a_panic(bytes in vec(any::<u8>(), 0..4000)) {
         entries::packet(&bytes);
         entries::telemetry(&bytes);
         entries::capture(&bytes);
@@ -60,7 +60,7 @@ proptest! {
     }
 
     #[test]
-    fn any_stream_of_damaged_packets_is_decoded_or_refused(
+    fn no_stream_of_damaged_packets_causes_a_panic(
         model in models(),
         configured in any::<bool>(),
         cut_azimuth_deg in -720.0..720.0_f32,
@@ -73,8 +73,8 @@ proptest! {
         for event in events {
             let datagram = match event {
                 Event::Finish => {
-                    if let Some(turn) = sensor.finish() {
-                        prop_assert!(turn.start_ns <= turn.end_ns);
+                    if let Some(revolution) = sensor.finish() {
+                        prop_assert!(revolution.start_ns <= revolution.end_ns);
                     }
                     continue;
                 }
@@ -95,16 +95,18 @@ proptest! {
                     let mode = if dual { ReturnMode::Dual } else { ReturnMode::Strongest };
                     Stream { mode, ..Stream::of(model) }.packet(index)
                 }
-                Event::Telemetry { damage } => damaged(telemetry::datagram(5_000_000, "$GPRMC,,V,,,,,,,,,,N*53\r\n"), &damage),
+                Event::Telemetry { damage } => {
+                    damaged(telemetry::datagram(5_000_000, "$GPRMC,,V,,,,,,,,,,N*53\r\n"), &damage)
+                }
             };
             index += 1;
             let before = sensor.status();
             match sensor.push(&datagram, stream.arrival_ns(index)) {
                 Ok(None) => {}
-                Ok(Some(turn)) => {
-                    prop_assert!(turn.start_ns <= turn.end_ns);
-                    prop_assert_eq!(turn.points().count(), turn.returns());
-                    prop_assert_eq!(turn.echoes[0].range_m.len(), turn.firings.len() * turn.lasers);
+                Ok(Some(revolution)) => {
+                    prop_assert!(revolution.start_ns <= revolution.end_ns);
+                    prop_assert_eq!(revolution.points().count(), revolution.returns());
+                    prop_assert_eq!(revolution.echoes[0].range_m.len(), revolution.firings.len() * revolution.lasers);
                 }
                 Err(_) => prop_assert_eq!(sensor.status(), before),
             }
@@ -112,7 +114,7 @@ proptest! {
     }
 
     #[test]
-    fn a_refused_datagram_changes_nothing_that_comes_after(
+    fn a_refused_datagram_changes_no_later_revolution(
         model in models(),
         at in 0..200_usize,
         damage in damage(),
@@ -121,24 +123,27 @@ proptest! {
         let stream = Stream::of(model);
         let decode = |bad: &[Vec<u8>]| {
             let mut sensor = Sensor::new(SensorConfig::default());
-            let mut turns = stream.push(&mut sensor, 0..at);
+            let mut revolutions = stream.push(&mut sensor, 0..at);
             let refused = bad.iter().all(|bad| sensor.push(bad, START_NS).is_err());
-            // One that was not refused makes copies of packets to come.
+            // A datagram that is accepted may make later packets copies, which are refused.
             let push = |index| sensor.push(&stream.packet(index), stream.arrival_ns(index)).ok().flatten().cloned();
-            turns.extend((at..260).filter_map(push));
-            turns.extend(sensor.finish().cloned());
-            let turn = |turn: &Revolution| (turn.start_ns, turn.end_ns, turn.partial, turn.points().collect::<Vec<_>>());
-            (refused, turns.iter().map(turn).collect::<Vec<_>>(), sensor.status())
+            revolutions.extend((at..260).filter_map(push));
+            revolutions.extend(sensor.finish().cloned());
+            let content = |revolution: &Revolution| {
+                let points: Vec<_> = revolution.points().collect();
+                (revolution.start_ns, revolution.end_ns, revolution.partial, points)
+            };
+            (refused, revolutions.iter().map(content).collect::<Vec<_>>(), sensor.status())
         };
         let mut bad = vec![damaged(stream.packet(at), &damage), noise];
         bad.retain(|bad| decode(std::slice::from_ref(bad)).0);
-        let ((_, turns, status), (_, expected_turns, expected_status)) = (decode(&bad), decode(&[]));
-        prop_assert!(turns == expected_turns);
+        let ((_, revolutions, status), (_, expected_turns, expected_status)) = (decode(&bad), decode(&[]));
+        prop_assert!(revolutions == expected_turns);
         prop_assert_eq!(status, expected_status);
     }
 
     #[test]
-    fn damaged_captures_and_messages_are_read_or_refused(damage in damage(), end in any::<prop::sample::Index>()) {
+    fn no_damaged_capture_causes_a_panic(damage in damage(), end in any::<prop::sample::Index>()) {
         let frames = [capture::ethernet(&capture::ip_packet(&[1; 64], 0), true), capture::ethernet(&[0; 9], false)];
         for bytes in [
             capture::pcap(1, &frames, false, false),

@@ -1,12 +1,12 @@
-//! A small encoder: packets of any model that looks at a round wall.
+//! A small encoder: packets of any model inside a round wall.
 
-use clearway_lidar::model::{AZIMUTHS_PER_TURN, BLOCK_FLAGS, BLOCKS_PER_PACKET, S1_FLAGS};
+use clearway_lidar::model::{AZIMUTHS_PER_REVOLUTION, BLOCK_FLAGS, BLOCKS_PER_PACKET, S1_FLAGS};
 use clearway_lidar::{Model, ReturnMode, Revolution, Sensor};
 
-/// When the streams start: 11:33:20 UTC on 14 May 2033, and the same past the hour.
+/// Start of the streams, in ns since the Unix epoch: 3:33:20 UTC on 18 May 2033, and the same past the hour.
 pub const START_NS: i64 = 2_000_000_000_000_000_000;
 
-/// A sensor at 10 turns a second, a wall `distance` counts away all around.
+/// A sensor at 10 revolutions per second, with a wall at `distance` counts in all directions.
 #[derive(Clone, Copy)]
 pub struct Stream {
     pub model: Model,
@@ -28,9 +28,9 @@ impl Stream {
         (packet * spec.firings_per_packet(self.mode) + firing) as u64 * u64::from(spec.period_ns(self.mode))
     }
 
-    /// Packets of so many turns, rounded up.
-    pub fn packets(&self, turns: f64) -> usize {
-        (turns * 1e8 / f64::from(self.model.spec().packet_period_ns(self.mode))).ceil() as usize
+    /// Number of packets of so many revolutions, rounded up.
+    pub fn packets(&self, revolutions: f64) -> usize {
+        (revolutions * 1e8 / f64::from(self.model.spec().packet_period_ns(self.mode))).ceil() as usize
     }
 
     pub fn packet(&self, index: usize) -> Vec<u8> {
@@ -41,7 +41,7 @@ impl Stream {
                 bytes.extend([0xFF; 100]);
                 continue;
             }
-            let place = spec.place(block, self.mode);
+            let place = spec.block_position(block, self.mode);
             let flag = if self.model == Model::Hdl64eS1 { S1_FLAGS[block % 4] } else { BLOCK_FLAGS[place.bank] };
             let turned = self.time_ns(index, place.firing) * 36_000 / 100_000_000;
             bytes.extend(flag.to_le_bytes());
@@ -62,9 +62,14 @@ impl Stream {
         bytes
     }
 
-    /// `count` packets and their arrivals of a sensor that turns `rpm(seconds)` and sends the columns that are `lit`,
-    /// counted from azimuth 180 degrees on.
-    pub fn turning(&self, count: usize, rpm: impl Fn(f64) -> f64, lit: impl Fn(u32) -> bool) -> Vec<(Vec<u8>, i64)> {
+    /// `count` packets, with their arrivals, of a sensor that rotates at `rpm(seconds)`, begins at azimuth 180 degrees,
+    /// and sends the columns of azimuths that are `visible`.
+    pub fn rotating(
+        &self,
+        count: usize,
+        rpm: impl Fn(f64) -> f64,
+        visible: impl Fn(u32) -> bool,
+    ) -> Vec<(Vec<u8>, i64)> {
         let spec = self.model.spec();
         let echoes = if self.mode == ReturnMode::Dual { 2 } else { 1 };
         let blocks = spec.blocks_per_firing * echoes;
@@ -74,8 +79,8 @@ impl Stream {
         let mut packet = || {
             let mut bytes = self.packet(0);
             for column in 0..columns {
-                while !lit(turned as u32 % AZIMUTHS_PER_TURN) {
-                    turned += rpm(seconds) / 60.0 * f64::from(AZIMUTHS_PER_TURN) * column_s;
+                while !visible(turned as u32 % AZIMUTHS_PER_REVOLUTION) {
+                    turned += rpm(seconds) / 60.0 * f64::from(AZIMUTHS_PER_REVOLUTION) * column_s;
                     seconds += column_s;
                 }
                 if column == 0 {
@@ -83,10 +88,10 @@ impl Stream {
                     bytes[1200..1204].copy_from_slice(&(device_us as u32).to_le_bytes());
                 }
                 for block in column * blocks..(column + 1) * blocks {
-                    let azimuth = (turned as u32 % AZIMUTHS_PER_TURN) as u16;
+                    let azimuth = (turned as u32 % AZIMUTHS_PER_REVOLUTION) as u16;
                     bytes[100 * block + 2..100 * block + 4].copy_from_slice(&azimuth.to_le_bytes());
                 }
-                turned += rpm(seconds) / 60.0 * f64::from(AZIMUTHS_PER_TURN) * column_s;
+                turned += rpm(seconds) / 60.0 * f64::from(AZIMUTHS_PER_REVOLUTION) * column_s;
                 seconds += column_s;
             }
             (bytes, START_NS + (seconds * 1e9) as i64)
@@ -94,7 +99,7 @@ impl Stream {
         (0..count).map(|_| packet()).collect()
     }
 
-    /// A packet with the time of the one at `index`.
+    /// The packet with the device time of the packet at `index`.
     pub fn at_time_of(&self, index: usize, packet: &[u8]) -> Vec<u8> {
         let mut packet = packet.to_vec();
         packet[1200..1204].copy_from_slice(&self.packet(index)[1200..1204]);
@@ -105,7 +110,7 @@ impl Stream {
         START_NS + self.time_ns(index + 1, 0) as i64
     }
 
-    /// Pushes packets `from..to`; the revolutions they complete.
+    /// Pushes packets, and returns the revolutions that they complete.
     pub fn push(&self, sensor: &mut Sensor, packets: impl IntoIterator<Item = usize>) -> Vec<Revolution> {
         let push = |index| sensor.push(&self.packet(index), self.arrival_ns(index)).unwrap().cloned();
         packets.into_iter().filter_map(push).collect()

@@ -1,7 +1,8 @@
-//! Telemetry datagrams, sound and damaged.
+//! Telemetry datagrams, valid and damaged.
 
-use clearway_lidar::telemetry::{NmeaError, Pps, Telemetry};
-use clearway_lidar::{Model, Refusal, Sensor, SensorConfig};
+use clearway_lidar::nmea::NmeaError;
+use clearway_lidar::telemetry::{Pps, Telemetry};
+use clearway_lidar::{DatagramError, Model, Sensor, SensorConfig};
 
 use crate::stream::{START_NS, Stream};
 
@@ -33,20 +34,20 @@ fn a_fix_is_read_to_the_last_field() {
 }
 
 #[test]
-fn no_receiver_and_no_fix_are_fine() {
+fn telemetry_without_receiver_or_fix_is_accepted() {
     assert_eq!(Telemetry::new(&datagram(0, "")).unwrap().gprmc, None);
     let fix = Telemetry::new(&datagram(0, &with_sum("GPRMC,,V,,,,,,,,,,N"))).unwrap().gprmc.unwrap();
     assert!(!fix.valid && fix.utc_ns.is_none() && fix.latitude_deg.is_none());
 }
 
 #[test]
-fn damaged_sentences_are_refused_as_nmea_with_what_was_wrong() {
-    let refusal = |sentence: &str| match Telemetry::new(&datagram(0, sentence)).unwrap_err() {
-        refusal @ Refusal::Nmea(_) => (refusal.reason(), refusal.to_string()),
+fn a_damaged_sentence_is_refused_as_nmea_with_the_wrong_value() {
+    let error_of = |sentence: &str| match Telemetry::new(&datagram(0, sentence)).unwrap_err() {
+        error @ DatagramError::Nmea(_) => (error.reason(), error.to_string()),
         other => panic!("{other}"),
     };
     let flipped = SENTENCE.replace("3707", "3708");
-    assert_eq!(refusal(&flipped), ("nmea", "telemetry: checksum `05`; 0A is right".into()));
+    assert_eq!(error_of(&flipped), ("nmea", "telemetry: checksum `05`; 0A is right".into()));
     for (text, named) in [
         ("GPGGA,1", "RMC"),
         ("GPRMC,254106,A,,,,,,,230715", "time: `254106`"),
@@ -64,19 +65,19 @@ fn damaged_sentences_are_refused_as_nmea_with_what_was_wrong() {
         ("GPRMC,2141,A,,,,,,,230715", "time: `2141`"),
         ("GPRMC,214106.5e300,A,,,,,,,230715", "time: `214106.5e300`"),
     ] {
-        let (_, shown) = refusal(&with_sum(text));
+        let (_, shown) = error_of(&with_sum(text));
         assert!(shown.contains(named), "{text}: {shown}");
     }
-    assert!(refusal("GPRMC").1.contains("RMC"));
+    assert!(error_of("GPRMC").1.contains("RMC"));
     assert!(matches!(
         Telemetry::new(&datagram(0, "$GPRMC\u{7f}")).unwrap_err(),
-        Refusal::Nmea(NmeaError::Byte { byte: 0x7F, at: 6 })
+        DatagramError::Nmea(NmeaError::Byte { byte: 0x7F, at: 6 })
     ));
 }
 
 #[test]
-fn gprmc_gives_the_hour_and_a_refused_datagram_nothing() {
-    // The device's own time agrees with GPRMC, while the host that recorded it lives in another hour.
+fn gprmc_gives_the_hour_and_a_refused_datagram_changes_nothing() {
+    // The device's time agrees with GPRMC, while the host's clock is in another hour.
     let past_hour_us = 41 * 60_000_000 + 7_100_000;
     let stream = Stream { device_us: past_hour_us, ..Stream::of(Model::Vlp16) };
     let utc_ns = 1_437_687_660_000_000_000 + 7_100_000_000;
@@ -87,27 +88,28 @@ fn gprmc_gives_the_hour_and_a_refused_datagram_nothing() {
     assert_eq!(sensor.status(), before);
     assert!(sensor.push(&datagram(past_hour_us, SENTENCE), arrival_ns(0)).unwrap().is_none());
     assert_eq!((sensor.status().telemetry, sensor.status().pps), (1, Some(Pps::Locked)));
-    let push = |index| sensor.push(&stream.packet(index), arrival_ns(index)).unwrap().map(|turn| turn.start_ns);
+    let push =
+        |index| sensor.push(&stream.packet(index), arrival_ns(index)).unwrap().map(|revolution| revolution.start_ns);
     assert_eq!((0..stream.packets(1.1)).find_map(push), Some(utc_ns));
 }
 
 #[test]
-fn stamps_ahead_of_gps_run_at_half_speed_until_it_catches_up() {
-    // Started without GPS, 9 s ahead of the device's own hour; then GPRMC sets it back by them.
+fn stamps_ahead_of_gps_run_at_half_speed_until_gps_catches_up() {
+    // The stream starts without GPS, and the host is 9 s ahead of the device's hour; then GPRMC sets stamps 9 s back.
     let utc_past_hour_us = 41 * 60_000_000 + 7_100_000;
     let stream = Stream { device_us: utc_past_hour_us, ..Stream::of(Model::Vlp16) };
     let arrival_ns = |index| 1_437_687_667_250_000_000 + stream.arrival_ns(index) - START_NS + 9_000_000_000;
     let mut sensor = Sensor::new(SensorConfig::default());
-    let mut turns = Vec::new();
+    let mut revolutions = Vec::new();
     for index in 0..stream.packets(1.6) {
-        turns.extend(sensor.push(&stream.packet(index), arrival_ns(index)).unwrap().cloned());
+        revolutions.extend(sensor.push(&stream.packet(index), arrival_ns(index)).unwrap().cloned());
     }
     sensor.push(&datagram(utc_past_hour_us, SENTENCE), 0).unwrap();
     for index in stream.packets(1.6)..stream.packets(200.0) {
-        turns.extend(sensor.push(&stream.packet(index), arrival_ns(index)).unwrap().cloned());
+        revolutions.extend(sensor.push(&stream.packet(index), arrival_ns(index)).unwrap().cloned());
     }
-    assert!(turns.windows(2).all(|pair| pair[0].end_ns <= pair[1].start_ns));
-    let last = turns.last().unwrap();
+    assert!(revolutions.windows(2).all(|pair| pair[0].end_ns <= pair[1].start_ns));
+    let last = revolutions.last().unwrap();
     let utc_ns = 1_437_687_667_100_000_000 + last.sequence as i64 * 100_000_000;
     assert!((last.start_ns - utc_ns).abs() < 1_000_000, "{}", last.start_ns - utc_ns);
 }

@@ -1,9 +1,9 @@
-//! Just enough of zip and npy to read the references.
+//! Readers of zip and npy, as far as the references need them.
 
 use std::collections::BTreeMap;
 use std::io::Read;
 
-/// Every file of a zip archive, by name.
+/// All files of a zip archive, by name.
 pub fn unzip(path: &str) -> BTreeMap<String, Vec<u8>> {
     let bytes = std::fs::read(super::data(path)).unwrap();
     let u16_at = |at: usize| usize::from(u16::from_le_bytes([bytes[at], bytes[at + 1]]));
@@ -28,7 +28,7 @@ pub fn unzip(path: &str) -> BTreeMap<String, Vec<u8>> {
     files
 }
 
-/// One point of velodyne-decoder's.
+/// One point of velodyne-decoder.
 #[derive(Clone, Copy, Debug)]
 pub struct Reference {
     pub xyz: [f32; 3],
@@ -39,7 +39,7 @@ pub struct Reference {
 
 /// The points of all scans of a reference, in the order of the scans.
 pub fn reference(path: &str) -> Vec<Reference> {
-    // BTreeMap order is scan0, scan1, …: there are fewer than ten.
+    // The order of the map is scan0, scan1, …, because there are fewer than ten scans.
     unzip(path).values().flat_map(|npy| rows(npy)).collect()
 }
 
@@ -57,7 +57,7 @@ fn rows(npy: &[u8]) -> Vec<Reference> {
     values.chunks_exact(8).map(row).collect()
 }
 
-/// Rows of VeloView's CSV: x to the right, y ahead, z up, intensity; given back in the sensor's frame.
+/// Rows of a CSV file of VeloView (x to the right, y ahead, z up, intensity), converted to the sensor's frame.
 pub fn veloview(csv: &str) -> Vec<([f32; 3], u8)> {
     let row = |line: &str| {
         let values: Vec<f32> = line.split(',').map(|value| value.trim().parse().unwrap()).collect();

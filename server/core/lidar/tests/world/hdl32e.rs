@@ -1,4 +1,4 @@
-//! An HDL-32E on a moving car, beside velodyne-decoder, and one packet of another.
+//! An HDL-32E on a moving car compared with velodyne-decoder, and one packet of another HDL-32E.
 
 use clearway_lidar::{Clock, Model, Revolution, Sensor, SensorConfig};
 
@@ -22,21 +22,21 @@ fn an_hdl32e_decodes_as_in_velodyne_decoder_echo_by_echo() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn stamps_follow_gprmc() {
+fn stamps_of_an_hdl32e_follow_gprmc() {
     let (revolutions, sensor) = decode_capture(SensorConfig::default(), CAPTURE);
     let fix = sensor.status().gprmc.unwrap();
     assert!((fix.speed_mps().unwrap() - 14.8).abs() < 0.5);
     assert!(revolutions.windows(2).all(|pair| pair[0].end_ns < pair[1].start_ns));
-    // The first packet says 164,473,090 µs past the hour; it is 22 h on 11 December 2012.
+    // The device time of the first packet is 164,473,090 µs past 22 h on 11 December 2012.
     assert_eq!(revolutions[0].start_ns, 1_355_263_200_000_000_000 + 164_473_090_000);
     assert!(revolutions.iter().all(|revolution| revolution.clock == Clock::Gps));
-    // The host that recorded it was 0.9 s ahead.
+    // The clock of the recording host was 0.9 s ahead.
     assert!(revolutions.iter().all(|revolution| (904..=905).contains(&revolution.clock_offset_ms)));
 }
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn one_packet_has_the_382_points_foxglove_found() {
+fn a_packet_has_the_382_points_that_foxglove_finds() {
     let mut sensor = Sensor::new(SensorConfig::default());
     let packet = std::fs::read(data("pcap/single/foxglove_HDL32E_PACKET1.bin")).unwrap();
     assert!(sensor.push(&packet, 0).unwrap().is_none());

@@ -1,4 +1,4 @@
-//! An HDL-64E S1 at a wall, with its own db.xml, beside VeloView's CSV.
+//! An HDL-64E S1 in front of a wall, with its own db.xml, compared with a CSV file of VeloView.
 
 use std::io::Read;
 
@@ -7,7 +7,7 @@ use clearway_lidar::{Calibration, Model, ReturnMode, SensorConfig};
 use crate::{archive, data, decode_capture, distance_m, points, spread};
 
 const CAPTURE: &str = "pcap/opendlv/proxy-velodyne64/cut_for_developers/atwall_first174packets.pcap";
-/// VeloView's frame begins so many echoes into the capture.
+/// Index of the return of the capture at which the frame of VeloView begins.
 const FIRST_ECHO_OF_FRAME: usize = 15_434;
 
 #[test]
@@ -25,7 +25,7 @@ fn an_s1_decodes_as_in_veloview_within_fifty_micrometres() {
     flate2::read::GzDecoder::new(std::fs::File::open(csv).unwrap()).read_to_string(&mut text).unwrap();
     let expected = archive::veloview(&text);
     let points = points(&revolutions);
-    assert_eq!(points.len(), 60_480, "every raw distance that is not zero; this part has no bogus ones");
+    assert_eq!(points.len(), 60_480, "all raw distances that are not zero; this part has no filler");
     let points = &points[FIRST_ECHO_OF_FRAME..];
     assert_eq!(points.len(), expected.len());
     let errors = points.iter().zip(&expected).map(|(point, (xyz, intensity))| {
@@ -38,7 +38,7 @@ fn an_s1_decodes_as_in_veloview_within_fifty_micrometres() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn an_s1_turns_at_592_rpm_by_arrival_alone() {
+fn the_rate_of_an_s1_follows_from_arrivals() {
     let (revolutions, sensor) = decode_capture(SensorConfig::default(), CAPTURE);
     assert!((sensor.status().rpm.unwrap() - 592.0).abs() < 6.0, "{:?}", sensor.status().rpm);
     let firings: usize = revolutions.iter().map(|revolution| revolution.firings.len()).sum();

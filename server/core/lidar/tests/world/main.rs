@@ -1,6 +1,6 @@
-//! Held against the world: recorded drives, decoded, beside what VeloView and velodyne-decoder made of them.
+//! Comparison of decoded recorded drives with the points of VeloView and velodyne-decoder.
 //!
-//! The recordings are other people's and stay outside the repository; without them these tests are reported ignored.
+//! The recordings belong to others and are not in the repository; without them these tests are reported as ignored.
 
 mod archive;
 mod hdl32e;
@@ -14,18 +14,18 @@ use clearway_lidar::capture::{Capture, Datagram};
 use clearway_lidar::{Point, Revolution, Sensor, SensorConfig};
 use clearway_ros::velodyne_scan::VelodyneScan;
 
-/// A file of the recorded drives.
+/// Path of a file of the recorded drives.
 pub fn data(path: &str) -> PathBuf {
     PathBuf::from(env!("CLEARWAY_DATA")).join(path)
 }
 
-/// Every whole datagram of a capture.
+/// All complete datagrams of a capture.
 pub fn datagrams(path: &str) -> Vec<Datagram> {
     let file = std::fs::File::open(data(path)).unwrap();
     Capture::new(file).unwrap().map_while(Result::ok).collect()
 }
 
-/// Every revolution of a stream, and the sensor afterwards.
+/// Decodes a stream, and returns all revolutions and the sensor.
 pub fn decode<'a>(
     config: SensorConfig,
     stream: impl IntoIterator<Item = (&'a [u8], i64)>,
@@ -39,23 +39,23 @@ pub fn decode<'a>(
     (revolutions, sensor)
 }
 
-/// Every revolution of a capture.
+/// Decodes a capture, and returns all revolutions and the sensor.
 pub fn decode_capture(config: SensorConfig, path: &str) -> (Vec<Revolution>, Sensor) {
     let datagrams = datagrams(path);
     decode(config, datagrams.iter().map(|datagram| (datagram.payload.as_slice(), datagram.stamp_ns)))
 }
 
-/// All points of a stream in time order.
+/// All points of the revolutions, in order.
 pub fn points(revolutions: &[Revolution]) -> Vec<Point> {
     revolutions.iter().flat_map(Revolution::points).collect()
 }
 
-/// Metres between two points.
+/// Distance between two points, in m.
 pub fn distance_m(a: [f32; 3], b: [f32; 3]) -> f32 {
     (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f32>().sqrt()
 }
 
-/// Median and greatest of some errors, printed for the report (`--nocapture`).
+/// Median and greatest of the errors, in m; both are printed (`--nocapture`).
 pub fn spread(name: &str, mut errors: Vec<f32>) -> (f32, f32) {
     errors.sort_by(f32::total_cmp);
     let (median, greatest) = (errors[errors.len() / 2], *errors.last().unwrap());
@@ -63,8 +63,8 @@ pub fn spread(name: &str, mut errors: Vec<f32>) -> (f32, f32) {
     (median, greatest)
 }
 
-/// Our points beside the reference's, which must be a run of ours without a gap: same rings, intensities and return
-/// types. Gives the errors and where the run begins.
+/// Compares our points with those of a reference. These must be a run of our points without a gap, with the same rings,
+/// intensities and return types. Returns the distances between points, in m, and the index at which the run begins.
 pub fn against(points: &[Point], expected: &[archive::Reference]) -> (Vec<f32>, usize) {
     let same = |point: &Point, expected: &archive::Reference| {
         (point.ring, f32::from(point.intensity), point.return_type)
@@ -79,7 +79,7 @@ pub fn against(points: &[Point], expected: &[archive::Reference]) -> (Vec<f32>, 
     (run.iter().zip(expected).map(|(ours, theirs)| distance_m([ours.x, ours.y, ours.z], theirs.xyz)).collect(), first)
 }
 
-/// Every packet of the `VelodyneScan` messages of an MCAP recording, with its stamp.
+/// All packets of the `VelodyneScan` messages of an MCAP recording, with their stamps.
 pub fn mcap_packets(path: &str) -> Vec<(i64, Vec<u8>)> {
     let file = std::fs::read(data(path)).unwrap();
     let messages = mcap::MessageStream::new(&file).unwrap().map(Result::unwrap);

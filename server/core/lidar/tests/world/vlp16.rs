@@ -1,16 +1,16 @@
-//! Three VLP-16s: on a car (VeloView and velodyne-decoder), indoors, and in dual return (velodyne-decoder).
+//! Three VLP-16s compared with VeloView and velodyne-decoder: on a car, indoors, and in dual-return mode.
 
 use clearway_lidar::{Clock, Model, Point, ReturnMode, Revolution, SensorConfig};
 
 use crate::{against, archive, data, decode, decode_capture, distance_m, mcap_packets, points, spread};
 
 const ON_A_CAR: &str = "pcap/opendlv/proxy-velodyne16/sampleShort.pcap";
-/// VeloView's frame begins so many echoes into the capture.
+/// Index of the return of the capture at which the frame of VeloView begins.
 const FIRST_ECHO_OF_FRAME: usize = 7_924;
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn a_vlp16_decodes_as_in_veloview_to_its_rounding_of_the_azimuth() {
+fn a_vlp16_decodes_as_in_veloview_up_to_azimuth_rounding() {
     let (revolutions, sensor) = decode_capture(SensorConfig::default(), ON_A_CAR);
     assert_eq!(sensor.status().model, Some(Model::Vlp16));
     let zip = archive::unzip("pcap/opendlv/proxy-velodyne16/sampleVeloViewFrame1.zip");
@@ -23,13 +23,13 @@ fn a_vlp16_decodes_as_in_veloview_to_its_rounding_of_the_azimuth() {
     for (point, (xyz, intensity)) in frame.iter().zip(&expected) {
         assert_eq!(point.intensity, *intensity);
         let error = distance_m([point.x, point.y, point.z], *xyz);
-        // VeloView rounds the azimuth of each return to a hundredth of a degree; on halves it may go the other way.
+        // VeloView rounds the azimuth of each return to a hundredth of a degree, and halves to either side.
         assert!(error < 1.01 * point.range_m * 0.01_f32.to_radians() + 1e-4, "{error} m at {} m", point.range_m);
         rounded_otherwise += usize::from(error > 1e-4);
         errors.push(error);
     }
     let (median, _) = spread("VLP-16 against VeloView", errors);
-    println!("rounded otherwise: {rounded_otherwise}");
+    println!("rounded to the other side: {rounded_otherwise}");
     assert!(median < 1e-5);
     assert!(rounded_otherwise * 100 < 7 * frame.len(), "{rounded_otherwise}");
 }
@@ -46,14 +46,15 @@ fn a_vlp16_decodes_as_in_velodyne_decoder_echo_by_echo() {
         assert_eq!(points.len(), expected.len());
         let (errors, _) = against(&points, &expected);
         let (median, greatest) = spread(capture, errors);
-        // It adds the lasers' heights (11.2 mm at most) and does not take the median of the packet's steps.
+        // velodyne-decoder adds the heights of the lasers (at most 11.2 mm) and does not use the median step of a
+        // packet.
         assert!(median < 0.008 && greatest < greatest_m, "{median} m, {greatest} m");
     }
 }
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn dual_return_counts_an_echo_that_is_both_strongest_and_last_once() {
+fn an_echo_that_is_both_strongest_and_last_is_counted_once() {
     let packets = mcap_packets("mcap/nebula_vlp16_zstd.mcap");
     assert_eq!(packets.len(), 603);
     let (revolutions, sensor) =
@@ -68,7 +69,7 @@ fn dual_return_counts_an_echo_that_is_both_strongest_and_last_once() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn revolutions_of_a_car_are_whole_between_the_first_and_the_last() {
+fn revolutions_between_the_first_and_the_last_are_complete() {
     let (revolutions, sensor) = decode_capture(SensorConfig::default(), ON_A_CAR);
     let partial: Vec<_> = revolutions.iter().map(|revolution| revolution.partial).collect();
     let inner = &revolutions[1..revolutions.len() - 1];
@@ -79,10 +80,10 @@ fn revolutions_of_a_car_are_whole_between_the_first_and_the_last() {
         assert!(first_azimuth_deg(revolution) >= 180.0 && first_azimuth_deg(revolution) < 180.25);
     }
     assert!(revolutions.windows(2).all(|pair| pair[0].end_ns < pair[1].start_ns));
-    // GPRMC 21:41:06 on 23 July 2015.
+    // The GPRMC is that of 21:41:06 on 23 July 2015.
     assert_eq!(sensor.status().gprmc.unwrap().utc_ns, Some(1_437_687_666_000_000_000));
-    // The first packet says 2,467,108,343 µs past 21 h; the pulse is locked, and the host that recorded it 1.4 s
-    // behind.
+    // The device time of the first packet is 2,467,108,343 µs past 21 h. The pulse is locked, and the clock of the
+    // recording host was 1.4 s behind.
     assert_eq!(revolutions[0].start_ns, 1_437_685_200_000_000_000 + 2_467_108_343_000);
     assert!(revolutions.iter().all(|revolution| revolution.clock == Clock::Gps));
     let offsets: Vec<_> = revolutions.iter().map(|revolution| revolution.clock_offset_ms).collect();
@@ -90,7 +91,7 @@ fn revolutions_of_a_car_are_whole_between_the_first_and_the_last() {
     assert_eq!(data(ON_A_CAR).metadata().unwrap().len(), 400_000);
 }
 
-/// Points in velodyne-decoder's order: the last echo of a beam before its strongest.
+/// Points in the order of velodyne-decoder: the last echo of a laser precedes its strongest.
 fn last_before_strongest(revolutions: &[Revolution]) -> Vec<Point> {
     let mut firings = 0;
     let mut points = Vec::new();

@@ -1,4 +1,4 @@
-//! A VLS-128 on a car, beside velodyne-decoder.
+//! A VLS-128 on a car compared with velodyne-decoder.
 
 use clearway_lidar::{Model, ReturnMode, SensorConfig};
 
@@ -17,7 +17,7 @@ fn a_vls128_decodes_as_in_velodyne_decoder_echo_by_echo() {
     assert_eq!(firings[1..4], [(1_809, None), (1_810, None), (1_809, None)], "{firings:?}");
     let (errors, first) = against(&points(&revolutions), &archive::reference("ref/nebula_vls128.npz"));
     assert_eq!(first, 0);
-    // It does not turn the lasers of the first packet, which comes without one before it.
+    // velodyne-decoder does not correct the azimuths of the first packet, because there is no packet before it.
     let first_packet =
         points(&revolutions).iter().filter(|point| point.firing < 3).take_while(|p| p.firing < 3).count();
     let errors = errors[first_packet..].to_vec();

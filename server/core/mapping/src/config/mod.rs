@@ -11,22 +11,31 @@
 //! | `sensor` | `[[vehicle.sensor]]` |
 //! | `fusion` | `[vehicle.fusion]` |
 //! | `body` | `[vehicle.body]` |
-//! | `maps` | `[vehicle.maps]`, and one table a layer, which stands in the folder of the layer |
+//! | `motion` | `[vehicle.maps.motion]` |
+//! | [`crate::layer`] | `[vehicle.maps]`, and one table for each layer, in the layer's folder |
 //! | `check` | checks of single values, and their error |
+//!
+//! This module names what other crates use. The files of this crate import from the files of the table, so that none of
+//! them depends on a file that uses it.
 
-mod body;
+pub(crate) mod body;
 pub(crate) mod check;
-mod fusion;
-mod maps;
-mod sensor;
-mod vehicle;
+pub(crate) mod fusion;
+pub(crate) mod motion;
+pub(crate) mod sensor;
+pub(crate) mod vehicle;
 
 pub use body::BodyConfig;
 pub use check::ConfigValueError;
 pub use fusion::FusionConfig;
-pub use maps::*;
+pub use motion::MotionConfig;
 pub use sensor::{BLIND_MAX, Extrinsics, RINGS_MAX, SensorConfig};
 pub use vehicle::{SENSORS_MAX, VehicleConfig};
 
+pub use crate::layer::drivability::config::{DrivabilityConfig, Passage, Seed};
+pub use crate::layer::height_difference::config::HeightDifferenceConfig;
 pub use crate::layer::occupancy::config::OccupancyConfig;
+pub use crate::layer::registry::MapsConfig;
+pub use crate::layer::safe_path::config::SafePathConfig;
 pub use crate::layer::speed::config::{Bonus, SpeedConfig};
+pub use crate::layer::terrain::config::{TerrainConfig, Variant};

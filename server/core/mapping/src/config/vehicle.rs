@@ -7,8 +7,8 @@ use clearway_lidar::calibration::Calibration;
 use crate::config::body::BodyConfig;
 use crate::config::check::{ConfigValueError, check_name};
 use crate::config::fusion::FusionConfig;
-use crate::config::maps::MapsConfig;
 use crate::config::sensor::SensorConfig;
+use crate::layer::registry::MapsConfig;
 
 /// Greatest number of sensors of one vehicle, declared ones included. Ours: the newest scan of each takes some
 /// megabytes.

@@ -32,12 +32,7 @@ pub struct Layer {
 
 impl Layer {
     /// A layer whose channels have no cells.
-    pub fn new(
-        name: &'static str,
-        geometry: Geometry,
-        legend: &'static [ClassInfo],
-        channels: Vec<Channel>,
-    ) -> Self {
+    pub fn new(name: &'static str, geometry: Geometry, legend: &'static [ClassInfo], channels: Vec<Channel>) -> Self {
         Self { name, geometry, legend, channels, planes: Vec::new(), metrics: Vec::new(), points: Vec::new() }
     }
 

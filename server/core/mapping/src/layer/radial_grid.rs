@@ -1,9 +1,10 @@
-//! The thesis' r-θ grid (§IV.1): rows are rings of range, columns are azimuth.
+//! The r-θ grid (UT Austin thesis, section IV.1): rows are ranges, columns are azimuths.
 //!
-//! In: the lasers' elevations, the sensor's height, the number of columns; then points, ego frame, metres. Out: each
-//! point's cell, `row * columns + column`. Rows follow the sensor: `r_bench` separates the rings its lasers draw on
-//! level ground. The circles are drawn about the ego origin, as in the thesis; the rings lie about the sensor, so the
-//! reference point of the ego frame is best chosen under it, or within a metre or two.
+//! In: the lasers' elevations, the sensor's height, the number of columns; then points, ego frame, metres. Out: the
+//! cell of each point, `row * columns + column`. The rows follow from the sensor: their radii (`r_bench` in the thesis)
+//! separate the rings that its lasers draw on level ground. The rows are circles about the ego origin, as in the
+//! thesis. The rings are circles about the sensor, so the ego origin should lie under the sensor, or within a metre or
+//! two of it.
 
 use std::f32::consts::{FRAC_PI_2, TAU};
 use std::sync::Arc;
@@ -13,84 +14,93 @@ use clearway_lidar::calibration::{Calibration, LaserCalibration};
 use crate::layer::grid::Geometry;
 use crate::sensor::sweep::Sweep;
 
-/// Points are taken in chunks of this many, so that their cells stay in the first cache level.
+/// Number of points that are processed together. Ours: their cells fit into the first-level cache.
 const CHUNK: usize = 1024;
 
-/// Buckets of the row table: the bits of r² above this one, 256 steps an octave, 0.2 % of r.
+/// Bits of a squared range that do not select a bucket of the row table. Ours: 256 buckets an octave, each 0.2 % of the
+/// range wide.
 const BUCKET_SHIFT: u32 = 15;
 
-/// 2²³: from here on floats are whole numbers, one apart.
+/// 2²³: floats from here on are whole numbers, one apart.
 const WHOLE_FROM: f32 = 8_388_608.0;
 
-/// Rings nearer to one another than this cannot be told apart under 2 cm of range noise and share a row.
+/// Least distance between two rings with a row each, metres. Ours: an HDL-64E's range noise of 2 cm mixes nearer rings.
 const RING_SPACING_M_MIN: f32 = 0.02;
 
-/// Cells by range and azimuth about the ego origin.
+/// Grid of range and azimuth about the ego origin.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RadialGrid {
-    /// Outer radius of each row, ascending; the last is the largest range.
-    r_bench_m: Vec<f32>,
-    /// The same squared; then, for the row beyond the grid, one that nothing exceeds.
-    r_bench_squared: Vec<f32>,
-    /// First row that may hold a squared range, by the float's upper bits, from `first_bucket` on; the last bucket lies
-    /// beyond the grid.
+    /// Outer radius of each row, metres, ascending; the last is the largest range.
+    row_radius_m: Vec<f32>,
+    /// The same squared, then infinity for the row beyond the grid.
+    row_radius_squared: Vec<f32>,
+    /// First row that may contain a squared range, by the upper bits of the float, starting with `first_bucket`. The
+    /// last bucket lies beyond the grid.
     row_of_bucket: Vec<u16>,
     first_bucket: u32,
-    /// Most borders of rows within one bucket.
+    /// Largest number of row borders within one bucket.
     borders_a_bucket: usize,
-    quadrants: Quadrants,
-    /// What the rows were made from.
+    azimuths: AzimuthColumns,
+    /// The lasers and the sensor height that the rows were computed from.
     made_from: Option<(Arc<Calibration>, f32)>,
 }
 
 impl RadialGrid {
-    /// A grid with the rows `r_bench_m` (outer radii, metres, positive, ascending) and `columns`.
-    pub fn new(r_bench_m: Vec<f32>, columns: u16) -> Self {
-        let mut r_bench_squared: Vec<f32> = r_bench_m.iter().map(|r| r * r).collect();
-        let innermost = r_bench_squared.first().copied().unwrap_or(1.0);
-        let outermost = r_bench_squared.last().copied().unwrap_or(1.0);
+    /// A grid with these rows (outer radii, metres, positive, ascending) and columns.
+    pub fn new(row_radius_m: Vec<f32>, columns: u16) -> Self {
+        let mut row_radius_squared: Vec<f32> = row_radius_m.iter().map(|r| r * r).collect();
+        let innermost = row_radius_squared.first().copied().unwrap_or(1.0);
+        let outermost = row_radius_squared.last().copied().unwrap_or(1.0);
         let first_bucket = innermost.to_bits() >> BUCKET_SHIFT;
-        // One more bucket, all of it beyond the outermost bench.
+        // One more bucket lies beyond the outermost row.
         let buckets = (outermost.to_bits() >> BUCKET_SHIFT) - first_bucket + 2;
         let first_row = |bucket: u32| {
             let least = f32::from_bits((first_bucket + bucket) << BUCKET_SHIFT);
-            r_bench_squared.partition_point(|bench| *bench < least)
+            row_radius_squared.partition_point(|radius| *radius < least)
         };
         let borders_a_bucket = (0..buckets).map(|bucket| first_row(bucket + 1) - first_row(bucket)).max().unwrap_or(0);
         let row_of_bucket = (0..buckets).map(|bucket| first_row(bucket) as u16).collect();
-        r_bench_squared.push(f32::INFINITY);
-        let quadrants = Quadrants::new(columns);
-        Self { r_bench_m, r_bench_squared, row_of_bucket, first_bucket, borders_a_bucket, quadrants, made_from: None }
+        row_radius_squared.push(f32::INFINITY);
+        let azimuths = AzimuthColumns::new(columns);
+        Self {
+            row_radius_m,
+            row_radius_squared,
+            row_of_bucket,
+            first_bucket,
+            borders_a_bucket,
+            azimuths,
+            made_from: None,
+        }
     }
 
-    /// Sees to it that the rows are those of the sensor that made `sweep`.
-    pub fn follow(&mut self, sweep: &Sweep, range_m_max: f32, columns: u16) {
+    /// Computes the rows again if the sensor of `sweep` differs from the last one.
+    pub fn update_rows(&mut self, sweep: &Sweep, range_m_max: f32, columns: u16) {
         let Some(calibration) = &sweep.calibration else {
-            // Nobody knows its rings: one row to the largest range.
+            // The rings are not known: one row to the largest range.
             *self = Self::new(vec![range_m_max], columns);
             return;
         };
         let height = sweep.mount_height_m;
-        // The sensor's table is shared by all its revolutions: the pointer is compared first, the table only after.
-        if let Some((held, held_height)) = &self.made_from
-            && *held_height == height
-            && (Arc::ptr_eq(held, calibration) || held == calibration)
+        // All revolutions of a sensor share its table, so that comparing the pointers mostly suffices.
+        if let Some((known, known_height)) = &self.made_from
+            && *known_height == height
+            && (Arc::ptr_eq(known, calibration) || known == calibration)
         {
             return;
         }
         let rings = ring_radii_m(calibration, height, range_m_max);
-        *self = Self::new(r_bench_m(&rings, range_m_max), columns);
+        *self = Self::new(row_radii_m(&rings, range_m_max), columns);
         self.made_from = Some((Arc::clone(calibration), height));
     }
 
     /// Number of rows.
     pub fn rows(&self) -> usize {
-        self.r_bench_m.len()
+        self.row_radius_m.len()
     }
 
     /// Number of columns.
     pub fn columns(&self) -> usize {
-        usize::from(self.quadrants.columns)
+        usize::from(self.azimuths.columns)
     }
 
     /// Number of cells.
@@ -100,34 +110,34 @@ impl RadialGrid {
 
     /// Inner and outer radius of a row, metres.
     pub fn row_span_m(&self, row: usize) -> (f32, f32) {
-        let inner = if row == 0 { 0.0 } else { self.r_bench_m[row - 1] };
-        (inner, self.r_bench_m[row])
+        let inner = if row == 0 { 0.0 } else { self.row_radius_m[row - 1] };
+        (inner, self.row_radius_m[row])
     }
 
-    /// Writes where the cells lie into `geometry`, keeping its buffer.
-    pub fn describe(&self, geometry: &mut Geometry) {
+    /// Writes the rows and columns into `geometry`, reusing its memory.
+    pub fn write_geometry(&self, geometry: &mut Geometry) {
         match geometry {
             Geometry::Radial { row_radius_m, columns } => {
-                row_radius_m.clone_from(&self.r_bench_m);
-                *columns = self.quadrants.columns;
+                row_radius_m.clone_from(&self.row_radius_m);
+                *columns = self.azimuths.columns;
             }
             other => {
-                let columns = self.quadrants.columns;
-                *other = Geometry::Radial { row_radius_m: self.r_bench_m.clone(), columns };
+                let columns = self.azimuths.columns;
+                *other = Geometry::Radial { row_radius_m: self.row_radius_m.clone(), columns };
             }
         }
     }
 
-    /// The cell that holds a position; `None` beyond the last row.
+    /// The cell that contains a position; `None` beyond the last row.
     pub fn cell(&self, x: f32, y: f32) -> Option<usize> {
-        let row = self.row(self.reach(x * x + y * y));
-        (row < self.rows()).then(|| row * self.columns() + self.quadrants.column(x, y) as usize)
+        let row = self.row(self.clamped(x * x + y * y));
+        (row < self.rows()).then(|| row * self.columns() + self.azimuths.column(x, y) as usize)
     }
 
-    /// Calls `take(first_point, cells)` for every chunk of the sweep. A point beyond the last row falls into the row
-    /// after it: its cell is `self.cells()` or more, and less than `self.cells() + self.columns()`. Where nobody knows
-    /// the sweep's rings there are no rows to fall into, and no call.
-    pub fn for_each_chunk(&self, sweep: &Sweep, mut take: impl FnMut(usize, &[u32])) {
+    /// Calls `visit(first_point, cells)` for each chunk of the sweep. A point beyond the last row falls into the row
+    /// after it: its cell is `self.cells()` or more, and less than `self.cells() + self.columns()`. If the sweep's
+    /// rings are not known, there is no call.
+    pub fn for_each_chunk(&self, sweep: &Sweep, mut visit: impl FnMut(usize, &[u32])) {
         if sweep.calibration.is_none() {
             return;
         }
@@ -136,57 +146,61 @@ impl RadialGrid {
         let columns = self.columns() as u32;
         for (index, (x, y)) in sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).enumerate() {
             let n = x.len();
-            // Arithmetic alone first, so that it runs four or eight points at a time; the tables after.
+            // The first loop is arithmetic alone, so that the compiler vectorises it; the second reads the tables.
             for (((range_squared, cell), &x), &y) in ranges_squared.iter_mut().zip(&mut cells).zip(x).zip(y) {
-                *range_squared = self.reach(x * x + y * y);
-                *cell = self.quadrants.column(x, y);
+                *range_squared = self.clamped(x * x + y * y);
+                *cell = self.azimuths.column(x, y);
             }
             for (cell, range_squared) in cells[..n].iter_mut().zip(&ranges_squared) {
                 *cell += self.row(*range_squared) as u32 * columns;
             }
-            take(index * CHUNK, &cells[..n]);
+            visit(index * CHUNK, &cells[..n]);
         }
     }
 
-    /// The squared range, or where it lies under or over the row table, one that stands for it: the least of the first
-    /// bucket, the least of the last. NaN lies over.
+    /// The squared range, clamped to the row table: at least the start of the first bucket, at most the start of the
+    /// last. NaN becomes the latter.
     #[inline(always)]
-    fn reach(&self, range_squared: f32) -> f32 {
+    fn clamped(&self, range_squared: f32) -> f32 {
         let least = f32::from_bits(self.first_bucket << BUCKET_SHIFT);
         let beyond = f32::from_bits((self.first_bucket + self.row_of_bucket.len() as u32 - 1) << BUCKET_SHIFT);
         let inside = if range_squared < beyond { range_squared } else { beyond };
         if inside > least { inside } else { least }
     }
 
-    /// First row j with `range <= r_bench[j]`, of a squared range that [`Self::reach`] gave; the number of rows where
-    /// there is none.
+    /// First row whose outer radius is at least the range, from a squared range that [`Self::clamped`] returned; the
+    /// number of rows if there is none.
     #[inline(always)]
-    fn row(&self, reach: f32) -> usize {
-        let mut row = usize::from(self.row_of_bucket[((reach.to_bits() >> BUCKET_SHIFT) - self.first_bucket) as usize]);
+    fn row(&self, range_squared: f32) -> usize {
+        let mut row =
+            usize::from(self.row_of_bucket[((range_squared.to_bits() >> BUCKET_SHIFT) - self.first_bucket) as usize]);
         for _ in 0..self.borders_a_bucket {
-            row += usize::from(reach > self.r_bench_squared[row]);
+            row += usize::from(range_squared > self.row_radius_squared[row]);
         }
         row
     }
 }
 
-/// From position to column, counter-clockwise from the x axis.
+/// Columns of equal azimuth: position -> column, counter-clockwise from the x axis.
 ///
-/// The position is first turned into the first quadrant by whole quarter turns, which is exact; so where a quarter turn
-/// is whole columns, a world turned by 90 degrees gives the same columns, a quarter further. Within the quadrant the
-/// angle is off by less than 2 µrad, a tenth of a millimetre at 60 m.
+/// The position is first rotated into the first quadrant by a multiple of 90 degrees, which is exact. So if 90 degrees
+/// are a whole number of columns, a world rotated by 90 degrees gives the same columns, shifted by a quarter. Within
+/// the quadrant the error of the angle is less than 2 µrad, a tenth of a millimetre at 60 m.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Quadrants {
+pub(crate) struct AzimuthColumns {
     columns: u16,
     columns_a_rad: f32,
-    /// Column that holds each quadrant's beginning, and where in it the quadrant begins, 0 to 1.
+    /// Column in which each quadrant begins.
     first: [u32; 4],
+    /// Position of the beginning of each quadrant in that column, 0 to 1.
     offset: [f32; 4],
-    /// Columns of a quadrant, less what rounding might carry over its end.
+    /// Largest position within a quadrant, in columns: slightly less than its width, so that rounding does not reach
+    /// the next quadrant.
     most: f32,
 }
 
-impl Quadrants {
+impl AzimuthColumns {
+    /// This many columns in a full circle.
     pub(crate) fn new(columns: u16) -> Self {
         let quarters = [0, 1, 2, 3].map(|quadrant| quadrant * u32::from(columns));
         Self {
@@ -198,9 +212,10 @@ impl Quadrants {
         }
     }
 
+    /// The column that contains a position; 0 for the origin.
     #[inline(always)]
     pub(crate) fn column(&self, x: f32, y: f32) -> u32 {
-        // Quadrants are half-open: [0, 90°) has x > 0, y >= 0, and so on around.
+        // AzimuthColumns are half-open: [0, 90°) has x > 0, y >= 0, and so on around.
         let second = x <= 0.0 && y > 0.0;
         let third = x < 0.0 && y <= 0.0;
         let fourth = x >= 0.0 && y < 0.0;
@@ -211,41 +226,41 @@ impl Quadrants {
         let (ax, ay) = (x.abs(), y.abs());
         let (along, across) = if second | fourth { (ay, ax) } else { (ax, ay) };
         let within = quarter_angle(across, along) * self.columns_a_rad;
-        // NaN fails the comparison too.
+        // NaN fails the comparison.
         let within = if within < self.most { within } else { self.most };
-        first + whole(within + offset)
+        first + floor_to_whole(within + offset)
     }
 }
 
-/// The whole number nearest to one from 0 to 2²²: without the checks of a cast, which would take points one at a time.
+/// The whole number nearest to a value from 0 to 2²². A cast has range checks, which would prevent vectorisation.
 #[inline(always)]
-pub(crate) fn nearest_whole(value: f32) -> u32 {
+pub(crate) fn round_to_whole(value: f32) -> u32 {
     (value + WHOLE_FROM).to_bits() - WHOLE_FROM.to_bits()
 }
 
-/// The same rounded down.
+/// The whole number at or below a value from 0 to 2²².
 #[inline(always)]
-pub(crate) fn whole(value: f32) -> u32 {
-    nearest_whole(value) - u32::from(value + WHOLE_FROM - WHOLE_FROM > value)
+pub(crate) fn floor_to_whole(value: f32) -> u32 {
+    round_to_whole(value) - u32::from(value + WHOLE_FROM - WHOLE_FROM > value)
 }
 
-/// atan2 of two numbers that are not negative, 0 for (0, 0): odd polynomial to degree 11 on [0, 1], mirrored at 45°.
-/// Coefficients: minimax by reweighted least squares, error under 1.7e-6.
+/// atan2 of two numbers that are not negative, 0 for (0, 0): an odd polynomial of degree 11 on [0, 1], mirrored at 45°.
+/// Ours: minimax coefficients by reweighted least squares, error below 1.7e-6.
 #[inline(always)]
 fn quarter_angle(y: f32, x: f32) -> f32 {
     const ATAN: [f32; 6] = [0.999_977_2, -0.332_622_83, 0.193_540_36, -0.116_426_45, 0.052_647_31, -0.011_719_12];
     let steep = y > x;
     let (small, large) = if steep { (x, y) } else { (y, x) };
-    // Keeps 0/0 at 0.
+    // The lower bound makes 0/0 0.
     let t = small / if large > f32::MIN_POSITIVE { large } else { f32::MIN_POSITIVE };
     let s = t * t;
     let p = ATAN.iter().rev().fold(0.0, |p, c| p * s + c) * t;
     if steep { FRAC_PI_2 - p } else { p }
 }
 
-/// Radii at which the lasers meet level ground `height_m` under the sensor, metres, ascending: those within
-/// `range_m_max`. A laser at elevation e, its origin v above the sensor's along its own normal, meets it at
-/// `(height + v cos e) / tan(-e) - v sin e`.
+/// Radii at which the lasers meet level ground `height_m` below the sensor, metres, ascending; only those below
+/// `range_m_max`. A laser at elevation e, whose origin lies v above the sensor's along the laser's normal, meets the
+/// ground at `(height + v cos e) / tan(-e) - v sin e`.
 pub fn ring_radii_m(calibration: &Calibration, height_m: f32, range_m_max: f32) -> Vec<f32> {
     let height = f64::from(height_m);
     let radius = |laser: &LaserCalibration| {
@@ -261,9 +276,9 @@ pub fn ring_radii_m(calibration: &Calibration, height_m: f32, range_m_max: f32) 
     radii
 }
 
-/// `r_bench`: outer radius of each row, metres. A bench lies midway between neighbouring rings, so that noise does not
-/// throw a ring over a row border; the last is the largest range.
-pub fn r_bench_m(rings_m: &[f32], range_m_max: f32) -> Vec<f32> {
+/// Outer radius of each row, metres, ascending (`r_bench` of the UT Austin thesis, section IV.1). A radius lies midway
+/// between neighbouring rings, so that noise does not move a ring over a row border; the last is the largest range.
+pub fn row_radii_m(rings_m: &[f32], range_m_max: f32) -> Vec<f32> {
     let midway = rings_m.windows(2).map(|pair| (pair[0] + pair[1]) / 2.0);
     midway.chain([range_m_max]).collect()
 }
@@ -272,7 +287,7 @@ pub fn r_bench_m(rings_m: &[f32], range_m_max: f32) -> Vec<f32> {
 mod tests {
     use super::*;
 
-    /// The exact column, and how far the position is from a column's border, in columns.
+    /// The exact column, and the distance from the position to the nearest column border, in columns.
     fn exact(x: f32, y: f32, columns: u16) -> (usize, f64) {
         let turns = f64::from(y).atan2(f64::from(x)) / std::f64::consts::TAU;
         let column = turns.rem_euclid(1.0) * f64::from(columns);
@@ -296,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn the_axes_begin_their_quadrants() {
+    fn each_axis_lies_in_the_first_column_of_its_quadrant() {
         let grid = RadialGrid::new(vec![10.0], 360);
         let axes = [([1.0, 0.0], 0), ([0.0, 1.0], 90), ([-1.0, 0.0], 180), ([0.0, -1.0], 270), ([1.0, -1e-7], 359)];
         for ([x, y], column) in axes {
@@ -307,15 +322,15 @@ mod tests {
     }
 
     #[test]
-    fn a_row_reaches_to_its_bench_and_the_table_agrees_with_the_search() {
-        let benches = vec![0.5, 3.0, 3.02, 3.05, 9.0, 60.0];
-        let grid = RadialGrid::new(benches.clone(), 8);
+    fn a_row_ends_at_its_radius_and_the_table_agrees_with_a_search() {
+        let radii = vec![0.5, 3.0, 3.02, 3.05, 9.0, 60.0];
+        let grid = RadialGrid::new(radii.clone(), 8);
         for step in 0..70_000 {
             let range_squared = (step as f32 * 1e-3) * (step as f32 * 1e-3);
-            let row = benches.iter().position(|bench| range_squared <= bench * bench);
-            assert_eq!(grid.row(grid.reach(range_squared)), row.unwrap_or(6), "{range_squared}");
+            let row = radii.iter().position(|radius| range_squared <= radius * radius);
+            assert_eq!(grid.row(grid.clamped(range_squared)), row.unwrap_or(6), "{range_squared}");
         }
-        assert_eq!(grid.cell(3.0, 0.0), Some(8), "a range equal to the bench is inside");
+        assert_eq!(grid.cell(3.0, 0.0), Some(8), "a range equal to the radius is inside");
         for wild in [f32::NAN, f32::INFINITY, f32::MAX, 60.001] {
             assert_eq!(grid.cell(wild, 0.0), None, "{wild}");
             assert_eq!(grid.cell(0.0, -wild), None, "{wild}");

@@ -1,33 +1,92 @@
-//! The list of the layers, and which of them are active.
+//! The list of the layers, their configuration, and which of them are active.
 //!
-//! In: the configuration, the names of the layers somebody subscribes to, scans and map sweeps. Out: the active layers,
+//! In: the configuration, the names of the layers with subscribers, scans and map sweeps. Out: the active layers,
 //! in the order of the list. A layer that is not active has no maker: it costs no time and no memory.
 
-use crate::config::MapsConfig;
+use serde::{Deserialize, Serialize};
+
+use crate::config::check::{ConfigValueError, check};
+use crate::config::motion::MotionConfig;
 use crate::layer::drivability::Drivability;
+use crate::layer::drivability::config::DrivabilityConfig;
 use crate::layer::height_difference::HeightDifference;
+use crate::layer::height_difference::config::HeightDifferenceConfig;
 use crate::layer::maker::{Context, Layer, LayerMaker, Rays, ScanExtras};
 use crate::layer::occupancy::Occupancy;
+use crate::layer::occupancy::config::OccupancyConfig;
 use crate::layer::safe_path::SafePath;
+use crate::layer::safe_path::config::SafePathConfig;
 use crate::layer::speed::Speed;
+use crate::layer::speed::config::SpeedConfig;
 use crate::layer::terrain::Terrain;
+use crate::layer::terrain::config::TerrainConfig;
 use crate::sensor::sweep::Sweep;
 
 /// Creates the maker of one layer; `None` if the configuration disables the layer.
 type Create = fn(&MapsConfig) -> Option<Box<dyn LayerMaker>>;
 
-/// All layers. A layer that is made from others comes after them.
-const LAYERS: [Create; 6] = [
-    |maps| created(maps.drivability.enabled, || Drivability::new(&maps.drivability)),
-    |maps| created(maps.height_difference.enabled, || HeightDifference::new(&maps.height_difference)),
-    |maps| created(maps.terrain.enabled, || Terrain::new(&maps.terrain)),
-    |maps| created(maps.occupancy.enabled, || Occupancy::new(&maps.occupancy)),
-    |maps| created(maps.speed.enabled, || Speed::new(&maps.speed)),
-    |maps| created(maps.safe_path.enabled, || SafePath::new(&maps.safe_path)),
-];
+/// Declares the layers: a name, the type of the maker and the type of the configuration each. The macro writes
+/// [`MapsConfig`], with one table for each layer, and the list of their makers.
+macro_rules! layers {
+    ($($(#[$doc:meta])* $name:ident: $Maker:ty, $Config:ty;)+) => {
+        /// The table `[vehicle.maps]`: which layers are made, each in its own table. A disabled layer costs nothing.
+        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields, default)]
+        pub struct MapsConfig {
+            /// Age after capture from which a map is stale, milliseconds. 300 is ours: three revolutions at 10 Hz.
+            pub valid_ms: u32,
+            /// How the points of a scan are moved to its end.
+            pub motion: MotionConfig,
+            $($(#[$doc])* pub $name: $Config,)+
+        }
 
-fn created<M: LayerMaker + 'static>(enabled: bool, create: impl FnOnce() -> M) -> Option<Box<dyn LayerMaker>> {
-    if enabled { Some(Box::new(create())) } else { None }
+        impl Default for MapsConfig {
+            fn default() -> Self {
+                Self { valid_ms: 300, motion: MotionConfig::default(), $($name: <$Config>::default(),)+ }
+            }
+        }
+
+        impl MapsConfig {
+            /// A configuration that disables all layers.
+            pub fn none() -> Self {
+                let mut maps = Self::default();
+                $(maps.$name.enabled = false;)+
+                maps
+            }
+
+            /// Checks all values of all layers, enabled or not.
+            ///
+            /// # Errors
+            /// [`ConfigValueError`] for the first value that is not allowed.
+            pub fn validate(&self) -> Result<(), ConfigValueError> {
+                check(f64::from(self.valid_ms), 1.0..=60_000.0, || "vehicle.maps.valid_ms".into(), "1 to 60000")?;
+                self.motion.validate("vehicle.maps.motion")?;
+                $(self.$name.validate(concat!("vehicle.maps.", stringify!($name)))?;)+
+                Ok(())
+            }
+        }
+
+        const LAYERS: &[Create] = &[$(|maps| {
+            let config = &maps.$name;
+            if config.enabled { Some(Box::new(<$Maker>::new(config))) } else { None }
+        },)+];
+    };
+}
+
+// A layer that is made from others comes after them.
+layers! {
+    /// The layer `drivability` (UT Austin thesis, section IV).
+    drivability: Drivability, DrivabilityConfig;
+    /// The layer `height_difference` (UT Austin thesis, section V).
+    height_difference: HeightDifference, HeightDifferenceConfig;
+    /// The layer `terrain` (Neuhaus 2009).
+    terrain: Terrain, TerrainConfig;
+    /// The layer `occupancy` (Seo 2014).
+    occupancy: Occupancy, OccupancyConfig;
+    /// The layer `speed` (Lindström 2005).
+    speed: Speed, SpeedConfig;
+    /// The layer `safe_path` (UT Austin thesis, section VI).
+    safe_path: SafePath, SafePathConfig;
 }
 
 /// The enabled layers, active or not.
@@ -37,7 +96,7 @@ pub(crate) struct Layers(Vec<EnabledLayer>);
 struct EnabledLayer {
     name: &'static str,
     create: Create,
-    /// True if somebody subscribes to the layer itself.
+    /// True if the layer itself has a subscriber.
     subscribed: bool,
     /// How often the layer was made.
     made: u64,

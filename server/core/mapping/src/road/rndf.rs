@@ -41,13 +41,13 @@ impl Rndf {
             let Some(keyword) = words.next() else { continue };
             let result = match (keyword, &mut open) {
                 ("lane", _) => {
-                    rndf.close(open.take());
+                    rndf.end_lane(open.take());
                     let name = words.next().unwrap_or("").to_owned();
                     open = Some((line_number, Lane { name, width_m: None, waypoints_deg: Vec::new() }));
                     Ok(())
                 }
                 ("end_lane" | "end_segment" | "segment" | "zone" | "end_file", _) => {
-                    rndf.close(open.take());
+                    rndf.end_lane(open.take());
                     Ok(())
                 }
                 ("lane_width", Some((_, lane))) => read_width(line_number, words.next(), lane),
@@ -58,12 +58,12 @@ impl Rndf {
             };
             rndf.refused.extend(result.err());
         }
-        rndf.close(open.take());
+        rndf.end_lane(open.take());
         rndf
     }
 
     /// Adds a lane that has ended, or reports it if it has fewer than two waypoints.
-    fn close(&mut self, lane: Option<(usize, Lane)>) {
+    fn end_lane(&mut self, lane: Option<(usize, Lane)>) {
         let Some((line, lane)) = lane else { return };
         if lane.waypoints_deg.len() >= 2 {
             self.lanes.push(lane);
@@ -115,7 +115,7 @@ fn read_waypoint(
 ) -> Result<(), LineError> {
     // Waypoint 3 of lane 1.2 is written 1.2.3.
     if id.rsplit_once('.').is_none_or(|(lane_name, _)| lane_name != lane.name) {
-        let allowed = "a waypoint of the lane it stands in";
+        let allowed = "a waypoint of this lane";
         return Err(LineError { line, what: "waypoint", found: id.to_owned(), allowed });
     }
     let position = [latitude(line, latitude_field)?, longitude(line, longitude_field)?];

@@ -17,10 +17,10 @@
 use std::collections::VecDeque;
 
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::telemetry::Gprmc;
+use clearway_lidar::nmea::Gprmc;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
-use crate::config::MotionConfig;
+use crate::config::motion::MotionConfig;
 use crate::event::{EgoPose, Scan};
 
 /// Number of poses that are kept. Ours: a second at 1 kHz, which is longer than a revolution of any sensor.
@@ -160,7 +160,8 @@ impl Motion {
             Some(after) if after.stamp_ns == stamp_ns => Some(after.map_from_ego),
             Some(after) => {
                 let before = &self.poses[next - 1];
-                (after.stamp_ns.saturating_sub(before.stamp_ns) <= GAP_NS_MAX).then(|| interpolate(before, after, stamp_ns))
+                (after.stamp_ns.saturating_sub(before.stamp_ns) <= GAP_NS_MAX)
+                    .then(|| interpolate(before, after, stamp_ns))
             }
             None => {
                 let is_near = stamp_ns.saturating_sub(last.stamp_ns) <= reach_ns;

@@ -1,88 +1,89 @@
-//! How a sensor is mounted when nobody measured it: height, pitch and roll from the ground around the vehicle.
+//! Estimates how a sensor is mounted: its height, pitch and roll, from the ground around the vehicle.
 //!
-//! In: the points of the first revolutions, sensor frame, metres. Out: a [`MountEstimate`], or an error where no ground
-//! is found. The ground is the plane that most of the low points near the vehicle share: candidates through three
-//! points drawn from a fixed seed, the best one refined by least squares. Position over the ground plan and yaw cannot
-//! be seen this way and stay 0.
+//! In: the points of the first revolutions, sensor frame, metres. Out: a [`MountEstimate`], or an error if no ground is
+//! found. The ground is the plane that contains most of the low points near the vehicle. Candidates are planes through
+//! three points, drawn with a fixed seed; the best one is refined by least squares. The ground does not show the
+//! horizontal position and the yaw; both are 0.
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 
-use crate::config::Extrinsics;
+use crate::config::sensor::Extrinsics;
 
-/// Nearer returns are the vehicle itself.
+/// Least range of a point, metres. Ours: nearer returns are the vehicle itself.
 const RANGE_M_MIN: f32 = 2.5;
-/// Farther ground is seldom the plane the vehicle stands on.
+/// Greatest coordinate of a point, metres. Ours: ground that is farther away is seldom in the plane under the vehicle.
 const RADIUS_M_MAX: f32 = 20.0;
-/// From a cargo bike to a haul truck.
+/// Heights of a sensor over the ground, metres. Ours: from a cargo bike to a haul truck.
 const HEIGHT_M: std::ops::RangeInclusive<f64> = 0.3..=4.0;
-/// A sensor tilted further than this does not scan around its vehicle.
+/// Greatest tilt, radians. Ours: a sensor that is tilted more does not scan around its vehicle.
 const TILT_RAD_MAX: f64 = 0.35;
-/// The ground is sampled by its lowest point a cell, so that near rings do not outvote far ones.
+/// Side of a cell, metres. Ours: one sample a cell, its lowest point, keeps dense near rings from outweighing far ones.
 const CELL_M: f32 = 0.5;
 const CELLS_ACROSS: usize = (2.0 * RADIUS_M_MAX / CELL_M) as usize;
-/// Points this near to a plane are on it: twice a Velodyne's noise on asphalt. Twice as much lets the plane lean onto
-/// kerbs and verges, half a degree in a street with pavements 0.12 m high.
+/// Greatest distance of a point on a plane from the plane, metres: twice a Velodyne's noise on asphalt. With twice as
+/// much the plane leans onto kerbs and verges, by half a degree in a street with pavements 0.12 m high (measured).
 const INLIER_M: f64 = 0.03;
-/// Candidates; with 40 % ground among the samples, all of them fail once in 10^14 estimates.
+/// Number of candidate planes. If 40 % of the samples are ground, all candidates fail once in 10^14 estimates.
 const CANDIDATES: usize = 500;
-/// Cells of a revolution whose lowest point a plane must hold, and the directions (of 12) it must be seen in, to be the
-/// ground. A VLP-16 on a road gives some 500 cells; indoors, or with half its view blocked, floors and chance stay
-/// under 60.
+/// Least number of cells of a revolution whose lowest point lies on the ground plane. Measured: a VLP-16 on a road
+/// gives some 500; indoors, or with half its view blocked, floors and chance give fewer than 60.
 const INLIERS_MIN: usize = 100;
+/// Least number of directions, of 12, in which the ground plane has points. Ours: a floor on one side is not the
+/// ground.
 const SECTORS_MIN: u32 = 4;
-/// Revolutions read at most: a second at 10 Hz.
+/// Greatest number of revolutions that are read: a second at 10 Hz.
 const REVOLUTIONS_MAX: usize = 10;
 
-/// A sensor's place over the ground.
+/// Height and orientation of a sensor over the ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MountEstimate {
-    /// Height over the ground.
+    /// Height over the ground, metres.
     pub height_m: f64,
-    /// About y; positive looks down.
+    /// Rotation about y, radians; a positive value tilts the sensor down.
     pub pitch_rad: f64,
-    /// About x.
+    /// Rotation about x, radians.
     pub roll_rad: f64,
-    /// Cells of 0.5 m whose lowest point lies on the ground plane, over all revolutions.
+    /// Number of cells of 0.5 m whose lowest point lies on the ground plane, over all revolutions.
     pub inliers: usize,
-    /// Cells with points.
+    /// Number of cells of 0.5 m with points, over all revolutions.
     pub samples: usize,
-    /// Root mean square distance of the inliers from the plane.
+    /// Root mean square distance of the inliers from the plane, metres.
     pub residual_m: f64,
-    /// Revolutions that were read.
+    /// Number of revolutions that were read.
     pub revolutions: usize,
 }
 
-/// Why no estimate is given.
+/// Why the mount cannot be estimated.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum MountError {
-    /// Nothing to look at.
+    /// Too few cells have points.
     #[error(
-        "{samples} places with points from 2.5 to 20 m around the sensor in {revolutions} revolution(s); 100 a revolution \
-         are needed"
+        "{samples} cells of 0.5 m with points from 2.5 to 20 m around the sensor in {revolutions} revolution(s); \
+         100 a revolution are needed"
     )]
     TooFewPoints {
-        /// Cells of 0.5 m that hold points.
+        /// Number of cells of 0.5 m with points.
         samples: usize,
-        /// Revolutions that were read.
+        /// Number of revolutions that were read.
         revolutions: usize,
     },
-    /// Points, but no plane that can be the ground.
+    /// No plane through the points can be the ground.
     #[error(
-        "best plane holds {inliers} of {samples} places, in {sectors} of 12 directions; 100 a revolution in 4, 0.3 to 4 m \
-         under the sensor and within 20 degrees of level, are needed"
+        "the best plane contains {inliers} of {samples} cells, in {sectors} of 12 directions; 100 a revolution in 4, \
+         0.3 to 4 m under the sensor and within 20 degrees of level, are needed"
     )]
     NoGround {
-        /// On the best plane.
+        /// Number of cells whose lowest point lies on the best plane.
         inliers: usize,
-        /// Looked at.
+        /// Number of cells with points.
         samples: usize,
-        /// Directions in which the best plane is seen.
+        /// Number of directions in which the best plane has points.
         sectors: u32,
     },
 }
 
 impl MountEstimate {
-    /// `ego_from_sensor` with x, y and yaw 0: the ego origin lies on the ground under the sensor.
+    /// The extrinsics with x, y and yaw 0: the ego origin lies on the ground under the sensor.
     pub fn extrinsics(&self) -> Extrinsics {
         Extrinsics {
             x_m: 0.0,
@@ -95,29 +96,30 @@ impl MountEstimate {
     }
 }
 
-/// Estimates the mount from revolutions in the sensor's frame; of many, the first ten are read.
+/// Estimates the mount from the points of revolutions, sensor frame, metres. At most the first ten are read.
 ///
 /// # Errors
-/// [`MountError`] where no plane around the vehicle can be the ground; never a guess.
+/// [`MountError::TooFewPoints`] if fewer than 100 cells a revolution have points; [`MountError::NoGround`] if no plane
+/// around the vehicle can be the ground.
 pub fn estimate<I, P>(revolutions: I) -> Result<MountEstimate, MountError>
 where
     I: IntoIterator<Item = P>,
     P: AsRef<[[f32; 3]]>,
 {
-    let around: Vec<Vec<[f32; 3]>> =
+    let near: Vec<Vec<[f32; 3]>> =
         revolutions.into_iter().take(REVOLUTIONS_MAX).map(|points| near_points(points.as_ref())).collect();
-    let read = around.len();
-    let samples: Vec<_> = around.iter().flat_map(|points| lowest_points(points)).collect();
+    let read = near.len();
+    let samples: Vec<_> = near.iter().flat_map(|points| lowest_points(points)).collect();
     if samples.len() < INLIERS_MIN * read.max(1) {
         return Err(MountError::TooFewPoints { samples: samples.len(), revolutions: read });
     }
     let no_ground = |inliers, sectors| MountError::NoGround { inliers, samples: samples.len(), sectors };
     let mut plane = best_candidate(&samples).ok_or(no_ground(0, 0))?;
     let mut on_plane = Vec::new();
-    // The lowest points lie under the ground by the noise, so the mean of each cell's points on the plane stands for
-    // it. Each fit moves the plane by less than the last; eight settle it to a fraction of a millimetre.
+    // The noise puts the lowest points under the ground, so each fit uses the mean of each cell's points on the plane.
+    // Each fit moves the plane by less than the fit before; after eight it moves by a fraction of a millimetre.
     for _ in 0..8 {
-        on_plane = around.iter().flat_map(|points| points_on(&plane, points)).collect();
+        on_plane = near.iter().flat_map(|points| points_on(&plane, points)).collect();
         plane = match Plane::through(&on_plane) {
             Some(plane) if plane.is_plausible() => plane,
             _ => return Err(no_ground(on_plane.len(), 0)),
@@ -129,7 +131,7 @@ where
         return Err(no_ground(inliers, sectors));
     }
     let squares: f64 = on_plane.iter().map(|p| plane.distance(p).powi(2)).sum();
-    // Rz(0) Ry(pitch) Rx(roll) carries the ground's normal, as the sensor sees it, onto the vertical.
+    // Rz(0) Ry(pitch) Rx(roll) rotates the ground's normal, sensor frame, onto the vertical.
     let [nx, ny, nz] = plane.normal.into();
     let roll_rad = ny.atan2(nz);
     let pitch_rad = -nx.atan2(ny.hypot(nz));
@@ -147,7 +149,7 @@ where
     })
 }
 
-/// Points p with `normal · p = -height`; the normal looks up.
+/// The plane of the points p with `normal · p = -height`, sensor frame, metres; the normal points up.
 #[derive(Clone, Copy, Debug)]
 struct Plane {
     normal: Vector3<f64>,
@@ -163,7 +165,7 @@ impl Plane {
         HEIGHT_M.contains(&self.height) && self.normal.z >= TILT_RAD_MAX.cos()
     }
 
-    /// Total least squares; `None` for fewer than three points or points in a line.
+    /// The plane of total least squares through points; `None` for fewer than three points and for points in a line.
     fn through(points: &[Vector3<f64>]) -> Option<Self> {
         if points.len() < 3 {
             return None;
@@ -179,16 +181,17 @@ impl Plane {
     }
 }
 
-/// The points the ground is looked for in: from 2.5 to 20 m around the sensor.
+/// The points from 2.5 to 20 m around the sensor, in which the ground is searched.
 fn near_points(points: &[[f32; 3]]) -> Vec<[f32; 3]> {
     let is_near = |[x, y, z]: &[f32; 3]| {
-        // NaN fails these; z is bounded so that a stray return far under the ground does not stand for its cell.
+        // NaN fails these comparisons. The bound of z removes stray returns far under the ground.
         let near = x.abs() < RADIUS_M_MAX && y.abs() < RADIUS_M_MAX && z.abs() < RADIUS_M_MAX;
         near && x * x + y * y + z * z >= RANGE_M_MIN * RANGE_M_MIN
     };
     points.iter().copied().filter(is_near).collect()
 }
 
+/// Index of the cell of a point.
 fn cell([x, y, _]: &[f32; 3]) -> usize {
     let index = |v: f32| (((v + RADIUS_M_MAX) / CELL_M) as usize).min(CELLS_ACROSS - 1);
     index(*x) * CELLS_ACROSS + index(*y)
@@ -198,9 +201,9 @@ fn cell([x, y, _]: &[f32; 3]) -> usize {
 fn lowest_points(points: &[[f32; 3]]) -> Vec<Vector3<f64>> {
     let mut lowest: Vec<Option<[f32; 3]>> = vec![None; CELLS_ACROSS * CELLS_ACROSS];
     for point in points {
-        let held = &mut lowest[cell(point)];
-        if held.is_none_or(|held| point[2] < held[2]) {
-            *held = Some(*point);
+        let cell_lowest = &mut lowest[cell(point)];
+        if cell_lowest.is_none_or(|before| point[2] < before[2]) {
+            *cell_lowest = Some(*point);
         }
     }
     lowest.into_iter().flatten().map(|p| Vector3::from(p.map(f64::from))).collect()
@@ -222,33 +225,36 @@ fn points_on(plane: &Plane, points: &[[f32; 3]]) -> Vec<Vector3<f64>> {
 
 /// The plausible plane through three samples that most samples lie on.
 fn best_candidate(samples: &[Vector3<f64>]) -> Option<Plane> {
-    let mut draw = Draw(0x2545_f491_4f6c_dd1d);
+    let mut random = RandomIndices(0x2545_f491_4f6c_dd1d);
     let candidates = (0..CANDIDATES).filter_map(|_| {
-        let [a, b, c] = [(); 3].map(|()| samples[draw.below(samples.len())]);
+        let [a, b, c] = [(); 3].map(|()| samples[random.below(samples.len())]);
         let normal = (b - a).cross(&(c - a)).try_normalize(1e-6)?;
         let normal = if normal.z < 0.0 { -normal } else { normal };
         let plane = Plane { normal, height: -normal.dot(&a) };
         let inliers = || samples.iter().filter(|p| plane.distance(p).abs() <= INLIER_M).count();
         plane.is_plausible().then(|| (inliers(), plane))
     });
-    // Of equally good ones the first drawn.
+    // The first of several equally good candidates.
     candidates
         .fold(None, |best: Option<(usize, Plane)>, next| match best {
-            Some(held) if held.0 >= next.0 => Some(held),
+            Some(before) if before.0 >= next.0 => Some(before),
             _ => Some(next),
         })
         .map(|(_, plane)| plane)
 }
 
+/// Number of directions, of 12, in which there are points.
 fn sectors(points: &[Vector3<f64>]) -> u32 {
     let sector = |p: &Vector3<f64>| ((p.y.atan2(p.x) / std::f64::consts::TAU).rem_euclid(1.0) * 12.0) as u32 % 12;
     points.iter().fold(0u32, |seen, p| seen | 1 << sector(p)).count_ones()
 }
 
-/// A small fixed generator (xorshift64*): the estimate is a function of the points alone.
-struct Draw(u64);
+/// A generator of pseudo-random numbers (xorshift64*) with a fixed seed, so that the estimate is a function of the
+/// points.
+struct RandomIndices(u64);
 
-impl Draw {
+impl RandomIndices {
+    /// The next number from 0 to n - 1.
     fn below(&mut self, n: usize) -> usize {
         self.0 ^= self.0 >> 12;
         self.0 ^= self.0 << 25;

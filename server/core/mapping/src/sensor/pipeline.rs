@@ -8,9 +8,10 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::{Partial, Revolution};
-use clearway_lidar::sensor::{Sensor, SensorStatus};
+use clearway_lidar::{Sensor, SensorStatus};
 
-use crate::config::{BodyConfig, SensorConfig};
+use crate::config::body::BodyConfig;
+use crate::config::sensor::SensorConfig;
 use crate::error::{EventError, check_newer, check_stamp_range};
 use crate::event::Scan;
 use crate::event_time::EventTime;
@@ -280,7 +281,7 @@ fn completeness(revolution: &Revolution) -> f32 {
         seen[(degree as usize).min(359)] = true;
     }
     let is_in_gap = |degree: usize| {
-        revolution.dark_rad.is_some_and(|ends| {
+        revolution.fov_gap_rad.is_some_and(|ends| {
             let [from_deg, to_deg] = ends.map(f32::to_degrees);
             (degree as f32 - from_deg).rem_euclid(360.0) + 1.0 <= (to_deg - from_deg).rem_euclid(360.0)
         })

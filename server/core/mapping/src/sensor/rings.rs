@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use clearway_lidar::calibration::{Calibration, LaserCalibration};
 
-use crate::config::RINGS_MAX;
+use crate::config::sensor::RINGS_MAX;
 use crate::event::Scan;
 use crate::sensor::sweep::classify;
 

@@ -4,7 +4,7 @@
 //! it, if there is one: it lies on the vehicle, its ray crosses the vehicle, or it lies in a blind sector. A ray that
 //! crosses the vehicle was reflected by its paint or glass, and its return is a mirror image.
 
-use crate::config::BodyConfig;
+use crate::config::body::BodyConfig;
 
 /// Why the self filter removes a return.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,4 +1,4 @@
-//! What the labels of the SemanticKITTI frame say, point by point and cell by cell.
+//! The labels of the SemanticKITTI frame, by point and by cell.
 #![cfg_attr(not(clearway_data), allow(unused))]
 
 use std::collections::BTreeMap;
@@ -12,15 +12,15 @@ use clearway_mapping::sensor::sweep::{Mount, Sweep};
 
 use super::{data, kitti};
 
-/// Height of KITTI's sensor over the ground, metres, as its makers publish it.
+/// Height of KITTI's sensor over the ground, metres, as published with the data set.
 pub const KITTI_HEIGHT_M: f64 = 1.73;
 
-/// Road, parking, sidewalk, other-ground, lane-marking, terrain.
+/// True for the labels road, parking, sidewalk, other-ground, lane-marking and terrain.
 pub fn is_ground(label: u32) -> bool {
     matches!(label, 40 | 44 | 48 | 49 | 60 | 72)
 }
 
-/// Height of the labelled ground about a place: the median of a square of 2 m, or of the nearest squares that hold any.
+/// Height of the labelled ground around a point: the median of a square of 2 m, or of the nearest squares with ground.
 struct GroundHeight(BTreeMap<(i32, i32), Vec<f32>>);
 
 impl GroundHeight {
@@ -37,7 +37,7 @@ impl GroundHeight {
         ((point[0] / 2.0).floor() as i32, (point[1] / 2.0).floor() as i32)
     }
 
-    fn about(&self, point: &[f32; 3]) -> f32 {
+    fn around(&self, point: &[f32; 3]) -> f32 {
         let (i, j) = Self::square(point);
         for reach in 0..4 {
             let around = (-reach..=reach).flat_map(|di| (-reach..=reach).map(move |dj| (i + di, j + dj)));
@@ -53,10 +53,10 @@ impl GroundHeight {
 
 /// A KITTI scan as a sweep.
 pub fn kitti_sweep(path: &str) -> Sweep {
-    sweep_of(&kitti(path))
+    sweep_from(&kitti(path))
 }
 
-fn sweep_of(scan: &Scan) -> Sweep {
+fn sweep_from(scan: &Scan) -> Sweep {
     let extrinsics =
         Extrinsics { x_m: 0.0, y_m: 0.0, z_m: KITTI_HEIGHT_M, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
     let mount = Mount { ego_from_sensor: extrinsics.ego_from_sensor(), range_m_min: 2.0 };
@@ -72,25 +72,25 @@ pub fn labelled_frame() -> (Sweep, Vec<u32>) {
     let labels: Vec<u32> =
         bytes.chunks_exact(4).map(|label| u32::from_le_bytes(label.try_into().unwrap()) & 0xffff).collect();
     assert_eq!(labels.len(), scan.x.len());
-    let sweep = sweep_of(&scan);
-    // The sweep leaves out what lies within 2 m; so must the labels.
+    let sweep = sweep_from(&scan);
+    // The sweep has no points within 2 m, so the labels of these points are removed.
     let seen = |i: &usize| (scan.x[*i].powi(2) + scan.y[*i].powi(2) + scan.z[*i].powi(2)) >= 4.0;
     let labels: Vec<u32> = (0..labels.len()).filter(seen).map(|i| labels[i]).collect();
     assert_eq!(labels.len(), sweep.x.len());
     (sweep, labels)
 }
 
-/// What the labels say of each cell.
+/// What the labels state about each cell.
 pub struct TruthByCell {
-    /// Road or lane marking, and no obstacle.
+    /// True if the cell contains road or lane marking, and no obstacle.
     pub road: Vec<bool>,
-    /// Any ground, and no obstacle.
+    /// True if the cell contains ground of any kind, and no obstacle.
     pub free: Vec<bool>,
-    /// A point of anything but ground, 0.3 to 2.5 m over the ground about it.
+    /// True if the cell contains a point that is not ground, 0.3 to 2.5 m over the ground around it.
     pub obstacle: Vec<bool>,
 }
 
-/// The labels of a sweep's points, gathered by `cell(x, y)` of `cells`.
+/// The truth of each cell from the labels of a sweep's points; `cell(x, y)` is one of `cells` cells.
 pub fn truth_by_cell(
     sweep: &Sweep,
     labels: &[u32],
@@ -104,8 +104,8 @@ pub fn truth_by_cell(
         let Some(cell) = cell(point[0], point[1]) else { continue };
         road[cell] |= matches!(label, 40 | 60);
         ground[cell] |= is_ground(*label);
-        // 0 and 1 are unlabelled and outliers.
-        let over = point[2] - height.about(point);
+        // Labels 0 and 1 mean unlabelled and outlier.
+        let over = point[2] - height.around(point);
         obstacle[cell] |= !is_ground(*label) && *label > 1 && over > 0.3 && over <= 2.5;
     }
     let without_obstacle =
@@ -113,7 +113,7 @@ pub fn truth_by_cell(
     TruthByCell { road: without_obstacle(&road), free: without_obstacle(&ground), obstacle }
 }
 
-/// Of the cells that hold, the share that also hold the other.
+/// Share of the cells of `of` for which `that` is true.
 pub fn share(of: &[bool], that: impl Fn(usize) -> bool) -> f64 {
     let cells: Vec<usize> = (0..of.len()).filter(|cell| of[*cell]).collect();
     cells.iter().filter(|cell| that(**cell)).count() as f64 / cells.len() as f64

@@ -1,4 +1,4 @@
-//! Sweeps for the tests: rays of a real sensor cast into worlds of a few lines, and the recorded scans.
+//! Sweeps for the tests: rays of a real sensor model cast into simple worlds, and recorded scans.
 #![allow(dead_code)]
 
 pub mod labels;
@@ -9,8 +9,8 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::layer::{Cells, Geometry, Layer, Rays};
 use clearway_mapping::layer::radial_grid::RadialGrid;
+use clearway_mapping::layer::{Cells, Geometry, Layer, Rays};
 use clearway_mapping::sensor::sweep::Sweep;
 
 /// Height of the sensor in all synthetic worlds, metres.
@@ -29,7 +29,7 @@ pub fn add(sweep: &mut Sweep, [x, y, z]: [f32; 3]) {
     sweep.returns += 1;
 }
 
-/// What rays meet in a turn of `model`, marched in steps of a few centimetres until `inside(x, y, z)`.
+/// Returns of one revolution of `model`; each ray is followed in steps of a few centimetres until `inside(x, y, z)`.
 pub fn cast(model: Model, inside: impl Fn(f32, f32, f32) -> bool) -> Sweep {
     let mut sweep = empty(model);
     let lasers = sweep.calibration.as_ref().unwrap().lasers.clone();
@@ -43,7 +43,7 @@ pub fn cast(model: Model, inside: impl Fn(f32, f32, f32) -> bool) -> Sweep {
                 let next = range + 0.02 + 0.002 * range;
                 let [x, y, z] = at(next);
                 if inside(x, y, z) {
-                    // Ten halvings: to a tenth of a millimetre.
+                    // Ten halvings give a tenth of a millimetre.
                     let (mut before, mut after) = (range, next);
                     for _ in 0..10 {
                         let middle = (before + after) / 2.0;
@@ -83,13 +83,13 @@ pub fn shuffled(sweep: &Sweep, seed: u64) -> Sweep {
     Sweep { x: pick(&sweep.x), y: pick(&sweep.y), z: pick(&sweep.z), ..sweep.clone() }
 }
 
-/// The sweep turned by 90° counter-clockwise, exactly.
-pub fn turned(sweep: &Sweep) -> Sweep {
+/// The sweep rotated by 90° counter-clockwise, exactly.
+pub fn rotated(sweep: &Sweep) -> Sweep {
     Sweep { x: sweep.y.iter().map(|y| -y).collect(), y: sweep.x.clone(), ..sweep.clone() }
 }
 
-/// The sweep without the points that lie within rounding of a border of square cells of 0.25 m: such a point belongs to
-/// the cell behind the border, and turned to the one before.
+/// The sweep without points on a border of square cells of 0.25 m, up to rounding: such a point belongs to the cell
+/// behind the border, and after a rotation to the cell before it.
 pub fn off_borders(sweep: &Sweep) -> Sweep {
     let kept = |i: &usize| [sweep.x[*i], sweep.y[*i]].iter().all(|v| (v * 4.0 - (v * 4.0).round()).abs() > 1e-4);
     let order: Vec<usize> = (0..sweep.x.len()).filter(kept).collect();
@@ -105,7 +105,7 @@ pub fn size(layer: &Layer) -> (usize, usize) {
     }
 }
 
-/// The cell of a layer that holds a position, if any does.
+/// The cell of a layer that contains a position, if there is one.
 pub fn cell_at(layer: &Layer, x: f32, y: f32) -> Option<usize> {
     match &layer.geometry {
         Geometry::Radial { row_radius_m, columns } => RadialGrid::new(row_radius_m.clone(), *columns).cell(x, y),
@@ -119,8 +119,8 @@ pub fn cell_at(layer: &Layer, x: f32, y: f32) -> Option<usize> {
     }
 }
 
-/// A channel's values after the ego frame was turned by 90° counter-clockwise under them.
-pub fn quarter_turned(layer: &Layer, values: &[i32]) -> Vec<i32> {
+/// The values of a channel in a world rotated by 90° counter-clockwise.
+pub fn quarter_rotated(layer: &Layer, values: &[i32]) -> Vec<i32> {
     let (rows, columns) = size(layer);
     match &layer.geometry {
         Geometry::Radial { .. } => values
@@ -131,9 +131,9 @@ pub fn quarter_turned(layer: &Layer, values: &[i32]) -> Vec<i32> {
                 row
             })
             .collect(),
-        // What was at (ix, iy) is at (width - 1 - iy, ix).
+        // The value of (ix, iy) moves to (width - 1 - iy, ix).
         Geometry::Cartesian { .. } => {
-            assert_eq!(rows, columns, "only a square is itself after a quarter turn");
+            assert_eq!(rows, columns, "only a square grid can be rotated by 90°");
             (0..rows * columns).map(|cell| values[(columns - 1 - cell % columns) * columns + cell / columns]).collect()
         }
     }
@@ -172,23 +172,23 @@ pub fn figure(layer: &Layer, name: &str) -> f64 {
     layer.metrics.iter().find(|(n, _)| *n == name).unwrap().1
 }
 
-/// Folder of the recorded drives.
+/// Path of a recorded drive.
 pub fn data(path: &str) -> std::path::PathBuf {
     std::path::Path::new(env!("CLEARWAY_DATA")).join(path)
 }
 
-/// A KITTI scan: x, y, z, intensity a point, sensor frame.
+/// A KITTI scan, sensor frame.
 pub fn kitti(path: &str) -> clearway_mapping::event::Scan {
     clearway_mapping::scan_file::read_bin(&std::fs::read(data(path)).unwrap()).unwrap()
 }
 
-/// Datagrams of a capture, up to where it is cut off.
+/// Datagrams of a capture, up to its end or the first record that is cut off.
 pub fn datagrams(path: &str) -> Vec<clearway_lidar::capture::Datagram> {
     let file = std::fs::File::open(data(path)).unwrap();
     clearway_lidar::capture::Capture::new(file).unwrap().map_while(Result::ok).collect()
 }
 
-/// One sensor's turn as `take()` gets it: what came back, from a sensor at the sweep's mount.
+/// The rays of one scan as `integrate()` gets them, from a sensor at the sweep's mount.
 pub fn rays(sweep: &Sweep) -> Rays<'_> {
     Rays {
         sensor: 0,

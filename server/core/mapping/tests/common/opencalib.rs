@@ -7,13 +7,13 @@ use nalgebra::{Isometry3, Matrix3, Matrix4, Point3, Rotation3, Translation3, Uni
 
 use super::{add, data};
 
-/// One sensor's scan, ego frame, and its place there.
+/// One sensor's scan and its position, ego frame.
 pub struct Sensor {
     pub sweep: Sweep,
     pub origin_m: [f32; 3],
 }
 
-/// Top, left, right. Where the top sensor sits is estimated from the ground it sees.
+/// The sensors top, left, right. The mount of the top sensor is estimated from the ground it sees.
 pub fn sensors(scene: &str) -> Vec<Sensor> {
     let folder = format!("multilidar/opencalib/real_world/{scene}");
     let extrinsics = std::fs::read_to_string(data(&format!("{folder}/extrinsics_from_result.json"))).unwrap();
@@ -37,8 +37,8 @@ pub fn sensors(scene: &str) -> Vec<Sensor> {
     files.iter().zip(&clouds).map(sensor).collect()
 }
 
-/// The matrix that follows the sensor's name, row by row.
-fn top_from_sensor(extrinsics: &str, file: &str) -> Isometry3<f64> {
+/// The matrix that follows the name of the sensor, row by row.
+pub fn top_from_sensor(extrinsics: &str, file: &str) -> Isometry3<f64> {
     let matrix = extrinsics.split(&format!("\"{file}\"")).nth(1).unwrap().split("T_top_from_sensor\":").nth(1).unwrap();
     let numbers = matrix.split(|c: char| !(c.is_ascii_digit() || "+-.e".contains(c)));
     let numbers: Vec<f64> = numbers.filter_map(|number| number.parse().ok()).take(16).collect();
@@ -48,12 +48,12 @@ fn top_from_sensor(extrinsics: &str, file: &str) -> Isometry3<f64> {
     Isometry3::from_parts(translation, UnitQuaternion::from_rotation_matrix(&rotation))
 }
 
-/// Positions of a PCD of `x y z intensity ring timestamp` whose fields lie behind one another, packed by LZF.
+/// Positions in a PCD file of `x y z intensity ring timestamp`, stored field by field and packed by LZF.
 fn points(path: &str) -> Vec<[f32; 3]> {
     let bytes = std::fs::read(data(path)).unwrap();
     let header = b"DATA binary_compressed\n";
     let body = bytes.windows(header.len()).position(|window| window == header).unwrap() + header.len();
-    let plain = unpacked(&bytes[body + 8..]);
+    let plain = unpack_lzf(&bytes[body + 8..]);
     let count = plain.len() / 26;
     let value = |field: usize, point: usize| {
         let at = 4 * (field * count + point);
@@ -63,8 +63,8 @@ fn points(path: &str) -> Vec<[f32; 3]> {
     points.filter(|point| point.iter().all(|value| value.is_finite())).collect()
 }
 
-/// LZF: a byte under 32 says how many plain bytes follow, less one; others repeat what was written before.
-fn unpacked(mut packed: &[u8]) -> Vec<u8> {
+/// Unpacks LZF: a byte under 32 is the number of plain bytes that follow, minus one; other bytes repeat earlier output.
+pub fn unpack_lzf(mut packed: &[u8]) -> Vec<u8> {
     let mut plain = Vec::new();
     while let [control, rest @ ..] = packed {
         let control = usize::from(*control);

@@ -1,32 +1,33 @@
-//! The simulated six-unit vehicle, its scans put into the ego frame of their ends, as the pipeline does.
+//! A simulated vehicle with six sensors. Its scans are transformed to the ego frame of their ends, as the pipeline
+//! does.
 
-use clearway_mapping::layer::{Context, Geometry, Layer, LayerMaker, Rays};
 use clearway_mapping::layer::occupancy::Occupancy;
+use clearway_mapping::layer::{Context, Geometry, Layer, LayerMaker, Rays};
 use clearway_mapping::sensor::sweep::Sweep;
 use clearway_sim::planes::PlaneUnit;
 use clearway_sim::scenes::Scene;
 use nalgebra::{Isometry3, Point3, Vector3};
 
-/// Scans of a map: 100 ms at 50 Hz.
+/// Number of scans of each sensor in a map: 100 ms at 50 Hz.
 pub const SCANS: i64 = 5;
 
-/// A scene, its vehicle's units, and the map they make.
+/// A scene, the sensors of its vehicle, and the layer they make.
 pub struct Street {
     pub scene: Scene,
     pub units: Vec<PlaneUnit>,
     pub occupancy: Occupancy,
 }
 
-/// One unit's scan, in the ego frame of its end.
-pub struct Taken {
+/// One sensor's scan, ego frame at its end.
+pub struct ScanInEgo {
     pub sweep: Sweep,
     pub no_returns: Vec<[f32; 3]>,
     pub origin_m: [f32; 3],
     pub map_from_ego: Isometry3<f64>,
 }
 
-/// Scan `number` of a unit.
-pub fn scan(scene: &Scene, unit: &PlaneUnit, number: i64) -> Taken {
+/// Scan `number` of a sensor.
+pub fn scan(scene: &Scene, unit: &PlaneUnit, number: i64) -> ScanInEgo {
     let scan = unit.scan(scene, number);
     let seconds = |ns: i64| ns as f64 * 1e-9;
     let map_from_ego = scene.pose_at(seconds(scan.end_ns));
@@ -38,17 +39,17 @@ pub fn scan(scene: &Scene, unit: &PlaneUnit, number: i64) -> Taken {
         let point = end_from_map * seen_at * unit.ego_from_sensor * point;
         super::add(&mut sweep, [point.x as f32, point.y as f32, point.z as f32]);
     }
-    let turned =
+    let rotated =
         |d: &[f32; 3]| (unit.ego_from_sensor.rotation * Vector3::from(d.map(f64::from))).map(|v| v as f32).into();
-    Taken {
+    ScanInEgo {
         sweep,
-        no_returns: scan.no_returns.iter().map(turned).collect(),
+        no_returns: scan.no_returns.iter().map(rotated).collect(),
         origin_m: unit.ego_from_sensor.translation.vector.map(|v| v as f32).into(),
         map_from_ego,
     }
 }
 
-/// Corners of a layer's cell in the world.
+/// Corners of a cell of a layer, world frame, metres.
 pub fn cell_corners(layer: &Layer, cell: usize, map_from_ego: &Isometry3<f64>) -> [[f64; 2]; 4] {
     let Geometry::Cartesian { origin_x_m, origin_y_m, width, cell_m, yaw_rad, .. } = layer.geometry else {
         panic!("{} has no square cells", layer.name)
@@ -63,19 +64,20 @@ pub fn cell_corners(layer: &Layer, cell: usize, map_from_ego: &Isometry3<f64>) -
 }
 
 impl Street {
-    /// Map `number`, which ends 100 ms after the one before, and where the vehicle is then.
+    /// Layer `number`, which ends 100 ms after the one before, with the pose of the vehicle and the time (s) at its
+    /// end.
     pub fn map(&mut self, number: i64) -> (Layer, Isometry3<f64>, f64) {
         let speed_mps = Some(self.scene.drive.speed);
         for number in number * SCANS + 1..=(number + 1) * SCANS {
             for (sensor, unit) in self.units.iter().enumerate() {
-                let taken = scan(&self.scene, unit, number);
+                let rays = scan(&self.scene, unit, number);
                 self.occupancy.integrate(&Rays {
                     sensor: sensor as u16,
                     stamp_ns: number * unit.period_ns,
-                    returns: &taken.sweep,
-                    origin_m: taken.origin_m,
-                    no_returns: &taken.no_returns,
-                    map_from_ego: Some(taken.map_from_ego),
+                    returns: &rays.sweep,
+                    origin_m: rays.origin_m,
+                    no_returns: &rays.no_returns,
+                    map_from_ego: Some(rays.map_from_ego),
                     speed_mps,
                 });
             }

@@ -1,10 +1,11 @@
-//! Several sensors on one vehicle: one map of them all, whatever one of them does; nothing held, nothing unnamed.
+//! Several sensors on one vehicle give one map, whatever one of them does. No sensor holds the maps back, and the map
+//! names each sensor that does not contribute.
 
 #[path = "../common/mod.rs"]
 mod common;
 mod declared;
+mod rotating;
 mod scans;
-mod turning;
 
 use bytes::Bytes;
 use clearway_lidar::calibration::Calibration;
@@ -12,10 +13,10 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::{BodyConfig, Extrinsics, FusionConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::error::EventError;
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
-use clearway_mapping::map::{Contribution, Map};
-use clearway_mapping::sensor::motion::Compensation;
 use clearway_mapping::ledger::Ledger;
+use clearway_mapping::map::{Contribution, Map};
 use clearway_mapping::pipeline::Pipeline;
+use clearway_mapping::sensor::motion::Compensation;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
 use clearway_sim::vehicle::SimulatedVehicle;
@@ -27,7 +28,7 @@ fn at(x_m: f64, y_m: f64, z_m: f64, yaw_deg: f64) -> Extrinsics {
     Extrinsics { x_m, y_m, z_m, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg }
 }
 
-/// A roof sensor and one on each side.
+/// A vehicle with a sensor on the roof and one on each side.
 fn config() -> VehicleConfig {
     let scanning = |name: &str, extrinsics| SensorConfig { range_m_min: 0.0, ..SensorConfig::new(name, extrinsics) };
     let roof = SensorConfig { model: Some(Model::Vlp16), ..scanning("top", at(0.0, 0.0, 1.9, 0.0)) };
@@ -45,7 +46,7 @@ fn event(source: u16, arrival_ns: i64, body: Body) -> Event {
     Event { sequence: 0, arrival_ns, source, body }
 }
 
-/// Points ahead of the sensor at each of these distances, so high over it.
+/// A scan with a point ahead of the sensor at each of these distances, `z_m` above it.
 fn ahead(stamp_ns: i64, distances_m: &[f32], z_m: f32) -> Scan {
     let points = distances_m.len();
     Scan {
@@ -58,7 +59,7 @@ fn ahead(stamp_ns: i64, distances_m: &[f32], z_m: f32) -> Scan {
     }
 }
 
-/// A scan of sensor `source` that ends when it arrives, 5 m ahead of it on the ground.
+/// A scan of sensor `source` that arrives when it ends, with points on the ground 5 and 6 m ahead.
 fn scan(source: u16, stamp_ns: i64) -> Event {
     let z_m = if source == 0 { -1.9 } else { -1.0 };
     event(source, stamp_ns, Body::Scan(ahead(stamp_ns, &[5.0, 6.0], z_m)))
@@ -68,7 +69,7 @@ fn step(pipeline: &mut Pipeline, event: &Event) -> Option<Map> {
     pipeline.step(event).unwrap().cloned()
 }
 
-fn parts(map: &Map) -> Vec<(Contribution, Option<i64>)> {
+fn contributions(map: &Map) -> Vec<(Contribution, Option<i64>)> {
     map.sensors.iter().map(|sensor| (sensor.contribution, sensor.age_ms.map(|ms| ms.round() as i64))).collect()
 }
 
@@ -77,41 +78,49 @@ fn balanced(ledger: &Ledger) -> bool {
 }
 
 #[test]
-fn the_leads_scan_makes_the_map_and_the_others_bring_their_newest() {
+fn the_reference_sensors_scan_makes_the_map_and_the_others_contribute() {
     let mut pipeline = pipeline(&config());
     assert_eq!(step(&mut pipeline, &scan(1, 10 * MS)), None);
     assert_eq!(step(&mut pipeline, &scan(1, 60 * MS)), None);
     let map = step(&mut pipeline, &scan(0, 100 * MS)).unwrap();
     assert_eq!((map.source, map.capture_start_ns, map.capture_end_ns), (0, 60 * MS, 100 * MS));
-    assert_eq!(parts(&map), [(Contribution::Ok, Some(0)), (Contribution::Ok, Some(40)), (Contribution::Silent, None)]);
+    assert_eq!(
+        contributions(&map),
+        [(Contribution::Ok, Some(0)), (Contribution::Ok, Some(40)), (Contribution::Silent, None)]
+    );
     assert_eq!(map.sensors.iter().map(|sensor| sensor.returns).collect::<Vec<_>>(), [2, 2, 0]);
-    assert_eq!(map.sensors[1].completeness, 1.0, "a field of view is no loss");
+    assert_eq!(map.sensors[1].completeness, 1.0, "a scan that covers less than 360 degrees is complete");
     let sweep = pipeline.newest_sweep();
-    // The left one looks to the left: its 5 m ahead are 6 m to the left of the vehicle.
+    // The left sensor points to the left: 5 m ahead of it is 6 m to the left of the ego origin.
     assert_eq!(sweep.x.len(), 4);
     assert!((sweep.y[2] - 6.0).abs() < 1e-5 && (sweep.x[2] + 0.25).abs() < 1e-5 && sweep.z[2].abs() < 1e-5);
 }
 
 #[test]
-fn a_sensor_that_stops_is_left_out_after_the_deadline_and_named_with_its_age() {
+fn a_sensor_that_stops_is_left_out_after_the_deadline() {
     let mut pipeline = pipeline(&config());
     step(&mut pipeline, &scan(1, 10 * MS));
     let made: Vec<_> = (1..5).map(|n| step(&mut pipeline, &scan(0, n * 100 * MS)).unwrap()).collect();
-    let left: Vec<_> = made.iter().map(|map| parts(map)[1]).collect();
+    let left: Vec<_> = made.iter().map(|map| contributions(map)[1]).collect();
     assert_eq!(
         left,
-        [(Contribution::Ok, Some(90)), (Contribution::Ok, Some(190)), (Contribution::Silent, Some(290)), (Contribution::Silent, Some(390))]
+        [
+            (Contribution::Ok, Some(90)),
+            (Contribution::Ok, Some(190)),
+            (Contribution::Silent, Some(290)),
+            (Contribution::Silent, Some(390))
+        ]
     );
-    assert_eq!(made[2].sensors[1].returns, 0, "nothing of it is in the map");
+    assert_eq!(made[2].sensors[1].returns, 0, "no point of the sensor is in the map");
     assert_eq!(pipeline.newest_sweep().x.len(), 2);
 }
 
 #[test]
-fn a_lead_that_stops_never_holds_the_map_and_leads_again_when_it_is_back() {
+fn another_sensor_replaces_a_reference_sensor_that_stops() {
     let mut pipeline = pipeline(&config());
     let mut made = Vec::new();
     for n in 1..20 {
-        // The lead is away from 250 ms to 1250 ms; the others scan on.
+        // The reference sensor is silent from 250 ms to 1250 ms; the others go on.
         let stamp_ns = n * 100 * MS;
         if !(3..=12).contains(&n) {
             made.extend(step(&mut pipeline, &scan(0, stamp_ns)));
@@ -120,23 +129,23 @@ fn a_lead_that_stops_never_holds_the_map_and_leads_again_when_it_is_back() {
             made.extend(step(&mut pipeline, &scan(source, stamp_ns + i64::from(source) * MS)));
         }
     }
-    let away: Vec<i64> = made.windows(2).map(|pair| pair[1].completed_ns - pair[0].completed_ns).collect();
-    assert!(away.iter().all(|gap_ns| *gap_ns <= 301 * MS), "deadline and one turn: {away:?}");
-    let makers: Vec<u16> = made.iter().map(|map| map.source).collect();
-    assert_eq!(makers[..3], [0, 0, 1], "the next in order stands in");
+    let gaps: Vec<i64> = made.windows(2).map(|pair| pair[1].completed_ns - pair[0].completed_ns).collect();
+    assert!(gaps.iter().all(|gap_ns| *gap_ns <= 301 * MS), "at most the deadline and one scan: {gaps:?}");
+    let sources: Vec<u16> = made.iter().map(|map| map.source).collect();
+    assert_eq!(sources[..3], [0, 0, 1], "the next sensor in order is the source");
     let back = made.iter().find(|map| map.capture_end_ns == 1300 * MS).unwrap();
     assert_eq!(back.source, 0);
     assert!(made.iter().filter(|map| map.capture_end_ns > 1300 * MS).all(|map| map.source == 0));
     let alone = made.iter().find(|map| map.source == 1 && map.capture_end_ns > 500 * MS).unwrap();
-    assert_eq!(parts(alone)[0].0, Contribution::Silent);
-    // One sensor's turn makes each map: ten of the lead's are missing, and no two stand in for one of them.
+    assert_eq!(contributions(alone)[0].0, Contribution::Silent);
+    // One scan makes each map: ten scans of the reference sensor are missing, and at most one scan replaces each.
     assert!((17..=19).contains(&made.len()), "{}", made.len());
 }
 
 #[test]
-fn the_rows_of_radial_maps_stay_the_leads_whoever_makes_the_map() {
+fn the_rows_of_radial_maps_are_those_of_the_reference_sensor() {
     let mut coarse = config();
-    // To this one alone all the ground is one row.
+    // For this sensor alone all the ground is one row.
     coarse.sensors[1].elevations_deg = vec![-5.0];
     let rows = |pipeline: &mut Pipeline, event: &Event| {
         let map = step(pipeline, event)?;
@@ -144,17 +153,17 @@ fn the_rows_of_radial_maps_stay_the_leads_whoever_makes_the_map() {
     };
     let mut alone = pipeline(&coarse);
     assert_eq!(rows(&mut alone, &scan(1, 10 * MS)), None);
-    assert_eq!(rows(&mut alone, &scan(1, 300 * MS)).map(|(maker, rows)| (maker, rows.len())), Some((1, 1)));
+    assert_eq!(rows(&mut alone, &scan(1, 300 * MS)).map(|(source, rows)| (source, rows.len())), Some((1, 1)));
     let mut pipeline = pipeline(&coarse);
-    let (_, of_lead) = rows(&mut pipeline, &scan(0, 100 * MS)).unwrap();
-    assert!(of_lead.len() > 4);
-    let stands_in = (1..6).find_map(|n| rows(&mut pipeline, &scan(1, (n + 1) * 100 * MS)));
-    assert_eq!(stands_in, Some((1, of_lead)));
+    let (_, reference_rows) = rows(&mut pipeline, &scan(0, 100 * MS)).unwrap();
+    assert!(reference_rows.len() > 4);
+    let replaced = (1..6).find_map(|n| rows(&mut pipeline, &scan(1, (n + 1) * 100 * MS)));
+    assert_eq!(replaced, Some((1, reference_rows)));
 }
 
 #[test]
-fn a_lead_that_lags_or_jumps_does_not_lead_and_is_named_with_its_age() {
-    for (name, off_ns, part) in [
+fn a_reference_sensor_whose_clock_is_wrong_is_replaced() {
+    for (name, off_ns, contribution) in [
         ("lags", -700 * MS, Contribution::Late),
         ("jumps ahead", 3_600_000 * MS, Contribution::Ahead),
         ("jumps back", -3_600_000 * MS, Contribution::Late),
@@ -166,23 +175,23 @@ fn a_lead_that_lags_or_jumps_does_not_lead_and_is_named_with_its_age() {
             let stamp_ns = start_ns + n * 100 * MS;
             made.extend(step(&mut pipeline, &scan(1, stamp_ns - MS)));
             let off_ns = if n < 4 { 0 } else { off_ns };
-            let lead = event(0, stamp_ns, Body::Scan(ahead(stamp_ns + off_ns, &[5.0], -1.9)));
-            // A stamp before the newest one is refused until the deadline has passed: it could be a repeated scan.
-            made.extend(pipeline.step(&lead).ok().flatten().cloned());
+            let reference = event(0, stamp_ns, Body::Scan(ahead(stamp_ns + off_ns, &[5.0], -1.9)));
+            // A stamp before the newest one is refused until the deadline has passed.
+            made.extend(pipeline.step(&reference).ok().flatten().cloned());
         }
         let gaps = made.windows(2).map(|pair| pair[1].completed_ns - pair[0].completed_ns);
         assert!(gaps.max().unwrap() <= 300 * MS, "{name}");
         let last = made.last().unwrap();
         assert_eq!(last.source, 1, "{name}");
-        assert_eq!(last.sensors[0].contribution, part, "{name}");
+        assert_eq!(last.sensors[0].contribution, contribution, "{name}");
         let age_ms = last.sensors[0].age_ms.unwrap();
         assert!((f64::from(age_ms) + off_ns as f64 / MS as f64 - 99.0).abs() < 1.0, "{name}: {age_ms}");
-        assert!(made.windows(2).all(|pair| pair[0].capture_end_ns < pair[1].capture_end_ns), "{name}: stamps rise");
+        assert!(made.windows(2).all(|pair| pair[0].capture_end_ns < pair[1].capture_end_ns), "{name}: the stamps rise");
     }
 }
 
 #[test]
-fn a_sensor_that_restarts_with_an_older_clock_is_taken_again_after_the_deadline() {
+fn scans_with_older_stamps_are_accepted_after_the_deadline() {
     let mut pipeline = pipeline(&config());
     step(&mut pipeline, &scan(1, 5_000 * MS));
     let restarted = |arrival_ms: i64| event(1, arrival_ms * MS, Body::Scan(ahead(arrival_ms, &[5.0], -1.0)));
@@ -190,14 +199,14 @@ fn a_sensor_that_restarts_with_an_older_clock_is_taken_again_after_the_deadline(
     assert_eq!(refused, EventError::Stamp { stamp_ns: 5_100, newest_ns: 5_000 * MS });
     pipeline.step(&restarted(5_300)).unwrap();
     pipeline.step(&restarted(5_400)).unwrap();
-    // The very scan again is refused at any time.
+    // A repeated scan is always refused.
     let again = event(1, 9_000 * MS, restarted(5_400).body);
     assert_eq!(pipeline.step(&again).unwrap_err().reason(), "stamp");
     assert_eq!(pipeline.sensors()[1].ledger.refused, [("stamp", 2)].into());
 }
 
 #[test]
-fn a_fast_lead_makes_a_map_a_period() {
+fn a_fast_reference_sensor_makes_one_map_a_period() {
     let fusion = FusionConfig { period_ms: 100, ..FusionConfig::default() };
     let mut pipeline = pipeline(&VehicleConfig { fusion, ..config() });
     // 50 Hz with 2 ms of jitter.
@@ -207,7 +216,7 @@ fn a_fast_lead_makes_a_map_a_period() {
 }
 
 #[test]
-fn the_configured_lead_leads() {
+fn the_configured_reference_sensor_makes_the_maps() {
     let mut config = config();
     config.fusion.reference_sensor = "right".into();
     let mut pipeline = pipeline(&config);
@@ -216,14 +225,14 @@ fn the_configured_lead_leads() {
 }
 
 #[test]
-fn older_turns_are_carried_to_the_maps_stamp_by_the_poses_or_the_speed() {
+fn older_scans_are_propagated_to_the_maps_stamp_by_poses_or_speed() {
     const SECOND: i64 = 1000 * MS;
     let pose = |ms: i64, x: f64| {
         let map_from_ego = Isometry3::new(Vector3::new(x, 0.0, 0.0), Vector3::zeros());
         event(0, SECOND + ms * MS, Body::EgoPose(EgoPose { stamp_ns: SECOND + ms * MS, map_from_ego, speed_mps: 20.0 }))
     };
-    let wall = |pipeline: &mut Pipeline| {
-        // A post at x = 10 in the world, 5 m to the left: seen by the left one at 40 ms, from x = 0.8.
+    let post_x = |pipeline: &mut Pipeline| {
+        // A post at x = 10 m in the world, 5 m to the left. The left sensor sees it at 40 ms, from x = 0.8 m.
         let post = Scan {
             x: vec![4.0],
             y: vec![-9.2],
@@ -239,18 +248,18 @@ fn older_turns_are_carried_to_the_maps_stamp_by_the_poses_or_the_speed() {
     for n in 0..=12 {
         step(&mut driven, &pose(n * 10, 0.2 * n as f64));
     }
-    let (_, x) = wall(&mut driven);
-    assert!((x - 8.0).abs() < 1e-4, "10 m less the 2 m driven: {x}");
-    let mut told = pipeline(&config());
-    step(&mut told, &pose(-900, 0.0));
-    let (_, x) = wall(&mut told);
+    let (_, x) = post_x(&mut driven);
+    assert!((x - 8.0).abs() < 1e-4, "10 m minus the 2 m driven: {x}");
+    let mut with_speed = pipeline(&config());
+    step(&mut with_speed, &pose(-900, 0.0));
+    let (_, x) = post_x(&mut with_speed);
     assert!((x - 8.0).abs() < 1e-4, "at 20 m/s for 60 ms: {x}");
-    let (compensation, x) = wall(&mut pipeline(&config()));
+    let (compensation, x) = post_x(&mut pipeline(&config()));
     assert_eq!(compensation, Compensation::None);
-    assert!((x - 9.2).abs() < 1e-4, "nobody knows: {x}");
+    assert!((x - 9.2).abs() < 1e-4, "without motion the point stays: {x}");
 }
 
-/// Datagrams of a standing simulated vehicle's sensor, so many milliseconds.
+/// Datagrams of the sensor of a standing simulated vehicle, for `until_ms` milliseconds.
 fn velodyne(model: Model, height_m: f64, until_ms: i64) -> Vec<Event> {
     let ego_from_sensor = Isometry3::translation(0.0, 0.0, height_m);
     let vehicle = SimulatedVehicle::new(scenes::flat(), ScannerConfig { model, ego_from_sensor, ..Default::default() });

@@ -1,16 +1,16 @@
-//! Scans: their points moved from when each was seen, what refuses one, and where the rows of radial maps come from.
+//! Scan events: motion compensation of their points, which scans are refused, and what defines the rows of radial maps.
 
 use super::*;
 
 #[test]
-fn a_scans_points_are_moved_from_when_each_was_seen() {
+fn each_point_of_a_scan_is_moved_from_its_own_time() {
     let mut pipeline = pipeline(&config());
     for n in 0..=10 {
         let map_from_ego = Isometry3::new(Vector3::new(0.15 * f64::from(n), 0.0, 0.0), Vector3::zeros());
         let pose = EgoPose { stamp_ns: i64::from(n) * 10 * MS, map_from_ego, speed_mps: 15.0 };
         step(&mut pipeline, &event(0, pose.stamp_ns, Body::EgoPose(pose.clone())));
     }
-    // A wall 30 m ahead in the world, seen in no order at all while the vehicle drives 1.5 m towards it.
+    // A wall 30 m ahead in the world; its points have random times while the vehicle drives 1.5 m towards it.
     let offsets: Vec<i32> = (0..500).map(|i| -(i * 7919 % 500) * 200_000).collect();
     let seen_at = |offset: &i32| 15.0 * (0.1 + *offset as f32 * 1e-9);
     let wall = Scan {
@@ -45,7 +45,7 @@ fn a_scans_points_are_moved_from_when_each_was_seen() {
     assert_eq!(direction, "scan with the no-return direction [NaN, 0.0, 1.0]: a unit vector is allowed");
 }
 
-/// What the core says to a scan of the lead.
+/// The error for a scan of the reference sensor.
 fn refusal(scan: Scan) -> String {
     let mut pipeline = pipeline(&config());
     let refused = pipeline.step(&event(0, 1, Body::Scan(scan))).unwrap_err();
@@ -54,7 +54,7 @@ fn refusal(scan: Scan) -> String {
 }
 
 #[test]
-fn rows_come_from_the_configured_elevations_or_the_scans_rings_and_without_either_radial_maps_are_unknown() {
+fn rows_come_from_the_configured_elevations_or_from_the_rings_of_the_scan() {
     let ground = |shuffled: bool| {
         let mut order: Vec<usize> = (0..720 * 8).collect();
         if shuffled {
@@ -81,21 +81,21 @@ fn rows_come_from_the_configured_elevations_or_the_scans_rings_and_without_eithe
     let measured = map(Vec::new(), ground(false));
     assert_eq!(common::benches(&measured.layers[0]).len(), 8);
     assert!(common::figure(&measured.layers[0], "drivable_share") > 0.95);
-    assert_eq!(map(Vec::new(), ground(true)).layers, measured.layers, "whatever the order of the points");
+    assert_eq!(map(Vec::new(), ground(true)).layers, measured.layers, "the order of the points has no effect");
     let configured = map(elevations_deg, Scan { ring: Vec::new(), ..ground(false) });
     for (a, b) in common::benches(&configured.layers[0]).iter().zip(common::benches(&measured.layers[0])) {
         assert!((a - b).abs() < 1e-2, "{a} {b}");
     }
-    let nobody = map(Vec::new(), Scan { ring: Vec::new(), ..ground(false) });
-    for layer in &nobody.layers[..2] {
+    let without_rows = map(Vec::new(), Scan { ring: Vec::new(), ..ground(false) });
+    for layer in &without_rows.layers[..2] {
         assert!(common::classes(layer).iter().all(|class| *class == 0), "{}", layer.name);
     }
     assert!(
-        common::classes(&nobody.layers[2]).iter().any(|class| *class != 0),
+        common::classes(&without_rows.layers[2]).iter().any(|class| *class != 0),
         "{} needs no rows",
-        nobody.layers[2].name
+        without_rows.layers[2].name
     );
-    // A sensor without rings that leads takes the rows of one that has them.
+    // If the reference sensor has no rings, the rows are those of a sensor that has them.
     let mut two = config();
     two.sensors[0].model = None;
     let mut pipeline = pipeline(&two);

@@ -1,9 +1,9 @@
 //! Whatever the rays: every cell is written, and their order says nothing.
 
 use clearway_mapping::config::OccupancyConfig;
-use clearway_mapping::layer::{LayerMaker, Rays};
 use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::layer::occupancy::class::OccupancyClass;
+use clearway_mapping::layer::{LayerMaker, Rays};
 use clearway_mapping::sensor::sweep::Sweep;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use proptest::prelude::*;

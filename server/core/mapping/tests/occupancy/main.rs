@@ -7,11 +7,11 @@ mod laws;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig, OccupancyConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, EgoPose, Event, Scan};
-use clearway_mapping::layer::{Context, Layer, LayerMaker, Rays};
-use clearway_mapping::map::Map;
 use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::layer::occupancy::class::OccupancyClass;
 use clearway_mapping::layer::occupancy::states::{Cell, Evidence};
+use clearway_mapping::layer::{Context, Layer, LayerMaker, Rays};
+use clearway_mapping::map::Map;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::planes::{PlaneScan, PlaneUnit};
@@ -84,7 +84,7 @@ fn each_arrow_of_a_cells_life_goes_where_the_table_says() {
             let letter = letter.chars().next().unwrap();
             let mut cell = Cell { state, hits, age: 0 };
             for held in 0..HOLD {
-                let next = cell.judged(fresh, told, NEEDED, HOLD);
+                let next = cell.next(fresh, told, NEEDED, HOLD);
                 if !letter.is_uppercase() {
                     assert_eq!(next.state, state_of(letter), "{state:?} when {name}");
                     break;
@@ -93,7 +93,7 @@ fn each_arrow_of_a_cells_life_goes_where_the_table_says() {
                 cell = next;
             }
             if letter.is_uppercase() {
-                let next = cell.judged(fresh, told, NEEDED, HOLD);
+                let next = cell.next(fresh, told, NEEDED, HOLD);
                 let expected = Cell { state: state_of(letter), hits: 0, age: HOLD + 1 };
                 assert_eq!(next, expected, "{state:?} when {name}, in the end");
             }
@@ -103,8 +103,8 @@ fn each_arrow_of_a_cells_life_goes_where_the_table_says() {
 
 #[test]
 fn hits_add_up_saturate_and_fade() {
-    let hit = |cell: Cell, fresh| cell.judged(fresh, Evidence::Nothing, 20, 2);
-    let passed = |cell: Cell| cell.judged(0, Evidence::Through, 20, 2);
+    let hit = |cell: Cell, fresh| cell.next(fresh, Evidence::Nothing, 20, 2);
+    let passed = |cell: Cell| cell.next(0, Evidence::Through, 20, 2);
     // A few returns a turn: unknown with its hits beside, then occupied.
     let mut cell = Cell::default();
     for turn in 1..=3 {
@@ -119,10 +119,18 @@ fn hits_add_up_saturate_and_fade() {
         .take(4)
         .map(|cell| (cell.state, cell.hits))
         .collect();
-    assert_eq!(states, [(OccupancyClass::Unknown, 19), (OccupancyClass::Unknown, 4), (OccupancyClass::Unknown, 1), (OccupancyClass::Clear, 0)]);
+    assert_eq!(
+        states,
+        [
+            (OccupancyClass::Unknown, 19),
+            (OccupancyClass::Unknown, 4),
+            (OccupancyClass::Unknown, 1),
+            (OccupancyClass::Clear, 0)
+        ]
+    );
     assert_eq!(hit(passed(cell), 1).state, OccupancyClass::Occupied, "missed once, it is back with one return");
     // The stronger evidence wins within one map.
-    assert_eq!(Cell::default().judged(20, Evidence::Through, 20, 2).state, OccupancyClass::Occupied);
+    assert_eq!(Cell::default().next(20, Evidence::Through, 20, 2).state, OccupancyClass::Occupied);
 }
 
 #[test]

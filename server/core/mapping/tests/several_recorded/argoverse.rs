@@ -1,9 +1,9 @@
-//! Argoverse 2's sweeps: Arrow files (Feather v2) of columns x y z (f16) intensity laser_number (u8) offset_ns (i32),
-//! LZ4 frames. As much of Arrow, its flatbuffers and LZ4 as these files use.
+//! Reads sweeps of Argoverse 2: Arrow files (Feather v2) with the columns x y z (f16) intensity laser_number (u8)
+//! offset_ns (i32), in LZ4 frames. It reads as much of Arrow, its flatbuffers and LZ4 as these files use.
 
 use clearway_mapping::event::Scan;
 
-/// A sweep as two scans, of lasers 0 to 31 and 32 to 63; points in the ego frame whose origin is the rear axle.
+/// A sweep as two scans, of lasers 0 to 31 and 32 to 63, in the ego frame of Argoverse, whose origin is the rear axle.
 pub fn scans(file: &[u8], start_ns: i64) -> [Scan; 2] {
     let mut scans = [Scan::default(), Scan::default()];
     // The schema comes first; every message is a marker, a length, metadata and a body.
@@ -51,7 +51,7 @@ fn follow(bytes: &[u8], at: usize) -> usize {
     at + u32_at(bytes, at)
 }
 
-/// Where a flatbuffer table keeps its field.
+/// Position of a field of a flatbuffer table.
 fn field(bytes: &[u8], table: usize, number: usize) -> usize {
     let shape = table - u32_at(bytes, table);
     let slot = shape + 4 + 2 * number;
@@ -69,7 +69,7 @@ fn f16(bytes: &[u8], index: usize) -> f32 {
     if sign == 1 { -size } else { size }
 }
 
-/// A compressed column: its length, then an LZ4 frame without checksums of its blocks.
+/// Unpacks a column: its length, then an LZ4 frame without checksums of its blocks.
 fn column(bytes: &[u8]) -> Vec<u8> {
     let (length, frame) = (i64_at(bytes, 0), &bytes[8..]);
     assert_eq!(u32_at(frame, 0), 0x184D_2204, "LZ4");

@@ -1,4 +1,4 @@
-//! Recorded vehicles with several LIDARs, through the same door: OpenCalib's three units, Argoverse's two VLP-32C.
+//! Recorded vehicles with several LIDARs: three sensors of OpenCalib, two VLP-32C of Argoverse 2.
 
 mod argoverse;
 #[path = "../common/mod.rs"]
@@ -8,9 +8,10 @@ use clearway_mapping::config::{Extrinsics, SensorConfig, VehicleConfig};
 use clearway_mapping::event::{Body, Event, Scan};
 use clearway_mapping::layer::Layer;
 use clearway_mapping::map::{Contribution, Map};
-use clearway_mapping::sensor::mount::estimate;
 use clearway_mapping::pipeline::Pipeline;
-use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
+use clearway_mapping::sensor::mount::estimate;
+use common::opencalib::{top_from_sensor, unpack_lzf};
+use nalgebra::Isometry3;
 
 const STAMP_NS: i64 = 1_644_917_764_449_000_000;
 
@@ -21,22 +22,6 @@ fn extrinsics(ego_from_sensor: &Isometry3<f64>) -> Extrinsics {
     Extrinsics { x_m: t.x, y_m: t.y, z_m: t.z, roll_deg, pitch_deg, yaw_deg }
 }
 
-/// LZF, as PCD files use it.
-fn lzf(packed: &[u8]) -> Vec<u8> {
-    let mut out = Vec::new();
-    let mut bytes = packed.iter().map(|byte| usize::from(*byte));
-    while let Some(control) = bytes.next() {
-        if control < 32 {
-            out.extend(bytes.by_ref().take(control + 1).map(|byte| byte as u8));
-        } else {
-            let length = if control >> 5 == 7 { 7 + bytes.next().unwrap() } else { control >> 5 } + 2;
-            let start = out.len() - (((control & 31) << 8) + bytes.next().unwrap()) - 1;
-            (start..start + length).for_each(|place| out.push(out[place]));
-        }
-    }
-    out
-}
-
 /// A `binary_compressed` PCD with the fields x y z intensity ring timestamp: a scan that ends at `STAMP_NS`.
 fn pcd(path: &str) -> Scan {
     let file = std::fs::read(common::data(path)).unwrap();
@@ -44,7 +29,7 @@ fn pcd(path: &str) -> Scan {
     let text = std::str::from_utf8(&file[..header]).unwrap();
     assert!(text.contains("FIELDS x y z intensity ring timestamp\nSIZE 4 4 4 4 2 8\n"), "{text}");
     let points: usize = text.lines().find_map(|line| line.strip_prefix("POINTS ")).unwrap().parse().unwrap();
-    let columns = lzf(&file[header + 31..]);
+    let columns = unpack_lzf(&file[header + 31..]);
     assert_eq!(columns.len(), points * 26, "{path}");
     let floats = |column: usize| -> Vec<f32> {
         let bytes = &columns[column * 4 * points..(column + 1) * 4 * points];
@@ -67,23 +52,11 @@ fn pcd(path: &str) -> Scan {
     }
 }
 
-/// The `T_top_from_sensor` of a file of OpenCalib's, by its name: sixteen numbers, row by row.
-fn top_from_sensor(json: &str, name: &str) -> Isometry3<f64> {
-    let from = json.find(&format!("\"{name}")).unwrap();
-    let matrix = &json[from + json[from..].find('[').unwrap()..];
-    let numbers = matrix.split(|c: char| "[], \n".contains(c)).filter(|part| !part.is_empty());
-    let m: Vec<f64> = numbers.map_while(|number| number.parse().ok()).take(12).collect();
-    assert_eq!(m.len(), 12, "{name}");
-    let rotation = Matrix3::new(m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]);
-    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
-    Isometry3::from_parts(Translation3::new(m[3], m[7], m[11]), rotation)
-}
-
 fn points(scan: &Scan) -> Vec<[f32; 3]> {
     scan.x.iter().zip(&scan.y).zip(&scan.z).map(|((&x, &y), &z)| [x, y, z]).collect()
 }
 
-/// The map of the first sensor's scan, which comes after the others'.
+/// The map of the first sensor's scan, which arrives after the others.
 fn map(config: &VehicleConfig, scans: &[Scan]) -> (Map, Pipeline) {
     let mut pipeline = Pipeline::new(config, vec![None; config.sensors.len()]).unwrap();
     let mut made = None;
@@ -92,10 +65,10 @@ fn map(config: &VehicleConfig, scans: &[Scan]) -> (Map, Pipeline) {
         let event = Event { sequence: 0, arrival_ns: scan.stamp_ns, source: sensor as u16, body };
         made = pipeline.step(&event).unwrap().cloned();
     }
-    (made.expect("the lead makes a map"), pipeline)
+    (made.expect("the reference sensor makes a map"), pipeline)
 }
 
-/// Cells of a Cartesian layer within so many metres, by class.
+/// Classes of the cells of a Cartesian layer within `reach_m`.
 fn near(layer: &Layer, reach_m: f32) -> Vec<u8> {
     let steps = (reach_m / 0.25) as i32;
     let places = (-steps..steps).flat_map(|i| (-steps..steps).map(move |j| (i, j)));
@@ -105,7 +78,7 @@ fn near(layer: &Layer, reach_m: f32) -> Vec<u8> {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn opencalibs_side_units_show_ground_where_the_top_unit_is_blind() {
+fn opencalibs_side_sensors_show_ground_where_the_top_sensor_is_blind() {
     for (scene, files) in [
         ("0001", ["top.pcd", "left.pcd", "right.pcd"]),
         (
@@ -134,16 +107,15 @@ fn opencalibs_side_units_show_ground_where_the_top_unit_is_blind() {
         let sum: usize = scans.iter().map(|scan| scan.x.len()).sum();
         let returns: u32 = fused.sensors.iter().map(|sensor| sensor.returns).sum();
         assert_eq!(returns as usize, sum, "{scene}");
-        assert!(pipeline.newest_sweep().x.len() * 1000 >= sum * 999, "{scene}: of the vehicle itself there is little");
-        // Terrain's class 1 is flat ground that was seen. The top unit sees none within 3 m, its first ring lies at 5
-        // m.
+        assert!(pipeline.newest_sweep().x.len() * 1000 >= sum * 999, "{scene}: few returns are the vehicle itself");
+        // Class 1 of terrain is flat ground. The top sensor sees none within 3 m: its first ring lies at 5 m.
         let flat = |map: &Map| near(&map.layers[2], 3.0).iter().filter(|class| **class == 1).count();
         println!("{scene}: flat ground seen within 3 m, cells: {} -> {}", flat(&top), flat(&fused));
         assert!(flat(&top) == 0 && flat(&fused) >= 250, "{scene}");
         assert!(newly_drivable(&top, &fused) >= 80, "{scene}");
         if scene == "0001" {
-            the_rail_is_closed(&pipeline);
-            // The top unit alone sees gaps in it and reaches the pavement behind: of its drivable cells, half.
+            check_rail(&pipeline);
+            // The top sensor alone sees gaps in the rail and reaches the pavement behind it.
             let [behind_top, behind] = [&top, &fused].map(|map| drivable(map, [-10.0, 9.0], [-9.0, -6.0]));
             let [lane_top, lane] = [&top, &fused].map(|map| drivable(map, [-10.0, 9.0], [-4.0, 0.0]));
             println!("drivable of the pavement {behind_top} -> {behind}, of the lane {lane_top} -> {lane} cells");
@@ -153,9 +125,9 @@ fn opencalibs_side_units_show_ground_where_the_top_unit_is_blind() {
     }
 }
 
-/// Scene 0001 has a guard rail to the right, between the lane and a pavement 15 cm over it: in every metre along it
-/// something stands 0.4 m or higher.
-fn the_rail_is_closed(pipeline: &Pipeline) {
+/// Checks the guard rail of scene 0001, to the right of the vehicle, between the lane and a pavement 15 cm above it:
+/// every metre of it has a return 0.4 m or higher.
+fn check_rail(pipeline: &Pipeline) {
     let sweep = pipeline.newest_sweep();
     for x_m in -10..9 {
         let x_m = x_m as f32;
@@ -165,7 +137,7 @@ fn the_rail_is_closed(pipeline: &Pipeline) {
     }
 }
 
-/// Cells of 0.25 m between these places that the drivability map calls drivable.
+/// Number of drivable cells of 0.25 m in a rectangle.
 fn drivable(map: &Map, [back, ahead]: [f32; 2], [right, left]: [f32; 2]) -> usize {
     let layer = &map.layers[0];
     let steps = |from: f32, to: f32| (0..((to - from) / 0.25) as i32).map(move |i| from + (i as f32 + 0.5) * 0.25);
@@ -173,7 +145,7 @@ fn drivable(map: &Map, [back, ahead]: [f32; 2], [right, left]: [f32; 2]) -> usiz
     places.filter(|&(x, y)| common::cell_at(layer, x, y).is_some_and(|cell| common::classes(layer)[cell] == 1)).count()
 }
 
-/// Cells of 0.25 m within 8 m that the fused drivability map calls drivable and the first knew nothing of.
+/// Number of cells of 0.25 m within 8 m that are drivable in the fused map and unknown in the first.
 fn newly_drivable(first: &Map, fused: &Map) -> usize {
     let both = near(&first.layers[0], 8.0).into_iter().zip(near(&fused.layers[0], 8.0));
     let new = both.filter(|both| *both == (0, 1)).count();
@@ -187,7 +159,7 @@ fn argoverses_second_vlp32c_shows_ground_where_the_first_is_blind() {
     let drive = "argoverse2/adcf7d18-0510-35b0-a2fa-b4cea13a6d76/sensors/lidar/315973157959879000.feather";
     let scans = argoverse::scans(&std::fs::read(common::data(drive)).unwrap(), 315_973_157_959_879_000);
     assert!(scans.iter().all(|scan| scan.x.len() > 40_000), "{:?}", scans.each_ref().map(|scan| scan.x.len()));
-    // Argoverse gives the points in a frame about the rear axle, 33 cm over the ground.
+    // The points of Argoverse are in the frame of the rear axle, 33 cm over the ground.
     let axle = Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 0.33, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
     let sensors = ["up", "down"].map(|name| SensorConfig::new(name, axle));
     let (fused, pipeline) = map(&VehicleConfig::new("car", sensors.to_vec()), &scans);

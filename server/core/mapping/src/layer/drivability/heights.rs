@@ -1,15 +1,15 @@
-//! Setting up the grid (thesis §IV.1 and §IV.2): each cell's highest point and unit height.
+//! Highest point and unit height of each cell (UT Austin thesis, sections IV.1 and IV.2).
 //!
-//! In: a sweep, ego frame, metres. Out: for each cell the highest point under the overhang cut-off and
+//! In: a sweep, ego frame, metres. Out: for each cell the highest point under the overhang cut-off, and
 //! `unit_height = floor((z + offset) / unit)`.
 
-use crate::config::DrivabilityConfig;
 use crate::layer::radial_grid::RadialGrid;
 use crate::sensor::sweep::Sweep;
 
 use super::class::UNIT_HEIGHT_UNKNOWN;
+use super::config::DrivabilityConfig;
 
-/// A cell as the points fall into it: height and index of its highest point.
+/// Highest point of a cell so far: its height and its index in the sweep.
 #[derive(Clone, Copy, Debug)]
 struct Highest {
     z: f32,
@@ -18,7 +18,7 @@ struct Highest {
 
 const EMPTY: Highest = Highest { z: f32::NEG_INFINITY, point: u32::MAX };
 
-/// Highest point and unit height of every cell.
+/// Highest point and unit height of each cell, in the order of the grid.
 #[derive(Clone, Debug, Default)]
 pub struct Heights {
     highest: Vec<Highest>,
@@ -27,10 +27,11 @@ pub struct Heights {
 }
 
 impl Heights {
-    /// Thesis, "Setting up the radial grid": every point into its cell, those too far or too high dropped.
-    pub fn set_up(&mut self, grid: &RadialGrid, sweep: &Sweep, config: &DrivabilityConfig) {
+    /// Finds the highest point of each cell; points too far or too high are dropped (UT Austin thesis, procedure
+    /// "Setting up the radial grid").
+    pub fn compute(&mut self, grid: &RadialGrid, sweep: &Sweep, config: &DrivabilityConfig) {
         self.highest.clear();
-        // One more row takes the points beyond the grid.
+        // One more row holds the points beyond the grid.
         self.highest.resize(grid.cells() + grid.columns(), EMPTY);
         let highest = &mut self.highest;
         grid.for_each_chunk(sweep, |first, cells| {
@@ -55,18 +56,19 @@ impl Heights {
         }
     }
 
-    /// Unit height of each cell; [`UNIT_HEIGHT_UNKNOWN`] where it is empty.
+    /// Unit height of each cell; [`UNIT_HEIGHT_UNKNOWN`] if the cell is empty.
     pub fn units(&self) -> &[i8] {
         &self.units
     }
 
-    /// Highest point of each cell, ego frame, metres; unspecified where it is empty.
+    /// Highest point (x, y, z) of each cell, ego frame, metres; unspecified if the cell is empty.
     pub fn points(&self) -> &[[f32; 3]] {
         &self.points
     }
 }
 
-/// Thesis, function `adjustHeight`; a tie goes to the larger x, then y, whatever the order of the points.
+/// Keeps the higher point (UT Austin thesis, function `adjustHeight`), of equally high points the one with the larger
+/// x, then y, so that the order of the points does not matter.
 #[inline(always)]
 fn adjust_height(cell: &mut Highest, z: f32, point: usize, sweep: &Sweep) {
     if z > cell.z {
@@ -79,7 +81,7 @@ fn adjust_height(cell: &mut Highest, z: f32, point: usize, sweep: &Sweep) {
     }
 }
 
-/// Height in whole units; what lies deeper or higher than the channel can say is clamped to its ends.
+/// Height in whole units, clamped to the range of the channel.
 pub fn unit_height(z: f32, config: &DrivabilityConfig) -> i8 {
     let units = ((z + config.offset_m) / config.unit_height_m).floor();
     units.clamp(f32::from(UNIT_HEIGHT_UNKNOWN + 1), f32::from(i8::MAX)) as i8

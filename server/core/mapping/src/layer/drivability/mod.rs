@@ -1,25 +1,25 @@
-//! The thesis' drivability map (§IV): which ground the vehicle can get to, on a radial grid.
+//! The layer `drivability` (UT Austin thesis, section IV): which ground the vehicle can get to, on a radial grid.
 //!
-//! In: a [`Sweep`], ego frame, metres. Out: the layer `drivability`. The steps, in the paper's order, each a function:
+//! In: a [`Sweep`], ego frame, metres. Out: the layer. The steps, in the paper's order, each a function:
 //!
 //! | step | thesis | where |
 //! |---|---|---|
-//! | rows and columns, `r_bench` | §IV.1 | [`crate::layer::radial_grid`] |
-//! | highest point and unit height of each cell, overhangs cut off | §IV.1-2 | [`heights`] |
-//! | segments grow from the vehicle | §IV.3 | [`segments`] |
-//! | one plane a segment | §IV.4 | [`planes`] |
-//! | which segments are drivable from one another, breadth first from segment 0 | §IV.5 | [`search`] |
+//! | rows and columns of the grid | section IV.1 | [`crate::layer::radial_grid`] |
+//! | highest point and unit height of each cell, without overhangs | sections IV.1 and IV.2 | [`heights`] |
+//! | segments grow from the vehicle | section IV.3 | [`segments`] |
+//! | one plane for each segment | section IV.4 | [`planes`] |
+//! | which segments are drivable from one another, breadth first from segment 0 | section IV.5 | [`search`] |
 //!
-//! Nothing depends on the order of the points: a cell keeps its highest point, and of equally high ones the one with
-//! the largest x, then y; everything after runs over cells in the order of the grid.
+//! The result does not depend on the order of the points: a cell keeps its highest point, and of equally high points
+//! the one with the largest x, then y; all later steps visit the cells in the order of the grid.
 
 pub mod class;
+pub mod config;
 pub mod heights;
 pub mod planes;
 pub mod search;
 pub mod segments;
 
-use crate::config::DrivabilityConfig;
 use crate::layer::channel::TypedChannel;
 use crate::layer::class::drivable_share;
 use crate::layer::grid::Geometry;
@@ -28,12 +28,13 @@ use crate::layer::radial_grid::RadialGrid;
 use crate::sensor::sweep::Sweep;
 
 use class::{DrivabilityClass, SEGMENT, UNIT_HEIGHT_UNKNOWN};
+use config::DrivabilityConfig;
 use heights::Heights;
 use planes::Planes;
 use search::Search;
 use segments::Segments;
 
-/// Makes the layer from sweep after sweep, reusing its buffers.
+/// Maker of the layer `drivability`. It reuses its buffers from map to map.
 pub struct Drivability {
     config: DrivabilityConfig,
     grid: RadialGrid,
@@ -44,7 +45,7 @@ pub struct Drivability {
 }
 
 impl Drivability {
-    /// Parameters must have passed [`crate::config::MapsConfig::validate`].
+    /// A maker with validated parameters.
     pub fn new(config: &DrivabilityConfig) -> Self {
         Self {
             config: config.clone(),
@@ -57,7 +58,7 @@ impl Drivability {
     }
 
     fn write(&self, layer: &mut Layer) {
-        self.grid.describe(&mut layer.geometry);
+        self.grid.write_geometry(&mut layer.geometry);
         layer.clear_lists();
         let mut unit_height = self.unit_height().reuse(&mut layer.channels);
         let mut segment = SEGMENT.reuse(&mut layer.channels);
@@ -81,7 +82,7 @@ impl Drivability {
         SEGMENT.store(&mut layer.channels, segment);
     }
 
-    /// Height of a cell's highest point, in units of the configured height.
+    /// Channel for the height of a cell's highest point, in units of the configured height.
     fn unit_height(&self) -> TypedChannel<i8> {
         let scale = self.config.unit_height_m;
         TypedChannel { name: "unit_height", unit: "m", scale, unknown: UNIT_HEIGHT_UNKNOWN }
@@ -95,8 +96,8 @@ impl LayerMaker for Drivability {
     }
 
     fn make(&mut self, sweep: &Sweep, _: &Context<'_>, layer: &mut Layer) {
-        self.grid.follow(sweep, self.config.range_m_max, self.config.columns);
-        self.heights.set_up(&self.grid, sweep, &self.config);
+        self.grid.update_rows(sweep, self.config.range_m_max, self.config.columns);
+        self.heights.compute(&self.grid, sweep, &self.config);
         self.segments.grow(&self.grid, &self.heights, &self.config);
         self.planes.fit(&self.heights, &self.segments);
         self.search.run(&self.grid, &self.heights, &self.segments, &self.planes, &self.config);

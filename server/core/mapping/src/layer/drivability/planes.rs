@@ -1,23 +1,24 @@
-//! Plane fitting (thesis §IV.4): z = ax + by + c through the highest points of each segment's cells.
+//! Plane fitting (UT Austin thesis, section IV.4): z = ax + by + c through the highest points of each segment's cells.
 //!
-//! In: highest points and segments. Out: a, b, c of each segment, ego frame. The thesis' normal equations, solved about
-//! the segment's centroid: there the sums of x and y vanish, two unknowns remain, and no digits are lost to the
-//! distance from the origin.
+//! In: highest points and segments. Out: a, b, c of each segment, ego frame, metres. The normal equations of the thesis
+//! are solved relative to the segment's centroid: there the sums of x and y are zero, two unknowns remain, and the
+//! distance from the origin costs no precision.
 
 use super::class::SEGMENT;
 use super::heights::Heights;
 use super::segments::Segments;
 
-/// A plane is not asked of fewer cells.
+/// Least number of cells of a segment with a plane (UT Austin thesis, section IV.4).
 const CELLS_MIN: u32 = 3;
 
-/// One plane a segment.
+/// One plane for each segment.
 #[derive(Clone, Debug, Default)]
 pub struct Planes {
     moments: Vec<Moments>,
     of_segment: Vec<[f64; 3]>,
 }
 
+/// Sums over the cells of one segment, relative to its centroid.
 #[derive(Clone, Copy, Debug, Default)]
 struct Moments {
     cells: u32,
@@ -30,7 +31,7 @@ struct Moments {
 }
 
 impl Planes {
-    /// Fits all segments but the last, unreachable one.
+    /// Fits a plane to each segment except the last, unreachable one.
     pub fn fit(&mut self, heights: &Heights, segments: &Segments) {
         let unreachable = usize::from(segments.unreachable());
         self.moments.clear();
@@ -55,12 +56,12 @@ impl Planes {
         self.of_segment.push([0.0; 3]);
     }
 
-    /// a, b, c by segment; zeros for a segment of fewer than three cells, and for the unreachable one.
+    /// a, b, c by segment; zeros for a segment of fewer than three cells, and for the unreachable segment.
     pub fn of_segment(&self) -> &[[f64; 3]] {
         &self.of_segment
     }
 
-    /// Cells of a segment.
+    /// Number of cells of a segment.
     pub fn cells(&self, segment: u16) -> u32 {
         self.moments[usize::from(segment)].cells
     }
@@ -88,8 +89,8 @@ impl Moments {
                 (self.yz * self.xx - self.xz * self.xy) / determinant,
             )
         } else if trace > 0.0 {
-            // Cells in a line, a thousand times longer than wide, tell the slope along it and nothing across: the
-            // solution of least slope.
+            // Cells in a line, a thousand times longer than wide, determine the slope along the line only: of all
+            // solutions this is the one of least slope.
             let scale = 1.0 / (trace * trace);
             ((self.xx * self.xz + self.xy * self.yz) * scale, (self.xy * self.xz + self.yy * self.yz) * scale)
         } else {

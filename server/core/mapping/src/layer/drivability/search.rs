@@ -1,22 +1,25 @@
-//! Local drivability map construction (thesis §IV.5): the three criteria between segments, then breadth first from
-//! segment 0.
+//! Local drivability map construction (UT Austin thesis, section IV.5): the three criteria between segments, then a
+//! breadth-first search from segment 0.
 //!
 //! In: highest points, segments, planes. Out: which segments the vehicle can get to. Two segments are drivable from one
-//! another when they share a contiguous boundary, at least `gate_m_min` wide, on which (1) their boundary cells are
-//! level and (2) the plane of one, carried to the boundary cells of the other, is off by at most `plane_error_m_max`.
+//! another if they share a contiguous boundary, at least `passage_m_min` wide, on which (1) their boundary cells are
+//! level and (2) the plane of one misses the boundary cells of the other by at most `plane_error_m_max`.
 //!
-//! The reading of (1): the thesis compares unit heights, and one unit apart may be 0.5 m apart. Cut into units, a low
-//! wall at 20 m whose foot rises from grass became ground (14 of 9,886 drivable cells of the labelled frame held an
-//! obstacle, 1 of 9,865 with this reading). So the highest points of boundary cells may differ by no more than a step
-//! the vehicle takes, `step_m_max`, or by what a slope of `grade_max` makes of the distance between them, which matters
-//! where rings lie metres apart. A step of two units is the thesis' own criterion.
+//! Where this differs from the thesis:
+//! - Criterion 1: the thesis compares unit heights, and heights one unit apart may differ by almost 0.5 m. In unit
+//!   heights, a low wall at 20 m whose foot rises from grass became ground (14 of 9,886 drivable cells of the labelled
+//!   frame contained an obstacle; with this criterion 1 of 9,865). Therefore the highest points of boundary cells may
+//!   differ by at most `step_m_max`, or by a slope of `grade_max` over the distance between them, which matters where
+//!   rings lie metres apart. A step of two units is the criterion of the thesis.
+//! - Criterion 2: the thesis judges all boundary cells of a pair of segments together. Here each side shared by two
+//!   cells is judged by itself, with the plane of the larger segment; no parameter restores the thesis.
 
 use std::collections::VecDeque;
 
-use crate::config::{DrivabilityConfig, Gate};
 use crate::layer::radial_grid::RadialGrid;
 
 use super::class::SEGMENT;
+use super::config::{DrivabilityConfig, Passage};
 use super::heights::Heights;
 use super::planes::Planes;
 use super::segments::{Segments, counter_clockwise, is_step, outward};
@@ -25,24 +28,26 @@ use super::segments::{Segments, counter_clockwise, is_step, outward};
 #[derive(Clone, Debug, Default)]
 pub struct Search {
     sides: Vec<Side>,
-    /// For each corner of the grid, the crossing under test that touched it last and the side that did.
+    /// By corner of the grid: number of the last boundary that touched it, and the side that touched it.
     corners: Vec<(u32, u32)>,
-    crossings: u32,
-    /// For each side of the crossing under test an earlier one of its group, or itself; and the group's width, metres.
+    /// Number of boundaries tested so far.
+    boundaries: u32,
+    /// By side of the boundary under test: an earlier side of the same contiguous group, or the side itself.
     group: Vec<u32>,
+    /// By side of the boundary under test: width of its group, metres, if the side is the group's first.
     widths: Vec<f32>,
     drivable: Vec<bool>,
     queue: VecDeque<u16>,
 }
 
-/// A side shared by two cells of different segments, on which criteria 1 and 2 hold; listed once for each segment.
+/// A side shared by two cells of different segments that meets criteria 1 and 2; listed once for each segment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Side {
     segment: u16,
     neighbor: u16,
-    /// The cell nearer to the vehicle, or clockwise, whichever segment it is of.
+    /// The cell inward or clockwise of the side, of either segment.
     cell: u32,
-    /// The cell outward, or counter-clockwise.
+    /// The cell outward or counter-clockwise of the side.
     other: u32,
 }
 
@@ -60,7 +65,7 @@ impl Search {
         self.search(grid, usize::from(segments.unreachable()), config);
     }
 
-    /// By segment, the unreachable one included (never).
+    /// True by segment if the vehicle can get there; false for the unreachable segment.
     pub fn drivable(&self) -> &[bool] {
         &self.drivable
     }
@@ -84,7 +89,7 @@ impl Search {
                 let (a, b) = (of_cell[cell], of_cell[other]);
                 if a != b
                     && is_step(grid, heights, config, cell, other)
-                    && is_taken(heights, config, cell, other)
+                    && is_level(heights, config, cell, other)
                     && planes_agree(planes, heights, config, (a, cell), (b, other))
                 {
                     let (cell, other) = (cell as u32, other as u32);
@@ -96,11 +101,11 @@ impl Search {
         self.sides.sort_unstable();
     }
 
-    /// Thesis, steps 1 and 2: breadth first from segment 0.
+    /// Searches breadth first from segment 0 (UT Austin thesis, section IV.5, steps 1 and 2).
     fn search(&mut self, grid: &RadialGrid, segments: usize, config: &DrivabilityConfig) {
         self.corners.clear();
         self.corners.resize((grid.rows() + 1) * grid.columns(), (0, 0));
-        self.crossings = 0;
+        self.boundaries = 0;
         self.drivable.clear();
         self.drivable.resize(segments + 1, false);
         self.queue.clear();
@@ -113,7 +118,7 @@ impl Search {
             while let Some(side) = self.sides[sides.clone()].first() {
                 let neighbor = side.neighbor;
                 sides.start += self.sides[sides.clone()].partition_point(|side| side.neighbor == neighbor);
-                if !self.drivable[usize::from(neighbor)] && self.is_gate(grid, config, segment, neighbor) {
+                if !self.drivable[usize::from(neighbor)] && self.is_passage(grid, config, segment, neighbor) {
                     self.drivable[usize::from(neighbor)] = true;
                     self.queue.push_back(neighbor);
                 }
@@ -126,51 +131,52 @@ impl Search {
         start..start + self.sides[start..].partition_point(|side| side.segment == segment)
     }
 
-    /// Criterion 3: the sides between `segment`, drivable, and `neighbor`, not yet, hold a contiguous piece at least a
-    /// gate wide. Unless the thesis' own reading is asked for, sides with all ground found drivable so far count alike:
-    /// where the ground crosses from unit to unit along a ring, noise frays it into pieces, and none of their borders
-    /// alone is wide enough although a vehicle notices nothing.
-    fn is_gate(&mut self, grid: &RadialGrid, config: &DrivabilityConfig, segment: u16, neighbor: u16) -> bool {
+    /// Criterion 3: true if the sides between `segment`, which is drivable, and `neighbor`, which is not yet, contain a
+    /// contiguous piece at least `passage_m_min` wide. With [`Passage::ToDrivableGround`] the sides between `neighbor`
+    /// and all ground found drivable so far count: where the ground changes from one unit to the next along a ring,
+    /// noise divides it into small segments, and none of their boundaries alone is wide enough.
+    fn is_passage(&mut self, grid: &RadialGrid, config: &DrivabilityConfig, segment: u16, neighbor: u16) -> bool {
         let boundary = self.sides_of(neighbor);
-        self.crossings += 1;
+        self.boundaries += 1;
         self.group.clear();
         self.group.extend(0..boundary.len() as u32);
         self.widths.clear();
         self.widths.resize(boundary.len(), 0.0);
         let drivable = &self.drivable;
-        let counts = |side: &Side| match config.gate {
-            Gate::BetweenSegments => side.neighbor == segment,
-            Gate::ToDrivableGround => drivable[usize::from(side.neighbor)],
+        let counts = |side: &Side| match config.passage {
+            Passage::BetweenSegments => side.neighbor == segment,
+            Passage::ToDrivableGround => drivable[usize::from(side.neighbor)],
         };
         let sides = &self.sides[boundary];
         for (index, side) in (0..).zip(sides).filter(|(_, side)| counts(side)) {
             for corner in corners(grid, side) {
-                let (crossing, held) = self.corners[corner];
-                if crossing == self.crossings {
-                    join(&mut self.group, held, index);
+                let (boundary_of_corner, touched_by) = self.corners[corner];
+                if boundary_of_corner == self.boundaries {
+                    join(&mut self.group, touched_by, index);
                 }
-                self.corners[corner] = (self.crossings, index);
+                self.corners[corner] = (self.boundaries, index);
             }
         }
-        // A gate of no width still needs a side.
+        // A passage of width 0 still needs a side.
         let mut widest = f32::NEG_INFINITY;
         for (index, side) in (0..).zip(sides).filter(|(_, side)| counts(side)) {
             let width = &mut self.widths[find(&mut self.group, index) as usize];
             *width += width_m(grid, side);
             widest = widest.max(*width);
         }
-        widest >= config.gate_m_min
+        widest >= config.passage_m_min
     }
 }
 
-/// Criterion 1, in metres: the highest points of boundary cells differ by a step or a slope the vehicle takes.
-fn is_taken(heights: &Heights, config: &DrivabilityConfig, cell: usize, other: usize) -> bool {
+/// Criterion 1: true if the highest points of two boundary cells differ by a step or a slope that the vehicle can drive
+/// over.
+fn is_level(heights: &Heights, config: &DrivabilityConfig, cell: usize, other: usize) -> bool {
     let ([xa, ya, za], [xb, yb, zb]) = (heights.points()[cell], heights.points()[other]);
     let distance = ((xa - xb) * (xa - xb) + (ya - yb) * (ya - yb)).sqrt();
     (za - zb).abs() <= config.step_m_max.max(config.grade_max * distance)
 }
 
-/// Criterion 2: the plane of the larger segment, carried to the boundary cell of the other, is off by little.
+/// Criterion 2: true if the plane of the larger segment misses the boundary cell of the other one by little.
 fn planes_agree(
     planes: &Planes,
     heights: &Heights,
@@ -178,15 +184,15 @@ fn planes_agree(
     a: (u16, usize),
     b: (u16, usize),
 ) -> bool {
-    // The larger segment's plane is the better known one; a plane through a handful of cells says little beyond them.
+    // The plane of the larger segment is better determined; a plane through a few cells says little beyond them.
     let ((segment, _), (_, cell)) = if planes.cells(a.0) >= planes.cells(b.0) { (a, b) } else { (b, a) };
     let [x, y, z] = heights.points()[cell].map(f64::from);
     let [pa, pb, pc] = planes.of_segment()[usize::from(segment)];
     (pa * x + pb * y + pc - z).abs() <= f64::from(config.plane_error_m_max)
 }
 
-/// Corners of the grid that a side touches; corner (row, column) is the inner clockwise one of cell (row, column). A
-/// side across empty rows touches the corners of all of them.
+/// Corners of the grid that a side touches. Corner (row, column) is the inner clockwise corner of cell (row, column). A
+/// side across empty rows touches the corners of all those rows.
 fn corners(grid: &RadialGrid, side: &Side) -> impl Iterator<Item = usize> {
     let columns = grid.columns();
     let (cell, other) = (side.cell as usize, side.other as usize);
@@ -198,7 +204,7 @@ fn corners(grid: &RadialGrid, side: &Side) -> impl Iterator<Item = usize> {
     (first..=last).flat_map(move |row| [row * columns + left, row * columns + right])
 }
 
-/// Width of a side, metres: the arc between two rows, or the depth of a row between two columns.
+/// Width of a side, metres: the length of the arc between two rows, or the depth of the row between two columns.
 fn width_m(grid: &RadialGrid, side: &Side) -> f32 {
     let columns = grid.columns();
     let (row, other_row) = (side.cell as usize / columns, side.other as usize / columns);
@@ -206,6 +212,7 @@ fn width_m(grid: &RadialGrid, side: &Side) -> f32 {
     if row == other_row { outer - inner } else { outer * std::f32::consts::TAU / columns as f32 }
 }
 
+/// The first side of a side's group.
 fn find(group: &mut [u32], mut side: u32) -> u32 {
     while group[side as usize] != side {
         group[side as usize] = group[group[side as usize] as usize];
@@ -214,8 +221,9 @@ fn find(group: &mut [u32], mut side: u32) -> u32 {
     side
 }
 
+/// Joins the groups of two sides.
 fn join(group: &mut [u32], a: u32, b: u32) {
     let (a, b) = (find(group, a), find(group, b));
-    // The earlier side leads, so that groups do not depend on the order of joining.
+    // The earlier side is the first one, so that groups do not depend on the order of joining.
     group[a.max(b) as usize] = a.min(b);
 }

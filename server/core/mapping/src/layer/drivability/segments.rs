@@ -1,27 +1,29 @@
-//! Segmenting (thesis §IV.3): sets of adjacent cells of one unit height, grown from the vehicle.
+//! Segmenting (UT Austin thesis, section IV.3): sets of adjacent cells of one unit height, grown from the vehicle.
 //!
-//! In: unit heights. Out: the segment of every cell, counted from 0 (under the vehicle) in the order they were found;
-//! the last is reserved for cells with points that were never reached. Written with a list instead of the thesis'
-//! recursion.
+//! In: unit heights. Out: the segment of each cell, counted from 0 (under the vehicle) in the order the segments were
+//! found. The last segment is reserved for cells with points that were not reached. A list replaces the recursion of
+//! the thesis.
 
 use std::collections::VecDeque;
 
-use crate::config::{DrivabilityConfig, Seed};
 use crate::layer::radial_grid::RadialGrid;
 
 use super::class::{SEGMENT, UNIT_HEIGHT_UNKNOWN};
+use super::config::{DrivabilityConfig, Seed};
 use super::heights::{Heights, unit_height};
 
-/// Cells with points that no segment has taken yet.
+/// Mark of a cell with points that belongs to no segment yet.
 const UNREACHED: u16 = u16::MAX - 1;
 
-/// The segment of every cell.
+/// The segment of each cell, in the order of the grid.
 #[derive(Clone, Debug, Default)]
 pub struct Segments {
     of_cell: Vec<u16>,
     unreachable: u16,
     seeds: Vec<u32>,
+    /// Cells one unit higher or lower than a segment, from which further segments start.
     neighbor_list: VecDeque<u32>,
+    /// Cells of the current segment whose neighbours are still to be visited.
     growing: Vec<u32>,
 }
 
@@ -51,7 +53,8 @@ impl Segments {
             current_segment += 1;
         }
         while let Some(cell) = self.neighbor_list.pop_front() {
-            // One id stays free for the unreachable segment; a grid of noise with more segments keeps the rest there.
+            // One id stays free for the unreachable segment. If a grid of noise has more segments, the rest of its
+            // cells become unreachable.
             if self.of_cell[cell as usize] == UNREACHED && current_segment < UNREACHED - 1 {
                 self.of_cell[cell as usize] = current_segment;
                 self.growing.push(cell);
@@ -68,7 +71,7 @@ impl Segments {
         }
     }
 
-    /// Thesis, procedure "recursive segmenting", from the cells in `growing`.
+    /// Grows one segment from the cells in `growing` (UT Austin thesis, procedure "recursive segmenting").
     fn grow_segment(&mut self, grid: &RadialGrid, heights: &Heights, config: &DrivabilityConfig, current_segment: u16) {
         let units = heights.units();
         while let Some(cell) = self.growing.pop() {
@@ -90,20 +93,20 @@ impl Segments {
         }
     }
 
-    /// Segment of each cell; [`SEGMENT`]`.unknown` where it is empty.
+    /// Segment of each cell; [`SEGMENT`]`.unknown` if the cell is empty.
     pub fn of_cell(&self) -> &[u16] {
         &self.of_cell
     }
 
-    /// The last segment: cells with points that were never reached.
+    /// The last segment: cells with points that were not reached.
     pub fn unreachable(&self) -> u16 {
         self.unreachable
     }
 }
 
-/// Whether two adjacent cells differ by at most one unit; across empty rows by one for each row, if the ground between
-/// them can be a slope of `grade_max`: on a hill the rings lie metres apart, and the cells that would have shown the
-/// units between are the empty ones.
+/// True if two adjacent cells differ by at most one unit, or across empty rows by at most one unit for each row, if the
+/// ground between them can be a slope of `grade_max`. On a hill the rings lie metres apart, and the cells with the unit
+/// heights between them are empty.
 pub fn is_step(grid: &RadialGrid, heights: &Heights, config: &DrivabilityConfig, cell: usize, other: usize) -> bool {
     let apart = usize::from(heights.units()[cell].abs_diff(heights.units()[other]));
     let rows = (cell / grid.columns()).abs_diff(other / grid.columns());
@@ -112,10 +115,10 @@ pub fn is_step(grid: &RadialGrid, heights: &Heights, config: &DrivabilityConfig,
     apart <= 1 || (apart <= rows && (za - zb).abs() <= config.grade_max * distance)
 }
 
-/// Cells where segments start, in the order of the columns.
+/// Finds the cells where segments start, in the order of the columns.
 ///
-/// The thesis starts at cell (0, 0). On real scans row 0 holds points in few columns, often in none, so every column
-/// offers its innermost cell within the blind zone: the ground between is hidden by the vehicle that stands on it.
+/// The thesis starts at cell (0, 0). On real scans row 0 has points in few columns, often in none. Therefore each
+/// column contributes its innermost cell within the blind zone: the vehicle itself hides the ground before it.
 fn find_seeds(grid: &RadialGrid, units: &[i8], config: &DrivabilityConfig, seeds: &mut Vec<u32>) {
     let under_the_vehicle = unit_height(0.0, config);
     let known = |cell: &usize| units[*cell] != UNIT_HEIGHT_UNKNOWN;
@@ -130,26 +133,26 @@ fn find_seeds(grid: &RadialGrid, units: &[i8], config: &DrivabilityConfig, seeds
     }
 }
 
-/// Unit height of segment 0: the one most seeds have; of equally frequent ones the nearest to the ground under the
-/// vehicle, then the lower.
+/// Unit height of segment 0: the unit height of most seeds. Of equally frequent ones, the nearest to the ground under
+/// the vehicle, then the lower, is chosen.
 fn ground_unit(seeds: &[u32], units: &[i8], config: &DrivabilityConfig) -> Option<i8> {
     if config.seed == Seed::FirstCell {
         return seeds.first().map(|seed| units[*seed as usize]);
     }
     let under_the_vehicle = unit_height(0.0, config);
     let votes = |unit: i8| seeds.iter().filter(|seed| units[**seed as usize] == unit).count();
-    // The last of equals wins, so they are listed from the least wanted on.
+    // `max_by_key` returns the last of equals, so the preferred unit is listed last.
     let units = [1, -1, 0].map(|step| under_the_vehicle.saturating_add(step));
     units.into_iter().filter(|unit| votes(*unit) > 0).max_by_key(|unit| votes(*unit))
 }
 
-/// The up to eight cells next to `cell` that hold points: inward, outward, clockwise, counter-clockwise, and across the
-/// corners where a ring slips from row to row.
+/// The up to eight cells with points next to `cell`: inward, outward, clockwise, counter-clockwise, and across the
+/// corners where a ring changes from one row to the next.
 ///
-/// Slopes stretch rings apart and leave rows empty, so inward and outward reach across up to `bridge_rows` of them; and
-/// a ring that climbs crosses from a row to the next between two columns, where it is the same ring although its cells
-/// share a corner only. That is so when the other two cells at the corner are empty. Nothing else is bridged between
-/// columns: a revolution leaves no gap there that is not a blocked view or a lost packet.
+/// Slopes stretch rings apart and leave rows empty, so that the neighbours inward and outward may lie across up to
+/// `bridge_rows` empty rows. A ring on a slope crosses from one row to the next between two columns: its two cells then
+/// share only a corner, and the other two cells at the corner are empty. Gaps between columns are not bridged, because
+/// there they are blocked views or lost packets.
 fn adjacent(grid: &RadialGrid, units: &[i8], bridge_rows: u8, cell: usize) -> [Option<usize>; 8] {
     let columns = grid.columns();
     let row = cell / columns;
@@ -172,12 +175,13 @@ fn adjacent(grid: &RadialGrid, units: &[i8], bridge_rows: u8, cell: usize) -> [O
     adjacent.map(|adjacent| adjacent.filter(known))
 }
 
-/// Whether a cell lies between two higher ones: opposite neighbours, corners included, both more than a unit above it.
+/// True if a cell lies between two higher ones: opposite neighbours, corners included, that are both more than one unit
+/// above it.
 ///
-/// Fences are seen through their slats, and a wall seen edge-on falls between two rays; so a barrier has holes one cell
-/// wide, and through one of them the ground behind would join the ground before. A column is never wider than a vehicle
-/// within 60 m, so nothing that could be driven through is closed sideways; what is lost is the ground between two
-/// things one row apart, most of which the nearer one hides anyway.
+/// The sensor sees through the slats of a fence, and a thin wall can fall between two rays. So a barrier has holes one
+/// cell wide, which would join the ground behind it to the ground before it. Within 60 m a column is narrower than a
+/// vehicle, so that no gap a vehicle fits through is closed sideways. The ground between two objects one row apart is
+/// lost; the nearer object hides most of it anyway.
 fn is_gap(grid: &RadialGrid, units: &[i8], cell: usize) -> bool {
     let columns = grid.columns();
     let higher = |other: usize| units.get(other).is_some_and(|unit| i16::from(*unit) > i16::from(units[cell]) + 1);
@@ -185,14 +189,14 @@ fn is_gap(grid: &RadialGrid, units: &[i8], cell: usize) -> bool {
     if higher(left) && higher(right) {
         return true;
     }
-    // Before the first row there is no cell, and after the last none that `get` finds.
+    // Before the first row there is no cell; after the last row `get` finds none.
     cell >= columns
         && [(cell, cell), (left, right), (right, left)]
             .iter()
             .any(|(inner, outer)| higher(inner - columns) && higher(outer + columns))
 }
 
-/// The next cell outward that holds points, across up to `bridge_rows` empty ones.
+/// The next cell outward with points, across up to `bridge_rows` empty rows.
 pub fn outward(grid: &RadialGrid, units: &[i8], bridge_rows: u8, cell: usize) -> Option<usize> {
     let across = (1..=usize::from(bridge_rows) + 1).map(|step| cell + step * grid.columns());
     across.take_while(|cell| *cell < units.len()).find(|cell| units[*cell] != UNIT_HEIGHT_UNKNOWN)

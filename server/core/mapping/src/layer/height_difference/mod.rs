@@ -1,12 +1,12 @@
-//! The thesis' baseline (§V), on the same r-θ grid: a cell whose highest and lowest points differ by more than a
-//! threshold is an obstacle.
+//! The layer `height_difference` (UT Austin thesis, section V), the baseline of the thesis on the same r-θ grid: a cell
+//! is an obstacle if the heights of its highest and lowest points differ by more than a threshold.
 //!
-//! In: a [`Sweep`], ego frame, metres. Out: the layer `height_difference`. Kept for comparison: it takes a steep road,
-//! or one under branches, for an obstacle, and calls ground behind a fence drivable, as the thesis shows.
+//! In: a [`Sweep`], ego frame, metres. Out: the layer. It serves for comparison: it calls a steep road, or one under
+//! branches, an obstacle, and calls ground behind a fence drivable, as the thesis shows.
 
 pub mod class;
+pub mod config;
 
-use crate::config::HeightDifferenceConfig;
 use crate::layer::channel::TypedChannel;
 use crate::layer::class::drivable_share;
 use crate::layer::grid::Geometry;
@@ -15,17 +15,18 @@ use crate::layer::radial_grid::RadialGrid;
 use crate::sensor::sweep::Sweep;
 
 use class::{DIFFERENCE, HeightDifferenceClass};
+use config::HeightDifferenceConfig;
 
-/// Makes the layer from sweep after sweep, reusing its buffers.
+/// Maker of the layer `height_difference`. It reuses its buffers from map to map.
 pub struct HeightDifference {
     config: HeightDifferenceConfig,
     grid: RadialGrid,
-    /// Highest and lowest z of each cell, and of one more row for points beyond the grid.
+    /// Highest and lowest z of each cell, metres, and of one more row for points beyond the grid.
     span: Vec<[f32; 2]>,
 }
 
 impl HeightDifference {
-    /// Parameters must have passed [`crate::config::MapsConfig::validate`].
+    /// A maker with validated parameters.
     pub fn new(config: &HeightDifferenceConfig) -> Self {
         Self { config: config.clone(), grid: RadialGrid::default(), span: Vec::new() }
     }
@@ -39,7 +40,7 @@ impl LayerMaker for HeightDifference {
     }
 
     fn make(&mut self, sweep: &Sweep, _: &Context<'_>, layer: &mut Layer) {
-        self.grid.follow(sweep, self.config.range_m_max, self.config.columns);
+        self.grid.update_rows(sweep, self.config.range_m_max, self.config.columns);
         self.span.clear();
         self.span.resize(self.grid.cells() + self.grid.columns(), [f32::NEG_INFINITY, f32::INFINITY]);
         let span = &mut self.span;
@@ -51,7 +52,7 @@ impl LayerMaker for HeightDifference {
             }
         });
 
-        self.grid.describe(&mut layer.geometry);
+        self.grid.write_geometry(&mut layer.geometry);
         layer.clear_lists();
         let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
         let mut difference = DIFFERENCE.reuse(&mut layer.channels);

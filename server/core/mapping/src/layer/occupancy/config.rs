@@ -2,45 +2,49 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::check::{ConfigValueError, check_each, check_fits};
+use crate::config::check::{ConfigValueError, check_cells, check_each, check_fits};
 
-/// Parameters of [`crate::layer::occupancy`].
+/// Parameters of the layer `occupancy`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct OccupancyConfig {
-    /// Whether the map is made.
+    /// True if the layer is made.
     pub enabled: bool,
-    /// The grid reaches this far to each side of the vehicle.
+    /// Distance from the vehicle to each edge of the grid, metres. 50: Seo 2014, section 2 (a map of 100 m).
     pub extent_m: f32,
-    /// Side of a cell.
+    /// Side of a cell, metres. 0.25: Seo 2014, section 2.
     pub cell_m: f32,
-    /// Returns lower than this over the ground are the ground's: the vehicle passes over them.
+    /// Least height of an obstacle over the ground, metres; the vehicle drives over lower ones. 0.3 is ours, because
+    /// the paper says "ego-vehicle's clearance" without a number; not tuned.
     pub clearance_m: f32,
-    /// Returns from here on up are not counted: the vehicle passes under them.
+    /// Least height of a return that is not counted, metres; the vehicle passes under it. 5: Seo 2014, section 2.
     pub overhang_m: f32,
-    /// A ray proves a cell clear where it is at least as high as this over it: it could be under a car's body, if
-    /// lower.
+    /// Least height at which a ray proves a cell clear, metres: a lower ray could pass under a car. 0.2 is ours; not
+    /// tuned.
     pub clear_height_m_min: f32,
-    /// And no higher than this: what is lower than the ray stays unnoticed.
+    /// Largest height at which a ray proves a cell clear, metres: a higher ray misses low obstacles. 0.5 is ours, the
+    /// height of a bumper; not tuned.
     pub clear_height_m_max: f32,
-    /// Reliable range of the sensors (§2: 150 m); farther cells are out of range.
+    /// Reliable range of the sensors, metres; cells beyond it are out of range. 150: Seo 2014, section 2.
     pub range_m_max: f32,
-    /// Rays that came back with nothing clear as far as this; 0: they prove nothing.
+    /// Range to which a ray without a return clears cells, metres; 0: such rays prove nothing. 0 is ours, because a
+    /// ray may also be lost on a dark or wet surface.
     pub no_return_m: f32,
-    /// Up to this speed it takes `hits_slow` returns to make a cell occupied (figure 5).
+    /// Speed up to which `hits_slow` returns make a cell occupied, m/s. 4.4 (10 mph): Seo 2014, figure 5.
     pub speed_mps_slow: f32,
-    /// From this speed on it takes `hits_fast`; between the two, in proportion.
+    /// Speed from which `hits_fast` returns do, m/s; the number is linear between the two speeds. 26.8 (60 mph): Seo
+    /// 2014, figure 5.
     pub speed_mps_fast: f32,
-    /// Returns at low speed.
+    /// Number of returns at low speed. 20: Seo 2014, figure 5.
     pub hits_slow: u8,
-    /// Returns at high speed, and where the speed is not known.
+    /// Number of returns at high speed, and if the speed is not known. 2: Seo 2014, figure 5.
     pub hits_fast: u8,
-    /// Maps for which a cell stays occupied that nobody sees.
+    /// Number of maps for which an occupied cell without new evidence stays occupied. 2 is ours, so that nothing is
+    /// left of an object three maps after it has gone; not tuned.
     pub hold_maps: u8,
 }
 
 impl Default for OccupancyConfig {
-    /// The paper's 10 and 60 mph with 20 and 2 returns. Three maps after a thing has gone nothing is left of it.
     fn default() -> Self {
         Self {
             enabled: true,
@@ -62,6 +66,10 @@ impl Default for OccupancyConfig {
 }
 
 impl OccupancyConfig {
+    /// Checks the values of the table `at`, and how they fit one another.
+    ///
+    /// # Errors
+    /// [`ConfigValueError`] for the first value that is not allowed.
     pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
         let values = [
             ("extent_m", self.extent_m, (5.0..=100.0, "5 to 100")),
@@ -74,7 +82,7 @@ impl OccupancyConfig {
             ("no_return_m", self.no_return_m, (0.0..=300.0, "0 to 300")),
             ("speed_mps_slow", self.speed_mps_slow, (0.0..=100.0, "0 to 100")),
             ("speed_mps_fast", self.speed_mps_fast, (0.1..=100.0, "0.1 to 100")),
-            // A cell no return can make occupied would be a cell no return can keep from being clear.
+            // If no return were needed, a cell could be occupied without one.
             ("hits_slow", self.hits_slow.into(), (1.0..=255.0, "1 to 255")),
             ("hits_fast", self.hits_fast.into(), (1.0..=255.0, "1 to 255")),
             ("hold_maps", self.hold_maps.into(), (0.0..=100.0, "0 to 100")),
@@ -87,6 +95,6 @@ impl OccupancyConfig {
         check_fits(at, "clear_height_m_min", self.clear_height_m_min, lower, "less than clearance_m")?;
         let faster = self.speed_mps_fast > self.speed_mps_slow;
         check_fits(at, "speed_mps_fast", self.speed_mps_fast, faster, "more than speed_mps_slow")?;
-        crate::config::check::check_cells(at, self.extent_m, self.cell_m)
+        check_cells(at, self.extent_m, self.cell_m)
     }
 }

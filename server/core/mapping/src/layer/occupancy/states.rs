@@ -1,86 +1,88 @@
-//! The life of a cell (Seo 2014, figure 4): which state follows from the state it had and what one map's rays tell of
-//! it.
+//! State transitions of a cell (Seo 2014, figure 4): the next state follows from the last state and the evidence since
+//! the last map.
 //!
-//! In: a [`Cell`] and its [`Evidence`] since the last map. Out: the cell as it is published.
+//! In: a [`Cell`] and its [`Evidence`]. Out: the cell as it is published.
 
 use super::class::OccupancyClass::{self, Clear, Occluded, Occupied, OutOfRange, Unknown};
 
-/// Told of a cell: a sensor looks there, over it or through it.
+/// Evidence bit of a cell: rays of a sensor pass over it or through it.
 pub const LOOKED_AT: u8 = 1;
-/// Told of a cell: low rays of a sensor's newest scan go through it.
+/// Evidence bit of a cell: low rays of a sensor's newest scan pass through it.
 pub const THROUGH: u8 = 2;
-/// Told of a cell: something hides it from a sensor.
+/// Evidence bit of a cell: something hides it from a sensor.
 pub const HIDDEN: u8 = 4;
 
-/// What the rays since the last map tell of one cell; the stronger comes later and wins.
+/// Evidence about one cell since the last map, weakest first; the strongest counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Evidence {
-    /// No sensor has sent anything.
+    /// No sensor sent a scan.
     Silence,
-    /// Sensors have, but none looks here.
+    /// Sensors sent scans, but no ray passes here.
     Nothing,
-    /// Rays went by overhead only.
+    /// Rays passed only overhead.
     Overhead,
-    /// Behind something.
+    /// Something nearer to the sensor hides the cell.
     Hidden,
-    /// Low rays went through, and none came back from here.
+    /// Low rays passed through, and no return came from here.
     Through,
-    /// The same, but earlier returns from here are not yet outweighed.
+    /// The same, but earlier returns from here still count.
     ThroughDoubted,
-    /// Returns, with those before fewer than it takes; where the cell is hidden as well, that says more.
+    /// Some hits, but fewer than the threshold; occlusion takes precedence.
     FewHits,
-    /// Returns, with those before as many as it takes.
+    /// As many hits as the threshold, together with earlier ones.
     Hits,
 }
 
-/// The strongest of what was told of a cell; `any`: whether any sensor sent anything.
-pub fn evidence(told: u8, any: bool) -> Evidence {
-    match told {
-        told if told & THROUGH != 0 => Evidence::Through,
-        told if told & HIDDEN != 0 => Evidence::Hidden,
-        told if told & LOOKED_AT != 0 => Evidence::Overhead,
+/// The strongest evidence in a cell's bits; `any` is true if any sensor sent a scan.
+pub fn evidence(bits: u8, any: bool) -> Evidence {
+    match bits {
+        bits if bits & THROUGH != 0 => Evidence::Through,
+        bits if bits & HIDDEN != 0 => Evidence::Hidden,
+        bits if bits & LOOKED_AT != 0 => Evidence::Overhead,
         _ if any => Evidence::Nothing,
         _ => Evidence::Silence,
     }
 }
 
-/// What follows.
+/// Next state of a cell.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next {
-    /// This state, now.
+    /// This state, immediately.
     Go(OccupancyClass),
-    /// The state it has, until it has not been confirmed for longer than `hold_maps`; then this one.
+    /// The last state, until no evidence has confirmed it for more than `hold_maps` maps; then this state.
     Hold(OccupancyClass),
 }
 
 use Next::{Go, Hold};
 
-/// `TRANSITIONS[whether the cell is occupied][evidence]`.
+/// Next state by last state and evidence: `TRANSITIONS[last state is occupied][evidence]`.
 ///
-/// Figure 4 says that a cell is first unobserved, and then occupied or occluded as sensors look; here every arrow is
-/// named. A cell loses its name the moment nobody confirms it; only an occupied one keeps its name for a few maps,
-/// because what hides it, or a sensor's pause, does not make it go away.
+/// Figure 4 of the paper shows that a cell is first unobserved, and then occupied or occluded; this table defines each
+/// transition. A cell loses its state as soon as no evidence confirms it. Only an occupied cell keeps its state for a
+/// few maps, because an occlusion or a pause of a sensor does not remove the object.
 #[rustfmt::skip]
 pub const TRANSITIONS: [[Next; 8]; 2] = [
-    // Silence       Nothing             Overhead       Hidden          Through    ThroughDoubted FewHits      Hits
-    [Go(Unknown),   Go(OutOfRange),   Go(Unknown),   Go(Occluded),   Go(Clear), Go(Unknown),   Go(Unknown), Go(Occupied)], // any other
-    [Hold(Unknown), Hold(OutOfRange), Hold(Unknown), Hold(Occluded), Go(Clear), Go(Unknown),   Go(Unknown), Go(Occupied)], // occupied
+    // not occupied
+    [Go(Unknown), Go(OutOfRange), Go(Unknown), Go(Occluded), Go(Clear), Go(Unknown), Go(Unknown), Go(Occupied)],
+    // occupied
+    [Hold(Unknown), Hold(OutOfRange), Hold(Unknown), Hold(Occluded), Go(Clear), Go(Unknown), Go(Unknown), Go(Occupied)],
 ];
 
-/// What is kept of a cell from map to map.
+/// State of a cell from map to map.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Cell {
     /// The state as published.
     pub state: OccupancyClass,
-    /// Returns counted, faded by rays that went through; 255 in an occupied cell that nothing has gone through.
+    /// Number of returns, reduced by rays that pass through; 255 in an occupied cell without such rays.
     pub hits: u8,
-    /// Maps since a ray came back from here or went through.
+    /// Number of maps since a ray returned from here or passed through.
     pub age: u8,
 }
 
 impl Cell {
-    /// The hits as published: 255 in an occupied cell, in an unknown one the power of two they reach (what tells 20
-    /// returns from 23 is chance, and would be half of the layer's bytes), 0 in any other.
+    /// The hits as published: 255 in an occupied cell, in an unknown cell the largest power of two up to the number of
+    /// hits, 0 in any other cell. The difference between 20 and 23 returns is chance, and would be half of the layer's
+    /// bytes.
     pub fn level(self) -> u8 {
         match (self.state, self.hits) {
             (Occupied, hits) => hits,
@@ -89,31 +91,32 @@ impl Cell {
         }
     }
 
-    /// The cell one map later: `fresh` returns came from it, and `told` is the strongest of what other rays tell
-    /// ([`Evidence::Silence`] to [`Evidence::Through`]). It takes `hits_needed` returns (at least 1) to be occupied.
+    /// The cell one map later. `fresh` returns came from it, and `rays` is the strongest evidence of other rays
+    /// ([`Evidence::Silence`] to [`Evidence::Through`]). `hits_needed` returns (at least 1) make a cell occupied.
     #[inline(always)]
-    pub fn judged(self, fresh: u8, told: Evidence, hits_needed: u8, hold_maps: u8) -> Self {
-        let (mut hits, mut evidence) = (self.hits, told);
+    pub fn next(self, fresh: u8, rays: Evidence, hits_needed: u8, hold_maps: u8) -> Self {
+        let (mut hits, mut evidence) = (self.hits, rays);
         if fresh > 0 {
-            // Returns win over rays that went through in the same cycle: something is there, or was a moment ago.
+            // Returns take precedence over rays that passed through since the same map: an object is there, or was
+            // there a moment ago.
             hits = hits.saturating_add(fresh);
-            evidence = match told {
+            evidence = match rays {
                 _ if hits >= hits_needed => Evidence::Hits,
                 Evidence::Hidden => Evidence::Hidden,
                 _ => Evidence::FewHits,
             };
-        } else if told == Evidence::Through {
-            // No longer enough at once, so that nothing leaves a trail; not forgotten at once, so that a thin thing
-            // that rays miss now and then is never clear.
+        } else if rays == Evidence::Through {
+            // The cell is no longer occupied at once, so that no object leaves a trail. The hits fade step by step, so
+            // that a thin object that rays sometimes miss does not become clear.
             hits = (hits >> 2).min(hits_needed - 1);
             evidence = if hits > 0 { Evidence::ThroughDoubted } else { Evidence::Through };
         }
-        let age = if fresh > 0 || told == Evidence::Through { 0 } else { self.age.saturating_add(1) };
-        let over = age > hold_maps;
+        let age = if fresh > 0 || rays == Evidence::Through { 0 } else { self.age.saturating_add(1) };
+        let expired = age > hold_maps;
         let state = match TRANSITIONS[usize::from(self.state == Occupied)][evidence as usize] {
             Go(state) => state,
             Hold(later) => {
-                if over {
+                if expired {
                     later
                 } else {
                     self.state
@@ -122,7 +125,7 @@ impl Cell {
         };
         let hits = if evidence == Evidence::Hits {
             u8::MAX
-        } else if over {
+        } else if expired {
             0
         } else {
             hits

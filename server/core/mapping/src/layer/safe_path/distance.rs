@@ -1,40 +1,41 @@
-//! Exact Euclidean distances to the nearest cell that is not free, in whole numbers.
+//! Distance transform: exact Euclidean distances to the nearest cell that is not free, in whole numbers.
 //!
-//! In: a [`State`] a cell. Out: for every cell the nearest such cell (its site), for any half-cell place the exact
-//! distance to the nearest such cell's square. Meijster, Roerdink and Hesselink 2000: first along columns, then along
-//! rows as a lower envelope of parabolas; linear in the cells.
+//! In: a [`State`] for each cell. Out: for each cell the nearest cell that is not free (its site); for any position in
+//! half cells the exact distance to the square of the nearest such cell. The algorithm is that of Meijster, Roerdink
+//! and Hesselink 2000: first along columns, then along rows as a lower envelope of parabolas; linear in the number of
+//! cells.
 
-use super::free::State;
+use super::free_space::State;
 
-/// Row or column that stands for "none".
+/// Row or column of a site that does not exist.
 const NONE: u16 = u16::MAX;
 
 /// Distances over a grid of `side` cells along x and y, cell index = iy * side + ix.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Distances {
     side: usize,
-    /// Row of the nearest site in the same column; [`NONE`] in a column without.
+    /// Row of the nearest site in the same column; [`NONE`] if the column has none.
     row_of_site: Vec<u16>,
-    /// Column of the nearest site of all; [`NONE`] without any site.
+    /// Column of the nearest site of the grid; [`NONE`] if the grid has none.
     column_of_site: Vec<u16>,
-    /// Envelope of one row: columns of the parabolas, and the cell from which each is the lowest.
+    /// Envelope of one row: column of each parabola, and the first cell at which it is the lowest.
     envelope: Vec<(u16, u16)>,
 }
 
 impl Distances {
-    /// Over a grid without sites.
+    /// Distances over a grid without sites.
     pub fn new(side: usize) -> Self {
         let none = vec![NONE; side * side];
         Self { side, row_of_site: none.clone(), column_of_site: none, envelope: Vec::new() }
     }
 
-    /// Cells along x, and along y.
+    /// Number of cells along x, and along y.
     pub fn side(&self) -> usize {
         self.side
     }
 
-    /// Measures anew.
-    pub fn measure(&mut self, states: &[State]) {
+    /// Computes all distances.
+    pub fn compute(&mut self, states: &[State]) {
         self.along_columns(states);
         for iy in 0..self.side {
             self.along_row(iy);
@@ -43,7 +44,7 @@ impl Distances {
 
     fn along_columns(&mut self, states: &[State]) {
         let side = self.side;
-        // Upwards: the nearest site at or under each cell.
+        // Upwards: the nearest site at or below each cell.
         for iy in 0..side {
             let (before, here) = self.row_of_site.split_at_mut(iy * side);
             let here = &mut here[..side];
@@ -56,7 +57,7 @@ impl Distances {
                 *row = if state.is_free() { *row } else { iy as u16 };
             }
         }
-        // Downwards: the one over it, where that is nearer.
+        // Downwards: the site above it, if that is nearer.
         for iy in (0..side.saturating_sub(1)).rev() {
             let (here, above) = self.row_of_site.split_at_mut((iy + 1) * side);
             for (row, &over) in here[iy * side..].iter_mut().zip(&above[..side]) {
@@ -67,23 +68,23 @@ impl Distances {
         }
     }
 
-    /// A cell that is not free is its own site, and hides those beyond it: each stretch of free cells is measured with
-    /// the two beside it alone.
+    /// A cell that is not free is its own site and is nearer than all sites beyond it, so that each run of free cells
+    /// needs only the sites of its own columns and of the two cells beside it.
     fn along_row(&mut self, iy: usize) {
         let mut from = 0;
         for ix in 0..self.side {
             if usize::from(self.row_of_site[iy * self.side + ix]) == iy {
-                self.along_stretch(iy, from, ix + 1);
+                self.along_run(iy, from, ix + 1);
                 self.column_of_site[iy * self.side + ix] = ix as u16;
                 from = ix;
             }
         }
-        self.along_stretch(iy, from, self.side);
+        self.along_run(iy, from, self.side);
     }
 
-    /// Measures the free cells among `from..end` of a row by the sites of these columns.
-    fn along_stretch(&mut self, iy: usize, from: usize, end: usize) {
-        // Two that are not free lie beside one another: nothing is between them.
+    /// Finds the sites of the free cells among `from..end` of a row, from the sites of these columns.
+    fn along_run(&mut self, iy: usize, from: usize, end: usize) {
+        // Two cells that are not free lie side by side: no cell is between them.
         if end - from <= 2 && from > 0 && end < self.side {
             return;
         }
@@ -101,15 +102,15 @@ impl Distances {
             if rows[usize::from(ix)] == NONE {
                 continue;
             }
-            // A parabola that is not lower even where it began is nowhere the lowest.
-            while self.envelope.last().is_some_and(|&(held, began)| value(began, held) > value(began, ix)) {
+            // A parabola that is not lower at its first cell is nowhere the lowest.
+            while self.envelope.last().is_some_and(|&(last, began)| value(began, last) > value(began, ix)) {
                 self.envelope.pop();
             }
             match self.envelope.last() {
                 None => self.envelope.push((ix, from as u16)),
-                Some(&(held, _)) => {
-                    let (u, i) = (i32::from(ix), i32::from(held));
-                    let meets = (u * u - i * i + height_squared(ix) - height_squared(held)).div_euclid(2 * (u - i));
+                Some(&(last, _)) => {
+                    let (u, i) = (i32::from(ix), i32::from(last));
+                    let meets = (u * u - i * i + height_squared(ix) - height_squared(last)).div_euclid(2 * (u - i));
                     if meets + 1 < end as i32 {
                         self.envelope.push((ix, (meets + 1) as u16));
                     }
@@ -127,7 +128,7 @@ impl Distances {
         }
     }
 
-    /// The nearest site to a cell, `[ix, iy]`; `None` where every cell is free.
+    /// The nearest site to a cell, `[ix, iy]`; `None` if all cells are free.
     #[inline]
     pub fn site(&self, ix: usize, iy: usize) -> Option<[i32; 2]> {
         let row = iy * self.side;
@@ -138,28 +139,28 @@ impl Distances {
         Some([i32::from(column), i32::from(self.row_of_site[row + usize::from(column)])])
     }
 
-    /// Squared distance from a place to the nearest square of a cell that is not free; place and distance in half
-    /// cells, the middle of cell (ix, iy) at (2 ix, 2 iy). `None` where every cell is free. The place lies within the
-    /// grid.
+    /// Squared distance from a position to the square of the nearest cell that is not free; `None` if all cells are
+    /// free. Position and distance are in half cells; the centre of cell (ix, iy) is (2 ix, 2 iy). The position must
+    /// lie within the grid.
     pub fn clearance_squared(&self, [hx, hy]: [i32; 2]) -> Option<i32> {
         let side = self.side as i32;
         let (row, between_rows) = ((hy / 2) as usize, hy % 2 == 1);
         let rows = &self.row_of_site[row * self.side..][..self.side];
         let above = between_rows.then(|| &self.row_of_site[(row + 1) * self.side..][..self.side]);
-        // From the place up or down to the nearest square in a column.
+        // Distance up or down to the nearest square in a column.
         let height = |ix: i32| {
             let distance = |rows: &[u16], iy: usize| match rows[ix as usize] {
                 NONE => None,
                 site => Some(i32::from(site.abs_diff(iy as u16))),
             };
             match above {
-                // A site in one row's column is a site in the other's too.
+                // If the column has a site, both rows have one.
                 Some(above) => Some(2 * distance(rows, row)?.min(distance(above, row + 1)?)),
                 None => Some((2 * distance(rows, row)? - 1).max(0)),
             }
         };
         let mut nearest = None::<i32>;
-        let mut look = |ix: i32| {
+        let mut visit = |ix: i32| {
             let along = ((2 * ix - hx).abs() - 1).max(0);
             if nearest.is_some_and(|nearest| along * along >= nearest) {
                 return false;
@@ -172,12 +173,12 @@ impl Distances {
         };
         let middle = hx / 2;
         for ix in middle..side {
-            if !look(ix) {
+            if !visit(ix) {
                 break;
             }
         }
         for ix in (0..middle).rev() {
-            if !look(ix) {
+            if !visit(ix) {
                 break;
             }
         }

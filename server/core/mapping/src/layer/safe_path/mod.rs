@@ -1,56 +1,57 @@
-//! Safe points (thesis §VI): places as far as can be from the obstacles on both sides, linked into paths that start at
-//! the vehicle.
+//! The layer `safe_path` (UT Austin thesis, section VI): safe points, which are as far as possible from the obstacles
+//! on both sides, linked into paths that start at the vehicle.
 //!
-//! In: the layer `drivability` of the same map, and its sweep. Out: the layer `safe_path`: points with radii and links,
-//! and the Cartesian grid they were found on. The steps:
+//! In: the layer `drivability` of the same map, and its sweep. Out: the layer: points with radii and links, and the
+//! Cartesian grid on which they were found. The steps:
 //!
 //! | step | where |
 //! |---|---|
-//! | which cells are free: drivable ones, and those the sensor cannot see under the vehicle | [`free`] |
-//! | exact distance to the nearest cell that is not free, and which one that is | [`distance`] |
-//! | ridge: neighbouring cells with two nearest obstacles; its exact radii; thinned to one-cell lines | [`ridge`] |
-//! | links between neighbours on the lines, from the vehicle on | [`links`] |
+//! | free space: drivable cells, and cells near the vehicle that the sensor cannot see | [`free_space`] |
+//! | distance transform: exact distance to the nearest cell that is not free, and that cell | [`distance`] |
+//! | medial axis: cells with two nearest obstacles; its exact radii; thinned to lines one cell wide | [`medial_axis`] |
+//! | links between neighbours on the lines, starting at the vehicle | [`links`] |
 //!
-//! Unknown ground is no way through: it counts like an obstacle, but for the blind zone and narrow holes ([`free`]).
-//! The thesis keeps no more than the picture; here each point knows its radius (the thesis' safety radius), and is kept
-//! where the vehicle fits: twice the radius is at least its width. What lies beyond the grid is not known to this map.
+//! Unknown ground counts as an obstacle, except in the blind zone and in narrow holes ([`free_space`]). The thesis
+//! shows only a picture; here each point has its radius (the safety radius of the thesis), and is kept if the vehicle
+//! fits there: if twice the radius is at least the vehicle's width. Ground beyond the grid is not considered.
 
 pub mod class;
+pub mod config;
 pub mod distance;
-pub mod free;
+pub mod free_space;
 pub mod links;
-pub mod ridge;
+pub mod medial_axis;
 
-use crate::config::SafePathConfig;
 use crate::layer::channel::TypedChannel;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker};
 use crate::sensor::sweep::Sweep;
 
 use class::SafePathClass;
+use config::SafePathConfig;
 use distance::Distances;
-use free::{Free, State};
+use free_space::{FreeSpace, State};
 use links::Links;
-use ridge::Ridge;
+use medial_axis::MedialAxis;
 
-/// Makes the layer from map after map, reusing its buffers.
+/// Maker of the layer `safe_path`. It reuses its buffers from map to map.
 pub struct SafePath {
     config: SafePathConfig,
-    free: Free,
+    free_space: FreeSpace,
     distances: Distances,
-    ridge: Ridge,
+    medial_axis: MedialAxis,
     links: Links,
 }
 
 impl SafePath {
-    /// Parameters must have passed [`crate::config::MapsConfig::validate`].
+    /// A maker with validated parameters.
     pub fn new(config: &SafePathConfig) -> Self {
         let side = 2 * (config.extent_m / config.cell_m).round() as usize;
         Self {
             config: config.clone(),
-            free: Free::new(side, f64::from(config.cell_m)),
+            free_space: FreeSpace::new(side, f64::from(config.cell_m)),
             distances: Distances::new(side),
-            ridge: Ridge::new(side),
+            medial_axis: MedialAxis::new(side),
             links: Links::default(),
         }
     }
@@ -58,7 +59,7 @@ impl SafePath {
     fn write(&self, layer: &mut Layer) {
         layer.clear_lists();
         let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
-        class.extend(self.free.states().iter().map(|state| {
+        class.extend(self.free_space.states().iter().map(|state| {
             let class = match state {
                 State::Unknown | State::Blind | State::Hole => SafePathClass::Unknown,
                 State::Drivable => SafePathClass::Free,
@@ -66,10 +67,10 @@ impl SafePath {
             };
             class.value()
         }));
-        let side = self.free.side();
+        let side = self.free_space.side();
         let cell_m = f64::from(self.config.cell_m);
         layer.points.extend(self.links.points().iter().map(|point| point.in_metres(side, cell_m)));
-        // The vehicle's own place lies between four cells.
+        // The first point is the vehicle's own position, which lies between four cells.
         self.links.points().iter().skip(1).for_each(|point| class[point.cell] = SafePathClass::Path.value());
         TypedChannel::CLASS.store(&mut layer.channels, class);
         layer.metrics.extend([
@@ -81,7 +82,7 @@ impl SafePath {
 
 impl LayerMaker for SafePath {
     fn layer(&self) -> Layer {
-        let geometry = Geometry::about_vehicle(self.free.side() as u32, self.config.cell_m);
+        let geometry = Geometry::about_vehicle(self.free_space.side() as u32, self.config.cell_m);
         Layer::new("safe_path", geometry, SafePathClass::LEGEND, vec![TypedChannel::CLASS.empty()])
     }
 
@@ -91,12 +92,12 @@ impl LayerMaker for SafePath {
 
     fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         let drivability = context.earlier.iter().find(|layer| layer.name == "drivability");
-        self.free.fill(drivability, sweep, &self.config);
-        self.distances.measure(self.free.states());
+        self.free_space.update(drivability, sweep, &self.config);
+        self.distances.compute(self.free_space.states());
         let width_cells = f64::from(self.config.vehicle_width_m) / f64::from(self.config.cell_m);
-        self.ridge.find(self.free.states(), &self.distances, width_cells);
+        self.medial_axis.find(self.free_space.states(), &self.distances, width_cells);
         let join_cells = f64::from(self.config.join_m_max) / f64::from(self.config.cell_m);
-        self.links.link(&self.ridge, self.free.states(), &self.distances, width_cells, join_cells);
+        self.links.link(&self.medial_axis, self.free_space.states(), &self.distances, width_cells, join_cells);
         layer.geometry = self.layer().geometry;
         self.write(layer);
     }

@@ -1,40 +1,40 @@
-//! The height map and what it says of each cell: a step, or how bumpy it is.
+//! The height map, and the bumpiness of each cell.
 //!
-//! In: the sweep's points, ego frame, metres. Out: a figure a cell, metres. The paper leaves the measure open ("methods
-//! similar to image processing methods"); the reading here:
+//! In: the sweep's points, ego frame, metres. Out: one value for each cell, metres. The paper does not define the
+//! measure ("methods similar to image processing methods", Lindström 2005, section 2). Ours:
 //!
-//! - the floor about a block of 4 × 4 cells is the lowest height in the 3 × 3 blocks, unless it lies further under a
-//!   few cells more than the ground may fall there: mirrored returns lie metres under the ground, a few cells of them
-//!   side by side, and are outvoted. What lies under the floor is forgotten, and the rest of such a cell is its highest
-//!   point;
-//! - a cell is an obstacle if its highest point rises by more than a step and what the grade explains over the lowest
-//!   point of the 3 × 3 cells around it, or over the floor, so that a roof is not taken for ground because no ground
-//!   was seen right beside it;
-//! - its bumpiness is the larger of the heights' standard deviation within it, less what the slope of its neighbours
-//!   explains, and half the second difference of the heights across it.
+//! - Floor: the floor of a block of 4 × 4 cells is the lowest height in the 3 × 3 blocks around it, unless that height
+//!   lies too far below a few others. Mirrored returns lie metres below the ground, in a few adjacent cells, and are
+//!   outvoted. Points below the floor are dropped; the rest of such a cell is its highest point.
+//! - Obstacle: a cell is an obstacle if its highest point rises by more than a step plus the allowed slope over the
+//!   lowest point of the 3 × 3 cells around it, or over the floor. Because of the floor, a roof is an obstacle even if
+//!   no ground was seen right beside it.
+//! - Bumpiness: the larger of two values: the standard deviation of the heights within the cell, without the part that
+//!   the slope of its neighbours explains; half the second difference of the mean heights across the cell.
 //!
-//! Heights are summed in whole millimetres, so their order says nothing.
+//! Heights are summed in whole millimetres, so that the order of the points does not matter.
 
-use crate::config::SpeedConfig;
-use crate::layer::radial_grid::whole;
+use crate::layer::radial_grid::floor_to_whole;
 use crate::sensor::sweep::Sweep;
+
+use super::config::SpeedConfig;
 
 /// Bumpiness of an obstacle.
 pub const OBSTACLE_BUMPINESS: f32 = f32::INFINITY;
 
-/// Points lower than this are no ground a vehicle at 0 gets to; ±20 m keep millimetres in 16 bits.
+/// Lowest height of a point that is used, metres. Ours: ±20 m in millimetres fit into 16 bits.
 const LOWEST_M: f32 = -20.0;
-/// Makes every height positive, and half a millimetre to round with.
+/// Offset that makes each height positive, plus half a millimetre for rounding, mm.
 const OFFSET_MM: f32 = 20_000.5;
-/// Points are taken in chunks of this many, so that what is worked out of them stays in the first cache level.
+/// Number of points that are processed together. Ours: their intermediate values fit into the first-level cache.
 const CHUNK: usize = 256;
-/// Of a point that lies in no cell.
+/// Cell of a point that lies in no cell.
 const NOWHERE: u32 = u32::MAX;
-/// Cells a side of a block.
+/// Number of cells along a side of a block. Ours; not tuned.
 const BLOCK: usize = 4;
-/// So many cells of 3 × 3 blocks are outvoted: the largest ghosts of the recorded drives cover six.
+/// Largest number of outvoted cells in 3 × 3 blocks. Ours: the largest ghosts of the recorded drives cover six cells.
 const OUTVOTED_CELLS: usize = 8;
-/// Where few cells were seen, no more than one of so many.
+/// Number of seen cells for each outvoted one, if few cells were seen. Ours; not tuned.
 const OUTVOTED_SHARE: usize = 8;
 
 /// Sums of one cell's heights, mm.
@@ -49,7 +49,7 @@ struct Cell {
 
 impl Cell {
     #[inline(always)]
-    fn take(&mut self, millimetres: i16) {
+    fn add_point(&mut self, millimetres: i16) {
         let wide = i64::from(millimetres);
         self.highest = self.highest.max(millimetres);
         self.lowest = self.lowest.min(millimetres);
@@ -59,7 +59,7 @@ impl Cell {
     }
 
     #[inline(always)]
-    fn add(&mut self, other: &Self) {
+    fn add_cell(&mut self, other: &Self) {
         self.highest = self.highest.max(other.highest);
         self.lowest = self.lowest.min(other.lowest);
         self.points += other.points;
@@ -70,18 +70,18 @@ impl Cell {
 
 const EMPTY: Cell = Cell { highest: i16::MIN, lowest: i16::MAX, points: 0, sum: 0, squares: 0 };
 
-/// Heights by cell, row by row, `side` cells along x and y; the vehicle stands in the middle.
+/// Heights of a grid of `side` cells along x and y with the vehicle in the middle: index = iy * side + ix.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeightMap {
     side: usize,
     cells: Vec<Cell>,
-    /// Cells that hold a point, in the order they were first met.
-    met: Vec<u32>,
-    /// Lowest height of each cell, block by block; [`EMPTY`]'s in cells without a point.
+    /// Indices of the cells with a point, in the order in which points fell into them.
+    seen: Vec<u32>,
+    /// By block: lowest height of each of its cells, mm; that of [`EMPTY`] in cells without a point.
     lowest_of_block: Vec<[i16; BLOCK * BLOCK]>,
-    /// By block: the lowest height about it that is not outvoted.
+    /// By block: the lowest height around it that is not outvoted, mm.
     floors: Vec<i16>,
-    /// Mean height of each cell, metres; NaN without points.
+    /// By cell: mean height, metres; NaN without points.
     means_m: Vec<f32>,
     bumpiness_m: Vec<f32>,
 }
@@ -92,7 +92,7 @@ impl HeightMap {
         Self {
             side,
             cells: vec![EMPTY; side * side],
-            met: Vec::new(),
+            seen: Vec::new(),
             lowest_of_block: Vec::new(),
             floors: Vec::new(),
             means_m: vec![f32::NAN; side * side],
@@ -100,58 +100,58 @@ impl HeightMap {
         }
     }
 
-    /// Cells along x, and along y.
+    /// Number of cells along x, and along y.
     pub fn side(&self) -> usize {
         self.side
     }
 
-    /// By cell: NaN where nothing was seen, [`OBSTACLE_BUMPINESS`] for an obstacle.
+    /// Bumpiness by cell, metres: NaN if the cell was not seen, [`OBSTACLE_BUMPINESS`] for an obstacle.
     pub fn bumpiness_m(&self) -> &[f32] {
         &self.bumpiness_m
     }
 
-    /// Cells of which something is known: that hold a point, ghosts left out.
+    /// Indices of the known cells: those with a point above the floor.
     pub fn known(&self) -> impl ExactSizeIterator<Item = usize> {
-        self.met.iter().map(|cell| *cell as usize)
+        self.seen.iter().map(|cell| *cell as usize)
     }
 
-    /// Takes the points of a sweep, in place of those before.
-    pub fn fill(&mut self, sweep: &Sweep, config: &SpeedConfig) {
-        for &cell in &self.met {
+    /// Replaces the points by those of a sweep.
+    pub fn update(&mut self, sweep: &Sweep, config: &SpeedConfig) {
+        for &cell in &self.seen {
             self.cells[cell as usize] = EMPTY;
             self.means_m[cell as usize] = f32::NAN;
             self.bumpiness_m[cell as usize] = f32::NAN;
         }
-        self.met.clear();
+        self.seen.clear();
         let (mut cells, mut millimetres) = ([NOWHERE; CHUNK], [0; CHUNK]);
-        // A laser's neighbouring points mostly share a cell: they are summed before they are written.
-        let (mut index, mut held) = (NOWHERE, EMPTY);
+        // Neighbouring points of a laser mostly share a cell, so they are summed before the sums are written.
+        let (mut index, mut sums) = (NOWHERE, EMPTY);
         let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
         for ((xs, ys), zs) in chunks {
             self.find_cells([xs, ys, zs], config, &mut cells, &mut millimetres);
             for (&next, &millimetres) in cells.iter().zip(&millimetres).take(xs.len()) {
                 if next != index {
-                    self.add(index, &held);
-                    (index, held) = (next, EMPTY);
+                    self.add(index, &sums);
+                    (index, sums) = (next, EMPTY);
                 }
-                held.take(millimetres as i16);
+                sums.add_point(millimetres as i16);
             }
         }
-        self.add(index, &held);
+        self.add(index, &sums);
     }
 
     #[inline(always)]
-    fn add(&mut self, index: u32, held: &Cell) {
+    fn add(&mut self, index: u32, sums: &Cell) {
         if index != NOWHERE {
             let cell = &mut self.cells[index as usize];
             if cell.points == 0 {
-                self.met.push(index);
+                self.seen.push(index);
             }
-            cell.add(held);
+            cell.add_cell(sums);
         }
     }
 
-    /// Cell and height of each point. Free of branches and tables, so that it runs four points at a time.
+    /// Finds cell and height of each point. It has no branches and reads no tables, so that the compiler vectorises it.
     fn find_cells(
         &self,
         [xs, ys, zs]: [&[f32]; 3],
@@ -168,25 +168,26 @@ impl HeightMap {
             // NaN fails every comparison.
             let within = (ix >= 0.0) & (ix < side) & (iy >= 0.0) & (iy < side);
             let inside = within & (z > LOWEST_M) & (z <= config.overhang_m);
-            let [ix, iy, z] = [ix, iy, z * 1000.0 + OFFSET_MM].map(|value| whole(if inside { value } else { 0.0 }));
+            let [ix, iy, z] =
+                [ix, iy, z * 1000.0 + OFFSET_MM].map(|value| floor_to_whole(if inside { value } else { 0.0 }));
             cells[i] = if inside { iy * self.side as u32 + ix } else { NOWHERE };
-            // Positive first, so that cutting off rounds.
+            // The value is positive before the cast, so that the cast rounds.
             millimetres[i] = z as i32 - OFFSET_MM as i32;
         }
     }
 
-    /// Judges every cell that holds a point.
+    /// Computes the bumpiness of each cell with a point.
     pub fn judge(&mut self, config: &SpeedConfig) {
         let over = |distance_m: f32| ((config.step_m_max + config.grade_max * distance_m) * 1000.0) as i32;
-        // From the middle of a cell or block to the far side of its neighbour.
+        // The distance is from the centre of a cell or block to the far side of its neighbour.
         let (over_cells, over_floor) = (over(1.5 * config.cell_m), over(1.5 * BLOCK as f32 * config.cell_m));
         self.find_floors(over_floor);
-        self.forget_ghosts();
-        for &index in &self.met {
+        self.remove_ghosts();
+        for &index in &self.seen {
             let cell = &self.cells[index as usize];
             self.means_m[index as usize] = (cell.sum as f64 / f64::from(cell.points) * 1e-3) as f32;
         }
-        for &index in &self.met {
+        for &index in &self.seen {
             let (index, cell) = (index as usize, self.cells[index as usize]);
             let (ix, iy) = (index % self.side, index / self.side);
             let near = around(ix, iy, self.side).map(|i| self.cells[i].lowest).min().unwrap_or(cell.lowest);
@@ -197,6 +198,7 @@ impl HeightMap {
         }
     }
 
+    /// Block of a cell.
     fn block(&self, cell: usize) -> usize {
         cell / self.side / BLOCK * self.side.div_ceil(BLOCK) + cell % self.side / BLOCK
     }
@@ -206,17 +208,17 @@ impl HeightMap {
         let blocks = blocks_a_side * blocks_a_side;
         self.lowest_of_block.clear();
         self.lowest_of_block.resize(blocks, [EMPTY.lowest; BLOCK * BLOCK]);
-        for &cell in &self.met {
+        for &cell in &self.seen {
             let (block, cell) = (self.block(cell as usize), cell as usize);
-            let place = cell / self.side % BLOCK * BLOCK + cell % self.side % BLOCK;
-            self.lowest_of_block[block][place] = self.cells[cell].lowest;
+            let within = cell / self.side % BLOCK * BLOCK + cell % self.side % BLOCK;
+            self.lowest_of_block[block][within] = self.cells[cell].lowest;
         }
         self.floors.clear();
         self.floors.resize(blocks, i16::MIN);
-        let holds = |height: &i16| *height != EMPTY.lowest;
-        let is_met = |block: &usize| self.lowest_of_block[*block].iter().any(holds);
+        let is_height = |height: &i16| *height != EMPTY.lowest;
+        let is_seen = |block: &usize| self.lowest_of_block[*block].iter().any(is_height);
         let mut heights = Vec::with_capacity(9 * BLOCK * BLOCK);
-        for block in (0..blocks).filter(is_met) {
+        for block in (0..blocks).filter(is_seen) {
             heights.clear();
             for near in around(block % blocks_a_side, block / blocks_a_side, blocks_a_side) {
                 heights.extend_from_slice(&self.lowest_of_block[near]);
@@ -225,10 +227,10 @@ impl HeightMap {
         }
     }
 
-    /// Drops what lies under the floor; a cell of nothing else holds no point.
-    fn forget_ghosts(&mut self) {
-        let mut met = std::mem::take(&mut self.met);
-        met.retain(|&index| {
+    /// Drops the points below the floor. A cell without other points becomes empty.
+    fn remove_ghosts(&mut self) {
+        let mut seen = std::mem::take(&mut self.seen);
+        seen.retain(|&index| {
             let floor = i32::from(self.floors[self.block(index as usize)]);
             let cell = &mut self.cells[index as usize];
             let is_ghost = |height: i16| i32::from(height) < floor;
@@ -241,9 +243,10 @@ impl HeightMap {
             }
             cell.points > 0
         });
-        self.met = met;
+        self.seen = seen;
     }
 
+    /// Bumpiness of a cell, metres.
     fn bumpiness(&self, ix: usize, iy: usize) -> f32 {
         let index = iy * self.side + ix;
         let here = self.means_m[index];
@@ -252,12 +255,12 @@ impl HeightMap {
         let row = self.side as isize;
         let (back, ahead) = (mean(ix > 0, -1), mean(ix + 1 < self.side, 1));
         let (right, left) = (mean(iy > 0, -row), mean(iy + 1 < self.side, row));
-        // What is not known on both sides is NaN, and NaN is neither larger nor explains anything.
+        // Without a neighbour on both sides the difference is NaN; `max` ignores it, and it explains no rise.
         let bend = f32::max(0.0, (back - 2.0 * here + ahead).abs() / 2.0).max((right - 2.0 * here + left).abs() / 2.0);
         let rise_squared = |rise: f32| if rise.is_nan() { 0.0 } else { rise * rise };
-        // Twice the rise across one cell.
+        // Each difference is twice the rise across one cell.
         let rises = rise_squared(ahead - back) + rise_squared(left - right);
-        // A plane that rises by h across a cell has the variance h²/12 in it.
+        // Heights on a plane that rises by h across a cell have the variance h²/12.
         let explained = rises / 4.0 / 12.0;
         let cell = &self.cells[index];
         let points = f64::from(cell.points);
@@ -267,13 +270,13 @@ impl HeightMap {
     }
 }
 
-/// The lowest of the heights that lies no more than `ghost_mm` under what a few of them outvote. One at least is no
-/// [`EMPTY`]'s.
+/// Robust minimum: the lowest height within `ghost_mm` below the n-th lowest, where n depends on the number of heights.
+/// At least one height must not be that of [`EMPTY`].
 fn floor(heights: &mut Vec<i16>, ghost_mm: i32) -> i16 {
-    let lowest = heights.iter().copied().min().expect("a height");
-    let held = heights.iter().filter(|height| **height != EMPTY.lowest).count();
-    let outvoted = (held / OUTVOTED_SHARE).min(OUTVOTED_CELLS);
-    // Mostly more of them lie about the lowest than could be outvoted.
+    let lowest = heights.iter().copied().min().expect("at least one height");
+    let known = heights.iter().filter(|height| **height != EMPTY.lowest).count();
+    let outvoted = (known / OUTVOTED_SHARE).min(OUTVOTED_CELLS);
+    // In most blocks, more heights lie near the lowest one than could be outvoted.
     let about = (i32::from(lowest) + ghost_mm).min(i32::from(EMPTY.lowest) - 1) as i16;
     if heights.iter().filter(|height| **height <= about).count() > outvoted {
         return lowest;
@@ -281,10 +284,10 @@ fn floor(heights: &mut Vec<i16>, ghost_mm: i32) -> i16 {
     heights.retain(|height| *height != EMPTY.lowest);
     let voted = i32::from(*heights.select_nth_unstable(outvoted).1);
     let floor = heights.iter().filter(|height| voted - i32::from(**height) <= ghost_mm).min();
-    *floor.expect("the voted height is none")
+    *floor.expect("the n-th lowest height is within its own distance")
 }
 
-/// Indices of the 3 × 3 cells or blocks around (ix, iy), as many as there are.
+/// Indices of the up to 3 × 3 cells or blocks around (ix, iy).
 fn around(ix: usize, iy: usize, side: usize) -> impl Iterator<Item = usize> {
     let near = move |i: usize| i.saturating_sub(1)..(i + 2).min(side);
     near(iy).flat_map(move |y| near(ix).map(move |x| y * side + x))

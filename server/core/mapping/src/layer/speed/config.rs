@@ -1,48 +1,58 @@
 //! The table `[vehicle.maps.speed]`.
+//!
+//! Lindström 2005 gives one value: the 30 m over which the route's curvature is measured.
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::check::{ConfigValueError, check_each, check_fits};
+use crate::config::check::{ConfigValueError, check_cells, check_each, check_fits};
 
-/// Parameters of [`crate::layer::speed`]; the paper states no figures but the 30 m.
+/// Parameters of the layer `speed`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SpeedConfig {
-    /// Whether the map is made.
+    /// True if the layer is made.
     pub enabled: bool,
-    /// The grid reaches this far to each side of the vehicle.
+    /// Distance from the vehicle to each edge of the grid, metres. 40 is ours; not tuned.
     pub extent_m: f32,
-    /// Side of a cell.
+    /// Side of a cell, metres. 0.5 is ours; not tuned.
     pub cell_m: f32,
-    /// Points higher than this over the ground are dropped: the vehicle passes under them.
+    /// Largest height of a point over the ground, metres; the vehicle passes under higher ones. 2.5 is ours: the value
+    /// of the layer `drivability` (UT Austin thesis, section IV.2).
     pub overhang_m: f32,
-    /// A cell that rises more than this over its surroundings, beyond what `grade_max` explains, is an obstacle.
+    /// Largest rise of a passable cell over its surroundings, beyond what `grade_max` explains, metres. 0.2 is ours;
+    /// not tuned.
     pub step_m_max: f32,
-    /// Rise over distance that is a slope, not a step.
+    /// Largest rise over distance that counts as a slope, not a step. 0.2 is ours; not tuned.
     pub grade_max: f32,
-    /// Up to this bumpiness the ground allows the full off-road speed; the sensor's own noise lies below.
+    /// Bumpiness up to which the ground allows `off_road_mps`, metres. 0.03 is ours, because the sensor's range noise
+    /// stays below it; not tuned.
     pub smooth_m: f32,
-    /// From this bumpiness on it allows a crawl.
+    /// Bumpiness from which the ground allows `crawl_mps`, metres. 0.15 is ours; not tuned.
     pub rough_m: f32,
-    /// Speed in cells nothing is known of; less than a crawl, so that the two cannot be taken for one another.
+    /// Speed of cells of which nothing is known, m/s; less than `crawl_mps`, so that the two differ. 1 is ours; not
+    /// tuned.
     pub unknown_mps: f32,
-    /// Speed over the roughest passable ground.
+    /// Speed on the roughest passable ground, m/s. 2 is ours; not tuned.
     pub crawl_mps: f32,
-    /// Speed over smooth ground off the road.
+    /// Speed on smooth ground off the road, m/s. 10 is ours; not tuned.
     pub off_road_mps: f32,
-    /// Greatest speed bonus of the road.
+    /// Largest speed bonus of the road, m/s. 8 is ours; not tuned.
     pub bonus_mps: f32,
-    /// How the bonus falls towards the road's edge.
+    /// How the bonus falls towards the road's edge. `relative`: Lindström 2005, section 3.2.2, the final variant.
     pub bonus: Bonus,
-    /// With `bonus = "absolute"`: distance from the centre line at which it reaches 0.
+    /// With `bonus = "absolute"`: distance from the centre line at which the bonus is 0, metres. 4 is ours; not tuned.
     pub bonus_reach_m: f32,
-    /// A road detected longer ago than this is not painted; lanes of a file, in the map frame, do not age.
+    /// Largest age of a detected road that is painted, milliseconds; lanes of a file, in the map frame, do not age. 500
+    /// is ours; not tuned.
     pub road_age_ms_max: u32,
-    /// No road under this Kullback-Leibler divergence of the detector's orientations from even ones, nats.
+    /// Least Kullback-Leibler divergence between the detector's orientations and even ones at which a road is painted,
+    /// nats. 0.1 is ours, because the paper derives its thresholds from data that it does not give (section 3.3); not
+    /// tuned.
     pub divergence_min: f32,
-    /// The route ahead is looked at this far.
+    /// Length of the route ahead whose curvature is measured, metres. 30: Lindström 2005, section 3.3.
     pub route_ahead_m: f32,
-    /// Largest curvature of the route the road detector follows; 0.05 is a radius of 20 m.
+    /// Largest curvature of the route at which a road is painted, 1/m. 0.05 (a radius of 20 m) is ours, because the
+    /// paper gives no value (section 3.3); not tuned.
     pub curvature_per_m_max: f32,
 }
 
@@ -71,19 +81,23 @@ impl Default for SpeedConfig {
     }
 }
 
-/// How the road's bonus falls towards its edge (§3.2.2): the paper's three ways, in its order.
+/// How the road's bonus falls towards its edge: the three variants of Lindström 2005, section 3.2.2, in its order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Bonus {
-    /// Not at all.
+    /// The bonus is the same over the whole width.
     Uniform,
-    /// With the square of the distance from the centre line.
+    /// The bonus falls with the square of the distance from the centre line.
     Absolute,
-    /// With the square of that distance relative to the road's half width there.
+    /// The bonus falls with the square of that distance over the road's half width at the same place.
     Relative,
 }
 
 impl SpeedConfig {
+    /// Checks the values of the table `at`, and how they fit one another.
+    ///
+    /// # Errors
+    /// [`ConfigValueError`] for the first value that is not allowed.
     pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
         let values = [
             ("extent_m", self.extent_m, (5.0..=200.0, "5 to 200")),
@@ -93,7 +107,7 @@ impl SpeedConfig {
             ("grade_max", self.grade_max, (0.0..=1.0, "0 to 1")),
             ("smooth_m", self.smooth_m, (0.0..=1.0, "0 to 1")),
             ("rough_m", self.rough_m, (0.01..=2.0, "0.01 to 2")),
-            // A speed is a cell of 8 bits in steps of 0.25 m/s, and 0 is an obstacle.
+            // A cell has 8 bits in steps of 0.25 m/s, and 0 is an obstacle.
             ("unknown_mps", self.unknown_mps, (0.25..=10.0, "0.25 to 10")),
             ("crawl_mps", self.crawl_mps, (0.5..=20.0, "0.5 to 20")),
             ("off_road_mps", self.off_road_mps, (0.5..=60.0, "0.5 to 60")),
@@ -105,7 +119,7 @@ impl SpeedConfig {
             ("curvature_per_m_max", self.curvature_per_m_max, (0.0..=10.0, "0 to 10")),
         ];
         check_each(at, values)?;
-        crate::config::check::check_cells(at, self.extent_m, self.cell_m)?;
+        check_cells(at, self.extent_m, self.cell_m)?;
         check_fits(at, "rough_m", self.rough_m, self.rough_m > self.smooth_m, "more than smooth_m")?;
         let above_unknown = self.crawl_mps >= self.unknown_mps + 0.25;
         check_fits(at, "crawl_mps", self.crawl_mps, above_unknown, "at least 0.25 more than unknown_mps")?;

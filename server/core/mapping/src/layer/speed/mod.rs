@@ -1,26 +1,25 @@
-//! The speed each place allows (Lindström 2005): from the ground's bumps and steps, with the road painted in as a
-//! bonus.
+//! The layer `speed` (Lindström 2005): the speed that each cell allows, from bumps and steps of the ground, with a
+//! bonus on the painted road.
 //!
-//! In: a [`Sweep`], ego frame, metres; the newest road and route, if any. Out: the layer `speed`, a Cartesian grid
-//! about the vehicle. The steps:
+//! In: a [`Sweep`], ego frame, metres; the newest road and route, if any. Out: the layer, a Cartesian grid about the
+//! vehicle. The steps:
 //!
 //! | step | paper | where |
 //! |---|---|---|
-//! | height map, its steps and bumpiness | §2 | [`bumpiness`] |
-//! | whether a road may be painted now | §3.3 | [`gates`] |
-//! | the road's polygon, scan-converted; how much bonus each cell gets | §3.2 | [`painting`] |
+//! | height map, its steps and bumpiness | section 2 | [`bumpiness`] |
+//! | whether a road may be painted now | section 3.3 | [`painting_conditions`] |
+//! | scan conversion of the road's polygon; bonus of each cell | section 3.2 | [`painting`] |
 //!
-//! The bonus is added where the ground was seen to be passable, never elsewhere: a road over an obstacle or over ground
-//! nobody saw changes nothing there. The speed of an unknown cell is low, as configured, and its raw value is the
-//! channel's `unknown`: no known cell has it.
+//! The bonus is added only to cells that were seen to be passable: a road over an obstacle or over unseen ground
+//! changes nothing there. Unknown cells have the configured low speed. Its raw value is the channel's `unknown`, and no
+//! known cell has this value.
 
 pub mod bumpiness;
 pub mod class;
 pub mod config;
-pub mod gates;
 pub mod painting;
+pub mod painting_conditions;
 
-use crate::config::SpeedConfig;
 use crate::layer::channel::TypedChannel;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker};
@@ -28,39 +27,41 @@ use crate::sensor::sweep::Sweep;
 
 use bumpiness::{HeightMap, OBSTACLE_BUMPINESS};
 use class::{SPEED_SCALE_MPS, SpeedClass};
-use gates::{Gate, Gates};
+use config::SpeedConfig;
 use painting::{NO_ROAD, Painter};
+use painting_conditions::{Condition, PaintingConditions};
 
-/// Makes the layer from sweep after sweep, reusing its buffers.
+/// Maker of the layer `speed`. It reuses its buffers from map to map.
 pub struct Speed {
     config: SpeedConfig,
     heights: HeightMap,
-    gates: Gates,
+    conditions: PaintingConditions,
     painter: Painter,
 }
 
 impl Speed {
-    /// Parameters must have passed [`crate::config::MapsConfig::validate`].
+    /// A maker with validated parameters.
     pub fn new(config: &SpeedConfig) -> Self {
         let side = 2 * (config.extent_m / config.cell_m).round() as usize;
         Self {
             config: config.clone(),
             heights: HeightMap::new(side),
-            gates: Gates::default(),
+            conditions: PaintingConditions::default(),
             painter: Painter::new(side, config),
         }
     }
 
-    /// Speed of a cell.
+    /// Channel for the speed of a cell.
     fn channel(&self) -> TypedChannel<u8> {
         TypedChannel { name: "speed", unit: "m/s", scale: SPEED_SCALE_MPS, unknown: self.unknown() }
     }
 
+    /// Raw speed of an unknown cell.
     fn unknown(&self) -> u8 {
         (self.config.unknown_mps / SPEED_SCALE_MPS) as u8
     }
 
-    /// Speed of a known cell off the road, m/s: falls linearly with bumpiness.
+    /// Speed of a known cell off the road, m/s. It falls linearly with bumpiness.
     fn off_road_mps(&self, bumpiness_m: f32) -> f32 {
         let SpeedConfig { smooth_m, rough_m, crawl_mps, off_road_mps, .. } = self.config;
         let evenness = ((rough_m - bumpiness_m) / (rough_m - smooth_m)).clamp(0.0, 1.0);
@@ -91,18 +92,18 @@ impl Speed {
         let known = self.heights.known().len() as u32;
         let share = |part: u32| if known == 0 { 0.0 } else { f64::from(part) / f64::from(known) };
         let flag = |set: bool| f64::from(u8::from(set));
-        let gates = &self.gates;
+        let conditions = &self.conditions;
         layer.metrics.extend([
             ("passable_share", share(passable)),
             ("road_share", share(road)),
-            ("painting", flag(gates.painting())),
-            ("stopped_by_age", flag(gates.closed(Gate::Age))),
-            ("stopped_by_missing_pose", flag(gates.closed(Gate::Pose))),
-            ("stopped_by_divergence", flag(gates.closed(Gate::Divergence))),
-            ("stopped_by_curvature", flag(gates.closed(Gate::Curvature))),
+            ("painting", flag(conditions.painting())),
+            ("stopped_by_age", flag(conditions.violated(Condition::Age))),
+            ("stopped_by_missing_pose", flag(conditions.violated(Condition::Pose))),
+            ("stopped_by_divergence", flag(conditions.violated(Condition::Divergence))),
+            ("stopped_by_curvature", flag(conditions.violated(Condition::Curvature))),
         ]);
-        layer.metrics.extend(gates.divergence.map(|value| ("orientation_divergence", value)));
-        layer.metrics.extend(gates.curvature_per_m.map(|value| ("route_curvature_per_m", value)));
+        layer.metrics.extend(conditions.divergence.map(|value| ("orientation_divergence", value)));
+        layer.metrics.extend(conditions.curvature_per_m.map(|value| ("route_curvature_per_m", value)));
     }
 }
 
@@ -114,13 +115,13 @@ impl LayerMaker for Speed {
     }
 
     fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
-        self.heights.fill(sweep, &self.config);
+        self.heights.update(sweep, &self.config);
         self.heights.judge(&self.config);
-        self.gates.judge(context, &self.config);
+        self.conditions.check(context, &self.config);
         self.painter.clear();
-        if self.gates.painting() {
-            let widths_m = context.road.map_or(&[][..], |taken| &taken.road.widths_m);
-            self.painter.paint(self.gates.road_m(), widths_m);
+        if self.conditions.painting() {
+            let widths_m = context.road.map_or(&[][..], |stored| &stored.road.widths_m);
+            self.painter.paint(self.conditions.road_m(), widths_m);
         }
         layer.geometry = self.layer().geometry;
         self.write(layer);

@@ -1,16 +1,16 @@
-//! The road as a polygon, scan-converted into the grid as a speed bonus (§3.2).
+//! Scan conversion of a road into the grid, as a speed bonus (Lindström 2005, section 3.2).
 //!
-//! In: the road's points (ego frame, metres) and widths. Out: the bonus of every cell whose middle lies on the road.
-//! The direction at a point is that from the point before to the one after; the edge points lie half the width to each
-//! side; each pair of points with its four edge points is one convex piece, painted row by row (§3.2.1). Where pieces
-//! overlap, in bends, the larger bonus stays, whatever their order.
+//! In: the road's points (ego frame, metres) and widths. Out: the bonus of each cell whose centre lies on the road. The
+//! direction at a point is that from the point before to the point after. The edge points lie half the width to each
+//! side. Each pair of points with its four edge points is one convex piece, which is painted row by row (section
+//! 3.2.1). If pieces overlap, in bends, the larger bonus is kept, so that their order does not matter.
 
-use crate::config::{Bonus, SpeedConfig};
+use super::config::{Bonus, SpeedConfig};
 
 /// Bonus of a cell that is not on the road.
 pub const NO_ROAD: f32 = -1.0;
 
-/// Paints roads into one grid, `side` cells along x and y; the vehicle stands in the middle.
+/// Painter of roads into a grid of `side` cells along x and y with the vehicle in the middle.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Painter {
     side: usize,
@@ -19,9 +19,9 @@ pub struct Painter {
     bonus_max_mps: f32,
     reach_m: f32,
     bonus_mps: Vec<f32>,
-    /// Whether anything was painted since the last time the grid was cleared.
+    /// True if a road was painted since the grid was last cleared.
     painted: bool,
-    /// Edge points: left, right.
+    /// By point of the road: its edge points left and right, ego frame, metres.
     edges: Vec<[[f64; 2]; 2]>,
 }
 
@@ -40,12 +40,12 @@ impl Painter {
         }
     }
 
-    /// By cell: [`NO_ROAD`], or 0 and more.
+    /// Bonus by cell, m/s: [`NO_ROAD`], or 0 or more.
     pub fn bonus_mps(&self) -> &[f32] {
         &self.bonus_mps
     }
 
-    /// Takes all road away.
+    /// Removes all roads.
     pub fn clear(&mut self) {
         if self.painted {
             self.bonus_mps.fill(NO_ROAD);
@@ -53,7 +53,7 @@ impl Painter {
         }
     }
 
-    /// Paints one road: points that [`crate::road::check`] has passed, and their widths.
+    /// Paints one road: points that [`crate::road::check`] accepted, and their widths, metres.
     pub fn paint(&mut self, points: &[[f64; 2]], widths_m: &[f64]) {
         self.painted = true;
         edge_points(points, widths_m, &mut self.edges);
@@ -68,7 +68,7 @@ impl Painter {
 
     fn paint_piece(&mut self, corners: &[[f64; 2]; 4], piece: &Piece) {
         let middle = self.side as f64 / 2.0;
-        // In cells, the middle of cell i at i.
+        // Positions in cells: the centre of cell i is i.
         let in_cells = |m: f64| m / self.cell_m + middle - 0.5;
         let corners = corners.map(|[x, y]| [in_cells(x), in_cells(y)]);
         let lowest = corners.iter().map(|c| c[1]).fold(f64::INFINITY, f64::min);
@@ -92,8 +92,9 @@ impl Painter {
     }
 }
 
-/// The inner loop: d and r are linear along the row, so a cell takes 2 multiplications for them, 2 for the squares, 1
-/// division and 1 multiplication for the bonus; the paper needed 8 and 1.
+/// Paints one row of a piece. Distance and radius are linear along the row, so that a cell costs 2 multiplications for
+/// them, 2 for the squares, and 1 division and 1 multiplication for the bonus; the paper states 8 multiplications and 1
+/// division (section 3.2.2).
 #[inline(always)]
 fn paint_row(row: &mut [f32], start: Across, step: Across, bonus_max: f32, scale_squared: impl Fn(f32) -> f32) {
     for (k, cell) in row.iter_mut().enumerate() {
@@ -102,38 +103,40 @@ fn paint_row(row: &mut [f32], start: Across, step: Across, bonus_max: f32, scale
         let radius = start.radius_m + k * step.radius_m;
         let relative_squared = distance * distance / scale_squared(radius);
         let bonus = bonus_max * (1.0 - relative_squared);
-        // At the edge 0; beyond it, in the outside of a bend, no less. NaN (0/0) loses to 0 too.
+        // The bonus is 0 at the edge, and beyond it on the outside of a bend. `max` returns 0 for NaN (0/0).
         *cell = cell.max(bonus.max(0.0));
     }
 }
 
-/// Where a place lies across the road.
+/// Position of a point across the road.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Across {
-    /// From the centre line, left positive.
+    /// Distance from the centre line, metres, positive to the left.
     distance_m: f32,
-    /// Half the road's width beside the place.
+    /// Half the road's width at the same place along it, metres.
     radius_m: f32,
 }
 
-/// One pair of points: `d` and `r(t)` of §3.2.2 as linear functions of the place.
+/// One pair of points: `d` and `r(t)` (Lindström 2005, section 3.2.2) as linear functions of the position.
 struct Piece {
     from: [f64; 2],
     /// Unit vector along the piece.
     along: [f64; 2],
-    /// Half widths at both ends, and the piece's length.
+    /// Half widths at both ends, metres.
     radii_m: [f64; 2],
+    /// Length of the piece, metres.
     length_m: f64,
 }
 
 impl Piece {
-    /// `None` where both points are one.
+    /// The piece of two points; `None` if they are equal.
     fn new([from, to]: [[f64; 2]; 2], radii_m: [f64; 2]) -> Option<Self> {
         let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
         let length_m = dx.hypot(dy);
         (length_m > 0.0).then(|| Self { from, along: [dx / length_m, dy / length_m], radii_m, length_m })
     }
 
+    /// Distance and radius at a position.
     fn at(&self, [x, y]: [f64; 2]) -> Across {
         let (qx, qy) = (x - self.from[0], y - self.from[1]);
         let [ax, ay] = self.along;
@@ -142,7 +145,7 @@ impl Piece {
         Across { distance_m: (ax * qy - ay * qx) as f32, radius_m: (r0 + t * (r1 - r0)) as f32 }
     }
 
-    /// What both change by over `x_m` along x.
+    /// Change of distance and radius over `x_m` along x.
     fn along_x(&self, x_m: f64) -> Across {
         let [ax, ay] = self.along;
         let [r0, r1] = self.radii_m;
@@ -150,7 +153,7 @@ impl Piece {
     }
 }
 
-/// Edge points of every point: half the width to the left and to the right of the direction there.
+/// Computes the edge points of each point: half the width to the left and to the right of the direction there.
 pub fn edge_points(points: &[[f64; 2]], widths_m: &[f64], edges: &mut Vec<[[f64; 2]; 2]>) {
     edges.clear();
     let last = points.len().saturating_sub(1);
@@ -161,7 +164,7 @@ pub fn edge_points(points: &[[f64; 2]], widths_m: &[f64], edges: &mut Vec<[[f64;
         };
         let (mut dx, mut dy, mut length) = direction(i.saturating_sub(1), (i + 1).min(last));
         if length == 0.0 {
-            // The road turns back on itself: the way it came counts.
+            // The road turns back on itself: the direction from the point before counts.
             (dx, dy, length) = direction(i.saturating_sub(1), i);
         }
         let half = if length > 0.0 { width / 2.0 / length } else { 0.0 };
@@ -169,7 +172,7 @@ pub fn edge_points(points: &[[f64; 2]], widths_m: &[f64], edges: &mut Vec<[[f64;
     }
 }
 
-/// Where the line of all middles of row `y` runs through a polygon; `None` where it does not.
+/// Range of x in which the line through the cell centres of row `y` crosses a polygon; `None` if it does not.
 fn span(corners: &[[f64; 2]; 4], y: f64) -> Option<(f64, f64)> {
     let (mut from, mut to) = (f64::INFINITY, f64::NEG_INFINITY);
     for i in 0..4 {
@@ -182,9 +185,9 @@ fn span(corners: &[[f64; 2]; 4], y: f64) -> Option<(f64, f64)> {
     (from <= to).then_some((from, to))
 }
 
-/// Cells whose middles lie between two places, in cells.
+/// Indices of the cells whose centres lie between two positions, which are in cells.
 fn cells_between(from: f64, to: f64, side: usize) -> std::ops::Range<usize> {
-    // `as` saturates, so places far outside fall on the grid's border.
+    // `as` saturates, so that positions far outside become the grid's border.
     let start = from.ceil().max(0.0) as usize;
     let end = ((to.floor() + 1.0).max(0.0) as usize).min(side);
     start.min(end)..end

@@ -1,16 +1,16 @@
-//! Principal components of a covariance, in closed form, as far as the maps need them.
+//! Principal components of a covariance matrix, in closed form.
 //!
 //! In: variances xx, yy, zz and covariances xy, xz, yz, m². Out: the eigenvalues, and which of them belongs to the most
-//! vertical eigenvector: Neuhaus 2009 eq. 1. The trigonometric solution of the characteristic polynomial in f64, scaled
-//! first, with the cosine of the third of the angle found by Newton's method instead of the system's `acos` and `cos`,
-//! whose last bits differ from machine to machine. The vertical share of an eigenvector follows from the eigenvalues of
-//! the matrix and those of its horizontal part, so no eigenvector is computed.
+//! vertical eigenvector (Neuhaus 2009, eq. 1). The matrix is scaled first; then the characteristic polynomial is solved
+//! trigonometrically in f64. Newton's method finds the cosine of a third of the angle, because the last bits of the
+//! system's `acos` and `cos` differ from machine to machine. The vertical component of an eigenvector follows from the
+//! eigenvalues of the matrix and of its horizontal part, so that no eigenvector is computed.
 
-/// Eigenvalues nearer to one another than this share of the largest entry are one double eigenvalue: beneath, the
-/// closed form's rounding decides which eigenvector is which.
+/// Least difference between two distinct eigenvalues, relative to the largest entry. Ours: below it, rounding decides
+/// which eigenvector belongs to which value.
 const DOUBLE: f64 = 1e-6;
 
-/// What principal component analysis says of some points.
+/// Result of the principal component analysis of a set of points.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Principal {
     /// Variance along the principal axes, m², largest first.
@@ -20,9 +20,9 @@ pub struct Principal {
 }
 
 impl Principal {
-    /// Of a covariance matrix: xx, yy, zz, xy, xz, yz.
-    pub fn of(covariance: [f64; 6]) -> Self {
-        // What is no number is not flat.
+    /// The principal components of a covariance matrix: xx, yy, zz, xy, xz, yz.
+    pub fn from_covariance(covariance: [f64; 6]) -> Self {
+        // A value that is not a number is not flat.
         if covariance.iter().any(|value| !value.is_finite()) {
             return Self { values: [f64::INFINITY; 3], vertical: 0 };
         }
@@ -41,7 +41,7 @@ impl Principal {
     }
 }
 
-/// Written so that x and y may change places without changing a bit of the result.
+/// Eigenvalues, largest first. Exchanging x and y does not change a bit of the result.
 fn eigenvalues([xx, yy, zz, xy, xz, yz]: [f64; 6]) -> [f64; 3] {
     let mean = ((xx + yy) + zz) / 3.0;
     let (x, y, z) = (xx - mean, yy - mean, zz - mean);
@@ -52,8 +52,8 @@ fn eigenvalues([xx, yy, zz, xy, xz, yz]: [f64; 6]) -> [f64; 3] {
     }
     let determinant = ((x * y) * z + 2.0 * (xy * (xz * yz))) - (x * (yz * yz) + y * (xz * xz)) - z * (xy * xy);
     let cosine = (determinant / (2.0 * radius * radius * radius)).clamp(-1.0, 1.0);
-    // In units of twice the radius from the mean the single one of the outer eigenvalues is the cosine of a third of
-    // the angle, on the side of the cosine's sign; the two others solve what is left, a square equation.
+    // In units of twice the radius from the mean, one of the outer eigenvalues is the cosine of a third of the angle,
+    // on the side of the cosine's sign. The two others solve the quadratic equation that remains.
     let single = cosine_of_third(cosine.abs());
     let (middle, spread) = (-single / 2.0, (3.0 * (1.0 - single * single)).max(0.0).sqrt() / 2.0);
     let own = [single, middle + spread, middle - spread].map(|value| 2.0 * radius * value);
@@ -63,7 +63,7 @@ fn eigenvalues([xx, yy, zz, xy, xz, yz]: [f64; 6]) -> [f64; 3] {
 /// cos(acos(cosine) / 3) for 0 <= cosine <= 1: the root of 4c³ - 3c = cosine between 0.86 and 1, where the slope is 6
 /// to 9.
 fn cosine_of_third(cosine: f64) -> f64 {
-    // The chord is nearer than 0.006; three steps square that to less than rounding.
+    // The chord is off by less than 0.006; the fourth step squares the error to less than rounding.
     let mut c = 0.866_025_403_784_438_6 + 0.133_974_596_215_561_4 * cosine;
     for _ in 0..4 {
         c -= ((4.0 * c * c - 3.0) * c - cosine) / (12.0 * c * c - 3.0);
@@ -71,16 +71,17 @@ fn cosine_of_third(cosine: f64) -> f64 {
     c
 }
 
+/// Index of the eigenvalue with the most vertical eigenvector.
 fn most_vertical([xx, yy, _, xy, ..]: [f64; 6], values: [f64; 3]) -> usize {
     let [a, b, c] = values;
-    // Squared vertical component of the eigenvector of `of`, whose value is none of the two others.
+    // Squared vertical component of the eigenvector of the value `of`; `others` are the two other values.
     let vertical =
         |of: f64, others: [f64; 2]| ((xx - of) * (yy - of) - xy * xy) / ((of - others[0]) * (of - others[1]));
     let (upper, lower) = (a - b < DOUBLE, b - c < DOUBLE);
     match (upper, lower) {
-        // Any direction is an eigenvector.
+        // Each direction is an eigenvector.
         (true, true) => 0,
-        // Of the eigenvectors in the plane of a double value one is as vertical as the plane.
+        // One eigenvector in the plane of a double value is as vertical as the plane.
         (true, false) => {
             let single = vertical(c, [a, b]);
             if single > 1.0 - single { 2 } else { 0 }
@@ -115,7 +116,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn values_and_the_vertical_one_are_those_the_matrix_was_made_of(
+        fn a_matrix_made_from_eigenvalues_gives_them_back(
             values in prop::array::uniform3(0f64..30.0), roll in -3f64..3.0, pitch in -1.5f64..1.5, yaw in -3f64..3.0,
             thin in 0f64..1.0,
         ) {
@@ -123,7 +124,7 @@ mod tests {
             values[2] *= thin.powi(6);
             let axes = Rotation3::from_euler_angles(roll, pitch, yaw);
             let matrix = axes.matrix() * Matrix3::from_diagonal(&Vector3::from(values)) * axes.matrix().transpose();
-            let found = Principal::of(entries(&matrix));
+            let found = Principal::from_covariance(entries(&matrix));
             let mut sorted = values;
             sorted.sort_by(|a, b| b.total_cmp(a));
             for (found, made) in found.values.iter().zip(sorted) {
@@ -140,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn the_third_of_an_angle_is_what_the_system_says() {
+    fn the_cosine_of_a_third_agrees_with_the_standard_library() {
         for step in 0..=1000 {
             let cosine = f64::from(step) / 1000.0;
             assert!((cosine_of_third(cosine) - (cosine.acos() / 3.0).cos()).abs() < 4e-16, "{cosine}");
@@ -148,14 +149,14 @@ mod tests {
     }
 
     #[test]
-    fn exact_shapes_have_the_disturbance_one_expects() {
-        let h = |covariance| Principal::of(covariance).height_disturbance();
+    fn exact_shapes_have_their_height_disturbance() {
+        let h = |covariance| Principal::from_covariance(covariance).height_disturbance();
         // Level plane, pole, wall, ball, line along x, nothing.
         assert_eq!(h([1.0, 1.0, 0.0, 0.0, 0.0, 0.0]), 0.0);
         assert!((h([1e-4, 1e-4, 1.0, 0.0, 0.0, 0.0]) - 1.0).abs() < 1e-12);
         assert!((h([0.0, 1.0, 0.5, 0.0, 0.0, 0.0]) - 0.5).abs() < 1e-12);
         assert!((h([2.0, 2.0, 2.0, 0.0, 0.0, 0.0]) - 2.0).abs() < 1e-12);
-        // Where two values are one, half the digits are lost.
+        // With a double value half the digits are lost.
         assert!(h([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]).abs() < 1e-7);
         assert_eq!(h([0.0; 6]), 0.0);
         assert_eq!(h([f64::NAN; 6]), f64::INFINITY);

@@ -1,31 +1,34 @@
-//! Beyond the paper: which flat regions are ground the vehicle stands on, and how far seen ground speaks for holes.
+//! Which flat regions join the ground under the vehicle, and which holes in that ground are inferred. Not in the paper.
 //!
-//! In: flat regions with their planes, cells that hold points. Out: by region whether it joins the ground under the
-//! vehicle without a step; by cell whether it is a hole narrow enough to be filled. A car's roof is as flat as a road;
-//! what tells them apart is the step between. A region of the division may reach far beyond the last point in it; what
-//! lies between two seen cells a short way apart is inferred, what lies beyond is unknown.
+//! In: flat regions with their planes, cells with points. Out: by region whether it joins the ground under the vehicle
+//! without a step; by cell whether it lies in a hole narrow enough to be filled. A car's roof is as flat as a road; the
+//! step between them tells them apart. A region of the division may extend far beyond the last point in it: only cells
+//! between two seen cells a short distance apart are inferred; all others are unknown.
 
-use crate::config::TerrainConfig;
-
+use super::config::TerrainConfig;
 use super::moments::Cells;
-use super::regions::{FIRST_FLAT, NOTHING, Plane, Regions};
+use super::regions::{FIRST_FLAT, NOT_JUDGED, Plane, Regions};
 
 /// Joined regions, and filled holes.
 #[derive(Clone, Debug, Default)]
 pub struct Ground {
-    /// Forest of regions; node 0 is the ground under the vehicle, node `1 + i` region `i`.
+    /// Union-find forest of regions: node 0 is the ground under the vehicle, node `1 + i` is region `i`.
     parent: Vec<u32>,
+    /// By region.
     joined: Vec<bool>,
-    /// Cells that are filled, each once, and by cell whether it is.
+    /// Indices of the filled cells, each once.
     filled: Vec<u32>,
+    /// By cell: true if it is in `filled`.
     is_filled: Vec<bool>,
+    /// By cell.
     bridged: Vec<bool>,
+    /// Indices of the cells with points, ascending.
     seen_cells: Vec<u32>,
 }
 
 impl Ground {
-    /// Joins regions and fills holes; `seen` tells by cell whether a point fell into it.
-    pub fn find(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
+    /// Joins regions and fills holes. `seen` is true by cell if a point fell into it.
+    pub fn join_and_fill(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
         self.parent.clear();
         self.parent.extend(0..=regions.planes().len() as u32);
         self.start_under_the_vehicle(cells, regions, seen, config);
@@ -41,7 +44,7 @@ impl Ground {
         self.fill_holes(cells, regions, seen, config);
     }
 
-    /// Seen cells in the blind zone that are about as high as the ground under the vehicle.
+    /// Joins the regions of seen cells in the blind zone that are about as high as the ground under the vehicle.
     fn start_under_the_vehicle(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
         let (width, margin) = (cells.width(), cells.margin());
         let reach = ((config.blind_zone_m / cells.cell_m()).ceil() as usize).min(width / 2);
@@ -62,15 +65,15 @@ impl Ground {
         }
     }
 
-    /// Flat regions that touch, and whose planes meet there without a step.
+    /// Joins flat regions that touch, if their planes meet there without a step.
     fn join_neighbours(&mut self, cells: &Cells, regions: &Regions, config: &TerrainConfig) {
         let (width, margin) = (cells.width() as u32, cells.margin());
         let (of_cell, planes) = (regions.of_cell(), regions.planes());
-        // Each region looks over its far sides; the near ones are far sides of its neighbours.
+        // Each region compares itself across its right and upper sides; the other two belong to its neighbours.
         for (here, &[left, low, right, high]) in regions.extents().iter().enumerate() {
             let ahead = (low..high).filter(|_| right < width).map(|iy| (right, iy, -0.5, 0.0));
             let beside = (left..right).filter(|_| high < width).map(|ix| (ix, high, 0.0, -0.5));
-            let mut last = NOTHING;
+            let mut last = NOT_JUDGED;
             for (ix, iy, dx, dy) in ahead.chain(beside) {
                 let other = of_cell[(iy * width + ix) as usize];
                 if other < FIRST_FLAT {
@@ -87,6 +90,7 @@ impl Ground {
         }
     }
 
+    /// Root of a node's tree.
     fn root(&mut self, mut node: u32) -> u32 {
         while self.parent[node as usize] != node {
             let above = self.parent[self.parent[node as usize] as usize];
@@ -96,14 +100,15 @@ impl Ground {
         node
     }
 
+    /// Joins the trees of two nodes.
     fn join(&mut self, a: u32, b: u32) {
         let (a, b) = (self.root(a), self.root(b));
-        // The smaller number is the root: the ground under the vehicle stays one.
+        // The smaller number becomes the root, so that node 0 stays a root.
         self.parent[a.max(b) as usize] = a.min(b);
     }
 
-    /// Along every row and every column: flat regions with nothing but unseen cells between them, as the rings of far
-    /// ground are, whose planes meet half-way without a step.
+    /// Joins flat regions along rows and columns that have only unseen cells between them, as the rings of far ground
+    /// do, if their planes meet half-way without a step.
     fn join_over_gaps(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
         let seen_cells = std::mem::take(&mut self.seen_cells);
         self.bridged.clear();
@@ -124,8 +129,8 @@ impl Ground {
         self.seen_cells = seen_cells;
     }
 
-    /// Along every row and every column, between two seen cells of the ground: unseen cells of its regions, and seen
-    /// ones of too few points that lie on it.
+    /// Fills cells along rows and columns between two seen cells of the ground: unseen cells of its regions, and seen
+    /// cells with too few points that lie on it.
     fn fill_holes(&mut self, cells: &Cells, regions: &Regions, seen: &[bool], config: &TerrainConfig) {
         let view = View { cells, regions, seen, seen_cells: &self.seen_cells, config };
         let (joined, of_cell) = (&self.joined, regions.of_cell());
@@ -145,23 +150,23 @@ impl Ground {
         });
     }
 
-    /// By flat region: whether it joins the ground under the vehicle.
+    /// True by flat region if it joins the ground under the vehicle.
     pub fn joined(&self) -> &[bool] {
         &self.joined
     }
 
-    /// Cells that lie in a hole of seen ground: unseen there, or seen with too few points to be judged alone.
+    /// Indices of the cells in holes of seen ground: unseen cells, or seen cells with too few points to be judged.
     pub fn filled(&self) -> &[u32] {
         &self.filled
     }
 
-    /// By cell: whether it lies in a gap over which two regions were joined.
+    /// True by cell if it lies in a gap across which two regions were joined.
     pub fn bridged(&self) -> &[bool] {
         &self.bridged
     }
 }
 
-/// Two cells of one row or column, and those between them.
+/// Two cells of one row or column, and the cells between them.
 struct Hole {
     from: usize,
     to: usize,
@@ -169,25 +174,27 @@ struct Hole {
 }
 
 impl Hole {
+    /// Indices of the cells between the two.
     fn within(&self) -> impl Iterator<Item = usize> + use<> {
         (self.from + self.stride..self.to).step_by(self.stride)
     }
 }
 
+/// The cells and regions of one map, for the search of holes.
 struct View<'a> {
     cells: &'a Cells,
     regions: &'a Regions,
     seen: &'a [bool],
-    /// The same as a list, row by row.
+    /// Indices of the seen cells, ascending.
     seen_cells: &'a [u32],
     config: &'a TerrainConfig,
 }
 
 impl View<'_> {
-    /// Calls `take` for every pair of neighbouring seen cells of a row or column whose regions are `of_ground`, with at
-    /// most `span` cells between, in which nothing stands: those are unseen, or their few points lie on the ground of
+    /// Calls `visit` for each pair of neighbouring seen cells of a row or column whose regions are `of_ground`, with at
+    /// most `span` cells between them. The cells between must be unseen, or their few points must lie on the planes of
     /// both.
-    fn for_each_hole(&self, span: usize, of_ground: impl Fn(u32) -> bool, mut take: impl FnMut(&Hole)) {
+    fn for_each_hole(&self, span: usize, of_ground: impl Fn(u32) -> bool, mut visit: impl FnMut(&Hole)) {
         const NONE: u32 = u32::MAX;
         let width = self.cells.width();
         let of_cell = self.regions.of_cell();
@@ -195,8 +202,8 @@ impl View<'_> {
         let (mut row, mut last_in_row) = (0, NONE);
         for &cell in self.seen_cells {
             let (cell, region) = (cell as usize, of_cell[cell as usize]);
-            if region == NOTHING {
-                // Too few points to be judged alone: checked where the hole ends.
+            if region == NOT_JUDGED {
+                // A cell with too few points is checked at the end of its hole.
                 continue;
             }
             let (iy, ix) = (cell / width, cell % width);
@@ -212,7 +219,7 @@ impl View<'_> {
                 if apart > stride && apart <= (span + 1) * stride {
                     let hole = Hole { from: last as usize, to: cell, stride };
                     if hole.within().all(|cell| !self.seen[cell] || self.lies_on_both(cell, &hole)) {
-                        take(&hole);
+                        visit(&hole);
                     }
                 }
             }
@@ -220,8 +227,9 @@ impl View<'_> {
         }
     }
 
+    /// True if the points of a cell lie on the planes of both ends of a hole.
     fn lies_on_both(&self, cell: usize, hole: &Hole) -> bool {
-        let (x, y) = self.place(cell);
+        let (x, y) = self.indices(cell);
         let [lowest, highest] = self.cells.span_m(self.cells.slot_at(x, y));
         let (x, y) = (self.cells.centre_m(x), self.cells.centre_m(y));
         [hole.from, hole.to].into_iter().all(|end| {
@@ -230,20 +238,21 @@ impl View<'_> {
         })
     }
 
-    /// Step between the planes of two cells, half-way between them.
+    /// Step between the planes of two cells, half-way between them, metres.
     fn step_m(&self, from: usize, to: usize) -> f32 {
-        let ((ax, ay), (bx, by)) = (self.place(from), self.place(to));
+        let ((ax, ay), (bx, by)) = (self.indices(from), self.indices(to));
         let middle = |a: usize, b: usize| (self.cells.centre_m(a) + self.cells.centre_m(b)) / 2.0;
         let (x, y) = (middle(ax, bx), middle(ay, by));
         (self.plane(from).height_m(x, y) - self.plane(to).height_m(x, y)).abs()
     }
 
+    /// Plane of a cell's flat region.
     fn plane(&self, cell: usize) -> Plane {
         self.regions.planes()[(self.regions.of_cell()[cell] - FIRST_FLAT) as usize]
     }
 
-    /// Where a cell of the grid lies in the division.
-    fn place(&self, cell: usize) -> (usize, usize) {
+    /// Indices (x, y) of a cell of the grid in the division.
+    fn indices(&self, cell: usize) -> (usize, usize) {
         let (width, margin) = (self.cells.width(), self.cells.margin());
         (cell % width + margin, cell / width + margin)
     }

@@ -1,25 +1,27 @@
-//! Neuhaus' terrain map (Neuhaus 2009 §2): where the ground is flat, by hierarchical principal component analysis, and
-//! how rough it is there.
+//! The layer `terrain` (Neuhaus 2009, section 2): where the ground is flat, by hierarchical principal component
+//! analysis, and how rough it is there.
 //!
-//! In: a [`Sweep`], ego frame, metres. Out: the layer `terrain`, square cells about the vehicle. The steps:
+//! In: a [`Sweep`], ego frame, metres. Out: the layer, square cells about the vehicle. The steps:
 //!
 //! | step | paper | where |
 //! |---|---|---|
-//! | points to cells; sums over any region in O(1) | §2.2 | [`moments`] |
-//! | principal components, local height disturbance h | §2.1, eq. 1 | [`eigen`] |
-//! | hierarchical division into flat regions (or each cell for itself) | §2.2, §2.3 | [`regions`] |
-//! | regions that join the ground under the vehicle; bounded inference | beyond the paper | [`ground`] |
-//! | which of it the vehicle gets to | beyond the paper | [`shadow`], [`reach`] |
-//! | roughness of flat cells | §2.4, §2.5, eq. 3 and 4 | [`crate::sensor::distance_series`], [`roughness`] |
+//! | points -> cells; sums over any region in O(1) | section 2.2 | [`moments`] |
+//! | principal components, local height disturbance h | section 2.1, eq. 1 | [`eigen`] |
+//! | hierarchical division into flat regions, or each cell by itself | sections 2.2 and 2.3 | [`regions`] |
+//! | regions that join the ground under the vehicle; bounded inference | not in the paper | [`ground`] |
+//! | which of this ground the vehicle can reach | not in the paper | [`shadow`], [`reach`] |
+//! | roughness of flat cells | sections 2.4 and 2.5, eq. 3 and 4 | [`crate::sensor::distance_series`], [`roughness`] |
 //!
-//! Three forms stand side by side ([`Form`]). `paper`: as published; car roofs are flat, and cells far beyond the last
-//! point are inferred. `grounded`: a flat region holds no point that stands out of its plane, joins the ground under
-//! the vehicle without a step, by ways the vehicle fits through, and speaks only for holes in seen ground. `grid`: each
-//! cell for itself, with the shape of its points.
+//! There are three variants ([`Variant`]):
+//! - `paper`: as published. Car roofs are flat, and cells far beyond the last point are inferred.
+//! - `grounded`: no point of a flat region lies off its plane; the region joins the ground under the vehicle without a
+//!   step, through passages that the vehicle fits through; only holes in seen ground are inferred.
+//! - `grid`: each cell by itself, with the shape of its points.
 //!
-//! Nothing depends on the order of the points: all sums are over whole numbers.
+//! The result does not depend on the order of the points: all sums are over whole numbers.
 
 pub mod class;
+pub mod config;
 pub mod eigen;
 pub mod ground;
 pub mod moments;
@@ -28,7 +30,6 @@ pub mod regions;
 pub mod roughness;
 pub mod shadow;
 
-use crate::config::{Form, TerrainConfig};
 use crate::layer::channel::TypedChannel;
 use crate::layer::class::drivable_share;
 use crate::layer::grid::Geometry;
@@ -36,17 +37,18 @@ use crate::layer::maker::{Context, Layer, LayerMaker, ScanExtras};
 use crate::sensor::sweep::Sweep;
 
 use class::{PLANE, ROUGHNESS, SHAPE, TerrainClass};
+use config::{TerrainConfig, Variant};
 use ground::Ground;
 use moments::{Cells, half_width};
-use reach::{Passage, Reach};
-use regions::{FIRST_FLAT, OBSTACLE as NOT_FLAT, Plane, Regions};
+use reach::{CellKind, Reach};
+use regions::{FIRST_FLAT, NOT_FLAT, Plane, Regions};
 use roughness::Roughness;
 use shadow::Shadow;
 
-/// What stands lower than this hides no more than itself: a kerb is no fence.
-const STANDS_M_MIN: f32 = 0.5;
+/// Least height of an obstacle that casts a shadow, metres. Ours: kerbs cast none; not tuned.
+const SHADOW_HEIGHT_M_MIN: f32 = 0.5;
 
-/// Makes the layer from sweep after sweep, reusing its buffers.
+/// Maker of the layer `terrain`. It reuses its buffers from map to map.
 pub struct Terrain {
     config: TerrainConfig,
     cells: Cells,
@@ -55,12 +57,14 @@ pub struct Terrain {
     shadow: Shadow,
     reach: Reach,
     roughness: Roughness,
+    /// By cell: true if a point fell into it.
     seen: Vec<bool>,
+    /// By cell.
     class: Vec<TerrainClass>,
 }
 
 impl Terrain {
-    /// Parameters must have passed [`crate::config::MapsConfig::validate`].
+    /// A maker with validated parameters.
     pub fn new(config: &TerrainConfig) -> Self {
         Self {
             config: config.clone(),
@@ -75,13 +79,14 @@ impl Terrain {
         }
     }
 
+    /// Fills `class` from the regions; `sensor_m` is the height of the sensor over the ground.
     fn classify(&mut self, sensor_m: f32) {
         let mut class = std::mem::take(&mut self.class);
         class.clear();
         let region_of = self.regions.of_cell();
-        if self.config.form == Form::Grounded {
+        if self.config.variant == Variant::Grounded {
             let joined = self.ground.joined();
-            // What is neither seen nor filled stays unknown.
+            // Cells that are neither seen nor filled stay unknown.
             class.resize(region_of.len(), TerrainClass::Unknown);
             for &cell in self.regions.cell_of_slot() {
                 class[cell as usize] = match region_of[cell as usize] {
@@ -97,7 +102,7 @@ impl Terrain {
                     *class = if self.seen[cell as usize] { TerrainClass::Flat } else { TerrainClass::FlatInferred };
                 }
             }
-            self.gate(&mut class, sensor_m);
+            self.remove_unreached(&mut class, sensor_m);
         } else {
             class.extend(region_of.iter().zip(&self.seen).map(|(&region, &seen)| match (region, seen) {
                 (NOT_FLAT, _) => TerrainClass::Obstacle,
@@ -109,16 +114,20 @@ impl Terrain {
         self.class = class;
     }
 
-    /// Takes back ground the vehicle does not get to; what is only inferred there is not known.
-    fn gate(&mut self, class: &mut [TerrainClass], sensor_m: f32) {
-        let TerrainConfig { gate_m_min, blind_zone_m, cell_m, .. } = self.config;
+    /// Marks flat cells that the vehicle cannot reach; inferred cells there become unknown.
+    fn remove_unreached(&mut self, class: &mut [TerrainClass], sensor_m: f32) {
+        let TerrainConfig { passage_m_min, blind_zone_m, cell_m, .. } = self.config;
         let (cells, seen, bridged) = (&self.cells, &self.seen, self.ground.bridged());
-        self.shadow.clear(class.len(), |cell| cells.middle_m(cell));
-        for (slot, &cell) in
-            self.regions.cell_of_slot().iter().enumerate().filter(|(_, cell)| class[**cell as usize] == TerrainClass::Obstacle)
+        self.shadow.clear(class.len(), |cell| cells.cell_centre_m(cell));
+        for (slot, &cell) in self
+            .regions
+            .cell_of_slot()
+            .iter()
+            .enumerate()
+            .filter(|(_, cell)| class[**cell as usize] == TerrainClass::Obstacle)
         {
             let [lowest_m, highest_m] = cells.span_m(slot);
-            if highest_m - lowest_m >= STANDS_M_MIN {
+            if highest_m - lowest_m >= SHADOW_HEIGHT_M_MIN {
                 self.shadow.cast(cell as usize, cell_m, [lowest_m, highest_m], sensor_m);
             }
         }
@@ -128,51 +137,56 @@ impl Terrain {
         let width = cells.width();
         let blind = (blind_zone_m / cell_m).ceil() as usize;
         let is_near = |ix: usize| ix + blind >= width / 2 && ix < width / 2 + blind;
-        let passage = |ix: usize, iy: usize| match (iy * width + ix, class[iy * width + ix]) {
-            (_, TerrainClass::Flat) => Passage::Open,
-            (_, TerrainClass::Obstacle | TerrainClass::FlatElevated) => Passage::Closed,
-            (cell, _) if seen[cell] => Passage::None,
-            (_, TerrainClass::FlatInferred) => Passage::Open,
-            (cell, _) if (bridged[cell] || is_ground(regions[cell])) && !shadow.hides(cell) => Passage::Open,
-            (cell, _) if is_near(ix) && is_near(iy) && shadow.distance_m(cell) <= blind_zone_m => Passage::Open,
-            _ => Passage::None,
+        let kind = |ix: usize, iy: usize| match (iy * width + ix, class[iy * width + ix]) {
+            (_, TerrainClass::Flat) => CellKind::Open,
+            (_, TerrainClass::Obstacle | TerrainClass::FlatElevated) => CellKind::Closed,
+            (cell, _) if seen[cell] => CellKind::NoGround,
+            (_, TerrainClass::FlatInferred) => CellKind::Open,
+            (cell, _) if (bridged[cell] || is_ground(regions[cell])) && !shadow.hides(cell) => CellKind::Open,
+            (cell, _) if is_near(ix) && is_near(iy) && shadow.distance_m(cell) <= blind_zone_m => CellKind::Open,
+            _ => CellKind::NoGround,
         };
-        // Between obstacles so far apart at least this many whole cells are free, less one: the disc's middle.
-        let radius = ((gate_m_min / cell_m - 2.0) / 2.0).max(0.0) as usize;
-        self.reach.find(width, radius, passage);
+        // Radius, in cells, of the largest disc sure to fit through a passage of `passage_m_min`.
+        let radius = ((passage_m_min / cell_m - 2.0) / 2.0).max(0.0) as usize;
+        self.reach.flood(width, radius, kind);
         for (iy, row) in class.chunks_exact_mut(width).enumerate() {
             for (ix, class) in row.iter_mut().enumerate() {
                 if matches!(*class, TerrainClass::Flat | TerrainClass::FlatInferred) && !self.reach.reached(ix, iy) {
-                    *class = if *class == TerrainClass::Flat { TerrainClass::FlatUnreachable } else { TerrainClass::Unknown };
+                    *class = if *class == TerrainClass::Flat {
+                        TerrainClass::FlatUnreachable
+                    } else {
+                        TerrainClass::Unknown
+                    };
                 }
             }
         }
     }
 
-    /// Roughness of the flat cells (drivable regions are examined further, §2.4).
+    /// Writes the roughness of the flat cells (section 2.4); `raw` is empty before.
     fn write_roughness(&mut self, sweep: &Sweep, raw: &mut Vec<u8>) {
         raw.resize(self.class.len(), ROUGHNESS.unknown);
         if sweep.deviation_m.is_empty() {
             return;
         }
-        self.roughness.take(sweep, &self.cells);
+        self.roughness.sum(sweep, &self.cells);
         for (slot, &cell) in self.regions.cell_of_slot().iter().enumerate() {
             let cell = cell as usize;
             if self.class[cell] == TerrainClass::Flat {
-                let [x, y] = self.cells.middle_m(cell);
+                let [x, y] = self.cells.cell_centre_m(cell);
                 let distance_m = (x * x + y * y + sweep.mount_height_m * sweep.mount_height_m).sqrt();
                 raw[cell] = self.roughness.raw(slot, distance_m, &self.config);
             }
         }
     }
 
+    /// Writes one channel of [`PLANE`]; `raw` is empty before.
     fn write_plane(&self, axis: usize, raw: &mut Vec<i8>) {
         raw.extend(self.class.iter().zip(self.regions.of_cell()).enumerate().map(|(cell, (&class, &region))| {
             if region < FIRST_FLAT || class == TerrainClass::Unknown {
                 return PLANE[axis].unknown;
             }
             let plane @ Plane([a, b, _]) = &self.regions.planes()[(region - FIRST_FLAT) as usize];
-            let [x, y] = self.cells.middle_m(cell);
+            let [x, y] = self.cells.cell_centre_m(cell);
             let value = [plane.height_m(x, y), *a, *b][axis] / PLANE[axis].scale;
             value.round().clamp(f32::from(i8::MIN + 1), f32::from(i8::MAX)) as i8
         }));
@@ -188,7 +202,7 @@ impl Terrain {
         layer.metrics.push(("inferred_share", if flat == 0.0 { 0.0 } else { inferred / flat }));
         layer.metrics.push(("flat_regions", self.regions.planes().len() as f64));
         TypedChannel::CLASS.store(&mut layer.channels, class);
-        if self.config.form == Form::Grid {
+        if self.config.variant == Variant::Grid {
             let mut shape = SHAPE.reuse(&mut layer.channels);
             shape.extend(self.regions.shape_of_cell().iter().map(|shape| *shape as u8));
             SHAPE.store(&mut layer.channels, shape);
@@ -207,7 +221,7 @@ impl Terrain {
 impl LayerMaker for Terrain {
     fn layer(&self) -> Layer {
         let mut channels = vec![TypedChannel::CLASS.empty()];
-        if self.config.form == Form::Grid {
+        if self.config.variant == Variant::Grid {
             channels.push(SHAPE.empty());
         }
         channels.push(ROUGHNESS.empty());
@@ -224,13 +238,13 @@ impl LayerMaker for Terrain {
     }
 
     fn make(&mut self, sweep: &Sweep, _: &Context<'_>, layer: &mut Layer) {
-        self.cells.take(sweep, self.config.overhang_m);
-        self.regions.find(&self.cells, &self.config);
+        self.cells.sort_points(sweep, self.config.overhang_m);
+        self.regions.divide(&self.cells, &self.config);
         self.seen.clear();
         self.seen.resize(self.regions.of_cell().len(), false);
         self.regions.cell_of_slot().iter().for_each(|cell| self.seen[*cell as usize] = true);
-        if self.config.form == Form::Grounded {
-            self.ground.find(&self.cells, &self.regions, &self.seen, &self.config);
+        if self.config.variant == Variant::Grounded {
+            self.ground.join_and_fill(&self.cells, &self.regions, &self.seen, &self.config);
         }
         self.classify(sweep.mount_height_m);
         self.write(sweep, layer);

@@ -1,28 +1,28 @@
-//! Points to cells, and the sums a principal component analysis needs over any region of the division, in O(1).
+//! Points -> cells, and the sums for a principal component analysis over any region of the division, in O(1).
 //!
-//! In: a [`Sweep`], ego frame, metres. Out: for every cell that holds a point its ten moments in whole millimetres, and
-//! their running sums in the order of the division: a square is cut into four quarters, each of them again, down to one
-//! cell (Morton order). A region of that division is a stretch of the order, so its sums are one difference. It is a
-//! summed-area table of only those cells that hold something: a tenth of them on real scans.
+//! In: a [`Sweep`], ego frame, metres. Out: for each cell with a point its ten moments in whole millimetres, and their
+//! running sums in the order of the division. The division cuts a square into four quarters, and each quarter again,
+//! down to one cell (Morton order). A region of the division is a range of that order, so its sums are one difference.
+//! Only cells with points have an entry ("slot"): a tenth of the cells on real scans.
 //!
-//! Sums of whole numbers are exact: they do not depend on the order of the points.
+//! Sums of whole numbers are exact, so that they do not depend on the order of the points.
 
 use crate::sensor::sweep::Sweep;
 
-/// Of a point that lies in no cell.
+/// Cell of a point that lies in no cell.
 const NOWHERE: u32 = u32::MAX;
-/// From 2^23 to 2^24 an f32 holds whole numbers, and nothing else.
+/// A value from 2^23 to 2^24, where each f32 is a whole number.
 const WHOLE: f32 = 1.5 * 8_388_608.0;
-/// Points lower than this are no positions on the ground, metres; it bounds the sums.
+/// Largest depth of a point below the ego origin, metres. Ours: it bounds the sums.
 const DEPTH_M_MAX: f32 = 100.0;
 
 /// Sums over the points of a region: number, coordinates in mm, products in mm².
 ///
-/// All are whole numbers. They stay exact in an `f64`, in whatever order they are added, below 2^53: the products of
-/// 900,000 points all of which lie 100 m away.
+/// All are whole numbers. In an `f64` they are exact up to 2^53, the sum of the products of 900,000 points at 100 m,
+/// and do not depend on the order of addition.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Moments {
-    /// n; x, y, z; xx, yy, zz, xy, xz, yz.
+    /// Sums of 1; x, y, z; xx, yy, zz, xy, xz, yz.
     sums: [f64; 10],
 }
 
@@ -50,15 +50,15 @@ impl Moments {
         self.sums[0]
     }
 
-    /// Centre of the points, metres. There must be one.
+    /// Mean position (x, y, z) of the points, metres. The region must have a point.
     pub fn mean(&self) -> [f64; 3] {
         let [n, x, y, z, ..] = self.sums;
         [x, y, z].map(|sum| sum / n * 1e-3)
     }
 
-    /// Variances xx, yy, zz and covariances xy, xz, yz, m². There must be a point.
+    /// Variances xx, yy, zz and covariances xy, xz, yz, m². The region must have a point.
     ///
-    /// What is left of rounding is 1e-12 m² a hundred metres out.
+    /// The rounding error is 1e-12 m² at a distance of 100 m.
     pub fn covariance(&self) -> [f64; 6] {
         let share = 1.0 / self.points();
         let [_, x, y, z, xx, yy, zz, xy, xz, yz] = self.sums.map(|sum| sum * share);
@@ -73,43 +73,43 @@ impl Moments {
     }
 }
 
-/// The cells that hold points, in the order of the division.
+/// The cells with points, in the order of the division.
 #[derive(Clone, Debug, Default)]
 pub struct Cells {
-    /// Cells from the ego origin to the grid's edge.
+    /// Number of cells from the ego origin to the grid's edge.
     half: i32,
-    /// Cells from the ego origin to the edge of the division, a power of two.
+    /// Number of cells from the ego origin to the edge of the division, a power of two.
     root_half: i32,
     cell_m: f32,
-    /// Code of each point's cell, and once the slots are numbered its slot.
+    /// Code of each point's cell; after the slots are numbered, its slot.
     cell_of_point: Vec<u32>,
-    /// One bit a cell of the division, by code: whether it holds a point.
+    /// One bit for each cell of the division, by code: set if the cell has a point.
     occupied: Vec<u64>,
-    /// Occupied cells before each word of `occupied`.
+    /// Number of occupied cells before each word of `occupied`.
     slots_before: Vec<u32>,
     code_of_slot: Vec<u32>,
-    /// Sums of all slots before; one more than slots.
+    /// Sums over all slots before; one entry more than slots.
     sums: Vec<Moments>,
-    /// Lowest and highest point of each slot, mm.
+    /// Heights of the lowest and highest point of each slot, mm.
     span: Vec<[f32; 2]>,
 }
 
-/// Cells of a grid from the ego origin to its edge.
+/// Number of cells from the ego origin to the edge of a grid.
 pub fn half_width(range_m_max: f32, cell_m: f32) -> i32 {
-    // A hair less, so that 60 / 0.2 is 300 in whatever precision.
+    // Slightly less, so that 60 / 0.2 gives 300 despite rounding.
     (range_m_max / cell_m - 1e-3).ceil().max(1.0) as i32
 }
 
 impl Cells {
-    /// A grid reaching `range_m_max` from the ego origin in each direction.
+    /// A grid that ends `range_m_max` from the ego origin in each direction.
     pub fn new(range_m_max: f32, cell_m: f32) -> Self {
         let half = half_width(range_m_max, cell_m);
         let root_half = (half as u32).next_power_of_two() as i32;
         Self { half, root_half, cell_m, ..Self::default() }
     }
 
-    /// Sorts the points in; those higher than `overhang_m` or beyond the grid are left out.
-    pub fn take(&mut self, sweep: &Sweep, overhang_m: f32) {
+    /// Assigns the points to cells, and sums them. Points above `overhang_m` or beyond the grid are left out.
+    pub fn sort_points(&mut self, sweep: &Sweep, overhang_m: f32) {
         self.find_cells(sweep, overhang_m);
         self.number_slots();
         self.sum(sweep);
@@ -122,9 +122,9 @@ impl Cells {
             let (i, j) = (x * scale, y * scale);
             // NaN fails every comparison.
             let inside = (i >= -half) & (i < half) & (j >= -half) & (j < half) & (z <= overhang_m) & (z > -DEPTH_M_MAX);
-            // Wraps far outside, where it is not used.
-            let place = |value: f32| morton(floor(value).wrapping_add(root_half) as u32);
-            let found = place(i) | place(j) << 1;
+            // Far outside the value wraps, and is not used.
+            let spread = |value: f32| morton(floor(value).wrapping_add(root_half) as u32);
+            let found = spread(i) | spread(j) << 1;
             *code = if inside { found } else { NOWHERE };
         }
     }
@@ -154,9 +154,9 @@ impl Cells {
         self.sums.resize(slots + 1, Moments::default());
         self.span.clear();
         self.span.resize(slots, [f32::INFINITY, -f32::INFINITY]);
-        // A laser's neighbouring points mostly share a cell: they are summed before they are written.
+        // Neighbouring points of a laser mostly share a cell, so they are summed before the sums are written.
         let nothing = (Moments::default(), f32::INFINITY, -f32::INFINITY);
-        let (mut code, mut place, (mut held, mut low, mut high)) = (NOWHERE, NOWHERE, nothing);
+        let (mut code, mut slot_of_code, (mut held, mut low, mut high)) = (NOWHERE, NOWHERE, nothing);
         let mut write = |slot: u32, held: &Moments, low: f32, high: f32| {
             if slot != NOWHERE {
                 let slot = slot as usize;
@@ -168,17 +168,17 @@ impl Cells {
         let points = self.cell_of_point.iter_mut().zip(&sweep.x).zip(&sweep.y).zip(&sweep.z);
         for (((cell, &x), &y), &z) in points {
             if *cell != code {
-                write(place, &held, low, high);
+                write(slot_of_code, &held, low, high);
                 (code, (held, low, high)) = (*cell, nothing);
                 let inside = code != NOWHERE;
-                place = if inside { slot(&self.occupied, &self.slots_before, code) as u32 } else { NOWHERE };
+                slot_of_code = if inside { slot(&self.occupied, &self.slots_before, code) as u32 } else { NOWHERE };
             }
-            *cell = place;
+            *cell = slot_of_code;
             let [x, y, z] = [x, y, z].map(millimetres);
             held.add([x, y, z]);
             (low, high) = (if z < low { z } else { low }, if z > high { z } else { high });
         }
-        write(place, &held, low, high);
+        write(slot_of_code, &held, low, high);
         let mut running = Moments::default();
         for sums in &mut self.sums {
             running = running.plus(sums);
@@ -186,17 +186,17 @@ impl Cells {
         }
     }
 
-    /// Cells along a side of the grid.
+    /// Number of cells along a side of the grid.
     pub fn width(&self) -> usize {
         2 * self.half as usize
     }
 
-    /// Cells along a side of the division, a power of two.
+    /// Number of cells along a side of the division, a power of two.
     pub fn root_width(&self) -> usize {
         2 * self.root_half as usize
     }
 
-    /// Cells the division reaches beyond the grid on each side.
+    /// Number of cells between the edges of the grid and of the division, on each side.
     pub fn margin(&self) -> usize {
         (self.root_half - self.half) as usize
     }
@@ -206,22 +206,22 @@ impl Cells {
         self.cell_m
     }
 
-    /// Centre of a cell along one axis, metres; `place` counts cells of the division.
-    pub fn centre_m(&self, place: usize) -> f32 {
-        (place as f32 - self.root_half as f32 + 0.5) * self.cell_m
+    /// Centre of a cell along one axis, ego frame, metres; `index` counts cells of the division.
+    pub fn centre_m(&self, index: usize) -> f32 {
+        (index as f32 - self.root_half as f32 + 0.5) * self.cell_m
     }
 
-    /// Middle of a cell of the grid, metres.
-    pub fn middle_m(&self, cell: usize) -> [f32; 2] {
-        [cell % self.width(), cell / self.width()].map(|place| self.centre_m(place + self.margin()))
+    /// Centre (x, y) of a cell of the grid, ego frame, metres.
+    pub fn cell_centre_m(&self, cell: usize) -> [f32; 2] {
+        [cell % self.width(), cell / self.width()].map(|index| self.centre_m(index + self.margin()))
     }
 
-    /// Slots: cells that hold a point.
+    /// Number of slots: of cells with a point.
     pub fn slots(&self) -> usize {
         self.code_of_slot.len()
     }
 
-    /// The slots before the cell with this code, occupied or not; the code may be one past the last.
+    /// Number of slots before the cell with this code, occupied or not; the code may be one past the last.
     pub fn slots_before(&self, code: u32) -> usize {
         if (code >> 6) as usize >= self.occupied.len() {
             return self.slots();
@@ -234,12 +234,12 @@ impl Cells {
         self.sums[to].minus(&self.sums[from])
     }
 
-    /// Lowest and highest point of a slot, metres.
+    /// Heights of the lowest and highest point of a slot, metres.
     pub fn span_m(&self, slot: usize) -> [f32; 2] {
         self.span[slot].map(|mm| mm * 1e-3)
     }
 
-    /// The slot of the cell at a place, cells of the division. The cell must hold a point.
+    /// The slot of the cell with these indices in the division. The cell must have a point.
     pub fn slot_at(&self, x: usize, y: usize) -> usize {
         self.slots_before(morton(x as u32) | morton(y as u32) << 1)
     }
@@ -249,25 +249,26 @@ impl Cells {
         self.code_of_slot[slot]
     }
 
-    /// The slot of every point, in the sweep's order; `None` for those left out.
+    /// The slot of each point, in the sweep's order; `None` for points that are left out.
     pub fn slot_of_points(&self) -> impl Iterator<Item = Option<usize>> + '_ {
         self.cell_of_point.iter().map(|slot| (*slot != NOWHERE).then_some(*slot as usize))
     }
 }
 
+/// Number of occupied cells before the cell with this code.
 fn slot(occupied: &[u64], slots_before: &[u32], code: u32) -> usize {
     let word = (code >> 6) as usize;
     let before = occupied[word] & ((1 << (code & 63)) - 1);
     (slots_before[word] + before.count_ones()) as usize
 }
 
-/// Whole millimetres; a turned world rounds alike.
+/// The nearest whole number of millimetres. It rounds to even, so that a rotated world rounds alike.
 #[inline(always)]
 fn millimetres(metres: f32) -> f32 {
     (metres * 1e3 + WHOLE) - WHOLE
 }
 
-/// Rounds down what lies within 2²² of 0: without the checks of a cast, which would take points one at a time.
+/// The whole number at or below a value within ±2²². A cast has range checks, which would prevent vectorisation.
 #[inline(always)]
 fn floor(value: f32) -> i32 {
     let nearest = value + WHOLE;
@@ -275,17 +276,17 @@ fn floor(value: f32) -> i32 {
     whole.wrapping_sub(i32::from(nearest - WHOLE > value))
 }
 
-/// Spreads the lower 16 bits to the even places.
-fn morton(place: u32) -> u32 {
-    let mut bits = place & 0xffff;
+/// Spreads the lower 16 bits of an index to the even bits.
+fn morton(index: u32) -> u32 {
+    let mut bits = index & 0xffff;
     bits = (bits | bits << 8) & 0x00ff_00ff;
     bits = (bits | bits << 4) & 0x0f0f_0f0f;
     bits = (bits | bits << 2) & 0x3333_3333;
     (bits | bits << 1) & 0x5555_5555
 }
 
-/// Place of a code's cell along x and y, cells of the division.
-pub fn places(code: u32) -> (usize, usize) {
+/// Indices (x, y) of a code's cell in the division.
+pub fn indices(code: u32) -> (usize, usize) {
     let gather = |code: u32| {
         let mut bits = code & 0x5555_5555;
         bits = (bits | bits >> 1) & 0x3333_3333;
@@ -301,14 +302,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_code_gives_back_its_place() {
+    fn a_code_gives_back_its_indices() {
         for (x, y) in [(0, 0), (1, 0), (0, 1), (511, 3), (1023, 1023)] {
-            assert_eq!(places(morton(x) | morton(y) << 1), (x as usize, y as usize));
+            assert_eq!(indices(morton(x) | morton(y) << 1), (x as usize, y as usize));
         }
     }
 
     #[test]
-    fn sums_over_any_quarter_are_those_of_its_points() {
+    fn the_sums_over_a_quarter_are_those_of_its_points() {
         let mut sweep = Sweep::default();
         for k in 0..5000 {
             let (angle, range) = (k as f32 * 0.7, 0.012 * k as f32);
@@ -317,7 +318,7 @@ mod tests {
             sweep.z.push(0.1 * angle.sin() - 0.2);
         }
         let mut cells = Cells::new(20.0, 0.25);
-        cells.take(&sweep, 2.5);
+        cells.sort_points(&sweep, 2.5);
         assert_eq!((cells.width(), cells.root_width(), cells.margin()), (160, 256, 48));
         for (side, corner) in [(256usize, (0usize, 0usize)), (64, (64, 128)), (8, (120, 136)), (1, (130, 127))] {
             let code = morton(corner.0 as u32) | morton(corner.1 as u32) << 1;
@@ -325,8 +326,8 @@ mod tests {
             let mut direct = Moments::default();
             for k in 0..sweep.x.len() {
                 let (x, y) = (sweep.x[k], sweep.y[k]);
-                let place = |v: f32| (floor(v * 4.0) + 128) as usize;
-                let within = |v: f32, first: usize| v.abs() < 20.0 && (first..first + side).contains(&place(v));
+                let index = |v: f32| (floor(v * 4.0) + 128) as usize;
+                let within = |v: f32, first: usize| v.abs() < 20.0 && (first..first + side).contains(&index(v));
                 if within(x, corner.0) && within(y, corner.1) {
                     direct.add([x, y, sweep.z[k]].map(millimetres));
                 }

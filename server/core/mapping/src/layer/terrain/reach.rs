@@ -1,71 +1,71 @@
-//! Beyond the paper: which ground the vehicle gets to.
+//! Which ground the vehicle can reach. Not in the paper.
 //!
-//! In: by cell of the square grid whether it may be driven over and whether something stands in it. Out: by cell
-//! whether the vehicle gets there, from the middle of the grid on, as a disc that nothing may stand in. Ground behind a
-//! closed fence is as flat as the road, and joins it where the sensor looks between two slats; no vehicle fits through
-//! there.
+//! In: by cell of the square grid whether it is ground and whether it is blocked. Out: by cell whether the vehicle can
+//! reach it, starting in the middle of the grid, as a disc without obstacles in it. Ground behind a closed fence is as
+//! flat as the road, and joins it where the sensor sees between two slats, but no vehicle fits through there.
 //!
-//! A row of the grid is a row of bits: widening what stands by the disc, and the flood, take 64 cells at a time.
+//! A row of the grid is a row of bits: dilating the obstacles by the disc, and the flood fill, process 64 cells at a
+//! time.
 
-/// What a cell is to a vehicle that wants to drive over it.
+/// How a cell takes part in the flood fill.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Passage {
-    /// Nothing is known that speaks for it.
+pub enum CellKind {
+    /// Neither ground nor an obstacle.
     #[default]
-    None,
-    /// Ground, or a gap in it.
+    NoGround,
+    /// Ground, or a gap in ground.
     Open,
-    /// Something stands there.
+    /// An obstacle.
     Closed,
 }
 
-/// Flood from the middle of a square grid, reusing its buffers.
+/// Flood fill from the middle of a square grid. It reuses its buffers.
 #[derive(Clone, Debug, Default)]
 pub struct Reach {
     open: Bits,
     closed: Bits,
-    widened: Bits,
+    dilated: Bits,
     reached: Bits,
 }
 
 impl Reach {
-    /// Floods a grid of `width` × `width` cells, `cell(ix, iy)` telling what each is, with a disc of `radius` cells
-    /// about its middle one.
-    pub fn find(&mut self, width: usize, radius: usize, cell: impl Fn(usize, usize) -> Passage) {
-        for bits in [&mut self.open, &mut self.closed, &mut self.widened, &mut self.reached] {
+    /// Floods a grid of `width` × `width` cells with a disc whose radius is `radius` cells around its middle cell.
+    /// `cell(ix, iy)` gives the kind of each cell.
+    pub fn flood(&mut self, width: usize, radius: usize, cell: impl Fn(usize, usize) -> CellKind) {
+        for bits in [&mut self.open, &mut self.closed, &mut self.dilated, &mut self.reached] {
             bits.clear(width);
         }
         let stride = self.open.stride;
         for (at, (open, closed)) in self.open.words.iter_mut().zip(&mut self.closed.words).enumerate() {
             let (first, iy) = (at % stride * 64, at / stride);
             for bit in 0..(width - first).min(64) {
-                let passage = cell(first + bit, iy);
-                *open |= u64::from(passage == Passage::Open) << bit;
-                *closed |= u64::from(passage == Passage::Closed) << bit;
+                let kind = cell(first + bit, iy);
+                *open |= u64::from(kind == CellKind::Open) << bit;
+                *closed |= u64::from(kind == CellKind::Closed) << bit;
             }
         }
-        self.widened.widen(&self.closed, radius);
-        self.open.words.iter_mut().zip(&self.widened.words).for_each(|(open, closed)| *open &= !closed);
-        // The vehicle stands between the four cells of the middle.
+        self.dilated.dilate(&self.closed, radius);
+        self.open.words.iter_mut().zip(&self.dilated.words).for_each(|(open, closed)| *open &= !closed);
+        // The vehicle stands between the four middle cells.
         for (ix, iy) in [width / 2 - 1, width / 2].into_iter().flat_map(|iy| [(width / 2 - 1, iy), (width / 2, iy)]) {
             self.reached.set(ix, iy);
         }
         self.reached.words.iter_mut().zip(&self.open.words).for_each(|(reached, open)| *reached &= open);
         self.reached.flood(&self.open);
-        self.widened.clear(width);
-        self.widened.widen(&self.reached, radius);
+        self.dilated.clear(width);
+        self.dilated.dilate(&self.reached, radius);
     }
 
-    /// Whether the vehicle gets there: whether the cell lies under the disc somewhere on its ways.
+    /// True if the vehicle can reach the cell: if the disc covers it somewhere on its path.
     pub fn reached(&self, ix: usize, iy: usize) -> bool {
-        self.widened.get(ix, iy)
+        self.dilated.get(ix, iy)
     }
 }
 
-/// A square of bits.
+/// A square of bits, one for each cell.
 #[derive(Clone, Debug, Default)]
 struct Bits {
-    /// Words a row.
+    /// Number of words in a row.
     stride: usize,
     words: Vec<u64>,
 }
@@ -85,8 +85,8 @@ impl Bits {
         self.words[iy * self.stride + ix / 64] >> (ix % 64) & 1 != 0
     }
 
-    /// Adds every place within `radius` of one of `from`. Beyond the last column bits may be set; no cell lies there.
-    fn widen(&mut self, from: &Self, radius: usize) {
+    /// Adds each cell within `radius` of a cell of `from`. Bits beyond the last column may be set; they are no cells.
+    fn dilate(&mut self, from: &Self, radius: usize) {
         let rows = from.words.len() / from.stride;
         let half_width = |dy: usize| (radius * radius - dy * dy).isqrt();
         let mut wide = vec![0; from.stride];
@@ -97,24 +97,24 @@ impl Bits {
             wide.copy_from_slice(row);
             for reach in 0..=radius {
                 for dy in (0..=radius).filter(|dy| half_width(*dy) == reach) {
-                    for there in [iy.checked_sub(dy), Some(iy + dy)].into_iter().flatten().filter(|there| *there < rows)
+                    for other in [iy.checked_sub(dy), Some(iy + dy)].into_iter().flatten().filter(|other| *other < rows)
                     {
-                        let row = &mut self.words[there * from.stride..][..from.stride];
+                        let row = &mut self.words[other * from.stride..][..from.stride];
                         row.iter_mut().zip(&wide).for_each(|(word, wide)| *word |= wide);
                     }
                 }
-                widen_by_one(&mut wide);
+                dilate_by_one(&mut wide);
             }
         }
     }
 
-    /// Spreads over sides of cells wherever `open` allows.
+    /// Spreads set bits to neighbours along sides of cells as long as they are set in `open`.
     fn flood(&mut self, open: &Self) {
         let rows = open.words.len() / open.stride;
         self.words.iter_mut().zip(&open.words).for_each(|(word, open)| *word = fill(*word, *open));
         loop {
             let mut grown = false;
-            // Down and up; a flood that turns back takes another round.
+            // Down and up; a path that turns back needs another round.
             for (iy, from) in (1..rows).map(|iy| (iy, iy - 1)).chain((1..rows).rev().map(|iy| (iy - 1, iy))) {
                 grown |= self.spread(open, iy, from);
             }
@@ -124,8 +124,8 @@ impl Bits {
         }
     }
 
-    /// From one row to the next, and along it; whether it grew. A word holds all that its own bits spread to, before
-    /// and after, so one that gains nothing is left alone.
+    /// Spreads bits from one row to the next, and along it; returns true if a bit was added. All bits that a word's own
+    /// bits spread to are always set, so that a word without new bits stays unchanged.
     fn spread(&mut self, open: &Self, iy: usize, from: usize) -> bool {
         let mut grown = false;
         let (row, from) = (iy * self.stride, from * self.stride);
@@ -142,7 +142,7 @@ impl Bits {
         grown
     }
 
-    /// Adds bits to a word, and what they spread to; whether it grew.
+    /// Adds bits to a word, and the bits they spread to; returns true if a bit was added.
     fn gain(&mut self, open: &Self, at: usize, bits: u64) -> bool {
         let bits = self.words[at] | bits & open.words[at];
         let grown = bits != self.words[at];
@@ -153,7 +153,7 @@ impl Bits {
     }
 }
 
-/// Spreads set bits both ways as long as `open` has them.
+/// Spreads set bits in both directions as long as they are set in `open`.
 fn fill(bits: u64, open: u64) -> u64 {
     match bits {
         0 => 0,
@@ -161,7 +161,7 @@ fn fill(bits: u64, open: u64) -> u64 {
     }
 }
 
-/// Spreads set bits towards higher ones as long as `open` has them.
+/// Spreads set bits towards higher bits as long as they are set in `open`.
 fn fill_up(mut bits: u64, mut open: u64) -> u64 {
     for step in [1, 2, 4, 8, 16, 32] {
         bits |= open & (bits << step);
@@ -170,7 +170,8 @@ fn fill_up(mut bits: u64, mut open: u64) -> u64 {
     bits
 }
 
-fn widen_by_one(row: &mut [u64]) {
+/// Adds the neighbours of each set bit of a row.
+fn dilate_by_one(row: &mut [u64]) {
     let mut before = 0;
     for word in 0..row.len() {
         let here = row[word];
@@ -184,15 +185,15 @@ fn widen_by_one(row: &mut [u64]) {
 mod tests {
     use super::*;
 
-    /// By a picture: `.` open, `#` closed, blank nothing; gives it with `o` where the vehicle gets.
+    /// Floods a picture: `.` is open, `#` closed, blank no ground. Returns it with `o` for open cells that are reached.
     fn flooded(picture: &[&str], radius: usize) -> Vec<String> {
-        let passage = |c: char| match c {
-            '.' => Passage::Open,
-            '#' => Passage::Closed,
-            _ => Passage::None,
+        let kind = |c: char| match c {
+            '.' => CellKind::Open,
+            '#' => CellKind::Closed,
+            _ => CellKind::NoGround,
         };
         let mut reach = Reach::default();
-        reach.find(picture.len(), radius, |ix, iy| passage(picture[iy].as_bytes()[ix].into()));
+        reach.flood(picture.len(), radius, |ix, iy| kind(picture[iy].as_bytes()[ix].into()));
         let drawn = |(iy, row): (usize, &&str)| {
             let cell = |(ix, c): (usize, char)| if c == '.' && reach.reached(ix, iy) { 'o' } else { c };
             row.chars().enumerate().map(cell).collect()
@@ -225,20 +226,19 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_finds_its_way_through_a_maze_wider_than_a_word() {
+    fn a_flood_fills_a_maze_wider_than_a_word() {
         let width = 200;
-        // Walls on every fourth row, each with one gap, at alternating ends.
+        // Each fourth row is a wall with one gap, at alternating ends.
         let wall = |iy: usize| iy % 4 == 3;
         let gap = |iy: usize| if iy % 8 == 3 { width - 1 } else { 0 };
-        let passage = |cell: usize| {
+        let kind = |cell: usize| {
             let (ix, iy) = (cell % width, cell / width);
-            if wall(iy) && ix != gap(iy) { Passage::Closed } else { Passage::Open }
+            if wall(iy) && ix != gap(iy) { CellKind::Closed } else { CellKind::Open }
         };
         let mut reach = Reach::default();
-        reach.find(width, 0, |ix, iy| passage(iy * width + ix));
+        reach.flood(width, 0, |ix, iy| kind(iy * width + ix));
         assert!(
-            (0..width * width)
-                .all(|cell| reach.reached(cell % width, cell / width) == (passage(cell) == Passage::Open))
+            (0..width * width).all(|cell| reach.reached(cell % width, cell / width) == (kind(cell) == CellKind::Open))
         );
     }
 }

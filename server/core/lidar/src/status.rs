@@ -1,0 +1,58 @@
+//! The state of a sensor, as far as its datagrams show it.
+
+use crate::datagram::nmea::Gprmc;
+use crate::datagram::telemetry::Pps;
+use crate::model::{Model, ReturnMode};
+use crate::revolution::Blocked;
+use crate::time::clock::Clock;
+
+/// The source of the per-laser corrections in use.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum CalibrationSource {
+    /// The nominal table of the model.
+    #[default]
+    Factory,
+    /// The table of [`crate::SensorConfig::calibration`].
+    Configured,
+    /// The table in the status bytes of an HDL-64E S2 or S3.
+    StatusBytes,
+}
+
+/// The state of a sensor, and what was counted of its datagrams.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct SensorStatus {
+    /// Model that is configured or was found in the data.
+    pub model: Option<Model>,
+    /// Return mode of the newest packet.
+    pub return_mode: Option<ReturnMode>,
+    /// Rate of rotation, in revolutions per minute: configured, or measured over the newest revolution.
+    pub rpm: Option<f32>,
+    /// Number of decoded data packets, without those that wait.
+    pub packets: u64,
+    /// Number of data packets that wait until the model is known, or until the packets before them arrive.
+    pub packets_waiting: usize,
+    /// Number of data packets that waited for the model, did not fit it, and were not decoded.
+    pub packets_unfit: u64,
+    /// Number of data packets that never arrived or arrived too late, ±1 per gap. A long gap is counted one revolution
+    /// later, if it is not repeated there as a field-of-view gap is. Of an HDL-64E S1, whose packets have no time, only
+    /// gaps of less than half a revolution are counted.
+    pub packets_lost: u64,
+    /// Number of telemetry datagrams.
+    pub telemetry: u64,
+    /// Number of returns (echoes with a range) in all revolutions.
+    pub returns: u64,
+    /// Number of revolutions.
+    pub revolutions: u64,
+    /// Sectors and lasers without returns in the newest revolution.
+    pub blocked: Blocked,
+    /// Source of the per-laser corrections in use.
+    pub calibration: CalibrationSource,
+    /// Clock that the stamps of the newest revolution follow; `None` before the first revolution.
+    pub clock: Option<Clock>,
+    /// Time by which the host's clock is ahead of that clock, in ms ([`crate::Revolution::clock_offset_ms`]).
+    pub clock_offset_ms: i64,
+    /// State of the pulse per second in the newest telemetry.
+    pub pps: Option<Pps>,
+    /// GPRMC of the newest telemetry.
+    pub gprmc: Option<Gprmc>,
+}

@@ -1,0 +1,301 @@
+//! The clock of a sensor: the stamps of its revolutions in Unix time, and the clock that these stamps follow.
+//!
+//! In: device time and arrival of every data packet, and telemetry. Out: the [`Stamp`] of each revolution. The stamps
+//! are a pure function of the datagrams and their arrivals.
+//!
+//! Device time runs on one timeline (`timeline.rs`). Unix time is that timeline plus an *offset*. There is one offset
+//! per revolution; it is chosen when the revolution ends.
+//!
+//! # States
+//!
+//! The state is the [`Clock`] of the newest revolution. The first row that applies decides it.
+//!
+//! | condition when a revolution ends | state | offset |
+//! |---|---|---|
+//! | A GPRMC is within reach, at most 3 s old, and the pulse is locked. | `gps` | that of the GPRMC |
+//! | A GPRMC is within reach. | `gps_unlocked` | that of the GPRMC |
+//! | Arrival is within reach, and agrees with the device's minutes to 250 ms. | `device` | whole hours |
+//! | Arrival is within reach. | `arrival` | the least delay of a revolution |
+//! | None of these, or arrival must not be followed. | `holdover` | unchanged |
+//!
+//! A clock is *within reach* if it is at most 60 s behind the stamps already given. If it is behind them during the
+//! whole revolution, the stamps run at half speed, and the state is `holdover` with the offset of that clock.
+//!
+//! # Transitions
+//!
+//! | event | `gps` | `gps_unlocked` | `device`, `arrival` | `holdover` |
+//! |---|---|---|---|---|
+//! | valid GPRMC, pulse locked | - | `gps` | `gps` | `gps` if within reach |
+//! | valid GPRMC, pulse not locked | `gps_unlocked` | - | `gps_unlocked` | `gps_unlocked` if within reach |
+//! | GPRMC invalid; telemetry silent for 3 s; device counter jumps | `gps_unlocked` | - | - | - |
+//! | device counter jumps, and arrival differs by 10 to 500 ms | `gps_unlocked` | - | new offset | new offset |
+//! | least delay rises by more than 500 ms | - | - | new offset | new offset |
+//! | least delay falls by more than 500 ms | - | - | `holdover` | - |
+//! | ten seconds agree on another delay, by 10 ms (`device`: 500 ms) | - | - | new offset | new offset |
+//! | the stamps reach the offset again | - | - | - | state of that offset |
+//!
+//! "New offset" leads to `device` or `arrival`, as in the first table. Between these events arrivals change no stamp.
+//!
+//! # Why
+//!
+//! - A GPRMC counts as valid if the receiver reports a valid fix, the device's minutes and seconds agree with it, and
+//!   it is at most [`crate::SensorConfig::gps_late_ns_max`] older than its arrival. An older one is that of an old
+//!   capture, or of a receiver that has lost count of its weeks; arrival then gives the time, as for the planner. A
+//!   GPRMC later than its arrival is valid: no packet arrives before it is sent, so the host's clock is wrong.
+//! - The offset of a GPRMC is a whole number of hours. It is the same to the nanosecond for all arrivals, and it stays
+//!   in force if GPS or the pulse is lost, over a restart, and if the host disagrees. If it is not within reach, the
+//!   stamps go on by arrival.
+//! - The offset by arrival is held and not averaged. A rise of the delay means that the host's clock was set, or that
+//!   the first revolution was read from a full socket buffer.
+//! - If the device's minutes and seconds agree with UTC, a receiver without telemetry, or PTP, has set them.
+//! - If the host's clock is set while the device is silent, that is no longer silence (`timeline.rs`). If it is set
+//!   between the two packets between which the device's counter jumps, the host's step is used, because nothing else
+//!   measures the jump. Stamps that are too far ahead for that reason wait until GPS or the host reaches them.
+//! - Stamps always rise. A correction forward applies at once. For a correction backward of at most 60 s the stamps run
+//!   at half speed. A longer correction backward is not made: a host's clock that falls behind the device (set back, or
+//!   a capture that is played too fast) is not followed.
+
+use super::minimum_delay::{MinimumDelay, STEP_NS_MAX};
+use super::timeline::{NS_PER_HOUR, NS_PER_SECOND, StepKind, Timeline, nearest_hour};
+use crate::datagram::telemetry::{Pps, Telemetry};
+
+/// Age of a GPRMC on the device's clock, in ns. A GPRMC names the second that has passed and is repeated until the next
+/// one: it is 0.85 to 1.85 s old in the recorded drives of an HDL-32E and 1.1 to 1.5 s in those of a VLP-16. A device
+/// whose time differs by more was not set by this receiver.
+const GPRMC_AGE_NS: std::ops::RangeInclusive<i64> = -500_000_000..=2_900_000_000;
+/// Time without telemetry, in ns, after which GPS is lost. Sensors send telemetry many times per second.
+const GPS_SILENCE_NS_MAX: i64 = 3 * NS_PER_SECOND;
+/// 1 January 2005, in ns since the Unix epoch: none of these sensors is older. A receiver without a fix sends 1980.
+const EARLIEST_NS: i64 = 1_104_537_600 * NS_PER_SECOND;
+/// Default of [`crate::SensorConfig::gps_late_ns_max`], in ns: 24 hours. The clock of a host may be wrong by hours
+/// (time zone, battery) but not by days, while the error of a receiver is 1024 weeks.
+pub const GPS_LATE_NS_MAX: i64 = 24 * NS_PER_HOUR;
+/// Latest arrival, in ns since the Unix epoch: the year 2096. Later arrivals are replaced by it, because stamps near
+/// the end of 64 bits would overflow.
+const ARRIVAL_NS_MAX: i64 = 4_000_000_000 * NS_PER_SECOND;
+/// Drift, in ns, above which the offset by arrival is chosen again. At 100 ppm it is reached in 100 s; at 15 m/s it is
+/// 15 cm.
+const DRIFT_NS_MAX: i64 = 10_000_000;
+/// Greatest difference, in ns, between whole hours and the offset by arrival of a device that was set. It is half of
+/// [`STEP_NS_MAX`], so that a small later difference does not change the state again.
+const HOUR_ERROR_NS_MAX: i64 = 250_000_000;
+/// Greatest time, in ns, by which stamps may be ahead of an offset that is within reach. At half speed the stamps need
+/// twice that time (two minutes) to be right again; ours, because a longer wait is worse than a wrong clock.
+const CATCH_UP_NS_MAX: i64 = 60 * NS_PER_SECOND;
+
+/// The clock that the stamps of a revolution follow.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Clock {
+    /// The host's clock at the arrival of the packets with the least delay, and between them the device's oscillator
+    /// (of an HDL-64E S1: the nominal packet rate).
+    #[default]
+    Arrival,
+    /// The device's minutes and seconds, which agree with those of the host; the hour is the host's.
+    Device,
+    /// GPS: telemetry gives date and hour, and the pulse is locked (an HDL-32E does not report whether it is).
+    Gps,
+    /// GPS, which has set the device; since then GPS or its pulse was lost.
+    GpsUnlocked,
+    /// No clock: the clock to follow is behind the stamps already given. The stamps advance with the device's
+    /// oscillator, at half speed if the clock is within reach.
+    Holdover,
+}
+
+impl Clock {
+    /// Name of the clock in configuration, maps and logs.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Arrival => "arrival",
+            Self::Device => "device",
+            Self::Gps => "gps",
+            Self::GpsUnlocked => "gps_unlocked",
+            Self::Holdover => "holdover",
+        }
+    }
+}
+
+/// The stamps of a revolution.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Stamp {
+    /// Stamp of the first firing, in ns since the Unix epoch.
+    pub start_ns: i64,
+    /// Stamp of the last firing, in ns since the Unix epoch.
+    pub end_ns: i64,
+    pub clock: Clock,
+    /// Least delay of the revolution's packets: arrival less stamp, in ms.
+    pub clock_offset_ms: i64,
+    /// Time, in ns, by which `start_ns` is ahead of the clock, so that stamps rise.
+    early_ns: i64,
+}
+
+impl Stamp {
+    /// Offset of a firing from `start_ns`, from its offset by device time; both in ns. They differ if the revolution
+    /// runs at half speed.
+    pub fn offset_ns(&self, device_offset_ns: u32) -> u32 {
+        if self.early_ns <= 0 {
+            return device_offset_ns;
+        }
+        let device_ns = i64::from(device_offset_ns);
+        (device_ns - self.early_ns).max(device_ns / 2) as u32
+    }
+}
+
+/// The clock of one sensor.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct DeviceClock {
+    gps_late_ns_max: i64,
+    timeline: Timeline,
+    gps: Option<Gps>,
+    /// Telemetry from behind a jump that no data packet has shown yet.
+    pending: Option<PendingGps>,
+    minimum_delay: MinimumDelay,
+    /// Offset in force, and the clock that it follows.
+    offset: Option<(i64, Clock)>,
+    /// True if the device's counter has jumped since the offset was chosen.
+    jumped: bool,
+    newest: Option<Stamp>,
+}
+
+/// The newest valid GPRMC.
+#[derive(Clone, Copy, Debug)]
+struct Gps {
+    offset_ns: i64,
+    /// Time of the telemetry on the timeline.
+    received_ns: i64,
+    locked: bool,
+}
+
+/// A valid GPRMC whose device time is not on the timeline yet.
+#[derive(Clone, Copy, Debug)]
+struct PendingGps {
+    device_us: u32,
+    utc_ns: i64,
+    locked: bool,
+}
+
+impl DeviceClock {
+    pub fn new(gps_late_ns_max: i64) -> Self {
+        Self { gps_late_ns_max, ..Self::default() }
+    }
+
+    /// Applies telemetry that arrived at `arrival_ns`. `reports_pps`: true if the model reports the state of the pulse.
+    pub fn apply_telemetry(&mut self, telemetry: &Telemetry, reports_pps: bool, arrival_ns: i64) {
+        let locked = match telemetry.pps {
+            Pps::Locked => true,
+            Pps::Absent => !reports_pps,
+            Pps::Attempting | Pps::Error | Pps::Unknown(_) => false,
+        };
+        let Some(utc_ns) = device_utc_ns(telemetry, arrival_ns, self.gps_late_ns_max) else {
+            self.gps.iter_mut().for_each(|gps| gps.locked = false);
+            return;
+        };
+        self.pending = Some(PendingGps { device_us: telemetry.device_us, utc_ns, locked });
+        self.apply_pending();
+    }
+
+    /// Applies the pending GPRMC if its device time is on the timeline now.
+    fn apply_pending(&mut self) {
+        let Some(PendingGps { device_us, utc_ns, locked }) = self.pending else { return };
+        if let Some(received_ns) = self.timeline.time_at(device_us) {
+            self.gps = Some(Gps { offset_ns: utc_ns - received_ns, received_ns, locked });
+            self.pending = None;
+        }
+    }
+
+    /// Adds a packet and returns the time of its first firing on the timeline, in ns. `device_us`: device time past the
+    /// hour, if the sensor sends one; `elapsed_ns`: time since the packet before, as far as packets show it;
+    /// `arrival_ns`: arrival of the datagram; `span_ns`: time from the first firing of the packet to its sending.
+    pub fn push_packet(&mut self, device_us: Option<u32>, elapsed_ns: i64, arrival_ns: i64, span_ns: i64) -> i64 {
+        let sent_ns = arrival_ns.clamp(0, ARRIVAL_NS_MAX) - span_ns;
+        let due_ns = self.offset.map(|(offset_ns, _)| sent_ns.saturating_sub(offset_ns));
+        let (time_ns, step) = self.timeline.push(device_us, elapsed_ns, sent_ns, due_ns);
+        if step == StepKind::Jumped {
+            self.gps.iter_mut().for_each(|gps| gps.locked = false);
+            (self.minimum_delay, self.jumped) = (MinimumDelay::default(), true);
+        }
+        if step != StepKind::Continuous {
+            self.apply_pending();
+        }
+        self.minimum_delay.push(sent_ns - time_ns);
+        time_ns
+    }
+
+    /// Ends a revolution and returns its stamps. `first_ns`: time of its first firing on the timeline;
+    /// `last_offset_ns`: time from its first to its last firing; `None` without firings.
+    pub fn end_revolution(&mut self, first_ns: i64, last_offset_ns: Option<u32>) -> Stamp {
+        let delay_ns = self.minimum_delay.end_revolution(first_ns);
+        let (offset_ns, clock) = self.choose(first_ns, delay_ns);
+        let right_ns = offset_ns + first_ns;
+        let start_ns = self.newest.map_or(right_ns, |newest| right_ns.max(newest.end_ns + 1));
+        let mut stamp = Stamp { start_ns, end_ns: start_ns, clock, clock_offset_ms: 0, early_ns: start_ns - right_ns };
+        if let Some(last_offset_ns) = last_offset_ns {
+            let last_offset_ns = i64::from(stamp.offset_ns(last_offset_ns));
+            stamp.end_ns += last_offset_ns;
+            if stamp.early_ns > 0 && last_offset_ns < stamp.early_ns {
+                stamp.clock = Clock::Holdover;
+            }
+        }
+        let ms = |ns: i64| (ns + 500_000).div_euclid(1_000_000);
+        stamp.clock_offset_ms = match delay_ns {
+            Some(delay_ns) => ms(delay_ns + first_ns - start_ns),
+            None => self.newest.map_or(0, |newest| newest.clock_offset_ms),
+        };
+        self.newest = Some(stamp);
+        stamp
+    }
+
+    /// Chooses the offset of a revolution, and the clock that it follows.
+    fn choose(&mut self, first_ns: i64, delay_ns: Option<i64>) -> (i64, Clock) {
+        let newest_ns = self.newest.map(|newest| newest.end_ns);
+        let in_reach = |offset_ns: i64| newest_ns.is_none_or(|ns| ns - (offset_ns + first_ns) <= CATCH_UP_NS_MAX);
+        let wanted = match self.gps.filter(|gps| in_reach(gps.offset_ns)) {
+            Some(gps) => {
+                let lost = !gps.locked || first_ns - gps.received_ns > GPS_SILENCE_NS_MAX;
+                Some((gps.offset_ns, if lost { Clock::GpsUnlocked } else { Clock::Gps }))
+            }
+            None => self.choose_by_arrival(first_ns, delay_ns),
+        };
+        match (wanted.filter(|(offset_ns, _)| in_reach(*offset_ns)), self.offset) {
+            (Some(wanted), _) => *self.offset.insert(wanted),
+            (None, before) => (before.map_or(0, |(offset_ns, _)| offset_ns), Clock::Holdover),
+        }
+    }
+
+    /// The offset by arrival; `None` while arrival cannot be followed.
+    fn choose_by_arrival(&mut self, first_ns: i64, delay_ns: Option<i64>) -> Option<(i64, Clock)> {
+        let (Some((offset_ns, clock)), Some(delay_ns)) = (self.offset, delay_ns) else {
+            return delay_ns.map(|delay_ns| self.offset_by_arrival(delay_ns)).or(self.offset);
+        };
+        let later_ns = delay_ns - offset_ns;
+        let jumped = std::mem::take(&mut self.jumped);
+        if later_ns > STEP_NS_MAX || (jumped && (DRIFT_NS_MAX..=STEP_NS_MAX).contains(&later_ns.abs())) {
+            return Some(self.offset_by_arrival(delay_ns));
+        }
+        let bound_ns = if clock == Clock::Arrival { DRIFT_NS_MAX } else { STEP_NS_MAX };
+        if let Some(agreed_ns) = self.minimum_delay.end_window(first_ns)
+            && agreed_ns.abs_diff(offset_ns) > bound_ns as u64
+        {
+            return Some(self.offset_by_arrival(agreed_ns));
+        }
+        (later_ns >= -STEP_NS_MAX).then_some((offset_ns, clock))
+    }
+
+    /// The offset of whole hours if it is near the offset by arrival, else the latter.
+    fn offset_by_arrival(&self, arrival_offset_ns: i64) -> (i64, Clock) {
+        match self.timeline.zero_by_hour_ns(arrival_offset_ns) {
+            Some(hours_ns) if (hours_ns - arrival_offset_ns).abs() <= HOUR_ERROR_NS_MAX => (hours_ns, Clock::Device),
+            _ => (arrival_offset_ns, Clock::Arrival),
+        }
+    }
+}
+
+/// UTC at which the device's clock showed the time of the telemetry; `None` if its GPRMC is not valid.
+fn device_utc_ns(telemetry: &Telemetry, arrival_ns: i64, late_ns_max: i64) -> Option<i64> {
+    let gprmc = telemetry.gprmc.as_ref().filter(|gprmc| gprmc.valid)?;
+    let utc_ns = gprmc.utc_ns.filter(|utc_ns| *utc_ns >= EARLIEST_NS)?;
+    if arrival_ns.saturating_sub(utc_ns) > late_ns_max {
+        return None;
+    }
+    let age_ns = nearest_hour(i64::from(telemetry.device_us) * 1_000 - utc_ns, 0);
+    GPRMC_AGE_NS.contains(&age_ns).then_some(utc_ns + age_ns)
+}

@@ -1,0 +1,439 @@
+//! Polar scans: the rays of each sensor's newest scan, collected by azimuth. For each azimuth, how far the view goes
+//! and where it proves the ground free.
+//!
+//! In: [`Rays`], ego frame, metres. Out: hits counted in the [`Window`] for each scan; when the map is made, the
+//! evidence about each cell, from one traced ray for each azimuth bin with rays.
+//!
+//! A ray proves a cell free if it passes low over it: at the height of a bumper, `clear_height_m_min` to `_max`. A ray
+//! from the roof over a car proves nothing about the car's cells, nor does a ray under the car's body. Therefore each
+//! azimuth bin (a quarter of a degree) has a row of bits, one for each step of a cell's side outward, set where a ray
+//! of the bin is low. Rays only set bits, so that their order does not matter.
+//!
+//! A traced ray ends at the nearest return from above the ground in its own bin or in the two bins to either side: the
+//! rays of one bin differ by part of its width, some are lost, and a traced ray must not run along an object just
+//! inside its edge. The cells behind that return are hidden, except where a ray comes down to the ground: those from
+//! where it is below the vehicle's clearance are free, if no obstacle lies between there and its end, so that it passed
+//! beneath nothing.
+//!
+//! Heights are measured over the plane under the vehicle. In a dip of the ground an obstacle may not reach above that
+//! plane. There a return counts as a hit if it is higher by the clearance than the lowest return around it, within a
+//! metre along its azimuth and a degree across.
+//!
+//! Only the newest scan of a sensor shows what is clear and what is hidden now. Therefore rays are traced once for each
+//! map, independent of the number of scans since the last one.
+
+use crate::layer::maker::Rays;
+use crate::layer::radial_grid::{floor_to_whole, round_to_whole};
+use crate::sensor::sweep::Sweep;
+
+use super::azimuth_bins::{AzimuthBins, BINS, around, neighbour};
+use super::bits::{any_bit, bits_of_word, set_bits};
+use super::config::OccupancyConfig;
+use super::ray::Ray;
+use super::states::{HIDDEN, LOOKED_AT, THROUGH};
+use super::window::Window;
+
+/// Number of steps after which a bin is traced as two rays. Ours: at 112 cells a bin is half a cell wide.
+const FORK: usize = 112;
+/// Depth below the plane, metres, at which a return is a mirror image, beyond what [`GRADE_MAX`] explains; its ray
+/// proves nothing. Ours; not tuned.
+const BELOW_M: f32 = 0.3;
+/// Grade of the steepest road down from the vehicle. Ours; not tuned.
+const GRADE_MAX: f32 = 0.1;
+/// Nearest hit of a bin without hits.
+const NONE: u16 = u16::MAX;
+/// Largest step number. Ours: beyond each window, and within 16 bits.
+const STEPS_MAX: f32 = 65_000.0;
+/// Number of points that are processed together. Ours: their intermediate values fit into the first-level cache.
+const CHUNK: usize = 256;
+
+/// A return from the ground.
+struct Ground {
+    bin: u16,
+    /// Step at which the ray comes below the clearance.
+    from: u16,
+    /// Step at which the ray is too low to prove anything.
+    low: u16,
+    /// Step after the return.
+    end: u16,
+    /// Index of the point in the scan.
+    point: u32,
+}
+
+/// Values computed from points by arithmetic alone; ranges and steps are in cells from the sensor.
+struct Chunk {
+    bin: [u32; CHUNK],
+    range: [f32; CHUNK],
+    step: [u32; CHUNK],
+    /// First step at which the ray is at the height of a bumper.
+    first: [u32; CHUNK],
+    /// Step after the last such one.
+    end: [u32; CHUNK],
+    /// Step at which the ray comes below the clearance.
+    under: [u32; CHUNK],
+    /// Step at which the ray is too low to prove anything.
+    low: [u32; CHUNK],
+}
+
+/// The newest scans of all sensors.
+pub struct PolarScans {
+    azimuths: AzimuthBins,
+    scans: Vec<PolarScan>,
+    /// Evidence of one traced ray, step by step; reused.
+    evidence: Vec<u8>,
+}
+
+/// The newest scan of one sensor, by azimuth bin.
+struct PolarScan {
+    sensor: u16,
+    /// True if the scan arrived since the last map.
+    fresh: bool,
+    /// End of the scan, ns since the Unix epoch.
+    stamp_ns: i64,
+    /// Position of the sensor, in cells of the world.
+    origin: [f64; 2],
+    /// Heading of the ego frame in the window's axes, radians.
+    yaw_rad: f64,
+    /// True by bin if it has rays.
+    present: Vec<bool>,
+    /// Step of the nearest hit by bin.
+    nearest_hit: Vec<u16>,
+    /// One bit for each step of each bin, set if a ray is low there.
+    low: Vec<u64>,
+    /// One bit for each step of each bin, set if a hit is there.
+    hits: Vec<u64>,
+    /// As `low`, for steps behind the nearest hit.
+    proved: Vec<u64>,
+    ground: Vec<Ground>,
+    /// Height of the lowest return of each patch of ground in a dip, metres; else infinite.
+    dips: Vec<f32>,
+    /// True if a patch lies in a dip.
+    dipped: bool,
+}
+
+impl PolarScans {
+    /// Polar scans for a window whose far corner is `reach_m` from a sensor.
+    pub fn new(reach_m: f32, cell_m: f32) -> Self {
+        let azimuths = AzimuthBins::new(reach_m, cell_m);
+        Self { evidence: vec![0; azimuths.steps], azimuths, scans: Vec::new() }
+    }
+
+    /// Replaces the last scan of a sensor, and counts the hits in the window, which must have moved to the vehicle.
+    pub fn insert(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, window: &mut Window) {
+        let known = self.scans.iter().position(|scan| scan.sensor == rays.sensor);
+        let index = known.unwrap_or_else(|| {
+            self.scans.push(PolarScan::new(rays.sensor, &self.azimuths));
+            self.scans.len() - 1
+        });
+        let scan = &mut self.scans[index];
+        scan.clear(&self.azimuths);
+        scan.set_sensor_pose(rays, config, window);
+        scan.insert_returns(rays, config, &self.azimuths, window);
+        scan.insert_no_returns(rays, config, &self.azimuths);
+    }
+
+    /// Removes the evidence of all scans.
+    pub fn clear(&mut self) {
+        self.scans.iter_mut().for_each(|scan| scan.fresh = false);
+    }
+
+    /// Adds the evidence of the scans since the last map, and since `earliest_ns`, to each cell of the window, row by
+    /// row. Returns true if there was any such scan.
+    pub fn write_evidence(
+        &mut self,
+        config: &OccupancyConfig,
+        earliest_ns: i64,
+        window: &Window,
+        of_cell: &mut [u8],
+    ) -> bool {
+        self.scans.iter_mut().filter(|scan| scan.stamp_ns < earliest_ns).for_each(|scan| scan.fresh = false);
+        let mut any = false;
+        for scan in self.scans.iter_mut().filter(|scan| scan.fresh) {
+            scan.prove_ground(&self.azimuths);
+            scan.trace(config, &self.azimuths, window, &mut self.evidence, of_cell);
+            (scan.fresh, any) = (false, true);
+        }
+        any
+    }
+}
+
+impl PolarScan {
+    /// An empty scan.
+    fn new(sensor: u16, azimuths: &AzimuthBins) -> Self {
+        let bits = || vec![0; BINS * azimuths.words];
+        Self {
+            sensor,
+            fresh: false,
+            stamp_ns: 0,
+            origin: [0.0; 2],
+            yaw_rad: 0.0,
+            present: vec![false; BINS],
+            nearest_hit: vec![NONE; BINS],
+            low: bits(),
+            hits: bits(),
+            proved: bits(),
+            ground: Vec::new(),
+            dips: vec![f32::INFINITY; azimuths.patches()],
+            dipped: false,
+        }
+    }
+
+    /// Removes all rays.
+    fn clear(&mut self, azimuths: &AzimuthBins) {
+        for bin in (0..BINS).filter(|bin| self.present[*bin]) {
+            for bits in [&mut self.low, &mut self.hits, &mut self.proved] {
+                bits[azimuths.row(bin)].fill(0);
+            }
+        }
+        self.present.fill(false);
+        self.nearest_hit.fill(NONE);
+        self.ground.clear();
+        if std::mem::take(&mut self.dipped) {
+            self.dips.fill(f32::INFINITY);
+        }
+    }
+
+    /// Sets the position of the sensor in the world, from the pose of the window.
+    fn set_sensor_pose(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, window: &Window) {
+        let (pose, corner) = (window.ego_pose(), window.corner());
+        let (sin, cos) = pose.yaw_rad.sin_cos();
+        let [x, y] = [rays.origin_m[0], rays.origin_m[1]].map(|metres| f64::from(metres / config.cell_m));
+        let from = [pose.cells[0] + x * cos - y * sin, pose.cells[1] + x * sin + y * cos];
+        self.origin = [0, 1].map(|i| corner[i] as f64 + from[i]);
+        (self.yaw_rad, self.fresh, self.stamp_ns) = (pose.yaw_rad, true, rays.stamp_ns);
+    }
+
+    /// Inserts the returns of a scan.
+    fn insert_returns(
+        &mut self,
+        rays: &Rays<'_>,
+        config: &OccupancyConfig,
+        azimuths: &AzimuthBins,
+        window: &mut Window,
+    ) {
+        let range_max = config.range_m_max / config.cell_m;
+        // On ground below this height an obstacle can stay below `clear_height_m_min`.
+        let dip = config.clear_height_m_min - config.clearance_m;
+        let window_from_ego = window.window_from_ego();
+        let sweep = rays.returns;
+        let mut chunk = Chunk::default();
+        let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
+        for (number, ((xs, ys), zs)) in chunks.enumerate() {
+            chunk.fill([xs, ys, zs], rays.origin_m, config, azimuths);
+            for (i, ((&x, &y), &z)) in xs.iter().zip(ys).zip(zs).enumerate() {
+                let (bin, range) = (chunk.bin[i] as usize, chunk.range[i]);
+                self.present[bin] = true;
+                if z < -BELOW_M - GRADE_MAX * config.cell_m * range {
+                    continue;
+                }
+                let row = azimuths.row(bin);
+                set_bits(&mut self.low[row.clone()], chunk.first[i] as usize, chunk.end[i] as usize);
+                if range > range_max || range.is_nan() || z >= config.overhang_m {
+                    continue;
+                }
+                let step = chunk.step[i] as u16;
+                let inside = usize::from(step) < azimuths.steps;
+                if z >= config.clear_height_m_min {
+                    if z >= config.clearance_m {
+                        window.record_hit(window_from_ego.apply(x, y));
+                    }
+                    self.record_hit(bin, step, azimuths);
+                } else if inside {
+                    let [from, low] = [chunk.under[i], chunk.low[i]].map(|value| value as u16);
+                    let point = (number * CHUNK + i) as u32;
+                    self.ground.push(Ground { bin: bin as u16, from, low, end: step + 1, point });
+                    if z < dip {
+                        let lowest = &mut self.dips[azimuths.patch(bin, step.into())];
+                        (*lowest, self.dipped) = (lowest.min(z), true);
+                    }
+                }
+            }
+        }
+        if self.dipped {
+            self.insert_obstacles_in_dips(sweep, config, azimuths, window);
+        }
+    }
+
+    /// Records a hit at a step of a bin.
+    #[inline(always)]
+    fn record_hit(&mut self, bin: usize, step: u16, azimuths: &AzimuthBins) {
+        self.nearest_hit[bin] = self.nearest_hit[bin].min(step);
+        if usize::from(step) < azimuths.steps {
+            self.hits[bin * azimuths.words + usize::from(step) / 64] |= 1 << (step % 64);
+        }
+    }
+
+    /// Records hits of returns that counted as ground, but lie too high over the ground around them.
+    fn insert_obstacles_in_dips(
+        &mut self,
+        sweep: &Sweep,
+        config: &OccupancyConfig,
+        azimuths: &AzimuthBins,
+        window: &mut Window,
+    ) {
+        let window_from_ego = window.window_from_ego();
+        for index in 0..self.ground.len() {
+            let Ground { bin, end, point, .. } = self.ground[index];
+            let (bin, step, point) = (usize::from(bin), end - 1, point as usize);
+            if sweep.z[point] - self.dips[azimuths.patch(bin, step.into())] >= config.clearance_m {
+                window.record_hit(window_from_ego.apply(sweep.x[point], sweep.y[point]));
+                self.record_hit(bin, step, azimuths);
+            }
+        }
+    }
+
+    /// Inserts the rays without a return.
+    fn insert_no_returns(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, azimuths: &AzimuthBins) {
+        let farthest = config.no_return_m.min(config.range_m_max) / config.cell_m;
+        for &[dx, dy, dz] in rays.no_returns {
+            let bin = azimuths.columns.column(dx, dy) as usize;
+            self.present[bin] = true;
+            let steps_a_m = (dx * dx + dy * dy).sqrt() / dz / config.cell_m;
+            let height = |height_m: f32| (height_m - rays.origin_m[2]) * steps_a_m;
+            let (from, to) = between(height(config.clear_height_m_min), height(config.clear_height_m_max));
+            let steps = azimuths.steps as f32;
+            let (first, end) = (round_to_whole(least(from, steps)), round_to_whole(least(to, least(farthest, steps))));
+            set_bits(&mut self.low[azimuths.row(bin)], first as usize, end as usize);
+        }
+    }
+
+    /// Step of the nearest hit of a bin and the bins beside it.
+    fn nearest(&self, bin: usize) -> usize {
+        let nearest = around(bin).map(|bin| self.nearest_hit[bin]).min();
+        usize::from(nearest.unwrap_or(NONE))
+    }
+
+    /// Marks the steps behind the nearest hit that returns from the ground prove free.
+    fn prove_ground(&mut self, azimuths: &AzimuthBins) {
+        let nearest: Vec<usize> = (0..BINS).map(|bin| self.nearest(bin)).collect();
+        for &Ground { bin, from, low, end, .. } in &self.ground {
+            let (bin, from, low, end) = (usize::from(bin), usize::from(from), usize::from(low), usize::from(end));
+            if low <= nearest[bin] {
+                continue;
+            }
+            let mut rows = around(bin).map(|bin| &self.hits[azimuths.row(bin)]);
+            if !rows.any(|row| any_bit(row, from, end)) {
+                set_bits(&mut self.proved[azimuths.row(bin)], from, low);
+            }
+        }
+    }
+
+    /// Traces the rays of all bins, and adds their evidence to the cells. `of_step` is a buffer.
+    fn trace(
+        &self,
+        config: &OccupancyConfig,
+        azimuths: &AzimuthBins,
+        window: &Window,
+        of_step: &mut [u8],
+        of_cell: &mut [u8],
+    ) {
+        let corner = window.corner();
+        let from = [0, 1].map(|i| self.origin[i] - corner[i] as f64);
+        let (sin, cos) = self.yaw_rad.sin_cos();
+        let reach = ((config.range_m_max / config.cell_m) as usize).min(azimuths.steps);
+        if !from.iter().all(|cells| (0.0..window.side() as f64).contains(cells)) {
+            return;
+        }
+        for bin in (0..BINS).filter(|bin| self.has_view(*bin)) {
+            self.evidence_of(bin, azimuths, of_step);
+            for (line, &[x, y]) in azimuths.lines[bin].iter().enumerate() {
+                let ray = Ray::new(from, [x * cos - y * sin, x * sin + y * cos], window.side());
+                let near = reach.min(FORK);
+                let steps = if line == 0 { 0..ray.steps(near) } else { near..ray.steps(reach).max(near) };
+                ray.write_evidence(steps, of_step, of_cell);
+            }
+        }
+    }
+
+    /// True if a bin, or both bins beside it, have rays: rays farther apart than a bin is wide leave each second bin
+    /// empty.
+    fn has_view(&self, bin: usize) -> bool {
+        self.present[bin] || self.present[neighbour(bin, -1)] && self.present[neighbour(bin, 1)]
+    }
+
+    /// Writes the evidence of a bin into `of_step`, step by step.
+    fn evidence_of(&self, bin: usize, azimuths: &AzimuthBins, of_step: &mut [u8]) {
+        let nearest = self.nearest(bin);
+        let (seen, hidden) = of_step.split_at_mut(nearest.min(azimuths.steps));
+        seen.fill(LOOKED_AT);
+        hidden.fill(LOOKED_AT | HIDDEN);
+        let [own, right, left] = [0, -1, 1].map(|beside| azimuths.row(neighbour(bin, beside)).start);
+        for (word, evidence) in of_step.chunks_exact_mut(64).enumerate() {
+            // In an empty bin a step is low if it is low in both bins beside it.
+            let (low, proved) = match self.present[bin] {
+                true => (self.low[own + word], self.proved[own + word]),
+                false => (self.low[right + word] & self.low[left + word], 0),
+            };
+            let before = bits_of_word(word, 0, nearest);
+            let mut free = low & before | proved & !before;
+            while free != 0 {
+                let first = free.trailing_zeros() as usize;
+                let end = first + (!(free >> first)).trailing_zeros() as usize;
+                evidence[first..end].fill(LOOKED_AT | THROUGH);
+                free &= !bits_of_word(0, first, end);
+            }
+        }
+    }
+}
+
+impl Default for Chunk {
+    fn default() -> Self {
+        let none = [0; CHUNK];
+        Self { bin: none, range: [0.0; CHUNK], step: none, first: none, end: none, under: none, low: none }
+    }
+}
+
+impl Chunk {
+    /// Computes the values of up to [`CHUNK`] points. It has no branches and reads no tables, so that the compiler
+    /// vectorises it.
+    #[inline(always)]
+    fn fill(
+        &mut self,
+        [xs, ys, zs]: [&[f32]; 3],
+        origin_m: [f32; 3],
+        config: &OccupancyConfig,
+        azimuths: &AzimuthBins,
+    ) {
+        let [ox, oy, oz] = origin_m;
+        let (per_m, steps) = (1.0 / config.cell_m, azimuths.steps as f32);
+        let [lowest, highest, clearance] =
+            [config.clear_height_m_min, config.clear_height_m_max, config.clearance_m].map(|height_m| height_m - oz);
+        let reliable = config.range_m_max * per_m;
+        let n = xs.len();
+        let (xs, ys, zs) = (&xs[..n], &ys[..n], &zs[..n]);
+        let (bin, range_of, step) = (&mut self.bin[..n], &mut self.range[..n], &mut self.step[..n]);
+        let (first, end) = (&mut self.first[..n], &mut self.end[..n]);
+        let (under_of, low_of) = (&mut self.under[..n], &mut self.low[..n]);
+        for i in 0..n {
+            let (dx, dy, z) = (xs[i] - ox, ys[i] - oy, zs[i]);
+            let range = (dx * dx + dy * dy).sqrt() * per_m;
+            // For a ray that returns from the ground, the ground is a straight line from under the sensor to the
+            // return.
+            let rise = if z < config.clear_height_m_min { -oz } else { z - oz };
+            let steps_a_m = range / rise;
+            let (from, to) = between(lowest * steps_a_m, highest * steps_a_m);
+            let (under, low) = between(lowest * steps_a_m, clearance * steps_a_m);
+            bin[i] = azimuths.columns.column(dx, dy);
+            range_of[i] = range;
+            step[i] = floor_to_whole(least(range, STEPS_MAX));
+            first[i] = round_to_whole(least(from, steps));
+            end[i] = round_to_whole(least(to, least(least(reliable, range), steps)));
+            under_of[i] = round_to_whole(least(under, least(range, steps)));
+            low_of[i] = round_to_whole(least(low, least(range, steps)));
+        }
+    }
+}
+
+/// Start and end of the part of a ray between two distances. Distances behind the sensor become 0.
+#[inline(always)]
+fn between(a: f32, b: f32) -> (f32, f32) {
+    // Level rays give infinities of the right sign. NaN fails every comparison.
+    let (from, to) = if a < b { (a, b) } else { (b, a) };
+    (if from > 0.0 { from } else { 0.0 }, if to > 0.0 { to } else { 0.0 })
+}
+
+/// The lesser of two values; the second if the first is NaN.
+#[inline(always)]
+fn least(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}

@@ -1,0 +1,72 @@
+//! The table `[vehicle.maps.safe_path]`.
+//!
+//! The UT Austin thesis gives no value for any parameter of its safe points (section VI).
+
+use serde::{Deserialize, Serialize};
+
+use crate::config::check::{ConfigValueError, check_cells, check_each};
+
+/// Parameters of the layer `safe_path`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SafePathConfig {
+    /// True if the layer is made.
+    pub enabled: bool,
+    /// Distance from the vehicle to each edge of the grid, metres. 30 is ours; not tuned.
+    pub extent_m: f32,
+    /// Side of a cell, metres. 0.25 is ours; not tuned.
+    pub cell_m: f32,
+    /// Width of the vehicle, metres. A safe point is at least half of it away from obstacles, and obstacles nearer to
+    /// one another count as one. 2 is ours, a car.
+    pub vehicle_width_m: f32,
+    /// Distance from the ego origin to the vehicle's front, metres. Returns from within the vehicle's outline are no
+    /// obstacles. 3 is ours, a car.
+    pub vehicle_front_m: f32,
+    /// Distance from the ego origin to the vehicle's rear, metres. 2 is ours, a car.
+    pub vehicle_rear_m: f32,
+    /// Range within which the sensor does not see the ground, metres; unknown cells before drivable ground are no
+    /// obstacles there. 7 is ours, as in the layer `drivability`; not tuned.
+    pub blind_zone_m: f32,
+    /// Widest unseen gap between drivable cells of one ring or azimuth that is no obstacle, metres; 0 closes no gap. 1
+    /// is ours; not tuned.
+    pub hole_m_max: f32,
+    /// Largest distance from the vehicle to a safe point that it drives to directly, metres. 15 is ours; not tuned.
+    pub join_m_max: f32,
+}
+
+impl Default for SafePathConfig {
+    fn default() -> Self {
+        Self {
+            enabled: true,
+            extent_m: 30.0,
+            cell_m: 0.25,
+            vehicle_width_m: 2.0,
+            vehicle_front_m: 3.0,
+            vehicle_rear_m: 2.0,
+            blind_zone_m: 7.0,
+            hole_m_max: 1.0,
+            join_m_max: 15.0,
+        }
+    }
+}
+
+impl SafePathConfig {
+    /// Checks the values of the table `at`.
+    ///
+    /// # Errors
+    /// [`ConfigValueError`] for the first value that is not allowed.
+    pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
+        let values = [
+            ("extent_m", self.extent_m, (5.0..=200.0, "5 to 200")),
+            ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
+            ("vehicle_width_m", self.vehicle_width_m, (0.1..=10.0, "0.1 to 10")),
+            ("vehicle_front_m", self.vehicle_front_m, (0.0..=20.0, "0 to 20")),
+            ("vehicle_rear_m", self.vehicle_rear_m, (0.0..=20.0, "0 to 20")),
+            ("blind_zone_m", self.blind_zone_m, (0.0..=60.0, "0 to 60")),
+            ("hole_m_max", self.hole_m_max, (0.0..=5.0, "0 to 5")),
+            ("join_m_max", self.join_m_max, (0.0..=100.0, "0 to 100")),
+        ];
+        check_each(at, values)?;
+        check_cells(at, self.extent_m, self.cell_m)
+    }
+}

@@ -1,0 +1,232 @@
+//! Free space: which cells of a Cartesian grid about the vehicle are free.
+//!
+//! In: the layer `drivability`, radial, and the sweep it was made from. Out: a [`State`] for each cell: the state of
+//! the radial cell in which the cell's centre lies. A radial cell with returns only from the vehicle's own outline (its
+//! bonnet) is unknown. Unseen ground is not free, with two exceptions:
+//! - The blind zone: if the innermost seen cell of a column is drivable and begins within the zone, the ground nearer
+//!   to the vehicle, which no laser reaches, is assumed to be free too, as the UT Austin thesis assumes when segments
+//!   grow from the vehicle (section IV.3).
+//! - Narrow holes in drivable ground: a cell or two in which a return was lost.
+//!
+//! Cells of the two exceptions are not called drivable, and no safe point lies in them. They are only no obstacles.
+
+use crate::layer::channel::TypedChannel;
+use crate::layer::drivability::class::DrivabilityClass;
+use crate::layer::grid::Geometry;
+use crate::layer::maker::Layer;
+use crate::layer::radial_grid::RadialGrid;
+use crate::sensor::sweep::Sweep;
+
+use super::config::SafePathConfig;
+
+/// State of a cell.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum State {
+    /// Not seen.
+    #[default]
+    Unknown,
+    /// The vehicle can get there.
+    Drivable,
+    /// Seen, and not drivable.
+    Obstacle,
+    /// Not seen, in the blind zone before drivable ground.
+    Blind,
+    /// Not seen, between drivable or blind cells of one ring or one azimuth.
+    Hole,
+}
+
+impl State {
+    /// True if the vehicle may drive over the cell.
+    pub fn is_free(self) -> bool {
+        matches!(self, Self::Drivable | Self::Blind | Self::Hole)
+    }
+}
+
+/// Which returns a radial cell has.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Returns {
+    /// From within the vehicle's outline.
+    own: bool,
+    /// From outside it.
+    other: bool,
+}
+
+/// States of a grid of `side` cells along x and y with the vehicle in the middle: index = iy * side + ix.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FreeSpace {
+    side: usize,
+    cell_m: f64,
+    states: Vec<State>,
+    of_radial_cell: Vec<State>,
+    grid: RadialGrid,
+    /// By radial cell near the vehicle's outline.
+    returns: Vec<Returns>,
+    /// Radial cell of each cell's centre; one past the last if the centre lies beyond the radial grid.
+    radial_cell: Vec<u32>,
+    /// The radial grid for which `radial_cell` was computed.
+    made_for: Option<Geometry>,
+}
+
+impl FreeSpace {
+    /// A grid of unknown cells.
+    pub fn new(side: usize, cell_m: f64) -> Self {
+        Self {
+            side,
+            cell_m,
+            states: vec![State::Unknown; side * side],
+            of_radial_cell: Vec::new(),
+            grid: RadialGrid::default(),
+            returns: Vec::new(),
+            radial_cell: Vec::new(),
+            made_for: None,
+        }
+    }
+
+    /// Number of cells along x, and along y.
+    pub fn side(&self) -> usize {
+        self.side
+    }
+
+    /// States by cell.
+    pub fn states(&self) -> &[State] {
+        &self.states
+    }
+
+    /// Computes the states from a map's layer `drivability`; without that layer all cells are unknown.
+    pub fn update(&mut self, drivability: Option<&Layer>, sweep: &Sweep, config: &SafePathConfig) {
+        let class = drivability.and_then(|layer| TypedChannel::CLASS.values(&layer.channels));
+        let (Some(layer), Some(class)) = (drivability, class) else { return self.states.fill(State::Unknown) };
+        let Geometry::Radial { row_radius_m, columns } = &layer.geometry else {
+            return self.states.fill(State::Unknown);
+        };
+        if self.made_for.as_ref() != Some(&layer.geometry) {
+            self.find_radial_cells(row_radius_m, *columns);
+            self.made_for = Some(layer.geometry.clone());
+        }
+        self.of_radial_cell.clear();
+        const UNKNOWN: u8 = DrivabilityClass::Unknown.value();
+        const DRIVABLE: u8 = DrivabilityClass::Drivable.value();
+        self.of_radial_cell.extend(class.iter().map(|&class| match class {
+            UNKNOWN => State::Unknown,
+            DRIVABLE => State::Drivable,
+            _ => State::Obstacle,
+        }));
+        self.remove_own_returns(sweep, config);
+        let columns = usize::from(*columns);
+        mark_blind_zone(&mut self.of_radial_cell, row_radius_m, columns, config.blind_zone_m);
+        mark_holes(&mut self.of_radial_cell, row_radius_m, columns, config.hole_m_max);
+        // State of the cells beyond the radial grid.
+        self.of_radial_cell.push(State::Unknown);
+        for (state, &cell) in self.states.iter_mut().zip(&self.radial_cell) {
+            *state = self.of_radial_cell[cell as usize];
+        }
+        self.free_outline(config);
+    }
+
+    /// Makes radial cells unknown that have returns only from the vehicle itself.
+    fn remove_own_returns(&mut self, sweep: &Sweep, config: &SafePathConfig) {
+        let SafePathConfig { vehicle_front_m, vehicle_rear_m, vehicle_width_m, .. } = *config;
+        let corner_m = vehicle_front_m.max(vehicle_rear_m).hypot(vehicle_width_m / 2.0);
+        // Rows up to the end of the last one that touches the outline.
+        let rows = (0..self.grid.rows()).take_while(|row| self.grid.row_span_m(*row).0 < corner_m).count();
+        let reach_m = rows.checked_sub(1).map_or(0.0, |last| self.grid.row_span_m(last).1);
+        self.returns.clear();
+        self.returns.resize(rows * self.grid.columns(), Returns::default());
+        for (&x, &y) in sweep.x.iter().zip(&sweep.y).filter(|(x, y)| **x * **x + **y * **y <= reach_m * reach_m) {
+            if let Some(returns) = self.grid.cell(x, y).and_then(|cell| self.returns.get_mut(cell)) {
+                let own = is_within_the_vehicle(x, y, config);
+                (returns.own, returns.other) = (returns.own | own, returns.other | !own);
+            }
+        }
+        for (state, returns) in self.of_radial_cell.iter_mut().zip(&self.returns) {
+            if returns.own && !returns.other {
+                *state = State::Unknown;
+            }
+        }
+    }
+
+    /// Makes the cells under the vehicle free: nothing else can stand there.
+    fn free_outline(&mut self, config: &SafePathConfig) {
+        let centre_m = |i: usize| ((i as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32;
+        let longest_m = config.vehicle_front_m.max(config.vehicle_rear_m).max(config.vehicle_width_m);
+        let reach = (f64::from(longest_m) / self.cell_m).ceil() as usize;
+        let near = (self.side / 2).saturating_sub(reach)..(self.side / 2 + reach).min(self.side);
+        for iy in near.clone() {
+            for ix in near.clone() {
+                let state = &mut self.states[iy * self.side + ix];
+                if is_within_the_vehicle(centre_m(ix), centre_m(iy), config) && !state.is_free() {
+                    *state = State::Blind;
+                }
+            }
+        }
+    }
+
+    /// Computes the radial cell of each cell.
+    fn find_radial_cells(&mut self, row_radius_m: &[f32], columns: u16) {
+        self.grid = RadialGrid::new(row_radius_m.to_vec(), columns);
+        let centre_m = |i: usize| ((i as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32;
+        let cell = |index: usize| self.grid.cell(centre_m(index % self.side), centre_m(index / self.side));
+        let cells = 0..self.side * self.side;
+        self.radial_cell = cells.map(|index| cell(index).unwrap_or(self.grid.cells()) as u32).collect();
+    }
+}
+
+/// True if a position lies within the vehicle's outline.
+fn is_within_the_vehicle(x: f32, y: f32, config: &SafePathConfig) -> bool {
+    (-config.vehicle_rear_m..=config.vehicle_front_m).contains(&x) && y.abs() <= config.vehicle_width_m / 2.0
+}
+
+/// Marks unseen cells nearer to the vehicle than drivable ground that begins within the blind zone.
+fn mark_blind_zone(of_radial_cell: &mut [State], row_radius_m: &[f32], columns: usize, blind_zone_m: f32) {
+    for column in 0..columns {
+        let seen = (0..row_radius_m.len()).find(|row| of_radial_cell[row * columns + column] != State::Unknown);
+        let Some(seen) = seen else { continue };
+        let begins_m = if seen == 0 { 0.0 } else { row_radius_m[seen - 1] };
+        if begins_m <= blind_zone_m && of_radial_cell[seen * columns + column] == State::Drivable {
+            (0..seen).for_each(|row| of_radial_cell[row * columns + column] = State::Blind);
+        }
+    }
+}
+
+/// Marks narrow holes along rings and along azimuths.
+fn mark_holes(of_radial_cell: &mut [State], row_radius_m: &[f32], columns: usize, hole_m_max: f32) {
+    let rows = row_radius_m.len();
+    for (row, &r) in row_radius_m.iter().enumerate() {
+        let column_m = r * std::f32::consts::TAU / columns as f32;
+        let ring = &mut of_radial_cell[row * columns..][..columns];
+        let Some(first) = ring.iter().position(|state| state.is_free()) else { continue };
+        // The walk goes once around the ring, from one free cell to itself.
+        let around = |i: usize| if first + i < columns { first + i } else { first + i - columns };
+        let width_m = |from: usize, to: usize| (to - from - 1) as f32 * column_m;
+        mark_along(columns + 1, around, |from, to| width_m(from, to) <= hole_m_max, ring);
+    }
+    for column in 0..columns {
+        let width_m = |from: usize, to: usize| row_radius_m[to - 1] - row_radius_m[from];
+        mark_along(rows, |row| row * columns + column, |from, to| width_m(from, to) <= hole_m_max, of_radial_cell);
+    }
+}
+
+/// Marks unseen cells between free ones along a line of `length` cells, if the hole is narrow enough.
+fn mark_along(
+    length: usize,
+    cell: impl Fn(usize) -> usize,
+    is_narrow: impl Fn(usize, usize) -> bool,
+    states: &mut [State],
+) {
+    let mut last_free = None;
+    for i in 0..length {
+        match states[cell(i)] {
+            State::Unknown | State::Hole => continue,
+            State::Drivable | State::Blind => {
+                if let Some(before) = last_free
+                    && i - before > 1
+                    && is_narrow(before, i)
+                {
+                    (before + 1..i).for_each(|hole| states[cell(hole)] = State::Hole);
+                }
+                last_free = Some(i);
+            }
+            State::Obstacle => last_free = None,
+        }
+    }
+}

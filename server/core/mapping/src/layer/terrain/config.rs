@@ -1,0 +1,128 @@
+//! The table `[vehicle.maps.terrain]`.
+//!
+//! Neuhaus 2009 gives no value for any parameter of the algorithm.
+
+use serde::{Deserialize, Serialize};
+
+use crate::config::check::{ConfigValueError, check_each};
+
+/// Parameters of the layer `terrain`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TerrainConfig {
+    /// True if the layer is made.
+    pub enabled: bool,
+    /// Variant of the algorithm. `grounded` is ours, because `paper` calls car roofs flat and infers cells far beyond
+    /// the last point (BENCHMARKS.md compares the three).
+    pub variant: Variant,
+    /// Distance from the vehicle to each edge of the grid, metres. 50 is ours; not tuned.
+    pub range_m_max: f32,
+    /// Side of a cell, metres. 0.25 is ours, because the paper only says "relatively small" (section 2.3); not tuned.
+    pub cell_m: f32,
+    /// Largest height of a point over the ground under the vehicle, metres; the vehicle passes under higher ones. 2.5
+    /// is ours: the value of the layer `drivability` (UT Austin thesis, section IV.2).
+    pub overhang_m: f32,
+    /// Largest local height disturbance of a flat region, m² (eq. 1: a variance). 0.005 is ours, because the paper
+    /// gives no threshold (section 2.3); not tuned.
+    pub flatness_m2_max: f32,
+    /// Least number of points of a region that is judged. 3 is ours: as many as define a plane.
+    pub points_min: u16,
+    /// With `variant = "grounded"`: largest distance between a point of a flat region and its plane, metres. 0.15 is
+    /// ours; chosen on the labelled frame of BENCHMARKS.md.
+    pub residual_m_max: f32,
+    /// With `variant = "grounded"`: largest rise over run of a flat region. 0.2 is ours; chosen on the labelled frame
+    /// of BENCHMARKS.md.
+    pub grade_max: f32,
+    /// With `variant = "grounded"`: largest range of flat ground that may belong to the ground under the vehicle,
+    /// metres. 7 is ours; not tuned.
+    pub blind_zone_m: f32,
+    /// With `variant = "grounded"`: largest height of that ground over or under the vehicle's, metres. 0.25 is ours;
+    /// not tuned.
+    pub start_m_max: f32,
+    /// With `variant = "grounded"`: largest step between neighbouring regions of the ground, metres. 0.15 is ours;
+    /// chosen on the labelled frame of BENCHMARKS.md.
+    pub step_m_max: f32,
+    /// With `variant = "grounded"`: widest gap without points between two neighbouring regions, metres; the rings of
+    /// far ground lie that far apart. 8 is ours; not tuned.
+    pub bridge_m_max: f32,
+    /// With `variant = "grounded"`: least width between obstacles that the vehicle drives through, metres; 0 accepts
+    /// every passage. 2 is ours, the width of a car; not tuned.
+    pub passage_m_min: f32,
+    /// With `variant = "grounded"`: widest hole in seen ground that is inferred to be flat, metres. 3 is ours; not
+    /// tuned.
+    pub inference_m_max: f32,
+    /// Standard deviation of the sensor's range noise, metres; it is subtracted from the roughness (section 2.5). 0.02
+    /// is ours: the range noise of an HDL-64E, because the paper gives no value.
+    pub noise_m: f32,
+    /// Least number of points with a range deviation in a cell with a roughness. 4 is ours; not tuned.
+    pub roughness_points_min: u16,
+    /// True if the layer has channels for the plane of each flat cell (height and slopes). `false` is ours, because the
+    /// channels cost bytes.
+    pub planes: bool,
+}
+
+impl Default for TerrainConfig {
+    fn default() -> Self {
+        Self {
+            enabled: true,
+            variant: Variant::Grounded,
+            range_m_max: 50.0,
+            cell_m: 0.25,
+            overhang_m: 2.5,
+            flatness_m2_max: 0.005,
+            points_min: 3,
+            residual_m_max: 0.15,
+            grade_max: 0.2,
+            blind_zone_m: 7.0,
+            start_m_max: 0.25,
+            step_m_max: 0.15,
+            bridge_m_max: 8.0,
+            passage_m_min: 2.0,
+            inference_m_max: 3.0,
+            noise_m: 0.02,
+            roughness_points_min: 4,
+            planes: false,
+        }
+    }
+}
+
+/// How the layer `terrain` finds flat cells.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Variant {
+    /// Hierarchical division; flat regions must join the ground under the vehicle; inference only within seen ground.
+    Grounded,
+    /// Hierarchical division alone (Neuhaus 2009, section 2.3, but with four parts a division instead of two).
+    Paper,
+    /// Each cell by itself, with the shape of its points (Neuhaus 2009, section 2.2).
+    Grid,
+}
+
+impl TerrainConfig {
+    /// Checks the values of the table `at`.
+    ///
+    /// # Errors
+    /// [`ConfigValueError`] for the first value that is not allowed.
+    pub(crate) fn validate(&self, at: &str) -> Result<(), ConfigValueError> {
+        let values = [
+            // At most 2000 cells a side.
+            ("range_m_max", self.range_m_max, (5.0..=100.0, "5 to 100")),
+            ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
+            ("overhang_m", self.overhang_m, (0.5..=100.0, "0.5 to 100")),
+            ("flatness_m2_max", self.flatness_m2_max, (1e-6..=1.0, "0.000001 to 1")),
+            ("residual_m_max", self.residual_m_max, (0.01..=10.0, "0.01 to 10")),
+            ("grade_max", self.grade_max, (0.01..=10.0, "0.01 to 10")),
+            ("blind_zone_m", self.blind_zone_m, (0.0..=60.0, "0 to 60")),
+            ("start_m_max", self.start_m_max, (0.01..=10.0, "0.01 to 10")),
+            ("step_m_max", self.step_m_max, (0.0..=10.0, "0 to 10")),
+            ("bridge_m_max", self.bridge_m_max, (0.0..=20.0, "0 to 20")),
+            ("passage_m_min", self.passage_m_min, (0.0..=20.0, "0 to 20")),
+            ("inference_m_max", self.inference_m_max, (0.0..=20.0, "0 to 20")),
+            // Without noise the plane through a piece of one ring is not defined.
+            ("noise_m", self.noise_m, (0.001..=1.0, "0.001 to 1")),
+            ("points_min", self.points_min.into(), (1.0..=1000.0, "1 to 1000")),
+            ("roughness_points_min", self.roughness_points_min.into(), (1.0..=1000.0, "1 to 1000")),
+        ];
+        check_each(at, values)
+    }
+}

@@ -1,0 +1,29 @@
+//! `clearway completions`: the name of a shell -> its completion script.
+
+use anyhow::Result;
+use clap::{Args, Command};
+use clap_complete::Shell;
+
+use super::output::print;
+
+/// Print the completion script of a shell.
+#[derive(Args)]
+#[command(after_help = "Examples:
+  clearway completions bash > ~/.local/share/bash-completion/completions/clearway
+  clearway completions zsh > ~/.zfunc/_clearway
+  clearway completions fish > ~/.config/fish/completions/clearway.fish")]
+pub struct Options {
+    /// The shell.
+    shell: Shell,
+}
+
+/// Prints the script that completes the subcommands and options of `command`.
+///
+/// # Errors
+/// As [`print`].
+pub fn run(options: &Options, mut command: Command) -> Result<()> {
+    let mut script = Vec::new();
+    clap_complete::generate(options.shell, &mut command, "clearway", &mut script);
+    print(&String::from_utf8_lossy(&script))?;
+    Ok(())
+}

@@ -1,0 +1,66 @@
+//! Options that several subcommands share: the configuration file, how a sensor is mounted.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result};
+use clap::Args;
+use clearway_mapping::config::Extrinsics;
+
+use crate::config::Config;
+
+/// The options that name a configuration file and override its keys.
+#[derive(Args)]
+pub struct ConfigurationOptions {
+    /// The configuration file; deploy/clearway.toml of the repository explains every key.
+    #[arg(short, long, value_name = "FILE", env = "CLEARWAY_CONFIG", default_value = "clearway.toml")]
+    pub config: PathBuf,
+    /// Override a key of the configuration, such as grpc.listen=0.0.0.0:50051; may be given several times.
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+}
+
+impl ConfigurationOptions {
+    /// Reads the file, applies the overrides and checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`](crate::config::ConfigError); for a file that does not exist with how to get one.
+    pub fn load(&self) -> Result<Config> {
+        let loaded = Config::load(&self.config, &self.set);
+        if self.config.exists() {
+            return Ok(loaded?);
+        }
+        loaded.context(
+            "no configuration file; name one with --config FILE, or copy deploy/clearway.toml of the repository, which has \
+             every key with its default",
+        )
+    }
+}
+
+/// Reads extrinsics from the command line: six numbers, separated by commas.
+///
+/// # Errors
+/// If there are not six numbers.
+pub fn extrinsics(text: &str) -> Result<Extrinsics, String> {
+    let numbers: Vec<f64> = text.split(',').filter_map(|number| number.trim().parse().ok()).collect();
+    match numbers[..] {
+        [x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg] if text.split(',').count() == 6 => {
+            Ok(Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg })
+        }
+        _ => Err("six numbers are needed: x,y,z in metres, roll,pitch,yaw in degrees".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn extrinsics_are_six_numbers_in_metres_and_degrees() {
+        let given = extrinsics("1,-0.5,1.9,0,-2.5,90").unwrap();
+        assert_eq!((given.x_m, given.y_m, given.z_m), (1.0, -0.5, 1.9));
+        assert_eq!((given.roll_deg, given.pitch_deg, given.yaw_deg), (0.0, -2.5, 90.0));
+        for wrong in ["", "1,2,3", "1,2,3,4,5,6,7", "1,2,3,4,5,x,6"] {
+            assert!(extrinsics(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,143 @@
+//! The options of `clearway replay`, and why a replay fails.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use clearway_lidar::model::Model;
+use clearway_mapping::config::Extrinsics;
+
+use super::clouds::CloudError;
+use crate::cli::configuration::extrinsics;
+use crate::config::ConfigError;
+use crate::ingest::files::FilesError;
+use crate::record::reader::RecordingError;
+use crate::server::{ShutdownError, StartError};
+
+/// Make maps from recorded drives: pcap, pcapng, MCAP, KITTI and PCD files or folders, in the order given.
+///
+/// The sensor's model, return mode and rotation rate are found from the data. If nothing says how the sensor is mounted,
+/// height, pitch and roll are estimated from the ground in the first revolutions; the estimate is printed and recorded.
+#[derive(Args, Clone, Debug, Default)]
+#[command(after_help = "Examples:
+  clearway replay drive.pcap --record drive.mcap
+  clearway replay drive.pcap --extrinsics 0,0,1.9,0,0,0 --json
+  clearway replay drive.mcap --serve --speed as-recorded")]
+pub struct Options {
+    /// pcap, pcapng, MCAP, KITTI .bin and .pcd files, or folders of them.
+    #[arg(required = true)]
+    pub files: Vec<PathBuf>,
+    /// Record the events and the maps to this MCAP file.
+    #[arg(long, value_name = "OUT.mcap")]
+    pub record: Option<PathBuf>,
+    /// Speed of the replay: as-recorded, max, or a factor [default: max; as-recorded with --serve].
+    #[arg(long)]
+    pub speed: Option<Speed>,
+    /// Print one JSON object at the end.
+    #[arg(long)]
+    pub json: bool,
+    /// Write the points of each revolution, in the sensor frame, to this folder as binary PCD files.
+    #[arg(long, value_name = "DIR")]
+    pub clouds: Option<PathBuf>,
+    /// Calibration file of the sensor (ROS YAML or Velodyne XML); the factory's values if absent.
+    #[arg(long, value_name = "FILE")]
+    pub calibration: Option<PathBuf>,
+    /// Position and orientation of the sensor in the ego frame, in metres and degrees; estimated from the ground if
+    /// neither this nor the files nor the configuration has it.
+    #[arg(long, value_name = "x,y,z,roll,pitch,yaw", value_parser = extrinsics, allow_hyphen_values = true)]
+    pub extrinsics: Option<Extrinsics>,
+    /// The sensor's model, if the data names the wrong one or none.
+    #[arg(long)]
+    pub model: Option<Model>,
+    /// Rotation rate of the sensor, in revolutions per minute, if the data gives the wrong one or none.
+    #[arg(long)]
+    pub rpm: Option<f32>,
+    /// A ROS topic of an MCAP file to read; may be given several times. Sensors and poses are chosen if absent.
+    #[arg(long = "topic", value_name = "TOPIC")]
+    pub topics: Vec<String>,
+    /// Use the vehicle, the maps and the publishers of this configuration.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Override a key of the configuration; may be given several times.
+    #[arg(long, value_name = "KEY=VALUE", requires = "config")]
+    pub set: Vec<String>,
+    /// Publish the maps, and the last map until SIGINT or SIGTERM. The maps keep the stamps of the recording, so readers
+    /// see old ones as stale.
+    #[arg(long)]
+    pub serve: bool,
+    /// The vehicle to replay, if the recording or the configuration has several.
+    #[arg(long)]
+    pub vehicle: Option<String>,
+}
+
+/// Speed of a replay, relative to the recorded time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Speed {
+    /// This many times the recorded speed; above 0.
+    Times(f64),
+    /// As fast as the machine can.
+    Max,
+}
+
+impl std::str::FromStr for Speed {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "as-recorded" => Ok(Self::Times(1.0)),
+            "max" => Ok(Self::Max),
+            factor => match factor.parse() {
+                Ok(times) if times > 0.0 && f64::is_finite(times) => Ok(Self::Times(times)),
+                _ => Err("as-recorded, max, or a factor above 0 is allowed".into()),
+            },
+        }
+    }
+}
+
+/// Why a replay failed.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// A file cannot be read.
+    #[error(transparent)]
+    Files(#[from] FilesError),
+    /// A recording cannot be used.
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    /// The configuration cannot be used.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The configuration has no vehicle of that name.
+    #[error("--vehicle {name}: the configuration has: {known}")]
+    Vehicle {
+        /// Name of the vehicle, as given.
+        name: String,
+        /// Names of the vehicles of the configuration, separated by commas.
+        known: String,
+    },
+    /// The point clouds cannot be written.
+    #[error(transparent)]
+    Clouds(#[from] CloudError),
+    /// The server did not start.
+    #[error(transparent)]
+    Start(#[from] StartError),
+    /// The server did not end in order.
+    #[error(transparent)]
+    End(#[from] ShutdownError),
+    /// The engine stopped before the end of the files.
+    #[error("the vehicle's engine has stopped")]
+    Engine,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_speed_is_a_word_or_a_factor_above_zero() {
+        assert_eq!("as-recorded".parse(), Ok(Speed::Times(1.0)));
+        assert_eq!("max".parse(), Ok(Speed::Max));
+        assert_eq!("2.5".parse(), Ok(Speed::Times(2.5)));
+        for wrong in ["0", "-1", "inf", "NaN", "fast"] {
+            assert!(wrong.parse::<Speed>().unwrap_err().contains("as-recorded, max"), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,76 @@
+//! Finding a vehicle by its name, and the error for a name that does not exist.
+
+/// A request names a vehicle, sensor or layer that does not exist.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum UnknownNameError {
+    /// No vehicle has this name, or the name is empty and there is not exactly one vehicle.
+    #[error("vehicle {name:?} is not known; known: {known}")]
+    Vehicle {
+        /// The requested name.
+        name: String,
+        /// The names of all vehicles, separated by commas.
+        known: String,
+    },
+    /// No sensor of the vehicle has this name, or the name is empty and there is not exactly one sensor.
+    #[error("sensor {name:?} is not known; vehicle {vehicle} has: {known}")]
+    Sensor {
+        /// The requested name.
+        name: String,
+        /// The vehicle's name.
+        vehicle: String,
+        /// The names of the vehicle's sensors, separated by commas.
+        known: String,
+    },
+    /// No layer of the vehicle's maps has this name.
+    #[error("layer {name:?} is not known; vehicle {vehicle} has: {known}")]
+    Layer {
+        /// The requested name.
+        name: String,
+        /// The vehicle's name.
+        vehicle: String,
+        /// The names of the layers, separated by commas.
+        known: String,
+    },
+}
+
+impl From<UnknownNameError> for tonic::Status {
+    fn from(error: UnknownNameError) -> Self {
+        match error {
+            UnknownNameError::Vehicle { .. } | UnknownNameError::Sensor { .. } => Self::not_found(error.to_string()),
+            UnknownNameError::Layer { .. } => Self::invalid_argument(error.to_string()),
+        }
+    }
+}
+
+/// Finds the vehicle called `name`; an empty `name` stands for the only vehicle.
+///
+/// # Errors
+/// [`UnknownNameError::Vehicle`] if no vehicle has the name, or if it is empty and there is not exactly one vehicle.
+pub fn find_vehicle<'a, T>(
+    vehicles: &'a [T],
+    name: &str,
+    name_of: impl Fn(&T) -> &str,
+) -> Result<&'a T, UnknownNameError> {
+    if let ("", [only]) = (name, vehicles) {
+        return Ok(only);
+    }
+    vehicles.iter().find(|vehicle| name_of(vehicle) == name).ok_or_else(|| {
+        let known: Vec<&str> = vehicles.iter().map(name_of).collect();
+        UnknownNameError::Vehicle { name: name.to_owned(), known: known.join(", ") }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_empty_name_stands_for_the_only_vehicle_and_for_no_other() {
+        let find = |vehicles: &[&str], name: &str| find_vehicle(vehicles, name, |of| of).map(|of| of.to_string());
+        assert_eq!(find(&["car"], "").unwrap(), "car");
+        assert_eq!(find(&["car", "van"], "van").unwrap(), "van");
+        let error = find(&["car", "van"], "").unwrap_err();
+        assert_eq!(error.to_string(), "vehicle \"\" is not known; known: car, van");
+        assert!(find(&["car"], "van").is_err());
+    }
+}

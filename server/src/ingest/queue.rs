@@ -1,0 +1,397 @@
+//! Readings in, numbered [`Event`]s out, on one bounded queue a vehicle.
+//!
+//! Only this file and the reader of recordings create an [`Event`]; the engine cannot tell live and captured events
+//! apart. The queue stamps a live reading with its clock; a captured reading keeps its own stamp. A reading that does
+//! not become an event is counted, because the queue or the kernel's buffer was full, the sender is unknown, or the
+//! datagram is too long. The queue turns these counts into [`Body::Lost`] events, so the journal and every replay of it
+//! contain all drops.
+
+use std::net::SocketAddr;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex};
+
+use clearway_mapping::event::{Body, Cause, Event};
+use futures::executor::block_on;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
+use super::drops::{DropCounters, Unreported, next_unreported};
+use super::receipt::{Outcome, Receipt};
+use crate::clock::Clock;
+use crate::sync::locked;
+
+/// Least time between two reports of drops to the engine, in ns. Drops by a full queue are reported at once; a flood of
+/// datagrams from unknown senders must not fill the journal. Ours: ten reports a second are fine enough for a rate.
+const REPORT_PERIOD_NS: u64 = 100_000_000;
+
+/// An event without its number: what a source of readings yields.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Reading {
+    /// Stamp of the capture, ns since the Unix epoch.
+    pub arrival_ns: i64,
+    /// Index of the sensor in the vehicle's configuration.
+    pub source: u16,
+    /// The content.
+    pub body: Body,
+}
+
+/// The queue takes no more events: the engine has stopped, or the queue is closed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the vehicle's engine has stopped")]
+pub struct QueueClosedError;
+
+/// One event on the queue.
+#[derive(Debug)]
+pub struct QueuedEvent {
+    /// The event.
+    pub event: Event,
+    /// Delivers the outcome to the client that sent the event. A recording does not contain it.
+    pub receipt: Option<Receipt>,
+    /// This event's space on the queue, free again when this is dropped.
+    _permit: OwnedSemaphorePermit,
+}
+
+/// The sending end of one vehicle's event queue. Clones share numbers, space and drop counters. The queue ends when it
+/// is closed or when the last clone is dropped.
+#[derive(Clone, Debug)]
+pub struct EventQueue {
+    state: Arc<Mutex<State>>,
+    space: Arc<Semaphore>,
+    drops: Arc<DropCounters>,
+    clock: Clock,
+}
+
+/// Numbers the events. A thread that holds its lock never waits, because it acquires space on the queue before.
+#[derive(Debug)]
+struct State {
+    /// `None` once the queue is closed.
+    sender: Option<SyncSender<QueuedEvent>>,
+    next_sequence: u64,
+    /// Arrival of the newest report of drops, ns since the Unix epoch.
+    reported_ns: i64,
+}
+
+/// Creates a queue of `capacity` events that stamps live readings with the system's clock.
+pub fn event_queue(capacity: usize) -> (EventQueue, Receiver<QueuedEvent>) {
+    event_queue_with_clock(Clock::default(), capacity)
+}
+
+/// Creates a queue of `capacity` events that stamps live readings with `clock`.
+pub fn event_queue_with_clock(clock: Clock, capacity: usize) -> (EventQueue, Receiver<QueuedEvent>) {
+    let (sender, events) = sync_channel(capacity);
+    let state = State { sender: Some(sender), next_sequence: 0, reported_ns: 0 };
+    let (state, space) = (Arc::new(Mutex::new(state)), Arc::new(Semaphore::new(capacity)));
+    (EventQueue { state, space, drops: Arc::default(), clock }, events)
+}
+
+impl EventQueue {
+    /// Pushes a live reading, stamped now. Never waits: if the queue is full, the reading is counted as lost.
+    ///
+    /// # Errors
+    /// [`QueueClosedError`] if the engine has stopped.
+    pub fn push(&self, source: u16, body: Body) -> Result<(), QueueClosedError> {
+        self.push_batch([(source, body)])
+    }
+
+    /// Pushes live readings that arrived together, all with the same stamp. Never waits, as [`EventQueue::push`].
+    ///
+    /// # Errors
+    /// [`QueueClosedError`] if the engine has stopped.
+    pub fn push_batch(&self, readings: impl IntoIterator<Item = (u16, Body)>) -> Result<(), QueueClosedError> {
+        self.push_all(None, readings.into_iter().map(|(source, body)| (source, body, None))).map(drop)
+    }
+
+    /// Pushes an observation, stamped `captured_ns` or now. Never waits. Returns true if the event is on the queue;
+    /// otherwise the receipt has delivered the refusal.
+    ///
+    /// # Errors
+    /// [`QueueClosedError`] if the engine has stopped; the receipt delivers that too.
+    pub fn push_observation(
+        &self,
+        captured_ns: Option<i64>,
+        source: u16,
+        body: Body,
+        receipt: Receipt,
+    ) -> Result<bool, QueueClosedError> {
+        self.push_all(captured_ns, [(source, body, Some(receipt))])
+    }
+
+    /// Returns true if all readings are on the queue.
+    fn push_all(
+        &self,
+        captured_ns: Option<i64>,
+        readings: impl IntoIterator<Item = (u16, Body, Option<Receipt>)>,
+    ) -> Result<bool, QueueClosedError> {
+        let mut state = locked(&self.state);
+        let mut unreported = locked(&self.drops.unreported);
+        // Reports of drops get the same stamp, so that the time of a captured drive never jumps to the clock's and back.
+        let arrival_ns = captured_ns.unwrap_or_else(|| self.clock.now_ns());
+        // Reports come before the readings, so that the journal has the drops where they happened.
+        let (is_due, mut has_space) = (state.is_report_due(arrival_ns), true);
+        while let Some(key) = next_unreported(&unreported, is_due).filter(|_| has_space) {
+            match self.try_acquire() {
+                Some(permit) => state.push_report(permit, &mut unreported, key, arrival_ns)?,
+                None => has_space = false,
+            }
+        }
+        for (source, body, receipt) in readings {
+            match has_space.then(|| self.try_acquire()).flatten() {
+                Some(permit) => state.push(permit, Reading { arrival_ns, source, body }, receipt)?,
+                None => {
+                    has_space = false;
+                    *unreported.entry((Cause::Queue, source)).or_default() += 1;
+                    if let Some(receipt) = receipt {
+                        let message = "the vehicle's queue is full: the engine does not keep up".to_owned();
+                        receipt.deliver(Outcome::Refused { reason: "queue", message });
+                    }
+                }
+            }
+        }
+        Ok(has_space)
+    }
+
+    /// Pushes a captured reading with its own stamp, after the reports of drops that are due. Waits while the queue is
+    /// full, so that no reading of a file is lost.
+    ///
+    /// # Errors
+    /// [`QueueClosedError`] if the engine has stopped.
+    pub fn push_captured(&self, reading: Reading) -> Result<(), QueueClosedError> {
+        let arrival_ns = reading.arrival_ns;
+        let is_due = locked(&self.state).is_report_due(arrival_ns);
+        loop {
+            let permit = self.acquire()?;
+            let (mut state, mut unreported) = (locked(&self.state), locked(&self.drops.unreported));
+            match next_unreported(&unreported, is_due) {
+                Some(key) => state.push_report(permit, &mut unreported, key, arrival_ns)?,
+                None => return state.push(permit, reading, None),
+            }
+        }
+    }
+
+    /// Space for one event, if there is any now.
+    fn try_acquire(&self) -> Option<OwnedSemaphorePermit> {
+        self.space.clone().try_acquire_owned().ok()
+    }
+
+    /// Waits for space for one event. Holds no lock meanwhile, so that live readings are not delayed.
+    fn acquire(&self) -> Result<OwnedSemaphorePermit, QueueClosedError> {
+        block_on(self.space.clone().acquire_owned()).map_err(|_| QueueClosedError)
+    }
+
+    /// Counts `count` readings of a sensor that did not become events.
+    pub fn record_drop(&self, source: u16, cause: Cause, count: u64) {
+        self.drops.record(source, cause, count);
+    }
+
+    /// Refuses a datagram whose sender is none of the vehicle's sensors, and remembers the sender.
+    pub fn refuse_unknown_sender(&self, address: SocketAddr) {
+        self.record_drop(0, Cause::Sender, 1);
+        self.drops.record_unknown_sender(address, self.clock.now_ns());
+    }
+
+    /// Reports all drops to the engine, stamped `captured_ns` or now, and waits for space. Needed at the end of a
+    /// drive, because no later reading brings the reports along.
+    ///
+    /// # Errors
+    /// [`QueueClosedError`] if the engine has stopped.
+    pub fn report_drops(&self, captured_ns: Option<i64>) -> Result<(), QueueClosedError> {
+        let arrival_ns = captured_ns.unwrap_or_else(|| self.clock.now_ns());
+        while !locked(&self.drops.unreported).is_empty() {
+            let permit = self.acquire()?;
+            let (mut state, mut unreported) = (locked(&self.state), locked(&self.drops.unreported));
+            if let Some(key) = next_unreported(&unreported, true) {
+                state.push_report(permit, &mut unreported, key, arrival_ns)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Closes the queue for all clones: the engine handles the events on the queue and then ends.
+    pub fn close(&self) {
+        locked(&self.state).sender = None;
+    }
+
+    /// The counts of readings that did not become events.
+    pub fn drops(&self) -> Arc<DropCounters> {
+        self.drops.clone()
+    }
+}
+
+impl State {
+    /// True if drops for other causes than a full queue may be reported again.
+    fn is_report_due(&self, arrival_ns: i64) -> bool {
+        self.reported_ns.abs_diff(arrival_ns) >= REPORT_PERIOD_NS
+    }
+
+    /// Pushes the drops of one cause and source as an event.
+    fn push_report(
+        &mut self,
+        permit: OwnedSemaphorePermit,
+        unreported: &mut Unreported,
+        key: (Cause, u16),
+        arrival_ns: i64,
+    ) -> Result<(), QueueClosedError> {
+        let (cause, source) = key;
+        let body = Body::Lost { cause, count: unreported.get(&key).copied().unwrap_or_default() };
+        self.push(permit, Reading { arrival_ns, source, body }, None)?;
+        unreported.remove(&key);
+        self.reported_ns = arrival_ns;
+        Ok(())
+    }
+
+    /// Pushes one event into the space that was acquired for it.
+    fn push(
+        &mut self,
+        permit: OwnedSemaphorePermit,
+        reading: Reading,
+        receipt: Option<Receipt>,
+    ) -> Result<(), QueueClosedError> {
+        let Reading { arrival_ns, source, body } = reading;
+        let event = Event { sequence: self.next_sequence, arrival_ns, source, body };
+        let sender = self.sender.as_ref().ok_or(QueueClosedError)?;
+        // There are as many permits as the channel is long, so this does not wait.
+        sender.send(QueuedEvent { event, receipt, _permit: permit }).map_err(|_| QueueClosedError)?;
+        self.next_sequence += 1;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clearway_mapping::ledger::Ledger;
+
+    use super::*;
+    use crate::ingest::receipt::ObservationId;
+
+    fn unreported(queue: &EventQueue) -> Ledger {
+        let mut ledger = Ledger::default();
+        queue.drops().add_unreported_to(&mut ledger, []);
+        ledger
+    }
+
+    #[test]
+    fn events_are_numbered_without_gaps_and_a_full_queue_becomes_one_loss() {
+        let (queue, events) = event_queue(2);
+        queue.push_batch((0..5).map(|_| (1, Body::End))).unwrap();
+        assert_eq!(unreported(&queue).lost, 3);
+        let received: Vec<_> = events.try_iter().map(|queued| queued.event).collect();
+        assert_eq!(received.iter().map(|e| e.sequence).collect::<Vec<_>>(), [0, 1]);
+        queue.push(0, Body::End).unwrap();
+        let received: Vec<_> = events.try_iter().map(|queued| queued.event).collect();
+        assert_eq!(received[0].body, Body::Lost { cause: Cause::Queue, count: 3 });
+        assert_eq!((received[0].sequence, received[0].source), (2, 1));
+        assert_eq!((received[1].sequence, received[1].source), (3, 0));
+        assert_eq!(unreported(&queue), Ledger::default());
+    }
+
+    #[test]
+    fn drops_are_reported_at_once_then_seldom_and_completely_at_the_end() {
+        let (queue, events) = event_queue(16);
+        let flood =
+            |queue: &EventQueue| (0..9).for_each(|port| queue.refuse_unknown_sender(([10, 0, 0, 9], port).into()));
+        flood(&queue);
+        queue.record_drop(1, Cause::Length, 2);
+        let ledger = unreported(&queue);
+        assert_eq!((ledger.received, ledger.refused["source"], ledger.refused["length"]), (11, 9, 2));
+        queue.push(0, Body::End).unwrap();
+        let bodies =
+            |events: &Receiver<QueuedEvent>| events.try_iter().map(|queued| queued.event.body).collect::<Vec<_>>();
+        let lost = |cause, count| Body::Lost { cause, count };
+        assert_eq!(bodies(&events), [lost(Cause::Sender, 9), lost(Cause::Length, 2), Body::End]);
+        flood(&queue);
+        queue.record_drop(0, Cause::Kernel, 5);
+        queue.report_drops(None).unwrap();
+        assert_eq!(bodies(&events), [lost(Cause::Kernel, 5), lost(Cause::Sender, 9)]);
+        assert_eq!(unreported(&queue), Ledger::default());
+        let senders = queue.drops().unknown_senders();
+        assert_eq!(senders.iter().map(|s| s.address.port()).collect::<Vec<_>>(), [1, 2, 3, 4, 5, 6, 7, 8]);
+        assert!(senders.iter().all(|sender| sender.datagrams == 1), "each was forgotten before it came again");
+    }
+
+    #[test]
+    fn a_receipt_delivers_that_the_queue_was_full_or_the_engine_stopped() {
+        let (sender, mut outcomes) = tokio::sync::mpsc::unbounded_channel();
+        let receipt = |number| Receipt::new(ObservationId { client: 0, number }, &sender);
+        let (queue, events) = event_queue(1);
+        queue.push_observation(Some(42), 0, Body::End, receipt(1)).unwrap();
+        assert!(outcomes.try_recv().is_err(), "the engine has not handled the event yet");
+        queue.push_observation(None, 0, Body::End, receipt(2)).unwrap();
+        let (id, outcome) = outcomes.try_recv().unwrap();
+        assert!(id.number == 2 && matches!(outcome, Outcome::Refused { reason: "queue", .. }), "{outcome:?}");
+        assert_eq!(unreported(&queue).lost, 1, "the loss is also reported to the engine");
+
+        let QueuedEvent { event, receipt: first, .. } = events.recv().unwrap();
+        assert_eq!(event.arrival_ns, 42, "the event keeps the stamp of its capture");
+        first.unwrap().deliver(Outcome::Accepted);
+        assert_eq!(outcomes.try_recv().unwrap().1, Outcome::Accepted);
+        drop(events);
+        assert_eq!(queue.push_observation(None, 0, Body::End, receipt(3)), Err(QueueClosedError));
+        assert!(matches!(outcomes.try_recv().unwrap().1, Outcome::Refused { reason: "stopped", .. }));
+    }
+
+    #[test]
+    fn a_closed_queue_ends_after_its_events_although_clones_remain() {
+        let (sender, mut outcomes) = tokio::sync::mpsc::unbounded_channel();
+        let (queue, events) = event_queue(2);
+        let clone = queue.clone();
+        queue.push(0, Body::End).unwrap();
+        queue.close();
+        assert_eq!(events.iter().count(), 1);
+        let receipt = Receipt::new(ObservationId { client: 0, number: 1 }, &sender);
+        assert_eq!(clone.push_observation(None, 0, Body::End, receipt), Err(QueueClosedError));
+        assert!(matches!(outcomes.try_recv().unwrap().1, Outcome::Refused { reason: "stopped", .. }));
+    }
+
+    #[test]
+    fn a_captured_reading_follows_the_refusals_before_it_all_at_its_own_stamp() {
+        let (queue, events) = event_queue(4);
+        let reading = |arrival_ns| Reading { arrival_ns, source: 0, body: Body::End };
+        let push = |arrival_ns| queue.push_captured(reading(arrival_ns)).unwrap();
+        let mut received = events.iter().map(|queued| (queued.event.arrival_ns, queued.event.body));
+        let refused = |count| Body::Lost { cause: Cause::Observation, count };
+        queue.drops().record_refused_messages(1, "ros_message", 2);
+        push(REPORT_PERIOD_NS as i64);
+        assert_eq!(received.next(), Some((REPORT_PERIOD_NS as i64, refused(2))));
+        assert_eq!(received.next(), Some((REPORT_PERIOD_NS as i64, Body::End)));
+        queue.drops().record_refused_messages(1, "ros_message", 3);
+        push(REPORT_PERIOD_NS as i64 + 42);
+        assert_eq!(received.next(), Some((REPORT_PERIOD_NS as i64 + 42, Body::End)), "no report is due yet");
+        queue.report_drops(Some(7)).unwrap();
+        assert_eq!(received.next(), Some((7, refused(3))));
+        assert_eq!(unreported(&queue), Ledger::default());
+    }
+
+    #[test]
+    fn live_readings_are_counted_while_a_captured_reading_waits_for_space() {
+        let (queue, events) = event_queue(1);
+        queue.push(0, Body::End).unwrap();
+        let waiting = std::thread::spawn({
+            let queue = queue.clone();
+            move || queue.push_captured(Reading { arrival_ns: 42, source: 0, body: Body::End })
+        });
+        // It makes no difference whether the other thread has begun to wait.
+        for _ in 0..3 {
+            queue.push(1, Body::End).unwrap();
+        }
+        assert_eq!(unreported(&queue).lost, 3);
+        let received: Vec<_> = events.iter().take(3).map(|queued| queued.event).collect();
+        assert_eq!(waiting.join().unwrap(), Ok(()));
+        assert_eq!(received[1].body, Body::Lost { cause: Cause::Queue, count: 3 });
+        assert_eq!(received.iter().map(|event| event.sequence).collect::<Vec<_>>(), [0, 1, 2]);
+        assert_eq!(received[2].arrival_ns, 42);
+
+        queue.push(0, Body::End).unwrap();
+        let waiting = std::thread::spawn({
+            let queue = queue.clone();
+            move || queue.push_captured(Reading { arrival_ns: 43, source: 0, body: Body::End })
+        });
+        drop(events);
+        assert_eq!(waiting.join().unwrap(), Err(QueueClosedError), "the wait ends with the engine");
+    }
+
+    #[test]
+    fn a_queue_without_an_engine_refuses_readings() {
+        let (queue, events) = event_queue(2);
+        drop(events);
+        assert_eq!(queue.push(0, Body::End), Err(QueueClosedError));
+    }
+}

@@ -1,0 +1,19 @@
+//! One running server: event queues, engines, recorder and publishers of one configuration. They start in an order in
+//! which nothing is lost, and stop in the reverse order.
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | `setup` | what a server is started with; why it did not start or did not end well |
+//! | `start` | [`Setup`] -> [`Running`] |
+//! | `running` | [`Running`], and its shutdown |
+//! | `over_zenoh` | everything that uses the zenoh session |
+
+#[cfg(feature = "zenoh")]
+mod over_zenoh;
+mod running;
+mod setup;
+mod start;
+
+pub use running::{Running, VehicleInput};
+pub use setup::{Setup, ShutdownError, StartError};
+pub use start::Server;

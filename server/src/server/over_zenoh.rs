@@ -1,0 +1,71 @@
+//! Everything of a running server that uses the zenoh session: maps out, observations in, live ROS 2 topics in.
+
+use tokio::task::JoinSet;
+use zenoh::Session;
+
+use super::running::VehicleInput;
+use crate::config::Config;
+use crate::ingest::gateway::Gateways;
+use crate::ingest::ros::live::{self, LiveTopics};
+use crate::ingest::zenoh::Ingest;
+use crate::publish::Vehicles;
+use crate::publish::zenoh::Publisher;
+use crate::zenoh_session::{self, ZenohError};
+
+/// The open session and its users.
+pub(super) struct OverZenoh {
+    session: Session,
+    publisher: Publisher,
+    /// One task a vehicle.
+    ingest: JoinSet<()>,
+    ros: Vec<LiveTopics>,
+}
+
+impl OverZenoh {
+    /// Opens the session, publishes all vehicles, and subscribes to their observations and ROS 2 topics.
+    ///
+    /// # Errors
+    /// [`ZenohError`] if the session cannot be opened or a key cannot be declared.
+    pub(super) async fn start(
+        config: &Config,
+        vehicles: &Vehicles,
+        gateways: &Gateways,
+        inputs: &[VehicleInput],
+    ) -> Result<Self, ZenohError> {
+        let session = zenoh_session::open(&config.zenoh, gateways.message_bytes_max()).await?;
+        let publisher = Publisher::start(&session, &config.zenoh, vehicles).await?;
+        let mut over_zenoh = Self { session, publisher, ingest: JoinSet::new(), ros: Vec::new() };
+        for gateway in gateways.all() {
+            let ingest = Ingest::subscribe(&over_zenoh.session, gateway.clone()).await?;
+            over_zenoh.ingest.spawn(ingest.run());
+        }
+        for (vehicle, input) in config.vehicles.iter().zip(inputs) {
+            let Some(ros) = &vehicle.ros else { continue };
+            let sensors = vehicle.sensors.iter().map(|sensor| &sensor.name);
+            let topics = live::subscribe(&over_zenoh.session, ros, sensors, input.queue.clone()).await?;
+            over_zenoh.ros.push(topics);
+        }
+        Ok(over_zenoh)
+    }
+
+    /// The endpoints the session listens on.
+    pub(super) async fn endpoints(&self) -> Vec<String> {
+        zenoh_session::endpoints(&self.session).await
+    }
+
+    /// Ends the ROS 2 subscriptions; no message enters a queue after this.
+    pub(super) async fn stop_ros(&mut self) {
+        for topics in self.ros.drain(..) {
+            topics.stop().await;
+        }
+    }
+
+    /// Ends publishing and ingest, and closes the session.
+    pub(super) async fn stop(mut self) {
+        self.ingest.shutdown().await;
+        self.publisher.stop().await;
+        if let Err(error) = self.session.close().await {
+            tracing::warn!(%error, "zenoh: close");
+        }
+    }
+}

@@ -1,0 +1,130 @@
+//! A running server, and its shutdown.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+
+use super::setup::ShutdownError;
+use crate::ingest::queue::EventQueue;
+use crate::ingest::udp;
+use crate::publish::{Vehicles, foxglove};
+use crate::record::writer::Recorder;
+use crate::subscriptions::LayerSubscription;
+
+/// Longest wait for each kind of publisher at shutdown. Ours: a stalled peer must not keep the server from ending.
+const PUBLISHERS_STOP_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Where the events of one vehicle enter a running server.
+pub struct VehicleInput {
+    /// The vehicle's name.
+    pub name: Arc<str>,
+    /// The vehicle's event queue.
+    pub queue: EventQueue,
+    /// The addresses that receive data packets and telemetry of the vehicle's first UDP sensor, if there is one.
+    pub udp: Option<(SocketAddr, SocketAddr)>,
+}
+
+/// A running server. If it is dropped without [`Running::shutdown`], the recording stays unfinished.
+#[derive(Default)]
+pub struct Running {
+    /// The newest maps and the status of all vehicles.
+    pub vehicles: Vehicles,
+    /// The inputs of all vehicles.
+    pub inputs: Vec<VehicleInput>,
+    /// The address of gRPC.
+    pub grpc: Option<SocketAddr>,
+    /// The address of the page.
+    pub page: Option<SocketAddr>,
+    /// The endpoints of zenoh.
+    pub zenoh: Vec<String>,
+    /// The address of the Foxglove WebSocket.
+    pub foxglove: Option<SocketAddr>,
+    pub(super) engines: Vec<(Arc<str>, JoinHandle<()>)>,
+    pub(super) recorder: Option<Recorder>,
+    pub(super) udp: Option<udp::UdpThreads>,
+    pub(super) publishers: JoinSet<()>,
+    pub(super) stop: watch::Sender<bool>,
+    /// Layers that are computed with or without readers; held until the end.
+    pub(super) subscriptions: Vec<LayerSubscription>,
+    pub(super) viewers: Option<foxglove::Publisher>,
+    #[cfg(feature = "zenoh")]
+    pub(super) over_zenoh: Option<super::over_zenoh::OverZenoh>,
+}
+
+impl Running {
+    /// The path of the recording, if the server records.
+    pub fn recording(&self) -> Option<String> {
+        self.recorder.as_ref().map(|recorder| recorder.counts().to_proto().file)
+    }
+
+    /// Resolves when the server stops.
+    pub(super) fn stopped(&self) -> impl Future<Output = ()> + Send + use<> {
+        let mut stopped = self.stop.subscribe();
+        async move {
+            // An error means that the sender is gone, so the server stops as well.
+            let _ = stopped.wait_for(|stop| *stop).await;
+        }
+    }
+
+    /// Ends the server in order: first the inputs, then the engines after their last event, the recorder after the last
+    /// map, and the publishers at the end.
+    ///
+    /// # Errors
+    /// [`ShutdownError`] if an engine panicked or the recording is incomplete; everything has ended then as well.
+    pub async fn shutdown(mut self) -> Result<(), ShutdownError> {
+        if let Some(threads) = self.udp.take() {
+            // Fails only if the runtime shuts down; then the threads end by themselves.
+            let _ = tokio::task::spawn_blocking(move || threads.stop()).await;
+        }
+        #[cfg(feature = "zenoh")]
+        if let Some(over_zenoh) = &mut self.over_zenoh {
+            over_zenoh.stop_ros().await;
+        }
+        let inputs = std::mem::take(&mut self.inputs);
+        let close_queues = move || {
+            for input in inputs {
+                // Fails only if the engine has stopped already.
+                let _ = input.queue.report_drops(None);
+                input.queue.close();
+            }
+        };
+        let _ = tokio::task::spawn_blocking(close_queues).await;
+        let (engines, recorder) = (self.engines, self.recorder);
+        let finished = tokio::task::spawn_blocking(move || finish(engines, recorder)).await;
+        let outcome = finished.unwrap_or_else(|error| Err(error.into()));
+        self.stop.send_replace(true);
+        let mut publishers = self.publishers;
+        let all = async { while publishers.join_next().await.is_some() {} };
+        if tokio::time::timeout(PUBLISHERS_STOP_TIMEOUT, all).await.is_err() {
+            publishers.shutdown().await;
+        }
+        if let Some(viewers) = self.viewers
+            && tokio::time::timeout(PUBLISHERS_STOP_TIMEOUT, viewers.stop()).await.is_err()
+        {
+            tracing::warn!("the Foxglove WebSocket did not close in time");
+        }
+        #[cfg(feature = "zenoh")]
+        if let Some(over_zenoh) = self.over_zenoh
+            && tokio::time::timeout(PUBLISHERS_STOP_TIMEOUT, over_zenoh.stop()).await.is_err()
+        {
+            tracing::warn!("zenoh did not close in time");
+        }
+        outcome
+    }
+}
+
+/// Waits for the engines, and then for the recorder, whose error matters more than that of an engine.
+fn finish(engines: Vec<(Arc<str>, JoinHandle<()>)>, recorder: Option<Recorder>) -> Result<(), ShutdownError> {
+    let mut outcome = Ok(());
+    for (name, engine) in engines {
+        if engine.join().is_err() {
+            outcome = Err(ShutdownError::Engine(name));
+        }
+    }
+    recorder.map_or(Ok(()), Recorder::finish)?;
+    outcome
+}

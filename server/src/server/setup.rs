@@ -1,0 +1,103 @@
+//! What a server is started with, and the errors of its start and its end.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use crate::config::{Calibrations, Certificates, Config};
+use crate::engine::Observer;
+use crate::ingest::udp;
+use crate::record::writer::{IncompleteRecordingError, RecordError};
+
+/// What a server is started with.
+#[derive(Default)]
+pub struct Setup {
+    /// The checked configuration.
+    pub config: Config,
+    /// The calibration tables of all sensors, as [`Config::calibrations`] returns them.
+    pub calibrations: Calibrations,
+    /// The certificates, as [`Config::certificates`] returns them; without them gRPC is plain text.
+    pub certificates: Option<Certificates>,
+    /// Identifies this run in maps and recordings; a random number if absent.
+    pub boot_id: Option<u64>,
+    /// True if the events come from files: then a full recorder queue delays them, so that nothing is lost.
+    pub from_files: bool,
+    /// Comment lines before the recorded configuration.
+    pub config_comments: Vec<String>,
+    /// Further metadata of the recording, by name.
+    pub metadata: BTreeMap<String, String>,
+    /// Is called after each revolution of the first vehicle.
+    pub observer: Option<Observer>,
+}
+
+/// A server did not start.
+#[derive(Debug, thiserror::Error)]
+pub enum StartError {
+    /// The configuration of a vehicle is invalid.
+    #[error(transparent)]
+    Vehicle(#[from] clearway_mapping::config::ConfigValueError),
+    /// The recording cannot be created.
+    #[error(transparent)]
+    Record(#[from] RecordError),
+    /// An address cannot be listened on.
+    #[error("{what} {at}: {source}")]
+    Listen {
+        /// The configuration key.
+        what: &'static str,
+        /// The address.
+        at: SocketAddr,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The certificates are invalid.
+    #[error("grpc.tls: {0}; a PEM certificate (chain), its PEM private key and PEM CA certificates are allowed")]
+    Certificates(String),
+    /// A vehicle's sockets cannot be bound.
+    #[error("vehicle {vehicle}: {source}")]
+    Udp {
+        /// The vehicle's name.
+        vehicle: Arc<str>,
+        /// The address and the system's reason.
+        source: udp::BindError,
+    },
+    /// The threads that read the sockets cannot be started.
+    #[error("no thread for a udp socket: {0}")]
+    UdpThread(std::io::Error),
+    /// The thread of an engine cannot be started.
+    #[error("vehicle {vehicle}: no thread for its engine: {source}")]
+    Thread {
+        /// The vehicle's name.
+        vehicle: Arc<str>,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The Foxglove WebSocket cannot be served.
+    #[error("foxglove.listen {at}: {source}")]
+    Foxglove {
+        /// The address.
+        at: SocketAddr,
+        /// Foxglove's reason.
+        source: foxglove::FoxgloveError,
+    },
+    /// The zenoh session cannot be opened, or a key cannot be declared on it.
+    #[cfg(feature = "zenoh")]
+    #[error(transparent)]
+    Zenoh(#[from] crate::zenoh_session::ZenohError),
+    /// The configuration enables zenoh, but the program was built without it.
+    #[error("zenoh.enabled = true: this clearway was built without the feature zenoh; allowed: false")]
+    NoZenoh,
+}
+
+/// A server ended, but not as it should have.
+#[derive(Debug, thiserror::Error)]
+pub enum ShutdownError {
+    /// The thread of an engine panicked.
+    #[error("the engine of vehicle {0} panicked")]
+    Engine(Arc<str>),
+    /// The recording is incomplete.
+    #[error(transparent)]
+    Recording(#[from] IncompleteRecordingError),
+    /// The task that waits for engines and recorder failed.
+    #[error("the end of engines and recorder is unknown: {0}")]
+    Task(#[from] tokio::task::JoinError),
+}

@@ -1,0 +1,118 @@
+//! The zenoh session that ingest and publishers share: its settings, its limits, its errors.
+
+use zenoh::{Config, Session};
+
+use crate::config::Zenoh as Options;
+
+/// What one peer may cost: zenoh's setting, value in JSON5. A file named in `[zenoh]` has its own values; the files in
+/// `deploy/zenoh` have these. All values are ours, for the reasons beside them.
+const LIMITS: [(&str, &str); 12] = [
+    // A thousand readers, and the vehicles.
+    ("transport/unicast/max_sessions", "1024"),
+    // Handshakes at a time; a peer that opens a connection and stays silent loses it after 5 s.
+    ("transport/unicast/accept_pending", "100"),
+    ("transport/unicast/accept_timeout", "5000"),
+    ("transport/unicast/open_timeout", "5000"),
+    // A restarted router has the maps again within a second.
+    ("connect/retry", "{ period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2 }"),
+    // A peer that disappears silently (a pulled cable) is noticed after 2 s; a live one sends four keep-alive
+    // messages in that time.
+    ("transport/link/tx/lease", "2000"),
+    ("transport/link/tx/keep_alive", "4"),
+    // Batches of 64 KiB in the queue of the maps, allocated when needed. Eight hold all layers of several maps, so that
+    // a short delay of the machine drops nothing. No more than this, and what the kernel holds, waits for a stopped peer.
+    ("transport/link/tx/queue/size", "{ interactive_high: 8 }"),
+    ("transport/link/tcp", "{ so_sndbuf: 262144 }"),
+    ("transport/link/tls/so_sndbuf", "262144"),
+    // In us. A sender waits once for a congested peer; afterwards it drops that peer's maps at once, until the peer
+    // receives again.
+    ("transport/link/tx/queue/congestion_control/drop", "{ wait_before_drop: 1000 }"),
+    // In us. A message that may not be dropped (a declaration, some replies) waits this long; then the connection ends.
+    ("transport/link/tx/queue/congestion_control/block", "{ wait_before_close: 1000000 }"),
+];
+/// The longest message of a peer, in bytes, unless observations may be longer. zenoh drops a longer message before it
+/// is assembled; a shorter one that is still too long is refused with a reason.
+const MESSAGE_BYTES_MAX: usize = 64 << 20;
+
+/// An operation on the zenoh session failed.
+#[derive(Debug, thiserror::Error)]
+#[error("zenoh: {what}: {reason}")]
+pub struct ZenohError {
+    /// The operation, with the key or setting.
+    what: String,
+    /// The reason that zenoh gives.
+    reason: zenoh::Error,
+}
+
+impl ZenohError {
+    /// For `map_err`: names the operation that zenoh's error belongs to.
+    pub(crate) fn of(what: impl Into<String>) -> impl FnOnce(zenoh::Error) -> Self {
+        let what = what.into();
+        |reason| Self { what, reason }
+    }
+}
+
+/// Opens the session. A message of a peer may be twice as long as `observation_bytes_max`, and [`MESSAGE_BYTES_MAX`]
+/// in any case.
+///
+/// # Errors
+/// [`ZenohError`] if the settings are invalid, the file of `[zenoh]` cannot be read, or an endpoint is not available.
+pub(crate) async fn open(options: &Options, observation_bytes_max: usize) -> Result<Session, ZenohError> {
+    let config = session_config(options, MESSAGE_BYTES_MAX.max(2 * observation_bytes_max))?;
+    let endpoints = options.listen.join(", ");
+    zenoh::open(config).await.map_err(ZenohError::of(format!("open (listen {endpoints})")))
+}
+
+/// The endpoints the session listens on, with the ports that the system chose.
+pub(crate) async fn endpoints(session: &Session) -> Vec<String> {
+    session.info().locators().await.iter().map(ToString::to_string).collect()
+}
+
+fn session_config(options: &Options, message_bytes_max: usize) -> Result<Config, ZenohError> {
+    let mut config = match options.file.as_os_str().is_empty() {
+        true => limited()?,
+        false => {
+            Config::from_file(&options.file).map_err(ZenohError::of(format!("zenoh.file {}", options.file.display())))?
+        }
+    };
+    let json = |value: serde_json::Value| value.to_string();
+    let settings = [
+        ("mode", json(options.mode.as_str().into())),
+        ("listen/endpoints", json(options.listen.clone().into())),
+        ("connect/endpoints", json(options.connect.clone().into())),
+        ("scouting/multicast/enabled", json(options.scouting.into())),
+        ("scouting/gossip/enabled", json(options.scouting.into())),
+        ("timestamping/enabled", json(true.into())),
+        ("transport/link/rx/max_message_size", json(message_bytes_max.into())),
+    ];
+    for (key, value) in settings {
+        config.insert_json5(key, &value).map_err(ZenohError::of(format!("{key} = {value}")))?;
+    }
+    Ok(config)
+}
+
+/// zenoh's default settings with [`LIMITS`].
+fn limited() -> Result<Config, ZenohError> {
+    let mut config = Config::default();
+    for (key, value) in LIMITS {
+        config.insert_json5(key, value).map_err(ZenohError::of(format!("{key} = {value}")))?;
+    }
+    Ok(config)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_files_in_deploy_have_the_limits_of_a_server_without_a_file() {
+        let limited = limited().unwrap();
+        for name in ["server.json5", "router.json5"] {
+            let file = format!("{}/../deploy/zenoh/{name}", env!("CARGO_MANIFEST_DIR"));
+            let config = Config::from_file(&file).unwrap();
+            for (key, _) in LIMITS {
+                assert_eq!(config.get_json(key).unwrap(), limited.get_json(key).unwrap(), "{name}: {key}");
+            }
+        }
+    }
+}
