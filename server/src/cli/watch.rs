@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use anyhow::{Result, bail};
 use clap::Args;
-use clearway_client::{MapStream, Sight, Subscription, Update, now_ns};
+use clearway_client::{MapStream, StreamEvent, Subscription, Update, now_ns};
 use serde_json::json;
 
 use super::connection::{ServerOptions, explain};
@@ -61,7 +61,7 @@ async fn watch(options: &Options) -> Result<()> {
     let mut printed = 0;
     while options.count.is_none_or(|count| printed < count) {
         let update = match next(&mut maps, printed == 0).await? {
-            Sight::Fresh(update) | Sight::Stale(update) => update,
+            StreamEvent::Fresh(update) | StreamEvent::Stale(update) => update,
         };
         let id = (update.map.header().boot_id, update.map.sequence());
         let is_new = last.replace(id) != Some(id);
@@ -75,7 +75,7 @@ async fn watch(options: &Options) -> Result<()> {
 }
 
 /// The next event of the stream. Says on stderr that it waits if this is the first one and does not come soon.
-async fn next(maps: &mut MapStream, is_first: bool) -> Result<Sight> {
+async fn next(maps: &mut MapStream, is_first: bool) -> Result<StreamEvent> {
     if is_first {
         if let Ok(event) = tokio::time::timeout(FIRST_MAP_TIMEOUT, maps.next_or_stale()).await {
             return event.map_err(explain);
