@@ -20,13 +20,13 @@ pub const RGB_MAX: u32 = 0x00ff_ffff;
 
 /// Name and value of each limit, as in `golden/limits.json`.
 pub const TABLE: [(&str, u64); 7] = [
-    ("channel_cells", CHANNEL_CELLS_MAX as u64),
-    ("map_cells", MAP_CELLS_MAX),
-    ("map_bytes", MAP_BYTES_MAX as u64),
-    ("map_parts", MAP_PARTS_MAX as u64),
-    ("number_bits", NUMBER_BITS_MAX as u64),
-    ("safe_point_steps", SAFE_POINT_STEPS_MAX as u64),
-    ("rgb", RGB_MAX as u64),
+    ("channel_cells_max", CHANNEL_CELLS_MAX as u64),
+    ("map_cells_max", MAP_CELLS_MAX),
+    ("map_bytes_max", MAP_BYTES_MAX as u64),
+    ("map_parts_max", MAP_PARTS_MAX as u64),
+    ("number_bits_max", NUMBER_BITS_MAX as u64),
+    ("safe_point_steps_max", SAFE_POINT_STEPS_MAX as u64),
+    ("rgb_max", RGB_MAX as u64),
 ];
 
 /// The limits that a reader may lower. The default is the table's values.

@@ -1,4 +1,4 @@
-//! Whether a vehicle touches anything: its upright box against every shape of the world, exactly.
+//! Contact of a vehicle with the world: its upright box against every shape, exactly.
 //!
 //! In: a world, a time, the vehicle's place. Frame: world, metres. Leaves and beams count as far down as they hang.
 
@@ -19,7 +19,7 @@ pub struct Hull {
 }
 
 impl World {
-    /// What a vehicle touches at `time` s; `None` if nothing.
+    /// The first object that a vehicle touches at `time` s, or `None`.
     pub fn touched(&self, hull: &Hull, time: f64) -> Option<Kind> {
         let floor = self.ground.height(hull.x, hull.y);
         let shapes = self.objects.iter().map(|object| (object.kind, object.at(time, &self.ground)));
@@ -33,7 +33,7 @@ impl World {
 }
 
 impl Hull {
-    /// Whether the ground it covers meets what a shape covers.
+    /// True if the ground that the hull covers overlaps that of a shape.
     fn meets(&self, shape: &Shape) -> bool {
         let (outline, radius) = shape.outline();
         let corners = outline.map(|corner| self.in_own_frame(corner));

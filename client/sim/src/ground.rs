@@ -1,7 +1,7 @@
-//! The ground: a height for every place, and where a ray meets it, both exact.
+//! The ground: its height at every place, and the point where a ray meets it, both exact.
 //!
 //! In: profiles along x and across y (metres, world frame) and raised terraces. Out: heights, slopes, ray distances.
-//! Every patch between two breakpoints is a plane and every terrace a prism, so nothing is marched or sampled.
+//! Every patch between two breakpoints is a plane and every terrace a prism, so no ray is marched or sampled.
 
 /// Heights along one axis, straight between the breakpoints and level beyond the ends.
 ///
@@ -71,7 +71,7 @@ impl Profile {
         self.line(self.patch(place)).1
     }
 
-    /// Where a walk in direction `toward` leaves the patch, or infinity.
+    /// The place at which a ray in direction `toward` leaves the patch, or infinity.
     fn border(&self, patch: usize, toward: f64) -> f64 {
         if toward > 0.0 {
             self.points.get(patch).map_or(f64::INFINITY, |point| point.0)

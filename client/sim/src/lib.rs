@@ -9,21 +9,22 @@
 //! |---|---|
 //! | [`ground`], [`object`], [`course`] | the parts a world is made of |
 //! | [`world`] | a description -> [`world::World`] |
-//! | [`scenes`] | the thesis' four scenes, a dirt track and a town |
-//! | [`truth`] | world, pose, time -> which ground is drivable |
+//! | [`scenes`] | the four scenes of the UT Austin thesis, a dirt track and a town |
+//! | [`truth`] | world, pose, time -> drivable ground |
 //! | [`plan`] | the same as text, seen from above |
-//! | [`pose`] | scene, time -> where the vehicle is |
-//! | [`raycast`] | world, rays -> what they meet |
-//! | [`scanner`] | world, poses, one sensor's figures -> firings of raw returns |
-//! | [`planes`] | world, poses, a unit of a few planes -> whole scans, with the rays that met nothing |
+//! | [`pose`] | scene, time -> the vehicle's pose |
+//! | [`raycast`] | world, rays -> the points that they meet |
+//! | [`scanner`] | world, poses, one sensor's constants -> firings of raw returns |
+//! | [`planes`] | world, poses, a unit of a few planes -> whole scans, with the rays without a return |
 //! | [`traffic`] | six such units on a car in traffic, and the ground each object covers |
-//! | [`contact`] | world, a vehicle's place and size -> what it touches |
+//! | [`contact`] | world, a vehicle's place and size -> the object that it touches |
 //! | [`encode`] | firings -> 1206-byte data packets |
 //! | [`telemetry`] | place, speed, time -> 512-byte telemetry datagrams |
 //! | [`vehicle`] | all of the above: datagrams without end |
-//! | [`impair`] | datagrams -> what a bad network leaves of them |
+//! | [`real_time`] | a vehicle and a clock -> its datagrams, but for what a slow machine skips |
+//! | [`impair`] | datagrams -> those that arrive through a bad network |
 //! | [`send`] | datagrams -> UDP, paced by the clock |
-//! | [`noise`] | chance by key, for all of them |
+//! | [`noise`] | key -> random number |
 
 pub mod contact;
 pub mod course;
@@ -36,6 +37,7 @@ pub mod plan;
 pub mod planes;
 pub mod pose;
 pub mod raycast;
+pub mod real_time;
 pub mod scanner;
 pub mod scenes;
 pub mod send;

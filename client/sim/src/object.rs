@@ -1,4 +1,4 @@
-//! The things that stand or drive on the ground, each a shape a ray meets exactly.
+//! The objects that stand or drive on the ground, each with a shape that a ray meets exactly.
 //!
 //! In: a ray in the world frame (metres, direction of length 1). Out: the distance at which it meets the shape.
 
@@ -6,11 +6,11 @@ use crate::course::Drive;
 use crate::ground::{Ground, disc, slab};
 use crate::noise::mixed;
 
-/// What an object is to a driver.
+/// Kind of an object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Kind {
-    /// A house or another solid block.
-    House,
+    /// A building or another solid block.
+    Building,
     /// A free-standing wall.
     Wall,
     /// A parked car.

@@ -7,12 +7,12 @@ use crate::course::Drive;
 use crate::ground::Ground;
 use crate::object::{Kind, Object, Shape};
 
-/// Everything a simulated vehicle can meet.
+/// Ground and objects.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct World {
-    /// The ground.
+    /// Ground.
     pub ground: Ground,
-    /// What is on it.
+    /// Objects on the ground.
     pub objects: Vec<Object>,
 }
 
@@ -30,12 +30,12 @@ impl World {
         self
     }
 
-    /// A house of `size` metres (along, across its heading) and `height`, its foot sunk into sloping ground.
-    pub fn house(self, x: f64, y: f64, heading: f64, size: [f64; 2], height: f64) -> Self {
+    /// A building of `size` metres (along, across its heading) and `height`, its foot sunk into sloping ground.
+    pub fn building(self, x: f64, y: f64, heading: f64, size: [f64; 2], height: f64) -> Self {
         let base = self.ground.height(x, y);
         let half = [size[0] / 2.0, size[1] / 2.0];
         let facing = (heading.cos(), heading.sin());
-        self.with(Kind::House, 90, Shape::Block { x, y, facing, half, z: (base - 3.0, base + height) })
+        self.with(Kind::Building, 90, Shape::Block { x, y, facing, half, z: (base - 3.0, base + height) })
     }
 
     /// A wall along these places, 0.3 m thick.
