@@ -110,9 +110,9 @@ impl Offered {
         match kind {
             Kind::TfMessage => {
                 for transform in tf_message(bytes).unwrap_or_default() {
-                    self.frames.take(&transform);
+                    self.frames.insert(&transform);
                     if are_static {
-                        self.latched.take(&transform);
+                        self.latched.insert(&transform);
                     }
                 }
             }
@@ -148,7 +148,7 @@ impl Offered {
                 return Err(ChoiceError::Topic { file: file.to_owned(), topic: topic.clone(), known });
             }
         }
-        let ego_frame = EGO_FRAMES.into_iter().find(|frame| self.frames.knows(frame)).unwrap_or("base_link");
+        let ego_frame = EGO_FRAMES.into_iter().find(|frame| self.frames.contains(frame)).unwrap_or("base_link");
         let mut sensors: Vec<&String> = wanted.iter().filter(|topic| self.topics[*topic].kind.is_sensor()).collect();
         if sensors.is_empty() {
             sensors = self.sensors(ego_frame);

@@ -107,7 +107,7 @@ impl Ear {
         let missing = sample.attachment().map_or(0, |attachment| self.missing(&attachment.to_bytes()));
         self.door.record_drop(self.intake.source(topic), Cause::Queue, missing);
         let name = sample.key_expr().as_str().rsplit('/').nth(1).unwrap_or_default();
-        let Some(kind) = Kind::of(name) else {
+        let Some(kind) = Kind::from_name(name) else {
             tracing::info!(topic, name, "ros: not a type that is read");
             return self.refuse(topic, "ros_type");
         };

@@ -128,7 +128,7 @@ impl Intake {
         } else if let Some(&source) = self.sensors.get(topic) {
             match kind {
                 Kind::PointCloud2 => {
-                    let scan = scan(Points::of(&PointCloud2::new(bytes)?)?);
+                    let scan = scan(Points::from_cloud(&PointCloud2::new(bytes)?)?);
                     readings.push_back(Reading { arrival_ns, source, body: Body::Scan(scan) });
                 }
                 Kind::VelodyneScan => {
@@ -188,7 +188,7 @@ impl Intake {
     ) -> Result<Option<EgoPose>, Refused> {
         let mut stamp_ns = None;
         for transform in transforms {
-            if !self.frames.take(transform) {
+            if !self.frames.insert(transform) {
                 return Err(Refused::Frames { frame: transform.child_frame_id.to_owned() });
             }
             let steps = self.frames.steps_up(&self.ego_frame, transform.child_frame_id);
