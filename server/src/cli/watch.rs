@@ -15,7 +15,8 @@ const FIRST_MAP_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps.
 ///
-/// If no newer map arrives before the last one becomes stale, a line says so; the lines continue when maps arrive again.
+/// If no newer map arrives before the last one becomes stale, a line says so; the lines continue when maps arrive
+/// again.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway watch
@@ -80,7 +81,9 @@ async fn next(maps: &mut MapStream, is_first: bool) -> Result<StreamEvent> {
         if let Ok(event) = tokio::time::timeout(FIRST_MAP_TIMEOUT, maps.next_or_stale()).await {
             return event.map_err(explain);
         }
-        eprintln!("clearway: no map yet; waiting for the first one (`clearway vehicles` shows what the server receives)");
+        eprintln!(
+            "clearway: no map yet; waiting for the first one (`clearway vehicles` shows what the server receives)"
+        );
     }
     maps.next_or_stale().await.map_err(explain)
 }
