@@ -9,10 +9,10 @@
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
-use clearway_mapping::event::Body;
-use clearway_mapping::ledger::Ledger;
 use clearway::config::{Config, Udp};
 use clearway::ingest::{queue::event_queue, udp};
+use clearway_mapping::event::Body;
+use clearway_mapping::ledger::Ledger;
 use nix::sys::socket::setsockopt;
 use nix::sys::socket::sockopt::UdpGsoSegment;
 

@@ -8,13 +8,13 @@ use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
+use clearway::config::Config;
+use clearway::encode::event_to_proto;
+use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway_mapping::config::{Extrinsics, SensorConfig};
 use clearway_mapping::event::{self as core, Event};
 use clearway_proto::packed::pack;
 use clearway_proto::v1;
-use clearway::config::Config;
-use clearway::record::reader::{RecordedMessage, RecordingReader};
-use clearway::encode::event_to_proto;
 use mcap::WriteOptions;
 use prost::Message;
 use v1::observation::Body;

@@ -18,8 +18,8 @@ use clearway_proto::v1;
 use prost::Message;
 use serde_json::{Value, json};
 
-use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 use crate::encode::EncodedMap;
+use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 
 /// Greatest number of differences in a report; all are counted. Ours: the first ones explain the others.
 const DIFFERENCES_MAX: usize = 20;
@@ -155,9 +155,13 @@ impl fmt::Display for Difference {
             DifferenceKind::Cell { row, column, channel, recorded, made } => {
                 write!(f, "cell row {row} column {column}, channel {channel}: recorded {recorded}, computed {made}")
             }
-            DifferenceKind::Field { field, recorded, made } => write!(f, "{field}: recorded {recorded}, computed {made}"),
+            DifferenceKind::Field { field, recorded, made } => {
+                write!(f, "{field}: recorded {recorded}, computed {made}")
+            }
             DifferenceKind::Missing => write!(f, "the recording lacks this map of the events"),
-            DifferenceKind::Extra | DifferenceKind::Gap { .. } => write!(f, "the recording has this map, which does not follow from the events"),
+            DifferenceKind::Extra | DifferenceKind::Gap { .. } => {
+                write!(f, "the recording has this map, which does not follow from the events")
+            }
         }
     }
 }

@@ -143,12 +143,7 @@ impl AvailableTopics {
     ///
     /// # Errors
     /// [`ChoiceError::Topic`] if the file does not have a requested topic.
-    pub fn choose(
-        &self,
-        file: &Path,
-        requested: &[String],
-        sensors_max: usize,
-    ) -> Result<TopicChoice, ChoiceError> {
+    pub fn choose(&self, file: &Path, requested: &[String], sensors_max: usize) -> Result<TopicChoice, ChoiceError> {
         for topic in requested {
             if !self.topics.contains_key(topic) {
                 let known = self.topics.iter().map(|(topic, of)| format!("{topic} ({})", of.kind));
@@ -231,7 +226,8 @@ impl AvailableTopics {
             None if sensors.is_empty() => {}
             None => notes.push("the file has no poses".into()),
         }
-        let unused = |(topic, found): &(&String, &Topic)| !used.contains(topic.as_str()) && found.kind != Kind::TfMessage;
+        let unused =
+            |(topic, found): &(&String, &Topic)| !used.contains(topic.as_str()) && found.kind != Kind::TfMessage;
         let unused = self.topics.iter().filter(unused);
         notes.extend(unused.map(|(topic, found)| format!("{topic} ({}) is not used", found.kind)));
         notes

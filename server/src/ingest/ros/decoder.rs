@@ -8,7 +8,7 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use bytes::Bytes;
-use clearway_mapping::event::{Body, EgoPose, UNKNOWN_SOURCE, Scan};
+use clearway_mapping::event::{Body, EgoPose, Scan, UNKNOWN_SOURCE};
 use clearway_ros::pose::{Odometry, StampedTransform, pose_stamped, tf_message};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, MessageError, PointCloud2, Points};

@@ -16,8 +16,8 @@
 
 use std::collections::VecDeque;
 
-use clearway_lidar::revolution::Revolution;
 use clearway_lidar::nmea::Gprmc;
+use clearway_lidar::revolution::Revolution;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
 use crate::config::motion::MotionConfig;
