@@ -8,8 +8,8 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use clearway_mapping::event::Event;
 use clearway_mapping::error::EventError;
+use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use tokio::sync::watch;
 

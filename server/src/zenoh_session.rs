@@ -71,9 +71,8 @@ pub(crate) async fn endpoints(session: &Session) -> Vec<String> {
 fn session_config(options: &Options, message_bytes_max: usize) -> Result<Config, ZenohError> {
     let mut config = match options.file.as_os_str().is_empty() {
         true => limited()?,
-        false => {
-            Config::from_file(&options.file).map_err(ZenohError::of(format!("zenoh.file {}", options.file.display())))?
-        }
+        false => Config::from_file(&options.file)
+            .map_err(ZenohError::of(format!("zenoh.file {}", options.file.display())))?,
     };
     let json = |value: serde_json::Value| value.to_string();
     let settings = [

@@ -112,7 +112,8 @@ fn simulated(scene: Scene, maps: usize) -> Vec<Sized> {
     for (sequence, told) in (0..).zip(rig.observations()) {
         let observation = v1::Observation::from(told.observation);
         let source = source(&observation.sensor);
-        let (_, body) = observation::decode(observation, &observation::Limits::from_points_max(1 << 16)).unwrap().remove(0);
+        let (_, body) =
+            observation::decode(observation, &observation::Limits::from_points_max(1 << 16)).unwrap().remove(0);
         let event = Event { sequence, arrival_ns: told.stamp_ns + 1_000_000, source, body };
         if let Ok(Some(map)) = pipeline.step(&event) {
             made.push(Sized::of(map));

@@ -166,11 +166,7 @@ impl Recorder {
     /// # Errors
     /// [`RecordError::Create`] if the file or the thread cannot be created, [`RecordError::Write`] if the header cannot
     /// be written.
-    pub fn start(
-        options: &Options,
-        header: &Header,
-        waits: bool,
-    ) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
+    pub fn start(options: &Options, header: &Header, waits: bool) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
         let path = options.file.clone();
         if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
             std::fs::create_dir_all(folder).map_err(|source| RecordError::Create { file: path.clone(), source })?;

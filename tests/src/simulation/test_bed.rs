@@ -7,13 +7,13 @@ use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
+use clearway::clock::Clock;
 use clearway::config::Config;
 use clearway::encode::EncodedMap;
 use clearway::engine::Engine;
 use clearway::ingest::gateway::Gateway;
-use clearway::ingest::receipt::{ClientSession, ObservationId, Outcome as EventOutcome, OutcomeSender};
-use clearway::clock::Clock;
 use clearway::ingest::queue::{EventQueue, QueuedEvent, event_queue_with_clock};
+use clearway::ingest::receipt::{ClientSession, ObservationId, Outcome as EventOutcome, OutcomeSender};
 use clearway::publish::{Served, Vehicles};
 use clearway::record::writer::{Header, RecordingWriter};
 use clearway::status::VehicleStatus;

@@ -207,7 +207,9 @@ async fn strangers_crowds_and_giants_are_told_what_is_allowed() {
     assert_eq!(running.vehicles.0[0].status.snapshot().ledger.refused.get("observation"), Some(&1));
     within("shutdown", running.shutdown()).await.unwrap();
     let told = RecordingReader::open(&file).unwrap().map(|entry| match entry.unwrap() {
-        RecordedMessage::Event { event: Event { body: Body::Lost { cause: Cause::Observation, count }, .. }, .. } => count,
+        RecordedMessage::Event {
+            event: Event { body: Body::Lost { cause: Cause::Observation, count }, .. }, ..
+        } => count,
         _ => 0,
     });
     assert_eq!(told.sum::<u64>(), 1, "the journal knows of it, though no event came after");

@@ -185,7 +185,7 @@ fn feed(
 
 /// Reports the messages that the files' readers have refused to the drop counters.
 fn leave_refused(readings: &mut Readings, queue: &EventQueue) {
-    for ((source, reason), count) in readings.untold() {
+    for ((source, reason), count) in readings.drain_refused() {
         queue.drops().record_refused_messages(source, reason, count);
     }
 }

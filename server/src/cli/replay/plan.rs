@@ -17,9 +17,10 @@ use super::clouds::{Clouds, Written};
 use super::options::{Options, ReplayError};
 use super::summary::{Mount, describe};
 use crate::config::{Calibrations, Config, Recorder};
-use crate::ingest::files::mcap::{McapError, Wanted};
+use crate::ingest::files::mcap::{McapError, McapOptions};
 use crate::ingest::files::{FilesError, Kind, Readings};
-use crate::ingest::ros::{Choice, Offered, PoseFrom, SensorTopic};
+use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
+use crate::ingest::ros::decoder::PoseSource;
 use crate::record::reader::RecordingReader;
 use crate::server::Setup;
 
@@ -44,13 +45,13 @@ pub(super) struct Plan {
 /// # Errors
 /// [`ReplayError`] if a file, a recording or the configuration cannot be used.
 pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
-    let files = Readings::open(&options.files, Wanted::default())?;
+    let files = Readings::open(&options.files, McapOptions::default())?;
     let recorded = files.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
     let scans = files.files().all(|(_, kind)| kind == Kind::Scan);
     let mut known = configured(options, recorded.as_deref())?;
     let vehicle = &mut known.config.vehicles[0];
     (vehicle.udp, vehicle.ros) = (None, None);
-    let mut wanted = Wanted {
+    let mut wanted = McapOptions {
         vehicle: options.vehicle.clone(),
         topics: options.topics.clone(),
         sensors_max: if known.is_mounted { vehicle.sensors.len() } else { SENSORS_MAX },
@@ -92,14 +93,19 @@ struct Known {
 }
 
 impl Known {
-    /// Configures the sensors of a ROS bag and puts their topics into `wanted`. Returns the mount of the first sensor
-    /// if tf has it.
-    fn apply_bag(&mut self, bag: &Path, wanted: &mut Wanted, is_given: bool) -> Result<Option<Mount>, ReplayError> {
+    /// Configures the sensors of a ROS bag and puts their topics into `wanted`. Returns the mount of the first sensor if
+    /// tf has it.
+    fn apply_bag(
+        &mut self,
+        bag: &Path,
+        wanted: &mut McapOptions,
+        is_given: bool,
+    ) -> Result<Option<Mount>, ReplayError> {
         let mut choice = choice(bag, wanted)?;
         keep_placed(&mut choice.sensors, is_given);
         // With names, the same topics are chosen again when the bag is read.
         wanted.topics = choice.sensors.iter().map(|sensor| sensor.topic.clone()).collect();
-        if let Some(PoseFrom::Topic(topic)) = &choice.pose {
+        if let Some(PoseSource::Topic(topic)) = &choice.pose {
             wanted.topics.push(topic.clone());
         }
         if choice.sensors.is_empty() {
@@ -113,8 +119,7 @@ impl Known {
     }
 
     fn remark(&mut self, sensor: &str, mount: Option<&Mount>) {
-        self.remarks
-            .extend(mount.and_then(describe).map(|description| format!("extrinsics of {sensor}: {description}")));
+        self.remarks.extend(mount.and_then(describe).map(|said| format!("extrinsics of {sensor}: {said}")));
     }
 
     /// Applies the sensor options; `scans` is true if the files hold nothing but scans.
@@ -227,14 +232,14 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, Repla
 }
 
 /// The topics of a ROS bag to read.
-fn choice(bag: &Path, wanted: &Wanted) -> Result<Choice, ReplayError> {
-    let offered = Offered::look(bag).map_err(McapError::from).map_err(FilesError::from)?;
+fn choice(bag: &Path, wanted: &McapOptions) -> Result<TopicChoice, ReplayError> {
+    let offered = AvailableTopics::from_file(bag).map_err(McapError::from).map_err(FilesError::from)?;
     let choice = offered.choose(bag, &wanted.topics, wanted.sensors_max).map_err(McapError::from);
     Ok(choice.map_err(FilesError::from)?)
 }
 
-/// Keeps the sensors that tf places. If tf places none, keeps the first, whose mount is estimated or given. If the
-/// mount `is_given`, the first sensor counts as placed.
+/// Keeps the sensors that tf places. If tf places none, keeps the first, whose mount is estimated or given. If the mount
+/// `is_given`, the first sensor counts as placed.
 fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
     let mut number = 0;
     let mut known = |sensor: &SensorTopic| {
@@ -249,7 +254,7 @@ fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
 
 /// The configuration of each sensor of a ROS bag, and its mount if tf has it. A single sensor is named `top`, several
 /// are named after their frames.
-fn sensors_of(choice: &Choice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
+fn sensors_of(choice: &TopicChoice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
     let mut sensors: Vec<SensorConfig> = Vec::new();
     for (index, sensor) in choice.sensors.iter().enumerate() {
         let mut name = name_of_frame(&sensor.frame_id);

@@ -28,7 +28,7 @@ pub use table::{Calibration, LaserCalibration};
 use crate::model::Model;
 
 impl Calibration {
-    /// The nominal table of a model. That of an HDL-64E only replaces the table of the unit, which is not known.
+    /// The nominal table of a model. Each HDL-64E has its own table, so use its nominal table only if that is unknown.
     pub fn factory(model: Model) -> Self {
         factory::factory(model)
     }

@@ -124,12 +124,12 @@ impl EmptySector {
         forward(self.from, self.to)
     }
 
-    /// True if both ends are those of `other`, give or take `reach` counts.
+    /// True if both ends are those of `other`, ± `reach` counts.
     fn is_about(&self, other: &EmptySector, reach: u32) -> bool {
         is_near(self.from, other.from, reach) && is_near(self.to, other.to, reach)
     }
 
-    /// True if `other` lies inside this sector, give or take `reach` counts.
+    /// True if `other` lies inside this sector, ± `reach` counts.
     fn contains(&self, other: &EmptySector, reach: u32) -> bool {
         let from = (self.from + AZIMUTHS_PER_REVOLUTION - reach % AZIMUTHS_PER_REVOLUTION) % AZIMUTHS_PER_REVOLUTION;
         let (begins, ends) = (forward(from, other.from), forward(from, other.to));

@@ -56,7 +56,7 @@ pub(crate) struct Gap {
     pub jumped: bool,
 }
 
-/// A packet whose turn it is to be decoded.
+/// A packet that is next to be decoded, and what is missing before it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct OrderedPacket<'a> {
     pub packet: Packet<'a>,

@@ -12,7 +12,7 @@
 //! | device time since the packet before | arrival since the packet before | step |
 //! |---|---|---|
 //! | within ±100 ms | any | the device's |
-//! | any | the same, give or take whole hours, 100 ms and 1 % | the device's: the sensor was silent |
+//! | any | the same ± whole hours, 100 ms and 1 % | the device's: the sensor was silent |
 //! | forward by less than 10 s | back by over 100 ms, or more than device time | the device's: the host was set |
 //! | other, and the packet before was the first such | any | arrival's: the device's counter jumped |
 //! | other | any | one packet period; the next packet must confirm the jump |
@@ -164,7 +164,7 @@ impl Timeline {
     }
 }
 
-/// Length of a silence over which the device counted `ahead_ns`, give or take whole hours, and the host `host_ns`;
+/// Length of a silence over which the device counted `ahead_ns` (± whole hours) and the host `host_ns`;
 /// `None` if they do not agree.
 fn silence_ns(ahead_ns: i64, host_ns: i64) -> Option<i64> {
     let host_ns = host_ns.clamp(0, SILENCE_NS_MAX);

@@ -22,24 +22,24 @@ fn decode(model: Model, packets: &[(Vec<u8>, i64)]) -> (Vec<Revolution>, SensorS
 fn a_packet_waits_only_behind_a_gap_and_until_it_is_filled() {
     let stream = Stream::of(Model::Vlp16);
     let mut sensor = sensor(Model::Vlp16);
-    let held = |sensor: &Sensor| sensor.status().packets_waiting;
+    let waiting = |sensor: &Sensor| sensor.status().packets_waiting;
     stream.push(&mut sensor, 0..32);
-    assert_eq!(held(&sensor), 32, "it is unknown whether packet 0 is the first");
+    assert_eq!(waiting(&sensor), 32, "it is unknown whether packet 0 is the first");
     for index in 32..60 {
         stream.push(&mut sensor, [index]);
-        assert_eq!(held(&sensor), 0, "{index}");
+        assert_eq!(waiting(&sensor), 0, "{index}");
     }
     stream.push(&mut sensor, 61..70);
-    assert_eq!(held(&sensor), 9);
+    assert_eq!(waiting(&sensor), 9);
     stream.push(&mut sensor, [60]);
-    assert_eq!((held(&sensor), sensor.status().packets), (0, 70));
+    assert_eq!((waiting(&sensor), sensor.status().packets), (0, 70));
     // Packet 70 never arrives: after 32 more packets the others pass.
     stream.push(&mut sensor, 71..103);
-    assert_eq!(held(&sensor), 32);
+    assert_eq!(waiting(&sensor), 32);
     stream.push(&mut sensor, 103..104);
-    assert!(held(&sensor) < 32, "a packet ends one revolution; packets behind its cut pass with the next packet");
+    assert!(waiting(&sensor) < 32, "a packet ends one revolution; packets behind its cut pass with the next packet");
     stream.push(&mut sensor, 104..105);
-    assert_eq!((held(&sensor), sensor.status().packets_lost), (0, 1));
+    assert_eq!((waiting(&sensor), sensor.status().packets_lost), (0, 1));
     let late = sensor.push(&stream.packet(70), stream.arrival_ns(104)).unwrap_err();
     assert_eq!(late.reason(), "late");
     assert_eq!(
