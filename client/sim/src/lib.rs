@@ -3,7 +3,8 @@
 //! In: a scene described object by object. Out: the datagrams its sensor would send, and the truth about the ground
 //! around the vehicle. Everything but [`send`] is a pure function of the scene, the seed and the time.
 //!
-//! The files, in the order the data flows:
+//! The files, in the order of the data. Those from `ground` to `pose` and `contact` are in `scene/`, those from `raycast`
+//! to `planes`, `encode` and `telemetry` are in `sensor/`:
 //!
 //! | file | in -> out |
 //! |---|---|
@@ -25,22 +26,13 @@
 //! | [`send`] | datagrams -> UDP, paced by the clock |
 //! | [`noise`] | chance by key, for all of them |
 
-pub mod contact;
-pub mod course;
-pub mod encode;
-pub mod ground;
 pub mod impair;
 pub mod noise;
-pub mod object;
-pub mod plan;
-pub mod planes;
-pub mod pose;
-pub mod raycast;
-pub mod scanner;
-pub mod scenes;
+mod scene;
 pub mod send;
-pub mod telemetry;
+mod sensor;
 pub mod traffic;
-pub mod truth;
 pub mod vehicle;
-pub mod world;
+
+pub use scene::{contact, course, ground, object, plan, pose, scenes, truth, world};
+pub use sensor::{encode, planes, raycast, scanner, telemetry};

@@ -8,12 +8,12 @@ use std::sync::Arc;
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 
-use crate::course::{Course, Drive};
-use crate::ground::Ground;
-use crate::object::{Kind, Shape};
-use crate::planes::PlaneUnit;
-use crate::scenes::Scene;
-use crate::world::World;
+use crate::scene::course::{Course, Drive};
+use crate::scene::ground::Ground;
+use crate::scene::object::{Kind, Shape};
+use crate::scene::scenes::Scene;
+use crate::scene::world::World;
+use crate::sensor::planes::PlaneUnit;
 
 /// A street along x with two lanes each way: parked cars, walls, poles and houses beside it, cars ahead, behind and
 /// coming the other way. The vehicle drives in the right-hand lane at `speed_mps`, or stands there.

@@ -2,8 +2,8 @@
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::{Model, ReturnMode};
-use clearway_lidar::{CalibrationSource, Sensor, SensorConfig};
 use clearway_lidar::telemetry::Telemetry;
+use clearway_lidar::{CalibrationSource, Sensor, SensorConfig};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
 use clearway_sim::truth::{Limits, Truth};

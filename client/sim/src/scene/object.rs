@@ -2,8 +2,8 @@
 //!
 //! In: a ray in the world frame (metres, direction of length 1). Out: the distance at which it meets the shape.
 
-use crate::course::Drive;
-use crate::ground::{Ground, disc, slab};
+use super::course::Drive;
+use super::ground::{Ground, disc, slab};
 use crate::noise::mixed;
 
 /// What an object is to a driver.

@@ -2,8 +2,8 @@
 //!
 //! In: a world, a time, the vehicle's place. Frame: world, metres. Leaves and beams count as far down as they hang.
 
-use crate::object::{Kind, Shape};
-use crate::world::World;
+use super::object::{Kind, Shape};
+use super::world::World;
 
 /// A vehicle's box: its middle, heading (rad, counter-clockwise from x) and extents. It stands on the ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -74,7 +74,7 @@ fn heights(shape: &Shape) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ground::Ground;
+    use crate::scene::ground::Ground;
 
     #[test]
     fn a_vehicle_touches_what_stands_in_its_way_and_passes_under_what_hangs_high() {

@@ -6,9 +6,9 @@
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::sync::Arc;
 
-use crate::course::{Course, Drive};
-use crate::ground::{Ground, Profile, Terrace};
-use crate::world::{SLATS, World};
+use super::course::{Course, Drive};
+use super::ground::{Ground, Profile, Terrace};
+use super::world::{SLATS, World};
 
 /// A world and the way a vehicle takes through it.
 #[derive(Clone, Debug, PartialEq)]

@@ -5,8 +5,8 @@
 
 use nalgebra::{Isometry3, Point3};
 
-use crate::object::Shape;
-use crate::world::World;
+use super::object::Shape;
+use super::world::World;
 
 /// What a place is to a vehicle that stands at the raster's middle.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -296,7 +296,7 @@ fn envelope(values: &[f64]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ground::{Ground, Profile, Terrace};
+    use crate::scene::ground::{Ground, Profile, Terrace};
 
     const EXTENT: (f64, f64) = (20.0, 0.2);
 
@@ -310,7 +310,7 @@ mod tests {
         World::on(Ground::default()).fence(
             &[[side, gate], [side, side], [-side, side], [-side, -side], [side, -side], [side, -gate]],
             1.5,
-            Some(crate::world::SLATS),
+            Some(crate::scene::world::SLATS),
         )
     }
 

@@ -3,9 +3,9 @@
 //! Frame: world ("map"), x east, y north, z up, metres; time in seconds from the scene's beginning. Feet of objects
 //! follow the ground.
 
-use crate::course::Drive;
-use crate::ground::Ground;
-use crate::object::{Kind, Object, Shape};
+use super::course::Drive;
+use super::ground::Ground;
+use super::object::{Kind, Object, Shape};
 
 /// Everything a simulated vehicle can meet.
 #[derive(Clone, Debug, Default, PartialEq)]

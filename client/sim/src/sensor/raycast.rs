@@ -6,8 +6,8 @@
 use std::f64::consts::{PI, TAU};
 use std::ops::Deref;
 
-use crate::object::{Kind, Shape};
-use crate::world::World;
+use crate::scene::object::{Kind, Shape};
+use crate::scene::world::World;
 
 /// Sectors about the sensor.
 const SECTORS: usize = 720;
@@ -182,7 +182,7 @@ fn distance(from: [f64; 2], shape: &Shape) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scenes;
+    use crate::scene::scenes;
 
     #[test]
     fn sectors_change_nothing_but_the_time() {
