@@ -1,63 +1,63 @@
-// In: the server's stamp on every update (sent_ns) and this browser's monotonic clock at its receipt, ms.
-// Out: the server's clock now, and how old a map is by it. Browser and server need not agree on the time of day.
+// In: the server's stamp on every update (sent_ns), and this browser's monotonic clock when it arrived, in ms.
+// Out: the server's present time, and the age of a map by it. Browser and server may disagree about the time of day.
 //
-// Each update gives receipt - sent_ns = (browser clock - server clock) + time on the way. The smallest difference of a
-// connection is the best guess of the first part. It may rise by at most DRIFT, what two quartz clocks can drift
-// apart, so a delay that grows by a millisecond a map shows as age and is not taken for a clock. What stays hidden is
-// the fastest trip of the connection: an age is short by that much (and what DRIFT allows), not by more.
+// For each update, arrival - sent_ns = (browser clock - server clock) + time on the way. The smallest difference of a
+// connection is the best estimate of the first part. The estimate may rise by at most DRIFT_PPM, which is how far two
+// quartz clocks drift apart; so a delay that grows by a millisecond a map appears as age, not as a clock offset. What
+// stays hidden is the fastest trip of the connection: an age is too small by that (and by the allowed drift), not more.
 
 const DRIFT_PPM = 100;
-// A link that lags by this much for this long has a queue to drop, or the server's clock was stepped back.
+// If a link lags by LAG_MS_MAX for LAG_FOR_MS, either a queue in it must be dropped or the server's clock was set back.
 const LAG_MS_MAX = 1000, LAG_FOR_MS = 10000;
-// Maps are stamped before they are sent; a capture this far after the server's own clock is a wrong stamp.
+// A map is stamped before it is sent. A capture that ends this far after the server's present time has a wrong stamp.
 const AHEAD_MS_MAX = 100;
 
 export class ServerClock {
   #offset_ms = null;
   #sampled_ms = 0;
-  #anew = true;
+  #is_new_connection = true;
   #in_time_ms = 0;
 
-  // A new connection: the next sample replaces what was known, and until it comes the held map goes on ageing.
+  // Starts a new connection: the next sample replaces the offset, by which the shown map ages until then.
   restart() {
-    this.#anew = true;
+    this.#is_new_connection = true;
   }
 
-  // This browser's clock was stepped or slept: nothing is known until the next sample.
+  // Forgets the offset, because this browser's clock was set or the computer slept.
   forget() {
     this.#offset_ms = null;
-    this.#anew = true;
+    this.#is_new_connection = true;
   }
 
-  // Gives false once updates have lagged behind the fastest trip for so long that only a new connection helps.
+  // Records one update. Returns false if updates have lagged for so long that only a new connection helps.
   sample(local_ms, sent_ns) {
     const offset = local_ms - Number(sent_ns) / 1e6;
     const drifted = this.#offset_ms + ((local_ms - this.#sampled_ms) * DRIFT_PPM) / 1e6;
-    this.#offset_ms = this.#anew ? offset : Math.min(offset, drifted);
+    this.#offset_ms = this.#is_new_connection ? offset : Math.min(offset, drifted);
     this.#sampled_ms = local_ms;
-    this.#anew = false;
+    this.#is_new_connection = false;
     if (offset - this.#offset_ms <= LAG_MS_MAX) this.#in_time_ms = local_ms;
     return local_ms - this.#in_time_ms <= LAG_FOR_MS;
   }
 
-  // Server's clock, ns since the Unix epoch (BigInt); null while unknown.
+  // The server's time, in ns since the Unix epoch (BigInt); null while it is unknown.
   now_ns(local_ms) {
     if (this.#offset_ms === null) return null;
     return BigInt(Math.round((local_ms - this.#offset_ms) * 1e3)) * 1000n;
   }
 
-  // How far the server's clock is ahead of this computer's time of day, ms; null while unknown.
+  // How far the server's clock is ahead of this computer's time of day, in ms; null while it is unknown.
   ahead_ms(wall_minus_monotonic_ms) {
     return this.#offset_ms === null ? null : -this.#offset_ms - wall_minus_monotonic_ms;
   }
 }
 
-// How a map stands at the server's time now_ns: { age_ms, validity_ms, fresh, why }. Unknown time is never fresh.
+// The age of a map at the server's time now_ns: { age_ms, validity_ms, fresh, why }. A map of unknown age is not fresh.
 export function freshness(header, now_ns) {
   const validity_ms = Number(header.valid_until_ns - header.capture_end_ns) / 1e6;
   if (now_ns === null) return { age_ms: null, validity_ms, fresh: false, why: "age unknown until the next map" };
   const age_ms = Number(now_ns - header.capture_end_ns) / 1e6;
-  if (age_ms < -AHEAD_MS_MAX) return { age_ms, validity_ms, fresh: false, why: "its stamp lies in the future" };
+  if (age_ms < -AHEAD_MS_MAX) return { age_ms, validity_ms, fresh: false, why: "its stamp is in the future" };
   const fresh = now_ns <= header.valid_until_ns;
   return { age_ms, validity_ms, fresh, why: fresh ? "" : "its validity has passed" };
 }

@@ -1,33 +1,35 @@
-// In: the wish for one vehicle's maps. Out: calls to `on`: vehicles(list, wanted), update(bytes, received_ms),
-// text(string), state({ phase, text, retry_at_ms }). Keeps trying, with growing pauses; a silent connection counts as cut.
+// The connection to the server. In: the name of a vehicle. Out: calls to `on`: vehicles(list, name), update(bytes,
+// arrived_ms), text(string), state({ phase, text, retry_at_ms }). It reconnects with growing pauses; a connection on
+// which nothing arrives counts as lost.
 // Server: GET vehicles (JSON list), WebSocket live?vehicle=NAME (binary: MapUpdate, text: JSON with "type").
 
 const PAUSE_MS_MIN = 250, PAUSE_MS_MAX = 5000;
-// Status comes every second, so four missed ones mean that the link is gone though no one said so.
+// The server sends a status every second, so four missing ones mean that the connection is lost.
 const SILENCE_MS_MAX = 4500;
 const ANSWER_MS_MAX = 4000;
 const LIST_EVERY_MS = 10000;
 
 export class Link {
   #on;
-  #wanted;
+  // The vehicle's name; undefined until one is chosen.
+  #vehicle;
   #socket = null;
   #pause_ms = PAUSE_MS_MIN;
-  #heard_ms = 0;
+  #arrived_ms = 0;
   #timer = 0;
-  // Counts attempts: an answer to an earlier one is not listened to.
+  // Counts attempts, so that an answer to an earlier one is ignored.
   #attempt = 0;
 
-  constructor(on, wanted) {
+  constructor(on, vehicle) {
     this.#on = on;
-    this.#wanted = wanted;
-    setInterval(() => this.#watch(), 500);
+    this.#vehicle = vehicle;
+    setInterval(() => this.#checkSilence(), 500);
     setInterval(() => this.#socket && this.#list().catch(() => {}), LIST_EVERY_MS);
     addEventListener("online", () => !this.#socket && this.connect());
   }
 
   choose(vehicle) {
-    this.#wanted = vehicle;
+    this.#vehicle = vehicle;
     this.connect();
   }
 
@@ -38,17 +40,17 @@ export class Link {
     try {
       const names = (await this.#list()).map((vehicle) => vehicle.name);
       if (attempt !== this.#attempt) return;
-      this.#wanted ??= names[0];
-      if (this.#wanted === undefined) return this.#retry("No vehicle yet");
-      if (!names.includes(this.#wanted)) return this.#retry(`No vehicle “${this.#wanted}” here`);
-      this.#open(this.#wanted);
+      this.#vehicle ??= names[0];
+      if (this.#vehicle === undefined) return this.#retry("The server has no vehicle yet");
+      if (!names.includes(this.#vehicle)) return this.#retry(`The server has no vehicle “${this.#vehicle}”`);
+      this.#open(this.#vehicle);
     } catch {
-      if (attempt === this.#attempt) this.#retry("Server does not answer");
+      if (attempt === this.#attempt) this.#retry("The server does not answer");
     }
   }
 
-  // Drops the connection and what is queued in it, and makes a new one.
-  renew(text) {
+  // Drops the connection and the messages that wait in it, and makes a new one.
+  reconnect(text) {
     this.#retry(text);
   }
 
@@ -56,7 +58,7 @@ export class Link {
     const answer = await fetch("vehicles", { cache: "no-store", signal: AbortSignal.timeout(ANSWER_MS_MAX) });
     if (!answer.ok) throw new Error(`vehicles: ${answer.status}`);
     const vehicles = await answer.json();
-    this.#on.vehicles(vehicles, this.#wanted);
+    this.#on.vehicles(vehicles, this.#vehicle);
     return vehicles;
   }
 
@@ -65,22 +67,23 @@ export class Link {
     address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
     const socket = (this.#socket = new WebSocket(address));
     socket.binaryType = "arraybuffer";
-    this.#heard_ms = performance.now();
+    this.#arrived_ms = performance.now();
     socket.onopen = () => {
-      this.#heard_ms = performance.now();
+      this.#arrived_ms = performance.now();
       this.#on.state({ phase: "live", text: "Connected", vehicle });
     };
     socket.onmessage = ({ data }) => {
-      this.#heard_ms = performance.now();
+      this.#arrived_ms = performance.now();
       this.#pause_ms = PAUSE_MS_MIN;
       if (typeof data === "string") this.#on.text(data);
-      else this.#on.update(new Uint8Array(data), this.#heard_ms);
+      else this.#on.update(new Uint8Array(data), this.#arrived_ms);
     };
     socket.onclose = () => this.#retry("Connection lost");
   }
 
-  #watch() {
-    if (this.#socket && performance.now() - this.#heard_ms > SILENCE_MS_MAX) this.#retry("Connection silent");
+  #checkSilence() {
+    const silence_ms = performance.now() - this.#arrived_ms;
+    if (this.#socket && silence_ms > SILENCE_MS_MAX) this.#retry("The server sends nothing");
   }
 
   #retry(text) {
@@ -97,7 +100,7 @@ export class Link {
     const socket = this.#socket;
     this.#socket = null;
     if (!socket) return;
-    // Closing a cut connection can take minutes; nothing of it is wanted meanwhile.
+    // Closing a lost connection can take minutes; its messages are ignored meanwhile.
     socket.onopen = socket.onmessage = socket.onclose = null;
     socket.close();
   }

@@ -1,33 +1,9 @@
-// In: a layer's legend or a channel's values. Out: colours, as [red, green, blue].
-// The first four classes differ in lightness as well as in hue (unknown, obstacle, drivable, not_drivable from dark to
-// light), so that they stay apart for colour-blind eyes and in grey.
+// In: a channel's values. Out: colours, as [red, green, blue]. The colours of classes come with the map.
 
-const CLASSES = {
-  unknown: [58, 63, 70],
-  drivable: [28, 158, 150],
-  not_drivable: [244, 184, 66],
-  obstacle: [196, 38, 56],
-  flat: [28, 158, 150],
-  flat_inferred: [22, 110, 106],
-  flat_elevated: [244, 184, 66],
-  flat_unreachable: [170, 128, 60],
-  passable: [28, 158, 150],
-  free: [22, 110, 106],
-  clear: [28, 158, 150],
-  occupied: [196, 38, 56],
-  occluded: [92, 92, 128],
-  out_of_range: [24, 26, 30],
-  road: [120, 190, 240],
-  path: [250, 250, 240],
-};
-// Classes without a colour of their own, by value.
-const OTHERS = [[86, 120, 200], [190, 140, 210], [120, 190, 240], [150, 160, 90], [220, 220, 220], [140, 90, 60]];
+// The colour of unknown cells in a layer without classes.
+export const UNKNOWN = [58, 63, 70];
 
-export const UNKNOWN = CLASSES.unknown;
-
-export const classColour = (name, value) => CLASSES[name] ?? OTHERS[value % OTHERS.length];
-
-// Dark blue to light yellow, even in lightness; t from 0 to 1.
+// Colours from dark blue to light yellow, even in lightness, for colour-blind eyes and in grey; t from 0 to 1.
 const STOPS = [[20, 44, 110], [70, 90, 120], [120, 128, 120], [186, 172, 98], [254, 232, 90]];
 
 export function scaleColour(t) {
@@ -36,7 +12,7 @@ export function scaleColour(t) {
   return STOPS[i].map((low, k) => Math.round(low + (STOPS[i + 1][k] - low) * part));
 }
 
-// Ids that follow one another get hues far apart: steps of the golden angle.
+// The colour of an id. Hues of consecutive ids are far apart: one golden angle.
 export function idColour(id) {
   const hue = (id * 137.508) % 360, light = 0.46 + 0.1 * (id % 3);
   const chroma = 0.28 * (1 - Math.abs(2 * light - 1));
@@ -46,6 +22,6 @@ export function idColour(id) {
   });
 }
 
-// As ImageData holds it in memory seen as 32-bit words, little-endian.
+// A colour as a 32-bit word of ImageData, in little-endian memory.
 export const word = ([red, green, blue]) => ((255 << 24) | (blue << 16) | (green << 8) | red) >>> 0;
 export const css = ([red, green, blue]) => `rgb(${red} ${green} ${blue})`;

@@ -1,10 +1,12 @@
-// In: numbers. Out: what a person reads.
+// In: numbers. Out: the texts that the page shows for them.
 
 export const dash = "–";
 
 export const count = (n) => (n === undefined || n === null ? dash : n.toLocaleString("en"));
 
 export const percent = (share, digits = 1) => (Number.isFinite(share) ? `${(100 * share).toFixed(digits)} %` : dash);
+
+export const words = (name) => name.replaceAll("_", " ");
 
 export function duration(ms) {
   if (ms === null || !Number.isFinite(ms)) return dash;
@@ -18,12 +20,12 @@ export function duration(ms) {
   return days < 730 ? `${Math.floor(days)} days` : `${(days / 365.25).toFixed(1)} years`;
 }
 
-// The clock a sensor's stamps follow, and how far the host's is from them (BigInt, ms).
+// The clock that a sensor's stamps follow, and how far the host's clock is from it (BigInt, ms).
 export function clockWords(clock, offset_ms) {
-  const words = { gps: "GPS", gps_unlocked: "GPS, not locked" }[clock] ?? clock;
+  const name = { gps: "GPS", gps_unlocked: "GPS, not locked" }[clock] ?? clock;
   const ms = Number(offset_ms ?? 0n);
-  if (!words) return dash;
-  return ms === 0 ? words : `${words}, host ${duration(Math.abs(ms))} ${ms > 0 ? "ahead" : "behind"}`;
+  if (!name) return dash;
+  return ms === 0 ? name : `${name}, host ${duration(Math.abs(ms))} ${ms > 0 ? "ahead" : "behind"}`;
 }
 
 export function utc(ns) {
@@ -35,10 +37,15 @@ export function bytes(n) {
   return n < 1024 ? `${n} B` : `${(n / 1024).toFixed(1)} KiB`;
 }
 
-// Azimuth from the ego x axis, counter-clockwise, as a person points.
+// A direction, given as the azimuth from the ego x axis (radians, counter-clockwise).
 export function bearing(azimuth) {
   const degrees = (azimuth * 180) / Math.PI;
   const size = Math.abs(degrees).toFixed(1);
   if (size === "0.0" || size === "180.0") return size === "0.0" ? "straight ahead" : "straight behind";
   return `${size}° ${degrees > 0 ? "left" : "right"}`;
+}
+
+// Writes a text only if it is another one: a browser lays out and paints what is written.
+export function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
 }

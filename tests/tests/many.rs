@@ -8,7 +8,7 @@ use std::iter::Peekable;
 use std::net::UdpSocket;
 
 use clearway::cli::demo::car::address;
-use clearway::cli::demo::rig::{Rig, Told};
+use clearway::cli::demo::rig::{Rig, TimedObservation};
 use clearway::config::{Sender, Udp};
 use clearway_client::{Client, MapView};
 use clearway_mapping::config::BodyConfig;
@@ -27,10 +27,10 @@ const UNDER_WAY: u64 = 60;
 /// The next reading of any of them, in the order of their stamps.
 enum Next {
     Datagram(usize, Datagram),
-    Told(Box<Told>),
+    Told(Box<TimedObservation>),
 }
 
-fn next(sensors: &mut [Peekable<SimulatedVehicle>], told: &mut Peekable<impl Iterator<Item = Told>>) -> Next {
+fn next(sensors: &mut [Peekable<SimulatedVehicle>], told: &mut Peekable<impl Iterator<Item = TimedObservation>>) -> Next {
     let sent = |(index, sensor): (usize, &mut Peekable<SimulatedVehicle>)| Some((sensor.peek()?.stamp_ns, index));
     let (stamp_ns, index) = sensors.iter_mut().enumerate().filter_map(sent).min().expect("they do not end");
     match told.next_if(|told| told.stamp_ns <= stamp_ns) {
@@ -63,7 +63,7 @@ async fn eight_sensors_through_real_doors_make_one_map_and_its_occupancy_is_the_
 
     let sockets: Vec<UdpSocket> = (0..2).map(|index| UdpSocket::bind((address(index), 0)).unwrap()).collect();
     let mut sensors: Vec<_> = (0..2).map(|index| rig.vehicle(index).peekable()).collect();
-    let mut told = rig.told().peekable();
+    let mut told = rig.observations().peekable();
     let (mut sent, mut scans) = (0, 0);
     loop {
         match next(&mut sensors, &mut told) {

@@ -109,7 +109,7 @@ fn simulated(scene: Scene, maps: usize) -> Vec<Sized> {
     let mut pipeline = Pipeline::new(&vehicle, vec![None; rig.units.len()]).unwrap();
     let source = |sensor: &str| rig.units.iter().position(|(name, _)| name == sensor).unwrap_or(0) as u16;
     let mut made = Vec::new();
-    for (sequence, told) in (0..).zip(rig.told()) {
+    for (sequence, told) in (0..).zip(rig.observations()) {
         let observation = v1::Observation::from(told.observation);
         let source = source(&observation.sensor);
         let (_, body) = observation::decode(observation, &observation::Limits::from_points_max(1 << 16)).unwrap().remove(0);

@@ -71,7 +71,7 @@ async fn a_ros_2_subscriber_who_comes_late_finds_every_layer_and_the_vehicle_on_
     for layer in map.layers() {
         let topic = format!("/clearway/car/{}", layer.name);
         assert_eq!(told["topics"][&topic]["qos"], "1:1:1,1:,:,:,,", "{topic}");
-        let (grid, raster) = (&told["told"][&topic], Raster::of(&layer.grid));
+        let (grid, raster) = (&told["told"][&topic], Raster::from_grid(&layer.grid));
         assert_eq!(grid["frame_id"], "car/base_link", "{topic}");
         assert_eq!(grid["stamp_ns"], map.header().capture_end_ns, "{topic}");
         assert_eq!(grid["size"], json!([raster.width, raster.height]), "{topic}");
@@ -132,7 +132,7 @@ async fn a_foxglove_client_is_shown_the_current_map_at_once_and_points_from_then
     assert_eq!(told["channels"].as_object().unwrap().len() as u64, LAYERS + 2);
     for name in ["drivability", "occupancy"] {
         let (layer, grid) = (map.layer(name).unwrap(), &told[format!("/car/map/{name}")]);
-        let (raster, schema) = (Raster::of(&layer.grid), &told["channels"][format!("/car/map/{name}")]);
+        let (raster, schema) = (Raster::from_grid(&layer.grid), &told["channels"][format!("/car/map/{name}")]);
         let data = raster.rgba(layer);
         assert_eq!((schema.as_str(), grid["frame_id"].as_str()), (Some("foxglove.Grid"), Some("car/base_link")));
         assert_eq!(grid["log_ns"], map.header().capture_end_ns);

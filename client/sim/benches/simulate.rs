@@ -1,4 +1,4 @@
-//! What simulating costs: a turn of datagrams of each kind, and a truth raster.
+//! Cost of the simulation: a revolution of datagrams of each model, and a truth raster.
 
 use clearway_lidar::model::Model;
 use clearway_sim::scanner::ScannerConfig;
@@ -10,15 +10,15 @@ fn main() {
     divan::main();
 }
 
-/// A tenth of a second of the town: one turn of an HDL-64E is 133,312 rays and must stay far under 100 ms.
+/// A tenth of a second of the town: one revolution of an HDL-64E is 133,312 rays and must take far less than 100 ms.
 #[divan::bench(args = [Model::Hdl64eS2, Model::Hdl32e, Model::Vlp16, Model::Vls128], sample_count = 20)]
 fn a_turn_in_town(bencher: divan::Bencher, model: Model) {
     let vehicle = SimulatedVehicle::new(scenes::town(), ScannerConfig { model, ..ScannerConfig::default() });
-    let mut turn = 0;
+    let mut revolution = 0;
     bencher.bench_local(|| {
-        turn += 1;
-        let end_ns = vehicle.start_ns() + (turn + 1) * 100_000_000;
-        vehicle.clone().from_turn(turn).take_while(|datagram| datagram.stamp_ns < end_ns).count()
+        revolution += 1;
+        let end_ns = vehicle.start_ns() + (revolution + 1) * 100_000_000;
+        vehicle.clone().from_revolution(revolution).take_while(|datagram| datagram.stamp_ns < end_ns).count()
     });
 }
 

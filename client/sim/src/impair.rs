@@ -1,41 +1,41 @@
 //! A bad network between sensor and server.
 //!
-//! In: datagrams in the order in which the sensor sent them. Out: what arrives of them, in the order and at the stamps
-//! of their arrival, and [`Counts`] of what was done. The same seed does the same.
+//! In: datagrams in the order in which the sensor sent them. Out: those that arrive, in the order and with the stamps
+//! of their arrival, and [`Counts`] of the faults. The same seed gives the same faults.
 
 use std::collections::BTreeMap;
 
 use crate::noise::{mixed, uniform};
 use crate::vehicle::{Datagram, Kind};
 
-/// What the network does. Shares are of all datagrams, 0 to 1. `Default`: nothing.
+/// The faults of a network. Shares are of all datagrams, from 0 to 1. `Default`: no faults.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Faults {
-    /// Share lost, one by one.
+    /// Share of the datagrams lost, each independently.
     pub loss: f64,
-    /// Share at which a burst begins: data packets lost in a row.
+    /// Share of the data packets at which a burst begins, in which consecutive data packets are lost.
     pub burst: f64,
-    /// Most data packets a burst takes, at least 1.
+    /// Greatest number of data packets lost in one burst, at least 1.
     pub burst_packets: u32,
-    /// Share that arrives twice, the copy up to `reorder` data packets later.
+    /// Share of the datagrams that arrive twice, the copy up to `reorder` data packets later.
     pub duplicate: f64,
     /// One data packet in four arrives later, by 1 to this many data packets.
     pub reorder: u32,
-    /// Share cut short.
+    /// Share of the datagrams that are cut short.
     pub truncate: f64,
-    /// Share with one bit flipped.
+    /// Share of the datagrams in which one bit is flipped.
     pub flip: f64,
-    /// Each arrives later by up to this, in order still.
+    /// Greatest delay of a datagram, in ns; the order is kept.
     pub delay_ns: i64,
-    /// Of every draw.
+    /// Seed of all random draws.
     pub seed: u64,
 }
 
-/// What was done.
+/// Number of datagrams that each fault befell.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
     /// Datagrams that were sent.
-    pub taken: u64,
+    pub sent: u64,
     /// Datagrams that arrived, copies among them.
     pub arrived: u64,
     /// Data packets lost, in bursts or alone.
@@ -44,17 +44,17 @@ pub struct Counts {
     pub telemetry_lost: u64,
     /// Runs of lost data packets.
     pub gaps: u64,
-    /// Copies.
+    /// Copies that were made.
     pub duplicated: u64,
-    /// Data packets that arrived after their turn; copies are not counted.
+    /// Data packets that arrived after a later one; copies are not counted.
     pub reordered: u64,
-    /// Cut short.
+    /// Datagrams that were cut short.
     pub truncated: u64,
-    /// With a bit flipped.
+    /// Datagrams in which a bit was flipped.
     pub flipped: u64,
 }
 
-/// A network and what is under way in it.
+/// A network with faults, and the datagrams under way in it.
 #[derive(Clone, Debug)]
 pub struct Impairment {
     faults: Faults,
@@ -63,26 +63,26 @@ pub struct Impairment {
     packets: u64,
     burst_left: u64,
     in_gap: bool,
-    /// By the data packet after which they arrive, and in the order in which they were sent.
+    /// Datagrams under way, by the data packet after which they arrive and the order in which they were sent.
     under_way: BTreeMap<(u64, u64), Datagram>,
     arrived: Vec<Datagram>,
     newest_ns: i64,
 }
 
 impl Impairment {
-    /// A network that has carried nothing yet.
+    /// A network without datagrams.
     pub fn new(faults: Faults) -> Self {
         let (under_way, arrived) = (BTreeMap::new(), Vec::new());
         let counts = Counts::default();
         Self { faults, counts, packets: 0, burst_left: 0, in_gap: false, under_way, arrived, newest_ns: i64::MIN }
     }
 
-    /// Takes a datagram; gives those that arrive before the next one is sent.
+    /// Sends a datagram; returns those that arrive before the next one is sent.
     pub fn push(&mut self, datagram: Datagram) -> std::vec::Drain<'_, Datagram> {
-        self.counts.taken += 1;
+        self.counts.sent += 1;
         let stamp_ns = datagram.stamp_ns;
         let is_packet = datagram.kind == Kind::Data;
-        let draws = Draws { key: mixed(self.faults.seed ^ mixed(self.counts.taken)) };
+        let draws = Draws { key: mixed(self.faults.seed ^ mixed(self.counts.sent)) };
         if is_packet {
             self.packets += 1;
         }
@@ -104,13 +104,13 @@ impl Impairment {
         self.arrived.drain(..)
     }
 
-    /// Gives what is still under way.
+    /// Returns the datagrams that are still under way.
     pub fn finish(&mut self) -> std::vec::Drain<'_, Datagram> {
         self.deliver(u64::MAX, self.newest_ns, &Draws { key: 0 });
         self.arrived.drain(..)
     }
 
-    /// What was done so far.
+    /// The counts so far.
     pub fn counts(&self) -> Counts {
         self.counts
     }
@@ -138,10 +138,10 @@ impl Impairment {
             datagram.payload[bit as usize / 8] ^= 1 << (bit % 8);
             self.counts.flipped += 1;
         }
-        self.under_way.insert((self.packets + packets_later, self.counts.taken + self.counts.duplicated), datagram);
+        self.under_way.insert((self.packets + packets_later, self.counts.sent + self.counts.duplicated), datagram);
     }
 
-    /// What arrives by the time data packet `packets` was sent, at `now_ns`.
+    /// Moves the datagrams that arrive until data packet `packets` is sent, at `now_ns`, to `arrived`.
     fn deliver(&mut self, packets: u64, now_ns: i64, draws: &Draws) {
         let later = self.under_way.split_off(&(packets.saturating_add(1), 0));
         for (_, mut datagram) in std::mem::replace(&mut self.under_way, later) {
@@ -154,7 +154,7 @@ impl Impairment {
     }
 }
 
-/// Chances of one datagram, by question.
+/// The random draws of one datagram, by their purpose.
 struct Draws {
     key: u64,
 }
@@ -170,7 +170,7 @@ impl Draws {
     }
 }
 
-/// What arrives of a stream.
+/// The datagrams of a stream that arrive.
 #[derive(Clone, Debug)]
 pub struct Impaired<I> {
     sent: I,
@@ -184,7 +184,7 @@ impl<I: Iterator<Item = Datagram>> Impaired<I> {
         Self { sent, network: Impairment::new(faults), ready: Default::default() }
     }
 
-    /// What was done so far.
+    /// The counts so far.
     pub fn counts(&self) -> Counts {
         self.network.counts()
     }

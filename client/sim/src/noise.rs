@@ -1,4 +1,4 @@
-//! Chance that can be asked for by place: the same key gives the same number, in any order, on any machine.
+//! Random numbers by key: the same key gives the same number, in any order of calls, on any machine.
 
 /// A well mixed number for each key (the finisher of splitmix64).
 pub fn mixed(key: u64) -> u64 {

@@ -1,4 +1,4 @@
-//! The one impure file: a vehicle's datagrams over UDP, paced by the clock.
+//! A vehicle's datagrams over UDP, paced by the clock. The only file of this crate that does I/O or reads a clock.
 //!
 //! In: datagrams in device-time order. Out: UDP to a data port and a telemetry port, and a count of what was sent.
 
@@ -9,30 +9,30 @@ use std::time::{Duration, Instant};
 
 use crate::vehicle::{Datagram, Kind};
 
-/// How fast device time passes.
+/// Speed at which device time passes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Pace {
-    /// As the clock does.
+    /// As fast as the clock.
     RealTime,
-    /// So many times as fast; above 0.
+    /// This many times as fast as the clock; above 0.
     Times(f64),
     /// Without waiting.
     AsFastAsPossible,
 }
 
-/// When to stop: at whichever comes first.
+/// When to stop: at the first of these.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Until<'a> {
-    /// Somebody sets this.
+    /// Another thread sets this.
     pub stop: Option<&'a AtomicBool>,
-    /// So much device time has passed.
+    /// This much device time has passed.
     pub device_time: Option<Duration>,
 }
 
-/// What was sent.
+/// Counts of what was sent.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sent {
-    /// Data packets.
+    /// Number of data packets.
     pub packets: u64,
     /// Telemetry datagrams.
     pub telemetry: u64,
@@ -40,14 +40,14 @@ pub struct Sent {
     pub device_time: Duration,
 }
 
-/// Datagrams that are due this soon leave at once: the clock is asked for one short burst a millisecond, and as each
-/// burst is measured from the beginning, the long-run rate is exact.
+/// Datagrams that are due within this time are sent at once, so that the thread sleeps at most once a millisecond. The
+/// due times count from the beginning, so the long-run rate is exact.
 const BURST: Duration = Duration::from_millis(1);
 
-/// Sends datagrams from an address of the sensor's own until there are no more or `until` says so; blocks.
+/// Sends datagrams from the address `own` until there are no more or `until` is reached; blocks.
 ///
 /// # Errors
-/// The operating system's, from opening the socket or sending.
+/// The operating system's error if the socket cannot be opened or a datagram cannot be sent.
 pub fn drive(
     own: SocketAddr,
     datagrams: impl IntoIterator<Item = Datagram>,

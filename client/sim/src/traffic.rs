@@ -1,7 +1,7 @@
 //! A car with six units of four planes (Seo 2014, figure 2) in traffic, and what each object covers of the ground.
 //!
-//! In: the ego vehicle's speed. Out: a [`Scene`], the six [`PlaneUnit`]s, and for any time which places lie inside a
-//! thing.
+//! In: the ego vehicle's speed. Out: a [`Scene`], the six [`PlaneUnit`]s, and for any time the ground that objects
+//! cover.
 
 use std::f64::consts::PI;
 use std::sync::Arc;
@@ -15,14 +15,14 @@ use crate::scene::scenes::Scene;
 use crate::scene::world::World;
 use crate::sensor::planes::PlaneUnit;
 
-/// A street along x with two lanes each way: parked cars, walls, poles and houses beside it, cars ahead, behind and
+/// A street along x with two lanes each way: parked cars, walls, poles and buildings beside it, cars ahead, behind and
 /// coming the other way. The vehicle drives in the right-hand lane at `speed_mps`, or stands there.
 pub fn street(speed_mps: f64) -> Scene {
     let course = Arc::new(Course::from(-400.0, 0.0, 0.0).straight(1200.0));
     let mut world = World::on(Ground { reflectivity: 15, ..Ground::default() })
         .wall(&[[-350.0, 14.0], [700.0, 14.0]], 1.2)
-        .house(12.0, -24.0, 0.1, [14.0, 10.0], 6.0)
-        .house(60.0, -23.0, -0.2, [12.0, 9.0], 6.0);
+        .building(12.0, -24.0, 0.1, [14.0, 10.0], 6.0)
+        .building(60.0, -23.0, -0.2, [12.0, 9.0], 6.0);
     for spot in 0..90 {
         let x = -180.0 + 8.0 * f64::from(spot);
         let chance = crate::noise::uniform(0x5741 + spot as u64);
@@ -74,18 +74,18 @@ pub fn six_units() -> [PlaneUnit; 6] {
     })
 }
 
-/// What stands on the ground at one moment.
+/// The objects on the ground at one time.
 #[derive(Clone, Debug)]
 pub struct Footprints(Vec<(Kind, Shape)>);
 
 impl Footprints {
-    /// The things of a world at `time` s, but for those that hang over the ground and those too thin to cover any.
+    /// The objects of a world at `time` s, without those that hang over the ground and those too thin to cover any.
     pub fn at(world: &World, time: f64) -> Self {
         let shapes = world.objects.iter().map(|object| (object.kind, object.at(time, &world.ground)));
         Self(shapes.filter(|(kind, _)| !matches!(kind, Kind::Leaves | Kind::Beam | Kind::Fence)).collect())
     }
 
-    /// Whether a thing covers a place (metres, world) or comes nearer to it than `margin_m` along its own sides.
+    /// True if an object covers a place (metres, world frame), or is nearer to it than `margin_m` along its own sides.
     pub fn near(&self, [x, y]: [f64; 2], margin_m: f64) -> bool {
         self.0.iter().any(|(_, shape)| shape.column(x, y, margin_m).is_some())
     }

@@ -1,9 +1,10 @@
-//! A simulated vehicle: a scene driven, a sensor turning on the roof, datagrams without end.
+//! A simulated vehicle that drives through a scene with one rotating sensor and sends datagrams without end.
 //!
-//! In: scene, sensor, start. Out: [`Datagram`]s in device-time order, the pose at any time, whole decoded turns with
-//! the truth beside them.
+//! In: scene, sensor, start. Out: [`Datagram`]s in device-time order, the pose at any time, whole decoded revolutions
+//! with the truth about the ground.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::Revolution;
@@ -19,44 +20,44 @@ use crate::sensor::raycast::Caster;
 use crate::sensor::scanner::{Scanner, ScannerConfig};
 use crate::sensor::telemetry::{Datum, Fix, telemetry};
 
-/// Which port a datagram goes to.
+/// Kind of a datagram, which decides its port.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// 1206 bytes (port 2368 out of the box).
+    /// Data packet of 1206 bytes (factory setting: port 2368).
     Data,
-    /// 512 bytes (port 8308).
+    /// Telemetry of 512 bytes (port 8308).
     Telemetry,
 }
 
-/// One datagram and when the sensor sends it.
+/// One datagram, and the time at which the sensor sends it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Datagram {
-    /// ns since the Unix epoch: just after the last firing in it.
+    /// Time just after the last firing in it, ns since the Unix epoch.
     pub stamp_ns: i64,
-    /// What it is.
+    /// Data packet or telemetry.
     pub kind: Kind,
-    /// The UDP payload.
+    /// UDP payload.
     pub payload: Vec<u8>,
 }
 
-/// A whole turn as the decoder gives it, with what the simulator knows.
+/// A whole revolution as the decoder gives it, with the truth of the simulation.
 #[derive(Clone, Debug)]
-pub struct Turn {
-    /// Decoded from the turn's own datagrams.
+pub struct TrueRevolution {
+    /// Decoded from the revolution's own datagrams.
     pub revolution: Revolution,
     /// `map_from_ego` at the revolution's end stamp.
     pub map_from_ego: Isometry3<f64>,
-    /// The truth about the ego frame at that stamp.
+    /// The truth about the ground in the ego frame at that stamp.
     pub truth: TruthGrid,
 }
 
-/// From one telemetry datagram to the next: the HDL-64E and its kin send about a hundred a second.
+/// Time from one telemetry datagram to the next: the sensors send about a hundred a second.
 const TELEMETRY_PERIOD_NS: i64 = 10_000_000;
 /// 2026-01-01 12:00:00 UTC.
 const NOON_NS: i64 = 1_767_268_800_000_000_000;
 const SECOND_NS: i64 = 1_000_000_000;
 
-/// A vehicle that drives through a scene and sends what its sensor sees.
+/// A vehicle that drives through a scene and sends what its sensor measures.
 #[derive(Clone, Debug)]
 pub struct SimulatedVehicle {
     scene: Scene,
@@ -73,12 +74,12 @@ pub struct SimulatedVehicle {
 }
 
 impl SimulatedVehicle {
-    /// A vehicle at the beginning of its scene, which is noon on 2026-01-01, UTC.
+    /// A vehicle at the beginning of its scene, at noon on 2026-01-01, UTC.
     pub fn new(scene: Scene, config: ScannerConfig) -> Self {
         Self::starting_at(scene, config, NOON_NS)
     }
 
-    /// The same beginning at `start_ns` (ns since the Unix epoch), as a live run wants it.
+    /// A vehicle whose scene begins at `start_ns` (ns since the Unix epoch), for a live run.
     pub fn starting_at(scene: Scene, config: ScannerConfig, start_ns: i64) -> Self {
         let scanner = Scanner::new(config);
         let config = scanner.config();
@@ -90,12 +91,12 @@ impl SimulatedVehicle {
         Self { scene, scanner, datum, start_ns, caster, encoder, next_firing: 0, next_telemetry_ns, waiting: None }
     }
 
-    /// The scene it drives in.
+    /// The scene in which the vehicle drives.
     pub fn scene(&self) -> &Scene {
         &self.scene
     }
 
-    /// Its sensor.
+    /// The vehicle's sensor.
     pub fn scanner(&self) -> &Scanner {
         &self.scanner
     }
@@ -105,7 +106,12 @@ impl SimulatedVehicle {
         self.start_ns
     }
 
-    /// The place on the globe of the world's origin.
+    /// The stamp of the next firing, ns since the Unix epoch.
+    pub fn next_stamp_ns(&self) -> i64 {
+        self.start_ns + self.scanner.firing_ns(self.next_firing)
+    }
+
+    /// Geographic position of the world's origin.
     pub fn datum(&self) -> Datum {
         self.datum
     }
@@ -126,8 +132,7 @@ impl SimulatedVehicle {
         TruthGrid::about(&self.scene.world, &pose, time, (half_extent_m, cell_m), limits)
     }
 
-    /// Whether the ground in each cell of a truth raster made for `stamp_ns` can be seen by the sensor then, in its
-    /// order.
+    /// For each cell of a truth raster made for `stamp_ns`, true if the sensor can see the ground in it at that time.
     pub fn sees(&self, stamp_ns: i64, truth: &TruthGrid) -> Vec<bool> {
         let (map_from_ego, time) = (self.pose_at(stamp_ns), self.time(stamp_ns));
         let eye: [f64; 3] = (map_from_ego * self.scanner.config().ego_from_sensor).translation.vector.into();
@@ -140,54 +145,91 @@ impl SimulatedVehicle {
         (0..truth.classes.len()).map(sees).collect()
     }
 
-    /// The datagrams from the beginning of turn `number` on (0 starts at the scene's beginning; turns before exist
-    /// too).
-    pub fn from_turn(mut self, number: i64) -> Self {
-        let per_packet = self.scanner.spec().firings_per_packet(self.scanner.config().return_mode) as i64;
-        let packet = self.scanner.first_firing_of(number).div_euclid(per_packet);
-        self.next_firing = packet * per_packet;
-        self.encoder = self.encoder.at_packet(packet);
-        let stamp_ns = self.start_ns + self.scanner.firing_ns(self.next_firing);
-        self.next_telemetry_ns = stamp_ns - stamp_ns.rem_euclid(TELEMETRY_PERIOD_NS);
-        self.waiting = None;
+    /// The vehicle moved to the beginning of revolution `number`. Revolution 0 starts at the scene's beginning; numbers
+    /// below 0 exist too.
+    pub fn from_revolution(mut self, number: i64) -> Self {
+        self.move_to(self.scanner.first_firing_of(number));
         self
     }
 
-    /// Turn `number`, whole, through real datagrams and the decoder, and the truth 60 m around in cells of 0.2 m at its
-    /// end.
+    /// True if the next packet is the last one before the angle at which a decoder ends a revolution by default: behind
+    /// the vehicle, half a revolution from the encoder's zero.
+    pub fn is_at_revolution_end(&self) -> bool {
+        let next = self.next_firing + self.firings_per_packet();
+        let [first, next] = [self.next_firing, next].map(|firing| self.scanner.encoder_share(firing));
+        self.waiting.is_none() && first < 0.5 && next >= 0.5
+    }
+
+    /// Skips as many whole revolutions as lie between the next packet and `stamp_ns`, without simulating them, and the
+    /// packet in which a revolution ends. The scene goes on meanwhile. Returns the skipped time, 0 if `stamp_ns` is
+    /// less than a revolution ahead.
+    ///
+    /// At [`SimulatedVehicle::is_at_revolution_end`], a decoder then sees one revolution end and the next one begin,
+    /// both without a few firings. Elsewhere it sees two parts of revolutions.
+    pub fn skip_to(&mut self, stamp_ns: i64) -> Duration {
+        let revolution_ns = 60e9 / self.scanner.config().rpm;
+        let revolutions = ((stamp_ns - self.next_stamp_ns()) as f64 / revolution_ns).floor();
+        if revolutions < 1.0 {
+            return Duration::ZERO;
+        }
+        let firings = revolutions * revolution_ns / self.scanner.firing_ns(1) as f64;
+        let before = self.next_firing;
+        // One packet after the first one that begins no earlier than this angle: that may still hold the end.
+        self.move_to(before + firings as i64 + 2 * self.firings_per_packet());
+        let skipped_ns = self.scanner.firing_ns(self.next_firing - before);
+        Duration::from_nanos(skipped_ns.unsigned_abs())
+    }
+
+    fn firings_per_packet(&self) -> i64 {
+        self.scanner.spec().firings_per_packet(self.scanner.config().return_mode) as i64
+    }
+
+    /// Makes the packet that holds `firing` the next one.
+    fn move_to(&mut self, firing: i64) {
+        let packet = firing.div_euclid(self.firings_per_packet());
+        self.next_firing = packet * self.firings_per_packet();
+        self.encoder.begin_packet(packet);
+        let stamp_ns = self.start_ns + self.scanner.firing_ns(self.next_firing);
+        self.next_telemetry_ns = stamp_ns - stamp_ns.rem_euclid(TELEMETRY_PERIOD_NS);
+        self.waiting = None;
+    }
+
+    /// Revolution `number`, whole, through real datagrams and the decoder, with the truth 60 m to every side, in cells
+    /// of 0.2 m, at its end.
     ///
     /// # Panics
-    /// If the decoder refuses a datagram of the encoder's or finds no whole turn: a fault of this project.
-    pub fn turn(&self, number: i64) -> Turn {
+    /// If the decoder refuses a datagram of the encoder or finds no whole revolution, which is a fault of this project.
+    pub fn true_revolution(&self, number: i64) -> TrueRevolution {
         let revolution = self.revolution(number);
         let map_from_ego = self.pose_at(revolution.end_ns);
         let truth = self.truth_at(revolution.end_ns, 60.0, 0.2, &Limits::default());
-        Turn { revolution, map_from_ego, truth }
+        TrueRevolution { revolution, map_from_ego, truth }
     }
 
-    /// Turn `number`, whole, through real datagrams and the decoder: the one whose middle is the encoder's zero, ahead
-    /// of the vehicle, at time `number * 60 / rpm`.
+    /// Revolution `number`, whole, through real datagrams and the decoder: the one whose middle is the encoder's zero,
+    /// ahead of the vehicle, at time `number * 60 / rpm`.
     ///
     /// # Panics
-    /// As [`SimulatedVehicle::turn`].
+    /// As [`SimulatedVehicle::true_revolution`].
     pub fn revolution(&self, number: i64) -> Revolution {
         let config = SensorConfig {
             model: Some(self.scanner.config().model),
-            // A VLS-128's dual-return packets hold one firing: alone they do not show how fast it turns.
+            // A dual-return packet of a VLS-128 holds one firing, so it does not show the rotation rate.
             rpm: Some(self.scanner.config().rpm as f32),
             calibration: Some(self.scanner.calibration().clone()),
             ..SensorConfig::default()
         };
         let mut sensor = Sensor::new(config);
-        // The decoder cuts turns behind the vehicle, half a turn before the encoder's zero. An angle that rounds to
-        // that begins a turn one firing early.
-        let half_turn_ns = (30e9 / self.scanner.config().rpm) as i64;
+        // The decoder ends revolutions behind the vehicle, half a revolution before the encoder's zero. A firing whose
+        // angle rounds to that one begins a revolution one firing early.
+        let half_revolution_ns = (30e9 / self.scanner.config().rpm) as i64;
         let slack_ns = self.scanner.firing_ns(2);
-        let begins_ns =
-            self.start_ns + self.scanner.firing_ns(self.scanner.first_firing_of(number)) - half_turn_ns - slack_ns;
-        for datagram in self.clone().from_turn(number - 1) {
+        let begins_ns = self.start_ns + self.scanner.firing_ns(self.scanner.first_firing_of(number))
+            - half_revolution_ns
+            - slack_ns;
+        for datagram in self.clone().from_revolution(number - 1) {
             let revolution = sensor.push(&datagram.payload, datagram.stamp_ns);
-            if let Some(revolution) = revolution.expect("the decoder takes what the encoder makes")
+            if let Some(revolution) = revolution.expect("the decoder accepts what the encoder makes")
                 && revolution.partial.is_none()
                 && revolution.start_ns > begins_ns
             {
@@ -197,9 +239,9 @@ impl SimulatedVehicle {
         unreachable!("datagrams do not end")
     }
 
-    /// From the next firing on, which this gives the stamp of, the vehicle follows an arc of this curvature (1/m, left
-    /// positive) from where it is, at `speed` m/s. What is asked about the time before is from then on told as if it
-    /// had always done so.
+    /// Steers the vehicle onto an arc of this curvature (1/m, left positive) at `speed` m/s, from the next firing on;
+    /// returns the stamp of that firing. Poses and speeds of the time before are from then on computed from the arc
+    /// too.
     pub fn steer(&mut self, curvature: f64, speed: f64) -> i64 {
         let offset_ns = self.scanner.firing_ns(self.next_firing);
         let time = offset_ns as f64 * 1e-9;
@@ -252,8 +294,8 @@ impl Iterator for SimulatedVehicle {
     fn next(&mut self) -> Option<Datagram> {
         let packet = self.waiting.take().unwrap_or_else(|| self.next_packet());
         // An S1 has neither clock nor receiver.
-        let speaks = self.scanner.config().model != Model::Hdl64eS1;
-        if speaks && self.next_telemetry_ns <= packet.stamp_ns {
+        let has_telemetry = self.scanner.config().model != Model::Hdl64eS1;
+        if has_telemetry && self.next_telemetry_ns <= packet.stamp_ns {
             let datagram = self.telemetry(self.next_telemetry_ns);
             self.next_telemetry_ns += TELEMETRY_PERIOD_NS;
             self.waiting = Some(packet);

@@ -26,7 +26,7 @@ fn crooked(model: Model, seed: u64) -> Calibration {
     calibration
 }
 
-/// The largest differences between a turn and the world: azimuth (degrees), range (counts), point (degrees at the
+/// The largest differences between a revolution and the world: azimuth (degrees), range (counts), point (degrees at the
 /// sensor, quantised range left out), stamp (µs).
 #[derive(Debug, Default, PartialEq)]
 struct Differences {
@@ -48,7 +48,7 @@ fn compare(vehicle: &SimulatedVehicle, revolution: &Revolution) -> Differences {
         let index = (stamp_ns - start_ns + period_ns / 2).div_euclid(period_ns);
         let exact_ns = start_ns + scanner.firing_ns(index);
         worst.stamp_us = worst.stamp_us.max((stamp_ns - exact_ns).abs() as f64 * 1e-3);
-        let turned = f64::from(firing.azimuth_rad).to_degrees() - 360.0 * scanner.encoder_turns(index);
+        let turned = f64::from(firing.azimuth_rad).to_degrees() - 360.0 * scanner.encoder_share(index);
         worst.azimuth_deg = worst.azimuth_deg.max(((turned + 180.0).rem_euclid(360.0) - 180.0).abs());
 
         let map_from_sensor = vehicle.pose_at(exact_ns) * config.ego_from_sensor;
@@ -73,7 +73,7 @@ fn compare(vehicle: &SimulatedVehicle, revolution: &Revolution) -> Differences {
                 let last = caster.cast_behind_leaves(from, to);
                 let hit: Option<Hit> = match (config.return_mode, echo) {
                     (ReturnMode::Last, _) => last,
-                    // The decoder takes out a last echo that is the strongest too.
+                    // The decoder removes a last echo that is the strongest too.
                     (_, 1) => last.filter(|_| nearest() != last),
                     _ => nearest(),
                 };
@@ -102,11 +102,11 @@ fn modes(model: Model) -> Vec<ReturnMode> {
     modes
 }
 
-fn holds(model: Model, return_mode: ReturnMode, rpm: f64, turn: i64, seed: u64) {
+fn holds(model: Model, return_mode: ReturnMode, rpm: f64, number: i64, seed: u64) {
     let calibration = Some(crooked(model, seed));
     let config = ScannerConfig { model, return_mode, rpm, calibration, seed, ..ScannerConfig::default() }.noiseless();
     let vehicle = SimulatedVehicle::new(scenes::town(), config);
-    let revolution = vehicle.revolution(turn);
+    let revolution = vehicle.revolution(number);
     let worst = compare(&vehicle, &revolution);
     println!("{model:?} {return_mode:?} {rpm:.0} rpm: {} firings, {worst:?}", revolution.firings.len());
     assert_eq!((revolution.model, revolution.echoes.len()), (model, 1 + usize::from(return_mode == ReturnMode::Dual)));
@@ -116,14 +116,14 @@ fn holds(model: Model, return_mode: ReturnMode, rpm: f64, turn: i64, seed: u64) 
     // A block's azimuth is rounded once; the second firing of a 16-laser block is rounded again.
     let rounded = if model.spec().firings_per_block > 1 { 0.0101 } else { 0.0051 };
     assert!(worst.azimuth_deg <= rounded, "{worst:?}");
-    // A laser's own turn is rounded again, and follows from a step from block to block that is rounded too.
+    // A laser's own rotation is rounded again, and follows from a step from block to block that is rounded too.
     assert!(worst.point_deg <= 0.02, "{worst:?}");
     assert!(worst.stamp_us <= 1.1, "{worst:?}");
     assert!(worst.returns > 5_000, "{worst:?}");
 }
 
 #[test]
-fn every_model_in_every_return_mode_decodes_to_the_world_it_saw() {
+fn every_model_and_return_mode_decodes_to_the_simulated_points() {
     for model in Model::ALL {
         for return_mode in modes(model) {
             holds(model, return_mode, 600.0, 3, 7);
@@ -135,15 +135,15 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 12, max_shrink_iters: 8, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn any_sensor_at_any_rate_anywhere_in_town_decodes_to_the_world_it_saw(
+    fn any_sensor_at_any_rate_and_place_decodes_to_the_simulated_points(
         model in 0..Model::ALL.len(),
         mode in 0..3_usize,
         rpm in 5..=20_u32,
-        turn in 0..2_000_i64,
+        number in 0..2_000_i64,
         seed in 0..u64::from(u32::MAX),
     ) {
         let model = Model::ALL[model];
         let modes = modes(model);
-        holds(model, modes[mode % modes.len()], 60.0 * f64::from(rpm), turn, seed);
+        holds(model, modes[mode % modes.len()], 60.0 * f64::from(rpm), number, seed);
     }
 }

@@ -19,7 +19,7 @@ fn first_second(vehicle: SimulatedVehicle) -> Vec<Datagram> {
 }
 
 #[test]
-fn each_model_sends_as_many_packets_a_second_as_its_manual_says() {
+fn each_model_sends_as_many_packets_per_second_as_in_its_manual() {
     for (model, return_mode, expected) in [
         (Model::Hdl64eS2, ReturnMode::Strongest, 3472),
         (Model::Hdl64eS3, ReturnMode::Dual, 5787),
@@ -34,7 +34,7 @@ fn each_model_sends_as_many_packets_a_second_as_its_manual_says() {
 }
 
 #[test]
-fn datagrams_come_in_the_order_of_their_stamps_and_have_their_lengths() {
+fn datagrams_are_in_order_of_their_stamps_and_have_their_lengths() {
     let datagrams = first_second(town(ScannerConfig::default()));
     assert!(datagrams.windows(2).all(|pair| pair[0].stamp_ns <= pair[1].stamp_ns));
     for datagram in &datagrams {
@@ -45,12 +45,12 @@ fn datagrams_come_in_the_order_of_their_stamps_and_have_their_lengths() {
 #[test]
 fn the_same_seed_sends_the_same_bytes_from_wherever_it_begins() {
     let config = ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() };
-    let late = town(config.clone()).from_turn(4);
+    let late = town(config.clone()).from_revolution(4);
     let packets = |vehicle: SimulatedVehicle| vehicle.filter(|datagram| datagram.kind == Kind::Data);
     let expected: Vec<Datagram> = packets(late).take(50).collect();
     let whole = packets(town(config.clone())).skip_while(|datagram| datagram.stamp_ns < expected[0].stamp_ns);
     assert_eq!(whole.take(50).collect::<Vec<_>>(), expected);
-    let other = packets(town(ScannerConfig { seed: 2, ..config }).from_turn(4)).take(50).collect::<Vec<_>>();
+    let other = packets(town(ScannerConfig { seed: 2, ..config }).from_revolution(4)).take(50).collect::<Vec<_>>();
     assert_ne!(other, expected, "another seed, other noise");
 }
 
@@ -95,16 +95,16 @@ fn the_way_round_the_town_is_free_and_never_ends() {
 #[test]
 fn a_turn_comes_with_the_truth_of_its_end() {
     let vehicle = SimulatedVehicle::new(scenes::fenced_road_under_canopy(), ScannerConfig::default());
-    let turn = vehicle.turn(0);
-    assert_eq!(turn.revolution.partial, None);
-    assert_eq!(turn.map_from_ego, vehicle.pose_at(turn.revolution.end_ns));
-    assert_eq!(turn.truth.class_at(0.0, 10.0), Truth::Unreachable, "behind the fence");
-    assert_eq!(turn.truth.class_at(6.0, 0.0), Truth::Drivable, "under the canopy");
+    let scan = vehicle.true_revolution(0);
+    assert_eq!(scan.revolution.partial, None);
+    assert_eq!(scan.map_from_ego, vehicle.pose_at(scan.revolution.end_ns));
+    assert_eq!(scan.truth.class_at(0.0, 10.0), Truth::Unreachable, "behind the fence");
+    assert_eq!(scan.truth.class_at(6.0, 0.0), Truth::Drivable, "under the canopy");
     let ahead = scenes::fenced_road_with_low_overhang();
-    let turn = SimulatedVehicle::new(ahead, ScannerConfig::default()).turn(0);
-    assert_eq!(turn.truth.class_at(4.0, 0.0), Truth::Obstacle, "the overhang");
-    assert_eq!(turn.truth.class_at(14.0, 0.0), Truth::Unreachable, "behind the overhang");
-    assert_eq!(turn.truth.class_at(-5.0, 0.0), Truth::Drivable, "the way back");
+    let scan = SimulatedVehicle::new(ahead, ScannerConfig::default()).true_revolution(0);
+    assert_eq!(scan.truth.class_at(4.0, 0.0), Truth::Obstacle, "the overhang");
+    assert_eq!(scan.truth.class_at(14.0, 0.0), Truth::Unreachable, "behind the overhang");
+    assert_eq!(scan.truth.class_at(-5.0, 0.0), Truth::Drivable, "the way back");
 }
 
 #[test]
@@ -116,11 +116,11 @@ fn an_hdl_64e_tells_its_own_table_in_its_status_bytes() {
     }
     let vehicle = town(ScannerConfig { calibration: Some(own.clone()), ..ScannerConfig::default() });
     let mut sensor = Sensor::new(SensorConfig::default());
-    let mut told = None;
-    // The table takes 4,160 packets; it is used from the next turn on.
+    let mut calibration = None;
+    // The table takes 4,160 packets; it is used from the next revolution on.
     for datagram in vehicle.take(4_160 + 2 * 360 + 200) {
         if let Some(revolution) = sensor.push(&datagram.payload, datagram.stamp_ns).expect("a sound datagram") {
-            told = Some(revolution.calibration.clone());
+            calibration = Some(revolution.calibration.clone());
         }
     }
     assert_eq!(sensor.status().calibration, CalibrationSource::StatusBytes);
@@ -128,10 +128,10 @@ fn an_hdl_64e_tells_its_own_table_in_its_status_bytes() {
         (sensor.status().model, sensor.status().return_mode),
         (Some(Model::Hdl64eS2), Some(ReturnMode::Strongest))
     );
-    for (told, own) in told.expect("a turn").lasers.iter().zip(&own.lasers) {
-        assert!((told.vert_correction - own.vert_correction).abs() < 0.0051_f64.to_radians());
-        assert!((told.dist_correction - own.dist_correction).abs() < 0.00051);
-        assert!((told.horiz_offset_correction - own.horiz_offset_correction).abs() < 0.00051);
+    for (sent, own) in calibration.expect("a revolution").lasers.iter().zip(&own.lasers) {
+        assert!((sent.vert_correction - own.vert_correction).abs() < 0.0051_f64.to_radians());
+        assert!((sent.dist_correction - own.dist_correction).abs() < 0.00051);
+        assert!((sent.horiz_offset_correction - own.horiz_offset_correction).abs() < 0.00051);
     }
 }
 
@@ -148,7 +148,7 @@ fn what_the_sensor_sees_is_less_than_what_is_there() {
 }
 
 #[test]
-fn a_steered_vehicle_goes_on_from_where_it_is_along_the_arc_it_is_told() {
+fn a_steered_vehicle_continues_from_its_place_along_the_given_arc() {
     let mut vehicle = town(ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() });
     vehicle.nth(100);
     for (curvature, speed) in [(0.1, 5.0), (0.0, 8.0), (-0.05, 3.0), (0.0, 0.0)] {

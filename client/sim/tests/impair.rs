@@ -11,16 +11,16 @@ use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
 
 const SEEDS: u64 = 100;
 
-/// The data packets of `turns` turns from the middle of one on, all around the same clock hour.
-fn stream(model: Model, return_mode: ReturnMode, rpm: f64, turns: f64) -> Vec<Datagram> {
+/// The data packets of this many revolutions, from the middle of one on, all around the same clock hour.
+fn stream(model: Model, return_mode: ReturnMode, rpm: f64, revolutions: f64) -> Vec<Datagram> {
     let vehicle =
         SimulatedVehicle::new(scenes::flat(), ScannerConfig { model, return_mode, rpm, ..Default::default() });
-    let end_ns = vehicle.start_ns() + (turns * 60e9 / rpm) as i64;
+    let end_ns = vehicle.start_ns() + (revolutions * 60e9 / rpm) as i64;
     let packets = vehicle.filter(|datagram| datagram.kind == Kind::Data);
     packets.take_while(|datagram| datagram.stamp_ns < end_ns).collect()
 }
 
-fn streams(turns: f64) -> Vec<(Model, Vec<Datagram>)> {
+fn streams(revolutions: f64) -> Vec<(Model, Vec<Datagram>)> {
     let kinds = [
         (Model::Hdl64eS2, ReturnMode::Strongest, 600.0),
         (Model::Hdl64eS3, ReturnMode::Dual, 900.0),
@@ -30,7 +30,7 @@ fn streams(turns: f64) -> Vec<(Model, Vec<Datagram>)> {
         (Model::Vlp32c, ReturnMode::Last, 600.0),
         (Model::Vls128, ReturnMode::Strongest, 600.0),
     ];
-    kinds.map(|(model, mode, rpm)| (model, stream(model, mode, rpm, turns))).into()
+    kinds.map(|(model, mode, rpm)| (model, stream(model, mode, rpm, revolutions))).into()
 }
 
 /// Every revolution, the status at the end, and the refusals.
@@ -66,7 +66,7 @@ fn bits(revolution: &Revolution) -> impl PartialEq + std::fmt::Debug + use<> {
 }
 
 #[test]
-fn copies_and_packets_out_of_order_leave_every_bit_of_every_revolution_as_it_was() {
+fn copies_and_reordered_packets_change_no_bit_of_a_revolution() {
     let streams = streams(2.6);
     let expected: Vec<Vec<_>> =
         streams.iter().map(|(model, sent)| decode(*model, sent.clone()).0.iter().map(bits).collect()).collect();
@@ -87,7 +87,7 @@ fn copies_and_packets_out_of_order_leave_every_bit_of_every_revolution_as_it_was
         assert_eq!(refused.len() as u64, counts.duplicated, "{model:?} {faults:?}: {refused:?}");
         assert!(refused.iter().all(|reason| *reason == "duplicate"), "{model:?} {faults:?}: {refused:?}");
         assert_eq!((status.packets_lost, status.packets), (0, sent.len() as u64), "{model:?} {faults:?}");
-        let same = revolutions.iter().zip(expected).all(|(turn, expected)| bits(turn) == *expected);
+        let same = revolutions.iter().zip(expected).all(|(revolution, expected)| bits(revolution) == *expected);
         assert!(revolutions.len() == expected.len() && same, "{model:?} {faults:?}");
     }
 }
@@ -105,7 +105,7 @@ fn lost_packets_are_counted_to_one_a_gap() {
             seed,
             ..Faults::default()
         };
-        // What comes before the first packet and after the last nobody can know.
+        // Losses before the first packet and after the last one cannot be seen.
         let (head, rest) = sent.split_at(1);
         let (middle, tail) = rest.split_at(rest.len() - 1);
         let mut network = Impaired::new(middle.iter().cloned(), faults);
@@ -115,7 +115,8 @@ fn lost_packets_are_counted_to_one_a_gap() {
         assert!(refused.is_empty(), "{model:?} {faults:?}: {refused:?}");
         let off = status.packets_lost.abs_diff(counts.packets_lost);
         assert!(off <= counts.gaps, "{model:?} {faults:?} {counts:?}: {}", status.packets_lost);
-        let missing: u64 = revolutions.iter().map(|turn| u64::from(turn.packets_expected - turn.packets)).sum();
+        let missing: u64 =
+            revolutions.iter().map(|revolution| u64::from(revolution.packets_expected - revolution.packets)).sum();
         assert!(missing.abs_diff(counts.packets_lost) <= counts.gaps, "{model:?} {faults:?} {counts:?}: {missing}");
         worst = worst.max(off);
     }

@@ -1,26 +1,26 @@
-//! `[grpc]`: where maps are served, with which certificates, and who may do what.
+//! The table `[grpc]`: where maps are served, with which certificates, and what each client may do.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{Config, ConfigError, Wrong, beside};
+use super::error::{ConfigError, ValueError, beside};
 
-/// `[grpc]`.
+/// The table `[grpc]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Grpc {
-    /// Whether it is served at all.
+    /// True if it is served.
     pub enabled: bool,
-    /// Address and port; port 0 takes a free one.
+    /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,
-    /// Peers connected at once; more are told so.
+    /// Most connections at once; further ones are refused with RESOURCE_EXHAUSTED.
     pub connections_max: usize,
-    /// Certificates; plain text without.
+    /// Certificates; without them gRPC is plain text.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls: Option<Tls>,
-    /// Who may do what, once client certificates are asked for.
+    /// What each client may do, if client certificates are required.
     pub access: Access,
 }
 
@@ -31,66 +31,60 @@ impl Default for Grpc {
     }
 }
 
-/// `[grpc.tls]`: PEM files; relative paths start at the configuration's folder.
+/// The table `[grpc.tls]`: PEM files. Relative paths start at the configuration's folder.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tls {
-    /// The server's certificate, and those between it and the CA.
+    /// The server's certificate, and the intermediate ones between it and the CA.
     pub certificate: PathBuf,
-    /// Its private key. Only the path is ever recorded.
+    /// Its private key. A recording holds the path only.
     pub key: PathBuf,
-    /// Whose certificates clients must have; without, no client is asked who it is.
+    /// CA of the certificates that clients must show; without it no client certificate is required.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub client_ca: Option<PathBuf>,
 }
 
-/// `[grpc.access]`: names in client certificates (common name or DNS name), by what their bearers may do. Whoever is in
-/// no list may do nothing.
+/// The table `[grpc.access]`: names in client certificates (common name or DNS name), by role. A client in no list may
+/// do nothing.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Access {
-    /// May read maps and status.
+    /// Clients that may read maps and status.
     pub readers: Vec<String>,
-    /// May send scans, poses, roads and packets.
+    /// Clients that may send scans, poses, roads and packets.
     pub ingesters: Vec<String>,
-    /// May do both.
+    /// Clients that may do both.
     pub operators: Vec<String>,
 }
 
-/// The files of `[grpc.tls]`, read. The key never leaves this value.
+/// The contents of the files of `[grpc.tls]`. The key is never logged or recorded.
 #[derive(Clone)]
 pub struct Certificates {
-    /// PEM.
+    /// Certificate of the server, PEM.
     pub certificate: String,
-    /// PEM.
+    /// Private key of the server, PEM.
     pub key: String,
-    /// PEM.
+    /// CA of the clients, PEM.
     pub client_ca: Option<String>,
 }
 
 impl Grpc {
-    pub(super) fn check(&self) -> Result<(), Wrong> {
+    pub(super) fn check(&self) -> Result<(), ValueError> {
         let Access { readers, ingesters, operators } = &self.access;
-        let asked = self.tls.as_ref().is_some_and(|tls| tls.client_ca.is_some());
-        if let Some(name) = readers.iter().chain(ingesters).chain(operators).next().filter(|_| !asked) {
-            let allowed = "nobody, unless grpc.tls.client_ca says whose certificates to ask for";
-            return Err(Wrong::new("grpc.access", name, allowed));
+        let required = self.tls.as_ref().is_some_and(|tls| tls.client_ca.is_some());
+        if let Some(name) = readers.iter().chain(ingesters).chain(operators).next().filter(|_| !required) {
+            let allowed = "no name without grpc.tls.client_ca, the CA of the clients' certificates";
+            return Err(ValueError::new("grpc.access", name, allowed));
         }
         if !(1..=65_536).contains(&self.connections_max) {
-            return Err(Wrong::new("grpc.connections_max", self.connections_max, "1 to 65536 connections"));
+            return Err(ValueError::new("grpc.connections_max", self.connections_max, "1 to 65536 connections"));
         }
         Ok(())
     }
-}
 
-impl Config {
-    /// Reads the files of `[grpc.tls]`; `None` where there is no such table. Relative paths start at the
-    /// configuration's folder, `file`'s parent.
-    ///
-    /// # Errors
-    /// [`ConfigError::File`] with what is wrong.
-    pub fn certificates(&self, file: &Path) -> Result<Option<Certificates>, ConfigError> {
-        let Some(tls) = &self.grpc.tls else { return Ok(None) };
+    /// Reads the files of `[grpc.tls]`: [`Config::certificates`](super::Config::certificates).
+    pub(super) fn certificates(&self, file: &Path) -> Result<Option<Certificates>, ConfigError> {
+        let Some(tls) = &self.tls else { return Ok(None) };
         let read = |key: &str, path: &PathBuf| {
             let named = beside(file, path);
             let wrong = |reason: String| ConfigError::File {

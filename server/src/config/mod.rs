@@ -1,7 +1,8 @@
 //! One TOML file -> [`Config`]: what is served where, what is recorded, and which vehicles there are.
 //!
-//! Unknown keys are refused with their line; values that make no sense are named with the file, the key, the value and
-//! what is allowed. Calibration files are read here too, so that nothing opens a socket before all of it is known good.
+//! An unknown key is refused with its line; a value that is not allowed is refused with the file, the key, the value and
+//! what is allowed. Calibration files are read here too, so that no socket is opened before the whole configuration is
+//! valid.
 //! `deploy/clearway.toml` holds every key with its default.
 
 use std::collections::BTreeSet;
@@ -12,35 +13,42 @@ use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::SensorConfig;
 use serde::{Deserialize, Serialize};
 
+use error::{ValueError, beside};
+
+mod error;
 mod grpc;
+mod listeners;
 mod ros;
 mod udp;
 mod vehicle;
 mod zenoh;
 
+pub use error::ConfigError;
 pub use grpc::{Access, Certificates, Grpc, Tls};
 pub use ros::Ros;
-pub use udp::{Listener, Ports, Route, Sender, Udp, listeners};
+pub use listeners::{Listener, Route, listeners};
+pub use udp::{Ports, Sender, Udp};
 pub use vehicle::{Ingest, Vehicle};
 pub use zenoh::{Ros2, Zenoh, ZenohMode};
 
-/// The configured tables by vehicle and sensor, in the order of the configuration; `None` where the factory's serves.
+/// The configured tables by vehicle and sensor, in the order of the configuration; `None` selects the
+/// factory's table.
 pub type Calibrations = Vec<Vec<Option<Calibration>>>;
 
 /// The whole configuration.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// Maps over gRPC.
+    /// Streams over gRPC.
     #[serde(default)]
     pub grpc: Grpc,
     /// The page, its WebSocket, `/healthz` and `/metrics`.
     #[serde(default)]
     pub page: Page,
-    /// Maps over zenoh.
+    /// Streams over zenoh.
     #[serde(default)]
     pub zenoh: Zenoh,
-    /// Maps for Foxglove.
+    /// The WebSocket for Foxglove.
     #[serde(default)]
     pub foxglove: Foxglove,
     /// The recording.
@@ -51,13 +59,13 @@ pub struct Config {
     pub vehicles: Vec<Vehicle>,
 }
 
-/// `[page]`.
+/// The table `[page]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Page {
-    /// Whether it is served at all.
+    /// True if it is served.
     pub enabled: bool,
-    /// Address and port; port 0 takes a free one.
+    /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,
 }
 
@@ -67,13 +75,13 @@ impl Default for Page {
     }
 }
 
-/// `[foxglove]`: a WebSocket for Foxglove; whoever reaches it may read.
+/// The table `[foxglove]`: a WebSocket for Foxglove. Every client that can connect may read.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Foxglove {
-    /// Whether it is served at all.
+    /// True if it is served.
     pub enabled: bool,
-    /// Address and port; port 0 takes a free one.
+    /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,
 }
 
@@ -83,15 +91,15 @@ impl Default for Foxglove {
     }
 }
 
-/// `[recorder]`.
+/// The table `[recorder]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Recorder {
-    /// MCAP file to write, relative paths from the configuration's folder; empty: nothing is recorded.
+    /// MCAP file to write; a relative path starts at the configuration's folder. Empty: nothing is recorded.
     pub file: PathBuf,
-    /// How much a crash may cost.
+    /// Longest time between two flushes, in ms: what a crash may cost of the recording.
     pub flush_ms: u64,
-    /// Events and maps that may wait for the disk.
+    /// Events and maps that may wait for the disk; more are counted as lost.
     pub queue: usize,
 }
 
@@ -102,97 +110,33 @@ impl Default for Recorder {
 }
 
 impl Recorder {
-    fn check(&self) -> Result<(), Wrong> {
+    fn check(&self) -> Result<(), ValueError> {
         if !(10..=60_000).contains(&self.flush_ms) {
-            return Err(Wrong::new("recorder.flush_ms", self.flush_ms, "10 to 60000 ms"));
+            return Err(ValueError::new("recorder.flush_ms", self.flush_ms, "10 to 60000 ms"));
         }
         if !(16..=1 << 20).contains(&self.queue) {
-            return Err(Wrong::new("recorder.queue", self.queue, "16 to 1048576 events"));
+            return Err(ValueError::new("recorder.queue", self.queue, "16 to 1048576 events"));
         }
         Ok(())
     }
-}
-
-/// A value that makes no sense.
-struct Wrong {
-    /// Path of the key.
-    key: String,
-    value: String,
-    allowed: String,
-}
-
-impl Wrong {
-    fn new(key: impl Into<String>, value: impl ToString, allowed: impl Into<String>) -> Self {
-        Self { key: key.into(), value: value.to_string(), allowed: allowed.into() }
-    }
-}
-
-/// What is wrong with a configuration.
-#[derive(Debug, thiserror::Error)]
-pub enum ConfigError {
-    /// The file cannot be read.
-    #[error("configuration {}: {source}", file.display())]
-    Read {
-        /// The configuration file.
-        file: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// Not TOML, an unknown key, a value of the wrong kind. The source shows line and column.
-    #[error("configuration {}: {source}", file.display())]
-    Parse {
-        /// The configuration file.
-        file: PathBuf,
-        /// Where and why.
-        source: Box<toml::de::Error>,
-    },
-    /// An override is not `key=value`.
-    #[error("--set {text}: expected KEY=VALUE, such as grpc.listen=\"0.0.0.0:50051\"")]
-    Override {
-        /// The override.
-        text: String,
-    },
-    /// A value that makes no sense.
-    #[error("configuration {}: {key} = {value}: allowed: {allowed}", file.display())]
-    Value {
-        /// The configuration file.
-        file: PathBuf,
-        /// Path of the key.
-        key: String,
-        /// What was found.
-        value: String,
-        /// What may stand there.
-        allowed: String,
-    },
-    /// A file that the configuration names (a calibration, a certificate) is missing or unreadable.
-    #[error("configuration {}: {key} = {}: {reason}", file.display(), named.display())]
-    File {
-        /// The configuration file.
-        file: PathBuf,
-        /// Path of the key.
-        key: String,
-        /// The file it names.
-        named: PathBuf,
-        /// What is wrong with it, and what is allowed.
-        reason: String,
-    },
 }
 
 impl Config {
     /// Reads `file`, applies the overrides (`grpc.listen=…`, in order) and checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`], which names the file, the key, the value and what is allowed.
+    /// [`ConfigError::Read`] if the file cannot be read, and the errors of [`Config::parse`].
     pub fn load(file: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
         let text =
             std::fs::read_to_string(file).map_err(|source| ConfigError::Read { file: file.to_owned(), source })?;
         Self::parse(&text, file, overrides)
     }
 
-    /// [`Config::load`] of a text; `file` is only named in errors, and where relative calibration paths start.
+    /// Like [`Config::load`], from a text; errors name `file`.
     ///
     /// # Errors
-    /// [`ConfigError`], which names the file, the key, the value and what is allowed.
+    /// [`ConfigError::Parse`] if the text is not TOML or has an unknown key, [`ConfigError::Override`] if an override is
+    /// not `key=value`, [`ConfigError::Value`] if a value is not allowed.
     pub fn parse(text: &str, file: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
         let parse = |source| ConfigError::Parse { file: file.to_owned(), source: Box::new(source) };
         let mut config: Self = toml::from_str(text).map_err(parse)?;
@@ -207,8 +151,8 @@ impl Config {
         Ok(config)
     }
 
-    /// One vehicle with one sensor and every default. Its extrinsics are yet to be set: the sensor stands 2 m above the
-    /// ground, level.
+    /// A configuration of one vehicle with one sensor and every default. The sensor is level, 2 m above the ground, until
+    /// its extrinsics are set.
     pub fn of_one_vehicle(vehicle: &str, sensor: &str) -> Self {
         let text = format!(
             "[[vehicle]]\nname = {vehicle:?}\n[[vehicle.sensor]]\nname = {sensor:?}\n[vehicle.sensor.extrinsics]\n\
@@ -217,25 +161,25 @@ impl Config {
         toml::from_str(&text).expect("a name and extrinsics are all that has no default")
     }
 
-    /// The configuration as TOML, every default spelled out.
+    /// The configuration as TOML, with every default.
     pub fn to_toml(&self) -> String {
         toml::to_string(self).expect("configurations have string keys only")
     }
 
-    /// Checks what the types cannot.
+    /// Checks the values, beyond their types.
     ///
     /// # Errors
-    /// [`ConfigError::Value`] for the first value that makes no sense.
+    /// [`ConfigError::Value`] for the first value that is not allowed.
     pub fn check(&self, file: &Path) -> Result<(), ConfigError> {
-        self.check_values().map_err(|Wrong { key, value, allowed }| {
+        self.check_values().map_err(|ValueError { key, value, allowed }| {
             let file = file.to_owned();
             ConfigError::Value { file, key, value, allowed }
         })
     }
 
-    fn check_values(&self) -> Result<(), Wrong> {
+    fn check_values(&self) -> Result<(), ValueError> {
         if self.vehicles.is_empty() {
-            return Err(Wrong::new("vehicle", "[]", "at least one [[vehicle]]"));
+            return Err(ValueError::new("vehicle", "[]", "at least one [[vehicle]]"));
         }
         self.grpc.check()?;
         self.recorder.check()?;
@@ -244,14 +188,22 @@ impl Config {
         for vehicle in &self.vehicles {
             vehicle.check(self.zenoh.enabled)?;
             if !names.insert(&vehicle.name) {
-                return Err(Wrong::new("vehicle.name", &vehicle.name, "each vehicle its own"));
+                return Err(ValueError::new("vehicle.name", &vehicle.name, "a different name for each vehicle"));
             }
         }
-        udp::check(&self.vehicles)
+        listeners::check(&self.vehicles)
     }
 
-    /// The configuration as it is served: relative paths of `recorder.file` and `zenoh.file` start at the
-    /// configuration's folder, `file`'s parent, as do those of the files that are read beforehand.
+    /// Reads the files of `[grpc.tls]`; `None` without that table. Relative paths start at the folder of `file`.
+    ///
+    /// # Errors
+    /// [`ConfigError::File`] if a file cannot be read or has no PEM block of its kind.
+    pub fn certificates(&self, file: &Path) -> Result<Option<Certificates>, ConfigError> {
+        self.grpc.certificates(file)
+    }
+
+    /// The configuration with the paths `recorder.file` and `zenoh.file` made relative to the working directory: in the
+    /// configuration they start at the folder of `file`.
     pub fn located(mut self, file: &Path) -> Self {
         for path in [&mut self.recorder.file, &mut self.zenoh.file] {
             if !path.as_os_str().is_empty() {
@@ -262,10 +214,10 @@ impl Config {
     }
 
     /// Reads the calibration files of all sensors: by vehicle and sensor, in the order of the configuration; `None`
-    /// where the factory's table serves. Relative paths start at the configuration's folder, `file`'s parent.
+    /// selects the factory's table. Relative paths start at the folder of `file`.
     ///
     /// # Errors
-    /// [`ConfigError::File`] with what is wrong and what is allowed.
+    /// [`ConfigError::File`] if a file cannot be read, is no calibration, or does not fit the model of its sensor.
     pub fn calibrations(&self, file: &Path) -> Result<Calibrations, ConfigError> {
         let of = |vehicle: &Vehicle, sensor: &SensorConfig| {
             let Some(path) = &sensor.calibration else { return Ok(None) };
@@ -287,12 +239,7 @@ impl Config {
     }
 }
 
-/// A path that stands in the configuration `file`, seen from the working directory.
-fn beside(file: &Path, path: &Path) -> PathBuf {
-    file.parent().unwrap_or(Path::new("")).join(path)
-}
-
-/// `a.b=value`: the value is TOML, or a bare string.
+/// Applies the override `a.b=value`; the value is TOML, or a bare string.
 fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
     let wrong = || ConfigError::Override { text: text.to_owned() };
     let (path, value) = text.split_once('=').ok_or_else(wrong)?;
@@ -305,7 +252,7 @@ fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
     let mut place = table;
     for key in keys {
         let slot = place.entry(key).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        // `vehicle.udp.data` means the first vehicle's: the common case has one.
+        // `vehicle.udp.data` means the first vehicle: the common case has one.
         let slot = match slot {
             toml::Value::Array(items) => items.first_mut().ok_or_else(wrong)?,
             other => other,

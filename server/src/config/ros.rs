@@ -1,30 +1,30 @@
-//! `[vehicle.ros]`: which ROS 2 topics feed a vehicle.
+//! The table `[vehicle.ros]`: which ROS 2 topics feed a vehicle.
 
 use std::collections::BTreeMap;
 
 use clearway_mapping::config::SensorConfig;
 use serde::{Deserialize, Serialize};
 
-use super::Wrong;
+use super::error::ValueError;
 
-/// What `ROS_DOMAIN_ID` may be.
+/// Greatest `ROS_DOMAIN_ID`.
 pub(super) const DOMAIN_MAX: u32 = 232;
 
-/// `[vehicle.ros]`.
+/// The table `[vehicle.ros]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Ros {
     /// `ROS_DOMAIN_ID`.
     pub domain: u32,
-    /// Odometry or stamped poses; empty: poses come by tf.
+    /// Topic of odometry or stamped poses; empty: poses come from tf.
     pub pose: String,
-    /// Without `pose`: the frame tf tells the vehicle's place in; empty: no poses.
+    /// Frame in which tf gives the vehicle's pose, if `pose` is empty; empty: no poses.
     pub fixed_frame: String,
-    /// The vehicle's own frame, its origin on the ground.
+    /// The vehicle's own frame, with its origin on the ground.
     pub ego_frame: String,
-    /// Transforms that move; empty: none are heard.
+    /// Topic of moving transforms; empty: no subscription.
     pub tf: String,
-    /// Transforms that do not; empty: none are heard.
+    /// Topic of static transforms; empty: no subscription.
     pub tf_static: String,
     /// Topic of each sensor (PointCloud2 or VelodyneScan), by sensor name.
     pub sensors: BTreeMap<String, String>,
@@ -45,34 +45,34 @@ impl Default for Ros {
 }
 
 impl Ros {
-    /// Keys as behind `vehicle.`.
-    pub(super) fn check(&self, zenoh_enabled: bool, sensors: &[SensorConfig]) -> Result<(), Wrong> {
+    /// Checks the values; the keys of errors start behind `vehicle.`.
+    pub(super) fn check(&self, zenoh_enabled: bool, sensors: &[SensorConfig]) -> Result<(), ValueError> {
         if !zenoh_enabled {
-            let allowed = "only with zenoh.enabled = true: it comes through zenoh";
-            return Err(Wrong::new("ros", "(set)", allowed));
+            let allowed = "only with zenoh.enabled = true, because ROS topics come through zenoh";
+            return Err(ValueError::new("ros", "(set)", allowed));
         }
         if self.domain > DOMAIN_MAX {
-            return Err(Wrong::new("ros.domain", self.domain, format!("0 to {DOMAIN_MAX}")));
+            return Err(ValueError::new("ros.domain", self.domain, format!("0 to {DOMAIN_MAX}")));
         }
         if let Some(unknown) = self.sensors.keys().find(|name| !sensors.iter().any(|sensor| sensor.name == **name)) {
             let known: Vec<_> = sensors.iter().map(|sensor| sensor.name.as_str()).collect();
             let allowed = format!("the vehicle's sensors: {}", known.join(", "));
-            return Err(Wrong::new("ros.sensors", unknown, allowed));
+            return Err(ValueError::new("ros.sensors", unknown, allowed));
         }
         let topics = self.sensors.values().chain([&self.pose, &self.tf, &self.tf_static]);
         let mut named: Vec<_> = topics.filter(|topic| !topic.is_empty()).collect();
         if let Some(topic) = named.iter().find(|topic| !is_topic(topic)) {
-            return Err(Wrong::new("ros", topic, "topics such as \"/sensing/top/points\""));
+            return Err(ValueError::new("ros", topic, "topics such as \"/sensing/top/points\""));
         }
         named.sort_unstable();
         match named.windows(2).find(|pair| pair[0] == pair[1]) {
-            Some(pair) => Err(Wrong::new("ros", pair[0], "each topic once")),
+            Some(pair) => Err(ValueError::new("ros", pair[0], "each topic once")),
             None => Ok(()),
         }
     }
 }
 
-/// Whether ROS allows such a topic: parts of letters, digits and underscores, each behind a slash.
+/// True if ROS allows the topic: parts of letters, digits and underscores, each after a slash.
 pub(super) fn is_topic(topic: &str) -> bool {
     let part = |part: &str| !part.is_empty() && part.bytes().all(|byte| byte == b'_' || byte.is_ascii_alphanumeric());
     topic.strip_prefix('/').is_some_and(|rest| rest.split('/').all(part))

@@ -1,9 +1,9 @@
-//! The configuration's promises: complete, strict, and clear about what is wrong.
+//! The configuration is complete and strict, and its errors name what is wrong.
 
 use super::*;
 
 const COMMENTED: &str = include_str!("../../../deploy/clearway.toml");
-/// What has no default, and nothing else.
+/// A configuration with the keys that have no default, and no others.
 const NEEDED: &str = "[[vehicle]]\nname = \"car\"\n[vehicle.udp]\n[[vehicle.sensor]]\nname = \"top\"\n\
     [vehicle.sensor.extrinsics]\nx_m = 0.0\ny_m = 0.0\nz_m = 1.9\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n";
 
@@ -31,7 +31,7 @@ fn keys(value: &toml::Value, at: &str, found: &mut BTreeSet<String>) {
 }
 
 #[test]
-fn the_commented_configuration_says_the_defaults_and_all_of_them() {
+fn the_commented_configuration_holds_every_key_with_its_default() {
     let commented = parse(COMMENTED).unwrap();
     assert_eq!(commented, parse(NEEDED).unwrap());
     let (mut said, mut all) = (BTreeSet::new(), BTreeSet::new());
@@ -39,14 +39,14 @@ fn the_commented_configuration_says_the_defaults_and_all_of_them() {
     keys(&toml::from_str(&commented.to_toml()).unwrap(), "", &mut all);
     let missing: Vec<_> = all.difference(&said).collect();
     assert!(missing.is_empty(), "not in deploy/clearway.toml: {missing:?}");
-    // Keys without a default stand there as comments.
+    // Keys without a default are comments in that file.
     for optional in ["# model = ", "# rpm = ", "# calibration = ", "# top = \"", "# top = {"] {
         assert!(COMMENTED.contains(optional), "{optional}");
     }
 }
 
 #[test]
-fn the_effective_configuration_reads_back_as_itself() {
+fn the_effective_configuration_parses_to_itself() {
     let config = parse(COMMENTED).unwrap();
     assert_eq!(parse(&config.to_toml()).unwrap(), config);
 }
@@ -59,7 +59,7 @@ fn an_unknown_key_is_refused_with_file_and_line() {
 }
 
 #[test]
-fn a_value_out_of_bounds_is_named_with_file_key_value_and_what_is_allowed() {
+fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
     let wrong = [
         ("name = \"car\"", "name = \"The Car\"", "The Car"),
         ("z_m = 1.9", "z_m = 1900.0", "0.1 to 20"),
@@ -83,7 +83,7 @@ fn a_value_out_of_bounds_is_named_with_file_key_value_and_what_is_allowed() {
 }
 
 #[test]
-fn a_calibration_that_is_none_is_named_before_anything_starts() {
+fn an_invalid_calibration_file_is_named_before_the_server_starts() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("clearway.toml");
     let text = NEEDED.replace("name = \"top\"", "name = \"top\"\ncalibration = \"top.yaml\"");
@@ -96,7 +96,7 @@ fn a_calibration_that_is_none_is_named_before_anything_starts() {
 }
 
 #[test]
-fn relative_paths_start_where_the_configuration_lies_and_absolute_ones_where_they_say() {
+fn relative_paths_start_at_the_configurations_folder() {
     let text = format!("[zenoh]\nfile = \"zenoh/server.json5\"\n[recorder]\nfile = \"/var/drive.mcap\"\n{NEEDED}");
     let config = parse(&text).unwrap();
     let located = config.clone().located(Path::new("/etc/clearway/clearway.toml"));
@@ -108,7 +108,7 @@ fn relative_paths_start_where_the_configuration_lies_and_absolute_ones_where_the
 }
 
 #[test]
-fn an_override_sets_what_the_file_says_otherwise() {
+fn an_override_takes_precedence_over_the_file() {
     let set = |text: &str| Config::parse(NEEDED, Path::new("clearway.toml"), &[text.to_owned()]);
     assert_eq!(set("grpc.listen=0.0.0.0:9").unwrap().grpc.listen.port(), 9);
     assert!(!set("zenoh.enabled = false").unwrap().zenoh.enabled);
@@ -122,8 +122,8 @@ fn a_sender_is_an_address_or_a_socket() {
     let from =
         |text: &str| parse(&NEEDED.replace("[vehicle.udp]", &format!("[vehicle.udp]\nfrom = {{ top = {text:?} }}")));
     let sender = |text: &str| from(text).unwrap().vehicles[0].udp.clone().unwrap().from["top"];
-    assert!(sender("10.0.0.1").is("10.0.0.1:77".parse().unwrap()));
-    assert!(!sender("10.0.0.1:78").is("10.0.0.1:77".parse().unwrap()));
+    assert!(sender("10.0.0.1").matches("10.0.0.1:77".parse().unwrap()));
+    assert!(!sender("10.0.0.1:78").matches("10.0.0.1:77".parse().unwrap()));
     assert!(from("the roof").unwrap_err().to_string().contains("192.168.1.201"));
 }
 
@@ -134,7 +134,7 @@ fn two(car: &str, truck: &str) -> Result<Config, ConfigError> {
 }
 
 #[test]
-fn vehicles_share_sockets_where_their_senders_tell_them_apart() {
+fn vehicles_share_a_socket_if_their_senders_differ() {
     let config = two("from.top = \"10.0.0.1\"", "from.top = \"10.0.0.2:2368\"\ngroups = [\"239.1.2.3\"]").unwrap();
     let sockets = listeners(&config.vehicles);
     assert_eq!(sockets.iter().map(|s| s.at.port()).collect::<Vec<_>>(), [2368, 8308]);
@@ -151,7 +151,7 @@ fn vehicles_share_sockets_where_their_senders_tell_them_apart() {
 }
 
 #[test]
-fn sensors_that_cannot_be_told_apart_are_refused() {
+fn sensors_that_cannot_be_distinguished_are_refused() {
     for (car, truck) in [
         ("", ""),
         ("from.top = \"10.0.0.1\"", ""),
@@ -159,12 +159,12 @@ fn sensors_that_cannot_be_told_apart_are_refused() {
         ("ports.top = { data = 8308, telemetry = 1 }", ""),
     ] {
         let error = two(car, truck).unwrap_err().to_string();
-        assert!(error.contains("top of car and top of truck cannot be told apart"), "{error}");
+        assert!(error.contains("top of car and top of truck cannot be distinguished"), "{error}");
     }
 }
 
 #[test]
-fn the_ros_door_as_the_default_file_shows_it_is_taken_and_wrong_topics_are_named() {
+fn the_commented_ros_table_is_valid_and_wrong_topics_are_named() {
     let shown = include_str!("../../../deploy/clearway.toml");
     let from = shown.find("# [vehicle.ros]").unwrap();
     let block: String = shown[from..].lines().take_while(|line| !line.is_empty()).fold(String::new(), |block, line| {
@@ -192,7 +192,7 @@ fn the_ros_door_as_the_default_file_shows_it_is_taken_and_wrong_topics_are_named
 }
 
 #[test]
-fn names_that_ros_2_does_not_know_are_refused_only_where_maps_go_to_it() {
+fn names_that_ros_2_does_not_allow_are_refused_if_ros2_is_enabled() {
     let ros2 = |ros2: &str| format!("[zenoh.ros2]\n{ros2}\n{NEEDED}");
     let names = NEEDED.replace("\"car\"", "\"4-wheeler\"");
     assert!(parse(&names).is_ok());

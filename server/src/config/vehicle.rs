@@ -1,35 +1,37 @@
-//! `[[vehicle]]`: its sensors and maps, and the doors its events come through.
+//! The table `[[vehicle]]`: its sensors and maps, and where its events come from.
 
 use clearway_mapping::config::{BodyConfig, FusionConfig, MapsConfig, SensorConfig, VehicleConfig};
 use serde::{Deserialize, Serialize};
 
-use super::{Ros, Udp, Wrong};
+use super::error::ValueError;
+use super::ros::Ros;
+use super::udp::Udp;
 
-/// One `[[vehicle]]`: its sensors and maps, and the doors its events come through.
+/// One table `[[vehicle]]`: its sensors and maps, and where its events come from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Vehicle {
-    /// Names the vehicle in keys and topics: `[a-z0-9_-]+`.
+    /// Name of the vehicle in keys and topics: `[a-z0-9_-]+`.
     pub name: String,
     /// Events that may wait for the engine; more are counted as lost.
     #[serde(default = "queue")]
     pub queue: usize,
-    /// The UDP door; a vehicle without one is fed by other doors.
+    /// Datagrams over UDP; without it the vehicle listens on no socket.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub udp: Option<Udp>,
-    /// The ROS 2 door, through rmw_zenoh's key space.
+    /// ROS 2 topics, through rmw_zenoh's key space.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ros: Option<Ros>,
     /// Observations over gRPC and zenoh.
     #[serde(default)]
     pub ingest: Ingest,
-    /// How one map is made of several sensors.
+    /// How the scans of several sensors are merged.
     #[serde(default)]
     pub fusion: FusionConfig,
-    /// Where the vehicle itself is; nothing is taken for it where absent.
+    /// Outline of the vehicle, for the self filter; without it no return is removed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub body: Option<BodyConfig>,
-    /// Which maps are made, and how.
+    /// Which layers are made, and with which parameters.
     #[serde(default)]
     pub maps: MapsConfig,
     /// The sensors.
@@ -42,7 +44,7 @@ fn queue() -> usize {
 }
 
 impl Vehicle {
-    /// What the core needs of it.
+    /// The part of the configuration that the core needs.
     pub fn core(&self) -> VehicleConfig {
         VehicleConfig {
             name: self.name.clone(),
@@ -54,15 +56,15 @@ impl Vehicle {
     }
 }
 
-/// `[vehicle.ingest]`.
+/// The table `[vehicle.ingest]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Ingest {
-    /// Whether anybody may send scans, poses, roads and packets.
+    /// True if clients may send scans, poses, roads and packets.
     pub enabled: bool,
-    /// Points of one scan; the longest message follows from it.
+    /// Most points of one scan; the longest message follows from it.
     pub points_max: usize,
-    /// Streams at once; each may have its share of half the queue on the way.
+    /// Most streams at once; they share half the event queue.
     pub streams_max: usize,
 }
 
@@ -73,23 +75,23 @@ impl Default for Ingest {
 }
 
 impl Vehicle {
-    pub(super) fn check(&self, zenoh_enabled: bool) -> Result<(), Wrong> {
+    pub(super) fn check(&self, zenoh_enabled: bool) -> Result<(), ValueError> {
         if let Err(error) = self.core().validate() {
-            return Err(Wrong::new(format!("{} (of {})", error.key, self.name), &error.value, error.allowed));
+            return Err(ValueError::new(format!("{} (of {})", error.key, self.name), &error.value, error.allowed));
         }
         let at = |key: &str| format!("vehicle.{key} (of {})", self.name);
         if !(16..=1 << 20).contains(&self.queue) {
-            return Err(Wrong::new(at("queue"), self.queue, "16 to 1048576 events"));
+            return Err(ValueError::new(at("queue"), self.queue, "16 to 1048576 events"));
         }
         if let Some(ros) = &self.ros {
-            ros.check(zenoh_enabled, &self.sensors).map_err(|wrong| Wrong { key: at(&wrong.key), ..wrong })?;
+            ros.check(zenoh_enabled, &self.sensors).map_err(|error| ValueError { key: at(&error.key), ..error })?;
         }
         let Ingest { points_max, streams_max, .. } = self.ingest;
         if !(1000..=20_000_000).contains(&points_max) {
-            return Err(Wrong::new(at("ingest.points_max"), points_max, "1000 to 20000000 points"));
+            return Err(ValueError::new(at("ingest.points_max"), points_max, "1000 to 20000000 points"));
         }
         if !(1..=64).contains(&streams_max) {
-            return Err(Wrong::new(at("ingest.streams_max"), streams_max, "1 to 64 streams"));
+            return Err(ValueError::new(at("ingest.streams_max"), streams_max, "1 to 64 streams"));
         }
         Ok(())
     }

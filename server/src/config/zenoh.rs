@@ -1,29 +1,30 @@
-//! `[zenoh]`: the session maps are published in, and `[zenoh.ros2]`: the ROS 2 topics they become.
+//! The table `[zenoh]`: the session in which maps are published; and `[zenoh.ros2]`: maps as ROS 2 topics.
 
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use super::error::ValueError;
 use super::ros::{DOMAIN_MAX, is_topic};
-use super::{Vehicle, Wrong};
+use super::vehicle::Vehicle;
 
-/// `[zenoh]`.
+/// The table `[zenoh]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Zenoh {
-    /// Whether it is published at all.
+    /// True if the session is opened.
     pub enabled: bool,
-    /// Part played in the zenoh network.
+    /// Role in the zenoh network.
     pub mode: ZenohMode,
     /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`.
     pub listen: Vec<String>,
     /// Endpoints of routers or peers to connect to.
     pub connect: Vec<String>,
-    /// Look for peers by multicast.
+    /// True if peers are found by multicast.
     pub scouting: bool,
     /// Maps as ROS 2 topics.
     pub ros2: Ros2,
-    /// A zenoh configuration (JSON5) to begin with: TLS, access control; the keys above stand over it. A relative path
+    /// A zenoh configuration (JSON5) with TLS and access control; the keys above take precedence over it. A relative path
     /// starts at the configuration's folder. Empty: zenoh's defaults, with limits for what one peer may cost.
     pub file: PathBuf,
 }
@@ -43,31 +44,31 @@ impl Default for Zenoh {
 }
 
 impl Zenoh {
-    pub(super) fn check(&self, vehicles: &[Vehicle]) -> Result<(), Wrong> {
+    pub(super) fn check(&self, vehicles: &[Vehicle]) -> Result<(), ValueError> {
         for (key, endpoints) in [("zenoh.listen", &self.listen), ("zenoh.connect", &self.connect)] {
             if let Some(endpoint) = endpoints.iter().find(|e| !e.starts_with("tcp/") && !e.starts_with("tls/")) {
                 let allowed = "endpoints such as \"tcp/127.0.0.1:7447\" or \"tls/localhost:7447\"";
-                return Err(Wrong::new(key, endpoint, allowed));
+                return Err(ValueError::new(key, endpoint, allowed));
             }
         }
         self.ros2.check(self.enabled, vehicles)
     }
 }
 
-/// Part played in the zenoh network.
+/// Role in the zenoh network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ZenohMode {
-    /// Talks to whoever connects, and to the endpoints of `connect`.
+    /// Exchanges data with the peers that connect, and with the endpoints of `connect`.
     Peer,
-    /// Hangs on one router.
+    /// Exchanges data through one router.
     Client,
-    /// Is itself a router.
+    /// Routes the data of others.
     Router,
 }
 
 impl ZenohMode {
-    /// As the zenoh configuration spells it.
+    /// The name in the zenoh configuration.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Peer => "peer",
@@ -77,15 +78,15 @@ impl ZenohMode {
     }
 }
 
-/// `[zenoh.ros2]`.
+/// The table `[zenoh.ros2]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Ros2 {
-    /// Whether maps are published to ROS 2 at all.
+    /// True if maps are published as ROS 2 topics.
     pub enabled: bool,
     /// `ROS_DOMAIN_ID`.
     pub domain: u32,
-    /// What stands before `/<vehicle>/<layer>`; may be empty.
+    /// Prefix of the topics `/<vehicle>/<layer>`; may be empty.
     pub namespace: String,
 }
 
@@ -96,29 +97,29 @@ impl Default for Ros2 {
 }
 
 impl Ros2 {
-    fn check(&self, zenoh_enabled: bool, vehicles: &[Vehicle]) -> Result<(), Wrong> {
+    fn check(&self, zenoh_enabled: bool, vehicles: &[Vehicle]) -> Result<(), ValueError> {
         if self.domain > DOMAIN_MAX {
-            return Err(Wrong::new("zenoh.ros2.domain", self.domain, format!("0 to {DOMAIN_MAX}")));
+            return Err(ValueError::new("zenoh.ros2.domain", self.domain, format!("0 to {DOMAIN_MAX}")));
         }
         if !self.enabled {
             return Ok(());
         }
         if !zenoh_enabled {
-            let allowed = "only with zenoh.enabled = true: it goes through zenoh";
-            return Err(Wrong::new("zenoh.ros2.enabled", "true", allowed));
+            let allowed = "only with zenoh.enabled = true, because ROS topics go through zenoh";
+            return Err(ValueError::new("zenoh.ros2.enabled", "true", allowed));
         }
-        // ROS 2 takes no name that begins with a digit.
+        // ROS 2 allows no name that begins with a digit.
         let is_name = |topic: &str| {
             is_topic(topic) && !topic.split('/').any(|part| part.starts_with(|c: char| c.is_ascii_digit()))
         };
         if !self.namespace.is_empty() && !is_name(&self.namespace) {
-            return Err(Wrong::new("zenoh.ros2.namespace", &self.namespace, "such as \"/clearway\", or empty"));
+            return Err(ValueError::new("zenoh.ros2.namespace", &self.namespace, "such as \"/clearway\", or empty"));
         }
         match vehicles.iter().find(|vehicle| !is_name(&format!("/{}", vehicle.name))) {
             None => Ok(()),
             Some(vehicle) => {
                 let allowed = "with zenoh.ros2.enabled: letters, digits and underscores, no digit first";
-                Err(Wrong::new("vehicle.name", &vehicle.name, allowed))
+                Err(ValueError::new("vehicle.name", &vehicle.name, allowed))
             }
         }
     }

@@ -1,6 +1,6 @@
-//! [`Event`] <-> `clearway.v1.Event`: what the journal holds, and what observations bring.
+//! [`Event`] <-> `clearway.v1.Event`: events of the journal, and bodies of observations.
 //!
-//! An event comes out of a journal exactly as it went in, also one that the core refuses.
+//! An event read from a journal equals the event that was written, also one that the core refuses.
 
 use bytes::Bytes;
 use clearway_lidar::model::Model;
@@ -11,7 +11,7 @@ use clearway_proto::v1;
 use nalgebra::{Isometry3, Quaternion, Translation3, Unit};
 use prost::Message;
 
-use super::pose;
+use super::map::pose;
 
 fn road(road: &Road) -> v1::Road {
     let purpose = match road.purpose {
@@ -33,20 +33,23 @@ fn road(road: &Road) -> v1::Road {
     }
 }
 
-/// What the core would refuse stays as it is: the journal holds it too. `Err` names what has no counterpart.
-pub(crate) fn road_from_proto(road: v1::Road) -> Result<Road, &'static str> {
+/// A road from the wire. Values that the core would refuse stay as they are, because the journal holds them too.
+///
+/// # Errors
+/// [`NoCounterpartError`] for an unknown purpose or frame, and if x and y differ in length.
+pub(crate) fn road_from_proto(road: v1::Road) -> Result<Road, NoCounterpartError> {
     let purpose = match road.purpose() {
         v1::RoadPurpose::Paint => RoadPurpose::Paint,
         v1::RoadPurpose::Route => RoadPurpose::Route,
-        v1::RoadPurpose::Unspecified => return Err("known road purpose"),
+        v1::RoadPurpose::Unspecified => return Err(NoCounterpartError("known road purpose")),
     };
     let frame = match road.frame() {
         v1::RoadFrame::Ego => RoadFrame::Ego,
         v1::RoadFrame::Map => RoadFrame::Map,
-        v1::RoadFrame::Unspecified => return Err("known road frame"),
+        v1::RoadFrame::Unspecified => return Err(NoCounterpartError("known road frame")),
     };
     if road.x.len() != road.y.len() {
-        return Err("y for every x of the road");
+        return Err(NoCounterpartError("y for every x of the road"));
     }
     Ok(Road {
         stamp_ns: road.stamp_ns,
@@ -58,10 +61,10 @@ pub(crate) fn road_from_proto(road: v1::Road) -> Result<Road, &'static str> {
     })
 }
 
-/// `None` where the pose is missing.
+/// An ego pose from the wire; `None` if the pose is missing.
 pub(crate) fn ego_pose_from_proto(ego: &v1::EgoPose) -> Option<EgoPose> {
     let pose = ego.map_from_ego.as_ref()?;
-    // Not normalised again: a rounding would make another pose of it than the one that was processed.
+    // Not normalised again: rounding would give another pose than the one that was processed.
     let rotation = Unit::new_unchecked(Quaternion::new(pose.qw, pose.qx, pose.qy, pose.qz));
     let map_from_ego = Isometry3::from_parts(Translation3::new(pose.x, pose.y, pose.z), rotation);
     Some(EgoPose { stamp_ns: ego.stamp_ns, map_from_ego, speed_mps: ego.speed_mps })
@@ -88,12 +91,15 @@ fn sensor_config(sensor: &SensorConfig) -> v1::Sensor {
     }
 }
 
-/// `Err` names what has no counterpart.
-pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, &'static str> {
+/// A sensor's configuration from the wire.
+///
+/// # Errors
+/// [`NoCounterpartError`] for an unknown model, and if blind_deg holds no pairs.
+pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, NoCounterpartError> {
     let v1::Sensor { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, .. } = sensor;
     let plain = SensorConfig::new(sensor.name, Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg });
-    let (blind_deg, []) = sensor.blind_deg.as_chunks() else { return Err("pairs in blind_deg") };
-    let model = sensor.model.map(|name| name.parse::<Model>().map_err(|_| "known sensor model")).transpose()?;
+    let (blind_deg, []) = sensor.blind_deg.as_chunks() else { return Err(NoCounterpartError("pairs in blind_deg")) };
+    let model = sensor.model.map(|name| name.parse::<Model>().map_err(|_| NoCounterpartError("known sensor model"))).transpose()?;
     Ok(SensorConfig {
         model,
         rpm: sensor.rpm,
@@ -120,12 +126,15 @@ fn scan(scan: &Scan) -> v1::Scan {
     }
 }
 
-/// What the core would refuse stays as it is: the journal holds it too. `Err` names what has no counterpart.
-pub(crate) fn scan_from_proto(scan: v1::Scan) -> Result<Scan, &'static str> {
-    const PART: &str = "whole number at the end of a scan's list";
+/// A scan from the wire. Values that the core would refuse stay as they are, because the journal holds them too.
+///
+/// # Errors
+/// [`NoCounterpartError`] if a list ends inside a number, or a direction lacks a coordinate.
+pub(crate) fn scan_from_proto(scan: v1::Scan) -> Result<Scan, NoCounterpartError> {
+    const PART: NoCounterpartError = NoCounterpartError("whole number at the end of a scan's list");
     let floats = |bytes: &[u8]| unpack(bytes).ok_or(PART);
     let no_returns = floats(&scan.no_returns)?;
-    let (directions, []) = no_returns.as_chunks::<3>() else { return Err("z for every x and y of no_returns") };
+    let (directions, []) = no_returns.as_chunks::<3>() else { return Err(NoCounterpartError("z for every x and y of no_returns")) };
     Ok(Scan {
         stamp_ns: scan.stamp_ns,
         x: floats(&scan.x)?,
@@ -176,59 +185,65 @@ fn loss_cause(cause: Cause) -> v1::LossCause {
     }
 }
 
-/// An event of a journal that is none.
+/// A message that lacks a part which its counterpart in the core needs; it names the part.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("no {0}")]
+pub struct NoCounterpartError(pub &'static str);
+
+/// Why bytes of a journal are no event.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum EventError {
-    /// Not protobuf.
+pub enum EventDecodeError {
+    /// The bytes are not protobuf.
     #[error("not a clearway.v1.Event: {0}")]
     Decode(#[from] prost::DecodeError),
-    /// A source no vehicle has.
+    /// The source is too large.
     #[error("event {sequence}: source {source_index}: 0 to 65535 is allowed")]
     Source {
-        /// The event's.
+        /// Sequence of the event.
         sequence: u64,
-        /// What was found.
+        /// The source that was found.
         source_index: u32,
     },
-    /// A body this version does not know, an ego pose without a pose, a loss without a cause, a road without frame or
-    /// purpose, a scan with half a direction, a sensor of an unknown model.
+    /// A part is missing or unknown: the body, the pose of an ego pose, the cause of a loss, the frame or purpose of a
+    /// road, a coordinate of a direction, the model of a sensor.
     #[error("event {sequence}: no {what}")]
     Missing {
-        /// The event's.
+        /// Sequence of the event.
         sequence: u64,
-        /// `body`, `pose`, or what of a loss, road, scan or sensor.
+        /// The missing part: `body`, `pose`, or a part of a loss, road, scan or sensor.
         what: &'static str,
     },
 }
 
-/// An event out of a journal, exactly as it was.
+/// An event from a journal, equal to the one that was written.
 ///
 /// # Errors
-/// [`EventError`] where the bytes are no event.
-pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventError> {
+/// [`EventDecodeError::Decode`] if the bytes are not protobuf, [`EventDecodeError::Source`] if the source is too large,
+/// [`EventDecodeError::Missing`] if a part is missing or unknown.
+pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventDecodeError> {
     let event = v1::Event::decode(bytes)?;
     let sequence = event.sequence;
     let source =
-        u16::try_from(event.source).map_err(|_| EventError::Source { sequence, source_index: event.source })?;
-    let body = match event.body.ok_or(EventError::Missing { sequence, what: "body" })? {
+        u16::try_from(event.source).map_err(|_| EventDecodeError::Source { sequence, source_index: event.source })?;
+    let body = match event.body.ok_or(EventDecodeError::Missing { sequence, what: "body" })? {
         v1::event::Body::Datagram(payload) => Body::Datagram(payload),
         v1::event::Body::Scan(scan) => {
-            Body::Scan(scan_from_proto(scan).map_err(|what| EventError::Missing { sequence, what })?)
+            Body::Scan(scan_from_proto(scan).map_err(|NoCounterpartError(what)| EventDecodeError::Missing { sequence, what })?)
         }
         v1::event::Body::EgoPose(ego) => {
-            Body::EgoPose(ego_pose_from_proto(&ego).ok_or(EventError::Missing { sequence, what: "pose" })?)
+            Body::EgoPose(ego_pose_from_proto(&ego).ok_or(EventDecodeError::Missing { sequence, what: "pose" })?)
         }
         v1::event::Body::Road(road) => {
-            Body::Road(road_from_proto(road).map_err(|what| EventError::Missing { sequence, what })?)
+            Body::Road(road_from_proto(road).map_err(|NoCounterpartError(what)| EventDecodeError::Missing { sequence, what })?)
         }
         v1::event::Body::Sensor(sensor) => {
-            let sensor = sensor_from_proto(sensor).map_err(|what| EventError::Missing { sequence, what })?;
+            let sensor = sensor_from_proto(sensor).map_err(|NoCounterpartError(what)| EventDecodeError::Missing { sequence, what })?;
             Body::Sensor(Box::new(sensor))
         }
         v1::event::Body::Lost(count) => {
             let causes = [Cause::Queue, Cause::Kernel, Cause::Sender, Cause::Length, Cause::Observation];
             let cause = causes.into_iter().find(|cause| i32::from(loss_cause(*cause)) == event.lost_cause);
-            let cause = cause.ok_or(EventError::Missing { sequence, what: "known cause of a loss" })?;
+            let cause = cause.ok_or(EventDecodeError::Missing { sequence, what: "known cause of a loss" })?;
             Body::Lost { cause, count }
         }
         v1::event::Body::End(v1::End {}) => Body::End,
@@ -241,7 +256,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_event_comes_out_of_the_journal_as_it_went_in() {
+    fn an_event_read_from_the_journal_equals_the_written_one() {
         let pose = Isometry3::new(nalgebra::vector![1.0, 2.0, 3.0], nalgebra::vector![0.1, 0.2, 0.3]);
         let bodies = [
             Body::Datagram(Bytes::from_static(b"anything")),
@@ -286,9 +301,9 @@ mod tests {
     }
 
     #[test]
-    fn bytes_that_are_no_event_are_named() {
-        assert!(matches!(event_from_bytes(Bytes::from_static(b"\xff")), Err(EventError::Decode(_))));
-        let missing = Err(EventError::Missing { sequence: 0, what: "body" });
+    fn the_reason_why_bytes_are_no_event_is_named() {
+        assert!(matches!(event_from_bytes(Bytes::from_static(b"\xff")), Err(EventDecodeError::Decode(_))));
+        let missing = Err(EventDecodeError::Missing { sequence: 0, what: "body" });
         assert_eq!(event_from_bytes(Bytes::new()), missing);
         for (road, what) in [
             (v1::Road { frame: 1, ..Default::default() }, "known road purpose"),
@@ -297,11 +312,11 @@ mod tests {
             (v1::Road { purpose: 1, frame: 1, x: vec![0.0], ..Default::default() }, "y for every x of the road"),
         ] {
             let event = v1::Event { body: Some(v1::event::Body::Road(road)), ..Default::default() };
-            let missing = Err(EventError::Missing { sequence: 0, what });
+            let missing = Err(EventDecodeError::Missing { sequence: 0, what });
             assert_eq!(event_from_bytes(event.encode_to_vec().into()), missing);
         }
         let far = v1::Event { source: 70_000, ..v1::Event::default() };
-        let source = Err(EventError::Source { sequence: 0, source_index: 70_000 });
+        let source = Err(EventDecodeError::Source { sequence: 0, source_index: 70_000 });
         assert_eq!(event_from_bytes(far.encode_to_vec().into()), source);
     }
 }

@@ -1,6 +1,6 @@
-//! One layer of a map -> a PNG: from above, the vehicle in the middle, its forward axis up, its left on the left.
+//! One layer of a map -> a PNG: seen from above, the vehicle in the middle, forward up, left on the left.
 //!
-//! The picture turns with the vehicle: up is ahead, not north. Classes have the colours of the layer's legend; a layer
+//! The picture rotates with the vehicle: up is ahead, not north. Classes have the colours of the layer's legend; a layer
 //! without classes is drawn from its first channel, dark to light.
 
 use clearway_proto::legend::Class;
@@ -8,28 +8,30 @@ use clearway_proto::map::Layer;
 
 /// Colour of the ground outside the grid, and of cells without a value: the colour of class `unknown` in every legend.
 const UNKNOWN: [u8; 3] = [58, 63, 70];
+/// Colour of the rings.
 const RING: [u8; 3] = [112, 116, 124];
+/// Colour of the vehicle's mark.
 const VEHICLE: [u8; 3] = [244, 244, 248];
-/// Half of a car's length and breadth, metres.
+/// Half the length and half the width of the vehicle's mark, in metres: those of a car.
 const VEHICLE_HALF_M: (f64, f64) = (2.2, 0.9);
 
-/// How to draw.
+/// How a picture is drawn.
 #[derive(Clone, Copy, Debug)]
 pub struct Style {
-    /// Edge of the picture.
+    /// Edge of the picture, in pixels.
     pub pixels: u32,
-    /// Edge of the ground shown is twice this; `None`: the whole grid.
+    /// Distance from the vehicle to the edge of the picture, in metres; `None` shows the whole grid.
     pub range_m: Option<f64>,
-    /// Rings every so many metres.
+    /// Distance between two rings, in metres; `None` draws none.
     pub rings_m: Option<f64>,
-    /// A mark where the vehicle stands.
+    /// True if the vehicle is marked.
     pub vehicle: bool,
 }
 
 /// Draws a layer and encodes the picture.
 ///
 /// # Errors
-/// What the PNG encoder says.
+/// [`png::EncodingError`] if the picture is larger than PNG allows.
 pub fn png(layer: &Layer, style: &Style) -> Result<Vec<u8>, png::EncodingError> {
     let pixels = style.pixels as usize;
     let mut rgb = vec![0; pixels * pixels * 3];
@@ -62,7 +64,7 @@ pub fn png(layer: &Layer, style: &Style) -> Result<Vec<u8>, png::EncodingError> 
 }
 
 pub(crate) enum Colours {
-    /// By class; the index is that of the channel.
+    /// Index of the channel `class`, and the colours of the classes.
     Classes(usize, Vec<[u8; 3]>),
     /// Least and greatest known value of channel 0.
     Shades(f64, f64),

@@ -9,6 +9,7 @@ use clearway_mapping::event::Body;
 use clearway_proto::packed::unpack;
 use clearway_proto::v1;
 
+use crate::encode::event::NoCounterpartError;
 use crate::encode::{ego_pose_from_proto, road_from_proto, scan_from_proto, sensor_from_proto};
 
 /// The limits of one observation.
@@ -145,7 +146,7 @@ pub type Bodies = Vec<(Option<i64>, Body)>;
 pub fn decode(observation: v1::Observation, limits: &Limits) -> Result<Bodies, ObservationError> {
     let v1::Observation { captured_ns, body, columns, .. } = observation;
     let captured_ns = (captured_ns != 0).then_some(captured_ns);
-    let missing = |body| move |what| ObservationError::Missing { body, what };
+    let missing = |body| move |NoCounterpartError(what)| ObservationError::Missing { body, what };
     let body = body.ok_or(ObservationError::Body)?;
     if let (Some(columns), false) = (&columns, matches!(body, v1::observation::Body::Scan(_))) {
         return Err(columns_error(columns, 0, " (there is none)"));
@@ -164,7 +165,7 @@ pub fn decode(observation: v1::Observation, limits: &Limits) -> Result<Bodies, O
             Body::Scan(scan)
         }
         v1::observation::Body::EgoPose(ego) => {
-            Body::EgoPose(ego_pose_from_proto(&ego).ok_or(missing("ego_pose")("map_from_ego"))?)
+            Body::EgoPose(ego_pose_from_proto(&ego).ok_or(missing("ego_pose")(NoCounterpartError("map_from_ego")))?)
         }
         v1::observation::Body::Road(road) => Body::Road(road_from_proto(road).map_err(missing("road"))?),
         v1::observation::Body::End(v1::End {}) => Body::End,

@@ -1,9 +1,9 @@
-//! A listener -> connections, so many at once and none that stays silent: what gRPC and the page accept from.
+//! A listener -> connections, limited in number and in silence: gRPC and the page accept from it.
 //!
-//! A peer that opens connections by the thousand would use up the process' file handles, with which recordings are
-//! opened too; one that connects and says nothing would hold its place for ever. Whoever finds no place can be let into
-//! a small lobby for a short while, to be told so; beyond it, connections are closed at once: nobody waits behind a
-//! thousand idle ones.
+//! A peer that opens thousands of connections would use up the file handles of the process, which recordings need too; a
+//! peer that connects and sends nothing would keep its connection for ever. A connection over the limit can be accepted
+//! for a short time, so that its peer gets an error that says why. Only a few of these are open at once; all others over
+//! the limit are closed immediately.
 
 use std::io;
 use std::net::SocketAddr;
@@ -19,59 +19,60 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::Sleep;
 use tonic::transport::server::Connected;
 
-/// Connections at once that are told that there is no place; more are closed without a word.
-const LOBBY_MAX: usize = 16;
-/// For a handshake, one call and its answer.
-const LOBBY_TIMEOUT: Duration = Duration::from_secs(5);
-/// Whoever connects has something to say.
+/// Most connections over the limit that are open at once to receive an error; others are closed without one. Ours: a
+/// small share of the file handles of a process.
+const OVER_LIMIT_MAX: usize = 16;
+/// Longest time that a connection over the limit stays open: enough for a handshake, one call and its answer.
+const OVER_LIMIT_TIMEOUT: Duration = Duration::from_secs(5);
+/// Longest time from the connection to its first byte. Ours: every client sends at once.
 const FIRST_BYTE_TIMEOUT: Duration = Duration::from_secs(10);
-/// After an error of the listener itself (no file handle left, say); trying again at once would only burn a core.
+/// Pause after an error of the listener itself, such as no free file handle: to try again at once would only use a core.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(200);
 
-/// A listener with a bound on its connections.
+/// A listener with a limit on its connections.
 #[derive(Debug)]
 pub struct Connections {
     listener: TcpListener,
-    room: Arc<Semaphore>,
-    lobby: Option<Arc<Semaphore>>,
+    permits: Arc<Semaphore>,
+    over_limit: Option<Arc<Semaphore>>,
     connections_max: usize,
     first_byte: Duration,
 }
 
-/// Where a connection is; requests carry it among their extensions.
+/// Whether a connection is within the limit; requests carry it in their extensions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Place {
-    /// It is served.
-    Room,
-    /// So many are served already, and that is all there may be: it is told so, and ended.
-    Lobby(usize),
+pub enum Admission {
+    /// The connection is served.
+    Served,
+    /// The connection is over the limit, which is the number: it gets an error and is closed.
+    OverLimit(usize),
 }
 
 impl Connections {
-    /// Of this listener, with places for so many; the others wait in the kernel.
+    /// Limits a listener to `connections_max` connections; others wait in the kernel.
     pub fn new(listener: TcpListener, connections_max: usize) -> Self {
-        let room = Arc::new(Semaphore::new(connections_max));
-        Self { listener, room, lobby: None, connections_max, first_byte: FIRST_BYTE_TIMEOUT }
+        let permits = Arc::new(Semaphore::new(connections_max));
+        Self { listener, permits, over_limit: None, connections_max, first_byte: FIRST_BYTE_TIMEOUT }
     }
 
-    /// Nobody waits: whoever serves them tells those in the lobby ([`Place::Lobby`]) that there is no place.
-    pub fn with_lobby(self) -> Self {
-        Self { lobby: Some(Arc::new(Semaphore::new(LOBBY_MAX))), ..self }
+    /// Accepts connections over the limit too, as [`Admission::OverLimit`]; the server must answer them with an error.
+    pub fn with_errors_over_limit(self) -> Self {
+        Self { over_limit: Some(Arc::new(Semaphore::new(OVER_LIMIT_MAX))), ..self }
     }
 
-    /// As tonic takes them.
+    /// The connections as a stream, as tonic needs them.
     pub fn stream(self) -> impl Stream<Item = io::Result<Connection>> {
         stream::unfold(self, |mut connections| async move { Some((Ok(connections.next().await.0), connections)) })
     }
 
-    /// Waits for a peer, and then for a place for it.
+    /// Waits for a peer, and then for a permit.
     async fn next(&mut self) -> (Connection, SocketAddr) {
         loop {
             match self.listener.accept().await {
                 Ok((stream, peer)) => {
                     // A failure leaves the default, which is slower but right.
                     let _ = stream.set_nodelay(true);
-                    if let Some(connection) = self.place(stream).await {
+                    if let Some(connection) = self.admit(stream).await {
                         return (connection, peer);
                     }
                 }
@@ -83,15 +84,15 @@ impl Connections {
         }
     }
 
-    /// `None` where there is none, not even in the lobby.
-    async fn place(&self, stream: TcpStream) -> Option<Connection> {
-        let (permit, place) = match (self.room.clone().try_acquire_owned(), &self.lobby) {
-            (Ok(permit), _) => (permit, Place::Room),
-            (Err(_), None) => (self.room.clone().acquire_owned().await.ok()?, Place::Room),
-            (Err(_), Some(lobby)) => (lobby.clone().try_acquire_owned().ok()?, Place::Lobby(self.connections_max)),
+    /// Admits a connection; `None` if it is over the limit and cannot get an error either.
+    async fn admit(&self, stream: TcpStream) -> Option<Connection> {
+        let (permit, admission) = match (self.permits.clone().try_acquire_owned(), &self.over_limit) {
+            (Ok(permit), _) => (permit, Admission::Served),
+            (Err(_), None) => (self.permits.clone().acquire_owned().await.ok()?, Admission::Served),
+            (Err(_), Some(over_limit)) => (over_limit.clone().try_acquire_owned().ok()?, Admission::OverLimit(self.connections_max)),
         };
-        let limit = if place == Place::Room { self.first_byte } else { LOBBY_TIMEOUT };
-        Some(Connection { stream, limit: Some(Box::pin(tokio::time::sleep(limit))), place, _permit: permit })
+        let limit = if admission == Admission::Served { self.first_byte } else { OVER_LIMIT_TIMEOUT };
+        Some(Connection { stream, limit: Some(Box::pin(tokio::time::sleep(limit))), admission, _permit: permit })
     }
 }
 
@@ -108,21 +109,21 @@ impl axum::serve::Listener for Connections {
     }
 }
 
-/// One accepted connection; its place is free again when it is dropped.
+/// One accepted connection; its permit is free again when it is dropped.
 #[derive(Debug)]
 pub struct Connection {
     stream: TcpStream,
-    /// Runs until the first byte; in the lobby, to the end.
+    /// Time limit: until the first byte, or for the whole connection if it is over the limit.
     limit: Option<Pin<Box<Sleep>>>,
-    place: Place,
+    admission: Admission,
     _permit: OwnedSemaphorePermit,
 }
 
 impl Connected for Connection {
-    type ConnectInfo = Place;
+    type ConnectInfo = Admission;
 
-    fn connect_info(&self) -> Place {
-        self.place
+    fn connect_info(&self) -> Admission {
+        self.admission
     }
 }
 
@@ -133,7 +134,7 @@ impl AsyncRead for Connection {
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
         let read = Pin::new(&mut self.stream).poll_read(context, buffer);
-        if read.is_ready() && self.place == Place::Room {
+        if read.is_ready() && self.admission == Admission::Served {
             self.limit = None;
         } else if let Some(limit) = &mut self.limit
             && limit.as_mut().poll(context).is_ready()
@@ -177,68 +178,68 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn a_peer_that_says_nothing_is_dropped_and_one_that_speaks_stays() {
+    async fn a_silent_peer_is_dropped_and_one_that_sends_stays() {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         let mut connections = Connections { first_byte: Duration::from_millis(1), ..Connections::new(listener, 8) };
-        let _mute = TcpStream::connect(address).await.unwrap();
-        let mut mute = connections.next().await.0;
-        assert_eq!(mute.read_u8().await.unwrap_err().kind(), io::ErrorKind::TimedOut);
+        let _silent = TcpStream::connect(address).await.unwrap();
+        let mut silent = connections.next().await.0;
+        assert_eq!(silent.read_u8().await.unwrap_err().kind(), io::ErrorKind::TimedOut);
 
-        let mut speaker = TcpStream::connect(address).await.unwrap();
-        speaker.write_all(b"a").await.unwrap();
-        let mut heard = connections.next().await.0;
-        heard.stream.readable().await.unwrap();
-        assert_eq!(heard.read_u8().await.unwrap(), b'a');
-        // Silent again, and for longer: the limit is for the first byte.
-        let pause = tokio::time::timeout(Duration::from_millis(5), heard.read_u8()).await;
+        let mut sender = TcpStream::connect(address).await.unwrap();
+        sender.write_all(b"a").await.unwrap();
+        let mut received = connections.next().await.0;
+        received.stream.readable().await.unwrap();
+        assert_eq!(received.read_u8().await.unwrap(), b'a');
+        // It is silent again, for longer: the limit is for the first byte only.
+        let pause = tokio::time::timeout(Duration::from_millis(5), received.read_u8()).await;
         assert!(pause.is_err(), "it waits");
-        speaker.write_all(b"b").await.unwrap();
-        assert_eq!(heard.read_u8().await.unwrap(), b'b');
+        sender.write_all(b"b").await.unwrap();
+        assert_eq!(received.read_u8().await.unwrap(), b'b');
     }
 
     #[tokio::test]
-    async fn whoever_finds_no_place_is_let_into_the_lobby_and_each_that_goes_makes_room() {
+    async fn a_connection_over_the_limit_is_admitted_to_get_an_error() {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
-        let mut connections = Connections::new(listener, 1).with_lobby();
+        let mut connections = Connections::new(listener, 1).with_errors_over_limit();
         let _peers = [(); 3].map(|()| std::net::TcpStream::connect(address).unwrap());
         let held = connections.next().await.0;
-        assert_eq!(held.connect_info(), Place::Room);
-        let told = connections.next().await.0;
-        assert_eq!(told.connect_info(), Place::Lobby(1));
+        assert_eq!(held.connect_info(), Admission::Served);
+        let rejected = connections.next().await.0;
+        assert_eq!(rejected.connect_info(), Admission::OverLimit(1));
         drop(held);
-        assert_eq!(connections.next().await.0.connect_info(), Place::Room);
+        assert_eq!(connections.next().await.0.connect_info(), Admission::Served);
     }
 
     #[tokio::test]
-    async fn the_lobby_is_small_too_and_nobody_stays_in_it() {
+    async fn connections_over_the_limit_are_few_and_short() {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
-        let lobby = Some(Arc::new(Semaphore::new(1)));
-        let mut connections = Connections { lobby, ..Connections::new(listener, 0) };
-        let mut talker = TcpStream::connect(address).await.unwrap();
+        let over_limit = Some(Arc::new(Semaphore::new(1)));
+        let mut connections = Connections { over_limit, ..Connections::new(listener, 0) };
+        let mut sender = TcpStream::connect(address).await.unwrap();
         let mut next = TcpStream::connect(address).await.unwrap();
-        let mut told = connections.next().await.0;
-        told.limit = Some(Box::pin(tokio::time::sleep(Duration::from_millis(1))));
+        let mut rejected = connections.next().await.0;
+        rejected.limit = Some(Box::pin(tokio::time::sleep(Duration::from_millis(1))));
         tokio::select! {
-            _ = connections.next() => panic!("no place at all"),
+            _ = connections.next() => panic!("no connection at all"),
             end = next.read_u8() => assert_eq!(end.unwrap_err().kind(), io::ErrorKind::UnexpectedEof),
         }
-        talker.write_all(b"a").await.unwrap();
-        told.stream.readable().await.unwrap();
-        assert_eq!(told.read_u8().await.unwrap(), b'a');
-        assert_eq!(told.read_u8().await.unwrap_err().kind(), io::ErrorKind::TimedOut, "talking does not help");
+        sender.write_all(b"a").await.unwrap();
+        rejected.stream.readable().await.unwrap();
+        assert_eq!(rejected.read_u8().await.unwrap(), b'a');
+        assert_eq!(rejected.read_u8().await.unwrap_err().kind(), io::ErrorKind::TimedOut, "the limit is for the whole connection");
     }
 
     #[tokio::test]
-    async fn without_a_lobby_the_next_one_waits_for_room() {
+    async fn without_errors_over_the_limit_the_next_connection_waits() {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         let mut connections = Connections::new(listener, 1);
         let _peers = [(); 2].map(|()| std::net::TcpStream::connect(address).unwrap());
         let held = connections.next().await.0;
-        assert_eq!(connections.room.available_permits(), 0);
+        assert_eq!(connections.permits.available_permits(), 0);
         drop(held);
         connections.next().await;
     }

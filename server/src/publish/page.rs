@@ -1,7 +1,8 @@
-//! The page, embedded, with its WebSocket `/live?vehicle=V`, `/vehicles`, `/healthz` and `/metrics`.
+//! The HTTP server of the page: its embedded files, its WebSocket `/live?vehicle=V`, `/vehicles`, `/healthz` and
+//! `/metrics`.
 //!
 //! The WebSocket sends each newest map as a binary `clearway.v1.MapUpdate` with all layers, and the status once a
-//! second as a JSON text. A browser that takes nothing for a while is dropped.
+//! second as a JSON text. A browser that reads nothing for [`SEND_TIMEOUT`] is disconnected.
 
 use std::time::Duration;
 
@@ -19,26 +20,27 @@ use serde_json::Value;
 use tokio::net::TcpListener;
 
 use super::connections::Connections;
-use super::{Served, Vehicles};
+use super::served::{Served, Vehicles};
 use crate::clock::now_ns;
 use crate::status::{Reader, prometheus};
 
-/// A browser that has not taken a frame for this long shows nothing true any more.
+/// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
+/// Time between two status messages.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
-/// Browsers at once, with a few connections each; a fleet's pages are served by a proxy that has a few of its own.
+/// Most connections. Ours: some dozens of browsers with a few connections each.
 const CONNECTIONS_MAX: usize = 256;
-/// A page sends nothing but pongs.
+/// Longest message from a browser, in bytes. Ours: the page sends only pongs.
 const MESSAGE_BYTES_MAX: usize = 4096;
 
 #[derive(RustEmbed)]
 #[folder = "web/"]
 struct Assets;
 
-/// Serves until `stop` resolves.
+/// Serves the page until `stop` resolves.
 ///
 /// # Errors
-/// What the listener says.
+/// [`std::io::Error`] if the server cannot run.
 pub async fn serve(
     listener: TcpListener,
     vehicles: Vehicles,
@@ -57,7 +59,7 @@ pub async fn serve(
 async fn asset(uri: Uri) -> Response {
     let path = uri.path().trim_start_matches('/');
     let path = if path.is_empty() { "index.html" } else { path };
-    // The page's own tests lie beside it.
+    // The page's tests lie beside its files and are not served.
     let is_asset = !path.ends_with(".mjs") && !path.ends_with(".json");
     match Assets::get(path).filter(|_| is_asset) {
         Some(file) => {
@@ -90,13 +92,13 @@ async fn metrics(State(vehicles): State<Vehicles>) -> impl IntoResponse {
 }
 
 #[derive(serde::Deserialize)]
-struct Wanted {
+struct LiveQuery {
     #[serde(default)]
     vehicle: String,
 }
 
-async fn live(State(vehicles): State<Vehicles>, Query(wanted): Query<Wanted>, upgrade: WebSocketUpgrade) -> Response {
-    match vehicles.find(&wanted.vehicle) {
+async fn live(State(vehicles): State<Vehicles>, Query(query): Query<LiveQuery>, upgrade: WebSocketUpgrade) -> Response {
+    match vehicles.find(&query.vehicle) {
         Ok(served) => {
             let served = served.clone();
             upgrade.max_message_size(MESSAGE_BYTES_MAX).on_upgrade(move |socket| stream(socket, served))
@@ -105,10 +107,10 @@ async fn live(State(vehicles): State<Vehicles>, Query(wanted): Query<Wanted>, up
     }
 }
 
-/// Sends until the browser goes, stalls, or the engine stops.
+/// Sends maps and status until the browser disconnects or stalls, or the engine stops.
 async fn stream(mut socket: WebSocket, served: Served) {
     let _reader = Reader::new(&served.status.page_readers);
-    let taken = served.status.subscriptions.subscribe(&[]);
+    let subscription = served.status.subscriptions.subscribe(&[]);
     let mut newest = served.newest.clone();
     newest.mark_changed();
     let mut every = tokio::time::interval(STATUS_PERIOD);
@@ -118,7 +120,7 @@ async fn stream(mut socket: WebSocket, served: Served) {
             changed = newest.changed() => {
                 let Ok(()) = changed else { break };
                 let map = newest.borrow_and_update().clone();
-                let Some(map) = map.filter(|map| taken.is_covered_by(map)) else { continue };
+                let Some(map) = map.filter(|map| subscription.is_covered_by(map)) else { continue };
                 let skipped = last_sequence.map_or(0, |last: u64| map.sequence.saturating_sub(last + 1));
                 last_sequence = Some(map.sequence);
                 let update = v1::MapUpdate { map: map.select(&[]), skipped, sent_ns: now_ns(), left_out: 0 };
@@ -130,7 +132,7 @@ async fn stream(mut socket: WebSocket, served: Served) {
                 Frame::Text(status.to_string().into())
             }
             received = socket.recv() => match received {
-                // Nothing a page could say is of interest; pings are answered by the library.
+                // Messages of the page have no meaning; the library answers pings.
                 Some(Ok(_)) => continue,
                 Some(Err(_)) | None => break,
             },

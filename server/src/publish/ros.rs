@@ -1,10 +1,10 @@
-//! Maps as ROS 2 topics in rmw_zenoh's key space, with no bridge between.
+//! Maps as ROS 2 topics in rmw_zenoh's key space, without a bridge.
 //!
-//! Of each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`, reliable, transient local, depth 1)
-//! and its place in `map` on `/tf` (reliable, volatile). A topic is published under
+//! For each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`, reliable, transient local, depth 1)
+//! and its pose in `map` on `/tf` (reliable, volatile). A topic is published under
 //! `<domain>/<topic>/<type>/<hash>`, the payload CDR, with an attachment: sequence, time of sending, length 16, the
-//! publisher's 16 bytes. Liveliness tokens under `@ros2_lv` tell of the node and its publishers. A grid is made while
-//! somebody subscribes; whoever comes gets the newest map at once, whoever comes later has it from the publisher's
+//! publisher's 16 bytes. Liveliness tokens under `@ros2_lv` announce the node and its publishers. A grid is made only
+//! while there is a subscriber; the first subscriber gets the newest map at once, later ones get it from the publisher's
 //! cache.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -21,27 +21,27 @@ use zenoh::qos::CongestionControl;
 use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
 
-use super::Served;
+use super::served::Served;
 use crate::config::Ros2;
 use crate::clock::now_ns;
 use crate::zenoh_session::ZenohError;
 use crate::encode::EncodedMap;
 
-/// The node's name.
+/// Name of the node.
 const NODE: &str = "clearway";
-/// reliability 1 reliable; durability 1 transient local; history 1 keep last, depth 1; deadline, lifespan and
-/// liveliness as they are by default.
+/// QoS of the grids: reliability 1 reliable; durability 1 transient local; history 1 keep last, depth 1; deadline,
+/// lifespan and liveliness by default.
 const LATCHED: &str = "1:1:1,1:,:,:,,";
-/// The same, but durability 2 volatile, depth 100: what tf's broadcaster has.
+/// QoS of `/tf`: the same, but durability 2 volatile, depth 100, as tf2's broadcaster has it.
 const MOVING: &str = "1:2:1,100:,:,:,,";
-/// How often a quiet publisher tells its last sequence, so that a lost last map is noticed.
+/// Interval at which a quiet publisher repeats its last sequence, so that subscribers notice a lost last map.
 const HEARTBEAT: Duration = Duration::from_secs(1);
 
-/// The node that all vehicles' topics belong to.
+/// The node of the topics of all vehicles.
 pub(super) struct Node<'a> {
     session: &'a Session,
     options: &'a Ros2,
-    /// Of the node and its publishers so far.
+    /// Tokens of the node and of its publishers so far.
     tokens: Vec<LivelinessToken>,
 }
 
@@ -53,7 +53,7 @@ impl<'a> Node<'a> {
         Ok(node)
     }
 
-    /// Publishes a vehicle's layers and pose.
+    /// Publishes the layers and the pose of a vehicle.
     pub async fn publish(&mut self, served: &Served, tasks: &mut JoinSet<()>) -> Result<(), ZenohError> {
         let vehicle = &served.status.name;
         for &layer in &served.status.layers {
@@ -62,7 +62,7 @@ impl<'a> Node<'a> {
             let mut rasters = Rasters::default();
             let grid = move |map: &EncodedMap| {
                 let (_, chunk) = map.layers.iter().find(|(name, _)| *name == layer)?;
-                let map = MapView::decode(map.layer(chunk)).inspect_err(not_ours).ok()?;
+                let map = MapView::decode(map.layer(chunk)).inspect_err(log_decode_error).ok()?;
                 let layer = map.layers().first()?;
                 Some(ros::occupancy_grid(&map, layer, rasters.of(layer)))
             };
@@ -70,14 +70,14 @@ impl<'a> Node<'a> {
         }
         let tf = self.topic("/tf", &TF_MESSAGE, MOVING).await?;
         let transform = |map: &EncodedMap| {
-            let map = MapView::decode(map.header.clone()).inspect_err(not_ours).ok()?;
+            let map = MapView::decode(map.header.clone()).inspect_err(log_decode_error).ok()?;
             ros::tf(&map)
         };
         tasks.spawn(tf.publish(served.clone(), None, transform));
         Ok(())
     }
 
-    /// The tokens; the node is there until they are dropped.
+    /// The tokens; the node disappears when they are dropped.
     pub fn into_tokens(self) -> Vec<LivelinessToken> {
         self.tokens
     }
@@ -93,7 +93,7 @@ impl<'a> Node<'a> {
     async fn topic(&mut self, topic: &str, kind: &Published, qos: &str) -> Result<Topic, ZenohError> {
         let (name, hash) = (kind.dds_name(), kind.hash);
         let key = format!("{}/{}/{name}/{hash}", self.options.domain, topic.trim_start_matches('/'));
-        // Not to ourselves: a vehicle may take its own poses from the same /tf.
+        // Not to this session: a vehicle may get its own poses from the same /tf.
         let publisher = self.session.declare_publisher(key.clone()).allowed_destination(Locality::Remote);
         let publisher = publisher.congestion_control(CongestionControl::Drop);
         let publisher = match qos {
@@ -110,7 +110,7 @@ impl<'a> Node<'a> {
     }
 }
 
-/// Sixteen bytes that are this publisher's alone: they follow from its token, which has the session's id.
+/// Sixteen bytes that identify a publisher, hashed from its token, which contains the session's id.
 fn gid(token: &str) -> [u8; 16] {
     let half = |half: u8| {
         let mut hasher = DefaultHasher::new();
@@ -123,11 +123,11 @@ fn gid(token: &str) -> [u8; 16] {
     gid
 }
 
-fn not_ours(error: &clearway_client::ClientError) {
-    tracing::error!(%error, "ros: a map of our own");
+fn log_decode_error(error: &clearway_client::ClientError) {
+    tracing::error!(%error, "ros: the newest map cannot be decoded");
 }
 
-/// A publisher of one topic.
+/// The publisher of one topic.
 struct Topic {
     publisher: AdvancedPublisher<'static>,
     gid: [u8; 16],
@@ -135,7 +135,7 @@ struct Topic {
 }
 
 impl Topic {
-    /// Sends what is made of each newest map while somebody subscribes, and takes the layer meanwhile.
+    /// Sends the message of each newest map while there is a subscriber, and keeps the layer active meanwhile.
     async fn publish(
         mut self,
         served: Served,
@@ -145,14 +145,14 @@ impl Topic {
         let Ok(matching) = self.publisher.matching_listener().await else { return };
         let mut newest = served.newest.clone();
         loop {
-            // Asked again, as the first subscriber may be older than the listener.
+            // Checked first, because the first subscriber may be older than the listener.
             if !self.publisher.matching_status().await.is_ok_and(|status| status.matching()) {
                 match matching.recv_async().await {
                     Ok(_) => continue,
                     Err(_) => return,
                 }
             }
-            let _taken = layer.map(|layer| served.status.subscriptions.subscribe(&[layer.to_owned()]));
+            let _subscription = layer.map(|layer| served.status.subscriptions.subscribe(&[layer.to_owned()]));
             newest.mark_changed();
             loop {
                 tokio::select! {

@@ -1,12 +1,13 @@
-//! Maps over zenoh, one layer a key: `clearway/<vehicle>/map/<layer>`.
+//! Maps over zenoh, one key for each layer: `clearway/<vehicle>/map/<layer>`.
 //!
-//! A layer is made while somebody subscribes to its key, and for who asks for it: late joiners get the current map from the
-//! publisher's cache (an old one where nobody took it; its age tells), the same key answers queries. Misses can be detected. A liveliness token `clearway/<vehicle>` lives as long as the vehicle is served; `clearway/<vehicle>/status`
-//! has the status once a second, JSON.
+//! A layer is made while its key has a subscriber, and for each query on it. Late joiners get the current map from the
+//! publisher's cache; it is old if the layer had no subscriber, and its age says so. The same key answers queries.
+//! Subscribers can detect misses. A liveliness token `clearway/<vehicle>` lives as long as the vehicle is served;
+//! `clearway/<vehicle>/status` has the status once a second, as JSON.
 //!
-//! Congestion drops: blocking would let one stopped peer hold up the healthy ones. Maps go before all else on a link, for a
-//! planner brakes by them; the status, which the next one replaces anyway, goes after all else; observations and reports
-//! have zenoh's ordinary priority in between.
+//! Congestion drops: blocking would let one stopped peer delay the healthy ones. Maps have the highest priority on a link,
+//! because planners brake by them; the status has the lowest, because the next one replaces it; observations and reports
+//! have zenoh's default priority.
 
 use std::time::Duration;
 
@@ -20,16 +21,19 @@ use zenoh::Session;
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig, RepliesConfig};
 
 use super::ros::Node;
-use super::{Served, Vehicles};
+use super::served::{Served, Vehicles};
 use crate::config::Zenoh as Options;
 use crate::zenoh_session::ZenohError;
 
+/// Time between two status messages.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
-/// How often a publisher tells its last number, so that a lost last map is noticed. By the clock and not only after a map:
-/// then a lost heartbeat is made good by the next one, and it may be dropped (zenoh's sporadic one blocks).
+/// Interval at which a publisher repeats its last sequence, so that subscribers notice a lost last map. By the clock and
+/// not only after a map: then the next heartbeat replaces a lost one, and a heartbeat may be dropped (zenoh's sporadic
+/// heartbeat blocks).
 const HEARTBEAT: Duration = Duration::from_secs(1);
-/// Above zenoh's ordinary one (`Data`); `RealTime` is left to what a vehicle has that is more urgent than a map.
+/// Priority of maps: above zenoh's default (`Data`); `RealTime` is left for more urgent data of a vehicle.
 const MAPS: Priority = Priority::InteractiveHigh;
+/// Priority of the status.
 const STATUS: Priority = Priority::DataLow;
 
 /// The open session and what it publishes.
@@ -59,7 +63,7 @@ impl Publisher {
         Ok(publisher)
     }
 
-    /// Ends publishing; the tokens vanish at once.
+    /// Stops publishing; the tokens disappear at once.
     pub async fn stop(mut self) {
         self.tasks.shutdown().await;
         for token in self.tokens {
@@ -72,7 +76,7 @@ impl Publisher {
     async fn publish(&mut self, served: &Served) -> Result<(), ZenohError> {
         let vehicle = &served.status.name;
         let mut publishers = Vec::new();
-        // By default they block, and one late joiner that stops at once would hold up the next ones.
+        // By default replies block, and one late joiner that stops at once would delay the next ones.
         let replies = RepliesConfig::default().congestion_control(CongestionControl::Drop).priority(MAPS);
         let cache = CacheConfig::default().max_samples(1).replies_config(replies);
         for layer in &served.status.layers {
@@ -83,7 +87,7 @@ impl Publisher {
                 .encoding(map_encoding())
                 .congestion_control(CongestionControl::Drop)
                 .priority(MAPS)
-                // Its own sequence numbers: the cache needs them or time stamps, and with them misses are seen.
+                // Sequence numbers of the publisher: the cache needs them or time stamps, and subscribers detect misses by them.
                 .sample_miss_detection(MissDetectionConfig::default().heartbeat(HEARTBEAT))
                 .cache(cache.clone())
                 .publisher_detection()
@@ -91,7 +95,7 @@ impl Publisher {
                 .map_err(ZenohError::of(format!("publisher {key}")))?;
             let matching = publisher.matching_listener().await.map_err(ZenohError::of(format!("subscribers of {key}")))?;
             let matches = publisher.matching_status().await.map_err(ZenohError::of(format!("subscribers of {key}")))?;
-            self.tasks.spawn(take_while(served.clone(), layer, matches.matching(), matching));
+            self.tasks.spawn(subscribe_while(served.clone(), layer, matches.matching(), matching));
             publishers.push((*layer, publisher));
             self.answer(served, layer, key).await?;
         }
@@ -137,7 +141,7 @@ impl Publisher {
 }
 
 /// Takes a layer while the listener says that somebody subscribes to it.
-async fn take_while(
+async fn subscribe_while(
     served: Served,
     layer: &'static str,
     mut matches: bool,

@@ -11,7 +11,7 @@ use clearway_ros::Kind;
 
 use super::mcap_reader::{Content, Header, McapReadError, McapReader, Message};
 use crate::config::{Calibrations, Config, ConfigError};
-use crate::encode::{EventError, event_from_bytes};
+use crate::encode::{EventDecodeError, event_from_bytes};
 
 /// One message of a recording.
 #[derive(Clone, Debug, PartialEq)]
@@ -59,7 +59,7 @@ pub enum RecordingError {
         /// The topic of the journal.
         topic: String,
         /// The fault of the message.
-        source: EventError,
+        source: EventDecodeError,
     },
     /// The file has no configuration: another program wrote it, or it was cut before its first message.
     #[error("{}: no attachment config.toml: not a recording of clearway, or cut at its very start", file.display())]

@@ -65,7 +65,7 @@ impl Drive {
                 datagrams.map(|d| Sent { offset_ns: d.stamp_ns - START_NS, reading: Reading::Datagram(index, d) }),
             );
         }
-        let told = rig.told().take_while(|told| told.stamp_ns < end_ns);
+        let told = rig.observations().take_while(|told| told.stamp_ns < end_ns);
         sent.extend(told.map(|told| Sent {
             offset_ns: told.stamp_ns - START_NS,
             reading: Reading::Observation(Box::new(told.observation.into())),

@@ -1,6 +1,7 @@
-//! Whether a vehicle touches anything: its upright box against every shape of the world, exactly.
+//! Contact of a vehicle with the world: its upright box against every shape, exactly.
 //!
-//! In: a world, a time, the vehicle's place. Frame: world, metres. Leaves and beams count as far down as they hang.
+//! In: a world, a time, the vehicle's place. Frame: world, metres. Leaves and beams are touched only at the heights at
+//! which they hang.
 
 use super::object::{Kind, Shape};
 use super::world::World;
@@ -8,9 +9,9 @@ use super::world::World;
 /// A vehicle's box: its middle, heading (rad, counter-clockwise from x) and extents. It stands on the ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hull {
-    /// Middle.
+    /// Coordinate of the middle, in metres.
     pub x: f64,
-    /// Middle.
+    /// Coordinate of the middle, in metres.
     pub y: f64,
     /// Counter-clockwise from x.
     pub heading: f64,
@@ -19,7 +20,7 @@ pub struct Hull {
 }
 
 impl World {
-    /// What a vehicle touches at `time` s; `None` if nothing.
+    /// The first object that a vehicle touches at `time` s, or `None`.
     pub fn touched(&self, hull: &Hull, time: f64) -> Option<Kind> {
         let floor = self.ground.height(hull.x, hull.y);
         let shapes = self.objects.iter().map(|object| (object.kind, object.at(time, &self.ground)));
@@ -33,7 +34,7 @@ impl World {
 }
 
 impl Hull {
-    /// Whether the ground it covers meets what a shape covers.
+    /// True if the ground that the hull covers overlaps that of a shape.
     fn meets(&self, shape: &Shape) -> bool {
         let (outline, radius) = shape.outline();
         let corners = outline.map(|corner| self.in_own_frame(corner));
@@ -77,7 +78,7 @@ mod tests {
     use crate::scene::ground::Ground;
 
     #[test]
-    fn a_vehicle_touches_what_stands_in_its_way_and_passes_under_what_hangs_high() {
+    fn a_vehicle_touches_standing_objects_and_passes_under_high_ones() {
         let world = World::on(Ground::default())
             .parked_car(10.0, 0.0, 0.0)
             .pole(0.0, 5.0, 0.1, 4.0)

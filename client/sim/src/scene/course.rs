@@ -1,7 +1,7 @@
-//! Where a vehicle drives: a line of straights and arcs, and how far along it a drive is at each time.
+//! A course, made of straights and arcs, and a drive along it.
 //!
-//! Out: place and heading in the world frame as functions of the time, in closed form, so that any moment can be asked
-//! for by itself.
+//! Out: place and heading in the world frame as functions of the time, in closed form, so that any time can be computed
+//! by itself.
 
 use std::f64::consts::TAU;
 use std::sync::Arc;
@@ -59,7 +59,7 @@ impl Course {
         self
     }
 
-    /// Length, metres.
+    /// Length of the course, in metres.
     pub fn length(&self) -> f64 {
         self.length
     }
@@ -82,7 +82,7 @@ impl Course {
     }
 }
 
-/// A course driven: which way, how fast, from where.
+/// A drive along a course: its direction, speed and start.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Drive {
     /// The line followed.
@@ -95,7 +95,7 @@ pub struct Drive {
     pub speed: f64,
     /// The speed swings about its mean by this much, m/s; less than the mean.
     pub swing: f64,
-    /// One swing takes this long, s.
+    /// Period of the swing, s.
     pub swing_s: f64,
 }
 
@@ -107,8 +107,8 @@ impl Drive {
 
     /// Metres along the course at `time` s.
     pub fn station(&self, time: f64) -> f64 {
-        let turn = TAU / self.swing_s;
-        self.start + self.speed * time + self.swing / turn * (1.0 - (turn * time).cos())
+        let rate = TAU / self.swing_s;
+        self.start + self.speed * time + self.swing / rate * (1.0 - (rate * time).cos())
     }
 
     /// Speed at `time` s, m/s, never negative.

@@ -1,4 +1,4 @@
-//! A scene seen from above, as text: what a reviewer looks at.
+//! A scene seen from above, as text, for reviewers.
 //!
 //! In: a truth raster. Out: lines of characters, the vehicle's x up the page and its y to the left, as on a map that is
 //! held in driving direction.
@@ -7,8 +7,8 @@ use super::truth::{Truth, TruthGrid};
 
 /// Draws `ahead` metres to the front and back and `beside` metres to either side, `rows` by `columns` characters.
 ///
-/// `.` drivable, `:` tight, `-` out of reach, `/` steep, `#` obstacle, `^` the vehicle; a character shows the gravest
-/// class it covers.
+/// `.` drivable, `:` tight, `-` out of reach, `/` steep, `#` obstacle, `^` the vehicle; a character shows the greatest
+/// class that it covers, in the order of [`Truth`].
 pub fn plan(truth: &TruthGrid, (ahead, beside): (f64, f64), (rows, columns): (usize, usize)) -> String {
     let mut page = String::with_capacity(rows * (columns + 1));
     let (tall, wide) = (2.0 * ahead / rows as f64, 2.0 * beside / columns as f64);
@@ -17,15 +17,15 @@ pub fn plan(truth: &TruthGrid, (ahead, beside): (f64, f64), (rows, columns): (us
         let mut line = String::with_capacity(columns);
         for column in 0..columns {
             let (x, y) = (ahead - row as f64 * tall, beside - column as f64 * wide);
-            let mut gravest = Truth::Outside;
+            let mut greatest = Truth::Outside;
             for i in 0..parts(tall) {
                 for j in 0..parts(wide) {
                     let part = |index: usize, size: f64| (index as f64 + 0.5) / parts(size) as f64 * size;
-                    gravest = gravest.max(truth.class_at(x - part(i, tall), y - part(j, wide)));
+                    greatest = greatest.max(truth.class_at(x - part(i, tall), y - part(j, wide)));
                 }
             }
             let here = x > 0.0 && x <= tall && y > 0.0 && y <= wide;
-            line.push(match gravest {
+            line.push(match greatest {
                 _ if here => '^',
                 Truth::Outside => ' ',
                 Truth::Drivable => '.',

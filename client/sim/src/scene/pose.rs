@@ -1,4 +1,4 @@
-//! Where a vehicle is: its drive laid on the ground.
+//! The pose of a vehicle: its drive projected on the ground.
 //!
 //! In: world, drive, time. Out: `map_from_ego`. The ego frame leans with the ground under the wheels.
 

@@ -1,7 +1,7 @@
-//! The scenes: the thesis' four (§V, figures 5 to 8), a dirt track, and a town to drive in for ever.
+//! The scenes: the four of the UT Austin thesis (section V, figures 5 to 8), a dirt track, and a town without end.
 //!
-//! Each is a [`World`] and the [`Drive`] of the vehicle in it. In the thesis' scenes the vehicle stands at the world's
-//! origin and looks along x.
+//! Each is a [`World`] and the [`Drive`] of the vehicle in it. In the scenes of the UT Austin thesis the vehicle stands
+//! at the world's origin and faces along x.
 
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::sync::Arc;
@@ -10,16 +10,16 @@ use super::course::{Course, Drive};
 use super::ground::{Ground, Profile, Terrace};
 use super::world::{SLATS, World};
 
-/// A world and the way a vehicle takes through it.
+/// A world, and the drive of a vehicle through it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
-    /// What it is called.
+    /// Name of the scene.
     pub name: &'static str,
-    /// The ground and what is on it.
+    /// A world: its ground and objects.
     pub world: Arc<World>,
-    /// The vehicle's way.
+    /// Drive of the vehicle.
     pub drive: Drive,
-    /// The drivable share the thesis reports for it (table of §V), percent.
+    /// Drivable share that the UT Austin thesis reports for the scene (section V, table), percent.
     pub paper_share: Option<f64>,
 }
 
@@ -30,7 +30,7 @@ fn standing(name: &'static str, world: World, paper_share: f64) -> Scene {
     Scene { name, world: Arc::new(world), drive: Drive::steady(course, 0.0, 0.0, 0.0), paper_share: Some(paper_share) }
 }
 
-/// All the thesis' scenes, in the order of its table.
+/// The scenes of the UT Austin thesis, in the order of its table.
 pub fn of_the_thesis() -> [Scene; 4] {
     [flat(), slopes_with_obstacles(), fenced_road_under_canopy(), fenced_road_with_low_overhang()]
 }
@@ -69,8 +69,8 @@ pub fn slopes_with_obstacles() -> Scene {
         .parked_car(20.0, 4.2, PI)
         .parked_car(39.0, -4.6, PI)
         .wall(&[[4.0, 12.0], [30.0, 12.5]], 1.8)
-        .house(-14.0, 18.0, 0.0, [12.0, 9.0], 6.0)
-        .house(40.0, 19.0, 0.1, [10.0, 9.0], 6.0)
+        .building(-14.0, 18.0, 0.0, [12.0, 9.0], 6.0)
+        .building(40.0, 19.0, 0.1, [10.0, 9.0], 6.0)
         .wall(&[[-40.0, -13.0], [-12.0, -13.0]], 2.2);
     for step in 0..9 {
         let x = -34.0 + 8.5 * f64::from(step);
@@ -85,7 +85,7 @@ pub fn fenced_road_under_canopy() -> Scene {
     standing("fenced road under canopy", fenced_road(), 78.3)
 }
 
-/// The same with something hanging too low over the road just ahead (figure 8): 37.00 %.
+/// The same scene with a beam that hangs too low over the road just ahead (figure 8): 37.00 %.
 pub fn fenced_road_with_low_overhang() -> Scene {
     let (left, right) = (on_the_bend(4.0, ROAD_HALF_M), on_the_bend(4.0, -ROAD_HALF_M));
     let world = fenced_road().beam(left, right, 1.5, 2.2);
@@ -106,12 +106,13 @@ fn fenced_road() -> World {
     let line = |left: f64, from: i32, to: i32| -> Vec<[f64; 2]> {
         (from..=to).map(|step| on_the_bend(4.0 * f64::from(step), left)).collect()
     };
-    // Slats on the left; on the right a wall that gives way to slats.
+    // There are slats on the left; on the right, a wall is followed by slats.
     let mut world = World::on(Ground { reflectivity: ASPHALT, ..Ground::default() })
         .fence(&line(ROAD_HALF_M, BEHIND, 17), 1.4, Some(SLATS))
         .wall(&line(-ROAD_HALF_M, BEHIND, 4), 2.0)
         .fence(&line(-ROAD_HALF_M, 4, 17), 1.4, Some(SLATS));
-    // The road's ends are closed, by a wall close behind and a fence far ahead, so that nothing is reached round them.
+    // The road's ends are closed, by a wall close behind and a fence far ahead, so that no ground behind them can be
+    // reached.
     let across = |step: i32| [ROAD_HALF_M, -ROAD_HALF_M].map(|left| on_the_bend(4.0 * f64::from(step), left));
     world = world.wall(&across(BEHIND), 2.0).fence(&across(17), 1.4, Some(SLATS));
     for step in 0..8 {
@@ -124,7 +125,7 @@ fn fenced_road() -> World {
         world = world.canopy(x, y, 4.0, 2.9);
     }
     let [car_x, car_y] = on_the_bend(19.0, -6.2);
-    world.parked_car(car_x, car_y, 0.15).wall(&[[-30.0, 24.0], [6.0, 24.0]], 2.5).house(
+    world.parked_car(car_x, car_y, 0.15).wall(&[[-30.0, 24.0], [6.0, 24.0]], 2.5).building(
         20.0,
         -26.0,
         0.3,
@@ -133,7 +134,7 @@ fn fenced_road() -> World {
     )
 }
 
-/// Where the fenced road ends behind the vehicle, in steps of 4 m.
+/// End of the fenced road behind the vehicle, in steps of 4 m.
 const BEHIND: i32 = -2;
 
 /// Half the width of the dirt track, metres.
@@ -157,9 +158,9 @@ const STREET_HALF_M: f64 = 5.6;
 const LOOP_HALF_M: [f64; 2] = [80.0, 50.0];
 const LOOP_CORNER_M: f64 = 18.0;
 
-/// A town: a street round a block of houses and gardens, more houses outside, cars parked and driving.
+/// A town: a street round a block of buildings and gardens, more buildings outside, cars parked and driving.
 ///
-/// The vehicle drives round it counter-clockwise in the right-hand lane, at 8 m/s give or take 2, for ever.
+/// The vehicle drives round the block counter-clockwise in the right-hand lane, at 6 to 10 m/s, without end.
 pub fn town() -> Scene {
     let street = |left: f64| {
         let radius = LOOP_CORNER_M;
@@ -181,7 +182,7 @@ pub fn town() -> Scene {
     };
     let terraces = vec![block(-STREET_HALF_M, false, 0.14), block(STREET_HALF_M, true, 0.14)];
     let ground = Ground { along: Profile::default(), across: Profile::default(), terraces, reflectivity: ASPHALT };
-    let mut world = town_houses(World::on(ground));
+    let mut world = town_buildings(World::on(ground));
     world = town_street(world, &course);
     let drive = Drive { swing: 2.0, swing_s: 25.0, ..Drive::steady(course.clone(), 20.0, lane, 8.0) };
     // One car ahead keeps its distance; the others come towards the vehicle.
@@ -192,21 +193,21 @@ pub fn town() -> Scene {
     Scene { name: "town", world: Arc::new(world), drive, paper_share: None }
 }
 
-/// Houses with gardens fenced in between them, inside and outside the street.
-fn town_houses(mut world: World) -> World {
-    // How far the house fronts and garden fences stand back from the street's middle line.
+/// Buildings with gardens fenced in between them, inside and outside the street.
+fn town_buildings(mut world: World) -> World {
+    // How far the building fronts and garden fences stand back from the street's middle line.
     let (front, depth) = (STREET_HALF_M + 3.0, 10.0);
     for (side, sign) in [(-1.0, 1.0), (-1.0, -1.0), (1.0, 1.0), (1.0, -1.0)] {
         // `sign` +1: the block inside the street; -1: beyond it.
         let line = side * (LOOP_HALF_M[1] - sign * front);
-        let houses = if sign > 0.0 { 5 } else { 7 };
+        let buildings = if sign > 0.0 { 5 } else { 7 };
         let pitch = 24.0;
-        let first = -pitch * f64::from(houses - 1) / 2.0;
-        for number in 0..houses {
+        let first = -pitch * f64::from(buildings - 1) / 2.0;
+        for number in 0..buildings {
             let x = first + pitch * f64::from(number);
             let size = [13.0 + f64::from(number % 3), depth];
-            world = world.house(x, line - side * sign * depth / 2.0, 0.0, size, 6.0 + f64::from(number % 2));
-            if number + 1 < houses {
+            world = world.building(x, line - side * sign * depth / 2.0, 0.0, size, 6.0 + f64::from(number % 2));
+            if number + 1 < buildings {
                 let gap = [[x + size[0] / 2.0, line], [x + pitch - (13.0 + f64::from((number + 1) % 3)) / 2.0, line]];
                 let slats = if number % 2 == 0 { Some(SLATS) } else { None };
                 world = world.fence(&gap, 1.3, slats).tree(x + pitch / 2.0, line - side * sign * 5.0, 2.8, 2.6);
@@ -215,12 +216,12 @@ fn town_houses(mut world: World) -> World {
     }
     for (side, sign) in [(-1.0, 1.0), (-1.0, -1.0), (1.0, 1.0), (1.0, -1.0)] {
         let line = side * (LOOP_HALF_M[0] - sign * front);
-        let houses = if sign > 0.0 { 2 } else { 4 };
-        let first = -11.0 * f64::from(houses - 1);
-        for number in 0..houses {
+        let buildings = if sign > 0.0 { 2 } else { 4 };
+        let first = -11.0 * f64::from(buildings - 1);
+        for number in 0..buildings {
             let y = first + 22.0 * f64::from(number);
-            world = world.house(line - side * sign * depth / 2.0, y, FRAC_PI_2, [14.0, depth], 6.5);
-            if number + 1 < houses {
+            world = world.building(line - side * sign * depth / 2.0, y, FRAC_PI_2, [14.0, depth], 6.5);
+            if number + 1 < buildings {
                 world = world.fence(&[[line, y + 7.0], [line, y + 15.0]], 1.3, Some(SLATS));
             }
         }
@@ -231,7 +232,7 @@ fn town_houses(mut world: World) -> World {
         let corner = [[sx * 54.0, sy * y], [sx * (x - 6.0), sy * y], [sx * x, sy * (y - 6.0)], [sx * x, sy * 17.0]];
         world = world.wall(&corner, 1.6);
     }
-    // So are those of the houses beyond the street.
+    // Garden walls close the corners of the buildings beyond the street too.
     let (x, y) = (LOOP_HALF_M[0] + front, LOOP_HALF_M[1] + front);
     for (sx, sy) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
         world = world.wall(&[[sx * 78.0, sy * y], [sx * x, sy * y], [sx * x, sy * 39.0]], 1.6);
@@ -239,7 +240,7 @@ fn town_houses(mut world: World) -> World {
     world
 }
 
-/// What lines the street: parked cars, trees, lamps, a gantry.
+/// Adds what stands along the street: parked cars, trees, lamps, gantries.
 fn town_street(mut world: World, course: &Course) -> World {
     let kerb = STREET_HALF_M;
     let spots = (course.length() / 7.0) as usize;

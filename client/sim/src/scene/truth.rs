@@ -1,60 +1,61 @@
-//! What is drivable in a world, known from the world itself: the truth the maps are held against.
+//! The truth about drivable ground, computed from the world itself, with which maps are compared.
 //!
 //! In: a world, the vehicle's pose, a time. Out: a raster in the ego frame (x forward, y left, metres). The limits are
-//! the thesis' §IV: a step of one unit (0.25 m), a clearance of 2.5 m, gates 3 m wide (criterion 3).
+//! those of the UT Austin thesis, section IV: a step of one unit (0.25 m), a clearance of 2.5 m, passages 3 m wide
+//! (criterion 3).
 
 use nalgebra::{Isometry3, Point3};
 
 use super::object::Shape;
 use super::world::World;
 
-/// What a place is to a vehicle that stands at the raster's middle.
+/// Class of a place, for a vehicle that stands in the middle of the raster.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Truth {
     /// Beyond the raster.
     #[default]
     Outside,
-    /// Free ground the vehicle reaches through gates wide enough.
+    /// Free ground that the vehicle reaches through passages that are wide enough.
     Drivable,
-    /// Free ground that is reached only through narrower gates, or a niche too narrow for the vehicle: either answer of
-    /// a map can be defended.
+    /// Free ground that is reached only through narrower passages, or is too narrow for the vehicle: a map may call it
+    /// drivable or not.
     Tight,
-    /// Free ground with no way to it.
+    /// Free ground that the vehicle cannot reach.
     Unreachable,
-    /// Ground that is too steep, or the edge of too high a step.
+    /// Ground that is too steep, or the edge of a step that is too high.
     Steep,
-    /// Something stands or hangs within the clearance.
+    /// Ground under an object that stands or hangs within the clearance.
     Obstacle,
 }
 
-/// What a vehicle can do.
+/// Limits of what a vehicle can drive on.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
-    /// Steepest ground, rise over run.
+    /// Steepest ground, as rise over run.
     pub slope_max: f64,
-    /// Highest step, and highest object that is driven over, metres.
+    /// Highest step, and highest object that the vehicle drives over, metres.
     pub step_m_max: f64,
-    /// Nothing hangs lower than this over drivable ground, metres.
+    /// Least height of an object over drivable ground, metres.
     pub clearance_m: f64,
-    /// Narrowest gate, metres.
-    pub gate_m_min: f64,
+    /// Narrowest passage, metres.
+    pub passage_m_min: f64,
 }
 
 impl Default for Limits {
-    /// 20 degrees, and the thesis' unit, cut-off height and boundary length (§IV).
+    /// 20 degrees (ours), and the unit, cut-off height and boundary length of the UT Austin thesis, section IV.
     fn default() -> Self {
-        Self { slope_max: 0.364, step_m_max: 0.25, clearance_m: 2.5, gate_m_min: 3.0 }
+        Self { slope_max: 0.364, step_m_max: 0.25, clearance_m: 2.5, passage_m_min: 3.0 }
     }
 }
 
-/// The truth about the ground around a vehicle, as a raster in its ego frame.
+/// Raster of the truth about the ground around a vehicle, in its ego frame.
 #[derive(Clone, Debug)]
 pub struct TruthGrid {
     /// Distance from the vehicle to each side of the raster, metres.
     pub half_extent_m: f64,
     /// Side of a cell, metres.
     pub cell_m: f64,
-    /// Cells a side.
+    /// Number of cells of a side.
     pub side: usize,
     /// Row by row: cell (i, j) at index `j * side + i` has its middle at x = (i + 0.5) * cell_m - half_extent_m, y
     /// alike.
@@ -110,7 +111,8 @@ impl TruthGrid {
         (place(index % self.side), place(index / self.side))
     }
 
-    /// World place (x, y, height of the ground) under each cell; a tilted vehicle's raster is carried along its z axis.
+    /// World point (x, y, height of the ground) of each cell. The raster of a tilted vehicle is projected along its z
+    /// axis.
     fn lay_on_ground(&mut self, world: &World, map_from_ego: &Isometry3<f64>) -> Vec<[f64; 3]> {
         let up = map_from_ego.rotation * nalgebra::Vector3::z();
         (0..self.classes.len())
@@ -155,7 +157,7 @@ impl TruthGrid {
         places: &[[f64; 3]],
         limits: &Limits,
     ) {
-        // Half a cell's diagonal: no thin thing slips between two middles.
+        // Half the diagonal of a cell, so that no thin object falls between two cell centres.
         let margin = 0.71 * self.cell_m;
         for shape in world.shapes_at(time) {
             let Some((low, high)) = self.cells_about(&shape, map_from_ego) else { continue };
@@ -177,7 +179,7 @@ impl TruthGrid {
     /// Lowest and highest cell indices that a shape can cover, or `None` if it is beyond the raster.
     fn cells_about(&self, shape: &Shape, map_from_ego: &Isometry3<f64>) -> Option<([usize; 2], [usize; 2])> {
         let (corners, radius) = shape.outline();
-        // A tilted raster's cells lean with the ground's height: a metre covers that.
+        // The cells of a tilted raster shift with the height of the ground, by less than a metre.
         let margin = radius + 1.0;
         let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
         for [x, y] in corners {
@@ -192,18 +194,20 @@ impl TruthGrid {
         (!beyond).then(|| (low.map(|cell| cell.max(0.0) as usize), high.map(|cell| cell.min(last) as usize)))
     }
 
-    /// Turns free ground into drivable, tight and unreachable ground.
+    /// Divides free ground into drivable, tight and unreachable ground.
     fn mark_reachable(&mut self, limits: &Limits) {
         let free: Vec<bool> = self.classes.iter().map(|&class| class == Truth::Unreachable).collect();
-        let half_gate = limits.gate_m_min / 2.0 / self.cell_m;
-        // Where a disc as wide as a gate fits; what the vehicle's own disc can be rolled to; what that disc sweeps.
-        let fits: Vec<bool> = squared_distance(&free, self.side).iter().map(|&d| d >= half_gate * half_gate).collect();
-        let rolled = self.flood(&fits, limits.gate_m_min);
+        let half_passage = limits.passage_m_min / 2.0 / self.cell_m;
+        // The places where a disc as wide as a passage fits; those it can be moved to from the vehicle; and the ground
+        // that the disc then covers.
+        let fits: Vec<bool> =
+            squared_distance(&free, self.side).iter().map(|&d| d >= half_passage * half_passage).collect();
+        let rolled = self.flood(&fits, limits.passage_m_min);
         let outside: Vec<bool> = rolled.iter().map(|&rolled| !rolled).collect();
         let swept = squared_distance(&outside, self.side);
-        let connected = self.flood(&free, limits.gate_m_min);
+        let connected = self.flood(&free, limits.passage_m_min);
         for index in 0..self.classes.len() {
-            if free[index] && swept[index] < half_gate * half_gate {
+            if free[index] && swept[index] < half_passage * half_passage {
                 self.classes[index] = Truth::Drivable;
             } else if connected[index] {
                 self.classes[index] = Truth::Tight;
@@ -211,7 +215,7 @@ impl TruthGrid {
         }
     }
 
-    /// The open cells connected, side by side, to those within `seed_m` of the vehicle.
+    /// True for the open cells that are connected by their sides to open cells within `seed_m` of the vehicle.
     fn flood(&self, open: &[bool], seed_m: f64) -> Vec<bool> {
         let mut reached = vec![false; open.len()];
         let mut front: Vec<usize> = (0..open.len())
@@ -262,7 +266,7 @@ fn squared_distance(open: &[bool], side: usize) -> Vec<f64> {
     distances
 }
 
-/// Lowest of the parabolas that stand on each value, at each place.
+/// At each index, the lowest of the parabolas that stand on the values.
 fn envelope(values: &[f64]) -> Vec<f64> {
     let mut feet: Vec<usize> = Vec::with_capacity(values.len());
     let mut from: Vec<f64> = Vec::with_capacity(values.len());
@@ -304,7 +308,7 @@ mod tests {
         TruthGrid::about(world, &Isometry3::identity(), 0.0, EXTENT, &Limits::default())
     }
 
-    /// A fence right round the vehicle, 12 m to each side, with a gate of this width ahead.
+    /// A fence right round the vehicle, 12 m to each side, with an opening of this width ahead.
     fn ring_with_gate(width: f64) -> World {
         let (side, gate) = (12.0, width / 2.0);
         World::on(Ground::default()).fence(

@@ -1,7 +1,7 @@
 //! Firings to data packets: the decoder's inverse.
 //!
-//! In: firings of raw returns, in time order. Out: 1206 bytes (clearway-lidar's `packet.rs` has the layout). Which
-//! block holds what is read from the model's [`ModelSpec`], the same that the decoder reads.
+//! In: firings of raw returns, in time order. Out: packets of 1206 bytes (the layout is in `packet.rs` of
+//! clearway-lidar). The content of each block follows from the model's [`ModelSpec`], which the decoder uses too.
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::calibration::status_table::status_bytes;
@@ -10,25 +10,25 @@ use clearway_lidar::packet::{BLOCK_LENGTH, PACKET_LENGTH};
 
 use super::telemetry::{civil_time, device_us};
 
-/// One echo on the wire; distance 0: no return.
+/// One echo as the packet holds it; distance 0 means no return.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RawReturn {
-    /// Distance counts.
+    /// Distance, in counts of the model's distance unit.
     pub distance: u16,
-    /// 0 to 255.
+    /// Intensity, 0 to 255.
     pub intensity: u8,
 }
 
-/// One firing as the sensor's electronics hold it.
+/// One firing of all lasers, before it is packed.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RawFiring {
-    /// When, ns since the Unix epoch.
+    /// Time of the firing, ns since the Unix epoch.
     pub stamp_ns: i64,
     /// Encoder angle, hundredths of a degree, in `0..36000`.
     pub azimuth: u16,
-    /// One slot a laser, for the only echo or the strongest.
+    /// For each laser, the only echo or the strongest.
     pub strongest: Vec<RawReturn>,
-    /// One slot a laser for the last echo of dual-return mode; else empty.
+    /// For each laser, the last echo in dual-return mode; else empty.
     pub last: Vec<RawReturn>,
 }
 
@@ -37,14 +37,14 @@ pub struct RawFiring {
 pub struct Encoder {
     spec: &'static ModelSpec,
     mode: ReturnMode,
-    /// The status type and value of an HDL-64E's packets, over and over.
+    /// The status types and values of an HDL-64E's packets, which repeat.
     status: Vec<(u8, u8)>,
     firings: Vec<RawFiring>,
     packets: i64,
 }
 
 impl Encoder {
-    /// An encoder of `model` in `mode`. An HDL-64E S2 or S3 sends `calibration` a byte a packet, over and over.
+    /// An encoder of `model` in `mode`. An HDL-64E S2 or S3 sends `calibration` repeatedly, one byte a packet.
     pub fn new(model: Model, mode: ReturnMode, calibration: &Calibration) -> Self {
         let status = match model {
             Model::Hdl64eS2 | Model::Hdl64eS3 => status_bytes(model, calibration),
@@ -53,14 +53,13 @@ impl Encoder {
         Self { spec: model.spec(), mode, status, firings: Vec::new(), packets: 0 }
     }
 
-    /// The same encoder with `number` as its next packet and nothing begun.
-    pub fn at_packet(mut self, number: i64) -> Self {
+    /// Drops the firings of an unfinished packet; the next packet is packet `number`.
+    pub fn begin_packet(&mut self, number: i64) {
         self.firings.clear();
         self.packets = number;
-        self
     }
 
-    /// Takes the next firing; gives the packet it completed, if any.
+    /// Adds the next firing; returns the packet that it completes, if any.
     pub fn push(&mut self, firing: RawFiring) -> Option<[u8; PACKET_LENGTH]> {
         self.firings.push(firing);
         (self.firings.len() == self.spec.firings_per_packet(self.mode)).then(|| {
@@ -98,8 +97,8 @@ impl Encoder {
         bytes
     }
 
-    /// What an HDL-64E under GPS says of the time: binary, the second before this one, as its GPRMC tells it (HDL-64E
-    /// S3 manual, appendix E). All of a cycle is said as its first packet finds it.
+    /// The status bytes by which an HDL-64E with GPS sends the time: binary, the second before the present one, as in
+    /// its GPRMC (HDL-64E S3 manual, appendix E). All bytes of a cycle are of the time of its first packet.
     fn clock_value(&self, kind: u8) -> Option<u8> {
         const CYCLE: i64 = 16;
         if !b"HMSDNYG".contains(&kind) {
@@ -115,18 +114,18 @@ impl Encoder {
             b'D' => day,
             b'N' => month,
             b'Y' => year % 100,
-            // Pulse and time are both there.
+            // GPS time and pulse are both present.
             _ => b'A'.into(),
         };
         u8::try_from(value).ok()
     }
 
-    /// The last six bytes: time past the hour, and return mode and model or status.
+    /// The last six bytes: the time past the hour, then return mode and model, or status.
     fn tail(&self) -> [u8; 6] {
         let [a, b, c, d] = device_us(self.firings[0].stamp_ns).to_le_bytes();
         match (self.spec.model_bytes.first(), self.status.len() as i64) {
             (Some(&model), _) => [a, b, c, d, mode_byte(self.mode), model],
-            // An S1 has no clock: firmware and spin count, temperature and its unit, in turn.
+            // An S1 has no clock: firmware and spin count alternate with temperature and its unit.
             (None, 0) if self.packets % 2 == 0 => *b"\x58\x02v25c",
             (None, 0) => *b"\x00\x19DegC",
             (None, length) => {

@@ -1,7 +1,7 @@
-//! A LIDAR of a few planes, as built into bumpers (Seo 2014 §2, §3): whole scans of one field of view.
+//! A LIDAR of a few planes, as built into bumpers (Seo 2014, sections 2 and 3): whole scans of one field of view.
 //!
-//! In: a world, the vehicle's pose at any time, the unit's figures. Out: [`PlaneScan`]s, sensor frame (x forward, y
-//! left, z up), each point where it was seen from at its own time; rays that met nothing are told by their directions.
+//! In: a world, the vehicle's pose at any time, the unit's constants. Out: [`PlaneScan`]s in the sensor frame (x
+//! forward, y left, z up), each point as measured at its own time; rays without a return are given as directions.
 
 use nalgebra::{Isometry3, Point3, Vector3};
 
@@ -9,36 +9,36 @@ use super::raycast::Caster;
 use crate::noise::{gaussian, mixed, uniform};
 use crate::scene::scenes::Scene;
 
-/// Nothing nearer than this returns, metres.
+/// Least range that returns, metres.
 const RANGE_M_MIN: f64 = 0.3;
 
-/// What such a unit is and how good it is.
+/// Geometry, mounting and accuracy of a unit.
 #[derive(Clone, Debug)]
 pub struct PlaneUnit {
     /// Elevation of each plane, rad, lowest first.
     pub elevations: Vec<f64>,
-    /// Field of view, rad, the same to both sides.
+    /// Field of view, rad, half of it to each side.
     pub field: f64,
-    /// Rays of a plane.
+    /// Number of rays in a plane.
     pub azimuths: u32,
-    /// From one scan to the next, ns.
+    /// Time from one scan to the next, ns.
     pub period_ns: i64,
-    /// Where it is mounted.
+    /// Pose of the unit on the vehicle.
     pub ego_from_sensor: Isometry3<f64>,
-    /// Deviation of the range, metres.
+    /// Standard deviation of the range, metres.
     pub noise_m: f64,
-    /// Share of the returns that go missing, 0 to 1.
+    /// Share of the returns that are missing, 0 to 1.
     pub dropout: f64,
-    /// Nothing farther returns, metres.
+    /// Greatest range that returns, metres.
     pub range_m_max: f64,
-    /// The same seed gives the same scans.
+    /// Seed of noise and missing returns: the same seed gives the same scans.
     pub seed: u64,
 }
 
 impl Default for PlaneUnit {
-    /// Four planes, 110 degrees in quarters of a degree, 50 scans a second, 200 m (§3). The paper prints 8 degrees from
-    /// plane to plane; the units of its time with such figures have 0.8, and with 8 two of four planes would look over
-    /// or under every car beyond 10 m.
+    /// Four planes, 110 degrees in quarters of a degree, 50 scans a second, 200 m (Seo 2014, section 3). The paper
+    /// prints 8 degrees from plane to plane. We use 0.8, as units of that time with the same other data have: with 8,
+    /// two of the four planes would pass over or under every car beyond 10 m.
     fn default() -> Self {
         Self {
             elevations: [-1.2, -0.4, 0.4, 1.2].map(f64::to_radians).to_vec(),
@@ -54,30 +54,30 @@ impl Default for PlaneUnit {
     }
 }
 
-/// One pass over the field of view. Same index, same point.
+/// One pass over the field of view. The same index in each list is the same point.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PlaneScan {
-    /// When it ended, ns after the scene's beginning.
+    /// End of the scan, ns after the scene's beginning.
     pub end_ns: i64,
-    /// Metres forward.
+    /// Forward, metres.
     pub x: Vec<f32>,
-    /// Metres to the left.
+    /// To the left, metres.
     pub y: Vec<f32>,
-    /// Metres up.
+    /// Up, metres.
     pub z: Vec<f32>,
-    /// 0 to 1.
+    /// Intensity, 0 to 1.
     pub intensity: Vec<f32>,
-    /// Plane, 0 lowest.
+    /// Index of the plane, 0 for the lowest.
     pub ring: Vec<u16>,
-    /// ns after the end, so at most 0.
+    /// Time after the end of the scan, ns, so at most 0.
     pub offset_ns: Vec<i32>,
-    /// Directions, length 1, of rays that came back with nothing.
+    /// Directions, length 1, of rays without a return.
     pub no_returns: Vec<[f32; 3]>,
 }
 
 impl PlaneUnit {
-    /// Scan `number`, which ends `number` periods after the scene's beginning; the mirror turns once a period, so the
-    /// field of view is passed in its share of that, from right to left.
+    /// Scan `number`, which ends `number` periods after the scene's beginning. The mirror rotates once a period, so it
+    /// passes the field of view in the field's share of a period, from right to left.
     pub fn scan(&self, scene: &Scene, number: i64) -> PlaneScan {
         let end_ns = number * self.period_ns;
         let mut scan = PlaneScan { end_ns, ..PlaneScan::default() };

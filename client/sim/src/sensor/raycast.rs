@@ -11,17 +11,17 @@ use crate::scene::world::World;
 
 /// Sectors about the sensor.
 const SECTORS: usize = 720;
-/// The sensor and the moving objects may move this far before the sectors are made anew, metres.
+/// Distance that the sensor and the moving objects may move before the sectors are made again, metres.
 const SLACK_M: f64 = 0.5;
 
-/// What a ray met.
+/// The point at which a ray met the world.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
     /// Distance along the ray, metres.
     pub range_m: f64,
     /// The object's index in [`World::objects`]; `None` is the ground.
     pub object: Option<usize>,
-    /// What the return weighs, 0 to 255.
+    /// Reflectivity of what was met, 0 to 255.
     pub reflectivity: u8,
 }
 
@@ -91,9 +91,9 @@ impl<W: Deref<Target = World>> Caster<W> {
             let first = bearing(corners[0]);
             let (mut low, mut high) = (0.0_f64, 0.0_f64);
             for &corner in &corners[1..] {
-                let turn = (bearing(corner) - first + PI).rem_euclid(TAU) - PI;
-                low = low.min(turn);
-                high = high.max(turn);
+                let offset = (bearing(corner) - first + PI).rem_euclid(TAU) - PI;
+                low = low.min(offset);
+                high = high.max(offset);
             }
             let reach = if radius > 0.0 { distance + radius } else { distance };
             let spread = (margin / reach).min(1.0).asin();
@@ -111,12 +111,12 @@ impl<W: Deref<Target = World>> Caster<W> {
         self.cast_through(origin, direction, Some(draw))
     }
 
-    /// The same, leaves left out: what a beam's remainder meets after them.
+    /// The same without leaves: the point that the rest of a ray meets behind them.
     pub fn cast_behind_leaves(&self, origin: [f64; 3], direction: [f64; 3]) -> Option<Hit> {
         self.cast_through(origin, direction, None)
     }
 
-    /// Whether the ground at (x, y) can be seen from `origin` (metres, world); leaves do not hide it.
+    /// True if the ground at (x, y) is visible from `origin` (metres, world frame). Leaves do not hide it.
     pub fn sees_ground(&self, origin: [f64; 3], x: f64, y: f64) -> bool {
         const TOLERANCE_M: f64 = 0.05;
         let way = [x - origin[0], y - origin[1], self.world.ground.height(x, y) - origin[2]];
@@ -208,7 +208,7 @@ mod tests {
 
     #[test]
     fn ground_behind_a_house_is_not_seen_and_ground_before_it_is() {
-        let world = World::default().house(10.0, 0.0, 0.0, [4.0, 8.0], 5.0).canopy(0.0, 10.0, 3.0, 1.0);
+        let world = World::default().building(10.0, 0.0, 0.0, [4.0, 8.0], 5.0).canopy(0.0, 10.0, 3.0, 1.0);
         let (caster, eye) = (Caster::new(&world, [0.0, 0.0, 1.9], 0.0, 120.0), [0.0, 0.0, 1.9]);
         assert!(caster.sees_ground(eye, 7.5, 0.0));
         assert!(!caster.sees_ground(eye, 20.0, 0.0));

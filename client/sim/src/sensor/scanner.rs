@@ -1,8 +1,8 @@
-//! One sensor: firings at their own times, each ray along its laser's true line, raw returns as the sensor would
-//! report.
+//! One rotating sensor: firings at their own times, each ray along its laser's true line, raw returns as the sensor
+//! reports them.
 //!
-//! In: a world, the sensor's pose at a firing, the sensor's figures. Out: [`RawFiring`]s. The per-laser corrections are
-//! applied backwards, so that the decoder's point lies where the ray met the world.
+//! In: a world, the sensor's pose at a firing, the model's constants. Out: [`RawFiring`]s. The corrections of each
+//! laser are applied inversely, so that the decoder's point is the point where the ray met the world.
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::{Model, ModelSpec, ReturnMode, S1_FLAGS};
@@ -16,26 +16,26 @@ use super::raycast::{Caster, Hit};
 use crate::noise::{gaussian, mixed, uniform};
 use crate::scene::world::World;
 
-/// What a simulated sensor is and how good it is.
+/// The model, mounting and accuracy of a simulated sensor.
 #[derive(Clone, Debug)]
 pub struct ScannerConfig {
-    /// The model.
+    /// Model of the sensor.
     pub model: Model,
-    /// The echoes it reports.
+    /// Echoes that the sensor reports.
     pub return_mode: ReturnMode,
-    /// Turning rate.
+    /// Rotation rate, revolutions per minute.
     pub rpm: f64,
-    /// Its own table; `None`: the factory's.
+    /// The sensor's own calibration; `None`: the factory calibration of the model.
     pub calibration: Option<Calibration>,
-    /// Where it is mounted.
+    /// Pose of the sensor on the vehicle.
     pub ego_from_sensor: Isometry3<f64>,
-    /// Deviation of the range, metres.
+    /// Standard deviation of the range, metres.
     pub noise_m: f64,
-    /// Share of the returns that go missing, 0 to 1.
+    /// Share of the returns that are missing, 0 to 1.
     pub dropout: f64,
-    /// Nothing farther returns, metres.
+    /// Greatest range that returns, metres.
     pub range_m_max: f64,
-    /// The same seed gives the same datagrams.
+    /// Seed of noise and missing returns: the same seed gives the same datagrams.
     pub seed: u64,
 }
 
@@ -63,23 +63,23 @@ impl ScannerConfig {
     }
 }
 
-/// Nothing nearer than this returns, metres.
+/// Least range that returns, metres. Ours, because the manuals state none below 0.5 m.
 const RANGE_M_MIN: f64 = 0.5;
 
-/// One laser's line in the turning head, for an encoder angle of 0 (x forward, y left, z up).
+/// One laser's line in the rotating head, at encoder angle 0 (x forward, y left, z up).
 #[derive(Clone, Copy, Debug)]
 struct Beam {
-    /// Where the line is at range 0.
+    /// The line's point at range 0.
     origin: [f64; 3],
-    /// Its direction, length 1.
+    /// The line's direction, length 1.
     direction: [f64; 3],
-    /// What the decoder adds to the range.
+    /// The distance that the decoder adds to the range.
     range_added_m: f64,
-    /// How far the head turns until it fires, as a share of the way from block to block.
-    turn: [f64; 2],
+    /// The head's rotation until the laser fires, as a share of that from block to block.
+    rotation: [f64; 2],
 }
 
-/// A sensor that can be fired.
+/// A simulated sensor that can fire.
 #[derive(Clone, Debug)]
 pub struct Scanner {
     config: ScannerConfig,
@@ -89,7 +89,8 @@ pub struct Scanner {
 }
 
 impl Scanner {
-    /// A sensor of this kind. Its lines of sight are straight: near-range corrections of a table are left out.
+    /// A sensor with this configuration. Its lines of sight are straight: near-range corrections of a calibration are
+    /// left out.
     pub fn new(config: ScannerConfig) -> Self {
         let spec = config.model.spec();
         let mut calibration = config.calibration.clone().unwrap_or_else(|| Calibration::factory(config.model));
@@ -101,35 +102,35 @@ impl Scanner {
         Self { config, spec, calibration, beams }
     }
 
-    /// What it is.
+    /// The sensor's configuration.
     pub fn config(&self) -> &ScannerConfig {
         &self.config
     }
 
-    /// The model's figures.
+    /// The model's constants.
     pub fn spec(&self) -> &'static ModelSpec {
         self.spec
     }
 
-    /// Its table.
+    /// The sensor's calibration.
     pub fn calibration(&self) -> &Calibration {
         &self.calibration
     }
 
-    /// When firing `index` happens, ns after firing 0.
+    /// Time of firing `index`, ns after firing 0.
     pub fn firing_ns(&self, index: i64) -> i64 {
         index * i64::from(self.spec.period_ns(self.config.return_mode))
     }
 
-    /// Encoder angle at firing `index`, turns in [0, 1); firing 0 is at 0.
-    pub fn encoder_turns(&self, index: i64) -> f64 {
+    /// Encoder angle at firing `index`, as a share of a revolution in [0, 1); firing 0 is at 0.
+    pub fn encoder_share(&self, index: i64) -> f64 {
         (self.firing_ns(index) as f64 * 1e-9 * self.config.rpm / 60.0).rem_euclid(1.0)
     }
 
-    /// The first firing of turn `number`.
+    /// The first firing of revolution `number`.
     pub fn first_firing_of(&self, number: i64) -> i64 {
-        let turn_ns = 60e9 / self.config.rpm;
-        (number as f64 * turn_ns / f64::from(self.spec.period_ns(self.config.return_mode))).ceil() as i64
+        let revolution_ns = 60e9 / self.config.rpm;
+        (number as f64 * revolution_ns / f64::from(self.spec.period_ns(self.config.return_mode))).ceil() as i64
     }
 
     /// The lasers that fire in firing `index`: all, but a bank of 32 on the HDL-64E S1.
@@ -142,29 +143,28 @@ impl Scanner {
         0..self.spec.lasers
     }
 
-    /// The ray of `laser` in firing `index`, in the sensor's frame: where it begins, its direction, and its encoder
-    /// angle.
+    /// The ray of `laser` in firing `index`, in the sensor's frame: its origin and its direction.
     ///
-    /// A point that the decoder gives range `r` lies `r` metres along it.
+    /// A point to which the decoder gives range `r` lies `r` metres along it.
     pub fn ray(&self, index: i64, laser: usize) -> ([f64; 3], [f64; 3]) {
         let per_block = self.spec.firings_per_block as i64;
         let beam = &self.beams[laser];
-        // The block reports the angle of its first firing; the head turns on while the rest of it is fired.
+        // The block reports the angle of its first firing; the head rotates on while the rest is fired.
         let first = index - index.rem_euclid(per_block);
-        let block_turns = self.firing_ns(per_block) as f64 * 1e-9 * self.config.rpm / 60.0;
-        let turns = self.encoder_turns(first) + block_turns * beam.turn[(index - first) as usize];
+        let block_share = self.firing_ns(per_block) as f64 * 1e-9 * self.config.rpm / 60.0;
+        let share = self.encoder_share(first) + block_share * beam.rotation[(index - first) as usize];
         // Velodyne's azimuth is clockwise from above.
-        let (sin, cos) = (-turns * TAU).sin_cos();
-        let turned = |[x, y, z]: [f64; 3]| [x * cos - y * sin, x * sin + y * cos, z];
-        (turned(beam.origin), turned(beam.direction))
+        let (sin, cos) = (-share * TAU).sin_cos();
+        let rotated = |[x, y, z]: [f64; 3]| [x * cos - y * sin, x * sin + y * cos, z];
+        (rotated(beam.origin), rotated(beam.direction))
     }
 
-    /// The chance of one ray: where leaves stop it, how it is measured.
+    /// The random draw of one ray, which decides where leaves stop it and how it is measured.
     pub fn draw(&self, index: i64, laser: usize) -> u64 {
         mixed(self.config.seed ^ ((index as u64) << 8)) ^ laser as u64
     }
 
-    /// Whether a return of `laser` from this range fits the wire.
+    /// True if a packet can hold a return of `laser` from this range.
     pub fn reports(&self, laser: usize, range_m: f64) -> bool {
         range_m >= RANGE_M_MIN && (1.0..f64::from(BOGUS_DISTANCE)).contains(&self.counts(laser, range_m))
     }
@@ -181,7 +181,7 @@ impl Scanner {
         index: i64,
         stamp_ns: i64,
     ) -> RawFiring {
-        let azimuth = (self.encoder_turns(index) * 36_000.0).round() as u32 % 36_000;
+        let azimuth = (self.encoder_share(index) * 36_000.0).round() as u32 % 36_000;
         let dual = self.config.return_mode == ReturnMode::Dual;
         let mut firing = RawFiring {
             stamp_ns,
@@ -208,7 +208,7 @@ impl Scanner {
         firing
     }
 
-    /// A hit as the sensor measures it.
+    /// A hit as the sensor reports it.
     fn measured(&self, hit: Option<Hit>, laser: usize, key: u64) -> RawReturn {
         let Some(hit) = hit else { return RawReturn::default() };
         if self.config.dropout > 0.0 && uniform(key ^ 0x0d) < self.config.dropout {
@@ -224,11 +224,11 @@ impl Scanner {
     }
 }
 
-/// A laser's line, from its corrections.
+/// A laser's line, from the corrections of its calibration.
 fn beam(spec: &ModelSpec, calibration: &Calibration, laser: usize) -> Beam {
     let own = &calibration.lasers[laser];
     let (sin_v, cos_v) = own.vert_correction.sin_cos();
-    // The correction turns counter-clockwise, against the encoder.
+    // The correction is counter-clockwise, against the encoder.
     let (sin_r, cos_r) = own.rot_correction.sin_cos();
     let left = own.horiz_offset_correction;
     let index = |firing: usize| spec.azimuth_offset(laser + firing * spec.lasers, FINE) as f64 / f64::from(FINE);
@@ -236,9 +236,9 @@ fn beam(spec: &ModelSpec, calibration: &Calibration, laser: usize) -> Beam {
         origin: [-left * sin_r, left * cos_r, own.vert_offset_correction],
         direction: [cos_v * cos_r, cos_v * sin_r, sin_v],
         range_added_m: own.dist_correction,
-        turn: [index(0), if spec.firings_per_block > 1 { index(1) } else { 0.0 }],
+        rotation: [index(0), if spec.firings_per_block > 1 { index(1) } else { 0.0 }],
     }
 }
 
-/// A step from block to block so long that the spec's rounding to counts does not matter.
+/// A step from block to block, in counts, so long that rounding to counts does not matter.
 const FINE: u32 = 1_000_000;

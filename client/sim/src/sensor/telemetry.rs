@@ -5,17 +5,17 @@
 
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
-/// A place on the globe that stands for the world's origin; x points east there.
+/// Geographic position of the world's origin; x points east there.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Datum {
-    /// Degrees, north positive.
+    /// Latitude in degrees, north positive.
     pub latitude_deg: f64,
-    /// Degrees, east positive.
+    /// Longitude in degrees, east positive.
     pub longitude_deg: f64,
 }
 
 impl Default for Datum {
-    /// The campus of UT Austin, where the thesis' car drove.
+    /// The campus of UT Austin, where the car of the UT Austin thesis drove.
     fn default() -> Self {
         Self { latitude_deg: 30.2862, longitude_deg: -97.7394 }
     }
@@ -34,18 +34,18 @@ impl Datum {
     }
 }
 
-/// What a GPS receiver knows at a whole second.
+/// State of a GPS receiver at a whole second.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fix {
-    /// ns since the Unix epoch.
+    /// Time of the fix, ns since the Unix epoch.
     pub stamp_ns: i64,
-    /// Degrees, north positive.
+    /// Latitude in degrees, north positive.
     pub latitude_deg: f64,
-    /// Degrees, east positive.
+    /// Longitude in degrees, east positive.
     pub longitude_deg: f64,
-    /// m/s.
+    /// Speed over ground, m/s.
     pub speed_mps: f64,
-    /// Degrees clockwise from north, in [0, 360).
+    /// Course over ground, degrees clockwise from north, in [0, 360).
     pub course_deg: f64,
 }
 

@@ -1,6 +1,6 @@
-//! Maps from one sweep of an HDL-64E, one thread: points a second beside the time.
+//! Time to make each layer from one sweep of an HDL-64E on one thread, with points per second.
 //!
-//! The sweep is KITTI's first scan where the recorded drives are, else a simulated turn.
+//! The sweep is KITTI's first scan if the recorded drives are there, else a simulated revolution.
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
@@ -36,7 +36,7 @@ fn mount(height_m: f64) -> Mount {
     Mount { ego_from_sensor: nalgebra::Isometry3::translation(0.0, 0.0, height_m), range_m_min: 2.0 }
 }
 
-/// KITTI's first scan, x y z intensity a point.
+/// KITTI's first scan: x, y, z and intensity of each point.
 fn kitti() -> Option<Scan> {
     let bytes = std::fs::read(concat!(env!("CLEARWAY_DATA"), "/kitti/patchwork-plusplus/000000.bin")).ok()?;
     let mut scan = Scan::default();
@@ -56,12 +56,12 @@ fn sweep() -> Sweep {
         Some(scan) => {
             sweep.set_scan(&scan, &Arc::new(Calibration::factory(Model::Hdl64eS2)), &mount(1.73));
         }
-        None => sweep.set_revolution(&turn(), &mount(1.9)),
+        None => sweep.set_revolution(&revolution(), &mount(1.9)),
     }
     sweep
 }
 
-fn turn() -> clearway_lidar::revolution::Revolution {
+fn revolution() -> clearway_lidar::revolution::Revolution {
     SimulatedVehicle::new(clearway_sim::scenes::town(), ScannerConfig::default()).revolution(1)
 }
 
@@ -83,17 +83,17 @@ fn height_difference(bencher: Bencher) {
 
 #[divan::bench]
 fn sweep_of_a_revolution(bencher: Bencher) {
-    let revolution = turn();
+    let revolution = revolution();
     let mount = mount(1.9);
     let mut sweep = Sweep::default();
     let slots = revolution.echoes[0].range_m.len();
     bencher.counter(ItemsCount::new(slots)).bench_local(|| sweep.set_revolution(&revolution, &mount));
 }
 
-/// The same with a pose each 10 ms: finding the motion, and moving every firing.
+/// The same with a pose each 10 ms: it includes the motion and the transform of each firing.
 #[divan::bench]
 fn sweep_of_a_moving_revolution(bencher: Bencher) {
-    let revolution = turn();
+    let revolution = revolution();
     let mount = mount(1.9);
     let mut motion = Motion::new(&MotionConfig::default());
     for step in 0..=20 {
@@ -114,17 +114,17 @@ fn sweep_of_a_moving_revolution(bencher: Bencher) {
 }
 
 #[divan::bench(args = [Variant::Grounded, Variant::Paper, Variant::Grid])]
-fn terrain(bencher: Bencher, form: Variant) {
+fn terrain(bencher: Bencher, variant: Variant) {
     let sweep = sweep();
-    let mut map = Terrain::new(&TerrainConfig { variant: form, ..TerrainConfig::default() });
+    let mut map = Terrain::new(&TerrainConfig { variant, ..TerrainConfig::default() });
     let mut layer = map.layer();
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &Context::default(), &mut layer));
 }
 
-/// The same with roughness: a simulated turn, whose distance series are known.
+/// The same with roughness, from a simulated revolution, which has distance series.
 #[divan::bench]
 fn terrain_with_roughness(bencher: Bencher) {
-    let (revolution, mount) = (turn(), mount(1.9));
+    let (revolution, mount) = (revolution(), mount(1.9));
     let mut sweep = Sweep::default();
     sweep.set_revolution(&revolution, &mount);
     sweep.set_deviations(&revolution, &mount, &mut DistanceSeries::default(), None);
@@ -135,7 +135,7 @@ fn terrain_with_roughness(bencher: Bencher) {
 
 #[divan::bench]
 fn deviations_of_a_revolution(bencher: Bencher) {
-    let (revolution, mount) = (turn(), mount(1.9));
+    let (revolution, mount) = (revolution(), mount(1.9));
     let (mut sweep, mut series) = (Sweep::default(), DistanceSeries::default());
     let slots = revolution.echoes[0].range_m.len();
     bencher
@@ -174,8 +174,8 @@ fn safe_path(bencher: Bencher) {
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &context, &mut layer));
 }
 
-/// What six units of four planes send in 100 ms from a vehicle in traffic: 52,800 rays, those without a return among
-/// them.
+/// Scans of 100 ms from six sensors of four planes each on a vehicle in traffic: 52,800 rays, with and without a
+/// return.
 fn six_units() -> Vec<(Sweep, [f32; 3])> {
     let scene = traffic::street(0.0);
     let scan = |unit: &PlaneUnit, number| {
@@ -194,7 +194,7 @@ fn six_units() -> Vec<(Sweep, [f32; 3])> {
     (1..=5).flat_map(|number| units.iter().map(move |unit| (unit, number))).map(|(u, n)| scan(u, n)).collect()
 }
 
-/// All scans of 100 ms and the layer written.
+/// Integrates all scans of 100 ms, and makes the layer.
 #[divan::bench]
 fn occupancy_of_six_units(bencher: Bencher) {
     let scans = six_units();
@@ -219,7 +219,7 @@ fn occupancy_of_six_units(bencher: Bencher) {
     });
 }
 
-/// The floor beside it: a plain Bresenham line for each return, from its sensor to the border, one store a cell.
+/// For comparison: a Bresenham line for each return, from its sensor to the border, with one store for each cell.
 #[divan::bench]
 fn bresenham_of_six_units(bencher: Bencher) {
     const SIDE: i32 = 400;
@@ -249,7 +249,7 @@ fn bresenham_of_six_units(bencher: Bencher) {
     });
 }
 
-/// One turn of an HDL-64E and the layer written.
+/// Integrates one revolution of an HDL-64E, and makes the layer.
 #[divan::bench]
 fn occupancy_of_a_turn(bencher: Bencher) {
     let sweep = sweep();

@@ -1,4 +1,4 @@
-//! The thesis' steps one by one, on worlds of a few cells.
+//! The steps of the layer `drivability` (UT Austin thesis, section IV), one by one, on small worlds.
 
 mod common;
 
@@ -19,8 +19,7 @@ const DRIVABLE: u8 = DrivabilityClass::Drivable.value();
 const NOT_DRIVABLE: u8 = DrivabilityClass::NotDrivable.value();
 const OBSTACLE: u8 = DrivabilityClass::Obstacle.value();
 
-/// A grid for one point a cell: the middle of every cell, at the height `z(row, column, x, y)` says; no point for
-/// `None`.
+/// A sweep with one point in the middle of each cell, at the height `z(row, column, x, y)`; no point for `None`.
 fn painted(z: impl Fn(usize, usize, f32, f32) -> Option<f32>) -> Sweep {
     let mut sweep = empty(Model::Hdl64eS2);
     let rings = ring_radii_m(sweep.calibration.as_ref().unwrap(), HEIGHT_M, 60.0);
@@ -36,7 +35,7 @@ fn painted(z: impl Fn(usize, usize, f32, f32) -> Option<f32>) -> Sweep {
     sweep
 }
 
-/// Rows of the painted grid whose ring lies in a range of radii.
+/// First row whose ring has at least this radius.
 fn row_at(radius_m: f32) -> usize {
     let rings = ring_radii_m(&Calibration::factory(Model::Hdl64eS2), HEIGHT_M, 60.0);
     rings.iter().position(|r| *r >= radius_m).unwrap()
@@ -60,11 +59,11 @@ fn rows_follow_the_rings_and_end_at_60_m() {
     // -15 to -3 degrees meet the ground within 60 m; -1 degree meets it at 115 m.
     assert_eq!(rings.len(), 7);
     assert!((rings[0] - 2.0 / 15f32.to_radians().tan()).abs() < 0.05, "{rings:?}");
-    let benches = row_radii_m(&rings, 60.0);
-    assert_eq!(benches.len(), 7);
-    assert_eq!(benches[6], 60.0);
-    for (bench, pair) in benches.iter().zip(rings.windows(2)) {
-        assert!((bench - (pair[0] + pair[1]) / 2.0).abs() < 1e-6);
+    let radii = row_radii_m(&rings, 60.0);
+    assert_eq!(radii.len(), 7);
+    assert_eq!(radii[6], 60.0);
+    for (radius, pair) in radii.iter().zip(rings.windows(2)) {
+        assert!((radius - (pair[0] + pair[1]) / 2.0).abs() < 1e-6);
     }
 }
 
@@ -83,15 +82,15 @@ fn no_sensor_has_more_rows_than_lasers_and_rows_ascend() {
     for model in models {
         let calibration = Calibration::factory(model);
         for height in [0.3, 1.0, 1.73, 4.0] {
-            let benches = row_radii_m(&ring_radii_m(&calibration, height, 60.0), 60.0);
-            assert!(benches.len() <= calibration.lasers.len(), "{model:?}");
-            assert!(benches.is_sorted_by(|a, b| a < b), "{model:?} at {height} m: {benches:?}");
+            let radii = row_radii_m(&ring_radii_m(&calibration, height, 60.0), 60.0);
+            assert!(radii.len() <= calibration.lasers.len(), "{model:?}");
+            assert!(radii.is_sorted_by(|a, b| a < b), "{model:?} at {height} m: {radii:?}");
         }
     }
 }
 
 #[test]
-fn points_beyond_60_m_or_above_the_overhang_are_not_there() {
+fn points_beyond_60_m_or_above_the_overhang_are_dropped() {
     let mut sweep = painted(|_, _, _, _| Some(0.0));
     let before = map(&DrivabilityConfig::default(), &sweep);
     add(&mut sweep, [61.0, 0.0, 0.0]);
@@ -103,16 +102,16 @@ fn points_beyond_60_m_or_above_the_overhang_are_not_there() {
 }
 
 #[test]
-fn the_offset_keeps_noise_about_level_ground_in_one_unit() {
+fn the_offset_keeps_noise_on_level_ground_in_one_unit() {
     let noisy = painted(|row, column, _, _| Some(if (row + column) % 2 == 0 { 0.01 } else { -0.01 }));
     let middle = map(&DrivabilityConfig::default(), &noisy);
     assert_eq!(middle.planes.len(), 2, "segment 0 and the unreachable one");
     let thesis = map(&DrivabilityConfig { offset_m: 0.0, ..DrivabilityConfig::default() }, &noisy);
-    assert!(thesis.planes.len() > 1000, "with offset 0 the ground falls apart: {} segments", thesis.planes.len());
+    assert!(thesis.planes.len() > 1000, "with offset 0 the ground is divided into {} segments", thesis.planes.len());
 }
 
 #[test]
-fn a_cell_never_reached_is_an_obstacle_and_an_empty_one_is_unknown() {
+fn a_cell_not_reached_is_an_obstacle_and_an_empty_one_is_unknown() {
     let row = row_at(10.0);
     let sweep = painted(|r, column, _, _| match (r == row, column) {
         (true, 90) => Some(1.0),
@@ -126,21 +125,21 @@ fn a_cell_never_reached_is_an_obstacle_and_an_empty_one_is_unknown() {
 }
 
 #[test]
-fn criterion_1_a_step_of_one_unit_that_no_vehicle_takes_is_not_crossed() {
-    // Half the world lies 0.2 m higher: one unit, but a step.
+fn criterion_1_a_step_above_the_limit_is_not_crossed() {
+    // Half the world lies 0.2 m higher, which is one unit.
     let terrace = |step: f32| painted(move |_, _, x, _| Some(if x > 10.0 { step } else { 0.0 }));
     let ahead = row_at(20.0);
     let layer = map(&DrivabilityConfig::default(), &terrace(0.2));
     assert_eq!(class(&layer, ahead, 0), NOT_DRIVABLE);
     let layer = map(&DrivabilityConfig::default(), &terrace(0.14));
     assert_eq!(class(&layer, ahead, 0), DRIVABLE);
-    // The thesis allows one unit height, whatever the metres.
+    // The thesis allows one unit height.
     let thesis = DrivabilityConfig { step_m_max: 0.5, plane_error_m_max: 0.25, ..DrivabilityConfig::default() };
     assert_eq!(class(&map(&thesis, &terrace(0.2)), ahead, 0), DRIVABLE);
 }
 
 #[test]
-fn criterion_2_a_plane_that_misses_the_boundary_is_not_crossed() {
+fn criterion_2_a_boundary_that_the_plane_misses_is_not_crossed() {
     let terrace = painted(|_, _, x, _| Some(if x > 10.0 { 0.3 } else { 0.0 }));
     let ahead = row_at(20.0);
     let without = DrivabilityConfig { step_m_max: 0.5, plane_error_m_max: 10.0, ..DrivabilityConfig::default() };
@@ -150,9 +149,9 @@ fn criterion_2_a_plane_that_misses_the_boundary_is_not_crossed() {
 }
 
 #[test]
-fn criterion_3_a_gate_narrower_than_3_m_is_not_crossed() {
+fn criterion_3_a_passage_narrower_than_3_m_is_not_crossed() {
     // A bank 0.14 m high behind a wall 15 m ahead, with a gap in the wall.
-    let gate = |half_width: f32| {
+    let passage = |half_width: f32| {
         painted(move |_, _, x, y| {
             let wall = (15.0..17.0).contains(&x.hypot(y)) && (y.abs() > half_width || x < 0.0);
             Some(if wall {
@@ -165,10 +164,10 @@ fn criterion_3_a_gate_narrower_than_3_m_is_not_crossed() {
         })
     };
     let behind = row_at(25.0);
-    assert_eq!(class(&map(&DrivabilityConfig::default(), &gate(2.0)), behind, 0), DRIVABLE);
-    assert_eq!(class(&map(&DrivabilityConfig::default(), &gate(1.0)), behind, 0), NOT_DRIVABLE);
+    assert_eq!(class(&map(&DrivabilityConfig::default(), &passage(2.0)), behind, 0), DRIVABLE);
+    assert_eq!(class(&map(&DrivabilityConfig::default(), &passage(1.0)), behind, 0), NOT_DRIVABLE);
     let open = DrivabilityConfig { passage_m_min: 0.0, ..DrivabilityConfig::default() };
-    assert_eq!(class(&map(&open, &gate(1.0)), behind, 0), DRIVABLE);
+    assert_eq!(class(&map(&open, &passage(1.0)), behind, 0), DRIVABLE);
 }
 
 #[test]
@@ -186,7 +185,7 @@ fn empty_rows_are_bridged_as_far_as_configured() {
 }
 
 #[test]
-fn the_thesis_single_seed_needs_a_point_in_cell_0_0() {
+fn the_seed_of_the_thesis_needs_a_point_in_cell_0_0() {
     let config = DrivabilityConfig { seed: Seed::FirstCell, ..DrivabilityConfig::default() };
     let whole = painted(|_, _, _, _| Some(0.0));
     assert_eq!(figure(&map(&config, &whole), "drivable_share"), 1.0);
@@ -196,8 +195,8 @@ fn the_thesis_single_seed_needs_a_point_in_cell_0_0() {
 }
 
 #[test]
-fn a_high_thing_beside_the_vehicle_is_no_seed() {
-    // A wall fills the innermost rows of the left side, as a neighbour at a traffic light does.
+fn a_high_object_beside_the_vehicle_is_no_seed() {
+    // A wall fills the innermost rows of the left side, like a car beside the vehicle at a traffic light.
     let (first, last) = (0, row_at(6.0));
     let sweep = painted(move |row, column, _, _| {
         Some(if (60..120).contains(&column) && (first..last).contains(&row) { 1.5 } else { 0.0 })
@@ -230,7 +229,7 @@ fn a_blocked_sector_is_unknown_and_never_drivable() {
 }
 
 #[test]
-fn one_table_shared_by_all_revolutions_or_an_equal_one_makes_the_same_rows() {
+fn a_shared_calibration_and_an_equal_one_give_the_same_rows() {
     let sweep = painted(|_, _, _, _| Some(0.0));
     let mut drivability = Drivability::new(&DrivabilityConfig::default());
     let (mut one, mut two) = (drivability.layer(), drivability.layer());

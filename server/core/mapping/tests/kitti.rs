@@ -16,13 +16,13 @@ use common::*;
 const UNKNOWN: u8 = DrivabilityClass::Unknown.value();
 const DRIVABLE: u8 = DrivabilityClass::Drivable.value();
 
-/// What the labels say of the frame, cell by cell.
+/// The labels of the frame, by cell.
 struct Labelled {
-    /// Cells with road or lane marking, and without an obstacle.
+    /// True for cells with road or lane marking, and without an obstacle.
     road: Vec<bool>,
-    /// Cells with an obstacle: a point of anything but ground, 0.3 to 2.5 m over the ground about it.
+    /// True for cells with an obstacle: a point that is not ground, 0.3 to 2.5 m over the ground around it.
     obstacle: Vec<bool>,
-    /// Ground without obstacle that can be reached over such cells from the blind zone, empty rows bridged.
+    /// True for ground without an obstacle that is connected to the blind zone by such cells, across empty rows.
     reachable: Vec<bool>,
 }
 
@@ -64,8 +64,8 @@ fn shares(config: &DrivabilityConfig) -> [f64; 3] {
     let road = share(&truth.road, |cell| drivable[cell]);
     let reachable = share(&truth.reachable, |cell| drivable[cell]);
     println!(
-        "{:>3} columns, {} bridged, close_gaps {:<5}: share {:.4}; of drivable cells free of obstacles {:.3} %; drivable of \
-         road {:.2} %, of reachable ground {:.2} %",
+        "{:>3} columns, {} bridged, close_gaps {:<5}: share {:.4}; of drivable cells free of obstacles {:.3} %; \
+         drivable of road {:.2} %, of reachable ground {:.2} %",
         config.columns,
         config.bridge_rows,
         config.close_gaps,
@@ -88,7 +88,7 @@ fn the_labelled_frame_reaches_its_targets() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn wider_columns_and_the_thesis_own_reading_stay_useful() {
+fn wider_columns_and_the_criteria_of_the_thesis_stay_useful() {
     let own = DrivabilityConfig::default();
     let thesis = DrivabilityConfig {
         bridge_rows: 0,
@@ -97,13 +97,13 @@ fn wider_columns_and_the_thesis_own_reading_stay_useful() {
         passage: Passage::BetweenSegments,
         ..own.clone()
     };
-    let readings = [
+    let configs = [
         DrivabilityConfig { columns: 180, ..own.clone() },
         DrivabilityConfig { columns: 90, ..own.clone() },
         thesis.clone(),
         DrivabilityConfig { offset_m: 0.0, ..thesis },
     ];
-    for config in readings {
+    for config in configs {
         let [free, road, reachable] = shares(&config);
         assert!(free >= 0.997 && road >= 0.97 && reachable >= 0.95, "{config:?}");
     }

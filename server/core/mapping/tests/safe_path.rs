@@ -1,4 +1,4 @@
-//! Safe points: as far from two obstacles, with exact radii, through every gate the vehicle fits and no other.
+//! Safe points: equally far from two obstacles, with exact radii, through each passage that the vehicle fits through.
 
 mod common;
 
@@ -24,7 +24,7 @@ const PATH: u8 = SafePathClass::Path.value();
 const NOT_SEEN: u8 = DrivabilityClass::Unknown.value();
 const DRIVABLE: u8 = DrivabilityClass::Drivable.value();
 
-/// MedialAxis and links of a grid.
+/// Medial axis and links of a grid.
 fn paths(side: usize, states: &[State], width_cells: f64) -> (MedialAxis, Links) {
     let mut distances = Distances::new(side);
     distances.compute(states);
@@ -45,9 +45,9 @@ fn to_square(position: [i32; 2], cell: [i32; 2]) -> i32 {
     along(0) * along(0) + along(1) * along(1)
 }
 
-/// A court of free cells with a wall one cell thick across it, and a gate of that many cells in the wall. The vehicle
-/// stands in the middle; the wall is five cells before it.
-fn court_with_gate(side: usize, gate_from: usize, gate_cells: usize, across_x: bool) -> Vec<State> {
+/// A court of free cells with a wall one cell thick across it, and a passage of `passage_cells` cells in the wall. The
+/// vehicle stands in the middle; the wall is five cells ahead.
+fn court_with_passage(side: usize, passage_from: usize, passage_cells: usize, across_x: bool) -> Vec<State> {
     let mut states = vec![State::Drivable; side * side];
     for k in 0..side {
         for border in [k, (side - 1) * side + k, k * side, k * side + side - 1] {
@@ -55,26 +55,27 @@ fn court_with_gate(side: usize, gate_from: usize, gate_cells: usize, across_x: b
         }
     }
     let wall = side / 2 + 12;
-    for k in (0..side).filter(|k| !(gate_from..gate_from + gate_cells).contains(k)) {
+    for k in (0..side).filter(|k| !(passage_from..passage_from + passage_cells).contains(k)) {
         states[if across_x { k * side + wall } else { wall * side + k }] = State::Obstacle;
     }
     states
 }
 
 #[test]
-fn a_gate_exactly_as_wide_as_the_vehicle_is_a_way_through_and_a_narrower_one_is_not() {
+fn a_path_leads_through_a_passage_as_wide_as_the_vehicle_and_no_narrower() {
     let side = 80;
     for width in [5, 6, 7, 8, 9, 12] {
-        for gate_from in [20, 33, 34, 47] {
-            for (gate, across_x) in
+        for passage_from in [20, 33, 34, 47] {
+            for (passage, across_x) in
                 [(width - 1, true), (width - 1, false), (width, true), (width, false), (width + 1, true)]
             {
-                let states = court_with_gate(side, gate_from, gate, across_x);
+                let states = court_with_passage(side, passage_from, passage, across_x);
                 let (_, links) = paths(side, &states, width as f64);
                 let beyond = |point: &&Point| point.position[usize::from(!across_x)] > 2 * (side as i32 / 2 + 13);
                 let through = links.points().iter().any(|point| beyond(&point));
                 assert!(links.points().len() > 20, "there are paths on the vehicle's side");
-                assert_eq!(through, gate >= width, "vehicle {width}, gate {gate} from {gate_from}, x {across_x}");
+                let case = format!("vehicle {width}, passage {passage} from {passage_from}, x {across_x}");
+                assert_eq!(through, passage >= width, "{case}");
             }
         }
     }
@@ -92,14 +93,14 @@ fn a_corridor_has_its_middle_line_with_half_its_width_as_radius() {
         assert_eq!(line.len(), side, "{free} cells");
         for point in line {
             assert_eq!(point.clearance_squared, (free * free) as i32);
-            // The middle of 7 cells is a cell's, that of 8 lies between two.
+            // The middle of 7 cells is the centre of a cell; that of 8 lies between two.
             assert_eq!(point.position[1], 2 * 26 + free as i32 - 1);
         }
     }
 }
 
 #[test]
-fn open_ground_has_no_safe_points_and_closed_ground_neither() {
+fn open_ground_and_closed_ground_have_no_safe_points() {
     for state in [State::Drivable, State::Obstacle, State::Unknown, State::Blind] {
         let (axis, links) = paths(20, &[state; 400], 4.0);
         assert_eq!((axis.points().len(), links.points().len()), (0, 0));
@@ -130,7 +131,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(150))]
 
     #[test]
-    fn every_cells_nearest_obstacle_is_the_nearest((side, states) in worlds()) {
+    fn the_distance_transform_agrees_with_a_search((side, states) in worlds()) {
         let mut distances = Distances::new(side);
         distances.compute(&states);
         let closed = closed(side, &states);
@@ -143,7 +144,7 @@ proptest! {
     }
 
     #[test]
-    fn safe_points_lie_on_drivable_ground_as_far_from_two_obstacles_with_exact_radii(
+    fn safe_points_are_equally_far_from_two_obstacles_with_exact_radii(
         (side, states) in worlds(), width in 2f64..9.0,
     ) {
         let (axis, links) = paths(side, &states, width);
@@ -153,7 +154,7 @@ proptest! {
             let exact = closed.iter().map(|cell| to_square(point.position, *cell)).min();
             prop_assert_eq!(Some(point.clearance_squared), exact, "{:?}", point);
             prop_assert!(f64::from(point.clearance_squared).sqrt() >= width, "{:?}", point);
-            // Two obstacles the vehicle fits between, as far away within a cell, from middle to middle.
+            // The vehicle fits between two obstacles whose distances to the point are equal within a cell.
             let away = |cell: &[i32; 2]| {
                 f64::from(point.position[0] - 2 * cell[0]).hypot(f64::from(point.position[1] - 2 * cell[1])) / 2.0
             };
@@ -162,15 +163,16 @@ proptest! {
             let apart = |a: &[i32; 2], b: &[i32; 2]| f64::from(a[0] - b[0]).hypot(f64::from(a[1] - b[1]));
             prop_assert!(near.iter().any(|a| near.iter().any(|b| apart(a, b) >= width)), "{:?}", point);
         }
-        // Lines one cell wide: no two by two cells of them, but where four lines meet, one at each cell.
-        let held = |[ix, iy]: [i32; 2]| axis.point_in(ix, iy).is_some();
+        // Lines are one cell wide: two by two cells occur only where four lines meet, one at each cell.
+        let has_point = |[ix, iy]: [i32; 2]| axis.point_in(ix, iy).is_some();
         for [ix, iy] in (0..side as i32 - 1).flat_map(|iy| (0..side as i32 - 1).map(move |ix| [ix, iy])) {
             let block = [[ix, iy], [ix + 1, iy], [ix, iy + 1], [ix + 1, iy + 1]];
             let around = |[x, y]: [i32; 2]| (y - 1..=y + 1).flat_map(move |y| (x - 1..=x + 1).map(move |x| [x, y]));
-            let goes_on = |cell: [i32; 2]| around(cell).any(|beside| !block.contains(&beside) && held(beside));
-            prop_assert!(!block.iter().all(|cell| held(*cell)) || block.iter().all(|cell| goes_on(*cell)), "{:?}", block);
+            let goes_on = |cell: [i32; 2]| around(cell).any(|beside| !block.contains(&beside) && has_point(beside));
+            let is_full = block.iter().all(|cell| has_point(*cell));
+            prop_assert!(!is_full || block.iter().all(|cell| goes_on(*cell)), "{:?}", block);
         }
-        // Links lead back, and on to where the vehicle is.
+        // Links lead to earlier points, and finally to the vehicle.
         for (index, point) in links.points().iter().enumerate() {
             prop_assert_eq!(point.links.is_empty(), index == 0, "{:?}", point);
             prop_assert!(point.links.is_sorted_by(|a, b| a < b));
@@ -186,7 +188,7 @@ proptest! {
     }
 }
 
-/// Drivability and safe paths of a sweep.
+/// The layers `drivability` and `safe_path` of a sweep.
 fn make(sweep: &Sweep, config: &SafePathConfig) -> (Layer, Layer) {
     let mut drivability = Drivability::new(&DrivabilityConfig::default());
     let mut earlier = [drivability.layer()];
@@ -199,7 +201,7 @@ fn make(sweep: &Sweep, config: &SafePathConfig) -> (Layer, Layer) {
 }
 
 #[test]
-fn a_courts_paths_start_at_the_vehicle_and_stay_on_its_drivable_ground() {
+fn paths_start_at_the_vehicle_and_stay_on_drivable_ground() {
     let config = SafePathConfig::default();
     let (drivability, layer) = make(&cast(Model::Hdl64eS2, court), &config);
     assert_eq!((layer.points[0].x_m, layer.points[0].y_m), (0.0, 0.0));
@@ -231,15 +233,15 @@ fn a_courts_paths_start_at_the_vehicle_and_stay_on_its_drivable_ground() {
 }
 
 #[test]
-fn the_vehicles_own_bonnet_is_no_obstacle_and_a_box_before_it_is() {
-    // 1.6 m wide and 0.9 m high, from `front` back by 0.7 m: it hides the ground behind it.
+fn the_vehicles_own_bonnet_is_no_obstacle_but_a_box_ahead_is() {
+    // A box 1.6 m wide, 0.9 m high and 0.7 m deep, whose front is at `front`, hides the ground behind it.
     let with_box = |front: f32, vehicle_front_m: f32| {
         let inside = |x: f32, y: f32, z: f32| {
             court(x, y, z) || ((front - 0.7..front).contains(&x) && y.abs() < 0.8 && (0.3..0.9).contains(&z))
         };
         make(&cast(Model::Hdl64eS2, inside), &SafePathConfig { vehicle_front_m, ..SafePathConfig::default() }).1
     };
-    // The way the vehicle drives at first: right before it.
+    // Number of points right ahead of the vehicle.
     let ahead = |layer: &Layer| {
         let near = |x: f64, y: f64| (3.0..6.0).contains(&x) && y.abs() < 1.0;
         layer.points.iter().filter(|point| near(point.x_m, point.y_m)).count()
@@ -251,13 +253,13 @@ fn the_vehicles_own_bonnet_is_no_obstacle_and_a_box_before_it_is() {
     let reach = |layer: &Layer| layer.points.iter().map(|point| point.x_m).fold(0.0, f64::max);
     assert!(reach(&own) > 6.0, "{}", reach(&own));
     assert_eq!(ahead(&before), 0);
-    // What it hides is not free either, but for the blind zone.
+    // The ground that the box hides is not free, except in the blind zone.
     let free = |layer: &Layer| classes(layer)[cell_at(layer, 3.4, 0.1).unwrap()];
     assert_eq!((free(&own), free(&before)), (UNKNOWN, OBSTACLE));
 }
 
 #[test]
-fn without_drivability_nothing_is_known() {
+fn without_drivability_all_cells_are_unknown() {
     let mut map = SafePath::new(&SafePathConfig::default());
     let mut layer = map.layer();
     map.make(&cast(Model::Vlp16, plain), &Context::default(), &mut layer);
@@ -267,7 +269,7 @@ fn without_drivability_nothing_is_known() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn real_streets_have_paths_both_ways() {
+fn real_streets_have_paths_forward_and_backward() {
     for frame in 0..3 {
         use clearway_lidar::calibration::Calibration;
         use clearway_mapping::sensor::sweep::Mount;

@@ -1,11 +1,11 @@
-//! The thesis' four scenes in the simulator: shares beside its table, precision and recall against the simulator's
-//! truth, and the baseline failing where the thesis says it fails.
+//! The four scenes of the UT Austin thesis in the simulator: drivable shares beside the thesis' table, precision and
+//! recall against the simulator's truth, and the failures of the baseline that the thesis reports.
 //!
-//! How a cell's truth is voted: each point of the sweep within the grid and under the overhang cut-off votes in its
-//! cell. A point more than 0.3 m over the true ground makes the cell an obstacle. Otherwise the truth at the points'
-//! places is counted and the most frequent class wins; the truth is a raster of 0.2 m, so ground seen within a raster
-//! cell that something stands in counts as `Tight`: either answer is right. Precision is the share of the cells called
-//! drivable that are not forbidden (obstacle, steep, unreachable); recall the share of the drivable cells called so.
+//! The truth of a cell follows from votes: each point of the sweep within the grid and under the overhang cut-off votes
+//! in its cell. A point more than 0.3 m over the true ground makes the cell an obstacle. Otherwise the most frequent
+//! class of the truth at the points' positions counts. The truth is a raster of 0.2 m. Ground within a raster cell with
+//! an object counts as `Tight`: both answers are right. Precision is the share of the cells called drivable that are
+//! not forbidden (obstacle, steep, unreachable). Recall is the share of the drivable cells that are called drivable.
 
 mod common;
 
@@ -26,19 +26,19 @@ use clearway_sim::world::World;
 use common::*;
 use std::sync::Arc;
 
-/// A turn of a standing simulated vehicle: its points and the truth about them.
-struct Turn {
+/// One revolution of a standing simulated vehicle: its points, and the truth about them.
+struct SimulatedScan {
     sweep: Sweep,
     truth: TruthGrid,
 }
 
-fn turn(scene: Scene) -> Turn {
+fn simulate(scene: Scene) -> SimulatedScan {
     let config = ScannerConfig::default();
     let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
-    let turn = SimulatedVehicle::new(scene, config).turn(1);
+    let simulated = SimulatedVehicle::new(scene, config).true_revolution(1);
     let mut sweep = Sweep::default();
-    sweep.set_revolution(&turn.revolution, &mount);
-    Turn { sweep, truth: turn.truth }
+    sweep.set_revolution(&simulated.revolution, &mount);
+    SimulatedScan { sweep, truth: simulated.truth }
 }
 
 fn drivability(sweep: &Sweep, columns: u16) -> Layer {
@@ -55,32 +55,32 @@ fn height_difference(sweep: &Sweep) -> Layer {
     layer
 }
 
-/// The voted truth of every cell; `None` where no point voted.
-fn voted(turn: &Turn, layer: &Layer) -> Vec<Option<Truth>> {
+/// The voted truth of each cell; `None` if no point voted.
+fn voted(scan: &SimulatedScan, layer: &Layer) -> Vec<Option<Truth>> {
     const CLASSES: [Truth; 4] = [Truth::Unreachable, Truth::Steep, Truth::Tight, Truth::Drivable];
     let (rows, columns) = size(layer);
     let grid = RadialGrid::new(benches(layer).to_vec(), columns as u16);
     let mut votes = vec![([0u32; 4], false); rows * columns];
-    for ((&x, &y), &z) in turn.sweep.x.iter().zip(&turn.sweep.y).zip(&turn.sweep.z) {
-        let (Some(cell), Some(ground)) = (grid.cell(x, y), turn.truth.height_at(x.into(), y.into())) else { continue };
+    for ((&x, &y), &z) in scan.sweep.x.iter().zip(&scan.sweep.y).zip(&scan.sweep.z) {
+        let (Some(cell), Some(ground)) = (grid.cell(x, y), scan.truth.height_at(x.into(), y.into())) else { continue };
         if z > 2.5 {
             continue;
         }
-        let class = match turn.truth.class_at(x.into(), y.into()) {
+        let class = match scan.truth.class_at(x.into(), y.into()) {
             Truth::Obstacle | Truth::Outside => Truth::Tight,
             class => class,
         };
         votes[cell].0[CLASSES.iter().position(|c| *c == class).unwrap()] += 1;
         votes[cell].1 |= z - ground > 0.3;
     }
-    let verdict = |(counts, high): &([u32; 4], bool)| {
+    let truth = |(counts, high): &([u32; 4], bool)| {
         if *high {
             return Some(Truth::Obstacle);
         }
         let most = (0..4).max_by_key(|i| (counts[*i], 4 - i)).unwrap();
         (counts[most] > 0).then_some(CLASSES[most])
     };
-    votes.iter().map(verdict).collect()
+    votes.iter().map(truth).collect()
 }
 
 #[derive(Debug)]
@@ -88,12 +88,12 @@ struct Score {
     share: f64,
     precision: f64,
     recall: f64,
-    /// Cells called drivable, by the forbidden class they are.
+    /// Number of cells called drivable by their forbidden class.
     wrong: Vec<(Truth, usize)>,
 }
 
-fn score(turn: &Turn, layer: &Layer, drivable: u8) -> Score {
-    let truth = voted(turn, layer);
+fn score(scan: &SimulatedScan, layer: &Layer, drivable: u8) -> Score {
+    let truth = voted(scan, layer);
     let cells = || classes(layer).iter().zip(&truth).filter_map(|(class, truth)| truth.map(|truth| (*class, truth)));
     let called = cells().filter(|(class, _)| *class == drivable).count();
     let wrong: Vec<_> = [Truth::Obstacle, Truth::Steep, Truth::Unreachable]
@@ -114,11 +114,11 @@ fn wrong(score: &Score, class: Truth) -> usize {
     score.wrong.iter().find(|(truth, _)| *truth == class).unwrap().1
 }
 
-/// What holds, by scene and columns: least precision and recall. Targets: 99.9 % and 98 %.
+/// Least precision and recall of a scene. The targets are 99.9 % and 98 %.
 ///
-/// Short of the target is the precision on slopes, by 0.1 to 0.3 %: cells on the rim of a ditch or a retaining step,
-/// most of whose points lie on the face while the highest, the only one the thesis keeps, lies on the level ground.
-fn promised(scene: &str) -> (f64, f64) {
+/// The precision on slopes misses the target by 0.1 to 0.3 %: most points of a cell on the rim of a ditch or of a step
+/// lie on its face, but the highest point, the only one that the thesis keeps, lies on the level ground.
+fn required(scene: &str) -> (f64, f64) {
     match scene {
         "slopes with obstacles" => (0.996, 0.985),
         _ => (0.9999, 0.998),
@@ -126,13 +126,13 @@ fn promised(scene: &str) -> (f64, f64) {
 }
 
 #[test]
-fn the_four_scenes_of_the_thesis_come_out_as_the_simulator_knows_them() {
+fn the_four_scenes_of_the_thesis_reach_precision_and_recall() {
     println!("scene                         columns   paper %  share %  precision %  recall %  wrong");
     for scene in scenes::of_the_thesis() {
         let (name, paper) = (scene.name, scene.paper_share.unwrap());
-        let turn = turn(scene);
+        let scan = simulate(scene);
         for columns in [360, 180, 90] {
-            let score = score(&turn, &drivability(&turn.sweep, columns), DrivabilityClass::Drivable.value());
+            let score = score(&scan, &drivability(&scan.sweep, columns), DrivabilityClass::Drivable.value());
             let percent = [score.share, score.precision, score.recall].map(|share| 100.0 * share);
             let [share, precision, recall] = percent;
             println!(
@@ -140,10 +140,10 @@ fn the_four_scenes_of_the_thesis_come_out_as_the_simulator_knows_them() {
                 360 / columns,
                 score.wrong
             );
-            let (precision, recall) = promised(name);
+            let (precision, recall) = required(name);
             assert!(score.precision >= precision, "{name}, {columns} columns: {score:?}");
             assert!(score.recall >= recall, "{name}, {columns} columns: {score:?}");
-            // Behind closed fences, under what hangs too low, in objects: not one cell.
+            // No cell is behind a closed fence, under a low overhang or in an object.
             assert_eq!(wrong(&score, Truth::Unreachable), 0, "{name}, {columns} columns");
             assert_eq!(wrong(&score, Truth::Obstacle), 0, "{name}, {columns} columns");
         }
@@ -151,19 +151,19 @@ fn the_four_scenes_of_the_thesis_come_out_as_the_simulator_knows_them() {
 }
 
 #[test]
-fn the_overhang_takes_a_third_of_the_map_as_in_the_thesis() {
-    let share = |scene| figure(&drivability(&turn(scene).sweep, 360), "drivable_share");
+fn a_low_overhang_removes_a_third_of_the_drivable_ground() {
+    let share = |scene| figure(&drivability(&simulate(scene).sweep, 360), "drivable_share");
     let (open, closed) = (share(scenes::fenced_road_under_canopy()), share(scenes::fenced_road_with_low_overhang()));
     println!("{open:.4} without, {closed:.4} with the overhang; the thesis has 0.783 and 0.370");
     assert!(closed < open - 0.2);
 }
 
 #[test]
-fn the_baseline_fails_where_the_thesis_says_it_fails() {
-    // On an upward slope of 10 %, 16 % at its steepest: a row is metres deep there, and the road within it rises by
-    // more than the threshold.
+fn the_baseline_fails_as_the_thesis_reports() {
+    // An upward slope of 10 %, 16 % at its steepest: a row is metres deep there, and the road within it rises by more
+    // than the threshold.
     let ground = Ground { along: Profile::default().ramp(14.0, 40.0, 26.0 * 0.1), ..Ground::default() };
-    let slope = turn(Scene { world: Arc::new(World::on(ground)), ..scenes::flat() });
+    let slope = simulate(Scene { world: Arc::new(World::on(ground)), ..scenes::flat() });
     let (ours, theirs) = (drivability(&slope.sweep, 360), height_difference(&slope.sweep));
     let truth = voted(&slope, &theirs);
     let (_, columns) = size(&theirs);
@@ -181,12 +181,11 @@ fn the_baseline_fails_where_the_thesis_says_it_fails() {
     println!("upward slope, {} cells: drivability calls {ours:.3} drivable, height_difference {theirs:.3}", road.len());
     assert!(ours > 0.95 && theirs < 0.8);
 
-    // Under the canopy it calls the road an obstacle, behind the fence it calls ground drivable.
-    // An HDL-64E looks up by 2 degrees at most, so the branches hang 30 m ahead, 2.6 m over the road, where it sees
-    // them.
+    // The baseline calls the road under branches an obstacle, and ground behind the fence drivable. An HDL-64E looks up
+    // by at most 2 degrees, so the branches hang 30 m ahead, 2.6 m over the road, where the sensor sees them.
     let scene = scenes::fenced_road_under_canopy();
     let world = World::clone(&scene.world).canopy(29.7, 3.4, 4.0, 2.6);
-    let canopy = turn(Scene { world: Arc::new(world), ..scene });
+    let canopy = simulate(Scene { world: Arc::new(world), ..scene });
     let (ours, theirs) = (drivability(&canopy.sweep, 360), height_difference(&canopy.sweep));
     let truth = voted(&canopy, &theirs);
     let count = |layer: &Layer, class: u8, is: Truth| {
@@ -202,7 +201,7 @@ fn the_baseline_fails_where_the_thesis_says_it_fails() {
     assert!(behind > 500 && behind_ours == 0);
 }
 
-/// The map as a driver would draw it: one character each 2 m, x up, y left; the vehicle at the middle.
+/// The map as text: one character for each 2 m, x up, y left; the vehicle is in the middle.
 fn drawing(layer: &Layer) -> String {
     let (_, columns) = size(layer);
     let grid = RadialGrid::new(benches(layer).to_vec(), columns as u16);
@@ -218,13 +217,13 @@ fn drawing(layer: &Layer) -> String {
 }
 
 #[test]
-fn the_scenes_look_as_they_did() {
+fn the_maps_of_the_four_scenes_equal_the_snapshots() {
     for (name, scene) in [
         ("flat", scenes::flat()),
         ("slopes", scenes::slopes_with_obstacles()),
         ("canopy", scenes::fenced_road_under_canopy()),
         ("overhang", scenes::fenced_road_with_low_overhang()),
     ] {
-        insta::assert_snapshot!(format!("drivability_{name}"), drawing(&drivability(&turn(scene).sweep, 360)));
+        insta::assert_snapshot!(format!("drivability_{name}"), drawing(&drivability(&simulate(scene).sweep, 360)));
     }
 }

@@ -1,4 +1,4 @@
-//! Lindström 2005: the ground's speed, the road's bonus, and what stops the painting.
+//! The layer `speed` (Lindström 2005): the speed of the ground, the bonus of the road, and the painting conditions.
 
 mod common;
 
@@ -19,7 +19,7 @@ const PASSABLE: u8 = SpeedClass::Passable.value();
 const OBSTACLE: u8 = SpeedClass::Obstacle.value();
 const ROAD: u8 = SpeedClass::Road.value();
 
-/// Level ground, a point every 10 cm over 20 m to each side.
+/// Level ground: a point each 10 cm, up to 20 m to each side.
 fn level() -> Sweep {
     let mut sweep = empty(Model::Hdl64eS2);
     for ix in -200..200 {
@@ -41,10 +41,10 @@ fn road(points: Vec<[f64; 2]>, widths_m: Vec<f64>) -> Road {
 
 fn route(points: Vec<[f64; 2]>) -> StoredRoad {
     let widths_m = vec![10.0; points.len()];
-    taken(Road { purpose: RoadPurpose::Route, ..road(points, widths_m) })
+    stored(Road { purpose: RoadPurpose::Route, ..road(points, widths_m) })
 }
 
-fn taken(road: Road) -> StoredRoad {
+fn stored(road: Road) -> StoredRoad {
     road::check(&road).unwrap();
     StoredRoad { road, map_from_ego: None }
 }
@@ -61,11 +61,11 @@ fn make(config: &SpeedConfig, sweep: &Sweep, context: &Context<'_>) -> Layer {
 }
 
 fn painted(config: &SpeedConfig, sweep: &Sweep, road: &Road) -> Layer {
-    make(config, sweep, &Context { road: Some(&taken(road.clone())), ..Context::default() })
+    make(config, sweep, &Context { road: Some(&stored(road.clone())), ..Context::default() })
 }
 
-/// A small planner: the time a vehicle 2 m wide takes past each cell it covers, summed across it, for places of its
-/// middle 0.25 m apart, 5 m ahead. Gives the places whose cost is within 1 % of the least.
+/// Lateral positions, 5 m ahead and 0.25 m apart, at which a vehicle 2 m wide is fastest: the cost of a position is the
+/// sum of the times past the cells that the vehicle covers. Returns the positions within 1 % of the least cost.
 fn best_places(layer: &Layer) -> Vec<f64> {
     let speeds = values(layer, "speed");
     let (_, columns) = size(layer);
@@ -80,7 +80,7 @@ fn best_places(layer: &Layer) -> Vec<f64> {
 }
 
 #[test]
-fn a_uniform_bonus_leaves_the_place_on_the_road_open_and_a_relative_one_does_not() {
+fn a_relative_bonus_draws_the_vehicle_to_the_middle_of_the_road() {
     let sweep = level();
     for width_m in [4.0, 12.0] {
         let uniform = best_places(&painted(&fine(Bonus::Uniform), &sweep, &straight(width_m)));
@@ -95,7 +95,7 @@ fn a_uniform_bonus_leaves_the_place_on_the_road_open_and_a_relative_one_does_not
 }
 
 #[test]
-fn a_metre_off_the_middle_costs_more_on_a_narrow_road_than_on_a_wide_one_but_not_with_absolute_distances() {
+fn a_relative_bonus_falls_faster_on_a_narrow_road_than_on_a_wide_one() {
     let sweep = level();
     let loss = |bonus, width_m| {
         let layer = painted(&fine(bonus), &sweep, &straight(width_m));
@@ -103,7 +103,7 @@ fn a_metre_off_the_middle_costs_more_on_a_narrow_road_than_on_a_wide_one_but_not
         let at = |cells: usize| values(&layer, "speed")[(columns / 2 + cells) * columns + columns / 2];
         f64::from(at(0) - at(4)) * f64::from(SPEED_SCALE_MPS)
     };
-    // 8 m/s * (1.125² - 0.125²) / r², give or take a raw step.
+    // The loss is 8 m/s * (1.125² - 0.125²) / r², within one raw step.
     assert!((loss(Bonus::Relative, 4.0) - 2.5).abs() <= 0.26, "{}", loss(Bonus::Relative, 4.0));
     assert!((loss(Bonus::Relative, 12.0) - 0.28).abs() <= 0.26, "{}", loss(Bonus::Relative, 12.0));
     assert_eq!(loss(Bonus::Absolute, 4.0), loss(Bonus::Absolute, 12.0));
@@ -113,7 +113,7 @@ fn a_metre_off_the_middle_costs_more_on_a_narrow_road_than_on_a_wide_one_but_not
 #[test]
 fn a_road_makes_neither_an_obstacle_nor_unknown_ground_passable() {
     let mut sweep = level();
-    // A post in the middle of the road, and a hole in the points behind it.
+    // A post stands in the middle of the road, and points are missing behind it.
     for k in 0..20 {
         add(&mut sweep, [8.1, 0.1, 0.05 * k as f32]);
     }
@@ -169,23 +169,23 @@ fn bumps_slow_down_and_a_slope_does_not() {
 }
 
 #[test]
-fn mirrored_returns_under_the_ground_make_no_obstacle_of_the_ground_about_them() {
+fn mirrored_returns_below_the_ground_make_no_obstacle() {
     let config = SpeedConfig::default();
     let mut sweep = level();
-    // As in KITTI's scans: a stroke of one laser 3 m under the ground, 2.5 m long.
+    // KITTI's scans have such returns: a line of one laser 3 m below the ground, 2.5 m long.
     (0..25).for_each(|k| add(&mut sweep, [9.0, 2.0 + 0.1 * k as f32, -3.0]));
     let plain = make(&config, &level(), &Context::default());
     let layer = make(&config, &sweep, &Context::default());
     assert_eq!(classes(&layer), classes(&plain));
     assert_eq!(values(&layer, "speed"), values(&plain, "speed"));
 
-    // Alone where nothing else was seen, they are not known to be ground.
+    // Without other points around them, they cannot be told from ground.
     let mut alone = level();
     (0..25).for_each(|k| add(&mut alone, [20.7, 2.0 + 0.1 * k as f32, -3.0]));
     let cell = cell_at(&layer, 20.7, 3.0).unwrap();
     assert_eq!(classes(&make(&config, &alone, &Context::default()))[cell], UNKNOWN);
 
-    // A drop that wide is no ghost: its edge is not passed.
+    // A drop that wide is real: its edge is an obstacle.
     let mut ditch = level();
     let within = |x: f32| (8.0..11.0).contains(&x);
     ditch.z.iter_mut().zip(&ditch.x).for_each(|(z, x)| *z = if within(*x) { -3.0 } else { *z });
@@ -196,7 +196,7 @@ fn mirrored_returns_under_the_ground_make_no_obstacle_of_the_ground_about_them()
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn the_labelled_frames_road_is_passable_in_spite_of_its_mirrored_returns() {
+fn the_road_of_the_labelled_frame_is_passable() {
     let (sweep, labels) = labels::labelled_frame();
     let layer = make(&SpeedConfig::default(), &sweep, &Context::default());
     let truth = labels::truth_by_cell(&sweep, &labels, classes(&layer).len(), |x, y| cell_at(&layer, x, y));
@@ -208,7 +208,7 @@ fn the_labelled_frames_road_is_passable_in_spite_of_its_mirrored_returns() {
 }
 
 #[test]
-fn painting_stops_the_moment_the_orientations_are_random_and_says_so() {
+fn painting_stops_when_the_orientations_are_random() {
     let sweep = level();
     let config = SpeedConfig::default();
     let mut map = Speed::new(&config);
@@ -216,7 +216,7 @@ fn painting_stops_the_moment_the_orientations_are_random_and_says_so() {
     let clear: Vec<f32> = (0..36).map(|bin| if bin == 9 { 300.0 } else { 10.0 }).collect();
     let random = vec![10.0; 36];
     for (votes, painting) in [(&clear, 1.0), (&random, 0.0), (&clear, 1.0), (&random, 0.0)] {
-        let road = taken(Road { orientations: votes.clone(), ..straight(6.0) });
+        let road = stored(Road { orientations: votes.clone(), ..straight(6.0) });
         map.make(&sweep, &Context { road: Some(&road), ..Context::default() }, &mut layer);
         assert_eq!(figure(&layer, "painting"), painting);
         assert_eq!(figure(&layer, "stopped_by_divergence"), 1.0 - painting);
@@ -230,12 +230,12 @@ fn painting_stops_the_moment_the_orientations_are_random_and_says_so() {
 }
 
 #[test]
-fn painting_stops_the_moment_the_route_bends_within_30_m_and_says_so() {
+fn painting_stops_when_the_route_bends_within_30_m() {
     let sweep = level();
     let mut map = Speed::new(&SpeedConfig::default());
     let mut layer = map.layer();
-    let road = taken(straight(6.0));
-    // A right angle that far ahead; the vehicle drives towards it.
+    let road = stored(straight(6.0));
+    // The route has a right angle this far ahead; the vehicle drives towards it.
     for (corner_m, painting) in [(60.0, 1.0), (36.0, 1.0), (30.0, 0.0), (12.0, 0.0), (1.0, 0.0), (0.0, 0.0)] {
         let route = route(vec![[corner_m - 100.0, 0.5], [corner_m, 0.5], [corner_m, 100.0]]);
         let context = Context { road: Some(&road), route: Some(&route), ..Context::default() };
@@ -245,7 +245,7 @@ fn painting_stops_the_moment_the_route_bends_within_30_m_and_says_so() {
         assert_eq!(figure(&layer, "stopped_by_divergence"), 0.0);
         assert_eq!(classes(&layer).contains(&ROAD), painting == 1.0);
     }
-    // The corner lies behind: 6 m, more than the base the curvature is measured over.
+    // The corner lies 6 m behind, farther than the length over which the curvature is measured.
     let behind = route(vec![[-6.0, -100.0], [-6.0, 0.5], [100.0, 0.5]]);
     let context = Context { road: Some(&road), route: Some(&behind), ..Context::default() };
     map.make(&sweep, &context, &mut layer);
@@ -253,7 +253,7 @@ fn painting_stops_the_moment_the_route_bends_within_30_m_and_says_so() {
 }
 
 #[test]
-fn the_curvature_of_a_circle_is_one_over_its_radius_however_dense_its_points() {
+fn the_curvature_of_a_circle_is_one_over_its_radius() {
     for radius in [15.0f64, 40.0, 200.0] {
         for step_m in [0.5, 2.0] {
             let angle = |i: i32| f64::from(i) * step_m / radius;
@@ -269,14 +269,14 @@ fn the_curvature_of_a_circle_is_one_over_its_radius_however_dense_its_points() {
 }
 
 #[test]
-fn an_old_road_or_one_without_a_place_is_not_painted() {
+fn an_old_road_or_one_without_a_pose_is_not_painted() {
     let (sweep, config) = (level(), SpeedConfig::default());
-    let road = taken(straight(6.0));
+    let road = stored(straight(6.0));
     let at = |stamp_ns| make(&config, &sweep, &Context { road: Some(&road), stamp_ns, ..Context::default() });
     assert_eq!(figure(&at(500_000_000), "painting"), 1.0);
     let old = at(500_000_001);
     assert_eq!((figure(&old, "painting"), figure(&old, "stopped_by_age")), (0.0, 1.0));
-    let lane = taken(Road { frame: RoadFrame::Map, ..straight(6.0) });
+    let lane = stored(Road { frame: RoadFrame::Map, ..straight(6.0) });
     let nowhere = make(&config, &sweep, &Context { road: Some(&lane), stamp_ns: i64::MAX, ..Context::default() });
     assert_eq!((figure(&nowhere, "painting"), figure(&nowhere, "stopped_by_missing_pose")), (0.0, 1.0));
     assert_eq!(figure(&nowhere, "stopped_by_age"), 0.0, "a lane does not age");
@@ -304,7 +304,7 @@ fn a_road_stays_where_it_was_seen_while_the_vehicle_drives_on() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(100))]
 
-    /// A cell is painted where its middle lies in one of the quads, and gets d²/r² of a piece it lies in.
+    /// A cell is painted if its centre lies in one of the quads; its bonus follows from d²/r² of such a quad.
     #[test]
     fn painting_agrees_with_the_formula_cell_by_cell(
         turns in prop::collection::vec(-0.3f64..0.3, 1..8), widths in prop::collection::vec(1.0f64..8.0, 10),
@@ -351,7 +351,9 @@ proptest! {
             }
             match expected {
                 None => prop_assert_eq!(bonus, NO_ROAD, "{:?}", q),
-                Some(expected) => prop_assert!((f64::from(bonus) - expected).abs() < 1e-2, "{:?}: {} {}", q, bonus, expected),
+                Some(expected) => {
+                    prop_assert!((f64::from(bonus) - expected).abs() < 1e-2, "{:?}: {} {}", q, bonus, expected)
+                }
             }
         }
     }
@@ -365,7 +367,7 @@ proptest! {
         ), 0..300),
         seed in any::<u64>(),
     ) {
-        // Single precision has 4 µm at 40 m: a point that near to a border may fall on either side of it.
+        // Single precision resolves 4 µm at 40 m: a point nearer to a border may fall on either side.
         let near_a_border = |v: f32| v.abs() < 41.0 && (v * 2.0 - (v * 2.0).round()).abs() < 1e-4;
         let mut points = points;
         points.retain(|(x, y, _)| !near_a_border(*x) && !near_a_border(*y));
@@ -391,7 +393,7 @@ proptest! {
     }
 
     #[test]
-    fn any_checked_road_is_painted_and_any_other_refused_without_a_panic(
+    fn a_checked_road_is_painted_and_any_other_is_refused(
         points in prop::collection::vec((prop_oneof![-60f64..60.0, any::<f64>()], -60f64..60.0), 0..8),
         widths in prop::collection::vec(prop_oneof![8 => 0f64..20.0, 1 => any::<f64>()], 0..8),
         votes in prop::collection::vec(prop_oneof![0f32..9.0, any::<f32>()], 0..5),
@@ -401,11 +403,12 @@ proptest! {
         if road::check(&road).is_ok() {
             for bonus in [Bonus::Uniform, Bonus::Absolute, Bonus::Relative] {
                 let config = SpeedConfig { extent_m: 10.0, bonus, ..SpeedConfig::default() };
-                let (lane, route) = (taken(road.clone()), taken(road.clone()));
+                let (lane, route) = (stored(road.clone()), stored(road.clone()));
                 let mut painter = Painter::new(40, &config);
                 painter.paint(&road.points, &road.widths_m);
                 prop_assert!(painter.bonus_mps().iter().all(|b| *b == NO_ROAD || (0.0..=8.0).contains(b)));
-                make(&config, &empty(Model::Vlp16), &Context { road: Some(&lane), route: Some(&route), ..Context::default() });
+                let context = Context { road: Some(&lane), route: Some(&route), ..Context::default() };
+                make(&config, &empty(Model::Vlp16), &context);
             }
         }
     }

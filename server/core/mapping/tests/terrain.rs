@@ -1,4 +1,4 @@
-//! Neuhaus' terrain map against labels, against its paper's figures and against the simulator.
+//! The layer `terrain` (Neuhaus 2009) against labels, against the figures of the paper and against the simulator.
 
 #![cfg_attr(not(clearway_data), allow(unused))]
 
@@ -31,27 +31,27 @@ fn terrain(sweep: &Sweep, config: &TerrainConfig) -> Layer {
     layer
 }
 
-fn form(form: Variant) -> TerrainConfig {
-    TerrainConfig { variant: form, ..TerrainConfig::default() }
+fn with(variant: Variant) -> TerrainConfig {
+    TerrainConfig { variant, ..TerrainConfig::default() }
 }
 
 /// Cells by class, in the order of the legend.
 fn counts(layer: &Layer) -> Vec<usize> {
-    (0..5).map(|class| classes(layer).iter().filter(|held| **held == class).count()).collect()
+    (0..5).map(|class| classes(layer).iter().filter(|value| **value == class).count()).collect()
 }
 
 fn is_drivable(class: u8) -> bool {
     matches!(class, FLAT | FLAT_INFERRED)
 }
 
-/// Bytes of a channel in the wire's runs: value and length, a varint each.
+/// Bytes of a channel as runs of value and length, a varint each.
 fn run_bytes(layer: &Layer, channel: &str) -> usize {
     let varint = |v: usize| (1..10).find(|bytes| v < 1 << (7 * bytes)).unwrap();
     let runs = values(layer, channel);
     runs.chunk_by(|a, b| a == b).map(|run| varint(run[0].unsigned_abs() as usize) + varint(run.len() - 1)).sum()
 }
 
-/// Share of the flat cells, seen or inferred, that are free of obstacles; share of the road's that are flat.
+/// Share of the flat cells, seen or inferred, without an obstacle; share of the road cells that are flat.
 fn against_the_labels(config: &TerrainConfig) -> [f64; 2] {
     let (sweep, labels) = labelled_frame();
     let layer = terrain(&sweep, config);
@@ -62,7 +62,8 @@ fn against_the_labels(config: &TerrainConfig) -> [f64; 2] {
     let [free, road] = [share(&flat, |cell| !truth.obstacle[cell]), share(&truth.road, |cell| flat[cell])];
     let seen_flat: Vec<bool> = classes(&layer).iter().map(|class| *class == FLAT).collect();
     println!(
-        "{:?}: of flat cells free of obstacles {:.3} % ({leaks} are not), of those seen {:.3} %; of road flat {:.2} %; cells {:?}",
+        "{:?}: of flat cells free of obstacles {:.3} % ({leaks} are not), of those seen {:.3} %; of road flat {:.2} %; \
+         cells {:?}",
         config.variant,
         100.0 * free,
         100.0 * share(&seen_flat, |cell| !truth.obstacle[cell]),
@@ -74,18 +75,18 @@ fn against_the_labels(config: &TerrainConfig) -> [f64; 2] {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn the_labelled_frame_reaches_its_targets_beside_the_paper_and_the_plain_grid() {
-    let [grid_free, grid_road] = against_the_labels(&form(Variant::Grid));
-    let [paper_free, paper_road] = against_the_labels(&form(Variant::Paper));
-    let [free, road] = against_the_labels(&form(Variant::Grounded));
+fn the_labelled_frame_reaches_its_targets_in_all_variants() {
+    let [grid_free, grid_road] = against_the_labels(&with(Variant::Grid));
+    let [paper_free, paper_road] = against_the_labels(&with(Variant::Paper));
+    let [free, road] = against_the_labels(&with(Variant::Grounded));
     assert!(free >= 0.998, "{free}");
     assert!(road >= 0.99, "{road}");
-    // What the paper's hierarchy is for, and what it lets through.
+    // The paper's hierarchy finds more of the road than the grid, and calls more obstacles flat than ours.
     assert!(paper_road > 0.99 && grid_road < 0.8, "{paper_road} {grid_road}");
     assert!(paper_free < 0.99 && grid_free < 0.99, "{paper_free} {grid_free}");
 }
 
-/// Cells between two flat ones of a row or column at most 3 m apart that the plain grid knows nothing of.
+/// Cells that are unknown in the variant `grid`, between two flat cells of a row or column at most 3 m apart.
 fn holes(grid: &Layer) -> Vec<usize> {
     let (_, width) = size(grid);
     let class = classes(grid);
@@ -93,7 +94,7 @@ fn holes(grid: &Layer) -> Vec<usize> {
     for line in 0..width {
         for (first, stride) in [(line * width, 1), (line, width)] {
             let mut last: Option<usize> = None;
-            for cell in (0..width).map(|place| first + place * stride) {
+            for cell in (0..width).map(|index| first + index * stride) {
                 match class[cell] {
                     FLAT => {
                         if let Some(last) = last.filter(|last| (cell - last) / stride <= 13) {
@@ -112,11 +113,11 @@ fn holes(grid: &Layer) -> Vec<usize> {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn merging_closes_the_holes_of_the_plain_grid_on_real_scans() {
+fn the_hierarchy_closes_holes_of_the_grid_on_real_scans() {
     for number in 0..3 {
         let sweep = kitti_sweep(&format!("kitti/patchwork-plusplus/00000{number}.bin"));
         let [grid, paper, grounded] =
-            [Variant::Grid, Variant::Paper, Variant::Grounded].map(|f| terrain(&sweep, &form(f)));
+            [Variant::Grid, Variant::Paper, Variant::Grounded].map(|variant| terrain(&sweep, &with(variant)));
         let holes = holes(&grid);
         let closed = |layer: &Layer| {
             let closed = holes.iter().filter(|cell| is_drivable(classes(layer)[**cell])).count();
@@ -136,7 +137,7 @@ fn merging_closes_the_holes_of_the_plain_grid_on_real_scans() {
 #[test]
 fn a_town_and_an_open_plain_fit_a_message_of_64_kib() {
     for scene in [scenes::flat(), scenes::town(), scenes::dirt_track_between_fields()] {
-        let layer = terrain(&turn(scene), &TerrainConfig::default());
+        let layer = terrain(&simulate(scene), &TerrainConfig::default());
         let [class, roughness] = ["class", "roughness"].map(|channel| run_bytes(&layer, channel));
         println!("{class} bytes of class, {roughness} of roughness");
         assert!(class + roughness < 65_000);
@@ -145,27 +146,26 @@ fn a_town_and_an_open_plain_fit_a_message_of_64_kib() {
 
 #[test]
 fn an_evenly_sloping_plane_is_flat() {
-    for (grade, forms) in
+    for (grade, variants) in
         [(0.15, &[Variant::Grounded, Variant::Paper, Variant::Grid][..]), (0.5, &[Variant::Paper, Variant::Grid])]
     {
         let sweep = cast(Model::Hdl64eS2, |x, y, z| z <= grade * (0.8 * x + 0.6 * y));
-        for &form in forms {
-            let layer =
-                terrain(&sweep, &TerrainConfig { variant: form, overhang_m: 100.0, ..TerrainConfig::default() });
+        for &variant in variants {
+            let layer = terrain(&sweep, &TerrainConfig { variant, overhang_m: 100.0, ..TerrainConfig::default() });
             let [_, flat, _, elevated, obstacle] = counts(&layer)[..] else { unreachable!() };
-            println!("{grade} {form:?}: {flat} flat, {elevated} elevated, {obstacle} obstacles");
-            assert!(flat > 1000 && elevated == 0 && obstacle == 0, "{form:?} {grade}");
+            println!("{grade} {variant:?}: {flat} flat, {elevated} elevated, {obstacle} obstacles");
+            assert!(flat > 1000 && elevated == 0 && obstacle == 0, "{variant:?} {grade}");
         }
     }
-    // Beyond what can be driven the paper still calls it flat.
+    // A plane too steep to drive on is flat only for the paper.
     let steep = cast(Model::Hdl64eS2, |x, _, z| z <= 0.5 * x);
     let layer = terrain(&steep, &TerrainConfig { overhang_m: 100.0, ..TerrainConfig::default() });
     assert_eq!(counts(&layer)[usize::from(FLAT)], 0);
 }
 
 #[test]
-fn a_roof_is_flat_to_the_paper_and_elevated_to_the_grounded_form() {
-    // A low flat-topped block, 4 m by 6 m, whose top the sensor looks down on.
+fn a_roof_is_flat_for_the_paper_and_elevated_for_the_grounded_variant() {
+    // The sensor looks down on the flat top of a low block, 4 m by 6 m.
     let block = |x: f32, y: f32, z: f32| z <= 0.0 || (z <= 1.2 && (8.03..12.03).contains(&x) && y.abs() <= 3.03);
     let sweep = cast(Model::Hdl64eS2, block);
     let top = |layer: &Layer| {
@@ -174,8 +174,8 @@ fn a_roof_is_flat_to_the_paper_and_elevated_to_the_grounded_form() {
         cells.for_each(|(x, y)| seen[usize::from(classes(layer)[cell_at(layer, x, y).unwrap()])] += 1);
         seen
     };
-    let paper = top(&terrain(&sweep, &form(Variant::Paper)));
-    let grounded = top(&terrain(&sweep, &form(Variant::Grounded)));
+    let paper = top(&terrain(&sweep, &with(Variant::Paper)));
+    let grounded = top(&terrain(&sweep, &with(Variant::Grounded)));
     println!("on top: paper {paper:?}, grounded {grounded:?}");
     assert!(paper[usize::from(FLAT)] > 20 && paper[usize::from(FLAT_INFERRED)] > 20);
     assert!(grounded[usize::from(FLAT_ELEVATED)] > 20);
@@ -184,7 +184,7 @@ fn a_roof_is_flat_to_the_paper_and_elevated_to_the_grounded_form() {
 
 #[test]
 fn nothing_is_inferred_beyond_the_last_point_or_across_a_wide_hole() {
-    // Level ground ahead only, from 4 to 10 m and from 14 m on: a hole of 4 m is wider than the configured 3 m.
+    // Level ground lies only ahead, from 4 to 10 m and from 14 m on. The hole of 4 m is wider than the configured 3 m.
     let mut sweep = empty(Model::Hdl64eS2);
     for i in 0..80 {
         for j in -40..40 {
@@ -195,19 +195,19 @@ fn nothing_is_inferred_beyond_the_last_point_or_across_a_wide_hole() {
         }
     }
     let at = |layer: &Layer, x: f32, y: f32| class_name(layer, cell_at(layer, x, y).unwrap());
-    let grounded = terrain(&sweep, &form(Variant::Grounded));
+    let grounded = terrain(&sweep, &with(Variant::Grounded));
     assert_eq!(at(&grounded, 6.1, 0.1), "flat");
     assert_eq!(at(&grounded, 17.1, 0.1), "flat");
     for (x, y) in [(12.1, 0.1), (6.1, 8.1), (-6.1, 0.1), (40.0, 40.0)] {
         assert_eq!(at(&grounded, x, y), "unknown", "{x} {y}");
-        assert_eq!(at(&terrain(&sweep, &form(Variant::Paper)), x, y), "flat_inferred", "{x} {y}");
+        assert_eq!(at(&terrain(&sweep, &with(Variant::Paper)), x, y), "flat_inferred", "{x} {y}");
     }
     let wide = TerrainConfig { inference_m_max: 5.0, ..TerrainConfig::default() };
     assert_eq!(at(&terrain(&sweep, &wide), 12.1, 0.1), "flat_inferred");
 }
 
 #[test]
-fn the_plain_grid_tells_scatter_line_and_plane_apart() {
+fn the_grid_variant_tells_scatter_line_and_plane_apart() {
     let mut sweep = empty(Model::Hdl64eS2);
     for k in 0..64 {
         let (i, j) = (0.03 * (k % 8) as f32, 0.03 * (k / 8) as f32);
@@ -217,7 +217,7 @@ fn the_plain_grid_tells_scatter_line_and_plane_apart() {
         add(&mut sweep, [15.02 + quarter(k), 5.02 + quarter(k / 4), quarter(k / 16)]);
     }
     add(&mut sweep, [20.1, 5.1, 0.0]);
-    let layer = terrain(&sweep, &form(Variant::Grid));
+    let layer = terrain(&sweep, &with(Variant::Grid));
     let shape = |x: f32| values(&layer, "shape")[cell_at(&layer, x, 5.1).unwrap()];
     let found = [5.1, 10.1, 15.1, 20.1].map(shape);
     assert_eq!(found, [Shape::Plane, Shape::Line, Shape::Scatter, Shape::Unknown].map(|shape| shape as i32));
@@ -235,10 +235,10 @@ fn the_plane_of_a_cell_is_the_ground_under_it() {
     }
 }
 
-fn turn(scene: Scene) -> Sweep {
+fn simulate(scene: Scene) -> Sweep {
     let config = ScannerConfig::default();
     let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
-    let revolution = SimulatedVehicle::new(scene, config).turn(1).revolution;
+    let revolution = SimulatedVehicle::new(scene, config).true_revolution(1).revolution;
     let mut sweep = Sweep::default();
     sweep.set_revolution(&revolution, &mount);
     sweep.set_deviations(&revolution, &mount, &mut DistanceSeries::default(), None);
@@ -246,12 +246,12 @@ fn turn(scene: Scene) -> Sweep {
     sweep
 }
 
-/// Root of the mean r (eq. 4) of the cells with a roughness that `wanted(x, y)`, and their number.
+/// Root of the mean r (eq. 4) of the cells with a roughness for which `wanted(x, y)` is true, and their number.
 fn roughness(layer: &Layer, wanted: impl Fn(f32, f32) -> bool) -> (f64, usize) {
     let (_, columns) = size(layer);
     let channel = layer.channels.iter().find(|channel| channel.name == "roughness").unwrap();
     let of_cell = values(layer, "roughness");
-    let centre = |place: usize| (place as f32 + 0.5 - columns as f32 / 2.0) * 0.25;
+    let centre = |index: usize| (index as f32 + 0.5 - columns as f32 / 2.0) * 0.25;
     let cells: Vec<f64> = (0..of_cell.len())
         .filter(|cell| of_cell[*cell] != i32::from(ROUGHNESS.unknown))
         .filter(|cell| wanted(centre(cell % columns), centre(cell / columns)))
@@ -262,8 +262,8 @@ fn roughness(layer: &Layer, wanted: impl Fn(f32, f32) -> bool) -> (f64, usize) {
 
 #[test]
 fn a_dirt_track_is_smoother_than_the_fields_beside_it_near_and_far_alike() {
-    let sweep = turn(scenes::dirt_track_between_fields());
-    // At 30 m a cell holds three points of one ring.
+    let sweep = simulate(scenes::dirt_track_between_fields());
+    // At 30 m a cell has three points of one ring.
     let layer = terrain(&sweep, &TerrainConfig { roughness_points_min: 3, ..TerrainConfig::default() });
     assert_eq!(figure(&layer, "drivable_share"), 1.0);
     let [near, far] = [10.0f32, 30.0].map(|distance| {
@@ -283,35 +283,35 @@ fn a_dirt_track_is_smoother_than_the_fields_beside_it_near_and_far_alike() {
 }
 
 #[test]
-fn a_turn_without_series_has_flat_cells_of_unknown_roughness() {
-    let sweep = Sweep { deviation_m: Vec::new(), ..turn(scenes::flat()) };
+fn a_sweep_without_deviations_has_unknown_roughness() {
+    let sweep = Sweep { deviation_m: Vec::new(), ..simulate(scenes::flat()) };
     let layer = terrain(&sweep, &TerrainConfig::default());
     assert!(counts(&layer)[usize::from(FLAT)] > 10_000);
     assert!(values(&layer, "roughness").iter().all(|raw| *raw == i32::from(ROUGHNESS.unknown)));
 }
 
 #[test]
-fn no_flat_cell_of_the_simulated_worlds_holds_an_object() {
+fn flat_cells_of_the_simulated_worlds_contain_no_object() {
     for scene in scenes::of_the_thesis().into_iter().chain([scenes::town()]) {
         let name = scene.name;
         let config = ScannerConfig::default();
         let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
-        let turn = SimulatedVehicle::new(scene, config).turn(1);
+        let simulated = SimulatedVehicle::new(scene, config).true_revolution(1);
         let mut sweep = Sweep::default();
-        sweep.set_revolution(&turn.revolution, &mount);
-        let [wrong, flat, found] = [Variant::Grid, Variant::Paper, Variant::Grounded].map(|f| {
-            let layer = terrain(&sweep, &form(f));
+        sweep.set_revolution(&simulated.revolution, &mount);
+        let [wrong, flat, found] = [Variant::Grid, Variant::Paper, Variant::Grounded].map(|variant| {
+            let layer = terrain(&sweep, &with(variant));
             let mut high = vec![false; classes(&layer).len()];
             let mut free = vec![false; classes(&layer).len()];
             for ((&x, &y), &z) in sweep.x.iter().zip(&sweep.y).zip(&sweep.z) {
-                let (Some(cell), Some(ground)) = (cell_at(&layer, x, y), turn.truth.height_at(x.into(), y.into()))
+                let (Some(cell), Some(ground)) = (cell_at(&layer, x, y), simulated.truth.height_at(x.into(), y.into()))
                 else {
                     continue;
                 };
                 high[cell] |= z - ground > 0.3 && z <= 2.5;
-                free[cell] |= turn.truth.class_at(x.into(), y.into()) == Truth::Drivable && z - ground < 0.1;
+                free[cell] |= simulated.truth.class_at(x.into(), y.into()) == Truth::Drivable && z - ground < 0.1;
             }
-            let of = |held: &dyn Fn(usize) -> bool| (0..high.len()).filter(|cell| held(*cell)).count();
+            let of = |counts: &dyn Fn(usize) -> bool| (0..high.len()).filter(|cell| counts(*cell)).count();
             let drivable = |cell: usize| is_drivable(classes(&layer)[cell]);
             let wrong = of(&|cell| drivable(cell) && high[cell]);
             let is = of(&|cell| free[cell] && !high[cell]);
@@ -334,13 +334,13 @@ fn ground_behind_a_closed_fence_or_a_low_beam_is_flat_but_not_reached() {
         let name = scene.name;
         let config = ScannerConfig::default();
         let mount = Mount { ego_from_sensor: config.ego_from_sensor, range_m_min: 2.0 };
-        let turn = SimulatedVehicle::new(scene, config).turn(1);
+        let simulated = SimulatedVehicle::new(scene, config).true_revolution(1);
         let mut sweep = Sweep::default();
-        sweep.set_revolution(&turn.revolution, &mount);
+        sweep.set_revolution(&simulated.revolution, &mount);
         let layer = terrain(&sweep, &TerrainConfig::default());
         let unreachable = |cell: usize| {
-            let middle = |i: usize| (i as f64 + 0.5) * 0.25 - 50.0;
-            turn.truth.class_at(middle(cell % 400), middle(cell / 400)) == Truth::Unreachable
+            let centre = |i: usize| (i as f64 + 0.5) * 0.25 - 50.0;
+            simulated.truth.class_at(centre(cell % 400), centre(cell / 400)) == Truth::Unreachable
         };
         let count = |wanted: &dyn Fn(u8) -> bool| {
             let cells = classes(&layer).iter().enumerate();
@@ -348,9 +348,9 @@ fn ground_behind_a_closed_fence_or_a_low_beam_is_flat_but_not_reached() {
         };
         let (reached, behind) = (count(&is_drivable), count(&|class| class == FLAT_UNREACHABLE));
         println!("{name}: {reached} cells behind are drivable, {behind} are not");
-        // A cell of the fence's own line may hold ground of both sides.
+        // A cell on the line of the fence may contain ground of both sides.
         assert!(reached <= 10 && behind >= behind_min, "{name}: {reached} {behind}");
-        // The paper's form knows no gate.
+        // The paper's variant has no rule about passages.
         let open = terrain(&sweep, &TerrainConfig { variant: Variant::Paper, ..TerrainConfig::default() });
         assert!(!classes(&open).contains(&FLAT_UNREACHABLE));
     }

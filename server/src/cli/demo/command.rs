@@ -1,36 +1,34 @@
-//! The options of `clearway demo`, and how its course is printed.
+//! The options of `clearway demo`, and how its reports are printed.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::Result;
-use clap::{Args, ValueEnum};
+use clap::Args;
 
-use super::{Options as DemoOptions, Places, Second, demo};
-use crate::cli::output::{block_on, print, print_line, stop_signal};
+use super::report::Report;
+use super::run::{Endpoints, Options as DemoOptions, demo};
+use super::sensors::Sensors;
+use crate::cli::output::{block_on, print_line, stop_signal};
 
-/// Drive a simulated vehicle against a server of its own, over real UDP.
+/// Drive a simulated car against a server of its own, over real UDP, and serve its maps.
+///
+/// A simulation that is too slow for this machine skips time and reports it. Only --record and a picture of the newest
+/// map (target/demo.png, or demo.png in the temporary folder) write to the disk.
 #[derive(Args)]
 pub struct Options {
     /// End after this many seconds; at Ctrl-C if absent.
     #[arg(long, value_parser = seconds)]
     seconds: Option<Duration>,
-    /// Record to this MCAP file; to a temporary file if absent.
-    #[arg(long)]
+    /// Record events and maps to this MCAP file, which grows by about 115 MB a minute with an HDL-64E.
+    #[arg(long, value_name = "OUT.mcap")]
     record: Option<PathBuf>,
-    /// one: one rotating LIDAR in a town. many: two of them and six that send scans, poses and roads over gRPC, in
-    /// traffic.
-    #[arg(long, value_enum, default_value = "one")]
+    /// The car's sensors.
+    #[arg(long, value_enum, default_value_t, visible_alias = "sensor")]
     sensors: Sensors,
     /// Print one JSON object a second, and a summary.
     #[arg(long)]
     json: bool,
-}
-
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Sensors {
-    One,
-    Many,
 }
 
 fn seconds(text: &str) -> Result<Duration, String> {
@@ -41,54 +39,44 @@ fn seconds(text: &str) -> Result<Duration, String> {
 /// Runs the demo and prints a line a second.
 ///
 /// # Errors
-/// [`DemoError`](super::DemoError).
+/// [`DemoError`](super::error::DemoError).
 pub fn run(options: Options) -> Result<()> {
     block_on(demo_and_print(options))
 }
 
 async fn demo_and_print(options: Options) -> Result<()> {
-    let Options { seconds, record, sensors, json } = options;
+    let Options { seconds: duration, record, sensors, json } = options;
     let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
-    let record = record.unwrap_or_else(|| folder.join("demo.mcap"));
-    let picture = record.with_extension("png");
-    let many_sensors = sensors == Sensors::Many;
-    let options = DemoOptions { duration: seconds, record, picture, many_sensors, any_port: false };
-    let begun = |places: &Places| {
+    let picture = record.as_ref().map_or_else(|| folder.join("demo.png"), |record| record.with_extension("png"));
+    let options = DemoOptions { duration, record, picture, sensors, any_port: false };
+    let (record, picture) = (options.record.clone(), options.picture.clone());
+    let begun = |endpoints: &Endpoints| {
         if !json {
-            places.notes.iter().for_each(|note| _ = print_line(note));
-            let _ = print(&welcome(places));
+            let _ = print_line(&introduction(endpoints, record.as_deref(), &picture));
         }
     };
-    let second = |second: &Second| {
-        let _ = print_line(&if json { second.to_json().to_string() } else { second.line() });
+    let report = |report: &Report| {
+        let _ = print_line(&if json { report.to_json().to_string() } else { report.line() });
     };
-    let summary = demo(options, begun, second, stop_signal()?).await?;
-    if json {
-        print_line(&summary.to_json().to_string())?;
-    } else {
-        let (sent, last) = (summary.sent, &summary.last.snapshot);
-        print_line(&format!(
-            "The car sent {} data packets and {} telemetry datagrams; {} were received, {} maps made.",
-            sent.packets, sent.telemetry, last.ledger.received, last.maps
-        ))?;
-    }
+    let summary = demo(options, begun, report, stop_signal()?).await?;
+    print_line(&if json { summary.to_json().to_string() } else { summary.text() })?;
     Ok(())
 }
 
-fn welcome(places: &Places) -> String {
-    format!(
-        "A simulated car drives through a simulated town.
-  page       http://{}/
-  gRPC       {}   (clearway watch --server http://{})
-  zenoh      {}   (clearway/car/map/drivability)
-  recording  {}
-  newest map {}   (drawn each second)
-",
-        places.page,
-        places.grpc,
-        places.grpc,
-        places.zenoh.join(", "),
-        places.record.display(),
-        places.picture.display(),
-    )
+fn introduction(endpoints: &Endpoints, record: Option<&Path>, picture: &Path) -> String {
+    let Endpoints { page, grpc, zenoh, sensors, notes } = endpoints;
+    let record = record.map_or("none (--record OUT.mcap makes one)".into(), |file| file.display().to_string());
+    let mut text: String = notes.iter().map(|note| format!("{note}\n")).collect();
+    text += "A simulated car drives through a simulated world.";
+    for (name, value) in [
+        ("page", format!("http://{page}/")),
+        ("gRPC", format!("{grpc}   (clearway watch --server http://{grpc})")),
+        ("zenoh", format!("{}   (clearway/car/map/drivability)", zenoh.join(", "))),
+        ("sensors", sensors.clone()),
+        ("recording", record),
+        ("newest map", format!("{}   (drawn every second)", picture.display())),
+    ] {
+        text += &format!("\n  {name:<10} {value}");
+    }
+    text
 }

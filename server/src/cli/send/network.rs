@@ -103,7 +103,7 @@ fn deliver(mut arriving: impl Iterator<Item = Datagram>, sender: &mut udp::Sende
 /// What the network has done, as JSON, to compare with a server's counters.
 pub fn document(counts: &Counts) -> Value {
     json!({
-        "taken": counts.taken, "arrived": counts.arrived, "packets_lost": counts.packets_lost, "gaps": counts.gaps,
+        "taken": counts.sent, "arrived": counts.arrived, "packets_lost": counts.packets_lost, "gaps": counts.gaps,
         "telemetry_lost": counts.telemetry_lost, "duplicated": counts.duplicated, "reordered": counts.reordered,
         "truncated": counts.truncated, "flipped": counts.flipped,
     })
@@ -111,7 +111,7 @@ pub fn document(counts: &Counts) -> Value {
 
 /// What the network has done, as a line of text.
 pub fn line(counts: &Counts) -> String {
-    let Counts { taken, arrived, packets_lost, telemetry_lost, gaps, duplicated, reordered, truncated, flipped } =
+    let Counts { sent: taken, arrived, packets_lost, telemetry_lost, gaps, duplicated, reordered, truncated, flipped } =
         counts;
     format!(
         "bad network: {taken} datagrams sent, {arrived} delivered: {packets_lost} data packets lost in {gaps} gaps, \

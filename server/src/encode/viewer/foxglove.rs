@@ -1,4 +1,4 @@
-//! A map -> Foxglove messages: `foxglove.Grid` a layer, `foxglove.FrameTransforms`, and `foxglove.PointCloud` of
+//! A map -> Foxglove messages: `foxglove.Grid` for each layer, `foxglove.FrameTransforms`, and `foxglove.PointCloud` of
 //! points.
 
 use clearway_proto::map::Layer;
@@ -9,15 +9,16 @@ use foxglove::messages::{
 };
 use nalgebra::Isometry3;
 
-use super::{MAP_FRAME, Raster, base_frame, map_from_ego};
+use super::frame::{MAP_FRAME, base_frame, map_from_ego};
+use super::raster::Raster;
 use clearway_client::MapView;
 
-/// Red, green, blue, alpha.
+/// Bytes of a cell: red, green, blue, alpha.
 const CELL_BYTES: u32 = 4;
-/// x, y, z.
+/// Bytes of a point: x, y, z.
 const POINT_BYTES: u32 = 12;
 
-/// A layer as a coloured grid in the vehicle's frame; a grid that turns under the vehicle keeps its axes.
+/// A layer as a coloured grid in the ego frame; a grid along the world's axes keeps these axes.
 pub fn grid(map: &MapView, layer: &Layer, raster: &Raster) -> Grid {
     let field = |(name, offset): (&str, u32)| field(name, offset, NumericType::Uint8);
     let edge = f64::from(raster.cell_m);
@@ -34,14 +35,14 @@ pub fn grid(map: &MapView, layer: &Layer, raster: &Raster) -> Grid {
     }
 }
 
-/// Where the vehicle is on the map; `None` where no pose is known.
+/// Pose of the ego frame in `map`; `None` if no pose is known.
 pub fn transforms(map: &MapView) -> Option<FrameTransforms> {
     let stamp_ns = map.header().capture_end_ns;
     let transform = transform(stamp_ns, MAP_FRAME, &base_frame(map.vehicle()), &map_from_ego(map)?);
     Some(FrameTransforms { transforms: vec![transform] })
 }
 
-/// Where a frame lies in its parent.
+/// Transform of a frame in its parent.
 pub fn transform(stamp_ns: i64, parent: &str, child: &str, parent_from_child: &Isometry3<f64>) -> FrameTransform {
     let Pose { position, orientation } = pose(parent_from_child);
     FrameTransform {
@@ -53,7 +54,7 @@ pub fn transform(stamp_ns: i64, parent: &str, child: &str, parent_from_child: &I
     }
 }
 
-/// Points of a frame, metres.
+/// Points in a frame, in metres.
 pub fn points(stamp_ns: i64, frame_id: &str, points: impl Iterator<Item = [f32; 3]>) -> PointCloud {
     let field = |(name, offset): (&str, u32)| field(name, offset, NumericType::Float32);
     PointCloud {
@@ -70,7 +71,7 @@ fn field(name: &str, offset: u32, kind: NumericType) -> PackedElementField {
     PackedElementField { name: name.to_owned(), offset, r#type: kind.into() }
 }
 
-/// Seconds beyond what the message can say (before 1970, after 2106) are held at its limits.
+/// A stamp, limited to the range of the message (1970 to 2106).
 fn timestamp(stamp_ns: i64) -> Timestamp {
     let seconds = stamp_ns.div_euclid(1_000_000_000).clamp(0, u32::MAX.into()) as u32;
     Timestamp::new(seconds, stamp_ns.rem_euclid(1_000_000_000) as u32)

@@ -1,10 +1,10 @@
 //! A layer -> square cells, as occupancies and as a picture.
 //!
 //! In: a layer, Cartesian or radial. Out: row by row, x first, an occupancy (0 free to 100 occupied, -1 unknown) or
-//! red, green, blue, alpha a cell; and where the cells lie in the ego frame. A Cartesian layer keeps its cells and its
-//! axes. A radial one is resampled: a square cell has the worst of the radial cell at its middle and those whose
-//! middles lie in it, so that near the vehicle, where radial cells are the smaller ones, no obstacle falls between; and
-//! unknown is worse than free.
+//! red, green, blue and alpha for each cell; and the position of the cells in the ego frame. A Cartesian layer keeps its
+//! cells and its axes. A radial layer is resampled: a square cell gets the worst of the radial cell at its middle and those
+//! whose middles lie in it, so that near the vehicle, where radial cells are smaller, no obstacle is lost. Unknown is worse
+//! than free.
 //!
 //! | occupancy | meaning of the class |
 //! |---|---|
@@ -12,7 +12,7 @@
 //! | 100 | occupied, not reached |
 //! | -1 | unknown, inferred, hidden |
 //!
-//! There is nothing between: planners that cut at a threshold take less than 100 for free.
+//! There is no value between, because planners with a threshold would treat less than 100 as free.
 
 use std::collections::BTreeMap;
 
@@ -24,19 +24,19 @@ use nalgebra::{Isometry3, Vector3};
 
 use crate::encode::picture::Colours;
 
-/// Cells that radial layers are resampled to, metres: as those of the other layers.
+/// Edge of the cells to which radial layers are resampled, in metres: that of the other layers.
 const CELL_M: f64 = 0.25;
-/// Square cells from the vehicle to the edge at most; farther grids have larger cells.
+/// Most square cells from the vehicle to the edge; larger grids get larger cells.
 const CELLS_MAX: f64 = 1000.0;
-/// No cell of the layer lies there.
+/// Index of a square outside the layer.
 const NOWHERE: u32 = u32::MAX;
 
-/// Nothing is known.
+/// Occupancy of an unknown cell.
 pub const UNKNOWN: i8 = -1;
 const FREE: i8 = 0;
 const OCCUPIED: i8 = 100;
 
-/// Where the square cells of a grid lie, and which cells of the grid they show.
+/// The square cells of a grid, and the cells of the grid that they show.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Raster {
     grid: Grid,
@@ -44,28 +44,28 @@ pub struct Raster {
     pub width: u32,
     /// Cells along its y axis.
     pub height: u32,
-    /// Edge of a cell, metres.
+    /// Edge of a cell, in metres.
     pub cell_m: f32,
-    /// The corner of cell (0, 0) and the raster's axes, in the ego frame.
+    /// Pose of the raster in the ego frame: the corner of cell (0, 0), and the axes.
     pub ego_from_raster: Isometry3<f64>,
-    /// `None`: the grid's own cells.
+    /// Resampled cells; `None` if the raster has the grid's own cells.
     samples: Option<Samples>,
 }
 
-/// Cells of a radial grid by square cell.
+/// Cells of a radial grid for each square cell.
 #[derive(Clone, Debug, PartialEq)]
 struct Samples {
-    /// The one at the middle of each, or [`NOWHERE`].
+    /// The cell at the middle of each square, or [`NOWHERE`].
     at_middle: Vec<u32>,
-    /// Square cell and radial cell whose middle lies in it.
+    /// Square cells, each with a radial cell whose middle lies in it.
     inside: Vec<(u32, u32)>,
 }
 
 impl Raster {
-    /// The raster of a grid; worth keeping while the grid stays the same ([`Rasters`]).
-    pub fn of(grid: &Grid) -> Self {
+    /// The raster of a grid; [`Rasters`] keeps it while the grid stays the same.
+    pub fn from_grid(grid: &Grid) -> Self {
         match *grid {
-            Grid::Radial { .. } => Self::of_radial(grid),
+            Grid::Radial { .. } => Self::from_radial(grid),
             Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
                 let ego_from_axes = Isometry3::rotation(Vector3::z() * -yaw_rad);
                 let ego_from_raster = ego_from_axes * Isometry3::translation(origin_x_m, origin_y_m, 0.0);
@@ -74,7 +74,7 @@ impl Raster {
         }
     }
 
-    fn of_radial(grid: &Grid) -> Self {
+    fn from_radial(grid: &Grid) -> Self {
         let range_m = grid.range_m_max();
         let cell_m = CELL_M.max(range_m / CELLS_MAX) as f32;
         let edge = f64::from(cell_m);
@@ -102,7 +102,7 @@ impl Raster {
         }
     }
 
-    /// An occupancy a cell, of a layer of this grid.
+    /// The occupancy of each cell of a layer with this grid.
     pub fn occupancies(&self, layer: &Layer) -> Vec<i8> {
         let occupancies = occupancies(layer);
         match &self.samples {
@@ -111,8 +111,8 @@ impl Raster {
         }
     }
 
-    /// Red, green, blue and alpha a cell, of a layer of this grid, in the colours of [`crate::picture`]; what lies
-    /// outside of a radial grid is transparent.
+    /// Red, green, blue and alpha of each cell of a layer with this grid, in the colours of [`crate::encode::picture`].
+    /// Squares outside a radial grid are transparent.
     pub fn rgba(&self, layer: &Layer) -> Vec<u8> {
         let colours = Colours::of(layer);
         let colour = |cell: u32| match cell {
@@ -130,7 +130,7 @@ impl Raster {
 }
 
 impl Samples {
-    /// By square cell, the radial one that it shows.
+    /// The radial cell that each square cell shows.
     fn worst(&self, occupancies: &[i8]) -> impl Iterator<Item = u32> + use<> {
         // Unknown is worse than free, and better than an obstacle.
         let rank = |cell: u32| match cell {
@@ -156,7 +156,7 @@ fn at(occupancies: &[i8], cell: u32) -> i8 {
     occupancies.get(cell as usize).copied().unwrap_or(UNKNOWN)
 }
 
-/// An occupancy for each of the layer's own cells; unknown where it has no classes.
+/// The occupancy of each of the layer's own cells; unknown if it has no classes.
 fn occupancies(layer: &Layer) -> Vec<i8> {
     let of_class: Vec<i8> = layer.legend.iter().map(|class| occupancy(class.meaning)).collect();
     let of = |class: i32| usize::try_from(class).ok().and_then(|class| of_class.get(class).copied()).unwrap_or(UNKNOWN);
@@ -177,16 +177,16 @@ pub fn occupancy(meaning: ClassMeaning) -> i8 {
     }
 }
 
-/// The raster of each layer, made anew where its grid has changed.
+/// The raster of each layer, made again when its grid changes.
 #[derive(Debug, Default)]
 pub struct Rasters(BTreeMap<String, Raster>);
 
 impl Rasters {
-    /// That of a layer.
+    /// The raster of a layer.
     pub fn of(&mut self, layer: &Layer) -> &Raster {
-        let raster = self.0.entry(layer.name.clone()).or_insert_with(|| Raster::of(&layer.grid));
+        let raster = self.0.entry(layer.name.clone()).or_insert_with(|| Raster::from_grid(&layer.grid));
         if raster.grid != layer.grid {
-            *raster = Raster::of(&layer.grid);
+            *raster = Raster::from_grid(&layer.grid);
         }
         raster
     }
@@ -237,14 +237,14 @@ mod tests {
     }
 
     #[test]
-    fn no_radial_cell_that_is_not_free_falls_between_square_ones() {
+    fn every_radial_cell_that_is_not_free_is_in_a_square_that_is_not_free() {
         let row_radius_m: Vec<f32> = (1..=40).map(|row| 0.02 * (row * row) as f32).collect();
         let grid = Grid::Radial { row_radius_m, columns: 360 };
         // Any mixture of classes.
         let class = |cell: u64| (cell.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 61).saturating_sub(4) as u8;
         let classes: Vec<u8> = (0..grid.cell_count()).map(class).collect();
         let layer = layer(grid.clone(), classes.clone());
-        let raster = Raster::of(&grid);
+        let raster = Raster::from_grid(&grid);
         let (occupancies, rgba) = (raster.occupancies(&layer), raster.rgba(&layer));
         let half_m = 0.5 * f64::from(raster.cell_m) * f64::from(raster.width);
         let square = |x_m: f64, y_m: f64| {
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turned_grid_keeps_its_cells_and_says_where_they_lie() {
+    fn a_rotated_grid_keeps_its_cells_and_its_pose() {
         let grid = Grid::Cartesian {
             origin_x_m: -1.5,
             origin_y_m: -0.5,
@@ -279,7 +279,7 @@ mod tests {
             first_iy: 0,
         };
         let layer = layer(grid.clone(), (0..12).map(|cell| cell % 4).collect());
-        let raster = Raster::of(&grid);
+        let raster = Raster::from_grid(&grid);
         assert_eq!(raster.occupancies(&layer), [-1, 0, 100, 100].repeat(3));
         for cell in 0..12_usize {
             let (column, row) = ((cell % 4) as f64, (cell / 4) as f64);

@@ -1,4 +1,4 @@
-//! A map -> ROS 2 messages, CDR: `nav_msgs/msg/OccupancyGrid` a layer, `tf2_msgs/msg/TFMessage` and
+//! A map -> ROS 2 messages, CDR: `nav_msgs/msg/OccupancyGrid` for each layer, `tf2_msgs/msg/TFMessage` and
 //! `nav_msgs/msg/Odometry`. A sensor's points -> `sensor_msgs/msg/PointCloud2`.
 
 use clearway_proto::map::Layer;
@@ -8,10 +8,11 @@ use clearway_ros::point_cloud2::{Datatype, Field, PointCloud2};
 use clearway_ros::pose::{Odometry, StampedTransform, tf_message_to_cdr};
 use nalgebra::Isometry3;
 
-use super::{MAP_FRAME, Raster, base_frame, map_from_ego};
+use super::frame::{MAP_FRAME, base_frame, map_from_ego};
+use super::raster::Raster;
 use clearway_client::MapView;
 
-/// A layer as an occupancy grid, its origin in the vehicle's frame; a grid that turns under the vehicle keeps its axes.
+/// A layer as an occupancy grid in the ego frame; a grid along the world's axes keeps these axes, in its origin.
 pub fn occupancy_grid(map: &MapView, layer: &Layer, raster: &Raster) -> Vec<u8> {
     OccupancyGrid {
         header: Header { stamp_ns: map.header().capture_end_ns, frame_id: &base_frame(map.vehicle()) },
@@ -24,12 +25,12 @@ pub fn occupancy_grid(map: &MapView, layer: &Layer, raster: &Raster) -> Vec<u8> 
     .to_cdr()
 }
 
-/// Where the vehicle is on the map, as tf tells it; `None` where no pose is known.
+/// Pose of the ego frame in `map` as a tf message; `None` if no pose is known.
 pub fn tf(map: &MapView) -> Option<Vec<u8>> {
     with_transform(map, |transform| tf_message_to_cdr(&[transform]))
 }
 
-/// Where the vehicle is on the map and how fast it goes forward; `None` where no pose is known.
+/// Pose of the ego frame in `map` and forward speed as odometry; `None` if no pose is known.
 pub fn odometry(map: &MapView) -> Option<Vec<u8>> {
     let forward_mps = map.header().speed_mps.unwrap_or_default();
     with_transform(map, |transform| {
@@ -37,13 +38,13 @@ pub fn odometry(map: &MapView) -> Option<Vec<u8>> {
     })
 }
 
-/// Where a frame lies in its parent, as tf tells it.
+/// Transform of a frame in its parent as a tf message.
 pub fn transform(stamp_ns: i64, parent: &str, child: &str, parent_from_child: &Isometry3<f64>) -> Vec<u8> {
     let header = Header { stamp_ns, frame_id: parent };
     tf_message_to_cdr(&[StampedTransform { header, child_frame_id: child, parent_from_child: *parent_from_child }])
 }
 
-/// Points of a frame, metres, in one row.
+/// Points in a frame, in metres, in one row.
 pub fn points(stamp_ns: i64, frame_id: &str, points: &[[f32; 3]]) -> Vec<u8> {
     let data: Vec<u8> = points.iter().flatten().flat_map(|metres| metres.to_le_bytes()).collect();
     let field = |(name, offset)| Field { name, offset, datatype: Datatype::Float32 as u8, count: 1 };

@@ -1,8 +1,7 @@
-//! Who may call what over gRPC: the names in a peer's certificate -> its roles -> the RPCs it may call.
+//! Access control of gRPC: the names in a client's certificate -> its roles -> the RPCs it may call.
 //!
-//! Off while no client certificates are asked for (`grpc.tls.client_ca`): then everybody who reaches the port may do
-//! everything. On, everything is denied that [`RPCS`] and `[grpc.access]` do not allow; a test holds [`RPCS`] equal to
-//! the wire contract.
+//! Without `grpc.tls.client_ca` no client certificate is required, and every client may call everything. With it, every
+//! call is denied that [`RPCS`] and `[grpc.access]` do not allow; a test holds [`RPCS`] equal to the wire contract.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::future::{Ready, ready};
@@ -19,22 +18,22 @@ use tower_service::Service;
 use x509_parser::extensions::GeneralName;
 use x509_parser::prelude::{FromDer, X509Certificate};
 
-use crate::publish::connections::Place;
+use crate::publish::connections::Admission;
 use crate::config;
 
-/// What a peer may be.
+/// Role of a client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Role {
-    /// Reads maps and status.
+    /// May read maps and status.
     Reader,
-    /// Sends scans, poses, roads and packets.
+    /// May send scans, poses, roads and packets.
     Ingester,
-    /// Does both.
+    /// May do both.
     Operator,
 }
 
 impl Role {
-    /// As the configuration's keys and the errors spell it.
+    /// The name in the configuration's keys and in errors.
     fn as_str(self) -> &'static str {
         match self {
             Self::Reader => "reader",
@@ -44,8 +43,7 @@ impl Role {
     }
 }
 
-/// Every RPC there is, and who may call it; operators may call all. Whoever has a role may ask for health and
-/// reflection.
+/// Every RPC, and the roles that may call it; operators may call all. Every role may call health and reflection.
 pub const RPCS: &[(&str, &[Role])] = &[
     ("/clearway.v1.MapService/Watch", &[Role::Reader]),
     ("/clearway.v1.MapService/GetMap", &[Role::Reader]),
@@ -64,7 +62,7 @@ pub struct Access {
 }
 
 impl Access {
-    /// As configured; a name may stand in several lists.
+    /// The configured roles; a name may stand in several lists.
     pub fn new(config: &config::Access) -> Self {
         let lists =
             [(Role::Reader, &config.readers), (Role::Ingester, &config.ingesters), (Role::Operator, &config.operators)];
@@ -77,10 +75,10 @@ impl Access {
         Self { roles }
     }
 
-    /// Whether a peer with these names in its certificate may call `path`.
+    /// Checks that a client with these names in its certificate may call `path`.
     ///
     /// # Errors
-    /// `PermissionDenied`, with the names, their roles and the roles that are allowed.
+    /// `PermissionDenied` with the names, their roles and the roles that are allowed, if none of its roles is allowed.
     pub fn check(&self, path: &str, names: &[String]) -> Result<(), Status> {
         let roles: BTreeSet<Role> = names.iter().filter_map(|name| self.roles.get(name)).flatten().copied().collect();
         let allowed = RPCS.iter().find(|(rpc, _)| *rpc == path).map_or(&[][..], |(_, allowed)| allowed);
@@ -97,7 +95,7 @@ impl Access {
     }
 }
 
-/// Lets through what [`Access`] allows (`None` lets everything through) of whom there is a place for.
+/// A tower layer that lets through calls within the connection limit that [`Access`] allows; `None` allows every call.
 #[derive(Clone, Debug)]
 pub struct Guard(pub Option<Arc<Access>>);
 
@@ -131,7 +129,7 @@ where
     fn call(&mut self, request: Request<B>) -> Self::Future {
         let allowed =
             || self.access.as_ref().map_or(Ok(()), |access| access.check(request.uri().path(), &names(&request)));
-        match has_place(&request).and_then(|()| allowed()).err() {
+        match check_admission(&request).and_then(|()| allowed()).err() {
             None => Either::Left(self.inner.call(request)),
             Some(status) => {
                 tracing::info!(status = status.message(), "denied");
@@ -141,22 +139,22 @@ where
     }
 }
 
-fn has_place<B>(request: &Request<B>) -> Result<(), Status> {
-    let encrypted = request.extensions().get::<TlsConnectInfo<Place>>().map(|tls| *tls.get_ref());
+fn check_admission<B>(request: &Request<B>) -> Result<(), Status> {
+    let encrypted = request.extensions().get::<TlsConnectInfo<Admission>>().map(|tls| *tls.get_ref());
     match encrypted.or_else(|| request.extensions().get().copied()) {
-        Some(Place::Lobby(connections_max)) => Err(Status::resource_exhausted(format!(
-            "{connections_max} connections are open, which grpc.connections_max allows; try again when one has gone"
+        Some(Admission::OverLimit(connections_max)) => Err(Status::resource_exhausted(format!(
+            "{connections_max} connections are open, the limit of grpc.connections_max; try again when one is closed"
         ))),
-        Some(Place::Room) | None => Ok(()),
+        Some(Admission::Served) | None => Ok(()),
     }
 }
 
-/// The names in the peer's own certificate, which the handshake has checked against `client_ca`: common name and DNS
+/// The names in the client's own certificate, which the handshake has checked against `client_ca`: common name and DNS
 /// names.
 fn names<B>(request: &Request<B>) -> Vec<String> {
-    let certificates = request.extensions().get::<TlsConnectInfo<Place>>().and_then(TlsConnectInfo::peer_certs);
+    let certificates = request.extensions().get::<TlsConnectInfo<Admission>>().and_then(TlsConnectInfo::peer_certs);
     let Some(certificate) = certificates.as_ref().and_then(|chain| chain.first()) else { return Vec::new() };
-    // What does not parse has no name, and so no role.
+    // A certificate that does not parse has no name, and so no role.
     let Ok((_, certificate)) = X509Certificate::from_der(certificate) else { return Vec::new() };
     let common = certificate.subject().iter_common_name().filter_map(|name| name.as_str().ok());
     let mut names: Vec<String> = common.map(str::to_owned).collect();
@@ -180,7 +178,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_rpc_of_the_wire_contract_has_its_line_and_no_line_is_without_an_rpc() {
+    fn the_list_of_rpcs_is_that_of_the_wire_contract() {
         let mut rpcs = BTreeSet::new();
         let sets = [
             DESCRIPTORS,
@@ -198,11 +196,11 @@ mod tests {
         }
         let listed: BTreeSet<_> = RPCS.iter().map(|(rpc, _)| (*rpc).to_owned()).collect();
         assert_eq!(listed, rpcs);
-        assert_eq!(listed.len(), RPCS.len(), "each once");
+        assert_eq!(listed.len(), RPCS.len(), "each RPC once");
     }
 
     #[test]
-    fn everything_is_denied_that_is_not_allowed() {
+    fn every_call_is_denied_that_is_not_allowed() {
         let config = config::Access {
             readers: vec!["planner".into()],
             ingesters: vec!["lidar-gateway".into()],
@@ -213,10 +211,10 @@ mod tests {
         for (path, allowed) in RPCS {
             assert_eq!(may("planner", path), allowed.contains(&Role::Reader), "{path}");
             assert_eq!(may("lidar-gateway", path), allowed.contains(&Role::Ingester), "{path}");
-            assert!(may("workshop", path) && !may("stranger", path), "{path}");
+            assert!(may("workshop", path) && !may("unknown", path), "{path}");
             assert!(access.check(path, &[]).is_err(), "{path}");
         }
-        assert!(!may("workshop", "/clearway.v1.MapService/Erase"), "an RPC nobody knows");
+        assert!(!may("workshop", "/clearway.v1.MapService/Erase"), "an unknown RPC");
         let denied = access.check("/clearway.v1.MapService/Watch", &["lidar-gateway".into()]).unwrap_err();
         assert_eq!(denied.code(), tonic::Code::PermissionDenied);
         assert_eq!(

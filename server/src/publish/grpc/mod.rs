@@ -1,8 +1,7 @@
-//! Maps over gRPC: `clearway.v1.MapService`, standard health and reflection, and beside them what vehicles send
+//! The gRPC server: `clearway.v1.MapService`, standard health and reflection, and the ingest service if it is configured
 //! ([`crate::ingest::grpc`]).
 //!
-//! What a peer may cost is set here, explicitly, each limit with its reason; what one reader gets is
-//! [`super::reader`]'s.
+//! The limits of what one client may cost are set here, each with its reason. [`reader`] has the updates of one reader.
 
 pub mod access;
 pub mod reader;
@@ -18,44 +17,49 @@ use tokio::net::TcpListener;
 use tonic::transport::{Certificate, Identity, Server, ServerTlsConfig};
 use tonic::{Request, Response, Status, Streaming};
 
-use access::{Access, Guard};
 use super::connections::Connections;
+use super::served::Vehicles;
+use access::{Access, Guard};
 use reader::watch;
-use super::Vehicles;
+
 use crate::config::{self, Certificates};
 use crate::clock::now_ns;
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
 use v1::map_service_server::{MapService, MapServiceServer};
 
-/// Requests are names and numbers; anything longer is not meant for us.
+/// Longest request, in bytes. Ours: requests hold names and numbers.
 const REQUEST_BYTES_MAX: usize = 64 << 10;
-/// What a peer may have sent and nobody has read: a connection costs no more.
+/// Flow-control window of a connection, in bytes: what a client may send before the server reads it. Ours: a scan takes a
+/// few windows, and a client that is not read costs no more than one.
 const WINDOW_BYTES: u32 = 1 << 20;
-/// Streams a connection: a fleet page watches some vehicles' layers, nobody a hundred.
+/// Most streams on one connection. Ours: more than a fleet page needs for its vehicles and layers.
 const STREAMS_MAX: u32 = 128;
-/// Streams of one connection that were reset before anybody looked at them, and those the server had to reset for the
-/// peer's mistakes. A planner that restarts resets its few; whoever goes on opening and resetting loses its connection.
+/// Most streams of one connection that the client reset before the server accepted them, and most that the server reset
+/// because of the client's errors. A planner that restarts resets a few; a client that keeps opening and resetting streams
+/// loses its connection.
 const RESETS_PENDING_MAX: usize = 20;
 const RESETS_FOR_MISTAKES_MAX: usize = 128;
-/// A reader that opens `Watch` says what it wants at once.
+/// Longest headers of a request, in bytes. Ours: gRPC headers have a few hundred bytes; this is hyper's default.
+const HEADERS_BYTES_MAX: u32 = 16 << 10;
+/// Longest time from opening `Watch` to its first request. Ours: a reader sends its selection at once.
 const SELECTION_TIMEOUT: Duration = Duration::from_secs(10);
-/// A peer that is gone without a word is noticed after two of these.
+/// Interval and timeout of HTTP/2 keepalive: a client that has disappeared is noticed after both.
 const KEEPALIVE: Duration = Duration::from_secs(10);
-/// A peer that has begun a handshake has no reason to wait.
+/// Longest TLS handshake. Ours: a client that has begun one has no reason to wait.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// How peers are met: in plain text and trusting everybody, or with certificates.
+/// How clients connect: in plain text with every right, or with certificates and roles.
 pub struct Security {
     builder: Server,
     guard: Guard,
 }
 
 impl Security {
-    /// From the configuration and the files it names; without certificates plain text.
+    /// The security of a configuration; plain text without certificates.
     ///
     /// # Errors
-    /// What the transport says of the certificates.
+    /// [`tonic::transport::Error`] if a certificate or key is invalid.
     pub fn new(certificates: Option<Certificates>, access: &config::Access) -> Result<Self, tonic::transport::Error> {
         let Some(Certificates { certificate, key, client_ca }) = certificates else {
             return Ok(Self { builder: Server::builder(), guard: Guard(None) });
@@ -69,10 +73,21 @@ impl Security {
     }
 }
 
-/// Serves maps, and `ingest` if the server takes observations, until `stop` resolves and all streams have ended.
+/// Why the gRPC server has stopped.
+#[derive(Debug, thiserror::Error)]
+pub enum GrpcError {
+    /// The transport failed.
+    #[error(transparent)]
+    Transport(#[from] tonic::transport::Error),
+    /// The reflection service could not be built from the descriptors.
+    #[error(transparent)]
+    Reflection(#[from] tonic_reflection::server::Error),
+}
+
+/// Serves maps, and `ingest` if it is configured, until `stop` resolves and all streams have ended.
 ///
 /// # Errors
-/// What the transport says.
+/// [`GrpcError::Transport`] if the transport fails, [`GrpcError::Reflection`] if the descriptors are invalid.
 pub async fn serve<I: IngestService>(
     listener: TcpListener,
     security: Security,
@@ -80,7 +95,7 @@ pub async fn serve<I: IngestService>(
     vehicles: Vehicles,
     ingest: Option<IngestServiceServer<I>>,
     stop: impl Future<Output = ()>,
-) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+) -> Result<(), GrpcError> {
     let Security { builder, guard } = security;
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<MapServiceServer<Maps>>().await;
@@ -97,20 +112,20 @@ pub async fn serve<I: IngestService>(
         .layer(guard)
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE))
-        // A scan is megabytes; what is not read yet is bounded by the connection's window either way.
+        // Streams get the window of their connection, because one scan has megabytes.
         .initial_stream_window_size(WINDOW_BYTES)
         .initial_connection_window_size(WINDOW_BYTES)
         .max_concurrent_streams(STREAMS_MAX)
         .http2_max_pending_accept_reset_streams(Some(RESETS_PENDING_MAX))
         .http2_max_local_error_reset_streams(Some(RESETS_FOR_MISTAKES_MAX))
-        .http2_max_header_list_size(16 << 10)
+        .http2_max_header_list_size(HEADERS_BYTES_MAX)
         .add_service(maps)
         .add_optional_service(ingest)
         .add_service(health_service)
         .add_service(reflection().build_v1()?)
-        // Older grpcurl knows only this one.
+        // Older versions of grpcurl know only this version.
         .add_service(reflection().build_v1alpha()?)
-        .serve_with_incoming_shutdown(Connections::new(listener, connections_max).with_lobby().stream(), stop)
+        .serve_with_incoming_shutdown(Connections::new(listener, connections_max).with_errors_over_limit().stream(), stop)
         .await?;
     Ok(())
 }
@@ -118,7 +133,6 @@ pub async fn serve<I: IngestService>(
 struct Maps {
     vehicles: Vehicles,
 }
-
 
 #[tonic::async_trait]
 impl MapService for Maps {
@@ -146,7 +160,7 @@ impl MapService for Maps {
             return Err(Status::unavailable(format!("vehicle {name} has no map yet")));
         }
         let newest = served.status.subscriptions.subscribe(&layers).newest_map(&served.newest).await;
-        let map = newest.ok_or_else(|| Status::unavailable(format!("vehicle {name} makes no map at present")))?;
+        let map = newest.ok_or_else(|| Status::unavailable(format!("vehicle {name} makes no map at present: no data arrived since the request")))?;
         Ok(Response::new(v1::MapUpdate { map: map.select(&layers), skipped: 0, sent_ns: now_ns(), left_out: 0 }))
     }
 

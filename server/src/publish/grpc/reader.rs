@@ -1,8 +1,8 @@
 //! One reader of `Watch`: its requests and the newest maps -> its updates.
 //!
-//! The stream is asked for its next update when the transport has room for one, and looks at the newest-map slot only
-//! then: a slow reader skips maps and is told how many, and costs the engine nothing. Credits bound what is on the way:
-//! without them HTTP/2 windows alone hold about half a minute of maps.
+//! The transport polls the stream for its next update when it has room for one, and only then the stream reads the
+//! latest-value slot: a slow reader skips maps, learns how many, and costs the engine nothing. Credits limit the maps on
+//! the way; without them the HTTP/2 windows alone hold about half a minute of maps.
 
 use std::sync::Arc;
 
@@ -12,18 +12,18 @@ use tokio::sync::watch;
 use tonic::Status;
 
 use super::selection::{Selection, Sent};
-use crate::publish::{Served, Vehicles};
+use crate::publish::served::{Served, Vehicles};
 use crate::subscriptions::LayerSubscription;
 use crate::newest::Newest;
 use crate::clock::now_ns;
 use crate::status::Reader;
 use crate::encode::EncodedMap;
 
-/// The updates of one reader: what it selected of the newest maps, as far as what it acknowledges allows. Any executor
-/// drives it.
+/// The updates of one reader: the selected parts of the newest maps, within its credits. Any executor can drive the
+/// stream.
 ///
 /// # Errors
-/// What is wrong with the selection.
+/// A status that names the vehicle, layer or value of the selection that is not allowed, and what is.
 pub fn watch<R>(
     vehicles: &Vehicles,
     selection: v1::Selection,
@@ -40,15 +40,15 @@ struct Watch<R> {
     requests: Option<R>,
     newest: watch::Receiver<Newest>,
     selection: Selection,
-    /// What this reader was sent last.
+    /// The last map sent to this reader.
     last: Option<Sent>,
-    /// The same map, for a reader of deltas alone: they are put on it. A stopped reader keeps nothing else.
+    /// The same map for a reader of deltas, which are made against it. A stopped reader keeps no other map.
     base: Option<Arc<EncodedMap>>,
     /// The reader asked for a whole map.
     want_full: bool,
     over: bool,
     /// Until it goes, its layers are made.
-    taken: LayerSubscription,
+    subscription: LayerSubscription,
     // Last, and only held: the reader is counted while this lives.
     _reader: Reader,
 }
@@ -61,7 +61,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         Self {
             requests: Some(requests),
             newest,
-            taken: served.status.subscriptions.subscribe(&selection.layers),
+            subscription: served.status.subscriptions.subscribe(&selection.layers),
             selection,
             last: None,
             base: None,
@@ -82,15 +82,15 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         })
     }
 
-    /// The next update: when a credit is there, the newest map that is due. `None` when the reader has gone.
+    /// The next update: the newest map that is due, as soon as there is a credit. `None` if the reader has disconnected.
     async fn next(&mut self) -> Result<Option<v1::MapUpdate>, Status> {
         loop {
             tokio::select! {
                 // Acknowledgements first: they free the credit that the map needs.
                 biased;
                 request = next_request(&mut self.requests) => match request? {
-                    Some(request) => self.hear(request)?,
-                    // Half closed: a plain reader goes on reading. Nobody will acknowledge any more.
+                    Some(request) => self.apply(request)?,
+                    // Half closed: a plain reader goes on reading and sends no more acknowledgements.
                     None => self.requests = None,
                 },
                 changed = self.newest.changed(), if self.selection.credits.left() => {
@@ -104,7 +104,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         }
     }
 
-    fn hear(&mut self, request: v1::WatchRequest) -> Result<(), Status> {
+    fn apply(&mut self, request: v1::WatchRequest) -> Result<(), Status> {
         if let Some(sequence) = request.acknowledged {
             self.selection.credits.acknowledge(sequence)?;
         }
@@ -115,9 +115,9 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         Ok(())
     }
 
-    /// A map without one of the layers was made before this reader came.
+    /// True if a map is to be sent. A map without one of the layers was made before this reader subscribed.
     fn is_due(&self, map: &EncodedMap) -> bool {
-        (self.want_full || self.selection.rate.is_due(map.capture_end_ns)) && self.taken.is_covered_by(map)
+        (self.want_full || self.selection.rate.is_due(map.capture_end_ns)) && self.subscription.is_covered_by(map)
     }
 
     fn send(&mut self, map: Arc<EncodedMap>) -> Result<v1::MapUpdate, Status> {

@@ -1,8 +1,8 @@
-//! What one reader of `Watch` asked for: checked, then applied to the newest maps as they come.
+//! The selection of one reader of `Watch`: checked, then applied to the newest maps.
 //!
-//! In: a [`v1::Selection`], the newest maps' capture stamps, acknowledgements. Out: whether a map may go now, and of
-//! the maps in between how many the reader missed and how many were left out at its wish. Pure: no clock is read, so
-//! the same maps and the same acknowledgements give the same updates.
+//! In: a [`v1::Selection`], the capture stamps of the newest maps, acknowledgements. Out: whether a map may be sent now,
+//! and how many of the maps between were missed or left out because of the rate. No clock is read: the same maps and the
+//! same acknowledgements give the same updates.
 
 use std::collections::VecDeque;
 
@@ -11,32 +11,33 @@ use clearway_proto::region::{self, RegionError};
 use clearway_proto::v1;
 use tonic::Status;
 
-use crate::publish::Served;
+use crate::publish::served::Served;
 use crate::encode::EncodedMap;
 
-/// What a reader may ask to have on its way: more would only be older.
+/// Greatest `max_in_flight`. Ours: more maps on the way would only be older ones.
 const IN_FLIGHT_MAX: u32 = 64;
 
-/// A selection that can be served.
+/// A checked selection.
 #[derive(Clone, Debug)]
 pub struct Selection {
-    /// All of them where empty.
+    /// The layers to send; all if empty.
     pub layers: Vec<String>,
-    /// The part of each layer that is sent; all of it where absent.
+    /// The part of each layer to send; the whole layer if absent.
     pub region: Option<v1::Region>,
-    /// Whether layers may come as deltas.
+    /// True if layers may be sent as deltas.
     pub deltas: bool,
-    /// Which maps are picked.
+    /// Which maps are sent.
     pub rate: Rate,
-    /// How many may be on their way.
+    /// How many maps may be on the way.
     pub credits: Credits,
 }
 
 impl Selection {
-    /// Checks what a reader of this vehicle asks for.
+    /// Checks the selection of a reader of this vehicle.
     ///
     /// # Errors
-    /// The first thing that cannot be had, with its value and what is allowed.
+    /// `NotFound` for an unknown layer; `InvalidArgument` for a value that is not allowed, or a region outside the grids.
+    /// Both name the value and what is allowed.
     pub fn new(served: &Served, selection: v1::Selection) -> Result<Self, Status> {
         let v1::Selection { vehicle: _, layers, max_in_flight, max_rate_hz, region, deltas } = selection;
         served.check_layers(&layers)?;
@@ -53,29 +54,29 @@ impl Selection {
         };
         let refused = |error: RegionError| Status::invalid_argument(error.to_string());
         selection.region.as_ref().map_or(Ok(()), region::check).map_err(refused)?;
-        // Where there is a map already, a region that it does not reach is refused before the stream begins.
+        // If there is a map already, a region outside its grids is refused before the stream begins.
         if let Some(newest) = served.newest.borrow().clone().filter(|_| selection.region.is_some()) {
             selection.bytes(&newest, None)?;
         }
         Ok(selection)
     }
 
-    /// What is sent of a map, as a delta against `base` where there is one.
+    /// The payload of a map, as a delta against `base` if there is one.
     ///
     /// # Errors
-    /// The region lies outside a layer's grid.
+    /// `InvalidArgument` if the region lies outside a layer's grid.
     pub fn bytes(&self, map: &EncodedMap, base: Option<&EncodedMap>) -> Result<Bytes, Status> {
-        let bytes = map.cut(&self.layers, self.region.as_ref(), base);
+        let bytes = map.encode_for(&self.layers, self.region.as_ref(), base);
         bytes.map_err(|error| Status::invalid_argument(error.to_string()))
     }
 }
 
-/// Picks maps by their capture stamps: on average no more than so many a second.
+/// Selects maps by their capture stamps, so that the mean rate stays below a limit.
 #[derive(Clone, Debug)]
 pub struct Rate {
-    /// 0: every map.
+    /// Least mean time between two maps, in ns; 0 sends every map.
     period_ns: i64,
-    /// Stamp from which on the next map is sent; `None` before the first.
+    /// Capture stamp from which the next map is due; `None` before the first map.
     due_ns: Option<i64>,
 }
 
@@ -83,7 +84,7 @@ impl Rate {
     fn new(max_rate_hz: Option<f64>) -> Result<Self, Status> {
         let period_ns = match max_rate_hz {
             None => 0,
-            // Saturates: a rate so small picks one map.
+            // Saturates: a very small rate sends one map.
             Some(hz) if hz.is_finite() && hz > 0.0 => (1e9 / hz) as i64,
             Some(hz) => {
                 let text = format!("max_rate_hz {hz}: more than 0 and finite is allowed; absent, every map is sent");
@@ -93,25 +94,25 @@ impl Rate {
         Ok(Self { period_ns, due_ns: None })
     }
 
-    /// Whether a map captured at `stamp_ns` is to be sent.
+    /// True if a map captured at `stamp_ns` is due.
     pub fn is_due(&self, stamp_ns: i64) -> bool {
         self.period_ns == 0 || self.due_ns.is_none_or(|due_ns| stamp_ns >= due_ns)
     }
 
-    /// A map captured then is sent. The next is due a period after this one was, however late it came, so that a rate
-    /// is kept of which the maps' own is no multiple; but a reader that was away does not catch up. A quarter of a
-    /// period keeps turns that are not quite even on their side of it.
+    /// Records that a map captured at `stamp_ns` was sent. The next map is due one period after this one was due, however
+    /// late it came, so that the mean rate is kept even if the map rate is no multiple of it; a reader that was away does
+    /// not catch up. The quarter of a period allows for jitter of the maps.
     pub fn send(&mut self, stamp_ns: i64) {
         let quarter_ns = self.period_ns / 4;
         self.due_ns = match self.due_ns {
             None => Some(stamp_ns.saturating_add(3 * quarter_ns)),
-            // A whole map that was asked for comes between two that are due.
+            // A requested keyframe was sent between two maps that are due.
             Some(due_ns) if stamp_ns < due_ns => Some(due_ns),
             Some(due_ns) => Some(due_ns.saturating_add(self.period_ns).max(stamp_ns.saturating_add(quarter_ns))),
         };
     }
 
-    /// Of `between` maps captured between two that were sent, how many there was room for.
+    /// How many of `between` maps, captured between two sent ones, the rate would have allowed.
     fn room(&self, between: u64, sent_ns: [i64; 2]) -> u64 {
         if self.period_ns == 0 {
             return between;
@@ -120,7 +121,7 @@ impl Rate {
         between.min(u64::try_from(periods - 1).unwrap_or(0))
     }
 
-    /// Of the maps between two that were sent: (missed, left out at the reader's wish).
+    /// Maps between two sent ones: (missed, left out because of the rate).
     pub fn between(&self, last: Sent, next: Sent) -> (u64, u64) {
         let all = next.sequence.saturating_sub(last.sequence.saturating_add(1));
         let missed = self.room(all, [last.stamp_ns, next.stamp_ns]);
@@ -128,21 +129,21 @@ impl Rate {
     }
 }
 
-/// A map that was sent, as far as those between it and the next are counted.
+/// Sequence and capture stamp of a sent map.
 #[derive(Clone, Copy, Debug)]
 pub struct Sent {
-    /// The map's.
+    /// Sequence of the map.
     pub sequence: u64,
-    /// Of the end of its capture.
+    /// End of its capture, in ns since the Unix epoch.
     pub stamp_ns: i64,
 }
 
-/// What is on its way to a reader without an acknowledgement.
+/// Maps on the way to a reader that it has not acknowledged.
 #[derive(Clone, Debug)]
 pub struct Credits {
     max_in_flight: usize,
     in_flight: VecDeque<u64>,
-    /// The last map sent, and the last one of which the reader has told that it has finished with it.
+    /// Sequence of the last map sent, and of the last one acknowledged.
     sent: Option<u64>,
     acknowledged: Option<u64>,
 }
@@ -152,12 +153,12 @@ impl Credits {
         Self { max_in_flight, in_flight: VecDeque::new(), sent: None, acknowledged: None }
     }
 
-    /// Whether one more map may go; always, for readers that never acknowledge.
+    /// True if one more map may be sent; always true for readers that never acknowledge.
     pub fn left(&self) -> bool {
         self.max_in_flight == 0 || self.in_flight.len() < self.max_in_flight
     }
 
-    /// A map goes.
+    /// Records that a map was sent.
     pub fn send(&mut self, sequence: u64) {
         self.sent = Some(sequence);
         if self.max_in_flight > 0 {
@@ -165,10 +166,10 @@ impl Credits {
         }
     }
 
-    /// The reader has finished with this map, and so with all before it. Saying so again changes nothing.
+    /// Records that the reader has processed this map and all before it. A repeated acknowledgement changes nothing.
     ///
     /// # Errors
-    /// The map was never sent.
+    /// `InvalidArgument` if the map was never sent on this stream.
     pub fn acknowledge(&mut self, sequence: u64) -> Result<(), Status> {
         let known = if self.max_in_flight == 0 {
             self.sent.is_some_and(|sent| sequence <= sent)
@@ -234,14 +235,14 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_that_never_acknowledges_is_not_held_up() {
+    fn a_reader_that_never_acknowledges_gets_every_map() {
         let mut credits = Credits::new(0);
         (0..1000).for_each(|sequence| credits.send(sequence));
         assert!(credits.left() && credits.in_flight.is_empty());
     }
 
-    /// Stamps of the maps that are sent of those made at `stamps`.
-    fn picked(hz: f64, stamps: impl IntoIterator<Item = i64>) -> Vec<i64> {
+    /// Stamps of the maps that are sent, of those made at `stamps`.
+    fn selected(hz: f64, stamps: impl IntoIterator<Item = i64>) -> Vec<i64> {
         let mut rate = Rate::new(Some(hz)).unwrap();
         let due = |stamp: &i64| {
             let due = rate.is_due(*stamp);
@@ -254,24 +255,24 @@ mod tests {
     }
 
     #[test]
-    fn maps_are_picked_by_their_stamps_at_the_rate_asked_for_and_no_faster() {
-        // 10 Hz with 8 ms of unrest.
-        let stamps = || (0..600).map(|turn| turn * 100 * MS + (turn * 37 % 17 - 8) * MS);
+    fn maps_are_sent_at_the_requested_rate_and_no_faster() {
+        // 10 Hz with 8 ms of jitter.
+        let stamps = || (0..600).map(|scan| scan * 100 * MS + (scan * 37 % 17 - 8) * MS);
         for (hz, expected) in [(100.0, 600), (10.0, 600), (7.0, 420), (5.0, 300), (3.0, 180), (0.5, 30), (1e-300, 1)] {
-            let got = picked(hz, stamps());
+            let got = selected(hz, stamps());
             assert!(got.len().abs_diff(expected) <= 1, "{hz} Hz: {} of {expected}", got.len());
             assert_eq!(got[0], stamps().next().unwrap(), "the first map is there at once");
             let mut rate = Rate::new(Some(hz)).unwrap();
             rate.send(0);
             for pair in got.windows(2) {
                 let between = stamps().filter(|stamp| (pair[0] + 1..pair[1]).contains(stamp)).count() as u64;
-                assert_eq!(rate.room(between, [pair[0], pair[1]]), 0, "{hz} Hz: a reader that keeps up misses nothing");
+                assert_eq!(rate.room(between, [pair[0], pair[1]]), 0, "{hz} Hz: a reader that keeps up misses no map");
             }
         }
     }
 
     #[test]
-    fn what_the_rate_left_out_is_told_from_what_was_lost() {
+    fn maps_left_out_by_the_rate_are_counted_apart_from_missed_ones() {
         let rate = Rate::new(Some(5.0)).unwrap();
         // Away for 2 s of 10 Hz maps: 19 in between, for 9 of which 5 Hz had room.
         assert_eq!(rate.room(19, [0, 2000 * MS]), 9);
@@ -280,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_that_is_none_is_refused_by_name() {
+    fn an_invalid_rate_is_refused_with_its_value() {
         for hz in [0.0, -0.0, -1.0, f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
             let refused = Rate::new(Some(hz)).unwrap_err();
             assert_eq!(refused.code(), tonic::Code::InvalidArgument);

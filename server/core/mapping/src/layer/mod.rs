@@ -14,6 +14,10 @@
 //! | [`occupancy`] | Seo 2014, section 2 |
 //! | [`speed`] | Lindström 2005 |
 //! | [`safe_path`] | UT Austin thesis, section VI |
+//!
+//! The folder of a layer has `class.rs` (classes and channels), `config.rs` (parameters), the steps of the algorithm, a
+//! maker in `mod.rs`, and a `README.md` for users. To add a layer, add its folder here, and one line to the list in
+//! `registry`.
 
 mod channel;
 mod class;

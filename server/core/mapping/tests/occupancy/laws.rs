@@ -1,4 +1,4 @@
-//! Whatever the rays: every cell is written, and their order says nothing.
+//! Properties of the layer `occupancy` for any rays: each cell is written, and the order of the points does not matter.
 
 use clearway_mapping::config::OccupancyConfig;
 use clearway_mapping::layer::occupancy::Occupancy;
@@ -11,7 +11,7 @@ use proptest::prelude::*;
 use crate::common::*;
 use crate::{CLEAR, OCCLUDED, made};
 
-/// Positions near the vehicle, and all the floats there are but NaN.
+/// Coordinates near the vehicle, and any float except NaN.
 fn coordinate() -> impl Strategy<Value = f32> {
     prop_oneof![8 => -70f32..70.0, 1 => -0.5f32..0.5, 1 => any::<f32>().prop_filter("NaN", |v| !v.is_nan())]
 }
@@ -25,7 +25,7 @@ fn any_pose() -> impl Strategy<Value = Option<Isometry3<f64>>> {
     }))
 }
 
-/// Returns, rays without, the sensor's place, its number, the vehicle's pose.
+/// Returns, rays without a return, sensor position, sensor index, ego pose.
 type AnyScan = (Vec<[f32; 3]>, Vec<[f32; 3]>, [f32; 3], u16, Option<Isometry3<f64>>);
 
 fn any_scan() -> impl Strategy<Value = AnyScan> {
@@ -41,11 +41,12 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
     #[test]
-    fn whatever_the_rays_every_cell_is_written_and_their_order_says_nothing(
+    fn each_cell_is_written_and_the_order_of_points_does_not_matter(
         scans in prop::collection::vec(any_scan(), 1..4), cell_m in 0.2f32..1.0, range_m_max in 5f32..200.0,
         no_return_m in 0f32..100.0, hits_slow in 1u8..40, hits_fast in 1u8..3, seed in any::<u64>(),
     ) {
-        let config = OccupancyConfig { cell_m, range_m_max, no_return_m, hits_slow, hits_fast, ..OccupancyConfig::default() };
+        let config =
+            OccupancyConfig { cell_m, range_m_max, no_return_m, hits_slow, hits_fast, ..OccupancyConfig::default() };
         let [mut map, mut again] = [Occupancy::new(&config), Occupancy::new(&config)];
         for (points, no_returns, origin_m, sensor, map_from_ego) in &scans {
             let mut sweep = Sweep::default();

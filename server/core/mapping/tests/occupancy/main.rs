@@ -1,4 +1,5 @@
-//! Seo's map: the life of a cell arrow by arrow, the scrolling window, and six units in traffic against the truth.
+//! The layer `occupancy` (Seo 2014): the transitions of a cell, the scrolling window, and six sensors in traffic
+//! against the simulator's truth.
 
 #[path = "../common/mod.rs"]
 mod common;
@@ -33,7 +34,7 @@ fn occupancy() -> Occupancy {
     Occupancy::new(&OccupancyConfig::default())
 }
 
-/// The map of rays taken so far.
+/// The map of the scans so far.
 fn made(occupancy: &mut Occupancy, map_from_ego: Option<Isometry3<f64>>) -> Layer {
     let mut layer = occupancy.layer();
     occupancy.make(&Sweep::default(), &Context { map_from_ego, ..Context::default() }, &mut layer);
@@ -49,10 +50,10 @@ fn pose(x: f64, y: f64, yaw: f64) -> Isometry3<f64> {
 }
 
 #[test]
-fn each_arrow_of_a_cells_life_goes_where_the_table_says() {
+fn each_transition_of_a_cell_agrees_with_the_table() {
     const NEEDED: u8 = 4;
     const HOLD: u8 = 2;
-    // What is told of the cell: rays other than returns, then fresh returns.
+    // Evidence about the cell: rays without its returns, then its new returns.
     let evidence = [
         ("silence", Evidence::Silence, 0),
         ("nothing", Evidence::Nothing, 0),
@@ -63,7 +64,7 @@ fn each_arrow_of_a_cells_life_goes_where_the_table_says() {
         ("few hits, hidden", Evidence::Hidden, NEEDED - 1),
         ("hits", Evidence::Hidden, NEEDED),
     ];
-    // A capital: the state is held for `hold_maps` first.
+    // A capital letter: the state is held for `hold_maps` first.
     let expected = [
         (OccupancyClass::Unknown, "u o u h c u h x"),
         (OccupancyClass::Clear, "u o u h c u h x"),
@@ -105,7 +106,7 @@ fn each_arrow_of_a_cells_life_goes_where_the_table_says() {
 fn hits_add_up_saturate_and_fade() {
     let hit = |cell: Cell, fresh| cell.next(fresh, Evidence::Nothing, 20, 2);
     let passed = |cell: Cell| cell.next(0, Evidence::Through, 20, 2);
-    // A few returns a turn: unknown with its hits beside, then occupied.
+    // With a few returns in each map the cell is unknown, then occupied.
     let mut cell = Cell::default();
     for turn in 1..=3 {
         cell = hit(cell, 6);
@@ -114,7 +115,7 @@ fn hits_add_up_saturate_and_fade() {
     cell = hit(cell, 6);
     assert_eq!((cell.state, cell.hits), (OccupancyClass::Occupied, u8::MAX));
     assert_eq!(hit(cell, 1), cell, "one more return keeps it");
-    // Gone: not occupied at once, clear some maps later, and never in between for a thing that rays miss once.
+    // After the object has gone, the cell is unknown at once, and clear some maps later.
     let states: Vec<(OccupancyClass, u8)> = std::iter::successors(Some(passed(cell)), |cell| Some(passed(*cell)))
         .take(4)
         .map(|cell| (cell.state, cell.hits))
@@ -128,20 +129,25 @@ fn hits_add_up_saturate_and_fade() {
             (OccupancyClass::Clear, 0)
         ]
     );
-    assert_eq!(hit(passed(cell), 1).state, OccupancyClass::Occupied, "missed once, it is back with one return");
-    // The stronger evidence wins within one map.
+    assert_eq!(
+        hit(passed(cell), 1).state,
+        OccupancyClass::Occupied,
+        "after one miss, one return makes it occupied again"
+    );
+    // The stronger evidence counts within one map.
     assert_eq!(Cell::default().next(20, Evidence::Through, 20, 2).state, OccupancyClass::Occupied);
 }
 
 #[test]
-fn fewer_hits_are_needed_the_faster_the_vehicle_is() {
+fn a_faster_vehicle_needs_fewer_hits() {
     let needed = |speed_mps| Occupancy::hits_needed(&OccupancyConfig::default(), speed_mps);
     let speeds = [0.0, 4.4, 4.5, 15.6, 26.7, 26.8, 60.0, -26.8];
     assert_eq!(speeds.map(|speed| needed(Some(speed))), [20, 20, 20, 11, 3, 2, 2, 2]);
-    assert_eq!(needed(None), 2, "who does not know may be fast");
+    assert_eq!(needed(None), 2, "an unknown speed may be fast");
 }
 
-/// A wall 10 m ahead of a sensor 0.45 m over the ground, half a degree from ray to ray, 60 degrees to both sides.
+/// A wall 10 m ahead of a sensor 0.45 m over the ground, seen by rays half a degree apart, up to 60 degrees to both
+/// sides.
 fn wall() -> Sweep {
     let mut sweep = Sweep { mount_height_m: 0.45, ..Sweep::default() };
     for step in -120..=120 {
@@ -154,7 +160,7 @@ fn wall() -> Sweep {
 }
 
 #[test]
-fn before_a_wall_is_clear_behind_it_hidden_and_what_nobody_looks_at_out_of_range() {
+fn cells_before_a_wall_are_clear_and_cells_behind_it_occluded() {
     let sweep = wall();
     let mut occupancy = occupancy();
     occupancy.integrate(&rays(&sweep));
@@ -172,12 +178,12 @@ fn before_a_wall_is_clear_behind_it_hidden_and_what_nobody_looks_at_out_of_range
     ] {
         assert_eq!(class_at(&layer, x, y), expected, "({x}, {y})");
     }
-    // The next map has no rays and no pose: nothing is known any more.
+    // The next map has no rays and no pose: all cells are unknown.
     assert!(classes(&made(&mut occupancy, None)).iter().all(|class| *class == UNKNOWN));
 }
 
 #[test]
-fn beyond_the_reliable_range_nothing_is_judged() {
+fn cells_beyond_the_reliable_range_are_out_of_range() {
     let sweep = wall();
     let mut occupancy = Occupancy::new(&OccupancyConfig { range_m_max: 20.0, ..OccupancyConfig::default() });
     occupancy.integrate(&rays(&sweep));
@@ -186,7 +192,7 @@ fn beyond_the_reliable_range_nothing_is_judged() {
 }
 
 #[test]
-fn rays_that_meet_nothing_clear_as_far_as_configured_and_never_mark() {
+fn rays_without_a_return_clear_as_far_as_configured() {
     let empty = Sweep { mount_height_m: 0.45, ..Sweep::default() };
     let ahead: Vec<[f32; 3]> =
         (-20..=20).map(|step| (step as f32 * 0.00436).sin_cos()).map(|(y, x)| [x, y, 0.0]).collect();
@@ -200,9 +206,9 @@ fn rays_that_meet_nothing_clear_as_far_as_configured_and_never_mark() {
 }
 
 #[test]
-fn a_ray_that_passes_under_or_over_a_thing_does_not_clear_it() {
-    // A car's side from 9 m on, seen from the roof; a ray comes back from the ground 1 m under it, another from behind
-    // it.
+fn a_ray_that_passes_under_or_over_an_object_does_not_clear_it() {
+    // A sensor on the roof sees a car's side from 9 m on. One ray returns from the ground 1 m under the car, another
+    // from behind it.
     let mut sweep = Sweep { mount_height_m: 1.8, ..Sweep::default() };
     for step in -8..=8 {
         let y = step as f32 * 0.04;
@@ -219,8 +225,8 @@ fn a_ray_that_passes_under_or_over_a_thing_does_not_clear_it() {
 }
 
 #[test]
-fn the_grid_scrolls_under_a_vehicle_that_drives_and_turns_and_the_world_stays() {
-    // A lone post of 20 returns at (30, 5) of the world and free ground before it, seen once; then nobody looks.
+fn the_grid_scrolls_with_the_vehicle_and_the_world_stays() {
+    // A post with 20 returns at (30, 5) of the world, and free ground before it, are seen once; then no scan arrives.
     let mut occupancy = occupancy();
     let mut sweep = Sweep { mount_height_m: 0.45, ..Sweep::default() };
     for _ in 0..20 {
@@ -236,7 +242,7 @@ fn the_grid_scrolls_under_a_vehicle_that_drives_and_turns_and_the_world_stays() 
         let occupied = classes(&layer).iter().filter(|class| **class == OCCUPIED).count();
         assert_eq!((class_at(&layer, post.x as f32, post.y as f32), occupied), (OCCUPIED, 1), "map {number}");
     }
-    // Out of the window and back: forgotten.
+    // The post leaves the window and comes back: its cell is unknown.
     made(&mut occupancy, Some(pose(500.0, 0.0, 0.0)));
     assert!(classes(&made(&mut occupancy, Some(start))).iter().all(|class| *class == UNKNOWN));
 }
@@ -250,11 +256,11 @@ fn a_silent_sensor_leaves_nothing_clear() {
     assert_eq!(class_at(&made(&mut occupancy, ego), 5.0, 0.1), CLEAR);
     let after = made(&mut occupancy, ego);
     assert!(classes(&after).iter().all(|class| *class != CLEAR && *class != OCCLUDED));
-    assert_eq!(class_at(&after, 10.1, 0.1), OCCUPIED, "what stood there a moment ago may still stand there");
+    assert_eq!(class_at(&after, 10.1, 0.1), OCCUPIED, "an object seen a moment ago may still be there");
 }
 
 #[test]
-fn what_a_sensor_saw_before_a_long_silence_clears_nothing_in_the_map_after_it() {
+fn a_scan_before_a_long_silence_clears_nothing() {
     let sweep = wall();
     for (earliest_ns, expected) in [(999, CLEAR), (1000, CLEAR), (1001, UNKNOWN)] {
         let mut occupancy = occupancy();
@@ -266,8 +272,8 @@ fn what_a_sensor_saw_before_a_long_silence_clears_nothing_in_the_map_after_it() 
     }
 }
 
-/// What a map says against the simulator's truth.
-fn hold_against_truth(layer: &Layer, map_from_ego: &Isometry3<f64>, world: &clearway_sim::world::World, time: f64) {
+/// Compares a map with the simulator's truth.
+fn compare_with_truth(layer: &Layer, map_from_ego: &Isometry3<f64>, world: &clearway_sim::world::World, time: f64) {
     let now = Footprints::at(world, time);
     let lately: Vec<Footprints> = (0..=6).map(|step| Footprints::at(world, time - 0.05 * f64::from(step))).collect();
     for (cell, class) in classes(layer).iter().enumerate() {
@@ -276,30 +282,30 @@ fn hold_against_truth(layer: &Layer, map_from_ego: &Isometry3<f64>, world: &clea
         }
         let corners = cell_corners(layer, cell, map_from_ego);
         if *class == CLEAR {
-            assert_eq!(now.covering(&corners), None, "clear inside a thing, {:?} at {time} s", corners[0]);
+            assert_eq!(now.covering(&corners), None, "clear inside an object, {:?} at {time} s", corners[0]);
         } else {
             let middle = [0, 1].map(|axis| corners.iter().map(|corner| corner[axis]).sum::<f64>() / 4.0);
-            // Half a cell's diagonal, and three deviations of the range.
+            // The tolerance is half a cell's diagonal, and three standard deviations of the range.
             let touched = lately.iter().any(|footprints| footprints.near(middle, 0.28));
-            assert!(touched, "occupied, and nothing was there for 0.3 s: {middle:?} at {time} s");
+            assert!(touched, "occupied without an object for 0.3 s: {middle:?} at {time} s");
         }
     }
 }
 
 #[test]
-fn six_units_in_traffic_call_no_cell_of_a_thing_clear_and_leave_no_trail() {
+fn six_sensors_in_traffic_clear_no_object_and_leave_no_trail() {
     for speed_mps in [0.0, 25.0] {
         let mut street =
             Street { scene: traffic::street(speed_mps), units: six_units().to_vec(), occupancy: occupancy() };
         for number in 0..20 {
             let (layer, map_from_ego, time) = street.map(number);
-            hold_against_truth(&layer, &map_from_ego, &street.scene.world, time);
+            compare_with_truth(&layer, &map_from_ego, &street.scene.world, time);
         }
     }
 }
 
 #[test]
-fn no_seam_shows_where_the_fields_of_view_meet() {
+fn no_gap_appears_where_fields_of_view_meet() {
     for speed_mps in [0.0, 25.0] {
         let mut street =
             Street { scene: traffic::street(speed_mps), units: six_units().to_vec(), occupancy: occupancy() };
@@ -309,7 +315,7 @@ fn no_seam_shows_where_the_fields_of_view_meet() {
         let sensors: Vec<_> = street.units.iter().map(|unit| map_from_ego * unit.ego_from_sensor).collect();
         let caster = |at: &Isometry3<f64>| Caster::new(&*street.scene.world, at.translation.vector.into(), time, 200.0);
         let casters: Vec<_> = sensors.iter().map(caster).collect();
-        // At the height of a bumper, so that what stands on wheels hides what is behind it.
+        // The sensors are at the height of a bumper, so that vehicles hide the ground behind them.
         let sees = |unit: usize, [x, y]: [f64; 2]| {
             let eye = sensors[unit].translation.vector;
             let (place, way) = (sensors[unit].inverse() * Point3::new(x, y, 0.35), Vector3::new(x, y, 0.35) - eye);
@@ -323,12 +329,12 @@ fn no_seam_shows_where_the_fields_of_view_meet() {
             let middle = [0, 1].map(|axis| corners.iter().map(|corner| corner[axis]).sum::<f64>() / 4.0);
             let ego = map_from_ego.inverse() * Point3::new(middle[0], middle[1], 0.0);
             let range = ego.x.hypot(ego.y);
-            // The vehicle itself, and what two neighbouring fields of view leave out just beside it.
+            // The vehicle itself, and the ground just beside it between two neighbouring fields of view, are left out.
             if !(5.0..30.0).contains(&range) {
                 continue;
             }
-            assert_ne!(*class, OUT_OF_RANGE, "{speed_mps} m/s: nobody looks at ({:.2}, {:.2})", ego.x, ego.y);
-            // Ground that can be seen, well away from anything.
+            assert_ne!(*class, OUT_OF_RANGE, "{speed_mps} m/s: no sensor sees ({:.2}, {:.2})", ego.x, ego.y);
+            // Visible ground away from objects.
             let lonely = !footprints.near(middle, 1.5);
             if lonely && (0..sensors.len()).any(|unit| sees(unit, middle)) {
                 free += 1;
@@ -336,13 +342,13 @@ fn no_seam_shows_where_the_fields_of_view_meet() {
             }
         }
         println!("{speed_mps} m/s: {clear} of {free} free cells in sight are clear");
-        // The rest lies beside shadows, whose edges count as shadow.
+        // The rest lies at the edges of shadows, which count as shadow.
         assert!(f64::from(clear) >= 0.96 * f64::from(free), "{clear} of {free}");
     }
 }
 
 #[test]
-fn a_turning_sensor_on_the_roof_clears_no_cell_of_a_car_it_looks_over() {
+fn a_sensor_on_the_roof_clears_no_cell_of_a_car() {
     for model in [Model::Hdl64eS2, Model::Vlp16] {
         let vehicle = SimulatedVehicle::new(traffic::street(0.0), ScannerConfig { model, ..ScannerConfig::default() });
         let mount = Mount { ego_from_sensor: Isometry3::translation(0.0, 0.0, 1.9), range_m_min: 2.0 };
@@ -360,9 +366,9 @@ fn a_turning_sensor_on_the_roof_clears_no_cell_of_a_car_it_looks_over() {
             let (now, before) = (Footprints::at(world, now), Footprints::at(world, before));
             for (cell, _) in classes(&layer).iter().enumerate().filter(|(_, class)| **class == CLEAR) {
                 let corners = cell_corners(&layer, cell, &map_from_ego);
-                // A turn takes 0.1 s: what is there throughout.
+                // A revolution takes 0.1 s; only objects that are there the whole time count.
                 let inside = now.covering(&corners).and(before.covering(&corners));
-                assert_eq!(inside, None, "{model:?}, turn {turn}: clear inside a thing at {:?}", corners[0]);
+                assert_eq!(inside, None, "{model:?}, revolution {turn}: clear inside an object at {:?}", corners[0]);
             }
             if turn == 4 {
                 let [clear, occupied] = ["clear_share", "occupied_share"].map(|name| figure(&layer, name));
@@ -373,7 +379,7 @@ fn a_turning_sensor_on_the_roof_clears_no_cell_of_a_car_it_looks_over() {
     }
 }
 
-/// Six units' scans and the vehicle's poses for `maps` maps, in the order they arrive.
+/// The scans of six sensors and the vehicle's poses for `maps` maps, in the order of arrival.
 fn events_of_the_street(scene: &clearway_sim::scenes::Scene, units: &[PlaneUnit], maps: i64) -> Vec<Event> {
     const START_NS: i64 = 1_800_000_000_000_000_000;
     let mut events = Vec::new();
@@ -381,13 +387,14 @@ fn events_of_the_street(scene: &clearway_sim::scenes::Scene, units: &[PlaneUnit]
         let sequence = events.len() as u64;
         events.push(Event { sequence, arrival_ns: START_NS + stamp_ns + 1_000_000, source: source as u16, body });
     };
-    // One scan more than the maps: a map is made when the lead's fifth scan comes, before the others' fifth.
+    // One scan more than for the maps: the reference sensor's fifth scan makes a map before the fifth scans of the
+    // others arrive.
     for number in 0..=maps * street::SCANS + 1 {
         let stamp_ns = number * 20_000_000;
         let map_from_ego = scene.pose_at(stamp_ns as f64 * 1e-9);
         let speed_mps = scene.drive.speed;
         push(stamp_ns, 0, Body::EgoPose(EgoPose { stamp_ns: START_NS + stamp_ns, map_from_ego, speed_mps }));
-        // The lead is the last to tell of a moment.
+        // The reference sensor is the last of each time step.
         for (source, unit) in units.iter().enumerate().rev().filter(|_| number > 0) {
             let PlaneScan { x, y, z, intensity, ring, offset_ns, no_returns, .. } = unit.scan(scene, number);
             let stamp_ns = START_NS + stamp_ns;
@@ -399,7 +406,7 @@ fn events_of_the_street(scene: &clearway_sim::scenes::Scene, units: &[PlaneUnit]
 }
 
 #[test]
-fn six_sensors_go_through_the_pipeline_as_events_and_the_same_events_give_the_same_map() {
+fn the_same_events_of_six_sensors_give_the_same_maps() {
     let (scene, units) = (traffic::street(25.0), six_units());
     let sensors = units.iter().enumerate().map(|(number, unit)| {
         let ([x_m, y_m, z_m], (_, _, yaw)): ([f64; 3], _) =
@@ -421,7 +428,7 @@ fn six_sensors_go_through_the_pipeline_as_events_and_the_same_events_give_the_sa
     for map in &maps {
         let map_from_ego = map.map_from_ego.unwrap();
         let time = (map.capture_end_ns - 1_800_000_000_000_000_000) as f64 * 1e-9;
-        hold_against_truth(&map.layers[0], &map_from_ego, &scene.world, time);
+        compare_with_truth(&map.layers[0], &map_from_ego, &scene.world, time);
     }
     assert!(figure(&maps[5].layers[0], "clear_share") > 0.2);
     assert_eq!(maps, run());
@@ -429,7 +436,7 @@ fn six_sensors_go_through_the_pipeline_as_events_and_the_same_events_give_the_sa
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn hardly_a_clear_cell_of_the_labelled_frame_holds_an_obstacle() {
+fn few_clear_cells_of_the_labelled_frame_contain_an_obstacle() {
     let (sweep, labels) = labels::labelled_frame();
     let mut occupancy = occupancy();
     occupancy.integrate(&rays(&sweep));
@@ -446,7 +453,7 @@ fn hardly_a_clear_cell_of_the_labelled_frame_holds_an_obstacle() {
         100.0 * road,
         100.0 * obstacle
     );
-    // What leaks hardly reaches over the vehicle's clearance.
+    // The obstacles in clear cells are little higher than the vehicle's clearance.
     assert!(free >= 0.999, "{free}");
     assert!(road >= 0.95, "{road}");
     assert!(obstacle >= 0.7, "{obstacle}");
@@ -454,7 +461,7 @@ fn hardly_a_clear_cell_of_the_labelled_frame_holds_an_obstacle() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn three_lidars_on_one_roof_see_together_what_none_sees_alone() {
+fn three_lidars_together_see_more_than_each_alone() {
     for scene in ["0001", "0002"] {
         let sensors = opencalib::sensors(scene);
         let make = |sensors: &[opencalib::Sensor]| {

@@ -39,8 +39,8 @@ pub struct OccupancyConfig {
     pub hits_slow: u8,
     /// Number of returns at high speed, and if the speed is not known. 2: Seo 2014, figure 5.
     pub hits_fast: u8,
-    /// Number of maps for which an occupied cell without new evidence stays occupied. 2 is ours, so that nothing is
-    /// left of an object three maps after it has gone; not tuned.
+    /// Number of maps for which an occupied cell without new evidence stays occupied. 2 is ours, so that an object
+    /// that no sensor sees again leaves the third map; not tuned.
     pub hold_maps: u8,
 }
 

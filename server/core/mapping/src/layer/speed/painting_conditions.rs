@@ -199,6 +199,7 @@ fn curvature_per_m([a, b, c]: [[f64; 2]; 3]) -> f64 {
     let side = |p: [f64; 2], q: [f64; 2]| (q[0] - p[0]).hypot(q[1] - p[1]);
     let twice_area = ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs();
     let sides = side(a, b) * side(b, c) * side(a, c);
-    // Two of the positions are equal: the line turns back on itself, and any circle is larger.
+    // Two of the positions are equal, because the line turns back on itself: the curvature is that of a circle whose
+    // radius is half of BASE_M.
     if sides > 0.0 { 2.0 * twice_area / sides } else { 2.0 / BASE_M }
 }

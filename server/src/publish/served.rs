@@ -1,0 +1,55 @@
+//! The vehicles that are served: status and newest map of each.
+
+use std::sync::Arc;
+
+use tokio::sync::watch;
+
+use crate::directory::{UnknownNameError, find_vehicle};
+use crate::newest::Newest;
+use crate::status::VehicleStatus;
+
+/// One vehicle, as publishers use it.
+#[derive(Clone, Debug)]
+pub struct Served {
+    /// Status: ledger, rates, readers.
+    pub status: Arc<VehicleStatus>,
+    /// The newest map; the channel closes when the vehicle's engine stops.
+    pub newest: watch::Receiver<Newest>,
+}
+
+/// All vehicles, in the order of the configuration.
+#[derive(Clone, Debug, Default)]
+pub struct Vehicles(pub Arc<[Served]>);
+
+impl Vehicles {
+    /// The vehicle with this name; the only vehicle if `name` is empty.
+    ///
+    /// # Errors
+    /// [`UnknownNameError::Vehicle`] with the known names if there is no such vehicle, or several and `name` is empty.
+    pub fn find(&self, name: &str) -> Result<&Served, UnknownNameError> {
+        find_vehicle(&self.0, name, |served| &served.status.name)
+    }
+
+    /// The status of every vehicle.
+    pub fn statuses(&self) -> Vec<Arc<VehicleStatus>> {
+        self.0.iter().map(|served| served.status.clone()).collect()
+    }
+}
+
+impl Served {
+    /// Checks that the vehicle's maps have all these layers.
+    ///
+    /// # Errors
+    /// [`UnknownNameError::Layer`] for the first layer that they do not have, with the known ones.
+    pub fn check_layers(&self, layers: &[String]) -> Result<(), UnknownNameError> {
+        let known = &self.status.layers;
+        match layers.iter().find(|layer| !known.contains(&layer.as_str())) {
+            None => Ok(()),
+            Some(name) => Err(UnknownNameError::Layer {
+                name: name.clone(),
+                vehicle: self.status.name.to_string(),
+                known: known.join(", "),
+            }),
+        }
+    }
+}

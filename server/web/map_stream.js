@@ -1,0 +1,69 @@
+// In: the updates of one vehicle, as they arrive. Out: the newest map that was not drawn yet, and counts of what
+// happened to all others. Only the header of an update is read here; the cells of a map that is replaced before it was
+// drawn are never decoded.
+
+import { openUpdate } from "./wire/map.js";
+
+export class MapStream {
+  counts = { received: 0n, skipped: 0n, replaced: 0n, lost: 0n, repeated: 0n, refused: 0n, restarts: 0n };
+  #newest = null;
+  // The header of the last map that was received; null before the first.
+  #last = null;
+  #is_new_connection = true;
+  // Updates that could not be read since the last map: they are in a gap of the sequence, but were not lost.
+  #unreadable = 0n;
+
+  // Starts a new connection. The maps that were made while there was none count neither as skipped nor as lost.
+  restart() {
+    this.#is_new_connection = true;
+    this.#unreadable = 0n;
+  }
+
+  // Records one message; returns its update. Throws a DecodeError or WireError if the message is refused.
+  push(message) {
+    let update;
+    try {
+      update = openUpdate(message);
+    } catch (error) {
+      this.#unreadable++;
+      this.counts.refused++;
+      throw error;
+    }
+    this.counts.skipped += update.skipped;
+    if (this.#isNew(update)) {
+      if (this.#newest) this.counts.replaced++;
+      this.#newest = update;
+      this.#last = update.map.header;
+      this.counts.received++;
+      this.#unreadable = 0n;
+    }
+    this.#is_new_connection = false;
+    return update;
+  }
+
+  // Removes and returns the newest update that was not drawn; null if there is none.
+  removeNewest() {
+    const newest = this.#newest;
+    this.#newest = null;
+    return newest;
+  }
+
+  // True if the map follows those received so far. Counts the gap before it.
+  #isNew({ map: { header }, skipped }) {
+    const last = this.#last;
+    if (!last) return true;
+    if (last.boot_id !== header.boot_id) {
+      this.counts.restarts++;
+      return true;
+    }
+    const ahead = header.sequence - last.sequence;
+    if (ahead <= 0n) {
+      // After a reconnection the server sends its newest map, which may be the last one received.
+      if (ahead < 0n || !this.#is_new_connection) this.counts.repeated++;
+      return false;
+    }
+    const missing = ahead - 1n - skipped - this.#unreadable;
+    if (!this.#is_new_connection && missing > 0n) this.counts.lost += missing;
+    return true;
+  }
+}

@@ -1,0 +1,96 @@
+// In: the geometry of a layer, radial or Cartesian (ego frame: x forward, y left, metres). Out: the cell at a point,
+// and a table from pixels to cells for a square canvas with the vehicle in its middle, forward up and left on the left.
+// The table is computed once for each geometry and size; then a map costs one look-up a pixel.
+
+import { DecodeError } from "./limits.js";
+
+// How many cells a grid may have is checked where they are decoded (codec.js).
+//
+// { key, radius_m, cellAt(x, y) -> the cell's index or -1 }, and for deltas { kind: equal if cells are comparable,
+// shape: [rows, columns], first: [number of the first row, of the first column] }.
+export function gridOf(layer) {
+  if (layer.radial) return radial(layer.radial);
+  if (layer.cartesian) return cartesian(layer.cartesian);
+  throw new DecodeError("geometry", `layer ${layer.name} has none; allowed are radial, cartesian`);
+}
+
+function radial({ row_radius_m, columns }) {
+  const rows = row_radius_m.length;
+  if (rows === 0 || columns === 0) {
+    throw new DecodeError("geometry", `${rows} rows of ${columns} columns; at least 1 of each is needed`);
+  }
+  row_radius_m.forEach((outer, row) => {
+    const inner = row ? row_radius_m[row - 1] : 0;
+    if (!(outer > inner && outer < Infinity)) {
+      throw new DecodeError("geometry", `row radius ${row} is ${outer} m; it must be finite and over ${inner} m`);
+    }
+  });
+  const radii = Float64Array.from(row_radius_m), perRadian = columns / (2 * Math.PI);
+  const rowAt = (r) => {
+    let low = 0, high = rows;
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (r <= radii[middle]) high = middle;
+      else low = middle + 1;
+    }
+    return low;
+  };
+  const cellAt = (x, y) => {
+    const row = rowAt(Math.hypot(x, y));
+    if (row === rows) return -1;
+    const azimuth = Math.atan2(y, x);
+    const column = Math.floor((azimuth < 0 ? azimuth + 2 * Math.PI : azimuth) * perRadian);
+    return row * columns + Math.min(column, columns - 1);
+  };
+  const key = `radial ${columns} ${row_radius_m.join()}`;
+  return { key, radius_m: radii[rows - 1], cellAt, kind: key, shape: [rows, columns], first: [0n, 0n] };
+}
+
+function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix = 0n, first_iy = 0n }) {
+  if (width === 0 || height === 0) throw new DecodeError("geometry", `${width} x ${height} cells; at least 1 x 1`);
+  if (!(cell_m > 0 && cell_m < Infinity)) throw new DecodeError("geometry", `cell_m is ${cell_m}; it must be over 0`);
+  if (!Number.isFinite(origin_x_m + origin_y_m + yaw_rad)) {
+    const what = `origin is (${origin_x_m}, ${origin_y_m}) m, yaw ${yaw_rad} rad; they must be finite`;
+    throw new DecodeError("geometry", what);
+  }
+  const cos = Math.cos(yaw_rad), sin = Math.sin(yaw_rad);
+  const cellAt = (x, y) => {
+    const ix = Math.floor((x * cos - y * sin - origin_x_m) / cell_m);
+    const iy = Math.floor((x * sin + y * cos - origin_y_m) / cell_m);
+    return ix >= 0 && ix < width && iy >= 0 && iy < height ? iy * width + ix : -1;
+  };
+  const edges = [origin_x_m, origin_x_m + width * cell_m, origin_y_m, origin_y_m + height * cell_m];
+  const key = `cartesian ${origin_x_m} ${origin_y_m} ${width} ${height} ${cell_m} ${yaw_rad}`;
+  const radius_m = Math.max(...edges.map(Math.abs));
+  return { key, radius_m, cellAt, kind: `cartesian ${cell_m}`, shape: [height, width], first: [first_iy, first_ix] };
+}
+
+// The ego coordinates, in metres, of the middle of a pixel of a canvas that is `size` pixels wide and shows `view_m` to
+// every side.
+export function egoAt(px, py, size, view_m) {
+  const metres = (2 * view_m) / size;
+  return { x: (size / 2 - py - 0.5) * metres, y: (size / 2 - px - 0.5) * metres };
+}
+
+// Layers of one map mostly share a geometry, so their panels share a table. A change of the view makes new tables, and
+// so does each map of a grid that turns under the vehicle; the table that was not used for the longest time is dropped.
+const TABLES_MAX = 4;
+const tables = new Map();
+
+// The index of the cell in the middle of each pixel, row by row from the upper left; -1 outside the grid.
+export function pixelCells(grid, size, view_m) {
+  const key = `${size} ${view_m} ${grid.key}`;
+  let table = tables.get(key);
+  if (!table) {
+    table = new Int32Array(size * size);
+    const metres = (2 * view_m) / size, { cellAt } = grid;
+    for (let py = 0, i = 0; py < size; py++) {
+      const x = (size / 2 - py - 0.5) * metres;
+      for (let px = 0; px < size; px++, i++) table[i] = cellAt(x, (size / 2 - px - 0.5) * metres);
+    }
+    if (tables.size >= TABLES_MAX) tables.delete(tables.keys().next().value);
+  }
+  tables.delete(key);
+  tables.set(key, table);
+  return table;
+}

@@ -1,0 +1,124 @@
+// In: the bytes of a MapUpdate or of a Map. Out: the map, whose layers and channels are decoded when they are first
+// needed, or a DecodeError or WireError that says what is wrong.
+
+import { baseByClass, decodeChannel } from "./codec.js";
+import { baseCells, baseLayer } from "./delta.js";
+import { gridOf } from "./grid.js";
+import { isWithoutLegend, readLegend } from "./legend.js";
+import { DecodeError, MAP_BYTES_MAX, MAP_CELLS_MAX, MAP_PARTS_MAX } from "./limits.js";
+import { countParts, readLayer, readLayerName, readMap, readMapUpdate } from "./protobuf.js";
+
+// { skipped, sent_ns, map }: a MapUpdate and its map. 64-bit values are BigInt.
+export function openUpdate(message) {
+  const update = readMapUpdate(message);
+  if (update.sent_ns <= 0n) throw new DecodeError("sent_ns", `${update.sent_ns}; the age needs it`);
+  return { ...update, map: new LiveMap(update.map) };
+}
+
+// A map of which only the header and the layers' names are read at first.
+export class LiveMap {
+  #layer_bytes = new Map();
+  #layers = new Map();
+  #cells_claimed = 0;
+
+  // bytes: an encoded Map. base: the map that deltas start from, or null. With a base every layer is opened at once, so
+  // that no map keeps another one.
+  constructor(bytes, base = null) {
+    this.length = bytes.length;
+    if (this.length > MAP_BYTES_MAX) {
+      throw new DecodeError("too_long", `${this.length} bytes; at most ${MAP_BYTES_MAX} are allowed`);
+    }
+    const parts = countParts(bytes);
+    if (parts > MAP_PARTS_MAX) {
+      throw new DecodeError("too_many_parts", `${parts} parts; at most ${MAP_PARTS_MAX} are allowed`);
+    }
+    const { header, layers } = readMap(bytes);
+    if (!header) throw new DecodeError("header", "the map has none");
+    this.header = header;
+    for (const layer of layers) {
+      const name = readLayerName(layer);
+      if (this.#layer_bytes.has(name)) throw new DecodeError("twice", `two layers are named ${name}`);
+      this.#layer_bytes.set(name, layer);
+    }
+    if (base) this.names.forEach((name) => this.layer(name, base));
+  }
+
+  // The names of the layers, in the order on the wire.
+  get names() {
+    return [...this.#layer_bytes.keys()];
+  }
+
+  // The layer of this name; null if the map has none.
+  layer(name, base = null) {
+    if (!this.#layer_bytes.has(name)) return null;
+    if (!this.#layers.has(name)) this.#layers.set(name, this.#open(this.#layer_bytes.get(name), base));
+    return this.#layers.get(name);
+  }
+
+  #open(bytes, base) {
+    const message = readLayer(bytes);
+    for (const { cell_count } of message.channels) this.#cells_claimed += cell_count;
+    if (this.#cells_claimed > MAP_CELLS_MAX) {
+      throw new DecodeError("too_many_cells", `${this.#cells_claimed} cells; a map may have ${MAP_CELLS_MAX}`);
+    }
+    return new Layer(message, baseLayer(message, this.header, base));
+  }
+}
+
+// One layer: { name, legend: [{ name, meaning, colour }], grid, metrics, channels: [{ name, unit, scale, unknown }] }.
+class Layer {
+  #channels = new Map();
+  #cells = new Map();
+  #before;
+
+  // message: a Layer message. before: the layer that a delta starts from; null for a whole layer.
+  constructor(message, before) {
+    this.name = message.name;
+    this.grid = gridOf(message);
+    this.legend = before && isWithoutLegend(message) ? before.legend : readLegend(message);
+    this.metrics = message.metrics;
+    this.#before = before;
+    for (const channel of message.channels) {
+      if (this.#channels.has(channel.name)) {
+        throw new DecodeError("twice", `layer ${this.name}: two channels are named ${channel.name}`);
+      }
+      this.#channels.set(channel.name, channel);
+    }
+    this.channels = message.channels.map(({ name, unit, scale, unknown }) => ({ name, unit, scale, unknown }));
+    if (this.channels.length === 0) throw new DecodeError("channels", `layer ${this.name} has none`);
+    if (before) this.channels.forEach(({ name }) => this.cells(name));
+    this.#before = null;
+  }
+
+  // The cells of the channel of this name, decoded at the first call; null if the layer has none.
+  cells(name) {
+    if (!this.#channels.has(name)) return null;
+    if (!this.#cells.has(name)) this.#cells.set(name, this.#decode(this.#channels.get(name)));
+    return this.#cells.get(name);
+  }
+
+  #decode(channel) {
+    const cells = decodeChannel(channel, this.grid.shape, this.#base(channel));
+    if (channel.name === "class") this.#checkClasses(cells);
+    return cells;
+  }
+
+  #base(channel) {
+    if (channel.by_class.length === 0) return this.#before && baseCells(this.name, this.grid, this.#before, channel);
+    // Channel "class" must lie before a channel that depends on it.
+    const names = [...this.#channels.keys()];
+    const has_classes = names.slice(0, names.indexOf(channel.name)).includes("class");
+    return baseByClass(channel, has_classes ? this.cells("class") : null, this.legend);
+  }
+
+  #checkClasses(cells) {
+    let greatest = 0, least = 0;
+    for (let i = 0; i < cells.length; i++) {
+      if (cells[i] > greatest) greatest = cells[i];
+      else if (cells[i] < least) least = cells[i];
+    }
+    if (least >= 0 && greatest < this.legend.length) return;
+    const unnamed = least < 0 ? least : greatest;
+    throw new DecodeError("class", `layer ${this.name}: class ${unnamed}; the legend names ${this.legend.length}`);
+  }
+}
