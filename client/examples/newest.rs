@@ -12,7 +12,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
         let (map, now) = (update.map, now_ns());
         let (_, ahead) = map.layer("drivability")?.class_at(10.0, 0.0);
         let stale = if map.is_stale(now) { "STALE, " } else { "" };
-        let share = 100.0 * map.figure("drivable_share").unwrap_or(0.0);
+        let share = 100.0 * map.metric("drivable_share").unwrap_or(0.0);
         let (sequence, age_ms, skipped) = (map.sequence(), map.age_ms(now), update.skipped);
         println!(
             "map {sequence}: {stale}{age_ms:.0} ms old, {skipped} skipped; 10 m ahead {ahead}, {share:.0} % drivable"

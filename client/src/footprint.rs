@@ -1,8 +1,8 @@
-//! What a vehicle of some size may do in a map: whether a footprint is free, and where the nearest obstacle lies.
+//! Whether a vehicle's footprint is free, and where the nearest obstacle is.
 //!
-//! In: a layer with classes, a rectangle or a point in the ego frame (x forward, y left, metres). Out: answers by every
-//! cell the rectangle touches and by the cells' own borders, not their middles. Unknown is never free, and so is
-//! everything outside the grid.
+//! In: a layer with classes, and a rectangle or a point in the ego frame (x forward, y left, metres). Out: answers from
+//! the meanings in the layer's legend. They consider every cell that the rectangle touches and the borders of cells,
+//! not only their centres. Only the meaning free is free; a place outside the grid is not free.
 
 use std::f64::consts::TAU;
 
@@ -10,57 +10,59 @@ use clearway_proto::grid::Grid;
 use clearway_proto::map::Layer;
 use clearway_proto::v1::ClassMeaning;
 
-use crate::ClientError;
+use crate::error::ClientError;
 use crate::view::MapView;
 
-/// What is nearer than this to a cell touches it, metres: far more than the rounding of any place on a map.
+/// Distance in metres below which a point touches a cell. Ours: far more than the rounding errors of a point on a map.
 const TOUCH_M: f64 = 1e-9;
 
-/// The ground a vehicle covers, its border included: a rectangle.
+/// The rectangle of ground that a vehicle covers, including its border.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Footprint {
-    /// Middle, metres forward.
+    /// Centre: distance forward, in metres.
     pub x_m: f64,
-    /// Middle, metres to the left.
+    /// Centre: distance to the left, in metres.
     pub y_m: f64,
-    /// Counter-clockwise from the ego x axis.
+    /// Heading in radians, counter-clockwise from the ego x axis.
     pub heading_rad: f64,
-    /// Along its heading.
+    /// Length along the heading, in metres.
     pub length_m: f64,
-    /// Across its heading.
+    /// Width across the heading, in metres.
     pub width_m: f64,
 }
 
-/// The nearest part of a cell with something in it.
+/// The nearest point of a cell that contains an obstacle.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Obstacle {
-    /// Metres forward.
+    /// Distance forward, in metres.
     pub x_m: f64,
-    /// Metres to the left.
+    /// Distance to the left, in metres.
     pub y_m: f64,
-    /// From the point asked about; 0 where that lies in such a cell. No obstacle of the layer is nearer; this one may be
-    /// farther, by as much as its cell is long: a map does not tell where in a cell something stands. The innermost
-    /// cells of a radial grid begin in the middle of the vehicle, so that an obstacle in one is 0 m from there.
+    /// Distance from the given point, in metres; 0 if the point lies in such a cell. No obstacle of the layer is
+    /// nearer. The obstacle itself can be farther away by up to the size of the cell, because a map does not state
+    /// where in a cell it stands. The innermost cells of a radial grid start at the vehicle's origin, so an obstacle in
+    /// one is 0 m from there.
     pub distance_m: f64,
-    /// From there, counter-clockwise from the ego x axis, -π to π.
+    /// Direction from the given point in radians, counter-clockwise from the ego x axis, -π to π.
     pub bearing_rad: f64,
 }
 
 impl MapView {
-    /// Whether a layer says of every cell the footprint touches that a vehicle may drive there. Never for what is not
-    /// finite.
+    /// True if every cell that the footprint touches has a class that means free. False if a value of the footprint is
+    /// not finite.
     ///
     /// # Errors
-    /// [`ClientError::NoLayer`] with the names of those there are.
+    /// [`ClientError::NoLayer`] if the map does not have the layer.
     pub fn is_free(&self, layer: &str, footprint: &Footprint) -> Result<bool, ClientError> {
         let layer = self.layer(layer)?;
         Ok(covers_only(&layer.grid, &footprint.corners(), &cells_that_mean(layer, ClassMeaning::Free)))
     }
 
-    /// The obstacle of a layer nearest to a point; `None` where the layer knows of none: what is unknown may hide one.
+    /// The obstacle of a layer that is nearest to a point; `None` if the layer has none. An obstacle can also stand in
+    /// an unknown cell.
     ///
     /// # Errors
-    /// [`ClientError::NoLayer`] with the names of those there are.
+    /// [`ClientError::NoLayer`] if the map does not have the layer.
     pub fn nearest_obstacle(&self, layer: &str, x_m: f64, y_m: f64) -> Result<Option<Obstacle>, ClientError> {
         let layer = self.layer(layer)?;
         let obstacles = cells_that_mean(layer, ClassMeaning::Occupied);
@@ -74,7 +76,7 @@ impl MapView {
 }
 
 impl Footprint {
-    /// Its corners (x, y), counter-clockwise from the one ahead on the right.
+    /// The corners (x, y) in metres, counter-clockwise, starting at the front right.
     pub fn corners(&self) -> [[f64; 2]; 4] {
         let (sin, cos) = self.heading_rad.sin_cos();
         let (ahead, left) = (self.length_m.abs() / 2.0, self.width_m.abs() / 2.0);
@@ -93,7 +95,7 @@ fn cells_that_mean(layer: &Layer, meaning: ClassMeaning) -> impl Fn(usize) -> bo
     }
 }
 
-/// Whether a convex polygon touches nothing but cells of this kind, and nothing outside the grid.
+/// True if every cell that a convex polygon touches satisfies `is_fit`, and the polygon lies inside the grid.
 fn covers_only(grid: &Grid, corners: &[[f64; 2]], is_fit: &dyn Fn(usize) -> bool) -> bool {
     if corners.iter().flatten().any(|value| !value.is_finite()) {
         return false;
@@ -121,7 +123,7 @@ fn covers_only(grid: &Grid, corners: &[[f64; 2]], is_fit: &dyn Fn(usize) -> bool
     }
 }
 
-/// Whether the part of a polygon that lies in one column of a radial grid touches only cells of this kind.
+/// True if the part of a polygon in one column of a radial grid touches only cells that satisfy `is_fit`.
 fn column_fits(
     row_radius_m: &[f32],
     (column, columns): (u32, u32),

@@ -1,7 +1,8 @@
 //! Maps over gRPC.
 //!
-//! In: a server's address. Out: its vehicles, their newest maps, and [`MapStream`]s. Each stream has its own connection
-//! with a small window and acknowledges every map: a stalled reader then holds up nobody, and gets nothing old.
+//! In: the address of a server. Out: its vehicles, their newest maps, and [`MapStream`]s. Each stream has its own
+//! connection with a small window and acknowledges every map, so a stalled reader delays no other reader and receives
+//! no old maps.
 
 use std::time::Duration;
 
@@ -16,19 +17,20 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
 
-use crate::ClientError;
+use crate::error::ClientError;
 use crate::freshness::Clock;
-use crate::ingest::{Deliver, Ear, Ingester};
-use crate::stream::{Between, Feed, MapStream};
+use crate::ingest::{Ingester, ReportReceiver, SendObservation};
+use crate::stream::{LatestSlot, MapStream, Missed};
 use crate::view::MapView;
 
-/// No map of ours is longer than 64 KiB, so this holds one in flight and no heap of old ones.
+/// Flow-control window of a stream, in bytes: one map with the default grids. More would queue old maps.
 const WINDOW_BYTES: u32 = 65_535;
+/// Longest time to connect. Ours.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
-/// A server that is gone without a word (a pulled cable) is noticed after two of these.
+/// Interval of keep-alive pings. A server that disappears (a pulled cable) is noticed after two intervals.
 const KEEPALIVE: Duration = Duration::from_secs(2);
 
-/// A server's maps.
+/// A connection to a server.
 #[derive(Clone, Debug)]
 pub struct Client {
     address: String,
@@ -36,31 +38,31 @@ pub struct Client {
     service: MapServiceClient<Channel>,
 }
 
-/// Which maps to stream. `Default`: every layer of the server's only vehicle, two in flight.
+/// Which maps to stream. The default is every layer of the server's only vehicle, with two maps in flight.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Subscription {
-    /// Empty where the server has a single vehicle.
+    /// Name of the vehicle. May be empty if the server has a single vehicle.
     pub vehicle: String,
-    /// Empty: every layer.
+    /// Names of the layers; empty: every layer.
     pub layers: Vec<String>,
-    /// Maps on their way without an acknowledgement, at least 1. With 2 the next one travels while one is looked at.
+    /// Most maps sent without an acknowledgement, at least 1. With 2, the next map travels while the reader uses one.
     pub max_in_flight: u32,
-    /// At most so many maps a second; every map where absent.
+    /// Highest rate in maps per second; absent: every map.
     pub max_rate_hz: Option<f64>,
-    /// The part of each layer that is sent, in the ego frame; all of it where absent.
+    /// The part of each layer that is sent, in the ego frame; absent: the whole layer.
     pub region: Option<v1::Region>,
-    /// Layers travel as what has changed since the map before: less on the link, the same maps.
+    /// Layers may be sent as deltas to the map before: fewer bytes, the same maps.
     pub deltas: bool,
 }
 
-/// What a client shows, and whom it believes. All PEM.
+/// Certificates of an encrypted connection, as PEM text.
 #[derive(Clone, Default)]
 pub struct Tls {
-    /// The CA that the server's certificate must be of.
+    /// Certificate of the authority that must have signed the server's certificate.
     pub ca: String,
-    /// The client's own certificate and private key, where the server asks who is there.
+    /// Certificate and private key of the client, if the server requires them.
     pub identity: Option<(String, String)>,
-    /// The name that must stand in the server's certificate; the address' host where empty.
+    /// Name that the server's certificate must contain; empty: the host of the address.
     pub server_name: String,
 }
 
@@ -81,7 +83,7 @@ impl Client {
     /// Connects to `HOST:PORT` or `http://HOST:PORT`, in plain text.
     ///
     /// # Errors
-    /// [`ClientError::Address`] for what is no address, [`ClientError::Unreachable`] where nobody answers.
+    /// [`ClientError::Address`] if the text is not an address, [`ClientError::Unreachable`] if no server answers.
     pub async fn connect(address: &str) -> Result<Self, ClientError> {
         Self::open(address, None).await
     }
@@ -89,9 +91,9 @@ impl Client {
     /// Connects to `HOST:PORT` or `https://HOST:PORT` with certificates.
     ///
     /// # Errors
-    /// [`ClientError::Address`] for what is no address or no certificate, [`ClientError::Unreachable`] where nobody
-    /// answers or one side does not believe the other; a client the server does not know may hear of it at its first
-    /// call only.
+    /// [`ClientError::Address`] if the text is not an address or a certificate is invalid, [`ClientError::Unreachable`]
+    /// if no server answers or one side rejects the certificate of the other. The server may reject a client's
+    /// certificate only at the first call.
     pub async fn connect_tls(address: &str, tls: &Tls) -> Result<Self, ClientError> {
         Self::open(address, Some(tls)).await
     }
@@ -128,30 +130,32 @@ impl Client {
         Ok(Self { address: url, endpoint, service })
     }
 
-    /// The server's vehicles and what it knows of them.
+    /// State of every vehicle of the server.
     ///
     /// # Errors
-    /// What the server or the transport says.
+    /// [`ClientError::Unreachable`] if the connection fails, [`ClientError::Refused`] if the server refuses the call.
     pub async fn vehicles(&self) -> Result<Vec<v1::Vehicle>, ClientError> {
         let answer = self.service.clone().list_vehicles(v1::ListVehiclesRequest {}).await;
         Ok(answer.map_err(|status| refused(&self.address, &status))?.into_inner().vehicles)
     }
 
-    /// The newest map of a vehicle (empty: the only one) with these layers (none named: all).
+    /// Newest map of a vehicle (empty: the only one) with these layers (empty: all).
     ///
     /// # Errors
-    /// What the server or the transport says, or what is wrong with the map.
+    /// [`ClientError::Unreachable`] if the connection fails, [`ClientError::Refused`] if the vehicle or a layer is
+    /// unknown or there is no map yet, [`ClientError::Map`] if the map is invalid.
     pub async fn newest(&self, vehicle: &str, layers: &[String]) -> Result<MapView, ClientError> {
         let request = v1::GetMapRequest { vehicle: vehicle.into(), layers: layers.to_vec() };
         let answer = self.service.clone().get_map(request).await;
         let map = MapView::decode(answer.map_err(|status| refused(&self.address, &status))?.into_inner().map)?;
-        Ok(map.arrived(&Clock::default()))
+        Ok(map.with_arrival(&Clock::default()))
     }
 
-    /// Streams maps over a connection of their own.
+    /// Streams maps over a separate connection.
     ///
     /// # Errors
-    /// What the server or the transport says; an unknown vehicle or layer is refused here.
+    /// [`ClientError::Unreachable`] if the connection fails, [`ClientError::Refused`] if the vehicle, a layer, the rate
+    /// or the region cannot be served.
     pub async fn subscribe(&self, subscription: Subscription) -> Result<MapStream, ClientError> {
         let Subscription { vehicle, layers, max_in_flight, max_rate_hz, region, deltas } = subscription;
         let max_in_flight = max_in_flight.max(1);
@@ -162,34 +166,34 @@ impl Client {
         let updates = service.watch(first.chain(ReceiverStream::new(requests))).await;
         let updates = updates.map_err(|status| refused(&self.address, &status))?.into_inner();
         let address = self.address.clone();
-        Ok(MapStream::spawn(move |feed| follow(feed, address, updates, acknowledge)))
+        Ok(MapStream::spawn(move |slot| receive_maps(slot, address, updates, acknowledge)))
     }
 
-    /// Opens a stream for a vehicle's observations, over a connection of its own.
+    /// Opens a stream for a vehicle's observations, over a separate connection.
     ///
     /// # Errors
-    /// What the server or the transport says; an unknown vehicle is refused here.
+    /// [`ClientError::Unreachable`] if the connection fails, [`ClientError::Refused`] if the vehicle is unknown.
     pub async fn ingest(&self, vehicle: &str) -> Result<Ingester, ClientError> {
         let mut service = IngestServiceClient::new(dial(&self.endpoint, &self.address).await?);
-        // One: what waits is bounded by the acknowledgements.
+        // A queue of one: the acknowledgements bound the number of observations that wait.
         let (observations, requests) = mpsc::channel(1);
-        let greeting = tokio_stream::once(v1::Observation { vehicle: vehicle.into(), ..Default::default() });
-        let reports = service.stream(greeting.chain(ReceiverStream::new(requests))).await;
-        let mut reports = reports.map_err(|status| refused(&self.address, &status))?.into_inner();
-        let (heard, address) = (Ear::new(), self.address.clone());
+        let first = tokio_stream::once(v1::Observation { vehicle: vehicle.into(), ..Default::default() });
+        let reports = service.stream(first.chain(ReceiverStream::new(requests))).await;
+        let mut incoming = reports.map_err(|status| refused(&self.address, &status))?.into_inner();
+        let (reports, address) = (ReportReceiver::new(), self.address.clone());
         tokio::spawn({
-            let (heard, address) = (heard.clone(), address.clone());
+            let (reports, address) = (reports.clone(), address.clone());
             async move {
-                heard.end(loop {
-                    match reports.message().await {
-                        Ok(Some(report)) => heard.report(report),
+                reports.end(loop {
+                    match incoming.message().await {
+                        Ok(Some(report)) => reports.push(report),
                         Ok(None) => break ClientError::Ended { address },
                         Err(status) => break refused(&address, &status),
                     }
                 });
             }
         });
-        let deliver: Deliver = Box::new({
+        let send: SendObservation = Box::new({
             let address = address.clone();
             move |observation| {
                 let (observations, address) = (observations.clone(), address.clone());
@@ -198,7 +202,7 @@ impl Client {
                 )
             }
         });
-        Ok(Ingester::new(address, deliver, heard))
+        Ok(Ingester::new(address, send, reports))
     }
 }
 
@@ -215,17 +219,17 @@ impl Tls {
     }
 }
 
-/// Takes every update, acknowledges it, and says in the end why there are no more. A delta against a map that is not
-/// here (an update was lost) is not shown: a whole map is asked for. All that was not shown counts as skipped, but for
-/// what the reader did not want.
-async fn follow(
-    feed: Feed,
+/// Stores the map of every update in the slot and acknowledges it; returns why the stream ended. If a delta needs a map
+/// that is not here (an update was lost), it requests a keyframe. Maps not stored count as skipped, except those that
+/// the requested rate excluded.
+async fn receive_maps(
+    slot: LatestSlot,
     address: String,
     mut updates: tonic::Streaming<v1::MapUpdate>,
     requests: mpsc::Sender<v1::WatchRequest>,
 ) -> ClientError {
     let mut base: Option<MapView> = None;
-    let (mut asked, mut left_out) = (false, 0);
+    let (mut is_requested, mut left_out) = (false, 0);
     loop {
         let update = match updates.message().await {
             Ok(Some(update)) => update,
@@ -238,15 +242,15 @@ async fn follow(
                 let sequence = map.sequence();
                 let last = base.replace(map.clone()).map_or(sequence, |last| last.sequence() + 1);
                 let skipped = sequence.saturating_sub(last).saturating_sub(left_out);
-                feed.put(map, Between { skipped, left_out, ..Between::default() });
-                (asked, left_out) = (false, 0);
+                slot.store(map, Missed { skipped, left_out, ..Missed::default() });
+                (is_requested, left_out) = (false, 0);
                 v1::WatchRequest { acknowledged: Some(sequence), ..Default::default() }
             }
             Err(error) => {
                 let Some(acknowledged) = sequence_of_delta(update.map) else { return error };
-                tracing::debug!(sequence = acknowledged, %error, "a delta is of no use, a whole map is asked for");
-                // More deltas may be on the way already; one question is enough for them all.
-                let request_keyframe = !std::mem::replace(&mut asked, true);
+                tracing::debug!(sequence = acknowledged, %error, "the base of a delta is missing; a keyframe is requested");
+                // More deltas may be in flight; one request is enough for all of them.
+                let request_keyframe = !std::mem::replace(&mut is_requested, true);
                 v1::WatchRequest { acknowledged: Some(acknowledged), request_keyframe, selection: None }
             }
         };
@@ -256,7 +260,7 @@ async fn follow(
     }
 }
 
-/// Of a map with a layer that needs another map; `None` where it stands for itself, or is no map.
+/// Sequence number of a map with a delta; `None` if all layers are whole, or the bytes are not a map.
 fn sequence_of_delta(bytes: Bytes) -> Option<u64> {
     let map = v1::Map::decode(bytes).ok()?;
     let is_delta = map.layers.iter().any(|layer| layer.base_sequence.is_some());
@@ -279,7 +283,7 @@ fn refused(address: &str, status: &Status) -> ClientError {
     }
 }
 
-/// "transport error" says little; what caused it says what to do.
+/// Message of the innermost cause: the outer one is only "transport error".
 fn innermost(error: &dyn std::error::Error) -> String {
     let mut error = error;
     while let Some(source) = error.source() {

@@ -1,49 +1,49 @@
-//! Updates, as fast as they come, to the newest map, as fast as it is asked for.
+//! Maps from a background task -> the newest map.
 //!
-//! In: maps from a background task. Out: the newest one, with the number of those in between. A reader that is
-//! slow, or that only looks now and then, never gets an old map from a queue: there is none. And a reader that waits is
-//! told when the map it has becomes stale, also where nothing comes any more.
+//! In: maps at the rate of the server. Out: the newest one at the rate of the reader, with the number of maps in
+//! missed. There is no queue, so a slow reader never gets an old map. A waiting reader is notified when its map becomes
+//! stale, also if no further map arrives.
 
 use std::time::Duration;
 
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
-use crate::ClientError;
-use crate::freshness::{Clock, LOOK};
+use crate::error::ClientError;
+use crate::freshness::{Clock, POLL_INTERVAL};
 use crate::view::MapView;
 
-/// One look at the stream.
+/// One map from a stream.
 #[derive(Clone, Debug)]
 pub struct Update {
     /// The newest map.
     pub map: MapView,
-    /// Maps made since the previous look and not seen by this reader: it, or its link, was slow.
+    /// Number of maps made since the update before that this reader did not get, because it or its link was slow.
     pub skipped: u64,
-    /// Those of the skipped ones that got lost on the link (zenoh drops what a congested or cut link does not take);
-    /// over gRPC the server skips instead, and this is 0.
+    /// Number of the skipped maps that the link lost (zenoh drops maps on a congested or cut link). It is 0 over gRPC,
+    /// where the server skips maps instead.
     pub lost: u64,
-    /// Maps made since the previous look that [`crate::Subscription::max_rate_hz`] left out.
+    /// Number of maps made since the update before that [`crate::Subscription::max_rate_hz`] excluded.
     pub left_out: u64,
 }
 
-/// A look at the stream that knows how old its map is.
+/// What a stream reports: a fresh map, or that the newest map is stale.
 #[derive(Clone, Debug)]
-pub enum Sight {
-    /// A new map, which may be used.
+pub enum StreamEvent {
+    /// A new map that may be used.
     Fresh(Update),
-    /// A map that must not be used: the one given last has become too old and no newer one is there, or a new one came
-    /// too late.
+    /// A map that must not be used: the last map has become stale and there is no newer one, or a new map was stale on
+    /// arrival.
     Stale(Update),
 }
 
-/// The newest map of one vehicle, kept up to date in the background until this is dropped.
+/// The newest map of one vehicle. A background task updates it until the stream is dropped.
 #[derive(Debug)]
 pub struct MapStream {
     slot: watch::Receiver<Slot>,
-    /// `Slot::made` at the previous look; `None` before the first.
-    seen: Option<Made>,
-    /// The map given last, until it is told as stale.
+    /// `Slot::counters` at the update before; `None` before the first.
+    seen: Option<Counters>,
+    /// The last map returned, until it is reported as stale.
     fresh: Option<MapView>,
     task: JoinHandle<()>,
 }
@@ -51,63 +51,68 @@ pub struct MapStream {
 #[derive(Debug, Default)]
 struct Slot {
     newest: Option<MapView>,
-    made: Made,
+    counters: Counters,
     ended: Option<ClientError>,
 }
 
-/// Maps since the start of the stream.
+/// Numbers of maps since the start of the stream.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-struct Made {
-    /// Those given and those skipped.
+struct Counters {
+    /// Maps stored and maps skipped.
     maps: u64,
-    /// Of the skipped ones, those that the link lost.
+    /// Skipped maps that the link lost.
     lost: u64,
-    /// Those left out at the reader's wish.
+    /// Maps that the requested rate excluded.
     left_out: u64,
 }
 
-/// Maps between one map and the one before.
+/// Numbers of maps between one stored map and the one before.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Between {
-    /// Not seen by this reader.
+pub(crate) struct Missed {
+    /// Maps that this reader did not get.
     pub skipped: u64,
-    /// Those of them that the link lost.
+    /// Skipped maps that the link lost.
     pub lost: u64,
-    /// Not wanted by this reader.
+    /// Maps that the requested rate excluded.
     pub left_out: u64,
 }
 
 impl MapStream {
-    /// Runs `feed` in the background; it ends with the reason why there are no more maps.
-    pub(crate) fn spawn<F: Future<Output = ClientError> + Send + 'static>(feed: impl FnOnce(Feed) -> F) -> Self {
-        Self::spawn_by(Clock::default(), feed)
+    /// Runs a task in the background that stores maps in the slot. Its result is the reason why it ended.
+    pub(crate) fn spawn<F: Future<Output = ClientError> + Send + 'static>(task: impl FnOnce(LatestSlot) -> F) -> Self {
+        Self::spawn_with_clock(Clock::default(), task)
     }
 
-    fn spawn_by<F: Future<Output = ClientError> + Send + 'static>(clock: Clock, feed: impl FnOnce(Feed) -> F) -> Self {
+    fn spawn_with_clock<F: Future<Output = ClientError> + Send + 'static>(
+        clock: Clock,
+        task: impl FnOnce(LatestSlot) -> F,
+    ) -> Self {
         let (sender, slot) = watch::channel(Slot::default());
-        let feed = feed(Feed { slot: sender.clone(), clock });
+        let task = task(LatestSlot { slot: sender.clone(), clock });
         let task = tokio::spawn(async move {
-            let reason = feed.await;
+            let reason = task.await;
             sender.send_modify(|slot| slot.ended = Some(reason));
         });
         Self { slot, seen: None, fresh: None, task }
     }
 
-    /// Waits for a map newer than the one given last.
+    /// Waits for a map newer than the last one returned.
     ///
     /// # Errors
-    /// Why the stream is over, once its last map has been given: then subscribe again.
+    /// Why the stream has ended, after its last map was returned; subscribe again then. [`ClientError::Ended`] if the
+    /// server ended it, [`ClientError::Unreachable`] if the connection failed, [`ClientError::Refused`] if the server
+    /// refused a request, [`ClientError::Map`] if a map is invalid.
     pub async fn next(&mut self) -> Result<Update, ClientError> {
         loop {
             {
                 let slot = self.slot.borrow_and_update();
-                let made = slot.made;
-                if let Some(map) = slot.newest.as_ref().filter(|_| self.seen != Some(made)) {
-                    // The first look has missed nothing: the reader was not there before.
-                    let before = self.seen.unwrap_or(Made { maps: made.maps - 1, ..made });
-                    (self.seen, self.fresh) = (Some(made), Some(map.clone()));
-                    let skipped = made.maps - before.maps - 1;
-                    let (lost, left_out) = (made.lost - before.lost, made.left_out - before.left_out);
+                let counters = slot.counters;
+                if let Some(map) = slot.newest.as_ref().filter(|_| self.seen != Some(counters)) {
+                    // The first update has skipped nothing: the reader was not subscribed before.
+                    let before = self.seen.unwrap_or(Counters { maps: counters.maps - 1, ..counters });
+                    (self.seen, self.fresh) = (Some(counters), Some(map.clone()));
+                    let skipped = counters.maps - before.maps - 1;
+                    let (lost, left_out) = (counters.lost - before.lost, counters.left_out - before.left_out);
                     return Ok(Update { map: map.clone(), skipped, lost, left_out });
                 }
                 if let Some(reason) = &slot.ended {
@@ -120,37 +125,37 @@ impl MapStream {
         }
     }
 
-    /// Waits for a map newer than the one given last, or until that one is stale, which is told once, at most 20 ms
-    /// late, by this machine's clocks and whether or not anything comes.
+    /// Waits for a map newer than the last one returned, or until that one is stale. A stale map is reported once, at
+    /// most 20 ms late, by this machine's clocks, also if no further map arrives.
     ///
     /// # Errors
     /// As [`MapStream::next`].
-    pub async fn next_or_stale(&mut self) -> Result<Sight, ClientError> {
-        let given = self.fresh.clone();
+    pub async fn next_or_stale(&mut self) -> Result<StreamEvent, ClientError> {
+        let last = self.fresh.clone();
         tokio::select! {
             biased;
             update = self.next() => {
                 let update = update?;
                 if update.map.fresh_for_ns().is_some() {
-                    return Ok(Sight::Fresh(update));
+                    return Ok(StreamEvent::Fresh(update));
                 }
                 self.fresh = None;
-                Ok(Sight::Stale(update))
+                Ok(StreamEvent::Stale(update))
             }
-            map = gone_stale(given) => {
+            map = wait_stale(last) => {
                 self.fresh = None;
-                Ok(Sight::Stale(Update { map, skipped: 0, lost: 0, left_out: 0 }))
+                Ok(StreamEvent::Stale(Update { map, skipped: 0, lost: 0, left_out: 0 }))
             }
         }
     }
 
-    /// The newest map at this moment, without waiting and without counting as a look; `None` before the first. It may
-    /// be stale: ask [`MapView::is_stale`].
+    /// The newest map at this moment; `None` before the first. It does not wait and does not change the counts of the
+    /// next update. The map may be stale ([`MapView::is_stale`]).
     pub fn newest(&self) -> Option<MapView> {
         self.slot.borrow().newest.clone()
     }
 
-    /// Why there will be no more maps; `None` while the stream goes on.
+    /// Why the stream has ended; `None` if it has not.
     pub fn ended(&self) -> Option<ClientError> {
         self.slot.borrow().ended.clone()
     }
@@ -162,28 +167,28 @@ impl Drop for MapStream {
     }
 }
 
-/// The map, as soon as it is stale.
-async fn gone_stale(map: Option<MapView>) -> MapView {
+/// Waits until the map is stale, and returns it.
+async fn wait_stale(map: Option<MapView>) -> MapView {
     let Some(map) = map else { return std::future::pending().await };
     while let Some(left_ns) = map.fresh_for_ns() {
         // A map is stale after its last nanosecond.
         let left = Duration::from_nanos(left_ns.unsigned_abs().saturating_add(1));
-        tokio::time::sleep(left.min(LOOK)).await;
+        tokio::time::sleep(left.min(POLL_INTERVAL)).await;
     }
     map
 }
 
-/// The background task's end of a [`MapStream`].
-pub(crate) struct Feed {
+/// The slot of a [`MapStream`], in which the background task stores the newest map.
+pub(crate) struct LatestSlot {
     slot: watch::Sender<Slot>,
     clock: Clock,
 }
 
-impl Feed {
-    /// Makes a map the newest, with what lies between it and the one before. A map that is no newer than the newest of
-    /// the same run of the server (a replayed one) is passed over.
-    pub(crate) fn put(&self, map: MapView, between: Between) {
-        let map = map.arrived(&self.clock);
+impl LatestSlot {
+    /// Stores a map as the newest, with the numbers of maps between it and the one before. It ignores a map that is not
+    /// newer than the newest of the same run of the server (a replayed one).
+    pub(crate) fn store(&self, map: MapView, missed: Missed) {
+        let map = map.with_arrival(&self.clock);
         self.slot.send_if_modified(|slot| {
             let of = |map: &MapView| (map.header().boot_id, map.sequence());
             let is_old = slot
@@ -192,9 +197,9 @@ impl Feed {
                 .map(of)
                 .is_some_and(|(boot_id, newest)| boot_id == map.header().boot_id && newest >= map.sequence());
             if !is_old {
-                slot.made.maps += 1 + between.skipped;
-                slot.made.lost += between.lost;
-                slot.made.left_out += between.left_out;
+                slot.counters.maps += 1 + missed.skipped;
+                slot.counters.lost += missed.lost;
+                slot.counters.left_out += missed.left_out;
                 slot.newest = Some(map);
             }
             !is_old
@@ -202,7 +207,7 @@ impl Feed {
     }
 }
 
-/// The six ways a map can be older than it looks, with clocks that the tests set.
+/// Situations in which a map is older than it seems, with clocks that the tests set.
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
@@ -219,16 +224,16 @@ mod tests {
     const START_NS: i64 = 1_700_000_000_000_000_000;
     const VALID_MS: i64 = 300;
 
-    /// A planner's machine and the server it reads from.
-    struct House {
+    /// A stream, its slot, and the clocks of the planner's machine.
+    struct TestBed {
         wall_ns: Arc<AtomicI64>,
         steady_ns: Arc<AtomicI64>,
-        feed: Feed,
+        slot: LatestSlot,
         end: Option<oneshot::Sender<ClientError>>,
         stream: MapStream,
     }
 
-    impl House {
+    impl TestBed {
         fn new() -> Self {
             let (wall_ns, steady_ns) = (Arc::new(AtomicI64::new(START_NS)), Arc::new(AtomicI64::new(0)));
             let read = |clock: &Arc<AtomicI64>| -> Arc<dyn Fn() -> i64 + Send + Sync> {
@@ -237,12 +242,12 @@ mod tests {
             };
             let clock = Clock { wall_ns: read(&wall_ns), steady_ns: read(&steady_ns) };
             let (end, ended) = oneshot::channel();
-            let mut feed = None;
-            let stream = MapStream::spawn_by(clock, |given| {
-                feed = Some(given);
-                async move { ended.await.expect("the test tells") }
+            let mut slot = None;
+            let stream = MapStream::spawn_with_clock(clock, |given| {
+                slot = Some(given);
+                async move { ended.await.expect("the test ends the stream") }
             });
-            Self { wall_ns, steady_ns, feed: feed.expect("given at once"), end: Some(end), stream }
+            Self { wall_ns, steady_ns, slot: slot.expect("given at once"), end: Some(end), stream }
         }
 
         fn pass(&self, ns: i64) {
@@ -254,12 +259,12 @@ mod tests {
             self.wall_ns.fetch_add(ns, Ordering::SeqCst);
         }
 
-        /// A map comes that was captured so long ago, as the wall clock has it.
-        fn comes(&self, boot_id: u64, sequence: u64, age_ns: i64) {
-            self.came(boot_id, sequence, self.wall_ns.load(Ordering::SeqCst) - age_ns);
+        /// Stores a map that was captured `age_ns` ago by the wall clock.
+        fn store_aged(&self, boot_id: u64, sequence: u64, age_ns: i64) {
+            self.store(boot_id, sequence, self.wall_ns.load(Ordering::SeqCst) - age_ns);
         }
 
-        fn came(&self, boot_id: u64, sequence: u64, capture_end_ns: i64) {
+        fn store(&self, boot_id: u64, sequence: u64, capture_end_ns: i64) {
             let header = v1::Header {
                 vehicle: "alpha".into(),
                 boot_id,
@@ -270,130 +275,129 @@ mod tests {
                 valid_until_ns: capture_end_ns + VALID_MS * MS,
                 ..Default::default()
             };
-            self.feed.put(MapView::decode(encode_header(&header)).expect("a map"), Between::default());
+            self.slot.store(MapView::decode(encode_header(&header)).expect("a map"), Missed::default());
         }
 
-        /// What the stream says, waiting for it: (stale, sequence, age in ns).
-        async fn says(&mut self) -> (bool, u64, i64) {
+        /// Waits for the next event: (stale, sequence, age in ns).
+        async fn next(&mut self) -> (bool, u64, i64) {
             let (stale, update) = match self.stream.next_or_stale().await.expect("no end") {
-                Sight::Fresh(update) => (false, update),
-                Sight::Stale(update) => (true, update),
+                StreamEvent::Fresh(update) => (false, update),
+                StreamEvent::Stale(update) => (true, update),
             };
             let now_ns = self.wall_ns.load(Ordering::SeqCst);
-            assert_eq!(stale, update.map.is_stale(now_ns), "both ways to ask agree");
+            assert_eq!(stale, update.map.is_stale(now_ns), "the event and the map agree");
             (stale, update.map.sequence(), update.map.age_ns(now_ns))
         }
 
-        /// That it has nothing to say at this moment.
+        /// True if the stream has no event at this moment.
         fn is_silent(&mut self) -> bool {
             self.stream.next_or_stale().now_or_never().is_none()
         }
 
-        /// Nothing comes any more; the map that was captured 40 ms before it came is told as stale after its last
-        /// nanosecond, and once.
-        async fn goes_stale(&mut self, sequence: u64) {
+        /// Checks that a map of 40 ms age is reported as stale after its last nanosecond, and once, if no map follows.
+        async fn check_becomes_stale(&mut self, sequence: u64) {
             self.pass(260 * MS);
-            assert!(self.is_silent(), "in its last nanosecond it may be used");
+            assert!(self.is_silent(), "the map may be used in its last nanosecond");
             self.pass(1);
-            assert_eq!(self.says().await, (true, sequence, VALID_MS * MS + 1));
+            assert_eq!(self.next().await, (true, sequence, VALID_MS * MS + 1));
             self.pass(1000 * MS);
-            assert!(self.is_silent(), "it is told once");
+            assert!(self.is_silent(), "a stale map is reported once");
         }
     }
 
     #[tokio::test]
-    async fn a_cut_link_leaves_a_map_that_is_told_as_stale_though_nothing_comes() {
-        let mut house = House::new();
-        assert!(house.is_silent());
-        house.comes(7, 0, 40 * MS);
-        assert_eq!(house.says().await, (false, 0, 40 * MS));
-        house.goes_stale(0).await;
-        house.comes(7, 20, 40 * MS);
-        assert_eq!(house.says().await, (false, 20, 40 * MS), "the link is there again");
+    async fn a_map_is_reported_as_stale_after_the_link_is_cut() {
+        let mut bed = TestBed::new();
+        assert!(bed.is_silent());
+        bed.store_aged(7, 0, 40 * MS);
+        assert_eq!(bed.next().await, (false, 0, 40 * MS));
+        bed.check_becomes_stale(0).await;
+        bed.store_aged(7, 20, 40 * MS);
+        assert_eq!(bed.next().await, (false, 20, 40 * MS), "the link is restored");
     }
 
     #[tokio::test]
-    async fn a_stopped_server_is_named_and_its_last_map_grows_stale_all_the_same() {
-        let mut house = House::new();
-        house.comes(7, 0, 40 * MS);
-        assert_eq!(house.says().await, (false, 0, 40 * MS));
+    async fn the_last_map_of_a_stopped_server_becomes_stale() {
+        let mut bed = TestBed::new();
+        bed.store_aged(7, 0, 40 * MS);
+        assert_eq!(bed.next().await, (false, 0, 40 * MS));
         let reason = ClientError::Ended { address: "alpha:1".into() };
-        house.end.take().expect("once").send(reason).expect("the stream lives");
-        assert!(matches!(house.stream.next_or_stale().await, Err(ClientError::Ended { .. })));
-        house.pass(261 * MS);
-        let newest = house.stream.newest().expect("still there");
-        assert!(newest.is_stale(house.wall_ns.load(Ordering::SeqCst)));
+        bed.end.take().expect("once").send(reason).expect("the stream lives");
+        assert!(matches!(bed.stream.next_or_stale().await, Err(ClientError::Ended { .. })));
+        bed.pass(261 * MS);
+        let newest = bed.stream.newest().expect("a map was stored");
+        assert!(newest.is_stale(bed.wall_ns.load(Ordering::SeqCst)));
     }
 
     #[tokio::test]
-    async fn a_delay_that_grows_by_a_millisecond_a_map_is_told_at_the_first_map_that_is_too_old() {
-        let mut house = House::new();
-        for turn in 0..320 {
-            house.pass(100 * MS);
-            house.comes(7, turn, turn as i64 * MS);
-            let told = house.says().await;
-            assert_eq!(told, (turn as i64 > VALID_MS, turn, turn as i64 * MS));
-            assert!(house.is_silent());
+    async fn a_growing_delay_is_reported_at_the_first_map_that_is_too_old() {
+        let mut bed = TestBed::new();
+        for sequence in 0..320 {
+            bed.pass(100 * MS);
+            bed.store_aged(7, sequence, sequence as i64 * MS);
+            let event = bed.next().await;
+            assert_eq!(event, (sequence as i64 > VALID_MS, sequence, sequence as i64 * MS));
+            assert!(bed.is_silent());
         }
     }
 
     #[tokio::test]
-    async fn an_old_map_that_is_replayed_is_neither_the_newest_nor_fresh() {
-        let mut house = House::new();
-        house.comes(7, 5, 40 * MS);
-        assert_eq!(house.says().await, (false, 5, 40 * MS));
+    async fn a_replayed_map_is_neither_newest_nor_fresh() {
+        let mut bed = TestBed::new();
+        bed.store_aged(7, 5, 40 * MS);
+        assert_eq!(bed.next().await, (false, 5, 40 * MS));
         let first_ns = START_NS - 40 * MS;
-        house.pass(200 * MS);
-        house.came(7, 5, first_ns);
-        house.came(7, 4, first_ns - 100 * MS);
-        assert!(house.is_silent(), "it is no newer than what is there");
-        // Also one with a number of its own has its age.
-        house.pass(1000 * MS);
-        assert_eq!(house.says().await, (true, 5, 1240 * MS));
-        house.came(7, 6, first_ns);
-        assert_eq!(house.says().await, (true, 6, 1240 * MS));
+        bed.pass(200 * MS);
+        bed.store(7, 5, first_ns);
+        bed.store(7, 4, first_ns - 100 * MS);
+        assert!(bed.is_silent(), "it is not newer than the newest");
+        // A replayed map with a new sequence number keeps its age.
+        bed.pass(1000 * MS);
+        assert_eq!(bed.next().await, (true, 5, 1240 * MS));
+        bed.store(7, 6, first_ns);
+        assert_eq!(bed.next().await, (true, 6, 1240 * MS));
     }
 
     #[tokio::test]
-    async fn a_restarted_server_is_another_boot_whose_first_map_is_the_newest() {
-        let mut house = House::new();
-        house.comes(7, 900, 40 * MS);
-        assert_eq!(house.says().await, (false, 900, 40 * MS));
-        house.goes_stale(900).await;
-        house.comes(8, 0, 40 * MS);
-        assert_eq!(house.says().await, (false, 0, 40 * MS));
-        house.goes_stale(0).await;
+    async fn the_first_map_of_a_restarted_server_is_the_newest() {
+        let mut bed = TestBed::new();
+        bed.store_aged(7, 900, 40 * MS);
+        assert_eq!(bed.next().await, (false, 900, 40 * MS));
+        bed.check_becomes_stale(900).await;
+        bed.store_aged(8, 0, 40 * MS);
+        assert_eq!(bed.next().await, (false, 0, 40 * MS));
+        bed.check_becomes_stale(0).await;
     }
 
     #[tokio::test]
     async fn a_step_of_the_wall_clock_makes_no_stale_map_fresh() {
         for step_ns in [-3600 * 1000 * MS, -200 * MS, -50 * MS] {
-            let mut house = House::new();
-            house.comes(7, 0, 40 * MS);
-            assert_eq!(house.says().await, (false, 0, 40 * MS));
-            house.step(step_ns);
+            let mut bed = TestBed::new();
+            bed.store_aged(7, 0, 40 * MS);
+            assert_eq!(bed.next().await, (false, 0, 40 * MS));
+            bed.step(step_ns);
             if step_ns < -VALID_MS * MS {
-                assert!(house.says().await.0, "a clock this far behind cannot tell the age");
+                assert!(bed.next().await.0, "the age is not known by a clock this far behind");
             } else {
-                house.goes_stale(0).await;
+                bed.check_becomes_stale(0).await;
             }
-            let stale = house.stream.newest().expect("it is there");
-            house.pass(400 * MS);
+            let stale = bed.stream.newest().expect("a map was stored");
+            bed.pass(400 * MS);
             for further_ns in [0, step_ns, 10 * step_ns] {
-                let now_ns = house.wall_ns.load(Ordering::SeqCst) + further_ns;
+                let now_ns = bed.wall_ns.load(Ordering::SeqCst) + further_ns;
                 assert!(stale.is_stale(now_ns) && stale.age_ns(now_ns) >= 440 * MS, "stepped by {step_ns} ns");
             }
         }
-        // Set forward, it may be right, so what seems too old is.
-        let mut house = House::new();
-        house.comes(7, 0, 40 * MS);
-        assert_eq!(house.says().await, (false, 0, 40 * MS));
-        house.step(1000 * MS);
-        assert_eq!(house.says().await, (true, 0, 1040 * MS));
+        // A clock that was set forward may be right, so a map that seems too old is stale.
+        let mut bed = TestBed::new();
+        bed.store_aged(7, 0, 40 * MS);
+        assert_eq!(bed.next().await, (false, 0, 40 * MS));
+        bed.step(1000 * MS);
+        assert_eq!(bed.next().await, (true, 0, 1040 * MS));
     }
 
     #[test]
-    fn a_stream_looks_at_its_clocks_often_enough_for_what_planners_are_promised() {
-        assert!(LOOK * 2 <= Duration::from_millis(50));
+    fn a_stream_polls_its_clocks_often_enough_for_the_promised_50_ms() {
+        assert!(POLL_INTERVAL * 2 <= Duration::from_millis(50));
     }
 }

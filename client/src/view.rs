@@ -1,7 +1,7 @@
-//! One map as a planner sees it.
+//! One decoded map with its age.
 //!
-//! In: an encoded `clearway.v1.Map`, whoever carried it. Out: header, layers and look-ups in the ego frame (x forward,
-//! y left, metres), and the age, measured from the end of the capture.
+//! In: an encoded `clearway.v1.Map` from any transport. Out: header, layers and look-ups in the ego frame (x forward, y
+//! left, metres), and the age, measured from the end of the capture.
 
 use std::sync::Arc;
 
@@ -10,15 +10,15 @@ use clearway_proto::codec::Limits;
 use clearway_proto::map::{Layer, Map, decode_map_on};
 use clearway_proto::v1;
 
-use crate::ClientError;
+use crate::error::ClientError;
 use crate::freshness::{Arrival, Clock, now_ns};
 
-/// A map, decoded once. Cloning it costs a reference count.
+/// A map, decoded once. A clone shares the decoded map.
 #[derive(Clone, Debug)]
 pub struct MapView {
     map: Arc<Map>,
     bytes: Bytes,
-    /// Absent where the map came from no server.
+    /// Absent if the map did not come from a server.
     arrival: Option<Arc<Arrival>>,
 }
 
@@ -26,55 +26,56 @@ impl MapView {
     /// Decodes and checks an encoded `clearway.v1.Map`.
     ///
     /// # Errors
-    /// [`ClientError::Map`], naming the first thing found wrong.
+    /// [`ClientError::Map`] with the first fault, if the bytes are not a valid map or if a layer is a delta.
     pub fn decode(bytes: Bytes) -> Result<Self, ClientError> {
         Self::decode_on(bytes, None)
     }
 
-    /// As [`MapView::decode`], of a map that may be a delta against `base`.
+    /// As [`MapView::decode`]; layers may be deltas to the layers of `base`.
     ///
     /// # Errors
-    /// [`ClientError::Map`], also where the delta is against another map.
+    /// [`ClientError::Map`] with the first fault, also if a layer is a delta to another map than `base`.
     pub fn decode_on(bytes: Bytes, base: Option<&Self>) -> Result<Self, ClientError> {
         let map = decode_map_on(bytes.clone(), base.map(|base| &*base.map), &Limits::default())?;
         Ok(Self { map: Arc::new(map), bytes, arrival: None })
     }
 
-    /// The map came just now.
-    pub(crate) fn arrived(self, clock: &Clock) -> Self {
+    /// Sets the arrival of the map to now.
+    pub(crate) fn with_arrival(self, clock: &Clock) -> Self {
         let arrival = Arrival::new(clock.clone(), self.map.header.capture_end_ns);
         Self { arrival: Some(Arc::new(arrival)), ..self }
     }
 
-    /// The header as on the wire: stamps, pose, speed, sensors.
+    /// The header as on the wire: stamps, pose, speed and sensors.
     pub fn header(&self) -> &v1::Header {
         &self.map.header
     }
 
-    /// The vehicle's name.
+    /// Name of the vehicle.
     pub fn vehicle(&self) -> &str {
         &self.map.header.vehicle
     }
 
-    /// Counts from 0 without a hole within one run of the server, which [`v1::Header::boot_id`] names.
+    /// Number of the map: 0, 1, 2 and so on, without gaps, within one run of the server ([`v1::Header::boot_id`]).
     pub fn sequence(&self) -> u64 {
         self.map.header.sequence
     }
 
-    /// The encoded map, as it came: with [`crate::Subscription::deltas`] it may need the one before.
+    /// The encoded map as received. With [`crate::Subscription::deltas`] it may need the map before to be decoded.
     pub fn bytes(&self) -> &Bytes {
         &self.bytes
     }
 
-    /// In the order of the server's configuration.
+    /// The layers, in the order of the server's configuration.
     pub fn layers(&self) -> &[Layer] {
         &self.map.layers
     }
 
-    /// The layer of that name; `layer.class_at(x_m, y_m)` and `layer.value_at(channel, x_m, y_m)` look into it.
+    /// The layer with this name. `layer.class_at(x_m, y_m)`, `layer.meaning_at(x_m, y_m)` and
+    /// `layer.value_at(channel, x_m, y_m)` look up a point.
     ///
     /// # Errors
-    /// [`ClientError::NoLayer`] with the names of those there are.
+    /// [`ClientError::NoLayer`] if the map does not have the layer.
     pub fn layer(&self, name: &str) -> Result<&Layer, ClientError> {
         self.map.layer(name).ok_or_else(|| ClientError::NoLayer {
             layer: name.into(),
@@ -82,38 +83,40 @@ impl MapView {
         })
     }
 
-    /// Age at `now_ns`, ns, from the end of the capture. Of a map from a server at least its age when it came and the
-    /// time since, so that no step of the clock makes it younger; else negative where `now_ns` is before the capture.
+    /// Age of the map at `now_ns`, in ns, measured from the end of the capture. If the map came from a server, it is at
+    /// least the age on arrival plus the time since, so that no step of the clock makes the map younger. Else it is
+    /// negative if
+    /// `now_ns` is before the capture.
     pub fn age_ns(&self, now_ns: i64) -> i64 {
         let by_wall_ns = now_ns.saturating_sub(self.map.header.capture_end_ns);
         self.arrival.as_ref().map_or(by_wall_ns, |arrival| arrival.age_ns_min().max(by_wall_ns))
     }
 
-    /// [`MapView::age_ns`] in milliseconds.
+    /// Age of the map at `now_ns` in milliseconds ([`MapView::age_ns`]).
     pub fn age_ms(&self, now_ns: i64) -> f64 {
         self.age_ns(now_ns) as f64 * 1e-6
     }
 
-    /// How long the map may be used after the end of its capture, ns.
+    /// Time from the end of the capture until the map is stale, in ns.
     fn valid_ns(&self) -> i64 {
         self.map.header.valid_until_ns.saturating_sub(self.map.header.capture_end_ns)
     }
 
-    /// Whether the map must not be used any more at `now_ns`: its validity has passed, or its capture lies further
-    /// ahead of this clock than its validity lasts, so that its age is not known.
+    /// True if the map must not be used at `now_ns`: its validity has passed, or its capture is so far in the future of
+    /// this clock that its age cannot be known.
     pub fn is_stale(&self, now_ns: i64) -> bool {
         let ahead_ns = self.map.header.capture_end_ns.saturating_sub(now_ns);
         self.age_ns(now_ns) > self.valid_ns() || ahead_ns > self.valid_ns()
     }
 
-    /// As far as is known now, ns until the map is stale; `None` where it is already.
+    /// Time from now until the map is stale, in ns; `None` if it is stale.
     pub(crate) fn fresh_for_ns(&self) -> Option<i64> {
         let now_ns = self.arrival.as_ref().map_or_else(now_ns, |arrival| arrival.now_ns());
         (!self.is_stale(now_ns)).then(|| self.valid_ns().saturating_sub(self.age_ns(now_ns)))
     }
 
-    /// A figure of the first layer that states it, such as `drivable_share`.
-    pub fn figure(&self, name: &str) -> Option<f64> {
+    /// Metric of the first layer that has it, such as `drivable_share`.
+    pub fn metric(&self, name: &str) -> Option<f64> {
         self.map.layers.iter().find_map(|layer| layer.metrics.get(name).copied())
     }
 }

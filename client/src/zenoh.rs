@@ -1,80 +1,75 @@
 //! Maps over zenoh: keys `clearway/<vehicle>/map/<layer>`, liveliness tokens `clearway/<vehicle>`.
 //!
-//! In: a router's or server's endpoint. Out: the same [`MapView`], [`MapStream`] and [`Ingester`] as over gRPC. Needs tokio's
-//! multi-thread runtime: zenoh panics in a current-thread one.
+//! In: the endpoint of a router or server. Out: the same [`MapView`], [`MapStream`] and [`Ingester`] as over gRPC. It
+//! needs tokio's multi-thread runtime, because zenoh panics in a current-thread one.
 //!
-//! A session that loses its router or server looks for it until it is there again; streams go on then, and tell meanwhile that
-//! their map is stale. One layer a stream: each key is dropped and delivered by itself, and layers that must be of one
-//! moment come together over gRPC.
+//! A session that loses its router or server reconnects when it is available again. Until then its streams report that
+//! their map is stale; afterwards they continue. A stream has one layer, because zenoh delivers and drops each key
+//! separately. Use gRPC for layers that must belong to one map.
 
 use std::hash::{BuildHasher, Hasher};
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
 
 use clearway_proto::v1;
 use prost::Message;
-use zenoh::bytes::ZBytes;
 use zenoh::qos::CongestionControl;
 use zenoh::{Config, Session};
 
-use crate::ClientError;
+use crate::error::ClientError;
 use crate::freshness::Clock;
-use crate::ingest::{Deliver, Ear, Ingester};
+use crate::ingest::{Ingester, ReportReceiver, SendObservation};
 use crate::stream::MapStream;
 use crate::view::MapView;
 
-mod tap;
+mod query;
+mod subscription;
 
-use tap::Tap;
+use query::{QUERY_TIMEOUT, decode, failed, query};
+use subscription::LayerSubscription;
 
-const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
-
-/// What every session of ours has, whatever else its file says.
+/// Settings of every session. They override those of a configuration file.
 const SETTINGS: [(&str, &str); 11] = [
     ("mode", "'client'"),
     ("listen/endpoints", "[]"),
     ("scouting/multicast/enabled", "false"),
     ("scouting/gossip/enabled", "false"),
     ("connect/timeout_ms", "5000"),
-    // A planner has maps again a second after its router, at the latest.
+    // Reconnects at most 1 s after the router is available again.
     ("connect/retry", "{ period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2 }"),
     ("transport/unicast/open_timeout", "2000"),
-    // Who is gone without a word (a pulled cable) is noticed after 2 s, as over gRPC. Each side tells the other its own.
+    // A peer that disappears (a pulled cable) is noticed after 2 s, about as over gRPC. Each side announces its own
+    // lease.
     ("transport/link/tx/lease", "2000"),
-    // Far more than a map may have; what is longer is dropped before it is put together.
+    // 16 MiB, far more than a map may have. A longer message is dropped before it is assembled.
     ("transport/link/rx/max_message_size", "16777216"),
-    // Some thirty maps: when a planner's machine halts, old maps wait here, and it reads through them when it goes on.
+    // About thirty maps: while a planner's machine is suspended, old maps wait here; it reads them all when it resumes.
     ("transport/link/tcp", "{ so_rcvbuf: 262144 }"),
     ("transport/link/tls/so_rcvbuf", "262144"),
 ];
 
-/// A session that reads maps.
+/// A zenoh session that reads maps and sends observations.
 #[derive(Clone, Debug)]
 pub struct ZenohClient {
     session: Session,
     endpoint: String,
 }
 
-fn failed(what: impl Into<String>) -> impl FnOnce(zenoh::Error) -> ClientError {
-    let what = what.into();
-    |reason| ClientError::Zenoh { what, reason: reason.to_string() }
-}
-
 impl ZenohClient {
-    /// Connects to one endpoint, such as `tcp/localhost:7447`; nothing is scouted, nothing listens.
+    /// Connects to one endpoint, such as `tcp/localhost:7447`, without scouting or listening.
     ///
     /// # Errors
-    /// [`ClientError::Zenoh`] for what is no endpoint and where nobody answers.
+    /// [`ClientError::Zenoh`] if the text is not an endpoint or no router answers.
     pub async fn connect(endpoint: &str) -> Result<Self, ClientError> {
         Self::open(endpoint, Config::default()).await
     }
 
-    /// As [`ZenohClient::connect`], with a zenoh configuration (JSON5) to begin with: certificates for `tls/HOST:PORT`, as in
-    /// `deploy/zenoh/client.json5`.
+    /// As [`ZenohClient::connect`], with a zenoh configuration file (JSON5) as the base: certificates for
+    /// `tls/HOST:PORT`, as in `deploy/zenoh/client.json5`.
     ///
     /// # Errors
-    /// [`ClientError::Zenoh`] also for a file that is none or cannot be read.
+    /// [`ClientError::Zenoh`] if the file cannot be read or is not a configuration, the text is not an endpoint, or no
+    /// router answers.
     pub async fn connect_with(endpoint: &str, file: &Path) -> Result<Self, ClientError> {
         let config = Config::from_file(file).map_err(failed(format!("configuration {}", file.display())))?;
         Self::open(endpoint, config).await
@@ -90,13 +85,13 @@ impl ZenohClient {
         Ok(Self { session, endpoint: endpoint.into() })
     }
 
-    /// Names of the vehicles that are served now, in order.
+    /// Sorted names of the vehicles that are served now.
     ///
     /// # Errors
-    /// What zenoh says.
+    /// [`ClientError::Zenoh`] if the query fails.
     pub async fn vehicles(&self) -> Result<Vec<String>, ClientError> {
         let liveliness = self.session.liveliness();
-        let replies = liveliness.get("clearway/*").timeout(ANSWER_TIMEOUT);
+        let replies = liveliness.get("clearway/*").timeout(QUERY_TIMEOUT);
         let replies = replies.await.map_err(failed("liveliness clearway/*"))?;
         let mut names = Vec::new();
         while let Ok(reply) = replies.recv_async().await {
@@ -109,79 +104,82 @@ impl ZenohClient {
         Ok(names)
     }
 
-    /// The newest map of one layer; `None` where nobody serves it, or before its first.
+    /// Newest map of one layer; `None` if no server serves it or there is no map yet.
     ///
     /// # Errors
-    /// What zenoh says, or what is wrong with the map.
+    /// [`ClientError::Zenoh`] if the query fails, [`ClientError::Map`] if the map is invalid.
     pub async fn newest(&self, vehicle: &str, layer: &str) -> Result<Option<MapView>, ClientError> {
         let key = format!("clearway/{vehicle}/map/{layer}");
         let map = query(&self.session, &key).await?.map(|map| decode(&map)).transpose()?;
-        Ok(map.map(|map| map.arrived(&Clock::default())))
+        Ok(map.map(|map| map.with_arrival(&Clock::default())))
     }
 
-    /// Streams one layer of one vehicle, beginning with the newest map there is (or the next one, where there is none yet).
-    /// It does not end with the server: [`MapStream::next_or_stale`] tells that its map is stale, and goes on with the maps
-    /// of the next server.
+    /// Streams one layer of one vehicle, starting with the newest map if there is one. The stream does not end with the
+    /// server: [`MapStream::next_or_stale`] reports that its map is stale, and continues with the maps of the next
+    /// server.
     ///
     /// # Errors
-    /// What zenoh says.
+    /// [`ClientError::Zenoh`] if the subscription fails.
     pub async fn subscribe(&self, vehicle: &str, layer: &str) -> Result<MapStream, ClientError> {
         let key = format!("clearway/{vehicle}/map/{layer}");
-        let tap = Tap::open(&self.session, &key).await.map_err(failed(format!("subscribe to {key}")))?;
-        // The session closes with its last clone, and takes the tap along: the stream keeps one.
+        let subscription =
+            LayerSubscription::open(&self.session, &key).await.map_err(failed(format!("subscribe to {key}")))?;
+        // A session closes with its last clone and ends its subscriptions, so the stream keeps a clone.
         let Self { session, endpoint: address } = self.clone();
-        Ok(MapStream::spawn(move |feed| async move {
+        Ok(MapStream::spawn(move |slot| async move {
             let _session = session;
-            tap.run(feed).await.err().unwrap_or(ClientError::Ended { address })
+            subscription.run(slot).await.err().unwrap_or(ClientError::Ended { address })
         }))
     }
 }
 
 impl ZenohClient {
-    /// A way to send a vehicle's observations; sensors must be named.
+    /// Opens a sender of a vehicle's observations. Each observation of a sensor must name the sensor.
     ///
     /// # Errors
-    /// What zenoh says; [`ClientError::Refused`] for a vehicle nobody serves, listing those that are served.
+    /// [`ClientError::Zenoh`] if a query or subscription fails, [`ClientError::Refused`] with the known vehicles if the
+    /// vehicle is not served.
     pub async fn ingest(&self, vehicle: &str) -> Result<Ingester, ClientError> {
         let served = self.vehicles().await?;
         if !served.iter().any(|name| name == vehicle) {
             let reason = format!("vehicle {vehicle:?} is not known; known: {}", served.join(", "));
             return Err(ClientError::Refused { address: self.endpoint.clone(), reason, code: "NotFound".into() });
         }
-        // Nobody else's: each `RandomState` is keyed by the system's randomness.
+        // Unique: the system's randomness is the key of each `RandomState`.
         let client = std::hash::RandomState::new().build_hasher().finish();
-        let (heard, prefix) = (Ear::new(), format!("clearway/{vehicle}/ingest"));
+        let (receiver, prefix) = (ReportReceiver::new(), format!("clearway/{vehicle}/ingest"));
         let key = format!("{prefix}/report");
         let reports = self.session.declare_subscriber(key.clone()).callback({
-            let heard = heard.clone();
+            let receiver = receiver.clone();
             move |sample| {
-                // What is no report, or another's, is not for us.
+                // Ignores messages that are not reports, and reports for other senders.
                 match v1::IngestReport::decode(&*sample.payload().to_bytes()) {
-                    Ok(report) if report.client == client => heard.report(report),
+                    Ok(report) if report.client == client => receiver.push(report),
                     _ => {}
                 }
             }
         });
         let reports = Arc::new(reports.await.map_err(failed(format!("subscribe to {key}")))?);
         let session = self.session.clone();
-        let deliver: Deliver = Box::new(move |observation| {
+        let send: SendObservation = Box::new(move |observation| {
             let (session, reports) = (session.clone(), reports.clone());
             let key = key_of(&prefix, &observation);
             let bytes = v1::Observation { client, ..observation }.encode_to_vec();
             Box::pin(async move {
-                // Held until the last observation is on its way.
+                // Keeps the subscription until the last observation is sent.
                 let _reports = reports;
-                // Blocks, for no observation may be lost; who waits is the sender alone. All of one priority, zenoh's
-                // ordinary one: it keeps the order only within one, and the server counts holes in the numbers.
+                // Blocks, because no observation may be lost; only the sender waits. All observations have zenoh's
+                // default priority: zenoh keeps the order within one priority, and the server counts gaps in the
+                // numbers.
                 let put = session.put(&key, bytes).congestion_control(CongestionControl::Block);
                 put.await.map_err(failed(format!("put {key}")))
             })
         });
-        Ok(Ingester::new(self.endpoint.clone(), deliver, heard))
+        Ok(Ingester::new(self.endpoint.clone(), send, receiver))
     }
 }
 
-/// Where an observation is put.
+/// Key of an observation.
 fn key_of(prefix: &str, observation: &v1::Observation) -> String {
     use v1::observation::Body;
     let (kind, sensor) = match &observation.body {
@@ -194,18 +192,4 @@ fn key_of(prefix: &str, observation: &v1::Observation) -> String {
     };
     let key = format!("{prefix}/{kind}/{sensor}");
     key.trim_end_matches('/').to_owned()
-}
-
-async fn query(session: &Session, key: &str) -> Result<Option<ZBytes>, ClientError> {
-    let replies = session.get(key).timeout(ANSWER_TIMEOUT).await.map_err(failed(format!("get {key}")))?;
-    while let Ok(reply) = replies.recv_async().await {
-        if let Ok(sample) = reply.result() {
-            return Ok(Some(sample.payload().clone()));
-        }
-    }
-    Ok(None)
-}
-
-fn decode(payload: &ZBytes) -> Result<MapView, ClientError> {
-    MapView::decode(payload.to_bytes().into_owned().into())
 }

@@ -5,7 +5,7 @@ mod common;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use clearway_client::{MapStream, Sight, Update, ZenohClient, now_ns, v1};
+use clearway_client::{MapStream, StreamEvent, Update, ZenohClient, now_ns, v1};
 use common::{CAPTURE_END_NS, map};
 use prost::Message;
 use tokio::net::{TcpListener, TcpStream};
@@ -168,8 +168,8 @@ async fn pass(mut near: TcpStream, mut leads: watch::Receiver<Option<String>>, p
 async fn goes_stale(maps: &mut MapStream, sequence: u64) {
     loop {
         match maps.next_or_stale().await.expect("a stream does not end with its server") {
-            Sight::Fresh(update) => assert_eq!(update.map.sequence(), sequence),
-            Sight::Stale(update) => {
+            StreamEvent::Fresh(update) => assert_eq!(update.map.sequence(), sequence),
+            StreamEvent::Stale(update) => {
                 assert_eq!(update.map.sequence(), sequence);
                 assert!(update.map.is_stale(now_ns()));
                 return;
@@ -187,8 +187,8 @@ fn lasting(sequence: u64) -> Bytes {
 
 async fn is_fresh(maps: &mut MapStream) -> (u64, u64, u64) {
     match maps.next_or_stale().await.expect("a stream does not end with its server") {
-        Sight::Fresh(Update { map, skipped, lost, .. }) => (map.sequence(), skipped, lost),
-        Sight::Stale(update) => panic!("map {} is told as stale", update.map.sequence()),
+        StreamEvent::Fresh(Update { map, skipped, lost, .. }) => (map.sequence(), skipped, lost),
+        StreamEvent::Stale(update) => panic!("map {} is told as stale", update.map.sequence()),
     }
 }
 

@@ -1,25 +1,30 @@
-//! The wire contract of Clearway. Pure: bytes in, values out.
+//! The wire contract of Clearway: `clearway.v1` protobuf, its generated types, and the map codec. Pure: bytes in,
+//! values out; no I/O and no clock.
 //!
-//! [`v1`] holds the generated protobuf and gRPC types, [`DESCRIPTORS`] their descriptor set (for reflection and for
-//! the schemas in recordings), [`codec`] the cells of a channel to bytes and back, [`grid`] where cells lie, [`map`] a
-//! whole map's bytes to checked values, [`delta`] a layer as what changed, [`by_class`] a channel as what is otherwise than
-//! its class says, [`region`] the part of a layer about a place, [`packed`] a scan's lists of numbers to bytes and back,
-//! [`safe_points`] a layer's points.
+//! | file | in -> out |
+//! |---|---|
+//! | [`v1`] | generated from `clearway/v1/*.proto`: messages and gRPC services |
+//! | [`limits`] | what a decoder accepts before it allocates |
+//! | [`packed`] | numbers <-> the packed lists of a scan |
+//! | [`cells`] | the raw cells of a channel, typed |
+//! | [`codec`] | raw cells <-> `Channel`: payload, encoding, CRC |
+//! | [`by_class`] | raw cells and their classes -> `Channel` with a class table |
+//! | [`map`] | encoded `Map` -> checked [`map::Map`]; header and layers -> bytes |
+//! | [`grid`] | point in the ego frame <-> cell index |
+//! | [`legend`] | names, meanings and colours of a layer's classes |
+//! | [`safe_points`] | safe points <-> `SafePoints` |
+//! | [`delta`] | two layers -> the changes between them |
+//! | [`region`] | layer and rectangle -> the part of the layer that contains the rectangle |
 
-mod bits;
-pub mod by_class;
-mod changes;
-pub mod codec;
-mod decode;
+mod channel;
 pub mod delta;
-pub mod grid;
-pub mod legend;
+pub mod limits;
 pub mod map;
 pub mod packed;
-mod parts;
 pub mod region;
-mod rows;
-pub mod safe_points;
+
+pub use channel::{by_class, cells, codec};
+pub use map::{grid, legend, safe_points};
 
 /// Generated from `clearway/v1/*.proto`.
 #[allow(missing_docs, clippy::all, rustdoc::broken_intra_doc_links)]
@@ -27,5 +32,6 @@ pub mod v1 {
     tonic::include_proto!("clearway.v1");
 }
 
-/// The encoded `FileDescriptorSet` of `clearway/v1/*.proto`, imports included.
+/// The encoded `FileDescriptorSet` of `clearway/v1/*.proto`, imports included: for gRPC reflection and for the schemas
+/// in recordings.
 pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/clearway.v1.bin"));

@@ -1,17 +1,17 @@
-//! Lists of numbers <-> the bytes of a scan's fields: little-endian, one after the other.
+//! Numbers <-> packed lists, the bytes of a scan's fields: little-endian, one number after the other.
 //!
-//! The same bytes a packed `repeated float` has on the wire, but copied at once instead of parsed number by number.
+//! The bytes are those of a packed `repeated float`, but they are copied as a whole instead of parsed number by number.
 
 use bytes::Bytes;
 
-/// A number with a fixed place in a packed list.
+/// A number of fixed size in a packed list.
 pub trait Number: Copy {
-    /// Bytes of one.
+    /// Bytes of one number.
     const BYTES: usize;
-    /// Of exactly [`Number::BYTES`] bytes.
+    /// The number of exactly [`Number::BYTES`] bytes.
     fn from_bytes(bytes: &[u8]) -> Self;
-    /// Writes it behind the others.
-    fn put(self, bytes: &mut Vec<u8>);
+    /// Appends the number to a list.
+    fn append_to(self, bytes: &mut Vec<u8>);
 }
 
 macro_rules! numbers {
@@ -23,7 +23,7 @@ macro_rules! numbers {
                 own.copy_from_slice(bytes);
                 Self::from_le_bytes(own)
             }
-            fn put(self, bytes: &mut Vec<u8>) {
+            fn append_to(self, bytes: &mut Vec<u8>) {
                 bytes.extend_from_slice(&self.to_le_bytes());
             }
         }
@@ -32,14 +32,14 @@ macro_rules! numbers {
 
 numbers!(f32, i32, i64, u16);
 
-/// Numbers as bytes.
+/// Packs numbers into bytes.
 pub fn pack<N: Number>(numbers: &[N]) -> Bytes {
     let mut bytes = Vec::with_capacity(numbers.len() * N::BYTES);
-    numbers.iter().for_each(|number| number.put(&mut bytes));
+    numbers.iter().for_each(|number| number.append_to(&mut bytes));
     bytes.into()
 }
 
-/// Bytes as numbers; `None` where part of a number is left over. Allocates what the bytes make.
+/// Unpacks bytes into numbers; `None` if the last number is incomplete.
 pub fn unpack<N: Number>(bytes: &[u8]) -> Option<Vec<N>> {
     bytes.len().is_multiple_of(N::BYTES).then(|| bytes.chunks_exact(N::BYTES).map(N::from_bytes).collect())
 }
@@ -49,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_come_back_bit_for_bit_and_half_a_number_is_none() {
+    fn numbers_unpack_bit_for_bit_and_an_incomplete_number_is_refused() {
         let floats = [0.0, -1.5, f32::NAN, f32::INFINITY, f32::MIN_POSITIVE];
         let back: Vec<f32> = unpack(&pack(&floats)).unwrap();
         let bits = |floats: &[f32]| floats.iter().map(|f| f.to_bits()).collect::<Vec<_>>();

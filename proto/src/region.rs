@@ -1,40 +1,44 @@
-//! The part of a layer that holds a rectangle of the ego frame.
+//! The part of a layer that contains a rectangle of the ego frame.
 //!
-//! In: a whole layer and a `Region`. Out: a layer like it with fewer cells, its channels encoded anew.
+//! In: a whole layer and a `Region`. Out: an equal layer with fewer cells; its channels are encoded again.
 //!
-//! A Cartesian grid keeps the smallest rectangle of its cells that holds the region; where it turns under the vehicle,
-//! that of the turned region. A radial grid keeps the rows from the vehicle to the region's farthest corner, with all
-//! columns: those cells of them are unknown whose ring or sector has nothing of the region. Planes, metrics, legend and
-//! safe points stay whole: they tell of the layer, not of its cells.
+//! A Cartesian grid keeps the smallest rectangle of cells that contains the region, or the rotated region if the grid
+//! is rotated. A radial grid keeps the rows from the vehicle to the region's farthest corner, with all columns; cells
+//! in rings and sectors that do not touch the region become unknown. Planes, metrics, legend and safe points stay
+//! whole, because they describe the layer and not single cells.
 
 use std::f64::consts::{PI, TAU};
 
-use crate::by_class::encode_beside;
-use crate::codec::{Cells, CellsRef, Limits, encode_grid};
-use crate::grid::{Grid, turned};
-use crate::map::{Channel, MapError, decode_layer};
+use crate::channel::by_class::encode_beside;
+use crate::channel::cells::{Cells, CellsRef};
+use crate::channel::codec::encode_grid;
+use crate::limits::Limits;
+use crate::map::decode::decode_layer;
+use crate::map::error::MapError;
+use crate::map::grid::{Grid, rotate};
+use crate::map::layer::Channel;
 use crate::v1;
 
-/// Why a layer has no such part.
+/// Why a layer has no part for a region.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RegionError {
-    /// A rectangle that is none.
-    #[error("region {region:?}: finite metres are needed, each from below its to")]
+    /// The region is not a rectangle.
+    #[error("region {region:?}: finite metres are needed, and each `from` below its `to`")]
     Bounds {
-        /// As it was asked for.
+        /// The region as requested.
         region: v1::Region,
     },
-    /// No cell of the layer lies in it.
+    /// No cell of the layer lies in the region.
     #[error("layer {layer:?} has no cell in the region {region:?}; it reaches {range_m_max} m from the vehicle")]
     Outside {
-        /// The layer's name.
+        /// Name of the layer.
         layer: String,
-        /// As it was asked for.
+        /// The region as requested.
         region: v1::Region,
         /// [`Grid::range_m_max`].
         range_m_max: f64,
     },
-    /// The layer is not whole or cannot be read.
+    /// The layer is not whole or is invalid.
     #[error(transparent)]
     Layer(#[from] MapError),
 }
@@ -42,17 +46,18 @@ pub enum RegionError {
 /// Checks that a region is a rectangle.
 ///
 /// # Errors
-/// [`RegionError::Bounds`].
+/// [`RegionError::Bounds`] if a coordinate is not finite, or a `from` is not less than its `to`.
 pub fn check(region: &v1::Region) -> Result<(), RegionError> {
     let v1::Region { x_from_m, x_to_m, y_from_m, y_to_m } = *region;
     let finite = [x_from_m, x_to_m, y_from_m, y_to_m].iter().all(|metres| metres.is_finite());
     if finite && x_from_m < x_to_m && y_from_m < y_to_m { Ok(()) } else { Err(RegionError::Bounds { region: *region }) }
 }
 
-/// The part of `layer` that holds `region`; the layer itself where that is all of it.
+/// Cuts `layer` to the part that contains `region`; returns the layer itself if that is all of it.
 ///
 /// # Errors
-/// [`RegionError`], with what was asked for and how far the layer reaches.
+/// [`RegionError::Bounds`] if the region is not a rectangle, [`RegionError::Outside`] if no cell of the layer lies in
+/// it, [`RegionError::Layer`] if the layer is a delta or invalid.
 pub fn crop(layer: &v1::Layer, region: &v1::Region, limits: &Limits) -> Result<v1::Layer, RegionError> {
     check(region)?;
     let decoded = decode_layer(layer.clone(), None, limits)?;
@@ -95,18 +100,19 @@ pub fn crop(layer: &v1::Layer, region: &v1::Region, limits: &Limits) -> Result<v
 
 type Span = std::ops::Range<usize>;
 
-/// Where in a grid a region lies.
+/// Where a region lies in a grid.
 struct Part {
-    /// What is kept.
+    /// Rows and columns that are kept.
     rows: Span,
     columns: Span,
-    /// Of what is kept, what is told: these rows, and these columns, counted on from 0 behind the last.
-    told_rows: Span,
-    told_columns: Span,
+    /// Rows and columns that keep their cells; the others become unknown. Columns continue past the last one with the
+    /// first: column `columns + 1` is column 1.
+    known_rows: Span,
+    known_columns: Span,
 }
 
 impl Part {
-    /// The smallest that holds the region; `None` where it lies outside the grid.
+    /// The smallest part that contains the region; `None` if the region lies outside the grid.
     fn of(grid: &Grid, region: &v1::Region) -> Option<Self> {
         let corners = [region.x_from_m, region.x_to_m].map(|x| [region.y_from_m, region.y_to_m].map(|y| (x, y)));
         let corners = corners.as_flattened();
@@ -117,13 +123,13 @@ impl Part {
                 let farthest = corners.iter().map(|(x, y)| x.hypot(*y)).fold(0.0, f64::max);
                 let row_at = |range_m: f64| row_radius_m.partition_point(|&outer| f64::from(outer) < range_m);
                 let rows = row_radius_m.len().min(row_at(farthest) + 1);
-                let told_rows = row_at(nearest)..rows;
-                let told_columns = sectors(region, corners, *columns);
-                let all = Self { rows: 0..rows, columns: 0..*columns as usize, told_rows, told_columns };
-                (!all.told_rows.is_empty()).then_some(all)
+                let known_rows = row_at(nearest)..rows;
+                let known_columns = sectors(region, corners, *columns);
+                let all = Self { rows: 0..rows, columns: 0..*columns as usize, known_rows, known_columns };
+                (!all.known_rows.is_empty()).then_some(all)
             }
             Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
-                let along = corners.iter().map(|&(x, y)| <[f64; 2]>::from(turned(x, y, *yaw_rad)));
+                let along = corners.iter().map(|&(x, y)| <[f64; 2]>::from(rotate(x, y, *yaw_rad)));
                 let span = |axis: usize, origin_m: f64, cells: u32| {
                     let places = along.clone().map(|at| (at[axis] - origin_m) / f64::from(*cell_m));
                     let (from, to) = places.fold((f64::MAX, f64::MIN), |(from, to), at| (from.min(at), to.max(at)));
@@ -131,47 +137,49 @@ impl Part {
                     (from < to).then_some(from..to)
                 };
                 let (rows, columns) = (span(1, *origin_y_m, *height)?, span(0, *origin_x_m, *width)?);
-                Some(Self { told_rows: rows.clone(), told_columns: columns.clone(), rows, columns })
+                Some(Self { known_rows: rows.clone(), known_columns: columns.clone(), rows, columns })
             }
         }
     }
 
     fn is_all_of(&self, [rows, columns]: [usize; 2]) -> bool {
-        self.told_rows.len() == rows && self.told_columns.len() == columns
+        self.known_rows.len() == rows && self.known_columns.len() == columns
     }
 
-    /// A channel's cells in the part, of a grid with so many columns.
+    /// The cells of a channel in the part; `columns_before`: columns of the whole grid.
     fn cells(&self, channel: &Channel, columns_before: usize) -> Cells {
         match channel.cells.as_ref() {
-            CellsRef::U8(cells) => Cells::U8(self.of_type(cells, columns_before, channel.unknown as u8)),
-            CellsRef::I8(cells) => Cells::I8(self.of_type(cells, columns_before, channel.unknown as i8)),
-            CellsRef::U16(cells) => Cells::U16(self.of_type(cells, columns_before, channel.unknown as u16)),
+            CellsRef::U8(cells) => Cells::U8(self.cut(cells, columns_before, channel.unknown as u8)),
+            CellsRef::I8(cells) => Cells::I8(self.cut(cells, columns_before, channel.unknown as i8)),
+            CellsRef::U16(cells) => Cells::U16(self.cut(cells, columns_before, channel.unknown as u16)),
         }
     }
 
-    fn of_type<T: Copy>(&self, cells: &[T], columns_before: usize, unknown: T) -> Vec<T> {
-        let told = |row: usize, column: usize| {
-            let columns = &self.told_columns;
-            self.told_rows.contains(&row) && (columns.contains(&column) || columns.contains(&(column + columns_before)))
+    fn cut<T: Copy>(&self, cells: &[T], columns_before: usize, unknown: T) -> Vec<T> {
+        let is_known = |row: usize, column: usize| {
+            let columns = &self.known_columns;
+            self.known_rows.contains(&row)
+                && (columns.contains(&column) || columns.contains(&(column + columns_before)))
         };
         let all = self.rows.clone().flat_map(|row| self.columns.clone().map(move |column| (row, column)));
-        all.map(|(row, column)| if told(row, column) { cells[row * columns_before + column] } else { unknown })
+        all.map(|(row, column)| if is_known(row, column) { cells[row * columns_before + column] } else { unknown })
             .collect()
     }
 }
 
-/// The columns of a radial grid that have something of a region; those behind the last are counted on.
+/// The columns of a radial grid that touch a region. Columns continue past the last one with the first.
 fn sectors(region: &v1::Region, corners: &[(f64, f64)], columns: u32) -> Span {
     let v1::Region { x_from_m, x_to_m, y_from_m, y_to_m } = *region;
     let count = columns as usize;
     if x_from_m < 0.0 && x_to_m > 0.0 && y_from_m < 0.0 && y_to_m > 0.0 {
         return 0..count;
     }
-    // The vehicle is not in it, so it lies within half a turn: to both sides of its middle.
+    // The vehicle is not inside the region, so the region spans less than 180 degrees: measure to both sides of its
+    // centre.
     let middle = (0.5 * (y_from_m + y_to_m)).atan2(0.5 * (x_from_m + x_to_m));
     let aside = corners.iter().map(|(x, y)| (y.atan2(*x) - middle + PI).rem_euclid(TAU) - PI);
     let (right, left) = aside.fold((0.0_f64, 0.0_f64), |(right, left), at| (right.min(at), left.max(at)));
-    // What lies on the edge of a sector may be counted to either side: half a nanoradian is nothing, and is enough.
+    // A corner on the edge of a sector may round to either side: half a nanoradian includes both.
     let at = |azimuth: f64| (azimuth / TAU * f64::from(columns)).floor() as i64;
     let [first, last] = [at(middle + right - 5e-10), at(middle + left + 5e-10)];
     let from = first.rem_euclid(i64::from(columns)) as usize;

@@ -1,4 +1,4 @@
-//! Channels told by class: shorter, and the same cells.
+//! Channels with a class table: shorter, and with the same cells.
 
 mod common;
 
@@ -20,13 +20,13 @@ const CLASSES: [(&str, ClassMeaning, u32); 4] = [
     ("hidden", ClassMeaning::Hidden, 0x5c5c80),
 ];
 
-/// The bytes of a map of one layer: these channels beside these classes, told by class or not.
+/// The bytes of a map with one layer: these classes and channels, with class tables if `by_class`.
 fn bytes(class: &[u8], columns: u32, channels: &[(&str, Cells)], by_class: bool) -> Bytes {
     let beside = |cells: CellsRef<'_>| match by_class {
         true => encode_beside(cells, class, CLASSES.len(), columns as usize),
         false => encode_grid(cells, columns as usize),
     };
-    let told = channels.iter().map(|(name, cells)| beside(cells.as_ref()).into_channel(name, "", 1.0, 0));
+    let others = channels.iter().map(|(name, cells)| beside(cells.as_ref()).into_channel(name, "", 1.0, 0));
     let of_class = encode_grid(CellsRef::U8(class), columns as usize).into_channel("class", "", 1.0, 0);
     let layer = v1::Layer {
         name: "occupancy".into(),
@@ -36,18 +36,18 @@ fn bytes(class: &[u8], columns: u32, channels: &[(&str, Cells)], by_class: bool)
             cell_m: 0.25,
             ..Default::default()
         })),
-        channels: std::iter::once(of_class).chain(told).collect(),
+        channels: std::iter::once(of_class).chain(others).collect(),
         ..Default::default()
     };
     let header = v1::Header { vehicle: "alpha".into(), boot_id: 7, sequence: 3, ..Default::default() };
     [encode_header(&header), encode_layer(&with_legend(layer, &CLASSES))].concat().into()
 }
 
-fn open(bytes: &Bytes) -> Map {
+fn decode(bytes: &Bytes) -> Map {
     decode_map(bytes.clone(), &Limits::default()).unwrap()
 }
 
-/// Arcs of classes; each channel has one value a class but in few cells.
+/// Arcs of classes. Each channel has one value per class except in few cells.
 fn golden_channels() -> (Vec<u8>, Vec<(&'static str, Cells)>) {
     let class: Vec<u8> = (0..1200).map(|cell| (((cell / 40) * (cell / 40) + (cell % 40) * 7) / 60 % 4) as u8).collect();
     let other = |cell: usize| cell.is_multiple_of(97);
@@ -64,25 +64,25 @@ fn golden_channels() -> (Vec<u8>, Vec<(&'static str, Cells)>) {
 }
 
 #[test]
-fn the_golden_map_told_by_class_is_the_one_told_cell_by_cell() {
+fn the_golden_map_with_class_tables_equals_the_one_without() {
     let (class, channels) = golden_channels();
-    let [told, plain] = [true, false].map(|by_class| bytes(&class, 40, &channels, by_class));
-    assert_golden("by_class.bin", &told);
+    let [tables, plain] = [true, false].map(|by_class| bytes(&class, 40, &channels, by_class));
+    assert_golden("by_class.bin", &tables);
     assert_golden("by_class_plain.bin", &plain);
-    let map = open(&told);
-    assert_eq!(map, open(&plain));
+    let map = decode(&tables);
+    assert_eq!(map, decode(&plain));
     channels.iter().for_each(|(name, cells)| assert_eq!(&map.layers[0].channel(name).unwrap().cells, cells, "{name}"));
-    let told_by_class = v1::Map::decode(&told[..]).unwrap().layers.remove(0).channels;
-    let lengths: Vec<usize> = told_by_class.iter().map(|channel| channel.by_class.len()).collect();
+    let with_tables = v1::Map::decode(&tables[..]).unwrap().layers.remove(0).channels;
+    let lengths: Vec<usize> = with_tables.iter().map(|channel| channel.by_class.len()).collect();
     assert_eq!(lengths, [0, 4, 4, 8]);
-    assert!(told.len() * 10 < plain.len() * 9, "{} bytes, and {} cell by cell", told.len(), plain.len());
+    assert!(tables.len() * 10 < plain.len() * 9, "{} bytes, and {} without tables", tables.len(), plain.len());
 }
 
 #[test]
-fn a_channel_of_a_delta_is_told_by_class_where_that_is_shorter() {
+fn a_channel_of_a_delta_has_a_class_table_if_that_is_shorter() {
     let (class, channels) = golden_channels();
     let before = bytes(&class, 40, &channels, true);
-    // What is where has nothing to do with what was; the channels go with the classes as before.
+    // The new classes have nothing to do with the old ones; the values of each class stay.
     let later: Vec<u8> = (0..1200).map(|cell: u32| (cell / 40 / 7 + cell % 40 / 9) as u8 % 4).collect();
     let of = |table: [u8; 4]| Cells::U8(later.iter().map(|class| table[usize::from(*class)]).collect());
     let after = [("hits", of([0, 3, 250, 255])), channels[1].clone(), channels[2].clone()];
@@ -94,13 +94,13 @@ fn a_channel_of_a_delta_is_told_by_class_where_that_is_shorter() {
     assert_eq!(lengths, [0, 4, 0, 0]);
     let header = v1::Header { vehicle: "alpha".into(), boot_id: 7, sequence: 4, ..Default::default() };
     let bytes = [encode_header(&header), encode_layer(&delta)].concat().into();
-    let opened = decode_map_on(bytes, Some(&open(&before)), &Limits::default()).unwrap();
-    assert_eq!(opened.layers, open(&after).layers);
+    let decoded = decode_map_on(bytes, Some(&decode(&before)), &Limits::default()).unwrap();
+    assert_eq!(decoded.layers, decode(&after).layers);
 }
 
 proptest! {
     #[test]
-    fn whatever_the_classes_cells_come_back_in_no_more_bytes(
+    fn class_tables_keep_the_cells_and_do_not_enlarge_the_map(
         columns in 1..20_u32,
         stretches in vec((0..4_u8, 1..60_usize), 1..30),
         values in vec(any::<u16>(), 4),
@@ -115,10 +115,10 @@ proptest! {
             ("u8", Cells::U8(cells.iter().map(|cell| *cell as u8).collect())),
             ("i8", Cells::I8(cells.iter().map(|cell| *cell as i8).collect())),
         ];
-        let [told, plain] = [true, false].map(|by_class| bytes(&class, columns, &channels, by_class));
-        prop_assert_eq!(open(&told), open(&plain));
-        // Two bytes a channel say that it is told by class, and how long the table is.
-        prop_assert!(told.len() <= plain.len() + 2 * channels.len());
-        prop_assert_eq!(&told, &bytes(&class, columns, &channels, true));
+        let [tables, plain] = [true, false].map(|by_class| bytes(&class, columns, &channels, by_class));
+        prop_assert_eq!(decode(&tables), decode(&plain));
+        // The field of a class table needs two bytes beside the table.
+        prop_assert!(tables.len() <= plain.len() + 2 * channels.len());
+        prop_assert_eq!(&tables, &bytes(&class, columns, &channels, true));
     }
 }

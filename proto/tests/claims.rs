@@ -1,5 +1,5 @@
-//! What is claimed and not true is refused before there is room for it: no more is allocated than the payload and 64 KiB,
-//! whatever number of cells a channel or map says it has.
+//! A decoder refuses false claims before it allocates memory for them: it allocates at most the length of the payload and
+//! 64 KiB, however many cells a channel or map claims.
 
 use bytes::Bytes;
 use clearway_proto::codec::{self, Limits};
@@ -11,18 +11,18 @@ use prost::Message;
 #[global_allocator]
 static ALLOCATED: PeakAlloc = PeakAlloc;
 
-/// Beside the payload.
+/// Bytes that may be allocated beside the payload.
 const BYTES_MAX: usize = 64 << 10;
 
-/// How much more than before was allocated at once.
+/// Runs a function; returns its result and by how many bytes the allocated memory grew at most.
 fn peak<T>(run: impl FnOnce() -> T) -> (T, usize) {
     ALLOCATED.reset_peak_usage();
     let before = ALLOCATED.current_usage();
-    let made = run();
-    (made, ALLOCATED.peak_usage().saturating_sub(before))
+    let result = run();
+    (result, ALLOCATED.peak_usage().saturating_sub(before))
 }
 
-/// Bits, most significant first, of a run in exp-Golomb code.
+/// Appends a number in exp-Golomb code, as text of bits.
 fn number(bits: &mut String, number: u64) {
     let binary = format!("{:b}", number + 1);
     *bits += &"0".repeat(binary.len() - 1);
@@ -34,8 +34,8 @@ fn bytes(bits: &str) -> Vec<u8> {
     bits.as_bytes().chunks(8).map(byte).collect()
 }
 
-/// Payloads of rows that tell of other numbers of cells than `count`, or of none at all.
-fn untrue_rows(count: u64) -> Vec<Vec<u8>> {
+/// Payloads of rows with another number of cells than `count`, and malformed ones.
+fn false_rows(count: u64) -> Vec<Vec<u8>> {
     let copy = |cells: u64| {
         let mut bits = String::new();
         number(&mut bits, cells);
@@ -75,12 +75,12 @@ fn channel(cell_type: v1::CellType, encoding: v1::Encoding, cell_count: u32, pay
     v1::Channel { name: "class".into(), cell_type, encoding, cell_count, payload: payload.into(), ..Default::default() }
 }
 
-/// Channels that claim the most cells that are allowed, or more than that.
+/// Channels that claim the greatest allowed number of cells, or more.
 fn channels() -> Vec<v1::Channel> {
     let most = Limits::default().channel_cells;
     let mut channels = Vec::new();
     for cell_type in [v1::CellType::U8, v1::CellType::I8, v1::CellType::U16] {
-        for payload in untrue_rows(most.into()) {
+        for payload in false_rows(most.into()) {
             channels.push(channel(cell_type, v1::Encoding::Rows, most, payload));
         }
         for encoding in [v1::Encoding::Raw, v1::Encoding::Rows, v1::Encoding::Changes] {
@@ -92,7 +92,7 @@ fn channels() -> Vec<v1::Channel> {
     channels
 }
 
-/// A map of one layer with a grid of so many cells.
+/// The bytes of a map with one layer.
 fn map_of(geometry: v1::layer::Geometry, channels: Vec<v1::Channel>) -> Vec<u8> {
     let header = v1::Header { vehicle: "car".into(), ..Default::default() };
     let mut layer = v1::Layer { name: "occupancy".into(), geometry: Some(geometry), channels, ..Default::default() };
@@ -114,14 +114,14 @@ fn maps() -> Vec<Vec<u8>> {
     for columns in [u32::MAX, 1 << 31, 1 << 23] {
         maps.push(map_of(radial(columns), vec![rows(columns.wrapping_mul(2), vec![0; 5])]));
     }
-    // Each channel within the limit, all of them together not.
+    // Each channel is within its limit, but all of them together exceed the limit of a map.
     let many = (0..64).map(|index| v1::Channel { name: format!("c{index}"), ..rows(most, vec![0; 5]) });
     maps.push(map_of(square(2048, 2048), many.collect()));
     maps
 }
 
 #[test]
-fn what_claims_cells_it_does_not_tell_is_refused_without_room_for_them() {
+fn false_claims_of_cells_are_refused_before_memory_is_allocated() {
     let limits = Limits::default();
     let (channels, maps) = (channels(), maps());
     assert!(channels.len() >= 40 && maps.len() >= 40);

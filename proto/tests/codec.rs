@@ -1,4 +1,4 @@
-//! Properties of the codec: what goes in comes out, there is one form for each content, and nothing panics.
+//! Properties of the codec: cells decode to themselves, each content has one encoding, and no input makes it panic.
 
 use bytes::Bytes;
 use clearway_proto::codec::{self, Cells, DecodeError, Limits};
@@ -6,7 +6,7 @@ use clearway_proto::{map, v1};
 use proptest::collection::vec;
 use proptest::prelude::*;
 
-/// Runs of few values and noise, in all cell types.
+/// Cells of all types: runs of few values, and noise.
 fn cells() -> impl Strategy<Value = Cells> {
     let spans = |length| vec((any::<u16>(), prop_oneof![Just(1_usize), 1..40_usize, 1..2000_usize]), 0..length);
     let spread = |spans: Vec<(u16, usize)>| spans.into_iter().flat_map(|(v, n)| std::iter::repeat_n(v, n)).collect();
@@ -19,7 +19,7 @@ fn cells() -> impl Strategy<Value = Cells> {
 
 proptest! {
     #[test]
-    fn the_cells_of_a_grid_decode_to_themselves_and_are_never_larger_than_raw(cells in cells(), columns in 1..3000_usize) {
+    fn cells_decode_to_themselves_and_never_exceed_the_raw_size(cells in cells(), columns in 1..3000_usize) {
         let encoded = codec::encode_grid(cells.as_ref(), columns);
         prop_assert!(encoded.payload.len() <= cells.as_ref().to_le_bytes().len());
         let channel = encoded.into_channel("c", "", 1.0, 0);
@@ -27,10 +27,12 @@ proptest! {
     }
 
     #[test]
-    fn rows_that_decode_are_the_ones_the_encoder_makes(columns in 1..6_usize, bytes in vec(any::<u8>(), 0..12), cell_count in 5..60_u32) {
+    fn only_canonical_rows_decode(
+        columns in 1..6_usize, bytes in vec(any::<u8>(), 0..12), cell_count in 5..60_u32,
+    ) {
         let (cell_type, encoding) = (v1::CellType::U8 as i32, v1::Encoding::Rows as i32);
         let mut channel = v1::Channel { cell_type, encoding, cell_count, payload: bytes.into(), ..Default::default() };
-        // The CRC is put right where it alone is wrong, so that the canonical form is what decides.
+        // The CRC is corrected if it alone is wrong, so that only the canonical form decides.
         if let Err(DecodeError::Crc { computed, .. }) = codec::decode(&channel, columns, &Limits::default()) {
             channel.crc32 = computed;
         }
@@ -40,12 +42,14 @@ proptest! {
     }
 
     #[test]
-    fn any_bytes_are_a_map_or_are_refused(bytes in vec(any::<u8>(), 0..400)) {
+    fn any_bytes_decode_or_are_refused(bytes in vec(any::<u8>(), 0..400)) {
         let _ = map::decode_map(Bytes::from(bytes), &Limits::default());
     }
 
     #[test]
-    fn a_golden_map_with_bytes_changed_is_a_map_or_is_refused(changes in vec((any::<prop::sample::Index>(), any::<u8>()), 1..6)) {
+    fn a_golden_map_with_changed_bytes_decodes_or_is_refused(
+        changes in vec((any::<prop::sample::Index>(), any::<u8>()), 1..6),
+    ) {
         let mut bytes = include_bytes!("../golden/map.bin").to_vec();
         for (at, byte) in changes {
             let at = at.index(bytes.len());
@@ -62,8 +66,10 @@ proptest! {
     }
 
     #[test]
-    fn the_middle_of_a_cell_lies_in_that_cell(benches in vec(0.01_f32..3.0, 1..60), columns in 1..720_u32, at in any::<prop::sample::Index>()) {
-        let row_radius_m = benches.iter().scan(0.0, |r, step| { *r += step; Some(*r) }).collect();
+    fn the_centre_of_a_cell_lies_in_that_cell(
+        widths in vec(0.01_f32..3.0, 1..60), columns in 1..720_u32, at in any::<prop::sample::Index>(),
+    ) {
+        let row_radius_m = widths.iter().scan(0.0, |r, step| { *r += step; Some(*r) }).collect();
         let grid = clearway_proto::grid::Grid::Radial { row_radius_m, columns };
         let index = at.index(grid.cell_count() as usize);
         let (x, y) = grid.centre_of(index).unwrap();
@@ -72,8 +78,8 @@ proptest! {
 }
 
 #[test]
-fn long_runs_of_many_channels_are_refused_before_their_cells_are_made() {
-    // Each channel keeps the limit of one channel; together they would take 80 MiB from 120 bytes.
+fn a_map_over_the_limit_of_cells_is_refused_before_they_are_decoded() {
+    // Each channel is within the limit of one channel; together they would need 80 MiB for 120 bytes.
     let channel = |name: usize| v1::Channel {
         name: name.to_string(),
         cell_type: v1::CellType::U16.into(),
@@ -89,7 +95,7 @@ fn long_runs_of_many_channels_are_refused_before_their_cells_are_made() {
 }
 
 #[test]
-fn a_map_of_a_million_empty_layers_is_refused_before_any_is_made() {
+fn a_map_of_a_million_empty_layers_is_refused_before_it_is_decoded() {
     // Field 2 of `Map`, a layer, of no bytes.
     let hostile = Bytes::from([0x12, 0x00].repeat(1 << 20));
     let allowed = Limits::default().map_parts;

@@ -1,5 +1,5 @@
-//! The golden vectors in `golden/`: what the encoder makes equals the files, what the files hold decodes or is refused
-//! under its name. Clients in other languages read the same files. `CLEARWAY_BLESS=1` writes them anew.
+//! The golden vectors in `golden/`: the encoder writes exactly these files, and the decoder accepts or refuses their
+//! contents by name. Clients in other languages read the same files. `CLEARWAY_BLESS=1` writes them again.
 
 mod common;
 
@@ -7,7 +7,7 @@ use bytes::Bytes;
 use clearway_proto::codec::{self, Cells, Limits};
 use clearway_proto::legend::encode_legend;
 use clearway_proto::v1::ClassMeaning;
-use clearway_proto::{map, safe_points, v1};
+use clearway_proto::{limits, map, safe_points, v1};
 use common::{assert_golden, bless, golden, hex, pretty, with_legend};
 use prost::Message;
 use serde_json::{Value, json};
@@ -16,7 +16,7 @@ fn unhex(text: &str) -> Vec<u8> {
     (0..text.len()).step_by(2).map(|at| u8::from_str_radix(&text[at..at + 2], 16).unwrap()).collect()
 }
 
-/// Cells as [value, length] pairs, so that long ones stay readable.
+/// Cells as [value, length] pairs, so that long lists stay readable.
 fn spans(cells: &Cells) -> Vec<[i64; 2]> {
     let mut spans: Vec<[i64; 2]> = Vec::new();
     for value in (0..cells.len()).map(|index| i64::from(cells.get(index).unwrap())) {
@@ -49,7 +49,7 @@ fn good_vectors() -> Vec<(&'static str, Cells)> {
     ]
 }
 
-/// Grids of so many columns whose rows resemble one another.
+/// Name, cells and number of columns of grids whose rows resemble one another.
 fn good_grids() -> Vec<(&'static str, Cells, usize)> {
     let patch = |cell: usize| u8::from((4..9).contains(&(cell / 20)) && (3..12).contains(&(cell % 20)));
     let arcs = |cell: usize| ((cell / 20).pow(2) + (cell % 20).pow(2)) / 40;
@@ -64,7 +64,7 @@ fn good_grids() -> Vec<(&'static str, Cells, usize)> {
 }
 
 #[test]
-fn the_encoder_makes_the_golden_channels() {
+fn the_encoder_writes_the_golden_channels() {
     let mut vectors = Vec::new();
     let rows_of_one = good_vectors().into_iter().map(|(name, cells)| (name, cells.clone(), cells.len().max(1)));
     for (name, cells, columns) in rows_of_one.chain(good_grids()) {
@@ -84,7 +84,7 @@ fn the_encoder_makes_the_golden_channels() {
     assert_golden("channels.json", &pretty(&json!(vectors)));
 }
 
-/// (name, expected variant, cell type, encoding, cell count, payload) of rows of 3 columns; the CRC is 0.
+/// (name, expected variant, cell type, encoding, cell count, payload) of a channel with 3 columns; the CRC is 0.
 type Bad = (&'static str, &'static str, i32, i32, u32, Vec<u8>);
 
 fn bad_vectors() -> Vec<Bad> {
@@ -99,51 +99,58 @@ fn bad_vectors() -> Vec<Bad> {
         ("claims_2_32_raw_cells", "TooManyCells", u8_, raw, max, vec![0; 4]),
         ("one_cell_over_the_limit", "TooManyCells", u8_, rows, (4 << 20) + 1, vec![0, 0, 2, 0, 0, 4]),
         ("cell_type_unspecified", "CellType", 0, raw, 1, vec![0]),
-        ("cell_type_unheard_of", "CellType", 9, raw, 1, vec![0]),
+        ("cell_type_undefined", "CellType", 9, raw, 1, vec![0]),
         ("cell_type_negative", "CellType", -1, raw, 1, vec![0]),
         ("encoding_unspecified", "Encoding", u8_, 0, 1, vec![0]),
-        ("encoding_unheard_of", "Encoding", u8_, 7, 1, vec![0]),
+        ("encoding_undefined", "Encoding", u8_, 7, 1, vec![0]),
         ("encoding_negative", "Encoding", u8_, i32::MIN, 1, vec![0]),
         ("raw_short", "RawLength", u8_, raw, 5, vec![0; 4]),
         ("raw_long", "RawLength", u8_, raw, 3, vec![0; 4]),
         ("raw_empty", "RawLength", u8_, raw, 3, vec![]),
-        ("raw_for_no_cells", "RawLength", u8_, raw, 0, vec![0]),
+        ("raw_of_zero_cells", "RawLength", u8_, raw, 0, vec![0]),
         ("raw_u16_odd", "RawLength", u16_, raw, 2, vec![0; 3]),
         ("raw_u16_in_single_bytes", "RawLength", u16_, raw, 4, vec![0; 4]),
         ("raw_with_a_wrong_crc", "Crc", u8_, raw, 3, vec![1, 2, 3]),
         ("rows_as_long_as_raw", "NotSmaller", u8_, rows, 2, vec![0x60, 0]),
         ("rows_longer_than_raw", "NotSmaller", u8_, rows, 2, vec![0x60, 0, 0]),
         ("rows_of_u16_as_long_as_raw", "NotSmaller", u16_, rows, 1, vec![0x40, 0]),
-        ("rows_for_no_cells", "NotSmaller", u8_, rows, 0, vec![]),
-        ("changes_of_no_cells", "NotSmaller", u8_, changes, 0, vec![0x80]),
-        ("changes_of_nothing", "NothingToChange", u8_, changes, 9, vec![0b0000_1001]),
-        ("rows_with_nothing", "Truncated", u8_, rows, 9, vec![]),
+        ("rows_of_zero_cells", "NotSmaller", u8_, rows, 0, vec![]),
+        ("changes_of_zero_cells", "NotSmaller", u8_, changes, 0, vec![0x80]),
+        ("changes_without_a_base", "NothingToChange", u8_, changes, 9, vec![0b0000_1001]),
+        ("rows_without_payload", "Truncated", u8_, rows, 9, vec![]),
         ("rows_end_inside_a_number", "Truncated", u8_, rows, 9, vec![0]),
         // Copy 3 (00100), value 1 (0 010), and nothing of the run.
         ("rows_end_before_a_run", "Truncated", u8_, rows, 9, vec![0b0010_0001]),
-        ("rows_number_of_33_zeros", "Overlong", u8_, rows, 9, vec![0, 0, 0, 0, 0x40]),
+        ("rows_number_with_33_zeros", "Overlong", u8_, rows, 9, vec![0, 0, 0, 0, 0x40]),
         // Copy 0 (1), another value (0), which is 256 (00000000 100000001), a run of 9 (0001001).
         ("rows_u8_256", "ValueTooLarge", u8_, rows, 9, vec![0b1000_0000, 0b0010_0000, 0b0010_0010, 0b0100_0000]),
         ("rows_i8_zigzag_256", "ValueTooLarge", i8_, rows, 9, vec![0b1000_0000, 0b0010_0000, 0b0010_0010, 0b0100_0000]),
         // The same with 65536.
         ("rows_u16_65536", "ValueTooLarge", u16_, rows, 9, vec![0x80, 0, 0x20, 0, 0x60]),
         // Copy 0 (1), another value (0), which is 0 (1): the same as before the first row; a run of 9 (0001001).
-        ("rows_value_as_a_row_before", "Repeated", u8_, rows, 9, vec![0b1010_0010, 0b0100_0000]),
+        ("rows_run_with_the_value_of_the_row_before", "Repeated", u8_, rows, 9, vec![0b1010_0010, 0b0100_0000]),
         // Copy 0, value 1 (0 010), a run of 1 (1); copy 0, value 1, a run of 8 (0001000).
-        ("rows_run_goes_on", "Repeated", u8_, rows, 9, vec![0b1001_0110, 0b0100_0010, 0]),
+        ("rows_run_that_is_split", "Repeated", u8_, rows, 9, vec![0b1001_0110, 0b0100_0010, 0]),
         // Copy 0, as the cell before: there is none; a run of 9.
-        ("rows_first_cell_as_the_one_before", "NothingBefore", u8_, rows, 9, vec![0b1100_0100, 0b1000_0000]),
+        ("rows_first_cell_repeats_the_cell_before", "NothingBefore", u8_, rows, 9, vec![0b1100_0100, 0b1000_0000]),
         // Copy 10 (0001011) of 9 cells.
         ("rows_copy_too_long", "RunTooLong", u8_, rows, 9, vec![0b0001_0110]),
         // Copy 0, value 1 (0 010), a run of 10 (0001010).
         ("rows_run_too_long", "RunTooLong", u8_, rows, 9, vec![0b1001_0000, 0b1010_0000]),
         // Copy 9 (0001010), then a 1 where zeros fill up.
-        ("rows_not_filled_up_with_zeros", "TrailingBytes", u8_, rows, 9, vec![0b0001_0101]),
+        ("rows_padded_with_a_one", "TrailingBytes", u8_, rows, 9, vec![0b0001_0101]),
         ("rows_with_a_byte_after", "TrailingBytes", u8_, rows, 9, vec![0b0001_0100, 0]),
         ("rows_with_a_wrong_crc", "Crc", u8_, rows, 9, vec![0b0001_0100]),
         // Copy 0, value 1, a run of 4 Mi.
         ("largest_channel_with_a_wrong_crc", "Crc", u16_, rows, 4 << 20, vec![0x90, 0, 0, 0x10, 0, 0, 0]),
     ]
+}
+
+#[test]
+fn the_limits_are_those_of_the_golden_file() {
+    let table: serde_json::Map<_, _> =
+        limits::TABLE.iter().map(|(name, value)| ((*name).into(), json!(value))).collect();
+    assert_golden("limits.json", &pretty(&Value::Object(table)));
 }
 
 #[test]
@@ -184,7 +191,7 @@ fn the_examples_in_map_proto_are_what_the_encoder_writes() {
 }
 
 #[test]
-fn every_bad_channel_is_refused_under_its_name() {
+fn every_bad_channel_is_refused_with_its_error() {
     let bad = bad_vectors();
     assert!(bad.len() >= 40, "{}", bad.len());
     let mut vectors = Vec::new();
@@ -298,7 +305,7 @@ fn points_of_flat() -> Vec<map::SafePoint> {
 }
 
 #[test]
-fn the_golden_map_is_its_header_and_its_layers_behind_each_other() {
+fn the_golden_map_is_its_header_and_its_layers_concatenated() {
     let (header, drivability, flat) = golden_map();
     let bytes = [map::encode_header(&header), map::encode_layer(&drivability), map::encode_layer(&flat)].concat();
     assert_golden("map.bin", &bytes);
@@ -307,7 +314,7 @@ fn the_golden_map_is_its_header_and_its_layers_behind_each_other() {
 
     let map = map::decode_map(Bytes::from(bytes), &Limits::default()).unwrap();
     assert_eq!(map.layers[1].points, points_of_flat());
-    let looks =
+    let places =
         [(2.0, 0.1), (0.0, 0.0), (-6.0, -0.1), (-6.0, 0.1), (-10.0, -0.1), (10.0, 0.1), (13.0, 0.0), (0.1, 6.0)];
     let layers: Vec<_> = map
         .layers
@@ -331,47 +338,51 @@ fn the_golden_map_is_its_header_and_its_layers_behind_each_other() {
         })
         .collect();
     let layer = map.layer("drivability").unwrap();
-    let looks: Vec<_> =
-        looks.iter().map(|&(x, y)| json!({
-        "x_m": x, "y_m": y, "class": layer.class_at(x, y).1, "meaning": layer.meaning_at(x, y).as_str_name(),
-    })).collect();
-    let described = json!({
+    let classes: Vec<_> = places
+        .iter()
+        .map(|&(x, y)| {
+            json!({
+                "x_m": x, "y_m": y, "class": layer.class_at(x, y).1, "meaning": layer.meaning_at(x, y).as_str_name(),
+            })
+        })
+        .collect();
+    let description = json!({
         "vehicle": map.header.vehicle,
         "sequence": map.header.sequence,
         "capture_end_ns": map.header.capture_end_ns,
         "valid_until_ns": map.header.valid_until_ns,
         "layers": layers,
-        "classes_of_drivability": looks,
+        "classes_of_drivability": classes,
     });
-    assert_golden("map.json", &pretty(&described));
+    assert_golden("map.json", &pretty(&description));
 }
 
-/// (name, expected error, what is done to the golden map).
-type Spoil = (&'static str, &'static str, fn(&mut v1::Map));
+/// (name, expected error, fault to inject into the golden map).
+type Fault = (&'static str, &'static str, fn(&mut v1::Map));
 
-fn spoils() -> [Spoil; 42] {
+fn faults() -> [Fault; 42] {
     [
-        ("by_class_of_too_few", "by_class", |map| map.layers[0].channels[1].by_class = vec![1; 3].into()),
-        ("by_class_of_classes", "by_class", |map| map.layers[0].channels[0].by_class = vec![0; 4].into()),
-        ("by_class_without_classes", "by_class", |map| map.layers[1].channels[0].by_class = vec![0; 2].into()),
-        ("by_class_without_changes", "by_class", |map| map.layers[0].channels[1].by_class = vec![1; 4].into()),
+        ("class_table_too_short", "by_class", |map| map.layers[0].channels[1].by_class = vec![1; 3].into()),
+        ("class_table_on_channel_class", "by_class", |map| map.layers[0].channels[0].by_class = vec![0; 4].into()),
+        ("class_table_without_classes", "by_class", |map| map.layers[1].channels[0].by_class = vec![0; 2].into()),
+        ("class_table_without_changes", "by_class", |map| map.layers[0].channels[1].by_class = vec![1; 4].into()),
         ("changes_of_other_cells", "cells", |map| {
             let channel = &mut map.layers[0].channels[1];
             (channel.encoding, channel.by_class) = (v1::Encoding::Changes.into(), vec![1; 4].into());
         }),
-        ("changes_of_no_map", "cells", |map| map.layers[0].channels[1].encoding = v1::Encoding::Changes.into()),
+        ("changes_in_a_whole_layer", "cells", |map| map.layers[0].channels[1].encoding = v1::Encoding::Changes.into()),
         ("no_header", "header", |map| map.header = None),
-        ("capture_backwards", "header", |map| map.header.as_mut().unwrap().capture_end_ns = 0),
+        ("capture_ends_before_its_start", "header", |map| map.header.as_mut().unwrap().capture_end_ns = 0),
         ("pose_not_finite", "header", |map| pose(map).x = f64::NAN),
         ("quaternion_of_norm_0", "header", |map| *pose(map) = v1::Pose::default()),
         ("two_layers_with_one_name", "twice", |map| map.layers[1].name = "drivability".into()),
         ("two_channels_with_one_name", "twice", |map| map.layers[0].channels[1].name = "class".into()),
         ("no_geometry", "geometry", |map| map.layers[0].geometry = None),
         ("no_columns", "geometry", |map| radial(map).columns = 0),
-        ("no_benches", "geometry", |map| radial(map).row_radius_m.clear()),
-        ("benches_descending", "geometry", |map| radial(map).row_radius_m[2] = 7.0),
-        ("bench_not_finite", "geometry", |map| radial(map).row_radius_m[2] = f32::INFINITY),
-        ("bench_at_0", "geometry", |map| radial(map).row_radius_m[0] = 0.0),
+        ("no_rows", "geometry", |map| radial(map).row_radius_m.clear()),
+        ("row_radii_descending", "geometry", |map| radial(map).row_radius_m[2] = 7.0),
+        ("row_radius_not_finite", "geometry", |map| radial(map).row_radius_m[2] = f32::INFINITY),
+        ("row_radius_of_0", "geometry", |map| radial(map).row_radius_m[0] = 0.0),
         ("cell_edge_negative", "geometry", |map| cartesian(map).cell_m = -0.5),
         ("origin_not_finite", "geometry", |map| cartesian(map).origin_x_m = f64::NAN),
         ("more_columns_than_cells", "cell_count", |map| radial(map).columns = 0x2000_0000),
@@ -386,29 +397,29 @@ fn spoils() -> [Spoil; 42] {
         ("legend_colour_of_25_bits", "legend", |map| map.layers[0].legend_rgb[1] = 1 << 24),
         ("class_without_a_name", "class", |map| encode_legend(&mut map.layers[0], CLASSES[..3].iter().copied())),
         ("safe_points_of_infinite_steps", "safe_point", |map| points(map).step_m = f32::INFINITY),
-        ("safe_points_in_no_steps", "safe_point", |map| points(map).step_m = 0.0),
+        ("safe_points_in_steps_of_0", "safe_point", |map| points(map).step_m = 0.0),
         ("safe_point_too_far", "safe_point", |map| points(map).x[1] = i32::MIN),
         ("safe_points_of_two_lengths", "safe_point", |map| points(map).y.truncate(3)),
         ("safe_radius_negative", "safe_point", |map| points(map).radius_cm[1] = -51),
-        ("safe_line_that_starts_beyond", "safe_point", |map| points(map).starts[0] = 4),
-        ("safe_line_that_starts_twice", "safe_point", |map| points(map).starts.push(0)),
-        ("safe_link_beyond", "safe_point", |map| points(map).link_from[0] = 4),
+        ("safe_start_past_the_last_point", "safe_point", |map| points(map).starts[0] = 4),
+        ("safe_start_that_occurs_twice", "safe_point", |map| points(map).starts.push(0)),
+        ("safe_link_from_past_the_last_point", "safe_point", |map| points(map).link_from[0] = 4),
         ("safe_link_before_the_first", "safe_point", |map| points(map).link_back[0] = 3),
         ("safe_link_to_the_point_before", "safe_point", |map| points(map).link_back[0] = 1),
         ("safe_points_linked_twice", "safe_point", |map| points(map).link_back[2] = 3),
         ("safe_links_of_two_lengths", "safe_point", |map| points(map).link_back.truncate(2)),
-        ("payload_spoilt", "cells", |map| map.layers[0].channels[0].crc32 ^= 1),
+        ("wrong_crc", "cells", |map| map.layers[0].channels[0].crc32 ^= 1),
     ]
 }
 
 #[test]
-fn a_map_with_one_thing_wrong_is_refused_under_that_name() {
+fn a_map_with_one_fault_is_refused_with_its_error() {
     let (header, drivability, flat) = golden_map();
     let whole = v1::Map { header: Some(header), layers: vec![drivability, flat] };
     let mut vectors = Vec::new();
-    for (name, error, spoil) in spoils() {
+    for (name, error, inject) in faults() {
         let mut map = whole.clone();
-        spoil(&mut map);
+        inject(&mut map);
         let bytes = map.encode_to_vec();
         let refused = map::decode_map(Bytes::from(bytes.clone()), &Limits::default()).expect_err(name);
         assert_eq!(refused.name(), error, "{name}: {refused}");
@@ -422,9 +433,9 @@ fn the_fuzz_corpus_decodes_or_is_refused() {
     let corpus = concat!(env!("CARGO_MANIFEST_DIR"), "/fuzz/corpus/decode_map");
     let (header, drivability, flat) = golden_map();
     let golden = v1::Map { header: Some(header), layers: vec![drivability, flat] };
-    let bad = spoils().map(|(name, _, spoil)| {
+    let bad = faults().map(|(name, _, inject)| {
         let mut map = golden.clone();
-        spoil(&mut map);
+        inject(&mut map);
         (name, map.encode_to_vec())
     });
     bless(corpus, bad.into_iter().chain([("golden", golden.encode_to_vec())]));

@@ -1,9 +1,10 @@
-//! What the UDP door takes: datagrams over loopback, from a thread that sends them, to an engine that only counts them.
+//! Throughput of the UDP ingest: a thread sends datagrams over loopback, and an engine that only counts them receives the
+//! events.
 //!
-//!   cargo bench -p clearway --bench udp                       flat out, 2,000,000 datagrams
-//!   cargo bench -p clearway --bench udp -- 6254 60            6,254 a second for 60 seconds, nothing may be lost
+//!   cargo bench -p clearway --bench udp                       as fast as possible, 2,000,000 datagrams
+//!   cargo bench -p clearway --bench udp -- 6254 60            6,254 a second for 60 seconds
 //!
-//! Every datagram is accounted for: sent = taken + lost in the queue + dropped by the kernel.
+//! Every datagram is accounted for: sent = received + lost at the queue + dropped by the kernel.
 
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
@@ -15,9 +16,10 @@ use clearway::ingest::{queue::event_queue, udp};
 use nix::sys::socket::setsockopt;
 use nix::sys::socket::sockopt::UdpGsoSegment;
 
-/// Datagrams between two looks at the clock, and in one call of the sender's: the kernel cuts them apart (UDP GSO), so that
-/// sending takes less of the two cores than receiving. At most 64 KiB.
+/// Number of datagrams of one send call, between two reads of the clock. The kernel splits them (UDP GSO), so that sending
+/// needs less time than receiving. At most 64 KiB.
 const BURST: usize = 32;
+/// Length of a data packet in bytes.
 const DATAGRAM: usize = 1206;
 
 fn main() {
@@ -32,10 +34,10 @@ fn main() {
     config.vehicles[0].udp = Some(Udp { data: any, telemetry: any, ..Udp::default() });
     let sockets = udp::Sockets::bind(&config.vehicles).expect("free ports");
     let (data, _) = sockets.addresses(0).expect("a socket");
-    let (door, events) = event_queue(config.vehicles[0].queue);
-    let readers = sockets.start(std::slice::from_ref(&door)).expect("threads");
-    let outside = door.drops();
-    drop(door);
+    let (queue, events) = event_queue(config.vehicles[0].queue);
+    let threads = sockets.start(std::slice::from_ref(&queue)).expect("threads");
+    let drops = queue.drops();
+    drop(queue);
 
     let sender = std::thread::spawn(move || {
         let socket = UdpSocket::bind("127.0.0.1:0").expect("a free port");
@@ -52,31 +54,35 @@ fn main() {
             socket.send(&burst[..datagrams * DATAGRAM]).expect("loopback takes datagrams");
         }
         let took = began.elapsed();
-        // The kernel tells its drops with the next datagram it takes; by now there is space for one.
+        // The kernel returns its drop counter with the next datagram; after this pause there is space for one.
         std::thread::sleep(Duration::from_millis(500));
         socket.send(&[]).expect("loopback takes datagrams");
         took
     });
-    let (mut taken, mut ledger) = (0, Ledger::default());
-    let mut took = Duration::ZERO;
+    let (mut received, mut ledger) = (0, Ledger::default());
+    let mut receiving = Duration::ZERO;
     let began = Instant::now();
     for queued in &events {
         match queued.event.body {
             Body::Lost { cause, count } => ledger.record_lost(cause, count),
             Body::Datagram(payload) if payload.is_empty() => break,
             _ => {
-                taken += 1;
-                took = began.elapsed();
+                received += 1;
+                receiving = began.elapsed();
             }
         }
     }
     let sending = sender.join().expect("no panic");
     drop(events);
-    readers.stop();
-    outside.add_unreported_to(&mut ledger, []);
-    let per_second = |n: u64, took: Duration| n as f64 / took.as_secs_f64();
-    println!("sent    {count:>9} in {:.2} s, {:.0} a second", sending.as_secs_f64(), per_second(count, sending));
-    println!("taken   {taken:>9} in {:.2} s, {:.0} a second", took.as_secs_f64(), per_second(taken, took));
-    println!("lost    {:>9} in the queue, {} in the kernel", ledger.lost, ledger.kernel_drops);
-    assert_eq!(taken + ledger.lost + ledger.kernel_drops, count, "every datagram is accounted for");
+    threads.stop();
+    drops.add_unreported_to(&mut ledger, []);
+    let per_second = |n: u64, duration: Duration| n as f64 / duration.as_secs_f64();
+    println!("sent     {count:>9} in {:.2} s, {:.0} a second", sending.as_secs_f64(), per_second(count, sending));
+    println!(
+        "received {received:>9} in {:.2} s, {:.0} a second",
+        receiving.as_secs_f64(),
+        per_second(received, receiving)
+    );
+    println!("lost     {:>9} at the queue, {} in the kernel", ledger.lost, ledger.kernel_drops);
+    assert_eq!(received + ledger.lost + ledger.kernel_drops, count, "every datagram is accounted for");
 }

@@ -1,5 +1,5 @@
-//! What the fuzzer, and `cargo test` with its corpora, do with bytes that somebody sends or a file holds. Nothing here
-//! may panic.
+//! The fuzz targets: bytes of a client or of a file, through the server to the maps. No target may panic. `cargo test`
+//! runs them with the files of their corpora.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -15,7 +15,7 @@ use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::encode::{event_from_bytes, event_to_proto};
 use prost::Message;
 
-/// One observation, as far as the maps.
+/// An encoded observation.
 pub fn observation(bytes: &[u8]) {
     let Ok(observation) = v1::Observation::decode(Bytes::copy_from_slice(bytes)) else { return };
     let Ok(bodies) = decode(observation, &Limits::from_points_max(1000)) else { return };
@@ -25,26 +25,26 @@ pub fn observation(bytes: &[u8]) {
     }
 }
 
-/// A journal, as far as the maps: events as protobuf writes them one behind the other, each behind its length.
+/// Encoded events, each after its length.
 pub fn event(bytes: &[u8]) {
     let mut rest = Bytes::copy_from_slice(bytes);
     let mut pipeline = pipeline();
     while let Ok(length) = prost::decode_length_delimiter(&mut rest) {
         let Ok(event) = event_from_bytes(rest.split_to(length.min(rest.remaining()))) else { continue };
         let written = event_to_proto(&event).encode_to_vec();
-        let read = event_from_bytes(written.clone().into()).expect("an event that was written");
-        assert_eq!(event_to_proto(&read).encode_to_vec(), written, "an event comes out as it went in");
+        let read = event_from_bytes(written.clone().into()).expect("an encoded event");
+        assert_eq!(event_to_proto(&read).encode_to_vec(), written, "an event is encoded as it was decoded");
         step(&mut pipeline, &event);
     }
 }
 
-/// A recording's file.
+/// The bytes of an MCAP file.
 pub fn recording(bytes: &[u8]) {
     let Ok(mut recording) = RecordingReader::from_source(Path::new("any.mcap"), Cursor::new(bytes.to_vec())) else { return };
     drop(recording.config());
     let mut pipeline = pipeline();
-    for entry in &mut recording {
-        if let Ok(RecordedMessage::Event { event, .. }) = entry {
+    for message in &mut recording {
+        if let Ok(RecordedMessage::Event { event, .. }) = message {
             step(&mut pipeline, &event);
         }
     }
@@ -56,11 +56,11 @@ fn pipeline() -> Pipeline {
     vehicle.maps.speed.enabled = true;
     vehicle.maps.safe_path.enabled = true;
     vehicle.sensors[0].model = Some(Model::Hdl32e);
-    Pipeline::new(&vehicle.core(), vec![None]).expect("the defaults are allowed")
+    Pipeline::new(&vehicle.core(), vec![None]).expect("the defaults are valid")
 }
 
 fn step(pipeline: &mut Pipeline, event: &Event) {
-    // A refusal is as good as a map.
+    // The core may refuse the event.
     let _ = pipeline.step(event);
     let ledger = pipeline.ledger();
     assert_eq!(ledger.received, ledger.decoded + ledger.telemetry + ledger.refused.values().sum::<u64>());

@@ -1,5 +1,5 @@
-//! The fuzzers' corpora, replayed. They hold bytes made here, written anew with `CLEARWAY_BLESS=1`, and what the fuzzers
-//! made of those (named by their hash).
+//! Replays the corpora of the fuzz targets. A corpus has the files that this test writes with `CLEARWAY_BLESS=1`, and the
+//! files that a fuzzer derived from them (named by their hash).
 
 #[path = "../fuzz/entries.rs"]
 mod entries;
@@ -29,7 +29,7 @@ fn write(target: &str, name: &str, bytes: &[u8]) {
 }
 
 #[test]
-fn every_seed_is_taken_or_refused_without_a_panic() {
+fn every_file_of_the_corpora_is_handled_without_a_panic() {
     if std::env::var_os("CLEARWAY_BLESS").is_some() {
         write_observations();
         write_journals();
@@ -37,7 +37,7 @@ fn every_seed_is_taken_or_refused_without_a_panic() {
         write("recording", "attachment_without_crc", &attachment_without_crc());
         write("recording", "record_beyond_its_chunk", &record_beyond_its_chunk());
     }
-    for (target, entry, least) in [
+    for (target, run, files_min) in [
         ("observation", entries::observation as fn(&[u8]), 12),
         ("event", entries::event, 3),
         ("recording", entries::recording, 4),
@@ -45,18 +45,18 @@ fn every_seed_is_taken_or_refused_without_a_panic() {
         let mut replayed = 0;
         for file in std::fs::read_dir(folder(target)).unwrap() {
             let bytes = std::fs::read(file.unwrap().path()).unwrap();
-            entry(&bytes);
-            // And every one that was cut off.
-            (0..bytes.len()).step_by(1 + bytes.len() / 64).for_each(|end| entry(&bytes[..end]));
+            run(&bytes);
+            // Truncated files as well.
+            (0..bytes.len()).step_by(1 + bytes.len() / 64).for_each(|end| run(&bytes[..end]));
             replayed += 1;
         }
-        assert!(replayed >= least, "{target}: {replayed} seeds");
+        assert!(replayed >= files_min, "{target}: {replayed} files");
     }
 }
 
 #[test]
-fn a_record_that_reaches_beyond_its_chunk_is_damage_and_what_came_before_it_is_given() {
-    let read = entries_of(record_beyond_its_chunk());
+fn a_record_that_reaches_beyond_its_chunk_is_damage() {
+    let read = messages_of(record_beyond_its_chunk());
     assert_eq!(read[0], "event 0");
     assert_eq!(read[1..], ["any.mcap: damaged after 1 messages: Chunk ended in the middle of a record"]);
 }
@@ -64,36 +64,36 @@ fn a_record_that_reaches_beyond_its_chunk_is_damage_and_what_came_before_it_is_g
 #[test]
 fn an_attachment_that_ends_before_its_crc_is_damage() {
     assert_eq!(
-        entries_of(attachment_without_crc()),
+        messages_of(attachment_without_crc()),
         ["any.mcap: damaged after 0 messages: MCAP file ended in the middle of a record"]
     );
 }
 
 #[test]
-fn a_chunk_that_claims_more_than_any_has_is_refused_before_it_is_unpacked() {
+fn a_chunk_with_a_wrong_length_is_refused() {
     let whole = mcap(ours());
-    let claimed = |at: usize, claim: u64| {
+    let with_length = |at: usize, length: u64| {
         let mut bytes = whole.clone();
         let chunk = chunk_at(&bytes);
-        bytes[chunk + at..chunk + at + 8].copy_from_slice(&claim.to_le_bytes());
-        entries_of(bytes).pop().unwrap()
+        bytes[chunk + at..chunk + at + 8].copy_from_slice(&length.to_le_bytes());
+        messages_of(bytes).pop().unwrap()
     };
-    // A record's head is nine bytes; the chunk's stamps come first, then its unpacked size.
-    assert!(claimed(9 + 16, u64::MAX).contains("damaged after 0 messages"), "{}", claimed(9 + 16, u64::MAX));
-    assert!(claimed(9 + 16, 1).contains("damaged after 0 messages"), "{}", claimed(9 + 16, 1));
-    assert!(claimed(1, u64::MAX).contains("damaged after 0 messages"), "{}", claimed(1, u64::MAX));
-    assert_eq!(entries_of(whole), ["event 0", "event 1", "end"]);
+    // The head of a record has nine bytes; then come the chunk's two stamps and its uncompressed size.
+    assert!(with_length(9 + 16, u64::MAX).contains("damaged after 0 messages"), "{}", with_length(9 + 16, u64::MAX));
+    assert!(with_length(9 + 16, 1).contains("damaged after 0 messages"), "{}", with_length(9 + 16, 1));
+    assert!(with_length(1, u64::MAX).contains("damaged after 0 messages"), "{}", with_length(1, u64::MAX));
+    assert_eq!(messages_of(whole), ["event 0", "event 1", "end"]);
 }
 
-/// What a recording gives: its events, then `end`, `cut`, or the error.
-fn entries_of(bytes: Vec<u8>) -> Vec<String> {
+/// The events of a recording, then `end`, `cut`, or the error.
+fn messages_of(bytes: Vec<u8>) -> Vec<String> {
     let mut recording = match RecordingReader::from_source(Path::new("any.mcap"), Cursor::new(bytes)) {
         Ok(recording) => recording,
         Err(error) => return vec![error.to_string()],
     };
     let mut read = Vec::new();
-    for entry in &mut recording {
-        match entry {
+    for message in &mut recording {
+        match message {
             Ok(RecordedMessage::Event { event, .. }) => read.push(format!("event {}", event.sequence)),
             Ok(other) => panic!("{other:?}"),
             Err(error) => return [read, vec![error.to_string()]].concat(),
@@ -111,13 +111,13 @@ fn ours() -> WriteOptions {
     WriteOptions::new().library("").compression(Some(mcap::Compression::Zstd)).compression_threads(0)
 }
 
-/// No checksums, so that a fuzzer gets beyond them.
+/// Without checksums, so that a fuzzer can change the contents.
 fn plain() -> WriteOptions {
     let options = WriteOptions::new().library("").compression(None);
     options.calculate_chunk_crcs(false).calculate_data_section_crc(false).calculate_summary_section_crc(false)
 }
 
-/// A recording of two events, as small as can be.
+/// A small recording of two events.
 fn mcap(options: WriteOptions) -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
     let mut writer = options.create(&mut bytes).unwrap();
@@ -141,7 +141,7 @@ fn mcap(options: WriteOptions) -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// Where the first record of a kind begins, among those that are not in a chunk.
+/// Offset of the first record of a kind outside of the chunks.
 fn record_at(bytes: &[u8], kind: u8) -> usize {
     let mut at = 8;
     while bytes[at] != kind {
@@ -156,7 +156,7 @@ fn chunk_at(bytes: &[u8]) -> usize {
 
 fn record_beyond_its_chunk() -> Vec<u8> {
     let mut bytes = mcap(plain());
-    // The second message is the chunk's last record, and ends with the bytes of its event.
+    // The second message is the last record of the chunk, and ends with the bytes of its event.
     let event = journal()[1].encode_to_vec();
     let last = bytes.windows(event.len()).rposition(|window| *window == event).unwrap() - 22 - 9;
     assert_eq!(bytes[last], mcap::records::op::MESSAGE);
@@ -174,7 +174,7 @@ fn attachment_without_crc() -> Vec<u8> {
     bytes
 }
 
-/// Every kind of event, in an order that a vehicle may meet.
+/// A journal with all kinds of events.
 fn journal() -> Vec<v1::Event> {
     use v1::event::Body;
     let ring = |of: &dyn Fn(f32) -> f32| pack(&(0..60_u8).map(|i| of(f32::from(i) * 0.105)).collect::<Vec<f32>>());

@@ -1,4 +1,4 @@
-//! A recording written here goes through `clearway export` and `clearway info`.
+//! `clearway export` and `clearway info` read a recording that the test writes.
 
 mod common;
 #[path = "../../tests/tests/fixture/venv.rs"]
@@ -19,7 +19,7 @@ use common::{CAPTURE_END_NS, CLASSES, clearway, map, text};
 use prost::Message;
 use serde_json::{Value, json};
 
-/// Three maps of alpha, as the server lays them out; unfinished: as a crash leaves it.
+/// Writes three maps of the vehicle alpha, as the server records them. An unfinished file is as after a crash.
 fn record(path: &Path, finished: bool) {
     let mut writer = mcap::WriteOptions::new().compression_threads(0).create(File::create(path).unwrap()).unwrap();
     let metadata = BTreeMap::from([("boot_id".to_string(), "7".to_string())]);
@@ -37,7 +37,7 @@ fn record(path: &Path, finished: bool) {
         writer.finish().unwrap();
     } else {
         let length = std::fs::metadata(path).unwrap().len();
-        // Dropping the writer would finish the file.
+        // A dropped writer would finish the file.
         std::mem::forget(writer);
         File::options().write(true).open(path).unwrap().set_len(length - 1).unwrap();
     }
@@ -48,7 +48,7 @@ fn folder() -> tempfile::TempDir {
 }
 
 #[test]
-fn a_picture_has_the_colour_of_each_class_where_it_lies() {
+fn a_picture_has_the_colour_of_each_class_in_its_place() {
     let folder = folder();
     let file = folder.path().join("run.mcap");
     record(&file, true);
@@ -64,7 +64,7 @@ fn a_picture_has_the_colour_of_each_class_where_it_lies() {
     let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
     let info = reader.next_frame(&mut pixels).unwrap();
     assert_eq!((info.width, info.height, info.color_type), (120, 120, png::ColorType::Rgb));
-    // Half a metre a pixel: forward is up, left is left.
+    // A pixel is half a metre; forward is up, left is left.
     let at = |x_m: f64, y_m: f64| {
         let (row, column) = (((30.0 - x_m) * 2.0) as usize, ((30.0 - y_m) * 2.0) as usize);
         let start = (row * 120 + column) * 3;
@@ -76,12 +76,12 @@ fn a_picture_has_the_colour_of_each_class_where_it_lies() {
     assert_eq!(at(-6.1, -6.1), unknown, "behind and to the right");
     assert_eq!(at(10.1, -10.1), obstacle, "ahead and to the right, 14 m off");
     assert_eq!(at(18.1, -15.1), drivable, "behind the obstacle");
-    assert_eq!(at(29.1, 29.1), unknown, "outside of the grid");
+    assert_eq!(at(29.1, 29.1), unknown, "outside the grid");
     assert_eq!(at(0.1, 0.1), [244, 244, 248], "the vehicle");
 }
 
 #[test]
-fn arrays_have_numpys_header_and_the_cells_and_come_with_a_document() {
+fn npy_writes_numpys_header_the_cells_and_a_json_document() {
     let folder = folder();
     let file = folder.path().join("run.mcap");
     record(&file, true);
@@ -116,7 +116,7 @@ fn arrays_have_numpys_header_and_the_cells_and_come_with_a_document() {
 }
 
 #[test]
-fn a_document_has_the_cells_inline() {
+fn json_writes_the_cells_into_the_document() {
     let folder = folder();
     let file = folder.path().join("run.mcap");
     record(&file, true);
@@ -130,7 +130,7 @@ fn a_document_has_the_cells_inline() {
 }
 
 #[test]
-fn a_recording_cut_by_a_crash_is_exported_as_far_as_it_goes_and_says_so() {
+fn a_recording_that_is_cut_off_is_exported_as_far_as_it_goes() {
     let folder = folder();
     let file = folder.path().join("cut.mcap");
     record(&file, false);
@@ -140,15 +140,15 @@ fn a_recording_cut_by_a_crash_is_exported_as_far_as_it_goes_and_says_so() {
     assert!(text(&done.stderr).contains("cut after"), "{}", text(&done.stderr));
     assert!(folder.path().join("000001_drivability.json").exists());
 
-    let told = clearway(&["info", paths[0], "--json"]);
-    let document: Value = serde_json::from_slice(&told.stdout).unwrap();
+    let info = clearway(&["info", paths[0], "--json"]);
+    let document: Value = serde_json::from_slice(&info.stdout).unwrap();
     assert_eq!(document["complete"], false);
     assert_eq!(document["run"]["boot_id"], "7");
     assert!(document["maps"]["alpha"]["drivability"].as_u64().unwrap() >= 2);
 }
 
 #[test]
-fn an_unknown_layer_is_refused_with_the_layers_there_are() {
+fn an_unknown_layer_is_refused_with_the_names_of_the_layers() {
     let folder = folder();
     let file = folder.path().join("run.mcap");
     record(&file, true);
@@ -159,14 +159,14 @@ fn an_unknown_layer_is_refused_with_the_layers_there_are() {
 }
 
 #[test]
-fn files_of_no_kind_known_are_refused_and_wrong_usage_is_another_exit_code() {
+fn a_file_of_an_unknown_kind_is_refused() {
     let folder = folder();
     let file = folder.path().join("note.txt");
     std::fs::write(&file, "dear reader").unwrap();
     let path = file.to_str().unwrap();
-    let told = clearway(&["info", path]);
-    assert_eq!(told.status.code(), Some(1));
-    assert!(text(&told.stderr).contains("not a capture"), "{}", text(&told.stderr));
+    let info = clearway(&["info", path]);
+    assert_eq!(info.status.code(), Some(1));
+    assert!(text(&info.stderr).contains("not a capture"), "{}", text(&info.stderr));
     let exported = clearway(&["export", path, "--layer", "x", "--format", "png", "--out", path]);
     assert_eq!(exported.status.code(), Some(1));
     assert!(text(&exported.stderr).contains("not an MCAP file"), "{}", text(&exported.stderr));
@@ -176,8 +176,8 @@ fn files_of_no_kind_known_are_refused_and_wrong_usage_is_another_exit_code() {
 const CONFIG: &str = "[[vehicle]]\nname = 'alpha'\nqueue = 16\n[[vehicle.sensor]]\nname = 'top'\nmodel = 'hdl64e_s2'\n\
     [vehicle.sensor.extrinsics]\nx_m = 0.5\ny_m = 0.0\nz_m = 1.9\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n";
 
-/// A journal of some turns of a simulated vehicle and three maps of a vehicle at rest that looks to its left, as the
-/// server lays them out. Gives the bytes of the points of each turn.
+/// Writes a journal of some revolutions of a simulated vehicle, and three maps of a vehicle at rest that faces left, as
+/// the server records them. Returns the number of bytes of each revolution's points.
 fn record_drive(path: &Path) -> Vec<usize> {
     let mut writer = mcap::WriteOptions::new().compression_threads(0).create(File::create(path).unwrap()).unwrap();
     let (name, data) = ("config.toml".to_owned(), CONFIG.as_bytes().into());
@@ -203,17 +203,17 @@ fn record_drive(path: &Path) -> Vec<usize> {
         put(journal, arrival_ns, &event.encode_to_vec());
     };
     let mut sensor = Sensor::new(SensorConfig { model: Some(Model::Hdl64eS2), ..SensorConfig::default() });
-    let (mut turns, mut last_ns) = (Vec::new(), 0);
-    // Tunnelled by somebody who knows of a second sensor: of no sensor here.
+    let (mut revolutions, mut last_ns) = (Vec::new(), 0);
+    // An event of a sensor that the configuration does not have.
     let stray = v1::Event { source: 3, body: Some(v1::event::Body::End(v1::End {})), ..Default::default() };
     for datagram in SimulatedVehicle::new(flat(), ScannerConfig::default()).take(1200) {
-        if let Ok(Some(turn)) = sensor.push(&datagram.payload, datagram.stamp_ns) {
-            turns.push(12 * turn.returns());
+        if let Ok(Some(revolution)) = sensor.push(&datagram.payload, datagram.stamp_ns) {
+            revolutions.push(12 * revolution.returns());
         }
         last_ns = datagram.stamp_ns;
         event(last_ns, v1::event::Body::Datagram(datagram.payload.into()));
     }
-    turns.extend(sensor.finish().map(|turn| 12 * turn.returns()));
+    revolutions.extend(sensor.finish().map(|revolution| 12 * revolution.returns()));
     event(last_ns, v1::event::Body::End(v1::End {}));
     put(journal, last_ns, &stray.encode_to_vec());
     for sequence in 0..3 {
@@ -228,39 +228,40 @@ fn record_drive(path: &Path) -> Vec<usize> {
         put(layers[1], end_ns + 1_000_000, &map.encode_to_vec());
     }
     writer.finish().unwrap();
-    turns
+    revolutions
 }
 
-/// Exports, and has a stranger read what came of it.
+/// Exports, and reads the file with a decoder of another project.
 fn exported(format: &str, more: &[&str]) -> (Value, Vec<usize>) {
     let folder = folder();
     let [file, out] = ["run.mcap", "out.mcap"].map(|name| folder.path().join(name));
-    let turns = record_drive(&file);
+    let revolutions = record_drive(&file);
     let paths = [file.to_str().unwrap(), out.to_str().unwrap()];
     let arguments = [&["export", paths[0], "--format", format, "--out", paths[1]], more].concat();
     let done = clearway(&arguments);
     assert!(done.status.success(), "{}", text(&done.stderr));
     let again = clearway(&arguments);
     assert!(!again.status.success() && text(&again.stderr).contains("exists"), "{}", text(&again.stderr));
-    (serde_json::from_str(&venv::run(venv::script("viewer_file.py").arg(&out), "mcap")).unwrap(), turns)
+    (serde_json::from_str(&venv::run(venv::script("viewer_file.py").arg(&out), "mcap")).unwrap(), revolutions)
 }
 
-fn schemas(told: &Value) -> Vec<(&str, &str, u64)> {
-    let topics = told.as_object().unwrap().iter();
+/// The topics of an exported file, each with its schema and its number of messages.
+fn schemas(file: &Value) -> Vec<(&str, &str, u64)> {
+    let topics = file.as_object().unwrap().iter();
     topics.map(|(topic, of)| (&**topic, of["schema"].as_str().unwrap(), of["count"].as_u64().unwrap())).collect()
 }
 
 #[test]
-fn a_file_for_ros_2_has_occupancy_grids_tf_and_odometry_that_a_stranger_reads() {
-    let (told, _) = exported("ros2", &["--no-points"]);
+fn a_ros_2_file_has_occupancy_grids_tf_and_odometry() {
+    let (topics, _) = exported("ros2", &["--no-points"]);
     let expected = [
         ("/clearway/alpha/drivability", "nav_msgs/msg/OccupancyGrid", 3),
         ("/clearway/alpha/odometry", "nav_msgs/msg/Odometry", 3),
         ("/clearway/alpha/second", "nav_msgs/msg/OccupancyGrid", 3),
         ("/tf", "tf2_msgs/msg/TFMessage", 3),
     ];
-    assert_eq!(schemas(&told), expected);
-    let grid = &told["/clearway/alpha/drivability"]["last"];
+    assert_eq!(schemas(&topics), expected);
+    let grid = &topics["/clearway/alpha/drivability"]["last"];
     assert_eq!(
         grid["header"],
         json!({"stamp": {"sec": 1_700_000_000, "nanosec": 300_000_000}, "frame_id": "alpha/base_link"})
@@ -272,39 +273,39 @@ fn a_file_for_ros_2_has_occupancy_grids_tf_and_odometry_that_a_stranger_reads() 
     assert_eq!(at(-6.1, 6.1), Some(100), "behind and to the left: not drivable");
     assert_eq!(at(-6.1, -6.1), Some(-1), "behind and to the right: unknown");
     assert_eq!(at(10.1, -10.1), Some(100), "ahead and to the right, 14 m off: an obstacle");
-    assert_eq!(at(29.1, 29.1), Some(-1), "outside of the grid");
-    let transform = &told["/tf"]["last"]["transforms"][0];
+    assert_eq!(at(29.1, 29.1), Some(-1), "outside the grid");
+    let transform = &topics["/tf"]["last"]["transforms"][0];
     assert_eq!(
         (&transform["header"]["frame_id"], &transform["child_frame_id"]),
         (&json!("map"), &json!("alpha/base_link"))
     );
     assert_eq!(transform["transform"]["translation"], json!({"x": 4.0, "y": 2.0, "z": 0.0}));
-    let odometry = &told["/clearway/alpha/odometry"]["last"];
+    let odometry = &topics["/clearway/alpha/odometry"]["last"];
     assert_eq!(odometry["twist"]["twist"]["linear"]["x"], 3.5);
     assert_eq!(odometry["pose"]["pose"]["orientation"]["z"], json!(std::f64::consts::FRAC_1_SQRT_2));
 }
 
 #[test]
-fn a_file_for_ros_2_has_the_points_of_every_turn_and_where_their_sensor_sits() {
-    let (told, turns) = exported("ros2", &["--layer", "second"]);
-    let clouds = turns.len() as u64;
+fn a_ros_2_file_has_the_points_of_every_revolution_and_the_mount() {
+    let (topics, revolutions) = exported("ros2", &["--layer", "second"]);
+    let clouds = revolutions.len() as u64;
     let expected = [
         ("/clearway/alpha/odometry", "nav_msgs/msg/Odometry", 3),
         ("/clearway/alpha/points/top", "sensor_msgs/msg/PointCloud2", clouds),
         ("/clearway/alpha/second", "nav_msgs/msg/OccupancyGrid", 3),
         ("/tf", "tf2_msgs/msg/TFMessage", 3 + clouds),
     ];
-    assert_eq!(schemas(&told), expected);
-    let cloud = &told["/clearway/alpha/points/top"]["last"];
-    let bytes = turns[turns.len() - 1];
+    assert_eq!(schemas(&topics), expected);
+    let cloud = &topics["/clearway/alpha/points/top"]["last"];
+    let bytes = revolutions[revolutions.len() - 1];
     assert_eq!(
         (&cloud["header"]["frame_id"], &cloud["width"], &cloud["data"]["length"]),
         (&json!("alpha/top"), &json!(bytes / 12), &json!(bytes))
     );
     let names: Vec<&Value> = cloud["fields"].as_array().unwrap().iter().map(|field| &field["name"]).collect();
     assert_eq!(names, ["x", "y", "z"]);
-    // The simulated vehicle drives later than the maps were made: the last is the sensor's mount.
-    let transform = &told["/tf"]["last"]["transforms"][0];
+    // The events are newer than the maps, so the last transform is the sensor's mount.
+    let transform = &topics["/tf"]["last"]["transforms"][0];
     assert_eq!(
         (&transform["header"]["frame_id"], &transform["child_frame_id"]),
         (&json!("alpha/base_link"), &json!("alpha/top"))
@@ -313,25 +314,28 @@ fn a_file_for_ros_2_has_the_points_of_every_turn_and_where_their_sensor_sits() {
 }
 
 #[test]
-fn a_file_for_foxglove_has_coloured_grids_transforms_and_the_points_of_every_turn() {
-    let (told, turns) = exported("foxglove", &[]);
-    let clouds = turns.len() as u64;
-    assert!(clouds >= 3, "{turns:?}");
+fn a_foxglove_file_has_grids_transforms_and_the_points_of_every_revolution() {
+    let (topics, revolutions) = exported("foxglove", &[]);
+    let clouds = revolutions.len() as u64;
+    assert!(clouds >= 3, "{revolutions:?}");
     let expected = [
         ("/alpha/map/drivability", "foxglove.Grid", 3),
         ("/alpha/map/second", "foxglove.Grid", 3),
         ("/alpha/points/top", "foxglove.PointCloud", clouds),
         ("/tf", "foxglove.FrameTransforms", 3 + clouds),
     ];
-    assert_eq!(schemas(&told), expected);
-    let grid = &told["/alpha/map/drivability"]["last"];
+    assert_eq!(schemas(&topics), expected);
+    let grid = &topics["/alpha/map/drivability"]["last"];
     assert_eq!(grid["timestamp"], "2023-11-14T22:13:20.300Z");
     assert_eq!((&grid["frame_id"], &grid["column_count"]), (&json!("alpha/base_link"), &json!(240)));
     assert_eq!(grid["data"]["length"], 240 * 240 * 4);
-    let cloud = &told["/alpha/points/top"]["last"];
-    assert_eq!((&cloud["frame_id"], &cloud["data"]["length"]), (&json!("alpha/top"), &json!(turns[turns.len() - 1])));
-    // The simulated vehicle drives later than the maps were made: the last is the sensor's mount.
-    let transform = &told["/tf"]["last"]["transforms"][0];
+    let cloud = &topics["/alpha/points/top"]["last"];
+    assert_eq!(
+        (&cloud["frame_id"], &cloud["data"]["length"]),
+        (&json!("alpha/top"), &json!(revolutions[revolutions.len() - 1]))
+    );
+    // The events are newer than the maps, so the last transform is the sensor's mount.
+    let transform = &topics["/tf"]["last"]["transforms"][0];
     assert_eq!(
         (&transform["parent_frame_id"], &transform["child_frame_id"]),
         (&json!("alpha/base_link"), &json!("alpha/top"))
@@ -340,7 +344,7 @@ fn a_file_for_foxglove_has_coloured_grids_transforms_and_the_points_of_every_tur
 }
 
 #[test]
-fn a_file_for_foxglove_has_one_layer_and_no_points_where_that_is_asked_for() {
-    let (told, _) = exported("foxglove", &["--layer", "second", "--no-points"]);
-    assert_eq!(schemas(&told), [("/alpha/map/second", "foxglove.Grid", 3), ("/tf", "foxglove.FrameTransforms", 3)]);
+fn a_foxglove_file_has_one_layer_and_no_points_if_the_options_say_so() {
+    let (topics, _) = exported("foxglove", &["--layer", "second", "--no-points"]);
+    assert_eq!(schemas(&topics), [("/alpha/map/second", "foxglove.Grid", 3), ("/tf", "foxglove.FrameTransforms", 3)]);
 }

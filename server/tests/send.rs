@@ -1,4 +1,4 @@
-//! A capture written here goes through `clearway send` to sockets here.
+//! `clearway send` sends a capture that the test writes to sockets of the test.
 
 mod common;
 
@@ -8,7 +8,7 @@ use std::time::Duration;
 use common::{clearway, text};
 use serde_json::Value;
 
-/// A pcap of Ethernet frames with one UDP datagram each.
+/// A pcap file of Ethernet frames with one UDP datagram each.
 fn pcap(payloads: &[Vec<u8>]) -> Vec<u8> {
     let mut file = vec![0xd4, 0xc3, 0xb2, 0xa1, 2, 0, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff, 0, 0, 1, 0, 0, 0];
     for (index, payload) in payloads.iter().enumerate() {
@@ -31,7 +31,7 @@ fn pcap(payloads: &[Vec<u8>]) -> Vec<u8> {
 fn received(socket: &UdpSocket) -> Vec<Vec<u8>> {
     let mut buffer = [0; 2048];
     let mut datagrams = Vec::new();
-    // All was sent before this is read: loopback delivers at once.
+    // Everything was sent before this: loopback delivers at once.
     socket.set_read_timeout(Some(Duration::from_millis(200))).unwrap();
     while let Ok(length) = socket.recv(&mut buffer) {
         datagrams.push(buffer[..length].to_vec());
@@ -40,7 +40,7 @@ fn received(socket: &UdpSocket) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn data_and_telemetry_go_their_ways_unchanged_and_the_rest_is_counted() {
+fn data_and_telemetry_are_sent_unchanged_and_other_datagrams_are_counted() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("drive.pcap");
     let payloads = [vec![1; 1206], vec![2; 512], vec![3; 100], vec![4; 1206]];
@@ -76,7 +76,7 @@ fn data_and_telemetry_go_their_ways_unchanged_and_the_rest_is_counted() {
 }
 
 #[test]
-fn what_is_no_target_is_refused_with_what_is_allowed() {
+fn a_wrong_target_is_refused_with_the_allowed_form() {
     let done = clearway(&["send", "/nowhere", "--to", "tcp://127.0.0.1:1"]);
     assert_eq!(done.status.code(), Some(1));
     assert!(text(&done.stderr).contains("udp://HOST:PORT is allowed"), "{}", text(&done.stderr));
@@ -84,7 +84,7 @@ fn what_is_no_target_is_refused_with_what_is_allowed() {
 }
 
 #[test]
-fn a_bad_network_does_what_it_says_and_the_same_for_the_same_seed() {
+fn a_bad_network_does_what_it_reports_and_repeats_it_with_the_same_seed() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("drive.pcap");
     let payloads: Vec<Vec<u8>> = (0..60_u8).map(|number| vec![number; 1206]).collect();

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, mpsc};
 use clearway::config::ZenohMode;
 use clearway::ingest::queue::Reading;
 use clearway::server::{Running, Server, Setup};
-use clearway_client::{MapStream, Sight, ZenohClient};
+use clearway_client::{MapStream, StreamEvent, ZenohClient};
 use fixture::{config, feed, readings, sequence, start, within};
 use zenoh::Session;
 use zenoh::sample::SampleKind;
@@ -135,7 +135,7 @@ async fn through_a_router_late_joiners_have_the_current_map_and_streams_outlive_
     assert_eq!((token.kind(), token.key_expr().as_str()), (SampleKind::Delete, "clearway/car"));
     assert!(early.vehicles().await.unwrap().is_empty());
     // A drive of long ago: its last map is stale, and said to be, though the server is gone.
-    let Ok(Sight::Stale(update)) = within("stale", early_maps.next_or_stale()).await else { panic!("it is stale") };
+    let Ok(StreamEvent::Stale(update)) = within("stale", early_maps.next_or_stale()).await else { panic!("it is stale") };
     assert_eq!(update.map.sequence(), next - 1);
     assert!(early_maps.ended().is_none());
     watcher.close().await.unwrap();

@@ -11,7 +11,7 @@ use std::path::Path;
 use clearway::config::Config;
 use clearway::ingest::queue::Reading;
 use clearway::record::reader::{RecordingError, RecordingReader};
-use clearway::record::verify::{What, verify};
+use clearway::record::verify::{DifferenceKind, verify};
 use clearway::server::{Server, Setup};
 use clearway_mapping::event::Body;
 use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
@@ -94,7 +94,7 @@ async fn a_planted_change_is_named_by_sequence_layer_and_cell() {
     assert_eq!((&*difference.vehicle, difference.sequence, &*difference.layer), ("car", 2, "drivability"));
     let (recorded, made) = was_and_is.unwrap();
     let channel = "class".to_owned();
-    assert_eq!(difference.what, What::Cell { row: row as u32, column: column as u32, channel, recorded, made });
+    assert_eq!(difference.kind, DifferenceKind::Cell { row: row as u32, column: column as u32, channel, recorded, made });
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -105,7 +105,7 @@ async fn a_missing_map_a_changed_header_and_a_hole_in_the_journal_are_named() {
 
     copy(&whole, &planted, |topic, sequence, data| (topic != "/car/map/drivability" || sequence != 1).then_some(data));
     let report = verify(&planted).unwrap();
-    assert_eq!((report.different, &report.differences[0].what), (1, &What::Missing));
+    assert_eq!((report.different, &report.differences[0].kind), (1, &DifferenceKind::Missing));
     assert_eq!(report.differences[0].sequence, 1);
 
     copy(&whole, &planted, |topic, sequence, data| {
@@ -117,12 +117,12 @@ async fn a_missing_map_a_changed_header_and_a_hole_in_the_journal_are_named() {
         Some(map.encode_to_vec())
     });
     let report = verify(&planted).unwrap();
-    let What::Field { field, .. } = &report.differences[0].what else { panic!("{:?}", report.differences) };
+    let DifferenceKind::Field { field, .. } = &report.differences[0].kind else { panic!("{:?}", report.differences) };
     assert_eq!((report.different, field.as_str()), (1, "header capture_end_ns"));
 
     copy(&whole, &planted, |topic, sequence, data| (topic != "/car/journal" || sequence != 40).then_some(data));
     let report = verify(&planted).unwrap();
-    assert_eq!((report.differences[0].sequence, &report.differences[0].what), (40, &What::Hole { found: 41 }));
+    assert_eq!((report.differences[0].sequence, &report.differences[0].kind), (40, &DifferenceKind::Gap { found: 41 }));
 }
 
 #[tokio::test(flavor = "multi_thread")]

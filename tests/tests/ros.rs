@@ -139,10 +139,10 @@ async fn a_bag_of_clouds_odometry_and_tf_is_mapped_where_tf_puts_the_sensor_reco
     assert!(summary.snapshot.drivable_share.unwrap() > 0.3, "{:?}", summary.snapshot.drivable_share);
     let notes = summary.notes.join("\n");
     for said in [
-        "/velodyne_points was taken, its frame velodyne placed by tf",
-        "/odom was taken for poses of base_link",
-        "/obstacles (sensor_msgs/msg/PointCloud2) was left alone",
-        "/merged (sensor_msgs/msg/PointCloud2) was left alone",
+        "/velodyne_points is used; tf places its frame velodyne",
+        "/odom is used for poses of base_link",
+        "/obstacles (sensor_msgs/msg/PointCloud2) is not used",
+        "/merged (sensor_msgs/msg/PointCloud2) is not used",
         "/velodyne_points: 1 messages refused, the first: data needs",
     ] {
         assert!(notes.contains(said), "{said:?} is not in {notes}");
@@ -181,7 +181,7 @@ async fn a_bag_of_several_sensors_makes_one_map_of_all_that_tf_places() {
     sensors.sort_unstable();
     assert_eq!(sensors, [("lidar_left", n), ("velodyne", n)]);
     let notes = summary.notes.join("\n");
-    assert!(notes.contains("/lost_points (sensor_msgs/msg/PointCloud2) was left alone"), "{notes}");
+    assert!(notes.contains("/lost_points (sensor_msgs/msg/PointCloud2) is not used"), "{notes}");
     let report = verify(&record).unwrap();
     assert!(report.is_good() && report.maps >= n, "{:?}", report.differences);
     let maps = fixture::recorded(&record);
@@ -228,7 +228,7 @@ async fn topics_are_taken_as_asked_for_and_one_that_is_not_there_is_named() {
     let asked = |topics: &[&str]| Options { topics: topics.iter().map(|&t| t.into()).collect(), ..options(&file) };
     let summary = replayed(asked(&["/merged"])).await.unwrap();
     assert!(
-        summary.notes.join("\n").contains("/merged was taken; tf does not place its frame base_link 0.1 to 20 m"),
+        summary.notes.join("\n").contains("/merged is used; tf does not place its frame base_link 0.1 to 20 m"),
         "{:?}",
         summary.notes
     );
@@ -265,7 +265,7 @@ async fn without_an_odometry_the_chain_of_tf_gives_poses_and_speed_and_a_bag_in_
     // The first only begins.
     assert_eq!((ledger.poses, ledger.poses_refused), (stamps.len() as u64 - 1, 0));
     assert_eq!(summary.snapshot.maps, stamps.len() as u64);
-    assert!(summary.notes.join("\n").contains("tf was taken for poses of base_link in map"), "{:?}", summary.notes);
+    assert!(summary.notes.join("\n").contains("tf is used for poses of base_link in map"), "{:?}", summary.notes);
     for entry in clearway::record::reader::RecordingReader::open(&record).unwrap() {
         let clearway::record::reader::RecordedMessage::Event { event, .. } = entry.unwrap() else { continue };
         let Body::EgoPose(pose) = event.body else { continue };

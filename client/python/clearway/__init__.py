@@ -13,14 +13,16 @@ from collections.abc import Sequence
 
 from . import over_grpc, over_zenoh
 from .errors import ClearwayError, DecodeError
-from .map import FREE, OBSTACLES, CartesianGrid, Channel, Layer, Map, Obstacle, RadialGrid, SafePoint, now_ns
+from .freshness import now_ns
+from .grid import CartesianGrid, RadialGrid
+from .map import Channel, Layer, LegendEntry, Map, Meaning, Obstacle, SafePoint
 from .recording import read
 from .stream import MapStream
 from .tls import Tls
 from .v1 import map_pb2, service_pb2
 
 __all__ = [
-    "FREE", "OBSTACLES", "CartesianGrid", "Channel", "ClearwayError", "DecodeError", "Layer", "Map", "MapStream",
+    "CartesianGrid", "Channel", "ClearwayError", "DecodeError", "Layer", "LegendEntry", "Map", "MapStream", "Meaning",
     "Obstacle", "RadialGrid", "SafePoint", "Tls", "get", "now_ns", "read", "vehicles", "watch",
 ]  # fmt: skip
 
@@ -35,13 +37,14 @@ def watch(
     deltas: bool = False,
     tls: Tls | None = None,
 ) -> MapStream:
-    """Streams the newest map, beginning with the one there is.
+    """Streams the newest map, starting with the present one.
 
-    `vehicle` may be left out over gRPC where the server has one; no `layers` means all of them, and over zenoh they must
-    be named. With `tls` the connection is encrypted. The rest is gRPC's: `max_in_flight` maps are on their way without an acknowledgement, at most `max_rate_hz` come
-    a second, of each layer the `region` (x_from_m, x_to_m, y_from_m, y_to_m) in the ego frame, and with `deltas` as what has
-    changed since the map before: less on the link, the same maps. Errors of the server (an unknown vehicle or layer: the
-    message lists the known ones) are raised by the first look.
+    `vehicle` may be empty over gRPC if the server has a single vehicle. Without `layers`, every layer is sent; over zenoh
+    both must be named. With `tls` the connection is encrypted. The other arguments are for gRPC: at most `max_in_flight`
+    maps are sent without an acknowledgement, and at most `max_rate_hz` maps per second. Each layer is cut to the `region`
+    (x_from_m, x_to_m, y_from_m, y_to_m) in the ego frame. With `deltas`, layers are sent as changes from the map before:
+    fewer bytes, the same maps. Errors of the server are raised by the first `next`; for an unknown vehicle or layer the
+    message lists the known ones.
     """
     if endpoint := _zenoh(address, vehicle, layers):
         if max_rate_hz is not None or region is not None or deltas:
@@ -57,14 +60,14 @@ def watch(
 
 
 def get(address: str, vehicle: str = "", layers: Sequence[str] = (), tls: Tls | None = None) -> Map:
-    """The newest map at this moment; it may be stale."""
+    """Returns the newest map; it may be stale."""
     if endpoint := _zenoh(address, vehicle, layers):
         return over_zenoh.get(endpoint, vehicle, layers, tls)
     return over_grpc.get(address, vehicle, layers, tls)
 
 
 def vehicles(address: str, tls: Tls | None = None) -> list[str]:
-    """Names of the vehicles that are served now, in order."""
+    """Returns the sorted names of the vehicles that are served now."""
     if address.startswith("zenoh:"):
         return over_zenoh.vehicles(address.removeprefix("zenoh:"), tls)
     return sorted(vehicle.name for vehicle in over_grpc.vehicles(address, tls))
@@ -74,5 +77,5 @@ def _zenoh(address: str, vehicle: str, layers: Sequence[str]) -> str | None:
     if not address.startswith("zenoh:"):
         return None
     if not vehicle or not layers:
-        raise ClearwayError("selection", f"{address}: over zenoh vehicle and layers are named, such as layers=['terrain']")
+        raise ClearwayError("selection", f"{address}: over zenoh vehicle and layers must be named, such as ['terrain']")
     return address.removeprefix("zenoh:")

@@ -1,8 +1,8 @@
-"""A channel's payload back to its cells: the numpy twin of `proto/src/decode.rs`, held to the same golden vectors.
+"""Decodes the cells of a channel, as `proto/src/channel` does; both read the same golden vectors.
 
-In: a `Channel` message from anywhere, hostile or not. Out: an array of raw cells, or a `DecodeError`. How many cells
-are claimed is checked before any is made. Whether a payload is canonical is left to the Rust decoder: here the CRC says
-whether the cells are right. Format: `proto/clearway/v1/map.proto`, `Channel` and `Encoding`.
+In: a `Channel` message from any source, also a hostile one. Out: an array of raw cells, or a `DecodeError`. The claimed
+number of cells is checked before memory is allocated. Only the Rust decoder checks that a payload is canonical; here
+the CRC alone decides whether the cells are right. Format: `proto/clearway/v1/map.proto`, `Channel` and `Encoding`.
 """
 
 import re
@@ -12,10 +12,8 @@ from collections.abc import Callable
 import numpy as np
 
 from .errors import DecodeError
+from .limits import CHANNEL_CELLS_MAX, NUMBER_BITS_MAX
 from .v1 import map_pb2
-
-#: Cells of one channel that are accepted: a 400 m square at 0.2 m.
-CELLS_MAX = 4 << 20
 
 _TYPES = {1: np.dtype("u1"), 2: np.dtype("i1"), 3: np.dtype("<u2")}
 _RAW, _ROWS, _CHANGES = map_pb2.ENCODING_RAW, map_pb2.ENCODING_ROWS, map_pb2.ENCODING_CHANGES
@@ -23,10 +21,11 @@ _BUSY = re.compile(rb"[^\0]")
 
 
 def decode(channel: map_pb2.Channel, columns: int, base: Callable[[np.dtype], np.ndarray] | None = None) -> np.ndarray:
-    """Gives the cells, shape (rows, columns). `base` makes what changes change; it is asked when counts are checked."""
+    """Returns the cells, shape (rows, columns). `base` makes the base of changes for a type of cells; it is called
+    after the counts are checked."""
     count, payload, dtype = channel.cell_count, channel.payload, _TYPES.get(channel.cell_type)
-    if count > CELLS_MAX:
-        raise DecodeError("too_many_cells", f"{count} cells; at most {CELLS_MAX} are allowed")
+    if count > CHANNEL_CELLS_MAX:
+        raise DecodeError("too_many_cells", f"{count} cells; at most {CHANNEL_CELLS_MAX} are allowed")
     spare = count * dtype.itemsize - len(payload) if dtype else -1
     fits = {_RAW: spare == 0, _ROWS: spare > 0, _CHANGES: spare > 0 and base is not None}
     if not fits.get(channel.encoding):
@@ -38,12 +37,12 @@ def decode(channel: map_pb2.Channel, columns: int, base: Callable[[np.dtype], np
     else:
         cells = _changes(_Bits(payload, dtype), base(dtype))
     if zlib.crc32(cells.tobytes()) != channel.crc32:
-        raise DecodeError("cells", f"CRC-32 of the cells is not {channel.crc32:08x}, as the channel says")
+        raise DecodeError("cells", f"CRC-32 of the cells is not {channel.crc32:08x}, as the channel states")
     return cells
 
 
 class _Bits:
-    """Numbers, most significant bit first."""
+    """Reads numbers from bits, most significant bit first."""
 
     def __init__(self, payload: bytes, dtype: np.dtype) -> None:
         self.text, self.at, self.dtype = bin(int.from_bytes(b"\1" + payload, "big"))[3:], 0, dtype
@@ -54,15 +53,15 @@ class _Bits:
         return self.text[self.at - 1 : self.at] == "1"
 
     def number(self, order: int = 0) -> int:
-        """In exp-Golomb code."""
-        one = self.text.find("1", self.at, self.at + 33 - order)
+        """Reads a number in exp-Golomb code of an order."""
+        one = self.text.find("1", self.at, self.at + NUMBER_BITS_MAX + 1 - order)
         start, self.at = one, 2 * one + 1 - self.at + order
         if one < 0 or self.at > len(self.text):
-            raise DecodeError("cells", "the payload ends inside the cells, or has a number of over 32 bits")
+            raise DecodeError("cells", f"the payload ends inside the cells, or a number exceeds {NUMBER_BITS_MAX} bits")
         return int(self.text[start : self.at], 2) - (1 << order)
 
-    def like(self, kind: object) -> int:
-        """The same in the order that follows from the numbers of this kind so far."""
+    def adaptive(self, kind: object) -> int:
+        """Reads a number in the order that follows from the mean of the numbers of this kind."""
         mean = self.means.get(kind, 0)
         number = self.number(max(mean.bit_length() - 1, 0))
         self.means[kind] = (mean + number + 1) // 2
@@ -73,7 +72,7 @@ class _Bits:
 
 
 def _rows(bits: _Bits, rows: int, columns: int, dtype: np.dtype) -> np.ndarray:
-    """Rows predicted by the rows before: cells as a row before, a run of another value, and so on."""
+    """Decodes `ENCODING_ROWS`: copies of the row before and runs of one value, in turn."""
     cells, at = np.zeros((rows + 1) * columns, dtype), columns
     while at < len(cells):
         end = min(at + bits.number(), len(cells))
@@ -86,34 +85,35 @@ def _rows(bits: _Bits, rows: int, columns: int, dtype: np.dtype) -> np.ndarray:
 
 
 def _changes(bits: _Bits, base: np.ndarray) -> np.ndarray:
-    """Changes from a base: in each context unchanged and changed cells take turns."""
-    turns: dict[int, tuple[bool, int]] = {}
+    """Decodes `ENCODING_CHANGES`: differences from a base, whose flags are runs in each context."""
+    #: Flag of each context's present run, and the flags left in it.
+    runs: dict[int, tuple[bool, int]] = {}
 
-    def turn(context: int) -> bool:
-        changed, left = turns.get(context, (None, 0))
+    def read_flag(context: int) -> bool:
+        changed, left = runs.get(context, (None, 0))
         if not left:
             changed = bits.bit() if changed is None else not changed
-            left = bits.like((context, changed)) + 1
-        turns[context] = changed, left - 1
+            left = bits.adaptive((context, changed)) + 1
+        runs[context] = changed, left - 1
         return changed
 
-    # Around the grid lies a row and a column more on each side, where nothing is other than beside it.
+    # One more row and column on each side, with the values of the border cells: outside the grid nothing differs.
     (rows, columns), around = base.shape, np.pad(base, 1, mode="edge")
     beside = {4: around[:-2, 1:-1], 8: around[1:-1, :-2], 16: around[2:, 1:-1], 32: around[1:-1, 2:]}
     borders = sum((cells != base) * np.uint8(bit) for bit, cells in beside.items())
     contexts = bytearray(borders.tobytes() + b"\1" * columns)
     at, width, cells = 0, columns + 2, around.reshape(-1)
     while at < base.size:
-        step, (changed, left) = 1, turns.get(0, (True, 0))
+        step, (changed, left) = 1, runs.get(0, (True, 0))
         if not contexts[at] and left and not changed:
-            # Calm cells are passed over together.
+            # Unchanged cells of context 0 are skipped together.
             step = min(_BUSY.search(contexts, at).start() - at, left)
-            turns[0] = changed, left - step
-        elif turn(contexts[at]):
+            runs[0] = changed, left - step
+        elif read_flag(contexts[at]):
             here = (at // columns + 1) * width + at % columns + 1
             near = cells[[here - 1, here - width, here + 1, here + width]]
-            likely = near[near != cells[here]][:1]
-            cells[here] = bits.cell(bits.like("value")) if not len(likely) or turn(64) else likely[0]
+            predicted = near[near != cells[here]][:1]
+            cells[here] = bits.cell(bits.adaptive("value")) if not len(predicted) or read_flag(64) else predicted[0]
             contexts[at + columns] |= 1
             contexts[at + 1] |= 2 if (at + 1) % columns else 0
         at += step
@@ -121,14 +121,15 @@ def _changes(bits: _Bits, base: np.ndarray) -> np.ndarray:
 
 
 def by_class(channel: map_pb2.Channel, classes: np.ndarray, legend: int, dtype: np.dtype) -> np.ndarray:
-    """What the changes of a channel told by class change: what cells of their class, of `legend`, mostly are."""
+    """The base of a channel with a class table: the table's value for the class of each cell. `legend`: number of
+    classes."""
     if classes.dtype != np.uint8 or len(channel.by_class) != legend * dtype.itemsize or (classes >= legend).any():
         raise DecodeError("by_class", f"channel {channel.name!r}: {len(channel.by_class)} bytes, {legend} classes")
     return np.frombuffer(channel.by_class, dtype)[classes]
 
 
 def shifted(before: np.ndarray, shape: tuple[int, int], by: tuple[int, int], unknown: int) -> np.ndarray:
-    """What the changes of a delta change: cell (row, column) + `by` of the earlier map, `unknown` outside of it."""
+    """The base of a delta: cell (row, column) + `by` of the base layer, `unknown` if there is no such cell."""
     cells = np.full(shape, np.int64(unknown).astype(before.dtype), before.dtype)
     spans = [(max(0, -by[i]), min(shape[i], before.shape[i] - by[i])) for i in (0, 1)]
     if all(start < end for start, end in spans):

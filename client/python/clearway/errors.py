@@ -1,10 +1,11 @@
-"""What can go wrong, each with what a person needs to mend it."""
+"""The errors of this package."""
 
 from __future__ import annotations
 
 
 class ClearwayError(Exception):
-    """Base of all errors of this package. `reason` is a short name: a gRPC status (`NOT_FOUND`), or a fault's own."""
+    """Base of all errors of this package. `reason` is a short name of the fault, such as the gRPC status
+    `NOT_FOUND`."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -12,4 +13,4 @@ class ClearwayError(Exception):
 
 
 class DecodeError(ClearwayError):
-    """A map that is none; `reason` is the name in the golden vectors, the same in every client language."""
+    """An invalid map. `reason` is the name in the golden vectors, the same in every client language."""

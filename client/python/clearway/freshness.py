@@ -1,7 +1,8 @@
-"""How old a map is, by two clocks.
+"""Age of a map by two clocks.
 
-Age counts from the end of the capture, which only the wall clock can tell; but a wall clock can be set back. So a map is at
-least as old as it was when it came, and the time since by a steady clock: no step of the wall clock makes a stale map fresh.
+The age starts at the end of the capture, which is a stamp of the wall clock; but a wall clock can be set back. So a map
+is at least as old as its age on arrival plus the time since then by a steady clock. No step of the wall clock makes a
+stale map fresh.
 """
 
 from __future__ import annotations
@@ -10,30 +11,30 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-#: How often a stream that waits looks at its clocks: a map is told as stale at most this late.
-LOOK_S = 0.02
+#: Interval at which a waiting stream reads its clocks, in seconds: it reports a stale map at most this late.
+POLL_INTERVAL_S = 0.02
 
 
 def now_ns() -> int:
-    """This machine's clock, ns since the Unix epoch."""
+    """Present time of this machine's wall clock, ns since the Unix epoch."""
     return time.time_ns()
 
 
 class Clock(NamedTuple):
-    """Where the time comes from."""
+    """The clocks of a stream."""
 
-    #: ns since the Unix epoch; may be stepped.
+    #: Wall clock, ns since the Unix epoch; it can be set forward and back.
     wall_ns: Callable[[], int] = now_ns
-    #: ns since some moment; never goes back.
+    #: Steady clock, ns since an arbitrary moment; it never goes back.
     steady_ns: Callable[[], int] = time.monotonic_ns
 
 
 class Arrival(NamedTuple):
-    """When a map came to this process."""
+    """Arrival of a map at this process."""
 
     clock: Clock
     steady_ns: int
-    #: By the wall clock, as it was then.
+    #: Age of the map on arrival, by the wall clock.
     age_ns: int
 
     @staticmethod
@@ -41,5 +42,5 @@ class Arrival(NamedTuple):
         return Arrival(clock, clock.steady_ns(), max(clock.wall_ns() - capture_end_ns, 0))
 
     def age_ns_min(self) -> int:
-        """What the map is old at least, whatever the wall clock says now."""
+        """Least age of the map in ns; it does not depend on the present wall clock."""
         return self.age_ns + self.clock.steady_ns() - self.steady_ns

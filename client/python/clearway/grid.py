@@ -1,6 +1,6 @@
-"""The two grids of a layer: points to cells, cells to places.
+"""The two grids of a layer: points <-> cell indices.
 
-In: points and cell indices (row by row) as numpy arrays. Frames are REP-103: x forward, y left, metres, ego frame.
+In: points and cell indices (row by row) as numpy arrays. Points are in the ego frame: x forward, y left, metres.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 
 @dataclass(frozen=True)
 class RadialGrid:
-    """Array shape (rows, columns): row j spans (row_radius_m[j-1], row_radius_m[j]], column c the azimuths
-    [c, c+1) * 2 pi / columns, counter-clockwise from the ego x axis."""
+    """Rings and sectors; array shape (rows, columns). Row j spans (row_radius_m[j-1], row_radius_m[j]], column c the
+    azimuths [c, c+1) * 2 pi / columns, counter-clockwise from the ego x axis."""
 
     row_radius_m: np.ndarray
     columns: int
@@ -26,29 +26,29 @@ class RadialGrid:
     def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Cell index of each point, -1 outside the grid."""
         row = np.searchsorted(self.row_radius_m, np.hypot(x_m, y_m), side="left")
-        turn = np.mod(np.arctan2(y_m, x_m) / math.tau, 1.0)
-        column = np.minimum((turn * self.columns).astype(np.int64), self.columns - 1)
+        share = np.mod(np.arctan2(y_m, x_m) / math.tau, 1.0)
+        column = np.minimum((share * self.columns).astype(np.int64), self.columns - 1)
         return np.where(row < len(self.row_radius_m), row * self.columns + column, -1)
 
     def nearest(self, cells: np.ndarray, x_m: float, y_m: float) -> np.ndarray:
-        """The place in each of these cells (indices) that is nearest to a point, shape (n, 2)."""
+        """The point of each of these cells (indices) that is nearest to a point, shape (n, 2)."""
         row, column = np.divmod(cells, self.columns)
         inner, outer = np.concatenate(([0.0], self.row_radius_m[:-1]))[row], self.row_radius_m[row]
 
-        def along(turn: np.ndarray) -> np.ndarray:
-            way = np.stack([np.cos(turn * math.tau), np.sin(turn * math.tau)], axis=-1)
-            return np.clip(way @ (x_m, y_m), inner, outer)[:, None] * way
+        def along(share: np.ndarray) -> np.ndarray:
+            ray = np.stack([np.cos(share * math.tau), np.sin(share * math.tau)], axis=-1)
+            return np.clip(ray @ (x_m, y_m), inner, outer)[:, None] * ray
 
-        turn = math.atan2(y_m, x_m) / math.tau % 1.0
-        abreast = (column <= turn * self.columns) & (turn * self.columns <= column + 1)
-        # Beside the column, one of its two sides is nearest: an arc comes nearer towards its ends.
+        share = math.atan2(y_m, x_m) / math.tau % 1.0
+        abreast = (column <= share * self.columns) & (share * self.columns <= column + 1)
+        # For a point beside the column, the nearest point is on one of the column's two sides.
         first, last = along(column / self.columns), along((column + 1) / self.columns)
         is_first = np.hypot(*(first - (x_m, y_m)).T) <= np.hypot(*(last - (x_m, y_m)).T)
         beside = np.where(is_first[:, None], first, last)
-        return np.where(abreast[:, None], along(np.full(len(cells), turn)), beside)
+        return np.where(abreast[:, None], along(np.full(len(cells), share)), beside)
 
     def centres(self) -> np.ndarray:
-        """Middle of every cell, shape (rows, columns, 2)."""
+        """Centre of every cell, shape (rows, columns, 2)."""
         outer = self.row_radius_m
         range_m = 0.5 * (np.concatenate(([0.0], outer[:-1])) + outer)
         azimuth = (np.arange(self.columns) + 0.5) / self.columns * math.tau
@@ -57,9 +57,11 @@ class RadialGrid:
 
 @dataclass(frozen=True)
 class CartesianGrid:
-    """Array shape (height, width), indexed [iy, ix]: cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m).
+    """Squares; array shape (height, width), indexed [iy, ix]. Cell (ix, iy) spans [origin + i * cell_m, origin + (i+1)
+    * cell_m).
 
-    Along the grid's axes, which begin at the ego frame's origin and in which that frame has the heading `yaw_rad`.
+    The spans are along the grid's axes, which start at the origin of the ego frame; seen from them, the ego frame has
+    the heading `yaw_rad`.
     """
 
     origin_x_m: float
@@ -68,7 +70,7 @@ class CartesianGrid:
     height: int
     cell_m: float
     yaw_rad: float = 0.0
-    #: Number of cell (0, 0) among all there could be: the world's where the axes are the world's.
+    #: Number of cell (0, 0) in the endless grid that map.proto defines.
     first_ix: int = 0
     first_iy: int = 0
 
@@ -85,7 +87,7 @@ class CartesianGrid:
         return np.where(inside, iy * self.width + ix, -1)
 
     def nearest(self, cells: np.ndarray, x_m: float, y_m: float) -> np.ndarray:
-        """The place in each of these cells (indices) that is nearest to a point, ego frame, shape (n, 2)."""
+        """The point of each of these cells (indices) that is nearest to a point, shape (n, 2)."""
         iy, ix = np.divmod(cells, self.width)
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         left, bottom = self.origin_x_m + ix * self.cell_m, self.origin_y_m + iy * self.cell_m
@@ -94,7 +96,7 @@ class CartesianGrid:
         return np.stack([x * cos + y * sin, y * cos - x * sin], axis=-1)
 
     def centres(self) -> np.ndarray:
-        """Middle of every cell in the ego frame, shape (height, width, 2)."""
+        """Centre of every cell in the ego frame, shape (height, width, 2)."""
         x, y = np.meshgrid(
             self.origin_x_m + (np.arange(self.width) + 0.5) * self.cell_m,
             self.origin_y_m + (np.arange(self.height) + 0.5) * self.cell_m,

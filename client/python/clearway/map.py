@@ -1,7 +1,7 @@
-"""One map as a planner sees it: layers as numpy arrays, look-ups in the ego frame, and the age.
+"""One decoded map: layers as numpy arrays, look-ups in the ego frame, and the age.
 
-In: an encoded `clearway.v1.Map`, whoever carried it. Frames are REP-103: x forward, y left, metres, the origin on the
-ground under the vehicle. Class 0 is unknown everywhere and is never free.
+In: an encoded `clearway.v1.Map` from any transport. Frames follow REP-103: x forward, y left, metres, the origin on the
+ground under the vehicle. Class 0 is unknown in every layer and is never free.
 """
 
 from __future__ import annotations
@@ -22,35 +22,27 @@ from . import codec
 from .errors import ClearwayError, DecodeError
 from .freshness import Arrival, Clock, now_ns
 from .grid import CartesianGrid, Grid, RadialGrid
+from .limits import MAP_BYTES_MAX, MAP_CELLS_MAX, MAP_PARTS_MAX, RGB_MAX, SAFE_POINT_STEPS_MAX
 from .v1 import map_pb2
-
-#: Cells of all channels of a map that are accepted.
-CELLS_MAX = 16 << 20
-#: Bytes of a map that are accepted; gRPC's default. Those of a server with default grids have under 64 KiB.
-BYTES_MAX = 4 << 20
-#: Safe points of a layer.
-POINTS_MAX = 1 << 16
-#: Steps a safe point may lie away: beyond, single precision is not exact.
-STEPS_MAX = 1 << 24
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One value a cell."""
+    """One value per cell of a layer."""
 
     name: str
     #: Unit of `values`; empty for classes and ids.
     unit: str
-    #: `values = raw * scale`.
+    #: Factor from `raw` to `values`.
     scale: float
-    #: The raw value that means: nothing is known of this cell.
+    #: Raw value of a cell of which nothing is known.
     unknown: int
-    #: Raw values, in the shape of the grid; not to be written to.
+    #: Raw values, in the shape of the grid; read-only.
     raw: np.ndarray
 
     @property
     def values(self) -> np.ndarray:
-        """Values in `unit`, NaN where nothing is known."""
+        """Values in `unit`; NaN for cells of which nothing is known."""
         return np.where(self.raw == self.unknown, np.nan, self.raw * np.float64(self.scale))
 
 
@@ -65,7 +57,7 @@ class Meaning(IntEnum):
     NOT_REACHED = map_pb2.CLASS_MEANING_NOT_REACHED
 
 
-class ClassInfo(NamedTuple):
+class LegendEntry(NamedTuple):
     """One class of a layer."""
 
     #: Name, such as `drivable`; `unknown` for class 0.
@@ -77,39 +69,43 @@ class ClassInfo(NamedTuple):
 
 
 class SafePoint(NamedTuple):
-    """A place as far as can be from the obstacles on both sides."""
+    """A point on the medial axis of the free space: as far as possible from the obstacles on both sides. Ego frame,
+    metres."""
 
     x_m: float
     y_m: float
-    #: Distance to the nearest cell that is not free.
+    #: Distance to the nearest cell that is not free, in metres.
     radius_m: float
-    #: Indices of points before this one that the vehicle gets to straight from here.
+    #: Indices of earlier points that the vehicle can drive to straight from here.
     links: tuple[int, ...]
 
 
 class Obstacle(NamedTuple):
-    """The nearest part of a cell with something in it."""
+    """The nearest point of a cell that contains an obstacle. Ego frame, metres."""
 
     x_m: float
     y_m: float
-    #: From the point asked about; 0 where that lies in such a cell. No obstacle of the layer is nearer; this one may be
-    #: farther, by as much as its cell is long: a map does not tell where in a cell something stands. The innermost cells of
-    #: a radial grid begin in the middle of the vehicle, so that an obstacle in one is 0 m from there.
+    #: Distance from the given point, in metres; 0 if the point lies in such a cell. No obstacle of the layer is nearer.
+    #: The
+    #: obstacle itself can be farther away by up to the size of the cell, because a map does not state where in a cell
+    #: it
+    #: stands. The innermost cells of a radial grid start at the vehicle's origin, so an obstacle in one is 0 m from
+    #: there.
     distance_m: float
 
 
 class Layer:
-    """One named grid of a map."""
+    """One grid of a map, with one or more values per cell."""
 
     def __init__(self, message: map_pb2.Layer, base: Layer | None = None) -> None:
         self.name: str = message.name
         self.grid: Grid = _grid(message)
-        #: Cell (row, column) of a delta changes cell (row, column) + shift of the base.
+        #: Cell (row, column) of a delta has the base cell (row, column) + shift.
         self._shift = _shift(message.name, base.grid, self.grid) if base else (0, 0)
         #: The classes, by value of the channel `class`; class 0 is `unknown`.
-        self.classes_info: tuple[ClassInfo, ...] = _legend(message, base)
+        self.legend_entries: tuple[LegendEntry, ...] = _legend(message, base)
         #: Names of the classes.
-        self.legend: tuple[str, ...] = tuple(entry.name for entry in self.classes_info)
+        self.legend: tuple[str, ...] = tuple(entry.name for entry in self.legend_entries)
         self.channels: dict[str, Channel] = {}
         for channel in message.channels:
             if channel.name in self.channels:
@@ -117,15 +113,16 @@ class Layer:
             self.channels[channel.name] = self._channel(channel, base)
         #: Planes z = ax + by + c in the ego frame, by segment id, shape (n, 3).
         self.planes = np.array([(p.a, p.b, p.c) for p in message.planes], dtype=np.float64).reshape(-1, 3)
-        #: Figures of the whole layer, such as `drivable_share`.
+        #: Metrics of the whole layer by name, such as `drivable_share`.
         self.metrics: dict[str, float] = dict(message.metrics)
-        #: Safe points, the vehicle's own place first.
+        #: Safe points, the vehicle's position first.
         self.points: tuple[SafePoint, ...] = tuple(self._points(message.safe_points))
         self._check_classes()
 
     @property
     def classes(self) -> np.ndarray:
-        """Class of each cell, in the shape of the grid; names are in `legend`. 0 is unknown, and never free."""
+        """Class of each cell, in the shape of the grid: an index of `legend` and `legend_entries`. 0 is unknown, and
+        never free."""
         return self._class_channel().raw
 
     @property
@@ -139,36 +136,38 @@ class Layer:
         return self._means(Meaning.OCCUPIED)
 
     def class_at(self, x_m: float, y_m: float) -> str:
-        """Name of the class at a point; what lies outside the grid is unknown."""
+        """Name of the class at a point (ego frame, metres); "unknown" outside the grid."""
         cell = int(self.grid.cells_at(np.float64(x_m), np.float64(y_m)))
         return "unknown" if cell < 0 else self.legend[int(self.classes.flat[cell])]
 
     def meaning_at(self, x_m: float, y_m: float) -> Meaning:
         """Meaning of the class at a point (ego frame, metres); `Meaning.UNKNOWN` outside the grid."""
         cell = int(self.grid.cells_at(np.float64(x_m), np.float64(y_m)))
-        return Meaning.UNKNOWN if cell < 0 else self.classes_info[int(self.classes.flat[cell])].meaning
+        return Meaning.UNKNOWN if cell < 0 else self.legend_entries[int(self.classes.flat[cell])].meaning
 
     def value_at(self, channel: str, x_m: float, y_m: float) -> float:
-        """A channel's value at a point in the channel's unit; NaN where nothing is known."""
+        """Value of a channel at a point (ego frame, metres), in the channel's unit; NaN if nothing is known of the
+        cell."""
         cell = int(self.grid.cells_at(np.float64(x_m), np.float64(y_m)))
         return math.nan if cell < 0 else float(self.channels[channel].values.flat[cell])
 
     def is_free(self, footprint: Sequence[tuple[float, float]], step_m: float = 0.1) -> bool:
-        """Whether every cell under a polygon (corners x, y in metres) is known and free; looked at every `step_m`, and at
-        the middle of every cell."""
+        """True if every cell under a polygon (corners x, y in metres, ego frame) has a class that means free. The
+        polygon is sampled every `step_m` metres and at the centre of every cell."""
         corners = np.asarray(footprint, dtype=np.float64)
         if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
             raise ClearwayError("footprint", f"footprint {footprint!r}: three or more finite corners (x, y) are needed")
         points = _inside(corners, step_m)
         cells = self.grid.cells_at(points[:, 0], points[:, 1])
-        # Cells smaller than a step, as those of a radial grid near the vehicle, would fall between the points.
-        middles = self.grid.centres().reshape(-1, 2)
-        near = np.flatnonzero(((middles >= corners.min(axis=0)) & (middles <= corners.max(axis=0))).all(axis=1))
-        cells = np.concatenate([cells, near[_within(corners, middles[near])]])
+        # Cells smaller than a step, such as those of a radial grid near the vehicle, could lie between the points.
+        centres = self.grid.centres().reshape(-1, 2)
+        near = np.flatnonzero(((centres >= corners.min(axis=0)) & (centres <= corners.max(axis=0))).all(axis=1))
+        cells = np.concatenate([cells, near[_within(corners, centres[near])]])
         return bool((cells >= 0).all() and self.free.ravel()[cells].all())
 
     def nearest_obstacle(self, x_m: float = 0.0, y_m: float = 0.0) -> Obstacle | None:
-        """The obstacle of the layer nearest to a point; `None` where the layer knows of none: what is unknown may hide one."""
+        """The obstacle of the layer that is nearest to a point (ego frame, metres); `None` if the layer has none. An
+        obstacle can also stand in an unknown cell."""
         cells = np.flatnonzero(self.obstacles)
         if not len(cells):
             return None
@@ -202,15 +201,15 @@ class Layer:
         return codec.shifted(before.raw, self.grid.shape, self._shift, message.unknown)
 
     def _points(self, packed: map_pb2.SafePoints) -> Iterator[SafePoint]:
-        """The differences summed up; at most `POINTS_MAX` points."""
+        """Unpacks at most `MAP_PARTS_MAX` safe points."""
         count, step = len(packed.x), packed.step_m
-        if len(packed.y) != count or len(packed.radius_cm) != count or count > POINTS_MAX:
+        if len(packed.y) != count or len(packed.radius_cm) != count or count > MAP_PARTS_MAX:
             raise DecodeError("safe_point", f"{count}, {len(packed.y)} and {len(packed.radius_cm)} values")
         if count and not (math.isfinite(step) and step > 0):
             raise DecodeError("safe_point", f"steps of {step} m; finite metres over 0 are needed")
         links = self._links(packed, count)
         for index, sums in enumerate(zip(*map(accumulate, (packed.x, packed.y, packed.radius_cm)))):
-            if max(map(abs, sums)) > STEPS_MAX or sums[2] < 0:
+            if max(map(abs, sums)) > SAFE_POINT_STEPS_MAX or sums[2] < 0:
                 raise DecodeError("safe_point", f"safe point {index}: {sums} steps and cm")
             yield SafePoint(sums[0] * step, sums[1] * step, sums[2] / 100, tuple(links[index]))
 
@@ -236,7 +235,7 @@ class Layer:
         if channel is None:
             return
         if not self.legend or self.legend[0] != "unknown":
-            raise DecodeError("legend", f"legend {self.legend}: entry 0 is 'unknown' everywhere")
+            raise DecodeError("legend", f"legend {self.legend}: class 0 is 'unknown' in every legend")
         if channel.raw.size and (channel.raw.min() < 0 or channel.raw.max() >= len(self.legend)):
             raise DecodeError("class", f"class {channel.raw.max()} has no name among {self.legend}")
 
@@ -246,66 +245,69 @@ class Layer:
         return self.channels["class"]
 
     def _means(self, meaning: Meaning) -> np.ndarray:
-        return np.array([entry.meaning == meaning for entry in self.classes_info])[self.classes]
+        return np.array([entry.meaning == meaning for entry in self.legend_entries])[self.classes]
 
 
 class Map:
     """A map, decoded and checked. `map["drivability"]` is a layer."""
 
     def __init__(self, encoded: bytes, skipped: int = 0, base: Map | None = None) -> None:
-        """`base`: the map that deltas stand on; whole layers do without it."""
-        if len(encoded) > BYTES_MAX:
-            raise DecodeError("too_long", f"map of {len(encoded)} bytes; at most {BYTES_MAX} are allowed")
+        """`base`: the base map of layers that are deltas; whole layers do not need it."""
+        if len(encoded) > MAP_BYTES_MAX:
+            raise DecodeError("too_long", f"map of {len(encoded)} bytes; at most {MAP_BYTES_MAX} are allowed")
         try:
             message = map_pb2.Map.FromString(encoded)
         except ProtobufError as fault:
             raise DecodeError("protobuf", f"not an encoded clearway.v1.Map: {fault}") from None
         _check_header(message)
-        #: As on the wire: stamps, pose, speed, sensors.
+        #: The header as on the wire: stamps, pose, speed and sensors.
         self.header: map_pb2.Header = message.header
-        #: Maps made since the one looked at before and not seen by this reader.
+        #: Number of maps made since the one before that this reader did not get, because it or its link was slow.
         self.skipped = skipped
-        #: Those of them that got lost on the link: zenoh drops what a congested or cut one does not take. 0 over gRPC, where the
-        #: server skips instead.
+        #: Number of the skipped maps that the link lost (zenoh drops maps on a congested or cut link). 0 over gRPC,
+        #: where the
+        #: server skips maps instead.
         self.lost = 0
-        #: Maps made since then that `max_rate_hz` left out.
+        #: Number of maps made since the one before that `max_rate_hz` excluded.
         self.left_out = 0
-        #: When the map came to this process; `None` where it came from no server.
+        #: Arrival at this process; `None` if the map did not come from a server.
         self._arrival: Arrival | None = None
         self._message = message
         self._bases: dict[str, Layer] = {}
-        if any(layer.HasField("base_sequence") for layer in message.layers):
-            self._bases = {layer.name: _base(message, layer, base) for layer in message.layers if layer.HasField("base_sequence")}
-            # At once: no map keeps the one before it, and that the one before it.
+        deltas = [layer for layer in message.layers if layer.HasField("base_sequence")]
+        if deltas:
+            self._bases = {layer.name: _base(message, layer, base) for layer in deltas}
+            # Decoded now, so that no map keeps a chain of earlier maps in memory.
             self.layers
             self._bases = {}
 
-    def arrived(self, clock: Clock = Clock()) -> Map:
-        """The map came just now."""
+    def with_arrival(self, clock: Clock = Clock()) -> Map:
+        """Sets the arrival of the map to now."""
         self._arrival = Arrival.of(self.header.capture_end_ns, clock)
         return self
 
-    def again(self, skipped: int = 0, lost: int = 0, left_out: int = 0) -> Map:
-        """The same map, for another look at the stream."""
+    def copy_with(self, skipped: int = 0, lost: int = 0, left_out: int = 0) -> Map:
+        """A copy of the map with other counts."""
         other = copy.copy(self)
         other.skipped, other.lost, other.left_out = skipped, lost, left_out
         return other
 
     @property
     def vehicle(self) -> str:
+        """Name of the vehicle."""
         return self.header.vehicle
 
     @property
     def sequence(self) -> int:
-        """Counts from 0 without a hole within one run of the server, which `header.boot_id` names."""
+        """Number of the map: 0, 1, 2 and so on, without gaps, within one run of the server (`header.boot_id`)."""
         return self.header.sequence
 
     @cached_property
     def layers(self) -> dict[str, Layer]:
-        """Layers by name, in the server's order; decoded at the first look."""
+        """Layers by name, in the order of the server's configuration. They are decoded at the first access."""
         cells = sum(channel.cell_count for layer in self._message.layers for channel in layer.channels)
-        if cells > CELLS_MAX:
-            raise DecodeError("too_many_cells", f"the channels claim {cells} cells; at most {CELLS_MAX} are allowed")
+        if cells > MAP_CELLS_MAX:
+            raise DecodeError("too_many_cells", f"the channels claim {cells} cells; at most {MAP_CELLS_MAX} are allowed")
         layers: dict[str, Layer] = {}
         for message in self._message.layers:
             if message.name in layers:
@@ -319,28 +321,29 @@ class Map:
         return self.layers[name]
 
     def age_ns(self, at_ns: int | None = None) -> int:
-        """Age, measured from the end of the capture. Of a map from a server at least its age when it came and the time
-        since, so that no step of the clock makes it younger; else negative before the capture."""
+        """Age of the map in ns at a time (default: now), measured from the end of the capture. If the map came from a
+        server, it is at least the age on arrival plus the time since, so that no step of the clock makes the map
+        younger. Else it is negative before the capture."""
         by_wall_ns = (self._now_ns() if at_ns is None else at_ns) - self.header.capture_end_ns
         return by_wall_ns if self._arrival is None else max(by_wall_ns, self._arrival.age_ns_min())
 
     def age_ms(self, at_ns: int | None = None) -> float:
-        """`age_ns` in milliseconds."""
+        """Age of the map in milliseconds (`age_ns`)."""
         return self.age_ns(at_ns) * 1e-6
 
     @property
     def stale(self) -> bool:
-        """Whether the map must not be used any more."""
+        """True if the map must not be used any more."""
         return self.is_stale(self._now_ns())
 
     def is_stale(self, at_ns: int) -> bool:
-        """Whether its validity has passed at a time, or its capture lies further ahead of that time than its validity
-        lasts, so that its age is not known."""
+        """True if the map must not be used at a time: its validity has passed, or its capture is so far in the future
+        of that time that its age cannot be known."""
         valid_ns = self._valid_ns()
         return self.age_ns(at_ns) > valid_ns or at_ns - self.header.capture_end_ns < -valid_ns
 
     def fresh_for_s(self) -> float:
-        """As far as is known now, seconds until the map is stale; 0 where it is already."""
+        """Time from now until the map is stale, in seconds; 0 if it is stale."""
         return 0.0 if self.stale else (self._valid_ns() - self.age_ns() + 1) * 1e-9
 
     def _valid_ns(self) -> int:
@@ -357,10 +360,10 @@ class Map:
 def _grid(message: map_pb2.Layer) -> Grid:
     kind = message.WhichOneof("geometry")
     if kind == "radial":
-        benches = np.array(message.radial.row_radius_m, dtype=np.float64)
-        rising = np.isfinite(benches).all() and (np.diff(benches, prepend=0.0) > 0).all()
-        if message.radial.columns and len(benches) and rising:
-            return RadialGrid(benches, message.radial.columns)
+        radii = np.array(message.radial.row_radius_m, dtype=np.float64)
+        ascending = np.isfinite(radii).all() and (np.diff(radii, prepend=0.0) > 0).all()
+        if message.radial.columns and len(radii) and ascending:
+            return RadialGrid(radii, message.radial.columns)
     elif kind == "cartesian":
         grid = message.cartesian
         finite = all(map(math.isfinite, (grid.origin_x_m, grid.origin_y_m, grid.cell_m, grid.yaw_rad)))
@@ -373,7 +376,7 @@ def _grid(message: map_pb2.Layer) -> Grid:
 
 
 def _base(message: map_pb2.Map, layer: map_pb2.Layer, base: Map | None) -> Layer:
-    """The layer that a delta stands on."""
+    """The base layer of a delta."""
     if base is None:
         raise DecodeError("no_base", f"layer {layer.name!r} is a delta to that of map {layer.base_sequence}")
     given = (base.vehicle, base.header.boot_id, base.sequence)
@@ -386,7 +389,7 @@ def _base(message: map_pb2.Map, layer: map_pb2.Layer, base: Map | None) -> Layer
 
 
 def _shift(layer: str, before: Grid, now: Grid) -> tuple[int, int]:
-    """(rows, columns) from a grid's cells to those of its base that tell of the same places."""
+    """(rows, columns) from the cells of a grid to those of its base layer at the same places."""
     if isinstance(before, CartesianGrid) and isinstance(now, CartesianGrid) and before.cell_m == now.cell_m:
         return now.first_iy - before.first_iy, now.first_ix - before.first_ix
     if isinstance(before, RadialGrid) and isinstance(now, RadialGrid):
@@ -395,24 +398,25 @@ def _shift(layer: str, before: Grid, now: Grid) -> tuple[int, int]:
     raise DecodeError("base_shape", f"layer {layer!r} is a delta to a grid that is not comparable")
 
 
-def _legend(message: map_pb2.Layer, base: Layer | None) -> tuple[ClassInfo, ...]:
-    """The legend of a layer; that of the base in a delta without one. A meaning that this version does not know becomes
-    `Meaning.UNKNOWN`, so that a planner does not enter cells of that class."""
+def _legend(message: map_pb2.Layer, base: Layer | None) -> tuple[LegendEntry, ...]:
+    """Reads the legend of a layer, or that of the base layer if a delta has none. A meaning that this version does not
+    know becomes `Meaning.UNKNOWN`, so that a planner does not enter cells of that class."""
     lists = (message.legend, message.legend_meanings, message.legend_rgb)
     if base is not None and not any(lists):
-        return base.classes_info
+        return base.legend_entries
     names, meanings, colours = map(len, lists)
     if not names == meanings == colours:
-        text = f"layer {message.name!r}: {names} names, {meanings} meanings and {colours} colours; one of each per class is needed"
+        text = f"layer {message.name!r}: {names} names, {meanings} meanings, {colours} colours; equal numbers are needed"
         raise DecodeError("legend", text)
     if names and message.legend_meanings[0] != Meaning.UNKNOWN:
         text = f"layer {message.name!r}: class 0 has the meaning {message.legend_meanings[0]}; 0 (unknown) is needed"
         raise DecodeError("legend", text)
-    if names and max(message.legend_rgb) > 0xFFFFFF:
-        text = f"layer {message.name!r}: a colour {max(message.legend_rgb):#x}; at most 0xffffff is allowed"
+    if names and max(message.legend_rgb) > RGB_MAX:
+        text = f"layer {message.name!r}: a colour {max(message.legend_rgb):#x}; at most {RGB_MAX:#x} is allowed"
         raise DecodeError("legend", text)
     known = {int(meaning) for meaning in Meaning}
-    return tuple(ClassInfo(name, Meaning(meaning if meaning in known else 0), rgb) for name, meaning, rgb in zip(*lists))
+    understood = (Meaning(meaning if meaning in known else 0) for meaning in message.legend_meanings)
+    return tuple(map(LegendEntry, message.legend, understood, message.legend_rgb))
 
 
 def _check_header(message: map_pb2.Map) -> None:
@@ -427,7 +431,7 @@ def _check_header(message: map_pb2.Map) -> None:
 
 
 def _inside(corners: np.ndarray, step_m: float) -> np.ndarray:
-    """Points in and on a polygon, no more than `step_m` apart."""
+    """Points in and on a polygon, at most `step_m` metres apart."""
     low, high = corners.min(axis=0), corners.max(axis=0)
     axes = [np.linspace(a, b, max(2, math.ceil((b - a) / step_m) + 1)) for a, b in zip(low, high)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
@@ -439,7 +443,7 @@ def _inside(corners: np.ndarray, step_m: float) -> np.ndarray:
 
 
 def _within(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Which points lie in a polygon."""
+    """True for each point that lies in a polygon."""
     within = np.zeros(len(points), dtype=bool)
     for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0)):
         crosses = (ay > points[:, 1]) != (by > points[:, 1])

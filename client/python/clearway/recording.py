@@ -1,4 +1,4 @@
-"""Maps out of a recording (MCAP), in the order they were made."""
+"""The maps of a recording (MCAP), in the order in which they were made."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .map import Map
 
 
 def read(file: str | PathLike[str], layer: str, vehicle: str = "") -> Iterator[Map]:
-    """Gives the recorded maps of one layer; `vehicle` may be left out where the recording has one."""
+    """Yields the recorded maps of one layer. `vehicle` may be empty if the recording has a single vehicle."""
     try:
         from mcap.reader import make_reader
     except ImportError:
@@ -19,9 +19,9 @@ def read(file: str | PathLike[str], layer: str, vehicle: str = "") -> Iterator[M
         reader = make_reader(stream)
         summary = reader.get_summary()
         topics = {channel.topic for channel in summary.channels.values()} if summary else set()
-        wanted = {t for t in topics if t.endswith(f"/map/{layer}") and (not vehicle or t == f"/{vehicle}/map/{layer}")}
-        if len(wanted) != 1:
+        selected = {t for t in topics if t.endswith(f"/map/{layer}") and (not vehicle or t == f"/{vehicle}/map/{layer}")}
+        if len(selected) != 1:
             known = ", ".join(sorted(t for t in topics if "/map/" in t)) or "none"
-            raise ClearwayError("layer", f"{file}: {len(wanted)} topics fit layer {layer!r}; the recording has {known}")
-        for _, _, message in reader.iter_messages(topics=wanted):
+            raise ClearwayError("layer", f"{file}: {len(selected)} topics fit layer {layer!r}; the recording has {known}")
+        for _, _, message in reader.iter_messages(topics=selected):
             yield Map(message.data)

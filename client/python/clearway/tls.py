@@ -1,4 +1,4 @@
-"""Certificates: whom a client believes, and what it shows of itself. All of them PEM files."""
+"""Certificates of an encrypted connection, as PEM files."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from .errors import ClearwayError
 
 @dataclass(frozen=True)
 class Tls:
-    """The connection is encrypted: `ca` is the CA that the server's certificate must be of, `cert` and `key` are the client's
-    own, where the server asks who is there."""
+    """Certificates of an encrypted connection. `ca`: certificate of the authority that must have signed the server's
+    certificate. `cert` and `key`: certificate and private key of the client, if the server requires them."""
 
     ca: str | PathLike[str]
     cert: str | PathLike[str] | None = None
@@ -20,10 +20,10 @@ class Tls:
 
     def __post_init__(self) -> None:
         if (self.cert is None) != (self.key is None):
-            raise ClearwayError("certificate", f"cert {self.cert!r} and key {self.key!r}: one is of no use without the other")
+            raise ClearwayError("certificate", f"cert {self.cert!r} and key {self.key!r}: both or none are needed")
 
     def files(self) -> dict[str, str]:
-        """Absolute paths of those that there are, by field. Raises `ClearwayError` for one that cannot be read."""
+        """Absolute path of each given file, by field. Raises `ClearwayError` if a file cannot be read."""
         named = {"ca": self.ca, "cert": self.cert, "key": self.key}
         files = {name: str(Path(fspath(path)).absolute()) for name, path in named.items() if path is not None}
         for name, path in files.items():
@@ -34,5 +34,5 @@ class Tls:
         return files
 
     def read(self) -> dict[str, bytes]:
-        """What is in them."""
+        """Content of each given file, by field."""
         return {name: Path(path).read_bytes() for name, path in self.files().items()}

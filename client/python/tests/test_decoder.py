@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import clearway
-from clearway import codec
+from clearway import codec, limits
 from clearway.grid import CartesianGrid, RadialGrid
 from clearway.map import Map
 from clearway.v1 import map_pb2
@@ -27,6 +27,11 @@ def channel(vector) -> map_pb2.Channel:
     return map_pb2.Channel(payload=bytes.fromhex(vector["payload_hex"]), **fields)
 
 
+def test_the_limits_are_those_of_every_client_language():
+    for name, value in golden("limits.json").items():
+        assert getattr(limits, name.upper()) == value, name
+
+
 @pytest.mark.parametrize("vector", golden("channels.json"), ids=lambda vector: vector["name"])
 def test_a_channel_has_the_cells_that_were_encoded(vector):
     expected = [value for value, length in vector["cells_value_length"] for _ in range(length)]
@@ -34,7 +39,7 @@ def test_a_channel_has_the_cells_that_were_encoded(vector):
 
 
 @pytest.mark.parametrize("vector", golden("bad_channels.json"), ids=lambda vector: vector["name"])
-def test_a_bad_channel_is_refused_by_name_and_what_it_claims_is_not_allocated(vector):
+def test_a_bad_channel_is_refused_without_allocating_its_claim(vector):
     message = channel(vector)
     tracemalloc.start()
     with pytest.raises(clearway.DecodeError) as error:
@@ -42,8 +47,8 @@ def test_a_bad_channel_is_refused_by_name_and_what_it_claims_is_not_allocated(ve
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert error.value.reason == vector["error"]
-    # No more cells are made than a reader accepts.
-    cells = 4 * codec.CELLS_MAX if message.cell_count <= codec.CELLS_MAX else 0
+    # At most the accepted number of cells is allocated.
+    cells = 4 * limits.CHANNEL_CELLS_MAX if message.cell_count <= limits.CHANNEL_CELLS_MAX else 0
     assert peak <= 64 * len(message.payload) + (64 << 10) + cells
 
 
@@ -54,23 +59,23 @@ def test_a_bad_map_is_refused_by_name(vector):
     assert error.value.reason == vector["error"]
 
 
-def test_the_golden_map_told_by_class_is_the_one_told_cell_by_cell():
-    told, plain = (clearway.Map((GOLDEN / f"{name}.bin").read_bytes()) for name in ("by_class", "by_class_plain"))
-    channels = told["occupancy"].channels
+def test_the_golden_map_with_class_tables_equals_the_one_without():
+    tables, plain = (clearway.Map((GOLDEN / f"{name}.bin").read_bytes()) for name in ("by_class", "by_class_plain"))
+    channels = tables["occupancy"].channels
     assert list(channels) == ["class", "hits", "unit_height", "difference"]
     for name, channel in channels.items():
         np.testing.assert_array_equal(channel.raw, plain["occupancy"].channels[name].raw)
 
 
-def test_the_golden_delta_on_its_base_is_the_golden_whole():
+def test_the_golden_delta_on_its_base_gives_the_golden_whole_map():
     base, delta, whole = ((GOLDEN / f"delta{name}.bin").read_bytes() for name in ("_base", "", "_whole"))
-    opened, expected = clearway.Map(delta, base=clearway.Map(base)), clearway.Map(whole)
-    assert list(opened.layers) == list(expected.layers) and opened.header == expected.header
+    decoded, expected = clearway.Map(delta, base=clearway.Map(base)), clearway.Map(whole)
+    assert list(decoded.layers) == list(expected.layers) and decoded.header == expected.header
     for name, layer in expected.layers.items():
         for channel, values in layer.channels.items():
-            assert np.array_equal(opened[name].channels[channel].raw, values.raw), (name, channel)
-        assert opened[name].metrics == layer.metrics and opened[name].legend == layer.legend
-    grid, whole_grid = opened["occupancy"].grid, expected["occupancy"].grid
+            assert np.array_equal(decoded[name].channels[channel].raw, values.raw), (name, channel)
+        assert decoded[name].metrics == layer.metrics and decoded[name].legend == layer.legend
+    grid, whole_grid = decoded["occupancy"].grid, expected["occupancy"].grid
     assert (grid.first_ix, grid.first_iy) == (whole_grid.first_ix, whole_grid.first_iy) != (0, 0)
 
 
@@ -82,37 +87,39 @@ def test_a_delta_on_a_wrong_base_is_refused_by_name(vector):
     assert error.value.reason == vector["error"]
 
 
-def test_the_golden_map_says_what_every_other_client_reads_in_it():
-    told = golden("map.json")
+def test_the_golden_map_decodes_as_in_every_client_language():
+    golden_map = golden("map.json")
     m = clearway.Map((GOLDEN / "map.bin").read_bytes())
-    assert (m.vehicle, m.sequence, m.header.valid_until_ns) == (told["vehicle"], told["sequence"], told["valid_until_ns"])
-    assert list(m.layers) == [layer["name"] for layer in told["layers"]]
-    for expected in told["layers"]:
+    assert (m.vehicle, m.sequence) == (golden_map["vehicle"], golden_map["sequence"])
+    assert m.header.valid_until_ns == golden_map["valid_until_ns"]
+    assert list(m.layers) == [layer["name"] for layer in golden_map["layers"]]
+    for expected in golden_map["layers"]:
         layer = m[expected["name"]]
         assert list(layer.grid.shape) == expected["shape"] and list(layer.legend) == expected["legend"]
         assert layer.metrics == expected["metrics"]
-        assert [f"CLASS_MEANING_{entry.meaning.name}" for entry in layer.classes_info] == expected["legend_meanings"]
-        assert [entry.rgb for entry in layer.classes_info] == expected["legend_rgb"]
+        assert [f"CLASS_MEANING_{entry.meaning.name}" for entry in layer.legend_entries] == expected["legend_meanings"]
+        assert [entry.rgb for entry in layer.legend_entries] == expected["legend_rgb"]
         for values in expected["channels"]:
             cells = [value for value, length in values["cells_value_length"] for _ in range(length)]
             assert layer.channels[values["name"]].raw.ravel().tolist() == cells
         assert [(p.x_m, p.y_m, p.radius_m, list(p.links)) for p in layer.points] == [
             (p["x_m"], p["y_m"], p["radius_m"], p["links"]) for p in expected["points"]
         ]
-    for at in told["classes_of_drivability"]:
+    for at in golden_map["classes_of_drivability"]:
         assert m["drivability"].class_at(at["x_m"], at["y_m"]) == at["class"]
         assert f"CLASS_MEANING_{m['drivability'].meaning_at(at['x_m'], at['y_m']).name}" == at["meaning"]
 
 
-def test_a_map_is_stale_after_its_validity_and_when_its_age_cannot_be_known():
+def test_a_map_is_stale_after_its_validity_or_if_its_age_is_unknown():
     m = clearway.Map((GOLDEN / "map.bin").read_bytes())
     end, until = m.header.capture_end_ns, m.header.valid_until_ns
     valid = until - end
-    assert [m.is_stale(at) for at in (end, until, until + 1, end - valid, end - valid - 1)] == [False, False, True, False, True]
+    times = (end, until, until + 1, end - valid, end - valid - 1)
+    assert [m.is_stale(at) for at in times] == [False, False, True, False, True]
     assert m.age_ms(end + 5_000_000) == 5.0
 
 
-def test_a_footprint_is_free_only_where_all_of_it_is_known_and_free():
+def test_a_footprint_is_free_only_if_every_cell_of_it_is_free():
     layer = clearway.Map((GOLDEN / "map.bin").read_bytes())["drivability"]
     centres = layer.grid.centres()
     assert [layer.class_at(x, y) for x, y in centres.reshape(-1, 2)] == [layer.legend[c] for c in layer.classes.ravel()]
@@ -123,15 +130,16 @@ def test_a_footprint_is_free_only_where_all_of_it_is_known_and_free():
         return [(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]
 
     assert layer.is_free(square(free)) and not layer.is_free(square(other))
-    assert not layer.is_free(square(free, half=100.0)), "what lies outside the grid is not known"
+    assert not layer.is_free(square(free, half=100.0)), "outside the grid nothing is known"
     with pytest.raises(clearway.ClearwayError, match="three or more finite corners"):
         layer.is_free([(0, 0), (1, float("nan")), (2, 2)])
 
 
 @pytest.mark.parametrize("yaw_rad", [None, 0.0, 0.7], ids=["radial", "square", "turned"])
-def test_the_nearest_obstacle_is_no_farther_than_any_place_of_one(yaw_rad):
+def test_the_nearest_obstacle_is_not_farther_than_any_point_of_one(yaw_rad):
     layer = clearway.Map((GOLDEN / "map.bin").read_bytes())["drivability"]
-    layer.grid = RadialGrid(np.array([0.6, 1.3, 2.5]), 8) if yaw_rad is None else CartesianGrid(-1.4, -1.7, 6, 6, 0.5, yaw_rad)
+    radial = RadialGrid(np.array([0.6, 1.3, 2.5]), 8)
+    layer.grid = radial if yaw_rad is None else CartesianGrid(-1.4, -1.7, 6, 6, 0.5, yaw_rad)
     looks = np.stack(np.meshgrid(*2 * [np.arange(-3.5, 3.5, 0.02)]), axis=-1).reshape(-1, 2)
     cells = layer.grid.cells_at(looks[:, 0], looks[:, 1])
     random = np.random.default_rng(7)
@@ -149,7 +157,7 @@ def test_the_nearest_obstacle_is_no_farther_than_any_place_of_one(yaw_rad):
     assert layer.nearest_obstacle() is None
 
 
-def test_no_cell_narrower_than_a_step_falls_between_the_points_of_a_footprint():
+def test_a_footprint_includes_cells_narrower_than_a_step():
     layer = clearway.Map((GOLDEN / "map.bin").read_bytes())["drivability"]
     layer.grid = RadialGrid(np.arange(1.0, 6.0), 360)
     raw = np.full(layer.grid.shape, layer.legend.index("drivable"), np.uint8)

@@ -10,7 +10,8 @@ import pytest
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text()
 PROGRAMS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-HERE = {name: os.environ.get(f"CLEARWAY_{name}", "") for name in ("GRPC", "ZENOH", "SECURED_GRPC", "CERTIFICATES", "RECORDING")}
+NAMES = ("GRPC", "ZENOH", "SECURED_GRPC", "CERTIFICATES", "RECORDING")
+HERE = {name: os.environ.get(f"CLEARWAY_{name}", "") for name in NAMES}
 pytestmark = pytest.mark.skipif(not HERE["GRPC"], reason="CLEARWAY_GRPC names no server")
 
 
@@ -25,7 +26,7 @@ def placed(program):
 
 
 @pytest.mark.parametrize("number", range(len(PROGRAMS)))
-def test_each_program_says_what_it_is_to_say(number, tmp_path):
+def test_each_program_of_the_readme_prints_what_it_should(number, tmp_path):
     file = tmp_path / "program.py"
     file.write_text(placed(PROGRAMS[number]))
     run = subprocess.Popen([sys.executable, "-u", file], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -37,5 +38,5 @@ def test_each_program_says_what_it_is_to_say(number, tmp_path):
         run.wait()
 
 
-def test_the_readme_has_a_program_for_each_way_to_maps():
+def test_the_readme_has_a_program_for_each_source_of_maps():
     assert len(PROGRAMS) == 5

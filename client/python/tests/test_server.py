@@ -16,7 +16,7 @@ TRANSPORTS = [{"address": GRPC}, {"address": f"zenoh:{ZENOH}", "vehicle": "car"}
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS, ids=["grpc", "zenoh"])
-def test_the_newest_map_comes_as_arrays(transport):
+def test_the_newest_map_has_numpy_arrays(transport):
     with clearway.watch(**transport, layers=["drivability", "terrain"]) as maps:
         m = next(maps)
     assert list(m.layers) == ["drivability", "terrain"] and m.vehicle == "car"
@@ -31,7 +31,7 @@ def test_the_newest_map_comes_as_arrays(transport):
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS, ids=["grpc", "zenoh"])
-def test_get_and_watch_give_the_same_map(transport):
+def test_get_and_watch_return_equal_maps(transport):
     one = clearway.get(**transport, layers=["drivability"])
     with clearway.watch(**transport, layers=["drivability"]) as maps:
         other = next(maps)
@@ -41,7 +41,7 @@ def test_get_and_watch_give_the_same_map(transport):
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS, ids=["grpc", "zenoh"])
-def test_a_slow_loop_body_gets_the_newest_map_and_is_told_what_it_skipped(transport):
+def test_a_slow_loop_body_gets_the_newest_map_and_the_skipped_count(transport):
     with clearway.watch(**transport, layers=["drivability"]) as maps:
         first = maps.next_or_stale()
         while maps.newest().sequence < first.sequence + 3:
@@ -52,7 +52,7 @@ def test_a_slow_loop_body_gets_the_newest_map_and_is_told_what_it_skipped(transp
     assert second.sequence - first.sequence == second.skipped + 1
 
 
-def test_deltas_of_a_region_at_a_rate_give_the_cells_of_whole_maps():
+def test_deltas_of_a_region_at_a_rate_have_the_cells_of_whole_maps():
     wanted = dict(layers=["drivability", "terrain"], region=(0, 20, -8, 8))
     with clearway.watch(GRPC, **wanted, deltas=True, max_rate_hz=5) as few, clearway.watch(GRPC, **wanted) as all_of_them:
         got = [next(few) for _ in range(3)]
@@ -69,22 +69,22 @@ def test_deltas_of_a_region_at_a_rate_give_the_cells_of_whole_maps():
 
 
 @pytest.mark.parametrize("wrong", [{"max_rate_hz": 0.0}, {"max_rate_hz": float("nan")}, {"region": (500, 600, 0, 1)}])
-def test_a_selection_that_cannot_be_had_is_refused_by_name(wrong):
+def test_an_impossible_selection_is_refused(wrong):
     with pytest.raises(clearway.ClearwayError, match=next(iter(wrong))):
         next(clearway.watch(GRPC, **wrong))
 
 
-def test_every_layer_comes_where_none_is_named():
+def test_without_layers_every_layer_is_sent():
     with clearway.watch(GRPC) as maps:
         assert {"drivability", "terrain"} <= set(next(maps).layers)
 
 
-def test_the_vehicles_are_known_on_both_transports():
+def test_both_transports_list_the_vehicles():
     assert clearway.vehicles(GRPC) == ["car"] == clearway.vehicles(f"zenoh:{ZENOH}")
 
 
 @pytest.mark.parametrize("wrong, known", [({"vehicle": "bus"}, "car"), ({"layers": ["dirt"]}, "drivability")])
-def test_an_unknown_vehicle_or_layer_is_answered_with_the_known_ones(wrong, known):
+def test_an_unknown_vehicle_or_layer_is_refused_with_the_known_ones(wrong, known):
     with pytest.raises(clearway.ClearwayError, match=known):
         clearway.get(GRPC, **wrong)
     with pytest.raises(clearway.ClearwayError, match=known):
@@ -107,7 +107,7 @@ def test_a_program_may_end_without_closing_its_stream():
     assert (run.returncode, run.stderr) == (0, "")
 
 
-def test_nobody_at_an_address_is_named():
+def test_an_address_without_a_server_is_reported():
     with pytest.raises(clearway.ClearwayError, match="127.0.0.1:9: .*[Cc]onnect"):
         clearway.vehicles("127.0.0.1:9")
 
@@ -122,7 +122,7 @@ def test_the_examples_run(example):
         run.wait()
 
 
-def test_a_recording_gives_its_maps_in_order():
+def test_a_recording_has_its_maps_in_order():
     sequences = [m.sequence for m in clearway.read(RECORDING, "drivability")]
     assert sequences and sequences == list(range(sequences[0], sequences[0] + len(sequences)))
     assert clearway.read(RECORDING, "drivability").__next__()["drivability"].free.any()

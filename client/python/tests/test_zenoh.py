@@ -1,4 +1,5 @@
-"""A stream over zenoh against a session in this process that publishes as the server does (see the Rust client's zenoh.rs)."""
+"""A stream over zenoh against a session in this process that publishes as the server does (see the Rust client's
+zenoh.rs)."""
 
 import socket
 import subprocess
@@ -19,7 +20,7 @@ LASTS_NS = 60_000_000_000
 
 @pytest.fixture
 def endpoint():
-    # zenoh for Python does not tell the port that the system chose.
+    # zenoh for Python does not return the port that the system chose.
     with socket.create_server(("127.0.0.1", 0)) as chosen:
         return f"tcp/127.0.0.1:{chosen.getsockname()[1]}"
 
@@ -42,7 +43,7 @@ def part(sequence, layer="drivability", valid_ns=LASTS_NS):
 
 
 def published(session, layer="drivability"):
-    """As the server publishes."""
+    """Declares a publisher as the server does."""
     misses = ext.MissDetectionConfig(heartbeat=0.5, sporadic_heartbeat=None)
     return ext.declare_advanced_publisher(session, KEY.format(layer), cache=ext.CacheConfig(1), publisher_detection=True,
                                           sample_miss_detection=misses)  # fmt: skip
@@ -52,18 +53,18 @@ def watch(at, *layers):
     return clearway.watch(f"zenoh:{at}", vehicle="alpha", layers=layers or ["drivability"])
 
 
-def told(m):
+def counts(m):
     return m.sequence, m.skipped, m.lost
 
 
 def matched(publisher):
-    """Waits until somebody subscribes."""
+    """Waits until there is a subscriber."""
     changes = publisher.declare_matching_listener()
     while not publisher.matching_status.matching:
         changes.recv()
 
 
-def test_who_comes_late_has_the_current_map_of_every_layer_at_once(server, endpoint):
+def test_a_new_subscriber_gets_the_current_map_of_every_layer(server, endpoint):
     layers = ["drivability", "terrain"]
     publishers = [published(server, layer) for layer in layers]
     for sequence in (40, 41):
@@ -71,49 +72,52 @@ def test_who_comes_late_has_the_current_map_of_every_layer_at_once(server, endpo
             publisher.put(part(sequence, layer))
     with watch(endpoint, *layers) as maps:
         m = next(maps)
-    assert told(m) == (41, 0, 0) and [layer.name for layer in m._message.layers] == layers
+    assert counts(m) == (41, 0, 0) and [layer.name for layer in m._message.layers] == layers
 
 
-def test_of_the_skipped_maps_those_the_link_lost_are_told_and_a_lost_last_one_is_asked_for(server, endpoint):
+def test_lost_maps_are_counted_and_a_lost_last_map_is_queried(server, endpoint):
     key = KEY.format("drivability")
     asked = server.declare_queryable(key)
     maps = server.declare_publisher(key)
     heartbeats = server.declare_publisher(f"{key}/@adv/pub/{maps.id.zid}/{maps.id.eid}/_")
 
     def put(number, sequence):
-        """What a publisher numbers; the numbers that are left out were lost."""
+        """Publishes a sample with a number; missing numbers are lost samples."""
         maps.put(part(sequence), source_info=zenoh.SourceInfo(maps.id, number))
 
     with watch(endpoint) as stream:
         matched(maps)
         matched(heartbeats)
         put(0, 41)
-        assert told(next(stream)) == (41, 0, 0)
+        assert counts(next(stream)) == (41, 0, 0)
         put(2, 43)
-        assert told(next(stream)) == (43, 1, 1), "lost is one of those skipped"
+        assert counts(next(stream)) == (43, 1, 1), "the lost map is one of the skipped ones"
         put(3, 46)
-        assert told(next(stream)) == (46, 2, 0), "two were never put"
+        assert counts(next(stream)) == (46, 2, 0), "two maps were never published"
         heartbeats.put(ext.z_serialize(ext.UInt32(3)))
         heartbeats.put(ext.z_serialize(ext.UInt32(4)))
         with asked.recv() as query:
             query.reply(key, part(47))
-        assert told(next(stream)) == (47, 0, 0), "the last map came late, and is not lost"
+        assert counts(next(stream)) == (47, 0, 0), "the last map arrived late and is not lost"
         put(5, 48)
-        assert told(next(stream)) == (48, 0, 0)
-        assert asked.try_recv() is None, "nobody asks without a reason"
+        assert counts(next(stream)) == (48, 0, 0)
+        assert asked.try_recv() is None, "there is no query without a reason"
 
 
 @pytest.mark.parametrize("ending", ["", "maps.close()", "raise SystemExit(3)"], ids=["end", "close", "exit"])
 def test_a_program_may_end_without_closing_its_stream(server, endpoint, ending):
     publisher = published(server)
     publisher.put(part(3))
-    program = f"import clearway; maps = clearway.watch('zenoh:{endpoint}', vehicle='alpha', layers=['drivability']); next(maps); "
+    program = (
+        f"import clearway; maps = clearway.watch('zenoh:{endpoint}', vehicle='alpha', layers=['drivability']); "
+        "next(maps); "
+    )
     run = subprocess.run([sys.executable, "-c", program + ending], capture_output=True, text=True, timeout=60)
     assert (run.returncode, run.stderr) == (3 if "raise" in ending else 0, "")
 
 
 class Wire:
-    """Between client and server; while it is cut nothing passes, and nobody is told."""
+    """A connection between client and server. While it is cut, no data pass and neither side is notified."""
 
     def __init__(self, to):
         self._to = self._address(to)
@@ -154,7 +158,7 @@ class Wire:
         self._whole.set()
 
 
-def test_a_cut_link_makes_a_map_stale_and_the_stream_goes_on_with_what_was_lost_told(server, endpoint):
+def test_a_stream_continues_after_a_cut_link_and_counts_lost_maps(server, endpoint):
     publisher = published(server)
     wire = Wire(endpoint)
     publisher.put(part(0, valid_ns=1))
@@ -166,12 +170,12 @@ def test_a_cut_link_makes_a_map_stale_and_the_stream_goes_on_with_what_was_lost_
             publisher.put(part(sequence))
         wire.lay_anew()
         m = maps.next_or_stale()
-        assert not m.stale and told(m) == (4, 3, 3), "the newest at once, and what was lost"
+        assert not m.stale and counts(m) == (4, 3, 3), "the newest map, and the number of lost ones"
         publisher.put(part(5))
-        assert told(maps.next_or_stale()) == (5, 0, 0)
+        assert counts(maps.next_or_stale()) == (5, 0, 0)
 
 
-def test_certificates_are_not_left_unused_without_a_word(tmp_path):
+def test_certificates_for_an_unencrypted_endpoint_are_refused(tmp_path):
     for name in ("ca.pem", "reader.pem"):
         (tmp_path / name).write_text("")
     tls = clearway.Tls(tmp_path / "ca.pem")

@@ -43,7 +43,10 @@ pub fn map(sequence: u64, capture_end_ns: i64) -> Bytes {
     let heights: Vec<i8> = (0..12).map(|i| if i == 2 { -128 } else { i }).collect();
     let mut layer = v1::Layer {
         name: "drivability".into(),
-        geometry: Some(v1::layer::Geometry::Radial(v1::RadialGrid { row_radius_m: vec![10.0, 20.0, 30.0], columns: 4 })),
+        geometry: Some(v1::layer::Geometry::Radial(v1::RadialGrid {
+            row_radius_m: vec![10.0, 20.0, 30.0],
+            columns: 4,
+        })),
         channels: vec![
             encode_grid(CellsRef::U8(&CLASSES), 4).into_channel("class", "", 1.0, 0),
             encode_grid(CellsRef::I8(&heights), 4).into_channel("unit_height", "m", 0.5, -128),

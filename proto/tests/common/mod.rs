@@ -1,5 +1,5 @@
-//! The files in `golden/`, read and, with `CLEARWAY_BLESS=1`, written.
-#![allow(dead_code, reason = "each test file uses its part")]
+//! Reads the files in `golden/`, and writes them if `CLEARWAY_BLESS=1` is set.
+#![allow(dead_code, reason = "each test file uses a part of it")]
 
 use std::path::PathBuf;
 
@@ -17,17 +17,17 @@ pub fn golden(file: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("golden").join(file)
 }
 
-/// Compares with the file, or writes it when asked to bless.
-pub fn assert_golden(file: &str, made: &[u8]) {
+/// Compares bytes with a golden file; writes the file first if `CLEARWAY_BLESS` is set.
+pub fn assert_golden(file: &str, encoded: &[u8]) {
     let path = golden(file);
     if std::env::var_os("CLEARWAY_BLESS").is_some() {
-        std::fs::write(&path, made).unwrap();
+        std::fs::write(&path, encoded).unwrap();
     }
     let stored = std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-    assert!(stored == made, "{file} differs from what the encoder makes; CLEARWAY_BLESS=1 writes it anew");
+    assert!(stored == encoded, "{file} differs from what the encoder writes; CLEARWAY_BLESS=1 writes it again");
 }
 
-/// Writes seeds of a fuzz corpus, when asked to bless.
+/// Writes seeds of a fuzz corpus if `CLEARWAY_BLESS` is set.
 pub fn bless(corpus: &str, seeds: impl IntoIterator<Item = (&'static str, Vec<u8>)>) {
     if std::env::var_os("CLEARWAY_BLESS").is_some() {
         seeds.into_iter().for_each(|(name, seed)| std::fs::write(format!("{corpus}/{name}"), seed).unwrap());

@@ -30,8 +30,8 @@ impl ConfigurationOptions {
             return Ok(loaded?);
         }
         loaded.context(
-            "no configuration file; name one with --config FILE, or copy deploy/clearway.toml of the repository, which has \
-             every key with its default",
+            "no configuration file; name one with --config FILE, or copy deploy/clearway.toml of the repository, \
+             which has every key with its default",
         )
     }
 }

@@ -1,4 +1,4 @@
-//! The options that say where a server is and how to reach it -> a connected client.
+//! The options that name a server and the certificates to reach it -> a connected client.
 
 use std::path::PathBuf;
 
@@ -9,7 +9,7 @@ use clearway_client::{Client, ClientError, Tls};
 /// The gRPC address of a server with the default configuration.
 const ADDRESS: &str = "localhost:50051";
 
-/// The options that say where a server is and how to reach it.
+/// The options that name a server and the certificates to reach it.
 #[derive(Args)]
 pub struct ServerOptions {
     /// The server's gRPC address.
@@ -63,8 +63,8 @@ fn advice(error: &str) -> Option<&'static str> {
              (port 50051 by default), not the one of the page ([page] listen, port 8080 by default)",
         );
     }
-    let no_map = ["has no map yet", "makes no map at present"];
-    no_map.iter().any(|part| error.contains(part)).then_some(
+    let has_no_map = error.contains("no map");
+    has_no_map.then_some(
         "the server has no map to give: no packet or scan has arrived since it started, or none arrives now; \
          `clearway vehicles` shows what arrives, and `clearway watch` waits for the next map",
     )
@@ -76,7 +76,8 @@ mod tests {
 
     #[test]
     fn an_answer_over_http_is_explained_by_the_ports() {
-        let error = "http://localhost:8080: protocol error: received message with invalid compression flag: 110 (Internal)";
+        let error =
+            "http://localhost:8080: protocol error: received message with invalid compression flag: 110 (Internal)";
         assert!(advice(error).unwrap().contains("[page] listen"));
         assert!(advice("no clearway server answers at http://localhost:1: Connection refused").is_none());
     }

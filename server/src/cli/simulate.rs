@@ -22,8 +22,11 @@ use super::send::udp::{self, Sender, Speed};
 /// Speed of the vehicle in the scene `street`, in m/s; as in `demo --sensors many`.
 const STREET_MPS: f64 = 8.0;
 
+/// Builds a scene.
+type SceneMaker = fn() -> Scene;
+
 /// The scenes by name. In `flat`, `slopes`, `canopy`, `overhang` and `track` the vehicle stands still.
-const SCENES: [(&str, fn() -> Scene); 7] = [
+const SCENES: [(&str, SceneMaker); 7] = [
     ("town", scenes::town),
     ("street", || traffic::street(STREET_MPS)),
     ("flat", scenes::flat),

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use anyhow::{Result, bail};
 use clap::Args;
-use clearway_client::{MapStream, Sight, Subscription, Update, now_ns};
+use clearway_client::{MapStream, StreamEvent, Subscription, Update, now_ns};
 use serde_json::json;
 
 use super::connection::{ServerOptions, explain};
@@ -15,7 +15,8 @@ const FIRST_MAP_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps.
 ///
-/// If no newer map arrives before the last one becomes stale, a line says so; the lines continue when maps arrive again.
+/// If no newer map arrives before the last one becomes stale, a line says so; the lines continue when maps arrive
+/// again.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway watch
@@ -61,7 +62,7 @@ async fn watch(options: &Options) -> Result<()> {
     let mut printed = 0;
     while options.count.is_none_or(|count| printed < count) {
         let update = match next(&mut maps, printed == 0).await? {
-            Sight::Fresh(update) | Sight::Stale(update) => update,
+            StreamEvent::Fresh(update) | StreamEvent::Stale(update) => update,
         };
         let id = (update.map.header().boot_id, update.map.sequence());
         let is_new = last.replace(id) != Some(id);
@@ -75,12 +76,14 @@ async fn watch(options: &Options) -> Result<()> {
 }
 
 /// The next event of the stream. Says on stderr that it waits if this is the first one and does not come soon.
-async fn next(maps: &mut MapStream, is_first: bool) -> Result<Sight> {
+async fn next(maps: &mut MapStream, is_first: bool) -> Result<StreamEvent> {
     if is_first {
         if let Ok(event) = tokio::time::timeout(FIRST_MAP_TIMEOUT, maps.next_or_stale()).await {
             return event.map_err(explain);
         }
-        eprintln!("clearway: no map yet; waiting for the first one (`clearway vehicles` shows what the server receives)");
+        eprintln!(
+            "clearway: no map yet; waiting for the first one (`clearway vehicles` shows what the server receives)"
+        );
     }
     maps.next_or_stale().await.map_err(explain)
 }
@@ -103,7 +106,7 @@ async fn subscribe(options: &Options) -> Result<MapStream> {
 /// The line for a new map.
 fn line(update: &Update, as_json: bool) -> String {
     let (map, skipped, now) = (&update.map, update.skipped, now_ns());
-    let share = map.figure("drivable_share");
+    let share = map.metric("drivable_share");
     if as_json {
         let document = json!({
             "vehicle": map.vehicle(), "sequence": map.sequence(), "age_ms": map.age_ms(now), "stale": map.is_stale(now),

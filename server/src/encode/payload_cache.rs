@@ -32,7 +32,6 @@ type Payload = OnceLock<Result<Bytes, RegionError>>;
 
 impl PayloadCache {
     /// The payload of a key, encoded or not.
-
     pub fn slot(&self, key: Key) -> Arc<Payload> {
         let mut payloads = locked(&self.0);
         match payloads.get(&key) {

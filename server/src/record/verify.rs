@@ -1,5 +1,7 @@
-//! A recording -> are these the maps of these events? Rebuilds every vehicle's pipeline from the recorded configuration
-//! and calibration, steps all journal events and holds each map's bytes against the recorded ones.
+//! Verifies a recording: are the recorded maps the maps of the recorded events?
+//!
+//! Builds every vehicle's pipeline from the recorded configuration and calibrations, steps it with all events of the
+//! journal, and compares the bytes of each map with those of the recorded map.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -19,45 +21,45 @@ use serde_json::{Value, json};
 use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 use crate::encode::EncodedMap;
 
-/// Differences kept in a report; all are counted.
+/// Greatest number of differences in a report; all are counted. Ours: the first ones explain the others.
 const DIFFERENCES_MAX: usize = 20;
 
-/// What a recording was found to be.
+/// The result of a verification.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Report {
-    /// Events stepped.
+    /// Number of events of all journals.
     pub events: u64,
-    /// Maps of one layer that equal the recomputed ones, byte for byte.
+    /// Number of recorded maps, of one layer each, that equal the computed map byte for byte.
     pub equal: u64,
-    /// Maps made by the events.
+    /// Number of maps computed from the events.
     pub maps: u64,
-    /// The file was cut by a crash: what it holds was checked.
+    /// True if a crash cut the file; then the part before the cut is verified.
     pub cut: bool,
-    /// Maps made by the last events before the cut, and no longer recorded.
+    /// Number of maps, of one layer each, that belong to the last event before the cut and are not recorded.
     pub beyond_cut: u64,
-    /// The first differences found.
+    /// The first differences.
     pub differences: Vec<Difference>,
-    /// All differences.
+    /// Number of all differences.
     pub different: u64,
 }
 
-/// Where a recording is not what its events make.
+/// A difference between a recording and the maps of its events.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Difference {
     /// The vehicle's name.
     pub vehicle: String,
-    /// Of the map; of the event where the journal has a hole.
+    /// Sequence of the map, or of the first missing event.
     pub sequence: u64,
-    /// The layer's name; empty where the journal has a hole.
+    /// The layer's name; empty for missing events.
     pub layer: String,
-    /// What differs first.
-    pub what: What,
+    /// The first difference of the map.
+    pub kind: DifferenceKind,
 }
 
-/// What differs.
+/// The kind of a difference.
 #[derive(Clone, Debug, PartialEq)]
-pub enum What {
-    /// A cell.
+pub enum DifferenceKind {
+    /// A cell differs.
     Cell {
         /// Row of the grid.
         row: u32,
@@ -67,47 +69,47 @@ pub enum What {
         channel: String,
         /// Raw value in the recording.
         recorded: i32,
-        /// Raw value made of the events.
+        /// Raw value computed from the events.
         made: i32,
     },
-    /// Anything else of the map.
+    /// Another part of the map differs.
     Field {
-        /// Its name.
+        /// Name of the part.
         field: String,
-        /// In the recording.
+        /// Value in the recording.
         recorded: String,
-        /// Made of the events.
+        /// Value computed from the events.
         made: String,
     },
-    /// The events make this map, the recording does not hold it.
+    /// The recording lacks this map of the events.
     Missing,
-    /// The recording holds this map, the events do not make it.
+    /// The recording has this map, which does not follow from the events.
     Extra,
-    /// The journal lacks the events from here up to the one named.
-    Hole {
-        /// Sequence of the event that came instead.
+    /// The journal lacks the events from the difference's sequence up to `found`.
+    Gap {
+        /// Sequence of the next event in the journal.
         found: u64,
     },
 }
 
-/// Why a recording cannot be checked.
+/// A recording cannot be verified.
 #[derive(Debug, thiserror::Error)]
 pub enum VerifyError {
-    /// The file cannot be read.
+    /// The file cannot be read or is damaged.
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    /// The recorded configuration cannot be used.
+    /// The recorded configuration of a vehicle is invalid.
     #[error(transparent)]
     Config(#[from] ConfigValueError),
 }
 
 impl Report {
-    /// Whether every recorded map is the map of its events.
+    /// True if every recorded map is the map of its events.
     pub fn is_good(&self) -> bool {
         self.different == 0
     }
 
-    /// One object with all of it.
+    /// The report as one JSON object.
     pub fn to_json(&self) -> Value {
         json!({
             "ok": self.is_good(),
@@ -117,100 +119,101 @@ impl Report {
         })
     }
 
-    fn add(&mut self, vehicle: &str, sequence: u64, layer: &str, what: What) {
+    fn add(&mut self, vehicle: &str, sequence: u64, layer: &str, kind: DifferenceKind) {
         self.different += 1;
         if self.differences.len() < DIFFERENCES_MAX {
-            self.differences.push(Difference { vehicle: vehicle.into(), sequence, layer: layer.into(), what });
+            self.differences.push(Difference { vehicle: vehicle.into(), sequence, layer: layer.into(), kind });
         }
     }
 }
 
 impl Difference {
     fn to_json(&self) -> Value {
-        let what = match &self.what {
-            What::Cell { row, column, channel, recorded, made } => json!({
+        let kind = match &self.kind {
+            DifferenceKind::Cell { row, column, channel, recorded, made } => json!({
                 "cell": { "row": row, "column": column, "channel": channel, "recorded": recorded, "made": made }
             }),
-            What::Field { field, recorded, made } => {
+            DifferenceKind::Field { field, recorded, made } => {
                 json!({ "field": { "name": field, "recorded": recorded, "made": made } })
             }
-            What::Missing => json!("missing"),
-            What::Extra => json!("extra"),
-            What::Hole { found } => json!({ "hole": { "found": found } }),
+            DifferenceKind::Missing => json!("missing"),
+            DifferenceKind::Extra => json!("extra"),
+            DifferenceKind::Gap { found } => json!({ "hole": { "found": found } }),
         };
-        json!({ "vehicle": self.vehicle, "sequence": self.sequence, "layer": self.layer, "what": what })
+        json!({ "vehicle": self.vehicle, "sequence": self.sequence, "layer": self.layer, "what": kind })
     }
 }
 
 impl fmt::Display for Difference {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { vehicle, sequence, layer, what } = self;
-        if let What::Hole { found } = what {
+        let Self { vehicle, sequence, layer, kind } = self;
+        if let DifferenceKind::Gap { found } = kind {
             return write!(f, "vehicle {vehicle}: the journal lacks events {sequence} to {}", found.saturating_sub(1));
         }
         write!(f, "vehicle {vehicle}, sequence {sequence}, layer {layer}: ")?;
-        match what {
-            What::Cell { row, column, channel, recorded, made } => {
-                write!(f, "cell row {row} column {column}, channel {channel}: recorded {recorded}, made {made}")
+        match kind {
+            DifferenceKind::Cell { row, column, channel, recorded, made } => {
+                write!(f, "cell row {row} column {column}, channel {channel}: recorded {recorded}, computed {made}")
             }
-            What::Field { field, recorded, made } => write!(f, "{field}: recorded {recorded}, made {made}"),
-            What::Missing => write!(f, "the events make this map, the recording does not hold it"),
-            What::Extra | What::Hole { .. } => write!(f, "the recording holds this map, the events do not make it"),
+            DifferenceKind::Field { field, recorded, made } => write!(f, "{field}: recorded {recorded}, computed {made}"),
+            DifferenceKind::Missing => write!(f, "the recording lacks this map of the events"),
+            DifferenceKind::Extra | DifferenceKind::Gap { .. } => write!(f, "the recording has this map, which does not follow from the events"),
         }
     }
 }
 
-/// One vehicle, stepped again.
-struct Remaker {
+/// One vehicle whose maps are computed again.
+struct VehicleReplay {
     name: Arc<str>,
     pipeline: Pipeline,
     valid_ms: u32,
     next_event: u64,
-    /// Made and not yet met in the recording, by sequence and layer.
-    made: BTreeMap<(u64, String), Bytes>,
+    /// Computed maps that are not compared yet, by sequence and layer.
+    computed: BTreeMap<(u64, String), Bytes>,
 }
 
-/// Checks a recording.
+/// Verifies a recording. A map that differs is not an error; the [`Report`] contains it.
 ///
 /// # Errors
-/// [`VerifyError`] where the file cannot be read as a recording; a map that differs is no error but in the [`Report`].
+/// [`VerifyError::Recording`] if the file is not a recording or is damaged, [`VerifyError::Config`] if its configuration
+/// is invalid.
 pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     let mut recording = RecordingReader::open(file)?;
     let boot_id = recording.header().boot_id;
     let (config, tables) = recording.config()?;
-    let mut remakers = Vec::new();
+    let mut replays = Vec::new();
     for (vehicle, tables) in config.vehicles.iter().zip(tables) {
-        remakers.push(Remaker {
+        replays.push(VehicleReplay {
             name: vehicle.name.as_str().into(),
             pipeline: Pipeline::new(&vehicle.core(), tables)?,
             valid_ms: vehicle.maps.valid_ms,
             next_event: 0,
-            made: BTreeMap::new(),
+            computed: BTreeMap::new(),
         });
     }
     let mut report = Report::default();
-    for entry in recording.by_ref() {
-        match entry? {
+    for message in recording.by_ref() {
+        match message? {
             RecordedMessage::Event { vehicle, event } => {
-                let Some(remaker) = remakers.iter_mut().find(|r| *r.name == *vehicle) else { continue };
+                let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else { continue };
                 report.events += 1;
-                if event.sequence != remaker.next_event {
-                    report.add(&vehicle, remaker.next_event, "", What::Hole { found: event.sequence });
+                if event.sequence != replay.next_event {
+                    report.add(&vehicle, replay.next_event, "", DifferenceKind::Gap { found: event.sequence });
                 }
-                remaker.next_event = event.sequence.saturating_add(1);
-                if let Ok(Some(map)) = remaker.pipeline.step(&event) {
-                    let map = EncodedMap::new(map, remaker.name.clone(), boot_id, remaker.valid_ms);
+                replay.next_event = event.sequence.saturating_add(1);
+                if let Ok(Some(map)) = replay.pipeline.step(&event) {
+                    let map = EncodedMap::new(map, replay.name.clone(), boot_id, replay.valid_ms);
                     report.maps += 1;
                     for (layer, chunk) in &map.layers {
-                        remaker.made.insert((map.sequence, (*layer).to_owned()), map.layer(chunk));
+                        replay.computed.insert((map.sequence, (*layer).to_owned()), map.layer(chunk));
                     }
                 }
             }
             RecordedMessage::Map { vehicle, layer, bytes } => {
                 let sequence = sequence_of(&bytes);
-                let remaker = remakers.iter_mut().find(|r| *r.name == *vehicle);
-                match remaker.and_then(|remaker| remaker.made.remove(&(sequence, layer.clone()))) {
-                    None => report.add(&vehicle, sequence, &layer, What::Extra),
+                let replay = replays.iter_mut().find(|r| *r.name == *vehicle);
+                match replay.and_then(|replay| replay.computed.remove(&(sequence, layer.clone()))) {
+                    None => report.add(&vehicle, sequence, &layer, DifferenceKind::Extra),
                     Some(made) if made == bytes => report.equal += 1,
                     Some(made) => report.add(&vehicle, sequence, &layer, first_difference(&bytes, &made)),
                 }
@@ -219,29 +222,29 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
         }
     }
     report.cut = recording.is_cut();
-    for remaker in &remakers {
-        // The recorder writes an event and then its map, so a cut may leave the last events without theirs, no others.
-        let tail = remaker.made.last_key_value().map(|((sequence, _), _)| *sequence);
-        for (sequence, layer) in remaker.made.keys() {
+    for replay in &replays {
+        // The recorder writes an event before its map, so a cut can remove only the map of the last event.
+        let tail = replay.computed.last_key_value().map(|((sequence, _), _)| *sequence);
+        for (sequence, layer) in replay.computed.keys() {
             if report.cut && Some(*sequence) == tail {
                 report.beyond_cut += 1;
             } else {
-                report.add(&remaker.name, *sequence, layer, What::Missing);
+                report.add(&replay.name, *sequence, layer, DifferenceKind::Missing);
             }
         }
     }
     Ok(report)
 }
 
-/// The sequence a recorded map claims; one that cannot be read is found as extra under the largest number there is.
+/// The sequence of a recorded map; `u64::MAX` for an unreadable map, which then counts as extra.
 fn sequence_of(bytes: &Bytes) -> u64 {
     let map = v1::Map::decode(bytes.clone()).ok();
     map.and_then(|map| map.header).map_or(u64::MAX, |header| header.sequence)
 }
 
-/// Where two encoded maps of one layer differ first: header, geometry, channels cell by cell, the rest.
-fn first_difference(recorded: &Bytes, made: &Bytes) -> What {
-    let field = |field: &str, recorded: &dyn fmt::Debug, made: &dyn fmt::Debug| What::Field {
+/// The first difference of two encoded maps of one layer, in the order header, geometry, channels, all else.
+fn first_difference(recorded: &Bytes, made: &Bytes) -> DifferenceKind {
+    let field = |field: &str, recorded: &dyn fmt::Debug, made: &dyn fmt::Debug| DifferenceKind::Field {
         field: field.to_owned(),
         recorded: format!("{recorded:?}"),
         made: format!("{made:?}"),
@@ -266,7 +269,7 @@ fn first_difference(recorded: &Bytes, made: &Bytes) -> What {
         ("header source_sensor", &head.source_sensor, &new.source_sensor),
     ];
     for (name, a, b) in fields {
-        // Debug prints every bit that matters: floats in full, and -0 apart from 0.
+        // Debug distinguishes all values: it prints floats exactly, and -0 differs from 0.
         if format!("{a:?}") != format!("{b:?}") {
             return field(name, a, b);
         }
@@ -278,7 +281,7 @@ fn first_difference(recorded: &Bytes, made: &Bytes) -> What {
         return field("geometry", &was.geometry, &is.geometry);
     }
     let columns = Grid::from_wire(is).map_or(1, |grid| grid.shape().1.max(1));
-    let (recorded, made) = match (decoded(recorded), decoded(made)) {
+    let (recorded, made) = match (decode_first_layer(recorded), decode_first_layer(made)) {
         (Ok(recorded), Ok(made)) => (recorded, made),
         (was, is) => return field("cells", &was.err(), &is.err()),
     };
@@ -292,7 +295,7 @@ fn first_difference(recorded: &Bytes, made: &Bytes) -> What {
             if let Some(cell) = cells.into_iter().find(|&cell| value(recorded, cell) != value(made, cell)) {
                 let (row, column) = (cell as u32 / columns, cell as u32 % columns);
                 let (recorded, made) = (value(recorded, cell), value(made, cell));
-                return What::Cell { row, column, channel: b.name.clone(), recorded, made };
+                return DifferenceKind::Cell { row, column, channel: b.name.clone(), recorded, made };
             }
         }
         return field(&format!("channel {}", b.name), a, b);
@@ -300,9 +303,9 @@ fn first_difference(recorded: &Bytes, made: &Bytes) -> What {
     field("layer", &was, &is)
 }
 
-/// The first layer, even where a checksum says that its cells are not those that were encoded, and without the channels
-/// that cannot be decoded.
-fn decoded(bytes: &Bytes) -> Result<Layer, MapError> {
+/// Decodes the first layer of a map, also if a checksum of its cells is wrong, and without the channels that cannot be
+/// decoded.
+fn decode_first_layer(bytes: &Bytes) -> Result<Layer, MapError> {
     let mut bytes = bytes.clone();
     loop {
         let (of, name, source) = match decode_map(bytes.clone(), &Limits::default()) {

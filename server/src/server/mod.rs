@@ -5,15 +5,18 @@
 //! |---|---|
 //! | `setup` | what a server is started with; why it did not start or did not end well |
 //! | `start` | [`Setup`] -> [`Running`] |
+//! | `input` | event queue and UDP addresses of one vehicle |
 //! | `running` | [`Running`], and its shutdown |
 //! | `over_zenoh` | everything that uses the zenoh session |
 
+mod input;
 #[cfg(feature = "zenoh")]
 mod over_zenoh;
 mod running;
 mod setup;
 mod start;
 
-pub use running::{Running, VehicleInput};
+pub use input::VehicleInput;
+pub use running::Running;
 pub use setup::{Setup, ShutdownError, StartError};
 pub use start::Server;

@@ -3,7 +3,7 @@
 use tokio::task::JoinSet;
 use zenoh::Session;
 
-use super::running::VehicleInput;
+use super::input::VehicleInput;
 use crate::config::Config;
 use crate::ingest::gateway::Gateways;
 use crate::ingest::ros::live::{self, LiveTopics};

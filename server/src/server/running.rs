@@ -8,8 +8,8 @@ use std::time::Duration;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
+use super::input::VehicleInput;
 use super::setup::ShutdownError;
-use crate::ingest::queue::EventQueue;
 use crate::ingest::udp;
 use crate::publish::{Vehicles, foxglove};
 use crate::record::writer::Recorder;
@@ -17,16 +17,6 @@ use crate::subscriptions::LayerSubscription;
 
 /// Longest wait for each kind of publisher at shutdown. Ours: a stalled peer must not keep the server from ending.
 const PUBLISHERS_STOP_TIMEOUT: Duration = Duration::from_secs(2);
-
-/// Where the events of one vehicle enter a running server.
-pub struct VehicleInput {
-    /// The vehicle's name.
-    pub name: Arc<str>,
-    /// The vehicle's event queue.
-    pub queue: EventQueue,
-    /// The addresses that receive data packets and telemetry of the vehicle's first UDP sensor, if there is one.
-    pub udp: Option<(SocketAddr, SocketAddr)>,
-}
 
 /// A running server. If it is dropped without [`Running::shutdown`], the recording stays unfinished.
 #[derive(Default)]

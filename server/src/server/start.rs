@@ -11,7 +11,8 @@ use clearway_mapping::pipeline::{Pipeline, layer_names};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 
-use super::running::{Running, VehicleInput};
+use super::input::VehicleInput;
+use super::running::Running;
 use super::setup::{Setup, StartError};
 use crate::config::{Certificates, Config, Foxglove, Grpc, Vehicle};
 use crate::engine::{Engine, Observer};

@@ -1,4 +1,4 @@
-//! The status of all vehicles -> Prometheus' text format. What ends in `_total` only counts up; all else is a gauge.
+//! The status of all vehicles -> Prometheus' text format. A name that ends in `_total` is a counter, others are gauges.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -6,16 +6,16 @@ use std::sync::Arc;
 
 use clearway_mapping::pipeline::NamedStatus;
 
-use super::{Snapshot, VehicleStatus};
+use super::vehicle::{Snapshot, VehicleStatus};
 use crate::clock::now_ns;
 
-/// What `/metrics` shows of these vehicles.
+/// The text of `/metrics`.
 pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {
     let all = vehicles.iter().map(|status| (&**status, status.snapshot())).collect();
     let mut metrics = Metrics { all, text: String::new() };
-    metrics.tell_arrivals();
-    metrics.tell_sensors();
-    metrics.tell_maps();
+    metrics.write_arrivals();
+    metrics.write_sensors();
+    metrics.write_maps();
     metrics.text
 }
 
@@ -25,31 +25,31 @@ struct Metrics<'a> {
 }
 
 impl Metrics<'_> {
-    fn tell_arrivals(&mut self) {
+    fn write_arrivals(&mut self) {
         self.each("clearway_packets_received_total", "Datagrams and scans received.", |s| s.ledger.received);
         self.each("clearway_packets_decoded_total", "Data packets and scans decoded.", |s| s.ledger.decoded);
         self.each("clearway_telemetry_total", "Telemetry datagrams read.", |s| s.ledger.telemetry);
         let help = "Datagrams and scans refused, by reason.";
         self.each_reason("clearway_packets_refused_total", help, |s| &s.ledger.refused);
-        let help = "Messages that are no observations, which the ledger calls observation, by their own reason.";
+        let help = "Messages that are not valid observations, by reason.";
         self.each_reason("clearway_observations_refused_total", help, |s| &s.observations_refused);
-        self.each("clearway_events_lost_total", "Readings that found the door's queue full.", |s| s.ledger.lost);
+        self.each("clearway_events_lost_total", "Readings lost because the event queue was full.", |s| s.ledger.lost);
         let help = "Datagrams the kernel dropped at the vehicle's sockets.";
         self.each("clearway_kernel_drops_total", help, |s| s.ledger.kernel_drops);
-        self.each("clearway_poses_total", "Ego poses taken.", |s| s.ledger.poses);
+        self.each("clearway_poses_total", "Ego poses accepted.", |s| s.ledger.poses);
         self.each("clearway_poses_refused_total", "Ego poses refused.", |s| s.ledger.poses_refused);
-        self.each("clearway_roads_total", "Roads taken.", |s| s.ledger.roads);
+        self.each("clearway_roads_total", "Roads accepted.", |s| s.ledger.roads);
         self.each("clearway_roads_refused_total", "Roads refused.", |s| s.ledger.roads_refused.values().sum());
     }
 
-    fn tell_sensors(&mut self) {
+    fn write_sensors(&mut self) {
         let help = "Datagrams and scans received from a sensor.";
         self.each_sensor("clearway_sensor_received_total", help, |s| s.ledger.received as f64);
         let help = "A sensor's data packets and scans decoded.";
         self.each_sensor("clearway_sensor_decoded_total", help, |s| s.ledger.decoded as f64);
         let help = "A sensor's telemetry datagrams read.";
         self.each_sensor("clearway_sensor_telemetry_total", help, |s| s.ledger.telemetry as f64);
-        let help = "A sensor's readings that found the queue full.";
+        let help = "Readings of a sensor lost because the event queue was full.";
         self.each_sensor("clearway_sensor_lost_total", help, |s| s.ledger.lost as f64);
         let refused = self.sensors().flat_map(|(of, sensor)| {
             sensor.ledger.refused.iter().map(move |(reason, n)| (format!("{of},reason=\"{reason}\""), *n as f64))
@@ -57,15 +57,15 @@ impl Metrics<'_> {
         let refused = refused.collect();
         let help = "A sensor's datagrams and scans refused, by reason.";
         self.family("clearway_sensor_refused_total", help, refused);
-        let help = "Data packets that never came, by device time and azimuth, +-1 a gap.";
+        let help = "Data packets that did not arrive, by device time and azimuth, exact to one packet per gap.";
         self.each_sensor("clearway_packets_missing_total", help, |s| s.status.packets_lost as f64);
-        let help = "Degrees in which a sensor used to see and does no more.";
+        let help = "Degrees in which a sensor used to get returns and gets none.";
         self.each_sensor("clearway_blocked_degrees", help, |s| {
             s.status.blocked.sectors.iter().map(|sector| f64::from(sector.to_deg - sector.from_deg)).sum()
         });
     }
 
-    fn tell_maps(&mut self) {
+    fn write_maps(&mut self) {
         self.each("clearway_maps_total", "Maps made.", |s| s.maps);
         self.each("clearway_revolutions_total", "Revolutions completed.", Snapshot::revolutions);
         let now_ns = now_ns();
@@ -74,14 +74,14 @@ impl Metrics<'_> {
             (s.maps > 0).then(|| (vehicle(of), age_ns as f64 / 1e9))
         };
         let ages = self.all.iter().filter_map(age).collect();
-        self.family("clearway_map_age_seconds", "Age of the newest map, from its capture's end.", ages);
+        self.family("clearway_map_age_seconds", "Age of the newest map, from the end of its capture.", ages);
         let latency = |(of, s): &(&VehicleStatus, Snapshot)| {
             let of = vehicle(of);
             let quantiles = [("0.5", s.latency_ms_p50), ("0.99", s.latency_ms_p99)];
             quantiles.map(|(q, ms)| Some((format!("{of},quantile=\"{q}\""), ms? / 1e3))).into_iter().flatten()
         };
         let latencies = self.all.iter().flat_map(latency).collect();
-        self.family("clearway_map_latency_seconds", "Step and encode of a map.", latencies);
+        self.family("clearway_map_latency_seconds", "Time to step and encode a map.", latencies);
         let readers = |(of, _): &(&VehicleStatus, Snapshot)| {
             let of = vehicle(of);
             move |(transport, n)| (format!("{of},transport=\"{transport}\""), f64::from(n))
@@ -92,7 +92,7 @@ impl Metrics<'_> {
             (vehicle(of), of.recorder.get().map_or(0, |counts| counts.lost()) as f64)
         };
         let lost = self.all.iter().map(lost).collect();
-        self.family("clearway_recorder_lost_total", "Events and maps the recording does not hold.", lost);
+        self.family("clearway_recorder_lost_total", "Events and maps lost to the recording.", lost);
     }
 
     /// The sensors of all vehicles, each with its labels.
@@ -122,7 +122,7 @@ impl Metrics<'_> {
         self.family(name, help, samples);
     }
 
-    /// One metric: its samples by their labels. Without samples there is none.
+    /// Writes one metric with its samples; without samples it is left out.
     fn family(&mut self, name: &str, help: &str, samples: Vec<(String, f64)>) {
         if samples.is_empty() {
             return;
@@ -138,4 +138,27 @@ impl Metrics<'_> {
 
 fn vehicle(status: &VehicleStatus) -> String {
     format!("vehicle=\"{}\"", status.name)
+}
+
+#[cfg(test)]
+mod tests {
+    use clearway_mapping::ledger::Ledger;
+
+    use super::*;
+
+    #[test]
+    fn readings_dropped_before_the_queue_are_in_the_metrics() {
+        let (door, _events) = crate::ingest::queue::event_queue(4);
+        door.refuse_unknown_sender(([10, 0, 0, 9], 2368).into());
+        door.refuse_unknown_sender(([10, 0, 0, 9], 2368).into());
+        let status = VehicleStatus::new("car".into(), 1, vec!["drivability"], door.drops());
+        let ledger = Ledger { received: 3, decoded: 2, telemetry: 1, ..Ledger::default() };
+        status.stepped(&ledger, Vec::new());
+        let shown = status.snapshot().ledger;
+        assert_eq!(shown.refused["source"], 2);
+        assert_eq!(shown.received, shown.decoded + shown.telemetry + shown.refused.values().sum::<u64>());
+        let text = prometheus(&[Arc::new(status)]);
+        assert!(text.contains("clearway_packets_received_total{vehicle=\"car\"} 5\n"), "{text}");
+        assert!(text.contains("clearway_packets_refused_total{vehicle=\"car\",reason=\"source\"} 2\n"), "{text}");
+    }
 }

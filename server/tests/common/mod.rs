@@ -1,6 +1,6 @@
-//! A map whose every class is known by heart, and the binary.
+//! A map with known classes, and the binary `clearway`.
 
-// Each test takes what it needs of this.
+// Each test file uses a part of this.
 #![allow(dead_code)]
 
 use std::process::{Command, Output};
@@ -14,7 +14,7 @@ use clearway_proto::v1::ClassMeaning;
 
 pub const CAPTURE_END_NS: i64 = 1_700_000_000_100_000_000;
 
-/// Three benches of 10 m, four columns of a quarter turn: ahead and to the left drivable, behind and to the left not,
+/// Three rows of 10 m, four columns of 90 degrees: ahead and to the left drivable, behind and to the left not drivable,
 /// behind and to the right unknown, ahead and to the right drivable with an obstacle from 10 to 20 m.
 #[rustfmt::skip]
 pub const CLASSES: [u8; 12] = [
@@ -37,7 +37,10 @@ pub fn map(sequence: u64, capture_end_ns: i64) -> Bytes {
     let heights: Vec<i8> = (0..12).map(|i| if i == 2 { -128 } else { i }).collect();
     let mut layer = v1::Layer {
         name: "drivability".into(),
-        geometry: Some(v1::layer::Geometry::Radial(v1::RadialGrid { row_radius_m: vec![10.0, 20.0, 30.0], columns: 4 })),
+        geometry: Some(v1::layer::Geometry::Radial(v1::RadialGrid {
+            row_radius_m: vec![10.0, 20.0, 30.0],
+            columns: 4,
+        })),
         channels: vec![
             encode_grid(CellsRef::U8(&CLASSES), 4).into_channel("class", "", 1.0, 0),
             encode_grid(CellsRef::I8(&heights), 4).into_channel("unit_height", "m", 0.5, -128),

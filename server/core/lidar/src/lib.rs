@@ -17,6 +17,9 @@
 //! | [`revolution`] | the range image |
 //! | `config`, `status` | [`SensorConfig`] and [`SensorStatus`] |
 
+// The core is pure: server/core/clippy.toml lists what it must not use.
+#![deny(clippy::disallowed_methods, clippy::disallowed_types)]
+
 pub mod calibration;
 mod config;
 mod datagram;

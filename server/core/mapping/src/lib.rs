@@ -16,6 +16,9 @@
 //! | [`map`] | what a map contains |
 //! | [`scan_file`] | KITTI `.bin`, `.pcd` -> scan |
 
+// The core is pure: server/core/clippy.toml lists what it must not use.
+#![deny(clippy::disallowed_methods, clippy::disallowed_types)]
+
 pub mod config;
 pub mod error;
 pub mod event;

@@ -1,19 +1,20 @@
-//! A layer of a map, and points whose truth is known -> counts that can be summed over frames, and precision and recall.
+//! A layer of a map, and points whose truth is known -> counts that can be summed over frames, and precision and
+//! recall.
 //!
 //! In: a [`Layer`] and [`Point`]s, both in the ego frame of one stamp. Out: a [`Tally`]. This file does not depend on
 //! where the truth comes from (labels or a simulated world).
 //!
 //! The points in a cell vote for its truth; points more than 2.5 m above the ground do not vote. A point of an obstacle
 //! makes the cell an obstacle. Otherwise the most frequent of forbidden, either and drivable wins, and in a tie the one
-//! named first here. Precision is the share of the cells called drivable, and seen by a point, that are neither obstacle
-//! nor forbidden. Recall is the share of the drivable cells that are called drivable. A point is called ground if its
-//! cell is called drivable and it lies at most [`GROUND_OVER_LOWEST_M`] above the cell's lowest point. Points outside
-//! the layer's grid are not scored.
+//! named first here. Precision is the share of the cells called drivable, and seen by a point, that are neither
+//! obstacle nor forbidden. Recall is the share of the drivable cells that are called drivable. A point is called ground
+//! if its cell is called drivable and it lies at most [`GROUND_OVER_LOWEST_M`] above the cell's lowest point. Points
+//! outside the layer's grid are not scored.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use clearway_mapping::layer::{Cells, ClassInfo, Geometry, Layer, Meaning};
 use clearway_mapping::layer::radial_grid::RadialGrid;
+use clearway_mapping::layer::{Cells, ClassInfo, Geometry, Layer, Meaning};
 
 /// Least height of an obstacle above the ground, in metres.
 pub const OBSTACLE_M_MIN: f32 = 0.3;
@@ -115,7 +116,8 @@ impl Confusion {
 }
 
 impl Tally {
-    /// Share of the cells called drivable that are neither obstacle nor forbidden; `None` if no cell is called drivable.
+    /// Share of the cells called drivable that are neither obstacle nor forbidden; `None` if no cell is called
+    /// drivable.
     pub fn precision(&self) -> Option<f64> {
         share(self.called - self.called_wrongly, self.called)
     }

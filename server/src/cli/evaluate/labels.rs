@@ -13,8 +13,8 @@ use clearway_mapping::sensor::sweep::Sweep;
 
 use super::judge::{OBSTACLE_M_MAX, OBSTACLE_M_MIN, Point, Scored, Vote};
 
-/// Name of each class by its number, from SemanticKITTI's list (semantic-kitti.yaml). A moving class has the name of the
-/// same class at rest.
+/// Name of each class by its number, from SemanticKITTI's list (semantic-kitti.yaml). A moving class has the name of
+/// the same class at rest.
 const CLASSES: [(u32, &str); 34] = [
     (0, "unlabeled"),
     (1, "outlier"),
@@ -171,8 +171,8 @@ fn scored(class: u32, low: bool) -> [Scored; 2] {
     }
 }
 
-/// Height of the labelled ground around a position: the median of its square of 2 m, or of the nearest squares that have
-/// ground, in metres.
+/// Height of the labelled ground around a position: the median of its square of 2 m, or of the nearest squares that
+/// have ground, in metres.
 struct GroundHeight(BTreeMap<(i32, i32), f32>);
 
 impl GroundHeight {

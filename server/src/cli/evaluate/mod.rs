@@ -40,8 +40,8 @@ use judge::{Point, Tally};
 use pairs::Pair;
 use report::{Report, Source};
 
-/// How the sensor is mounted on KITTI's car, from KITTI's published sensor setup. The published metrics of other methods
-/// use it, and an estimate from one scan tilts with the road under it.
+/// How the sensor is mounted on KITTI's car, from KITTI's published sensor setup. The published metrics of other
+/// methods use it, and an estimate from one scan tilts with the road under it.
 const KITTI_EXTRINSICS: Extrinsics =
     Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.73, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
 /// Largest difference between the estimated height of the sensor and KITTI's, in metres; beyond it the scans are from
@@ -149,7 +149,11 @@ pub fn run(options: &Options) -> anyhow::Result<()> {
     });
     bar.finish_and_clear();
     let report = outcome?;
-    if options.json { print_line(&format!("{:#}", report.to_json()))? } else { print(&report.to_text())? };
+    if options.json {
+        print_line(&format!("{:#}", report.to_json()))?
+    } else {
+        print(&report.to_text())?
+    };
     Ok(())
 }
 

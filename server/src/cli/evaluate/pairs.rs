@@ -1,8 +1,8 @@
 //! Files and folders -> scans with their labels.
 //!
 //! A scan `STEM.bin` and its labels `STEM.label` form a pair in one folder, in `velodyne/` beside `labels/` as
-//! SemanticKITTI has them, or in any two folders of one parent. Labels without a scan are an error. Scans without labels
-//! are counted, because a drive is often labelled in part.
+//! SemanticKITTI has them, or in any two folders of one parent. Labels without a scan are an error. Scans without
+//! labels are counted, because a drive is often labelled in part.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -46,7 +46,10 @@ pub enum PairsError {
         path: PathBuf,
     },
     /// Labels without a scan.
-    #[error("{}: no {stem}.bin in its folder, in ../velodyne or in another folder of the same parent", labels.display())]
+    #[error(
+        "{}: no {stem}.bin in its folder, in ../velodyne or in another folder of the same parent",
+        labels.display()
+    )]
     NoScan {
         /// File of the labels.
         labels: PathBuf,

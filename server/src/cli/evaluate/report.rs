@@ -7,18 +7,18 @@ use serde_json::{Value, json};
 use super::judge::{Confusion, Tally};
 
 /// The protocols by which ground points are scored: name and description. Both leave out points without a class
-/// (unlabeled, outlier) and the vehicle itself, and count road, parking, sidewalk, other-ground, lane-marking and terrain
-/// as ground.
+/// (unlabeled, outlier) and the vehicle itself, and count road, parking, sidewalk, other-ground, lane-marking and
+/// terrain as ground.
 pub const PROTOCOLS: [(&str, &str); 2] = [
     (
         "vegetation_excluded",
-        "as in Patchwork++ (Lee 2022, section IV.A) and GroundGrid's published script: ground is road, parking, sidewalk, \
-         other-ground, lane-marking and terrain; vegetation is not scored; everything else is not ground",
+        "as in Patchwork++ (Lee 2022, section IV.A) and GroundGrid's published script: ground is road, parking, \
+         sidewalk, other-ground, lane-marking and terrain; vegetation is not scored; everything else is not ground",
     ),
     (
         "low_vegetation_ground",
-        "as in Patchwork (Lim 2021): the same, except that vegetation lower than a quarter of the sensor's height above the \
-         vehicle's ground (z < -1.3 m from KITTI's sensor) is ground, and higher vegetation is not",
+        "as in Patchwork (Lim 2021): the same, except that vegetation lower than a quarter of the sensor's height \
+         above the vehicle's ground (z < -1.3 m from KITTI's sensor) is ground, and higher vegetation is not",
     ),
 ];
 
@@ -93,8 +93,8 @@ impl Report {
         }
         let _ = writeln!(
             text,
-            "A leak is a cell called drivable that has a point 0.3 to 2.5 m above the ground, or (simulated) ground that is \
-             too steep or cannot be reached."
+            "A leak is a cell called drivable that has a point 0.3 to 2.5 m above the ground, or (simulated) ground \
+             that is too steep or cannot be reached."
         );
         PROTOCOLS.iter().for_each(|(name, words)| _ = writeln!(text, "{name}: {words}."));
         text
@@ -135,7 +135,7 @@ impl Report {
             })
         };
         json!({
-            "protocols": PROTOCOLS.iter().map(|(name, words)| json!({ "name": name, "counts": words })).collect::<Vec<_>>(),
+            "protocols": PROTOCOLS.map(|(name, words)| json!({ "name": name, "counts": words })),
             "sources": self.sources.iter().map(source).collect::<Vec<_>>(),
         })
     }

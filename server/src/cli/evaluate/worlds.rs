@@ -31,8 +31,8 @@ pub fn scanner() -> ScannerConfig {
     ScannerConfig::default()
 }
 
-/// Drives through the scene until `revolutions` whole revolutions have become maps, and calls `judge` after each with the
-/// pipeline and the points of the map.
+/// Drives through the scene until `revolutions` whole revolutions have become maps, and calls `judge` after each with
+/// the pipeline and the points of the map.
 pub fn drive(scene: Scene, pipeline: &mut Pipeline, revolutions: u64, mut judge: impl FnMut(&Pipeline, Vec<Point>)) {
     let vehicle = SimulatedVehicle::new(scene, scanner());
     let mut next_pose_ns = vehicle.start_ns();

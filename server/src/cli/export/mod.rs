@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `layer_json` | a layer -> JSON |
 //! | `npy` | the cells of a channel -> a NumPy file |
-//! | `scans` | the events of a recording -> the points of each revolution |
+//! | `scans` | the events of a recording -> the points of each scan |
 //! | `viewer_file` | maps, points -> an MCAP file for viewers |
 
 use std::fs;
@@ -96,7 +96,7 @@ impl Output {
     }
 }
 
-/// The options that say how pictures are drawn.
+/// The options for drawing pictures.
 #[derive(Args)]
 pub struct DrawingOptions {
     /// Edge of a picture, in pixels.
@@ -147,7 +147,7 @@ pub fn run(options: &Options) -> Result<()> {
             continue;
         }
         if let Output::Viewer(viewer) = &mut output {
-            viewer.take_event(&message, recording.header())?;
+            viewer.write_event(&message, recording.header())?;
         }
         let Some((_, of_layer)) = message.map_of() else { continue };
         if layer.as_ref().is_some_and(|only| only != of_layer) {
@@ -159,7 +159,7 @@ pub fn run(options: &Options) -> Result<()> {
         let map = decode(&message, file)?;
         let of_layer = map.layer(of_layer)?;
         match &mut output {
-            Output::Viewer(viewer) => viewer.take_map(&map, of_layer, message.log_ns)?,
+            Output::Viewer(viewer) => viewer.write_map(&map, of_layer, message.log_ns)?,
             Output::Files(_) if vehicles.len() > 1 => {
                 bail!("{} has maps of {}: name one with --vehicle", file.display(), vehicles.join(" and "))
             }

@@ -1,44 +1,46 @@
-//! A recording's journal -> the turns of each sensor, decoded again: points in the sensor's own frame, as it saw them.
+//! The events of a recording -> the scans of each sensor, decoded again: points in the sensor frame.
 //!
-//! The recorded configuration and calibrations say how. Points are not moved to the turn's end, and what the maps leave
-//! out (the vehicle itself, blind sectors) is there.
+//! The sensors are those of the recorded configuration and calibrations. The points are not compensated for the motion
+//! of the vehicle, and those that the maps leave out (the vehicle itself, blind sectors) are in the scans.
 
 use std::collections::BTreeMap;
 
 use anyhow::{Context, Result};
 use clearway_client::v1;
+use clearway_lidar::Sensor;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::Sensor;
 use clearway_mapping::config::{Extrinsics, SensorConfig};
 use clearway_proto::packed::unpack;
 use nalgebra::Isometry3;
-use crate::record::mcap_reader::Header;
 use prost::Message;
 use serde::Deserialize;
 
-/// One turn of one sensor.
-pub struct Turn<'a> {
-    /// The sensor's name.
+use crate::record::mcap_reader::Header;
+
+/// One scan of one sensor.
+pub struct SensorScan<'a> {
+    /// Name of the sensor.
     pub sensor: &'a str,
-    /// Of its end, ns since the Unix epoch.
+    /// Stamp of its end, in nanoseconds since the Unix epoch.
     pub stamp_ns: i64,
-    /// Where the sensor sits.
+    /// Position and orientation of the sensor in the ego frame.
     pub ego_from_sensor: &'a Isometry3<f64>,
-    /// Sensor frame, metres.
+    /// Points in the sensor frame, in metres.
     pub points: Vec<[f32; 3]>,
 }
 
-/// The sensors of every vehicle, by index.
-pub struct Turns(BTreeMap<String, Vec<OneSensor>>);
+/// The decoders of the sensors of a recording, by vehicle and index.
+pub struct ScanDecoder(BTreeMap<String, Vec<OneSensor>>);
 
+/// One sensor and its decoder.
 struct OneSensor {
     name: String,
     ego_from_sensor: Isometry3<f64>,
     decoder: Sensor,
 }
 
-/// Of the recorded configuration, what matters here.
+/// The parts of the recorded configuration that are needed to decode.
 #[derive(Deserialize)]
 struct Config {
     #[serde(rename = "vehicle")]
@@ -52,11 +54,11 @@ struct Vehicle {
     sensors: Vec<SensorConfig>,
 }
 
-impl Turns {
-    /// The sensors of a recording, by its header; none where it has no configuration.
+impl ScanDecoder {
+    /// The decoders of the sensors in the recording's header; none if it has no configuration.
     ///
     /// # Errors
-    /// What is wrong with the configuration or a calibration.
+    /// If the configuration or a calibration in the header is wrong.
     pub fn new(header: &Header) -> Result<Self> {
         let Some(config) = &header.config else { return Ok(Self(BTreeMap::new())) };
         let config: Config = toml::from_str(config).context("attachment config.toml")?;
@@ -73,11 +75,11 @@ impl Turns {
         config.vehicles.into_iter().map(sensors).collect::<Result<_>>().map(Self)
     }
 
-    /// Takes an event of a vehicle's journal; gives the turn that it completes. What a sensor refuses completes none.
+    /// Decodes an event of a vehicle's journal; returns the scan that it completes. A refused datagram completes none.
     ///
     /// # Errors
-    /// Where the bytes are no event.
-    pub fn take(&mut self, vehicle: &str, event: &[u8]) -> Result<Option<Turn<'_>>> {
+    /// If the bytes are not an event.
+    pub fn decode(&mut self, vehicle: &str, event: &[u8]) -> Result<Option<SensorScan<'_>>> {
         use v1::event::Body;
         let Some(sensors) = self.0.get_mut(vehicle) else { return Ok(None) };
         let event = v1::Event::decode(event).with_context(|| format!("journal of {vehicle}"))?;
@@ -89,13 +91,15 @@ impl Turns {
             return Ok(None);
         }
         let Some(OneSensor { name, ego_from_sensor, decoder }) = sensors.get_mut(index) else { return Ok(None) };
-        let turn = match &event.body {
-            Some(Body::Datagram(payload)) => decoder.push(payload, event.arrival_ns).ok().flatten().map(of_revolution),
-            Some(Body::End(_)) => decoder.finish().map(of_revolution),
-            Some(Body::Scan(scan)) => of_scan(scan),
+        let scan = match &event.body {
+            Some(Body::Datagram(payload)) => {
+                decoder.push(payload, event.arrival_ns).ok().flatten().map(from_revolution)
+            }
+            Some(Body::End(_)) => decoder.finish().map(from_revolution),
+            Some(Body::Scan(scan)) => from_scan(scan),
             _ => None,
         };
-        Ok(turn.map(|(stamp_ns, points)| Turn { sensor: name, stamp_ns, ego_from_sensor, points }))
+        Ok(scan.map(|(stamp_ns, points)| SensorScan { sensor: name, stamp_ns, ego_from_sensor, points }))
     }
 }
 
@@ -109,18 +113,18 @@ impl OneSensor {
     }
 }
 
-fn of_revolution(revolution: &Revolution) -> (i64, Vec<[f32; 3]>) {
+fn from_revolution(revolution: &Revolution) -> (i64, Vec<[f32; 3]>) {
     (revolution.end_ns, revolution.points().map(|point| [point.x, point.y, point.z]).collect())
 }
 
-/// `None` where the lists are not of one length.
-fn of_scan(scan: &v1::Scan) -> Option<(i64, Vec<[f32; 3]>)> {
+/// The stamp and the points of a recorded scan; `None` if its lists differ in length.
+fn from_scan(scan: &v1::Scan) -> Option<(i64, Vec<[f32; 3]>)> {
     let [x, y, z]: [Vec<f32>; 3] = [unpack(&scan.x)?, unpack(&scan.y)?, unpack(&scan.z)?];
     let points = x.iter().zip(&y).zip(&z).map(|((&x, &y), &z)| [x, y, z]).collect();
     (x.len() == y.len() && y.len() == z.len()).then_some((scan.stamp_ns, points))
 }
 
-/// A sensor that a stream told of, with what decoding needs.
+/// The configuration of a sensor that a client declared, as far as decoding needs it.
 fn declared(sensor: &v1::Sensor) -> SensorConfig {
     let &v1::Sensor { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, .. } = sensor;
     let plain = SensorConfig::new(&sensor.name, Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg });

@@ -1,47 +1,48 @@
-//! A recording -> one MCAP file that viewers open with nothing installed.
+//! A recording -> one MCAP file that viewers open without a plug-in.
 //!
 //! foxglove: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf`
 //! (`foxglove.FrameTransforms`). ros2: `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`),
 //! `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`), `/clearway/<vehicle>/odometry`
-//! (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages are logged when the recording has
-//! them, and stamped with the capture's end, or the turn's.
+//! (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages have the log
+//! times of the recording, and the stamp of the capture's or the scan's end.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
-use anyhow::{Context, Result};
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::{base_frame, foxglove as messages, ros};
+use anyhow::{Context, Result};
 use clearway_client::{Layer, MapView};
 use clearway_ros::published::{OCCUPANCY_GRID, ODOMETRY, POINT_CLOUD2, Published, TF_MESSAGE};
 use foxglove::Encode;
 use foxglove::messages::FrameTransforms;
 use mcap::records::MessageHeader;
 
-use super::scans::{Turn, Turns};
+use super::scans::{ScanDecoder, SensorScan};
 use crate::record::mcap_reader::{Header, Message};
 
-/// Whose messages the file has.
+/// Kind of the messages in the file.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Dialect {
-    /// Foxglove's schemas, protobuf.
+    /// Foxglove's messages, encoded in protobuf.
     Foxglove,
-    /// ROS 2's, CDR.
+    /// ROS 2 messages, encoded in CDR.
     Ros2,
 }
 
-/// A file being written.
+/// An MCAP file for viewers that is being written.
 pub struct ViewerFile {
     dialect: Dialect,
     writer: mcap::Writer<BufWriter<File>>,
-    /// Channel and newest sequence by topic.
+    /// The id of each topic's channel and the sequence number of its newest message, by topic.
     channels: HashMap<String, (u16, u32)>,
     rasters: BTreeMap<String, Rasters>,
-    /// By vehicle: stamp of the newest map whose pose is written.
+    /// Stamp of the newest map whose pose is written, by vehicle.
     placed: HashMap<String, i64>,
-    turns: Option<Turns>,
+    /// `None` before the first event.
+    decoder: Option<ScanDecoder>,
     with_points: bool,
 }
 
@@ -49,7 +50,7 @@ impl ViewerFile {
     /// Creates the file.
     ///
     /// # Errors
-    /// Where it cannot be written.
+    /// If the file exists or cannot be written.
     pub fn create(file: &Path, dialect: Dialect, with_points: bool) -> Result<Self> {
         let open = File::create_new(file).with_context(|| format!("create {}", file.display()))?;
         let profile = if dialect == Dialect::Ros2 { "ros2" } else { "" };
@@ -60,33 +61,33 @@ impl ViewerFile {
             channels: HashMap::new(),
             rasters: BTreeMap::new(),
             placed: HashMap::new(),
-            turns: None,
+            decoder: None,
             with_points,
         })
     }
 
-    /// Takes an event of a journal, for the points in it; `header` is the recording's.
+    /// Writes the points of the scan that an event completes; `header` is that of the recording.
     ///
     /// # Errors
-    /// What is wrong with the recording, or where the file cannot be written.
-    pub fn take_event(&mut self, message: &Message, header: &Header) -> Result<()> {
+    /// If the event or the header is wrong, or the file cannot be written.
+    pub fn write_event(&mut self, message: &Message, header: &Header) -> Result<()> {
         let Some(vehicle) = message.journal_of().filter(|_| self.with_points) else { return Ok(()) };
-        let mut turns = match self.turns.take() {
-            Some(turns) => turns,
-            None => Turns::new(header)?,
+        let mut decoder = match self.decoder.take() {
+            Some(decoder) => decoder,
+            None => ScanDecoder::new(header)?,
         };
-        if let Some(turn) = turns.take(vehicle, &message.data)? {
-            self.write_turn(vehicle, &turn, message.log_ns)?;
+        if let Some(scan) = decoder.decode(vehicle, &message.data)? {
+            self.write_scan(vehicle, &scan, message.log_ns)?;
         }
-        self.turns = Some(turns);
+        self.decoder = Some(decoder);
         Ok(())
     }
 
-    /// Takes a map's layer, and where the vehicle was.
+    /// Writes a layer of a map, and the vehicle's pose if the map is new.
     ///
     /// # Errors
-    /// Where the file cannot be written.
-    pub fn take_map(&mut self, map: &MapView, layer: &Layer, log_ns: u64) -> Result<()> {
+    /// If the file cannot be written.
+    pub fn write_map(&mut self, map: &MapView, layer: &Layer, log_ns: u64) -> Result<()> {
         let (vehicle, name) = (map.vehicle(), &layer.name);
         let mut rasters = self.rasters.remove(vehicle).unwrap_or_default();
         let raster = rasters.of(layer);
@@ -101,16 +102,16 @@ impl ViewerFile {
             }
         }
         self.rasters.insert(vehicle.to_owned(), rasters);
-        // A map's layers are messages of their own, each with the same header.
+        // Each layer of a map is a message of its own, with the header of the map.
         let stamp_ns = map.header().capture_end_ns;
         let is_new = self.placed.insert(vehicle.to_owned(), stamp_ns) != Some(stamp_ns);
         if is_new { self.write_pose(map, log_ns) } else { Ok(()) }
     }
 
-    /// Closes the file.
+    /// Writes the end of the file.
     ///
     /// # Errors
-    /// Where it cannot be written.
+    /// If the file cannot be written.
     pub fn finish(mut self) -> Result<()> {
         self.writer.finish()?;
         Ok(())
@@ -131,20 +132,20 @@ impl ViewerFile {
         }
     }
 
-    fn write_turn(&mut self, vehicle: &str, turn: &Turn, log_ns: u64) -> Result<()> {
-        let frame = format!("{vehicle}/{}", turn.sensor);
-        let (stamp_ns, base, mount) = (turn.stamp_ns, base_frame(vehicle), turn.ego_from_sensor);
+    fn write_scan(&mut self, vehicle: &str, scan: &SensorScan, log_ns: u64) -> Result<()> {
+        let frame = format!("{vehicle}/{}", scan.sensor);
+        let (stamp_ns, base, mount) = (scan.stamp_ns, base_frame(vehicle), scan.ego_from_sensor);
         match self.dialect {
             Dialect::Foxglove => {
                 let mount = messages::transform(stamp_ns, &base, &frame, mount);
                 self.write_foxglove("/tf", &FrameTransforms { transforms: vec![mount] }, log_ns)?;
-                let cloud = messages::points(stamp_ns, &frame, turn.points.iter().copied());
-                self.write_foxglove(&format!("/{vehicle}/points/{}", turn.sensor), &cloud, log_ns)
+                let cloud = messages::points(stamp_ns, &frame, scan.points.iter().copied());
+                self.write_foxglove(&format!("/{vehicle}/points/{}", scan.sensor), &cloud, log_ns)
             }
             Dialect::Ros2 => {
                 self.write_ros("/tf", &TF_MESSAGE, &ros::transform(stamp_ns, &base, &frame, mount), log_ns)?;
-                let cloud = ros::points(stamp_ns, &frame, &turn.points);
-                let topic = format!("/clearway/{vehicle}/points/{}", turn.sensor);
+                let cloud = ros::points(stamp_ns, &frame, &scan.points);
+                let topic = format!("/clearway/{vehicle}/points/{}", scan.sensor);
                 self.write_ros(&topic, &POINT_CLOUD2, &cloud, log_ns)
             }
         }

@@ -23,7 +23,7 @@ const PACKETS_NS: i64 = 20_000_000;
 /// Width of an RNDF lane without a width, in metres: 12 feet, the width of most lanes.
 const LANE_M: f64 = 12.0 * FOOT_M;
 
-/// The options that say which files are sent, and how they are read.
+/// The options that name the files to send and how to read them.
 #[derive(Args)]
 pub struct FileOptions {
     /// The files. Each scan is sent with the stamp of a pose, or from now on at --hz if there are no poses.
@@ -132,7 +132,11 @@ impl Plan {
             }
         }
         if !poses.is_empty() && scans.len() > poses.len() {
-            bail!("{} scans and {} poses: each scan needs a pose for its stamp, or there must be no poses", scans.len(), poses.len());
+            bail!(
+                "{} scans and {} poses: each scan needs a pose for its stamp, or there must be no poses",
+                scans.len(),
+                poses.len()
+            );
         }
         let first_ns = poses.first().map_or_else(now_ns, |(stamp_ns, _)| *stamp_ns);
         let stamp_ns = |index: usize| match poses.get(index) {

@@ -20,8 +20,8 @@ mod files;
 
 /// Send observations from files to a server: scans, poses, roads and the packets of drives.
 ///
-/// Reads scans (KITTI .bin, .pcd), ego poses (.tum: lines of "seconds x y z qx qy qz qw"), roads (.rddf, .rndf) and drives
-/// (.pcap, .pcapng: their packets with their own stamps). Prints what the server has refused, and why.
+/// Reads scans (KITTI .bin, .pcd), ego poses (.tum: lines of "seconds x y z qx qy qz qw"), roads (.rddf, .rndf) and
+/// drives (.pcap, .pcapng: their packets with their own stamps). Prints what the server has refused, and why.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway ingest scans/*.bin poses.tum --sensor top
@@ -51,8 +51,8 @@ pub struct Options {
 /// Sends the observations.
 ///
 /// # Errors
-/// If a file cannot be read, or as [`ClientError`](clearway_client::ClientError). A refused observation is not an error;
-/// the output says so.
+/// If a file cannot be read, or as [`ClientError`](clearway_client::ClientError). A refused observation is not an
+/// error; the output says so.
 pub fn run(options: &Options) -> Result<()> {
     block_on(ingest(options))
 }

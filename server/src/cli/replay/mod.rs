@@ -9,8 +9,8 @@
 //! | [`summary`] | the state at the end -> text, JSON |
 //!
 //! A capture rarely contains how its sensor was mounted. Without extrinsics, a first pass over the first revolutions
-//! estimates height, pitch and roll from the ground around the vehicle; the estimate is printed and recorded. If there is
-//! no ground to estimate from, the files are decoded and no map is made, and the summary says so.
+//! estimates height, pitch and roll from the ground around the vehicle; the estimate is printed and recorded. If there
+//! is no ground to estimate from, the files are decoded and no map is made, and the summary says so.
 
 use std::io::IsTerminal;
 use std::sync::Arc;
@@ -71,7 +71,11 @@ async fn replay_and_print(options: Options) -> anyhow::Result<()> {
     for note in &summary.notes {
         eprintln!("note: {note}");
     }
-    if json { print_line(&format!("{:#}", summary.to_json()))? } else { print(&summary.to_text())? };
+    if json {
+        print_line(&format!("{:#}", summary.to_json()))?
+    } else {
+        print(&summary.to_text())?
+    };
     Ok(())
 }
 
@@ -154,7 +158,12 @@ pub async fn replay(
 }
 
 /// Pushes every reading to the event queue, at its time if the speed is not [`Speed::Max`].
-fn feed(mut readings: Readings, queue: &EventQueue, speed: Speed, progress: &Progress) -> Result<Readings, ReplayError> {
+fn feed(
+    mut readings: Readings,
+    queue: &EventQueue,
+    speed: Speed,
+    progress: &Progress,
+) -> Result<Readings, ReplayError> {
     let began = Instant::now();
     let (mut first_ns, mut newest_ns) = (None, None);
     while let Some(reading) = readings.next() {
@@ -176,7 +185,7 @@ fn feed(mut readings: Readings, queue: &EventQueue, speed: Speed, progress: &Pro
 
 /// Reports the messages that the files' readers have refused to the drop counters.
 fn leave_refused(readings: &mut Readings, queue: &EventQueue) {
-    for ((source, reason), count) in readings.untold() {
+    for ((source, reason), count) in readings.drain_refused() {
         queue.drops().record_refused_messages(source, reason, count);
     }
 }

@@ -15,8 +15,9 @@ use crate::server::{ShutdownError, StartError};
 
 /// Make maps from recorded drives: pcap, pcapng, MCAP, KITTI and PCD files or folders, in the order given.
 ///
-/// The sensor's model, return mode and rotation rate are found from the data. If nothing says how the sensor is mounted,
-/// height, pitch and roll are estimated from the ground in the first revolutions; the estimate is printed and recorded.
+/// The sensor's model, return mode and rotation rate are found from the data. If nothing says how the sensor is
+/// mounted, height, pitch and roll are estimated from the ground in the first revolutions; the estimate is printed and
+/// recorded.
 #[derive(Args, Clone, Debug, Default)]
 #[command(after_help = "Examples:
   clearway replay drive.pcap --record drive.mcap
@@ -60,8 +61,8 @@ pub struct Options {
     /// Override a key of the configuration; may be given several times.
     #[arg(long, value_name = "KEY=VALUE", requires = "config")]
     pub set: Vec<String>,
-    /// Publish the maps, and the last map until SIGINT or SIGTERM. The maps keep the stamps of the recording, so readers
-    /// see old ones as stale.
+    /// Publish the maps, and the last map until SIGINT or SIGTERM. The maps keep the stamps of the recording, so
+    /// readers see old ones as stale.
     #[arg(long)]
     pub serve: bool,
     /// The vehicle to replay, if the recording or the configuration has several.

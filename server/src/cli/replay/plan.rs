@@ -18,8 +18,9 @@ use super::options::{Options, ReplayError};
 use super::summary::{Mount, describe};
 use crate::config::{Calibrations, Config, Recorder};
 use crate::ingest::files::{FilesError, Kind, Readings};
-use crate::ingest::files::mcap::{McapError, Wanted};
-use crate::ingest::ros::{Choice, Offered, PoseFrom, SensorTopic};
+use crate::ingest::files::mcap::{McapError, McapOptions};
+use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
+use crate::ingest::ros::decoder::PoseSource;
 use crate::record::reader::RecordingReader;
 use crate::server::Setup;
 
@@ -44,13 +45,13 @@ pub(super) struct Plan {
 /// # Errors
 /// [`ReplayError`] if a file, a recording or the configuration cannot be used.
 pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
-    let files = Readings::open(&options.files, Wanted::default())?;
+    let files = Readings::open(&options.files, McapOptions::default())?;
     let recorded = files.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
     let scans = files.files().all(|(_, kind)| kind == Kind::Scan);
     let mut known = configured(options, recorded.as_deref())?;
     let vehicle = &mut known.config.vehicles[0];
     (vehicle.udp, vehicle.ros) = (None, None);
-    let mut wanted = Wanted {
+    let mut wanted = McapOptions {
         vehicle: options.vehicle.clone(),
         topics: options.topics.clone(),
         sensors_max: if known.is_mounted { vehicle.sensors.len() } else { SENSORS_MAX },
@@ -94,12 +95,12 @@ struct Known {
 impl Known {
     /// Configures the sensors of a ROS bag and puts their topics into `wanted`. Returns the mount of the first sensor if
     /// tf has it.
-    fn apply_bag(&mut self, bag: &Path, wanted: &mut Wanted, is_given: bool) -> Result<Option<Mount>, ReplayError> {
+    fn apply_bag(&mut self, bag: &Path, wanted: &mut McapOptions, is_given: bool) -> Result<Option<Mount>, ReplayError> {
         let mut choice = choice(bag, wanted)?;
         keep_placed(&mut choice.sensors, is_given);
         // With names, the same topics are chosen again when the bag is read.
         wanted.topics = choice.sensors.iter().map(|sensor| sensor.topic.clone()).collect();
-        if let Some(PoseFrom::Topic(topic)) = &choice.pose {
+        if let Some(PoseSource::Topic(topic)) = &choice.pose {
             wanted.topics.push(topic.clone());
         }
         if choice.sensors.is_empty() {
@@ -217,8 +218,8 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, Repla
 }
 
 /// The topics of a ROS bag to read.
-fn choice(bag: &Path, wanted: &Wanted) -> Result<Choice, ReplayError> {
-    let offered = Offered::look(bag).map_err(McapError::from).map_err(FilesError::from)?;
+fn choice(bag: &Path, wanted: &McapOptions) -> Result<TopicChoice, ReplayError> {
+    let offered = AvailableTopics::from_file(bag).map_err(McapError::from).map_err(FilesError::from)?;
     let choice = offered.choose(bag, &wanted.topics, wanted.sensors_max).map_err(McapError::from);
     Ok(choice.map_err(FilesError::from)?)
 }
@@ -239,7 +240,7 @@ fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
 
 /// The configuration of each sensor of a ROS bag, and its mount if tf has it. A single sensor is named `top`, several
 /// are named after their frames.
-fn sensors_of(choice: &Choice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
+fn sensors_of(choice: &TopicChoice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
     let mut sensors: Vec<SensorConfig> = Vec::new();
     for (index, sensor) in choice.sensors.iter().enumerate() {
         let mut name = name_of_frame(&sensor.frame_id);

@@ -158,13 +158,13 @@ pub fn describe(mount: &Mount) -> Option<String> {
             estimate.residual_m,
         )),
         Mount::Tf { ego_frame, frame_id } => Some(format!(
-            "from tf, from {frame_id} to {ego_frame}; this assumes that the origin of {ego_frame} is on the ground; if it is \
-             not, give --extrinsics"
+            "from tf, from {frame_id} to {ego_frame}; this assumes that the origin of {ego_frame} is on the ground; \
+             if it is not, give --extrinsics"
         )),
         Mount::Unknown(why) => Some(format!(
-            "unknown, so no map is made: the files do not contain how the sensor is mounted, and it cannot be estimated: \
-             {why}; give it with --extrinsics x,y,z,roll,pitch,yaw (metres and degrees, such as 0,0,1.9,0,0,0), or with \
-             --config FILE"
+            "unknown, so no map is made: the files do not contain how the sensor is mounted, and it cannot be \
+             estimated: {why}; give it with --extrinsics x,y,z,roll,pitch,yaw (metres and degrees, such as \
+             0,0,1.9,0,0,0), or with --config FILE"
         )),
         Mount::Given | Mount::Unneeded => None,
     }

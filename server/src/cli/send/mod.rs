@@ -74,7 +74,8 @@ pub fn run(options: &Options) -> Result<()> {
         skipped: BTreeMap::new(),
     };
     let is_mcap = options.file.extension().is_some_and(|extension| extension == "mcap");
-    let cut = if is_mcap { send_mcap(options, &mut route, length)? } else { send_capture(options, &mut route, length)? };
+    let cut =
+        if is_mcap { send_mcap(options, &mut route, length)? } else { send_capture(options, &mut route, length)? };
     let sent = route.finish()?;
     report(options, (to, telemetry_to), &sent, cut.as_deref())?;
     if sent.sender.packets + sent.sender.telemetry == 0 {

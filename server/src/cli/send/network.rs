@@ -115,7 +115,7 @@ pub fn line(counts: &Counts) -> String {
         counts;
     format!(
         "bad network: {taken} datagrams sent, {arrived} delivered: {packets_lost} data packets lost in {gaps} gaps, \
-         {telemetry_lost} telemetry datagrams lost, {duplicated} delivered twice, {reordered} late, {truncated} cut short, \
-         {flipped} with a flipped bit"
+         {telemetry_lost} telemetry datagrams lost, {duplicated} delivered twice, {reordered} late, {truncated} cut \
+         short, {flipped} with a flipped bit"
     )
 }

@@ -1,8 +1,8 @@
 //! One pcap or pcapng file -> readings with the capture's stamps.
 //!
-//! A capture may hold several sensors; one replay is of one. The first sender of a data packet is the sensor, the data
-//! packets and telemetry of others are left alone and named. Any other datagram goes through the door like a live one
-//! and is refused with its reason.
+//! A capture may have packets of several sensors; a replay uses one of them: the sender of the first data packet. Data
+//! packets and telemetry of other senders are ignored and counted. Any other datagram becomes a reading as a live one
+//! does, and the core refuses it with a reason.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -18,28 +18,28 @@ use clearway_mapping::event::Body;
 
 use crate::ingest::queue::Reading;
 
-/// Why a capture cannot be read on.
+/// A capture cannot be read further.
 #[derive(Debug, thiserror::Error)]
 pub enum CaptureError {
-    /// It cannot be opened.
+    /// The file cannot be opened.
     #[error("{}: {source}", file.display())]
     Open {
         /// The capture.
         file: PathBuf,
-        /// Why.
+        /// The system's reason.
         source: std::io::Error,
     },
-    /// It is none, or damaged.
+    /// The file is not a capture, or is damaged.
     #[error("{}: {source}", file.display())]
     Read {
         /// The capture.
         file: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         source: Error,
     },
 }
 
-/// An open capture; an iterator over its readings. One that was cut off gives what it holds, then ends.
+/// An open capture; an iterator over its readings. A truncated capture yields its whole packets and then ends.
 pub struct Source {
     file: PathBuf,
     capture: Capture<'static>,
@@ -52,7 +52,7 @@ impl Source {
     /// Opens a capture.
     ///
     /// # Errors
-    /// [`CaptureError`] where it cannot be opened or is no capture.
+    /// [`CaptureError::Open`] if the file cannot be opened, [`CaptureError::Read`] if it is not a capture.
     pub fn open(file: &Path) -> Result<Self, CaptureError> {
         let open = File::open(file).map_err(|source| CaptureError::Open { file: file.to_owned(), source })?;
         let capture = Capture::new(BufReader::new(open));
@@ -60,25 +60,25 @@ impl Source {
         Ok(Self { file: file.to_owned(), capture, sensor: None, others: BTreeMap::new(), truncated: None })
     }
 
-    /// Bytes read, in whole packets.
+    /// Number of bytes read, in whole packets.
     pub fn bytes_read(&self) -> u64 {
         self.capture.offset()
     }
 
-    /// Where and how the file was cut off, once its end has been met.
+    /// Where and how the file is truncated; known after the last reading.
     pub fn truncated(&self) -> Option<String> {
         self.truncated.clone()
     }
 
-    /// What was not taken, and why.
+    /// The datagrams and packets that were ignored, and why, for people.
     pub fn notes(&self) -> Vec<String> {
         let others =
-            self.others.iter().map(|(sender, n)| format!("{n} datagrams of another sensor, {sender}, left alone"));
+            self.others.iter().map(|(sender, n)| format!("{n} datagrams of another sensor, {sender}, ignored"));
         let skipped = self.capture.skipped();
         let skipped = [
-            (skipped.not_udp, "packets that are not UDP passed over"),
-            (skipped.fragmented, "pieces of fragmented datagrams passed over"),
-            (skipped.unreadable, "unreadable packets passed over"),
+            (skipped.not_udp, "packets that are not UDP ignored"),
+            (skipped.fragmented, "pieces of fragmented datagrams ignored"),
+            (skipped.unreadable, "unreadable packets ignored"),
         ];
         others.chain(skipped.into_iter().filter(|(n, _)| *n > 0).map(|(n, what)| format!("{n} {what}"))).collect()
     }
@@ -102,8 +102,8 @@ impl Iterator for Source {
             if length == PACKET_LENGTH {
                 self.sensor.get_or_insert(sender);
             }
-            let of_a_sensor = length == PACKET_LENGTH || length == TELEMETRY_LENGTH;
-            if of_a_sensor && self.sensor.is_some_and(|sensor| sensor != sender) {
+            let is_of_sensor = length == PACKET_LENGTH || length == TELEMETRY_LENGTH;
+            if is_of_sensor && self.sensor.is_some_and(|sensor| sensor != sender) {
                 *self.others.entry(sender).or_default() += 1;
                 continue;
             }

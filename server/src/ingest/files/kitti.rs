@@ -1,7 +1,7 @@
-//! Scans somebody else has assembled -> readings: KITTI `.bin` and `.pcd`, read by [`clearway_mapping::scan_file`].
+//! Scan files of other programs -> readings: KITTI `.bin` and `.pcd`, read by [`clearway_mapping::scan_file`].
 //!
-//! Such files carry no stamps: the scans are given those of a 10 Hz sensor from a fixed moment on ([`EPOCH_NS`]), so
-//! that the same files always make the same maps.
+//! These files have no stamps. The scans get the stamps of a 10 Hz sensor from a fixed time on ([`EPOCH_NS`]), so that the
+//! same files always yield the same maps.
 
 use std::path::{Path, PathBuf};
 
@@ -10,36 +10,36 @@ use clearway_mapping::scan_file::{ScanFileError, read_bin, read_pcd};
 
 use crate::ingest::queue::Reading;
 
-/// Stamp of the first scan: 2011-09-26 00:00:00 UTC, the day of KITTI's first drives.
+/// Stamp of the first scan, ns since the Unix epoch: 2011-09-26 00:00:00 UTC, the day of KITTI's first drives.
 pub const EPOCH_NS: i64 = 1_316_995_200_000_000_000;
-/// Scans come at 10 Hz.
+/// Time between two scans, in ns: 10 Hz, as the sensor of KITTI.
 pub const PERIOD_NS: i64 = 100_000_000;
 
-/// Why a scan cannot be read.
+/// A scan cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ScanError {
     /// The file cannot be read.
     #[error("{}: {source}", file.display())]
     Read {
-        /// The scan.
+        /// The file.
         file: PathBuf,
-        /// Why.
+        /// The system's reason.
         source: std::io::Error,
     },
-    /// It holds no scan.
+    /// The file has no valid scan.
     #[error("{}: {source}", file.display())]
     Scan {
-        /// The scan.
+        /// The file.
         file: PathBuf,
-        /// What is wrong with it.
+        /// The fault.
         source: ScanFileError,
     },
 }
 
-/// Reads one scan; `index` counts the scans of this replay from 0 and gives it its stamp.
+/// Reads one scan. Its stamp follows from `index`, which counts the scans of this replay from 0.
 ///
 /// # Errors
-/// [`ScanError`], which names the file and what is wrong with it.
+/// [`ScanError::Read`] if the file cannot be read, [`ScanError::Scan`] if it has no valid scan.
 pub fn read(file: &Path, index: u64) -> Result<Reading, ScanError> {
     let bytes = std::fs::read(file).map_err(|source| ScanError::Read { file: file.to_owned(), source })?;
     let scan = match file.extension().and_then(|extension| extension.to_str()) {

@@ -1,24 +1,25 @@
-//! One MCAP file -> readings: the journal of one vehicle where the file is a recording of ours, else the ROS 2 messages
-//! of the topics that [`super::ros`] chooses.
+//! One MCAP file -> readings: the journal of one vehicle if the file is a recording of this server, otherwise the ROS 2
+//! messages of the topics that [`AvailableTopics::choose`] chooses.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::Path;
 
 use crate::ingest::queue::Reading;
-use crate::ingest::ros::{ChoiceError, Intake, Offered};
+use crate::ingest::ros::choice::{AvailableTopics, ChoiceError};
+use crate::ingest::ros::decoder::TopicDecoder;
 use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 
-/// Messages refused that the door has not been told of yet, by sensor and reason.
-pub type Untold = BTreeMap<(u16, &'static str), u64>;
+/// Number of refused messages that are not reported to the event queue yet, by sensor and reason.
+pub type RefusedMessages = BTreeMap<(u16, &'static str), u64>;
 
-/// What is read of MCAP files.
+/// The part of MCAP files that is read.
 #[derive(Clone, Debug, Default)]
-pub struct Wanted {
-    /// The vehicle whose journal is read out of recordings of several; the first one met where `None`.
+pub struct McapOptions {
+    /// The vehicle whose journal is read from a recording of several vehicles; the vehicle of the first event if `None`.
     pub vehicle: Option<String>,
-    /// ROS topics; chosen where none is named.
+    /// ROS topics; chosen automatically if empty.
     pub topics: Vec<String>,
-    /// Sensors the vehicle may have; a topic more is left alone.
+    /// Greatest number of sensors of the vehicle; topics of further sensors are ignored.
     pub sensors_max: usize,
 }
 
@@ -26,21 +27,22 @@ pub struct Wanted {
 pub struct Source {
     recording: RecordingReader,
     vehicle: Option<String>,
-    /// What takes the ROS messages; `None` where the file is a recording of ours.
-    intake: Option<Intake>,
+    /// Decodes the ROS messages; `None` if the file is a recording of this server.
+    decoder: Option<TopicDecoder>,
     notes: Vec<String>,
+    /// Topics of the journals of other vehicles.
     ignored: BTreeSet<String>,
-    /// By topic: messages that were not taken, and what was wrong with the first.
-    refused: BTreeMap<String, (u64, String)>,
-    untold: Untold,
+    /// By topic: the number of refused messages, and the fault of the first.
+    refused_topics: BTreeMap<String, (u64, String)>,
+    refused: RefusedMessages,
     waiting: VecDeque<Reading>,
     is_journal: bool,
 }
 
-/// Why an MCAP file cannot be read on.
+/// An MCAP file cannot be read further.
 #[derive(Debug, thiserror::Error)]
 pub enum McapError {
-    /// The file cannot be read.
+    /// The file cannot be read or is damaged.
     #[error(transparent)]
     Recording(#[from] RecordingError),
     /// Its topics cannot be chosen.
@@ -49,64 +51,65 @@ pub enum McapError {
 }
 
 impl Source {
-    /// Opens the file. `intake` comes from the file before, so that a bag in several files is one; where there is none,
-    /// the topics are chosen.
+    /// Opens the file. `decoder` is that of the file before, so that several files of one bag are decoded as one; without
+    /// it, the topics are chosen here.
     ///
     /// # Errors
-    /// [`McapError`] where the file cannot be read, is no MCAP, or has not the topics wanted.
-    pub fn open(file: &Path, wanted: &Wanted, intake: Option<Intake>) -> Result<Self, McapError> {
+    /// [`McapError::Recording`] if the file cannot be read or is not an MCAP file, [`McapError::Choice`] if it does not
+    /// have a requested topic.
+    pub fn open(file: &Path, options: &McapOptions, decoder: Option<TopicDecoder>) -> Result<Self, McapError> {
         let recording = RecordingReader::open(file)?;
-        let (mut intake, mut notes) = (intake, Vec::new());
+        let (mut decoder, mut notes) = (decoder, Vec::new());
         if recording.header().config.is_some() {
-            intake = None;
-        } else if intake.is_none() {
-            let choice = Offered::look(file)?.choose(file, &wanted.topics, wanted.sensors_max)?;
+            decoder = None;
+        } else if decoder.is_none() {
+            let choice = AvailableTopics::from_file(file)?.choose(file, &options.topics, options.sensors_max)?;
             notes.clone_from(&choice.notes);
-            intake = Some(choice.intake());
+            decoder = Some(choice.decoder());
         }
         Ok(Self {
             recording,
-            vehicle: wanted.vehicle.clone(),
-            intake,
+            vehicle: options.vehicle.clone(),
+            decoder,
             notes,
             ignored: BTreeSet::new(),
-            refused: BTreeMap::new(),
-            untold: Untold::new(),
+            refused_topics: BTreeMap::new(),
+            refused: RefusedMessages::new(),
             waiting: VecDeque::new(),
             is_journal: false,
         })
     }
 
-    /// The recording underneath.
+    /// The reader of the file.
     pub fn recording(&self) -> &RecordingReader {
         &self.recording
     }
 
-    /// Whether the readings so far came out of a journal: then the ends of sources are in it too.
+    /// True if the readings so far came from a journal, which also contains the ends of its sources.
     pub fn is_journal(&self) -> bool {
         self.is_journal
     }
 
-    /// What was taken, left alone and refused.
+    /// What was read, ignored and refused, for people.
     pub fn notes(&self) -> Vec<String> {
-        let ignored = self.ignored.iter().map(|topic| format!("{topic} was left alone"));
-        let refused = self.refused.iter();
+        let ignored = self.ignored.iter().map(|topic| format!("{topic} is not used"));
+        let refused = self.refused_topics.iter();
         let refused = refused.map(|(topic, (n, first))| format!("{topic}: {n} messages refused, the first: {first}"));
         self.notes.iter().cloned().chain(ignored).chain(refused).collect()
     }
 
-    /// Messages that were refused since this was last asked.
-    pub fn untold(&mut self) -> Untold {
-        std::mem::take(&mut self.untold)
+    /// Returns the refused messages since the last call.
+    pub fn drain_refused(&mut self) -> RefusedMessages {
+        std::mem::take(&mut self.refused)
     }
 
-    /// What takes the ROS messages of the bag's next file.
-    pub fn into_intake(self) -> Option<Intake> {
-        self.intake
+    /// The decoder for the next file of the same bag.
+    pub fn into_decoder(self) -> Option<TopicDecoder> {
+        self.decoder
     }
 
-    fn take(&mut self, entry: RecordedMessage) {
-        match entry {
+    fn push(&mut self, message: RecordedMessage) {
+        match message {
             RecordedMessage::Event { vehicle, event } => {
                 if *self.vehicle.get_or_insert_with(|| vehicle.clone()) == vehicle {
                     self.is_journal = true;
@@ -117,12 +120,12 @@ impl Source {
                 }
             }
             RecordedMessage::Ros { topic, kind, log_ns, bytes } => {
-                let Some(intake) = self.intake.as_mut().filter(|intake| intake.wants(&topic, kind)) else {
+                let Some(decoder) = self.decoder.as_mut().filter(|decoder| decoder.accepts(&topic, kind)) else {
                     return;
                 };
-                if let Err(refused) = intake.take(&topic, kind, log_ns, &bytes, &mut self.waiting) {
-                    *self.untold.entry((intake.source(&topic), refused.reason())).or_default() += 1;
-                    self.refused.entry(topic).or_insert_with(|| (0, refused.to_string())).0 += 1;
+                if let Err(error) = decoder.decode(&topic, kind, log_ns, &bytes, &mut self.waiting) {
+                    *self.refused.entry((decoder.source(&topic), error.reason())).or_default() += 1;
+                    self.refused_topics.entry(topic).or_insert_with(|| (0, error.to_string())).0 += 1;
                 }
             }
             RecordedMessage::Map { .. } => {}
@@ -139,7 +142,7 @@ impl Iterator for Source {
                 return Some(Ok(reading));
             }
             match self.recording.next()? {
-                Ok(entry) => self.take(entry),
+                Ok(message) => self.push(message),
                 Err(error) => return Some(Err(error.into())),
             }
         }

@@ -1,5 +1,13 @@
-//! Files and folders, in the order given -> readings. What a file is, its first bytes tell, else its name: pcap,
-//! pcapng, MCAP, KITTI `.bin`, `.pcd`. A folder stands for the files in it, by name.
+//! Files and folders, in the given order -> readings.
+//!
+//! The first bytes of a file give its kind, or else its name does: pcap, pcapng, MCAP, KITTI `.bin`, `.pcd`. A folder
+//! stands for its files in alphabetical order.
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | [`capture`] | pcap, pcapng -> readings |
+//! | [`mcap`] | recording or ROS 2 bag -> readings |
+//! | [`kitti`] | one scan, `.bin` or `.pcd` -> reading |
 
 pub mod capture;
 pub mod kitti;
@@ -13,11 +21,11 @@ use clearway_mapping::event::Body;
 
 use capture::CaptureError;
 use kitti::ScanError;
-use mcap::{McapError, Untold, Wanted};
-use super::ros::Intake;
+use mcap::{McapError, McapOptions, RefusedMessages};
 use crate::ingest::queue::Reading;
+use crate::ingest::ros::decoder::TopicDecoder;
 
-/// What a file holds.
+/// The kind of a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
     /// pcap or pcapng.
@@ -28,43 +36,43 @@ pub enum Kind {
     Scan,
 }
 
-/// Why files cannot be read.
+/// Files cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum FilesError {
     /// A file or folder cannot be opened.
     #[error("{}: {source}", file.display())]
     Open {
-        /// Which.
+        /// The file or folder.
         file: PathBuf,
-        /// Why.
+        /// The system's reason.
         source: std::io::Error,
     },
-    /// A file of no known kind.
+    /// The kind of a file is unknown.
     #[error("{}: not pcap, pcapng, MCAP, KITTI .bin or .pcd", file.display())]
     Kind {
-        /// Which.
+        /// The file or folder.
         file: PathBuf,
     },
-    /// A bag in the older storage of ROS 2.
+    /// A ROS 2 bag has the older sqlite3 storage.
     #[error(
         "{}: a ROS 2 bag in sqlite3; MCAP is read: write `output_bags: [{{uri: converted, storage_id: mcap, all_topics: true}}]` \
          into convert.yaml, then `ros2 bag convert -i {} -o convert.yaml`",
         file.display(), file.display()
     )]
     Sqlite {
-        /// Which.
+        /// The file or folder.
         file: PathBuf,
     },
-    /// A folder without any such file.
+    /// A folder has no file of a known kind.
     #[error("{}: no pcap, pcapng, mcap, bin or pcd file in this folder", file.display())]
     Empty {
-        /// Which.
+        /// The file or folder.
         file: PathBuf,
     },
-    /// A capture is damaged.
+    /// A capture cannot be read.
     #[error(transparent)]
     Capture(#[from] CaptureError),
-    /// An MCAP file is damaged.
+    /// An MCAP file cannot be read.
     #[error(transparent)]
     Mcap(#[from] McapError),
     /// A scan cannot be read.
@@ -72,31 +80,31 @@ pub enum FilesError {
     Scan(#[from] ScanError),
 }
 
-/// A file that ended in the middle of something; what came before was taken.
+/// A file that is truncated; its readings before the end were used.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Truncated {
-    /// Which.
+    /// The file.
     pub file: PathBuf,
-    /// How it ended.
+    /// How the file ends.
     pub reason: String,
 }
 
-/// The readings of several files; an iterator that stops at the first file that cannot be read.
+/// An iterator over the readings of several files; it ends with the error of the first file that cannot be read.
 pub struct Readings {
     files: VecDeque<(PathBuf, Kind)>,
-    wanted: Wanted,
-    /// Takes the ROS messages of the next file of a bag.
-    intake: Option<Intake>,
-    /// Messages refused in files already closed, and not told to the door yet.
-    untold: Untold,
+    options: McapOptions,
+    /// The decoder for the next file of a bag.
+    decoder: Option<TopicDecoder>,
+    /// Refused messages of closed files that are not reported to the event queue yet.
+    refused: RefusedMessages,
     open: Option<Open>,
     scans: u64,
     bytes_before: u64,
-    /// Stamp of the newest reading behind which unfinished revolutions may be, and the sensors they may be of.
+    /// Stamp of the newest reading, and the sensors that may have an unfinished revolution.
     pending_ends: (i64, BTreeSet<u16>),
     truncated: Vec<Truncated>,
     notes: Vec<String>,
-    over: bool,
+    has_ended: bool,
 }
 
 enum Open {
@@ -105,45 +113,46 @@ enum Open {
 }
 
 impl Readings {
-    /// Looks at the files, without reading them yet; `wanted` is what is read of MCAP files.
+    /// Finds the kind of each file, without reading it; `options` apply to MCAP files.
     ///
     /// # Errors
-    /// [`FilesError`] for the first file that is missing or of no known kind.
-    pub fn open(files: &[PathBuf], wanted: Wanted) -> Result<Self, FilesError> {
+    /// [`FilesError::Open`] if a file or folder cannot be opened, [`FilesError::Kind`] or [`FilesError::Sqlite`] if a
+    /// file is of another kind, [`FilesError::Empty`] if a folder has no suitable file.
+    pub fn open(files: &[PathBuf], options: McapOptions) -> Result<Self, FilesError> {
         let mut all = VecDeque::new();
         for file in files {
             if file.is_dir() {
-                all.extend(folder(file)?);
+                all.extend(files_of_folder(file)?);
             } else {
                 all.push_back((file.clone(), kind(file)?));
             }
         }
         Ok(Self {
             files: all,
-            wanted,
-            intake: None,
-            untold: Untold::new(),
+            options,
+            decoder: None,
+            refused: RefusedMessages::new(),
             open: None,
             scans: 0,
             bytes_before: 0,
             pending_ends: Default::default(),
             truncated: Vec::new(),
             notes: Vec::new(),
-            over: false,
+            has_ended: false,
         })
     }
 
-    /// The files still to be opened.
+    /// The files that are not open yet, with their kinds.
     pub fn files(&self) -> impl Iterator<Item = (&Path, Kind)> {
         self.files.iter().map(|(file, kind)| (file.as_path(), *kind))
     }
 
-    /// Bytes of all files.
+    /// Number of bytes of these files.
     pub fn bytes(&self) -> u64 {
         self.files.iter().filter_map(|(file, _)| file.metadata().ok()).map(|metadata| metadata.len()).sum()
     }
 
-    /// Bytes read so far.
+    /// Number of bytes read so far.
     pub fn bytes_read(&self) -> u64 {
         self.bytes_before
             + match &self.open {
@@ -153,23 +162,23 @@ impl Readings {
             }
     }
 
-    /// Files that ended in the middle of something.
+    /// The truncated files so far.
     pub fn truncated(&self) -> &[Truncated] {
         &self.truncated
     }
 
-    /// What else a reader should know: topics left alone, frames that were no datagrams.
+    /// Topics and packets that were ignored or refused, for people.
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
 
-    /// Messages that were refused since this was last asked, before they became readings.
-    pub fn untold(&mut self) -> Untold {
-        let mut untold = std::mem::take(&mut self.untold);
+    /// Returns the messages since the last call that were refused before they became readings.
+    pub fn drain_refused(&mut self) -> RefusedMessages {
+        let mut refused = std::mem::take(&mut self.refused);
         if let Some(Open::Mcap(_, source)) = &mut self.open {
-            add(&mut untold, source.untold());
+            add(&mut refused, source.drain_refused());
         }
-        untold
+        refused
     }
 
     fn read(&mut self) -> Result<Option<Reading>, FilesError> {
@@ -180,8 +189,8 @@ impl Readings {
                 Some(Open::Mcap(_, source)) => source.next().transpose()?,
             };
             if let Some(reading) = next {
-                let journal = matches!(&self.open, Some(Open::Mcap(_, source)) if source.is_journal());
-                self.await_end(&reading, journal);
+                let is_journal = matches!(&self.open, Some(Open::Mcap(_, source)) if source.is_journal());
+                self.note_unfinished(&reading, is_journal);
                 return Ok(Some(reading));
             }
             self.close();
@@ -193,22 +202,22 @@ impl Readings {
             match kind {
                 Kind::Capture => self.open = Some(Open::Capture(file.clone(), Box::new(capture::Source::open(&file)?))),
                 Kind::Mcap => {
-                    let source = mcap::Source::open(&file, &self.wanted, self.intake.take())?;
+                    let source = mcap::Source::open(&file, &self.options, self.decoder.take())?;
                     self.open = Some(Open::Mcap(file, Box::new(source)));
                 }
                 Kind::Scan => {
                     let reading = kitti::read(&file, self.scans)?;
                     self.scans += 1;
                     self.bytes_before += file.metadata().map_or(0, |metadata| metadata.len());
-                    self.await_end(&reading, false);
+                    self.note_unfinished(&reading, false);
                     return Ok(Some(reading));
                 }
             }
         }
     }
 
-    /// Takes note of a sensor whose end the files do not tell, as a journal does.
-    fn await_end(&mut self, reading: &Reading, is_journal: bool) {
+    /// Remembers the sensor of a reading, whose last revolution may need an end. A journal contains the ends itself.
+    fn note_unfinished(&mut self, reading: &Reading, is_journal: bool) {
         let (newest_ns, sources) = &mut self.pending_ends;
         *newest_ns = reading.arrival_ns;
         if is_journal {
@@ -218,7 +227,7 @@ impl Readings {
         }
     }
 
-    /// Takes note of how the open file ended.
+    /// Closes the open file and remembers how it ended.
     fn close(&mut self) {
         self.bytes_before = self.bytes_read();
         match self.open.take() {
@@ -235,34 +244,35 @@ impl Readings {
                     self.truncated.push(Truncated { file: file.clone(), reason });
                 }
                 self.notes.extend(source.notes().into_iter().map(|note| format!("{}: {note}", file.display())));
-                add(&mut self.untold, source.untold());
-                self.intake = source.into_intake();
+                add(&mut self.refused, source.drain_refused());
+                self.decoder = source.into_decoder();
             }
         }
     }
 }
 
-fn add(untold: &mut Untold, more: Untold) {
-    more.into_iter().for_each(|(whose, count)| *untold.entry(whose).or_default() += count);
+fn add(refused: &mut RefusedMessages, more: RefusedMessages) {
+    more.into_iter().for_each(|(key, count)| *refused.entry(key).or_default() += count);
 }
 
 impl Iterator for Readings {
     type Item = Result<Reading, FilesError>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        if self.over {
+        if self.has_ended {
             return None;
         }
         let next = self.read().transpose();
-        self.over = !matches!(next, Some(Ok(_)));
+        self.has_ended = !matches!(next, Some(Ok(_)));
         next
     }
 }
 
-/// What a file is.
+/// Finds the kind of a file.
 ///
 /// # Errors
-/// [`FilesError::Open`] where it cannot be read, [`FilesError::Kind`] where it is nothing known.
+/// [`FilesError::Open`] if the file cannot be read, [`FilesError::Sqlite`] if it is a ROS 2 bag in sqlite3,
+/// [`FilesError::Kind`] if its kind is unknown.
 pub fn kind(file: &Path) -> Result<Kind, FilesError> {
     let mut magic = Vec::new();
     std::fs::File::open(file)
@@ -277,7 +287,7 @@ pub fn kind(file: &Path) -> Result<Kind, FilesError> {
         b"SQLite f" => return Err(FilesError::Sqlite { file: file.to_owned() }),
         _ => {}
     }
-    // Without its magic a file is read as what its name says, and the reader says what is wrong with it.
+    // Without known first bytes the name decides; the reader of that kind then reports the fault.
     kind_by_name(file).ok_or_else(|| FilesError::Kind { file: file.to_owned() })
 }
 
@@ -290,13 +300,13 @@ fn kind_by_name(file: &Path) -> Option<Kind> {
     }
 }
 
-fn folder(folder: &Path) -> Result<Vec<(PathBuf, Kind)>, FilesError> {
+fn files_of_folder(folder: &Path) -> Result<Vec<(PathBuf, Kind)>, FilesError> {
     let open = |source| FilesError::Open { file: folder.to_owned(), source };
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(open)? {
         let file = entry.map_err(open)?.path();
-        let bag = file.extension().is_some_and(|extension| extension == "db3");
-        if file.is_file() && (bag || kind_by_name(&file).is_some()) {
+        let is_bag = file.extension().is_some_and(|extension| extension == "db3");
+        if file.is_file() && (is_bag || kind_by_name(&file).is_some()) {
             files.push((file.clone(), kind(&file)?));
         }
     }
@@ -312,7 +322,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_bytes_tell_what_a_file_is_and_then_its_name() {
+    fn the_first_bytes_give_the_kind_of_a_file_or_else_its_name() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str, bytes: &[u8]| {
             let file = folder.path().join(name);
@@ -323,20 +333,20 @@ mod tests {
         assert_eq!(kind(&at("a.bin", &[0x89, b'M', b'C', b'A', b'P'])).unwrap(), Kind::Mcap);
         assert_eq!(kind(&at("b.bin", &[0; 16])).unwrap(), Kind::Scan);
         assert!(matches!(kind(&at("notes.txt", b"hello")), Err(FilesError::Kind { .. })));
-        let bag = Readings::open(&[at("bag_0.db3", b"SQLite format 3\0").parent().unwrap().into()], Wanted::default());
+        let bag = Readings::open(&[at("bag_0.db3", b"SQLite format 3\0").parent().unwrap().into()], McapOptions::default());
         assert!(bag.err().unwrap().to_string().contains("ros2 bag convert -i"));
         assert!(matches!(kind(Path::new("/no/such/file")), Err(FilesError::Open { .. })));
     }
 
     #[test]
-    fn a_folder_of_scans_is_read_by_name_and_ends_once() {
+    fn a_folder_of_scans_is_read_in_order_and_ends_once() {
         let folder = tempfile::tempdir().unwrap();
         for (name, x) in [("1.bin", 1.0f32), ("0.bin", 0.0)] {
             let bytes: Vec<u8> = [x, 0.0, 0.0, 0.0].iter().flat_map(|v| v.to_le_bytes()).collect();
             std::fs::write(folder.path().join(name), bytes).unwrap();
         }
         let readings: Vec<_> =
-            Readings::open(&[folder.path().to_owned()], Wanted::default()).unwrap().collect::<Result<_, _>>().unwrap();
+            Readings::open(&[folder.path().to_owned()], McapOptions::default()).unwrap().collect::<Result<_, _>>().unwrap();
         let x = |reading: &Reading| match &reading.body {
             Body::Scan(scan) => scan.x[0],
             _ => f32::NAN,

@@ -1,4 +1,4 @@
-//! Which topics of an MCAP file are taken: those asked for, else the sensors it has and the best poses it has.
+//! Chooses the topics of an MCAP file to decode: the requested topics, or the sensors and the best poses in the file.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -9,104 +9,106 @@ use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, PointCloud2};
 use nalgebra::Isometry3;
 
-use super::{Intake, PoseFrom};
+use super::decoder::{PoseSource, TopicDecoder};
 use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 
-/// How much of a file is looked at before its topics are chosen: latched transforms come first, everything else often.
-const LOOK_NS: i64 = 10_000_000_000;
-/// The vehicle's own frame, the first of these that tf knows; REP-105 puts `base_footprint` on the ground (REP-120).
+/// Duration of the start of a file from which its topics are known, in ns. Ours: latched transforms come first, all other
+/// messages come often.
+const START_NS: i64 = 10_000_000_000;
+/// The vehicle's frame: the first of these in the tf tree. REP-120 puts `base_footprint` on the ground.
 const EGO_FRAMES: [&str; 2] = ["base_footprint", "base_link"];
-/// Heights over the ground that a sensor may be mounted at; tf's of another was told in a frame that is not on the
-/// ground.
+/// Plausible heights of a sensor above the ground, in metres. A transform with another height belongs to an ego frame
+/// that is not on the ground.
 const HEIGHTS_M: std::ops::RangeInclusive<f64> = 0.1..=20.0;
-/// Frames that do not move, best first (REP-105).
+/// Fixed frames, the preferred one first (REP-105).
 const FIXED_FRAMES: [&str; 2] = ["map", "odom"];
 
-/// Why topics cannot be chosen.
+/// Topics cannot be chosen.
 #[derive(Debug, thiserror::Error)]
 pub enum ChoiceError {
     /// The file cannot be read.
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    /// A topic that was asked for is not there.
+    /// The file does not have a requested topic.
     #[error("{}: --topic {topic}: the file has, in its first 10 s: {known}", file.display())]
     Topic {
         /// The file.
         file: PathBuf,
-        /// As it was asked for.
+        /// The requested topic.
         topic: String,
-        /// What could be taken.
+        /// The topics of the file, with their types.
         known: String,
     },
 }
 
-/// What an MCAP file has to offer.
+/// The topics of an MCAP file that can be decoded.
 #[derive(Clone, Debug, Default)]
-pub struct Offered {
-    topics: BTreeMap<String, Offer>,
-    /// All frames, as they lay last.
+pub struct AvailableTopics {
+    topics: BTreeMap<String, Topic>,
+    /// The newest transforms of all frames.
     frames: Frames,
-    /// Those that do not move.
+    /// The static transforms.
     latched: Frames,
 }
 
 #[derive(Clone, Debug)]
-struct Offer {
+struct Topic {
     kind: Kind,
-    /// Frame of a sensor's points, or the one an odometry places; of the first message that could be read.
+    /// Frame of a sensor's points, or child frame of an odometry; of the first readable message.
     frame_id: Option<String>,
     points: u64,
-    /// Its place among the topics, by first message.
+    /// Index of the topic in the order of their first messages.
     order: usize,
 }
 
-/// A sensor's topic.
+/// The topic of a sensor.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SensorTopic {
     /// The topic.
     pub topic: String,
-    /// The frame of what it brings.
+    /// The frame of its messages.
     pub frame_id: String,
-    /// Where tf puts that frame on the vehicle; `None` where no chain of transforms tells, or tells no possible height.
+    /// The sensor's pose on the vehicle, from tf; `None` if no chain of transforms gives it, or if its height is
+    /// implausible.
     pub ego_from_sensor: Option<Isometry3<f64>>,
 }
 
-/// What is taken.
+/// The chosen topics.
 #[derive(Clone, Debug)]
-pub struct Choice {
-    /// By index of the sensor.
+pub struct TopicChoice {
+    /// The topics of the sensors, by index of the sensor.
     pub sensors: Vec<SensorTopic>,
-    /// Where ego poses come from.
-    pub pose: Option<PoseFrom>,
-    /// The vehicle's own frame.
+    /// The source of the ego poses.
+    pub pose: Option<PoseSource>,
+    /// The vehicle's frame.
     pub ego_frame: String,
-    /// What was taken and what was left, for people.
+    /// A description of the choice, for people.
     pub notes: Vec<String>,
     latched: Frames,
 }
 
-impl Offered {
-    /// Looks at the first 10 s of a file.
+impl AvailableTopics {
+    /// Reads the topics from the first 10 s of a file.
     ///
     /// # Errors
-    /// [`RecordingError`] where it cannot be read.
-    pub fn look(file: &Path) -> Result<Self, RecordingError> {
-        let mut offered = Self::default();
+    /// [`RecordingError`] if the file cannot be read or is damaged there.
+    pub fn from_file(file: &Path) -> Result<Self, RecordingError> {
+        let mut available = Self::default();
         let mut first_ns = None;
-        for entry in RecordingReader::open(file)? {
-            let RecordedMessage::Ros { topic, kind, log_ns, bytes } = entry? else { continue };
-            if log_ns.saturating_sub(*first_ns.get_or_insert(log_ns)) > LOOK_NS {
+        for message in RecordingReader::open(file)? {
+            let RecordedMessage::Ros { topic, kind, log_ns, bytes } = message? else { continue };
+            if log_ns.saturating_sub(*first_ns.get_or_insert(log_ns)) > START_NS {
                 break;
             }
-            offered.see(topic, kind, &bytes);
+            available.insert(topic, kind, &bytes);
         }
-        Ok(offered)
+        Ok(available)
     }
 
-    fn see(&mut self, topic: String, kind: Kind, bytes: &[u8]) {
+    fn insert(&mut self, topic: String, kind: Kind, bytes: &[u8]) {
         let (order, are_static) = (self.topics.len(), topic.ends_with("tf_static"));
-        let offer = self.topics.entry(topic).or_insert(Offer { kind, frame_id: None, points: 0, order });
-        // What cannot be read is counted and named when it is taken.
+        let found = self.topics.entry(topic).or_insert(Topic { kind, frame_id: None, points: 0, order });
+        // An unreadable message is counted and reported when it is decoded.
         match kind {
             Kind::TfMessage => {
                 for transform in tf_message(bytes).unwrap_or_default() {
@@ -116,129 +118,131 @@ impl Offered {
                     }
                 }
             }
-            _ if offer.frame_id.is_some() => {}
+            _ if found.frame_id.is_some() => {}
             Kind::PointCloud2 => {
                 if let Ok(cloud) = PointCloud2::new(bytes) {
-                    offer.frame_id = Some(name(cloud.header.frame_id).to_owned());
-                    offer.points = u64::from(cloud.width) * u64::from(cloud.height);
+                    found.frame_id = Some(name(cloud.header.frame_id).to_owned());
+                    found.points = u64::from(cloud.width) * u64::from(cloud.height);
                 }
             }
             Kind::VelodyneScan => {
-                offer.frame_id = VelodyneScan::new(bytes).ok().map(|scan| name(scan.header.frame_id).to_owned());
+                found.frame_id = VelodyneScan::new(bytes).ok().map(|scan| name(scan.header.frame_id).to_owned());
             }
             Kind::Odometry => {
-                offer.frame_id = Odometry::new(bytes).ok().map(|o| name(o.transform.child_frame_id).to_owned());
+                found.frame_id = Odometry::new(bytes).ok().map(|o| name(o.transform.child_frame_id).to_owned());
             }
             Kind::PoseStamped => {}
         }
     }
 
-    /// Chooses. Of `wanted` topics the sensors are taken in this order, and of theirs the first with poses; where none
-    /// of a sort is named, the choice is made here. Sensors: one topic a frame, packets before points, then the cloud
-    /// with most points; clouds in the vehicle's own or a fixed frame have been put together by somebody and are left.
-    /// Poses: an odometry, else the tf chain from `map`, else from `odom`, else stamped poses.
+    /// Chooses the topics to decode: of the `requested` topics all sensors, in this order, and the first with poses. If
+    /// no requested topic is a sensor, or none has poses, the choice is made here. Sensors: one topic a frame, packets
+    /// before points, then the cloud with the most points; a cloud in the vehicle's frame or in a fixed frame is left
+    /// out, because another program has merged it. Poses: an odometry, else the tf chain from `map`, else from `odom`,
+    /// else stamped poses.
     ///
     /// # Errors
-    /// [`ChoiceError::Topic`] for a wanted topic that is not there.
-    pub fn choose(&self, file: &Path, wanted: &[String], sensors_max: usize) -> Result<Choice, ChoiceError> {
-        for topic in wanted {
+    /// [`ChoiceError::Topic`] if the file does not have a requested topic.
+    pub fn choose(
+        &self,
+        file: &Path,
+        requested: &[String],
+        sensors_max: usize,
+    ) -> Result<TopicChoice, ChoiceError> {
+        for topic in requested {
             if !self.topics.contains_key(topic) {
-                let known = self.topics.iter().map(|(topic, offer)| format!("{topic} ({})", offer.kind));
+                let known = self.topics.iter().map(|(topic, of)| format!("{topic} ({})", of.kind));
                 let known = known.collect::<Vec<_>>().join(", ");
                 return Err(ChoiceError::Topic { file: file.to_owned(), topic: topic.clone(), known });
             }
         }
+        let kind = |topic: &String| self.topics[topic].kind;
         let ego_frame = EGO_FRAMES.into_iter().find(|frame| self.frames.knows(frame)).unwrap_or("base_link");
-        let mut sensors: Vec<&String> = wanted.iter().filter(|topic| self.topics[*topic].kind.is_sensor()).collect();
+        let mut sensors: Vec<&String> = requested.iter().filter(|topic| kind(topic).is_sensor()).collect();
         if sensors.is_empty() {
-            sensors = self.sensors(ego_frame);
+            sensors = self.best_sensors(ego_frame);
         }
         sensors.truncate(sensors_max);
-        let pose = wanted.iter().find(|topic| matches!(self.topics[*topic].kind, Kind::Odometry | Kind::PoseStamped));
-        let pose = pose.map(|topic| PoseFrom::Topic(topic.clone())).or_else(|| self.pose(ego_frame));
-        let place = |topic: &&String| {
+        let pose = requested.iter().find(|topic| matches!(kind(topic), Kind::Odometry | Kind::PoseStamped));
+        let pose = pose.map(|topic| PoseSource::Topic(topic.clone())).or_else(|| self.best_pose(ego_frame));
+        let sensor_topic = |topic: &&String| {
             let frame_id = self.topics[*topic].frame_id.clone().unwrap_or_default();
             let ego_from_sensor = self.frames.a_from_b(ego_frame, &frame_id);
-            let ego_from_sensor = ego_from_sensor.filter(|placed| HEIGHTS_M.contains(&placed.translation.z));
+            let ego_from_sensor = ego_from_sensor.filter(|pose| HEIGHTS_M.contains(&pose.translation.z));
             SensorTopic { topic: (*topic).clone(), frame_id, ego_from_sensor }
         };
-        let sensors = sensors.iter().map(place).collect();
-        let notes = self.notes(&sensors, pose.as_ref(), ego_frame);
-        Ok(Choice { sensors, pose, ego_frame: ego_frame.to_owned(), notes, latched: self.latched.clone() })
+        let sensors: Vec<SensorTopic> = sensors.iter().map(sensor_topic).collect();
+        let notes = self.describe(&sensors, pose.as_ref(), ego_frame);
+        Ok(TopicChoice { sensors, pose, ego_frame: ego_frame.to_owned(), notes, latched: self.latched.clone() })
     }
 
-    fn sensors(&self, ego_frame: &str) -> Vec<&String> {
-        let put_together =
+    fn best_sensors(&self, ego_frame: &str) -> Vec<&String> {
+        let is_merged =
             |frame: &str| frame == ego_frame || EGO_FRAMES.contains(&frame) || FIXED_FRAMES.contains(&frame);
-        let mut best: BTreeMap<&str, (&String, &Offer)> = BTreeMap::new();
-        for (topic, offer) in self.topics.iter().filter(|(_, offer)| offer.kind.is_sensor()) {
-            let frame = offer.frame_id.as_deref().unwrap_or_default();
-            if put_together(frame) {
+        let mut best: BTreeMap<&str, (&String, &Topic)> = BTreeMap::new();
+        for (topic, found) in self.topics.iter().filter(|(_, found)| found.kind.is_sensor()) {
+            let frame = found.frame_id.as_deref().unwrap_or_default();
+            if is_merged(frame) {
                 continue;
             }
-            let rank = |offer: &Offer| (offer.kind == Kind::VelodyneScan, offer.points, usize::MAX - offer.order);
-            let held = best.entry(frame).or_insert((topic, offer));
-            if rank(offer) > rank(held.1) {
-                *held = (topic, offer);
+            let rank = |of: &Topic| (of.kind == Kind::VelodyneScan, of.points, usize::MAX - of.order);
+            let best_of_frame = best.entry(frame).or_insert((topic, found));
+            if rank(found) > rank(best_of_frame.1) {
+                *best_of_frame = (topic, found);
             }
         }
         let mut best: Vec<_> = best.into_values().collect();
-        best.sort_by_key(|(_, offer)| offer.order);
+        best.sort_by_key(|(_, found)| found.order);
         best.into_iter().map(|(topic, _)| topic).collect()
     }
 
-    fn pose(&self, ego_frame: &str) -> Option<PoseFrom> {
-        let first = |kind: Kind, fits: &dyn Fn(&Offer) -> bool| {
-            let of_kind = self.topics.iter().filter(|(_, offer)| offer.kind == kind && fits(offer));
-            of_kind.min_by_key(|(_, offer)| offer.order).map(|(topic, _)| PoseFrom::Topic(topic.clone()))
+    fn best_pose(&self, ego_frame: &str) -> Option<PoseSource> {
+        let first = |kind: Kind, fits: &dyn Fn(&Topic) -> bool| {
+            let of_kind = self.topics.iter().filter(|(_, found)| found.kind == kind && fits(found));
+            of_kind.min_by_key(|(_, found)| found.order).map(|(topic, _)| PoseSource::Topic(topic.clone()))
         };
-        let joined = |offer: &Offer| {
-            offer.frame_id.as_deref().is_some_and(|frame| self.frames.a_from_b(frame, ego_frame).is_some())
+        let is_joined = |found: &Topic| {
+            found.frame_id.as_deref().is_some_and(|frame| self.frames.a_from_b(frame, ego_frame).is_some())
         };
         let mut fixed = FIXED_FRAMES.into_iter().filter(|fixed| self.frames.a_from_b(fixed, ego_frame).is_some());
-        first(Kind::Odometry, &joined)
-            .or_else(|| fixed.next().map(|fixed| PoseFrom::Frames { fixed: fixed.to_owned() }))
+        first(Kind::Odometry, &is_joined)
+            .or_else(|| fixed.next().map(|fixed| PoseSource::Frames { fixed: fixed.to_owned() }))
             .or_else(|| first(Kind::PoseStamped, &|_| true))
     }
 
-    fn notes(&self, sensors: &Vec<SensorTopic>, pose: Option<&PoseFrom>, ego_frame: &str) -> Vec<String> {
+    fn describe(&self, sensors: &[SensorTopic], pose: Option<&PoseSource>, ego_frame: &str) -> Vec<String> {
         let mut notes = Vec::new();
-        let mut taken: BTreeSet<&str> = BTreeSet::new();
-        for sensor in sensors {
-            taken.insert(&sensor.topic);
-            notes.push(match sensor.ego_from_sensor {
-                Some(_) => format!("{} was taken, its frame {} placed by tf", sensor.topic, sensor.frame_id),
-                None => {
-                    format!(
-                        "{} was taken; tf does not place its frame {} 0.1 to 20 m over {ego_frame}",
-                        sensor.topic, sensor.frame_id
-                    )
-                }
+        let mut used: BTreeSet<&str> = BTreeSet::new();
+        for SensorTopic { topic, frame_id, ego_from_sensor } in sensors {
+            used.insert(topic);
+            notes.push(match ego_from_sensor {
+                Some(_) => format!("{topic} is used; tf places its frame {frame_id}"),
+                None => format!("{topic} is used; tf does not place its frame {frame_id} 0.1 to 20 m over {ego_frame}"),
             });
         }
         match pose {
-            Some(PoseFrom::Topic(topic)) => {
-                taken.insert(topic);
-                notes.push(format!("{topic} was taken for poses of {ego_frame}"));
+            Some(PoseSource::Topic(topic)) => {
+                used.insert(topic);
+                notes.push(format!("{topic} is used for poses of {ego_frame}"));
             }
-            Some(PoseFrom::Frames { fixed }) => notes.push(format!("tf was taken for poses of {ego_frame} in {fixed}")),
+            Some(PoseSource::Frames { fixed }) => {
+                notes.push(format!("tf is used for poses of {ego_frame} in {fixed}"));
+            }
             None if sensors.is_empty() => {}
-            None => notes.push("nothing in it tells poses".into()),
+            None => notes.push("the file has no poses".into()),
         }
-        let left = self
-            .topics
-            .iter()
-            .filter(|(topic, offer)| !taken.contains(topic.as_str()) && offer.kind != Kind::TfMessage);
-        notes.extend(left.map(|(topic, offer)| format!("{topic} ({}) was left alone", offer.kind)));
+        let unused = |(topic, found): &(&String, &Topic)| !used.contains(topic.as_str()) && found.kind != Kind::TfMessage;
+        let unused = self.topics.iter().filter(unused);
+        notes.extend(unused.map(|(topic, found)| format!("{topic} ({}) is not used", found.kind)));
         notes
     }
 }
 
-impl Choice {
-    /// What takes these topics' messages. The transforms that do not move are known from its start: they hold for the
-    /// messages before them too.
-    pub fn intake(&self) -> Intake {
+impl TopicChoice {
+    /// The decoder of the chosen topics. It has the static transforms from the start, so that they also apply to earlier
+    /// messages.
+    pub fn decoder(&self) -> TopicDecoder {
         let sensors = self.sensors.iter().zip(0..).map(|(sensor, index)| (sensor.topic.clone(), index)).collect();
-        Intake::new(sensors, self.pose.clone(), &self.ego_frame, self.latched.clone())
+        TopicDecoder::new(sensors, self.pose.clone(), &self.ego_frame, self.latched.clone())
     }
 }

@@ -1,30 +1,30 @@
-//! Cells as rows predicted by the rows before: `ENCODING_ROWS` of map.proto.
+//! Cells <-> bits, each row predicted by the row before: `ENCODING_ROWS` of map.proto.
 //!
-//! In: cells and the columns of their grid. Out: bits: how many cells are equal to those a row before, then a run of
-//! another value, and so on. Maps are patches, so most of a row is the row before it.
+//! In: cells and the number of columns of their grid. Out: bits that alternate copies (cells equal to the row before)
+//! and runs (cells of one other value). A map consists of patches, so most of a row equals the row before it.
 
-use crate::bits::{BitReader, BitWriter};
-use crate::codec::Cell;
-use crate::decode::DecodeError;
+use crate::channel::bits::{BitReader, BitWriter};
+use crate::channel::cells::Cell;
+use crate::channel::error::DecodeError;
 
-/// The cells; `None` where that is not smaller than they are themselves.
+/// Encodes cells in rows of `columns`; `None` if the result is not smaller than the raw cells.
 pub(crate) fn encode_rows<T: Cell>(cells: &[T], columns: usize) -> Option<Vec<u8>> {
     let raw_length = cells.len() * T::BYTES;
     let mut bits = BitWriter::with_capacity((raw_length / 16).max(16));
     let mut at = 0;
     loop {
         let end = copy_end(cells, columns, at);
-        bits.number((end - at) as u64);
+        bits.write_number((end - at) as u64);
         if end == cells.len() || bits.len() >= raw_length {
             break;
         }
-        let as_before = end > 0 && cells[end] == cells[end - 1];
-        bits.bit(as_before);
-        if !as_before {
-            bits.number(cells[end].to_wire().into());
+        let repeats_before = end > 0 && cells[end] == cells[end - 1];
+        bits.write_bit(repeats_before);
+        if !repeats_before {
+            bits.write_number(cells[end].to_wire().into());
         }
-        at = end + 1 + equal(&cells[end + 1..], &cells[end..]);
-        bits.number((at - end - 1) as u64);
+        at = end + 1 + equal_prefix(&cells[end + 1..], &cells[end..]);
+        bits.write_number((at - end - 1) as u64);
         if at == cells.len() {
             break;
         }
@@ -33,45 +33,46 @@ pub(crate) fn encode_rows<T: Cell>(cells: &[T], columns: usize) -> Option<Vec<u8
     (rows.len() < raw_length).then_some(rows)
 }
 
-/// Where the cells from `start` on differ from those a row before; before the first row all cells are 0.
+/// Index of the first cell from `start` on that differs from the cell one row before. The row before the first is
+/// zeros.
 fn copy_end<T: Cell>(cells: &[T], columns: usize, start: usize) -> usize {
     let first = &cells[..columns.min(cells.len())];
     let zeros = first.iter().skip(start).take_while(|cell| **cell == T::default()).count();
     let at = start + zeros;
-    if at < first.len() { at } else { at + equal(&cells[at..], &cells[at - columns.min(at)..]) }
+    if at < first.len() { at } else { at + equal_prefix(&cells[at..], &cells[at - columns.min(at)..]) }
 }
 
-/// How many of the first cells are equal.
-fn equal<T: Cell>(cells: &[T], others: &[T]) -> usize {
-    // So many are compared at once.
+/// Length of the common prefix.
+fn equal_prefix<T: Cell>(cells: &[T], others: &[T]) -> usize {
+    // Compares 32 cells at once: the compiler turns this into vector instructions.
     const STEP: usize = 32;
     let steps = cells.chunks_exact(STEP).zip(others.chunks_exact(STEP)).take_while(|(cells, others)| cells == others);
     let at = STEP * steps.count();
     at + cells[at..].iter().zip(&others[at..]).take_while(|(cell, other)| cell == other).count()
 }
 
-/// The way back, which refuses what [`encode_rows`] would not have written. A payload that does not tell `count` cells
-/// is refused before there is room for one.
+/// Decodes `count` cells in rows of `columns`. Refuses a payload that [`encode_rows`] would not write. The lengths are
+/// checked before memory for the cells is allocated.
 pub(crate) fn decode_rows<T: Cell>(payload: &[u8], count: usize, columns: usize) -> Result<Vec<T>, DecodeError> {
     check_lengths::<T>(payload, count)?;
     let mut bits = BitReader::new(payload);
     let mut cells: Vec<T> = Vec::with_capacity(count);
     let above = |cells: &[T]| cells.len().checked_sub(columns).map_or(T::default(), |above| cells[above]);
-    // The value of the run that ends here, if one does.
+    // Value of the run that ends at this cell, if one does.
     let mut run = None;
     while cells.len() < count {
         let offset = bits.offset();
-        let end = cells.len() + fits(bits.number()?, count - cells.len(), offset)?;
+        let end = cells.len() + check_length(bits.read_number()?, count - cells.len(), offset)?;
         let repeated = |value: T| DecodeError::Repeated { offset, value: value.to_wire().into() };
         if cells.len() < end {
-            // A run goes on as long as its value does.
+            // Canonical: a run does not end before a cell that has its value.
             let value = above(&cells);
             if run.take() == Some(value) {
                 return Err(repeated(value));
             }
         }
         while cells.len() < end {
-            // As much at once as there is above.
+            // Copies up to one row at a time: the source must exist.
             let (at, left) = (cells.len(), end - cells.len());
             match at.checked_sub(columns) {
                 Some(above) => cells.extend_from_within(above..above + left.min(columns)),
@@ -82,18 +83,19 @@ pub(crate) fn decode_rows<T: Cell>(payload: &[u8], count: usize, columns: usize)
             break;
         }
         let before = cells.last().copied();
-        let as_before = bits.bit()?;
+        let repeats_before = bits.read_bit()?;
         let value = match before {
-            Some(before) if as_before => before,
-            _ if as_before => return Err(DecodeError::NothingBefore { offset }),
-            _ => bits.cell(None)?,
+            Some(before) if repeats_before => before,
+            _ if repeats_before => return Err(DecodeError::NothingBefore { offset }),
+            _ => bits.read_cell(None)?,
         };
-        // As above it would have been copied; as before it would have been said so, or been part of the run.
-        if value == above(&cells) || (!as_before && before == Some(value)) || run == Some(value) {
+        // Canonical: the value is not that of the row before (a copy), of the cell before (the bit), or of the last
+        // run.
+        if value == above(&cells) || (!repeats_before && before == Some(value)) || run == Some(value) {
             return Err(repeated(value));
         }
         let offset = bits.offset();
-        let length = fits(bits.number()? + 1, count - cells.len(), offset)?;
+        let length = check_length(bits.read_number()? + 1, count - cells.len(), offset)?;
         cells.resize(cells.len() + length, value);
         run = Some(value);
     }
@@ -101,25 +103,25 @@ pub(crate) fn decode_rows<T: Cell>(payload: &[u8], count: usize, columns: usize)
     Ok(cells)
 }
 
-/// Whether a payload holds numbers and values of so many cells, and nothing else.
+/// Checks that a payload holds copies and runs of `count` cells and nothing else.
 fn check_lengths<T: Cell>(payload: &[u8], count: usize) -> Result<(), DecodeError> {
     let (mut bits, mut cells) = (BitReader::new(payload), 0);
     while cells < count {
         let offset = bits.offset();
-        cells += fits(bits.number()?, count - cells, offset)?;
+        cells += check_length(bits.read_number()?, count - cells, offset)?;
         if cells == count {
             break;
         }
-        if !bits.bit()? {
-            bits.cell::<T>(None)?;
+        if !bits.read_bit()? {
+            bits.read_cell::<T>(None)?;
         }
         let offset = bits.offset();
-        cells += fits(bits.number()? + 1, count - cells, offset)?;
+        cells += check_length(bits.read_number()? + 1, count - cells, offset)?;
     }
     bits.finish()
 }
 
-fn fits(length: u64, left: usize, offset: usize) -> Result<usize, DecodeError> {
+fn check_length(length: u64, left: usize, offset: usize) -> Result<usize, DecodeError> {
     if length <= left as u64 {
         Ok(length as usize)
     } else {

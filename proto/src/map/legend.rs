@@ -2,6 +2,7 @@
 //!
 //! In: the three parallel lists of `clearway.v1.Layer`. Out: one [`Class`] per value of channel `class`, checked.
 
+use crate::limits::RGB_MAX;
 use crate::v1::{self, ClassMeaning};
 
 /// One class of a layer.
@@ -49,7 +50,7 @@ pub enum LegendError {
         meaning: i32,
     },
     /// A colour has more than 24 bits.
-    #[error("class {class} has the colour {rgb:#x}; at most 0xffffff is allowed")]
+    #[error("class {class} has the colour {rgb:#x}; at most {RGB_MAX:#x} is allowed")]
     Colour {
         /// Value of the class.
         class: usize,
@@ -73,7 +74,7 @@ pub(crate) fn decode_legend(layer: &v1::Layer) -> Result<Vec<Class>, LegendError
     if let Some(&meaning) = legend_meanings.first().filter(|meaning| **meaning != ClassMeaning::Unknown as i32) {
         return Err(LegendError::FirstMeaning { meaning });
     }
-    if let Some((class, &rgb)) = legend_rgb.iter().enumerate().find(|(_, rgb)| **rgb > 0x00ff_ffff) {
+    if let Some((class, &rgb)) = legend_rgb.iter().enumerate().find(|(_, rgb)| **rgb > RGB_MAX) {
         return Err(LegendError::Colour { class, rgb });
     }
     let entries = legend.iter().zip(legend_meanings).zip(legend_rgb);
@@ -103,7 +104,5 @@ pub(crate) fn is_empty(layer: &v1::Layer) -> bool {
 
 /// True if two layers have the same legend.
 pub(crate) fn is_same_legend(one: &v1::Layer, other: &v1::Layer) -> bool {
-    one.legend == other.legend
-        && one.legend_meanings == other.legend_meanings
-        && one.legend_rgb == other.legend_rgb
+    one.legend == other.legend && one.legend_meanings == other.legend_meanings && one.legend_rgb == other.legend_rgb
 }

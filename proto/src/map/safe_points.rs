@@ -1,15 +1,14 @@
-//! Safe points <-> `clearway.v1.SafePoints`: whole steps, each as the difference from the point before.
+//! Safe points <-> `clearway.v1.SafePoints`: integer steps, each as the difference from the point before.
 //!
-//! Neighbours lie a cell apart, and most are linked with the point before them: so a point takes three bytes.
+//! Consecutive points lie one cell apart, and most are linked to the point before, so a point needs three bytes.
 
-use crate::map::{MapError, SafePoint};
+use crate::limits::SAFE_POINT_STEPS_MAX;
+use crate::map::error::MapError;
+use crate::map::layer::SafePoint;
 use crate::v1;
 
-/// Places beyond this many steps would not be exact in single precision.
-const STEPS_MAX: i64 = 1 << 24;
-
-/// Packs points whose places are multiples of `step_m`; others are rounded to the nearest, radii down to centimetres.
-/// `links` hold, for each point, points before it, ascending.
+/// Packs points. Coordinates are rounded to the nearest multiple of `step_m`, radii down to centimetres. The links of
+/// each point are earlier points, ascending.
 pub fn pack(points: &[SafePoint], step_m: f32) -> v1::SafePoints {
     let steps = |metres: f32| (f64::from(metres) / f64::from(step_m)).round() as i32;
     let differences = |value: &dyn Fn(&SafePoint) -> i32| -> Vec<i32> {
@@ -20,7 +19,7 @@ pub fn pack(points: &[SafePoint], step_m: f32) -> v1::SafePoints {
         step_m,
         x: differences(&|point| steps(point.x_m)),
         y: differences(&|point| steps(point.y_m)),
-        // A millionth of a centimetre for what single precision took off.
+        // A millionth of a centimetre makes up for the rounding of single precision.
         radius_cm: differences(&|point| (f64::from(point.radius_m) * 100.0 + 1e-6).floor() as i32),
         ..Default::default()
     };
@@ -39,10 +38,12 @@ pub fn pack(points: &[SafePoint], step_m: f32) -> v1::SafePoints {
     packed
 }
 
-/// Unpacks, at most `points_max` points.
+/// Unpacks at most `points_max` points of a layer.
 ///
 /// # Errors
-/// [`MapError::SafePoint`] of the layer, naming the first point found wrong.
+/// [`MapError::SafePoint`] with the first invalid point: if the lists differ in length or there are too many points, if
+/// the step is not a finite length over 0, if a point is too far away or has a negative radius, or if a start or link
+/// is not ascending or leads to a point that does not exist.
 pub(crate) fn unpack(layer: &str, packed: &v1::SafePoints, points_max: usize) -> Result<Vec<SafePoint>, MapError> {
     let wrong = |point: usize, what: String| MapError::SafePoint { layer: layer.to_owned(), point, what };
     let v1::SafePoints { step_m, x, y, radius_cm, starts, link_from, link_back } = packed;
@@ -59,8 +60,9 @@ pub(crate) fn unpack(layer: &str, packed: &v1::SafePoints, points_max: usize) ->
         for (sum, difference) in sums.iter_mut().zip([dx, dy, dr]) {
             *sum += i64::from(*difference);
         }
-        if sums.iter().any(|sum| sum.abs() > STEPS_MAX) || sums[2] < 0 {
-            let text = format!("{sums:?} steps and cm; to ±{STEPS_MAX} and a radius of 0 or more are allowed");
+        if sums.iter().any(|sum| sum.abs() > SAFE_POINT_STEPS_MAX) || sums[2] < 0 {
+            let text =
+                format!("{sums:?} steps and cm; to ±{SAFE_POINT_STEPS_MAX} and a radius of 0 or more are allowed");
             return Err(wrong(index, text));
         }
         let [x_m, y_m] = [sums[0], sums[1]].map(|steps| steps as f32 * step_m);
@@ -73,17 +75,22 @@ pub(crate) fn unpack(layer: &str, packed: &v1::SafePoints, points_max: usize) ->
         start += *ahead as usize;
         match points.get_mut(start).filter(|_| *ahead > 0) {
             Some(point) => point.links.clear(),
-            None => return Err(wrong(start, "starts a line; points behind the first, ascending, are needed".into())),
+            None => return Err(wrong(start, "starts a line; ascending points after the first are needed".into())),
         }
     }
-    link(&mut points, link_from, link_back).map_err(|(point, what)| wrong(point, what))?;
+    add_links(&mut points, link_from, link_back, wrong)?;
     Ok(points)
 }
 
-/// Adds the links that are not to the point before.
-fn link(points: &mut [SafePoint], link_from: &[u32], link_back: &[u32]) -> Result<(), (usize, String)> {
+/// Adds the links other than those to the point before. `wrong` makes the error of a point.
+fn add_links(
+    points: &mut [SafePoint],
+    link_from: &[u32],
+    link_back: &[u32],
+    wrong: impl Fn(usize, String) -> MapError,
+) -> Result<(), MapError> {
     if link_from.len() != link_back.len() {
-        return Err((0, format!("links from {} points to {}", link_from.len(), link_back.len())));
+        return Err(wrong(0, format!("links from {} points to {}", link_from.len(), link_back.len())));
     }
     let mut from = 0;
     let mut from_before = None;
@@ -91,14 +98,15 @@ fn link(points: &mut [SafePoint], link_from: &[u32], link_back: &[u32]) -> Resul
         from += *ahead as usize;
         let to = from.checked_sub(*back as usize).map(|to| to as u32);
         let (Some(point), Some(to), 2..) = (points.get_mut(from), to, *back) else {
-            return Err((from, format!("a link {back} points back; to points before the one before it is allowed")));
+            let text = format!("a link {back} points back; 2 or more, to a point that exists, are needed");
+            return Err(wrong(from, text));
         };
-        // A pair before leads to a point before: no link is named twice.
+        // Links of one point ascend, so no link occurs twice.
         if from_before.is_some_and(|(before, other)| before == from && other >= to) {
-            return Err((from, format!("a link to {to} behind a later one; ascending ones are needed")));
+            return Err(wrong(from, format!("a link to {to} after one to a later point; ascending links are needed")));
         }
         from_before = Some((from, to));
-        // The point before stays last.
+        // The link to the point before stays last.
         let place = point.links.partition_point(|link| *link < to);
         point.links.insert(place, to);
     }
@@ -114,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn points_come_back_as_they_were_their_radii_rounded_down() {
+    fn points_unpack_to_themselves_with_radii_rounded_down() {
         let points = [
             point(0.0, 0.0, 1.25, &[]),
             point(-0.125, 60.0, 0.999, &[]),

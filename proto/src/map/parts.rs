@@ -1,15 +1,15 @@
-//! How many parts an encoded map claims, counted before any is made.
+//! The number of parts that an encoded map claims, counted before any is decoded.
 //!
 //! In: an encoded `clearway.v1.Map`. Out: its layers, channels, planes, sensors and names together. Two bytes can claim
-//! an empty layer, which takes a hundred times as many in memory: so the bytes are walked first.
+//! an empty layer, which needs a hundred times as many in memory; so the fields are counted before they are decoded.
 
 use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_field};
 
 /// Fields of `Map` whose parts repeat: `header` and `layers`.
 const NESTING: [u32; 2] = [1, 2];
 
-/// The length-delimited fields of a map, of its header and of its layers, up to the first byte that is not protobuf:
-/// there the decoding ends too.
+/// Number of length-delimited fields of a map, of its header and of its layers, up to the first byte that is not
+/// protobuf: there the decoder stops too.
 pub(crate) fn count(map: &[u8]) -> usize {
     Parts(map).map(|(tag, content)| 1 + if NESTING.contains(&tag) { Parts(content).count() } else { 0 }).sum()
 }

@@ -1,12 +1,12 @@
-//! One layer's key: samples as zenoh gives them -> the newest map, with what was missed on the way.
+//! Samples of one layer's key -> the newest map, with the numbers of missed maps.
 //!
-//! The publisher's cache gives the current map to who comes late, and again when it is seen again after a cut. Nothing is
-//! recovered: an old map is worth nothing, and zenoh would hold the newest one back until the lost ones had come. Only
-//! where the last map got lost nothing newer follows that could show it: the publisher's heartbeat tells that there is one,
-//! and it is asked for.
+//! The publisher's cache gives the current map to a new subscriber, and again after a lost connection is restored. Lost
+//! maps are not recovered: an old map has no use, and zenoh would delay the newest one until the lost ones had arrived.
+//! Only if the last map is lost, no newer sample follows that shows the loss. Then the publisher's heartbeat states its
+//! number, and this file queries it.
 //!
-//! Callbacks only put aside, each into a place of one: zenoh's queue of 256 would hand a slow planner maps that are seconds
-//! old. Holes in the maps' own sequence are the skipped ones; those of them that zenoh has missed are the lost ones.
+//! Callbacks store each sample in a slot of one: from zenoh's queue of 256 a slow planner would get maps that are
+//! seconds old. Gaps in the maps' sequence numbers are skipped maps; those among them that zenoh missed are lost maps.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
@@ -18,14 +18,14 @@ use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, HistoryConfig, z_deserialize};
 
-use super::{ANSWER_TIMEOUT, decode};
-use crate::ClientError;
-use crate::stream::{Between, Feed};
+use crate::error::ClientError;
+use crate::stream::{LatestSlot, Missed};
+use crate::zenoh::query::{QUERY_TIMEOUT, decode};
 
-/// A subscription to one key, with what has come last.
-pub(super) struct Tap {
+/// A subscription to the key of one layer, with its newest sample.
+pub(super) struct LayerSubscription {
     newest: watch::Receiver<Published>,
-    /// The newest map where it had to be asked for.
+    /// The newest map, if it had to be queried.
     answer: watch::Receiver<ZBytes>,
     _subscriber: AdvancedSubscriber<()>,
     _heartbeats: Subscriber<()>,
@@ -34,19 +34,19 @@ pub(super) struct Tap {
 #[derive(Clone, Default)]
 struct Published {
     payload: ZBytes,
-    /// Samples missed since the tap was opened, up to this one.
+    /// Samples missed since the subscription was opened, up to this one.
     missed: u64,
 }
 
-impl Tap {
+impl LayerSubscription {
     pub async fn open(session: &Session, key: &str) -> zenoh::Result<Self> {
-        let (put_aside, newest) = watch::channel(Published::default());
-        let (put_answer, answer) = watch::channel(ZBytes::default());
+        let (sample_slot, newest) = watch::channel(Published::default());
+        let (answer_slot, answer) = watch::channel(ZBytes::default());
         let missed = Arc::new(AtomicU64::new(0));
-        // The publisher's number of the sample that came last, or that was asked for last.
+        // The publisher's number of the sample that was received or queried last.
         let number = Arc::new(AtomicU32::new(u32::MAX));
 
-        let take = session.declare_subscriber(key.to_owned()).callback({
+        let declaration = session.declare_subscriber(key.to_owned()).callback({
             let (missed, number) = (missed.clone(), number.clone());
             move |sample| {
                 if sample.kind() == SampleKind::Put {
@@ -54,13 +54,13 @@ impl Tap {
                         number.store(source.source_sn(), Ordering::Relaxed);
                     }
                     let missed = missed.load(Ordering::Relaxed);
-                    put_aside.send_replace(Published { payload: sample.payload().clone(), missed });
+                    sample_slot.send_replace(Published { payload: sample.payload().clone(), missed });
                 }
             }
         });
         let history = HistoryConfig::default().max_samples(1).detect_late_publishers();
-        let subscriber = take.history(history).await?;
-        // Called before the sample behind the hole is, under the same lock.
+        let subscriber = declaration.history(history).await?;
+        // zenoh calls this before the sample after the gap, under the same lock.
         let listen = subscriber.sample_miss_listener();
         let count = move |miss: zenoh_ext::Miss| _ = missed.fetch_add(miss.nb().into(), Ordering::Relaxed);
         listen.callback(count).background().await?;
@@ -68,19 +68,19 @@ impl Tap {
         let heartbeats = session.declare_subscriber(format!("{key}/@adv/pub/**")).callback({
             let (session, key) = (session.clone(), key.to_owned());
             move |heartbeat| {
-                let told = z_deserialize::<u32>(heartbeat.payload());
-                let Ok(told) = told else { return };
-                if number.swap(told, Ordering::Relaxed) == told {
+                let newest = z_deserialize::<u32>(heartbeat.payload());
+                let Ok(newest) = newest else { return };
+                if number.swap(newest, Ordering::Relaxed) == newest {
                     return;
                 }
-                let put_answer = put_answer.clone();
-                let ask = session.get(&key).timeout(ANSWER_TIMEOUT).callback(move |reply| {
+                let answer_slot = answer_slot.clone();
+                let query = session.get(&key).timeout(QUERY_TIMEOUT).callback(move |reply| {
                     if let Ok(sample) = reply.into_result() {
-                        put_answer.send_replace(sample.payload().clone());
+                        answer_slot.send_replace(sample.payload().clone());
                     }
                 });
-                if let Err(error) = ask.wait() {
-                    tracing::debug!(%error, %key, "the last map got lost, and cannot be asked for");
+                if let Err(error) = query.wait() {
+                    tracing::debug!(%error, %key, "the last map was lost and cannot be queried");
                 }
             }
         });
@@ -88,16 +88,16 @@ impl Tap {
         Ok(Self { newest, answer, _subscriber: subscriber, _heartbeats: heartbeats })
     }
 
-    /// Puts every newer map into the feed until the session is closed.
+    /// Stores every newer map in the slot until the session is closed.
     ///
     /// # Errors
-    /// What is wrong with a map.
-    pub async fn run(mut self, feed: Feed) -> Result<(), ClientError> {
+    /// [`ClientError::Map`] if a map is invalid.
+    pub async fn run(mut self, slot: LatestSlot) -> Result<(), ClientError> {
         let mut last = None;
         let mut missed_before = 0;
         loop {
             let (payload, missed) = tokio::select! {
-                // Ends with the subscriber, when the session does.
+                // Fails when the session is closed.
                 changed = self.newest.changed() => {
                     if changed.is_err() {
                         return Ok(());
@@ -112,14 +112,14 @@ impl Tap {
             let skipped = match last {
                 Some((boot, seen)) if boot == boot_id && sequence <= seen => continue,
                 Some((boot, seen)) if boot == boot_id => sequence - seen - 1,
-                // Another run of the server: its sequence begins anew.
+                // Another run of the server: its sequence starts at 0.
                 _ => 0,
             };
             last = Some((boot_id, sequence));
-            // A missed one that was asked for is there, and none of the skipped ones.
+            // A missed map that was queried has arrived, so it is not a skipped one.
             let lost = skipped.min(missed - missed_before);
             missed_before = missed;
-            feed.put(map, Between { skipped, lost, left_out: 0 });
+            slot.store(map, Missed { skipped, lost, left_out: 0 });
         }
     }
 }

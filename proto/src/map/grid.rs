@@ -1,42 +1,43 @@
-//! Where the cells of a layer lie: metres in the ego frame (x forward, y left) to cell index and back.
+//! Where the cells of a layer lie: point in the ego frame (x forward, y left, metres) <-> cell index.
 //!
-//! In: `RadialGrid` or `CartesianGrid` from the wire, checked. Out: look-ups that are total: a point outside the grid
+//! In: `RadialGrid` or `CartesianGrid` from the wire, checked. Out: look-ups that never panic; a point outside the grid
 //! has no cell.
 
 use std::f64::consts::TAU;
 
-use crate::map::MapError;
+use crate::map::error::MapError;
 use crate::v1;
 
-/// The geometry of one layer, checked: no look-up panics.
+/// The geometry of one layer, checked.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Grid {
-    /// r-θ: cell index = row * columns + column. Row j spans (row_radius_m\[j-1\], row_radius_m\[j\]], row 0 starts at the
-    /// origin; column c spans azimuths [c, c+1) * 2π / columns, counter-clockwise from the ego x axis.
+    /// Rings and sectors around the origin. Cell index = row * columns + column. Row j spans (row_radius_m\[j-1\],
+    /// row_radius_m\[j\]], row 0 starts at the origin; column c spans azimuths [c, c+1) * 2π / columns,
+    /// counter-clockwise from the ego x axis.
     Radial {
-        /// Outer radius of each row, metres, ascending.
+        /// Outer radius of each row in metres, ascending.
         row_radius_m: Vec<f32>,
-        /// At least 1.
+        /// Number of columns (sectors), at least 1.
         columns: u32,
     },
-    /// Cell index = iy * width + ix; cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m) along the
-    /// grid's axes, which begin at the ego frame's origin.
+    /// Squares. Cell index = iy * width + ix; cell (ix, iy) spans [origin + i * cell_m, origin + (i+1) * cell_m) along
+    /// the grid's axes, which start at the origin of the ego frame.
     Cartesian {
-        /// Metres.
+        /// Corner of cell (0, 0) along the x axis, in metres.
         origin_x_m: f64,
-        /// Metres.
+        /// Corner of cell (0, 0) along the y axis, in metres.
         origin_y_m: f64,
-        /// Cells along x, at least 1.
+        /// Number of cells along x, at least 1.
         width: u32,
-        /// Cells along y, at least 1.
+        /// Number of cells along y, at least 1.
         height: u32,
-        /// Edge of a cell, metres.
+        /// Edge of a cell in metres.
         cell_m: f32,
-        /// Heading of the ego frame in the grid's axes; 0 where these are the vehicle's own.
+        /// Heading of the ego frame seen from the grid's axes; 0 if the axes are the vehicle's own.
         yaw_rad: f64,
-        /// Number of cell (0, 0) along x among all there could be: the world's where the axes are the world's.
+        /// Number of cell (0, 0) along x in the endless grid that map.proto defines.
         first_ix: i64,
-        /// The same along y.
+        /// Number of cell (0, 0) along y in the endless grid.
         first_iy: i64,
     },
 }
@@ -45,7 +46,8 @@ impl Grid {
     /// Checks a layer's geometry.
     ///
     /// # Errors
-    /// [`MapError::Geometry`] with what is wrong and the value.
+    /// [`MapError::Geometry`] if the grid is absent, has no cell, has radii that are not finite and ascending, or has
+    /// an edge, origin or heading that is impossible.
     pub fn from_wire(layer: &v1::Layer) -> Result<Self, MapError> {
         let wrong = |what: String| MapError::Geometry { layer: layer.name.clone(), what };
         match &layer.geometry {
@@ -53,7 +55,7 @@ impl Grid {
             Some(v1::layer::Geometry::Radial(v1::RadialGrid { row_radius_m, columns })) => {
                 if *columns == 0 || row_radius_m.is_empty() {
                     return Err(wrong(format!(
-                        "{} benches and {columns} columns; at least 1 of each is needed",
+                        "{} rows and {columns} columns; at least 1 of each is needed",
                         row_radius_m.len()
                     )));
                 }
@@ -61,7 +63,7 @@ impl Grid {
                 for (row, &outer) in row_radius_m.iter().enumerate() {
                     if !outer.is_finite() || outer <= inner {
                         return Err(wrong(format!(
-                            "bench {row} is {outer} m; a finite value above {inner} m is needed"
+                            "row {row} has a radius of {outer} m; a finite value above {inner} m is needed"
                         )));
                     }
                     inner = outer;
@@ -88,7 +90,7 @@ impl Grid {
         }
     }
 
-    /// (rows, columns) of the array that the cells make: (benches, columns) or (height, width).
+    /// Shape of the array of cells as (rows, columns); (height, width) for a Cartesian grid.
     pub fn shape(&self) -> (u32, u32) {
         match self {
             Self::Radial { row_radius_m, columns } => (row_radius_m.len() as u32, *columns),
@@ -102,7 +104,8 @@ impl Grid {
         u64::from(rows) * u64::from(columns)
     }
 
-    /// The cell that holds a point, ego frame, metres; `None` outside the grid and for values that are not finite.
+    /// Index of the cell that contains a point (ego frame, metres); `None` outside the grid and if a coordinate is not
+    /// finite.
     pub fn cell_at(&self, x_m: f64, y_m: f64) -> Option<usize> {
         if !x_m.is_finite() || !y_m.is_finite() {
             return None;
@@ -114,13 +117,13 @@ impl Grid {
                 if row == row_radius_m.len() {
                     return None;
                 }
-                let turn = (y_m.atan2(x_m) / TAU).rem_euclid(1.0);
-                // A turn just below 1 can round up to `columns`.
-                let column = ((turn * f64::from(*columns)) as usize).min(*columns as usize - 1);
+                let share = (y_m.atan2(x_m) / TAU).rem_euclid(1.0);
+                // A share just below 1 can round up to `columns`.
+                let column = ((share * f64::from(*columns)) as usize).min(*columns as usize - 1);
                 Some(row * *columns as usize + column)
             }
             Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
-                let (x_m, y_m) = turned(x_m, y_m, *yaw_rad);
+                let (x_m, y_m) = rotate(x_m, y_m, *yaw_rad);
                 let ix = ((x_m - origin_x_m) / f64::from(*cell_m)).floor();
                 let iy = ((y_m - origin_y_m) / f64::from(*cell_m)).floor();
                 let inside = ix >= 0.0 && ix < f64::from(*width) && iy >= 0.0 && iy < f64::from(*height);
@@ -129,7 +132,7 @@ impl Grid {
         }
     }
 
-    /// The middle of a cell (x, y), ego frame, metres; `None` past the last cell.
+    /// Centre (x, y) of a cell in the ego frame, in metres; `None` past the last cell.
     pub fn centre_of(&self, index: usize) -> Option<(f64, f64)> {
         if index as u64 >= self.cell_count() {
             return None;
@@ -145,12 +148,12 @@ impl Grid {
             Self::Cartesian { origin_x_m, origin_y_m, width, cell_m, yaw_rad, .. } => {
                 let (ix, iy) = (index % *width as usize, index / *width as usize);
                 let edge = f64::from(*cell_m);
-                turned(origin_x_m + (ix as f64 + 0.5) * edge, origin_y_m + (iy as f64 + 0.5) * edge, -yaw_rad)
+                rotate(origin_x_m + (ix as f64 + 0.5) * edge, origin_y_m + (iy as f64 + 0.5) * edge, -yaw_rad)
             }
         })
     }
 
-    /// How far the grid reaches from the vehicle along its own axes, metres.
+    /// Greatest distance of the grid's edge from the vehicle along the grid's axes, in metres.
     pub fn range_m_max(&self) -> f64 {
         match self {
             Self::Radial { row_radius_m, .. } => row_radius_m.last().map_or(0.0, |&r| f64::from(r)),
@@ -163,8 +166,8 @@ impl Grid {
     }
 }
 
-/// A place turned counter-clockwise about the origin; by 0 it stays what it is, to the bit.
-pub(crate) fn turned(x: f64, y: f64, angle: f64) -> (f64, f64) {
+/// Rotates a point counter-clockwise about the origin. An angle of 0 leaves every bit of it as it is.
+pub(crate) fn rotate(x: f64, y: f64, angle: f64) -> (f64, f64) {
     let (sin, cos) = angle.sin_cos();
     (x * cos - y * sin, x * sin + y * cos)
 }
@@ -174,7 +177,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_grid_that_turns_under_the_vehicle_is_looked_up_along_its_own_axes() {
+    fn a_rotated_grid_is_looked_up_along_its_own_axes() {
         let grid = |yaw_rad| Grid::Cartesian {
             origin_x_m: -2.0,
             origin_y_m: -2.0,

@@ -1,0 +1,71 @@
+//! Why a call failed.
+
+use clearway_proto::map::MapError;
+
+/// Why a call failed. `address` is that of the server or router, as the client connected to it.
+#[derive(Clone, Debug, thiserror::Error)]
+pub enum ClientError {
+    /// The text is not an address, or a certificate is invalid.
+    #[error(
+        "server address {address:?}: {reason}; HOST:PORT or http://HOST:PORT is allowed, such as localhost:50051, and https://HOST:PORT with certificates"
+    )]
+    Address {
+        /// The text as given.
+        address: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// No server answers at the address, or the connection failed.
+    #[error("no clearway server answers at {address}: {reason}")]
+    Unreachable {
+        /// The address.
+        address: String,
+        /// Error of the transport.
+        reason: String,
+    },
+    /// The server refused the call.
+    #[error("{address}: {reason} ({code})")]
+    Refused {
+        /// The address.
+        address: String,
+        /// The server's message: what is wrong and what is allowed.
+        reason: String,
+        /// The gRPC status code, such as `NotFound`.
+        code: String,
+    },
+    /// The server did not report the outcome of observations in time.
+    #[error("{address} has acknowledged {acknowledged} of {sent} observations, and then nothing for 10 s")]
+    Silent {
+        /// The address.
+        address: String,
+        /// Number of observations sent.
+        sent: u64,
+        /// Number of observations acknowledged.
+        acknowledged: u64,
+    },
+    /// The server ended the stream of maps or observations.
+    #[error("{address} has ended the stream")]
+    Ended {
+        /// The address.
+        address: String,
+    },
+    /// A received map is invalid.
+    #[error("refused a map: {0}")]
+    Map(#[from] MapError),
+    /// The map does not have the layer.
+    #[error("no layer {layer:?}; the map has {}", present.join(", "))]
+    NoLayer {
+        /// Name of the layer, as requested.
+        layer: String,
+        /// Names of the layers that the map has.
+        present: Vec<String>,
+    },
+    /// A zenoh operation failed.
+    #[error("zenoh, {what}: {reason}")]
+    Zenoh {
+        /// The operation.
+        what: String,
+        /// Error of zenoh.
+        reason: String,
+    },
+}

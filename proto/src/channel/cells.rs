@@ -1,0 +1,144 @@
+//! The raw cells of a channel, typed, in the order of the grid's cell index.
+
+use std::borrow::Cow;
+
+use crate::v1;
+
+/// Raw cell values, borrowed, in the order of the grid's cell index.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum CellsRef<'a> {
+    /// Values from 0 to 255.
+    U8(&'a [u8]),
+    /// Values from -128 to 127.
+    I8(&'a [i8]),
+    /// Values from 0 to 65,535.
+    U16(&'a [u16]),
+}
+
+/// Raw cell values, in the order of the grid's cell index.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Cells {
+    /// Values from 0 to 255.
+    U8(Vec<u8>),
+    /// Values from -128 to 127.
+    I8(Vec<i8>),
+    /// Values from 0 to 65,535.
+    U16(Vec<u16>),
+}
+
+impl Cells {
+    /// Borrows the values.
+    pub fn as_ref(&self) -> CellsRef<'_> {
+        match self {
+            Self::U8(cells) => CellsRef::U8(cells),
+            Self::I8(cells) => CellsRef::I8(cells),
+            Self::U16(cells) => CellsRef::U16(cells),
+        }
+    }
+
+    /// Number of cells.
+    pub fn len(&self) -> usize {
+        self.as_ref().len()
+    }
+
+    /// True if there is no cell.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Raw value of one cell; `None` past the last cell.
+    pub fn get(&self, index: usize) -> Option<i32> {
+        match self {
+            Self::U8(cells) => cells.get(index).map(|&v| i32::from(v)),
+            Self::I8(cells) => cells.get(index).map(|&v| i32::from(v)),
+            Self::U16(cells) => cells.get(index).map(|&v| i32::from(v)),
+        }
+    }
+}
+
+impl<'a> CellsRef<'a> {
+    /// Number of cells.
+    pub fn len(self) -> usize {
+        match self {
+            Self::U8(cells) => cells.len(),
+            Self::I8(cells) => cells.len(),
+            Self::U16(cells) => cells.len(),
+        }
+    }
+
+    /// True if there is no cell.
+    pub fn is_empty(self) -> bool {
+        self.len() == 0
+    }
+
+    /// The type of the cells on the wire.
+    pub fn cell_type(self) -> v1::CellType {
+        match self {
+            Self::U8(_) => v1::CellType::U8,
+            Self::I8(_) => v1::CellType::I8,
+            Self::U16(_) => v1::CellType::U16,
+        }
+    }
+
+    /// The cells as a raw payload: little-endian, one or two bytes per cell.
+    pub fn to_le_bytes(self) -> Cow<'a, [u8]> {
+        match self {
+            Self::U8(cells) => Cow::Borrowed(cells),
+            Self::I8(cells) => cells.iter().map(|&v| v as u8).collect::<Vec<u8>>().into(),
+            Self::U16(cells) => cells.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into(),
+        }
+    }
+}
+
+/// A raw cell value of one type.
+pub(crate) trait Cell: Copy + Default + PartialEq {
+    /// Bytes of one raw cell.
+    const BYTES: usize;
+    /// The value as a number of 0 or more: the value itself if unsigned; zigzag if signed (0, -1, 1, -2 are 0, 1, 2,
+    /// 3).
+    fn to_wire(self) -> u16;
+    /// The inverse of [`Cell::to_wire`]; `None` if the type has no such value.
+    fn from_wire(value: u64) -> Option<Self>;
+    /// The value of [`Cell::BYTES`] little-endian bytes.
+    fn from_le_bytes(bytes: &[u8]) -> Self;
+    /// Wraps cells of this type.
+    fn into_cells(cells: Vec<Self>) -> Cells;
+    /// Unwraps cells of this type; `None` for cells of another type.
+    fn from_cells(cells: Cells) -> Option<Vec<Self>>;
+}
+
+macro_rules! cells {
+    ($($cell:ty, $variant:ident, $to_wire:expr, $from_wire:expr;)*) => {$(
+        impl Cell for $cell {
+            const BYTES: usize = size_of::<$cell>();
+
+            fn to_wire(self) -> u16 {
+                $to_wire(self)
+            }
+
+            fn from_wire(value: u64) -> Option<Self> {
+                value.try_into().ok().map($from_wire)
+            }
+
+            fn from_le_bytes(bytes: &[u8]) -> Self {
+                let mut own = [0; size_of::<$cell>()];
+                own.copy_from_slice(bytes);
+                <$cell>::from_le_bytes(own)
+            }
+
+            fn into_cells(cells: Vec<Self>) -> Cells {
+                Cells::$variant(cells)
+            }
+
+            fn from_cells(cells: Cells) -> Option<Vec<Self>> {
+                if let Cells::$variant(cells) = cells { Some(cells) } else { None }
+            }
+        }
+    )*};
+}
+
+cells! {
+    u8, U8, u16::from, |wire: u8| wire;
+    i8, I8, |cell: i8| u16::from(((cell << 1) ^ (cell >> 7)) as u8), |wire: u8| (wire >> 1) as i8 ^ -((wire & 1) as i8);
+    u16, U16, |cell| cell, |wire: u16| wire;
+}

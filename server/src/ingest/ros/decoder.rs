@@ -1,0 +1,209 @@
+//! Decodes the messages of the chosen ROS 2 topics of one vehicle into readings.
+//!
+//! Scans come in the sensor's frame, and the sensor's extrinsics place them on the vehicle. Ego poses come from an
+//! odometry, from stamped poses, or from the tf chain of a fixed frame down to the vehicle's frame. If a message refers
+//! to another frame than the vehicle's, the tf tree transforms it; a missing chain is an error. tf and stamped poses have
+//! no speed: it is computed from the forward distance since the pose before, so the first of them yields no reading.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use bytes::Bytes;
+use clearway_mapping::event::{Body, EgoPose, UNKNOWN_SOURCE, Scan};
+use clearway_ros::pose::{Odometry, StampedTransform, pose_stamped, tf_message};
+use clearway_ros::velodyne_scan::VelodyneScan;
+use clearway_ros::{Frames, Kind, MessageError, PointCloud2, Points};
+use nalgebra::{Isometry3, Vector3};
+
+use crate::ingest::queue::Reading;
+
+/// The source of the ego poses.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum PoseSource {
+    /// The odometry or the stamped poses of a topic.
+    Topic(String),
+    /// The tf chain from a fixed frame down to the vehicle's frame.
+    Frames {
+        /// The locally fixed frame, such as `map` or `odom`.
+        fixed: String,
+    },
+}
+
+/// A ROS 2 message was refused.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum RosMessageError {
+    /// The bytes do not decode as the message's type.
+    #[error(transparent)]
+    Message(#[from] MessageError),
+    /// The topic's role does not allow this type.
+    #[error("a {kind}: allowed: {allowed}")]
+    Kind {
+        /// The message's type.
+        kind: Kind,
+        /// The allowed types.
+        allowed: &'static str,
+    },
+    /// No chain of transforms joins the message's frame and the vehicle's.
+    #[error("frame {frame}: no chain of transforms joins it to {ego_frame}")]
+    Frame {
+        /// The message's frame.
+        frame: String,
+        /// The vehicle's frame.
+        ego_frame: String,
+    },
+    /// The tf tree has as many frames as are allowed.
+    #[error("frame {frame}: up to 4096 frames are kept")]
+    Frames {
+        /// The frame that exceeds the limit.
+        frame: String,
+    },
+}
+
+impl RosMessageError {
+    /// The key by which the refusal is counted.
+    pub fn reason(&self) -> &'static str {
+        match self {
+            Self::Message(_) => "ros_message",
+            Self::Kind { .. } => "ros_kind",
+            Self::Frame { .. } => "ros_frame",
+            Self::Frames { .. } => "ros_frames",
+        }
+    }
+}
+
+/// Decodes the chosen topics of one vehicle; keeps the transforms and the newest pose of the messages so far.
+#[derive(Clone, Debug)]
+pub struct TopicDecoder {
+    /// Index of the sensor by topic.
+    sensors: BTreeMap<String, u16>,
+    pose: Option<PoseSource>,
+    ego_frame: String,
+    frames: Frames,
+    /// Stamp and `map_from_ego` of the newest pose without a speed.
+    newest: Option<(i64, Isometry3<f64>)>,
+    /// Number of transforms between the vehicle's frame and the nearest moving frame above it.
+    steps_to_moving: usize,
+}
+
+impl TopicDecoder {
+    /// A decoder of these topics; `frames` are the transforms that are known before the first message.
+    pub fn new(sensors: BTreeMap<String, u16>, pose: Option<PoseSource>, ego_frame: &str, frames: Frames) -> Self {
+        Self { sensors, pose, ego_frame: ego_frame.to_owned(), frames, newest: None, steps_to_moving: usize::MAX }
+    }
+
+    /// True if messages of this topic and type are decoded.
+    pub fn accepts(&self, topic: &str, kind: Kind) -> bool {
+        kind == Kind::TfMessage || self.sensors.contains_key(topic) || self.is_pose(topic)
+    }
+
+    /// Index of the topic's sensor; [`UNKNOWN_SOURCE`] if the topic concerns the whole vehicle.
+    pub fn source(&self, topic: &str) -> u16 {
+        self.sensors.get(topic).copied().unwrap_or(UNKNOWN_SOURCE)
+    }
+
+    fn is_pose(&self, topic: &str) -> bool {
+        matches!(&self.pose, Some(PoseSource::Topic(of)) if of == topic)
+    }
+
+    /// Decodes one message of an accepted topic and appends its readings to `readings`. Packets arrive at their own
+    /// stamps, everything else at `arrival_ns`.
+    ///
+    /// # Errors
+    /// [`RosMessageError`] with the fault; then `readings` has no reading of the message.
+    pub fn decode(
+        &mut self,
+        topic: &str,
+        kind: Kind,
+        arrival_ns: i64,
+        bytes: &Bytes,
+        readings: &mut VecDeque<Reading>,
+    ) -> Result<(), RosMessageError> {
+        if kind == Kind::TfMessage {
+            let pose = self.insert_transforms(&tf_message(bytes)?, topic.ends_with("tf_static"))?;
+            readings.extend(pose.map(|pose| Reading { arrival_ns, source: 0, body: Body::EgoPose(pose) }));
+        } else if let Some(&source) = self.sensors.get(topic) {
+            match kind {
+                Kind::PointCloud2 => {
+                    let scan = scan(Points::of(&PointCloud2::new(bytes)?)?);
+                    readings.push_back(Reading { arrival_ns, source, body: Body::Scan(scan) });
+                }
+                Kind::VelodyneScan => {
+                    let packets = VelodyneScan::new(bytes)?.packets().collect::<Result<Vec<_>, _>>()?;
+                    readings.extend(packets.into_iter().map(|(arrival_ns, packet)| {
+                        let body = Body::Datagram(bytes.slice_ref(packet));
+                        Reading { arrival_ns, source, body }
+                    }));
+                }
+                kind => {
+                    return Err(RosMessageError::Kind { kind, allowed: "PointCloud2 and VelodyneScan for a sensor" });
+                }
+            }
+        } else if self.is_pose(topic) {
+            let pose = match kind {
+                Kind::Odometry => Some(self.pose_of_odometry(&Odometry::new(bytes)?)?),
+                Kind::PoseStamped => {
+                    let pose = pose_stamped(bytes)?;
+                    self.pose_with_speed(pose.header.stamp_ns, pose.parent_from_child)
+                }
+                kind => return Err(RosMessageError::Kind { kind, allowed: "Odometry and PoseStamped for poses" }),
+            };
+            readings.extend(pose.map(|pose| Reading { arrival_ns, source: 0, body: Body::EgoPose(pose) }));
+        }
+        Ok(())
+    }
+
+    fn pose_of_odometry(&self, odometry: &Odometry) -> Result<EgoPose, RosMessageError> {
+        let StampedTransform { header, child_frame_id, parent_from_child } = &odometry.transform;
+        let child_from_ego = self.frames.a_from_b(child_frame_id, &self.ego_frame).ok_or_else(|| {
+            RosMessageError::Frame { frame: (*child_frame_id).to_owned(), ego_frame: self.ego_frame.clone() }
+        })?;
+        // The twist is that of the child frame; while it rotates, a point at a distance from it moves as well.
+        let from_rotation = Vector3::from(odometry.angular_rps).cross(&child_from_ego.translation.vector);
+        let velocity = child_from_ego.rotation.inverse() * (Vector3::from(odometry.linear_mps) + from_rotation);
+        let map_from_ego = parent_from_child * child_from_ego;
+        Ok(EgoPose { stamp_ns: header.stamp_ns, map_from_ego, speed_mps: velocity.x })
+    }
+
+    /// The ego pose with its speed, computed from the forward distance since the pose before. `None` for the first pose,
+    /// and for a pose that is not newer than the one before.
+    fn pose_with_speed(&mut self, stamp_ns: i64, map_from_ego: Isometry3<f64>) -> Option<EgoPose> {
+        if self.newest.is_some_and(|(before_ns, _)| before_ns >= stamp_ns) {
+            return None;
+        }
+        let (before_ns, before) = self.newest.replace((stamp_ns, map_from_ego))?;
+        let seconds = stamp_ns.abs_diff(before_ns) as f64 * 1e-9;
+        let forward_m = (before.inverse() * map_from_ego).translation.x;
+        Some(EgoPose { stamp_ns, map_from_ego, speed_mps: forward_m / seconds })
+    }
+
+    /// Inserts transforms into the tf tree. Returns the vehicle's pose if they move it. The nearest moving transform
+    /// above the vehicle's frame gives the stamp, because transforms farther up (those of a localisation) are rare, and
+    /// some programs stamp them in advance.
+    fn insert_transforms(
+        &mut self,
+        transforms: &[StampedTransform],
+        are_static: bool,
+    ) -> Result<Option<EgoPose>, RosMessageError> {
+        let mut stamp_ns = None;
+        for transform in transforms {
+            if !self.frames.take(transform) {
+                return Err(RosMessageError::Frames { frame: transform.child_frame_id.to_owned() });
+            }
+            let steps = self.frames.steps_up(&self.ego_frame, transform.child_frame_id);
+            if let Some(steps) = steps.filter(|steps| *steps <= self.steps_to_moving && !are_static) {
+                self.steps_to_moving = steps;
+                stamp_ns = Some(transform.header.stamp_ns);
+            }
+        }
+        let (Some(stamp_ns), Some(PoseSource::Frames { fixed })) = (stamp_ns, &self.pose) else { return Ok(None) };
+        match self.frames.a_from_b(fixed, &self.ego_frame) {
+            Some(fixed_from_ego) => Ok(self.pose_with_speed(stamp_ns, fixed_from_ego)),
+            // The upper part of the chain may not have arrived yet.
+            None => Ok(None),
+        }
+    }
+}
+
+fn scan(points: Points) -> Scan {
+    let Points { stamp_ns, x, y, z, intensity, ring, offset_ns, no_returns: _ } = points;
+    Scan { stamp_ns, x, y, z, intensity, ring, offset_ns, no_returns: Vec::new() }
+}

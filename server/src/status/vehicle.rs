@@ -1,0 +1,343 @@
+//! The status of one vehicle: counts, rates, latency, readers, recorder.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::{Arc, Mutex, OnceLock};
+use std::time::{Duration, Instant};
+
+use clearway_mapping::ledger::Ledger;
+use clearway_mapping::pipeline::NamedStatus;
+use clearway_proto::v1;
+use serde_json::{Value, json};
+use tokio::sync::watch;
+
+use crate::subscriptions::LayerSubscriptions;
+use crate::newest::NewestSweep;
+use crate::clock::now_ns;
+use crate::ingest::drops::{DropCounters, UnknownSender};
+use crate::sync::locked;
+use crate::record::writer::RecorderCounts;
+use crate::encode::EncodedMap;
+
+use super::sensor_json::{ledger_json, sensor_json};
+
+/// Latencies kept for the percentiles: seven minutes of a 10 Hz sensor.
+const LATENCIES: usize = 4096;
+/// Maps over which the rates are measured.
+const RATE_MAPS: usize = 16;
+/// Time without a new map after which the rates are 0.
+const RATE_AGE_MAX: Duration = Duration::from_secs(2);
+
+/// Status of one vehicle, written by its engine and read by every publisher.
+#[derive(Debug)]
+pub struct VehicleStatus {
+    /// Name of the vehicle.
+    pub name: Arc<str>,
+    /// Identifier of this run of the server.
+    pub boot_id: u64,
+    /// Names of the layers of its maps, in order.
+    pub layers: Vec<&'static str>,
+    /// Subscriptions of readers to the layers.
+    pub subscriptions: LayerSubscriptions,
+    /// The points of the newest map, while a reader subscribes to them.
+    pub sweeps: watch::Sender<NewestSweep>,
+    /// Number of readers over gRPC.
+    pub grpc_readers: Arc<AtomicU32>,
+    /// Number of open pages.
+    pub page_readers: Arc<AtomicU32>,
+    drops: Arc<DropCounters>,
+    pub(super) recorder: OnceLock<Arc<RecorderCounts>>,
+    engine_stopped: AtomicBool,
+    state: Mutex<State>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    ledger: Ledger,
+    sensors: Vec<NamedStatus>,
+    states: Vec<v1::SensorState>,
+    maps: u64,
+    newest_capture_end_ns: i64,
+    drivable_share: Option<f64>,
+    /// Time to step and encode each of the newest maps, in ns.
+    latencies_ns: VecDeque<u64>,
+    /// Publication of each of the newest maps, and the datagrams received until then.
+    paces: VecDeque<(Instant, u64)>,
+}
+
+/// One reader of a vehicle's maps, counted until it is dropped.
+#[derive(Debug)]
+pub struct Reader(Arc<AtomicU32>);
+
+impl Reader {
+    /// Counts one more reader.
+    pub fn new(readers: &Arc<AtomicU32>) -> Self {
+        readers.fetch_add(1, Ordering::Relaxed);
+        Self(readers.clone())
+    }
+}
+
+impl Drop for Reader {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+/// Status of a vehicle at one moment.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Snapshot {
+    /// Counts of everything that arrived: the core's ledger, and readings dropped before the event queue.
+    pub ledger: Ledger,
+    /// The sensors with their status and counts.
+    pub sensors: Vec<NamedStatus>,
+    /// Invalid messages since the start of the server, by reason; the ledger counts them as `observation`.
+    pub observations_refused: BTreeMap<&'static str, u64>,
+    /// Number of maps made.
+    pub maps: u64,
+    /// End of the newest map's capture, in ns since the Unix epoch; 0 before the first map.
+    pub newest_capture_end_ns: i64,
+    /// Drivable share of the newest map, while a reader subscribes to that layer.
+    pub drivable_share: Option<f64>,
+    /// Median time to step and encode a map; `None` before the first map.
+    pub latency_ms_p50: Option<f64>,
+    /// 99th percentile of that time.
+    pub latency_ms_p99: Option<f64>,
+    /// Maps per second, over the newest maps.
+    pub maps_hz: f64,
+    /// Datagrams per second, over the newest maps.
+    pub packets_hz: f64,
+}
+
+impl Snapshot {
+    /// Number of revolutions of all sensors.
+    pub fn revolutions(&self) -> u64 {
+        self.sensors.iter().map(|sensor| sensor.status.revolutions).sum()
+    }
+
+    /// Counts without telemetry, as JSON: received = decoded + the sum of refused.
+    pub fn packets_json(&self) -> Value {
+        let Ledger { received, telemetry, decoded, refused, .. } = &self.ledger;
+        json!({ "received": received - telemetry, "decoded": decoded, "refused": refused })
+    }
+
+    /// Number of datagrams refused, for any reason.
+    pub fn refused(&self) -> u64 {
+        self.ledger.refused.values().sum()
+    }
+}
+
+impl VehicleStatus {
+    /// The status of a vehicle before its first event.
+    pub fn new(name: Arc<str>, boot_id: u64, layers: Vec<&'static str>, drops: Arc<DropCounters>) -> Self {
+        Self {
+            name,
+            boot_id,
+            subscriptions: LayerSubscriptions::new(&layers),
+            sweeps: watch::Sender::new(None),
+            layers,
+            grpc_readers: Arc::default(),
+            page_readers: Arc::default(),
+            drops,
+            recorder: OnceLock::new(),
+            engine_stopped: AtomicBool::new(false),
+            state: Mutex::default(),
+        }
+    }
+
+    /// Adds the counts of the vehicle's recorder; a second call changes nothing.
+    pub fn show_recorder(&self, counts: Arc<RecorderCounts>) {
+        self.recorder.get_or_init(|| counts);
+    }
+
+    /// True if the vehicle's engine is running.
+    pub fn is_alive(&self) -> bool {
+        !self.engine_stopped.load(Ordering::Acquire)
+    }
+
+    /// Records that the engine has stopped.
+    pub(crate) fn engine_stopped(&self) {
+        self.engine_stopped.store(true, Ordering::Release);
+    }
+
+    /// Records the counts after a step of the engine.
+    pub(crate) fn stepped(&self, ledger: &Ledger, sensors: Vec<NamedStatus>) {
+        let mut state = locked(&self.state);
+        state.ledger.clone_from(ledger);
+        state.sensors = sensors;
+    }
+
+    /// Records a new map and the time it took.
+    pub(crate) fn mapped(&self, map: &EncodedMap, states: Vec<v1::SensorState>, latency: Duration) {
+        let mut state = locked(&self.state);
+        state.states = states;
+        state.maps += 1;
+        state.newest_capture_end_ns = map.capture_end_ns;
+        state.drivable_share = map.drivable_share;
+        if state.latencies_ns.len() == LATENCIES {
+            state.latencies_ns.pop_front();
+        }
+        state.latencies_ns.push_back(u64::try_from(latency.as_nanos()).unwrap_or(u64::MAX));
+        if state.paces.len() == RATE_MAPS {
+            state.paces.pop_front();
+        }
+        let received = state.ledger.received;
+        state.paces.push_back((Instant::now(), received));
+    }
+
+    /// The current status.
+    pub fn snapshot(&self) -> Snapshot {
+        let state = locked(&self.state);
+        let mut latencies: Vec<u64> = state.latencies_ns.iter().copied().collect();
+        let (maps_hz, packets_hz) = rates(&state.paces);
+        let mut snapshot = Snapshot {
+            ledger: state.ledger.clone(),
+            sensors: state.sensors.clone(),
+            maps: state.maps,
+            newest_capture_end_ns: state.newest_capture_end_ns,
+            drivable_share: state.drivable_share,
+            maps_hz,
+            packets_hz,
+            ..Snapshot::default()
+        };
+        let sensors = snapshot.sensors.iter_mut().map(|sensor| &mut sensor.ledger);
+        self.drops.add_unreported_to(&mut snapshot.ledger, sensors);
+        // The engine waits for this lock, so slower work follows after it.
+        drop(state);
+        snapshot.observations_refused = self.drops.refused_messages();
+        latencies.sort_unstable();
+        snapshot.latency_ms_p50 = percentile_ms(&latencies, 50);
+        snapshot.latency_ms_p99 = percentile_ms(&latencies, 99);
+        snapshot
+    }
+
+    /// Number of readers of its maps, by transport.
+    pub(super) fn readers(&self) -> [(&'static str, u32); 2] {
+        [("grpc", &self.grpc_readers), ("page", &self.page_readers)]
+            .map(|(transport, readers)| (transport, readers.load(Ordering::Relaxed)))
+    }
+
+    /// The status as a message of the wire.
+    pub fn to_proto(&self) -> v1::Vehicle {
+        self.proto_of(&self.snapshot())
+    }
+
+    fn proto_of(&self, snapshot: &Snapshot) -> v1::Vehicle {
+        v1::Vehicle {
+            name: self.name.to_string(),
+            boot_id: self.boot_id,
+            layers: self.layers.iter().map(|&layer| layer.to_owned()).collect(),
+            maps: snapshot.maps,
+            newest_capture_end_ns: snapshot.newest_capture_end_ns,
+            sensors: locked(&self.state).states.clone(),
+            ledger: Some(ledger(&snapshot.ledger)),
+            sensor_ledgers: snapshot.sensors.iter().map(|s| (s.name.clone(), ledger(&s.ledger))).collect(),
+            recorder: Some(self.recorder.get().map(|counts| counts.to_proto()).unwrap_or_default()),
+            readers: self.readers().map(|(transport, readers)| (transport.to_owned(), readers)).into(),
+            unknown_senders: self.drops.unknown_senders().iter().map(unknown_sender).collect(),
+            observations_refused: by_name(&snapshot.observations_refused),
+        }
+    }
+
+    /// The status as JSON: the content of [`VehicleStatus::to_proto`], rates, latency and age. 64-bit numbers that a
+    /// browser's doubles cannot hold (boot id, stamps) are strings.
+    pub fn to_json(&self) -> Value {
+        let snapshot = self.snapshot();
+        let proto = self.proto_of(&snapshot);
+        let (ledger, recorder) = (proto.ledger.unwrap_or_default(), proto.recorder.unwrap_or_default());
+        let sensors = proto.sensors.iter().map(|state| {
+            let mut sensor = sensor_json(state);
+            sensor["ledger"] = proto.sensor_ledgers.get(&state.name).map(ledger_json).into();
+            sensor
+        });
+        json!({
+            "name": proto.name,
+            "boot_id": proto.boot_id.to_string(),
+            "layers": proto.layers,
+            "maps": proto.maps,
+            "newest_capture_end_ns": proto.newest_capture_end_ns.to_string(),
+            "now_ns": now_ns().to_string(),
+            "drivable_share": snapshot.drivable_share,
+            "sensors": sensors.collect::<Vec<_>>(),
+            "ledger": ledger_json(&ledger),
+            "observations_refused": proto.observations_refused,
+            "recorder": {
+                "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
+                "stopped": self.recorder.get().and_then(|counts| counts.stop_reason()),
+            },
+            "readers": proto.readers,
+            "unknown_senders": proto.unknown_senders.iter().map(|s| {
+                json!({ "address": s.address, "datagrams": s.datagrams, "newest_ns": s.newest_ns.to_string() })
+            }).collect::<Vec<_>>(),
+            "rates": { "maps_hz": snapshot.maps_hz, "packets_hz": snapshot.packets_hz },
+            "latency_ms": { "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 },
+            "alive": self.is_alive(),
+        })
+    }
+}
+
+fn unknown_sender(sender: &UnknownSender) -> v1::UnknownSender {
+    let UnknownSender { address, datagrams, newest_ns } = *sender;
+    v1::UnknownSender { address: address.to_string(), datagrams, newest_ns }
+}
+
+fn ledger(ledger: &Ledger) -> v1::Ledger {
+    v1::Ledger {
+        received: ledger.received,
+        decoded: ledger.decoded,
+        telemetry: ledger.telemetry,
+        refused: by_name(&ledger.refused),
+        lost: ledger.lost,
+        kernel_drops: ledger.kernel_drops,
+        points_dropped: ledger.points_dropped,
+        own_body: ledger.own_body,
+        through_body: ledger.through_body,
+        blind: ledger.blind,
+        poses: ledger.poses,
+        poses_refused: ledger.poses_refused,
+        roads: ledger.roads,
+        roads_refused: by_name(&ledger.roads_refused),
+    }
+}
+
+fn by_name(counts: &BTreeMap<&'static str, u64>) -> BTreeMap<String, u64> {
+    counts.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect()
+}
+
+/// Maps and datagrams per second.
+fn rates(paces: &VecDeque<(Instant, u64)>) -> (f64, f64) {
+    let (Some((first, before)), Some((last, after))) = (paces.front(), paces.back()) else { return (0.0, 0.0) };
+    let seconds = (*last - *first).as_secs_f64();
+    if paces.len() < 2 || seconds <= 0.0 || last.elapsed() > RATE_AGE_MAX {
+        return (0.0, 0.0);
+    }
+    ((paces.len() - 1) as f64 / seconds, (after - before) as f64 / seconds)
+}
+
+/// Nearest-rank percentile of ascending durations.
+fn percentile_ms(ascending_ns: &[u64], percent: usize) -> Option<f64> {
+    let rank = (ascending_ns.len() * percent).div_ceil(100).max(1);
+    ascending_ns.get(rank - 1).map(|&ns| ns as f64 / 1e6)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn percentiles_are_nearest_ranks() {
+        let ns: Vec<u64> = (1..=100).map(|ms| ms * 1_000_000).collect();
+        assert_eq!(percentile_ms(&ns, 50), Some(50.0));
+        assert_eq!(percentile_ms(&ns, 99), Some(99.0));
+        assert_eq!(percentile_ms(&ns[..1], 50), Some(1.0));
+        assert_eq!(percentile_ms(&[], 50), None);
+    }
+
+    #[test]
+    fn a_reader_is_counted_until_it_is_dropped() {
+        let readers = Arc::new(AtomicU32::new(0));
+        let reader = Reader::new(&readers);
+        assert_eq!(readers.load(Ordering::Relaxed), 1);
+        drop(reader);
+        assert_eq!(readers.load(Ordering::Relaxed), 0);
+    }
+}
