@@ -132,7 +132,12 @@ fn every_model_and_return_mode_decodes_to_the_simulated_points() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 12, max_shrink_iters: 8, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig {
+        cases: 12,
+        max_shrink_iters: 8,
+        failure_persistence: None,
+        ..ProptestConfig::default()
+    })]
 
     #[test]
     fn any_sensor_at_any_rate_and_place_decodes_to_the_simulated_points(

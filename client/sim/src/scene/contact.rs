@@ -9,11 +9,11 @@ use super::world::World;
 /// A vehicle's box: its middle, heading (rad, counter-clockwise from x) and extents. It stands on the ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hull {
-    /// Coordinate of the middle, in metres.
+    /// Coordinate x of the middle, in metres.
     pub x: f64,
-    /// Coordinate of the middle, in metres.
+    /// Coordinate y of the middle, in metres.
     pub y: f64,
-    /// Counter-clockwise from x.
+    /// Heading, in rad, counter-clockwise from x.
     pub heading: f64,
     /// Length, width and height.
     pub size: [f64; 3],

@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn ground_behind_a_house_is_not_seen_and_ground_before_it_is() {
+    fn ground_behind_a_building_is_not_visible() {
         let world = World::default().building(10.0, 0.0, 0.0, [4.0, 8.0], 5.0).canopy(0.0, 10.0, 3.0, 1.0);
         let (caster, eye) = (Caster::new(&world, [0.0, 0.0, 1.9], 0.0, 120.0), [0.0, 0.0, 1.9]);
         assert!(caster.sees_ground(eye, 7.5, 0.0));
