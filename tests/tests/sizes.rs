@@ -1,5 +1,5 @@
-//! How many bytes the maps of recorded and simulated drives take: of each layer and channel, whole and as a delta to the
-//! map before.
+//! The sizes of the maps of recorded and simulated drives: for each layer and channel, as a whole map and as a delta to
+//! the map before.
 //! `cargo test -p clearway-tests --test sizes -- --nocapture` prints the table.
 
 #![cfg_attr(not(clearway_data), allow(unused))]
@@ -35,11 +35,11 @@ struct Drive {
 }
 
 enum Poses {
-    /// Nobody knows.
+    /// The poses are not known.
     None,
-    /// One a scan, in a file of the folder.
+    /// One pose for each scan, in this file of the folder.
     PerScan(&'static str),
-    /// Straight ahead.
+    /// The vehicle drives straight ahead at this speed.
     SpeedMps(f64),
 }
 
