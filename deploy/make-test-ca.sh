@@ -1,6 +1,5 @@
-#!/bin/sh
-# Makes a CA for trying out TLS, and certificates of it: a server's (localhost) and one for each role. Not for production:
-# the CA's key lies beside them, and nothing can be revoked.
+# !/bin/sh Makes a CA for trying out TLS, and certificates of it: a server's (localhost) and one for each role. Not for
+# production: the CA's key lies beside them, and nothing can be revoked.
 #
 #   deploy/make-test-ca.sh FOLDER [DAYS]
 #

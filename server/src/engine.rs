@@ -20,7 +20,8 @@ use crate::newest::Newest;
 use crate::record::writer::RecordingHandle;
 use crate::status::VehicleStatus;
 
-/// Period at which an engine without events checks for new subscribers. Ours: short beside a revolution of 50 to 200 ms.
+/// Period at which an engine without events checks for new subscribers. Ours: short beside a revolution of 50 to 200
+/// ms.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// A function that is called with the pipeline after each event that completed a revolution.

@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Longest line, in characters; tables and links of Markdown may be longer.
+/// Longest line, in characters. Tables and links of Markdown, and lines of code with a string, may be longer.
 const LINE_MAX: usize = 120;
 /// Longest source file, in lines: what a reader holds in mind at once. Most files stay under 400.
 const FILE_MAX: usize = 500;
 
 /// Words that the glossary of CONTRIBUTING.md replaces, each with what is written instead.
-const WORDS: [(&str, &str); 19] = [
+const WORDS: [(&str, &str); 20] = [
     ("anew", "again"),
     ("whoever", "the noun: a reader, a sender"),
     ("whence", "from where"),
@@ -29,10 +29,11 @@ const WORDS: [(&str, &str); 19] = [
     ("todo", "the change itself"),
     ("fixme", "the change itself"),
     ("xxx", "the change itself"),
+    ("houses", "systems, servers or test beds"),
     ("house", "system, server or test bed"),
 ];
-/// Files in which a word of [`WORDS`] is meant: this one, the glossary, and simulated houses.
-const WORDS_ALLOWED: [&str; 2] = ["tests/tests/tidy.rs", "CONTRIBUTING.md"];
+/// Files and folders in which a word of [`WORDS`] is meant: this file, the glossary, and the houses of simulated towns.
+const WORDS_ALLOWED: [&str; 3] = ["tests/tests/tidy.rs", "CONTRIBUTING.md", "client/sim/"];
 
 /// The folders of all crates' sources.
 const CRATES: [&str; 8] = [
@@ -78,9 +79,12 @@ fn shown(path: &Path) -> String {
 fn no_line_is_longer_than_120_characters() {
     let mut wrong = Vec::new();
     for file in files(&repository(), &["rs", "py", "js", "proto", "md", "toml", "css", "html", "sh"]) {
-        let is_text = file.extension().is_some_and(|ending| ending == "md");
+        let is_markdown = file.extension().is_some_and(|ending| ending == "md");
         for (index, line) in fs::read_to_string(&file).expect("UTF-8").lines().enumerate() {
-            let may_be_long = is_text && (line.starts_with('|') || line.contains("]("));
+            let may_be_long = match is_markdown {
+                true => line.starts_with('|') || line.contains("]("),
+                false => line.contains('"'),
+            };
             if line.chars().count() > LINE_MAX && !may_be_long {
                 wrong.push(format!("{}:{}", shown(&file), index + 1));
             }
@@ -103,7 +107,7 @@ fn no_source_file_is_longer_than_500_lines() {
 fn words_of_the_glossary_replace_home_made_ones() {
     let mut wrong = Vec::new();
     for file in files(&repository(), &["rs", "py", "js", "proto", "md", "toml", "html"]) {
-        if WORDS_ALLOWED.contains(&&*shown(&file)) {
+        if WORDS_ALLOWED.iter().any(|allowed| shown(&file).starts_with(allowed)) {
             continue;
         }
         for (index, line) in fs::read_to_string(&file).expect("UTF-8").lines().enumerate() {

@@ -1,4 +1,5 @@
-//! The sockets of all vehicles: one [`Listener`] for each address, which several sensors and several vehicles can share.
+//! The sockets of all vehicles: one [`Listener`] for each address, which several sensors and several vehicles can
+//! share.
 
 use std::collections::BTreeSet;
 use std::net::{IpAddr, SocketAddr};

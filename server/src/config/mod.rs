@@ -1,9 +1,8 @@
 //! One TOML file -> [`Config`]: what is served where, what is recorded, and which vehicles there are.
 //!
-//! An unknown key is refused with its line; a value that is not allowed is refused with the file, the key, the value and
-//! what is allowed. Calibration files are read here too, so that no socket is opened before the whole configuration is
-//! valid.
-//! `deploy/clearway.toml` holds every key with its default.
+//! An unknown key is refused with its line; a value that is not allowed is refused with the file, the key, the value
+//! and what is allowed. Calibration files are read here too, so that no socket is opened before the whole configuration
+//! is valid. `deploy/clearway.toml` holds every key with its default.
 
 use std::collections::BTreeSet;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -135,8 +134,8 @@ impl Config {
     /// Like [`Config::load`], from a text; errors name `file`.
     ///
     /// # Errors
-    /// [`ConfigError::Parse`] if the text is not TOML or has an unknown key, [`ConfigError::Override`] if an override is
-    /// not `key=value`, [`ConfigError::Value`] if a value is not allowed.
+    /// [`ConfigError::Parse`] if the text is not TOML or has an unknown key, [`ConfigError::Override`] if an override
+    /// is not `key=value`, [`ConfigError::Value`] if a value is not allowed.
     pub fn parse(text: &str, file: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
         let parse = |source| ConfigError::Parse { file: file.to_owned(), source: Box::new(source) };
         let mut config: Self = toml::from_str(text).map_err(parse)?;
@@ -151,8 +150,8 @@ impl Config {
         Ok(config)
     }
 
-    /// A configuration of one vehicle with one sensor and every default. The sensor is level, 2 m above the ground, until
-    /// its extrinsics are set.
+    /// A configuration of one vehicle with one sensor and every default. The sensor is level, 2 m above the ground,
+    /// until its extrinsics are set.
     pub fn of_one_vehicle(vehicle: &str, sensor: &str) -> Self {
         let text = format!(
             "[[vehicle]]\nname = {vehicle:?}\n[[vehicle.sensor]]\nname = {sensor:?}\n[vehicle.sensor.extrinsics]\n\

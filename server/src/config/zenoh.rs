@@ -24,8 +24,8 @@ pub struct Zenoh {
     pub scouting: bool,
     /// Maps as ROS 2 topics.
     pub ros2: Ros2,
-    /// A zenoh configuration (JSON5) with TLS and access control; the keys above take precedence over it. A relative path
-    /// starts at the configuration's folder. Empty: zenoh's defaults, with limits for what one peer may cost.
+    /// A zenoh configuration (JSON5) with TLS and access control; the keys above take precedence over it. A relative
+    /// path starts at the configuration's folder. Empty: zenoh's defaults, with limits for what one peer may cost.
     pub file: PathBuf,
 }
 

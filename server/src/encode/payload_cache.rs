@@ -1,7 +1,7 @@
 //! Payloads for readers with a region or deltas: some layers, cropped to a region, as deltas against an earlier map.
 //!
-//! In: an [`EncodedMap`](super::EncodedMap), a region in the ego frame, the map that the reader has. Out: the bytes of one
-//! `clearway.v1.Map`. Each layer is cropped and compared at most once, for all readers that need the same.
+//! In: an [`EncodedMap`](super::EncodedMap), a region in the ego frame, the map that the reader has. Out: the bytes of
+//! one `clearway.v1.Map`. Each layer is cropped and compared at most once, for all readers that need the same.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, OnceLock};
@@ -16,8 +16,8 @@ use prost::Message;
 
 use crate::sync::locked;
 
-/// Most payloads kept for one map; further ones are encoded for each reader. Ours: ten readers with regions of their own,
-/// six layers each.
+/// Most payloads kept for one map; further ones are encoded for each reader. Ours: ten readers with regions of their
+/// own, six layers each.
 const PAYLOADS_MAX: usize = 64;
 
 /// Payloads of one map, by layer, region and base.

@@ -1,7 +1,7 @@
 //! One layer of a map -> a PNG: seen from above, the vehicle in the middle, forward up, left on the left.
 //!
-//! The picture rotates with the vehicle: up is ahead, not north. Classes have the colours of the layer's legend; a layer
-//! without classes is drawn from its first channel, dark to light.
+//! The picture rotates with the vehicle: up is ahead, not north. Classes have the colours of the layer's legend; a
+//! layer without classes is drawn from its first channel, dark to light.
 
 use clearway_proto::legend::Class;
 use clearway_proto::map::Layer;

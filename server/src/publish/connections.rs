@@ -1,9 +1,9 @@
 //! A listener -> connections, limited in number and in silence: gRPC and the page accept from it.
 //!
-//! A peer that opens thousands of connections would use up the file handles of the process, which recordings need too; a
-//! peer that connects and sends nothing would keep its connection for ever. A connection over the limit can be accepted
-//! for a short time, so that its peer gets an error that says why. Only a few of these are open at once; all others over
-//! the limit are closed immediately.
+//! A peer that opens thousands of connections would use up the file handles of the process, which recordings need too;
+//! a peer that connects and sends nothing would keep its connection for ever. A connection over the limit can be
+//! accepted for a short time, so that its peer gets an error that says why. Only a few of these are open at once; all
+//! others over the limit are closed immediately.
 
 use std::io;
 use std::net::SocketAddr;
@@ -26,7 +26,8 @@ const OVER_LIMIT_MAX: usize = 16;
 const OVER_LIMIT_TIMEOUT: Duration = Duration::from_secs(5);
 /// Longest time from the connection to its first byte. Ours: every client sends at once.
 const FIRST_BYTE_TIMEOUT: Duration = Duration::from_secs(10);
-/// Pause after an error of the listener itself, such as no free file handle: to try again at once would only use a core.
+/// Pause after an error of the listener itself, such as no free file handle: to try again at once would only use a
+/// core.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(200);
 
 /// A listener with a limit on its connections.

@@ -1,8 +1,8 @@
 //! Maps, points and poses for Foxglove, and for other clients of its WebSocket protocol (`foxglove.sdk.v1`).
 //!
 //! Channels: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/points` (`foxglove.PointCloud`: what the newest
-//! map was made from) and `/tf` (`foxglove.FrameTransforms`: `<vehicle>/base_link` in `map`). Channels without
-//! a subscription are not made. A new subscription gets the newest map at once. A stalled client has at most [`BACKLOG`]
+//! map was made from) and `/tf` (`foxglove.FrameTransforms`: `<vehicle>/base_link` in `map`). Channels without a
+//! subscription are not made. A new subscription gets the newest map at once. A stalled client has at most [`BACKLOG`]
 //! messages, then the oldest are dropped.
 
 use std::collections::HashMap;
@@ -24,8 +24,8 @@ use crate::newest::NewestSweep;
 use crate::subscriptions::LayerSubscription;
 use crate::sync::locked;
 
-/// Most messages on the way to one client. Ours: some revolutions of every layer; the largest message, a grid, has about
-/// 1 MB.
+/// Most messages on the way to one client. Ours: some revolutions of every layer; the largest message, a grid, has
+/// about 1 MB.
 const BACKLOG: usize = 32;
 
 /// The running WebSocket server.

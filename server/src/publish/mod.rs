@@ -1,7 +1,7 @@
 //! The newest map of each vehicle -> its readers over gRPC, zenoh, ROS 2 and Foxglove, and on the page.
 //!
-//! All publishers follow the same latest-value slots and send the same bytes, or what they decode from them. None of them
-//! can delay an engine.
+//! All publishers follow the same latest-value slots and send the same bytes, or what they decode from them. None of
+//! them can delay an engine.
 //!
 //! | file | in -> out |
 //! |---|---|

@@ -1,11 +1,10 @@
 //! Maps as ROS 2 topics in rmw_zenoh's key space, without a bridge.
 //!
 //! For each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`, reliable, transient local, depth 1)
-//! and its pose in `map` on `/tf` (reliable, volatile). A topic is published under
-//! `<domain>/<topic>/<type>/<hash>`, the payload CDR, with an attachment: sequence, time of sending, length 16, the
-//! publisher's 16 bytes. Liveliness tokens under `@ros2_lv` announce the node and its publishers. A grid is made only
-//! while there is a subscriber; the first subscriber gets the newest map at once, later ones get it from the publisher's
-//! cache.
+//! and its pose in `map` on `/tf` (reliable, volatile). A topic is published under `<domain>/<topic>/<type>/<hash>`,
+//! the payload CDR, with an attachment: sequence, time of sending, length 16, the publisher's 16 bytes. Liveliness
+//! tokens under `@ros2_lv` announce the node and its publishers. A grid is made only while there is a subscriber; the
+//! first subscriber gets the newest map at once, later ones get it from the publisher's cache.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;

@@ -5,9 +5,9 @@
 //! Subscribers can detect misses. A liveliness token `clearway/<vehicle>` lives as long as the vehicle is served;
 //! `clearway/<vehicle>/status` has the status once a second, as JSON.
 //!
-//! Congestion drops: blocking would let one stopped peer delay the healthy ones. Maps have the highest priority on a link,
-//! because planners brake by them; the status has the lowest, because the next one replaces it; observations and reports
-//! have zenoh's default priority.
+//! Congestion drops: blocking would let one stopped peer delay the healthy ones. Maps have the highest priority on a
+//! link, because planners brake by them; the status has the lowest, because the next one replaces it; observations and
+//! reports have zenoh's default priority.
 
 use std::time::Duration;
 
@@ -27,9 +27,9 @@ use crate::zenoh_session::ZenohError;
 
 /// Time between two status messages.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
-/// Interval at which a publisher repeats its last sequence, so that subscribers notice a lost last map. By the clock and
-/// not only after a map: then the next heartbeat replaces a lost one, and a heartbeat may be dropped (zenoh's sporadic
-/// heartbeat blocks).
+/// Interval at which a publisher repeats its last sequence, so that subscribers notice a lost last map. By the clock
+/// and not only after a map: then the next heartbeat replaces a lost one, and a heartbeat may be dropped (zenoh's
+/// sporadic heartbeat blocks).
 const HEARTBEAT: Duration = Duration::from_secs(1);
 /// Priority of maps: above zenoh's default (`Data`); `RealTime` is left for more urgent data of a vehicle.
 const MAPS: Priority = Priority::InteractiveHigh;
@@ -87,7 +87,8 @@ impl Publisher {
                 .encoding(map_encoding())
                 .congestion_control(CongestionControl::Drop)
                 .priority(MAPS)
-                // Sequence numbers of the publisher: the cache needs them or time stamps, and subscribers detect misses by them.
+                // Sequence numbers of the publisher: the cache needs them or time stamps, and subscribers detect misses
+                // by them.
                 .sample_miss_detection(MissDetectionConfig::default().heartbeat(HEARTBEAT))
                 .cache(cache.clone())
                 .publisher_detection()

@@ -1,8 +1,8 @@
 //! Any MCAP file -> its header and its messages, in file order. All commands read MCAP files with this reader.
 //!
-//! A file that a crash cut yields all its whole chunks, and is then reported as cut. Damage is an error, even after valid
-//! messages: the reader checks the CRC of a chunk before it returns a message of it. [`McapReader::salvage`] instead
-//! returns the messages before the damage and then reports it.
+//! A file that a crash cut yields all its whole chunks, and is then reported as cut. Damage is an error, even after
+//! valid messages: the reader checks the CRC of a chunk before it returns a message of it. [`McapReader::salvage`]
+//! instead returns the messages before the damage and then reports it.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::fs::File;

@@ -179,8 +179,8 @@ struct VehicleReplay {
 /// Verifies a recording. A map that differs is not an error; the [`Report`] contains it.
 ///
 /// # Errors
-/// [`VerifyError::Recording`] if the file is not a recording or is damaged, [`VerifyError::Config`] if its configuration
-/// is invalid.
+/// [`VerifyError::Recording`] if the file is not a recording or is damaged, [`VerifyError::Config`] if its
+/// configuration is invalid.
 pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     let mut recording = RecordingReader::open(file)?;
     let boot_id = recording.header().boot_id;

@@ -2,10 +2,10 @@
 //!
 //! Layout: metadata `clearway` (boot id, version, vehicles, source of each calibration), attachments `config.toml` (the
 //! effective configuration) and `calibration/<vehicle>/<sensor>.yaml` (the configured tables), then the channels
-//! `/<vehicle>/journal` (`clearway.v1.Event`) and `/<vehicle>/map/<layer>` (`clearway.v1.Map`, the same bytes that zenoh
-//! carries). Log time is the arrival of the event, or of the event that completed the map. Chunks are closed by time, so
-//! that a crash loses at most `flush_ms`. A disk that fails ends the recording with a reason; maps are still computed
-//! and served.
+//! `/<vehicle>/journal` (`clearway.v1.Event`) and `/<vehicle>/map/<layer>` (`clearway.v1.Map`, the same bytes that
+//! zenoh carries). Log time is the arrival of the event, or of the event that completed the map. Chunks are closed by
+//! time, so that a crash loses at most `flush_ms`. A disk that fails ends the recording with a reason; maps are still
+//! computed and served.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -160,8 +160,8 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Creates the file, writes the header and starts the thread. Returns a handle for each vehicle, in the order of the
-    /// header. With `waits` a full queue delays its sender and loses nothing: right for files, wrong for live data.
+    /// Creates the file, writes the header and starts the thread. Returns a handle for each vehicle, in the order of
+    /// the header. With `waits` a full queue delays its sender and loses nothing: right for files, wrong for live data.
     ///
     /// # Errors
     /// [`RecordError::Create`] if the file or the thread cannot be created, [`RecordError::Write`] if the header cannot

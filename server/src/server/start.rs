@@ -135,7 +135,8 @@ impl Running {
         }
         for Prepared { served: Served { status, .. }, mut engine, events } in prepared {
             self.recorder.iter().for_each(|recorder| status.show_recorder(recorder.counts()));
-            // A replay computes all layers: a reader that comes late gets the last map, and the summary has all metrics.
+            // A replay computes all layers: a reader that comes late gets the last map, and the summary has all
+            // metrics.
             self.subscriptions.extend(from_files.then(|| status.subscriptions.subscribe(&[])));
             engine.recording = handles.next();
             let name = status.name.clone();

@@ -1,4 +1,5 @@
-//! The JSON objects of a sensor's state and of a ledger: the same for the page, `clearway vehicles`, `get` and `export`.
+//! The JSON objects of a sensor's state and of a ledger: the same for the page, `clearway vehicles`, `get` and
+//! `export`.
 
 use clearway_proto::v1;
 use serde_json::{Value, json};

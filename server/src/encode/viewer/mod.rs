@@ -1,7 +1,7 @@
 //! Maps for ROS 2 and Foxglove: messages of one [`MapView`](clearway_client::MapView).
 //!
-//! Frames: grids and points in `<vehicle>/base_link`, the ego frame; if poses are known, that frame in `map`. Every stamp
-//! is the end of the capture.
+//! Frames: grids and points in `<vehicle>/base_link`, the ego frame; if poses are known, that frame in `map`. Every
+//! stamp is the end of the capture.
 //!
 //! | file | in -> out |
 //! |---|---|

@@ -1,5 +1,5 @@
-//! The gRPC server: `clearway.v1.MapService`, standard health and reflection, and the ingest service if it is configured
-//! ([`crate::ingest::grpc`]).
+//! The gRPC server: `clearway.v1.MapService`, standard health and reflection, and the ingest service if it is
+//! configured ([`crate::ingest::grpc`]).
 //!
 //! The limits of what one client may cost are set here, each with its reason. [`reader`] has the updates of one reader.
 
@@ -30,14 +30,14 @@ use v1::map_service_server::{MapService, MapServiceServer};
 
 /// Longest request, in bytes. Ours: requests hold names and numbers.
 const REQUEST_BYTES_MAX: usize = 64 << 10;
-/// Flow-control window of a connection, in bytes: what a client may send before the server reads it. Ours: a scan takes a
-/// few windows, and a client that is not read costs no more than one.
+/// Flow-control window of a connection, in bytes: what a client may send before the server reads it. Ours: a scan takes
+/// a few windows, and a client that is not read costs no more than one.
 const WINDOW_BYTES: u32 = 1 << 20;
 /// Most streams on one connection. Ours: more than a fleet page needs for its vehicles and layers.
 const STREAMS_MAX: u32 = 128;
 /// Most streams of one connection that the client reset before the server accepted them, and most that the server reset
-/// because of the client's errors. A planner that restarts resets a few; a client that keeps opening and resetting streams
-/// loses its connection.
+/// because of the client's errors. A planner that restarts resets a few; a client that keeps opening and resetting
+/// streams loses its connection.
 const RESETS_PENDING_MAX: usize = 20;
 const RESETS_FOR_MISTAKES_MAX: usize = 128;
 /// Longest headers of a request, in bytes. Ours: gRPC headers have a few hundred bytes; this is hyper's default.

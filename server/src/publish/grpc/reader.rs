@@ -1,8 +1,8 @@
 //! One reader of `Watch`: its requests and the newest maps -> its updates.
 //!
 //! The transport polls the stream for its next update when it has room for one, and only then the stream reads the
-//! latest-value slot: a slow reader skips maps, learns how many, and costs the engine nothing. Credits limit the maps on
-//! the way; without them the HTTP/2 windows alone hold about half a minute of maps.
+//! latest-value slot: a slow reader skips maps, learns how many, and costs the engine nothing. Credits limit the maps
+//! on the way; without them the HTTP/2 windows alone hold about half a minute of maps.
 
 use std::sync::Arc;
 
@@ -82,7 +82,8 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         })
     }
 
-    /// The next update: the newest map that is due, as soon as there is a credit. `None` if the reader has disconnected.
+    /// The next update: the newest map that is due, as soon as there is a credit. `None` if the reader has
+    /// disconnected.
     async fn next(&mut self) -> Result<Option<v1::MapUpdate>, Status> {
         loop {
             tokio::select! {

@@ -1,8 +1,8 @@
 //! The selection of one reader of `Watch`: checked, then applied to the newest maps.
 //!
-//! In: a [`v1::Selection`], the capture stamps of the newest maps, acknowledgements. Out: whether a map may be sent now,
-//! and how many of the maps between were missed or left out because of the rate. No clock is read: the same maps and the
-//! same acknowledgements give the same updates.
+//! In: a [`v1::Selection`], the capture stamps of the newest maps, acknowledgements. Out: whether a map may be sent
+//! now, and how many of the maps between were missed or left out because of the rate. No clock is read: the same maps
+//! and the same acknowledgements give the same updates.
 
 use std::collections::VecDeque;
 
@@ -36,8 +36,8 @@ impl Selection {
     /// Checks the selection of a reader of this vehicle.
     ///
     /// # Errors
-    /// `NotFound` for an unknown layer; `InvalidArgument` for a value that is not allowed, or a region outside the grids.
-    /// Both name the value and what is allowed.
+    /// `NotFound` for an unknown layer; `InvalidArgument` for a value that is not allowed, or a region outside the
+    /// grids. Both name the value and what is allowed.
     pub fn new(served: &Served, selection: v1::Selection) -> Result<Self, Status> {
         let v1::Selection { vehicle: _, layers, max_in_flight, max_rate_hz, region, deltas } = selection;
         served.check_layers(&layers)?;
@@ -99,9 +99,9 @@ impl Rate {
         self.period_ns == 0 || self.due_ns.is_none_or(|due_ns| stamp_ns >= due_ns)
     }
 
-    /// Records that a map captured at `stamp_ns` was sent. The next map is due one period after this one was due, however
-    /// late it came, so that the mean rate is kept even if the map rate is no multiple of it; a reader that was away does
-    /// not catch up. The quarter of a period allows for jitter of the maps.
+    /// Records that a map captured at `stamp_ns` was sent. The next map is due one period after this one was due,
+    /// however late it came, so that the mean rate is kept even if the map rate is no multiple of it; a reader that was
+    /// away does not catch up. The quarter of a period allows for jitter of the maps.
     pub fn send(&mut self, stamp_ns: i64) {
         let quarter_ns = self.period_ns / 4;
         self.due_ns = match self.due_ns {

@@ -13,8 +13,8 @@ pub struct MotionConfig {
     /// Time for which the motion is extrapolated after the newest pose (and before the oldest), milliseconds. 200 is
     /// ours: two revolutions at 10 Hz.
     pub extrapolation_ms: u32,
-    /// Largest age of a speed that is used if no poses are near enough, milliseconds; 0 leaves such scans uncompensated.
-    /// 2000 is ours: two sentences of a GPS receiver that sends one each second.
+    /// Largest age of a speed that is used if no poses are near enough, milliseconds; 0 leaves such scans
+    /// uncompensated. 2000 is ours: two sentences of a GPS receiver that sends one each second.
     pub speed_age_ms: u32,
 }
 
