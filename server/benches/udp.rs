@@ -1,5 +1,5 @@
-//! Throughput of the UDP ingest: a thread sends datagrams over loopback, and an engine that only counts them receives the
-//! events.
+//! Throughput of the UDP ingest: a thread sends datagrams over loopback, and an engine that only counts them receives
+//! the events.
 //!
 //!   cargo bench -p clearway --bench udp                       as fast as possible, 2,000,000 datagrams
 //!   cargo bench -p clearway --bench udp -- 6254 60            6,254 a second for 60 seconds
@@ -9,15 +9,15 @@
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
-use clearway_mapping::event::Body;
-use clearway_mapping::ledger::Ledger;
 use clearway::config::{Config, Udp};
 use clearway::ingest::{queue::event_queue, udp};
+use clearway_mapping::event::Body;
+use clearway_mapping::ledger::Ledger;
 use nix::sys::socket::setsockopt;
 use nix::sys::socket::sockopt::UdpGsoSegment;
 
-/// Number of datagrams of one send call, between two reads of the clock. The kernel splits them (UDP GSO), so that sending
-/// needs less time than receiving. At most 64 KiB.
+/// Number of datagrams of one send call, between two reads of the clock. The kernel splits them (UDP GSO), so that
+/// sending needs less time than receiving. At most 64 KiB.
 const BURST: usize = 32;
 /// Length of a data packet in bytes.
 const DATAGRAM: usize = 1206;

@@ -5,14 +5,14 @@ use std::io::Cursor;
 use std::path::Path;
 
 use bytes::{Buf, Bytes};
+use clearway::config::Config;
+use clearway::encode::{event_from_bytes, event_to_proto};
+use clearway::ingest::observation::{Limits, decode};
+use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway_lidar::model::Model;
 use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
-use clearway::config::Config;
-use clearway::ingest::observation::{Limits, decode};
-use clearway::record::reader::{RecordedMessage, RecordingReader};
-use clearway::encode::{event_from_bytes, event_to_proto};
 use prost::Message;
 
 /// An encoded observation.
@@ -40,7 +40,9 @@ pub fn event(bytes: &[u8]) {
 
 /// The bytes of an MCAP file.
 pub fn recording(bytes: &[u8]) {
-    let Ok(mut recording) = RecordingReader::from_source(Path::new("any.mcap"), Cursor::new(bytes.to_vec())) else { return };
+    let Ok(mut recording) = RecordingReader::from_source(Path::new("any.mcap"), Cursor::new(bytes.to_vec())) else {
+        return;
+    };
     drop(recording.config());
     let mut pipeline = pipeline();
     for message in &mut recording {

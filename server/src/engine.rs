@@ -8,8 +8,8 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use clearway_mapping::event::Event;
 use clearway_mapping::error::EventError;
+use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use tokio::sync::watch;
 
@@ -20,7 +20,8 @@ use crate::newest::Newest;
 use crate::record::writer::RecordingHandle;
 use crate::status::VehicleStatus;
 
-/// Period at which an engine without events checks for new subscribers. Ours: short beside a revolution of 50 to 200 ms.
+/// Period at which an engine without events checks for new subscribers. Ours: short beside a revolution of 50 to 200
+/// ms.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// A function that is called with the pipeline after each event that completed a revolution.

@@ -20,7 +20,8 @@ const LIMITS: [(&str, &str); 12] = [
     ("transport/link/tx/lease", "2000"),
     ("transport/link/tx/keep_alive", "4"),
     // Batches of 64 KiB in the queue of the maps, allocated when needed. Eight hold all layers of several maps, so that
-    // a short delay of the machine drops nothing. No more than this, and what the kernel holds, waits for a stopped peer.
+    // a short delay of the machine drops nothing. No more than this, and what the kernel holds, waits for a stopped
+    // peer.
     ("transport/link/tx/queue/size", "{ interactive_high: 8 }"),
     ("transport/link/tcp", "{ so_sndbuf: 262144 }"),
     ("transport/link/tls/so_sndbuf", "262144"),
@@ -71,9 +72,8 @@ pub(crate) async fn endpoints(session: &Session) -> Vec<String> {
 fn session_config(options: &Options, message_bytes_max: usize) -> Result<Config, ZenohError> {
     let mut config = match options.file.as_os_str().is_empty() {
         true => limited()?,
-        false => {
-            Config::from_file(&options.file).map_err(ZenohError::of(format!("zenoh.file {}", options.file.display())))?
-        }
+        false => Config::from_file(&options.file)
+            .map_err(ZenohError::of(format!("zenoh.file {}", options.file.display())))?,
     };
     let json = |value: serde_json::Value| value.to_string();
     let settings = [

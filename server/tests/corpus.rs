@@ -1,5 +1,5 @@
-//! Replays the corpora of the fuzz targets. A corpus has the files that this test writes with `CLEARWAY_BLESS=1`, and the
-//! files that a fuzzer derived from them (named by their hash).
+//! Replays the corpora of the fuzz targets. A corpus has the files that this test writes with `CLEARWAY_BLESS=1`, and
+//! the files that a fuzzer derived from them (named by their hash).
 
 #[path = "../fuzz/entries.rs"]
 mod entries;
@@ -8,13 +8,13 @@ use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
+use clearway::config::Config;
+use clearway::encode::event_to_proto;
+use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway_mapping::config::{Extrinsics, SensorConfig};
 use clearway_mapping::event::{self as core, Event};
 use clearway_proto::packed::pack;
 use clearway_proto::v1;
-use clearway::config::Config;
-use clearway::record::reader::{RecordedMessage, RecordingReader};
-use clearway::encode::event_to_proto;
 use mcap::WriteOptions;
 use prost::Message;
 use v1::observation::Body;

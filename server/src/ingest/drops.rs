@@ -39,7 +39,8 @@ pub struct UnknownSender {
 }
 
 impl DropCounters {
-    /// Adds the drops that are not reported to the engine yet to the vehicle's ledger and to the ledgers of its sensors.
+    /// Adds the drops that are not reported to the engine yet to the vehicle's ledger and to the ledgers of its
+    /// sensors.
     pub fn add_unreported_to<'a>(&self, ledger: &mut Ledger, sensors: impl IntoIterator<Item = &'a mut Ledger>) {
         let mut sensors: Vec<_> = sensors.into_iter().collect();
         for (&(cause, source), &count) in &*locked(&self.unreported) {

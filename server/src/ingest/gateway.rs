@@ -1,4 +1,5 @@
-//! The gateway of one vehicle: one observation of a client -> events on the vehicle's queue. gRPC and zenoh both use it.
+//! The gateway of one vehicle: one observation of a client -> events on the vehicle's queue. gRPC and zenoh both use
+//! it.
 
 use std::sync::{Arc, Mutex};
 
@@ -208,7 +209,8 @@ impl Gateways {
     /// The gateway of the vehicle `name`; of the only vehicle if `name` is empty.
     ///
     /// # Errors
-    /// [`UnknownNameError::Vehicle`] if no vehicle has the name, or if it is empty and there is not exactly one vehicle.
+    /// [`UnknownNameError::Vehicle`] if no vehicle has the name, or if it is empty and there is not exactly one
+    /// vehicle.
     pub fn find(&self, name: &str) -> Result<&Arc<Gateway>, UnknownNameError> {
         find_vehicle(&self.all, name, |gateway| &gateway.vehicle)
     }

@@ -1,9 +1,9 @@
 //! Observations over gRPC: `clearway.v1.IngestService`.
 //!
 //! A stream reads its next observation only while its events in flight are within the vehicle's limits and the peer
-//! receives its reports. A fast client therefore waits, and the server holds no more than the limits. The engine returns
-//! the outcome of each event by its [`Receipt`](super::receipt::Receipt); the stream collects outcomes into as few
-//! reports as the transport can send.
+//! receives its reports. A fast client therefore waits, and the server holds no more than the limits. The engine
+//! returns the outcome of each event by its [`Receipt`](super::receipt::Receipt); the stream collects outcomes into as
+//! few reports as the transport can send.
 
 use std::pin::Pin;
 use std::sync::Arc;

@@ -34,7 +34,7 @@ pub struct Reading {
     pub body: Body,
 }
 
-/// The queue takes no more events: the engine has stopped, or the queue is closed.
+/// The queue accepts no more events, because the engine has stopped or the queue is closed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the vehicle's engine has stopped")]
 pub struct QueueClosedError;
@@ -123,7 +123,8 @@ impl EventQueue {
     ) -> Result<bool, QueueClosedError> {
         let mut state = locked(&self.state);
         let mut unreported = locked(&self.drops.unreported);
-        // Reports of drops get the same stamp, so that the time of a captured drive never jumps to the clock's and back.
+        // Reports of drops get the same stamp, so that the time of a captured drive never jumps to the clock's and
+        // back.
         let arrival_ns = captured_ns.unwrap_or_else(|| self.clock.now_ns());
         // Reports come before the readings, so that the journal has the drops where they happened.
         let (is_due, mut has_space) = (state.is_report_due(arrival_ns), true);

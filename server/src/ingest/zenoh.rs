@@ -1,10 +1,10 @@
-//! Observations over zenoh: `clearway/<vehicle>/ingest/{scan,packet,end,sensor}/<sensor>` and `.../{pose,road}`; reports
-//! go to `clearway/<vehicle>/ingest/report`.
+//! Observations over zenoh: `clearway/<vehicle>/ingest/{scan,packet,end,sensor}/<sensor>` and `.../{pose,road}`;
+//! reports go to `clearway/<vehicle>/ingest/report`.
 //!
-//! zenoh's callback only queues a sample, within two bounds; one task a vehicle decodes the queued samples. A sample that
-//! exceeds a bound is counted as `queue`, and its client learns of it because its numbers then have a gap. Reports are
-//! dropped under congestion, so that a stopped peer does not delay the others; the newest acknowledgement is therefore
-//! repeated for a while.
+//! zenoh's callback only queues a sample, within two bounds; one task a vehicle decodes the queued samples. A sample
+//! that exceeds a bound is counted as `queue`, and its client learns of it because its numbers then have a gap. Reports
+//! are dropped under congestion, so that a stopped peer does not delay the others; the newest acknowledgement is
+//! therefore repeated for a while.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};

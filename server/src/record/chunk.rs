@@ -9,8 +9,8 @@ use std::io::Read;
 use mcap::records::{ChunkHeader, Record, op};
 use mcap::{McapError, parse_record};
 
-/// Greatest length of a record, and of a decompressed chunk, in bytes. Ours: our chunks have a few MiB; a greater length
-/// is damage, refused before it is allocated.
+/// Greatest length of a record, and of a decompressed chunk, in bytes. Ours: our chunks have a few MiB; a greater
+/// length is damage, refused before it is allocated.
 pub(super) const RECORD_BYTES_MAX: usize = 256 << 20;
 /// Length of the head of a record: its kind (one byte) and its length (eight bytes).
 const RECORD_HEAD_BYTES: usize = 9;

@@ -92,7 +92,8 @@ impl RecordingReader {
     /// Opens a recording and reads up to its first message.
     ///
     /// # Errors
-    /// [`RecordingError::Mcap`] if the file cannot be read, is not an MCAP file, or is damaged before its first message.
+    /// [`RecordingError::Mcap`] if the file cannot be read, is not an MCAP file, or is damaged before its first
+    /// message.
     pub fn open(file: &Path) -> Result<Self, RecordingError> {
         Ok(Self { reader: McapReader::open(file)?, has_ended: false })
     }

@@ -21,7 +21,8 @@ use crate::ingest::grpc::Ingest;
 use crate::ingest::queue::{EventQueue, QueuedEvent, event_queue};
 use crate::ingest::udp;
 use crate::publish::{Served, Vehicles, foxglove, grpc, page};
-use crate::record::writer::{Header, Recorder, recording_path};
+use crate::record::mcap_file::Header;
+use crate::record::writer::{Recorder, recording_path};
 use crate::status::VehicleStatus;
 
 /// The server.
@@ -135,7 +136,8 @@ impl Running {
         }
         for Prepared { served: Served { status, .. }, mut engine, events } in prepared {
             self.recorder.iter().for_each(|recorder| status.show_recorder(recorder.counts()));
-            // A replay computes all layers: a reader that comes late gets the last map, and the summary has all metrics.
+            // A replay computes all layers: a reader that comes late gets the last map, and the summary has all
+            // metrics.
             self.subscriptions.extend(from_files.then(|| status.subscriptions.subscribe(&[])));
             engine.recording = handles.next();
             let name = status.name.clone();

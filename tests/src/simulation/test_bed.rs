@@ -15,7 +15,8 @@ use clearway::ingest::receipt::{ClientSession, ObservationId, Outcome as EventOu
 use clearway::clock::Clock;
 use clearway::ingest::queue::{EventQueue, QueuedEvent, event_queue_with_clock};
 use clearway::publish::{Served, Vehicles};
-use clearway::record::writer::{Header, RecordingWriter};
+use clearway::record::mcap_file::Header;
+use clearway::record::writer::RecordingWriter;
 use clearway::status::VehicleStatus;
 use clearway_mapping::pipeline::{Pipeline, layer_names};
 use clearway_proto::v1;

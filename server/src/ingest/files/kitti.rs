@@ -1,7 +1,7 @@
 //! Scan files of other programs -> readings: KITTI `.bin` and `.pcd`, read by [`clearway_mapping::scan_file`].
 //!
-//! These files have no stamps. The scans get the stamps of a 10 Hz sensor from a fixed time on ([`EPOCH_NS`]), so that the
-//! same files always yield the same maps.
+//! These files have no stamps. The scans get the stamps of a 10 Hz sensor from a fixed time on ([`EPOCH_NS`]), so that
+//! the same files always yield the same maps.
 
 use std::path::{Path, PathBuf};
 

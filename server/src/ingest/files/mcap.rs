@@ -15,7 +15,8 @@ pub type RefusedMessages = BTreeMap<(u16, &'static str), u64>;
 /// The part of MCAP files that is read.
 #[derive(Clone, Debug, Default)]
 pub struct McapOptions {
-    /// The vehicle whose journal is read from a recording of several vehicles; the vehicle of the first event if `None`.
+    /// The vehicle whose journal is read from a recording of several vehicles; the vehicle of the first event if
+    /// `None`.
     pub vehicle: Option<String>,
     /// ROS topics; chosen automatically if empty.
     pub topics: Vec<String>,
@@ -51,8 +52,8 @@ pub enum McapError {
 }
 
 impl Source {
-    /// Opens the file. `decoder` is that of the file before, so that several files of one bag are decoded as one; without
-    /// it, the topics are chosen here.
+    /// Opens the file. `decoder` is that of the file before, so that several files of one bag are decoded as one;
+    /// without it, the topics are chosen here.
     ///
     /// # Errors
     /// [`McapError::Recording`] if the file cannot be read or is not an MCAP file, [`McapError::Choice`] if it does not

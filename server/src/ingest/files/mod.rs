@@ -19,11 +19,11 @@ use std::path::{Path, PathBuf};
 
 use clearway_mapping::event::Body;
 
+use crate::ingest::queue::Reading;
+use crate::ingest::ros::decoder::TopicDecoder;
 use capture::CaptureError;
 use kitti::ScanError;
 use mcap::{McapError, McapOptions, RefusedMessages};
-use crate::ingest::queue::Reading;
-use crate::ingest::ros::decoder::TopicDecoder;
 
 /// The kind of a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -55,8 +55,9 @@ pub enum FilesError {
     },
     /// A ROS 2 bag has the older sqlite3 storage.
     #[error(
-        "{}: a ROS 2 bag in sqlite3; MCAP is read: write `output_bags: [{{uri: converted, storage_id: mcap, all_topics: true}}]` \
-         into convert.yaml, then `ros2 bag convert -i {} -o convert.yaml`",
+        "{}: a ROS 2 bag in sqlite3; MCAP is read: write \
+         `output_bags: [{{uri: converted, storage_id: mcap, all_topics: true}}]` into convert.yaml, \
+         then `ros2 bag convert -i {} -o convert.yaml`",
         file.display(), file.display()
     )]
     Sqlite {
@@ -333,7 +334,8 @@ mod tests {
         assert_eq!(kind(&at("a.bin", &[0x89, b'M', b'C', b'A', b'P'])).unwrap(), Kind::Mcap);
         assert_eq!(kind(&at("b.bin", &[0; 16])).unwrap(), Kind::Scan);
         assert!(matches!(kind(&at("notes.txt", b"hello")), Err(FilesError::Kind { .. })));
-        let bag = Readings::open(&[at("bag_0.db3", b"SQLite format 3\0").parent().unwrap().into()], McapOptions::default());
+        let bag =
+            Readings::open(&[at("bag_0.db3", b"SQLite format 3\0").parent().unwrap().into()], McapOptions::default());
         assert!(bag.err().unwrap().to_string().contains("ros2 bag convert -i"));
         assert!(matches!(kind(Path::new("/no/such/file")), Err(FilesError::Open { .. })));
     }
@@ -345,8 +347,10 @@ mod tests {
             let bytes: Vec<u8> = [x, 0.0, 0.0, 0.0].iter().flat_map(|v| v.to_le_bytes()).collect();
             std::fs::write(folder.path().join(name), bytes).unwrap();
         }
-        let readings: Vec<_> =
-            Readings::open(&[folder.path().to_owned()], McapOptions::default()).unwrap().collect::<Result<_, _>>().unwrap();
+        let readings: Vec<_> = Readings::open(&[folder.path().to_owned()], McapOptions::default())
+            .unwrap()
+            .collect::<Result<_, _>>()
+            .unwrap();
         let x = |reading: &Reading| match &reading.body {
             Body::Scan(scan) => scan.x[0],
             _ => f32::NAN,

@@ -12,8 +12,8 @@ use nalgebra::Isometry3;
 use super::decoder::{PoseSource, TopicDecoder};
 use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 
-/// Duration of the start of a file from which its topics are known, in ns. Ours: latched transforms come first, all other
-/// messages come often.
+/// Duration of the start of a file from which its topics are known, in ns. Ours: latched transforms come first, all
+/// other messages come often.
 const START_NS: i64 = 10_000_000_000;
 /// The vehicle's frame: the first of these in the tf tree. REP-120 puts `base_footprint` on the ground.
 const EGO_FRAMES: [&str; 2] = ["base_footprint", "base_link"];
@@ -143,12 +143,7 @@ impl AvailableTopics {
     ///
     /// # Errors
     /// [`ChoiceError::Topic`] if the file does not have a requested topic.
-    pub fn choose(
-        &self,
-        file: &Path,
-        requested: &[String],
-        sensors_max: usize,
-    ) -> Result<TopicChoice, ChoiceError> {
+    pub fn choose(&self, file: &Path, requested: &[String], sensors_max: usize) -> Result<TopicChoice, ChoiceError> {
         for topic in requested {
             if !self.topics.contains_key(topic) {
                 let known = self.topics.iter().map(|(topic, of)| format!("{topic} ({})", of.kind));
@@ -231,7 +226,8 @@ impl AvailableTopics {
             None if sensors.is_empty() => {}
             None => notes.push("the file has no poses".into()),
         }
-        let unused = |(topic, found): &(&String, &Topic)| !used.contains(topic.as_str()) && found.kind != Kind::TfMessage;
+        let unused =
+            |(topic, found): &(&String, &Topic)| !used.contains(topic.as_str()) && found.kind != Kind::TfMessage;
         let unused = self.topics.iter().filter(unused);
         notes.extend(unused.map(|(topic, found)| format!("{topic} ({}) is not used", found.kind)));
         notes
@@ -239,8 +235,8 @@ impl AvailableTopics {
 }
 
 impl TopicChoice {
-    /// The decoder of the chosen topics. It has the static transforms from the start, so that they also apply to earlier
-    /// messages.
+    /// The decoder of the chosen topics. It has the static transforms from the start, so that they also apply to
+    /// earlier messages.
     pub fn decoder(&self) -> TopicDecoder {
         let sensors = self.sensors.iter().zip(0..).map(|(sensor, index)| (sensor.topic.clone(), index)).collect();
         TopicDecoder::new(sensors, self.pose.clone(), &self.ego_frame, self.latched.clone())

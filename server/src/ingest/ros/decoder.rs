@@ -2,13 +2,14 @@
 //!
 //! Scans come in the sensor's frame, and the sensor's extrinsics place them on the vehicle. Ego poses come from an
 //! odometry, from stamped poses, or from the tf chain of a fixed frame down to the vehicle's frame. If a message refers
-//! to another frame than the vehicle's, the tf tree transforms it; a missing chain is an error. tf and stamped poses have
-//! no speed: it is computed from the forward distance since the pose before, so the first of them yields no reading.
+//! to another frame than the vehicle's, the tf tree transforms it; a missing chain is an error. tf and stamped poses
+//! have no speed: it is computed from the forward distance since the pose before, so the first of them yields no
+//! reading.
 
 use std::collections::{BTreeMap, VecDeque};
 
 use bytes::Bytes;
-use clearway_mapping::event::{Body, EgoPose, UNKNOWN_SOURCE, Scan};
+use clearway_mapping::event::{Body, EgoPose, Scan, UNKNOWN_SOURCE};
 use clearway_ros::pose::{Odometry, StampedTransform, pose_stamped, tf_message};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, Kind, MessageError, PointCloud2, Points};
@@ -163,8 +164,8 @@ impl TopicDecoder {
         Ok(EgoPose { stamp_ns: header.stamp_ns, map_from_ego, speed_mps: velocity.x })
     }
 
-    /// The ego pose with its speed, computed from the forward distance since the pose before. `None` for the first pose,
-    /// and for a pose that is not newer than the one before.
+    /// The ego pose with its speed, computed from the forward distance since the pose before. `None` for the first
+    /// pose, and for a pose that is not newer than the one before.
     fn pose_with_speed(&mut self, stamp_ns: i64, map_from_ego: Isometry3<f64>) -> Option<EgoPose> {
         if self.newest.is_some_and(|(before_ns, _)| before_ns >= stamp_ns) {
             return None;
