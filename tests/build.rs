@@ -3,12 +3,13 @@
 //!
 //! | `cfg` | what was found |
 //! |---|---|
-//! | `clearway_data` | recorded drives, with an `INDEX.md`: `$CLEARWAY_DATA`, else `shared/data` beside the repository |
+//! | `clearway_data` | recorded drives with an `INDEX.md`: `$CLEARWAY_DATA`, else `shared/data` beside the repository |
 //! | `clearway_python` | `python3` with the modules `venv` and `ensurepip` |
 //! | `clearway_openssl` | `openssl`, with which `deploy/make-test-ca.sh` makes certificates |
 //! | `clearway_browser` | `chromium` and `chromedriver` |
 //!
-//! `env!("CLEARWAY_DATA")` is the path of the recorded drives, or empty. After installing one of them, `touch tests/build.rs` lets cargo look again.
+//! `env!("CLEARWAY_DATA")` is the path of the recorded drives, or empty. After you install one of them,
+//! `touch tests/build.rs` makes cargo look again.
 
 use std::env;
 use std::path::{Path, PathBuf};

@@ -119,7 +119,8 @@ proptest! {
             return Ok(());
         };
         let seen = seen.expect("cells are larger than the looks are apart");
-        prop_assert!(obstacle.distance_m <= seen + 1e-9 && obstacle.distance_m > seen - 2.0 * LOOK_M, "{obstacle:?}, {seen}");
+        let distance_m = obstacle.distance_m;
+        prop_assert!(distance_m <= seen + 1e-9 && distance_m > seen - 2.0 * LOOK_M, "{obstacle:?}, {seen}");
         let (sin, cos) = obstacle.bearing_rad.sin_cos();
         let place = (x + obstacle.distance_m * cos, y + obstacle.distance_m * sin);
         prop_assert!((place.0 - obstacle.x_m).hypot(place.1 - obstacle.y_m) < 1e-9, "{obstacle:?}");

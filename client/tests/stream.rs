@@ -18,7 +18,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 type Updates = Vec<Result<v1::MapUpdate, Status>>;
 
-/// Sends what it was given; tells every request it gets.
+/// A service that sends the given updates, and forwards every request that it receives to the test.
 struct Script {
     updates: Mutex<Updates>,
     requests: mpsc::UnboundedSender<v1::WatchRequest>,
@@ -74,7 +74,7 @@ fn update(sequence: u64, skipped: u64) -> Result<v1::MapUpdate, Status> {
 }
 
 #[tokio::test]
-async fn every_map_is_acknowledged_and_the_newest_is_handed_out_with_the_skipped_ones_counted() {
+async fn every_map_is_acknowledged_and_skipped_maps_are_counted() {
     let (address, mut told) = serve(vec![update(0, 0), update(3, 2), update(4, 0)]).await;
     let client = Client::connect(&address).await.unwrap();
     let layers = vec!["drivability".to_string()];
@@ -84,7 +84,7 @@ async fn every_map_is_acknowledged_and_the_newest_is_handed_out_with_the_skipped
     for sequence in [0, 3, 4] {
         assert_eq!(told.recv().await.unwrap().acknowledged, Some(sequence));
     }
-    // However the looks fell between the updates, every map was either given or counted.
+    // At whatever times the client calls `next`, every map is either returned or counted as skipped.
     let (mut given, mut skipped, mut newest) = (0, 0, None);
     let ended = loop {
         match maps.next().await {
@@ -113,7 +113,7 @@ fn delta(sequence: u64, base_sequence: u64) -> Result<v1::MapUpdate, Status> {
 
 #[tokio::test]
 async fn a_lost_update_leads_to_a_whole_map_and_never_to_a_wrong_cell() {
-    // Map 1 is lost on the way; 3 is under way already when the server hears of it.
+    // Map 1 is lost. Map 3 is already sent when the server receives the request for a keyframe.
     let (address, mut told) = serve(vec![update(0, 0), delta(2, 1), delta(3, 2), update(4, 0), delta(5, 4)]).await;
     let client = Client::connect(&address).await.unwrap();
     let mut maps = client.subscribe(Subscription { deltas: true, ..Default::default() }).await.unwrap();
@@ -131,11 +131,11 @@ async fn a_lost_update_leads_to_a_whole_map_and_never_to_a_wrong_cell() {
     }
     assert!(given.iter().all(|sequence| [0, 4, 5].contains(sequence)), "{given:?}");
     assert_eq!(given.last(), Some(&5));
-    assert_eq!(given[0] + given.len() as u64 + skipped, 6, "{given:?}, and {skipped} are told as skipped");
+    assert_eq!(given[0] + given.len() as u64 + skipped, 6, "{given:?}, and {skipped} are counted as skipped");
 }
 
 #[tokio::test]
-async fn a_delta_nobody_asked_for_is_not_shown_either() {
+async fn a_delta_that_was_not_requested_is_not_shown() {
     let (address, mut told) = serve(vec![delta(2, 1), update(3, 0)]).await;
     let client = Client::connect(&address).await.unwrap();
     let mut maps = client.subscribe(Subscription::default()).await.unwrap();
@@ -145,7 +145,7 @@ async fn a_delta_nobody_asked_for_is_not_shown_either() {
 }
 
 #[tokio::test]
-async fn a_map_that_is_not_right_ends_the_stream_instead_of_being_shown() {
+async fn an_invalid_map_ends_the_stream_and_is_not_shown() {
     let spoilt = v1::MapUpdate { map: map(1, CAPTURE_END_NS).slice(..100), ..Default::default() };
     let (address, _told) = serve(vec![Ok(spoilt)]).await;
     let client = Client::connect(&address).await.unwrap();
@@ -156,7 +156,7 @@ async fn a_map_that_is_not_right_ends_the_stream_instead_of_being_shown() {
 }
 
 #[tokio::test]
-async fn the_servers_refusal_reaches_the_caller_in_its_words() {
+async fn the_error_of_a_call_contains_the_servers_message() {
     let (address, _told) = serve(vec![Err(Status::unavailable("the vehicle's engine has stopped"))]).await;
     let client = Client::connect(&format!("http://{address}")).await.unwrap();
     assert_eq!(client.vehicles().await.unwrap()[0].name, "alpha");
@@ -169,7 +169,7 @@ async fn the_servers_refusal_reaches_the_caller_in_its_words() {
 }
 
 #[tokio::test]
-async fn bad_addresses_are_named_with_what_is_allowed() {
+async fn a_bad_address_is_refused_with_the_allowed_forms() {
     for address in ["localhost", "localhost:", ":50051", "localhost:70000", "https://localhost:1", "a b:1"] {
         let error = Client::connect(address).await.unwrap_err();
         assert!(matches!(error, ClientError::Address { .. }), "{address}: {error}");

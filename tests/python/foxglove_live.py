@@ -1,6 +1,7 @@
-"""A WebSocket client of Foxglove's protocol: takes what is advertised, decodes it by the schemas that are advertised with it.
+"""A WebSocket client of Foxglove's protocol. It subscribes to advertised channels, and decodes the messages by the
+schemas that are advertised with them.
 
-Prints two JSON objects, a line each: what came of the current map at once, and then, for maps made from now on, the points.
+Prints two JSON objects, one a line: first the messages of the current map, then the points of the next map.
 
 Usage: foxglove_live.py URL
 """
@@ -10,7 +11,7 @@ import base64
 import json
 import sys
 
-import told as tell
+import message_json
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from websockets.asyncio.client import connect
 
@@ -28,8 +29,8 @@ def decoder(channel):
 
 async def receive(socket, decoders, wanted):
     """One message of each of these subscriptions."""
-    told = {}
-    while set(told) < wanted:
+    received = {}
+    while set(received) < wanted:
         frame = await socket.recv()
         if isinstance(frame, str):
             continue
@@ -38,8 +39,8 @@ async def receive(socket, decoders, wanted):
         log_ns = int.from_bytes(frame[5:13], "little")
         if subscription in wanted:
             message = decoders[subscription](frame[13:])
-            told.setdefault(subscription, {"log_ns": log_ns, **tell.protobuf(message)})
-    return told
+            received.setdefault(subscription, {"log_ns": log_ns, **message_json.of_protobuf(message)})
+    return received
 
 
 async def main(url):
@@ -56,23 +57,24 @@ async def main(url):
         decoders = {ids[topic]: decoder(channel) for topic, channel in channels.items()}
 
         async def subscribe(topic):
-            wish = {"id": ids[topic], "channelId": channels[topic]["id"]}
-            await socket.send(json.dumps({"op": "subscribe", "subscriptions": [wish]}))
+            subscription = {"id": ids[topic], "channelId": channels[topic]["id"]}
+            await socket.send(json.dumps({"op": "subscribe", "subscriptions": [subscription]}))
 
-        # One who wants everything and reads nothing is nobody else's trouble.
+        # A client that subscribes to everything and reads nothing does not disturb the others.
         stalled = await connect(url, subprotocols=["foxglove.sdk.v1"], max_queue=1)
-        wishes = [{"id": ids[topic], "channelId": channel["id"]} for topic, channel in channels.items()]
-        await stalled.send(json.dumps({"op": "subscribe", "subscriptions": wishes}))
+        everything = [{"id": ids[topic], "channelId": channel["id"]} for topic, channel in channels.items()]
+        await stalled.send(json.dumps({"op": "subscribe", "subscriptions": everything}))
 
-        # The points' subscription has been heard when what was asked for after it comes.
+        # The server reads subscriptions in order: the points are subscribed when messages of later subscriptions come.
         now = ["/car/map/drivability", "/car/map/occupancy", "/tf"]
         for topic in [LATER, *now]:
             await subscribe(topic)
-        told = await receive(socket, decoders, {ids[topic] for topic in now})
+        received = await receive(socket, decoders, {ids[topic] for topic in now})
         topics = {topic: channel["schemaName"] for topic, channel in channels.items()}
-        print(json.dumps({"name": info["name"], "channels": topics, **{topic: told[ids[topic]] for topic in now}}), flush=True)
-        told = await receive(socket, decoders, {ids[LATER]})
-        print(json.dumps(told[ids[LATER]]), flush=True)
+        newest = {topic: received[ids[topic]] for topic in now}
+        print(json.dumps({"name": info["name"], "channels": topics, **newest}), flush=True)
+        received = await receive(socket, decoders, {ids[LATER]})
+        print(json.dumps(received[ids[LATER]]), flush=True)
         stalled.transport.abort()
 
 

@@ -1,5 +1,5 @@
-"""A stranger to Clearway that knows rmw_zenoh's key space and ROS 2's messages: finds the topics by their liveliness tokens,
-subscribes late, twice, and prints what it got as one JSON object.
+"""A subscriber that uses nothing of Clearway, only rmw_zenoh's key space and ROS 2's messages. It finds the topics by
+their liveliness tokens, subscribes late, twice, and prints the topics and the messages as one JSON object.
 
 Usage: ros_topics.py ENDPOINT DOMAIN
 """
@@ -20,7 +20,7 @@ def ros_type(dds_name):
 
 
 def publishers(session, domain):
-    """Topic -> what its token says."""
+    """The topics, each with the fields of its liveliness token."""
     found = {}
     for reply in session.liveliness().get(f"@ros2_lv/{domain}/**"):
         parts = str(reply.ok.key_expr).split("/")
@@ -64,30 +64,30 @@ def main(endpoint, domain):
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as session:
-        topics, told = publishers(session, domain), {}
+        topics, messages = publishers(session, domain), {}
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-        for topic, says in topics.items():
-            name = ros_type(says["type"])
-            assert says["hash"] == STORE.hash_rihs01(name), name
-            key = f"{domain}/{topic.strip('/')}/{says['type']}/{says['hash']}"
+        for topic, token in topics.items():
+            name = ros_type(token["type"])
+            assert token["hash"] == STORE.hash_rihs01(name), name
+            key = f"{domain}/{topic.strip('/')}/{token['type']}/{token['hash']}"
             if name == "tf2_msgs/msg/TFMessage":
                 samples = queue.Queue()
                 subscriber = session.declare_subscriber(key, samples.put)
                 transform = message(samples.get(timeout=60), name)[0].transforms[0]
                 at, q = transform.transform.translation, transform.transform.rotation
                 frames = [transform.header.frame_id, transform.child_frame_id]
-                told[topic] = {"frames": frames, "pose": [at.x, at.y, at.z, q.x, q.y, q.z, q.w]}
+                messages[topic] = {"frames": frames, "pose": [at.x, at.y, at.z, q.x, q.y, q.z, q.w]}
                 subscriber.undeclare()
                 continue
-            # The second comes while the first is there: nothing is published for it, so it has the map from the cache.
+            # Nothing is published after the second subscriber comes, so its map is from the cache.
             early, late = queue.Queue(), queue.Queue()
             first = zenoh.ext.declare_advanced_subscriber(session, key, early.put, history=history)
-            told[topic] = grid(early.get(timeout=60))
+            messages[topic] = grid(early.get(timeout=60))
             second = zenoh.ext.declare_advanced_subscriber(session, key, late.put, history=history)
-            assert grid(late.get(timeout=60)) == told[topic], topic
+            assert grid(late.get(timeout=60)) == messages[topic], topic
             first.undeclare()
             second.undeclare()
-    print(json.dumps({"topics": topics, "told": told}))
+    print(json.dumps({"topics": topics, "messages": messages}))
 
 
 main(*sys.argv[1:])

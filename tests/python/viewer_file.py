@@ -1,5 +1,5 @@
-"""Reads an MCAP file with nothing but what the file says of itself; prints its topics with schema, number of messages and the
-last message of each, as one JSON object.
+"""Reads an MCAP file with the schemas that the file holds, and prints its topics as one JSON object, each with its
+schema, its number of messages and its last message.
 
 Usage: viewer_file.py FILE
 """
@@ -7,18 +7,18 @@ Usage: viewer_file.py FILE
 import json
 import sys
 
-import told
+import message_json
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory as Protobuf
 from mcap_ros2.decoder import DecoderFactory as Ros2
 
 
 def plain(value):
-    """A decoded ROS 2 message as JSON has it."""
+    """A decoded ROS 2 message as JSON values."""
     if hasattr(value, "__slots__"):
         return {name: plain(getattr(value, name)) for name in value.__slots__}
     if isinstance(value, bytes):
-        return told.of_bytes(value)
+        return message_json.of_bytes(value)
     return [plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
@@ -33,7 +33,7 @@ def main(file):
             topic["last"] = decoded
     for topic in topics.values():
         last = topic["last"]
-        topic["last"] = told.protobuf(last) if hasattr(last, "DESCRIPTOR") else plain(last)
+        topic["last"] = message_json.of_protobuf(last) if hasattr(last, "DESCRIPTOR") else plain(last)
     print(json.dumps(topics))
 
 

@@ -106,7 +106,7 @@ async fn through_a_router_late_joiners_have_the_current_map_and_streams_outlive_
     let each = Given { maps: 1 + next - begun, skipped: 0, lost: 0 };
     assert_eq!((&early_given, &late_given), (&each, &each));
 
-    // The router goes; maps are made, and reach nobody. Streams tell that theirs is stale, and wait.
+    // The router stops: maps are made and reach no reader. The streams report their map as stale, and wait.
     within("the router goes", first.close().into_future()).await.unwrap();
     let before = next;
     while next < before + 3 {
@@ -135,7 +135,9 @@ async fn through_a_router_late_joiners_have_the_current_map_and_streams_outlive_
     assert_eq!((token.kind(), token.key_expr().as_str()), (SampleKind::Delete, "clearway/car"));
     assert!(early.vehicles().await.unwrap().is_empty());
     // A drive of long ago: its last map is stale, and said to be, though the server is gone.
-    let Ok(StreamEvent::Stale(update)) = within("stale", early_maps.next_or_stale()).await else { panic!("it is stale") };
+    let Ok(StreamEvent::Stale(update)) = within("stale", early_maps.next_or_stale()).await else {
+        panic!("it is stale")
+    };
     assert_eq!(update.map.sequence(), next - 1);
     assert!(early_maps.ended().is_none());
     watcher.close().await.unwrap();
@@ -143,10 +145,10 @@ async fn through_a_router_late_joiners_have_the_current_map_and_streams_outlive_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_layer_nobody_took_is_made_for_the_planner_that_subscribes_and_at_once() {
+async fn a_layer_without_subscribers_is_made_at_once_for_a_new_planner() {
     let mut config = config();
     config.zenoh.enabled = true;
-    // Nothing is recorded and nobody listens, so no layer is made.
+    // There is no recording and no subscriber, so no layer is made.
     let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
     let maps = feed(&running, readings(3)).await;
     let made = || running.vehicles.0[0].newest.borrow().clone().expect("a map");

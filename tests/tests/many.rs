@@ -30,7 +30,10 @@ enum Next {
     Told(Box<TimedObservation>),
 }
 
-fn next(sensors: &mut [Peekable<SimulatedVehicle>], told: &mut Peekable<impl Iterator<Item = TimedObservation>>) -> Next {
+fn next(
+    sensors: &mut [Peekable<SimulatedVehicle>],
+    told: &mut Peekable<impl Iterator<Item = TimedObservation>>,
+) -> Next {
     let sent = |(index, sensor): (usize, &mut Peekable<SimulatedVehicle>)| Some((sensor.peek()?.stamp_ns, index));
     let (stamp_ns, index) = sensors.iter_mut().enumerate().filter_map(sent).min().expect("they do not end");
     match told.next_if(|told| told.stamp_ns <= stamp_ns) {

@@ -39,7 +39,7 @@ fn fingerprint(repository: &Path) -> String {
     format!("{:016x}", hasher.finish())
 }
 
-/// The interpreter of an environment with the client as it lies in the tree; made anew only where that has changed.
+/// Interpreter of an environment with the client of this tree. It is made again only if the client changes.
 fn python() -> PathBuf {
     let repository = Path::new(REPOSITORY).canonicalize().expect("the repository");
     environment("python-client", &fingerprint(&repository), |environment| {
@@ -57,7 +57,7 @@ fn python() -> PathBuf {
 /// A server that asks everybody for a certificate, with some maps, behind such a router.
 async fn asking(folder: &Path, router: &str) -> Running {
     let mut config = behind(router, folder, secured(true));
-    // All layers are made, whether or not somebody reads them yet.
+    // A recording makes the server make all layers, with or without readers.
     config.recorder.file = folder.join("asking.mcap");
     let running = fixture::certificates::start(config).await;
     feed(&running, readings(3)).await;

@@ -94,7 +94,10 @@ async fn a_planted_change_is_named_by_sequence_layer_and_cell() {
     assert_eq!((&*difference.vehicle, difference.sequence, &*difference.layer), ("car", 2, "drivability"));
     let (recorded, computed) = was_and_is.unwrap();
     let channel = "class".to_owned();
-    assert_eq!(difference.kind, DifferenceKind::Cell { row: row as u32, column: column as u32, channel, recorded, computed });
+    assert_eq!(
+        difference.kind,
+        DifferenceKind::Cell { row: row as u32, column: column as u32, channel, recorded, computed }
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -318,7 +321,10 @@ fn a_disk_that_fails_ends_the_recording_with_its_reason_and_maps_go_on() {
         .unwrap();
     let (said, complained) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(!output.status.success(), "an incomplete recording is no success");
-    assert!(complained.contains("the recording is incomplete") && complained.contains("File too large"), "{complained}");
+    assert!(
+        complained.contains("the recording is incomplete") && complained.contains("File too large"),
+        "{complained}"
+    );
     let seconds: Vec<serde_json::Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let maps: Vec<u64> = seconds.iter().map(|second| second["maps"].as_u64().unwrap()).collect();
     assert!(maps.len() > 2 && maps.last() > maps.get(1), "maps are made after the disk has failed: {said}");

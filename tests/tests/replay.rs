@@ -1,4 +1,4 @@
-//! Recorded drives through the whole house: the counts are exact, and what is wrong with a file is said.
+//! Recorded drives through the whole system: the counts are exact, and errors name the file and what is wrong with it.
 
 mod fixture;
 

@@ -132,9 +132,8 @@ async fn a_bag_of_clouds_odometry_and_tf_is_mapped_where_tf_puts_the_sensor_reco
     assert_eq!((ledger.refused["observation"], ledger.received), (1, turns + 1));
     assert_eq!(summary.snapshot.sensors[0].ledger.refused["observation"], 1, "it is known whose it was");
     assert_eq!(summary.snapshot.observations_refused, [("ros_message", 1)].into());
-    assert!(
-        matches!(&summary.mount, Mount::Tf { ego_frame, frame_id } if ego_frame == "base_link" && frame_id == "velodyne")
-    );
+    assert!(matches!(&summary.mount, Mount::Tf { ego_frame, frame_id }
+            if ego_frame == "base_link" && frame_id == "velodyne"));
     assert_eq!(summary.extrinsics, Extrinsics { z_m: 1.9, ..summary.extrinsics });
     assert!(summary.snapshot.drivable_share.unwrap() > 0.3, "{:?}", summary.snapshot.drivable_share);
     let notes = summary.notes.join("\n");
@@ -165,7 +164,7 @@ async fn a_bag_of_several_sensors_makes_one_map_of_all_that_tf_places() {
         transform(start_ns, "base_link", "Lidar/Left", [0.3, 1.0, 1.9]),
     ];
     messages[0].3 = tf_message_to_cdr(&mounts);
-    // What the second one sees it saw 10 ms before the first; of a third nobody knows where it is.
+    // The second sensor's scans are 10 ms older than the first's; tf does not place the third sensor.
     for (stamp_ns, _) in &turns {
         let data = points_of(&turns, *stamp_ns);
         let at = messages.iter().position(|m| m.0 == "/velodyne_points" && m.2 == stamp_ns + 1000).unwrap();
@@ -275,7 +274,7 @@ async fn without_an_odometry_the_chain_of_tf_gives_poses_and_speed_and_a_bag_in_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn live_topics_of_rmw_zenoh_reach_the_map_and_strangers_are_counted() {
+async fn live_topics_of_rmw_zenoh_reach_the_map_and_other_messages_are_counted() {
     let mut config = fixture::config();
     config.zenoh.enabled = true;
     config.vehicles[0].udp = None;

@@ -30,7 +30,7 @@ async fn vehicles(running: &Running, tls: &Tls) -> Result<usize, ClientError> {
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn with_a_servers_certificate_alone_everybody_reads_over_tls_and_nobody_in_plain_text() {
+async fn a_server_without_a_client_ca_serves_all_over_tls_and_none_in_plain_text() {
     let running = start(secured(false)).await;
     assert_eq!(vehicles(&running, &tls("ours", None)).await.unwrap(), 1);
     let believed = vehicles(&running, &tls("theirs", None)).await;
@@ -64,9 +64,9 @@ async fn a_certificate_opens_what_its_roles_allow_and_nothing_else() {
         }
         assert_eq!(client.vehicles().await.is_ok(), name != "server", "{name}");
     }
-    for stranger in [None, Some(("theirs", "reader"))] {
-        let answer = vehicles(&running, &tls("ours", stranger)).await;
-        assert!(answer.is_err(), "{stranger:?} is let in");
+    for identity in [None, Some(("theirs", "reader"))] {
+        let answer = vehicles(&running, &tls("ours", identity)).await;
+        assert!(answer.is_err(), "{identity:?} is accepted");
     }
     within("shutdown", running.shutdown()).await.unwrap();
 }
@@ -114,7 +114,7 @@ async fn a_replay_that_serves_asks_for_the_certificates_that_its_configuration_a
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn certificates_that_nobody_read_are_no_reason_to_serve_in_plain_text() {
+async fn a_server_does_not_serve_in_plain_text_if_its_certificates_were_not_read() {
     let setup = Setup { config: secured(false), ..Setup::default() };
     let error = Server::start(setup).await.err().expect("no server").to_string();
     assert!(error.starts_with("grpc.tls: "), "{error}");
@@ -169,7 +169,7 @@ async fn zenoh_client(router: &str, ca: &str, name: &str) -> zenoh::Result<zenoh
         ("connect/timeout_ms", "5000".to_owned()),
         ("listen/endpoints", "[]".to_owned()),
         ("scouting/multicast/enabled", "false".to_owned()),
-        // Whoever it is, it believes the router.
+        // Every client trusts the router's CA.
         ("transport/link/tls/root_ca_certificate", format!("{:?}", ours.display().to_string())),
     ];
     for (key, value) in settings {

@@ -1,5 +1,5 @@
-//! The whole system under faults drawn from seeds: it counts everything, recovers, and its recording is equal to its maps.
-//! Injected faults show that each check can fail.
+//! The whole system under faults drawn from seeds: it counts everything, it recovers, and its recording is equal to its
+//! maps. Injected faults show that each check can fail.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 

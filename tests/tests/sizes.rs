@@ -1,5 +1,5 @@
-//! How many bytes the maps of recorded and simulated drives take: of each layer and channel, whole and as a delta to the
-//! map before.
+//! The sizes of the maps of recorded and simulated drives: for each layer and channel, as a whole map and as a delta to
+//! the map before.
 //! `cargo test -p clearway-tests --test sizes -- --nocapture` prints the table.
 
 #![cfg_attr(not(clearway_data), allow(unused))]
@@ -35,11 +35,11 @@ struct Drive {
 }
 
 enum Poses {
-    /// Nobody knows.
+    /// The poses are not known.
     None,
-    /// One a scan, in a file of the folder.
+    /// One pose for each scan, in this file of the folder.
     PerScan(&'static str),
-    /// Straight ahead.
+    /// The vehicle drives straight ahead at this speed.
     SpeedMps(f64),
 }
 
@@ -112,7 +112,8 @@ fn simulated(scene: Scene, maps: usize) -> Vec<Sized> {
     for (sequence, told) in (0..).zip(rig.observations()) {
         let observation = v1::Observation::from(told.observation);
         let source = source(&observation.sensor);
-        let (_, body) = observation::decode(observation, &observation::Limits::from_points_max(1 << 16)).unwrap().remove(0);
+        let (_, body) =
+            observation::decode(observation, &observation::Limits::from_points_max(1 << 16)).unwrap().remove(0);
         let event = Event { sequence, arrival_ns: told.stamp_ns + 1_000_000, source, body };
         if let Ok(Some(map)) = pipeline.step(&event) {
             made.push(Sized::of(map));

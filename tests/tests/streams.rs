@@ -36,7 +36,7 @@ async fn watch(running: &clearway::server::Running, max_in_flight: u32) -> (Requ
     (Requests(sender), updates)
 }
 
-/// A zenoh session connected to the server and to nobody else.
+/// A zenoh session connected to the server only.
 async fn session(running: &clearway::server::Running) -> Session {
     let mut config = zenoh::Config::default();
     let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
@@ -117,7 +117,7 @@ async fn refused_datagrams_are_counted_by_reason_and_the_ledger_adds_up() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_sender_nobody_configured_is_refused_for_its_source() {
+async fn a_sender_that_is_not_configured_is_refused_for_its_source() {
     let mut config = config();
     let udp = config.vehicles[0].udp.as_mut().unwrap();
     udp.from.insert("top".into(), clearway::config::Sender::Address("127.0.0.2".parse().unwrap()));
@@ -220,7 +220,7 @@ async fn a_late_zenoh_joiner_gets_the_current_map_and_the_same_key_answers_queri
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_reader_that_never_reads_slows_nobody_and_costs_no_more_than_its_credits() {
+async fn a_stopped_reader_slows_no_other_reader_and_gets_only_its_credits() {
     let running = start(config()).await;
     let (stopped_requests, mut stopped) = watch(&running, 2).await;
     let (requests, mut healthy) = watch(&running, 1).await;
@@ -390,7 +390,7 @@ async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn layers_are_made_while_somebody_takes_them_and_a_late_joiner_gets_his_of_the_newest_turn() {
+async fn layers_are_made_while_subscribed_and_at_once_for_a_late_joiner() {
     let setup = Setup { config: config(), ..Setup::default() };
     let running = Server::start(setup).await.expect("the server starts");
     let newest = || running.vehicles.0[0].newest.borrow().clone().expect("a map");
@@ -399,18 +399,18 @@ async fn layers_are_made_while_somebody_takes_them_and_a_late_joiner_gets_his_of
     let third = all.len() / 3;
     let part = |number: usize| all[number * third..(number + 1) * third].to_vec();
 
-    // Maps are counted, and told as alive, but nobody takes a layer.
+    // Maps are made and counted, but no reader subscribes to a layer.
     assert!(feed(&running, part(0)).await >= 2);
     assert!(layers().is_empty());
 
-    let made_for_nobody = newest();
+    let without_layers = newest();
     let (requests, mut updates) = watch(&running, 0).await;
     let subscriptions = running.vehicles.0[0].status.subscriptions.clone();
     until("the reader's layer is taken", || subscriptions.is_subscribed(LAYER)).await;
     assert!(!subscriptions.is_subscribed("terrain"));
     let update = within("the newest turn's map", updates.message()).await.unwrap().unwrap();
-    assert_eq!(sequence(&update.map), made_for_nobody.sequence + 1, "no map without the layer is sent");
-    assert_eq!(newest().capture_end_ns, made_for_nobody.capture_end_ns);
+    assert_eq!(sequence(&update.map), without_layers.sequence + 1, "no map without the layer is sent");
+    assert_eq!(newest().capture_end_ns, without_layers.capture_end_ns);
     assert_eq!(layers(), [LAYER]);
     feed(&running, part(1)).await;
     within("the next turn's map", updates.message()).await.unwrap().unwrap();

@@ -1,4 +1,4 @@
-//! Datagrams over real sockets: nothing is lost without being counted, and maps do not tell a socket from a file.
+//! Datagrams over real sockets: every lost datagram is counted, and maps are the same from a socket and from a file.
 
 mod fixture;
 
@@ -39,7 +39,7 @@ fn socket(from: &str) -> UdpSocket {
     UdpSocket::bind((from, 0)).expect("a free port")
 }
 
-/// A port that nobody else asks for at this address.
+/// A port at this address that no other test uses.
 fn port_at(address: &str) -> SocketAddr {
     socket(address).local_addr().expect("bound")
 }
@@ -87,7 +87,7 @@ async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording()
     let telemetry = SocketAddr::new("127.0.0.1".parse().unwrap(), telemetry.port());
 
     let (packets, position) = datagrams();
-    let (sensor, stranger, side) = (socket("127.0.0.2"), socket("127.0.0.3"), socket("127.0.0.4"));
+    let (sensor, unknown_sender, side) = (socket("127.0.0.2"), socket("127.0.0.3"), socket("127.0.0.4"));
     let mut broken = packets[0].clone();
     broken[0] = 0;
     // In turns of one batch or less, so that the kernel's buffer holds whatever the machine does meanwhile.
@@ -107,10 +107,10 @@ async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording()
         sensor.send_to(&[0xff; 65_507], data).unwrap();
         side.send_to(&packets[0], data).unwrap();
         side.send_to(&[0xff; 65_507], data).unwrap();
-        stranger.send_to(&packets[0], data).unwrap();
-        stranger.send_to(&position, telemetry).unwrap();
-        let stranger = UdpSocket::bind("[::1]:0").unwrap();
-        stranger.send_to(&position, SocketAddr::new("::1".parse().unwrap(), telemetry.port())).unwrap();
+        unknown_sender.send_to(&packets[0], data).unwrap();
+        unknown_sender.send_to(&position, telemetry).unwrap();
+        let unknown_sender = UdpSocket::bind("[::1]:0").unwrap();
+        unknown_sender.send_to(&position, SocketAddr::new("::1".parse().unwrap(), telemetry.port())).unwrap();
     }
     sent += 1 + 3 * 11;
     until("all are counted", || ledger(&running, 0).received == sent).await;
@@ -130,10 +130,10 @@ async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording()
     let metrics = clearway::status::prometheus(std::slice::from_ref(&status));
     let line = "clearway_sensor_refused_total{vehicle=\"car\",sensor=\"side\",reason=\"length\"} 3\n";
     assert!(metrics.contains(line), "{metrics}");
-    let strangers = status.to_proto().unknown_senders;
-    let known = strangers.iter().find(|s| s.address == stranger.local_addr().unwrap().to_string());
-    assert_eq!(known.expect("the stranger is shown").datagrams, 6);
-    assert_eq!(strangers.len(), 4, "{strangers:?}");
+    let unknown_senders = status.to_proto().unknown_senders;
+    let known = unknown_senders.iter().find(|s| s.address == unknown_sender.local_addr().unwrap().to_string());
+    assert_eq!(known.expect("the unknown sender is listed").datagrams, 6);
+    assert_eq!(unknown_senders.len(), 4, "{unknown_senders:?}");
 
     within("shutdown", running.shutdown()).await.unwrap();
     assert_eq!(status.snapshot().ledger, counted);

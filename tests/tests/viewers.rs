@@ -1,5 +1,5 @@
-//! Strangers who know ROS 2 and Foxglove and nothing of Clearway: they find the maps, decode them by what they are
-//! told, and have what the maps say.
+//! ROS 2 and Foxglove clients that use nothing of Clearway: they find the maps, decode them by the published schemas,
+//! and have the same cells as the maps.
 
 mod fixture;
 
@@ -59,19 +59,19 @@ async fn a_ros_2_subscriber_who_comes_late_finds_every_layer_and_the_vehicle_on_
     place(&running, &readings).await;
     feed(&running, readings).await;
     let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens").clone();
-    let told = tokio::task::spawn_blocking(move || {
+    let received = tokio::task::spawn_blocking(move || {
         venv::run(venv::script("ros_topics.py").args([&endpoint, "7"]), "the script names what it missed")
     });
-    let told: Value = serde_json::from_str(&told.await.unwrap()).unwrap();
+    let received: Value = serde_json::from_str(&received.await.unwrap()).unwrap();
 
     let map = newest(&running);
     assert_eq!(map.layers().len() as u64, LAYERS);
-    assert_eq!(told["topics"].as_object().unwrap().len() as u64, LAYERS + 1);
+    assert_eq!(received["topics"].as_object().unwrap().len() as u64, LAYERS + 1);
     let mut gids = Vec::new();
     for layer in map.layers() {
         let topic = format!("/clearway/car/{}", layer.name);
-        assert_eq!(told["topics"][&topic]["qos"], "1:1:1,1:,:,:,,", "{topic}");
-        let (grid, raster) = (&told["told"][&topic], Raster::from_grid(&layer.grid));
+        assert_eq!(received["topics"][&topic]["qos"], "1:1:1,1:,:,:,,", "{topic}");
+        let (grid, raster) = (&received["messages"][&topic], Raster::from_grid(&layer.grid));
         assert_eq!(grid["frame_id"], "car/base_link", "{topic}");
         assert_eq!(grid["stamp_ns"], map.header().capture_end_ns, "{topic}");
         assert_eq!(grid["size"], json!([raster.width, raster.height]), "{topic}");
@@ -88,15 +88,15 @@ async fn a_ros_2_subscriber_who_comes_late_finds_every_layer_and_the_vehicle_on_
     assert_eq!(gids.len() as u64, LAYERS, "each publisher has its own");
     // The occupancy grid's axes are the world's, so they are turned in the vehicle's frame.
     let (sin, cos) = (-FRAC_PI_4 / 2.0).sin_cos();
-    let origin = told["told"]["/clearway/car/occupancy"]["origin"].as_array().unwrap();
+    let origin = received["messages"]["/clearway/car/occupancy"]["origin"].as_array().unwrap();
     assert_near(&json!(origin[2..]), &[sin, cos]);
-    assert_eq!(told["told"]["/tf"]["frames"], json!(["map", "car/base_link"]));
-    assert_near(&told["told"]["/tf"]["pose"], &[7.0, -3.0, 0.5, 0.0, 0.0, -sin, cos]);
+    assert_eq!(received["messages"]["/tf"]["frames"], json!(["map", "car/base_link"]));
+    assert_near(&received["messages"]["/tf"]["pose"], &[7.0, -3.0, 0.5, 0.0, 0.0, -sin, cos]);
     within("shutdown", running.shutdown()).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn no_layer_is_made_for_topics_and_channels_nobody_subscribes_to() {
+async fn no_layer_is_made_for_topics_and_channels_without_subscribers() {
     let mut config = ros2();
     config.foxglove = Foxglove { enabled: true, listen: "127.0.0.1:0".parse().unwrap() };
     let running = Server::start(Setup { config, ..Setup::default() }).await.unwrap();

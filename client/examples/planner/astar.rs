@@ -2,7 +2,8 @@
 //!
 //! In: maps, a goal. Out: the next [`Move`]. Frame: the maps' world ("map") where the vehicle tells its ego poses; what
 //! was seen is then remembered for a while, since a sensor sees nothing close by. Without poses each map stands alone,
-//! in the ego frame. Ground that nobody saw is never entered, but for where the vehicle stands at first.
+//! in the ego frame. The planner never enters ground that no map has shown, except the place where the vehicle stands
+//! at first.
 
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, HashMap};
@@ -101,7 +102,7 @@ impl Planner {
         Ok(())
     }
 
-    /// What it knows of the ground about the vehicle, ahead up: `.` passable, `#` an obstacle, blank nobody saw.
+    /// Text picture of the ground around the vehicle, ahead up: `.` is passable, `#` an obstacle, a blank is unseen.
     pub fn picture(&self) -> String {
         let here = self.cell_of_ego();
         let mark = |ahead: i32, left: i32| {

@@ -170,7 +170,7 @@ impl Draws {
     }
 }
 
-/// What arrives of a stream.
+/// The datagrams of a stream that arrive.
 #[derive(Clone, Debug)]
 pub struct Impaired<I> {
     sent: I,

@@ -1,7 +1,7 @@
 //! A simulated vehicle in real time, on a machine that may be too slow for it.
 //!
 //! In: a vehicle whose stamps are times of a clock, that clock, and how far the server has come. Out: the vehicle's
-//! datagrams, but for whole revolutions that are skipped, without being simulated, when the vehicle or the server is
+//! datagrams, without whole revolutions that are skipped, and not simulated, when the vehicle or the server is
 //! late. So the age of the maps stays bounded. Between two skips the datagrams are those that the vehicle gives by
 //! itself.
 
@@ -11,8 +11,8 @@ use std::time::Duration;
 
 use crate::vehicle::{Datagram, SimulatedVehicle};
 
-/// Greatest lateness of a simulation that does not skip: one revolution at 10 Hz. A machine that is fast enough makes up
-/// for less; more would be part of the age of every map.
+/// Greatest lateness of a simulation that does not skip: one revolution at 10 Hz. A machine that is fast enough makes
+/// up for less; more would be part of the age of every map.
 const LATE_NS_MAX: i64 = 100_000_000;
 /// Greatest backlog of a server for which the simulation does not wait: more than two revolutions at 10 Hz, because the
 /// maps of two may be under way in a server that is in time.
@@ -96,8 +96,8 @@ mod tests {
     use std::cell::Cell;
 
     use super::*;
-    use crate::scanner::ScannerConfig;
-    use crate::scenes::flat;
+    use crate::scene::scenes::flat;
+    use crate::sensor::scanner::ScannerConfig;
 
     use clearway_lidar::model::Model;
     use clearway_lidar::{Sensor, SensorConfig};

@@ -32,7 +32,7 @@ pub struct Until<'a> {
 /// Counts of what was sent.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sent {
-    /// Data packets.
+    /// Number of data packets.
     pub packets: u64,
     /// Telemetry datagrams.
     pub telemetry: u64,

@@ -8,12 +8,12 @@ use std::sync::Arc;
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 
-use crate::course::{Course, Drive};
-use crate::ground::Ground;
-use crate::object::{Kind, Shape};
-use crate::planes::PlaneUnit;
-use crate::scenes::Scene;
-use crate::world::World;
+use crate::scene::course::{Course, Drive};
+use crate::scene::ground::Ground;
+use crate::scene::object::{Kind, Shape};
+use crate::scene::scenes::Scene;
+use crate::scene::world::World;
+use crate::sensor::planes::PlaneUnit;
 
 /// A street along x with two lanes each way: parked cars, walls, poles and buildings beside it, cars ahead, behind and
 /// coming the other way. The vehicle drives in the right-hand lane at `speed_mps`, or stands there.
@@ -74,18 +74,18 @@ pub fn six_units() -> [PlaneUnit; 6] {
     })
 }
 
-/// What stands on the ground at one moment.
+/// The objects on the ground at one time.
 #[derive(Clone, Debug)]
 pub struct Footprints(Vec<(Kind, Shape)>);
 
 impl Footprints {
-    /// The things of a world at `time` s, but for those that hang over the ground and those too thin to cover any.
+    /// The objects of a world at `time` s, without those that hang over the ground and those too thin to cover any.
     pub fn at(world: &World, time: f64) -> Self {
         let shapes = world.objects.iter().map(|object| (object.kind, object.at(time, &world.ground)));
         Self(shapes.filter(|(kind, _)| !matches!(kind, Kind::Leaves | Kind::Beam | Kind::Fence)).collect())
     }
 
-    /// Whether a thing covers a place (metres, world) or comes nearer to it than `margin_m` along its own sides.
+    /// True if an object covers a place (metres, world frame), or is nearer to it than `margin_m` along its own sides.
     pub fn near(&self, [x, y]: [f64; 2], margin_m: f64) -> bool {
         self.0.iter().any(|(_, shape)| shape.column(x, y, margin_m).is_some())
     }

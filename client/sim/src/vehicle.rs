@@ -11,14 +11,14 @@ use clearway_lidar::revolution::Revolution;
 use clearway_lidar::{Sensor, SensorConfig};
 use nalgebra::{Isometry3, Point3};
 
-use crate::course::{Course, Drive};
-use crate::encode::Encoder;
-use crate::raycast::Caster;
-use crate::scanner::{Scanner, ScannerConfig};
-use crate::scenes::Scene;
-use crate::telemetry::{Datum, Fix, telemetry};
-use crate::truth::{Limits, TruthGrid};
-use crate::world::World;
+use crate::scene::course::{Course, Drive};
+use crate::scene::scenes::Scene;
+use crate::scene::truth::{Limits, TruthGrid};
+use crate::scene::world::World;
+use crate::sensor::encode::Encoder;
+use crate::sensor::raycast::Caster;
+use crate::sensor::scanner::{Scanner, ScannerConfig};
+use crate::sensor::telemetry::{Datum, Fix, telemetry};
 
 /// Kind of a datagram, which decides its port.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

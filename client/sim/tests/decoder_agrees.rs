@@ -123,7 +123,7 @@ fn holds(model: Model, return_mode: ReturnMode, rpm: f64, number: i64, seed: u64
 }
 
 #[test]
-fn every_model_in_every_return_mode_decodes_to_the_world_it_saw() {
+fn every_model_and_return_mode_decodes_to_the_simulated_points() {
     for model in Model::ALL {
         for return_mode in modes(model) {
             holds(model, return_mode, 600.0, 3, 7);
@@ -132,10 +132,15 @@ fn every_model_in_every_return_mode_decodes_to_the_world_it_saw() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 12, max_shrink_iters: 8, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig {
+        cases: 12,
+        max_shrink_iters: 8,
+        failure_persistence: None,
+        ..ProptestConfig::default()
+    })]
 
     #[test]
-    fn any_sensor_at_any_rate_anywhere_in_town_decodes_to_the_world_it_saw(
+    fn any_sensor_at_any_rate_and_place_decodes_to_the_simulated_points(
         model in 0..Model::ALL.len(),
         mode in 0..3_usize,
         rpm in 5..=20_u32,

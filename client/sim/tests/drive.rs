@@ -2,8 +2,8 @@
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::{Model, ReturnMode};
-use clearway_lidar::{CalibrationSource, Sensor, SensorConfig};
 use clearway_lidar::telemetry::Telemetry;
+use clearway_lidar::{CalibrationSource, Sensor, SensorConfig};
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes;
 use clearway_sim::truth::{Limits, Truth};
@@ -19,7 +19,7 @@ fn first_second(vehicle: SimulatedVehicle) -> Vec<Datagram> {
 }
 
 #[test]
-fn each_model_sends_as_many_packets_a_second_as_its_manual_says() {
+fn each_model_sends_as_many_packets_per_second_as_in_its_manual() {
     for (model, return_mode, expected) in [
         (Model::Hdl64eS2, ReturnMode::Strongest, 3472),
         (Model::Hdl64eS3, ReturnMode::Dual, 5787),
@@ -34,7 +34,7 @@ fn each_model_sends_as_many_packets_a_second_as_its_manual_says() {
 }
 
 #[test]
-fn datagrams_come_in_the_order_of_their_stamps_and_have_their_lengths() {
+fn datagrams_are_in_order_of_their_stamps_and_have_their_lengths() {
     let datagrams = first_second(town(ScannerConfig::default()));
     assert!(datagrams.windows(2).all(|pair| pair[0].stamp_ns <= pair[1].stamp_ns));
     for datagram in &datagrams {
@@ -148,7 +148,7 @@ fn what_the_sensor_sees_is_less_than_what_is_there() {
 }
 
 #[test]
-fn a_steered_vehicle_goes_on_from_where_it_is_along_the_arc_it_is_told() {
+fn a_steered_vehicle_continues_from_its_place_along_the_given_arc() {
     let mut vehicle = town(ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() });
     vehicle.nth(100);
     for (curvature, speed) in [(0.1, 5.0), (0.0, 8.0), (-0.05, 3.0), (0.0, 0.0)] {

@@ -66,7 +66,7 @@ fn bits(revolution: &Revolution) -> impl PartialEq + std::fmt::Debug + use<> {
 }
 
 #[test]
-fn copies_and_packets_out_of_order_leave_every_bit_of_every_revolution_as_it_was() {
+fn copies_and_reordered_packets_change_no_bit_of_a_revolution() {
     let streams = streams(2.6);
     let expected: Vec<Vec<_>> =
         streams.iter().map(|(model, sent)| decode(*model, sent.clone()).0.iter().map(bits).collect()).collect();

@@ -1,14 +1,14 @@
-//! What the fuzzer, and `cargo test` with its corpus, do with a file's bytes. Nothing here may panic.
+//! What the fuzzer does with the bytes of a file, and `cargo test` with its corpus. Nothing here may panic.
 
 use clearway_ros::pose::{Odometry, pose_stamped, tf_message};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{Frames, PointCloud2, Points};
 
-/// The bytes as each of the messages that are read; `PointCloud2` first of all.
+/// Reads the bytes as each kind of message.
 pub fn message(bytes: &[u8]) {
     if let Ok(cloud) = PointCloud2::new(bytes) {
         let written = cloud.to_cdr();
-        let points = Points::of(&cloud);
+        let points = Points::from_cloud(&cloud);
         assert_eq!(PointCloud2::new(&written), Ok(cloud));
         if let Ok(points) = points {
             check(&points, bytes.len());
@@ -21,12 +21,12 @@ pub fn message(bytes: &[u8]) {
     drop(pose_stamped(bytes));
     let mut frames = Frames::default();
     for transform in tf_message(bytes).unwrap_or_default() {
-        frames.take(&transform);
+        frames.insert(&transform);
         frames.a_from_b("base_link", transform.child_frame_id);
     }
 }
 
-/// What holds for the points of any message.
+/// Checks what holds for the points of any message.
 fn check(points: &Points, bytes: usize) {
     let n = points.x.len();
     assert!(n <= bytes && [points.y.len(), points.z.len(), points.intensity.len()] == [n; 3]);

@@ -1,53 +1,54 @@
-//! Bytes of one message <-> numbers, texts, headers: CDR as ROS 2 uses it (XCDR1, OMG DDS-XTypes 1.3, section 7.4.1).
+//! Bytes of one message <-> numbers, texts and headers: CDR as ROS 2 uses it (XCDR1, OMG DDS-XTypes 1.3, section
+//! 7.4.1).
 //!
-//! Four bytes of encapsulation, then the members one after another. A number stands at a multiple of its size, counted
-//! after the encapsulation; a text is its length (u32, with its zero), its bytes and the zero; a sequence is its count
-//! and its elements.
+//! A message has four bytes of encapsulation, then its members in order. A number is aligned to a multiple of its size,
+//! counted from the end of the encapsulation. A text is its length (u32, including the final zero), its bytes and a
+//! zero. A sequence is its count (u32) and its elements.
 
 /// Bytes before the first member.
 const ENCAPSULATION: usize = 4;
 
-/// What is wrong with a message.
+/// Why a message was refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum MessageError {
-    /// Not plain CDR.
+    /// The message is not plain CDR.
     #[error("encapsulation {found:02x?}; 00 00 (big endian) or 00 01 (little endian) is allowed")]
     Encapsulation {
-        /// The first two bytes.
+        /// The first two bytes of the message.
         found: [u8; 2],
     },
-    /// The message ends too soon.
+    /// The message ends before a member does.
     #[error("{what} needs {needed} bytes at {at}, but the message has {length}")]
     Truncated {
-        /// What was being read.
+        /// The member.
         what: &'static str,
-        /// Bytes it needs.
+        /// Bytes that the member needs.
         needed: usize,
-        /// Where it starts.
+        /// Offset of the member in bytes.
         at: usize,
-        /// Bytes of the message.
+        /// Length of the message in bytes.
         length: usize,
     },
-    /// A text that is none.
+    /// A text is not UTF-8, or does not end in its only zero.
     #[error("{what} is not UTF-8 ending in its only zero")]
     Text {
-        /// Which member.
+        /// The member.
         what: &'static str,
     },
-    /// A value that makes no sense.
+    /// The value of a member is not allowed.
     #[error("{what} = {value}: allowed: {allowed}")]
     Value {
-        /// Which member.
+        /// The member.
         what: &'static str,
-        /// What was found.
+        /// The value found.
         value: String,
-        /// What may stand there.
+        /// The values allowed.
         allowed: &'static str,
     },
 }
 
 impl MessageError {
-    /// The ledger's word for it.
+    /// Key of the error in the ledger.
     pub fn reason(&self) -> &'static str {
         match self {
             Self::Encapsulation { .. } => "ros_encapsulation",
@@ -65,13 +66,13 @@ impl MessageError {
 /// `std_msgs/Header`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header<'a> {
-    /// ns since the Unix epoch.
+    /// Time of the data, ns since the Unix epoch.
     pub stamp_ns: i64,
-    /// The frame in which the rest is told, as written.
+    /// Frame of the data, as written.
     pub frame_id: &'a str,
 }
 
-/// A cursor over a message.
+/// Reads the members of a message in order.
 #[derive(Clone, Debug)]
 pub struct Reader<'a> {
     message: &'a [u8],
@@ -80,13 +81,14 @@ pub struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    /// At the first member.
+    /// A reader at the first member.
     ///
     /// # Errors
-    /// [`MessageError`] where the encapsulation is missing or no plain CDR.
+    /// [`MessageError::Truncated`] if the encapsulation is missing, [`MessageError::Encapsulation`] if it is not plain
+    /// CDR.
     pub fn new(message: &'a [u8]) -> Result<Self, MessageError> {
         let mut reader = Self { message, at: 0, little_endian: true };
-        let head = reader.take("encapsulation", ENCAPSULATION)?;
+        let head = reader.read_bytes("encapsulation", ENCAPSULATION)?;
         reader.little_endian = match [head[0], head[1]] {
             [0, 0] => false,
             [0, 1] => true,
@@ -95,53 +97,53 @@ impl<'a> Reader<'a> {
         Ok(reader)
     }
 
-    /// The next `length` bytes.
+    /// Reads the next `length` bytes.
     ///
     /// # Errors
-    /// [`MessageError::Truncated`], here and below, where the message ends before.
-    pub fn take(&mut self, what: &'static str, length: usize) -> Result<&'a [u8], MessageError> {
-        let (at, held) = (self.at, self.message.len());
-        let end = at.checked_add(length).filter(|end| *end <= held);
-        let end = end.ok_or(MessageError::Truncated { what, needed: length, at, length: held })?;
+    /// [`MessageError::Truncated`] if the message ends before.
+    pub fn read_bytes(&mut self, what: &'static str, length: usize) -> Result<&'a [u8], MessageError> {
+        let (at, available) = (self.at, self.message.len());
+        let end = at.checked_add(length).filter(|end| *end <= available);
+        let end = end.ok_or(MessageError::Truncated { what, needed: length, at, length: available })?;
         self.at = end;
         Ok(&self.message[at..end])
     }
 
-    /// The next number, of `N` bytes, least byte first.
+    /// Reads the next number of `N` bytes, as little-endian bytes.
     fn number<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], MessageError> {
         self.align(N);
-        let mut bytes: [u8; N] = self.take(what, N)?.try_into().expect("that many bytes");
+        let mut bytes: [u8; N] = self.read_bytes(what, N)?.try_into().expect("N bytes");
         if !self.little_endian {
             bytes.reverse();
         }
         Ok(bytes)
     }
 
-    /// Skips the padding before a member of this size; padding beyond the message is noticed by whoever reads there.
+    /// Skips the padding before a member of this size. If the padding exceeds the message, the next read fails.
     fn align(&mut self, size: usize) {
         self.at = ENCAPSULATION + (self.at - ENCAPSULATION).next_multiple_of(size);
     }
 
-    /// A byte.
+    /// Reads a byte.
     ///
     /// # Errors
-    /// As [`Reader::take`].
+    /// As [`Reader::read_bytes`].
     pub fn u8(&mut self, what: &'static str) -> Result<u8, MessageError> {
-        Ok(self.take(what, 1)?[0])
+        Ok(self.read_bytes(what, 1)?[0])
     }
 
-    /// A number.
+    /// Reads a number.
     ///
     /// # Errors
-    /// As [`Reader::take`].
+    /// As [`Reader::read_bytes`].
     pub fn u32(&mut self, what: &'static str) -> Result<u32, MessageError> {
         self.number(what).map(u32::from_le_bytes)
     }
 
-    /// So many numbers.
+    /// Reads `N` numbers.
     ///
     /// # Errors
-    /// As [`Reader::take`].
+    /// As [`Reader::read_bytes`].
     pub fn f64s<const N: usize>(&mut self, what: &'static str) -> Result<[f64; N], MessageError> {
         let mut numbers = [0.0; N];
         for number in &mut numbers {
@@ -150,20 +152,21 @@ impl<'a> Reader<'a> {
         Ok(numbers)
     }
 
-    /// A text without its zero.
+    /// Reads a text, without its final zero.
     ///
     /// # Errors
-    /// As [`Reader::take`], and [`MessageError::Text`].
+    /// As [`Reader::read_bytes`], and [`MessageError::Text`] if it is not UTF-8 with a single, final zero.
     pub fn text(&mut self, what: &'static str) -> Result<&'a str, MessageError> {
         let length = self.u32(what)? as usize;
-        let text = self.take(what, length)?.strip_suffix(&[0]).filter(|text| !text.contains(&0));
+        let text = self.read_bytes(what, length)?.strip_suffix(&[0]).filter(|text| !text.contains(&0));
         text.and_then(|text| std::str::from_utf8(text).ok()).ok_or(MessageError::Text { what })
     }
 
-    /// The count of a sequence whose elements take at least `shortest` bytes each.
+    /// Reads the count of a sequence whose elements have at least `shortest` bytes each.
     ///
     /// # Errors
-    /// As [`Reader::take`], also if fewer bytes are left than that many elements would take.
+    /// [`MessageError::Truncated`] if the message ends before the count, or has fewer bytes left than the elements
+    /// need.
     pub fn count(&mut self, what: &'static str, shortest: usize) -> Result<usize, MessageError> {
         let count = self.u32(what)? as usize;
         let needed = count.saturating_mul(shortest);
@@ -173,10 +176,10 @@ impl<'a> Reader<'a> {
         Ok(count)
     }
 
-    /// A `builtin_interfaces/Time`, ns since the Unix epoch.
+    /// Reads a `builtin_interfaces/Time`, in ns since the Unix epoch.
     ///
     /// # Errors
-    /// As [`Reader::take`], and [`MessageError::Value`] for more nanoseconds than a second has.
+    /// As [`Reader::read_bytes`], and [`MessageError::Value`] if the nanoseconds exceed a second.
     pub fn stamp(&mut self, what: &'static str) -> Result<i64, MessageError> {
         let seconds = self.u32(what)?.cast_signed();
         match self.u32(what)? {
@@ -185,16 +188,16 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// A `std_msgs/Header`.
+    /// Reads a `std_msgs/Header`.
     ///
     /// # Errors
-    /// As its members.
+    /// As [`Reader::stamp`] and [`Reader::text`].
     pub fn header(&mut self) -> Result<Header<'a>, MessageError> {
         Ok(Header { stamp_ns: self.stamp("header.stamp")?, frame_id: self.text("header.frame_id")? })
     }
 }
 
-/// A message being written, little-endian.
+/// Writes the members of a message in order, little-endian.
 #[derive(Clone, Debug)]
 pub struct Writer {
     message: Vec<u8>,
@@ -207,18 +210,18 @@ impl Default for Writer {
 }
 
 impl Writer {
-    /// The message.
+    /// Returns the message.
     pub fn finish(self) -> Vec<u8> {
         self.message
     }
 
-    /// Bytes as they are, without a count.
+    /// Writes bytes without a count.
     pub fn bytes(&mut self, bytes: &[u8]) -> &mut Self {
         self.message.extend_from_slice(bytes);
         self
     }
 
-    /// Signed bytes as they are, without a count.
+    /// Writes signed bytes without a count.
     pub fn signed_bytes(&mut self, bytes: &[i8]) -> &mut Self {
         self.message.extend(bytes.iter().map(|byte| byte.cast_unsigned()));
         self
@@ -230,35 +233,35 @@ impl Writer {
         self.bytes(bytes)
     }
 
-    /// A number, or the count of a sequence.
+    /// Writes a number, or the count of a sequence.
     pub fn u32(&mut self, value: u32) -> &mut Self {
         self.number(&value.to_le_bytes())
     }
 
-    /// Numbers, without a count.
+    /// Writes numbers without a count.
     pub fn f64s(&mut self, values: &[f64]) -> &mut Self {
         values.iter().fold(self, |writer, value| writer.number(&value.to_le_bytes()))
     }
 
-    /// A text without zeros in it; its own is added.
+    /// Writes a text, which contains no zero, and its final zero.
     pub fn text(&mut self, text: &str) -> &mut Self {
         self.u32(length(text.len() + 1)).bytes(text.as_bytes()).bytes(&[0])
     }
 
-    /// A `builtin_interfaces/Time`; seconds beyond its 32 bits (the year 2038) are held at their limit.
+    /// Writes a `builtin_interfaces/Time`. Seconds beyond 32 bits (after January 2038) are clamped.
     pub fn stamp(&mut self, stamp_ns: i64) -> &mut Self {
         let (seconds, limit) = (stamp_ns.div_euclid(1_000_000_000), i64::from(i32::MAX));
         let seconds = seconds.clamp(-limit - 1, limit) as i32;
         self.u32(seconds.cast_unsigned()).u32(stamp_ns.rem_euclid(1_000_000_000) as u32)
     }
 
-    /// A `std_msgs/Header`.
+    /// Writes a `std_msgs/Header`.
     pub fn header(&mut self, header: &Header) -> &mut Self {
         self.stamp(header.stamp_ns).text(header.frame_id)
     }
 }
 
-/// A length as CDR writes it. Nothing of 4 GiB is written here.
+/// A length as CDR writes it. No message of 4 GiB is written here.
 pub(crate) fn length(length: usize) -> u32 {
     u32::try_from(length).expect("shorter than 4 GiB")
 }

@@ -1,4 +1,4 @@
-//! Transforms -> where one frame lies in another: the tree that `/tf` and `/tf_static` tell of.
+//! Transforms -> pose of one frame in another: the tree of `/tf` and `/tf_static`.
 
 use std::collections::BTreeMap;
 
@@ -6,9 +6,9 @@ use nalgebra::Isometry3;
 
 use crate::pose::StampedTransform;
 
-/// Frames from a leaf to its root; a longer chain is a ring.
+/// Most frames from a leaf to its root. Ours; a longer chain is a cycle.
 const DEPTH_MAX: usize = 64;
-/// Frames kept; names beyond are made up by a peer that means no good.
+/// Most frames kept. Ours; it bounds the memory that a hostile peer can claim.
 const FRAMES_MAX: usize = 4096;
 
 /// The newest transform of each frame to its parent.
@@ -18,8 +18,8 @@ pub struct Frames {
 }
 
 impl Frames {
-    /// Takes a transform in place of the child's former one; `false` where there are too many frames already.
-    pub fn take(&mut self, transform: &StampedTransform) -> bool {
+    /// Inserts a transform, which replaces the child's former one. Returns false if there are too many frames.
+    pub fn insert(&mut self, transform: &StampedTransform) -> bool {
         let child = name(transform.child_frame_id);
         if self.parents.len() >= FRAMES_MAX && !self.parents.contains_key(child) {
             return false;
@@ -29,42 +29,43 @@ impl Frames {
         true
     }
 
-    /// Whether the frame hangs on another one, or another one on it.
-    pub fn knows(&self, frame: &str) -> bool {
+    /// True if the frame has a parent or a child.
+    pub fn contains(&self, frame: &str) -> bool {
         let frame = name(frame);
         self.parents.contains_key(frame) || self.parents.values().any(|(parent, _)| parent == frame)
     }
 
-    /// Carries points of `b` into `a`; `None` where no chain of transforms joins them. A frame lies in itself unmoved.
+    /// Pose of frame `b` in frame `a`, which maps points of `b` to `a`; `None` if no chain of transforms joins them. It
+    /// is the identity if both are the same frame.
     pub fn a_from_b(&self, a: &str, b: &str) -> Option<Isometry3<f64>> {
         let (up_from_a, up_from_b) = (self.up(name(a)), self.up(name(b)));
-        // The first frame above b that is above a too.
+        // The first ancestor of b that is an ancestor of a too.
         up_from_b.iter().find_map(|(frame, common_from_b)| {
             let (_, common_from_a) = up_from_a.iter().find(|(above, _)| above == frame)?;
             Some(common_from_a.inverse() * common_from_b)
         })
     }
 
-    /// The frame and all above it, each with `above_from_frame`.
+    /// The frame and its ancestors, each with `ancestor_from_frame`.
     fn up<'a>(&'a self, frame: &'a str) -> Vec<(&'a str, Isometry3<f64>)> {
         let mut chain = vec![(frame, Isometry3::identity())];
         while let Some((parent, parent_from_child)) = self.parents.get(chain[chain.len() - 1].0) {
             if chain.len() > DEPTH_MAX {
                 break;
             }
-            let above_from_frame = parent_from_child * chain[chain.len() - 1].1;
-            chain.push((parent, above_from_frame));
+            let ancestor_from_frame = parent_from_child * chain[chain.len() - 1].1;
+            chain.push((parent, ancestor_from_frame));
         }
         chain
     }
 
-    /// How many transforms above `frame` its `ancestor` stands; 0 where they are the same, `None` where it is none.
+    /// Number of transforms from `frame` up to its `ancestor`: 0 if they are the same, `None` if it is not an ancestor.
     pub fn steps_up(&self, frame: &str, ancestor: &str) -> Option<usize> {
         self.up(name(frame)).iter().position(|(above, _)| *above == name(ancestor))
     }
 }
 
-/// A frame's name as tf2 has it; the tf of ROS 1 put a slash before it, and some drivers still do.
+/// Name of a frame without the leading slash that ROS 1 and some drivers write.
 pub fn name(frame_id: &str) -> &str {
     frame_id.strip_prefix('/').unwrap_or(frame_id)
 }

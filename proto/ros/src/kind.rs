@@ -1,6 +1,6 @@
-//! A type's name -> which of the messages read here it is.
+//! Name of a message type -> [`Kind`].
 
-/// The messages that are read.
+/// The message types that are read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
     /// `velodyne_msgs/msg/VelodyneScan`.
@@ -16,13 +16,14 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// All of them.
+    /// All kinds.
     pub const ALL: [Self; 5] =
         [Self::VelodyneScan, Self::PointCloud2, Self::Odometry, Self::PoseStamped, Self::TfMessage];
 
-    /// By its name: `sensor_msgs/msg/PointCloud2`, `sensor_msgs/PointCloud2`, or as DDS and rmw_zenoh spell it,
+    /// The kind with this name: `sensor_msgs/msg/PointCloud2`, `sensor_msgs/PointCloud2`, or as DDS and rmw_zenoh spell
+    /// it,
     /// `sensor_msgs::msg::dds_::PointCloud2_`.
-    pub fn of(name: &str) -> Option<Self> {
+    pub fn from_name(name: &str) -> Option<Self> {
         let (package, message) = match name.split_once("::msg::dds_::") {
             Some((package, message)) => (package, message.strip_suffix('_')?),
             None => {
@@ -44,7 +45,7 @@ impl Kind {
         }
     }
 
-    /// Whether it brings what a sensor saw.
+    /// True if the message holds data of a sensor.
     pub fn is_sensor(self) -> bool {
         matches!(self, Self::VelodyneScan | Self::PointCloud2)
     }
@@ -62,17 +63,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_type_is_known_by_each_of_its_spellings_and_by_no_other() {
+    fn a_type_is_found_by_each_of_its_spellings_only() {
         for kind in Kind::ALL {
             let (package, message) = kind.parts();
             for name in [format!("{package}/msg/{message}"), format!("{package}/{message}")] {
-                assert_eq!(Kind::of(&name), Some(kind), "{name}");
+                assert_eq!(Kind::from_name(&name), Some(kind), "{name}");
             }
-            assert_eq!(Kind::of(&format!("{package}::msg::dds_::{message}_")), Some(kind));
-            assert_eq!(Kind::of(&format!("{package}::msg::dds_::{message}")), None);
+            assert_eq!(Kind::from_name(&format!("{package}::msg::dds_::{message}_")), Some(kind));
+            assert_eq!(Kind::from_name(&format!("{package}::msg::dds_::{message}")), None);
         }
         for other in ["", "/", "PointCloud2", "sensor_msgs/msg/PointCloud", "sensor_msgs/srv/PointCloud2"] {
-            assert_eq!(Kind::of(other), None, "{other}");
+            assert_eq!(Kind::from_name(other), None, "{other}");
         }
     }
 }

@@ -1,20 +1,20 @@
-//! ROS 2 messages to values, and back.
+//! ROS 2 messages <-> values. Pure: no I/O and no clock.
 //!
-//! In: the bytes of one message as ROS 2 writes them (CDR, XCDR1, either byte order), from an MCAP file or out of
-//! rmw_zenoh's key space. Out: values, frames as the message names them, metres, radians, ns since the Unix epoch.
-//! Nothing is allocated that the message has no bytes for, and whatever is wrong is named.
+//! In: the bytes of one message as ROS 2 writes them (CDR, XCDR1, either byte order), from an MCAP file or from
+//! rmw_zenoh. Out: values in metres, radians and ns since the Unix epoch, in the frames that the message names. A
+//! reader allocates only as much memory as the message has bytes for, and every error names the member that is wrong.
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | [`kind`] | a type's name -> which of these messages it is |
+//! | [`kind`] | name of a message type -> [`Kind`] |
 //! | [`cdr`] | bytes -> numbers, texts, headers; and back |
 //! | [`velodyne_scan`] | `velodyne_msgs/VelodyneScan` -> packets |
 //! | [`point_cloud2`] | `sensor_msgs/PointCloud2` -> fields and bytes; and back |
-//! | [`points`] | fields and bytes -> positions, intensities, rings, times, by the drivers' conventions |
+//! | [`points`] | fields and bytes -> positions, intensities, rings and times, by the conventions of drivers |
 //! | [`occupancy_grid`] | cells -> `nav_msgs/OccupancyGrid` |
 //! | [`pose`] | `nav_msgs/Odometry`, `geometry_msgs/PoseStamped`, `tf2_msgs/TFMessage` -> poses |
-//! | [`frames`] | transforms -> where one frame lies in another |
-//! | [`published`] | the types that are published: names, hashes, definitions |
+//! | [`frames`] | transforms -> pose of one frame in another |
+//! | [`published`] | the published types: names, hashes, definitions |
 
 pub mod cdr;
 pub mod frames;

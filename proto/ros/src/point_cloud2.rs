@@ -1,86 +1,85 @@
 //! One `sensor_msgs/msg/PointCloud2` message.
 //!
-//! In: the bytes of a message. Out: header, layout and the points' bytes, read in place; [`crate::points`] makes
-//! numbers of them. Layout: header; height, width; fields (name, offset, datatype, count); is_bigendian; point_step,
+//! In: the bytes of a message. Out: header, layout and the bytes of the points, without a copy; [`crate::points`]
+//! decodes them. Layout: header; height, width; fields (name, offset, datatype, count); is_bigendian; point_step,
 //! row_step; data; is_dense.
 
 use crate::cdr::{Header, MessageError, Reader, Writer, length};
 
-/// A driver's point has a dozen fields.
+/// Most fields of a point. Ours; drivers write about a dozen.
 const FIELDS_MAX: usize = 256;
-/// Bytes the shortest field takes: name 4 + 1, padding 3, offset 4, datatype 1, and count 4 after padding 3.
+/// Bytes of the shortest field: name 4 + 1, padding 3, offset 4, datatype 1, and count 4 after padding 3.
 const FIELD_LENGTH: usize = 20;
 
-/// A message, read in place. `data` holds all its points: `height` rows of `width` points, and each field lies within
-/// its point.
+/// A message whose bytes are borrowed. `data` holds `height` rows of `width` points; each field lies within its point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PointCloud2<'a> {
-    /// Stamp, and the frame of the points.
+    /// Time and frame of the points.
     pub header: Header<'a>,
-    /// Rows; 1 where the cloud has no order.
+    /// Number of rows; 1 if the points have no order.
     pub height: u32,
-    /// Points of a row.
+    /// Number of points in a row.
     pub width: u32,
-    /// What each point has.
+    /// Fields of each point.
     pub fields: Vec<Field<'a>>,
-    /// Whether the points' numbers have their greatest byte first; the message's own order is another matter.
+    /// True if the numbers of the points are big-endian. The byte order of the message itself is independent of it.
     pub big_endian: bool,
     /// Bytes from one point to the next.
     pub point_step: u32,
     /// Bytes from one row to the next.
     pub row_step: u32,
-    /// The points.
+    /// Bytes of the points.
     pub data: &'a [u8],
-    /// Whether all points are said to be positions; nothing here relies on it.
+    /// True if the sender states that all points have positions. Nothing here relies on it.
     pub dense: bool,
 }
 
 /// `sensor_msgs/PointField`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Field<'a> {
-    /// Such as `x` or `intensity`.
+    /// Name, such as `x` or `intensity`.
     pub name: &'a str,
-    /// Bytes from the point's start.
+    /// Offset from the start of the point, in bytes.
     pub offset: u32,
-    /// [`Datatype`] as a number; drivers write others too, in fields nobody needs.
+    /// [`Datatype`] as a number. Drivers also write other numbers, in fields that are not needed.
     pub datatype: u8,
-    /// Elements.
+    /// Number of elements.
     pub count: u32,
 }
 
-/// What a field's elements are.
+/// Type of the elements of a field.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Datatype {
-    /// One signed byte.
+    /// Signed integer of 8 bits.
     Int8 = 1,
-    /// One byte.
+    /// Unsigned integer of 8 bits.
     Uint8,
-    /// Two bytes, signed.
+    /// Signed integer of 16 bits.
     Int16,
-    /// Two bytes.
+    /// Unsigned integer of 16 bits.
     Uint16,
-    /// Four bytes, signed.
+    /// Signed integer of 32 bits.
     Int32,
-    /// Four bytes.
+    /// Unsigned integer of 32 bits.
     Uint32,
-    /// Single precision.
+    /// Floating-point number of 32 bits.
     Float32,
-    /// Double precision.
+    /// Floating-point number of 64 bits.
     Float64,
 }
 
 impl Datatype {
-    /// In the order of their numbers, from 1.
+    /// All types in the order of their numbers, from 1.
     pub const ALL: [Self; 8] =
         [Self::Int8, Self::Uint8, Self::Int16, Self::Uint16, Self::Int32, Self::Uint32, Self::Float32, Self::Float64];
 
-    /// By its number.
-    pub fn of(number: u8) -> Option<Self> {
+    /// The type with this number.
+    pub fn from_number(number: u8) -> Option<Self> {
         Self::ALL.into_iter().find(|datatype| *datatype as u8 == number)
     }
 
-    /// Bytes of one.
+    /// Bytes of one element.
     pub fn size(self) -> u32 {
         match self {
             Self::Int8 | Self::Uint8 => 1,
@@ -95,7 +94,8 @@ impl<'a> PointCloud2<'a> {
     /// Reads a message.
     ///
     /// # Errors
-    /// [`MessageError`], also where rows, points or fields do not fit into one another.
+    /// [`MessageError`] as of [`Reader`]; [`MessageError::Value`] if there are too many fields, or if rows, points or
+    /// fields do not fit into one another.
     pub fn new(message: &'a [u8]) -> Result<Self, MessageError> {
         let mut reader = Reader::new(message)?;
         let header = reader.header()?;
@@ -107,20 +107,20 @@ impl<'a> PointCloud2<'a> {
         let fields = (0..count).map(|_| field(&mut reader)).collect::<Result<_, _>>()?;
         let big_endian = reader.u8("is_bigendian")? != 0;
         let (point_step, row_step) = (reader.u32("point_step")?, reader.u32("row_step")?);
-        let held = reader.count("data", 1)?;
-        let data = reader.take("data", held)?;
+        let length = reader.count("data", 1)?;
+        let data = reader.read_bytes("data", length)?;
         let dense = reader.u8("is_dense")? != 0;
         let cloud = Self { header, height, width, fields, big_endian, point_step, row_step, data, dense };
         cloud.check()?;
         Ok(cloud)
     }
 
-    /// Whether there is not one point.
+    /// True if the cloud has no point.
     pub fn is_empty(&self) -> bool {
         self.height == 0 || self.width == 0
     }
 
-    /// The bytes of each point, row by row.
+    /// Bytes of each point, row by row.
     pub fn rows(&self) -> impl Iterator<Item = &'a [u8]> + use<'a> {
         let rows = if self.is_empty() { 0 } else { self.height as usize };
         let (width, point, row, data) =
@@ -128,7 +128,7 @@ impl<'a> PointCloud2<'a> {
         (0..rows).flat_map(move |index| data[index * row..][..width * point].chunks_exact(point))
     }
 
-    /// The message, little-endian.
+    /// Encodes the message, little-endian.
     pub fn to_cdr(&self) -> Vec<u8> {
         let mut writer = Writer::default();
         writer.header(&self.header).u32(self.height).u32(self.width).u32(length(self.fields.len()));
@@ -151,26 +151,26 @@ impl<'a> PointCloud2<'a> {
         if needed < row {
             return Err(MessageError::value("row_step", needed, "at least width times point_step"));
         }
-        // The last row may lack the padding the others have.
+        // The last row may lack the padding of the other rows.
         let needed = u128::from(needed) * u128::from(self.height - 1) + u128::from(row);
         if needed > self.data.len() as u128 {
             let found = format!("{} bytes for {} x {} points", self.data.len(), self.height, self.width);
             return Err(MessageError::value("data", found, "row_step a row"));
         }
         let inside = |field: &&Field| {
-            let size = Datatype::of(field.datatype).map_or(1, Datatype::size);
+            let size = Datatype::from_number(field.datatype).map_or(1, Datatype::size);
             let end = u64::from(field.offset) + u64::from(field.count) * u64::from(size);
             end <= u64::from(self.point_step)
         };
         match self.fields.iter().find(|field| !inside(field)) {
             None => Ok(()),
-            Some(field) => Err(MessageError::value("fields[]", described(field), "fields that end within point_step")),
+            Some(field) => Err(MessageError::value("fields[]", describe(field), "fields that end within point_step")),
         }
     }
 }
 
-/// A field in words, for errors.
-pub(crate) fn described(field: &Field) -> String {
+/// Text of a field for errors.
+pub(crate) fn describe(field: &Field) -> String {
     let Field { name, offset, datatype, count } = field;
     format!("{name} (offset {offset}, datatype {datatype}, count {count})")
 }

@@ -1,33 +1,33 @@
 //! Poses: `nav_msgs/msg/Odometry`, `geometry_msgs/msg/PoseStamped`, `tf2_msgs/msg/TFMessage`.
 //!
-//! In: the bytes of a message. Out: rigid transforms, each with the frames it joins. A quaternion within a thousandth
-//! of unit length is made one; any other, as the all-zero one of a message nobody filled, is refused.
+//! In: the bytes of a message. Out: rigid transforms, each with the two frames it joins. A quaternion whose length is
+//! within 0.001 of 1 is normalised; any other is refused, such as the zeros of an unset message.
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
 use crate::cdr::{Header, MessageError, Reader, Writer, length};
 
-/// Bytes of a transform, less padding: header 8 + 4 + 1, name 4 + 1, seven numbers.
+/// Bytes of a transform without padding: header 8 + 4 + 1, name 4 + 1, seven numbers.
 const TRANSFORM_LENGTH: usize = 74;
-/// A robot with more joints is no vehicle.
+/// Most transforms of a message. Ours; far more than a vehicle has frames.
 const TRANSFORMS_MAX: usize = 4096;
 
-/// Where a frame lies in another one at a moment. An odometry's, a stamped pose's (without a child), or one transform
-/// of a tf message.
+/// Pose of a child frame in a parent frame at one time: of an odometry, of a stamped pose (without a child frame), or
+/// one transform of a tf message.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StampedTransform<'a> {
-    /// Stamp and parent frame.
+    /// Time and parent frame.
     pub header: Header<'a>,
-    /// The frame that is placed; empty for a `PoseStamped`, which does not say.
+    /// Child frame; empty for a `PoseStamped`, which does not name it.
     pub child_frame_id: &'a str,
-    /// Carries points of the child's frame into the parent's.
+    /// Pose of the child frame in the parent frame; it maps points of the child to the parent.
     pub parent_from_child: Isometry3<f64>,
 }
 
 /// `nav_msgs/msg/Odometry`, without the covariances.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Odometry<'a> {
-    /// Where the vehicle was.
+    /// Pose of the vehicle.
     pub transform: StampedTransform<'a>,
     /// Linear velocity in the child's frame, m/s.
     pub linear_mps: [f64; 3],
@@ -39,7 +39,8 @@ impl<'a> Odometry<'a> {
     /// Reads a message.
     ///
     /// # Errors
-    /// [`MessageError`].
+    /// [`MessageError`] as of [`Reader`]; [`MessageError::Value`] if a number is not finite or a quaternion is not of
+    /// length 1.
     pub fn new(message: &'a [u8]) -> Result<Self, MessageError> {
         let mut reader = Reader::new(message)?;
         let header = reader.header()?;
@@ -53,7 +54,7 @@ impl<'a> Odometry<'a> {
         Ok(Self { transform, linear_mps, angular_rps })
     }
 
-    /// The message, little-endian, its covariances 0.
+    /// Encodes the message, little-endian, with covariances of 0.
     pub fn to_cdr(&self) -> Vec<u8> {
         let mut writer = Writer::default();
         writer.header(&self.transform.header).text(self.transform.child_frame_id);
@@ -66,7 +67,7 @@ impl<'a> Odometry<'a> {
 /// Reads a `geometry_msgs/msg/PoseStamped`.
 ///
 /// # Errors
-/// [`MessageError`].
+/// As [`Odometry::new`].
 pub fn pose_stamped(message: &[u8]) -> Result<StampedTransform<'_>, MessageError> {
     let mut reader = Reader::new(message)?;
     let header = reader.header()?;
@@ -76,7 +77,7 @@ pub fn pose_stamped(message: &[u8]) -> Result<StampedTransform<'_>, MessageError
 /// Reads a `tf2_msgs/msg/TFMessage`.
 ///
 /// # Errors
-/// [`MessageError`].
+/// As [`Odometry::new`]; [`MessageError::Value`] also if there are more than 4096 transforms.
 pub fn tf_message(message: &[u8]) -> Result<Vec<StampedTransform<'_>>, MessageError> {
     let mut reader = Reader::new(message)?;
     let count = reader.count("transforms", TRANSFORM_LENGTH)?;
@@ -91,7 +92,7 @@ pub fn tf_message(message: &[u8]) -> Result<Vec<StampedTransform<'_>>, MessageEr
     (0..count).map(transform).collect()
 }
 
-/// A `tf2_msgs/msg/TFMessage`, little-endian.
+/// Encodes a `tf2_msgs/msg/TFMessage`, little-endian.
 pub fn tf_message_to_cdr(transforms: &[StampedTransform]) -> Vec<u8> {
     let mut writer = Writer::default();
     writer.u32(length(transforms.len()));
@@ -102,12 +103,12 @@ pub fn tf_message_to_cdr(transforms: &[StampedTransform]) -> Vec<u8> {
     writer.finish()
 }
 
-/// A `geometry_msgs/Pose` or `Transform`: position, then quaternion x y z w.
+/// Reads a `geometry_msgs/Pose` or `Transform`: position, then quaternion x y z w.
 fn pose(reader: &mut Reader, what: &'static str) -> Result<Isometry3<f64>, MessageError> {
     let [x, y, z] = finite(reader.f64s(what)?, what)?;
     let [i, j, k, w] = reader.f64s(what)?;
     let quaternion = Quaternion::new(w, i, j, k);
-    // NaN is in no range.
+    // A range contains no NaN.
     if !(0.999..=1.001).contains(&quaternion.norm()) {
         return Err(MessageError::value(what, format!("quaternion {i} {j} {k} {w}"), "a unit quaternion"));
     }
@@ -115,7 +116,7 @@ fn pose(reader: &mut Reader, what: &'static str) -> Result<Isometry3<f64>, Messa
 }
 
 pub(crate) fn write_pose<'a>(writer: &'a mut Writer, pose: &Isometry3<f64>) -> &'a mut Writer {
-    // Both are stored as they are written: x y z, and x y z w.
+    // nalgebra stores both in the order of the message: x y z, and x y z w.
     writer.f64s(pose.translation.vector.as_slice()).f64s(pose.rotation.coords.as_slice())
 }
 

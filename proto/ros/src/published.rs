@@ -1,26 +1,26 @@
-//! The types that are published: their names, what rmw_zenoh calls them, and their definitions for MCAP files.
+//! The published message types: their names, their names in rmw_zenoh, and their definitions for MCAP files.
 //!
-//! Hashes are RIHS01 (REP-2016), the same from Iron to Jazzy; definitions are those of `common_interfaces` and
-//! `geometry2` without their comments, each followed by those it is made of (MCAP's `ros2msg`).
+//! Hashes are RIHS01 (REP-2016), equal from Iron to Jazzy. Definitions are those of `common_interfaces` and `geometry2`
+//! without comments, each followed by the definitions of its members (MCAP's `ros2msg`).
 
 /// A message type.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Published {
     package: &'static str,
     message: &'static str,
-    /// `RIHS01_` and 64 hexadecimal digits.
+    /// Type hash: `RIHS01_` and 64 hexadecimal digits.
     pub hash: &'static str,
-    /// `ros2msg`.
+    /// Definition in the format `ros2msg`.
     pub definition: &'static str,
 }
 
 impl Published {
-    /// `nav_msgs/msg/OccupancyGrid`.
+    /// Name in ROS 2, such as `nav_msgs/msg/OccupancyGrid`.
     pub fn name(&self) -> String {
         format!("{}/msg/{}", self.package, self.message)
     }
 
-    /// As DDS and rmw_zenoh spell it: `nav_msgs::msg::dds_::OccupancyGrid_`.
+    /// Name in DDS and rmw_zenoh, such as `nav_msgs::msg::dds_::OccupancyGrid_`.
     pub fn dds_name(&self) -> String {
         format!("{}::msg::dds_::{}_", self.package, self.message)
     }

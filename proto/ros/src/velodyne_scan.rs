@@ -1,21 +1,21 @@
 //! One `velodyne_msgs/msg/VelodyneScan` message.
 //!
-//! In: the bytes of a message. Out: header and packets, read in place. Layout: header; packets (count u32, each stamp
-//! and 1,206 bytes).
+//! In: the bytes of a message. Out: header and packets, without a copy. Layout: header; packets (count u32, then for
+//! each a stamp and 1,206 bytes).
 
 use crate::cdr::{Header, MessageError, Reader};
 
 /// Bytes of one data packet.
 pub const PACKET_LENGTH: usize = 1206;
-/// Bytes of one packet in a message, less the padding before it.
+/// Bytes of one packet in a message without the padding before it.
 const ENTRY_LENGTH: usize = 8 + PACKET_LENGTH;
 
-/// A message, read in place.
+/// A message whose bytes are borrowed.
 #[derive(Clone, Debug)]
 pub struct VelodyneScan<'a> {
-    /// Stamp, and the sensor's name in the ROS tree.
+    /// Time and frame of the sensor.
     pub header: Header<'a>,
-    /// Packets the message has.
+    /// Number of packets.
     pub count: usize,
     reader: Reader<'a>,
 }
@@ -24,7 +24,8 @@ impl<'a> VelodyneScan<'a> {
     /// Reads the header and finds the packets.
     ///
     /// # Errors
-    /// [`MessageError`], also if fewer bytes are left than the packets would take.
+    /// [`MessageError`] as of [`Reader`]; [`MessageError::Truncated`] also if the message has fewer bytes than the
+    /// packets need.
     pub fn new(message: &'a [u8]) -> Result<Self, MessageError> {
         let mut reader = Reader::new(message)?;
         let header = reader.header()?;
@@ -32,7 +33,7 @@ impl<'a> VelodyneScan<'a> {
         Ok(Self { header, count, reader })
     }
 
-    /// The packets in order, each with its stamp, ns since the Unix epoch. An error ends them.
+    /// The packets in order, each with its time in ns since the Unix epoch. The iterator ends after an error.
     pub fn packets(&self) -> impl Iterator<Item = Result<(i64, &'a [u8; PACKET_LENGTH]), MessageError>> + use<'a> {
         let (mut reader, mut left) = (self.reader.clone(), self.count);
         std::iter::from_fn(move || {
@@ -46,6 +47,6 @@ impl<'a> VelodyneScan<'a> {
 
 fn packet<'a>(reader: &mut Reader<'a>) -> Result<(i64, &'a [u8; PACKET_LENGTH]), MessageError> {
     let stamp_ns = reader.stamp("packets[].stamp")?;
-    let data = reader.take("packets[].data", PACKET_LENGTH)?;
-    Ok((stamp_ns, data.try_into().expect("that many bytes")))
+    let data = reader.read_bytes("packets[].data", PACKET_LENGTH)?;
+    Ok((stamp_ns, data.try_into().expect("1,206 bytes")))
 }

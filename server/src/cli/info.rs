@@ -88,7 +88,7 @@ fn describe(object: &Map<String, Value>, indent: &str, lines: &mut Vec<String>) 
     }
 }
 
-/// The value to a thousandth, which is all that is printed of seconds and metres.
+/// The value to a thousandth, as seconds, metres and revolutions per minute are printed.
 fn rounded(value: f64) -> f64 {
     (value * 1e3).round() / 1e3
 }
@@ -209,7 +209,7 @@ fn sensor(source: &Source) -> Value {
     json!({
         "model": status.model.map(|model| model.spec().name),
         "return_mode": status.return_mode.map(|mode| format!("{mode:?}").to_lowercase()),
-        "rpm": status.rpm,
+        "rpm": status.rpm.map(|rpm| rounded(rpm.into())),
         "clock": status.clock.map(|clock| clock.as_str()),
         "clock_offset_ms": status.clock_offset_ms,
         "packets": status.packets,

@@ -51,7 +51,7 @@ use std::fmt::Write as _;
 use std::io::IsTerminal;
 use std::process::ExitCode;
 
-use anyhow::Result;
+use anyhow::{Error, Result};
 use clap::builder::StyledStr;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use tracing_subscriber::EnvFilter;
@@ -60,8 +60,16 @@ use tracing_subscriber::EnvFilter;
 #[derive(Parser)]
 #[command(name = "clearway", version, after_help = EXIT_CODES)]
 struct Arguments {
-    /// Format of the log lines on stderr; the environment variable RUST_LOG selects which lines are logged.
-    #[arg(long, value_enum, default_value = "text", global = true)]
+    /// Format of the log on stderr; RUST_LOG selects its lines.
+    #[arg(
+        long,
+        value_enum,
+        default_value = "text",
+        global = true,
+        value_name = "text|json",
+        hide_possible_values = true,
+        display_order = 900
+    )]
     log_format: LogFormat,
     #[command(subcommand)]
     command: Command,
@@ -119,10 +127,21 @@ pub fn main() -> ExitCode {
     match run(arguments.command) {
         Ok(code) => code,
         Err(error) => {
-            eprintln!("clearway: {error:#}");
+            eprintln!("clearway: {}", with_causes(&error));
             ExitCode::FAILURE
         }
     }
+}
+
+/// The text of an error and of its causes. A cause that the text before it contains already is left out.
+fn with_causes(error: &Error) -> String {
+    let mut text = error.to_string();
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        if !text.contains(&cause) {
+            text = format!("{text}: {cause}");
+        }
+    }
+    text
 }
 
 fn start_logs(format: LogFormat) {
@@ -197,6 +216,14 @@ mod tests {
         let grouped = GROUPS.iter().flat_map(|(_, names)| *names).copied();
         let listed: Vec<&str> = grouped.filter(|name| command.find_subcommand(name).is_some()).collect();
         assert_eq!(listed, defined);
+    }
+
+    #[test]
+    fn an_error_names_each_cause_once() {
+        let cause = std::io::Error::other("the disk is full");
+        assert_eq!(with_causes(&Error::new(cause).context("write a.png")), "write a.png: the disk is full");
+        let cause = std::io::Error::other("the disk is full");
+        assert_eq!(with_causes(&Error::new(cause).context("a.png: the disk is full")), "a.png: the disk is full");
     }
 
     #[test]

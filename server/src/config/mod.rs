@@ -25,8 +25,8 @@ mod zenoh;
 
 pub use error::ConfigError;
 pub use grpc::{Access, Certificates, Grpc, Tls};
-pub use ros::Ros;
 pub use listeners::{Listener, Route, listeners};
+pub use ros::Ros;
 pub use udp::{Ports, Sender, Udp};
 pub use vehicle::{Ingest, Vehicle};
 pub use zenoh::{Ros2, Zenoh, ZenohMode};

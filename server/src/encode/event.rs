@@ -99,7 +99,10 @@ pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, NoCo
     let v1::Sensor { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, .. } = sensor;
     let plain = SensorConfig::new(sensor.name, Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg });
     let (blind_deg, []) = sensor.blind_deg.as_chunks() else { return Err(NoCounterpartError("pairs in blind_deg")) };
-    let model = sensor.model.map(|name| name.parse::<Model>().map_err(|_| NoCounterpartError("known sensor model"))).transpose()?;
+    let model = sensor
+        .model
+        .map(|name| name.parse::<Model>().map_err(|_| NoCounterpartError("known sensor model")))
+        .transpose()?;
     Ok(SensorConfig {
         model,
         rpm: sensor.rpm,
@@ -134,7 +137,9 @@ pub(crate) fn scan_from_proto(scan: v1::Scan) -> Result<Scan, NoCounterpartError
     const PART: NoCounterpartError = NoCounterpartError("whole number at the end of a scan's list");
     let floats = |bytes: &[u8]| unpack(bytes).ok_or(PART);
     let no_returns = floats(&scan.no_returns)?;
-    let (directions, []) = no_returns.as_chunks::<3>() else { return Err(NoCounterpartError("z for every x and y of no_returns")) };
+    let (directions, []) = no_returns.as_chunks::<3>() else {
+        return Err(NoCounterpartError("z for every x and y of no_returns"));
+    };
     Ok(Scan {
         stamp_ns: scan.stamp_ns,
         x: floats(&scan.x)?,
@@ -227,17 +232,18 @@ pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventDecodeError> {
         u16::try_from(event.source).map_err(|_| EventDecodeError::Source { sequence, source_index: event.source })?;
     let body = match event.body.ok_or(EventDecodeError::Missing { sequence, what: "body" })? {
         v1::event::Body::Datagram(payload) => Body::Datagram(payload),
-        v1::event::Body::Scan(scan) => {
-            Body::Scan(scan_from_proto(scan).map_err(|NoCounterpartError(what)| EventDecodeError::Missing { sequence, what })?)
-        }
+        v1::event::Body::Scan(scan) => Body::Scan(
+            scan_from_proto(scan).map_err(|NoCounterpartError(what)| EventDecodeError::Missing { sequence, what })?,
+        ),
         v1::event::Body::EgoPose(ego) => {
             Body::EgoPose(ego_pose_from_proto(&ego).ok_or(EventDecodeError::Missing { sequence, what: "pose" })?)
         }
-        v1::event::Body::Road(road) => {
-            Body::Road(road_from_proto(road).map_err(|NoCounterpartError(what)| EventDecodeError::Missing { sequence, what })?)
-        }
+        v1::event::Body::Road(road) => Body::Road(
+            road_from_proto(road).map_err(|NoCounterpartError(what)| EventDecodeError::Missing { sequence, what })?,
+        ),
         v1::event::Body::Sensor(sensor) => {
-            let sensor = sensor_from_proto(sensor).map_err(|NoCounterpartError(what)| EventDecodeError::Missing { sequence, what })?;
+            let sensor = sensor_from_proto(sensor)
+                .map_err(|NoCounterpartError(what)| EventDecodeError::Missing { sequence, what })?;
             Body::Sensor(Box::new(sensor))
         }
         v1::event::Body::Lost(count) => {

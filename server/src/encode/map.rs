@@ -115,7 +115,8 @@ impl EncodedMap {
             (Some(region), None) => slot(None).get_or_init(|| cropped(whole, region)).clone(),
             (_, Some((base, at))) => slot(Some(base.sequence))
                 .get_or_init(|| {
-                    let (from, to) = (base.encode_layer_for(at, region, None)?, self.encode_layer_for(index, region, None)?);
+                    let (from, to) =
+                        (base.encode_layer_for(at, region, None)?, self.encode_layer_for(index, region, None)?);
                     Ok(delta(&from, base.sequence, &to).unwrap_or(to))
                 })
                 .clone(),
@@ -174,12 +175,10 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
 
 fn layer(layer: &Layer) -> v1::Layer {
     let geometry = match &layer.geometry {
-        Geometry::Radial { row_radius_m, columns } => {
-            v1::layer::Geometry::Radial(v1::RadialGrid {
-                row_radius_m: row_radius_m.clone(),
-                columns: u32::from(*columns),
-            })
-        }
+        Geometry::Radial { row_radius_m, columns } => v1::layer::Geometry::Radial(v1::RadialGrid {
+            row_radius_m: row_radius_m.clone(),
+            columns: u32::from(*columns),
+        }),
         &Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_cell } => {
             let [first_ix, first_iy] = first_cell;
             v1::layer::Geometry::Cartesian(v1::CartesianGrid {
@@ -286,8 +285,18 @@ mod tests {
             compensation: clearway_mapping::sensor::motion::Compensation::Speed,
             source: 1,
             sensors: vec![
-                SensorState { name: "top".into(), contribution: Contribution::Late, age_ms: Some(250.5), ..SensorState::default() },
-                SensorState { name: "left".into(), packets_expected: 75, contribution: Contribution::Ok, ..SensorState::default() },
+                SensorState {
+                    name: "top".into(),
+                    contribution: Contribution::Late,
+                    age_ms: Some(250.5),
+                    ..SensorState::default()
+                },
+                SensorState {
+                    name: "left".into(),
+                    packets_expected: 75,
+                    contribution: Contribution::Ok,
+                    ..SensorState::default()
+                },
             ],
             layers: vec![layer("drivability"), layer("height_difference")],
         }

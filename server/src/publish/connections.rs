@@ -89,7 +89,9 @@ impl Connections {
         let (permit, admission) = match (self.permits.clone().try_acquire_owned(), &self.over_limit) {
             (Ok(permit), _) => (permit, Admission::Served),
             (Err(_), None) => (self.permits.clone().acquire_owned().await.ok()?, Admission::Served),
-            (Err(_), Some(over_limit)) => (over_limit.clone().try_acquire_owned().ok()?, Admission::OverLimit(self.connections_max)),
+            (Err(_), Some(over_limit)) => {
+                (over_limit.clone().try_acquire_owned().ok()?, Admission::OverLimit(self.connections_max))
+            }
         };
         let limit = if admission == Admission::Served { self.first_byte } else { OVER_LIMIT_TIMEOUT };
         Some(Connection { stream, limit: Some(Box::pin(tokio::time::sleep(limit))), admission, _permit: permit })
@@ -229,7 +231,11 @@ mod tests {
         sender.write_all(b"a").await.unwrap();
         rejected.stream.readable().await.unwrap();
         assert_eq!(rejected.read_u8().await.unwrap(), b'a');
-        assert_eq!(rejected.read_u8().await.unwrap_err().kind(), io::ErrorKind::TimedOut, "the limit is for the whole connection");
+        assert_eq!(
+            rejected.read_u8().await.unwrap_err().kind(),
+            io::ErrorKind::TimedOut,
+            "the limit is for the whole connection"
+        );
     }
 
     #[tokio::test]

@@ -8,9 +8,9 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
-use clearway_client::MapView;
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::{base_frame, foxglove as messages};
+use clearway_client::MapView;
 use foxglove::messages::{FrameTransforms, Grid, PointCloud};
 use foxglove::websocket::{ChannelView, Client, ServerListener};
 use foxglove::{Channel, ChannelId, Context, Encode, FoxgloveError, PartialMetadata, SinkId, WebSocketServerHandle};
@@ -19,10 +19,10 @@ use tokio::task::JoinSet;
 
 use super::served::{Served, Vehicles};
 use crate::config::Foxglove as Options;
-use crate::subscriptions::LayerSubscription;
-use crate::newest::NewestSweep;
-use crate::sync::locked;
 use crate::encode::EncodedMap;
+use crate::newest::NewestSweep;
+use crate::subscriptions::LayerSubscription;
+use crate::sync::locked;
 
 /// Most messages on the way to one client. Ours: some revolutions of every layer; the largest message, a grid, has about
 /// 1 MB.
@@ -44,7 +44,8 @@ impl Publisher {
     pub async fn start(options: &Options, vehicles: &Vehicles) -> Result<Self, FoxgloveError> {
         let context = Context::new();
         let tf = Arc::new(context.channel_builder("/tf").build::<FrameTransforms>());
-        let vehicles_channels: Vec<_> = vehicles.0.iter().map(|served| Arc::new(VehicleChannels::new(served, &context, &tf))).collect();
+        let vehicles_channels: Vec<_> =
+            vehicles.0.iter().map(|served| Arc::new(VehicleChannels::new(served, &context, &tf))).collect();
         let server = context.websocket_server().name("clearway").message_backlog_size(BACKLOG);
         let server = server.listener(Arc::new(SubscriptionListener(vehicles_channels.clone())));
         let server = server.bind(options.listen.ip().to_string(), options.listen.port()).start().await?;
@@ -126,7 +127,8 @@ impl VehicleChannels {
         let status = &self.served.status;
         let layer_subscription = layer.map(|(name, _)| status.subscriptions.subscribe(&[(*name).to_owned()]));
         let points = is_points.then(|| status.sweeps.subscribe());
-        locked(&self.subscriptions).insert((channel, sink), ClientSubscription { is_new: true, _layer: layer_subscription, points });
+        locked(&self.subscriptions)
+            .insert((channel, sink), ClientSubscription { is_new: true, _layer: layer_subscription, points });
         self.subscribed.notify_one();
     }
 
@@ -160,7 +162,9 @@ impl VehicleChannels {
     /// New subscriptions, which are no longer new afterwards.
     fn take_new(&self) -> Vec<(ChannelId, SinkId)> {
         let mut subscriptions = locked(&self.subscriptions);
-        let new = subscriptions.iter_mut().filter_map(|(&key, subscription)| std::mem::take(&mut subscription.is_new).then_some(key));
+        let new = subscriptions
+            .iter_mut()
+            .filter_map(|(&key, subscription)| std::mem::take(&mut subscription.is_new).then_some(key));
         new.collect()
     }
 
@@ -194,7 +198,9 @@ impl VehicleChannels {
 }
 
 fn view(bytes: bytes::Bytes) -> Option<MapView> {
-    MapView::decode(bytes).inspect_err(|error| tracing::error!(%error, "foxglove: the newest map cannot be decoded")).ok()
+    MapView::decode(bytes)
+        .inspect_err(|error| tracing::error!(%error, "foxglove: the newest map cannot be decoded"))
+        .ok()
 }
 
 fn is_subscribed<T: Encode>(channel: &Channel<T>, to: Option<(ChannelId, SinkId)>) -> bool {

@@ -10,9 +10,9 @@
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
 
-use clearway_client::MapView;
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::ros;
+use clearway_client::MapView;
 use clearway_ros::published::{OCCUPANCY_GRID, Published, TF_MESSAGE};
 use tokio::task::JoinSet;
 use zenoh::Session;
@@ -22,10 +22,10 @@ use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
 
 use super::served::Served;
-use crate::config::Ros2;
 use crate::clock::now_ns;
-use crate::zenoh_session::ZenohError;
+use crate::config::Ros2;
 use crate::encode::EncodedMap;
+use crate::zenoh_session::ZenohError;
 
 /// Name of the node.
 const NODE: &str = "clearway";

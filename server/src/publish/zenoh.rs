@@ -12,12 +12,12 @@
 use std::time::Duration;
 
 use tokio::task::JoinSet;
+use zenoh::Session;
 use zenoh::bytes::Encoding;
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::matching::{MatchingListener, MatchingStatus};
 use zenoh::qos::{CongestionControl, Priority};
-use zenoh::Session;
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig, RepliesConfig};
 
 use super::ros::Node;
@@ -93,7 +93,8 @@ impl Publisher {
                 .publisher_detection()
                 .await
                 .map_err(ZenohError::of(format!("publisher {key}")))?;
-            let matching = publisher.matching_listener().await.map_err(ZenohError::of(format!("subscribers of {key}")))?;
+            let matching =
+                publisher.matching_listener().await.map_err(ZenohError::of(format!("subscribers of {key}")))?;
             let matches = publisher.matching_status().await.map_err(ZenohError::of(format!("subscribers of {key}")))?;
             self.tasks.spawn(subscribe_while(served.clone(), layer, matches.matching(), matching));
             publishers.push((*layer, publisher));
@@ -102,8 +103,10 @@ impl Publisher {
         let key = format!("clearway/{vehicle}/status");
         let status = self.session.declare_publisher(key.clone()).encoding(Encoding::APPLICATION_JSON);
         let status = status.priority(STATUS);
-        let status =
-            status.congestion_control(CongestionControl::Drop).await.map_err(ZenohError::of(format!("publisher {key}")))?;
+        let status = status
+            .congestion_control(CongestionControl::Drop)
+            .await
+            .map_err(ZenohError::of(format!("publisher {key}")))?;
         let token = self.session.liveliness().declare_token(format!("clearway/{vehicle}"));
         self.tokens.push(token.await.map_err(ZenohError::of(format!("liveliness clearway/{vehicle}")))?);
         self.tasks.spawn(send_maps(served.clone(), publishers));
@@ -129,7 +132,9 @@ impl Publisher {
         let (newest, subscriptions) = (served.newest.clone(), served.status.subscriptions.clone());
         self.tasks.spawn(async move {
             while let Ok(query) = queries.recv_async().await {
-                let Some(map) = subscriptions.subscribe(&[layer.to_owned()]).newest_map(&newest).await else { continue };
+                let Some(map) = subscriptions.subscribe(&[layer.to_owned()]).newest_map(&newest).await else {
+                    continue;
+                };
                 let Some((_, chunk)) = map.layers.iter().find(|(name, _)| *name == layer) else { continue };
                 if let Err(error) = query.reply(&key, map.layer(chunk)).encoding(map_encoding()).await {
                     tracing::debug!(%error, "zenoh: reply");

@@ -102,7 +102,7 @@ impl Message {
 
     /// True if this is a `VelodyneScan`, in any encoding.
     pub fn is_velodyne_scan(&self) -> bool {
-        Kind::of(&self.channel.schema) == Some(Kind::VelodyneScan)
+        Kind::from_name(&self.channel.schema) == Some(Kind::VelodyneScan)
     }
 }
 
@@ -372,7 +372,7 @@ fn open(file: &Path) -> Result<File, McapReadError> {
 /// The kind of the messages of a channel, by its topic, the name of its schema, and its encoding.
 fn content(topic: &str, schema: &str, encoding: &str) -> Content {
     // A bag that was converted from ROS 1 has the same types in another encoding.
-    if let Some(kind) = Kind::of(schema).filter(|_| encoding == "cdr") {
+    if let Some(kind) = Kind::from_name(schema).filter(|_| encoding == "cdr") {
         return Content::Ros(kind);
     }
     let parts: Vec<&str> = topic.split('/').collect();

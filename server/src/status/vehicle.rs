@@ -11,13 +11,13 @@ use clearway_proto::v1;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
-use crate::subscriptions::LayerSubscriptions;
-use crate::newest::NewestSweep;
 use crate::clock::now_ns;
-use crate::ingest::drops::{DropCounters, UnknownSender};
-use crate::sync::locked;
-use crate::record::writer::RecorderCounts;
 use crate::encode::EncodedMap;
+use crate::ingest::drops::{DropCounters, UnknownSender};
+use crate::newest::NewestSweep;
+use crate::record::writer::RecorderCounts;
+use crate::subscriptions::LayerSubscriptions;
+use crate::sync::locked;
 
 use super::sensor_json::{ledger_json, sensor_json};
 

@@ -77,7 +77,7 @@ fn send(turns: &[Vec<Datagram>], to: SocketAddr, cuts: &Cuts, stop: &AtomicBool)
                 return;
             }
             if index + 1 == turn.len() {
-                cuts.lock().expect("nobody panics").push((datagram.stamp_ns, now_ns()));
+                cuts.lock().expect("no thread panics").push((datagram.stamp_ns, now_ns()));
             }
             socket.send_to(&datagram.payload, to).expect("loopback takes datagrams");
         }

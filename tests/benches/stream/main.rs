@@ -186,7 +186,7 @@ async fn measure(
     car.stop();
     tasks.shutdown().await;
     server.stop();
-    let mut seen = readers.seen.lock().expect("nobody panics");
+    let mut seen = readers.seen.lock().expect("no thread panics");
     let seen = &mut *seen;
     let maps = seen.carried.len() as u64;
     json!({
@@ -274,7 +274,7 @@ impl Readers {
             let arrived_ns = now_ns();
             let sequence = self.take(&update.map, update.sent_ns, arrived_ns, is_planner);
             if self.counts.load(Ordering::Relaxed) {
-                self.seen.lock().expect("nobody panics").skipped += update.skipped;
+                self.seen.lock().expect("no thread panics").skipped += update.skipped;
             }
             let acknowledged = v1::WatchRequest { acknowledged: Some(sequence), ..Default::default() };
             if acknowledge.send(acknowledged).await.is_err() {
@@ -321,7 +321,7 @@ impl Readers {
     fn count(&self, bytes: usize, sent_ns: i64, arrived_ns: i64) -> bool {
         let counts = self.counts.load(Ordering::Relaxed);
         if counts {
-            let mut seen = self.seen.lock().expect("nobody panics");
+            let mut seen = self.seen.lock().expect("no thread panics");
             seen.carried.push((arrived_ns - sent_ns) as f64 * 1e-6);
             seen.bytes += bytes as u64;
         }
@@ -339,7 +339,7 @@ impl Readers {
         if self.count(map.len(), sent_ns, arrived_ns)
             && let Some(age_ms) = self.age_ms(header.capture_end_ns, arrived_ns)
         {
-            let mut seen = self.seen.lock().expect("nobody panics");
+            let mut seen = self.seen.lock().expect("no thread panics");
             seen.ages.push(age_ms);
             if is_planner {
                 seen.planner.push(age_ms + (in_hands_ns - arrived_ns) as f64 * 1e-6);
@@ -350,7 +350,7 @@ impl Readers {
 
     /// From the last packet of a capture to then, ms.
     fn age_ms(&self, capture_end_ns: i64, then_ns: i64) -> Option<f64> {
-        let cuts = self.cuts.lock().expect("nobody panics");
+        let cuts = self.cuts.lock().expect("no thread panics");
         // The turn's last packet is the first that was stamped after the capture's end.
         let (_, cut_ns) = cuts.iter().rev().take_while(|(stamp, _)| *stamp >= capture_end_ns).last()?;
         Some((then_ns - cut_ns) as f64 * 1e-6)

@@ -1,4 +1,5 @@
-//! The server in a process of its own, whose memory nobody shares, and beside it the floor: plain TCP with as many bytes.
+//! The server in its own process, so that its memory can be measured; beside it a plain TCP server that sends as many
+//! bytes, which is the lower bound.
 
 use std::io::{BufRead, BufReader};
 use std::net::{SocketAddr, TcpListener};

@@ -1,10 +1,11 @@
-//! What slow readers cost the others: eight healthy readers, without and with a stopped and a slow one beside them, in turn.
+//! Measures what slow readers cost the others: eight healthy readers, alternately alone and beside a stopped and a slow
+//! reader.
 //!
-//! In: the turns, seconds of each part. Out, of each part: age in the healthy ones' hands and maps they missed, growth of
-//! the server's resident set, and, when the stopped one goes on, how old the first map is that was not on its way already.
-//! One looks no more, as a planner that hangs (its connection lives: whoever does not even answer pings is dropped after
-//! 20 s); the other looks all the time over a slow link. Both have the windows that tonic gives any client, and the credits
-//! that ours ask for.
+//! In: the revolutions, and the seconds of each part. Out, for each part: the age of the maps at the healthy readers,
+//! the maps they missed, the growth of the server's resident set, and the age of the first new map of the stopped
+//! reader after it resumes (new: not already sent when it resumed). The stopped reader stops reading, as a planner
+//! that hangs; its connection still answers pings (the server drops one that does not after 20 s). The slow reader
+//! reads all the time over a slow link. Both have tonic's default windows, and the credits that our client requests.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -80,7 +81,7 @@ async fn part(arguments: &Arguments, turns: &Turns, with: bool) -> Value {
     car.stop();
     tasks.shutdown().await;
     server.stop();
-    let mut seen = readers.seen.lock().expect("nobody panics");
+    let mut seen = readers.seen.lock().expect("no thread panics");
     let seen = &mut *seen;
     json!({
         "slow_readers": if with { "with" } else { "without" },

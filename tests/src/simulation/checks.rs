@@ -26,8 +26,8 @@ pub fn violation(check: &'static str, found: impl Into<String>) -> Violation {
     Violation { check, found: found.into() }
 }
 
-/// Least distance of a checked cell, in metres: nearer cells were visible past the edge of the covered sector from where
-/// the car was earlier in the revolution.
+/// Least distance of a checked cell, in metres: earlier in the revolution, from the car's earlier place, the sensor saw
+/// nearer cells past the edge of the covered sector.
 const COVERED_M_MIN: f64 = 8.0;
 /// Outermost degrees of the sector that are not checked, for the same reason.
 const COVERED_EDGE_DEG: i64 = 15;

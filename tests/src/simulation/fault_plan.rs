@@ -85,7 +85,8 @@ impl Rng {
 pub struct SensorFault {
     /// While it sends nothing.
     pub silent: Option<Range<i64>>,
-    /// Time of a restart, and microseconds by which the device's clock is ahead from then on. Its GPS receiver has no fix.
+    /// Time of a restart, and microseconds by which the device's clock is ahead from then on. The GPS receiver has no
+    /// fix.
     pub restart: Option<(i64, u32)>,
 }
 
@@ -143,7 +144,7 @@ impl FaultPlan {
             let from_deg = rng.within(0..360);
             (from_deg..from_deg + rng.within(60..120), 9 * REVOLUTION_NS..HEAL_NS)
         });
-        // A flipped bit would make a return where the window is covered, and a clock that jumps would move the revolutions.
+        // A flipped bit would make a return where the window is covered, and a clock step would move the revolutions.
         let plain = covered.is_some();
         let networks: Vec<Faults> = (0..rotating).map(|_| network(&mut rng, plain)).collect();
         let during = |rng: &mut Rng, longest_ns| {

@@ -1,6 +1,6 @@
-//! Readers of every kind on the server's own `Watch`, polled by hand: each at its own times, and every update is compared
-//! with the map that the engine made. Readers over zenoh are not among them, because its sessions have threads and clocks
-//! of their own.
+//! Readers of every kind on the server's own `Watch`, polled by hand: each at its own times, and every update is
+//! compared with the map that the engine made. Readers over zenoh are not among them, because its sessions have threads
+//! and clocks of their own.
 
 use std::collections::VecDeque;
 use std::ops::Range;

@@ -73,7 +73,8 @@ pub struct Recorded {
 }
 
 impl Recorded {
-    /// Checks that the recorded maps are the maps of the recorded events, byte for byte, and that every loss is reported.
+    /// Checks that the recorded maps are the maps of the recorded events, byte for byte, and that the recording reports
+    /// every loss.
     /// Returns true if the recording is complete.
     pub fn check(&self) -> Result<bool, Violation> {
         let wrong = |what: String| Err(violation("recording", what));

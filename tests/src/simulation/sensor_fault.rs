@@ -38,7 +38,7 @@ pub fn inside(sector_deg: &Range<i64>, direction_deg: f64) -> bool {
     (direction_deg - sector_deg.start as f64).rem_euclid(360.0) < (sector_deg.end - sector_deg.start) as f64
 }
 
-/// Removes the returns in a sector of directions from a data packet. The encoder's angle is the direction of its lasers.
+/// Removes the returns in a sector of directions from a data packet. The encoder's angle is the lasers' direction.
 pub fn cover_datagram(datagram: &mut Datagram, sector_deg: &Range<i64>, ego_from_sensor: &Isometry3<f64>) {
     if datagram.kind != Kind::Data {
         return;

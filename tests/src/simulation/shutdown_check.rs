@@ -85,11 +85,11 @@ impl TestBed<'_> {
     fn check_recording(self, outcome: Outcome, mut hasher: DefaultHasher) -> Result<Outcome, Violation> {
         let now = self.instant();
         let layers = self.maps.first().map_or(0, |map| map.layers.len() as u64);
-        let Some(mut scribe) = self.scribe else { return Ok(Outcome { digest: hasher.finish(), ..outcome }) };
+        let Some(mut writer) = self.writer else { return Ok(Outcome { digest: hasher.finish(), ..outcome }) };
         drop(self.engine);
-        while scribe.write_next(now) {}
-        let counts = scribe.counts();
-        scribe.finish();
+        while writer.write_next(now) {}
+        let counts = writer.counts();
+        writer.finish();
         let crashed = self.disk_at_crash.is_some();
         let mut bytes = self.disk_at_crash.unwrap_or_else(|| self.disk.bytes());
         if self.injected == Some(InjectedFault::CorruptRecording) {

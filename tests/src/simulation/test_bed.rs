@@ -7,13 +7,13 @@ use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
+use clearway::clock::Clock;
 use clearway::config::Config;
 use clearway::encode::EncodedMap;
 use clearway::engine::Engine;
 use clearway::ingest::gateway::Gateway;
-use clearway::ingest::receipt::{ClientSession, ObservationId, Outcome as EventOutcome, OutcomeSender};
-use clearway::clock::Clock;
 use clearway::ingest::queue::{EventQueue, QueuedEvent, event_queue_with_clock};
+use clearway::ingest::receipt::{ClientSession, ObservationId, Outcome as EventOutcome, OutcomeSender};
 use clearway::publish::{Served, Vehicles};
 use clearway::record::mcap_file::Header;
 use clearway::record::writer::RecordingWriter;
@@ -70,7 +70,7 @@ pub(super) struct TestBed<'a> {
 
     pub(super) began: Instant,
     pub(super) disk: MemoryDisk,
-    pub(super) scribe: Option<RecordingWriter<MemoryDisk>>,
+    pub(super) writer: Option<RecordingWriter<MemoryDisk>>,
     /// Events passed to the recorder by the end of each tick.
     pub(super) recorded_by_tick: Vec<u64>,
     /// Content of the disk when the machine crashed.
@@ -94,13 +94,13 @@ impl<'a> TestBed<'a> {
         let vehicles = vec![("car".into(), layers.clone())];
         let header = Header { boot_id: 1, config: config.to_toml(), vehicles, ..Header::default() };
         let disk = MemoryDisk::new(plan.disk.clone());
-        let (scribe, journal) = match RecordingWriter::new(disk.clone(), &config.recorder, &header, false) {
-            Ok((scribe, mut journals)) => (Some(scribe), journals.pop()),
+        let (writer, journal) = match RecordingWriter::new(disk.clone(), &config.recorder, &header, false) {
+            Ok((writer, mut journals)) => (Some(writer), journals.pop()),
             // The disk is full before the first event: the run goes on without a recording.
             Err(_) => (None, None),
         };
         let status = Arc::new(VehicleStatus::new("car".into(), 1, layers.clone(), door.drops()));
-        scribe.iter().for_each(|scribe| status.show_recorder(scribe.counts()));
+        writer.iter().for_each(|writer| status.show_recorder(writer.counts()));
         let (newest, receiver) = watch::channel(None);
         let pipeline = Pipeline::new(&vehicle.core(), vec![None; vehicle.sensors.len()]).expect("a valid car");
         let valid_ms = vehicle.maps.valid_ms;
@@ -135,7 +135,7 @@ impl<'a> TestBed<'a> {
             rng,
             began: Instant::now(),
             disk,
-            scribe,
+            writer,
             recorded_by_tick: Vec::new(),
             disk_at_crash: None,
         }
@@ -223,9 +223,9 @@ impl<'a> TestBed<'a> {
     fn record(&mut self) {
         let now = self.instant();
         if !during(&self.plan.recorder_stall, self.now_ns)
-            && let Some(scribe) = &mut self.scribe
+            && let Some(writer) = &mut self.writer
         {
-            while scribe.write_next(now) {}
+            while writer.write_next(now) {}
         }
         self.recorded_by_tick.push(self.taken);
         if let DiskFault::Crash(at_ns, torn) = self.plan.disk

@@ -1,4 +1,4 @@
-//! What is not taken, and what its sender hears of it: each with its reason, and nobody else is the worse for it.
+//! Refused observations: the sender receives a reason for each, and no other client is disturbed.
 
 use std::path::Path;
 
@@ -146,7 +146,7 @@ async fn points_that_are_nowhere_are_counted_and_left_out() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn strangers_crowds_and_giants_are_told_what_is_allowed() {
+async fn unknown_vehicles_surplus_streams_and_large_scans_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let mut config = scanned_config();
     (config.vehicles[0].ingest.points_max, config.vehicles[0].ingest.streams_max) = (1000, 1);
@@ -207,7 +207,9 @@ async fn strangers_crowds_and_giants_are_told_what_is_allowed() {
     assert_eq!(running.vehicles.0[0].status.snapshot().ledger.refused.get("observation"), Some(&1));
     within("shutdown", running.shutdown()).await.unwrap();
     let told = RecordingReader::open(&file).unwrap().map(|entry| match entry.unwrap() {
-        RecordedMessage::Event { event: Event { body: Body::Lost { cause: Cause::Observation, count }, .. }, .. } => count,
+        RecordedMessage::Event {
+            event: Event { body: Body::Lost { cause: Cause::Observation, count }, .. }, ..
+        } => count,
         _ => 0,
     });
     assert_eq!(told.sum::<u64>(), 1, "the journal knows of it, though no event came after");

@@ -102,7 +102,7 @@ async fn a_stopped_and_a_slow_reader_cost_eight_healthy_ones_nothing_and_resume_
         (before, seen) = (update, seen + 1);
     }
     assert!(seen <= 3, "{seen} maps over a link of 10 kB/s, of which all but two were on the way");
-    // Who never acknowledges at all gets what was on the way, and no gap is untold.
+    // A reader that never acknowledges receives what was already sent, and every gap is reported as skipped.
     wall.allowed.add_permits(Semaphore::MAX_PERMITS / 2);
     let mut expected = 0;
     while expected < next {
@@ -128,7 +128,7 @@ async fn a_thousand_idle_connections_take_no_more_than_their_places_and_the_next
         idle.push(connection);
     }
     keeps_up(&mut healthy, &running).await;
-    // The lobby is full of them too; as soon as it is not, whoever comes hears why there is no place.
+    // Connections over the limit are also limited. Once there are fewer, a new peer is told why it is refused.
     let status = within("an answer", async {
         loop {
             let channel = Channel::from_shared(format!("http://{server}")).unwrap().connect_lazy();
@@ -169,7 +169,7 @@ fn open_and_reset(stream: u32) -> Vec<u8> {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn who_opens_and_resets_streams_in_a_loop_loses_its_connection_and_nobody_else_does() {
+async fn a_client_that_resets_streams_in_a_loop_loses_only_its_own_connection() {
     let running = start(config()).await;
     let server = running.grpc.unwrap();
     let mut healthy = Reader::open(&mut plain(server).await, of_layer(1)).await.unwrap();

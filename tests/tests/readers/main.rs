@@ -1,5 +1,4 @@
-//! Readers of `Watch` over real sockets: what they ask for, what they are told, and that the bad ones cost nobody
-//! anything.
+//! Readers of `Watch` over real sockets: their requests, their updates, and that bad readers do not disturb the others.
 
 mod bad;
 #[path = "../fixture/mod.rs"]
@@ -86,7 +85,7 @@ async fn keeps_up(reader: &mut Reader, running: &Running) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_a_reader_asks_for_and_cannot_have_is_refused_by_name_and_disturbs_nobody() {
+async fn an_impossible_request_is_refused_and_disturbs_no_other_reader() {
     let running = start(config()).await;
     let mut client = plain(running.grpc.unwrap()).await;
     let mut healthy = Reader::open(&mut client, of_layer(1)).await.unwrap();
@@ -263,14 +262,14 @@ impl MapService for Lossy {
     }
 
     async fn get_map(&self, _: Request<v1::GetMapRequest>) -> Result<Response<v1::MapUpdate>, Status> {
-        Err(Status::unimplemented("nobody asks"))
+        Err(Status::unimplemented("not called by this test"))
     }
 
     async fn list_vehicles(
         &self,
         _: Request<v1::ListVehiclesRequest>,
     ) -> Result<Response<v1::ListVehiclesResponse>, Status> {
-        Err(Status::unimplemented("nobody asks"))
+        Err(Status::unimplemented("not called by this test"))
     }
 }
 
@@ -294,7 +293,7 @@ async fn our_client_shows_the_cells_of_whole_maps_also_when_an_update_is_lost_be
             let update = truth.next().await.unwrap();
             truth.acknowledge(expected).await;
             if expected == 2 {
-                // Nobody can know yet.
+                // The client cannot know of the loss yet.
                 continue;
             }
             let seen = within("a map", maps.next()).await.unwrap();

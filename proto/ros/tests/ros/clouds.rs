@@ -1,11 +1,11 @@
-//! Any layout of a cloud gives the points that were put into it.
+//! A cloud of any layout decodes to the points that were encoded.
 
 use clearway_ros::cdr::Header;
 use clearway_ros::point_cloud2::{Datatype, Field};
 use clearway_ros::{PointCloud2, Points};
 use proptest::prelude::*;
 
-/// One point as a test has it.
+/// One point of a test.
 #[derive(Clone, Debug)]
 struct Point {
     xyz: [f32; 3],
@@ -43,7 +43,7 @@ fn number(datatype: Datatype, value: f64, big_endian: bool) -> Vec<u8> {
 
 proptest! {
     #[test]
-    fn points_come_out_of_any_layout_as_they_went_in(
+    fn points_of_any_layout_decode_to_themselves(
         points in proptest::collection::vec(point(), 1..40),
         rows in 1..4_usize,
         gaps in proptest::array::uniform6(0..9_usize),
@@ -64,11 +64,11 @@ proptest! {
             offset += gap + datatype.size() as usize;
             field
         }).collect();
-        let (step, nowhere) = (offset, Point { xyz: [f32::NAN; 3], intensity: 0, ring: 0, time_ns: 0 });
+        let (step, absent) = (offset, Point { xyz: [f32::NAN; 3], intensity: 0, ring: 0, time_ns: 0 });
         let mut data = Vec::new();
         for row in 0..rows {
             for column in 0..width {
-                let point = points.get(row * width + column).unwrap_or(&nowhere);
+                let point = points.get(row * width + column).unwrap_or(&absent);
                 let values = [point.xyz[0].into(), point.xyz[1].into(), point.xyz[2].into(), point.intensity.into(), point.ring.into(), f64::from(point.time_ns)];
                 let start = data.len();
                 data.resize(start + step, 0xAA);
@@ -93,13 +93,13 @@ proptest! {
         let bytes = cloud.to_cdr();
         let read = PointCloud2::new(&bytes).unwrap();
         prop_assert_eq!(&read, &cloud);
-        let read = Points::of(&read).unwrap();
+        let read = Points::from_cloud(&read).unwrap();
 
         let seen: Vec<&Point> = points.iter().filter(|p| !p.xyz.iter().any(|v| v.is_nan()) && p.xyz != [0.0; 3]).collect();
         prop_assert_eq!(read.no_returns as usize, rows * width - seen.len());
         let newest = seen.iter().map(|p| p.time_ns).max().unwrap_or(0);
         prop_assert_eq!(read.stamp_ns, 5_000_000_007 + i64::from(newest));
-        let turned = seen.first().is_some_and(|p| read.ring[0] != u16::from(p.ring)) || {
+        let is_reversed = seen.first().is_some_and(|p| read.ring[0] != u16::from(p.ring)) || {
             seen.iter().zip(&read.ring).any(|(p, ring)| *ring != u16::from(p.ring))
         };
         let highest = seen.iter().map(|p| u16::from(p.ring)).max().unwrap_or(0) + 1;
@@ -109,7 +109,7 @@ proptest! {
             prop_assert_eq!(read.intensity[index], f32::from(point.intensity) / 255.0);
             prop_assert_eq!(read.offset_ns[index], point.time_ns as i32 - newest as i32);
             let ring = u16::from(point.ring);
-            prop_assert_eq!(read.ring[index], if turned { rings - 1 - ring } else { ring });
+            prop_assert_eq!(read.ring[index], if is_reversed { rings - 1 - ring } else { ring });
         }
     }
 }

@@ -11,7 +11,7 @@ fn transform<'a>(parent: &'a str, child: &'a str, x: f64, yaw: f64) -> StampedTr
 }
 
 #[test]
-fn a_frame_is_found_up_and_down_the_tree_and_nowhere_else() {
+fn a_frame_is_found_up_and_down_its_tree_only() {
     let mut frames = Frames::default();
     let quarter = std::f64::consts::FRAC_PI_2;
     for (parent, child, x, yaw) in [
@@ -20,7 +20,7 @@ fn a_frame_is_found_up_and_down_the_tree_and_nowhere_else() {
         ("base_link", "top", 2.0, 0.0),
         ("rig", "left", 1.0, 0.0),
     ] {
-        assert!(frames.take(&transform(parent, child, x, yaw)));
+        assert!(frames.insert(&transform(parent, child, x, yaw)));
     }
     let at = |a: &str, b: &str| frames.a_from_b(a, b).map(|a_from_b| a_from_b * Point3::origin());
     let near = |a: Option<Point3<f64>>, x: f64, y: f64| (a.unwrap() - Point3::new(x, y, 0.0)).norm() < 1e-12;
@@ -29,15 +29,15 @@ fn a_frame_is_found_up_and_down_the_tree_and_nowhere_else() {
     assert!(near(at("top", "odom"), -2.0, 5.0));
     assert_eq!(at("top", "/top"), Some(Point3::origin()));
     assert_eq!(at("base_link", "left"), None);
-    assert_eq!(at("base_link", "nowhere"), None);
+    assert_eq!(at("base_link", "absent"), None);
     assert_eq!([frames.steps_up("top", "map"), frames.steps_up("left", "map")], [Some(3), None]);
-    assert!(frames.knows("rig") && !frames.knows("nowhere"));
+    assert!(frames.contains("rig") && !frames.contains("absent"));
 }
 
 #[test]
-fn a_ring_of_frames_ends() {
+fn a_cycle_of_frames_ends() {
     let mut frames = Frames::default();
-    frames.take(&transform("a", "b", 1.0, 0.0));
-    frames.take(&transform("b", "a", 1.0, 0.0));
+    frames.insert(&transform("a", "b", 1.0, 0.0));
+    frames.insert(&transform("b", "a", 1.0, 0.0));
     assert_eq!(frames.a_from_b("map", "a"), None);
 }

@@ -1,4 +1,4 @@
-//! What rosbags writes is read as it was meant, and what is written here is what rosbags writes.
+//! Messages written by rosbags are read correctly, and messages written here equal those of rosbags.
 
 use clearway_ros::pose::{Odometry, StampedTransform, pose_stamped, tf_message, tf_message_to_cdr};
 use clearway_ros::velodyne_scan::VelodyneScan;
@@ -8,11 +8,11 @@ use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 use crate::{STAMP_NS, golden};
 
 fn points(name: &str) -> Points {
-    Points::of(&PointCloud2::new(&golden(name)).unwrap()).unwrap()
+    Points::from_cloud(&PointCloud2::new(&golden(name)).unwrap()).unwrap()
 }
 
 #[test]
-fn seconds_after_the_stamp_are_velodynes() {
+fn a_cloud_of_the_velodyne_driver_is_read() {
     let read = points("velodyne");
     assert_eq!((read.x, read.y, read.z), (vec![10.0, 12.0], vec![0.0, 1.0], vec![-2.0, 2.0]));
     assert_eq!((read.intensity, read.ring), (vec![0.2, 1.0], vec![0, 15]));
@@ -20,7 +20,7 @@ fn seconds_after_the_stamp_are_velodynes() {
 }
 
 #[test]
-fn padded_rows_nanoseconds_rings_from_the_top_and_zeros_for_no_return_are_ousters() {
+fn a_cloud_of_the_ouster_driver_is_read() {
     let read = points("ouster");
     assert_eq!((read.x, read.z), (vec![5.0, 5.0, 6.0], vec![1.0, -1.0, -1.0]));
     assert_eq!((read.ring, read.intensity), (vec![63, 0, 0], vec![0.5, 0.25, 1.0]));
@@ -29,7 +29,7 @@ fn padded_rows_nanoseconds_rings_from_the_top_and_zeros_for_no_return_are_ouster
 }
 
 #[test]
-fn seconds_since_the_epoch_are_hesais_and_big_endian_is_read() {
+fn a_big_endian_cloud_of_the_hesai_driver_is_read() {
     let read = points("hesai_big_endian");
     assert_eq!((read.x, read.y, read.z), (vec![1.0, 3.0], vec![2.0, 2.0], vec![3.0, -1.0]));
     assert_eq!((read.stamp_ns, read.offset_ns), (STAMP_NS + 125_000_000, vec![-125_000_000, 0]));
@@ -37,7 +37,7 @@ fn seconds_since_the_epoch_are_hesais_and_big_endian_is_read() {
 }
 
 #[test]
-fn nanoseconds_since_the_epoch_are_livoxs_and_double_positions_are_read() {
+fn a_cloud_of_the_livox_driver_is_read() {
     let read = points("livox");
     assert_eq!((read.x, read.z, read.ring), (vec![1.0, 3.0], vec![3.0, 1.0], vec![1, 0]));
     // A double holds ns since the epoch in steps of 256.
@@ -46,14 +46,14 @@ fn nanoseconds_since_the_epoch_are_livoxs_and_double_positions_are_read() {
 }
 
 #[test]
-fn byte_intensities_and_channels_are_nebulas() {
+fn a_cloud_of_the_nebula_driver_is_read() {
     let read = points("nebula");
     assert_eq!((read.intensity, read.ring), (vec![0.2, 1.0], vec![0, 127]));
     assert_eq!((read.stamp_ns, read.offset_ns), (STAMP_NS + 99_000_000, vec![-99_000_000, 0]));
 }
 
 #[test]
-fn a_cloud_is_written_as_rosbags_writes_it() {
+fn a_cloud_is_written_as_by_rosbags() {
     for name in ["velodyne", "ouster", "livox", "nebula"] {
         let bytes = golden(name);
         assert_eq!(PointCloud2::new(&bytes).unwrap().to_cdr(), bytes, "{name}");
@@ -66,7 +66,7 @@ fn golden_pose() -> Isometry3<f64> {
 }
 
 #[test]
-fn poses_are_read_with_their_frames_and_speeds() {
+fn poses_have_their_frames_and_speeds() {
     let bytes = golden("odometry");
     let odometry = Odometry::new(&bytes).unwrap();
     assert_eq!((odometry.linear_mps, odometry.angular_rps), ([15.0, 0.5, 0.0], [0.0, 0.0, 0.25]));
@@ -88,7 +88,7 @@ fn poses_are_read_with_their_frames_and_speeds() {
 }
 
 #[test]
-fn packets_are_read_with_their_stamps() {
+fn packets_have_their_stamps() {
     let bytes = golden("velodyne_scan");
     let scan = VelodyneScan::new(&bytes).unwrap();
     assert_eq!((scan.header.stamp_ns, scan.header.frame_id, scan.count), (STAMP_NS, "velodyne", 3));

@@ -1,4 +1,4 @@
-//! Damaged and malicious messages are refused by name; the fuzzer's corpus is replayed.
+//! Damaged and malicious messages are refused with the member that is wrong; the corpus of the fuzzer is replayed.
 
 use clearway_ros::cdr::{Header, Writer};
 use clearway_ros::point_cloud2::Field;
@@ -38,7 +38,7 @@ fn a_message_cut_anywhere_is_refused_as_truncated() {
     }
 }
 
-/// A cloud of two points with these fields, and what is said of it.
+/// The error text, or the number of points, of a cloud of two points after a change.
 fn refused(change: impl FnOnce(&mut PointCloud2)) -> String {
     let field = |(index, name): (usize, &'static str)| Field { name, offset: 4 * index as u32, datatype: 7, count: 1 };
     let fields = ["x", "y", "z", "intensity", "time", "ring"].into_iter().enumerate().map(field).collect();
@@ -59,14 +59,14 @@ fn refused(change: impl FnOnce(&mut PointCloud2)) -> String {
     cloud.fields[5].datatype = 6;
     change(&mut cloud);
     let bytes = cloud.to_cdr();
-    let read = PointCloud2::new(&bytes).and_then(|cloud| Points::of(&cloud));
+    let read = PointCloud2::new(&bytes).and_then(|cloud| Points::from_cloud(&cloud));
     read.map_or_else(|error| error.to_string(), |points| format!("{} points", points.x.len()))
 }
 
 #[test]
-fn wrong_layouts_are_refused_by_name_with_what_is_allowed() {
+fn wrong_layouts_are_refused_with_what_is_allowed() {
     let claim = |claimed: u32| move |cloud: &mut PointCloud2| cloud.width = claimed;
-    let says = [
+    let cases = [
         (refused(|_| {}), "2 points"),
         (refused(claim(0)), "0 points"),
         (refused(claim(u32::MAX)), "row_step = 48: allowed: at least width times point_step"),
@@ -101,13 +101,13 @@ fn wrong_layouts_are_refused_by_name_with_what_is_allowed() {
         ),
         (refused(|c| c.fields.extend(vec![c.fields[0]; 251])), "fields = 257: allowed: up to 256 fields"),
     ];
-    for (said, expected) in says {
-        assert!(said.starts_with(expected), "{said:?} does not start with {expected:?}");
+    for (text, expected) in cases {
+        assert!(text.starts_with(expected), "{text:?} does not start with {expected:?}");
     }
 }
 
 #[test]
-fn texts_encapsulations_stamps_and_rotations_that_are_none_are_refused_by_name() {
+fn invalid_texts_encapsulations_stamps_and_rotations_are_refused() {
     let message = |frame: &[u8]| {
         let mut writer = Writer::default();
         writer.stamp(1).u32(frame.len() as u32).bytes(frame);
@@ -125,7 +125,7 @@ fn texts_encapsulations_stamps_and_rotations_that_are_none_are_refused_by_name()
     let mut other = golden("pose_stamped");
     other[1] = 7;
     assert_eq!(pose_stamped(&other), Err(MessageError::Encapsulation { found: [0, 7] }));
-    for (value, said) in [
+    for (value, expected) in [
         (0.0_f64, "pose = quaternion 0 0 0 0: allowed: a unit quaternion"),
         (f64::NAN, "pose = quaternion NaN NaN NaN NaN"),
     ] {
@@ -133,7 +133,7 @@ fn texts_encapsulations_stamps_and_rotations_that_are_none_are_refused_by_name()
         let at = bytes.len() - 32;
         bytes[at..].copy_from_slice(&value.to_le_bytes().repeat(4));
         let shown = pose_stamped(&bytes).unwrap_err().to_string();
-        assert!(shown.starts_with(said), "{shown}");
+        assert!(shown.starts_with(expected), "{shown}");
     }
     let mut greedy = Writer::default();
     greedy.u32(u32::MAX);
@@ -142,7 +142,7 @@ fn texts_encapsulations_stamps_and_rotations_that_are_none_are_refused_by_name()
 
 proptest! {
     #[test]
-    fn a_damaged_message_never_panics_nor_gives_more_than_it_holds(
+    fn a_damaged_message_never_panics(
         name in proptest::sample::select(NAMES.to_vec()),
         damage in proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..8),
         end in any::<prop::sample::Index>(),
@@ -160,7 +160,7 @@ proptest! {
 }
 
 #[test]
-fn every_seed_is_taken_without_a_panic() {
+fn no_seed_of_the_corpus_causes_a_panic() {
     let corpus: std::path::PathBuf = [env!("CARGO_MANIFEST_DIR"), "fuzz", "corpus", "message"].iter().collect();
     if std::env::var_os("CLEARWAY_BLESS").is_some() {
         std::fs::create_dir_all(&corpus).unwrap();

@@ -23,7 +23,7 @@ pub fn message(frame_id: &str, packets: &[(i32, u32, Vec<u8>)]) -> Vec<u8> {
 }
 
 #[test]
-fn packets_come_out_as_they_went_in() {
+fn packets_decode_to_themselves() {
     for frame_id in ["", "v", "velodyne", "velodyne_top"] {
         let sent: Vec<_> = (0..3).map(|i| (100 + i, 7 * i as u32, vec![i as u8; 1206])).collect();
         let bytes = message(frame_id, &sent);
@@ -38,7 +38,7 @@ fn packets_come_out_as_they_went_in() {
 }
 
 #[test]
-fn a_claimed_length_that_the_message_has_not_is_refused() {
+fn a_claimed_length_beyond_the_message_is_refused() {
     let bytes = message("velodyne", &[(1, 2, vec![3; 1206])]);
     for end in 0..bytes.len() {
         let shown = VelodyneScan::new(&bytes[..end]).unwrap_err();

@@ -2,9 +2,9 @@
 //!
 //! In: one [`Event`] after the other. Out: an [`Outcome`] each, and the inputs of fusion and layers.
 
+use clearway_lidar::SensorStatus;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::SensorStatus;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 
 use crate::config::sensor::SensorConfig;

@@ -4,9 +4,9 @@
 //! [`Pipeline::step`]: event -> [`Inputs`] -> the newest scan of one sensor -> [`Fusion`] -> the map's [`Sweep`] -> one
 //! layer a map -> [`Map`].
 
+use clearway_lidar::SensorStatus;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
-use clearway_lidar::SensorStatus;
 
 use crate::config::{ConfigValueError, MapsConfig, VehicleConfig};
 use crate::error::EventError;

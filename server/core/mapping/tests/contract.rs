@@ -4,7 +4,7 @@ mod common;
 
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{
-    DrivabilityConfig, Variant, HeightDifferenceConfig, OccupancyConfig, SafePathConfig, SpeedConfig, TerrainConfig,
+    DrivabilityConfig, HeightDifferenceConfig, OccupancyConfig, SafePathConfig, SpeedConfig, TerrainConfig, Variant,
 };
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::height_difference::HeightDifference;

@@ -4,10 +4,10 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use clearway_lidar::Sensor;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_lidar::revolution::{Echo, Revolution};
-use clearway_lidar::Sensor;
 use clearway_mapping::config::{Extrinsics, MapsConfig, SENSORS_MAX, SensorConfig};
 use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::sensor::mount::estimate;
@@ -17,8 +17,8 @@ use super::clouds::{Clouds, Written};
 use super::options::{Options, ReplayError};
 use super::summary::{Mount, describe};
 use crate::config::{Calibrations, Config, Recorder};
-use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::files::mcap::{McapError, McapOptions};
+use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
 use crate::ingest::ros::decoder::PoseSource;
 use crate::record::reader::RecordingReader;
@@ -95,7 +95,12 @@ struct Known {
 impl Known {
     /// Configures the sensors of a ROS bag and puts their topics into `wanted`. Returns the mount of the first sensor if
     /// tf has it.
-    fn apply_bag(&mut self, bag: &Path, wanted: &mut McapOptions, is_given: bool) -> Result<Option<Mount>, ReplayError> {
+    fn apply_bag(
+        &mut self,
+        bag: &Path,
+        wanted: &mut McapOptions,
+        is_given: bool,
+    ) -> Result<Option<Mount>, ReplayError> {
         let mut choice = choice(bag, wanted)?;
         keep_placed(&mut choice.sensors, is_given);
         // With names, the same topics are chosen again when the bag is read.
@@ -178,7 +183,16 @@ impl Known {
         if !remarks.is_empty() {
             notes.insert("mount".to_owned(), remarks.join("\n"));
         }
-        Ok(Setup { config, calibrations, certificates, boot_id, from_files: true, config_comments: remarks, metadata: notes, observer: None })
+        Ok(Setup {
+            config,
+            calibrations,
+            certificates,
+            boot_id,
+            from_files: true,
+            config_comments: remarks,
+            metadata: notes,
+            observer: None,
+        })
     }
 }
 

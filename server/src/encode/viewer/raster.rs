@@ -227,7 +227,8 @@ mod tests {
         use clearway_mapping::layer::safe_path::class::SafePathClass;
         use clearway_mapping::layer::speed::class::SpeedClass;
         use clearway_mapping::layer::terrain::class::TerrainClass;
-        let of = |legend: &[ClassInfo]| legend.iter().map(|class| occupancy(meaning(class.meaning))).collect::<Vec<_>>();
+        let of =
+            |legend: &[ClassInfo]| legend.iter().map(|class| occupancy(meaning(class.meaning))).collect::<Vec<_>>();
         assert_eq!(of(DrivabilityClass::LEGEND), [-1, 0, 100, 100]);
         assert_eq!(of(HeightDifferenceClass::LEGEND), [-1, 0, 100]);
         assert_eq!(of(TerrainClass::LEGEND), [-1, 0, -1, 100, 100, 100]);

@@ -112,9 +112,9 @@ impl AvailableTopics {
         match kind {
             Kind::TfMessage => {
                 for transform in tf_message(bytes).unwrap_or_default() {
-                    self.frames.take(&transform);
+                    self.frames.insert(&transform);
                     if are_static {
-                        self.latched.take(&transform);
+                        self.latched.insert(&transform);
                     }
                 }
             }
@@ -152,7 +152,7 @@ impl AvailableTopics {
             }
         }
         let kind = |topic: &String| self.topics[topic].kind;
-        let ego_frame = EGO_FRAMES.into_iter().find(|frame| self.frames.knows(frame)).unwrap_or("base_link");
+        let ego_frame = EGO_FRAMES.into_iter().find(|frame| self.frames.contains(frame)).unwrap_or("base_link");
         let mut sensors: Vec<&String> = requested.iter().filter(|topic| kind(topic).is_sensor()).collect();
         if sensors.is_empty() {
             sensors = self.best_sensors(ego_frame);

@@ -124,7 +124,7 @@ impl TopicDecoder {
         } else if let Some(&source) = self.sensors.get(topic) {
             match kind {
                 Kind::PointCloud2 => {
-                    let scan = scan(Points::of(&PointCloud2::new(bytes)?)?);
+                    let scan = scan(Points::from_cloud(&PointCloud2::new(bytes)?)?);
                     readings.push_back(Reading { arrival_ns, source, body: Body::Scan(scan) });
                 }
                 Kind::VelodyneScan => {
@@ -186,7 +186,7 @@ impl TopicDecoder {
     ) -> Result<Option<EgoPose>, RosMessageError> {
         let mut stamp_ns = None;
         for transform in transforms {
-            if !self.frames.take(transform) {
+            if !self.frames.insert(transform) {
                 return Err(RosMessageError::Frames { frame: transform.child_frame_id.to_owned() });
             }
             let steps = self.frames.steps_up(&self.ego_frame, transform.child_frame_id);

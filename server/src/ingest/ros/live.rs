@@ -106,7 +106,7 @@ impl SampleReceiver {
         let lost = sample.attachment().map_or(0, |attachment| self.lost_before(&attachment.to_bytes()));
         self.queue.record_drop(self.decoder.source(topic), Cause::Queue, lost);
         let name = sample.key_expr().as_str().rsplit('/').nth(1).unwrap_or_default();
-        let Some(kind) = Kind::of(name) else {
+        let Some(kind) = Kind::from_name(name) else {
             tracing::info!(topic, name, "ros: a type that is not decoded");
             return self.record_refusal(topic, "ros_type");
         };

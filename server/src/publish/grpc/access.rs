@@ -18,8 +18,8 @@ use tower_service::Service;
 use x509_parser::extensions::GeneralName;
 use x509_parser::prelude::{FromDer, X509Certificate};
 
-use crate::publish::connections::Admission;
 use crate::config;
+use crate::publish::connections::Admission;
 
 /// Role of a client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

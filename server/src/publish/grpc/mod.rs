@@ -22,8 +22,8 @@ use super::served::Vehicles;
 use access::{Access, Guard};
 use reader::watch;
 
-use crate::config::{self, Certificates};
 use crate::clock::now_ns;
+use crate::config::{self, Certificates};
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
 use v1::map_service_server::{MapService, MapServiceServer};
@@ -125,7 +125,10 @@ pub async fn serve<I: IngestService>(
         .add_service(reflection().build_v1()?)
         // Older versions of grpcurl know only this version.
         .add_service(reflection().build_v1alpha()?)
-        .serve_with_incoming_shutdown(Connections::new(listener, connections_max).with_errors_over_limit().stream(), stop)
+        .serve_with_incoming_shutdown(
+            Connections::new(listener, connections_max).with_errors_over_limit().stream(),
+            stop,
+        )
         .await?;
     Ok(())
 }
@@ -160,7 +163,9 @@ impl MapService for Maps {
             return Err(Status::unavailable(format!("vehicle {name} has no map yet")));
         }
         let newest = served.status.subscriptions.subscribe(&layers).newest_map(&served.newest).await;
-        let map = newest.ok_or_else(|| Status::unavailable(format!("vehicle {name} makes no map at present: no data arrived since the request")))?;
+        let map = newest.ok_or_else(|| {
+            Status::unavailable(format!("vehicle {name} makes no map at present: no data arrived since the request"))
+        })?;
         Ok(Response::new(v1::MapUpdate { map: map.select(&layers), skipped: 0, sent_ns: now_ns(), left_out: 0 }))
     }
 

@@ -12,12 +12,12 @@ use tokio::sync::watch;
 use tonic::Status;
 
 use super::selection::{Selection, Sent};
-use crate::publish::served::{Served, Vehicles};
-use crate::subscriptions::LayerSubscription;
-use crate::newest::Newest;
 use crate::clock::now_ns;
-use crate::status::Reader;
 use crate::encode::EncodedMap;
+use crate::newest::Newest;
+use crate::publish::served::{Served, Vehicles};
+use crate::status::Reader;
+use crate::subscriptions::LayerSubscription;
 
 /// The updates of one reader: the selected parts of the newest maps, within its credits. Any executor can drive the
 /// stream.

@@ -16,8 +16,8 @@
 
 use std::collections::VecDeque;
 
-use clearway_lidar::revolution::Revolution;
 use clearway_lidar::nmea::Gprmc;
+use clearway_lidar::revolution::Revolution;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
 use crate::config::motion::MotionConfig;
@@ -130,7 +130,7 @@ impl Motion {
 
     /// Sets the newest speed to the speed over ground of a GPRMC sentence, if the receiver marks it as valid.
     /// `stamp_ns` is the end of the newest scan of the same sensor; `None` before its first. The speed has no sign: a
-    /// vehicle that drives backwards for long switches `speed_age_ms` off or sends poses.
+    /// vehicle that often drives backwards sends poses, or sets `speed_age_ms` to 0.
     pub fn apply_gprmc(&mut self, gprmc: &Gprmc, stamp_ns: Option<i64>) {
         let is_repeated = self.measured.is_some_and(|before| before.utc_ns.is_some() && before.utc_ns == gprmc.utc_ns);
         if let (true, false, Some(speed_mps)) = (gprmc.valid, is_repeated, gprmc.speed_mps()) {

@@ -1,18 +1,19 @@
 //! Contact of a vehicle with the world: its upright box against every shape, exactly.
 //!
-//! In: a world, a time, the vehicle's place. Frame: world, metres. Leaves and beams count as far down as they hang.
+//! In: a world, a time, the vehicle's place. Frame: world, metres. Leaves and beams are touched only at the heights at
+//! which they hang.
 
-use crate::object::{Kind, Shape};
-use crate::world::World;
+use super::object::{Kind, Shape};
+use super::world::World;
 
 /// A vehicle's box: its middle, heading (rad, counter-clockwise from x) and extents. It stands on the ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hull {
-    /// Middle.
+    /// Coordinate x of the middle, in metres.
     pub x: f64,
-    /// Middle.
+    /// Coordinate y of the middle, in metres.
     pub y: f64,
-    /// Counter-clockwise from x.
+    /// Heading, in rad, counter-clockwise from x.
     pub heading: f64,
     /// Length, width and height.
     pub size: [f64; 3],
@@ -74,10 +75,10 @@ fn heights(shape: &Shape) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ground::Ground;
+    use crate::scene::ground::Ground;
 
     #[test]
-    fn a_vehicle_touches_what_stands_in_its_way_and_passes_under_what_hangs_high() {
+    fn a_vehicle_touches_standing_objects_and_passes_under_high_ones() {
         let world = World::on(Ground::default())
             .parked_car(10.0, 0.0, 0.0)
             .pole(0.0, 5.0, 0.1, 4.0)

@@ -59,7 +59,7 @@ impl Course {
         self
     }
 
-    /// Length, metres.
+    /// Length of the course, in metres.
     pub fn length(&self) -> f64 {
         self.length
     }

@@ -6,8 +6,8 @@
 
 use nalgebra::{Isometry3, Point3};
 
-use crate::object::Shape;
-use crate::world::World;
+use super::object::Shape;
+use super::world::World;
 
 /// Class of a place, for a vehicle that stands in the middle of the raster.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -55,7 +55,7 @@ pub struct TruthGrid {
     pub half_extent_m: f64,
     /// Side of a cell, metres.
     pub cell_m: f64,
-    /// Cells a side.
+    /// Number of cells of a side.
     pub side: usize,
     /// Row by row: cell (i, j) at index `j * side + i` has its middle at x = (i + 0.5) * cell_m - half_extent_m, y
     /// alike.
@@ -300,7 +300,7 @@ fn envelope(values: &[f64]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ground::{Ground, Profile, Terrace};
+    use crate::scene::ground::{Ground, Profile, Terrace};
 
     const EXTENT: (f64, f64) = (20.0, 0.2);
 
@@ -308,13 +308,13 @@ mod tests {
         TruthGrid::about(world, &Isometry3::identity(), 0.0, EXTENT, &Limits::default())
     }
 
-    /// A fence right round the vehicle, 12 m to each side, with a gate of this width ahead.
+    /// A fence right round the vehicle, 12 m to each side, with an opening of this width ahead.
     fn ring_with_gate(width: f64) -> World {
         let (side, gate) = (12.0, width / 2.0);
         World::on(Ground::default()).fence(
             &[[side, gate], [side, side], [-side, side], [-side, -side], [side, -side], [side, -gate]],
             1.5,
-            Some(crate::world::SLATS),
+            Some(crate::scene::world::SLATS),
         )
     }
 

@@ -6,8 +6,8 @@
 use std::f64::consts::{PI, TAU};
 use std::ops::Deref;
 
-use crate::object::{Kind, Shape};
-use crate::world::World;
+use crate::scene::object::{Kind, Shape};
+use crate::scene::world::World;
 
 /// Sectors about the sensor.
 const SECTORS: usize = 720;
@@ -111,12 +111,12 @@ impl<W: Deref<Target = World>> Caster<W> {
         self.cast_through(origin, direction, Some(draw))
     }
 
-    /// The same, leaves left out: what a beam's remainder meets after them.
+    /// The same without leaves: the point that the rest of a ray meets behind them.
     pub fn cast_behind_leaves(&self, origin: [f64; 3], direction: [f64; 3]) -> Option<Hit> {
         self.cast_through(origin, direction, None)
     }
 
-    /// Whether the ground at (x, y) can be seen from `origin` (metres, world); leaves do not hide it.
+    /// True if the ground at (x, y) is visible from `origin` (metres, world frame). Leaves do not hide it.
     pub fn sees_ground(&self, origin: [f64; 3], x: f64, y: f64) -> bool {
         const TOLERANCE_M: f64 = 0.05;
         let way = [x - origin[0], y - origin[1], self.world.ground.height(x, y) - origin[2]];
@@ -182,7 +182,7 @@ fn distance(from: [f64; 2], shape: &Shape) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scenes;
+    use crate::scene::scenes;
 
     #[test]
     fn sectors_change_nothing_but_the_time() {
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn ground_behind_a_house_is_not_seen_and_ground_before_it_is() {
+    fn ground_behind_a_building_is_not_visible() {
         let world = World::default().building(10.0, 0.0, 0.0, [4.0, 8.0], 5.0).canopy(0.0, 10.0, 3.0, 1.0);
         let (caster, eye) = (Caster::new(&world, [0.0, 0.0, 1.9], 0.0, 120.0), [0.0, 0.0, 1.9]);
         assert!(caster.sees_ground(eye, 7.5, 0.0));

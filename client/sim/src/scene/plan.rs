@@ -3,7 +3,7 @@
 //! In: a truth raster. Out: lines of characters, the vehicle's x up the page and its y to the left, as on a map that is
 //! held in driving direction.
 
-use crate::truth::{Truth, TruthGrid};
+use super::truth::{Truth, TruthGrid};
 
 /// Draws `ahead` metres to the front and back and `beside` metres to either side, `rows` by `columns` characters.
 ///

@@ -1,21 +1,21 @@
 //! The scenes: the four of the UT Austin thesis (section V, figures 5 to 8), a dirt track, and a town without end.
 //!
-//! Each is a [`World`] and the [`Drive`] of the vehicle in it. In the scenes of the thesis the vehicle stands at the
-//! world's origin and faces along x.
+//! Each is a [`World`] and the [`Drive`] of the vehicle in it. In the scenes of the UT Austin thesis the vehicle stands
+//! at the world's origin and faces along x.
 
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::sync::Arc;
 
-use crate::course::{Course, Drive};
-use crate::ground::{Ground, Profile, Terrace};
-use crate::world::{SLATS, World};
+use super::course::{Course, Drive};
+use super::ground::{Ground, Profile, Terrace};
+use super::world::{SLATS, World};
 
 /// A world, and the drive of a vehicle through it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
     /// Name of the scene.
     pub name: &'static str,
-    /// Ground and objects.
+    /// A world: its ground and objects.
     pub world: Arc<World>,
     /// Drive of the vehicle.
     pub drive: Drive,
@@ -106,7 +106,7 @@ fn fenced_road() -> World {
     let line = |left: f64, from: i32, to: i32| -> Vec<[f64; 2]> {
         (from..=to).map(|step| on_the_bend(4.0 * f64::from(step), left)).collect()
     };
-    // Slats on the left; on the right a wall that gives way to slats.
+    // There are slats on the left; on the right, a wall is followed by slats.
     let mut world = World::on(Ground { reflectivity: ASPHALT, ..Ground::default() })
         .fence(&line(ROAD_HALF_M, BEHIND, 17), 1.4, Some(SLATS))
         .wall(&line(-ROAD_HALF_M, BEHIND, 4), 2.0)
@@ -134,7 +134,7 @@ fn fenced_road() -> World {
     )
 }
 
-/// Where the fenced road ends behind the vehicle, in steps of 4 m.
+/// End of the fenced road behind the vehicle, in steps of 4 m.
 const BEHIND: i32 = -2;
 
 /// Half the width of the dirt track, metres.

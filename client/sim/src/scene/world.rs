@@ -1,26 +1,26 @@
-//! A world: the ground and what stands, hangs or drives over it, described object by object.
+//! A world: the ground, and the objects that stand, hang or drive over it.
 //!
 //! Frame: world ("map"), x east, y north, z up, metres; time in seconds from the scene's beginning. Feet of objects
 //! follow the ground.
 
-use crate::course::Drive;
-use crate::ground::Ground;
-use crate::object::{Kind, Object, Shape};
+use super::course::Drive;
+use super::ground::Ground;
+use super::object::{Kind, Object, Shape};
 
-/// Ground and objects.
+/// A world: its ground and objects.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct World {
-    /// Ground.
+    /// Ground of the world.
     pub ground: Ground,
     /// Objects on the ground.
     pub objects: Vec<Object>,
 }
 
-/// Distance from slat to slat and the width of a slat of an open fence, metres.
+/// Distance from slat to slat, and width of a slat, of an open fence, in metres.
 pub const SLATS: (f64, f64) = (0.15, 0.09);
 
 impl World {
-    /// Bare ground.
+    /// A world without objects.
     pub fn on(ground: Ground) -> Self {
         Self { ground, objects: Vec::new() }
     }
@@ -77,7 +77,7 @@ impl World {
         self
     }
 
-    /// A pole.
+    /// An upright pole.
     pub fn pole(self, x: f64, y: f64, radius: f64, height: f64) -> Self {
         let base = self.ground.height(x, y);
         self.with(Kind::Pole, 120, Shape::Post { x, y, radius, z: (base - 0.5, base + height) })
@@ -90,7 +90,8 @@ impl World {
         self.with(Kind::Trunk, 50, trunk).canopy(x, y, radius, underside)
     }
 
-    /// Leaves alone: a flattened ball of `radius` about (x, y), cut off level `underside` metres over the ground.
+    /// Leaves without a trunk: a flattened ball of `radius` around (x, y), whose level underside is `underside` metres
+    /// over the ground.
     pub fn canopy(self, x: f64, y: f64, radius: f64, underside: f64) -> Self {
         let rise = 0.7 * radius;
         let underside = self.ground.height(x, y) + underside;
@@ -98,7 +99,7 @@ impl World {
         self.with(Kind::Leaves, 70, shape)
     }
 
-    /// A beam from place to place, 0.4 m wide, its underside `underside` and its top `top` metres over the ground.
+    /// A horizontal beam between two places, 0.4 m wide, from `underside` to `top` metres over the ground.
     pub fn beam(self, from: [f64; 2], to: [f64; 2], underside: f64, top: f64) -> Self {
         let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
         let (x, y) = (from[0] + dx / 2.0, from[1] + dy / 2.0);
@@ -125,7 +126,7 @@ impl World {
         self
     }
 
-    /// A car that drives.
+    /// A car that follows a drive.
     pub fn moving_car(mut self, drive: Drive) -> Self {
         for (ahead, half, z) in car() {
             let shape = Shape::Block { x: ahead, y: 0.0, facing: (1.0, 0.0), half, z };
@@ -140,7 +141,7 @@ impl World {
     }
 }
 
-/// A saloon of 4.4 m by 1.8 m: body and cabin, each its place ahead of the middle, half extents, bottom and top.
+/// A car of 4.4 m by 1.8 m, as body and cabin: distance ahead of the middle, half extents, bottom and top, in metres.
 fn car() -> [(f64, [f64; 2], (f64, f64)); 2] {
     [(0.0, [2.2, 0.9], (0.18, 0.85)), (-0.25, [1.15, 0.78], (0.85, 1.45))]
 }

@@ -5,9 +5,9 @@
 
 use nalgebra::{Isometry3, Point3, Vector3};
 
+use super::raycast::Caster;
 use crate::noise::{gaussian, mixed, uniform};
-use crate::raycast::Caster;
-use crate::scenes::Scene;
+use crate::scene::scenes::Scene;
 
 /// Least range that returns, metres.
 const RANGE_M_MIN: f64 = 0.3;

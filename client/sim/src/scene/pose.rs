@@ -4,7 +4,7 @@
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
-use crate::scenes::Scene;
+use super::scenes::Scene;
 
 /// Half the distances between the axles and between the wheels of an axle, metres: a mid-size car's.
 const WHEELS_M: [f64; 2] = [1.4, 0.8];
@@ -32,9 +32,9 @@ impl Scene {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::course::{Course, Drive};
-    use crate::ground::{Ground, Profile};
-    use crate::world::World;
+    use crate::scene::course::{Course, Drive};
+    use crate::scene::ground::{Ground, Profile};
+    use crate::scene::world::World;
 
     #[test]
     fn a_vehicle_on_a_slope_leans_with_it() {

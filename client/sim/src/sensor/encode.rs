@@ -8,7 +8,7 @@ use clearway_lidar::calibration::status_table::status_bytes;
 use clearway_lidar::model::{Model, ModelSpec, RETURNS_PER_BLOCK, ReturnMode, S1_FLAGS};
 use clearway_lidar::packet::{BLOCK_LENGTH, PACKET_LENGTH};
 
-use crate::telemetry::{civil_time, device_us};
+use super::telemetry::{civil_time, device_us};
 
 /// One echo as the packet holds it; distance 0 means no return.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -63,8 +63,8 @@ impl Fix {
             (if self.latitude_deg < 0.0 { 'S' } else { 'N' }, if self.longitude_deg < 0.0 { 'W' } else { 'E' });
         let knots = self.speed_mps * 3600.0 / 1852.0;
         let body = format!(
-            "GPRMC,{hour:02}{minute:02}{second:02},A,{lat:02}{lat_minute:07.4},{north},{lon:03}{lon_minute:07.4},{east},\
-             {knots:05.1},{:05.1},{day:02}{month:02}{:02},000.0,E,A",
+            "GPRMC,{hour:02}{minute:02}{second:02},A,{lat:02}{lat_minute:07.4},{north},{lon:03}{lon_minute:07.4},\
+             {east},{knots:05.1},{:05.1},{day:02}{month:02}{:02},000.0,E,A",
             self.course_deg,
             year % 100,
         );

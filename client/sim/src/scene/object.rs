@@ -2,18 +2,18 @@
 //!
 //! In: a ray in the world frame (metres, direction of length 1). Out: the distance at which it meets the shape.
 
-use crate::course::Drive;
-use crate::ground::{Ground, disc, slab};
+use super::course::Drive;
+use super::ground::{Ground, disc, slab};
 use crate::noise::mixed;
 
 /// Kind of an object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Kind {
-    /// A building or another solid block.
+    /// A building, or another solid block.
     Building,
     /// A free-standing wall.
     Wall,
-    /// A parked car.
+    /// A car that is parked.
     ParkedCar,
     /// A car that drives.
     MovingCar,
@@ -21,77 +21,78 @@ pub enum Kind {
     Fence,
     /// A pole.
     Pole,
-    /// A tree's trunk.
+    /// The trunk of a tree.
     Trunk,
-    /// A tree's leaves.
+    /// The leaves of a tree.
     Leaves,
     /// A beam over the road.
     Beam,
 }
 
-/// A shape in the world frame, metres.
+/// A shape in the world frame, in metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Shape {
     /// An upright box.
     Block {
-        /// Centre.
+        /// Coordinate x of the centre.
         x: f64,
-        /// Centre.
+        /// Coordinate y of the centre.
         y: f64,
         /// Cosine and sine of the heading.
         facing: (f64, f64),
         /// Half extents along and across the heading.
         half: [f64; 2],
-        /// Bottom and top.
+        /// Heights of bottom and top.
         z: (f64, f64),
     },
     /// A thin upright panel between two places; a ray passes between its slats.
     Panel {
-        /// One foot.
+        /// Place (x, y) of one end.
         from: [f64; 2],
-        /// Direction to the other foot, length 1.
+        /// Direction to the other end, as a vector of length 1.
         along: [f64; 2],
-        /// Length.
+        /// Length of the panel.
         length: f64,
-        /// Height of the lower edge at the first foot, and its rise a metre.
+        /// Height of the lower edge at the first end, and its slope.
         base: (f64, f64),
-        /// Height over the lower edge.
+        /// Height of the upper edge over the lower edge.
         height: f64,
-        /// Distance from slat to slat, and the width of one; equal for a closed panel.
+        /// Distance from slat to slat, and width of a slat. They are equal for a closed panel.
         slats: (f64, f64),
     },
     /// An upright cylinder.
     Post {
-        /// Axis.
+        /// Coordinate x of the axis.
         x: f64,
-        /// Axis.
+        /// Coordinate y of the axis.
         y: f64,
-        /// Radius.
+        /// Radius of the cylinder.
         radius: f64,
-        /// Bottom and top.
+        /// Heights of bottom and top.
         z: (f64, f64),
     },
-    /// An upright ellipsoid of leaves, cut off level below; a ray is stopped somewhere inside, or passes.
+    /// An upright ellipsoid of leaves with a level underside. A leaf stops the ray at a random place inside, or none
+    /// does.
     Crown {
-        /// Centre.
+        /// Coordinate x of the centre.
         x: f64,
-        /// Centre.
+        /// Coordinate y of the centre.
         y: f64,
-        /// Centre.
+        /// Coordinate z of the centre.
         z: f64,
         /// Horizontal radius.
         radius: f64,
         /// Vertical radius.
         rise: f64,
-        /// No leaf is lower.
+        /// Height of the underside.
         underside: f64,
-        /// Leaves met a metre of way, on average.
+        /// Mean number of leaves that a ray meets per metre.
         density: f64,
     },
 }
 
 impl Shape {
-    /// Distance at which the ray meets the shape; `draw` decides where leaves stop it.
+    /// Distance at which the ray meets the shape. `draw`, a random number, decides where leaves stop it.
     pub fn meets(&self, origin: [f64; 3], direction: [f64; 3], draw: u64) -> Option<f64> {
         match *self {
             Shape::Block { x, y, facing: (cos, sin), half, z } => {
@@ -141,7 +142,7 @@ impl Shape {
         }
     }
 
-    /// Bottom and top over (x, y), grown sideways by `margin`; `None` beside the shape.
+    /// Heights of bottom and top at (x, y) of the shape, widened by `margin` on all sides; `None` beside the shape.
     pub fn column(&self, x: f64, y: f64, margin: f64) -> Option<(f64, f64)> {
         match *self {
             Shape::Block { x: cx, y: cy, facing: (cos, sin), half, z } => {
@@ -165,7 +166,8 @@ impl Shape {
         }
     }
 
-    /// Corners of the footprint, and a radius: every part of it lies between the corners, or within the radius of one.
+    /// Corners of the footprint, and a radius. Every part of the footprint is between the corners or within the radius
+    /// of a corner.
     pub(crate) fn outline(&self) -> ([[f64; 2]; 4], f64) {
         match *self {
             Shape::Block { x, y, facing: (cos, sin), half: [l, w], .. } => {
@@ -181,7 +183,7 @@ impl Shape {
     }
 }
 
-/// The part of a stretch of a ray that lies between two heights.
+/// The part of an interval of a ray that is between two heights.
 fn within((from, to): (f64, f64), height: f64, climb: f64, z: (f64, f64)) -> Option<(f64, f64)> {
     if climb.abs() < 1e-12 {
         return (height >= z.0 && height <= z.1).then_some((from, to));
@@ -191,27 +193,27 @@ fn within((from, to): (f64, f64), height: f64, climb: f64, z: (f64, f64)) -> Opt
     (from < to).then_some((from, to))
 }
 
-/// A ray enters a solid in front of it; one that begins inside sees nothing of it.
+/// Distance at which a ray enters a solid; `None` if the ray begins inside it.
 fn entry(from: f64, to: f64) -> Option<f64> {
     (from > 0.0 && to > from).then_some(from)
 }
 
-/// One thing of the world.
+/// One object of the world.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Object {
-    /// What it is.
+    /// Kind of the object.
     pub kind: Kind,
-    /// Its shape: in the world frame, or for one that drives in the driver's frame (x forward, y left, z over the
-    /// ground).
+    /// Shape of the object, in the world frame. That of a driving object is in its own frame (x forward, y left, z over
+    /// the ground).
     pub shape: Shape,
-    /// What a return from it weighs, 0 to 255.
+    /// Reflectivity, 0 to 255.
     pub reflectivity: u8,
-    /// How it drives; `None` stands.
+    /// Drive of the object; `None` if it stands.
     pub drive: Option<Drive>,
 }
 
 impl Object {
-    /// Its shape in the world frame at `time` s.
+    /// Shape in the world frame at `time` s.
     pub fn at(&self, time: f64, ground: &Ground) -> Shape {
         let (Some(drive), Shape::Block { x, y, facing: (cos, sin), half, z }) = (&self.drive, self.shape) else {
             return self.shape;

@@ -3,17 +3,17 @@
 //! In: profiles along x and across y (metres, world frame) and raised terraces. Out: heights, slopes, ray distances.
 //! Every patch between two breakpoints is a plane and every terrace a prism, so no ray is marched or sampled.
 
-/// Heights along one axis, straight between the breakpoints and level beyond the ends.
+/// The heights along one axis: linear between the breakpoints and level beyond the ends.
 ///
-/// Two breakpoints at one place make a vertical step.
+/// Two breakpoints at the same place are a vertical step.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Profile {
-    /// Place and height of each breakpoint, metres, places ascending.
+    /// Place and height of each breakpoint, in metres, by ascending place.
     points: Vec<(f64, f64)>,
 }
 
 impl Profile {
-    /// A profile through these places and heights, metres; places must ascend.
+    /// A profile through these places and heights, in metres. Places must ascend.
     pub fn through(points: &[(f64, f64)]) -> Self {
         assert!(points.windows(2).all(|pair| pair[0].0 <= pair[1].0), "a profile's places ascend: {points:?}");
         Self { points: points.to_vec() }
@@ -21,7 +21,7 @@ impl Profile {
 
     /// Continues level from the last breakpoint to `from`, then rises by `rise` until `to` along half a cosine.
     ///
-    /// The half cosine is drawn in straight pieces, so a ramp begins and ends softly and rays still meet planes.
+    /// The half cosine consists of straight pieces, so that rays meet planes.
     pub fn ramp(mut self, from: f64, to: f64, rise: f64) -> Self {
         const PIECES: usize = 12;
         let last = self.points.last().copied();
@@ -45,7 +45,7 @@ impl Profile {
         self.points.partition_point(|point| point.0 <= place)
     }
 
-    /// Height at place 0 and slope of a patch, as if it went on for ever.
+    /// Height at place 0 and slope of the line that a patch is part of.
     fn line(&self, patch: usize) -> (f64, f64) {
         let Some(last) = self.points.len().checked_sub(1) else { return (0.0, 0.0) };
         if patch == 0 {
@@ -85,20 +85,20 @@ impl Profile {
     }
 }
 
-/// A part of the ground raised (or sunk) by a vertical step all round: a kerbed island, a pavement, a bed.
+/// A part of the ground that is raised (or lowered) by a vertical step on all sides: an island with kerbs, a pavement.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Terrace {
-    /// Centre, metres.
+    /// Centre (x, y), in metres.
     pub centre: [f64; 2],
-    /// Half extents along x and y, corners included, metres.
+    /// Half extents along x and y with the corners, in metres.
     pub half: [f64; 2],
-    /// Radius of the corners, metres.
+    /// Radius of the corners, in metres.
     pub corner: f64,
-    /// Everything outside the rounded rectangle is raised instead of the inside.
+    /// True if the ground outside the rounded rectangle is raised instead of the inside.
     pub outside: bool,
-    /// Height of the step, metres.
+    /// Height of the step, in metres.
     pub rise: f64,
-    /// What a return from it weighs, 0 to 255.
+    /// Reflectivity, 0 to 255.
     pub reflectivity: u8,
 }
 
@@ -110,8 +110,8 @@ impl Terrace {
         inside != self.outside
     }
 
-    /// Whether the outline may lie between two places: not if both are inside it (it is convex), or both beyond one
-    /// side.
+    /// True if the outline may be between two places. It is not if both are inside it, because it is convex, or if both
+    /// are beyond one side.
     fn may_be_crossed(&self, ends: [[f64; 2]; 2]) -> bool {
         let inside = |[x, y]: [f64; 2]| self.holds(x, y) != self.outside;
         let beyond = (0..2).any(|axis| {
@@ -121,7 +121,7 @@ impl Terrace {
         !beyond && !ends.into_iter().all(inside)
     }
 
-    /// Where a line crosses the outline: entering and leaving.
+    /// Distances along a line at which it enters and leaves the outline.
     fn crossings(&self, origin: [f64; 2], direction: [f64; 2]) -> Option<(f64, f64)> {
         let o = [origin[0] - self.centre[0], origin[1] - self.centre[1]];
         let (mut enter, mut leave) = (f64::INFINITY, f64::NEG_INFINITY);
@@ -141,7 +141,7 @@ impl Terrace {
     }
 }
 
-/// Where a line is inside a rectangle about the origin.
+/// Distances along a line at which it enters and leaves a rectangle around the origin.
 pub(crate) fn slab(origin: [f64; 2], direction: [f64; 2], half: [f64; 2]) -> Option<(f64, f64)> {
     let (mut from, mut to) = (f64::NEG_INFINITY, f64::INFINITY);
     for axis in 0..2 {
@@ -159,7 +159,7 @@ pub(crate) fn slab(origin: [f64; 2], direction: [f64; 2], half: [f64; 2]) -> Opt
     (from < to).then_some((from, to))
 }
 
-/// Where a line is inside a circle about the origin.
+/// Distances along a line at which it enters and leaves a circle around the origin.
 pub(crate) fn disc(origin: [f64; 2], direction: [f64; 2], radius: f64) -> Option<(f64, f64)> {
     let a = direction[0] * direction[0] + direction[1] * direction[1];
     let half_b = origin[0] * direction[0] + origin[1] * direction[1];
@@ -167,31 +167,31 @@ pub(crate) fn disc(origin: [f64; 2], direction: [f64; 2], radius: f64) -> Option
     (root > 0.0 && a > 0.0).then(|| ((-half_b - root.sqrt()) / a, (-half_b + root.sqrt()) / a))
 }
 
-/// The whole ground: `along(x) + across(y)` plus the rises of the terraces that hold (x, y).
+/// The ground: its height is `along(x) + across(y)` plus the rises of all terraces that contain (x, y).
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Ground {
-    /// Height over x.
+    /// Height as a function of x.
     pub along: Profile,
-    /// Height over y; steps are kerbs along a straight road.
+    /// Height as a function of y. Steps are the kerbs of a straight road.
     pub across: Profile,
-    /// Raised parts.
+    /// Raised parts of the ground.
     pub terraces: Vec<Terrace>,
-    /// What a return from the bare ground weighs, 0 to 255.
+    /// Reflectivity of the ground outside of terraces, 0 to 255.
     pub reflectivity: u8,
 }
 
 impl Ground {
-    /// Height at (x, y), metres.
+    /// Height at (x, y), in metres.
     pub fn height(&self, x: f64, y: f64) -> f64 {
         self.along.height(x) + self.across.height(y) + self.rise(x, y)
     }
 
-    /// Steepness at (x, y): rise over run, steps left out.
+    /// Slope at (x, y), as rise over run, without steps.
     pub fn slope(&self, x: f64, y: f64) -> f64 {
         self.along.slope(x).hypot(self.across.slope(y))
     }
 
-    /// What a return from (x, y) weighs, 0 to 255: the terrace's, else the bare ground's.
+    /// Reflectivity at (x, y), 0 to 255: that of the terrace, else of the ground.
     pub fn reflectivity(&self, x: f64, y: f64) -> u8 {
         let terrace = self.terraces.iter().rfind(|terrace| terrace.holds(x, y));
         terrace.map_or(self.reflectivity, |terrace| terrace.reflectivity)
@@ -201,7 +201,7 @@ impl Ground {
         self.terraces.iter().filter(|terrace| terrace.holds(x, y)).map(|terrace| terrace.rise).sum()
     }
 
-    /// No ground is higher than this.
+    /// Upper bound of the height of the ground, in metres.
     fn highest(&self) -> f64 {
         self.along.highest() + self.across.highest() + self.highest_rise()
     }
@@ -249,7 +249,7 @@ impl Ground {
         }
     }
 
-    /// The same within one plane, whose height under the ray is `over + climb * t` lower.
+    /// Distance along the ray at which it meets one plane, which is `over + climb * t` below the ray.
     fn meets_patch(
         &self,
         origin: [f64; 3],

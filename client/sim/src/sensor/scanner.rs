@@ -11,10 +11,10 @@ use nalgebra::{Isometry3, Point3, Vector3};
 use std::f64::consts::TAU;
 use std::ops::Deref;
 
-use crate::encode::{RawFiring, RawReturn};
+use super::encode::{RawFiring, RawReturn};
+use super::raycast::{Caster, Hit};
 use crate::noise::{gaussian, mixed, uniform};
-use crate::raycast::{Caster, Hit};
-use crate::world::World;
+use crate::scene::world::World;
 
 /// The model, mounting and accuracy of a simulated sensor.
 #[derive(Clone, Debug)]
