@@ -1,5 +1,5 @@
-//! Replays the corpora of the fuzz targets. A corpus has the files that this test writes with `CLEARWAY_BLESS=1`,
-//! and the files that a fuzzer derived from them (named by their hash).
+//! Replays the corpora of the fuzz targets. A corpus has the files that this test writes with `CLEARWAY_BLESS=1`, and
+//! the files that a fuzzer derived from them (named by their hash).
 
 #[path = "../fuzz/entries.rs"]
 mod entries;

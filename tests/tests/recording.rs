@@ -92,11 +92,11 @@ async fn a_planted_change_is_named_by_sequence_layer_and_cell() {
     assert_eq!(report.different, 1);
     let difference = &report.differences[0];
     assert_eq!((&*difference.vehicle, difference.sequence, &*difference.layer), ("car", 2, "drivability"));
-    let (recorded, made) = was_and_is.unwrap();
+    let (recorded, computed) = was_and_is.unwrap();
     let channel = "class".to_owned();
     assert_eq!(
         difference.kind,
-        DifferenceKind::Cell { row: row as u32, column: column as u32, channel, recorded, made }
+        DifferenceKind::Cell { row: row as u32, column: column as u32, channel, recorded, computed }
     );
 }
 

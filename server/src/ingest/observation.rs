@@ -79,8 +79,8 @@ pub enum ObservationError {
     },
     /// The columns do not match the points of the scan.
     #[error(
-        "{columns} columns with {points} points together and {offsets} offsets, of a scan of {of} points{also}: one offset \
-         a column and all points are allowed"
+        "{columns} columns with {points} points together and {offsets} offsets, of a scan of {of} points{also}: \
+         one offset a column and all points are allowed"
     )]
     Columns {
         /// Number of columns.

@@ -34,7 +34,7 @@ pub struct Reading {
     pub body: Body,
 }
 
-/// The queue takes no more events: the engine has stopped, or the queue is closed.
+/// The queue accepts no more events, because the engine has stopped or the queue is closed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("the vehicle's engine has stopped")]
 pub struct QueueClosedError;

@@ -1,5 +1,5 @@
-//! The outcome of an event -> a report to the client that sent it. The receipt lies beside the event on the queue; it
-//! is not recorded, so a replay has none.
+//! The outcome of an event -> a report to the client that sent it. The receipt is on the queue together with its
+//! event. It is not recorded, so a replay has no receipts.
 
 use std::collections::VecDeque;
 

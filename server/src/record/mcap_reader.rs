@@ -42,11 +42,11 @@ pub struct Channel {
     pub topic: String,
     /// The name of the schema, such as `clearway.v1.Map`.
     pub schema: String,
-    /// What the messages contain.
+    /// The kind of the messages.
     pub content: Content,
 }
 
-/// What the messages of a channel contain.
+/// The kind of the messages of a channel.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Content {
     /// Events of a vehicle's journal.
@@ -369,7 +369,7 @@ fn open(file: &Path) -> Result<File, McapReadError> {
     File::open(file).map_err(|source| McapReadError::Read { file: file.to_owned(), source })
 }
 
-/// What the messages of a channel contain, by its topic, the name of its schema, and its encoding.
+/// The kind of the messages of a channel, by its topic, the name of its schema, and its encoding.
 fn content(topic: &str, schema: &str, encoding: &str) -> Content {
     // A bag that was converted from ROS 1 has the same types in another encoding.
     if let Some(kind) = Kind::from_name(schema).filter(|_| encoding == "cdr") {

@@ -2,12 +2,14 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | [`writer`] | events and maps -> MCAP file |
+//! | [`writer`] | events and maps -> queue -> recorder thread |
+//! | [`mcap_file`] | events and maps -> bytes of the MCAP file |
 //! | [`mcap_reader`] | any MCAP file -> its header and its messages |
 //! | [`reader`] | those messages -> events, maps, ROS 2 messages |
 //! | [`verify`] | recording -> differences between the recorded maps and the maps of the recorded events |
 
 mod chunk;
+pub mod mcap_file;
 pub mod mcap_reader;
 pub mod reader;
 pub mod verify;

@@ -70,7 +70,7 @@ pub enum DifferenceKind {
         /// Raw value in the recording.
         recorded: i32,
         /// Raw value computed from the events.
-        made: i32,
+        computed: i32,
     },
     /// Another part of the map differs.
     Field {
@@ -79,7 +79,7 @@ pub enum DifferenceKind {
         /// Value in the recording.
         recorded: String,
         /// Value computed from the events.
-        made: String,
+        computed: String,
     },
     /// The recording lacks this map of the events.
     Missing,
@@ -130,15 +130,15 @@ impl Report {
 impl Difference {
     fn to_json(&self) -> Value {
         let kind = match &self.kind {
-            DifferenceKind::Cell { row, column, channel, recorded, made } => json!({
-                "cell": { "row": row, "column": column, "channel": channel, "recorded": recorded, "made": made }
+            DifferenceKind::Cell { row, column, channel, recorded, computed } => json!({
+                "cell": { "row": row, "column": column, "channel": channel, "recorded": recorded, "computed": computed }
             }),
-            DifferenceKind::Field { field, recorded, made } => {
-                json!({ "field": { "name": field, "recorded": recorded, "made": made } })
+            DifferenceKind::Field { field, recorded, computed } => {
+                json!({ "field": { "name": field, "recorded": recorded, "computed": computed } })
             }
             DifferenceKind::Missing => json!("missing"),
             DifferenceKind::Extra => json!("extra"),
-            DifferenceKind::Gap { found } => json!({ "hole": { "found": found } }),
+            DifferenceKind::Gap { found } => json!({ "gap": { "found": found } }),
         };
         json!({ "vehicle": self.vehicle, "sequence": self.sequence, "layer": self.layer, "what": kind })
     }
@@ -152,11 +152,11 @@ impl fmt::Display for Difference {
         }
         write!(f, "vehicle {vehicle}, sequence {sequence}, layer {layer}: ")?;
         match kind {
-            DifferenceKind::Cell { row, column, channel, recorded, made } => {
-                write!(f, "cell row {row} column {column}, channel {channel}: recorded {recorded}, computed {made}")
+            DifferenceKind::Cell { row, column, channel, recorded, computed } => {
+                write!(f, "cell row {row} column {column}, channel {channel}: recorded {recorded}, computed {computed}")
             }
-            DifferenceKind::Field { field, recorded, made } => {
-                write!(f, "{field}: recorded {recorded}, computed {made}")
+            DifferenceKind::Field { field, recorded, computed } => {
+                write!(f, "{field}: recorded {recorded}, computed {computed}")
             }
             DifferenceKind::Missing => write!(f, "the recording lacks this map of the events"),
             DifferenceKind::Extra | DifferenceKind::Gap { .. } => {
@@ -218,8 +218,8 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
                 let replay = replays.iter_mut().find(|r| *r.name == *vehicle);
                 match replay.and_then(|replay| replay.computed.remove(&(sequence, layer.clone()))) {
                     None => report.add(&vehicle, sequence, &layer, DifferenceKind::Extra),
-                    Some(made) if made == bytes => report.equal += 1,
-                    Some(made) => report.add(&vehicle, sequence, &layer, first_difference(&bytes, &made)),
+                    Some(computed) if computed == bytes => report.equal += 1,
+                    Some(computed) => report.add(&vehicle, sequence, &layer, first_difference(&bytes, &computed)),
                 }
             }
             RecordedMessage::Ros { .. } => {}
@@ -247,13 +247,13 @@ fn sequence_of(bytes: &Bytes) -> u64 {
 }
 
 /// The first difference of two encoded maps of one layer, in the order header, geometry, channels, all else.
-fn first_difference(recorded: &Bytes, made: &Bytes) -> DifferenceKind {
-    let field = |field: &str, recorded: &dyn fmt::Debug, made: &dyn fmt::Debug| DifferenceKind::Field {
+fn first_difference(recorded: &Bytes, computed: &Bytes) -> DifferenceKind {
+    let field = |field: &str, recorded: &dyn fmt::Debug, computed: &dyn fmt::Debug| DifferenceKind::Field {
         field: field.to_owned(),
         recorded: format!("{recorded:?}"),
-        made: format!("{made:?}"),
+        computed: format!("{computed:?}"),
     };
-    let (was, is) = match (v1::Map::decode(recorded.clone()), v1::Map::decode(made.clone())) {
+    let (was, is) = match (v1::Map::decode(recorded.clone()), v1::Map::decode(computed.clone())) {
         (Ok(was), Ok(is)) => (was, is),
         (was, is) => return field("message", &was.err(), &is.err()),
     };
@@ -285,21 +285,21 @@ fn first_difference(recorded: &Bytes, made: &Bytes) -> DifferenceKind {
         return field("geometry", &was.geometry, &is.geometry);
     }
     let columns = Grid::from_wire(is).map_or(1, |grid| grid.shape().1.max(1));
-    let (recorded, made) = match (decode_first_layer(recorded), decode_first_layer(made)) {
-        (Ok(recorded), Ok(made)) => (recorded, made),
+    let (recorded, computed) = match (decode_first_layer(recorded), decode_first_layer(computed)) {
+        (Ok(recorded), Ok(computed)) => (recorded, computed),
         (was, is) => return field("cells", &was.err(), &is.err()),
     };
     for (a, b) in was.channels.iter().zip(&is.channels) {
         if a == b {
             continue;
         }
-        if let (Some(recorded), Some(made)) = (recorded.channel(&a.name), made.channel(&b.name)) {
-            let cells = 0..recorded.cells.len().min(made.cells.len());
+        if let (Some(recorded), Some(computed)) = (recorded.channel(&a.name), computed.channel(&b.name)) {
+            let cells = 0..recorded.cells.len().min(computed.cells.len());
             let value = |of: &Channel, cell: usize| of.cells.get(cell).unwrap_or_default();
-            if let Some(cell) = cells.into_iter().find(|&cell| value(recorded, cell) != value(made, cell)) {
+            if let Some(cell) = cells.into_iter().find(|&cell| value(recorded, cell) != value(computed, cell)) {
                 let (row, column) = (cell as u32 / columns, cell as u32 % columns);
-                let (recorded, made) = (value(recorded, cell), value(made, cell));
-                return DifferenceKind::Cell { row, column, channel: b.name.clone(), recorded, made };
+                let (recorded, computed) = (value(recorded, cell), value(computed, cell));
+                return DifferenceKind::Cell { row, column, channel: b.name.clone(), recorded, computed };
             }
         }
         return field(&format!("channel {}", b.name), a, b);

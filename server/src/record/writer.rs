@@ -1,15 +1,9 @@
-//! Every event and every map -> one MCAP file, on its own thread behind its own queue.
+//! Every event and every map -> one MCAP file, on its own thread with its own queue.
 //!
-//! Layout: metadata `clearway` (boot id, version, vehicles, source of each calibration), attachments `config.toml` (the
-//! effective configuration) and `calibration/<vehicle>/<sensor>.yaml` (the configured tables), then the channels
-//! `/<vehicle>/journal` (`clearway.v1.Event`) and `/<vehicle>/map/<layer>` (`clearway.v1.Map`, the same bytes that
-//! zenoh carries). Log time is the arrival of the event, or of the event that completed the map. Chunks are closed by
-//! time, so that a crash loses at most `flush_ms`. A disk that fails ends the recording with a reason; maps are still
-//! computed and served.
+//! Chunks are closed by time, so that a crash loses at most `flush_ms`. A disk that fails ends the recording with a
+//! reason; maps are still computed and served.
 
-use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
@@ -17,32 +11,14 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use bytes::Bytes;
 use clearway_mapping::event::Event;
-use clearway_proto::{DESCRIPTORS, v1};
-use mcap::records::{MessageHeader, Metadata};
-use mcap::write::NoSeek;
-use mcap::{Attachment, Compression, McapError, WriteOptions};
-use prost::Message;
+use clearway_proto::v1;
+use mcap::McapError;
 
+use super::mcap_file::{Disk, Header, McapFile};
 use crate::config::Recorder as Options;
-use crate::encode::{self, EncodedMap};
+use crate::encode::EncodedMap;
 use crate::sync::locked;
-
-/// The contents of a recording before its first event.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Header {
-    /// Identifies the run of the server.
-    pub boot_id: u64,
-    /// The effective configuration, TOML.
-    pub config: String,
-    /// The vehicles with the layers of their maps, in the order of the configuration.
-    pub vehicles: Vec<(Arc<str>, Vec<&'static str>)>,
-    /// The configured calibration tables: vehicle, sensor, ROS YAML.
-    pub calibrations: Vec<(String, String, String)>,
-    /// Further metadata, by name.
-    pub metadata: BTreeMap<String, String>,
-}
 
 /// A recording cannot begin.
 #[derive(Debug, thiserror::Error)]
@@ -197,50 +173,6 @@ impl Recorder {
     }
 }
 
-/// The disk that receives the bytes of a recording: a file, or a simulated disk in tests.
-pub trait Disk: Write + Send {
-    /// Makes everything written so far survive a crash of the machine.
-    ///
-    /// # Errors
-    /// [`io::Error`] if the disk fails.
-    fn sync(&mut self) -> io::Result<()>;
-}
-
-impl Disk for File {
-    fn sync(&mut self) -> io::Result<()> {
-        self.sync_all()
-    }
-}
-
-/// A disk that is never written again after its first failure. The MCAP library finishes a file when its writer is
-/// dropped; a disk that has recovered by then would hold a file that looks complete but lacks its end.
-struct StopAtFailure<D: Disk> {
-    disk: D,
-    failed: Option<io::ErrorKind>,
-}
-
-impl<D: Disk> StopAtFailure<D> {
-    fn unless_failed<T>(&mut self, act: impl FnOnce(&mut D) -> io::Result<T>) -> io::Result<T> {
-        match self.failed {
-            Some(kind) => Err(kind.into()),
-            // The caller repeats an interrupted call, so it is not a failure.
-            None => act(&mut self.disk).inspect_err(|error| {
-                self.failed = Some(error.kind()).filter(|kind| *kind != io::ErrorKind::Interrupted);
-            }),
-        }
-    }
-}
-
-impl<D: Disk> Write for StopAtFailure<D> {
-    fn write(&mut self, data: &[u8]) -> io::Result<usize> {
-        self.unless_failed(|disk| disk.write(data))
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        self.unless_failed(Write::flush)
-    }
-}
-
 /// Writes a recording, without a thread or clock of its own: its owner passes the time. After a failure of the disk it
 /// still empties its queue, and counts the elements as lost.
 pub struct RecordingWriter<D: Disk> {
@@ -313,9 +245,14 @@ impl<D: Disk> RecordingWriter<D> {
 
     fn write(&mut self, item: &Item, now: Instant) {
         let Some(file) = &mut self.file else { return self.counts.record_loss() };
-        if let Err(error) = file.write(item, &self.counts) {
+        let (written, count) = match item {
+            Item::Event(vehicle, event) => (file.write_event(*vehicle, event), &self.counts.events),
+            Item::Map(vehicle, map) => (file.write_map(*vehicle, map), &self.counts.maps),
+        };
+        if let Err(error) = written {
             return self.stop(&error);
         }
+        count.fetch_add(1, Ordering::Relaxed);
         self.flush_at.get_or_insert(now + self.flush_period);
         // Checked after each element, so that a queue that is never empty does not postpone the flush.
         self.flush_if_due(now);
@@ -337,99 +274,6 @@ impl<D: Disk> RecordingWriter<D> {
         tracing::error!(file = %self.counts.file, %reason, "the recording stops here; maps are still served");
         *locked(&self.counts.stop_reason) = Some(reason);
         (self.file, self.flush_at) = (None, None);
-    }
-}
-
-/// An open MCAP file with the channels of all vehicles.
-struct McapFile<D: Disk> {
-    writer: mcap::Writer<NoSeek<BufWriter<StopAtFailure<D>>>>,
-    vehicles: Vec<VehicleChannels>,
-}
-
-struct VehicleChannels {
-    journal: u16,
-    maps: BTreeMap<&'static str, u16>,
-}
-
-impl<D: Disk> McapFile<D> {
-    fn create(disk: D, header: &Header) -> Result<Self, McapError> {
-        let mut writer = WriteOptions::new()
-            .profile("")
-            .library(concat!("clearway/", env!("CARGO_PKG_VERSION")))
-            .compression(Some(Compression::Zstd))
-            // Compresses in the recorder's thread; by default the library starts one thread a core.
-            .compression_threads(0)
-            // Writes each chunk at once, with its length first. Otherwise a crash leaves a chunk with length 0, which a
-            // reader cannot distinguish from damage.
-            .disable_seeking(true)
-            .create(NoSeek::new(BufWriter::new(StopAtFailure { disk, failed: None })))?;
-        let names: Vec<&str> = header.vehicles.iter().map(|(name, _)| &**name).collect();
-        let mut metadata = header.metadata.clone();
-        metadata.insert("boot_id".into(), header.boot_id.to_string());
-        metadata.insert("version".into(), env!("CARGO_PKG_VERSION").into());
-        metadata.insert("vehicles".into(), names.join(","));
-        writer.write_metadata(&Metadata { name: "clearway".into(), metadata })?;
-        let mut attach = |name: String, media_type: &str, text: &str| {
-            let data = text.as_bytes().into();
-            writer.attach(&Attachment { log_time: 0, create_time: 0, name, media_type: media_type.into(), data })
-        };
-        attach("config.toml".into(), "application/toml", &header.config)?;
-        for (vehicle, sensor, yaml) in &header.calibrations {
-            attach(format!("calibration/{vehicle}/{sensor}.yaml"), "application/yaml", yaml)?;
-        }
-        let event = writer.add_schema("clearway.v1.Event", "protobuf", DESCRIPTORS)?;
-        let map = writer.add_schema("clearway.v1.Map", "protobuf", DESCRIPTORS)?;
-        let mut vehicles = Vec::new();
-        for (vehicle, layers) in &header.vehicles {
-            let mut channel = |schema, topic: String| writer.add_channel(schema, &topic, "protobuf", &BTreeMap::new());
-            let journal = channel(event, format!("/{vehicle}/journal"))?;
-            let maps = layers
-                .iter()
-                .map(|&layer| Ok((layer, channel(map, format!("/{vehicle}/map/{layer}"))?)))
-                .collect::<Result<_, McapError>>()?;
-            vehicles.push(VehicleChannels { journal, maps });
-        }
-        writer.flush()?;
-        Ok(Self { writer, vehicles })
-    }
-
-    fn write(&mut self, item: &Item, counts: &RecorderCounts) -> Result<(), McapError> {
-        match item {
-            Item::Event(vehicle, event) => {
-                let bytes = encode::event_to_proto(event).encode_to_vec();
-                self.write_message(self.vehicles[*vehicle].journal, event.sequence, event.arrival_ns, &bytes)?;
-                counts.events.fetch_add(1, Ordering::Relaxed);
-            }
-            Item::Map(vehicle, map) => {
-                for (layer, chunk) in &map.layers {
-                    let Some(&channel) = self.vehicles[*vehicle].maps.get(layer) else { continue };
-                    let bytes: Bytes = map.layer(chunk);
-                    self.write_message(channel, map.sequence, map.completed_ns, &bytes)?;
-                }
-                counts.maps.fetch_add(1, Ordering::Relaxed);
-            }
-        }
-        Ok(())
-    }
-
-    fn write_message(&mut self, channel_id: u16, sequence: u64, arrival_ns: i64, data: &[u8]) -> Result<(), McapError> {
-        // MCAP has 32-bit sequences and no time before 1970; the message itself has the full values.
-        let sequence = sequence as u32;
-        let log_time = u64::try_from(arrival_ns).unwrap_or(0);
-        let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
-        self.writer.write_to_known_channel(&header, data)
-    }
-
-    fn flush(&mut self) -> Result<(), McapError> {
-        self.writer.flush()
-    }
-
-    fn finish(mut self) -> Result<(), McapError> {
-        self.writer.finish()?;
-        // `finish` leaves the last bytes in the buffer.
-        let buffer = self.writer.into_inner().into_inner();
-        let mut complete = buffer.into_inner().map_err(|error| McapError::Io(error.into_error()))?;
-        complete.disk.sync().map_err(McapError::Io)
     }
 }
 

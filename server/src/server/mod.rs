@@ -3,7 +3,7 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | `setup` | what a server is started with; why it did not start or did not end well |
+//! | `setup` | parameters of a server; errors of its start and its end |
 //! | `start` | [`Setup`] -> [`Running`] |
 //! | `input` | event queue and UDP addresses of one vehicle |
 //! | `running` | [`Running`], and its shutdown |

@@ -1,4 +1,4 @@
-//! What a server is started with, and the errors of its start and its end.
+//! The parameters of a server, and the errors of its start and its end.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -9,7 +9,7 @@ use crate::engine::Observer;
 use crate::ingest::udp;
 use crate::record::writer::{IncompleteRecordingError, RecordError};
 
-/// What a server is started with.
+/// The parameters of a server.
 #[derive(Default)]
 pub struct Setup {
     /// The checked configuration.

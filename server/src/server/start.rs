@@ -21,7 +21,8 @@ use crate::ingest::grpc::Ingest;
 use crate::ingest::queue::{EventQueue, QueuedEvent, event_queue};
 use crate::ingest::udp;
 use crate::publish::{Served, Vehicles, foxglove, grpc, page};
-use crate::record::writer::{Header, Recorder, recording_path};
+use crate::record::mcap_file::Header;
+use crate::record::writer::{Recorder, recording_path};
 use crate::status::VehicleStatus;
 
 /// The server.

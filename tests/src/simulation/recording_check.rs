@@ -4,7 +4,8 @@ use std::io::{self, Write};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use clearway::record::verify::{VerifyError, verify};
-use clearway::record::writer::{Disk, RecorderCounts};
+use clearway::record::mcap_file::Disk;
+use clearway::record::writer::RecorderCounts;
 
 use super::checks::{Violation, violation};
 use super::fault_plan::DiskFault;

@@ -55,8 +55,9 @@ pub enum FilesError {
     },
     /// A ROS 2 bag has the older sqlite3 storage.
     #[error(
-        "{}: a ROS 2 bag in sqlite3; MCAP is read: write `output_bags: [{{uri: converted, storage_id: mcap, all_topics: true}}]` \
-         into convert.yaml, then `ros2 bag convert -i {} -o convert.yaml`",
+        "{}: a ROS 2 bag in sqlite3; MCAP is read: write \
+         `output_bags: [{{uri: converted, storage_id: mcap, all_topics: true}}]` into convert.yaml, \
+         then `ros2 bag convert -i {} -o convert.yaml`",
         file.display(), file.display()
     )]
     Sqlite {

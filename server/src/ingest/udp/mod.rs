@@ -107,7 +107,8 @@ fn bind(listener: &Listener) -> io::Result<(Socket, SocketAddr)> {
     // Linux reports twice the requested size, because it adds as much for its own bookkeeping.
     let granted = socket.recv_buffer_size()? / 2;
     if granted < *receive_buffer_bytes {
-        tracing::warn!(%at, requested = receive_buffer_bytes, granted, "receive buffer clamped: raise net.core.rmem_max");
+        let requested = receive_buffer_bytes;
+        tracing::warn!(%at, requested, granted, "receive buffer clamped: raise net.core.rmem_max");
     }
     socket.set_nonblocking(true)?;
     if at.is_ipv6() {
