@@ -93,8 +93,8 @@ struct Known {
 }
 
 impl Known {
-    /// Configures the sensors of a ROS bag and puts their topics into `wanted`. Returns the mount of the first sensor if
-    /// tf has it.
+    /// Configures the sensors of a ROS bag and puts their topics into `wanted`. Returns the mount of the first sensor
+    /// if tf has it.
     fn apply_bag(
         &mut self,
         bag: &Path,
@@ -238,8 +238,8 @@ fn choice(bag: &Path, wanted: &McapOptions) -> Result<TopicChoice, ReplayError> 
     Ok(choice.map_err(FilesError::from)?)
 }
 
-/// Keeps the sensors that tf places. If tf places none, keeps the first, whose mount is estimated or given. If the mount
-/// `is_given`, the first sensor counts as placed.
+/// Keeps the sensors that tf places. If tf places none, keeps the first, whose mount is estimated or given. If the
+/// mount `is_given`, the first sensor counts as placed.
 fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
     let mut number = 0;
     let mut known = |sensor: &SensorTopic| {
