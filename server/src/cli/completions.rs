@@ -20,7 +20,7 @@ pub struct Options {
 /// Prints the script that completes the subcommands and options of `command`.
 ///
 /// # Errors
-/// As [`print`].
+/// As [`print()`].
 pub fn run(options: &Options, mut command: Command) -> Result<()> {
     let mut script = Vec::new();
     clap_complete::generate(options.shell, &mut command, "clearway", &mut script);

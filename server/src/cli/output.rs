@@ -22,10 +22,10 @@ pub fn print(text: &str) -> Result<bool> {
     }
 }
 
-/// Prints `line` and a line end, as [`print`] does.
+/// Prints `line` and a line end, as [`print()`] does.
 ///
 /// # Errors
-/// As [`print`].
+/// As [`print()`].
 pub fn print_line(line: &str) -> Result<bool> {
     print(&format!("{line}\n"))
 }
