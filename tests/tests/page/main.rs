@@ -84,8 +84,7 @@ mod fresh {
             let (stop, stopped) = tokio::sync::oneshot::channel();
             let (send_page, page) = mpsc::channel();
             let thread = std::thread::spawn(move || {
-                let folder = tempfile::tempdir().expect("a folder");
-                let options = Options { picture: folder.path().join("map.png"), any_port: true, ..Options::default() };
+                let options = Options { any_port: true, ..Options::default() };
                 let begun = move |endpoints: &Endpoints| {
                     println!("sensors: {}", endpoints.sensors);
                     send_page.send(endpoints.page).expect("the test waits");

@@ -48,8 +48,8 @@ async fn demo_and_print(options: Options) -> Result<()> {
     let Options { seconds: duration, record, sensors, json } = options;
     let folder = if Path::new("target").is_dir() { PathBuf::from("target") } else { std::env::temp_dir() };
     let picture = record.as_ref().map_or_else(|| folder.join("demo.png"), |record| record.with_extension("png"));
-    let options = DemoOptions { duration, record, picture, sensors, any_port: false };
-    let (record, picture) = (options.record.clone(), options.picture.clone());
+    let options =
+        DemoOptions { duration, record: record.clone(), picture: Some(picture.clone()), sensors, any_port: false };
     let begun = |endpoints: &Endpoints| {
         if !json {
             let _ = print_line(&introduction(endpoints, record.as_deref(), &picture));

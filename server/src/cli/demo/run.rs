@@ -32,8 +32,8 @@ pub struct Options {
     pub duration: Option<Duration>,
     /// The file that events and maps are recorded to; `None`: nothing is recorded.
     pub record: Option<PathBuf>,
-    /// The file that the newest map is drawn to every second.
-    pub picture: PathBuf,
+    /// The file that the newest map is drawn to every second; `None`: nothing is drawn.
+    pub picture: Option<PathBuf>,
     /// The car's sensors.
     pub sensors: Sensors,
     /// True if the operating system chooses every port, for tests that run beside each other.
@@ -81,7 +81,7 @@ pub async fn demo(
     });
     let udp = running.inputs[0].udp.unwrap_or((nowhere, nowhere));
     let served = running.vehicles.0[0].clone();
-    // The picture and the line need this layer, whether anyone else reads it or not.
+    // The picture and the line need this layer, whether or not a reader subscribes to it.
     let _subscription = served.status.subscriptions.subscribe(&["drivability".to_owned()]);
     // The car starts after everything else, so that its first firing is now.
     let car = Car::start(rig(now_ns()), udp, running.grpc.unwrap_or(nowhere), &served.newest)?;
@@ -111,9 +111,9 @@ pub async fn demo(
             _ = every.tick() => {
                 last = now(&running, &last);
                 report(&last);
-                let newest = running.vehicles.0[0].newest.borrow().clone();
-                if let Some(map) = newest {
-                    tokio::task::block_in_place(|| draw(&map, &options.picture))?;
+                let newest = served.newest.borrow().clone();
+                if let Some((map, picture)) = newest.zip(options.picture.as_deref()) {
+                    tokio::task::block_in_place(|| draw(&map, picture))?;
                 }
             }
         }
