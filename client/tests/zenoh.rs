@@ -1,4 +1,4 @@
-//! A client against a zenoh session in this process.
+//! The zenoh client with a zenoh session in this process.
 
 mod common;
 
@@ -27,14 +27,14 @@ async fn server() -> (Session, String) {
     (server, endpoint)
 }
 
-/// As the server publishes.
+/// Declares a publisher as the server does.
 async fn publisher(server: &Session) -> AdvancedPublisher<'static> {
     let publisher = server.declare_publisher(KEY).cache(CacheConfig::default().max_samples(1));
     let misses = publisher.sample_miss_detection(MissDetectionConfig::default());
     misses.publisher_detection().await.unwrap()
 }
 
-/// Waits until somebody subscribes.
+/// Waits until there is a subscriber.
 async fn matched(publisher: &zenoh::pubsub::Publisher<'_>) {
     let matching = publisher.matching_listener().await.unwrap();
     while !publisher.matching_status().await.unwrap().matching() {
@@ -48,7 +48,7 @@ async fn next(maps: &mut MapStream) -> (u64, u64, u64) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_stream_begins_with_the_newest_map_goes_on_and_outlives_its_client() {
+async fn a_stream_starts_with_the_newest_map_and_survives_its_client() {
     let (server, endpoint) = server().await;
     let _token = server.liveliness().declare_token("clearway/alpha").await.unwrap();
     let queries = server.declare_queryable(KEY).await.unwrap();
@@ -68,18 +68,18 @@ async fn a_stream_begins_with_the_newest_map_goes_on_and_outlives_its_client() {
     drop(client);
     assert_eq!(next(&mut maps).await, (41, 0, 0));
 
-    // The subscription may reach the publisher after the answer did.
+    // The subscription may reach the publisher later than the query.
     let matching = publisher.matching_listener().await.unwrap();
     while !publisher.matching_status().await.unwrap().matching() {
         matching.recv_async().await.unwrap();
     }
     publisher.put(map(40, CAPTURE_END_NS)).await.unwrap();
     publisher.put(map(44, CAPTURE_END_NS)).await.unwrap();
-    assert_eq!(next(&mut maps).await, (44, 2, 0), "an old map is passed over, holes are counted");
+    assert_eq!(next(&mut maps).await, (44, 2, 0), "an old map is ignored and gaps are counted");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn of_the_skipped_maps_those_the_link_lost_are_told_and_a_lost_last_one_is_asked_for() {
+async fn lost_maps_are_counted_and_a_lost_last_map_is_queried() {
     let (server, endpoint) = server().await;
     let queries = server.declare_queryable(KEY).await.unwrap();
     let maps = server.declare_publisher(KEY).await.unwrap();
@@ -90,7 +90,7 @@ async fn of_the_skipped_maps_those_the_link_lost_are_told_and_a_lost_last_one_is
     matched(&maps).await;
     matched(&heartbeats).await;
 
-    // What a publisher numbers; the numbers that are left out were lost.
+    // Publishes a sample with a number; missing numbers are lost samples.
     let put = async |number: u32, sequence: u64| {
         let put = maps.put(map(sequence, CAPTURE_END_NS)).source_info(SourceInfo::new(maps.id(), number));
         put.await.unwrap();
@@ -98,41 +98,41 @@ async fn of_the_skipped_maps_those_the_link_lost_are_told_and_a_lost_last_one_is
     put(0, 41).await;
     assert_eq!(next(&mut stream).await, (41, 0, 0));
     put(2, 43).await;
-    assert_eq!(next(&mut stream).await, (43, 1, 1), "lost is one of those skipped");
+    assert_eq!(next(&mut stream).await, (43, 1, 1), "the lost map is one of the skipped ones");
     put(3, 46).await;
-    assert_eq!(next(&mut stream).await, (46, 2, 0), "two were never put");
+    assert_eq!(next(&mut stream).await, (46, 2, 0), "two maps were never published");
 
     heartbeats.put(z_serialize(&3_u32)).await.unwrap();
     heartbeats.put(z_serialize(&4_u32)).await.unwrap();
     let query = queries.recv_async().await.unwrap();
     query.reply(KEY, map(47, CAPTURE_END_NS)).await.unwrap();
     drop(query);
-    assert_eq!(next(&mut stream).await, (47, 0, 0), "the last map came late, and is not lost");
+    assert_eq!(next(&mut stream).await, (47, 0, 0), "the last map arrived late and is not lost");
     put(5, 48).await;
     assert_eq!(next(&mut stream).await, (48, 0, 0));
-    assert!(matches!(queries.try_recv(), Ok(None)), "nobody asks without a reason");
+    assert!(matches!(queries.try_recv(), Ok(None)), "there is no query without a reason");
 }
 
-/// A wire between client and server that the test cuts, and lays to another server.
-struct Wire {
+/// A connection between client and server that the test cuts, and restores to another server.
+struct Link {
     endpoint: String,
-    /// Where it leads; `None` while it is cut: then nothing passes, and nobody is told.
+    /// Address of the server; `None` while the link is cut: then no data pass and neither side is notified.
     to: watch::Sender<Option<String>>,
-    /// Read while something may pass.
+    /// Held as a reader while data may pass.
     passing: Arc<RwLock<()>>,
 }
 
-impl Wire {
-    async fn lay(to: &str) -> Self {
+impl Link {
+    async fn open(to: &str) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let endpoint = format!("tcp/{}", listener.local_addr().unwrap());
-        let (to, leads) = watch::channel(Some(to.replace("tcp/", "")));
+        let (to, target) = watch::channel(Some(to.replace("tcp/", "")));
         let passing = Arc::new(RwLock::new(()));
         tokio::spawn({
             let passing = passing.clone();
             async move {
                 while let Ok((near, _)) = listener.accept().await {
-                    tokio::spawn(pass(near, leads.clone(), passing.clone()));
+                    tokio::spawn(forward(near, target.clone(), passing.clone()));
                 }
             }
         });
@@ -144,28 +144,28 @@ impl Wire {
         let _nothing_passes = self.passing.write().await;
     }
 
-    fn lay_to(&self, to: &str) {
+    fn restore_to(&self, to: &str) {
         self.to.send_replace(Some(to.replace("tcp/", "")));
     }
 }
 
-/// Carries one connection until it is cut.
-async fn pass(mut near: TcpStream, mut leads: watch::Receiver<Option<String>>, passing: Arc<RwLock<()>>) {
-    let to = leads.borrow_and_update().clone();
+/// Forwards one connection until the link is cut.
+async fn forward(mut near: TcpStream, mut target: watch::Receiver<Option<String>>, passing: Arc<RwLock<()>>) {
+    let to = target.borrow_and_update().clone();
     if let Some(to) = to {
         let _passing = passing.read().await;
         let Ok(mut far) = TcpStream::connect(to).await else { return };
         tokio::select! {
             _ = tokio::io::copy_bidirectional(&mut near, &mut far) => return,
-            _ = leads.changed() => {}
+            _ = target.changed() => {}
         }
     }
-    // Cut: held, and never read, until the test ends. Only the silence tells.
-    while leads.changed().await.is_ok() {}
+    // The link is cut: the connection stays open without data until the test ends.
+    while target.changed().await.is_ok() {}
 }
 
-/// Waits until the stream says that this map is stale; it must not end, and no other map may come.
-async fn goes_stale(maps: &mut MapStream, sequence: u64) {
+/// Waits until the stream reports that this map is stale; it must not end or return another map.
+async fn wait_stale(maps: &mut MapStream, sequence: u64) {
     loop {
         match maps.next_or_stale().await.expect("a stream does not end with its server") {
             StreamEvent::Fresh(update) => assert_eq!(update.map.sequence(), sequence),
@@ -178,46 +178,46 @@ async fn goes_stale(maps: &mut MapStream, sequence: u64) {
     }
 }
 
-/// A map of now that is fresh for a minute, however slow the machine.
+/// A map captured now that is fresh for a minute, so that a slow machine does not matter.
 fn lasting(sequence: u64) -> Bytes {
     let mut map = v1::Map::decode(map(sequence, now_ns())).unwrap();
     map.header.as_mut().unwrap().valid_until_ns += 60_000_000_000;
     map.encode_to_vec().into()
 }
 
-async fn is_fresh(maps: &mut MapStream) -> (u64, u64, u64) {
+async fn next_fresh(maps: &mut MapStream) -> (u64, u64, u64) {
     match maps.next_or_stale().await.expect("a stream does not end with its server") {
         StreamEvent::Fresh(Update { map, skipped, lost, .. }) => (map.sequence(), skipped, lost),
-        StreamEvent::Stale(update) => panic!("map {} is told as stale", update.map.sequence()),
+        StreamEvent::Stale(update) => panic!("map {} is stale", update.map.sequence()),
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_cut_link_and_a_stopped_server_make_a_map_stale_and_the_stream_goes_on_when_they_are_back() {
+async fn a_stream_continues_after_a_cut_link_and_a_stopped_server() {
     let (first, endpoint) = server().await;
     let published = publisher(&first).await;
-    let wire = Wire::lay(&endpoint).await;
-    let client = ZenohClient::connect(&wire.endpoint).await.unwrap();
+    let link = Link::open(&endpoint).await;
+    let client = ZenohClient::connect(&link.endpoint).await.unwrap();
     let mut maps = client.subscribe("alpha", "drivability").await.unwrap();
     published.put(map(0, now_ns())).await.unwrap();
-    goes_stale(&mut maps, 0).await;
+    wait_stale(&mut maps, 0).await;
 
-    wire.cut().await;
+    link.cut().await;
     for sequence in 1..5 {
         published.put(lasting(sequence)).await.unwrap();
     }
-    wire.lay_to(&endpoint);
-    assert_eq!(is_fresh(&mut maps).await, (4, 3, 3), "the newest at once, and what was lost");
+    link.restore_to(&endpoint);
+    assert_eq!(next_fresh(&mut maps).await, (4, 3, 3), "the newest map, and the number of lost ones");
 
     published.put(map(5, now_ns())).await.unwrap();
-    goes_stale(&mut maps, 5).await;
-    wire.cut().await;
+    wait_stale(&mut maps, 5).await;
+    link.cut().await;
     first.close().await.unwrap();
     let (second, endpoint) = server().await;
     let published = publisher(&second).await;
     published.put(lasting(9)).await.unwrap();
-    wire.lay_to(&endpoint);
-    assert_eq!(is_fresh(&mut maps).await, (9, 3, 0), "another publisher counts anew");
+    link.restore_to(&endpoint);
+    assert_eq!(next_fresh(&mut maps).await, (9, 3, 0), "another publisher starts at 0");
     published.put(lasting(10)).await.unwrap();
-    assert_eq!(is_fresh(&mut maps).await, (10, 0, 0));
+    assert_eq!(next_fresh(&mut maps).await, (10, 0, 0));
 }

@@ -54,7 +54,8 @@ def test_a_slow_loop_body_gets_the_newest_map_and_the_skipped_count(transport):
 
 def test_deltas_of_a_region_at_a_rate_have_the_cells_of_whole_maps():
     wanted = dict(layers=["drivability", "terrain"], region=(0, 20, -8, 8))
-    with clearway.watch(GRPC, **wanted, deltas=True, max_rate_hz=5) as few, clearway.watch(GRPC, **wanted) as all_of_them:
+    few_maps = clearway.watch(GRPC, **wanted, deltas=True, max_rate_hz=5)
+    with few_maps as few, clearway.watch(GRPC, **wanted) as all_of_them:
         got = [next(few) for _ in range(3)]
         whole = {}
         while got[-1].sequence not in whole:

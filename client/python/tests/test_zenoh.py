@@ -45,8 +45,9 @@ def part(sequence, layer="drivability", valid_ns=LASTS_NS):
 def published(session, layer="drivability"):
     """Declares a publisher as the server does."""
     misses = ext.MissDetectionConfig(heartbeat=0.5, sporadic_heartbeat=None)
-    return ext.declare_advanced_publisher(session, KEY.format(layer), cache=ext.CacheConfig(1), publisher_detection=True,
-                                          sample_miss_detection=misses)  # fmt: skip
+    return ext.declare_advanced_publisher(
+        session, KEY.format(layer), cache=ext.CacheConfig(1), publisher_detection=True, sample_miss_detection=misses
+    )
 
 
 def watch(at, *layers):
@@ -146,14 +147,14 @@ class Wire:
 
     @staticmethod
     def _carry(of, to, laid):
-        # What comes after the cut is read by nobody.
+        # Data that arrive after the cut are not read.
         while laid.is_set() and (said := of.recv(65_536)) and laid.is_set():
             to.sendall(said)
 
     def cut(self):
         self._whole.clear()
 
-    def lay_anew(self):
+    def restore(self):
         self._whole = threading.Event()
         self._whole.set()
 
@@ -168,7 +169,7 @@ def test_a_stream_continues_after_a_cut_link_and_counts_lost_maps(server, endpoi
         wire.cut()
         for sequence in range(1, 5):
             publisher.put(part(sequence))
-        wire.lay_anew()
+        wire.restore()
         m = maps.next_or_stale()
         assert not m.stale and counts(m) == (4, 3, 3), "the newest map, and the number of lost ones"
         publisher.put(part(5))
