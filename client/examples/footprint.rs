@@ -1,4 +1,5 @@
-//! Is there room for the vehicle ahead? `cargo run -p clearway-client --example footprint -- [ADDRESS]`
+//! Prints how far the ground ahead is free for a vehicle. `cargo run -p clearway-client --example footprint --
+//! [ADDRESS]`
 
 use clearway_client::{Client, Footprint, Subscription, now_ns};
 
@@ -11,7 +12,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
     loop {
         let map = maps.next().await?.map;
         let mut room_m = None;
-        // A map that is too old says nothing of now.
+        // A stale map does not describe the present scene.
         if !map.is_stale(now_ns()) {
             for x_m in (6..40).map(f64::from) {
                 if !map.is_free("occupancy", &Footprint { x_m, ..car })? {

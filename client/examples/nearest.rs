@@ -1,4 +1,5 @@
-//! What is the nearest obstacle, and where? `cargo run -p clearway-client --example nearest -- [ADDRESS]`
+//! Prints the distance and direction of the nearest obstacle. `cargo run -p clearway-client --example nearest --
+//! [ADDRESS]`
 
 use clearway_client::{Client, Subscription, now_ns};
 
@@ -14,8 +15,8 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
             Some(obstacle) => {
                 let bearing_deg = obstacle.bearing_rad.to_degrees();
                 let side = if bearing_deg < 0.0 { "right" } else { "left" };
-                let (distance_m, turn_deg) = (obstacle.distance_m, bearing_deg.abs());
-                println!("{age_ms:.0} ms ago: {distance_m:.1} m away, {turn_deg:.0} degrees to the {side}");
+                let (distance_m, angle_deg) = (obstacle.distance_m, bearing_deg.abs());
+                println!("{age_ms:.0} ms ago: {distance_m:.1} m away, {angle_deg:.0} degrees to the {side}");
             }
             None => println!("{age_ms:.0} ms ago: none known"),
         }

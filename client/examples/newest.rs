@@ -1,4 +1,4 @@
-//! Follows the newest map: `cargo run -p clearway-client --example newest -- [ADDRESS]`
+//! Prints a line for each new map: `cargo run -p clearway-client --example newest -- [ADDRESS]`
 
 use clearway_client::{Client, Subscription, now_ns};
 

@@ -7,7 +7,8 @@ use clearway_proto::map::MapError;
 pub enum ClientError {
     /// The text is not an address, or a certificate is invalid.
     #[error(
-        "server address {address:?}: {reason}; HOST:PORT or http://HOST:PORT is allowed, such as localhost:50051, and https://HOST:PORT with certificates"
+        "server address {address:?}: {reason}; HOST:PORT or http://HOST:PORT is allowed, such as localhost:50051, \
+         and https://HOST:PORT with certificates"
     )]
     Address {
         /// The text as given.

@@ -218,8 +218,8 @@ fn nearest_in(grid: &Grid, cell: usize, [x, y]: [f64; 2]) -> [f64; 2] {
             let (row, column) = (cell / *columns as usize, (cell % *columns as usize) as f64);
             let (inner, outer) =
                 (if row == 0 { 0.0 } else { f64::from(row_radius_m[row - 1]) }, f64::from(row_radius_m[row]));
-            let turn = (y.atan2(x) / TAU).rem_euclid(1.0) * f64::from(*columns);
-            if (column..=column + 1.0).contains(&turn) {
+            let position = (y.atan2(x) / TAU).rem_euclid(1.0) * f64::from(*columns);
+            if (column..=column + 1.0).contains(&position) {
                 let range_m = x.hypot(y).clamp(inner, outer);
                 let (sin, cos) = y.atan2(x).sin_cos();
                 return [range_m * cos, range_m * sin];

@@ -248,7 +248,7 @@ async fn receive_maps(
             }
             Err(error) => {
                 let Some(acknowledged) = sequence_of_delta(update.map) else { return error };
-                tracing::debug!(sequence = acknowledged, %error, "the base of a delta is missing; a keyframe is requested");
+                tracing::debug!(sequence = acknowledged, %error, "a keyframe is requested: a base is missing");
                 // More deltas may be in flight; one request is enough for all of them.
                 let request_keyframe = !std::mem::replace(&mut is_requested, true);
                 v1::WatchRequest { acknowledged: Some(acknowledged), request_keyframe, selection: None }

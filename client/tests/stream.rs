@@ -1,4 +1,4 @@
-//! A client against a small service in this process.
+//! The gRPC client with a scripted service in this process.
 
 mod common;
 
@@ -18,7 +18,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 type Updates = Vec<Result<v1::MapUpdate, Status>>;
 
-/// A service that sends the given updates, and forwards every request that it receives to the test.
+/// A service that sends returned updates and forwards every request to the test.
 struct Script {
     updates: Mutex<Updates>,
     requests: mpsc::UnboundedSender<v1::WatchRequest>,
@@ -33,10 +33,10 @@ impl MapService for Script {
         request: Request<Streaming<v1::WatchRequest>>,
     ) -> Result<Response<Self::WatchStream>, Status> {
         let mut requests = request.into_inner();
-        let told = self.requests.clone();
+        let received = self.requests.clone();
         tokio::spawn(async move {
             while let Ok(Some(request)) = requests.message().await {
-                let _ = told.send(request);
+                let _ = received.send(request);
             }
         });
         let updates = std::mem::take(&mut *self.updates.lock().unwrap());
@@ -62,11 +62,11 @@ impl MapService for Script {
 async fn serve(updates: Updates) -> (String, mpsc::UnboundedReceiver<v1::WatchRequest>) {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap().to_string();
-    let (requests, told) = mpsc::unbounded_channel();
+    let (requests, received) = mpsc::unbounded_channel();
     let service = MapServiceServer::new(Script { updates: Mutex::new(updates), requests });
     let incoming = tonic::transport::server::TcpIncoming::from(listener);
     tokio::spawn(tonic::transport::Server::builder().add_service(service).serve_with_incoming(incoming));
-    (address, told)
+    (address, received)
 }
 
 fn update(sequence: u64, skipped: u64) -> Result<v1::MapUpdate, Status> {
@@ -75,21 +75,21 @@ fn update(sequence: u64, skipped: u64) -> Result<v1::MapUpdate, Status> {
 
 #[tokio::test]
 async fn every_map_is_acknowledged_and_skipped_maps_are_counted() {
-    let (address, mut told) = serve(vec![update(0, 0), update(3, 2), update(4, 0)]).await;
+    let (address, mut received) = serve(vec![update(0, 0), update(3, 2), update(4, 0)]).await;
     let client = Client::connect(&address).await.unwrap();
     let layers = vec!["drivability".to_string()];
     let mut maps = client.subscribe(Subscription { layers: layers.clone(), ..Default::default() }).await.unwrap();
-    let selection = told.recv().await.unwrap().selection.unwrap();
+    let selection = received.recv().await.unwrap().selection.unwrap();
     assert_eq!(selection, v1::Selection { vehicle: String::new(), layers, max_in_flight: 2, ..Default::default() });
     for sequence in [0, 3, 4] {
-        assert_eq!(told.recv().await.unwrap().acknowledged, Some(sequence));
+        assert_eq!(received.recv().await.unwrap().acknowledged, Some(sequence));
     }
-    // At whatever times the client calls `next`, every map is either returned or counted as skipped.
-    let (mut given, mut skipped, mut newest) = (0, 0, None);
+    // Every map is either returned or counted, whatever the timing of the reader and the updates.
+    let (mut returned, mut skipped, mut newest) = (0, 0, None);
     let ended = loop {
         match maps.next().await {
             Ok(update) => {
-                given += 1;
+                returned += 1;
                 skipped += update.skipped;
                 newest = Some(update.map.sequence());
             }
@@ -98,56 +98,56 @@ async fn every_map_is_acknowledged_and_skipped_maps_are_counted() {
     };
     assert!(matches!(ended, ClientError::Ended { .. }), "{ended}");
     assert_eq!(newest, Some(4));
-    assert!(given >= 1 && given + skipped <= 5, "{given} given, {skipped} skipped of 5");
+    assert!(returned >= 1 && returned + skipped <= 5, "{returned} returned, {skipped} skipped of 5");
     assert_eq!(maps.newest().unwrap().sequence(), 4);
 }
 
-/// The map of that sequence as a delta against another.
+/// Map `sequence` as a delta to map `base_sequence`.
 fn delta(sequence: u64, base_sequence: u64) -> Result<v1::MapUpdate, Status> {
     let [base, map] = [base_sequence, sequence].map(|sequence| v1::Map::decode(map(sequence, CAPTURE_END_NS)).unwrap());
-    let layer =
-        encode_delta(&base.layers[0], base_sequence, &map.layers[0], &Limits::default()).expect("no change is short");
+    let layer = encode_delta(&base.layers[0], base_sequence, &map.layers[0], &Limits::default())
+        .expect("a delta without changes is small");
     let bytes = [encode_header(&map.header.unwrap()), encode_layer(&layer)].concat();
     Ok(v1::MapUpdate { map: bytes.into(), ..Default::default() })
 }
 
 #[tokio::test]
-async fn a_lost_update_leads_to_a_whole_map_and_never_to_a_wrong_cell() {
-    // Map 1 is lost. Map 3 is already sent when the server receives the request for a keyframe.
-    let (address, mut told) = serve(vec![update(0, 0), delta(2, 1), delta(3, 2), update(4, 0), delta(5, 4)]).await;
+async fn a_lost_update_requests_a_keyframe_and_gives_no_wrong_cell() {
+    // Map 1 is lost; map 3 is already in flight when the server gets the request.
+    let (address, mut received) = serve(vec![update(0, 0), delta(2, 1), delta(3, 2), update(4, 0), delta(5, 4)]).await;
     let client = Client::connect(&address).await.unwrap();
     let mut maps = client.subscribe(Subscription { deltas: true, ..Default::default() }).await.unwrap();
-    assert!(told.recv().await.unwrap().selection.unwrap().deltas);
+    assert!(received.recv().await.unwrap().selection.unwrap().deltas);
     for (sequence, request_keyframe) in [(0, false), (2, true), (3, false), (4, false), (5, false)] {
-        let request = told.recv().await.unwrap();
+        let request = received.recv().await.unwrap();
         assert_eq!((request.acknowledged, request.request_keyframe), (Some(sequence), request_keyframe));
     }
-    let (mut given, mut skipped) = (Vec::new(), 0);
+    let (mut returned, mut skipped) = (Vec::new(), 0);
     while let Ok(update) = maps.next().await {
         let layer = update.map.layer("drivability").unwrap();
         assert_eq!(layer.class_at(10.0, -10.0), (3, "obstacle"));
-        given.push(update.map.sequence());
+        returned.push(update.map.sequence());
         skipped += update.skipped;
     }
-    assert!(given.iter().all(|sequence| [0, 4, 5].contains(sequence)), "{given:?}");
-    assert_eq!(given.last(), Some(&5));
-    assert_eq!(given[0] + given.len() as u64 + skipped, 6, "{given:?}, and {skipped} are counted as skipped");
+    assert!(returned.iter().all(|sequence| [0, 4, 5].contains(sequence)), "{returned:?}");
+    assert_eq!(returned.last(), Some(&5));
+    assert_eq!(returned[0] + returned.len() as u64 + skipped, 6, "{returned:?}, and {skipped} skipped");
 }
 
 #[tokio::test]
-async fn a_delta_that_was_not_requested_is_not_shown() {
-    let (address, mut told) = serve(vec![delta(2, 1), update(3, 0)]).await;
+async fn an_unrequested_delta_without_its_base_requests_a_keyframe() {
+    let (address, mut received) = serve(vec![delta(2, 1), update(3, 0)]).await;
     let client = Client::connect(&address).await.unwrap();
     let mut maps = client.subscribe(Subscription::default()).await.unwrap();
-    told.recv().await.unwrap();
-    assert!(told.recv().await.unwrap().request_keyframe);
+    received.recv().await.unwrap();
+    assert!(received.recv().await.unwrap().request_keyframe);
     assert_eq!(maps.next().await.unwrap().map.sequence(), 3);
 }
 
 #[tokio::test]
-async fn an_invalid_map_ends_the_stream_and_is_not_shown() {
-    let spoilt = v1::MapUpdate { map: map(1, CAPTURE_END_NS).slice(..100), ..Default::default() };
-    let (address, _told) = serve(vec![Ok(spoilt)]).await;
+async fn an_invalid_map_ends_the_stream() {
+    let corrupt = v1::MapUpdate { map: map(1, CAPTURE_END_NS).slice(..100), ..Default::default() };
+    let (address, _received) = serve(vec![Ok(corrupt)]).await;
     let client = Client::connect(&address).await.unwrap();
     let mut maps = client.subscribe(Subscription::default()).await.unwrap();
     let error = maps.next().await.unwrap_err();
@@ -156,8 +156,8 @@ async fn an_invalid_map_ends_the_stream_and_is_not_shown() {
 }
 
 #[tokio::test]
-async fn the_error_of_a_call_contains_the_servers_message() {
-    let (address, _told) = serve(vec![Err(Status::unavailable("the vehicle's engine has stopped"))]).await;
+async fn an_error_contains_the_message_of_the_server() {
+    let (address, _received) = serve(vec![Err(Status::unavailable("the vehicle's engine has stopped"))]).await;
     let client = Client::connect(&format!("http://{address}")).await.unwrap();
     assert_eq!(client.vehicles().await.unwrap()[0].name, "alpha");
     assert_eq!(client.newest("alpha", &[]).await.unwrap().sequence(), 9);
@@ -169,7 +169,7 @@ async fn the_error_of_a_call_contains_the_servers_message() {
 }
 
 #[tokio::test]
-async fn a_bad_address_is_refused_with_the_allowed_forms() {
+async fn an_invalid_address_is_refused_with_what_is_allowed() {
     for address in ["localhost", "localhost:", ":50051", "localhost:70000", "https://localhost:1", "a b:1"] {
         let error = Client::connect(address).await.unwrap_err();
         assert!(matches!(error, ClientError::Address { .. }), "{address}: {error}");

@@ -1,4 +1,4 @@
-//! Look-ups in metres and age.
+//! Look-ups at points in metres, and the age of a map.
 
 mod common;
 
@@ -10,7 +10,7 @@ fn view() -> MapView {
 }
 
 #[test]
-fn the_class_at_a_point_is_that_of_the_cell_around_it() {
+fn the_class_at_a_point_is_that_of_its_cell() {
     let view = view();
     let layer = view.layer("drivability").unwrap();
     let expected = [
@@ -20,13 +20,13 @@ fn the_class_at_a_point_is_that_of_the_cell_around_it() {
         ((5.0, -5.0), "drivable"),
         ((10.0, -10.0), "obstacle"),
         ((20.0, -15.0), "drivable"),
-        // A bench belongs to the row inside of it, a column starts at its azimuth.
+        // An outer radius belongs to its row; a column starts at its azimuth.
         ((10.0, 0.0), "drivable"),
         ((0.0, 15.0), "not_drivable"),
         ((0.0, -10.0), "drivable"),
         ((0.0, -10.1), "obstacle"),
         ((0.0, 0.0), "drivable"),
-        // Outside of the grid, and nowhere.
+        // Outside the grid, and not finite.
         ((30.1, 0.0), "unknown"),
         ((-25.0, 25.0), "unknown"),
         ((f64::NAN, 0.0), "unknown"),
@@ -39,7 +39,7 @@ fn the_class_at_a_point_is_that_of_the_cell_around_it() {
 }
 
 #[test]
-fn a_value_is_scaled_and_nothing_where_it_is_unknown() {
+fn a_value_is_scaled_and_none_if_unknown() {
     let view = view();
     let layer = view.layer("drivability").unwrap();
     assert_eq!(layer.value_at("unit_height", 10.0, -10.0), Some(3.5));
@@ -49,7 +49,7 @@ fn a_value_is_scaled_and_nothing_where_it_is_unknown() {
 }
 
 #[test]
-fn a_map_is_stale_when_its_validity_has_passed_or_its_age_is_not_known() {
+fn a_map_is_stale_after_its_validity_or_if_its_age_is_unknown() {
     let view = view();
     let ms = 1_000_000;
     assert_eq!(view.age_ms(CAPTURE_END_NS + 40 * ms), 40.0);
@@ -57,12 +57,12 @@ fn a_map_is_stale_when_its_validity_has_passed_or_its_age_is_not_known() {
     assert!(!view.is_stale(CAPTURE_END_NS + 300 * ms));
     assert!(view.is_stale(CAPTURE_END_NS + 300 * ms + 1));
     assert!(!view.is_stale(CAPTURE_END_NS - 300 * ms), "clocks may differ a little");
-    assert!(view.is_stale(CAPTURE_END_NS - 301 * ms), "a clock this far behind cannot tell the age");
+    assert!(view.is_stale(CAPTURE_END_NS - 301 * ms), "the age is not known by a clock this far behind");
     assert!(view.is_stale(i64::MAX) && view.is_stale(i64::MIN));
 }
 
 #[test]
-fn an_unknown_layer_is_named_with_those_there_are() {
+fn an_unknown_layer_is_refused_with_the_present_ones() {
     match view().layer("roughness") {
         Err(ClientError::NoLayer { layer, present }) => {
             assert_eq!((layer.as_str(), present), ("roughness", vec!["drivability".to_string()]));

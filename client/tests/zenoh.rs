@@ -1,4 +1,4 @@
-//! A client against a zenoh session in this process.
+//! The zenoh client with a zenoh session in this process.
 
 mod common;
 
@@ -48,7 +48,7 @@ async fn next(maps: &mut MapStream) -> (u64, u64, u64) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_stream_begins_with_the_newest_map_and_outlives_its_client() {
+async fn a_stream_starts_with_the_newest_map_and_survives_its_client() {
     let (server, endpoint) = server().await;
     let _token = server.liveliness().declare_token("clearway/alpha").await.unwrap();
     let queries = server.declare_queryable(KEY).await.unwrap();
@@ -68,14 +68,14 @@ async fn a_stream_begins_with_the_newest_map_and_outlives_its_client() {
     drop(client);
     assert_eq!(next(&mut maps).await, (41, 0, 0));
 
-    // The subscription may reach the publisher after the answer.
+    // The subscription may reach the publisher later than the query.
     let matching = publisher.matching_listener().await.unwrap();
     while !publisher.matching_status().await.unwrap().matching() {
         matching.recv_async().await.unwrap();
     }
     publisher.put(map(40, CAPTURE_END_NS)).await.unwrap();
     publisher.put(map(44, CAPTURE_END_NS)).await.unwrap();
-    assert_eq!(next(&mut maps).await, (44, 2, 0), "an old map is not returned, and missing maps are counted");
+    assert_eq!(next(&mut maps).await, (44, 2, 0), "an old map is ignored and gaps are counted");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -113,26 +113,26 @@ async fn lost_maps_are_counted_and_a_lost_last_map_is_queried() {
     assert!(matches!(queries.try_recv(), Ok(None)), "there is no query without a reason");
 }
 
-/// A wire between client and server that the test cuts, and lays to another server.
-struct Wire {
+/// A connection between client and server that the test cuts, and restores to another server.
+struct Link {
     endpoint: String,
-    /// Address of the server; `None` while the wire is cut. Then no data pass, and neither side is notified.
+    /// Address of the server; `None` while the link is cut: then no data pass and neither side is notified.
     to: watch::Sender<Option<String>>,
-    /// Locked for reading while data may pass.
+    /// Held as a reader while data may pass.
     passing: Arc<RwLock<()>>,
 }
 
-impl Wire {
-    async fn lay(to: &str) -> Self {
+impl Link {
+    async fn open(to: &str) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let endpoint = format!("tcp/{}", listener.local_addr().unwrap());
-        let (to, leads) = watch::channel(Some(to.replace("tcp/", "")));
+        let (to, target) = watch::channel(Some(to.replace("tcp/", "")));
         let passing = Arc::new(RwLock::new(()));
         tokio::spawn({
             let passing = passing.clone();
             async move {
                 while let Ok((near, _)) = listener.accept().await {
-                    tokio::spawn(pass(near, leads.clone(), passing.clone()));
+                    tokio::spawn(forward(near, target.clone(), passing.clone()));
                 }
             }
         });
@@ -144,28 +144,28 @@ impl Wire {
         let _nothing_passes = self.passing.write().await;
     }
 
-    fn lay_to(&self, to: &str) {
+    fn restore_to(&self, to: &str) {
         self.to.send_replace(Some(to.replace("tcp/", "")));
     }
 }
 
-/// Copies the data of one connection until it is cut.
-async fn pass(mut near: TcpStream, mut leads: watch::Receiver<Option<String>>, passing: Arc<RwLock<()>>) {
-    let to = leads.borrow_and_update().clone();
+/// Forwards one connection until the link is cut.
+async fn forward(mut near: TcpStream, mut target: watch::Receiver<Option<String>>, passing: Arc<RwLock<()>>) {
+    let to = target.borrow_and_update().clone();
     if let Some(to) = to {
         let _passing = passing.read().await;
         let Ok(mut far) = TcpStream::connect(to).await else { return };
         tokio::select! {
             _ = tokio::io::copy_bidirectional(&mut near, &mut far) => return,
-            _ = leads.changed() => {}
+            _ = target.changed() => {}
         }
     }
-    // The connection is cut: it stays open and unread until the test ends, so only the silence shows the cut.
-    while leads.changed().await.is_ok() {}
+    // The link is cut: the connection stays open without data until the test ends.
+    while target.changed().await.is_ok() {}
 }
 
-/// Waits until the stream reports this map as stale. The stream must not end, and no other map may come.
-async fn goes_stale(maps: &mut MapStream, sequence: u64) {
+/// Waits until the stream reports that this map is stale; it must not end or return another map.
+async fn wait_stale(maps: &mut MapStream, sequence: u64) {
     loop {
         match maps.next_or_stale().await.expect("a stream does not end with its server") {
             StreamEvent::Fresh(update) => assert_eq!(update.map.sequence(), sequence),
@@ -178,46 +178,46 @@ async fn goes_stale(maps: &mut MapStream, sequence: u64) {
     }
 }
 
-/// A map with the current time that is valid for a minute, so that it stays fresh on a slow machine.
+/// A map captured now that is fresh for a minute, so that a slow machine does not matter.
 fn lasting(sequence: u64) -> Bytes {
     let mut map = v1::Map::decode(map(sequence, now_ns())).unwrap();
     map.header.as_mut().unwrap().valid_until_ns += 60_000_000_000;
     map.encode_to_vec().into()
 }
 
-async fn is_fresh(maps: &mut MapStream) -> (u64, u64, u64) {
+async fn next_fresh(maps: &mut MapStream) -> (u64, u64, u64) {
     match maps.next_or_stale().await.expect("a stream does not end with its server") {
         StreamEvent::Fresh(Update { map, skipped, lost, .. }) => (map.sequence(), skipped, lost),
-        StreamEvent::Stale(update) => panic!("map {} is reported as stale", update.map.sequence()),
+        StreamEvent::Stale(update) => panic!("map {} is stale", update.map.sequence()),
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_stream_is_stale_while_its_server_is_unreachable_and_then_continues() {
+async fn a_stream_continues_after_a_cut_link_and_a_stopped_server() {
     let (first, endpoint) = server().await;
     let published = publisher(&first).await;
-    let wire = Wire::lay(&endpoint).await;
-    let client = ZenohClient::connect(&wire.endpoint).await.unwrap();
+    let link = Link::open(&endpoint).await;
+    let client = ZenohClient::connect(&link.endpoint).await.unwrap();
     let mut maps = client.subscribe("alpha", "drivability").await.unwrap();
     published.put(map(0, now_ns())).await.unwrap();
-    goes_stale(&mut maps, 0).await;
+    wait_stale(&mut maps, 0).await;
 
-    wire.cut().await;
+    link.cut().await;
     for sequence in 1..5 {
         published.put(lasting(sequence)).await.unwrap();
     }
-    wire.lay_to(&endpoint);
-    assert_eq!(is_fresh(&mut maps).await, (4, 3, 3), "the newest map, and the number of lost ones");
+    link.restore_to(&endpoint);
+    assert_eq!(next_fresh(&mut maps).await, (4, 3, 3), "the newest map, and the number of lost ones");
 
     published.put(map(5, now_ns())).await.unwrap();
-    goes_stale(&mut maps, 5).await;
-    wire.cut().await;
+    wait_stale(&mut maps, 5).await;
+    link.cut().await;
     first.close().await.unwrap();
     let (second, endpoint) = server().await;
     let published = publisher(&second).await;
     published.put(lasting(9)).await.unwrap();
-    wire.lay_to(&endpoint);
-    assert_eq!(is_fresh(&mut maps).await, (9, 3, 0), "the count of lost maps starts again with another publisher");
+    link.restore_to(&endpoint);
+    assert_eq!(next_fresh(&mut maps).await, (9, 3, 0), "another publisher starts at 0");
     published.put(lasting(10)).await.unwrap();
-    assert_eq!(is_fresh(&mut maps).await, (10, 0, 0));
+    assert_eq!(next_fresh(&mut maps).await, (10, 0, 0));
 }

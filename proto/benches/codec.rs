@@ -1,5 +1,5 @@
-//! Cells to payload and back: 160,000 cells (400 x 400) of a drivability-like map, and of noise; a layer of them as a
-//! delta to the one before, from which it has scrolled by 3 cells.
+//! Cells <-> payload: 160,000 cells (400 x 400) that resemble a drivability map, with noise; and a layer of them as a
+//! delta to the layer before, from which it has scrolled by 3 cells.
 
 use clearway_proto::by_class::encode_beside;
 use clearway_proto::codec::{self, Cells, Limits};
@@ -11,7 +11,7 @@ use divan::{Bencher, counter::ItemsCount};
 
 const SIDE: usize = 400;
 
-/// Three classes in blobs, and `noise` per thousand of stray cells.
+/// Three classes in patches, and `noise` stray cells per thousand.
 fn scene(noise: u32) -> Cells {
     let mut state = 1_u32;
     let mut random = || {
@@ -42,7 +42,7 @@ fn decode(bencher: Bencher, noise: u32) {
         .bench(|| codec::decode(divan::black_box(&channel), SIDE, &Limits::default()));
 }
 
-/// A channel that goes with the classes but in `noise` per thousand of the cells.
+/// A channel with one value per class, except in `noise` cells per thousand.
 #[divan::bench(args = [0, 20])]
 fn encode_by_class(bencher: Bencher, noise: u32) {
     let (Cells::U8(class), Cells::U8(noisy)) = (scene(0), scene(noise)) else { unreachable!("scene() gives u8") };
@@ -52,7 +52,7 @@ fn encode_by_class(bencher: Bencher, noise: u32) {
     bencher.counter(ItemsCount::new(SIDE * SIDE)).bench(|| encode_beside(divan::black_box(hits), &class, 4, SIDE));
 }
 
-/// The scene as a layer whose first cell is cell (`first_ix`, 0) of the world.
+/// The scene as a layer whose cell (0, 0) has the number (`first_ix`, 0).
 fn layer(first_ix: i64) -> v1::Layer {
     let Cells::U8(scene) = scene(0) else { unreachable!("scene() gives u8") };
     let shift = first_ix as usize;

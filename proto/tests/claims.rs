@@ -1,5 +1,5 @@
-//! A decoder refuses false claims before it allocates memory for them: it allocates at most the length of the payload and
-//! 64 KiB, however many cells a channel or map claims.
+//! A decoder refuses false claims before it allocates memory for them: it allocates at most the length of the payload
+//! and 64 KiB, however many cells a channel or map claims.
 
 use bytes::Bytes;
 use clearway_proto::codec::{self, Limits};

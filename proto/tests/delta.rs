@@ -6,7 +6,7 @@ use bytes::Bytes;
 use clearway_proto::codec::{Cells, CellsRef, Limits, encode_grid};
 use clearway_proto::delta::encode_delta;
 use clearway_proto::grid::Grid;
-use clearway_proto::map::{self, Map, MapError, decode_map, decode_map_on};
+use clearway_proto::map::{self, Channel, Map, MapError, decode_map, decode_map_on};
 use clearway_proto::region::{self, RegionError};
 use clearway_proto::v1::layer::Geometry;
 use clearway_proto::v1::{self, ClassMeaning};
@@ -121,7 +121,8 @@ proptest! {
         seed in any::<u64>(), base_of_delta in 0..6_u64, scroll in [-2..3_i64, -2..3_i64],
     ) {
         let at = |time: u64| layer(seed, time, scroll.map(|step| step * time as i64), [40, 30]);
-        let delta = encode_delta(&at(base_of_delta), base_of_delta, &at(6), &LIMITS()).expect("40 x 30 cells of which few change");
+        let delta = encode_delta(&at(base_of_delta), base_of_delta, &at(6), &LIMITS());
+        let delta = delta.expect("40 x 30 cells of which few change");
         let whole = decode(6, &at(6), None).unwrap();
         for given in 0..6 {
             let base = decode(given, &at(given), None).unwrap();
@@ -133,7 +134,9 @@ proptest! {
             let foreign = decode(base_of_delta, &at(given), None).unwrap();
             match decode(6, &delta, Some(&foreign)) {
                 Ok(map) => prop_assert_eq!(&map, &whole),
-                Err(refused) => prop_assert!(given != base_of_delta && ["cells", "class"].contains(&refused.name()), "{refused}"),
+                Err(refused) => {
+                    prop_assert!(given != base_of_delta && ["cells", "class"].contains(&refused.name()), "{refused}");
+                }
             }
         }
     }
@@ -143,7 +146,8 @@ proptest! {
         changes in proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 1..5),
     ) {
         let base = decode(41, &layer(3, 1, [5, 5], [20, 20]), None).unwrap();
-        let delta = encode_delta(&layer(3, 1, [5, 5], [20, 20]), 41, &layer(3, 2, [6, 3], [20, 20]), &LIMITS()).unwrap();
+        let [before, now] = [layer(3, 1, [5, 5], [20, 20]), layer(3, 2, [6, 3], [20, 20])];
+        let delta = encode_delta(&before, 41, &now, &LIMITS()).unwrap();
         let mut bytes = bytes(&header(42), &delta).to_vec();
         for (at, byte) in changes {
             let at = at.index(bytes.len());
@@ -152,21 +156,24 @@ proptest! {
         if let Ok(map) = decode_map_on(bytes.into(), Some(&base), &LIMITS()) {
             for layer in &map.layers {
                 layer.class_at(3.0, 4.0);
-                prop_assert!(layer.channels.iter().all(|channel| channel.cells.len() as u64 == layer.grid.cell_count()));
+                let has_all_cells = |channel: &Channel| channel.cells.len() as u64 == layer.grid.cell_count();
+                prop_assert!(layer.channels.iter().all(has_all_cells));
             }
         }
     }
 
     #[test]
     fn a_part_has_the_cells_of_the_whole_and_all_cells_of_the_region(
-        seed in any::<u64>(), yaw_rad in -4.0..4.0_f64, from in [-9.0..9.0_f64, -9.0..9.0_f64], size in [0.1..12.0_f64, 0.1..12.0_f64],
+        seed in any::<u64>(), yaw_rad in -4.0..4.0_f64,
+        from in [-9.0..9.0_f64, -9.0..9.0_f64], size in [0.1..12.0_f64, 0.1..12.0_f64],
     ) {
         let mut whole = layer(seed, 1, [-17, 4], [30, 20]);
         let grid = cartesian(&mut whole);
         (grid.yaw_rad, grid.origin_x_m, grid.origin_y_m) = (yaw_rad, -7.3, -4.9);
-        let wanted = v1::Region { x_from_m: from[0], x_to_m: from[0] + size[0], y_from_m: from[1], y_to_m: from[1] + size[1] };
+        let wanted = rectangle(from, size);
         let all = decode(1, &whole, None).unwrap();
-        let inside = |x: f64, y: f64| wanted.x_from_m <= x && x <= wanted.x_to_m && wanted.y_from_m <= y && y <= wanted.y_to_m;
+        let v1::Region { x_from_m, x_to_m, y_from_m, y_to_m } = wanted;
+        let inside = |x: f64, y: f64| x_from_m <= x && x <= x_to_m && y_from_m <= y && y <= y_to_m;
         let middles = (0..600).filter_map(|cell| all.layers[0].grid.centre_of(cell)).filter(|&(x, y)| inside(x, y));
         match region::crop(&whole, &wanted, &LIMITS()) {
             Err(refused) => {
@@ -178,10 +185,11 @@ proptest! {
                 for (x, y) in middles {
                     prop_assert!(part.layers[0].grid.cell_at(x, y).is_some());
                 }
-                for cell in 0..part.layers[0].grid.cell_count() as usize {
-                    let (x, y) = part.layers[0].grid.centre_of(cell).unwrap();
-                    prop_assert_eq!(part.layers[0].class_at(x, y), all.layers[0].class_at(x, y));
-                    prop_assert_eq!(part.layers[0].value_at("unit_height", x, y), all.layers[0].value_at("unit_height", x, y));
+                let (part, all) = (&part.layers[0], &all.layers[0]);
+                for cell in 0..part.grid.cell_count() as usize {
+                    let (x, y) = part.grid.centre_of(cell).unwrap();
+                    prop_assert_eq!(part.class_at(x, y), all.class_at(x, y));
+                    prop_assert_eq!(part.value_at("unit_height", x, y), all.value_at("unit_height", x, y));
                 }
             }
         }
@@ -189,13 +197,13 @@ proptest! {
 
     #[test]
     fn a_radial_part_equals_the_whole_in_the_region_and_is_unknown_elsewhere(
-        seed in any::<u64>(), columns in 1..40_u32, from in [-12.0..9.0_f64, -12.0..9.0_f64], size in [0.1..14.0_f64, 0.1..14.0_f64],
-        on_axis in 0..4,
+        seed in any::<u64>(), columns in 1..40_u32, on_axis in 0..4,
+        from in [-12.0..9.0_f64, -12.0..9.0_f64], size in [0.1..14.0_f64, 0.1..14.0_f64],
     ) {
         // Some regions have an edge or a corner at the vehicle.
         let from = [0, 1].map(|axis| if on_axis & (1 << axis) == 0 { from[axis] } else { 0.0 });
         let whole = radial(layer(seed, 1, [0, 0], [columns, 5]), vec![2.0, 5.0, 6.0, 9.0, 11.0]);
-        let wanted = v1::Region { x_from_m: from[0], x_to_m: from[0] + size[0], y_from_m: from[1], y_to_m: from[1] + size[1] };
+        let wanted = rectangle(from, size);
         let Ok(part) = region::crop(&whole, &wanted, &LIMITS()) else { return Ok(()) };
         let (part, all) = (decode(1, &part, None).unwrap(), decode(1, &whole, None).unwrap());
         let (part, all) = (&part.layers[0], &all.layers[0]);
@@ -211,6 +219,10 @@ proptest! {
             }
         }
     }
+}
+
+fn rectangle(from: [f64; 2], size: [f64; 2]) -> v1::Region {
+    v1::Region { x_from_m: from[0], x_to_m: from[0] + size[0], y_from_m: from[1], y_to_m: from[1] + size[1] }
 }
 
 /// `layer` with a radial grid.

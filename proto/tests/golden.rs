@@ -124,7 +124,7 @@ fn bad_vectors() -> Vec<Bad> {
         ("rows_number_with_33_zeros", "Overlong", u8_, rows, 9, vec![0, 0, 0, 0, 0x40]),
         // Copy 0 (1), another value (0), which is 256 (00000000 100000001), a run of 9 (0001001).
         ("rows_u8_256", "ValueTooLarge", u8_, rows, 9, vec![0b1000_0000, 0b0010_0000, 0b0010_0010, 0b0100_0000]),
-        ("rows_i8_zigzag_256", "ValueTooLarge", i8_, rows, 9, vec![0b1000_0000, 0b0010_0000, 0b0010_0010, 0b0100_0000]),
+        ("rows_i8_zigzag_256", "ValueTooLarge", i8_, rows, 9, vec![0x80, 0x20, 0x22, 0x40]),
         // The same with 65536.
         ("rows_u16_65536", "ValueTooLarge", u16_, rows, 9, vec![0x80, 0, 0x20, 0, 0x60]),
         // Copy 0 (1), another value (0), which is 0 (1): the same as before the first row; a run of 9 (0001001).
@@ -201,7 +201,8 @@ fn every_bad_channel_is_refused_with_its_error() {
         let refused = codec::decode(&channel, 3, &Limits::default()).expect_err(name);
         assert!(format!("{refused:?}").starts_with(variant), "{name}: {refused:?}");
         vectors.push(json!({
-            "name": name, "error": refused.name(), "cell_type": cell_type, "encoding": encoding, "cell_count": cell_count,
+            "name": name, "error": refused.name(),
+            "cell_type": cell_type, "encoding": encoding, "cell_count": cell_count,
             "columns": 3, "crc32": 0, "payload_hex": payload_hex,
         }));
     }
@@ -322,11 +323,20 @@ fn the_golden_map_is_its_header_and_its_layers_concatenated() {
         .map(|layer| {
             let channels = layer.channels.iter();
             let channels: Vec<_> = channels
-                .map(|c| json!({"name": c.name, "unit": c.unit, "scale": c.scale, "unknown": c.unknown, "cells_value_length": spans(&c.cells)}))
+                .map(|c| {
+                    let cells = spans(&c.cells);
+                    json!({
+                        "name": c.name, "unit": c.unit, "scale": c.scale, "unknown": c.unknown,
+                        "cells_value_length": cells,
+                    })
+                })
                 .collect();
             let (rows, columns) = layer.grid.shape();
-            let points: Vec<_> =
-                layer.points.iter().map(|p| json!({"x_m": p.x_m, "y_m": p.y_m, "radius_m": p.radius_m, "links": p.links})).collect();
+            let points: Vec<_> = layer
+                .points
+                .iter()
+                .map(|p| json!({"x_m": p.x_m, "y_m": p.y_m, "radius_m": p.radius_m, "links": p.links}))
+                .collect();
             let names: Vec<_> = layer.legend.iter().map(|class| &class.name).collect();
             let meanings: Vec<_> = layer.legend.iter().map(|class| class.meaning.as_str_name()).collect();
             let colours: Vec<_> = layer.legend.iter().map(|class| class.rgb).collect();

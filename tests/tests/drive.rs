@@ -102,7 +102,7 @@ impl Loop {
     async fn drive(mut self, length_m: f64) -> Driven {
         let route = town().drive;
         let mut planner = Planner::default();
-        let mut next = Move { curvature_per_m: 0.0, mps: 0.0, way_m: 0.0 };
+        let mut next = Move { curvature_per_m: 0.0, mps: 0.0, path_m: 0.0 };
         let mut driven = Driven { turns: 0, length_m: 0.0, seconds: 0.0, nearest_m: 1.0 };
         // The first turn is not whole.
         cast(&mut self.vehicle);
@@ -114,7 +114,7 @@ impl Loop {
             driven.seconds = self.seconds(stamps.end);
             driven.length_m = along(&route, driven.length_m, self.vehicle.scene().drive.at(driven.seconds));
             // The same bytes: each carrier brings every other map.
-            planner.take(if driven.turns.is_multiple_of(2) { &over_grpc } else { &over_zenoh }).unwrap();
+            planner.update(if driven.turns.is_multiple_of(2) { &over_grpc } else { &over_zenoh }).unwrap();
             let (x, y, _) = route.course.at(route.start + driven.length_m + GOAL_M, route.left);
             next = planner.next_move([x, y]);
             if driven.turns.is_multiple_of(100) {

@@ -1,9 +1,8 @@
-//! `speed` maps to a way and a move: A* by travel time over ground that was seen to be passable.
+//! Maps with the layer `speed` -> a path and the next move: A* by travel time over free ground.
 //!
-//! In: maps, a goal. Out: the next [`Move`]. Frame: the maps' world ("map") where the vehicle tells its ego poses; what
-//! was seen is then remembered for a while, since a sensor sees nothing close by. Without poses each map stands alone,
-//! in the ego frame. The planner never enters ground that no map has shown, except the place where the vehicle stands
-//! at first.
+//! In: maps, a goal. Out: the next [`Move`]. With ego poses, the planner works in the world frame and keeps cells for a
+//! while, because a sensor does not measure the ground near the vehicle. Without poses it uses each map alone, in the
+//! ego frame. It never enters ground that is not measured, except around the vehicle's first position.
 
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, HashMap};
@@ -11,63 +10,63 @@ use std::collections::{BinaryHeap, HashMap};
 use clearway_client::v1::ClassMeaning;
 use clearway_client::{ClientError, MapView};
 
-/// Edge of a cell of the planner's own grid, metres.
+/// Edge of a cell of the planner's grid, in metres.
 const CELL_M: f64 = 0.5;
-/// It looks this far, metres.
-const REACH_M: f64 = 16.0;
-/// Three discs about these places of the vehicle, metres ahead of its middle, cover it; each has a radius of 1.16 m.
+/// Radius of the planner's grid around the vehicle, in metres.
+const RANGE_M: f64 = 16.0;
+/// Centres of three discs that cover the vehicle, in metres ahead of its centre; each has a radius of 1.16 m.
 const DISCS_M: [f64; 3] = [1.45, 0.0, -1.45];
-/// From the middle of a disc to an obstacle's: its radius, and half a cell. Where that is not to be had, less at a
-/// crawl.
+/// Distance from the centre of a disc to that of an obstacle's cell in metres (its radius and half a cell), and
+/// greatest speed in m/s. The second is tried if there is no path with the first.
 const CLEARANCES_M: [(f64, f64); 2] = [(1.5, MPS_MAX), (1.2, 1.0)];
-/// Where it begins, the ground about it that its sensor cannot see is taken on trust, metres.
-const STAND_M: f64 = 5.0;
-/// And driven over so slowly, m/s.
-const STAND_MPS: f64 = 2.0;
-/// An obstacle that is not seen again is forgotten after this, ns; the ground under it is then unknown.
+/// Radius around the first position in which unknown ground is assumed free, in metres: the sensor cannot measure it.
+const START_M: f64 = 5.0;
+/// Speed on that ground, in m/s.
+const START_MPS: f64 = 2.0;
+/// Time after which an obstacle that is not measured again is removed, in ns; its cell is then unknown.
 const MEMORY_NS: i64 = 2_000_000_000;
-/// Never faster, m/s.
+/// Greatest speed in m/s.
 const MPS_MAX: f64 = 8.0;
-/// Nothing nearer is aimed at, metres.
+/// Least distance of the point to aim at, in metres.
 const NEAREST_M: f64 = 2.0;
-/// Braking, and to the side, m/s².
+/// Greatest braking and lateral acceleration in m/s².
 const BRAKE_MPS2: f64 = 4.0;
-/// Tightest turn, 1/m.
+/// Greatest curvature in 1/m.
 const CURVATURE_MAX: f64 = 0.2;
 
-/// A place, metres.
-pub type Place = [f64; 2];
+/// A point, in metres.
+pub type Point = [f64; 2];
 type Cell = [i32; 2];
 
 /// What the vehicle should do until the next map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Move {
-    /// Of the arc to follow, left positive, 1/m.
+    /// Curvature of the arc to follow in 1/m, positive to the left.
     pub curvature_per_m: f64,
-    /// 0 where there is no way.
+    /// Speed in m/s; 0 if there is no path.
     pub mps: f64,
-    /// Length of the way found towards the goal.
-    pub way_m: f64,
+    /// Length of the path towards the goal, in metres.
+    pub path_m: f64,
 }
 
-/// Remembers what it was shown.
+/// A planner with a grid of recently measured cells.
 #[derive(Debug, Default)]
 pub struct Planner {
     seen: HashMap<Cell, Seen>,
-    /// Of the newest map: x, y, heading.
+    /// Pose of the newest map: x, y, heading.
     ego: [f64; 3],
 }
 
 #[derive(Clone, Copy, Debug)]
 struct Seen {
-    /// 0: an obstacle.
+    /// Speed in m/s; 0 for an obstacle.
     mps: f64,
     stamp_ns: i64,
 }
 
 impl Planner {
-    /// Takes a map with the layer `speed`.
-    pub fn take(&mut self, map: &MapView) -> Result<(), ClientError> {
+    /// Updates the grid from a map with the layer `speed`.
+    pub fn update(&mut self, map: &MapView) -> Result<(), ClientError> {
         let (layer, stamp_ns) = (map.layer("speed")?, map.header().capture_end_ns);
         self.ego = match &map.header().map_from_ego {
             Some(p) => {
@@ -78,31 +77,31 @@ impl Planner {
                 [0.0; 3]
             }
         };
-        let begins = self.seen.is_empty();
+        let is_first = self.seen.is_empty();
         let here = [self.ego[0], self.ego[1]];
         self.seen.retain(|cell, seen| {
             let is_fresh = seen.mps > 0.0 || stamp_ns - seen.stamp_ns < MEMORY_NS;
-            is_fresh && distance(middle(*cell), here) < 1.25 * REACH_M
+            is_fresh && distance(centre(*cell), here) < 1.25 * RANGE_M
         });
-        for cell in about(self.cell_of_ego(), REACH_M) {
-            let [x, y] = self.in_ego(middle(cell));
+        for cell in cells_within(self.cell_of_ego(), RANGE_M) {
+            let [x, y] = self.in_ego(centre(cell));
             let mps = match layer.meaning_at(x, y) {
                 ClassMeaning::Free => layer.value_at("speed", x, y).unwrap_or(0.0),
-                ClassMeaning::Unknown if begins && x.hypot(y) < STAND_M => STAND_MPS,
+                ClassMeaning::Unknown if is_first && x.hypot(y) < START_M => START_MPS,
                 _ => continue,
             };
             self.seen.insert(cell, Seen { mps, stamp_ns });
         }
-        // By the obstacles' own cells: none falls between two of the planner's.
+        // Uses the cells of the obstacles, so that none lies between two cells of the planner.
         let occupied = |index: &usize| layer.meaning_of(*index) == ClassMeaning::Occupied;
         for index in (0..layer.grid.cell_count() as usize).filter(occupied) {
-            let Some((x, y)) = layer.grid.centre_of(index).filter(|(x, y)| x.hypot(*y) < REACH_M) else { continue };
+            let Some((x, y)) = layer.grid.centre_of(index).filter(|(x, y)| x.hypot(*y) < RANGE_M) else { continue };
             self.seen.insert(cell_of(self.in_map([x, y])), Seen { mps: 0.0, stamp_ns });
         }
         Ok(())
     }
 
-    /// Text picture of the ground around the vehicle, ahead up: `.` is passable, `#` an obstacle, a blank is unseen.
+    /// Text picture of the grid, with forward up: `.` free, `#` obstacle, blank unknown.
     pub fn picture(&self) -> String {
         let here = self.cell_of_ego();
         let mark = |ahead: i32, left: i32| {
@@ -118,58 +117,59 @@ impl Planner {
         (-8..=24).rev().map(line).collect()
     }
 
-    /// The place so many metres straight ahead, in the planner's frame.
-    pub fn ahead(&self, metres: f64) -> Place {
+    /// The point `metres` straight ahead, in the planner's frame.
+    pub fn ahead(&self, metres: f64) -> Point {
         self.in_map([metres, 0.0])
     }
 
-    /// The next move towards a goal, or to where the way ends nearest to it: the arc to the farthest place of the way
-    /// that can be followed up to there.
-    pub fn next_move(&self, goal: Place) -> Move {
-        let mut way_m = 0.0;
+    /// The next move towards a goal, or towards the reachable point nearest to it: the arc to the farthest point of the
+    /// path that the vehicle can follow without touching an obstacle.
+    pub fn next_move(&self, goal: Point) -> Move {
+        let mut path_m = 0.0;
         for (clearance_m, mps) in CLEARANCES_M {
             let open = self.open(clearance_m);
-            let way = self.way(goal, &open);
-            way_m = way.array_windows().map(|[a, b]| distance(*a, *b)).sum();
+            let path = self.find_path(goal, &open);
+            path_m = path.array_windows().map(|[a, b]| distance(*a, *b)).sum();
             let ahead =
-                way.iter().rev().map(|place| self.in_ego(*place)).filter(|[x, y]| *x > 0.0 && x.hypot(*y) > NEAREST_M);
+                path.iter().rev().map(|point| self.in_ego(*point)).filter(|[x, y]| *x > 0.0 && x.hypot(*y) > NEAREST_M);
             let mut arcs = ahead.map(|[x, y]| (2.0 * y / (x * x + y * y), x.hypot(y)));
             let Some((curvature_per_m, _)) = arcs.find(|(bend, length_m)| self.is_clear(*bend, *length_m, &open))
             else {
                 continue;
             };
-            let seen = way.iter().filter_map(|place| self.seen.get(&cell_of(*place)));
+            let seen = path.iter().filter_map(|point| self.seen.get(&cell_of(*point)));
             let allowed = seen.take(6).map(|seen| seen.mps).fold(mps, f64::min);
             let in_bend = (BRAKE_MPS2 / curvature_per_m.abs()).sqrt();
-            let to_stop = (2.0 * BRAKE_MPS2 * (way_m - 2.0).max(0.0)).sqrt();
-            return Move { curvature_per_m, mps: allowed.min(in_bend).min(to_stop), way_m };
+            let to_stop = (2.0 * BRAKE_MPS2 * (path_m - 2.0).max(0.0)).sqrt();
+            return Move { curvature_per_m, mps: allowed.min(in_bend).min(to_stop), path_m };
         }
-        Move { curvature_per_m: 0.0, mps: 0.0, way_m }
+        Move { curvature_per_m: 0.0, mps: 0.0, path_m }
     }
 
-    /// Whether the vehicle may follow an arc so far; bends are slight enough to take an arc to be as long as its chord.
+    /// True if the vehicle can follow an arc for a length without touching an obstacle. Curvatures are so small that
+    /// the chord has about the length of the arc.
     fn is_clear(&self, curvature_per_m: f64, length_m: f64, open: &HashMap<Cell, f64>) -> bool {
         let steps = (length_m / (CELL_M / 2.0)).ceil();
         let is_open = |step: f64, disc_m: f64| {
-            let turned = curvature_per_m * length_m * step / steps;
-            // The chord of an arc points half as far round as the arc turns.
-            let (chord_m, (half_sin, half_cos)) = (length_m * step / steps, (turned / 2.0).sin_cos());
-            let (sin, cos) = turned.sin_cos();
-            let place = [chord_m * half_cos + disc_m * cos, chord_m * half_sin + disc_m * sin];
-            open.contains_key(&cell_of(self.in_map(place)))
+            let angle = curvature_per_m * length_m * step / steps;
+            // The chord of an arc has half the angle of the arc.
+            let (chord_m, (half_sin, half_cos)) = (length_m * step / steps, (angle / 2.0).sin_cos());
+            let (sin, cos) = angle.sin_cos();
+            let point = [chord_m * half_cos + disc_m * cos, chord_m * half_sin + disc_m * sin];
+            open.contains_key(&cell_of(self.in_map(point)))
         };
-        // What the tail stands in it leaves.
+        // Discs behind the start are left out: the vehicle leaves that ground.
         let discs = |step: f64| DISCS_M.into_iter().filter(move |disc_m| length_m * step / steps + disc_m > 0.5);
         curvature_per_m.abs() <= CURVATURE_MAX
             && (0..=steps as u32).map(f64::from).all(|step| discs(step).all(|disc_m| is_open(step, disc_m)))
     }
 
-    /// A* over the planner's cells; begins with the vehicle's place.
-    fn way(&self, goal: Place, open: &HashMap<Cell, f64>) -> Vec<Place> {
+    /// A* over the planner's cells, from the cell of the vehicle.
+    fn find_path(&self, goal: Point, open: &HashMap<Cell, f64>) -> Vec<Point> {
         let start = self.cell_of_ego();
-        let left_s = |cell: Cell| distance(middle(cell), goal) / MPS_MAX;
+        let left_s = |cell: Cell| distance(centre(cell), goal) / MPS_MAX;
         let mut best: HashMap<Cell, (f64, Cell)> = HashMap::from([(start, (0.0, start))]);
-        // Times in µs: whole numbers have an order.
+        // Times in integer microseconds, because floats have no total order.
         let rank = |seconds: f64| Reverse((seconds * 1e6) as u64);
         let mut queue = BinaryHeap::from([(rank(left_s(start)), start)]);
         let mut nearest = start;
@@ -181,12 +181,12 @@ impl Planner {
             if left_s(cell) < left_s(nearest) {
                 nearest = cell;
             }
-            if distance(middle(cell), goal) < CELL_M {
+            if distance(centre(cell), goal) < CELL_M {
                 break;
             }
-            for next in about(cell, 1.5 * CELL_M).filter(|next| *next != cell) {
+            for next in cells_within(cell, 1.5 * CELL_M).filter(|next| *next != cell) {
                 let Some(mps) = open.get(&next) else { continue };
-                let spent = spent + distance(middle(cell), middle(next)) / mps.min(MPS_MAX);
+                let spent = spent + distance(centre(cell), centre(next)) / mps.min(MPS_MAX);
                 if best.get(&next).is_none_or(|(before, _)| spent < *before) {
                     best.insert(next, (spent, cell));
                     queue.push((rank(spent + left_s(next)), next));
@@ -194,18 +194,18 @@ impl Planner {
             }
         }
         let back = std::iter::successors(Some(nearest), |cell| (*cell != start).then(|| best[cell].1));
-        let mut way: Vec<Place> = back.map(middle).collect();
-        way.reverse();
-        way
+        let mut path: Vec<Point> = back.map(middle).collect();
+        path.reverse();
+        path
     }
 
-    /// Speeds of the cells a disc's middle may be in: seen, passable, and no obstacle within the clearance.
+    /// Speed of each cell that the centre of a disc may be in: free, with no obstacle within the clearance.
     fn open(&self, clearance_m: f64) -> HashMap<Cell, f64> {
-        let near = |cell: &Cell| distance(middle(*cell), [self.ego[0], self.ego[1]]) < REACH_M;
+        let near = |cell: &Cell| distance(centre(*cell), [self.ego[0], self.ego[1]]) < RANGE_M;
         let seen = self.seen.iter().filter(|(cell, _)| near(cell));
         let mut open: HashMap<Cell, f64> = seen.clone().map(|(cell, seen)| (*cell, seen.mps)).collect();
         for (obstacle, _) in seen.filter(|(_, seen)| seen.mps == 0.0) {
-            for cell in about(*obstacle, clearance_m) {
+            for cell in cells_within(*obstacle, clearance_m) {
                 open.remove(&cell);
             }
         }
@@ -216,32 +216,32 @@ impl Planner {
         cell_of([self.ego[0], self.ego[1]])
     }
 
-    fn in_ego(&self, [x, y]: Place) -> Place {
+    fn in_ego(&self, [x, y]: Point) -> Point {
         let ([dx, dy], (sin, cos)) = ([x - self.ego[0], y - self.ego[1]], self.ego[2].sin_cos());
         [dx * cos + dy * sin, dy * cos - dx * sin]
     }
 
-    fn in_map(&self, [x, y]: Place) -> Place {
+    fn in_map(&self, [x, y]: Point) -> Point {
         let (sin, cos) = self.ego[2].sin_cos();
         [self.ego[0] + x * cos - y * sin, self.ego[1] + x * sin + y * cos]
     }
 }
 
-fn cell_of(place: Place) -> Cell {
-    place.map(|value| (value / CELL_M).floor() as i32)
+fn cell_of(point: Point) -> Cell {
+    point.map(|value| (value / CELL_M).floor() as i32)
 }
 
-fn middle(cell: Cell) -> Place {
+fn centre(cell: Cell) -> Point {
     cell.map(|index| (f64::from(index) + 0.5) * CELL_M)
 }
 
-fn distance(a: Place, b: Place) -> f64 {
+fn distance(a: Point, b: Point) -> f64 {
     (a[0] - b[0]).hypot(a[1] - b[1])
 }
 
-/// A cell and those whose middles lie within so many metres of its own.
-fn about([ix, iy]: Cell, reach_m: f64) -> impl Iterator<Item = Cell> {
-    let cells = reach_m / CELL_M;
+/// The cells whose centres lie within a distance in metres of the centre of a cell, including it.
+fn cells_within([ix, iy]: Cell, range_m: f64) -> impl Iterator<Item = Cell> {
+    let cells = range_m / CELL_M;
     let reach = cells as i32;
     let square = (-reach..=reach).flat_map(move |dx| (-reach..=reach).map(move |dy| [dx, dy]));
     let disc = square.filter(move |[dx, dy]| f64::from(dx * dx + dy * dy) <= cells * cells);

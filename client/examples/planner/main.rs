@@ -1,4 +1,4 @@
-//! A toy planner: A* on `speed`, and the move it would make at each map.
+//! A simple planner: A* on the layer `speed`. It prints the next move at each map.
 //! `cargo run -p clearway-client --example planner -- [ADDRESS]`; over zenoh with an endpoint such as
 //! tcp/localhost:7447.
 
@@ -24,9 +24,12 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
             println!("map {}: stale, so stop", map.sequence());
             continue;
         }
-        planner.take(&map)?;
-        let Move { curvature_per_m, mps, way_m } = planner.next_move(planner.ahead(12.0));
+        planner.update(&map)?;
+        let Move { curvature_per_m, mps, path_m } = planner.next_move(planner.ahead(12.0));
         println!("{}", planner.picture());
-        println!("map {}: a way of {way_m:4.1} m; drive {mps:.1} m/s, turn {curvature_per_m:+.3} 1/m", map.sequence());
+        println!(
+            "map {}: path of {path_m:4.1} m; drive {mps:.1} m/s, curvature {curvature_per_m:+.3} 1/m",
+            map.sequence()
+        );
     }
 }

@@ -39,12 +39,12 @@ def watch(
 ) -> MapStream:
     """Streams the newest map, starting with the present one.
 
-    `vehicle` may be empty over gRPC if the server has a single vehicle. Without `layers`, every layer is sent; over zenoh
-    both must be named. With `tls` the connection is encrypted. The other arguments are for gRPC: at most `max_in_flight`
-    maps are sent without an acknowledgement, and at most `max_rate_hz` maps per second. Each layer is cut to the `region`
-    (x_from_m, x_to_m, y_from_m, y_to_m) in the ego frame. With `deltas`, layers are sent as changes from the map before:
-    fewer bytes, the same maps. Errors of the server are raised by the first `next`; for an unknown vehicle or layer the
-    message lists the known ones.
+    `vehicle` may be empty over gRPC if the server has a single vehicle. Without `layers`, every layer is sent; over
+    zenoh both must be named. With `tls` the connection is encrypted. The other arguments are for gRPC: at most
+    `max_in_flight` maps are sent without an acknowledgement, and at most `max_rate_hz` maps per second. Each layer is
+    cut to the `region` (x_from_m, x_to_m, y_from_m, y_to_m) in the ego frame. With `deltas`, layers are sent as
+    changes from the map before: fewer bytes, the same maps. Errors of the server are raised by the first `next`; for
+    an unknown vehicle or layer the message lists the known ones.
     """
     if endpoint := _zenoh(address, vehicle, layers):
         if max_rate_hz is not None or region is not None or deltas:

@@ -307,7 +307,8 @@ class Map:
         """Layers by name, in the order of the server's configuration. They are decoded at the first access."""
         cells = sum(channel.cell_count for layer in self._message.layers for channel in layer.channels)
         if cells > MAP_CELLS_MAX:
-            raise DecodeError("too_many_cells", f"the channels claim {cells} cells; at most {MAP_CELLS_MAX} are allowed")
+            text = f"the channels claim {cells} cells; at most {MAP_CELLS_MAX} are allowed"
+            raise DecodeError("too_many_cells", text)
         layers: dict[str, Layer] = {}
         for message in self._message.layers:
             if message.name in layers:
@@ -406,7 +407,8 @@ def _legend(message: map_pb2.Layer, base: Layer | None) -> tuple[LegendEntry, ..
         return base.legend_entries
     names, meanings, colours = map(len, lists)
     if not names == meanings == colours:
-        text = f"layer {message.name!r}: {names} names, {meanings} meanings, {colours} colours; equal numbers are needed"
+        found = f"{names} names, {meanings} meanings, {colours} colours"
+        text = f"layer {message.name!r}: {found}; equal numbers are needed"
         raise DecodeError("legend", text)
     if names and message.legend_meanings[0] != Meaning.UNKNOWN:
         text = f"layer {message.name!r}: class 0 has the meaning {message.legend_meanings[0]}; 0 (unknown) is needed"

@@ -19,9 +19,11 @@ def read(file: str | PathLike[str], layer: str, vehicle: str = "") -> Iterator[M
         reader = make_reader(stream)
         summary = reader.get_summary()
         topics = {channel.topic for channel in summary.channels.values()} if summary else set()
-        selected = {t for t in topics if t.endswith(f"/map/{layer}") and (not vehicle or t == f"/{vehicle}/map/{layer}")}
+        names = {f"/{vehicle}/map/{layer}"} if vehicle else {t for t in topics if t.endswith(f"/map/{layer}")}
+        selected = topics & names
         if len(selected) != 1:
             known = ", ".join(sorted(t for t in topics if "/map/" in t)) or "none"
-            raise ClearwayError("layer", f"{file}: {len(selected)} topics fit layer {layer!r}; the recording has {known}")
+            text = f"{file}: {len(selected)} topics fit layer {layer!r}; the recording has {known}"
+            raise ClearwayError("layer", text)
         for _, _, message in reader.iter_messages(topics=selected):
             yield Map(message.data)

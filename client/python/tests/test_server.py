@@ -54,11 +54,12 @@ def test_a_slow_loop_body_gets_the_newest_map_and_the_skipped_count(transport):
 
 def test_deltas_of_a_region_at_a_rate_have_the_cells_of_whole_maps():
     wanted = dict(layers=["drivability", "terrain"], region=(0, 20, -8, 8))
-    with clearway.watch(GRPC, **wanted, deltas=True, max_rate_hz=5) as few, clearway.watch(GRPC, **wanted) as every:
+    few_maps = clearway.watch(GRPC, **wanted, deltas=True, max_rate_hz=5)
+    with few_maps as few, clearway.watch(GRPC, **wanted) as all_of_them:
         got = [next(few) for _ in range(3)]
         whole = {}
         while got[-1].sequence not in whole:
-            m = next(every)
+            m = next(all_of_them)
             whole[m.sequence] = m
             assert m.sequence <= got[-1].sequence + 50
     assert all(m.left_out for m in got[1:])

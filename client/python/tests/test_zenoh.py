@@ -45,8 +45,9 @@ def part(sequence, layer="drivability", valid_ns=LASTS_NS):
 def published(session, layer="drivability"):
     """Declares a publisher as the server does."""
     misses = ext.MissDetectionConfig(heartbeat=0.5, sporadic_heartbeat=None)
-    return ext.declare_advanced_publisher(session, KEY.format(layer), cache=ext.CacheConfig(1),
-                                          publisher_detection=True, sample_miss_detection=misses)  # fmt: skip
+    return ext.declare_advanced_publisher(
+        session, KEY.format(layer), cache=ext.CacheConfig(1), publisher_detection=True, sample_miss_detection=misses
+    )
 
 
 def watch(at, *layers):
@@ -153,7 +154,7 @@ class Wire:
     def cut(self):
         self._whole.clear()
 
-    def reconnect(self):
+    def restore(self):
         self._whole = threading.Event()
         self._whole.set()
 
@@ -168,7 +169,7 @@ def test_a_stream_continues_after_a_cut_link_and_counts_lost_maps(server, endpoi
         wire.cut()
         for sequence in range(1, 5):
             publisher.put(part(sequence))
-        wire.reconnect()
+        wire.restore()
         m = maps.next_or_stale()
         assert not m.stale and counts(m) == (4, 3, 3), "the newest map, and the number of lost ones"
         publisher.put(part(5))

@@ -1,4 +1,4 @@
-//! On the golden base any bytes are a map or are refused; what is a map has the cells its grid promises.
+//! Any bytes decode on the golden base or are refused. A decoded map has the cells of its grids.
 #![no_main]
 
 use std::sync::LazyLock;

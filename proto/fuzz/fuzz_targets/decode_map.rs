@@ -1,4 +1,4 @@
-//! Any bytes are a map or are refused; what is a map has the cells its grid promises.
+//! Any bytes decode or are refused. A decoded map has the cells of its grids.
 #![no_main]
 
 use bytes::Bytes;

@@ -44,7 +44,7 @@ fn copy_end<T: Cell>(cells: &[T], columns: usize, start: usize) -> usize {
 
 /// Length of the common prefix.
 fn equal_prefix<T: Cell>(cells: &[T], others: &[T]) -> usize {
-    // Compares 32 cells at once: the compiler turns this into vector instructions.
+    // Compares 32 cells at once: the compiler makes vector instructions of it.
     const STEP: usize = 32;
     let steps = cells.chunks_exact(STEP).zip(others.chunks_exact(STEP)).take_while(|(cells, others)| cells == others);
     let at = STEP * steps.count();

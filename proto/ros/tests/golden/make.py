@@ -1,7 +1,7 @@
-"""Writes the golden messages of this folder with rosbags (PyPI, 0.11.9), an implementation of CDR that is not ours.
+"""Writes the golden messages of this folder with rosbags (PyPI, 0.11.9), an independent implementation of CDR.
 
 python -m venv venv && venv/bin/pip install rosbags==0.11.9 && venv/bin/python make.py
-All values are made up here; golden.rs holds the same ones.
+The values are arbitrary; golden.rs has the same ones.
 """
 
 from pathlib import Path
@@ -10,7 +10,8 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 store = get_typestore(Stores.ROS2_JAZZY)
-store.register(get_types_from_msg("builtin_interfaces/Time stamp\nuint8[1206] data", "velodyne_msgs/msg/VelodynePacket"))
+store.register(get_types_from_msg(
+    "builtin_interfaces/Time stamp\nuint8[1206] data", "velodyne_msgs/msg/VelodynePacket"))
 store.register(get_types_from_msg(
     "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets", "velodyne_msgs/msg/VelodyneScan"))
 T = store.types
@@ -37,7 +38,8 @@ def cloud(frame, dtype, points, height=1, row_padding=0):
     width = len(points) // height
     rows = [array[i * width:(i + 1) * width].tobytes() + bytes(row_padding) for i in range(height)]
     fields = [
-        T["sensor_msgs/msg/PointField"](name=n, offset=dtype.fields[n][1], datatype=DATATYPES[dtype.fields[n][0].str[1:]], count=1)
+        T["sensor_msgs/msg/PointField"](
+            name=n, offset=dtype.fields[n][1], datatype=DATATYPES[dtype.fields[n][0].str[1:]], count=1)
         for n in dtype.names
     ]
     return T["sensor_msgs/msg/PointCloud2"](
@@ -68,7 +70,8 @@ write("hesai_big_endian.cdr", cloud("hesai_lidar", np.dtype(
 # Livox: float64 ns since the epoch, float64 positions for good measure.
 write("livox.cdr", cloud("livox_frame", np.dtype(
     {"names": ["x", "y", "z", "intensity", "tag", "line", "timestamp"],
-     "formats": ["<f8", "<f8", "<f8", "<f4", "<u1", "<u1", "<f8"], "offsets": [0, 8, 16, 24, 28, 29, 30], "itemsize": 38}),
+     "formats": ["<f8", "<f8", "<f8", "<f4", "<u1", "<u1", "<f8"],
+    "offsets": [0, 8, 16, 24, 28, 29, 30], "itemsize": 38}),
     [(1, 2, 3, 255, 0, 1, (SEC + 0.25) * 1e9), (3, 2, 1, 0, 0, 0, (SEC + 0.3125) * 1e9)]))
 # nebula, PointXYZIRCAEDT.
 write("nebula.cdr", cloud("lidar_top", np.dtype(

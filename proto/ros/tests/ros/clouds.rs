@@ -4,6 +4,7 @@ use clearway_ros::cdr::Header;
 use clearway_ros::point_cloud2::{Datatype, Field};
 use clearway_ros::{PointCloud2, Points};
 use proptest::prelude::*;
+use proptest::sample::select;
 
 /// One point of a test.
 #[derive(Clone, Debug)]
@@ -51,12 +52,19 @@ proptest! {
         order in Just([0, 1, 2, 3, 4, 5_usize]).prop_shuffle(),
         big_endian: bool,
         double: bool,
-        ring_type in proptest::sample::select(vec![Datatype::Uint8, Datatype::Uint16, Datatype::Int32, Datatype::Uint32]),
-        names in (proptest::sample::select(vec!["ring", "channel"]), proptest::sample::select(vec!["t", "time_stamp"])),
+        ring_type in select(vec![Datatype::Uint8, Datatype::Uint16, Datatype::Int32, Datatype::Uint32]),
+        names in (select(vec!["ring", "channel"]), select(vec!["t", "time_stamp"])),
     ) {
         let width = points.len().div_ceil(rows);
         let xyz = if double { Datatype::Float64 } else { Datatype::Float32 };
-        let kinds = [("x", xyz), ("y", xyz), ("z", xyz), ("intensity", Datatype::Uint8), (names.0, ring_type), (names.1, Datatype::Uint32)];
+        let kinds = [
+            ("x", xyz),
+            ("y", xyz),
+            ("z", xyz),
+            ("intensity", Datatype::Uint8),
+            (names.0, ring_type),
+            (names.1, Datatype::Uint32),
+        ];
         let mut offset = 0;
         let fields: Vec<Field> = order.iter().zip(gaps).map(|(&kind, gap)| {
             let (name, datatype) = kinds[kind];
@@ -69,7 +77,8 @@ proptest! {
         for row in 0..rows {
             for column in 0..width {
                 let point = points.get(row * width + column).unwrap_or(&absent);
-                let values = [point.xyz[0].into(), point.xyz[1].into(), point.xyz[2].into(), point.intensity.into(), point.ring.into(), f64::from(point.time_ns)];
+                let [x, y, z] = point.xyz.map(f64::from);
+                let values = [x, y, z, point.intensity.into(), point.ring.into(), f64::from(point.time_ns)];
                 let start = data.len();
                 data.resize(start + step, 0xAA);
                 for (&kind, field) in order.iter().zip(&fields) {
@@ -95,7 +104,8 @@ proptest! {
         prop_assert_eq!(&read, &cloud);
         let read = Points::from_cloud(&read).unwrap();
 
-        let seen: Vec<&Point> = points.iter().filter(|p| !p.xyz.iter().any(|v| v.is_nan()) && p.xyz != [0.0; 3]).collect();
+        let has_return = |p: &&Point| !p.xyz.iter().any(|v| v.is_nan()) && p.xyz != [0.0; 3];
+        let seen: Vec<&Point> = points.iter().filter(has_return).collect();
         prop_assert_eq!(read.no_returns as usize, rows * width - seen.len());
         let newest = seen.iter().map(|p| p.time_ns).max().unwrap_or(0);
         prop_assert_eq!(read.stamp_ns, 5_000_000_007 + i64::from(newest));
