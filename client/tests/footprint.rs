@@ -97,7 +97,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
 
     #[test]
-    fn a_footprint_is_free_exactly_where_every_place_of_it_is(map in maps(), footprint in footprints()) {
+    fn a_footprint_is_free_exactly_if_every_point_of_it_is_free(map in maps(), footprint in footprints()) {
         let layer = map.layer("drivability").unwrap();
         let drivable = |(x, y): (f64, f64)| layer.class_at(x, y).0 == 1;
         let free = map.is_free("drivability", &footprint).unwrap();
@@ -109,7 +109,7 @@ proptest! {
     }
 
     #[test]
-    fn the_nearest_obstacle_is_no_farther_than_any_place_of_one(map in maps(), x in -3.0_f64..3.0, y in -3.0_f64..3.0) {
+    fn the_nearest_obstacle_is_no_farther_than_any_point_of_an_obstacle(map in maps(), x in -3.0_f64..3.0, y in -3.0_f64..3.0) {
         let layer = map.layer("drivability").unwrap();
         let grid = Footprint { x_m: 0.0, y_m: 0.0, heading_rad: 0.0, length_m: 7.0, width_m: 7.0 };
         let seen = places(&grid, 0.0).filter(|&(x, y)| layer.class_at(x, y).0 == 3);
@@ -133,7 +133,7 @@ proptest! {
 }
 
 #[test]
-fn unknown_is_never_free_and_neither_is_what_lies_outside_or_nowhere() {
+fn unknown_cells_and_places_outside_the_grid_are_not_free() {
     let known = view(cartesian(0.0), &[1; (SIDE * SIDE) as usize]);
     let footprint = Footprint { x_m: 0.0, y_m: 0.0, heading_rad: 0.3, length_m: 1.0, width_m: 0.5 };
     assert!(known.is_free("drivability", &footprint).unwrap());
@@ -161,14 +161,14 @@ fn only_the_meaning_free_is_free_and_only_occupied_is_an_obstacle() {
 }
 
 #[test]
-fn an_obstacle_beside_the_vehicle_is_never_told_farther_than_its_cell_begins() {
+fn the_distance_of_an_obstacle_is_at_most_that_of_its_cells_border() {
     let map = view(radial(8), &[[0, 0, 0, 0, 0, 0, 0, 3], [0; 8], [0; 8]].concat());
     let obstacle = map.nearest_obstacle("drivability", 0.0, 0.0).unwrap().unwrap();
     assert_eq!(obstacle.distance_m, 0.0, "the innermost cells begin in the middle: {obstacle:?}");
 }
 
 #[test]
-fn distance_and_bearing_are_to_the_cells_border_as_the_vehicle_sees_it() {
+fn distance_and_bearing_are_to_the_nearest_point_of_the_cell() {
     let map = MapView::decode(common::map(5, common::CAPTURE_END_NS)).unwrap();
     // From 10 to 20 m, ahead and to the right: the nearest of it is the bench's inner border.
     let obstacle = map.nearest_obstacle("drivability", 0.0, -4.0).unwrap().unwrap();

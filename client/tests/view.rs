@@ -39,7 +39,7 @@ fn the_class_at_a_point_is_that_of_the_cell_around_it() {
 }
 
 #[test]
-fn a_value_is_scaled_and_nothing_where_it_is_unknown() {
+fn a_value_is_scaled_and_none_if_it_is_unknown() {
     let view = view();
     let layer = view.layer("drivability").unwrap();
     assert_eq!(layer.value_at("unit_height", 10.0, -10.0), Some(3.5));
@@ -62,7 +62,7 @@ fn a_map_is_stale_when_its_validity_has_passed_or_its_age_is_not_known() {
 }
 
 #[test]
-fn an_unknown_layer_is_named_with_those_there_are() {
+fn an_unknown_layer_is_refused_with_the_known_ones() {
     match view().layer("roughness") {
         Err(ClientError::NoLayer { layer, present }) => {
             assert_eq!((layer.as_str(), present), ("roughness", vec!["drivability".to_string()]));

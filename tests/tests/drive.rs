@@ -194,7 +194,7 @@ async fn map_since(maps: &mut MapStream, begin_ns: i64) -> MapView {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn planners_over_grpc_and_zenoh_drive_round_the_town_alike_and_touch_nothing() {
+async fn a_planner_on_maps_of_grpc_and_zenoh_drives_a_lap_without_contact() {
     let running = server().await;
     let client = Client::connect(&running.grpc.unwrap().to_string()).await.unwrap();
     let ingester = within("a stream", client.ingest("car")).await.unwrap();

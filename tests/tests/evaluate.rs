@@ -19,7 +19,7 @@ fn judged(arguments: &[&str]) -> Value {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn the_real_frame_meets_the_targets_of_drivability() {
+fn drivability_of_the_labelled_frame_meets_its_targets() {
     // The scan and its labels lie in folders side by side; two more scans there have no labels.
     for (columns, precision, road) in [("1", 0.9995, 0.99), ("2", 0.997, 0.98), ("4", 0.997, 0.97)] {
         let report = judged(&[&kitti(), "--columns", columns]);
@@ -48,7 +48,7 @@ fn the_real_frame_meets_the_targets_of_drivability() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn labels_without_their_scan_are_named_and_end_in_failure() {
+fn labels_without_their_scan_are_refused_by_name() {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::copy(Path::new(&kitti()).join("mmdet3d/000000.label"), folder.path().join("000000.label"))
         .expect("labels");

@@ -76,7 +76,7 @@ async fn behind(router: &str) -> Running {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn through_a_router_late_joiners_have_the_current_map_and_streams_outlive_the_router() {
+async fn streams_through_a_router_survive_a_restart_of_the_router() {
     let (first, at) = router(0).await;
     let port = at.rsplit_once(':').and_then(|(_, port)| port.parse().ok()).expect("a port");
     let running = behind(&at).await;
@@ -173,7 +173,7 @@ const MAPS: u64 = 300;
 const HEALTHY: usize = 8;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_subscriber_that_has_stopped_loses_maps_and_eight_others_have_at_least_999_of_1000() {
+async fn a_stopped_subscriber_does_not_slow_eight_others() {
     let mut config = config();
     config.zenoh.enabled = true;
     let running = start(config).await;

@@ -43,7 +43,7 @@ fn next(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn eight_sensors_through_real_doors_make_one_map_and_its_occupancy_is_the_worlds() {
+async fn eight_sensors_over_udp_and_grpc_make_one_map_that_matches_the_world() {
     let rig = Rig::many(street(8.0), START_NS);
     let mut config = config();
     let vehicle = &mut config.vehicles[0];
@@ -97,12 +97,12 @@ async fn eight_sensors_through_real_doors_make_one_map_and_its_occupancy_is_the_
     let states: Vec<_> = header.sensors.iter().map(|sensor| (&*sensor.name, &*sensor.state)).collect();
     assert!(states.len() == 8 && states.iter().all(|(_, state)| *state == "ok"), "{states:?}");
     assert_eq!((&*header.source_sensor, &*header.compensation), ("top", "poses"));
-    hold_against_truth(&map, &rig);
+    assert_matches_world(&map, &rig);
     within("shutdown", running.shutdown()).await.unwrap();
 }
 
 /// No clear cell lies inside a thing that was there for a turn, and where a cell is occupied, something was lately.
-fn hold_against_truth(map: &MapView, rig: &Rig) {
+fn assert_matches_world(map: &MapView, rig: &Rig) {
     let header = map.header();
     let v1::Pose { x, y, z, qx, qy, qz, qw } = header.map_from_ego.expect("poses are told");
     let turned = Unit::new_normalize(Quaternion::new(qw, qx, qy, qz));

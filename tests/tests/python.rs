@@ -67,7 +67,7 @@ async fn asking(folder: &Path, router: &str) -> Running {
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
 #[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
-async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording() {
+async fn the_tests_of_the_python_client_pass_against_running_servers() {
     let interpreter = tokio::task::spawn_blocking(python).await.expect("the Python client installs");
 
     let folder = tempfile::tempdir().unwrap();

@@ -69,7 +69,7 @@ fn the_demo_runs_and_ends_cleanly() {
 #[test]
 #[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn a_capture_is_replayed_verified_exported_and_described_as_the_readme_says() {
+fn the_offline_commands_of_the_readme_succeed_on_a_capture() {
     let folder = tempfile::tempdir().expect("a folder");
     let capture = Path::new(env!("CLEARWAY_DATA")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
     fs::copy(&capture, folder.path().join("drive.pcap")).expect("the HDL-32E capture");
@@ -96,7 +96,7 @@ fn a_capture_is_replayed_verified_exported_and_described_as_the_readme_says() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn the_maps_are_judged_as_the_readme_says() {
+fn the_evaluate_commands_of_the_readme_succeed() {
     let folder = tempfile::tempdir().expect("a folder");
     let data = Path::new(option_env!("CLEARWAY_DATA").unwrap_or_default()).join("kitti");
     for (file, place) in [("patchwork-plusplus/000000.bin", "velodyne"), ("mmdet3d/000000.label", "labels")] {

@@ -61,7 +61,7 @@ fn copy(from: &Path, to: &Path, mut change: impl FnMut(&str, u32, Vec<u8>) -> Op
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_planted_change_is_named_by_sequence_layer_and_cell() {
+async fn verify_names_a_changed_cell_by_sequence_layer_row_and_column() {
     let folder = tempfile::tempdir().unwrap();
     let (whole, planted) = (folder.path().join("whole.mcap"), folder.path().join("planted.mcap"));
     recording(&whole).await;
@@ -101,7 +101,7 @@ async fn a_planted_change_is_named_by_sequence_layer_and_cell() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_missing_map_a_changed_header_and_a_hole_in_the_journal_are_named() {
+async fn verify_names_a_missing_map_a_changed_header_and_a_journal_gap() {
     let folder = tempfile::tempdir().unwrap();
     let (whole, planted) = (folder.path().join("whole.mcap"), folder.path().join("planted.mcap"));
     recording(&whole).await;
@@ -129,7 +129,7 @@ async fn a_missing_map_a_changed_header_and_a_hole_in_the_journal_are_named() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_recording_cut_by_a_crash_is_read_to_its_last_whole_chunk_and_says_so() {
+async fn a_truncated_recording_is_read_to_its_last_whole_chunk() {
     let folder = tempfile::tempdir().unwrap();
     let (whole, cut) = (folder.path().join("whole.mcap"), folder.path().join("cut.mcap"));
     recording(&whole).await;
@@ -150,7 +150,7 @@ async fn a_recording_cut_by_a_crash_is_read_to_its_last_whole_chunk_and_says_so(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn damage_is_named_and_never_passes_for_a_good_recording() {
+async fn a_damaged_recording_is_refused_with_its_file_and_position() {
     let folder = tempfile::tempdir().unwrap();
     let (whole, damaged) = (folder.path().join("whole.mcap"), folder.path().join("damaged.mcap"));
     recording(&whole).await;
@@ -163,7 +163,7 @@ async fn damage_is_named_and_never_passes_for_a_good_recording() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_recording_holds_what_it_takes_to_make_its_maps_again() {
+async fn a_recording_has_the_configuration_and_calibration_of_its_maps() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("whole.mcap");
     recording(&file).await;
@@ -178,7 +178,7 @@ async fn a_recording_holds_what_it_takes_to_make_its_maps_again() {
 }
 
 #[test]
-fn a_foreign_mcap_file_is_no_recording() {
+fn an_mcap_file_without_a_configuration_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("foreign.mcap");
     mcap::Writer::new(BufWriter::new(File::create(&file).unwrap())).unwrap().finish().unwrap();
@@ -190,7 +190,7 @@ fn a_foreign_mcap_file_is_no_recording() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn whatever_bytes_are_changed_the_reader_answers_and_invents_no_event() {
+async fn changed_bytes_cause_no_panic_and_no_additional_event() {
     use proptest::prelude::*;
     use proptest::test_runner::TestRunner;
     let folder = tempfile::tempdir().unwrap();
@@ -258,7 +258,7 @@ fn drive_until(file: &Path, bytes: u64, data: SocketAddr) {
 }
 
 #[test]
-fn sigterm_leaves_a_whole_recording_and_sigkill_one_that_can_be_read_to_its_cut() {
+fn sigterm_leaves_a_whole_recording_and_sigkill_a_readable_one() {
     let folder = tempfile::tempdir().unwrap();
     for (signal, cut) in [("-TERM", false), ("-KILL", true)] {
         let file = folder.path().join(format!("live{signal}.mcap"));
@@ -274,7 +274,7 @@ fn sigterm_leaves_a_whole_recording_and_sigkill_one_that_can_be_read_to_its_cut(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_address_in_use_is_named_by_its_key_and_costs_no_earlier_recording_its_file() {
+async fn an_address_in_use_is_refused_and_the_old_recording_is_kept() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("earlier.mcap");
     std::fs::write(&file, b"what was recorded before").unwrap();
@@ -308,7 +308,7 @@ async fn an_address_in_use_is_named_by_its_key_and_costs_no_earlier_recording_it
 }
 
 #[test]
-fn a_disk_that_fails_ends_the_recording_with_its_reason_and_maps_go_on() {
+fn a_full_disk_ends_the_recording_and_maps_continue() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("full.mcap");
     // No file of this process may grow beyond half a megabyte; the write fails instead of the process.

@@ -118,7 +118,7 @@ fn options(file: &Path) -> Options {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_bag_of_clouds_odometry_and_tf_is_mapped_where_tf_puts_the_sensor_recorded_and_verified() {
+async fn a_bag_of_clouds_odometry_and_tf_is_mapped_recorded_and_verified() {
     let folder = tempfile::tempdir().unwrap();
     let (file, record) = (folder.path().join("bag.mcap"), folder.path().join("maps.mcap"));
     let messages = drive();
@@ -154,7 +154,7 @@ async fn a_bag_of_clouds_odometry_and_tf_is_mapped_where_tf_puts_the_sensor_reco
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_bag_of_several_sensors_makes_one_map_of_all_that_tf_places() {
+async fn a_bag_of_several_sensors_makes_maps_of_all_that_tf_places() {
     let folder = tempfile::tempdir().unwrap();
     let (file, record) = (folder.path().join("bag.mcap"), folder.path().join("maps.mcap"));
     let mut messages = drive();
@@ -206,7 +206,7 @@ fn points_of(turns: &[(i64, Vec<u8>)], stamp_ns: i64) -> Vec<u8> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_cloud_of_the_points_makes_nearly_the_map_of_the_packets() {
+async fn clouds_make_nearly_the_same_map_as_packets() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("bag.mcap");
     bag(&file, &drive());
@@ -220,7 +220,7 @@ async fn a_cloud_of_the_points_makes_nearly_the_map_of_the_packets() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn topics_are_taken_as_asked_for_and_one_that_is_not_there_is_named() {
+async fn replay_reads_the_requested_topics_and_refuses_an_absent_one() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("bag.mcap");
     bag(&file, &drive());
@@ -240,7 +240,7 @@ async fn topics_are_taken_as_asked_for_and_one_that_is_not_there_is_named() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_an_odometry_the_chain_of_tf_gives_poses_and_speed_and_a_bag_in_two_files_is_one() {
+async fn tf_gives_poses_and_speed_without_odometry_in_a_bag_of_two_files() {
     let folder = tempfile::tempdir().unwrap();
     let files = [0, 1].map(|part| folder.path().join(format!("bag_{part}.mcap")));
     let mut messages = drive();
@@ -274,7 +274,7 @@ async fn without_an_odometry_the_chain_of_tf_gives_poses_and_speed_and_a_bag_in_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn live_topics_of_rmw_zenoh_reach_the_map_and_other_messages_are_counted() {
+async fn live_topics_of_rmw_zenoh_make_maps_and_bad_messages_are_counted() {
     let mut config = fixture::config();
     config.zenoh.enabled = true;
     config.vehicles[0].udp = None;

@@ -30,7 +30,7 @@ async fn vehicles(running: &Running, tls: &Tls) -> Result<usize, ClientError> {
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn a_server_without_a_client_ca_serves_all_over_tls_and_none_in_plain_text() {
+async fn a_server_with_tls_only_refuses_clients_in_plain_text() {
     let running = start(secured(false)).await;
     assert_eq!(vehicles(&running, &tls("ours", None)).await.unwrap(), 1);
     let believed = vehicles(&running, &tls("theirs", None)).await;
@@ -43,7 +43,7 @@ async fn a_server_without_a_client_ca_serves_all_over_tls_and_none_in_plain_text
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn a_certificate_opens_what_its_roles_allow_and_nothing_else() {
+async fn a_certificate_allows_the_calls_of_its_roles_only() {
     let running = start(secured(true)).await;
     feed(&running, readings(2)).await;
     let address = running.grpc.unwrap().to_string();
@@ -73,7 +73,7 @@ async fn a_certificate_opens_what_its_roles_allow_and_nothing_else() {
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn a_recording_holds_the_path_of_the_key_and_nothing_of_the_key() {
+async fn a_recording_has_the_path_of_the_private_key_but_not_the_key() {
     let folder = tempfile::tempdir().unwrap();
     let record = folder.path().join("secured.mcap");
     let mut config = secured(true);
@@ -92,7 +92,7 @@ async fn a_recording_holds_the_path_of_the_key_and_nothing_of_the_key() {
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn a_replay_that_serves_asks_for_the_certificates_that_its_configuration_asks_for() {
+async fn replay_with_serve_requires_the_certificates_of_its_configuration() {
     let folder = tempfile::tempdir().unwrap();
     let (file, scan) = (folder.path().join("clearway.toml"), folder.path().join("0.bin"));
     std::fs::write(&file, secured(true).to_toml()).unwrap();
@@ -114,7 +114,7 @@ async fn a_replay_that_serves_asks_for_the_certificates_that_its_configuration_a
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn a_server_does_not_serve_in_plain_text_if_its_certificates_were_not_read() {
+async fn a_server_with_unread_certificates_does_not_serve_in_plain_text() {
     let setup = Setup { config: secured(false), ..Setup::default() };
     let error = Server::start(setup).await.err().expect("no server").to_string();
     assert!(error.starts_with("grpc.tls: "), "{error}");
@@ -122,7 +122,7 @@ async fn a_server_does_not_serve_in_plain_text_if_its_certificates_were_not_read
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn peers_that_shake_no_hand_reset_or_say_too_much_leave_the_others_served() {
+async fn silent_resetting_and_oversized_peers_do_not_disturb_the_others() {
     let running = start(config()).await;
     feed(&running, readings(2)).await;
     let address = running.grpc.unwrap();
@@ -180,7 +180,7 @@ async fn zenoh_client(router: &str, ca: &str, name: &str) -> zenoh::Result<zenoh
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn behind_the_router_of_deploy_each_certificate_does_what_its_rules_allow() {
+async fn the_router_of_deploy_allows_each_certificate_only_its_keys() {
     let folder = tempfile::tempdir().unwrap();
     let ours = certificates("ours");
     let (router, at) = router().await;

@@ -213,7 +213,7 @@ impl Table {
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn maps_of_recorded_scans_are_as_small_as_promised() {
+async fn maps_of_recorded_drives_are_within_their_size_limits() {
     let mut classes = Table::default();
     for drive in &DRIVES {
         let maps = maps(drive).await;

@@ -47,7 +47,7 @@ async fn session(running: &clearway::server::Running) -> Session {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_live_drive_over_udp_reaches_grpc_and_zenoh_with_the_bytes_of_the_recording() {
+async fn grpc_zenoh_and_the_recording_have_the_same_bytes_of_a_live_drive() {
     let folder = tempfile::tempdir().unwrap();
     let record = folder.path().join("live.mcap");
     let mut config = config();
@@ -138,7 +138,7 @@ async fn a_sender_that_is_not_configured_is_refused_for_its_source() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_unknown_vehicle_or_layer_is_answered_with_the_known_ones() {
+async fn an_unknown_vehicle_or_layer_is_refused_with_the_known_ones() {
     let running = start(config()).await;
     let mut client = grpc(&running).await;
     let get = |vehicle: &str, layer: &str| v1::GetMapRequest { vehicle: vehicle.into(), layers: vec![layer.into()] };
@@ -192,7 +192,7 @@ async fn health_and_reflection_answer() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_late_zenoh_joiner_gets_the_current_map_and_the_same_key_answers_queries() {
+async fn a_late_zenoh_subscriber_and_a_query_get_the_current_map() {
     let mut config = config();
     config.zenoh.enabled = true;
     let running = start(config).await;
@@ -350,7 +350,7 @@ async fn the_page_its_live_maps_and_the_metrics_are_served() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
+async fn two_vehicles_have_their_own_sockets_maps_and_journals() {
     let folder = tempfile::tempdir().unwrap();
     let record = folder.path().join("two.mcap");
     let mut config = config();

@@ -68,7 +68,7 @@ fn replayed(record: &Path, vehicle: &str) -> Ledger {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording() {
+async fn every_datagram_is_counted_in_the_ledger_and_in_the_recording() {
     let folder = tempfile::tempdir().unwrap();
     let record = folder.path().join("d.mcap");
     let mut config = config();
@@ -142,7 +142,7 @@ async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_group_is_heard_on_its_interface() {
+async fn a_multicast_group_is_received_on_its_interface() {
     let mut config = config();
     let groups = vec!["239.255.77.1".parse().unwrap()];
     let any = "0.0.0.0:0".parse().unwrap();
@@ -281,7 +281,7 @@ fn without_arrival(map: &[u8]) -> v1::Map {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn two_captures_sent_to_one_port_at_once_give_both_vehicles_the_maps_of_their_files() {
+async fn two_captures_sent_to_one_port_make_the_maps_of_their_files() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let captures = [("car", HDL32, "127.0.0.2"), ("van", VLP16, "127.0.0.3")]

@@ -53,7 +53,7 @@ fn assert_near(found: &Value, expected: &[f64]) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
-async fn a_ros_2_subscriber_who_comes_late_finds_every_layer_and_the_vehicle_on_the_map() {
+async fn a_late_ros_2_subscriber_receives_every_layer_and_the_transform() {
     let running = start(ros2()).await;
     let readings = readings(4);
     place(&running, &readings).await;
@@ -107,7 +107,7 @@ async fn no_layer_is_made_for_topics_and_channels_without_subscribers() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
-async fn a_foxglove_client_is_shown_the_current_map_at_once_and_points_from_then_on() {
+async fn a_foxglove_client_gets_the_current_map_and_points_of_later_maps() {
     let mut config = config();
     config.foxglove = Foxglove { enabled: true, listen: "127.0.0.1:0".parse().unwrap() };
     let running = start(config).await;

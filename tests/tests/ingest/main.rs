@@ -94,7 +94,7 @@ fn tunnelled(readings: &[Reading], count: usize) -> Vec<Observation> {
 }
 
 /// Holds a drive's maps, come as tunnelled packets, against those it makes by the door of files.
-async fn assert_tunnelled_makes_the_maps_of_the_file_door(config: Config, readings: Vec<Reading>) -> usize {
+async fn assert_tunnelled_makes_the_maps_of_the_file(config: Config, readings: Vec<Reading>) -> usize {
     let folder = tempfile::tempdir().unwrap();
     let (by_file, by_grpc) = (folder.path().join("file.mcap"), folder.path().join("grpc.mcap"));
     let end_ns = readings.last().expect("a drive").arrival_ns;
@@ -121,19 +121,19 @@ async fn assert_tunnelled_makes_the_maps_of_the_file_door(config: Config, readin
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_drive_tunnelled_over_grpc_makes_the_maps_of_the_file_door() {
-    let maps = assert_tunnelled_makes_the_maps_of_the_file_door(config(), readings(5)).await;
+async fn a_drive_tunnelled_over_grpc_makes_the_maps_of_the_file() {
+    let maps = assert_tunnelled_makes_the_maps_of_the_file(config(), readings(5)).await;
     assert!(maps as u64 >= 5 * fixture::LAYERS, "{maps}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn a_recorded_drive_tunnelled_over_grpc_makes_the_maps_of_the_file_door() {
+async fn a_recorded_drive_tunnelled_over_grpc_makes_the_maps_of_the_file() {
     let file = Path::new(env!("CLEARWAY_DATA")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
     let drive = clearway::ingest::files::capture::Source::open(&file).unwrap();
     let readings: Vec<Reading> = drive.map(Result::unwrap).collect();
     assert_eq!(readings.len(), 976);
-    let maps = assert_tunnelled_makes_the_maps_of_the_file_door(config(), readings).await;
+    let maps = assert_tunnelled_makes_the_maps_of_the_file(config(), readings).await;
     assert_eq!(maps as u64, 6 * fixture::LAYERS);
 }
 
@@ -206,7 +206,7 @@ fn road_cells(map: &v1::Map) -> u32 {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_session_of_scans_poses_and_roads_over_grpc_makes_moved_maps_with_the_road_and_verifies() {
+async fn scans_poses_and_roads_over_grpc_make_compensated_maps_with_the_road() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let turns = 4;
@@ -234,7 +234,7 @@ async fn a_session_of_scans_poses_and_roads_over_grpc_makes_moved_maps_with_the_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_sensor_that_the_stream_declares_is_mapped_recorded_and_declared_again_without_harm() {
+async fn a_sensor_declared_in_the_stream_is_mapped_and_recorded() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("r.mcap");
     let running = start(scanned_config(), &file).await;
@@ -269,7 +269,7 @@ async fn a_sensor_that_the_stream_declares_is_mapped_recorded_and_declared_again
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn what_a_blind_sector_hides_is_counted_as_far_as_the_status_and_unknown_in_the_map() {
+async fn points_in_a_blind_sector_are_counted_in_the_status_and_metrics() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("r.mcap");
     let mut config = scanned_config();
@@ -287,7 +287,7 @@ async fn what_a_blind_sector_hides_is_counted_as_far_as_the_status_and_unknown_i
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn the_same_session_over_zenoh_makes_the_same_maps_and_hears_the_same_refusals() {
+async fn a_session_over_zenoh_makes_the_same_maps_and_refusals_as_over_grpc() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let running = start(scanned_config(), &at("grpc.mcap")).await;
@@ -318,7 +318,7 @@ async fn the_same_session_over_zenoh_makes_the_same_maps_and_hears_the_same_refu
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn the_command_sends_scans_poses_and_a_road_and_says_what_was_refused() {
+async fn clearway_ingest_sends_scans_poses_and_a_road_and_counts_refusals() {
     let folder = tempfile::tempdir().unwrap();
     let point = |x: f32, y: f32| [x, y, -1.9, 0.5].map(f32::to_le_bytes).concat();
     let plain: Vec<u8> = (0..400_u16).map(f32::from).flat_map(|i| point(3.0 + i % 20.0, i / 20.0 - 10.0)).collect();
@@ -345,7 +345,7 @@ async fn the_command_sends_scans_poses_and_a_road_and_says_what_was_refused() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_server_that_stops_has_told_what_became_of_everything() {
+async fn a_server_that_stops_has_reported_every_outcome() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("r.mcap");
     let running = start(config(), &file).await;

@@ -25,7 +25,7 @@ fn spoilt(scan: v1::Scan, last: f32) -> v1::Scan {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn whatever_is_no_observation_is_refused_by_name_and_leaves_the_maps_as_they_would_be() {
+async fn invalid_observations_are_refused_by_name_and_do_not_change_maps() {
     let folder = tempfile::tempdir().unwrap();
     let (clean, hostile) = (folder.path().join("clean.mcap"), folder.path().join("hostile.mcap"));
     let good = [1_000_000_000, 1_100_000_000].map(plain);
@@ -132,7 +132,7 @@ async fn whatever_is_no_observation_is_refused_by_name_and_leaves_the_maps_as_th
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn points_that_are_nowhere_are_counted_and_left_out() {
+async fn points_without_a_finite_position_are_counted_and_dropped() {
     let folder = tempfile::tempdir().unwrap();
     let running = start(scanned_config(), &folder.path().join("r.mcap")).await;
     let wild = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e9];

@@ -47,7 +47,7 @@ impl Link {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_stopped_and_a_slow_reader_cost_eight_healthy_ones_nothing_and_resume_with_the_newest_map() {
+async fn stopped_and_slow_readers_cost_the_others_nothing_and_resume_newest() {
     /// What the wire's greetings take, and 10 kB/s of a server of ten maps a second.
     const GREETING_BYTES: usize = 1000;
     const BYTES_A_TURN: usize = 1000;
@@ -114,7 +114,7 @@ async fn a_stopped_and_a_slow_reader_cost_eight_healthy_ones_nothing_and_resume_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_thousand_idle_connections_take_no_more_than_their_places_and_the_next_peer_is_told() {
+async fn idle_connections_are_limited_and_the_next_peer_is_told_the_limit() {
     let mut config = config();
     config.grpc.connections_max = 32;
     let running = start(config).await;

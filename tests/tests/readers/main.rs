@@ -127,7 +127,7 @@ async fn an_impossible_request_is_refused_and_disturbs_no_other_reader() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_rate_picks_maps_by_their_stamps_and_what_it_left_out_is_told_from_what_was_lost() {
+async fn a_rate_selects_maps_by_stamp_and_counts_left_out_and_skipped_maps() {
     let running = start(config()).await;
     let mut client = plain(running.grpc.unwrap()).await;
     let halved = v1::Selection { max_rate_hz: Some(5.0), ..of_layer(1) };
@@ -161,7 +161,7 @@ async fn a_rate_picks_maps_by_their_stamps_and_what_it_left_out_is_told_from_wha
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_late_joiner_gets_the_current_map_and_only_the_late_joiner() {
+async fn the_current_map_is_sent_again_to_a_late_joiner_only() {
     let running = start(config()).await;
     let mut client = plain(running.grpc.unwrap()).await;
     let mut early = Reader::open(&mut client, of_layer(1)).await.unwrap();
@@ -183,7 +183,7 @@ async fn a_late_joiner_gets_the_current_map_and_only_the_late_joiner() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn deltas_lead_to_the_cells_of_whole_maps_and_a_reader_that_lost_one_gets_a_whole_map_at_once() {
+async fn deltas_decode_to_whole_maps_and_a_lost_one_is_followed_by_a_keyframe() {
     let running = start(config()).await;
     let mut client = plain(running.grpc.unwrap()).await;
     let every = || v1::Selection { max_in_flight: 1, ..Default::default() };
@@ -274,7 +274,7 @@ impl MapService for Lossy {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn our_client_shows_the_cells_of_whole_maps_also_when_an_update_is_lost_between() {
+async fn the_client_has_the_cells_of_whole_maps_after_a_lost_delta() {
     let running = start(config()).await;
     let server = running.grpc.unwrap();
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
