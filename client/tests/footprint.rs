@@ -1,4 +1,4 @@
-//! Whether a footprint is free and where the nearest obstacle lies, against looking everywhere.
+//! Compares `is_free` and `nearest_obstacle` with a brute-force search over closely spaced points.
 
 mod common;
 
@@ -14,12 +14,12 @@ use clearway_proto::v1::ClassMeaning;
 use proptest::prelude::*;
 
 const SIDE: u32 = 6;
-const BENCHES: [f32; 3] = [0.6, 1.3, 2.5];
-/// Between two looks; what the brute force may miss is a little more than this.
-const LOOK_M: f64 = 0.02;
+const ROW_RADII_M: [f32; 3] = [0.6, 1.3, 2.5];
+/// Spacing of the brute-force points, in metres; the search may miss a little more than this.
+const SPACING_M: f64 = 0.02;
 
 fn radial(columns: u32) -> Geometry {
-    Geometry::Radial(v1::RadialGrid { row_radius_m: BENCHES.to_vec(), columns })
+    Geometry::Radial(v1::RadialGrid { row_radius_m: ROW_RADII_M.to_vec(), columns })
 }
 
 fn cartesian(yaw_rad: f64) -> Geometry {
@@ -57,15 +57,15 @@ fn view_of(geometry: Geometry, classes: &[u8], legend: &[(&str, ClassMeaning, u3
     MapView::decode(Bytes::from([encode_header(&v1::Header::default()), encode_layer(&layer)].concat())).unwrap()
 }
 
-/// Places of a footprint grown by `margin_m`, its border included, as close together as looks go.
+/// Points of a footprint grown by `margin_m`, its border included, at most `SPACING_M` apart.
 fn places(footprint: &Footprint, margin_m: f64) -> impl Iterator<Item = (f64, f64)> {
     let (length, width) = (footprint.length_m + 2.0 * margin_m, footprint.width_m + 2.0 * margin_m);
     let (sin, cos) = footprint.heading_rad.sin_cos();
     let (x, y) = (footprint.x_m, footprint.y_m);
-    let looks = |side: f64| (side / LOOK_M).ceil().max(1.0) as i32;
-    let at = move |i: i32, side: f64| side * (f64::from(i) / f64::from(looks(side)) - 0.5);
-    (0..=looks(length)).flat_map(move |i| {
-        (0..=looks(width)).map(move |j| {
+    let steps = |side: f64| (side / SPACING_M).ceil().max(1.0) as i32;
+    let at = move |i: i32, side: f64| side * (f64::from(i) / f64::from(steps(side)) - 0.5);
+    (0..=steps(length)).flat_map(move |i| {
+        (0..=steps(width)).map(move |j| {
             let (ahead, left) = (at(i, length), at(j, width));
             (x + ahead * cos - left * sin, y + ahead * sin + left * cos)
         })
@@ -74,7 +74,7 @@ fn places(footprint: &Footprint, margin_m: f64) -> impl Iterator<Item = (f64, f6
 
 fn geometries() -> impl Strategy<Value = (Geometry, usize)> {
     prop_oneof![
-        (1_u32..9).prop_map(|columns| (radial(columns), BENCHES.len() * columns as usize)),
+        (1_u32..9).prop_map(|columns| (radial(columns), ROW_RADII_M.len() * columns as usize)),
         (-4.0..4.0).prop_map(|yaw| (cartesian(yaw), (SIDE * SIDE) as usize)),
         Just((cartesian(0.0), (SIDE * SIDE) as usize)),
     ]
@@ -102,9 +102,9 @@ proptest! {
         let drivable = |(x, y): (f64, f64)| layer.class_at(x, y).0 == 1;
         let free = map.is_free("drivability", &footprint).unwrap();
         if free {
-            prop_assert!(places(&footprint, 0.0).all(drivable), "called free, but a place of it is not");
+            prop_assert!(places(&footprint, 0.0).all(drivable), "free, but a point of it is not");
         } else {
-            prop_assert!(!places(&footprint, 1.5 * LOOK_M).all(drivable), "called not free, but all of it is");
+            prop_assert!(!places(&footprint, 1.5 * SPACING_M).all(drivable), "not free, but all of its points are");
         }
     }
 
@@ -118,13 +118,13 @@ proptest! {
             prop_assert_eq!(seen, None);
             return Ok(());
         };
-        let seen = seen.expect("cells are larger than the looks are apart");
+        let seen = seen.expect("cells are larger than the spacing");
         let distance_m = obstacle.distance_m;
-        prop_assert!(distance_m <= seen + 1e-9 && distance_m > seen - 2.0 * LOOK_M, "{obstacle:?}, {seen}");
+        prop_assert!(distance_m <= seen + 1e-9 && distance_m > seen - 2.0 * SPACING_M, "{obstacle:?}, {seen}");
         let (sin, cos) = obstacle.bearing_rad.sin_cos();
         let place = (x + obstacle.distance_m * cos, y + obstacle.distance_m * sin);
         prop_assert!((place.0 - obstacle.x_m).hypot(place.1 - obstacle.y_m) < 1e-9, "{obstacle:?}");
-        // On the border of its cell at most.
+        // The point may lie on the border of its cell.
         let nudges = [-1e-7, 0.0, 1e-7];
         let (ox, oy) = (obstacle.x_m, obstacle.y_m);
         let is_obstacle = |(dx, dy): (f64, f64)| layer.class_at(ox + dx, oy + dy).0 == 3;
@@ -164,13 +164,13 @@ fn only_the_meaning_free_is_free_and_only_occupied_is_an_obstacle() {
 fn the_distance_of_an_obstacle_is_at_most_that_of_its_cells_border() {
     let map = view(radial(8), &[[0, 0, 0, 0, 0, 0, 0, 3], [0; 8], [0; 8]].concat());
     let obstacle = map.nearest_obstacle("drivability", 0.0, 0.0).unwrap().unwrap();
-    assert_eq!(obstacle.distance_m, 0.0, "the innermost cells begin in the middle: {obstacle:?}");
+    assert_eq!(obstacle.distance_m, 0.0, "the innermost cells begin at the vehicle: {obstacle:?}");
 }
 
 #[test]
 fn distance_and_bearing_are_to_the_nearest_point_of_the_cell() {
     let map = MapView::decode(common::map(5, common::CAPTURE_END_NS)).unwrap();
-    // From 10 to 20 m, ahead and to the right: the nearest of it is the bench's inner border.
+    // The obstacle lies from 10 to 20 m, ahead and to the right; its nearest point is on the inner border of its row.
     let obstacle = map.nearest_obstacle("drivability", 0.0, -4.0).unwrap().unwrap();
     assert!(
         (obstacle.distance_m - 6.0).abs() < 1e-9 && (obstacle.bearing_rad + FRAC_PI_2).abs() < 1e-9,

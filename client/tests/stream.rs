@@ -33,10 +33,10 @@ impl MapService for Script {
         request: Request<Streaming<v1::WatchRequest>>,
     ) -> Result<Response<Self::WatchStream>, Status> {
         let mut requests = request.into_inner();
-        let told = self.requests.clone();
+        let forward = self.requests.clone();
         tokio::spawn(async move {
             while let Ok(Some(request)) = requests.message().await {
-                let _ = told.send(request);
+                let _ = forward.send(request);
             }
         });
         let updates = std::mem::take(&mut *self.updates.lock().unwrap());
@@ -62,11 +62,11 @@ impl MapService for Script {
 async fn serve(updates: Updates) -> (String, mpsc::UnboundedReceiver<v1::WatchRequest>) {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap().to_string();
-    let (requests, told) = mpsc::unbounded_channel();
+    let (requests, received) = mpsc::unbounded_channel();
     let service = MapServiceServer::new(Script { updates: Mutex::new(updates), requests });
     let incoming = tonic::transport::server::TcpIncoming::from(listener);
     tokio::spawn(tonic::transport::Server::builder().add_service(service).serve_with_incoming(incoming));
-    (address, told)
+    (address, received)
 }
 
 fn update(sequence: u64, skipped: u64) -> Result<v1::MapUpdate, Status> {
@@ -75,14 +75,14 @@ fn update(sequence: u64, skipped: u64) -> Result<v1::MapUpdate, Status> {
 
 #[tokio::test]
 async fn every_map_is_acknowledged_and_skipped_maps_are_counted() {
-    let (address, mut told) = serve(vec![update(0, 0), update(3, 2), update(4, 0)]).await;
+    let (address, mut received) = serve(vec![update(0, 0), update(3, 2), update(4, 0)]).await;
     let client = Client::connect(&address).await.unwrap();
     let layers = vec!["drivability".to_string()];
     let mut maps = client.subscribe(Subscription { layers: layers.clone(), ..Default::default() }).await.unwrap();
-    let selection = told.recv().await.unwrap().selection.unwrap();
+    let selection = received.recv().await.unwrap().selection.unwrap();
     assert_eq!(selection, v1::Selection { vehicle: String::new(), layers, max_in_flight: 2, ..Default::default() });
     for sequence in [0, 3, 4] {
-        assert_eq!(told.recv().await.unwrap().acknowledged, Some(sequence));
+        assert_eq!(received.recv().await.unwrap().acknowledged, Some(sequence));
     }
     // At whatever times the client calls `next`, every map is either returned or counted as skipped.
     let (mut given, mut skipped, mut newest) = (0, 0, None);
@@ -114,12 +114,12 @@ fn delta(sequence: u64, base_sequence: u64) -> Result<v1::MapUpdate, Status> {
 #[tokio::test]
 async fn a_lost_update_leads_to_a_whole_map_and_never_to_a_wrong_cell() {
     // Map 1 is lost. Map 3 is already sent when the server receives the request for a keyframe.
-    let (address, mut told) = serve(vec![update(0, 0), delta(2, 1), delta(3, 2), update(4, 0), delta(5, 4)]).await;
+    let (address, mut received) = serve(vec![update(0, 0), delta(2, 1), delta(3, 2), update(4, 0), delta(5, 4)]).await;
     let client = Client::connect(&address).await.unwrap();
     let mut maps = client.subscribe(Subscription { deltas: true, ..Default::default() }).await.unwrap();
-    assert!(told.recv().await.unwrap().selection.unwrap().deltas);
+    assert!(received.recv().await.unwrap().selection.unwrap().deltas);
     for (sequence, request_keyframe) in [(0, false), (2, true), (3, false), (4, false), (5, false)] {
-        let request = told.recv().await.unwrap();
+        let request = received.recv().await.unwrap();
         assert_eq!((request.acknowledged, request.request_keyframe), (Some(sequence), request_keyframe));
     }
     let (mut given, mut skipped) = (Vec::new(), 0);
@@ -136,18 +136,18 @@ async fn a_lost_update_leads_to_a_whole_map_and_never_to_a_wrong_cell() {
 
 #[tokio::test]
 async fn a_delta_that_was_not_requested_is_not_shown() {
-    let (address, mut told) = serve(vec![delta(2, 1), update(3, 0)]).await;
+    let (address, mut received) = serve(vec![delta(2, 1), update(3, 0)]).await;
     let client = Client::connect(&address).await.unwrap();
     let mut maps = client.subscribe(Subscription::default()).await.unwrap();
-    told.recv().await.unwrap();
-    assert!(told.recv().await.unwrap().request_keyframe);
+    received.recv().await.unwrap();
+    assert!(received.recv().await.unwrap().request_keyframe);
     assert_eq!(maps.next().await.unwrap().map.sequence(), 3);
 }
 
 #[tokio::test]
 async fn an_invalid_map_ends_the_stream_and_is_not_shown() {
-    let spoilt = v1::MapUpdate { map: map(1, CAPTURE_END_NS).slice(..100), ..Default::default() };
-    let (address, _told) = serve(vec![Ok(spoilt)]).await;
+    let truncated = v1::MapUpdate { map: map(1, CAPTURE_END_NS).slice(..100), ..Default::default() };
+    let (address, _received) = serve(vec![Ok(truncated)]).await;
     let client = Client::connect(&address).await.unwrap();
     let mut maps = client.subscribe(Subscription::default()).await.unwrap();
     let error = maps.next().await.unwrap_err();
@@ -157,7 +157,7 @@ async fn an_invalid_map_ends_the_stream_and_is_not_shown() {
 
 #[tokio::test]
 async fn the_error_of_a_call_contains_the_servers_message() {
-    let (address, _told) = serve(vec![Err(Status::unavailable("the vehicle's engine has stopped"))]).await;
+    let (address, _received) = serve(vec![Err(Status::unavailable("the vehicle's engine has stopped"))]).await;
     let client = Client::connect(&format!("http://{address}")).await.unwrap();
     assert_eq!(client.vehicles().await.unwrap()[0].name, "alpha");
     assert_eq!(client.newest("alpha", &[]).await.unwrap().sequence(), 9);

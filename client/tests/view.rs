@@ -20,13 +20,13 @@ fn the_class_at_a_point_is_that_of_the_cell_around_it() {
         ((5.0, -5.0), "drivable"),
         ((10.0, -10.0), "obstacle"),
         ((20.0, -15.0), "drivable"),
-        // A bench belongs to the row inside of it, a column starts at its azimuth.
+        // A row includes its outer radius, and a column starts at its azimuth.
         ((10.0, 0.0), "drivable"),
         ((0.0, 15.0), "not_drivable"),
         ((0.0, -10.0), "drivable"),
         ((0.0, -10.1), "obstacle"),
         ((0.0, 0.0), "drivable"),
-        // Outside of the grid, and nowhere.
+        // Outside the grid, and not finite.
         ((30.1, 0.0), "unknown"),
         ((-25.0, 25.0), "unknown"),
         ((f64::NAN, 0.0), "unknown"),
@@ -57,7 +57,7 @@ fn a_map_is_stale_when_its_validity_has_passed_or_its_age_is_not_known() {
     assert!(!view.is_stale(CAPTURE_END_NS + 300 * ms));
     assert!(view.is_stale(CAPTURE_END_NS + 300 * ms + 1));
     assert!(!view.is_stale(CAPTURE_END_NS - 300 * ms), "clocks may differ a little");
-    assert!(view.is_stale(CAPTURE_END_NS - 301 * ms), "a clock this far behind cannot tell the age");
+    assert!(view.is_stale(CAPTURE_END_NS - 301 * ms), "with a clock this far behind the age is not known");
     assert!(view.is_stale(i64::MAX) && view.is_stale(i64::MIN));
 }
 

@@ -1,4 +1,4 @@
-//! Recordings are the maps of their events, and where one is not, it is said which map, layer and cell.
+//! The maps of a recording are the maps of its events; `verify` names the first map, layer and cell that differs.
 
 mod fixture;
 
@@ -29,8 +29,8 @@ async fn recording(file: &Path) {
     let mut readings = readings(5);
     let arrival_ns = readings.last().unwrap().arrival_ns;
     readings.push(Reading { arrival_ns, source: 0, body: Body::End });
-    let door = running.inputs[0].queue.clone();
-    let fed = move || readings.into_iter().try_for_each(|reading| door.push_captured(reading));
+    let queue = running.inputs[0].queue.clone();
+    let fed = move || readings.into_iter().try_for_each(|reading| queue.push_captured(reading));
     tokio::task::spawn_blocking(fed).await.unwrap().unwrap();
     running.shutdown().await.unwrap();
 }
@@ -63,15 +63,15 @@ fn copy(from: &Path, to: &Path, mut change: impl FnMut(&str, u32, Vec<u8>) -> Op
 #[tokio::test(flavor = "multi_thread")]
 async fn verify_names_a_changed_cell_by_sequence_layer_row_and_column() {
     let folder = tempfile::tempdir().unwrap();
-    let (whole, planted) = (folder.path().join("whole.mcap"), folder.path().join("planted.mcap"));
+    let (whole, changed_copy) = (folder.path().join("whole.mcap"), folder.path().join("changed_copy.mcap"));
     recording(&whole).await;
     let report = verify(&whole).unwrap();
     assert!(report.is_good() && report.maps >= 5 && report.equal == fixture::LAYERS * report.maps, "{report:?}");
 
-    // One cell of the third map's class goes from whatever it is to an obstacle or back.
+    // One class of the third map changes to an obstacle, or from an obstacle to drivable.
     let (row, column, columns) = (3, 17, 360);
     let mut was_and_is = None;
-    copy(&whole, &planted, |topic, sequence, data| {
+    copy(&whole, &changed_copy, |topic, sequence, data| {
         if topic != "/car/map/drivability" || sequence != 2 {
             return Some(data);
         }
@@ -88,7 +88,7 @@ async fn verify_names_a_changed_cell_by_sequence_layer_row_and_column() {
         *channel = encode_grid(CellsRef::U8(&cells), columns).into_channel(&name, &unit, scale, unknown);
         Some(map.encode_to_vec())
     });
-    let report = verify(&planted).unwrap();
+    let report = verify(&changed_copy).unwrap();
     assert_eq!(report.different, 1);
     let difference = &report.differences[0];
     assert_eq!((&*difference.vehicle, difference.sequence, &*difference.layer), ("car", 2, "drivability"));
@@ -103,15 +103,17 @@ async fn verify_names_a_changed_cell_by_sequence_layer_row_and_column() {
 #[tokio::test(flavor = "multi_thread")]
 async fn verify_names_a_missing_map_a_changed_header_and_a_journal_gap() {
     let folder = tempfile::tempdir().unwrap();
-    let (whole, planted) = (folder.path().join("whole.mcap"), folder.path().join("planted.mcap"));
+    let (whole, changed_copy) = (folder.path().join("whole.mcap"), folder.path().join("changed_copy.mcap"));
     recording(&whole).await;
 
-    copy(&whole, &planted, |topic, sequence, data| (topic != "/car/map/drivability" || sequence != 1).then_some(data));
-    let report = verify(&planted).unwrap();
+    copy(&whole, &changed_copy, |topic, sequence, data| {
+        (topic != "/car/map/drivability" || sequence != 1).then_some(data)
+    });
+    let report = verify(&changed_copy).unwrap();
     assert_eq!((report.different, &report.differences[0].kind), (1, &DifferenceKind::Missing));
     assert_eq!(report.differences[0].sequence, 1);
 
-    copy(&whole, &planted, |topic, sequence, data| {
+    copy(&whole, &changed_copy, |topic, sequence, data| {
         if topic != "/car/map/height_difference" || sequence != 0 {
             return Some(data);
         }
@@ -119,12 +121,12 @@ async fn verify_names_a_missing_map_a_changed_header_and_a_journal_gap() {
         map.header.as_mut().unwrap().capture_end_ns += 1;
         Some(map.encode_to_vec())
     });
-    let report = verify(&planted).unwrap();
+    let report = verify(&changed_copy).unwrap();
     let DifferenceKind::Field { field, .. } = &report.differences[0].kind else { panic!("{:?}", report.differences) };
     assert_eq!((report.different, field.as_str()), (1, "header capture_end_ns"));
 
-    copy(&whole, &planted, |topic, sequence, data| (topic != "/car/journal" || sequence != 40).then_some(data));
-    let report = verify(&planted).unwrap();
+    copy(&whole, &changed_copy, |topic, sequence, data| (topic != "/car/journal" || sequence != 40).then_some(data));
+    let report = verify(&changed_copy).unwrap();
     assert_eq!((report.differences[0].sequence, &report.differences[0].kind), (40, &DifferenceKind::Gap { found: 41 }));
 }
 
@@ -208,7 +210,7 @@ async fn changed_bytes_cause_no_panic_and_no_additional_event() {
             }
             bytes.truncate(bytes.len() - missing);
             std::fs::write(&changed, &bytes).unwrap();
-            // Read, refused or found different: all are answers. A panic is none.
+            // The recording may be read, refused or found different; it must not cause a panic.
             if let Ok(report) = verify(&changed) {
                 prop_assert!(report.events <= events, "{report:?}");
             }
@@ -217,13 +219,13 @@ async fn changed_bytes_cause_no_panic_and_no_additional_event() {
         .unwrap();
 }
 
-/// A server of its own process, recording to `file`; and where it listens for data.
+/// Starts a server in its own process that records to `file`; returns its data address too.
 fn serving(folder: &Path, file: &Path) -> (std::process::Child, SocketAddr) {
     let free = || std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let data = free();
     let mut config = config();
     (config.grpc.enabled, config.page.enabled, config.zenoh.enabled) = (false, false, false);
-    // Found beside the configuration, wherever the server was started.
+    // The path is relative to the folder of the configuration.
     config.recorder.file = file.file_name().unwrap().into();
     config.recorder.flush_ms = 50;
     let udp = config.vehicles[0].udp.as_mut().unwrap();
@@ -248,7 +250,7 @@ fn drive_until(file: &Path, bytes: u64, data: SocketAddr) {
     });
     let payloads: Vec<_> = payloads.collect();
     for payload in payloads.iter().cycle() {
-        // A server that is not up yet refuses; it will hear the next turn.
+        // A server that has not started yet refuses; it receives the next revolution.
         let _ = socket.send_to(payload, data);
         if file.metadata().is_ok_and(|metadata| metadata.len() > bytes) {
             return;
@@ -279,9 +281,9 @@ async fn an_address_in_use_is_refused_and_the_old_recording_is_kept() {
     let file = folder.path().join("earlier.mcap");
     std::fs::write(&file, b"what was recorded before").unwrap();
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-    let heard = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
-    let (tcp, udp) = (taken.local_addr().unwrap(), heard.local_addr().unwrap());
-    // Of an address that no other test is given ports of: free until it is taken here.
+    let in_use = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    let (tcp, udp) = (taken.local_addr().unwrap(), in_use.local_addr().unwrap());
+    // No other test uses this address, so its port stays free until this test uses it.
     let free = std::net::TcpListener::bind("127.0.0.77:0").unwrap().local_addr().unwrap();
     type Take = fn(&mut Config, SocketAddr);
     let wrong: [(&str, SocketAddr, Take); 5] = [
@@ -302,7 +304,7 @@ async fn an_address_in_use_is_refused_and_the_old_recording_is_kept() {
         let error = within("a refusal", Server::start(setup)).await.err().expect(key).to_string();
         assert!(error.contains(key) && error.contains(&at.port().to_string()), "{key}: {error}");
         assert_eq!(std::fs::read(&file).unwrap(), b"what was recorded before", "{key}");
-        // Foxglove's own task lets go of the port a moment after it is told to stop.
+        // Foxglove's task releases the port shortly after it stops.
         until("nothing left running", || std::net::TcpListener::bind(free).is_ok()).await;
     }
 }

@@ -28,7 +28,7 @@ async fn every_packet_of_an_hdl32e_drive_is_decoded_and_its_recording_is_good() 
     let snapshot = &summary.snapshot;
     assert_eq!((snapshot.ledger.received, snapshot.ledger.decoded, snapshot.ledger.telemetry), (976, 876, 100));
     assert_eq!((snapshot.refused(), snapshot.ledger.lost), (0, 0));
-    // 5.7 turns: the first and the last are parts of one.
+    // 5.7 revolutions: the first and the last are not whole.
     assert_eq!((snapshot.revolutions(), snapshot.maps), (6, 6));
     let sensor = &snapshot.sensors[0].status;
     assert_eq!(sensor.model, Some(clearway_lidar::model::Model::Hdl32e));
@@ -80,7 +80,7 @@ async fn each_scan_of_a_folder_makes_a_map() {
     let options = Options { files: vec![drive("kitti/patchwork-plusplus")], ..Options::default() };
     let summary = replayed(options).await.unwrap();
     assert_eq!((summary.snapshot.maps, summary.snapshot.ledger.decoded), (3, 3));
-    // KITTI's own calibration says 1.73 m.
+    // 1.73 m in KITTI's own calibration.
     assert!((1.6..1.9).contains(&summary.extrinsics.z_m), "{:?}", summary.extrinsics);
 }
 
@@ -137,7 +137,7 @@ async fn without_ground_no_map_is_made_and_the_extrinsics_are_requested() {
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 async fn a_map_of_all_default_layers_is_at_most_64_kib_except_of_a_vls128() {
-    // A VLS-128's is not, by a fifth: it may grow no larger.
+    // A map of a VLS-128 is a fifth larger than 64 KiB; it must not grow.
     for (file, allowed) in [(HDL32, 64), ("kitti/udacity_data_2", 64), ("mcap/nebula_vls128_none.mcap", 80)] {
         let folder = tempfile::tempdir().unwrap();
         let record = folder.path().join("sizes.mcap");
@@ -145,7 +145,7 @@ async fn a_map_of_all_default_layers_is_at_most_64_kib_except_of_a_vls128() {
         replayed(options).await.unwrap();
         let (mut whole, mut most) = (BTreeMap::<u64, usize>::new(), BTreeMap::<String, usize>::new());
         for ((sequence, layer), bytes) in fixture::recorded(&record) {
-            // Each with the header, which a whole map has once.
+            // Each layer is recorded with the header, which a whole map has once.
             *whole.entry(sequence).or_default() += bytes.len();
             let most = most.entry(layer).or_default();
             *most = bytes.len().max(*most);

@@ -1,9 +1,9 @@
-//! `speed` maps to a way and a move: A* by travel time over ground that was seen to be passable.
+//! Plans a path and a move on the layer `speed`: A* by travel time over ground that the maps have shown as passable.
 //!
-//! In: maps, a goal. Out: the next [`Move`]. Frame: the maps' world ("map") where the vehicle tells its ego poses; what
-//! was seen is then remembered for a while, since a sensor sees nothing close by. Without poses each map stands alone,
-//! in the ego frame. The planner never enters ground that no map has shown, except the place where the vehicle stands
-//! at first.
+//! In: maps, a goal. Out: the next [`Move`]. Frame: "map" if the vehicle sends ego poses; the planner then remembers
+//! earlier maps for a while, because a sensor does not see the ground near the vehicle. Without poses the planner uses
+//! the newest map only, in the ego frame. The planner never enters ground that no map has shown, except the place where
+//! the vehicle stands at first.
 
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, HashMap};
@@ -11,63 +11,63 @@ use std::collections::{BinaryHeap, HashMap};
 use clearway_client::v1::ClassMeaning;
 use clearway_client::{ClientError, MapView};
 
-/// Edge of a cell of the planner's own grid, metres.
+/// Edge of a cell of the planner's own grid, in metres.
 const CELL_M: f64 = 0.5;
-/// It looks this far, metres.
+/// Reach of the planner's grid around the vehicle, in metres.
 const REACH_M: f64 = 16.0;
-/// Three discs about these places of the vehicle, metres ahead of its middle, cover it; each has a radius of 1.16 m.
+/// Centres of three discs that cover the vehicle, in metres ahead of its middle; each has a radius of 1.16 m.
 const DISCS_M: [f64; 3] = [1.45, 0.0, -1.45];
-/// From the middle of a disc to an obstacle's: its radius, and half a cell. Where that is not to be had, less at a
-/// crawl.
+/// Least distances from the centre of a disc to that of an obstacle's cell, each with the greatest speed, in metres and
+/// m/s. The first is the disc's radius and half a cell; the second applies if the first leaves no path.
 const CLEARANCES_M: [(f64, f64); 2] = [(1.5, MPS_MAX), (1.2, 1.0)];
-/// Where it begins, the ground about it that its sensor cannot see is taken on trust, metres.
+/// Radius around the first place of the vehicle in which unseen ground counts as passable, in metres.
 const STAND_M: f64 = 5.0;
-/// And driven over so slowly, m/s.
+/// Speed on that unseen ground, in m/s.
 const STAND_MPS: f64 = 2.0;
-/// An obstacle that is not seen again is forgotten after this, ns; the ground under it is then unknown.
+/// Time after which an obstacle that is not seen again is forgotten, in ns; its cell is then unknown.
 const MEMORY_NS: i64 = 2_000_000_000;
-/// Never faster, m/s.
+/// Greatest speed, in m/s.
 const MPS_MAX: f64 = 8.0;
-/// Nothing nearer is aimed at, metres.
+/// Least distance of the place that a move aims at, in metres.
 const NEAREST_M: f64 = 2.0;
-/// Braking, and to the side, m/s².
+/// Greatest braking and lateral acceleration, in m/s².
 const BRAKE_MPS2: f64 = 4.0;
-/// Tightest turn, 1/m.
+/// Greatest curvature of a move, in 1/m.
 const CURVATURE_MAX: f64 = 0.2;
 
-/// A place, metres.
+/// A place in the planner's frame: x, y, in metres.
 pub type Place = [f64; 2];
 type Cell = [i32; 2];
 
 /// What the vehicle should do until the next map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Move {
-    /// Of the arc to follow, left positive, 1/m.
+    /// Curvature of the arc to follow, left positive, in 1/m.
     pub curvature_per_m: f64,
-    /// 0 where there is no way.
+    /// Speed, in m/s; 0 if there is no path.
     pub mps: f64,
-    /// Length of the way found towards the goal.
+    /// Length of the path towards the goal, in metres.
     pub way_m: f64,
 }
 
-/// Remembers what it was shown.
+/// A planner that remembers the ground of earlier maps.
 #[derive(Debug, Default)]
 pub struct Planner {
     seen: HashMap<Cell, Seen>,
-    /// Of the newest map: x, y, heading.
+    /// Pose of the newest map: x and y in metres, heading in radians.
     ego: [f64; 3],
 }
 
 #[derive(Clone, Copy, Debug)]
 struct Seen {
-    /// 0: an obstacle.
+    /// Allowed speed, in m/s; 0 for an obstacle.
     mps: f64,
     stamp_ns: i64,
 }
 
 impl Planner {
-    /// Takes a map with the layer `speed`.
-    pub fn take(&mut self, map: &MapView) -> Result<(), ClientError> {
+    /// Updates the remembered ground with a map that has the layer `speed`.
+    pub fn update(&mut self, map: &MapView) -> Result<(), ClientError> {
         let (layer, stamp_ns) = (map.layer("speed")?, map.header().capture_end_ns);
         self.ego = match &map.header().map_from_ego {
             Some(p) => {
@@ -93,7 +93,7 @@ impl Planner {
             };
             self.seen.insert(cell, Seen { mps, stamp_ns });
         }
-        // By the obstacles' own cells: none falls between two of the planner's.
+        // Over the cells of the map, so that no obstacle falls between two cells of the planner.
         let occupied = |index: &usize| layer.meaning_of(*index) == ClassMeaning::Occupied;
         for index in (0..layer.grid.cell_count() as usize).filter(occupied) {
             let Some((x, y)) = layer.grid.centre_of(index).filter(|(x, y)| x.hypot(*y) < REACH_M) else { continue };
@@ -118,13 +118,13 @@ impl Planner {
         (-8..=24).rev().map(line).collect()
     }
 
-    /// The place so many metres straight ahead, in the planner's frame.
+    /// The place this many metres straight ahead, in the planner's frame.
     pub fn ahead(&self, metres: f64) -> Place {
         self.in_map([metres, 0.0])
     }
 
-    /// The next move towards a goal, or to where the way ends nearest to it: the arc to the farthest place of the way
-    /// that can be followed up to there.
+    /// The next move towards a goal, or towards the reachable place nearest to it: the arc to the farthest place of the
+    /// path that the vehicle can reach on a free arc.
     pub fn next_move(&self, goal: Place) -> Move {
         let mut way_m = 0.0;
         for (clearance_m, mps) in CLEARANCES_M {
@@ -147,7 +147,7 @@ impl Planner {
         Move { curvature_per_m: 0.0, mps: 0.0, way_m }
     }
 
-    /// Whether the vehicle may follow an arc so far; bends are slight enough to take an arc to be as long as its chord.
+    /// True if the vehicle may follow an arc for this length. Arcs are so slight that the chord has the same length.
     fn is_clear(&self, curvature_per_m: f64, length_m: f64, open: &HashMap<Cell, f64>) -> bool {
         let steps = (length_m / (CELL_M / 2.0)).ceil();
         let is_open = |step: f64, disc_m: f64| {
@@ -158,7 +158,7 @@ impl Planner {
             let place = [chord_m * half_cos + disc_m * cos, chord_m * half_sin + disc_m * sin];
             open.contains_key(&cell_of(self.in_map(place)))
         };
-        // What the tail stands in it leaves.
+        // Cells under the tail do not count, because the vehicle leaves them.
         let discs = |step: f64| DISCS_M.into_iter().filter(move |disc_m| length_m * step / steps + disc_m > 0.5);
         curvature_per_m.abs() <= CURVATURE_MAX
             && (0..=steps as u32).map(f64::from).all(|step| discs(step).all(|disc_m| is_open(step, disc_m)))
@@ -239,7 +239,7 @@ fn distance(a: Place, b: Place) -> f64 {
     (a[0] - b[0]).hypot(a[1] - b[1])
 }
 
-/// A cell and those whose middles lie within so many metres of its own.
+/// A cell and the cells whose centres lie within this many metres of its own.
 fn about([ix, iy]: Cell, reach_m: f64) -> impl Iterator<Item = Cell> {
     let cells = reach_m / CELL_M;
     let reach = cells as i32;

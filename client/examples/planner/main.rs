@@ -1,4 +1,4 @@
-//! A toy planner: A* on `speed`, and the move it would make at each map.
+//! An example planner: A* on the layer `speed`; prints the planned move for each map.
 //! `cargo run -p clearway-client --example planner -- [ADDRESS]`; over zenoh with an endpoint such as
 //! tcp/localhost:7447.
 
@@ -24,7 +24,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
             println!("map {}: stale, so stop", map.sequence());
             continue;
         }
-        planner.take(&map)?;
+        planner.update(&map)?;
         let Move { curvature_per_m, mps, way_m } = planner.next_move(planner.ahead(12.0));
         println!("{}", planner.picture());
         println!("map {}: a way of {way_m:4.1} m; drive {mps:.1} m/s, turn {curvature_per_m:+.3} 1/m", map.sequence());

@@ -1,6 +1,6 @@
 //! A small map with known classes.
 
-// Each test takes what it needs of this.
+// Each test file uses a part of this.
 #![allow(dead_code)]
 
 use bytes::Bytes;
@@ -20,7 +20,7 @@ pub const LEGEND: [(&str, ClassMeaning, u32); 4] = [
 
 pub const CAPTURE_END_NS: i64 = 1_700_000_000_100_000_000;
 
-/// Three benches of 10 m, four columns of a quarter turn: ahead and to the left drivable, behind and to the left not,
+/// Three rows of 10 m, four columns of 90 degrees: ahead and to the left drivable, behind and to the left not drivable,
 /// behind and to the right unknown, ahead and to the right drivable with an obstacle from 10 to 20 m.
 #[rustfmt::skip]
 pub const CLASSES: [u8; 12] = [
