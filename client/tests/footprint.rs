@@ -109,7 +109,7 @@ proptest! {
     }
 
     #[test]
-    fn the_nearest_obstacle_is_no_farther_than_any_point_of_an_obstacle(map in maps(), x in -3.0_f64..3.0, y in -3.0_f64..3.0) {
+    fn the_nearest_obstacle_is_as_near_as_its_nearest_point(map in maps(), x in -3.0_f64..3.0, y in -3.0_f64..3.0) {
         let layer = map.layer("drivability").unwrap();
         let grid = Footprint { x_m: 0.0, y_m: 0.0, heading_rad: 0.0, length_m: 7.0, width_m: 7.0 };
         let seen = places(&grid, 0.0).filter(|&(x, y)| layer.class_at(x, y).0 == 3);

@@ -96,7 +96,7 @@ async fn part(arguments: &Arguments, revolutions: &Revolutions, with: bool) -> V
 /// A reader that stops, or is behind a slow link.
 struct Slow {
     reads: watch::Sender<bool>,
-    heard: watch::Receiver<Received>,
+    received: watch::Receiver<Received>,
     task: tokio::task::JoinHandle<()>,
 }
 
@@ -119,22 +119,24 @@ impl Slow {
         requests.send(v1::WatchRequest { selection: Some(selection), ..Default::default() }).await.expect("capacity");
         let requested = futures::stream::poll_fn(move |context| receiver.poll_recv(context));
         let updates = service.watch(requested).await.expect("the server streams").into_inner();
-        let (tell, mut heard) = watch::channel(Received::default());
+        let (sender, mut received) = watch::channel(Received::default());
         let (reads, may_read) = watch::channel(true);
-        let task = tokio::spawn(read(updates, requests, may_read, tell));
-        heard.changed().await.expect("a first map");
-        Self { reads, heard, task }
+        let task = tokio::spawn(read(updates, requests, may_read, sender));
+        received.changed().await.expect("a first map");
+        Self { reads, received, task }
     }
 
     /// Reads again; returns the age of the first map that was not in flight before, in ms.
     async fn resume(&mut self, readers: &Readers) -> f64 {
-        let before = self.heard.borrow_and_update().updates;
+        let before = self.received.borrow_and_update().updates;
         self.reads.send_replace(true);
         loop {
-            self.heard.changed().await.expect("the stream goes on");
-            let heard = *self.heard.borrow_and_update();
-            if heard.updates > before + u64::from(IN_FLIGHT) {
-                return readers.age_ms(heard.capture_end_ns, heard.arrived_ns).expect("a revolution that was sent");
+            self.received.changed().await.expect("the stream goes on");
+            let received = *self.received.borrow_and_update();
+            if received.updates > before + u64::from(IN_FLIGHT) {
+                return readers
+                    .age_ms(received.capture_end_ns, received.arrived_ns)
+                    .expect("a revolution that was sent");
             }
         }
     }
@@ -144,15 +146,15 @@ async fn read(
     mut updates: Streaming<v1::MapUpdate>,
     requests: tokio::sync::mpsc::Sender<v1::WatchRequest>,
     mut may_read: watch::Receiver<bool>,
-    tell: watch::Sender<Received>,
+    sender: watch::Sender<Received>,
 ) {
     while may_read.wait_for(|reads| *reads).await.is_ok()
         && let Ok(Some(update)) = updates.message().await
     {
         let arrived_ns = now_ns();
         let header = v1::Map::decode(update.map).expect("a map").header.expect("a header");
-        tell.send_modify(|heard| {
-            *heard = Received { updates: heard.updates + 1, capture_end_ns: header.capture_end_ns, arrived_ns };
+        sender.send_modify(|received| {
+            *received = Received { updates: received.updates + 1, capture_end_ns: header.capture_end_ns, arrived_ns };
         });
         let acknowledged = v1::WatchRequest { acknowledged: Some(header.sequence), ..Default::default() };
         if requests.send(acknowledged).await.is_err() {
