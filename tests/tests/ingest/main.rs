@@ -271,7 +271,7 @@ async fn a_sensor_declared_in_the_stream_is_mapped_and_recorded() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn points_in_a_blind_sector_are_counted_in_the_status_and_metrics() {
+async fn points_in_a_blind_sector_are_counted_in_the_ledger_and_the_status() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("r.mcap");
     let mut config = scanned_config();
