@@ -314,7 +314,7 @@ fn a_ros_2_file_has_the_points_of_every_revolution_and_the_mount() {
 }
 
 #[test]
-fn a_foxglove_file_has_grids_transforms_and_the_points_of_every_revolution() {
+fn a_foxglove_file_has_grids_transforms_and_points_of_every_revolution() {
     let (topics, revolutions) = exported("foxglove", &[]);
     let clouds = revolutions.len() as u64;
     assert!(clouds >= 3, "{revolutions:?}");

@@ -1,5 +1,4 @@
-//! `clearway evaluate` on the labelled SemanticKITTI frame: the targets, and what it says of files that do not
-//! fit.
+//! `clearway evaluate` on the labelled SemanticKITTI frame: the targets, and the errors for files that do not match.
 
 use std::path::Path;
 
@@ -10,7 +9,7 @@ fn kitti() -> String {
     Path::new(env!("CLEARWAY_DATA")).join("kitti").display().to_string()
 }
 
-fn judged(arguments: &[&str]) -> Value {
+fn evaluated(arguments: &[&str]) -> Value {
     let folder = tempfile::tempdir().expect("a folder");
     let output = run(folder.path(), "clearway", &[&["evaluate", "--json"], arguments].concat());
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -19,26 +18,26 @@ fn judged(arguments: &[&str]) -> Value {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn the_real_frame_meets_the_targets_of_drivability() {
+fn drivability_of_the_labelled_frame_meets_its_targets() {
     // The scan and its labels lie in folders side by side; two more scans there have no labels.
     for (columns, precision, road) in [("1", 0.9995, 0.99), ("2", 0.997, 0.98), ("4", 0.997, 0.97)] {
-        let report = judged(&[&kitti(), "--columns", columns]);
+        let report = evaluated(&[&kitti(), "--columns", columns]);
         let source = &report["sources"][0];
         assert_eq!((source["frames"].as_u64(), source["scans_without_labels"].as_u64()), (Some(1), Some(2)));
         let maps = source["maps"].as_array().expect("maps");
         let map = maps.iter().find(|map| map["layer"] == "drivability").expect("drivability");
-        let figure = |pointer: &str| map.pointer(pointer).and_then(Value::as_f64).expect(pointer);
+        let metric = |pointer: &str| map.pointer(pointer).and_then(Value::as_f64).expect(pointer);
         println!(
             "{columns}°: cells {:.5} / {:.5}, road {:.5}, ground points {:.4} / {:.4}, leaks {}",
-            figure("/cells/precision"),
-            figure("/cells/recall"),
-            figure("/road/recall"),
-            figure("/ground_points/vegetation_excluded/precision"),
-            figure("/ground_points/vegetation_excluded/recall"),
+            metric("/cells/precision"),
+            metric("/cells/recall"),
+            metric("/road/recall"),
+            metric("/ground_points/vegetation_excluded/precision"),
+            metric("/ground_points/vegetation_excluded/recall"),
             map["leaks"]["by_class"]
         );
-        assert!(figure("/cells/precision") >= precision && figure("/road/recall") >= road);
-        assert!(figure("/cells/recall") >= 0.95);
+        assert!(metric("/cells/precision") >= precision && metric("/road/recall") >= road);
+        assert!(metric("/cells/recall") >= 0.95);
         let classes = map["leaks"]["by_class"].as_object().expect("leaks by class");
         for grave in ["person", "car", "pole", "fence"] {
             assert!(columns != "1" || !classes.contains_key(grave), "{grave}: {classes:?}");
@@ -48,7 +47,7 @@ fn the_real_frame_meets_the_targets_of_drivability() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn labels_without_their_scan_are_named_and_end_in_failure() {
+fn labels_without_their_scan_are_refused_by_name() {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::copy(Path::new(&kitti()).join("mmdet3d/000000.label"), folder.path().join("000000.label"))
         .expect("labels");

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use clearway::server::Running;
-use fixture::certificates::{behind, certificates, router, secured};
+use fixture::certificates::{self, behind, certificates, router};
 use fixture::venv::{environment, run};
 use fixture::{config, feed, readings, start, until, within};
 
@@ -26,7 +26,7 @@ fn files(folder: &Path, into: &mut Vec<PathBuf>) {
     }
 }
 
-/// What is installed follows from these files.
+/// Hash of the files that determine the installed packages.
 fn fingerprint(repository: &Path) -> String {
     let mut paths = Vec::new();
     files(&repository.join("client/python"), &mut paths);
@@ -54,11 +54,11 @@ fn python() -> PathBuf {
     })
 }
 
-/// A server that asks everybody for a certificate, with some maps, behind such a router.
-async fn asking(folder: &Path, router: &str) -> Running {
-    let mut config = behind(router, folder, secured(true));
+/// A server with some maps that requires client certificates, behind a router that requires them too.
+async fn secured_server(folder: &Path, router: &str) -> Running {
+    let mut config = behind(router, folder, certificates::secured(true));
     // A recording makes the server make all layers, with or without readers.
-    config.recorder.file = folder.join("asking.mcap");
+    config.recorder.file = folder.join("secured.mcap");
     let running = fixture::certificates::start(config).await;
     feed(&running, readings(3)).await;
     running
@@ -67,7 +67,7 @@ async fn asking(folder: &Path, router: &str) -> Running {
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
 #[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
-async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording() {
+async fn the_tests_of_the_python_client_pass_against_running_servers() {
     let interpreter = tokio::task::spawn_blocking(python).await.expect("the Python client installs");
 
     let folder = tempfile::tempdir().unwrap();
@@ -86,13 +86,13 @@ async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording
     until("a map", || status.snapshot().maps > 0).await;
 
     let (router, routed) = router().await;
-    let asking = asking(folder.path(), &routed).await;
+    let secured = secured_server(folder.path(), &routed).await;
     let zenoh = running.zenoh.iter().find(|endpoint| endpoint.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
     let grpc = |running: &Running| running.grpc.expect("gRPC is served").to_string();
     let places = [
         ("CLEARWAY_GRPC", grpc(&running)),
         ("CLEARWAY_ZENOH", zenoh.clone()),
-        ("CLEARWAY_SECURED_GRPC", grpc(&asking)),
+        ("CLEARWAY_SECURED_GRPC", grpc(&secured)),
         ("CLEARWAY_SECURED_ZENOH", routed),
         ("CLEARWAY_CERTIFICATES", certificates("ours").display().to_string()),
         ("CLEARWAY_RECORDING", recording.display().to_string()),
@@ -108,7 +108,7 @@ async fn the_python_client_reads_golden_vectors_a_running_server_and_a_recording
     let outcome = tests.await;
     car.halt();
     within("shutdown", running.shutdown()).await.unwrap();
-    within("shutdown", asking.shutdown()).await.unwrap();
+    within("shutdown", secured.shutdown()).await.unwrap();
     router.close().await.unwrap();
     outcome.expect("the Python client's tests pass");
 }

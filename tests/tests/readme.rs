@@ -1,4 +1,4 @@
-//! The README's commands do what the README says.
+//! The commands of the README, run as they are written there.
 
 #[path = "fixture/venv.rs"]
 mod venv;
@@ -10,7 +10,7 @@ use std::sync::{Mutex, PoisonError};
 
 use clearway_tests::{binaries, run, workspace};
 
-/// The demo and a server with the default configuration want the same ports.
+/// The demo and a server with the default configuration use the same ports.
 static DEFAULT_PORTS: Mutex<()> = Mutex::new(());
 
 /// Every command line of the README's `sh` blocks, in order.
@@ -29,7 +29,7 @@ fn commands() -> Vec<String> {
     lines
 }
 
-/// A server the test stops again, whatever happens.
+/// A server that stops when this is dropped.
 struct Stopped(Child);
 
 impl Drop for Stopped {
@@ -62,14 +62,14 @@ fn the_demo_runs_and_ends_cleanly() {
     let said = String::from_utf8_lossy(&output.stdout);
     assert!(output.status.success(), "{}\n{said}\n{}", output.status, String::from_utf8_lossy(&output.stderr));
     for place in ["http://", "gRPC", "zenoh", ".mcap", ".png"] {
-        assert!(said.contains(place), "the demo tells of {place}:\n{said}");
+        assert!(said.contains(place), "the demo prints {place}:\n{said}");
     }
 }
 
 #[test]
 #[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn a_capture_is_replayed_verified_exported_and_described_as_the_readme_says() {
+fn the_offline_commands_of_the_readme_succeed_on_a_capture() {
     let folder = tempfile::tempdir().expect("a folder");
     let capture = Path::new(env!("CLEARWAY_DATA")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
     fs::copy(&capture, folder.path().join("drive.pcap")).expect("the HDL-32E capture");
@@ -85,10 +85,10 @@ fn a_capture_is_replayed_verified_exported_and_described_as_the_readme_says() {
     assert!(pictures >= 6, "{pictures} pictures of 5.7 revolutions");
     for (name, schema) in [("drive.foxglove.mcap", "foxglove.Grid"), ("drive.ros2.mcap", "nav_msgs/msg/OccupancyGrid")]
     {
-        let told =
-            venv::run(venv::script("viewer_file.py").arg(folder.path().join(name)), "the README says who reads it");
-        let told: serde_json::Value = serde_json::from_str(&told).expect("one object");
-        let topics = told.as_object().expect("topics by name").values();
+        let topics =
+            venv::run(venv::script("viewer_file.py").arg(folder.path().join(name)), "the README names its readers");
+        let topics: serde_json::Value = serde_json::from_str(&topics).expect("one object");
+        let topics = topics.as_object().expect("topics by name").values();
         let grids = topics.filter(|topic| topic["schema"] == schema && topic["count"].as_u64() >= Some(6)).count();
         assert_eq!(grids, 6, "every layer of 5.7 revolutions in {name}");
     }
@@ -96,7 +96,7 @@ fn a_capture_is_replayed_verified_exported_and_described_as_the_readme_says() {
 
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-fn the_maps_are_judged_as_the_readme_says() {
+fn the_evaluate_commands_of_the_readme_succeed() {
     let folder = tempfile::tempdir().expect("a folder");
     let data = Path::new(option_env!("CLEARWAY_DATA").unwrap_or_default()).join("kitti");
     for (file, place) in [("patchwork-plusplus/000000.bin", "velodyne"), ("mmdet3d/000000.label", "labels")] {

@@ -1,4 +1,4 @@
-//! Recordings are the maps of their events, and where one is not, it is said which map, layer and cell.
+//! The maps of a recording are the maps of its events; `verify` names the first map, layer and cell that differs.
 
 mod fixture;
 
@@ -29,8 +29,8 @@ async fn recording(file: &Path) {
     let mut readings = readings(5);
     let arrival_ns = readings.last().unwrap().arrival_ns;
     readings.push(Reading { arrival_ns, source: 0, body: Body::End });
-    let door = running.inputs[0].queue.clone();
-    let fed = move || readings.into_iter().try_for_each(|reading| door.push_captured(reading));
+    let queue = running.inputs[0].queue.clone();
+    let fed = move || readings.into_iter().try_for_each(|reading| queue.push_captured(reading));
     tokio::task::spawn_blocking(fed).await.unwrap().unwrap();
     running.shutdown().await.unwrap();
 }
@@ -61,17 +61,17 @@ fn copy(from: &Path, to: &Path, mut change: impl FnMut(&str, u32, Vec<u8>) -> Op
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_planted_change_is_named_by_sequence_layer_and_cell() {
+async fn verify_names_a_changed_cell_by_sequence_layer_row_and_column() {
     let folder = tempfile::tempdir().unwrap();
-    let (whole, planted) = (folder.path().join("whole.mcap"), folder.path().join("planted.mcap"));
+    let (whole, changed_copy) = (folder.path().join("whole.mcap"), folder.path().join("changed_copy.mcap"));
     recording(&whole).await;
     let report = verify(&whole).unwrap();
     assert!(report.is_good() && report.maps >= 5 && report.equal == fixture::LAYERS * report.maps, "{report:?}");
 
-    // One cell of the third map's class goes from whatever it is to an obstacle or back.
+    // One class of the third map changes to an obstacle, or from an obstacle to drivable.
     let (row, column, columns) = (3, 17, 360);
     let mut was_and_is = None;
-    copy(&whole, &planted, |topic, sequence, data| {
+    copy(&whole, &changed_copy, |topic, sequence, data| {
         if topic != "/car/map/drivability" || sequence != 2 {
             return Some(data);
         }
@@ -88,7 +88,7 @@ async fn a_planted_change_is_named_by_sequence_layer_and_cell() {
         *channel = encode_grid(CellsRef::U8(&cells), columns).into_channel(&name, &unit, scale, unknown);
         Some(map.encode_to_vec())
     });
-    let report = verify(&planted).unwrap();
+    let report = verify(&changed_copy).unwrap();
     assert_eq!(report.different, 1);
     let difference = &report.differences[0];
     assert_eq!((&*difference.vehicle, difference.sequence, &*difference.layer), ("car", 2, "drivability"));
@@ -101,17 +101,19 @@ async fn a_planted_change_is_named_by_sequence_layer_and_cell() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_missing_map_a_changed_header_and_a_hole_in_the_journal_are_named() {
+async fn verify_names_a_missing_map_a_changed_header_and_a_journal_gap() {
     let folder = tempfile::tempdir().unwrap();
-    let (whole, planted) = (folder.path().join("whole.mcap"), folder.path().join("planted.mcap"));
+    let (whole, changed_copy) = (folder.path().join("whole.mcap"), folder.path().join("changed_copy.mcap"));
     recording(&whole).await;
 
-    copy(&whole, &planted, |topic, sequence, data| (topic != "/car/map/drivability" || sequence != 1).then_some(data));
-    let report = verify(&planted).unwrap();
+    copy(&whole, &changed_copy, |topic, sequence, data| {
+        (topic != "/car/map/drivability" || sequence != 1).then_some(data)
+    });
+    let report = verify(&changed_copy).unwrap();
     assert_eq!((report.different, &report.differences[0].kind), (1, &DifferenceKind::Missing));
     assert_eq!(report.differences[0].sequence, 1);
 
-    copy(&whole, &planted, |topic, sequence, data| {
+    copy(&whole, &changed_copy, |topic, sequence, data| {
         if topic != "/car/map/height_difference" || sequence != 0 {
             return Some(data);
         }
@@ -119,17 +121,17 @@ async fn a_missing_map_a_changed_header_and_a_hole_in_the_journal_are_named() {
         map.header.as_mut().unwrap().capture_end_ns += 1;
         Some(map.encode_to_vec())
     });
-    let report = verify(&planted).unwrap();
+    let report = verify(&changed_copy).unwrap();
     let DifferenceKind::Field { field, .. } = &report.differences[0].kind else { panic!("{:?}", report.differences) };
     assert_eq!((report.different, field.as_str()), (1, "header capture_end_ns"));
 
-    copy(&whole, &planted, |topic, sequence, data| (topic != "/car/journal" || sequence != 40).then_some(data));
-    let report = verify(&planted).unwrap();
+    copy(&whole, &changed_copy, |topic, sequence, data| (topic != "/car/journal" || sequence != 40).then_some(data));
+    let report = verify(&changed_copy).unwrap();
     assert_eq!((report.differences[0].sequence, &report.differences[0].kind), (40, &DifferenceKind::Gap { found: 41 }));
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_recording_cut_by_a_crash_is_read_to_its_last_whole_chunk_and_says_so() {
+async fn a_truncated_recording_is_read_to_its_last_whole_chunk() {
     let folder = tempfile::tempdir().unwrap();
     let (whole, cut) = (folder.path().join("whole.mcap"), folder.path().join("cut.mcap"));
     recording(&whole).await;
@@ -150,7 +152,7 @@ async fn a_recording_cut_by_a_crash_is_read_to_its_last_whole_chunk_and_says_so(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn damage_is_named_and_never_passes_for_a_good_recording() {
+async fn a_damaged_recording_is_refused_with_its_file_and_position() {
     let folder = tempfile::tempdir().unwrap();
     let (whole, damaged) = (folder.path().join("whole.mcap"), folder.path().join("damaged.mcap"));
     recording(&whole).await;
@@ -163,7 +165,7 @@ async fn damage_is_named_and_never_passes_for_a_good_recording() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_recording_holds_what_it_takes_to_make_its_maps_again() {
+async fn a_recording_has_the_configuration_and_calibration_of_its_maps() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("whole.mcap");
     recording(&file).await;
@@ -178,7 +180,7 @@ async fn a_recording_holds_what_it_takes_to_make_its_maps_again() {
 }
 
 #[test]
-fn a_foreign_mcap_file_is_no_recording() {
+fn an_mcap_file_without_a_configuration_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("foreign.mcap");
     mcap::Writer::new(BufWriter::new(File::create(&file).unwrap())).unwrap().finish().unwrap();
@@ -190,7 +192,7 @@ fn a_foreign_mcap_file_is_no_recording() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn whatever_bytes_are_changed_the_reader_answers_and_invents_no_event() {
+async fn changed_bytes_cause_no_panic_and_no_additional_event() {
     use proptest::prelude::*;
     use proptest::test_runner::TestRunner;
     let folder = tempfile::tempdir().unwrap();
@@ -208,7 +210,7 @@ async fn whatever_bytes_are_changed_the_reader_answers_and_invents_no_event() {
             }
             bytes.truncate(bytes.len() - missing);
             std::fs::write(&changed, &bytes).unwrap();
-            // Read, refused or found different: all are answers. A panic is none.
+            // The recording may be read, refused or found different; it must not cause a panic.
             if let Ok(report) = verify(&changed) {
                 prop_assert!(report.events <= events, "{report:?}");
             }
@@ -217,13 +219,13 @@ async fn whatever_bytes_are_changed_the_reader_answers_and_invents_no_event() {
         .unwrap();
 }
 
-/// A server of its own process, recording to `file`; and where it listens for data.
+/// Starts a server in its own process that records to `file`; returns its data address too.
 fn serving(folder: &Path, file: &Path) -> (std::process::Child, SocketAddr) {
     let free = || std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let data = free();
     let mut config = config();
     (config.grpc.enabled, config.page.enabled, config.zenoh.enabled) = (false, false, false);
-    // Found beside the configuration, wherever the server was started.
+    // The path is relative to the folder of the configuration.
     config.recorder.file = file.file_name().unwrap().into();
     config.recorder.flush_ms = 50;
     let udp = config.vehicles[0].udp.as_mut().unwrap();
@@ -248,7 +250,7 @@ fn drive_until(file: &Path, bytes: u64, data: SocketAddr) {
     });
     let payloads: Vec<_> = payloads.collect();
     for payload in payloads.iter().cycle() {
-        // A server that is not up yet refuses; it will hear the next turn.
+        // A server that has not started yet refuses; it receives the next revolution.
         let _ = socket.send_to(payload, data);
         if file.metadata().is_ok_and(|metadata| metadata.len() > bytes) {
             return;
@@ -258,7 +260,7 @@ fn drive_until(file: &Path, bytes: u64, data: SocketAddr) {
 }
 
 #[test]
-fn sigterm_leaves_a_whole_recording_and_sigkill_one_that_can_be_read_to_its_cut() {
+fn sigterm_leaves_a_whole_recording_and_sigkill_a_readable_one() {
     let folder = tempfile::tempdir().unwrap();
     for (signal, cut) in [("-TERM", false), ("-KILL", true)] {
         let file = folder.path().join(format!("live{signal}.mcap"));
@@ -274,14 +276,14 @@ fn sigterm_leaves_a_whole_recording_and_sigkill_one_that_can_be_read_to_its_cut(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_address_in_use_is_named_by_its_key_and_costs_no_earlier_recording_its_file() {
+async fn an_address_in_use_is_refused_and_the_old_recording_is_kept() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("earlier.mcap");
     std::fs::write(&file, b"what was recorded before").unwrap();
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-    let heard = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
-    let (tcp, udp) = (taken.local_addr().unwrap(), heard.local_addr().unwrap());
-    // Of an address that no other test is given ports of: free until it is taken here.
+    let in_use = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    let (tcp, udp) = (taken.local_addr().unwrap(), in_use.local_addr().unwrap());
+    // No other test uses this address, so its port stays free until this test uses it.
     let free = std::net::TcpListener::bind("127.0.0.77:0").unwrap().local_addr().unwrap();
     type Take = fn(&mut Config, SocketAddr);
     let wrong: [(&str, SocketAddr, Take); 5] = [
@@ -302,13 +304,13 @@ async fn an_address_in_use_is_named_by_its_key_and_costs_no_earlier_recording_it
         let error = within("a refusal", Server::start(setup)).await.err().expect(key).to_string();
         assert!(error.contains(key) && error.contains(&at.port().to_string()), "{key}: {error}");
         assert_eq!(std::fs::read(&file).unwrap(), b"what was recorded before", "{key}");
-        // Foxglove's own task lets go of the port a moment after it is told to stop.
+        // Foxglove's task releases the port shortly after it stops.
         until("nothing left running", || std::net::TcpListener::bind(free).is_ok()).await;
     }
 }
 
 #[test]
-fn a_disk_that_fails_ends_the_recording_with_its_reason_and_maps_go_on() {
+fn a_full_disk_ends_the_recording_and_maps_continue() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("full.mcap");
     // No file of this process may grow beyond half a megabyte; the write fails instead of the process.

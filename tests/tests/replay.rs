@@ -20,7 +20,7 @@ const HDL32: &str = "pcap/rust-lidar-utils/hdl32_example.pcap";
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn every_packet_of_the_hdl32_drive_is_decoded_mapped_recorded_and_verified() {
+async fn every_packet_of_an_hdl32e_drive_is_decoded_and_its_recording_is_good() {
     let folder = tempfile::tempdir().unwrap();
     let record = folder.path().join("d.mcap");
     let options = Options { files: vec![drive(HDL32)], record: Some(record.clone()), ..Options::default() };
@@ -28,7 +28,7 @@ async fn every_packet_of_the_hdl32_drive_is_decoded_mapped_recorded_and_verified
     let snapshot = &summary.snapshot;
     assert_eq!((snapshot.ledger.received, snapshot.ledger.decoded, snapshot.ledger.telemetry), (976, 876, 100));
     assert_eq!((snapshot.refused(), snapshot.ledger.lost), (0, 0));
-    // 5.7 turns: the first and the last are parts of one.
+    // 5.7 revolutions: the first and the last are not whole.
     assert_eq!((snapshot.revolutions(), snapshot.maps), (6, 6));
     let sensor = &snapshot.sensors[0].status;
     assert_eq!(sensor.model, Some(clearway_lidar::model::Model::Hdl32e));
@@ -44,7 +44,7 @@ async fn every_packet_of_the_hdl32_drive_is_decoded_mapped_recorded_and_verified
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn the_same_drive_makes_the_same_bytes_from_the_capture_and_from_its_recording() {
+async fn a_capture_and_its_recording_make_the_same_bytes() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let options =
@@ -60,7 +60,7 @@ async fn the_same_drive_makes_the_same_bytes_from_the_capture_and_from_its_recor
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn a_truncated_capture_yields_what_it_holds_and_says_so() {
+async fn a_truncated_capture_is_read_to_its_end_and_reported() {
     let folder = tempfile::tempdir().unwrap();
     let cut = folder.path().join("cut.pcap");
     let whole = std::fs::read(drive(HDL32)).unwrap();
@@ -76,17 +76,17 @@ async fn a_truncated_capture_yields_what_it_holds_and_says_so() {
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn scans_of_a_folder_become_a_map_each() {
+async fn each_scan_of_a_folder_makes_a_map() {
     let options = Options { files: vec![drive("kitti/patchwork-plusplus")], ..Options::default() };
     let summary = replayed(options).await.unwrap();
     assert_eq!((summary.snapshot.maps, summary.snapshot.ledger.decoded), (3, 3));
-    // KITTI's own calibration says 1.73 m.
+    // 1.73 m in KITTI's own calibration.
     assert!((1.6..1.9).contains(&summary.extrinsics.z_m), "{:?}", summary.extrinsics);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn velodyne_scan_messages_are_read_packet_by_packet_and_clouds_are_written() {
+async fn the_packets_of_velodyne_scan_messages_make_maps_and_clouds() {
     let folder = tempfile::tempdir().unwrap();
     let options = Options {
         files: vec![drive("mcap/nebula_vls128_none.mcap")],
@@ -109,7 +109,7 @@ async fn velodyne_scan_messages_are_read_packet_by_packet_and_clouds_are_written
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_file_that_is_nothing_known_is_named() {
+async fn a_file_of_an_unknown_format_is_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("drive.pcap");
     std::fs::write(&file, b"this is no capture at all").unwrap();
@@ -120,7 +120,7 @@ async fn a_file_that_is_nothing_known_is_named() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_ground_to_estimate_a_mount_from_no_map_is_made_and_the_mount_is_asked_for() {
+async fn without_ground_no_map_is_made_and_the_extrinsics_are_requested() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("wall.bin");
     let points = (0..2000).map(|i| [5.0f32, (i % 50) as f32 * 0.1 - 2.5, (i / 50) as f32 * 0.1, 0.5]);
@@ -136,8 +136,8 @@ async fn without_ground_to_estimate_a_mount_from_no_map_is_made_and_the_mount_is
 /// WIRE.md: a map with every default layer travels in one zenoh frame and one DDS-sized burst.
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn a_map_of_all_default_layers_is_at_most_64_kib_but_for_a_vls128() {
-    // A VLS-128's is not, by a fifth: it may grow no larger.
+async fn a_map_of_all_default_layers_is_at_most_64_kib_except_of_a_vls128() {
+    // A map of a VLS-128 is a fifth larger than 64 KiB; it must not grow.
     for (file, allowed) in [(HDL32, 64), ("kitti/udacity_data_2", 64), ("mcap/nebula_vls128_none.mcap", 80)] {
         let folder = tempfile::tempdir().unwrap();
         let record = folder.path().join("sizes.mcap");
@@ -145,7 +145,7 @@ async fn a_map_of_all_default_layers_is_at_most_64_kib_but_for_a_vls128() {
         replayed(options).await.unwrap();
         let (mut whole, mut most) = (BTreeMap::<u64, usize>::new(), BTreeMap::<String, usize>::new());
         for ((sequence, layer), bytes) in fixture::recorded(&record) {
-            // Each with the header, which a whole map has once.
+            // Each layer is recorded with the header, which a whole map has once.
             *whole.entry(sequence).or_default() += bytes.len();
             let most = most.entry(layer).or_default();
             *most = bytes.len().max(*most);

@@ -1,4 +1,4 @@
-//! ROS 2 users: bags and live topics become the maps that the sensor's own packets make, and what is wrong is counted.
+//! ROS 2 bags and live topics make the maps that the sensor's own packets make, and bad messages are counted.
 
 mod fixture;
 
@@ -26,26 +26,26 @@ const CLOUD: &str = "sensor_msgs/msg/PointCloud2";
 const ODOMETRY: &str = "nav_msgs/msg/Odometry";
 const TF: &str = "tf2_msgs/msg/TFMessage";
 
-/// Topic, type, when it was logged, and the bytes.
+/// Topic, type, log time in ns, and bytes.
 type Message = (&'static str, &'static str, i64, Vec<u8>);
 
-/// The simulated vehicle's turns as velodyne_pointcloud publishes them, with the stamp of each.
+/// The simulated vehicle's revolutions as velodyne_pointcloud publishes them, each with its stamp in ns.
 fn clouds(tenths: i64) -> Vec<(i64, Vec<u8>)> {
     let mut sensor = Sensor::new(SensorConfig { model: Some(Model::Hdl64eS2), ..SensorConfig::default() });
     let mut clouds = Vec::new();
     for reading in readings(tenths) {
         let Body::Datagram(payload) = reading.body else { continue };
-        let Ok(Some(turn)) = sensor.push(&payload, reading.arrival_ns) else { continue };
+        let Ok(Some(revolution)) = sensor.push(&payload, reading.arrival_ns) else { continue };
         let mut data = Vec::new();
-        for point in turn.points() {
-            let time = (point.time_ns - turn.end_ns) as f32 * 1e-9;
+        for point in revolution.points() {
+            let time = (point.time_ns - revolution.end_ns) as f32 * 1e-9;
             for value in [point.x, point.y, point.z, point.intensity.into()] {
                 data.extend(value.to_le_bytes());
             }
             data.extend(point.ring.to_le_bytes());
             data.extend(time.to_le_bytes());
         }
-        clouds.push((turn.end_ns, cloud("velodyne", turn.end_ns, &data).to_cdr()));
+        clouds.push((revolution.end_ns, cloud("velodyne", revolution.end_ns, &data).to_cdr()));
     }
     clouds
 }
@@ -89,20 +89,20 @@ fn bag(file: &Path, messages: &[Message]) {
     writer.finish().unwrap();
 }
 
-/// Three turns with odometry between, a map frame, a mount, a second cloud of the same sensor, one put together, and a
-/// broken one.
+/// Messages of three revolutions: odometry, the mount in tf, the clouds, a second cloud of the same sensor, a merged
+/// cloud, and a broken one.
 fn drive() -> Vec<Message> {
-    let turns = clouds(4);
-    let start_ns = turns[0].0;
+    let revolutions = clouds(4);
+    let start_ns = revolutions[0].0;
     let mount = [transform(start_ns, "base_link", "velodyne", [0.0, 0.0, 1.9])];
     let mut messages = vec![
         ("/tf_static", TF, start_ns, tf_message_to_cdr(&mount)),
         ("/obstacles", CLOUD, start_ns, cloud("velodyne", start_ns, &[0; 22]).to_cdr()),
         ("/merged", CLOUD, start_ns, cloud("base_link", start_ns, &[0; 220]).to_cdr()),
     ];
-    for (stamp_ns, turn) in turns {
+    for (stamp_ns, revolution) in revolutions {
         messages.push(("/odom", ODOMETRY, stamp_ns, odometry(stamp_ns)));
-        messages.push(("/velodyne_points", CLOUD, stamp_ns + 1000, turn));
+        messages.push(("/velodyne_points", CLOUD, stamp_ns + 1000, revolution));
     }
     let broken = messages.last().unwrap().3[..5000].to_vec();
     messages.push(("/velodyne_points", CLOUD, start_ns + 400_000_000, broken));
@@ -118,19 +118,22 @@ fn options(file: &Path) -> Options {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_bag_of_clouds_odometry_and_tf_is_mapped_where_tf_puts_the_sensor_recorded_and_verified() {
+async fn a_bag_of_clouds_odometry_and_tf_is_mapped_recorded_and_verified() {
     let folder = tempfile::tempdir().unwrap();
     let (file, record) = (folder.path().join("bag.mcap"), folder.path().join("maps.mcap"));
     let messages = drive();
-    let turns = messages.iter().filter(|(topic, ..)| *topic == "/odom").count() as u64;
+    let revolutions = messages.iter().filter(|(topic, ..)| *topic == "/odom").count() as u64;
     bag(&file, &messages);
     let summary = replayed(Options { record: Some(record.clone()), ..options(&file) }).await.unwrap();
 
     let ledger = &summary.snapshot.ledger;
-    assert!(turns >= 3);
-    assert_eq!((summary.snapshot.maps, ledger.decoded, ledger.poses, ledger.poses_refused), (turns, turns, turns, 0));
-    assert_eq!((ledger.refused["observation"], ledger.received), (1, turns + 1));
-    assert_eq!(summary.snapshot.sensors[0].ledger.refused["observation"], 1, "it is known whose it was");
+    assert!(revolutions >= 3);
+    assert_eq!(
+        (summary.snapshot.maps, ledger.decoded, ledger.poses, ledger.poses_refused),
+        (revolutions, revolutions, revolutions, 0)
+    );
+    assert_eq!((ledger.refused["observation"], ledger.received), (1, revolutions + 1));
+    assert_eq!(summary.snapshot.sensors[0].ledger.refused["observation"], 1, "the refusal is counted for its sensor");
     assert_eq!(summary.snapshot.observations_refused, [("ros_message", 1)].into());
     assert!(matches!(&summary.mount, Mount::Tf { ego_frame, frame_id }
             if ego_frame == "base_link" && frame_id == "velodyne"));
@@ -147,26 +150,26 @@ async fn a_bag_of_clouds_odometry_and_tf_is_mapped_where_tf_puts_the_sensor_reco
         assert!(notes.contains(said), "{said:?} is not in {notes}");
     }
     let report = verify(&record).unwrap();
-    assert!(report.is_good() && report.maps == turns, "{:?}", report.differences);
+    assert!(report.is_good() && report.maps == revolutions, "{:?}", report.differences);
     let again = replayed(options(&record)).await.unwrap();
-    assert_eq!(again.snapshot.ledger, *ledger, "what was refused is in the recording too");
+    assert_eq!(again.snapshot.ledger, *ledger, "the recording has the refusals too");
     assert_eq!(again.snapshot.sensors[0].ledger, summary.snapshot.sensors[0].ledger);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_bag_of_several_sensors_makes_one_map_of_all_that_tf_places() {
+async fn a_bag_of_several_sensors_makes_maps_of_all_that_tf_places() {
     let folder = tempfile::tempdir().unwrap();
     let (file, record) = (folder.path().join("bag.mcap"), folder.path().join("maps.mcap"));
     let mut messages = drive();
-    let (turns, start_ns) = (clouds(4), messages[0].2);
+    let (revolutions, start_ns) = (clouds(4), messages[0].2);
     let mounts = [
         transform(start_ns, "base_link", "velodyne", [0.0, 0.0, 1.9]),
         transform(start_ns, "base_link", "Lidar/Left", [0.3, 1.0, 1.9]),
     ];
     messages[0].3 = tf_message_to_cdr(&mounts);
     // The second sensor's scans are 10 ms older than the first's; tf does not place the third sensor.
-    for (stamp_ns, _) in &turns {
-        let data = points_of(&turns, *stamp_ns);
+    for (stamp_ns, _) in &revolutions {
+        let data = points_of(&revolutions, *stamp_ns);
         let at = messages.iter().position(|m| m.0 == "/velodyne_points" && m.2 == stamp_ns + 1000).unwrap();
         let left = cloud("Lidar/Left", stamp_ns - 10_000_000, &data).to_cdr();
         messages.insert(at, ("/left_points", CLOUD, stamp_ns + 500, left));
@@ -174,7 +177,7 @@ async fn a_bag_of_several_sensors_makes_one_map_of_all_that_tf_places() {
     }
     bag(&file, &messages);
     let summary = replayed(Options { record: Some(record.clone()), ..options(&file) }).await.unwrap();
-    let (n, snapshot) = (turns.len() as u64, &summary.snapshot);
+    let (n, snapshot) = (revolutions.len() as u64, &summary.snapshot);
     let sensors = snapshot.sensors.iter().map(|sensor| (sensor.name.as_str(), sensor.ledger.decoded));
     let mut sensors: Vec<_> = sensors.collect();
     sensors.sort_unstable();
@@ -187,7 +190,7 @@ async fn a_bag_of_several_sensors_makes_one_map_of_all_that_tf_places() {
     let header = |bytes: &bytes::Bytes| <clearway_proto::v1::Map as prost::Message>::decode(&bytes[..]).unwrap().header;
     let last = header(maps.last_key_value().unwrap().1).unwrap();
     assert!(last.sensors.len() == 2 && last.sensors.iter().all(|sensor| sensor.returns > 1000), "{:?}", last.sensors);
-    // Each has its own place, and its own end.
+    // Each sensor has its own mount, and its own end.
     let entries = clearway::record::reader::RecordingReader::open(&record).unwrap().map(|entry| entry.unwrap());
     let ends = entries.filter_map(|entry| match entry {
         clearway::record::reader::RecordedMessage::Event { event, .. } if event.body == Body::End => Some(event.source),
@@ -200,13 +203,13 @@ async fn a_bag_of_several_sensors_makes_one_map_of_all_that_tf_places() {
 }
 
 /// The data of the cloud of this stamp.
-fn points_of(turns: &[(i64, Vec<u8>)], stamp_ns: i64) -> Vec<u8> {
-    let (_, bytes) = turns.iter().find(|(of_ns, _)| *of_ns == stamp_ns).unwrap();
+fn points_of(revolutions: &[(i64, Vec<u8>)], stamp_ns: i64) -> Vec<u8> {
+    let (_, bytes) = revolutions.iter().find(|(of_ns, _)| *of_ns == stamp_ns).unwrap();
     PointCloud2::new(bytes).unwrap().data.to_vec()
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_cloud_of_the_points_makes_nearly_the_map_of_the_packets() {
+async fn clouds_make_nearly_the_same_map_as_packets() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("bag.mcap");
     bag(&file, &drive());
@@ -220,19 +223,20 @@ async fn a_cloud_of_the_points_makes_nearly_the_map_of_the_packets() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn topics_are_taken_as_asked_for_and_one_that_is_not_there_is_named() {
+async fn replay_reads_the_requested_topics_and_refuses_an_absent_one() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("bag.mcap");
     bag(&file, &drive());
-    let asked = |topics: &[&str]| Options { topics: topics.iter().map(|&t| t.into()).collect(), ..options(&file) };
-    let summary = replayed(asked(&["/merged"])).await.unwrap();
+    let with_topics =
+        |topics: &[&str]| Options { topics: topics.iter().map(|&t| t.into()).collect(), ..options(&file) };
+    let summary = replayed(with_topics(&["/merged"])).await.unwrap();
     assert!(
         summary.notes.join("\n").contains("/merged is used; tf does not place its frame base_link 0.1 to 20 m"),
         "{:?}",
         summary.notes
     );
     assert_eq!(summary.snapshot.ledger.received, 1);
-    let error = replayed(asked(&["/nowhere"])).await.unwrap_err().to_string();
+    let error = replayed(with_topics(&["/nowhere"])).await.unwrap_err().to_string();
     assert!(
         error.contains("--topic /nowhere: the file has") && error.contains("/odom (nav_msgs/msg/Odometry)"),
         "{error}"
@@ -240,7 +244,7 @@ async fn topics_are_taken_as_asked_for_and_one_that_is_not_there_is_named() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_an_odometry_the_chain_of_tf_gives_poses_and_speed_and_a_bag_in_two_files_is_one() {
+async fn tf_gives_poses_and_speed_without_odometry_in_a_bag_of_two_files() {
     let folder = tempfile::tempdir().unwrap();
     let files = [0, 1].map(|part| folder.path().join(format!("bag_{part}.mcap")));
     let mut messages = drive();
@@ -251,7 +255,7 @@ async fn without_an_odometry_the_chain_of_tf_gives_poses_and_speed_and_a_bag_in_
         *message =
             ("/tf", TF, message.2, tf_message_to_cdr(&[transform(message.2, "odom", "base_link", [x, 0.0, 0.0])]));
     }
-    // A localisation stamps ahead and seldom; it moves the chain, and makes no pose of its own.
+    // A localisation stamps ahead and seldom: it moves the chain of transforms, and makes no pose itself.
     let ahead = transform(stamps[0] + 500_000_000, "map", "odom", [100.0, 0.0, 0.0]);
     messages.insert(1, ("/tf", TF, stamps[0], tf_message_to_cdr(&[ahead])));
     let (first, second) = messages.split_at(messages.len() - 2);
@@ -261,7 +265,7 @@ async fn without_an_odometry_the_chain_of_tf_gives_poses_and_speed_and_a_bag_in_
     let summary =
         replayed(Options { files: files.to_vec(), record: Some(record.clone()), ..options(&files[0]) }).await.unwrap();
     let ledger = &summary.snapshot.ledger;
-    // The first only begins.
+    // The first transform has no speed, so it makes no pose.
     assert_eq!((ledger.poses, ledger.poses_refused), (stamps.len() as u64 - 1, 0));
     assert_eq!(summary.snapshot.maps, stamps.len() as u64);
     assert!(summary.notes.join("\n").contains("tf is used for poses of base_link in map"), "{:?}", summary.notes);
@@ -274,7 +278,7 @@ async fn without_an_odometry_the_chain_of_tf_gives_poses_and_speed_and_a_bag_in_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn live_topics_of_rmw_zenoh_reach_the_map_and_other_messages_are_counted() {
+async fn live_topics_of_rmw_zenoh_make_maps_and_bad_messages_are_counted() {
     let mut config = fixture::config();
     config.zenoh.enabled = true;
     config.vehicles[0].udp = None;
@@ -294,7 +298,7 @@ async fn live_topics_of_rmw_zenoh_reach_the_map_and_other_messages_are_counted()
     let attachment = |sequence: i64| [&sequence.to_le_bytes()[..], &9_i64.to_le_bytes(), &[16], &[3; 16]].concat();
     let cloud_key = "7/velodyne_points/sensor_msgs::msg::dds_::PointCloud2_/RIHS01_00";
     let odometry_key = "7/odom/nav_msgs::msg::dds_::Odometry_/TypeHashNotSupported";
-    // Reliable, as rmw_zenoh declares it: megabytes at once would be dropped else.
+    // Reliable, as rmw_zenoh declares it; else zenoh drops messages of several megabytes.
     let publisher = |key| session.declare_publisher(key).congestion_control(CongestionControl::Block);
     let string_key = "7/velodyne_points/std_msgs::msg::dds_::String_/h";
     let [cloud, odom, string] = [cloud_key, odometry_key, string_key].map(publisher);
@@ -305,18 +309,18 @@ async fn live_topics_of_rmw_zenoh_reach_the_map_and_other_messages_are_counted()
             within("the server listens", matching.recv_async()).await.unwrap();
         }
     }
-    let turns = clouds(4);
-    for (sequence, (stamp_ns, turn)) in (0..).zip(&turns) {
+    let revolutions = clouds(4);
+    for (sequence, (stamp_ns, revolution)) in (0..).zip(&revolutions) {
         odom.put(odometry(*stamp_ns)).await.unwrap();
-        // Of the cloud's row two numbers are missing before the last.
-        let last = sequence + 1 == turns.len() as i64;
+        // Two sequence numbers are missing before the last cloud.
+        let last = sequence + 1 == revolutions.len() as i64;
         let sequence = if last { sequence + 2 } else { sequence };
-        cloud.put(turn.clone()).attachment(attachment(sequence)).await.unwrap();
+        cloud.put(revolution.clone()).attachment(attachment(sequence)).await.unwrap();
     }
-    // Another type, and bytes that are none.
+    // A message of another type, and bytes that are no message.
     string.put(vec![0, 1, 0, 0]).await.unwrap();
     odom.put(vec![0, 1, 0, 0, 1]).attachment(vec![1, 2, 3]).await.unwrap();
-    let n = turns.len() as u64;
+    let n = revolutions.len() as u64;
     until("all is taken or refused", || {
         let ledger = status.snapshot().ledger;
         ledger.poses == n && ledger.decoded == n && ledger.refused.get("observation") == Some(&2)
@@ -326,7 +330,7 @@ async fn live_topics_of_rmw_zenoh_reach_the_map_and_other_messages_are_counted()
     assert_eq!((snapshot.maps, snapshot.ledger.lost), (n, 2));
     assert_eq!(snapshot.ledger.refused["observation"], 2);
     assert_eq!(snapshot.observations_refused, [("ros_message", 1), ("ros_type", 1)].into());
-    // Odometry is no sensor's.
+    // The refused odometry belongs to no sensor.
     assert_eq!(snapshot.sensors[0].ledger.refused["observation"], 1);
     assert!(snapshot.drivable_share.unwrap() > 0.3);
     session.close().await.unwrap();

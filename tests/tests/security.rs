@@ -1,4 +1,4 @@
-//! Certificates and roles: who is let in, who is told what they may not do, and what of it is recorded.
+//! Certificates and roles: which clients are accepted, how the others are refused, and what a recording has of them.
 
 mod fixture;
 
@@ -22,7 +22,7 @@ fn tls(ca: &str, identity: Option<(&str, &str)>) -> Tls {
     Tls { ca: read(&certificates(ca), "ca.pem".into()), identity, server_name: "localhost".into() }
 }
 
-/// Connects and asks for the vehicles; the handshake's refusal may show in either.
+/// Connects and requests the vehicles; a refused handshake may show in either step.
 async fn vehicles(running: &Running, tls: &Tls) -> Result<usize, ClientError> {
     let address = running.grpc.expect("gRPC is served").to_string();
     within("an answer", async { Ok(Client::connect_tls(&address, tls).await?.vehicles().await?.len()) }).await
@@ -30,7 +30,7 @@ async fn vehicles(running: &Running, tls: &Tls) -> Result<usize, ClientError> {
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn a_server_without_a_client_ca_serves_all_over_tls_and_none_in_plain_text() {
+async fn a_server_without_client_ca_is_readable_over_tls_only() {
     let running = start(secured(false)).await;
     assert_eq!(vehicles(&running, &tls("ours", None)).await.unwrap(), 1);
     let believed = vehicles(&running, &tls("theirs", None)).await;
@@ -43,7 +43,7 @@ async fn a_server_without_a_client_ca_serves_all_over_tls_and_none_in_plain_text
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn a_certificate_opens_what_its_roles_allow_and_nothing_else() {
+async fn a_certificate_allows_the_calls_of_its_roles_only() {
     let running = start(secured(true)).await;
     feed(&running, readings(2)).await;
     let address = running.grpc.unwrap().to_string();
@@ -73,7 +73,7 @@ async fn a_certificate_opens_what_its_roles_allow_and_nothing_else() {
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn a_recording_holds_the_path_of_the_key_and_nothing_of_the_key() {
+async fn a_recording_has_the_path_of_the_private_key_but_not_the_key() {
     let folder = tempfile::tempdir().unwrap();
     let record = folder.path().join("secured.mcap");
     let mut config = secured(true);
@@ -92,14 +92,14 @@ async fn a_recording_holds_the_path_of_the_key_and_nothing_of_the_key() {
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn a_replay_that_serves_asks_for_the_certificates_that_its_configuration_asks_for() {
+async fn replay_with_serve_requires_the_certificates_of_its_configuration() {
     let folder = tempfile::tempdir().unwrap();
     let (file, scan) = (folder.path().join("clearway.toml"), folder.path().join("0.bin"));
     std::fs::write(&file, secured(true).to_toml()).unwrap();
     std::fs::write(&scan, [0; 16]).unwrap();
-    let (told, address) = tokio::sync::oneshot::channel();
-    let started = |running: &Running, _: &Summary| told.send(running.grpc).expect("the test listens");
-    let asked = async {
+    let (send_address, address) = tokio::sync::oneshot::channel();
+    let started = |running: &Running, _: &Summary| send_address.send(running.grpc).expect("the test listens");
+    let requests = async {
         let address = address.await.expect("it starts").expect("gRPC is served").to_string();
         let plain = async { Client::connect(&address).await?.vehicles().await }.await;
         assert!(plain.is_err(), "{plain:?}");
@@ -109,12 +109,12 @@ async fn a_replay_that_serves_asks_for_the_certificates_that_its_configuration_a
         }
     };
     let options = Options { files: vec![scan], config: Some(file), serve: true, ..Options::default() };
-    within("a replay", replay(options, Arc::default(), started, asked)).await.unwrap();
+    within("a replay", replay(options, Arc::default(), started, requests)).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn a_server_does_not_serve_in_plain_text_if_its_certificates_were_not_read() {
+async fn a_server_with_unread_certificates_does_not_serve_in_plain_text() {
     let setup = Setup { config: secured(false), ..Setup::default() };
     let error = Server::start(setup).await.err().expect("no server").to_string();
     assert!(error.starts_with("grpc.tls: "), "{error}");
@@ -122,18 +122,18 @@ async fn a_server_does_not_serve_in_plain_text_if_its_certificates_were_not_read
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn peers_that_shake_no_hand_reset_or_say_too_much_leave_the_others_served() {
+async fn silent_resetting_and_oversized_peers_do_not_disturb_the_others() {
     let running = start(config()).await;
     feed(&running, readings(2)).await;
     let address = running.grpc.unwrap();
-    // Opened, and never a byte: they wait for their place, or lose it.
+    // These connections never send a byte: they wait for a free connection, or are closed.
     let mut silent = Vec::new();
     for _ in 0..200 {
         silent.push(TcpStream::connect(address).await.expect("a place in the kernel's queue"));
     }
     let mut client = grpc(&running).await;
     for _ in 0..100 {
-        // A stream begun and dropped at once.
+        // A stream that is dropped at once.
         let begun = client.watch(tokio_stream::once(fixture::selection("car", &[], 1))).await;
         drop(begun.expect("a stream"));
     }
@@ -152,7 +152,7 @@ async fn peers_that_shake_no_hand_reset_or_say_too_much_leave_the_others_served(
     within("shutdown", running.shutdown()).await.unwrap();
 }
 
-/// A session of a client that hangs on the router and shows this certificate.
+/// A session of a client that connects to the router with this certificate.
 async fn zenoh_client(router: &str, ca: &str, name: &str) -> zenoh::Result<zenoh::Session> {
     let folder = certificates(ca);
     let text = zenoh_file("server.json5", &folder);
@@ -180,7 +180,7 @@ async fn zenoh_client(router: &str, ca: &str, name: &str) -> zenoh::Result<zenoh
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn behind_the_router_of_deploy_each_certificate_does_what_its_rules_allow() {
+async fn the_router_of_deploy_allows_each_certificate_only_its_keys() {
     let folder = tempfile::tempdir().unwrap();
     let ours = certificates("ours");
     let (router, at) = router().await;
@@ -189,7 +189,7 @@ async fn behind_the_router_of_deploy_each_certificate_does_what_its_rules_allow(
     let reader = zenoh_client(&at, "ours", "reader").await.expect("a session");
     let unlisted = zenoh_client(&at, "ours", "operator").await.expect("a session");
     let ingester = zenoh_client(&at, "ours", "ingester").await.expect("a session");
-    assert!(zenoh_client(&at, "theirs", "reader").await.is_err(), "a certificate of another CA is let in");
+    assert!(zenoh_client(&at, "theirs", "reader").await.is_err(), "a certificate of another CA is accepted");
 
     let key = "clearway/car/map/drivability";
     let maps = reader.declare_subscriber(key).await.unwrap();
@@ -198,14 +198,14 @@ async fn behind_the_router_of_deploy_each_certificate_does_what_its_rules_allow(
     let planner = within("zenoh", ZenohClient::connect_with(&at, &file)).await.expect("a planner's session");
     let mut planned = planner.subscribe("car", "drivability").await.unwrap();
     let nothing = unlisted.declare_subscriber(key).await.unwrap();
-    // A certificate of the server's name may see everything: it is the judge of what the others put.
-    let judge = zenoh_client(&at, "ours", "server").await.expect("a session");
-    let put = judge.declare_subscriber("clearway/car/**").await.unwrap();
+    // The server's certificate may subscribe to everything, so this session sees what the others publish.
+    let observer = zenoh_client(&at, "ours", "server").await.expect("a session");
+    let put = observer.declare_subscriber("clearway/car/**").await.unwrap();
     let mut drive = readings(6);
     let rest = drive.split_off(drive.len() / 2);
     feed(&running, drive).await;
     within("the reader's first map", async {
-        // What the server declares travels; an answer shows that it has arrived, and so has the reader's subscription.
+        // An answer shows that the server's declarations and the reader's subscription have arrived at the router.
         while reader.get(key).await.unwrap().recv_async().await.is_err() {}
     })
     .await;
@@ -225,9 +225,9 @@ async fn behind_the_router_of_deploy_each_certificate_does_what_its_rules_allow(
         }
     })
     .await;
-    assert!(matches!(nothing.try_recv(), Ok(None)), "an unlisted certificate is told of maps");
+    assert!(matches!(nothing.try_recv(), Ok(None)), "an unlisted certificate receives maps");
 
-    for session in [reader, unlisted, ingester, judge] {
+    for session in [reader, unlisted, ingester, observer] {
         session.close().await.unwrap();
     }
     within("shutdown", running.shutdown()).await.unwrap();

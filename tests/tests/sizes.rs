@@ -27,7 +27,7 @@ use clearway_sim::traffic::street;
 use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion, Vector3};
 use prost::Message;
 
-/// A recorded drive, and where the vehicle was at a share of its scans or seconds.
+/// A recorded drive and the source of its poses.
 struct Drive {
     name: &'static str,
     path: &'static str,
@@ -52,7 +52,7 @@ const DRIVES: [Drive; 6] = [
     Drive { name: "vls128", path: "mcap/nebula_vls128_none.mcap", poses: Poses::None },
 ];
 
-/// Maps of a drive: whole message, and layers by name.
+/// One map: the size of the whole message in bytes, and the layers.
 struct Sized {
     message: usize,
     layers: Vec<v1::Layer>,
@@ -65,7 +65,7 @@ impl Sized {
     }
 }
 
-/// Replays a drive once to learn its events and how its sensor is mounted, then makes its maps with the poses added.
+/// Replays a drive once for its events and the mount of its sensor, then makes its maps with the poses added.
 async fn maps(drive: &Drive) -> Vec<Sized> {
     let folder = tempfile::tempdir().unwrap();
     let (file, record) = (Path::new(env!("CLEARWAY_DATA")).join(drive.path), folder.path().join("drive.mcap"));
@@ -73,7 +73,7 @@ async fn maps(drive: &Drive) -> Vec<Sized> {
     fixture::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
     let mut recording = RecordingReader::open(&record).unwrap();
     let (config, tables) = recording.config().unwrap();
-    // By how much the arrivals are ahead of the sensor's own clock, which the poses are to follow.
+    // Time by which the arrivals are ahead of the sensor's clock: the poses have stamps of that clock.
     let (mut events, mut ahead_ns) = (Vec::new(), None);
     for entry in recording.by_ref() {
         match entry.unwrap() {
@@ -97,7 +97,7 @@ async fn maps(drive: &Drive) -> Vec<Sized> {
     made
 }
 
-/// Maps of six units of four planes at 50 Hz on a car that drives through a simulated scene, with its poses.
+/// Maps of a car with six sensors of four planes at 50 Hz that drives through a simulated scene, with poses.
 fn simulated(scene: Scene, maps: usize) -> Vec<Sized> {
     const START_NS: i64 = 1_767_270_000_000_000_000;
     let mut rig = Rig::many(scene, START_NS);
@@ -109,12 +109,12 @@ fn simulated(scene: Scene, maps: usize) -> Vec<Sized> {
     let mut pipeline = Pipeline::new(&vehicle, vec![None; rig.units.len()]).unwrap();
     let source = |sensor: &str| rig.units.iter().position(|(name, _)| name == sensor).unwrap_or(0) as u16;
     let mut made = Vec::new();
-    for (sequence, told) in (0..).zip(rig.observations()) {
-        let observation = v1::Observation::from(told.observation);
+    for (sequence, timed) in (0..).zip(rig.observations()) {
+        let observation = v1::Observation::from(timed.observation);
         let source = source(&observation.sensor);
         let (_, body) =
             observation::decode(observation, &observation::Limits::from_points_max(1 << 16)).unwrap().remove(0);
-        let event = Event { sequence, arrival_ns: told.stamp_ns + 1_000_000, source, body };
+        let event = Event { sequence, arrival_ns: timed.stamp_ns + 1_000_000, source, body };
         if let Ok(Some(map)) = pipeline.step(&event) {
             made.push(Sized::of(map));
             if made.len() == maps {
@@ -137,9 +137,9 @@ fn with_poses(drive: &Drive, folder: &Path, ahead_ns: i64, events: Vec<Event>) -
             let list: Vec<serde_json::Value> = serde_json::from_slice(&text).unwrap();
             let mut poses = list.iter().map(|entry| {
                 let rows: [[f64; 4]; 4] = serde_json::from_value(entry["T_first_from_this"].clone()).unwrap();
-                let turn = Matrix3::from_fn(|row, column| rows[row][column]);
-                let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&turn));
-                Isometry3::from_parts(Vector3::new(rows[0][3], rows[1][3], rows[2][3]).into(), turn)
+                let rotation = Matrix3::from_fn(|row, column| rows[row][column]);
+                let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation));
+                Isometry3::from_parts(Vector3::new(rows[0][3], rows[1][3], rows[2][3]).into(), rotation)
             });
             let mut all = Vec::new();
             for event in events {
@@ -165,7 +165,7 @@ fn with_poses(drive: &Drive, folder: &Path, ahead_ns: i64, events: Vec<Event>) -
     }
 }
 
-/// Bytes by what takes them, summed over maps, and how many maps.
+/// Sum of the bytes and number of maps of each part of a map.
 #[derive(Default)]
 struct Table(BTreeMap<String, (usize, usize)>);
 
@@ -175,7 +175,7 @@ impl Table {
         (*sum, *maps) = (*sum + bytes, *maps + 1);
     }
 
-    /// Of each layer and channel, whole and as it is sent to who has the map before.
+    /// Sizes of each layer and channel, whole and as sent to a reader that has the map before.
     fn of(maps: &[Sized]) -> Self {
         let mut table = Self::default();
         for (number, map) in maps.iter().enumerate() {
@@ -213,7 +213,7 @@ impl Table {
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn maps_of_recorded_scans_are_as_small_as_promised() {
+async fn maps_of_recorded_drives_are_within_their_size_limits() {
     let mut classes = Table::default();
     for drive in &DRIVES {
         let maps = maps(drive).await;
@@ -235,7 +235,7 @@ async fn maps_of_recorded_scans_are_as_small_as_promised() {
 
 #[test]
 fn deltas_of_a_simulated_drive_take_no_more_than_half_of_the_maps() {
-    // The first maps, of a car that has seen nothing yet, are no drive.
+    // The first maps are left out: the car has not seen its surroundings yet.
     const SEEN: usize = 25;
     for scene in [street(8.0), town()] {
         let name = scene.name;

@@ -1,4 +1,4 @@
-//! Maps on their way to readers: the same bytes everywhere, and no reader can slow another.
+//! Streams of maps: all readers receive the same bytes, and no reader slows another.
 
 mod fixture;
 
@@ -18,7 +18,7 @@ use zenoh_ext::{AdvancedSubscriberBuilderExt, HistoryConfig};
 
 const LAYER: &str = "drivability";
 
-/// A request stream the test writes to.
+/// A request stream that the test writes.
 struct Requests(mpsc::Sender<v1::WatchRequest>);
 
 impl Requests {
@@ -47,7 +47,7 @@ async fn session(running: &clearway::server::Running) -> Session {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_live_drive_over_udp_reaches_grpc_and_zenoh_with_the_bytes_of_the_recording() {
+async fn grpc_zenoh_and_the_recording_have_the_same_bytes_of_a_live_drive() {
     let folder = tempfile::tempdir().unwrap();
     let record = folder.path().join("live.mcap");
     let mut config = config();
@@ -100,7 +100,7 @@ async fn refused_datagrams_are_counted_by_reason_and_the_ledger_adds_up() {
     let flags = vec![0x11; 1206];
     let mut azimuth = vec![0; 1206];
     for block in azimuth[..1200].chunks_exact_mut(100) {
-        // Block flag EEFF, azimuth 0xFFFF: more than a turn.
+        // Block flag EEFF, azimuth 0xFFFF: more than a revolution.
         block[..4].copy_from_slice(&[0xff, 0xee, 0xff, 0xff]);
     }
     for datagram in [&b"hello"[..], &[0; 1205], &[0; 1207], &flags, &azimuth] {
@@ -138,7 +138,7 @@ async fn a_sender_that_is_not_configured_is_refused_for_its_source() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_unknown_vehicle_or_layer_is_answered_with_the_known_ones() {
+async fn an_unknown_vehicle_or_layer_is_refused_with_the_known_ones() {
     let running = start(config()).await;
     let mut client = grpc(&running).await;
     let get = |vehicle: &str, layer: &str| v1::GetMapRequest { vehicle: vehicle.into(), layers: vec![layer.into()] };
@@ -192,7 +192,7 @@ async fn health_and_reflection_answer() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_late_zenoh_joiner_gets_the_current_map_and_the_same_key_answers_queries() {
+async fn a_late_zenoh_subscriber_and_a_query_get_the_current_map() {
     let mut config = config();
     config.zenoh.enabled = true;
     let running = start(config).await;
@@ -225,17 +225,17 @@ async fn a_stopped_reader_slows_no_other_reader_and_gets_only_its_credits() {
     let (stopped_requests, mut stopped) = watch(&running, 2).await;
     let (requests, mut healthy) = watch(&running, 1).await;
 
-    // Fed less than a turn at a time (some 350 datagrams), a reader that keeps up misses none of them.
-    let mut turns: Vec<Vec<_>> = vec![Vec::new()];
+    // Portions of less than a revolution (about 350 datagrams), so that a reader that keeps up misses no map.
+    let mut revolutions: Vec<Vec<_>> = vec![Vec::new()];
     for reading in readings(12) {
-        turns.last_mut().unwrap().push(reading);
-        if turns.last().unwrap().len() == 300 {
-            turns.push(Vec::new());
+        revolutions.last_mut().unwrap().push(reading);
+        if revolutions.last().unwrap().len() == 300 {
+            revolutions.push(Vec::new());
         }
     }
     let mut next = 0;
-    for turn in turns {
-        let maps = feed(&running, turn).await;
+    for revolution in revolutions {
+        let maps = feed(&running, revolution).await;
         while next < maps {
             let update = within("a map", healthy.message()).await.unwrap().unwrap();
             assert_eq!((sequence(&update.map), update.skipped), (next, 0));
@@ -245,7 +245,7 @@ async fn a_stopped_reader_slows_no_other_reader_and_gets_only_its_credits() {
     }
     assert!(next >= 10, "{next} maps");
 
-    // The stopped one has two old maps, and then the newest, with the number it missed.
+    // The stopped reader receives two old maps, then the newest one with the number of skipped maps.
     let first = within("a map", stopped.message()).await.unwrap().unwrap();
     let second = within("a map", stopped.message()).await.unwrap().unwrap();
     assert_eq!(sequence(&second.map), sequence(&first.map) + 1 + second.skipped);
@@ -270,7 +270,7 @@ async fn a_stopped_reader_slows_no_other_reader_and_gets_only_its_credits() {
         }
     })
     .await;
-    assert_eq!(end.unwrap_err().code(), Code::Unavailable, "the reader is told that the server stops");
+    assert_eq!(end.unwrap_err().code(), Code::Unavailable, "the stream ends with the status that the server stops");
 }
 
 /// One frame of a WebSocket: its opcode and payload. Servers do not mask.
@@ -288,7 +288,7 @@ async fn frame(stream: &mut tokio::net::TcpStream) -> (u8, Vec<u8>) {
     (head[0] & 0x0f, payload)
 }
 
-/// A plain HTTP request: its whole answer.
+/// Sends a plain HTTP request; returns the whole answer.
 async fn http(address: std::net::SocketAddr, path: &str) -> String {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     let mut stream = tokio::net::TcpStream::connect(address).await.unwrap();
@@ -350,7 +350,7 @@ async fn the_page_its_live_maps_and_the_metrics_are_served() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
+async fn two_vehicles_have_their_own_sockets_maps_and_journals() {
     let folder = tempfile::tempdir().unwrap();
     let record = folder.path().join("two.mcap");
     let mut config = config();
@@ -362,7 +362,7 @@ async fn two_vehicles_have_doors_maps_and_journals_of_their_own() {
     let running = start(config).await;
     let mut client = grpc(&running).await;
 
-    // The car hears two turns, the truck one.
+    // The car receives two revolutions, the truck one.
     let maps = feed(&running, readings(2)).await;
     let (data, _) = running.inputs[1].udp.unwrap();
     let halt = Duration::from_millis(250);
@@ -406,21 +406,21 @@ async fn layers_are_made_while_subscribed_and_at_once_for_a_late_joiner() {
     let without_layers = newest();
     let (requests, mut updates) = watch(&running, 0).await;
     let subscriptions = running.vehicles.0[0].status.subscriptions.clone();
-    until("the reader's layer is taken", || subscriptions.is_subscribed(LAYER)).await;
+    until("the reader's layer is subscribed", || subscriptions.is_subscribed(LAYER)).await;
     assert!(!subscriptions.is_subscribed("terrain"));
-    let update = within("the newest turn's map", updates.message()).await.unwrap().unwrap();
+    let update = within("the newest revolution's map", updates.message()).await.unwrap().unwrap();
     assert_eq!(sequence(&update.map), without_layers.sequence + 1, "no map without the layer is sent");
     assert_eq!(newest().capture_end_ns, without_layers.capture_end_ns);
     assert_eq!(layers(), [LAYER]);
     feed(&running, part(1)).await;
-    within("the next turn's map", updates.message()).await.unwrap().unwrap();
+    within("the next revolution's map", updates.message()).await.unwrap().unwrap();
     assert_eq!(layers(), [LAYER]);
 
     drop((requests, updates));
     until("the reader is gone", || !subscriptions.is_subscribed(LAYER)).await;
-    let taken = subscriptions.subscribe(&["safe_path".into()]);
+    let subscription = subscriptions.subscribe(&["safe_path".into()]);
     feed(&running, part(2)).await;
-    assert_eq!(layers(), ["drivability", "safe_path"], "what it is made from comes along");
-    assert!(taken.is_covered_by(&newest()));
+    assert_eq!(layers(), ["drivability", "safe_path"], "the layers from which it is made are made too");
+    assert!(subscription.is_covered_by(&newest()));
     within("shutdown", running.shutdown()).await.unwrap();
 }

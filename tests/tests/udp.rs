@@ -44,14 +44,14 @@ fn port_at(address: &str) -> SocketAddr {
     socket(address).local_addr().expect("bound")
 }
 
-/// Data packets of the simulated vehicle, and a telemetry datagram.
+/// Data packets of the simulated vehicle, and one telemetry datagram.
 fn datagrams() -> (Vec<Vec<u8>>, Vec<u8>) {
     let all: Vec<Vec<u8>> = fixture::vehicle().take(1500).map(|datagram| datagram.payload).collect();
-    let telemetry = all.iter().find(|payload| payload.len() == 512).expect("one a turn").clone();
+    let telemetry = all.iter().find(|payload| payload.len() == 512).expect("one a revolution").clone();
     (all.into_iter().filter(|payload| payload.len() == 1206).collect(), telemetry)
 }
 
-/// The ledger a recording's events add up to.
+/// The ledger of a recording's events.
 fn replayed(record: &Path, vehicle: &str) -> Ledger {
     let mut recording = RecordingReader::open(record).unwrap();
     let (config, tables) = recording.config().unwrap();
@@ -68,13 +68,13 @@ fn replayed(record: &Path, vehicle: &str) -> Ledger {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording() {
+async fn every_datagram_is_counted_in_the_ledger_and_in_the_recording() {
     let folder = tempfile::tempdir().unwrap();
     let record = folder.path().join("d.mcap");
     let mut config = config();
     config.recorder.file = record.clone();
     let vehicle = &mut config.vehicles[0];
-    // The telemetry's socket hears IPv4 and IPv6.
+    // The telemetry socket receives IPv4 and IPv6.
     let (data, telemetry) = ("127.0.0.1:0".parse().unwrap(), "[::]:0".parse().unwrap());
     let mut side = vehicle.sensors[0].clone();
     side.name = "side".into();
@@ -90,7 +90,7 @@ async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording()
     let (sensor, unknown_sender, side) = (socket("127.0.0.2"), socket("127.0.0.3"), socket("127.0.0.4"));
     let mut broken = packets[0].clone();
     broken[0] = 0;
-    // In turns of one batch or less, so that the kernel's buffer holds whatever the machine does meanwhile.
+    // At most 50 packets are in flight, so that the kernel's buffer does not overflow on a slow machine.
     let mut sent = 0;
     for packet in &packets {
         sensor.send_to(packet, data).unwrap();
@@ -137,12 +137,12 @@ async fn whatever_comes_through_a_socket_is_in_the_ledger_and_in_the_recording()
 
     within("shutdown", running.shutdown()).await.unwrap();
     assert_eq!(status.snapshot().ledger, counted);
-    assert_eq!(replayed(&record, "car"), counted, "the recording tells what stayed outside too");
+    assert_eq!(replayed(&record, "car"), counted, "the recording has the dropped datagrams too");
     assert!(verify(&record).unwrap().is_good());
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_group_is_heard_on_its_interface() {
+async fn a_multicast_group_is_received_on_its_interface() {
     let mut config = config();
     let groups = vec!["239.255.77.1".parse().unwrap()];
     let any = "0.0.0.0:0".parse().unwrap();
@@ -169,7 +169,7 @@ fn a_million_datagrams_add_up_exactly() {
     let maps = &mut config.vehicles[0].maps;
     (maps.drivability.enabled, maps.height_difference.enabled, maps.terrain.enabled) = (false, false, false);
     let mut pipeline = Pipeline::new(&config.vehicles[0].core(), vec![None]).unwrap();
-    let (door, events) = event_queue(256);
+    let (queue, events) = event_queue(256);
 
     let (packets, position) = datagrams();
     let mut broken = packets[0].clone();
@@ -177,7 +177,7 @@ fn a_million_datagrams_add_up_exactly() {
     let kinds = [position, broken, Vec::new(), vec![0; 1205], vec![0; 1536]].map(bytes::Bytes::from);
     let packets: Vec<_> = packets.into_iter().map(bytes::Bytes::from).collect();
     let total = 1_000_000;
-    let (mut sent, mut outside, mut next) = (0_u64, [0_u64; 3], 0);
+    let (mut sent, mut dropped, mut next) = (0_u64, [0_u64; 3], 0);
     while sent < total {
         let size = u64::from(random.next_u32() % 64).min(total - sent);
         sent += size;
@@ -185,16 +185,16 @@ fn a_million_datagrams_add_up_exactly() {
         for _ in 0..size {
             match random.next_u32() % 16 {
                 0 => {
-                    door.refuse_unknown_sender(([10, 0, 0, (random.next_u32() % 16) as u8], 2368).into());
-                    outside[0] += 1;
+                    queue.refuse_unknown_sender(([10, 0, 0, (random.next_u32() % 16) as u8], 2368).into());
+                    dropped[0] += 1;
                 }
                 1 => {
-                    door.record_drop(0, Cause::Length, 1);
-                    outside[1] += 1;
+                    queue.record_drop(0, Cause::Length, 1);
+                    dropped[1] += 1;
                 }
                 2 => {
-                    door.record_drop(0, Cause::Kernel, 1);
-                    outside[2] += 1;
+                    queue.record_drop(0, Cause::Kernel, 1);
+                    dropped[2] += 1;
                 }
                 kind @ 3..8 => readings.push((0, Body::Datagram(kinds[kind as usize - 3].clone()))),
                 _ => {
@@ -203,21 +203,21 @@ fn a_million_datagrams_add_up_exactly() {
                 }
             }
         }
-        door.push_batch(readings).unwrap();
-        // An engine that stalls now and then.
+        queue.push_batch(readings).unwrap();
+        // The engine stalls now and then.
         if random.next_u32().is_multiple_of(8) {
             events.try_iter().for_each(|queued| drop(pipeline.step(&queued.event)));
         }
     }
     events.try_iter().for_each(|queued| drop(pipeline.step(&queued.event)));
-    door.report_drops(None).unwrap();
+    queue.report_drops(None).unwrap();
     events.try_iter().for_each(|queued| drop(pipeline.step(&queued.event)));
 
     let ledger = pipeline.ledger();
     assert!(adds_up(ledger), "{ledger:?}");
     assert_eq!(ledger.received + ledger.lost + ledger.kernel_drops, total);
-    assert_eq!((ledger.refused["source"], ledger.kernel_drops), (outside[0], outside[2]));
-    assert!(ledger.refused["length"] > outside[1] && ledger.refused["block_flag"] > 0 && ledger.telemetry > 0);
+    assert_eq!((ledger.refused["source"], ledger.kernel_drops), (dropped[0], dropped[2]));
+    assert!(ledger.refused["length"] > dropped[1] && ledger.refused["block_flag"] > 0 && ledger.telemetry > 0);
     assert!(ledger.decoded > total / 4 && ledger.lost > total / 100, "{ledger:?}");
 }
 
@@ -225,19 +225,19 @@ fn drive(path: &str) -> PathBuf {
     Path::new(env!("CLEARWAY_DATA")).join(path)
 }
 
-/// The vehicle `name` with a level sensor 1.9 m up, heard at `at` from `from`.
-fn heard_at(name: &str, at: SocketAddr, from: &str) -> clearway::config::Vehicle {
+/// The vehicle `name` with a level sensor 1.9 m above the ground that receives at `at` from the sender `from`.
+fn receiving_at(name: &str, at: SocketAddr, from: &str) -> clearway::config::Vehicle {
     let mut vehicle = Config::of_one_vehicle(name, "top").vehicles.remove(0);
     vehicle.sensors[0].extrinsics.z_m = 1.9;
-    // These captures are years old: their own time is believed all the same.
+    // These captures are years old; the server accepts their time all the same.
     vehicle.sensors[0].gps_late_days_max = 36_525.0;
     let from = [("top".to_owned(), Sender::Address(from.parse().unwrap()))].into();
     vehicle.udp = Some(Udp { data: at, telemetry: at, from, ..Udp::default() });
     vehicle
 }
 
-/// A copy of a capture that begins with its first telemetry datagram. These captures are years old: sent today, their
-/// sensors' own clocks must be known before the first turn is stamped, as stamps never go back.
+/// A copy of a capture that begins with its first telemetry datagram. These captures are years old, and stamps never go
+/// back: the server must have the sensor's clock before it stamps the first revolution.
 fn with_its_clock_first(capture: &Path, copy: PathBuf) -> PathBuf {
     const FILE_HEADER: usize = 24;
     const RECORD_HEADER: usize = 16;
@@ -246,7 +246,7 @@ fn with_its_clock_first(capture: &Path, copy: PathBuf) -> PathBuf {
     let (mut records, mut rest) = (Vec::new(), &bytes[FILE_HEADER..]);
     while let Some(length) = rest.get(8..12) {
         let length = RECORD_HEADER + u32::from_le_bytes(length.try_into().unwrap()) as usize;
-        // One of them is cut in its last datagram.
+        // One of the captures is truncated in its last datagram.
         let Some((record, after)) = rest.split_at_checked(length) else { break };
         records.push(record);
         rest = after;
@@ -257,7 +257,7 @@ fn with_its_clock_first(capture: &Path, copy: PathBuf) -> PathBuf {
     copy
 }
 
-/// Sends a capture's datagrams as fast as it goes; gives their number.
+/// Sends a capture's datagrams at full speed; returns their number.
 fn send(capture: &Path, from: &str, to: SocketAddr) -> u64 {
     let socket = socket(from);
     let capture = Capture::new(BufReader::new(File::open(capture).unwrap())).unwrap();
@@ -269,8 +269,8 @@ fn send(capture: &Path, from: &str, to: SocketAddr) -> u64 {
     sent
 }
 
-/// A map without what says when and where it was made: arrivals and what follows from them, the vehicle's name and the
-/// server's run. The stamps of the capture itself are the sensor's, and stay.
+/// A map without the fields that depend on the arrival times, on the vehicle's name and on the server's run. The stamps
+/// of the capture are those of the sensor, and stay.
 fn without_arrival(map: &[u8]) -> v1::Map {
     let mut map = v1::Map::decode(map).unwrap();
     let header = map.header.as_mut().unwrap();
@@ -281,14 +281,14 @@ fn without_arrival(map: &[u8]) -> v1::Map {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn two_captures_sent_to_one_port_at_once_give_both_vehicles_the_maps_of_their_files() {
+async fn two_captures_sent_to_one_port_make_the_maps_of_their_files() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let captures = [("car", HDL32, "127.0.0.2"), ("van", VLP16, "127.0.0.3")]
         .map(|(vehicle, capture, from)| (vehicle, with_its_clock_first(&drive(capture), at(vehicle)), from));
     let one_port = port_at("127.9.9.9");
     let mut config = config();
-    config.vehicles = captures.iter().map(|(vehicle, _, from)| heard_at(vehicle, one_port, from)).collect();
+    config.vehicles = captures.iter().map(|(vehicle, _, from)| receiving_at(vehicle, one_port, from)).collect();
     config.recorder.file = at("live.mcap");
     let extrinsics = config.vehicles[0].sensors[0].extrinsics;
     let running = start(config).await;
@@ -309,7 +309,7 @@ async fn two_captures_sent_to_one_port_at_once_give_both_vehicles_the_maps_of_th
         };
         within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
         let mut file: Vec<_> = recorded(&record).into_iter().collect();
-        // The file's end gives the last, unfinished turn; a socket has no end.
+        // The end of the file completes the last revolution; a socket has no end.
         let last = file.last().unwrap().0.0;
         file.retain(|((sequence, _), _)| *sequence < last);
         assert!(file.len() >= 3 * fixture::LAYERS as usize, "{} maps", file.len());

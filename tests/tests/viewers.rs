@@ -17,8 +17,8 @@ use fixture::{LAYERS, config, feed, readings, start, venv, within};
 use nalgebra::{Isometry3, Vector3};
 use serde_json::{Value, json};
 
-/// Poses of a vehicle that heads north-east, at rest, for as long as the readings last and some more.
-async fn place(running: &Running, readings: &[Reading]) {
+/// Sends poses of a vehicle at rest that heads north-east, from 0.2 s before the readings to 0.2 s after them.
+async fn send_poses(running: &Running, readings: &[Reading]) {
     let (first_ns, last_ns) = (readings[0].arrival_ns, readings[readings.len() - 1].arrival_ns);
     let map_from_ego = Isometry3::new(Vector3::new(7.0, -3.0, 0.5), Vector3::z() * FRAC_PI_4);
     let pose = |stamp_ns| {
@@ -26,9 +26,9 @@ async fn place(running: &Running, readings: &[Reading]) {
         Reading { arrival_ns: first_ns, source: 0, body }
     };
     let poses: Vec<_> = (first_ns - 200_000_000..last_ns + 200_000_000).step_by(50_000_000).map(pose).collect();
-    let door = running.inputs[0].queue.clone();
-    let entered = tokio::task::spawn_blocking(move || poses.into_iter().try_for_each(|pose| door.push_captured(pose)));
-    entered.await.unwrap().unwrap();
+    let queue = running.inputs[0].queue.clone();
+    let pushed = tokio::task::spawn_blocking(move || poses.into_iter().try_for_each(|pose| queue.push_captured(pose)));
+    pushed.await.unwrap().unwrap();
 }
 
 fn newest(running: &Running) -> MapView {
@@ -53,10 +53,10 @@ fn assert_near(found: &Value, expected: &[f64]) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
-async fn a_ros_2_subscriber_who_comes_late_finds_every_layer_and_the_vehicle_on_the_map() {
+async fn a_late_ros_2_subscriber_receives_every_layer_and_the_transform() {
     let running = start(ros2()).await;
     let readings = readings(4);
-    place(&running, &readings).await;
+    send_poses(&running, &readings).await;
     feed(&running, readings).await;
     let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens").clone();
     let received = tokio::task::spawn_blocking(move || {
@@ -75,18 +75,18 @@ async fn a_ros_2_subscriber_who_comes_late_finds_every_layer_and_the_vehicle_on_
         assert_eq!(grid["frame_id"], "car/base_link", "{topic}");
         assert_eq!(grid["stamp_ns"], map.header().capture_end_ns, "{topic}");
         assert_eq!(grid["size"], json!([raster.width, raster.height]), "{topic}");
-        assert_eq!(grid["sequence"], 1, "{topic}: who comes second has it from the cache");
+        assert_eq!(grid["sequence"], 1, "{topic}: the second subscriber has it from the cache");
         assert_eq!(grid["data"], json!(raster.occupancies(layer)), "{topic}");
         assert!(
             grid["data"].as_array().unwrap().contains(&json!(0)),
-            "{topic}: ground is seen about a vehicle on a plain"
+            "{topic}: the map has clear ground around a vehicle on a plain"
         );
         gids.push(grid["gid"].as_str().unwrap());
     }
     gids.sort_unstable();
     gids.dedup();
-    assert_eq!(gids.len() as u64, LAYERS, "each publisher has its own");
-    // The occupancy grid's axes are the world's, so they are turned in the vehicle's frame.
+    assert_eq!(gids.len() as u64, LAYERS, "each publisher has its own gid");
+    // The axes of the occupancy grid are those of the world, so the grid is rotated in the vehicle's frame.
     let (sin, cos) = (-FRAC_PI_4 / 2.0).sin_cos();
     let origin = received["messages"]["/clearway/car/occupancy"]["origin"].as_array().unwrap();
     assert_near(&json!(origin[2..]), &[sin, cos]);
@@ -107,12 +107,12 @@ async fn no_layer_is_made_for_topics_and_channels_without_subscribers() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
-async fn a_foxglove_client_is_shown_the_current_map_at_once_and_points_from_then_on() {
+async fn a_foxglove_client_gets_the_current_map_and_points_of_later_maps() {
     let mut config = config();
     config.foxglove = Foxglove { enabled: true, listen: "127.0.0.1:0".parse().unwrap() };
     let running = start(config).await;
     let mut readings = readings(8);
-    place(&running, &readings).await;
+    send_poses(&running, &readings).await;
     let rest = readings.split_off(readings.len() / 2);
     feed(&running, readings).await;
     let address = format!("ws://{}", running.foxglove.expect("Foxglove is served"));
@@ -125,24 +125,24 @@ async fn a_foxglove_client_is_shown_the_current_map_at_once_and_points_from_then
     })
     .await
     .unwrap();
-    let (told, lines) =
+    let (newest_map, lines) =
         tokio::task::spawn_blocking(move || (lines.next().expect("a line").unwrap(), lines)).await.unwrap();
-    let told: Value = serde_json::from_str(&told).unwrap();
-    assert_eq!(told["name"], "clearway");
-    assert_eq!(told["channels"].as_object().unwrap().len() as u64, LAYERS + 2);
+    let newest_map: Value = serde_json::from_str(&newest_map).unwrap();
+    assert_eq!(newest_map["name"], "clearway");
+    assert_eq!(newest_map["channels"].as_object().unwrap().len() as u64, LAYERS + 2);
     for name in ["drivability", "occupancy"] {
-        let (layer, grid) = (map.layer(name).unwrap(), &told[format!("/car/map/{name}")]);
-        let (raster, schema) = (Raster::from_grid(&layer.grid), &told["channels"][format!("/car/map/{name}")]);
+        let (layer, grid) = (map.layer(name).unwrap(), &newest_map[format!("/car/map/{name}")]);
+        let (raster, schema) = (Raster::from_grid(&layer.grid), &newest_map["channels"][format!("/car/map/{name}")]);
         let data = raster.rgba(layer);
         assert_eq!((schema.as_str(), grid["frame_id"].as_str()), (Some("foxglove.Grid"), Some("car/base_link")));
         assert_eq!(grid["log_ns"], map.header().capture_end_ns);
         assert_eq!((&grid["column_count"], &grid["row_stride"]), (&json!(raster.width), &json!(4 * raster.width)));
         assert_eq!(grid["data"], json!({"length": data.len(), "crc32": crc32fast::hash(&data)}), "{name}");
     }
-    let turned = &told["/car/map/occupancy"]["pose"]["orientation"];
+    let turned = &newest_map["/car/map/occupancy"]["pose"]["orientation"];
     let (sin, cos) = (-FRAC_PI_4 / 2.0).sin_cos();
     assert_near(&json!([turned["z"], turned["w"]]), &[sin, cos]);
-    let transform = &told["/tf"]["transforms"][0];
+    let transform = &newest_map["/tf"]["transforms"][0];
     assert_eq!((&transform["parent_frame_id"], &transform["child_frame_id"]), (&json!("map"), &json!("car/base_link")));
     assert_near(&json!([transform["translation"]["x"], transform["rotation"]["z"]]), &[7.0, -sin]);
 

@@ -79,7 +79,7 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
     }
     assert!(error("").contains("at least one [[vehicle]]"));
     assert!(error(&NEEDED.replace("z_m = 1.9\n", "")).contains("z_m"), "a missing transform is an error");
-    assert!(error(&format!("{NEEDED}{NEEDED}")).contains("each vehicle its own"));
+    assert!(error(&format!("{NEEDED}{NEEDED}")).contains("a different name for each vehicle"));
 }
 
 #[test]

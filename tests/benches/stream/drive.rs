@@ -1,4 +1,4 @@
-//! A simulated HDL-64E in the town: its datagrams are cast beforehand, then sent in real time.
+//! A simulated HDL-64E in the town: its datagrams are made beforehand, then sent in real time.
 
 use std::net::{SocketAddr, UdpSocket};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,25 +13,25 @@ use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
 /// Packets that are due this soon leave at once.
 const BURST: Duration = Duration::from_millis(1);
 
-/// Datagrams of turns, each of which ends with the packet at which the server cuts it.
-pub type Turns = Arc<Vec<Vec<Datagram>>>;
+/// Datagrams of revolutions; each ends with the packet at which the server ends the revolution.
+pub type Revolutions = Arc<Vec<Vec<Datagram>>>;
 
-/// Stamps of the last packets of turns, device and host clock, ns.
+/// Stamps of the last packets of revolutions, by the device's clock and by the host's clock, in ns.
 pub type Cuts = Arc<Mutex<Vec<(i64, i64)>>>;
 
-/// A drive that goes on until it is stopped.
+/// A drive that continues until it is stopped.
 pub struct Car {
     stop: Arc<AtomicBool>,
     thread: std::thread::JoinHandle<()>,
 }
 
 impl Car {
-    /// Drives, as long as there are turns.
-    pub fn drive(turns: &Turns, to: SocketAddr, cuts: &Cuts) -> Self {
+    /// Starts the drive; it ends with the last revolution at the latest.
+    pub fn drive(revolutions: &Revolutions, to: SocketAddr, cuts: &Cuts) -> Self {
         let stop = Arc::new(AtomicBool::new(false));
         let thread = std::thread::spawn({
-            let (turns, cuts, stop) = (turns.clone(), cuts.clone(), stop.clone());
-            move || send(&turns, to, &cuts, &stop)
+            let (revolutions, cuts, stop) = (revolutions.clone(), cuts.clone(), stop.clone());
+            move || send(&revolutions, to, &cuts, &stop)
         });
         Self { stop, thread }
     }
@@ -42,32 +42,32 @@ impl Car {
     }
 }
 
-/// What the sensor sends in so many turns of the town; each ends with the packet at which the server cuts it.
-pub fn cast(count: usize) -> Turns {
+/// The datagrams of this many revolutions in the town; each ends with the packet at which the server ends it.
+pub fn cast(count: usize) -> Revolutions {
     let mut vehicle = SimulatedVehicle::new(town(), ScannerConfig::default());
-    let (mut turns, mut turn, mut before) = (Vec::new(), Vec::new(), u16::MAX);
-    while turns.len() < count {
+    let (mut revolutions, mut revolution, mut before) = (Vec::new(), Vec::new(), u16::MAX);
+    while revolutions.len() < count {
         let datagram = vehicle.next().expect("datagrams do not end");
         if datagram.kind == Kind::Telemetry {
             continue;
         }
-        // Of the last block; behind the vehicle turns are cut.
+        // The azimuth of the last block; the server ends revolutions behind the vehicle.
         let azimuth = u16::from_le_bytes([datagram.payload[1102], datagram.payload[1103]]);
-        turn.push(datagram);
+        revolution.push(datagram);
         if before < 18_000 && azimuth >= 18_000 {
-            turns.push(std::mem::take(&mut turn));
+            revolutions.push(std::mem::take(&mut revolution));
         }
         before = azimuth;
     }
-    turns.into()
+    revolutions.into()
 }
 
-/// Sends the turns in real time, and notes when the last packet of each left.
-fn send(turns: &[Vec<Datagram>], to: SocketAddr, cuts: &Cuts, stop: &AtomicBool) {
+/// Sends the revolutions in real time, and records when the last packet of each was sent.
+fn send(revolutions: &[Vec<Datagram>], to: SocketAddr, cuts: &Cuts, stop: &AtomicBool) {
     let socket = UdpSocket::bind("127.0.0.1:0").expect("a free port");
-    let (began, first_ns) = (Instant::now(), turns[0][0].stamp_ns);
-    for turn in turns {
-        for (index, datagram) in turn.iter().enumerate() {
+    let (began, first_ns) = (Instant::now(), revolutions[0][0].stamp_ns);
+    for revolution in revolutions {
+        for (index, datagram) in revolution.iter().enumerate() {
             let due = Duration::from_nanos((datagram.stamp_ns - first_ns).unsigned_abs());
             let early = due.saturating_sub(began.elapsed());
             if early > BURST {
@@ -76,7 +76,7 @@ fn send(turns: &[Vec<Datagram>], to: SocketAddr, cuts: &Cuts, stop: &AtomicBool)
             if stop.load(Ordering::Relaxed) {
                 return;
             }
-            if index + 1 == turn.len() {
+            if index + 1 == revolution.len() {
                 cuts.lock().expect("no thread panics").push((datagram.stamp_ns, now_ns()));
             }
             socket.send_to(&datagram.payload, to).expect("loopback takes datagrams");

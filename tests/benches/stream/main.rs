@@ -1,13 +1,15 @@
-//! What the stream costs: a real server in a process of its own, a simulated HDL-64E sending datagrams to it in real
-//! time, and readers of one layer over gRPC, over zenoh, and over plain TCP, which is the floor for the same bytes.
+//! Measures the cost of the stream: a server in its own process, a simulated HDL-64E that sends datagrams to it in real
+//! time, and readers of one layer over gRPC, over zenoh, and over plain TCP, which is the lower bound for the same
+//! bytes.
 //!
 //!   cargo bench -p clearway-tests --bench stream                                  1, 10, 100 and 1,000 readers
 //!   cargo bench -p clearway-tests --bench stream -- --readers 1,10 --seconds 30 --layer occupancy --json
 //!   cargo bench -p clearway-tests --bench stream -- --slow --seconds 60           what slow readers cost the others
 //!
-//! Age: from the last packet of a turn sent to its map in a reader's hands. Carried: from the server's hand-over to the
-//! transport until then. The first reader decodes every map, as a planner does; the others take the bytes, and on gRPC
-//! acknowledge them. Memory: growth of the server's resident set, divided by the readers. Clocks: one machine's.
+//! Age: time from sending the last packet of a revolution to receiving its map. Carried: time from the server's
+//! hand-over to the transport to receiving the map. The first reader decodes every map, as a planner does; the others
+//! receive the bytes, and acknowledge them over gRPC. Memory: growth of the server's resident set, divided by the
+//! number of readers. All processes use the clock of one machine.
 
 mod drive;
 mod server;
@@ -27,14 +29,14 @@ use tokio::io::AsyncReadExt;
 use tokio::task::JoinSet;
 use tonic::transport::{Channel, Endpoint};
 
-use drive::{Car, Cuts, Turns, cast};
+use drive::{Car, Cuts, Revolutions, cast};
 use server::{Process, serve};
 
-/// Readers of a gRPC connection: a thousand of them would not get a connection each.
+/// Streams of a gRPC connection, because the server does not accept a thousand connections.
 const STREAMS: usize = 8;
-/// The drive is cast beforehand, so much longer than what is measured: readers come in the meantime.
+/// Time that the drive is longer than the measurement, in seconds: readers connect meanwhile.
 const BEFORE_S: u64 = 30;
-/// Readers have begun, and their memory is taken, after this.
+/// Time after which readers have started and their memory is allocated.
 const SETTLE: Duration = Duration::from_secs(3);
 
 #[derive(Parser)]
@@ -42,27 +44,28 @@ struct Arguments {
     /// How many readers, one row each.
     #[arg(long, value_delimiter = ',', default_values_t = [1, 10, 100, 1000])]
     readers: Vec<usize>,
-    /// Of each row.
+    /// Seconds of each row.
     #[arg(long, default_value_t = 20)]
     seconds: u64,
-    /// What they read.
+    /// Layer that is read.
     #[arg(long, default_value = "drivability")]
     layer: String,
-    /// Instead, what a stopped and a slow reader cost eight others, and how old the first map of a resumed one is.
+    /// Measures instead what a stopped and a slow reader cost eight others, and the age of the first map after
+    /// resuming.
     #[arg(long)]
     slow: bool,
-    /// One object instead of a table.
+    /// Prints one JSON object instead of a table.
     #[arg(long)]
     json: bool,
-    /// Be the server: what this program starts itself as.
+    /// Runs as the server; this program starts itself so.
     #[arg(long, hide = true)]
     serve: bool,
-    /// Cargo's.
+    /// Set by cargo bench.
     #[arg(long, hide = true)]
     bench: bool,
 }
 
-/// How maps are carried.
+/// Transport of the maps.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Carrier {
     Tcp,
@@ -70,20 +73,20 @@ enum Carrier {
     Zenoh,
 }
 
-/// What readers have seen, all of them together.
+/// Measurements of all readers together.
 #[derive(Debug, Default)]
 struct Seen {
-    /// ms, of every map of every reader.
+    /// Age of every map of every reader, in ms.
     ages: Vec<f64>,
     carried: Vec<f64>,
-    /// ms, of the one that decodes.
+    /// Age of every map of the reader that decodes, in ms.
     planner: Vec<f64>,
     bytes: u64,
-    /// Maps that the server says it left out because their reader, or its link, was slow.
+    /// Maps that the server skipped because a reader, or its link, was slow.
     skipped: u64,
 }
 
-/// One carrier's readers.
+/// The readers of one carrier.
 #[derive(Clone, Default)]
 struct Readers {
     seen: Arc<Mutex<Seen>>,
@@ -98,9 +101,9 @@ fn main() -> ExitCode {
         runtime.block_on(serve());
         return ExitCode::SUCCESS;
     }
-    let turns = cast(10 * (arguments.seconds + BEFORE_S) as usize);
+    let revolutions = cast(10 * (arguments.seconds + BEFORE_S) as usize);
     if arguments.slow {
-        let rows = runtime.block_on(slow::measure(&arguments, &turns));
+        let rows = runtime.block_on(slow::measure(&arguments, &revolutions));
         if arguments.json {
             println!("{}", json!({ "layer": arguments.layer, "load_average": load_average(), "rows": rows }));
         }
@@ -122,9 +125,9 @@ fn main() -> ExitCode {
     }
     for &readers in &arguments.readers {
         let mut bytes = 10_000;
-        // Last the floor, for as many bytes as a map had.
+        // TCP is last, with as many bytes as a map has.
         for carrier in [Carrier::Grpc, Carrier::Zenoh, Carrier::Tcp] {
-            let row = runtime.block_on(measure(&arguments, &turns, carrier, readers, bytes));
+            let row = runtime.block_on(measure(&arguments, &revolutions, carrier, readers, bytes));
             bytes = row["bytes_per_map"].as_u64().unwrap_or(bytes);
             if !arguments.json {
                 print_row(&row);
@@ -163,18 +166,18 @@ fn print_row(row: &serde_json::Value) {
     );
 }
 
-/// One row: a server of its own, this many readers, so many seconds.
+/// Measures one row: a new server, and this many readers.
 async fn measure(
     arguments: &Arguments,
-    turns: &Turns,
+    revolutions: &Revolutions,
     carrier: Carrier,
     count: usize,
     bytes: u64,
 ) -> serde_json::Value {
     let mut server = Process::start();
     let readers = Readers::default();
-    let car = Car::drive(turns, server.data, &readers.cuts);
-    // With one reader first, so that what the first costs the server once is none of the others'.
+    let car = Car::drive(revolutions, server.data, &readers.cuts);
+    // One reader connects first, so that its one-time cost does not count for the others.
     let mut tasks = JoinSet::new();
     readers.join(&mut tasks, &server, carrier, &arguments.layer, 1, bytes).await;
     tokio::time::sleep(SETTLE).await;
@@ -227,7 +230,7 @@ impl Readers {
                 }
             }
             Carrier::Grpc => {
-                // Connections of a stream each as far as that goes.
+                // One stream for each connection, unless there are too many readers.
                 let streams = if count > 128 { STREAMS } else { 1 };
                 let mut left = count;
                 while left > 0 {
@@ -267,12 +270,12 @@ impl Readers {
         let selection =
             v1::Selection { vehicle: String::new(), layers: vec![layer], max_in_flight: 2, ..Default::default() };
         let first = v1::WatchRequest { selection: Some(selection), ..Default::default() };
-        acknowledge.send(first).await.expect("room");
+        acknowledge.send(first).await.expect("capacity");
         let requests = futures::stream::poll_fn(move |context| requests.poll_recv(context));
         let mut updates = service.watch(requests).await.expect("the server streams").into_inner();
         while let Ok(Some(update)) = updates.message().await {
             let arrived_ns = now_ns();
-            let sequence = self.take(&update.map, update.sent_ns, arrived_ns, is_planner);
+            let sequence = self.count_map(&update.map, update.sent_ns, arrived_ns, is_planner);
             if self.counts.load(Ordering::Relaxed) {
                 self.seen.lock().expect("no thread panics").skipped += update.skipped;
             }
@@ -289,7 +292,7 @@ impl Readers {
         while let Ok(sample) = subscriber.recv_async().await {
             let arrived_ns = now_ns();
             let sent = sample.timestamp().expect("the server stamps").get_time().to_duration();
-            self.take(
+            self.count_map(
                 &Bytes::from(sample.payload().to_bytes().into_owned()),
                 sent.as_nanos() as i64,
                 arrived_ns,
@@ -298,7 +301,7 @@ impl Readers {
         }
     }
 
-    /// Asks for messages of so many bytes, the first eight of which are the server's clock.
+    /// Requests messages of this many bytes; the first eight are the time by the server's clock.
     async fn over_tcp(self, mut stream: tokio::net::TcpStream, bytes: usize) {
         use tokio::io::AsyncWriteExt;
         stream.set_nodelay(true).expect("an option");
@@ -311,7 +314,7 @@ impl Readers {
         }
     }
 
-    /// What comes in the meantime counts.
+    /// Counts the maps that arrive in this time.
     async fn count_for(&self, time: Duration) {
         self.counts.store(true, Ordering::Relaxed);
         tokio::time::sleep(time).await;
@@ -328,8 +331,8 @@ impl Readers {
         counts
     }
 
-    /// Counts a map; gives its sequence.
-    fn take(&self, map: &Bytes, sent_ns: i64, arrived_ns: i64, is_planner: bool) -> u64 {
+    /// Counts a map; returns its sequence.
+    fn count_map(&self, map: &Bytes, sent_ns: i64, arrived_ns: i64, is_planner: bool) -> u64 {
         use prost::Message;
         let header = v1::Map::decode(map.clone()).expect("a map").header.expect("a header");
         if is_planner {
@@ -348,10 +351,10 @@ impl Readers {
         header.sequence
     }
 
-    /// From the last packet of a capture to then, ms.
+    /// Time from the last packet of a capture to then, in ms.
     fn age_ms(&self, capture_end_ns: i64, then_ns: i64) -> Option<f64> {
         let cuts = self.cuts.lock().expect("no thread panics");
-        // The turn's last packet is the first that was stamped after the capture's end.
+        // The last packet of the revolution is the first that was stamped after the capture's end.
         let (_, cut_ns) = cuts.iter().rev().take_while(|(stamp, _)| *stamp >= capture_end_ns).last()?;
         Some((then_ns - cut_ns) as f64 * 1e-6)
     }

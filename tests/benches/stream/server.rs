@@ -12,7 +12,7 @@ use clearway_client::now_ns;
 use clearway_sim::scanner::ScannerConfig;
 use tokio::io::AsyncReadExt;
 
-/// The server's process, and where it is met.
+/// The server's process and its addresses.
 pub struct Process {
     child: Child,
     pub data: SocketAddr,
@@ -29,26 +29,26 @@ impl Process {
         let mut line = String::new();
         BufReader::new(child.stdout.take().expect("piped")).read_line(&mut line).expect("a line");
         let places: Vec<&str> = line.split_whitespace().collect();
-        let [data, grpc, floor, zenoh] = places[..] else { panic!("the server says {line:?}") };
+        let [data, grpc, floor, zenoh] = places[..] else { panic!("the server prints {line:?}") };
         let at = |address: &str| address.parse().expect("an address");
         Self { data: at(data), grpc: at(grpc), floor: at(floor), zenoh: zenoh.into(), child }
     }
 
-    /// What the kernel holds in memory for it, KiB.
+    /// Resident set of the process, in KiB.
     pub fn resident_kib(&self) -> i64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("Linux");
         let line = status.lines().find(|line| line.starts_with("VmRSS")).expect("VmRSS");
         line.split_whitespace().nth(1).and_then(|kib| kib.parse().ok()).expect("a number")
     }
 
-    /// Ends with its standard input.
+    /// Ends the process by the end of its standard input.
     pub fn stop(&mut self) {
         drop(self.child.stdin.take());
         self.child.wait().expect("it ends");
     }
 }
 
-/// The server: until standard input ends.
+/// Runs the server until standard input ends.
 pub async fn serve() {
     let mut config = Config::of_one_vehicle("car", "top");
     let any: SocketAddr = "127.0.0.1:0".parse().expect("an address");
@@ -72,7 +72,7 @@ pub async fn serve() {
     ended.await.expect("no panic").expect("standard input");
 }
 
-/// Ten messages a second to every connection, as long as each asks for, each with the stamp of its making.
+/// Sends ten messages a second to every connection, each of the requested length and with the time of its making.
 async fn serve_floor(listener: TcpListener) {
     use tokio::io::AsyncWriteExt;
     listener.set_nonblocking(true).expect("an option");

@@ -21,19 +21,19 @@ use tokio::task::JoinSet;
 use tonic::Streaming;
 use tonic::transport::Endpoint;
 
-use crate::drive::{Car, Turns};
+use crate::drive::{Car, Revolutions};
 use crate::server::Process;
 use crate::{Arguments, Carrier, Readers, SETTLE, percentiles};
 
 const HEALTHY: usize = 8;
 const BYTES_A_SECOND: u64 = 10_000;
-/// Maps that may be on their way to a reader without an acknowledgement.
+/// Maps that may be in flight to a reader without an acknowledgement.
 const IN_FLIGHT: u32 = 2;
-/// Parts without slow readers and with them, in turn.
+/// Rounds; each has a part without slow readers and a part with them.
 const ROUNDS: usize = 2;
 
-/// Measures and prints; gives the rows.
-pub async fn measure(arguments: &Arguments, turns: &Turns) -> Vec<Value> {
+/// Measures and prints; returns the rows.
+pub async fn measure(arguments: &Arguments, revolutions: &Revolutions) -> Vec<Value> {
     let mut rows = Vec::new();
     if !arguments.json {
         println!(
@@ -42,7 +42,7 @@ pub async fn measure(arguments: &Arguments, turns: &Turns) -> Vec<Value> {
         );
     }
     for with in [false, true].into_iter().cycle().take(2 * ROUNDS) {
-        let row = part(arguments, turns, with).await;
+        let row = part(arguments, revolutions, with).await;
         if !arguments.json {
             let [p50, p99] = [0, 1].map(|at| row["age_ms"][at].as_f64().unwrap_or(f64::NAN));
             let resumed = row["resumed_age_ms"].as_f64().map_or("-".into(), |ms| format!("{ms:.1}"));
@@ -55,21 +55,21 @@ pub async fn measure(arguments: &Arguments, turns: &Turns) -> Vec<Value> {
     rows
 }
 
-/// A server of its own, and so many seconds.
-async fn part(arguments: &Arguments, turns: &Turns, with: bool) -> Value {
+/// Measures one part with a new server.
+async fn part(arguments: &Arguments, revolutions: &Revolutions, with: bool) -> Value {
     let mut server = Process::start();
     let readers = Readers::default();
-    let car = Car::drive(turns, server.data, &readers.cuts);
+    let car = Car::drive(revolutions, server.data, &readers.cuts);
     let mut tasks = JoinSet::new();
     readers.join(&mut tasks, &server, Carrier::Grpc, &arguments.layer, HEALTHY, 0).await;
     tokio::time::sleep(SETTLE).await;
     let alone_kib = server.resident_kib();
     let mut slow = Vec::new();
     if with {
-        let link = lay(server.grpc).await;
+        let link = slow_link(server.grpc).await;
         slow.push(Slow::join(server.grpc, &arguments.layer).await);
         slow.push(Slow::join(link, &arguments.layer).await);
-        slow[0].looks.send_replace(false);
+        slow[0].reads.send_replace(false);
     }
     readers.count_for(Duration::from_secs(arguments.seconds)).await;
     let grown_kib = server.resident_kib() - alone_kib;
@@ -95,46 +95,48 @@ async fn part(arguments: &Arguments, turns: &Turns, with: bool) -> Value {
 
 /// A reader that stops, or is behind a slow link.
 struct Slow {
-    looks: watch::Sender<bool>,
-    heard: watch::Receiver<Heard>,
+    reads: watch::Sender<bool>,
+    received: watch::Receiver<Received>,
     task: tokio::task::JoinHandle<()>,
 }
 
-/// How many updates came, and when the newest did.
+/// Number of received updates, and the stamps of the newest.
 #[derive(Clone, Copy, Debug, Default)]
-struct Heard {
+struct Received {
     updates: u64,
     capture_end_ns: i64,
     arrived_ns: i64,
 }
 
 impl Slow {
-    /// Opens a stream and has its first map.
+    /// Opens a stream and receives its first map.
     async fn join(address: SocketAddr, layer: &str) -> Self {
         let endpoint = Endpoint::from_shared(format!("http://{address}")).expect("an address");
         let mut service = MapServiceClient::new(endpoint.connect().await.expect("gRPC answers"));
         let selection =
             v1::Selection { layers: vec![layer.to_owned()], max_in_flight: IN_FLIGHT, ..Default::default() };
-        let (requests, mut said) = tokio::sync::mpsc::channel(8);
-        requests.send(v1::WatchRequest { selection: Some(selection), ..Default::default() }).await.expect("room");
-        let said = futures::stream::poll_fn(move |context| said.poll_recv(context));
-        let updates = service.watch(said).await.expect("the server streams").into_inner();
-        let (tell, mut heard) = watch::channel(Heard::default());
-        let (looks, may_look) = watch::channel(true);
-        let task = tokio::spawn(read(updates, requests, may_look, tell));
-        heard.changed().await.expect("a first map");
-        Self { looks, heard, task }
+        let (requests, mut receiver) = tokio::sync::mpsc::channel(8);
+        requests.send(v1::WatchRequest { selection: Some(selection), ..Default::default() }).await.expect("capacity");
+        let requested = futures::stream::poll_fn(move |context| receiver.poll_recv(context));
+        let updates = service.watch(requested).await.expect("the server streams").into_inner();
+        let (sender, mut received) = watch::channel(Received::default());
+        let (reads, may_read) = watch::channel(true);
+        let task = tokio::spawn(read(updates, requests, may_read, sender));
+        received.changed().await.expect("a first map");
+        Self { reads, received, task }
     }
 
-    /// Looks again; gives the age, ms, of the first map that was not on its way before.
+    /// Reads again; returns the age of the first map that was not in flight before, in ms.
     async fn resume(&mut self, readers: &Readers) -> f64 {
-        let before = self.heard.borrow_and_update().updates;
-        self.looks.send_replace(true);
+        let before = self.received.borrow_and_update().updates;
+        self.reads.send_replace(true);
         loop {
-            self.heard.changed().await.expect("the stream goes on");
-            let heard = *self.heard.borrow_and_update();
-            if heard.updates > before + u64::from(IN_FLIGHT) {
-                return readers.age_ms(heard.capture_end_ns, heard.arrived_ns).expect("a turn that was sent");
+            self.received.changed().await.expect("the stream goes on");
+            let received = *self.received.borrow_and_update();
+            if received.updates > before + u64::from(IN_FLIGHT) {
+                return readers
+                    .age_ms(received.capture_end_ns, received.arrived_ns)
+                    .expect("a revolution that was sent");
             }
         }
     }
@@ -143,16 +145,16 @@ impl Slow {
 async fn read(
     mut updates: Streaming<v1::MapUpdate>,
     requests: tokio::sync::mpsc::Sender<v1::WatchRequest>,
-    mut may_look: watch::Receiver<bool>,
-    tell: watch::Sender<Heard>,
+    mut may_read: watch::Receiver<bool>,
+    sender: watch::Sender<Received>,
 ) {
-    while may_look.wait_for(|looks| *looks).await.is_ok()
+    while may_read.wait_for(|reads| *reads).await.is_ok()
         && let Ok(Some(update)) = updates.message().await
     {
         let arrived_ns = now_ns();
         let header = v1::Map::decode(update.map).expect("a map").header.expect("a header");
-        tell.send_modify(|heard| {
-            *heard = Heard { updates: heard.updates + 1, capture_end_ns: header.capture_end_ns, arrived_ns };
+        sender.send_modify(|received| {
+            *received = Received { updates: received.updates + 1, capture_end_ns: header.capture_end_ns, arrived_ns };
         });
         let acknowledged = v1::WatchRequest { acknowledged: Some(header.sequence), ..Default::default() };
         if requests.send(acknowledged).await.is_err() {
@@ -162,7 +164,7 @@ async fn read(
 }
 
 /// A slow link to the server, for one connection.
-async fn lay(server: SocketAddr) -> SocketAddr {
+async fn slow_link(server: SocketAddr) -> SocketAddr {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
     let address = listener.local_addr().expect("bound");
     tokio::spawn(async move {

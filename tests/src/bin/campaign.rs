@@ -41,7 +41,7 @@ fn main() -> ExitCode {
     if let Some(seed) = arguments.seed {
         println!("{:#?}", simulation::fault_plan(seed));
     }
-    // Cast before the clock starts.
+    // The drives are made before the time measurement starts.
     simulation::drive::drives();
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let threads = arguments.threads.unwrap_or(cores).max(1);

@@ -35,13 +35,13 @@ const COVERED_EDGE_DEG: i64 = 15;
 const SEEN_S_MAX: f64 = 0.3;
 
 /// Checks that received = decoded + telemetry + refused by reason.
-pub fn adds_up(whose: &str, ledger: &Ledger) -> Result<(), Violation> {
+pub fn adds_up(part: &str, ledger: &Ledger) -> Result<(), Violation> {
     let sum = ledger.decoded + ledger.telemetry + ledger.refused.values().sum::<u64>();
     match ledger.received == sum {
         true => Ok(()),
         false => Err(violation(
             "ledger",
-            format!("{whose}: received {}, and the parts make {sum}: {ledger:?}", ledger.received),
+            format!("{part}: received {}, and the parts make {sum}: {ledger:?}", ledger.received),
         )),
     }
 }

@@ -65,10 +65,10 @@ impl Drive {
                 datagrams.map(|d| Sent { offset_ns: d.stamp_ns - START_NS, reading: Reading::Datagram(index, d) }),
             );
         }
-        let told = rig.observations().take_while(|told| told.stamp_ns < end_ns);
-        sent.extend(told.map(|told| Sent {
-            offset_ns: told.stamp_ns - START_NS,
-            reading: Reading::Observation(Box::new(told.observation.into())),
+        let observations = rig.observations().take_while(|timed| timed.stamp_ns < end_ns);
+        sent.extend(observations.map(|timed| Sent {
+            offset_ns: timed.stamp_ns - START_NS,
+            reading: Reading::Observation(Box::new(timed.observation.into())),
         }));
         sent.sort_by_key(|sent| sent.offset_ns);
         let mut config = Config::of_one_vehicle("car", "top");

@@ -95,8 +95,8 @@ impl TestBed<'_> {
         let source = self.rng.within(0..self.networks.len() as i64) as u16;
         self.offered += 1;
         match self.rng.within(0..4) {
-            0 => self.door.record_drop(source, Cause::Length, 1),
-            1 => self.door.refuse_unknown_sender(([10, 0, 0, self.rng.within(1..99) as u8], 2368).into()),
+            0 => self.queue.record_drop(source, Cause::Length, 1),
+            1 => self.queue.refuse_unknown_sender(([10, 0, 0, self.rng.within(1..99) as u8], 2368).into()),
             2 => {
                 self.offered -= 1;
                 let stamp_ns = self.drive.rig.start_ns + self.plan.offset_ns + self.now_ns;
@@ -127,27 +127,27 @@ impl TestBed<'_> {
                 continue;
             }
             assert!(payload.len() <= DATAGRAM_BYTES_MAX, "the network does not lengthen datagrams");
-            self.door.push(source, Body::Datagram(Bytes::from(payload))).expect("the engine is there");
+            self.queue.push(source, Body::Datagram(Bytes::from(payload))).expect("the engine is there");
         }
         self.set_clock(self.now_ns);
     }
 
     /// Sends as many observations as the gateway has room for, and receives their outcomes.
     pub fn observe(&mut self) {
-        while let Ok((mark, verdict)) = self.told.try_recv() {
+        while let Ok((id, outcome)) = self.outcomes.try_recv() {
             if self.injected != Some(InjectedFault::LostOutcome) || mark.number != 100 {
-                self.account.record_outcome(mark.number, verdict);
+                self.session.record_outcome(id.number, outcome);
             }
         }
-        let limits = &self.entrance.limits;
-        while self.account.has_credit(self.entrance.in_flight_max, limits.message_bytes_max) {
+        let limits = &self.gateway.limits;
+        while self.session.has_credit(self.gateway.in_flight_max, limits.message_bytes_max) {
             let Some(mut observation) = self.waiting.pop_front() else { break };
             self.observations += 1;
             observation.number = self.observations;
             self.offered += 1;
             let bytes = observation.encoded_len();
             // An unknown sensor ends a real stream; its car connects again.
-            let _ = self.entrance.push(observation, bytes, &mut self.account, &self.verdicts);
+            let _ = self.gateway.push(observation, bytes, &mut self.session, &self.outcome_sender);
         }
     }
 }

@@ -51,15 +51,15 @@ impl TestBed<'_> {
         if self.clock.load(Ordering::Relaxed) - newest_ns > 2 * REVOLUTION_NS {
             return Err(violation("converge", format!("no map for two revolutions: {last}")));
         }
-        self.door.report_drops(None).map_err(|closed| violation("ledger", closed.to_string()))?;
+        self.queue.report_drops(None).map_err(|closed| violation("ledger", closed.to_string()))?;
         self.step()?;
         self.engine.update_status();
         let snapshot = self.vehicles.0[0].status.snapshot();
         accounts(self.offered, &snapshot.ledger, &snapshot.sensors)?;
         adds_up("at the end, the core", self.engine.pipeline.ledger())?;
         self.observe();
-        if !self.account.is_idle() || !self.waiting.is_empty() {
-            let (events, _) = self.account.in_flight();
+        if !self.session.is_idle() || !self.waiting.is_empty() {
+            let (events, _) = self.session.in_flight();
             let found = format!("{events} events without an outcome, {} observations still wait", self.waiting.len());
             return Err(violation("outcomes", found));
         }

@@ -43,7 +43,7 @@ pub(super) struct TestBed<'a> {
     pub(super) now_ns: i64,
 
     pub(super) clock: Arc<AtomicI64>,
-    pub(super) door: EventQueue,
+    pub(super) queue: EventQueue,
     pub(super) events: Receiver<QueuedEvent>,
     pub(super) engine: Engine,
     pub(super) vehicles: Vehicles,
@@ -59,12 +59,12 @@ pub(super) struct TestBed<'a> {
     pub(super) next_sent: usize,
     pub(super) offered: u64,
 
-    pub(super) entrance: Gateway,
+    pub(super) gateway: Gateway,
     pub(super) waiting: VecDeque<v1::Observation>,
-    pub(super) account: ClientSession,
+    pub(super) session: ClientSession,
     pub(super) observations: u64,
-    pub(super) verdicts: OutcomeSender,
-    pub(super) told: UnboundedReceiver<(ObservationId, EventOutcome)>,
+    pub(super) outcome_sender: OutcomeSender,
+    pub(super) outcomes: UnboundedReceiver<(ObservationId, EventOutcome)>,
 
     pub(super) readers: Vec<Reader>,
 
@@ -84,7 +84,7 @@ impl<'a> TestBed<'a> {
         let vehicle = &config.vehicles[0];
         let layers = layer_names(&vehicle.maps);
         let clock = Arc::new(AtomicI64::new(0));
-        let (door, events) = event_queue_with_clock(
+        let (queue, events) = event_queue_with_clock(
             Clock::new({
                 let clock = clock.clone();
                 move || clock.load(Ordering::Relaxed)
@@ -99,22 +99,22 @@ impl<'a> TestBed<'a> {
             // The disk is full before the first event: the run goes on without a recording.
             Err(_) => (None, None),
         };
-        let status = Arc::new(VehicleStatus::new("car".into(), 1, layers.clone(), door.drops()));
+        let status = Arc::new(VehicleStatus::new("car".into(), 1, layers.clone(), queue.drops()));
         writer.iter().for_each(|writer| status.show_recorder(writer.counts()));
         let (newest, receiver) = watch::channel(None);
         let pipeline = Pipeline::new(&vehicle.core(), vec![None; vehicle.sensors.len()]).expect("a valid car");
         let valid_ms = vehicle.maps.valid_ms;
         let engine = Engine { pipeline, valid_ms, newest, recording: journal, status: status.clone(), observer: None };
         let mut rng = Rng::new(!plan.seed);
-        let (verdicts, told) = unbounded_channel();
+        let (outcome_sender, outcomes) = unbounded_channel();
         Self {
             plan,
             injected,
             drive,
             now_ns: 0,
             clock,
-            entrance: Gateway::new(vehicle, &door),
-            door,
+            gateway: Gateway::new(vehicle, &queue),
+            queue,
             events,
             engine,
             vehicles: Vehicles(vec![Served { status, newest: receiver }].into()),
@@ -127,10 +127,10 @@ impl<'a> TestBed<'a> {
             next_sent: drive.sent.partition_point(|sent| sent.offset_ns < plan.offset_ns),
             offered: 0,
             waiting: VecDeque::new(),
-            account: ClientSession::new(0),
+            session: ClientSession::new(0),
             observations: 0,
-            verdicts,
-            told,
+            outcome_sender,
+            outcomes,
             readers: readers(&mut rng, &layers),
             rng,
             began: Instant::now(),

@@ -1,5 +1,5 @@
-//! Scans, poses, roads and tunnelled packets over the network: the same maps as by any other door, and for everything
-//! that is not taken a reason.
+//! Scans, poses, roads and tunnelled packets over the network: the maps are the same as from files, and every refused
+//! observation has a reason.
 
 #[path = "../fixture/mod.rs"]
 mod fixture;
@@ -41,12 +41,12 @@ async fn ingester(running: &Running) -> Ingester {
     within("a stream", client(running).await.ingest("car")).await.expect("the car is known")
 }
 
-/// Sends everything and gives what was refused.
-async fn told(ingester: &mut Ingester, observations: Vec<Observation>) -> Vec<Refusal> {
+/// Sends all observations; returns the refusals.
+async fn send_all(ingester: &mut Ingester, observations: Vec<Observation>) -> Vec<Refusal> {
     for observation in observations {
-        within("room", ingester.send(observation)).await.expect("the stream is open");
+        within("capacity", ingester.send(observation)).await.expect("the stream is open");
     }
-    within("verdicts", ingester.settled()).await.expect("the stream is open")
+    within("outcomes", ingester.settled()).await.expect("the stream is open")
 }
 
 /// A scan of a plain.
@@ -65,7 +65,7 @@ fn scan(number: u64, scan: v1::Scan) -> v1::Observation {
     v1::Observation { number, captured_ns: 1_000_000_000, body, ..Default::default() }
 }
 
-/// Sends raw observations in one stream and gives every report, and how the stream ended.
+/// Sends raw observations in one stream; returns every report and the stream's final status.
 async fn reports(running: &Running, sent: Vec<v1::Observation>) -> (Vec<v1::IngestReport>, Option<tonic::Status>) {
     let channel = tonic::transport::Channel::from_shared(format!("http://{}", running.grpc.unwrap())).unwrap();
     let mut client = IngestServiceClient::new(channel.connect().await.unwrap());
@@ -93,8 +93,8 @@ fn tunnelled(readings: &[Reading], count: usize) -> Vec<Observation> {
     readings.chunks(count).map(packets).collect()
 }
 
-/// Holds a drive's maps, come as tunnelled packets, against those it makes by the door of files.
-async fn assert_tunnelled_makes_the_maps_of_the_file_door(config: Config, readings: Vec<Reading>) -> usize {
+/// Asserts that a drive makes the same maps from tunnelled packets as from a file; returns the number of maps.
+async fn assert_tunnelled_makes_the_maps_of_the_file(config: Config, readings: Vec<Reading>) -> usize {
     let folder = tempfile::tempdir().unwrap();
     let (by_file, by_grpc) = (folder.path().join("file.mcap"), folder.path().join("grpc.mcap"));
     let end_ns = readings.last().expect("a drive").arrival_ns;
@@ -102,15 +102,15 @@ async fn assert_tunnelled_makes_the_maps_of_the_file_door(config: Config, readin
 
     let running = start(config.clone(), &by_file).await;
     feed(&running, readings.clone()).await;
-    let door = running.inputs[0].queue.clone();
-    tokio::task::spawn_blocking(move || door.push_captured(end)).await.unwrap().unwrap();
+    let queue = running.inputs[0].queue.clone();
+    tokio::task::spawn_blocking(move || queue.push_captured(end)).await.unwrap().unwrap();
     within("shutdown", running.shutdown()).await.unwrap();
 
     let running = start(config, &by_grpc).await;
     let mut ingester = ingester(&running).await;
     let mut observations = tunnelled(&readings, 97);
     observations.push(Observation::end("").captured_at(end_ns));
-    assert_eq!(told(&mut ingester, observations).await, []);
+    assert_eq!(send_all(&mut ingester, observations).await, []);
     within("shutdown", running.shutdown()).await.unwrap();
 
     let maps = recorded(&by_file);
@@ -121,23 +121,23 @@ async fn assert_tunnelled_makes_the_maps_of_the_file_door(config: Config, readin
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_drive_tunnelled_over_grpc_makes_the_maps_of_the_file_door() {
-    let maps = assert_tunnelled_makes_the_maps_of_the_file_door(config(), readings(5)).await;
+async fn a_drive_tunnelled_over_grpc_makes_the_maps_of_the_file() {
+    let maps = assert_tunnelled_makes_the_maps_of_the_file(config(), readings(5)).await;
     assert!(maps as u64 >= 5 * fixture::LAYERS, "{maps}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn a_recorded_drive_tunnelled_over_grpc_makes_the_maps_of_the_file_door() {
+async fn a_recorded_drive_tunnelled_over_grpc_makes_the_maps_of_the_file() {
     let file = Path::new(env!("CLEARWAY_DATA")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
     let drive = clearway::ingest::files::capture::Source::open(&file).unwrap();
     let readings: Vec<Reading> = drive.map(Result::unwrap).collect();
     assert_eq!(readings.len(), 976);
-    let maps = assert_tunnelled_makes_the_maps_of_the_file_door(config(), readings).await;
+    let maps = assert_tunnelled_makes_the_maps_of_the_file(config(), readings).await;
     assert_eq!(maps as u64, 6 * fixture::LAYERS);
 }
 
-/// A car in the town whose sensor's turns come as scans; the speed map is on.
+/// Configuration of a car in the town that sends each revolution as a scan; the speed map is on.
 fn scanned_config() -> Config {
     let mut config = config();
     config.vehicles[0].udp = None;
@@ -146,15 +146,15 @@ fn scanned_config() -> Config {
     config
 }
 
-/// What the car tells of `turns` turns: poses at 100 Hz, the road ahead, and each turn as a scan with the time of each
-/// point, or of each column.
-fn scanned(turns: i64, by_column: bool) -> Vec<Observation> {
+/// Observations of `revolutions` revolutions: poses at 100 Hz, the road ahead, and each revolution as a scan with the
+/// time of each point, or of each column.
+fn scanned(revolutions: i64, by_column: bool) -> Vec<Observation> {
     let scanner = ScannerConfig { model: Model::Hdl32e, ..ScannerConfig::default() };
     let car = SimulatedVehicle::new(town(), scanner);
     let mut observations = Vec::new();
-    for number in 1..=turns {
-        let turn = car.revolution(number);
-        let end_ns = turn.end_ns;
+    for number in 1..=revolutions {
+        let revolution = car.revolution(number);
+        let end_ns = revolution.end_ns;
         let first_ns = end_ns - 100_000_000 + 10_000_000;
         for stamp_ns in (first_ns..=end_ns).step_by(10_000_000) {
             let pose = car.pose_at(stamp_ns);
@@ -169,16 +169,18 @@ fn scanned(turns: i64, by_column: bool) -> Vec<Observation> {
 
         let (mut x, mut y, mut z, mut intensity) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         let (mut rings, mut offsets_ns, mut columns) = (Vec::new(), Vec::new(), (Vec::new(), Vec::new()));
-        let echo = &turn.echoes[0];
-        for (firing, when) in turn.firings.iter().enumerate() {
-            let offset_ns = i32::try_from(turn.start_ns + i64::from(when.offset_ns) - end_ns).unwrap();
+        let echo = &revolution.echoes[0];
+        for (firing, when) in revolution.firings.iter().enumerate() {
+            let offset_ns = i32::try_from(revolution.start_ns + i64::from(when.offset_ns) - end_ns).unwrap();
             let before = x.len();
-            for slot in (firing * turn.lasers..(firing + 1) * turn.lasers).filter(|slot| echo.range_m[*slot] > 0.0) {
+            for slot in
+                (firing * revolution.lasers..(firing + 1) * revolution.lasers).filter(|slot| echo.range_m[*slot] > 0.0)
+            {
                 x.push(echo.x[slot]);
                 y.push(echo.y[slot]);
                 z.push(echo.z[slot]);
                 intensity.push(f32::from(echo.intensity[slot]) / 255.0);
-                rings.push(u16::try_from(slot % turn.lasers).unwrap());
+                rings.push(u16::try_from(slot % revolution.lasers).unwrap());
                 offsets_ns.push(offset_ns);
             }
             columns.0.push(offset_ns);
@@ -206,23 +208,23 @@ fn road_cells(map: &v1::Map) -> u32 {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_session_of_scans_poses_and_roads_over_grpc_makes_moved_maps_with_the_road_and_verifies() {
+async fn scans_poses_and_roads_over_grpc_make_compensated_maps_with_the_road() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
-    let turns = 4;
+    let revolutions = 4;
     for (file, by_column) in [("points.mcap", false), ("columns.mcap", true)] {
         let running = start(scanned_config(), &at(file)).await;
         let mut ingester = ingester(&running).await;
-        assert_eq!(told(&mut ingester, scanned(turns, by_column)).await, []);
+        assert_eq!(send_all(&mut ingester, scanned(revolutions, by_column)).await, []);
         let ledger = running.vehicles.0[0].status.snapshot().ledger;
         let taken = (ledger.decoded, ledger.poses, ledger.roads, ledger.received, ledger.lost);
-        assert_eq!(taken, (4, 40, 4, 4, 0), "acknowledged is counted: {ledger:?}");
+        assert_eq!(taken, (4, 40, 4, 4, 0), "every acknowledged observation is counted: {ledger:?}");
         within("shutdown", running.shutdown()).await.unwrap();
         let report = verify(&at(file)).unwrap();
         assert!(report.is_good() && report.maps == 4 && report.events == 48, "{report:?}");
     }
     let maps = recorded(&at("points.mcap"));
-    assert!(recorded(&at("columns.mcap")) == maps, "time by column says what time by point says");
+    assert!(recorded(&at("columns.mcap")) == maps, "times by column give the same maps as times by point");
     let speed = layer(&maps, "speed");
     assert_eq!(speed.len(), 4);
     for map in &speed {
@@ -234,7 +236,7 @@ async fn a_session_of_scans_poses_and_roads_over_grpc_makes_moved_maps_with_the_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_sensor_that_the_stream_declares_is_mapped_recorded_and_declared_again_without_harm() {
+async fn a_sensor_declared_in_the_stream_is_mapped_and_recorded() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("r.mcap");
     let running = start(scanned_config(), &file).await;
@@ -246,21 +248,21 @@ async fn a_sensor_that_the_stream_declares_is_mapped_recorded_and_declared_again
     };
     let declared = || Observation::declare(sensor.clone()).captured_at(1_000_000_000);
     let mut first = ingester(&running).await;
-    let told_first = vec![declared(), rays("left", 1_000_000_000), rays("top", 1_010_000_000)];
-    assert_eq!(told(&mut first, told_first).await, []);
+    let observations = vec![declared(), rays("left", 1_000_000_000), rays("top", 1_010_000_000)];
+    assert_eq!(send_all(&mut first, observations).await, []);
 
     let mut second = ingester(&running).await;
     let moved = Observation::declare(Sensor { y_m: -0.8, ..sensor.clone() });
     let nowhere = Observation::declare(Sensor { name: "right".into(), z_m: f64::NAN, ..sensor.clone() });
     let strange = Observation::declare(Sensor { name: "up".into(), model: Some("ouster".into()), ..sensor.clone() });
-    let refusals = told(&mut second, vec![declared(), moved, nowhere, strange, rays("left", 1_100_000_000)]).await;
+    let refusals = send_all(&mut second, vec![declared(), moved, nowhere, strange, rays("left", 1_100_000_000)]).await;
     assert_eq!(by_reason(&refusals), [("missing", 1), ("sensor", 2)].into());
     assert!(refusals[0].message.contains("each sensor its own"), "{refusals:?}");
     assert!(refusals[1].message.contains("z_m"), "{refusals:?}");
     let snapshot = running.vehicles.0[0].status.snapshot();
     let names: Vec<_> = snapshot.sensors.iter().map(|sensor| sensor.name.as_str()).collect();
     assert_eq!(names, ["top", "left"]);
-    assert_eq!((snapshot.ledger.decoded, snapshot.maps), (3, 1), "the lead's scan makes the map");
+    assert_eq!((snapshot.ledger.decoded, snapshot.maps), (3, 1), "the scan of the reference sensor makes the map");
     within("shutdown", running.shutdown()).await.unwrap();
     let report = verify(&file).unwrap();
     assert!(report.is_good() && report.maps == 1, "{report:?}");
@@ -269,11 +271,11 @@ async fn a_sensor_that_the_stream_declares_is_mapped_recorded_and_declared_again
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn what_a_blind_sector_hides_is_counted_as_far_as_the_status_and_unknown_in_the_map() {
+async fn points_in_a_blind_sector_are_counted_in_the_ledger_and_the_status() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("r.mcap");
     let mut config = scanned_config();
-    // Clockwise, so 80 to 100 degrees to the left of the vehicle.
+    // Azimuths count clockwise, so this is the sector from 80 to 100 degrees to the left of the vehicle.
     config.vehicles[0].sensors[0].blind_deg = vec![[260.0, 280.0]];
     let running = start(config, &file).await;
     assert!(reports(&running, vec![scan(1, plain(1_000_000_000))]).await.1.is_none());
@@ -287,12 +289,12 @@ async fn what_a_blind_sector_hides_is_counted_as_far_as_the_status_and_unknown_i
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn the_same_session_over_zenoh_makes_the_same_maps_and_hears_the_same_refusals() {
+async fn a_session_over_zenoh_makes_the_same_maps_and_refusals_as_over_grpc() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let running = start(scanned_config(), &at("grpc.mcap")).await;
     let mut grpc = ingester(&running).await;
-    assert_eq!(told(&mut grpc, scanned(2, false)).await, []);
+    assert_eq!(send_all(&mut grpc, scanned(2, false)).await, []);
     within("shutdown", running.shutdown()).await.unwrap();
 
     let mut config = scanned_config();
@@ -302,13 +304,13 @@ async fn the_same_session_over_zenoh_makes_the_same_maps_and_hears_the_same_refu
     let client = within("zenoh", ZenohClient::connect(endpoint)).await.unwrap();
     let unknown = within("an answer", client.ingest("truck")).await.err().unwrap().to_string();
     assert!(unknown.contains("truck") && unknown.contains("car"), "{unknown}");
-    let mut zenoh = within("a way", client.ingest("car")).await.unwrap();
-    assert_eq!(told(&mut zenoh, scanned(2, false)).await, []);
+    let mut zenoh = within("an ingester", client.ingest("car")).await.unwrap();
+    assert_eq!(send_all(&mut zenoh, scanned(2, false)).await, []);
 
     let stale = Observation::pose(5, [0.0; 3], [0.0, 0.0, 0.0, 1.0], 0.0).captured_at(1_000_000_000);
     let strange = Observation::scan("bottom", 5, &[1.0], &[1.0], &[1.0]);
     let crooked = Observation::scan("top", i64::MAX, &[1.0], &[1.0, 2.0], &[1.0]);
-    let refusals = told(&mut zenoh, vec![stale, strange, crooked]).await;
+    let refusals = send_all(&mut zenoh, vec![stale, strange, crooked]).await;
     assert_eq!(by_reason(&refusals), [("stamp", 1), ("source", 1), ("scan_lengths", 1)].into());
     assert!(refusals[1].message.contains("top"), "{refusals:?}");
     within("shutdown", running.shutdown()).await.unwrap();
@@ -318,7 +320,7 @@ async fn the_same_session_over_zenoh_makes_the_same_maps_and_hears_the_same_refu
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn the_command_sends_scans_poses_and_a_road_and_says_what_was_refused() {
+async fn clearway_ingest_sends_scans_poses_and_a_road_and_counts_refusals() {
     let folder = tempfile::tempdir().unwrap();
     let point = |x: f32, y: f32| [x, y, -1.9, 0.5].map(f32::to_le_bytes).concat();
     let plain: Vec<u8> = (0..400_u16).map(f32::from).flat_map(|i| point(3.0 + i % 20.0, i / 20.0 - 10.0)).collect();
@@ -345,12 +347,12 @@ async fn the_command_sends_scans_poses_and_a_road_and_says_what_was_refused() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_server_that_stops_has_told_what_became_of_everything() {
+async fn a_server_that_stops_has_reported_every_outcome() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("r.mcap");
     let running = start(config(), &file).await;
     let mut ingester = ingester(&running).await;
-    assert_eq!(told(&mut ingester, tunnelled(&readings(1), 50)).await, []);
+    assert_eq!(send_all(&mut ingester, tunnelled(&readings(1), 50)).await, []);
     within("shutdown", running.shutdown()).await.unwrap();
     let mut later = Vec::new();
     let error = within("the end", async {

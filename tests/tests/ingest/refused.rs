@@ -16,8 +16,8 @@ use tonic::Code;
 use super::fixture::{recorded, within};
 use super::{client, ingester, plain, reports, scan, scanned_config, start};
 
-/// Every list of `scan` with its last number replaced.
-fn spoilt(scan: v1::Scan, last: f32) -> v1::Scan {
+/// `scan` with the x of its last point replaced.
+fn with_last_x(scan: v1::Scan, last: f32) -> v1::Scan {
     let mut x = scan.x.to_vec();
     let end = x.len() - 4;
     x[end..].copy_from_slice(&last.to_le_bytes());
@@ -25,7 +25,7 @@ fn spoilt(scan: v1::Scan, last: f32) -> v1::Scan {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn whatever_is_no_observation_is_refused_by_name_and_leaves_the_maps_as_they_would_be() {
+async fn invalid_observations_are_refused_by_name_and_do_not_change_maps() {
     let folder = tempfile::tempdir().unwrap();
     let (clean, hostile) = (folder.path().join("clean.mcap"), folder.path().join("hostile.mcap"));
     let good = [1_000_000_000, 1_100_000_000].map(plain);
@@ -101,7 +101,7 @@ async fn whatever_is_no_observation_is_refused_by_name_and_leaves_the_maps_as_th
         |(number, (_, observation)): (u64, &(&str, v1::Observation))| v1::Observation { number, ..observation.clone() };
     sent.extend((2..).zip(&bad).map(numbered));
     let last = sent.len() as u64 + 1;
-    // One number twice; it does not count as an observation of its own.
+    // A number that is sent twice is not counted as another observation.
     sent.push(v1::Observation { number: 2, ..scan(0, base.clone()) });
     sent.push(scan(last, good[1].clone()));
 
@@ -128,16 +128,16 @@ async fn whatever_is_no_observation_is_refused_by_name_and_leaves_the_maps_as_th
         let maps = recorded(file).into_values().map(|bytes| v1::Map::decode(bytes).unwrap());
         maps.map(|map| map.layers).collect()
     };
-    assert!(cells(&hostile) == cells(&clean), "nothing of them is in a map");
+    assert!(cells(&hostile) == cells(&clean), "no cell comes from a refused observation");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn points_that_are_nowhere_are_counted_and_left_out() {
+async fn points_at_impossible_positions_are_counted_and_dropped() {
     let folder = tempfile::tempdir().unwrap();
     let running = start(scanned_config(), &folder.path().join("r.mcap")).await;
     let wild = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e9];
     let stamps = (1_i64..).map(|n| n * 100_000_000);
-    let sent = wild.iter().zip(stamps).zip(1..).map(|((&x, stamp), number)| scan(number, spoilt(plain(stamp), x)));
+    let sent = wild.iter().zip(stamps).zip(1..).map(|((&x, stamp), number)| scan(number, with_last_x(plain(stamp), x)));
     let (reports, _) = reports(&running, sent.collect()).await;
     assert!(reports.iter().all(|report| report.refused.is_empty()));
     let ledger = running.vehicles.0[0].status.snapshot().ledger;
@@ -183,7 +183,7 @@ async fn unknown_vehicles_surplus_streams_and_large_scans_are_refused() {
         loop {
             match client.ingest("car").await {
                 Ok(ingester) => return ingester,
-                // The stream before may not be quite gone.
+                // The stream before may not have ended yet.
                 Err(ClientError::Refused { .. }) => tokio::task::yield_now().await,
                 Err(other) => panic!("{other}"),
             }
@@ -206,11 +206,11 @@ async fn unknown_vehicles_surplus_streams_and_large_scans_are_refused() {
     assert!(status.code() == Code::OutOfRange && status.message().contains("97536"), "{status:?}");
     assert_eq!(running.vehicles.0[0].status.snapshot().ledger.refused.get("observation"), Some(&1));
     within("shutdown", running.shutdown()).await.unwrap();
-    let told = RecordingReader::open(&file).unwrap().map(|entry| match entry.unwrap() {
+    let counts = RecordingReader::open(&file).unwrap().map(|entry| match entry.unwrap() {
         RecordedMessage::Event {
             event: Event { body: Body::Lost { cause: Cause::Observation, count }, .. }, ..
         } => count,
         _ => 0,
     });
-    assert_eq!(told.sum::<u64>(), 1, "the journal knows of it, though no event came after");
+    assert_eq!(counts.sum::<u64>(), 1, "the journal has the loss, although no event followed it");
 }

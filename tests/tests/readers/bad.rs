@@ -1,4 +1,4 @@
-//! Readers that stop, lag, sit idle or reset their streams, and the healthy ones beside them that lose nothing by it.
+//! Readers that stop, lag, sit idle or reset their streams, beside healthy ones that lose no map because of them.
 
 use std::net::SocketAddr;
 use std::sync::{Arc, Weak};
@@ -15,7 +15,7 @@ use tonic::transport::Channel;
 use super::fixture::{self, config, feed, sequence, start, until, within};
 use super::{Reader, keeps_up, of_layer, plain, portions};
 
-/// A link to the server that lets through as many of its bytes as it is allowed to.
+/// A link from the server that passes only the allowed number of bytes.
 struct Link {
     address: SocketAddr,
     allowed: Arc<Semaphore>,
@@ -47,17 +47,17 @@ impl Link {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_stopped_and_a_slow_reader_cost_eight_healthy_ones_nothing_and_resume_with_the_newest_map() {
-    /// What the wire's greetings take, and 10 kB/s of a server of ten maps a second.
-    const GREETING_BYTES: usize = 1000;
-    const BYTES_A_TURN: usize = 1000;
+async fn stopped_and_slow_readers_cost_the_others_nothing_and_resume_newest() {
+    /// Bytes of the connection setup, and 10 kB/s at ten maps a second.
+    const SETUP_BYTES: usize = 1000;
+    const BYTES_PER_REVOLUTION: usize = 1000;
     let running = start(config()).await;
     let server = running.grpc.unwrap();
-    let [link, wall] = [Link::to(server).await, Link::to(server).await];
-    [&link, &wall].iter().for_each(|link| link.allowed.add_permits(GREETING_BYTES));
-    // With small windows as our own client has, and with a plain client's, which hold minutes of maps.
+    let [link, blocked] = [Link::to(server).await, Link::to(server).await];
+    [&link, &blocked].iter().for_each(|link| link.allowed.add_permits(SETUP_BYTES));
+    // Small windows as our client has them, and those of a plain client, which hold minutes of maps.
     let mut slow = Reader::open(&mut plain(link.address).await, of_layer(2)).await.unwrap();
-    let mut deaf = Reader::open(&mut plain(wall.address).await, of_layer(0)).await.unwrap();
+    let mut silent = Reader::open(&mut plain(blocked.address).await, of_layer(0)).await.unwrap();
     let deltas = v1::Selection { deltas: true, ..of_layer(2) };
     let mut stopped = Reader::open(&mut plain(server).await, deltas).await.unwrap();
     let mut small = Reader::open(&mut fixture::grpc(&running).await, of_layer(2)).await.unwrap();
@@ -74,14 +74,14 @@ async fn a_stopped_and_a_slow_reader_cost_eight_healthy_ones_nothing_and_resume_
         for expected in next..maps {
             made.push(Arc::downgrade(running.vehicles.0[0].newest.borrow().as_ref().unwrap()));
             for reader in &mut healthy {
-                assert_eq!(reader.take().await, (expected, 0, 0));
+                assert_eq!(reader.receive().await, (expected, 0, 0));
             }
-            link.allowed.add_permits(BYTES_A_TURN);
+            link.allowed.add_permits(BYTES_PER_REVOLUTION);
         }
         next = maps;
     }
     assert!(next >= 18, "{next} maps");
-    // The slot holds the newest, the stopped reader of deltas the map they are put on; nothing else keeps one.
+    // The latest-value slot keeps the newest map, and the stopped reader of deltas keeps its base; nothing else does.
     let alive = made.iter().filter(|map| map.upgrade().is_some()).count();
     assert!(alive <= 2, "{alive} of {next} maps are kept");
 
@@ -90,23 +90,23 @@ async fn a_stopped_and_a_slow_reader_cost_eight_healthy_ones_nothing_and_resume_
             [reader.next().await.unwrap(), reader.next().await.unwrap()].map(|update| sequence(&update.map));
         assert_eq!(on_the_way[0], 0);
         reader.acknowledge(on_the_way[1]).await;
-        let (sequence, skipped, _) = reader.take().await;
-        assert_eq!((sequence, skipped), (next - 1, next - 2 - on_the_way[1]), "the first new map is the newest");
+        let (sequence, skipped, _) = reader.receive().await;
+        assert_eq!((sequence, skipped), (next - 1, next - 2 - on_the_way[1]), "the first new map is the newest one");
     }
-    // The slow one had no more than its credits on the way: after those, the newest comes.
+    // The slow reader has at most its credits in flight; after those it receives the newest map.
     link.allowed.add_permits(Semaphore::MAX_PERMITS / 2);
-    let (mut before, mut seen) = (slow.take().await, 1);
+    let (mut before, mut seen) = (slow.receive().await, 1);
     while before.0 < next - 1 {
-        let update = slow.take().await;
-        assert_eq!(update.0, before.0 + 1 + update.1, "what it missed is counted");
+        let update = slow.receive().await;
+        assert_eq!(update.0, before.0 + 1 + update.1, "every missed map is counted");
         (before, seen) = (update, seen + 1);
     }
-    assert!(seen <= 3, "{seen} maps over a link of 10 kB/s, of which all but two were on the way");
+    assert!(seen <= 3, "{seen} maps over a link of 10 kB/s, of which at most two were in flight");
     // A reader that never acknowledges receives what was already sent, and every gap is reported as skipped.
-    wall.allowed.add_permits(Semaphore::MAX_PERMITS / 2);
+    blocked.allowed.add_permits(Semaphore::MAX_PERMITS / 2);
     let mut expected = 0;
     while expected < next {
-        let update = deaf.next().await.unwrap();
+        let update = silent.next().await.unwrap();
         assert_eq!(sequence(&update.map), expected + update.skipped);
         expected += update.skipped + 1;
     }
@@ -114,7 +114,7 @@ async fn a_stopped_and_a_slow_reader_cost_eight_healthy_ones_nothing_and_resume_
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_thousand_idle_connections_take_no_more_than_their_places_and_the_next_peer_is_told() {
+async fn idle_connections_are_limited_and_the_next_peer_is_told_the_limit() {
     let mut config = config();
     config.grpc.connections_max = 32;
     let running = start(config).await;
@@ -123,7 +123,7 @@ async fn a_thousand_idle_connections_take_no_more_than_their_places_and_the_next
     let mut idle = Vec::new();
     for _ in 0..1000 {
         let mut connection = TcpStream::connect(server).await.unwrap();
-        // A greeting, so that it counts as alive; some are closed before it.
+        // The HTTP/2 preface, so that the connection counts as alive; some are closed before it.
         let _ = connection.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").await;
         idle.push(connection);
     }
@@ -135,16 +135,16 @@ async fn a_thousand_idle_connections_take_no_more_than_their_places_and_the_next
             let request = v1::ListVehiclesRequest {};
             match MapServiceClient::new(channel).list_vehicles(request).await {
                 Err(status) if status.code() == Code::ResourceExhausted => return status,
-                // Closed without a word.
+                // Closed without an answer.
                 Err(_) => {}
-                Ok(_) => panic!("there is no place"),
+                Ok(_) => panic!("all connections are in use"),
             }
         }
     })
     .await;
     assert!(status.message().starts_with("32 connections are open, which grpc.connections_max allows"), "{status}");
     drop(idle);
-    within("a place", async {
+    within("a free connection", async {
         let connect = || Channel::from_shared(format!("http://{server}")).unwrap().connect_lazy();
         while MapServiceClient::new(connect()).list_vehicles(v1::ListVehiclesRequest {}).await.is_err() {}
     })
@@ -174,15 +174,15 @@ async fn a_client_that_resets_streams_in_a_loop_loses_only_its_own_connection() 
     let server = running.grpc.unwrap();
     let mut healthy = Reader::open(&mut plain(server).await, of_layer(1)).await.unwrap();
     let mut hostile = TcpStream::connect(server).await.unwrap();
-    let mut said = [&b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"[..], &frame(4, 0, 0, &[])].concat();
-    (0..20_000).for_each(|index| said.extend(open_and_reset(2 * index + 1)));
-    // The server may close before all of it is said.
-    let _ = hostile.write_all(&said).await;
-    let mut heard = Vec::new();
-    let _ = within("the end", hostile.read_to_end(&mut heard)).await;
+    let mut frames = [&b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"[..], &frame(4, 0, 0, &[])].concat();
+    (0..20_000).for_each(|index| frames.extend(open_and_reset(2 * index + 1)));
+    // The server may close the connection before it has read everything.
+    let _ = hostile.write_all(&frames).await;
+    let mut answer = Vec::new();
+    let _ = within("the end", hostile.read_to_end(&mut answer)).await;
     drop(hostile);
 
-    // A client that means no harm but gives up at once each time, over one connection.
+    // A regular client that opens and drops streams over one connection.
     let mut hasty = plain(server).await;
     for _ in 0..300 {
         drop(Reader::open(&mut hasty, of_layer(0)).await);

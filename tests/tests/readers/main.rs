@@ -24,7 +24,7 @@ use tonic::{Code, Request, Response, Status, Streaming};
 
 const LAYER: &str = "drivability";
 
-/// A reader the test plays by hand.
+/// A reader that the test controls step by step.
 struct Reader {
     requests: mpsc::Sender<v1::WatchRequest>,
     updates: Streaming<v1::MapUpdate>,
@@ -32,10 +32,10 @@ struct Reader {
 
 impl Reader {
     async fn open(client: &mut MapServiceClient<Channel>, selection: v1::Selection) -> Result<Self, Status> {
-        let (requests, mut heard) = mpsc::channel(16);
-        requests.send(v1::WatchRequest { selection: Some(selection), ..Default::default() }).await.expect("room");
-        let heard = futures::stream::poll_fn(move |context| heard.poll_recv(context));
-        let updates = within("watch", client.watch(heard)).await?.into_inner();
+        let (requests, mut receiver) = mpsc::channel(16);
+        requests.send(v1::WatchRequest { selection: Some(selection), ..Default::default() }).await.expect("capacity");
+        let requested = futures::stream::poll_fn(move |context| receiver.poll_recv(context));
+        let updates = within("watch", client.watch(requested)).await?.into_inner();
         Ok(Self { requests, updates })
     }
 
@@ -48,8 +48,8 @@ impl Reader {
         within("a map", self.updates.message()).await.map(|update| update.expect("no end"))
     }
 
-    /// The next map, acknowledged: its sequence, how many were missed before it, how many left out.
-    async fn take(&mut self) -> (u64, u64, u64) {
+    /// Receives and acknowledges the next map: its sequence, the skipped maps before it, and those left out.
+    async fn receive(&mut self) -> (u64, u64, u64) {
         let update = self.next().await.expect("a map");
         let sequence = sequence(&update.map);
         self.acknowledge(sequence).await;
@@ -61,24 +61,24 @@ fn of_layer(max_in_flight: u32) -> v1::Selection {
     v1::Selection { layers: vec![LAYER.into()], max_in_flight, ..Default::default() }
 }
 
-/// As any tonic client connects, with the windows it has by default.
+/// A tonic client with its default windows.
 async fn plain(address: SocketAddr) -> MapServiceClient<Channel> {
     let channel = Channel::from_shared(format!("http://{address}")).unwrap().connect().await;
     MapServiceClient::new(channel.expect("gRPC answers"))
 }
 
-/// Less than a turn each (some 350 datagrams): a reader that keeps up misses no map of it.
+/// Portions of less than a revolution (about 350 datagrams), so that a reader that keeps up misses no map.
 fn portions(tenths: i64) -> Vec<Vec<Reading>> {
     readings(tenths).chunks(300).map(<[_]>::to_vec).collect()
 }
 
-/// The reader gets every map of three tenths of a second, the first of this server.
+/// Asserts that the reader receives every map of the first 0.3 s of this server.
 async fn keeps_up(reader: &mut Reader, running: &Running) {
     let mut next = 0;
     for portion in portions(3) {
         let maps = feed(running, portion).await;
         for expected in next..maps {
-            assert_eq!(reader.take().await, (expected, 0, 0));
+            assert_eq!(reader.receive().await, (expected, 0, 0));
         }
         next = maps;
     }
@@ -90,7 +90,7 @@ async fn an_impossible_request_is_refused_and_disturbs_no_other_reader() {
     let mut client = plain(running.grpc.unwrap()).await;
     let mut healthy = Reader::open(&mut client, of_layer(1)).await.unwrap();
     feed(&running, readings(2)).await;
-    let first = healthy.take().await.0;
+    let first = healthy.receive().await.0;
 
     let far = v1::Region { x_from_m: 500.0, x_to_m: 600.0, y_from_m: -5.0, y_to_m: 5.0 };
     let wrong = [
@@ -107,10 +107,10 @@ async fn an_impossible_request_is_refused_and_disturbs_no_other_reader() {
         assert!(status.message().contains(named), "{named}: {status}");
     }
 
-    let mut liar = Reader::open(&mut client, of_layer(2)).await.unwrap();
-    let newest = liar.take().await.0;
-    liar.acknowledge(4711).await;
-    let status = liar.next().await.unwrap_err();
+    let mut untrue = Reader::open(&mut client, of_layer(2)).await.unwrap();
+    let newest = untrue.receive().await.0;
+    untrue.acknowledge(4711).await;
+    let status = untrue.next().await.unwrap_err();
     assert_eq!(status.code(), Code::InvalidArgument, "{status}");
     let last = format!("acknowledged 4711: this map was never sent on this stream; the last one sent is {newest}");
     assert!(status.message().starts_with(&last), "{status}");
@@ -122,12 +122,12 @@ async fn an_impossible_request_is_refused_and_disturbs_no_other_reader() {
 
     let maps = feed(&running, readings(2)).await;
     assert!(maps > first + 1);
-    assert!(healthy.take().await.0 > first, "the healthy reader goes on");
+    assert!(healthy.receive().await.0 > first, "the healthy reader continues");
     within("shutdown", running.shutdown()).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_rate_picks_maps_by_their_stamps_and_what_it_left_out_is_told_from_what_was_lost() {
+async fn a_rate_selects_maps_by_stamp_and_counts_left_out_and_skipped_maps() {
     let running = start(config()).await;
     let mut client = plain(running.grpc.unwrap()).await;
     let halved = v1::Selection { max_rate_hz: Some(5.0), ..of_layer(1) };
@@ -138,12 +138,12 @@ async fn a_rate_picks_maps_by_their_stamps_and_what_it_left_out_is_told_from_wha
     for portion in portions(14) {
         let maps = feed(&running, portion).await;
         while next < maps {
-            assert_eq!(all.take().await, (next, 0, 0));
+            assert_eq!(all.receive().await, (next, 0, 0));
             if next == 0 {
                 first = Some(sequence(&slow.next().await.unwrap().map));
             }
             if next % 2 == 0 {
-                picked.push(reader.take().await);
+                picked.push(reader.receive().await);
             }
             next += 1;
         }
@@ -152,16 +152,16 @@ async fn a_rate_picks_maps_by_their_stamps_and_what_it_left_out_is_told_from_wha
     let expected = (0..).step_by(2).map(|sequence| (sequence, 0, u64::from(sequence > 0)));
     assert!(picked.iter().copied().eq(expected.take(picked.len())), "{picked:?}");
 
-    // One that did not acknowledge for all this time is told what it missed, and what it would not have got anyway.
+    // The reader without acknowledgements receives both counts: skipped maps, and maps that its rate leaves out.
     slow.acknowledge(first.unwrap()).await;
-    let (sequence, skipped, left_out) = slow.take().await;
+    let (sequence, skipped, left_out) = slow.receive().await;
     assert_eq!((sequence, skipped + left_out), (next - 1, next - 2));
     assert!(skipped.abs_diff(picked.len() as u64 - 2) <= 1, "{skipped} missed, {left_out} left out");
     within("shutdown", running.shutdown()).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_late_joiner_gets_the_current_map_and_only_the_late_joiner() {
+async fn the_current_map_is_sent_again_to_a_late_joiner_only() {
     let running = start(config()).await;
     let mut client = plain(running.grpc.unwrap()).await;
     let mut early = Reader::open(&mut client, of_layer(1)).await.unwrap();
@@ -169,7 +169,7 @@ async fn a_late_joiner_gets_the_current_map_and_only_the_late_joiner() {
     for portion in portions(4) {
         let maps = feed(&running, portion).await;
         for expected in next..maps {
-            assert_eq!(early.take().await, (expected, 0, 0));
+            assert_eq!(early.receive().await, (expected, 0, 0));
             let joiners = [of_layer(1), v1::Selection { deltas: true, max_rate_hz: Some(1.0), ..Default::default() }];
             for selection in joiners {
                 let update = Reader::open(&mut client, selection).await.unwrap().next().await.unwrap();
@@ -183,7 +183,7 @@ async fn a_late_joiner_gets_the_current_map_and_only_the_late_joiner() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn deltas_lead_to_the_cells_of_whole_maps_and_a_reader_that_lost_one_gets_a_whole_map_at_once() {
+async fn deltas_decode_to_whole_maps_and_a_lost_one_is_followed_by_a_keyframe() {
     let running = start(config()).await;
     let mut client = plain(running.grpc.unwrap()).await;
     let every = || v1::Selection { max_in_flight: 1, ..Default::default() };
@@ -219,11 +219,11 @@ async fn deltas_lead_to_the_cells_of_whole_maps_and_a_reader_that_lost_one_gets_
                 near_bytes += part.map.len();
             }
             if expected == 3 {
-                // This one is lost on its way, says the reader, which has acknowledged nothing yet.
+                // The reader reports this map as lost; it has not acknowledged it.
                 let lost = v1::WatchRequest { acknowledged: Some(expected), request_keyframe: true, selection: None };
                 reader.requests.send(lost).await.unwrap();
                 let again = reader.next().await.unwrap();
-                assert_eq!((again.map, again.skipped, again.left_out), (update.map, 0, 0), "whole, and at once");
+                assert_eq!((again.map, again.skipped, again.left_out), (update.map, 0, 0), "a whole map, at once");
             }
             reader.acknowledge(expected).await;
             (base, near_base) = (Some(truth), Some(part_map));
@@ -239,7 +239,7 @@ async fn deltas_lead_to_the_cells_of_whole_maps_and_a_reader_that_lost_one_gets_
     within("shutdown", running.shutdown()).await.unwrap();
 }
 
-/// A server between reader and server that loses one update.
+/// A server between the reader and the real server that loses one update.
 struct Lossy {
     to: SocketAddr,
     lost: u64,
@@ -274,7 +274,7 @@ impl MapService for Lossy {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn our_client_shows_the_cells_of_whole_maps_also_when_an_update_is_lost_between() {
+async fn the_client_has_the_cells_of_whole_maps_after_a_lost_delta() {
     let running = start(config()).await;
     let server = running.grpc.unwrap();
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -298,7 +298,7 @@ async fn our_client_shows_the_cells_of_whole_maps_also_when_an_update_is_lost_be
             }
             let seen = within("a map", maps.next()).await.unwrap();
             assert_eq!(seen.map.sequence(), expected, "after the loss a whole map comes at once");
-            assert_eq!(seen.skipped, u64::from(expected == 3), "and it is told");
+            assert_eq!(seen.skipped, u64::from(expected == 3), "the lost map is counted as skipped");
             assert_eq!(seen.map.layers(), decode_map(update.map, &Limits::default()).unwrap().layers);
             shown.push(expected);
         }
