@@ -245,10 +245,13 @@ fn exported(format: &str, more: &[&str]) -> (Value, Vec<usize>) {
     (serde_json::from_str(&venv::run(venv::script("viewer_file.py").arg(&out), "mcap")).unwrap(), revolutions)
 }
 
-/// The topics of an exported file, each with its schema and its number of messages.
+/// The topics of an exported file in alphabetical order, each with its schema and its number of messages.
 fn schemas(file: &Value) -> Vec<(&str, &str, u64)> {
     let topics = file.as_object().unwrap().iter();
-    topics.map(|(topic, of)| (&**topic, of["schema"].as_str().unwrap(), of["count"].as_u64().unwrap())).collect()
+    let topics = topics.map(|(topic, of)| (&**topic, of["schema"].as_str().unwrap(), of["count"].as_u64().unwrap()));
+    let mut topics: Vec<_> = topics.collect();
+    topics.sort_unstable();
+    topics
 }
 
 #[test]
