@@ -34,8 +34,11 @@ pub fn bless(corpus: &str, seeds: impl IntoIterator<Item = (&'static str, Vec<u8
     }
 }
 
+/// JSON with its keys in alphabetical order.
 pub fn pretty(value: &Value) -> Vec<u8> {
-    let mut text = serde_json::to_string_pretty(value).unwrap();
+    let mut value = value.clone();
+    value.sort_all_objects();
+    let mut text = serde_json::to_string_pretty(&value).unwrap();
     text.push('\n');
     text.into_bytes()
 }
