@@ -3,8 +3,8 @@
 use std::io::{self, Write};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use clearway::record::verify::{VerifyError, verify};
 use clearway::record::mcap_file::Disk;
+use clearway::record::verify::{VerifyError, verify};
 use clearway::record::writer::RecorderCounts;
 
 use super::checks::{Violation, violation};
