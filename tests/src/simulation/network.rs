@@ -135,7 +135,7 @@ impl TestBed<'_> {
     /// Sends as many observations as the gateway has room for, and receives their outcomes.
     pub fn observe(&mut self) {
         while let Ok((id, outcome)) = self.outcomes.try_recv() {
-            if self.injected != Some(InjectedFault::LostOutcome) || mark.number != 100 {
+            if self.injected != Some(InjectedFault::LostOutcome) || id.number != 100 {
                 self.session.record_outcome(id.number, outcome);
             }
         }
