@@ -194,7 +194,7 @@ impl Planner {
             }
         }
         let back = std::iter::successors(Some(nearest), |cell| (*cell != start).then(|| best[cell].1));
-        let mut path: Vec<Point> = back.map(middle).collect();
+        let mut path: Vec<Point> = back.map(centre).collect();
         path.reverse();
         path
     }
