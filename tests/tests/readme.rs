@@ -75,9 +75,12 @@ fn the_offline_commands_of_the_readme_succeed_on_a_capture() {
     fs::copy(&capture, folder.path().join("drive.pcap")).expect("the HDL-32E capture");
     let offline: Vec<_> = commands()
         .into_iter()
-        .filter(|c| ["replay", "verify", "export", "info"].iter().any(|verb| c.split(' ').nth(1) == Some(verb)))
+        .filter(|c| {
+            let verbs = ["replay", "verify", "export", "info", "simulate"];
+            verbs.iter().any(|verb| c.split(' ').nth(1) == Some(verb))
+        })
         .collect();
-    assert_eq!(offline.len(), 6, "{offline:?}");
+    assert_eq!(offline.len(), 9, "{offline:?}");
     for command in &offline {
         succeeds(folder.path(), command);
     }
