@@ -1,7 +1,7 @@
-//! A closed loop: the simulated vehicle scans the town, its datagrams and ego poses go through real sockets into the
-//! real server, the map comes back over gRPC and over zenoh, the example planner plans on each, and the vehicle makes
-//! the move they agree on. One turn, one map, one move: the loop waits for each and never for the clock, so that every
-//! run drives the same way.
+//! A closed loop: the simulated vehicle scans the town and sends datagrams and ego poses through real sockets to a
+//! server. The maps come back over gRPC and over zenoh, the example planner plans on them, and the vehicle makes the
+//! planned move. Each revolution makes one map and one move. The loop waits for each map and never for the clock, so
+//! that every run drives the same way.
 
 #[allow(dead_code, reason = "the example shows pictures")]
 #[path = "../../client/examples/planner/astar.rs"]
@@ -23,33 +23,33 @@ use clearway_sim::scenes::{Scene, town};
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
 use fixture::{config, until, within};
 
-/// A saloon; the simulated cars have the same.
+/// Length, width and height of the vehicle, in metres: those of the simulated cars.
 const SIZE_M: [f64; 3] = [4.4, 1.8, 1.5];
-/// The goal lies so far along the route.
+/// Distance of the goal along the route, in metres.
 const GOAL_M: f64 = 10.0;
-/// Datagrams on their way: as many as the smallest kernel buffer holds.
+/// Most datagrams in flight: as many as the smallest kernel buffer holds.
 const UNDER_WAY: u64 = 60;
-/// From one ego pose to the next, and from one look at the truth to the next.
+/// Period of the ego poses and of the checks against the world, in ns.
 const POSE_PERIOD_NS: i64 = 20_000_000;
 
-/// The vehicle, its way to the server, and its eyes.
+/// The vehicle, its connections to the server, and the maps that it receives.
 struct Loop {
     vehicle: SimulatedVehicle,
     socket: UdpSocket,
     running: Running,
     ingester: Ingester,
-    /// Over gRPC, over zenoh.
+    /// The maps over gRPC, and those over zenoh.
     maps: [MapStream; 2],
     sent: u64,
 }
 
-/// What came of a drive.
+/// Result of a drive.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Driven {
-    turns: u32,
+    revolutions: u32,
     length_m: f64,
     seconds: f64,
-    /// From the hull to the nearest thing, the least of the whole drive, in steps of 0.1 m.
+    /// Least distance from the hull to a thing in the whole drive, in steps of 0.1 m.
     nearest_m: f64,
 }
 
@@ -57,7 +57,7 @@ async fn server() -> Running {
     let mut config = config();
     config.zenoh.enabled = true;
     let vehicle = &mut config.vehicles[0];
-    // The drive is older than its arrival, and nothing of the vehicle itself is in its world.
+    // The stamps are older than the arrivals, and the simulated world does not contain the vehicle itself.
     vehicle.sensors[0].gps_late_days_max = 36_525.0;
     vehicle.sensors[0].range_m_min = 0.5;
     vehicle.body = None;
@@ -75,52 +75,55 @@ impl Loop {
         Self { vehicle, socket, running, ingester, maps, sent: 0 }
     }
 
-    /// Drives so until the sensor's head has turned past the vehicle's back, where the server cuts turns; then waits
-    /// for the map of that turn. Gives when that was, and the map.
-    async fn turn(&mut self, next: Move) -> (Range<i64>, [MapView; 2]) {
+    /// Drives until the sensor's head has passed the vehicle's back, where the server ends a revolution, then waits for
+    /// the map of that revolution. Returns the range of its stamps, and the map over gRPC and over zenoh.
+    async fn revolution(&mut self, next: Move) -> (Range<i64>, [MapView; 2]) {
         let begin_ns = self.vehicle.steer(next.curvature_per_m, next.mps);
         let datagrams = cast(&mut self.vehicle);
-        let end_ns = datagrams.last().expect("a turn").stamp_ns;
+        let end_ns = datagrams.last().expect("a revolution").stamp_ns;
         for stamp_ns in (begin_ns..end_ns).step_by(POSE_PERIOD_NS as usize).skip(1).chain([end_ns]) {
             let pose = pose(&self.vehicle, stamp_ns, next.mps);
-            within("room", self.ingester.send(pose)).await.unwrap();
+            within("capacity", self.ingester.send(pose)).await.unwrap();
         }
-        assert_eq!(within("verdicts", self.ingester.settled()).await.unwrap(), []);
+        assert_eq!(within("outcomes", self.ingester.settled()).await.unwrap(), []);
         let (data, telemetry) = self.running.inputs[0].udp.unwrap();
         let status = self.running.vehicles.0[0].status.clone();
         for datagram in datagrams {
             let to = if datagram.kind == Kind::Data { data } else { telemetry };
             self.socket.send_to(&datagram.payload, to).unwrap();
             self.sent += 1;
-            until("room", || status.snapshot().ledger.received + UNDER_WAY > self.sent).await;
+            until("capacity", || status.snapshot().ledger.received + UNDER_WAY > self.sent).await;
         }
         let [grpc, zenoh] = &mut self.maps;
         (begin_ns..end_ns, [map_since(grpc, begin_ns).await, map_since(zenoh, begin_ns).await])
     }
 
-    /// Follows the route for `length_m`; panics where anything is touched, or where it stands still for too long.
+    /// Follows the route for `length_m`. Panics if the vehicle touches a thing, or if it does not progress.
     async fn drive(mut self, length_m: f64) -> Driven {
         let route = town().drive;
         let mut planner = Planner::default();
         let mut next = Move { curvature_per_m: 0.0, mps: 0.0, path_m: 0.0 };
-        let mut driven = Driven { turns: 0, length_m: 0.0, seconds: 0.0, nearest_m: 1.0 };
-        // The first turn is not whole.
+        let mut driven = Driven { revolutions: 0, length_m: 0.0, seconds: 0.0, nearest_m: 1.0 };
+        // The first revolution is not whole.
         cast(&mut self.vehicle);
         while driven.length_m < length_m {
-            let (stamps, [over_grpc, over_zenoh]) = self.turn(next).await;
+            let (stamps, [over_grpc, over_zenoh]) = self.revolution(next).await;
             assert_eq!(over_grpc.bytes(), over_zenoh.bytes(), "{driven:?}");
-            self.look(stamps.clone(), &mut driven);
-            driven.turns += 1;
+            self.check_contact(stamps.clone(), &mut driven);
+            driven.revolutions += 1;
             driven.seconds = self.seconds(stamps.end);
             driven.length_m = along(&route, driven.length_m, self.vehicle.scene().drive.at(driven.seconds));
-            // The same bytes: each carrier brings every other map.
-            planner.update(if driven.turns.is_multiple_of(2) { &over_grpc } else { &over_zenoh }).unwrap();
+            // The bytes are equal, so the planner uses the maps of both carriers alternately.
+            planner.update(if driven.revolutions.is_multiple_of(2) { &over_grpc } else { &over_zenoh }).unwrap();
             let (x, y, _) = route.course.at(route.start + driven.length_m + GOAL_M, route.left);
             next = planner.next_move([x, y]);
-            if driven.turns.is_multiple_of(100) {
+            if driven.revolutions.is_multiple_of(100) {
                 println!("{driven:?}: {next:?}");
             }
-            assert!(driven.seconds < 30.0 + driven.length_m / 2.0, "it does not get on: {driven:?}, {next:?}");
+            assert!(
+                driven.seconds < 30.0 + driven.length_m / 2.0,
+                "the vehicle does not progress: {driven:?}, {next:?}"
+            );
         }
         let ledger = self.running.vehicles.0[0].status.snapshot().ledger;
         assert_eq!((ledger.lost, ledger.kernel_drops, ledger.refused.len()), (0, 0, 0));
@@ -128,8 +131,8 @@ impl Loop {
         driven
     }
 
-    /// Looks where the vehicle was, by the world's own geometry.
-    fn look(&self, stamps: Range<i64>, driven: &mut Driven) {
+    /// Checks the places of the vehicle against the geometry of the world.
+    fn check_contact(&self, stamps: Range<i64>, driven: &mut Driven) {
         let scene = self.vehicle.scene();
         for stamp_ns in stamps.step_by(POSE_PERIOD_NS as usize) {
             let time = self.seconds(stamp_ns);
@@ -143,13 +146,13 @@ impl Loop {
         }
     }
 
-    /// Of the scene.
+    /// Time in the scene, in seconds.
     fn seconds(&self, stamp_ns: i64) -> f64 {
         (stamp_ns - self.vehicle.start_ns()) as f64 * 1e-9
     }
 }
 
-/// The length of the route up to where it is nearest to a place, at most 4 m more than before.
+/// Length of the route up to its point nearest to a place: at most 4 m more than `before_m`.
 fn along(route: &Drive, before_m: f64, (x, y, _): (f64, f64, f64)) -> f64 {
     let off = |length_m: &f64| {
         let (route_x, route_y, _) = route.course.at(route.start + length_m, route.left);
@@ -159,12 +162,12 @@ fn along(route: &Drive, before_m: f64, (x, y, _): (f64, f64, f64)) -> f64 {
     lengths.min_by(|a, b| off(a).total_cmp(&off(b))).expect("lengths")
 }
 
-/// What the sensor sends until its head has turned past the vehicle's back.
+/// The datagrams until the sensor's head has passed the vehicle's back.
 fn cast(vehicle: &mut SimulatedVehicle) -> Vec<Datagram> {
     let (mut datagrams, mut before) = (Vec::new(), u16::MAX);
     loop {
         let datagram = vehicle.next().expect("datagrams do not end");
-        // Of the last block; 1 degree later the server has seen it too.
+        // The azimuth of the last block; 181 degrees, so that the server has seen the end of the revolution too.
         let azimuth = match datagram.kind {
             Kind::Data => u16::from_le_bytes([datagram.payload[1102], datagram.payload[1103]]),
             Kind::Telemetry => before,
@@ -183,7 +186,7 @@ fn pose(vehicle: &SimulatedVehicle, stamp_ns: i64, speed_mps: f64) -> Observatio
     Observation::pose(stamp_ns, at.into(), [turned.x, turned.y, turned.z, turned.w], speed_mps)
 }
 
-/// The next map of a turn that ended after `begin_ns`: those of before may be told again for a late reader.
+/// The next map of a revolution that ended after `begin_ns`. Earlier maps may be sent again to a late reader.
 async fn map_since(maps: &mut MapStream, begin_ns: i64) -> MapView {
     loop {
         let map = within("a map", maps.next()).await.unwrap().map;
@@ -194,7 +197,7 @@ async fn map_since(maps: &mut MapStream, begin_ns: i64) -> MapView {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn planners_over_grpc_and_zenoh_drive_round_the_town_alike_and_touch_nothing() {
+async fn a_planner_on_maps_of_grpc_and_zenoh_drives_a_lap_without_contact() {
     let running = server().await;
     let client = Client::connect(&running.grpc.unwrap().to_string()).await.unwrap();
     let ingester = within("a stream", client.ingest("car")).await.unwrap();

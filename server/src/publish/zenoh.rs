@@ -146,7 +146,7 @@ impl Publisher {
     }
 }
 
-/// Takes a layer while the listener says that somebody subscribes to it.
+/// Keeps a layer active while its key has a subscriber.
 async fn subscribe_while(
     served: Served,
     layer: &'static str,

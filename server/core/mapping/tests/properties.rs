@@ -116,7 +116,8 @@ proptest! {
 
         let (rows, columns) = size(&layer);
         // Not by cell_at: rounding decides to which cell a point on a border belongs.
-        let held = classes(&layer).iter().filter(|c| [TerrainClass::Flat.value(), TerrainClass::Obstacle.value()].contains(c)).count();
+        let judged = [TerrainClass::Flat.value(), TerrainClass::Obstacle.value()];
+        let held = classes(&layer).iter().filter(|class| judged.contains(class)).count();
         prop_assert!(held <= points.len());
         for channel in &layer.channels {
             let written = values(&layer, channel.name);
