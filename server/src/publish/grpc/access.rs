@@ -143,7 +143,7 @@ fn check_admission<B>(request: &Request<B>) -> Result<(), Status> {
     let encrypted = request.extensions().get::<TlsConnectInfo<Admission>>().map(|tls| *tls.get_ref());
     match encrypted.or_else(|| request.extensions().get().copied()) {
         Some(Admission::OverLimit(connections_max)) => Err(Status::resource_exhausted(format!(
-            "{connections_max} connections are open, the limit of grpc.connections_max; try again when one is closed"
+            "{connections_max} connections are open, which grpc.connections_max allows; try again when one is closed"
         ))),
         Some(Admission::Served) | None => Ok(()),
     }

@@ -43,7 +43,7 @@ pub struct Roads {
 }
 
 impl Roads {
-    /// Replaces the newest road of the same purpose by a road that [`check`] has accepted.
+    /// Replaces the newest road of the same purpose by a road that `road::check` has accepted.
     pub fn insert(&mut self, road: &Road, map_from_ego: Option<Isometry3<f64>>) {
         let stored = Some(StoredRoad { road: road.clone(), map_from_ego });
         match road.purpose {
