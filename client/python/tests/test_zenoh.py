@@ -185,5 +185,5 @@ def test_certificates_for_an_unencrypted_endpoint_are_refused(tmp_path):
     for address in ("127.0.0.1:9", "zenoh:tls/127.0.0.1:7447"):
         with pytest.raises(clearway.ClearwayError, match="absent.pem"):
             clearway.vehicles(address, tls=clearway.Tls(tmp_path / "absent.pem"))
-    with pytest.raises(clearway.ClearwayError, match="of no use without the other"):
+    with pytest.raises(clearway.ClearwayError, match="both or none are needed"):
         clearway.Tls(tmp_path / "ca.pem", cert=tmp_path / "reader.pem")
