@@ -41,7 +41,7 @@ pub mod view;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
 
-pub use clearway_proto::map::{Channel, Layer};
+pub use clearway_proto::map::{Channel, Layer, SafePoint};
 pub use clearway_proto::{codec, grid, v1};
 
 pub use error::ClientError;

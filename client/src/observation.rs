@@ -78,7 +78,8 @@ impl Observation {
     pub fn road(stamp_ns: i64, purpose: RoadPurpose, frame: RoadFrame, points: &[[f64; 3]]) -> Self {
         let of = |index: usize| points.iter().map(|point| point[index]).collect();
         let (purpose, frame) = (purpose.into(), frame.into());
-        let road = v1::Road { stamp_ns, purpose, frame, x: of(0), y: of(1), width: of(2), orientations: Vec::new() };
+        let (x, y, width) = (of(0), of(1), of(2));
+        let road = v1::Road { stamp_ns, purpose, frame, x, y, width, ..v1::Road::default() };
         Self::new("", v1::observation::Body::Road(road))
     }
 

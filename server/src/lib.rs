@@ -17,14 +17,16 @@
 //! | [`server`] | starts and stops all of these |
 //! | [`cli`] | the subcommands of `clearway` |
 //!
-//! At the ground, used by all: [`clock`], `sync`, [`directory`], `zenoh_session`.
+//! At the ground, used by all: [`clock`], `sync`, `counted`, [`directory`], `file_advice`, `zenoh_session`.
 
 pub mod cli;
 pub mod clock;
 pub mod config;
+mod counted;
 pub mod directory;
 pub mod encode;
 pub mod engine;
+mod file_advice;
 pub mod ingest;
 pub mod newest;
 pub mod publish;

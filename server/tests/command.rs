@@ -50,6 +50,23 @@ fn check_prints_the_default_configuration_in_a_form_that_check_accepts() {
 }
 
 #[test]
+fn the_default_configuration_is_printed_with_its_comments_and_is_valid() {
+    let printed = clearway(&["check", "--default"]);
+    assert!(printed.status.success(), "{}", text(&printed.stderr));
+    let shown = text(&printed.stdout);
+    for optional in
+        ["# [grpc.tls]", "[vehicle.udp]", "# [vehicle.ros]", "# [vehicle.body]", "[recorder]", "# Maps over"]
+    {
+        assert!(shown.contains(optional), "{optional}");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("clearway.toml"), &printed.stdout).unwrap();
+    let checked = clearway_in(folder.path(), &["check"]);
+    assert!(checked.status.success(), "{}", text(&checked.stderr));
+    assert_eq!(clearway(&["check", "--default", "--set", "grpc.enabled=false"]).status.code(), Some(2));
+}
+
+#[test]
 fn an_unknown_key_is_refused_with_its_file_and_line() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("clearway.toml");
@@ -67,7 +84,7 @@ fn serve_without_a_configuration_file_names_the_example() {
     let error = text(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{error}");
     assert!(
-        error.contains("deploy/clearway.toml") && error.contains("configuration clearway.toml: No such"),
+        error.contains("clearway check --default") && error.contains("configuration clearway.toml: No such file"),
         "{error}"
     );
 }
@@ -77,6 +94,122 @@ fn wrong_usage_prints_the_usage_and_exits_with_2() {
     let output = clearway(&["replay"]);
     assert_eq!(output.status.code(), Some(2));
     assert!(text(&output.stderr).contains("Usage: clearway replay"));
+}
+
+#[test]
+fn a_negative_number_is_a_wrong_value_and_not_an_unknown_option() {
+    for (arguments, allowed) in [
+        (&["replay", "a.pcap", "--speed", "-1"][..], "a factor above 0 is allowed"),
+        (&["simulate", "flat", "--out", "a.pcap", "--seconds", "-1"], "0.1 to 3600 seconds are allowed"),
+        (&["demo", "--seconds", "-1"], "0 or more seconds are allowed"),
+        (&["ingest", "a.bin", "--hz", "-1"], "0.1 to 100 is allowed"),
+        (&["get", "--range", "-1"], "0.1 to 10000 m is allowed"),
+    ] {
+        let output = clearway(arguments);
+        let error = text(&output.stderr);
+        assert!(output.status.code() == Some(2) && error.contains(allowed), "{arguments:?}: {error}");
+    }
+    let extrinsics = clearway(&["replay", "absent.pcap", "--extrinsics", "-1,0,1.9,0,-2,0"]);
+    assert_eq!(extrinsics.status.code(), Some(1), "{}", text(&extrinsics.stderr));
+}
+
+#[test]
+fn a_sensor_model_is_listed_in_the_help_and_read_in_each_way_to_write_it() {
+    let names = ["hdl64e_s1", "hdl64e_s2", "hdl64e_s3", "hdl32e", "vlp16", "puck_hi_res", "vlp32c", "vls128"];
+    for command in ["replay", "simulate"] {
+        let help = text(&clearway(&[command, "--help"]).stdout);
+        assert!(names.iter().all(|name| help.contains(name)), "{help}");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let simulated = |sensor: &str| {
+        let file = folder.path().join(format!("{sensor}.pcap"));
+        let arguments = ["simulate", "flat", "--seconds", "0.1", "--out", file.to_str().unwrap(), "--sensor", sensor];
+        text(&clearway(&arguments).stdout)
+    };
+    assert!(simulated("hdl64e").contains("with the sensor hdl64e_s2"));
+    assert!(simulated("VLP-16").contains("with the sensor vlp16"));
+    let refused = clearway(&["replay", "a.pcap", "--model", "hdl64e"]);
+    let error = text(&refused.stderr);
+    assert!(refused.status.code() == Some(2) && error.contains("hdl64e_s1, hdl64e_s2, hdl64e_s3"), "{error}");
+}
+
+#[test]
+fn a_file_that_cannot_be_used_is_named_with_what_to_do() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).display().to_string();
+    for name in ["empty.pcap", "empty.mcap", "empty.bag"] {
+        std::fs::write(at(name), "").unwrap();
+    }
+    let (no_file, is_folder, is_empty) = (": No such file", ": this is a folder; name a file", "empty");
+    let poses = at("absent.tum");
+    let (absent, here) = (at("absent.pcap"), folder.path().display().to_string());
+    let (capture, recording, unknown) = (at("empty.pcap"), at("empty.mcap"), at("empty.bag"));
+    let (to, png) = ("udp://127.0.0.1:9", at("out"));
+    let scan = at("scan.bin");
+    std::fs::write(&scan, [0; 16]).unwrap();
+    let clouds = ["replay", &scan, "--extrinsics", "0,0,1.9,0,0,0", "--clouds", &capture];
+    let wrong_files: [(&[&str], &str, &str); 20] = [
+        (&clouds, &capture, "this is a file; name a folder"),
+        (&["info", &absent], &absent, no_file),
+        (&["info", &here], &here, is_folder),
+        (&["info", &capture], &capture, is_empty),
+        (&["replay", &absent], &absent, no_file),
+        (&["replay", &capture], &capture, is_empty),
+        (&["replay", &recording], &recording, is_empty),
+        (&["replay", &unknown], &unknown, is_empty),
+        (&["verify", &absent], &absent, no_file),
+        (&["verify", &here], &here, is_folder),
+        (&["verify", &recording], &recording, is_empty),
+        (&["export", &here, "--format", "png", "--out", &png], &here, is_folder),
+        (&["export", &recording, "--format", "png", "--out", &png], &recording, is_empty),
+        (&["send", &absent, "--to", to], &absent, no_file),
+        (&["send", &here, "--to", to], &here, is_folder),
+        (&["ingest", &here], &here, "name its files, such as"),
+        (&["ingest", &poses], &poses, no_file),
+        (&["check", "--config", &absent], &absent, ": No such file; `clearway check --default > clearway.toml`"),
+        (&["check", "--config", &here], &here, is_folder),
+        (&["simulate", "flat", "--out", &capture], &capture, "exists and is not overwritten; delete it"),
+    ];
+    for (arguments, file, advice) in wrong_files {
+        let output = clearway(arguments);
+        let error = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{arguments:?}: {error}");
+        assert!(error.contains(file) && error.contains(advice), "{arguments:?}: {error}");
+        assert!(!error.contains("os error"), "{arguments:?}: {error}");
+    }
+}
+
+#[test]
+fn options_that_would_have_no_effect_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("drive.pcap");
+    simulated(&file, "1");
+    let path = file.to_str().unwrap();
+    let to = "udp://127.0.0.1:9";
+    let refused: [(&[&str], i32, &str); 7] = [
+        (&["replay", path, "--vehicle", "car"], 1, "--vehicle car: the files name no vehicle"),
+        (&["replay", path, "--topic", "/points"], 1, "--topic /points: the files have no topics"),
+        (&["replay", path, "--record", path], 1, "this file is replayed; name another file"),
+        (&["simulate", "flat", "--out", "x.pcap", "--telemetry-to", to], 2, "--telemetry-to"),
+        (&["send", path, "--to", to, "--seed", "7"], 2, "--seed needs a fault of the network"),
+        (&["watch", "--zenoh", "tcp/localhost:1", "--ca", "ca.pem"], 2, "--ca"),
+        (&["check", "--default", "--config", "a.toml"], 2, "--config"),
+    ];
+    for (arguments, code, message) in refused {
+        let output = clearway(arguments);
+        let error = text(&output.stderr);
+        assert!(output.status.code() == Some(code) && error.contains(message), "{arguments:?}: {error}");
+    }
+    // The capture was not overwritten by its own recording.
+    assert_eq!(&std::fs::read(&file).unwrap()[..4], [0x4d, 0x3c, 0xb2, 0xa1]);
+
+    let recording = folder.path().join("drive.mcap");
+    let recording = recording.to_str().unwrap();
+    let extrinsics = ["--extrinsics", "0,0,1.9,0,0,0"];
+    assert!(clearway(&[&["replay", path, "--record", recording], &extrinsics[..]].concat()).status.success());
+    let output = clearway(&["replay", recording, "--topic", "/points"]);
+    let error = text(&output.stderr);
+    assert!(error.contains("is a recording of clearway, of which the events are replayed"), "{error}");
 }
 
 #[test]

@@ -58,7 +58,7 @@ fn every_file_of_the_corpora_is_handled_without_a_panic() {
 fn a_record_that_reaches_beyond_its_chunk_is_damage() {
     let read = messages_of(record_beyond_its_chunk());
     assert_eq!(read[0], "event 0");
-    assert_eq!(read[1..], ["any.mcap: damaged after 1 messages: Chunk ended in the middle of a record"]);
+    assert_eq!(read[1..], ["any.mcap: damaged after 1 message: Chunk ended in the middle of a record"]);
 }
 
 #[test]

@@ -16,6 +16,9 @@ const METRICS_EVERY_MS = 500;
 // The two clocks of a browser run alike, unless one was set or the computer slept.
 const CLOCK_STEP_MS = 1000;
 
+// The layer whose safe points can be drawn over the other layers.
+const SAFE_PATH = "safe_path";
+
 const $ = (id) => document.getElementById(id);
 const clock = new ServerClock();
 const panels = new Map();
@@ -26,6 +29,8 @@ let status = null, status_arrived_ms = null;
 let link_state = { phase: "connecting", text: "Connecting …" };
 // When maps were drawn on this connection: the first, and those of the last RATE_OVER_MS.
 let first_drawn_ms = null, drawn_ms = [];
+// True if the safe paths are drawn over every layer.
+let with_paths = false;
 let is_draw_scheduled = false, age_timer = 0, metrics_at_ms = 0, view_m = 0;
 let wall_minus_monotonic = Date.now() - performance.now();
 
@@ -107,6 +112,7 @@ function draw() {
 function canDecode(map) {
   try {
     for (const panel of panels.values()) if (panel.is_in_sight) panel.decode(map);
+    safePoints(map);
     return true;
   } catch (error) {
     stream.counts.refused++;
@@ -115,8 +121,12 @@ function canDecode(map) {
   }
 }
 
+// The safe points to draw over every layer; null if none are wanted or the map has none.
+const safePoints = (map) => (with_paths ? (map.layer(SAFE_PATH)?.safe_points ?? null) : null);
+
 // Makes a panel for each layer, and removes the panels of layers that the map has not.
 function writePanels(names) {
+  $("paths-choice").hidden = !names.includes(SAFE_PATH);
   for (const [name, panel] of panels) {
     if (names.includes(name)) continue;
     panel.element.remove();
@@ -134,7 +144,7 @@ function writePanels(names) {
 function drawPanel(panel) {
   if (!panel.is_in_sight) return;
   try {
-    panel.draw(shown.map, view_m);
+    panel.draw(shown.map, view_m, safePoints(shown.map));
   } catch (error) {
     panel.clear();
     writeRefusal("map", error);
@@ -223,6 +233,12 @@ $("vehicle").onchange = () => {
 };
 $("view").onchange = () => {
   view_m = Number($("view").value);
+  scheduleDraw();
+};
+// A browser may keep the check mark when the page is loaded again.
+with_paths = $("paths").checked;
+$("paths").onchange = () => {
+  with_paths = $("paths").checked;
   scheduleDraw();
 };
 

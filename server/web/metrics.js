@@ -72,6 +72,12 @@ export function writeServerMetrics(element, status) {
   writeList(element, [
     ["Maps made", status ? count(status.maps ?? 0) : dash],
     ["Readers", status ? reader_text : dash],
+    ...(status?.sensors ?? []).filter(({ mount }) => mount?.contradicts).map(({ name, mount }) => [
+      `Mount of ${name}`,
+      `the ground contradicts it: ${signed(mount.height_m, 2)} m, pitch ${signed(mount.pitch_deg, 1)}°, ` +
+        `roll ${signed(mount.roll_deg, 1)}°`,
+      true,
+    ]),
     ["Recorder", !status ? dash : recorder?.file ? recorder.file : "not recording"],
     ...(recorder?.file
       ? [
@@ -83,6 +89,11 @@ export function writeServerMetrics(element, status) {
   ]);
 }
 
+const signed = (value, digits) => `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(digits)}`;
+
+/// Sources of elevations that are not those of the sensor.
+const DOUBTFUL = ["nominal", "estimated", "unknown"];
+
 export function writeSensors(body, sensors) {
   const blocked = (sensor) => [
     ...(sensor.blocked_sectors ?? []).map(({ from_deg, to_deg }) => `${from_deg}° to ${to_deg}°`),
@@ -92,7 +103,8 @@ export function writeSensors(body, sensors) {
     sensor.name, sensor.model || "not known yet", sensor.rpm ? sensor.rpm.toFixed(0) : dash, count(sensor.returns),
     count(sensor.packets), count(sensor.refused), percent(sensor.completeness),
     clockWords(sensor.clock, sensor.clock_offset_ms),
-    (sensor.partial ? `partial: ${sensor.partial}` : "whole") + (blocked(sensor) && `, blocked: ${blocked(sensor)}`),
+    (sensor.partial ? `partial: ${sensor.partial}` : "whole") + (blocked(sensor) && `, blocked: ${blocked(sensor)}`) +
+      (DOUBTFUL.includes(sensor.elevations) ? `, elevations: ${sensor.elevations}` : ""),
   ]);
   const alarms = sensors.map((sensor) => Boolean(sensor.partial || blocked(sensor)));
   const newRow = () => {

@@ -3,8 +3,8 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 import { freshness, ServerClock } from "./clock.js";
+import { paintChannel } from "./draw/paint.js";
 import { MapStream } from "./map_stream.js";
-import { paintChannel } from "./paint.js";
 import { clockWords } from "./text.js";
 
 const ns = (ms) => BigInt(Math.round(ms * 1e6));

@@ -1,10 +1,11 @@
-// In: one layer of the shown map. Out: its panel: cells on a canvas, range rings, legend, share of drivable ground, and
-// the values of the cell under the pointer. Forward is up, left is left, the vehicle in the middle.
+// In: one layer of the shown map. Out: its panel: cells on a canvas, safe paths, range rings, legend, share of drivable
+// ground, and the values of the cell under the pointer. Forward is up, left is left, the vehicle in the middle.
 
-import { drawOverlay } from "./overlay.js";
-import { paintChannel, paintPixels } from "./paint.js";
-import { css } from "./palette.js";
-import { bearing, count, percent, setText, words } from "./text.js";
+import { drawOverlay } from "./draw/overlay.js";
+import { isId, paintChannel, paintPixels } from "./draw/paint.js";
+import { css, scaleGradient } from "./draw/palette.js";
+import { drawSafePaths } from "./draw/safe_paths.js";
+import { bearing, count, percent, setText, valueText, words } from "./text.js";
 import { egoAt, pixelCells } from "./wire/grid.js";
 
 // More pixels a side show no more of a grid with columns of a degree.
@@ -23,6 +24,8 @@ export class Panel {
   #pixels = null;
   #shown = "class";
   #range = null;
+  // True if the canvas of the safe paths is empty.
+  #is_pathless = true;
   #probe = null;
   #legend_texts = "";
   #redraw;
@@ -33,7 +36,9 @@ export class Panel {
     this.#redraw = redraw;
     this.element = template.content.firstElementChild.cloneNode(true);
     const part = (name) => this.element.querySelector(`[data-part="${name}"]`);
-    const parts = ["title", "share", "channel", "plot", "cells", "overlay", "mark", "readout", "legend", "stale"];
+    const parts = [
+      "title", "share", "channel", "plot", "cells", "paths", "overlay", "mark", "readout", "scale", "legend", "stale",
+    ];
     this.part = Object.fromEntries(parts.map((name) => [name, part(name)]));
     setText(this.part.title, words(name));
     setText(this.part.readout, HINT);
@@ -57,8 +62,9 @@ export class Panel {
     if (layer) for (const name of this.#neededChannels(layer)) layer.cells(name);
   }
 
-  // view_m: metres shown to every side; 0 shows the whole grid.
-  draw(map, view_m) {
+  // view_m: metres shown to every side; 0 shows the whole grid. safe_points: those of another layer to draw over this
+  // one, or null; a layer always shows its own.
+  draw(map, view_m, safe_points) {
     const layer = map.layer(this.name);
     this.decode(map);
     this.#layer = layer;
@@ -69,6 +75,7 @@ export class Panel {
       this.#drawOverlay();
     }
     this.#drawCells();
+    this.#drawPaths(layer.safe_points ?? safe_points);
     const share = layer.metrics.get("drivable_share");
     setText(this.part.share, share === undefined ? "" : `${percent(share)} drivable`);
     const label = `${words(this.name)} around the vehicle, forward up. ${this.part.share.textContent}`;
@@ -81,7 +88,9 @@ export class Panel {
     this.#layer = null;
     this.#pixels?.fill(0);
     if (this.#image) this.part.cells.getContext("2d").putImageData(this.#image, 0, 0);
+    this.#drawPaths(null);
     this.#writeLegend([]);
+    this.#writeScale(null);
     this.#writeProbe();
     setText(this.part.share, "");
   }
@@ -116,7 +125,9 @@ export class Panel {
     if (size === 0 || size === this.#size) return;
     this.#size = size;
     this.#scale = size / side;
-    for (const canvas of [this.part.cells, this.part.overlay]) canvas.width = canvas.height = size;
+    const { cells, paths, overlay } = this.part;
+    for (const canvas of [cells, paths, overlay]) canvas.width = canvas.height = size;
+    this.#is_pathless = true;
     this.#image = new ImageData(size, size);
     this.#pixels = new Uint32Array(this.#image.data.buffer);
     this.#drawOverlay();
@@ -125,12 +136,30 @@ export class Panel {
 
   #drawCells() {
     const channel = this.#shownChannel(this.#layer), cells = this.#layer.cells(channel.name);
-    const { colours, legend, range } = paintChannel(this.#layer, channel, cells, this.#range);
+    const { colours, legend, range, bar } = paintChannel(this.#layer, channel, cells, this.#range);
     this.#range = range;
     this.#writeLegend(legend);
+    this.#writeScale(bar);
     if (!this.#size) return;
     paintPixels(this.#pixels, pixelCells(this.#layer.grid, this.#size, this.#view_m), cells, colours);
     this.part.cells.getContext("2d").putImageData(this.#image, 0, 0);
+  }
+
+  #drawPaths(safe_points) {
+    if (!this.#size || (!safe_points && this.#is_pathless)) return;
+    drawSafePaths(this.part.paths, this.#size, this.#scale, this.#view_m, safe_points);
+    this.#is_pathless = !safe_points;
+  }
+
+  // texts: of the colour bar, from left to right; null hides it.
+  #writeScale(texts) {
+    const { scale } = this.part, [bar, labels] = scale.children;
+    scale.hidden = !texts;
+    if (!texts) return;
+    bar.style.background = scaleGradient();
+    while (labels.children.length > texts.length) labels.lastChild.remove();
+    while (labels.children.length < texts.length) labels.append(document.createElement("span"));
+    texts.forEach((text, i) => setText(labels.children[i], text));
   }
 
   #writeLegend(entries) {
@@ -194,9 +223,9 @@ export class Panel {
   }
 }
 
-function cellText(layer, { name, unit, scale, unknown }, cell) {
-  const raw = layer.cells(name)[cell];
+function cellText(layer, channel, cell) {
+  const { name, scale, unknown } = channel, raw = layer.cells(name)[cell];
   if (name === "class") return words(layer.legend[raw].name);
-  const value = raw === unknown ? "unknown" : unit === "" ? count(raw) : `${(raw * scale).toFixed(2)} ${unit}`;
+  const value = raw === unknown ? "unknown" : isId(channel) ? count(raw) : valueText(raw * scale, channel);
   return `${words(name)} ${value}`;
 }

@@ -20,6 +20,13 @@ export function duration(ms) {
   return days < 730 ? `${Math.floor(days)} days` : `${(days / 365.25).toFixed(1)} years`;
 }
 
+// A value of a channel with its unit, with as many decimals as a step of its scale needs.
+export function valueText(value, { unit, scale }) {
+  // 0.01 in single precision is a little less than 0.01.
+  const digits = Math.min(Math.max(Math.ceil(-Math.log10(scale) - 1e-6), 0), 6);
+  return `${value.toFixed(digits)} ${unit}`.trimEnd();
+}
+
 // The clock that a sensor's stamps follow, and how far the host's clock is from it (BigInt, ms).
 export function clockWords(clock, offset_ms) {
   const name = { gps: "GPS", gps_unlocked: "GPS, not locked" }[clock] ?? clock;

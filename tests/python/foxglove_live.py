@@ -49,7 +49,7 @@ async def main(url):
         channels = {}
         info = json.loads(await socket.recv())
         assert info["op"] == "serverInfo", info
-        while LATER not in channels or "/tf" not in channels or "/car/map/safe_path" not in channels:
+        while LATER not in channels or "/tf" not in channels or "/car/safe_points" not in channels:
             advertised = json.loads(await socket.recv())
             assert advertised["op"] == "advertise", advertised
             channels.update({channel["topic"]: channel for channel in advertised["channels"]})
@@ -66,7 +66,7 @@ async def main(url):
         await stalled.send(json.dumps({"op": "subscribe", "subscriptions": everything}))
 
         # The server reads subscriptions in order: the points are subscribed when messages of later subscriptions come.
-        now = ["/car/map/drivability", "/car/map/occupancy", "/tf"]
+        now = ["/car/map/drivability", "/car/map/occupancy", "/car/safe_points", "/tf"]
         for topic in [LATER, *now]:
             await subscribe(topic)
         received = await receive(socket, decoders, {ids[topic] for topic in now})

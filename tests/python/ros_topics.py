@@ -43,19 +43,41 @@ def message(sample, name):
     return decoded, sequence, attachment[17:].hex()
 
 
-def grid(sample):
-    decoded, sequence, gid = message(sample, "nav_msgs/msg/OccupancyGrid")
+def of_header(header):
+    return {"stamp_ns": header.stamp.sec * 10**9 + header.stamp.nanosec, "frame_id": header.frame_id}
+
+
+def markers(decoded):
+    """The ends of the lines of each marker, by the marker's name."""
+    lines = {marker.ns: [[point.x, point.y] for point in marker.points] for marker in decoded.markers}
+    return {**of_header(decoded.markers[0].header), "lines": lines}
+
+
+def poses(decoded):
+    return {**of_header(decoded.header), "poses": [[pose.position.x, pose.position.y] for pose in decoded.poses]}
+
+
+def grid(decoded):
     position, orientation = decoded.info.origin.position, decoded.info.origin.orientation
     return {
-        "sequence": sequence,
-        "gid": gid,
-        "stamp_ns": decoded.header.stamp.sec * 10**9 + decoded.header.stamp.nanosec,
-        "frame_id": decoded.header.frame_id,
+        **of_header(decoded.header),
         "resolution": decoded.info.resolution,
         "size": [decoded.info.width, decoded.info.height],
         "origin": [position.x, position.y, orientation.z, orientation.w],
         "data": decoded.data.tolist(),
     }
+
+
+OF_TYPE = {
+    "nav_msgs/msg/OccupancyGrid": grid,
+    "visualization_msgs/msg/MarkerArray": markers,
+    "geometry_msgs/msg/PoseArray": poses,
+}
+
+
+def described(sample, name):
+    decoded, sequence, gid = message(sample, name)
+    return {"sequence": sequence, "gid": gid, **OF_TYPE[name](decoded)}
 
 
 def main(endpoint, domain):
@@ -82,9 +104,9 @@ def main(endpoint, domain):
             # Nothing is published after the second subscriber comes, so its map is from the cache.
             early, late = queue.Queue(), queue.Queue()
             first = zenoh.ext.declare_advanced_subscriber(session, key, early.put, history=history)
-            messages[topic] = grid(early.get(timeout=60))
+            messages[topic] = described(early.get(timeout=60), name)
             second = zenoh.ext.declare_advanced_subscriber(session, key, late.put, history=history)
-            assert grid(late.get(timeout=60)) == messages[topic], topic
+            assert described(late.get(timeout=60), name) == messages[topic], topic
             first.undeclare()
             second.undeclare()
     print(json.dumps({"topics": topics, "messages": messages}))

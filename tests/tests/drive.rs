@@ -1,17 +1,22 @@
 //! A closed loop: the simulated vehicle scans the town and sends datagrams and ego poses through real sockets to a
-//! server. The maps come back over gRPC and over zenoh, the example planner plans on them, and the vehicle makes the
+//! server. The maps come back over gRPC (and over zenoh), an example program plans on them, and the vehicle makes the
 //! planned move. Each revolution makes one map and one move. The loop waits for each map and never for the clock, so
 //! that every run drives the same way.
+//!
+//! Two programs drive: A* on the layer `speed`, and the follower of the safe points on the layer `safe_path`.
 
 #[allow(dead_code, reason = "the example shows pictures")]
 #[path = "../../client/examples/planner/astar.rs"]
 mod astar;
 mod fixture;
+#[allow(dead_code, reason = "the example has a goal straight ahead")]
+#[path = "../../client/examples/follower/safe_points.rs"]
+mod safe_points;
 
 use std::net::UdpSocket;
 use std::ops::Range;
 
-use astar::{Move, Planner};
+use astar::Planner;
 use clearway::server::{Running, Server, Setup};
 use clearway_client::ingest::Ingester;
 use clearway_client::stream::MapStream;
@@ -22,15 +27,75 @@ use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::{Scene, town};
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
 use fixture::{config, until, within};
+use safe_points::Follower;
 
 /// Length, width and height of the vehicle, in metres: those of the simulated cars.
 const SIZE_M: [f64; 3] = [4.4, 1.8, 1.5];
 /// Distance of the goal along the route, in metres.
 const GOAL_M: f64 = 10.0;
+/// Least distance that a drive must keep from all things, in metres. Ours: the planner keeps 0.2 and 0.3 m in its two
+/// drives, the follower 0.2 and 0.4 m, measured in steps of 0.1 m.
+const NEAREST_M_MIN: f64 = 0.05;
 /// Most datagrams in flight: as many as the smallest kernel buffer holds.
 const UNDER_WAY: u64 = 60;
 /// Period of the ego poses and of the checks against the world, in ns.
 const POSE_PERIOD_NS: i64 = 20_000_000;
+
+/// A program that drives by the maps of one layer.
+trait Driver: Default {
+    const LAYER: &'static str;
+    fn update(&mut self, map: &MapView);
+    /// The next move towards a goal.
+    fn next_move(&self, goal: [f64; 2]) -> Move;
+}
+
+/// Curvature in 1/m, positive to the left, and speed in m/s.
+#[derive(Clone, Copy, Debug, Default)]
+struct Move {
+    curvature_per_m: f64,
+    mps: f64,
+}
+
+impl Driver for Planner {
+    const LAYER: &'static str = "speed";
+
+    fn update(&mut self, map: &MapView) {
+        Planner::update(self, map).unwrap();
+    }
+
+    fn next_move(&self, goal: [f64; 2]) -> Move {
+        let astar::Move { curvature_per_m, mps, .. } = Planner::next_move(self, goal);
+        Move { curvature_per_m, mps }
+    }
+}
+
+impl Driver for Follower {
+    const LAYER: &'static str = "safe_path";
+
+    fn update(&mut self, map: &MapView) {
+        Follower::update(self, map).unwrap();
+    }
+
+    fn next_move(&self, goal: [f64; 2]) -> Move {
+        let safe_points::Move { curvature_per_m, mps, .. } = Follower::next_move(self, goal);
+        Move { curvature_per_m, mps }
+    }
+}
+
+/// One drive: its start and its length along the route in metres, and the seed of the sensor's noise.
+#[derive(Clone, Copy, Debug)]
+struct Plan {
+    start_m: f64,
+    length_m: f64,
+    seed: u64,
+}
+
+/// A lap from the simulation's own start, and a drive that starts behind the second corner, where the street runs in
+/// the opposite direction.
+fn plans() -> [Plan; 2] {
+    let lap_m = town().drive.course.length();
+    [Plan { start_m: 0.0, length_m: lap_m, seed: 1 }, Plan { start_m: 250.0, length_m: 200.0, seed: 7 }]
+}
 
 /// The vehicle, its connections to the server, and the maps that it receives.
 struct Loop {
@@ -38,8 +103,9 @@ struct Loop {
     socket: UdpSocket,
     running: Running,
     ingester: Ingester,
-    /// The maps over gRPC, and those over zenoh.
-    maps: [MapStream; 2],
+    /// The same maps over each transport; at least one.
+    maps: Vec<MapStream>,
+    plan: Plan,
     sent: u64,
 }
 
@@ -65,19 +131,19 @@ async fn server() -> Running {
 }
 
 impl Loop {
-    fn new(running: Running, ingester: Ingester, maps: [MapStream; 2]) -> Self {
+    fn new(running: Running, ingester: Ingester, maps: Vec<MapStream>, plan: Plan) -> Self {
         let scene = town();
-        let (x, y, heading) = scene.drive.at(0.0);
+        let (x, y, heading) = scene.drive.course.at(scene.drive.start + plan.start_m, scene.drive.left);
         let here = Course::from(x, y, heading).straight(1.0);
         let scene = Scene { drive: Drive::steady(here.into(), 0.0, 0.0, 0.0), ..scene };
-        let vehicle = SimulatedVehicle::new(scene, ScannerConfig::default());
+        let vehicle = SimulatedVehicle::new(scene, ScannerConfig { seed: plan.seed, ..ScannerConfig::default() });
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
-        Self { vehicle, socket, running, ingester, maps, sent: 0 }
+        Self { vehicle, socket, running, ingester, maps, plan, sent: 0 }
     }
 
     /// Drives until the sensor's head has passed the vehicle's back, where the server ends a revolution, then waits for
-    /// the map of that revolution. Returns the range of its stamps, and the map over gRPC and over zenoh.
-    async fn revolution(&mut self, next: Move) -> (Range<i64>, [MapView; 2]) {
+    /// the map of that revolution. Returns the range of its stamps, and the map over each transport.
+    async fn revolution(&mut self, next: Move) -> (Range<i64>, Vec<MapView>) {
         let begin_ns = self.vehicle.steer(next.curvature_per_m, next.mps);
         let datagrams = cast(&mut self.vehicle);
         let end_ns = datagrams.last().expect("a revolution").stamp_ns;
@@ -94,29 +160,34 @@ impl Loop {
             self.sent += 1;
             until("capacity", || status.snapshot().ledger.received + UNDER_WAY > self.sent).await;
         }
-        let [grpc, zenoh] = &mut self.maps;
-        (begin_ns..end_ns, [map_since(grpc, begin_ns).await, map_since(zenoh, begin_ns).await])
+        let mut maps = Vec::new();
+        for stream in &mut self.maps {
+            maps.push(map_since(stream, begin_ns).await);
+        }
+        (begin_ns..end_ns, maps)
     }
 
-    /// Follows the route for `length_m`. Panics if the vehicle touches a thing, or if it does not progress.
-    async fn drive(mut self, length_m: f64) -> Driven {
-        let route = town().drive;
-        let mut planner = Planner::default();
-        let mut next = Move { curvature_per_m: 0.0, mps: 0.0, path_m: 0.0 };
+    /// Drives as planned. Panics if the vehicle touches a thing, or if it does not progress.
+    async fn drive<D: Driver>(mut self) -> Driven {
+        let mut route = town().drive;
+        route.start += self.plan.start_m;
+        let mut driver = D::default();
+        let mut next = Move::default();
         let mut driven = Driven { revolutions: 0, length_m: 0.0, seconds: 0.0, nearest_m: 1.0 };
+        println!("{}: {:?}", D::LAYER, self.plan);
         // The first revolution is not whole.
         cast(&mut self.vehicle);
-        while driven.length_m < length_m {
-            let (stamps, [over_grpc, over_zenoh]) = self.revolution(next).await;
-            assert_eq!(over_grpc.bytes(), over_zenoh.bytes(), "{driven:?}");
+        while driven.length_m < self.plan.length_m {
+            let (stamps, maps) = self.revolution(next).await;
+            assert!(maps.iter().all(|map| map.bytes() == maps[0].bytes()), "{driven:?}");
             self.check_contact(stamps.clone(), &mut driven);
             driven.revolutions += 1;
             driven.seconds = self.seconds(stamps.end);
             driven.length_m = along(&route, driven.length_m, self.vehicle.scene().drive.at(driven.seconds));
-            // The bytes are equal, so the planner uses the maps of both carriers alternately.
-            planner.update(if driven.revolutions.is_multiple_of(2) { &over_grpc } else { &over_zenoh }).unwrap();
+            // The bytes are equal, so the driver uses the maps of the transports in turn.
+            driver.update(&maps[driven.revolutions as usize % maps.len()]);
             let (x, y, _) = route.course.at(route.start + driven.length_m + GOAL_M, route.left);
-            next = planner.next_move([x, y]);
+            next = driver.next_move([x, y]);
             if driven.revolutions.is_multiple_of(100) {
                 println!("{driven:?}: {next:?}");
             }
@@ -125,6 +196,7 @@ impl Loop {
                 "the vehicle does not progress: {driven:?}, {next:?}"
             );
         }
+        println!("{driven:?}");
         let ledger = self.running.vehicles.0[0].status.snapshot().ledger;
         assert_eq!((ledger.lost, ledger.kernel_drops, ledger.refused.len()), (0, 0, 0));
         within("shutdown", self.running.shutdown()).await.unwrap();
@@ -196,17 +268,33 @@ async fn map_since(maps: &mut MapStream, begin_ns: i64) -> MapView {
     }
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn a_planner_on_maps_of_grpc_and_zenoh_drives_a_lap_without_contact() {
+/// Drives by the maps of gRPC, and also of zenoh if that is demanded.
+async fn drive<D: Driver>(plan: Plan, over_zenoh: bool) -> Driven {
     let running = server().await;
     let client = Client::connect(&running.grpc.unwrap().to_string()).await.unwrap();
     let ingester = within("a stream", client.ingest("car")).await.unwrap();
-    let selection = Subscription { layers: vec!["speed".into()], ..Default::default() };
-    let over_grpc = within("maps over gRPC", client.subscribe(selection)).await.unwrap();
+    let selection = Subscription { layers: vec![D::LAYER.into()], ..Default::default() };
+    let mut maps = vec![within("maps over gRPC", client.subscribe(selection)).await.unwrap()];
     let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens");
     let client = within("zenoh", ZenohClient::connect(endpoint)).await.unwrap();
-    let over_zenoh = within("maps over zenoh", client.subscribe("car", "speed")).await.unwrap();
-    let lap_m = town().drive.course.length();
-    let driven = Loop::new(running, ingester, [over_grpc, over_zenoh]).drive(lap_m).await;
-    println!("{driven:?}");
+    if over_zenoh {
+        maps.push(within("maps over zenoh", client.subscribe("car", D::LAYER)).await.unwrap());
+    }
+    Loop::new(running, ingester, maps, plan).drive::<D>().await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_planner_on_maps_of_grpc_and_zenoh_drives_a_lap_without_contact() {
+    for plan in plans() {
+        let driven = drive::<Planner>(plan, true).await;
+        assert!(driven.nearest_m > NEAREST_M_MIN, "{driven:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn a_follower_of_the_safe_points_drives_a_lap_without_contact() {
+    for plan in plans() {
+        let driven = drive::<Follower>(plan, false).await;
+        assert!(driven.nearest_m > NEAREST_M_MIN, "{driven:?}");
+    }
 }

@@ -80,7 +80,7 @@ fn the_offline_commands_of_the_readme_succeed_on_a_capture() {
             verbs.iter().any(|verb| c.split(' ').nth(1) == Some(verb))
         })
         .collect();
-    assert_eq!(offline.len(), 9, "{offline:?}");
+    assert_eq!(offline.len(), 10, "{offline:?}");
     for command in &offline {
         succeeds(folder.path(), command);
     }
@@ -109,7 +109,7 @@ fn the_evaluate_commands_of_the_readme_succeed() {
         fs::copy(&from, to.join(from.file_name().expect("a name"))).expect("the labelled frame");
     }
     let evaluations: Vec<_> = commands().into_iter().filter(|c| c.starts_with("clearway evaluate")).collect();
-    assert_eq!(evaluations.len(), 2, "{evaluations:?}");
+    assert_eq!(evaluations.len(), 3, "{evaluations:?}");
     for command in &evaluations {
         succeeds(folder.path(), command);
     }

@@ -86,6 +86,36 @@ async fn each_scan_of_a_folder_makes_a_map() {
 
 #[tokio::test(flavor = "multi_thread")]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+async fn a_nuscenes_scan_faces_forward_and_its_own_rings_make_the_rows() {
+    let summary = replayed(Options { files: vec![drive("nuscenes/mmdet3d")], ..Options::default() }).await.unwrap();
+    assert_eq!((summary.snapshot.maps, summary.snapshot.sensors[0].status.returns), (1, 34_688));
+    // nuScenes' own calibration: 1.84 m over the ground, and the y axis of the sensor points forward.
+    assert!((summary.extrinsics.z_m - 1.84).abs() < 0.05, "{:?}", summary.extrinsics);
+    assert!((summary.extrinsics.yaw_deg + 90.0).abs() < 0.5, "{:?}", summary.extrinsics);
+    assert_eq!(summary.to_json()["sensors"][0]["elevations"], "rings");
+    assert!(summary.to_json()["mount"]["roll_std_deg"].as_f64().unwrap() < 1.0, "{}", summary.to_json()["mount"]);
+    let options = Options {
+        files: vec![drive("nuscenes/mmdet3d")],
+        model: Some("hdl32e".parse().unwrap()),
+        ..Options::default()
+    };
+    let modelled = replayed(options).await.unwrap();
+    assert_eq!(modelled.to_json()["sensors"][0]["elevations"], "model");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bin_file_that_is_no_scan_is_refused_with_the_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("0.bin");
+    // x y z without an intensity.
+    let floats = (0..1600).flat_map(|i| [-5.0f32, (i % 50) as f32 * 0.1 - 2.5, -1.7]);
+    std::fs::write(&file, floats.flat_map(f32::to_le_bytes).collect::<Vec<u8>>()).unwrap();
+    let error = replayed(Options { files: vec![file], ..Options::default() }).await.unwrap_err().to_string();
+    assert!(error.contains("0.bin: neither a KITTI scan") && error.contains("intensity = -"), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 async fn the_packets_of_velodyne_scan_messages_make_maps_and_clouds() {
     let folder = tempfile::tempdir().unwrap();
     let options = Options {
@@ -153,6 +183,6 @@ async fn a_map_of_all_default_layers_is_at_most_64_kib_except_of_a_vls128() {
         let largest = whole.values().max().unwrap();
         println!("{file}: {largest} bytes at most in {} maps; by layer {most:?}", whole.len());
         assert!(*largest <= allowed << 10, "{file}: {largest}");
-        assert!(most["safe_path"] <= 7_000, "{file}: {most:?}");
+        assert!(most["safe_path"] <= 9_000, "{file}: {most:?}");
     }
 }

@@ -7,7 +7,7 @@ use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
 use clearway::cli::replay::{Mount, Options, ReplayError, Summary, replay};
-use clearway::config::Ros;
+use clearway::config::{Origin, Ros};
 use clearway::record::verify::verify;
 use clearway_lidar::model::Model;
 use clearway_lidar::{Sensor, SensorConfig};
@@ -145,7 +145,7 @@ async fn a_bag_of_clouds_odometry_and_tf_is_mapped_recorded_and_verified() {
         "/odom is used for poses of base_link",
         "/obstacles (sensor_msgs/msg/PointCloud2) is not used",
         "/merged (sensor_msgs/msg/PointCloud2) is not used",
-        "/velodyne_points: 1 messages refused, the first: data needs",
+        "/velodyne_points: 1 message refused, the first: data needs",
     ] {
         assert!(notes.contains(said), "{said:?} is not in {notes}");
     }
@@ -200,6 +200,21 @@ async fn a_bag_of_several_sensors_makes_maps_of_all_that_tf_places() {
     let (config, _) = clearway::record::reader::RecordingReader::open(&record).unwrap().config().unwrap();
     let places = config.vehicles[0].sensors.iter().map(|sensor| (sensor.name.as_str(), sensor.extrinsics.y_m));
     assert!(places.clone().any(|place| place == ("lidar_left", 1.0)), "{:?}", places.collect::<Vec<_>>());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bag_without_mounts_is_mapped_by_the_sensor_that_shows_most() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("bag.mcap");
+    let mut messages = drive();
+    let start_ns = messages[0].2;
+    // In place of tf the first message is a scan of another sensor.
+    messages[0] = ("/bumper_points", CLOUD, start_ns - 1000, cloud("bumper", start_ns - 1000, &[0; 2200]).to_cdr());
+    bag(&file, &messages);
+    let summary = replayed(options(&file)).await.unwrap();
+    assert!(summary.notes.join("\n").contains("/velodyne_points is used"), "{:?}", summary.notes);
+    assert!((summary.extrinsics.z_m - 1.9).abs() < 0.05, "{:?}", summary.extrinsics);
+    assert!(summary.snapshot.maps >= 3 && summary.snapshot.sensors.len() == 1);
 }
 
 /// The data of the cloud of this stamp.
@@ -285,7 +300,7 @@ async fn live_topics_of_rmw_zenoh_make_maps_and_bad_messages_are_counted() {
     config.vehicles[0].sensors[0].model = Some(Model::Hdl64eS2);
     let sensors = [("top".to_owned(), "/velodyne_points".to_owned())].into();
     config.vehicles[0].ros = Some(Ros { domain: 7, pose: "/odom".into(), sensors, ..Ros::default() });
-    config.check(Path::new("test")).unwrap();
+    config.check(&Origin::file(Path::new("test"))).unwrap();
     let running = fixture::start(config).await;
     let status = running.vehicles.0[0].status.clone();
 

@@ -420,7 +420,7 @@ async fn layers_are_made_while_subscribed_and_at_once_for_a_late_joiner() {
     until("the reader is gone", || !subscriptions.is_subscribed(LAYER)).await;
     let subscription = subscriptions.subscribe(&["safe_path".into()]);
     feed(&running, part(2)).await;
-    assert_eq!(layers(), ["drivability", "safe_path"], "the layers from which it is made are made too");
+    assert_eq!(layers(), ["drivability", "occupancy", "safe_path"], "the layers from which it is made are made too");
     assert!(subscription.is_covered_by(&newest()));
     within("shutdown", running.shutdown()).await.unwrap();
 }

@@ -11,7 +11,7 @@ use clearway::config::{Config, Foxglove, Ros2};
 use clearway::encode::viewer::Raster;
 use clearway::ingest::queue::Reading;
 use clearway::server::{Running, Server, Setup};
-use clearway_client::MapView;
+use clearway_client::{MapView, SafePoint};
 use clearway_mapping::event::{Body, EgoPose};
 use fixture::{LAYERS, config, feed, readings, start, venv, within};
 use nalgebra::{Isometry3, Vector3};
@@ -66,7 +66,7 @@ async fn a_late_ros_2_subscriber_receives_every_layer_and_the_transform() {
 
     let map = newest(&running);
     assert_eq!(map.layers().len() as u64, LAYERS);
-    assert_eq!(received["topics"].as_object().unwrap().len() as u64, LAYERS + 1);
+    assert_eq!(received["topics"].as_object().unwrap().len() as u64, LAYERS + 3);
     let mut gids = Vec::new();
     for layer in map.layers() {
         let topic = format!("/clearway/car/{}", layer.name);
@@ -83,9 +83,26 @@ async fn a_late_ros_2_subscriber_receives_every_layer_and_the_transform() {
         );
         gids.push(grid["gid"].as_str().unwrap());
     }
+    let points = &map.layer("safe_path").unwrap().points;
+    assert!(points.len() > 10, "{} safe points", points.len());
+    let [markers, poses] = ["markers", "poses"].map(|kind| format!("/clearway/car/safe_path/{kind}"));
+    for topic in [&markers, &poses] {
+        let message = &received["messages"][topic];
+        assert_eq!(received["topics"][topic]["qos"], "1:1:1,1:,:,:,,", "{topic}");
+        assert_eq!(message["stamp_ns"], map.header().capture_end_ns, "{topic}");
+        assert_eq!(message["frame_id"], "car/base_link", "{topic}");
+        gids.push(message["gid"].as_str().unwrap());
+    }
+    let place = |point: &SafePoint| [point.x_m, point.y_m].map(f64::from);
+    let places: Vec<_> = points.iter().map(place).collect();
+    let links: Vec<_> =
+        points.iter().flat_map(|from| from.links.iter().flat_map(|&to| [place(from), places[to as usize]])).collect();
+    assert_eq!(received["messages"][&poses]["poses"], json!(places));
+    assert_eq!(received["messages"][&markers]["lines"]["links"], json!(links));
+    assert!(!received["messages"][&markers]["lines"]["radii"].as_array().unwrap().is_empty());
     gids.sort_unstable();
     gids.dedup();
-    assert_eq!(gids.len() as u64, LAYERS, "each publisher has its own gid");
+    assert_eq!(gids.len() as u64, LAYERS + 2, "each publisher has its own gid");
     // The axes of the occupancy grid are those of the world, so the grid is rotated in the vehicle's frame.
     let (sin, cos) = (-FRAC_PI_4 / 2.0).sin_cos();
     let origin = received["messages"]["/clearway/car/occupancy"]["origin"].as_array().unwrap();
@@ -129,7 +146,7 @@ async fn a_foxglove_client_gets_the_current_map_and_points_of_later_maps() {
         tokio::task::spawn_blocking(move || (lines.next().expect("a line").unwrap(), lines)).await.unwrap();
     let newest_map: Value = serde_json::from_str(&newest_map).unwrap();
     assert_eq!(newest_map["name"], "clearway");
-    assert_eq!(newest_map["channels"].as_object().unwrap().len() as u64, LAYERS + 2);
+    assert_eq!(newest_map["channels"].as_object().unwrap().len() as u64, LAYERS + 3);
     for name in ["drivability", "occupancy"] {
         let (layer, grid) = (map.layer(name).unwrap(), &newest_map[format!("/car/map/{name}")]);
         let (raster, schema) = (Raster::from_grid(&layer.grid), &newest_map["channels"][format!("/car/map/{name}")]);
@@ -139,6 +156,14 @@ async fn a_foxglove_client_gets_the_current_map_and_points_of_later_maps() {
         assert_eq!((&grid["column_count"], &grid["row_stride"]), (&json!(raster.width), &json!(4 * raster.width)));
         assert_eq!(grid["data"], json!({"length": data.len(), "crc32": crc32fast::hash(&data)}), "{name}");
     }
+    let (scene, points) = (&newest_map["/car/safe_points"], &map.layer("safe_path").unwrap().points);
+    assert_eq!(newest_map["channels"]["/car/safe_points"], "foxglove.SceneUpdate");
+    let (entity, links) = (&scene["entities"][0], points.iter().map(|point| point.links.len()).sum::<usize>());
+    assert_eq!(
+        (entity["frame_id"].as_str(), &scene["log_ns"]),
+        (Some("car/base_link"), &json!(map.header().capture_end_ns))
+    );
+    assert!(links > 10 && entity["lines"][0]["points"].as_array().unwrap().len() == 2 * links, "{links} links");
     let turned = &newest_map["/car/map/occupancy"]["pose"]["orientation"];
     let (sin, cos) = (-FRAC_PI_4 / 2.0).sin_cos();
     assert_near(&json!([turned["z"], turned["w"]]), &[sin, cos]);

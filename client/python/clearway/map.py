@@ -31,7 +31,7 @@ class Channel:
     """One value per cell of a layer."""
 
     name: str
-    #: Unit of `values`; empty for classes and ids.
+    #: Unit of `values`: `id` for ids; empty for classes and plain numbers.
     unit: str
     #: Factor from `raw` to `values`.
     scale: float
@@ -184,7 +184,8 @@ class Layer:
         make_base = None
         if message.by_class:
             if message.encoding != map_pb2.ENCODING_CHANGES or "class" not in self.channels:
-                text = f"layer {self.name!r}: {message.name!r} without changes, or without a channel 'class' before it"
+                needed = "the encoding of changes and a channel 'class' before it are needed"
+                text = f"layer {self.name!r}: channel {message.name!r} refers to the class of each cell; {needed}"
                 raise DecodeError("by_class", text)
             classes = self.channels["class"].raw
             make_base = lambda dtype: codec.by_class(message, classes, len(self.legend), dtype)  # noqa: E731
@@ -204,26 +205,31 @@ class Layer:
         """Unpacks at most `MAP_PARTS_MAX` safe points."""
         count, step = len(packed.x), packed.step_m
         if len(packed.y) != count or len(packed.radius_cm) != count or count > MAP_PARTS_MAX:
-            raise DecodeError("safe_point", f"{count}, {len(packed.y)} and {len(packed.radius_cm)} values")
+            found = f"{count} values of x, {len(packed.y)} of y, {len(packed.radius_cm)} of the radius"
+            raise DecodeError("safe_point", f"safe points: {found}; equal numbers up to {MAP_PARTS_MAX} are needed")
         if count and not (math.isfinite(step) and step > 0):
-            raise DecodeError("safe_point", f"steps of {step} m; finite metres over 0 are needed")
+            raise DecodeError("safe_point", f"safe points: a step of {step} m; a finite length over 0 is needed")
         links = self._links(packed, count)
         for index, sums in enumerate(zip(*map(accumulate, (packed.x, packed.y, packed.radius_cm)))):
             if max(map(abs, sums)) > SAFE_POINT_STEPS_MAX or sums[2] < 0:
-                raise DecodeError("safe_point", f"safe point {index}: {sums} steps and cm")
+                allowed = f"up to {SAFE_POINT_STEPS_MAX} in size and a radius of 0 or more are allowed"
+                raise DecodeError("safe_point", f"safe point {index}: x, y in steps and radius in cm {sums}; {allowed}")
             yield SafePoint(sums[0] * step, sums[1] * step, sums[2] / 100, tuple(links[index]))
 
     @staticmethod
     def _links(packed: map_pb2.SafePoints, count: int) -> list[list[int]]:
         starts = list(accumulate(packed.starts))
         if 0 in packed.starts or starts and starts[-1] >= count or len(packed.link_from) != len(packed.link_back):
-            raise DecodeError("safe_point", f"lines that start at {starts} of {count} safe points")
+            found = f"lines of safe points that start at {starts}, and {len(packed.link_from)} links"
+            allowed = f"rising numbers under {count}, and as many ends ({len(packed.link_back)}) as links are needed"
+            raise DecodeError("safe_point", f"{found}; {allowed}")
         links: list[list[int]] = [[] for _ in range(count)]
         before = (-1, -1)
         for start, back in zip(accumulate(packed.link_from), packed.link_back):
             link = (start, start - back)
             if start >= count or back < 2 or back > start or link <= before:
-                raise DecodeError("safe_point", f"a link {link} among {count} safe points")
+                allowed = f"links in rising order, each to an earlier one of the {count} safe points, are allowed"
+                raise DecodeError("safe_point", f"a link from safe point {link[0]} to {link[1]}; {allowed}")
             links[start].append(link[1])
             before = link
         for index in set(range(1, count)).difference(starts):
@@ -385,7 +391,7 @@ def _base(message: map_pb2.Map, layer: map_pb2.Layer, base: Map | None) -> Layer
     if needed != given:
         raise DecodeError("other_base", f"layer {layer.name!r} is a delta to map {needed}; given was {given}")
     if layer.name not in base.layers:
-        raise DecodeError("no_base", f"layer {layer.name!r} is a delta, and not in its base")
+        raise DecodeError("no_base", f"layer {layer.name!r} is a delta, and its base map does not have this layer")
     return base.layers[layer.name]
 
 
@@ -424,7 +430,7 @@ def _legend(message: map_pb2.Layer, base: Layer | None) -> tuple[LegendEntry, ..
 def _check_header(message: map_pb2.Map) -> None:
     header = message.header
     if not message.HasField("header") or header.capture_start_ns > header.capture_end_ns:
-        raise DecodeError("header", "header absent, or a capture that starts after its end")
+        raise DecodeError("header", "the header is absent, or its capture starts after its end")
     if header.HasField("map_from_ego"):
         pose = header.map_from_ego
         norm = math.hypot(pose.qx, pose.qy, pose.qz, pose.qw)

@@ -11,6 +11,7 @@
 //! | [`ground`], [`object`], [`course`] (`scene/`) | the parts of a world |
 //! | [`world`] (`scene/`) | a description -> [`world::World`] |
 //! | [`scenes`] (`scene/`) | the four scenes of the UT Austin thesis, a dirt track and a town |
+//! | [`random`] (`scene/random/`) | seed -> a random world: its ground, its objects, the mount of its sensor |
 //! | [`truth`] (`scene/`) | world, pose, time -> drivable ground |
 //! | [`plan`] (`scene/`) | the same as text, seen from above |
 //! | [`pose`] (`scene/`) | scene, time -> the vehicle's pose |
@@ -36,5 +37,5 @@ mod sensor;
 pub mod traffic;
 pub mod vehicle;
 
-pub use scene::{contact, course, ground, object, plan, pose, scenes, truth, world};
+pub use scene::{contact, course, ground, object, plan, pose, random, scenes, truth, world};
 pub use sensor::{encode, planes, raycast, scanner, telemetry};

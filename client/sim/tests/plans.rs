@@ -3,6 +3,7 @@
 //! `.` drivable, `:` tight, `-` out of reach, `/` steep, `#` obstacle, `^` the vehicle, which looks up the page.
 
 use clearway_sim::plan::plan;
+use clearway_sim::random::random_world;
 use clearway_sim::scenes::{self, Scene};
 use clearway_sim::truth::{Limits, TruthGrid};
 
@@ -21,4 +22,16 @@ fn the_thesis_scenes_look_as_its_figures_say() {
 #[test]
 fn the_town_looks_like_a_town() {
     insta::assert_snapshot!("town", seen_from_above(&scenes::town(), 60.0));
+}
+
+/// A narrow opening, a closed fence, a wide opening, a ditch and a low overhang.
+#[test]
+fn random_worlds_look_as_their_descriptions_say() {
+    for seed in [6, 10, 8, 28, 46] {
+        let world = random_world(seed);
+        let (form, theme) = (world.form.name(), world.theme.name());
+        let seen = seen_from_above(&world.scene, 40.0);
+        let text = format!("seed {seed}: {theme}, {form}\n{}\n{seen}", world.description);
+        insta::assert_snapshot!(format!("random_{seed}"), text);
+    }
 }

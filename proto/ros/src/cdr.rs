@@ -100,7 +100,7 @@ impl<'a> Reader<'a> {
     /// Reads the next `length` bytes.
     ///
     /// # Errors
-    /// [`MessageError::Truncated`] if the message ends before.
+    /// [`MessageError::Truncated`] if the message ends before the last of them.
     pub fn read_bytes(&mut self, what: &'static str, length: usize) -> Result<&'a [u8], MessageError> {
         let (at, available) = (self.at, self.message.len());
         let end = at.checked_add(length).filter(|end| *end <= available);

@@ -12,13 +12,15 @@
 //! | [`point_cloud2`] | `sensor_msgs/PointCloud2` -> fields and bytes; and back |
 //! | [`points`] | fields and bytes -> positions, intensities, rings and times, by the conventions of drivers |
 //! | [`occupancy_grid`] | cells -> `nav_msgs/OccupancyGrid` |
-//! | [`pose`] | `nav_msgs/Odometry`, `geometry_msgs/PoseStamped`, `tf2_msgs/TFMessage` -> poses |
+//! | [`markers`] | lines -> `visualization_msgs/MarkerArray` |
+//! | [`pose`] | `Odometry`, `PoseStamped`, `TFMessage` -> poses; poses -> `Odometry`, `TFMessage`, `PoseArray` |
 //! | [`frames`] | transforms -> pose of one frame in another |
 //! | [`published`] | the published types: names, hashes, definitions |
 
 pub mod cdr;
 pub mod frames;
 pub mod kind;
+pub mod markers;
 pub mod occupancy_grid;
 pub mod point_cloud2;
 pub mod points;

@@ -1,4 +1,5 @@
-//! Poses: `nav_msgs/msg/Odometry`, `geometry_msgs/msg/PoseStamped`, `tf2_msgs/msg/TFMessage`.
+//! Poses: `nav_msgs/msg/Odometry`, `geometry_msgs/msg/PoseStamped`, `geometry_msgs/msg/PoseArray`,
+//! `tf2_msgs/msg/TFMessage`.
 //!
 //! In: the bytes of a message. Out: rigid transforms, each with the two frames it joins. A quaternion whose length is
 //! within 0.001 of 1 is normalised; any other is refused, such as the zeros of an unset message.
@@ -100,6 +101,14 @@ pub fn tf_message_to_cdr(transforms: &[StampedTransform]) -> Vec<u8> {
         writer.header(&transform.header).text(transform.child_frame_id);
         write_pose(&mut writer, &transform.parent_from_child);
     }
+    writer.finish()
+}
+
+/// Encodes a `geometry_msgs/msg/PoseArray`, little-endian.
+pub fn pose_array_to_cdr(header: &Header, poses: &[Isometry3<f64>]) -> Vec<u8> {
+    let mut writer = Writer::default();
+    writer.header(header).u32(length(poses.len()));
+    poses.iter().fold(&mut writer, |writer, pose| write_pose(writer, pose));
     writer.finish()
 }
 

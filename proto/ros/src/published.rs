@@ -57,3 +57,19 @@ pub const POINT_CLOUD2: Published = Published {
     hash: "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
     definition: include_str!("definitions/PointCloud2.msg"),
 };
+
+/// `geometry_msgs/msg/PoseArray`.
+pub const POSE_ARRAY: Published = Published {
+    package: "geometry_msgs",
+    message: "PoseArray",
+    hash: "RIHS01_af0cc36d190e104d546d168d6b39df04fa4b4ccecf59cb4c9ed328d3d5004aa0",
+    definition: include_str!("definitions/PoseArray.msg"),
+};
+
+/// `visualization_msgs/msg/MarkerArray`.
+pub const MARKER_ARRAY: Published = Published {
+    package: "visualization_msgs",
+    message: "MarkerArray",
+    hash: "RIHS01_86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf",
+    definition: include_str!("definitions/MarkerArray.msg"),
+};

@@ -54,7 +54,7 @@ pub struct SafePoint {
 pub struct Channel {
     /// Name, such as `class` or `unit_height`.
     pub name: String,
-    /// Unit of `raw * scale`; empty for classes and ids.
+    /// Unit of `raw * scale`: `id` for ids; empty for classes and plain numbers.
     pub unit: String,
     /// Factor from a raw value to a value in [`Channel::unit`].
     pub scale: f32,

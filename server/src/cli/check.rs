@@ -5,10 +5,25 @@ use clap::Args;
 
 use super::configuration::ConfigurationOptions;
 use super::output::print;
+use crate::config::COMMENTED;
+
+/// The first lines of the configuration that is printed.
+const HEAD: &str = "# Every value that this configuration has, given or default. Optional tables that it does not have \
+    are not here.\n# `clearway check --default` prints them too, and what each key means.\n\n";
 
 /// Check a configuration file and print it with every default.
+///
+/// With --default, print instead the default configuration with an explanation of every key; optional keys and tables
+/// are comments in it.
 #[derive(Args)]
+#[command(after_help = "Examples:
+  clearway check --default > clearway.toml
+  clearway check --config clearway.toml
+  clearway check --set grpc.listen=0.0.0.0:50051")]
 pub struct Options {
+    /// Print the default configuration, in which every key and every optional table is explained.
+    #[arg(long, conflicts_with_all = ["config", "set"])]
+    default: bool,
     #[command(flatten)]
     configuration: ConfigurationOptions,
 }
@@ -18,10 +33,14 @@ pub struct Options {
 /// # Errors
 /// [`ConfigError`](crate::config::ConfigError), also for a calibration or a certificate that the file names.
 pub fn run(options: &Options) -> Result<()> {
-    let Options { configuration } = options;
+    let Options { default, configuration } = options;
+    if *default {
+        print(COMMENTED)?;
+        return Ok(());
+    }
     let config = configuration.load()?;
     config.calibrations(&configuration.config)?;
     config.certificates(&configuration.config)?;
-    print(&config.to_toml())?;
+    print(&format!("{HEAD}{}", config.to_toml()))?;
     Ok(())
 }

@@ -2,16 +2,15 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, Result};
 use clap::Args;
 use clearway_mapping::config::Extrinsics;
 
-use crate::config::Config;
+use crate::config::{Config, ConfigError};
 
 /// The options that name a configuration file and override its keys.
 #[derive(Args)]
 pub struct ConfigurationOptions {
-    /// The configuration file; deploy/clearway.toml of the repository explains every key.
+    /// The configuration file; `clearway check --default` prints one with every key explained.
     #[arg(short, long, value_name = "FILE", env = "CLEARWAY_CONFIG", default_value = "clearway.toml")]
     pub config: PathBuf,
     /// Override a key of the configuration, such as grpc.listen=0.0.0.0:50051; may be given several times.
@@ -23,16 +22,9 @@ impl ConfigurationOptions {
     /// Reads the file, applies the overrides and checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`](crate::config::ConfigError); for a file that does not exist with how to get one.
-    pub fn load(&self) -> Result<Config> {
-        let loaded = Config::load(&self.config, &self.set);
-        if self.config.exists() {
-            return Ok(loaded?);
-        }
-        loaded.context(
-            "no configuration file; name one with --config FILE, or copy deploy/clearway.toml of the repository, \
-             which has every key with its default",
-        )
+    /// [`ConfigError`].
+    pub fn load(&self) -> Result<Config, ConfigError> {
+        Config::load(&self.config, &self.set)
     }
 }
 

@@ -2,9 +2,11 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, Error, Result};
+use anyhow::{Error, Result};
 use clap::Args;
 use clearway_client::{Client, ClientError, Tls};
+
+use super::files;
 
 /// The gRPC address of a server with the default configuration.
 const ADDRESS: &str = "localhost:50051";
@@ -32,7 +34,7 @@ impl ServerOptions {
     /// # Errors
     /// If a PEM file cannot be read, and as [`Client::connect`].
     pub async fn connect(&self) -> Result<Client> {
-        let read = |file: &PathBuf| std::fs::read_to_string(file).with_context(|| format!("read {}", file.display()));
+        let read = |file: &PathBuf| files::read_text(file);
         let Some(ca) = &self.ca else { return Client::connect(&self.address).await.map_err(explain) };
         let identity = match (&self.cert, &self.key) {
             (Some(certificate), Some(key)) => Some((read(certificate)?, read(key)?)),

@@ -1,35 +1,41 @@
 //! `clearway get`: a server -> its newest map, printed or written to a file.
 
-use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use clap::Args;
-use clearway_client::now_ns;
+use clearway_client::{Layer, MapView, now_ns};
+use serde_json::{Value, json};
 
 use super::connection::{ServerOptions, explain};
 use super::export::{DrawingOptions, layer_json, npy};
-use super::output::{block_on, print_line};
+use super::files;
+use super::output::{block_on, print_line, usage_error};
 use crate::encode::picture;
 
-/// Get the newest map: print its header and metrics, or write one layer to a file.
+/// Get the newest map: print one layer's classes and metrics, or write the layer to a file.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway get
   clearway get --layer drivability --out newest.png --rings 10
-  clearway get --layer occupancy --out newest.npy")]
+  clearway get --layer occupancy --out newest.npy
+  clearway get --json")]
 pub struct Options {
     #[command(flatten)]
     server: ServerOptions,
     /// The vehicle, if the server has several.
-    #[arg(long, default_value = "", hide_default_value = true)]
+    #[arg(long, value_name = "NAME", default_value = "", hide_default_value = true)]
     vehicle: String,
     /// The layer; the first of the map if absent.
     #[arg(long)]
     layer: Option<String>,
-    /// Write the layer to this file: .png (a picture), .npy (the channel `class`, or the first), .json (everything).
+    /// Write the layer to this file, which is replaced if it exists: .png (a picture), .npy (the channel `class`, or
+    /// the first), .json (everything).
     #[arg(long, value_name = "FILE.png|.npy|.json")]
     out: Option<PathBuf>,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
     #[command(flatten)]
     drawing: DrawingOptions,
 }
@@ -40,17 +46,38 @@ pub struct Options {
 /// [`ClientError`](clearway_client::ClientError) if the server refuses or does not answer; if the file cannot be
 /// written.
 pub fn run(options: &Options) -> Result<()> {
-    block_on(get(options))
+    let format = options.out.as_deref().map(Format::from_name).transpose()?;
+    if let Some(option) = options.drawing.first_given().filter(|_| format != Some(Format::Png)) {
+        return Err(usage_error(format!("{option} is for pictures: it needs --out FILE.png")));
+    }
+    block_on(get(options, format))
 }
 
-async fn get(options: &Options) -> Result<()> {
-    let Options { server, vehicle, layer, out, drawing } = options;
-    let extension = out.as_ref().map(|out| out.extension().and_then(|e| e.to_str()).unwrap_or("").to_owned());
-    if let (Some(out), Some(extension)) = (out, &extension)
-        && !matches!(extension.as_str(), "png" | "npy" | "json")
-    {
-        bail!("--out {}: the name ends in {extension:?}; .png, .npy and .json are allowed", out.display());
+/// Format of the file.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Format {
+    Png,
+    Npy,
+    Json,
+}
+
+impl Format {
+    /// The format that the end of a file's name gives.
+    fn from_name(file: &Path) -> Result<Self> {
+        match file.extension().and_then(|extension| extension.to_str()).unwrap_or("") {
+            "png" => Ok(Self::Png),
+            "npy" => Ok(Self::Npy),
+            "json" => Ok(Self::Json),
+            other => Err(usage_error(format!(
+                "--out {}: the name ends in {other:?}; .png, .npy and .json are allowed",
+                file.display()
+            ))),
+        }
     }
+}
+
+async fn get(options: &Options, format: Option<Format>) -> Result<()> {
+    let Options { server, vehicle, layer, out, json, drawing } = options;
     let client = server.connect().await?;
     let layers: Vec<String> = layer.iter().cloned().collect();
     let map = client.newest(vehicle, &layers).await.map_err(explain)?;
@@ -58,29 +85,75 @@ async fn get(options: &Options) -> Result<()> {
         Some(name) => map.layer(name)?,
         None => map.layers().first().context("the map has no layer")?,
     };
-    let Some(out) = out else {
-        let mut document = layer_json::layer(&map, layer, false);
-        document["age_ms"] = map.age_ms(now_ns()).into();
-        document["stale"] = map.is_stale(now_ns()).into();
-        print_line(&serde_json::to_string_pretty(&document)?)?;
+    let Some((file, format)) = out.as_ref().zip(format) else {
+        let text = if *json { format!("{:#}", document(&map, layer, now_ns())) } else { text(&map, layer, now_ns()) };
+        print_line(&text)?;
         return Ok(());
     };
-    let bytes = match extension.as_deref() {
-        Some("png") => picture::png(layer, &drawing.style())?,
-        Some("npy") => {
+    let bytes = match format {
+        Format::Png => picture::png(layer, &drawing.style())?,
+        Format::Npy => {
             let channel = layer.channel("class").or(layer.channels.first()).context("the layer has no channel")?;
             npy::encode(&channel.cells, layer.grid.shape())
         }
-        _ => serde_json::to_vec(&layer_json::layer(&map, layer, true))?,
+        Format::Json => serde_json::to_vec(&layer_json::layer(&map, layer, true))?,
     };
-    fs::write(out, bytes).with_context(|| format!("write {}", out.display()))?;
-    let age = map.age_ms(now_ns());
-    print_line(&format!(
-        "{} #{:06}: {}, {age:.0} ms old, written to {}",
-        map.vehicle(),
-        map.sequence(),
-        layer.name,
-        out.display()
-    ))?;
+    files::write(file, &bytes)?;
+    let (age_ms, stale) = (map.age_ms(now_ns()), map.is_stale(now_ns()));
+    print_line(&if *json {
+        json!({
+            "vehicle": map.vehicle(), "sequence": map.sequence(), "layer": layer.name, "age_ms": age_ms, "stale": stale,
+            "file": file,
+        })
+        .to_string()
+    } else {
+        let stale = if stale { ", STALE" } else { "" };
+        let (vehicle, sequence, name) = (map.vehicle(), map.sequence(), &layer.name);
+        format!("{vehicle} #{sequence:06}: {name}, {age_ms:.0} ms old{stale}, written to {}", file.display())
+    })?;
     Ok(())
+}
+
+/// The header, geometry, legend and metrics of one layer.
+fn document(map: &MapView, layer: &Layer, now_ns: i64) -> Value {
+    let mut document = layer_json::layer(map, layer, false);
+    document["age_ms"] = map.age_ms(now_ns).into();
+    document["stale"] = map.is_stale(now_ns).into();
+    document
+}
+
+/// A line for the map as `watch` prints it, the share of each class, and the metrics.
+fn text(map: &MapView, layer: &Layer, now_ns: i64) -> String {
+    let stale = if map.is_stale(now_ns) { "  STALE" } else { "" };
+    let (rows, columns) = layer.grid.shape();
+    let mut lines = vec![
+        format!("{} #{:06}  age {:7.1} ms{stale}", map.vehicle(), map.sequence(), map.age_ms(now_ns)),
+        format!("layer {}: {rows} rows, {columns} columns", layer.name),
+    ];
+    if let Some(class) = layer.channel("class") {
+        let cells = class.cells.len();
+        for (number, entry) in layer.legend.iter().enumerate() {
+            let count = (0..cells).filter(|&cell| class.cells.get(cell) == i32::try_from(number).ok()).count();
+            lines.push(format!(
+                "  {:<18} {:5.1} % of the cells",
+                entry.name,
+                100.0 * count as f64 / cells.max(1) as f64
+            ));
+        }
+    }
+    lines.extend(layer.metrics.iter().map(|(name, value)| format!("  {name} {value}")));
+    lines.join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_end_of_a_name_gives_the_format() {
+        let format = |name: &str| Format::from_name(Path::new(name));
+        assert!(format("a.png").unwrap() == Format::Png && format("b.npy").unwrap() == Format::Npy);
+        assert!(format("c.json").unwrap() == Format::Json);
+        assert!(format("d.jpg").unwrap_err().to_string().contains(".png, .npy and .json are allowed"));
+    }
 }

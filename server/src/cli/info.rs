@@ -14,19 +14,20 @@ use clearway_lidar::packet::PACKET_LENGTH;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use clearway_lidar::{Sensor, SensorConfig};
 use clearway_mapping::event::Scan;
-use clearway_mapping::scan_file::{read_bin, read_pcd};
+use clearway_mapping::scan_file;
 use serde_json::{Map, Value, json};
 
-use super::output::print_line;
+use super::files;
+use super::output::{counted, print_line};
 use crate::record::mcap_reader::McapReader;
 
-/// Describe a file: an MCAP recording, a pcap or pcapng capture, a KITTI .bin or a .pcd scan.
+/// Describe a file: an MCAP recording, a pcap or pcapng capture, or a scan (.bin, .pcd.bin, .pcd).
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway info drive.mcap
   clearway info drive.pcap --json")]
 pub struct Options {
-    /// The file.
+    /// The file; its first bytes, or else its name, give its kind.
     file: PathBuf,
     /// Print one JSON object.
     #[arg(long)]
@@ -40,13 +41,10 @@ pub struct Options {
 pub fn run(options: &Options) -> Result<()> {
     let file = &options.file;
     let mut start = Vec::new();
-    File::open(file)
-        .and_then(|f| f.take(8).read_to_end(&mut start))
-        .with_context(|| format!("open {}", file.display()))?;
+    files::open(file)?.0.take(8).read_to_end(&mut start).with_context(|| file.display().to_string())?;
     let extension = file.extension().and_then(|extension| extension.to_str()).unwrap_or("");
     let document = match extension {
-        "bin" => kitti(file),
-        "pcd" => pcd(file),
+        "bin" | "pcd" => scan_file(file),
         _ if start.starts_with(b"\x89MCAP") => recording(file),
         _ => capture(file),
     }
@@ -80,7 +78,8 @@ fn describe(object: &Map<String, Value>, indent: &str, lines: &mut Vec<String>) 
             }
             Value::Null => lines.push(format!("{indent}{key}: not known")),
             Value::String(text) if text.contains('\n') => {
-                lines.push(format!("{indent}{key}: {} lines; --json prints them", text.lines().count()));
+                lines
+                    .push(format!("{indent}{key}: {}; --json prints it", counted(text.lines().count() as u64, "line")));
             }
             Value::String(text) => lines.push(format!("{indent}{key}: {text}")),
             other => lines.push(format!("{indent}{key}: {other}")),
@@ -221,15 +220,12 @@ fn sensor(source: &Source) -> Value {
     })
 }
 
-fn kitti(file: &Path) -> Result<Value> {
-    Ok(scan("KITTI .bin", &read_bin(&std::fs::read(file)?)?))
+fn scan_file(file: &Path) -> Result<Value> {
+    let (format, found) = scan_file::read(&file.to_string_lossy(), &std::fs::read(file)?)?;
+    Ok(scan(format.as_str(), &found))
 }
 
-fn pcd(file: &Path) -> Result<Value> {
-    Ok(scan("PCD", &read_pcd(&std::fs::read(file)?)?))
-}
-
-/// The number of points of a scan and the box around those that are finite.
+/// The number of points and rings of a scan and the box around the points that are finite.
 fn scan(format: &str, scan: &Scan) -> Value {
     let points = || scan.x.iter().zip(&scan.y).zip(&scan.z).map(|((&x, &y), &z)| [x, y, z]);
     let finite = || points().filter(|point| point.iter().all(|value| value.is_finite()));
@@ -240,8 +236,10 @@ fn scan(format: &str, scan: &Scan) -> Value {
         });
         least_and_greatest.map(|bounds| bounds.map(rounded))
     };
+    let rings: std::collections::BTreeSet<u16> = scan.ring.iter().copied().collect();
     json!({
-        "kind": "scan", "format": format, "points": scan.x.len(), "not_finite": scan.x.len() - finite().count(),
+        "kind": "scan", "format": format, "rings": (!rings.is_empty()).then_some(rings.len()),
+        "points": scan.x.len(), "not_finite": scan.x.len() - finite().count(),
         "bounds_m": {"x": bounds(0), "y": bounds(1), "z": bounds(2)},
     })
 }

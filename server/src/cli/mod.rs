@@ -23,8 +23,10 @@
 //! | file | in -> out |
 //! |---|---|
 //! | `configuration` | options -> a configuration, extrinsics |
+//! | `model` | the name of a sensor model -> the model |
 //! | `connection` | options -> a connected client |
-//! | `output` | text -> stdout; progress bar, runtime, signals |
+//! | `files` | paths -> open files, or errors that say what to do |
+//! | `output` | text -> stdout; progress bar, runtime, signals, errors of usage |
 
 mod check;
 mod completions;
@@ -34,9 +36,11 @@ mod connection;
 pub mod demo;
 pub mod evaluate;
 mod export;
+mod files;
 mod get;
 mod info;
 mod ingest;
+mod model;
 mod output;
 pub mod replay;
 mod send;
@@ -60,7 +64,7 @@ use tracing_subscriber::EnvFilter;
 #[derive(Parser)]
 #[command(name = "clearway", version, after_help = EXIT_CODES)]
 struct Arguments {
-    /// Format of the log on stderr; RUST_LOG selects its lines.
+    /// Format of the log on stderr; the environment variable RUST_LOG, such as RUST_LOG=warn, selects its lines.
     #[arg(
         long,
         value_enum,
@@ -126,10 +130,13 @@ pub fn main() -> ExitCode {
     start_logs(arguments.log_format);
     match run(arguments.command) {
         Ok(code) => code,
-        Err(error) => {
-            eprintln!("clearway: {}", with_causes(&error));
-            ExitCode::FAILURE
-        }
+        Err(error) => match error.downcast::<clap::Error>() {
+            Ok(usage) => usage.exit(),
+            Err(error) => {
+                eprintln!("clearway: {}", with_causes(&error));
+                ExitCode::FAILURE
+            }
+        },
     }
 }
 
@@ -181,7 +188,10 @@ fn command() -> clap::Command {
     let command = Arguments::command();
     let list = grouped_subcommands(&command);
     let template = format!("{{about}}\n\n{{usage-heading}} {{usage}}\n{list}\nOptions:\n{{options}}{{after-help}}\n");
-    command.help_template(StyledStr::from(template))
+    let names: Vec<String> = command.get_subcommands().map(|command| command.get_name().to_owned()).collect();
+    // `--speed -1` is then a wrong speed and not an unknown option.
+    let numbers = |command: clap::Command, name| command.mut_subcommand(name, |c| c.allow_negative_numbers(true));
+    names.into_iter().fold(command, numbers).help_template(StyledStr::from(template))
 }
 
 /// The list of subcommands under the headings of [`GROUPS`]. clap lists them under one heading only.

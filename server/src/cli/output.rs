@@ -2,9 +2,11 @@
 
 use std::io::{ErrorKind, Write};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Error, Result};
 use indicatif::{ProgressBar, ProgressStyle};
 use tokio::signal::unix::{SignalKind, signal};
+
+pub use crate::counted::counted;
 
 /// Threads of the runtime at least, because zenoh needs several, whatever the machine has.
 const THREADS_MIN: usize = 2;
@@ -28,6 +30,11 @@ pub fn print(text: &str) -> Result<bool> {
 /// As [`print()`].
 pub fn print_line(line: &str) -> Result<bool> {
     print(&format!("{line}\n"))
+}
+
+/// An error of usage that only the values of several options together show; the command ends with exit code 2.
+pub fn usage_error(message: impl std::fmt::Display) -> Error {
+    clap::Error::raw(clap::error::ErrorKind::ArgumentConflict, format!("{message}\n")).into()
 }
 
 /// A progress bar on stderr of `length` bytes; nothing is drawn if stderr is not a terminal.

@@ -11,7 +11,7 @@ use crate::server::{Running, Server, Setup};
 /// Listen for sensor data, make maps and publish them, until SIGINT or SIGTERM.
 #[derive(Args)]
 #[command(after_help = "Examples:
-  clearway serve --config deploy/clearway.toml
+  clearway serve
   clearway serve --config car.toml --set grpc.listen=0.0.0.0:50051 --set recorder.file=drive.mcap")]
 pub struct Options {
     #[command(flatten)]

@@ -1,6 +1,5 @@
 //! `clearway simulate`: a simulated scene -> the datagrams of a simulated vehicle, in a capture or over UDP.
 
-use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -8,7 +7,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result};
 use clap::Args;
-use clap::builder::PossibleValuesParser;
+use clap::builder::{PossibleValue, PossibleValuesParser};
 use clearway_client::now_ns;
 use clearway_lidar::model::Model;
 use clearway_sim::scanner::ScannerConfig;
@@ -16,7 +15,9 @@ use clearway_sim::scenes::{self, Scene};
 use clearway_sim::traffic;
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
 
-use super::output::{print_line, progress_bar};
+use super::files;
+use super::model::ModelParser;
+use super::output::{counted, print_line, progress_bar};
 use super::send::udp::{self, Sender, Speed};
 
 /// Speed of the vehicle in the scene `street`, in m/s; as in `demo --sensors many`.
@@ -25,16 +26,25 @@ const STREET_MPS: f64 = 8.0;
 /// Builds a scene.
 type SceneMaker = fn() -> Scene;
 
-/// The scenes by name. In `flat`, `slopes`, `canopy`, `overhang` and `track` the vehicle stands still.
-const SCENES: [(&str, SceneMaker); 7] = [
-    ("town", scenes::town),
-    ("street", || traffic::street(STREET_MPS)),
-    ("flat", scenes::flat),
-    ("slopes", scenes::slopes_with_obstacles),
-    ("canopy", scenes::fenced_road_under_canopy),
-    ("overhang", scenes::fenced_road_with_low_overhang),
-    ("track", scenes::dirt_track_between_fields),
+/// The scenes: name, description, maker.
+const SCENES: [(&str, &str, SceneMaker); 7] = [
+    ("town", "a street round a block of buildings, with traffic; the vehicle drives", scenes::town),
+    ("street", "a straight street with traffic in both directions; the vehicle drives", || traffic::street(STREET_MPS)),
+    ("flat", "flat ground with few obstacles; the vehicle stands", scenes::flat),
+    ("slopes", "a road that falls and rises between banks and cars; the vehicle stands", scenes::slopes_with_obstacles),
+    ("canopy", "a fenced road under branches; the vehicle stands", scenes::fenced_road_under_canopy),
+    (
+        "overhang",
+        "the same road under a beam that is too low; the vehicle stands",
+        scenes::fenced_road_with_low_overhang,
+    ),
+    ("track", "a dirt track between ploughed fields; the vehicle stands", scenes::dirt_track_between_fields),
 ];
+
+/// The names of the scenes as the command line accepts them.
+fn names() -> PossibleValuesParser {
+    PossibleValuesParser::new(SCENES.map(|(name, description, _)| PossibleValue::new(name).help(description)))
+}
 
 /// Simulate a drive: write the datagrams of a simulated vehicle to a capture, or send them over UDP.
 ///
@@ -45,11 +55,11 @@ const SCENES: [(&str, SceneMaker); 7] = [
   clearway simulate town --seconds 10 --out drive.pcap
   clearway simulate street --sensor vlp16 --to udp://127.0.0.1:2368")]
 pub struct Options {
-    /// The scene; the vehicle drives in town and street, and stands in the others.
-    #[arg(value_parser = PossibleValuesParser::new(SCENES.map(|(name, _)| name)))]
+    /// The scene.
+    #[arg(value_parser = names())]
     scene: String,
-    /// Model of the sensor.
-    #[arg(long, value_name = "MODEL", default_value = "hdl64e_s2")]
+    /// Model of the sensor; hdl64e is hdl64e_s2.
+    #[arg(long, value_name = "MODEL", default_value = "hdl64e_s2", value_parser = ModelParser::simulated())]
     sensor: Model,
     /// Duration of the drive, in seconds.
     #[arg(long, default_value = "10", value_parser = seconds)]
@@ -63,8 +73,8 @@ pub struct Options {
     /// Send the datagrams to this address as they are made, in real time.
     #[arg(long, value_name = "udp://HOST:PORT")]
     to: Option<String>,
-    /// Target of the telemetry; that of the data packets if absent.
-    #[arg(long, value_name = "udp://HOST:PORT", requires = "to")]
+    /// With --to: the target of the telemetry; that of the data packets if absent.
+    #[arg(long, value_name = "udp://HOST:PORT", requires = "to", conflicts_with = "out")]
     telemetry_to: Option<String>,
 }
 
@@ -75,7 +85,7 @@ fn seconds(text: &str) -> Result<Duration, String> {
 
 /// The scene of that name; `None` if there is none.
 pub fn scene(name: &str) -> Option<Scene> {
-    SCENES.iter().find(|(known, _)| *known == name).map(|(_, scene)| scene())
+    SCENES.iter().find(|(known, ..)| *known == name).map(|(.., scene)| scene())
 }
 
 /// Simulates the drive.
@@ -95,10 +105,12 @@ pub fn run(options: &Options) -> Result<()> {
         (None, None) => unreachable!("clap requires --out or --to"),
     };
     print_line(&format!(
-        "{:.1} s of {} with the sensor {}: {packets} data packets and {telemetry} telemetry datagrams {target}",
+        "{:.1} s of {} with the sensor {}: {} and {} {target}",
         options.seconds.as_secs_f64(),
         options.scene,
         options.sensor.as_str(),
+        counted(packets, "data packet"),
+        counted(telemetry, "telemetry datagram"),
     ))?;
     Ok(())
 }
@@ -112,7 +124,7 @@ fn datagrams(vehicle: SimulatedVehicle, duration: Duration) -> impl Iterator<Ite
 /// Writes the drive to a new pcap file; returns the number of data packets and telemetry datagrams, and where they are.
 fn write_capture(vehicle: SimulatedVehicle, duration: Duration, file: &Path) -> Result<(u64, u64, String)> {
     let context = || format!("write {}", file.display());
-    let mut pcap = Pcap::new(BufWriter::new(File::create_new(file).with_context(context)?)).with_context(context)?;
+    let mut pcap = Pcap::new(BufWriter::new(files::create_new(file)?)).with_context(context)?;
     let start_ns = vehicle.start_ns();
     let progress = progress_bar(u64::try_from(duration.as_millis()).unwrap_or(u64::MAX));
     let (mut packets, mut telemetry) = (0, 0);

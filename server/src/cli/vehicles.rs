@@ -6,8 +6,8 @@ use clearway_client::{now_ns, v1};
 use serde_json::{Value, json};
 
 use super::connection::{ServerOptions, explain};
-use super::output::{block_on, print_line};
-use crate::status::{ledger_json, sensor_json};
+use super::output::{block_on, counted, print_line};
+use crate::status::vehicle_json;
 
 /// List the vehicles of a server: maps, sensors, refused and lost datagrams, readers, recording.
 #[derive(Args)]
@@ -52,37 +52,29 @@ fn age_ms(vehicle: &v1::Vehicle, now: i64) -> Option<f64> {
 }
 
 fn document(vehicle: &v1::Vehicle, now: i64) -> Value {
-    let ledger = vehicle.ledger.clone().unwrap_or_default();
-    let recorder = vehicle.recorder.clone().unwrap_or_default();
-    let sensors = vehicle.sensors.iter().map(|state| {
-        let mut sensor = sensor_json(state);
-        sensor["ledger"] = vehicle.sensor_ledgers.get(&state.name).map(ledger_json).into();
-        sensor
+    let unknown_senders = vehicle.unknown_senders.iter().map(|sender| {
+        let age_ms = (now - sender.newest_ns) as f64 * 1e-6;
+        json!({"address": sender.address, "datagrams": sender.datagrams, "newest_age_ms": age_ms})
     });
-    json!({
-        "name": vehicle.name,
-        "boot_id": vehicle.boot_id,
-        "layers": vehicle.layers,
-        "maps": vehicle.maps,
-        "newest_age_ms": age_ms(vehicle, now),
-        "sensors": sensors.collect::<Vec<_>>(),
-        "ledger": ledger_json(&ledger),
-        "observations_refused": vehicle.observations_refused,
-        "recorder": {"file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost},
-        "readers": vehicle.readers,
-        "unknown_senders": vehicle.unknown_senders.iter().map(|s| {
-            json!({"address": s.address, "datagrams": s.datagrams, "newest_age_ms": (now - s.newest_ns) as f64 * 1e-6})
-        }).collect::<Vec<_>>(),
-    })
+    let mut document = vehicle_json(vehicle);
+    document["boot_id"] = vehicle.boot_id.into();
+    document["newest_age_ms"] = age_ms(vehicle, now).into();
+    document["unknown_senders"] = unknown_senders.collect();
+    document
 }
 
 /// The lines for one vehicle.
 fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
     let age = age_ms(vehicle, now).map_or("none yet".to_owned(), |age| format!("newest {age:.0} ms old"));
-    let mut lines =
-        vec![format!("{}: {} maps, {age}; layers {}", vehicle.name, vehicle.maps, vehicle.layers.join(", "))];
+    let mut lines = vec![format!(
+        "{}: {}, {age}; layers {}",
+        vehicle.name,
+        counted(vehicle.maps, "map"),
+        vehicle.layers.join(", ")
+    )];
     for state in &vehicle.sensors {
         lines.push(sensor_line(state));
+        lines.extend(vehicle.mounts.get(&state.name).filter(|mount| mount.contradicts).map(mount_line));
         lines.extend(vehicle.sensor_ledgers.get(&state.name).map(|ledger| format!("    {}", ledger_line(ledger))));
     }
     if let Some(ledger) = &vehicle.ledger {
@@ -97,10 +89,14 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
     }
     for s in &vehicle.unknown_senders {
         let age = (now - s.newest_ns) as f64 * 1e-9;
-        lines.push(format!("  unknown sender {}: {} datagrams, the newest {age:.0} s ago", s.address, s.datagrams));
+        let datagrams = counted(s.datagrams, "datagram");
+        lines.push(format!("  unknown sender {}: {datagrams}, the newest {age:.0} s ago", s.address));
     }
     match vehicle.recorder.as_ref().filter(|recorder| !recorder.file.is_empty()) {
-        Some(r) => lines.push(format!("  recording {}: {} events, {} maps, lost {}", r.file, r.events, r.maps, r.lost)),
+        Some(r) => {
+            let (events, maps) = (counted(r.events, "event"), counted(r.maps, "map"));
+            lines.push(format!("  recording {}: {events}, {maps}, lost {}", r.file, r.lost));
+        }
         None => lines.push("  not recording".into()),
     }
     let readers: Vec<_> = vehicle.readers.iter().map(|(transport, n)| format!("{transport} {n}")).collect();
@@ -114,18 +110,28 @@ fn sensor_line(state: &v1::SensorState) -> String {
     let lasers = state.blocked_lasers.iter().map(|laser| format!("laser {laser}"));
     let blocked = sectors.chain(lasers).collect::<Vec<_>>().join(", ");
     let blocked = if blocked.is_empty() { blocked } else { format!(", BLOCKED: {blocked}") };
+    let elevations =
+        if state.elevations.is_empty() { String::new() } else { format!(", elevations {}", state.elevations) };
     format!(
-        "  sensor {} ({}): {:.0} rpm, {} of {} packets and {} returns a revolution, {:.1} % of the revolution{partial}\
-         {blocked}, clock {} (host {:+} ms)",
+        "  sensor {} ({}): {:.0} rpm, {} of {} packets and {} a revolution, {:.1} % of the revolution{partial}\
+         {blocked}{elevations}, clock {} (host {:+} ms)",
         state.name,
         state.model,
         state.rpm,
         state.packets,
         state.packets_expected,
-        state.returns,
+        counted(state.returns.into(), "return"),
         100.0 * state.completeness,
         state.clock,
         state.clock_offset_ms
+    )
+}
+
+fn mount_line(mount: &v1::MountDeviation) -> String {
+    format!(
+        "    MOUNT: the ground contradicts it: the sensor is {:+.2} ± {:.2} m higher than configured, the ground is \
+         tilted by {:+.1} ± {:.1} deg in pitch and {:+.1} ± {:.1} deg in roll",
+        mount.height_m, mount.height_std_m, mount.pitch_deg, mount.pitch_std_deg, mount.roll_deg, mount.roll_std_deg
     )
 }
 

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::Args;
 
-use super::output::print_line;
+use super::output::{counted, print_line};
 use crate::record::verify::verify;
 
 /// Compute every map of a recording again from its events, and name the first differences.
@@ -35,11 +35,13 @@ pub fn run(options: &Options) -> Result<ExitCode> {
     } else {
         let file = options.file.display();
         let cut = if report.cut { "; the file is cut off, as after a crash, and this is all it holds" } else { "" };
-        let counts = format!("{} events, {} maps, {} layers equal{cut}", report.events, report.maps, report.equal);
+        let [events, maps, equal] = [(report.events, "event"), (report.maps, "map"), (report.equal, "layer")]
+            .map(|(count, noun)| counted(count, noun));
+        let counts = format!("{events}, {maps}, {equal} equal{cut}");
         if report.is_good() {
             print_line(&format!("{file}: every map is the map of its events: {counts}"))?;
         } else {
-            print_line(&format!("{file}: {} differences: {counts}", report.different))?;
+            print_line(&format!("{file}: {}: {counts}", counted(report.different, "difference")))?;
             for difference in &report.differences {
                 print_line(&difference.to_string())?;
             }

@@ -26,15 +26,15 @@ pub struct Options {
     #[command(flatten)]
     server: ServerOptions,
     /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447.
-    #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
+    #[arg(long, value_name = "ENDPOINT", conflicts_with_all = ["address", "ca", "cert", "key"])]
     zenoh: Option<String>,
     /// The vehicle, if the server has several.
-    #[arg(long)]
+    #[arg(long, value_name = "NAME")]
     vehicle: Option<String>,
-    /// Layers, separated by commas; all if absent. Over zenoh one layer, drivability if absent.
-    #[arg(long, value_delimiter = ',')]
+    /// Layers, separated by commas; all if absent. Over zenoh one layer; drivability if absent.
+    #[arg(long, alias = "layer", value_name = "LAYER", value_delimiter = ',')]
     layers: Vec<String>,
-    /// Most maps a second; every map if absent.
+    /// Greatest number of maps a second; every map if absent.
     #[arg(long, value_name = "HZ", conflicts_with = "zenoh")]
     max_rate_hz: Option<f64>,
     /// Receive only the cells that have changed since the last map.
@@ -43,8 +43,8 @@ pub struct Options {
     /// Print each line as a JSON object.
     #[arg(long)]
     json: bool,
-    /// End after this many maps.
-    #[arg(long)]
+    /// End after this many maps; at Ctrl-C if absent.
+    #[arg(long, value_name = "MAPS")]
     count: Option<u64>,
 }
 

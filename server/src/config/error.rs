@@ -1,8 +1,9 @@
 //! Errors of the configuration, and paths that it names.
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 
-/// A value that is not allowed; [`ConfigError::Value`] adds the file.
+/// A value that is not allowed; [`ConfigError::Value`] adds where it was given.
 #[derive(Debug, thiserror::Error)]
 #[error("{key} = {value}: allowed: {allowed}")]
 pub(super) struct ValueError {
@@ -18,22 +19,63 @@ impl ValueError {
     pub fn new(key: impl Into<String>, value: impl ToString, allowed: impl Into<String>) -> Self {
         Self { key: key.into(), value: value.to_string(), allowed: allowed.into() }
     }
+
+    /// The error for a value that was given at `origin`.
+    pub fn at(self, origin: &Origin) -> ConfigError {
+        let Self { key, value, allowed } = self;
+        ConfigError::Value { origin: origin.clone(), key, value, allowed }
+    }
+}
+
+/// Where a key or a value was given.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Origin {
+    /// In the configuration file.
+    File {
+        /// The file.
+        file: PathBuf,
+        /// Number of the line, if it is known.
+        line: Option<usize>,
+    },
+    /// In options of the command line, such as `--set grpc.listen=abc`.
+    Options(Vec<String>),
+}
+
+impl Origin {
+    /// The configuration file, at a line that is not known.
+    pub fn file(file: &Path) -> Self {
+        Self::File { file: file.to_owned(), line: None }
+    }
+}
+
+impl fmt::Display for Origin {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::File { file, line: None } => write!(f, "configuration {}", file.display()),
+            Self::File { file, line: Some(line) } => write!(f, "configuration {}, line {line}", file.display()),
+            Self::Options(options) => f.write_str(&options.join(" ")),
+        }
+    }
 }
 
 /// Why a configuration cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
-    #[error("configuration {}: {source}", file.display())]
+    #[error(
+        "configuration {}: {source}; `clearway check --default > clearway.toml` writes a file with every key and its \
+         default, and `--config FILE` names the file to use",
+        file.display()
+    )]
     Read {
         /// The configuration file.
         file: PathBuf,
         /// Error of the system.
         source: std::io::Error,
     },
-    /// The text is not TOML, or has an unknown key or a value of the wrong type. The source shows line and column.
+    /// The text is not TOML. The source shows line and column.
     #[error("configuration {}: {source}", file.display())]
-    Parse {
+    Syntax {
         /// The configuration file.
         file: PathBuf,
         /// Position and reason.
@@ -45,11 +87,37 @@ pub enum ConfigError {
         /// The override.
         text: String,
     },
+    /// The key of an override goes on below a value that is no table.
+    #[error("--set {text}: {key} is not a table, so that it has no keys")]
+    NotTable {
+        /// The override.
+        text: String,
+        /// The key that is no table.
+        key: String,
+    },
+    /// A table has no such key.
+    #[error("{origin}: {key} is not a key; its table has: {known}")]
+    UnknownKey {
+        /// The file or the options.
+        origin: Origin,
+        /// Path of the key.
+        key: String,
+        /// The keys of the table, separated by commas.
+        known: String,
+    },
+    /// A key that has no default is not given.
+    #[error("{origin}: {key} is missing, and has no default; `clearway check --default` shows every key")]
+    MissingKey {
+        /// The file or the options.
+        origin: Origin,
+        /// Path of the key.
+        key: String,
+    },
     /// A value is not allowed.
-    #[error("configuration {}: {key} = {value}: allowed: {allowed}", file.display())]
+    #[error("{origin}: {key} = {value}: allowed: {allowed}")]
     Value {
-        /// The configuration file.
-        file: PathBuf,
+        /// The file or the options.
+        origin: Origin,
         /// Path of the key.
         key: String,
         /// The value that was found.

@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::file_advice::advised;
+
 use super::error::{ConfigError, ValueError, beside};
 
 /// The table `[grpc]`.
@@ -93,7 +95,7 @@ impl Grpc {
                 named: named.clone(),
                 reason,
             };
-            let text = std::fs::read_to_string(&named).map_err(|error| wrong(error.to_string()))?;
+            let text = std::fs::read_to_string(&named).map_err(|error| wrong(advised(&named, error).to_string()))?;
             let what = if key == "key" { "PRIVATE KEY-----" } else { "BEGIN CERTIFICATE-----" };
             let found = text.contains(what);
             if found { Ok(text) } else { Err(wrong(format!("no PEM block \"{what}\" in it"))) }

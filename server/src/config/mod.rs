@@ -1,8 +1,8 @@
 //! One TOML file -> [`Config`]: what is served where, what is recorded, and which vehicles there are.
 //!
-//! An unknown key is refused with its line; a value that is not allowed is refused with the file, the key, the value
-//! and what is allowed. Calibration files are read here too, so that no socket is opened before the whole configuration
-//! is valid. `deploy/clearway.toml` holds every key with its default.
+//! An error names where the key was given (the file and its line, or the option), the key, its value and what is
+//! allowed. Calibration files are read here too, so that no socket is opened before the whole configuration is valid.
+//! `deploy/clearway.toml` holds every key with its default.
 
 use std::collections::BTreeSet;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -12,23 +12,29 @@ use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::SensorConfig;
 use serde::{Deserialize, Serialize};
 
+use crate::file_advice::advised;
 use error::{ValueError, beside};
+use read::{Problem, Refusal, plain_key};
 
 mod error;
 mod grpc;
 mod listeners;
+mod read;
 mod ros;
 mod udp;
 mod vehicle;
 mod zenoh;
 
-pub use error::ConfigError;
+pub use error::{ConfigError, Origin};
 pub use grpc::{Access, Certificates, Grpc, Tls};
 pub use listeners::{Listener, Route, listeners};
 pub use ros::Ros;
 pub use udp::{Ports, Sender, Udp};
 pub use vehicle::{Ingest, Vehicle};
 pub use zenoh::{Ros2, Zenoh, ZenohMode};
+
+/// The commented configuration: every key with its default, the optional tables as comments.
+pub const COMMENTED: &str = include_str!("../../../deploy/clearway.toml");
 
 /// The configured tables by vehicle and sensor, in the order of the configuration; `None` selects the
 /// factory's table.
@@ -126,28 +132,44 @@ impl Config {
     /// # Errors
     /// [`ConfigError::Read`] if the file cannot be read, and the errors of [`Config::parse`].
     pub fn load(file: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let text =
-            std::fs::read_to_string(file).map_err(|source| ConfigError::Read { file: file.to_owned(), source })?;
+        let text = std::fs::read_to_string(file)
+            .map_err(|source| ConfigError::Read { file: file.to_owned(), source: advised(file, source) })?;
         Self::parse(&text, file, overrides)
     }
 
     /// Like [`Config::load`], from a text; errors name `file`.
     ///
     /// # Errors
-    /// [`ConfigError::Parse`] if the text is not TOML or has an unknown key, [`ConfigError::Override`] if an override
-    /// is not `key=value`, [`ConfigError::Value`] if a value is not allowed.
+    /// [`ConfigError::Syntax`] if the text is not TOML, [`ConfigError::Override`] or [`ConfigError::NotTable`] if an
+    /// override is not `key=value` or its key goes on below a value; [`ConfigError::UnknownKey`],
+    /// [`ConfigError::MissingKey`] and [`ConfigError::Value`] for the first key or value that is not allowed.
     pub fn parse(text: &str, file: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let parse = |source| ConfigError::Parse { file: file.to_owned(), source: Box::new(source) };
-        let mut config: Self = toml::from_str(text).map_err(parse)?;
-        if !overrides.is_empty() {
-            let mut table: toml::Table = toml::from_str(text).map_err(parse)?;
-            for text in overrides {
-                set(&mut table, text)?;
-            }
-            config = table.try_into().map_err(parse)?;
+        let syntax = |source| ConfigError::Syntax { file: file.to_owned(), source: Box::new(source) };
+        let mut table: toml::Table = toml::from_str(text).map_err(syntax)?;
+        let config: Self = read::from_text(text, &table).map_err(|refusal| {
+            let line = refusal.at.map(|at| 1 + text[..at].matches('\n').count());
+            refused(refusal, Origin::File { file: file.to_owned(), line })
+        })?;
+        if overrides.is_empty() {
+            config.check(&Origin::file(file))?;
+            return Ok(config);
         }
-        config.check(file)?;
-        Ok(config)
+        overrides.iter().try_for_each(|text| set(&mut table, text))?;
+        let blamed = |key: &str| Origin::Options(blamed(overrides, key));
+        let overridden: Self = read::from_table(&table).map_err(|refusal| {
+            // A key is missing because an override begins its table.
+            let is_missing = refusal.problem == Problem::Missing;
+            let key = refusal.key.rsplit_once('.').filter(|_| is_missing).map_or(&*refusal.key, |(table, _)| table);
+            let origin = blamed(key);
+            refused(refusal, origin)
+        })?;
+        overridden.check_values().map_err(|error| {
+            // What the file holds without the overrides is not the fault of one, unless it sets that key.
+            let is_of_file = config.check_values().is_err() && matching(overrides, &error.key).next().is_none();
+            let origin = if is_of_file { Origin::file(file) } else { blamed(&error.key) };
+            error.at(&origin)
+        })?;
+        Ok(overridden)
     }
 
     /// A configuration of one vehicle with one sensor and every default. The sensor is level, 2 m above the ground,
@@ -165,15 +187,12 @@ impl Config {
         toml::to_string(self).expect("configurations have string keys only")
     }
 
-    /// Checks the values, beyond their types.
+    /// Checks the values, beyond their types; `origin` is where they were given.
     ///
     /// # Errors
     /// [`ConfigError::Value`] for the first value that is not allowed.
-    pub fn check(&self, file: &Path) -> Result<(), ConfigError> {
-        self.check_values().map_err(|ValueError { key, value, allowed }| {
-            let file = file.to_owned();
-            ConfigError::Value { file, key, value, allowed }
-        })
+    pub fn check(&self, origin: &Origin) -> Result<(), ConfigError> {
+        self.check_values().map_err(|error| error.at(origin))
     }
 
     fn check_values(&self) -> Result<(), ValueError> {
@@ -227,7 +246,7 @@ impl Config {
                 named: path.clone(),
                 reason,
             };
-            let text = std::fs::read_to_string(&path).map_err(|error| wrong(error.to_string()))?;
+            let text = std::fs::read_to_string(&path).map_err(|error| wrong(advised(&path, error).to_string()))?;
             let table = Calibration::load_str(&text).map_err(|error| wrong(error.to_string()))?;
             if let Some(model) = sensor.model {
                 table.fits(model).map_err(|error| wrong(error.to_string()))?;
@@ -235,6 +254,37 @@ impl Config {
             Ok(Some(table))
         };
         self.vehicles.iter().map(|v| v.sensors.iter().map(|s| of(v, s)).collect()).collect()
+    }
+}
+
+/// The error for a key or value that was given at `origin`.
+fn refused(refusal: Refusal, origin: Origin) -> ConfigError {
+    let Refusal { key, problem, .. } = refusal;
+    match problem {
+        Problem::Unknown { known } => ConfigError::UnknownKey { origin, key, known },
+        Problem::Missing => ConfigError::MissingKey { origin, key },
+        Problem::Value { value, allowed } => ConfigError::Value { origin, key, value, allowed },
+    }
+}
+
+/// The overrides that set `key`, a table with that key, or a key of that table.
+fn matching<'a>(overrides: &'a [String], key: &str) -> impl Iterator<Item = &'a String> {
+    let key = plain_key(key);
+    let is_within = |inner: &str, outer: &str| {
+        inner.strip_prefix(outer).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+    };
+    overrides.iter().filter(move |text| {
+        let path = text.split('=').next().unwrap_or(text).trim();
+        is_within(path, &key) || is_within(&key, path)
+    })
+}
+
+/// The options that an error at `key` is due to: the last override of that key, or all if none sets it.
+fn blamed(overrides: &[String], key: &str) -> Vec<String> {
+    let option = |text: &String| format!("--set {text}");
+    match matching(overrides, key).last() {
+        Some(text) => vec![option(text)],
+        None => overrides.iter().map(option).collect(),
     }
 }
 
@@ -246,19 +296,20 @@ fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
         Ok(mut parsed) => parsed.remove("v").ok_or_else(wrong)?,
         Err(_) => toml::Value::String(value.to_owned()),
     };
-    let mut keys: Vec<&str> = path.trim().split('.').collect();
-    let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(wrong)?;
+    let keys: Vec<&str> = path.trim().split('.').collect();
+    let (last, before) = keys.split_last().filter(|_| keys.iter().all(|key| !key.is_empty())).ok_or_else(wrong)?;
     let mut place = table;
-    for key in keys {
-        let slot = place.entry(key).or_insert_with(|| toml::Value::Table(toml::Table::new()));
+    for (index, key) in before.iter().enumerate() {
+        let not_table = || ConfigError::NotTable { text: text.to_owned(), key: keys[..=index].join(".") };
+        let slot = place.entry(*key).or_insert_with(|| toml::Value::Table(toml::Table::new()));
         // `vehicle.udp.data` means the first vehicle: the common case has one.
         let slot = match slot {
-            toml::Value::Array(items) => items.first_mut().ok_or_else(wrong)?,
+            toml::Value::Array(items) => items.first_mut().ok_or_else(not_table)?,
             other => other,
         };
-        place = slot.as_table_mut().ok_or_else(wrong)?;
+        place = slot.as_table_mut().ok_or_else(not_table)?;
     }
-    place.insert(last.to_owned(), value);
+    place.insert((*last).to_owned(), value);
     Ok(())
 }
 

@@ -2,7 +2,6 @@
 
 use super::*;
 
-const COMMENTED: &str = include_str!("../../../deploy/clearway.toml");
 /// A configuration with the keys that have no default, and no others.
 const NEEDED: &str = "[[vehicle]]\nname = \"car\"\n[vehicle.udp]\n[[vehicle.sensor]]\nname = \"top\"\n\
     [vehicle.sensor.extrinsics]\nx_m = 0.0\ny_m = 0.0\nz_m = 1.9\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n";
@@ -39,10 +38,122 @@ fn the_commented_configuration_holds_every_key_with_its_default() {
     keys(&toml::from_str(&commented.to_toml()).unwrap(), "", &mut all);
     let missing: Vec<_> = all.difference(&said).collect();
     assert!(missing.is_empty(), "not in deploy/clearway.toml: {missing:?}");
-    // Keys without a default are comments in that file.
-    for optional in ["# model = ", "# rpm = ", "# calibration = ", "# top = \"", "# top = {"] {
-        assert!(COMMENTED.contains(optional), "{optional}");
+}
+
+/// The commented configuration with its optional keys and tables, which are comments in it.
+fn uncommented() -> String {
+    let is_toml = |line: &str| {
+        let name = line.split_once(" = ").map_or("", |(name, _)| name);
+        let is_key = !name.is_empty() && name.bytes().all(|byte| byte == b'_' || byte.is_ascii_lowercase());
+        (is_key || line.starts_with('[')) && toml::from_str::<toml::Table>(line).is_ok()
+    };
+    let line = |line: &str| match line.strip_prefix("# ").filter(|line| is_toml(line)) {
+        Some(optional) => format!("{optional}\n"),
+        None => format!("{line}\n"),
+    };
+    COMMENTED.lines().map(line).collect()
+}
+
+#[test]
+fn the_commented_configuration_shows_every_optional_key_and_table() {
+    let text = uncommented();
+    let config = parse(&text).unwrap();
+    let (vehicle, tls) = (&config.vehicles[0], config.grpc.tls.as_ref().unwrap());
+    let sensor = &vehicle.sensors[0];
+    assert!(vehicle.ros.is_some() && vehicle.body.is_some() && tls.client_ca.is_some());
+    assert!(sensor.model.is_some() && sensor.rpm.is_some() && sensor.calibration.is_some());
+    let udp = vehicle.udp.as_ref().unwrap();
+    assert!(udp.from.contains_key("top") && udp.ports.contains_key("top"));
+    let (mut shown, mut all) = (BTreeSet::new(), BTreeSet::new());
+    keys(&toml::from_str(&text).unwrap(), "", &mut shown);
+    keys(&toml::from_str(&config.to_toml()).unwrap(), "", &mut all);
+    assert_eq!(all.difference(&shown).collect::<Vec<_>>(), Vec::<&String>::new());
+}
+
+/// The keys below `at` that hold a single value or a list of such, and a value of another type for each.
+fn wrong_values(value: &toml::Value, at: &str, found: &mut Vec<(String, String)>) {
+    match value {
+        toml::Value::Table(table) => {
+            for (key, value) in table {
+                wrong_values(value, &if at.is_empty() { key.clone() } else { format!("{at}.{key}") }, found);
+            }
+        }
+        toml::Value::Array(items) if items.iter().any(toml::Value::is_table) => {
+            items.iter().for_each(|item| wrong_values(item, at, found));
+        }
+        toml::Value::String(_) => found.push((at.to_owned(), "true".into())),
+        _ => found.push((at.to_owned(), "\"many\"".into())),
     }
+}
+
+#[test]
+fn a_value_of_a_wrong_type_is_named_with_key_value_and_what_is_allowed() {
+    let text = uncommented();
+    let mut wrong = Vec::new();
+    wrong_values(&toml::from_str(&text).unwrap(), "", &mut wrong);
+    assert!(wrong.len() > 100, "{wrong:?}");
+    for (key, value) in wrong {
+        // `from.top` of `[vehicle.udp]`, and `vehicle.name`, which then cannot name its vehicle.
+        let option = format!("{key}={value}");
+        let error = Config::parse(&text, Path::new("a.toml"), std::slice::from_ref(&option)).unwrap_err().to_string();
+        let plain = error.replace("[0]", "").replace(" (of car)", "");
+        let start = format!("--set {option}: {key} = {value}: allowed: ");
+        let allowed = plain.strip_prefix(&start).unwrap_or_else(|| panic!("{option}: {error}"));
+        let rust = ["expected", "invalid", "u16", "u32", "u64", "usize", "f32", "f64", "struct ", "variant", "string"];
+        assert!(!allowed.is_empty() && rust.iter().all(|word| !allowed.contains(word)), "{option}: {error}");
+    }
+}
+
+#[test]
+fn a_wrong_value_is_named_with_its_line() {
+    let refused = error(&format!("[grpc]\nenabled = true\nlisten = \"localhost\"\n{NEEDED}"));
+    let start = "configuration clearway.toml, line 3: grpc.listen = \"localhost\": allowed: an address with a port";
+    assert!(refused.starts_with(start), "{refused}");
+    let refused = error(&NEEDED.replace("name = \"top\"", "name = \"top\"\nmodel = \"hdl64e\""));
+    let start = "configuration clearway.toml, line 6: vehicle.sensor[0].model (of car) = \"hdl64e\": allowed: ";
+    assert!(refused.starts_with(start) && refused.contains("\"hdl64e_s2\", \"hdl64e_s3\""), "{refused}");
+}
+
+#[test]
+fn tables_with_the_wrong_number_of_brackets_are_shown_with_the_right_one() {
+    let name = "vehicle = (a table): allowed: a list of tables: write [[vehicle]] instead of [vehicle]";
+    assert!(
+        error(&NEEDED.replace("[[vehicle]]", "[vehicle]").replace("[[vehicle.sensor]]", "[vehicle.sensor]"))
+            .contains(name)
+    );
+    let sensor = error(&NEEDED.replace("[[vehicle.sensor]]", "[vehicle.sensor]"));
+    assert!(sensor.contains("write [[vehicle.sensor]] instead of [vehicle.sensor]"), "{sensor}");
+    let grpc = error(&format!("[[grpc]]\nenabled = true\n{NEEDED}"));
+    assert!(grpc.contains("grpc = (a table): allowed: one table: write [grpc] instead of [[grpc]]"), "{grpc}");
+    let udp = error(&NEEDED.replace("[vehicle.udp]", "[[vehicle.udp]]"));
+    assert!(udp.contains("write [vehicle.udp] instead of [[vehicle.udp]]"), "{udp}");
+    assert!(error("vehicle = 3").contains("vehicle = 3: allowed: a list of tables: write [[vehicle]]"));
+}
+
+#[test]
+fn an_error_of_an_override_names_the_option_and_not_the_file() {
+    let refused = |text: &str, overrides: &[&str]| {
+        let overrides: Vec<String> = overrides.iter().map(|&text| text.to_owned()).collect();
+        Config::parse(text, Path::new("clearway.toml"), &overrides).unwrap_err().to_string()
+    };
+    for (option, error) in [
+        ("grpc.listen=abc", "--set grpc.listen=abc: grpc.listen = \"abc\": allowed: an address with a port"),
+        ("grpc.liste=1", "--set grpc.liste=1: grpc.liste is not a key; its table has: enabled, listen"),
+        ("vehicle.queue=3", "--set vehicle.queue=3: vehicle.queue (of car) = 3: allowed: 16 to 1048576"),
+        ("vehicle.sensor.rpm=1", "--set vehicle.sensor.rpm=1: vehicle.sensor[0].rpm (of car) = 1: allowed: 60 to 2400"),
+        ("vehicle.body.x_m_min=-1", "--set vehicle.body.x_m_min=-1: vehicle.body.x_m_max (of car) is missing"),
+        ("vehicle.name.first=a", "--set vehicle.name.first=a: vehicle.name is not a table"),
+        ("grpc..listen=a", "--set grpc..listen=a: expected KEY=VALUE"),
+    ] {
+        let refused = refused(NEEDED, &["zenoh.enabled=true", option, "page.enabled=true"]);
+        assert!(refused.starts_with(error), "{option}: {refused}");
+    }
+    // The file is to blame for what no override sets.
+    let queue = NEEDED.replace("name = \"car\"", "name = \"car\"\nqueue = 3");
+    assert!(refused(&queue, &["page.enabled=true"]).starts_with("configuration clearway.toml: vehicle.queue"));
+    // Values that are wrong only beside an override are the fault of the overrides.
+    let ros = NEEDED.replace("[vehicle.udp]", "[vehicle.ros]");
+    assert!(refused(&ros, &["zenoh.enabled=false"]).starts_with("--set zenoh.enabled=false: vehicle.ros (of car)"));
 }
 
 #[test]
@@ -67,7 +178,7 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
         ("[vehicle.udp]", "[vehicle.udp]\nfrom = { roof = \"10.0.0.1\" }", "top"),
         ("[vehicle.udp]", "[vehicle.udp]\nreceive_buffer_bytes = 1", "65536"),
         ("[vehicle.udp]", "[vehicle.udp]\nports = { roof = { data = 1, telemetry = 2 } }", "top"),
-        ("[vehicle.udp]", "[vehicle.udp]\nports = { top = { data = 70000, telemetry = 2 } }", "u16"),
+        ("[vehicle.udp]", "[vehicle.udp]\nports = { top = { data = 70000, telemetry = 2 } }", "0 to 65535"),
         ("[vehicle.udp]", "[vehicle.udp]\ngroups = [\"10.0.0.1\"]", "multicast"),
         ("[vehicle.udp]", "[vehicle.udp]\ngroups = [\"ff02::1\"]", "multicast"),
         ("[[vehicle]]", "[zenoh]\nlisten = [\"quic/1.2.3.4:1\"]\n[[vehicle]]", "tcp/127.0.0.1:7447"),
@@ -165,13 +276,10 @@ fn sensors_that_cannot_be_distinguished_are_refused() {
 
 #[test]
 fn the_commented_ros_table_is_valid_and_wrong_topics_are_named() {
-    let shown = include_str!("../../../deploy/clearway.toml");
-    let from = shown.find("# [vehicle.ros]").unwrap();
-    let block: String = shown[from..].lines().take_while(|line| !line.is_empty()).fold(String::new(), |block, line| {
-        let line = line.strip_prefix("# ").unwrap_or(line);
-        let is_key = line.starts_with('[') || line.split_once(" = ").is_some_and(|(key, _)| !key.contains(' '));
-        if is_key { block + line + "\n" } else { block }
-    });
+    let text = uncommented();
+    let from = text.find("[vehicle.ros]").unwrap();
+    let block: String =
+        text[from..].lines().take_while(|line| !line.is_empty()).map(|line| format!("{line}\n")).collect();
     let head = "[[vehicle]]\nname = \"car\"\n";
     let sensor = NEEDED.split_once("[vehicle.udp]\n").unwrap().1;
     let parse = |ros: &str, set: &[String]| Config::parse(&format!("{head}{ros}{sensor}"), Path::new("a.toml"), set);

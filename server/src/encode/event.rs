@@ -30,6 +30,7 @@ fn road(road: &Road) -> v1::Road {
         y: road.points.iter().map(|[_, y]| *y).collect(),
         width: road.widths_m.clone(),
         orientations: road.orientations.clone(),
+        speed_limit: road.speed_limits_mps.clone(),
     }
 }
 
@@ -58,6 +59,7 @@ pub(crate) fn road_from_proto(road: v1::Road) -> Result<Road, NoCounterpartError
         points: road.x.into_iter().zip(road.y).map(|(x, y)| [x, y]).collect(),
         widths_m: road.width,
         orientations: road.orientations,
+        speed_limits_mps: road.speed_limit,
     })
 }
 
@@ -88,6 +90,7 @@ fn sensor_config(sensor: &SensorConfig) -> v1::Sensor {
         calibration: sensor.calibration.clone(),
         blind_deg: sensor.blind_deg.as_flattened().to_vec(),
         gps_late_days_max: Some(sensor.gps_late_days_max),
+        range_noise_m: sensor.range_noise_m,
     }
 }
 
@@ -112,6 +115,7 @@ pub(crate) fn sensor_from_proto(sensor: v1::Sensor) -> Result<SensorConfig, NoCo
         blind_deg: blind_deg.to_vec(),
         gps_late_days_max: sensor.gps_late_days_max.unwrap_or(plain.gps_late_days_max),
         elevations_deg: sensor.elevations_deg,
+        range_noise_m: sensor.range_noise_m,
         ..plain
     })
 }
@@ -284,6 +288,7 @@ mod tests {
                 points: vec![[0.0, -1.5], [1e9, 2.0]],
                 widths_m: vec![3.5],
                 orientations: vec![1.0, 0.25],
+                speed_limits_mps: vec![0.0, 13.5],
             }),
             Body::Sensor(Box::new(SensorConfig {
                 model: Some(Model::PuckHiRes),
@@ -291,6 +296,7 @@ mod tests {
                 elevations_deg: vec![-15.0, 1.5],
                 blind_deg: vec![[350.0, 10.0], [80.0, 100.0]],
                 gps_late_days_max: 0.5,
+                range_noise_m: Some(0.03),
                 ..SensorConfig::new(
                     "left-2",
                     Extrinsics { x_m: 1.0, y_m: -2.0, z_m: 0.5, roll_deg: 3.0, pitch_deg: 4.0, yaw_deg: -90.0 },

@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
 use clearway_mapping::layer::{Cells, Geometry, Layer, Meaning, SafePoint};
-use clearway_mapping::map::{Map, SensorState};
+use clearway_mapping::map::{ElevationSource, Map, SensorState};
 use clearway_proto::by_class::encode_beside;
 use clearway_proto::codec::{self, CellsRef};
 use clearway_proto::map::{encode_header, encode_layer};
@@ -138,6 +138,8 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
         sensors: map.sensors.iter().map(sensor).collect(),
         compensation: map.compensation.as_str().to_owned(),
         source_sensor: map.sensors.get(usize::from(map.source)).map_or(String::new(), |sensor| sensor.name.clone()),
+        reference_sensor: (map.sensors.get(usize::from(map.reference_sensor)))
+            .map_or(String::new(), |sensor| sensor.name.clone()),
     }
 }
 
@@ -170,6 +172,7 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
         blocked_lasers: state.blocked.lasers.iter().map(|&laser| laser.into()).collect(),
         state: state.contribution.as_str().to_owned(),
         age_ms: state.age_ms,
+        elevations: state.elevations.map_or("", ElevationSource::as_str).to_owned(),
     }
 }
 
@@ -284,6 +287,7 @@ mod tests {
             speed_mps: None,
             compensation: clearway_mapping::sensor::motion::Compensation::Speed,
             source: 1,
+            reference_sensor: 0,
             sensors: vec![
                 SensorState {
                     name: "top".into(),

@@ -5,11 +5,16 @@
 //! | [`map`] | map -> header chunk and layer chunks, once |
 //! | [`payload_cache`] | an encoded map -> a region of it, a delta of it, once for all readers that need the same |
 //! | [`event`] | event <-> the journal's bytes; observations -> event bodies |
+//! | [`palette`] | a value or an id -> its colour |
 //! | [`picture`] | a layer -> PNG |
+//! | `legend`, `font` | classes and colours -> the strip under a picture; a letter -> its dots |
 //! | [`viewer`] | a decoded map -> ROS 2 and Foxglove messages |
 
 pub mod event;
+mod font;
+mod legend;
 pub mod map;
+mod palette;
 pub mod payload_cache;
 pub mod picture;
 pub mod viewer;

@@ -1,13 +1,24 @@
 //! One layer of a map -> a PNG: seen from above, the vehicle in the middle, forward up, left on the left.
 //!
-//! The picture rotates with the vehicle: up is ahead, not north. Classes have the colours of the layer's legend; a
-//! layer without classes is drawn from its first channel, dark to light.
+//! The picture rotates with the vehicle: up is ahead, not north. It shows the classes in the colours of the layer's
+//! legend, or one channel: ids in one colour each, other values from dark to light. The PNG's text `Comment` names the
+//! channel, its least and greatest value and its unit. Safe points of the layer are drawn as lines between linked
+//! points, in a band as wide as their radii. A strip under the picture shows the legend of the classes or the colour
+//! bar of the channel, a scale bar and which direction is up, unless the style leaves it out.
 
-use clearway_proto::legend::Class;
+mod canvas;
+mod colours;
+mod error;
+mod safe_paths;
+
 use clearway_proto::map::Layer;
 
-/// Colour of the ground outside the grid, and of cells without a value: the colour of class `unknown` in every legend.
-const UNKNOWN: [u8; 3] = [58, 63, 70];
+use super::legend;
+use canvas::Canvas;
+pub(crate) use colours::Colours;
+use colours::UNKNOWN;
+pub use error::PictureError;
+
 /// Colour of the rings.
 const RING: [u8; 3] = [112, 116, 124];
 /// Colour of the vehicle's mark.
@@ -16,9 +27,9 @@ const VEHICLE: [u8; 3] = [244, 244, 248];
 const VEHICLE_HALF_M: (f64, f64) = (2.2, 0.9);
 
 /// How a picture is drawn.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct Style {
-    /// Edge of the picture, in pixels.
+    /// Edge of the map in the picture, in pixels.
     pub pixels: u32,
     /// Distance from the vehicle to the edge of the picture, in metres; `None` shows the whole grid.
     pub range_m: Option<f64>,
@@ -26,78 +37,62 @@ pub struct Style {
     pub rings_m: Option<f64>,
     /// True if the vehicle is marked.
     pub vehicle: bool,
+    /// Name of the channel; `None` shows the classes, or the first channel of a layer without classes.
+    pub channel: Option<String>,
+    /// True if the strip with the legend is under the map.
+    pub legend: bool,
 }
 
 /// Draws a layer and encodes the picture.
 ///
 /// # Errors
-/// [`png::EncodingError`] if the picture is larger than PNG allows.
-pub fn png(layer: &Layer, style: &Style) -> Result<Vec<u8>, png::EncodingError> {
-    let pixels = style.pixels as usize;
-    let mut rgb = vec![0; pixels * pixels * 3];
+/// [`PictureError::NoChannel`] if the style names a channel that the layer does not have, [`PictureError::Encoding`] if
+/// the picture is larger than PNG allows.
+pub fn png(layer: &Layer, style: &Style) -> Result<Vec<u8>, PictureError> {
+    let colours = Colours::of(layer, style.channel.as_deref())?;
+    let side = style.pixels as usize;
     let range_m = style.range_m.unwrap_or(layer.grid.range_m_max());
-    let metres = 2.0 * range_m / pixels as f64;
-    let colours = Colours::of(layer);
-    for (index, pixel) in rgb.as_chunks_mut::<3>().0.iter_mut().enumerate() {
-        let x_m = range_m - ((index / pixels) as f64 + 0.5) * metres;
-        let y_m = range_m - ((index % pixels) as f64 + 0.5) * metres;
+    let mut canvas = Canvas { side, range_m, rgb: vec![UNKNOWN; side * side] };
+    for index in 0..side * side {
+        let (x_m, y_m) = canvas.point(index);
         let on_ring = style.rings_m.is_some_and(|every| {
             let rings = x_m.hypot(y_m) / every;
-            rings > 0.5 && (rings - rings.round()).abs() * every < 0.5 * metres
+            rings > 0.5 && (rings - rings.round()).abs() * every < 0.5 * canvas.pixel_m()
         });
-        *pixel = if style.vehicle && x_m.abs() < VEHICLE_HALF_M.0 && y_m.abs() < VEHICLE_HALF_M.1 {
-            VEHICLE
-        } else if on_ring {
+        canvas.rgb[index] = if on_ring {
             RING
         } else {
             layer.grid.cell_at(x_m, y_m).map_or(UNKNOWN, |cell| colours.of_cell(layer, cell))
         };
     }
+    safe_paths::draw(&mut canvas, &layer.points);
+    if style.vehicle {
+        for index in 0..side * side {
+            let (x_m, y_m) = canvas.point(index);
+            if x_m.abs() < VEHICLE_HALF_M.0 && y_m.abs() < VEHICLE_HALF_M.1 {
+                canvas.rgb[index] = VEHICLE;
+            }
+        }
+    }
+    let metres = canvas.pixel_m();
+    let (mut width, mut height, mut rgb) = (side, side, canvas.rgb);
+    if style.legend {
+        let strip = legend::strip(&colours.legend(layer), side, metres);
+        // A strip that needs more width leaves a margin beside the map.
+        let margin = vec![[0; 3]; strip.width - side];
+        rgb = rgb.chunks(side).flat_map(|row| row.iter().chain(&margin)).copied().collect();
+        rgb.extend(strip.rgb);
+        (width, height) = (strip.width, side + strip.height);
+    }
     let mut file = Vec::new();
-    let mut encoder = png::Encoder::new(&mut file, style.pixels, style.pixels);
+    let mut encoder = png::Encoder::new(&mut file, width as u32, height as u32);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_depth(png::BitDepth::Eight);
+    if let Some(text) = colours.text(layer) {
+        encoder.add_text_chunk("Comment".into(), text)?;
+    }
     let mut writer = encoder.write_header()?;
-    writer.write_image_data(&rgb)?;
+    writer.write_image_data(rgb.as_flattened())?;
     writer.finish()?;
     Ok(file)
-}
-
-pub(crate) enum Colours {
-    /// Index of the channel `class`, and the colours of the classes.
-    Classes(usize, Vec<[u8; 3]>),
-    /// Least and greatest known value of channel 0.
-    Shades(f64, f64),
-}
-
-impl Colours {
-    pub(crate) fn of(layer: &Layer) -> Self {
-        if let Some(channel) = layer.channels.iter().position(|channel| channel.name == "class") {
-            return Self::Classes(channel, layer.legend.iter().map(Class::colour).collect());
-        }
-        let (mut least, mut greatest) = (f64::INFINITY, f64::NEG_INFINITY);
-        if let Some(channel) = layer.channels.first() {
-            for value in (0..channel.cells.len()).filter_map(|cell| channel.value(cell)) {
-                least = least.min(value);
-                greatest = greatest.max(value);
-            }
-        }
-        Self::Shades(least, greatest)
-    }
-
-    pub(crate) fn of_cell(&self, layer: &Layer, cell: usize) -> [u8; 3] {
-        match self {
-            Self::Classes(channel, colours) => {
-                let class = layer.channels[*channel].cells.get(cell).and_then(|class| usize::try_from(class).ok());
-                class.and_then(|class| colours.get(class)).copied().unwrap_or(UNKNOWN)
-            }
-            Self::Shades(least, greatest) => match layer.channels.first().and_then(|channel| channel.value(cell)) {
-                Some(value) => {
-                    let share = (value - least) / (greatest - least).max(f64::MIN_POSITIVE);
-                    [72 + (share * 168.0) as u8; 3]
-                }
-                None => UNKNOWN,
-            },
-        }
-    }
 }

@@ -1,17 +1,18 @@
 //! Maps, points and poses for Foxglove, and for other clients of its WebSocket protocol (`foxglove.sdk.v1`).
 //!
-//! Channels: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/points` (`foxglove.PointCloud`: what the newest
-//! map was made from) and `/tf` (`foxglove.FrameTransforms`: `<vehicle>/base_link` in `map`). Channels without a
-//! subscription are not made. A new subscription gets the newest map at once. A stalled client has at most [`BACKLOG`]
-//! messages, then the oldest are dropped.
+//! Channels: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/safe_points` (`foxglove.SceneUpdate`: lines and
+//! circles of the layer `safe_path`), `/<vehicle>/points` (`foxglove.PointCloud`: what the newest map was made from)
+//! and `/tf` (`foxglove.FrameTransforms`: `<vehicle>/base_link` in `map`). Channels without a subscription are not
+//! made. A new subscription gets the newest map at once. A stalled client has at most [`BACKLOG`] messages, then the
+//! oldest are dropped.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
 
 use crate::encode::viewer::raster::Rasters;
-use crate::encode::viewer::{base_frame, foxglove as messages};
+use crate::encode::viewer::{base_frame, foxglove as messages, safe_paths};
 use clearway_client::MapView;
-use foxglove::messages::{FrameTransforms, Grid, PointCloud};
+use foxglove::messages::{FrameTransforms, Grid, PointCloud, SceneUpdate};
 use foxglove::websocket::{ChannelView, Client, ServerListener};
 use foxglove::{Channel, ChannelId, Context, Encode, FoxgloveError, PartialMetadata, SinkId, WebSocketServerHandle};
 use tokio::sync::{Notify, watch};
@@ -87,6 +88,8 @@ impl ServerListener for SubscriptionListener {
 struct VehicleChannels {
     served: Served,
     layers: Vec<(&'static str, Channel<Grid>)>,
+    /// The channel of the safe points; `None` if the vehicle's maps have none.
+    safe_points: Option<Channel<SceneUpdate>>,
     points: Channel<PointCloud>,
     /// The channel of transforms, shared by all vehicles.
     tf: Arc<Channel<FrameTransforms>>,
@@ -110,6 +113,8 @@ impl VehicleChannels {
         Self {
             served: served.clone(),
             layers: served.status.layers.iter().map(layer).collect(),
+            safe_points: (served.status.layers.contains(&safe_paths::LAYER))
+                .then(|| context.channel_builder(format!("/{vehicle}/safe_points")).build()),
             points: context.channel_builder(format!("/{vehicle}/points")).build(),
             tf: tf.clone(),
             subscriptions: Mutex::default(),
@@ -119,13 +124,15 @@ impl VehicleChannels {
 
     /// Adds a client's subscription, if the channel is one of this vehicle's.
     fn subscribe(&self, channel: ChannelId, sink: SinkId) {
-        let layer = self.layers.iter().find(|(_, of)| of.id() == channel);
+        let of_safe_points = self.safe_points.iter().map(|of| (safe_paths::LAYER, of.id()));
+        let mut layers = self.layers.iter().map(|(name, of)| (*name, of.id())).chain(of_safe_points);
+        let layer = layers.find(|(_, id)| *id == channel).map(|(name, _)| name);
         let is_points = self.points.id() == channel;
         if layer.is_none() && !is_points && self.tf.id() != channel {
             return;
         }
         let status = &self.served.status;
-        let layer_subscription = layer.map(|(name, _)| status.subscriptions.subscribe(&[(*name).to_owned()]));
+        let layer_subscription = layer.map(|name| status.subscriptions.subscribe(&[name.to_owned()]));
         let points = is_points.then(|| status.sweeps.subscribe());
         locked(&self.subscriptions)
             .insert((channel, sink), ClientSubscription { is_new: true, _layer: layer_subscription, points });
@@ -171,10 +178,19 @@ impl VehicleChannels {
     /// Sends a map: to all subscribed clients, or on one channel to one client.
     fn send_map(&self, map: &EncodedMap, to: Option<(ChannelId, SinkId)>, rasters: &mut Rasters) {
         for (name, channel) in &self.layers {
-            let chunk = map.layers.iter().find(|(of, _)| of == name).filter(|_| is_subscribed(channel, to));
+            let safe_points = self.safe_points.as_ref().filter(|_| *name == safe_paths::LAYER);
+            let safe_points = safe_points.filter(|channel| is_subscribed(channel, to));
+            let channel = Some(channel).filter(|channel| is_subscribed(channel, to));
+            let chunk = map.layers.iter().find(|(of, _)| of == name);
+            let chunk = chunk.filter(|_| channel.is_some() || safe_points.is_some());
             let Some(view) = chunk.and_then(|(_, chunk)| view(map.layer(chunk))) else { continue };
             let Some(layer) = view.layers().first() else { continue };
-            send(channel, &messages::grid(&view, layer, rasters.of(layer)), map, to);
+            if let Some(channel) = channel {
+                send(channel, &messages::grid(&view, layer, rasters.of(layer)), map, to);
+            }
+            if let Some(channel) = safe_points {
+                send(channel, &messages::safe_paths(&view, layer), map, to);
+            }
         }
         if is_subscribed(&self.tf, to)
             && let Some(transforms) = view(map.header.clone()).and_then(|view| messages::transforms(&view))

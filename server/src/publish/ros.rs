@@ -1,18 +1,21 @@
 //! Maps as ROS 2 topics in rmw_zenoh's key space, without a bridge.
 //!
-//! For each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`, reliable, transient local, depth 1)
-//! and its pose in `map` on `/tf` (reliable, volatile). A topic is published under `<domain>/<topic>/<type>/<hash>`,
+//! For each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`), of the layer `safe_path` also
+//! `.../safe_path/markers` (`visualization_msgs/msg/MarkerArray`) and `.../safe_path/poses`
+//! (`geometry_msgs/msg/PoseArray`), all reliable, transient local, depth 1; and its pose in `map` on `/tf` (reliable,
+//! volatile). A topic is published under `<domain>/<topic>/<type>/<hash>`,
 //! the payload CDR, with an attachment: sequence, time of sending, length 16, the publisher's 16 bytes. Liveliness
-//! tokens under `@ros2_lv` announce the node and its publishers. A grid is made only while there is a subscriber; the
-//! first subscriber gets the newest map at once, later ones get it from the publisher's cache.
+//! tokens under `@ros2_lv` announce the node and its publishers. A message is made only while there is a subscriber;
+//! the first subscriber gets the newest map at once, later ones get it from the publisher's cache.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
 
 use crate::encode::viewer::raster::Rasters;
-use crate::encode::viewer::ros;
+use crate::encode::viewer::{ros, safe_paths};
+use clearway_client::Layer;
 use clearway_client::MapView;
-use clearway_ros::published::{OCCUPANCY_GRID, Published, TF_MESSAGE};
+use clearway_ros::published::{MARKER_ARRAY, OCCUPANCY_GRID, POSE_ARRAY, Published, TF_MESSAGE};
 use tokio::task::JoinSet;
 use zenoh::Session;
 use zenoh::liveliness::LivelinessToken;
@@ -57,15 +60,14 @@ impl<'a> Node<'a> {
         let vehicle = &served.status.name;
         for &layer in &served.status.layers {
             let topic = format!("{}/{vehicle}/{layer}", self.options.namespace);
-            let topic = self.topic(&topic, &OCCUPANCY_GRID, LATCHED).await?;
             let mut rasters = Rasters::default();
-            let grid = move |map: &EncodedMap| {
-                let (_, chunk) = map.layers.iter().find(|(name, _)| *name == layer)?;
-                let map = MapView::decode(map.layer(chunk)).inspect_err(log_decode_error).ok()?;
-                let layer = map.layers().first()?;
-                Some(ros::occupancy_grid(&map, layer, rasters.of(layer)))
-            };
-            tasks.spawn(topic.publish(served.clone(), Some(layer), grid));
+            let grid = move |map: &MapView, layer: &Layer| ros::occupancy_grid(map, layer, rasters.of(layer));
+            self.publish_layer(served, layer, (&topic, &OCCUPANCY_GRID), grid, tasks).await?;
+            if layer == safe_paths::LAYER {
+                let (markers, poses) = (format!("{topic}/markers"), format!("{topic}/poses"));
+                self.publish_layer(served, layer, (&markers, &MARKER_ARRAY), ros::safe_path_markers, tasks).await?;
+                self.publish_layer(served, layer, (&poses, &POSE_ARRAY), ros::safe_point_poses, tasks).await?;
+            }
         }
         let tf = self.topic("/tf", &TF_MESSAGE, MOVING).await?;
         let transform = |map: &EncodedMap| {
@@ -73,6 +75,26 @@ impl<'a> Node<'a> {
             ros::tf(&map)
         };
         tasks.spawn(tf.publish(served.clone(), None, transform));
+        Ok(())
+    }
+
+    /// Publishes a message of each newest map's layer on a topic of this name and type.
+    async fn publish_layer(
+        &mut self,
+        served: &Served,
+        layer: &'static str,
+        (topic, kind): (&str, &Published),
+        mut write: impl FnMut(&MapView, &Layer) -> Vec<u8> + Send + 'static,
+        tasks: &mut JoinSet<()>,
+    ) -> Result<(), ZenohError> {
+        let topic = self.topic(topic, kind, LATCHED).await?;
+        let message = move |map: &EncodedMap| {
+            let (_, chunk) = map.layers.iter().find(|(name, _)| *name == layer)?;
+            let map = MapView::decode(map.layer(chunk)).inspect_err(log_decode_error).ok()?;
+            let layer = map.layers().first()?;
+            Some(write(&map, layer))
+        };
+        tasks.spawn(topic.publish(served.clone(), Some(layer), message));
         Ok(())
     }
 

@@ -1,12 +1,12 @@
 //! Any MCAP file -> its header and its messages, in file order. All commands read MCAP files with this reader.
 //!
-//! A file that a crash cut yields all its whole chunks, and is then reported as cut. Damage is an error, even after
-//! valid messages: the reader checks the CRC of a chunk before it returns a message of it. [`McapReader::salvage`]
-//! instead returns the messages before the damage and then reports it.
+//! The reader returns all whole chunks of a file that a crash has cut, and then reports it as cut. Damage is an error,
+//! even after valid messages: the reader checks the CRC of a chunk before it returns a message of it.
+//! [`McapReader::salvage`] instead returns the messages before the damage and then reports it.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::fs::File;
-use std::io::Read;
+use std::io::{Error, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -17,9 +17,12 @@ use mcap::records::{ChunkHeader, Record};
 use mcap::sans_io::LinearReaderOptions;
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader};
 
+use crate::counted::counted;
+use crate::file_advice::advised;
+
 use super::chunk::{RECORD_BYTES_MAX, decompress, parse, split_record};
 
-/// Greatest number of bytes per read, so that memory for a record's claimed length is allocated only as its bytes come.
+/// Greatest number of bytes of one read. A record that claims to be long gets memory only as its bytes are read.
 const READ_BYTES_MAX: usize = 1 << 20;
 
 /// The contents of a recording before its first message; empty in an MCAP file of another program.
@@ -124,7 +127,7 @@ pub enum McapReadError {
         file: PathBuf,
     },
     /// The file is damaged.
-    #[error("{}: damaged after {messages} messages: {source}", file.display())]
+    #[error("{}: damaged after {}: {source}", file.display(), counted(*messages, "message"))]
     Damaged {
         /// The file.
         file: PathBuf,
@@ -263,10 +266,9 @@ impl McapReader {
             let record = match self.records.next_event() {
                 None => break,
                 Some(Ok(LinearReadEvent::ReadRequest(need))) => {
-                    let read = self
-                        .source
-                        .read(self.records.insert(need.min(READ_BYTES_MAX)))
-                        .map_err(|source| McapReadError::Read { file: self.file.clone(), source })?;
+                    let read = self.source.read(self.records.insert(need.min(READ_BYTES_MAX))).map_err(|source| {
+                        McapReadError::Read { file: self.file.clone(), source: advised(&self.file, source) }
+                    })?;
                     self.records.notify_read(read);
                     self.bytes_read += read as u64;
                     continue;
@@ -366,7 +368,14 @@ impl Iterator for McapReader {
 }
 
 fn open(file: &Path) -> Result<File, McapReadError> {
-    File::open(file).map_err(|source| McapReadError::Read { file: file.to_owned(), source })
+    let wrong = |source| McapReadError::Read { file: file.to_owned(), source: advised(file, source) };
+    let opened = File::open(file).map_err(wrong)?;
+    match opened.metadata().map_err(wrong)? {
+        of_file if of_file.is_file() && of_file.len() == 0 => {
+            Err(wrong(Error::new(ErrorKind::UnexpectedEof, "the file is empty")))
+        }
+        _ => Ok(opened),
+    }
 }
 
 /// The kind of the messages of a channel, by its topic, the name of its schema, and its encoding.

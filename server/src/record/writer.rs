@@ -18,6 +18,7 @@ use mcap::McapError;
 use super::mcap_file::{Disk, Header, McapFile};
 use crate::config::Recorder as Options;
 use crate::encode::EncodedMap;
+use crate::file_advice::advised;
 use crate::sync::locked;
 
 /// A recording cannot begin.
@@ -144,16 +145,14 @@ impl Recorder {
     /// be written.
     pub fn start(options: &Options, header: &Header, waits: bool) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
         let path = options.file.clone();
+        let create = |source| RecordError::Create { file: path.clone(), source: advised(&path, source) };
         if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
-            std::fs::create_dir_all(folder).map_err(|source| RecordError::Create { file: path.clone(), source })?;
+            std::fs::create_dir_all(folder).map_err(create)?;
         }
-        let file = File::create(&path).map_err(|source| RecordError::Create { file: path.clone(), source })?;
+        let file = File::create(&path).map_err(create)?;
         let (writer, handles) = RecordingWriter::new(file, options, header, waits)?;
         let counts = writer.counts();
-        let thread = std::thread::Builder::new()
-            .name("recorder".into())
-            .spawn(move || writer.run())
-            .map_err(|source| RecordError::Create { file: path, source })?;
+        let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || writer.run()).map_err(create)?;
         Ok((Self { counts, thread }, handles))
     }
 

@@ -3,13 +3,15 @@
 //! | file | in -> out |
 //! |---|---|
 //! | [`vehicle`] | counts of engine, queue, recorder and readers -> one snapshot, as message or JSON |
-//! | `sensor_json` | a sensor's state and counts -> JSON |
+//! | `json` | a vehicle's and a sensor's state and counts -> JSON |
+//! | `notices` | changes of the sensors -> the log, each once |
 //! | `prometheus` | the status of all vehicles -> Prometheus' text format |
 
+mod json;
+mod notices;
 mod prometheus;
-mod sensor_json;
 pub mod vehicle;
 
+pub use json::{sensor_json, vehicle_json};
 pub use prometheus::prometheus;
-pub use sensor_json::{ledger_json, sensor_json};
 pub use vehicle::{Reader, Snapshot, VehicleStatus};

@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use std::sync::Arc;
 
 use clearway_mapping::pipeline::NamedStatus;
+use clearway_mapping::sensor::mount::check::MountDeviation;
 
 use super::vehicle::{Snapshot, VehicleStatus};
 use crate::clock::now_ns;
@@ -59,10 +60,47 @@ impl Metrics<'_> {
         self.family("clearway_sensor_refused_total", help, refused);
         let help = "Data packets that did not arrive, by device time and azimuth, exact to one packet per gap.";
         self.each_sensor("clearway_packets_missing_total", help, |s| s.status.packets_lost as f64);
+        let help = "1 for the source of the elevations of a sensor's lasers.";
+        let elevations = self
+            .sensors()
+            .filter_map(|(of, sensor)| Some((format!("{of},source=\"{}\"", sensor.elevations?.as_str()), 1.0)));
+        let elevations = elevations.collect();
+        self.family("clearway_sensor_elevations", help, elevations);
+        self.write_mounts();
         let help = "Degrees in which a sensor used to get returns and gets none.";
         self.each_sensor("clearway_blocked_degrees", help, |s| {
             s.status.blocked.sectors.iter().map(|sector| f64::from(sector.to_deg - sector.from_deg)).sum()
         });
+    }
+
+    fn write_mounts(&mut self) {
+        type Metric = (&'static str, &'static str, fn(&MountDeviation) -> f64);
+        let metrics: [Metric; 4] = [
+            (
+                "clearway_mount_height_deviation_meters",
+                "Height of a sensor over the ground it sees, less the configured height.",
+                |mount| mount.height_m,
+            ),
+            (
+                "clearway_mount_pitch_deviation_degrees",
+                "Rotation about the vehicle's y axis that would level the ground a sensor sees.",
+                |mount| mount.pitch_rad.to_degrees(),
+            ),
+            (
+                "clearway_mount_roll_deviation_degrees",
+                "Rotation about the vehicle's x axis that would level the ground a sensor sees.",
+                |mount| mount.roll_rad.to_degrees(),
+            ),
+            (
+                "clearway_mount_contradicted",
+                "1 if the ground contradicts the configured mount of a sensor, else 0.",
+                |mount| f64::from(u8::from(mount.contradicts)),
+            ),
+        ];
+        for (name, help, value) in metrics {
+            let samples = self.sensors().filter_map(|(of, sensor)| Some((of, value(&sensor.mount?)))).collect();
+            self.family(name, help, samples);
+        }
     }
 
     fn write_maps(&mut self) {
@@ -160,5 +198,35 @@ mod tests {
         let text = prometheus(&[Arc::new(status)]);
         assert!(text.contains("clearway_packets_received_total{vehicle=\"car\"} 5\n"), "{text}");
         assert!(text.contains("clearway_packets_refused_total{vehicle=\"car\",reason=\"source\"} 2\n"), "{text}");
+    }
+
+    #[test]
+    fn a_sensors_elevations_and_the_deviation_of_its_mount_are_in_the_metrics() {
+        use clearway_mapping::map::ElevationSource;
+        let (door, _events) = crate::ingest::queue::event_queue(4);
+        let status = VehicleStatus::new("car".into(), 1, vec!["drivability"], door.drops());
+        let sensor = |name: &str, elevations, mount| NamedStatus {
+            name: name.into(),
+            is_reference: name == "top",
+            status: clearway_lidar::SensorStatus::default(),
+            elevations,
+            mount,
+            ledger: Ledger::default(),
+        };
+        let deviation = MountDeviation { height_m: -0.58, contradicts: true, scans: 30, ..MountDeviation::default() };
+        let sensors = vec![sensor("top", Some(ElevationSource::Nominal), Some(deviation)), sensor("rear", None, None)];
+        status.stepped(&Ledger::default(), sensors);
+        let message = status.to_proto();
+        assert_eq!((message.mounts["top"].height_m, message.reference_sensor.as_str()), (-0.58, "top"));
+        let text = prometheus(&[Arc::new(status)]);
+        for line in [
+            "clearway_sensor_elevations{vehicle=\"car\",sensor=\"top\",source=\"nominal\"} 1\n",
+            "clearway_mount_height_deviation_meters{vehicle=\"car\",sensor=\"top\"} -0.58\n",
+            "clearway_mount_contradicted{vehicle=\"car\",sensor=\"top\"} 1\n",
+        ] {
+            assert!(text.contains(line), "{text}");
+        }
+        let of_rear = |line: &&str| line.contains("rear") && (line.contains("mount") || line.contains("elevations"));
+        assert_eq!(text.lines().find(of_rear), None);
     }
 }

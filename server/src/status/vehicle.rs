@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use clearway_mapping::ledger::Ledger;
 use clearway_mapping::pipeline::NamedStatus;
+use clearway_mapping::sensor::mount::check::MountDeviation;
 use clearway_proto::v1;
 use serde_json::{Value, json};
 use tokio::sync::watch;
@@ -19,7 +20,8 @@ use crate::record::writer::RecorderCounts;
 use crate::subscriptions::LayerSubscriptions;
 use crate::sync::locked;
 
-use super::sensor_json::{ledger_json, sensor_json};
+use super::json::vehicle_json;
+use super::notices::Notices;
 
 /// Latencies kept for the percentiles: seven minutes of a 10 Hz sensor.
 const LATENCIES: usize = 4096;
@@ -55,6 +57,7 @@ pub struct VehicleStatus {
 struct State {
     ledger: Ledger,
     sensors: Vec<NamedStatus>,
+    notices: Notices,
     states: Vec<v1::SensorState>,
     maps: u64,
     newest_capture_end_ns: i64,
@@ -114,6 +117,11 @@ impl Snapshot {
         self.sensors.iter().map(|sensor| sensor.status.revolutions).sum()
     }
 
+    /// Name of the reference sensor; `None` before the first event.
+    pub fn reference_sensor(&self) -> Option<&str> {
+        self.sensors.iter().find(|sensor| sensor.is_reference).map(|sensor| sensor.name.as_str())
+    }
+
     /// Counts without telemetry, as JSON: received = decoded + the sum of refused.
     pub fn packets_json(&self) -> Value {
         let Ledger { received, telemetry, decoded, refused, .. } = &self.ledger;
@@ -163,6 +171,7 @@ impl VehicleStatus {
     pub(crate) fn stepped(&self, ledger: &Ledger, sensors: Vec<NamedStatus>) {
         let mut state = locked(&self.state);
         state.ledger.clone_from(ledger);
+        state.notices.update(&self.name, &sensors);
         state.sensors = sensors;
     }
 
@@ -235,6 +244,8 @@ impl VehicleStatus {
             readers: self.readers().map(|(transport, readers)| (transport.to_owned(), readers)).into(),
             unknown_senders: self.drops.unknown_senders().iter().map(unknown_sender).collect(),
             observations_refused: by_name(&snapshot.observations_refused),
+            reference_sensor: snapshot.reference_sensor().unwrap_or_default().to_owned(),
+            mounts: snapshot.sensors.iter().filter_map(|s| Some((s.name.clone(), mount(&s.mount?)))).collect(),
         }
     }
 
@@ -243,35 +254,37 @@ impl VehicleStatus {
     pub fn to_json(&self) -> Value {
         let snapshot = self.snapshot();
         let proto = self.proto_of(&snapshot);
-        let (ledger, recorder) = (proto.ledger.unwrap_or_default(), proto.recorder.unwrap_or_default());
-        let sensors = proto.sensors.iter().map(|state| {
-            let mut sensor = sensor_json(state);
-            sensor["ledger"] = proto.sensor_ledgers.get(&state.name).map(ledger_json).into();
-            sensor
+        let unknown_senders = proto.unknown_senders.iter();
+        let unknown_senders = unknown_senders.map(|sender| {
+            json!({
+                "address": sender.address, "datagrams": sender.datagrams, "newest_ns": sender.newest_ns.to_string()
+            })
         });
-        json!({
-            "name": proto.name,
-            "boot_id": proto.boot_id.to_string(),
-            "layers": proto.layers,
-            "maps": proto.maps,
-            "newest_capture_end_ns": proto.newest_capture_end_ns.to_string(),
-            "now_ns": now_ns().to_string(),
-            "drivable_share": snapshot.drivable_share,
-            "sensors": sensors.collect::<Vec<_>>(),
-            "ledger": ledger_json(&ledger),
-            "observations_refused": proto.observations_refused,
-            "recorder": {
-                "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
-                "stopped": self.recorder.get().and_then(|counts| counts.stop_reason()),
-            },
-            "readers": proto.readers,
-            "unknown_senders": proto.unknown_senders.iter().map(|s| {
-                json!({ "address": s.address, "datagrams": s.datagrams, "newest_ns": s.newest_ns.to_string() })
-            }).collect::<Vec<_>>(),
-            "rates": { "maps_hz": snapshot.maps_hz, "packets_hz": snapshot.packets_hz },
-            "latency_ms": { "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 },
-            "alive": self.is_alive(),
-        })
+        let mut document = vehicle_json(&proto);
+        document["boot_id"] = proto.boot_id.to_string().into();
+        document["newest_capture_end_ns"] = proto.newest_capture_end_ns.to_string().into();
+        document["now_ns"] = now_ns().to_string().into();
+        document["drivable_share"] = snapshot.drivable_share.into();
+        document["recorder"]["stopped"] = self.recorder.get().and_then(|counts| counts.stop_reason()).into();
+        document["unknown_senders"] = unknown_senders.collect();
+        document["rates"] = json!({ "maps_hz": snapshot.maps_hz, "packets_hz": snapshot.packets_hz });
+        document["latency_ms"] = json!({ "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 });
+        document["alive"] = self.is_alive().into();
+        document
+    }
+}
+
+fn mount(deviation: &MountDeviation) -> v1::MountDeviation {
+    let [height_std_m, pitch_std_rad, roll_std_rad] = deviation.std;
+    v1::MountDeviation {
+        height_m: deviation.height_m,
+        pitch_deg: deviation.pitch_rad.to_degrees(),
+        roll_deg: deviation.roll_rad.to_degrees(),
+        height_std_m,
+        pitch_std_deg: pitch_std_rad.to_degrees(),
+        roll_std_deg: roll_std_rad.to_degrees(),
+        scans: deviation.scans as u32,
+        contradicts: deviation.contradicts,
     }
 }
 

@@ -10,6 +10,9 @@ export const MAP_BYTES_MAX = 4 << 20;
 // Layers, channels, planes, sensors and names of one map together.
 export const MAP_PARTS_MAX = 1 << 16;
 
+// Largest coordinate of a safe point in steps, and its largest radius in centimetres.
+export const SAFE_POINT_STEPS_MAX = 1 << 24;
+
 // The error for a message that is refused. `reason` is the name that the golden vectors give the fault.
 export class DecodeError extends Error {
   name = "DecodeError";

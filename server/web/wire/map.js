@@ -7,6 +7,7 @@ import { gridOf } from "./grid.js";
 import { isWithoutLegend, readLegend } from "./legend.js";
 import { DecodeError, MAP_BYTES_MAX, MAP_CELLS_MAX, MAP_PARTS_MAX } from "./limits.js";
 import { countParts, readLayer, readLayerName, readMap, readMapUpdate } from "./protobuf.js";
+import { readSafePoints } from "./safe_points.js";
 
 // { skipped, sent_ns, map }: a MapUpdate and its map. 64-bit values are BigInt.
 export function openUpdate(message) {
@@ -65,7 +66,8 @@ export class LiveMap {
   }
 }
 
-// One layer: { name, legend: [{ name, meaning, colour }], grid, metrics, channels: [{ name, unit, scale, unknown }] }.
+// One layer: { name, legend: [{ name, meaning, colour }], grid, metrics, channels: [{ name, unit, scale, unknown }],
+// safe_points: of safe_points.js, or null }.
 class Layer {
   #channels = new Map();
   #cells = new Map();
@@ -77,6 +79,7 @@ class Layer {
     this.grid = gridOf(message);
     this.legend = before && isWithoutLegend(message) ? before.legend : readLegend(message);
     this.metrics = message.metrics;
+    this.safe_points = readSafePoints(message.name, message.safe_points);
     this.#before = before;
     for (const channel of message.channels) {
       if (this.#channels.has(channel.name)) {

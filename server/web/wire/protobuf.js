@@ -136,6 +136,7 @@ const SENSOR = {
   6: ["rpm", float], 7: ["completeness", float], 8: ["partial", string],
   12: ["clock", string], 13: ["clock_offset_ms", sint64],
   14: ["blocked_sectors", repeated(message(SECTOR))], 15: ["blocked_lasers", repeated(uint32)],
+  16: ["elevations", string],
 };
 const HEADER = {
   1: ["vehicle", string], 2: ["boot_id", fixed64], 3: ["sequence", uint64], 4: ["capture_start_ns", sfixed64],
@@ -153,10 +154,15 @@ const CHANNEL = {
   6: ["encoding", uint32], 7: ["cell_count", uint32], 8: ["crc32", fixed32], 9: ["payload", bytes],
   10: ["by_class", bytes],
 };
+const SAFE_POINTS = {
+  1: ["step_m", float], 2: ["x", repeated(sint32)], 3: ["y", repeated(sint32)], 4: ["radius_cm", repeated(sint32)],
+  5: ["starts", repeated(uint32)], 6: ["link_from", repeated(uint32)], 7: ["link_back", repeated(uint32)],
+};
 const LAYER = {
   1: ["name", string], 2: ["radial", message(RADIAL)], 3: ["cartesian", message(CARTESIAN)],
   4: ["legend", repeated(string)],
   5: ["channels", repeated(message(CHANNEL))], 7: ["metrics", map(double)],
+  9: ["safe_points", message(SAFE_POINTS)],
   10: ["base_sequence", optional(uint64)],
   11: ["legend_meanings", repeated(uint32)], 12: ["legend_rgb", repeated(fixed32)],
 };

@@ -53,11 +53,30 @@ function decodeMap(bytes, base = null) {
 }
 
 test("the limits are those of the golden file", () => {
-  const { channel_cells_max, map_cells_max, map_bytes_max, map_parts_max } = golden("limits.json");
+  const { channel_cells_max, map_cells_max, map_bytes_max, map_parts_max, ...others } = golden("limits.json");
   assert.equal(limits.CHANNEL_CELLS_MAX, channel_cells_max);
   assert.equal(limits.MAP_CELLS_MAX, map_cells_max);
   assert.equal(limits.MAP_BYTES_MAX, map_bytes_max);
   assert.equal(limits.MAP_PARTS_MAX, map_parts_max);
+  assert.equal(limits.SAFE_POINT_STEPS_MAX, others.safe_point_steps_max);
+});
+
+test("the golden safe points decode to their places, radii and links", () => {
+  const map = new LiveMap(goldenMap("map"));
+  const described = golden("map.json").layers.map(({ name, points }) => [name, points]);
+  for (const [name, points] of described) {
+    const decoded = map.layer(name).safe_points;
+    if (points.length === 0) {
+      assert.equal(decoded, null, name);
+      continue;
+    }
+    assert.deepEqual([...decoded.x], points.map((point) => point.x_m));
+    assert.deepEqual([...decoded.y], points.map((point) => point.y_m));
+    assert.deepEqual([...decoded.radius], points.map((point) => point.radius_m));
+    const links = points.flatMap((point, from) => point.links.map((to) => [from, to]));
+    assert.deepEqual(decoded.links.toSorted(), links.toSorted());
+  }
+  assert.equal(described.flatMap(([, points]) => points).length, 4);
 });
 
 test("a golden map with channels by class equals the same map with plain channels", () => {
@@ -72,12 +91,11 @@ test("a golden delta on its base equals the golden whole map", () => {
   assert.notDeepEqual(decoded.layers[0].grid[2], [0n, 0n]);
 });
 
-// Faults of the golden vectors that this decoder does not look for: the page draws neither poses nor safe points.
-const NOT_CHECKED = ["safe_point"];
+// Faults of the golden vectors that this decoder does not look for: the page draws no poses.
 const HEADERS_NOT_CHECKED = ["capture_ends_before_its_start", "pose_not_finite", "quaternion_of_norm_0"];
 
 test("the golden bad maps are refused for the stated reason", () => {
-  const vectors = golden("bad_maps.json").filter(({ error }) => !NOT_CHECKED.includes(error));
+  const vectors = golden("bad_maps.json");
   for (const { name, error, map_hex } of vectors.filter(({ name }) => !HEADERS_NOT_CHECKED.includes(name))) {
     assert.throws(() => decodeMap(bytesOf(map_hex)), { name: "DecodeError", reason: error }, name);
   }

@@ -10,7 +10,7 @@ use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
 use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
 
-/// Packets that are due this soon leave at once.
+/// Time before its due time within which a packet is sent without waiting.
 const BURST: Duration = Duration::from_millis(1);
 
 /// Datagrams of revolutions; each ends with the packet at which the server ends the revolution.

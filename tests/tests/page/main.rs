@@ -40,6 +40,11 @@ mod fresh {
     /// Share of the looks of the longer test in which the map must be fresh, in percent.
     const FRESH_PERCENT_MIN: u64 = 95;
 
+    /// Returns the number of layers over which paths are drawn.
+    const DRAWN_PATHS: &str = "return [...document.querySelectorAll('[data-part=\"paths\"]')].filter((canvas) =>
+        canvas.width > 0 && canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data.some(Boolean)
+    ).length";
+
     pub fn the_page_shows_a_fresh_map() {
         let seconds = std::env::var("CLEARWAY_PAGE_SECONDS").ok();
         let fresh_percent_min = if seconds.is_some() { FRESH_PERCENT_MIN } else { 1 };
@@ -60,6 +65,14 @@ mod fresh {
             fresh += u64::from(badge == "FRESH");
         }
         println!("fresh in {fresh} of {looks} looks\n{}", browser.text("#stream"));
+        // Safe paths are drawn over the layer that has them, and over every layer that is in sight if they are chosen.
+        let drawn = browser.run(DRAWN_PATHS);
+        browser.run("document.getElementById('paths').click()");
+        let began = Instant::now();
+        while browser.run(DRAWN_PATHS) == drawn {
+            assert!(began.elapsed() < START_MAX, "paths on {drawn} of the layers in sight");
+            std::thread::sleep(Duration::from_millis(100));
+        }
         let errors = browser.console_errors();
         drop(browser);
         println!("{}", demo.stop().text());

@@ -78,6 +78,11 @@ impl Browser {
         text.as_str().expect("a text").to_owned()
     }
 
+    /// Runs a script in the page; returns its result.
+    pub fn run(&self, script: &str) -> Value {
+        self.post(&format!("{}/execute/sync", self.session), json!({ "script": script, "args": [] }))
+    }
+
     /// The errors in the browser's console since the last call.
     pub fn console_errors(&self) -> Vec<String> {
         let log = self.post(&format!("{}/se/log", self.session), json!({ "type": "browser" }));

@@ -41,6 +41,15 @@ impl Profile {
         self
     }
 
+    /// The sum of two profiles, which must not have a step at the same place.
+    pub fn plus(&self, other: &Self) -> Self {
+        let own = self.points.iter().map(|&(place, height)| (place, height + other.height(place)));
+        let added = other.points.iter().map(|&(place, height)| (place, height + self.height(place)));
+        let mut points: Vec<(f64, f64)> = own.chain(added).collect();
+        points.sort_by(|a, b| a.0.total_cmp(&b.0));
+        Self { points }
+    }
+
     fn patch(&self, place: f64) -> usize {
         self.points.partition_point(|point| point.0 <= place)
     }
@@ -306,6 +315,17 @@ mod tests {
         let hit = ground.meets([0.0, 0.0, 2.0], [down.cos(), 0.0, down.sin()], 100.0).unwrap();
         assert!((hit - 2.0 / 0.1_f64.sin()).abs() < 1e-9);
         assert_eq!(ground.meets([0.0, 0.0, 2.0], [0.1_f64.cos(), 0.0, 0.1_f64.sin()], 100.0), None);
+    }
+
+    #[test]
+    fn the_height_of_a_sum_is_the_sum_of_the_heights() {
+        let slope = Profile::through(&[(-10.0, -1.0), (4.0, 0.4), (10.0, 0.0)]);
+        let kerbs = Profile::through(&[(-3.0, 0.15), (-3.0, 0.0), (3.0, 0.0), (3.0, 0.4)]);
+        let sum = slope.plus(&kerbs);
+        for step in -1200..1200 {
+            let place = f64::from(step) * 0.01 + 0.005;
+            assert!((sum.height(place) - slope.height(place) - kerbs.height(place)).abs() < 1e-12, "{place}");
+        }
     }
 
     #[test]

@@ -6,6 +6,7 @@ pub mod ground;
 pub mod object;
 pub mod plan;
 pub mod pose;
+pub mod random;
 pub mod scenes;
 pub mod truth;
 pub mod world;

@@ -17,10 +17,10 @@ pub enum Truth {
     Outside,
     /// Free ground that the vehicle reaches through passages that are wide enough.
     Drivable,
-    /// Free ground that is reached only through narrower passages, or is too narrow for the vehicle: a map may call it
-    /// drivable or not.
+    /// Free ground that is reached only through narrower passages that the vehicle fits into, or a place that is too
+    /// narrow for it: a map may call it drivable or not.
     Tight,
-    /// Free ground that the vehicle cannot reach.
+    /// Free ground that the vehicle cannot reach, or reaches only through openings that are narrower than itself.
     Unreachable,
     /// Ground that is too steep, or the edge of a step that is too high.
     Steep,
@@ -31,7 +31,7 @@ pub enum Truth {
 /// Limits of what a vehicle can drive on.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
-    /// Steepest ground, as rise over run.
+    /// Steepest ground, as rise over run. Steeper ground that rises less than a step is driven over.
     pub slope_max: f64,
     /// Highest step, and highest object that the vehicle drives over, metres.
     pub step_m_max: f64,
@@ -39,14 +39,21 @@ pub struct Limits {
     pub clearance_m: f64,
     /// Narrowest passage, metres.
     pub passage_m_min: f64,
+    /// Width of the vehicle, metres. No map may call the ground behind a narrower opening drivable.
+    pub vehicle_m: f64,
 }
 
 impl Default for Limits {
-    /// 20 degrees (ours), and the unit, cut-off height and boundary length of the UT Austin thesis, section IV.
+    /// 20 degrees (ours), the unit, cut-off height and boundary length of the UT Austin thesis, section IV, and the
+    /// width of the simulated cars.
     fn default() -> Self {
-        Self { slope_max: 0.364, step_m_max: 0.25, clearance_m: 2.5, passage_m_min: 3.0 }
+        Self { slope_max: 0.364, step_m_max: 0.25, clearance_m: 2.5, passage_m_min: 3.0, vehicle_m: 1.8 }
     }
 }
+
+/// Distance by which objects are widened, in cells: half the diagonal of a cell, so that no thin object falls between
+/// two cell centres.
+const OBJECT_MARGIN: f64 = 0.71;
 
 /// Raster of the truth about the ground around a vehicle, in its ego frame.
 #[derive(Clone, Debug)]
@@ -133,7 +140,7 @@ impl TruthGrid {
     fn mark_ground(&mut self, world: &World, places: &[[f64; 3]], limits: &Limits) {
         for (index, &[x, y, z]) in places.iter().enumerate() {
             let slope = world.ground.slope(x, y);
-            if slope > limits.slope_max {
+            if slope > limits.slope_max && is_high(world, [x, y], limits) {
                 self.classes[index] = Truth::Steep;
             }
             let (i, j) = (index % self.side, index / self.side);
@@ -157,8 +164,7 @@ impl TruthGrid {
         places: &[[f64; 3]],
         limits: &Limits,
     ) {
-        // Half the diagonal of a cell, so that no thin object falls between two cell centres.
-        let margin = 0.71 * self.cell_m;
+        let margin = OBJECT_MARGIN * self.cell_m;
         for shape in world.shapes_at(time) {
             let Some((low, high)) = self.cells_about(&shape, map_from_ego) else { continue };
             for j in low[1]..=high[1] {
@@ -197,22 +203,34 @@ impl TruthGrid {
     /// Divides free ground into drivable, tight and unreachable ground.
     fn mark_reachable(&mut self, limits: &Limits) {
         let free: Vec<bool> = self.classes.iter().map(|&class| class == Truth::Unreachable).collect();
+        let distances = squared_distance(&free, self.side);
         let half_passage = limits.passage_m_min / 2.0 / self.cell_m;
-        // The places where a disc as wide as a passage fits; those it can be moved to from the vehicle; and the ground
-        // that the disc then covers.
-        let fits: Vec<bool> =
-            squared_distance(&free, self.side).iter().map(|&d| d >= half_passage * half_passage).collect();
-        let rolled = self.flood(&fits, limits.passage_m_min);
-        let outside: Vec<bool> = rolled.iter().map(|&rolled| !rolled).collect();
-        let swept = squared_distance(&outside, self.side);
+        let (_, passes) = self.covered(&distances, half_passage, limits.passage_m_min);
+        // Objects are widened in the raster. A vehicle must not become too wide for an opening by that.
+        let half_vehicle = limits.vehicle_m / 2.0 / self.cell_m - OBJECT_MARGIN;
+        let (fits, comes) = self.covered(&distances, half_vehicle, limits.passage_m_min);
         let connected = self.flood(&free, limits.passage_m_min);
         for index in 0..self.classes.len() {
-            if free[index] && swept[index] < half_passage * half_passage {
+            if free[index] && passes[index] {
                 self.classes[index] = Truth::Drivable;
-            } else if connected[index] {
+            } else if connected[index] && (comes[index] || !fits[index]) {
                 self.classes[index] = Truth::Tight;
             }
         }
+    }
+
+    /// The ground that a disc of this radius (in cells) covers, at any place where it fits; and the ground that it
+    /// covers if it is moved there from places within `seed_m` of the vehicle. `distances` are the squared distances
+    /// of free cells to the nearest other cell.
+    fn covered(&self, distances: &[f64], radius: f64, seed_m: f64) -> (Vec<bool>, Vec<bool>) {
+        let squared = radius * radius;
+        let fits: Vec<bool> = distances.iter().map(|&distance| distance >= squared && distance > 0.0).collect();
+        let moved = self.flood(&fits, seed_m);
+        let [anywhere, reached] = [&fits, &moved].map(|places| {
+            let outside: Vec<bool> = places.iter().map(|&place| !place).collect();
+            squared_distance(&outside, self.side).into_iter().map(|distance| distance < squared).collect()
+        });
+        (anywhere, reached)
     }
 
     /// True for the open cells that are connected by their sides to open cells within `seed_m` of the vehicle.
@@ -242,6 +260,18 @@ impl TruthGrid {
         }
         reached
     }
+}
+
+/// Half the distance over which a steep place must rise more than a step to be too steep, metres. Ours: a wheel of a
+/// car spans about as much, so that a furrow of a field is driven over, whatever its sides are.
+const STEEP_HALF_M: f64 = 0.5;
+
+/// True if the ground around a place rises more than a step.
+fn is_high(world: &World, [x, y]: [f64; 2], limits: &Limits) -> bool {
+    let places = [(STEEP_HALF_M, 0.0), (-STEEP_HALF_M, 0.0), (0.0, STEEP_HALF_M), (0.0, -STEEP_HALF_M), (0.0, 0.0)];
+    let heights = places.map(|(dx, dy)| world.ground.height(x + dx, y + dy));
+    let [low, high] = [heights.into_iter().fold(f64::INFINITY, f64::min), heights.into_iter().fold(f64::MIN, f64::max)];
+    high - low > limits.step_m_max
 }
 
 /// Squared distance in cells from each open cell to the nearest closed one; the raster's border is open.
@@ -322,6 +352,12 @@ mod tests {
     fn behind_a_fence_is_reached_through_a_wide_gate_only() {
         assert_eq!(about(&ring_with_gate(4.0)).class_at(15.0, 0.0), Truth::Drivable);
         assert_eq!(about(&ring_with_gate(2.0)).class_at(15.0, 0.0), Truth::Tight);
+        // The vehicle is 1.8 m wide; the raster leaves 0.4 m below that undecided.
+        for width in [1.35, 0.6] {
+            let narrow = about(&ring_with_gate(width));
+            assert_eq!(narrow.class_at(15.0, 0.0), Truth::Unreachable, "opening of {width} m");
+            assert_eq!(narrow.class_at(11.0, 0.0), Truth::Drivable, "before the opening of {width} m");
+        }
         let closed = about(&ring_with_gate(0.0));
         assert_eq!(closed.class_at(15.0, 0.0), Truth::Unreachable);
         assert_eq!(closed.class_at(12.0, 5.0), Truth::Obstacle);
@@ -345,6 +381,16 @@ mod tests {
             let world = World::on(Ground { terraces: vec![terrace], ..Ground::default() });
             assert_eq!(about(&world).class_at(10.0, 0.0), expected, "rise {rise}");
         }
+    }
+
+    #[test]
+    fn a_furrow_is_driven_over_and_a_ditch_is_not() {
+        let trench = |depth: f64| {
+            let across =
+                Profile::through(&[(4.0, 0.0), (4.0 + depth, -depth), (4.3 + depth, -depth), (4.3 + 2.0 * depth, 0.0)]);
+            about(&World::on(Ground { across, ..Ground::default() })).class_at(0.0, 10.0)
+        };
+        assert_eq!([trench(0.05), trench(0.15), trench(0.6)], [Truth::Drivable, Truth::Drivable, Truth::Unreachable]);
     }
 
     #[test]

@@ -51,6 +51,28 @@ impl World {
         self
     }
 
+    /// A guard rail along these places, between `underside` and `top` metres over the ground, without its posts.
+    pub fn rail(mut self, along: &[[f64; 2]], underside: f64, top: f64) -> Self {
+        let fences = Self { ground: std::mem::take(&mut self.ground), objects: Vec::new() }.fence(along, top, None);
+        self.ground = fences.ground;
+        for mut object in fences.objects {
+            if let Shape::Panel { base, height, .. } = &mut object.shape {
+                base.0 += underside;
+                *height -= underside;
+            }
+            self.objects.push(object);
+        }
+        self
+    }
+
+    /// A bush: leaves down to the ground, so dense that hardly a ray passes, `radius` wide to each side.
+    pub fn bush(self, x: f64, y: f64, radius: f64, height: f64) -> Self {
+        let base = self.ground.height(x, y);
+        let rise = 0.7 * height;
+        let z = base + height - rise;
+        self.with(Kind::Leaves, 60, Shape::Crown { x, y, z, radius, rise, underside: base - 0.5, density: 6.0 })
+    }
+
     /// A fence along these places; `slats` as in [`SLATS`], or `None` for a closed one.
     pub fn fence(mut self, along: &[[f64; 2]], height: f64, slats: Option<(f64, f64)>) -> Self {
         for pair in along.windows(2) {

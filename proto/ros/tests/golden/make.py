@@ -92,6 +92,27 @@ stamped = T["geometry_msgs/msg/TransformStamped"]
 write("tf_message.cdr", T["tf2_msgs/msg/TFMessage"](transforms=[
     stamped(header=header("map"), child_frame_id="odom", transform=transform),
     stamped(header=header("odom", 0), child_frame_id="base_link", transform=transform)]))
+write("pose_array.cdr", T["geometry_msgs/msg/PoseArray"](header=header("car/base_link"), poses=[pose, pose]))
+point, time = T["geometry_msgs/msg/Point"], T["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+image = T["sensor_msgs/msg/CompressedImage"](
+    header=T["std_msgs/msg/Header"](stamp=time, frame_id=""), format="", data=np.zeros(0, np.uint8))
+unturned = T["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+
+
+def lines(name, action, width, rgba, points):
+    return T["visualization_msgs/msg/Marker"](
+        header=header("car/base_link"), ns=name, id=0, type=5, action=action,
+        pose=T["geometry_msgs/msg/Pose"](position=point(x=0.0, y=0.0, z=0.0), orientation=unturned),
+        scale=vector(x=width, y=0.0, z=0.0), color=T["std_msgs/msg/ColorRGBA"](*rgba),
+        lifetime=T["builtin_interfaces/msg/Duration"](sec=1, nanosec=500_000_000), frame_locked=True,
+        points=[point(*p) for p in points], colors=[], texture_resource="", texture=image, uv_coordinates=[], text="",
+        mesh_resource="", mesh_file=T["visualization_msgs/msg/MeshFile"](filename="", data=np.zeros(0, np.uint8)),
+        mesh_use_embedded_materials=False)
+
+
+write("marker_array.cdr", T["visualization_msgs/msg/MarkerArray"](markers=[
+    lines("links", 0, 0.1, (1.0, 0.5, 0.25, 1.0), [(1.0, 2.0, 0.0), (3.0, -4.0, 0.5)]),
+    lines("radii", 2, 0.05, (0.0, 0.0, 1.0, 0.5), [])]))
 packets = [T["velodyne_msgs/msg/VelodynePacket"](
     stamp=T["builtin_interfaces/msg/Time"](sec=SEC, nanosec=i), data=np.full(1206, i, np.uint8)) for i in range(3)]
 write("velodyne_scan.cdr", T["velodyne_msgs/msg/VelodyneScan"](header=header("velodyne"), packets=packets))

@@ -1,6 +1,8 @@
 //! Messages written by rosbags are read correctly, and messages written here equal those of rosbags.
 
-use clearway_ros::pose::{Odometry, StampedTransform, pose_stamped, tf_message, tf_message_to_cdr};
+use clearway_ros::cdr::Header;
+use clearway_ros::markers::{Lines, marker_array_to_cdr};
+use clearway_ros::pose::{Odometry, StampedTransform, pose_array_to_cdr, pose_stamped, tf_message, tf_message_to_cdr};
 use clearway_ros::velodyne_scan::VelodyneScan;
 use clearway_ros::{PointCloud2, Points};
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
@@ -85,6 +87,18 @@ fn poses_have_their_frames_and_speeds() {
     assert_eq!(frames, [("map", "odom", STAMP_NS), ("odom", "base_link", STAMP_NS - 250_000_000)]);
     assert_eq!(transforms[1].parent_from_child, golden_pose());
     assert_eq!(tf_message_to_cdr(&transforms), bytes);
+}
+
+#[test]
+fn poses_and_lines_are_written_as_by_rosbags() {
+    let header = Header { stamp_ns: STAMP_NS, frame_id: "car/base_link" };
+    assert_eq!(pose_array_to_cdr(&header, &[golden_pose(), golden_pose()]), golden("pose_array"));
+    let points = vec![[1.0, 2.0, 0.0], [3.0, -4.0, 0.5]];
+    let markers = [
+        Lines { name: "links", width_m: 0.1, rgba: [1.0, 0.5, 0.25, 1.0], points },
+        Lines { name: "radii", width_m: 0.05, rgba: [0.0, 0.0, 1.0, 0.5], points: Vec::new() },
+    ];
+    assert_eq!(marker_array_to_cdr(&header, 1_500_000_000, &markers), golden("marker_array"));
 }
 
 #[test]

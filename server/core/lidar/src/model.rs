@@ -91,6 +91,8 @@ pub struct ModelSpec {
     pub rpm_nominal: f32,
     /// Greatest range in the manual, in m.
     pub range_m_max: f32,
+    /// Range noise, one standard deviation, in m: the distance accuracy in the specifications of the manual.
+    pub range_noise_m: f32,
     /// Lowest and highest nominal elevation, in degrees.
     pub elevation_deg: (f32, f32),
 }
@@ -291,6 +293,8 @@ const HDL64E_S2: ModelSpec = ModelSpec {
     distance_m_per_count: 0.002,
     rpm_nominal: 600.0,
     range_m_max: 120.0,
+    // 63-HDL64ES3, specifications: "< 2 cm distance accuracy (one sigma)".
+    range_noise_m: 0.02,
     elevation_deg: (-24.33, 2.0),
 };
 
@@ -316,6 +320,8 @@ const HDL32E: ModelSpec = ModelSpec {
     model_bytes: &[0x21],
     dual_return: true,
     range_m_max: 100.0,
+    // HDL-32E user's manual 63-9113, specifications: "±2 cm (one sigma at 25 m)".
+    range_noise_m: 0.02,
     elevation_deg: (-30.67, 10.67),
     ..HDL64E_S2
 };
@@ -329,6 +335,8 @@ const VLP16: ModelSpec = ModelSpec {
     firing_period_dual_ns: 55_296,
     // Sensors of 2014 send the byte of the HDL-32E.
     model_bytes: &[0x22, 0x21],
+    // 63-9243, specifications: "range accuracy up to ±3 cm (typical)".
+    range_noise_m: 0.03,
     elevation_deg: (-15.0, 15.0),
     ..HDL32E
 };
@@ -349,6 +357,8 @@ const VLP32C: ModelSpec = ModelSpec {
     model_bytes: &[0x28],
     distance_m_per_count: 0.004,
     range_m_max: 200.0,
+    // 63-9325, specifications: "range accuracy up to ±3 cm (typical)".
+    range_noise_m: 0.03,
     elevation_deg: (-25.0, 15.0),
     ..HDL32E
 };
@@ -366,5 +376,7 @@ const VLS128: ModelSpec = ModelSpec {
     distance_m_per_count: 0.004,
     rpm_nominal: 600.0,
     range_m_max: 245.0,
+    // 63-9480, specifications: "range accuracy up to ±3 cm (typical)".
+    range_noise_m: 0.03,
     elevation_deg: (-25.0, 15.0),
 };

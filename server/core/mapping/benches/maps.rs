@@ -5,8 +5,8 @@
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{
-    DrivabilityConfig, HeightDifferenceConfig, MotionConfig, OccupancyConfig, SafePathConfig, SpeedConfig,
-    TerrainConfig, Variant,
+    DrivabilityConfig, HeightDifferenceConfig, MotionConfig, OccupancyConfig, OccupancyVariant, SafePathConfig,
+    SpeedConfig, TerrainConfig, Variant,
 };
 use clearway_mapping::event::{EgoPose, Road, RoadFrame, RoadPurpose, Scan};
 use clearway_mapping::layer::drivability::Drivability;
@@ -14,11 +14,13 @@ use clearway_mapping::layer::height_difference::HeightDifference;
 use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::layer::safe_path::SafePath;
 use clearway_mapping::layer::speed::Speed;
+use clearway_mapping::layer::speed::measured_road::MeasuredRoad;
 use clearway_mapping::layer::terrain::Terrain;
 use clearway_mapping::layer::{Context, LayerMaker, Rays};
 use clearway_mapping::road::StoredRoad;
 use clearway_mapping::sensor::distance_series::DistanceSeries;
 use clearway_mapping::sensor::motion::{EgoTrajectory, Motion};
+use clearway_mapping::sensor::ring_series::RingSeries;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::planes::PlaneUnit;
 use clearway_sim::scanner::ScannerConfig;
@@ -90,6 +92,30 @@ fn sweep_of_a_revolution(bencher: Bencher) {
     bencher.counter(ItemsCount::new(slots)).bench_local(|| sweep.set_revolution(&revolution, &mount));
 }
 
+/// The distance series of a scan with rings: a simulated revolution as a client sends it.
+#[divan::bench]
+fn deviations_of_a_scan(bencher: Bencher) {
+    let revolution = revolution();
+    let (echo, lasers) = (&revolution.echoes[0], revolution.lasers);
+    let mut scan = Scan::default();
+    for slot in (0..echo.range_m.len()).filter(|slot| echo.range_m[*slot] > 0.0) {
+        scan.x.push(echo.x[slot]);
+        scan.y.push(echo.y[slot]);
+        scan.z.push(echo.z[slot]);
+        scan.ring.push((slot % lasers) as u16);
+    }
+    let mut series = RingSeries::default();
+    bencher.counter(ItemsCount::new(scan.x.len())).bench_local(|| divan::black_box(series.deviations(&scan).len()));
+}
+
+/// Measures the road ahead in a sweep.
+#[divan::bench]
+fn road_measured_in_the_sweep(bencher: Bencher) {
+    let sweep = sweep();
+    let mut road = MeasuredRoad::default();
+    bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| divan::black_box(road.measure(&sweep)));
+}
+
 /// The same with a pose each 10 ms: it includes the motion and the transform of each firing.
 #[divan::bench]
 fn sweep_of_a_moving_revolution(bencher: Bencher) {
@@ -127,7 +153,7 @@ fn terrain_with_roughness(bencher: Bencher) {
     let (revolution, mount) = (revolution(), mount(1.9));
     let mut sweep = Sweep::default();
     sweep.set_revolution(&revolution, &mount);
-    sweep.set_deviations(&revolution, &mount, &mut DistanceSeries::default(), None);
+    sweep.set_deviations(&revolution, &mount, &mut DistanceSeries::default(), 0.02, None);
     let mut map = Terrain::new(&TerrainConfig::default());
     let mut layer = map.layer();
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| map.make(&sweep, &Context::default(), &mut layer));
@@ -140,7 +166,7 @@ fn deviations_of_a_revolution(bencher: Bencher) {
     let slots = revolution.echoes[0].range_m.len();
     bencher
         .counter(ItemsCount::new(slots))
-        .bench_local(|| sweep.set_deviations(&revolution, &mount, &mut series, None));
+        .bench_local(|| sweep.set_deviations(&revolution, &mount, &mut series, 0.02, None));
 }
 
 /// With a road of 20 points, 6 m wide.
@@ -154,6 +180,7 @@ fn speed(bencher: Bencher) {
         points: (0..20).map(|i| [2.0 * f64::from(i), 0.05 * f64::from(i * i)]).collect(),
         widths_m: vec![6.0; 20],
         orientations: Vec::new(),
+        speed_limits_mps: Vec::new(),
     };
     let taken = StoredRoad { road, map_from_ego: None };
     let mut map = Speed::new(&SpeedConfig::default());
@@ -195,10 +222,10 @@ fn six_units() -> Vec<(Sweep, [f32; 3])> {
 }
 
 /// Integrates all scans of 100 ms, and makes the layer.
-#[divan::bench]
-fn occupancy_of_six_units(bencher: Bencher) {
+#[divan::bench(args = [OccupancyVariant::Polar, OccupancyVariant::Paper])]
+fn occupancy_of_six_units(bencher: Bencher, variant: OccupancyVariant) {
     let scans = six_units();
-    let mut map = Occupancy::new(&OccupancyConfig::default());
+    let mut map = Occupancy::new(&OccupancyConfig { variant, ..OccupancyConfig::default() });
     let mut layer = map.layer();
     let pose = Some(nalgebra::Isometry3::identity());
     let context = Context { map_from_ego: pose, ..Context::default() };
@@ -208,7 +235,9 @@ fn occupancy_of_six_units(bencher: Bencher) {
                 sensor: (number % 6) as u16,
                 stamp_ns: 0,
                 returns,
+                heights_m: &returns.z,
                 origin_m: *origin_m,
+                origin_height_m: origin_m[2],
                 no_returns: &[],
                 map_from_ego: pose,
                 speed_mps: Some(0.0),
@@ -219,47 +248,27 @@ fn occupancy_of_six_units(bencher: Bencher) {
     });
 }
 
-/// For comparison: a Bresenham line for each return, from its sensor to the border, with one store for each cell.
-#[divan::bench]
-fn bresenham_of_six_units(bencher: Bencher) {
-    const SIDE: i32 = 400;
-    let scans = six_units();
-    let mut cells = vec![0_u8; (SIDE * SIDE) as usize];
-    bencher.counter(ItemsCount::new(52_800_usize)).bench_local(|| {
-        for (sweep, [ox, oy, _]) in &scans {
-            let cell = |metres: f32| (metres * 4.0).floor() as i32 + SIDE / 2;
-            let (x0, y0) = (cell(*ox), cell(*oy));
-            for (x, y) in sweep.x.iter().zip(&sweep.y) {
-                let (hit_x, hit_y) = (cell(*x), cell(*y));
-                let far = 100.0 / ((x - ox).hypot(y - oy)).max(0.1);
-                let (x1, y1) = (cell(ox + (x - ox) * far), cell(oy + (y - oy) * far));
-                let (dx, dy) = ((x1 - x0).abs(), -(y1 - y0).abs());
-                let (sx, sy) = ((x1 - x0).signum(), (y1 - y0).signum());
-                let (mut x, mut y, mut error, mut state) = (x0, y0, dx + dy, 1);
-                while (0..SIDE).contains(&x) && (0..SIDE).contains(&y) {
-                    state = if (x, y) == (hit_x, hit_y) { 3 } else { state };
-                    cells[(y * SIDE + x) as usize] = state;
-                    let twice = 2 * error;
-                    (x, error) = if twice >= dy { (x + sx, error + dy) } else { (x, error) };
-                    (y, error) = if twice <= dx { (y + sy, error + dx) } else { (y, error) };
-                }
-            }
-        }
-        divan::black_box(&cells);
-    });
-}
-
 /// Integrates one revolution of an HDL-64E, and makes the layer.
-#[divan::bench]
-fn occupancy_of_a_turn(bencher: Bencher) {
+#[divan::bench(args = [OccupancyVariant::Polar, OccupancyVariant::Paper])]
+fn occupancy_of_a_turn(bencher: Bencher, variant: OccupancyVariant) {
     let sweep = sweep();
-    let mut map = Occupancy::new(&OccupancyConfig::default());
+    let mut map = Occupancy::new(&OccupancyConfig { variant, ..OccupancyConfig::default() });
     let mut layer = map.layer();
     bencher.counter(ItemsCount::new(sweep.x.len())).bench_local(|| {
         let origin_m = [0.0, 0.0, sweep.mount_height_m];
         let returns = &sweep;
         let (map_from_ego, speed_mps) = (Some(nalgebra::Isometry3::identity()), Some(0.0));
-        map.integrate(&Rays { sensor: 0, stamp_ns: 0, returns, origin_m, no_returns: &[], map_from_ego, speed_mps });
+        map.integrate(&Rays {
+            sensor: 0,
+            stamp_ns: 0,
+            returns,
+            heights_m: &returns.z,
+            origin_m,
+            origin_height_m: origin_m[2],
+            no_returns: &[],
+            map_from_ego,
+            speed_mps,
+        });
         map.make(&sweep, &Context::default(), &mut layer);
     });
 }

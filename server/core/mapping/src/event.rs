@@ -119,6 +119,8 @@ pub struct Road {
     pub widths_m: Vec<f64>,
     /// Votes for each dominant orientation in the detector's image; empty if the road was not found in an image.
     pub orientations: Vec<f32>,
+    /// Speed limit from each point to the next one, m/s; 0: no limit. Empty if the road has no limits.
+    pub speed_limits_mps: Vec<f64>,
 }
 
 /// What a road is used for.
@@ -126,7 +128,8 @@ pub struct Road {
 pub enum RoadPurpose {
     /// A detected road or a lane: it is painted into the speed map, and replaces the one before.
     Paint,
-    /// The centre line of the route (RDDF): it is never painted. Its curvature shows where a detector fails.
+    /// The centre line of the route (RDDF): it is never painted. Its curvature shows where a detector fails; its width
+    /// is the corridor in which roads are painted; its limits cap the speed.
     Route,
 }
 

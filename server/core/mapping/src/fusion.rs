@@ -7,6 +7,9 @@
 //! - The source of a map is the first usable sensor in this order: the reference sensor, then the others as they are
 //!   configured. A sensor is not usable while it completes no scan for `deadline_ms` of event time, or while its scans
 //!   arrive that much later after their stamps (or that much earlier before them) than those of the timeliest sensor.
+//! - A map waits for the scans of other sensors that are due with the same stamp: those whose stamp before, plus the
+//!   time between their last two stamps, is the map's stamp. It waits until they are there, until an event shows that a
+//!   quarter of `deadline_ms` has passed, or until the next scan makes a map. A vehicle with one sensor never waits.
 //! - If no map was made for `deadline_ms` (for `period_ms` if that is more), the next timely scan of any sensor makes
 //!   one: no silent sensor holds back the maps.
 //! - The rows of radial maps are those of the reference sensor once it has completed a scan, whichever sensor is the
@@ -16,6 +19,8 @@
 //!
 //! The order in which the scans of different sensors arrive between two maps does not change the layers that are made
 //! from the sweep.
+
+use nalgebra::Isometry3;
 
 use crate::config::fusion::FusionConfig;
 use crate::event_time::EventTime;
@@ -29,6 +34,13 @@ const NS_PER_MS: i64 = 1_000_000;
 /// by some per cent of their own period, and a scan that comes a little early must not halve the rate of maps.
 const PERIOD_TOLERANCE_PARTS: i64 = 10;
 
+/// A map waits at most the deadline divided by this. Ours: scans that are taken together arrive within some
+/// milliseconds of each other, and a map that waits is older for the planner.
+const WAIT_PARTS: i64 = 4;
+/// Stamps that differ by at most this part of a sensor's period are equal. Ours: sensors that are locked to each other
+/// turn evenly to a per cent.
+const EQUAL_STAMP_PARTS: i64 = 50;
+
 /// The newest map, as far as the next one depends on it.
 #[derive(Clone, Copy, Debug)]
 struct NewestMap {
@@ -37,12 +49,50 @@ struct NewestMap {
     event_ns: i64,
 }
 
+/// A map whose source has completed its scan, while scans with the same stamp are due.
+struct WaitingMap {
+    /// The source's scan, without its points.
+    own: OwnScan,
+    /// Indices of the sensors whose scans are due.
+    due: Vec<usize>,
+    /// Event time from which the map waits, ns.
+    since_ns: i64,
+}
+
+/// What a map needs of its source's scan beside the points. A later scan does not change it.
+struct OwnScan {
+    source: usize,
+    start_ns: i64,
+    end_ns: i64,
+    compensation: Compensation,
+    map_from_ego: Option<Isometry3<f64>>,
+    speed_mps: Option<f64>,
+    state: SensorState,
+}
+
+impl OwnScan {
+    fn new(source: usize, scan: &SensorScan) -> Self {
+        Self {
+            source,
+            start_ns: scan.start_ns,
+            end_ns: scan.end_ns,
+            compensation: scan.compensation,
+            map_from_ego: scan.map_from_ego,
+            speed_mps: scan.speed_mps,
+            state: scan.state.clone(),
+        }
+    }
+}
+
 /// The fusion of one vehicle.
 pub(crate) struct Fusion {
     reference_sensor: usize,
     deadline_ns: i64,
     period_ns: i64,
     newest: Option<NewestMap>,
+    waiting: Option<WaitingMap>,
+    /// Points of the scan of the map that waits.
+    waiting_sweep: Sweep,
     /// True if the newest scan of any sensor made the newest map.
     is_current: bool,
     /// The newest map's points if they are not the points of its source alone.
@@ -56,6 +106,12 @@ pub(crate) struct MergedScans {
     pub source: usize,
     /// Stamp of the earliest first firing of the contributing scans, ns since the Unix epoch.
     pub start_ns: i64,
+    /// Stamp of the source's last firing, ns since the Unix epoch.
+    pub end_ns: i64,
+    /// Ego frame in the world frame at `end_ns`; `None` if no pose is near enough.
+    pub map_from_ego: Option<Isometry3<f64>>,
+    /// Forward speed at `end_ns`; `None` if it is unknown.
+    pub speed_mps: Option<f64>,
     /// Weakest motion compensation among the contributing sensors.
     pub compensation: Compensation,
     /// State of every sensor, by source; `refused` is 0.
@@ -70,10 +126,22 @@ impl Fusion {
             deadline_ns: config.deadline_ns(),
             period_ns: i64::from(config.period_ms) * NS_PER_MS,
             newest: None,
+            waiting: None,
+            waiting_sweep: Sweep::default(),
             is_current: false,
             sweep: Sweep::default(),
             is_merged: false,
         }
+    }
+
+    /// Sets the reference sensor from now on.
+    pub fn set_reference_sensor(&mut self, reference_sensor: usize) {
+        self.reference_sensor = reference_sensor;
+    }
+
+    /// Index of the reference sensor.
+    pub fn reference_sensor(&self) -> usize {
+        self.reference_sensor
     }
 
     /// Index of the sensor whose scan made the newest map; `None` before the first map.
@@ -92,8 +160,8 @@ impl Fusion {
         if self.is_merged { &self.sweep } else { &scans[source].sweep }
     }
 
-    /// Merges the newest scans to the points of a map if the scan that sensor `source` has just completed makes one;
-    /// `None` if it makes none. [`Fusion::sweep`] then returns the points.
+    /// Merges the newest scans to the points of a map if the scan that sensor `source` has just completed makes one, or
+    /// if it is the last for which a map waits; `None` if there is no map. [`Fusion::sweep`] then returns the points.
     pub fn merge(
         &mut self,
         source: usize,
@@ -101,8 +169,73 @@ impl Fusion {
         motion: &Motion,
         now: EventTime,
     ) -> Option<MergedScans> {
-        self.is_current = self.makes_map(source, scans, now);
-        self.is_current.then(|| self.merge_scans(source, scans, motion, now))
+        let makes_map = self.makes_map(source, scans, now);
+        self.is_current = false;
+        if let Some(waiting) = &mut self.waiting {
+            waiting.due.retain(|due| *due != source);
+        }
+        let released = self.release(makes_map, scans, motion, now);
+        if !makes_map {
+            return released;
+        }
+        let own = OwnScan::new(source, &scans[source]);
+        self.newest = Some(NewestMap { source, stamp_ns: own.end_ns, event_ns: now.event_ns });
+        let due = self.due(source, scans, now);
+        if released.is_some() || !due.is_empty() {
+            // Only one map is made at a time: behind a map that has waited, this one waits for the next event.
+            self.is_current = false;
+            self.waiting = Some(WaitingMap { own, due, since_ns: now.event_ns });
+            self.waiting_sweep.copy_from(&scans[source].sweep);
+            return released;
+        }
+        (self.is_merged, self.is_current) = (false, true);
+        Some(self.merge_scans(own, scans, motion, now))
+    }
+
+    /// Merges the map that waits if an event that completed no scan shows that it has waited long enough, or that its
+    /// source or a sensor for which it waits has ended; `None` if no map waits or it goes on waiting.
+    pub fn merge_waiting(
+        &mut self,
+        ended: Option<usize>,
+        scans: &[SensorScan],
+        motion: &Motion,
+        now: EventTime,
+    ) -> Option<MergedScans> {
+        let waiting = self.waiting.as_mut()?;
+        waiting.due.retain(|due| Some(*due) != ended);
+        let has_ended = ended == Some(waiting.own.source);
+        self.release(has_ended, scans, motion, now)
+    }
+
+    /// Merges the map that waits if nothing is due any more, if it has waited long enough, or if `is_over`.
+    fn release(&mut self, is_over: bool, scans: &[SensorScan], motion: &Motion, now: EventTime) -> Option<MergedScans> {
+        let wait_ns = self.deadline_ns / WAIT_PARTS;
+        let is_over = |waiting: &mut WaitingMap| {
+            is_over || waiting.due.is_empty() || now.event_ns.saturating_sub(waiting.since_ns) > wait_ns
+        };
+        let waiting = self.waiting.take_if(is_over)?;
+        std::mem::swap(&mut self.sweep, &mut self.waiting_sweep);
+        self.is_merged = true;
+        self.is_current = scans[waiting.own.source].end_ns == waiting.own.end_ns;
+        Some(self.merge_scans(waiting.own, scans, motion, now))
+    }
+
+    /// Indices of the sensors whose next scans have the stamp of the newest scan of `source` and arrive in time.
+    fn due(&self, source: usize, scans: &[SensorScan], now: EventTime) -> Vec<usize> {
+        let (stamp_ns, wait_ns) = (scans[source].end_ns, self.deadline_ns / WAIT_PARTS);
+        let delay_ns = |scan: &SensorScan| scan.completed_at.arrival_ns.saturating_sub(scan.end_ns);
+        let is_due = |index: &usize| {
+            let scan = &scans[*index];
+            let period_ns = scan.period_ns.filter(|period_ns| (1..=self.deadline_ns).contains(period_ns));
+            let equal_ns = period_ns.map_or(0, |period_ns| period_ns / EQUAL_STAMP_PARTS);
+            let next_ns = period_ns.map(|period_ns| scan.end_ns.saturating_add(period_ns));
+            next_ns.is_some_and(|next_ns| next_ns.saturating_sub(stamp_ns).saturating_abs() <= equal_ns)
+                && stamp_ns.saturating_sub(scan.end_ns) > equal_ns
+                && delay_ns(scan).saturating_sub(delay_ns(&scans[source])) <= wait_ns
+                && self.is_fresh(scan, now)
+                && self.is_timely(*index, scans, now)
+        };
+        (0..scans.len()).filter(|index| *index != source).filter(is_due).collect()
     }
 
     /// True if the sensor's scans arrive no later after their stamps, nor earlier before them, than those of the
@@ -173,23 +306,26 @@ impl Fusion {
         since_ns.saturating_abs() > self.deadline_ns
     }
 
-    fn merge_scans(&mut self, source: usize, scans: &[SensorScan], motion: &Motion, now: EventTime) -> MergedScans {
-        let own = &scans[source];
-        let stamp_ns = own.end_ns;
-        self.newest = Some(NewestMap { source, stamp_ns, event_ns: now.event_ns });
-        self.is_merged = false;
+    fn merge_scans(&mut self, own: OwnScan, scans: &[SensorScan], motion: &Motion, now: EventTime) -> MergedScans {
+        let (source, stamp_ns) = (own.source, own.end_ns);
         let mut merged = MergedScans {
             source,
             start_ns: own.start_ns,
+            end_ns: stamp_ns,
+            map_from_ego: own.map_from_ego,
+            speed_mps: own.speed_mps,
             compensation: own.compensation,
             sensors: Vec::with_capacity(scans.len()),
         };
         for (index, scan) in scans.iter().enumerate() {
-            let contribution =
-                if index == source { own.state.contribution } else { self.contribution(scan, stamp_ns, now) };
-            if index != source && contribution.is_in_map() {
+            if index == source {
+                merged.sensors.push(SensorState { age_ms: Some(0.0), ..own.state.clone() });
+                continue;
+            }
+            let contribution = self.contribution(scan, stamp_ns, now);
+            if contribution.is_in_map() {
                 let (stamp_from_end, compensation) = motion.propagate(scan.end_ns, stamp_ns);
-                self.copy_once(&own.sweep);
+                self.copy_once(&scans[source].sweep);
                 self.sweep.append(&scan.sweep, &stamp_from_end);
                 merged.start_ns = merged.start_ns.min(scan.start_ns);
                 merged.compensation = merged.compensation.min(compensation).min(scan.compensation);
@@ -198,7 +334,7 @@ impl Fusion {
         }
         let reference = &scans[self.reference_sensor].sweep;
         if source != self.reference_sensor && reference.calibration.is_some() {
-            self.copy_once(&own.sweep);
+            self.copy_once(&scans[source].sweep);
             self.sweep.copy_rows(reference);
         }
         merged
@@ -238,6 +374,7 @@ fn sensor_state(scan: &SensorScan, contribution: Contribution, stamp_ns: i64) ->
         contribution,
         clock: scan.state.clock,
         clock_offset_ms: scan.state.clock_offset_ms,
+        elevations: scan.state.elevations,
         age_ms: (scan.completed > 0).then(|| (age_ns as f64 / NS_PER_MS as f64) as f32),
         ..counts
     }

@@ -2,7 +2,6 @@
 //!
 //! In: one [`Event`] after the other. Out: an [`Outcome`] each, and the inputs of fusion and layers.
 
-use clearway_lidar::SensorStatus;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
 use clearway_lidar::telemetry::TELEMETRY_LENGTH;
@@ -13,6 +12,7 @@ use crate::error::{EventError, check_newer, check_stamp_range};
 use crate::event::{Body, EgoPose, Event, Road};
 use crate::event_time::EventTime;
 use crate::layer::ScanExtras;
+use crate::reference_sensor::ReferenceChoice;
 use crate::road::{self, Roads};
 use crate::sensor::motion::Motion;
 use crate::sensor::pipeline::SensorPipeline;
@@ -43,6 +43,7 @@ pub(crate) struct Inputs {
     config: VehicleConfig,
     deadline_ns: i64,
     extras: ScanExtras,
+    reference_sensor: usize,
     /// By source.
     sensors: Vec<SensorPipeline>,
     /// By source.
@@ -59,6 +60,7 @@ impl Inputs {
         let mut inputs = Self {
             deadline_ns: config.fusion.deadline_ns(),
             extras,
+            reference_sensor: config.reference_sensor().unwrap_or(0),
             sensors: Vec::new(),
             scans: Vec::new(),
             motion: Motion::new(&config.maps.motion),
@@ -103,10 +105,21 @@ impl Inputs {
     /// Sets what the active layers need of every scan from now on.
     pub fn set_extras(&mut self, extras: ScanExtras) {
         self.extras = extras;
-        for source in 0..self.sensors.len() {
-            let extras = self.extras_of(source);
-            self.sensors[source].set_extras(extras, &mut self.scans[source]);
+        for (sensor, scan) in self.sensors.iter_mut().zip(&mut self.scans) {
+            sensor.set_extras(extras, scan);
         }
+    }
+
+    /// Sets the reference sensor from now on.
+    pub fn set_reference_sensor(&mut self, reference_sensor: usize) {
+        self.reference_sensor = reference_sensor;
+        self.set_extras(self.extras);
+    }
+
+    /// Index of the reference sensor by the configuration alone, if it names none.
+    pub fn reference_by_configuration(&self) -> usize {
+        let lasers: Vec<usize> = self.sensors.iter().map(SensorPipeline::lasers_configured).collect();
+        ReferenceChoice::by_configuration(&self.scans, &lasers)
     }
 
     /// The newest scan of each sensor, by source.
@@ -124,10 +137,9 @@ impl Inputs {
         &self.roads
     }
 
-    /// Name and status of each sensor, by source.
-    pub fn statuses(&self) -> impl Iterator<Item = (&str, SensorStatus)> {
-        let names = self.config.sensors.iter().map(|sensor| sensor.name.as_str());
-        names.zip(self.sensors.iter().map(SensorPipeline::status))
+    /// Name of each sensor and its pipeline, by source.
+    pub fn sensors(&self) -> impl Iterator<Item = (&str, &SensorPipeline)> {
+        self.config.sensors.iter().map(|sensor| sensor.name.as_str()).zip(&self.sensors)
     }
 
     /// The revolution from which the newest scan of a sensor was made; `None` if the scan came as an event.
@@ -182,16 +194,9 @@ impl Inputs {
     }
 
     fn add_sensor(&mut self, sensor: &SensorConfig, calibration: Option<Calibration>) {
-        let extras = self.extras_of(self.sensors.len());
-        let pipeline = SensorPipeline::new(sensor, calibration, self.config.body.as_ref(), extras);
-        self.scans.push(SensorScan::new(&sensor.name, pipeline.origin_m()));
+        let pipeline = SensorPipeline::new(sensor, calibration, self.config.body.as_ref(), self.extras);
+        self.scans.push(SensorScan::new(&sensor.name, pipeline.origin_m(), pipeline.tilt_rad()));
         self.sensors.push(pipeline);
-    }
-
-    /// What the layers need of one sensor: deviations of the reference sensor alone.
-    fn extras_of(&self, source: usize) -> ScanExtras {
-        let is_reference = self.config.reference_sensor() == Some(source);
-        ScanExtras { deviations: self.extras.deviations && is_reference, ..self.extras }
     }
 }
 

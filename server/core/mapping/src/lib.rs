@@ -11,10 +11,15 @@
 //! | [`road`] | RDDF and RNDF files, road events -> the newest checked roads |
 //! | [`ledger`] | every event and its outcome -> counts |
 //! | [`error`] | why an event is refused |
+//! | `reference_sensor` | the sensors, their first scans -> the one whose scans make the maps |
 //! | `fusion` | the newest scans of all sensors -> the points of one map |
+//! | [`memory`] | the points of earlier maps -> the points that the newest map lacks |
+//! | [`ground`] | the points of one map -> height of the local ground, shared by all layers |
+//! | [`reach`] | the points of one map and their ground -> obstacles, and what the vehicle can reach |
 //! | [`layer`] | the points of one map -> one layer for each of the six maps |
 //! | [`map`] | what a map contains |
-//! | [`scan_file`] | KITTI `.bin`, `.pcd` -> scan |
+//! | [`vehicle_outline`] | the vehicle, seen from above |
+//! | [`scan_file`] | KITTI `.bin`, nuScenes `.pcd.bin`, `.pcd` -> scan |
 
 // The core is pure: server/core/clippy.toml lists what it must not use.
 #![deny(clippy::disallowed_methods, clippy::disallowed_types)]
@@ -24,11 +29,17 @@ pub mod error;
 pub mod event;
 mod event_time;
 mod fusion;
+pub mod ground;
 mod inputs;
 pub mod layer;
 pub mod ledger;
 pub mod map;
+mod map_ground;
+pub mod memory;
 pub mod pipeline;
+pub mod reach;
+mod reference_sensor;
 pub mod road;
 pub mod scan_file;
 pub mod sensor;
+pub mod vehicle_outline;

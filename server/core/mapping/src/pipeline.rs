@@ -1,8 +1,8 @@
 //! The conductor of one vehicle: events in, maps out. The events alone decide what a map contains.
 //!
 //! In: [`Event`]s in the order of the event queue. Out: a [`Map`] for every scan that makes one. The hops of
-//! [`Pipeline::step`]: event -> [`Inputs`] -> the newest scan of one sensor -> [`Fusion`] -> the map's [`Sweep`] -> one
-//! layer a map -> [`Map`].
+//! [`Pipeline::step`]: event -> [`Inputs`] -> the newest scan of one sensor -> [`Fusion`] -> the map's [`Sweep`] -> its
+//! [`MapGround`] -> one layer a map -> [`Map`].
 
 use clearway_lidar::SensorStatus;
 use clearway_lidar::calibration::Calibration;
@@ -10,14 +10,19 @@ use clearway_lidar::revolution::Revolution;
 
 use crate::config::{ConfigValueError, MapsConfig, VehicleConfig};
 use crate::error::EventError;
-use crate::event::Event;
+use crate::event::{Body, Event};
 use crate::event_time::{EventClock, EventTime};
 use crate::fusion::{Fusion, MergedScans};
+use crate::ground::Ground;
 use crate::inputs::Inputs;
 use crate::layer::Context;
 use crate::layer::registry::Layers;
 use crate::ledger::{Ledger, Ledgers};
-use crate::map::Map;
+use crate::map::{ElevationSource, Map};
+use crate::map_ground::MapGround;
+use crate::reference_sensor::ReferenceChoice;
+use crate::sensor::mount::check::MountDeviation;
+use crate::sensor::pipeline::SensorPipeline;
 use crate::sensor::sweep::Sweep;
 
 /// The maps of one vehicle, made from its events.
@@ -27,7 +32,9 @@ pub struct Pipeline {
     clock: EventClock,
     inputs: Inputs,
     ledgers: Ledgers,
+    reference: ReferenceChoice,
     fusion: Fusion,
+    ground: MapGround,
     layers: Layers,
     /// Number of maps made so far.
     maps_made: u64,
@@ -40,8 +47,14 @@ pub struct Pipeline {
 pub struct NamedStatus {
     /// Name of the sensor in the configuration.
     pub name: String,
+    /// True if it is the reference sensor: the configured one, else the one that was chosen.
+    pub is_reference: bool,
     /// Status found from the sensor's data; a scan event counts as a revolution.
     pub status: SensorStatus,
+    /// Source of the elevations of the newest scan; `None` before the first.
+    pub elevations: Option<ElevationSource>,
+    /// How far the ground deviates from the configured mount; `None` before the first scan with ground.
+    pub mount: Option<MountDeviation>,
     /// Counts of what became of everything the sensor sent.
     pub ledger: Ledger,
 }
@@ -59,14 +72,20 @@ impl Pipeline {
             return Err(ConfigValueError::new("vehicle.sensor", "calibrations", "one calibration, or none, a sensor"));
         }
         let layers = Layers::new(&config.maps);
-        let reference_sensor = config.reference_sensor().expect("validate() checks the reference sensor");
+        let mut inputs = Inputs::new(config, calibrations, layers.uses());
+        let is_named = !config.fusion.reference_sensor.is_empty();
+        let configured = config.reference_sensor().expect("validate() checks the reference sensor");
+        let reference_sensor = if is_named { configured } else { inputs.reference_by_configuration() };
+        inputs.set_reference_sensor(reference_sensor);
         Ok(Self {
+            reference: ReferenceChoice::new(is_named || config.sensors.len() == 1, config.fusion.deadline_ns()),
             maps: config.maps.clone(),
             deadline_ns: config.fusion.deadline_ns(),
             clock: EventClock::default(),
-            inputs: Inputs::new(config, calibrations, layers.uses()),
+            inputs,
             ledgers: Ledgers::new(config.sensors.len()),
             fusion: Fusion::new(&config.fusion, reference_sensor),
+            ground: MapGround::new(&config.maps),
             layers,
             maps_made: 0,
             map: Map::default(),
@@ -82,14 +101,12 @@ impl Pipeline {
         let now = self.clock.advance(event.arrival_ns);
         let outcome = self.inputs.apply(event, now);
         self.ledgers.record(event, &outcome);
-        if outcome?.completed_scan.is_none() {
-            return Ok(None);
-        }
-        let (source, scans) = (usize::from(event.source), self.inputs.scans());
-        if self.fusion.is_timely(source, scans, now) {
-            self.layers.integrate(&scans[source].rays(event.source));
-        }
-        let Some(merged) = self.fusion.merge(source, scans, self.inputs.motion(), now) else { return Ok(None) };
+        let completed = outcome?.completed_scan.map(|_| event.source);
+        self.choose_reference(completed, now);
+        let merged = self.merge_scans(event, completed, now);
+        self.estimate_ground(merged.as_ref());
+        self.integrate(completed, now);
+        let Some(merged) = merged else { return Ok(None) };
         self.begin_map(merged, now);
         self.make_layers();
         Ok(Some(&self.map))
@@ -114,8 +131,10 @@ impl Pipeline {
         if !is_empty || !self.layers.any_active() || !self.fusion.is_current() {
             return None;
         }
-        let source = self.map.source;
-        self.layers.integrate(&self.inputs.scans()[usize::from(source)].rays(source));
+        let (source, scans) = (self.map.source, self.inputs.scans());
+        let scan = &scans[usize::from(source)];
+        self.ground.estimate(self.fusion.sweep(scans), source, scan);
+        self.layers.integrate(&self.ground.rays(scan, source));
         self.make_layers();
         Some(&self.map)
     }
@@ -133,12 +152,16 @@ impl Pipeline {
     /// The sensors in the order of the configuration, then the declared ones.
     pub fn sensors(&self) -> Vec<NamedStatus> {
         let ledgers = self.ledgers.sensors();
-        let with_ledger = |((name, status), ledger): ((&str, SensorStatus), &Ledger)| NamedStatus {
-            name: name.to_owned(),
-            status,
-            ledger: ledger.clone(),
-        };
-        self.inputs.statuses().zip(ledgers).map(with_ledger).collect()
+        let with_ledger =
+            |(index, ((name, sensor), ledger)): (usize, ((&str, &SensorPipeline), &Ledger))| NamedStatus {
+                name: name.to_owned(),
+                is_reference: index == self.fusion.reference_sensor(),
+                status: sensor.status(),
+                elevations: sensor.elevations(),
+                mount: sensor.mount_deviation(),
+                ledger: ledger.clone(),
+            };
+        self.inputs.sensors().zip(ledgers).enumerate().map(with_ledger).collect()
     }
 
     /// The newest map; `None` before the first.
@@ -151,18 +174,71 @@ impl Pipeline {
         self.fusion.sweep(self.inputs.scans())
     }
 
+    /// Local ground of the newest map; `None` before the first, and if heights are taken over the plane under the
+    /// vehicle or no layer needs the ground.
+    pub fn newest_ground(&self) -> Option<&Ground> {
+        self.ground.ground()
+    }
+
     /// The revolution that made the newest map; `None` before the first map, and if a scan event made it.
     pub fn newest_revolution(&self) -> Option<&Revolution> {
         self.inputs.revolution(self.fusion.source()?)
     }
 
+    /// Changes the reference sensor if the scans so far decide for another one. `completed` is the sensor that has
+    /// completed a scan.
+    fn choose_reference(&mut self, completed: Option<u16>, now: EventTime) {
+        if completed.is_some()
+            && let Some(chosen) = self.reference.by_scans(self.inputs.scans(), now)
+            && chosen != self.fusion.reference_sensor()
+        {
+            self.fusion.set_reference_sensor(chosen);
+            self.inputs.set_reference_sensor(chosen);
+        }
+    }
+
+    /// Merges the newest scans to a map if the completed scan, or the time of the event, completes one.
+    fn merge_scans(&mut self, event: &Event, completed: Option<u16>, now: EventTime) -> Option<MergedScans> {
+        let (scans, motion) = (self.inputs.scans(), self.inputs.motion());
+        match completed {
+            Some(source) => self.fusion.merge(usize::from(source), scans, motion, now),
+            None => {
+                let ended = matches!(event.body, Body::End).then_some(usize::from(event.source));
+                self.fusion.merge_waiting(ended, scans, motion, now)
+            }
+        }
+    }
+
+    /// Estimates the ground of a map, and what the vehicle can reach on it, if a layer uses them.
+    fn estimate_ground(&mut self, merged: Option<&MergedScans>) {
+        let scans = self.inputs.scans();
+        if let Some(merged) = merged.filter(|_| self.layers.uses().ground) {
+            let source = merged.source;
+            self.ground.estimate(self.fusion.sweep(scans), source as u16, &scans[source]);
+        }
+    }
+
+    /// Adds the evidence of the completed scan to the layers, if it is timely.
+    fn integrate(&mut self, completed: Option<u16>, now: EventTime) {
+        let scans = self.inputs.scans();
+        if let Some(source) = completed.filter(|source| self.fusion.is_timely(usize::from(*source), scans, now)) {
+            self.layers.integrate(&self.ground.rays(&scans[usize::from(source)], source));
+        }
+    }
+
+    /// Index of the reference sensor: the configured one, else the one that is chosen from the sensors and their scans.
+    pub fn reference_sensor(&self) -> usize {
+        self.fusion.reference_sensor()
+    }
+
     /// Begins the next map in place of the newest one: all but its sequence and its layers.
     fn begin_map(&mut self, merged: MergedScans, now: EventTime) {
-        let (map, scan) = (&mut self.map, &self.inputs.scans()[merged.source]);
-        (map.capture_start_ns, map.capture_end_ns) = (merged.start_ns, scan.end_ns);
+        let map = &mut self.map;
+        (map.capture_start_ns, map.capture_end_ns) = (merged.start_ns, merged.end_ns);
         map.completed_ns = now.arrival_ns;
-        (map.map_from_ego, map.speed_mps) = (scan.map_from_ego, scan.speed_mps);
+        (map.map_from_ego, map.speed_mps) = (merged.map_from_ego, merged.speed_mps);
         (map.compensation, map.source) = (merged.compensation, merged.source as u16);
+        map.reference_sensor = self.fusion.reference_sensor() as u16;
         map.sensors = merged.sensors;
         for (sensor, ledger) in map.sensors.iter_mut().zip(self.ledgers.sensors()) {
             sensor.refused = ledger.refused_sum();
@@ -177,10 +253,15 @@ impl Pipeline {
             stamp_ns,
             earliest_ns: stamp_ns.saturating_sub(self.deadline_ns),
             map_from_ego: self.map.map_from_ego,
+            ground: self.ground.ground(),
+            reach: self.ground.reach(),
+            memory: self.ground.memory(),
             road: roads.to_paint(),
             route: roads.route(),
         };
-        self.layers.make(self.fusion.sweep(self.inputs.scans()), &context, &mut self.map.layers);
+        let sweep = self.fusion.sweep(self.inputs.scans());
+        let sweep = if context.ground.is_some() { self.ground.sweep(sweep) } else { sweep };
+        self.layers.make(sweep, &context, &mut self.map.layers);
         self.map.sequence = self.maps_made;
         self.maps_made += 1;
     }

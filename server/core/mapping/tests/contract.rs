@@ -76,7 +76,7 @@ fn makers() -> Vec<Box<dyn LayerMaker>> {
 
 fn make(maker: &mut dyn LayerMaker, sweep: &Sweep) -> Layer {
     let mut layer = maker.layer();
-    maker.make(sweep, &Context::default(), &mut layer);
+    maker.make(sweep, &shared(sweep).context(), &mut layer);
     layer
 }
 
@@ -165,9 +165,15 @@ fn ends_of_paths_aside(layer: &Layer, name: &str) -> Vec<i32> {
 #[test]
 fn a_world_rotated_by_90_degrees_gives_a_rotated_layer() {
     let sweep = off_borders(&cast(Model::Hdl64eS2, court));
+    // The paper's division cuts along x first; the other variants of `terrain` are invariant.
+    let paper = TerrainConfig { variant: Variant::Paper, ..TerrainConfig::default() };
+    let paper = make(&mut Terrain::new(&paper), &sweep);
     for mut maker in makers() {
         let (layer, quarter) = (make(maker.as_mut(), &sweep), make(maker.as_mut(), &rotated(&sweep)));
         let (_, columns) = size(&layer);
+        if layer.name == "terrain" && classes(&layer) == classes(&paper) {
+            continue;
+        }
         // A quarter of 90 columns is not a whole number.
         if columns % 4 != 0 {
             continue;
@@ -202,7 +208,7 @@ fn buffers_that_were_used_before_have_no_effect() {
         garbage.points = vec![SafePoint::default(); 3];
         garbage.planes = vec![[9.0; 3]; 70];
         garbage.metrics = vec![("drivable_share", -1.0), ("left_over", 1.0)];
-        maker.make(&sweep, &Context::default(), &mut garbage);
+        maker.make(&sweep, &shared(&sweep).context(), &mut garbage);
         assert_eq!(garbage, fresh);
     }
 }

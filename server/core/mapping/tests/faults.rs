@@ -27,6 +27,7 @@ fn config(model: Model) -> VehicleConfig {
         gps_late_days_max: 1.0,
         range_m_min: 2.0,
         elevations_deg: Vec::new(),
+        range_noise_m: None,
         extrinsics,
     };
     VehicleConfig {

@@ -4,7 +4,7 @@
 
 mod common;
 
-use clearway_mapping::config::{DrivabilityConfig, Passage};
+use clearway_mapping::config::{DrivabilityConfig, DrivabilityVariant, Passage, PlaneTest, Seed};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
 use clearway_mapping::layer::radial_grid::RadialGrid;
@@ -53,11 +53,20 @@ fn by_cell(sweep: &Sweep, labels: &[u32], layer: &Layer) -> Labelled {
     Labelled { road, obstacle, reachable }
 }
 
-fn shares(config: &DrivabilityConfig) -> [f64; 3] {
+/// Heights over the local ground, or over the plane under the vehicle as in the thesis.
+enum Over {
+    Ground,
+    Plane,
+}
+
+fn shares(config: &DrivabilityConfig, over: Over) -> [f64; 3] {
     let (sweep, labels) = labelled_frame();
     let mut map = Drivability::new(config);
     let mut layer = map.layer();
-    map.make(&sweep, &Context::default(), &mut layer);
+    match over {
+        Over::Ground => map.make(&sweep, &shared(&sweep).context(), &mut layer),
+        Over::Plane => map.make(&sweep, &Context::default(), &mut layer),
+    }
     let truth = by_cell(&sweep, &labels, &layer);
     let drivable: Vec<bool> = classes(&layer).iter().map(|class| *class == DRIVABLE).collect();
     let free = share(&drivable, |cell| !truth.obstacle[cell]);
@@ -80,10 +89,33 @@ fn shares(config: &DrivabilityConfig) -> [f64; 3] {
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn the_labelled_frame_reaches_its_targets() {
-    let [free, road, reachable] = shares(&DrivabilityConfig::default());
+    let [free, road, reachable] = shares(&DrivabilityConfig::default(), Over::Ground);
     assert!(free >= 0.9995, "{free}");
     assert!(road >= 0.99, "{road}");
     assert!(reachable >= 0.95, "{reachable}");
+}
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn each_step_of_the_thesis_has_its_price_on_the_labelled_frame() {
+    let own = DrivabilityConfig::default();
+    let whole_boundary = DrivabilityConfig { plane_test: PlaneTest::WholeBoundary, ..own.clone() };
+    let thesis = DrivabilityConfig {
+        offset_m: 0.0,
+        bridge_rows: 0,
+        close_gaps: false,
+        step_m_max: 0.5,
+        grade_max: 0.0,
+        plane_test: PlaneTest::WholeBoundary,
+        passage: Passage::BetweenSegments,
+        ..own.clone()
+    };
+    assert_eq!((own.seed, thesis.seed), (Seed::BlindZone, Seed::BlindZone));
+    let [.., reachable] = shares(&own, Over::Plane);
+    let [.., of_boundaries] = shares(&whole_boundary, Over::Plane);
+    let [free, road, of_thesis] = shares(&thesis, Over::Plane);
+    assert!(of_boundaries <= reachable && of_thesis <= reachable, "{reachable} {of_boundaries} {of_thesis}");
+    assert!(free > 0.99 && road > 0.5, "{free} {road}");
 }
 
 #[test]
@@ -97,14 +129,20 @@ fn wider_columns_and_the_criteria_of_the_thesis_stay_useful() {
         passage: Passage::BetweenSegments,
         ..own.clone()
     };
+    // The thesis whole starts at cell (0, 0), which has no point in this frame: no segment grows.
+    let paper = DrivabilityConfig { variant: DrivabilityVariant::Paper, ..own.clone() };
+    let mut map = Drivability::new(&paper);
+    let mut layer = map.layer();
+    map.make(&labelled_frame().0, &Context::default(), &mut layer);
+    assert_eq!(figure(&layer, "drivable_share"), 0.0);
     let configs = [
-        DrivabilityConfig { columns: 180, ..own.clone() },
-        DrivabilityConfig { columns: 90, ..own.clone() },
-        thesis.clone(),
-        DrivabilityConfig { offset_m: 0.0, ..thesis },
+        (DrivabilityConfig { columns: 180, ..own.clone() }, Over::Ground),
+        (DrivabilityConfig { columns: 90, ..own.clone() }, Over::Ground),
+        (thesis.clone(), Over::Plane),
+        (DrivabilityConfig { offset_m: 0.0, ..thesis }, Over::Plane),
     ];
-    for config in configs {
-        let [free, road, reachable] = shares(&config);
+    for (config, over) in configs {
+        let [free, road, reachable] = shares(&config, over);
         assert!(free >= 0.997 && road >= 0.97 && reachable >= 0.95, "{config:?}");
     }
 }

@@ -7,6 +7,7 @@ use clearway_lidar::model::Model;
 use clearway_mapping::config::{BodyConfig, ConfigValueError, Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
 use clearway_mapping::error::EventError;
 use clearway_mapping::event::{Body, Cause, EgoPose, Event, Scan};
+use clearway_mapping::layer::Cells;
 use clearway_mapping::map::Map;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_sim::scanner::ScannerConfig;
@@ -395,11 +396,12 @@ fn an_inactive_layer_is_not_made_until_the_next_map_after_its_activation() {
     let names = |map: &Map| map.layers.iter().map(|layer| layer.name).collect::<Vec<_>>();
     let (mut all_active, mut some_active) = (pipeline(None), pipeline(None));
     assert_eq!(all_active.layers_made(), all.map(|layer| (layer, 0)));
-    // The layers that are activated, and those in the next map: safe_path is made from drivability.
+    // The layers that are activated, and those in the next map: safe_path is made from drivability
+    // and occupancy.
     let steps: [(&[&str], &[&str]); 6] = [
         (&[], &[]),
         (&["terrain"], &["terrain"]),
-        (&["safe_path", "speed"], &["drivability", "speed", "safe_path"]),
+        (&["safe_path", "speed"], &["drivability", "occupancy", "speed", "safe_path"]),
         (&["occupancy"], &["occupancy"]),
         (&[], &[]),
         (&all, &all),
@@ -419,7 +421,59 @@ fn an_inactive_layer_is_not_made_until_the_next_map_after_its_activation() {
     }
     assert_eq!(all_active.layers_made(), all.map(|layer| (layer, 6)));
     let made: Vec<u64> = some_active.layers_made().iter().map(|(_, made)| *made).collect();
-    assert_eq!(made, [2, 1, 2, 2, 2, 2]);
+    assert_eq!(made, [2, 1, 2, 3, 2, 2]);
+}
+
+/// A scan of five rings on level ground, each range longer or shorter by turns.
+fn scan_of_rings(stamp_ns: i64, bump_m: f32) -> Scan {
+    let mut scan = Scan { stamp_ns, ..Scan::default() };
+    for (ring, radius_m) in [5.0_f32, 6.0, 7.0, 8.0, 9.0].into_iter().enumerate() {
+        for step in 0..1800 {
+            let (sin, cos) = (step as f32 * 0.2).to_radians().sin_cos();
+            let longer = if step % 2 == 0 { 1.0 + bump_m / radius_m } else { 1.0 };
+            scan.x.push(radius_m * cos * longer);
+            scan.y.push(radius_m * sin * longer);
+            scan.z.push(-1.9 * longer);
+            scan.intensity.push(0.5);
+            scan.ring.push(ring as u16);
+        }
+    }
+    scan
+}
+
+#[test]
+fn the_deviations_of_all_sensors_stay_in_a_merged_sweep() {
+    let at = |x_m| Extrinsics { x_m, y_m: 0.0, z_m: 1.9, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
+    let rough = SensorConfig { range_noise_m: Some(0.03), ..SensorConfig::new("rear", at(-20.0)) };
+    let config = VehicleConfig::new("car-1", vec![SensorConfig::new("top", at(0.0)), rough]);
+    let mut pipeline = Pipeline::new(&config, vec![None, None]).unwrap();
+    let send = |pipeline: &mut Pipeline, source, stamp_ns, bump_m| {
+        let body = Body::Scan(scan_of_rings(stamp_ns, bump_m));
+        pipeline.step(&Event { sequence: 0, arrival_ns: stamp_ns, source, body }).unwrap().cloned()
+    };
+    assert!(send(&mut pipeline, 1, 1_000_000_000, 0.16).is_none(), "the reference sensor makes the maps");
+    let map = send(&mut pipeline, 0, 1_000_000_001, 0.0).unwrap();
+    let sweep = pipeline.newest_sweep();
+    assert_eq!((sweep.x.len(), sweep.deviation.len(), sweep.noise.len()), (18_000, 18_000, 18_000));
+    assert!(sweep.deviation[..9000].iter().all(|deviation| deviation.abs() < 1e-4));
+    // The range of the rear sensor, not the distance from the ego origin, divides the deviation and the noise.
+    let range_m = 5.0_f32.hypot(1.9);
+    assert!((sweep.deviation[9011].abs() * range_m - 0.08).abs() < 0.02, "{}", sweep.deviation[9011]);
+    assert!((sweep.noise[9011] * range_m - 0.03).abs() < 1e-4 && (sweep.noise[11] * range_m - 0.02).abs() < 1e-4);
+    let terrain = map.layers.iter().find(|layer| layer.name == "terrain").unwrap();
+    let channel = terrain.channels.iter().find(|channel| channel.name == "roughness").unwrap();
+    let Cells::U8(raw) = &channel.cells else { panic!("roughness is u8") };
+    let known = |columns: std::ops::Range<usize>| {
+        let cells = (0..400).flat_map(|row| columns.clone().map(move |column| row * 400 + column));
+        let known: Vec<u8> = cells.map(|cell| raw[cell]).filter(|raw| i32::from(*raw) != channel.unknown).collect();
+        known
+    };
+    // The rear sensor alone sees the cells more than 11 m behind the ego origin.
+    let (front, rear) = (known(190..250), known(60..150));
+    assert!(front.len() > 100 && rear.len() > 100, "{} {}", front.len(), rear.len());
+    // In a cell with short or with long ranges alone the deviations do not differ.
+    let rough = rear.iter().filter(|raw| **raw > 20).count();
+    assert!(front.iter().all(|raw| *raw == 0) && 4 * rough > rear.len(), "{rough} of {} are rough", rear.len());
 }
 
 #[test]
@@ -432,6 +486,9 @@ fn roughness_is_measured_again_when_terrain_is_activated_again() {
     assert!(maps(&mut late, &events[..half]).iter().all(|map| map.layers.is_empty()));
     late.set_active_layers(|layer| layer == "terrain");
     let made = roughness(&maps(&mut late, &events[half..]));
-    assert!(made.is_some());
+    let channel = made.as_ref().unwrap().channels.iter().find(|channel| channel.name == "roughness").unwrap();
+    let Cells::U8(raw) = &channel.cells else { panic!("roughness is u8") };
+    let known = raw.iter().filter(|raw| i32::from(**raw) != channel.unknown).count();
+    assert!(known > 300, "{known} cells have a roughness");
     assert_eq!(made, roughness(&maps(&mut pipeline(Some(Model::Vlp16)), &events)));
 }

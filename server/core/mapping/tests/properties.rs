@@ -56,7 +56,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
 
     #[test]
-    fn a_cell_is_known_exactly_if_it_contains_a_point(
+    fn over_the_plane_a_cell_is_known_exactly_if_it_contains_a_point(
         model in models(), height in 0.1f32..4.0, points in points(), config in config(), seed in any::<u64>(),
     ) {
         let mut sweep = Sweep { mount_height_m: height, ..empty(model) };
@@ -92,7 +92,7 @@ proptest! {
         points.iter().for_each(|point| add(&mut sweep, *point));
         let mut map = HeightDifference::new(&HeightDifferenceConfig::default());
         let mut layer = map.layer();
-        map.make(&sweep, &Context::default(), &mut layer);
+        map.make(&sweep, &shared(&sweep).context(), &mut layer);
         let (rows, columns) = size(&layer);
         prop_assert_eq!(classes(&layer).len(), rows * columns);
         prop_assert_eq!(values(&layer, "difference").len(), rows * columns);
@@ -106,13 +106,14 @@ proptest! {
     ) {
         let mut sweep = empty(Model::Hdl64eS2);
         points.iter().for_each(|point| add(&mut sweep, *point));
-        sweep.deviation_m = deviations[..points.len()].to_vec();
+        sweep.deviation = deviations[..points.len()].to_vec();
+        sweep.noise = vec![0.001; points.len()];
         let config = TerrainConfig {
             variant, cell_m, range_m_max, points_min, planes, roughness_points_min: 1, ..TerrainConfig::default()
         };
         let mut map = Terrain::new(&config);
         let mut layer = map.layer();
-        map.make(&sweep, &Context::default(), &mut layer);
+        map.make(&sweep, &shared(&sweep).context(), &mut layer);
 
         let (rows, columns) = size(&layer);
         // Not by cell_at: rounding decides to which cell a point on a border belongs.
@@ -128,10 +129,10 @@ proptest! {
             }
         }
 
-        sweep.deviation_m.clear();
-        map.make(&sweep, &Context::default(), &mut layer);
+        sweep.deviation.clear();
+        map.make(&sweep, &shared(&sweep).context(), &mut layer);
         let mut again = map.layer();
-        map.make(&shuffled(&sweep, seed), &Context::default(), &mut again);
+        map.make(&shuffled(&sweep, seed), &shared(&shuffled(&sweep, seed)).context(), &mut again);
         prop_assert_eq!(layer, again);
     }
 

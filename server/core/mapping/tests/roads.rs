@@ -18,6 +18,7 @@ fn good() -> Road {
         points: vec![[0.0, 0.0], [5.0, 0.0], [10.0, 1.0]],
         widths_m: vec![4.0; 3],
         orientations: vec![1.0, 2.0],
+        speed_limits_mps: Vec::new(),
     }
 }
 
@@ -47,7 +48,7 @@ fn an_invalid_road_is_refused_and_counted_and_the_one_before_stays() {
     assert_eq!(step(&mut pipeline, Body::Road(good())), Ok(()));
 
     type Change = fn(&mut Road);
-    let changes: [(&str, Change); 16] = [
+    let changes: [(&str, Change); 20] = [
         ("road_points", |road| road.points.clear()),
         ("road_points", |road| road.points.truncate(1)),
         ("road_points", |road| road.points = vec![[0.0; 2]; 65_537]),
@@ -63,6 +64,10 @@ fn an_invalid_road_is_refused_and_counted_and_the_one_before_stays() {
         ("road_orientations", |road| road.orientations[0] = -1.0),
         ("road_orientations", |road| road.orientations[0] = f32::NAN),
         ("road_orientations", |road| road.orientations = vec![0.0; 9]),
+        ("road_speed_limits", |road| road.speed_limits_mps = vec![5.0; 2]),
+        ("road_speed_limit", |road| road.speed_limits_mps = vec![5.0, -1.0, 5.0]),
+        ("road_speed_limit", |road| road.speed_limits_mps = vec![5.0, 5.0, f64::NAN]),
+        ("road_speed_limit", |road| road.speed_limits_mps = vec![f64::INFINITY, 5.0, 5.0]),
         ("stamp", |road| road.stamp_ns = 0),
     ];
     for (reason, change) in changes {
@@ -84,6 +89,8 @@ fn an_invalid_road_is_refused_and_counted_and_the_one_before_stays() {
         ("road_orientations", 3),
         ("road_point", 3),
         ("road_points", 3),
+        ("road_speed_limit", 3),
+        ("road_speed_limits", 1),
         ("road_width", 3),
         ("road_widths", 1),
         ("stamp", 1),
@@ -106,6 +113,7 @@ fn the_rows_of_a_route_file_give_its_centre_line() {
     assert_eq!(road::check(&road), Ok(()));
     assert_eq!((road.points[0], road.frame, road.purpose), ([0.0, 0.0], RoadFrame::Map, RoadPurpose::Route));
     assert!((road.widths_m[2] - 487.68).abs() < 1e-9);
+    assert!((road.speed_limits_mps[2] - 60.0 * 0.44704).abs() < 1e-12 && road.speed_limits_mps[3] == 0.0);
 }
 
 #[test]

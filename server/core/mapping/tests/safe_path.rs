@@ -3,7 +3,7 @@
 mod common;
 
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{DrivabilityConfig, SafePathConfig};
+use clearway_mapping::config::{DrivabilityConfig, ReachConfig, SafePathConfig};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
 use clearway_mapping::layer::safe_path::SafePath;
@@ -21,7 +21,8 @@ const UNKNOWN: u8 = SafePathClass::Unknown.value();
 const FREE: u8 = SafePathClass::Free.value();
 const OBSTACLE: u8 = SafePathClass::Obstacle.value();
 const PATH: u8 = SafePathClass::Path.value();
-const NOT_SEEN: u8 = DrivabilityClass::Unknown.value();
+const NOT_REACHED: u8 = SafePathClass::NotReached.value();
+const NOT_DRIVABLE: u8 = DrivabilityClass::NotDrivable.value();
 const DRIVABLE: u8 = DrivabilityClass::Drivable.value();
 
 /// Medial axis and links of a grid.
@@ -190,12 +191,18 @@ proptest! {
 
 /// The layers `drivability` and `safe_path` of a sweep.
 fn make(sweep: &Sweep, config: &SafePathConfig) -> (Layer, Layer) {
+    make_for(&ReachConfig::default(), sweep, config)
+}
+
+/// The same for another vehicle.
+fn make_for(vehicle: &ReachConfig, sweep: &Sweep, config: &SafePathConfig) -> (Layer, Layer) {
+    let shared = shared_with(sweep, vehicle);
     let mut drivability = Drivability::new(&DrivabilityConfig::default());
     let mut earlier = [drivability.layer()];
-    drivability.make(sweep, &Context::default(), &mut earlier[0]);
+    drivability.make(sweep, &shared.context(), &mut earlier[0]);
     let mut map = SafePath::new(config);
     let mut layer = map.layer();
-    map.make(sweep, &Context { earlier: &earlier, ..Context::default() }, &mut layer);
+    map.make(sweep, &Context { earlier: &earlier, ..shared.context() }, &mut layer);
     let [drivability] = earlier;
     (drivability, layer)
 }
@@ -203,7 +210,8 @@ fn make(sweep: &Sweep, config: &SafePathConfig) -> (Layer, Layer) {
 #[test]
 fn paths_start_at_the_vehicle_and_stay_on_drivable_ground() {
     let config = SafePathConfig::default();
-    let (drivability, layer) = make(&cast(Model::Hdl64eS2, court), &config);
+    let sweep = cast(Model::Hdl64eS2, court);
+    let (drivability, layer) = make(&sweep, &config);
     assert_eq!((layer.points[0].x_m, layer.points[0].y_m), (0.0, 0.0));
     // The court is 16 m wide: its middle line runs past the vehicle, forward and back.
     assert!(layer.points.len() > 60, "{} points", layer.points.len());
@@ -217,18 +225,20 @@ fn paths_start_at_the_vehicle_and_stay_on_drivable_ground() {
         let near = [cell, cell + 1, cell + columns, cell + columns + 1];
         assert!(near.iter().any(|cell| classes(&layer)[*cell] == PATH), "{point:?}");
     }
+    let shared = shared(&sweep);
     for (cell, class) in classes(&layer).iter().enumerate() {
         let (_, columns) = size(&layer);
         let middle = |i: usize| (i as f32 + 0.5) * 0.25 - 30.0;
-        let there =
-            classes(&drivability)[cell_at(&drivability, middle(cell % columns), middle(cell / columns)).unwrap()];
-        let expected = match there {
-            NOT_SEEN => UNKNOWN,
-            DRIVABLE if *class == PATH => PATH,
-            DRIVABLE => FREE,
-            _ => OBSTACLE,
+        let (x, y) = (middle(cell % columns), middle(cell / columns));
+        let there = classes(&drivability)[cell_at(&drivability, x, y).unwrap()];
+        let (closed, reached) = (shared.context().is_closed(x, y), shared.context().is_reached(x, y));
+        let expected: &[u8] = match there {
+            _ if closed => &[OBSTACLE],
+            DRIVABLE if reached => &[FREE, PATH],
+            DRIVABLE | NOT_DRIVABLE => &[NOT_REACHED],
+            _ => &[UNKNOWN],
         };
-        assert_eq!(*class, expected);
+        assert!(expected.contains(class), "({x}, {y}): {class}");
     }
 }
 
@@ -239,7 +249,8 @@ fn the_vehicles_own_bonnet_is_no_obstacle_but_a_box_ahead_is() {
         let inside = |x: f32, y: f32, z: f32| {
             court(x, y, z) || ((front - 0.7..front).contains(&x) && y.abs() < 0.8 && (0.3..0.9).contains(&z))
         };
-        make(&cast(Model::Hdl64eS2, inside), &SafePathConfig { vehicle_front_m, ..SafePathConfig::default() }).1
+        let vehicle = ReachConfig { vehicle_front_m, ..ReachConfig::default() };
+        make_for(&vehicle, &cast(Model::Hdl64eS2, inside), &SafePathConfig::default()).1
     };
     // Number of points right ahead of the vehicle.
     let ahead = |layer: &Layer| {
@@ -254,7 +265,7 @@ fn the_vehicles_own_bonnet_is_no_obstacle_but_a_box_ahead_is() {
     assert!(reach(&own) > 6.0, "{}", reach(&own));
     assert_eq!(ahead(&before), 0);
     // The ground that the box hides is not free, except in the blind zone.
-    let free = |layer: &Layer| classes(layer)[cell_at(layer, 3.4, 0.1).unwrap()];
+    let free = |layer: &Layer| classes(layer)[cell_at(layer, 4.1, 0.1).unwrap()];
     assert_eq!((free(&own), free(&before)), (UNKNOWN, OBSTACLE));
 }
 

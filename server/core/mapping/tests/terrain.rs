@@ -5,10 +5,13 @@
 mod common;
 
 use clearway_lidar::model::Model;
-use clearway_mapping::config::{TerrainConfig, Variant};
+use clearway_mapping::config::{Extrinsics, SensorConfig, TerrainConfig, Variant, VehicleConfig};
+use clearway_mapping::event::{Body, Event};
+use clearway_mapping::layer::roughness::Roughness;
 use clearway_mapping::layer::terrain::Terrain;
 use clearway_mapping::layer::terrain::class::{ROUGHNESS, Shape, TerrainClass};
-use clearway_mapping::layer::{Context, Layer, LayerMaker};
+use clearway_mapping::layer::{Layer, LayerMaker};
+use clearway_mapping::pipeline::Pipeline;
 use clearway_mapping::sensor::distance_series::DistanceSeries;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::scanner::ScannerConfig;
@@ -27,7 +30,7 @@ const FLAT_UNREACHABLE: u8 = TerrainClass::FlatUnreachable.value();
 fn terrain(sweep: &Sweep, config: &TerrainConfig) -> Layer {
     let mut map = Terrain::new(config);
     let mut layer = map.layer();
-    map.make(sweep, &Context::default(), &mut layer);
+    map.make(sweep, &shared(sweep).context(), &mut layer);
     layer
 }
 
@@ -241,8 +244,8 @@ fn simulate(scene: Scene) -> Sweep {
     let revolution = SimulatedVehicle::new(scene, config).true_revolution(1).revolution;
     let mut sweep = Sweep::default();
     sweep.set_revolution(&revolution, &mount);
-    sweep.set_deviations(&revolution, &mount, &mut DistanceSeries::default(), None);
-    assert_eq!(sweep.deviation_m.len(), sweep.x.len());
+    sweep.set_deviations(&revolution, &mount, &mut DistanceSeries::default(), 0.02, None);
+    assert_eq!(sweep.deviation.len(), sweep.x.len());
     sweep
 }
 
@@ -282,9 +285,97 @@ fn a_dirt_track_is_smoother_than_the_fields_beside_it_near_and_far_alike() {
     assert!((0.7..1.4).contains(&(near / far)), "{near} near, {far} far");
 }
 
+/// Cell of 0.5 m of a position within 50 m.
+fn coarse_cell(x: f32, y: f32) -> Option<usize> {
+    let (i, j) = ((x * 2.0).floor() + 100.0, (y * 2.0).floor() + 100.0);
+    ((0.0..200.0).contains(&i) && (0.0..200.0).contains(&j)).then(|| j as usize * 200 + i as usize)
+}
+
+/// Roughness by [`coarse_cell`], from the points up to 2.5 m over the ground.
+fn coarse_roughness(sweep: &Sweep) -> Vec<Option<f32>> {
+    let mut roughness = Roughness::default();
+    roughness.clear(200 * 200);
+    for index in (0..sweep.x.len()).filter(|index| sweep.z[*index] < 2.5) {
+        if let Some(cell) = coarse_cell(sweep.x[index], sweep.y[index]) {
+            roughness.add(cell, sweep.deviation[index], sweep.noise[index]);
+        }
+    }
+    (0..200 * 200).map(|cell| roughness.of_cell(cell, 4)).collect()
+}
+
+/// Mean, median and number of the roughness of the cells within a range whose points all have this label.
+fn labelled_roughness(
+    roughness: &[Option<f32>],
+    sweep: &Sweep,
+    labels: &[u32],
+    wanted: u32,
+    [from, to]: [f32; 2],
+) -> (f32, f32, usize) {
+    // By cell: 0 without a point, 1 with points of this label only, 2 with others.
+    let mut kind = vec![0_u8; roughness.len()];
+    for (index, label) in labels.iter().enumerate() {
+        let (x, y) = (sweep.x[index], sweep.y[index]);
+        if let Some(cell) = coarse_cell(x, y).filter(|_| (from..to).contains(&x.hypot(y)) && sweep.z[index] < 2.5) {
+            kind[cell] = kind[cell].max(if *label == wanted { 1 } else { 2 });
+        }
+    }
+    let mut known: Vec<f32> =
+        (0..kind.len()).filter(|cell| kind[*cell] == 1).filter_map(|cell| roughness[cell]).collect();
+    known.sort_by(f32::total_cmp);
+    (known.iter().sum::<f32>() / known.len() as f32, known[known.len() / 2], known.len())
+}
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn a_real_road_is_smoother_than_grass_and_grass_than_bushes() {
+    let (sweep, labels) = labelled_frame_with_deviations();
+    let roughness = coarse_roughness(&sweep);
+    for ranges in [[8.0, 15.0], [15.0, 25.0], [25.0, 40.0]] {
+        let of = |label| labelled_roughness(&roughness, &sweep, &labels, label, ranges);
+        let found = [of(40), of(48), of(72), of(70)];
+        println!("{ranges:?} m: road, sidewalk, terrain, vegetation (mean, median, cells): {found:?}");
+        let [road, _, terrain, vegetation] = found;
+        assert!(road.2 > 100 && terrain.2 > 30 && vegetation.2 > 100);
+        assert!(road.1 < 1e-4 && terrain.1 > 0.003, "medians: {road:?} {terrain:?}");
+        assert!(terrain.0 > 4.0 * road.0 && vegetation.0 > 2.0 * terrain.0, "{road:?} {terrain:?} {vegetation:?}");
+    }
+}
+
+#[test]
+#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
+fn the_roads_of_captures_of_32_and_16_lasers_are_smooth() {
+    for path in ["pcap/rust-lidar-utils/hdl32_example.pcap", "pcap/opendlv/proxy-velodyne16/sampleShort.pcap"] {
+        let extrinsics = Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.9, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
+        let config = VehicleConfig::new("car", vec![SensorConfig::new("top", extrinsics)]);
+        let mut pipeline = Pipeline::new(&config, vec![None]).unwrap();
+        for (sequence, datagram) in (0..).zip(datagrams(path)) {
+            let body = Body::Datagram(datagram.payload.into());
+            let event = Event { sequence, arrival_ns: datagram.stamp_ns, source: 0, body };
+            let _ = pipeline.step(&event);
+        }
+        let map = pipeline.newest_map().unwrap();
+        let drivability = map.layers.iter().find(|layer| layer.name == "drivability").unwrap();
+        let roughness = coarse_roughness(pipeline.newest_sweep());
+        let is_road = |cell: &usize| {
+            let [x, y] = [cell % 200, cell / 200].map(|index| (index as f32 - 99.5) / 2.0);
+            let cell = cell_at(drivability, x, y).filter(|_| (4.0..15.0).contains(&x) && y.abs() < 1.5);
+            cell.is_some_and(|cell| class_name(drivability, cell) == "drivable")
+        };
+        let mut road: Vec<f32> = (0..roughness.len()).filter(is_road).filter_map(|cell| roughness[cell]).collect();
+        road.sort_by(f32::total_cmp);
+        let known = roughness.iter().flatten().count();
+        println!(
+            "{path}: {known} cells have a roughness; of {} of the road the median is {}",
+            road.len(),
+            road[road.len() / 2]
+        );
+        assert!(known > 600 && road.len() > 20 && road[road.len() / 2] < 0.001, "{known} {road:?}");
+    }
+}
+
 #[test]
 fn a_sweep_without_deviations_has_unknown_roughness() {
-    let sweep = Sweep { deviation_m: Vec::new(), ..simulate(scenes::flat()) };
+    let sweep = Sweep { deviation: Vec::new(), noise: Vec::new(), ..simulate(scenes::flat()) };
     let layer = terrain(&sweep, &TerrainConfig::default());
     assert!(counts(&layer)[usize::from(FLAT)] > 10_000);
     assert!(values(&layer, "roughness").iter().all(|raw| *raw == i32::from(ROUGHNESS.unknown)));

@@ -16,11 +16,15 @@ use crate::cli::output::{block_on, print_line, stop_signal};
 /// A simulation that is too slow for this machine skips time and reports it. Only --record and a picture of the newest
 /// map (target/demo.png, or demo.png in the temporary folder) write to the disk.
 #[derive(Args)]
+#[command(after_help = "Examples:
+  clearway demo
+  clearway demo --sensors vlp16 --seconds 30 --record drive.mcap")]
 pub struct Options {
     /// End after this many seconds; at Ctrl-C if absent.
     #[arg(long, value_parser = seconds)]
     seconds: Option<Duration>,
-    /// Record events and maps to this MCAP file, which grows by about 115 MB a minute with an HDL-64E.
+    /// Record events and maps to this MCAP file, which is replaced if it exists; it grows by about 115 MB a minute with
+    /// an HDL-64E.
     #[arg(long, value_name = "OUT.mcap")]
     record: Option<PathBuf>,
     /// The car's sensors.

@@ -7,6 +7,7 @@ use std::time::Duration;
 use clearway_sim::send::Sent;
 use serde_json::{Value, json};
 
+use crate::cli::output::counted;
 use crate::status::Snapshot;
 
 /// The state of the demo at one moment.
@@ -67,10 +68,10 @@ impl Report {
     pub fn line(&self) -> String {
         let number = |value: Option<f64>, unit: &str| value.map_or("-".into(), |value| format!("{value:.1} {unit}"));
         let mut line = format!(
-            "{:>4} s  {:>6} revolutions  {:>8} packets  {} refused  {} lost  age {}{}  latency {}  drivable {}",
+            "{:>4} s  {:>18}  {:>16}  {} refused  {} lost  age {}{}  latency {}  drivable {}",
             self.elapsed.as_secs(),
-            self.snapshot.revolutions(),
-            self.snapshot.ledger.received,
+            counted(self.snapshot.revolutions(), "revolution"),
+            counted(self.snapshot.ledger.received, "packet"),
             self.snapshot.refused(),
             self.snapshot.ledger.lost + self.snapshot.ledger.kernel_drops,
             number(self.age_ms, "ms"),
@@ -110,8 +111,11 @@ impl Summary {
     pub fn text(&self) -> String {
         let (sent, last) = (&self.sent, &self.last.snapshot);
         let mut text = format!(
-            "The car sent {} data packets and {} telemetry datagrams; {} were received, {} maps made.",
-            sent.packets, sent.telemetry, last.ledger.received, last.maps
+            "The car sent {} and {}; {} received, {} made.",
+            counted(sent.packets, "data packet"),
+            counted(sent.telemetry, "telemetry datagram"),
+            last.ledger.received,
+            counted(last.maps, "map")
         );
         if !self.last.skipped.is_zero() {
             let (skipped, all) = (self.last.skipped.as_secs_f64(), self.last.elapsed.as_secs_f64());

@@ -18,7 +18,8 @@ pub enum Sensors {
     #[default]
     #[value(alias = "one")]
     Auto,
-    /// One HDL-64E S2 on the roof, in a town.
+    /// One HDL-64E S2 on the roof, in a town; hdl64e for short.
+    #[value(name = "hdl64e_s2", alias = "hdl64e")]
     Hdl64e,
     /// One HDL-32E on the roof, in a town.
     Hdl32e,

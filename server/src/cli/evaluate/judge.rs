@@ -1,20 +1,20 @@
-//! A layer of a map, and points whose truth is known -> counts that can be summed over frames, and precision and
-//! recall.
+//! A layer of a map, and points whose truth is known -> counts.
 //!
-//! In: a [`Layer`] and [`Point`]s, both in the ego frame of one stamp. Out: a [`Tally`]. This file does not depend on
-//! where the truth comes from (labels or a simulated world).
+//! In: a [`Layer`] and [`Point`]s, both in the ego frame of one stamp. Out: additions to a [`Tally`]. This file does
+//! not depend on where the truth comes from (labels or a simulated world).
 //!
 //! The points in a cell vote for its truth; points more than 2.5 m above the ground do not vote. A point of an obstacle
 //! makes the cell an obstacle. Otherwise the most frequent of forbidden, either and drivable wins, and in a tie the one
 //! named first here. Precision is the share of the cells called drivable, and seen by a point, that are neither
 //! obstacle nor forbidden. Recall is the share of the drivable cells that are called drivable. A point is called ground
-//! if its cell is called drivable and it lies at most [`GROUND_OVER_LOWEST_M`] above the cell's lowest point. Points
-//! outside the layer's grid are not scored.
-
-use std::collections::{BTreeMap, BTreeSet};
+//! if its cell is called drivable and it lies at most [`GROUND_OVER_LOWEST_M`] above the cell's lowest point, or, by an
+//! estimate of the ground, if it lies within [`GROUND_OFF_M_MAX`] of that. Points outside the layer's grid are not
+//! scored.
 
 use clearway_mapping::layer::radial_grid::RadialGrid;
-use clearway_mapping::layer::{Cells, ClassInfo, Geometry, Layer, Meaning};
+use clearway_mapping::layer::{Cells, Geometry, Layer, Meaning};
+
+use super::tally::{Tally, band};
 
 /// Least height of an obstacle above the ground, in metres.
 pub const OBSTACLE_M_MIN: f32 = 0.3;
@@ -22,6 +22,9 @@ pub const OBSTACLE_M_MIN: f32 = 0.3;
 pub const OBSTACLE_M_MAX: f32 = 2.5;
 /// Greatest height of a ground point above the lowest point of its cell, in metres.
 pub const GROUND_OVER_LOWEST_M: f32 = 0.3;
+/// Greatest distance of a ground point from the estimated ground, above or below it, in metres. Ours, because the
+/// published F1 of other methods is compared at this distance.
+pub const GROUND_OFF_M_MAX: f32 = 0.2;
 
 /// The vote of a point for the truth of its cell.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -30,7 +33,9 @@ pub enum Vote {
     Nothing,
     /// The cell was seen; the point does not decide what its ground is.
     Seen,
-    /// Ground where no vehicle may drive: too steep, or not reachable.
+    /// Ground that is too steep to drive on. A map may call it occupied.
+    Steep,
+    /// Ground that a vehicle cannot reach.
     Forbidden,
     /// Ground for which both answers count as correct.
     Either,
@@ -66,140 +71,126 @@ pub struct Point {
     pub ground: [Scored; 2],
 }
 
-/// Counts of correct and wrong answers to one yes-or-no question.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Confusion {
-    /// Number of true positives.
-    pub right: u64,
-    /// Number of false positives.
-    pub wrong: u64,
-    /// Number of false negatives.
-    pub missed: u64,
+/// Adds the counts of `layer` against the points of its frame. Returns `false` and adds nothing if none of its classes
+/// is free.
+pub fn judge(tally: &mut Tally, layer: &Layer, points: &[Point]) -> bool {
+    let Some(called) = called(layer) else { return false };
+    let cell_of = locate(&layer.geometry);
+    let cells: Vec<Option<usize>> = points.iter().map(|point| cell_of(point.place)).collect();
+    let mut classes = Classes::default();
+    let mut ballots = vec![Ballot::default(); called.len()];
+    for (point, cell) in points.iter().zip(&cells).filter_map(|(point, cell)| Some((point, (*cell)?))) {
+        ballots[cell].cast(point, classes.bit(point.class));
+    }
+    tally.frames += 1;
+    for (ballot, called) in ballots.iter().zip(&called).filter(|(ballot, _)| ballot.points > 0) {
+        add_cell(tally, ballot, *called, &classes);
+    }
+    for (point, cell) in points.iter().zip(&cells).filter_map(|(point, cell)| Some((point, (*cell)?))) {
+        let near_ground = point.place[2] - ballots[cell].lowest <= GROUND_OVER_LOWEST_M;
+        score(tally, point, called[cell].is_free() && near_ground);
+    }
+    true
 }
 
-/// Counts of one layer, summed over frames.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Tally {
-    /// Number of frames judged.
-    pub frames: u64,
-    /// Number of cells called drivable that a point has seen.
-    pub called: u64,
-    /// Number of cells called drivable that are obstacle or forbidden.
-    pub called_wrongly: u64,
-    /// Number of cells called drivable that have a point of an obstacle.
-    pub leaking: u64,
-    /// Number of drivable cells, and of those among them that are called drivable.
-    pub drivable: (u64, u64),
-    /// Number of road cells without obstacle, and of those among them that are called drivable.
-    pub road: (u64, u64),
-    /// Number of cells called drivable that have a point of an obstacle or of forbidden ground, by class of the point.
-    pub leaks: BTreeMap<&'static str, u64>,
-    /// Counts of ground points, by protocol.
-    pub points: [Confusion; 2],
-}
-
-impl Confusion {
-    /// Precision = TP / (TP + FP); `None` without positives.
-    pub fn precision(&self) -> Option<f64> {
-        share(self.right, self.right + self.wrong)
-    }
-
-    /// Recall = TP / (TP + FN); `None` if nothing is true.
-    pub fn recall(&self) -> Option<f64> {
-        share(self.right, self.right + self.missed)
-    }
-
-    /// F1 = harmonic mean of precision and recall; `None` without one of them.
-    pub fn f1(&self) -> Option<f64> {
-        f1(self.precision(), self.recall())
+/// Adds the counts of an estimate of the ground. `height_over_m` is the height of a position over that ground, in
+/// metres; `None` if the estimate does not cover it.
+pub fn judge_ground(tally: &mut Tally, points: &[Point], height_over_m: impl Fn([f32; 3]) -> Option<f32>) {
+    tally.frames += 1;
+    for point in points {
+        let is_ground = height_over_m(point.place).is_some_and(|height| height.abs() <= GROUND_OFF_M_MAX);
+        score(tally, point, is_ground);
     }
 }
 
-impl Tally {
-    /// Share of the cells called drivable that are neither obstacle nor forbidden; `None` if no cell is called
-    /// drivable.
-    pub fn precision(&self) -> Option<f64> {
-        share(self.called - self.called_wrongly, self.called)
+fn score(tally: &mut Tally, point: &Point, called_ground: bool) {
+    for (confusion, scored) in tally.points.iter_mut().zip(point.ground) {
+        confusion.right += u64::from(called_ground && scored == Scored::Ground);
+        confusion.wrong += u64::from(called_ground && scored == Scored::Other);
+        confusion.missed += u64::from(!called_ground && scored == Scored::Ground);
     }
+}
 
-    /// Share of the drivable cells that are called drivable; `None` if no cell is drivable.
-    pub fn recall(&self) -> Option<f64> {
-        share(self.drivable.1, self.drivable.0)
+fn add_cell(tally: &mut Tally, ballot: &Ballot, called: Called, classes: &Classes) {
+    let (verdict, free) = (ballot.verdict(), called.is_free());
+    let wrong = matches!(verdict, Some(Vote::Obstacle | Vote::Forbidden));
+    tally.called += u64::from(free && ballot.seen);
+    tally.called_wrongly += u64::from(free && wrong);
+    tally.leaking += u64::from(free && verdict == Some(Vote::Obstacle));
+    let band = band(ballot.range_m / ballot.points as f32);
+    if let (Some(band), true) = (band, free && ballot.seen) {
+        tally.wrong_by_range[band].add(wrong);
     }
-
-    /// F1 = harmonic mean of precision and recall; `None` without one of them.
-    pub fn f1(&self) -> Option<f64> {
-        f1(self.precision(), self.recall())
-    }
-
-    /// Share of the road cells that are called drivable; `None` without road cells.
-    pub fn road_recall(&self) -> Option<f64> {
-        share(self.road.1, self.road.0)
-    }
-
-    /// Adds the counts of `layer` against the points of its frame. Returns `false` and adds nothing if none of its
-    /// classes is free.
-    pub fn add(&mut self, layer: &Layer, points: &[Point]) -> bool {
-        let Some(called) = called(layer) else { return false };
-        let cell_of = locate(&layer.geometry);
-        let cells: Vec<Option<usize>> = points.iter().map(|point| cell_of(point.place)).collect();
-        let mut ballots = vec![Ballot::default(); called.len()];
-        for (point, cell) in points.iter().zip(&cells).filter_map(|(point, cell)| Some((point, (*cell)?))) {
-            ballots[cell].cast(point);
-        }
-        self.frames += 1;
-        for (ballot, called) in ballots.iter().zip(&called) {
-            self.add_cell(ballot, *called);
-        }
-        let mut leaking: BTreeSet<(&'static str, usize)> = BTreeSet::new();
-        for (point, cell) in points.iter().zip(&cells).filter_map(|(point, cell)| Some((point, (*cell)?))) {
-            let near_ground = point.place[2] - ballots[cell].lowest <= GROUND_OVER_LOWEST_M;
-            let ground = called[cell] && near_ground;
-            for (confusion, scored) in self.points.iter_mut().zip(point.ground) {
-                confusion.right += u64::from(ground && scored == Scored::Ground);
-                confusion.wrong += u64::from(ground && scored == Scored::Other);
-                confusion.missed += u64::from(!ground && scored == Scored::Ground);
-            }
-            // Forbidden ground is a leak only if the cell is forbidden by vote; an obstacle always is one.
-            let forbidden = point.vote == Vote::Forbidden && ballots[cell].verdict() == Some(Vote::Forbidden);
-            if called[cell] && (point.vote == Vote::Obstacle || forbidden) {
-                leaking.insert((point.class, cell));
+    if verdict == Some(Vote::Drivable) {
+        tally.drivable.add(free);
+        tally.not_reached.add(called == Called::NotReached);
+        if let Some(band) = band {
+            tally.by_range[band].add(free);
+            for class in classes.of(ballot.ground) {
+                tally.by_class.entry(class).or_default()[band].add(free);
             }
         }
-        leaking.into_iter().for_each(|(class, _)| *self.leaks.entry(class).or_default() += 1);
-        true
     }
-
-    fn add_cell(&mut self, ballot: &Ballot, called: bool) {
-        let verdict = ballot.verdict();
-        let wrong = matches!(verdict, Some(Vote::Obstacle | Vote::Forbidden));
-        self.called += u64::from(called && ballot.seen);
-        self.called_wrongly += u64::from(called && wrong);
-        self.leaking += u64::from(called && verdict == Some(Vote::Obstacle));
-        let drivable = verdict == Some(Vote::Drivable);
-        self.drivable.0 += u64::from(drivable);
-        self.drivable.1 += u64::from(drivable && called);
-        let road = ballot.road && verdict != Some(Vote::Obstacle);
-        self.road.0 += u64::from(road);
-        self.road.1 += u64::from(road && called);
+    if ballot.road && verdict != Some(Vote::Obstacle) {
+        tally.road.add(free);
+    }
+    if ballot.scored_ground && verdict != Some(Vote::Obstacle) && !ballot.steep {
+        tally.ground.add(called == Called::Occupied);
+        if !ballot.mixed {
+            tally.pure_ground.add(called == Called::Occupied);
+        }
+    }
+    if free {
+        // Forbidden ground is a leak only if the cell is forbidden by vote; an obstacle always is one.
+        let forbidden = if verdict == Some(Vote::Forbidden) { ballot.forbidden } else { 0 };
+        for class in classes.of(ballot.obstacles | forbidden) {
+            *tally.leaks.entry(class).or_default() += 1;
+        }
     }
 }
 
-fn share(part: u64, whole: u64) -> Option<f64> {
-    (whole > 0).then(|| part as f64 / whole as f64)
-}
+/// The classes of points by number, so that a cell holds them as bits.
+#[derive(Default)]
+struct Classes(Vec<&'static str>);
 
-fn f1(precision: Option<f64>, recall: Option<f64>) -> Option<f64> {
-    let (precision, recall) = (precision?, recall?);
-    Some(if precision + recall > 0.0 { 2.0 * precision * recall / (precision + recall) } else { 0.0 })
+impl Classes {
+    /// The bit of a class. The 64th class and all after it share one.
+    fn bit(&mut self, class: &'static str) -> u64 {
+        let index = self.0.iter().position(|known| *known == class).unwrap_or_else(|| {
+            self.0.push(class);
+            self.0.len() - 1
+        });
+        1 << index.min(63)
+    }
+
+    fn of(&self, bits: u64) -> impl Iterator<Item = &'static str> {
+        self.0
+            .iter()
+            .copied()
+            .enumerate()
+            .filter(move |(index, _)| bits >> index.min(&63) & 1 == 1)
+            .map(|(_, name)| name)
+    }
 }
 
 /// The votes of the points in one cell.
 #[derive(Clone, Copy, Debug)]
 struct Ballot {
+    /// Number of points.
+    points: u32,
+    /// Sum of the points' horizontal distances from the ego origin, in metres.
+    range_m: f32,
     seen: bool,
     road: bool,
-    obstacle: bool,
+    steep: bool,
+    /// True if a point is ground by the first protocol.
+    scored_ground: bool,
+    /// True if a point that votes is not ground by the first protocol.
+    mixed: bool,
+    /// Classes of the points that vote for an obstacle, for forbidden or steep ground, and for other ground.
+    obstacles: u64,
+    forbidden: u64,
+    ground: u64,
     /// Number of votes for forbidden, either and drivable.
     votes: [u32; 3],
     /// z of the lowest point, in metres.
@@ -208,21 +199,49 @@ struct Ballot {
 
 impl Default for Ballot {
     fn default() -> Self {
-        Self { seen: false, road: false, obstacle: false, votes: [0; 3], lowest: f32::INFINITY }
+        Self {
+            points: 0,
+            range_m: 0.0,
+            seen: false,
+            road: false,
+            steep: false,
+            scored_ground: false,
+            mixed: false,
+            obstacles: 0,
+            forbidden: 0,
+            ground: 0,
+            votes: [0; 3],
+            lowest: f32::INFINITY,
+        }
     }
 }
 
 impl Ballot {
-    fn cast(&mut self, point: &Point) {
-        self.lowest = self.lowest.min(point.place[2]);
-        self.seen |= point.vote != Vote::Nothing;
+    fn cast(&mut self, point: &Point, class: u64) {
+        let [x, y, z] = point.place;
+        self.points += 1;
+        self.range_m += x.hypot(y);
+        self.lowest = self.lowest.min(z);
         self.road |= point.road;
+        if point.vote == Vote::Nothing {
+            return;
+        }
+        self.seen = true;
+        let is_ground = point.ground[0] == Scored::Ground;
+        self.scored_ground |= is_ground;
+        self.mixed |= !is_ground;
         match point.vote {
             Vote::Nothing | Vote::Seen => {}
-            Vote::Forbidden => self.votes[0] += 1,
-            Vote::Either => self.votes[1] += 1,
-            Vote::Drivable => self.votes[2] += 1,
-            Vote::Obstacle => self.obstacle = true,
+            Vote::Steep | Vote::Forbidden => {
+                self.votes[0] += 1;
+                self.forbidden |= class;
+                self.steep |= point.vote == Vote::Steep;
+            }
+            Vote::Either | Vote::Drivable => {
+                self.votes[if point.vote == Vote::Either { 1 } else { 2 }] += 1;
+                self.ground |= class;
+            }
+            Vote::Obstacle => self.obstacles |= class,
         }
     }
 
@@ -230,7 +249,7 @@ impl Ballot {
     fn verdict(&self) -> Option<Vote> {
         let [forbidden, either, drivable] = self.votes;
         match () {
-            () if self.obstacle => Some(Vote::Obstacle),
+            () if self.obstacles != 0 => Some(Vote::Obstacle),
             () if forbidden + either + drivable == 0 => None,
             () if forbidden >= either && forbidden >= drivable => Some(Vote::Forbidden),
             () if either >= drivable => Some(Vote::Either),
@@ -239,19 +258,43 @@ impl Ballot {
     }
 }
 
-/// For each cell, true if its class is free or inferred to be free; `None` if the layer has no such class.
-fn called(layer: &Layer) -> Option<Vec<bool>> {
-    let passes = |class: &ClassInfo| matches!(class.meaning, Meaning::Free | Meaning::Inferred);
-    let passes: Vec<bool> = layer.legend.iter().map(passes).collect();
+/// What a layer says about a cell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Called {
+    /// Free, or inferred to be free.
+    Free,
+    /// Something stands in the cell.
+    Occupied,
+    /// Free ground to which the layer found no way.
+    NotReached,
+    /// Unknown or hidden.
+    Unknown,
+}
+
+impl Called {
+    fn is_free(self) -> bool {
+        self == Self::Free
+    }
+}
+
+/// What the layer says about each cell; `None` if it has no free class.
+fn called(layer: &Layer) -> Option<Vec<Called>> {
+    let meanings = layer.legend.iter().map(|class| match class.meaning {
+        Meaning::Free | Meaning::Inferred => Called::Free,
+        Meaning::Occupied => Called::Occupied,
+        Meaning::NotReached => Called::NotReached,
+        Meaning::Unknown | Meaning::Hidden => Called::Unknown,
+    });
+    let meanings: Vec<Called> = meanings.collect();
     let class = layer.channels.iter().find(|channel| channel.name == "class")?;
-    if !passes.contains(&true) {
+    if !meanings.contains(&Called::Free) {
         return None;
     }
-    let is = |class: usize| passes.get(class).copied().unwrap_or(false);
+    let meaning = |class: usize| meanings.get(class).copied().unwrap_or(Called::Unknown);
     Some(match &class.cells {
-        Cells::U8(cells) => cells.iter().map(|cell| is(usize::from(*cell))).collect(),
-        Cells::U16(cells) => cells.iter().map(|cell| is(usize::from(*cell))).collect(),
-        Cells::I8(cells) => cells.iter().map(|cell| usize::try_from(*cell).is_ok_and(is)).collect(),
+        Cells::U8(cells) => cells.iter().map(|cell| meaning(usize::from(*cell))).collect(),
+        Cells::U16(cells) => cells.iter().map(|cell| meaning(usize::from(*cell))).collect(),
+        Cells::I8(cells) => cells.iter().map(|cell| usize::try_from(*cell).map_or(Called::Unknown, meaning)).collect(),
     })
 }
 
@@ -279,8 +322,11 @@ fn locate(geometry: &Geometry) -> Box<dyn Fn([f32; 3]) -> Option<usize>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clearway_mapping::layer::Channel;
+    use std::collections::BTreeMap;
+
+    use super::super::tally::{Confusion, Count};
     use clearway_mapping::layer::height_difference::class::HeightDifferenceClass;
+    use clearway_mapping::layer::{Channel, ClassInfo};
 
     /// Four cells of 1 m in a row: drivable, drivable, obstacle, unknown.
     fn layer() -> Layer {
@@ -337,16 +383,23 @@ mod tests {
             point(9.0, 0.0, "road", Vote::Drivable),
         ];
         let mut tally = Tally::default();
-        assert!(tally.add(&layer(), &points));
+        assert!(judge(&mut tally, &layer(), &points));
         assert_eq!((tally.called, tally.called_wrongly, tally.leaking), (2, 1, 1));
-        assert_eq!((tally.drivable, tally.road), ((3, 1), (2, 1)));
+        assert_eq!((tally.drivable, tally.road), (Count { all: 3, of_them: 1 }, Count { all: 2, of_them: 1 }));
+        // Cell 2 is ground called occupied; cell 0 has grass in it, so it is not pure.
+        assert_eq!(tally.ground, Count { all: 3, of_them: 1 });
+        assert_eq!(tally.pure_ground, Count { all: 2, of_them: 1 });
+        assert_eq!(tally.by_range[0], tally.drivable);
+        assert_eq!(tally.wrong_by_range[0], Count { all: 2, of_them: 1 });
+        assert_eq!(tally.by_class["road"][0], Count { all: 2, of_them: 1 });
+        assert_eq!(tally.by_class["terrain"][0], Count { all: 1, of_them: 0 });
         assert_eq!(tally.leaks, BTreeMap::from([("person", 1)]), "a cell counts once for a class");
         // Both road points of called cells are ground; the person is too high to be; two ground points are missed.
         assert_eq!(tally.points[0], Confusion { right: 2, wrong: 0, missed: 2 });
         assert_eq!(tally.points[1], Confusion::default());
         assert_eq!((tally.precision(), tally.recall(), tally.road_recall()), (Some(0.5), Some(1.0 / 3.0), Some(0.5)));
         assert_eq!(tally.f1(), Some(0.4));
-        assert!(tally.add(&layer(), &points));
+        assert!(judge(&mut tally, &layer(), &points));
         assert_eq!((tally.frames, tally.called, tally.precision()), (2, 4, Some(0.5)));
     }
 
@@ -354,20 +407,21 @@ mod tests {
     fn forbidden_ground_wins_a_tie_and_leaks_by_name() {
         let mut tally = Tally::default();
         let tie = [point(0.2, 0.0, "steep", Vote::Forbidden), point(0.4, 0.0, "road", Vote::Drivable)];
-        tally.add(&layer(), &tie);
-        assert_eq!((tally.called_wrongly, tally.leaking, tally.drivable), (1, 0, (0, 0)));
+        judge(&mut tally, &layer(), &tie);
+        assert_eq!((tally.called_wrongly, tally.leaking, tally.drivable), (1, 0, Count::default()));
         assert_eq!(tally.leaks, BTreeMap::from([("steep", 1)]));
         let mut outvoted = Tally::default();
         let more = [tie[0], tie[1], tie[1], point(1.5, 0.0, "lawn", Vote::Either)];
-        outvoted.add(&layer(), &more);
-        assert_eq!((outvoted.called, outvoted.called_wrongly, outvoted.drivable), (2, 0, (1, 1)));
+        judge(&mut outvoted, &layer(), &more);
+        assert_eq!((outvoted.called, outvoted.called_wrongly), (2, 0));
+        assert_eq!(outvoted.drivable, Count { all: 1, of_them: 1 });
         assert!(outvoted.leaks.is_empty());
     }
 
     #[test]
     fn a_layer_without_a_free_class_is_left_out() {
         let mut tally = Tally::default();
-        assert!(!tally.add(&Layer { legend: &[ClassInfo::UNKNOWN; 3], ..layer() }, &[]));
+        assert!(!judge(&mut tally, &Layer { legend: &[ClassInfo::UNKNOWN; 3], ..layer() }, &[]));
         assert_eq!(tally, Tally::default());
         assert_eq!((tally.precision(), tally.recall(), tally.f1()), (None, None, None));
     }
@@ -380,7 +434,46 @@ mod tests {
             ..layer()
         };
         let mut tally = Tally::default();
-        tally.add(&radial, &[Point { place: [0.5, 0.1, 0.0], ..point(0.0, 0.0, "road", Vote::Drivable) }]);
-        assert_eq!((tally.called, tally.drivable), (1, (1, 1)));
+        judge(&mut tally, &radial, &[Point { place: [0.5, 0.1, 0.0], ..point(0.0, 0.0, "road", Vote::Drivable) }]);
+        assert_eq!((tally.called, tally.drivable), (1, Count { all: 1, of_them: 1 }));
+    }
+
+    #[test]
+    fn steep_ground_may_be_called_occupied_and_not_drivable() {
+        let mut tally = Tally::default();
+        let steep = |x: f32| Point { class: "steep", ..point(x, 0.0, "steep", Vote::Steep) };
+        judge(&mut tally, &layer(), &[steep(0.5), steep(2.5)]);
+        assert_eq!((tally.called_wrongly, tally.ground), (1, Count::default()));
+        assert_eq!(tally.leaks, BTreeMap::from([("steep", 1)]));
+    }
+
+    #[test]
+    fn ground_that_is_not_reached_counts_apart_from_occupied_ground() {
+        use clearway_mapping::layer::drivability::class::DrivabilityClass;
+        let legend = DrivabilityClass::LEGEND;
+        let mut layer = Layer { legend, ..layer() };
+        let value = |meaning| legend.iter().position(|class| class.meaning == meaning).unwrap() as u8;
+        let [free, occupied, not_reached] = [Meaning::Free, Meaning::Occupied, Meaning::NotReached].map(value);
+        layer.channels[0].cells = Cells::U8(vec![free, occupied, not_reached, 0]);
+        let mut tally = Tally::default();
+        let points = [0.5, 1.5, 2.5, 3.5].map(|x| point(x, 0.0, "road", Vote::Drivable));
+        judge(&mut tally, &layer, &points);
+        assert_eq!(tally.drivable, Count { all: 4, of_them: 1 });
+        assert_eq!(tally.not_reached, Count { all: 4, of_them: 1 });
+        assert_eq!(tally.pure_ground, Count { all: 4, of_them: 1 });
+    }
+
+    #[test]
+    fn points_near_the_estimated_ground_are_called_ground() {
+        let points = [
+            point(1.0, 1.0, "road", Vote::Drivable),
+            point(2.0, 1.3, "road", Vote::Drivable),
+            point(3.0, 0.9, "car", Vote::Obstacle),
+            point(4.0, 3.0, "car", Vote::Obstacle),
+            point(50.0, 1.0, "road", Vote::Drivable),
+        ];
+        let mut tally = Tally::default();
+        judge_ground(&mut tally, &points, |[x, _, z]| (x < 40.0).then_some(z - 1.0));
+        assert_eq!(tally.points[0], Confusion { right: 1, wrong: 1, missed: 2 });
     }
 }

@@ -1,69 +1,73 @@
-//! `clearway evaluate`: every map against the truth, of labelled scans and of simulated scenes.
+//! `clearway evaluate`: every map against the truth, of labelled scans, of simulated scenes and of random worlds.
 //!
 //! In: folders or files as SemanticKITTI has them, or `sim:NAME`. Out: a [`Report`]. The scans and datagrams go through
-//! the same [`Pipeline`] as live data; its maps are judged point by point and cell by cell.
+//! the same pipeline as live data; its maps are judged point by point and cell by cell.
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | [`pairs`] | paths -> scans with their labels |
-//! | [`labels`] | labels -> the truth about the points of a scan |
-//! | [`worlds`] | a simulated scene -> maps, and the truth about their points |
+//! | [`source`] | paths, scenes, seeds -> maps, and the truth about their points |
 //! | [`judge`] | a layer and points of known truth -> counts |
-//! | [`report`] | counts -> table, JSON |
+//! | [`tally`] | counts -> sums and shares |
+//! | [`report`] | counts -> JSON |
+//! | [`table`] | counts -> tables |
+//! | [`error`] | why an evaluation failed |
 
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 use clearway_lidar::model::Model;
 use clearway_mapping::config::{Extrinsics, MapsConfig};
-use clearway_mapping::error::EventError;
-use clearway_mapping::event::{Body, Event, Scan};
-use clearway_mapping::pipeline::Pipeline;
-use clearway_mapping::sensor::mount::{MountError, estimate};
-use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use indicatif::ProgressBar;
 
 use super::configuration::extrinsics;
 use super::output::{print, print_line};
-use crate::config::{Config, ConfigError};
-use crate::ingest::files::kitti::{self, ScanError};
+use crate::config::Config;
 
+pub mod error;
 pub mod judge;
-pub mod labels;
-pub mod pairs;
 pub mod report;
-#[cfg(feature = "sim")]
-pub mod worlds;
+pub mod source;
+pub mod table;
+pub mod tally;
 
-use judge::{Point, Tally};
-use pairs::Pair;
+use error::EvaluateError;
 use report::{Report, Source};
+use source::argoverse::Log;
+use source::pairs;
+use source::scans::{Plan, judge_folder};
+use source::setup::SensorSetup;
+use source::variation::Variation;
+#[cfg(feature = "sim")]
+use source::{random, worlds};
 
-/// How the sensor is mounted on KITTI's car, from KITTI's published sensor setup. The published metrics of other
-/// methods use it, and an estimate from one scan tilts with the road under it.
-const KITTI_EXTRINSICS: Extrinsics =
-    Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 1.73, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
-/// Largest difference between the estimated height of the sensor and KITTI's, in metres; beyond it the scans are from
-/// another car. Ours.
-const MOUNT_M_OFF_MAX: f64 = 0.3;
-/// Number of scans from which the height of the sensor is estimated.
-const MOUNT_SCANS: usize = 10;
+/// Number of random worlds that are judged by default: every form of ground with every theme, once in even and once in
+/// odd seeds.
+const SEEDS: u64 = 156;
 
-/// Judge every map against labelled scans (.bin and .label as SemanticKITTI has them) or simulated scenes.
+/// Judge every map against labelled scans, logs of Argoverse 2, simulated scenes or random worlds.
 ///
-/// Prints, for each map, precision, recall and F1 of the drivable cells and of the ground points, and the leaks: cells
-/// called drivable with a car, person, pole or fence in them.
+/// Prints, for each map, precision and reach (recall of all reachable ground) of the drivable cells, recall by range
+/// and by class of ground, false obstacles (ground called occupied), precision, recall and F1 of ground points, and the
+/// leaks: cells called drivable with a car, person, pole or fence in them, or behind a fence.
 #[derive(Args, Clone, Debug, Default)]
 #[command(after_help = "Examples:
   clearway evaluate sequences/00
+  clearway evaluate sequences/00 --variations all
+  clearway evaluate scans --labels truth --extrinsics 0,0,1.9,0,0,0 --model hdl32e --config car.toml
   clearway evaluate sim:town --json
-  clearway evaluate scans --extrinsics 0,0,1.9,0,0,0 --config car.toml")]
+  clearway evaluate sim:random --seeds 100 --model vlp16
+
+Even seeds, and the variations without an asterisk, are for tuning. Odd seeds, and the variations with an asterisk, are
+for final tables only: no parameter may be chosen by their figures.")]
 pub struct Options {
-    /// Folders with .bin and .label files of the same names, or sim:flat, sim:slopes, sim:canopy, sim:overhang,
-    /// sim:town.
+    /// Folders with scans (.bin, .pcd) and labels (.label) of the same names, folders of Argoverse 2 logs, sim:flat,
+    /// sim:slopes, sim:canopy, sim:overhang, sim:town, sim:street, sim:track, or sim:random.
     #[arg(required = true, value_name = "PATH")]
     pub paths: Vec<String>,
+    /// Labels of the scans, a folder or a file; inside the paths themselves if absent.
+    #[arg(long, value_name = "PATH")]
+    pub labels: Option<PathBuf>,
     /// Print one JSON object.
     #[arg(long)]
     pub json: bool,
@@ -73,6 +77,40 @@ pub struct Options {
     /// Position and orientation of the sensor in the ego frame, in metres and degrees; as on KITTI's car if absent.
     #[arg(long, value_name = "x,y,z,roll,pitch,yaw", value_parser = extrinsics, allow_hyphen_values = true)]
     pub extrinsics: Option<Extrinsics>,
+    /// Model of the sensor. If absent: of scans, the rings in the file define the rows of radial maps, or an HDL-64E if
+    /// the file has no rings; of simulated scenes, an HDL-64E.
+    #[arg(long, value_name = "MODEL")]
+    pub model: Option<Model>,
+    /// Elevation of each laser of the scans' sensor, in degrees, separated by commas.
+    #[arg(long, value_name = "DEG,...", value_delimiter = ',', allow_hyphen_values = true, conflicts_with = "model")]
+    pub elevations_deg: Vec<f32>,
+    /// Judge each labelled scan as recorded and in all variations: bent by ±3, 6 and 10 %, rolled by ±3 degrees, with
+    /// 32 and 16 lasers, with the ego origin 1.5 m behind the sensor.
+    #[arg(long, value_name = "all")]
+    pub variations: Option<Variations>,
+    /// Judge each labelled scan of a world that rises by this many percent from 8 m on, or falls (negative); may be
+    /// given several times.
+    #[arg(long, value_name = "PERCENT", allow_hyphen_values = true, value_parser = amount)]
+    pub bend: Vec<f64>,
+    /// Judge each labelled scan of a world that is rolled about the vehicle's forward axis; may be given several times.
+    #[arg(long, value_name = "DEG", allow_hyphen_values = true, value_parser = amount)]
+    pub roll: Vec<f64>,
+    /// Judge every 2nd or 4th laser of each labelled scan of an HDL-64E, by the order of the points in the file.
+    #[arg(long, value_name = "32|16", value_parser = lasers)]
+    pub lasers: Vec<u16>,
+    /// Judge each labelled scan with the ego frame's origin this many metres behind the sensor.
+    #[arg(long, value_name = "M", allow_hyphen_values = true, value_parser = amount)]
+    pub sensor_offset: Vec<f64>,
+    /// Write each scan and its truth to this folder, for other programs, but not those of sim:NAME other than
+    /// sim:random; files that exist are not replaced.
+    #[arg(long, value_name = "DIR")]
+    pub write_scans: Option<PathBuf>,
+    /// Number of random worlds.
+    #[arg(long, value_name = "N", default_value_t = SEEDS, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    pub seeds: u64,
+    /// Seed of the first random world.
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=u64::MAX / 2))]
+    pub first_seed: u64,
     /// Judge the maps of the first vehicle of this configuration; of the default configuration if absent.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
@@ -81,59 +119,34 @@ pub struct Options {
     pub set: Vec<String>,
 }
 
-/// Why an evaluation failed.
-#[derive(Debug, thiserror::Error)]
-pub enum EvaluateError {
-    /// The scans and labels do not match.
-    #[error(transparent)]
-    Pairs(#[from] pairs::PairsError),
-    /// A scan cannot be read.
-    #[error(transparent)]
-    Scan(#[from] ScanError),
-    /// Labels cannot be used.
-    #[error(transparent)]
-    Labels(#[from] labels::LabelError),
-    /// No simulated scene has that name.
-    #[error("sim:{name}: the scenes are {known}")]
-    Scene {
-        /// Name of the scene, as given.
-        name: String,
-        /// Names of the scenes, separated by commas.
-        known: String,
-    },
-    /// The estimate of the sensor's mount failed.
-    #[error("{}: {source}; give --extrinsics", folder.display())]
-    Mount {
-        /// Folder of the scans.
-        folder: PathBuf,
-        /// Why the estimate failed.
-        source: MountError,
-    },
-    /// The scans are not from KITTI's car.
-    #[error(
-        "{}: the sensor is {height_m:.2} m above the ground, on KITTI's car 1.73 m; give --extrinsics",
-        folder.display()
-    )]
-    OtherMount {
-        /// Folder of the scans.
-        folder: PathBuf,
-        /// Height of the sensor, estimated from the ground, in metres.
-        height_m: f64,
-    },
-    /// The configuration cannot be used.
-    #[error(transparent)]
-    Config(#[from] ConfigError),
-    /// A value of the maps' configuration cannot be used.
-    #[error(transparent)]
-    Maps(#[from] clearway_mapping::config::ConfigValueError),
-    /// The pipeline refused a scan.
-    #[error("{}: {source}", scan.display())]
-    Rejected {
-        /// File of the scan.
-        scan: PathBuf,
-        /// Why it was refused.
-        source: EventError,
-    },
+/// A family of variations.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Variations {
+    /// The whole family.
+    All,
+}
+
+impl Options {
+    /// The variations in the order of the report; the scans as recorded if none is given.
+    fn variations(&self) -> Vec<Variation> {
+        let bends = self.bend.iter().copied().map(Variation::Bend);
+        let rolls = self.roll.iter().copied().map(Variation::Roll);
+        let lasers = self.lasers.iter().copied().map(Variation::Lasers);
+        let offsets = self.sensor_offset.iter().copied().map(Variation::SensorOffset);
+        let mut variations = if self.variations.is_some() { Variation::ALL.to_vec() } else { Vec::new() };
+        for variation in bends.chain(rolls).chain(lasers).chain(offsets) {
+            if !variations.contains(&variation) {
+                variations.push(variation);
+            }
+        }
+        if variations.is_empty() { vec![Variation::Recorded] } else { variations }
+    }
+
+    fn plan(&self) -> Plan {
+        let sensor =
+            SensorSetup { model: self.model, elevations_deg: self.elevations_deg.clone(), extrinsics: self.extrinsics };
+        Plan { sensor, variations: self.variations(), write_to: self.write_scans.clone() }
+    }
 }
 
 /// Judges the maps and prints the report.
@@ -162,6 +175,16 @@ fn columns_deg(text: &str) -> Result<u16, String> {
     degrees.ok_or_else(|| "1, 2 or 4 degrees are allowed".into())
 }
 
+fn amount(text: &str) -> Result<f64, String> {
+    let amount = text.parse().ok().filter(|amount: &f64| amount.abs() <= 45.0);
+    amount.ok_or_else(|| "-45 to 45 are allowed".into())
+}
+
+fn lasers(text: &str) -> Result<u16, String> {
+    let number = text.parse().ok().filter(|number| matches!(number, 16 | 32));
+    number.ok_or_else(|| "32 and 16 are allowed".into())
+}
+
 /// The number of columns of a radial map whose columns are `degrees` wide; `None` if that width is not allowed.
 pub fn columns(degrees: u16) -> Option<u16> {
     matches!(degrees, 1 | 2 | 4).then(|| 360 / degrees)
@@ -172,11 +195,11 @@ pub fn columns(degrees: u16) -> Option<u16> {
 ///
 /// # Errors
 /// [`EvaluateError`] for the first path that cannot be judged.
-pub fn evaluate(options: &Options, mut progress: impl FnMut(u64, u64)) -> Result<Report, EvaluateError> {
-    let maps = maps(options)?;
+pub fn evaluate(options: &Options, mut progress: impl FnMut(u64, u64) + Send) -> Result<Report, EvaluateError> {
+    let (maps, plan) = (maps(options)?, options.plan());
     // Every path is checked before the first is judged, so that an error appears at once.
-    let sources = options.paths.iter().map(|path| Input::new(path)).collect::<Result<Vec<_>, _>>()?;
-    let total = sources.iter().map(Input::frames).sum();
+    let sources = options.paths.iter().map(|path| Input::new(path, options)).collect::<Result<Vec<_>, _>>()?;
+    let total = sources.iter().map(|input| input.frames(&plan)).sum();
     let (mut done, mut report) = (0, Report::default());
     for (path, input) in options.paths.iter().zip(sources) {
         let mut source = Source { path: path.clone(), ..Source::default() };
@@ -186,11 +209,16 @@ pub fn evaluate(options: &Options, mut progress: impl FnMut(u64, u64)) -> Result
         };
         match input {
             #[cfg(feature = "sim")]
-            Input::World(name, revolutions) => judge_world(name, revolutions, &maps, &mut source, &mut judged)?,
+            Input::World(name, revolutions) => {
+                judge_world(name, revolutions, options.model, &maps, &mut source, &mut judged)?;
+            }
+            #[cfg(feature = "sim")]
+            Input::Random(seeds) => random::judge_worlds(&seeds, &maps, &mut source, &mut judged)?,
+            Input::Argoverse(log) => log.judge(&maps, plan.write_to.as_deref(), &mut source, &mut judged)?,
             Input::Labelled(found) => {
                 source.unlabelled = found.unlabelled;
                 for pairs in found.pairs.chunk_by(|a, b| a.scan.parent() == b.scan.parent()) {
-                    judge_folder(pairs, options.extrinsics, &maps, &mut source, &mut judged)?;
+                    judge_folder(pairs, &plan, &maps, &mut source, &mut judged)?;
                 }
             }
         }
@@ -204,37 +232,53 @@ enum Input {
     /// A simulated scene, and how many revolutions of it are judged.
     #[cfg(feature = "sim")]
     World(&'static str, u64),
+    /// Random worlds.
+    #[cfg(feature = "sim")]
+    Random(random::Seeds),
+    /// A log of Argoverse 2.
+    Argoverse(Log),
     /// Labelled scans.
     Labelled(pairs::Pairs),
 }
 
 impl Input {
-    fn new(path: &str) -> Result<Self, EvaluateError> {
-        match path.strip_prefix("sim:") {
-            Some(name) => Self::world(name),
-            None => Ok(Self::Labelled(pairs::find(Path::new(path))?)),
+    fn new(path: &str, options: &Options) -> Result<Self, EvaluateError> {
+        if let Some(name) = path.strip_prefix("sim:") {
+            return Self::world(name, options);
         }
+        if let Some(log) = Log::find(Path::new(path)) {
+            return Ok(Self::Argoverse(log));
+        }
+        Ok(Self::Labelled(pairs::find(Path::new(path), options.labels.as_deref())?))
     }
 
     #[cfg(feature = "sim")]
-    fn world(name: &str) -> Result<Self, EvaluateError> {
-        let known = || worlds::SCENES.map(|(name, _)| name).join(", ");
+    fn world(name: &str, options: &Options) -> Result<Self, EvaluateError> {
+        if name == "random" {
+            let (first, count, model) = (options.first_seed, options.seeds, options.model);
+            let write_to = options.write_scans.clone();
+            return Ok(Self::Random(random::Seeds { first, count, model, write_to }));
+        }
+        let known = || worlds::SCENES.map(|(name, _)| name).join(", ") + ", random";
         let found = worlds::SCENES.iter().find(|(known, _)| *known == name);
         let (name, revolutions) = found.ok_or_else(|| EvaluateError::Scene { name: name.into(), known: known() })?;
         Ok(Self::World(name, *revolutions))
     }
 
     #[cfg(not(feature = "sim"))]
-    fn world(name: &str) -> Result<Self, EvaluateError> {
+    fn world(name: &str, _: &Options) -> Result<Self, EvaluateError> {
         let known = "not in this build, which is without the feature sim; folders and files are allowed".into();
         Err(EvaluateError::Scene { name: name.into(), known })
     }
 
-    fn frames(&self) -> u64 {
+    fn frames(&self, plan: &Plan) -> u64 {
         match self {
             #[cfg(feature = "sim")]
             Self::World(_, revolutions) => *revolutions,
-            Self::Labelled(found) => found.pairs.len() as u64,
+            #[cfg(feature = "sim")]
+            Self::Random(seeds) => seeds.count,
+            Self::Argoverse(log) => log.frames(),
+            Self::Labelled(found) => (found.pairs.len() * plan.variations.len()) as u64,
         }
     }
 }
@@ -251,114 +295,23 @@ fn maps(options: &Options) -> Result<MapsConfig, EvaluateError> {
     Ok(maps)
 }
 
-/// The pipeline of a vehicle with one sensor, and the sensor's mount.
-fn pipeline(maps: &MapsConfig, model: Model, extrinsics: Extrinsics) -> Result<(Pipeline, Mount), EvaluateError> {
-    let mut config = Config::of_one_vehicle("car", "top").vehicles.remove(0).core();
-    config.maps = maps.clone();
-    let sensor = &mut config.sensors[0];
-    (sensor.model, sensor.extrinsics) = (Some(model), extrinsics);
-    let mount = Mount { ego_from_sensor: extrinsics.ego_from_sensor(), range_m_min: sensor.range_m_min };
-    Ok((Pipeline::new(&config, vec![None])?, mount))
-}
-
-impl Source {
-    fn judge(&mut self, layers: &[clearway_mapping::layer::Layer], points: &[Point]) {
-        self.frames += 1;
-        for layer in layers {
-            let at = self.layers.iter().position(|(name, _)| name == layer.name);
-            let mut tally = Tally::default();
-            let tally = at.map_or(&mut tally, |at| &mut self.layers[at].1);
-            match (tally.add(layer, points), at) {
-                (true, None) => {
-                    let tally = tally.clone();
-                    self.layers.push((layer.name.to_owned(), tally));
-                }
-                (false, None) if !self.left_out.iter().any(|name| name == layer.name) => {
-                    self.left_out.push(layer.name.to_owned());
-                }
-                _ => {}
-            }
-        }
-    }
-}
-
 #[cfg(feature = "sim")]
 fn judge_world(
     name: &str,
     revolutions: u64,
+    model: Option<Model>,
     maps: &MapsConfig,
     source: &mut Source,
     judged: &mut impl FnMut(),
 ) -> Result<(), EvaluateError> {
     let scene = super::simulate::scene(name).expect("the list has only names of scenes");
-    let scanner = worlds::scanner();
-    let at = scanner.ego_from_sensor.translation;
-    // The simulated sensor is upright.
-    let extrinsics = Extrinsics { x_m: at.x, y_m: at.y, z_m: at.z, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
-    let (mut pipeline, _) = pipeline(maps, scanner.model, extrinsics)?;
-    worlds::drive(scene, &mut pipeline, revolutions, |pipeline, points| {
-        let map = pipeline.newest_map().expect("a revolution makes a map");
-        source.judge(&map.layers, &points);
+    let scanner = worlds::scanner(model);
+    let mut pipeline = worlds::pipeline_of(&scanner, maps)?;
+    worlds::drive(scene, scanner, &mut pipeline, revolutions, |pipeline, points| {
+        source.row("", false).judge_map(pipeline, &points);
         judged();
     });
     Ok(())
-}
-
-/// Judges the labelled scans of one folder, in order, with one pipeline.
-fn judge_folder(
-    pairs: &[Pair],
-    extrinsics: Option<Extrinsics>,
-    maps: &MapsConfig,
-    source: &mut Source,
-    judged: &mut impl FnMut(),
-) -> Result<(), EvaluateError> {
-    let folder = pairs[0].scan.parent().unwrap_or(Path::new("")).to_owned();
-    let (extrinsics, origin) = match extrinsics {
-        Some(extrinsics) => (extrinsics, "as given".to_owned()),
-        None => (KITTI_EXTRINSICS, kitti_mount(&folder, pairs)?),
-    };
-    let Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg } = extrinsics;
-    let numbers = format!("{x_m},{y_m},{z_m},{roll_deg},{pitch_deg},{yaw_deg}");
-    source.mounts.push(format!("{numbers} in {}: {origin}", folder.display()));
-    // The sensor of SemanticKITTI.
-    let (mut pipeline, mount) = pipeline(maps, Model::Hdl64eS2, extrinsics)?;
-    for (index, pair) in (0..).zip(pairs) {
-        let scan = read_scan(&pair.scan, index)?;
-        let classes = labels::read(&pair.labels, &pair.scan, scan.x.len())?;
-        let kept = (0..classes.len()).filter(|i| Sweep::keeps(&mount, [scan.x[*i], scan.y[*i], scan.z[*i]]));
-        let classes: Vec<u32> = kept.map(|i| classes[i]).collect();
-        let event = Event { sequence: index, arrival_ns: scan.stamp_ns, source: 0, body: Body::Scan(scan) };
-        let rejected = |source| EvaluateError::Rejected { scan: pair.scan.clone(), source };
-        pipeline.step(&event).map_err(rejected)?;
-        let points = labels::truth(pipeline.newest_sweep(), &classes);
-        source.judge(&pipeline.newest_map().expect("a scan makes a map").layers, &points);
-        judged();
-    }
-    Ok(())
-}
-
-/// Checks KITTI's mount against the ground in the scans; returns the reason for using it, for the report.
-fn kitti_mount(folder: &Path, pairs: &[Pair]) -> Result<String, EvaluateError> {
-    let points = |scan: Scan| scan.x.iter().zip(&scan.y).zip(&scan.z).map(|((&x, &y), &z)| [x, y, z]).collect();
-    let first = pairs.iter().zip(0..).take(MOUNT_SCANS).map(|(pair, index)| read_scan(&pair.scan, index).map(points));
-    let scans: Vec<Vec<[f32; 3]>> = first.collect::<Result<_, _>>()?;
-    let estimated = estimate(&scans).map_err(|source| EvaluateError::Mount { folder: folder.to_owned(), source })?;
-    let Extrinsics { z_m, pitch_deg, roll_deg, .. } = estimated.extrinsics();
-    if (z_m - KITTI_EXTRINSICS.z_m).abs() > MOUNT_M_OFF_MAX {
-        return Err(EvaluateError::OtherMount { folder: folder.to_owned(), height_m: z_m });
-    }
-    Ok(format!(
-        "KITTI's car as published; estimated from the ground in {} scan(s): {z_m:.2} m, pitch {pitch_deg:.1}°, roll \
-         {roll_deg:.1}°",
-        scans.len()
-    ))
-}
-
-fn read_scan(file: &Path, index: u64) -> Result<Scan, EvaluateError> {
-    match kitti::read(file, index)?.body {
-        Body::Scan(scan) => Ok(scan),
-        _ => unreachable!("the reading of a scan file is a scan"),
-    }
 }
 
 #[cfg(test)]

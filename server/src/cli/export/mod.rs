@@ -1,13 +1,14 @@
-//! `clearway export`: a recording -> a picture, arrays or a document for each map, or one MCAP file for viewers.
+//! `clearway export`: a recording -> pictures, arrays or documents for each map, or one MCAP file for viewers.
 //!
 //! | file | in -> out |
 //! |---|---|
+//! | `drawing` | options -> the style of pictures |
 //! | `layer_json` | a layer -> JSON |
 //! | `npy` | the cells of a channel -> a NumPy file |
 //! | `scans` | the events of a recording -> the points of each scan |
 //! | `viewer_file` | maps, points -> an MCAP file for viewers |
 
-use std::fs;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
@@ -15,10 +16,13 @@ use clap::{Args, ValueEnum};
 use clearway_client::{Channel, Layer, MapView};
 
 use self::viewer_file::{Dialect, ViewerFile};
-use super::output::{print_line, progress_bar};
+use super::files;
+use super::output::{counted, print_line, progress_bar, usage_error};
 use crate::encode::picture::{self, Style};
 use crate::record::mcap_reader::{McapReader, Message};
+pub use drawing::DrawingOptions;
 
+mod drawing;
 pub mod layer_json;
 pub mod npy;
 mod scans;
@@ -26,31 +30,35 @@ mod viewer_file;
 
 /// Export the maps of a recording: files for each map, or one MCAP file for viewers.
 ///
-/// Names of the files begin with the map's sequence number in six digits. png and json write
-/// `<sequence>_<layer>.<format>`; npy writes `<sequence>_<layer>_<channel>.npy` (NumPy 1.0, shape (rows, columns)) and
-/// `<sequence>_<layer>.json` with geometry, pose, stamps and class legend. Pictures show the map from above, with the
-/// vehicle in the middle, forward up and left on the left.
+/// Names of the files begin with the map's sequence number in six digits, and contain the layer. png and json write
+/// `<sequence>_<layer>.<format>`, png with --channel `<sequence>_<layer>_<channel>.png`; npy writes
+/// `<sequence>_<layer>_<channel>.npy` (NumPy 1.0, shape (rows, columns)) and `<sequence>_<layer>.json` with geometry,
+/// pose, stamps and class legend. Pictures show the map from above, with the vehicle in the middle, forward up and left
+/// on the left, and the legend under it.
 ///
-/// foxglove and ros2 write one new MCAP file with every layer of every vehicle and the sensors' points: foxglove has
-/// coloured grids and transforms, ros2 has occupancy grids (0 free, 100 occupied, -1 unknown), tf and odometry.
+/// foxglove and ros2 write one new MCAP file with the layers of every vehicle and the sensors' points: foxglove has
+/// coloured grids, scenes of the safe points and transforms, ros2 has occupancy grids (0 free, 100 occupied, -1
+/// unknown), markers and poses of the safe points, tf and odometry.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway export drive.mcap --layer drivability --format png --out maps
+  clearway export drive.mcap --layer terrain --channel roughness --format png --out maps
+  clearway export drive.mcap --format png --rings 10 --out maps
   clearway export drive.mcap --format foxglove --out drive.foxglove.mcap")]
 pub struct Options {
     /// The recording (MCAP); a file that is cut off is exported as far as it goes.
     recording: PathBuf,
-    /// The layer, such as drivability; for foxglove and ros2 all layers if absent.
-    #[arg(long, required_if_eq_any([("format", "png"), ("format", "npy"), ("format", "json")]))]
-    layer: Option<String>,
+    /// Layers, such as drivability, separated by commas; all if absent. `clearway info` lists those of a recording.
+    #[arg(long = "layer", alias = "layers", value_name = "LAYER", value_delimiter = ',')]
+    layers: Vec<String>,
     /// Format of the files.
     #[arg(long, value_enum)]
     format: Format,
     /// The folder to write to, which is created if needed; for foxglove and ros2 the new file.
-    #[arg(long)]
+    #[arg(long, value_name = "PATH")]
     out: PathBuf,
-    /// The vehicle, if the recording has several.
-    #[arg(long)]
+    /// The vehicle; needed for png, npy and json if the recording has several.
+    #[arg(long, value_name = "NAME")]
     vehicle: Option<String>,
     /// For foxglove and ros2: leave out the sensors' points, which are most of the file.
     #[arg(long)]
@@ -62,7 +70,7 @@ pub struct Options {
 /// Format in which maps are written.
 #[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Format {
-    /// A picture from above.
+    /// Pictures from above.
     Png,
     /// NumPy arrays, one for each channel, and a JSON document.
     Npy,
@@ -96,34 +104,15 @@ impl Output {
     }
 }
 
-/// The options for drawing pictures.
-#[derive(Args)]
-pub struct DrawingOptions {
-    /// Edge of a picture, in pixels.
-    #[arg(long, default_value_t = 800, value_parser = clap::value_parser!(u32).range(16..=8192))]
-    pixels: u32,
-    /// Distance from the vehicle to the picture's edge, in metres; the whole grid if absent.
-    #[arg(long, value_parser = metres)]
-    range: Option<f64>,
-    /// Draw a ring at each multiple of this distance from the vehicle.
-    #[arg(long, value_name = "METRES", value_parser = metres)]
-    rings: Option<f64>,
-    /// Leave out the vehicle.
-    #[arg(long)]
-    no_vehicle: bool,
-}
-
-impl DrawingOptions {
-    /// The style of these options.
-    pub fn style(&self) -> Style {
-        let Self { pixels, range, rings, no_vehicle } = *self;
-        Style { pixels, range_m: range, rings_m: rings, vehicle: !no_vehicle }
+/// Refuses options that the format does not use.
+fn check(options: &Options) -> Result<()> {
+    if let Some(option) = options.drawing.first_given().filter(|_| options.format != Format::Png) {
+        return Err(usage_error(format!("{option} is for pictures: it needs --format png")));
     }
-}
-
-fn metres(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| "not a number of metres".to_owned())?;
-    if (0.1..=10_000.0).contains(&value) { Ok(value) } else { Err("0.1 to 10000 m is allowed".into()) }
+    if options.no_points && !matches!(options.format, Format::Foxglove | Format::Ros2) {
+        return Err(usage_error("--no-points needs --format foxglove or ros2; other formats have no points"));
+    }
+    Ok(())
 }
 
 /// Exports the maps of the recording.
@@ -131,13 +120,15 @@ fn metres(text: &str) -> Result<f64, String> {
 /// # Errors
 /// If a file cannot be read or written; for an unknown layer or vehicle with the names of those in the recording.
 pub fn run(options: &Options) -> Result<()> {
-    let Options { recording: file, layer, out, vehicle, .. } = options;
-    let length = fs::metadata(file).with_context(|| format!("open {}", file.display()))?.len();
+    check(options)?;
+    let Options { recording: file, layers, out, vehicle, .. } = options;
+    let (_, length) = files::open(file)?;
     let mut recording = McapReader::salvage(file)?;
     let mut output = Output::new(options)?;
     let style = options.drawing.style();
     let progress = progress_bar(length);
-    let mut maps = 0_u64;
+    // Number of maps, by layer.
+    let mut maps: BTreeMap<String, u64> = BTreeMap::new();
     let mut vehicles: Vec<String> = Vec::new();
     while let Some(message) = recording.next() {
         let message = message?;
@@ -149,29 +140,29 @@ pub fn run(options: &Options) -> Result<()> {
         if let Output::Viewer(viewer) = &mut output {
             viewer.write_event(&message, recording.header())?;
         }
-        let Some((_, of_layer)) = message.map_of() else { continue };
-        if layer.as_ref().is_some_and(|only| only != of_layer) {
+        let Some((_, layer)) = message.map_of() else { continue };
+        if !layers.is_empty() && !layers.iter().any(|name| name == layer) {
             continue;
         }
         if !vehicles.iter().any(|known| known == of_vehicle) {
             vehicles.push(of_vehicle.to_owned());
         }
         let map = decode(&message, file)?;
-        let of_layer = map.layer(of_layer)?;
+        let of_layer = map.layer(layer)?;
         match &mut output {
             Output::Viewer(viewer) => viewer.write_map(&map, of_layer, message.log_ns)?,
             Output::Files(_) if vehicles.len() > 1 => {
                 bail!("{} has maps of {}: name one with --vehicle", file.display(), vehicles.join(" and "))
             }
-            Output::Files(files) => {
-                if maps == 0 {
-                    fs::create_dir_all(out).with_context(|| format!("create the folder {}", out.display()))?;
+            Output::Files(encode) => {
+                if maps.is_empty() {
+                    files::create_folder(out)?;
                 }
-                write(&format!("{:06}_{}", map.sequence(), of_layer.name), files(&map, of_layer, &style)?, out)?;
+                write(&format!("{:06}_{layer}", map.sequence()), encode(&map, of_layer, &style)?, out)?;
             }
         }
-        maps += 1;
-        progress.set_message(format!("{maps} maps"));
+        *maps.entry(layer.to_owned()).or_default() += 1;
+        progress.set_message(counted(maps.values().sum(), "map"));
     }
     progress.finish_and_clear();
     if let Output::Viewer(viewer) = output {
@@ -180,10 +171,15 @@ pub fn run(options: &Options) -> Result<()> {
     if let Some(cut) = recording.incomplete() {
         eprintln!("clearway: {} is {cut}; the maps before that are exported", file.display());
     }
-    if maps == 0 {
-        bail!("{}", nothing_exported(file, &recording, layer.as_deref(), vehicle.as_deref()));
+    if let Some(layer) = layers.iter().find(|layer| !maps.contains_key(*layer)) {
+        bail!("{}", nothing_exported(file, &recording, Some(layer), vehicle.as_deref()));
     }
-    print_line(&format!("{maps} maps of {} in {}", layer.as_deref().unwrap_or("all layers"), out.display()))?;
+    if maps.is_empty() {
+        bail!("{}", nothing_exported(file, &recording, None, vehicle.as_deref()));
+    }
+    for (layer, maps) in &maps {
+        print_line(&format!("{} of {layer} in {}", counted(*maps, "map"), out.display()))?;
+    }
     Ok(())
 }
 
@@ -205,20 +201,21 @@ fn nothing_exported(file: &Path, recording: &McapReader, layer: Option<&str>, ve
     }
     match absent(vehicle, &vehicles) {
         Some(name) => format!("{file} has no vehicle {name:?} with maps; it has {}", vehicles.join(", ")),
-        None => format!("{file} has no map of this layer and vehicle"),
+        None => format!("{file} has no map of the layer {} of this vehicle", layer.unwrap_or("(any)")),
     }
 }
 
 /// Writes the files of one layer to the folder `out`; `stem` is the beginning of their names.
-fn write(stem: &str, files: Vec<(String, Vec<u8>)>, out: &Path) -> Result<()> {
-    files.into_iter().try_for_each(|(ending, bytes)| {
+fn write(stem: &str, encoded: Vec<(String, Vec<u8>)>, out: &Path) -> Result<()> {
+    encoded.into_iter().try_for_each(|(ending, bytes)| {
         let path = out.join(format!("{stem}{ending}"));
-        fs::write(&path, bytes).with_context(|| format!("write {}", path.display()))
+        files::write(&path, &bytes)
     })
 }
 
 fn png(_: &MapView, layer: &Layer, style: &Style) -> Result<Vec<(String, Vec<u8>)>> {
-    Ok(vec![(".png".into(), picture::png(layer, style)?)])
+    let ending = style.channel.as_ref().map_or(".png".to_owned(), |channel| format!("_{channel}.png"));
+    Ok(vec![(ending, picture::png(layer, style)?)])
 }
 
 fn json(map: &MapView, layer: &Layer, _: &Style) -> Result<Vec<(String, Vec<u8>)>> {

@@ -1,10 +1,12 @@
 //! A recording -> one MCAP file that viewers open without a plug-in.
 //!
-//! foxglove: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf`
-//! (`foxglove.FrameTransforms`). ros2: `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`),
+//! foxglove: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/safe_points` (`foxglove.SceneUpdate`),
+//! `/<vehicle>/points/<sensor>` (`foxglove.PointCloud`) and `/tf` (`foxglove.FrameTransforms`). ros2:
+//! `/clearway/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`), `/clearway/<vehicle>/safe_path/markers`
+//! (`visualization_msgs/msg/MarkerArray`) and `.../poses` (`geometry_msgs/msg/PoseArray`),
 //! `/clearway/<vehicle>/points/<sensor>` (`sensor_msgs/msg/PointCloud2`), `/clearway/<vehicle>/odometry`
-//! (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages have the log
-//! times of the recording, and the stamp of the capture's or the scan's end.
+//! (`nav_msgs/msg/Odometry`) and `/tf` (`tf2_msgs/msg/TFMessage`), CDR. Messages have the log times of the recording,
+//! and the stamp of the capture's or the scan's end.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
@@ -12,15 +14,18 @@ use std::io::BufWriter;
 use std::path::Path;
 
 use crate::encode::viewer::raster::Rasters;
-use crate::encode::viewer::{base_frame, foxglove as messages, ros};
+use crate::encode::viewer::{base_frame, foxglove as messages, ros, safe_paths};
 use anyhow::{Context, Result};
 use clearway_client::{Layer, MapView};
-use clearway_ros::published::{OCCUPANCY_GRID, ODOMETRY, POINT_CLOUD2, Published, TF_MESSAGE};
+use clearway_ros::published::{
+    MARKER_ARRAY, OCCUPANCY_GRID, ODOMETRY, POINT_CLOUD2, POSE_ARRAY, Published, TF_MESSAGE,
+};
 use foxglove::Encode;
 use foxglove::messages::FrameTransforms;
 use mcap::records::MessageHeader;
 
 use super::scans::{ScanDecoder, SensorScan};
+use crate::cli::files;
 use crate::record::mcap_reader::{Header, Message};
 
 /// Kind of the messages in the file.
@@ -52,7 +57,7 @@ impl ViewerFile {
     /// # Errors
     /// If the file exists or cannot be written.
     pub fn create(file: &Path, dialect: Dialect, with_points: bool) -> Result<Self> {
-        let open = File::create_new(file).with_context(|| format!("create {}", file.display()))?;
+        let open = files::create_new(file)?;
         let profile = if dialect == Dialect::Ros2 { "ros2" } else { "" };
         let options = mcap::WriteOptions::new().profile(profile).compression_threads(0);
         Ok(Self {
@@ -95,10 +100,20 @@ impl ViewerFile {
             Dialect::Foxglove => {
                 let grid = messages::grid(map, layer, raster);
                 self.write_foxglove(&format!("/{vehicle}/map/{name}"), &grid, log_ns)?;
+                if name == safe_paths::LAYER {
+                    let scene = messages::safe_paths(map, layer);
+                    self.write_foxglove(&format!("/{vehicle}/safe_points"), &scene, log_ns)?;
+                }
             }
             Dialect::Ros2 => {
                 let grid = ros::occupancy_grid(map, layer, raster);
-                self.write_ros(&format!("/clearway/{vehicle}/{name}"), &OCCUPANCY_GRID, &grid, log_ns)?;
+                let topic = format!("/clearway/{vehicle}/{name}");
+                self.write_ros(&topic, &OCCUPANCY_GRID, &grid, log_ns)?;
+                if name == safe_paths::LAYER {
+                    let (markers, poses) = (ros::safe_path_markers(map, layer), ros::safe_point_poses(map, layer));
+                    self.write_ros(&format!("{topic}/markers"), &MARKER_ARRAY, &markers, log_ns)?;
+                    self.write_ros(&format!("{topic}/poses"), &POSE_ARRAY, &poses, log_ns)?;
+                }
             }
         }
         self.rasters.insert(vehicle.to_owned(), rasters);

@@ -1,6 +1,5 @@
 //! Files, by the endings of their names -> observations and the stamps at which they are sent.
 
-use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
@@ -13,7 +12,10 @@ use clearway_mapping::event::{Road, RoadPurpose as Purpose};
 use clearway_mapping::road::rddf::Rddf;
 use clearway_mapping::road::rndf::Rndf;
 use clearway_mapping::road::{FOOT_M, LineError, LocalFrame};
-use clearway_mapping::scan_file::{read_bin, read_pcd};
+use clearway_mapping::scan_file;
+
+use crate::cli::files;
+use crate::cli::output::{counted, usage_error};
 
 /// Most datagrams of a drive in one observation: 50 ms of an HDL-64E.
 const PACKETS: usize = 175;
@@ -23,15 +25,18 @@ const PACKETS_NS: i64 = 20_000_000;
 /// Width of an RNDF lane without a width, in metres: 12 feet, the width of most lanes.
 const LANE_M: f64 = 12.0 * FOOT_M;
 
+/// Scans a second if the options do not give them: those of most rotating sensors at 600 rpm.
+const HZ: f64 = 10.0;
+
 /// The options that name the files to send and how to read them.
 #[derive(Args)]
 pub struct FileOptions {
     /// The files. Each scan is sent with the stamp of a pose, or from now on at --hz if there are no poses.
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// Scans a second, if there are no poses.
-    #[arg(long, default_value_t = 10.0, value_parser = hz)]
-    hz: f64,
+    /// Scans a second, if there are no poses; 10 if absent.
+    #[arg(long, value_parser = hz)]
+    hz: Option<f64>,
     /// Position on the Earth, in degrees, of the map frame's origin, for roads; their first point if absent.
     #[arg(long, value_name = "LATITUDE,LONGITUDE", allow_hyphen_values = true, value_parser = origin)]
     origin: Option<[f64; 2]>,
@@ -95,11 +100,11 @@ impl Item {
                 ("roads", Observation::road(stamp_ns, purpose, RoadFrame::Map, &points))
             }
             Self::Scan(file) => {
-                let bytes = std::fs::read(file).with_context(|| file.display().to_string())?;
-                let scan = if ending(file) == "pcd" { read_pcd(&bytes) } else { read_bin(&bytes) };
-                let scan = scan.with_context(|| file.display().to_string())?;
+                let bytes = files::read(file)?;
+                let scan = scan_file::read(&file.to_string_lossy(), &bytes);
+                let (_, scan) = scan.with_context(|| file.display().to_string())?;
                 let observation = Observation::scan(sensor, stamp_ns, &scan.x, &scan.y, &scan.z);
-                ("scans", observation.intensity(&scan.intensity))
+                ("scans", observation.intensity(&scan.intensity).rings(&scan.ring))
             }
         })
     }
@@ -118,7 +123,7 @@ impl Plan {
         let (mut scans, mut poses, mut roads) = (Vec::new(), Vec::new(), Vec::new());
         let (mut drives, mut notes) = (Vec::new(), Vec::new());
         for file in &options.files {
-            let text = || std::fs::read_to_string(file).with_context(|| file.display().to_string());
+            let text = || files::read_text(file);
             match ending(file) {
                 "bin" | "pcd" => scans.push(file.clone()),
                 "pcap" | "pcapng" => drives.push(file.clone()),
@@ -128,20 +133,33 @@ impl Plan {
                     notes.extend(refused.iter().map(|line| format!("{}: {line}", file.display())));
                     roads.push(road.with_context(|| file.display().to_string())?);
                 }
+                _ if file.is_dir() => bail!("{0}: this is a folder; name its files, such as {0}/*.bin", file.display()),
                 other => bail!("{}: .{other}: bin, pcd, pcap, pcapng, tum, rddf and rndf are allowed", file.display()),
             }
         }
         if !poses.is_empty() && scans.len() > poses.len() {
             bail!(
-                "{} scans and {} poses: each scan needs a pose for its stamp, or there must be no poses",
-                scans.len(),
-                poses.len()
+                "{} and {}: each scan needs a pose for its stamp, or there must be no poses",
+                counted(scans.len() as u64, "scan"),
+                counted(poses.len() as u64, "pose")
             );
         }
+        let unused = |option: &str, needs: &str| Err(usage_error(format!("{option} needs {needs} among the files")));
+        let has = |wanted: &[&str]| options.files.iter().any(|file| wanted.contains(&ending(file)));
+        if options.lane.is_some() && !has(&["rndf"]) {
+            return unused("--lane", "an .rndf");
+        }
+        if options.origin.is_some() && roads.is_empty() {
+            return unused("--origin", "an .rndf or .rddf");
+        }
+        if options.hz.is_some() && (scans.is_empty() || !poses.is_empty()) {
+            return unused("--hz", "scans (.bin, .pcd) and no poses (.tum)");
+        }
+        let hz = options.hz.unwrap_or(HZ);
         let first_ns = poses.first().map_or_else(now_ns, |(stamp_ns, _)| *stamp_ns);
         let stamp_ns = |index: usize| match poses.get(index) {
             Some((stamp_ns, _)) => *stamp_ns,
-            None => first_ns.saturating_add((index as f64 * 1e9 / options.hz) as i64),
+            None => first_ns.saturating_add((index as f64 * 1e9 / hz) as i64),
         };
         let scans = scans.into_iter().enumerate().map(|(index, file)| (stamp_ns(index), Item::Scan(file)));
         // Each road has a stamp of its own, because the server uses the newest.
@@ -220,8 +238,8 @@ type Packets = Vec<(i64, Vec<u8>)>;
 /// # Errors
 /// If the file cannot be read.
 pub fn chunks(file: &Path) -> Result<impl Iterator<Item = Result<Packets, CaptureError>>> {
-    let open = File::open(file).with_context(|| format!("open {}", file.display()))?;
-    let capture = Capture::new(BufReader::new(open)).with_context(|| file.display().to_string())?;
+    let (opened, _) = files::open(file)?;
+    let capture = Capture::new(BufReader::new(opened)).with_context(|| file.display().to_string())?;
     let mut datagrams = capture.peekable();
     Ok(std::iter::from_fn(move || {
         let mut packets = Packets::new();
@@ -252,7 +270,12 @@ mod tests {
     }
 
     fn plan(folder: &Path, files: &[(&str, &[u8])]) -> Result<Plan> {
+        plan_with(folder, files, &[])
+    }
+
+    fn plan_with(folder: &Path, files: &[(&str, &[u8])], options: &[&str]) -> Result<Plan> {
         let mut arguments = vec!["ingest".to_owned()];
+        arguments.extend(options.iter().map(|&option| option.to_owned()));
         for (name, bytes) in files {
             std::fs::write(folder.join(name), bytes).unwrap();
             arguments.push(folder.join(name).display().to_string());
@@ -287,6 +310,22 @@ mod tests {
     }
 
     #[test]
+    fn options_that_no_file_uses_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let pose: &[u8] = b"1 0 0 0 0 0 0 1\n";
+        for (files, option, value) in [
+            (&[("a.bin", pose)][..], "--lane", "1.1"),
+            (&[("a.bin", pose)], "--origin", "30,-97"),
+            (&[("a.bin", pose), ("a.tum", pose)], "--hz", "5"),
+            (&[("a.tum", pose)], "--hz", "5"),
+        ] {
+            let error = plan_with(folder.path(), files, &[option, value]).err().unwrap();
+            assert!(error.is::<clap::Error>() && error.to_string().contains(&format!("{option} needs")), "{error}");
+        }
+        assert!(plan_with(folder.path(), &[("a.bin", pose)], &["--hz", "5"]).is_ok());
+    }
+
+    #[test]
     fn files_that_cannot_be_sent_are_refused_with_the_reason() {
         let folder = tempfile::tempdir().unwrap();
         let error = |files: &[(&str, &[u8])]| format!("{:#}", plan(folder.path(), files).err().unwrap());
@@ -295,7 +334,7 @@ mod tests {
         assert!(error(&[("a.rddf", b"")]).contains("no row"));
         assert!(error(&[("a.rndf", b"RNDF_name x\n")]).contains("no such lane"));
         assert!(
-            error(&[("a.bin", b""), ("b.bin", b""), ("a.tum", b"1 0 0 0 0 0 0 1\n")]).contains("2 scans and 1 poses")
+            error(&[("a.bin", b""), ("b.bin", b""), ("a.tum", b"1 0 0 0 0 0 0 1\n")]).contains("2 scans and 1 pose:")
         );
     }
 }

@@ -13,15 +13,16 @@ use clearway_client::{Ingester, Observation, Refusal};
 use serde_json::json;
 
 use super::connection::{ServerOptions, explain};
-use super::output::{block_on, print_line};
-use files::{FileOptions, Plan};
+use super::output::{block_on, counted, print_line, usage_error};
+use files::{FileOptions, Item, Plan};
 
 mod files;
 
 /// Send observations from files to a server: scans, poses, roads and the packets of drives.
 ///
-/// Reads scans (KITTI .bin, .pcd), ego poses (.tum: lines of "seconds x y z qx qy qz qw"), roads (.rddf, .rndf) and
-/// drives (.pcap, .pcapng: their packets with their own stamps). Prints what the server has refused, and why.
+/// Reads scans (KITTI .bin, nuScenes .pcd.bin, .pcd), ego poses (.tum: lines of "seconds x y z qx qy qz qw"), roads
+/// (.rddf, .rndf) and drives (.pcap, .pcapng: their packets with their own stamps). Prints what the server has refused,
+/// and why.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway ingest scans/*.bin poses.tum --sensor top
@@ -32,13 +33,13 @@ pub struct Options {
     #[command(flatten)]
     server: ServerOptions,
     /// Send over zenoh instead of gRPC, to this endpoint, such as tcp/localhost:7447.
-    #[arg(long, value_name = "ENDPOINT", conflicts_with = "address")]
+    #[arg(long, value_name = "ENDPOINT", conflicts_with_all = ["address", "ca", "cert", "key"])]
     zenoh: Option<String>,
     /// The vehicle; needed over zenoh, and if the server has several.
-    #[arg(long, default_value = "", hide_default_value = true)]
+    #[arg(long, value_name = "NAME", default_value = "", hide_default_value = true)]
     vehicle: String,
     /// The sensor of the scans or packets; needed over zenoh, and if the vehicle has several.
-    #[arg(long, default_value = "", hide_default_value = true)]
+    #[arg(long, value_name = "NAME", default_value = "", hide_default_value = true)]
     sensor: String,
     /// Send as fast as the server accepts, instead of at the recorded pace.
     #[arg(long)]
@@ -59,6 +60,10 @@ pub fn run(options: &Options) -> Result<()> {
 
 async fn ingest(options: &Options) -> Result<()> {
     let plan = Plan::new(&options.files)?;
+    let has_scans = plan.items.iter().any(|(_, item)| matches!(item, Item::Scan(_)));
+    if !options.sensor.is_empty() && !has_scans && plan.drives.is_empty() {
+        return Err(usage_error("--sensor is for scans and drives, and the files have neither"));
+    }
     let ingester = match &options.zenoh {
         Some(endpoint) => ingest_over_zenoh(endpoint, &options.vehicle).await?,
         None => options.server.connect().await?.ingest(&options.vehicle).await.map_err(explain)?,
@@ -127,7 +132,8 @@ fn report(sender: &Sender, notes: &[String], as_json: bool) -> Result<()> {
         print_line(&json!({ "sent": sender.sent, "refused": reasons, "notes": notes }).to_string())?;
         return Ok(());
     }
-    let sent: Vec<String> = sender.sent.iter().map(|(kind, n)| format!("{n} {kind}")).collect();
+    let sent = sender.sent.iter().map(|(kind, count)| counted(*count, kind.trim_end_matches('s')));
+    let sent: Vec<String> = sent.collect();
     print_line(&format!("sent {}; all of them were acknowledged", sent.join(", ")))?;
     for (reason, count) in &reasons {
         let first = sender.refusals.iter().find(|refusal| refusal.reason == **reason);

@@ -5,13 +5,14 @@
 //! (u8, 1 strongest, 2 last, 3 both in one). The points are in firing order; within a firing they are ordered by laser,
 //! and of one laser the strongest return comes before the last.
 
-use std::io::Write;
+use std::io::{Error, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 use clearway_lidar::revolution::Revolution;
 
 use crate::engine::Observer;
+use crate::file_advice::advised;
 use crate::sync::locked;
 
 /// A folder to which point clouds are written.
@@ -22,7 +23,7 @@ pub struct Clouds {
 
 /// Why a point cloud cannot be written.
 #[derive(Debug, thiserror::Error)]
-#[error("point cloud {}: {source}", file.display())]
+#[error("--clouds {}: {source}", file.display())]
 pub struct CloudError {
     /// The folder or file that cannot be written.
     pub file: PathBuf,
@@ -37,10 +38,13 @@ impl Clouds {
     /// Creates the folder, unless it exists.
     ///
     /// # Errors
-    /// [`CloudError`] if it cannot be created.
+    /// [`CloudError`] if a file has its name, or it cannot be created.
     pub fn create(folder: &Path) -> Result<Self, CloudError> {
-        let made = std::fs::create_dir_all(folder);
-        made.map_err(|source| CloudError { file: folder.to_owned(), source })?;
+        let wrong = |source| CloudError { file: folder.to_owned(), source };
+        if folder.is_file() {
+            return Err(wrong(Error::new(ErrorKind::NotADirectory, "this is a file; name a folder")));
+        }
+        std::fs::create_dir_all(folder).map_err(|source| wrong(advised(folder, source)))?;
         Ok(Self { folder: folder.to_owned() })
     }
 
@@ -55,7 +59,7 @@ impl Clouds {
             let Ok(count) = *written else { return };
             let file = self.folder.join(format!("{:06}.pcd", revolution.sequence));
             let done = std::fs::File::create(&file).and_then(|mut open| open.write_all(&pcd(revolution)));
-            *written = done.map(|()| count + 1).map_err(|source| CloudError { file, source });
+            *written = done.map(|()| count + 1).map_err(|source| CloudError { source: advised(&file, source), file });
         });
         (observer, count)
     }

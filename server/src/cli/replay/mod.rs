@@ -152,6 +152,9 @@ pub async fn replay(
     summary.notes = readings.notes().to_vec();
     if let Some(clouds) = clouds {
         summary.clouds = std::mem::replace(&mut *locked(&clouds), Ok(0))?;
+        if summary.clouds == 0 {
+            summary.notes.push("--clouds wrote no file: it writes revolutions, and the files have none".into());
+        }
     }
     summary.seconds = began.elapsed().as_secs_f64();
     Ok(summary)

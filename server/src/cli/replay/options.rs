@@ -8,12 +8,13 @@ use clearway_mapping::config::Extrinsics;
 
 use super::clouds::CloudError;
 use crate::cli::configuration::extrinsics;
+use crate::cli::model::ModelParser;
 use crate::config::ConfigError;
 use crate::ingest::files::FilesError;
 use crate::record::reader::RecordingError;
 use crate::server::{ShutdownError, StartError};
 
-/// Make maps from recorded drives: pcap, pcapng, MCAP, KITTI and PCD files or folders, in the order given.
+/// Make maps from recorded drives: pcap, pcapng, MCAP, KITTI, nuScenes and PCD files or folders.
 ///
 /// The sensor's model, return mode and rotation rate are found from the data. If nothing says how the sensor is
 /// mounted, height, pitch and roll are estimated from the ground in the first revolutions; the estimate is printed and
@@ -24,14 +25,15 @@ use crate::server::{ShutdownError, StartError};
   clearway replay drive.pcap --extrinsics 0,0,1.9,0,0,0 --json
   clearway replay drive.mcap --serve --speed as-recorded")]
 pub struct Options {
-    /// pcap, pcapng, MCAP, KITTI .bin and .pcd files, or folders of them.
+    /// pcap, pcapng, MCAP, KITTI .bin, nuScenes .pcd.bin and .pcd files, or folders of them, in the order
+    /// given.
     #[arg(required = true)]
     pub files: Vec<PathBuf>,
-    /// Record the events and the maps to this MCAP file.
+    /// Record the events and the maps to this MCAP file, which is replaced if it exists.
     #[arg(long, value_name = "OUT.mcap")]
     pub record: Option<PathBuf>,
-    /// Speed of the replay: as-recorded, max, or a factor [default: max; as-recorded with --serve].
-    #[arg(long)]
+    /// Speed of the replay: as-recorded, max, or a factor such as 0.5 [default: max; as-recorded with --serve].
+    #[arg(long, value_name = "as-recorded|max|X")]
     pub speed: Option<Speed>,
     /// Print one JSON object at the end.
     #[arg(long)]
@@ -39,34 +41,34 @@ pub struct Options {
     /// Write the points of each revolution, in the sensor frame, to this folder as binary PCD files.
     #[arg(long, value_name = "DIR")]
     pub clouds: Option<PathBuf>,
-    /// Calibration file of the sensor (ROS YAML or Velodyne XML); the factory's values if absent.
+    /// Calibration file of the first sensor (ROS YAML or Velodyne XML); the factory's values if absent.
     #[arg(long, value_name = "FILE")]
     pub calibration: Option<PathBuf>,
-    /// Position and orientation of the sensor in the ego frame, in metres and degrees; estimated from the ground if
-    /// neither this nor the files nor the configuration has it.
+    /// Position and orientation of the first sensor in the ego frame, in metres and degrees, such as 0,0,1.9,0,0,0;
+    /// estimated from the ground if neither this nor the files nor the configuration has it.
     #[arg(long, value_name = "x,y,z,roll,pitch,yaw", value_parser = extrinsics, allow_hyphen_values = true)]
     pub extrinsics: Option<Extrinsics>,
-    /// The sensor's model, if the data names the wrong one or none.
-    #[arg(long)]
+    /// Model of every sensor, if the data names the wrong one or none; of scans, the model whose elevations they have.
+    #[arg(long, value_parser = ModelParser::any())]
     pub model: Option<Model>,
-    /// Rotation rate of the sensor, in revolutions per minute, if the data gives the wrong one or none.
+    /// Rotation rate of every sensor, in revolutions per minute, if the data gives the wrong one or none.
     #[arg(long)]
     pub rpm: Option<f32>,
-    /// A ROS topic of an MCAP file to read; may be given several times. Sensors and poses are chosen if absent.
+    /// A ROS topic of a ROS 2 bag (MCAP) to read; may be given several times. Sensors and poses are chosen if absent.
     #[arg(long = "topic", value_name = "TOPIC")]
     pub topics: Vec<String>,
     /// Use the vehicle, the maps and the publishers of this configuration.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// Override a key of the configuration; may be given several times.
+    /// Override a key of the configuration, such as vehicle.maps.valid_ms=500; may be given several times.
     #[arg(long, value_name = "KEY=VALUE", requires = "config")]
     pub set: Vec<String>,
-    /// Publish the maps, and the last map until SIGINT or SIGTERM. The maps keep the stamps of the recording, so
-    /// readers see old ones as stale.
+    /// Publish the maps, and the last one until SIGINT (Ctrl-C) or SIGTERM. The maps keep the stamps of the recording,
+    /// so readers see those of an old recording as stale.
     #[arg(long)]
     pub serve: bool,
-    /// The vehicle to replay, if the recording or the configuration has several.
-    #[arg(long)]
+    /// The vehicle to replay; needed if the recording or the configuration has several.
+    #[arg(long, value_name = "NAME")]
     pub vehicle: Option<String>,
 }
 
@@ -113,6 +115,28 @@ pub enum ReplayError {
         name: String,
         /// Names of the vehicles of the configuration, separated by commas.
         known: String,
+    },
+    /// The recording or the configuration has several vehicles.
+    #[error("{} has the vehicles {known}: name one with --vehicle", file.display())]
+    Vehicles {
+        /// The recording or the configuration.
+        file: PathBuf,
+        /// Names of its vehicles, separated by commas.
+        known: String,
+    },
+    /// An option has no meaning for these files.
+    #[error("{option}: {reason}")]
+    Unused {
+        /// The option, with its value.
+        option: String,
+        /// Why it has no meaning.
+        reason: String,
+    },
+    /// The recording would replace a file that is replayed.
+    #[error("--record {}: this file is replayed; name another file", file.display())]
+    RecordsInput {
+        /// The file.
+        file: PathBuf,
     },
     /// The point clouds cannot be written.
     #[error(transparent)]

@@ -6,17 +6,17 @@ use std::path::{Path, PathBuf};
 
 use clearway_lidar::Sensor;
 use clearway_lidar::calibration::Calibration;
-use clearway_lidar::model::Model;
 use clearway_lidar::revolution::{Echo, Revolution};
 use clearway_mapping::config::{Extrinsics, MapsConfig, SENSORS_MAX, SensorConfig};
 use clearway_mapping::event::{Body, Scan};
+use clearway_mapping::scan_file::ScanFormat;
 use clearway_mapping::sensor::mount::estimate;
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Point3, Vector3};
 
 use super::clouds::{Clouds, Written};
 use super::options::{Options, ReplayError};
 use super::summary::{Mount, describe};
-use crate::config::{Calibrations, Config, Recorder};
+use crate::config::{Calibrations, Config, Origin, Recorder};
 use crate::ingest::files::mcap::{McapError, McapOptions};
 use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
@@ -24,8 +24,11 @@ use crate::ingest::ros::decoder::PoseSource;
 use crate::record::reader::RecordingReader;
 use crate::server::Setup;
 
-/// Number of revolutions from which the mount is estimated: one second of a sensor at 600 rpm.
-const MOUNT_REVOLUTIONS: usize = 10;
+/// Number of revolutions from which the mount is estimated: the first of them follow each other, and between the others
+/// there are ten. Ours: a second at 600 rpm, which a short file has, and ten seconds more, in which the road changes.
+const MOUNT_REVOLUTIONS: usize = 20;
+const MOUNT_REVOLUTIONS_FIRST: usize = 10;
+const MOUNT_REVOLUTIONS_STEP: usize = 10;
 /// Height of a sensor above the ego frame's origin until its mount is given or estimated, in metres; ours, about the
 /// roof of a car.
 const MOUNT_HEIGHT_M: f64 = 2.0;
@@ -47,7 +50,11 @@ pub(super) struct Plan {
 pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     let files = Readings::open(&options.files, McapOptions::default())?;
     let recorded = files.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
-    let scans = files.files().all(|(_, kind)| kind == Kind::Scan);
+    let journal = match &recorded {
+        Some(file) => RecordingReader::open(file)?.header().config.is_some(),
+        None => false,
+    };
+    check(options, recorded.as_deref(), journal)?;
     let mut known = configured(options, recorded.as_deref())?;
     let vehicle = &mut known.config.vehicles[0];
     (vehicle.udp, vehicle.ros) = (None, None);
@@ -60,7 +67,7 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
         Some(bag) => known.apply_bag(&bag, &mut wanted, options.extrinsics.is_some())?,
         None => None,
     };
-    known.apply_options(options, scans)?;
+    known.apply_options(options)?;
     let open = || Readings::open(&options.files, wanted.clone());
     let readings = open()?;
     let mount = match options.extrinsics {
@@ -77,6 +84,34 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     let clouds = options.clouds.as_deref().map(Clouds::create).transpose()?;
     let (observer, clouds) = clouds.map(Clouds::observer).unzip();
     Ok(Plan { setup: Setup { observer, ..setup }, mount, extrinsics, readings, clouds })
+}
+
+/// Refuses options that have no meaning for the files. `mcap` is the first MCAP file, and `journal` is true if it is a
+/// recording of clearway.
+fn check(options: &Options, mcap: Option<&Path>, journal: bool) -> Result<(), ReplayError> {
+    let unused = |option: String, reason: String| Err(ReplayError::Unused { option, reason });
+    if let Some(topic) = options.topics.first() {
+        let option = format!("--topic {topic}");
+        match mcap {
+            None => return unused(option, "the files have no topics; a ROS 2 bag in MCAP has".into()),
+            Some(file) if journal => {
+                let file = file.display();
+                return unused(option, format!("{file} is a recording of clearway, of which the events are replayed"));
+            }
+            Some(_) => {}
+        }
+    }
+    if let Some(name) = options.vehicle.as_ref().filter(|_| options.config.is_none() && !journal) {
+        let reason = "the files name no vehicle; the option needs --config FILE or a recording of clearway";
+        return unused(format!("--vehicle {name}"), reason.into());
+    }
+    let same = |a: &Path, b: &Path| a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b));
+    match &options.record {
+        Some(record) if options.files.iter().any(|file| same(file, record)) => {
+            Err(ReplayError::RecordsInput { file: record.clone() })
+        }
+        _ => Ok(()),
+    }
 }
 
 /// What is known about the vehicle so far.
@@ -122,15 +157,14 @@ impl Known {
         self.remarks.extend(mount.and_then(describe).map(|said| format!("extrinsics of {sensor}: {said}")));
     }
 
-    /// Applies the sensor options; `scans` is true if the files hold nothing but scans.
-    fn apply_options(&mut self, options: &Options, scans: bool) -> Result<(), ReplayError> {
+    /// Applies the sensor options. A model on the command line comes before the configured elevations.
+    fn apply_options(&mut self, options: &Options) -> Result<(), ReplayError> {
         let sensors = &mut self.config.vehicles[0].sensors;
         for sensor in sensors.iter_mut() {
             (sensor.model, sensor.rpm) = (options.model.or(sensor.model), options.rpm.or(sensor.rpm));
-        }
-        // Scans do not name their sensor, and KITTI's scans are from this one.
-        if scans && sensors[0].model.is_none() && self.tables[0][0].is_none() {
-            sensors[0].model = Some(Model::Hdl64eS2);
+            if options.model.is_some() {
+                sensor.elevations_deg.clear();
+            }
         }
         if let Some(file) = &options.calibration {
             sensors[0].calibration = Some(file.display().to_string());
@@ -143,16 +177,31 @@ impl Known {
     }
 
     /// Estimates the mount of the first sensor from the ground in the first revolutions. If that fails, no map is made.
-    fn estimate_mount(&mut self, readings: Readings) -> Result<Mount, ReplayError> {
+    fn estimate_mount(&mut self, mut readings: Readings) -> Result<Mount, ReplayError> {
         let vehicle = &mut self.config.vehicles[0];
         let sensor = &mut vehicle.sensors[0];
-        let revolutions = first_revolutions(readings, sensor, self.tables[0][0].clone())?;
+        let mut revolutions = first_revolutions(&mut readings, sensor, self.tables[0][0].clone())?;
         if revolutions.is_empty() {
             return Ok(Mount::Unneeded);
         }
+        // The ground does not show which way is forward; the format of a scan file does.
+        let yaw_rad = readings.scan_format().map_or(0.0, ScanFormat::yaw_deg).to_radians();
+        let forward_from_sensor = Isometry3::rotation(Vector3::z() * yaw_rad);
+        if yaw_rad != 0.0 {
+            let turned = |point: &mut [f32; 3]| {
+                *point = (forward_from_sensor * Point3::from(point.map(f64::from))).cast::<f32>().into();
+            };
+            revolutions.iter_mut().flatten().for_each(turned);
+        }
         let mount = estimate(&revolutions).map_or_else(Mount::Unknown, Mount::Estimated);
         match &mount {
-            Mount::Estimated(estimate) => sensor.extrinsics = estimate.extrinsics(),
+            Mount::Estimated(estimate) => {
+                let ego_from_forward = estimate.extrinsics().ego_from_sensor();
+                sensor.extrinsics = match yaw_rad {
+                    0.0 => estimate.extrinsics(),
+                    _ => extrinsics_of(&(ego_from_forward * forward_from_sensor)),
+                };
+            }
             _ => vehicle.maps = MapsConfig::none(),
         }
         let name = sensor.name.clone();
@@ -163,7 +212,7 @@ impl Known {
     /// The setup with which the server starts.
     fn setup(self, options: &Options) -> Result<Setup, ReplayError> {
         let Self { config, tables: calibrations, boot_id, remarks, .. } = self;
-        let file = options.config.as_deref().unwrap_or(Path::new("(replay)"));
+        let file = options.config.as_deref().unwrap_or(Path::new("of the replayed files"));
         // A run that serves nothing opens none of these paths, and its boot id must not depend on the folder.
         let mut config = if options.serve { config.located(file) } else { config };
         config.recorder.file = options.record.clone().unwrap_or_default();
@@ -171,7 +220,7 @@ impl Known {
             (config.grpc.enabled, config.page.enabled, config.foxglove.enabled) = (false, false, false);
             (config.zenoh.enabled, config.zenoh.ros2.enabled) = (false, false);
         }
-        config.check(file)?;
+        config.check(&origin(options, file))?;
         let certificates = if options.serve { config.certificates(file)? } else { None };
         // The same files and settings get the same boot id. Served maps need a new one, because a reader that has seen
         // these maps before would drop them as old.
@@ -196,17 +245,32 @@ impl Known {
     }
 }
 
+/// Where a wrong value of the configuration was given. The configuration was checked when it was read, so a value is
+/// wrong because of the options, or of the mounts in a bag.
+fn origin(options: &Options, file: &Path) -> Origin {
+    let extrinsics = options
+        .extrinsics
+        .map(|e| format!("--extrinsics {},{},{},{},{},{}", e.x_m, e.y_m, e.z_m, e.roll_deg, e.pitch_deg, e.yaw_deg));
+    let rpm = options.rpm.map(|rpm| format!("--rpm {rpm}"));
+    let given: Vec<String> = rpm.into_iter().chain(extrinsics).collect();
+    if given.is_empty() { Origin::file(file) } else { Origin::Options(given) }
+}
+
 /// The configuration of `--config`, else of the recording, else the default one.
 fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, ReplayError> {
     let known =
         |config, tables, boot_id, is_mounted| Known { config, tables, boot_id, is_mounted, remarks: Vec::new() };
-    let pick = |config: &mut Config, tables: &mut Calibrations| {
+    let pick = |file: &Path, config: &mut Config, tables: &mut Calibrations| {
+        let known = || config.vehicles.iter().map(|v| v.name.as_str()).collect::<Vec<_>>().join(", ");
         let index = match &options.vehicle {
+            None if config.vehicles.len() > 1 => {
+                return Err(ReplayError::Vehicles { file: file.to_owned(), known: known() });
+            }
             None => 0,
-            Some(name) => config.vehicles.iter().position(|v| v.name == *name).ok_or_else(|| ReplayError::Vehicle {
-                name: name.clone(),
-                known: config.vehicles.iter().map(|v| v.name.as_str()).collect::<Vec<_>>().join(", "),
-            })?,
+            Some(name) => {
+                let found = config.vehicles.iter().position(|vehicle| vehicle.name == *name);
+                found.ok_or_else(|| ReplayError::Vehicle { name: name.clone(), known: known() })?
+            }
         };
         config.vehicles = vec![config.vehicles.swap_remove(index)];
         *tables = vec![tables.swap_remove(index)];
@@ -215,14 +279,14 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, Repla
     if let Some(file) = &options.config {
         let mut config = Config::load(file, &options.set)?;
         let mut tables = config.calibrations(file)?;
-        pick(&mut config, &mut tables)?;
+        pick(file, &mut config, &mut tables)?;
         return Ok(known(config, tables, None, true));
     }
     if let Some(file) = recorded {
         let recording = RecordingReader::open(file)?;
         if recording.header().config.is_some() {
             let (mut config, mut tables) = recording.config()?;
-            pick(&mut config, &mut tables)?;
+            pick(file, &mut config, &mut tables)?;
             // The publishers and files of the recorded run are not those of this run.
             let config = Config { vehicles: config.vehicles, ..Config::default() };
             return Ok(known(config, tables, Some(recording.header().boot_id), true));
@@ -291,26 +355,32 @@ fn extrinsics_of(ego_from_sensor: &Isometry3<f64>) -> Extrinsics {
 
 /// The points of the first revolutions or scans, in the sensor frame, in metres.
 fn first_revolutions(
-    readings: Readings,
+    readings: &mut Readings,
     config: &SensorConfig,
     calibration: Option<Calibration>,
 ) -> Result<Vec<Vec<[f32; 3]>>, ReplayError> {
     let mut sensor = Sensor::new(config.lidar(calibration));
-    let mut clouds = Vec::new();
-    for reading in readings {
-        let reading = reading?;
-        match &reading.body {
-            // Refused datagrams are counted in the second pass, which makes the maps.
-            Body::Datagram(payload) => {
-                if let Ok(Some(revolution)) = sensor.push(payload, reading.arrival_ns) {
-                    clouds.push(points_of(revolution));
-                }
-            }
-            Body::Scan(scan) => clouds.push(points_of_scan(scan)),
-            Body::End => clouds.extend(sensor.finish().map(points_of)),
-            Body::EgoPose(_) | Body::Road(_) | Body::Sensor(_) | Body::Lost { .. } => {}
+    let (mut clouds, mut seen) = (Vec::new(), 0);
+    let mut push = |points: &dyn Fn() -> Vec<[f32; 3]>| {
+        if seen < MOUNT_REVOLUTIONS_FIRST || seen % MOUNT_REVOLUTIONS_STEP == 0 {
+            clouds.push(points());
         }
-        if clouds.len() >= MOUNT_REVOLUTIONS {
+        seen += 1;
+        clouds.len() < MOUNT_REVOLUTIONS
+    };
+    for reading in readings.filter(|reading| !matches!(reading, Ok(other) if other.source != 0)) {
+        let reading = reading?;
+        let needs_more = match &reading.body {
+            // Refused datagrams are counted in the second pass, which makes the maps.
+            Body::Datagram(payload) => match sensor.push(payload, reading.arrival_ns) {
+                Ok(Some(revolution)) => push(&|| points_of(revolution)),
+                Ok(None) | Err(_) => true,
+            },
+            Body::Scan(scan) => push(&|| points_of_scan(scan)),
+            Body::End => sensor.finish().is_none_or(|revolution| push(&|| points_of(revolution))),
+            Body::EgoPose(_) | Body::Road(_) | Body::Sensor(_) | Body::Lost { .. } => true,
+        };
+        if !needs_more {
             break;
         }
     }

@@ -3,9 +3,11 @@
 use std::path::PathBuf;
 
 use clearway_mapping::config::Extrinsics;
+use clearway_mapping::map::ElevationSource;
 use clearway_mapping::sensor::mount::{MountError, MountEstimate};
 use serde_json::{Value, json};
 
+use crate::cli::output::counted;
 use crate::ingest::files::Truncated;
 use crate::status::Snapshot;
 
@@ -59,6 +61,7 @@ impl Summary {
             json!({
                 "name": sensor.name, "model": model, "returns": sensor.status.returns, "rpm": sensor.status.rpm,
                 "revolutions": sensor.status.revolutions,
+                "elevations": sensor.elevations.map(ElevationSource::as_str),
             })
         });
         let truncated = self.truncated.iter().map(|t| json!({ "file": t.file, "reason": t.reason }));
@@ -69,6 +72,7 @@ impl Summary {
             "revolutions": self.snapshot.revolutions(),
             "maps": self.snapshot.maps,
             "sensors": sensors.collect::<Vec<_>>(),
+            "reference_sensor": self.snapshot.reference_sensor(),
             "latency_ms": { "p50": self.snapshot.latency_ms_p50, "p99": self.snapshot.latency_ms_p99 },
             "drivable_share": self.snapshot.drivable_share,
             "mount": self.mount_json(),
@@ -98,6 +102,9 @@ impl Summary {
             Mount::Estimated(estimate) => {
                 known["source"] = "estimated".into();
                 known["revolutions"] = estimate.revolutions.into();
+                known["height_std_m"] = estimate.height_std_m.into();
+                known["pitch_std_deg"] = estimate.pitch_std_rad.to_degrees().into();
+                known["roll_std_deg"] = estimate.roll_std_rad.to_degrees().into();
                 known["residual_m"] = estimate.residual_m.into();
                 known["inliers"] = estimate.inliers.into();
                 known["samples"] = estimate.samples.into();
@@ -121,15 +128,23 @@ impl Summary {
             ledger.lost
         )];
         lines.extend(ledger.refused.iter().map(|(reason, n)| format!("  refused for {reason}: {n}")));
+        let several = snapshot.sensors.len() > 1;
         for sensor in &snapshot.sensors {
             let model = sensor.status.model.map_or("unknown model", clearway_lidar::model::Model::as_str);
             let rpm = sensor.status.rpm.map_or(String::new(), |rpm| format!(", {rpm:.0} rpm"));
             let (revolutions, returns) = (sensor.status.revolutions, sensor.status.returns);
-            lines.push(format!("{}: {model}{rpm}, {revolutions} revolutions, {returns} returns", sensor.name));
+            let (revolutions, returns) = (counted(revolutions, "revolution"), counted(returns, "return"));
+            lines.push(format!("{}: {model}{rpm}, {revolutions}, {returns}", sensor.name));
+            if several && sensor.is_reference {
+                lines.push("  reference sensor: its scans make the maps".to_owned());
+            }
+            if let Some((source, advice)) = sensor.elevations.and_then(|of| Some((of.as_str(), of.advice()?))) {
+                lines.push(format!("  elevations {source}: {advice}"));
+            }
         }
         let share =
             snapshot.drivable_share.map_or(String::new(), |share| format!(", newest {:.1} % drivable", 100.0 * share));
-        lines.push(format!("{} maps{share}", snapshot.maps));
+        lines.push(format!("{}{share}", counted(snapshot.maps, "map")));
         if let (Some(p50), Some(p99)) = (snapshot.latency_ms_p50, snapshot.latency_ms_p99) {
             lines.push(format!("time to make a map: median {p50:.2} ms, 99th percentile {p99:.2} ms"));
         }
@@ -137,7 +152,7 @@ impl Summary {
             lines.push(format!("recorded {}", record.display()));
         }
         if self.clouds > 0 {
-            lines.push(format!("{} point clouds written", self.clouds));
+            lines.push(format!("{} written", counted(self.clouds, "point cloud")));
         }
         lines.join("\n") + "\n"
     }
@@ -147,12 +162,15 @@ impl Summary {
 pub fn describe(mount: &Mount) -> Option<String> {
     match mount {
         Mount::Estimated(estimate) => Some(format!(
-            "estimated from the ground in {} revolutions: height {:.3} m, pitch {:.2} deg, roll {:.2} deg ({} of {} \
-             lowest points on one plane, residual {:.3} m)",
-            estimate.revolutions,
+            "estimated from the ground in {}: height {:.3} ± {:.3} m, pitch {:.2} ± {:.2} deg, roll {:.2} ± {:.2} deg \
+             ({} of {} lowest points on one plane, residual {:.3} m)",
+            counted(estimate.revolutions as u64, "revolution"),
             estimate.height_m,
+            estimate.height_std_m,
             estimate.pitch_rad.to_degrees(),
+            estimate.pitch_std_rad.to_degrees(),
             estimate.roll_rad.to_degrees(),
+            estimate.roll_std_rad.to_degrees(),
             estimate.inliers,
             estimate.samples,
             estimate.residual_m,

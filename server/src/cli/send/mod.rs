@@ -6,7 +6,6 @@
 //! | `network` | datagrams -> what a bad network delivers of them (feature `sim`) |
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::BufReader;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -19,7 +18,8 @@ use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use clearway_ros::velodyne_scan::VelodyneScan;
 use serde_json::{Value, json};
 
-use super::output::{print_line, progress_bar};
+use super::files;
+use super::output::{counted, print_line, progress_bar};
 use crate::record::mcap_reader::McapReader;
 use udp::{Kind, Sender, Speed};
 
@@ -36,7 +36,7 @@ pub mod udp;
   clearway send drive.pcap --to udp://127.0.0.1:2368
   clearway send drive.pcap --to udp://127.0.0.1:2368 --bind 127.0.0.2 --speed max")]
 pub struct Options {
-    /// The capture.
+    /// The capture: pcap, pcapng, or MCAP with VelodyneScan messages.
     file: PathBuf,
     /// Target of the data packets.
     #[arg(long, value_name = "udp://HOST:PORT")]
@@ -47,7 +47,7 @@ pub struct Options {
     /// Address to send from, with or without a port; a server tells sensors apart by it.
     #[arg(long, value_name = "ADDRESS", value_parser = udp::own_address)]
     bind: Option<SocketAddr>,
-    /// Multiple of the recorded pace, or max for as fast as possible.
+    /// Speed, as a multiple of the recorded one, such as 0.5; or max for as fast as possible.
     #[arg(long, default_value = "1", value_name = "X|max", value_parser = udp::speed)]
     speed: Speed,
     /// Print one JSON object at the end.
@@ -66,10 +66,10 @@ pub struct Options {
 pub fn run(options: &Options) -> Result<()> {
     let to = udp::target(&options.to)?;
     let telemetry_to = options.telemetry_to.as_deref().map_or(Ok(to), udp::target)?;
-    let length = std::fs::metadata(&options.file).with_context(|| format!("open {}", options.file.display()))?.len();
+    let (_, length) = files::open(&options.file)?;
     let mut route = Route {
         #[cfg(feature = "sim")]
-        network: options.network.network(),
+        network: options.network.network()?,
         sender: Sender::new(to, telemetry_to, options.bind, options.speed)?,
         skipped: BTreeMap::new(),
     };
@@ -108,7 +108,7 @@ fn send_mcap(options: &Options, route: &mut Route, length: u64) -> Result<Option
 /// Sends the datagrams of a pcap or pcapng file; returns why the file is not whole.
 fn send_capture(options: &Options, route: &mut Route, length: u64) -> Result<Option<String>> {
     let progress = progress_bar(length);
-    let file = File::open(&options.file).with_context(|| format!("open {}", options.file.display()))?;
+    let (file, _) = files::open(&options.file)?;
     let mut capture = Capture::new(BufReader::new(file)).with_context(|| options.file.display().to_string())?;
     let mut cut = None;
     while let Some(datagram) = capture.next() {
@@ -139,7 +139,9 @@ fn report(options: &Options, to: (SocketAddr, SocketAddr), sent: &Sent, cut: Opt
     }
     let (to, telemetry_to) = to;
     print_line(&format!(
-        "sent {packets} data packets to {to} and {telemetry} telemetry datagrams to {telemetry_to} in {seconds:.1} s"
+        "sent {} to {to} and {} to {telemetry_to} in {seconds:.1} s",
+        counted(packets, "data packet"),
+        counted(telemetry, "telemetry datagram")
     ))?;
     if let Some(line) = sent.network_line() {
         print_line(&line)?;

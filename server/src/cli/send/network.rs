@@ -7,6 +7,7 @@ use clearway_sim::vehicle::{Datagram, Kind};
 use serde_json::{Value, json};
 
 use super::udp;
+use crate::cli::output::{counted, usage_error};
 
 /// Data packets from the beginning of one burst of losses to the next, on average; ours.
 const PACKETS_PER_BURST: f64 = 200.0;
@@ -18,13 +19,13 @@ pub struct NetworkOptions {
     /// Share of the datagrams to lose, in percent.
     #[arg(long, default_value = "0", value_name = "PERCENT", value_parser = share)]
     loss: f64,
-    /// Most data packets to lose in a row; about one packet in 200 begins such a burst.
+    /// Greatest number of data packets to lose in a row; about one packet in 200 begins such a burst.
     #[arg(long, default_value = "0", value_name = "PACKETS")]
     burst: u32,
     /// Share of the datagrams to send twice, in percent.
     #[arg(long, default_value = "0", value_name = "PERCENT", value_parser = share)]
     duplicate: f64,
-    /// Most data packets by which a packet is late; one packet in four and every copy is.
+    /// Greatest number of data packets that overtake a late packet; one packet in four is late, and every copy.
     #[arg(long, default_value = "0", value_name = "PACKETS")]
     reorder: u32,
     /// Share of the datagrams to cut short, in percent.
@@ -33,12 +34,12 @@ pub struct NetworkOptions {
     /// Share of the datagrams in which to flip a bit, in percent.
     #[arg(long, default_value = "0", value_name = "PERCENT", value_parser = share)]
     flip: f64,
-    /// Most milliseconds by which each datagram is delayed.
+    /// Greatest delay of a datagram, in milliseconds.
     #[arg(long, default_value = "0", value_name = "MS")]
     delay: u32,
-    /// Seed of the random numbers; the same seed makes the same network.
-    #[arg(long, default_value = "0")]
-    seed: u64,
+    /// Seed of the random numbers; the same seed makes the same network. 0 if absent.
+    #[arg(long)]
+    seed: Option<u64>,
 }
 
 fn share(text: &str) -> Result<f64, String> {
@@ -48,7 +49,11 @@ fn share(text: &str) -> Result<f64, String> {
 
 impl NetworkOptions {
     /// The network of these options; `None` if it has no fault.
-    pub fn network(&self) -> Option<Network> {
+    ///
+    /// # Errors
+    /// If there is a seed and no fault that uses it.
+    pub fn network(&self) -> Result<Option<Network>> {
+        let seed = self.seed.unwrap_or(0);
         let faults = Faults {
             loss: self.loss,
             burst: if self.burst > 0 { 1.0 / PACKETS_PER_BURST } else { 0.0 },
@@ -58,9 +63,13 @@ impl NetworkOptions {
             truncate: self.truncate,
             flip: self.flip,
             delay_ns: i64::from(self.delay) * 1_000_000,
-            seed: self.seed,
+            seed,
         };
-        (faults != Faults { seed: self.seed, ..Faults::default() }).then(|| Network(Impairment::new(faults)))
+        let has_faults = faults != Faults { seed, ..Faults::default() };
+        if self.seed.is_some() && !has_faults {
+            return Err(usage_error("--seed needs a fault of the network that uses it, such as --loss 5"));
+        }
+        Ok(has_faults.then(|| Network(Impairment::new(faults))))
     }
 }
 
@@ -113,9 +122,11 @@ pub fn document(counts: &Counts) -> Value {
 pub fn line(counts: &Counts) -> String {
     let Counts { sent: taken, arrived, packets_lost, telemetry_lost, gaps, duplicated, reordered, truncated, flipped } =
         counts;
+    let [taken, packets, telemetry, gaps] =
+        [(taken, "datagram"), (packets_lost, "data packet"), (telemetry_lost, "telemetry datagram"), (gaps, "gap")]
+            .map(|(count, noun)| counted(*count, noun));
     format!(
-        "bad network: {taken} datagrams sent, {arrived} delivered: {packets_lost} data packets lost in {gaps} gaps, \
-         {telemetry_lost} telemetry datagrams lost, {duplicated} delivered twice, {reordered} late, {truncated} cut \
-         short, {flipped} with a flipped bit"
+        "bad network: {taken} sent, {arrived} delivered: {packets} lost in {gaps}, {telemetry} lost, {duplicated} \
+         delivered twice, {reordered} late, {truncated} cut short, {flipped} with a flipped bit"
     )
 }

@@ -1,16 +1,18 @@
-//! A map -> Foxglove messages: `foxglove.Grid` for each layer, `foxglove.FrameTransforms`, and `foxglove.PointCloud` of
-//! points.
+//! A map -> Foxglove messages: `foxglove.Grid` for each layer, `foxglove.SceneUpdate` of safe points,
+//! `foxglove.FrameTransforms`, and `foxglove.PointCloud` of points.
 
 use clearway_proto::map::Layer;
+use foxglove::messages::line_primitive::Type;
 use foxglove::messages::packed_element_field::NumericType;
 use foxglove::messages::{
-    FrameTransform, FrameTransforms, Grid, PackedElementField, PointCloud, Pose, Quaternion, Timestamp, Vector2,
-    Vector3,
+    Color, Duration, FrameTransform, FrameTransforms, Grid, LinePrimitive, PackedElementField, Point3, PointCloud,
+    Pose, Quaternion, SceneEntity, SceneUpdate, Timestamp, Vector2, Vector3,
 };
 use nalgebra::Isometry3;
 
 use super::frame::{MAP_FRAME, base_frame, map_from_ego};
 use super::raster::Raster;
+use super::safe_paths::{self, Place};
 use clearway_client::MapView;
 
 /// Bytes of a cell: red, green, blue, alpha.
@@ -33,6 +35,33 @@ pub fn grid(map: &MapView, layer: &Layer, raster: &Raster) -> Grid {
         fields: [("red", 0), ("green", 1), ("blue", 2), ("alpha", 3)].map(field).to_vec(),
         data: raster.rgba(layer).into(),
     }
+}
+
+/// Safe points of a layer: their links as lines, and circles with their radii. Each map replaces the scene of the map
+/// before; the scene disappears when the map is stale.
+pub fn safe_paths(map: &MapView, layer: &Layer) -> SceneUpdate {
+    let header = map.header();
+    let valid_ns = header.valid_until_ns.saturating_sub(header.capture_end_ns).max(0);
+    let lines = |points: Vec<Place>, [r, g, b, a]: [f32; 4], thickness: f64| LinePrimitive {
+        r#type: Type::LineList.into(),
+        pose: Some(pose(&Isometry3::identity())),
+        thickness,
+        points: points.into_iter().map(|[x, y, z]| Point3 { x, y, z }).collect(),
+        color: Some(Color { r: r.into(), g: g.into(), b: b.into(), a: a.into() }),
+        ..LinePrimitive::default()
+    };
+    let links = lines(safe_paths::links(&layer.points), safe_paths::LINK_RGBA, safe_paths::LINK_M);
+    let circles = lines(safe_paths::circles(&layer.points), safe_paths::CIRCLE_RGBA, safe_paths::CIRCLE_M);
+    let entity = SceneEntity {
+        timestamp: Some(timestamp(header.capture_end_ns)),
+        frame_id: base_frame(map.vehicle()),
+        id: layer.name.clone(),
+        lifetime: Some(Duration::new((valid_ns / 1_000_000_000) as i32, (valid_ns % 1_000_000_000) as u32)),
+        frame_locked: true,
+        lines: vec![links, circles],
+        ..SceneEntity::default()
+    };
+    SceneUpdate { deletions: Vec::new(), entities: vec![entity] }
 }
 
 /// Pose of the ego frame in `map`; `None` if no pose is known.

@@ -6,6 +6,7 @@
 //! | file | in -> out |
 //! |---|---|
 //! | [`raster`] | a layer -> square cells, as occupancies or colours |
+//! | [`safe_paths`] | safe points -> lines, circles, poses |
 //! | [`frame`] | a map -> its frames and its pose |
 //! | [`ros`] | a map -> CDR messages of ROS 2 |
 //! | [`foxglove`] | a map -> Foxglove's messages |
@@ -14,6 +15,7 @@ pub mod foxglove;
 pub mod frame;
 pub mod raster;
 pub mod ros;
+pub mod safe_paths;
 
 pub use frame::base_frame;
 pub use raster::Raster;

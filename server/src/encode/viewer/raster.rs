@@ -114,7 +114,7 @@ impl Raster {
     /// Red, green, blue and alpha of each cell of a layer with this grid, in the colours of [`crate::encode::picture`].
     /// Squares outside a radial grid are transparent.
     pub fn rgba(&self, layer: &Layer) -> Vec<u8> {
-        let colours = Colours::of(layer);
+        let colours = Colours::of_layer(layer);
         let colour = |cell: u32| match cell {
             NOWHERE => [0; 4],
             cell => {
@@ -233,8 +233,8 @@ mod tests {
         assert_eq!(of(HeightDifferenceClass::LEGEND), [-1, 0, 100]);
         assert_eq!(of(TerrainClass::LEGEND), [-1, 0, -1, 100, 100, 100]);
         assert_eq!(of(OccupancyClass::LEGEND), [-1, 0, 100, -1, -1]);
-        assert_eq!(of(SpeedClass::LEGEND), [-1, 0, 100, 0]);
-        assert_eq!(of(SafePathClass::LEGEND), [-1, 0, 100, 0]);
+        assert_eq!(of(SpeedClass::LEGEND), [-1, 0, 100, 0, 100]);
+        assert_eq!(of(SafePathClass::LEGEND), [-1, 0, 100, 0, 100]);
     }
 
     #[test]

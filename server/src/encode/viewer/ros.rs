@@ -1,15 +1,18 @@
-//! A map -> ROS 2 messages, CDR: `nav_msgs/msg/OccupancyGrid` for each layer, `tf2_msgs/msg/TFMessage` and
-//! `nav_msgs/msg/Odometry`. A sensor's points -> `sensor_msgs/msg/PointCloud2`.
+//! A map -> ROS 2 messages, CDR: `nav_msgs/msg/OccupancyGrid` for each layer, `visualization_msgs/msg/MarkerArray` and
+//! `geometry_msgs/msg/PoseArray` of safe points, `tf2_msgs/msg/TFMessage` and `nav_msgs/msg/Odometry`. A sensor's
+//! points -> `sensor_msgs/msg/PointCloud2`.
 
 use clearway_proto::map::Layer;
 use clearway_ros::OccupancyGrid;
 use clearway_ros::cdr::Header;
+use clearway_ros::markers::{Lines, marker_array_to_cdr};
 use clearway_ros::point_cloud2::{Datatype, Field, PointCloud2};
-use clearway_ros::pose::{Odometry, StampedTransform, tf_message_to_cdr};
+use clearway_ros::pose::{Odometry, StampedTransform, pose_array_to_cdr, tf_message_to_cdr};
 use nalgebra::Isometry3;
 
 use super::frame::{MAP_FRAME, base_frame, map_from_ego};
 use super::raster::Raster;
+use super::safe_paths;
 use clearway_client::MapView;
 
 /// A layer as an occupancy grid in the ego frame; a grid along the world's axes keeps these axes, in its origin.
@@ -23,6 +26,25 @@ pub fn occupancy_grid(map: &MapView, layer: &Layer, raster: &Raster) -> Vec<u8> 
         data: raster.occupancies(layer),
     }
     .to_cdr()
+}
+
+/// Safe points of a layer as lines of the links and of circles with the radii; they disappear when the map is stale.
+pub fn safe_path_markers(map: &MapView, layer: &Layer) -> Vec<u8> {
+    let header = map.header();
+    let lines = |name, points, rgba, width_m| Lines { name, width_m, rgba, points };
+    let markers = [
+        lines("links", safe_paths::links(&layer.points), safe_paths::LINK_RGBA, safe_paths::LINK_M),
+        lines("radii", safe_paths::circles(&layer.points), safe_paths::CIRCLE_RGBA, safe_paths::CIRCLE_M),
+    ];
+    let valid_ns = header.valid_until_ns.saturating_sub(header.capture_end_ns).max(0);
+    let frame = base_frame(map.vehicle());
+    marker_array_to_cdr(&Header { stamp_ns: header.capture_end_ns, frame_id: &frame }, valid_ns, &markers)
+}
+
+/// Safe points of a layer as poses, each along its link.
+pub fn safe_point_poses(map: &MapView, layer: &Layer) -> Vec<u8> {
+    let header = Header { stamp_ns: map.header().capture_end_ns, frame_id: &base_frame(map.vehicle()) };
+    pose_array_to_cdr(&header, &safe_paths::poses(&layer.points))
 }
 
 /// Pose of the ego frame in `map` as a tf message; `None` if no pose is known.

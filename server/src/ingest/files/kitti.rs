@@ -1,4 +1,5 @@
-//! Scan files of other programs -> readings: KITTI `.bin` and `.pcd`, read by [`clearway_mapping::scan_file`].
+//! Scan files of other programs -> readings: KITTI `.bin`, nuScenes `.pcd.bin` and `.pcd`, read by
+//! [`clearway_mapping::scan_file`].
 //!
 //! These files have no stamps. The scans get the stamps of a 10 Hz sensor from a fixed time on ([`EPOCH_NS`]), so that
 //! the same files always yield the same maps.
@@ -6,7 +7,7 @@
 use std::path::{Path, PathBuf};
 
 use clearway_mapping::event::Body;
-use clearway_mapping::scan_file::{ScanFileError, read_bin, read_pcd};
+use clearway_mapping::scan_file::{self, ScanFileError, ScanFormat};
 
 use crate::ingest::queue::Reading;
 
@@ -32,7 +33,7 @@ pub enum ScanError {
         /// The file.
         file: PathBuf,
         /// The fault.
-        source: ScanFileError,
+        source: Box<ScanFileError>,
     },
 }
 
@@ -41,14 +42,19 @@ pub enum ScanError {
 /// # Errors
 /// [`ScanError::Read`] if the file cannot be read, [`ScanError::Scan`] if it has no valid scan.
 pub fn read(file: &Path, index: u64) -> Result<Reading, ScanError> {
+    read_with_format(file, index).map(|(_, reading)| reading)
+}
+
+/// Reads one scan, with the format of its file; its stamp is that of [`read`].
+///
+/// # Errors
+/// [`ScanError::Read`] if the file cannot be read, [`ScanError::Scan`] if it has no valid scan.
+pub fn read_with_format(file: &Path, index: u64) -> Result<(ScanFormat, Reading), ScanError> {
     let bytes = std::fs::read(file).map_err(|source| ScanError::Read { file: file.to_owned(), source })?;
-    let scan = match file.extension().and_then(|extension| extension.to_str()) {
-        Some("pcd") => read_pcd(&bytes),
-        _ => read_bin(&bytes),
-    };
-    let mut scan = scan.map_err(|source| ScanError::Scan { file: file.to_owned(), source })?;
+    let scan = scan_file::read(&file.to_string_lossy(), &bytes);
+    let (format, mut scan) = scan.map_err(|source| ScanError::Scan { file: file.to_owned(), source: source.into() })?;
     scan.stamp_ns = EPOCH_NS + i64::try_from(index).unwrap_or(i64::MAX / PERIOD_NS) * PERIOD_NS;
-    Ok(Reading { arrival_ns: scan.stamp_ns, source: 0, body: Body::Scan(scan) })
+    Ok((format, Reading { arrival_ns: scan.stamp_ns, source: 0, body: Body::Scan(scan) }))
 }
 
 #[cfg(test)]
@@ -66,7 +72,9 @@ mod tests {
     fn scans_without_stamps_are_a_tenth_of_a_second_apart() {
         let bytes: Vec<u8> = [1.0f32, 2.0, 3.0, 0.5].iter().flat_map(|v| v.to_le_bytes()).collect();
         let (_folder, file) = written("0.bin", &bytes);
-        let Reading { arrival_ns, body: Body::Scan(scan), .. } = read(&file, 3).unwrap() else { panic!("no scan") };
+        let (format, reading) = read_with_format(&file, 3).unwrap();
+        let Reading { arrival_ns, body: Body::Scan(scan), .. } = reading else { panic!("no scan") };
+        assert_eq!(format, ScanFormat::Kitti);
         assert_eq!(arrival_ns, EPOCH_NS + 300_000_000);
         assert_eq!((scan.x, scan.z, scan.intensity), (vec![1.0], vec![3.0], vec![0.5]));
     }

@@ -4,6 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::Path;
 
+use crate::counted::counted;
 use crate::ingest::queue::Reading;
 use crate::ingest::ros::choice::{AvailableTopics, ChoiceError};
 use crate::ingest::ros::decoder::TopicDecoder;
@@ -95,7 +96,8 @@ impl Source {
     pub fn notes(&self) -> Vec<String> {
         let ignored = self.ignored.iter().map(|topic| format!("{topic} is not used"));
         let refused = self.refused_topics.iter();
-        let refused = refused.map(|(topic, (n, first))| format!("{topic}: {n} messages refused, the first: {first}"));
+        let refused = refused
+            .map(|(topic, (n, first))| format!("{topic}: {} refused, the first: {first}", counted(*n, "message")));
         self.notes.iter().cloned().chain(ignored).chain(refused).collect()
     }
 

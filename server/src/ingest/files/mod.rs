@@ -1,24 +1,27 @@
 //! Files and folders, in the given order -> readings.
 //!
-//! The first bytes of a file give its kind, or else its name does: pcap, pcapng, MCAP, KITTI `.bin`, `.pcd`. A folder
+//! The first bytes of a file give its kind, or else its name does: pcap, pcapng, MCAP, KITTI `.bin`, nuScenes
+//! `.pcd.bin`, `.pcd`. A folder
 //! stands for its files in alphabetical order.
 //!
 //! | file | in -> out |
 //! |---|---|
 //! | [`capture`] | pcap, pcapng -> readings |
 //! | [`mcap`] | recording or ROS 2 bag -> readings |
-//! | [`kitti`] | one scan, `.bin` or `.pcd` -> reading |
+//! | [`kitti`] | one scan, `.bin`, `.pcd.bin` or `.pcd` -> reading |
 
 pub mod capture;
 pub mod kitti;
 pub mod mcap;
 
 use std::collections::{BTreeSet, VecDeque};
-use std::io::Read;
+use std::io::{Error, ErrorKind, Read};
 use std::path::{Path, PathBuf};
 
 use clearway_mapping::event::Body;
+use clearway_mapping::scan_file::ScanFormat;
 
+use crate::file_advice::advised;
 use crate::ingest::queue::Reading;
 use crate::ingest::ros::decoder::TopicDecoder;
 use capture::CaptureError;
@@ -32,7 +35,7 @@ pub enum Kind {
     Capture,
     /// MCAP.
     Mcap,
-    /// One scan: KITTI `.bin` or `.pcd`.
+    /// One scan: KITTI `.bin`, nuScenes `.pcd.bin` or `.pcd`.
     Scan,
 }
 
@@ -48,7 +51,7 @@ pub enum FilesError {
         source: std::io::Error,
     },
     /// The kind of a file is unknown.
-    #[error("{}: not pcap, pcapng, MCAP, KITTI .bin or .pcd", file.display())]
+    #[error("{}: not pcap, pcapng, MCAP, KITTI .bin, nuScenes .pcd.bin or .pcd", file.display())]
     Kind {
         /// The file or folder.
         file: PathBuf,
@@ -100,6 +103,8 @@ pub struct Readings {
     refused: RefusedMessages,
     open: Option<Open>,
     scans: u64,
+    /// Format of the newest scan file.
+    scan_format: Option<ScanFormat>,
     bytes_before: u64,
     /// Stamp of the newest reading, and the sensors that may have an unfinished revolution.
     pending_ends: (i64, BTreeSet<u16>),
@@ -135,6 +140,7 @@ impl Readings {
             refused: RefusedMessages::new(),
             open: None,
             scans: 0,
+            scan_format: None,
             bytes_before: 0,
             pending_ends: Default::default(),
             truncated: Vec::new(),
@@ -161,6 +167,11 @@ impl Readings {
                 Some(Open::Capture(_, source)) => source.bytes_read(),
                 Some(Open::Mcap(_, source)) => source.recording().bytes_read(),
             }
+    }
+
+    /// Format of the newest scan file; `None` before the first.
+    pub fn scan_format(&self) -> Option<ScanFormat> {
+        self.scan_format
     }
 
     /// The truncated files so far.
@@ -207,7 +218,8 @@ impl Readings {
                     self.open = Some(Open::Mcap(file, Box::new(source)));
                 }
                 Kind::Scan => {
-                    let reading = kitti::read(&file, self.scans)?;
+                    let (format, reading) = kitti::read_with_format(&file, self.scans)?;
+                    self.scan_format = Some(format);
                     self.scans += 1;
                     self.bytes_before += file.metadata().map_or(0, |metadata| metadata.len());
                     self.note_unfinished(&reading, false);
@@ -272,13 +284,13 @@ impl Iterator for Readings {
 /// Finds the kind of a file.
 ///
 /// # Errors
-/// [`FilesError::Open`] if the file cannot be read, [`FilesError::Sqlite`] if it is a ROS 2 bag in sqlite3,
+/// [`FilesError::Open`] if the file cannot be read or is empty, [`FilesError::Sqlite`] if it is a ROS 2 bag in sqlite3,
 /// [`FilesError::Kind`] if its kind is unknown.
 pub fn kind(file: &Path) -> Result<Kind, FilesError> {
     let mut magic = Vec::new();
     std::fs::File::open(file)
         .and_then(|open| open.take(8).read_to_end(&mut magic))
-        .map_err(|source| FilesError::Open { file: file.to_owned(), source })?;
+        .map_err(|source| FilesError::Open { file: file.to_owned(), source: advised(file, source) })?;
     match &magic[..] {
         // pcap in both byte orders, with micro- and nanoseconds; pcapng's section header.
         [0xd4, 0xc3, 0xb2, 0xa1, ..] | [0xa1, 0xb2, 0xc3, 0xd4, ..] => return Ok(Kind::Capture),
@@ -289,7 +301,12 @@ pub fn kind(file: &Path) -> Result<Kind, FilesError> {
         _ => {}
     }
     // Without known first bytes the name decides; the reader of that kind then reports the fault.
-    kind_by_name(file).ok_or_else(|| FilesError::Kind { file: file.to_owned() })
+    let by_name = kind_by_name(file);
+    if magic.is_empty() && by_name != Some(Kind::Scan) {
+        let source = Error::new(ErrorKind::UnexpectedEof, "the file is empty");
+        return Err(FilesError::Open { file: file.to_owned(), source });
+    }
+    by_name.ok_or_else(|| FilesError::Kind { file: file.to_owned() })
 }
 
 fn kind_by_name(file: &Path) -> Option<Kind> {
@@ -302,7 +319,7 @@ fn kind_by_name(file: &Path) -> Option<Kind> {
 }
 
 fn files_of_folder(folder: &Path) -> Result<Vec<(PathBuf, Kind)>, FilesError> {
-    let open = |source| FilesError::Open { file: folder.to_owned(), source };
+    let open = |source| FilesError::Open { file: folder.to_owned(), source: advised(folder, source) };
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(open)? {
         let file = entry.map_err(open)?.path();

@@ -166,7 +166,16 @@ impl AvailableTopics {
             let ego_from_sensor = ego_from_sensor.filter(|pose| HEIGHTS_M.contains(&pose.translation.z));
             SensorTopic { topic: (*topic).clone(), frame_id, ego_from_sensor }
         };
-        let sensors: Vec<SensorTopic> = sensors.iter().map(sensor_topic).collect();
+        let is_requested = requested.iter().any(|topic| kind(topic).is_sensor());
+        let mut sensors: Vec<SensorTopic> = sensors.iter().map(sensor_topic).collect();
+        if !is_requested && sensors.iter().all(|sensor| sensor.ego_from_sensor.is_none()) {
+            // A replay can use one sensor that is not placed: the one that shows most, whichever sent first.
+            let shown = |sensor: &SensorTopic| {
+                let found = &self.topics[&sensor.topic];
+                (found.kind == Kind::VelodyneScan, found.points)
+            };
+            sensors.sort_by_key(|sensor| std::cmp::Reverse(shown(sensor)));
+        }
         let notes = self.describe(&sensors, pose.as_ref(), ego_frame);
         Ok(TopicChoice { sensors, pose, ego_frame: ego_frame.to_owned(), notes, latched: self.latched.clone() })
     }

@@ -47,7 +47,7 @@ pub struct Skipped {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CaptureError {
     /// The file is neither pcap nor pcapng.
-    #[error("not a capture: it starts with {start:02x?}; pcap or pcapng is allowed")]
+    #[error("not a capture: it {}; pcap or pcapng is allowed", describe(start))]
     Format {
         /// At most the first four bytes of the file.
         start: Vec<u8>,
@@ -74,6 +74,11 @@ pub enum CaptureError {
         /// Message of the operating system.
         what: String,
     },
+}
+
+/// How a file starts.
+fn describe(start: &[u8]) -> String {
+    if start.is_empty() { "is empty".into() } else { format!("starts with {start:02x?}") }
 }
 
 /// Reader of a capture: an iterator over its [`Datagram`]s that ends after the first error.

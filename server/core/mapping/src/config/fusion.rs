@@ -8,7 +8,9 @@ use crate::config::check::{ConfigValueError, check};
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FusionConfig {
-    /// Name of the sensor whose scans make the maps; if it is empty, the first sensor.
+    /// Name of the sensor whose scans make the maps. If it is empty, the sensor is chosen when all sensors have
+    /// completed a scan, or `deadline_ms` after the first scan: one with known elevations, upright, that sees the most
+    /// directions with the most lasers; of equal sensors the first.
     pub reference_sensor: String,
     /// Greatest time between a sensor's newest scan and the map's stamp, ms; an older scan contributes nothing. A
     /// sensor that completes no scan for so long makes no maps until it is back. More than the longest scan of any

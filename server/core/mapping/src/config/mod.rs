@@ -12,6 +12,9 @@
 //! | `fusion` | `[vehicle.fusion]` |
 //! | `body` | `[vehicle.body]` |
 //! | `motion` | `[vehicle.maps.motion]` |
+//! | [`crate::memory`] | `[vehicle.maps.memory]` |
+//! | [`crate::ground`] | `[vehicle.maps.ground]` |
+//! | [`crate::reach`] | `[vehicle.maps.reach]` |
 //! | [`crate::layer`] | `[vehicle.maps]`, and one table for each layer, in the layer's folder |
 //! | `check` | checks of single values, and their error |
 //!
@@ -32,10 +35,13 @@ pub use motion::MotionConfig;
 pub use sensor::{BLIND_MAX, Extrinsics, RINGS_MAX, SensorConfig};
 pub use vehicle::{SENSORS_MAX, VehicleConfig};
 
-pub use crate::layer::drivability::config::{DrivabilityConfig, Passage, Seed};
+pub use crate::ground::config::{GroundConfig, Variant as GroundVariant};
+pub use crate::layer::drivability::config::{DrivabilityConfig, DrivabilityVariant, Passage, PlaneTest, Seed};
 pub use crate::layer::height_difference::config::HeightDifferenceConfig;
-pub use crate::layer::occupancy::config::OccupancyConfig;
+pub use crate::layer::occupancy::config::{Hits, OccupancyConfig, OccupancyVariant};
 pub use crate::layer::registry::MapsConfig;
 pub use crate::layer::safe_path::config::SafePathConfig;
 pub use crate::layer::speed::config::{Bonus, SpeedConfig};
 pub use crate::layer::terrain::config::{TerrainConfig, Variant};
+pub use crate::memory::config::MemoryConfig;
+pub use crate::reach::config::ReachConfig;

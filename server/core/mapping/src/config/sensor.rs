@@ -48,11 +48,15 @@ pub struct SensorConfig {
     /// the host's clock: then a capture is played live, or the receiver has miscounted the weeks.
     #[serde(default = "default_gps_late_days_max")]
     pub gps_late_days_max: f64,
-    /// Elevation of each laser, degrees; for a sensor that sends scans and has no [`Model`]. If it is empty too, the
-    /// elevations are measured from the rings of the first scan; if that has no rings, radial maps whose rows this
-    /// sensor defines are unknown.
+    /// Elevation of each laser, degrees; for a sensor that sends scans. They come before those of the model. Without
+    /// either, the elevations are measured from the rings of the first scan; if that has no rings, from the order and
+    /// the elevations of its points; if these show no lasers, radial maps whose rows this sensor defines are unknown.
     #[serde(default)]
     pub elevations_deg: Vec<f32>,
+    /// Standard deviation of the sensor's range noise, metres; the roughness of the ground is measured without it.
+    /// `None` selects the value of the model's manual; for scans without a model 0.02, the value of an HDL-64E.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub range_noise_m: Option<f32>,
     /// Position and orientation of the sensor on the vehicle.
     pub extrinsics: Extrinsics,
 }
@@ -133,6 +137,7 @@ impl SensorConfig {
             blind_deg: Vec::new(),
             gps_late_days_max: default_gps_late_days_max(),
             elevations_deg: Vec::new(),
+            range_noise_m: None,
             extrinsics,
         }
     }
@@ -182,6 +187,9 @@ impl SensorConfig {
         }
         for &elevation in &self.elevations_deg {
             check(f64::from(elevation), -90.0..=90.0, || format!("{at}.elevations_deg"), "-90 to 90")?;
+        }
+        if let Some(noise_m) = self.range_noise_m {
+            check(f64::from(noise_m), 0.0..=1.0, || format!("{at}.range_noise_m"), "0 to 1")?;
         }
         let extrinsics = &self.extrinsics;
         for (key, value) in [("x_m", extrinsics.x_m), ("y_m", extrinsics.y_m)] {

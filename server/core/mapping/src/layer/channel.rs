@@ -8,7 +8,7 @@
 pub struct Channel {
     /// `class`, `unit_height`, `segment`, `difference`, …
     pub name: &'static str,
-    /// Unit of `raw * scale`, for example `m`; `""` for a class or an id.
+    /// Unit of `raw * scale`, for example `m`; `id` for an id, `""` for a class and for a value without a unit.
     pub unit: &'static str,
     /// Factor from a raw value to a value in `unit`.
     pub scale: f32,

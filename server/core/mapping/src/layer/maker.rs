@@ -5,9 +5,12 @@
 
 use nalgebra::Isometry3;
 
+use crate::ground::Ground;
 use crate::layer::channel::Channel;
 use crate::layer::class::ClassInfo;
 use crate::layer::grid::Geometry;
+use crate::memory::MemoryState;
+use crate::reach::Reach;
 use crate::road::StoredRoad;
 use crate::sensor::sweep::Sweep;
 
@@ -59,7 +62,7 @@ pub struct SafePoint {
 }
 
 /// What a layer may use beside the points of the map.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Default)]
 pub struct Context<'a> {
     /// The layers of the same map that were made before this one, in the map's order.
     pub earlier: &'a [Layer],
@@ -69,10 +72,47 @@ pub struct Context<'a> {
     pub earliest_ns: i64,
     /// Ego frame in the world frame at `stamp_ns`; `None` if no pose is near enough.
     pub map_from_ego: Option<Isometry3<f64>>,
+    /// Local ground of the sweep; `None` if heights are taken over the plane under the vehicle.
+    pub ground: Option<&'a Ground>,
+    /// What the vehicle can reach; `None` if layers do not consider it.
+    pub reach: Option<&'a Reach>,
+    /// What the map got from memory; `None` without a memory.
+    pub memory: Option<MemoryState>,
     /// Newest road to paint.
     pub road: Option<&'a StoredRoad>,
     /// Newest route.
     pub route: Option<&'a StoredRoad>,
+}
+
+impl<'a> Context<'a> {
+    /// Height of each point of the map's sweep over the ground, metres; NaN for a point that may be ground where no
+    /// ground is known. Such a point proves nothing.
+    pub fn heights_m(&self, sweep: &'a Sweep) -> &'a [f32] {
+        self.ground.map_or(&sweep.z, Ground::heights_m)
+    }
+
+    /// Azimuth of each point of the map's sweep, in columns of two degrees; `None` if they were not computed.
+    pub fn azimuths(&self) -> Option<&'a [f32]> {
+        self.ground.map(Ground::azimuths)
+    }
+
+    /// Height of the ground at a position, ego frame, metres.
+    #[inline(always)]
+    pub fn ground_m(&self, x: f32, y: f32) -> f32 {
+        self.ground.map_or(0.0, |ground| ground.height_m(x, y))
+    }
+
+    /// True if the vehicle can get to a position.
+    #[inline(always)]
+    pub fn is_reached(&self, x: f32, y: f32) -> bool {
+        self.reach.is_none_or(|reach| reach.is_reached(x, y))
+    }
+
+    /// True if an obstacle stands at a position, or a step of the ground ends there.
+    #[inline(always)]
+    pub fn is_closed(&self, x: f32, y: f32) -> bool {
+        self.reach.is_some_and(|reach| reach.is_closed(x, y))
+    }
 }
 
 /// The rays of one sensor's scan, for layers that collect evidence between two maps.
@@ -84,8 +124,12 @@ pub struct Rays<'a> {
     pub stamp_ns: i64,
     /// The returns, ego frame.
     pub returns: &'a Sweep,
+    /// Height of each return over the ground, metres; NaN for a return that may be ground where no ground is known.
+    pub heights_m: &'a [f32],
     /// Position of the sensor, ego frame, metres.
     pub origin_m: [f32; 3],
+    /// Height of the sensor over the ground under it, metres.
+    pub origin_height_m: f32,
     /// Directions (unit vectors, ego frame) of rays without a return; empty if the sensor does not report them.
     pub no_returns: &'a [[f32; 3]],
     /// Ego frame in the world frame at `stamp_ns`; `None` if no pose is near enough.
@@ -94,10 +138,12 @@ pub struct Rays<'a> {
     pub speed_mps: Option<f64>,
 }
 
-/// Optional data of a sensor's scan. The pipeline computes it only if an active layer uses it.
+/// Optional data of a sensor's scan and of a map. The pipeline computes it only if an active layer uses it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ScanExtras {
-    /// Range deviations of the reference sensor's distance series ([`Sweep::deviation_m`]).
+    /// The local ground and what the vehicle can reach ([`Context::ground`], [`Context::reach`]).
+    pub ground: bool,
+    /// Range deviations of the distance series of all sensors ([`Sweep::deviation`]).
     pub deviations: bool,
     /// Directions of the rays without a return ([`Rays::no_returns`]).
     pub no_returns: bool,
@@ -115,7 +161,7 @@ pub trait LayerMaker: Send {
 
     /// The optional data of a scan this layer uses.
     fn uses(&self) -> ScanExtras {
-        ScanExtras::default()
+        ScanExtras { ground: true, ..ScanExtras::default() }
     }
 
     /// Adds the evidence of one sensor's scan. The pipeline calls it for each scan when the scan ends, in the order of

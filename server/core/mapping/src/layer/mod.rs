@@ -7,6 +7,7 @@
 //! | `channel` | one value a cell, typed |
 //! | `grid` | where the cells lie |
 //! | [`radial_grid`] | r-θ grid: position -> cell |
+//! | [`roughness`] | deviations of the points -> roughness by cell, for `terrain` and `speed` |
 //! | `registry` | the list of the six; which of them are active |
 //! | [`drivability`] | UT Austin thesis, section IV |
 //! | [`height_difference`] | UT Austin thesis, section V: the baseline |
@@ -28,6 +29,7 @@ mod maker;
 pub mod occupancy;
 pub mod radial_grid;
 pub(crate) mod registry;
+pub mod roughness;
 pub mod safe_path;
 pub mod speed;
 pub mod terrain;

@@ -136,20 +136,35 @@ impl RadialGrid {
 
     /// Calls `visit(first_point, cells)` for each chunk of the sweep. A point beyond the last row falls into the row
     /// after it: its cell is `self.cells()` or more, and less than `self.cells() + self.columns()`. If the sweep's
-    /// rings are not known, there is no call.
-    pub fn for_each_chunk(&self, sweep: &Sweep, mut visit: impl FnMut(usize, &[u32])) {
+    /// rings are not known, there is no call. `azimuths` are those of the points in columns of two degrees, if they are
+    /// known.
+    pub fn for_each_chunk(&self, sweep: &Sweep, azimuths: Option<&[f32]>, mut visit: impl FnMut(usize, &[u32])) {
         if sweep.calibration.is_none() {
             return;
         }
         let mut ranges_squared = [0.0f32; CHUNK];
         let mut cells = [0u32; CHUNK];
         let columns = self.columns() as u32;
+        let ratio = f32::from(self.azimuths.columns) / f32::from(AzimuthColumns::TWO_DEGREES);
+        // The product with a power of two is exact, so that the columns are those of the position itself.
+        let azimuths = azimuths.filter(|_| ratio.to_bits() & 0x007f_ffff == 0);
         for (index, (x, y)) in sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).enumerate() {
             let n = x.len();
-            // The first loop is arithmetic alone, so that the compiler vectorises it; the second reads the tables.
-            for (((range_squared, cell), &x), &y) in ranges_squared.iter_mut().zip(&mut cells).zip(x).zip(y) {
+            // The first loops are arithmetic alone, so that the compiler vectorises them; the last reads the tables.
+            for ((range_squared, &x), &y) in ranges_squared.iter_mut().zip(x).zip(y) {
                 *range_squared = self.clamped(x * x + y * y);
-                *cell = self.azimuths.column(x, y);
+            }
+            match azimuths {
+                Some(azimuths) => {
+                    for (cell, azimuth) in cells.iter_mut().zip(&azimuths[index * CHUNK..][..n]) {
+                        *cell = floor_to_whole(azimuth * ratio);
+                    }
+                }
+                None => {
+                    for ((cell, &x), &y) in cells.iter_mut().zip(x).zip(y) {
+                        *cell = self.azimuths.column(x, y);
+                    }
+                }
             }
             for (cell, range_squared) in cells[..n].iter_mut().zip(&ranges_squared) {
                 *cell += self.row(*range_squared) as u32 * columns;
@@ -200,6 +215,9 @@ pub(crate) struct AzimuthColumns {
 }
 
 impl AzimuthColumns {
+    /// Number of columns of two degrees, in which the local ground is estimated.
+    pub(crate) const TWO_DEGREES: u16 = 180;
+
     /// This many columns in a full circle.
     pub(crate) fn new(columns: u16) -> Self {
         let quarters = [0, 1, 2, 3].map(|quadrant| quadrant * u32::from(columns));
@@ -215,6 +233,21 @@ impl AzimuthColumns {
     /// The column that contains a position; 0 for the origin.
     #[inline(always)]
     pub(crate) fn column(&self, x: f32, y: f32) -> u32 {
+        let (first, within) = self.quadrant(x, y);
+        first + floor_to_whole(within)
+    }
+
+    /// The azimuth of a position in columns, with a fraction; 0 for the origin. It is less than the number of columns.
+    #[inline(always)]
+    pub(crate) fn position(&self, x: f32, y: f32) -> f32 {
+        let (first, within) = self.quadrant(x, y);
+        // The cast of a signed number is one instruction.
+        first as i32 as f32 + within
+    }
+
+    /// The column in which a position's quadrant begins, and the columns from there to the position.
+    #[inline(always)]
+    fn quadrant(&self, x: f32, y: f32) -> (u32, f32) {
         // AzimuthColumns are half-open: [0, 90°) has x > 0, y >= 0, and so on around.
         let second = x <= 0.0 && y > 0.0;
         let third = x < 0.0 && y <= 0.0;
@@ -228,7 +261,7 @@ impl AzimuthColumns {
         let within = quarter_angle(across, along) * self.columns_a_rad;
         // NaN fails the comparison.
         let within = if within < self.most { within } else { self.most };
-        first + floor_to_whole(within + offset)
+        (first, within + offset)
     }
 }
 

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::check::{ConfigValueError, check};
 use crate::config::motion::MotionConfig;
+use crate::ground::config::GroundConfig;
 use crate::layer::drivability::Drivability;
 use crate::layer::drivability::config::DrivabilityConfig;
 use crate::layer::height_difference::HeightDifference;
@@ -20,6 +21,8 @@ use crate::layer::speed::Speed;
 use crate::layer::speed::config::SpeedConfig;
 use crate::layer::terrain::Terrain;
 use crate::layer::terrain::config::TerrainConfig;
+use crate::memory::config::MemoryConfig;
+use crate::reach::config::ReachConfig;
 use crate::sensor::sweep::Sweep;
 
 /// Creates the maker of one layer; `None` if the configuration disables the layer.
@@ -37,12 +40,25 @@ macro_rules! layers {
             pub valid_ms: u32,
             /// How the points of a scan are moved to its end.
             pub motion: MotionConfig,
+            /// Ground that is carried from map to map.
+            pub memory: MemoryConfig,
+            /// What heights over the ground are taken over.
+            pub ground: GroundConfig,
+            /// The vehicle's outline, and what it can reach.
+            pub reach: ReachConfig,
             $($(#[$doc])* pub $name: $Config,)+
         }
 
         impl Default for MapsConfig {
             fn default() -> Self {
-                Self { valid_ms: 300, motion: MotionConfig::default(), $($name: <$Config>::default(),)+ }
+                Self {
+                    valid_ms: 300,
+                    motion: MotionConfig::default(),
+                    memory: MemoryConfig::default(),
+                    ground: GroundConfig::default(),
+                    reach: ReachConfig::default(),
+                    $($name: <$Config>::default(),)+
+                }
             }
         }
 
@@ -61,6 +77,8 @@ macro_rules! layers {
             pub fn validate(&self) -> Result<(), ConfigValueError> {
                 check(f64::from(self.valid_ms), 1.0..=60_000.0, || "vehicle.maps.valid_ms".into(), "1 to 60000")?;
                 self.motion.validate("vehicle.maps.motion")?;
+                self.memory.validate("vehicle.maps.memory")?;
+                self.reach.validate("vehicle.maps.reach")?;
                 $(self.$name.validate(concat!("vehicle.maps.", stringify!($name)))?;)+
                 Ok(())
             }
@@ -142,6 +160,7 @@ impl Layers {
     pub fn uses(&self) -> ScanExtras {
         let active = self.0.iter().filter_map(|layer| layer.active.as_ref());
         active.map(|active| active.maker.uses()).fold(ScanExtras::default(), |all, uses| ScanExtras {
+            ground: all.ground || uses.ground,
             deviations: all.deviations || uses.deviations,
             no_returns: all.no_returns || uses.no_returns,
         })

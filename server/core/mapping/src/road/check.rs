@@ -11,6 +11,8 @@ const COORDINATE_M_MAX: f64 = 1e7;
 const WIDTH_M_MAX: f64 = 1000.0;
 /// Least distance between neighbouring points, metres. Ours: nearer points give no direction.
 const SPACING_M_MIN: f64 = 0.01;
+/// Greatest speed limit, m/s. Ours: the greatest speed of an ego pose.
+const SPEED_LIMIT_MPS_MAX: f64 = 1000.0;
 /// Greatest number of bins of a histogram of orientations. Ours: a tenth of a degree each.
 const BINS_MAX: usize = 3600;
 
@@ -67,6 +69,22 @@ pub enum RoadError {
         /// Sum of the votes.
         votes: f64,
     },
+    /// The number of speed limits is neither 0 nor that of the points.
+    #[error("road with {points} points and {limits} speed limits: none or one a point are allowed")]
+    SpeedLimits {
+        /// Number of points.
+        points: usize,
+        /// Number of speed limits.
+        limits: usize,
+    },
+    /// A speed limit is not finite, negative or too large.
+    #[error("road point {index} with a speed limit of {mps} m/s: 0 to 1000 m/s is allowed")]
+    SpeedLimit {
+        /// Index of the point.
+        index: usize,
+        /// The speed limit, m/s.
+        mps: f64,
+    },
 }
 
 impl RoadError {
@@ -79,6 +97,8 @@ impl RoadError {
             Self::Coinciding { .. } => "road_coinciding",
             Self::Width { .. } => "road_width",
             Self::Orientations { .. } => "road_orientations",
+            Self::SpeedLimits { .. } => "road_speed_limits",
+            Self::SpeedLimit { .. } => "road_speed_limit",
         }
     }
 }
@@ -120,5 +140,14 @@ pub fn check(road: &Road) -> Result<(), RoadError> {
             return Err(RoadError::Orientations { bins, votes });
         }
     }
-    Ok(())
+    let limits = road.speed_limits_mps.len();
+    if limits != 0 && limits != points {
+        return Err(RoadError::SpeedLimits { points, limits });
+    }
+    // NaN is in no range.
+    let is_valid = |mps: &f64| (0.0..=SPEED_LIMIT_MPS_MAX).contains(mps);
+    match road.speed_limits_mps.iter().position(|mps| !is_valid(mps)) {
+        Some(index) => Err(RoadError::SpeedLimit { index, mps: road.speed_limits_mps[index] }),
+        None => Ok(()),
+    }
 }

@@ -57,7 +57,7 @@ impl Rddf {
         self.rows.first().map(|row| LocalFrame::new(row.latitude_deg, row.longitude_deg))
     }
 
-    /// The centre line with the widths of the corridor, in a local frame.
+    /// The centre line with the widths of the corridor and the speed limits, in a local frame.
     pub fn road(&self, frame: &LocalFrame, purpose: RoadPurpose, stamp_ns: i64) -> Road {
         Road {
             stamp_ns,
@@ -66,6 +66,7 @@ impl Rddf {
             points: self.rows.iter().map(|row| frame.position_m(row.latitude_deg, row.longitude_deg)).collect(),
             widths_m: self.rows.iter().map(|row| 2.0 * row.lateral_offset_m).collect(),
             orientations: Vec::new(),
+            speed_limits_mps: self.rows.iter().map(|row| row.speed_mps).collect(),
         }
     }
 }

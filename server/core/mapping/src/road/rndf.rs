@@ -96,6 +96,7 @@ impl Lane {
                 .collect(),
             widths_m: vec![width_m; self.waypoints_deg.len()],
             orientations: Vec::new(),
+            speed_limits_mps: Vec::new(),
         })
     }
 }

@@ -8,7 +8,7 @@
 use clearway_lidar::revolution::Revolution;
 
 /// Number of ranges on each side of the smoothed one: Neuhaus 2009, section 2.5, takes the mean of nine.
-const REACH: usize = 4;
+pub(crate) const REACH: usize = 4;
 /// Number of lasers that fire together: a block of a data packet has 32 returns.
 const BANK: usize = 32;
 

@@ -8,16 +8,18 @@
 //! | [`self_filter`] | return -> the reason to remove it, if it does not belong to the surroundings |
 //! | [`sweep`] | revolution or scan + mount -> [`sweep::Sweep`] in the ego frame |
 //! | [`distance_series`] | revolution -> how far each range deviates from its laser's neighbouring ranges |
+//! | [`ring_series`] | scan with rings -> the same for each of its points |
 //! | `no_returns` | revolution -> directions of the rays without a return |
-//! | `rings` | scan with rings -> elevations of the lasers |
-//! | [`mount`] | first revolutions -> height, pitch and roll of a sensor whose mount is not measured |
+//! | `rings` | scan -> elevations of the lasers, rings of the points |
+//! | [`mount`] | revolutions -> height, pitch and roll of a sensor; scans -> the ground's deviation from its mount |
 
 pub mod distance_series;
 pub mod motion;
 pub mod mount;
 mod no_returns;
 pub(crate) mod pipeline;
-mod rings;
+pub mod ring_series;
+pub(crate) mod rings;
 pub(crate) mod scan;
 pub mod self_filter;
 pub mod sweep;

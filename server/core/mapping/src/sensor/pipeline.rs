@@ -8,7 +8,9 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::{Partial, Revolution};
-use clearway_lidar::{Sensor, SensorStatus};
+use clearway_lidar::{CalibrationSource, Model, Sensor, SensorStatus};
+
+use nalgebra::Vector3;
 
 use crate::config::body::BodyConfig;
 use crate::config::sensor::SensorConfig;
@@ -16,10 +18,12 @@ use crate::error::{EventError, check_newer, check_stamp_range};
 use crate::event::Scan;
 use crate::event_time::EventTime;
 use crate::layer::ScanExtras;
-use crate::map::{Contribution, SensorState};
+use crate::map::{Contribution, ElevationSource, SensorState};
 use crate::sensor::distance_series::DistanceSeries;
 use crate::sensor::motion::{EgoTrajectory, Motion};
+use crate::sensor::mount::check::{MountCheck, MountDeviation};
 use crate::sensor::no_returns::{find_no_returns, rotated};
+use crate::sensor::ring_series::RingSeries;
 use crate::sensor::rings;
 use crate::sensor::scan::SensorScan;
 use crate::sensor::self_filter::{RemovedPoints, SelfFilter};
@@ -29,6 +33,14 @@ use crate::sensor::sweep::Mount;
 /// thousandth is one of length alone, which no layer uses.
 const SQUARED_UNIT: std::ops::RangeInclusive<f32> = 0.998..=1.002;
 
+/// Number of scans from whose points the elevations are estimated. Ours: if the first scans do not show them, the later
+/// ones do not either, and each estimate takes as long as a layer.
+const ESTIMATES_MAX: u64 = 20;
+
+/// Standard deviation of the range noise of a sensor whose model is not known, metres. Ours: that of an HDL-64E or
+/// HDL-32E, the least of the family, so that no roughness is lost.
+const RANGE_NOISE_M: f32 = 0.02;
+
 /// One sensor of the vehicle.
 pub(crate) struct SensorPipeline {
     name: String,
@@ -37,19 +49,37 @@ pub(crate) struct SensorPipeline {
     filter: Option<SelfFilter>,
     /// Elevations of the lasers behind scan events; `None` until they are known.
     scan_calibration: Option<Arc<Calibration>>,
+    /// Source of these elevations.
+    scan_elevations: ElevationSource,
+    /// Source of the elevations of the newest scan; `None` before the first.
+    elevations: Option<ElevationSource>,
     /// Stamp and event time of the newest accepted scan event, ns.
     newest_scan: Option<(i64, i64)>,
+    mount_check: MountCheck,
+    /// End of the newest scan, ns; `None` before the first.
+    newest_end_ns: Option<i64>,
     /// Number of accepted scan events.
     scans: u64,
     /// Number of returns in all accepted scan events.
     scan_returns: u64,
+    /// Configured standard deviation of the range noise, metres; `None` selects that of the model.
+    range_noise_m: Option<f32>,
+    /// Configured model.
+    model: Option<Model>,
     /// `None` unless a layer needs the deviations.
-    series: Option<DistanceSeries>,
+    series: Option<Series>,
     finds_no_returns: bool,
     /// How the vehicle moved through the newest scan.
     trajectory: EgoTrajectory,
     /// Number of packets that [`SensorPipeline::drain_unfit`] has returned.
     unfit_drained: u64,
+}
+
+/// The distance series of a sensor's revolutions and scan events.
+#[derive(Default)]
+struct Series {
+    of_lasers: DistanceSeries,
+    of_rings: RingSeries,
 }
 
 impl SensorPipeline {
@@ -60,20 +90,24 @@ impl SensorPipeline {
         body: Option<&BodyConfig>,
         extras: ScanExtras,
     ) -> Self {
-        let configured = (!config.elevations_deg.is_empty())
-            .then(|| rings::table(config.elevations_deg.iter().map(|degrees| f64::from(*degrees).to_radians())));
-        let factory = || config.model.map(Calibration::factory);
+        let (scan_calibration, scan_elevations) = scan_calibration(config, calibration.as_ref());
         let mount = Mount { ego_from_sensor: config.extrinsics.ego_from_sensor(), range_m_min: config.range_m_min };
         Self {
             name: config.name.clone(),
-            scan_calibration: calibration.clone().or_else(factory).or(configured).map(Arc::new),
+            scan_calibration: scan_calibration.map(Arc::new),
+            scan_elevations,
+            elevations: None,
             decoder: Sensor::new(config.lidar(calibration)),
             filter: SelfFilter::new(body, mount.origin_m(), &config.blind_deg),
             mount,
             newest_scan: None,
+            mount_check: MountCheck::default(),
+            newest_end_ns: None,
             scans: 0,
             scan_returns: 0,
-            series: extras.deviations.then(DistanceSeries::default),
+            range_noise_m: config.range_noise_m,
+            model: config.model,
+            series: extras.deviations.then(Series::default),
             finds_no_returns: extras.no_returns,
             trajectory: EgoTrajectory::default(),
             unfit_drained: 0,
@@ -85,10 +119,20 @@ impl SensorPipeline {
         self.mount.origin_m()
     }
 
+    /// Angle between the sensor's z axis and the vertical, radians.
+    pub fn tilt_rad(&self) -> f32 {
+        (self.mount.ego_from_sensor.rotation * Vector3::z()).angle(&Vector3::z()) as f32
+    }
+
+    /// Number of lasers whose elevations are configured; 0 if they are found from the data.
+    pub fn lasers_configured(&self) -> usize {
+        self.scan_calibration.as_ref().map_or(0, |table| table.lasers.len())
+    }
+
     /// Sets what the layers need of the sensor's scans from now on; `scan` is its newest one.
     pub fn set_extras(&mut self, extras: ScanExtras, scan: &mut SensorScan) {
         if extras.deviations != self.series.is_some() {
-            self.series = extras.deviations.then(DistanceSeries::default);
+            self.series = extras.deviations.then(Series::default);
         }
         self.finds_no_returns = extras.no_returns;
         if !extras.no_returns {
@@ -102,6 +146,16 @@ impl SensorPipeline {
         status.revolutions += self.scans;
         status.returns += self.scan_returns;
         status
+    }
+
+    /// Source of the elevations of the newest scan; `None` before the first.
+    pub fn elevations(&self) -> Option<ElevationSource> {
+        self.elevations
+    }
+
+    /// How far the ground deviates from the configured mount; `None` before the first scan with ground.
+    pub fn mount_deviation(&self) -> Option<MountDeviation> {
+        self.mount_check.deviation()
     }
 
     /// The newest revolution; `None` before the first.
@@ -152,12 +206,15 @@ impl SensorPipeline {
         motion.follow_revolution(revolution, &mut self.trajectory);
         let removed = scan.sweep.set_moving_revolution(revolution, mount, &self.trajectory.end_from_ego, filter);
         if let Some(series) = &mut self.series {
-            scan.sweep.set_deviations(revolution, mount, series, filter);
+            let noise_m = self.range_noise_m.unwrap_or(revolution.model.spec().range_noise_m);
+            scan.sweep.set_deviations(revolution, mount, &mut series.of_lasers, noise_m, filter);
         }
         if self.finds_no_returns {
             find_no_returns(revolution, mount, &self.trajectory, filter, &mut scan.no_returns);
         }
-        scan.state = revolution_state(&self.name, revolution, scan.sweep.returns);
+        let elevations = revolution_elevations(self.decoder.status().calibration, revolution.model);
+        self.elevations = Some(elevations);
+        scan.state = revolution_state(&self.name, revolution, elevations, scan.sweep.returns);
         (scan.start_ns, scan.end_ns, scan.is_revolution) = (revolution.start_ns, revolution.end_ns, true);
         self.complete(scan, motion, now);
         Some(removed)
@@ -186,19 +243,23 @@ impl SensorPipeline {
             check_newer(scan.stamp_ns, Some(newest_ns))?;
         }
         self.newest_scan = Some((scan.stamp_ns, now.event_ns));
-        if self.scan_calibration.is_none() {
-            self.scan_calibration = rings::measured(scan).map(Arc::new);
-        }
+        self.find_elevations(scan);
         motion.follow_scan(scan, &mut self.trajectory);
         let (calibration, end_from_ego) = (self.scan_calibration.as_ref(), &self.trajectory.end_from_ego);
         let removed = newest.sweep.set_moving_scan(scan, calibration, &self.mount, end_from_ego, self.filter.as_ref());
+        if let Some(series) = &mut self.series {
+            let of_model = || self.model.map_or(RANGE_NOISE_M, |model| model.spec().range_noise_m);
+            let noise_m = self.range_noise_m.unwrap_or_else(of_model);
+            let deviations_m = series.of_rings.deviations(scan);
+            newest.sweep.set_scan_deviations(scan, &self.mount, deviations_m, noise_m, self.filter.as_ref());
+        }
         newest.no_returns.clear();
         if self.finds_no_returns {
             let to_ego = |ray: &[f32; 3]| rotated(&self.mount.ego_from_sensor, *ray);
             let is_blind = |ray: &[f32; 3]| self.filter.as_ref().is_some_and(|filter| filter.is_blind(*ray));
             newest.no_returns.extend(scan.no_returns.iter().filter(|ray| !is_blind(ray)).map(to_ego));
         }
-        newest.state = scan_state(&self.name, scan, newest.sweep.returns, now);
+        newest.state = scan_state(&self.name, scan, self.scan_elevations, newest.sweep.returns, now);
         let first_ns = scan.offset_ns.iter().min().copied().unwrap_or(0);
         newest.start_ns = scan.stamp_ns.saturating_add(i64::from(first_ns));
         (newest.end_ns, newest.is_revolution) = (scan.stamp_ns, false);
@@ -207,7 +268,22 @@ impl SensorPipeline {
         Ok(removed)
     }
 
-    fn complete(&self, scan: &mut SensorScan, motion: &Motion, now: EventTime) {
+    /// Finds the elevations behind scan events, unless they are known: from the scan's rings, else from its points.
+    fn find_elevations(&mut self, scan: &Scan) {
+        let is_tried = self.scans < ESTIMATES_MAX;
+        if self.scan_calibration.is_none() {
+            let by_rings = rings::measured(scan).map(|found| (found, ElevationSource::Rings));
+            let by_points = || rings::estimated(scan).map(|found| (found, ElevationSource::Estimated));
+            if let Some((found, source)) = by_rings.or_else(|| if is_tried { by_points() } else { None }) {
+                (self.scan_calibration, self.scan_elevations) = (Some(Arc::new(found)), source);
+            }
+        }
+        self.elevations = Some(self.scan_elevations);
+    }
+
+    fn complete(&mut self, scan: &mut SensorScan, motion: &Motion, now: EventTime) {
+        self.mount_check.push(&scan.sweep, self.mount.origin_m());
+        scan.period_ns = self.newest_end_ns.replace(scan.end_ns).map(|before_ns| scan.end_ns.saturating_sub(before_ns));
         scan.completed_at = now;
         scan.compensation = self.trajectory.compensation;
         scan.speed_mps = self.trajectory.speed_mps;
@@ -216,8 +292,35 @@ impl SensorPipeline {
     }
 }
 
+/// The configured elevations behind scan events, and their source: the table, else `elevations_deg`, else the model.
+fn scan_calibration(
+    config: &SensorConfig,
+    calibration: Option<&Calibration>,
+) -> (Option<Calibration>, ElevationSource) {
+    if let Some(table) = calibration {
+        (Some(table.clone()), ElevationSource::Table)
+    } else if !config.elevations_deg.is_empty() {
+        let elevations_rad = config.elevations_deg.iter().map(|degrees| f64::from(*degrees).to_radians());
+        (Some(rings::table(elevations_rad)), ElevationSource::Configured)
+    } else if let Some(model) = config.model {
+        (Some(Calibration::factory(model)), ElevationSource::Model)
+    } else {
+        (None, ElevationSource::Unknown)
+    }
+}
+
+/// Source of the elevations of a revolution.
+fn revolution_elevations(source: CalibrationSource, model: Model) -> ElevationSource {
+    match (source, model) {
+        (CalibrationSource::Configured, _) => ElevationSource::Table,
+        (CalibrationSource::StatusBytes, _) => ElevationSource::StatusBytes,
+        (CalibrationSource::Factory, Model::Hdl64eS1 | Model::Hdl64eS2 | Model::Hdl64eS3) => ElevationSource::Nominal,
+        (CalibrationSource::Factory, _) => ElevationSource::Model,
+    }
+}
+
 /// What a map states about the sensor of a revolution.
-fn revolution_state(name: &str, revolution: &Revolution, returns: u32) -> SensorState {
+fn revolution_state(name: &str, revolution: &Revolution, elevations: ElevationSource, returns: u32) -> SensorState {
     SensorState {
         name: name.to_owned(),
         model: revolution.model.as_str().to_owned(),
@@ -233,11 +336,12 @@ fn revolution_state(name: &str, revolution: &Revolution, returns: u32) -> Sensor
         blocked: revolution.blocked.clone(),
         clock: revolution.clock.as_str(),
         clock_offset_ms: revolution.clock_offset_ms,
+        elevations: Some(elevations),
     }
 }
 
 /// What a map states about the sensor of a scan event.
-fn scan_state(name: &str, scan: &Scan, returns: u32, now: EventTime) -> SensorState {
+fn scan_state(name: &str, scan: &Scan, elevations: ElevationSource, returns: u32, now: EventTime) -> SensorState {
     SensorState {
         name: name.to_owned(),
         model: "scan".to_owned(),
@@ -247,6 +351,7 @@ fn scan_state(name: &str, scan: &Scan, returns: u32, now: EventTime) -> SensorSt
         contribution: Contribution::Ok,
         clock: "sender",
         clock_offset_ms: now.arrival_ns.saturating_sub(scan.stamp_ns) / 1_000_000,
+        elevations: Some(elevations),
         ..SensorState::default()
     }
 }

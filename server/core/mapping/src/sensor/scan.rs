@@ -19,12 +19,16 @@ pub(crate) struct SensorScan {
     pub start_ns: i64,
     /// Stamp of the last firing or point, ns since the Unix epoch.
     pub end_ns: i64,
+    /// Time from the end of the scan before to the end of this one, ns; `None` for the first.
+    pub period_ns: Option<i64>,
     /// When the event arrived that completed the scan.
     pub completed_at: EventTime,
     /// True if the scan was made from a revolution, false if it came as a scan event.
     pub is_revolution: bool,
     /// Position of the sensor, ego frame, metres.
     pub origin_m: [f32; 3],
+    /// Angle between the sensor's z axis and the vertical, radians.
+    pub tilt_rad: f32,
     /// Points, ego frame at `end_ns`.
     pub sweep: Sweep,
     /// Directions (unit vectors) of the rays without a return, ego frame at `end_ns`; empty unless a layer needs them.
@@ -41,17 +45,25 @@ pub(crate) struct SensorScan {
 
 impl SensorScan {
     /// The scan of a sensor that has completed none yet.
-    pub fn new(name: &str, origin_m: [f32; 3]) -> Self {
-        Self { origin_m, state: SensorState { name: name.to_owned(), ..SensorState::default() }, ..Self::default() }
+    pub fn new(name: &str, origin_m: [f32; 3], tilt_rad: f32) -> Self {
+        Self {
+            origin_m,
+            tilt_rad,
+            state: SensorState { name: name.to_owned(), ..SensorState::default() },
+            ..Self::default()
+        }
     }
 
-    /// The scan as the input of layers that gather evidence; `sensor` is the index of the sensor.
+    /// The scan as the input of layers that gather evidence; `sensor` is the index of the sensor. Heights are those
+    /// over the plane under the vehicle.
     pub fn rays(&self, sensor: u16) -> Rays<'_> {
         Rays {
             sensor,
             stamp_ns: self.end_ns,
             returns: &self.sweep,
+            heights_m: &self.sweep.z,
             origin_m: self.origin_m,
+            origin_height_m: self.origin_m[2],
             no_returns: &self.no_returns,
             map_from_ego: self.map_from_ego,
             speed_mps: self.speed_mps,

@@ -45,9 +45,12 @@ pub struct Sweep {
     pub y: Vec<f32>,
     /// Height over the ground under the vehicle, metres.
     pub z: Vec<f32>,
-    /// Deviation of each range from the mean of its laser's neighbouring ranges, metres; NaN if it is unknown. Empty
-    /// until [`Sweep::set_deviations`] fills it.
-    pub deviation_m: Vec<f32>,
+    /// Deviation of each range from the mean of its laser's neighbouring ranges, over the range itself: metres per
+    /// metre of distance from the sensor that measured the point. NaN if it is unknown. Empty until
+    /// [`Sweep::set_deviations`] or [`Sweep::set_scan_deviations`] fills it.
+    pub deviation: Vec<f32>,
+    /// Standard deviation of the sensor's range noise over the range, as long as `deviation`; NaN where that is.
+    pub noise: Vec<f32>,
     /// Number of returns before the vehicle's own were removed.
     pub returns: u32,
     /// Elevations of the lasers that define the rows of radial maps; `None` if they are unknown. Then all cells of
@@ -123,19 +126,21 @@ impl Sweep {
         removed
     }
 
-    /// Fills in the deviation of each point that [`Sweep::set_moving_revolution`] kept of the same revolution with the
-    /// same filter. The deviations of a second echo are NaN: it has no series.
+    /// Fills in deviation and noise of each point that [`Sweep::set_moving_revolution`] kept of the same revolution
+    /// with the same filter. `noise_m` is the standard deviation of the sensor's range noise, metres. The deviations of
+    /// a second echo are NaN: it has no series.
     pub fn set_deviations(
         &mut self,
         revolution: &Revolution,
         mount: &Mount,
         series: &mut DistanceSeries,
+        noise_m: f32,
         filter: Option<&SelfFilter>,
     ) {
         let first = series.deviations(revolution);
         match filter {
-            None => self.fill_deviations(revolution, mount, first, |_| None),
-            Some(filter) => self.fill_deviations(revolution, mount, first, check(mount, filter)),
+            None => self.fill_deviations(revolution, mount, first, noise_m, |_| None),
+            Some(filter) => self.fill_deviations(revolution, mount, first, noise_m, check(mount, filter)),
         }
     }
 
@@ -144,20 +149,48 @@ impl Sweep {
         revolution: &Revolution,
         mount: &Mount,
         first: &[f32],
+        noise_m: f32,
         check: impl Fn([f32; 3]) -> Option<FilterReason>,
     ) {
         // Without a branch, as in `fill`.
-        self.deviation_m.resize(revolution.echoes.iter().map(|echo| echo.range_m.len()).sum::<usize>() + 1, f32::NAN);
+        let slots = revolution.echoes.iter().map(|echo| echo.range_m.len()).sum::<usize>() + 1;
+        self.deviation.resize(slots, f32::NAN);
+        self.noise.resize(slots, f32::NAN);
         let mut kept = 0;
         for (number, echo) in revolution.echoes.iter().enumerate() {
+            let unknown = if number == 0 { 1.0 } else { f32::NAN };
             let slots = echo.range_m.iter().zip(first).zip(&echo.x).zip(&echo.y).zip(&echo.z);
-            for ((((&range, &deviation), &x), &y), &z) in slots {
-                self.deviation_m[kept] = if number == 0 { deviation } else { f32::NAN };
+            for ((((&range, &deviation_m), &x), &y), &z) in slots {
+                let per_m = unknown / range;
+                (self.deviation[kept], self.noise[kept]) = (deviation_m * per_m, noise_m * per_m);
                 let is_far = range > 0.0 && range >= mount.range_m_min;
                 kept += usize::from(is_far && check([x, y, z]).is_none());
             }
         }
-        self.deviation_m.truncate(kept);
+        self.deviation.truncate(kept);
+        self.noise.truncate(kept);
+    }
+
+    /// Fills in deviation and noise of each point that [`Sweep::set_moving_scan`] kept of the same scan with the same
+    /// filter. `deviations_m` has one entry for each point of the scan, metres ([`crate::sensor::ring_series`]).
+    pub fn set_scan_deviations(
+        &mut self,
+        scan: &Scan,
+        mount: &Mount,
+        deviations_m: &[f32],
+        noise_m: f32,
+        filter: Option<&SelfFilter>,
+    ) {
+        let check = filter.map(|filter| check(mount, filter));
+        let points = scan.x.iter().zip(&scan.y).zip(&scan.z).zip(deviations_m);
+        for (((&x, &y), &z), &deviation_m) in points {
+            let is_removed = check.as_ref().is_some_and(|check| check([x, y, z]).is_some());
+            if Self::keeps(mount, [x, y, z]) && !is_removed {
+                let range_m = squared_range(x, y, z).sqrt();
+                self.deviation.push(deviation_m / range_m);
+                self.noise.push(if deviation_m.is_nan() { f32::NAN } else { noise_m / range_m });
+            }
+        }
     }
 
     /// Replaces the points by those of a scan of a vehicle at rest, without a self filter. Returns the number of points
@@ -214,15 +247,24 @@ impl Sweep {
         for (axis, from) in [(&mut self.x, &other.x), (&mut self.y, &other.y), (&mut self.z, &other.z)] {
             axis.clone_from(from);
         }
-        self.deviation_m.clone_from(&other.deviation_m);
+        self.deviation.clone_from(&other.deviation);
+        self.noise.clone_from(&other.noise);
         self.calibration.clone_from(&other.calibration);
         (self.returns, self.mount_height_m) = (other.returns, other.mount_height_m);
     }
 
-    /// Adds another sensor's points after transforming them; their deviations are NaN. If this sweep has no rows of
-    /// radial maps, those of the other sweep are used.
+    /// Adds another sensor's points after transforming them, with their deviations. If this sweep has no rows of radial
+    /// maps, those of the other sweep are used.
     pub(crate) fn append(&mut self, other: &Sweep, self_from_other: &Isometry3<f64>) {
         let transform = Transform::new(self_from_other);
+        for (own, others) in [(&mut self.deviation, &other.deviation), (&mut self.noise, &other.noise)] {
+            // A sensor without deviations has an empty list.
+            if !own.is_empty() || !others.is_empty() {
+                own.resize(self.x.len(), f32::NAN);
+                own.extend_from_slice(others);
+                own.resize(self.x.len() + other.x.len(), f32::NAN);
+            }
+        }
         for ((&x, &y), &z) in other.x.iter().zip(&other.y).zip(&other.z) {
             let [x, y, z] = transform.apply(x, y, z);
             self.x.push(x);
@@ -230,12 +272,19 @@ impl Sweep {
             self.z.push(z);
         }
         self.returns += other.returns;
-        if !self.deviation_m.is_empty() {
-            self.deviation_m.resize(self.x.len(), f32::NAN);
-        }
         if self.calibration.is_none() && other.calibration.is_some() {
             self.copy_rows(other);
         }
+    }
+
+    /// Adds a point that no sensor has measured in this sweep; its deviation is NaN.
+    pub(crate) fn push_remembered(&mut self, [x, y, z]: [f32; 3]) {
+        for list in [&mut self.deviation, &mut self.noise].into_iter().filter(|list| !list.is_empty()) {
+            list.push(f32::NAN);
+        }
+        self.x.push(x);
+        self.y.push(y);
+        self.z.push(z);
     }
 
     /// Copies what defines the rows of radial maps: the elevations and the height of the sensor.
@@ -252,7 +301,8 @@ impl Sweep {
     fn prepare(&mut self, calibration: Option<&Arc<Calibration>>, mount: &Mount) {
         self.calibration = calibration.map(Arc::clone);
         self.mount_height_m = mount.ego_from_sensor.translation.z as f32;
-        self.deviation_m.clear();
+        self.deviation.clear();
+        self.noise.clear();
     }
 
     /// Makes the arrays long enough for `slots` points, and for one more that is written and not kept.

@@ -8,6 +8,7 @@ use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::Extrinsics;
 use clearway_mapping::event::Scan;
+use clearway_mapping::sensor::ring_series::RingSeries;
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 
 use super::{data, kitti};
@@ -77,6 +78,24 @@ pub fn labelled_frame() -> (Sweep, Vec<u32>) {
     let seen = |i: &usize| (scan.x[*i].powi(2) + scan.y[*i].powi(2) + scan.z[*i].powi(2)) >= 4.0;
     let labels: Vec<u32> = (0..labels.len()).filter(seen).map(|i| labels[i]).collect();
     assert_eq!(labels.len(), sweep.x.len());
+    (sweep, labels)
+}
+
+/// The labelled frame with the deviations of its distance series: the points of the file lie ring by ring, the highest
+/// first, each from azimuth 0 counter-clockwise.
+pub fn labelled_frame_with_deviations() -> (Sweep, Vec<u32>) {
+    let mut scan = kitti("kitti/patchwork-plusplus/000000.bin");
+    scan.ring.clear();
+    let mut ring = 63;
+    for index in 0..scan.x.len() {
+        let is_first = index > 0 && scan.y[index - 1] < 0.0 && scan.y[index] >= 0.0 && scan.x[index] > 0.0;
+        ring -= u16::from(is_first);
+        scan.ring.push(ring);
+    }
+    let (mut sweep, labels) = labelled_frame();
+    let mount = Mount { ego_from_sensor: nalgebra::Isometry3::identity(), range_m_min: 2.0 };
+    sweep.set_scan_deviations(&scan, &mount, RingSeries::default().deviations(&scan), 0.02, None);
+    assert_eq!((ring, sweep.deviation.len()), (0, sweep.x.len()));
     (sweep, labels)
 }
 

@@ -9,8 +9,11 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
+use clearway_mapping::config::ReachConfig;
+use clearway_mapping::ground::Ground;
 use clearway_mapping::layer::radial_grid::RadialGrid;
-use clearway_mapping::layer::{Cells, Geometry, Layer, Rays};
+use clearway_mapping::layer::{Cells, Context, Geometry, Layer, Rays};
+use clearway_mapping::reach::Reach;
 use clearway_mapping::sensor::sweep::Sweep;
 
 /// Height of the sensor in all synthetic worlds, metres.
@@ -188,13 +191,41 @@ pub fn datagrams(path: &str) -> Vec<clearway_lidar::capture::Datagram> {
     clearway_lidar::capture::Capture::new(file).unwrap().map_while(Result::ok).collect()
 }
 
-/// The rays of one scan as `integrate()` gets them, from a sensor at the sweep's mount.
+/// The ground of a sweep, and what the vehicle can reach on it.
+pub struct Shared {
+    ground: Ground,
+    reach: Reach,
+}
+
+/// Estimates the ground of a sweep, and what the vehicle can reach on it.
+pub fn shared(sweep: &Sweep) -> Shared {
+    shared_with(sweep, &ReachConfig::default())
+}
+
+/// The same for another vehicle.
+pub fn shared_with(sweep: &Sweep, config: &ReachConfig) -> Shared {
+    let (mut ground, mut reach) = (Ground::new(config.outline()), Reach::new(config));
+    ground.estimate(sweep);
+    reach.update(sweep, &ground);
+    Shared { ground, reach }
+}
+
+impl Shared {
+    /// The context of a map with this ground.
+    pub fn context(&self) -> Context<'_> {
+        Context { ground: Some(&self.ground), reach: Some(&self.reach), ..Context::default() }
+    }
+}
+
+/// The rays of one scan on level ground as `integrate()` gets them, from a sensor at the sweep's mount.
 pub fn rays(sweep: &Sweep) -> Rays<'_> {
     Rays {
         sensor: 0,
         stamp_ns: 0,
         returns: sweep,
+        heights_m: &sweep.z,
         origin_m: [0.0, 0.0, sweep.mount_height_m],
+        origin_height_m: sweep.mount_height_m,
         no_returns: &[],
         map_from_ego: None,
         speed_mps: None,

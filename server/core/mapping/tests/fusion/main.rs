@@ -4,6 +4,8 @@
 #[path = "../common/mod.rs"]
 mod common;
 mod declared;
+mod equal_stamps;
+mod reference;
 mod rotating;
 mod scans;
 

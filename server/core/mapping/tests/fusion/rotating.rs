@@ -38,7 +38,7 @@ fn the_self_filter_removes_returns_and_counts_them_by_sensor() {
     let (boxed, ledger) = sweep(&alone);
     assert_eq!((none.own_body, none.through_body), (0, 0));
     assert!(ledger.through_body > 1000, "rays to the ground in front of the bonnet cross the roof: {ledger:?}");
-    assert!(boxed.x.len() < open.x.len() && boxed.deviation_m.len() == boxed.x.len());
+    assert!(boxed.x.len() < open.x.len() && boxed.deviation.len() == boxed.x.len());
     assert_eq!(boxed.returns, open.returns);
 }
 
@@ -78,6 +78,8 @@ fn two_rotating_sensors_have_a_decoder_and_a_ledger_each() {
     let mut config = config();
     let low = SensorConfig { model: Some(Model::Hdl32e), ..SensorConfig::new("low", at(0.0, 0.0, 1.5, 0.0)) };
     config.sensors = vec![config.sensors[0].clone(), low, config.sensors[1].clone()];
+    // The lower sensor has more lasers, and would be chosen.
+    config.fusion.reference_sensor = "top".into();
     let reference = velodyne(Model::Vlp16, 1.9, 430);
     let low = velodyne(Model::Hdl32e, 1.5, 430).into_iter().map(|event| Event { source: 1, ..event });
     let mut events: Vec<Event> = reference.iter().cloned().chain(low).collect();

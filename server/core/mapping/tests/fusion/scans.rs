@@ -86,7 +86,16 @@ fn rows_come_from_the_configured_elevations_or_from_the_rings_of_the_scan() {
     for (a, b) in common::benches(&configured.layers[0]).iter().zip(common::benches(&measured.layers[0])) {
         assert!((a - b).abs() < 1e-2, "{a} {b}");
     }
-    let without_rows = map(Vec::new(), Scan { ring: Vec::new(), ..ground(false) });
+    let by_order = map(Vec::new(), Scan { ring: Vec::new(), ..ground(true) });
+    // The maps that need rings for their roughness differ.
+    assert_eq!(by_order.layers[..2], measured.layers[..2], "points that are stored ring by ring show the rings");
+    // Points in no order, at elevations without clusters.
+    let order = |i: usize| i * 1979 % (720 * 8);
+    let pick = |axis: &[f32]| (0..axis.len()).map(|i| axis[order(i)]).collect::<Vec<f32>>();
+    let ringed = ground(false);
+    let z = pick(&ringed.z).iter().zip(0..).map(|(z, i)| z + (i * 13 % 97) as f32 * 0.005).collect();
+    let (x, y) = (pick(&ringed.x), pick(&ringed.y));
+    let without_rows = map(Vec::new(), Scan { x, y, z, ring: Vec::new(), ..ringed });
     for layer in &without_rows.layers[..2] {
         assert!(common::classes(layer).iter().all(|class| *class == 0), "{}", layer.name);
     }

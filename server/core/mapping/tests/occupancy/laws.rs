@@ -1,6 +1,6 @@
 //! Properties of the layer `occupancy` for any rays: each cell is written, and the order of the points does not matter.
 
-use clearway_mapping::config::OccupancyConfig;
+use clearway_mapping::config::{Hits, OccupancyConfig, OccupancyVariant};
 use clearway_mapping::layer::occupancy::Occupancy;
 use clearway_mapping::layer::occupancy::class::OccupancyClass;
 use clearway_mapping::layer::{LayerMaker, Rays};
@@ -44,20 +44,24 @@ proptest! {
     fn each_cell_is_written_and_the_order_of_points_does_not_matter(
         scans in prop::collection::vec(any_scan(), 1..4), cell_m in 0.2f32..1.0, range_m_max in 5f32..200.0,
         no_return_m in 0f32..100.0, hits_slow in 1u8..40, hits_fast in 1u8..3, seed in any::<u64>(),
+        is_paper in any::<bool>(), is_counted in any::<bool>(),
     ) {
-        let config =
-            OccupancyConfig { cell_m, range_m_max, no_return_m, hits_slow, hits_fast, ..OccupancyConfig::default() };
+        let variant = if is_paper { OccupancyVariant::Paper } else { OccupancyVariant::Polar };
+        let hits = if is_counted { Hits::Counted } else { Hits::Reduced };
+        let config = OccupancyConfig {
+            variant, cell_m, range_m_max, no_return_m, hits_slow, hits_fast, hits, ..OccupancyConfig::default()
+        };
         let [mut map, mut again] = [Occupancy::new(&config), Occupancy::new(&config)];
         for (points, no_returns, origin_m, sensor, map_from_ego) in &scans {
             let mut sweep = Sweep::default();
             points.iter().for_each(|point| add(&mut sweep, *point));
             let other = shuffled(&sweep, seed);
-            let rays = |returns| Rays {
-                sensor: *sensor, stamp_ns: 0, returns, origin_m: *origin_m, no_returns, map_from_ego: *map_from_ego,
-                speed_mps: Some(3.0),
-            };
-            map.integrate(&rays(&sweep));
-            again.integrate(&rays(&other));
+            let [rays, rays_again] = [&sweep, &other].map(|returns| Rays {
+                sensor: *sensor, stamp_ns: 0, returns, heights_m: &returns.z, origin_m: *origin_m,
+                origin_height_m: origin_m[2], no_returns, map_from_ego: *map_from_ego, speed_mps: Some(3.0),
+            });
+            map.integrate(&rays);
+            again.integrate(&rays_again);
             let layer = made(&mut map, *map_from_ego);
             let (rows, columns) = size(&layer);
             let hits = values(&layer, "hits");

@@ -12,6 +12,10 @@ use crate::config::check::{ConfigValueError, check_columns, check_each};
 pub struct DrivabilityConfig {
     /// True if the layer is made.
     pub enabled: bool,
+    /// Variant of the algorithm. `extended` is ours, because `paper` starts at a cell that has no point on most real
+    /// scans, and loses slopes (BENCHMARKS.md compares the two). `paper` replaces `offset_m`, `seed`, `bridge_rows`,
+    /// `close_gaps`, `step_m_max`, `grade_max`, `plane_test` and `passage` by the thesis' values.
+    pub variant: DrivabilityVariant,
     /// Largest horizontal range of a point, metres; the outermost row ends here. 60: thesis, section IV.1.
     pub range_m_max: f32,
     /// Largest height of a point over the ground, metres; the vehicle passes under higher ones. 2.5: thesis, section
@@ -45,6 +49,9 @@ pub struct DrivabilityConfig {
     /// Largest distance between a segment's plane and the boundary cells of its neighbour, metres (criterion 2). 0.25,
     /// one unit: thesis, section IV.5.
     pub plane_error_m_max: f32,
+    /// The boundary cells that are compared with a plane (criterion 2). `each_side` is ours, because one bad cell of a
+    /// long boundary must not close all of it; not tuned. The thesis has `whole_boundary`.
+    pub plane_test: PlaneTest,
     /// Least width of a contiguous boundary that the vehicle can drive across, metres (criterion 3). 3: thesis, section
     /// IV.5.
     pub passage_m_min: f32,
@@ -57,6 +64,7 @@ impl Default for DrivabilityConfig {
     fn default() -> Self {
         Self {
             enabled: true,
+            variant: DrivabilityVariant::Extended,
             range_m_max: 60.0,
             overhang_m: 2.5,
             unit_height_m: 0.25,
@@ -69,10 +77,32 @@ impl Default for DrivabilityConfig {
             step_m_max: 0.15,
             grade_max: 0.2,
             plane_error_m_max: 0.25,
+            plane_test: PlaneTest::EachSide,
             passage_m_min: 3.0,
             passage: Passage::ToDrivableGround,
         }
     }
+}
+
+/// Which steps the layer `drivability` takes from the thesis.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DrivabilityVariant {
+    /// The values of the keys as they are.
+    Extended,
+    /// The UT Austin thesis, section IV, in every step.
+    Paper,
+}
+
+/// The boundary cells that are compared with a plane (criterion 2).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PlaneTest {
+    /// Each side shared by two cells by itself: the plane of the larger segment at the cell of the other one.
+    EachSide,
+    /// The planes of both segments at all boundary cells of the other one (UT Austin thesis, section IV.5). One cell
+    /// that fails separates the two segments.
+    WholeBoundary,
 }
 
 /// Cells where segments start to grow.
@@ -97,6 +127,25 @@ pub enum Passage {
 }
 
 impl DrivabilityConfig {
+    /// The parameters with the values of the variant.
+    pub(crate) fn of_variant(&self) -> Self {
+        match self.variant {
+            DrivabilityVariant::Extended => self.clone(),
+            DrivabilityVariant::Paper => Self {
+                offset_m: 0.0,
+                seed: Seed::FirstCell,
+                bridge_rows: 0,
+                close_gaps: false,
+                // Segments grow by one unit, and heights one unit apart differ by less than two.
+                step_m_max: 2.0 * self.unit_height_m,
+                grade_max: 0.0,
+                plane_test: PlaneTest::WholeBoundary,
+                passage: Passage::BetweenSegments,
+                ..self.clone()
+            },
+        }
+    }
+
     /// Checks the values of the table `at`.
     ///
     /// # Errors

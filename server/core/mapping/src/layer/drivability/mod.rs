@@ -28,7 +28,7 @@ use crate::layer::radial_grid::RadialGrid;
 use crate::sensor::sweep::Sweep;
 
 use class::{DrivabilityClass, SEGMENT, UNIT_HEIGHT_UNKNOWN};
-use config::DrivabilityConfig;
+use config::{DrivabilityConfig, DrivabilityVariant};
 use heights::Heights;
 use planes::Planes;
 use search::Search;
@@ -40,7 +40,10 @@ pub struct Drivability {
     grid: RadialGrid,
     heights: Heights,
     segments: Segments,
+    /// Planes of the heights over the ground, for the criteria.
     planes: Planes,
+    /// Planes in the ego frame, for readers.
+    ego_planes: Planes,
     search: Search,
 }
 
@@ -48,16 +51,17 @@ impl Drivability {
     /// A maker with validated parameters.
     pub fn new(config: &DrivabilityConfig) -> Self {
         Self {
-            config: config.clone(),
+            config: config.of_variant(),
             grid: RadialGrid::default(),
             heights: Heights::default(),
             segments: Segments::default(),
             planes: Planes::default(),
+            ego_planes: Planes::default(),
             search: Search::default(),
         }
     }
 
-    fn write(&self, layer: &mut Layer) {
+    fn write(&self, context: &Context<'_>, layer: &mut Layer) {
         self.grid.write_geometry(&mut layer.geometry);
         layer.clear_lists();
         let mut unit_height = self.unit_height().reuse(&mut layer.channels);
@@ -65,21 +69,35 @@ impl Drivability {
         let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
         unit_height.extend_from_slice(self.heights.units());
         segment.extend_from_slice(self.segments.of_cell());
-        let (unreachable, drivable) = (self.segments.unreachable(), self.search.drivable());
-        class.extend(segment.iter().map(|&segment| {
-            let class = match segment {
-                _ if segment == SEGMENT.unknown => DrivabilityClass::Unknown,
-                _ if segment == unreachable => DrivabilityClass::Obstacle,
-                _ if drivable[usize::from(segment)] => DrivabilityClass::Drivable,
-                _ => DrivabilityClass::NotDrivable,
-            };
-            class.value()
-        }));
-        layer.planes.extend_from_slice(self.planes.of_segment());
+        class.extend(segment.iter().enumerate().map(|(cell, &segment)| self.class(cell, segment, context).value()));
+        layer.planes.extend_from_slice(self.ego_planes.of_segment());
         layer.metrics.push(("drivable_share", drivable_share(layer.legend, &class)));
+        if let Some(memory) = context.memory {
+            layer.metrics.push(("remembered_points", memory.points as f64));
+            layer.metrics.push(("memory_drops", memory.drops as f64));
+        }
         TypedChannel::CLASS.store(&mut layer.channels, class);
         self.unit_height().store(&mut layer.channels, unit_height);
         SEGMENT.store(&mut layer.channels, segment);
+    }
+
+    /// Class of a cell: an obstacle if something stands in it; drivable if the criteria and the vehicle's width allow
+    /// to get there.
+    fn class(&self, cell: usize, segment: u16, context: &Context<'_>) -> DrivabilityClass {
+        if segment == SEGMENT.unknown {
+            return DrivabilityClass::Unknown;
+        }
+        let [x, y, height_m] = self.heights.points()[cell];
+        let is_obstacle = match context.ground {
+            Some(_) => height_m > self.config.unit_height_m,
+            None => segment == self.segments.unreachable(),
+        };
+        let is_joined = segment != self.segments.unreachable() && self.search.drivable()[usize::from(segment)];
+        match () {
+            () if is_obstacle => DrivabilityClass::Obstacle,
+            () if is_joined && context.is_reached(x, y) => DrivabilityClass::Drivable,
+            () => DrivabilityClass::NotDrivable,
+        }
     }
 
     /// Channel for the height of a cell's highest point, in units of the configured height.
@@ -95,12 +113,17 @@ impl LayerMaker for Drivability {
         Layer::new("drivability", Geometry::radial(self.config.columns), DrivabilityClass::LEGEND, channels)
     }
 
-    fn make(&mut self, sweep: &Sweep, _: &Context<'_>, layer: &mut Layer) {
+    fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
+        // The thesis takes heights over the plane under the vehicle, and has no width of a vehicle.
+        let plane = Context { ground: None, reach: None, ..*context };
+        let context = if self.config.variant == DrivabilityVariant::Paper { &plane } else { context };
         self.grid.update_rows(sweep, self.config.range_m_max, self.config.columns);
-        self.heights.compute(&self.grid, sweep, &self.config);
+        self.heights.compute(&self.grid, sweep, context, &self.config);
         self.segments.grow(&self.grid, &self.heights, &self.config);
-        self.planes.fit(&self.heights, &self.segments);
+        let points = self.heights.points().iter().copied();
+        self.planes.fit(points.clone(), &self.segments);
+        self.ego_planes.fit(points.zip(self.heights.z_m()).map(|([x, y, _], &z)| [x, y, z]), &self.segments);
         self.search.run(&self.grid, &self.heights, &self.segments, &self.planes, &self.config);
-        self.write(layer);
+        self.write(context, layer);
     }
 }

@@ -1,11 +1,10 @@
 //! Plane fitting (UT Austin thesis, section IV.4): z = ax + by + c through the highest points of each segment's cells.
 //!
-//! In: highest points and segments. Out: a, b, c of each segment, ego frame, metres. The normal equations of the thesis
-//! are solved relative to the segment's centroid: there the sums of x and y are zero, two unknowns remain, and the
-//! distance from the origin costs no precision.
+//! In: highest points and segments. Out: a, b, c of each segment, metres; in the frame of the points. The normal
+//! equations of the thesis are solved relative to the segment's centroid: there the sums of x and y are zero, two
+//! unknowns remain, and the distance from the origin costs no precision.
 
 use super::class::SEGMENT;
-use super::heights::Heights;
 use super::segments::Segments;
 
 /// Least number of cells of a segment with a plane (UT Austin thesis, section IV.4).
@@ -31,17 +30,17 @@ struct Moments {
 }
 
 impl Planes {
-    /// Fits a plane to each segment except the last, unreachable one.
-    pub fn fit(&mut self, heights: &Heights, segments: &Segments) {
+    /// Fits a plane to each segment except the last, unreachable one. `points` are the highest points of all cells.
+    pub fn fit(&mut self, points: impl Iterator<Item = [f32; 3]> + Clone, segments: &Segments) {
         let unreachable = usize::from(segments.unreachable());
         self.moments.clear();
         self.moments.resize(unreachable + 1, Moments::default());
-        let cells = || segments.of_cell().iter().zip(heights.points()).filter(|(s, _)| **s != SEGMENT.unknown);
+        let cells = || segments.of_cell().iter().zip(points.clone()).filter(|(s, _)| **s != SEGMENT.unknown);
         for (segment, point) in cells() {
             let moments = &mut self.moments[usize::from(*segment)];
             moments.cells += 1;
             for (sum, value) in moments.centroid.iter_mut().zip(point) {
-                *sum += f64::from(*value);
+                *sum += f64::from(value);
             }
         }
         for moments in &mut self.moments {
@@ -49,7 +48,7 @@ impl Planes {
             moments.centroid = moments.centroid.map(|sum| sum / cells);
         }
         for (segment, point) in cells() {
-            self.moments[usize::from(*segment)].add(point);
+            self.moments[usize::from(*segment)].add(&point);
         }
         self.of_segment.clear();
         self.of_segment.extend(self.moments[..unreachable].iter().map(Moments::plane));

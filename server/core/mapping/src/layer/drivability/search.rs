@@ -11,15 +11,16 @@
 //!   frame contained an obstacle; with this criterion 1 of 9,865). Therefore the highest points of boundary cells may
 //!   differ by at most `step_m_max`, or by a slope of `grade_max` over the distance between them, which matters where
 //!   rings lie metres apart. A step of two units is the criterion of the thesis.
-//! - Criterion 2: the thesis judges all boundary cells of a pair of segments together. Here each side shared by two
-//!   cells is judged by itself, with the plane of the larger segment; no parameter restores the thesis.
+//! - Criterion 2: the thesis judges all boundary cells of a pair of segments together, with the planes of both
+//!   ([`PlaneTest::WholeBoundary`]). By default each side shared by two cells is judged by itself, with the plane of
+//!   the larger segment.
 
 use std::collections::VecDeque;
 
 use crate::layer::radial_grid::RadialGrid;
 
 use super::class::SEGMENT;
-use super::config::{DrivabilityConfig, Passage};
+use super::config::{DrivabilityConfig, Passage, PlaneTest};
 use super::heights::Heights;
 use super::planes::Planes;
 use super::segments::{Segments, counter_clockwise, is_step, outward};
@@ -90,7 +91,8 @@ impl Search {
                 if a != b
                     && is_step(grid, heights, config, cell, other)
                     && is_level(heights, config, cell, other)
-                    && planes_agree(planes, heights, config, (a, cell), (b, other))
+                    && (config.plane_test == PlaneTest::WholeBoundary
+                        || planes_agree(planes, heights, config, (a, cell), (b, other)))
                 {
                     let (cell, other) = (cell as u32, other as u32);
                     self.sides.push(Side { segment: a, neighbor: b, cell, other });
@@ -99,6 +101,32 @@ impl Search {
             }
         }
         self.sides.sort_unstable();
+        if config.plane_test == PlaneTest::WholeBoundary {
+            self.remove_uneven_boundaries(of_cell, planes, heights, config);
+        }
+    }
+
+    /// Criterion 2 of the thesis: removes all sides of two segments if the plane of one misses a boundary cell of the
+    /// other.
+    fn remove_uneven_boundaries(
+        &mut self,
+        of_cell: &[u16],
+        planes: &Planes,
+        heights: &Heights,
+        config: &DrivabilityConfig,
+    ) {
+        let fits = |side: &Side| {
+            let (cell, other) = (side.cell as usize, side.other as usize);
+            is_near_plane(planes, heights, config, of_cell[other], cell)
+                && is_near_plane(planes, heights, config, of_cell[cell], other)
+        };
+        let mut even = Vec::with_capacity(self.sides.len());
+        for boundary in self.sides.chunk_by(|a, b| (a.segment, a.neighbor) == (b.segment, b.neighbor)) {
+            if boundary.iter().all(fits) {
+                even.extend_from_slice(boundary);
+            }
+        }
+        self.sides = even;
     }
 
     /// Searches breadth first from segment 0 (UT Austin thesis, section IV.5, steps 1 and 2).
@@ -186,6 +214,11 @@ fn planes_agree(
 ) -> bool {
     // The plane of the larger segment is better determined; a plane through a few cells says little beyond them.
     let ((segment, _), (_, cell)) = if planes.cells(a.0) >= planes.cells(b.0) { (a, b) } else { (b, a) };
+    is_near_plane(planes, heights, config, segment, cell)
+}
+
+/// True if the plane of a segment misses the highest point of a cell by little.
+fn is_near_plane(planes: &Planes, heights: &Heights, config: &DrivabilityConfig, segment: u16, cell: usize) -> bool {
     let [x, y, z] = heights.points()[cell].map(f64::from);
     let [pa, pb, pc] = planes.of_segment()[usize::from(segment)];
     (pa * x + pb * y + pc - z).abs() <= f64::from(config.plane_error_m_max)

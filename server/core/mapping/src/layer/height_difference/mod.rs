@@ -10,7 +10,7 @@ pub mod config;
 use crate::layer::channel::TypedChannel;
 use crate::layer::class::drivable_share;
 use crate::layer::grid::Geometry;
-use crate::layer::maker::{Context, Layer, LayerMaker};
+use crate::layer::maker::{Context, Layer, LayerMaker, ScanExtras};
 use crate::layer::radial_grid::RadialGrid;
 use crate::sensor::sweep::Sweep;
 
@@ -39,12 +39,16 @@ impl LayerMaker for HeightDifference {
         Layer::new("height_difference", geometry, HeightDifferenceClass::LEGEND, channels)
     }
 
-    fn make(&mut self, sweep: &Sweep, _: &Context<'_>, layer: &mut Layer) {
+    fn uses(&self) -> ScanExtras {
+        ScanExtras::default()
+    }
+
+    fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         self.grid.update_rows(sweep, self.config.range_m_max, self.config.columns);
         self.span.clear();
         self.span.resize(self.grid.cells() + self.grid.columns(), [f32::NEG_INFINITY, f32::INFINITY]);
         let span = &mut self.span;
-        self.grid.for_each_chunk(sweep, |first, cells| {
+        self.grid.for_each_chunk(sweep, context.azimuths(), |first, cells| {
             for (cell, &z) in cells.iter().zip(&sweep.z[first..]) {
                 let [highest, lowest] = &mut span[*cell as usize];
                 *highest = if z > *highest { z } else { *highest };

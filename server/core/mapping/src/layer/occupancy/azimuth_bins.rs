@@ -10,8 +10,6 @@ use crate::layer::radial_grid::AzimuthColumns;
 pub const BINS: usize = 1440;
 /// Number of bins to either side whose hits also end a traced ray. Ours; not tuned.
 const BESIDE: isize = 2;
-/// Number of bins and of steps of a patch of ground. Ours: a degree and a metre with the default cell.
-const PATCH: [usize; 2] = [4, 4];
 
 /// The azimuth bins around a sensor.
 pub struct AzimuthBins {
@@ -41,17 +39,6 @@ impl AzimuthBins {
         let lines = (0..BINS).map(|bin| [0.5, 0.25, 0.75].map(|within| line(bin, within)));
         let columns = AzimuthColumns::new(BINS as u16);
         Self { columns, lines: lines.collect(), steps: words * 64, words }
-    }
-
-    /// Number of patches of ground around the sensor.
-    pub fn patches(&self) -> usize {
-        BINS / PATCH[0] * self.steps / PATCH[1]
-    }
-
-    /// Index of the patch that contains a step of a bin.
-    #[inline]
-    pub fn patch(&self, bin: usize, step: usize) -> usize {
-        bin / PATCH[0] * (self.steps / PATCH[1]) + step / PATCH[1]
     }
 
     /// Words of a bin's bits.

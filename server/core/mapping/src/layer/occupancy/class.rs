@@ -19,5 +19,5 @@ classes! {
     }
 }
 
-/// Hits of a cell: 255 in an occupied cell, in an unknown one the power of two its hits reach, 0 in any other.
-pub const HITS: TypedChannel<u8> = TypedChannel { name: "hits", unit: "", scale: 1.0, unknown: 0 };
+/// Hits of a cell: 255 in an occupied cell, in others as [`super::config::Hits`] states.
+pub const HITS: TypedChannel<u8> = TypedChannel { name: "hits", unit: "hits", scale: 1.0, unknown: 0 };

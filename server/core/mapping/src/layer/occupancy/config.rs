@@ -10,6 +10,10 @@ use crate::config::check::{ConfigValueError, check_cells, check_each, check_fits
 pub struct OccupancyConfig {
     /// True if the layer is made.
     pub enabled: bool,
+    /// Variant of the algorithm. `polar` is ours, because `paper` traces a line for every return, and so takes ten
+    /// times as long; and because its lines clear the cells under the rays of a sensor on the roof (BENCHMARKS.md
+    /// compares the two).
+    pub variant: OccupancyVariant,
     /// Distance from the vehicle to each edge of the grid, metres. 50: Seo 2014, section 2 (a map of 100 m).
     pub extent_m: f32,
     /// Side of a cell, metres. 0.25: Seo 2014, section 2.
@@ -42,12 +46,36 @@ pub struct OccupancyConfig {
     /// Number of maps for which an occupied cell without new evidence stays occupied. 2 is ours, so that an object
     /// that no sensor sees again leaves the third map; not tuned.
     pub hold_maps: u8,
+    /// What the channel `hits` contains. `reduced` is ours, because it costs fewer bytes (BENCHMARKS.md has the sizes);
+    /// `counted` is the paper's (section 2).
+    pub hits: Hits,
+}
+
+/// How the layer `occupancy` finds what rays pass through and what hides cells.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OccupancyVariant {
+    /// One traced ray for each azimuth; a ray clears a cell only where it is low over the ground.
+    Polar,
+    /// One line for each return from the sensor through the return to the reliable range (Seo 2014, algorithm 1).
+    Paper,
+}
+
+/// The published number of hits of a cell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Hits {
+    /// 255 in an occupied cell, in an unknown one the power of two that its hits reach, 0 in any other.
+    Reduced,
+    /// 255 in an occupied cell, in any other the number of its hits, at most 254 (Seo 2014, section 2).
+    Counted,
 }
 
 impl Default for OccupancyConfig {
     fn default() -> Self {
         Self {
             enabled: true,
+            variant: OccupancyVariant::Polar,
             extent_m: 50.0,
             cell_m: 0.25,
             clearance_m: 0.3,
@@ -61,6 +89,7 @@ impl Default for OccupancyConfig {
             hits_slow: 20,
             hits_fast: 2,
             hold_maps: 2,
+            hits: Hits::Reduced,
         }
     }
 }

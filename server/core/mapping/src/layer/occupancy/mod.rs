@@ -7,25 +7,24 @@
 //! | step | paper | where |
 //! |---|---|---|
 //! | a square that scrolls with the vehicle | section 2 ("ScrollingByteMap") | [`window`] |
-//! | rays -> hits, and -> evidence along rays from the sensor outward | algorithm 1 | [`polar_scan`], [`ray`] |
+//! | rays -> hits, and -> evidence along rays, outward | algorithm 1 | [`lines`]; [`polar_scan`], [`ray`] |
 //! | evidence -> states; hits fade | figure 4 | [`states`] |
 //! | number of hits that make a cell occupied | figure 5 | [`Occupancy::hits_needed`] |
 //!
-//! Where this differs from the paper:
+//! There are two variants ([`OccupancyVariant`]): `paper` traces a line for each return, as published; `polar` differs:
 //! - A ray proves a cell free only if it passes low over it. So a sensor on the roof, whose rays pass over cars, can be
 //!   used like one in the bumper ([`polar_scan`]).
-//! - The paper traces one line for each return. Here the returns of a scan are collected by azimuth, and one ray for
-//!   each azimuth is traced when the map is made. A scan costs its points; a map costs one set of rays for each sensor
-//!   and one pass over the grid.
+//! - The returns of a scan are collected by azimuth, and one ray for each azimuth is traced when the map is made. A
+//!   scan costs its points; a map costs one set of rays for each sensor and one pass over the grid.
+//!
+//! Where both differ from the paper:
 //! - If the vehicle's speed is not known, it is assumed to be fast, so that two hits suffice. Otherwise an obstacle
 //!   would need twenty.
-//! - The channel `hits` has 255 in occupied cells and a power of two in unknown ones, not the number of hits.
+//! - The channel `hits` has 255 in occupied cells and a power of two in unknown ones, unless `hits = "counted"`.
 //!
 //! Hits add up over maps. A single Velodyne at 10 Hz on a standing vehicle reports near cars as occupied at once, and
 //! far ones after some scans. Until then their cells are unknown, or occluded if something hides them as well. Heights
-//! of returns are measured over the plane under the vehicle, or over the ground around them where the ground dips.
-//! Heights of rays that return from the ground are measured over the line from the ground under the sensor to the
-//! return.
+//! are those over the local ground ([`crate::ground`]).
 //!
 //! Without an ego pose the cells of the last map cannot be related to those of this one. The grid then has the
 //! vehicle's axes and contains only evidence since the last map (the metric `world_aligned` is 0).
@@ -34,6 +33,7 @@ mod azimuth_bins;
 mod bits;
 pub mod class;
 pub mod config;
+pub mod lines;
 pub mod polar_scan;
 pub mod ray;
 pub mod states;
@@ -45,7 +45,8 @@ use crate::layer::maker::{Context, Layer, LayerMaker, Rays, ScanExtras};
 use crate::sensor::sweep::Sweep;
 
 use class::{HITS, OccupancyClass};
-use config::OccupancyConfig;
+use config::{OccupancyConfig, OccupancyVariant};
+use lines::Lines;
 use polar_scan::PolarScans;
 use window::Window;
 
@@ -53,9 +54,44 @@ use window::Window;
 pub struct Occupancy {
     config: OccupancyConfig,
     window: Window,
-    scans: PolarScans,
+    scans: Scans,
     /// Forward speed at the newest scan, m/s, if known.
     speed_mps: Option<f64>,
+}
+
+/// The newest scan of each sensor, as its variant keeps it.
+enum Scans {
+    Polar(PolarScans),
+    Paper(Lines),
+}
+
+impl Scans {
+    fn insert(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, window: &mut Window) {
+        match self {
+            Self::Polar(scans) => scans.insert(rays, config, window),
+            Self::Paper(lines) => lines.insert(rays, config, window),
+        }
+    }
+
+    fn clear(&mut self) {
+        match self {
+            Self::Polar(scans) => scans.clear(),
+            Self::Paper(lines) => lines.clear(),
+        }
+    }
+
+    fn write_evidence(
+        &mut self,
+        config: &OccupancyConfig,
+        earliest_ns: i64,
+        window: &Window,
+        of_cell: &mut [u8],
+    ) -> bool {
+        match self {
+            Self::Polar(scans) => scans.write_evidence(config, earliest_ns, window, of_cell),
+            Self::Paper(lines) => lines.write_evidence(earliest_ns, window, of_cell),
+        }
+    }
 }
 
 impl Occupancy {
@@ -67,7 +103,12 @@ impl Occupancy {
         Self {
             config: config.clone(),
             window: Window::new(side, f64::from(config.cell_m)),
-            scans: PolarScans::new(reach_m.min(config.range_m_max), config.cell_m),
+            scans: match config.variant {
+                OccupancyVariant::Polar => {
+                    Scans::Polar(PolarScans::new(reach_m.min(config.range_m_max), config.cell_m))
+                }
+                OccupancyVariant::Paper => Scans::Paper(Lines::default()),
+            },
             speed_mps: None,
         }
     }
@@ -105,7 +146,8 @@ impl Occupancy {
         class.resize(cells, 0);
         hits.resize(cells, 0);
         let any = self.scans.write_evidence(&self.config, earliest_ns, &self.window, &mut class);
-        self.window.update_states([needed, self.config.hold_maps], any, &mut class, &mut hits);
+        let limits = [needed, self.config.hold_maps];
+        self.window.update_states(limits, any, self.config.hits, &mut class, &mut hits);
         let share =
             |of: OccupancyClass| class.iter().filter(|class| **class == of.value()).count() as f64 / cells as f64;
         layer.metrics.extend([
@@ -127,7 +169,11 @@ impl LayerMaker for Occupancy {
     }
 
     fn uses(&self) -> ScanExtras {
-        ScanExtras { no_returns: self.config.no_return_m > 0.0, ..ScanExtras::default() }
+        ScanExtras {
+            ground: true,
+            no_returns: self.config.no_return_m > 0.0 && self.config.variant == OccupancyVariant::Polar,
+            ..ScanExtras::default()
+        }
     }
 
     fn integrate(&mut self, rays: &Rays<'_>) {

@@ -15,16 +15,14 @@
 //! where it is below the vehicle's clearance are free, if no obstacle lies between there and its end, so that it passed
 //! beneath nothing.
 //!
-//! Heights are measured over the plane under the vehicle. In a dip of the ground an obstacle may not reach above that
-//! plane. There a return counts as a hit if it is higher by the clearance than the lowest return around it, within a
-//! metre along its azimuth and a degree across.
+//! Heights are those over the local ground ([`Rays::heights_m`]). Between the sensor and a return the ground is taken
+//! as a straight line, from under the sensor to under the return.
 //!
 //! Only the newest scan of a sensor shows what is clear and what is hidden now. Therefore rays are traced once for each
 //! map, independent of the number of scans since the last one.
 
 use crate::layer::maker::Rays;
 use crate::layer::radial_grid::{floor_to_whole, round_to_whole};
-use crate::sensor::sweep::Sweep;
 
 use super::azimuth_bins::{AzimuthBins, BINS, around, neighbour};
 use super::bits::{any_bit, bits_of_word, set_bits};
@@ -35,11 +33,10 @@ use super::window::Window;
 
 /// Number of steps after which a bin is traced as two rays. Ours: at 112 cells a bin is half a cell wide.
 const FORK: usize = 112;
-/// Depth below the plane, metres, at which a return is a mirror image, beyond what [`GRADE_MAX`] explains; its ray
-/// proves nothing. Ours; not tuned.
+/// Depth below the ground, metres, at which a return is a mirror image, and how much more a metre of range allows; its
+/// ray proves nothing. Ours; not tuned.
 const BELOW_M: f32 = 0.3;
-/// Grade of the steepest road down from the vehicle. Ours; not tuned.
-const GRADE_MAX: f32 = 0.1;
+const BELOW_A_METRE: f32 = 0.01;
 /// Nearest hit of a bin without hits.
 const NONE: u16 = u16::MAX;
 /// Largest step number. Ours: beyond each window, and within 16 bits.
@@ -56,8 +53,6 @@ struct Ground {
     low: u16,
     /// Step after the return.
     end: u16,
-    /// Index of the point in the scan.
-    point: u32,
 }
 
 /// Values computed from points by arithmetic alone; ranges and steps are in cells from the sensor.
@@ -105,10 +100,6 @@ struct PolarScan {
     /// As `low`, for steps behind the nearest hit.
     proved: Vec<u64>,
     ground: Vec<Ground>,
-    /// Height of the lowest return of each patch of ground in a dip, metres; else infinite.
-    dips: Vec<f32>,
-    /// True if a patch lies in a dip.
-    dipped: bool,
 }
 
 impl PolarScans {
@@ -173,8 +164,6 @@ impl PolarScan {
             hits: bits(),
             proved: bits(),
             ground: Vec::new(),
-            dips: vec![f32::INFINITY; azimuths.patches()],
-            dipped: false,
         }
     }
 
@@ -188,9 +177,6 @@ impl PolarScan {
         self.present.fill(false);
         self.nearest_hit.fill(NONE);
         self.ground.clear();
-        if std::mem::take(&mut self.dipped) {
-            self.dips.fill(f32::INFINITY);
-        }
     }
 
     /// Sets the position of the sensor in the world, from the pose of the window.
@@ -212,18 +198,17 @@ impl PolarScan {
         window: &mut Window,
     ) {
         let range_max = config.range_m_max / config.cell_m;
-        // On ground below this height an obstacle can stay below `clear_height_m_min`.
-        let dip = config.clear_height_m_min - config.clearance_m;
         let window_from_ego = window.window_from_ego();
         let sweep = rays.returns;
         let mut chunk = Chunk::default();
-        let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
-        for (number, ((xs, ys), zs)) in chunks.enumerate() {
-            chunk.fill([xs, ys, zs], rays.origin_m, config, azimuths);
+        let origin = [rays.origin_m[0], rays.origin_m[1], rays.origin_height_m];
+        let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(rays.heights_m.chunks(CHUNK));
+        for ((xs, ys), zs) in chunks {
+            chunk.fill([xs, ys, zs], origin, config, azimuths);
             for (i, ((&x, &y), &z)) in xs.iter().zip(ys).zip(zs).enumerate() {
                 let (bin, range) = (chunk.bin[i] as usize, chunk.range[i]);
                 self.present[bin] = true;
-                if z < -BELOW_M - GRADE_MAX * config.cell_m * range {
+                if z.is_nan() || z < -BELOW_M - BELOW_A_METRE * config.cell_m * range {
                     continue;
                 }
                 let row = azimuths.row(bin);
@@ -240,17 +225,9 @@ impl PolarScan {
                     self.record_hit(bin, step, azimuths);
                 } else if inside {
                     let [from, low] = [chunk.under[i], chunk.low[i]].map(|value| value as u16);
-                    let point = (number * CHUNK + i) as u32;
-                    self.ground.push(Ground { bin: bin as u16, from, low, end: step + 1, point });
-                    if z < dip {
-                        let lowest = &mut self.dips[azimuths.patch(bin, step.into())];
-                        (*lowest, self.dipped) = (lowest.min(z), true);
-                    }
+                    self.ground.push(Ground { bin: bin as u16, from, low, end: step + 1 });
                 }
             }
-        }
-        if self.dipped {
-            self.insert_obstacles_in_dips(sweep, config, azimuths, window);
         }
     }
 
@@ -263,25 +240,6 @@ impl PolarScan {
         }
     }
 
-    /// Records hits of returns that counted as ground, but lie too high over the ground around them.
-    fn insert_obstacles_in_dips(
-        &mut self,
-        sweep: &Sweep,
-        config: &OccupancyConfig,
-        azimuths: &AzimuthBins,
-        window: &mut Window,
-    ) {
-        let window_from_ego = window.window_from_ego();
-        for index in 0..self.ground.len() {
-            let Ground { bin, end, point, .. } = self.ground[index];
-            let (bin, step, point) = (usize::from(bin), end - 1, point as usize);
-            if sweep.z[point] - self.dips[azimuths.patch(bin, step.into())] >= config.clearance_m {
-                window.record_hit(window_from_ego.apply(sweep.x[point], sweep.y[point]));
-                self.record_hit(bin, step, azimuths);
-            }
-        }
-    }
-
     /// Inserts the rays without a return.
     fn insert_no_returns(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, azimuths: &AzimuthBins) {
         let farthest = config.no_return_m.min(config.range_m_max) / config.cell_m;
@@ -289,7 +247,7 @@ impl PolarScan {
             let bin = azimuths.columns.column(dx, dy) as usize;
             self.present[bin] = true;
             let steps_a_m = (dx * dx + dy * dy).sqrt() / dz / config.cell_m;
-            let height = |height_m: f32| (height_m - rays.origin_m[2]) * steps_a_m;
+            let height = |height_m: f32| (height_m - rays.origin_height_m) * steps_a_m;
             let (from, to) = between(height(config.clear_height_m_min), height(config.clear_height_m_max));
             let steps = azimuths.steps as f32;
             let (first, end) = (round_to_whole(least(from, steps)), round_to_whole(least(to, least(farthest, steps))));
@@ -306,7 +264,7 @@ impl PolarScan {
     /// Marks the steps behind the nearest hit that returns from the ground prove free.
     fn prove_ground(&mut self, azimuths: &AzimuthBins) {
         let nearest: Vec<usize> = (0..BINS).map(|bin| self.nearest(bin)).collect();
-        for &Ground { bin, from, low, end, .. } in &self.ground {
+        for &Ground { bin, from, low, end } in &self.ground {
             let (bin, from, low, end) = (usize::from(bin), usize::from(from), usize::from(low), usize::from(end));
             if low <= nearest[bin] {
                 continue;

@@ -4,6 +4,7 @@
 //! In: a [`Cell`] and its [`Evidence`]. Out: the cell as it is published.
 
 use super::class::OccupancyClass::{self, Clear, Occluded, Occupied, OutOfRange, Unknown};
+use super::config::Hits;
 
 /// Evidence bit of a cell: rays of a sensor pass over it or through it.
 pub const LOOKED_AT: u8 = 1;
@@ -80,14 +81,14 @@ pub struct Cell {
 }
 
 impl Cell {
-    /// The hits as published: 255 in an occupied cell, in an unknown cell the largest power of two up to the number of
-    /// hits, 0 in any other cell. The difference between 20 and 23 returns is chance, and would be half of the layer's
-    /// bytes.
-    pub fn level(self) -> u8 {
-        match (self.state, self.hits) {
-            (Occupied, hits) => hits,
-            (Unknown, hits) if hits > 0 => 1 << hits.ilog2(),
-            _ => 0,
+    /// The hits as published. Reduced, because the difference between 20 and 23 returns is chance, and would be half of
+    /// the layer's bytes; or counted (Seo 2014, section 2).
+    pub fn level(self, published: Hits) -> u8 {
+        match (published, self.state, self.hits) {
+            (_, Occupied, hits) => hits,
+            (Hits::Reduced, Unknown, hits) if hits > 0 => 1 << hits.ilog2(),
+            (Hits::Reduced, ..) => 0,
+            (Hits::Counted, _, hits) => hits.min(u8::MAX - 1),
         }
     }
 

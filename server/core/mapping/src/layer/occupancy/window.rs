@@ -8,6 +8,7 @@
 
 use nalgebra::Isometry3;
 
+use super::config::Hits;
 use super::states::{Cell, evidence};
 use crate::layer::radial_grid::floor_to_whole;
 
@@ -178,14 +179,21 @@ impl Window {
     /// Computes the state of each cell. In: in `class` the evidence bits since the last map
     /// ([`super::states::LOOKED_AT`], …), and `any`, true if a sensor sent a scan. Out: the states in `class`, the
     /// published hits in `hits`.
-    pub fn update_states(&mut self, [needed, hold_maps]: [u8; 2], any: bool, class: &mut [u8], hits: &mut [u8]) {
+    pub fn update_states(
+        &mut self,
+        [needed, hold_maps]: [u8; 2],
+        any: bool,
+        published: Hits,
+        class: &mut [u8],
+        hits: &mut [u8],
+    ) {
         hits.fill(0);
         let mut listed = std::mem::take(&mut self.listed);
         listed.retain(|index| {
             let ([x, y], index) = (self.cell(*index), *index as usize);
             let (at, fresh) = (y * self.side + x, std::mem::take(&mut self.fresh[index]));
             let cell = self.cells[index].next(fresh, evidence(class[at], any), needed, hold_maps);
-            (class[at], hits[at]) = (STATE | cell.state.value(), cell.level());
+            (class[at], hits[at]) = (STATE | cell.state.value(), cell.level(published));
             self.cells[index] = if cell.hits > 0 { cell } else { Cell::default() };
             cell.hits > 0
         });

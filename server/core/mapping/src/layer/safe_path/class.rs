@@ -13,5 +13,7 @@ classes! {
         Obstacle: "obstacle", Occupied, 0xc42638;
         /// Drivable, and a safe point that the vehicle can reach lies in the cell.
         Path: "path", Free, 0xfafaf0;
+        /// Free ground, but no passage wide enough for the vehicle leads there.
+        NotReached: "not_reached", NotReached, 0xaa803c;
     }
 }

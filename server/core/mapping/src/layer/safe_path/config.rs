@@ -16,14 +16,6 @@ pub struct SafePathConfig {
     pub extent_m: f32,
     /// Side of a cell, metres. 0.25 is ours; not tuned.
     pub cell_m: f32,
-    /// Width of the vehicle, metres. A safe point is at least half of it away from obstacles, and obstacles nearer to
-    /// one another count as one. 2 is ours, a car.
-    pub vehicle_width_m: f32,
-    /// Distance from the ego origin to the vehicle's front, metres. Returns from within the vehicle's outline are no
-    /// obstacles. 3 is ours, a car.
-    pub vehicle_front_m: f32,
-    /// Distance from the ego origin to the vehicle's rear, metres. 2 is ours, a car.
-    pub vehicle_rear_m: f32,
     /// Range within which the sensor does not see the ground, metres; unknown cells before drivable ground are no
     /// obstacles there. 7 is ours, as in the layer `drivability`; not tuned.
     pub blind_zone_m: f32,
@@ -36,17 +28,7 @@ pub struct SafePathConfig {
 
 impl Default for SafePathConfig {
     fn default() -> Self {
-        Self {
-            enabled: true,
-            extent_m: 30.0,
-            cell_m: 0.25,
-            vehicle_width_m: 2.0,
-            vehicle_front_m: 3.0,
-            vehicle_rear_m: 2.0,
-            blind_zone_m: 7.0,
-            hole_m_max: 1.0,
-            join_m_max: 15.0,
-        }
+        Self { enabled: true, extent_m: 30.0, cell_m: 0.25, blind_zone_m: 7.0, hole_m_max: 1.0, join_m_max: 15.0 }
     }
 }
 
@@ -59,9 +41,6 @@ impl SafePathConfig {
         let values = [
             ("extent_m", self.extent_m, (5.0..=200.0, "5 to 200")),
             ("cell_m", self.cell_m, (0.1..=2.0, "0.1 to 2")),
-            ("vehicle_width_m", self.vehicle_width_m, (0.1..=10.0, "0.1 to 10")),
-            ("vehicle_front_m", self.vehicle_front_m, (0.0..=20.0, "0 to 20")),
-            ("vehicle_rear_m", self.vehicle_rear_m, (0.0..=20.0, "0 to 20")),
             ("blind_zone_m", self.blind_zone_m, (0.0..=60.0, "0 to 60")),
             ("hole_m_max", self.hole_m_max, (0.0..=5.0, "0 to 5")),
             ("join_m_max", self.join_m_max, (0.0..=100.0, "0 to 100")),

@@ -1,8 +1,9 @@
 //! Free space: which cells of a Cartesian grid about the vehicle are free.
 //!
-//! In: the layer `drivability`, radial, and the sweep it was made from. Out: a [`State`] for each cell: the state of
-//! the radial cell in which the cell's centre lies. A radial cell with returns only from the vehicle's own outline (its
-//! bonnet) is unknown. Unseen ground is not free, with two exceptions:
+//! In: the layers `drivability`, radial, and `occupancy`, the sweep, and what the vehicle can reach. Out: a [`State`]
+//! for each cell: the state of the radial cell in which the cell's centre lies, unless an obstacle stands in the cell
+//! or the vehicle cannot reach it. A radial cell with returns only from the vehicle's own outline (its bonnet) is
+//! unknown. Unseen ground is not free, with two exceptions:
 //! - The blind zone: if the innermost seen cell of a column is drivable and begins within the zone, the ground nearer
 //!   to the vehicle, which no laser reaches, is assumed to be free too, as the UT Austin thesis assumes when segments
 //!   grow from the vehicle (section IV.3).
@@ -13,9 +14,11 @@
 use crate::layer::channel::TypedChannel;
 use crate::layer::drivability::class::DrivabilityClass;
 use crate::layer::grid::Geometry;
-use crate::layer::maker::Layer;
+use crate::layer::maker::{Context, Layer};
+use crate::layer::occupancy::class::OccupancyClass;
 use crate::layer::radial_grid::RadialGrid;
 use crate::sensor::sweep::Sweep;
+use crate::vehicle_outline::Outline;
 
 use super::config::SafePathConfig;
 
@@ -27,8 +30,10 @@ pub enum State {
     Unknown,
     /// The vehicle can get there.
     Drivable,
-    /// Seen, and not drivable.
+    /// Something stands in the cell, or it is no ground.
     Obstacle,
+    /// Free ground that the vehicle does not reach.
+    NotReached,
     /// Not seen, in the blind zone before drivable ground.
     Blind,
     /// Not seen, between drivable or blind cells of one ring or one azimuth.
@@ -92,8 +97,18 @@ impl FreeSpace {
         &self.states
     }
 
-    /// Computes the states from a map's layer `drivability`; without that layer all cells are unknown.
-    pub fn update(&mut self, drivability: Option<&Layer>, sweep: &Sweep, config: &SafePathConfig) {
+    /// Computes the states from a map's layers `drivability` and `occupancy` and from what the vehicle can reach;
+    /// without `drivability` all cells are unknown.
+    pub fn update(&mut self, sweep: &Sweep, context: &Context<'_>, outline: &Outline, config: &SafePathConfig) {
+        let layer = |name| context.earlier.iter().find(move |layer| layer.name == name);
+        self.project(layer("drivability"), sweep, outline, config);
+        self.add_obstacles(context);
+        self.add_occupied_cells(layer("occupancy"));
+        self.free_outline(outline);
+    }
+
+    /// Gives each cell the state of its radial cell.
+    fn project(&mut self, drivability: Option<&Layer>, sweep: &Sweep, outline: &Outline, config: &SafePathConfig) {
         let class = drivability.and_then(|layer| TypedChannel::CLASS.values(&layer.channels));
         let (Some(layer), Some(class)) = (drivability, class) else { return self.states.fill(State::Unknown) };
         let Geometry::Radial { row_radius_m, columns } = &layer.geometry else {
@@ -106,12 +121,14 @@ impl FreeSpace {
         self.of_radial_cell.clear();
         const UNKNOWN: u8 = DrivabilityClass::Unknown.value();
         const DRIVABLE: u8 = DrivabilityClass::Drivable.value();
+        const NOT_DRIVABLE: u8 = DrivabilityClass::NotDrivable.value();
         self.of_radial_cell.extend(class.iter().map(|&class| match class {
             UNKNOWN => State::Unknown,
             DRIVABLE => State::Drivable,
+            NOT_DRIVABLE => State::NotReached,
             _ => State::Obstacle,
         }));
-        self.remove_own_returns(sweep, config);
+        self.remove_own_returns(sweep, outline);
         let columns = usize::from(*columns);
         mark_blind_zone(&mut self.of_radial_cell, row_radius_m, columns, config.blind_zone_m);
         mark_holes(&mut self.of_radial_cell, row_radius_m, columns, config.hole_m_max);
@@ -120,13 +137,52 @@ impl FreeSpace {
         for (state, &cell) in self.states.iter_mut().zip(&self.radial_cell) {
             *state = self.of_radial_cell[cell as usize];
         }
-        self.free_outline(config);
+    }
+
+    /// Closes the cells in which an obstacle stands, and those that the vehicle cannot reach.
+    fn add_obstacles(&mut self, context: &Context<'_>) {
+        for index in 0..self.states.len() {
+            let (x, y) = (self.centre_m(index % self.side), self.centre_m(index / self.side));
+            let state = &mut self.states[index];
+            *state = match *state {
+                _ if context.is_closed(x, y) => State::Obstacle,
+                // The obstacle stands in another part of the radial cell.
+                State::Obstacle if context.reach.is_some() => State::Unknown,
+                free if free.is_free() && !context.is_reached(x, y) => State::NotReached,
+                unchanged => unchanged,
+            };
+        }
+    }
+
+    /// Closes the cells that contain the centre of a cell that the layer `occupancy` calls occupied.
+    fn add_occupied_cells(&mut self, occupancy: Option<&Layer>) {
+        let class = occupancy.and_then(|layer| TypedChannel::CLASS.values(&layer.channels));
+        let (Some(layer), Some(class)) = (occupancy, class) else { return };
+        let Geometry::Cartesian { origin_x_m, origin_y_m, width, cell_m, yaw_rad, .. } = layer.geometry else { return };
+        let (sin, cos) = yaw_rad.sin_cos();
+        let occupied = (0..class.len()).filter(|cell| class[*cell] == OccupancyClass::Occupied.value());
+        for cell in occupied {
+            let (ix, iy) = (cell % width as usize, cell / width as usize);
+            let (u, v) = (
+                origin_x_m + (ix as f64 + 0.5) * f64::from(cell_m),
+                origin_y_m + (iy as f64 + 0.5) * f64::from(cell_m),
+            );
+            let index = |metres: f64| (metres / self.cell_m + self.side as f64 / 2.0).floor();
+            let (x, y) = (index(u * cos + v * sin), index(v * cos - u * sin));
+            if (0.0..self.side as f64).contains(&x) && (0.0..self.side as f64).contains(&y) {
+                self.states[y as usize * self.side + x as usize] = State::Obstacle;
+            }
+        }
+    }
+
+    /// Coordinate of the centre of a cell, metres.
+    fn centre_m(&self, index: usize) -> f32 {
+        ((index as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32
     }
 
     /// Makes radial cells unknown that have returns only from the vehicle itself.
-    fn remove_own_returns(&mut self, sweep: &Sweep, config: &SafePathConfig) {
-        let SafePathConfig { vehicle_front_m, vehicle_rear_m, vehicle_width_m, .. } = *config;
-        let corner_m = vehicle_front_m.max(vehicle_rear_m).hypot(vehicle_width_m / 2.0);
+    fn remove_own_returns(&mut self, sweep: &Sweep, outline: &Outline) {
+        let corner_m = outline.front_m.max(outline.rear_m).hypot(outline.width_m / 2.0);
         // Rows up to the end of the last one that touches the outline.
         let rows = (0..self.grid.rows()).take_while(|row| self.grid.row_span_m(*row).0 < corner_m).count();
         let reach_m = rows.checked_sub(1).map_or(0.0, |last| self.grid.row_span_m(last).1);
@@ -134,7 +190,7 @@ impl FreeSpace {
         self.returns.resize(rows * self.grid.columns(), Returns::default());
         for (&x, &y) in sweep.x.iter().zip(&sweep.y).filter(|(x, y)| **x * **x + **y * **y <= reach_m * reach_m) {
             if let Some(returns) = self.grid.cell(x, y).and_then(|cell| self.returns.get_mut(cell)) {
-                let own = is_within_the_vehicle(x, y, config);
+                let own = outline.contains(x, y);
                 (returns.own, returns.other) = (returns.own | own, returns.other | !own);
             }
         }
@@ -146,15 +202,15 @@ impl FreeSpace {
     }
 
     /// Makes the cells under the vehicle free: nothing else can stand there.
-    fn free_outline(&mut self, config: &SafePathConfig) {
-        let centre_m = |i: usize| ((i as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32;
-        let longest_m = config.vehicle_front_m.max(config.vehicle_rear_m).max(config.vehicle_width_m);
+    fn free_outline(&mut self, outline: &Outline) {
+        let longest_m = outline.front_m.max(outline.rear_m).max(outline.width_m);
         let reach = (f64::from(longest_m) / self.cell_m).ceil() as usize;
         let near = (self.side / 2).saturating_sub(reach)..(self.side / 2 + reach).min(self.side);
         for iy in near.clone() {
             for ix in near.clone() {
+                let is_within = outline.contains(self.centre_m(ix), self.centre_m(iy));
                 let state = &mut self.states[iy * self.side + ix];
-                if is_within_the_vehicle(centre_m(ix), centre_m(iy), config) && !state.is_free() {
+                if is_within && !state.is_free() {
                     *state = State::Blind;
                 }
             }
@@ -164,16 +220,10 @@ impl FreeSpace {
     /// Computes the radial cell of each cell.
     fn find_radial_cells(&mut self, row_radius_m: &[f32], columns: u16) {
         self.grid = RadialGrid::new(row_radius_m.to_vec(), columns);
-        let centre_m = |i: usize| ((i as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32;
-        let cell = |index: usize| self.grid.cell(centre_m(index % self.side), centre_m(index / self.side));
+        let cell = |index: usize| self.grid.cell(self.centre_m(index % self.side), self.centre_m(index / self.side));
         let cells = 0..self.side * self.side;
         self.radial_cell = cells.map(|index| cell(index).unwrap_or(self.grid.cells()) as u32).collect();
     }
-}
-
-/// True if a position lies within the vehicle's outline.
-fn is_within_the_vehicle(x: f32, y: f32, config: &SafePathConfig) -> bool {
-    (-config.vehicle_rear_m..=config.vehicle_front_m).contains(&x) && y.abs() <= config.vehicle_width_m / 2.0
 }
 
 /// Marks unseen cells nearer to the vehicle than drivable ground that begins within the blind zone.
@@ -226,7 +276,7 @@ fn mark_along(
                 }
                 last_free = Some(i);
             }
-            State::Obstacle => last_free = None,
+            State::Obstacle | State::NotReached => last_free = None,
         }
     }
 }

@@ -1,8 +1,8 @@
 //! The layer `safe_path` (UT Austin thesis, section VI): safe points, which are as far as possible from the obstacles
 //! on both sides, linked into paths that start at the vehicle.
 //!
-//! In: the layer `drivability` of the same map, and its sweep. Out: the layer: points with radii and links, and the
-//! Cartesian grid on which they were found. The steps:
+//! In: the layers `drivability` and `occupancy` of the same map, its sweep, and what the vehicle can reach. Out: the
+//! layer: points with radii and links, and the Cartesian grid on which they were found. The steps:
 //!
 //! | step | where |
 //! |---|---|
@@ -25,6 +25,7 @@ pub mod medial_axis;
 use crate::layer::channel::TypedChannel;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker};
+use crate::reach::config::ReachConfig;
 use crate::sensor::sweep::Sweep;
 
 use class::SafePathClass;
@@ -64,6 +65,7 @@ impl SafePath {
                 State::Unknown | State::Blind | State::Hole => SafePathClass::Unknown,
                 State::Drivable => SafePathClass::Free,
                 State::Obstacle => SafePathClass::Obstacle,
+                State::NotReached => SafePathClass::NotReached,
             };
             class.value()
         }));
@@ -87,14 +89,14 @@ impl LayerMaker for SafePath {
     }
 
     fn needs(&self) -> &'static [&'static str] {
-        &["drivability"]
+        &["drivability", "occupancy"]
     }
 
     fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
-        let drivability = context.earlier.iter().find(|layer| layer.name == "drivability");
-        self.free_space.update(drivability, sweep, &self.config);
+        let outline = context.reach.map_or_else(|| ReachConfig::default().outline(), |reach| reach.config().outline());
+        self.free_space.update(sweep, context, &outline, &self.config);
         self.distances.compute(self.free_space.states());
-        let width_cells = f64::from(self.config.vehicle_width_m) / f64::from(self.config.cell_m);
+        let width_cells = f64::from(outline.width_m) / f64::from(self.config.cell_m);
         self.medial_axis.find(self.free_space.states(), &self.distances, width_cells);
         let join_cells = f64::from(self.config.join_m_max) / f64::from(self.config.cell_m);
         self.links.link(&self.medial_axis, self.free_space.states(), &self.distances, width_cells, join_cells);

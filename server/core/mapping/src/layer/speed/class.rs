@@ -13,6 +13,8 @@ classes! {
         Obstacle: "obstacle", Occupied, 0xc42638;
         /// Passable, and on the painted road.
         Road: "road", Free, 0x78bef0;
+        /// Even enough to drive over, but no passage wide enough for the vehicle leads there.
+        NotReached: "not_reached", NotReached, 0xaa803c;
     }
 }
 

@@ -29,6 +29,15 @@ pub struct SpeedConfig {
     pub smooth_m: f32,
     /// Bumpiness from which the ground allows `crawl_mps`, metres. 0.15 is ours; not tuned.
     pub rough_m: f32,
+    /// Roughness (the square root of Neuhaus 2009, eq. 4) up to which the ground allows its full speed, metres per
+    /// metre. 0.002 is ours: nine tenths of the road of the labelled frame of BENCHMARKS.md are smoother up to 25 m.
+    pub roughness_smooth: f32,
+    /// Roughness from which the ground allows `rough_share` of its speed, metres per metre. 0.01 is ours: nine tenths
+    /// of the grass beside that road are smoother up to 15 m.
+    pub roughness_rough: f32,
+    /// Share of its speed above `crawl_mps` that the roughest ground allows; 1: roughness changes nothing. 0.5 is ours;
+    /// not tuned.
+    pub rough_share: f32,
     /// Speed of cells of which nothing is known, m/s; less than `crawl_mps`, so that the two differ. 1 is ours; not
     /// tuned.
     pub unknown_mps: f32,
@@ -42,6 +51,19 @@ pub struct SpeedConfig {
     pub bonus: Bonus,
     /// With `bonus = "absolute"`: distance from the centre line at which the bonus is 0, metres. 4 is ours; not tuned.
     pub bonus_reach_m: f32,
+    /// True if the road ahead is measured in the sweep while no road is sent: its width and its lateral offset, from
+    /// kerbs, berms and verges on both sides (Lindström 2005, section 3.1). `false` is ours, because the edges were
+    /// measured in one town and one recorded street only.
+    pub measure_road: bool,
+    /// True if roads are painted only within the corridor of the route, if there is one. `true` follows the corridor of
+    /// an RDDF (Lindström 2005, section 3.2.1).
+    pub corridor: bool,
+    /// Speed limit outside the corridor of the route, m/s; 0: no limit. 0 is ours, because a route may lie beside the
+    /// road by the error of the positions.
+    pub outside_corridor_mps: f32,
+    /// True if the speed limits of the route cap the speed in their part of its corridor. `true` is ours, because the
+    /// rules of the race demand it; the paper reads the same file for its curvature alone.
+    pub speed_limits: bool,
     /// Largest age of a detected road that is painted, milliseconds; lanes of a file, in the map frame, do not age. 500
     /// is ours; not tuned.
     pub road_age_ms_max: u32,
@@ -67,12 +89,19 @@ impl Default for SpeedConfig {
             grade_max: 0.2,
             smooth_m: 0.03,
             rough_m: 0.15,
+            roughness_smooth: 0.002,
+            roughness_rough: 0.01,
+            rough_share: 0.5,
             unknown_mps: 1.0,
             crawl_mps: 2.0,
             off_road_mps: 10.0,
             bonus_mps: 8.0,
             bonus: Bonus::Relative,
             bonus_reach_m: 4.0,
+            measure_road: false,
+            corridor: true,
+            outside_corridor_mps: 0.0,
+            speed_limits: true,
             road_age_ms_max: 500,
             divergence_min: 0.1,
             route_ahead_m: 30.0,
@@ -107,6 +136,10 @@ impl SpeedConfig {
             ("grade_max", self.grade_max, (0.0..=1.0, "0 to 1")),
             ("smooth_m", self.smooth_m, (0.0..=1.0, "0 to 1")),
             ("rough_m", self.rough_m, (0.01..=2.0, "0.01 to 2")),
+            ("roughness_smooth", self.roughness_smooth, (0.0..=1.0, "0 to 1")),
+            ("roughness_rough", self.roughness_rough, (0.0001..=1.0, "0.0001 to 1")),
+            ("rough_share", self.rough_share, (0.0..=1.0, "0 to 1")),
+            ("outside_corridor_mps", self.outside_corridor_mps, (0.0..=60.0, "0 to 60")),
             // A cell has 8 bits in steps of 0.25 m/s, and 0 is an obstacle.
             ("unknown_mps", self.unknown_mps, (0.25..=10.0, "0.25 to 10")),
             ("crawl_mps", self.crawl_mps, (0.5..=20.0, "0.5 to 20")),
@@ -121,6 +154,8 @@ impl SpeedConfig {
         check_each(at, values)?;
         check_cells(at, self.extent_m, self.cell_m)?;
         check_fits(at, "rough_m", self.rough_m, self.rough_m > self.smooth_m, "more than smooth_m")?;
+        let rougher = self.roughness_rough > self.roughness_smooth;
+        check_fits(at, "roughness_rough", self.roughness_rough, rougher, "more than roughness_smooth")?;
         let above_unknown = self.crawl_mps >= self.unknown_mps + 0.25;
         check_fits(at, "crawl_mps", self.crawl_mps, above_unknown, "at least 0.25 more than unknown_mps")?;
         check_fits(at, "off_road_mps", self.off_road_mps, self.off_road_mps >= self.crawl_mps, "at least crawl_mps")

@@ -1,10 +1,11 @@
 //! Whether a road may be painted now (Lindström 2005, section 3.3): each condition that is violated stops the painting
 //! at once.
 //!
-//! In: the newest road and route with the newest ego pose. Out: [`PaintingConditions`]: the road in the ego frame, and
-//! which conditions are violated. Two conditions are the paper's: (1) the dominant orientations in the detector's image
-//! are no better than random; (2) the route bends more than the detector can follow. Two are ours, because the system
-//! has clocks and frames: (3) the road was detected too long ago; (4) it lies in the map frame and no pose is known.
+//! In: the newest road and route with the newest ego pose, and, where no road is sent, the measured one. Out:
+//! [`PaintingConditions`]: the road in the ego frame, its source, and which conditions are violated. Two conditions are
+//! the paper's: (1) the dominant orientations in the detector's image are no better than random; (2) the route bends
+//! more than the detector can follow. Two are ours, because the system has clocks and frames: (3) the road was detected
+//! too long ago; (4) it lies in the map frame and no pose is known.
 
 use crate::event::RoadFrame;
 use crate::layer::maker::Context;
@@ -30,6 +31,18 @@ pub enum Condition {
     Curvature,
 }
 
+/// Where a road comes from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum RoadSource {
+    /// There is no road.
+    #[default]
+    None,
+    /// A road that was sent.
+    Sent,
+    /// The road that was measured in the sweep.
+    Measured,
+}
+
 /// The conditions of one map.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PaintingConditions {
@@ -38,9 +51,11 @@ pub struct PaintingConditions {
     /// Largest curvature of the route ahead, 1/m; `None` without a route.
     pub curvature_per_m: Option<f64>,
     violated: Vec<Condition>,
-    has_road: bool,
+    source: RoadSource,
     road_m: Vec<[f64; 2]>,
+    widths_m: Vec<f64>,
     route_m: Vec<[f64; 2]>,
+    is_route_placed: bool,
 }
 
 impl PaintingConditions {
@@ -48,24 +63,48 @@ impl PaintingConditions {
     pub fn check(&mut self, context: &Context<'_>, config: &SpeedConfig) {
         self.violated.clear();
         self.road_m.clear();
-        (self.divergence, self.curvature_per_m, self.has_road) = (None, None, false);
+        self.widths_m.clear();
+        (self.divergence, self.curvature_per_m, self.source) = (None, None, RoadSource::None);
+        let pose = context.map_from_ego.as_ref();
+        self.is_route_placed = context.route.is_some_and(|route| route.points_in_ego(pose, &mut self.route_m));
         let Some(stored) = context.road else { return };
-        self.has_road = true;
+        self.source = RoadSource::Sent;
 
         let age_ns = context.stamp_ns.saturating_sub(stored.road.stamp_ns);
         let ages = stored.road.frame == RoadFrame::Ego;
         // A road with a stamp in the future is no more current than an old one.
         self.add(Condition::Age, ages && age_ns.unsigned_abs() > u64::from(config.road_age_ms_max) * 1_000_000);
 
-        let pose = context.map_from_ego.as_ref();
-        let road_placed = stored.points_in_ego(pose, &mut self.road_m);
-        let route_placed = context.route.is_none_or(|route| route.points_in_ego(pose, &mut self.route_m));
-        self.add(Condition::Pose, !road_placed || !route_placed);
-
+        let is_road_placed = stored.points_in_ego(pose, &mut self.road_m);
+        self.add(Condition::Pose, !is_road_placed);
+        self.widths_m.extend_from_slice(&stored.road.widths_m);
         self.divergence = divergence(&stored.road.orientations);
         self.add(Condition::Divergence, self.divergence.is_some_and(|found| found < f64::from(config.divergence_min)));
 
-        if context.route.is_some() && route_placed {
+        self.check_route(context, config);
+    }
+
+    /// True if no road was sent, or only one that is too old.
+    pub fn lacks_road(&self) -> bool {
+        self.source == RoadSource::None || self.violated(Condition::Age)
+    }
+
+    /// Offers a measured road (ego frame, metres) in place of a road that was not sent or is too old.
+    pub fn offer(&mut self, points_m: &[[f64; 2]], widths_m: &[f64], context: &Context<'_>, config: &SpeedConfig) {
+        self.violated.clear();
+        self.divergence = None;
+        self.source = RoadSource::Measured;
+        self.road_m.clear();
+        self.road_m.extend_from_slice(points_m);
+        self.widths_m.clear();
+        self.widths_m.extend_from_slice(widths_m);
+        self.check_route(context, config);
+    }
+
+    /// Checks the conditions of the route.
+    fn check_route(&mut self, context: &Context<'_>, config: &SpeedConfig) {
+        self.add(Condition::Pose, context.route.is_some() && !self.is_route_placed);
+        if self.is_route_placed {
             let curvature = curvature_ahead_per_m(&self.route_m, f64::from(config.route_ahead_m));
             self.curvature_per_m = Some(curvature);
             self.add(Condition::Curvature, curvature > f64::from(config.curvature_per_m_max));
@@ -80,7 +119,12 @@ impl PaintingConditions {
 
     /// True if there is a road and no condition is violated.
     pub fn painting(&self) -> bool {
-        self.has_road && self.violated.is_empty()
+        self.source != RoadSource::None && self.violated.is_empty()
+    }
+
+    /// Source of the road that is painted; [`RoadSource::None`] if none is.
+    pub fn painted_source(&self) -> RoadSource {
+        if self.painting() { self.source } else { RoadSource::None }
     }
 
     /// True if this condition is violated.
@@ -91,6 +135,16 @@ impl PaintingConditions {
     /// The road's points (x, y), ego frame, metres.
     pub fn road_m(&self) -> &[[f64; 2]] {
         &self.road_m
+    }
+
+    /// Width of the road at each point, metres.
+    pub fn widths_m(&self) -> &[f64] {
+        &self.widths_m
+    }
+
+    /// The route's points (x, y), ego frame, metres; `None` without a route, or if its place is not known.
+    pub fn route_m(&self) -> Option<&[[f64; 2]]> {
+        self.is_route_placed.then_some(&self.route_m[..])
     }
 }
 

@@ -12,11 +12,11 @@ classes! {
         Flat: "flat", Free, 0x1c9e96;
         /// No point fell into the cell; the flat region around it covers it.
         FlatInferred: "flat_inferred", Inferred, 0x166e6a;
-        /// Flat, but not joined to the ground under the vehicle: a car's roof, a wall's top, a far bank.
-        FlatElevated: "flat_elevated", NotReached, 0xf4b842;
+        /// Flat, but higher than a step over the local ground: a car's roof, a wall's top.
+        FlatElevated: "flat_elevated", Occupied, 0xf4b842;
         /// Not flat.
         Obstacle: "obstacle", Occupied, 0xc42638;
-        /// Flat and joined to the ground under the vehicle, but no passage wide enough for the vehicle leads there.
+        /// Flat ground, but no passage wide enough for the vehicle leads there.
         FlatUnreachable: "flat_unreachable", NotReached, 0xaa803c;
     }
 }
@@ -26,7 +26,7 @@ pub const SHAPE: TypedChannel<u8> = TypedChannel { name: "shape", unit: "", scal
 
 /// Square root of the paper's roughness: one raw unit is a fifth of a millimetre of range deviation per metre of
 /// distance. Unknown in a cell that is not flat, or has too few points with a distance series.
-pub const ROUGHNESS: TypedChannel<u8> = TypedChannel { name: "roughness", unit: "", scale: 2e-4, unknown: u8::MAX };
+pub const ROUGHNESS: TypedChannel<u8> = TypedChannel { name: "roughness", unit: "m/m", scale: 2e-4, unknown: u8::MAX };
 
 /// Plane of a cell's flat region: height at the cell's centre, then rise over run along x and along y.
 pub const PLANE: [TypedChannel<i8>; 3] = [

@@ -6,6 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::check::{ConfigValueError, check_each};
 
+use super::division::Division;
+
 /// Parameters of the layer `terrain`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -33,26 +35,15 @@ pub struct TerrainConfig {
     /// With `variant = "grounded"`: largest rise over run of a flat region. 0.2 is ours; chosen on the labelled frame
     /// of BENCHMARKS.md.
     pub grade_max: f32,
-    /// With `variant = "grounded"`: largest range of flat ground that may belong to the ground under the vehicle,
-    /// metres. 7 is ours; not tuned.
-    pub blind_zone_m: f32,
-    /// With `variant = "grounded"`: largest height of that ground over or under the vehicle's, metres. 0.25 is ours;
-    /// not tuned.
-    pub start_m_max: f32,
-    /// With `variant = "grounded"`: largest step between neighbouring regions of the ground, metres. 0.15 is ours;
-    /// chosen on the labelled frame of BENCHMARKS.md.
+    /// With `variant = "grounded"`: largest height of a flat cell's points over the local ground, metres. 0.25 is ours:
+    /// one unit of the layer `drivability`.
     pub step_m_max: f32,
-    /// With `variant = "grounded"`: widest gap without points between two neighbouring regions, metres; the rings of
-    /// far ground lie that far apart. 8 is ours; not tuned.
-    pub bridge_m_max: f32,
-    /// With `variant = "grounded"`: least width between obstacles that the vehicle drives through, metres; 0 accepts
-    /// every passage. 2 is ours, the width of a car; not tuned.
-    pub passage_m_min: f32,
     /// With `variant = "grounded"`: widest hole in seen ground that is inferred to be flat, metres. 3 is ours; not
     /// tuned.
     pub inference_m_max: f32,
-    /// Standard deviation of the sensor's range noise, metres; it is subtracted from the roughness (section 2.5). 0.02
-    /// is ours: the range noise of an HDL-64E, because the paper gives no value.
+    /// Standard deviation of the positions of points, metres: a flat region's plane has no slope in a direction in
+    /// which its points lie this close together. 0.02 is ours: the range noise of an HDL-64E. The noise that is
+    /// subtracted from the roughness (section 2.5) is a property of each sensor: `range_noise_m` of its table.
     pub noise_m: f32,
     /// Least number of points with a range deviation in a cell with a roughness. 4 is ours; not tuned.
     pub roughness_points_min: u16,
@@ -73,11 +64,7 @@ impl Default for TerrainConfig {
             points_min: 3,
             residual_m_max: 0.15,
             grade_max: 0.2,
-            blind_zone_m: 7.0,
-            start_m_max: 0.25,
-            step_m_max: 0.15,
-            bridge_m_max: 8.0,
-            passage_m_min: 2.0,
+            step_m_max: 0.25,
             inference_m_max: 3.0,
             noise_m: 0.02,
             roughness_points_min: 4,
@@ -90,12 +77,23 @@ impl Default for TerrainConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Variant {
-    /// Hierarchical division; flat regions must join the ground under the vehicle; inference only within seen ground.
+    /// Hierarchical division into quarters; flat regions must lie on the local ground, where the vehicle can reach
+    /// them; inference only within seen ground.
     Grounded,
-    /// Hierarchical division alone (Neuhaus 2009, section 2.3, but with four parts a division instead of two).
+    /// Hierarchical division alone (Neuhaus 2009, section 2.3).
     Paper,
     /// Each cell by itself, with the shape of its points (Neuhaus 2009, section 2.2).
     Grid,
+}
+
+impl Variant {
+    /// How the variant divides the grid.
+    pub(crate) fn division(self) -> Division {
+        match self {
+            Self::Grounded => Division::Quarters,
+            Self::Paper | Self::Grid => Division::Halves,
+        }
+    }
 }
 
 impl TerrainConfig {
@@ -112,11 +110,7 @@ impl TerrainConfig {
             ("flatness_m2_max", self.flatness_m2_max, (1e-6..=1.0, "0.000001 to 1")),
             ("residual_m_max", self.residual_m_max, (0.01..=10.0, "0.01 to 10")),
             ("grade_max", self.grade_max, (0.01..=10.0, "0.01 to 10")),
-            ("blind_zone_m", self.blind_zone_m, (0.0..=60.0, "0 to 60")),
-            ("start_m_max", self.start_m_max, (0.01..=10.0, "0.01 to 10")),
             ("step_m_max", self.step_m_max, (0.0..=10.0, "0 to 10")),
-            ("bridge_m_max", self.bridge_m_max, (0.0..=20.0, "0 to 20")),
-            ("passage_m_min", self.passage_m_min, (0.0..=20.0, "0 to 20")),
             ("inference_m_max", self.inference_m_max, (0.0..=20.0, "0 to 20")),
             // Without noise the plane through a piece of one ring is not defined.
             ("noise_m", self.noise_m, (0.001..=1.0, "0.001 to 1")),

@@ -7,55 +7,47 @@
 //! |---|---|---|
 //! | points -> cells; sums over any region in O(1) | section 2.2 | [`moments`] |
 //! | principal components, local height disturbance h | section 2.1, eq. 1 | [`eigen`] |
+//! | the whole grid, then two pieces along the longest axis; or four quarters | section 2.3 | [`division`] |
 //! | hierarchical division into flat regions, or each cell by itself | sections 2.2 and 2.3 | [`regions`] |
-//! | regions that join the ground under the vehicle; bounded inference | not in the paper | [`ground`] |
-//! | which of this ground the vehicle can reach | not in the paper | [`shadow`], [`reach`] |
-//! | roughness of flat cells | sections 2.4 and 2.5, eq. 3 and 4 | [`crate::sensor::distance_series`], [`roughness`] |
+//! | regions on the local ground that the vehicle can reach | not in the paper | [`crate::ground`], [`crate::reach`] |
+//! | bounded inference | not in the paper | [`holes`] |
+//! | roughness of flat cells | sections 2.4 and 2.5, eq. 3 and 4 | [`crate::sensor::distance_series`], [`Roughness`] |
 //!
 //! There are three variants ([`Variant`]):
 //! - `paper`: as published. Car roofs are flat, and cells far beyond the last point are inferred.
-//! - `grounded`: no point of a flat region lies off its plane; the region joins the ground under the vehicle without a
-//!   step, through passages that the vehicle fits through; only holes in seen ground are inferred.
+//! - `grounded`: no point of a flat region lies off its plane; its cells lie on the local ground, and the vehicle can
+//!   reach them; only holes in seen ground are inferred.
 //! - `grid`: each cell by itself, with the shape of its points.
 //!
 //! The result does not depend on the order of the points: all sums are over whole numbers.
 
 pub mod class;
 pub mod config;
+pub mod division;
 pub mod eigen;
-pub mod ground;
+pub mod holes;
 pub mod moments;
-pub mod reach;
 pub mod regions;
-pub mod roughness;
-pub mod shadow;
 
 use crate::layer::channel::TypedChannel;
 use crate::layer::class::drivable_share;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker, ScanExtras};
+use crate::layer::roughness::Roughness;
 use crate::sensor::sweep::Sweep;
 
 use class::{PLANE, ROUGHNESS, SHAPE, TerrainClass};
 use config::{TerrainConfig, Variant};
-use ground::Ground;
+use holes::{Holes, Role};
 use moments::{Cells, half_width};
-use reach::{CellKind, Reach};
 use regions::{FIRST_FLAT, NOT_FLAT, Plane, Regions};
-use roughness::Roughness;
-use shadow::Shadow;
-
-/// Least height of an obstacle that casts a shadow, metres. Ours: kerbs cast none; not tuned.
-const SHADOW_HEIGHT_M_MIN: f32 = 0.5;
 
 /// Maker of the layer `terrain`. It reuses its buffers from map to map.
 pub struct Terrain {
     config: TerrainConfig,
     cells: Cells,
     regions: Regions,
-    ground: Ground,
-    shadow: Shadow,
-    reach: Reach,
+    holes: Holes,
     roughness: Roughness,
     /// By cell: true if a point fell into it.
     seen: Vec<bool>,
@@ -68,41 +60,27 @@ impl Terrain {
     pub fn new(config: &TerrainConfig) -> Self {
         Self {
             config: config.clone(),
-            cells: Cells::new(config.range_m_max, config.cell_m),
+            cells: Cells::new(config.range_m_max, config.cell_m, config.variant.division()),
             regions: Regions::default(),
-            ground: Ground::default(),
-            shadow: Shadow::default(),
-            reach: Reach::default(),
+            holes: Holes::default(),
             roughness: Roughness::default(),
             seen: Vec::new(),
             class: Vec::new(),
         }
     }
 
-    /// Fills `class` from the regions; `sensor_m` is the height of the sensor over the ground.
-    fn classify(&mut self, sensor_m: f32) {
+    /// Fills `class` from the regions.
+    fn classify(&mut self, context: &Context<'_>) {
         let mut class = std::mem::take(&mut self.class);
         class.clear();
         let region_of = self.regions.of_cell();
         if self.config.variant == Variant::Grounded {
-            let joined = self.ground.joined();
             // Cells that are neither seen nor filled stay unknown.
             class.resize(region_of.len(), TerrainClass::Unknown);
-            for &cell in self.regions.cell_of_slot() {
-                class[cell as usize] = match region_of[cell as usize] {
-                    NOT_FLAT => TerrainClass::Obstacle,
-                    region @ FIRST_FLAT.. if joined[(region - FIRST_FLAT) as usize] => TerrainClass::Flat,
-                    FIRST_FLAT.. => TerrainClass::FlatElevated,
-                    _ => TerrainClass::Unknown,
-                };
+            for (slot, &cell) in self.regions.cell_of_slot().iter().enumerate() {
+                class[cell as usize] = self.class_of_slot(slot, region_of[cell as usize], context);
             }
-            for &cell in self.ground.filled() {
-                let class = &mut class[cell as usize];
-                if *class == TerrainClass::Unknown {
-                    *class = if self.seen[cell as usize] { TerrainClass::Flat } else { TerrainClass::FlatInferred };
-                }
-            }
-            self.remove_unreached(&mut class, sensor_m);
+            self.fill_holes(&mut class, context);
         } else {
             class.extend(region_of.iter().zip(&self.seen).map(|(&region, &seen)| match (region, seen) {
                 (NOT_FLAT, _) => TerrainClass::Obstacle,
@@ -114,50 +92,38 @@ impl Terrain {
         self.class = class;
     }
 
-    /// Marks flat cells that the vehicle cannot reach; inferred cells there become unknown.
-    fn remove_unreached(&mut self, class: &mut [TerrainClass], sensor_m: f32) {
-        let TerrainConfig { passage_m_min, blind_zone_m, cell_m, .. } = self.config;
-        let (cells, seen, bridged) = (&self.cells, &self.seen, self.ground.bridged());
-        self.shadow.clear(class.len(), |cell| cells.cell_centre_m(cell));
-        for (slot, &cell) in self
-            .regions
-            .cell_of_slot()
-            .iter()
-            .enumerate()
-            .filter(|(_, cell)| class[**cell as usize] == TerrainClass::Obstacle)
-        {
-            let [lowest_m, highest_m] = cells.span_m(slot);
-            if highest_m - lowest_m >= SHADOW_HEIGHT_M_MIN {
-                self.shadow.cast(cell as usize, cell_m, [lowest_m, highest_m], sensor_m);
-            }
+    /// Class of a cell with points, in the variant `grounded`: flat if all its points lie on the local ground.
+    fn class_of_slot(&self, slot: usize, region: u32, context: &Context<'_>) -> TerrainClass {
+        let [x, y] = self.cells.cell_centre_m(self.cells.cell_of_slot(slot));
+        let highest_m = self.cells.span_m(slot)[1] - context.ground_m(x, y);
+        match region {
+            _ if highest_m > self.config.step_m_max && region == NOT_FLAT => TerrainClass::Obstacle,
+            _ if highest_m > self.config.step_m_max && region >= FIRST_FLAT => TerrainClass::FlatElevated,
+            _ if region != NOT_FLAT && region < FIRST_FLAT => TerrainClass::Unknown,
+            _ if context.is_reached(x, y) => TerrainClass::Flat,
+            _ => TerrainClass::FlatUnreachable,
         }
+    }
 
-        let (regions, joined, shadow) = (self.regions.of_cell(), self.ground.joined(), &self.shadow);
-        let is_ground = |region: u32| region >= FIRST_FLAT && joined[(region - FIRST_FLAT) as usize];
-        let width = cells.width();
-        let blind = (blind_zone_m / cell_m).ceil() as usize;
-        let is_near = |ix: usize| ix + blind >= width / 2 && ix < width / 2 + blind;
-        let kind = |ix: usize, iy: usize| match (iy * width + ix, class[iy * width + ix]) {
-            (_, TerrainClass::Flat) => CellKind::Open,
-            (_, TerrainClass::Obstacle | TerrainClass::FlatElevated) => CellKind::Closed,
-            (cell, _) if seen[cell] => CellKind::NoGround,
-            (_, TerrainClass::FlatInferred) => CellKind::Open,
-            (cell, _) if (bridged[cell] || is_ground(regions[cell])) && !shadow.hides(cell) => CellKind::Open,
-            (cell, _) if is_near(ix) && is_near(iy) && shadow.distance_m(cell) <= blind_zone_m => CellKind::Open,
-            _ => CellKind::NoGround,
+    /// Infers narrow holes in flat ground that the vehicle can reach. A seen cell with too few points to be judged is
+    /// flat in such a hole if they lie on the local ground.
+    fn fill_holes(&mut self, class: &mut [TerrainClass], context: &Context<'_>) {
+        let (cells, seen, width) = (&self.cells, &self.seen, self.cells.width());
+        let span = (self.config.inference_m_max / self.config.cell_m).round() as usize;
+        let is_low = |cell: usize| {
+            let [x, y] = cells.cell_centre_m(cell);
+            cells.span_m(cells.slot_of_cell(cell))[1] - context.ground_m(x, y) <= self.config.step_m_max
         };
-        // Radius, in cells, of the largest disc sure to fit through a passage of `passage_m_min`.
-        let radius = ((passage_m_min / cell_m - 2.0) / 2.0).max(0.0) as usize;
-        self.reach.flood(width, radius, kind);
-        for (iy, row) in class.chunks_exact_mut(width).enumerate() {
-            for (ix, class) in row.iter_mut().enumerate() {
-                if matches!(*class, TerrainClass::Flat | TerrainClass::FlatInferred) && !self.reach.reached(ix, iy) {
-                    *class = if *class == TerrainClass::Flat {
-                        TerrainClass::FlatUnreachable
-                    } else {
-                        TerrainClass::Unknown
-                    };
-                }
+        self.holes.find(width, span, |cell| match class[cell] {
+            TerrainClass::Flat => Role::Flat,
+            TerrainClass::Unknown if !seen[cell] || is_low(cell) => Role::Fillable,
+            _ => Role::Barrier,
+        });
+        for &cell in self.holes.cells() {
+            let cell = cell as usize;
+            let [x, y] = cells.cell_centre_m(cell);
+            if context.is_reached(x, y) {
+                class[cell] = if seen[cell] { TerrainClass::Flat } else { TerrainClass::FlatInferred };
             }
         }
     }
@@ -165,16 +131,23 @@ impl Terrain {
     /// Writes the roughness of the flat cells (section 2.4); `raw` is empty before.
     fn write_roughness(&mut self, sweep: &Sweep, raw: &mut Vec<u8>) {
         raw.resize(self.class.len(), ROUGHNESS.unknown);
-        if sweep.deviation_m.is_empty() {
+        if sweep.deviation.is_empty() {
             return;
         }
-        self.roughness.sum(sweep, &self.cells);
+        self.roughness.clear(self.cells.slots());
+        let points = self.cells.slot_of_points().zip(&sweep.deviation).zip(&sweep.noise);
+        for ((slot, &deviation), &noise) in points {
+            if let Some(slot) = slot {
+                self.roughness.add(slot, deviation, noise);
+            }
+        }
         for (slot, &cell) in self.regions.cell_of_slot().iter().enumerate() {
             let cell = cell as usize;
-            if self.class[cell] == TerrainClass::Flat {
-                let [x, y] = self.cells.cell_centre_m(cell);
-                let distance_m = (x * x + y * y + sweep.mount_height_m * sweep.mount_height_m).sqrt();
-                raw[cell] = self.roughness.raw(slot, distance_m, &self.config);
+            let is_flat = matches!(self.class[cell], TerrainClass::Flat | TerrainClass::FlatUnreachable);
+            let known = self.roughness.of_cell(slot, self.config.roughness_points_min).filter(|_| is_flat);
+            if let Some(roughness) = known {
+                let steps = (roughness / ROUGHNESS.scale).round() as u32;
+                raw[cell] = steps.min(u32::from(ROUGHNESS.unknown) - 1) as u8;
             }
         }
     }
@@ -234,19 +207,19 @@ impl LayerMaker for Terrain {
     }
 
     fn uses(&self) -> ScanExtras {
-        ScanExtras { deviations: true, ..ScanExtras::default() }
+        ScanExtras { ground: true, deviations: true, ..ScanExtras::default() }
     }
 
-    fn make(&mut self, sweep: &Sweep, _: &Context<'_>, layer: &mut Layer) {
-        self.cells.sort_points(sweep, self.config.overhang_m);
+    fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
+        // The paper takes heights over the plane under the vehicle.
+        let is_ours = self.config.variant == Variant::Grounded;
+        let heights_m = if is_ours { context.heights_m(sweep) } else { &sweep.z };
+        self.cells.sort_points(sweep, heights_m, self.config.overhang_m);
         self.regions.divide(&self.cells, &self.config);
         self.seen.clear();
         self.seen.resize(self.regions.of_cell().len(), false);
         self.regions.cell_of_slot().iter().for_each(|cell| self.seen[*cell as usize] = true);
-        if self.config.variant == Variant::Grounded {
-            self.ground.join_and_fill(&self.cells, &self.regions, &self.seen, &self.config);
-        }
-        self.classify(sweep.mount_height_m);
+        self.classify(context);
         self.write(sweep, layer);
     }
 }

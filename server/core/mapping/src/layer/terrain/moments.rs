@@ -1,13 +1,14 @@
 //! Points -> cells, and the sums for a principal component analysis over any region of the division, in O(1).
 //!
 //! In: a [`Sweep`], ego frame, metres. Out: for each cell with a point its ten moments in whole millimetres, and their
-//! running sums in the order of the division. The division cuts a square into four quarters, and each quarter again,
-//! down to one cell (Morton order). A region of the division is a range of that order, so its sums are one difference.
-//! Only cells with points have an entry ("slot"): a tenth of the cells on real scans.
+//! running sums in the order of the [`division`](super::division). A region of the division is a range of that order,
+//! so its sums are one difference. Only cells with points have an entry ("slot"): a tenth of the cells on real scans.
 //!
 //! Sums of whole numbers are exact, so that they do not depend on the order of the points.
 
 use crate::sensor::sweep::Sweep;
+
+use super::division::{Division, Region, cell_of_rank};
 
 /// Cell of a point that lies in no cell.
 const NOWHERE: u32 = u32::MAX;
@@ -78,16 +79,20 @@ impl Moments {
 pub struct Cells {
     /// Number of cells from the ego origin to the grid's edge.
     half: i32,
-    /// Number of cells from the ego origin to the edge of the division, a power of two.
-    root_half: i32,
+    /// Number of cells along a side of the divided square: of the grid, or more.
+    side: u32,
     cell_m: f32,
-    /// Code of each point's cell; after the slots are numbered, its slot.
+    /// Rank of each cell of the grid in the order of the division.
+    rank_of_cell: Vec<u32>,
+    /// Index in the grid of the cell of each rank; [`NOWHERE`] for a cell beyond the grid.
+    cell_of_rank: Vec<u32>,
+    /// Cell of each point; then the rank of that cell; after the slots are numbered, its slot.
     cell_of_point: Vec<u32>,
-    /// One bit for each cell of the division, by code: set if the cell has a point.
+    /// One bit for each cell of the grid, by rank: set if the cell has a point.
     occupied: Vec<u64>,
     /// Number of occupied cells before each word of `occupied`.
     slots_before: Vec<u32>,
-    code_of_slot: Vec<u32>,
+    rank_of_slot: Vec<u32>,
     /// Sums over all slots before; one entry more than slots.
     sums: Vec<Moments>,
     /// Heights of the lowest and highest point of each slot, mm.
@@ -102,61 +107,100 @@ pub fn half_width(range_m_max: f32, cell_m: f32) -> i32 {
 
 impl Cells {
     /// A grid that ends `range_m_max` from the ego origin in each direction.
-    pub fn new(range_m_max: f32, cell_m: f32) -> Self {
+    pub fn new(range_m_max: f32, cell_m: f32, division: Division) -> Self {
         let half = half_width(range_m_max, cell_m);
-        let root_half = (half as u32).next_power_of_two() as i32;
-        Self { half, root_half, cell_m, ..Self::default() }
+        let width = 2 * half as u32;
+        let side = division.side(width);
+        let margin = (side - width) / 2;
+        let mut cell_of_rank = cell_of_rank(side);
+        let mut rank_of_cell = vec![0; (width * width) as usize];
+        for (rank, cell) in (0..).zip(&mut cell_of_rank) {
+            let (x, y) = ((*cell % side).wrapping_sub(margin), (*cell / side).wrapping_sub(margin));
+            *cell = if x < width && y < width { y * width + x } else { NOWHERE };
+            if let Some(of_cell) = rank_of_cell.get_mut(*cell as usize) {
+                *of_cell = rank;
+            }
+        }
+        Self { half, side, cell_m, rank_of_cell, cell_of_rank, ..Self::default() }
     }
 
-    /// Assigns the points to cells, and sums them. Points above `overhang_m` or beyond the grid are left out.
-    pub fn sort_points(&mut self, sweep: &Sweep, overhang_m: f32) {
-        self.find_cells(sweep, overhang_m);
+    /// The region with which the division begins.
+    pub fn whole(&self) -> Region {
+        Region::whole(self.side)
+    }
+
+    /// The part of a region that lies in the grid: first column, first row, end of columns, end of rows.
+    pub fn extent(&self, region: &Region) -> [u32; 4] {
+        let width = 2 * self.half as u32;
+        let margin = (self.side - width) / 2;
+        let Region { x, y, width: columns, height: rows, .. } = *region;
+        [x, y, x + columns, y + rows].map(|index| index.saturating_sub(margin).min(width))
+    }
+
+    /// Assigns the points to cells, and sums them. Points that are higher over the ground than `overhang_m`, and points
+    /// beyond the grid, are left out. `heights_m` are the heights of the points over the ground, metres.
+    pub fn sort_points(&mut self, sweep: &Sweep, heights_m: &[f32], overhang_m: f32) {
+        self.find_cells(sweep, heights_m, overhang_m);
         self.number_slots();
         self.sum(sweep);
     }
 
-    fn find_cells(&mut self, sweep: &Sweep, overhang_m: f32) {
-        let (scale, half, root_half) = (1.0 / self.cell_m, self.half as f32, self.root_half);
+    fn find_cells(&mut self, sweep: &Sweep, heights_m: &[f32], overhang_m: f32) {
+        let (scale, half) = (1.0 / self.cell_m, self.half as f32);
+        let (offset, width) = (self.half, 2 * self.half as u32);
         self.cell_of_point.resize(sweep.x.len(), NOWHERE);
-        for (((code, &x), &y), &z) in self.cell_of_point.iter_mut().zip(&sweep.x).zip(&sweep.y).zip(&sweep.z) {
+        for (((cell, &x), &y), &height) in self.cell_of_point.iter_mut().zip(&sweep.x).zip(&sweep.y).zip(heights_m) {
             let (i, j) = (x * scale, y * scale);
             // NaN fails every comparison.
-            let inside = (i >= -half) & (i < half) & (j >= -half) & (j < half) & (z <= overhang_m) & (z > -DEPTH_M_MAX);
+            let inside = (i >= -half)
+                & (i < half)
+                & (j >= -half)
+                & (j < half)
+                & (height <= overhang_m)
+                & (height > -DEPTH_M_MAX);
             // Far outside the value wraps, and is not used.
-            let spread = |value: f32| morton(floor(value).wrapping_add(root_half) as u32);
-            let found = spread(i) | spread(j) << 1;
-            *code = if inside { found } else { NOWHERE };
+            let [i, j] = [i, j].map(|value| floor(value).wrapping_add(offset) as u32);
+            let found = j.wrapping_mul(width).wrapping_add(i);
+            *cell = if inside { found } else { NOWHERE };
         }
     }
 
     fn number_slots(&mut self) {
-        let cells = (4 * self.root_half * self.root_half) as usize;
         self.occupied.clear();
-        self.occupied.resize(cells.div_ceil(64), 0);
-        for &code in self.cell_of_point.iter().filter(|code| **code != NOWHERE) {
-            self.occupied[(code >> 6) as usize] |= 1 << (code & 63);
+        self.occupied.resize(self.cell_of_rank.len().div_ceil(64), 0);
+        // Neighbouring points of a laser mostly share a cell.
+        let (mut last, mut rank) = (NOWHERE, NOWHERE);
+        for cell in &mut self.cell_of_point {
+            if *cell != last {
+                last = *cell;
+                rank = self.rank_of_cell.get(last as usize).copied().unwrap_or(NOWHERE);
+                if rank != NOWHERE {
+                    self.occupied[(rank >> 6) as usize] |= 1 << (rank & 63);
+                }
+            }
+            *cell = rank;
         }
         self.slots_before.clear();
-        self.code_of_slot.clear();
+        self.rank_of_slot.clear();
         for (word, &bits) in self.occupied.iter().enumerate() {
-            self.slots_before.push(self.code_of_slot.len() as u32);
+            self.slots_before.push(self.rank_of_slot.len() as u32);
             let mut left = bits;
             while left != 0 {
-                self.code_of_slot.push((word as u32) << 6 | left.trailing_zeros());
+                self.rank_of_slot.push((word as u32) << 6 | left.trailing_zeros());
                 left &= left - 1;
             }
         }
     }
 
     fn sum(&mut self, sweep: &Sweep) {
-        let slots = self.code_of_slot.len();
+        let slots = self.rank_of_slot.len();
         self.sums.clear();
         self.sums.resize(slots + 1, Moments::default());
         self.span.clear();
         self.span.resize(slots, [f32::INFINITY, -f32::INFINITY]);
         // Neighbouring points of a laser mostly share a cell, so they are summed before the sums are written.
         let nothing = (Moments::default(), f32::INFINITY, -f32::INFINITY);
-        let (mut code, mut slot_of_code, (mut held, mut low, mut high)) = (NOWHERE, NOWHERE, nothing);
+        let (mut rank, mut slot_of_rank, (mut held, mut low, mut high)) = (NOWHERE, NOWHERE, nothing);
         let mut write = |slot: u32, held: &Moments, low: f32, high: f32| {
             if slot != NOWHERE {
                 let slot = slot as usize;
@@ -167,18 +211,18 @@ impl Cells {
         };
         let points = self.cell_of_point.iter_mut().zip(&sweep.x).zip(&sweep.y).zip(&sweep.z);
         for (((cell, &x), &y), &z) in points {
-            if *cell != code {
-                write(slot_of_code, &held, low, high);
-                (code, (held, low, high)) = (*cell, nothing);
-                let inside = code != NOWHERE;
-                slot_of_code = if inside { slot(&self.occupied, &self.slots_before, code) as u32 } else { NOWHERE };
+            if *cell != rank {
+                write(slot_of_rank, &held, low, high);
+                (rank, (held, low, high)) = (*cell, nothing);
+                let inside = rank != NOWHERE;
+                slot_of_rank = if inside { slot(&self.occupied, &self.slots_before, rank) as u32 } else { NOWHERE };
             }
-            *cell = slot_of_code;
+            *cell = slot_of_rank;
             let [x, y, z] = [x, y, z].map(millimetres);
             held.add([x, y, z]);
             (low, high) = (if z < low { z } else { low }, if z > high { z } else { high });
         }
-        write(slot_of_code, &held, low, high);
+        write(slot_of_rank, &held, low, high);
         let mut running = Moments::default();
         for sums in &mut self.sums {
             running = running.plus(sums);
@@ -191,42 +235,32 @@ impl Cells {
         2 * self.half as usize
     }
 
-    /// Number of cells along a side of the division, a power of two.
-    pub fn root_width(&self) -> usize {
-        2 * self.root_half as usize
-    }
-
-    /// Number of cells between the edges of the grid and of the division, on each side.
-    pub fn margin(&self) -> usize {
-        (self.root_half - self.half) as usize
-    }
-
     /// Side of a cell, metres.
     pub fn cell_m(&self) -> f32 {
         self.cell_m
     }
 
-    /// Centre of a cell along one axis, ego frame, metres; `index` counts cells of the division.
+    /// Centre of a column or row of cells along its axis, ego frame, metres.
     pub fn centre_m(&self, index: usize) -> f32 {
-        (index as f32 - self.root_half as f32 + 0.5) * self.cell_m
+        (index as f32 - self.half as f32 + 0.5) * self.cell_m
     }
 
     /// Centre (x, y) of a cell of the grid, ego frame, metres.
     pub fn cell_centre_m(&self, cell: usize) -> [f32; 2] {
-        [cell % self.width(), cell / self.width()].map(|index| self.centre_m(index + self.margin()))
+        [cell % self.width(), cell / self.width()].map(|index| self.centre_m(index))
     }
 
     /// Number of slots: of cells with a point.
     pub fn slots(&self) -> usize {
-        self.code_of_slot.len()
+        self.rank_of_slot.len()
     }
 
-    /// Number of slots before the cell with this code, occupied or not; the code may be one past the last.
-    pub fn slots_before(&self, code: u32) -> usize {
-        if (code >> 6) as usize >= self.occupied.len() {
+    /// Number of slots before the cell of this rank, occupied or not; the rank may be one past the last.
+    pub fn slots_before(&self, rank: u32) -> usize {
+        if (rank >> 6) as usize >= self.occupied.len() {
             return self.slots();
         }
-        slot(&self.occupied, &self.slots_before, code)
+        slot(&self.occupied, &self.slots_before, rank)
     }
 
     /// Sums over the slots `from..to`.
@@ -239,14 +273,14 @@ impl Cells {
         self.span[slot].map(|mm| mm * 1e-3)
     }
 
-    /// The slot of the cell with these indices in the division. The cell must have a point.
-    pub fn slot_at(&self, x: usize, y: usize) -> usize {
-        self.slots_before(morton(x as u32) | morton(y as u32) << 1)
+    /// The slot of a cell of the grid. The cell must have a point.
+    pub fn slot_of_cell(&self, cell: usize) -> usize {
+        self.slots_before(self.rank_of_cell[cell])
     }
 
-    /// Code of a slot's cell.
-    pub fn code(&self, slot: usize) -> u32 {
-        self.code_of_slot[slot]
+    /// Index of a slot's cell in the grid.
+    pub fn cell_of_slot(&self, slot: usize) -> usize {
+        self.cell_of_rank[self.rank_of_slot[slot] as usize] as usize
     }
 
     /// The slot of each point, in the sweep's order; `None` for points that are left out.
@@ -255,10 +289,10 @@ impl Cells {
     }
 }
 
-/// Number of occupied cells before the cell with this code.
-fn slot(occupied: &[u64], slots_before: &[u32], code: u32) -> usize {
-    let word = (code >> 6) as usize;
-    let before = occupied[word] & ((1 << (code & 63)) - 1);
+/// Number of occupied cells before the cell of this rank.
+fn slot(occupied: &[u64], slots_before: &[u32], rank: u32) -> usize {
+    let word = (rank >> 6) as usize;
+    let before = occupied[word] & ((1 << (rank & 63)) - 1);
     (slots_before[word] + before.count_ones()) as usize
 }
 
@@ -276,40 +310,12 @@ fn floor(value: f32) -> i32 {
     whole.wrapping_sub(i32::from(nearest - WHOLE > value))
 }
 
-/// Spreads the lower 16 bits of an index to the even bits.
-fn morton(index: u32) -> u32 {
-    let mut bits = index & 0xffff;
-    bits = (bits | bits << 8) & 0x00ff_00ff;
-    bits = (bits | bits << 4) & 0x0f0f_0f0f;
-    bits = (bits | bits << 2) & 0x3333_3333;
-    (bits | bits << 1) & 0x5555_5555
-}
-
-/// Indices (x, y) of a code's cell in the division.
-pub fn indices(code: u32) -> (usize, usize) {
-    let gather = |code: u32| {
-        let mut bits = code & 0x5555_5555;
-        bits = (bits | bits >> 1) & 0x3333_3333;
-        bits = (bits | bits >> 2) & 0x0f0f_0f0f;
-        bits = (bits | bits >> 4) & 0x00ff_00ff;
-        ((bits | bits >> 8) & 0xffff) as usize
-    };
-    (gather(code), gather(code >> 1))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn a_code_gives_back_its_indices() {
-        for (x, y) in [(0, 0), (1, 0), (0, 1), (511, 3), (1023, 1023)] {
-            assert_eq!(indices(morton(x) | morton(y) << 1), (x as usize, y as usize));
-        }
-    }
-
-    #[test]
-    fn the_sums_over_a_quarter_are_those_of_its_points() {
+    fn the_sums_over_a_region_are_those_of_its_points() {
         let mut sweep = Sweep::default();
         for k in 0..5000 {
             let (angle, range) = (k as f32 * 0.7, 0.012 * k as f32);
@@ -317,22 +323,31 @@ mod tests {
             sweep.y.push(range * angle.sin());
             sweep.z.push(0.1 * angle.sin() - 0.2);
         }
-        let mut cells = Cells::new(20.0, 0.25);
-        cells.sort_points(&sweep, 2.5);
-        assert_eq!((cells.width(), cells.root_width(), cells.margin()), (160, 256, 48));
-        for (side, corner) in [(256usize, (0usize, 0usize)), (64, (64, 128)), (8, (120, 136)), (1, (130, 127))] {
-            let code = morton(corner.0 as u32) | morton(corner.1 as u32) << 1;
-            let (from, to) = (cells.slots_before(code), cells.slots_before(code + (side * side) as u32));
-            let mut direct = Moments::default();
-            for k in 0..sweep.x.len() {
-                let (x, y) = (sweep.x[k], sweep.y[k]);
-                let index = |v: f32| (floor(v * 4.0) + 128) as usize;
-                let within = |v: f32, first: usize| v.abs() < 20.0 && (first..first + side).contains(&index(v));
-                if within(x, corner.0) && within(y, corner.1) {
-                    direct.add([x, y, sweep.z[k]].map(millimetres));
+        for (division, side, margin) in [(Division::Halves, 160, 0), (Division::Quarters, 256, 48)] {
+            let mut cells = Cells::new(20.0, 0.25, division);
+            cells.sort_points(&sweep, &sweep.z, 2.5);
+            assert_eq!((cells.width(), cells.whole()), (160, Region::whole(side)));
+            let mut region = cells.whole();
+            for take_second in
+                [false, true, true, false, true, false, true, true, false, false, true, true, false, true]
+            {
+                let (from, to) = (cells.slots_before(region.rank), cells.slots_before(region.rank + region.cells()));
+                let mut direct = Moments::default();
+                for k in 0..sweep.x.len() {
+                    let (x, y) = (sweep.x[k], sweep.y[k]);
+                    let index = |v: f32| (floor(v * 4.0) + 80) as u32 + margin;
+                    let within =
+                        |v: f32, first: u32, cells: u32| v.abs() < 20.0 && (first..first + cells).contains(&index(v));
+                    if within(x, region.x, region.width) && within(y, region.y, region.height) {
+                        direct.add([x, y, sweep.z[k]].map(millimetres));
+                    }
                 }
+                assert_eq!(cells.moments(from, to), direct, "{region:?}");
+                region = region.halves().unwrap()[usize::from(take_second)];
             }
-            assert_eq!(cells.moments(from, to), direct, "side {side}");
+            for slot in 0..cells.slots() {
+                assert_eq!(cells.slot_of_cell(cells.cell_of_slot(slot)), slot);
+            }
         }
     }
 }

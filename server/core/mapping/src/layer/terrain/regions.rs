@@ -2,14 +2,14 @@
 //!
 //! In: [`Cells`] with their sums. Out: flat regions with a plane each, and for each cell of the grid its flat region,
 //! or that it is an obstacle, or that it is not known. The division starts with the whole square. A region whose local
-//! height disturbance h is below the threshold is flat; any other region is divided again, down to one cell, which then
-//! is an obstacle. The paper divides a region into two along its longest axis. Here a square is divided into four
-//! quarters, because then a region is a range of the order of [`super::moments`]; no parameter restores the paper.
+//! height disturbance h is below the threshold is flat; any other region is divided ([`super::division`]), down to one
+//! cell, which then is an obstacle.
 
 use super::class::Shape;
 use super::config::{TerrainConfig, Variant};
+use super::division::Region;
 use super::eigen::Principal;
-use super::moments::{Cells, Moments, indices};
+use super::moments::{Cells, Moments};
 
 /// Region of a cell that lies in no region with enough points to be judged.
 pub const NOT_JUDGED: u32 = 0;
@@ -58,8 +58,8 @@ pub struct Regions {
     /// By slot: the cell's index in the grid.
     cell_of_slot: Vec<u32>,
     shape_of_cell: Vec<Shape>,
-    /// Regions still to be judged: code of the first cell, side in cells.
-    waiting: Vec<(u32, u32)>,
+    /// Regions still to be judged.
+    waiting: Vec<Region>,
 }
 
 impl Regions {
@@ -72,13 +72,10 @@ impl Regions {
         self.of_cell.resize(width * width, NOT_JUDGED);
         self.shape_of_cell.clear();
         self.cell_of_slot.clear();
-        self.cell_of_slot.extend((0..cells.slots()).map(|slot| {
-            let (x, y) = indices(cells.code(slot));
-            ((y - cells.margin()) * width + x - cells.margin()) as u32
-        }));
+        self.cell_of_slot.extend((0..cells.slots()).map(|slot| cells.cell_of_slot(slot) as u32));
         match config.variant {
             Variant::Grid => self.judge_cells(cells, config),
-            Variant::Paper | Variant::Grounded => self.divide_square(cells, config),
+            Variant::Paper | Variant::Grounded => self.divide_grid(cells, config),
         }
     }
 
@@ -98,12 +95,13 @@ impl Regions {
         }
     }
 
-    /// Divides the square hierarchically (section 2.3).
-    fn divide_square(&mut self, cells: &Cells, config: &TerrainConfig) {
+    /// Divides the grid hierarchically (section 2.3).
+    fn divide_grid(&mut self, cells: &Cells, config: &TerrainConfig) {
         self.waiting.clear();
-        self.waiting.push((0, cells.root_width() as u32));
-        while let Some((code, side)) = self.waiting.pop() {
-            let (from, to) = (cells.slots_before(code), cells.slots_before(code + side * side));
+        let division = config.variant.division();
+        self.waiting.push(cells.whole());
+        while let Some(region) = self.waiting.pop() {
+            let (from, to) = (cells.slots_before(region.rank), cells.slots_before(region.rank + region.cells()));
             if from == to {
                 continue;
             }
@@ -112,21 +110,18 @@ impl Regions {
             if moments.points() < f64::from(config.points_min) {
                 continue;
             }
-            if is_flat(&moments, f64::from(config.flatness_m2_max)) {
+            if division.judges(&region) && is_flat(&moments, f64::from(config.flatness_m2_max)) {
                 let plane = Plane::fit(&moments, f64::from(config.noise_m).powi(2));
                 if config.variant == Variant::Paper || is_ground_like(&plane, cells, from..to, config) {
                     self.planes.push(plane);
-                    let region = FIRST_FLAT + self.planes.len() as u32 - 1;
-                    self.paint(cells, code, side, region);
+                    self.paint(cells.width(), cells.extent(&region), FIRST_FLAT + self.planes.len() as u32 - 1);
                     continue;
                 }
             }
-            if side == 1 {
-                self.of_cell[self.cell_of_slot[from] as usize] = NOT_FLAT;
-            } else {
-                let quarter = side / 2;
-                // The last region pushed is judged first, so that regions are judged in the order of their codes.
-                self.waiting.extend((0..4).rev().map(|part| (code + part * quarter * quarter, quarter)));
+            match region.halves() {
+                // The last region pushed is judged first, so that regions are judged in the order of the division.
+                Some([first, second]) => self.waiting.extend([second, first]),
+                None => self.of_cell[self.cell_of_slot[from] as usize] = NOT_FLAT,
             }
         }
     }
@@ -138,17 +133,11 @@ impl Regions {
     }
 
     /// Writes a region into its cells.
-    fn paint(&mut self, cells: &Cells, code: u32, side: u32, region: u32) {
-        let (x, y) = indices(code);
-        let within = |first: usize| {
-            let clip = |index: usize| index.saturating_sub(cells.margin()).min(cells.width());
-            clip(first)..clip(first + side as usize)
-        };
-        let (columns, rows) = (within(x), within(y));
-        self.extents.push([columns.start, rows.start, columns.end, rows.end].map(|index| index as u32));
-        for row in rows {
-            let first = row * cells.width();
-            self.of_cell[first + columns.start..first + columns.end].fill(region);
+    fn paint(&mut self, width: usize, extent: [u32; 4], value: u32) {
+        self.extents.push(extent);
+        let [left, low, right, high] = extent.map(|index| index as usize);
+        for row in low..high {
+            self.of_cell[row * width + left..row * width + right].fill(value);
         }
     }
 
@@ -205,8 +194,8 @@ fn is_ground_like(plane: &Plane, cells: &Cells, slots: std::ops::Range<usize>, c
     let [a, b, _] = plane.0;
     let allowed = config.residual_m_max + (a.abs() + b.abs()) * cells.cell_m() / 2.0;
     slots.into_iter().all(|slot| {
-        let (x, y) = indices(cells.code(slot));
-        let height = plane.height_m(cells.centre_m(x), cells.centre_m(y));
+        let [x, y] = cells.cell_centre_m(cells.cell_of_slot(slot));
+        let height = plane.height_m(x, y);
         let [lowest, highest] = cells.span_m(slot);
         highest - height <= allowed && height - lowest <= allowed
     })

@@ -1,0 +1,113 @@
+//! The plane of the ground near the vehicle.
+//!
+//! In: the lowest returns of the cells, ego frame. Out: a plane z = ax + by + c, metres, found by least squares over
+//! the cells near the vehicle, repeated with ever smaller tolerances. Cells are smaller near the vehicle, so near
+//! ground weighs most.
+
+use super::polar::{COLUMNS, PolarCells, ROWS, column_directions, row_start_m};
+
+/// Largest range of the cells, metres. Ours: farther ground need not lie in the plane.
+const RANGE_M_MAX: f32 = 12.0;
+/// By round: how far a return may lie above and below the plane, metres, and how much more a metre of range allows.
+/// Ours: the first round allows a mount that is wrong by 0.3 m and 6 degrees, the last the noise and the crown of a
+/// road.
+const TOLERANCES: [[f32; 3]; 6] = [
+    [0.35, 0.6, 0.10],
+    [0.35, 0.6, 0.05],
+    [0.30, 0.45, 0.02],
+    [0.22, 0.30, 0.01],
+    [0.17, 0.20, 0.0],
+    [0.14, 0.16, 0.0],
+];
+/// Least number of cells that define the plane. Ours: half of those that a VLP-16 fills; the returns of sensors in the
+/// bumper, which see objects and no ground so near, fill a hundred.
+const CELLS_MIN: usize = 300;
+/// Steepest plane. Ours: no vehicle stands on a steeper one.
+const SLOPE_MAX: f32 = 0.3;
+/// Least number of directions, of 12, in which the cells lie. Ours: ground on one side does not define the plane.
+const DIRECTIONS_MIN: u32 = 4;
+
+/// The plane of the ground near the vehicle.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct NearPlane {
+    /// Rise over run along x, rise over run along y, height at the ego origin in metres.
+    pub abc: [f32; 3],
+    /// True if returns define the plane; else it is the plane z = 0 under the configured mount.
+    pub is_seen: bool,
+}
+
+impl NearPlane {
+    /// Height of the plane, metres.
+    #[inline(always)]
+    pub fn height_m(&self, x: f32, y: f32) -> f32 {
+        let [a, b, c] = self.abc;
+        a * x + b * y + c
+    }
+
+    /// Fits the plane; the plane z = 0 if too few returns lie near one.
+    pub fn fit(cells: &PolarCells) -> Self {
+        let directions = column_directions();
+        let rows = (0..ROWS).take_while(|row| row_start_m(*row) < RANGE_M_MAX).count();
+        let near: Vec<(usize, usize)> = (0..rows)
+            .flat_map(|row| (0..COLUMNS).map(move |column| (row, column)))
+            .filter(|(row, column)| cells.is_seen(row * COLUMNS + column))
+            .collect();
+        let mut plane = Self::default();
+        for [above, below, a_metre] in TOLERANCES {
+            let mut sums = Sums::default();
+            for &(row, column) in &near {
+                let [cos, sin] = directions[column];
+                let found = cells.lowest(row * COLUMNS + column).find_map(|point| {
+                    let (x, y) = (point.range_m * cos, point.range_m * sin);
+                    let over = point.z_m - plane.height_m(x, y);
+                    let more = a_metre * point.range_m;
+                    (over >= -below - more).then_some((over <= above + more).then_some([x, y, point.z_m]))
+                });
+                if let Some(Some(point)) = found {
+                    sums.add(point, column * 12 / COLUMNS);
+                }
+            }
+            match sums.solve() {
+                Some(abc @ [a, b, _]) if a * a + b * b <= SLOPE_MAX * SLOPE_MAX => plane = Self { abc, is_seen: true },
+                _ => return Self::default(),
+            }
+        }
+        plane
+    }
+}
+
+/// Sums of the normal equations.
+#[derive(Default)]
+struct Sums {
+    cells: usize,
+    directions: u32,
+    /// Σx, Σy, Σz, Σxx, Σxy, Σyy, Σxz, Σyz.
+    of: [f64; 8],
+}
+
+impl Sums {
+    fn add(&mut self, point: [f32; 3], direction: usize) {
+        let [x, y, z] = point.map(f64::from);
+        self.cells += 1;
+        self.directions |= 1 << direction;
+        let terms = [x, y, z, x * x, x * y, y * y, x * z, y * z];
+        self.of.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
+    }
+
+    /// The plane of least squares; `None` if the returns do not define one.
+    fn solve(&self) -> Option<[f32; 3]> {
+        if self.cells < CELLS_MIN || self.directions.count_ones() < DIRECTIONS_MIN {
+            return None;
+        }
+        let n = self.cells as f64;
+        let [x, y, z, xx, xy, yy, xz, yz] = self.of.map(|sum| sum / n);
+        let (xx, xy, yy, xz, yz) = (xx - x * x, xy - x * y, yy - y * y, xz - x * z, yz - y * z);
+        let determinant = xx * yy - xy * xy;
+        // A square metre each way: less does not define the slopes.
+        if determinant < 1.0 {
+            return None;
+        }
+        let (a, b) = ((yy * xz - xy * yz) / determinant, (xx * yz - xy * xz) / determinant);
+        Some([a as f32, b as f32, (z - a * x - b * y) as f32])
+    }
+}

@@ -1,0 +1,254 @@
+//! The polar grid of the ground estimate, and the lowest returns of each of its cells.
+//!
+//! In: a sweep, ego frame, metres. Out: for each cell its three lowest returns and the height of its highest one. The
+//! columns are azimuths about the ego origin. The rows are eight steps to a doubling of the squared range, so that a
+//! row follows from the bits of a float without a root or a logarithm. A return is kept as one whole number, so that
+//! the order of the points does not matter.
+
+use std::f32::consts::TAU;
+
+use crate::layer::radial_grid::{AzimuthColumns, floor_to_whole};
+use crate::sensor::sweep::Sweep;
+use crate::vehicle_outline::Outline;
+
+/// Number of columns: two degrees each. Ours: at 10 m a column is about as wide as a row is deep.
+pub const COLUMNS: usize = AzimuthColumns::TWO_DEGREES as usize;
+/// Number of rows: ten doublings of the squared range, from 2 to 64 m.
+pub const ROWS: usize = 80;
+/// Number of cells.
+pub const CELLS: usize = ROWS * COLUMNS;
+/// Range at which the first row begins, metres. Ours: nearer returns are the vehicle itself.
+pub const RANGE_M_MIN: f32 = 2.0;
+/// Range at which the last row ends, metres.
+pub const RANGE_M_MAX: f32 = 64.0;
+
+/// Bits of a squared range below the number of its row.
+const ROW_SHIFT: u32 = 20;
+/// Number of returns a cell keeps.
+const KEPT: usize = 3;
+/// Return of a cell without one.
+const NONE: u32 = u32::MAX;
+/// Offset that makes each height positive, metres, plus half a millimetre for rounding.
+const OFFSET_M: f32 = 32.0005;
+/// Steps of a return's place within its cell, along the range and along the azimuth.
+const PLACES: f32 = 256.0;
+/// Number of points that are processed together. Ours: their intermediate values fit into the first-level cache.
+const CHUNK: usize = 1024;
+
+/// One return of a cell.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Return {
+    /// Range, metres.
+    pub range_m: f32,
+    /// Height in the ego frame, metres.
+    pub z_m: f32,
+}
+
+/// The returns of each cell; index `row * COLUMNS + column`.
+pub struct PolarCells {
+    azimuths: AzimuthColumns,
+    outline: Outline,
+    /// The lowest returns of each cell, ascending: height in millimetres in the upper 16 bits, then the place within
+    /// the cell along the range and along the azimuth, 8 bits each.
+    lowest: Vec<[u32; KEPT]>,
+    /// Row and column coordinate by point of the sweep.
+    coordinates: [Vec<f32>; 2],
+    /// Height of the highest return of each cell, as the upper 16 bits of a return.
+    highest: Vec<u16>,
+}
+
+impl PolarCells {
+    /// Cells without returns around a vehicle with this outline.
+    pub fn new(outline: Outline) -> Self {
+        let azimuths = AzimuthColumns::new(COLUMNS as u16);
+        let (lowest, highest) = (vec![[NONE; KEPT]; CELLS], vec![0; CELLS]);
+        Self { azimuths, outline, lowest, coordinates: Default::default(), highest }
+    }
+
+    /// Replaces the returns by those of a sweep. A return far above or below the plane under the vehicle (a gradient of
+    /// 30 % and 1.5 m) cannot be ground and is left out, and so are the returns of the vehicle itself.
+    pub fn sort_points(&mut self, sweep: &Sweep) {
+        self.lowest.fill([NONE; KEPT]);
+        self.highest.fill(0);
+        let [mut rows, mut turns] = std::mem::take(&mut self.coordinates);
+        rows.resize(sweep.x.len(), 0.0);
+        turns.resize(sweep.x.len(), 0.0);
+        let (mut cells, mut keys) = ([0_u32; CHUNK], [NONE; CHUNK]);
+        let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
+        let coordinates = rows.chunks_mut(CHUNK).zip(turns.chunks_mut(CHUNK));
+        for (((xs, ys), zs), (rows, turns)) in chunks.zip(coordinates) {
+            find_coordinates(&self.azimuths, [xs, ys], [rows, turns]);
+            self.find_cells([xs, ys, zs, rows, turns], &mut cells, &mut keys);
+            for (&cell, &key) in cells.iter().zip(&keys).take(xs.len()) {
+                if key == NONE {
+                    continue;
+                }
+                let cell = cell as usize;
+                insert(&mut self.lowest[cell], key);
+                let highest = &mut self.highest[cell];
+                *highest = (*highest).max((key >> 16) as u16);
+            }
+        }
+        self.coordinates = [rows, turns];
+    }
+
+    /// Computes cell and key of each point; [`NONE`] for a point that is left out. It has no branches and reads no
+    /// tables, so that the compiler vectorises it.
+    fn find_cells(&self, [xs, ys, zs, rows, turns]: [&[f32]; 5], cells: &mut [u32; CHUNK], keys: &mut [u32; CHUNK]) {
+        let n = xs.len().min(CHUNK);
+        let (xs, ys, zs, rows, turns) = (&xs[..n], &ys[..n], &zs[..n], &rows[..n], &turns[..n]);
+        let (cells, keys) = (&mut cells[..n], &mut keys[..n]);
+        let (least, most) = (RANGE_M_MIN * RANGE_M_MIN, RANGE_M_MAX * RANGE_M_MAX);
+        for i in 0..n {
+            let (x, y, z, row, turn) = (xs[i], ys[i], zs[i], rows[i], turns[i]);
+            let squared = x * x + y * y;
+            // NaN fails every comparison.
+            let inside = (squared >= least) & (squared < most) & (z * z <= 2.25 + 0.09 * squared);
+            // The row of a return right before the end of the last row is rounded up.
+            let inside = inside & (row < ROWS as f32) & !self.outline.contains(x, y);
+            let (whole_row, column) = (floor_to_whole(row), floor_to_whole(turn));
+            let along = floor_to_whole((row - whole_row as i32 as f32) * PLACES);
+            let across = floor_to_whole((turn - column as i32 as f32) * (PLACES - 1.0));
+            let height = floor_to_whole(((if inside { z } else { 0.0 }) + OFFSET_M) * 1000.0);
+            cells[i] = whole_row * COLUMNS as u32 + column;
+            keys[i] = if inside { height << 16 | along << 8 | across } else { NONE };
+        }
+    }
+
+    /// Row and column coordinate of each point of the sweep; see [`find_coordinates`].
+    pub fn point_coordinates(&self) -> [&[f32]; 2] {
+        let [rows, turns] = &self.coordinates;
+        [rows, turns]
+    }
+
+    /// The up to three lowest returns of a cell, lowest first.
+    pub fn lowest(&self, cell: usize) -> impl Iterator<Item = Return> {
+        self.lowest[cell].into_iter().take_while(|key| *key != NONE).map(move |key| unpack(cell / COLUMNS, key))
+    }
+
+    /// True if the cell has a return.
+    pub fn is_seen(&self, cell: usize) -> bool {
+        self.lowest[cell][0] != NONE
+    }
+
+    /// Height of the cell's highest return over its lowest one, metres; 0 without returns.
+    pub fn span_m(&self, cell: usize) -> f32 {
+        let lowest = self.lowest[cell][0];
+        if lowest == NONE { 0.0 } else { (f32::from(self.highest[cell]) - (lowest >> 16) as f32) * 1e-3 }
+    }
+
+    /// Coordinates of a position; see [`find_coordinates`].
+    #[inline(always)]
+    pub fn coordinates(&self, x: f32, y: f32) -> [f32; 2] {
+        coordinates(&self.azimuths, x, y)
+    }
+}
+
+/// Computes the coordinates of points: rows outward from [`RANGE_M_MIN`], columns counter-clockwise, both with a
+/// fraction. The row of a nearer point is 0, that of a farther one [`ROWS`]. It has no branches, so that the compiler
+/// vectorises it.
+fn find_coordinates(azimuths: &AzimuthColumns, [xs, ys]: [&[f32]; 2], [rows, turns]: [&mut [f32]; 2]) {
+    let n = xs.len();
+    let (ys, rows, turns) = (&ys[..n], &mut rows[..n], &mut turns[..n]);
+    for i in 0..n {
+        [rows[i], turns[i]] = coordinates(azimuths, xs[i], ys[i]);
+    }
+}
+
+#[inline(always)]
+fn coordinates(azimuths: &AzimuthColumns, x: f32, y: f32) -> [f32; 2] {
+    let (least, most) = (RANGE_M_MIN * RANGE_M_MIN, RANGE_M_MAX * RANGE_M_MAX);
+    let squared = x * x + y * y;
+    let squared = if squared < most { squared } else { most };
+    let squared = if squared > least { squared } else { least };
+    // The bits of a float grow with its value; the difference fits into a signed number.
+    let row = (squared.to_bits() - least.to_bits()) as i32 as f32 * (1.0 / (1_u32 << ROW_SHIFT) as f32);
+    [row, azimuths.position(x, y)]
+}
+
+/// Index of the polar cell that contains a position; [`PolarIndex::at`] finds it once for a fixed position.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PolarIndex(u16);
+
+impl PolarIndex {
+    /// The cell that contains a position, ego frame, metres. Positions nearer than the first row belong to it.
+    pub fn at(x: f32, y: f32) -> Self {
+        let [row, column] = coordinates(&AzimuthColumns::new(COLUMNS as u16), x, y);
+        let cell = floor_to_whole(row) as usize * COLUMNS + floor_to_whole(column) as usize;
+        Self(cell.min(CELLS) as u16)
+    }
+
+    /// Index of the cell; `None` beyond the last row.
+    pub fn index(self) -> Option<usize> {
+        Some(usize::from(self.0)).filter(|index| *index < CELLS)
+    }
+
+    /// The value of the cell; `None` beyond the last row.
+    #[inline(always)]
+    pub fn of<T>(self, values: &[T]) -> Option<&T> {
+        values.get(usize::from(self.0))
+    }
+}
+
+/// Inserts a return among the lowest of a cell.
+#[inline(always)]
+fn insert(lowest: &mut [u32; KEPT], key: u32) {
+    let [first, second, third] = *lowest;
+    if key < third {
+        *lowest = [first.min(key), first.max(key).min(second), second.max(key)];
+    }
+}
+
+/// The return that a key stands for.
+fn unpack(row: usize, key: u32) -> Return {
+    let steps = (row as u32) << ROW_SHIFT | (key >> 8 & 0xff) << (ROW_SHIFT - 8);
+    let squared = f32::from_bits((RANGE_M_MIN * RANGE_M_MIN).to_bits() + steps + (1 << (ROW_SHIFT - 9)));
+    Return { range_m: squared.sqrt(), z_m: (key >> 16) as f32 * 1e-3 - 32.0 }
+}
+
+/// Range at which a row begins, metres; [`RANGE_M_MAX`] for [`ROWS`].
+pub fn row_start_m(row: usize) -> f32 {
+    f32::from_bits((RANGE_M_MIN * RANGE_M_MIN).to_bits() + ((row as u32) << ROW_SHIFT)).sqrt()
+}
+
+/// Range of the middle of each row, metres.
+pub fn row_middles_m() -> [f32; ROWS] {
+    std::array::from_fn(|row| (row_start_m(row) + row_start_m(row + 1)) / 2.0)
+}
+
+/// Cosine and sine of the middle of each column, rotated by quarters from the first, so that a rotated world gives a
+/// rotated ground to the bit.
+pub fn column_directions() -> [[f32; 2]; COLUMNS] {
+    const QUARTER: usize = COLUMNS / 4;
+    std::array::from_fn(|column| {
+        let (y, x) = (((column % QUARTER) as f32 + 0.5) / COLUMNS as f32 * TAU).sin_cos();
+        [[x, y], [-y, x], [-x, -y], [y, -x]][column / QUARTER]
+    })
+}
+
+/// The column `beside` columns counter-clockwise of a column; clockwise if `beside` is negative.
+#[inline(always)]
+pub fn beside(column: usize, beside: isize) -> usize {
+    (column + COLUMNS).wrapping_add_signed(beside) % COLUMNS
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn returns_right_before_the_end_of_the_last_row_are_in_it_or_left_out() {
+        let mut cells = PolarCells::new(Outline { width_m: 2.0, front_m: 3.0, rear_m: 2.0 });
+        let mut sweep = Sweep { x: vec![-60.07333], y: vec![22.07249], ..Sweep::default() };
+        for step in 0..3600 {
+            let (sin, cos) = (step as f32 * std::f32::consts::TAU / 3600.0).sin_cos();
+            for range_m in [RANGE_M_MAX, RANGE_M_MAX.next_down(), RANGE_M_MAX.next_up()] {
+                sweep.x.push(range_m * cos);
+                sweep.y.push(range_m * sin);
+            }
+        }
+        sweep.z.resize(sweep.x.len(), 0.0);
+        cells.sort_points(&sweep);
+        assert!((0..CELLS).all(|cell| !cells.is_seen(cell) || cell / COLUMNS == ROWS - 1));
+    }
+}

@@ -1,0 +1,65 @@
+//! Narrow holes in seen flat ground, which are inferred to be flat. Not in the paper.
+//!
+//! In: by cell whether it is flat, whether it may be filled, and whether it ends a hole. Out: the cells of holes. A
+//! region of the division may extend far beyond the last point in it: only cells between two seen flat cells a short
+//! distance apart are inferred; all others are unknown.
+
+/// What a cell does to a hole.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Role {
+    /// A hole begins or ends here.
+    Flat,
+    /// The cell may lie in a hole.
+    Fillable,
+    /// No hole continues over the cell.
+    Barrier,
+}
+
+/// The cells of holes, and the buffers to find them.
+#[derive(Clone, Debug, Default)]
+pub struct Holes {
+    cells: Vec<u32>,
+    is_listed: Vec<bool>,
+}
+
+impl Holes {
+    /// Finds the cells between two flat cells of a row or column of a grid of `width` × `width` cells, with at most
+    /// `span` cells between them.
+    pub fn find(&mut self, width: usize, span: usize, role: impl Fn(usize) -> Role) {
+        self.cells.clear();
+        self.is_listed.clear();
+        self.is_listed.resize(width * width, false);
+        // By column, and for the row: the flat cell after which only cells that may be filled came.
+        let mut last_in_column = vec![None::<usize>; width];
+        for iy in 0..width {
+            let mut last_in_row = None;
+            for (ix, last_in_column) in last_in_column.iter_mut().enumerate() {
+                let cell = iy * width + ix;
+                match role(cell) {
+                    Role::Fillable => {}
+                    Role::Barrier => (last_in_row, *last_in_column) = (None, None),
+                    Role::Flat => {
+                        self.list(last_in_row, cell, 1, span);
+                        self.list(*last_in_column, cell, width, span);
+                        (last_in_row, *last_in_column) = (Some(cell), Some(cell));
+                    }
+                }
+            }
+        }
+    }
+
+    /// Lists the cells between two flat ones, if they are few enough.
+    fn list(&mut self, from: Option<usize>, to: usize, stride: usize, span: usize) {
+        let Some(from) = from.filter(|from| to - from <= (span + 1) * stride) else { return };
+        for cell in (from + stride..to).step_by(stride) {
+            if !std::mem::replace(&mut self.is_listed[cell], true) {
+                self.cells.push(cell as u32);
+            }
+        }
+    }
+
+    /// Indices of the cells of holes, each once.
+    pub fn cells(&self) -> &[u32] {
+        &self.cells
+    }
+}

@@ -1,0 +1,220 @@
+//! Memory: ground and obstacles that earlier maps have seen, carried into the newest one. Not in the papers.
+//!
+//! In: the points of each map with their heights over the ground, and the ego pose. Out: [`Memory::extended`]: the
+//! points of the newest map, and one more for each remembered cell of 0.25 m. A sensor with few lasers on a moving
+//! vehicle so knows the ground between its rings.
+//!
+//! - A cell remembers its lowest ground until a return shows it again, for `ground_s_max`.
+//! - An obstacle removes the ground of its cell. It is itself remembered for `obstacle_s_max`; then the cell is
+//!   unknown, so that a moving object leaves no trail, and ground under it is free only when it is seen again.
+//! - Cells are those of the world. If a pose is missing or jumps, everything is forgotten.
+
+pub mod config;
+
+use nalgebra::{Isometry3, Point3};
+
+use crate::sensor::sweep::Sweep;
+
+use config::MemoryConfig;
+
+/// Side of a cell, metres. Ours: the cells of the reach stage.
+const CELL_M: f64 = 0.25;
+/// Number of stored cells along a side, a power of two: 64 m.
+const SIDE: i64 = 256;
+/// Largest height of ground over or under the local ground, metres. Ours; not tuned.
+const GROUND_M_MAX: f32 = 0.2;
+/// Least and greatest height of an obstacle over the local ground, metres: those of the reach stage.
+const OBSTACLE_M: std::ops::RangeInclusive<f32> = 0.25..=2.5;
+/// Greatest distance and turn between two poses, metres and radians, and how much more a second of time allows. Ours:
+/// no vehicle on wheels is faster.
+const JUMP_M: [f64; 2] = [1.0, 60.0];
+const JUMP_RAD: [f64; 2] = [0.2, 3.0];
+const NS_PER_S: f64 = 1e9;
+
+/// What one cell of the world holds.
+#[derive(Clone, Copy, Debug, Default)]
+struct Cell {
+    /// World index (x, y) of the cell that is stored here.
+    world: [i64; 2],
+    /// Height of the lowest ground of the newest map that saw it, world frame, metres.
+    ground_m: f64,
+    /// Stamp of that map, ns; 0 without ground.
+    ground_ns: i64,
+    /// Height of the highest obstacle of the newest map that saw one, world frame, metres.
+    obstacle_m: f64,
+    /// Stamp of that map, ns; 0 without an obstacle.
+    obstacle_ns: i64,
+}
+
+/// The memory of one vehicle.
+pub(crate) struct Memory {
+    config: MemoryConfig,
+    cells: Vec<Cell>,
+    /// Indices of the cells that hold something.
+    listed: Vec<u32>,
+    /// Pose and stamp of the newest map; `None` without a pose.
+    newest: Option<(Isometry3<f64>, i64)>,
+    /// Points of the newest map and the remembered ones.
+    extended: Sweep,
+    /// What the newest map got.
+    state: MemoryState,
+}
+
+/// What a map got from memory.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct MemoryState {
+    /// Number of remembered points in the map.
+    pub points: usize,
+    /// Number of times everything was forgotten because a pose was missing or jumped.
+    pub drops: u64,
+}
+
+impl Memory {
+    /// An empty memory; `None` if the configuration disables it.
+    pub fn new(config: &MemoryConfig) -> Option<Self> {
+        config.enabled.then(|| Self {
+            config: config.clone(),
+            cells: vec![Cell::default(); (SIDE * SIDE) as usize],
+            listed: Vec::new(),
+            newest: None,
+            extended: Sweep::default(),
+            state: MemoryState::default(),
+        })
+    }
+
+    /// The points of the newest map, followed by the remembered ones; `own` are the former alone.
+    pub fn extended<'a>(&'a self, own: &'a Sweep) -> &'a Sweep {
+        if self.newest.is_some() { &self.extended } else { own }
+    }
+
+    /// What the newest map got.
+    pub fn state(&self) -> MemoryState {
+        self.state
+    }
+
+    /// Adds the remembered points to those of a map that ends at `stamp_ns`.
+    pub fn extend(&mut self, sweep: &Sweep, map_from_ego: Option<&Isometry3<f64>>, stamp_ns: i64) {
+        if self.newest.is_some_and(|newest| !continues(newest, map_from_ego, stamp_ns)) {
+            self.forget();
+        }
+        self.newest = map_from_ego.map(|pose| (*pose, stamp_ns));
+        self.state.points = 0;
+        if let Some(pose) = map_from_ego {
+            self.extended.copy_from(sweep);
+            self.expire(stamp_ns);
+            self.recall(pose);
+            self.state.points = self.extended.x.len() - sweep.x.len();
+        }
+    }
+
+    /// Remembers the points of the newest map's own sweep, which have these heights over the ground.
+    pub fn remember(&mut self, own_points: usize, heights_m: &[f32]) {
+        let Some((pose, stamp_ns)) = self.newest else { return };
+        let sweep = std::mem::take(&mut self.extended);
+        let range_squared = self.config.range_m_max * self.config.range_m_max;
+        let points = sweep.x.iter().zip(&sweep.y).zip(&sweep.z).zip(heights_m).take(own_points);
+        for (((&x, &y), &z), &height) in points {
+            let (is_ground, is_obstacle) = (height.abs() <= GROUND_M_MAX, OBSTACLE_M.contains(&height));
+            if (is_ground || is_obstacle) && x * x + y * y <= range_squared {
+                let point = pose * Point3::new(x, y, z).cast::<f64>();
+                self.insert(point, is_obstacle, stamp_ns);
+            }
+        }
+        self.extended = sweep;
+    }
+
+    fn insert(&mut self, point: Point3<f64>, is_obstacle: bool, stamp_ns: i64) {
+        let world = [point.x, point.y].map(|metres| (metres / CELL_M).floor() as i64);
+        let index = (world[1].rem_euclid(SIDE) * SIDE + world[0].rem_euclid(SIDE)) as usize;
+        let cell = &mut self.cells[index];
+        if cell.ground_ns == 0 && cell.obstacle_ns == 0 {
+            self.listed.push(index as u32);
+        }
+        if cell.world != world {
+            *cell = Cell { world, ..Cell::default() };
+        }
+        if is_obstacle {
+            let is_higher = cell.obstacle_ns != stamp_ns || point.z > cell.obstacle_m;
+            cell.obstacle_m = if is_higher { point.z } else { cell.obstacle_m };
+            cell.obstacle_ns = stamp_ns;
+        } else {
+            let is_lower = cell.ground_ns != stamp_ns || point.z < cell.ground_m;
+            cell.ground_m = if is_lower { point.z } else { cell.ground_m };
+            cell.ground_ns = stamp_ns;
+        }
+    }
+
+    /// Removes what is too old, and the ground of cells with a newer obstacle.
+    fn expire(&mut self, stamp_ns: i64) {
+        let [ground_ns, obstacle_ns] = [self.config.ground_s_max, self.config.obstacle_s_max]
+            .map(|seconds| (f64::from(seconds) * NS_PER_S) as i64);
+        let cells = &mut self.cells;
+        self.listed.retain(|index| {
+            let cell = &mut cells[*index as usize];
+            if cell.obstacle_ns != 0 && cell.ground_ns <= cell.obstacle_ns {
+                cell.ground_ns = 0;
+            }
+            if stamp_ns - cell.ground_ns > ground_ns {
+                cell.ground_ns = 0;
+            }
+            if stamp_ns - cell.obstacle_ns > obstacle_ns {
+                cell.obstacle_ns = 0;
+            }
+            cell.ground_ns != 0 || cell.obstacle_ns != 0
+        });
+        // The order in which cells were first seen follows the order of the points, which must not matter.
+        self.listed.sort_unstable();
+    }
+
+    /// Adds a point for each remembered cell near the vehicle in which the map has no point itself.
+    fn recall(&mut self, map_from_ego: &Isometry3<f64>) {
+        let ego_from_map = map_from_ego.inverse();
+        let seen = self.seen_cells(map_from_ego);
+        for &index in &self.listed {
+            if seen[index as usize / 64] >> (index % 64) & 1 != 0 {
+                continue;
+            }
+            let cell = &self.cells[index as usize];
+            let [x, y] = cell.world.map(|world| (world as f64 + 0.5) * CELL_M);
+            let z = if cell.obstacle_ns != 0 { cell.obstacle_m } else { cell.ground_m };
+            let point = (ego_from_map * Point3::new(x, y, z)).cast::<f32>();
+            if point.x * point.x + point.y * point.y <= self.config.range_m_max * self.config.range_m_max {
+                self.extended.push_remembered([point.x, point.y, point.z]);
+            }
+        }
+    }
+
+    /// One bit for each stored cell, set if the map has a point there.
+    fn seen_cells(&self, map_from_ego: &Isometry3<f64>) -> Vec<u64> {
+        let mut seen = vec![0_u64; (SIDE * SIDE / 64) as usize];
+        let range_squared = self.config.range_m_max * self.config.range_m_max;
+        let sweep = &self.extended;
+        for ((&x, &y), &z) in sweep.x.iter().zip(&sweep.y).zip(&sweep.z) {
+            if x * x + y * y <= range_squared {
+                let point = map_from_ego * Point3::new(x, y, z).cast::<f64>();
+                let [i, j] = [point.x, point.y].map(|metres| ((metres / CELL_M).floor() as i64).rem_euclid(SIDE));
+                let index = (j * SIDE + i) as usize;
+                seen[index / 64] |= 1 << (index % 64);
+            }
+        }
+        seen
+    }
+
+    fn forget(&mut self) {
+        for index in self.listed.drain(..) {
+            self.cells[index as usize] = Cell::default();
+        }
+        self.state.drops += 1;
+    }
+}
+
+/// True if a pose follows from the newest one: a vehicle can have moved so far in the time between.
+fn continues((newest, newest_ns): (Isometry3<f64>, i64), map_from_ego: Option<&Isometry3<f64>>, stamp_ns: i64) -> bool {
+    let Some(pose) = map_from_ego else { return false };
+    let seconds = stamp_ns.saturating_sub(newest_ns) as f64 / NS_PER_S;
+    let moved = newest.inv_mul(pose);
+    // A pose of a world far away gives infinities, which fail the comparisons.
+    seconds >= 0.0
+        && moved.translation.vector.norm() <= JUMP_M[0] + JUMP_M[1] * seconds
+        && moved.rotation.angle() <= JUMP_RAD[0] + JUMP_RAD[1] * seconds
+}

@@ -1,0 +1,244 @@
+//! Flood fill of a square grid with a disc.
+//!
+//! In: by cell whether it is open, and whether it is closed. Out: by cell whether the disc can get there, starting in
+//! the middle of the grid, without a closed cell in it. A row of the grid is a row of bits: dilating the closed cells
+//! by the disc, and the flood fill, process 64 cells at a time.
+
+/// Flood fill from the middle of a square grid. It reuses its buffers.
+#[derive(Clone, Debug)]
+pub struct Flood {
+    width: usize,
+    passable: Bits,
+    reached: Bits,
+    covered: Bits,
+}
+
+impl Flood {
+    /// A flood fill of `width` × `width` cells.
+    pub fn new(width: usize) -> Self {
+        let bits = Bits::square(width);
+        Self { width, passable: bits.clone(), reached: bits.clone(), covered: bits }
+    }
+
+    /// Floods the grid with a disc whose radius is `radius` cells around its middle cell. The middle of the disc moves
+    /// over open cells.
+    pub fn run(&mut self, open: &Bits, closed: &Bits, radius: usize) {
+        let Self { width, passable, reached, covered } = self;
+        passable.clear();
+        passable.dilate(closed, radius);
+        passable.words.iter_mut().zip(&open.words).for_each(|(passable, open)| *passable = open & !*passable);
+        reached.clear();
+        // The vehicle stands between the four middle cells.
+        for (ix, iy) in [*width / 2 - 1, *width / 2].into_iter().flat_map(|iy| [(*width / 2 - 1, iy), (*width / 2, iy)])
+        {
+            reached.set(ix, iy);
+        }
+        reached.words.iter_mut().zip(&passable.words).for_each(|(reached, passable)| *reached &= passable);
+        reached.flood(passable);
+        covered.clear();
+        covered.dilate(reached, radius);
+    }
+
+    /// True if the disc covers the cell somewhere on its path.
+    pub fn is_reached(&self, ix: usize, iy: usize) -> bool {
+        self.covered.get(ix, iy)
+    }
+}
+
+/// A square of bits, one for each cell.
+#[derive(Clone, Debug)]
+pub struct Bits {
+    width: usize,
+    /// Number of words in a row.
+    stride: usize,
+    words: Vec<u64>,
+}
+
+impl Bits {
+    /// `width` × `width` bits that are not set.
+    pub fn square(width: usize) -> Self {
+        let stride = width.div_ceil(64);
+        Self { width, stride, words: vec![0; stride * width] }
+    }
+
+    /// Clears all bits.
+    pub fn clear(&mut self) {
+        self.words.fill(0);
+    }
+
+    /// Sets the bits of the cells, row by row, for which `is_set` is true, and clears the others.
+    pub fn fill(&mut self, is_set: impl Fn(usize) -> bool) {
+        for (at, word) in self.words.iter_mut().enumerate() {
+            let (first, iy) = (at % self.stride * 64, at / self.stride);
+            let bits = (self.width - first).min(64);
+            *word = (0..bits).fold(0, |word, bit| word | u64::from(is_set(iy * self.width + first + bit)) << bit);
+        }
+    }
+
+    /// Sets the bit of a cell.
+    #[inline(always)]
+    pub fn set(&mut self, ix: usize, iy: usize) {
+        self.words[iy * self.stride + ix / 64] |= 1 << (ix % 64);
+    }
+
+    /// The bit of a cell.
+    #[inline(always)]
+    pub fn get(&self, ix: usize, iy: usize) -> bool {
+        self.words[iy * self.stride + ix / 64] >> (ix % 64) & 1 != 0
+    }
+
+    /// Adds each cell within `radius` of a cell of `from`. Bits beyond the last column may be set; they are no cells.
+    fn dilate(&mut self, from: &Self, radius: usize) {
+        let rows = from.words.len() / from.stride;
+        let half_width = |dy: usize| (radius * radius - dy * dy).isqrt();
+        let mut wide = vec![0; from.stride];
+        for (iy, row) in from.words.chunks_exact(from.stride).enumerate() {
+            if row.iter().all(|word| *word == 0) {
+                continue;
+            }
+            wide.copy_from_slice(row);
+            for reach in 0..=radius {
+                for dy in (0..=radius).filter(|dy| half_width(*dy) == reach) {
+                    for other in [iy.checked_sub(dy), Some(iy + dy)].into_iter().flatten().filter(|other| *other < rows)
+                    {
+                        let row = &mut self.words[other * from.stride..][..from.stride];
+                        row.iter_mut().zip(&wide).for_each(|(word, wide)| *word |= wide);
+                    }
+                }
+                dilate_by_one(&mut wide);
+            }
+        }
+    }
+
+    /// Spreads set bits to neighbours along sides of cells as long as they are set in `open`.
+    fn flood(&mut self, open: &Self) {
+        let rows = open.words.len() / open.stride;
+        self.words.iter_mut().zip(&open.words).for_each(|(word, open)| *word = fill(*word, *open));
+        loop {
+            let mut grown = false;
+            // Down and up; a path that turns back needs another round.
+            for (iy, from) in (1..rows).map(|iy| (iy, iy - 1)).chain((1..rows).rev().map(|iy| (iy - 1, iy))) {
+                grown |= self.spread(open, iy, from);
+            }
+            if !grown {
+                break;
+            }
+        }
+    }
+
+    /// Spreads bits from one row to the next, and along it; returns true if a bit was added. All bits that a word's own
+    /// bits spread to are always set, so that a word without new bits stays unchanged.
+    fn spread(&mut self, open: &Self, iy: usize, from: usize) -> bool {
+        let mut grown = false;
+        let (row, from) = (iy * self.stride, from * self.stride);
+        let mut carry = 0;
+        for word in 0..self.stride {
+            grown |= self.gain(open, row + word, self.words[from + word] | carry);
+            carry = self.words[row + word] >> 63;
+        }
+        carry = 0;
+        for word in (0..self.stride).rev() {
+            grown |= self.gain(open, row + word, carry);
+            carry = self.words[row + word] << 63;
+        }
+        grown
+    }
+
+    /// Adds bits to a word, and the bits they spread to; returns true if a bit was added.
+    fn gain(&mut self, open: &Self, at: usize, bits: u64) -> bool {
+        let bits = self.words[at] | bits & open.words[at];
+        let grown = bits != self.words[at];
+        if grown {
+            self.words[at] = fill(bits, open.words[at]);
+        }
+        grown
+    }
+}
+
+/// Spreads set bits in both directions as long as they are set in `open`.
+fn fill(bits: u64, open: u64) -> u64 {
+    match bits {
+        0 => 0,
+        _ => fill_up(bits, open) | fill_up(bits.reverse_bits(), open.reverse_bits()).reverse_bits(),
+    }
+}
+
+/// Spreads set bits towards higher bits as long as they are set in `open`.
+fn fill_up(mut bits: u64, mut open: u64) -> u64 {
+    for step in [1, 2, 4, 8, 16, 32] {
+        bits |= open & (bits << step);
+        open &= open << step;
+    }
+    bits
+}
+
+/// Adds the neighbours of each set bit of a row.
+fn dilate_by_one(row: &mut [u64]) {
+    let mut before = 0;
+    for word in 0..row.len() {
+        let here = row[word];
+        let after = row.get(word + 1).map_or(0, |next| next << 63);
+        row[word] = here | here << 1 | here >> 1 | before >> 63 | after;
+        before = here;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn bits(width: usize, is_set: impl Fn(usize) -> bool) -> Bits {
+        let mut bits = Bits::square(width);
+        bits.fill(is_set);
+        bits
+    }
+
+    /// Floods a picture: `.` is open, `#` closed, blank neither. Returns it with `o` for open cells that are reached.
+    fn flooded(picture: &[&str], radius: usize) -> Vec<String> {
+        let width = picture.len();
+        let is = |c: u8| bits(width, |cell| picture[cell / width].as_bytes()[cell % width] == c);
+        let mut flood = Flood::new(width);
+        flood.run(&is(b'.'), &is(b'#'), radius);
+        let drawn = |(iy, row): (usize, &&str)| {
+            let cell = |(ix, c): (usize, char)| if c == '.' && flood.is_reached(ix, iy) { 'o' } else { c };
+            row.chars().enumerate().map(cell).collect()
+        };
+        picture.iter().enumerate().map(drawn).collect()
+    }
+
+    #[test]
+    fn a_disc_passes_a_gap_as_wide_as_itself_and_no_narrower_one() {
+        let court = [
+            "...........", //
+            "...........",
+            "...........",
+            "....###....",
+            "....# #....",
+            "...........",
+            "...........",
+            "####...####",
+            "...........",
+            "...........",
+            "...........",
+        ];
+        let everywhere: Vec<String> = court.iter().map(|row| row.replace('.', "o")).collect();
+        assert_eq!(flooded(&court, 0), everywhere);
+        assert_eq!(flooded(&court, 1)[8..], everywhere[8..]);
+        let narrower: Vec<String> = court.iter().map(|row| row.replace("####...####", "####..#####")).collect();
+        let narrower: Vec<&str> = narrower.iter().map(String::as_str).collect();
+        assert_eq!(flooded(&narrower, 1)[8..], court[8..]);
+        assert_eq!(flooded(&narrower, 0)[8..], everywhere[8..]);
+    }
+
+    #[test]
+    fn a_flood_fills_a_maze_wider_than_a_word() {
+        let width = 200;
+        // Each fourth row is a wall with one gap, at alternating ends.
+        let wall = |iy: usize| iy % 4 == 3;
+        let gap = |iy: usize| if iy % 8 == 3 { width - 1 } else { 0 };
+        let is_closed = |cell: usize| wall(cell / width) && cell % width != gap(cell / width);
+        let mut flood = Flood::new(width);
+        flood.run(&bits(width, |cell| !is_closed(cell)), &bits(width, is_closed), 0);
+        assert!((0..width * width).all(|cell| flood.is_reached(cell % width, cell / width) != is_closed(cell)));
+    }
+}

@@ -1,0 +1,174 @@
+//! Which ground the vehicle can reach, found once for each map and shared by all layers.
+//!
+//! In: the sweep and its local ground. Out: [`Reach`]: by cell of 0.25 m to 64 m whether something closes it (an
+//! obstacle, or a step of the ground), and whether the vehicle can get there. Ground behind a closed fence is as free
+//! as the road, and joins it where the sensor sees between two slats, but no vehicle fits through there. So the flood
+//! fill starts under the vehicle, and moves a disc of the vehicle's width over ground that was seen, or that lies in a
+//! gap of seen ground that no obstacle hides; no closed cell may lie in the disc.
+//!
+//! | step | where |
+//! |---|---|
+//! | points -> cells with an obstacle | `obstacles` |
+//! | points -> cells beside a step of the ground | `steps` |
+//! | obstacles -> the ground that they hide | `shadow` |
+//! | open and closed cells -> reached cells | `flood` |
+
+mod cells;
+pub mod config;
+mod flood;
+mod obstacles;
+mod shadow;
+mod steps;
+
+use crate::ground::Ground;
+use crate::ground::polar::{CELLS, COLUMNS, PolarIndex, ROWS, beside};
+use crate::ground::surface::Confidence;
+use crate::sensor::sweep::Sweep;
+
+use cells::{CELL_M, SIDE};
+use config::ReachConfig;
+use flood::{Bits, Flood};
+use obstacles::Obstacles;
+use shadow::Shadow;
+use steps::Steps;
+
+/// Least height that an obstacle's returns span if it casts a shadow, metres. Ours: kerbs cast none; not tuned.
+const SHADOW_HEIGHT_M_MIN: f32 = 0.5;
+
+/// Whether unseen ground of a polar cell counts as free of obstacles.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum View {
+    /// It does.
+    Clear,
+    /// It does where no obstacle casts a shadow on it.
+    BesideObstacle,
+    /// It does not.
+    Closed,
+}
+
+/// Closed cells and reached ground around the vehicle, ego frame.
+pub struct Reach {
+    config: ReachConfig,
+    /// By cell: the polar cell of its centre.
+    polar_of_cell: Vec<PolarIndex>,
+    /// Indices of the cells under the vehicle.
+    under_vehicle: Vec<usize>,
+    /// By point of the sweep.
+    cell_of_point: Vec<u32>,
+    obstacles: Obstacles,
+    steps: Steps,
+    shadow: Shadow,
+    /// True by polar cell if an obstacle stands in it.
+    has_obstacle: Vec<bool>,
+    /// By polar cell.
+    views: Vec<View>,
+    open: Bits,
+    closed: Bits,
+    flood: Flood,
+}
+
+impl Reach {
+    /// A maker with validated parameters.
+    pub fn new(config: &ReachConfig) -> Self {
+        let outline = config.outline();
+        let centres_m = (0..SIDE * SIDE).map(|cell| (cell, cells::centre_m(cell)));
+        let bits = Bits::square(SIDE);
+        Self {
+            config: config.clone(),
+            polar_of_cell: centres_m.clone().map(|(_, [x, y])| PolarIndex::at(x, y)).collect(),
+            under_vehicle: centres_m.filter(|(_, [x, y])| outline.contains(*x, *y)).map(|(cell, _)| cell).collect(),
+            cell_of_point: Vec::new(),
+            obstacles: Obstacles::new(),
+            steps: Steps::new(),
+            shadow: Shadow::new((0..SIDE * SIDE).map(cells::centre_m)),
+            has_obstacle: vec![false; CELLS],
+            views: vec![View::Closed; CELLS],
+            open: bits.clone(),
+            closed: bits,
+            flood: Flood::new(SIDE),
+        }
+    }
+
+    /// The vehicle's outline, and what it cannot drive over or under.
+    pub fn config(&self) -> &ReachConfig {
+        &self.config
+    }
+
+    /// Finds closed cells and reached ground. `ground` is that of `sweep`.
+    pub fn update(&mut self, sweep: &Sweep, ground: &Ground) {
+        self.closed.clear();
+        let closed = &mut self.closed;
+        cells::find(&sweep.x, &sweep.y, &mut self.cell_of_point);
+        self.obstacles.find(sweep, ground.heights_m(), &self.cell_of_point, &self.config);
+        self.obstacles.cells().for_each(|(cell, _)| closed.set(cell % SIDE, cell / SIDE));
+        self.steps.find(sweep, ground.heights_m(), &self.cell_of_point, &self.config, |cell| {
+            closed.set(cell % SIDE, cell / SIDE)
+        });
+        self.open_seen_ground(sweep.mount_height_m, ground.confidences());
+        // Radius, in cells, of the largest disc sure to fit through a passage of the vehicle's width.
+        let radius = ((self.config.vehicle_width_m / CELL_M - 2.0) / 2.0).max(0.0) as usize;
+        self.flood.run(&self.open, &self.closed, radius);
+    }
+
+    /// True if an obstacle stands at a position, or a step of the ground ends there.
+    #[inline(always)]
+    pub fn is_closed(&self, x: f32, y: f32) -> bool {
+        cells::at(x, y).is_some_and(|cell| self.closed.get(cell % SIDE, cell / SIDE))
+    }
+
+    /// True if the vehicle can get to a position: if the disc covers it somewhere on its path.
+    #[inline(always)]
+    pub fn is_reached(&self, x: f32, y: f32) -> bool {
+        cells::at(x, y).is_some_and(|cell| self.flood.is_reached(cell % SIDE, cell / SIDE))
+    }
+
+    /// Opens the cells with a return from the ground, and the unseen ones between them. Unseen ground right behind an
+    /// obstacle is not opened, nor is ground in a shadow beside an obstacle: they may hide the continuation of a fence.
+    fn open_seen_ground(&mut self, sensor_m: f32, confidences: &[Confidence]) {
+        self.shadow.clear();
+        self.has_obstacle.fill(false);
+        for (cell, span_m) in self.obstacles.cells() {
+            if let Some(polar) = self.polar_of_cell[cell].index() {
+                self.has_obstacle[polar] = true;
+            }
+            if span_m[1] - span_m[0] >= SHADOW_HEIGHT_M_MIN {
+                self.shadow.cast(cell, CELL_M, span_m, sensor_m);
+            }
+        }
+        self.classify_polar_cells(confidences);
+        let (polar_of_cell, shadow, views) = (&self.polar_of_cell, &self.shadow, &self.views);
+        self.open.fill(|cell| match polar_of_cell[cell].of(views) {
+            Some(View::Clear) => true,
+            Some(View::BesideObstacle) => !shadow.hides(cell),
+            Some(View::Closed) | None => false,
+        });
+        for cell in self.steps.seen().chain(self.under_vehicle.iter().copied()) {
+            self.open.set(cell % SIDE, cell / SIDE);
+        }
+    }
+
+    /// Decides for each polar cell whether its unseen ground counts as free of obstacles.
+    fn classify_polar_cells(&mut self, confidences: &[Confidence]) {
+        for column in 0..COLUMNS {
+            let mut is_hidden = false;
+            for row in 0..ROWS {
+                let cell = row * COLUMNS + column;
+                is_hidden = self.has_obstacle[cell] || is_hidden && confidences[cell] != Confidence::Seen;
+                self.views[cell] = match confidences[cell] {
+                    Confidence::Bridged if is_hidden => View::Closed,
+                    Confidence::Seen | Confidence::Bridged if self.is_beside_obstacle(row, column) => {
+                        View::BesideObstacle
+                    }
+                    Confidence::Seen | Confidence::Bridged => View::Clear,
+                    Confidence::Extrapolated | Confidence::None => View::Closed,
+                };
+            }
+        }
+    }
+
+    fn is_beside_obstacle(&self, row: usize, column: usize) -> bool {
+        let rows = row.saturating_sub(1)..(row + 2).min(ROWS);
+        rows.flat_map(|row| [-1, 0, 1].map(|offset| row * COLUMNS + beside(column, offset)))
+            .any(|cell| self.has_obstacle[cell])
+    }
+}

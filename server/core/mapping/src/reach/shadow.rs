@@ -1,0 +1,92 @@
+//! Shadows: the ground that nearer obstacles hide from the sensor.
+//!
+//! In: cells with an obstacle, and the heights over the ground that it spans, metres. Out: by cell whether the ground
+//! there lies in a shadow. A gap between two rings on visible ground is only a gap; a gap in a shadow may hide the
+//! continuation of a fence. The sensor is assumed to be above the ego origin, as in the radial layers.
+
+use std::f32::consts::TAU;
+
+/// Number of azimuths about the vehicle. Ours: 90 degrees are a whole number of azimuths, and no centre of a cell lies
+/// on the border between two.
+const AZIMUTHS: usize = 1440;
+/// Number of distance steps. Ours: one bit each of a 64-bit word.
+const STEPS: usize = 64;
+
+/// Shadows on the ground by azimuth and distance.
+#[derive(Clone, Debug)]
+pub struct Shadow {
+    /// By cell: azimuth and distance of its centre.
+    polar_of_cell: Vec<(u16, f32)>,
+    steps_a_m: f32,
+    /// By azimuth: one bit for each distance step, set if it is hidden.
+    hidden: Vec<u64>,
+}
+
+impl Shadow {
+    /// Shadows on cells with these centres; none yet.
+    pub fn new(centres_m: impl Iterator<Item = [f32; 2]>) -> Self {
+        let polar_of_cell: Vec<(u16, f32)> = centres_m.map(polar).collect();
+        let farthest_m = polar_of_cell.iter().map(|(_, distance_m)| *distance_m).fold(1.0, f32::max);
+        Self { polar_of_cell, steps_a_m: (STEPS - 1) as f32 / farthest_m, hidden: vec![0; AZIMUTHS] }
+    }
+
+    /// Removes all shadows.
+    pub fn clear(&mut self) {
+        self.hidden.fill(0);
+    }
+
+    /// Adds the shadow of an obstacle that spans these heights in a cell of this size, with the sensor at height
+    /// `sensor_m`.
+    pub fn cast(&mut self, cell: usize, cell_m: f32, [lowest_m, highest_m]: [f32; 2], sensor_m: f32) {
+        let (azimuth, distance_m) = self.polar_of_cell[cell];
+        // Distance at which the ray over a height meets the ground.
+        let meets = |height_m: f32| {
+            if height_m < sensor_m { distance_m * sensor_m / (sensor_m - height_m) } else { f32::INFINITY }
+        };
+        // The shadow begins with the step behind the obstacle.
+        let first = (meets(lowest_m.max(0.0)).max(distance_m + cell_m) * self.steps_a_m).ceil() as usize;
+        let last = (meets(highest_m) * self.steps_a_m).min(STEPS as f32) as usize;
+        if first >= last {
+            return;
+        }
+        let steps = (u64::MAX >> (STEPS - (last - first))) << first;
+        let half_width = (cell_m / 2.0 / distance_m * AZIMUTHS as f32 / TAU) as usize;
+        for azimuth in usize::from(azimuth) + AZIMUTHS - half_width..=usize::from(azimuth) + AZIMUTHS + half_width {
+            self.hidden[azimuth % AZIMUTHS] |= steps;
+        }
+    }
+
+    /// True if the ground in a cell is hidden.
+    pub fn hides(&self, cell: usize) -> bool {
+        let (azimuth, distance_m) = self.polar_of_cell[cell];
+        self.hidden[usize::from(azimuth)] >> (distance_m * self.steps_a_m) as usize & 1 != 0
+    }
+}
+
+/// Azimuth step and distance of a position.
+fn polar([x, y]: [f32; 2]) -> (u16, f32) {
+    let azimuth = (y.atan2(x) / TAU * AZIMUTHS as f32 + AZIMUTHS as f32 + 0.5) as usize % AZIMUTHS;
+    (azimuth as u16, (x * x + y * y).sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_low_wall_hides_the_ground_behind_it_and_a_branch_the_ground_farther_on() {
+        let centre = |cell: usize| [cell as f32 * 0.5 + 0.25, 0.25];
+        let shadow = |span_m: [f32; 2]| {
+            let mut shadow = Shadow::new((0..120).map(centre));
+            // 10.25 m away; a sensor at 2 m looks over 1 m of it at 20.5 m.
+            shadow.cast(20, 0.5, span_m, 2.0);
+            (0..120).filter(|cell| shadow.hides(*cell)).map(|cell| centre(cell)[0]).collect::<Vec<f32>>()
+        };
+        let wall = shadow([0.0, 1.0]);
+        assert!((10.5..12.5).contains(&wall[0]) && (18.5..20.6).contains(wall.last().unwrap()), "{wall:?}");
+        let branch = shadow([1.0, 1.5]);
+        assert!((20.5..22.5).contains(&branch[0]) && (38.5..41.1).contains(branch.last().unwrap()), "{branch:?}");
+        assert!(shadow([1.0, 3.0]).last().unwrap() > &58.0);
+        assert!(shadow([0.1, 0.1]).is_empty());
+    }
+}

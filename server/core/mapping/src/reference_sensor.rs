@@ -1,0 +1,117 @@
+//! Which sensor is the reference sensor of a vehicle whose configuration names none.
+//!
+//! In: the sensors of the configuration, then their first scans. Out: the index of the reference sensor. Its scans make
+//! the maps and its lasers define the rows of radial maps, so it should stand upright, see all around the vehicle and
+//! have many lasers. Until every sensor has completed a scan, or the deadline has passed since the first scan, the
+//! configuration alone decides; then the scans decide, once. Events alone decide, so a replay chooses the same sensor.
+
+use crate::event_time::EventTime;
+use crate::sensor::scan::SensorScan;
+
+/// Greatest tilt of an upright sensor, radians: 20 degrees, as of a mount that is estimated.
+const UPRIGHT_RAD_MAX: f32 = 0.35;
+/// Number of directions around the sensor that are distinguished. Ours: a gap between buildings is narrower.
+const SECTORS: u32 = 12;
+
+/// Properties by which sensors are compared, the most important first; of two equal sensors the one configured first is
+/// chosen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Merits {
+    has_elevations: bool,
+    is_upright: bool,
+    sectors: u32,
+    lasers: usize,
+    /// Tilt in whole steps of 5 degrees, negative.
+    uprightness: i32,
+}
+
+/// The choice of one vehicle.
+pub(crate) struct ReferenceChoice {
+    is_decided: bool,
+    deadline_ns: i64,
+    /// Event time of the first completed scan, ns.
+    first_ns: Option<i64>,
+}
+
+impl ReferenceChoice {
+    /// A choice before the first event; it is made already if the configuration names the sensor or has only one.
+    pub fn new(is_decided: bool, deadline_ns: i64) -> Self {
+        Self { is_decided, deadline_ns, first_ns: None }
+    }
+
+    /// The reference sensor by the configuration alone: `lasers_configured` has the number of lasers of each sensor
+    /// whose elevations are configured, else 0.
+    pub fn by_configuration(scans: &[SensorScan], lasers_configured: &[usize]) -> usize {
+        let merits = |(scan, lasers): (&SensorScan, &usize)| Merits { sectors: 0, ..merits(scan, *lasers) };
+        best(scans.iter().zip(lasers_configured).map(merits))
+    }
+
+    /// The reference sensor by the scans, when they decide: after a completed scan, once.
+    pub fn by_scans(&mut self, scans: &[SensorScan], now: EventTime) -> Option<usize> {
+        if self.is_decided {
+            return None;
+        }
+        let since_ns = now.event_ns.saturating_sub(*self.first_ns.get_or_insert(now.event_ns));
+        if since_ns <= self.deadline_ns && scans.iter().any(|scan| scan.completed == 0) {
+            return None;
+        }
+        self.is_decided = true;
+        let lasers = |scan: &SensorScan| scan.sweep.calibration.as_ref().map_or(0, |table| table.lasers.len());
+        Some(best(scans.iter().map(|scan| merits(scan, lasers(scan)))))
+    }
+}
+
+/// Index of the greatest; of several, the first.
+fn best(merits: impl Iterator<Item = Merits>) -> usize {
+    let later = |best: (usize, Merits), next: (usize, Merits)| if next.1 > best.1 { next } else { best };
+    merits.enumerate().reduce(later).map_or(0, |(index, _)| index)
+}
+
+fn merits(scan: &SensorScan, lasers: usize) -> Merits {
+    let [x, y, _] = scan.origin_m;
+    let sector =
+        |x: f32, y: f32| (y.atan2(x).rem_euclid(std::f32::consts::TAU) / std::f32::consts::TAU) * SECTORS as f32;
+    let seen = scan
+        .sweep
+        .x
+        .iter()
+        .zip(&scan.sweep.y)
+        .fold(0u32, |seen, (px, py)| seen | 1 << (sector(px - x, py - y) as u32).min(SECTORS - 1));
+    Merits {
+        has_elevations: lasers > 0,
+        is_upright: scan.tilt_rad <= UPRIGHT_RAD_MAX,
+        sectors: seen.count_ones(),
+        lasers,
+        uprightness: -((scan.tilt_rad.to_degrees() / 5.0) as i32),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn scan(tilt_deg: f32, sectors: u32) -> SensorScan {
+        let mut scan = SensorScan::new("top", [1.0, 2.0, 1.8], tilt_deg.to_radians());
+        for sector in 0..sectors {
+            let angle = (sector as f32 + 0.5) * std::f32::consts::TAU / SECTORS as f32;
+            scan.sweep.x.push(1.0 + 9.0 * angle.cos());
+            scan.sweep.y.push(2.0 + 9.0 * angle.sin());
+        }
+        scan
+    }
+
+    #[test]
+    fn an_upright_sensor_that_sees_all_around_with_many_lasers_is_best() {
+        let order = [
+            merits(&scan(0.0, 12), 0),
+            merits(&scan(30.0, 12), 64),
+            merits(&scan(0.0, 5), 64),
+            merits(&scan(0.0, 12), 16),
+            merits(&scan(9.0, 12), 32),
+            merits(&scan(2.0, 12), 32),
+        ];
+        assert!(order.is_sorted_by(|worse, better| worse < better), "{order:?}");
+        assert_eq!(best(order.into_iter()), 5);
+        assert_eq!(best([order[3], order[5], order[5]].into_iter()), 1, "the first of two equal sensors");
+    }
+}

@@ -1,0 +1,66 @@
+//! Options of the command line -> the style of pictures.
+
+use clap::Args;
+
+use crate::encode::picture::Style;
+
+/// Edge of the map in a picture if the options do not give it, in pixels; ours, because it fits a screen.
+const PIXELS: u32 = 800;
+
+/// The options for drawing pictures.
+#[derive(Args)]
+#[command(next_help_heading = "Pictures")]
+pub struct DrawingOptions {
+    /// Edge of the map in a picture, in pixels; 800 if absent.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(16..=8192))]
+    pixels: Option<u32>,
+    /// Distance from the vehicle to the edge of the map, in metres; the whole grid if absent.
+    #[arg(long, value_name = "METRES", value_parser = metres)]
+    range: Option<f64>,
+    /// Draw a ring at each multiple of this distance from the vehicle.
+    #[arg(long, value_name = "METRES", value_parser = metres)]
+    rings: Option<f64>,
+    /// Draw this channel, such as roughness, with its colour bar; the classes if absent.
+    #[arg(long)]
+    channel: Option<String>,
+    /// Leave out the vehicle.
+    #[arg(long)]
+    no_vehicle: bool,
+    /// Leave out the strip under the map, which has the legend or colour bar, a scale bar and the direction that is up.
+    #[arg(long)]
+    plain: bool,
+}
+
+impl DrawingOptions {
+    /// The style of these options.
+    pub fn style(&self) -> Style {
+        let Self { pixels, range, rings, ref channel, no_vehicle, plain } = *self;
+        Style {
+            pixels: pixels.unwrap_or(PIXELS),
+            range_m: range,
+            rings_m: rings,
+            vehicle: !no_vehicle,
+            channel: channel.clone(),
+            legend: !plain,
+        }
+    }
+
+    /// The first of these options that is given.
+    pub fn first_given(&self) -> Option<&'static str> {
+        let Self { pixels, range, rings, ref channel, no_vehicle, plain } = *self;
+        let options = [
+            ("--pixels", pixels.is_some()),
+            ("--range", range.is_some()),
+            ("--rings", rings.is_some()),
+            ("--channel", channel.is_some()),
+            ("--no-vehicle", no_vehicle),
+            ("--plain", plain),
+        ];
+        options.into_iter().find(|(_, is_given)| *is_given).map(|(name, _)| name)
+    }
+}
+
+fn metres(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| "not a number of metres".to_owned())?;
+    if (0.1..=10_000.0).contains(&value) { Ok(value) } else { Err("0.1 to 10000 m is allowed".into()) }
+}

@@ -1,0 +1,49 @@
+//! The system's error about a file -> an error that says what is wrong with the file, and what to do.
+
+use std::io::{Error, ErrorKind};
+use std::path::Path;
+
+/// The error of `file`, which could not be read or created, with a text that says what is wrong and what to do. The
+/// text does not name the file, because the caller does.
+pub fn advised(file: &Path, error: Error) -> Error {
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let kind = error.kind();
+    let advice = match kind {
+        ErrorKind::NotFound => match folder.filter(|folder| !folder.exists()) {
+            Some(folder) => format!("No such file: the folder {} does not exist", folder.display()),
+            None => "No such file".to_owned(),
+        },
+        ErrorKind::PermissionDenied => "permission denied; check its owner and its mode".into(),
+        _ if file.is_dir() => "this is a folder; name a file".into(),
+        ErrorKind::AlreadyExists if file.exists() => {
+            "the file exists and is not overwritten; delete it, or name another file".into()
+        }
+        ErrorKind::AlreadyExists | ErrorKind::NotADirectory => {
+            "a part of this path is a file, where a folder is needed".into()
+        }
+        _ => return error,
+    };
+    Error::new(kind, advice)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::{self, File};
+
+    use super::*;
+
+    #[test]
+    fn each_error_of_the_system_becomes_an_advice() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        fs::write(at("there"), "").unwrap();
+        let advice = |file: &Path, result: std::io::Result<()>| advised(file, result.unwrap_err()).to_string();
+        let read = |file: &Path| advice(file, fs::read(file).map(drop));
+        assert_eq!(read(&at("absent")), "No such file");
+        assert!(read(&at("no/absent")).contains("the folder") && read(&at("no/absent")).contains("does not exist"));
+        assert_eq!(read(folder.path()), "this is a folder; name a file");
+        assert!(read(&at("there/in")).contains("where a folder is needed"));
+        let exists = advice(&at("there"), File::create_new(at("there")).map(drop));
+        assert_eq!(exists, "the file exists and is not overwritten; delete it, or name another file");
+    }
+}

@@ -1,0 +1,85 @@
+// In: one channel of a layer. Out: the colour of each raw value, and the legend to the colours.
+
+import { valueText, words } from "../text.js";
+import { idColour, scaleColour, UNKNOWN, word } from "./palette.js";
+
+// The least raw value of an array type: a colour table is indexed by raw value minus this.
+const least = (cells) => (cells instanceof Int8Array ? -128 : 0);
+const tableLength = (cells) => 2 ** (8 * cells.BYTES_PER_ELEMENT);
+
+// True if the values of a channel are ids, of which only equality means something.
+export const isId = ({ name, unit }) => unit === "id" || (name === "segment" && unit === "");
+
+// { colours, legend, range, bar }. colours: an ImageData word for each raw value. legend: [[colour or null, text,
+// share?, meaning?]]. The wire gives the classes' colours and meanings; that of "unknown" holds for every channel.
+// range: [least, greatest] value shown so far in the channel's unit, which `range` was before this map, or null.
+// bar: the texts of a colour bar's ends and middle, from the least value to the greatest; null if the channel has none.
+export function paintChannel(layer, channel, cells, range) {
+  if (channel.name === "class") return paintClasses(layer, cells);
+  const unknown_colour = layer.legend[0]?.colour ?? UNKNOWN;
+  return isId(channel)
+    ? paintIds(channel, cells, unknown_colour)
+    : paintScale(channel, cells, range, unknown_colour);
+}
+
+// Writes the colour of each pixel's cell; transparent outside the grid. table: from pixels to cells, of grid.js.
+export function paintPixels(pixels, table, cells, colours) {
+  const low = least(cells);
+  for (let i = 0; i < table.length; i++) pixels[i] = table[i] < 0 ? 0 : colours[cells[table[i]] - low];
+}
+
+function paintClasses(layer, cells) {
+  const counts = new Uint32Array(tableLength(cells)), colours = new Uint32Array(tableLength(cells)), low = least(cells);
+  for (let i = 0; i < cells.length; i++) counts[cells[i] - low]++;
+  const legend = layer.legend.map(({ name, meaning, colour }, value) => {
+    colours[value - low] = word(colour);
+    return [colour, words(name), counts[value - low] / cells.length, meaning];
+  });
+  return { colours, legend, range: null, bar: null };
+}
+
+function paintIds({ unknown }, cells, unknown_colour) {
+  const used = new Uint8Array(tableLength(cells)), colours = new Uint32Array(tableLength(cells)), low = least(cells);
+  let unknown_count = 0, ids = 0;
+  for (let i = 0; i < cells.length; i++) {
+    if (cells[i] === unknown) unknown_count++;
+    else used[cells[i] - low] = 1;
+  }
+  for (let i = 0; i < used.length; i++) {
+    if (!used[i]) continue;
+    ids++;
+    colours[i] = word(idColour(i + low));
+  }
+  if (unknown_count > 0) colours[unknown - low] = word(unknown_colour);
+  const legend = [unknownEntry(unknown_colour, unknown_count, cells), [null, `${ids} ids, one colour each`]];
+  return { colours, legend, range: null, bar: null };
+}
+
+function paintScale(channel, cells, range, unknown_colour) {
+  const { scale, unknown } = channel;
+  const colours = new Uint32Array(tableLength(cells)), low = least(cells);
+  let unknown_count = 0, lowest = Infinity, highest = -Infinity;
+  for (let i = 0; i < cells.length; i++) {
+    const cell = cells[i];
+    if (cell === unknown) {
+      unknown_count++;
+      continue;
+    }
+    if (cell < lowest) lowest = cell;
+    if (cell > highest) highest = cell;
+  }
+  // The range only grows while a channel is shown, so that a colour keeps its meaning from map to map.
+  if (lowest <= highest) {
+    range = [Math.min(range?.[0] ?? Infinity, lowest * scale), Math.max(range?.[1] ?? -Infinity, highest * scale)];
+  }
+  const [from, to] = range ?? [0, 0];
+  for (let raw = lowest; raw <= highest; raw++) {
+    colours[raw - low] = word(scaleColour(to > from ? (raw * scale - from) / (to - from) : 0.5));
+  }
+  if (unknown_count > 0) colours[unknown - low] = word(unknown_colour);
+  const values = to > from ? [from, (from + to) / 2, to] : [from];
+  const bar = range && values.map((value) => valueText(value, channel));
+  return { colours, legend: [unknownEntry(unknown_colour, unknown_count, cells)], range, bar };
+}
+
+const unknownEntry = (colour, unknown_count, cells) => [colour, "unknown", unknown_count / cells.length, "unknown"];
