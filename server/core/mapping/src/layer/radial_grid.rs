@@ -27,6 +27,9 @@ const WHOLE_FROM: f32 = 8_388_608.0;
 /// Least distance between two rings with a row each, metres. Ours: an HDL-64E's range noise of 2 cm mixes nearer rings.
 const RING_SPACING_M_MIN: f32 = 0.02;
 
+/// Depth of a row if the rings are not known, metres. Ours: near ground must not free a cell that reaches far beyond it.
+const ROW_DEPTH_M: f32 = 1.0;
+
 /// Grid of range and azimuth about the ego origin.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RadialGrid {
@@ -76,8 +79,7 @@ impl RadialGrid {
     /// Computes the rows again if the sensor of `sweep` differs from the last one.
     pub fn update_rows(&mut self, sweep: &Sweep, range_m_max: f32, columns: u16) {
         let Some(calibration) = &sweep.calibration else {
-            // The rings are not known: one row to the largest range.
-            *self = Self::new(vec![range_m_max], columns);
+            *self = Self::new(row_radii_m(&[], range_m_max), columns);
             return;
         };
         let height = sweep.mount_height_m;
@@ -311,7 +313,12 @@ pub fn ring_radii_m(calibration: &Calibration, height_m: f32, range_m_max: f32) 
 
 /// Outer radius of each row, metres, ascending (`r_bench` of the UT Austin thesis, section IV.1). A radius lies midway
 /// between neighbouring rings, so that noise does not move a ring over a row border; the last is the largest range.
+/// Fewer than two rings separate nothing: then all rows have the same depth.
 pub fn row_radii_m(rings_m: &[f32], range_m_max: f32) -> Vec<f32> {
+    if rings_m.len() < 2 {
+        let rows = (range_m_max / ROW_DEPTH_M).ceil().max(1.0) as u16;
+        return (1..=rows).map(|row| range_m_max * f32::from(row) / f32::from(rows)).collect();
+    }
     let midway = rings_m.windows(2).map(|pair| (pair[0] + pair[1]) / 2.0);
     midway.chain([range_m_max]).collect()
 }

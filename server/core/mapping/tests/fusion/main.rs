@@ -147,15 +147,15 @@ fn another_sensor_replaces_a_reference_sensor_that_stops() {
 #[test]
 fn the_rows_of_radial_maps_are_those_of_the_reference_sensor() {
     let mut coarse = config();
-    // For this sensor alone all the ground is one row.
-    coarse.sensors[1].elevations_deg = vec![-5.0];
+    // For this sensor alone the ground is two rows.
+    coarse.sensors[1].elevations_deg = vec![-10.0, -5.0];
     let rows = |pipeline: &mut Pipeline, event: &Event| {
         let map = step(pipeline, event)?;
         Some((map.source, common::benches(&map.layers[0]).to_vec()))
     };
     let mut alone = pipeline(&coarse);
     assert_eq!(rows(&mut alone, &scan(1, 10 * MS)), None);
-    assert_eq!(rows(&mut alone, &scan(1, 300 * MS)).map(|(source, rows)| (source, rows.len())), Some((1, 1)));
+    assert_eq!(rows(&mut alone, &scan(1, 300 * MS)).map(|(source, rows)| (source, rows.len())), Some((1, 2)));
     let mut pipeline = pipeline(&coarse);
     let (_, reference_rows) = rows(&mut pipeline, &scan(0, 100 * MS)).unwrap();
     assert!(reference_rows.len() > 4);

@@ -77,3 +77,17 @@ fn a_sensor_that_never_sends_does_not_delay_the_choice() {
     assert_eq!(pipeline.reference_sensor(), 1);
     assert!(made.iter().any(|map| (map.source, map.reference_sensor) == (1, 1)));
 }
+
+#[test]
+fn a_better_sensor_that_starts_late_becomes_the_reference() {
+    let mut pipeline = pipeline(&bumper_and_roof());
+    let late = |event: &Event| event.source == 0 || event.arrival_ns > 4 * 100 * MS;
+    for event in events(0).iter().filter(|event| late(event)) {
+        step(&mut pipeline, event);
+        assert_eq!(pipeline.reference_sensor(), usize::from(event.source), "after {} ms", event.arrival_ns / MS);
+        if event.source == 1 {
+            return;
+        }
+    }
+    panic!("the roof's sensor sends nothing");
+}
