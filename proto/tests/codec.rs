@@ -70,7 +70,7 @@ proptest! {
         widths in vec(0.01_f32..3.0, 1..60), columns in 1..720_u32, at in any::<prop::sample::Index>(),
     ) {
         let row_radius_m = widths.iter().scan(0.0, |r, step| { *r += step; Some(*r) }).collect();
-        let grid = clearway_proto::grid::Grid::Radial { row_radius_m, columns };
+        let grid = clearway_proto::grid::Grid::Radial { centre_m: [0.0; 2], row_radius_m, columns };
         let index = at.index(grid.cell_count() as usize);
         let (x, y) = grid.centre_of(index).unwrap();
         prop_assert_eq!(grid.cell_at(x, y), Some(index));

@@ -369,8 +369,9 @@ def _grid(message: map_pb2.Layer) -> Grid:
     if kind == "radial":
         radii = np.array(message.radial.row_radius_m, dtype=np.float64)
         ascending = np.isfinite(radii).all() and (np.diff(radii, prepend=0.0) > 0).all()
-        if message.radial.columns and len(radii) and ascending:
-            return RadialGrid(radii, message.radial.columns)
+        centre = (message.radial.centre_x_m, message.radial.centre_y_m)
+        if message.radial.columns and len(radii) and ascending and all(map(math.isfinite, centre)):
+            return RadialGrid(radii, message.radial.columns, centre)
     elif kind == "cartesian":
         grid = message.cartesian
         finite = all(map(math.isfinite, (grid.origin_x_m, grid.origin_y_m, grid.cell_m, grid.yaw_rad)))
@@ -400,7 +401,8 @@ def _shift(layer: str, before: Grid, now: Grid) -> tuple[int, int]:
     if isinstance(before, CartesianGrid) and isinstance(now, CartesianGrid) and before.cell_m == now.cell_m:
         return now.first_iy - before.first_iy, now.first_ix - before.first_ix
     if isinstance(before, RadialGrid) and isinstance(now, RadialGrid):
-        if before.columns == now.columns and np.array_equal(before.row_radius_m, now.row_radius_m):
+        same = (before.columns, before.centre_m) == (now.columns, now.centre_m)
+        if same and np.array_equal(before.row_radius_m, now.row_radius_m):
             return 0, 0
     raise DecodeError("base_shape", f"layer {layer!r} is a delta to a grid that is not comparable")
 

@@ -138,7 +138,7 @@ def test_a_footprint_is_free_only_if_every_cell_of_it_is_free():
 @pytest.mark.parametrize("yaw_rad", [None, 0.0, 0.7], ids=["radial", "square", "turned"])
 def test_the_nearest_obstacle_is_not_farther_than_any_point_of_one(yaw_rad):
     layer = clearway.Map((GOLDEN / "map.bin").read_bytes())["drivability"]
-    radial = RadialGrid(np.array([0.6, 1.3, 2.5]), 8)
+    radial = RadialGrid(np.array([0.6, 1.3, 2.5]), 8, (0.3, -0.4))
     layer.grid = radial if yaw_rad is None else CartesianGrid(-1.4, -1.7, 6, 6, 0.5, yaw_rad)
     looks = np.stack(np.meshgrid(*2 * [np.arange(-3.5, 3.5, 0.02)]), axis=-1).reshape(-1, 2)
     cells = layer.grid.cells_at(looks[:, 0], looks[:, 1])

@@ -46,6 +46,7 @@ pub fn map(sequence: u64, capture_end_ns: i64) -> Bytes {
         geometry: Some(v1::layer::Geometry::Radial(v1::RadialGrid {
             row_radius_m: vec![10.0, 20.0, 30.0],
             columns: 4,
+            ..Default::default()
         })),
         channels: vec![
             encode_grid(CellsRef::U8(&CLASSES), 4).into_channel("class", "", 1.0, 0),

@@ -178,9 +178,11 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
 
 fn layer(layer: &Layer) -> v1::Layer {
     let geometry = match &layer.geometry {
-        Geometry::Radial { row_radius_m, columns } => v1::layer::Geometry::Radial(v1::RadialGrid {
+        Geometry::Radial { centre_m, row_radius_m, columns } => v1::layer::Geometry::Radial(v1::RadialGrid {
             row_radius_m: row_radius_m.clone(),
             columns: u32::from(*columns),
+            centre_x_m: centre_m[0],
+            centre_y_m: centre_m[1],
         }),
         &Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_cell } => {
             let [first_ix, first_iy] = first_cell;
@@ -265,7 +267,7 @@ mod tests {
     fn map() -> Map {
         let layer = |name| Layer {
             name,
-            geometry: Geometry::Radial { row_radius_m: vec![5.0, 60.0], columns: 4 },
+            geometry: Geometry::Radial { centre_m: [0.0; 2], row_radius_m: vec![5.0, 60.0], columns: 4 },
             legend: &[ClassInfo::UNKNOWN, ClassInfo { name: "drivable", meaning: Meaning::Free, rgb: 0 }],
             channels: vec![clearway_mapping::layer::Channel {
                 name: "class",

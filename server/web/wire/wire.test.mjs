@@ -194,6 +194,13 @@ test("columns run counter-clockwise from ahead, and an outer radius belongs to i
   assert.throws(() => gridOf({ radial: { row_radius_m: [2, 1], columns: 4 } }), /row radius 1 is 1 m/);
 });
 
+test("a radial grid is addressed about its own centre", () => {
+  const grid = gridOf({ radial: { row_radius_m: [1, 2.5], columns: 12, centre_x_m: 1.5, centre_y_m: -0.5 } });
+  assert.deepEqual([grid.cellAt(1.6, -0.4), grid.cellAt(4.1, -0.5), grid.cellAt(-0.9, -0.4)], [1, -1, 17]);
+  assert.equal(grid.radius_m, 4);
+  assert.throws(() => gridOf({ radial: { row_radius_m: [1], columns: 4, centre_x_m: NaN } }), /centre is \(NaN, 0\)/);
+});
+
 test("a Cartesian cell contains its lower edge", () => {
   const grid = gridOf({ cartesian: { origin_x_m: -1, origin_y_m: -1, width: 3, height: 2, cell_m: 1, yaw_rad: 0 } });
   assert.deepEqual([grid.cellAt(-1, -1), grid.cellAt(1.5, 0.5), grid.cellAt(2, 0), grid.cellAt(0, 1)], [0, 5, -1, -1]);

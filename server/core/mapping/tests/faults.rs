@@ -153,7 +153,7 @@ fn covered(
 /// Middle of a cell, ego frame, metres.
 fn middle(geometry: &Geometry, cell: usize) -> (f64, f64) {
     match geometry {
-        Geometry::Radial { row_radius_m, columns } => {
+        Geometry::Radial { row_radius_m, columns, .. } => {
             let (row, column) = (cell / usize::from(*columns), cell % usize::from(*columns));
             let inner = if row == 0 { 0.0 } else { f64::from(row_radius_m[row - 1]) };
             let (r, angle) =

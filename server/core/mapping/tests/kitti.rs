@@ -7,7 +7,6 @@ mod common;
 use clearway_mapping::config::{DrivabilityConfig, DrivabilityVariant, Passage, PlaneTest, Seed};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
-use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::sensor::sweep::Sweep;
 use common::labels::*;
@@ -28,7 +27,7 @@ struct Labelled {
 
 fn by_cell(sweep: &Sweep, labels: &[u32], layer: &Layer) -> Labelled {
     let (rows, columns) = size(layer);
-    let grid = RadialGrid::new(benches(layer).to_vec(), columns as u16);
+    let grid = radial_grid(layer);
     let cells = rows * columns;
     let TruthByCell { road, free, obstacle } = truth_by_cell(sweep, labels, cells, |x, y| grid.cell(x, y));
 

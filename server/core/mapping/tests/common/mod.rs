@@ -103,7 +103,7 @@ pub fn off_borders(sweep: &Sweep) -> Sweep {
 /// Rows and columns of a layer.
 pub fn size(layer: &Layer) -> (usize, usize) {
     match &layer.geometry {
-        Geometry::Radial { row_radius_m, columns } => (row_radius_m.len(), usize::from(*columns)),
+        Geometry::Radial { row_radius_m, columns, .. } => (row_radius_m.len(), usize::from(*columns)),
         Geometry::Cartesian { width, height, .. } => (*height as usize, *width as usize),
     }
 }
@@ -111,7 +111,7 @@ pub fn size(layer: &Layer) -> (usize, usize) {
 /// The cell of a layer that contains a position, if there is one.
 pub fn cell_at(layer: &Layer, x: f32, y: f32) -> Option<usize> {
     match &layer.geometry {
-        Geometry::Radial { row_radius_m, columns } => RadialGrid::new(row_radius_m.clone(), *columns).cell(x, y),
+        Geometry::Radial { .. } => radial_grid(layer).cell(x, y),
         Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
             let ((x, y), (sin, cos)) = ((f64::from(x), f64::from(y)), yaw_rad.sin_cos());
             let place = |v: f64, origin: f64| ((v - origin) / f64::from(*cell_m)).floor();
@@ -139,6 +139,16 @@ pub fn quarter_rotated(layer: &Layer, values: &[i32]) -> Vec<i32> {
             assert_eq!(rows, columns, "only a square grid can be rotated by 90°");
             (0..rows * columns).map(|cell| values[(columns - 1 - cell % columns) * columns + cell / columns]).collect()
         }
+    }
+}
+
+/// The grid of a radial layer.
+pub fn radial_grid(layer: &Layer) -> RadialGrid {
+    match &layer.geometry {
+        Geometry::Radial { centre_m, row_radius_m, columns } => {
+            RadialGrid::new(*centre_m, row_radius_m.clone(), *columns)
+        }
+        Geometry::Cartesian { .. } => panic!("{} is no radial grid", layer.name),
     }
 }
 
