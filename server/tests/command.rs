@@ -67,6 +67,22 @@ fn the_default_configuration_is_printed_with_its_comments_and_is_valid() {
 }
 
 #[test]
+fn the_variable_clearway_config_names_the_default_file_and_contradicts_no_option() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("other.toml"), "[grpc]\nenabled = 7\n").unwrap();
+    let check = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_clearway"));
+        command.arg("check").args(arguments).env("CLEARWAY_CONFIG", "other.toml").current_dir(folder.path());
+        command.output().expect("the binary starts")
+    };
+    let refused = check(&[]);
+    let error = text(&refused.stderr);
+    assert!(refused.status.code() == Some(1) && error.contains("other.toml"), "{error}");
+    let printed = check(&["--default"]);
+    assert!(printed.status.success(), "{}", text(&printed.stderr));
+}
+
+#[test]
 fn an_unknown_key_is_refused_with_its_file_and_line() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("clearway.toml");

@@ -10,8 +10,9 @@ use crate::config::{Config, ConfigError};
 /// The options that name a configuration file and override its keys.
 #[derive(Args)]
 pub struct ConfigurationOptions {
-    /// The configuration file; `clearway check --default` prints one with every key explained.
-    #[arg(short, long, value_name = "FILE", env = "CLEARWAY_CONFIG", default_value = "clearway.toml")]
+    /// The configuration file, by default $CLEARWAY_CONFIG, else clearway.toml; `clearway check --default` prints one
+    /// with every key explained.
+    #[arg(short, long, value_name = "FILE", default_value_os_t = default_file())]
     pub config: PathBuf,
     /// Override a key of the configuration, such as grpc.listen=0.0.0.0:50051; may be given several times.
     #[arg(long, value_name = "KEY=VALUE")]
@@ -26,6 +27,12 @@ impl ConfigurationOptions {
     pub fn load(&self) -> Result<Config, ConfigError> {
         Config::load(&self.config, &self.set)
     }
+}
+
+/// The file that `$CLEARWAY_CONFIG` names, else `clearway.toml`. For clap it is a default and not `env`: the variable
+/// contradicts no option.
+fn default_file() -> PathBuf {
+    std::env::var_os("CLEARWAY_CONFIG").map_or_else(|| PathBuf::from("clearway.toml"), PathBuf::from)
 }
 
 /// Reads extrinsics from the command line: six numbers, separated by commas.

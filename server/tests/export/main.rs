@@ -181,18 +181,21 @@ fn a_recording_that_is_cut_off_is_exported_as_far_as_it_goes() {
 }
 
 #[test]
-fn an_unknown_layer_is_refused_with_the_names_of_the_layers() {
+fn an_unknown_layer_is_refused_with_the_names_of_the_layers_before_anything_is_written() {
     let folder = folder();
     let file = folder.path().join("run.mcap");
     record(&file, true);
-    let paths = [file.to_str().unwrap(), folder.path().to_str().unwrap()];
-    let done = clearway(&["export", paths[0], "--layer", "roughness", "--format", "png", "--out", paths[1]]);
-    assert_eq!(done.status.code(), Some(1));
-    assert!(
-        text(&done.stderr).contains("no layer \"roughness\"; it has drivability, safe_path"),
-        "{}",
-        text(&done.stderr)
-    );
+    let (path, out) = (file.to_str().unwrap(), folder.path().join("maps"));
+    for layers in ["roughness", "drivability,roughness"] {
+        for format in ["png", "npy", "foxglove"] {
+            let arguments = ["export", path, "--layer", layers, "--format", format, "--out", out.to_str().unwrap()];
+            let done = clearway(&arguments);
+            let error = text(&done.stderr);
+            assert_eq!(done.status.code(), Some(1));
+            assert!(error.contains("no layer \"roughness\"; it has drivability, safe_path"), "{error}");
+            assert!(!out.exists(), "{layers} as {format}");
+        }
+    }
 }
 
 #[test]

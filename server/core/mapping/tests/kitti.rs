@@ -99,16 +99,7 @@ fn the_labelled_frame_reaches_its_targets() {
 fn each_step_of_the_thesis_has_its_price_on_the_labelled_frame() {
     let own = DrivabilityConfig::default();
     let whole_boundary = DrivabilityConfig { plane_test: PlaneTest::WholeBoundary, ..own.clone() };
-    let thesis = DrivabilityConfig {
-        offset_m: 0.0,
-        bridge_rows: 0,
-        close_gaps: false,
-        step_m_max: 0.5,
-        grade_max: 0.0,
-        plane_test: PlaneTest::WholeBoundary,
-        passage: Passage::BetweenSegments,
-        ..own.clone()
-    };
+    let thesis = thesis_with_own_seeds();
     assert_eq!((own.seed, thesis.seed), (Seed::BlindZone, Seed::BlindZone));
     let [.., reachable] = shares(&own, Over::Plane);
     let [.., of_boundaries] = shares(&whole_boundary, Over::Plane);

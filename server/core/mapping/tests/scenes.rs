@@ -9,7 +9,7 @@
 
 mod common;
 
-use clearway_mapping::config::{DrivabilityConfig, DrivabilityVariant, HeightDifferenceConfig, Passage, PlaneTest};
+use clearway_mapping::config::{DrivabilityConfig, DrivabilityVariant, HeightDifferenceConfig};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
 use clearway_mapping::layer::height_difference::HeightDifference;
@@ -233,17 +233,7 @@ fn the_maps_of_the_four_scenes_equal_the_snapshots() {
 #[test]
 fn the_thesis_whole_comes_near_its_table_in_the_simulated_scenes() {
     let paper = DrivabilityConfig { variant: DrivabilityVariant::Paper, ..DrivabilityConfig::default() };
-    // The same with seeds in the whole blind zone.
-    let seeded = DrivabilityConfig {
-        offset_m: 0.0,
-        bridge_rows: 0,
-        close_gaps: false,
-        step_m_max: 0.5,
-        grade_max: 0.0,
-        plane_test: PlaneTest::WholeBoundary,
-        passage: Passage::BetweenSegments,
-        ..DrivabilityConfig::default()
-    };
+    let seeded = thesis_with_own_seeds();
     for scene in scenes::of_the_thesis() {
         let (name, paper_share) = (scene.name, scene.paper_share.unwrap());
         let scan = simulate(scene);

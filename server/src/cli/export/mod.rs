@@ -115,6 +115,26 @@ fn check(options: &Options) -> Result<()> {
     Ok(())
 }
 
+/// Checks, before anything is written, that the recording has a map of each layer. The recording is read until all have
+/// been seen, which is seldom far.
+fn check_layers(options: &Options) -> Result<()> {
+    let Options { recording: file, layers, vehicle, .. } = options;
+    let mut recording = McapReader::salvage(file)?;
+    let mut absent: Vec<&String> = layers.iter().collect();
+    while let Some(name) = absent.first() {
+        let Some(message) = recording.next() else {
+            bail!("{}", nothing_exported(file, &recording, Some(name), vehicle.as_deref()));
+        };
+        let message = message?;
+        if vehicle.as_ref().is_none_or(|only| message.vehicle() == Some(only))
+            && let Some((_, layer)) = message.map_of()
+        {
+            absent.retain(|name| *name != layer);
+        }
+    }
+    Ok(())
+}
+
 /// Exports the maps of the recording.
 ///
 /// # Errors
@@ -123,6 +143,7 @@ pub fn run(options: &Options) -> Result<()> {
     check(options)?;
     let Options { recording: file, layers, out, vehicle, .. } = options;
     let (_, length) = files::open(file)?;
+    check_layers(options)?;
     let mut recording = McapReader::salvage(file)?;
     let mut output = Output::new(options)?;
     let style = options.drawing.style();
@@ -170,9 +191,6 @@ pub fn run(options: &Options) -> Result<()> {
     }
     if let Some(cut) = recording.incomplete() {
         eprintln!("clearway: {} is {cut}; the maps before that are exported", file.display());
-    }
-    if let Some(layer) = layers.iter().find(|layer| !maps.contains_key(*layer)) {
-        bail!("{}", nothing_exported(file, &recording, Some(layer), vehicle.as_deref()));
     }
     if maps.is_empty() {
         bail!("{}", nothing_exported(file, &recording, None, vehicle.as_deref()));

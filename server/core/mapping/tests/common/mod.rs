@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::config::ReachConfig;
+use clearway_mapping::config::{DrivabilityConfig, Passage, PlaneTest, ReachConfig};
 use clearway_mapping::ground::Ground;
 use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::layer::{Cells, Context, Geometry, Layer, Rays};
@@ -61,6 +61,20 @@ pub fn cast(model: Model, inside: impl Fn(f32, f32, f32) -> bool) -> Sweep {
         }
     }
     sweep
+}
+
+/// The parameters of the UT Austin thesis, but for the cells where segments start: the whole blind zone.
+pub fn thesis_with_own_seeds() -> DrivabilityConfig {
+    DrivabilityConfig {
+        offset_m: 0.0,
+        bridge_rows: 0,
+        close_gaps: false,
+        step_m_max: 0.5,
+        grade_max: 0.0,
+        plane_test: PlaneTest::WholeBoundary,
+        passage: Passage::BetweenSegments,
+        ..DrivabilityConfig::default()
+    }
 }
 
 /// Level ground.
