@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use bytes::Bytes;
 use clearway_lidar::calibration::Calibration;
+use clearway_mapping::config::TimeConfig;
 use clearway_mapping::event::Event;
 use clearway_ros::Kind;
 
@@ -129,7 +130,8 @@ impl RecordingReader {
     pub fn config(&self) -> Result<(Config, Calibrations), RecordingError> {
         let (file, header) = (self.reader.file(), self.header());
         let text = header.config.as_ref().ok_or_else(|| RecordingError::NoConfig { file: file.to_owned() })?;
-        let config = Config::parse(text, &file.join("config.toml"), &[])?;
+        let mut config = Config::parse(text, &file.join("config.toml"), &[])?;
+        use_rules_of_the_run(&mut config, text);
         let table = |vehicle: &str, sensor: &clearway_mapping::config::SensorConfig| {
             if sensor.calibration.is_none() {
                 return Ok(None);
@@ -166,6 +168,18 @@ impl RecordingReader {
                 let file = self.reader.file();
                 Some(event.map_err(|source| RecordingError::Event { file: file.into(), topic: topic.clone(), source }))
             }
+        }
+    }
+}
+
+/// Sets the rules of a run that was recorded before they could be configured. A recorded configuration is complete, so a
+/// table that it lacks is one that its program did not have.
+fn use_rules_of_the_run(config: &mut Config, text: &str) {
+    let document: toml::Table = text.parse().unwrap_or_default();
+    let recorded = document.get("vehicle").and_then(toml::Value::as_array).into_iter().flatten();
+    for (vehicle, recorded) in config.vehicles.iter_mut().zip(recorded) {
+        if recorded.get("time").is_none() {
+            vehicle.time = TimeConfig::WITHOUT_EPOCHS;
         }
     }
 }
