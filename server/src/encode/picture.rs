@@ -4,8 +4,8 @@
 //! legend, or one channel: ids in one colour each, other values from dark to light. The PNG's text `Comment` names the
 //! channel, its least and greatest value and its unit. Safe points of the layer are drawn as lines between linked
 //! points, in a band as wide as their radii. A strip under the picture shows the legend of the classes or the colour
-//! bar of the channel, a scale bar and which direction is up, unless the style leaves it out. The picture of a stale map
-//! has a red frame and the word STALE.
+//! bar of the channel, a scale bar and which direction is up, unless the style leaves it out. The picture of a stale
+//! map has a red frame and the word STALE.
 
 mod canvas;
 mod colours;

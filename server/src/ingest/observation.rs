@@ -194,8 +194,8 @@ pub fn decode(observation: v1::Observation, limits: &Limits) -> Result<Bodies, O
     Ok(vec![(captured_ns, body)])
 }
 
-/// Returns `bodies` if no stamp in them is too far ahead of the server's clock `now_ns`. A stamp of the past is allowed:
-/// it may be that of an old drive, and a map never looks younger by it.
+/// Returns `bodies` if no stamp in them is too far ahead of the server's clock `now_ns`. A stamp of the past is
+/// allowed: it may be that of an old drive, and a map never looks younger by it.
 ///
 /// # Errors
 /// [`ObservationError::StampAhead`] with the first stamp that is.

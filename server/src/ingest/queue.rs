@@ -1,8 +1,8 @@
 //! Readings in, numbered [`Event`]s out, on one bounded queue a vehicle.
 //!
 //! Only this file and the reader of recordings create an [`Event`]; the engine cannot tell live and captured events
-//! apart. The queue stamps a live reading with its clock, or with the kernel's stamp of the datagram if that is plausible;
-//! a captured reading keeps its own stamp. A reading that does
+//! apart. The queue stamps a live reading with its clock, or with the kernel's stamp of the datagram if that is
+//! plausible; a captured reading keeps its own stamp. A reading that does
 //! not become an event is counted, because the queue or the kernel's buffer was full, the sender is unknown, or the
 //! datagram is too long. The queue turns these counts into [`Body::Lost`] events, so the journal and every replay of it
 //! contain all drops.
@@ -25,8 +25,8 @@ use crate::sync::locked;
 /// datagrams from unknown senders must not fill the journal. Ours: ten reports a second are fine enough for a rate.
 const REPORT_PERIOD_NS: u64 = 100_000_000;
 
-/// Greatest age of a datagram by the kernel's stamp, in ns. Ours: no server stands still for longer and goes on; a stamp
-/// that differs by more is that of a clock that was set between the kernel's stamp and the reading.
+/// Greatest age of a datagram by the kernel's stamp, in ns. Ours: no server stands still for longer and goes on; a
+/// stamp that differs by more is that of a clock that was set between the kernel's stamp and the reading.
 const RECEIVED_AGE_NS_MAX: i64 = 60_000_000_000;
 
 /// An event without its number: what a source of readings yields.
@@ -150,9 +150,9 @@ impl EventQueue {
         self.push_all(None, readings.into_iter().map(|(source, body)| (source, None, body, None)), None).map(drop)
     }
 
-    /// Pushes datagrams of sensors with the times at which the kernel received them. A time that is not plausible by the
-    /// queue's clock, or unknown, is replaced by the present. Never waits, as [`EventQueue::push`]. Each sensor has its
-    /// share of the queue; what is more is counted as lost, and leaves the space of the others.
+    /// Pushes datagrams of sensors with the times at which the kernel received them. A time that is not plausible by
+    /// the queue's clock, or unknown, is replaced by the present. Never waits, as [`EventQueue::push`]. Each sensor has
+    /// its share of the queue; what is more is counted as lost, and leaves the space of the others.
     ///
     /// # Errors
     /// [`QueueClosedError`] if the engine has stopped.

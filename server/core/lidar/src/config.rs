@@ -18,8 +18,8 @@ pub struct SensorConfig {
     pub cut_azimuth_deg: f32,
     /// Greatest age of GPS time at its arrival, in ns; older GPS time is ignored ([`crate::clock`]).
     pub gps_late_ns_max: i64,
-    /// Greatest time, in ns, by which stamps may be ahead of the clock that they follow; if they are ahead by more, they
-    /// go back and a new epoch begins. 0: stamps never go back ([`crate::clock`]).
+    /// Greatest time, in ns, by which stamps may be ahead of the clock that they follow; if they are ahead by more,
+    /// they go back and a new epoch begins. 0: stamps never go back ([`crate::clock`]).
     pub ahead_ns_max: i64,
 }
 

@@ -10,7 +10,7 @@
 //! |---|---|
 //! | later than all arrivals before | advances by the difference |
 //! | earlier, but not earlier than the one before in its lane | stays: the event was read late |
-//! | earlier than the one before in its lane, or more than 10 s earlier than any | stays; later arrivals count from it |
+//! | earlier than the one before in its lane, or by more than 10 s than any | stays; later arrivals count from it |
 
 use std::collections::BTreeMap;
 
@@ -28,8 +28,8 @@ pub(crate) struct EventTime {
     pub event_ns: i64,
 }
 
-/// Greatest time by which an event that was read late is behind the latest one, ns. Ours: a server that stands still for
-/// longer is restarted, and a single event with a stamp in the future must not stop the event time for longer.
+/// Greatest time by which an event that was read late is behind the latest one, ns. Ours: a server that stands still
+/// for longer is restarted, and a single event with a stamp in the future must not stop the event time for longer.
 const LATE_NS_MAX: i64 = 10_000_000_000;
 
 /// The event time of one vehicle.

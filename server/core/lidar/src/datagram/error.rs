@@ -86,15 +86,10 @@ pub enum DatagramError {
     #[error("telemetry: {0}")]
     Nmea(NmeaError),
     /// A datagram of 512 bytes has no sentence and is no telemetry.
-    #[error(
-        "telemetry without a sentence, device time {device_us} us, pulse state {pps}: under 3601000000 us, 0 to 3 and \
-         text are allowed"
-    )]
+    #[error("telemetry without a sentence, device time {device_us} us: under 3601000000 us, and text, are allowed")]
     Telemetry {
         /// Bytes 198 to 201.
         device_us: u32,
-        /// Byte 202.
-        pps: u8,
     },
 }
 

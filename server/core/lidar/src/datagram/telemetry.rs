@@ -13,8 +13,6 @@ const DEVICE_US: usize = 198;
 const PPS: usize = 202;
 /// Device time from which on none is possible, in microseconds: in a leap second the counter passes the hour.
 const DEVICE_US_MAX: u32 = 3_601_000_000;
-/// Greatest state of the pulse that the manuals name.
-const PPS_MAX: u8 = 3;
 const NMEA: std::ops::Range<usize> = 206..334;
 
 /// The content of a telemetry datagram.
@@ -65,9 +63,9 @@ impl Telemetry {
         let text = payload[NMEA].split(|byte| matches!(byte, 0 | b'\r' | b'\n')).next().unwrap_or_default();
         let gprmc = if text.is_empty() { None } else { Some(Gprmc::parse(text).map_err(DatagramError::Nmea)?) };
         let is_text = |byte: &u8| matches!(byte, 0 | b'\r' | b'\n' | b' '..=b'~');
-        let is_telemetry = device_us < DEVICE_US_MAX && payload[PPS] <= PPS_MAX && payload[NMEA].iter().all(is_text);
+        let is_telemetry = device_us < DEVICE_US_MAX && payload[NMEA].iter().all(is_text);
         if gprmc.is_none() && !is_telemetry {
-            return Err(DatagramError::Telemetry { device_us, pps: payload[PPS] });
+            return Err(DatagramError::Telemetry { device_us });
         }
         Ok(Self { device_us, pps, gprmc })
     }

@@ -52,9 +52,9 @@
 //! - The offset of a GPRMC is a whole number of hours. It is the same to the nanosecond for all arrivals, and it stays
 //!   in force if GPS or the pulse is lost, over a restart, and if the host disagrees. If it is not within reach, the
 //!   stamps go on by arrival.
-//! - The offset by arrival is held and not averaged. A rise of the delay means that the host's clock was set forward. If
-//!   the packets come faster than they were sent, they have waited (a receiver that stood still, a network): then the
-//!   rise is an age and no offset, and the stamps must show it.
+//! - The offset by arrival is held and not averaged. A rise of the delay means that the host's clock was set forward.
+//!   If the packets come faster than they were sent, they have waited (a receiver that stood still, a network): then
+//!   the rise is an age and no offset, and the stamps must show it.
 //! - A delay that stays less than the offset means that the host's clock was set back, or that the offset came from
 //!   packets that had waited. While the delay goes on falling (a capture that is sent too fast, a burst), there is no
 //!   clock to follow.
@@ -62,10 +62,10 @@
 //! - If the host's clock is set while the device is silent, that is no longer silence (`timeline.rs`). If it is set
 //!   between the two packets between which the device's counter jumps, the host's step is used, because nothing else
 //!   measures the jump. Stamps that are too far ahead for that reason wait until GPS or the host reaches them.
-//! - A correction forward applies at once. A reader whose clock is behind the stamps cannot tell the age of a map, so it
-//!   uses none: stamps that are too far ahead must go back soon, and must not do so silently.
-//! - If `ahead_ns_max` is 0, no epoch begins: for a clock that is at most 60 s behind, the stamps run at half speed, and
-//!   no other is followed. Recordings made before there were epochs are replayed so.
+//! - A correction forward applies at once. A reader whose clock is behind the stamps cannot tell the age of a map, so
+//!   it uses none: stamps that are too far ahead must go back soon, and must not do so silently.
+//! - If `ahead_ns_max` is 0, no epoch begins: for a clock that is at most 60 s behind, the stamps run at half speed,
+//!   and no other is followed. Recordings made before there were epochs are replayed so.
 
 use super::minimum_delay::{MinimumDelay, STEP_NS_MAX};
 use super::timeline::{NS_PER_HOUR, NS_PER_SECOND, StepKind, Timeline, nearest_hour};
@@ -97,8 +97,8 @@ const REACH_NS_MAX: i64 = 60 * NS_PER_SECOND;
 /// Default of [`crate::SensorConfig::ahead_ns_max`], in ns: less than the 300 ms for which a map is valid, and at half
 /// speed the stamps are right again after twice this time.
 pub const AHEAD_NS_MAX: i64 = 250_000_000;
-/// Least time, in ns of the timeline, between the beginnings of two epochs. Ours: telemetry that contradicts itself does
-/// not make the stamps go back more often.
+/// Least time, in ns of the timeline, between the beginnings of two epochs. Ours: telemetry that contradicts itself
+/// does not make the stamps go back more often.
 const EPOCH_NS_MIN: i64 = NS_PER_SECOND;
 /// Fall of the delay, in ns, that is followed as soon as revolutions agree on it. Ours: a smaller one is drift, for
 /// which ten seconds are soon enough.

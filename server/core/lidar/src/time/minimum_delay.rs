@@ -15,8 +15,8 @@ pub(super) const STEP_NS_MAX: i64 = 500_000_000;
 const DRIFT_WINDOW_NS: i64 = 10 * NS_PER_SECOND;
 
 /// Time, in ns, for which the least delays of revolutions must agree before a clock that is behind the stamps is
-/// followed. Ours: stamps are then right again half a second after the clock was set, and the delays of packets that are
-/// sent or read in a burst do not agree for so long.
+/// followed. Ours: stamps are then right again half a second after the clock was set, and the delays of packets that
+/// are sent or read in a burst do not agree for so long.
 const AGREED_NS: i64 = 350_000_000;
 /// Greatest difference, in ns, between the least delays of revolutions that agree on such a clock. Ours: a capture that
 /// is sent 1.3 times too fast differs by more.

@@ -1,5 +1,5 @@
-//! Stamps: they rise within an epoch, and after an event of any clock they are right again one revolution later, or half
-//! a second later if they must go back.
+//! Stamps: they rise within an epoch, and after an event of any clock they are right again one revolution later, or
+//! half a second later if they must go back.
 
 use clearway_lidar::{Clock, DatagramError, Model, Revolution, Sensor, SensorConfig};
 use proptest::collection::vec;
@@ -301,7 +301,8 @@ proptest! {
                 let packet = with_device_us(stream.packet(index), device_us);
                 if let Some(revolution) = push(&mut sensor, &packet, arrival_ns) {
                     let goes_back = newest_ns >= revolution.start_ns;
-                    prop_assert!(revolution.epoch == epoch + u32::from(goes_back), "{newest_ns} {}", revolution.start_ns);
+                    let (start_ns, expected) = (revolution.start_ns, epoch + u32::from(goes_back));
+                    prop_assert!(revolution.epoch == expected, "{newest_ns} {start_ns}");
                     prop_assert!(revolution.start_ns <= revolution.end_ns);
                     (newest_ns, epoch) = (revolution.end_ns, revolution.epoch);
                 }

@@ -339,6 +339,7 @@ pub(crate) fn scripts() -> Vec<Script> {
             event_ns: 2 * S,
             lasts_ns: 5 * S,
             healed_ns: 2 * S + REVOLUTION,
+            epochs: 1,
             ..late
         },
     ]
