@@ -58,7 +58,9 @@ impl Engine {
                 }
             }
             let _stopped = Stopped(self.status.clone());
+            self.status.engine_beats();
             while let Some(queued) = self.next(&events) {
+                self.status.engine_beats();
                 self.step(queued);
             }
         })
@@ -89,7 +91,10 @@ impl Engine {
         loop {
             match events.recv_timeout(POLL_INTERVAL) {
                 Ok(queued) => return Some(queued),
-                Err(RecvTimeoutError::Timeout) => self.complete_newest_map(),
+                Err(RecvTimeoutError::Timeout) => {
+                    self.status.engine_beats();
+                    self.complete_newest_map();
+                }
                 Err(RecvTimeoutError::Disconnected) => {
                     self.update_status();
                     return None;

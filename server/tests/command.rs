@@ -23,7 +23,7 @@ fn help_lists_the_subcommands_by_purpose_and_the_exit_codes() {
     let order =
         ["Make maps:", "  demo ", "  serve ", "  replay ", "Check maps", "  verify ", "Send sensor data:", "Shell:"];
     assert!(order.map(position).is_sorted(), "{help}");
-    position("Exit codes: 0 success, 1 failure, 2 wrong usage.");
+    position("Exit codes: 0 success, 1 failure, 2 wrong usage, 3 the map is stale (get, watch).");
 }
 
 #[test]

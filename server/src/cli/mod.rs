@@ -118,9 +118,10 @@ const GROUPS: [(&str, &[&str]); 6] = [
 ];
 
 #[cfg(feature = "sim")]
-const EXIT_CODES: &str = "Exit codes: 0 success, 1 failure, 2 wrong usage.";
+const EXIT_CODES: &str = "Exit codes: 0 success, 1 failure, 2 wrong usage, 3 the map is stale (get, watch).";
 #[cfg(not(feature = "sim"))]
-const EXIT_CODES: &str = "Exit codes: 0 success, 1 failure, 2 wrong usage.\n\nThis build is without the feature `sim`: \
+const EXIT_CODES: &str = "Exit codes: 0 success, 1 failure, 2 wrong usage, 3 the map is stale (get, watch).\n\n\
+    This build is without the feature `sim`: \
     `demo`, `simulate`, `evaluate sim:NAME` and the bad network of `send` are not in it.";
 
 /// Runs the command line of this process.
@@ -169,8 +170,8 @@ fn run(command: Command) -> Result<ExitCode> {
         Command::Verify(options) => return verify::run(&options),
         Command::Evaluate(options) => evaluate::run(&options)?,
         Command::Check(options) => check::run(&options)?,
-        Command::Watch(options) => watch::run(&options)?,
-        Command::Get(options) => get::run(&options)?,
+        Command::Watch(options) => return watch::run(&options),
+        Command::Get(options) => return get::run(&options),
         Command::Vehicles(options) => vehicles::run(&options)?,
         Command::Export(options) => export::run(&options)?,
         Command::Info(options) => info::run(&options)?,

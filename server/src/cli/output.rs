@@ -1,12 +1,21 @@
 //! What the subcommands share to run and to print: stdout, the progress bar, the runtime, the signals that end them.
 
 use std::io::{ErrorKind, Write};
+use std::process::ExitCode;
 
 use anyhow::{Context, Error, Result};
 use indicatif::{ProgressBar, ProgressStyle};
 use tokio::signal::unix::{SignalKind, signal};
 
 pub use crate::counted::counted;
+
+/// Exit code of a command whose newest map is stale. Ours: 1 is any other failure and 2 an error of usage.
+const STALE: u8 = 3;
+
+/// The exit code of a command that showed a map: success, or 3 if the map is stale.
+pub fn exit_code(is_stale: bool) -> ExitCode {
+    if is_stale { ExitCode::from(STALE) } else { ExitCode::SUCCESS }
+}
 
 /// Threads of the runtime at least, because zenoh needs several, whatever the machine has.
 const THREADS_MIN: usize = 2;

@@ -6,7 +6,7 @@ use clap::Args;
 use super::configuration::ConfigurationOptions;
 use super::output::{block_on, stop_signal};
 use crate::record::writer;
-use crate::server::{Running, Server, Setup};
+use crate::server::{Running, Server, Setup, ShutdownError};
 
 /// Listen for sensor data, make maps and publish them, until SIGINT or SIGTERM.
 #[derive(Args)]
@@ -42,8 +42,13 @@ async fn serve(configuration: &ConfigurationOptions) -> Result<()> {
     log_endpoints(&running);
     stop.await;
     tracing::info!("stopping");
-    running.shutdown().await?;
-    Ok(())
+    let ended = running.shutdown_in_time().await;
+    if let Err(error @ ShutdownError::Deadline { .. }) = &ended {
+        // A thread that hangs would keep the runtime, and with it the process.
+        tracing::error!(%error, "ending without it");
+        std::process::exit(1);
+    }
+    Ok(ended?)
 }
 
 /// Logs every address at which the server listens, and the recording.

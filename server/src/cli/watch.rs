@@ -1,5 +1,6 @@
 //! `clearway watch`: a server -> one line for each map, and a line when the maps stop.
 
+use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::{Result, bail};
@@ -8,20 +9,23 @@ use clearway_client::{MapStream, StreamEvent, Subscription, Update, now_ns};
 use serde_json::json;
 
 use super::connection::{ServerOptions, explain};
-use super::output::{block_on, print_line};
+use super::output::{block_on, exit_code, print_line};
 
-/// Time without a first map after which the command says that it waits.
-const FIRST_MAP_TIMEOUT: Duration = Duration::from_secs(1);
+/// Time between two lines while no fresh map comes. Ours: a person sees that the command still waits.
+const STALE_PERIOD: Duration = Duration::from_secs(1);
+/// Interval at which the age of the last map is read after the stream has ended.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps.
 ///
-/// If no newer map arrives before the last one becomes stale, a line says so; the lines continue when maps arrive
-/// again.
+/// If no map arrives, or no newer one before the last one becomes stale, a line says STALE once a second until maps
+/// arrive again. The exit code is 3 if the last line says STALE, and 1 if the server ends the stream.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway watch
   clearway watch --server vehicle.local:50051 --layers drivability,occupancy --max-rate-hz 2
-  clearway watch --count 10 --json")]
+  clearway watch --count 10 --json
+  clearway watch --until-stale || echo \"the maps are stale\"")]
 pub struct Options {
     #[command(flatten)]
     server: ServerOptions,
@@ -46,46 +50,66 @@ pub struct Options {
     /// End after this many maps; at Ctrl-C if absent.
     #[arg(long, value_name = "MAPS")]
     count: Option<u64>,
+    /// End with exit code 3 as soon as the map is stale, or none has come for a second.
+    #[arg(long)]
+    until_stale: bool,
 }
 
-/// Prints lines until the stream ends, the count is reached or the reader of stdout has closed it.
+/// Prints lines until the stream ends, the count is reached, the map is stale with `--until-stale`, or the reader of
+/// stdout has closed it.
 ///
 /// # Errors
 /// [`ClientError`](clearway_client::ClientError) if the server refuses, does not answer or ends the stream.
-pub fn run(options: &Options) -> Result<()> {
+pub fn run(options: &Options) -> Result<ExitCode> {
     block_on(watch(options))
 }
 
-async fn watch(options: &Options) -> Result<()> {
+async fn watch(options: &Options) -> Result<ExitCode> {
     let mut maps = subscribe(options).await?;
-    let mut last = None;
-    let mut printed = 0;
-    while options.count.is_none_or(|count| printed < count) {
-        let update = match next(&mut maps, printed == 0).await? {
-            StreamEvent::Fresh(update) | StreamEvent::Stale(update) => update,
+    let mut newest: Option<Update> = None;
+    let (mut printed, mut is_stale) = (0, false);
+    while options.count.is_none_or(|count| printed < count) && !(is_stale && options.until_stale) {
+        let event = tokio::time::timeout(STALE_PERIOD, maps.next_or_stale()).await;
+        let (said, is_new) = match event {
+            Ok(Ok(StreamEvent::Fresh(update) | StreamEvent::Stale(update))) => {
+                let is_new = newest.as_ref().map(id) != Some(id(&update));
+                is_stale = update.map.is_stale(now_ns());
+                let said = if is_new { line(&update, options.json) } else { stale_line(Some(&update), options) };
+                newest = Some(update);
+                (said, is_new)
+            }
+            Ok(Err(ended)) => {
+                if let Some(last) = newest.filter(|_| !is_stale) {
+                    wait_until_stale(&last).await;
+                    print_line(&stale_line(Some(&last), options))?;
+                }
+                return Err(explain(ended));
+            }
+            // A fresh map is not repeated: maps may be rarer than this period.
+            Err(_) if newest.as_ref().is_some_and(|last| !last.map.is_stale(now_ns())) => continue,
+            Err(_) => {
+                is_stale = true;
+                (stale_line(newest.as_ref(), options), false)
+            }
         };
-        let id = (update.map.header().boot_id, update.map.sequence());
-        let is_new = last.replace(id) != Some(id);
-        let line = if is_new || options.json { line(&update, options.json) } else { stopped_line(&update) };
-        if !print_line(&line)? {
+        if !print_line(&said)? {
             break;
         }
         printed += u64::from(is_new);
     }
-    Ok(())
+    Ok(exit_code(is_stale))
 }
 
-/// The next event of the stream. Says on stderr that it waits if this is the first one and does not come soon.
-async fn next(maps: &mut MapStream, is_first: bool) -> Result<StreamEvent> {
-    if is_first {
-        if let Ok(event) = tokio::time::timeout(FIRST_MAP_TIMEOUT, maps.next_or_stale()).await {
-            return event.map_err(explain);
-        }
-        eprintln!(
-            "clearway: no map yet; waiting for the first one (`clearway vehicles` shows what the server receives)"
-        );
+/// Identity of a map.
+fn id(update: &Update) -> (u64, u64) {
+    (update.map.header().boot_id, update.map.sequence())
+}
+
+/// Waits until the last map of a stream that has ended is stale.
+async fn wait_until_stale(last: &Update) {
+    while !last.map.is_stale(now_ns()) {
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
-    maps.next_or_stale().await.map_err(explain)
 }
 
 async fn subscribe(options: &Options) -> Result<MapStream> {
@@ -127,15 +151,21 @@ fn line(update: &Update, as_json: bool) -> String {
     )
 }
 
-/// The line for a map that has become stale without a newer one.
-fn stopped_line(update: &Update) -> String {
-    let map = &update.map;
-    format!(
-        "{} #{:06}  age {:7.1} ms  STALE: no newer map has arrived; waiting",
-        map.vehicle(),
-        map.sequence(),
-        map.age_ms(now_ns())
-    )
+/// The line while no fresh map is there: the newest one is stale, or none has come.
+fn stale_line(newest: Option<&Update>, options: &Options) -> String {
+    match newest {
+        Some(update) if options.json => line(update, true),
+        Some(Update { map, .. }) => format!(
+            "{} #{:06}  age {:7.1} ms  STALE: no newer map has arrived; waiting",
+            map.vehicle(),
+            map.sequence(),
+            map.age_ms(now_ns())
+        ),
+        None if options.json => {
+            json!({"vehicle": options.vehicle, "sequence": null, "age_ms": null, "stale": true}).to_string()
+        }
+        None => "STALE: no map has arrived; waiting (`clearway vehicles` shows what the server receives)".to_owned(),
+    }
 }
 
 #[cfg(feature = "zenoh")]

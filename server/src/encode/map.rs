@@ -140,6 +140,7 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
         source_sensor: map.sensors.get(usize::from(map.source)).map_or(String::new(), |sensor| sensor.name.clone()),
         reference_sensor: (map.sensors.get(usize::from(map.reference_sensor)))
             .map_or(String::new(), |sensor| sensor.name.clone()),
+        epoch: map.epoch,
     }
 }
 
@@ -162,6 +163,7 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
         partial: state.partial.to_owned(),
         clock: state.clock.to_owned(),
         clock_offset_ms: state.clock_offset_ms,
+        epoch: state.epoch,
         packets_expected: state.packets_expected,
         blocked_sectors: state
             .blocked
@@ -284,6 +286,7 @@ mod tests {
             sequence: 9,
             capture_start_ns: 1,
             capture_end_ns: 100,
+            epoch: 0,
             completed_ns: 101,
             map_from_ego: None,
             speed_mps: None,

@@ -4,12 +4,14 @@
 //! legend, or one channel: ids in one colour each, other values from dark to light. The PNG's text `Comment` names the
 //! channel, its least and greatest value and its unit. Safe points of the layer are drawn as lines between linked
 //! points, in a band as wide as their radii. A strip under the picture shows the legend of the classes or the colour
-//! bar of the channel, a scale bar and which direction is up, unless the style leaves it out.
+//! bar of the channel, a scale bar and which direction is up, unless the style leaves it out. The picture of a stale
+//! map has a red frame and the word STALE.
 
 mod canvas;
 mod colours;
 mod error;
 mod safe_paths;
+mod stale;
 
 use clearway_proto::map::Layer;
 
@@ -41,6 +43,8 @@ pub struct Style {
     pub channel: Option<String>,
     /// True if the strip with the legend is under the map.
     pub legend: bool,
+    /// True if the map is stale: the picture says so across the map.
+    pub stale: bool,
 }
 
 /// Draws a layer and encodes the picture.
@@ -73,6 +77,9 @@ pub fn png(layer: &Layer, style: &Style) -> Result<Vec<u8>, PictureError> {
                 canvas.rgb[index] = VEHICLE;
             }
         }
+    }
+    if style.stale {
+        stale::draw(&mut canvas);
     }
     let metres = canvas.pixel_m();
     let (mut width, mut height, mut rgb) = (side, side, canvas.rgb);

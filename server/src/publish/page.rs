@@ -77,12 +77,9 @@ async fn list(State(vehicles): State<Vehicles>) -> impl IntoResponse {
 }
 
 async fn health(State(vehicles): State<Vehicles>) -> Response {
-    match vehicles.statuses().iter().find(|status| !status.is_alive()) {
+    match vehicles.statuses().iter().find_map(|status| status.fault()) {
         None => "ok\n".into_response(),
-        Some(dead) => {
-            let text = format!("the engine of vehicle {} has stopped\n", dead.name);
-            (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
-        }
+        Some(fault) => (StatusCode::SERVICE_UNAVAILABLE, fault + "\n").into_response(),
     }
 }
 

@@ -1,7 +1,7 @@
 //! A running server, and its shutdown.
 
 use std::net::SocketAddr;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -14,7 +14,10 @@ use crate::ingest::udp;
 use crate::publish::{Vehicles, foxglove};
 use crate::record::writer::Recorder;
 use crate::subscriptions::LayerSubscription;
+use crate::sync::locked;
 
+/// Longest time of [`Running::shutdown_in_time`]. Ours: service managers wait 10 s or more before they kill a server.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_millis(4500);
 /// Longest wait for each kind of publisher at shutdown. Ours: a stalled peer must not keep the server from ending.
 const PUBLISHERS_STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -38,6 +41,8 @@ pub struct Running {
     pub(super) udp: Option<udp::UdpThreads>,
     pub(super) publishers: JoinSet<()>,
     pub(super) stop: watch::Sender<bool>,
+    /// What the shutdown waits for.
+    shutdown_step: Arc<Mutex<&'static str>>,
     /// Layers that are computed with or without readers; held until the end.
     pub(super) subscriptions: Vec<LayerSubscription>,
     pub(super) viewers: Option<foxglove::Publisher>,
@@ -60,12 +65,28 @@ impl Running {
         }
     }
 
+    /// As [`Running::shutdown`], but gives up after 4.5 s whatever a disk or an engine does. Threads may go on then, so
+    /// the process should end.
+    ///
+    /// # Errors
+    /// As [`Running::shutdown`], and [`ShutdownError::Deadline`] with the part that did not end.
+    pub async fn shutdown_in_time(self) -> Result<(), ShutdownError> {
+        let step = self.shutdown_step.clone();
+        match tokio::time::timeout(SHUTDOWN_TIMEOUT, self.shutdown()).await {
+            Ok(ended) => ended,
+            Err(_) => Err(ShutdownError::Deadline { waiting_for: *locked(&step), limit: SHUTDOWN_TIMEOUT }),
+        }
+    }
+
     /// Ends the server in order: first the inputs, then the engines after their last event, the recorder after the last
     /// map, and the publishers at the end.
     ///
     /// # Errors
     /// [`ShutdownError`] if an engine panicked or the recording is incomplete; everything has ended then as well.
     pub async fn shutdown(mut self) -> Result<(), ShutdownError> {
+        let step = self.shutdown_step.clone();
+        let begin = |what: &'static str| *locked(&step) = what;
+        begin("the sockets' threads");
         if let Some(threads) = self.udp.take() {
             // Fails only if the runtime shuts down; then the threads end by themselves.
             let _ = tokio::task::spawn_blocking(move || threads.stop()).await;
@@ -74,6 +95,7 @@ impl Running {
         if let Some(over_zenoh) = &mut self.over_zenoh {
             over_zenoh.stop_ros().await;
         }
+        begin("the event queues");
         let inputs = std::mem::take(&mut self.inputs);
         let close_queues = move || {
             for input in inputs {
@@ -84,8 +106,10 @@ impl Running {
         };
         let _ = tokio::task::spawn_blocking(close_queues).await;
         let (engines, recorder) = (self.engines, self.recorder);
-        let finished = tokio::task::spawn_blocking(move || finish(engines, recorder)).await;
+        let of_finish = step.clone();
+        let finished = tokio::task::spawn_blocking(move || finish(engines, recorder, &of_finish)).await;
         let outcome = finished.unwrap_or_else(|error| Err(error.into()));
+        begin("the publishers");
         self.stop.send_replace(true);
         let mut publishers = self.publishers;
         let all = async { while publishers.join_next().await.is_some() {} };
@@ -108,13 +132,19 @@ impl Running {
 }
 
 /// Waits for the engines, and then for the recorder, whose error matters more than that of an engine.
-fn finish(engines: Vec<(Arc<str>, JoinHandle<()>)>, recorder: Option<Recorder>) -> Result<(), ShutdownError> {
+fn finish(
+    engines: Vec<(Arc<str>, JoinHandle<()>)>,
+    recorder: Option<Recorder>,
+    step: &Mutex<&'static str>,
+) -> Result<(), ShutdownError> {
     let mut outcome = Ok(());
+    *locked(step) = "the engines";
     for (name, engine) in engines {
         if engine.join().is_err() {
             outcome = Err(ShutdownError::Engine(name));
         }
     }
+    *locked(step) = "the recorder";
     recorder.map_or(Ok(()), Recorder::finish)?;
     outcome
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::config::{Calibrations, Certificates, Config};
 use crate::engine::Observer;
@@ -94,6 +95,14 @@ pub enum ShutdownError {
     /// The thread of an engine panicked.
     #[error("the engine of vehicle {0} panicked")]
     Engine(Arc<str>),
+    /// A part of the server did not end in time.
+    #[error("not ended after {} ms: {waiting_for} did not end", .limit.as_millis())]
+    Deadline {
+        /// The part for which the shutdown waited.
+        waiting_for: &'static str,
+        /// Longest time of a shutdown.
+        limit: Duration,
+    },
     /// The recording is incomplete.
     #[error(transparent)]
     Recording(#[from] IncompleteRecordingError),

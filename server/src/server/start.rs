@@ -1,6 +1,6 @@
 //! Starts a server: [`Setup`] -> [`Running`].
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::hash::{BuildHasher, Hasher};
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use tokio::sync::watch;
 use super::input::VehicleInput;
 use super::running::Running;
 use super::setup::{Setup, StartError};
-use crate::config::{Certificates, Config, Foxglove, Grpc, Vehicle};
+use crate::config::{Certificates, Config, Foxglove, Grpc, Vehicle, listeners};
 use crate::engine::{Engine, Observer};
 use crate::ingest::gateway::{Gateway, Gateways};
 use crate::ingest::grpc::Ingest;
@@ -75,6 +75,7 @@ impl Running {
     fn prepare(&mut self, vehicle: &Vehicle, boot_id: u64, pipeline: Pipeline, observer: Option<Observer>) -> Prepared {
         let name: Arc<str> = vehicle.name.as_str().into();
         let (queue, events) = event_queue(vehicle.queue);
+        let queue = queue.with_shares(vehicle.queue - vehicle.ingest.events_max(vehicle.queue), udp_sensors(vehicle));
         let layers = layer_names(&vehicle.maps);
         let status = Arc::new(VehicleStatus::new(name.clone(), boot_id, layers, queue.drops()));
         let (newest, receiver) = watch::channel(None);
@@ -197,6 +198,12 @@ impl Running {
         self.udp = Some(sockets.start(&queues).map_err(StartError::UdpThread)?);
         Ok(())
     }
+}
+
+/// Number of a vehicle's sensors that send datagrams.
+fn udp_sensors(vehicle: &Vehicle) -> usize {
+    let routes = listeners(std::slice::from_ref(vehicle)).into_iter().flat_map(|listener| listener.routes);
+    routes.map(|route| route.source).collect::<BTreeSet<_>>().len()
 }
 
 /// The transport security of gRPC. It is never plain text if the configuration names certificates.

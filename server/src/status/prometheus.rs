@@ -60,6 +60,8 @@ impl Metrics<'_> {
         self.family("clearway_sensor_refused_total", help, refused);
         let help = "Data packets that did not arrive, by device time and azimuth, exact to one packet per gap.";
         self.each_sensor("clearway_packets_missing_total", help, |s| s.status.packets_lost as f64);
+        let help = "Times the stamps of a sensor went back: each began a new epoch.";
+        self.each_sensor("clearway_sensor_epochs_total", help, |s| f64::from(s.status.epoch));
         let help = "1 for the source of the elevations of a sensor's lasers.";
         let elevations = self
             .sensors()
@@ -105,6 +107,9 @@ impl Metrics<'_> {
 
     fn write_maps(&mut self) {
         self.each("clearway_maps_total", "Maps made.", |s| s.maps);
+        let alive = self.all.iter().map(|(of, _)| (vehicle(of), f64::from(u8::from(of.is_alive())))).collect();
+        let help = "1 if the vehicle's engine and the threads that read its sockets work, else 0.";
+        self.family("clearway_vehicle_alive", help, alive);
         self.each("clearway_revolutions_total", "Revolutions completed.", Snapshot::revolutions);
         let now_ns = now_ns();
         let age = |(of, s): &(&VehicleStatus, Snapshot)| {

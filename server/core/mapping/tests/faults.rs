@@ -4,7 +4,7 @@ use bytes::Bytes;
 use clearway_lidar::BlockedSector;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::{Model, ReturnMode};
-use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig, TimeConfig, VehicleConfig};
 use clearway_mapping::event::{Body, Event};
 use clearway_mapping::layer::{Cells, Geometry, Layer};
 use clearway_mapping::map::Map;
@@ -31,6 +31,7 @@ fn config(model: Model) -> VehicleConfig {
         extrinsics,
     };
     VehicleConfig {
+        time: TimeConfig::default(),
         name: "car-1".into(),
         sensors: vec![sensor],
         fusion: Default::default(),

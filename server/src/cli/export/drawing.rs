@@ -42,6 +42,7 @@ impl DrawingOptions {
             vehicle: !no_vehicle,
             channel: channel.clone(),
             legend: !plain,
+            stale: false,
         }
     }
 
