@@ -1,6 +1,6 @@
 // In: a Channel message, as protobuf.js reads it. Out: its cells in a typed array, or a DecodeError.
-// The claimed count is checked before anything is allocated; where it is large beside the payload, so are the lengths in
-// the payload, so that a false claim costs nothing. This decoder does not check that a payload is canonical:
+// The claimed count is checked before anything is allocated; where it is large beside the payload, the lengths in it
+// are too, so that a false claim costs nothing. This decoder does not check that a payload is canonical:
 // the CRC shows whether the cells are right. Format: proto/clearway/v1/map.proto, Channel and Encoding.
 // The loops over cells call no function a cell: on 160,000 cells `Uint8Array.from(cells, callback)` takes 53 ms where
 // a loop takes 0.8 ms (Node 20).
@@ -39,7 +39,8 @@ export function decodeChannel(channel, [rows, columns], base = null) {
   let cells;
   if (encoding === RAW) cells = littleEndian(payload, Cells);
   else if (encoding === ROWS) {
-    if (cell_count > CELLS_PER_BYTE * (payload.length + 64)) checkLengths(new BitReader(payload, error), cell_count, error);
+    const is_large = cell_count > CELLS_PER_BYTE * (payload.length + 64);
+    if (is_large) checkLengths(new BitReader(payload, error), cell_count, error);
     cells = readRows(bits, new Cells(cell_count), columns);
   }
   else cells = readChanges(bits, base(Cells), columns);

@@ -157,7 +157,8 @@ test("20 bytes that claim many cells allocate no more than they are worth", () =
   for (const count of [2 ** 28, 2 ** 32 - 1, limits.CHANNEL_CELLS_MAX]) {
     for (const payload of few) {
       const given = channel(U16, ROWS, payload, [], count);
-      const bytes = allocated(() => assertRefused(count > limits.CHANNEL_CELLS_MAX ? "too_many_cells" : "cells", given));
+      const reason = count > limits.CHANNEL_CELLS_MAX ? "too_many_cells" : "cells";
+      const bytes = allocated(() => assertRefused(reason, given));
       assert.ok(bytes < 64 << 10, `${bytes} bytes for ${count} cells in ${payload.length} bytes`);
     }
   }
