@@ -52,6 +52,18 @@ def test_a_bad_channel_is_refused_without_allocating_its_claim(vector):
     assert peak <= 64 * len(message.payload) + (64 << 10) + cells
 
 
+@pytest.mark.parametrize("count", [1 << 28, (1 << 32) - 1, limits.CHANNEL_CELLS_MAX])
+def test_20_bytes_that_claim_many_cells_allocate_no_more_than_they_are_worth(count):
+    for payload in [b"", b"\xff", b"\xff" * 20, b"\0" * 20, b"\0\0\0\x80", b"\x55" * 19]:
+        message = map_pb2.Channel(cell_type=3, encoding=map_pb2.ENCODING_ROWS, cell_count=count, payload=payload)
+        tracemalloc.start()
+        with pytest.raises(clearway.DecodeError):
+            codec.decode(message, 2048)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak <= 64 << 10, (count, payload)
+
+
 @pytest.mark.parametrize("vector", golden("bad_maps.json"), ids=lambda vector: vector["name"])
 def test_a_bad_map_is_refused_by_name(vector):
     with pytest.raises(clearway.DecodeError) as error:

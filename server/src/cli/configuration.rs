@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use clearway_mapping::config::Extrinsics;
 
-use crate::config::{Config, ConfigError};
+use crate::config::{Config, ConfigError, Origin};
 
 /// The options that name a configuration file and override its keys.
 #[derive(Args)]
@@ -20,12 +20,15 @@ pub struct ConfigurationOptions {
 }
 
 impl ConfigurationOptions {
-    /// Reads the file, applies the overrides and checks every value.
+    /// Reads the file, applies the overrides and checks every value, and that nothing is served to other hosts
+    /// without protection.
     ///
     /// # Errors
     /// [`ConfigError`].
     pub fn load(&self) -> Result<Config, ConfigError> {
-        Config::load(&self.config, &self.set)
+        let config = Config::load(&self.config, &self.set)?;
+        config.check_exposure(&Origin::file(&self.config))?;
+        Ok(config)
     }
 }
 

@@ -16,6 +16,7 @@ use crate::file_advice::advised;
 use error::{ValueError, beside};
 use read::{Problem, Refusal, plain_key};
 
+mod connections;
 mod error;
 mod grpc;
 mod listeners;
@@ -25,8 +26,9 @@ mod udp;
 mod vehicle;
 mod zenoh;
 
+pub use connections::{Connections, Service};
 pub use error::{ConfigError, Origin};
-pub use grpc::{Access, Certificates, Grpc, Tls};
+pub use grpc::{Access, Certificates, Grpc, Only, Tls};
 pub use listeners::{Listener, Route, listeners};
 pub use ros::Ros;
 pub use udp::{Ports, Sender, Udp};
@@ -47,15 +49,21 @@ pub struct Config {
     /// Streams over gRPC.
     #[serde(default)]
     pub grpc: Grpc,
-    /// The page, its WebSocket, `/healthz` and `/metrics`.
+    /// The page, its WebSocket, `/healthz`, `/readyz` and `/metrics`.
     #[serde(default)]
     pub page: Page,
+    /// `/healthz`, `/readyz` and `/metrics` on a listener of their own.
+    #[serde(default)]
+    pub metrics: Metrics,
     /// Streams over zenoh.
     #[serde(default)]
     pub zenoh: Zenoh,
     /// The WebSocket for Foxglove.
     #[serde(default)]
     pub foxglove: Foxglove,
+    /// What the peers of all TCP listeners may cost.
+    #[serde(default)]
+    pub connections: Connections,
     /// The recording.
     #[serde(default)]
     pub recorder: Recorder,
@@ -80,7 +88,23 @@ impl Default for Page {
     }
 }
 
-/// The table `[foxglove]`: a WebSocket for Foxglove. Every client that can connect may read.
+/// The table `[metrics]`: `/healthz`, `/readyz` and `/metrics` alone, which no reader of the page can delay.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Metrics {
+    /// True if it is served.
+    pub enabled: bool,
+    /// Address and port to listen on; port 0 selects a free port.
+    pub listen: SocketAddr,
+}
+
+impl Default for Metrics {
+    fn default() -> Self {
+        Self { enabled: false, listen: SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 9464) }
+    }
+}
+
+/// The table `[foxglove]`: a WebSocket for Foxglove.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Foxglove {
@@ -172,6 +196,15 @@ impl Config {
         Ok(overridden)
     }
 
+    /// Checks that nothing is served to other hosts without protection, unless `connections.unprotected` names it. For
+    /// a server that starts: the configuration of a recording is not served.
+    ///
+    /// # Errors
+    /// [`ConfigError::Value`] for the first address that other hosts can reach without TLS, or from any sender.
+    pub fn check_exposure(&self, origin: &Origin) -> Result<(), ConfigError> {
+        self.check_exposed_values().map_err(|error| error.at(origin))
+    }
+
     /// A configuration of one vehicle with one sensor and every default. The sensor is level, 2 m above the ground,
     /// until its extrinsics are set.
     pub fn of_one_vehicle(vehicle: &str, sensor: &str) -> Self {
@@ -200,6 +233,7 @@ impl Config {
             return Err(ValueError::new("vehicle", "[]", "at least one [[vehicle]]"));
         }
         self.grpc.check()?;
+        self.connections.check()?;
         self.recorder.check()?;
         self.zenoh.check(&self.vehicles)?;
         let mut names = BTreeSet::new();

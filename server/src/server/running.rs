@@ -9,9 +9,13 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use super::input::VehicleInput;
+use super::listeners::limits;
 use super::setup::ShutdownError;
+use crate::config::{Certificates, Config};
 use crate::ingest::udp;
-use crate::publish::{Vehicles, foxglove};
+use crate::publish::Vehicles;
+use crate::publish::listen::ListenerHandle;
+use crate::publish::listen::security::{Current, Security};
 use crate::record::writer::Recorder;
 use crate::subscriptions::LayerSubscription;
 use crate::sync::locked;
@@ -32,6 +36,8 @@ pub struct Running {
     pub grpc: Option<SocketAddr>,
     /// The address of the page.
     pub page: Option<SocketAddr>,
+    /// The address of `/healthz`, `/readyz` and `/metrics` alone.
+    pub metrics: Option<SocketAddr>,
     /// The endpoints of zenoh.
     pub zenoh: Vec<String>,
     /// The address of the Foxglove WebSocket.
@@ -45,7 +51,8 @@ pub struct Running {
     shutdown_step: Arc<Mutex<&'static str>>,
     /// Layers that are computed with or without readers; held until the end.
     pub(super) subscriptions: Vec<LayerSubscription>,
-    pub(super) viewers: Option<foxglove::Publisher>,
+    /// The security and the counts of the TCP listeners.
+    pub(super) listeners: Option<(Security, Vec<(&'static str, ListenerHandle)>)>,
     #[cfg(feature = "zenoh")]
     pub(super) over_zenoh: Option<super::over_zenoh::OverZenoh>,
 }
@@ -54,6 +61,28 @@ impl Running {
     /// The path of the recording, if the server records.
     pub fn recording(&self) -> Option<String> {
         self.recorder.as_ref().map(|recorder| recorder.counts().to_proto().file)
+    }
+
+    /// True if the TCP listeners have certificates.
+    pub fn is_encrypted(&self) -> bool {
+        self.listeners.as_ref().is_some_and(|(security, _)| security.current().tls.is_some())
+    }
+
+    /// Uses the certificates, tokens, roles and limits of another configuration from now on, for new connections and
+    /// new calls. Open connections stay.
+    ///
+    /// # Errors
+    /// A text that says which certificate is invalid, or that TLS cannot begin or end while the server runs; then
+    /// everything stays as it was.
+    pub fn reload(&self, config: &Config, certificates: Option<&Certificates>) -> Result<(), String> {
+        let Some((security, handles)) = &self.listeners else { return Ok(()) };
+        let next = Current::new(config, certificates)?;
+        if next.tls.is_some() != security.current().tls.is_some() {
+            return Err("TLS begins or ends only with a restart".into());
+        }
+        security.replace(next);
+        handles.iter().for_each(|(name, handle)| handle.set_limits(limits(name, config)));
+        Ok(())
     }
 
     /// Resolves when the server stops.
@@ -115,11 +144,6 @@ impl Running {
         let all = async { while publishers.join_next().await.is_some() {} };
         if tokio::time::timeout(PUBLISHERS_STOP_TIMEOUT, all).await.is_err() {
             publishers.shutdown().await;
-        }
-        if let Some(viewers) = self.viewers
-            && tokio::time::timeout(PUBLISHERS_STOP_TIMEOUT, viewers.stop()).await.is_err()
-        {
-            tracing::warn!("the Foxglove WebSocket did not close in time");
         }
         #[cfg(feature = "zenoh")]
         if let Some(over_zenoh) = self.over_zenoh

@@ -17,7 +17,7 @@ pub struct Setup {
     pub config: Config,
     /// The calibration tables of all sensors, as [`Config::calibrations`] returns them.
     pub calibrations: Calibrations,
-    /// The certificates, as [`Config::certificates`] returns them; without them gRPC is plain text.
+    /// The certificates, as [`Config::certificates`] returns them; without them all listeners are plain text.
     pub certificates: Option<Certificates>,
     /// Identifies this run in maps and recordings; a random number if absent.
     pub boot_id: Option<u64>,
@@ -41,9 +41,9 @@ pub enum StartError {
     #[error(transparent)]
     Record(#[from] RecordError),
     /// An address cannot be listened on.
-    #[error("{what} {at}: {source}")]
+    #[error("{what}.listen {at}: {source}")]
     Listen {
-        /// The configuration key.
+        /// The configuration's table.
         what: &'static str,
         /// The address.
         at: SocketAddr,
@@ -71,14 +71,6 @@ pub enum StartError {
         vehicle: Arc<str>,
         /// The system's reason.
         source: std::io::Error,
-    },
-    /// The Foxglove WebSocket cannot be served.
-    #[error("foxglove.listen {at}: {source}")]
-    Foxglove {
-        /// The address.
-        at: SocketAddr,
-        /// Foxglove's reason.
-        source: foxglove::FoxgloveError,
     },
     /// The zenoh session cannot be opened, or a key cannot be declared on it.
     #[cfg(feature = "zenoh")]

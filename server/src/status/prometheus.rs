@@ -10,13 +10,17 @@ use clearway_mapping::sensor::mount::check::MountDeviation;
 use super::vehicle::{Snapshot, VehicleStatus};
 use crate::clock::now_ns;
 
-/// The text of `/metrics`.
-pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {
+/// Counts of a listener: open connections, bytes that wait for readers, connections refused or closed by reason.
+type ListenerCounts = (&'static str, (usize, usize, BTreeMap<&'static str, u64>));
+
+/// The text of `/metrics`: of these vehicles, and of the TCP listeners by name.
+pub fn prometheus(vehicles: &[Arc<VehicleStatus>], listeners: &[ListenerCounts]) -> String {
     let all = vehicles.iter().map(|status| (&**status, status.snapshot())).collect();
     let mut metrics = Metrics { all, text: String::new() };
     metrics.write_arrivals();
     metrics.write_sensors();
     metrics.write_maps();
+    metrics.write_listeners(listeners);
     metrics.text
 }
 
@@ -41,6 +45,19 @@ impl Metrics<'_> {
         self.each("clearway_poses_refused_total", "Ego poses refused.", |s| s.ledger.poses_refused);
         self.each("clearway_roads_total", "Roads accepted.", |s| s.ledger.roads);
         self.each("clearway_roads_refused_total", "Roads refused.", |s| s.ledger.roads_refused.values().sum());
+    }
+
+    fn write_listeners(&mut self, listeners: &[ListenerCounts]) {
+        let each = |of: &dyn Fn(&ListenerCounts) -> usize| {
+            listeners.iter().map(|counts| (format!("listener=\"{}\"", counts.0), of(counts) as f64)).collect()
+        };
+        self.family("clearway_connections", "Open connections of a listener.", each(&|(_, counts)| counts.0));
+        self.family("clearway_waiting_bytes", "Bytes that wait for the readers of a listener.", each(&|(_, c)| c.1));
+        let closed = listeners.iter().flat_map(|(name, (_, _, closed))| {
+            closed.iter().map(move |(reason, n)| (format!("listener=\"{name}\",reason=\"{reason}\""), *n as f64))
+        });
+        let help = "Connections and calls that a listener refused or closed, by reason.";
+        self.family("clearway_connections_closed_total", help, closed.collect());
     }
 
     fn write_sensors(&mut self) {
@@ -200,7 +217,7 @@ mod tests {
         let shown = status.snapshot().ledger;
         assert_eq!(shown.refused["source"], 2);
         assert_eq!(shown.received, shown.decoded + shown.telemetry + shown.refused.values().sum::<u64>());
-        let text = prometheus(&[Arc::new(status)]);
+        let text = prometheus(&[Arc::new(status)], &[]);
         assert!(text.contains("clearway_packets_received_total{vehicle=\"car\"} 5\n"), "{text}");
         assert!(text.contains("clearway_packets_refused_total{vehicle=\"car\",reason=\"source\"} 2\n"), "{text}");
     }
@@ -223,7 +240,7 @@ mod tests {
         status.stepped(&Ledger::default(), sensors);
         let message = status.to_proto();
         assert_eq!((message.mounts["top"].height_m, message.reference_sensor.as_str()), (-0.58, "top"));
-        let text = prometheus(&[Arc::new(status)]);
+        let text = prometheus(&[Arc::new(status)], &[]);
         for line in [
             "clearway_sensor_elevations{vehicle=\"car\",sensor=\"top\",source=\"nominal\"} 1\n",
             "clearway_mount_height_deviation_meters{vehicle=\"car\",sensor=\"top\"} -0.58\n",

@@ -145,6 +145,25 @@ test("wrong cells are refused for the stated reason", () => {
   assertRefused("cells", channel(9, RAW, [1], [1], 1));
 });
 
+// The most memory that `run` allocates for arrays, in bytes.
+function allocated(run) {
+  const before = process.memoryUsage().arrayBuffers;
+  run();
+  return process.memoryUsage().arrayBuffers - before;
+}
+
+test("20 bytes that claim many cells allocate no more than they are worth", () => {
+  const few = [[], [0xff], Array(20).fill(0xff), Array(20).fill(0), [0, 0, 0, 0x80], Array(19).fill(0x55)];
+  for (const count of [2 ** 28, 2 ** 32 - 1, limits.CHANNEL_CELLS_MAX]) {
+    for (const payload of few) {
+      const given = channel(U16, ROWS, payload, [], count);
+      const reason = count > limits.CHANNEL_CELLS_MAX ? "too_many_cells" : "cells";
+      const bytes = allocated(() => assertRefused(reason, given));
+      assert.ok(bytes < 64 << 10, `${bytes} bytes for ${count} cells in ${payload.length} bytes`);
+    }
+  }
+});
+
 test("random bytes as changes give an error and no other exception", () => {
   let seed = 3;
   const byte = () => (seed = (Math.imul(seed, 1664525) + 1013904223) >>> 0) >>> 24;
