@@ -187,7 +187,7 @@ async fn the_router_of_deploy_allows_each_certificate_only_its_keys() {
     let running = fixture::start(behind(&at, folder.path(), config())).await;
 
     let reader = zenoh_client(&at, "ours", "reader").await.expect("a session");
-    let unlisted = zenoh_client(&at, "ours", "operator").await.expect("a session");
+    let unlisted = zenoh_client(&at, "ours", "unlisted").await.expect("a session");
     let ingester = zenoh_client(&at, "ours", "ingester").await.expect("a session");
     assert!(zenoh_client(&at, "theirs", "reader").await.is_err(), "a certificate of another CA is accepted");
 
