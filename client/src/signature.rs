@@ -1,9 +1,9 @@
 //! Signatures of maps over zenoh: who published a map, where the transport cannot tell.
 //!
-//! zenoh vouches for the peer at the other end of one link. Behind a router, or in a network without access control, any
-//! peer may have put a map on a key. So a server with `zenoh.signing_key` adds an Ed25519 signature to each map, as the
-//! attachment of the sample (64 bytes). It signs [`signed_message`]: the key is part of it, so that a map of one vehicle
-//! or layer is not valid on the key of another. Readers have the public key only, and cannot sign.
+//! zenoh vouches for the peer at the other end of one link. Behind a router, or in a network without access control,
+//! any peer may have put a map on a key. So a server with `zenoh.signing_key` adds an Ed25519 signature to each map, as
+//! the attachment of the sample (64 bytes). It signs [`signed_message`]: the key is part of it, so that a map of one
+//! vehicle or layer is not valid on the key of another. Readers have the public key only, and cannot sign.
 //!
 //! ```sh
 //! openssl genpkey -algorithm ed25519 -out maps.key        # the server's: zenoh.signing_key

@@ -270,9 +270,9 @@ pub(crate) type Reason = fn(&mut PassedOver) -> &mut u64;
 
 /// Why `map` does not replace `newest`; `None` if it does.
 ///
-/// Within one run of the server a map is newer by its sequence, or, if that goes back, by its stamp: one forged sequence
-/// does not refuse the true maps after it. Another run has to wait until the present one is stale or silent for
-/// [`RUN_HOLD_NS`]: a forged run is not shown beside a true one.
+/// Within one run of the server a map is newer by its sequence, or, if that goes back, by its stamp: one forged
+/// sequence does not refuse the true maps after it. Another run has to wait until the present one is stale or silent
+/// for [`RUN_HOLD_NS`]: a forged run is not shown beside a true one.
 fn refuse(newest: &MapView, map: &MapView) -> Option<Reason> {
     let ahead_ns = |map: &MapView| map.header().capture_end_ns.saturating_sub(map.now_ns());
     let is_ahead = ahead_ns(newest) > AHEAD_NS_MAX;

@@ -13,8 +13,8 @@ use clearway_proto::v1;
 use crate::error::ClientError;
 use crate::freshness::{Arrival, Clock, now_ns};
 
-/// Longest time after its capture for which a map is believed to be valid, whatever it states: a forged map is not fresh
-/// for good. Ours: far longer than any planner uses a map.
+/// Longest time after its capture for which a map is believed to be valid, whatever it states: a forged map is not
+/// fresh for good. Ours: far longer than any planner uses a map.
 const VALID_NS_MAX: i64 = 60_000_000_000;
 
 /// A map, decoded once. A clone shares the decoded map.

@@ -58,8 +58,8 @@ impl ZenohError {
 }
 
 /// Opens the session. Without access control in the file of `[zenoh]`, no peer may publish what the server publishes of
-/// its `vehicles` ([`own_keys`]). A message of a peer may be twice as long as `observation_bytes_max`, and [`MESSAGE_BYTES_MAX`]
-/// in any case.
+/// its `vehicles` ([`own_keys`]). A message of a peer may be twice as long as `observation_bytes_max`, and
+/// [`MESSAGE_BYTES_MAX`] in any case.
 ///
 /// # Errors
 /// [`ZenohError`] if the settings are invalid, the file of `[zenoh]` cannot be read, or an endpoint is not available.

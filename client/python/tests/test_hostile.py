@@ -87,7 +87,7 @@ def test_a_false_answer_to_a_query_hides_no_true_one(attacked, server, endpoint)
     assert clearway.get(f"zenoh:{endpoint}", "alpha", ["drivability"]).sequence == 5
 
 
-def test_with_a_public_key_only_maps_signed_with_its_private_key_are_believed(attacked, endpoint, tmp_path):  # noqa: F811
+def test_with_a_public_key_only_signed_maps_are_believed(attacked, endpoint, tmp_path):  # noqa: F811
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 

@@ -6,8 +6,8 @@
 //! number, and this file queries it.
 //!
 //! Callbacks check and decode each sample, and store its map in a slot of one: from zenoh's queue of 256 a slow planner
-//! would get maps that are seconds old. What does not belong on the key is counted and takes no map's place. Gaps in the
-//! maps' sequence numbers are skipped maps; those among them that zenoh missed are lost maps.
+//! would get maps that are seconds old. What does not belong on the key is counted and takes no map's place. Gaps in
+//! the maps' sequence numbers are skipped maps; those among them that zenoh missed are lost maps.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};

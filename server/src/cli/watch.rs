@@ -1,13 +1,16 @@
 //! `clearway watch`: a server -> one line for each map, and a line when the maps stop.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Result, bail};
 use clap::Args;
-use clearway_client::{MapStream, StreamEvent, Subscription, Update, now_ns};
+use clearway_client::{MapStream, PassedOver, StreamEvent, Subscription, Update, now_ns};
 use serde_json::json;
 
 use super::connection::{ServerOptions, explain};
+#[cfg(feature = "zenoh")]
+use super::files;
 use super::output::{block_on, print_line};
 
 /// Time without a first map after which the command says that it waits.
@@ -28,6 +31,9 @@ pub struct Options {
     /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447.
     #[arg(long, value_name = "ENDPOINT", conflicts_with_all = ["address", "ca", "cert", "key"])]
     zenoh: Option<String>,
+    /// Believe only maps that are signed with the private key of this public key (`zenoh.signing_key` of the server).
+    #[arg(long, value_name = "FILE.pub", requires = "zenoh")]
+    signed_by: Option<PathBuf>,
     /// The vehicle, if the server has several.
     #[arg(long, value_name = "NAME")]
     vehicle: Option<String>,
@@ -66,7 +72,10 @@ async fn watch(options: &Options) -> Result<()> {
         };
         let id = (update.map.header().boot_id, update.map.sequence());
         let is_new = last.replace(id) != Some(id);
-        let line = if is_new || options.json { line(&update, options.json) } else { stopped_line(&update) };
+        let line = match is_new || options.json {
+            true => line(&update, maps.passed_over(), options.json),
+            false => stopped_line(&update),
+        };
         if !print_line(&line)? {
             break;
         }
@@ -104,22 +113,26 @@ async fn subscribe(options: &Options) -> Result<MapStream> {
 }
 
 /// The line for a new map.
-fn line(update: &Update, as_json: bool) -> String {
+fn line(update: &Update, passed_over: PassedOver, as_json: bool) -> String {
     let (map, skipped, now) = (&update.map, update.skipped, now_ns());
     let share = map.metric("drivable_share");
     if as_json {
         let document = json!({
             "vehicle": map.vehicle(), "sequence": map.sequence(), "age_ms": map.age_ms(now), "stale": map.is_stale(now),
             "drivable_share": share, "bytes": map.bytes().len(), "skipped": skipped,
-            "lost": update.lost, "left_out": update.left_out,
+            "lost": update.lost, "left_out": update.left_out, "passed_over": passed_over.hostile(),
             "layers": map.layers().iter().map(|layer| &layer.name).collect::<Vec<_>>(),
         });
         return document.to_string();
     }
     let share = share.map_or("    -".into(), |share| format!("{:5.1}", 100.0 * share));
     let stale = if map.is_stale(now) { "  STALE" } else { "" };
+    let passed_over = match passed_over.hostile() {
+        0 => String::new(),
+        messages => format!("  passed over {messages} messages that are no maps of this server"),
+    };
     format!(
-        "{} #{:06}  age {:7.1} ms  drivable {share} %  {:6} bytes  skipped {skipped}{stale}",
+        "{} #{:06}  age {:7.1} ms  drivable {share} %  {:6} bytes  skipped {skipped}{stale}{passed_over}",
         map.vehicle(),
         map.sequence(),
         map.age_ms(now),
@@ -145,7 +158,10 @@ async fn subscribe_over_zenoh(endpoint: &str, options: &Options) -> Result<MapSt
         [layer] => layer,
         several => bail!("--layers {}: over zenoh each layer has its own key; name one", several.join(",")),
     };
-    let client = clearway_client::ZenohClient::connect(endpoint).await?;
+    let mut client = clearway_client::ZenohClient::connect(endpoint).await?;
+    if let Some(file) = &options.signed_by {
+        client = client.signed_by(clearway_client::PublicKey::from_pem(&files::read_text(file)?)?);
+    }
     let vehicle = match &options.vehicle {
         Some(name) => name.clone(),
         None => match &client.vehicles().await?[..] {

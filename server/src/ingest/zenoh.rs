@@ -188,6 +188,9 @@ impl Ingest {
         let number = observation.number;
         session.refuse_missed(number);
         if let Err(denied) = allowed {
+            if session.check_number(number).is_ok() {
+                session.begin(number, 0, 0);
+            }
             return self.gateway.refuse(session, number, "role", denied);
         }
         match sensor_of_key(key, observation.body.as_ref()) {

@@ -11,6 +11,7 @@
 //! link, because planners brake by them; the status has the lowest, because the next one replaces it; observations and
 //! reports have zenoh's default priority.
 
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -53,8 +54,8 @@ impl Publisher {
     /// Declares every vehicle's keys on the session and starts publishing. Needs a multi-thread runtime.
     ///
     /// # Errors
-    /// [`ZenohError`] if the signing key cannot be read, or if a publisher, queryable, listener or liveliness token cannot
-    /// be declared.
+    /// [`ZenohError`] if the signing key cannot be read, or if a publisher, queryable, listener or liveliness token
+    /// cannot be declared.
     pub async fn start(session: &Session, options: &Options, vehicles: &Vehicles) -> Result<Self, ZenohError> {
         let signing_key = signing_key(&options.signing_key)?.map(Arc::new);
         let mut publisher = Self { session: session.clone(), tokens: Vec::new(), tasks: JoinSet::new(), signing_key };
@@ -178,9 +179,14 @@ fn signing_key(file: &Path) -> Result<Option<SigningKey>, ZenohError> {
     if file.as_os_str().is_empty() {
         return Ok(None);
     }
-    let what = || format!("zenoh.signing_key {}", file.display());
-    let text = std::fs::read_to_string(file).map_err(|error| ZenohError::of(what())(error.into()))?;
-    SigningKey::from_pem(&text).map(Some).map_err(|error| ZenohError::of(what())(error.into()))
+    let wrong = |error: zenoh::Error| ZenohError::of(format!("zenoh.signing_key {}", file.display()))(error);
+    let mode = std::fs::metadata(file).map_err(|error| wrong(error.into()))?.permissions().mode() & 0o777;
+    if mode & 0o007 != 0 {
+        let allowed = "allowed: 600 or 640 (chmod 600)";
+        return Err(wrong(format!("every user of this host may use it (mode {mode:03o}); {allowed}").into()));
+    }
+    let text = std::fs::read_to_string(file).map_err(|error| wrong(error.into()))?;
+    SigningKey::from_pem(&text).map(Some).map_err(|error| wrong(error.into()))
 }
 
 /// The attachment of a map on a key: its signature.

@@ -10,7 +10,7 @@ use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use tokio::net::UdpSocket;
 
-use super::Attack;
+use super::target::Attack;
 
 /// Bytes of a data packet of a Velodyne sensor.
 const PACKET: usize = 1206;

@@ -8,7 +8,7 @@ use clearway_proto::v1;
 use futures::FutureExt;
 use zenoh::Session;
 
-use super::Attack;
+use super::target::Attack;
 
 const MAPS: &str = "clearway/car/map/drivability";
 /// Samples between two pauses.

@@ -8,7 +8,7 @@ use futures::future::join_all;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
-use super::{Attack, Target};
+use super::target::{Attack, Target};
 
 /// Connections of one attack at once: as many as a listener of the default configuration allows, and some more.
 const CONNECTIONS: usize = 300;
@@ -31,7 +31,7 @@ pub const ATTACKS: &[Attack] = &[
 ];
 
 const REQUEST: &[u8] = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n";
-const UPGRADE: &[u8] = b"GET /stream HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+const UPGRADE: &[u8] = b"GET /live HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
     Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
 
 fn zenoh(target: &Target) -> SocketAddr {

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use clearway_client::{Client, ClientError, MapStream, Subscription, ZenohClient, now_ns};
 
-use super::Target;
+use super::target::Target;
 
 /// Longest time that a reader waits for one map, or a newcomer for its first.
 const PATIENCE: Duration = Duration::from_secs(5);

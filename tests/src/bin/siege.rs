@@ -18,8 +18,9 @@ use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::flat;
 use clearway_sim::send::{Pace, Until, drive};
 use clearway_sim::vehicle::SimulatedVehicle;
+use clearway_tests::attack::attacks;
+use clearway_tests::attack::target::{Attack, Target};
 use clearway_tests::attack::watch::{Reader, newcomer, resident_mib};
-use clearway_tests::attack::{Attack, Target, attacks};
 
 /// Every attack against one server, with healthy readers beside it.
 #[derive(Parser)]
