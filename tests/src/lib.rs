@@ -4,9 +4,10 @@ use std::path::PathBuf;
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-#[cfg(feature = "siege")]
-pub mod attack;
 pub mod simulation;
+
+#[cfg(feature = "siege")]
+pub mod siege;
 
 /// The folder of the built command, brought up to date once for all tests of this process.
 ///

@@ -18,9 +18,9 @@ use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::flat;
 use clearway_sim::send::{Pace, Until, drive};
 use clearway_sim::vehicle::SimulatedVehicle;
-use clearway_tests::attack::attacks;
-use clearway_tests::attack::target::{Attack, Target};
-use clearway_tests::attack::watch::{Reader, newcomer, resident_mib};
+use clearway_tests::siege::attacks;
+use clearway_tests::siege::target::{Attack, Target};
+use clearway_tests::siege::watch::{Reader, newcomer, resident_mib};
 
 /// Every attack against one server, with healthy readers beside it.
 #[derive(Parser)]
@@ -162,7 +162,7 @@ async fn run(process: u32, target: &Target, attack: &Attack, each: Duration, rea
     let seen = readers.each_ref().map(Reader::take);
     tokio::time::sleep(RECOVERY).await;
     readers.iter().for_each(|reader| drop(reader.take()));
-    let of = |mut seen: clearway_tests::attack::watch::Seen| {
+    let of = |mut seen: clearway_tests::siege::watch::Seen| {
         let (p99, worst) = (seen.age_ms(0.99), seen.age_ms(1.0));
         (format!("{p99:.0} | {worst:.0} | {} | {}", seen.missed, seen.broken), seen.passed_over)
     };
