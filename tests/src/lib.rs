@@ -8,6 +8,9 @@ use std::sync::OnceLock;
 pub mod attack;
 pub mod simulation;
 
+#[cfg(feature = "siege")]
+pub mod siege;
+
 /// The folder of the built command, brought up to date once for all tests of this process.
 ///
 /// `cargo test --workspace` has just built them, beside the tests of their packages; after a `cargo test` of this

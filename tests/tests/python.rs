@@ -50,7 +50,7 @@ fn python() -> PathBuf {
             std::fs::create_dir_all(copy.join(to)).expect("a folder of ours");
             run(Command::new("cp").arg("-r").arg(from).arg(copy.join(to)), "cp");
         }
-        vec![format!("{}[zenoh,recording,test]", copy.join("client/python").display()).into()]
+        vec![format!("{}[zenoh,signed,recording,test]", copy.join("client/python").display()).into()]
     })
 }
 

@@ -1,14 +1,17 @@
 //! `clearway watch`: a server -> one line for each map, and a line when the maps stop.
 
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::{Result, bail};
 use clap::Args;
-use clearway_client::{MapStream, StreamEvent, Subscription, Update, now_ns};
+use clearway_client::{MapStream, PassedOver, StreamEvent, Subscription, Update, now_ns};
 use serde_json::json;
 
 use super::connection::{ServerOptions, explain};
+#[cfg(feature = "zenoh")]
+use super::files;
 use super::output::{block_on, exit_code, print_line};
 
 /// Time between two lines while no fresh map comes. Ours: a person sees that the command still waits.
@@ -32,6 +35,9 @@ pub struct Options {
     /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447.
     #[arg(long, value_name = "ENDPOINT", conflicts_with_all = ["address", "ca", "cert", "key"])]
     zenoh: Option<String>,
+    /// Believe only maps that are signed with the private key of this public key (`zenoh.signing_key` of the server).
+    #[arg(long, value_name = "FILE.pub", requires = "zenoh")]
+    signed_by: Option<PathBuf>,
     /// The vehicle, if the server has several.
     #[arg(long, value_name = "NAME")]
     vehicle: Option<String>,
@@ -74,14 +80,18 @@ async fn watch(options: &Options) -> Result<ExitCode> {
             Ok(Ok(StreamEvent::Fresh(update) | StreamEvent::Stale(update))) => {
                 let is_new = newest.as_ref().map(id) != Some(id(&update));
                 is_stale = update.map.is_stale(now_ns());
-                let said = if is_new { line(&update, options.json) } else { stale_line(Some(&update), options) };
+                let said = if is_new {
+                    line(&update, maps.passed_over(), options.json)
+                } else {
+                    stale_line(Some(&update), maps.passed_over(), options)
+                };
                 newest = Some(update);
                 (said, is_new)
             }
             Ok(Err(ended)) => {
                 if let Some(last) = newest.filter(|_| !is_stale) {
                     wait_until_stale(&last).await;
-                    print_line(&stale_line(Some(&last), options))?;
+                    print_line(&stale_line(Some(&last), maps.passed_over(), options))?;
                 }
                 return Err(explain(ended));
             }
@@ -89,7 +99,7 @@ async fn watch(options: &Options) -> Result<ExitCode> {
             Err(_) if newest.as_ref().is_some_and(|last| !last.map.is_stale(now_ns())) => continue,
             Err(_) => {
                 is_stale = true;
-                (stale_line(newest.as_ref(), options), false)
+                (stale_line(newest.as_ref(), maps.passed_over(), options), false)
             }
         };
         if !print_line(&said)? {
@@ -128,22 +138,26 @@ async fn subscribe(options: &Options) -> Result<MapStream> {
 }
 
 /// The line for a new map.
-fn line(update: &Update, as_json: bool) -> String {
+fn line(update: &Update, passed_over: PassedOver, as_json: bool) -> String {
     let (map, skipped, now) = (&update.map, update.skipped, now_ns());
     let share = map.metric("drivable_share");
     if as_json {
         let document = json!({
             "vehicle": map.vehicle(), "sequence": map.sequence(), "age_ms": map.age_ms(now), "stale": map.is_stale(now),
             "drivable_share": share, "bytes": map.bytes().len(), "skipped": skipped,
-            "lost": update.lost, "left_out": update.left_out,
+            "lost": update.lost, "left_out": update.left_out, "passed_over": passed_over.hostile(),
             "layers": map.layers().iter().map(|layer| &layer.name).collect::<Vec<_>>(),
         });
         return document.to_string();
     }
     let share = share.map_or("    -".into(), |share| format!("{:5.1}", 100.0 * share));
     let stale = if map.is_stale(now) { "  STALE" } else { "" };
+    let passed_over = match passed_over.hostile() {
+        0 => String::new(),
+        messages => format!("  passed over {messages} messages that are no maps of this server"),
+    };
     format!(
-        "{} #{:06}  age {:7.1} ms  drivable {share} %  {:6} bytes  skipped {skipped}{stale}",
+        "{} #{:06}  age {:7.1} ms  drivable {share} %  {:6} bytes  skipped {skipped}{stale}{passed_over}",
         map.vehicle(),
         map.sequence(),
         map.age_ms(now),
@@ -152,9 +166,9 @@ fn line(update: &Update, as_json: bool) -> String {
 }
 
 /// The line while no fresh map is there: the newest one is stale, or none has come.
-fn stale_line(newest: Option<&Update>, options: &Options) -> String {
+fn stale_line(newest: Option<&Update>, passed_over: PassedOver, options: &Options) -> String {
     match newest {
-        Some(update) if options.json => line(update, true),
+        Some(update) if options.json => line(update, passed_over, true),
         Some(Update { map, .. }) => format!(
             "{} #{:06}  age {:7.1} ms  STALE: no newer map has arrived; waiting",
             map.vehicle(),
@@ -175,7 +189,10 @@ async fn subscribe_over_zenoh(endpoint: &str, options: &Options) -> Result<MapSt
         [layer] => layer,
         several => bail!("--layers {}: over zenoh each layer has its own key; name one", several.join(",")),
     };
-    let client = clearway_client::ZenohClient::connect(endpoint).await?;
+    let mut client = clearway_client::ZenohClient::connect(endpoint).await?;
+    if let Some(file) = &options.signed_by {
+        client = client.signed_by(clearway_client::PublicKey::from_pem(&files::read_text(file)?)?);
+    }
     let vehicle = match &options.vehicle {
         Some(name) => name.clone(),
         None => match &client.vehicles().await?[..] {

@@ -254,10 +254,11 @@ impl Config {
         self.grpc.certificates(file)
     }
 
-    /// The configuration with the paths `recorder.file` and `zenoh.file` made relative to the working directory: in the
+    /// The configuration with the paths `recorder.file`, `zenoh.file` and
+    /// `zenoh.signing_key` made relative to the working directory: in the
     /// configuration they start at the folder of `file`.
     pub fn located(mut self, file: &Path) -> Self {
-        for path in [&mut self.recorder.file, &mut self.zenoh.file] {
+        for path in [&mut self.recorder.file, &mut self.zenoh.file, &mut self.zenoh.signing_key] {
             if !path.as_os_str().is_empty() {
                 *path = beside(file, path);
             }

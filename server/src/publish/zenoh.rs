@@ -5,15 +5,21 @@
 //! Subscribers can detect misses. A liveliness token `clearway/<vehicle>` lives as long as the vehicle is served;
 //! `clearway/<vehicle>/status` has the status once a second, as JSON.
 //!
+//! With `zenoh.signing_key` each map has a signature ([`clearway_client::signature`]) as the sample's attachment.
+//!
 //! Congestion drops: blocking would let one stopped peer delay the healthy ones. Maps have the highest priority on a
 //! link, because planners brake by them; the status has the lowest, because the next one replaces it; observations and
 //! reports have zenoh's default priority.
 
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
+use clearway_client::signature::SigningKey;
 use tokio::task::JoinSet;
 use zenoh::Session;
-use zenoh::bytes::Encoding;
+use zenoh::bytes::{Encoding, ZBytes};
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::matching::{MatchingListener, MatchingStatus};
@@ -41,15 +47,18 @@ pub struct Publisher {
     session: Session,
     tokens: Vec<LivelinessToken>,
     tasks: JoinSet<()>,
+    signing_key: Option<Arc<SigningKey>>,
 }
 
 impl Publisher {
     /// Declares every vehicle's keys on the session and starts publishing. Needs a multi-thread runtime.
     ///
     /// # Errors
-    /// [`ZenohError`] if a publisher, queryable, listener or liveliness token cannot be declared.
+    /// [`ZenohError`] if the signing key cannot be read, or if a publisher, queryable, listener or liveliness token
+    /// cannot be declared.
     pub async fn start(session: &Session, options: &Options, vehicles: &Vehicles) -> Result<Self, ZenohError> {
-        let mut publisher = Self { session: session.clone(), tokens: Vec::new(), tasks: JoinSet::new() };
+        let signing_key = signing_key(&options.signing_key)?.map(Arc::new);
+        let mut publisher = Self { session: session.clone(), tokens: Vec::new(), tasks: JoinSet::new(), signing_key };
         for served in vehicles.0.iter() {
             publisher.publish(served).await?;
         }
@@ -98,7 +107,7 @@ impl Publisher {
                 publisher.matching_listener().await.map_err(ZenohError::of(format!("subscribers of {key}")))?;
             let matches = publisher.matching_status().await.map_err(ZenohError::of(format!("subscribers of {key}")))?;
             self.tasks.spawn(subscribe_while(served.clone(), layer, matches.matching(), matching));
-            publishers.push((*layer, publisher));
+            publishers.push((*layer, key.clone(), publisher));
             self.answer(served, layer, key).await?;
         }
         let key = format!("clearway/{vehicle}/status");
@@ -110,7 +119,7 @@ impl Publisher {
             .map_err(ZenohError::of(format!("publisher {key}")))?;
         let token = self.session.liveliness().declare_token(format!("clearway/{vehicle}"));
         self.tokens.push(token.await.map_err(ZenohError::of(format!("liveliness clearway/{vehicle}")))?);
-        self.tasks.spawn(send_maps(served.clone(), publishers));
+        self.tasks.spawn(send_maps(served.clone(), publishers, self.signing_key.clone()));
         self.tasks.spawn({
             let served = served.clone();
             async move {
@@ -131,13 +140,16 @@ impl Publisher {
         let queryable = self.session.declare_queryable(key.clone()).complete(true);
         let queries = queryable.await.map_err(ZenohError::of(format!("queryable {key}")))?;
         let (newest, subscriptions) = (served.newest.clone(), served.status.subscriptions.clone());
+        let signing_key = self.signing_key.clone();
         self.tasks.spawn(async move {
             while let Ok(query) = queries.recv_async().await {
                 let Some(map) = subscriptions.subscribe(&[layer.to_owned()]).newest_map(&newest).await else {
                     continue;
                 };
                 let Some((_, chunk)) = map.layers.iter().find(|(name, _)| *name == layer) else { continue };
-                if let Err(error) = query.reply(&key, map.layer(chunk)).encoding(map_encoding()).await {
+                let bytes = map.layer(chunk);
+                let signature = signature(signing_key.as_deref(), &key, &bytes);
+                if let Err(error) = query.reply(&key, bytes).encoding(map_encoding()).attachment(signature).await {
                     tracing::debug!(%error, "zenoh: reply");
                 }
             }
@@ -162,15 +174,41 @@ async fn subscribe_while(
     }
 }
 
-async fn send_maps(served: Served, publishers: Vec<(&'static str, AdvancedPublisher<'static>)>) {
+/// Reads the key that signs maps; `None` if the path is empty.
+fn signing_key(file: &Path) -> Result<Option<SigningKey>, ZenohError> {
+    if file.as_os_str().is_empty() {
+        return Ok(None);
+    }
+    let wrong = |error: zenoh::Error| ZenohError::of(format!("zenoh.signing_key {}", file.display()))(error);
+    let mode = std::fs::metadata(file).map_err(|error| wrong(error.into()))?.permissions().mode() & 0o777;
+    if mode & 0o007 != 0 {
+        let allowed = "allowed: 600 or 640 (chmod 600)";
+        return Err(wrong(format!("every user of this host may use it (mode {mode:03o}); {allowed}").into()));
+    }
+    let text = std::fs::read_to_string(file).map_err(|error| wrong(error.into()))?;
+    SigningKey::from_pem(&text).map(Some).map_err(|error| wrong(error.into()))
+}
+
+/// The attachment of a map on a key: its signature.
+fn signature(key: Option<&SigningKey>, on: &str, map: &[u8]) -> Option<ZBytes> {
+    key.map(|key| key.sign(on, map).as_slice().into())
+}
+
+async fn send_maps(
+    served: Served,
+    publishers: Vec<(&'static str, String, AdvancedPublisher<'static>)>,
+    signing_key: Option<Arc<SigningKey>>,
+) {
     let mut newest = served.newest.clone();
     newest.mark_changed();
     while newest.changed().await.is_ok() {
         let map = newest.borrow_and_update().clone();
         let Some(map) = map else { continue };
         for (layer, chunk) in &map.layers {
-            let Some((_, publisher)) = publishers.iter().find(|(name, _)| name == layer) else { continue };
-            if let Err(error) = publisher.put(map.layer(chunk)).await {
+            let Some((_, key, publisher)) = publishers.iter().find(|(name, ..)| name == layer) else { continue };
+            let bytes = map.layer(chunk);
+            let signature = signature(signing_key.as_deref(), key, &bytes);
+            if let Err(error) = publisher.put(bytes).attachment(signature).await {
                 tracing::warn!(%error, layer, "zenoh: put");
             }
         }
