@@ -1,9 +1,11 @@
-//! What the whole-system tests share: the built command, a way to run it, and the simulation of the whole system.
+//! What the whole-system tests share: the built command, a way to run it, damaged recordings, and the
+//! simulation of the whole system.
 
 use std::path::PathBuf;
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
+pub mod damage;
 pub mod simulation;
 
 /// The folder of the built command, brought up to date once for all tests of this process.

@@ -84,12 +84,12 @@ pub enum FilesError {
     Scan(#[from] ScanError),
 }
 
-/// A file that is truncated; its readings before the end were used.
+/// A file that is truncated or damaged; the readings of its whole parts were used.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Truncated {
     /// The file.
     pub file: PathBuf,
-    /// How the file ends.
+    /// How the file is incomplete.
     pub reason: String,
 }
 
@@ -174,7 +174,7 @@ impl Readings {
         self.scan_format
     }
 
-    /// The truncated files so far.
+    /// The truncated and damaged files so far.
     pub fn truncated(&self) -> &[Truncated] {
         &self.truncated
     }
@@ -252,8 +252,7 @@ impl Readings {
                 self.notes.extend(source.notes().into_iter().map(|note| format!("{}: {note}", file.display())));
             }
             Some(Open::Mcap(file, mut source)) => {
-                if source.recording().is_cut() {
-                    let reason = "the file ends without its closing records, as after a crash".into();
+                if let Some(reason) = source.recording().incomplete() {
                     self.truncated.push(Truncated { file: file.clone(), reason });
                 }
                 self.notes.extend(source.notes().into_iter().map(|note| format!("{}: {note}", file.display())));
