@@ -132,11 +132,14 @@ impl Copy {
         let lost = original.messages.len().checked_sub(messages.len()).ok_or("more messages than were recorded")?;
         let same = original.messages.iter().zip(&messages).take_while(|(was, is)| was == is).count();
         // What is lost is one chunk, or nothing; the messages after it are all there.
-        let is_one_chunk = |chunk: &Range<usize>| chunk.len() == lost && chunk.start <= same && same <= chunk.end;
+        let is_one_chunk = |chunk: &Range<usize>| chunk.len() == lost && chunk.contains(&same);
         let chunk = original.chunks.iter().find(|chunk| is_one_chunk(chunk));
         let from = chunk.map_or(same, |chunk| chunk.start);
         if lost > 0 && chunk.is_none() || messages[from..] != original.messages[from + lost..] {
-            return Err(format!("{lost} messages are lost after {same}, which is not one chunk: {:?}", reader.damages()));
+            return Err(format!(
+                "{lost} messages are lost after {same}, which is not one chunk: {:?}",
+                reader.damages()
+            ));
         }
         let named = reader.damages().iter().flat_map(|damage| damage.messages.values()).sum();
         Ok(Outcome { refused: false, lost: lost as u64, named })

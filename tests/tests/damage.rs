@@ -90,9 +90,7 @@ fn a_changed_bit_is_named_and_costs_at_most_its_chunk() {
     let copy = original.copy(&folder.path().join("changed.mcap")).unwrap();
     let mut runner = TestRunner::new(ProptestConfig { cases: 150, ..ProptestConfig::default() });
     let change = (0..original.length(), 0..8_u8);
-    runner
-        .run(&change, |(at, bit)| copy.flip(&original, at, bit).map(drop).map_err(TestCaseError::fail))
-        .unwrap();
+    runner.run(&change, |(at, bit)| copy.flip(&original, at, bit).map(drop).map_err(TestCaseError::fail)).unwrap();
     // The heads of the records have few of all bytes, but all of the framing.
     let bytes = in_chunks();
     for at in records(&bytes, op::CHUNK).into_iter().chain(records(&bytes, op::MESSAGE_INDEX)) {
@@ -178,7 +176,8 @@ fn an_unreadable_file_never_ends_with_success() {
     ];
     for (name, bytes) in files {
         std::fs::write(folder.path().join(name), bytes).unwrap();
-        for command in [&["info", name][..], &["verify", name], &["replay", name], &["export", name, "--format", "json"]]
+        for command in
+            [&["info", name][..], &["verify", name], &["replay", name], &["export", name, "--format", "json"]]
         {
             let output = run(folder.path(), "clearway", command);
             assert_eq!(output.status.code(), Some(2), "{command:?}: {}", text(&output.stderr));

@@ -18,13 +18,13 @@ use clearway_mapping::event::Scan;
 use clearway_mapping::scan_file;
 use serde_json::{Map, Value, json};
 
-use super::files;
 use super::exit::Exit;
+use super::files;
 use super::output::{counted, print_line};
 use crate::encode::event_from_bytes;
 use crate::record::mcap_reader::{McapReader, Message};
 
-/// Describe a file: an MCAP recording, a pcap or pcapng capture, or a scan (.bin, .pcd.bin, .pcd).
+/// Describe a file: an MCAP recording, a ROS 2 bag, a pcap or pcapng capture, or a scan (.bin, .pcd.bin, .pcd).
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway info drive.mcap
@@ -48,7 +48,7 @@ pub fn run(options: &Options) -> Result<Exit> {
     let extension = file.extension().and_then(|extension| extension.to_str()).unwrap_or("");
     let document = match extension {
         "bin" | "pcd" => scan_file(file),
-        _ if start.starts_with(b"\x89MCAP") => recording(file),
+        _ if start.starts_with(b"\x89MCAP") || start == b"SQLite f" => recording(file),
         _ => capture(file),
     }
     .with_context(|| file.display().to_string())?;
@@ -139,11 +139,8 @@ fn recording(file: &Path) -> Result<Value> {
         format!("{} of {topic} cannot be decoded, the first: {first}", counted(*count, "message"))
     });
     let faults: Vec<String> = recording.incomplete().into_iter().chain(undecoded).collect();
-    let damage: Map<String, Value> = recording
-        .damages()
-        .iter()
-        .map(|damage| (format!("byte {}", damage.bytes.0), damage.to_json()))
-        .collect();
+    let damage: Map<String, Value> =
+        recording.damages().iter().map(|damage| (format!("byte {}", damage.bytes.0), damage.to_json())).collect();
     Ok(json!({
         "kind": "recording",
         "complete": faults.is_empty(),
@@ -180,7 +177,7 @@ struct Source {
 
 fn capture(file: &Path) -> Result<Value> {
     let mut capture =
-        Capture::new(BufReader::new(File::open(file)?)).context("MCAP, pcap, pcapng, .bin and .pcd are known")?;
+        Capture::new(BufReader::new(File::open(file)?)).context("MCAP, .db3, pcap, pcapng, .bin and .pcd are known")?;
     let mut sources: BTreeMap<SocketAddr, Source> = BTreeMap::new();
     let (mut packets, mut telemetry, mut other) = (0_u64, 0_u64, 0_u64);
     let mut ports: BTreeMap<String, u64> = BTreeMap::new();

@@ -15,6 +15,8 @@
 //! | `export` | a recording -> pictures, arrays, documents, files for viewers |
 //! | `info` | a file -> a description of its contents, and what is wrong with it |
 //! | `repair` | a damaged recording -> a recording of all that can be read |
+//! | `upload` | a folder of recordings -> a store |
+//! | `recordings` | a store and a search -> the recordings that it finds |
 //! | `send`, `ingest` | files -> a server: as datagrams over UDP; as observations over gRPC or zenoh |
 //! | `simulate` | a simulated scene -> a capture, or datagrams over UDP |
 //! | `completions` | a shell's name -> its completion script |
@@ -45,12 +47,16 @@ mod info;
 mod ingest;
 mod model;
 mod output;
+#[cfg(feature = "store")]
+mod recordings;
 mod repair;
 pub mod replay;
 mod send;
 mod serve;
 #[cfg(feature = "sim")]
 mod simulate;
+#[cfg(feature = "store")]
+mod upload;
 mod vehicles;
 mod verify;
 mod watch;
@@ -107,6 +113,10 @@ enum Command {
     Export(export::Options),
     Info(info::Options),
     Repair(repair::Options),
+    #[cfg(feature = "store")]
+    Upload(upload::Options),
+    #[cfg(feature = "store")]
+    Recordings(recordings::Options),
     Send(send::Options),
     Ingest(ingest::Options),
     #[cfg(feature = "sim")]
@@ -115,11 +125,12 @@ enum Command {
 }
 
 /// The subcommands by purpose, as `clearway --help` lists them.
-const GROUPS: [(&str, &[&str]); 6] = [
+const GROUPS: [(&str, &[&str]); 7] = [
     ("Make maps", &["demo", "serve", "replay"]),
     ("Check maps and configurations", &["verify", "evaluate", "check"]),
     ("Read maps from a server", &["watch", "get", "vehicles"]),
     ("Read files", &["export", "info", "repair"]),
+    ("Keep recordings", &["upload", "recordings"]),
     ("Send sensor data", &["send", "ingest", "simulate"]),
     ("Shell", &["completions"]),
 ];
@@ -193,6 +204,10 @@ fn run(command: Command) -> Result<Exit> {
         Command::Export(options) => return export::run(&options),
         Command::Info(options) => return info::run(&options),
         Command::Repair(options) => return repair::run(&options),
+        #[cfg(feature = "store")]
+        Command::Upload(options) => return upload::run(&options),
+        #[cfg(feature = "store")]
+        Command::Recordings(options) => return recordings::run(&options),
         Command::Send(options) => return send::run(&options),
         Command::Ingest(options) => ingest::run(&options)?,
         #[cfg(feature = "sim")]

@@ -14,11 +14,13 @@ use crate::record::repair::repair;
 /// The file that is read stays as it is; the file that is written must not exist. It is read again before the command
 /// ends.
 #[derive(Args)]
-#[command(after_help = "Exit codes: 0 the file was whole and so is the new one, 1 the new file is whole and lacks what \
+#[command(
+    after_help = "Exit codes: 0 the file was whole and so is the new one, 1 the new file is whole and lacks what \
     is lost, 2 no message can be read and no file is written, 3 wrong use.
 
 Example:
-  clearway repair damaged.mcap repaired.mcap")]
+  clearway repair damaged.mcap repaired.mcap"
+)]
 pub struct Options {
     /// The damaged file (MCAP, of any program).
     input: PathBuf,

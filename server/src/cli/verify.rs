@@ -11,11 +11,13 @@ use crate::record::verify::{Report, verify};
 
 /// Compute every map of a recording again from its events, and name the first differences.
 #[derive(Args)]
-#[command(after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 the file cannot be read, is not whole or has no event, 3 wrong use.
+#[command(
+    after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 the file cannot be read, is not whole or has no event, 3 wrong use.
 
 Example:
   clearway replay drive.pcap --record drive.mcap
-  clearway verify drive.mcap")]
+  clearway verify drive.mcap"
+)]
 pub struct Options {
     /// The recording (MCAP).
     file: PathBuf,

@@ -1,12 +1,12 @@
-//! Any MCAP file -> its header and its messages, in file order. All commands read MCAP files with this reader.
+//! Any MCAP file, or a ROS 2 bag in sqlite -> its header and its messages, in file order. All commands read such files
+//! with this reader.
 //!
 //! Damage costs the damaged chunk and is not an error, and neither is a file that a crash has cut: the reader returns
 //! every message that is whole, and [`McapReader::incomplete`] then says what is missing. A chunk whose CRC is wrong is
 //! damaged as a whole.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
-use std::fs::File;
-use std::io::{Error, ErrorKind, Read};
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -18,7 +18,8 @@ use crate::counted::counted;
 use crate::file_advice::advised;
 
 use super::damage::Damage;
-use super::mcap_records::{McapRecords, RecordsError};
+use super::file_records::FileRecords;
+use super::mcap_records::{LostPart, McapRecords, RecordsError};
 use super::mcap_summary;
 
 /// Version of the contents of our recordings, in their metadata. A recording without one has version 1.
@@ -145,7 +146,7 @@ pub enum McapReadError {
 /// An open MCAP file; an iterator over its messages.
 pub struct McapReader {
     file: PathBuf,
-    records: McapRecords,
+    records: FileRecords,
     /// True if `file` can be opened to read its summary.
     has_path: bool,
     schemas: HashMap<u16, String>,
@@ -170,7 +171,7 @@ impl McapReader {
     /// [`McapReadError::Read`] if the file cannot be read, [`McapReadError::NotMcap`] if it is not an MCAP file,
     /// [`McapReadError::Version`] if a later version of clearway wrote it.
     pub fn open(file: &Path) -> Result<Self, McapReadError> {
-        Self::new(file, McapRecords::new(open(file)?, false), true)
+        Self::new(file, open(file, false)?, true)
     }
 
     /// Reads an MCAP file from `source`, up to its first message; errors name it `file`.
@@ -178,21 +179,21 @@ impl McapReader {
     /// # Errors
     /// As [`McapReader::open`].
     pub fn from_source(file: &Path, source: impl Read + Send + 'static) -> Result<Self, McapReadError> {
-        Self::new(file, McapRecords::new(source, false), false)
+        Self::new(file, FileRecords::Mcap(McapRecords::new(source, false)), false)
     }
 
     /// Opens a file to read its records; its first bytes may be damaged too.
     pub(super) fn open_any(file: &Path) -> Result<Self, McapReadError> {
-        Ok(Self::unread(file, McapRecords::new(open(file)?, true), true))
+        Ok(Self::unread(file, open(file, true)?, true))
     }
 
-    fn new(file: &Path, records: McapRecords, has_path: bool) -> Result<Self, McapReadError> {
+    fn new(file: &Path, records: FileRecords, has_path: bool) -> Result<Self, McapReadError> {
         let mut reader = Self::unread(file, records, has_path);
         reader.first = reader.read()?;
         Ok(reader)
     }
 
-    fn unread(file: &Path, records: McapRecords, has_path: bool) -> Self {
+    fn unread(file: &Path, records: FileRecords, has_path: bool) -> Self {
         Self {
             file: file.to_owned(),
             records,
@@ -226,13 +227,13 @@ impl McapReader {
 
     /// True if the file ended before its closing records, because a crash cut it. Known after the last message.
     pub fn is_cut(&self) -> bool {
-        self.has_ended && !self.records.has_footer()
+        self.has_ended && !self.records.has_end()
     }
 
     /// The damaged parts so far.
     pub fn damages(&self) -> Vec<Damage> {
         let topic = |id: &u16| self.channels.get(id).map_or_else(|| format!("channel {id}"), |of| of.topic.clone());
-        let damage = |lost: &super::mcap_records::LostPart| Damage {
+        let damage = |lost: &LostPart| Damage {
             bytes: lost.bytes,
             reason: lost.reason.clone(),
             log_ns: lost.log_ns,
@@ -378,7 +379,9 @@ impl McapReader {
         let is_known = !schema.starts_with("clearway.") || PACKAGES.iter().any(|package| schema.starts_with(package));
         match is_known {
             true => Ok(()),
-            false => Err(self.version_error(format!("messages of schema {schema}"), format!("{}*", PACKAGES.join("*, ")))),
+            false => {
+                Err(self.version_error(format!("messages of schema {schema}"), format!("{}*", PACKAGES.join("*, "))))
+            }
         }
     }
 
@@ -401,15 +404,9 @@ impl Iterator for McapReader {
     }
 }
 
-fn open(file: &Path) -> Result<File, McapReadError> {
+fn open(file: &Path, any_start: bool) -> Result<FileRecords, McapReadError> {
     let wrong = |source| McapReadError::Read { file: file.to_owned(), source: advised(file, source) };
-    let opened = File::open(file).map_err(wrong)?;
-    match opened.metadata().map_err(wrong)? {
-        of_file if of_file.is_file() && of_file.len() == 0 => {
-            Err(wrong(Error::new(ErrorKind::UnexpectedEof, "the file is empty")))
-        }
-        _ => Ok(opened),
-    }
+    FileRecords::open(file, any_start).map_err(wrong)
 }
 
 /// The kind of the messages of a channel, by its topic, the name of its schema, and its encoding.

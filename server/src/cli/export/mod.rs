@@ -16,8 +16,8 @@ use clap::{Args, ValueEnum};
 use clearway_client::{Channel, Layer, MapView};
 
 use self::viewer_file::{Dialect, ViewerFile};
-use super::files;
 use super::exit::Exit;
+use super::files;
 use super::output::{counted, print_line, progress_bar, usage_error};
 use crate::encode::picture::{self, Style};
 use crate::record::mcap_reader::{McapReader, Message};

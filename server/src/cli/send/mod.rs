@@ -18,8 +18,8 @@ use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use clearway_ros::velodyne_scan::VelodyneScan;
 use serde_json::{Value, json};
 
-use super::files;
 use super::exit::Exit;
+use super::files;
 use super::output::{counted, print_line, progress_bar};
 use crate::record::mcap_reader::McapReader;
 use udp::{Kind, Sender, Speed};
@@ -74,7 +74,7 @@ pub fn run(options: &Options) -> Result<Exit> {
         sender: Sender::new(to, telemetry_to, options.bind, options.speed)?,
         skipped: BTreeMap::new(),
     };
-    let is_mcap = options.file.extension().is_some_and(|extension| extension == "mcap");
+    let is_mcap = options.file.extension().is_some_and(|extension| extension == "mcap" || extension == "db3");
     let cut =
         if is_mcap { send_mcap(options, &mut route, length)? } else { send_capture(options, &mut route, length)? };
     let sent = route.finish()?;
