@@ -61,7 +61,11 @@ pub fn run(options: &Options) -> Result<Exit> {
             }
         }
     }
-    Ok(Exit::from_incomplete(document["complete"] == false))
+    let is_incomplete = document["complete"] == false;
+    if is_incomplete {
+        eprintln!("clearway: {} is not whole: {}", file.display(), document["state"].as_str().unwrap_or_default());
+    }
+    Ok(Exit::from_incomplete(is_incomplete))
 }
 
 /// The document as `key: value` lines; nested objects are indented.
