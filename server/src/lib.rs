@@ -13,6 +13,7 @@
 //! | [`newest`] | contents of the latest-value slots between engine and readers |
 //! | [`publish`] | newest map -> gRPC, zenoh, ROS 2, Foxglove, page |
 //! | [`record`] | events and maps -> MCAP file, and back; verification |
+//! | `store` | finished recordings -> a folder or a bucket, with an index; a search -> recordings |
 //! | [`status`] | ledger, rates and latency of each vehicle |
 //! | [`server`] | starts and stops all of these |
 //! | [`cli`] | the subcommands of `clearway` |
@@ -33,6 +34,8 @@ pub mod publish;
 pub mod record;
 pub mod server;
 pub mod status;
+#[cfg(feature = "store")]
+pub mod store;
 pub mod subscriptions;
 mod sync;
 #[cfg(feature = "zenoh")]

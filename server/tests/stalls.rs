@@ -228,7 +228,7 @@ async fn watch_says_stale_when_nothing_comes_and_its_exit_code_too() {
     for at in [&grpc, &zenoh] {
         let output = until_stale(at).await;
         let said = text(&output.stdout);
-        assert!(said.starts_with("STALE: no map has arrived") && output.status.code() == Some(3), "{at:?}: {said}");
+        assert!(said.starts_with("STALE: no map has arrived") && output.status.code() == Some(4), "{at:?}: {said}");
     }
     // With data that end.
     for (at, stops) in [(&grpc, false), (&zenoh, false), (&zenoh, true)] {
@@ -247,6 +247,6 @@ async fn watch_says_stale_when_nothing_comes_and_its_exit_code_too() {
         let output = within("the end of watch", watching).await.unwrap();
         let said = text(&output.stdout);
         assert!(said.lines().last().is_some_and(|line| line.contains("STALE")), "{at:?}: {said}");
-        assert_eq!(output.status.code(), Some(3), "{at:?}: {said} {}", text(&output.stderr));
+        assert_eq!(output.status.code(), Some(4), "{at:?}: {said} {}", text(&output.stderr));
     }
 }

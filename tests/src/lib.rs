@@ -1,11 +1,12 @@
-//! What the whole-system tests share: the built command, a way to run it, the simulation of the whole system, and
-//! attacks on its listeners.
+//! What the whole-system tests share: the built command, a way to run it, damaged recordings, the simulation of the
+//! whole system, and attacks on its listeners.
 
 use std::path::PathBuf;
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
 pub mod attack;
+pub mod damage;
 pub mod simulation;
 
 #[cfg(feature = "siege")]

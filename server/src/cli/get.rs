@@ -1,7 +1,6 @@
 //! `clearway get`: a server -> its newest map, printed or written to a file.
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use anyhow::{Context, Result};
 use clap::Args;
@@ -9,14 +8,15 @@ use clearway_client::{Layer, MapView, now_ns};
 use serde_json::{Value, json};
 
 use super::connection::{ServerOptions, explain};
+use super::exit::Exit;
 use super::export::{DrawingOptions, layer_json, npy};
 use super::files;
-use super::output::{block_on, exit_code, print_line, usage_error};
+use super::output::{block_on, print_line, usage_error};
 use crate::encode::picture;
 
 /// Get the newest map: print one layer's classes and metrics, or write the layer to a file.
 ///
-/// If the map is stale, the output and the picture say STALE, and the exit code is 3.
+/// If the map is stale, the output and the picture say STALE, and the exit code is 4.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway get
@@ -48,7 +48,7 @@ pub struct Options {
 /// # Errors
 /// [`ClientError`](clearway_client::ClientError) if the server refuses or does not answer; if the file cannot be
 /// written.
-pub fn run(options: &Options) -> Result<ExitCode> {
+pub fn run(options: &Options) -> Result<Exit> {
     let format = options.out.as_deref().map(Format::from_name).transpose()?;
     if let Some(option) = options.drawing.first_given().filter(|_| format != Some(Format::Png)) {
         return Err(usage_error(format!("{option} is for pictures: it needs --out FILE.png")));
@@ -79,7 +79,7 @@ impl Format {
     }
 }
 
-async fn get(options: &Options, format: Option<Format>) -> Result<ExitCode> {
+async fn get(options: &Options, format: Option<Format>) -> Result<Exit> {
     let Options { server, vehicle, layer, out, json, drawing } = options;
     let client = server.connect().await?;
     let layers: Vec<String> = layer.iter().cloned().collect();
@@ -92,7 +92,7 @@ async fn get(options: &Options, format: Option<Format>) -> Result<ExitCode> {
         let now_ns = now_ns();
         let text = if *json { format!("{:#}", document(&map, layer, now_ns)) } else { text(&map, layer, now_ns) };
         print_line(&text)?;
-        return Ok(exit_code(map.is_stale(now_ns)));
+        return Ok(Exit::from_stale(map.is_stale(now_ns)));
     };
     let (age_ms, stale) = (map.age_ms(now_ns()), map.is_stale(now_ns()));
     let bytes = match format {
@@ -115,7 +115,7 @@ async fn get(options: &Options, format: Option<Format>) -> Result<ExitCode> {
         let (vehicle, sequence, name) = (map.vehicle(), map.sequence(), &layer.name);
         format!("{vehicle} #{sequence:06}: {name}, {age_ms:.0} ms old{said}, written to {}", file.display())
     })?;
-    Ok(exit_code(stale))
+    Ok(Exit::from_stale(stale))
 }
 
 /// The header, geometry, legend and metrics of one layer.

@@ -1,21 +1,12 @@
 //! What the subcommands share to run and to print: stdout, the progress bar, the runtime, the signals that end them.
 
 use std::io::{ErrorKind, Write};
-use std::process::ExitCode;
 
 use anyhow::{Context, Error, Result};
 use indicatif::{ProgressBar, ProgressStyle};
 use tokio::signal::unix::{SignalKind, signal};
 
 pub use crate::counted::counted;
-
-/// Exit code of a command whose newest map is stale. Ours: 1 is any other failure and 2 an error of usage.
-const STALE: u8 = 3;
-
-/// The exit code of a command that showed a map: success, or 3 if the map is stale.
-pub fn exit_code(is_stale: bool) -> ExitCode {
-    if is_stale { ExitCode::from(STALE) } else { ExitCode::SUCCESS }
-}
 
 /// Threads of the runtime at least, because zenoh needs several, whatever the machine has.
 const THREADS_MIN: usize = 2;
@@ -41,7 +32,7 @@ pub fn print_line(line: &str) -> Result<bool> {
     print(&format!("{line}\n"))
 }
 
-/// An error of usage that only the values of several options together show; the command ends with exit code 2.
+/// An error of usage that only the values of several options together show; the command ends with exit code 3.
 pub fn usage_error(message: impl std::fmt::Display) -> Error {
     clap::Error::raw(clap::error::ErrorKind::ArgumentConflict, format!("{message}\n")).into()
 }

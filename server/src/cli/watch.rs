@@ -1,7 +1,6 @@
 //! `clearway watch`: a server -> one line for each map, and a line when the maps stop.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::{Result, bail};
@@ -10,9 +9,10 @@ use clearway_client::{MapStream, PassedOver, StreamEvent, Subscription, Update, 
 use serde_json::json;
 
 use super::connection::{ServerOptions, explain};
+use super::exit::Exit;
 #[cfg(feature = "zenoh")]
 use super::files;
-use super::output::{block_on, exit_code, print_line};
+use super::output::{block_on, print_line};
 
 /// Time between two lines while no fresh map comes. Ours: a person sees that the command still waits.
 const STALE_PERIOD: Duration = Duration::from_secs(1);
@@ -22,7 +22,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 /// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps.
 ///
 /// If no map arrives, or no newer one before the last one becomes stale, a line says STALE once a second until maps
-/// arrive again. The exit code is 3 if the last line says STALE, and 1 if the server ends the stream.
+/// arrive again. The exit code is 4 if the last line says STALE, and 2 if the server ends the stream.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway watch
@@ -56,7 +56,7 @@ pub struct Options {
     /// End after this many maps; at Ctrl-C if absent.
     #[arg(long, value_name = "MAPS")]
     count: Option<u64>,
-    /// End with exit code 3 as soon as the map is stale, or none has come for a second.
+    /// End with exit code 4 as soon as the map is stale, or none has come for a second.
     #[arg(long)]
     until_stale: bool,
 }
@@ -66,11 +66,11 @@ pub struct Options {
 ///
 /// # Errors
 /// [`ClientError`](clearway_client::ClientError) if the server refuses, does not answer or ends the stream.
-pub fn run(options: &Options) -> Result<ExitCode> {
+pub fn run(options: &Options) -> Result<Exit> {
     block_on(watch(options))
 }
 
-async fn watch(options: &Options) -> Result<ExitCode> {
+async fn watch(options: &Options) -> Result<Exit> {
     let mut maps = subscribe(options).await?;
     let mut newest: Option<Update> = None;
     let (mut printed, mut is_stale) = (0, false);
@@ -107,7 +107,7 @@ async fn watch(options: &Options) -> Result<ExitCode> {
         }
         printed += u64::from(is_new);
     }
-    Ok(exit_code(is_stale))
+    Ok(Exit::from_stale(is_stale))
 }
 
 /// Identity of a map.

@@ -10,6 +10,7 @@ use clearway_mapping::config::TimeConfig;
 use clearway_mapping::event::Event;
 use clearway_ros::Kind;
 
+use super::damage::Damage;
 use super::mcap_reader::{Content, Header, McapReadError, McapReader, Message};
 use crate::config::{Calibrations, Config, ConfigError};
 use crate::encode::{EventDecodeError, event_from_bytes};
@@ -49,7 +50,7 @@ pub enum RecordedMessage {
 /// A recording cannot be read further, or its configuration cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordingError {
-    /// The file cannot be read, is not an MCAP file, or is damaged.
+    /// The file cannot be read, is not an MCAP file, or is of a later version.
     #[error(transparent)]
     Mcap(#[from] McapReadError),
     /// A message of a journal is not an event.
@@ -93,8 +94,7 @@ impl RecordingReader {
     /// Opens a recording and reads up to its first message.
     ///
     /// # Errors
-    /// [`RecordingError::Mcap`] if the file cannot be read, is not an MCAP file, or is damaged before its first
-    /// message.
+    /// [`RecordingError::Mcap`] if the file cannot be read, is not an MCAP file, or is of a later version.
     pub fn open(file: &Path) -> Result<Self, RecordingError> {
         Ok(Self { reader: McapReader::open(file)?, has_ended: false })
     }
@@ -120,6 +120,22 @@ impl RecordingReader {
     /// True if the file ended before its closing records, because a crash cut it. Known after the last message.
     pub fn is_cut(&self) -> bool {
         self.reader.is_cut()
+    }
+
+    /// The damaged parts so far.
+    pub fn damages(&self) -> Vec<Damage> {
+        self.reader.damages()
+    }
+
+    /// Number of damaged parts so far.
+    pub fn damage_count(&self) -> usize {
+        self.reader.damage_count()
+    }
+
+    /// How the file is incomplete: damaged, cut, or with fewer messages than it says. `None` for a complete file, and
+    /// before the last message.
+    pub fn incomplete(&self) -> Option<String> {
+        self.reader.incomplete()
     }
 
     /// The configuration of the recorded run, and its calibration tables as [`Config::calibrations`] returns them.

@@ -15,7 +15,7 @@ use clearway::server::Running;
 use clearway_proto::v1;
 use clearway_tests::attack::http2::{answer_pings_only, never_read};
 use clearway_tests::attack::sockets::{OPENINGS, Opening, closed, hold};
-use fixture::{feed, grpc, readings, selection, sequence, start, until, within};
+use fixture::{feed, grpc, readings, selection, sequence, start, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
@@ -37,6 +37,7 @@ pub async fn ask(address: SocketAddr, head: &str) -> String {
     String::from_utf8_lossy(&answer).into_owned()
 }
 
+/// The head of a request for a path.
 pub fn get(path: &str) -> String {
     format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n")
 }

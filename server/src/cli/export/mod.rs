@@ -16,6 +16,7 @@ use clap::{Args, ValueEnum};
 use clearway_client::{Channel, Layer, MapView};
 
 use self::viewer_file::{Dialect, ViewerFile};
+use super::exit::Exit;
 use super::files;
 use super::output::{counted, print_line, progress_bar, usage_error};
 use crate::encode::picture::{self, Style};
@@ -119,7 +120,7 @@ fn check(options: &Options) -> Result<()> {
 /// been seen, which is seldom far.
 fn check_layers(options: &Options) -> Result<()> {
     let Options { recording: file, layers, vehicle, .. } = options;
-    let mut recording = McapReader::salvage(file)?;
+    let mut recording = McapReader::open(file)?;
     let mut absent: Vec<&String> = layers.iter().collect();
     while let Some(name) = absent.first() {
         let Some(message) = recording.next() else {
@@ -139,12 +140,12 @@ fn check_layers(options: &Options) -> Result<()> {
 ///
 /// # Errors
 /// If a file cannot be read or written; for an unknown layer or vehicle with the names of those in the recording.
-pub fn run(options: &Options) -> Result<()> {
+pub fn run(options: &Options) -> Result<Exit> {
     check(options)?;
     let Options { recording: file, layers, out, vehicle, .. } = options;
     let (_, length) = files::open(file)?;
     check_layers(options)?;
-    let mut recording = McapReader::salvage(file)?;
+    let mut recording = McapReader::open(file)?;
     let mut output = Output::new(options)?;
     let style = options.drawing.style();
     let progress = progress_bar(length);
@@ -189,8 +190,9 @@ pub fn run(options: &Options) -> Result<()> {
     if let Output::Viewer(viewer) = output {
         viewer.finish().with_context(|| format!("write {}", out.display()))?;
     }
-    if let Some(cut) = recording.incomplete() {
-        eprintln!("clearway: {} is {cut}; the maps before that are exported", file.display());
+    let incomplete = recording.incomplete();
+    if let Some(incomplete) = &incomplete {
+        eprintln!("clearway: {} is {incomplete}; the maps of the rest are exported", file.display());
     }
     if maps.is_empty() {
         bail!("{}", nothing_exported(file, &recording, None, vehicle.as_deref()));
@@ -198,7 +200,7 @@ pub fn run(options: &Options) -> Result<()> {
     for (layer, maps) in &maps {
         print_line(&format!("{} of {layer} in {}", counted(*maps, "map"), out.display()))?;
     }
-    Ok(())
+    Ok(Exit::from_incomplete(incomplete.is_some()))
 }
 
 fn decode(message: &Message, file: &Path) -> Result<MapView> {

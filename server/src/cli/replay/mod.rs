@@ -19,6 +19,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::exit::Exit;
 use super::output::{block_on, print, print_line, stop_signal};
 use super::serve::log_endpoints;
 use crate::ingest::files::Readings;
@@ -38,15 +39,15 @@ pub use summary::{Mount, Summary, describe};
 /// Interval at which the progress bar is drawn again.
 const DRAW_INTERVAL: Duration = Duration::from_millis(100);
 
-/// Replays the files and prints the summary.
+/// Replays the files and prints the summary. A file that is not whole is [`Exit::Unreadable`].
 ///
 /// # Errors
 /// [`ReplayError`].
-pub fn run(options: Options) -> anyhow::Result<()> {
+pub fn run(options: Options) -> anyhow::Result<Exit> {
     block_on(replay_and_print(options))
 }
 
-async fn replay_and_print(options: Options) -> anyhow::Result<()> {
+async fn replay_and_print(options: Options) -> anyhow::Result<Exit> {
     let json = options.json;
     let progress = Arc::new(Progress::default());
     let mut bar = None;
@@ -66,7 +67,7 @@ async fn replay_and_print(options: Options) -> anyhow::Result<()> {
     }
     let summary = outcome?;
     for truncated in &summary.truncated {
-        eprintln!("warning: {}: {}; what came before was used", truncated.file.display(), truncated.reason);
+        eprintln!("warning: {}: {}; the rest was used", truncated.file.display(), truncated.reason);
     }
     for note in &summary.notes {
         eprintln!("note: {note}");
@@ -76,7 +77,7 @@ async fn replay_and_print(options: Options) -> anyhow::Result<()> {
     } else {
         print(&summary.to_text())?
     };
-    Ok(())
+    Ok(Exit::from_incomplete(!summary.truncated.is_empty()))
 }
 
 /// How many bytes of the files a replay has read, for a progress bar.
