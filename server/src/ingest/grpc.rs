@@ -90,7 +90,6 @@ struct IngestStream {
     outcomes: UnboundedReceiver<(ObservationId, Outcome)>,
     /// The status that ends the stream, after everything in flight is reported.
     end: Option<Status>,
-    is_over: bool,
     // The last field, so that it is dropped last.
     _permits: [OwnedSemaphorePermit; 2],
 }
@@ -111,20 +110,12 @@ impl IngestStream {
             outcome_sender,
             outcomes,
             end: None,
-            is_over: false,
             _permits: permits,
         }
     }
 
     fn reports(self) -> impl Stream<Item = Result<v1::IngestReport, Status>> {
-        stream::unfold(self, |mut stream| async move {
-            if stream.is_over {
-                return None;
-            }
-            let report = stream.next().await.transpose()?;
-            stream.is_over = report.is_err();
-            Some((report, stream))
-        })
+        stream::try_unfold(self, |mut stream| async move { Ok(stream.next().await?.map(|report| (report, stream))) })
     }
 
     /// Waits for the next report. `None` once everything is reported and no more observations will come.

@@ -46,7 +46,6 @@ struct Watch<R> {
     base: Option<Arc<EncodedMap>>,
     /// The reader asked for a whole map.
     want_full: bool,
-    over: bool,
     /// Until it goes, its layers are made.
     subscription: LayerSubscription,
     // Last, and only held: the reader is counted while this lives.
@@ -66,20 +65,12 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
             last: None,
             base: None,
             want_full: false,
-            over: false,
             _reader: Reader::new(&served.status.grpc_readers),
         }
     }
 
     fn updates(self) -> impl Stream<Item = Result<v1::MapUpdate, Status>> {
-        stream::unfold(self, |mut watch| async move {
-            if watch.over {
-                return None;
-            }
-            let update = watch.next().await.transpose()?;
-            watch.over = update.is_err();
-            Some((update, watch))
-        })
+        stream::try_unfold(self, |mut watch| async move { Ok(watch.next().await?.map(|update| (update, watch))) })
     }
 
     /// The next update: the newest map that is due, as soon as there is a credit. `None` if the reader has

@@ -208,6 +208,16 @@ fn scans_with_older_stamps_are_accepted_after_the_deadline() {
 }
 
 #[test]
+fn a_host_clock_set_back_does_not_hold_back_the_maps_of_another_sensor() {
+    let mut pipeline = pipeline(&config());
+    let hour_ns = 3_600_000 * MS;
+    assert!((0..5).all(|n| step(&mut pipeline, &scan(0, hour_ns + n * 100 * MS)).is_some()));
+    // The reference sensor stops as the clock is set; stamps and arrivals of the other one agree.
+    let made = (0..10).filter_map(|n| step(&mut pipeline, &scan(1, n * 100 * MS))).count();
+    assert!((6..=9).contains(&made), "{made} maps in 1 s: none until the deadline, then one a scan");
+}
+
+#[test]
 fn a_fast_reference_sensor_makes_one_map_a_period() {
     let fusion = FusionConfig { period_ms: 100, ..FusionConfig::default() };
     let mut pipeline = pipeline(&VehicleConfig { fusion, ..config() });

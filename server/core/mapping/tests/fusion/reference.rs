@@ -41,6 +41,8 @@ fn the_sensor_that_sees_all_around_is_the_reference_whichever_sends_first() {
         let mut pipeline = pipeline(&bumper_and_roof());
         let made: Vec<Map> = events(first).iter().filter_map(|event| step(&mut pipeline, event)).collect();
         assert_eq!(pipeline.reference_sensor(), 1, "{first}");
+        let marked: Vec<bool> = pipeline.sensors().iter().map(|sensor| sensor.is_reference).collect();
+        assert_eq!(marked, [false, true], "the status of the sensors names it too");
         let chosen = made.iter().skip_while(|map| map.reference_sensor == 0);
         assert!(chosen.clone().count() >= 5, "{first}: chosen when both have completed a scan");
         assert!(chosen.clone().all(|map| (map.source, map.reference_sensor) == (1, 1)), "{first}");
