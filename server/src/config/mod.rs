@@ -18,6 +18,7 @@ use read::{Problem, Refusal, plain_key};
 
 mod connections;
 mod error;
+mod exposure;
 mod grpc;
 mod listeners;
 mod read;
