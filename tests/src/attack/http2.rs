@@ -20,6 +20,8 @@ const ACKNOWLEDGED: u8 = 1;
 const END_HEADERS: u8 = 4;
 /// Setting: window of a new stream.
 const INITIAL_WINDOW: u16 = 4;
+/// The path of the streams of maps.
+pub const WATCH: &str = "/clearway.v1.MapService/Watch";
 /// The largest window.
 pub const WINDOW_MAX: u32 = (1 << 31) - 1;
 
@@ -65,7 +67,7 @@ pub fn message(stream: u32, message: &impl Message) -> Vec<u8> {
 /// A `Watch` of all layers of the only vehicle, by a reader that never acknowledges.
 pub fn watch(stream: u32) -> Vec<u8> {
     let first = v1::WatchRequest { selection: Some(v1::Selection::default()), ..Default::default() };
-    [call(stream, "/clearway.v1.MapService/Watch"), message(stream, &first)].concat()
+    [call(stream, WATCH), message(stream, &first)].concat()
 }
 
 /// The end of a stream by the client.

@@ -13,7 +13,7 @@ use super::http2;
 pub enum Opening {
     /// Nothing.
     Nothing,
-    /// The first byte of the HTTP/2 preface, and of a TLS record by chance of nothing.
+    /// The first byte of the HTTP/2 preface.
     OneByte,
     /// Half the head of an HTTP/1 request.
     HalfHead,

@@ -73,7 +73,7 @@ async fn every_path_asks_for_a_certificate_or_a_token_with_a_role() {
     let running = start(with_roles(folder.path())).await;
     feed(&running, readings(2)).await;
     let [page, metrics, foxglove] = [running.page, running.metrics, running.foxglove].map(Option::unwrap);
-    // Nobody, another CA, and the roles reader, ingester, operator; "server" has no role.
+    // No certificate, one of another CA, and the roles reader, ingester, operator; "server" has no role.
     let callers = [None, Some("theirs"), Some("server"), Some("reader"), Some("ingester"), Some("operator")];
     for (address, path, expected) in [
         (page, "/healthz", [200, 0, 200, 200, 200, 200]),

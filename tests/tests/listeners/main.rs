@@ -37,7 +37,7 @@ pub async fn ask(address: SocketAddr, head: &str) -> String {
     String::from_utf8_lossy(&answer).into_owned()
 }
 
-/// The head of a request for a path.
+/// The head of a request, without the empty line at its end.
 pub fn get(path: &str) -> String {
     format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n")
 }
@@ -125,7 +125,7 @@ async fn a_reader_that_takes_no_maps_is_cut_although_it_answers_pings() {
 async fn streams_that_are_never_read_hold_few_bytes_and_these_are_given_back() {
     let running = start(everything()).await;
     let healthy = &mut grpc(&running).await;
-    let mut maps = healthy.watch(tokio_stream::once(selection("car", &[], 1))).await.unwrap().into_inner();
+    let mut maps = healthy.watch(tokio_stream::once(selection("car", &[], 0))).await.unwrap().into_inner();
     let hostile = within("2,000 streams", never_read(running.grpc.unwrap(), 20, 100)).await.unwrap();
     let calls = "clearway_connections_closed_total{listener=\"grpc\",reason=\"calls\"}";
     within("1,745 streams are refused", async {
@@ -136,22 +136,16 @@ async fn streams_that_are_never_read_hold_few_bytes_and_these_are_given_back() {
     .await;
     let waiting = "clearway_waiting_bytes{listener=\"grpc\"}";
     let mut next = 0;
-    for portion in readings(12).chunks(150).map(<[_]>::to_vec) {
+    for portion in readings(12).chunks(40).map(<[_]>::to_vec) {
         let made = feed(&running, portion).await;
         while next < made {
             let update = within("the next map", maps.message()).await.unwrap().unwrap();
             assert_eq!((sequence(&update.map), update.skipped), (next, 0), "the healthy reader misses none");
-            let acknowledged = v1::WatchRequest { acknowledged: Some(next), ..Default::default() };
-            drop(acknowledged);
             next += 1;
-            break;
         }
         assert!(metric(&running, waiting).await <= f64::from(9 << 20), "8 MiB of one address, and a map");
-        if next > 0 {
-            break;
-        }
     }
-    assert!(next > 0);
+    assert!(next >= 10, "{next} maps");
     drop(hostile);
     within("all bytes are given back", async {
         while metric(&running, waiting).await > 0.0 {

@@ -47,8 +47,7 @@ async fn only_get_and_head_from_the_page_itself_are_answered() {
     let refused = [("/live?vehicle=car", running.page.unwrap()), ("/", running.foxglove.unwrap())];
     for (path, address) in refused {
         for origin in ["http://evil.example", "null", "http://localhost.evil.example", "http://localhost:1"] {
-            let answer = ask(address, &upgrade(path, origin)).await;
-            assert!(answer.starts_with("HTTP/1.1 403") && answer.contains("connections.origins"), "{origin}: {answer}");
+            assert_eq!(begin(address, &upgrade(path, origin)).await, "HTTP/1.1 403", "{origin}");
         }
         for origin in ["http://localhost", "https://fleet.example"] {
             assert_eq!(begin(address, &upgrade(path, origin)).await, "HTTP/1.1 101", "{origin}");

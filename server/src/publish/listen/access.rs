@@ -45,8 +45,8 @@ pub const RPCS: &[(&str, &[Role])] = &[
     ("/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo", &[Role::Reader, Role::Ingester]),
 ];
 
-/// The paths of the page, the metrics and Foxglove, and the roles that may use them; operators may use all. Every client
-/// may use a path without roles. Every other path is a file of the page.
+/// The paths of the page, the metrics and Foxglove, and the roles that may use them; operators may use all. Every
+/// client may use a path without roles. Every other path is a file of the page.
 pub const PATHS: &[(&str, &[Role])] = &[
     ("/healthz", &[]),
     ("/readyz", &[]),

@@ -7,6 +7,7 @@
 //! |---|---|
 //! | `places` | connections -> those that may stay: limits in all and of one address, idle and stalled ones closed |
 //! | `flow` | responses -> their bytes while they wait, limited |
+//! | `body` | the body of a response -> pieces for the transport, counted |
 //! | `connection` | a socket, plain or encrypted -> bytes, until its place is closed |
 //! | `tls` | certificates -> TLS, names of clients |
 //! | [`access`] | names -> roles -> RPCs and paths, vehicles and layers |
@@ -14,6 +15,7 @@
 //! | `web` | a browser's request -> who may ask, by which host, from which origin; headers |
 
 pub mod access;
+mod body;
 mod connection;
 mod flow;
 mod places;
@@ -43,8 +45,9 @@ use tonic::Status;
 use tower_service::Service;
 
 use access::Caller;
+use body::CountedBody;
 use connection::{Connection, Transport};
-use flow::{CountedBody, Flows};
+use flow::Flows;
 use places::Places;
 use security::Security;
 

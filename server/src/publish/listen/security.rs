@@ -1,10 +1,10 @@
 //! The certificates, roles and tokens that hold at present: they can be replaced while the server runs.
 
+use std::net::IpAddr;
 use std::sync::{Arc, RwLock};
 
 use super::access::Access;
 use super::tls::Tls;
-use super::web::is_address;
 use crate::config::{Certificates, Config};
 
 /// The certificates, roles and tokens of all listeners.
@@ -58,7 +58,10 @@ impl Current {
     /// True if a browser may address the server by this host.
     pub fn is_own_host(&self, host: &str) -> bool {
         let certified = self.tls.iter().flat_map(|tls| &tls.names);
-        is_address(host) || host == "localhost" || self.hosts.iter().chain(certified).any(|own| own == host)
+        // Another page cannot make a browser send an address that is not the server's own.
+        host.parse::<IpAddr>().is_ok()
+            || host == "localhost"
+            || self.hosts.iter().chain(certified).any(|own| own == host)
     }
 }
 

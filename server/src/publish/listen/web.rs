@@ -6,7 +6,6 @@ use axum::http::header::{self, HeaderMap, HeaderValue};
 use axum::http::uri::Authority;
 use axum::http::{Method, Request, Response, StatusCode};
 use axum::response::IntoResponse;
-use std::net::IpAddr;
 use tonic::{Code, Status};
 
 use super::access::Caller;
@@ -105,11 +104,6 @@ fn host_of(authority: &str) -> &str {
         Some((address, _)) => address,
         None => authority.rsplit_once(':').map_or(authority, |(host, _)| host),
     }
-}
-
-/// True for an address: another page cannot make a browser send one that is not the server's own.
-pub fn is_address(host: &str) -> bool {
-    host.parse::<IpAddr>().is_ok()
 }
 
 /// Adds the headers of every response.
