@@ -1,7 +1,7 @@
 //! Cuts a recording at many bytes and changes many of its bits, and judges what is read of each copy.
 //!
-//! `cargo run --release -p clearway-tests --bin cuts_and_flips -- drive.mcap --flips 10000` cuts at every byte; the exit code
-//! is 1 if damage is not named, costs more than its chunk, or causes a panic.
+//! `cargo run --release -p clearway-tests --bin cuts_and_flips -- drive.mcap --flips 10000` cuts at every byte; the
+//! exit code is 1 if damage is not named, costs more than its chunk, or causes a panic.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
