@@ -12,6 +12,7 @@
 //! | `check` | a configuration -> the same with every default |
 //! | `watch`, `get` | a server -> a line for each map; the newest map as a file |
 //! | `vehicles` | a server -> the state of its vehicles |
+//! | `recorder` | a request -> the recorder of a server |
 //! | `export` | a recording -> pictures, arrays, documents, files for viewers |
 //! | `info` | a file -> a description of its contents |
 //! | `send`, `ingest` | files -> a server: as datagrams over UDP; as observations over gRPC or zenoh |
@@ -42,6 +43,7 @@ mod info;
 mod ingest;
 mod model;
 mod output;
+mod recorder;
 pub mod replay;
 mod send;
 mod serve;
@@ -98,6 +100,7 @@ enum Command {
     Watch(watch::Options),
     Get(get::Options),
     Vehicles(vehicles::Options),
+    Recorder(recorder::Options),
     Export(export::Options),
     Info(info::Options),
     Send(send::Options),
@@ -108,10 +111,11 @@ enum Command {
 }
 
 /// The subcommands by purpose, as `clearway --help` lists them.
-const GROUPS: [(&str, &[&str]); 6] = [
+const GROUPS: [(&str, &[&str]); 7] = [
     ("Make maps", &["demo", "serve", "replay"]),
     ("Check maps and configurations", &["verify", "evaluate", "check"]),
     ("Read maps from a server", &["watch", "get", "vehicles"]),
+    ("Control a server", &["recorder"]),
     ("Read files", &["export", "info"]),
     ("Send sensor data", &["send", "ingest", "simulate"]),
     ("Shell", &["completions"]),
@@ -172,6 +176,7 @@ fn run(command: Command) -> Result<ExitCode> {
         Command::Watch(options) => watch::run(&options)?,
         Command::Get(options) => get::run(&options)?,
         Command::Vehicles(options) => vehicles::run(&options)?,
+        Command::Recorder(options) => recorder::run(options)?,
         Command::Export(options) => export::run(&options)?,
         Command::Info(options) => info::run(&options)?,
         Command::Send(options) => send::run(&options)?,

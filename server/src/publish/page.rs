@@ -78,7 +78,11 @@ async fn list(State(vehicles): State<Vehicles>) -> impl IntoResponse {
 
 async fn health(State(vehicles): State<Vehicles>) -> Response {
     match vehicles.statuses().iter().find(|status| !status.is_alive()) {
-        None => "ok\n".into_response(),
+        // The maps are served, so a supervisor must not end the server.
+        None => match vehicles.statuses().iter().find_map(|status| status.recorder_problem()) {
+            None => "ok\n".into_response(),
+            Some(problem) => format!("degraded\nrecorder: {problem}\n").into_response(),
+        },
         Some(dead) => {
             let text = format!("the engine of vehicle {} has stopped\n", dead.name);
             (StatusCode::SERVICE_UNAVAILABLE, text).into_response()

@@ -1,7 +1,9 @@
 //! Verifies a recording: are the recorded maps the maps of the recorded events?
 //!
 //! Builds every vehicle's pipeline from the recorded configuration and calibrations, steps it with all events of the
-//! journal, and compares the bytes of each map with those of the recorded map.
+//! journal, and compares the bytes of each map with those of the recorded map. At a keyframe a new pipeline replaces
+//! the old one, as it did in the recorded run. Maps that follow from events which the file lacks are counted as
+//! unjudged: those after a gap, until the next keyframe.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -9,8 +11,10 @@ use std::path::Path;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use clearway_mapping::config::ConfigValueError;
-use clearway_mapping::pipeline::Pipeline;
+use clearway_lidar::calibration::Calibration;
+use clearway_mapping::config::{ConfigValueError, VehicleConfig};
+use clearway_mapping::event::Event;
+use clearway_mapping::pipeline::{Handover, Pipeline};
 use clearway_proto::codec::{DecodeError, Limits};
 use clearway_proto::grid::Grid;
 use clearway_proto::map::{Channel, Layer, MapError, decode_map};
@@ -37,6 +41,15 @@ pub struct Report {
     pub cut: bool,
     /// Number of maps, of one layer each, that belong to the last event before the cut and are not recorded.
     pub beyond_cut: u64,
+    /// Number of recorded maps, of one layer each, that cannot be made again: they follow from events that the file
+    /// lacks.
+    pub unjudged: u64,
+    /// Number of messages that the recorder has dropped, as the file states it.
+    pub dropped: u64,
+    /// The first topic with dropped messages and why they were dropped; empty without any.
+    pub dropped_because: String,
+    /// True if the recorder has closed the file; always false in files of versions without counts.
+    pub is_closed: bool,
     /// The first differences.
     pub differences: Vec<Difference>,
     /// Number of all differences.
@@ -104,9 +117,9 @@ pub enum VerifyError {
 }
 
 impl Report {
-    /// True if every recorded map is the map of its events.
+    /// True if every recorded map is the map of its events, and the recorder has dropped nothing.
     pub fn is_good(&self) -> bool {
-        self.different == 0
+        self.different == 0 && self.dropped == 0
     }
 
     /// The report as one JSON object.
@@ -115,6 +128,7 @@ impl Report {
             "ok": self.is_good(),
             "events": self.events, "maps": self.maps, "equal": self.equal, "different": self.different,
             "cut": self.cut, "beyond_cut": self.beyond_cut,
+            "unjudged": self.unjudged, "dropped": self.dropped, "dropped_because": self.dropped_because,
             "differences": self.differences.iter().map(Difference::to_json).collect::<Vec<_>>(),
         })
     }
@@ -169,9 +183,16 @@ impl fmt::Display for Difference {
 /// One vehicle whose maps are computed again.
 struct VehicleReplay {
     name: Arc<str>,
-    pipeline: Pipeline,
+    config: VehicleConfig,
+    tables: Vec<Option<Calibration>>,
+    /// Makes the maps; `None` where they do not follow from the events of the file: before the first keyframe of a part
+    /// that is not the first, and after a gap until the next keyframe.
+    pipeline: Option<Pipeline>,
+    /// The pipeline of the next keyframe.
+    warm_up: Option<Pipeline>,
     valid_ms: u32,
-    next_event: u64,
+    /// Sequence of the next event; `None` before the first one.
+    next_event: Option<u64>,
     /// Computed maps that are not compared yet, by sequence and layer.
     computed: BTreeMap<(u64, String), Bytes>,
 }
@@ -186,12 +207,18 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     let boot_id = recording.header().boot_id;
     let (config, tables) = recording.config()?;
     let mut replays = Vec::new();
+    let is_first_part = recording.part() == 1;
     for (vehicle, tables) in config.vehicles.iter().zip(tables) {
+        let config = vehicle.core();
+        let pipeline = Pipeline::new(&config, tables.clone())?;
         replays.push(VehicleReplay {
             name: vehicle.name.as_str().into(),
-            pipeline: Pipeline::new(&vehicle.core(), tables)?,
+            config,
+            tables,
+            pipeline: is_first_part.then_some(pipeline),
+            warm_up: None,
             valid_ms: vehicle.maps.valid_ms,
-            next_event: 0,
+            next_event: is_first_part.then_some(0),
             computed: BTreeMap::new(),
         });
     }
@@ -201,22 +228,37 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
             RecordedMessage::Event { vehicle, event } => {
                 let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else { continue };
                 report.events += 1;
-                if event.sequence != replay.next_event {
-                    report.add(&vehicle, replay.next_event, "", DifferenceKind::Gap { found: event.sequence });
-                }
-                replay.next_event = event.sequence.saturating_add(1);
-                if let Ok(Some(map)) = replay.pipeline.step(&event) {
-                    let map = EncodedMap::new(map, replay.name.clone(), boot_id, replay.valid_ms);
-                    report.maps += 1;
-                    for (layer, chunk) in &map.layers {
-                        replay.computed.insert((map.sequence, (*layer).to_owned()), map.layer(chunk));
+                replay.step(&event, boot_id, &mut report);
+            }
+            RecordedMessage::Keyframe { vehicle, keyframe } => {
+                let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else { continue };
+                match keyframe.phase() {
+                    v1::KeyframePhase::WarmUp => {
+                        replay.warm_up = Some(Pipeline::new(&replay.config, replay.tables.clone())?);
+                        replay.next_event.get_or_insert(keyframe.first_event);
                     }
+                    v1::KeyframePhase::Begin => {
+                        if let Some(mut pipeline) = replay.warm_up.take() {
+                            pipeline.take_over(Handover::from_recording(keyframe.next_map, &keyframe.refused));
+                            replay.pipeline = Some(pipeline);
+                        }
+                    }
+                    v1::KeyframePhase::Unspecified => {}
                 }
+            }
+            RecordedMessage::Counts(counts) => {
+                if let Some(topic) = counts.topics.iter().find(|topic| topic.dropped > 0) {
+                    report.dropped = counts.topics.iter().map(|topic| topic.dropped).sum();
+                    report.dropped_because = format!("{}: {}", topic.topic, counts.reason);
+                }
+                report.is_closed |= counts.closed;
             }
             RecordedMessage::Map { vehicle, layer, bytes } => {
                 let sequence = sequence_of(&bytes);
                 let replay = replays.iter_mut().find(|r| *r.name == *vehicle);
+                let is_judged = replay.as_ref().is_none_or(|replay| replay.pipeline.is_some());
                 match replay.and_then(|replay| replay.computed.remove(&(sequence, layer.clone()))) {
+                    None if !is_judged => report.unjudged += 1,
                     None => report.add(&vehicle, sequence, &layer, DifferenceKind::Extra),
                     Some(computed) if computed == bytes => report.equal += 1,
                     Some(computed) => report.add(&vehicle, sequence, &layer, first_difference(&bytes, &computed)),
@@ -238,6 +280,34 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
         }
     }
     Ok(report)
+}
+
+impl VehicleReplay {
+    /// Steps the pipelines with an event and keeps the map that it completes.
+    fn step(&mut self, event: &Event, boot_id: u64, report: &mut Report) {
+        if let Some(warm_up) = &mut self.warm_up {
+            // Refused as it was in the recorded run.
+            let _ = warm_up.step(event);
+        }
+        let expected = self.next_event.unwrap_or(event.sequence);
+        // An event that is repeated for a keyframe was processed before.
+        if event.sequence < expected {
+            return;
+        }
+        self.next_event = Some(event.sequence.saturating_add(1));
+        if event.sequence > expected {
+            report.add(&self.name, expected, "", DifferenceKind::Gap { found: event.sequence });
+            (self.pipeline, self.warm_up) = (None, None);
+        }
+        let Some(pipeline) = &mut self.pipeline else { return };
+        if let Ok(Some(map)) = pipeline.step(event) {
+            let map = EncodedMap::new(map, self.name.clone(), boot_id, self.valid_ms);
+            report.maps += 1;
+            for (layer, chunk) in &map.layers {
+                self.computed.insert((map.sequence, (*layer).to_owned()), map.layer(chunk));
+            }
+        }
+    }
 }
 
 /// The sequence of a recorded map; `u64::MAX` for an unreadable map, which then counts as extra.

@@ -28,7 +28,7 @@ pub enum Role {
     Reader,
     /// May send scans, poses, roads and packets.
     Ingester,
-    /// May do both.
+    /// May do both, and control the recorder.
     Operator,
 }
 
@@ -49,6 +49,12 @@ pub const RPCS: &[(&str, &[Role])] = &[
     ("/clearway.v1.MapService/GetMap", &[Role::Reader]),
     ("/clearway.v1.MapService/ListVehicles", &[Role::Reader, Role::Ingester]),
     ("/clearway.v1.IngestService/Stream", &[Role::Ingester]),
+    ("/clearway.v1.RecordingService/Start", &[]),
+    ("/clearway.v1.RecordingService/Stop", &[]),
+    ("/clearway.v1.RecordingService/Split", &[]),
+    ("/clearway.v1.RecordingService/Save", &[]),
+    ("/clearway.v1.RecordingService/List", &[]),
+    ("/clearway.v1.RecordingService/Status", &[]),
     ("/grpc.health.v1.Health/Check", &[Role::Reader, Role::Ingester]),
     ("/grpc.health.v1.Health/Watch", &[Role::Reader, Role::Ingester]),
     ("/grpc.reflection.v1.ServerReflection/ServerReflectionInfo", &[Role::Reader, Role::Ingester]),
@@ -81,8 +87,8 @@ impl Access {
     /// `PermissionDenied` with the names, their roles and the roles that are allowed, if none of its roles is allowed.
     pub fn check(&self, path: &str, names: &[String]) -> Result<(), Status> {
         let roles: BTreeSet<Role> = names.iter().filter_map(|name| self.roles.get(name)).flatten().copied().collect();
-        let allowed = RPCS.iter().find(|(rpc, _)| *rpc == path).map_or(&[][..], |(_, allowed)| allowed);
-        let known = !allowed.is_empty();
+        let found = RPCS.iter().find(|(rpc, _)| *rpc == path);
+        let (known, allowed) = (found.is_some(), found.map_or(&[][..], |(_, allowed)| allowed));
         if known && (roles.contains(&Role::Operator) || allowed.iter().any(|role| roles.contains(role))) {
             return Ok(());
         }

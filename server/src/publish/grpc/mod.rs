@@ -1,10 +1,11 @@
-//! The gRPC server: `clearway.v1.MapService`, standard health and reflection, and the ingest service if it is
-//! configured ([`crate::ingest::grpc`]).
+//! The gRPC server: `clearway.v1.MapService` and `clearway.v1.RecordingService`, standard health and reflection, and the
+//! ingest service if it is configured ([`crate::ingest::grpc`]).
 //!
 //! The limits of what one client may cost are set here, each with its reason. [`reader`] has the updates of one reader.
 
 pub mod access;
 pub mod reader;
+mod recording;
 pub mod selection;
 
 use std::pin::Pin;
@@ -16,17 +17,21 @@ use futures::Stream;
 use tokio::net::TcpListener;
 use tonic::transport::{Certificate, Identity, Server, ServerTlsConfig};
 use tonic::{Request, Response, Status, Streaming};
+use tonic_health::server::HealthReporter;
 
 use super::connections::Connections;
 use super::served::Vehicles;
 use access::{Access, Guard};
 use reader::watch;
+use recording::Recordings;
 
 use crate::clock::now_ns;
 use crate::config::{self, Certificates};
+use crate::record::writer::RecorderControl;
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
 use v1::map_service_server::{MapService, MapServiceServer};
+use v1::recording_service_server::RecordingServiceServer;
 
 /// Longest request, in bytes. Ours: requests hold names and numbers.
 const REQUEST_BYTES_MAX: usize = 64 << 10;
@@ -46,6 +51,8 @@ const HEADERS_BYTES_MAX: u32 = 16 << 10;
 const SELECTION_TIMEOUT: Duration = Duration::from_secs(10);
 /// Interval and timeout of HTTP/2 keepalive: a client that has disappeared is noticed after both.
 const KEEPALIVE: Duration = Duration::from_secs(10);
+/// Interval at which the health of the recorder is reported.
+const RECORDER_PERIOD: Duration = Duration::from_secs(1);
 /// Longest TLS handshake. Ours: a client that has begun one has no reason to wait.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -94,6 +101,7 @@ pub async fn serve<I: IngestService>(
     connections_max: usize,
     vehicles: Vehicles,
     ingest: Option<IngestServiceServer<I>>,
+    recorder: Option<RecorderControl>,
     stop: impl Future<Output = ()>,
 ) -> Result<(), GrpcError> {
     let Security { builder, guard } = security;
@@ -108,7 +116,10 @@ pub async fn serve<I: IngestService>(
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
     let maps = MapServiceServer::new(Maps { vehicles }).max_decoding_message_size(REQUEST_BYTES_MAX);
-    builder
+    let recordings = RecordingServiceServer::new(Recordings { control: recorder.clone() });
+    let recordings = recordings.max_decoding_message_size(REQUEST_BYTES_MAX);
+    let reports = recorder.map(|recorder| tokio::spawn(report_recorder(health, recorder)));
+    let served = builder
         .layer(guard)
         .http2_keepalive_interval(Some(KEEPALIVE))
         .http2_keepalive_timeout(Some(KEEPALIVE))
@@ -121,6 +132,7 @@ pub async fn serve<I: IngestService>(
         .http2_max_header_list_size(HEADERS_BYTES_MAX)
         .add_service(maps)
         .add_optional_service(ingest)
+        .add_service(recordings)
         .add_service(health_service)
         .add_service(reflection().build_v1()?)
         // Older versions of grpcurl know only this version.
@@ -129,8 +141,22 @@ pub async fn serve<I: IngestService>(
             Connections::new(listener, connections_max).with_errors_over_limit().stream(),
             stop,
         )
-        .await?;
-    Ok(())
+        .await;
+    reports.iter().for_each(tokio::task::JoinHandle::abort);
+    Ok(served?)
+}
+
+/// Reports the health of the recorder as that of its service, once in [`RECORDER_PERIOD`].
+async fn report_recorder(health: HealthReporter, recorder: RecorderControl) {
+    let mut every = tokio::time::interval(RECORDER_PERIOD);
+    loop {
+        every.tick().await;
+        if recorder.status().reason.is_empty() {
+            health.set_serving::<RecordingServiceServer<Recordings>>().await;
+        } else {
+            health.set_not_serving::<RecordingServiceServer<Recordings>>().await;
+        }
+    }
 }
 
 struct Maps {
