@@ -1,14 +1,14 @@
 //! The MCAP file of one part of a recording while it is written. Standard MCAP; any MCAP program reads it.
 //!
-//! Layout: metadata `clearway` (boot id, version, vehicles, source of each calibration, number of the part), attachments
-//! `config.toml` (the effective configuration) and `calibration/<vehicle>/<sensor>.yaml` (the configured tables), then
-//! the channels. Log time is the arrival of the event, or of the event that completed the map.
+//! Layout: metadata `clearway` (boot id, version, vehicles, source of each calibration, number of the part),
+//! attachments `config.toml` (the effective configuration) and `calibration/<vehicle>/<sensor>.yaml` (the configured
+//! tables), then the channels. Log time is the arrival of the event, or of the event that completed the map.
 //!
 //! | channel | schema | contents |
 //! |---|---|---|
-//! | `/<vehicle>/journal` | `clearway.v1.Event` | every event; in a part after the first also those in force at its start |
+//! | `/<vehicle>/journal` | `clearway.v1.Event` | every event; at a keyframe also those that are in force |
 //! | `/<vehicle>/map/<layer>` | `clearway.v1.Map` | the same bytes that zenoh carries |
-//! | `/<vehicle>/keyframe` | `clearway.v1.Keyframe` | from where on the maps follow from the events in this file alone |
+//! | `/<vehicle>/keyframe` | `clearway.v1.Keyframe` | from where on the maps follow from this file's events alone |
 //! | `/recorder/counts` | `clearway.v1.RecordingCounts` | after each loss, and as the last message of a closed file |
 //!
 //! Metadata `part` is the number of the part, `1` for the first. Part 1 begins with a new pipeline, so it needs no

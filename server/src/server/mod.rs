@@ -7,12 +7,14 @@
 //! | `start` | [`Setup`] -> [`Running`] |
 //! | `input` | event queue and UDP addresses of one vehicle |
 //! | `running` | [`Running`], and its shutdown |
+//! | `save_rules` | stale maps and lost sensors -> saves of the recording |
 //! | `over_zenoh` | everything that uses the zenoh session |
 
 mod input;
 #[cfg(feature = "zenoh")]
 mod over_zenoh;
 mod running;
+mod save_rules;
 mod setup;
 mod start;
 

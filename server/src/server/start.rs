@@ -14,6 +14,7 @@ use tokio::sync::watch;
 
 use super::input::VehicleInput;
 use super::running::Running;
+use super::save_rules;
 use super::setup::{Setup, StartError};
 use crate::config::{Certificates, Config, Foxglove, Grpc, Vehicle};
 use crate::engine::{Engine, Observer};
@@ -123,6 +124,16 @@ impl Running {
             self.over_zenoh = Some(over_zenoh);
         }
         self.start_engines(config, prepared, from_files, header)?;
+        if let Some(recorder) = self.recorder.as_ref().filter(|_| !config.recorder.save_on.is_empty()) {
+            let (rules, stopped) =
+                (save_rules::watch(config.clone(), self.vehicles.clone(), recorder.control()), self.stopped());
+            self.publishers.spawn(async move {
+                tokio::select! {
+                    () = rules => {}
+                    () = stopped => {}
+                }
+            });
+        }
         if let Some(listener) = grpc {
             self.serve_grpc(listener, security, config.grpc.connections_max, gateways);
         }
