@@ -1,5 +1,5 @@
-//! The gRPC server: `clearway.v1.MapService` and `clearway.v1.RecordingService`, standard health and reflection, and the
-//! ingest service if it is configured ([`crate::ingest::grpc`]).
+//! The gRPC server: `clearway.v1.MapService` and `clearway.v1.RecordingService`, standard health and reflection, and
+//! the ingest service if it is configured ([`crate::ingest::grpc`]).
 //!
 //! The limits of what one client may cost are set here, each with its reason. [`reader`] has the updates of one reader.
 
