@@ -10,6 +10,7 @@ use bytes::Bytes;
 use clearway_proto::v1;
 use clearway_proto::v1::ingest_service_client::IngestServiceClient;
 use clearway_proto::v1::map_service_client::MapServiceClient;
+use clearway_proto::v1::recording_service_client::RecordingServiceClient;
 use prost::Message;
 use tokio::sync::mpsc;
 use tokio_stream::StreamExt;
@@ -96,6 +97,19 @@ impl Client {
     /// certificate only at the first call.
     pub async fn connect_tls(address: &str, tls: &Tls) -> Result<Self, ClientError> {
         Self::open(address, Some(tls)).await
+    }
+
+    /// Controls the server's recorder; needs the role of an operator, if clients have roles.
+    ///
+    /// # Errors
+    /// [`ClientError::Unreachable`] if no server answers.
+    pub async fn recorder(&self) -> Result<RecordingServiceClient<Channel>, ClientError> {
+        let channel = self
+            .endpoint
+            .connect()
+            .await
+            .map_err(|error| ClientError::Unreachable { address: self.address.clone(), reason: innermost(&error) })?;
+        Ok(RecordingServiceClient::new(channel))
     }
 
     async fn open(address: &str, tls: Option<&Tls>) -> Result<Self, ClientError> {

@@ -93,6 +93,9 @@ impl Engine {
                 Ok(queued) => return Some(queued),
                 Err(RecvTimeoutError::Timeout) => {
                     self.status.engine_beats();
+                    if let Some(recording) = &mut self.recording {
+                        recording.idle(&mut self.pipeline);
+                    }
                     self.complete_newest_map();
                 }
                 Err(RecvTimeoutError::Disconnected) => {
@@ -113,20 +116,23 @@ impl Engine {
     }
 
     fn step_event(&mut self, event: &Event) -> Result<(), EventError> {
-        if let Some(recording) = &self.recording {
+        if let Some(recording) = &mut self.recording {
             recording.record_event(event);
         }
         let started = Instant::now();
         self.update_layers();
-        match self.pipeline.step(event) {
-            Ok(Some(_)) => self.publish(started),
-            Ok(None) => {}
+        let outcome = self.pipeline.step(event).map(|map| map.is_some());
+        match &outcome {
+            Ok(true) => self.publish(started),
+            Ok(false) => {}
             Err(error) => {
                 tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %error, "refused");
-                return Err(error);
             }
         }
-        Ok(())
+        if let Some(recording) = &mut self.recording {
+            recording.keep_up(event, &mut self.pipeline);
+        }
+        outcome.map(|_| ())
     }
 
     /// Encodes the newest map and gives it to readers, recorder and observer.
@@ -148,8 +154,8 @@ impl Engine {
         if let Some((encoded, states)) = encoded {
             self.status.mapped(&encoded, states, latency);
             self.newest.send_replace(Some(encoded.clone()));
-            if let Some(recording) = &self.recording {
-                recording.record_map(encoded);
+            if let Some(recording) = &mut self.recording {
+                recording.record_map(&encoded);
             }
         }
         if let Some(observer) = &mut self.observer {
@@ -157,10 +163,11 @@ impl Engine {
         }
     }
 
-    /// Makes the pipeline compute the layers that have subscribers. With a recorder it computes all layers, because a
+    /// Makes the pipeline compute the layers that have subscribers. While it records it computes all layers, because a
     /// replay does not have the readers of the recorded run.
     fn update_layers(&mut self) {
-        let (all, subscriptions) = (self.recording.is_some(), &self.status.subscriptions);
+        let all = self.recording.as_ref().is_some_and(RecordingHandle::is_recording);
+        let subscriptions = &self.status.subscriptions;
         self.pipeline.set_active_layers(|layer| all || subscriptions.is_subscribed(layer));
     }
 }

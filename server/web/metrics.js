@@ -78,7 +78,8 @@ export function writeServerMetrics(element, status) {
         `roll ${signed(mount.roll_deg, 1)}°`,
       true,
     ]),
-    ["Recorder", !status ? dash : recorder?.file ? recorder.file : "not recording"],
+    ["Recorder", !status ? dash : recorder?.file ? recorder.file : recorder?.state || "not recording"],
+    ...(recorder?.reason ? [["Fault of the recorder", recorder.reason, true]] : []),
     ...(recorder?.file
       ? [
           ["Recorded events", count(recorder.events ?? 0)],

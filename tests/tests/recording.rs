@@ -252,12 +252,13 @@ fn sigterm_leaves_a_whole_recording_and_sigkill_a_readable_one() {
     for (signal, cut) in [("-TERM", false), ("-KILL", true)] {
         let file = folder.path().join(format!("live{signal}.mcap"));
         let (mut server, data) = serving(folder.path(), &file);
-        drive_until(&file, 1_000_000, data);
+        drive_until(&file.with_extension("unfinished.mcap"), 1_000_000, data);
         let killed = std::process::Command::new("kill").args([signal, &server.id().to_string()]).status().unwrap();
         assert!(killed.success());
         let ended = server.wait().unwrap();
         assert_eq!(ended.success(), !cut, "{signal}: {ended}");
-        let report = verify(&file).unwrap();
+        let left = if cut { file.with_extension("unfinished.mcap") } else { file };
+        let report = verify(&left).unwrap();
         assert!(report.is_good() && report.events > 0 && report.cut == cut, "{signal}: {report:?}");
     }
 }
@@ -317,6 +318,6 @@ fn a_full_disk_ends_the_recording_and_maps_continue() {
     let seconds: Vec<serde_json::Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let maps: Vec<u64> = seconds.iter().map(|second| second["maps"].as_u64().unwrap()).collect();
     assert!(maps.len() > 2 && maps.last() > maps.get(1), "maps are made after the disk has failed: {said}");
-    let report = verify(&file).unwrap();
+    let report = verify(&file.with_extension("unfinished.mcap")).unwrap();
     assert!(report.is_good() && report.cut, "what was recorded before is good: {report:?}");
 }

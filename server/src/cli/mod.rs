@@ -12,6 +12,7 @@
 //! | `check` | a configuration -> the same with every default |
 //! | `watch`, `get` | a server -> a line for each map; the newest map as a file |
 //! | `vehicles` | a server -> the state of its vehicles |
+//! | `recorder` | a request -> the recorder of a server |
 //! | `export` | a recording -> pictures, arrays, documents, files for viewers |
 //! | `info` | a file -> a description of its contents, and what is wrong with it |
 //! | `repair` | a damaged recording -> a recording of all that can be read |
@@ -47,6 +48,7 @@ mod info;
 mod ingest;
 mod model;
 mod output;
+mod recorder;
 #[cfg(feature = "store")]
 mod recordings;
 mod repair;
@@ -110,6 +112,7 @@ enum Command {
     Watch(watch::Options),
     Get(get::Options),
     Vehicles(vehicles::Options),
+    Recorder(recorder::Options),
     Export(export::Options),
     Info(info::Options),
     Repair(repair::Options),
@@ -125,10 +128,11 @@ enum Command {
 }
 
 /// The subcommands by purpose, as `clearway --help` lists them.
-const GROUPS: [(&str, &[&str]); 7] = [
+const GROUPS: [(&str, &[&str]); 8] = [
     ("Make maps", &["demo", "serve", "replay"]),
     ("Check maps and configurations", &["verify", "evaluate", "check"]),
     ("Read maps from a server", &["watch", "get", "vehicles"]),
+    ("Control a server", &["recorder"]),
     ("Read files", &["export", "info", "repair"]),
     ("Keep recordings", &["upload", "recordings"]),
     ("Send sensor data", &["send", "ingest", "simulate"]),
@@ -201,6 +205,7 @@ fn run(command: Command) -> Result<Exit> {
         Command::Watch(options) => return watch::run(&options),
         Command::Get(options) => return get::run(&options),
         Command::Vehicles(options) => vehicles::run(&options)?,
+        Command::Recorder(options) => recorder::run(options)?,
         Command::Export(options) => return export::run(&options),
         Command::Info(options) => return info::run(&options),
         Command::Repair(options) => return repair::run(&options),

@@ -37,7 +37,8 @@ async fn serve(configuration: &ConfigurationOptions) -> Result<()> {
     let certificates = config.certificates(file)?;
     let mut config = config.located(file);
     if let Some(recording) = writer::recording_path(&config.recorder) {
-        config.recorder.file = writer::next_free_name(recording);
+        let free = writer::next_free_name(recording);
+        config.recorder.family = std::mem::replace(&mut config.recorder.file, free);
     }
     // Before the server starts, so that a signal during the start ends it in order.
     let stop = stop_signal()?;

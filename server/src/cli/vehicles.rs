@@ -95,7 +95,11 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
     match vehicle.recorder.as_ref().filter(|recorder| !recorder.file.is_empty()) {
         Some(r) => {
             let (events, maps) = (counted(r.events, "event"), counted(r.maps, "map"));
-            lines.push(format!("  recording {}: {events}, {maps}, lost {}", r.file, r.lost));
+            let reason = if r.reason.is_empty() { String::new() } else { format!(": {}", r.reason) };
+            lines.push(format!("  recording {}: {events}, {maps}, lost {}{reason}", r.file, r.lost));
+        }
+        None if let Some(r) = vehicle.recorder.as_ref().filter(|recorder| !recorder.state.is_empty()) => {
+            lines.push(format!("  recorder {}: {}, lost {}", r.state, r.reason, r.lost));
         }
         None => lines.push("  not recording".into()),
     }

@@ -6,7 +6,7 @@
 
 use std::collections::BTreeSet;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::SensorConfig;
@@ -21,6 +21,7 @@ mod error;
 mod grpc;
 mod listeners;
 mod read;
+mod recorder;
 mod ros;
 mod udp;
 mod vehicle;
@@ -30,6 +31,7 @@ pub use connections::{Connections, Service};
 pub use error::{ConfigError, Origin};
 pub use grpc::{Access, Certificates, Grpc, Only, Tls};
 pub use listeners::{Listener, Route, listeners};
+pub use recorder::{Compression, Recorder, SaveRule};
 pub use ros::Ros;
 pub use udp::{Ports, Sender, Udp};
 pub use vehicle::{Ingest, Vehicle};
@@ -117,36 +119,6 @@ pub struct Foxglove {
 impl Default for Foxglove {
     fn default() -> Self {
         Self { enabled: false, listen: SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 8765) }
-    }
-}
-
-/// The table `[recorder]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Recorder {
-    /// MCAP file to write; a relative path starts at the configuration's folder. Empty: nothing is recorded.
-    pub file: PathBuf,
-    /// Longest time between two flushes, in ms: what a crash may cost of the recording.
-    pub flush_ms: u64,
-    /// Events and maps that may wait for the disk; more are counted as lost.
-    pub queue: usize,
-}
-
-impl Default for Recorder {
-    fn default() -> Self {
-        Self { file: PathBuf::new(), flush_ms: 1000, queue: 16_384 }
-    }
-}
-
-impl Recorder {
-    fn check(&self) -> Result<(), ValueError> {
-        if !(10..=60_000).contains(&self.flush_ms) {
-            return Err(ValueError::new("recorder.flush_ms", self.flush_ms, "10 to 60000 ms"));
-        }
-        if !(16..=1 << 20).contains(&self.queue) {
-            return Err(ValueError::new("recorder.queue", self.queue, "16 to 1048576 events"));
-        }
-        Ok(())
     }
 }
 

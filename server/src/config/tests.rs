@@ -215,7 +215,11 @@ fn relative_paths_start_at_the_configurations_folder() {
     assert_eq!(located.recorder.file, Path::new("/var/drive.mcap"));
     assert_eq!(config.clone().located(Path::new("clearway.toml")), config, "in the working directory");
     let none = parse(NEEDED).unwrap().located(Path::new("/etc/clearway/clearway.toml"));
-    assert_eq!((none.zenoh.file, none.recorder.file), (PathBuf::new(), PathBuf::new()), "none is none");
+    assert_eq!(
+        (none.zenoh.file, none.recorder.file),
+        (std::path::PathBuf::new(), std::path::PathBuf::new()),
+        "none is none"
+    );
 }
 
 #[test]

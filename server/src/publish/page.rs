@@ -82,8 +82,13 @@ async fn list(State(shown): State<Shown>, Extension(caller): Extension<Caller>) 
 }
 
 async fn health(State(shown): State<Shown>) -> Response {
-    match shown.vehicles.statuses().iter().find_map(|status| status.fault()) {
-        None => "ok\n".into_response(),
+    let statuses = shown.vehicles.statuses();
+    match statuses.iter().find_map(|status| status.fault()) {
+        // The maps are served, so a supervisor must not end the server.
+        None => match statuses.iter().find_map(|status| status.recorder_problem()) {
+            None => "ok\n".into_response(),
+            Some(problem) => format!("degraded\nrecorder: {problem}\n").into_response(),
+        },
         Some(fault) => unavailable(fault + "\n"),
     }
 }

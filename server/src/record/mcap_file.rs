@@ -1,25 +1,40 @@
-//! The MCAP file of a recording while it is written.
+//! The MCAP file of one part of a recording while it is written. Standard MCAP; any MCAP program reads it.
 //!
-//! Layout: metadata `clearway` (boot id, version, vehicles, source of each calibration), attachments `config.toml` (the
-//! effective configuration) and `calibration/<vehicle>/<sensor>.yaml` (the configured tables), then the channels
-//! `/<vehicle>/journal` (`clearway.v1.Event`) and `/<vehicle>/map/<layer>` (`clearway.v1.Map`, the same bytes that
-//! zenoh carries). Log time is the arrival of the event, or of the event that completed the map.
+//! Layout: metadata `clearway` (boot id, version, vehicles, source of each calibration, number of the part),
+//! attachments `config.toml` (the effective configuration) and `calibration/<vehicle>/<sensor>.yaml` (the configured
+//! tables), then the channels. Log time is the arrival of the event, or of the event that completed the map.
+//!
+//! | channel | schema | contents |
+//! |---|---|---|
+//! | `/<vehicle>/journal` | `clearway.v1.Event` | every event; at a keyframe also those that are in force |
+//! | `/<vehicle>/map/<layer>` | `clearway.v1.Map` | the same bytes that zenoh carries |
+//! | `/<vehicle>/keyframe` | `clearway.v1.Keyframe` | from where on the maps follow from this file's events alone |
+//! | `/recorder/counts` | `clearway.v1.RecordingCounts` | after each loss, and as the last message of a closed file |
+//!
+//! Metadata `part` is the number of the part, `1` for the first. Part 1 begins with a new pipeline, so it needs no
+//! keyframe. Other parts hold no map before the first keyframe with `BEGIN`. Files of earlier versions have neither
+//! `part` nor the last two channels: they are read as part 1.
+//!
+//! Chunks are compressed and have a CRC, as have the data section, the summary and each attachment. A chunk ends when
+//! it is full and at each [`McapFile::sync`], so a cut file ends with a whole chunk that was on the disk.
 
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use bytes::Bytes;
 use clearway_mapping::event::Event;
-use clearway_proto::DESCRIPTORS;
+use clearway_proto::{DESCRIPTORS, v1};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
-use mcap::{Attachment, Compression, McapError, WriteOptions};
+use mcap::{Attachment, McapError, WriteOptions};
 use prost::Message;
 
 use super::mcap_reader::FORMAT;
+use crate::config::{Compression, Recorder as Options};
 use crate::encode::{self, EncodedMap};
+use crate::sync::locked;
 
 /// The contents of a recording before its first event.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -36,9 +51,9 @@ pub struct Header {
     pub metadata: BTreeMap<String, String>,
 }
 
-/// The disk that receives the bytes of a recording: a file, or a simulated disk in tests.
+/// The disk that receives the bytes of one file: a file, or a simulated disk in tests.
 pub trait Disk: Write + Send {
-    /// Makes everything written so far survive a crash of the machine.
+    /// Waits until everything written so far survives a power cut.
     ///
     /// # Errors
     /// [`io::Error`] if the disk fails.
@@ -47,7 +62,7 @@ pub trait Disk: Write + Send {
 
 impl Disk for File {
     fn sync(&mut self) -> io::Result<()> {
-        self.sync_all()
+        self.sync_data()
     }
 }
 
@@ -56,6 +71,8 @@ impl Disk for File {
 struct StopAtFailure<D: Disk> {
     disk: D,
     failed: Option<io::ErrorKind>,
+    /// Number of bytes written.
+    bytes: u64,
 }
 
 impl<D: Disk> StopAtFailure<D> {
@@ -70,46 +87,73 @@ impl<D: Disk> StopAtFailure<D> {
     }
 }
 
-impl<D: Disk> Write for StopAtFailure<D> {
+/// The disk, for the MCAP library to write and for [`McapFile`] to sync.
+struct SharedDisk<D: Disk>(Arc<Mutex<StopAtFailure<D>>>);
+
+impl<D: Disk> Clone for SharedDisk<D> {
+    fn clone(&self) -> Self {
+        Self(self.0.clone())
+    }
+}
+
+impl<D: Disk> Write for SharedDisk<D> {
     fn write(&mut self, data: &[u8]) -> io::Result<usize> {
-        self.unless_failed(|disk| disk.write(data))
+        let mut disk = locked(&self.0);
+        let written = disk.unless_failed(|disk| disk.write(data))?;
+        disk.bytes += written as u64;
+        Ok(written)
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        self.unless_failed(Write::flush)
+        locked(&self.0).unless_failed(Write::flush)
     }
 }
 
 /// An open MCAP file with the channels of all vehicles.
 pub(super) struct McapFile<D: Disk> {
-    writer: mcap::Writer<NoSeek<BufWriter<StopAtFailure<D>>>>,
+    writer: mcap::Writer<NoSeek<BufWriter<SharedDisk<D>>>>,
+    disk: SharedDisk<D>,
     vehicles: Vec<VehicleChannels>,
+    counts: u16,
+    newest_ns: i64,
 }
 
 struct VehicleChannels {
     journal: u16,
+    keyframes: u16,
     maps: BTreeMap<&'static str, u16>,
 }
 
 impl<D: Disk> McapFile<D> {
-    /// Writes the header to `disk`.
-    pub(super) fn create(disk: D, header: &Header) -> Result<Self, McapError> {
+    /// Writes the header of part number `part` to `disk`.
+    pub(super) fn create(disk: D, options: &Options, header: &Header, part: u64) -> Result<Self, McapError> {
+        let disk = SharedDisk(Arc::new(Mutex::new(StopAtFailure { disk, failed: None, bytes: 0 })));
+        let compression = match options.compression {
+            Compression::Zstd => Some(mcap::Compression::Zstd),
+            Compression::None => None,
+        };
         let mut writer = WriteOptions::new()
             .profile("")
             .library(concat!("clearway/", env!("CARGO_PKG_VERSION")))
-            .compression(Some(Compression::Zstd))
+            .compression(compression)
+            .chunk_size(Some(options.chunk_kb << 10))
+            .calculate_chunk_crcs(true)
+            .calculate_data_section_crc(true)
+            .calculate_summary_section_crc(true)
+            .calculate_attachment_crcs(true)
             // Compresses in the recorder's thread; by default the library starts one thread a core.
             .compression_threads(0)
             // Writes each chunk at once, with its length first. Otherwise a crash leaves a chunk with length 0, which a
             // reader cannot distinguish from damage.
             .disable_seeking(true)
-            .create(NoSeek::new(BufWriter::new(StopAtFailure { disk, failed: None })))?;
+            .create(NoSeek::new(BufWriter::new(disk.clone())))?;
         let names: Vec<&str> = header.vehicles.iter().map(|(name, _)| &**name).collect();
         let mut metadata = header.metadata.clone();
         metadata.insert("format".into(), FORMAT.to_string());
         metadata.insert("boot_id".into(), header.boot_id.to_string());
         metadata.insert("version".into(), env!("CARGO_PKG_VERSION").into());
         metadata.insert("vehicles".into(), names.join(","));
+        metadata.insert("part".into(), part.to_string());
         writer.write_metadata(&Metadata { name: "clearway".into(), metadata })?;
         let mut attach = |name: String, media_type: &str, text: &str| {
             let data = text.as_bytes().into();
@@ -121,23 +165,34 @@ impl<D: Disk> McapFile<D> {
         }
         let event = writer.add_schema("clearway.v1.Event", "protobuf", DESCRIPTORS)?;
         let map = writer.add_schema("clearway.v1.Map", "protobuf", DESCRIPTORS)?;
+        let keyframe = writer.add_schema("clearway.v1.Keyframe", "protobuf", DESCRIPTORS)?;
+        let counts = writer.add_schema("clearway.v1.RecordingCounts", "protobuf", DESCRIPTORS)?;
+        let mut channel = |schema, topic: &str| writer.add_channel(schema, topic, "protobuf", &BTreeMap::new());
         let mut vehicles = Vec::new();
         for (vehicle, layers) in &header.vehicles {
-            let mut channel = |schema, topic: String| writer.add_channel(schema, &topic, "protobuf", &BTreeMap::new());
-            let journal = channel(event, format!("/{vehicle}/journal"))?;
+            let journal = channel(event, &format!("/{vehicle}/journal"))?;
+            let keyframes = channel(keyframe, &format!("/{vehicle}/keyframe"))?;
             let maps = layers
                 .iter()
-                .map(|&layer| Ok((layer, channel(map, format!("/{vehicle}/map/{layer}"))?)))
+                .map(|&layer| Ok((layer, channel(map, &format!("/{vehicle}/map/{layer}"))?)))
                 .collect::<Result<_, McapError>>()?;
-            vehicles.push(VehicleChannels { journal, maps });
+            vehicles.push(VehicleChannels { journal, keyframes, maps });
         }
-        writer.flush()?;
-        Ok(Self { writer, vehicles })
+        let counts = channel(counts, "/recorder/counts")?;
+        let mut file = Self { writer, disk, vehicles, counts, newest_ns: 0 };
+        file.sync()?;
+        Ok(file)
+    }
+
+    /// Number of bytes in the file so far.
+    pub(super) fn bytes(&self) -> u64 {
+        locked(&self.disk.0).bytes
     }
 
     /// Writes an event into the journal of the vehicle with this index.
     pub(super) fn write_event(&mut self, vehicle: usize, event: &Event) -> Result<(), McapError> {
         let bytes = encode::event_to_proto(event).encode_to_vec();
+        self.newest_ns = event.arrival_ns;
         self.write_message(self.vehicles[vehicle].journal, event.sequence, event.arrival_ns, &bytes)
     }
 
@@ -151,6 +206,17 @@ impl<D: Disk> McapFile<D> {
         Ok(())
     }
 
+    /// Writes a keyframe of the vehicle with this index, with the log time of the newest event.
+    pub(super) fn write_keyframe(&mut self, vehicle: usize, keyframe: &v1::Keyframe) -> Result<(), McapError> {
+        let channel = self.vehicles[vehicle].keyframes;
+        self.write_message(channel, keyframe.first_event, self.newest_ns, &keyframe.encode_to_vec())
+    }
+
+    /// Writes what the file holds and lacks, with the log time of the newest event.
+    pub(super) fn write_counts(&mut self, counts: &v1::RecordingCounts) -> Result<(), McapError> {
+        self.write_message(self.counts, 0, self.newest_ns, &counts.encode_to_vec())
+    }
+
     fn write_message(&mut self, channel_id: u16, sequence: u64, arrival_ns: i64, data: &[u8]) -> Result<(), McapError> {
         // MCAP has 32-bit sequences and no time before 1970; the message itself has the full values.
         let sequence = sequence as u32;
@@ -159,17 +225,23 @@ impl<D: Disk> McapFile<D> {
         self.writer.write_to_known_channel(&header, data)
     }
 
-    /// Ends the current chunk, so that a crash does not lose it.
-    pub(super) fn flush(&mut self) -> Result<(), McapError> {
-        self.writer.flush()
+    /// Ends the current chunk and waits until the disk has it, so that a power cut does not lose it.
+    pub(super) fn sync(&mut self) -> Result<(), McapError> {
+        self.writer.flush()?;
+        locked(&self.disk.0).unless_failed(Disk::sync).map_err(McapError::Io)
     }
 
-    /// Writes the closing records.
+    /// Writes the closing records and waits until the disk has them.
     pub(super) fn finish(mut self) -> Result<(), McapError> {
         self.writer.finish()?;
         // `finish` leaves the last bytes in the buffer.
         let buffer = self.writer.into_inner().into_inner();
-        let mut complete = buffer.into_inner().map_err(|error| McapError::Io(error.into_error()))?;
-        complete.disk.sync().map_err(McapError::Io)
+        buffer.into_inner().map_err(|error| McapError::Io(error.into_error()))?;
+        locked(&self.disk.0).unless_failed(Disk::sync).map_err(McapError::Io)
+    }
+
+    /// Leaves the file as it is, without closing records: it stays recognizable as cut.
+    pub(super) fn abandon(self) {
+        locked(&self.disk.0).failed.get_or_insert(io::ErrorKind::Other);
     }
 }

@@ -66,6 +66,13 @@ pub enum Content {
         /// The layer's name.
         layer: String,
     },
+    /// Keyframes of a vehicle.
+    Keyframe {
+        /// The vehicle's name.
+        vehicle: String,
+    },
+    /// Counts of the recorder.
+    Counts,
     /// ROS 2 messages in CDR.
     Ros(Kind),
     /// Anything else.
@@ -421,6 +428,8 @@ fn content(topic: &str, schema: &str, encoding: &str) -> Content {
         ("clearway.v1.Map", ["", vehicle, "map", layer]) => {
             Content::Map { vehicle: (*vehicle).into(), layer: (*layer).into() }
         }
+        ("clearway.v1.Keyframe", ["", vehicle, "keyframe"]) => Content::Keyframe { vehicle: (*vehicle).into() },
+        ("clearway.v1.RecordingCounts", ["", "recorder", "counts"]) => Content::Counts,
         _ => Content::Other,
     }
 }

@@ -8,7 +8,9 @@ use bytes::Bytes;
 use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::TimeConfig;
 use clearway_mapping::event::Event;
+use clearway_proto::v1;
 use clearway_ros::Kind;
+use prost::Message as _;
 
 use super::damage::Damage;
 use super::mcap_reader::{Content, Header, McapReadError, McapReader, Message};
@@ -34,6 +36,15 @@ pub enum RecordedMessage {
         /// An encoded `clearway.v1.Map` with this one layer.
         bytes: Bytes,
     },
+    /// A mark of `/<vehicle>/keyframe`.
+    Keyframe {
+        /// The vehicle's name.
+        vehicle: String,
+        /// The mark.
+        keyframe: v1::Keyframe,
+    },
+    /// What the recorder has written and dropped so far, of `/recorder/counts`.
+    Counts(v1::RecordingCounts),
     /// A ROS 2 message.
     Ros {
         /// The topic.
@@ -138,6 +149,11 @@ impl RecordingReader {
         self.reader.incomplete()
     }
 
+    /// The number of the part; 1 for a recording without parts.
+    pub fn part(&self) -> u64 {
+        self.header().metadata.get("part").and_then(|part| part.parse().ok()).unwrap_or(1)
+    }
+
     /// The configuration of the recorded run, and its calibration tables as [`Config::calibrations`] returns them.
     ///
     /// # Errors
@@ -174,6 +190,12 @@ impl RecordingReader {
             Content::Map { vehicle, layer } => {
                 Some(Ok(RecordedMessage::Map { vehicle: vehicle.clone(), layer: layer.clone(), bytes }))
             }
+            Content::Keyframe { vehicle } => {
+                // One that cannot be decoded leaves the maps after it unjudged.
+                let keyframe = v1::Keyframe::decode(bytes).ok()?;
+                Some(Ok(RecordedMessage::Keyframe { vehicle: vehicle.clone(), keyframe }))
+            }
+            Content::Counts => Some(Ok(RecordedMessage::Counts(v1::RecordingCounts::decode(bytes).ok()?))),
             Content::Ros(kind) => {
                 let log_ns = i64::try_from(log_ns).unwrap_or(i64::MAX);
                 Some(Ok(RecordedMessage::Ros { topic: topic.clone(), kind: *kind, log_ns, bytes }))

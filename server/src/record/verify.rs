@@ -1,7 +1,9 @@
 //! Verifies a recording: are the recorded maps the maps of the recorded events?
 //!
 //! Builds every vehicle's pipeline from the recorded configuration and calibrations, steps it with all events of the
-//! journal, and compares the bytes of each map with those of the recorded map.
+//! journal, and compares the bytes of each map with those of the recorded map. At a keyframe a new pipeline replaces
+//! the old one, as it did in the recorded run. Maps that follow from events which the file lacks are counted as
+//! unjudged: those after a gap, until the next keyframe.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -9,9 +11,10 @@ use std::path::Path;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use clearway_mapping::config::ConfigValueError;
+use clearway_lidar::calibration::Calibration;
+use clearway_mapping::config::{ConfigValueError, VehicleConfig};
 use clearway_mapping::event::Event;
-use clearway_mapping::pipeline::Pipeline;
+use clearway_mapping::pipeline::{Handover, Pipeline};
 use clearway_proto::codec::{DecodeError, Limits};
 use clearway_proto::grid::Grid;
 use clearway_proto::map::{Channel, Layer, MapError, decode_map};
@@ -39,9 +42,15 @@ pub struct Report {
     pub cut: bool,
     /// Number of maps, of one layer each, that belong to the last event before the cut and are not recorded.
     pub beyond_cut: u64,
-    /// Number of layers of maps after missing events, which do not equal the computed layer or are not recorded. They
-    /// cannot be judged, because the events that made them are not all known.
+    /// Number of layers of maps that follow from events which the file lacks, and which do not equal the computed layer
+    /// or are not recorded. They cannot be judged.
     pub unjudged: u64,
+    /// Number of messages that the recorder has dropped, as the file states it.
+    pub dropped: u64,
+    /// The first topic with dropped messages and why they were dropped; empty without any.
+    pub dropped_because: String,
+    /// True if the recorder has closed the file; always false in files of versions without counts.
+    pub is_closed: bool,
     /// The damaged parts of the file.
     pub damages: Vec<Damage>,
     /// How the file is incomplete; `None` if it is whole.
@@ -113,9 +122,10 @@ pub enum VerifyError {
 }
 
 impl Report {
-    /// True if the readable part of the recording has events, and every map in it is the map of its events.
+    /// True if the readable part of the recording has events, every map in it is the map of its events, and the recorder
+    /// has dropped nothing.
     pub fn is_good(&self) -> bool {
-        self.different == 0 && self.events > 0
+        self.different == 0 && self.events > 0 && self.dropped == 0
     }
 
     /// The report as one JSON object.
@@ -124,6 +134,7 @@ impl Report {
             "ok": self.is_good() && self.incomplete.is_none(),
             "events": self.events, "maps": self.maps, "equal": self.equal, "different": self.different,
             "cut": self.cut, "beyond_cut": self.beyond_cut, "unjudged": self.unjudged, "incomplete": self.incomplete,
+            "dropped": self.dropped, "dropped_because": self.dropped_because,
             "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(),
             "differences": self.differences.iter().map(Difference::to_json).collect::<Vec<_>>(),
         })
@@ -179,10 +190,17 @@ impl fmt::Display for Difference {
 /// One vehicle whose maps are computed again.
 struct VehicleReplay {
     name: Arc<str>,
-    pipeline: Pipeline,
+    config: VehicleConfig,
+    tables: Vec<Option<Calibration>>,
+    /// Makes the maps; `None` where they do not follow from the events of the file: before the first keyframe of a part
+    /// that is not the first, and after a gap until the next keyframe.
+    pipeline: Option<Pipeline>,
+    /// The pipeline of the next keyframe.
+    warm_up: Option<Pipeline>,
     valid_ms: u32,
-    next_event: u64,
-    /// True if events are missing before this one; the maps that follow need not equal the computed ones.
+    /// Sequence of the next event; `None` before the first one.
+    next_event: Option<u64>,
+    /// True if events are missing before this one, until the next keyframe; the maps need not equal the computed ones.
     lacks_events: bool,
     /// Computed maps that are not compared yet, by sequence and layer.
     computed: BTreeMap<(u64, String), Bytes>,
@@ -198,12 +216,18 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     let boot_id = recording.header().boot_id;
     let (config, tables) = recording.config()?;
     let mut replays = Vec::new();
+    let is_first_part = recording.part() == 1;
     for (vehicle, tables) in config.vehicles.iter().zip(tables) {
+        let config = vehicle.core();
+        let pipeline = Pipeline::new(&config, tables.clone())?;
         replays.push(VehicleReplay {
             name: vehicle.name.as_str().into(),
-            pipeline: Pipeline::new(&vehicle.core(), tables)?,
+            config,
+            tables,
+            pipeline: is_first_part.then_some(pipeline),
+            warm_up: None,
             valid_ms: vehicle.maps.valid_ms,
-            next_event: 0,
+            next_event: is_first_part.then_some(0),
             lacks_events: false,
             computed: BTreeMap::new(),
         });
@@ -225,6 +249,17 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
                 let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else { continue };
                 report.events += 1;
                 replay.step(&event, boot_id, &mut report, recording.damage_count() > 0);
+            }
+            RecordedMessage::Keyframe { vehicle, keyframe } => {
+                let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else { continue };
+                replay.apply(&keyframe)?;
+            }
+            RecordedMessage::Counts(counts) => {
+                if let Some(topic) = counts.topics.iter().find(|topic| topic.dropped > 0) {
+                    report.dropped = counts.topics.iter().map(|topic| topic.dropped).sum();
+                    report.dropped_because = format!("{}: {}", topic.topic, counts.reason);
+                }
+                report.is_closed |= counts.closed;
             }
             RecordedMessage::Map { vehicle, layer, bytes } => {
                 let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else {
@@ -256,17 +291,45 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
 }
 
 impl VehicleReplay {
-    /// Computes the map of the next event. Events that are missing in a damaged file are no difference: the damage
-    /// is reported.
-    fn step(&mut self, event: &Event, boot_id: u64, report: &mut Report, is_damaged: bool) {
-        if event.sequence != self.next_event {
-            if !(is_damaged && self.lacks_events) {
-                report.add(&self.name, self.next_event, "", DifferenceKind::Gap { found: event.sequence });
+    /// Begins a pipeline for the keyframe, or lets it make the maps from here on.
+    fn apply(&mut self, keyframe: &v1::Keyframe) -> Result<(), ConfigValueError> {
+        match keyframe.phase() {
+            v1::KeyframePhase::WarmUp => {
+                self.warm_up = Some(Pipeline::new(&self.config, self.tables.clone())?);
+                self.next_event.get_or_insert(keyframe.first_event);
             }
-            self.lacks_events = true;
+            v1::KeyframePhase::Begin => {
+                if let Some(mut pipeline) = self.warm_up.take() {
+                    pipeline.take_over(Handover::from_recording(keyframe.next_map, &keyframe.refused));
+                    (self.pipeline, self.lacks_events) = (Some(pipeline), false);
+                }
+            }
+            v1::KeyframePhase::Unspecified => {}
         }
-        self.next_event = event.sequence.saturating_add(1);
-        if let Ok(Some(map)) = self.pipeline.step(event) {
+        Ok(())
+    }
+
+    /// Steps the pipelines with an event and keeps the map that it completes. Events that are missing in a damaged file
+    /// are no difference: the damage is reported.
+    fn step(&mut self, event: &Event, boot_id: u64, report: &mut Report, is_damaged: bool) {
+        if let Some(warm_up) = &mut self.warm_up {
+            // Refused as it was in the recorded run.
+            let _ = warm_up.step(event);
+        }
+        let expected = self.next_event.unwrap_or(event.sequence);
+        // An event that is repeated for a keyframe was processed before.
+        if event.sequence < expected {
+            return;
+        }
+        self.next_event = Some(event.sequence.saturating_add(1));
+        if event.sequence > expected {
+            if !(is_damaged && self.lacks_events) {
+                report.add(&self.name, expected, "", DifferenceKind::Gap { found: event.sequence });
+            }
+            (self.lacks_events, self.warm_up) = (true, None);
+        }
+        let Some(pipeline) = &mut self.pipeline else { return };
+        if let Ok(Some(map)) = pipeline.step(event) {
             let map = EncodedMap::new(map, self.name.clone(), boot_id, self.valid_ms);
             report.maps += 1;
             for (layer, chunk) in &map.layers {
@@ -280,7 +343,7 @@ impl VehicleReplay {
         let sequence = sequence_of(bytes);
         match self.computed.remove(&(sequence, layer.to_owned())) {
             Some(computed) if computed == *bytes => report.equal += 1,
-            _ if self.lacks_events => report.unjudged += 1,
+            _ if self.lacks_events || self.pipeline.is_none() => report.unjudged += 1,
             None => report.add(&self.name, sequence, layer, DifferenceKind::Extra),
             Some(computed) => report.add(&self.name, sequence, layer, first_difference(bytes, &computed)),
         }

@@ -8,6 +8,7 @@
 //! | `input` | event queue and UDP addresses of one vehicle |
 //! | `listeners` | the TCP listeners of a configuration |
 //! | `running` | [`Running`], and its shutdown |
+//! | `save_rules` | stale maps and lost sensors -> saves of the recording |
 //! | `over_zenoh` | everything that uses the zenoh session |
 
 mod input;
@@ -15,6 +16,7 @@ mod listeners;
 #[cfg(feature = "zenoh")]
 mod over_zenoh;
 mod running;
+mod save_rules;
 mod setup;
 mod start;
 

@@ -6,12 +6,14 @@ use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 
 use clearway_lidar::calibration::Calibration;
+use clearway_mapping::config::VehicleConfig;
 use clearway_mapping::pipeline::{Pipeline, layer_names};
 use tokio::sync::watch;
 
 use super::input::VehicleInput;
 use super::listeners::Listeners;
 use super::running::Running;
+use super::save_rules;
 use super::setup::{Setup, StartError};
 use crate::config::{Certificates, Config, Vehicle, listeners};
 use crate::engine::{Engine, Observer};
@@ -47,8 +49,9 @@ impl Server {
         let mut prepared = Vec::new();
         for (vehicle, tables) in config.vehicles.iter().zip(&mut calibrations) {
             tables.resize(vehicle.sensors.len(), None);
-            let pipeline = Pipeline::new(&vehicle.core(), tables.clone())?;
-            prepared.push(running.prepare(vehicle, boot_id, pipeline, observer.take()));
+            let core = (vehicle.core(), tables.clone());
+            let pipeline = Pipeline::new(&core.0, core.1.clone())?;
+            prepared.push(running.prepare(vehicle, boot_id, pipeline, core, observer.take()));
         }
         running.vehicles = Vehicles(prepared.iter().map(|prepared| prepared.served.clone()).collect());
         let header = || header(&config, &calibrations, boot_id, &setup.config_comments, setup.metadata);
@@ -68,12 +71,21 @@ struct Prepared {
     served: Served,
     engine: Engine,
     events: Receiver<QueuedEvent>,
+    /// The configuration and the tables of the vehicle's pipelines.
+    core: (VehicleConfig, Vec<Option<Calibration>>),
 }
 
 /// The steps of [`Server::start`], in order.
 impl Running {
     /// Creates a vehicle's event queue, its engine, and what publishers see of it.
-    fn prepare(&mut self, vehicle: &Vehicle, boot_id: u64, pipeline: Pipeline, observer: Option<Observer>) -> Prepared {
+    fn prepare(
+        &mut self,
+        vehicle: &Vehicle,
+        boot_id: u64,
+        pipeline: Pipeline,
+        core: (VehicleConfig, Vec<Option<Calibration>>),
+        observer: Option<Observer>,
+    ) -> Prepared {
         let name: Arc<str> = vehicle.name.as_str().into();
         let (queue, events) = event_queue(vehicle.queue);
         let queue = queue.with_shares(vehicle.queue - vehicle.ingest.events_max(vehicle.queue), udp_sensors(vehicle));
@@ -83,7 +95,7 @@ impl Running {
         let valid_ms = vehicle.maps.valid_ms;
         let engine = Engine { pipeline, valid_ms, newest, recording: None, status: status.clone(), observer };
         self.inputs.push(VehicleInput { name, queue, udp: None });
-        Prepared { served: Served { status, newest: receiver }, engine, events }
+        Prepared { served: Served { status, newest: receiver }, engine, events, core }
     }
 
     async fn start_all(
@@ -110,6 +122,16 @@ impl Running {
             self.over_zenoh = Some(over_zenoh);
         }
         self.start_engines(config, prepared, from_files, header)?;
+        if let Some(recorder) = self.recorder.as_ref().filter(|_| !config.recorder.save_on.is_empty()) {
+            let (rules, stopped) =
+                (save_rules::watch(config.clone(), self.vehicles.clone(), recorder.control()), self.stopped());
+            self.publishers.spawn(async move {
+                tokio::select! {
+                    () = rules => {}
+                    () = stopped => {}
+                }
+            });
+        }
         self.serve(listeners, gateways);
         self.start_udp(sockets)
     }
@@ -127,12 +149,13 @@ impl Running {
             let (recorder, of_vehicles) = Recorder::start(&config.recorder, &header(), from_files)?;
             (self.recorder, handles) = (Some(recorder), of_vehicles.into_iter());
         }
-        for Prepared { served: Served { status, .. }, mut engine, events } in prepared {
+        for Prepared { served: Served { status, .. }, mut engine, events, core: (core, tables) } in prepared {
             self.recorder.iter().for_each(|recorder| status.show_recorder(recorder.counts()));
             // A replay computes all layers: a reader that comes late gets the last map, and the summary has all
             // metrics.
             self.subscriptions.extend(from_files.then(|| status.subscriptions.subscribe(&[])));
             engine.recording = handles.next();
+            engine.recording.iter_mut().for_each(|recording| recording.set_config(core.clone(), tables.clone()));
             let name = status.name.clone();
             let thread = engine.start(events).map_err(|source| StartError::Thread { vehicle: name.clone(), source })?;
             self.engines.push((name, thread));
@@ -155,9 +178,10 @@ impl Running {
         self.foxglove = address(&foxglove);
         if let Some(listener) = grpc {
             let (vehicles, stopped) = (self.vehicles.clone(), self.stopped());
+            let recorder = self.recorder.as_ref().map(Recorder::control);
             let ingest = (!gateways.all().is_empty()).then(|| Ingest::new(gateways).into_service());
             self.publishers.spawn(async move {
-                if let Err(error) = grpc::serve(listener, vehicles, ingest, stopped).await {
+                if let Err(error) = grpc::serve(listener, vehicles, ingest, recorder, stopped).await {
                     tracing::error!(%error, "grpc ended");
                 }
             });

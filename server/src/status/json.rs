@@ -38,7 +38,14 @@ pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
         "sensors": sensors.collect::<Vec<_>>(),
         "ledger": ledger_json(&vehicle.ledger.clone().unwrap_or_default()),
         "observations_refused": vehicle.observations_refused,
-        "recorder": {"file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost},
+        "recorder": {
+            "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
+            "state": recorder.state, "reason": recorder.reason, "part": recorder.part,
+            "durable_events": recorder.durable_events,
+            "topics": recorder.topics.iter().map(|of| {
+                json!({"topic": of.topic, "offered": of.offered, "written": of.written, "dropped": of.dropped})
+            }).collect::<Vec<_>>(),
+        },
         "readers": vehicle.readers,
     })
 }

@@ -153,6 +153,18 @@ impl Metrics<'_> {
         };
         let lost = self.all.iter().map(lost).collect();
         self.family("clearway_recorder_lost_total", "Events and maps lost to the recording.", lost);
+        let healthy = |(of, _): &(&VehicleStatus, Snapshot)| {
+            let recorder = of.recorder.get()?;
+            Some((vehicle(of), f64::from(u8::from(recorder.problem().is_none()))))
+        };
+        let healthy = self.all.iter().filter_map(healthy).collect();
+        self.family("clearway_recorder_healthy", "1 if the recording lacks nothing and the disk keeps up.", healthy);
+        let durable = |(of, _): &(&VehicleStatus, Snapshot)| {
+            let recorder = of.recorder.get()?;
+            Some((vehicle(of), recorder.durable_events(&of.name) as f64))
+        };
+        let durable = self.all.iter().filter_map(durable).collect();
+        self.family("clearway_recorder_durable_events", "Events that survive a power cut.", durable);
     }
 
     /// The sensors of all vehicles, each with its labels.

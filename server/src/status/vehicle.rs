@@ -165,6 +165,11 @@ impl VehicleStatus {
         self.recorder.get_or_init(|| counts);
     }
 
+    /// What is wrong with the recording now; `None` if nothing is, or nothing is recorded.
+    pub fn recorder_problem(&self) -> Option<String> {
+        self.recorder.get().and_then(|counts| counts.problem())
+    }
+
     /// True if nothing of the vehicle has stopped or hangs.
     pub fn is_alive(&self) -> bool {
         self.fault().is_none()

@@ -22,6 +22,9 @@ pub(super) const TICK_NS: i64 = 10_000_000;
 /// Flush interval of the recorder, in ms: what a crash of the machine may cost of the recording.
 pub(super) const FLUSH_MS: u64 = 200;
 
+/// Warm-up of a new pipeline before a keyframe, in ms: six revolutions.
+pub(super) const WARM_UP_MS: u64 = 600;
+
 /// A fault of the system itself, injected to show that a check finds it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum InjectedFault {
@@ -95,7 +98,7 @@ pub struct SensorFault {
 pub enum DiskFault {
     /// The recording is written and closed.
     Sound,
-    /// The machine crashes at this time, and the disk lacks this many of the last bytes.
+    /// The machine crashes at this time, and of what was not synced the disk has at most this many bytes of each file.
     Crash(i64, usize),
     /// The disk is full after so many bytes.
     Full(usize),
@@ -134,6 +137,8 @@ pub struct FaultPlan {
     pub recorder_queue: usize,
     /// Fault of the disk.
     pub disk: DiskFault,
+    /// True if the recording has parts of one second.
+    pub parts: bool,
 }
 
 impl FaultPlan {
@@ -192,6 +197,7 @@ impl FaultPlan {
             recorder_stall: rng.happens(0.15).then(|| during(&mut rng, HEAL_NS)),
             recorder_queue: if rng.happens(0.5) { 16_384 } else { rng.within(400..1500) as usize },
             disk,
+            parts: rng.happens(0.3),
         }
     }
 }

@@ -4,7 +4,7 @@ use std::hash::{DefaultHasher, Hasher};
 use std::sync::atomic::Ordering;
 
 use super::checks::{Violation, accounts, adds_up, describe, violation};
-use super::fault_plan::{DiskFault, FLUSH_MS, HEAL_NS, InjectedFault, REVOLUTION_NS, TICK_NS};
+use super::fault_plan::{HEAL_NS, InjectedFault, REVOLUTION_NS};
 use super::readers::Reader;
 use super::recording_check::Recorded;
 use super::test_bed::TestBed;
@@ -98,29 +98,22 @@ impl TestBed<'_> {
         let now = self.instant();
         let layers = self.maps.first().map_or(0, |map| map.layers.len() as u64);
         let Some(mut writer) = self.writer else { return Ok(Outcome { digest: hasher.finish(), ..outcome }) };
+        // Ends the queue of the recorder.
         drop(self.engine);
         while writer.write_next(now) {}
         let counts = writer.counts();
         writer.finish();
-        let crashed = self.disk_at_crash.is_some();
-        let mut bytes = self.disk_at_crash.unwrap_or_else(|| self.disk.bytes());
-        if self.injected == Some(InjectedFault::CorruptRecording) {
-            let middle = bytes.len() / 2;
-            bytes[middle] ^= 1;
+        let mut recorded = self.recorded_at_crash.unwrap_or_else(|| {
+            let expected = Some((self.taken, outcome.maps * layers));
+            let (durable, lost) = (counts.durable_events("car"), counts.lost());
+            Recorded { files: self.disk.files(), counts, expected, durable, lost }
+        });
+        if let (Some(InjectedFault::CorruptRecording), Some(file)) = (self.injected, recorded.files.get_mut(&1)) {
+            let middle = file.bytes.len() / 2;
+            file.bytes[middle] ^= 1;
         }
-        let mut confirmed = 0;
-        if let DiskFault::Crash(at_ns, 0) = self.plan.disk
-            && self.plan.recorder_stall.is_none()
-            && counts.lost() == 0
-        {
-            // A flush follows at most FLUSH_MS after what it flushes, in the next tick.
-            let ticks = (at_ns - FLUSH_MS as i64 * 1_000_000).div_euclid(TICK_NS) - 2;
-            confirmed =
-                usize::try_from(ticks).ok().and_then(|tick| self.recorded_by_tick.get(tick)).copied().unwrap_or(0);
-        }
-        hasher.write(&bytes);
-        let expected = (self.taken, outcome.maps * layers);
-        let recorded = Recorded { bytes, counts, expected, confirmed, crashed }.check()?;
+        recorded.files.values().for_each(|file| hasher.write(&file.bytes));
+        let recorded = recorded.check()?;
         Ok(Outcome { recorded, digest: hasher.finish(), ..outcome })
     }
 }

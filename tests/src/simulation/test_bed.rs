@@ -26,9 +26,11 @@ use tokio::sync::watch;
 
 use super::checks::{Violation, accounts, adds_up, describe, freed, is_healthy, nothing_free, violation};
 use super::drive::{Drive, drives};
-use super::fault_plan::{DiskFault, END_NS, FLUSH_MS, FaultPlan, HEAL_NS, InjectedFault, REVOLUTION_NS, Rng, TICK_NS};
+use super::fault_plan::{
+    DiskFault, END_NS, FLUSH_MS, FaultPlan, HEAL_NS, InjectedFault, REVOLUTION_NS, Rng, TICK_NS, WARM_UP_MS,
+};
 use super::readers::{Reader, readers};
-use super::recording_check::MemoryDisk;
+use super::recording_check::{MemoryDisk, Recorded};
 
 /// Revolutions with a covered window until maps must show it: the one in which it was covered, another, and those in
 /// which the newest scan of a stopped sensor may still contribute.
@@ -75,10 +77,8 @@ pub(super) struct TestBed<'a> {
     pub(super) began: Instant,
     pub(super) disk: MemoryDisk,
     pub(super) writer: Option<RecordingWriter<MemoryDisk>>,
-    /// Events passed to the recorder by the end of each tick.
-    pub(super) recorded_by_tick: Vec<u64>,
-    /// Content of the disk when the machine crashed.
-    pub(super) disk_at_crash: Option<Vec<u8>>,
+    /// What the disk held when the machine crashed.
+    pub(super) recorded_at_crash: Option<Recorded>,
 }
 
 impl<'a> TestBed<'a> {
@@ -98,15 +98,20 @@ impl<'a> TestBed<'a> {
         let vehicles = vec![("car".into(), layers.clone())];
         let header = Header { boot_id: 1, config: config.to_toml(), vehicles, ..Header::default() };
         let disk = MemoryDisk::new(plan.disk.clone());
-        let (writer, journal) = match RecordingWriter::new(disk.clone(), &config.recorder, &header, false) {
-            Ok((writer, mut journals)) => (Some(writer), journals.pop()),
+        let began = Instant::now();
+        let tables = vec![None; vehicle.sensors.len()];
+        let (writer, journal) = match RecordingWriter::new(disk.clone(), &config.recorder, &header, false, began) {
+            Ok((writer, mut journals)) => {
+                journals.iter_mut().for_each(|journal| journal.set_config(vehicle.core(), tables.clone()));
+                (Some(writer), journals.pop())
+            }
             // The disk is full before the first event: the run goes on without a recording.
             Err(_) => (None, None),
         };
         let status = Arc::new(VehicleStatus::new("car".into(), 1, layers.clone(), queue.drops()));
         writer.iter().for_each(|writer| status.show_recorder(writer.counts()));
         let (newest, receiver) = watch::channel(None);
-        let pipeline = Pipeline::new(&vehicle.core(), vec![None; vehicle.sensors.len()]).expect("a valid car");
+        let pipeline = Pipeline::new(&vehicle.core(), tables).expect("a valid car");
         let valid_ms = vehicle.maps.valid_ms;
         let engine = Engine { pipeline, valid_ms, newest, recording: journal, status: status.clone(), observer: None };
         let mut rng = Rng::new(!plan.seed);
@@ -139,11 +144,10 @@ impl<'a> TestBed<'a> {
             outcomes,
             readers: readers(&mut rng, &layers),
             rng,
-            began: Instant::now(),
+            began,
             disk,
             writer,
-            recorded_by_tick: Vec::new(),
-            disk_at_crash: None,
+            recorded_at_crash: None,
         }
     }
 
@@ -247,14 +251,14 @@ impl<'a> TestBed<'a> {
         {
             while writer.write_next(now) {}
         }
-        self.recorded_by_tick.push(self.taken);
-        if let DiskFault::Crash(at_ns, torn) = self.plan.disk
-            && self.disk_at_crash.is_none()
-            && self.now_ns >= at_ns
+        if let (DiskFault::Crash(at_ns, torn), Some(writer)) = (&self.plan.disk, &self.writer)
+            && self.recorded_at_crash.is_none()
+            && self.now_ns >= *at_ns
         {
-            let mut bytes = self.disk.bytes();
-            bytes.truncate(bytes.len() - torn.min(bytes.len()));
-            self.disk_at_crash = Some(bytes);
+            let counts = writer.counts();
+            let (durable, lost) = (counts.durable_events("car"), counts.lost());
+            let files = self.disk.files_after_crash(*torn);
+            self.recorded_at_crash = Some(Recorded { files, counts, expected: None, durable, lost });
         }
     }
 }
@@ -269,6 +273,8 @@ fn config(drive: &Drive, plan: &FaultPlan) -> Config {
     let mut config = drive.config.clone();
     config.recorder.flush_ms = FLUSH_MS;
     config.recorder.queue = plan.recorder_queue;
+    config.recorder.warm_up_ms = WARM_UP_MS;
+    config.recorder.part_s = u64::from(plan.parts);
     let vehicle = &mut config.vehicles[0];
     vehicle.queue = plan.queue;
     let maps = &mut vehicle.maps;

@@ -89,6 +89,7 @@ impl Ledger {
 }
 
 /// The ledgers of one vehicle.
+#[derive(Clone, Debug)]
 pub(crate) struct Ledgers {
     vehicle: Ledger,
     /// By source.
@@ -99,6 +100,20 @@ impl Ledgers {
     /// Empty ledgers of a vehicle with this number of configured sensors.
     pub fn new(sensors: usize) -> Self {
         Self { vehicle: Ledger::default(), sensors: vec![Ledger::default(); sensors] }
+    }
+
+    /// Ledgers in which each sensor has this many refused readings; a recording states no more of them.
+    pub fn with_refused(refused: &[u64]) -> Self {
+        let of_sensor = |count: &u64| Ledger {
+            refused: BTreeMap::from([("earlier", (*count).min(LOST_MAX))]),
+            ..Ledger::default()
+        };
+        Self { vehicle: Ledger::default(), sensors: refused.iter().map(of_sensor).collect() }
+    }
+
+    /// Adds empty ledgers, or removes the last ones, until there is one for each of so many sensors.
+    pub fn set_sensors(&mut self, sensors: usize) {
+        self.sensors.resize(sensors, Ledger::default());
     }
 
     /// The ledger of the whole vehicle.

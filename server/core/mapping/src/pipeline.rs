@@ -60,6 +60,26 @@ pub struct NamedStatus {
     pub ledger: Ledger,
 }
 
+/// What a pipeline takes over from the one that it replaces: the numbers that go on.
+#[derive(Clone, Debug)]
+pub struct Handover {
+    /// Sequence of the next map.
+    pub next_map: u64,
+    ledgers: Ledgers,
+}
+
+impl Handover {
+    /// A handover as a recording states it: the sequence of the next map, and [`Handover::refused`].
+    pub fn from_recording(next_map: u64, refused: &[u64]) -> Self {
+        Self { next_map, ledgers: Ledgers::with_refused(refused) }
+    }
+
+    /// Number of refused datagrams and scans of each sensor, by source: the counts that are in maps.
+    pub fn refused(&self) -> Vec<u64> {
+        self.ledgers.sensors().iter().map(Ledger::refused_sum).collect()
+    }
+}
+
 impl Pipeline {
     /// A pipeline before the first event, with all enabled layers active. `calibrations[i]` is the table of
     /// `config.sensors[i].calibration`; `None` selects the factory's table, or the one in the sensor's status bytes.
@@ -149,6 +169,21 @@ impl Pipeline {
     /// Counts of what became of all events so far.
     pub fn ledger(&self) -> &Ledger {
         self.ledgers.vehicle()
+    }
+
+    /// What a pipeline that replaces this one takes over.
+    pub fn handover(&self) -> Handover {
+        Handover { next_map: self.maps_made, ledgers: self.ledgers.clone() }
+    }
+
+    /// Replaces another pipeline: the next map gets its number, and the counts go on from those of the other. All else
+    /// follows from the events that this pipeline has processed itself.
+    pub fn take_over(&mut self, handover: Handover) {
+        let sensors = self.inputs.sensors().count();
+        self.maps_made = handover.next_map;
+        self.map.sequence = handover.next_map.saturating_sub(1);
+        self.ledgers = handover.ledgers;
+        self.ledgers.set_sensors(sensors);
     }
 
     /// The sensors in the order of the configuration, then the declared ones.

@@ -32,6 +32,10 @@ pub struct Options {
     pub duration: Option<Duration>,
     /// The file that events and maps are recorded to; `None`: nothing is recorded.
     pub record: Option<PathBuf>,
+    /// True if an existing file of that name is replaced.
+    pub force: bool,
+    /// Greatest length of the recording in MiB, beyond which its oldest parts are deleted; 0: no limit.
+    pub record_mb: u64,
     /// The file that the newest map is drawn to every second; `None`: nothing is drawn.
     pub picture: Option<PathBuf>,
     /// The car's sensors.
@@ -197,6 +201,9 @@ fn configuration(options: &Options, rig: &Rig) -> (Config, Vec<String>) {
     config.zenoh.listen = vec![format!("tcp/{zenoh}")];
     if let Some(file) = &options.record {
         config.recorder.file = file.clone();
+        config.recorder.replaces = options.force;
+        // A quarter for each part, so that what is kept is never much less than what is allowed.
+        (config.recorder.keep_mb, config.recorder.part_mb) = (options.record_mb, options.record_mb.div_ceil(4));
     }
     let any = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 0);
     let many = options.sensors == Sensors::Many;

@@ -29,9 +29,12 @@ pub struct Options {
     /// given.
     #[arg(required = true)]
     pub files: Vec<PathBuf>,
-    /// Record the events and the maps to this MCAP file, which is replaced if it exists.
+    /// Record the events and the maps to this MCAP file, which must not exist.
     #[arg(long, value_name = "OUT.mcap")]
     pub record: Option<PathBuf>,
+    /// Replace the file of --record if it exists, when the new one is whole.
+    #[arg(long, requires = "record")]
+    pub force: bool,
     /// Speed of the replay: as-recorded, max, or a factor such as 0.5 [default: max; as-recorded with --serve].
     #[arg(long, value_name = "as-recorded|max|X")]
     pub speed: Option<Speed>,
@@ -135,6 +138,12 @@ pub enum ReplayError {
     /// The recording would replace a file that is replayed.
     #[error("--record {}: this file is replayed; name another file", file.display())]
     RecordsInput {
+        /// The file.
+        file: PathBuf,
+    },
+    /// The recording would replace a file, and that was not allowed.
+    #[error("--record {}: the file exists and is not overwritten; name another file, or add --force", file.display())]
+    RecordExists {
         /// The file.
         file: PathBuf,
     },

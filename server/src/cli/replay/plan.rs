@@ -22,6 +22,7 @@ use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
 use crate::ingest::ros::decoder::PoseSource;
 use crate::record::reader::RecordingReader;
+use crate::record::writer::is_same_file;
 use crate::server::Setup;
 
 /// Number of revolutions from which the mount is estimated: the first of them follow each other, and between the others
@@ -105,13 +106,19 @@ fn check(options: &Options, mcap: Option<&Path>, journal: bool) -> Result<(), Re
         let reason = "the files name no vehicle; the option needs --config FILE or a recording of clearway";
         return unused(format!("--vehicle {name}"), reason.into());
     }
-    let same = |a: &Path, b: &Path| a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b));
-    match &options.record {
-        Some(record) if options.files.iter().any(|file| same(file, record)) => {
-            Err(ReplayError::RecordsInput { file: record.clone() })
-        }
-        _ => Ok(()),
+    let Some(record) = &options.record else { return Ok(()) };
+    // A folder stands for the files in it.
+    let is_in = |folder: &Path| {
+        let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
+        entries.map(|entry| entry.path()).any(|file| is_same_file(&file, record))
+    };
+    if options.files.iter().any(|file| is_same_file(file, record) || is_in(file)) {
+        return Err(ReplayError::RecordsInput { file: record.clone() });
     }
+    if !options.force && record.symlink_metadata().is_ok() {
+        return Err(ReplayError::RecordExists { file: record.clone() });
+    }
+    Ok(())
 }
 
 /// What is known about the vehicle so far.
@@ -216,6 +223,7 @@ impl Known {
         // A run that serves nothing opens none of these paths, and its boot id must not depend on the folder.
         let mut config = if options.serve { config.located(file) } else { config };
         config.recorder.file = options.record.clone().unwrap_or_default();
+        config.recorder.replaces = options.force;
         if !options.serve {
             (config.grpc.enabled, config.page.enabled, config.foxglove.enabled) = (false, false, false);
             (config.zenoh.enabled, config.zenoh.ros2.enabled) = (false, false);

@@ -39,6 +39,8 @@ pub struct Source {
     refused: RefusedMessages,
     waiting: VecDeque<Reading>,
     is_journal: bool,
+    /// Sequence of the event after the newest one of the journal.
+    next_event: u64,
 }
 
 /// An MCAP file cannot be read further.
@@ -79,6 +81,7 @@ impl Source {
             refused: RefusedMessages::new(),
             waiting: VecDeque::new(),
             is_journal: false,
+            next_event: 0,
         })
     }
 
@@ -116,6 +119,11 @@ impl Source {
             RecordedMessage::Event { vehicle, event } => {
                 if *self.vehicle.get_or_insert_with(|| vehicle.clone()) == vehicle {
                     self.is_journal = true;
+                    // A keyframe repeats events that were read before.
+                    if event.sequence < self.next_event {
+                        return;
+                    }
+                    self.next_event = event.sequence.saturating_add(1);
                     let (arrival_ns, source, body) = (event.arrival_ns, event.source, event.body);
                     self.waiting.push_back(Reading { arrival_ns, source, body });
                 } else {
@@ -131,7 +139,7 @@ impl Source {
                     self.refused_topics.entry(topic).or_insert_with(|| (0, error.to_string())).0 += 1;
                 }
             }
-            RecordedMessage::Map { .. } => {}
+            RecordedMessage::Map { .. } | RecordedMessage::Keyframe { .. } | RecordedMessage::Counts(_) => {}
         }
     }
 }

@@ -1,9 +1,10 @@
-//! The gRPC server: `clearway.v1.MapService`, standard health and reflection, and the ingest service if it is
-//! configured ([`crate::ingest::grpc`]).
+//! The gRPC server: `clearway.v1.MapService` and `clearway.v1.RecordingService`, standard health and reflection, and
+//! the ingest service if it is configured ([`crate::ingest::grpc`]).
 //!
 //! [`listen`](super::listen) accepts the connections and checks who calls. [`reader`] has the updates of one reader.
 
 pub mod reader;
+mod recording;
 pub mod selection;
 
 use std::pin::Pin;
@@ -13,21 +14,28 @@ use clearway_proto::{DESCRIPTORS, v1};
 use futures::Stream;
 use tonic::service::Routes;
 use tonic::{Request, Response, Status, Streaming};
+use tonic_health::server::HealthReporter;
 
 use super::listen::Listener;
 use super::listen::access::Caller;
 use super::served::Vehicles;
 use reader::watch;
+use recording::Recordings;
 
 use crate::clock::now_ns;
+use crate::record::writer::RecorderControl;
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
 use v1::map_service_server::{MapService, MapServiceServer};
+use v1::recording_service_server::RecordingServiceServer;
 
 /// Longest request, in bytes. Ours: requests hold names and numbers.
 const REQUEST_BYTES_MAX: usize = 64 << 10;
 /// Longest time from opening `Watch` to its first request. Ours: a reader sends its selection at once.
 const SELECTION_TIMEOUT: Duration = Duration::from_secs(10);
+/// Interval at which the health of the recorder is reported.
+const RECORDER_PERIOD: Duration = Duration::from_secs(1);
+
 /// Serves maps, and `ingest` if it is configured, until `stop` resolves and all streams have ended.
 ///
 /// # Errors
@@ -36,6 +44,7 @@ pub async fn serve<I: IngestService>(
     listener: Listener,
     vehicles: Vehicles,
     ingest: Option<IngestServiceServer<I>>,
+    recorder: Option<RecorderControl>,
     stop: impl Future<Output = ()>,
 ) -> Result<(), tonic_reflection::server::Error> {
     let (health, health_service) = tonic_health::server::health_reporter();
@@ -50,13 +59,30 @@ pub async fn serve<I: IngestService>(
     };
     let mut routes = Routes::builder();
     routes.add_service(MapServiceServer::new(Maps { vehicles }).max_decoding_message_size(REQUEST_BYTES_MAX));
+    let recordings = RecordingServiceServer::new(Recordings { control: recorder.clone() });
+    routes.add_service(recordings.max_decoding_message_size(REQUEST_BYTES_MAX));
     if let Some(ingest) = ingest {
         routes.add_service(ingest);
     }
     // Older versions of grpcurl know only the older version of reflection.
     routes.add_service(health_service).add_service(reflection().build_v1()?).add_service(reflection().build_v1alpha()?);
+    let reports = recorder.map(|recorder| tokio::spawn(report_recorder(health, recorder)));
     listener.serve(routes.routes().prepare().into_axum_router(), stop).await;
+    reports.iter().for_each(tokio::task::JoinHandle::abort);
     Ok(())
+}
+
+/// Reports the health of the recorder as that of its service, once in [`RECORDER_PERIOD`].
+async fn report_recorder(health: HealthReporter, recorder: RecorderControl) {
+    let mut every = tokio::time::interval(RECORDER_PERIOD);
+    loop {
+        every.tick().await;
+        if recorder.status().reason.is_empty() {
+            health.set_serving::<RecordingServiceServer<Recordings>>().await;
+        } else {
+            health.set_not_serving::<RecordingServiceServer<Recordings>>().await;
+        }
+    }
 }
 
 /// What the client of a request may reach.

@@ -18,7 +18,7 @@ pub enum Role {
     Reader,
     /// May send scans, poses, roads and packets.
     Ingester,
-    /// May do both.
+    /// May do both, and control the recorder.
     Operator,
 }
 
@@ -39,6 +39,12 @@ pub const RPCS: &[(&str, &[Role])] = &[
     ("/clearway.v1.MapService/GetMap", &[Role::Reader]),
     ("/clearway.v1.MapService/ListVehicles", &[Role::Reader, Role::Ingester]),
     ("/clearway.v1.IngestService/Stream", &[Role::Ingester]),
+    ("/clearway.v1.RecordingService/Start", &[Role::Operator]),
+    ("/clearway.v1.RecordingService/Stop", &[Role::Operator]),
+    ("/clearway.v1.RecordingService/Split", &[Role::Operator]),
+    ("/clearway.v1.RecordingService/Save", &[Role::Operator]),
+    ("/clearway.v1.RecordingService/List", &[Role::Operator]),
+    ("/clearway.v1.RecordingService/Status", &[Role::Operator]),
     ("/grpc.health.v1.Health/Check", &[Role::Reader, Role::Ingester]),
     ("/grpc.health.v1.Health/Watch", &[Role::Reader, Role::Ingester]),
     ("/grpc.reflection.v1.ServerReflection/ServerReflectionInfo", &[Role::Reader, Role::Ingester]),

@@ -1,0 +1,108 @@
+//! The table `[recorder]`.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use super::error::ValueError;
+
+/// The table `[recorder]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Recorder {
+    /// MCAP file to write; a relative path starts at the configuration's folder. Empty: nothing is recorded.
+    pub file: PathBuf,
+    /// Longest time from a message to the disk, in ms: what a crash or a power cut may cost of the recording.
+    pub flush_ms: u64,
+    /// Events and maps that may wait for the disk; more are counted as dropped.
+    pub queue: usize,
+    /// Length in MiB from which the next part begins; 0: no limit.
+    pub part_mb: u64,
+    /// Time in seconds after which the next part begins; 0: no limit.
+    pub part_s: u64,
+    /// Time in ms for which the new pipeline of a part processes events before its maps are served and recorded.
+    pub warm_up_ms: u64,
+    /// Total length in MiB beyond which the oldest parts are deleted; 0: none is.
+    pub keep_mb: u64,
+    /// Age in hours beyond which parts are deleted; 0: none is.
+    pub keep_hours: u64,
+    /// Number of seconds that a save keeps, unless the request says otherwise.
+    pub save_s: u64,
+    /// Conditions on which the last `save_s` seconds are saved without a request.
+    pub save_on: Vec<SaveRule>,
+    /// Length of a chunk in KiB before compression.
+    pub chunk_kb: u64,
+    /// Compression of the chunks.
+    pub compression: Compression,
+    /// True if an existing file is replaced when the new one is whole; never configured, only by `--force`.
+    #[serde(skip)]
+    pub replaces: bool,
+    /// The configured file, if `file` is another name because that one is taken.
+    #[serde(skip)]
+    pub family: PathBuf,
+}
+
+/// A condition on which the last seconds are saved.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SaveRule {
+    /// A vehicle's newest map has become older than its `valid_ms`.
+    MapStale,
+    /// A sensor that was in the maps of its vehicle no longer is.
+    SensorLost,
+}
+
+/// Compression of the chunks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Compression {
+    /// Zstandard, level 3.
+    Zstd,
+    /// None: for a weak processor.
+    None,
+}
+
+impl Default for Recorder {
+    fn default() -> Self {
+        Self {
+            file: PathBuf::new(),
+            flush_ms: 1000,
+            queue: 16_384,
+            part_mb: 0,
+            part_s: 0,
+            warm_up_ms: 10_000,
+            keep_mb: 0,
+            keep_hours: 0,
+            save_s: 60,
+            save_on: Vec::new(),
+            chunk_kb: 1024,
+            compression: Compression::Zstd,
+            replaces: false,
+            family: PathBuf::new(),
+        }
+    }
+}
+
+impl Recorder {
+    pub(super) fn check(&self) -> Result<(), ValueError> {
+        if !(16..=1 << 20).contains(&self.queue) {
+            return Err(ValueError::new("recorder.queue", self.queue, "16 to 1048576 events"));
+        }
+        let ranges = [
+            ("recorder.flush_ms", self.flush_ms, 10..=60_000, "10 to 60000 ms"),
+            ("recorder.part_mb", self.part_mb, 0..=1 << 20, "0 to 1048576 MiB"),
+            ("recorder.part_s", self.part_s, 0..=86_400, "0 to 86400 s"),
+            ("recorder.warm_up_ms", self.warm_up_ms, 100..=600_000, "100 to 600000 ms"),
+            ("recorder.keep_mb", self.keep_mb, 0..=1 << 30, "0 to 1073741824 MiB"),
+            ("recorder.keep_hours", self.keep_hours, 0..=876_000, "0 to 876000 h"),
+            ("recorder.save_s", self.save_s, 1..=86_400, "1 to 86400 s"),
+            ("recorder.chunk_kb", self.chunk_kb, 16..=65_536, "16 to 65536 KiB"),
+        ];
+        for (key, value, allowed, text) in ranges {
+            if !allowed.contains(&value) {
+                return Err(ValueError::new(key, value, text));
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,252 @@
+//! The recorder as a service: it replaces no file, its parts are verifiable alone, it says what the disk has, and it
+//! loses nothing that it has confirmed.
+
+mod fixture;
+
+use std::collections::BTreeSet;
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+
+use clearway::config::Config;
+use clearway::ingest::queue::Reading;
+use clearway::record::reader::{RecordedMessage, RecordingReader};
+use clearway::record::verify::verify;
+use clearway::server::{Running, Server, Setup};
+use clearway_mapping::event::Body;
+use clearway_proto::v1;
+use clearway_proto::v1::recording_service_client::RecordingServiceClient;
+use fixture::{config, feed, readings, until, within};
+use tonic::Code;
+use tonic::transport::Channel;
+
+/// Number of servers that are killed; 200 by `CLEARWAY_KILLS=200 cargo test --release --test recorder kill`.
+fn kills() -> usize {
+    std::env::var("CLEARWAY_KILLS").ok().and_then(|kills| kills.parse().ok()).unwrap_or(20)
+}
+
+/// A live server that records to `file` with a short warm-up.
+async fn live(file: &Path) -> Running {
+    let mut config = config();
+    config.recorder.file = file.to_owned();
+    (config.recorder.warm_up_ms, config.recorder.flush_ms) = (500, 50);
+    Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts")
+}
+
+async fn service(running: &Running) -> RecordingServiceClient<Channel> {
+    let address = format!("http://{}", running.grpc.expect("gRPC is served"));
+    RecordingServiceClient::connect(address).await.expect("gRPC answers")
+}
+
+/// The readings of three seconds, cut at these tenths of a second.
+fn cut_at(tenths: &[i64]) -> Vec<Vec<Reading>> {
+    let all = readings(30);
+    let start_ns = all[0].arrival_ns;
+    let mut groups: Vec<Vec<Reading>> = vec![Vec::new(); tenths.len() + 1];
+    for reading in all {
+        let tenth = (reading.arrival_ns - start_ns) / 100_000_000;
+        let group = tenths.iter().filter(|cut| tenth >= **cut).count();
+        groups[group].push(reading);
+    }
+    groups
+}
+
+/// The sequences of the events, and of the maps with their layers, of a recording.
+fn contents(file: &Path) -> (BTreeSet<u64>, BTreeSet<(u64, String)>) {
+    let (mut events, mut maps) = (BTreeSet::new(), BTreeSet::new());
+    for message in RecordingReader::open(file).unwrap() {
+        match message.unwrap() {
+            RecordedMessage::Event { event, .. } => {
+                events.insert(event.sequence);
+            }
+            RecordedMessage::Map { layer, bytes, .. } => {
+                assert!(maps.insert((fixture::sequence(&bytes), layer)), "each map once");
+            }
+            _ => {}
+        }
+    }
+    (events, maps)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn each_part_is_verifiable_alone_and_together_they_hold_everything() {
+    let folder = tempfile::tempdir().unwrap();
+    let running = live(&folder.path().join("car.mcap")).await;
+    let mut service = service(&running).await;
+    for group in cut_at(&[8, 18]) {
+        feed(&running, group).await;
+        service.split(v1::SplitRecordingRequest {}).await.unwrap();
+    }
+    let status = running.vehicles.0[0].status.clone();
+    let made = status.snapshot().maps;
+    within("shutdown", running.shutdown()).await.unwrap();
+    let recorder = status.to_proto().recorder.unwrap();
+    for topic in &recorder.topics {
+        assert_eq!((topic.offered, topic.dropped), (topic.written, 0), "{topic:?}");
+    }
+    let (mut events, mut maps) = (BTreeSet::new(), BTreeSet::new());
+    for part in ["car.mcap", "car.part-0002.mcap", "car.part-0003.mcap"] {
+        let file = folder.path().join(part);
+        let report = verify(&file).unwrap();
+        assert!(report.is_good() && !report.cut && report.is_closed && report.unjudged == 0, "{part}: {report:?}");
+        assert!(report.equal >= 3 * fixture::LAYERS, "{part}: {report:?}");
+        let (of_part, maps_of_part) = contents(&file);
+        events.extend(of_part);
+        maps_of_part.into_iter().for_each(|map| assert!(maps.insert(map), "{part}: each map is in one part"));
+    }
+    assert_eq!(maps.len() as u64, made * fixture::LAYERS);
+    assert_eq!(events.len() as u64, recorder.durable_events["car"]);
+    assert_eq!(events.last().copied(), Some(events.len() as u64 - 1), "no event is missing");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recording_is_stopped_started_saved_and_listed() {
+    let folder = tempfile::tempdir().unwrap();
+    let running = live(&folder.path().join("car.mcap")).await;
+    let mut service = service(&running).await;
+    let groups = cut_at(&[5, 10]);
+    let mut groups = groups.into_iter();
+    feed(&running, groups.next().unwrap()).await;
+    let refused = service.start(v1::StartRecordingRequest {}).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition, "{refused:?}");
+    let wrong = v1::SaveRecordingRequest { seconds: 10, reason: "../x".into() };
+    assert_eq!(service.save(wrong).await.unwrap_err().code(), Code::InvalidArgument);
+
+    let save = v1::SaveRecordingRequest { seconds: 10, reason: "near-miss".into() };
+    let saved = service.save(save).await.unwrap().into_inner().files;
+    assert!(saved.len() == 1 && saved[0].contains("saved") && saved[0].contains("near-miss"), "{saved:?}");
+    let (events, _) = contents(Path::new(&saved[0]));
+    assert!(events.len() > 300, "the saved file holds what was recorded: {}", events.len());
+
+    service.stop(v1::StopRecordingRequest {}).await.unwrap();
+    let status = running.vehicles.0[0].status.clone();
+    until("the recorder has stopped", || status.to_proto().recorder.unwrap().state == "stopped").await;
+    assert!(verify(Path::new(&saved[0])).unwrap().is_closed, "the saved file is whole now");
+    feed(&running, groups.next().unwrap()).await;
+    assert_eq!(status.to_proto().recorder.unwrap().lost, 0, "what is not to be recorded is not lost");
+    service.start(v1::StartRecordingRequest {}).await.unwrap();
+    feed(&running, groups.next().unwrap()).await;
+    let listed = service.list(v1::ListRecordingsRequest {}).await.unwrap().into_inner().parts;
+    assert!(listed.iter().any(|part| part.file.ends_with("car.mcap")), "{listed:?}");
+    assert!(listed.iter().any(|part| part.is_unfinished), "{listed:?}");
+    let part = service.status(v1::RecordingStatusRequest {}).await.unwrap().into_inner().status.unwrap().part;
+    within("shutdown", running.shutdown()).await.unwrap();
+    let report = verify(&folder.path().join(format!("car.part-{part:04}.mcap"))).unwrap();
+    assert!(report.is_good() && report.equal >= fixture::LAYERS && report.unjudged == 0, "{report:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn without_a_recorder_each_request_is_refused() {
+    let running = fixture::start(config()).await;
+    let refused = service(&running).await.split(v1::SplitRecordingRequest {}).await.unwrap_err();
+    assert!(refused.message().contains("recorder.file"), "{refused:?}");
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[test]
+fn a_replay_replaces_neither_its_input_nor_an_existing_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let replay = |arguments: &[&str]| {
+        let output = clearway_tests::run(folder.path(), "clearway", &[&["replay"], arguments].concat());
+        (output.status.success(), String::from_utf8_lossy(&output.stderr).into_owned())
+    };
+    let simulated = clearway_tests::run(
+        folder.path(),
+        "clearway",
+        &["simulate", "town", "--sensor", "vlp16", "--seconds", "1", "--out", "drive.pcap"],
+    );
+    assert!(simulated.status.success(), "{}", String::from_utf8_lossy(&simulated.stderr));
+    let (recorded, error) = replay(&["drive.pcap", "--record", "a.mcap"]);
+    assert!(recorded, "{error}");
+    let bytes = std::fs::read(at("a.mcap")).unwrap();
+    std::fs::hard_link(at("a.mcap"), at("hard.mcap")).unwrap();
+    std::os::unix::fs::symlink("a.mcap", at("soft.mcap")).unwrap();
+    for (output, force, expected) in [
+        ("a.mcap", false, "this file is replayed"),
+        ("a.mcap", true, "this file is replayed"),
+        ("hard.mcap", true, "this file is replayed"),
+        ("soft.mcap", true, "this file is replayed"),
+        ("drive.pcap", false, "exists"),
+    ] {
+        let force = if force { &["--force"][..] } else { &[] };
+        let (success, error) = replay(&[&["a.mcap", "--record", output][..], force].concat());
+        assert!(!success && error.contains(expected), "{output}: {error}");
+        assert_eq!(std::fs::read(at("a.mcap")).unwrap(), bytes, "{output}: the input is unchanged");
+    }
+    std::fs::write(at("old.mcap"), "old").unwrap();
+    let (success, error) = replay(&["a.mcap", "--record", "old.mcap", "--force"]);
+    assert!(success, "{error}");
+    assert!(verify(&at("old.mcap")).unwrap().is_good());
+    assert!(!at("old.unfinished.mcap").exists());
+}
+
+/// A server in its own process that records to `folder`; its data address and its page.
+fn serving(folder: &Path, run: usize) -> (Child, SocketAddr, SocketAddr) {
+    let free = || std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    // Another address for each run, so that no port is in use.
+    let page = SocketAddr::new([127, 0, 3, 1 + (run % 250) as u8].into(), free().port());
+    let data = free();
+    let mut config: Config = config();
+    (config.grpc.enabled, config.page.enabled, config.page.listen) = (false, true, page);
+    (config.recorder.file, config.recorder.flush_ms) = (format!("run{run}.mcap").into(), 100);
+    let udp = config.vehicles[0].udp.as_mut().unwrap();
+    (udp.data, udp.telemetry) = (data, free());
+    let path = folder.join("clearway.toml");
+    std::fs::write(&path, config.to_toml()).unwrap();
+    let mut server = Command::new(clearway_tests::binaries().join("clearway"));
+    server.args(["serve", "--config"]).arg(&path).stderr(Stdio::null());
+    (server.spawn().unwrap(), data, page)
+}
+
+/// The number of durable events by the server's status; `None` until it answers.
+fn durable(page: SocketAddr) -> Option<u64> {
+    let mut stream = TcpStream::connect(page).ok()?;
+    stream.write_all(b"GET /vehicles HTTP/1.0\r\nHost: localhost\r\n\r\n").ok()?;
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).ok()?;
+    let (_, body) = answer.split_once("\r\n\r\n")?;
+    let vehicles: serde_json::Value = serde_json::from_str(body).ok()?;
+    vehicles[0]["recorder"]["durable_events"]["car"].as_u64()
+}
+
+#[test]
+fn kill_9_costs_no_event_that_the_status_called_durable() {
+    let folder = tempfile::tempdir().unwrap();
+    let socket = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+    let payloads: Vec<_> = readings(10)
+        .into_iter()
+        .filter_map(|reading| match reading.body {
+            Body::Datagram(payload) if payload.len() == 1206 => Some(payload),
+            _ => None,
+        })
+        .collect();
+    let mut tails = Vec::new();
+    for run in 0..kills() {
+        let (mut server, data, page) = serving(folder.path(), run);
+        let least = 200 + 37 * run as u64;
+        let mut confirmed = 0;
+        for (index, payload) in payloads.iter().cycle().enumerate() {
+            let _ = socket.send_to(payload, data);
+            if index % 50 == 0 {
+                confirmed = durable(page).unwrap_or(0);
+                if confirmed >= least {
+                    break;
+                }
+                assert!(server.try_wait().unwrap().is_none(), "the server runs");
+            }
+        }
+        server.kill().unwrap();
+        server.wait().unwrap();
+        let file: PathBuf = folder.path().join(format!("run{run}.unfinished.mcap"));
+        let report = verify(&file).unwrap();
+        assert!(report.is_good() && report.cut, "run {run}: {report:?}");
+        let (events, _) = contents(&file);
+        let missing = (0..confirmed).filter(|sequence| !events.contains(sequence)).count();
+        assert_eq!(missing, 0, "run {run}: {confirmed} events were durable, {} are there", events.len());
+        tails.push(events.len() as u64 - confirmed);
+        std::fs::remove_file(file).unwrap();
+    }
+    println!("{} kills, 0 durable events lost; more than confirmed by at most {:?}", kills(), tails.iter().max());
+}
