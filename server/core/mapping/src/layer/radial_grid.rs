@@ -26,7 +26,7 @@ const WHOLE_FROM: f32 = 8_388_608.0;
 /// Least distance between two rings with a row each, metres. Ours: an HDL-64E's range noise of 2 cm mixes nearer rings.
 const RING_SPACING_M_MIN: f32 = 0.02;
 
-/// Depth of a row if the rings are not known, metres. Ours: near ground must not free a cell that reaches far beyond it.
+/// Depth of a row if fewer than two rings meet the ground, metres. Ours: near ground must not free a cell that reaches far beyond it.
 const ROW_DEPTH_M: f32 = 1.0;
 
 /// Grid of range and azimuth about a sensor.
@@ -82,7 +82,8 @@ impl RadialGrid {
     /// Computes the rows again if the sensor of `sweep` differs from the last one.
     pub fn update_rows(&mut self, sweep: &Sweep, range_m_max: f32, columns: u16) {
         let Some(calibration) = &sweep.calibration else {
-            *self = Self::new(sweep.mount_m, row_radii_m(&[], range_m_max), columns);
+            // The rings are not known, and no cell will be: one row to the largest range.
+            *self = Self::new(sweep.mount_m, vec![range_m_max], columns);
             return;
         };
         let height = sweep.mount_height_m;
