@@ -45,6 +45,13 @@ fn succeeds(folder: &Path, command: &str) {
     assert!(output.status.success(), "{command}: {}\n{}", output.status, String::from_utf8_lossy(&output.stderr));
 }
 
+/// The capture has ended, so the newest map may be stale: then the exit code is 4.
+fn shows_a_map(folder: &Path, command: &str) {
+    let words: Vec<_> = command.split_whitespace().collect();
+    let output = run(folder, words[0], &words[1..]);
+    assert!(matches!(output.status.code(), Some(0 | 4)), "{command}: {}", String::from_utf8_lossy(&output.stderr));
+}
+
 #[test]
 fn the_first_command_is_the_demo_and_the_second_runs_all_tests() {
     let commands = commands();
@@ -139,8 +146,8 @@ fn the_default_configuration_serves_what_send_sends_to_the_readers() {
     for command in commands().iter().filter(|c| c.starts_with("clearway send") || c.starts_with("clearway vehicles")) {
         succeeds(folder.path(), command);
     }
-    succeeds(folder.path(), "clearway watch --count 1");
+    shows_a_map(folder.path(), "clearway watch --count 1");
     let get = commands().into_iter().find(|c| c.starts_with("clearway get")).expect("the README shows `clearway get`");
-    succeeds(folder.path(), &get);
+    shows_a_map(folder.path(), &get);
     assert!(folder.path().join("newest.png").is_file());
 }
