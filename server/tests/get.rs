@@ -58,7 +58,7 @@ fn get(options: &[&str]) -> String {
     runtime.spawn(tonic::transport::Server::builder().add_service(service).serve_with_incoming(incoming));
     let output = clearway(&[&["get", "--server", &address], options].concat());
     let is_stale = !options.contains(&"fresh");
-    assert_eq!(output.status.code(), Some(if is_stale { 3 } else { 0 }), "{}", text(&output.stderr));
+    assert_eq!(output.status.code(), Some(if is_stale { 4 } else { 0 }), "{}", text(&output.stderr));
     text(&output.stdout)
 }
 

@@ -110,7 +110,8 @@ fn a_map_names_the_source_of_the_elevations() {
     let cases = [
         ("rings", sensor(), None, ringed, Rings, 16),
         ("order", sensor(), None, ground(), Estimated, 16),
-        ("no order", sensor(), None, shuffled(&ground()), Unknown, 1),
+        // Without known rings the rows are 1 m deep, to the reach of 60 m.
+        ("no order", sensor(), None, shuffled(&ground()), Unknown, 60),
         ("elevations", SensorConfig { elevations_deg, ..sensor() }, None, ground(), Configured, 3),
         ("model", with_model.clone(), None, ground(), Model, 6),
         ("both", both.clone(), None, ground(), Configured, 3),
