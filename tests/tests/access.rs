@@ -13,10 +13,11 @@ use std::time::Duration;
 use clearway::publish::listen::access::RPCS;
 use clearway::server::Running;
 use clearway_proto::v1;
-use fixture::certificates::{certificates, secured, start, zenoh_file};
-use fixture::{Driving, within};
+use fixture::certificates::{TOKEN, certificates, start, with_roles, zenoh_file};
+use fixture::{Driving, https, until, within};
 use futures::future::join_all;
 use prost::Message;
+use tokio::io::AsyncReadExt;
 use tonic::Code;
 use tonic::codegen::http::uri::PathAndQuery;
 use tonic::transport::{Certificate, ClientTlsConfig, Endpoint, Identity};
@@ -32,7 +33,7 @@ const END: &str = "<!-- End of the table. -->";
 
 /// Headers that ask for a WebSocket.
 const UPGRADE: &str = "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
-    Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n";
+    Sec-WebSocket-Protocol: foxglove.sdk.v1\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n";
 
 /// What a client shows to the server.
 #[derive(Clone, Copy, Debug)]
@@ -51,7 +52,7 @@ const CALLERS: [Caller; 8] = [
     Caller { name: "reader", certificate: Some(("ours", "reader")), token: None },
     Caller { name: "ingester", certificate: Some(("ours", "ingester")), token: None },
     Caller { name: "operator", certificate: Some(("ours", "operator")), token: None },
-    Caller { name: "token", certificate: None, token: Some("secret") },
+    Caller { name: "token", certificate: None, token: Some(TOKEN) },
 ];
 
 /// What a client attempts.
@@ -69,10 +70,18 @@ enum Attempt {
     Observe(&'static str),
     /// Puts a sample on a key over zenoh that a reader of the server then receives.
     Forge(&'static str),
-    /// Requests a path of the page.
-    Page(&'static str),
-    /// Opens a WebSocket on a path of the page.
-    WebSocket(&'static str),
+    /// Requests a path of a listener.
+    Get(Listener, &'static str),
+    /// Opens a WebSocket on a path of a listener.
+    WebSocket(Listener, &'static str),
+}
+
+/// A listener for browsers and their like.
+#[derive(Clone, Copy, Debug)]
+enum Listener {
+    Page,
+    Metrics,
+    Foxglove,
 }
 
 /// Every row of the table.
@@ -97,11 +106,17 @@ fn rows() -> Vec<(String, Attempt)> {
         row("zenoh, put `clearway/car/map/drivability`", Attempt::Forge("clearway/car/map/drivability")),
         row("zenoh, put `clearway/car/status`", Attempt::Forge("clearway/car/status")),
         row("zenoh, put `clearway/**`", Attempt::Forge("clearway/**")),
-        row("page `/healthz`", Attempt::Page("/healthz")),
-        row("page `/metrics`", Attempt::Page("/metrics")),
-        row("page `/vehicles`", Attempt::Page("/vehicles")),
-        row("page `/`", Attempt::Page("/")),
-        row("page, WebSocket `/live`", Attempt::WebSocket("/live")),
+        row("page `/healthz`", Attempt::Get(Listener::Page, "/healthz")),
+        row("page `/readyz`", Attempt::Get(Listener::Page, "/readyz")),
+        row("page `/metrics`", Attempt::Get(Listener::Page, "/metrics")),
+        row("page `/vehicles`", Attempt::Get(Listener::Page, "/vehicles")),
+        row("page `/`", Attempt::Get(Listener::Page, "/")),
+        row("page `/main.js`", Attempt::Get(Listener::Page, "/main.js")),
+        row("page, WebSocket `/live`", Attempt::WebSocket(Listener::Page, "/live")),
+        row("metrics `/healthz`", Attempt::Get(Listener::Metrics, "/healthz")),
+        row("metrics `/readyz`", Attempt::Get(Listener::Metrics, "/readyz")),
+        row("metrics `/metrics`", Attempt::Get(Listener::Metrics, "/metrics")),
+        row("Foxglove, WebSocket `/`", Attempt::WebSocket(Listener::Foxglove, "/")),
     ]);
     rows
 }
@@ -125,8 +140,10 @@ impl Bed {
         let session = self.sessions.get(caller.name);
         match (attempt, session) {
             (Attempt::Rpc(path), _) => self.call(path, caller).await,
-            (Attempt::Page(path), _) => self.request(path, caller, "Connection: close\r\n", "200").await,
-            (Attempt::WebSocket(path), _) => self.request(path, caller, UPGRADE, "101").await,
+            (Attempt::Get(listener, path), _) => {
+                self.request(*listener, path, caller, "Connection: close\r\n", 200).await;
+            }
+            (Attempt::WebSocket(listener, path), _) => self.request(*listener, path, caller, UPGRADE, 101).await,
             (_, None) => std::future::pending().await,
             (Attempt::Subscribe(key), Some(session)) => {
                 // What this session puts itself would reach it without the server.
@@ -192,17 +209,20 @@ impl Bed {
         }
     }
 
-    /// Sends a request with these headers, until its answer has this status.
-    async fn request(&self, path: &'static str, caller: Caller, headers: &str, status: &str) {
-        use tokio::io::{AsyncReadExt, AsyncWriteExt};
-        let at = self.running.page.expect("the page is served");
-        let mut socket = tokio::net::TcpStream::connect(at).await.unwrap();
+    /// Sends a request with these headers; returns if its answer has this status.
+    async fn request(&self, listener: Listener, path: &str, caller: Caller, headers: &str, status: u16) {
+        let at = match listener {
+            Listener::Page => self.running.page,
+            Listener::Metrics => self.running.metrics,
+            Listener::Foxglove => self.running.foxglove,
+        };
         let token = caller.token.map_or_else(String::new, |token| format!("Authorization: Bearer {token}\r\n"));
-        let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n{headers}{token}\r\n");
-        socket.write_all(request.as_bytes()).await.unwrap();
-        let mut answer = vec![0; "HTTP/1.1 200".len()];
-        let _cut = socket.read_exact(&mut answer).await;
-        if answer != format!("HTTP/1.1 {status}").into_bytes() {
+        let head = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n{headers}{token}");
+        let mut answer = [0; "HTTP/1.1 200".len()];
+        if let Some(mut stream) = https::send(at.expect("it is served"), &head, caller.certificate).await {
+            let _closed = stream.read_exact(&mut answer).await;
+        }
+        if https::status(&String::from_utf8_lossy(&answer)) != status {
             std::future::pending().await
         }
     }
@@ -234,12 +254,13 @@ async fn session(server: String, certificate: Option<(&'static str, &'static str
 }
 
 async fn bed(folder: &Path) -> Bed {
-    let mut config = secured(true);
+    let mut config = with_roles(folder);
+    // All attempts are made at once, from one address.
+    config.connections.per_address_max = 256;
     let file = folder.join("server.json5");
     std::fs::write(&file, zenoh_file("server.json5", &certificates("ours"))).unwrap();
     (config.zenoh.enabled, config.zenoh.file) = (true, file);
     config.zenoh.listen = vec!["tls/127.0.0.1:0".into()];
-    config.page.enabled = true;
     let running = start(config).await;
     let port = running.zenoh[0].rsplit_once(':').expect("an endpoint").1.to_owned();
     let zenoh = format!("tls/localhost:{port}");
@@ -348,6 +369,7 @@ async fn the_access_table_of_security_md_is_what_the_server_does() {
     let folder = tempfile::tempdir().unwrap();
     let bed = within("a server", bed(folder.path())).await;
     let car = Driving::to(&bed.running);
+    until("a map", || bed.running.vehicles.0[0].status.snapshot().maps > 0).await;
     // No expectations when the golden table is written: then every attempt has the same time.
     let expected = if is_blessed() { BTreeMap::new() } else { read(golden) };
     let found = within("the attempts", measure(&bed, &expected)).await;

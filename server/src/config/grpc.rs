@@ -148,8 +148,11 @@ fn text(file: &Path) -> Result<String, String> {
     std::fs::read_to_string(file).map_err(|error| advised(file, error).to_string())
 }
 
-/// The text of a file that only its owner and its group may read.
-fn secret(file: &Path) -> Result<String, String> {
+/// The text of a file that only its owner and its group may read: of each key and each token.
+///
+/// # Errors
+/// A text that says what is wrong, without the file's name, because the caller names it.
+pub fn secret(file: &Path) -> Result<String, String> {
     let text = text(file)?;
     let mode = std::fs::metadata(file).map_err(|error| error.to_string())?.permissions().mode() & 0o777;
     match mode & 0o007 {

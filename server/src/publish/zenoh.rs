@@ -11,7 +11,6 @@
 //! link, because planners brake by them; the status has the lowest, because the next one replaces it; observations and
 //! reports have zenoh's default priority.
 
-use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -28,7 +27,7 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 
 use super::ros::Node;
 use super::served::{Served, Vehicles};
-use crate::config::Zenoh as Options;
+use crate::config::{Zenoh as Options, secret};
 use crate::zenoh_session::ZenohError;
 
 /// Time between two status messages.
@@ -180,12 +179,7 @@ fn signing_key(file: &Path) -> Result<Option<SigningKey>, ZenohError> {
         return Ok(None);
     }
     let wrong = |error: zenoh::Error| ZenohError::of(format!("zenoh.signing_key {}", file.display()))(error);
-    let mode = std::fs::metadata(file).map_err(|error| wrong(error.into()))?.permissions().mode() & 0o777;
-    if mode & 0o007 != 0 {
-        let allowed = "allowed: 600 or 640 (chmod 600)";
-        return Err(wrong(format!("every user of this host may use it (mode {mode:03o}); {allowed}").into()));
-    }
-    let text = std::fs::read_to_string(file).map_err(|error| wrong(error.into()))?;
+    let text = secret(file).map_err(|error| wrong(error.into()))?;
     SigningKey::from_pem(&text).map(Some).map_err(|error| wrong(error.into()))
 }
 

@@ -1,70 +1,16 @@
 //! Certificates, tokens and roles on the page, the metrics and Foxglove; access by vehicle and layer; and their change
 //! while the server runs.
 
-use std::net::SocketAddr;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
-use std::sync::Arc;
 
-use clearway::config::{Config, Foxglove, Metrics, Only};
+use clearway::config::Only;
 use clearway_client::{Client, ClientError, Subscription, Tls};
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
-use tokio_rustls::TlsConnector;
-use tokio_rustls::rustls::crypto::ring::default_provider;
-use tokio_rustls::rustls::pki_types::pem::PemObject;
-use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
-use tokio_rustls::rustls::{ClientConfig, RootCertStore};
 
-use super::fixture::certificates::{certificates, secured, start};
+use super::fixture::certificates::{TOKEN, certificates, secured, start, with_roles};
+use super::fixture::https::ask;
 use super::fixture::{feed, readings, within};
 use super::get;
-
-const TOKEN: &str = "0123456789abcdef0123456789abcdef";
-
-/// A server with roles on every TCP listener, and one token.
-fn with_roles(folder: &Path) -> Config {
-    let (mut config, any) = (secured(true), "127.0.0.1:0".parse().unwrap());
-    config.page.enabled = true;
-    config.metrics = Metrics { enabled: true, listen: any };
-    config.foxglove = Foxglove { enabled: true, listen: any };
-    let file = folder.join("prometheus.token");
-    std::fs::write(&file, format!("{TOKEN}\n")).unwrap();
-    std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o600)).unwrap();
-    config.grpc.access.tokens = [("prometheus".to_owned(), file)].into();
-    config.grpc.access.readers.push("prometheus".into());
-    config
-}
-
-/// The status of an answer over TLS, and the whole answer; 0 if there is none. `identity`: CA and name of the client's
-/// certificate.
-async fn ask(address: SocketAddr, head: &str, identity: Option<(&str, &str)>) -> (u16, String) {
-    let mut roots = RootCertStore::empty();
-    let ca = std::fs::read(certificates("ours").join("ca.pem")).unwrap();
-    roots.add(CertificateDer::from_pem_slice(&ca).unwrap()).unwrap();
-    let builder = ClientConfig::builder_with_provider(Arc::new(default_provider()));
-    let builder = builder.with_safe_default_protocol_versions().unwrap().with_root_certificates(roots);
-    let config = match identity {
-        None => builder.with_no_client_auth(),
-        Some((ca, name)) => {
-            let at = |ending: &str| certificates(ca).join(format!("{name}.{ending}"));
-            let certificate = CertificateDer::from_pem_file(at("pem")).unwrap();
-            let key = PrivateKeyDer::from_pem_file(at("key")).unwrap();
-            builder.with_client_auth_cert(vec![certificate], key).unwrap()
-        }
-    };
-    let stream = TcpStream::connect(address).await.unwrap();
-    let connector = TlsConnector::from(Arc::new(config));
-    let Ok(mut stream) = connector.connect("localhost".try_into().unwrap(), stream).await else {
-        return (0, String::new());
-    };
-    let _ = stream.write_all(format!("{head}\r\n").as_bytes()).await;
-    let mut answer = Vec::new();
-    // A refused certificate shows only here.
-    let _ = within("an answer", stream.read_to_end(&mut answer)).await;
-    let answer = String::from_utf8_lossy(&answer).into_owned();
-    (answer.get(9..12).and_then(|status| status.parse().ok()).unwrap_or(0), answer)
-}
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
