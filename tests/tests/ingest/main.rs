@@ -14,7 +14,7 @@ use clearway::ingest::queue::Reading;
 use clearway::record::verify::verify;
 use clearway::server::{Running, Server, Setup};
 use clearway_client::observation::{RoadFrame, RoadPurpose, Sensor, by_reason};
-use clearway_client::{Client, ClientError, Ingester, Observation, Refusal, ZenohClient};
+use clearway_client::{Client, ClientError, Ingester, Observation, Refusal, ZenohClient, now_ns};
 use clearway_lidar::model::Model;
 use clearway_mapping::event::Body;
 use clearway_proto::packed::{pack, unpack};
@@ -309,7 +309,7 @@ async fn a_session_over_zenoh_makes_the_same_maps_and_refusals_as_over_grpc() {
 
     let stale = Observation::pose(5, [0.0; 3], [0.0, 0.0, 0.0, 1.0], 0.0).captured_at(1_000_000_000);
     let strange = Observation::scan("bottom", 5, &[1.0], &[1.0], &[1.0]);
-    let crooked = Observation::scan("top", i64::MAX, &[1.0], &[1.0, 2.0], &[1.0]);
+    let crooked = Observation::scan("top", now_ns(), &[1.0], &[1.0, 2.0], &[1.0]);
     let refusals = send_all(&mut zenoh, vec![stale, strange, crooked]).await;
     assert_eq!(by_reason(&refusals), [("stamp", 1), ("source", 1), ("scan_lengths", 1)].into());
     assert!(refusals[1].message.contains("top"), "{refusals:?}");

@@ -73,7 +73,7 @@ async fn invalid_observations_are_refused_by_name_and_do_not_change_maps() {
         ("scan_lengths", scan(0, v1::Scan { intensity: pack(&[0.5_f32]), ..base.clone() })),
         ("stamp", scan(0, plain(1_000_000_000))),
         ("stamp_range", scan(0, plain(i64::MIN))),
-        ("stamp_range", scan(0, plain((1 << 62) + 1))),
+        ("stamp_ahead", scan(0, plain((1 << 62) + 1))),
         ("columns", columns(&[0], &[7199])),
         ("columns", columns(&[0, 0], &[7200])),
         ("columns", columns(&[0; 20_000], &[65_535; 20_000])),
