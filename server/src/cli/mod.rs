@@ -7,7 +7,7 @@
 //! | [`demo`] | a simulated vehicle -> a server of its own, over real UDP |
 //! | `serve` | a configuration -> a server that runs until a signal |
 //! | [`replay`] | recorded drives -> maps, a recording |
-//! | `verify` | a recording -> true if each map is the map of its events |
+//! | `verify` | recordings -> whether each map is the map of its events, or what a change changes in the maps |
 //! | [`evaluate`] | labelled scans, simulated scenes -> precision and recall of each map |
 //! | `check` | a configuration -> the same with every default |
 //! | `watch`, `get` | a server -> a line for each map; the newest map as a file |

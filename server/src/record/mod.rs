@@ -7,8 +7,10 @@
 //! | [`mcap_reader`] | any MCAP file -> its header and its messages |
 //! | [`reader`] | those messages -> events, maps, ROS 2 messages |
 //! | [`verify`] | recording -> differences between the recorded maps and the maps of the recorded events |
+//! | [`compare`] | two sets of maps of one drive -> changed cells, gained and lost free space |
 
 mod chunk;
+pub mod compare;
 pub mod mcap_file;
 pub mod mcap_reader;
 pub mod reader;

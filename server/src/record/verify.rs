@@ -33,6 +33,8 @@ pub struct Report {
     pub equal: u64,
     /// Number of maps computed from the events.
     pub maps: u64,
+    /// Number of cells of the recorded maps that have a computed map: those of their layers' grids.
+    pub cells: u64,
     /// True if a crash cut the file; then the part before the cut is verified.
     pub cut: bool,
     /// Number of maps, of one layer each, that belong to the last event before the cut and are not recorded.
@@ -114,6 +116,7 @@ impl Report {
         json!({
             "ok": self.is_good(),
             "events": self.events, "maps": self.maps, "equal": self.equal, "different": self.different,
+            "cells": self.cells,
             "cut": self.cut, "beyond_cut": self.beyond_cut,
             "differences": self.differences.iter().map(Difference::to_json).collect::<Vec<_>>(),
         })
@@ -214,9 +217,11 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
                 }
             }
             RecordedMessage::Map { vehicle, layer, bytes } => {
-                let sequence = sequence_of(&bytes);
+                let (sequence, cells) = sequence_and_cells(&bytes);
                 let replay = replays.iter_mut().find(|r| *r.name == *vehicle);
-                match replay.and_then(|replay| replay.computed.remove(&(sequence, layer.clone()))) {
+                let computed = replay.and_then(|replay| replay.computed.remove(&(sequence, layer.clone())));
+                report.cells += if computed.is_some() { cells } else { 0 };
+                match computed {
                     None => report.add(&vehicle, sequence, &layer, DifferenceKind::Extra),
                     Some(computed) if computed == bytes => report.equal += 1,
                     Some(computed) => report.add(&vehicle, sequence, &layer, first_difference(&bytes, &computed)),
@@ -240,10 +245,13 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     Ok(report)
 }
 
-/// The sequence of a recorded map; `u64::MAX` for an unreadable map, which then counts as extra.
-fn sequence_of(bytes: &Bytes) -> u64 {
-    let map = v1::Map::decode(bytes.clone()).ok();
-    map.and_then(|map| map.header).map_or(u64::MAX, |header| header.sequence)
+/// The sequence of a recorded map of one layer and the number of its cells; `u64::MAX` for an unreadable map, which then
+/// counts as extra.
+fn sequence_and_cells(bytes: &Bytes) -> (u64, u64) {
+    let Ok(map) = v1::Map::decode(bytes.clone()) else { return (u64::MAX, 0) };
+    let channels = map.layers.first().map(|layer| &layer.channels[..]).unwrap_or_default();
+    let cells = channels.first().map_or(0, |channel| channel.cell_count.into());
+    (map.header.map_or(u64::MAX, |header| header.sequence), cells)
 }
 
 /// The first difference of two encoded maps of one layer, in the order header, geometry, channels, all else.
