@@ -28,6 +28,7 @@
 //! | [`observation`] | scans, poses, roads, packets -> [`Observation`] |
 //! | [`ingest`] | observations -> the server, and their outcomes |
 //! | `zenoh` | endpoint of a router -> `ZenohClient` (feature `zenoh`); its `subscription`: one key -> the newest map |
+//! | `test` | a recording -> a server that replays it, for tests of planners (feature `test`) |
 //! | `error` | why a call failed |
 
 mod error;
@@ -37,6 +38,8 @@ pub mod grpc;
 pub mod ingest;
 pub mod observation;
 pub mod stream;
+#[cfg(feature = "test")]
+pub mod test;
 pub mod view;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;

@@ -44,7 +44,7 @@ pub struct Strip {
 }
 
 /// Draws the strip of a picture that is `width` pixels wide and shows `metres` metres in each pixel; the lines of
-/// `caption` stand first.
+/// `caption` stand first, and continue on the next line if they are longer than the strip.
 pub fn strip(caption: &[String], legend: &Legend, width: usize, metres: f64) -> Strip {
     let dot = (width / PIXELS_PER_DOT).max(1);
     let (scale_m, bar) = scale_bar(width, metres);
@@ -57,7 +57,7 @@ pub fn strip(caption: &[String], legend: &Legend, width: usize, metres: f64) -> 
         }
     };
     let last = entry_width(bar, &scale, dot) + 2 * margin + text_width(up, dot);
-    let longest = caption.iter().map(|line| text_width(line, dot)).max().unwrap_or(0);
+    let longest = caption.iter().flat_map(|line| line.split(' ')).map(|word| text_width(word, dot)).max().unwrap_or(0);
     let width = width.max(2 * margin + widest.unwrap_or(0).max(last).max(longest));
     let mut strip = caption_strip(caption, width, dot);
     let explained = match legend {
@@ -90,10 +90,20 @@ fn entry_width(square: usize, text: &str, dot: usize) -> usize {
 /// The lines of text.
 fn caption_strip(caption: &[String], width: usize, dot: usize) -> Strip {
     let mut strip = Strip::new(width, 0);
+    let margin = SPACE * dot;
     for line in caption {
-        let y = strip.height + SPACE * dot;
-        strip.extend(LINE * dot);
-        strip.write((SPACE * dot, y), dot, line);
+        let mut words = line.split(' ').peekable();
+        while let Some(first) = words.next() {
+            let mut text = first.to_owned();
+            while let Some(word) =
+                words.next_if(|word| text_width(&text, dot) + text_width(word, dot) + 2 * margin < width)
+            {
+                text = format!("{text} {word}");
+            }
+            let y = strip.height + margin;
+            strip.extend(LINE * dot);
+            strip.write((margin, y), dot, &text);
+        }
     }
     strip
 }

@@ -14,7 +14,10 @@ mod error;
 mod image;
 mod safe_paths;
 
+use std::time::{Duration, UNIX_EPOCH};
+
 use clearway_proto::map::{Layer, SafePoint};
+use clearway_proto::v1;
 
 use super::legend::{self, Legend};
 use super::palette::Rgb;
@@ -84,6 +87,22 @@ pub fn of_layer(layer: &Layer, style: &Style) -> Result<Picture, PictureError> {
     let colour_at = |x_m, y_m| layer.grid.cell_at(x_m, y_m).map_or(UNKNOWN, |cell| colours.of_cell(layer, cell));
     let picture = draw(range_m, style, &layer.points, &colours.legend(layer), colour_at);
     Ok(Picture { comment: colours.text(layer), ..picture })
+}
+
+/// The lines under a picture of a map: vehicle, layer, sequence and stamp; then the sensors that are not whole, with
+/// `partial` and why, or their state.
+pub fn caption(header: &v1::Header, layer: &str) -> Vec<String> {
+    let end_ns = u64::try_from(header.capture_end_ns).unwrap_or(0);
+    let stamp = humantime::format_rfc3339_millis(UNIX_EPOCH + Duration::from_nanos(end_ns));
+    let mut lines = vec![format!("{} {layer} {} {stamp}", header.vehicle, header.sequence)];
+    for sensor in &header.sensors {
+        match (&*sensor.partial, &*sensor.state) {
+            ("", "ok") => {}
+            ("", state) => lines.push(format!("{}: {state}", sensor.name)),
+            (partial, _) => lines.push(format!("{}: partial, {partial}", sensor.name)),
+        }
+    }
+    lines
 }
 
 /// Draws where the classes of a layer differ from those of the same layer of another map, `before`.

@@ -60,6 +60,10 @@ fn write_line(text: &mut String, width: usize, [name, events, maps, layers, cell
 fn write_changes(text: &mut String, comparison: &Comparison) {
     for ((vehicle, layer), change) in &comparison.layers {
         let LayerChange { maps, cells, changed, values, .. } = change;
+        if change.is_equal() {
+            let _ = writeln!(text, "  {vehicle} {layer}: {}, equal", counted(*maps, "map"));
+            continue;
+        }
         let per_map = |sum: f64| sum / (*maps as f64).max(1.0);
         let share = 100.0 * *changed as f64 / (*cells as f64).max(1.0);
         let _ = writeln!(
