@@ -36,7 +36,8 @@ mod viewer_file;
 /// Names of the files begin with the map's sequence number in six digits, and contain the layer. png and json write
 /// `<sequence>_<layer>.<format>`, png with --channel `<sequence>_<layer>_<channel>.png`; npy writes
 /// `<sequence>_<layer>_<channel>.npy` (NumPy 1.0, shape (rows, columns)) and `<sequence>_<layer>.json` with geometry,
-/// pose, stamps and class legend; sheet writes `sheet_<layer>.png`. Pictures show the map from above, with the vehicle in the middle, forward up and left
+/// pose, stamps and class legend; sheet writes `sheet_<layer>.png`. Pictures show the map from above, with
+/// the vehicle in the middle, forward up and left
 /// on the left, and under it the stamp, the sensors that are partial, the legend and a scale.
 ///
 /// foxglove and ros2 write one new MCAP file with the layers of every vehicle and the sensors' points: foxglove has
