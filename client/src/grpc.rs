@@ -236,11 +236,17 @@ async fn receive_maps(
             Ok(None) => return ClientError::Ended { address },
             Err(status) => return refused(&address, &status),
         };
+        if update.replay_ended {
+            slot.end_replay(ClientError::ReplayEnded { address: address.clone() });
+            continue;
+        }
         left_out += update.left_out;
         let request = match MapView::decode_on(update.map.clone(), base.as_ref()) {
             Ok(map) => {
                 let sequence = map.sequence();
-                let last = base.replace(map.clone()).map_or(sequence, |last| last.sequence() + 1);
+                // Maps of another run, or before a jump of a replay, were not skipped.
+                let last = base.replace(map.clone()).filter(|last| last.header().boot_id == map.header().boot_id);
+                let last = last.map_or(sequence, |last| last.sequence() + 1);
                 let skipped = sequence.saturating_sub(last).saturating_sub(left_out);
                 slot.store(map, Missed { skipped, left_out, ..Missed::default() });
                 (is_requested, left_out) = (false, 0);

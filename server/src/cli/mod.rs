@@ -165,7 +165,7 @@ fn run(command: Command) -> Result<ExitCode> {
         #[cfg(feature = "sim")]
         Command::Demo(options) => demo::command::run(options)?,
         Command::Serve(options) => serve::run(&options)?,
-        Command::Replay(options) => replay::run(*options)?,
+        Command::Replay(options) => return replay::run(*options),
         Command::Verify(options) => return verify::run(&options),
         Command::Evaluate(options) => evaluate::run(&options)?,
         Command::Check(options) => check::run(&options)?,

@@ -23,6 +23,7 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 use super::ros::Node;
 use super::served::{Served, Vehicles};
 use crate::config::Zenoh as Options;
+use crate::status::Reader;
 use crate::zenoh_session::ZenohError;
 
 /// Time between two status messages.
@@ -154,7 +155,9 @@ async fn subscribe_while(
     matching: MatchingListener<FifoChannelHandler<MatchingStatus>>,
 ) {
     loop {
-        let _taken = matches.then(|| served.status.subscriptions.subscribe(&[layer.to_owned()]));
+        let _taken = matches.then(|| {
+            (served.status.subscriptions.subscribe(&[layer.to_owned()]), Reader::new(&served.status.zenoh_readers))
+        });
         match matching.recv_async().await {
             Ok(status) => matches = status.matching(),
             Err(_) => return,

@@ -5,6 +5,7 @@
 //! |---|---|
 //! | [`options`] | the command line -> [`Options`] |
 //! | `plan` | options, files -> configuration, mount, readings |
+//! | `ready_file` | the running server -> the file that tells programs its addresses |
 //! | [`clouds`] | revolutions -> PCD files |
 //! | [`summary`] | the state at the end -> text, JSON |
 //!
@@ -13,40 +14,51 @@
 //! is no ground to estimate from, the files are decoded and no map is made, and the summary says so.
 
 use std::io::IsTerminal;
+use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
+use clearway_proto::v1;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::output::{block_on, print, print_line, stop_signal};
 use super::serve::log_endpoints;
-use crate::ingest::files::Readings;
-use crate::ingest::queue::EventQueue;
-use crate::server::{Running, Server};
+use crate::replay::ReplayHandle;
+use crate::replay::control::check;
+use crate::replay::player::{Played, Player, PlayerOptions, ReplayedVehicle};
+use crate::replay::timeline::Timeline;
+use crate::server::{Running, Server, Setup, random};
 use crate::sync::locked;
 
 pub mod clouds;
 pub mod options;
 mod plan;
+mod ready_file;
 pub mod summary;
 
 pub use options::{Options, ReplayError, Speed};
 use plan::{Plan, plan};
+use ready_file::ReadyFile;
 pub use summary::{Mount, Summary, describe};
 
 /// Interval at which the progress bar is drawn again.
 const DRAW_INTERVAL: Duration = Duration::from_millis(100);
+/// Longest wait for an acknowledgement in lockstep, in seconds. Ours: a planner that stands in a debugger says so with
+/// --lockstep-timeout.
+const ACKNOWLEDGE_S_MAX: f64 = 10.0;
+/// Exit code of a replay that a signal has stopped before its end.
+const STOPPED: u8 = 3;
 
-/// Replays the files and prints the summary.
+/// Replays the files and prints the summary. The exit code is 0 at the end, and 3 if a signal came before.
 ///
 /// # Errors
 /// [`ReplayError`].
-pub fn run(options: Options) -> anyhow::Result<()> {
+pub fn run(options: Options) -> anyhow::Result<ExitCode> {
     block_on(replay_and_print(options))
 }
 
-async fn replay_and_print(options: Options) -> anyhow::Result<()> {
+async fn replay_and_print(options: Options) -> anyhow::Result<ExitCode> {
     let json = options.json;
     let progress = Arc::new(Progress::default());
     let mut bar = None;
@@ -76,7 +88,7 @@ async fn replay_and_print(options: Options) -> anyhow::Result<()> {
     } else {
         print(&summary.to_text())?
     };
-    Ok(())
+    Ok(if summary.reached_end { ExitCode::SUCCESS } else { ExitCode::from(STOPPED) })
 }
 
 /// How many bytes of the files a replay has read, for a progress bar.
@@ -85,7 +97,7 @@ pub struct Progress {
     /// Bytes of all files.
     pub bytes: AtomicU64,
     /// Bytes read so far.
-    pub bytes_read: AtomicU64,
+    pub bytes_read: Arc<AtomicU64>,
 }
 
 /// Draws the progress bar until the task is aborted, and then clears it.
@@ -106,7 +118,8 @@ async fn draw(progress: Arc<Progress>) {
 }
 
 /// Replays the files to their end. `started` is called with the running server before the first event; with
-/// [`Options::serve`] the replay returns only after `stop` has resolved. Needs a multi-thread tokio runtime.
+/// [`Options::serve`] the replay returns only after `stop` has resolved, or with [`Options::exit_at_end`]. It ends early
+/// if `stop` resolves. Needs a multi-thread tokio runtime.
 ///
 /// # Errors
 /// [`ReplayError`]; nothing is left running.
@@ -117,12 +130,19 @@ pub async fn replay(
     stop: impl Future<Output = ()>,
 ) -> Result<Summary, ReplayError> {
     let began = Instant::now();
+    options.ready_file.as_deref().map_or(Ok(()), ReadyFile::remove_earlier)?;
     let plan = tokio::task::block_in_place(|| plan(&options))?;
-    let Plan { setup, mount, extrinsics, readings, clouds } = plan;
-    progress.bytes.store(readings.bytes(), Ordering::Relaxed);
-    let running = Server::start(setup).await?;
+    let Plan { setup, mount, extrinsics, mut timeline, bytes, boot_id, clouds } = plan;
+    progress.bytes.store(bytes, Ordering::Relaxed);
+    timeline.bytes_read = progress.bytes_read.clone();
+    let state = tokio::task::block_in_place(|| initial_state(&options, &timeline))?;
+    let (handle, input) = ReplayHandle::new(state);
+    let setup = Setup { replay: options.serve.then(|| handle.clone()), ..setup };
+    let mut running = Server::start(setup).await?;
+    let ready_file = options.ready_file.as_deref().map(|file| ReadyFile::write(file, &running)).transpose();
+    let status = running.vehicles.0[0].status.clone();
     let mut summary = Summary {
-        snapshot: running.vehicles.0[0].status.snapshot(),
+        snapshot: status.snapshot(),
         extrinsics,
         mount,
         truncated: Vec::new(),
@@ -130,26 +150,46 @@ pub async fn replay(
         clouds: 0,
         seconds: 0.0,
         record: options.record.clone(),
+        reached_end: false,
     };
     started(&running, &summary);
 
-    let speed = options.speed.unwrap_or(if options.serve { Speed::Times(1.0) } else { Speed::Max });
-    let queue = running.inputs[0].queue.clone();
-    let read = tokio::task::spawn_blocking(move || feed(readings, &queue, speed, &progress)).await;
-    let status = running.vehicles.0[0].status.clone();
-    let outcome = match read {
-        Ok(outcome) => outcome,
-        Err(_) => Err(ReplayError::Engine),
+    // Maps that are as recorded keep their boot id until the first jump.
+    let first_boot_id = boot_id.filter(|_| !options.as_live).unwrap_or_else(random);
+    let player_options = PlayerOptions {
+        is_served: options.serve,
+        is_recorded: options.record.is_some(),
+        exits_at_end: options.exit_at_end,
+        acknowledge_timeout: Duration::from_secs_f64(options.lockstep_timeout.unwrap_or(ACKNOWLEDGE_S_MAX)),
+        boot_id: first_boot_id,
     };
-    if options.serve && outcome.is_ok() {
-        stop.await;
-    }
+    let stepped = std::mem::take(&mut running.stepped).into_iter().zip(&running.inputs);
+    let vehicles: Vec<_> = stepped
+        .map(|((engine, events), input)| ReplayedVehicle { engine, events, queue: input.queue.clone() })
+        .collect();
+    let runtime = tokio::runtime::Handle::current();
+    let play = move || Player::new(timeline, vehicles, input, player_options, runtime)?.run();
+    let outcome = match &ready_file {
+        Err(_) => Ok(Ok(Played::default())),
+        Ok(_) => {
+            let mut player = tokio::task::spawn_blocking(play);
+            tokio::select! {
+                played = &mut player => played,
+                () = stop => {
+                    handle.stop();
+                    player.await
+                }
+            }
+        }
+    };
     let ended = running.shutdown().await;
-    let readings = outcome?;
+    ready_file?;
+    let played = outcome.map_err(|_| ReplayError::Engine)??;
     ended?;
+    summary.reached_end = played.reached_end;
     summary.snapshot = status.snapshot();
-    summary.truncated = readings.truncated().to_vec();
-    summary.notes = readings.notes().to_vec();
+    summary.truncated = played.remarks.truncated;
+    summary.notes = played.remarks.notes;
     if let Some(clouds) = clouds {
         summary.clouds = std::mem::replace(&mut *locked(&clouds), Ok(0))?;
         if summary.clouds == 0 {
@@ -160,35 +200,37 @@ pub async fn replay(
     Ok(summary)
 }
 
-/// Pushes every reading to the event queue, at its time if the speed is not [`Speed::Max`].
-fn feed(
-    mut readings: Readings,
-    queue: &EventQueue,
-    speed: Speed,
-    progress: &Progress,
-) -> Result<Readings, ReplayError> {
-    let began = Instant::now();
-    let (mut first_ns, mut newest_ns) = (None, None);
-    while let Some(reading) = readings.next() {
-        let reading = reading?;
-        if let Speed::Times(times) = speed {
-            let passed_ns = reading.arrival_ns.saturating_sub(*first_ns.get_or_insert(reading.arrival_ns));
-            let due = Duration::try_from_secs_f64(passed_ns.max(0) as f64 * 1e-9 / times).unwrap_or(Duration::MAX);
-            std::thread::sleep(due.saturating_sub(began.elapsed()));
-        }
-        progress.bytes_read.store(readings.bytes_read(), Ordering::Relaxed);
-        leave_refused(&mut readings, queue);
-        newest_ns = Some(reading.arrival_ns);
-        queue.push_captured(reading).map_err(|_| ReplayError::Engine)?;
+/// How the replay begins. Reads the files once if it is served or has a range, because only then their times matter.
+fn initial_state(options: &Options, timeline: &Timeline) -> Result<v1::ReplayState, ReplayError> {
+    let needs_extent = options.serve || options.from.is_some() || options.to.is_some();
+    let extent = if needs_extent { timeline.extent()?.ok_or(ReplayError::Empty)? } else { (i64::MIN, i64::MAX) };
+    let (begin_ns, end_ns) = extent;
+    let default_speed = if options.serve && !options.lockstep { Speed::Times(1.0) } else { Speed::Max };
+    let phase = match (options.wait_readers, options.paused) {
+        (Some(1..), _) => v1::ReplayPhase::Waiting,
+        (_, true) => v1::ReplayPhase::Paused,
+        (_, false) => v1::ReplayPhase::Playing,
+    };
+    let mut state = v1::ReplayState {
+        phase: phase.into(),
+        begin_ns,
+        end_ns,
+        from_ns: begin_ns,
+        to_ns: end_ns,
+        position_ns: begin_ns,
+        rate: options.speed.unwrap_or(default_speed).rate(),
+        repeat: options.r#loop,
+        lockstep: options.lockstep,
+        as_live: options.as_live,
+        jumps: 0,
+        vehicles: Vec::new(),
+        readers_awaited: options.wait_readers.unwrap_or(0),
+    };
+    // Saturates: what lies outside the files is refused.
+    let at = |seconds: f64| begin_ns.saturating_add((seconds * 1e9) as i64);
+    let range = v1::ReplayControl { from_ns: options.from.map(at), to_ns: options.to.map(at), ..Default::default() };
+    if needs_extent && (range.from_ns.is_some() || range.to_ns.is_some()) {
+        (state.from_ns, state.to_ns) = check(&range, &state, false)?;
     }
-    leave_refused(&mut readings, queue);
-    queue.report_drops(newest_ns).map_err(|_| ReplayError::Engine)?;
-    Ok(readings)
-}
-
-/// Reports the messages that the files' readers have refused to the drop counters.
-fn leave_refused(readings: &mut Readings, queue: &EventQueue) {
-    for ((source, reason), count) in readings.drain_refused() {
-        queue.drops().record_refused_messages(source, reason, count);
-    }
+    Ok(state)
 }

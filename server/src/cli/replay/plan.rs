@@ -2,7 +2,9 @@
 //! sensors are mounted, the readings.
 
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use clearway_lidar::Sensor;
 use clearway_lidar::calibration::Calibration;
@@ -22,6 +24,7 @@ use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
 use crate::ingest::ros::decoder::PoseSource;
 use crate::record::reader::RecordingReader;
+use crate::replay::timeline::{Timeline, Track};
 use crate::server::Setup;
 
 /// Number of revolutions from which the mount is estimated: the first of them follow each other, and between the others
@@ -38,7 +41,11 @@ pub(super) struct Plan {
     pub(super) setup: Setup,
     pub(super) mount: Mount,
     pub(super) extrinsics: Extrinsics,
-    pub(super) readings: Readings,
+    pub(super) timeline: Timeline,
+    /// Bytes of all files.
+    pub(super) bytes: u64,
+    /// Boot id of the recording whose maps are made again.
+    pub(super) boot_id: Option<u64>,
     /// The number of point clouds written, or the error that ended the writing.
     pub(super) clouds: Option<Written>,
 }
@@ -69,7 +76,7 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     };
     known.apply_options(options)?;
     let open = || Readings::open(&options.files, wanted.clone());
-    let readings = open()?;
+    let bytes = files.bytes();
     let mount = match options.extrinsics {
         Some(extrinsics) => {
             known.config.vehicles[0].sensors[0].extrinsics = extrinsics;
@@ -83,7 +90,10 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     let setup = known.setup(options)?;
     let clouds = options.clouds.as_deref().map(Clouds::create).transpose()?;
     let (observer, clouds) = clouds.map(Clouds::observer).unzip();
-    Ok(Plan { setup: Setup { observer, ..setup }, mount, extrinsics, readings, clouds })
+    let boot_id = setup.boot_id;
+    let tracks = vec![Track { files: options.files.clone(), options: wanted }];
+    let timeline = Timeline { tracks, bytes_read: Arc::default() };
+    Ok(Plan { setup: Setup { observer, ..setup }, mount, extrinsics, timeline, bytes, boot_id, clouds })
 }
 
 /// Refuses options that have no meaning for the files. `mcap` is the first MCAP file, and `journal` is true if it is a
@@ -106,6 +116,10 @@ fn check(options: &Options, mcap: Option<&Path>, journal: bool) -> Result<(), Re
         return unused(format!("--vehicle {name}"), reason.into());
     }
     let same = |a: &Path, b: &Path| a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b));
+    if let (Some(from), Some(_)) = (options.from, &options.record) {
+        let reason = "a recording begins with the first event; --to may end it earlier";
+        return unused(format!("--from {from}"), reason.into());
+    }
     match &options.record {
         Some(record) if options.files.iter().any(|file| same(file, record)) => {
             Err(ReplayError::RecordsInput { file: record.clone() })
@@ -220,6 +234,11 @@ impl Known {
             (config.grpc.enabled, config.page.enabled, config.foxglove.enabled) = (false, false, false);
             (config.zenoh.enabled, config.zenoh.ros2.enabled) = (false, false);
         }
+        if options.any_port {
+            let any = SocketAddr::from(([127, 0, 0, 1], 0));
+            (config.grpc.listen, config.page.listen, config.foxglove.listen) = (any, any, any);
+            config.zenoh.listen = vec!["tcp/127.0.0.1:0".into()];
+        }
         config.check(&origin(options, file))?;
         let certificates = if options.serve { config.certificates(file)? } else { None };
         // The same files and settings get the same boot id. Served maps need a new one, because a reader that has seen
@@ -241,6 +260,8 @@ impl Known {
             config_comments: remarks,
             metadata: notes,
             observer: None,
+            is_stepped: true,
+            replay: None,
         })
     }
 }
