@@ -10,6 +10,7 @@ use bytes::Bytes;
 use clearway_proto::v1;
 use clearway_proto::v1::ingest_service_client::IngestServiceClient;
 use clearway_proto::v1::map_service_client::MapServiceClient;
+use clearway_proto::v1::replay_service_client::ReplayServiceClient;
 use prost::Message;
 use tokio::sync::mpsc;
 use tokio_stream::StreamExt;
@@ -149,6 +150,17 @@ impl Client {
         let answer = self.service.clone().get_map(request).await;
         let map = MapView::decode(answer.map_err(|status| refused(&self.address, &status))?.into_inner().map)?;
         Ok(map.with_arrival(&Clock::default()))
+    }
+
+    /// Controls the replay that the server serves; an empty request changes nothing. Returns the state after the change.
+    ///
+    /// # Errors
+    /// [`ClientError::Unreachable`] if the connection fails, [`ClientError::Refused`] if the server serves no replay
+    /// (`Unimplemented`) or the request is not allowed.
+    pub async fn replay_control(&self, request: v1::ReplayControl) -> Result<v1::ReplayState, ClientError> {
+        let mut service = ReplayServiceClient::new(dial(&self.endpoint, &self.address).await?);
+        let answer = service.control(request).await;
+        Ok(answer.map_err(|status| refused(&self.address, &status))?.into_inner())
     }
 
     /// Streams maps over a separate connection.

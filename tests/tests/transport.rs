@@ -23,8 +23,13 @@ use tonic::transport::Channel;
 
 /// A recorded drive of this many tenths of a second, one map each, with ego poses and with memory.
 async fn recorded_drive(folder: &Path, tenths: i64) -> PathBuf {
-    let file = folder.join("drive.mcap");
+    recorded_drive_of("car", folder, tenths).await
+}
+
+async fn recorded_drive_of(vehicle: &str, folder: &Path, tenths: i64) -> PathBuf {
+    let file = folder.join(format!("{vehicle}.mcap"));
     let mut config = fixture::config();
+    config.vehicles[0].name = vehicle.to_owned();
     config.recorder.file = file.clone();
     config.vehicles[0].maps.memory.enabled = true;
     let running = fixture::start(config).await;
@@ -147,7 +152,7 @@ async fn maps_as_live_are_the_recorded_ones_moved_by_one_constant_until_the_end(
 #[tokio::test(flavor = "multi_thread")]
 async fn a_seek_to_any_of_a_hundred_moments_gives_the_map_of_the_straight_run() {
     let folder = tempfile::tempdir().unwrap();
-    let drive = recorded_drive(folder.path(), 30).await;
+    let drive = recorded_drive(folder.path(), 20).await;
     let recorded = recorded_maps(&drive);
     let mut random = 14_u64;
     println!("seed {random}");
@@ -193,10 +198,15 @@ async fn a_step_makes_so_many_maps_and_a_range_ends_and_begins_again() {
         let client = Client::connect(&address).await.unwrap();
         let mut transport = transport(&address).await;
         let mut states = transport.watch_state(v1::WatchStateRequest {}).await.unwrap().into_inner();
-        let mut sequences = Vec::new();
+        let (mut sequences, mut position_ns) = (Vec::new(), recorded[0].0 - 1);
         for step in [1, 2] {
             transport.control(v1::ReplayControl { step: Some(step), ..Default::default() }).await.unwrap();
-            while states.message().await.unwrap().unwrap().phase() != v1::ReplayPhase::Paused {}
+            position_ns = loop {
+                let state = states.message().await.unwrap().unwrap();
+                if state.phase() == v1::ReplayPhase::Paused && state.position_ns > position_ns {
+                    break state.position_ns;
+                }
+            };
             sequences.push(client.newest("", &[]).await.unwrap().sequence());
         }
         let mut stream = client.subscribe(Subscription::default()).await.unwrap();
@@ -269,10 +279,8 @@ async fn in_lockstep_a_reader_gets_every_map_and_one_that_never_acknowledges_is_
     let options = Options { lockstep_timeout: Some(0.2), ..options };
     let (summary, _) = replayed(options, |address| reads(address, false)).await;
     let error = summary.unwrap_err().to_string();
-    assert!(
-        error.contains("map 0 of vehicle car was not acknowledged within 0.2 s; awaited: gRPC reader 127.0.0.1:"),
-        "{error}"
-    );
+    let named = "map 0 of vehicle car was not acknowledged within 0.2 s; awaited: gRPC reader of drivability";
+    assert!(error.contains(named), "{error}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -288,4 +296,71 @@ async fn a_range_outside_the_files_is_refused_and_a_stopped_replay_says_so() {
     let summary = summary.unwrap();
     assert!(!summary.reached_end && summary.snapshot.maps == 0);
     assert_eq!(summary.to_json()["reached_end"], false);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn recordings_of_two_vehicles_run_in_one_time() {
+    let folder = tempfile::tempdir().unwrap();
+    let (car, van) =
+        (recorded_drive_of("car", folder.path(), 6).await, recorded_drive_of("van", folder.path(), 4).await);
+    let both = folder.path().join("both.mcap");
+    let options = Options { files: vec![car.clone(), van.clone()], record: Some(both.clone()), ..Options::default() };
+    let (summary, _) = replayed(options, async |_| {}).await;
+    assert!(summary.unwrap().notes.iter().any(|note| note.starts_with("vehicle van: ")));
+    let report = verify(&both).unwrap();
+    assert!(report.is_good(), "{:?}", report.differences);
+    assert_eq!(report.maps as usize, recorded_maps(&car).len() + recorded_maps(&van).len());
+    // One of them is replayed as ever.
+    let options = Options { files: vec![both], vehicle: Some("van".into()), ..Options::default() };
+    let (summary, _) = replayed(options, async |_| {}).await;
+    assert_eq!(summary.unwrap().snapshot.maps as usize, recorded_maps(&van).len());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_same_faults_give_the_same_maps_and_are_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    let drive = recorded_drive(folder.path(), 10).await;
+    let script = folder.path().join("faults.txt");
+    std::fs::write(&script, "# a window of the sensor\nlost:top@0.4-0.65\n\nloss:5 # percent\npose:1,0,5@0.5\n")
+        .unwrap();
+    let mut runs = Vec::new();
+    for name in ["a.mcap", "b.mcap"] {
+        let record = folder.path().join(name);
+        let options = Options {
+            files: vec![drive.clone()],
+            record: Some(record.clone()),
+            fault_script: Some(script.clone()),
+            fault_seed: Some(7),
+            ..Options::default()
+        };
+        let (summary, _) = replayed(options, async |_| {}).await;
+        let notes = summary.unwrap().notes;
+        assert!(notes.iter().any(|note| note.starts_with("fault lost:top@0.4-0.65: ")), "{notes:?}");
+        assert!(notes.iter().all(|note| !note.ends_with(": 0 readings")), "{notes:?}");
+        let report = verify(&record).unwrap();
+        assert!(report.is_good(), "{:?}", report.differences);
+        runs.push(fixture::recorded(&record));
+    }
+    assert!(runs[0] == runs[1], "the seed repeats the faults");
+    assert!(runs[0].len() < fixture::recorded(&drive).len(), "the lost sensor makes no maps");
+    let unknown = Options { files: vec![drive], faults: vec!["lost:front@1-2".parse().unwrap()], ..Options::default() };
+    let (error, _) = replayed(unknown, async |_| {}).await;
+    assert!(error.unwrap_err().to_string().contains("sensor \"front\" is not known; known: top"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn overlapping_files_and_a_configuration_of_other_sensors_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let drive = recorded_drive(folder.path(), 3).await;
+    let twice = Options { files: vec![drive.clone(), drive.clone()], ..Options::default() };
+    let (error, _) = replayed(twice, async |_| {}).await;
+    let error = error.unwrap_err().to_string();
+    assert!(error.contains("car.mcap: it begins 0.") && error.contains("without overlap"), "{error}");
+    let (file, mut config) = (folder.path().join("other.toml"), fixture::config());
+    config.vehicles[0].sensors[0].name = "front".into();
+    std::fs::write(&file, config.to_toml()).unwrap();
+    let other = Options { files: vec![drive], config: Some(file), ..Options::default() };
+    let (error, _) = replayed(other, async |_| {}).await;
+    let error = error.unwrap_err().to_string();
+    assert!(error.contains("vehicle car has the sensors [front], but the recording has [top]"), "{error}");
 }

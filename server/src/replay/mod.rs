@@ -3,6 +3,7 @@
 //! | file | in -> out |
 //! |---|---|
 //! | [`timeline`] | files of one or several vehicles -> readings in the order of recorded time |
+//! | [`faults`] | readings -> the same drive with lost sensors, packets, poses that jump |
 //! | [`clock`] | recorded time -> when an event is due, and how far its stamps move |
 //! | [`control`] | requests of clients -> commands; the state of the replay -> clients |
 //! | [`snapshots`] | pipelines at some moments -> the last one before another moment |
@@ -13,6 +14,7 @@
 
 pub mod clock;
 pub mod control;
+pub mod faults;
 pub mod player;
 pub mod snapshots;
 pub mod timeline;

@@ -287,8 +287,8 @@ impl Player {
     fn push_next(&mut self) -> Result<Option<usize>, PlayError> {
         let Some(next) = self.readings.take() else { return Ok(None) };
         self.taken += 1;
-        self.newest_ns = Some(next.reading.arrival_ns);
-        self.state.position_ns = next.reading.arrival_ns;
+        self.newest_ns = Some(next.at_ns);
+        self.state.position_ns = next.at_ns;
         let queue = &self.vehicles[next.vehicle].queue;
         report_refused(queue, next.refused);
         queue.push_captured(next.reading)?;
@@ -305,7 +305,7 @@ impl Player {
         for (_, ReplayedVehicle { engine, events, .. }) in vehicles.filter(|(i, _)| vehicle.is_none_or(|v| v == *i)) {
             let before = engine.maps();
             while let Ok(queued) = events.try_recv() {
-                engine.replayed = replayed(clock, state, boot_id, queued.event.arrival_ns, now_ns);
+                engine.replayed = replayed(clock, state, boot_id, state.position_ns, now_ns);
                 engine.step(queued);
             }
             if vehicle.is_none() {
@@ -428,6 +428,7 @@ impl Player {
         }
         self.awaited = None;
         while let Some(at_ns) = self.readings.next_ns()?.filter(|at_ns| *at_ns <= to_ns) {
+            debug_assert!(at_ns <= to_ns);
             let Some(vehicle) = self.push_next()? else { break };
             let ReplayedVehicle { engine, events, .. } = &mut self.vehicles[vehicle];
             let before = engine.maps();
@@ -435,7 +436,6 @@ impl Player {
             if engine.maps() > before {
                 self.copy_if_due();
             }
-            debug_assert!(at_ns <= to_ns);
         }
         self.state.position_ns = to_ns;
         self.clock.restart();
@@ -484,15 +484,9 @@ impl Player {
     }
 }
 
-/// The header that a map of the event at `arrival_ns` is served with; `None` for that of the recorded map.
-fn replayed(
-    clock: &ReplayClock,
-    state: &v1::ReplayState,
-    boot_id: u64,
-    arrival_ns: i64,
-    now_ns: i64,
-) -> Option<Replayed> {
-    let shift_ns = if state.as_live { clock.shift_ns(arrival_ns, now_ns) } else { 0 };
+/// The header that a map of the recorded time `at_ns` is served with; `None` for that of the recorded map.
+fn replayed(clock: &ReplayClock, state: &v1::ReplayState, boot_id: u64, at_ns: i64, now_ns: i64) -> Option<Replayed> {
+    let shift_ns = if state.as_live { clock.shift_ns(at_ns, now_ns) } else { 0 };
     let boot_id = boot_id.wrapping_add(state.jumps);
     (state.as_live || state.jumps > 0).then_some(Replayed { shift_ns, boot_id })
 }

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, sync_channel};
 
+use super::faults::Faults;
 use crate::ingest::files::mcap::{McapOptions, RefusedMessages};
 use crate::ingest::files::{FilesError, Readings, Truncated};
 use crate::ingest::queue::Reading;
@@ -31,6 +32,8 @@ pub struct Timeline {
     pub tracks: Vec<Track>,
     /// Bytes read since the timeline was last opened, for a progress bar.
     pub bytes_read: Arc<AtomicU64>,
+    /// Faults that the readings get.
+    pub faults: Faults,
 }
 
 /// One reading of the timeline.
@@ -38,6 +41,8 @@ pub struct Timeline {
 pub struct TimedReading {
     /// Index of the vehicle.
     pub vehicle: usize,
+    /// Recorded time: the reading's arrival, without a step of the clock that is a fault.
+    pub at_ns: i64,
     /// The reading.
     pub reading: Reading,
     /// Messages of this vehicle that were refused before it became readings.
@@ -64,9 +69,8 @@ impl Timeline {
         let mut merged = self.open()?;
         let mut extent: Option<(i64, i64)> = None;
         while let Some(next) = merged.next()? {
-            let at = next.reading.arrival_ns;
-            let (begin, end) = extent.unwrap_or((at, at));
-            extent = Some((begin.min(at), end.max(at)));
+            let (begin, end) = extent.unwrap_or((merged.begin_ns.unwrap_or(next.at_ns), next.at_ns));
+            extent = Some((begin.min(next.at_ns), end.max(next.at_ns)));
         }
         Ok(extent)
     }
@@ -108,7 +112,8 @@ impl Timeline {
 
     fn open(&self) -> Result<Merged, FilesError> {
         let open = |track: &Track| Ok((Readings::open(&track.files, track.options.clone())?, None));
-        Ok(Merged { tracks: self.tracks.iter().map(open).collect::<Result<_, FilesError>>()? })
+        let tracks = self.tracks.iter().map(open).collect::<Result<_, FilesError>>()?;
+        Ok(Merged { tracks, faults: self.faults.clone(), number: 0, begin_ns: None })
     }
 }
 
@@ -138,7 +143,7 @@ impl Ahead {
                 Err(_) => self.end = Some(Remarks::default()),
             }
         }
-        Ok(self.next.as_ref().map(|next| next.reading.arrival_ns))
+        Ok(self.next.as_ref().map(|next| next.at_ns))
     }
 
     /// Takes the reading that [`Ahead::next_ns`] has looked at.
@@ -155,21 +160,39 @@ impl Ahead {
 /// The readings of several vehicles, each with the one that is next.
 struct Merged {
     tracks: Vec<(Readings, Option<Reading>)>,
+    faults: Faults,
+    /// Number of readings so far, with those that a fault has dropped.
+    number: u64,
+    /// Recorded time of the first reading.
+    begin_ns: Option<i64>,
 }
 
 impl Merged {
-    /// The earliest of the vehicles' next readings; of equal times that of the first vehicle.
+    /// The next reading that no fault drops.
     fn next(&mut self) -> Result<Option<TimedReading>, FilesError> {
+        while let Some(TimedReading { vehicle, at_ns, reading, refused }) = self.earliest()? {
+            self.number += 1;
+            let begin_ns = *self.begin_ns.get_or_insert(at_ns);
+            let after_s = at_ns.saturating_sub(begin_ns) as f64 * 1e-9;
+            if let Some(reading) = self.faults.apply(reading, vehicle, self.number, after_s) {
+                return Ok(Some(TimedReading { vehicle, at_ns, reading, refused }));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The earliest of the vehicles' next readings; of equal times that of the first vehicle.
+    fn earliest(&mut self) -> Result<Option<TimedReading>, FilesError> {
         for (readings, next) in &mut self.tracks {
             if next.is_none() {
                 *next = readings.next().transpose()?;
             }
         }
         let times = self.tracks.iter().enumerate().filter_map(|(i, (_, next))| Some((next.as_ref()?.arrival_ns, i)));
-        let Some((_, vehicle)) = times.min() else { return Ok(None) };
+        let Some((at_ns, vehicle)) = times.min() else { return Ok(None) };
         let (readings, next) = &mut self.tracks[vehicle];
         let refused = readings.drain_refused();
-        Ok(next.take().map(|reading| TimedReading { vehicle, reading, refused }))
+        Ok(next.take().map(|reading| TimedReading { vehicle, at_ns, reading, refused }))
     }
 
     fn remarks(&mut self) -> Remarks {
@@ -179,6 +202,7 @@ impl Merged {
             remarks.notes.extend_from_slice(readings.notes());
             remarks.refused.push(readings.drain_refused());
         }
+        remarks.notes.extend(self.faults.notes());
         remarks
     }
 }

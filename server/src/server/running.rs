@@ -60,6 +60,11 @@ impl Running {
         self.recorder.as_ref().map(|recorder| recorder.counts().to_proto().file)
     }
 
+    /// Controls the replay that the server serves, if it serves one.
+    pub fn replay(&self) -> Option<ReplayHandle> {
+        self.replay.clone()
+    }
+
     /// Resolves when the server stops.
     pub(super) fn stopped(&self) -> impl Future<Output = ()> + Send + use<> {
         let mut stopped = self.stop.subscribe();

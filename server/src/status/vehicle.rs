@@ -343,7 +343,7 @@ fn rates(paces: &VecDeque<(Instant, u64)>) -> (f64, f64) {
     if paces.len() < 2 || seconds <= 0.0 || last.elapsed() > RATE_AGE_MAX {
         return (0.0, 0.0);
     }
-    ((paces.len() - 1) as f64 / seconds, (after - before) as f64 / seconds)
+    ((paces.len() - 1) as f64 / seconds, after.saturating_sub(*before) as f64 / seconds)
 }
 
 /// Nearest-rank percentile of ascending durations.

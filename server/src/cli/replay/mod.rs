@@ -6,6 +6,8 @@
 //! | [`options`] | the command line -> [`Options`] |
 //! | `plan` | options, files -> configuration, mount, readings |
 //! | `ready_file` | the running server -> the file that tells programs its addresses |
+//! | `keys` | lines of a terminal -> requests |
+//! | [`state`] | the state of the replay -> text, JSON |
 //! | [`clouds`] | revolutions -> PCD files |
 //! | [`summary`] | the state at the end -> text, JSON |
 //!
@@ -22,19 +24,23 @@ use std::time::{Duration, Instant};
 use clearway_proto::v1;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::output::{block_on, print, print_line, stop_signal};
+use super::output::{block_on, counted, print, print_line, stop_signal};
 use super::serve::log_endpoints;
+use crate::config::{Config, Vehicle};
 use crate::replay::ReplayHandle;
 use crate::replay::control::check;
+use crate::replay::faults::Faults;
 use crate::replay::player::{Played, Player, PlayerOptions, ReplayedVehicle};
 use crate::replay::timeline::Timeline;
 use crate::server::{Running, Server, Setup, random};
 use crate::sync::locked;
 
 pub mod clouds;
+mod keys;
 pub mod options;
 mod plan;
 mod ready_file;
+pub mod state;
 pub mod summary;
 
 pub use options::{Options, ReplayError, Speed};
@@ -59,7 +65,7 @@ pub fn run(options: Options) -> anyhow::Result<ExitCode> {
 }
 
 async fn replay_and_print(options: Options) -> anyhow::Result<ExitCode> {
-    let json = options.json;
+    let (json, serve) = (options.json, options.serve);
     let progress = Arc::new(Progress::default());
     let mut bar = None;
     let started = |running: &Running, summary: &Summary| {
@@ -68,7 +74,10 @@ async fn replay_and_print(options: Options) -> anyhow::Result<ExitCode> {
         }
         log_endpoints(running);
         // Only now: a bar drawn before these lines would stay above them.
-        bar = (!json && std::io::stderr().is_terminal()).then(|| tokio::spawn(draw(progress.clone())));
+        if let Some(replay) = running.replay() {
+            keys::follow(replay, tokio::runtime::Handle::current());
+        }
+        bar = (!json && !serve && std::io::stderr().is_terminal()).then(|| tokio::spawn(draw(progress.clone())));
     };
     let outcome = replay(options, progress.clone(), started, stop_signal()?).await;
     if let Some(bar) = bar {
@@ -135,12 +144,16 @@ pub async fn replay(
     let Plan { setup, mount, extrinsics, mut timeline, bytes, boot_id, clouds } = plan;
     progress.bytes.store(bytes, Ordering::Relaxed);
     timeline.bytes_read = progress.bytes_read.clone();
-    let state = tokio::task::block_in_place(|| initial_state(&options, &timeline))?;
+    let extent = tokio::task::block_in_place(|| extent(&options, &timeline))?;
+    let mut state = initial_state(&options, extent)?;
+    state.vehicles = setup.config.vehicles.iter().map(|vehicle| vehicle.name.clone()).collect();
+    timeline.faults = faults(&options, extent, &setup.config)?;
     let (handle, input) = ReplayHandle::new(state);
     let setup = Setup { replay: options.serve.then(|| handle.clone()), ..setup };
     let mut running = Server::start(setup).await?;
     let ready_file = options.ready_file.as_deref().map(|file| ReadyFile::write(file, &running)).transpose();
-    let status = running.vehicles.0[0].status.clone();
+    let running_vehicles = running.vehicles.clone();
+    let status = running_vehicles.0[0].status.clone();
     let mut summary = Summary {
         snapshot: status.snapshot(),
         extrinsics,
@@ -190,6 +203,12 @@ pub async fn replay(
     summary.snapshot = status.snapshot();
     summary.truncated = played.remarks.truncated;
     summary.notes = played.remarks.notes;
+    let others = running_vehicles.0.iter().skip(1);
+    summary
+        .notes
+        .extend(others.map(|served| {
+            format!("vehicle {}: {}", served.status.name, counted(served.status.snapshot().maps, "map"))
+        }));
     if let Some(clouds) = clouds {
         summary.clouds = std::mem::replace(&mut *locked(&clouds), Ok(0))?;
         if summary.clouds == 0 {
@@ -200,11 +219,37 @@ pub async fn replay(
     Ok(summary)
 }
 
-/// How the replay begins. Reads the files once if it is served or has a range, because only then their times matter.
-fn initial_state(options: &Options, timeline: &Timeline) -> Result<v1::ReplayState, ReplayError> {
-    let needs_extent = options.serve || options.from.is_some() || options.to.is_some();
-    let extent = if needs_extent { timeline.extent()?.ok_or(ReplayError::Empty)? } else { (i64::MIN, i64::MAX) };
-    let (begin_ns, end_ns) = extent;
+/// Recorded time of the first and the last event. Reads the files once if that time matters.
+fn extent(options: &Options, timeline: &Timeline) -> Result<Option<(i64, i64)>, ReplayError> {
+    let has_range = options.from.is_some() || options.to.is_some();
+    if options.serve || has_range || options.fault_seed.is_some() {
+        return Ok(Some(timeline.extent()?.ok_or(ReplayError::Empty)?));
+    }
+    Ok(None)
+}
+
+/// The faults of the options, of the script, or of the seed alone.
+fn faults(options: &Options, extent: Option<(i64, i64)>, config: &Config) -> Result<Faults, ReplayError> {
+    let mut all = options.faults.clone();
+    if let Some(file) = &options.fault_script {
+        let text = std::fs::read_to_string(file);
+        let text = text.map_err(|source| ReplayError::FaultScript { file: file.clone(), source })?;
+        let lines = text.lines().map(|line| line.split('#').next().unwrap_or_default().trim());
+        for line in lines.filter(|line| !line.is_empty()) {
+            all.push(line.parse()?);
+        }
+    }
+    let names = |vehicle: &Vehicle| vehicle.sensors.iter().map(|sensor| sensor.name.clone()).collect();
+    let sensors: Vec<Vec<String>> = config.vehicles.iter().map(names).collect();
+    if let (Some(seed), Some((begin, end)), true) = (options.fault_seed, extent, all.is_empty()) {
+        all = Faults::random(seed, end.saturating_sub(begin) as f64 * 1e-9, &sensors);
+    }
+    Ok(Faults::new(all, options.fault_seed.unwrap_or(0), sensors)?)
+}
+
+/// How the replay begins; `extent` is the recorded time of its events, if it is known.
+fn initial_state(options: &Options, extent: Option<(i64, i64)>) -> Result<v1::ReplayState, ReplayError> {
+    let (begin_ns, end_ns) = extent.unwrap_or((i64::MIN, i64::MAX));
     let default_speed = if options.serve && !options.lockstep { Speed::Times(1.0) } else { Speed::Max };
     let phase = match (options.wait_readers, options.paused) {
         (Some(1..), _) => v1::ReplayPhase::Waiting,
@@ -229,7 +274,7 @@ fn initial_state(options: &Options, timeline: &Timeline) -> Result<v1::ReplaySta
     // Saturates: what lies outside the files is refused.
     let at = |seconds: f64| begin_ns.saturating_add((seconds * 1e9) as i64);
     let range = v1::ReplayControl { from_ns: options.from.map(at), to_ns: options.to.map(at), ..Default::default() };
-    if needs_extent && (range.from_ns.is_some() || range.to_ns.is_some()) {
+    if range.from_ns.is_some() || range.to_ns.is_some() {
         (state.from_ns, state.to_ns) = check(&range, &state, false)?;
     }
     Ok(state)

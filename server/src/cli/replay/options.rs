@@ -13,6 +13,7 @@ use crate::config::ConfigError;
 use crate::ingest::files::FilesError;
 use crate::record::reader::RecordingError;
 use crate::replay::control::{ControlError, RATES};
+use crate::replay::faults::{Fault, FaultError};
 use crate::replay::player::PlayError;
 use crate::server::{ShutdownError, StartError};
 
@@ -105,6 +106,16 @@ pub struct Options {
     /// Listen on free ports of this machine only; --ready-file and the log say which.
     #[arg(long, requires = "serve")]
     pub any_port: bool,
+    /// Replay with a fault: lost:SENSOR@FROM-TO, loss:PERCENT[@FROM-TO], clock:MS@AT, pose:X,Y,YAW@AT or stop@FROM-TO, in
+    /// seconds after the first event, metres and degrees; may be given several times.
+    #[arg(long = "fault", value_name = "FAULT", value_parser = |text: &str| text.parse::<Fault>())]
+    pub faults: Vec<Fault>,
+    /// Replay with the faults of this file, one a line; # begins a comment.
+    #[arg(long, value_name = "FILE")]
+    pub fault_script: Option<PathBuf>,
+    /// Seed of the faults; without --fault and --fault-script it draws one of each kind.
+    #[arg(long, value_name = "SEED")]
+    pub fault_seed: Option<u64>,
     /// End when the end of the drive or of --to is reached, instead of serving the last map.
     #[arg(long, requires = "serve")]
     pub exit_at_end: bool,
@@ -212,6 +223,41 @@ pub enum ReplayError {
     /// The files have no events.
     #[error("the files have no events to serve")]
     Empty,
+    /// A fault is not known.
+    #[error(transparent)]
+    Fault(#[from] FaultError),
+    /// The script of the faults cannot be read.
+    #[error("--fault-script {}: {source}", file.display())]
+    FaultScript {
+        /// The file.
+        file: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// Two recordings of one vehicle have different configurations of it.
+    #[error("{}: its configuration of vehicle {vehicle} differs from that of the files before", file.display())]
+    Differs {
+        /// The recording.
+        file: PathBuf,
+        /// The vehicle's name.
+        vehicle: String,
+    },
+    /// The configuration does not fit the recording: its sensors are others, or in another order.
+    #[error(
+        "{}: vehicle {vehicle} has the sensors [{configured}], but the recording has [{recorded}]; the same names in \
+         the same order are allowed",
+        file.display()
+    )]
+    Sensors {
+        /// The configuration.
+        file: PathBuf,
+        /// The vehicle's name.
+        vehicle: String,
+        /// Its sensors in the configuration, separated by commas.
+        configured: String,
+        /// Its sensors in the recording, separated by commas.
+        recorded: String,
+    },
     /// The replay could not go on.
     #[error(transparent)]
     Play(#[from] PlayError),

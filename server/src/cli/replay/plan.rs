@@ -1,7 +1,7 @@
 //! The options and files of a replay -> everything that is known before its first event: the configuration, how the
 //! sensors are mounted, the readings.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -18,12 +18,13 @@ use nalgebra::{Isometry3, Point3, Vector3};
 use super::clouds::{Clouds, Written};
 use super::options::{Options, ReplayError};
 use super::summary::{Mount, describe};
-use crate::config::{Calibrations, Config, Origin, Recorder};
+use crate::config::{Calibrations, Config, Origin, Recorder, Vehicle};
 use crate::ingest::files::mcap::{McapError, McapOptions};
 use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
 use crate::ingest::ros::decoder::PoseSource;
 use crate::record::reader::RecordingReader;
+use crate::replay::faults::Faults;
 use crate::replay::timeline::{Timeline, Track};
 use crate::server::Setup;
 
@@ -62,6 +63,12 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
         None => false,
     };
     check(options, recorded.as_deref(), journal)?;
+    if options.vehicle.is_none()
+        && options.config.is_none()
+        && let Some(recordings) = several_vehicles(&files)?
+    {
+        return plan_several(options, recordings, files.bytes());
+    }
     let mut known = configured(options, recorded.as_deref())?;
     let vehicle = &mut known.config.vehicles[0];
     (vehicle.udp, vehicle.ros) = (None, None);
@@ -92,8 +99,95 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     let (observer, clouds) = clouds.map(Clouds::observer).unzip();
     let boot_id = setup.boot_id;
     let tracks = vec![Track { files: options.files.clone(), options: wanted }];
-    let timeline = Timeline { tracks, bytes_read: Arc::default() };
+    let timeline = Timeline { tracks, bytes_read: Arc::default(), faults: Faults::default() };
     Ok(Plan { setup: Setup { observer, ..setup }, mount, extrinsics, timeline, bytes, boot_id, clouds })
+}
+
+/// A recording of this server.
+struct Recorded {
+    file: PathBuf,
+    config: Config,
+    tables: Calibrations,
+    boot_id: u64,
+}
+
+/// The recordings, if all files are recordings of this server and they have several vehicles.
+fn several_vehicles(files: &Readings) -> Result<Option<Vec<Recorded>>, ReplayError> {
+    let (mut recordings, mut names) = (Vec::new(), BTreeSet::new());
+    for (file, kind) in files.files() {
+        if kind != Kind::Mcap {
+            return Ok(None);
+        }
+        let recording = RecordingReader::open(file)?;
+        if recording.header().config.is_none() {
+            return Ok(None);
+        }
+        let (config, tables) = recording.config()?;
+        names.extend(config.vehicles.iter().map(|vehicle| vehicle.name.clone()));
+        recordings.push(Recorded { file: file.to_owned(), config, tables, boot_id: recording.header().boot_id });
+    }
+    Ok((names.len() > 1).then_some(recordings))
+}
+
+/// The plan of several vehicles in one recorded time. The files of one vehicle follow each other.
+fn plan_several(options: &Options, recordings: Vec<Recorded>, bytes: u64) -> Result<Plan, ReplayError> {
+    let given = [
+        ("--extrinsics", options.extrinsics.is_some()),
+        ("--model", options.model.is_some()),
+        ("--rpm", options.rpm.is_some()),
+        ("--calibration", options.calibration.is_some()),
+        ("--clouds", options.clouds.is_some()),
+    ];
+    if let Some((option, _)) = given.iter().find(|(_, is_given)| *is_given) {
+        let reason = "the recordings have several vehicles; name one with --vehicle".to_owned();
+        return Err(ReplayError::Unused { option: (*option).to_owned(), reason });
+    }
+    let boot_ids: BTreeSet<u64> = recordings.iter().map(|recording| recording.boot_id).collect();
+    let boot_id = boot_ids.first().copied().filter(|_| boot_ids.len() == 1);
+    let config = Config { vehicles: Vec::new(), ..Config::default() };
+    let mut known = Known { config, tables: Vec::new(), boot_id, is_mounted: true, remarks: Vec::new() };
+    let mut tracks: Vec<Track> = Vec::new();
+    for Recorded { file, config, tables, .. } in recordings {
+        for (mut vehicle, tables) in config.vehicles.into_iter().zip(tables) {
+            (vehicle.udp, vehicle.ros) = (None, None);
+            match known.config.vehicles.iter().position(|before| before.name == vehicle.name) {
+                Some(index) if known.config.vehicles[index] != vehicle => {
+                    return Err(ReplayError::Differs { file, vehicle: vehicle.name });
+                }
+                Some(index) => tracks[index].files.push(file.clone()),
+                None => {
+                    let options = McapOptions { vehicle: Some(vehicle.name.clone()), ..McapOptions::default() };
+                    tracks.push(Track { files: vec![file.clone()], options });
+                    known.config.vehicles.push(vehicle);
+                    known.tables.push(tables);
+                }
+            }
+        }
+    }
+    let extrinsics = known.config.vehicles[0].sensors[0].extrinsics;
+    let setup = known.setup(options)?;
+    let boot_id = setup.boot_id;
+    let timeline = Timeline { tracks, bytes_read: Arc::default(), faults: Faults::default() };
+    Ok(Plan { setup, mount: Mount::Given, extrinsics, timeline, bytes, boot_id, clouds: None })
+}
+
+/// Refuses a configuration whose sensors are not those of the recording: events name a sensor by its place.
+fn check_sensors(file: &Path, config: &Config, recording: &Path) -> Result<(), ReplayError> {
+    let recording = RecordingReader::open(recording)?;
+    if recording.header().config.is_none() {
+        return Ok(());
+    }
+    let (recorded, _) = recording.config()?;
+    let vehicle = &config.vehicles[0];
+    let names =
+        |vehicle: &Vehicle| vehicle.sensors.iter().map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", ");
+    let of_name = recorded.vehicles.iter().find(|of| of.name == vehicle.name || recorded.vehicles.len() == 1);
+    match of_name.map(|of| (names(vehicle), names(of))) {
+        Some((configured, recorded)) if configured != recorded => {
+            Err(ReplayError::Sensors { file: file.to_owned(), vehicle: vehicle.name.clone(), configured, recorded })
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Refuses options that have no meaning for the files. `mcap` is the first MCAP file, and `journal` is true if it is a
@@ -301,6 +395,7 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, Repla
         let mut config = Config::load(file, &options.set)?;
         let mut tables = config.calibrations(file)?;
         pick(file, &mut config, &mut tables)?;
+        recorded.map_or(Ok(()), |recording| check_sensors(file, &config, recording))?;
         return Ok(known(config, tables, None, true));
     }
     if let Some(file) = recorded {

@@ -155,14 +155,15 @@ impl MapService for Maps {
         &self,
         request: Request<Streaming<v1::WatchRequest>>,
     ) -> Result<Response<Self::WatchStream>, Status> {
-        let address = request.remote_addr();
+        let agent = request.metadata().get("user-agent").and_then(|agent| agent.to_str().ok()).map(str::to_owned);
         let mut requests = request.into_inner();
         let first = tokio::time::timeout(SELECTION_TIMEOUT, requests.message())
             .await
             .map_err(|_| Status::deadline_exceeded(format!("no selection within {SELECTION_TIMEOUT:?}")))??;
         let selection = first.and_then(|first| first.selection);
         let selection = selection.ok_or_else(|| Status::invalid_argument("the first request carries a selection"))?;
-        let name = address.map_or("a gRPC reader".to_owned(), |address| format!("gRPC reader {address}"));
+        let layers = if selection.layers.is_empty() { "all layers".to_owned() } else { selection.layers.join(", ") };
+        let name = format!("gRPC reader of {layers} ({})", agent.as_deref().unwrap_or("no user-agent"));
         Ok(Response::new(Box::pin(watch(&self.vehicles, selection, requests, name)?)))
     }
 
