@@ -50,8 +50,8 @@ pub enum ClientError {
         /// The address.
         address: String,
     },
-    /// The replay that the server serves has reached its end, and its last map was returned. The stream goes on: further
-    /// maps come if the replay is set back.
+    /// The replay that the server serves has reached its end, and its last map was returned. The stream goes on:
+    /// further maps come if the replay is set back.
     #[error("{address}: the replay has ended")]
     ReplayEnded {
         /// The address.

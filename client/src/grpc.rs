@@ -152,7 +152,8 @@ impl Client {
         Ok(map.with_arrival(&Clock::default()))
     }
 
-    /// Controls the replay that the server serves; an empty request changes nothing. Returns the state after the change.
+    /// Controls the replay that the server serves; an empty request changes nothing. Returns the state after the
+    /// change.
     ///
     /// # Errors
     /// [`ClientError::Unreachable`] if the connection fails, [`ClientError::Refused`] if the server serves no replay

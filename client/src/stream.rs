@@ -106,8 +106,8 @@ impl MapStream {
     /// # Errors
     /// Why the stream has ended, after its last map was returned; subscribe again then. [`ClientError::Ended`] if the
     /// server ended it, [`ClientError::Unreachable`] if the connection failed, [`ClientError::Refused`] if the server
-    /// refused a request, [`ClientError::Map`] if a map is invalid. [`ClientError::ReplayEnded`] once after the last map
-    /// of a replay; the stream has not ended then.
+    /// refused a request, [`ClientError::Map`] if a map is invalid. [`ClientError::ReplayEnded`] once after the last
+    /// map of a replay; the stream has not ended then.
     pub async fn next(&mut self) -> Result<Update, ClientError> {
         loop {
             {

@@ -27,8 +27,8 @@ class _Counters(NamedTuple):
 
 
 class MapStream:
-    """An iterator over the newest map; it stops at the end of a replay, and has no end otherwise. Close it, or use it in
-    a `with` statement."""
+    """An iterator over the newest map; it stops at the end of a replay, and has no end otherwise. Close it, or use it
+    in a `with` statement."""
 
     def __init__(self, clock: Clock = Clock()) -> None:
         self._clock = clock

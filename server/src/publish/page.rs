@@ -3,7 +3,7 @@
 //!
 //! The WebSocket sends each newest map as a binary `clearway.v1.MapUpdate` with all layers, and the status once a
 //! second as a JSON text. Over a replay it also sends its state as a JSON text (`type`: `replay`) at each change, and
-//! takes requests from pages of its own address ([`super::page_replay`]). A browser that reads nothing for [`SEND_TIMEOUT`] is disconnected.
+//! takes requests from pages of its own address. A browser that reads nothing for [`SEND_TIMEOUT`] is disconnected.
 
 use std::time::Duration;
 

@@ -7,6 +7,7 @@
 //! | [`clock`] | recorded time -> when an event is due, and how far its stamps move |
 //! | [`control`] | requests of clients -> commands; the state of the replay -> clients |
 //! | [`snapshots`] | pipelines at some moments -> the last one before another moment |
+//! | [`outcome`] | how a replay ended, or why it cannot go on |
 //! | [`player`] | readings, commands -> stepped engines |
 //!
 //! A jump goes back to a copy of the pipelines and applies every event from there to the requested moment without
@@ -15,6 +16,7 @@
 pub mod clock;
 pub mod control;
 pub mod faults;
+pub mod outcome;
 pub mod player;
 pub mod snapshots;
 pub mod timeline;

@@ -11,15 +11,16 @@ use tokio::runtime::Handle;
 
 use super::clock::ReplayClock;
 use super::control::{Command, ControlError, ReplayInput, check};
+use super::outcome::{PlayError, Played};
 use super::snapshots::{Snapshot, Snapshots};
-use super::timeline::{Ahead, Remarks, Timeline};
+use super::timeline::{Ahead, Timeline};
 use crate::clock::now_ns;
 use crate::counted::counted;
 use crate::encode::Replayed;
 use crate::engine::Engine;
 use crate::ingest::files::FilesError;
 use crate::ingest::files::mcap::RefusedMessages;
-use crate::ingest::queue::{EventQueue, QueueClosedError, QueuedEvent};
+use crate::ingest::queue::{EventQueue, QueuedEvent};
 
 /// Interval at which a waiting replay looks for live observations and readers. Ours: short beside a revolution.
 const POLL: Duration = Duration::from_millis(20);
@@ -53,40 +54,6 @@ pub struct PlayerOptions {
     pub acknowledge_timeout: Duration,
     /// The boot id that maps are served with, if their header differs from the recorded one; each jump adds 1.
     pub boot_id: u64,
-}
-
-/// How a replay ended.
-#[derive(Debug, Default)]
-pub struct Played {
-    /// False if it was stopped before the end of its range.
-    pub reached_end: bool,
-    /// What the files have beside their readings; empty if their end was not reached.
-    pub remarks: Remarks,
-}
-
-/// A replay cannot go on.
-#[derive(Debug, thiserror::Error)]
-pub enum PlayError {
-    /// A file cannot be read.
-    #[error(transparent)]
-    Files(#[from] FilesError),
-    /// A queue is closed.
-    #[error(transparent)]
-    Queue(#[from] QueueClosedError),
-    /// A reader has not acknowledged a map in lockstep.
-    #[error(
-        "lockstep: map {sequence} of vehicle {vehicle} was not acknowledged within {seconds} s; awaited: {readers}"
-    )]
-    Unacknowledged {
-        /// The vehicle's name.
-        vehicle: String,
-        /// Sequence of the map.
-        sequence: u64,
-        /// The longest wait, in seconds.
-        seconds: f64,
-        /// The readers that have not acknowledged it.
-        readers: String,
-    },
 }
 
 /// The client or the user wants the replay to end.
@@ -223,7 +190,11 @@ impl Player {
 
     /// Steps the next reading, of recorded time `at_ns`, when it is due, unless a command comes before.
     fn wait_for(&mut self, at_ns: i64) -> Result<Result<(), Stopped>, PlayError> {
-        let due = self.clock.due(at_ns, now_ns()).filter(|_| self.step.is_none());
+        if self.step.is_some() {
+            // A step is as fast as possible, and its stamps are those of the present.
+            self.clock.restart();
+        }
+        let due = self.step.is_none().then(|| self.clock.due(at_ns, now_ns())).flatten();
         let left = due.map_or(Duration::ZERO, |due| due.saturating_duration_since(Instant::now()));
         let has_command = !self.input.commands.is_empty();
         if left > EXACT || has_command {

@@ -5,6 +5,7 @@
 //! |---|---|
 //! | [`options`] | the command line -> [`Options`] |
 //! | `plan` | options, files -> configuration, mount, readings |
+//! | `recordings` | files -> recordings of several vehicles; sensors that do not fit |
 //! | `ready_file` | the running server -> the file that tells programs its addresses |
 //! | `keys` | lines of a terminal -> requests |
 //! | [`state`] | the state of the replay -> text, JSON |
@@ -30,7 +31,8 @@ use crate::config::{Config, Vehicle};
 use crate::replay::ReplayHandle;
 use crate::replay::control::check;
 use crate::replay::faults::Faults;
-use crate::replay::player::{Played, Player, PlayerOptions, ReplayedVehicle};
+use crate::replay::outcome::Played;
+use crate::replay::player::{Player, PlayerOptions, ReplayedVehicle};
 use crate::replay::timeline::Timeline;
 use crate::server::{Running, Server, Setup, random};
 use crate::sync::locked;
@@ -40,6 +42,7 @@ mod keys;
 pub mod options;
 mod plan;
 mod ready_file;
+mod recordings;
 pub mod state;
 pub mod summary;
 
@@ -127,8 +130,8 @@ async fn draw(progress: Arc<Progress>) {
 }
 
 /// Replays the files to their end. `started` is called with the running server before the first event; with
-/// [`Options::serve`] the replay returns only after `stop` has resolved, or with [`Options::exit_at_end`]. It ends early
-/// if `stop` resolves. Needs a multi-thread tokio runtime.
+/// [`Options::serve`] the replay returns only after `stop` has resolved, or with [`Options::exit_at_end`]. It ends
+/// early if `stop` resolves. Needs a multi-thread tokio runtime.
 ///
 /// # Errors
 /// [`ReplayError`]; nothing is left running.
@@ -183,7 +186,11 @@ pub async fn replay(
     let runtime = tokio::runtime::Handle::current();
     let play = move || Player::new(timeline, vehicles, input, player_options, runtime)?.run();
     let outcome = match &ready_file {
-        Err(_) => Ok(Ok(Played::default())),
+        Err(_) => {
+            // With its engines, for which the recorder waits.
+            drop(play);
+            Ok(Ok(Played::default()))
+        }
         Ok(_) => {
             let mut player = tokio::task::spawn_blocking(play);
             tokio::select! {

@@ -14,7 +14,7 @@ use crate::ingest::files::FilesError;
 use crate::record::reader::RecordingError;
 use crate::replay::control::{ControlError, RATES};
 use crate::replay::faults::{Fault, FaultError};
-use crate::replay::player::PlayError;
+use crate::replay::outcome::PlayError;
 use crate::server::{ShutdownError, StartError};
 
 /// Make maps from recorded drives: pcap, pcapng, MCAP, KITTI, nuScenes and PCD files or folders.
@@ -106,8 +106,8 @@ pub struct Options {
     /// Listen on free ports of this machine only; --ready-file and the log say which.
     #[arg(long, requires = "serve")]
     pub any_port: bool,
-    /// Replay with a fault: lost:SENSOR@FROM-TO, loss:PERCENT[@FROM-TO], clock:MS@AT, pose:X,Y,YAW@AT or stop@FROM-TO, in
-    /// seconds after the first event, metres and degrees; may be given several times.
+    /// Replay with a fault: lost:SENSOR@FROM-TO, loss:PERCENT[@FROM-TO], clock:MS@AT, pose:X,Y,YAW@AT or stop@FROM-TO,
+    /// in seconds after the first event, metres and degrees; may be given several times.
     #[arg(long = "fault", value_name = "FAULT", value_parser = |text: &str| text.parse::<Fault>())]
     pub faults: Vec<Fault>,
     /// Replay with the faults of this file, one a line; # begins a comment.

@@ -17,8 +17,9 @@ use nalgebra::{Isometry3, Point3, Vector3};
 
 use super::clouds::{Clouds, Written};
 use super::options::{Options, ReplayError};
+use super::recordings::{Recorded, check_sensors, several_vehicles};
 use super::summary::{Mount, describe};
-use crate::config::{Calibrations, Config, Origin, Recorder, Vehicle};
+use crate::config::{Calibrations, Config, Origin, Recorder};
 use crate::ingest::files::mcap::{McapError, McapOptions};
 use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
@@ -103,32 +104,6 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     Ok(Plan { setup: Setup { observer, ..setup }, mount, extrinsics, timeline, bytes, boot_id, clouds })
 }
 
-/// A recording of this server.
-struct Recorded {
-    file: PathBuf,
-    config: Config,
-    tables: Calibrations,
-    boot_id: u64,
-}
-
-/// The recordings, if all files are recordings of this server and they have several vehicles.
-fn several_vehicles(files: &Readings) -> Result<Option<Vec<Recorded>>, ReplayError> {
-    let (mut recordings, mut names) = (Vec::new(), BTreeSet::new());
-    for (file, kind) in files.files() {
-        if kind != Kind::Mcap {
-            return Ok(None);
-        }
-        let recording = RecordingReader::open(file)?;
-        if recording.header().config.is_none() {
-            return Ok(None);
-        }
-        let (config, tables) = recording.config()?;
-        names.extend(config.vehicles.iter().map(|vehicle| vehicle.name.clone()));
-        recordings.push(Recorded { file: file.to_owned(), config, tables, boot_id: recording.header().boot_id });
-    }
-    Ok((names.len() > 1).then_some(recordings))
-}
-
 /// The plan of several vehicles in one recorded time. The files of one vehicle follow each other.
 fn plan_several(options: &Options, recordings: Vec<Recorded>, bytes: u64) -> Result<Plan, ReplayError> {
     let given = [
@@ -169,25 +144,6 @@ fn plan_several(options: &Options, recordings: Vec<Recorded>, bytes: u64) -> Res
     let boot_id = setup.boot_id;
     let timeline = Timeline { tracks, bytes_read: Arc::default(), faults: Faults::default() };
     Ok(Plan { setup, mount: Mount::Given, extrinsics, timeline, bytes, boot_id, clouds: None })
-}
-
-/// Refuses a configuration whose sensors are not those of the recording: events name a sensor by its place.
-fn check_sensors(file: &Path, config: &Config, recording: &Path) -> Result<(), ReplayError> {
-    let recording = RecordingReader::open(recording)?;
-    if recording.header().config.is_none() {
-        return Ok(());
-    }
-    let (recorded, _) = recording.config()?;
-    let vehicle = &config.vehicles[0];
-    let names =
-        |vehicle: &Vehicle| vehicle.sensors.iter().map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", ");
-    let of_name = recorded.vehicles.iter().find(|of| of.name == vehicle.name || recorded.vehicles.len() == 1);
-    match of_name.map(|of| (names(vehicle), names(of))) {
-        Some((configured, recorded)) if configured != recorded => {
-            Err(ReplayError::Sensors { file: file.to_owned(), vehicle: vehicle.name.clone(), configured, recorded })
-        }
-        _ => Ok(()),
-    }
 }
 
 /// Refuses options that have no meaning for the files. `mcap` is the first MCAP file, and `journal` is true if it is a

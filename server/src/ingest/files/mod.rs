@@ -246,7 +246,8 @@ impl Readings {
         }
     }
 
-    /// Refuses a file whose first reading is older than the last of the file before. Bags of ROS 2 may overlap a little.
+    /// Refuses a file whose first reading is older than the last of the file before. Bags of ROS 2 may overlap a
+    /// little.
     fn check_overlap(&mut self, reading: &Reading, is_journal: bool) -> Result<(), FilesError> {
         let file = match &self.open {
             Some(Open::Capture(file, _)) => file,

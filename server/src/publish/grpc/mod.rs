@@ -88,7 +88,8 @@ pub enum GrpcError {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
-/// Serves maps, `ingest` if it is configured, and the control of `replay` if there is one, until `stop` resolves and all streams have ended.
+/// Serves maps, `ingest` if it is configured, and the control of `replay` if there is one, until `stop` resolves and
+/// all streams have ended.
 ///
 /// # Errors
 /// [`GrpcError::Transport`] if the transport fails, [`GrpcError::Reflection`] if the descriptors are invalid.
