@@ -45,6 +45,8 @@ pub struct MapStream {
     seen: Option<Counters>,
     /// The last map returned, until it is reported as stale.
     fresh: Option<MapView>,
+    /// `Slot::replay_ends` at the last call.
+    replay_ends: u64,
     task: JoinHandle<()>,
 }
 
@@ -53,6 +55,9 @@ struct Slot {
     newest: Option<MapView>,
     counters: Counters,
     ended: Option<ClientError>,
+    /// How often a replay has reached its end, and how the reader is told.
+    replay_ends: u64,
+    replay_ended: Option<ClientError>,
 }
 
 /// Numbers of maps since the start of the stream.
@@ -93,7 +98,7 @@ impl MapStream {
             let reason = task.await;
             sender.send_modify(|slot| slot.ended = Some(reason));
         });
-        Self { slot, seen: None, fresh: None, task }
+        Self { slot, seen: None, fresh: None, replay_ends: 0, task }
     }
 
     /// Waits for a map newer than the last one returned.
@@ -101,7 +106,8 @@ impl MapStream {
     /// # Errors
     /// Why the stream has ended, after its last map was returned; subscribe again then. [`ClientError::Ended`] if the
     /// server ended it, [`ClientError::Unreachable`] if the connection failed, [`ClientError::Refused`] if the server
-    /// refused a request, [`ClientError::Map`] if a map is invalid.
+    /// refused a request, [`ClientError::Map`] if a map is invalid. [`ClientError::ReplayEnded`] once after the last
+    /// map of a replay; the stream has not ended then.
     pub async fn next(&mut self) -> Result<Update, ClientError> {
         loop {
             {
@@ -114,6 +120,10 @@ impl MapStream {
                     let skipped = counters.maps - before.maps - 1;
                     let (lost, left_out) = (counters.lost - before.lost, counters.left_out - before.left_out);
                     return Ok(Update { map: map.clone(), skipped, lost, left_out });
+                }
+                if let Some(ended) = slot.replay_ended.clone().filter(|_| slot.replay_ends > self.replay_ends) {
+                    self.replay_ends = slot.replay_ends;
+                    return Err(ended);
                 }
                 if let Some(reason) = &slot.ended {
                     return Err(reason.clone());
@@ -185,6 +195,14 @@ pub(crate) struct LatestSlot {
 }
 
 impl LatestSlot {
+    /// Records that the replay has ended, for the reader of the stream.
+    pub(crate) fn end_replay(&self, ended: ClientError) {
+        self.slot.send_modify(|slot| {
+            slot.replay_ends += 1;
+            slot.replay_ended = Some(ended);
+        });
+    }
+
     /// Stores a map as the newest, with the numbers of maps between it and the one before. It ignores a map that is not
     /// newer than the newest of the same run of the server (a replayed one).
     pub(crate) fn store(&self, map: MapView, missed: Missed) {

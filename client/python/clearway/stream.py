@@ -27,7 +27,8 @@ class _Counters(NamedTuple):
 
 
 class MapStream:
-    """An endless iterator over the newest map. Close it, or use it in a `with` statement."""
+    """An iterator over the newest map; it stops at the end of a replay, and has no end otherwise. Close it, or use it
+    in a `with` statement."""
 
     def __init__(self, clock: Clock = Clock()) -> None:
         self._clock = clock
@@ -40,6 +41,8 @@ class MapStream:
         self._fresh: Map | None = None
         self._ended: ClearwayError | None = None
         self._closed = False
+        #: Replays that have reached their end, and those of them after which the iteration has stopped.
+        self._replay_ends = self._replay_ends_seen = 0
         self._close: Callable[[], None] = lambda: None
 
     def __iter__(self) -> Iterator[Map]:
@@ -47,7 +50,7 @@ class MapStream:
 
     def __next__(self) -> Map:
         """Waits for a map newer than the last one returned. Raises the reason if the stream has ended; stops when
-        closed."""
+        closed, and once after the last map of a replay: iterate again for the maps of a replay that is set back."""
         return self._next(report_stale=False)
 
     def next_or_stale(self) -> Map:
@@ -58,7 +61,7 @@ class MapStream:
 
     def _next(self, *, report_stale: bool) -> Map:
         with self._changed:
-            while not (self._closed or self._is_unseen() or self._ended):
+            while not (self._closed or self._is_unseen() or self._ended or self.replay_ended):
                 last = self._fresh if report_stale else None
                 if last is not None and last.stale:
                     self._fresh = None
@@ -68,6 +71,9 @@ class MapStream:
             if self._closed:
                 raise StopIteration
             newest = self._newest
+            if self.replay_ended and not self._is_unseen():
+                self._replay_ends_seen = self._replay_ends
+                raise StopIteration
             if newest is None or not self._is_unseen():
                 assert self._ended is not None
                 raise self._ended
@@ -79,6 +85,11 @@ class MapStream:
             )
             self._fresh = None if last.stale else last
             return last
+
+    @property
+    def replay_ended(self) -> bool:
+        """True from the end of a replay until the iteration has stopped for it."""
+        return self._replay_ends > self._replay_ends_seen
 
     def newest(self) -> Map | None:
         """The newest map at this moment; `None` before the first. It does not wait and does not change the counts of
@@ -119,6 +130,12 @@ class MapStream:
         """Ends the stream with a reason. For the background thread."""
         with self._changed:
             self._ended = reason
+            self._changed.notify_all()
+
+    def end_replay(self) -> None:
+        """Records that the replay has ended. For the background thread."""
+        with self._changed:
+            self._replay_ends += 1
             self._changed.notify_all()
 
     def on_close(self, close: Callable[[], None]) -> None:

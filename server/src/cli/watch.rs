@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use anyhow::{Result, bail};
 use clap::Args;
-use clearway_client::{MapStream, StreamEvent, Subscription, Update, now_ns};
+use clearway_client::{ClientError, MapStream, StreamEvent, Subscription, Update, now_ns};
 use serde_json::json;
 
 use super::connection::{ServerOptions, explain};
@@ -61,8 +61,13 @@ async fn watch(options: &Options) -> Result<()> {
     let mut last = None;
     let mut printed = 0;
     while options.count.is_none_or(|count| printed < count) {
-        let update = match next(&mut maps, printed == 0).await? {
-            StreamEvent::Fresh(update) | StreamEvent::Stale(update) => update,
+        let update = match next(&mut maps, printed == 0).await {
+            Ok(StreamEvent::Fresh(update) | StreamEvent::Stale(update)) => update,
+            Err(error) if matches!(error.downcast_ref(), Some(ClientError::ReplayEnded { .. })) => {
+                eprintln!("clearway: {error}");
+                break;
+            }
+            Err(error) => return Err(error),
         };
         let id = (update.map.header().boot_id, update.map.sequence());
         let is_new = last.replace(id) != Some(id);

@@ -22,6 +22,7 @@ use super::served::{Served, Vehicles};
 use crate::config::Foxglove as Options;
 use crate::encode::EncodedMap;
 use crate::newest::NewestSweep;
+use crate::status::Reader;
 use crate::subscriptions::LayerSubscription;
 use crate::sync::locked;
 
@@ -104,6 +105,7 @@ struct ClientSubscription {
     /// Keeps its layer active.
     _layer: Option<LayerSubscription>,
     points: Option<watch::Receiver<NewestSweep>>,
+    _reader: Reader,
 }
 
 impl VehicleChannels {
@@ -134,8 +136,9 @@ impl VehicleChannels {
         let status = &self.served.status;
         let layer_subscription = layer.map(|name| status.subscriptions.subscribe(&[name.to_owned()]));
         let points = is_points.then(|| status.sweeps.subscribe());
+        let _reader = Reader::new(&status.foxglove_readers);
         locked(&self.subscriptions)
-            .insert((channel, sink), ClientSubscription { is_new: true, _layer: layer_subscription, points });
+            .insert((channel, sink), ClientSubscription { is_new: true, _layer: layer_subscription, points, _reader });
         self.subscribed.notify_one();
     }
 

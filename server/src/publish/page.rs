@@ -2,26 +2,30 @@
 //! `/metrics`.
 //!
 //! The WebSocket sends each newest map as a binary `clearway.v1.MapUpdate` with all layers, and the status once a
-//! second as a JSON text. A browser that reads nothing for [`SEND_TIMEOUT`] is disconnected.
+//! second as a JSON text. Over a replay it also sends its state as a JSON text (`type`: `replay`) at each change, and
+//! takes requests from pages of its own address. A browser that reads nothing for [`SEND_TIMEOUT`] is disconnected.
 
 use std::time::Duration;
 
-use axum::Router;
 use axum::extract::ws::{Message as Frame, WebSocket, WebSocketUpgrade};
 use axum::extract::{Query, State};
-use axum::http::{StatusCode, Uri, header};
+use axum::http::{HeaderMap, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
+use axum::{Extension, Router};
 use bytes::Bytes;
 use clearway_proto::v1;
 use prost::Message;
 use rust_embed::RustEmbed;
 use serde_json::Value;
 use tokio::net::TcpListener;
+use tokio::sync::watch;
 
 use super::connections::Connections;
+use super::page_replay::{PageReplay, is_same_origin, replay_changed, replay_json};
 use super::served::{Served, Vehicles};
 use crate::clock::now_ns;
+use crate::replay::ReplayHandle;
 use crate::status::{Reader, prometheus};
 
 /// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.
@@ -44,6 +48,7 @@ struct Assets;
 pub async fn serve(
     listener: TcpListener,
     vehicles: Vehicles,
+    replay: Option<ReplayHandle>,
     stop: impl Future<Output = ()> + Send + 'static,
 ) -> std::io::Result<()> {
     let router = Router::new()
@@ -52,6 +57,7 @@ pub async fn serve(
         .route("/healthz", get(health))
         .route("/metrics", get(metrics))
         .fallback(asset)
+        .layer(Extension(replay))
         .with_state(vehicles);
     axum::serve(Connections::new(listener, CONNECTIONS_MAX), router).with_graceful_shutdown(stop).await
 }
@@ -97,23 +103,32 @@ struct LiveQuery {
     vehicle: String,
 }
 
-async fn live(State(vehicles): State<Vehicles>, Query(query): Query<LiveQuery>, upgrade: WebSocketUpgrade) -> Response {
+async fn live(
+    State(vehicles): State<Vehicles>,
+    Extension(replay): Extension<Option<ReplayHandle>>,
+    Query(query): Query<LiveQuery>,
+    headers: HeaderMap,
+    upgrade: WebSocketUpgrade,
+) -> Response {
     match vehicles.find(&query.vehicle) {
         Ok(served) => {
             let served = served.clone();
-            upgrade.max_message_size(MESSAGE_BYTES_MAX).on_upgrade(move |socket| stream(socket, served))
+            let replay = replay.map(|handle| PageReplay { may_control: is_same_origin(&headers), handle });
+            upgrade.max_message_size(MESSAGE_BYTES_MAX).on_upgrade(move |socket| stream(socket, served, replay))
         }
         Err(unknown) => (StatusCode::NOT_FOUND, format!("{unknown}\n")).into_response(),
     }
 }
 
 /// Sends maps and status until the browser disconnects or stalls, or the engine stops.
-async fn stream(mut socket: WebSocket, served: Served) {
+async fn stream(mut socket: WebSocket, served: Served, replay: Option<PageReplay>) {
     let _reader = Reader::new(&served.status.page_readers);
     let subscription = served.status.subscriptions.subscribe(&[]);
     let mut newest = served.newest.clone();
     newest.mark_changed();
     let mut every = tokio::time::interval(STATUS_PERIOD);
+    let mut replay_state = replay.as_ref().map(|replay| replay.handle.state());
+    replay_state.iter_mut().for_each(watch::Receiver::mark_changed);
     let mut last_sequence = None;
     loop {
         let frame = tokio::select! {
@@ -121,9 +136,12 @@ async fn stream(mut socket: WebSocket, served: Served) {
                 let Ok(()) = changed else { break };
                 let map = newest.borrow_and_update().clone();
                 let Some(map) = map.filter(|map| subscription.is_covered_by(map)) else { continue };
-                let skipped = last_sequence.map_or(0, |last: u64| map.sequence.saturating_sub(last + 1));
-                last_sequence = Some(map.sequence);
-                let update = v1::MapUpdate { map: map.select(&[]), skipped, sent_ns: now_ns(), left_out: 0 };
+                let last = last_sequence.filter(|(boot_id, _)| *boot_id == map.boot_id);
+                let skipped = last.map_or(0, |(_, last): (u64, u64)| map.sequence.saturating_sub(last + 1));
+                last_sequence = Some((map.boot_id, map.sequence));
+                let update = v1::MapUpdate {
+                    map: map.select(&[]), skipped, sent_ns: now_ns(), ..Default::default()
+                };
                 Frame::Binary(Bytes::from(update.encode_to_vec()))
             }
             _ = every.tick() => {
@@ -131,8 +149,13 @@ async fn stream(mut socket: WebSocket, served: Served) {
                 status["type"] = "status".into();
                 Frame::Text(status.to_string().into())
             }
+            state = replay_changed(&mut replay_state) => Frame::Text(replay_json(&state, "").into()),
             received = socket.recv() => match received {
-                // Messages of the page have no meaning; the library answers pings.
+                Some(Ok(Frame::Text(text))) => match &replay {
+                    Some(replay) => Frame::Text(replay.answer(&text).await.into()),
+                    // Other messages of the page have no meaning; the library answers pings.
+                    None => continue,
+                },
                 Some(Ok(_)) => continue,
                 Some(Err(_)) | None => break,
             },

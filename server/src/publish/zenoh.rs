@@ -3,7 +3,8 @@
 //! A layer is made while its key has a subscriber, and for each query on it. Late joiners get the current map from the
 //! publisher's cache; it is old if the layer had no subscriber, and its age says so. The same key answers queries.
 //! Subscribers can detect misses. A liveliness token `clearway/<vehicle>` lives as long as the vehicle is served;
-//! `clearway/<vehicle>/status` has the status once a second, as JSON.
+//! `clearway/<vehicle>/status` has the status once a second, as JSON. `clearway/<vehicle>/replay` has `{"ended":true}`
+//! after the last map of a replay, and `{"ended":false}` when it is set back.
 //!
 //! Congestion drops: blocking would let one stopped peer delay the healthy ones. Maps have the highest priority on a
 //! link, because planners brake by them; the status has the lowest, because the next one replaces it; observations and
@@ -23,6 +24,8 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 use super::ros::Node;
 use super::served::{Served, Vehicles};
 use crate::config::Zenoh as Options;
+use crate::encode::EncodedMap;
+use crate::status::Reader;
 use crate::zenoh_session::ZenohError;
 
 /// Time between two status messages.
@@ -110,7 +113,11 @@ impl Publisher {
             .map_err(ZenohError::of(format!("publisher {key}")))?;
         let token = self.session.liveliness().declare_token(format!("clearway/{vehicle}"));
         self.tokens.push(token.await.map_err(ZenohError::of(format!("liveliness clearway/{vehicle}")))?);
-        self.tasks.spawn(send_maps(served.clone(), publishers));
+        let key = format!("clearway/{vehicle}/replay");
+        let replay = self.session.declare_publisher(key.clone()).encoding(Encoding::APPLICATION_JSON).priority(MAPS);
+        let replay = replay.congestion_control(CongestionControl::Drop).await;
+        let replay = replay.map_err(ZenohError::of(format!("publisher {key}")))?;
+        self.tasks.spawn(send_maps(served.clone(), publishers, replay));
         self.tasks.spawn({
             let served = served.clone();
             async move {
@@ -154,7 +161,9 @@ async fn subscribe_while(
     matching: MatchingListener<FifoChannelHandler<MatchingStatus>>,
 ) {
     loop {
-        let _taken = matches.then(|| served.status.subscriptions.subscribe(&[layer.to_owned()]));
+        let _taken = matches.then(|| {
+            (served.status.subscriptions.subscribe(&[layer.to_owned()]), Reader::new(&served.status.zenoh_readers))
+        });
         match matching.recv_async().await {
             Ok(status) => matches = status.matching(),
             Err(_) => return,
@@ -162,21 +171,48 @@ async fn subscribe_while(
     }
 }
 
-async fn send_maps(served: Served, publishers: Vec<(&'static str, AdvancedPublisher<'static>)>) {
-    let mut newest = served.newest.clone();
+/// Sends each newest map, and after the last map of a replay that it has ended.
+async fn send_maps(
+    served: Served,
+    publishers: Vec<(&'static str, AdvancedPublisher<'static>)>,
+    replay: zenoh::pubsub::Publisher<'static>,
+) {
+    let (mut newest, mut replay_ended) = (served.newest.clone(), served.status.replay_ended.subscribe());
     newest.mark_changed();
-    while newest.changed().await.is_ok() {
-        let map = newest.borrow_and_update().clone();
-        let Some(map) = map else { continue };
-        for (layer, chunk) in &map.layers {
-            let Some((_, publisher)) = publishers.iter().find(|(name, _)| name == layer) else { continue };
-            if let Err(error) = publisher.put(map.layer(chunk)).await {
-                tracing::warn!(%error, layer, "zenoh: put");
+    let mut reported = false;
+    loop {
+        tokio::select! {
+            biased;
+            changed = newest.changed() => {
+                if changed.is_err() {
+                    break;
+                }
+                let map = newest.borrow_and_update().clone();
+                if let Some(map) = map {
+                    send_map(&map, &publishers).await;
+                }
+            }
+            Ok(()) = replay_ended.changed() => {}
+        }
+        let ended = *replay_ended.borrow();
+        if ended != reported && !newest.has_changed().unwrap_or(false) {
+            reported = ended;
+            if let Err(error) = replay.put(format!("{{\"ended\":{ended}}}")).await {
+                tracing::warn!(%error, "zenoh: replay");
             }
         }
     }
     // The engine has stopped, but the current map stays in the caches until the session ends.
     std::future::pending::<()>().await;
+}
+
+async fn send_map(map: &EncodedMap, publishers: &[(&'static str, AdvancedPublisher<'static>)]) {
+    for (layer, chunk) in &map.layers {
+        let Some((_, publisher)) = publishers.iter().find(|(name, _)| name == layer) else { continue };
+        if let Err(error) = publisher.put(map.layer(chunk)).await {
+            tracing::warn!(%error, layer, "zenoh: put");
+        }
+    }
 }
 
 fn map_encoding() -> Encoding {

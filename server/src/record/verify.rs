@@ -18,7 +18,7 @@ use clearway_proto::v1;
 use prost::Message;
 use serde_json::{Value, json};
 
-use crate::encode::EncodedMap;
+use crate::encode::{EncodedMap, as_served};
 use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 
 /// Greatest number of differences in a report; all are counted. Ours: the first ones explain the others.
@@ -221,7 +221,7 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
                 let replay = replays.iter_mut().find(|r| *r.name == *vehicle);
                 let computed = replay.and_then(|replay| replay.computed.remove(&(sequence, layer.clone())));
                 report.cells += if computed.is_some() { cells } else { 0 };
-                match computed {
+                match computed.map(|computed| as_served(computed, &bytes)) {
                     None => report.add(&vehicle, sequence, &layer, DifferenceKind::Extra),
                     Some(computed) if computed == bytes => report.equal += 1,
                     Some(computed) => report.add(&vehicle, sequence, &layer, first_difference(&bytes, &computed)),

@@ -20,3 +20,4 @@ pub use input::VehicleInput;
 pub use running::Running;
 pub use setup::{Setup, ShutdownError, StartError};
 pub use start::Server;
+pub(crate) use start::random;

@@ -2,6 +2,7 @@
 
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::sync::mpsc::Receiver;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -10,9 +11,12 @@ use tokio::task::JoinSet;
 
 use super::input::VehicleInput;
 use super::setup::ShutdownError;
+use crate::engine::Engine;
+use crate::ingest::queue::QueuedEvent;
 use crate::ingest::udp;
 use crate::publish::{Vehicles, foxglove};
 use crate::record::writer::Recorder;
+use crate::replay::ReplayHandle;
 use crate::subscriptions::LayerSubscription;
 
 /// Longest wait for each kind of publisher at shutdown. Ours: a stalled peer must not keep the server from ending.
@@ -33,6 +37,11 @@ pub struct Running {
     pub zenoh: Vec<String>,
     /// The address of the Foxglove WebSocket.
     pub foxglove: Option<SocketAddr>,
+    /// The engines that the caller steps, with the events of their queues; in the order of the vehicles. They must be
+    /// dropped before [`Running::shutdown`].
+    pub stepped: Vec<(Engine, Receiver<QueuedEvent>)>,
+    /// Controls the replay that the server serves.
+    pub(super) replay: Option<ReplayHandle>,
     pub(super) engines: Vec<(Arc<str>, JoinHandle<()>)>,
     pub(super) recorder: Option<Recorder>,
     pub(super) udp: Option<udp::UdpThreads>,
@@ -51,6 +60,11 @@ impl Running {
         self.recorder.as_ref().map(|recorder| recorder.counts().to_proto().file)
     }
 
+    /// Controls the replay that the server serves, if it serves one.
+    pub fn replay(&self) -> Option<ReplayHandle> {
+        self.replay.clone()
+    }
+
     /// Resolves when the server stops.
     pub(super) fn stopped(&self) -> impl Future<Output = ()> + Send + use<> {
         let mut stopped = self.stop.subscribe();
@@ -66,6 +80,7 @@ impl Running {
     /// # Errors
     /// [`ShutdownError`] if an engine panicked or the recording is incomplete; everything has ended then as well.
     pub async fn shutdown(mut self) -> Result<(), ShutdownError> {
+        self.stepped.clear();
         if let Some(threads) = self.udp.take() {
             // Fails only if the runtime shuts down; then the threads end by themselves.
             let _ = tokio::task::spawn_blocking(move || threads.stop()).await;

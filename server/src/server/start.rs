@@ -42,7 +42,7 @@ impl Server {
         let boot_id = boot_id.unwrap_or_else(random);
         let mut observer = setup.observer;
         calibrations.resize_with(config.vehicles.len(), Vec::new);
-        let mut running = Running::default();
+        let mut running = Running { replay: setup.replay, ..Running::default() };
         let mut prepared = Vec::new();
         for (vehicle, tables) in config.vehicles.iter().zip(&mut calibrations) {
             tables.resize(vehicle.sensors.len(), None);
@@ -51,7 +51,8 @@ impl Server {
         }
         running.vehicles = Vehicles(prepared.iter().map(|prepared| prepared.served.clone()).collect());
         let header = || header(&config, &calibrations, boot_id, &setup.config_comments, setup.metadata);
-        match running.start_all(&config, setup.certificates, prepared, setup.from_files, header).await {
+        let driver = Driver { from_files: setup.from_files, is_stepped: setup.is_stepped };
+        match running.start_all(&config, setup.certificates, prepared, driver, header).await {
             Ok(()) => Ok(running),
             Err(error) => {
                 // The caller needs the error of the start, not one of the shutdown that follows from it.
@@ -60,6 +61,13 @@ impl Server {
             }
         }
     }
+}
+
+/// Where the events come from, and which thread steps the engines ([`Setup::from_files`], [`Setup::is_stepped`]).
+#[derive(Clone, Copy)]
+struct Driver {
+    from_files: bool,
+    is_stepped: bool,
 }
 
 /// One vehicle before its engine runs.
@@ -79,7 +87,8 @@ impl Running {
         let status = Arc::new(VehicleStatus::new(name.clone(), boot_id, layers, queue.drops()));
         let (newest, receiver) = watch::channel(None);
         let valid_ms = vehicle.maps.valid_ms;
-        let engine = Engine { pipeline, valid_ms, newest, recording: None, status: status.clone(), observer };
+        let engine =
+            Engine { pipeline, valid_ms, newest, recording: None, status: status.clone(), observer, replayed: None };
         self.inputs.push(VehicleInput { name, queue, udp: None });
         Prepared { served: Served { status, newest: receiver }, engine, events }
     }
@@ -89,7 +98,7 @@ impl Running {
         config: &Config,
         certificates: Option<Certificates>,
         prepared: Vec<Prepared>,
-        from_files: bool,
+        driver: Driver,
         header: impl FnOnce() -> Header,
     ) -> Result<(), StartError> {
         // Before the recorder: a port in use must not overwrite an earlier recording.
@@ -111,7 +120,7 @@ impl Running {
             self.zenoh = over_zenoh.endpoints().await;
             self.over_zenoh = Some(over_zenoh);
         }
-        self.start_engines(config, prepared, from_files, header)?;
+        self.start_engines(config, prepared, driver, header)?;
         if let Some(listener) = grpc {
             self.serve_grpc(listener, security, config.grpc.connections_max, gateways);
         }
@@ -126,20 +135,24 @@ impl Running {
         &mut self,
         config: &Config,
         prepared: Vec<Prepared>,
-        from_files: bool,
+        driver: Driver,
         header: impl FnOnce() -> Header,
     ) -> Result<(), StartError> {
         let mut handles = Vec::new().into_iter();
         if recording_path(&config.recorder).is_some() {
-            let (recorder, of_vehicles) = Recorder::start(&config.recorder, &header(), from_files)?;
+            let (recorder, of_vehicles) = Recorder::start(&config.recorder, &header(), driver.from_files)?;
             (self.recorder, handles) = (Some(recorder), of_vehicles.into_iter());
         }
         for Prepared { served: Served { status, .. }, mut engine, events } in prepared {
             self.recorder.iter().for_each(|recorder| status.show_recorder(recorder.counts()));
             // A replay computes all layers: a reader that comes late gets the last map, and the summary has all
             // metrics.
-            self.subscriptions.extend(from_files.then(|| status.subscriptions.subscribe(&[])));
+            self.subscriptions.extend(driver.from_files.then(|| status.subscriptions.subscribe(&[])));
             engine.recording = handles.next();
+            if driver.is_stepped {
+                self.stepped.push((engine, events));
+                continue;
+            }
             let name = status.name.clone();
             let thread = engine.start(events).map_err(|source| StartError::Thread { vehicle: name.clone(), source })?;
             self.engines.push((name, thread));
@@ -163,8 +176,10 @@ impl Running {
         self.grpc = listener.local_addr().ok();
         let (vehicles, stopped) = (self.vehicles.clone(), self.stopped());
         let ingest = (!gateways.all().is_empty()).then(|| Ingest::new(gateways).into_service());
+        let replay = self.replay.clone();
         self.publishers.spawn(async move {
-            if let Err(error) = grpc::serve(listener, security, connections_max, vehicles, ingest, stopped).await {
+            let served = grpc::serve(listener, security, connections_max, vehicles, ingest, replay, stopped);
+            if let Err(error) = served.await {
                 tracing::error!(%error, "grpc ended");
             }
         });
@@ -172,9 +187,9 @@ impl Running {
 
     fn serve_page(&mut self, listener: TcpListener) {
         self.page = listener.local_addr().ok();
-        let (vehicles, stopped) = (self.vehicles.clone(), self.stopped());
+        let (vehicles, stopped, replay) = (self.vehicles.clone(), self.stopped(), self.replay.clone());
         self.publishers.spawn(async move {
-            if let Err(error) = page::serve(listener, vehicles, stopped).await {
+            if let Err(error) = page::serve(listener, vehicles, replay, stopped).await {
                 tracing::error!(%error, "page ended");
             }
         });
@@ -247,6 +262,6 @@ fn header(
 }
 
 /// A random 64-bit number: the system seeds each `RandomState` with its randomness.
-fn random() -> u64 {
+pub fn random() -> u64 {
     std::hash::RandomState::new().build_hasher().finish()
 }

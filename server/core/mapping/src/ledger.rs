@@ -89,6 +89,7 @@ impl Ledger {
 }
 
 /// The ledgers of one vehicle.
+#[derive(Clone)]
 pub(crate) struct Ledgers {
     vehicle: Ledger,
     /// By source.

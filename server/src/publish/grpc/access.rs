@@ -49,6 +49,8 @@ pub const RPCS: &[(&str, &[Role])] = &[
     ("/clearway.v1.MapService/GetMap", &[Role::Reader]),
     ("/clearway.v1.MapService/ListVehicles", &[Role::Reader, Role::Ingester]),
     ("/clearway.v1.IngestService/Stream", &[Role::Ingester]),
+    ("/clearway.v1.ReplayService/Control", &[Role::Operator]),
+    ("/clearway.v1.ReplayService/WatchState", &[Role::Reader]),
     ("/grpc.health.v1.Health/Check", &[Role::Reader, Role::Ingester]),
     ("/grpc.health.v1.Health/Watch", &[Role::Reader, Role::Ingester]),
     ("/grpc.reflection.v1.ServerReflection/ServerReflectionInfo", &[Role::Reader, Role::Ingester]),
@@ -87,7 +89,9 @@ impl Access {
             return Ok(());
         }
         let list = |roles: &mut dyn Iterator<Item = Role>| roles.map(Role::as_str).collect::<Vec<_>>().join(", ");
-        let allowed = list(&mut allowed.iter().copied().chain(known.then_some(Role::Operator)));
+        let allowed = list(
+            &mut allowed.iter().copied().chain((known && !allowed.contains(&Role::Operator)).then_some(Role::Operator)),
+        );
         let (names, roles) = (names.join(", "), list(&mut roles.into_iter()));
         Err(Status::permission_denied(format!(
             "{path}: certificate of [{names}] with the roles [{roles}]; allowed roles are [{allowed}]"

@@ -5,6 +5,7 @@
 
 pub mod access;
 pub mod reader;
+mod replay;
 pub mod selection;
 
 use std::pin::Pin;
@@ -21,12 +22,15 @@ use super::connections::Connections;
 use super::served::Vehicles;
 use access::{Access, Guard};
 use reader::watch;
+use replay::Replay;
 
 use crate::clock::now_ns;
 use crate::config::{self, Certificates};
+use crate::replay::ReplayHandle;
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
 use v1::map_service_server::{MapService, MapServiceServer};
+use v1::replay_service_server::ReplayServiceServer;
 
 /// Longest request, in bytes. Ours: requests hold names and numbers.
 const REQUEST_BYTES_MAX: usize = 64 << 10;
@@ -84,7 +88,8 @@ pub enum GrpcError {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
-/// Serves maps, and `ingest` if it is configured, until `stop` resolves and all streams have ended.
+/// Serves maps, `ingest` if it is configured, and the control of `replay` if there is one, until `stop` resolves and
+/// all streams have ended.
 ///
 /// # Errors
 /// [`GrpcError::Transport`] if the transport fails, [`GrpcError::Reflection`] if the descriptors are invalid.
@@ -94,6 +99,7 @@ pub async fn serve<I: IngestService>(
     connections_max: usize,
     vehicles: Vehicles,
     ingest: Option<IngestServiceServer<I>>,
+    replay: Option<ReplayHandle>,
     stop: impl Future<Output = ()>,
 ) -> Result<(), GrpcError> {
     let Security { builder, guard } = security;
@@ -101,6 +107,10 @@ pub async fn serve<I: IngestService>(
     health.set_serving::<MapServiceServer<Maps>>().await;
     if ingest.is_some() {
         health.set_serving::<IngestServiceServer<I>>().await;
+    }
+    let replay = replay.map(|replay| ReplayServiceServer::new(Replay(replay)));
+    if replay.is_some() {
+        health.set_serving::<ReplayServiceServer<Replay>>().await;
     }
     let reflection = || {
         tonic_reflection::server::Builder::configure()
@@ -121,6 +131,7 @@ pub async fn serve<I: IngestService>(
         .http2_max_header_list_size(HEADERS_BYTES_MAX)
         .add_service(maps)
         .add_optional_service(ingest)
+        .add_optional_service(replay)
         .add_service(health_service)
         .add_service(reflection().build_v1()?)
         // Older versions of grpcurl know only this version.
@@ -145,13 +156,16 @@ impl MapService for Maps {
         &self,
         request: Request<Streaming<v1::WatchRequest>>,
     ) -> Result<Response<Self::WatchStream>, Status> {
+        let agent = request.metadata().get("user-agent").and_then(|agent| agent.to_str().ok()).map(str::to_owned);
         let mut requests = request.into_inner();
         let first = tokio::time::timeout(SELECTION_TIMEOUT, requests.message())
             .await
             .map_err(|_| Status::deadline_exceeded(format!("no selection within {SELECTION_TIMEOUT:?}")))??;
         let selection = first.and_then(|first| first.selection);
         let selection = selection.ok_or_else(|| Status::invalid_argument("the first request carries a selection"))?;
-        Ok(Response::new(Box::pin(watch(&self.vehicles, selection, requests)?)))
+        let layers = if selection.layers.is_empty() { "all layers".to_owned() } else { selection.layers.join(", ") };
+        let name = format!("gRPC reader of {layers} ({})", agent.as_deref().unwrap_or("no user-agent"));
+        Ok(Response::new(Box::pin(watch(&self.vehicles, selection, requests, name)?)))
     }
 
     async fn get_map(&self, request: Request<v1::GetMapRequest>) -> Result<Response<v1::MapUpdate>, Status> {
@@ -166,7 +180,7 @@ impl MapService for Maps {
         let map = newest.ok_or_else(|| {
             Status::unavailable(format!("vehicle {name} makes no map at present: no data arrived since the request"))
         })?;
-        Ok(Response::new(v1::MapUpdate { map: map.select(&layers), skipped: 0, sent_ns: now_ns(), left_out: 0 }))
+        Ok(Response::new(v1::MapUpdate { map: map.select(&layers), sent_ns: now_ns(), ..Default::default() }))
     }
 
     async fn list_vehicles(
