@@ -68,6 +68,12 @@ pub enum ClientError {
         /// Names of the layers that the map has.
         present: Vec<String>,
     },
+    /// The text is no key that signs maps, or no public key that checks them.
+    #[error("key of signed maps: {reason}")]
+    SigningKey {
+        /// What is wrong with it, and what is allowed.
+        reason: String,
+    },
     /// A zenoh operation failed.
     #[error("zenoh, {what}: {reason}")]
     Zenoh {

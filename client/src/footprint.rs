@@ -101,8 +101,9 @@ fn covers_only(grid: &Grid, corners: &[[f64; 2]], is_fit: &dyn Fn(usize) -> bool
         return false;
     }
     match grid {
-        Grid::Radial { row_radius_m, columns } => {
-            (0..*columns).all(|column| column_fits(row_radius_m, (column, *columns), corners, is_fit))
+        Grid::Radial { centre_m, row_radius_m, columns } => {
+            let corners: Vec<_> = corners.iter().map(|corner| from_centre(*centre_m, *corner)).collect();
+            (0..*columns).all(|column| column_fits(row_radius_m, (column, *columns), &corners, is_fit))
         }
         Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
             let (sin, cos) = yaw_rad.sin_cos();
@@ -121,6 +122,11 @@ fn covers_only(grid: &Grid, corners: &[[f64; 2]], is_fit: &dyn Fn(usize) -> bool
             })
         }
     }
+}
+
+/// A position of the ego frame as seen from the centre of a radial grid.
+fn from_centre(centre_m: [f32; 2], [x, y]: [f64; 2]) -> [f64; 2] {
+    [x - f64::from(centre_m[0]), y - f64::from(centre_m[1])]
 }
 
 /// True if the part of a polygon in one column of a radial grid touches only cells that satisfy `is_fit`.
@@ -214,7 +220,10 @@ fn nearest_in(grid: &Grid, cell: usize, [x, y]: [f64; 2]) -> [f64; 2] {
             let near_y = (x * sin + y * cos).clamp(origin_y_m + iy * edge, origin_y_m + (iy + 1.0) * edge);
             [near_x * cos + near_y * sin, near_y * cos - near_x * sin]
         }
-        Grid::Radial { row_radius_m, columns } => {
+        Grid::Radial { centre_m, row_radius_m, columns } => {
+            let [centre_x, centre_y] = centre_m.map(f64::from);
+            let in_ego_frame = |[x, y]: [f64; 2]| [x + centre_x, y + centre_y];
+            let [x, y] = from_centre(*centre_m, [x, y]);
             let (row, column) = (cell / *columns as usize, (cell % *columns as usize) as f64);
             let (inner, outer) =
                 (if row == 0 { 0.0 } else { f64::from(row_radius_m[row - 1]) }, f64::from(row_radius_m[row]));
@@ -222,7 +231,7 @@ fn nearest_in(grid: &Grid, cell: usize, [x, y]: [f64; 2]) -> [f64; 2] {
             if (column..=column + 1.0).contains(&position) {
                 let range_m = x.hypot(y).clamp(inner, outer);
                 let (sin, cos) = y.atan2(x).sin_cos();
-                return [range_m * cos, range_m * sin];
+                return in_ego_frame([range_m * cos, range_m * sin]);
             }
             // Beside the column, one of its two sides is nearest: an arc comes nearer towards its ends.
             let side = |column: f64| {
@@ -231,7 +240,7 @@ fn nearest_in(grid: &Grid, cell: usize, [x, y]: [f64; 2]) -> [f64; 2] {
             };
             let distance = |[a, b]: [f64; 2]| (a - x).hypot(b - y);
             let (first, last) = (side(column), side(column + 1.0));
-            if distance(first) <= distance(last) { first } else { last }
+            in_ego_frame(if distance(first) <= distance(last) { first } else { last })
         }
     }
 }

@@ -58,7 +58,12 @@ impl Arrival {
 
     /// Least age of the map; it does not depend on the present wall clock.
     pub fn age_ns_min(&self) -> i64 {
-        self.age_ns.saturating_add((self.clock.steady_ns)().saturating_sub(self.steady_ns))
+        self.age_ns.saturating_add(self.since_ns())
+    }
+
+    /// Time since the arrival, in ns, by the steady clock.
+    pub fn since_ns(&self) -> i64 {
+        (self.clock.steady_ns)().saturating_sub(self.steady_ns)
     }
 
     /// Present time of the wall clock, ns since the Unix epoch.

@@ -261,7 +261,7 @@ async fn receive_maps(
                 let last = base.replace(map.clone()).filter(|last| last.header().boot_id == map.header().boot_id);
                 let last = last.map_or(sequence, |last| last.sequence() + 1);
                 let skipped = sequence.saturating_sub(last).saturating_sub(left_out);
-                slot.store(map, Missed { skipped, left_out, ..Missed::default() });
+                slot.store(map, |_| Missed { skipped, left_out, ..Missed::default() });
                 (is_requested, left_out) = (false, 0);
                 v1::WatchRequest { acknowledged: Some(sequence), ..Default::default() }
             }

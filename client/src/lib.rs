@@ -26,6 +26,7 @@
 //! | [`stream`] | updates -> the newest map, with the number of skipped ones |
 //! | [`grpc`] | address of a server -> [`Client`] |
 //! | [`observation`] | scans, poses, roads, packets -> [`Observation`] |
+//! | `signature` | a map on its key and its signature -> whether the expected server published it (feature `zenoh`) |
 //! | [`ingest`] | observations -> the server, and their outcomes |
 //! | `zenoh` | endpoint of a router -> `ZenohClient` (feature `zenoh`); its `subscription`: one key -> the newest map |
 //! | `test` | a recording -> a server that replays it, for tests of planners (feature `test`) |
@@ -37,6 +38,8 @@ mod freshness;
 pub mod grpc;
 pub mod ingest;
 pub mod observation;
+#[cfg(feature = "zenoh")]
+pub mod signature;
 pub mod stream;
 #[cfg(feature = "test")]
 pub mod test;
@@ -53,7 +56,9 @@ pub use freshness::now_ns;
 pub use grpc::{Client, Subscription, Tls};
 pub use ingest::Ingester;
 pub use observation::{Observation, Refusal};
-pub use stream::{MapStream, StreamEvent, Update};
+#[cfg(feature = "zenoh")]
+pub use signature::PublicKey;
+pub use stream::{MapStream, PassedOver, StreamEvent, Update};
 pub use view::MapView;
 #[cfg(feature = "zenoh")]
 pub use zenoh::ZenohClient;

@@ -54,11 +54,46 @@ pub struct MapStream {
 struct Slot {
     newest: Option<MapView>,
     counters: Counters,
+    passed_over: PassedOver,
     ended: Option<ClientError>,
     /// How often a replay has reached its end, and how the reader is told.
     replay_ends: u64,
     replay_ended: Option<ClientError>,
 }
+
+/// Numbers of received maps that a stream passed over since its start, by reason. None of them was shown to the reader.
+///
+/// A peer of a zenoh network without access control can put anything on the key of a map.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct PassedOver {
+    /// Messages that are no valid map.
+    pub undecodable: u64,
+    /// Maps of another vehicle or layer than their key names, and messages on a key with wildcards.
+    pub misplaced: u64,
+    /// Maps without a signature of the expected publisher ([`crate::signature`]).
+    pub unsigned: u64,
+    /// Maps of another run of the server while the present run sends fresh ones.
+    pub other_run: u64,
+    /// Maps that are not newer than the newest (repeated ones).
+    pub not_newer: u64,
+}
+
+impl PassedOver {
+    /// Number of all messages that were passed over and that no honest publisher sends: without
+    /// [`PassedOver::not_newer`], because zenoh itself repeats the newest map.
+    pub fn hostile(&self) -> u64 {
+        self.undecodable + self.misplaced + self.unsigned + self.other_run
+    }
+}
+
+/// Time after which a silent run of the server holds its place no longer against maps of another run. Ours: several
+/// maps, and no longer than a planner is without maps after a restart.
+const RUN_HOLD_NS: i64 = 1_000_000_000;
+/// A map that is stamped farther ahead of this machine's clock is no reason to refuse maps with earlier stamps.
+const AHEAD_NS_MAX: i64 = 1_000_000_000;
+/// Most maps that a server makes in a millisecond, and between two equal stamps: a sequence that jumps farther says
+/// nothing about skipped maps.
+const SKIPPED_MAX: (u64, u64) = (1, 1000);
 
 /// Numbers of maps since the start of the stream.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -83,22 +118,32 @@ pub(crate) struct Missed {
 }
 
 impl MapStream {
-    /// Runs a task in the background that stores maps in the slot. Its result is the reason why it ended.
+    /// Runs a task in the background that stores the maps of one server in the slot. Its result is the reason why it
+    /// ended.
     pub(crate) fn spawn<F: Future<Output = ClientError> + Send + 'static>(task: impl FnOnce(LatestSlot) -> F) -> Self {
-        Self::spawn_with_clock(Clock::default(), task)
+        let slot = LatestSlot { has_one_server: true, ..LatestSlot::new(Clock::default()) };
+        let task = task(slot.clone());
+        Self::of_slot(&slot, task)
     }
 
+    #[cfg(test)]
     fn spawn_with_clock<F: Future<Output = ClientError> + Send + 'static>(
         clock: Clock,
         task: impl FnOnce(LatestSlot) -> F,
     ) -> Self {
-        let (sender, slot) = watch::channel(Slot::default());
-        let task = task(LatestSlot { slot: sender.clone(), clock });
+        let slot = LatestSlot::new(clock);
+        let task = task(slot.clone());
+        Self::of_slot(&slot, task)
+    }
+
+    /// The stream of a slot that was made before. The result of the task is the reason why the stream ended.
+    pub(crate) fn of_slot(slot: &LatestSlot, task: impl Future<Output = ClientError> + Send + 'static) -> Self {
+        let (receiver, sender) = (slot.slot.subscribe(), slot.slot.clone());
         let task = tokio::spawn(async move {
             let reason = task.await;
             sender.send_modify(|slot| slot.ended = Some(reason));
         });
-        Self { slot, seen: None, fresh: None, replay_ends: 0, task }
+        Self { slot: receiver, seen: None, fresh: None, replay_ends: 0, task }
     }
 
     /// Waits for a map newer than the last one returned.
@@ -165,6 +210,11 @@ impl MapStream {
         self.slot.borrow().newest.clone()
     }
 
+    /// Numbers of received maps that were passed over since the start of the stream, by reason.
+    pub fn passed_over(&self) -> PassedOver {
+        self.slot.borrow().passed_over
+    }
+
     /// Why the stream has ended; `None` if it has not.
     pub fn ended(&self) -> Option<ClientError> {
         self.slot.borrow().ended.clone()
@@ -189,12 +239,19 @@ async fn wait_stale(map: Option<MapView>) -> MapView {
 }
 
 /// The slot of a [`MapStream`], in which the background task stores the newest map.
+#[derive(Clone, Debug)]
 pub(crate) struct LatestSlot {
     slot: watch::Sender<Slot>,
     clock: Clock,
+    /// True if all maps come from one server that is known: another run is then a jump of its replay.
+    has_one_server: bool,
 }
 
 impl LatestSlot {
+    pub(crate) fn new(clock: Clock) -> Self {
+        Self { slot: watch::channel(Slot::default()).0, clock, has_one_server: false }
+    }
+
     /// Records that the replay has ended, for the reader of the stream.
     pub(crate) fn end_replay(&self, ended: ClientError) {
         self.slot.send_modify(|slot| {
@@ -203,26 +260,69 @@ impl LatestSlot {
         });
     }
 
-    /// Stores a map as the newest, with the numbers of maps between it and the one before. It ignores a map that is not
-    /// newer than the newest of the same run of the server (a replayed one).
-    pub(crate) fn store(&self, map: MapView, missed: Missed) {
+    /// Stores a map as the newest, with the numbers of maps between it and the one before, or counts it as passed over
+    /// ([`refuse`]). `missed` gets the number of maps that the sequence skips, and is called only if the map is stored.
+    pub(crate) fn store(&self, map: MapView, missed: impl FnOnce(u64) -> Missed) {
         let map = map.with_arrival(&self.clock);
         self.slot.send_if_modified(|slot| {
-            let of = |map: &MapView| (map.header().boot_id, map.sequence());
-            let is_old = slot
-                .newest
-                .as_ref()
-                .map(of)
-                .is_some_and(|(boot_id, newest)| boot_id == map.header().boot_id && newest >= map.sequence());
-            if !is_old {
-                slot.counters.maps += 1 + missed.skipped;
-                slot.counters.lost += missed.lost;
-                slot.counters.left_out += missed.left_out;
-                slot.newest = Some(map);
+            let is_jump = |newest: &MapView| self.has_one_server && newest.header().boot_id != map.header().boot_id;
+            let newest = slot.newest.as_ref().filter(|newest| !is_jump(newest));
+            if let Some(reason) = newest.and_then(|newest| refuse(newest, &map)) {
+                *reason(&mut slot.passed_over) += 1;
+                return false;
             }
-            !is_old
+            let missed = missed(slot.newest.as_ref().map_or(0, |newest| skipped(newest, &map)));
+            let counters = &mut slot.counters;
+            counters.maps = counters.maps.saturating_add(missed.skipped).saturating_add(1);
+            counters.lost = counters.lost.saturating_add(missed.lost);
+            counters.left_out = counters.left_out.saturating_add(missed.left_out);
+            slot.newest = Some(map);
+            true
         });
     }
+
+    /// Counts a message that is not stored.
+    #[cfg_attr(not(feature = "zenoh"), allow(dead_code, reason = "over gRPC the server itself is known"))]
+    pub(crate) fn pass_over(&self, reason: Reason) {
+        self.slot.send_if_modified(|slot| {
+            *reason(&mut slot.passed_over) += 1;
+            false
+        });
+    }
+}
+
+/// The counter of one reason to pass over a map.
+pub(crate) type Reason = fn(&mut PassedOver) -> &mut u64;
+
+/// Why `map` does not replace `newest`; `None` if it does.
+///
+/// Within one run of the server a map is newer by its sequence, or, if that goes back, by its stamp: one forged
+/// sequence does not refuse the true maps after it. Another run has to wait until the present one is stale or silent
+/// for [`RUN_HOLD_NS`]: a forged run is not shown beside a true one.
+fn refuse(newest: &MapView, map: &MapView) -> Option<Reason> {
+    let ahead_ns = |map: &MapView| map.header().capture_end_ns.saturating_sub(map.now_ns());
+    let is_ahead = ahead_ns(newest) > AHEAD_NS_MAX;
+    if newest.header().boot_id != map.header().boot_id {
+        let holds = newest.fresh_for_ns().is_some() && !is_ahead && newest.since_arrival_ns() < RUN_HOLD_NS;
+        return holds.then_some(|passed| &mut passed.other_run);
+    }
+    let is_next = map.sequence() > newest.sequence();
+    let is_later = map.header().capture_end_ns > newest.header().capture_end_ns;
+    let resynchronises = map.fresh_for_ns().is_some() && (is_later || is_ahead || newest.fresh_for_ns().is_none());
+    (!is_next && !resynchronises).then_some(|passed| &mut passed.not_newer)
+}
+
+/// Number of maps between two of one run, by their sequences; 0 if the sequence goes back, or jumps farther than the
+/// stamps explain.
+fn skipped(newest: &MapView, map: &MapView) -> u64 {
+    let between_ns = map.header().capture_end_ns.saturating_sub(newest.header().capture_end_ns).max(0);
+    let skipped_max = SKIPPED_MAX.1 + SKIPPED_MAX.0 * between_ns.unsigned_abs() / 1_000_000;
+    let skipped = match newest.header().boot_id == map.header().boot_id {
+        true => map.sequence().saturating_sub(newest.sequence()).saturating_sub(1),
+        // Another run of the server: its sequence starts at 0.
+        false => 0,
+    };
+    if skipped > skipped_max { 0 } else { skipped }
 }
 
 /// Situations in which a map is older than it seems, with clocks that the tests set.
@@ -293,7 +393,7 @@ mod tests {
                 valid_until_ns: capture_end_ns + VALID_MS * MS,
                 ..Default::default()
             };
-            self.slot.store(MapView::decode(encode_header(&header)).expect("a map"), Missed::default());
+            self.slot.store(MapView::decode(encode_header(&header)).expect("a map"), |_| Missed::default());
         }
 
         /// Waits for the next event: (stale, sequence, age in ns).

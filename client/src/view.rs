@@ -13,6 +13,10 @@ use clearway_proto::v1;
 use crate::error::ClientError;
 use crate::freshness::{Arrival, Clock, now_ns};
 
+/// Longest time after its capture for which a map is believed to be valid, whatever it states: a forged map is not
+/// fresh for good. Ours: far longer than any planner uses a map.
+const VALID_NS_MAX: i64 = 60_000_000_000;
+
 /// A map, decoded once. A clone shares the decoded map.
 #[derive(Clone, Debug)]
 pub struct MapView {
@@ -97,9 +101,19 @@ impl MapView {
         self.age_ns(now_ns) as f64 * 1e-6
     }
 
-    /// Time from the end of the capture until the map is stale, in ns.
+    /// Time from the end of the capture until the map is stale, in ns; at most [`VALID_NS_MAX`].
     fn valid_ns(&self) -> i64 {
-        self.map.header.valid_until_ns.saturating_sub(self.map.header.capture_end_ns)
+        self.map.header.valid_until_ns.saturating_sub(self.map.header.capture_end_ns).min(VALID_NS_MAX)
+    }
+
+    /// Time since the map arrived at this process, in ns, by the steady clock; 0 if it did not come from a server.
+    pub(crate) fn since_arrival_ns(&self) -> i64 {
+        self.arrival.as_ref().map_or(0, |arrival| arrival.since_ns())
+    }
+
+    /// Present time of the wall clock by which the map's age is measured, ns since the Unix epoch.
+    pub(crate) fn now_ns(&self) -> i64 {
+        self.arrival.as_ref().map_or_else(now_ns, |arrival| arrival.now_ns())
     }
 
     /// True if the map must not be used at `now_ns`: its validity has passed, or its capture is so far in the future of
@@ -111,7 +125,7 @@ impl MapView {
 
     /// Time from now until the map is stale, in ns; `None` if it is stale.
     pub(crate) fn fresh_for_ns(&self) -> Option<i64> {
-        let now_ns = self.arrival.as_ref().map_or_else(now_ns, |arrival| arrival.now_ns());
+        let now_ns = self.now_ns();
         (!self.is_stale(now_ns)).then(|| self.valid_ns().saturating_sub(self.age_ns(now_ns)))
     }
 

@@ -14,18 +14,20 @@ use std::sync::Arc;
 use clearway_proto::v1;
 use prost::Message;
 use zenoh::qos::CongestionControl;
+use zenoh::sample::SourceInfo;
 use zenoh::{Config, Session};
 
 use crate::error::ClientError;
 use crate::freshness::Clock;
 use crate::ingest::{Ingester, ReportReceiver, SendObservation};
-use crate::stream::MapStream;
+use crate::signature::PublicKey;
+use crate::stream::{LatestSlot, MapStream};
 use crate::view::MapView;
 
 mod query;
 mod subscription;
 
-use query::{QUERY_TIMEOUT, decode, failed, query};
+use query::{LayerKey, QUERY_TIMEOUT, failed};
 use subscription::LayerSubscription;
 
 /// Settings of every session. They override those of a configuration file.
@@ -53,6 +55,7 @@ const SETTINGS: [(&str, &str); 11] = [
 pub struct ZenohClient {
     session: Session,
     endpoint: String,
+    signed_by: Option<PublicKey>,
 }
 
 impl ZenohClient {
@@ -82,7 +85,14 @@ impl ZenohClient {
         let endpoints = format!("[{endpoint:?}]");
         config.insert_json5("connect/endpoints", &endpoints).map_err(failed(format!("endpoint {endpoint:?}")))?;
         let session = zenoh::open(config).await.map_err(failed(format!("connect to {endpoint}")))?;
-        Ok(Self { session, endpoint: endpoint.into() })
+        Ok(Self { session, endpoint: endpoint.into(), signed_by: None })
+    }
+
+    /// Believes only maps that have a signature of this key; the others are counted and passed over
+    /// ([`MapStream::passed_over`]). The server signs with `zenoh.signing_key`.
+    #[must_use]
+    pub fn signed_by(self, key: PublicKey) -> Self {
+        Self { signed_by: Some(key), ..self }
     }
 
     /// Sorted names of the vehicles that are served now.
@@ -107,28 +117,28 @@ impl ZenohClient {
     /// Newest map of one layer; `None` if no server serves it or there is no map yet.
     ///
     /// # Errors
-    /// [`ClientError::Zenoh`] if the query fails, [`ClientError::Map`] if the map is invalid.
+    /// [`ClientError::Zenoh`] if the query fails, [`ClientError::Map`] if there are answers and none is a valid map.
     pub async fn newest(&self, vehicle: &str, layer: &str) -> Result<Option<MapView>, ClientError> {
-        let key = format!("clearway/{vehicle}/map/{layer}");
-        let map = query(&self.session, &key).await?.map(|map| decode(&map)).transpose()?;
-        Ok(map.map(|map| map.with_arrival(&Clock::default())))
+        LayerKey::new(vehicle, layer, self.signed_by.clone()).newest(&self.session).await
     }
 
     /// Streams one layer of one vehicle, starting with the newest map if there is one. The stream does not end with the
     /// server: [`MapStream::next_or_stale`] reports that its map is stale, and continues with the maps of the next
-    /// server.
+    /// server. Nor does it end with a message that is no valid map: it is counted ([`MapStream::passed_over`]).
     ///
     /// # Errors
     /// [`ClientError::Zenoh`] if the subscription fails.
     pub async fn subscribe(&self, vehicle: &str, layer: &str) -> Result<MapStream, ClientError> {
-        let key = format!("clearway/{vehicle}/map/{layer}");
-        let subscription =
-            LayerSubscription::open(&self.session, &key).await.map_err(failed(format!("subscribe to {key}")))?;
+        let layer = LayerKey::new(vehicle, layer, self.signed_by.clone());
+        let (slot, key) = (LatestSlot::new(Clock::default()), layer.key.clone());
+        let subscription = LayerSubscription::open(&self.session, layer, slot.clone()).await;
+        let subscription = subscription.map_err(failed(format!("subscribe to {key}")))?;
         // A session closes with its last clone and ends its subscriptions, so the stream keeps a clone.
-        let Self { session, endpoint: address } = self.clone();
-        Ok(MapStream::spawn(move |slot| async move {
+        let Self { session, endpoint: address, .. } = self.clone();
+        Ok(MapStream::of_slot(&slot, async move {
             let _session = session;
-            subscription.run(slot).await.err().unwrap_or(ClientError::Ended { address })
+            subscription.closed().await;
+            ClientError::Ended { address }
         }))
     }
 }
@@ -163,7 +173,7 @@ impl ZenohClient {
         let session = self.session.clone();
         let send: SendObservation = Box::new(move |observation| {
             let (session, reports) = (session.clone(), reports.clone());
-            let key = key_of(&prefix, &observation);
+            let (key, number) = (key_of(&prefix, &observation), observation.number as u32);
             let bytes = v1::Observation { client, ..observation }.encode_to_vec();
             Box::pin(async move {
                 // Keeps the subscription until the last observation is sent.
@@ -172,6 +182,8 @@ impl ZenohClient {
                 // default priority: zenoh keeps the order within one priority, and the server counts gaps in the
                 // numbers.
                 let put = session.put(&key, bytes).congestion_control(CongestionControl::Block);
+                // With roles the server looks up the certificate of the session that this names.
+                let put = put.source_info(SourceInfo::new(session.id(), number));
                 put.await.map_err(failed(format!("put {key}")))
             })
         });

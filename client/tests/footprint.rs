@@ -18,8 +18,8 @@ const ROW_RADII_M: [f32; 3] = [0.6, 1.3, 2.5];
 /// Distance between two sample points in metres. The search may miss a little more than this.
 const STEP_M: f64 = 0.02;
 
-fn radial(columns: u32) -> Geometry {
-    Geometry::Radial(v1::RadialGrid { row_radius_m: ROW_RADII_M.to_vec(), columns })
+fn radial(columns: u32, [centre_x_m, centre_y_m]: [f32; 2]) -> Geometry {
+    Geometry::Radial(v1::RadialGrid { row_radius_m: ROW_RADII_M.to_vec(), columns, centre_x_m, centre_y_m })
 }
 
 fn cartesian(yaw_rad: f64) -> Geometry {
@@ -74,7 +74,8 @@ fn points(footprint: &Footprint, margin_m: f64) -> impl Iterator<Item = (f64, f6
 
 fn geometries() -> impl Strategy<Value = (Geometry, usize)> {
     prop_oneof![
-        (1_u32..9).prop_map(|columns| (radial(columns), ROW_RADII_M.len() * columns as usize)),
+        (1_u32..9, [-0.7_f32..0.7, -0.7_f32..0.7])
+            .prop_map(|(columns, centre_m)| { (radial(columns, centre_m), ROW_RADII_M.len() * columns as usize) }),
         (-4.0..4.0).prop_map(|yaw| (cartesian(yaw), (SIDE * SIDE) as usize)),
         Just((cartesian(0.0), (SIDE * SIDE) as usize)),
     ]
@@ -164,7 +165,7 @@ fn only_the_meaning_free_is_free_and_only_occupied_is_an_obstacle() {
 
 #[test]
 fn an_obstacle_in_an_innermost_cell_is_0_m_away() {
-    let map = view(radial(8), &[[0, 0, 0, 0, 0, 0, 0, 3], [0; 8], [0; 8]].concat());
+    let map = view(radial(8, [0.0; 2]), &[[0, 0, 0, 0, 0, 0, 0, 3], [0; 8], [0; 8]].concat());
     let obstacle = map.nearest_obstacle("drivability", 0.0, 0.0).unwrap().unwrap();
     assert_eq!(obstacle.distance_m, 0.0, "{obstacle:?}");
 }

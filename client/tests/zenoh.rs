@@ -5,7 +5,8 @@ mod common;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use clearway_client::{MapStream, StreamEvent, Update, ZenohClient, now_ns, v1};
+use clearway_client::signature::{PublicKey, SigningKey};
+use clearway_client::{MapStream, PassedOver, StreamEvent, Update, ZenohClient, now_ns, v1};
 use common::{CAPTURE_END_NS, map};
 use prost::Message;
 use tokio::net::{TcpListener, TcpStream};
@@ -220,4 +221,143 @@ async fn a_stream_continues_after_a_cut_link_and_a_stopped_server() {
     assert_eq!(next_fresh(&mut maps).await, (9, 3, 0), "another publisher starts at 0");
     published.put(lasting(10)).await.unwrap();
     assert_eq!(next_fresh(&mut maps).await, (10, 0, 0));
+}
+
+/// A map captured `late_ns` ago that is fresh for a minute, with these ids.
+fn forged(boot_id: u64, sequence: u64, late_ns: i64) -> v1::Map {
+    let mut map = v1::Map::decode(map(sequence, now_ns() - late_ns)).unwrap();
+    let header = map.header.as_mut().unwrap();
+    (header.boot_id, header.valid_until_ns) = (boot_id, header.valid_until_ns + 60_000_000_000);
+    map
+}
+
+/// A server that has published map 1 of run 7, a stream that has received it, and a peer that may put anything.
+async fn attacked() -> (AdvancedPublisher<'static>, Session, MapStream, Session) {
+    let (server, endpoint) = server().await;
+    let published = publisher(&server).await;
+    published.put(lasting(1)).await.unwrap();
+    let mut maps = ZenohClient::connect(&endpoint).await.unwrap().subscribe("alpha", "drivability").await.unwrap();
+    // The subscription may reach the publisher later than the query for its cache.
+    let matching = published.matching_listener().await.unwrap();
+    while !published.matching_status().await.unwrap().matching() {
+        matching.recv_async().await.unwrap();
+    }
+    assert_eq!(next_fresh(&mut maps).await, (1, 0, 0));
+    let mut config = zenoh::Config::default();
+    config.insert_json5("mode", "\"client\"").unwrap();
+    config.insert_json5("connect/endpoints", &format!("[\"{endpoint}\"]")).unwrap();
+    config.insert_json5("scouting/multicast/enabled", "false").unwrap();
+    (published, zenoh::open(config).await.unwrap(), maps, server)
+}
+
+/// Waits until the stream has counted this many messages.
+async fn passed_over(maps: &MapStream, count: impl Fn(PassedOver) -> u64, expected: u64) {
+    let counted = async {
+        while count(maps.passed_over()) < expected {
+            tokio::task::yield_now().await;
+        }
+    };
+    let waited = tokio::time::timeout(std::time::Duration::from_secs(60), counted).await;
+    assert!(waited.is_ok() && count(maps.passed_over()) == expected, "{:?}", maps.passed_over());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_no_map_of_the_key_is_counted_and_passed_over() {
+    let (published, peer, mut maps, _server) = attacked().await;
+    peer.put(KEY, "x").await.unwrap();
+    passed_over(&maps, |passed| passed.undecodable, 1).await;
+    let mut other = forged(7, 2, 0);
+    other.header.as_mut().unwrap().vehicle = "beta".into();
+    peer.put(KEY, other.encode_to_vec()).await.unwrap();
+    other = forged(7, 2, 0);
+    other.layers[0].name = "terrain".into();
+    peer.put(KEY, other.encode_to_vec()).await.unwrap();
+    peer.put("clearway/**", forged(7, 2, 0).encode_to_vec()).await.unwrap();
+    passed_over(&maps, |passed| passed.misplaced, 3).await;
+    published.put(lasting(2)).await.unwrap();
+    assert_eq!(next_fresh(&mut maps).await, (2, 0, 0), "the next true map");
+    assert_eq!(maps.passed_over().hostile(), 4);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_forged_sequence_holds_no_true_map_back() {
+    for ahead_ns in [0, 3_600_000_000_000] {
+        let (published, peer, mut maps, _server) = attacked().await;
+        peer.put(KEY, forged(7, 1 << 63, -ahead_ns).encode_to_vec()).await.unwrap();
+        // It is shown, as fresh or as stale; without a signature it cannot be told from a true one.
+        let (StreamEvent::Fresh(shown) | StreamEvent::Stale(shown)) = maps.next_or_stale().await.unwrap();
+        assert_eq!(shown.map.sequence(), 1 << 63);
+        published.put(lasting(2)).await.unwrap();
+        assert_eq!(next_fresh(&mut maps).await, (2, 0, 0), "stamped {ahead_ns} ns ahead");
+        published.put(lasting(4)).await.unwrap();
+        assert_eq!(next_fresh(&mut maps).await, (4, 1, 0), "gaps are counted again");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_forged_run_is_not_shown_beside_the_true_one() {
+    let (published, peer, mut maps, _server) = attacked().await;
+    for sequence in 2..30 {
+        published.put(lasting(sequence)).await.unwrap();
+        assert_eq!(next_fresh(&mut maps).await, (sequence, 0, 0));
+        peer.put(KEY, forged(666, sequence + 1, 0).encode_to_vec()).await.unwrap();
+        passed_over(&maps, |passed| passed.other_run, sequence - 1).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn no_map_is_fresh_for_good_whatever_it_states() {
+    let (_published, peer, mut maps, _server) = attacked().await;
+    let mut eternal = forged(7, 2, 0);
+    eternal.header.as_mut().unwrap().valid_until_ns = i64::MAX;
+    peer.put(KEY, eternal.encode_to_vec()).await.unwrap();
+    let map = maps.next().await.unwrap().map;
+    assert!(!map.is_stale(now_ns()) && map.is_stale(now_ns() + 60_000_000_000));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_false_answer_to_a_query_hides_no_true_one() {
+    let (_published, peer, _maps, server) = attacked().await;
+    let endpoint = server.info().locators().await.first().unwrap().to_string();
+    let client = ZenohClient::connect(&endpoint).await.unwrap();
+    for (session, answer) in [(&peer, Bytes::from("x")), (&server, lasting(5))] {
+        let queries = session.declare_queryable(KEY).complete(true).await.unwrap();
+        tokio::spawn(async move {
+            while let Ok(query) = queries.recv_async().await {
+                query.reply(KEY, answer.clone()).await.unwrap();
+            }
+        });
+    }
+    assert_eq!(client.newest("alpha", "drivability").await.unwrap().unwrap().sequence(), 5);
+}
+
+/// The keys of RFC 8032, section 7.1, tests 1 and 2.
+const SERVER: [&str; 2] = [
+    "MC4CAQAwBQYDK2VwBCIEIJ1hsZ3v/VpguoRK9JLsLMREScVpezJpGXA7rAMcrn9g",
+    "MCowBQYDK2VwAyEA11qYAYKxCrfVS/7TyWQHOg7hcvPapiMlrwIaaPcHURo=",
+];
+const PEER: &str = "MC4CAQAwBQYDK2VwBCIEIEzNCJso/5banbbDRuwRTg9bijGfNaumJNqM9u1PuKb7";
+
+#[tokio::test(flavor = "multi_thread")]
+async fn with_a_public_key_only_maps_signed_with_its_private_key_are_believed() {
+    let pem = |kind: &str, key: &str| format!("-----BEGIN {kind} KEY-----\n{key}\n-----END {kind} KEY-----\n");
+    let key = |key: &str| SigningKey::from_pem(&pem("PRIVATE", key)).unwrap();
+    let (server_key, peer_key) = (key(SERVER[0]), key(PEER));
+    let (published, peer, _, server) = attacked().await;
+    let endpoint = server.info().locators().await.first().unwrap().to_string();
+    let client = ZenohClient::connect(&endpoint).await.unwrap();
+    let client = client.signed_by(PublicKey::from_pem(&pem("PUBLIC", SERVER[1])).unwrap());
+    let mut maps = client.subscribe("alpha", "drivability").await.unwrap();
+    passed_over(&maps, |passed| passed.unsigned, 1).await;
+
+    let next = lasting(2);
+    published.put(next.clone()).attachment(server_key.sign(KEY, &next)).await.unwrap();
+    assert_eq!(next_fresh(&mut maps).await, (2, 0, 0), "the true map");
+    let next = lasting(3);
+    peer.put(KEY, next.clone()).await.unwrap();
+    peer.put(KEY, next.clone()).attachment(peer_key.sign(KEY, &next)).await.unwrap();
+    peer.put(KEY, next.clone()).attachment(server_key.sign("clearway/alpha/map/terrain", &next)).await.unwrap();
+    passed_over(&maps, |passed| passed.unsigned, 4).await;
+    published.put(next.clone()).attachment(server_key.sign(KEY, &next)).await.unwrap();
+    assert_eq!(next_fresh(&mut maps).await, (3, 0, 0));
 }

@@ -117,14 +117,22 @@ impl Part {
         let corners = [region.x_from_m, region.x_to_m].map(|x| [region.y_from_m, region.y_to_m].map(|y| (x, y)));
         let corners = corners.as_flattened();
         match grid {
-            Grid::Radial { row_radius_m, columns } => {
+            Grid::Radial { centre_m, row_radius_m, columns } => {
+                let [x, y] = centre_m.map(f64::from);
+                let region = &v1::Region {
+                    x_from_m: region.x_from_m - x,
+                    x_to_m: region.x_to_m - x,
+                    y_from_m: region.y_from_m - y,
+                    y_to_m: region.y_to_m - y,
+                };
+                let corners: Vec<(f64, f64)> = corners.iter().map(|(to_x, to_y)| (to_x - x, to_y - y)).collect();
                 let nearest =
                     region.x_from_m.max(0.0).max(-region.x_to_m).hypot(region.y_from_m.max(0.0).max(-region.y_to_m));
                 let farthest = corners.iter().map(|(x, y)| x.hypot(*y)).fold(0.0, f64::max);
                 let row_at = |range_m: f64| row_radius_m.partition_point(|&outer| f64::from(outer) < range_m);
                 let rows = row_radius_m.len().min(row_at(farthest) + 1);
                 let known_rows = row_at(nearest)..rows;
-                let known_columns = sectors(region, corners, *columns);
+                let known_columns = sectors(region, &corners, *columns);
                 let all = Self { rows: 0..rows, columns: 0..*columns as usize, known_rows, known_columns };
                 (!all.known_rows.is_empty()).then_some(all)
             }

@@ -105,7 +105,9 @@ fn maps() -> Vec<Vec<u8>> {
     let square = |width, height| {
         v1::layer::Geometry::Cartesian(v1::CartesianGrid { width, height, cell_m: 0.25, ..Default::default() })
     };
-    let radial = |columns| v1::layer::Geometry::Radial(v1::RadialGrid { row_radius_m: vec![1.0, 2.0], columns });
+    let radial = |columns| {
+        v1::layer::Geometry::Radial(v1::RadialGrid { row_radius_m: vec![1.0, 2.0], columns, ..Default::default() })
+    };
     let rows = |count: u32, payload: Vec<u8>| channel(v1::CellType::U8, v1::Encoding::Rows, count, payload);
     let mut maps: Vec<_> = channels().into_iter().map(|channel| map_of(square(2048, 2048), vec![channel])).collect();
     for (width, height) in [(u32::MAX, u32::MAX), (u32::MAX, 1), (65_536, 65_536), (4096, 4096)] {

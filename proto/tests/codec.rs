@@ -17,6 +17,14 @@ fn cells() -> impl Strategy<Value = Cells> {
     })
 }
 
+/// Norms of a quaternion, and whether a pose may have them.
+fn norms() -> impl Strategy<Value = (f64, bool)> {
+    prop_oneof![
+        (0.9995..1.0005_f64).prop_map(|norm| (norm, true)),
+        prop_oneof![0.0..0.998_f64, 1.002..3.0_f64].prop_map(|norm| (norm, false)),
+    ]
+}
+
 proptest! {
     #[test]
     fn cells_decode_to_themselves_and_never_exceed_the_raw_size(cells in cells(), columns in 1..3000_usize) {
@@ -39,6 +47,18 @@ proptest! {
         if let Ok(cells) = codec::decode(&channel, columns, &Limits::default()) {
             prop_assert_eq!(codec::encode_grid(cells.as_ref(), columns).payload, channel.payload);
         }
+    }
+
+    #[test]
+    fn a_pose_decodes_exactly_if_its_quaternion_has_norm_1(
+        [qx, qy, qz, qw] in [-1.0..1.0_f64, -1.0..1.0, -1.0..1.0, -1.0..1.0], (norm, allowed) in norms(),
+    ) {
+        let scale = norm / (qx * qx + qy * qy + qz * qz + qw * qw).sqrt().max(1e-9);
+        let [qx, qy, qz, qw] = [qx, qy, qz, qw].map(|part| part * scale);
+        let pose = v1::Pose { x: 1.0, y: -2.0, z: 0.5, qx, qy, qz, qw };
+        let header = v1::Header { map_from_ego: Some(pose), ..Default::default() };
+        let decoded = map::decode_map(map::encode_header(&header).into(), &Limits::default());
+        prop_assert_eq!(decoded.is_ok(), allowed, "{:?}", decoded);
     }
 
     #[test]
@@ -70,7 +90,7 @@ proptest! {
         widths in vec(0.01_f32..3.0, 1..60), columns in 1..720_u32, at in any::<prop::sample::Index>(),
     ) {
         let row_radius_m = widths.iter().scan(0.0, |r, step| { *r += step; Some(*r) }).collect();
-        let grid = clearway_proto::grid::Grid::Radial { row_radius_m, columns };
+        let grid = clearway_proto::grid::Grid::Radial { centre_m: [0.0; 2], row_radius_m, columns };
         let index = at.index(grid.cell_count() as usize);
         let (x, y) = grid.centre_of(index).unwrap();
         prop_assert_eq!(grid.cell_at(x, y), Some(index));

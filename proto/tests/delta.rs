@@ -228,7 +228,7 @@ fn rectangle(from: [f64; 2], size: [f64; 2]) -> v1::Region {
 /// `layer` with a radial grid.
 fn radial(mut layer: v1::Layer, row_radius_m: Vec<f32>) -> v1::Layer {
     let columns = layer.channels[0].cell_count / row_radius_m.len() as u32;
-    layer.geometry = Some(Geometry::Radial(v1::RadialGrid { row_radius_m, columns }));
+    layer.geometry = Some(Geometry::Radial(v1::RadialGrid { row_radius_m, columns, ..Default::default() }));
     layer
 }
 
@@ -369,7 +369,7 @@ fn a_radial_part_has_rows_to_the_farthest_corner_and_all_columns() {
     let rings = radial(layer(2, 1, [0, 0], [24, 5]), vec![2.0, 5.0, 6.0, 9.0, 11.0]);
     let corner = |x_to_m, y_to_m| v1::Region { x_from_m: -1.0, x_to_m, y_from_m: -1.0, y_to_m };
     let part = decode(1, &region::crop(&rings, &corner(3.0, 4.0), &LIMITS()).unwrap(), None).unwrap();
-    assert_eq!(part.layers[0].grid, Grid::Radial { row_radius_m: vec![2.0, 5.0], columns: 24 });
+    assert_eq!(part.layers[0].grid, Grid::Radial { centre_m: [0.0; 2], row_radius_m: vec![2.0, 5.0], columns: 24 });
     let (whole, Cells::U8(class)) = (decode(1, &rings, None).unwrap(), &part.layers[0].channels[0].cells) else {
         panic!("class of u8")
     };

@@ -260,7 +260,7 @@ fn golden_map() -> (v1::Header, v1::Layer, v1::Layer) {
         compensation: "poses".into(),
         ..Default::default()
     };
-    let radial = v1::RadialGrid { row_radius_m: vec![4.0, 8.0, 12.0], columns: 8 };
+    let radial = v1::RadialGrid { row_radius_m: vec![4.0, 8.0, 12.0], columns: 8, ..Default::default() };
     let class: Vec<u8> = [[1; 8], [1, 1, 1, 1, 2, 2, 1, 1], [0, 0, 1, 1, 3, 3, 0, 0]].concat();
     let height: Vec<i8> = (0..24).map(|i| if i < 16 { -2 } else { i }).collect();
     let drivability = v1::Layer {

@@ -52,7 +52,17 @@ impl Engine {
     /// [`std::io::Error`] if the system cannot create a thread.
     pub fn start(mut self, events: Receiver<QueuedEvent>) -> std::io::Result<JoinHandle<()>> {
         std::thread::Builder::new().name(format!("engine {}", self.status.name)).spawn(move || {
+            // Marks the engine as stopped also if the thread panics.
+            struct Stopped(Arc<VehicleStatus>);
+            impl Drop for Stopped {
+                fn drop(&mut self) {
+                    self.0.engine_stopped();
+                }
+            }
+            let _stopped = Stopped(self.status.clone());
+            self.status.engine_beats();
             while let Some(queued) = self.next(&events) {
+                self.status.engine_beats();
                 self.step(queued);
             }
         })
@@ -100,7 +110,10 @@ impl Engine {
         loop {
             match events.recv_timeout(POLL_INTERVAL) {
                 Ok(queued) => return Some(queued),
-                Err(RecvTimeoutError::Timeout) => self.complete_newest_map(),
+                Err(RecvTimeoutError::Timeout) => {
+                    self.status.engine_beats();
+                    self.complete_newest_map();
+                }
                 Err(RecvTimeoutError::Disconnected) => {
                     self.update_status();
                     return None;

@@ -15,6 +15,7 @@
 //! | [`publish`] | newest map -> gRPC, zenoh, ROS 2, Foxglove, page |
 //! | [`record`] | events and maps -> MCAP file, and back; verification |
 //! | [`replay`] | recorded readings -> engines that are stepped in recorded time, and set back |
+//! | `store` | finished recordings -> a folder or a bucket, with an index; a search -> recordings |
 //! | [`status`] | ledger, rates and latency of each vehicle |
 //! | [`server`] | starts and stops all of these |
 //! | [`cli`] | the subcommands of `clearway` |
@@ -37,6 +38,8 @@ pub mod record;
 pub mod replay;
 pub mod server;
 pub mod status;
+#[cfg(feature = "store")]
+pub mod store;
 pub mod subscriptions;
 mod sync;
 #[cfg(feature = "zenoh")]

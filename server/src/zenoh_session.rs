@@ -1,5 +1,9 @@
 //! The zenoh session that ingest and publishers share: its settings, its limits, its errors.
 
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use zenoh::session::ZenohId;
 use zenoh::{Config, Session};
 
 use crate::config::Zenoh as Options;
@@ -53,13 +57,22 @@ impl ZenohError {
     }
 }
 
-/// Opens the session. A message of a peer may be twice as long as `observation_bytes_max`, and [`MESSAGE_BYTES_MAX`]
-/// in any case.
+/// Opens the session. Without access control in the file of `[zenoh]`, no peer may publish what the server publishes of
+/// its `vehicles` ([`own_keys`]). A message of a peer may be twice as long as `observation_bytes_max`, and
+/// [`MESSAGE_BYTES_MAX`] in any case.
 ///
 /// # Errors
 /// [`ZenohError`] if the settings are invalid, the file of `[zenoh]` cannot be read, or an endpoint is not available.
-pub(crate) async fn open(options: &Options, observation_bytes_max: usize) -> Result<Session, ZenohError> {
-    let config = session_config(options, MESSAGE_BYTES_MAX.max(2 * observation_bytes_max))?;
+pub(crate) async fn open(
+    options: &Options,
+    observation_bytes_max: usize,
+    vehicles: impl Iterator<Item = &str>,
+) -> Result<Session, ZenohError> {
+    let mut config = session_config(options, MESSAGE_BYTES_MAX.max(2 * observation_bytes_max))?;
+    if config.get_json("access_control/enabled").is_ok_and(|enabled| enabled != "true") {
+        let own_keys = own_keys(vehicles).to_string();
+        config.insert_json5("access_control", &own_keys).map_err(ZenohError::of("access_control"))?;
+    }
     let endpoints = options.listen.join(", ");
     zenoh::open(config).await.map_err(ZenohError::of(format!("open (listen {endpoints})")))
 }
@@ -67,6 +80,33 @@ pub(crate) async fn open(options: &Options, observation_bytes_max: usize) -> Res
 /// The endpoints the session listens on, with the ports that the system chose.
 pub(crate) async fn endpoints(session: &Session) -> Vec<String> {
     session.info().locators().await.iter().map(ToString::to_string).collect()
+}
+
+/// The names in the certificates of the peers at the other end of this session's links.
+pub(crate) struct PeerNames {
+    session: Session,
+    names: BTreeMap<ZenohId, String>,
+    read: Option<Instant>,
+}
+
+impl PeerNames {
+    /// Longest time for which the names are not read again. Ours.
+    const AGE_MAX: Duration = Duration::from_secs(1);
+
+    pub(crate) fn new(session: &Session) -> Self {
+        Self { session: session.clone(), names: BTreeMap::new(), read: None }
+    }
+
+    /// The common name in the certificate of a peer; `None` if no link of this session leads to it, or without TLS.
+    pub(crate) async fn name(&mut self, peer: ZenohId) -> Option<&str> {
+        let is_old = self.read.is_none_or(|read| read.elapsed() > Self::AGE_MAX);
+        if is_old || !self.names.contains_key(&peer) {
+            let links = self.session.info().links().await;
+            self.names = links.filter_map(|link| Some((*link.zid(), link.auth_identifier()?.to_owned()))).collect();
+            self.read = Some(Instant::now());
+        }
+        self.names.get(&peer).map(String::as_str)
+    }
 }
 
 fn session_config(options: &Options, message_bytes_max: usize) -> Result<Config, ZenohError> {
@@ -89,6 +129,25 @@ fn session_config(options: &Options, message_bytes_max: usize) -> Result<Config,
         config.insert_json5(key, &value).map_err(ZenohError::of(format!("{key} = {value}")))?;
     }
     Ok(config)
+}
+
+/// Access control under which peers may do everything but publish on the keys on which the server publishes. zenoh lets
+/// a publication on a key with wildcards through; Clearway's clients pass over it.
+fn own_keys<'a>(vehicles: impl Iterator<Item = &'a str>) -> serde_json::Value {
+    let keys = |vehicle| {
+        ["", "/status", "/ingest/report", "/map/**", "/map/*/@adv/**"].map(|rest| format!("clearway/{vehicle}{rest}"))
+    };
+    let keys: Vec<_> = vehicles.flat_map(keys).collect();
+    serde_json::json!({
+        "enabled": true,
+        "default_permission": "allow",
+        "rules": [{
+            "id": "publish as the server", "permission": "deny", "flows": ["ingress"], "key_exprs": keys,
+            "messages": ["put", "delete", "reply", "declare_queryable", "liveliness_token"],
+        }],
+        "subjects": [{ "id": "every peer" }],
+        "policies": [{ "rules": ["publish as the server"], "subjects": ["every peer"] }],
+    })
 }
 
 /// zenoh's default settings with [`LIMITS`].
@@ -114,5 +173,15 @@ mod tests {
                 assert_eq!(config.get_json(key).unwrap(), limited.get_json(key).unwrap(), "{name}: {key}");
             }
         }
+    }
+
+    #[test]
+    fn roles_with_and_without_a_router_are_the_same() {
+        let roles = ["server.json5", "router.json5"].map(|name| {
+            let file = format!("{}/../deploy/zenoh/{name}", env!("CARGO_MANIFEST_DIR"));
+            Config::from_file(&file).unwrap().get_json("access_control").unwrap()
+        });
+        assert_eq!(roles[0], roles[1]);
+        assert!(roles[0].contains("\"default_permission\":\"deny\""), "{}", roles[0]);
     }
 }

@@ -23,7 +23,7 @@ fn help_lists_the_subcommands_by_purpose_and_the_exit_codes() {
     let order =
         ["Make maps:", "  demo ", "  serve ", "  replay ", "Check maps", "  verify ", "Send sensor data:", "Shell:"];
     assert!(order.map(position).is_sorted(), "{help}");
-    position("Exit codes: 0 success, 1 failure, 2 wrong usage.");
+    position("Exit codes: 0 good, 1 the result differs, 2 an input cannot be read");
 }
 
 #[test]
@@ -31,7 +31,7 @@ fn every_subcommand_has_help() {
     let help = text(&clearway(&["--help"]).stdout);
     let names = help.lines().filter_map(|line| line.strip_prefix("  ")?.split_once(' ').map(|(name, _)| name));
     let names: Vec<&str> = names.filter(|name| !name.is_empty() && !name.starts_with('-')).collect();
-    assert_eq!(names.len(), 15, "{names:?}");
+    assert_eq!(names.len(), 18, "{names:?}");
     for name in names {
         let output = clearway(&[name, "--help"]);
         assert!(output.status.success() && text(&output.stdout).contains(&format!("Usage: clearway {name}")), "{name}");
@@ -63,7 +63,23 @@ fn the_default_configuration_is_printed_with_its_comments_and_is_valid() {
     std::fs::write(folder.path().join("clearway.toml"), &printed.stdout).unwrap();
     let checked = clearway_in(folder.path(), &["check"]);
     assert!(checked.status.success(), "{}", text(&checked.stderr));
-    assert_eq!(clearway(&["check", "--default", "--set", "grpc.enabled=false"]).status.code(), Some(2));
+    assert_eq!(clearway(&["check", "--default", "--set", "grpc.enabled=false"]).status.code(), Some(3));
+}
+
+#[test]
+fn the_variable_clearway_config_names_the_default_file_and_contradicts_no_option() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("other.toml"), "[grpc]\nenabled = 7\n").unwrap();
+    let check = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_clearway"));
+        command.arg("check").args(arguments).env("CLEARWAY_CONFIG", "other.toml").current_dir(folder.path());
+        command.output().expect("the binary starts")
+    };
+    let refused = check(&[]);
+    let error = text(&refused.stderr);
+    assert!(refused.status.code() == Some(2) && error.contains("other.toml"), "{error}");
+    let printed = check(&["--default"]);
+    assert!(printed.status.success(), "{}", text(&printed.stderr));
 }
 
 #[test]
@@ -73,7 +89,7 @@ fn an_unknown_key_is_refused_with_its_file_and_line() {
     std::fs::write(&file, "[grpc]\nlisten = \"127.0.0.1:0\"\nlissten = 1\n").unwrap();
     let output = clearway(&["serve", "--config", file.to_str().unwrap()]);
     let error = text(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{error}");
+    assert_eq!(output.status.code(), Some(2), "{error}");
     assert!(error.contains("clearway.toml") && error.contains("line 3") && error.contains("lissten"), "{error}");
 }
 
@@ -82,7 +98,7 @@ fn serve_without_a_configuration_file_names_the_example() {
     let folder = tempfile::tempdir().unwrap();
     let output = clearway_in(folder.path(), &["serve"]);
     let error = text(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{error}");
+    assert_eq!(output.status.code(), Some(2), "{error}");
     assert!(
         error.contains("clearway check --default") && error.contains("configuration clearway.toml: No such file"),
         "{error}"
@@ -90,9 +106,9 @@ fn serve_without_a_configuration_file_names_the_example() {
 }
 
 #[test]
-fn wrong_usage_prints_the_usage_and_exits_with_2() {
+fn wrong_usage_prints_the_usage_and_exits_with_3() {
     let output = clearway(&["replay"]);
-    assert_eq!(output.status.code(), Some(2));
+    assert_eq!(output.status.code(), Some(3));
     assert!(text(&output.stderr).contains("Usage: clearway replay"));
 }
 
@@ -107,10 +123,10 @@ fn a_negative_number_is_a_wrong_value_and_not_an_unknown_option() {
     ] {
         let output = clearway(arguments);
         let error = text(&output.stderr);
-        assert!(output.status.code() == Some(2) && error.contains(allowed), "{arguments:?}: {error}");
+        assert!(output.status.code() == Some(3) && error.contains(allowed), "{arguments:?}: {error}");
     }
     let extrinsics = clearway(&["replay", "absent.pcap", "--extrinsics", "-1,0,1.9,0,-2,0"]);
-    assert_eq!(extrinsics.status.code(), Some(1), "{}", text(&extrinsics.stderr));
+    assert_eq!(extrinsics.status.code(), Some(2), "{}", text(&extrinsics.stderr));
 }
 
 #[test]
@@ -130,7 +146,7 @@ fn a_sensor_model_is_listed_in_the_help_and_read_in_each_way_to_write_it() {
     assert!(simulated("VLP-16").contains("with the sensor vlp16"));
     let refused = clearway(&["replay", "a.pcap", "--model", "hdl64e"]);
     let error = text(&refused.stderr);
-    assert!(refused.status.code() == Some(2) && error.contains("hdl64e_s1, hdl64e_s2, hdl64e_s3"), "{error}");
+    assert!(refused.status.code() == Some(3) && error.contains("hdl64e_s1, hdl64e_s2, hdl64e_s3"), "{error}");
 }
 
 #[test]
@@ -173,8 +189,7 @@ fn a_file_that_cannot_be_used_is_named_with_what_to_do() {
     for (arguments, file, advice) in wrong_files {
         let output = clearway(arguments);
         let error = text(&output.stderr);
-        let code = if arguments[0] == "verify" { 2 } else { 1 };
-        assert_eq!(output.status.code(), Some(code), "{arguments:?}: {error}");
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {error}");
         assert!(error.contains(file) && error.contains(advice), "{arguments:?}: {error}");
         assert!(!error.contains("os error"), "{arguments:?}: {error}");
     }
@@ -188,13 +203,13 @@ fn options_that_would_have_no_effect_are_refused() {
     let path = file.to_str().unwrap();
     let to = "udp://127.0.0.1:9";
     let refused: [(&[&str], i32, &str); 7] = [
-        (&["replay", path, "--vehicle", "car"], 1, "--vehicle car: the files name no vehicle"),
-        (&["replay", path, "--topic", "/points"], 1, "--topic /points: the files have no topics"),
-        (&["replay", path, "--record", path], 1, "this file is replayed; name another file"),
-        (&["simulate", "flat", "--out", "x.pcap", "--telemetry-to", to], 2, "--telemetry-to"),
-        (&["send", path, "--to", to, "--seed", "7"], 2, "--seed needs a fault of the network"),
-        (&["watch", "--zenoh", "tcp/localhost:1", "--ca", "ca.pem"], 2, "--ca"),
-        (&["check", "--default", "--config", "a.toml"], 2, "--config"),
+        (&["replay", path, "--vehicle", "car"], 2, "--vehicle car: the files name no vehicle"),
+        (&["replay", path, "--topic", "/points"], 2, "--topic /points: the files have no topics"),
+        (&["replay", path, "--record", path], 2, "this file is replayed; name another file"),
+        (&["simulate", "flat", "--out", "x.pcap", "--telemetry-to", to], 3, "--telemetry-to"),
+        (&["send", path, "--to", to, "--seed", "7"], 3, "--seed needs a fault of the network"),
+        (&["watch", "--zenoh", "tcp/localhost:1", "--ca", "ca.pem"], 3, "--ca"),
+        (&["check", "--default", "--config", "a.toml"], 3, "--config"),
     ];
     for (arguments, code, message) in refused {
         let output = clearway(arguments);
@@ -222,7 +237,7 @@ fn completions_know_every_subcommand() {
             output.status.success() && ["replay", "simulate", "completions"].iter().all(|name| script.contains(name))
         );
     }
-    assert_eq!(clearway(&["completions", "dos"]).status.code(), Some(2));
+    assert_eq!(clearway(&["completions", "dos"]).status.code(), Some(3));
 }
 
 /// Simulates 0.3 s of a town with a VLP-16 to a new file; returns the bytes of the file.
@@ -266,7 +281,7 @@ fn simulate_refuses_to_overwrite_a_file() {
     let file = folder.path().join("keep.pcap");
     std::fs::write(&file, "keep").unwrap();
     let output = clearway(&["simulate", "flat", "--seconds", "0.1", "--out", file.to_str().unwrap()]);
-    assert!(output.status.code() == Some(1) && text(&output.stderr).contains("exists"), "{}", text(&output.stderr));
+    assert!(output.status.code() == Some(2) && text(&output.stderr).contains("exists"), "{}", text(&output.stderr));
     assert_eq!(std::fs::read(&file).unwrap(), b"keep");
-    assert_eq!(clearway(&["simulate", "flat"]).status.code(), Some(2), "--out or --to is needed");
+    assert_eq!(clearway(&["simulate", "flat"]).status.code(), Some(3), "--out or --to is needed");
 }

@@ -58,15 +58,13 @@ fn every_file_of_the_corpora_is_handled_without_a_panic() {
 fn a_record_that_reaches_beyond_its_chunk_is_damage() {
     let read = messages_of(record_beyond_its_chunk());
     assert_eq!(read[0], "event 0");
-    assert_eq!(read[1..], ["any.mcap: damaged after 1 message: Chunk ended in the middle of a record"]);
+    assert!(read[1].contains("damaged in 1 place") && read[1].contains("in the middle of a record"), "{read:?}");
 }
 
 #[test]
 fn an_attachment_that_ends_before_its_crc_is_damage() {
-    assert_eq!(
-        messages_of(attachment_without_crc()),
-        ["any.mcap: damaged after 0 messages: MCAP file ended in the middle of a record"]
-    );
+    let read = messages_of(attachment_without_crc());
+    assert!(read[0].contains("in the middle of a record"), "{read:?}");
 }
 
 #[test]
@@ -79,13 +77,13 @@ fn a_chunk_with_a_wrong_length_is_refused() {
         messages_of(bytes).pop().unwrap()
     };
     // The head of a record has nine bytes; then come the chunk's two stamps and its uncompressed size.
-    assert!(with_length(9 + 16, u64::MAX).contains("damaged after 0 messages"), "{}", with_length(9 + 16, u64::MAX));
-    assert!(with_length(9 + 16, 1).contains("damaged after 0 messages"), "{}", with_length(9 + 16, 1));
-    assert!(with_length(1, u64::MAX).contains("damaged after 0 messages"), "{}", with_length(1, u64::MAX));
+    for (at, length) in [(9 + 16, u64::MAX), (9 + 16, 1), (1, u64::MAX), (1, 1 << 20), (1, 1)] {
+        assert!(with_length(at, length).contains("damaged in"), "{at}, {length}: {}", with_length(at, length));
+    }
     assert_eq!(messages_of(whole), ["event 0", "event 1", "end"]);
 }
 
-/// The events of a recording, then `end`, `cut`, or the error.
+/// The events of a recording, then `end`, what is wrong with it, or the error.
 fn messages_of(bytes: Vec<u8>) -> Vec<String> {
     let mut recording = match RecordingReader::from_source(Path::new("any.mcap"), Cursor::new(bytes)) {
         Ok(recording) => recording,
@@ -99,7 +97,7 @@ fn messages_of(bytes: Vec<u8>) -> Vec<String> {
             Err(error) => return [read, vec![error.to_string()]].concat(),
         }
     }
-    read.push(if recording.is_cut() { "cut" } else { "end" }.into());
+    read.push(recording.incomplete().unwrap_or_else(|| "end".into()));
     read
 }
 

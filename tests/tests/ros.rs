@@ -4,7 +4,7 @@ mod fixture;
 
 use std::fs::File;
 use std::io::BufWriter;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use clearway::cli::replay::{Mount, Options, ReplayError, Summary, replay};
 use clearway::config::{Origin, Ros};
@@ -350,13 +350,4 @@ async fn live_topics_of_rmw_zenoh_make_maps_and_bad_messages_are_counted() {
     assert!(snapshot.drivable_share.unwrap() > 0.3);
     session.close().await.unwrap();
     running.shutdown().await.unwrap();
-}
-
-#[tokio::test(flavor = "multi_thread")]
-#[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
-async fn a_sqlite3_bag_is_refused_with_the_command_that_converts_it() {
-    let folder = "ros2bag/nebula/decoder_ground_truth/vlp16/1673400471837873222";
-    let file: PathBuf = Path::new(env!("CLEARWAY_DATA")).join(folder);
-    let error = replayed(options(&file)).await.unwrap_err().to_string();
-    assert!(error.contains("_0.db3: a ROS 2 bag in sqlite3") && error.contains("ros2 bag convert -i"), "{error}");
 }

@@ -2,14 +2,16 @@
 
 mod fixture;
 
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::sync::Arc;
 
 use clearway::cli::replay::{Options, Summary, replay};
 use clearway::server::{Running, Server, Setup};
-use clearway_client::{Client, ClientError, Subscription, Tls, ZenohClient};
+use clearway_client::{Client, ClientError, Observation, PublicKey, Subscription, Tls, ZenohClient, now_ns};
 use fixture::certificates::{behind, certificates, router, secured, start, zenoh_file};
-use fixture::{config, feed, grpc, readings, within};
+use fixture::{config, feed, grpc, readings, until, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
@@ -187,7 +189,7 @@ async fn the_router_of_deploy_allows_each_certificate_only_its_keys() {
     let running = fixture::start(behind(&at, folder.path(), config())).await;
 
     let reader = zenoh_client(&at, "ours", "reader").await.expect("a session");
-    let unlisted = zenoh_client(&at, "ours", "operator").await.expect("a session");
+    let unlisted = zenoh_client(&at, "ours", "unlisted").await.expect("a session");
     let ingester = zenoh_client(&at, "ours", "ingester").await.expect("a session");
     assert!(zenoh_client(&at, "theirs", "reader").await.is_err(), "a certificate of another CA is accepted");
 
@@ -232,4 +234,75 @@ async fn the_router_of_deploy_allows_each_certificate_only_its_keys() {
     }
     within("shutdown", running.shutdown()).await.unwrap();
     router.close().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
+async fn an_observation_over_zenoh_needs_the_role_also_without_access_control_in_the_session() {
+    let (folder, ours) = (tempfile::tempdir().unwrap(), certificates("ours"));
+    let mut config = secured(true);
+    let file = folder.path().join("server.json5");
+    let text = zenoh_file("server.json5", &ours);
+    std::fs::write(
+        &file,
+        text.replace("enabled: true,\n    default_permission", "enabled: false,\n    default_permission"),
+    )
+    .unwrap();
+    (config.zenoh.enabled, config.zenoh.file) = (true, file);
+    config.zenoh.listen = vec!["tls/127.0.0.1:0".into()];
+    let running = start(config).await;
+    let at = format!("tls/localhost:{}", running.zenoh[0].rsplit_once(':').unwrap().1);
+    for (name, may_send) in [("reader", false), ("unlisted", false), ("ingester", true), ("operator", true)] {
+        let file = folder.path().join(format!("{name}.json5"));
+        let text = zenoh_file("client.json5", &ours);
+        std::fs::write(&file, text.replace("/reader.", &format!("/{name}."))).unwrap();
+        let client = within("zenoh", ZenohClient::connect_with(&at, &file)).await.expect("a session");
+        let mut ingester = within("an ingester", client.ingest("car")).await.unwrap();
+        let pose = Observation::pose(now_ns(), [0.0; 3], [0.0, 0.0, 0.0, 1.0], 1.0);
+        within("a pose", ingester.send(pose)).await.unwrap();
+        let refused = within("its outcome", ingester.settled()).await.unwrap();
+        let reasons: Vec<_> = refused.iter().map(|refusal| refusal.reason.as_str()).collect();
+        assert_eq!(reasons, if may_send { &[][..] } else { &["role"][..] }, "{name}: {refused:?}");
+    }
+    let ledger = &running.vehicles.0[0].status;
+    until("both poses", || ledger.snapshot().ledger.poses == 2).await;
+    within("shutdown", running.shutdown()).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+#[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
+async fn readers_with_the_public_key_believe_the_server_that_signs() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name).display().to_string();
+    for name in ["maps", "others"] {
+        let (key, public) = (file(&format!("{name}.key")), file(&format!("{name}.pub")));
+        for arguments in [
+            ["genpkey", "-algorithm", "ed25519", "-out", &key].as_slice(),
+            ["pkey", "-in", &key, "-pubout", "-out", &public].as_slice(),
+        ] {
+            assert!(std::process::Command::new("openssl").args(arguments).status().unwrap().success());
+        }
+    }
+    let mut config = config();
+    (config.zenoh.enabled, config.zenoh.signing_key) = (true, file("maps.key").into());
+    std::fs::set_permissions(file("maps.key"), Permissions::from_mode(0o644)).unwrap();
+    let error = Server::start(Setup { config: config.clone(), ..Setup::default() }).await.err().unwrap().to_string();
+    assert!(error.contains("zenoh.signing_key") && error.contains("mode 644"), "{error}");
+    std::fs::set_permissions(file("maps.key"), Permissions::from_mode(0o600)).unwrap();
+    let running = fixture::start(config).await;
+    let public = |name: &str| PublicKey::from_pem(&std::fs::read_to_string(file(name)).unwrap()).unwrap();
+    let client = within("zenoh", ZenohClient::connect(&running.zenoh[0])).await.unwrap();
+    let (ours, others) = (client.clone().signed_by(public("maps.pub")), client.signed_by(public("others.pub")));
+    let mut believed = ours.subscribe("car", "drivability").await.unwrap();
+    let doubted = others.subscribe("car", "drivability").await.unwrap();
+    let car = fixture::Driving::to(&running);
+    within("a signed map", believed.next()).await.unwrap();
+    until("maps that are passed over", || doubted.passed_over().unsigned > 1).await;
+    assert!(doubted.newest().is_none());
+    assert_eq!(believed.passed_over().hostile(), 0);
+    let queried = within("an answer", ours.newest("car", "drivability")).await.unwrap();
+    assert!(queried.is_some(), "answers to queries are signed too");
+    assert!(within("an answer", others.newest("car", "drivability")).await.unwrap().is_none());
+    car.halt();
+    within("shutdown", running.shutdown()).await.unwrap();
 }

@@ -292,7 +292,7 @@ async fn frame(stream: &mut tokio::net::TcpStream) -> (u8, Vec<u8>) {
 async fn http(address: std::net::SocketAddr, path: &str) -> String {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     let mut stream = tokio::net::TcpStream::connect(address).await.unwrap();
-    let request = format!("GET {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n");
+    let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n");
     stream.write_all(request.as_bytes()).await.unwrap();
     let mut answer = Vec::new();
     within("an answer", stream.read_to_end(&mut answer)).await.unwrap();
@@ -323,7 +323,7 @@ async fn the_page_its_live_maps_and_the_metrics_are_served() {
     assert_eq!(vehicles[0]["name"], "car");
 
     let mut stream = tokio::net::TcpStream::connect(address).await.unwrap();
-    let upgrade = "GET /live?vehicle=car HTTP/1.1\r\nHost: x\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+    let upgrade = "GET /live?vehicle=car HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
         Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n";
     stream.write_all(upgrade.as_bytes()).await.unwrap();
     let mut head = Vec::new();

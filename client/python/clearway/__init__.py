@@ -10,6 +10,7 @@ An address is `HOST:PORT` for gRPC, or `zenoh:ENDPOINT` (`zenoh:tcp/localhost:74
 from __future__ import annotations
 
 from collections.abc import Sequence
+from os import PathLike
 
 from . import over_grpc, over_zenoh
 from .errors import ClearwayError, DecodeError
@@ -17,13 +18,13 @@ from .freshness import now_ns
 from .grid import CartesianGrid, RadialGrid
 from .map import Channel, Layer, LegendEntry, Map, Meaning, Obstacle, SafePoint
 from .recording import read
-from .stream import MapStream
+from .stream import MapStream, PassedOver
 from .tls import Tls
 from .v1 import map_pb2, service_pb2
 
 __all__ = [
     "CartesianGrid", "Channel", "ClearwayError", "DecodeError", "Layer", "LegendEntry", "Map", "MapStream", "Meaning",
-    "Obstacle", "RadialGrid", "SafePoint", "Tls", "get", "now_ns", "read", "vehicles", "watch",
+    "Obstacle", "PassedOver", "RadialGrid", "SafePoint", "Tls", "get", "now_ns", "read", "vehicles", "watch",
 ]  # fmt: skip
 
 
@@ -36,6 +37,7 @@ def watch(
     region: Sequence[float] | None = None,
     deltas: bool = False,
     tls: Tls | None = None,
+    signed_by: str | PathLike[str] | None = None,
 ) -> MapStream:
     """Streams the newest map, starting with the present one.
 
@@ -44,12 +46,14 @@ def watch(
     `max_in_flight` maps are sent without an acknowledgement, and at most `max_rate_hz` maps per second. Each layer is
     cut to the `region` (x_from_m, x_to_m, y_from_m, y_to_m) in the ego frame. With `deltas`, layers are sent as
     changes from the map before: fewer bytes, the same maps. Errors of the server are raised by the first `next`; for
-    an unknown vehicle or layer the message lists the known ones.
+    an unknown vehicle or layer the message lists the known ones. For zenoh: with `signed_by`, the PEM file of a
+    server's public key, only maps that this server has signed are believed; `MapStream.passed_over` counts the others.
     """
+    _check_signed_by(address, signed_by)
     if endpoint := _zenoh(address, vehicle, layers):
         if max_rate_hz is not None or region is not None or deltas:
             raise ClearwayError("selection", f"{address}: max_rate_hz, region and deltas are for gRPC, HOST:PORT")
-        return over_zenoh.watch(endpoint, vehicle, layers, tls)
+        return over_zenoh.watch(endpoint, vehicle, layers, tls, signed_by)
     selection = service_pb2.Selection(vehicle=vehicle, layers=layers, max_in_flight=max_in_flight, deltas=deltas)
     if max_rate_hz is not None:
         selection.max_rate_hz = max_rate_hz
@@ -59,10 +63,17 @@ def watch(
     return over_grpc.watch(address, selection, tls)
 
 
-def get(address: str, vehicle: str = "", layers: Sequence[str] = (), tls: Tls | None = None) -> Map:
-    """Returns the newest map; it may be stale."""
+def get(
+    address: str,
+    vehicle: str = "",
+    layers: Sequence[str] = (),
+    tls: Tls | None = None,
+    signed_by: str | PathLike[str] | None = None,
+) -> Map:
+    """Returns the newest map; it may be stale. `signed_by` as in `watch`."""
+    _check_signed_by(address, signed_by)
     if endpoint := _zenoh(address, vehicle, layers):
-        return over_zenoh.get(endpoint, vehicle, layers, tls)
+        return over_zenoh.get(endpoint, vehicle, layers, tls, signed_by)
     return over_grpc.get(address, vehicle, layers, tls)
 
 
@@ -71,6 +82,11 @@ def vehicles(address: str, tls: Tls | None = None) -> list[str]:
     if address.startswith("zenoh:"):
         return over_zenoh.vehicles(address.removeprefix("zenoh:"), tls)
     return sorted(vehicle.name for vehicle in over_grpc.vehicles(address, tls))
+
+
+def _check_signed_by(address: str, signed_by: str | PathLike[str] | None) -> None:
+    if signed_by is not None and not address.startswith("zenoh:"):
+        raise ClearwayError("selection", f"{address}: signed_by is for zenoh:ENDPOINT; over gRPC use tls")
 
 
 def _zenoh(address: str, vehicle: str, layers: Sequence[str]) -> str | None:

@@ -1,7 +1,8 @@
 """Decodes the cells of a channel, as `proto/src/channel` does; both read the same golden vectors.
 
 In: a `Channel` message from any source, also a hostile one. Out: an array of raw cells, or a `DecodeError`. The claimed
-number of cells is checked before memory is allocated. Only the Rust decoder checks that a payload is canonical; here
+number of cells is checked before memory is allocated; where it is large beside the payload, so are the lengths in the
+payload, so that a false claim costs nothing. Only the Rust decoder checks that a payload is canonical; here
 the CRC alone decides whether the cells are right. Format: `proto/clearway/v1/map.proto`, `Channel` and `Encoding`.
 """
 
@@ -17,6 +18,8 @@ from .v1 import map_pb2
 
 _TYPES = {1: np.dtype("u1"), 2: np.dtype("i1"), 3: np.dtype("<u2")}
 _RAW, _ROWS, _CHANGES = map_pb2.ENCODING_RAW, map_pb2.ENCODING_ROWS, map_pb2.ENCODING_CHANGES
+# Claims of more cells for each byte of the payload are checked before memory is allocated for them.
+_CELLS_PER_BYTE = 1024
 _BUSY = re.compile(rb"[^\0]")
 
 
@@ -33,6 +36,8 @@ def decode(channel: map_pb2.Channel, columns: int, base: Callable[[np.dtype], np
     if channel.encoding == _RAW:
         cells = np.frombuffer(payload, dtype).reshape(-1, columns)
     elif channel.encoding == _ROWS:
+        if count > _CELLS_PER_BYTE * (len(payload) + 64):
+            _check_lengths(_Bits(payload, dtype), count)
         cells = _rows(_Bits(payload, dtype), count // columns, columns, dtype)
     else:
         cells = _changes(_Bits(payload, dtype), base(dtype))
@@ -69,6 +74,19 @@ class _Bits:
 
     def cell(self, number: int) -> np.generic:
         return np.int64(number >> 1 ^ -(number & 1) if self.dtype.kind == "i" else number).astype(self.dtype)
+
+
+def _check_lengths(bits: _Bits, count: int) -> None:
+    """Checks that the lengths of `ENCODING_ROWS` add up to the number of cells."""
+    at = 0
+    while at < count:
+        at += bits.number()
+        if at < count:
+            if not bits.bit():
+                bits.number()
+            at += bits.number() + 1
+    if at != count:
+        raise DecodeError("cells", f"the payload has {at} cells, not {count}")
 
 
 def _rows(bits: _Bits, rows: int, columns: int, dtype: np.dtype) -> np.ndarray:

@@ -43,4 +43,8 @@ class Arrival(NamedTuple):
 
     def age_ns_min(self) -> int:
         """Least age of the map in ns; it does not depend on the present wall clock."""
-        return self.age_ns + self.clock.steady_ns() - self.steady_ns
+        return self.age_ns + self.since_ns()
+
+    def since_ns(self) -> int:
+        """Time since the arrival in ns, by the steady clock."""
+        return self.clock.steady_ns() - self.steady_ns

@@ -14,10 +14,12 @@ import numpy as np
 @dataclass(frozen=True)
 class RadialGrid:
     """Rings and sectors; array shape (rows, columns). Row j spans (row_radius_m[j-1], row_radius_m[j]], column c the
-    azimuths [c, c+1) * 2 pi / columns, counter-clockwise from the ego x axis."""
+    azimuths [c, c+1) * 2 pi / columns, counter-clockwise from the ego x axis, both about the centre."""
 
     row_radius_m: np.ndarray
     columns: int
+    #: Position (x, y) of the centre: the sensor whose lasers define the rows.
+    centre_m: tuple[float, float] = (0.0, 0.0)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -25,6 +27,7 @@ class RadialGrid:
 
     def cells_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Cell index of each point, -1 outside the grid."""
+        x_m, y_m = np.asarray(x_m) - self.centre_m[0], np.asarray(y_m) - self.centre_m[1]
         row = np.searchsorted(self.row_radius_m, np.hypot(x_m, y_m), side="left")
         share = np.mod(np.arctan2(y_m, x_m) / math.tau, 1.0)
         column = np.minimum((share * self.columns).astype(np.int64), self.columns - 1)
@@ -32,6 +35,7 @@ class RadialGrid:
 
     def nearest(self, cells: np.ndarray, x_m: float, y_m: float) -> np.ndarray:
         """The point of each of these cells (indices) that is nearest to a point, shape (n, 2)."""
+        x_m, y_m = x_m - self.centre_m[0], y_m - self.centre_m[1]
         row, column = np.divmod(cells, self.columns)
         inner, outer = np.concatenate(([0.0], self.row_radius_m[:-1]))[row], self.row_radius_m[row]
 
@@ -45,14 +49,14 @@ class RadialGrid:
         first, last = along(column / self.columns), along((column + 1) / self.columns)
         is_first = np.hypot(*(first - (x_m, y_m)).T) <= np.hypot(*(last - (x_m, y_m)).T)
         beside = np.where(is_first[:, None], first, last)
-        return np.where(abreast[:, None], along(np.full(len(cells), share)), beside)
+        return np.where(abreast[:, None], along(np.full(len(cells), share)), beside) + self.centre_m
 
     def centres(self) -> np.ndarray:
         """Centre of every cell, shape (rows, columns, 2)."""
         outer = self.row_radius_m
         range_m = 0.5 * (np.concatenate(([0.0], outer[:-1])) + outer)
         azimuth = (np.arange(self.columns) + 0.5) / self.columns * math.tau
-        return range_m[:, None, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
+        return range_m[:, None, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1) + self.centre_m
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,10 @@ from .limits import MAP_BYTES_MAX, MAP_CELLS_MAX, MAP_PARTS_MAX, RGB_MAX, SAFE_P
 from .v1 import map_pb2
 
 
+#: Longest time after its capture for which a map is believed to be valid (the Rust client's view.rs).
+_VALID_NS_MAX = 60_000_000_000
+
+
 @dataclass(frozen=True)
 class Channel:
     """One value per cell of a layer."""
@@ -353,8 +357,16 @@ class Map:
         """Time from now until the map is stale, in seconds; 0 if it is stale."""
         return 0.0 if self.stale else (self._valid_ns() - self.age_ns() + 1) * 1e-9
 
+    def ahead_ns(self) -> int:
+        """Time by which the end of the capture lies in the future of this machine's clock, in ns."""
+        return self.header.capture_end_ns - self._now_ns()
+
+    def since_arrival_ns(self) -> int:
+        """Time since the map arrived at this process, in ns; 0 if it did not come from a server."""
+        return 0 if self._arrival is None else self._arrival.since_ns()
+
     def _valid_ns(self) -> int:
-        return self.header.valid_until_ns - self.header.capture_end_ns
+        return min(self.header.valid_until_ns - self.header.capture_end_ns, _VALID_NS_MAX)
 
     def _now_ns(self) -> int:
         return now_ns() if self._arrival is None else self._arrival.clock.wall_ns()
@@ -369,8 +381,9 @@ def _grid(message: map_pb2.Layer) -> Grid:
     if kind == "radial":
         radii = np.array(message.radial.row_radius_m, dtype=np.float64)
         ascending = np.isfinite(radii).all() and (np.diff(radii, prepend=0.0) > 0).all()
-        if message.radial.columns and len(radii) and ascending:
-            return RadialGrid(radii, message.radial.columns)
+        centre = (message.radial.centre_x_m, message.radial.centre_y_m)
+        if message.radial.columns and len(radii) and ascending and all(map(math.isfinite, centre)):
+            return RadialGrid(radii, message.radial.columns, centre)
     elif kind == "cartesian":
         grid = message.cartesian
         finite = all(map(math.isfinite, (grid.origin_x_m, grid.origin_y_m, grid.cell_m, grid.yaw_rad)))
@@ -400,7 +413,8 @@ def _shift(layer: str, before: Grid, now: Grid) -> tuple[int, int]:
     if isinstance(before, CartesianGrid) and isinstance(now, CartesianGrid) and before.cell_m == now.cell_m:
         return now.first_iy - before.first_iy, now.first_ix - before.first_ix
     if isinstance(before, RadialGrid) and isinstance(now, RadialGrid):
-        if before.columns == now.columns and np.array_equal(before.row_radius_m, now.row_radius_m):
+        same = (before.columns, before.centre_m) == (now.columns, now.centre_m)
+        if same and np.array_equal(before.row_radius_m, now.row_radius_m):
             return 0, 0
     raise DecodeError("base_shape", f"layer {layer!r} is a delta to a grid that is not comparable")
 

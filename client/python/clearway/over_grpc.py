@@ -75,7 +75,7 @@ def watch(address: str, selection: service_pb2.Selection, tls: Tls | None) -> Ma
             yield request
 
     updates = service.Watch(outgoing())
-    stream = MapStream()
+    stream = MapStream(has_one_server=True)
 
     def run() -> None:
         try:

@@ -3,8 +3,8 @@
 Each layer has its own key; a map is complete when all selected layers with one sequence number have arrived. The
 publisher's cache gives the current map to a new subscriber, and again after a lost connection is restored. Lost maps
 are not recovered: an old map has no use. Only if the last map is lost, no newer sample follows that shows the loss;
-then the publisher's heartbeat states its number, and it is queried. zenoh keeps one sample per key for this process,
-the newest: a queue would deliver old maps.
+then the publisher's heartbeat states its number, and it is queried. A thread per key checks and decodes each sample;
+what does not belong on the key is counted and passed over.
 """
 
 from __future__ import annotations
@@ -12,11 +12,13 @@ from __future__ import annotations
 import atexit
 import json
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from os import PathLike
 from typing import TYPE_CHECKING
 
 from .errors import ClearwayError
 from .map import Map
+from .signature import PublicKey
 from .stream import MapStream
 from .tls import Tls
 from .v1 import map_pb2
@@ -29,6 +31,10 @@ _TIMEOUT_S = 5.0
 #: Most gaps kept between two samples. If there are more (the process was suspended), the first count as skipped and not
 #: as lost.
 _MISSES_KEPT = 1024
+#: Samples kept per key between zenoh and the thread that reads them: that many false ones hide no true one.
+_SAMPLES_KEPT = 64
+#: Most maps of which some layers have arrived. Ours: layers of one map arrive together.
+_MAPS_BEGUN_MAX = 16
 #: Settings of every session; client/src/zenoh.rs has the reasons.
 _SETTINGS = {
     "mode": "client",
@@ -73,29 +79,75 @@ def vehicles(endpoint: str, tls: Tls | None) -> list[str]:
         return sorted({str(reply.ok.key_expr).removeprefix("clearway/") for reply in replies if reply.ok})
 
 
-def _newest(session: zenoh.Session, key: str) -> bytes | None:
-    for reply in session.get(key, timeout=_TIMEOUT_S):
+def _replies(session: zenoh.Session, key: str) -> Iterator[zenoh.Sample]:
+    """Every reply of every peer: zenoh would otherwise select one, perhaps that of a peer that is no server."""
+    import zenoh
+
+    everything = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE}
+    for reply in session.get(key, timeout=_TIMEOUT_S, **everything):
         if reply.ok:
-            return reply.ok.payload.to_bytes()
-    return None
+            yield reply.ok
 
 
-def get(endpoint: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -> Map:
-    collector = _LayerCollector(layers)
+class _Unfit(Exception):
+    """A sample that is no map of its key. The text is the name of a field of `PassedOver`."""
+
+
+class _LayerKey:
+    """The key of one layer of one vehicle, and the server that publishes it."""
+
+    def __init__(self, vehicle: str, layer: str, signed_by: PublicKey | None) -> None:
+        self.key, self._vehicle, self.layer = f"clearway/{vehicle}/map/{layer}", vehicle, layer
+        self._signed_by = signed_by
+
+    def part(self, sample: zenoh.Sample) -> tuple[bytes, map_pb2.Map]:
+        """The encoded map of a sample and its message. Raises `_Unfit` if it does not belong on this key."""
+        # A sample on `clearway/**` reaches this subscription too.
+        if str(sample.key_expr) != self.key:
+            raise _Unfit("misplaced")
+        part = sample.payload.to_bytes()
+        if self._signed_by is not None:
+            signature = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            if not self._signed_by.verifies(self.key, part, signature):
+                raise _Unfit("unsigned")
+        try:
+            m = Map(part)
+            names = list(m.layers)
+        except Exception:  # noqa: BLE001: whatever is wrong with it, it is no map.
+            raise _Unfit("undecodable") from None
+        if m.vehicle != self._vehicle or any(name != self.layer for name in names):
+            raise _Unfit("misplaced")
+        return part, map_pb2.Map.FromString(part)
+
+
+def get(
+    endpoint: str, vehicle: str, layers: Sequence[str], tls: Tls | None, signed_by: str | PathLike[str] | None
+) -> Map:
+    collector, server = _LayerCollector(layers), None if signed_by is None else PublicKey(signed_by)
+    keys, whole, unfit = [_LayerKey(vehicle, layer, server) for layer in layers], [], 0
     with _session(endpoint, tls) as session:
         # A new map can come between two queries; the second round then finds one sequence.
         for _ in range(10):
-            for layer in layers:
-                key = f"clearway/{vehicle}/map/{layer}"
-                part = _newest(session, key)
-                if part is None:
-                    raise ClearwayError("NOT_FOUND", f"{endpoint}: no server serves {key}")
-                if whole := collector.add(part):
-                    return Map(whole[0]).with_arrival()
-    raise ClearwayError("zenoh", f"{endpoint}: ten queries did not find the layers {', '.join(layers)} of one map")
+            for key in keys:
+                is_served = False
+                for sample in _replies(session, key.key):
+                    is_served = True
+                    try:
+                        whole += [Map(encoded).with_arrival() for encoded in collector.add(*key.part(sample))]
+                    except _Unfit:
+                        unfit += 1
+                if not is_served:
+                    raise ClearwayError("NOT_FOUND", f"{endpoint}: no server serves {key.key}")
+            if whole:
+                return max(whole, key=lambda m: (not m.stale, m.header.capture_end_ns))
+    found = f"ten queries did not find the layers {', '.join(layers)} of one map; {unfit} answers were no map of theirs"
+    raise ClearwayError("zenoh", f"{endpoint}: {found}")
 
 
-def watch(endpoint: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -> MapStream:
+def watch(
+    endpoint: str, vehicle: str, layers: Sequence[str], tls: Tls | None, signed_by: str | PathLike[str] | None
+) -> MapStream:
+    server = None if signed_by is None else PublicKey(signed_by)
     session = _session(endpoint, tls)
     stream = MapStream()
     writer = _StreamWriter(stream, layers)
@@ -112,7 +164,7 @@ def watch(endpoint: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -
     stream.on_close(close)
     try:
         for layer in writer.layers:
-            threads += _LayerSubscription(session, f"clearway/{vehicle}/map/{layer}", layer, writer).threads
+            threads += _LayerSubscription(session, _LayerKey(vehicle, layer, server), writer).threads
     except Exception as error:
         close()
         raise ClearwayError("zenoh", f"subscribe to the layers of {vehicle!r}: {error}") from None
@@ -122,20 +174,20 @@ def watch(endpoint: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -
 class _LayerSubscription:
     """Samples of one layer's key -> the newest part of a map, with the number of missed samples."""
 
-    def __init__(self, session: zenoh.Session, key: str, layer: str, writer: _StreamWriter) -> None:
+    def __init__(self, session: zenoh.Session, layer: _LayerKey, writer: _StreamWriter) -> None:
         import zenoh
         from zenoh import ext
 
-        self._session, self._key, self._layer, self._writer = session, key, layer, writer
+        self._session, self._layer, self._writer = session, layer, writer
         #: The publisher's number of the sample that was received or queried last.
         self._number: int | None = None
         history = ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
         ring = zenoh.handlers.RingChannel
-        self._samples = ext.declare_advanced_subscriber(session, key, ring(1), history=history)
+        self._samples = ext.declare_advanced_subscriber(session, layer.key, ring(_SAMPLES_KEPT), history=history)
         self._misses = self._samples.sample_miss_listener(ring(_MISSES_KEPT))
-        self._heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", ring(1))
+        self._heartbeats = session.declare_subscriber(f"{layer.key}/@adv/pub/**", ring(1))
         # Own threads instead of zenoh's callback threads: those would keep a process alive that leaves its stream open.
-        name = f"clearway watch {layer}"
+        name = f"clearway watch {layer.layer}"
         loops = (self._read_samples, self._read_heartbeats)
         self.threads = [threading.Thread(target=loop, name=name, daemon=True) for loop in loops]
         for thread in self.threads:
@@ -145,14 +197,16 @@ class _LayerSubscription:
         import zenoh
 
         for sample in self._samples:
-            # zenoh reports a gap before the sample after it.
-            while (miss := self._misses.try_recv()) is not None:
-                self._writer.add_missed(self._layer, miss.nb)
-            if sample.kind != zenoh.SampleKind.PUT:
-                continue
-            if sample.source_info is not None:
-                self._number = sample.source_info.source_sn
-            self._writer.add(sample.payload.to_bytes())
+            try:
+                # zenoh reports a gap before the sample after it.
+                while (miss := self._misses.try_recv()) is not None:
+                    self._writer.add_missed(self._layer.layer, miss.nb)
+            except zenoh.ZError:
+                # The session is closed, with samples left.
+                return
+            if sample.kind == zenoh.SampleKind.PUT and self._writer.add(self._layer, sample):
+                if sample.source_info is not None:
+                    self._number = sample.source_info.source_sn
 
     def _read_heartbeats(self) -> None:
         import zenoh
@@ -161,13 +215,13 @@ class _LayerSubscription:
         for heartbeat in self._heartbeats:
             try:
                 newest = int(ext.z_deserialize(ext.UInt32, heartbeat.payload))
-                part = _newest(self._session, self._key) if newest != self._number else None
+                samples = list(_replies(self._session, self._layer.key)) if newest != self._number else []
             except (ext.ZDeserializeError, zenoh.ZError):
                 # Not a heartbeat, or the session is being closed.
                 continue
             self._number = newest
-            if part is not None:
-                self._writer.add(part)
+            for sample in samples:
+                self._writer.add(self._layer, sample)
 
 
 class _StreamWriter:
@@ -183,48 +237,44 @@ class _StreamWriter:
         with self._lock:
             self._missed[layer] += count
 
-    def add(self, part: bytes) -> None:
+    def add(self, layer: _LayerKey, sample: zenoh.Sample) -> bool:
+        """Adds the part of a map; counts it as passed over if it does not belong on its key. Returns whether it
+        does."""
         try:
-            with self._lock:
-                if whole := self._collector.add(part):
-                    m, skipped = Map(whole[0]), whole[1]
-                    # A missed map that was queried has arrived, so it is not a skipped one.
-                    self._stream.store(m, skipped, lost=min(skipped, max(self._missed.values())))
+            part = layer.part(sample)
+        except _Unfit as unfit:
+            self._stream.pass_over(str(unfit))
+            return False
+        with self._lock:
+            for whole in self._collector.add(*part):
+                # A missed map that was queried has arrived, so it is not a skipped one.
+                if self._stream.store(Map(whole), None, lost=max(self._missed.values())):
                     self._missed = dict.fromkeys(self.layers, 0)
-        except ClearwayError as error:
-            self._stream.end(error)
-        except Exception as error:  # noqa: BLE001: any error ends the stream.
-            self._stream.end(ClearwayError("protobuf", f"a map of {', '.join(self.layers)}: {error}"))
+        return True
 
 
 class _LayerCollector:
-    """Collects the layers of one map."""
+    """Collects the layers of maps."""
 
     def __init__(self, layers: Sequence[str]) -> None:
         self._layers = list(dict.fromkeys(layers))
-        self._id: tuple[int, int] | None = None
-        self._parts: dict[str, bytes] = {}
-        self._last: tuple[int, int] | None = None
+        #: Parts of the maps that began last, by run and sequence: a false part does not replace those of a true map.
+        self._parts: dict[tuple[int, int], dict[str, bytes]] = {}
 
-    def add(self, part: bytes) -> tuple[bytes, int] | None:
-        """Adds one layer. Returns the whole map and the number of skipped maps when the map is complete, else
-        `None`."""
-        message = map_pb2.Map.FromString(part)
+    def add(self, part: bytes, message: map_pb2.Map) -> list[bytes]:
+        """Adds one layer. Returns the whole map when it is complete, else nothing."""
         id_ = (message.header.boot_id, message.header.sequence)
-        if self._id is not None and self._id[0] == id_[0] and id_[1] < self._id[1]:
-            return None
-        if id_ != self._id:
-            self._id, self._parts = id_, {}
-        self._parts.update({layer.name: part for layer in message.layers})
-        if id_ == self._last or not all(layer in self._parts for layer in self._layers):
-            return None
-        same_boot = self._last is not None and self._last[0] == id_[0]
-        skipped = id_[1] - self._last[1] - 1 if same_boot and self._last else 0
-        self._last = id_
-        return self._whole(), skipped
+        parts = self._parts.pop(id_, {})
+        parts.update({layer.name: part for layer in message.layers})
+        if all(layer in parts for layer in self._layers):
+            return [self._whole(parts)]
+        self._parts[id_] = parts
+        while len(self._parts) > _MAPS_BEGUN_MAX:
+            del self._parts[next(iter(self._parts))]
+        return []
 
-    def _whole(self) -> bytes:
-        first, *rest = (self._parts[layer] for layer in self._layers)
+    def _whole(self, parts: dict[str, bytes]) -> bytes:
+        first, *rest = (parts[layer] for layer in self._layers)
         # Protobuf messages concatenate: header and first layer, then the other layers.
         return first + b"".join(_without_header(part) for part in rest)
 

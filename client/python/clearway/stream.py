@@ -26,15 +26,40 @@ class _Counters(NamedTuple):
     left_out: int = 0
 
 
+class PassedOver(NamedTuple):
+    """Numbers of received maps that a stream passed over since its start, by reason. A peer of a zenoh network without
+    access control can put anything on the key of a map."""
+
+    #: Messages that are no valid map.
+    undecodable: int = 0
+    #: Maps of another vehicle or layer than their key names, and messages on a key with wildcards.
+    misplaced: int = 0
+    #: Maps without a signature of the expected publisher (`signed_by`).
+    unsigned: int = 0
+    #: Maps of another run of the server while the present run sends fresh ones.
+    other_run: int = 0
+    #: Maps that are not newer than the newest (repeated ones).
+    not_newer: int = 0
+
+
+#: As in the Rust client's stream.rs, which has the reasons.
+_RUN_HOLD_NS = 1_000_000_000
+_AHEAD_NS_MAX = 1_000_000_000
+_SKIPPED_MAX_PER_MS, _SKIPPED_MAX = 1, 1000
+
+
 class MapStream:
     """An iterator over the newest map; it stops at the end of a replay, and has no end otherwise. Close it, or use it
     in a `with` statement."""
 
-    def __init__(self, clock: Clock = Clock()) -> None:
+    def __init__(self, clock: Clock = Clock(), *, has_one_server: bool = False) -> None:
         self._clock = clock
+        #: True if all maps come from one server that is known: another run is then a jump of its replay.
+        self._has_one_server = has_one_server
         self._changed = threading.Condition()
         self._newest: Map | None = None
         self._counters = _Counters()
+        self._passed_over = PassedOver()
         #: `_counters` at the map before; `None` before the first.
         self._seen: _Counters | None = None
         #: The last map returned, until it is reported as stale.
@@ -113,18 +138,39 @@ class MapStream:
     def __del__(self) -> None:
         self._close()
 
-    def store(self, m: Map, skipped: int, *, lost: int = 0, left_out: int = 0) -> None:
-        """Stores a map as the newest. Between it and the one before there are `skipped` maps, of which the link lost
-        `lost`, and `left_out` maps that the requested rate excluded. Ignores a map that is not newer than the newest of
-        the same run of the server (a replayed one). For the background thread."""
+    @property
+    def passed_over(self) -> PassedOver:
+        """Numbers of received maps that were passed over since the start of the stream, by reason."""
+        with self._changed:
+            return self._passed_over
+
+    def store(self, m: Map, skipped: int | None, *, lost: int = 0, left_out: int = 0) -> bool:
+        """Stores a map as the newest, or counts it as passed over. Between it and the one before there are `skipped`
+        maps (`None`: those that the sequence skips), of which the link lost at most `lost`, and `left_out` maps that
+        the requested rate excluded. Returns whether it is stored. For the background thread."""
         m.with_arrival(self._clock)
         with self._changed:
             newest = self._newest
-            if newest is None or newest.header.boot_id != m.header.boot_id or newest.sequence < m.sequence:
-                before = self._counters
-                self._counters = _Counters(before.maps + 1 + skipped, before.lost + lost, before.left_out + left_out)
-                self._newest = m
-                self._changed.notify_all()
+            is_jump = self._has_one_server and newest is not None and newest.header.boot_id != m.header.boot_id
+            if newest is not None and not is_jump and (reason := _refuse(newest, m)):
+                self._count(reason)
+                return False
+            if skipped is None:
+                skipped = 0 if self._newest is None else _skipped(self._newest, m)
+                lost = min(lost, skipped)
+            before = self._counters
+            self._counters = _Counters(before.maps + 1 + skipped, before.lost + lost, before.left_out + left_out)
+            self._newest = m
+            self._changed.notify_all()
+            return True
+
+    def pass_over(self, reason: str) -> None:
+        """Counts a message that is not stored, by the name of a field of `PassedOver`. For the background thread."""
+        with self._changed:
+            self._count(reason)
+
+    def _count(self, reason: str) -> None:
+        self._passed_over = self._passed_over._replace(**{reason: getattr(self._passed_over, reason) + 1})
 
     def end(self, reason: ClearwayError) -> None:
         """Ends the stream with a reason. For the background thread."""
@@ -144,3 +190,23 @@ class MapStream:
 
     def _is_unseen(self) -> bool:
         return self._newest is not None and self._seen != self._counters
+
+
+def _refuse(newest: Map, m: Map) -> str | None:
+    """Why a map does not replace the newest; `None` if it does. `refuse` of the Rust client's stream.rs."""
+    is_ahead = newest.ahead_ns() > _AHEAD_NS_MAX
+    if newest.header.boot_id != m.header.boot_id:
+        holds = not newest.stale and not is_ahead and newest.since_arrival_ns() < _RUN_HOLD_NS
+        return "other_run" if holds else None
+    is_later = m.header.capture_end_ns > newest.header.capture_end_ns
+    resynchronises = not m.stale and (is_later or is_ahead or newest.stale)
+    return None if m.sequence > newest.sequence or resynchronises else "not_newer"
+
+
+def _skipped(newest: Map, m: Map) -> int:
+    """Number of maps between two of one run; 0 if the sequence goes back, or jumps farther than the stamps explain."""
+    if newest.header.boot_id != m.header.boot_id:
+        return 0
+    skipped = max(m.sequence - newest.sequence - 1, 0)
+    between_ms = max(m.header.capture_end_ns - newest.header.capture_end_ns, 0) // 1_000_000
+    return skipped if skipped <= _SKIPPED_MAX + _SKIPPED_MAX_PER_MS * between_ms else 0

@@ -52,6 +52,18 @@ def test_a_bad_channel_is_refused_without_allocating_its_claim(vector):
     assert peak <= 64 * len(message.payload) + (64 << 10) + cells
 
 
+@pytest.mark.parametrize("count", [1 << 28, (1 << 32) - 1, limits.CHANNEL_CELLS_MAX])
+def test_20_bytes_that_claim_many_cells_allocate_no_more_than_they_are_worth(count):
+    for payload in [b"", b"\xff", b"\xff" * 20, b"\0" * 20, b"\0\0\0\x80", b"\x55" * 19]:
+        message = map_pb2.Channel(cell_type=3, encoding=map_pb2.ENCODING_ROWS, cell_count=count, payload=payload)
+        tracemalloc.start()
+        with pytest.raises(clearway.DecodeError):
+            codec.decode(message, 2048)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak <= 64 << 10, (count, payload)
+
+
 @pytest.mark.parametrize("vector", golden("bad_maps.json"), ids=lambda vector: vector["name"])
 def test_a_bad_map_is_refused_by_name(vector):
     with pytest.raises(clearway.DecodeError) as error:
@@ -138,7 +150,7 @@ def test_a_footprint_is_free_only_if_every_cell_of_it_is_free():
 @pytest.mark.parametrize("yaw_rad", [None, 0.0, 0.7], ids=["radial", "square", "turned"])
 def test_the_nearest_obstacle_is_not_farther_than_any_point_of_one(yaw_rad):
     layer = clearway.Map((GOLDEN / "map.bin").read_bytes())["drivability"]
-    radial = RadialGrid(np.array([0.6, 1.3, 2.5]), 8)
+    radial = RadialGrid(np.array([0.6, 1.3, 2.5]), 8, (0.3, -0.4))
     layer.grid = radial if yaw_rad is None else CartesianGrid(-1.4, -1.7, 6, 6, 0.5, yaw_rad)
     looks = np.stack(np.meshgrid(*2 * [np.arange(-3.5, 3.5, 0.02)]), axis=-1).reshape(-1, 2)
     cells = layer.grid.cells_at(looks[:, 0], looks[:, 1])

@@ -35,11 +35,12 @@ def server(endpoint):
         yield session
 
 
-def part(sequence, layer="drivability", valid_ns=LASTS_NS):
-    now_ns = clearway.now_ns()
-    header = map_pb2.Header(vehicle="alpha", boot_id=7, sequence=sequence, capture_start_ns=now_ns,
-                            capture_end_ns=now_ns, valid_until_ns=now_ns + valid_ns)  # fmt: skip
-    return map_pb2.Map(header=header, layers=[map_pb2.Layer(name=layer)]).SerializeToString()
+def part(sequence, layer="drivability", valid_ns=LASTS_NS, vehicle="alpha", boot_id=7, ahead_ns=0):
+    end_ns = clearway.now_ns() + ahead_ns
+    header = map_pb2.Header(vehicle=vehicle, boot_id=boot_id, sequence=sequence, capture_start_ns=end_ns,
+                            capture_end_ns=end_ns, valid_until_ns=end_ns + valid_ns)  # fmt: skip
+    grid = map_pb2.RadialGrid(row_radius_m=[10.0], columns=4)
+    return map_pb2.Map(header=header, layers=[map_pb2.Layer(name=layer, radial=grid)]).SerializeToString()
 
 
 def published(session, layer="drivability"):

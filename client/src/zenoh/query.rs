@@ -1,11 +1,15 @@
-//! Key -> the newest map; and the errors of zenoh.
+//! Samples of a key -> maps that belong there; key -> the newest map; and the errors of zenoh.
 
 use std::time::Duration;
 
 use zenoh::Session;
-use zenoh::bytes::ZBytes;
+use zenoh::query::{ConsolidationMode, QueryTarget};
+use zenoh::sample::Sample;
 
 use crate::error::ClientError;
+use crate::freshness::Clock;
+use crate::signature::PublicKey;
+use crate::stream::Reason;
 use crate::view::MapView;
 
 /// Longest time to wait for the replies to a query. Ours.
@@ -17,18 +21,72 @@ pub(super) fn failed(what: impl Into<String>) -> impl FnOnce(zenoh::Error) -> Cl
     |reason| ClientError::Zenoh { what, reason: reason.to_string() }
 }
 
-/// Returns the first reply to a query; `None` if there is none.
-pub(super) async fn query(session: &Session, key: &str) -> Result<Option<ZBytes>, ClientError> {
-    let replies = session.get(key).timeout(QUERY_TIMEOUT).await.map_err(failed(format!("get {key}")))?;
-    while let Ok(reply) = replies.recv_async().await {
-        if let Ok(sample) = reply.result() {
-            return Ok(Some(sample.payload().clone()));
-        }
-    }
-    Ok(None)
+/// The key of one layer of one vehicle, and the server that publishes it.
+#[derive(Clone, Debug)]
+pub(super) struct LayerKey {
+    pub key: String,
+    vehicle: String,
+    layer: String,
+    /// Maps must have the signature of this key; `None`: every map on the key is believed.
+    signed_by: Option<PublicKey>,
 }
 
-/// Decodes the map of a sample.
-pub(super) fn decode(payload: &ZBytes) -> Result<MapView, ClientError> {
-    MapView::decode(payload.to_bytes().into_owned().into())
+impl LayerKey {
+    pub fn new(vehicle: &str, layer: &str, signed_by: Option<PublicKey>) -> Self {
+        let key = format!("clearway/{vehicle}/map/{layer}");
+        Self { key, vehicle: vehicle.into(), layer: layer.into(), signed_by }
+    }
+
+    /// Decodes the map of a sample.
+    ///
+    /// # Errors
+    /// Why it does not belong on this key: the counter of [`crate::PassedOver`], and the error if it is no map.
+    pub fn map(&self, sample: &Sample) -> Result<MapView, (Reason, Option<ClientError>)> {
+        // A sample on `clearway/**` reaches this subscription too.
+        if sample.key_expr().as_str() != self.key {
+            return Err((|passed| &mut passed.misplaced, None));
+        }
+        let payload = sample.payload().to_bytes();
+        if let Some(server) = &self.signed_by {
+            let signature = sample.attachment().map(|attachment| attachment.to_bytes()).unwrap_or_default();
+            if !server.verifies(&self.key, &payload, &signature) {
+                return Err((|passed| &mut passed.unsigned, None));
+            }
+        }
+        let map = MapView::decode(payload.into_owned().into());
+        let map = map.map_err(|error| (undecodable as Reason, Some(error)))?;
+        let is_ours = map.vehicle() == self.vehicle && map.layers().iter().all(|layer| layer.name == self.layer);
+        if is_ours { Ok(map) } else { Err((|passed| &mut passed.misplaced, None)) }
+    }
+
+    /// The newest map among the replies to a query; `None` if there is none.
+    ///
+    /// # Errors
+    /// [`ClientError::Zenoh`] if the query fails, [`ClientError::Map`] if there are replies and none is a valid map.
+    pub async fn newest(&self, session: &Session) -> Result<Option<MapView>, ClientError> {
+        let query = session.get(&self.key).timeout(QUERY_TIMEOUT);
+        // Every reply of every peer: zenoh would otherwise select one, perhaps that of a peer that is no server.
+        let query = query.target(QueryTarget::All).consolidation(ConsolidationMode::None);
+        let replies = query.await.map_err(failed(format!("get {}", self.key)))?;
+        let (mut newest, mut wrong) = (None::<MapView>, None);
+        while let Ok(reply) = replies.recv_async().await {
+            match reply.result().map(|sample| self.map(sample)) {
+                Ok(Ok(map)) => {
+                    let map = map.with_arrival(&Clock::default());
+                    let order = |map: &MapView| (map.fresh_for_ns().is_some(), map.header().capture_end_ns);
+                    newest = newest.filter(|newest| order(newest) >= order(&map)).or(Some(map));
+                }
+                Ok(Err((_, error))) => wrong = wrong.or(error),
+                Err(_) => {}
+            }
+        }
+        match (newest, wrong) {
+            (None, Some(error)) => Err(error),
+            (newest, _) => Ok(newest),
+        }
+    }
+}
+
+fn undecodable(passed: &mut crate::stream::PassedOver) -> &mut u64 {
+    &mut passed.undecodable
 }

@@ -5,56 +5,54 @@
 //! Only if the last map is lost, no newer sample follows that shows the loss. Then the publisher's heartbeat states its
 //! number, and this file queries it.
 //!
-//! Callbacks store each sample in a slot of one: from zenoh's queue of 256 a slow planner would get maps that are
-//! seconds old. Gaps in the maps' sequence numbers are skipped maps; those among them that zenoh missed are lost maps.
+//! Callbacks check and decode each sample, and store its map in a slot of one: from zenoh's queue of 256 a slow planner
+//! would get maps that are seconds old. What does not belong on the key is counted and takes no map's place. Gaps in
+//! the maps' sequence numbers are skipped maps; those among them that zenoh missed are lost maps.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 
 use tokio::sync::watch;
-use zenoh::bytes::ZBytes;
 use zenoh::pubsub::Subscriber;
-use zenoh::sample::SampleKind;
+use zenoh::query::{ConsolidationMode, QueryTarget};
+use zenoh::sample::{Sample, SampleKind};
 use zenoh::{Session, Wait};
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, HistoryConfig, z_deserialize};
 
-use crate::error::ClientError;
 use crate::stream::{LatestSlot, Missed};
-use crate::zenoh::query::{QUERY_TIMEOUT, decode};
+use crate::zenoh::query::{LayerKey, QUERY_TIMEOUT};
 
-/// A subscription to the key of one layer, with its newest sample.
+/// A subscription to the key of one layer, which stores the newest map in a slot.
 pub(super) struct LayerSubscription {
-    newest: watch::Receiver<Published>,
-    /// The newest map, if it had to be queried.
-    answer: watch::Receiver<ZBytes>,
+    /// Its sender lives in the subscriber's callback, and so as long as the session.
+    open: watch::Receiver<()>,
     _subscriber: AdvancedSubscriber<()>,
     _heartbeats: Subscriber<()>,
 }
 
-#[derive(Clone, Default)]
-struct Published {
-    payload: ZBytes,
-    /// Samples missed since the subscription was opened, up to this one.
-    missed: u64,
-}
-
 impl LayerSubscription {
-    pub async fn open(session: &Session, key: &str) -> zenoh::Result<Self> {
-        let (sample_slot, newest) = watch::channel(Published::default());
-        let (answer_slot, answer) = watch::channel(ZBytes::default());
+    pub async fn open(session: &Session, layer: LayerKey, slot: LatestSlot) -> zenoh::Result<Self> {
+        let (is_open, open) = watch::channel(());
+        let key = layer.key.clone();
+        // Samples missed since the newest map.
         let missed = Arc::new(AtomicU64::new(0));
         // The publisher's number of the sample that was received or queried last.
         let number = Arc::new(AtomicU32::new(u32::MAX));
 
-        let declaration = session.declare_subscriber(key.to_owned()).callback({
-            let (missed, number) = (missed.clone(), number.clone());
+        let declaration = session.declare_subscriber(key.clone()).callback({
+            let (missed, number, slot, layer) = (missed.clone(), number.clone(), slot.clone(), layer.clone());
             move |sample| {
-                if sample.kind() == SampleKind::Put {
-                    if let Some(source) = sample.source_info() {
-                        number.store(source.source_sn(), Ordering::Relaxed);
-                    }
-                    let missed = missed.load(Ordering::Relaxed);
-                    sample_slot.send_replace(Published { payload: sample.payload().clone(), missed });
+                let _session_is_open = &is_open;
+                if sample.kind() != SampleKind::Put {
+                    return;
+                }
+                let is_stored = store(&slot, &layer, &sample, |skipped| {
+                    // A missed map that was queried has arrived, so it is not a skipped one.
+                    let lost = skipped.min(missed.swap(0, Ordering::Relaxed));
+                    Missed { skipped, lost, left_out: 0 }
+                });
+                if let Some(source) = sample.source_info().filter(|_| is_stored) {
+                    number.store(source.source_sn(), Ordering::Relaxed);
                 }
             }
         });
@@ -66,17 +64,23 @@ impl LayerSubscription {
         listen.callback(count).background().await?;
 
         let heartbeats = session.declare_subscriber(format!("{key}/@adv/pub/**")).callback({
-            let (session, key) = (session.clone(), key.to_owned());
+            let session = session.clone();
+            // One query at a time, however many heartbeats a peer sends.
+            let is_querying = Arc::new(AtomicBool::new(false));
             move |heartbeat| {
                 let newest = z_deserialize::<u32>(heartbeat.payload());
                 let Ok(newest) = newest else { return };
-                if number.swap(newest, Ordering::Relaxed) == newest {
+                if number.load(Ordering::Relaxed) == newest || is_querying.swap(true, Ordering::Relaxed) {
                     return;
                 }
-                let answer_slot = answer_slot.clone();
-                let query = session.get(&key).timeout(QUERY_TIMEOUT).callback(move |reply| {
-                    if let Ok(sample) = reply.into_result() {
-                        answer_slot.send_replace(sample.payload().clone());
+                number.store(newest, Ordering::Relaxed);
+                let (slot, layer) = (slot.clone(), layer.clone());
+                let querying = ClearOnDrop(is_querying.clone());
+                let query = session.get(&key).timeout(QUERY_TIMEOUT).target(QueryTarget::All);
+                let query = query.consolidation(ConsolidationMode::None).callback(move |reply| {
+                    let _ends_with_the_query = &querying;
+                    if let Ok(sample) = reply.result() {
+                        store(&slot, &layer, sample, |skipped| Missed { skipped, ..Missed::default() });
                     }
                 });
                 if let Err(error) = query.wait() {
@@ -85,41 +89,33 @@ impl LayerSubscription {
             }
         });
         let heartbeats = heartbeats.await?;
-        Ok(Self { newest, answer, _subscriber: subscriber, _heartbeats: heartbeats })
+        Ok(Self { open, _subscriber: subscriber, _heartbeats: heartbeats })
     }
 
-    /// Stores every newer map in the slot until the session is closed.
-    ///
-    /// # Errors
-    /// [`ClientError::Map`] if a map is invalid.
-    pub async fn run(mut self, slot: LatestSlot) -> Result<(), ClientError> {
-        let mut last = None;
-        let mut missed_before = 0;
-        loop {
-            let (payload, missed) = tokio::select! {
-                // Fails when the session is closed.
-                changed = self.newest.changed() => {
-                    if changed.is_err() {
-                        return Ok(());
-                    }
-                    let Published { payload, missed } = self.newest.borrow_and_update().clone();
-                    (payload, missed)
-                }
-                Ok(()) = self.answer.changed() => (self.answer.borrow_and_update().clone(), missed_before),
-            };
-            let map = decode(&payload)?;
-            let (boot_id, sequence) = (map.header().boot_id, map.sequence());
-            let skipped = match last {
-                Some((boot, seen)) if boot == boot_id && sequence <= seen => continue,
-                Some((boot, seen)) if boot == boot_id => sequence - seen - 1,
-                // Another run of the server: its sequence starts at 0.
-                _ => 0,
-            };
-            last = Some((boot_id, sequence));
-            // A missed map that was queried has arrived, so it is not a skipped one.
-            let lost = skipped.min(missed - missed_before);
-            missed_before = missed;
-            slot.store(map, Missed { skipped, lost, left_out: 0 });
+    /// Waits until the session is closed.
+    pub async fn closed(mut self) {
+        while self.open.changed().await.is_ok() {}
+    }
+}
+
+/// Stores the map of a sample, or counts why it is passed over. Returns true if the sample was a map of this key.
+fn store(slot: &LatestSlot, layer: &LayerKey, sample: &Sample, missed: impl FnOnce(u64) -> Missed) -> bool {
+    match layer.map(sample) {
+        Ok(map) => slot.store(map, missed),
+        Err((reason, error)) => {
+            tracing::debug!(?error, key = %sample.key_expr(), "passed over");
+            slot.pass_over(reason);
+            return false;
         }
+    }
+    true
+}
+
+/// Clears a flag when it is dropped.
+struct ClearOnDrop(Arc<AtomicBool>);
+
+impl Drop for ClearOnDrop {
+    fn drop(&mut self) {
+        self.0.store(false, Ordering::Relaxed);
     }
 }

@@ -46,11 +46,12 @@ pub fn map(sequence: u64, capture_end_ns: i64) -> Bytes {
         geometry: Some(v1::layer::Geometry::Radial(v1::RadialGrid {
             row_radius_m: vec![10.0, 20.0, 30.0],
             columns: 4,
+            ..Default::default()
         })),
         channels: vec![
             encode_grid(CellsRef::U8(&CLASSES), 4).into_channel("class", "", 1.0, 0),
             encode_grid(CellsRef::I8(&heights), 4).into_channel("unit_height", "m", 0.5, -128),
-            encode_grid(CellsRef::U16(&[400; 12]), 4).into_channel("segment", "", 1.0, 65_535),
+            encode_grid(CellsRef::U16(&[400; 12]), 4).into_channel("segment", "id", 1.0, 65_535),
         ],
         metrics: [("drivable_share".to_string(), 0.625)].into(),
         ..Default::default()

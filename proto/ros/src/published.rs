@@ -15,6 +15,10 @@ pub struct Published {
 }
 
 impl Published {
+    const fn new(package: &'static str, message: &'static str, hash: &'static str, definition: &'static str) -> Self {
+        Self { package, message, hash, definition }
+    }
+
     /// Name in ROS 2, such as `nav_msgs/msg/OccupancyGrid`.
     pub fn name(&self) -> String {
         format!("{}/msg/{}", self.package, self.message)
@@ -27,49 +31,49 @@ impl Published {
 }
 
 /// `nav_msgs/msg/OccupancyGrid`.
-pub const OCCUPANCY_GRID: Published = Published {
-    package: "nav_msgs",
-    message: "OccupancyGrid",
-    hash: "RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7",
-    definition: include_str!("definitions/OccupancyGrid.msg"),
-};
+pub const OCCUPANCY_GRID: Published = Published::new(
+    "nav_msgs",
+    "OccupancyGrid",
+    "RIHS01_8d348150c12913a31ee0ec170fbf25089e4745d17035792a1ba94d6f0bc0cfc7",
+    include_str!("definitions/OccupancyGrid.msg"),
+);
 
 /// `tf2_msgs/msg/TFMessage`.
-pub const TF_MESSAGE: Published = Published {
-    package: "tf2_msgs",
-    message: "TFMessage",
-    hash: "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
-    definition: include_str!("definitions/TFMessage.msg"),
-};
+pub const TF_MESSAGE: Published = Published::new(
+    "tf2_msgs",
+    "TFMessage",
+    "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    include_str!("definitions/TFMessage.msg"),
+);
 
 /// `nav_msgs/msg/Odometry`.
-pub const ODOMETRY: Published = Published {
-    package: "nav_msgs",
-    message: "Odometry",
-    hash: "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
-    definition: include_str!("definitions/Odometry.msg"),
-};
+pub const ODOMETRY: Published = Published::new(
+    "nav_msgs",
+    "Odometry",
+    "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
+    include_str!("definitions/Odometry.msg"),
+);
 
 /// `sensor_msgs/msg/PointCloud2`.
-pub const POINT_CLOUD2: Published = Published {
-    package: "sensor_msgs",
-    message: "PointCloud2",
-    hash: "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
-    definition: include_str!("definitions/PointCloud2.msg"),
-};
+pub const POINT_CLOUD2: Published = Published::new(
+    "sensor_msgs",
+    "PointCloud2",
+    "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5",
+    include_str!("definitions/PointCloud2.msg"),
+);
 
 /// `geometry_msgs/msg/PoseArray`.
-pub const POSE_ARRAY: Published = Published {
-    package: "geometry_msgs",
-    message: "PoseArray",
-    hash: "RIHS01_af0cc36d190e104d546d168d6b39df04fa4b4ccecf59cb4c9ed328d3d5004aa0",
-    definition: include_str!("definitions/PoseArray.msg"),
-};
+pub const POSE_ARRAY: Published = Published::new(
+    "geometry_msgs",
+    "PoseArray",
+    "RIHS01_af0cc36d190e104d546d168d6b39df04fa4b4ccecf59cb4c9ed328d3d5004aa0",
+    include_str!("definitions/PoseArray.msg"),
+);
 
 /// `visualization_msgs/msg/MarkerArray`.
-pub const MARKER_ARRAY: Published = Published {
-    package: "visualization_msgs",
-    message: "MarkerArray",
-    hash: "RIHS01_86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf",
-    definition: include_str!("definitions/MarkerArray.msg"),
-};
+pub const MARKER_ARRAY: Published = Published::new(
+    "visualization_msgs",
+    "MarkerArray",
+    "RIHS01_86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf",
+    include_str!("definitions/MarkerArray.msg"),
+);

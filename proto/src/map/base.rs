@@ -41,10 +41,10 @@ impl<'a> Shift<'a> {
     pub(crate) fn new(base: &'a Layer, grid: &Grid) -> Result<Self, BaseError> {
         let by = match (&base.grid, grid) {
             (
-                Grid::Radial { row_radius_m: before, columns: columns_before },
-                Grid::Radial { row_radius_m: now, columns: columns_now },
+                Grid::Radial { centre_m: centre_before, row_radius_m: before, columns: columns_before },
+                Grid::Radial { centre_m: centre_now, row_radius_m: now, columns: columns_now },
             ) => {
-                if before != now || columns_before != columns_now {
+                if before != now || columns_before != columns_now || centre_before != centre_now {
                     return Err(BaseError::Rings);
                 }
                 [0, 0]

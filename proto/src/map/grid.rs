@@ -11,10 +11,12 @@ use crate::v1;
 /// The geometry of one layer, checked.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Grid {
-    /// Rings and sectors around the origin. Cell index = row * columns + column. Row j spans (row_radius_m\[j-1\],
-    /// row_radius_m\[j\]], row 0 starts at the origin; column c spans azimuths [c, c+1) * 2π / columns,
-    /// counter-clockwise from the ego x axis.
+    /// Rings and sectors around a centre. Cell index = row * columns + column. Row j spans (row_radius_m\[j-1\],
+    /// row_radius_m\[j\]], row 0 starts at the centre; column c spans azimuths [c, c+1) * 2π / columns about the
+    /// centre, counter-clockwise from the direction of the ego x axis.
     Radial {
+        /// Position (x, y) of the centre in metres.
+        centre_m: [f32; 2],
         /// Outer radius of each row in metres, ascending.
         row_radius_m: Vec<f32>,
         /// Number of columns (sectors), at least 1.
@@ -52,7 +54,7 @@ impl Grid {
         let wrong = |what: String| MapError::Geometry { layer: layer.name.clone(), what };
         match &layer.geometry {
             None => Err(wrong("none given; radial or cartesian is needed".into())),
-            Some(v1::layer::Geometry::Radial(v1::RadialGrid { row_radius_m, columns })) => {
+            Some(v1::layer::Geometry::Radial(v1::RadialGrid { row_radius_m, columns, centre_x_m, centre_y_m })) => {
                 if *columns == 0 || row_radius_m.is_empty() {
                     return Err(wrong(format!(
                         "{} rows and {columns} columns; at least 1 of each is needed",
@@ -68,7 +70,11 @@ impl Grid {
                     }
                     inner = outer;
                 }
-                Ok(Self::Radial { row_radius_m: row_radius_m.clone(), columns: *columns })
+                let centre_m = [*centre_x_m, *centre_y_m];
+                if !centre_m.iter().all(|place| place.is_finite()) {
+                    return Err(wrong(format!("centre ({centre_x_m}, {centre_y_m}) m; finite values are needed")));
+                }
+                Ok(Self::Radial { centre_m, row_radius_m: row_radius_m.clone(), columns: *columns })
             }
             Some(v1::layer::Geometry::Cartesian(grid)) => {
                 let v1::CartesianGrid { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix, first_iy } =
@@ -93,7 +99,7 @@ impl Grid {
     /// Shape of the array of cells as (rows, columns); (height, width) for a Cartesian grid.
     pub fn shape(&self) -> (u32, u32) {
         match self {
-            Self::Radial { row_radius_m, columns } => (row_radius_m.len() as u32, *columns),
+            Self::Radial { row_radius_m, columns, .. } => (row_radius_m.len() as u32, *columns),
             Self::Cartesian { width, height, .. } => (*height, *width),
         }
     }
@@ -111,7 +117,8 @@ impl Grid {
             return None;
         }
         match self {
-            Self::Radial { row_radius_m, columns } => {
+            Self::Radial { centre_m, row_radius_m, columns } => {
+                let [x_m, y_m] = [x_m - f64::from(centre_m[0]), y_m - f64::from(centre_m[1])];
                 let range_m = x_m.hypot(y_m);
                 let row = row_radius_m.partition_point(|&outer| f64::from(outer) < range_m);
                 if row == row_radius_m.len() {
@@ -138,12 +145,12 @@ impl Grid {
             return None;
         }
         Some(match self {
-            Self::Radial { row_radius_m, columns } => {
+            Self::Radial { centre_m, row_radius_m, columns } => {
                 let (row, column) = (index / *columns as usize, index % *columns as usize);
                 let inner = if row == 0 { 0.0 } else { f64::from(row_radius_m[row - 1]) };
                 let range_m = 0.5 * (inner + f64::from(row_radius_m[row]));
                 let (sin, cos) = ((column as f64 + 0.5) / f64::from(*columns) * TAU).sin_cos();
-                (range_m * cos, range_m * sin)
+                (range_m * cos + f64::from(centre_m[0]), range_m * sin + f64::from(centre_m[1]))
             }
             Self::Cartesian { origin_x_m, origin_y_m, width, cell_m, yaw_rad, .. } => {
                 let (ix, iy) = (index % *width as usize, index / *width as usize);
@@ -156,7 +163,10 @@ impl Grid {
     /// Greatest distance of the grid's edge from the vehicle along the grid's axes, in metres.
     pub fn range_m_max(&self) -> f64 {
         match self {
-            Self::Radial { row_radius_m, .. } => row_radius_m.last().map_or(0.0, |&r| f64::from(r)),
+            Self::Radial { centre_m, row_radius_m, .. } => {
+                let [x, y] = centre_m.map(|place| f64::from(place.abs()));
+                row_radius_m.last().map_or(0.0, |&r| f64::from(r)) + x.max(y)
+            }
             Self::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, .. } => {
                 let end_x = origin_x_m + f64::from(*width) * f64::from(*cell_m);
                 let end_y = origin_y_m + f64::from(*height) * f64::from(*cell_m);
@@ -175,6 +185,21 @@ pub(crate) fn rotate(x: f64, y: f64, angle: f64) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_radial_grid_is_looked_up_about_its_own_centre() {
+        let grid = |centre_m| Grid::Radial { centre_m, row_radius_m: vec![1.0, 2.5], columns: 12 };
+        let off = grid([1.5, -0.5]);
+        assert_eq!(off.cell_at(1.6, -0.4), Some(1));
+        assert_eq!([off.cell_at(4.1, -0.5), off.cell_at(-0.9, -0.4)], [None, Some(17)]);
+        assert_eq!(off.range_m_max(), 4.0);
+        for cell in 0..24 {
+            let (x, y) = off.centre_of(cell).unwrap();
+            assert_eq!(off.cell_at(x, y), Some(cell));
+            let (about_x, about_y) = grid([0.0; 2]).centre_of(cell).unwrap();
+            assert!((about_x + 1.5 - x).hypot(about_y - 0.5 - y) < 1e-12);
+        }
+    }
 
     #[test]
     fn a_rotated_grid_is_looked_up_along_its_own_axes() {

@@ -5,13 +5,14 @@ use std::path::PathBuf;
 use clap::Args;
 use clearway_mapping::config::Extrinsics;
 
-use crate::config::{Config, ConfigError};
+use crate::config::{Config, ConfigError, Origin};
 
 /// The options that name a configuration file and override its keys.
 #[derive(Args)]
 pub struct ConfigurationOptions {
-    /// The configuration file; `clearway check --default` prints one with every key explained.
-    #[arg(short, long, value_name = "FILE", env = "CLEARWAY_CONFIG", default_value = "clearway.toml")]
+    /// The configuration file, by default $CLEARWAY_CONFIG, else clearway.toml; `clearway check --default` prints one
+    /// with every key explained.
+    #[arg(short, long, value_name = "FILE", default_value_os_t = default_file())]
     pub config: PathBuf,
     /// Override a key of the configuration, such as grpc.listen=0.0.0.0:50051; may be given several times.
     #[arg(long, value_name = "KEY=VALUE")]
@@ -19,13 +20,22 @@ pub struct ConfigurationOptions {
 }
 
 impl ConfigurationOptions {
-    /// Reads the file, applies the overrides and checks every value.
+    /// Reads the file, applies the overrides and checks every value, and that nothing is served to other hosts
+    /// without protection.
     ///
     /// # Errors
     /// [`ConfigError`].
     pub fn load(&self) -> Result<Config, ConfigError> {
-        Config::load(&self.config, &self.set)
+        let config = Config::load(&self.config, &self.set)?;
+        config.check_exposure(&Origin::file(&self.config))?;
+        Ok(config)
     }
+}
+
+/// The file that `$CLEARWAY_CONFIG` names, else `clearway.toml`. For clap it is a default and not `env`: the variable
+/// contradicts no option.
+fn default_file() -> PathBuf {
+    std::env::var_os("CLEARWAY_CONFIG").map_or_else(|| PathBuf::from("clearway.toml"), PathBuf::from)
 }
 
 /// Reads extrinsics from the command line: six numbers, separated by commas.

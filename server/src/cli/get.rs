@@ -8,12 +8,15 @@ use clearway_client::{Layer, MapView, now_ns};
 use serde_json::{Value, json};
 
 use super::connection::{ServerOptions, explain};
+use super::exit::Exit;
 use super::export::{DrawingOptions, layer_json, npy};
 use super::files;
 use super::output::{block_on, print_line, usage_error};
 use crate::encode::picture;
 
 /// Get the newest map: print one layer's classes and metrics, or write the layer to a file.
+///
+/// If the map is stale, the output and the picture say STALE, and the exit code is 4.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway get
@@ -45,7 +48,7 @@ pub struct Options {
 /// # Errors
 /// [`ClientError`](clearway_client::ClientError) if the server refuses or does not answer; if the file cannot be
 /// written.
-pub fn run(options: &Options) -> Result<()> {
+pub fn run(options: &Options) -> Result<Exit> {
     let format = options.out.as_deref().map(Format::from_name).transpose()?;
     if let Some(option) = options.drawing.first_given().filter(|_| format != Some(Format::Png)) {
         return Err(usage_error(format!("{option} is for pictures: it needs --out FILE.png")));
@@ -76,7 +79,7 @@ impl Format {
     }
 }
 
-async fn get(options: &Options, format: Option<Format>) -> Result<()> {
+async fn get(options: &Options, format: Option<Format>) -> Result<Exit> {
     let Options { server, vehicle, layer, out, json, drawing } = options;
     let client = server.connect().await?;
     let layers: Vec<String> = layer.iter().cloned().collect();
@@ -86,12 +89,14 @@ async fn get(options: &Options, format: Option<Format>) -> Result<()> {
         None => map.layers().first().context("the map has no layer")?,
     };
     let Some((file, format)) = out.as_ref().zip(format) else {
-        let text = if *json { format!("{:#}", document(&map, layer, now_ns())) } else { text(&map, layer, now_ns()) };
+        let now_ns = now_ns();
+        let text = if *json { format!("{:#}", document(&map, layer, now_ns)) } else { text(&map, layer, now_ns) };
         print_line(&text)?;
-        return Ok(());
+        return Ok(Exit::from_stale(map.is_stale(now_ns)));
     };
+    let (age_ms, stale) = (map.age_ms(now_ns()), map.is_stale(now_ns()));
     let bytes = match format {
-        Format::Png => picture::png(layer, &drawing.style())?,
+        Format::Png => picture::png(layer, &picture::Style { stale, ..drawing.style() })?,
         Format::Npy => {
             let channel = layer.channel("class").or(layer.channels.first()).context("the layer has no channel")?;
             npy::encode(&channel.cells, layer.grid.shape())
@@ -99,7 +104,6 @@ async fn get(options: &Options, format: Option<Format>) -> Result<()> {
         Format::Json => serde_json::to_vec(&layer_json::layer(&map, layer, true))?,
     };
     files::write(file, &bytes)?;
-    let (age_ms, stale) = (map.age_ms(now_ns()), map.is_stale(now_ns()));
     print_line(&if *json {
         json!({
             "vehicle": map.vehicle(), "sequence": map.sequence(), "layer": layer.name, "age_ms": age_ms, "stale": stale,
@@ -107,11 +111,11 @@ async fn get(options: &Options, format: Option<Format>) -> Result<()> {
         })
         .to_string()
     } else {
-        let stale = if stale { ", STALE" } else { "" };
+        let said = if stale { ", STALE" } else { "" };
         let (vehicle, sequence, name) = (map.vehicle(), map.sequence(), &layer.name);
-        format!("{vehicle} #{sequence:06}: {name}, {age_ms:.0} ms old{stale}, written to {}", file.display())
+        format!("{vehicle} #{sequence:06}: {name}, {age_ms:.0} ms old{said}, written to {}", file.display())
     })?;
-    Ok(())
+    Ok(Exit::from_stale(stale))
 }
 
 /// The header, geometry, legend and metrics of one layer.

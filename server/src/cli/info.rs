@@ -1,6 +1,7 @@
-//! `clearway info`: a recording, a capture or a scan -> a description of its contents.
+//! `clearway info`: a recording, a capture or a scan -> a description of its contents, and what is wrong with it.
 
 use std::collections::BTreeMap;
+use std::fmt::Display;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::net::SocketAddr;
@@ -17,11 +18,13 @@ use clearway_mapping::event::Scan;
 use clearway_mapping::scan_file;
 use serde_json::{Map, Value, json};
 
+use super::exit::Exit;
 use super::files;
 use super::output::{counted, print_line};
-use crate::record::mcap_reader::McapReader;
+use crate::encode::event_from_bytes;
+use crate::record::mcap_reader::{McapReader, Message};
 
-/// Describe a file: an MCAP recording, a pcap or pcapng capture, or a scan (.bin, .pcd.bin, .pcd).
+/// Describe a file: an MCAP recording, a ROS 2 bag, a pcap or pcapng capture, or a scan (.bin, .pcd.bin, .pcd).
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway info drive.mcap
@@ -34,31 +37,35 @@ pub struct Options {
     json: bool,
 }
 
-/// Prints the description of the file.
+/// Prints the description of the file. One that is not whole is [`Exit::Unreadable`].
 ///
 /// # Errors
 /// If the file cannot be read or its kind is not known.
-pub fn run(options: &Options) -> Result<()> {
+pub fn run(options: &Options) -> Result<Exit> {
     let file = &options.file;
     let mut start = Vec::new();
     files::open(file)?.0.take(8).read_to_end(&mut start).with_context(|| file.display().to_string())?;
     let extension = file.extension().and_then(|extension| extension.to_str()).unwrap_or("");
     let document = match extension {
         "bin" | "pcd" => scan_file(file),
-        _ if start.starts_with(b"\x89MCAP") => recording(file),
+        _ if start.starts_with(b"\x89MCAP") || start == b"SQLite f" => recording(file),
         _ => capture(file),
     }
     .with_context(|| file.display().to_string())?;
     if options.json {
         print_line(&serde_json::to_string_pretty(&document)?)?;
-        return Ok(());
-    }
-    for line in lines(&document) {
-        if !print_line(&line)? {
-            break;
+    } else {
+        for line in lines(&document) {
+            if !print_line(&line)? {
+                break;
+            }
         }
     }
-    Ok(())
+    let is_incomplete = document["complete"] == false;
+    if is_incomplete {
+        eprintln!("clearway: {} is not whole: {}", file.display(), document["state"].as_str().unwrap_or_default());
+    }
+    Ok(Exit::from_incomplete(is_incomplete))
 }
 
 /// The document as `key: value` lines; nested objects are indented.
@@ -93,30 +100,37 @@ fn rounded(value: f64) -> f64 {
 }
 
 fn recording(file: &Path) -> Result<Value> {
-    let mut recording = McapReader::salvage(file)?;
+    let mut recording = McapReader::open(file)?;
     let mut messages: BTreeMap<String, u64> = BTreeMap::new();
     let (mut events, mut maps, mut scans) = (0_u64, BTreeMap::<(String, String), u64>::new(), 0_u64);
     let mut grids: BTreeMap<String, Value> = BTreeMap::new();
+    // By topic: the number of messages that cannot be decoded, and the fault of the first.
+    let mut unreadable: BTreeMap<String, (u64, String)> = BTreeMap::new();
     let mut span: Option<(u64, u64)> = None;
     for message in recording.by_ref() {
         let message = message?;
         *messages.entry(message.channel.topic.clone()).or_default() += 1;
         let at = message.log_ns;
         span = Some(span.map_or((at, at), |(first, last)| (first.min(at), last.max(at))));
-        events += u64::from(message.channel.schema == "clearway.v1.Event");
+        let mut add_unreadable = |message: &Message, reason: &dyn Display| {
+            let of_topic = unreadable.entry(message.channel.topic.clone());
+            of_topic.or_insert_with(|| (0, reason.to_string())).0 += 1;
+        };
+        if message.journal_of().is_some() {
+            events += 1;
+            if let Err(error) = event_from_bytes(message.data.clone()) {
+                add_unreadable(&message, &error);
+            }
+        }
         scans += u64::from(message.is_velodyne_scan());
         if let Some((vehicle, layer)) = message.map_of() {
             *maps.entry((vehicle.to_owned(), layer.to_owned())).or_default() += 1;
-            if !grids.contains_key(layer) {
-                let map = MapView::decode(message.data.clone()).with_context(|| message.channel.topic.clone())?;
-                let found = map.layer(layer)?;
-                let (rows, columns) = found.grid.shape();
-                let channels: Vec<_> = found.channels.iter().map(|channel| &channel.name).collect();
-                let legend: Vec<_> = found.legend.iter().map(|class| &class.name).collect();
-                grids.insert(
-                    layer.into(),
-                    json!({"rows": rows, "columns": columns, "legend": legend, "channels": channels}),
-                );
+            match grid(&message, layer) {
+                Ok(grid) if !grids.contains_key(layer) => {
+                    grids.insert(layer.to_owned(), grid);
+                }
+                Ok(_) => {}
+                Err(error) => add_unreadable(&message, &error),
             }
         }
     }
@@ -125,10 +139,17 @@ fn recording(file: &Path) -> Result<Value> {
         vehicles.entry(vehicle).or_default().insert(layer, count);
     }
     let header = recording.header();
+    let undecoded = unreadable.iter().map(|(topic, (count, first))| {
+        format!("{} of {topic} cannot be decoded, the first: {first}", counted(*count, "message"))
+    });
+    let faults: Vec<String> = recording.incomplete().into_iter().chain(undecoded).collect();
+    let damage: Map<String, Value> =
+        recording.damages().iter().map(|damage| (format!("byte {}", damage.bytes.0), damage.to_json())).collect();
     Ok(json!({
         "kind": "recording",
-        "complete": recording.incomplete().is_none(),
-        "state": recording.incomplete().unwrap_or_else(|| "complete".into()),
+        "complete": faults.is_empty(),
+        "state": if faults.is_empty() { "complete".to_owned() } else { faults.join("; ") },
+        "damage": damage,
         "duration_s": span.map(|(first, last)| rounded((last - first) as f64 * 1e-9)),
         "run": header.metadata,
         "maps": vehicles,
@@ -141,6 +162,16 @@ fn recording(file: &Path) -> Result<Value> {
     }))
 }
 
+/// The shape, classes and channels of a recorded layer.
+fn grid(message: &Message, layer: &str) -> Result<Value> {
+    let map = MapView::decode(message.data.clone())?;
+    let found = map.layer(layer)?;
+    let (rows, columns) = found.grid.shape();
+    let channels: Vec<_> = found.channels.iter().map(|channel| &channel.name).collect();
+    let legend: Vec<_> = found.legend.iter().map(|class| &class.name).collect();
+    Ok(json!({"rows": rows, "columns": columns, "legend": legend, "channels": channels}))
+}
+
 /// One sender of a capture.
 struct Source {
     sensor: Sensor,
@@ -150,7 +181,7 @@ struct Source {
 
 fn capture(file: &Path) -> Result<Value> {
     let mut capture =
-        Capture::new(BufReader::new(File::open(file)?)).context("MCAP, pcap, pcapng, .bin and .pcd are known")?;
+        Capture::new(BufReader::new(File::open(file)?)).context("MCAP, .db3, pcap, pcapng, .bin and .pcd are known")?;
     let mut sources: BTreeMap<SocketAddr, Source> = BTreeMap::new();
     let (mut packets, mut telemetry, mut other) = (0_u64, 0_u64, 0_u64);
     let mut ports: BTreeMap<String, u64> = BTreeMap::new();

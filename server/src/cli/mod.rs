@@ -14,7 +14,10 @@
 //! | `watch`, `get` | a server -> a line for each map; the newest map as a file |
 //! | `vehicles` | a server -> the state of its vehicles |
 //! | `export` | a recording -> pictures, arrays, documents, files for viewers |
-//! | `info` | a file -> a description of its contents |
+//! | `info` | a file -> a description of its contents, and what is wrong with it |
+//! | `repair` | a damaged recording -> a recording of all that can be read |
+//! | `upload` | a folder of recordings -> a store |
+//! | `recordings` | a store and a search -> the recordings that it finds |
 //! | `send`, `ingest` | files -> a server: as datagrams over UDP; as observations over gRPC or zenoh |
 //! | `simulate` | a simulated scene -> a capture, or datagrams over UDP |
 //! | `completions` | a shell's name -> its completion script |
@@ -26,6 +29,7 @@
 //! | `configuration` | options -> a configuration, extrinsics |
 //! | `model` | the name of a sensor model -> the model |
 //! | `connection` | options -> a connected client |
+//! | `exit` | the exit codes |
 //! | `files` | paths -> open files, or errors that say what to do |
 //! | `output` | text -> stdout; progress bar, runtime, signals, errors of usage |
 
@@ -36,6 +40,7 @@ mod connection;
 #[cfg(feature = "sim")]
 pub mod demo;
 pub mod evaluate;
+mod exit;
 mod export;
 mod files;
 mod get;
@@ -43,12 +48,17 @@ mod info;
 mod ingest;
 mod model;
 mod output;
+#[cfg(feature = "store")]
+mod recordings;
+mod repair;
 pub mod replay;
 mod send;
 mod serve;
 #[cfg(feature = "sim")]
 mod simulate;
 mod transport;
+#[cfg(feature = "store")]
+mod upload;
 mod vehicles;
 mod verify;
 mod watch;
@@ -62,9 +72,11 @@ use clap::builder::StyledStr;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use tracing_subscriber::EnvFilter;
 
+use exit::{EXIT_CODES, Exit};
+
 /// Clearway turns LIDAR packets into maps of where a vehicle may drive.
 #[derive(Parser)]
-#[command(name = "clearway", version, after_help = EXIT_CODES)]
+#[command(name = "clearway", version, after_help = after_help())]
 struct Arguments {
     /// Format of the log on stderr; the environment variable RUST_LOG, such as RUST_LOG=warn, selects its lines.
     #[arg(
@@ -103,6 +115,11 @@ enum Command {
     Vehicles(vehicles::Options),
     Export(export::Options),
     Info(info::Options),
+    Repair(repair::Options),
+    #[cfg(feature = "store")]
+    Upload(upload::Options),
+    #[cfg(feature = "store")]
+    Recordings(recordings::Options),
     Send(send::Options),
     Ingest(ingest::Options),
     #[cfg(feature = "sim")]
@@ -111,36 +128,48 @@ enum Command {
 }
 
 /// The subcommands by purpose, as `clearway --help` lists them.
-const GROUPS: [(&str, &[&str]); 6] = [
+const GROUPS: [(&str, &[&str]); 7] = [
     ("Make maps", &["demo", "serve", "replay", "transport"]),
     ("Check maps and configurations", &["verify", "evaluate", "check"]),
     ("Read maps from a server", &["watch", "get", "vehicles"]),
-    ("Read files", &["export", "info"]),
+    ("Read files", &["export", "info", "repair"]),
+    ("Keep recordings", &["upload", "recordings"]),
     ("Send sensor data", &["send", "ingest", "simulate"]),
     ("Shell", &["completions"]),
 ];
 
-#[cfg(feature = "sim")]
-const EXIT_CODES: &str = "Exit codes: 0 success, 1 failure, 2 wrong usage.";
-#[cfg(not(feature = "sim"))]
-const EXIT_CODES: &str = "Exit codes: 0 success, 1 failure, 2 wrong usage.\n\nThis build is without the feature `sim`: \
-    `demo`, `simulate`, `evaluate sim:NAME` and the bad network of `send` are not in it.";
+/// What the help text says after the options.
+fn after_help() -> String {
+    let without_sim = "This build is without the feature `sim`: `demo`, `simulate`, `evaluate sim:NAME` and the bad \
+        network of `send` are not in it.";
+    if cfg!(feature = "sim") { EXIT_CODES.to_owned() } else { format!("{EXIT_CODES}\n\n{without_sim}") }
+}
 
 /// Runs the command line of this process.
 pub fn main() -> ExitCode {
-    let matches = command().get_matches();
-    let arguments = Arguments::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
+    let matches = command().try_get_matches();
+    let arguments = match matches.and_then(|matches| Arguments::from_arg_matches(&matches)) {
+        Ok(arguments) => arguments,
+        Err(usage) => return print_usage(&usage),
+    };
     start_logs(arguments.log_format);
     match run(arguments.command) {
-        Ok(code) => code,
+        Ok(exit) => exit.into(),
         Err(error) => match error.downcast::<clap::Error>() {
-            Ok(usage) => usage.exit(),
+            Ok(usage) => print_usage(&usage),
             Err(error) => {
                 eprintln!("clearway: {}", with_causes(&error));
-                ExitCode::FAILURE
+                Exit::Unreadable.into()
             }
         },
     }
+}
+
+/// Prints an error of usage, or the help that was asked for.
+fn print_usage(usage: &clap::Error) -> ExitCode {
+    // A closed stdout or stderr changes nothing.
+    let _ = usage.print();
+    if usage.use_stderr() { Exit::WrongUse.into() } else { Exit::Good.into() }
 }
 
 /// The text of an error and of its causes. A cause that the text before it contains already is left out.
@@ -163,7 +192,7 @@ fn start_logs(format: LogFormat) {
     }
 }
 
-fn run(command: Command) -> Result<ExitCode> {
+fn run(command: Command) -> Result<Exit> {
     match command {
         #[cfg(feature = "sim")]
         Command::Demo(options) => demo::command::run(options)?,
@@ -173,18 +202,23 @@ fn run(command: Command) -> Result<ExitCode> {
         Command::Verify(options) => return verify::run(&options),
         Command::Evaluate(options) => evaluate::run(&options)?,
         Command::Check(options) => check::run(&options)?,
-        Command::Watch(options) => watch::run(&options)?,
-        Command::Get(options) => get::run(&options)?,
+        Command::Watch(options) => return watch::run(&options),
+        Command::Get(options) => return get::run(&options),
         Command::Vehicles(options) => vehicles::run(&options)?,
-        Command::Export(options) => export::run(&options)?,
-        Command::Info(options) => info::run(&options)?,
-        Command::Send(options) => send::run(&options)?,
+        Command::Export(options) => return export::run(&options),
+        Command::Info(options) => return info::run(&options),
+        Command::Repair(options) => return repair::run(&options),
+        #[cfg(feature = "store")]
+        Command::Upload(options) => return upload::run(&options),
+        #[cfg(feature = "store")]
+        Command::Recordings(options) => return recordings::run(&options),
+        Command::Send(options) => return send::run(&options),
         Command::Ingest(options) => ingest::run(&options)?,
         #[cfg(feature = "sim")]
         Command::Simulate(options) => simulate::run(&options)?,
         Command::Completions(options) => completions::run(&options, self::command())?,
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(Exit::Good)
 }
 
 /// The command line as clap reads it; its help lists the subcommands by purpose.

@@ -32,7 +32,7 @@ pub fn print_line(line: &str) -> Result<bool> {
     print(&format!("{line}\n"))
 }
 
-/// An error of usage that only the values of several options together show; the command ends with exit code 2.
+/// An error of usage that only the values of several options together show; the command ends with exit code 3.
 pub fn usage_error(message: impl std::fmt::Display) -> Error {
     clap::Error::raw(clap::error::ErrorKind::ArgumentConflict, format!("{message}\n")).into()
 }

@@ -1,14 +1,17 @@
 //! `clearway serve`: a configuration file -> a server that runs until a signal.
 
-use anyhow::Result;
+use anyhow::{Result, anyhow};
 use clap::Args;
+use tokio::signal::unix::{SignalKind, signal};
 
 use super::configuration::ConfigurationOptions;
 use super::output::{block_on, stop_signal};
+use crate::config::Config;
 use crate::record::writer;
-use crate::server::{Running, Server, Setup};
+use crate::server::{Running, Server, Setup, ShutdownError};
 
-/// Listen for sensor data, make maps and publish them, until SIGINT or SIGTERM.
+/// Listen for sensor data, make maps and publish them, until SIGINT or SIGTERM. SIGHUP reads certificates, tokens,
+/// roles and limits again.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway serve
@@ -38,11 +41,42 @@ async fn serve(configuration: &ConfigurationOptions) -> Result<()> {
     }
     // Before the server starts, so that a signal during the start ends it in order.
     let stop = stop_signal()?;
-    let running = Server::start(Setup { config, calibrations, certificates, ..Setup::default() }).await?;
+    let mut hangups = signal(SignalKind::hangup())?;
+    let running =
+        Server::start(Setup { config: config.clone(), calibrations, certificates, ..Setup::default() }).await?;
     log_endpoints(&running);
-    stop.await;
+    tokio::pin!(stop);
+    loop {
+        tokio::select! {
+            () = &mut stop => break,
+            _ = hangups.recv() => match reload(&running, configuration, &config) {
+                Ok(()) => tracing::info!("certificates, tokens, roles and limits are read again"),
+                Err(error) => tracing::error!("nothing is changed: {error:#}"),
+            }
+        }
+    }
     tracing::info!("stopping");
-    running.shutdown().await?;
+    let ended = running.shutdown_in_time().await;
+    if let Err(error @ ShutdownError::Deadline { .. }) = &ended {
+        // A thread that hangs would keep the runtime, and with it the process.
+        tracing::error!(%error, "ending without it");
+        std::process::exit(1);
+    }
+    Ok(ended?)
+}
+
+/// Reads the configuration again and applies what can be changed without a restart; names the tables that cannot.
+fn reload(running: &Running, configuration: &ConfigurationOptions, old: &Config) -> Result<()> {
+    let file = &configuration.config;
+    let config = configuration.load()?;
+    let certificates = config.certificates(file)?;
+    running.reload(&config, certificates.as_ref()).map_err(|reason| anyhow!("grpc.tls: {reason}"))?;
+    let mut config = config.located(file);
+    config.recorder.file.clone_from(&old.recorder.file);
+    let unchanged = config.without_reloaded(old) == *old;
+    if !unchanged {
+        tracing::warn!("other keys than certificates, tokens, roles and limits have changed: they need a restart");
+    }
     Ok(())
 }
 
@@ -56,14 +90,18 @@ pub fn log_endpoints(running: &Running) {
     if let Some(at) = running.grpc {
         tracing::info!(%at, "gRPC");
     }
+    let tls = if running.is_encrypted() { "s" } else { "" };
     if let Some(at) = running.page {
-        tracing::info!("page http://{at}/");
+        tracing::info!("page http{tls}://{at}/");
+    }
+    if let Some(at) = running.metrics {
+        tracing::info!("metrics http{tls}://{at}/metrics");
     }
     for endpoint in &running.zenoh {
         tracing::info!(%endpoint, "zenoh");
     }
     if let Some(at) = running.foxglove {
-        tracing::info!("foxglove ws://{at}");
+        tracing::info!("foxglove ws{tls}://{at}");
     }
     if let Some(recording) = running.recording() {
         tracing::info!(%recording, "recording");

@@ -99,6 +99,9 @@ fn lines(vehicle: &v1::Vehicle, now: i64) -> Vec<String> {
         }
         None => lines.push("  not recording".into()),
     }
+    if !vehicle.fault.is_empty() {
+        lines.push(format!("  FAULT: {}", vehicle.fault));
+    }
     let readers: Vec<_> = vehicle.readers.iter().map(|(transport, n)| format!("{transport} {n}")).collect();
     lines.push(format!("  readers: {}", if readers.is_empty() { "none".into() } else { readers.join(", ") }));
     lines
@@ -110,11 +113,12 @@ fn sensor_line(state: &v1::SensorState) -> String {
     let lasers = state.blocked_lasers.iter().map(|laser| format!("laser {laser}"));
     let blocked = sectors.chain(lasers).collect::<Vec<_>>().join(", ");
     let blocked = if blocked.is_empty() { blocked } else { format!(", BLOCKED: {blocked}") };
+    let epoch = if state.epoch == 0 { String::new() } else { format!(", epoch {}", state.epoch) };
     let elevations =
         if state.elevations.is_empty() { String::new() } else { format!(", elevations {}", state.elevations) };
     format!(
         "  sensor {} ({}): {:.0} rpm, {} of {} packets and {} a revolution, {:.1} % of the revolution{partial}\
-         {blocked}{elevations}, clock {} (host {:+} ms)",
+         {blocked}{elevations}, clock {} (host {:+} ms){epoch}",
         state.name,
         state.model,
         state.rpm,

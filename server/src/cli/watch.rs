@@ -1,33 +1,43 @@
 //! `clearway watch`: a server -> one line for each map, and a line when the maps stop.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Result, bail};
 use clap::Args;
-use clearway_client::{ClientError, MapStream, StreamEvent, Subscription, Update, now_ns};
+use clearway_client::{ClientError, MapStream, PassedOver, StreamEvent, Subscription, Update, now_ns};
 use serde_json::json;
 
 use super::connection::{ServerOptions, explain};
+use super::exit::Exit;
+#[cfg(feature = "zenoh")]
+use super::files;
 use super::output::{block_on, print_line};
 
-/// Time without a first map after which the command says that it waits.
-const FIRST_MAP_TIMEOUT: Duration = Duration::from_secs(1);
+/// Time between two lines while no fresh map comes. Ours: a person sees that the command still waits.
+const STALE_PERIOD: Duration = Duration::from_secs(1);
+/// Interval at which the age of the last map is read after the stream has ended.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps.
 ///
-/// If no newer map arrives before the last one becomes stale, a line says so; the lines continue when maps arrive
-/// again.
+/// If no map arrives, or no newer one before the last one becomes stale, a line says STALE once a second until maps
+/// arrive again. The exit code is 4 if the last line says STALE, and 2 if the server ends the stream.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway watch
   clearway watch --server vehicle.local:50051 --layers drivability,occupancy --max-rate-hz 2
-  clearway watch --count 10 --json")]
+  clearway watch --count 10 --json
+  clearway watch --until-stale || echo \"the maps are stale\"")]
 pub struct Options {
     #[command(flatten)]
     server: ServerOptions,
     /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447.
     #[arg(long, value_name = "ENDPOINT", conflicts_with_all = ["address", "ca", "cert", "key"])]
     zenoh: Option<String>,
+    /// Believe only maps that are signed with the private key of this public key (`zenoh.signing_key` of the server).
+    #[arg(long, value_name = "FILE.pub", requires = "zenoh")]
+    signed_by: Option<PathBuf>,
     /// The vehicle, if the server has several.
     #[arg(long, value_name = "NAME")]
     vehicle: Option<String>,
@@ -46,51 +56,74 @@ pub struct Options {
     /// End after this many maps; at Ctrl-C if absent.
     #[arg(long, value_name = "MAPS")]
     count: Option<u64>,
+    /// End with exit code 4 as soon as the map is stale, or none has come for a second.
+    #[arg(long)]
+    until_stale: bool,
 }
 
-/// Prints lines until the stream ends, the count is reached or the reader of stdout has closed it.
+/// Prints lines until the stream or a replay ends, the count is reached, the map is stale with `--until-stale`, or the reader of
+/// stdout has closed it.
 ///
 /// # Errors
 /// [`ClientError`](clearway_client::ClientError) if the server refuses, does not answer or ends the stream.
-pub fn run(options: &Options) -> Result<()> {
+pub fn run(options: &Options) -> Result<Exit> {
     block_on(watch(options))
 }
 
-async fn watch(options: &Options) -> Result<()> {
+async fn watch(options: &Options) -> Result<Exit> {
     let mut maps = subscribe(options).await?;
-    let mut last = None;
-    let mut printed = 0;
-    while options.count.is_none_or(|count| printed < count) {
-        let update = match next(&mut maps, printed == 0).await {
-            Ok(StreamEvent::Fresh(update) | StreamEvent::Stale(update)) => update,
-            Err(error) if matches!(error.downcast_ref(), Some(ClientError::ReplayEnded { .. })) => {
+    let mut newest: Option<Update> = None;
+    let (mut printed, mut is_stale) = (0, false);
+    while options.count.is_none_or(|count| printed < count) && !(is_stale && options.until_stale) {
+        let event = tokio::time::timeout(STALE_PERIOD, maps.next_or_stale()).await;
+        let (said, is_new) = match event {
+            Ok(Ok(StreamEvent::Fresh(update) | StreamEvent::Stale(update))) => {
+                let is_new = newest.as_ref().map(id) != Some(id(&update));
+                is_stale = update.map.is_stale(now_ns());
+                let said = if is_new {
+                    line(&update, maps.passed_over(), options.json)
+                } else {
+                    stale_line(Some(&update), maps.passed_over(), options)
+                };
+                newest = Some(update);
+                (said, is_new)
+            }
+            Ok(Err(error @ ClientError::ReplayEnded { .. })) => {
                 eprintln!("clearway: {error}");
                 break;
             }
-            Err(error) => return Err(error),
+            Ok(Err(ended)) => {
+                if let Some(last) = newest.filter(|_| !is_stale) {
+                    wait_until_stale(&last).await;
+                    print_line(&stale_line(Some(&last), maps.passed_over(), options))?;
+                }
+                return Err(explain(ended));
+            }
+            // A fresh map is not repeated: maps may be rarer than this period.
+            Err(_) if newest.as_ref().is_some_and(|last| !last.map.is_stale(now_ns())) => continue,
+            Err(_) => {
+                is_stale = true;
+                (stale_line(newest.as_ref(), maps.passed_over(), options), false)
+            }
         };
-        let id = (update.map.header().boot_id, update.map.sequence());
-        let is_new = last.replace(id) != Some(id);
-        let line = if is_new || options.json { line(&update, options.json) } else { stopped_line(&update) };
-        if !print_line(&line)? {
+        if !print_line(&said)? {
             break;
         }
         printed += u64::from(is_new);
     }
-    Ok(())
+    Ok(Exit::from_stale(is_stale))
 }
 
-/// The next event of the stream. Says on stderr that it waits if this is the first one and does not come soon.
-async fn next(maps: &mut MapStream, is_first: bool) -> Result<StreamEvent> {
-    if is_first {
-        if let Ok(event) = tokio::time::timeout(FIRST_MAP_TIMEOUT, maps.next_or_stale()).await {
-            return event.map_err(explain);
-        }
-        eprintln!(
-            "clearway: no map yet; waiting for the first one (`clearway vehicles` shows what the server receives)"
-        );
+/// Identity of a map.
+fn id(update: &Update) -> (u64, u64) {
+    (update.map.header().boot_id, update.map.sequence())
+}
+
+/// Waits until the last map of a stream that has ended is stale.
+async fn wait_until_stale(last: &Update) {
+    while !last.map.is_stale(now_ns()) {
+        tokio::time::sleep(POLL_INTERVAL).await;
     }
-    maps.next_or_stale().await.map_err(explain)
 }
 
 async fn subscribe(options: &Options) -> Result<MapStream> {
@@ -109,22 +142,26 @@ async fn subscribe(options: &Options) -> Result<MapStream> {
 }
 
 /// The line for a new map.
-fn line(update: &Update, as_json: bool) -> String {
+fn line(update: &Update, passed_over: PassedOver, as_json: bool) -> String {
     let (map, skipped, now) = (&update.map, update.skipped, now_ns());
     let share = map.metric("drivable_share");
     if as_json {
         let document = json!({
             "vehicle": map.vehicle(), "sequence": map.sequence(), "age_ms": map.age_ms(now), "stale": map.is_stale(now),
             "drivable_share": share, "bytes": map.bytes().len(), "skipped": skipped,
-            "lost": update.lost, "left_out": update.left_out,
+            "lost": update.lost, "left_out": update.left_out, "passed_over": passed_over.hostile(),
             "layers": map.layers().iter().map(|layer| &layer.name).collect::<Vec<_>>(),
         });
         return document.to_string();
     }
     let share = share.map_or("    -".into(), |share| format!("{:5.1}", 100.0 * share));
     let stale = if map.is_stale(now) { "  STALE" } else { "" };
+    let passed_over = match passed_over.hostile() {
+        0 => String::new(),
+        messages => format!("  passed over {messages} messages that are no maps of this server"),
+    };
     format!(
-        "{} #{:06}  age {:7.1} ms  drivable {share} %  {:6} bytes  skipped {skipped}{stale}",
+        "{} #{:06}  age {:7.1} ms  drivable {share} %  {:6} bytes  skipped {skipped}{stale}{passed_over}",
         map.vehicle(),
         map.sequence(),
         map.age_ms(now),
@@ -132,15 +169,21 @@ fn line(update: &Update, as_json: bool) -> String {
     )
 }
 
-/// The line for a map that has become stale without a newer one.
-fn stopped_line(update: &Update) -> String {
-    let map = &update.map;
-    format!(
-        "{} #{:06}  age {:7.1} ms  STALE: no newer map has arrived; waiting",
-        map.vehicle(),
-        map.sequence(),
-        map.age_ms(now_ns())
-    )
+/// The line while no fresh map is there: the newest one is stale, or none has come.
+fn stale_line(newest: Option<&Update>, passed_over: PassedOver, options: &Options) -> String {
+    match newest {
+        Some(update) if options.json => line(update, passed_over, true),
+        Some(Update { map, .. }) => format!(
+            "{} #{:06}  age {:7.1} ms  STALE: no newer map has arrived; waiting",
+            map.vehicle(),
+            map.sequence(),
+            map.age_ms(now_ns())
+        ),
+        None if options.json => {
+            json!({"vehicle": options.vehicle, "sequence": null, "age_ms": null, "stale": true}).to_string()
+        }
+        None => "STALE: no map has arrived; waiting (`clearway vehicles` shows what the server receives)".to_owned(),
+    }
 }
 
 #[cfg(feature = "zenoh")]
@@ -150,7 +193,10 @@ async fn subscribe_over_zenoh(endpoint: &str, options: &Options) -> Result<MapSt
         [layer] => layer,
         several => bail!("--layers {}: over zenoh each layer has its own key; name one", several.join(",")),
     };
-    let client = clearway_client::ZenohClient::connect(endpoint).await?;
+    let mut client = clearway_client::ZenohClient::connect(endpoint).await?;
+    if let Some(file) = &options.signed_by {
+        client = client.signed_by(clearway_client::PublicKey::from_pem(&files::read_text(file)?)?);
+    }
     let vehicle = match &options.vehicle {
         Some(name) => name.clone(),
         None => match &client.vehicles().await?[..] {

@@ -1,6 +1,9 @@
-//! The table `[grpc]`: where maps are served, with which certificates, and what each client may do.
+//! The table `[grpc]`: where maps are served, with which certificates, and what each client may do. The certificates
+//! and the roles hold for the page, the metrics and Foxglove too.
 
+use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -57,9 +60,27 @@ pub struct Access {
     pub ingesters: Vec<String>,
     /// Clients that may do both.
     pub operators: Vec<String>,
+    /// Files with the bearer tokens of clients that have no certificate (browsers, Prometheus), by the client's name.
+    /// A recording holds the paths only.
+    pub tokens: BTreeMap<String, PathBuf>,
+    /// What a name is limited to; a name that is not here may reach every vehicle and layer.
+    pub only: BTreeMap<String, Only>,
 }
 
-/// The contents of the files of `[grpc.tls]`. The key is never logged or recorded.
+/// The vehicles and layers that a name is limited to.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Only {
+    /// Names of vehicles; empty: every vehicle.
+    pub vehicles: Vec<String>,
+    /// Names of layers; empty: every layer.
+    pub layers: Vec<String>,
+}
+
+/// Least length of a token, in characters. Ours: 128 bits in hexadecimal.
+const TOKEN_CHARACTERS_MIN: usize = 32;
+
+/// The contents of the files of `[grpc.tls]` and `[grpc.access.tokens]`. Keys and tokens are never logged or recorded.
 #[derive(Clone)]
 pub struct Certificates {
     /// Certificate of the server, PEM.
@@ -68,13 +89,16 @@ pub struct Certificates {
     pub key: String,
     /// CA of the clients, PEM.
     pub client_ca: Option<String>,
+    /// Name and token of each client without a certificate.
+    pub tokens: Vec<(String, String)>,
 }
 
 impl Grpc {
     pub(super) fn check(&self) -> Result<(), ValueError> {
-        let Access { readers, ingesters, operators } = &self.access;
+        let Access { readers, ingesters, operators, tokens, only } = &self.access;
         let required = self.tls.as_ref().is_some_and(|tls| tls.client_ca.is_some());
-        if let Some(name) = readers.iter().chain(ingesters).chain(operators).next().filter(|_| !required) {
+        let mut names = readers.iter().chain(ingesters).chain(operators).chain(tokens.keys()).chain(only.keys());
+        if let Some(name) = names.next().filter(|_| !required) {
             let allowed = "no name without grpc.tls.client_ca, the CA of the clients' certificates";
             return Err(ValueError::new("grpc.access", name, allowed));
         }
@@ -87,21 +111,49 @@ impl Grpc {
     /// Reads the files of `[grpc.tls]`: [`Config::certificates`](super::Config::certificates).
     pub(super) fn certificates(&self, file: &Path) -> Result<Option<Certificates>, ConfigError> {
         let Some(tls) = &self.tls else { return Ok(None) };
-        let read = |key: &str, path: &PathBuf| {
-            let named = beside(file, path);
-            let wrong = |reason: String| ConfigError::File {
-                file: file.to_owned(),
-                key: format!("grpc.tls.{key}"),
-                named: named.clone(),
-                reason,
-            };
-            let text = std::fs::read_to_string(&named).map_err(|error| wrong(advised(&named, error).to_string()))?;
-            let what = if key == "key" { "PRIVATE KEY-----" } else { "BEGIN CERTIFICATE-----" };
-            let found = text.contains(what);
-            if found { Ok(text) } else { Err(wrong(format!("no PEM block \"{what}\" in it"))) }
+        let pem = |key: &str, path: &Path, block: &str| {
+            let (read, named) = (if key == "key" { secret } else { text }, beside(file, path));
+            let found = read(&named).and_then(|text| match text.contains(block) {
+                true => Ok(text),
+                false => Err(format!("no PEM block \"{block}\" in it")),
+            });
+            found.map_err(|reason| wrong(file, format!("grpc.tls.{key}"), named, reason))
         };
-        let client_ca = tls.client_ca.as_ref().map(|path| read("client_ca", path)).transpose()?;
-        let (certificate, key) = (read("certificate", &tls.certificate)?, read("key", &tls.key)?);
-        Ok(Some(Certificates { certificate, key, client_ca }))
+        let certificate = |key, path: &Path| pem(key, path, "BEGIN CERTIFICATE-----");
+        let token = |(name, path): (&String, &PathBuf)| {
+            let named = beside(file, path);
+            let token = secret(&named).and_then(|text| match text.trim() {
+                token if token.len() >= TOKEN_CHARACTERS_MIN && token.chars().all(|c| c.is_ascii_graphic()) => {
+                    Ok(token.to_owned())
+                }
+                _ => Err(format!("at least {TOKEN_CHARACTERS_MIN} printable ASCII characters on one line are allowed")),
+            });
+            let token = token.map_err(|reason| wrong(file, format!("grpc.access.tokens.{name}"), named, reason));
+            Ok((name.clone(), token?))
+        };
+        Ok(Some(Certificates {
+            client_ca: tls.client_ca.as_ref().map(|path| certificate("client_ca", path)).transpose()?,
+            certificate: certificate("certificate", &tls.certificate)?,
+            key: pem("key", &tls.key, "PRIVATE KEY-----")?,
+            tokens: self.access.tokens.iter().map(token).collect::<Result<_, _>>()?,
+        }))
+    }
+}
+
+fn wrong(file: &Path, key: String, named: PathBuf, reason: String) -> ConfigError {
+    ConfigError::File { file: file.to_owned(), key, named, reason }
+}
+
+fn text(file: &Path) -> Result<String, String> {
+    std::fs::read_to_string(file).map_err(|error| advised(file, error).to_string())
+}
+
+/// The text of a file that only its owner and its group may read.
+fn secret(file: &Path) -> Result<String, String> {
+    let text = text(file)?;
+    let mode = std::fs::metadata(file).map_err(|error| error.to_string())?.permissions().mode() & 0o777;
+    match mode & 0o007 {
+        0 => Ok(text),
+        _ => Err(format!("every user of this host may use it (mode {mode:03o}); allowed: 600 or 640 (chmod 600)")),
     }
 }

@@ -5,7 +5,7 @@
 //! `deploy/clearway.toml` holds every key with its default.
 
 use std::collections::BTreeSet;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 
 use clearway_lidar::calibration::Calibration;
@@ -16,6 +16,7 @@ use crate::file_advice::advised;
 use error::{ValueError, beside};
 use read::{Problem, Refusal, plain_key};
 
+mod connections;
 mod error;
 mod grpc;
 mod listeners;
@@ -25,8 +26,9 @@ mod udp;
 mod vehicle;
 mod zenoh;
 
+pub use connections::{Connections, Service};
 pub use error::{ConfigError, Origin};
-pub use grpc::{Access, Certificates, Grpc, Tls};
+pub use grpc::{Access, Certificates, Grpc, Only, Tls};
 pub use listeners::{Listener, Route, listeners};
 pub use ros::Ros;
 pub use udp::{Ports, Sender, Udp};
@@ -47,15 +49,21 @@ pub struct Config {
     /// Streams over gRPC.
     #[serde(default)]
     pub grpc: Grpc,
-    /// The page, its WebSocket, `/healthz` and `/metrics`.
+    /// The page, its WebSocket, `/healthz`, `/readyz` and `/metrics`.
     #[serde(default)]
     pub page: Page,
+    /// `/healthz`, `/readyz` and `/metrics` on a listener of their own.
+    #[serde(default)]
+    pub metrics: Metrics,
     /// Streams over zenoh.
     #[serde(default)]
     pub zenoh: Zenoh,
     /// The WebSocket for Foxglove.
     #[serde(default)]
     pub foxglove: Foxglove,
+    /// What the peers of all TCP listeners may cost.
+    #[serde(default)]
+    pub connections: Connections,
     /// The recording.
     #[serde(default)]
     pub recorder: Recorder,
@@ -80,7 +88,23 @@ impl Default for Page {
     }
 }
 
-/// The table `[foxglove]`: a WebSocket for Foxglove. Every client that can connect may read.
+/// The table `[metrics]`: `/healthz`, `/readyz` and `/metrics` alone, which no reader of the page can delay.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Metrics {
+    /// True if it is served.
+    pub enabled: bool,
+    /// Address and port to listen on; port 0 selects a free port.
+    pub listen: SocketAddr,
+}
+
+impl Default for Metrics {
+    fn default() -> Self {
+        Self { enabled: false, listen: SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 9464) }
+    }
+}
+
+/// The table `[foxglove]`: a WebSocket for Foxglove.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Foxglove {
@@ -172,6 +196,15 @@ impl Config {
         Ok(overridden)
     }
 
+    /// Checks that nothing is served to other hosts without protection, unless `connections.unprotected` names it. For
+    /// a server that starts: the configuration of a recording is not served.
+    ///
+    /// # Errors
+    /// [`ConfigError::Value`] for the first address that other hosts can reach without TLS, or from any sender.
+    pub fn check_exposure(&self, origin: &Origin) -> Result<(), ConfigError> {
+        self.check_exposed_values().map_err(|error| error.at(origin))
+    }
+
     /// A configuration of one vehicle with one sensor and every default. The sensor is level, 2 m above the ground,
     /// until its extrinsics are set.
     pub fn of_one_vehicle(vehicle: &str, sensor: &str) -> Self {
@@ -200,6 +233,7 @@ impl Config {
             return Err(ValueError::new("vehicle", "[]", "at least one [[vehicle]]"));
         }
         self.grpc.check()?;
+        self.connections.check()?;
         self.recorder.check()?;
         self.zenoh.check(&self.vehicles)?;
         let mut names = BTreeSet::new();
@@ -220,10 +254,11 @@ impl Config {
         self.grpc.certificates(file)
     }
 
-    /// The configuration with the paths `recorder.file` and `zenoh.file` made relative to the working directory: in the
+    /// The configuration with the paths `recorder.file`, `zenoh.file` and
+    /// `zenoh.signing_key` made relative to the working directory: in the
     /// configuration they start at the folder of `file`.
     pub fn located(mut self, file: &Path) -> Self {
-        for path in [&mut self.recorder.file, &mut self.zenoh.file] {
+        for path in [&mut self.recorder.file, &mut self.zenoh.file, &mut self.zenoh.signing_key] {
             if !path.as_os_str().is_empty() {
                 *path = beside(file, path);
             }
@@ -311,6 +346,71 @@ fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
     }
     place.insert((*last).to_owned(), value);
     Ok(())
+}
+
+impl Config {
+    /// The configuration with those of `old`'s values that a running server can replace: certificates, tokens, roles
+    /// and limits. It equals `old` if nothing else differs.
+    pub fn without_reloaded(mut self, old: &Self) -> Self {
+        self.grpc.tls.clone_from(&old.grpc.tls);
+        self.grpc.access.clone_from(&old.grpc.access);
+        self.grpc.connections_max = old.grpc.connections_max;
+        let (calls_max, per_address) = (self.connections.calls_max, self.connections.calls_per_address_max);
+        self.connections = Connections { calls_max, calls_per_address_max: per_address, ..old.connections.clone() };
+        self
+    }
+
+    /// Checks that nothing is served to other hosts without protection, unless the configuration names it in
+    /// `connections.unprotected`. For a server that starts; the configuration of a recording is not served.
+    ///
+    /// # Errors
+    /// [`ValueError`] with the first address that other hosts can reach without TLS, or from any sender.
+    fn check_exposed_values(&self) -> Result<(), ValueError> {
+        let is_allowed = |service: Service| self.connections.unprotected.contains(&service);
+        let refuse = |service: Service, key: String, value: String, protection: &str| {
+            let name = service.as_str();
+            let allowed = format!(
+                "an address of this host, such as 127.0.0.1, or {protection}; connections.unprotected = [\"{name}\"] \
+                 says that every host of the network may use it"
+            );
+            Err(ValueError::new(key, value, allowed))
+        };
+        let tcp = [
+            (Service::Grpc, self.grpc.enabled, self.grpc.listen),
+            (Service::Page, self.page.enabled, self.page.listen),
+            (Service::Metrics, self.metrics.enabled, self.metrics.listen),
+            (Service::Foxglove, self.foxglove.enabled, self.foxglove.listen),
+        ];
+        for (service, enabled, at) in tcp {
+            if enabled && !at.ip().is_loopback() && self.grpc.tls.is_none() && !is_allowed(service) {
+                let key = format!("{}.listen", service.as_str());
+                return refuse(service, key, at.to_string(), "certificates in grpc.tls");
+            }
+        }
+        let is_public = |endpoint: &&String| {
+            let address = endpoint.split('/').nth(1).unwrap_or_default().split(['?', '#']).next().unwrap_or_default();
+            let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
+            host != "localhost" && !host.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
+        };
+        let endpoint = self.zenoh.listen.iter().find(is_public).filter(|_| self.zenoh.enabled);
+        if let Some(endpoint) = endpoint.filter(|_| self.zenoh.file.as_os_str().is_empty())
+            && !is_allowed(Service::Zenoh)
+        {
+            let protection = "TLS and access control in zenoh.file";
+            return refuse(Service::Zenoh, "zenoh.listen".into(), endpoint.clone(), protection);
+        }
+        for listener in listeners(&self.vehicles) {
+            let from_anyone = listener.routes.iter().find(|route| route.from.is_none());
+            if let Some(route) = from_anyone.filter(|_| !listener.at.ip().is_loopback())
+                && !is_allowed(Service::Udp)
+            {
+                let key = format!("vehicle.udp (of {})", self.vehicles[route.vehicle].name);
+                let protection = "the address of each sensor in vehicle.udp.from";
+                return refuse(Service::Udp, key, listener.at.to_string(), protection);
+            }
+        }
+        Ok(())
+    }
 }
 
 #[cfg(test)]

@@ -319,3 +319,47 @@ fn names_that_ros_2_does_not_allow_are_refused_if_ros2_is_enabled() {
     let refused = error(&format!("[zenoh]\nenabled = false\n{}", ros2("enabled = true")));
     assert!(refused.contains("zenoh.ros2.enabled = true: allowed: only with zenoh.enabled = true"), "{refused}");
 }
+
+#[test]
+fn an_address_that_other_hosts_can_reach_needs_protection_or_its_name_in_words() {
+    let exposed = |text: &str| {
+        let config = Config::parse(NEEDED, Path::new("a.toml"), &[text.to_owned()]).unwrap();
+        config.check_exposure(&Origin::file(Path::new("a.toml"))).err().map(|error| error.to_string())
+    };
+    assert_eq!(exposed("grpc.enabled=true"), None, "the defaults");
+    for (setting, service) in [
+        ("grpc.listen=0.0.0.0:1", "grpc"),
+        ("grpc.listen=[::]:1", "grpc"),
+        ("page.listen=192.168.1.7:80", "page"),
+        ("metrics={ enabled = true, listen = \"0.0.0.0:1\" }", "metrics"),
+        ("foxglove={ enabled = true, listen = \"0.0.0.0:1\" }", "foxglove"),
+        ("zenoh.listen=[\"tcp/0.0.0.0:7447\"]", "zenoh"),
+        ("zenoh.listen=[\"tcp/[::]:7447\"]", "zenoh"),
+        ("vehicle.udp.data=0.0.0.0:2368", "udp"),
+    ] {
+        let refused = exposed(setting).unwrap_or_else(|| panic!("{setting} is accepted"));
+        assert!(refused.contains(&format!("connections.unprotected = [\"{service}\"]")), "{refused}");
+        let options = [setting.to_owned(), format!("connections.unprotected=[\"{service}\"]")];
+        let config = Config::parse(NEEDED, Path::new("a.toml"), &options).unwrap();
+        config.check_exposure(&Origin::file(Path::new("a.toml"))).unwrap();
+    }
+    for allowed in [
+        "zenoh.listen=[\"tcp/localhost:7447\", \"tcp/[::1]:7447\", \"tcp/127.0.0.1:7447\"]",
+        "foxglove={ enabled = false, listen = \"0.0.0.0:1\" }",
+        "vehicle.udp={ data = \"0.0.0.0:2368\", telemetry = \"0.0.0.0:8308\", from = { top = \"10.0.0.1\" } }",
+    ] {
+        assert_eq!(exposed(allowed), None, "{allowed}");
+    }
+}
+
+#[test]
+fn a_reload_changes_certificates_roles_and_limits_and_nothing_else() {
+    let config = |option: &str| Config::parse(NEEDED, Path::new("a.toml"), &[option.to_owned()]).unwrap();
+    let old = config("grpc.enabled=true");
+    for reloaded in ["grpc.connections_max=7", "connections.idle_s=7", "connections.hosts=[\"car.example\"]"] {
+        assert_eq!(config(reloaded).without_reloaded(&old), old, "{reloaded}");
+    }
+    for fixed in ["grpc.listen=127.0.0.1:7", "connections.calls_max=7", "vehicle.queue=64"] {
+        assert_ne!(config(fixed).without_reloaded(&old), old, "{fixed}");
+    }
+}

@@ -29,10 +29,10 @@ pub struct Udp {
 
 impl Default for Udp {
     fn default() -> Self {
-        let any = |port| SocketAddr::new(Ipv4Addr::UNSPECIFIED.into(), port);
+        let at = |port| SocketAddr::new(Ipv4Addr::LOCALHOST.into(), port);
         Self {
-            data: any(2368),
-            telemetry: any(8308),
+            data: at(2368),
+            telemetry: at(8308),
             receive_buffer_bytes: 4 << 20,
             groups: Vec::new(),
             interface: String::new(),

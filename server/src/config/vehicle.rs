@@ -1,6 +1,6 @@
 //! The table `[[vehicle]]`: its sensors and maps, and where its events come from.
 
-use clearway_mapping::config::{BodyConfig, FusionConfig, MapsConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::config::{BodyConfig, FusionConfig, MapsConfig, SensorConfig, TimeConfig, VehicleConfig};
 use serde::{Deserialize, Serialize};
 
 use super::error::ValueError;
@@ -25,6 +25,9 @@ pub struct Vehicle {
     /// Observations over gRPC and zenoh.
     #[serde(default)]
     pub ingest: Ingest,
+    /// How stamps follow the clocks.
+    #[serde(default)]
+    pub time: TimeConfig,
     /// How the scans of several sensors are merged.
     #[serde(default)]
     pub fusion: FusionConfig,
@@ -49,6 +52,7 @@ impl Vehicle {
         VehicleConfig {
             name: self.name.clone(),
             sensors: self.sensors.clone(),
+            time: self.time,
             fusion: self.fusion.clone(),
             body: self.body,
             maps: self.maps.clone(),
@@ -66,11 +70,20 @@ pub struct Ingest {
     pub points_max: usize,
     /// Most streams at once; they share half the event queue.
     pub streams_max: usize,
+    /// Greatest time by which the stamp of an observation may be ahead of the server's clock, milliseconds.
+    pub ahead_ms_max: u32,
 }
 
 impl Default for Ingest {
     fn default() -> Self {
-        Self { enabled: true, points_max: 2_000_000, streams_max: 8 }
+        Self { enabled: true, points_max: 2_000_000, streams_max: 8, ahead_ms_max: 10_000 }
+    }
+}
+
+impl Ingest {
+    /// Number of events of all streams together on a queue of this length: half of it, the other half is for UDP.
+    pub fn events_max(&self, queue: usize) -> usize {
+        if self.enabled { queue / 2 } else { 0 }
     }
 }
 
@@ -86,7 +99,10 @@ impl Vehicle {
         if let Some(ros) = &self.ros {
             ros.check(zenoh_enabled, &self.sensors).map_err(|error| ValueError { key: at(&error.key), ..error })?;
         }
-        let Ingest { points_max, streams_max, .. } = self.ingest;
+        let Ingest { points_max, streams_max, ahead_ms_max, .. } = self.ingest;
+        if !(100..=86_400_000).contains(&ahead_ms_max) {
+            return Err(ValueError::new(at("ingest.ahead_ms_max"), ahead_ms_max, "100 to 86400000 ms"));
+        }
         if !(1000..=20_000_000).contains(&points_max) {
             return Err(ValueError::new(at("ingest.points_max"), points_max, "1000 to 20000000 points"));
         }

@@ -27,6 +27,9 @@ pub struct Zenoh {
     /// A zenoh configuration (JSON5) with TLS and access control; the keys above take precedence over it. A relative
     /// path starts at the configuration's folder. Empty: zenoh's defaults, with limits for what one peer may cost.
     pub file: PathBuf,
+    /// Private key (Ed25519, PEM) with which maps are signed; a relative path starts at the configuration's folder.
+    /// Empty: maps have no signature. A recording holds the path only.
+    pub signing_key: PathBuf,
 }
 
 impl Default for Zenoh {
@@ -39,6 +42,7 @@ impl Default for Zenoh {
             scouting: false,
             ros2: Ros2::default(),
             file: PathBuf::new(),
+            signing_key: PathBuf::new(),
         }
     }
 }

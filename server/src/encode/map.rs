@@ -190,6 +190,7 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
         source_sensor: map.sensors.get(usize::from(map.source)).map_or(String::new(), |sensor| sensor.name.clone()),
         reference_sensor: (map.sensors.get(usize::from(map.reference_sensor)))
             .map_or(String::new(), |sensor| sensor.name.clone()),
+        epoch: map.epoch,
         replay: None,
     }
 }
@@ -213,6 +214,7 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
         partial: state.partial.to_owned(),
         clock: state.clock.to_owned(),
         clock_offset_ms: state.clock_offset_ms,
+        epoch: state.epoch,
         packets_expected: state.packets_expected,
         blocked_sectors: state
             .blocked
@@ -229,9 +231,11 @@ pub(crate) fn sensor(state: &SensorState) -> v1::SensorState {
 
 fn layer(layer: &Layer) -> v1::Layer {
     let geometry = match &layer.geometry {
-        Geometry::Radial { row_radius_m, columns } => v1::layer::Geometry::Radial(v1::RadialGrid {
+        Geometry::Radial { centre_m, row_radius_m, columns } => v1::layer::Geometry::Radial(v1::RadialGrid {
             row_radius_m: row_radius_m.clone(),
             columns: u32::from(*columns),
+            centre_x_m: centre_m[0],
+            centre_y_m: centre_m[1],
         }),
         &Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_cell } => {
             let [first_ix, first_iy] = first_cell;
@@ -316,7 +320,7 @@ mod tests {
     fn map() -> Map {
         let layer = |name| Layer {
             name,
-            geometry: Geometry::Radial { row_radius_m: vec![5.0, 60.0], columns: 4 },
+            geometry: Geometry::Radial { centre_m: [0.0; 2], row_radius_m: vec![5.0, 60.0], columns: 4 },
             legend: &[ClassInfo::UNKNOWN, ClassInfo { name: "drivable", meaning: Meaning::Free, rgb: 0 }],
             channels: vec![clearway_mapping::layer::Channel {
                 name: "class",
@@ -333,6 +337,7 @@ mod tests {
             sequence: 9,
             capture_start_ns: 1,
             capture_end_ns: 100,
+            epoch: 0,
             completed_ns: 101,
             map_from_ego: None,
             speed_mps: None,

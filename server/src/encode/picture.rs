@@ -4,8 +4,8 @@
 //! legend, or one channel: ids in one colour each, other values from dark to light. The PNG's text `Comment` names the
 //! channel, its least and greatest value and its unit. Safe points of the layer are drawn as lines between linked
 //! points, in a band as wide as their radii. A strip under the picture shows the legend of the classes or the colour
-//! bar of the channel, a scale bar and which direction is up, unless the style leaves it out. [`of_change`] draws where
-//! two maps of one layer differ.
+//! bar of the channel, a scale bar and which direction is up, unless the style leaves it out. The picture of a stale
+//! map has a red frame and the word STALE. [`of_change`] draws where two maps of one layer differ.
 
 mod canvas;
 pub mod change;
@@ -13,6 +13,7 @@ mod colours;
 mod error;
 mod image;
 mod safe_paths;
+mod stale;
 
 use std::time::{Duration, UNIX_EPOCH};
 
@@ -52,6 +53,8 @@ pub struct Style {
     pub legend: bool,
     /// Lines of text over the legend, such as the stamp of the map; they need the strip.
     pub caption: Vec<String>,
+    /// True if the map is stale: the picture says so across the map.
+    pub stale: bool,
 }
 
 impl Default for Style {
@@ -65,6 +68,7 @@ impl Default for Style {
             channel: None,
             legend: true,
             caption: Vec::new(),
+            stale: false,
         }
     }
 }
@@ -138,6 +142,9 @@ fn draw(
                 canvas.rgb[index] = VEHICLE;
             }
         }
+    }
+    if style.stale {
+        stale::draw(&mut canvas);
     }
     let metres = canvas.pixel_m();
     let mut picture = Picture { width: side, height: side, rgb: canvas.rgb, comment: None };

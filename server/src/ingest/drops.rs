@@ -22,6 +22,8 @@ pub struct DropCounters {
     unknown_senders: Mutex<VecDeque<UnknownSender>>,
     /// Refused messages by reason; the ledger counts all of them as `observation`.
     refused_messages: Mutex<BTreeMap<&'static str, u64>>,
+    /// Threads that read for the vehicle and ended by a fault.
+    ended_inputs: Mutex<Vec<String>>,
 }
 
 /// Number of dropped readings that are not reported to the engine yet, by cause and sensor. A full queue comes first.
@@ -80,6 +82,16 @@ impl DropCounters {
     /// Number of refused messages since the server's start, by reason.
     pub fn refused_messages(&self) -> BTreeMap<&'static str, u64> {
         locked(&self.refused_messages).clone()
+    }
+
+    /// Records that a thread that reads for the vehicle has ended by a fault.
+    pub(crate) fn record_ended_input(&self, what: String) {
+        locked(&self.ended_inputs).push(what);
+    }
+
+    /// The threads that read for the vehicle and have ended by a fault.
+    pub fn ended_inputs(&self) -> Vec<String> {
+        locked(&self.ended_inputs).clone()
     }
 
     /// The most recent unknown senders, the newest last.

@@ -48,8 +48,11 @@ impl Gateway {
         let streams_max = vehicle.ingest.streams_max;
         Self {
             vehicle: vehicle.name.as_str().into(),
-            limits: Limits::from_points_max(vehicle.ingest.points_max),
-            in_flight_max: (vehicle.queue / (2 * streams_max)).max(1),
+            limits: Limits {
+                ahead_ns_max: i64::from(vehicle.ingest.ahead_ms_max) * 1_000_000,
+                ..Limits::from_points_max(vehicle.ingest.points_max)
+            },
+            in_flight_max: (vehicle.ingest.events_max(vehicle.queue) / streams_max).max(1),
             config: Mutex::new(vehicle.core()),
             streams: Arc::new(Semaphore::new(streams_max)),
             streams_max,
@@ -92,7 +95,9 @@ impl Gateway {
                 return Err(unknown);
             }
         };
-        match observation::decode(observation, &self.limits) {
+        let now_ns = self.queue.now_ns();
+        let decoded = observation::decode(observation, &self.limits);
+        match decoded.and_then(|bodies| observation::check_stamps(bodies, now_ns, &self.limits)) {
             Err(error) => {
                 session.begin(number, 0, 0);
                 self.record_drop(if concerns_vehicle { UNKNOWN_SOURCE } else { source }, error.reason());

@@ -19,6 +19,8 @@ use tonic::{Code, Request, Response, Status, Streaming};
 use super::gateway::{Gateway, Gateways};
 use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender};
 
+use crate::publish::listen::access::Caller;
+
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
 
 /// A new stream must name its vehicle within this time. Ours: no client has a reason to wait.
@@ -52,6 +54,7 @@ impl IngestService for Ingest {
     ) -> Result<Response<Self::StreamStream>, Status> {
         let full = |what: &str| Status::resource_exhausted(format!("{what}; close one first"));
         let permit = self.gateways.acquire_stream().ok_or_else(|| full("every stream the server allows is open"))?;
+        let caller = request.extensions().get::<Caller>().cloned().unwrap_or_default();
         let mut observations = request.into_inner();
         let first = tokio::time::timeout(OPENING_TIMEOUT, observations.message())
             .await
@@ -63,6 +66,7 @@ impl IngestService for Ingest {
         })?;
         let first = first.ok_or_else(|| Status::invalid_argument("a stream without an observation"))?;
         let gateway = self.gateways.find(&first.vehicle)?.clone();
+        caller.check_vehicle(&gateway.vehicle)?;
         let vehicle_permit = gateway.acquire_stream().map_err(|error| full(&error.to_string()))?;
         let permits = [permit, vehicle_permit];
         let mut stream = IngestStream::new(observations, gateway, self.gateways.clone(), permits);
@@ -86,7 +90,6 @@ struct IngestStream {
     outcomes: UnboundedReceiver<(ObservationId, Outcome)>,
     /// The status that ends the stream, after everything in flight is reported.
     end: Option<Status>,
-    is_over: bool,
     // The last field, so that it is dropped last.
     _permits: [OwnedSemaphorePermit; 2],
 }
@@ -107,20 +110,12 @@ impl IngestStream {
             outcome_sender,
             outcomes,
             end: None,
-            is_over: false,
             _permits: permits,
         }
     }
 
     fn reports(self) -> impl Stream<Item = Result<v1::IngestReport, Status>> {
-        stream::unfold(self, |mut stream| async move {
-            if stream.is_over {
-                return None;
-            }
-            let report = stream.next().await.transpose()?;
-            stream.is_over = report.is_err();
-            Some((report, stream))
-        })
+        stream::try_unfold(self, |mut stream| async move { Ok(stream.next().await?.map(|report| (report, stream))) })
     }
 
     /// Waits for the next report. `None` once everything is reported and no more observations will come.

@@ -19,6 +19,8 @@ pub struct Limits {
     pub points_max: usize,
     /// Greatest length of one message in bytes; more than `points_max` points with all their fields need.
     pub message_bytes_max: usize,
+    /// Greatest time by which a stamp may be ahead of the server's clock, ns.
+    pub ahead_ns_max: i64,
 }
 
 /// Greatest number of datagrams in one observation. Ours: a third of a second of an HDL-64E; a client that collects
@@ -33,7 +35,8 @@ const MESSAGE_BYTES: usize = 64 << 10;
 impl Limits {
     /// The limits for scans of at most `points_max` points.
     pub fn from_points_max(points_max: usize) -> Self {
-        Self { points_max, message_bytes_max: points_max.saturating_mul(POINT_BYTES).saturating_add(MESSAGE_BYTES) }
+        let message_bytes_max = points_max.saturating_mul(POINT_BYTES).saturating_add(MESSAGE_BYTES);
+        Self { points_max, message_bytes_max, ahead_ns_max: i64::MAX }
     }
 }
 
@@ -109,6 +112,20 @@ pub enum ObservationError {
         /// Length of all payloads in bytes.
         bytes: usize,
     },
+    /// A stamp is ahead of the server's clock.
+    #[error(
+        "stamp {stamp_ns} ns: {} ms ahead of the server's clock; up to {} ms are allowed",
+        .ahead_ns / 1_000_000,
+        .ahead_ns_max / 1_000_000
+    )]
+    StampAhead {
+        /// The stamp, ns since the Unix epoch.
+        stamp_ns: i64,
+        /// Time by which it is ahead, ns.
+        ahead_ns: i64,
+        /// [`Limits::ahead_ns_max`].
+        ahead_ns_max: i64,
+    },
     /// A required field is missing.
     #[error("{body} without {what}")]
     Missing {
@@ -130,6 +147,7 @@ impl ObservationError {
             Self::Points { .. } => "points",
             Self::Columns { .. } => "columns",
             Self::Packets { .. } => "packets",
+            Self::StampAhead { .. } => "stamp_ahead",
             Self::Missing { .. } => "missing",
         }
     }
@@ -174,6 +192,29 @@ pub fn decode(observation: v1::Observation, limits: &Limits) -> Result<Bodies, O
         }
     };
     Ok(vec![(captured_ns, body)])
+}
+
+/// Returns `bodies` if no stamp in them is too far ahead of the server's clock `now_ns`. A stamp of the past is
+/// allowed: it may be that of an old drive, and a map never looks younger by it.
+///
+/// # Errors
+/// [`ObservationError::StampAhead`] with the first stamp that is.
+pub fn check_stamps(bodies: Bodies, now_ns: i64, limits: &Limits) -> Result<Bodies, ObservationError> {
+    for (captured_ns, body) in &bodies {
+        let of_body = match body {
+            Body::Scan(scan) => Some(scan.stamp_ns),
+            Body::EgoPose(pose) => Some(pose.stamp_ns),
+            Body::Road(road) => Some(road.stamp_ns),
+            Body::Datagram(_) | Body::Sensor(_) | Body::Lost { .. } | Body::End => None,
+        };
+        for stamp_ns in [*captured_ns, of_body].into_iter().flatten() {
+            let ahead_ns = stamp_ns.saturating_sub(now_ns);
+            if ahead_ns > limits.ahead_ns_max {
+                return Err(ObservationError::StampAhead { stamp_ns, ahead_ns, ahead_ns_max: limits.ahead_ns_max });
+            }
+        }
+    }
+    Ok(bodies)
 }
 
 /// Checks that every list of a scan consists of whole numbers and that none is too long.
@@ -256,7 +297,7 @@ mod tests {
 
     use super::*;
 
-    const LIMITS: Limits = Limits { points_max: 4, message_bytes_max: 1000 };
+    const LIMITS: Limits = Limits { points_max: 4, message_bytes_max: 1000, ahead_ns_max: 10 };
 
     fn scan() -> v1::Scan {
         let floats = pack(&[1.0_f32, 2.0, 3.0]);
@@ -340,6 +381,21 @@ mod tests {
         }
         let odd = v1::Packets { lengths: Bytes::from_static(&[2, 0, 0, 0, 1, 0, 9]), ..packets };
         assert_eq!(read_packets(odd).unwrap_err().reason(), "packed");
+    }
+
+    #[test]
+    fn a_stamp_that_is_too_far_ahead_of_the_clock_is_refused() {
+        let checked = |captured_ns, now_ns| {
+            let bodies = read(v1::observation::Body::Scan(scan()), None).unwrap();
+            let bodies = bodies.into_iter().map(|(_, body)| (captured_ns, body)).collect();
+            check_stamps(bodies, now_ns, &LIMITS)
+        };
+        // The scan's stamp is 9.
+        assert!(checked(None, -1).is_ok() && checked(Some(9), -1).is_ok() && checked(Some(9), 1 << 62).is_ok());
+        for (captured_ns, now_ns) in [(None, -2), (Some(-5), -2), (Some(30), 19), (Some(i64::MAX), i64::MIN)] {
+            let error = checked(captured_ns, now_ns).unwrap_err();
+            assert_eq!(error.reason(), "stamp_ahead", "{error}");
+        }
     }
 
     #[test]

@@ -1,11 +1,13 @@
 //! Readings in, numbered [`Event`]s out, on one bounded queue a vehicle.
 //!
 //! Only this file and the reader of recordings create an [`Event`]; the engine cannot tell live and captured events
-//! apart. The queue stamps a live reading with its clock; a captured reading keeps its own stamp. A reading that does
+//! apart. The queue stamps a live reading with its clock, or with the kernel's stamp of the datagram if that is
+//! plausible; a captured reading keeps its own stamp. A reading that does
 //! not become an event is counted, because the queue or the kernel's buffer was full, the sender is unknown, or the
 //! datagram is too long. The queue turns these counts into [`Body::Lost`] events, so the journal and every replay of it
 //! contain all drops.
 
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
@@ -22,6 +24,10 @@ use crate::sync::locked;
 /// Least time between two reports of drops to the engine, in ns. Drops by a full queue are reported at once; a flood of
 /// datagrams from unknown senders must not fill the journal. Ours: ten reports a second are fine enough for a rate.
 const REPORT_PERIOD_NS: u64 = 100_000_000;
+
+/// Greatest age of a datagram by the kernel's stamp, in ns. Ours: no server stands still for longer and goes on; a
+/// stamp that differs by more is that of a clock that was set between the kernel's stamp and the reading.
+const RECEIVED_AGE_NS_MAX: i64 = 60_000_000_000;
 
 /// An event without its number: what a source of readings yields.
 #[derive(Clone, Debug, PartialEq)]
@@ -47,7 +53,38 @@ pub struct QueuedEvent {
     /// Delivers the outcome to the client that sent the event. A recording does not contain it.
     pub receipt: Option<Receipt>,
     /// This event's space on the queue, free again when this is dropped.
-    _permit: OwnedSemaphorePermit,
+    _space: Space,
+}
+
+/// The space of one event.
+#[derive(Debug)]
+struct Space {
+    _place: OwnedSemaphorePermit,
+    /// In the share of the event's sensor; `None` for events that belong to no share.
+    _share: Option<OwnedSemaphorePermit>,
+}
+
+impl From<OwnedSemaphorePermit> for Space {
+    fn from(place: OwnedSemaphorePermit) -> Self {
+        Self { _place: place, _share: None }
+    }
+}
+
+/// The equal shares of a vehicle's sensors in the part of the queue that is for datagrams.
+#[derive(Debug)]
+struct Shares {
+    events_max: usize,
+    /// By sensor; a sensor without datagrams has none.
+    free: Mutex<BTreeMap<u16, Arc<Semaphore>>>,
+}
+
+impl Shares {
+    /// Space in a sensor's share, if there is any now.
+    fn try_acquire(&self, source: u16) -> Option<OwnedSemaphorePermit> {
+        let mut free = locked(&self.free);
+        let free = free.entry(source).or_insert_with(|| Arc::new(Semaphore::new(self.events_max)));
+        free.clone().try_acquire_owned().ok()
+    }
 }
 
 /// The sending end of one vehicle's event queue. Clones share numbers, space and drop counters. The queue ends when it
@@ -56,6 +93,7 @@ pub struct QueuedEvent {
 pub struct EventQueue {
     state: Arc<Mutex<State>>,
     space: Arc<Semaphore>,
+    shares: Option<Arc<Shares>>,
     drops: Arc<DropCounters>,
     clock: Clock,
 }
@@ -87,10 +125,22 @@ pub fn event_queue_with_clock(clock: Clock, capacity: usize) -> (EventQueue, Rec
     let (sender, events) = sync_channel(capacity);
     let state = State { sender: Some(sender), next_sequence: 0, reported_ns: 0 };
     let (state, space) = (Arc::new(Mutex::new(state)), Arc::new(Semaphore::new(capacity)));
-    (EventQueue { state, space, drops: Arc::default(), clock }, events)
+    (EventQueue { state, space, shares: None, drops: Arc::default(), clock }, events)
 }
 
 impl EventQueue {
+    /// Divides the space for `events` datagrams among `sensors`, so that a flood from the address of one leaves the
+    /// shares of the others free.
+    pub fn with_shares(self, events: usize, sensors: usize) -> Self {
+        let events_max = (events / sensors.max(1)).max(1);
+        Self { shares: Some(Arc::new(Shares { events_max, free: Mutex::default() })), ..self }
+    }
+
+    /// The time of the queue's clock, ns since the Unix epoch.
+    pub fn now_ns(&self) -> i64 {
+        self.clock.now_ns()
+    }
+
     /// Pushes a live reading, stamped now. Never waits: if the queue is full, the reading is counted as lost.
     ///
     /// # Errors
@@ -104,7 +154,21 @@ impl EventQueue {
     /// # Errors
     /// [`QueueClosedError`] if the engine has stopped.
     pub fn push_batch(&self, readings: impl IntoIterator<Item = (u16, Body)>) -> Result<(), QueueClosedError> {
-        self.push_all(None, readings.into_iter().map(|(source, body)| (source, body, None))).map(drop)
+        self.push_all(None, readings.into_iter().map(|(source, body)| (source, None, body, None)), None).map(drop)
+    }
+
+    /// Pushes datagrams of sensors with the times at which the kernel received them. A time that is not plausible by
+    /// the queue's clock, or unknown, is replaced by the present. Never waits, as [`EventQueue::push`]. Each sensor has
+    /// its share of the queue; what is more is counted as lost, and leaves the space of the others.
+    ///
+    /// # Errors
+    /// [`QueueClosedError`] if the engine has stopped.
+    pub fn push_received(
+        &self,
+        readings: impl IntoIterator<Item = (u16, Option<i64>, Body)>,
+    ) -> Result<(), QueueClosedError> {
+        let readings = readings.into_iter().map(|(source, received_ns, body)| (source, received_ns, body, None));
+        self.push_all(None, readings, self.shares.as_deref()).map(drop)
     }
 
     /// Pushes an observation, stamped `captured_ns` or now. Never waits. Returns true if the event is on the queue;
@@ -119,14 +183,15 @@ impl EventQueue {
         body: Body,
         receipt: Receipt,
     ) -> Result<bool, QueueClosedError> {
-        self.push_all(captured_ns, [(source, body, Some(receipt))])
+        self.push_all(captured_ns, [(source, captured_ns, body, Some(receipt))], None)
     }
 
-    /// Returns true if all readings are on the queue.
+    /// Returns true if all readings are on the queue. With `shares`, each takes space of its sensor's share.
     fn push_all(
         &self,
         captured_ns: Option<i64>,
-        readings: impl IntoIterator<Item = (u16, Body, Option<Receipt>)>,
+        readings: impl IntoIterator<Item = (u16, Option<i64>, Body, Option<Receipt>)>,
+        shares: Option<&Shares>,
     ) -> Result<bool, QueueClosedError> {
         let mut state = locked(&self.state);
         let mut unreported = locked(&self.drops.unreported);
@@ -137,13 +202,23 @@ impl EventQueue {
         let (is_due, mut has_space) = (state.is_report_due(arrival_ns), true);
         while let Some(key) = next_unreported(&unreported, is_due).filter(|_| has_space) {
             match self.try_acquire() {
-                Some(permit) => state.push_report(permit, &mut unreported, key, arrival_ns)?,
+                Some(permit) => state.push_report(permit.into(), &mut unreported, key, arrival_ns)?,
                 None => has_space = false,
             }
         }
-        for (source, body, receipt) in readings {
+        for (source, stamp_ns, body, receipt) in readings {
+            let is_plausible = |ns: &i64| captured_ns.is_some() || is_age_plausible(arrival_ns, *ns);
+            let arrival_ns = stamp_ns.filter(is_plausible).unwrap_or(arrival_ns);
+            let share = shares.map(|shares| shares.try_acquire(source));
+            if let Some(None) = share {
+                *unreported.entry((Cause::Queue, source)).or_default() += 1;
+                continue;
+            }
             match has_space.then(|| self.try_acquire()).flatten() {
-                Some(permit) => state.push(permit, Reading { arrival_ns, source, body }, receipt)?,
+                Some(place) => {
+                    let space = Space { _place: place, _share: share.flatten() };
+                    state.push(space, Reading { arrival_ns, source, body }, receipt)?;
+                }
                 None => {
                     has_space = false;
                     *unreported.entry((Cause::Queue, source)).or_default() += 1;
@@ -166,7 +241,7 @@ impl EventQueue {
         let arrival_ns = reading.arrival_ns;
         let is_due = locked(&self.state).is_report_due(arrival_ns);
         loop {
-            let permit = self.acquire()?;
+            let permit = self.acquire()?.into();
             let (mut state, mut unreported) = (locked(&self.state), locked(&self.drops.unreported));
             match next_unreported(&unreported, is_due) {
                 Some(key) => state.push_report(permit, &mut unreported, key, arrival_ns)?,
@@ -207,7 +282,7 @@ impl EventQueue {
             let permit = self.acquire()?;
             let (mut state, mut unreported) = (locked(&self.state), locked(&self.drops.unreported));
             if let Some(key) = next_unreported(&unreported, true) {
-                state.push_report(permit, &mut unreported, key, arrival_ns)?;
+                state.push_report(permit.into(), &mut unreported, key, arrival_ns)?;
             }
         }
         Ok(())
@@ -236,6 +311,11 @@ impl EventQueue {
     }
 }
 
+/// True if a datagram that is read at `now_ns` can have been received at `received_ns`.
+fn is_age_plausible(now_ns: i64, received_ns: i64) -> bool {
+    (0..=RECEIVED_AGE_NS_MAX).contains(&now_ns.saturating_sub(received_ns))
+}
+
 impl State {
     /// True if drops for other causes than a full queue may be reported again.
     fn is_report_due(&self, arrival_ns: i64) -> bool {
@@ -245,31 +325,26 @@ impl State {
     /// Pushes the drops of one cause and source as an event.
     fn push_report(
         &mut self,
-        permit: OwnedSemaphorePermit,
+        space: Space,
         unreported: &mut Unreported,
         key: (Cause, u16),
         arrival_ns: i64,
     ) -> Result<(), QueueClosedError> {
         let (cause, source) = key;
         let body = Body::Lost { cause, count: unreported.get(&key).copied().unwrap_or_default() };
-        self.push(permit, Reading { arrival_ns, source, body }, None)?;
+        self.push(space, Reading { arrival_ns, source, body }, None)?;
         unreported.remove(&key);
         self.reported_ns = arrival_ns;
         Ok(())
     }
 
     /// Pushes one event into the space that was acquired for it.
-    fn push(
-        &mut self,
-        permit: OwnedSemaphorePermit,
-        reading: Reading,
-        receipt: Option<Receipt>,
-    ) -> Result<(), QueueClosedError> {
+    fn push(&mut self, space: Space, reading: Reading, receipt: Option<Receipt>) -> Result<(), QueueClosedError> {
         let Reading { arrival_ns, source, body } = reading;
         let event = Event { sequence: self.next_sequence, arrival_ns, source, body };
         let sender = self.sender.as_ref().ok_or(QueueClosedError)?;
         // There are as many permits as the channel is long, so this does not wait.
-        sender.send(QueuedEvent { event, receipt, _permit: permit }).map_err(|_| QueueClosedError)?;
+        sender.send(QueuedEvent { event, receipt, _space: space }).map_err(|_| QueueClosedError)?;
         self.next_sequence += 1;
         Ok(())
     }
@@ -406,6 +481,32 @@ mod tests {
         });
         drop(events);
         assert_eq!(waiting.join().unwrap(), Err(QueueClosedError), "the wait ends with the engine");
+    }
+
+    #[test]
+    fn a_flood_from_one_sensor_leaves_the_share_of_another() {
+        let (queue, events) = event_queue(16);
+        let queue = queue.with_shares(8, 2);
+        queue.push_received((0..100).map(|_| (0, None, Body::End))).unwrap();
+        queue.push_received((0..4).map(|_| (1, None, Body::End))).unwrap();
+        let of = |events: &Receiver<QueuedEvent>, source| {
+            let readings = events.try_iter().filter(|queued| queued.event.body == Body::End);
+            readings.filter(|queued| queued.event.source == source).count()
+        };
+        assert_eq!(unreported(&queue).lost, 0, "the second push reported the loss of the first");
+        assert_eq!(of(&events, 1), 4);
+        queue.push_received((0..100).map(|_| (0, None, Body::End))).unwrap();
+        assert_eq!((of(&events, 0), unreported(&queue).lost), (4, 96), "the share is free again");
+    }
+
+    #[test]
+    fn a_datagram_has_the_kernels_stamp_if_that_is_plausible() {
+        let now_ns = 1_000 * RECEIVED_AGE_NS_MAX;
+        let (queue, events) = event_queue_with_clock(Clock::new(move || now_ns), 8);
+        let stamps = [Some(now_ns - 4_000_000_000), None, Some(now_ns + 1), Some(now_ns - RECEIVED_AGE_NS_MAX - 1)];
+        queue.push_received(stamps.map(|ns| (0, ns, Body::End))).unwrap();
+        let arrivals: Vec<_> = events.try_iter().map(|queued| queued.event.arrival_ns).collect();
+        assert_eq!(arrivals, [now_ns - 4_000_000_000, now_ns, now_ns, now_ns]);
     }
 
     #[test]

@@ -5,6 +5,9 @@
 //! that exceeds a bound is counted as `queue`, and its client learns of it because its numbers then have a gap. Reports
 //! are dropped under congestion, so that a stopped peer does not delay the others; the newest acknowledgement is
 //! therefore repeated for a while.
+//!
+//! With roles ([`Senders`]) a sample needs a certificate with the role of an ingester, as over gRPC. zenoh's access
+//! control refuses the others first; this check also holds if it is configured otherwise.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -19,11 +22,12 @@ use zenoh::bytes::{Encoding, ZBytes};
 use zenoh::pubsub::{Publisher, Subscriber};
 use zenoh::qos::CongestionControl;
 use zenoh::sample::{Locality, SampleKind};
+use zenoh::session::ZenohId;
 
 use super::gateway::Gateway;
 use super::observation::ObservationError;
 use super::receipt::{ClientSession, OutcomeSender};
-use crate::zenoh_session::ZenohError;
+use crate::zenoh_session::{PeerNames, ZenohError};
 
 /// Greatest number of queued samples of one vehicle. Together they have at most twice the bytes of its longest message.
 const QUEUED_MAX: usize = 256;
@@ -38,6 +42,33 @@ struct QueuedSample {
     /// The key after `clearway/<vehicle>/ingest/`.
     key: String,
     payload: ZBytes,
+    /// The session that has sent it, as the sample states.
+    source: Option<ZenohId>,
+}
+
+/// Who may send observations, if clients have roles.
+pub struct Senders {
+    peers: PeerNames,
+    may_send: MaySend,
+}
+
+/// Whether a client with these names in its certificate may send observations; if not, why.
+type MaySend = Box<dyn Fn(&[String]) -> Result<(), String> + Send + Sync>;
+
+impl Senders {
+    /// The senders of a session whose peers connect to this server: each shows its own certificate.
+    pub fn new(session: &Session, may_send: MaySend) -> Self {
+        Self { peers: PeerNames::new(session), may_send }
+    }
+
+    /// Checks the sender of a sample by the certificate of its link.
+    async fn check(&mut self, source: Option<ZenohId>) -> Result<(), String> {
+        let Some(source) = source else {
+            return Err("the sample does not state its source; with roles it must (zenoh's source_info)".into());
+        };
+        let name = self.peers.name(source).await.map(str::to_owned);
+        (self.may_send)(name.as_slice())
+    }
 }
 
 /// The subscription to the observations of one vehicle, and the publisher of its reports.
@@ -46,6 +77,8 @@ pub struct Ingest {
     samples: Receiver<QueuedSample>,
     bytes_queued: Arc<AtomicUsize>,
     reports: Publisher<'static>,
+    /// `None`: every peer may send.
+    senders: Option<Senders>,
     // The last field, so that it is dropped last.
     _subscriber: Subscriber<()>,
 }
@@ -55,7 +88,11 @@ impl Ingest {
     ///
     /// # Errors
     /// [`ZenohError`] if the publisher or the subscriber cannot be declared.
-    pub async fn subscribe(session: &Session, gateway: Arc<Gateway>) -> Result<Self, ZenohError> {
+    pub async fn subscribe(
+        session: &Session,
+        gateway: Arc<Gateway>,
+        senders: Option<Senders>,
+    ) -> Result<Self, ZenohError> {
         let prefix = format!("clearway/{}/ingest/", gateway.vehicle);
         let key = format!("{prefix}report");
         let reports = session.declare_publisher(key.clone()).congestion_control(CongestionControl::Drop);
@@ -75,7 +112,8 @@ impl Ingest {
                 let bytes = sample.payload().len();
                 let before = bytes_queued.fetch_add(bytes, Ordering::Relaxed);
                 let fits = before <= gateway.limits.message_bytes_max;
-                let sample = QueuedSample { key: key.to_owned(), payload: sample.payload().clone() };
+                let source = sample.source_info().map(|source| source.source_id().zid());
+                let sample = QueuedSample { key: key.to_owned(), payload: sample.payload().clone(), source };
                 if !fits || matches!(sender.try_send(sample), Err(TrySendError::Full(_))) {
                     bytes_queued.fetch_sub(bytes, Ordering::Relaxed);
                     gateway.record_refusal("queue");
@@ -83,7 +121,7 @@ impl Ingest {
             }
         });
         let subscriber = subscriber.await.map_err(ZenohError::of(format!("subscribe to {keys}")))?;
-        Ok(Self { gateway, samples, bytes_queued, reports, _subscriber: subscriber })
+        Ok(Self { gateway, samples, bytes_queued, reports, senders, _subscriber: subscriber })
     }
 
     /// Decodes samples and sends reports until the future is dropped.
@@ -103,10 +141,14 @@ impl Ingest {
                 }
                 sample = self.samples.recv(), if clients.have_credit(events_max, bytes_max) => {
                     // The channel cannot end, because `self` holds the subscriber with the sender.
-                    let Some(QueuedSample { key, payload }) = sample else { return };
+                    let Some(QueuedSample { key, payload, source }) = sample else { return };
                     let bytes = Bytes::from(payload.to_bytes().into_owned());
                     self.bytes_queued.fetch_sub(bytes.len(), Ordering::Relaxed);
-                    self.push(&key, bytes, &mut clients, &outcome_sender);
+                    let allowed = match &mut self.senders {
+                        Some(senders) => senders.check(source).await,
+                        None => Ok(()),
+                    };
+                    self.push(&key, bytes, allowed, &mut clients, &outcome_sender);
                 }
                 _ = repeat.tick() => clients.request_repetitions(),
             }
@@ -123,7 +165,14 @@ impl Ingest {
         }
     }
 
-    fn push(&self, key: &str, bytes: Bytes, clients: &mut Clients, outcomes: &OutcomeSender) {
+    fn push(
+        &self,
+        key: &str,
+        bytes: Bytes,
+        allowed: Result<(), String>,
+        clients: &mut Clients,
+        outcomes: &OutcomeSender,
+    ) {
         let (length, bytes_max) = (bytes.len(), self.gateway.limits.message_bytes_max);
         let decoded = match length <= bytes_max {
             false => Err(ObservationError::Length { bytes: length, bytes_max }),
@@ -138,6 +187,12 @@ impl Ingest {
         let session = &mut clients.get_or_insert(observation.client).session;
         let number = observation.number;
         session.refuse_missed(number);
+        if let Err(denied) = allowed {
+            if session.check_number(number).is_ok() {
+                session.begin(number, 0, 0);
+            }
+            return self.gateway.refuse(session, number, "role", denied);
+        }
         match sensor_of_key(key, observation.body.as_ref()) {
             Some(sensor) => sensor.clone_into(&mut observation.sensor),
             None => {

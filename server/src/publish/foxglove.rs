@@ -3,230 +3,393 @@
 //! Channels: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/safe_points` (`foxglove.SceneUpdate`: lines and
 //! circles of the layer `safe_path`), `/<vehicle>/points` (`foxglove.PointCloud`: what the newest map was made from)
 //! and `/tf` (`foxglove.FrameTransforms`: `<vehicle>/base_link` in `map`). Channels without a subscription are not
-//! made. A new subscription gets the newest map at once. A stalled client has at most [`BACKLOG`] messages, then the
-//! oldest are dropped.
+//! made; a message is encoded once for all clients. A new subscription gets the newest map at once. A slow client skips
+//! messages, and one that receives nothing for [`SEND_TIMEOUT`] is disconnected.
 
-use std::collections::HashMap;
-use std::sync::{Arc, Mutex};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
 
-use crate::encode::viewer::raster::Rasters;
-use crate::encode::viewer::{base_frame, foxglove as messages, safe_paths};
+use axum::Router;
+use axum::extract::ws::{Message as WsMessage, WebSocket, WebSocketUpgrade};
+use axum::extract::{Extension, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
+use bytes::{BufMut, Bytes, BytesMut};
 use clearway_client::MapView;
 use foxglove::messages::{FrameTransforms, Grid, PointCloud, SceneUpdate};
-use foxglove::websocket::{ChannelView, Client, ServerListener};
-use foxglove::{Channel, ChannelId, Context, Encode, FoxgloveError, PartialMetadata, SinkId, WebSocketServerHandle};
+use foxglove::{Encode, Schema};
+use serde::Deserialize;
+use serde_json::{Value, json};
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 
+use super::listen::access::Caller;
+use super::listen::{InProgress, Listener, Place};
 use super::served::{Served, Vehicles};
-use crate::config::Foxglove as Options;
 use crate::encode::EncodedMap;
+use crate::encode::viewer::raster::Rasters;
+use crate::encode::viewer::{base_frame, foxglove as messages, safe_paths};
 use crate::newest::NewestSweep;
 use crate::status::Reader;
 use crate::subscriptions::LayerSubscription;
-use crate::sync::locked;
 
-/// Most messages on the way to one client. Ours: some revolutions of every layer; the largest message, a grid, has
-/// about 1 MB.
-const BACKLOG: usize = 32;
+/// Pages from which Foxglove connects, beside those of the configuration.
+pub const ORIGINS: &[&str] = &["https://app.foxglove.dev"];
+/// The protocol.
+const PROTOCOL: &str = "foxglove.sdk.v1";
+/// Longest time to send a message. Ours: a client this late shows stale maps anyway.
+const SEND_TIMEOUT: Duration = Duration::from_secs(5);
+/// Longest message of a client, in bytes. Ours: a subscription to some hundred channels.
+const MESSAGE_BYTES_MAX: usize = 64 << 10;
+/// Most subscriptions of one client. Ours: some of each channel of some vehicles.
+const SUBSCRIPTIONS_MAX: usize = 256;
 
-/// The running WebSocket server.
-pub struct Publisher {
-    server: WebSocketServerHandle,
-    /// Connects channels and server; neither of them owns it.
-    _context: Arc<Context>,
-    tasks: JoinSet<()>,
+/// Serves the WebSocket until `stop` resolves.
+pub async fn serve(listener: Listener, vehicles: Vehicles, stop: impl Future<Output = ()>) {
+    let published = Arc::new(watch::Sender::new(0));
+    let (mut vehicles_channels, mut tasks) = (Vec::new(), JoinSet::new());
+    let mut number = 0;
+    for served in vehicles.0.iter() {
+        let channels = Arc::new(VehicleChannels::new(served, &mut number, published.clone()));
+        tasks.spawn({
+            let channels = channels.clone();
+            async move { channels.run().await }
+        });
+        vehicles_channels.push(channels);
+    }
+    let all = All { vehicles: vehicles_channels.into(), published };
+    // The tasks end with this function.
+    listener.serve(Router::new().route("/", get(connect)).with_state(all), stop).await;
 }
 
-impl Publisher {
-    /// Starts the server, with channels for every vehicle.
-    ///
-    /// # Errors
-    /// [`FoxgloveError`] if the server cannot start, for example if its address is in use.
-    pub async fn start(options: &Options, vehicles: &Vehicles) -> Result<Self, FoxgloveError> {
-        let context = Context::new();
-        let tf = Arc::new(context.channel_builder("/tf").build::<FrameTransforms>());
-        let vehicles_channels: Vec<_> =
-            vehicles.0.iter().map(|served| Arc::new(VehicleChannels::new(served, &context, &tf))).collect();
-        let server = context.websocket_server().name("clearway").message_backlog_size(BACKLOG);
-        let server = server.listener(Arc::new(SubscriptionListener(vehicles_channels.clone())));
-        let server = server.bind(options.listen.ip().to_string(), options.listen.port()).start().await?;
-        let mut tasks = JoinSet::new();
-        for channels in vehicles_channels {
-            tasks.spawn(async move { channels.run().await });
+/// The channels of all vehicles.
+#[derive(Clone)]
+struct All {
+    vehicles: Arc<[Arc<VehicleChannels>]>,
+    /// Changes whenever a channel has a new message.
+    published: Arc<watch::Sender<u64>>,
+}
+
+/// What a channel carries.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Kind {
+    Layer(&'static str),
+    SafePoints,
+    Points,
+    Transforms,
+}
+
+/// A message of a channel, without the subscription that it is for.
+#[derive(Clone, Debug)]
+struct Message {
+    sequence: u64,
+    log_ns: u64,
+    data: Bytes,
+}
+
+/// One channel.
+struct Channel {
+    id: u64,
+    topic: String,
+    kind: Kind,
+    newest: watch::Sender<Option<Message>>,
+}
+
+impl Channel {
+    /// The layer that the channel needs; `None` if it needs none.
+    fn layer(&self) -> Option<&'static str> {
+        match self.kind {
+            Kind::Layer(name) => Some(name),
+            Kind::SafePoints => Some(safe_paths::LAYER),
+            Kind::Points | Kind::Transforms => None,
         }
-        Ok(Self { server, _context: context, tasks })
     }
 
-    /// The port of the server.
-    pub fn port(&self) -> u16 {
-        self.server.port()
+    fn schema(&self) -> Option<Schema> {
+        match self.kind {
+            Kind::Layer(_) => Grid::get_schema(),
+            Kind::SafePoints => SceneUpdate::get_schema(),
+            Kind::Points => PointCloud::get_schema(),
+            Kind::Transforms => FrameTransforms::get_schema(),
+        }
     }
 
-    /// Stops the server and closes its connections.
-    pub async fn stop(mut self) {
-        self.tasks.shutdown().await;
-        self.server.stop().wait().await;
+    fn advertisement(&self) -> Value {
+        let schema = self.schema().unwrap_or_else(|| Schema::new("", "", Vec::new()));
+        json!({
+            "id": self.id, "topic": self.topic, "encoding": "protobuf",
+            "schemaName": schema.name, "schemaEncoding": schema.encoding,
+            "schema": BASE64_STANDARD.encode(&schema.data),
+        })
+    }
+
+    /// True if a client waits for a message of this map.
+    fn lacks(&self, map: &EncodedMap) -> bool {
+        let is_old = |message: &Message| message.sequence != map.sequence || message.log_ns != log_ns(map);
+        self.newest.receiver_count() > 0 && self.newest.borrow().as_ref().is_none_or(is_old)
+    }
+
+    fn publish<T: Encode>(&self, map: &EncodedMap, message: &T) {
+        let mut data = BytesMut::with_capacity(message.encoded_len().unwrap_or(1024));
+        match message.encode(&mut data) {
+            Ok(()) => {
+                let message = Message { sequence: map.sequence, log_ns: log_ns(map), data: data.freeze() };
+                self.newest.send_replace(Some(message));
+            }
+            Err(error) => tracing::error!(%error, topic = self.topic, "foxglove: a message cannot be encoded"),
+        }
     }
 }
 
-/// Reports subscriptions of clients to the vehicles' channels.
-struct SubscriptionListener(Vec<Arc<VehicleChannels>>);
-
-impl ServerListener for SubscriptionListener {
-    fn on_subscribe(&self, client: Client, channel: ChannelView) {
-        let Some(sink) = client.sink_id() else { return };
-        self.0.iter().for_each(|channels| channels.subscribe(channel.id(), sink));
-    }
-
-    fn on_unsubscribe(&self, client: Client, channel: ChannelView) {
-        let Some(sink) = client.sink_id() else { return };
-        self.0.iter().for_each(|channels| _ = locked(&channels.subscriptions).remove(&(channel.id(), sink)));
-    }
+fn log_ns(map: &EncodedMap) -> u64 {
+    u64::try_from(map.capture_end_ns).unwrap_or(0)
 }
 
 /// One vehicle's channels.
 struct VehicleChannels {
     served: Served,
-    layers: Vec<(&'static str, Channel<Grid>)>,
-    /// The channel of the safe points; `None` if the vehicle's maps have none.
-    safe_points: Option<Channel<SceneUpdate>>,
-    points: Channel<PointCloud>,
-    /// The channel of transforms, shared by all vehicles.
-    tf: Arc<Channel<FrameTransforms>>,
-    subscriptions: Mutex<HashMap<(ChannelId, SinkId), ClientSubscription>>,
+    channels: Vec<Channel>,
     subscribed: Notify,
-}
-
-/// One client's subscription to one channel.
-struct ClientSubscription {
-    /// True until the newest map was sent.
-    is_new: bool,
-    /// Keeps its layer active.
-    _layer: Option<LayerSubscription>,
-    points: Option<watch::Receiver<NewestSweep>>,
-    _reader: Reader,
+    published: Arc<watch::Sender<u64>>,
 }
 
 impl VehicleChannels {
-    fn new(served: &Served, context: &Arc<Context>, tf: &Arc<Channel<FrameTransforms>>) -> Self {
+    fn new(served: &Served, number: &mut u64, published: Arc<watch::Sender<u64>>) -> Self {
         let vehicle = &served.status.name;
-        let layer = |&name: &&'static str| (name, context.channel_builder(format!("/{vehicle}/map/{name}")).build());
-        Self {
-            served: served.clone(),
-            layers: served.status.layers.iter().map(layer).collect(),
-            safe_points: (served.status.layers.contains(&safe_paths::LAYER))
-                .then(|| context.channel_builder(format!("/{vehicle}/safe_points")).build()),
-            points: context.channel_builder(format!("/{vehicle}/points")).build(),
-            tf: tf.clone(),
-            subscriptions: Mutex::default(),
-            subscribed: Notify::new(),
+        let mut kinds: Vec<(String, Kind)> = Vec::new();
+        for &layer in &served.status.layers {
+            kinds.push((format!("/{vehicle}/map/{layer}"), Kind::Layer(layer)));
         }
+        if served.status.layers.contains(&safe_paths::LAYER) {
+            kinds.push((format!("/{vehicle}/safe_points"), Kind::SafePoints));
+        }
+        kinds.push((format!("/{vehicle}/points"), Kind::Points));
+        kinds.push(("/tf".to_owned(), Kind::Transforms));
+        let channel = |(topic, kind)| {
+            *number += 1;
+            Channel { id: *number, topic, kind, newest: watch::Sender::new(None) }
+        };
+        let channels = kinds.into_iter().map(channel).collect();
+        Self { served: served.clone(), channels, subscribed: Notify::new(), published }
     }
 
-    /// Adds a client's subscription, if the channel is one of this vehicle's.
-    fn subscribe(&self, channel: ChannelId, sink: SinkId) {
-        let of_safe_points = self.safe_points.iter().map(|of| (safe_paths::LAYER, of.id()));
-        let mut layers = self.layers.iter().map(|(name, of)| (*name, of.id())).chain(of_safe_points);
-        let layer = layers.find(|(_, id)| *id == channel).map(|(name, _)| name);
-        let is_points = self.points.id() == channel;
-        if layer.is_none() && !is_points && self.tf.id() != channel {
-            return;
-        }
-        let status = &self.served.status;
-        let layer_subscription = layer.map(|name| status.subscriptions.subscribe(&[name.to_owned()]));
-        let points = is_points.then(|| status.sweeps.subscribe());
-        let _reader = Reader::new(&status.foxglove_readers);
-        locked(&self.subscriptions)
-            .insert((channel, sink), ClientSubscription { is_new: true, _layer: layer_subscription, points, _reader });
-        self.subscribed.notify_one();
-    }
-
-    /// Sends each newest map to all subscribed clients, and the current one to each new subscription.
+    /// Encodes each newest map for the channels that have subscriptions, and the current one for new subscriptions.
     async fn run(&self) {
         let mut newest = self.served.newest.clone();
         let mut rasters = Rasters::default();
+        let mut sweeps = None;
         newest.mark_changed();
         loop {
-            let is_new_map = tokio::select! {
-                changed = newest.changed() => match changed {
-                    Ok(()) => true,
+            tokio::select! {
+                changed = newest.changed() => if changed.is_err() {
                     // The engine has stopped; new subscriptions still get its last map.
-                    Err(_) => {
-                        self.subscribed.notified().await;
-                        false
-                    }
+                    self.subscribed.notified().await;
                 },
-                () = self.subscribed.notified() => false,
-            };
-            let map = if is_new_map { newest.borrow_and_update().clone() } else { newest.borrow().clone() };
-            let (new, Some(map)) = (self.take_new(), map) else { continue };
-            if is_new_map {
-                self.send_map(&map, None, &mut rasters);
-            } else {
-                new.into_iter().for_each(|key| self.send_map(&map, Some(key), &mut rasters));
+                () = self.subscribed.notified() => {}
             }
-        }
-    }
-
-    /// New subscriptions, which are no longer new afterwards.
-    fn take_new(&self) -> Vec<(ChannelId, SinkId)> {
-        let mut subscriptions = locked(&self.subscriptions);
-        let new = subscriptions
-            .iter_mut()
-            .filter_map(|(&key, subscription)| std::mem::take(&mut subscription.is_new).then_some(key));
-        new.collect()
-    }
-
-    /// Sends a map: to all subscribed clients, or on one channel to one client.
-    fn send_map(&self, map: &EncodedMap, to: Option<(ChannelId, SinkId)>, rasters: &mut Rasters) {
-        for (name, channel) in &self.layers {
-            let safe_points = self.safe_points.as_ref().filter(|_| *name == safe_paths::LAYER);
-            let safe_points = safe_points.filter(|channel| is_subscribed(channel, to));
-            let channel = Some(channel).filter(|channel| is_subscribed(channel, to));
-            let chunk = map.layers.iter().find(|(of, _)| of == name);
-            let chunk = chunk.filter(|_| channel.is_some() || safe_points.is_some());
-            let Some(view) = chunk.and_then(|(_, chunk)| view(map.layer(chunk))) else { continue };
-            let Some(layer) = view.layers().first() else { continue };
-            if let Some(channel) = channel {
-                send(channel, &messages::grid(&view, layer, rasters.of(layer)), map, to);
+            let has_points = |channel: &Channel| channel.kind == Kind::Points && channel.newest.receiver_count() > 0;
+            match self.channels.iter().any(has_points) {
+                true => _ = sweeps.get_or_insert_with(|| self.served.status.sweeps.subscribe()),
+                false => sweeps = None,
             }
-            if let Some(channel) = safe_points {
-                send(channel, &messages::safe_paths(&view, layer), map, to);
-            }
+            let map = newest.borrow_and_update().clone();
+            let Some(map) = map else { continue };
+            let sweep = sweeps.as_ref().and_then(|sweeps| sweeps.borrow().clone());
+            self.channels
+                .iter()
+                .filter(|channel| channel.lacks(&map))
+                .for_each(|channel| publish(channel, &map, &sweep, &mut rasters));
+            self.published.send_modify(|count| *count += 1);
         }
-        if is_subscribed(&self.tf, to)
-            && let Some(transforms) = view(map.header.clone()).and_then(|view| messages::transforms(&view))
-        {
-            send(&self.tf, &transforms, map, to);
-        }
-        if is_subscribed(&self.points, to)
-            && let Some(sweep) = self.sweep().filter(|sweep| sweep.0 == map.capture_end_ns)
-        {
-            let sweep = &sweep.1;
-            let points = (0..sweep.x.len()).map(|i| [sweep.x[i], sweep.y[i], sweep.z[i]]);
-            let cloud = messages::points(map.capture_end_ns, &base_frame(&map.vehicle), points);
-            send(&self.points, &cloud, map, to);
-        }
-    }
-
-    /// The newest points, if a client subscribes to them.
-    fn sweep(&self) -> NewestSweep {
-        locked(&self.subscriptions).values().find_map(|subscription| subscription.points.as_ref()?.borrow().clone())
     }
 }
 
-fn view(bytes: bytes::Bytes) -> Option<MapView> {
+/// Encodes a map for a channel, if it has what the channel carries.
+fn publish(channel: &Channel, map: &EncodedMap, sweep: &NewestSweep, rasters: &mut Rasters) {
+    match channel.kind {
+        Kind::Layer(_) | Kind::SafePoints => {
+            let name = channel.layer().unwrap_or_default();
+            let chunk = map.layers.iter().find(|(of, _)| *of == name);
+            let Some(view) = chunk.and_then(|(_, chunk)| view(map.layer(chunk))) else { return };
+            let Some(layer) = view.layers().first() else { return };
+            match channel.kind {
+                Kind::SafePoints => channel.publish(map, &messages::safe_paths(&view, layer)),
+                _ => channel.publish(map, &messages::grid(&view, layer, rasters.of(layer))),
+            }
+        }
+        Kind::Transforms => {
+            if let Some(transforms) = view(map.header.clone()).and_then(|view| messages::transforms(&view)) {
+                channel.publish(map, &transforms);
+            }
+        }
+        Kind::Points => {
+            if let Some(sweep) = sweep.as_ref().filter(|sweep| sweep.0 == map.capture_end_ns) {
+                let sweep = &sweep.1;
+                let points = (0..sweep.x.len()).map(|i| [sweep.x[i], sweep.y[i], sweep.z[i]]);
+                channel.publish(map, &messages::points(map.capture_end_ns, &base_frame(&map.vehicle), points));
+            }
+        }
+    }
+}
+
+fn view(bytes: Bytes) -> Option<MapView> {
     MapView::decode(bytes)
         .inspect_err(|error| tracing::error!(%error, "foxglove: the newest map cannot be decoded"))
         .ok()
 }
 
-fn is_subscribed<T: Encode>(channel: &Channel<T>, to: Option<(ChannelId, SinkId)>) -> bool {
-    to.map_or(channel.has_sinks(), |(id, _)| id == channel.id())
+async fn connect(
+    State(all): State<All>,
+    Extension(caller): Extension<Caller>,
+    Extension(place): Extension<Arc<Place>>,
+    upgrade: WebSocketUpgrade,
+) -> Response {
+    let upgrade = upgrade.protocols([PROTOCOL]).max_message_size(MESSAGE_BYTES_MAX);
+    if upgrade.selected_protocol().is_none() {
+        return (StatusCode::BAD_REQUEST, format!("the protocol {PROTOCOL} is needed\n")).into_response();
+    }
+    let in_progress = place.begin_request();
+    upgrade.on_upgrade(move |socket| async move {
+        let mut published = all.published.subscribe();
+        published.mark_changed();
+        let client = Client { all, caller, subscriptions: BTreeMap::new(), _in_progress: in_progress };
+        client.run(socket, published).await;
+    })
 }
 
-fn send<T: Encode>(channel: &Channel<T>, message: &T, map: &EncodedMap, to: Option<(ChannelId, SinkId)>) {
-    let stamp_ns = u64::try_from(map.capture_end_ns).unwrap_or(0);
-    channel.log_with_meta_to_sink(message, PartialMetadata::with_log_time(stamp_ns), to.map(|(_, sink)| sink));
+/// One connected client.
+struct Client {
+    all: All,
+    caller: Caller,
+    subscriptions: BTreeMap<u32, Subscription>,
+    _in_progress: InProgress,
+}
+
+/// One client's subscription to one channel.
+struct Subscription {
+    newest: watch::Receiver<Option<Message>>,
+    /// Keeps its layer active.
+    _layer: Option<LayerSubscription>,
+    _reader: Reader,
+}
+
+/// What a client may ask for.
+#[derive(Deserialize)]
+#[serde(tag = "op", rename_all = "camelCase")]
+enum Request {
+    Subscribe {
+        subscriptions: Vec<Wanted>,
+    },
+    #[serde(rename_all = "camelCase")]
+    Unsubscribe {
+        subscription_ids: Vec<u32>,
+    },
+}
+
+/// A subscription that a client asks for.
+#[derive(Clone, Copy, Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Wanted {
+    id: u32,
+    channel_id: u64,
+}
+
+impl Client {
+    /// Sends what the client subscribes to until it disconnects or stalls.
+    async fn run(mut self, mut socket: WebSocket, mut published: watch::Receiver<u64>) {
+        let channels = self.channels().map(|(_, channel)| channel.advertisement());
+        let advertise = json!({ "op": "advertise", "channels": channels.collect::<Vec<_>>() });
+        let info = json!({ "op": "serverInfo", "name": "clearway", "capabilities": [] });
+        for text in [info, advertise] {
+            if !send(&mut socket, WsMessage::Text(text.to_string().into())).await {
+                return;
+            }
+        }
+        loop {
+            let answer = tokio::select! {
+                changed = published.changed() => {
+                    let Ok(()) = changed else { return };
+                    None
+                }
+                received = socket.recv() => match received {
+                    Some(Ok(WsMessage::Text(text))) => self.apply(&text).err(),
+                    // The library answers pings, and other messages have no meaning here.
+                    Some(Ok(_)) => continue,
+                    Some(Err(_)) | None => return,
+                },
+            };
+            let status = answer.map(|text| json!({ "op": "status", "level": 2, "message": text }));
+            let status = status.map(|status| WsMessage::Text(status.to_string().into()));
+            let frames: Vec<_> = status.into_iter().chain(self.due()).collect();
+            for frame in frames {
+                if !send(&mut socket, frame).await {
+                    return;
+                }
+            }
+        }
+    }
+
+    /// The channels that this client may read.
+    fn channels(&self) -> impl Iterator<Item = (&Arc<VehicleChannels>, &Channel)> {
+        let all = self.all.vehicles.iter().flat_map(|of| of.channels.iter().map(move |channel| (of, channel)));
+        all.filter(|(of, channel)| {
+            let vehicle = &of.served.status.name;
+            channel.layer().map_or_else(
+                // Points and transforms are of the whole vehicle.
+                || of.served.status.layers.iter().all(|layer| self.caller.may_read(vehicle, layer)),
+                |layer| self.caller.may_read(vehicle, layer),
+            )
+        })
+    }
+
+    /// # Errors
+    /// A text that says what of a request cannot be done.
+    fn apply(&mut self, text: &str) -> Result<(), String> {
+        let request: Request = serde_json::from_str(text).map_err(|error| error.to_string())?;
+        match request {
+            Request::Unsubscribe { subscription_ids } => {
+                subscription_ids.iter().for_each(|id| _ = self.subscriptions.remove(id));
+            }
+            Request::Subscribe { subscriptions } => {
+                for Wanted { id, channel_id } in subscriptions {
+                    if self.subscriptions.len() >= SUBSCRIPTIONS_MAX {
+                        return Err(format!("subscription {id}: at most {SUBSCRIPTIONS_MAX} are allowed"));
+                    }
+                    let found = self.channels().find(|(_, channel)| channel.id == channel_id);
+                    let (of, channel) = found.ok_or_else(|| format!("channel {channel_id} is not known"))?;
+                    let layer = channel.layer().map(|layer| of.served.status.subscriptions.subscribe(&[layer.into()]));
+                    let mut newest = channel.newest.subscribe();
+                    newest.mark_changed();
+                    of.subscribed.notify_one();
+                    let reader = Reader::new(&of.served.status.foxglove_readers);
+                    self.subscriptions.insert(id, Subscription { newest, _layer: layer, _reader: reader });
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The new messages of all subscriptions.
+    fn due(&mut self) -> Vec<WsMessage> {
+        let changed = self.subscriptions.iter_mut().filter(|(_, of)| of.newest.has_changed().unwrap_or(false));
+        let due = changed.filter_map(|(&id, of)| {
+            let message = of.newest.borrow_and_update().clone()?;
+            let mut frame = BytesMut::with_capacity(13 + message.data.len());
+            frame.put_u8(1);
+            frame.put_u32_le(id);
+            frame.put_u64_le(message.log_ns);
+            frame.extend_from_slice(&message.data);
+            Some(WsMessage::Binary(frame.freeze()))
+        });
+        due.collect()
+    }
+}
+
+/// `false` if the client is gone, or does not receive.
+async fn send(socket: &mut WebSocket, frame: WsMessage) -> bool {
+    matches!(tokio::time::timeout(SEND_TIMEOUT, socket.send(frame)).await, Ok(Ok(())))
 }

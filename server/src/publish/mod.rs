@@ -6,17 +6,17 @@
 //! | file | in -> out |
 //! |---|---|
 //! | [`served`] | a name -> the status and the newest map of a vehicle |
-//! | [`connections`] | a listener -> connections, with limits in number and silence |
+//! | [`listen`] | a TCP listener -> connections within their limits, requests of clients that may send them |
 //! | [`grpc`] | newest map -> gRPC streams, each with its layers, region, rate, deltas and credits |
 //! | `zenoh` | newest map -> one key for each layer, a status, a liveliness token |
 //! | `ros` | newest map -> ROS 2 topics in rmw_zenoh's key space |
 //! | [`foxglove`] | newest map, points, pose -> Foxglove's WebSocket |
 //! | `page_replay` | the state of a replay and requests of the page, as JSON |
-//! | [`page`] | newest map, status -> the page's WebSocket, `/vehicles`, `/healthz`, `/metrics` |
+//! | [`page`] | newest map, status -> the page's WebSocket, `/vehicles`, `/healthz`, `/readyz`, `/metrics` |
 
-pub mod connections;
 pub mod foxglove;
 pub mod grpc;
+pub mod listen;
 pub mod page;
 mod page_replay;
 #[cfg(feature = "zenoh")]

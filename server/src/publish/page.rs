@@ -1,28 +1,29 @@
-//! The HTTP server of the page: its embedded files, its WebSocket `/live?vehicle=V`, `/vehicles`, `/healthz` and
-//! `/metrics`.
+//! The HTTP server of the page: its embedded files, its WebSocket `/live?vehicle=V`, `/vehicles`, `/healthz`, `/readyz`
+//! and `/metrics`. The last three are also served alone, on a listener of their own.
 //!
 //! The WebSocket sends each newest map as a binary `clearway.v1.MapUpdate` with all layers, and the status once a
 //! second as a JSON text. Over a replay it also sends its state as a JSON text (`type`: `replay`) at each change, and
-//! takes requests from pages of its own address. A browser that reads nothing for [`SEND_TIMEOUT`] is disconnected.
+//! takes requests of operators. A browser that reads nothing for [`SEND_TIMEOUT`] is disconnected.
 
+use std::sync::Arc;
 use std::time::Duration;
 
+use axum::Router;
 use axum::extract::ws::{Message as Frame, WebSocket, WebSocketUpgrade};
-use axum::extract::{Query, State};
-use axum::http::{HeaderMap, StatusCode, Uri, header};
+use axum::extract::{Extension, Query, State};
+use axum::http::{StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use axum::{Extension, Router};
 use bytes::Bytes;
 use clearway_proto::v1;
 use prost::Message;
 use rust_embed::RustEmbed;
 use serde_json::Value;
-use tokio::net::TcpListener;
 use tokio::sync::watch;
 
-use super::connections::Connections;
-use super::page_replay::{PageReplay, is_same_origin, replay_changed, replay_json};
+use super::listen::access::Caller;
+use super::listen::{InProgress, Listener, ListenerHandle, Place};
+use super::page_replay::{PageReplay, replay_changed, replay_json};
 use super::served::{Served, Vehicles};
 use crate::clock::now_ns;
 use crate::replay::ReplayHandle;
@@ -32,34 +33,37 @@ use crate::status::{Reader, prometheus};
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
 /// Time between two status messages.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
-/// Most connections. Ours: some dozens of browsers with a few connections each.
-const CONNECTIONS_MAX: usize = 256;
-/// Longest message from a browser, in bytes. Ours: the page sends only pongs.
+/// Longest message from a browser, in bytes. Ours: the page sends pongs and short requests.
 const MESSAGE_BYTES_MAX: usize = 4096;
 
 #[derive(RustEmbed)]
 #[folder = "web/"]
 struct Assets;
 
+/// What is served: the vehicles, the counts of the listeners by name, and the replay if there is one.
+#[derive(Clone)]
+pub struct Shown {
+    /// The vehicles.
+    pub vehicles: Vehicles,
+    /// The listeners.
+    pub listeners: Arc<[(&'static str, ListenerHandle)]>,
+    /// Controls the replay that the server serves.
+    pub replay: Option<ReplayHandle>,
+}
+
 /// Serves the page until `stop` resolves.
-///
-/// # Errors
-/// [`std::io::Error`] if the server cannot run.
-pub async fn serve(
-    listener: TcpListener,
-    vehicles: Vehicles,
-    replay: Option<ReplayHandle>,
-    stop: impl Future<Output = ()> + Send + 'static,
-) -> std::io::Result<()> {
-    let router = Router::new()
-        .route("/live", get(live))
-        .route("/vehicles", get(list))
-        .route("/healthz", get(health))
-        .route("/metrics", get(metrics))
-        .fallback(asset)
-        .layer(Extension(replay))
-        .with_state(vehicles);
-    axum::serve(Connections::new(listener, CONNECTIONS_MAX), router).with_graceful_shutdown(stop).await
+pub async fn serve(listener: Listener, shown: Shown, stop: impl Future<Output = ()>) {
+    let router = metrics_routes().route("/live", get(live)).route("/vehicles", get(list)).fallback(asset);
+    listener.serve(router.with_state(shown), stop).await;
+}
+
+/// Serves `/healthz`, `/readyz` and `/metrics` alone until `stop` resolves.
+pub async fn serve_metrics(listener: Listener, shown: Shown, stop: impl Future<Output = ()>) {
+    listener.serve(metrics_routes().with_state(shown), stop).await;
+}
+
+fn metrics_routes() -> Router<Shown> {
+    Router::new().route("/healthz", get(health)).route("/readyz", get(ready)).route("/metrics", get(metrics))
 }
 
 async fn asset(uri: Uri) -> Response {
@@ -77,24 +81,37 @@ async fn asset(uri: Uri) -> Response {
     }
 }
 
-async fn list(State(vehicles): State<Vehicles>) -> impl IntoResponse {
-    let all: Vec<Value> = vehicles.statuses().iter().map(|status| status.to_json()).collect();
-    ([(header::CONTENT_TYPE, "application/json")], Value::from(all).to_string())
+async fn list(State(shown): State<Shown>, Extension(caller): Extension<Caller>) -> impl IntoResponse {
+    let statuses = shown.vehicles.statuses();
+    let all = statuses.iter().filter(|status| caller.may_reach(&status.name)).map(|status| status.to_json());
+    ([(header::CONTENT_TYPE, "application/json")], Value::from(all.collect::<Vec<_>>()).to_string())
 }
 
-async fn health(State(vehicles): State<Vehicles>) -> Response {
-    match vehicles.statuses().iter().find(|status| !status.is_alive()) {
+async fn health(State(shown): State<Shown>) -> Response {
+    match shown.vehicles.statuses().iter().find_map(|status| status.fault()) {
         None => "ok\n".into_response(),
-        Some(dead) => {
-            let text = format!("the engine of vehicle {} has stopped\n", dead.name);
-            (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
-        }
+        Some(fault) => unavailable(fault + "\n"),
     }
 }
 
-async fn metrics(State(vehicles): State<Vehicles>) -> impl IntoResponse {
+/// Ready: every vehicle is alive and has a map.
+async fn ready(State(shown): State<Shown>) -> Response {
+    match shown.vehicles.0.iter().find(|served| !served.status.is_alive() || served.newest.borrow().is_none()) {
+        None => "ready\n".into_response(),
+        Some(served) => unavailable(format!("vehicle {} has no map\n", served.status.name)),
+    }
+}
+
+fn unavailable(text: String) -> Response {
+    (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
+}
+
+async fn metrics(State(shown): State<Shown>, Extension(caller): Extension<Caller>) -> impl IntoResponse {
     let kind = [(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")];
-    (kind, prometheus(&vehicles.statuses()))
+    let mut statuses = shown.vehicles.statuses();
+    statuses.retain(|status| caller.may_reach(&status.name));
+    let listeners: Vec<_> = shown.listeners.iter().map(|(name, listener)| (*name, listener.counts())).collect();
+    (kind, prometheus(&statuses, &listeners))
 }
 
 #[derive(serde::Deserialize)]
@@ -104,26 +121,37 @@ struct LiveQuery {
 }
 
 async fn live(
-    State(vehicles): State<Vehicles>,
-    Extension(replay): Extension<Option<ReplayHandle>>,
+    State(shown): State<Shown>,
+    Extension(caller): Extension<Caller>,
+    Extension(place): Extension<Arc<Place>>,
     Query(query): Query<LiveQuery>,
-    headers: HeaderMap,
     upgrade: WebSocketUpgrade,
 ) -> Response {
-    match vehicles.find(&query.vehicle) {
-        Ok(served) => {
-            let served = served.clone();
-            let replay = replay.map(|handle| PageReplay { may_control: is_same_origin(&headers), handle });
-            upgrade.max_message_size(MESSAGE_BYTES_MAX).on_upgrade(move |socket| stream(socket, served, replay))
+    let served = match shown.vehicles.find(&query.vehicle) {
+        Ok(served) => served.clone(),
+        Err(unknown) => return (StatusCode::NOT_FOUND, format!("{unknown}\n")).into_response(),
+    };
+    match caller.layers(&served.status.name, Vec::new(), &served.status.layers) {
+        Ok(layers) => {
+            let replay = shown.replay.and_then(|handle| PageReplay::new(handle, &caller));
+            let in_progress = place.begin_request();
+            let upgrade = upgrade.max_message_size(MESSAGE_BYTES_MAX);
+            upgrade.on_upgrade(move |socket| stream(socket, served, layers, replay, in_progress))
         }
-        Err(unknown) => (StatusCode::NOT_FOUND, format!("{unknown}\n")).into_response(),
+        Err(denied) => (StatusCode::FORBIDDEN, format!("{}\n", denied.message())).into_response(),
     }
 }
 
 /// Sends maps and status until the browser disconnects or stalls, or the engine stops.
-async fn stream(mut socket: WebSocket, served: Served, replay: Option<PageReplay>) {
+async fn stream(
+    mut socket: WebSocket,
+    served: Served,
+    layers: Vec<String>,
+    replay: Option<PageReplay>,
+    _in_progress: InProgress,
+) {
     let _reader = Reader::new(&served.status.page_readers);
-    let subscription = served.status.subscriptions.subscribe(&[]);
+    let subscription = served.status.subscriptions.subscribe(&layers);
     let mut newest = served.newest.clone();
     newest.mark_changed();
     let mut every = tokio::time::interval(STATUS_PERIOD);
@@ -140,7 +168,7 @@ async fn stream(mut socket: WebSocket, served: Served, replay: Option<PageReplay
                 let skipped = last.map_or(0, |(_, last): (u64, u64)| map.sequence.saturating_sub(last + 1));
                 last_sequence = Some((map.boot_id, map.sequence));
                 let update = v1::MapUpdate {
-                    map: map.select(&[]), skipped, sent_ns: now_ns(), ..Default::default()
+                    map: map.select(&layers), skipped, sent_ns: now_ns(), ..Default::default()
                 };
                 Frame::Binary(Bytes::from(update.encode_to_vec()))
             }

@@ -4,28 +4,26 @@
 //! of nanoseconds, because a browser's doubles cannot hold them, and the rate may be `"max"`. It is answered with the
 //! state after the change, or with `error`.
 
-use axum::http::{HeaderMap, header};
 use clearway_proto::v1;
 use serde::Deserialize;
 use serde_json::json;
 use tokio::sync::watch;
 
+use super::listen::access::Caller;
 use crate::replay::ReplayHandle;
 
 /// The replay as one page reaches it.
 pub(super) struct PageReplay {
     pub handle: ReplayHandle,
-    /// False if the page comes from another address, so that no other site controls a replay.
-    pub may_control: bool,
+    /// True if the client is an operator.
+    may_control: bool,
 }
 
-/// True if the WebSocket was opened by a page of this server, or by a program that is no browser.
-pub(super) fn is_same_origin(headers: &HeaderMap) -> bool {
-    let text = |name| headers.get(name).and_then(|value| value.to_str().ok());
-    match (text(header::ORIGIN), text(header::HOST)) {
-        (None, _) => true,
-        (Some(origin), Some(host)) => origin.split_once("://").is_some_and(|(_, of)| of == host),
-        (Some(_), None) => false,
+impl PageReplay {
+    /// The replay as a client reaches it; `None` if it may not reach all its vehicles, which have one time.
+    pub fn new(handle: ReplayHandle, caller: &Caller) -> Option<Self> {
+        let reaches_all = handle.state().borrow().vehicles.iter().all(|vehicle| caller.may_reach(vehicle));
+        reaches_all.then(|| Self { handle, may_control: caller.is_operator() })
     }
 }
 
@@ -58,7 +56,7 @@ impl PageReplay {
     pub async fn answer(&self, text: &str) -> String {
         let outcome = match serde_json::from_str::<PageRequest>(text) {
             Err(error) => Err(error.to_string()),
-            Ok(_) if !self.may_control => Err("a page of another address may not control the replay".to_owned()),
+            Ok(_) if !self.may_control => Err("the role operator is needed to control the replay".to_owned()),
             Ok(request) => match request.to_control() {
                 Err(error) => Err(error),
                 Ok(request) => self.handle.control(request).await.map_err(|error| error.to_string()),
@@ -108,17 +106,6 @@ impl PageRequest {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn only_pages_of_this_server_may_control_the_replay() {
-        let headers = |origin: &str| {
-            let pairs = [(header::ORIGIN, origin), (header::HOST, "127.0.0.1:8080")];
-            pairs.into_iter().map(|(name, value)| (name, value.parse().unwrap())).collect::<HeaderMap>()
-        };
-        assert!(is_same_origin(&headers("http://127.0.0.1:8080")));
-        assert!(!is_same_origin(&headers("http://example.com")));
-        assert!(is_same_origin(&HeaderMap::new()), "a program");
-    }
 
     #[test]
     fn a_request_of_the_page_is_read_whole_or_refused() {

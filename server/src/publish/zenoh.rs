@@ -6,15 +6,21 @@
 //! `clearway/<vehicle>/status` has the status once a second, as JSON. `clearway/<vehicle>/replay` has `{"ended":true}`
 //! after the last map of a replay, and `{"ended":false}` when it is set back.
 //!
+//! With `zenoh.signing_key` each map has a signature ([`clearway_client::signature`]) as the sample's attachment.
+//!
 //! Congestion drops: blocking would let one stopped peer delay the healthy ones. Maps have the highest priority on a
 //! link, because planners brake by them; the status has the lowest, because the next one replaces it; observations and
 //! reports have zenoh's default priority.
 
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
+use clearway_client::signature::SigningKey;
 use tokio::task::JoinSet;
 use zenoh::Session;
-use zenoh::bytes::Encoding;
+use zenoh::bytes::{Encoding, ZBytes};
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::matching::{MatchingListener, MatchingStatus};
@@ -44,15 +50,18 @@ pub struct Publisher {
     session: Session,
     tokens: Vec<LivelinessToken>,
     tasks: JoinSet<()>,
+    signing_key: Option<Arc<SigningKey>>,
 }
 
 impl Publisher {
     /// Declares every vehicle's keys on the session and starts publishing. Needs a multi-thread runtime.
     ///
     /// # Errors
-    /// [`ZenohError`] if a publisher, queryable, listener or liveliness token cannot be declared.
+    /// [`ZenohError`] if the signing key cannot be read, or if a publisher, queryable, listener or liveliness token
+    /// cannot be declared.
     pub async fn start(session: &Session, options: &Options, vehicles: &Vehicles) -> Result<Self, ZenohError> {
-        let mut publisher = Self { session: session.clone(), tokens: Vec::new(), tasks: JoinSet::new() };
+        let signing_key = signing_key(&options.signing_key)?.map(Arc::new);
+        let mut publisher = Self { session: session.clone(), tokens: Vec::new(), tasks: JoinSet::new(), signing_key };
         for served in vehicles.0.iter() {
             publisher.publish(served).await?;
         }
@@ -101,7 +110,7 @@ impl Publisher {
                 publisher.matching_listener().await.map_err(ZenohError::of(format!("subscribers of {key}")))?;
             let matches = publisher.matching_status().await.map_err(ZenohError::of(format!("subscribers of {key}")))?;
             self.tasks.spawn(subscribe_while(served.clone(), layer, matches.matching(), matching));
-            publishers.push((*layer, publisher));
+            publishers.push((*layer, key.clone(), publisher));
             self.answer(served, layer, key).await?;
         }
         let key = format!("clearway/{vehicle}/status");
@@ -117,7 +126,7 @@ impl Publisher {
         let replay = self.session.declare_publisher(key.clone()).encoding(Encoding::APPLICATION_JSON).priority(MAPS);
         let replay = replay.congestion_control(CongestionControl::Drop).await;
         let replay = replay.map_err(ZenohError::of(format!("publisher {key}")))?;
-        self.tasks.spawn(send_maps(served.clone(), publishers, replay));
+        self.tasks.spawn(send_maps(served.clone(), publishers, self.signing_key.clone(), replay));
         self.tasks.spawn({
             let served = served.clone();
             async move {
@@ -138,13 +147,16 @@ impl Publisher {
         let queryable = self.session.declare_queryable(key.clone()).complete(true);
         let queries = queryable.await.map_err(ZenohError::of(format!("queryable {key}")))?;
         let (newest, subscriptions) = (served.newest.clone(), served.status.subscriptions.clone());
+        let signing_key = self.signing_key.clone();
         self.tasks.spawn(async move {
             while let Ok(query) = queries.recv_async().await {
                 let Some(map) = subscriptions.subscribe(&[layer.to_owned()]).newest_map(&newest).await else {
                     continue;
                 };
                 let Some((_, chunk)) = map.layers.iter().find(|(name, _)| *name == layer) else { continue };
-                if let Err(error) = query.reply(&key, map.layer(chunk)).encoding(map_encoding()).await {
+                let bytes = map.layer(chunk);
+                let signature = signature(signing_key.as_deref(), &key, &bytes);
+                if let Err(error) = query.reply(&key, bytes).encoding(map_encoding()).attachment(signature).await {
                     tracing::debug!(%error, "zenoh: reply");
                 }
             }
@@ -171,10 +183,31 @@ async fn subscribe_while(
     }
 }
 
+/// Reads the key that signs maps; `None` if the path is empty.
+fn signing_key(file: &Path) -> Result<Option<SigningKey>, ZenohError> {
+    if file.as_os_str().is_empty() {
+        return Ok(None);
+    }
+    let wrong = |error: zenoh::Error| ZenohError::of(format!("zenoh.signing_key {}", file.display()))(error);
+    let mode = std::fs::metadata(file).map_err(|error| wrong(error.into()))?.permissions().mode() & 0o777;
+    if mode & 0o007 != 0 {
+        let allowed = "allowed: 600 or 640 (chmod 600)";
+        return Err(wrong(format!("every user of this host may use it (mode {mode:03o}); {allowed}").into()));
+    }
+    let text = std::fs::read_to_string(file).map_err(|error| wrong(error.into()))?;
+    SigningKey::from_pem(&text).map(Some).map_err(|error| wrong(error.into()))
+}
+
+/// The attachment of a map on a key: its signature.
+fn signature(key: Option<&SigningKey>, on: &str, map: &[u8]) -> Option<ZBytes> {
+    key.map(|key| key.sign(on, map).as_slice().into())
+}
+
 /// Sends each newest map, and after the last map of a replay that it has ended.
 async fn send_maps(
     served: Served,
-    publishers: Vec<(&'static str, AdvancedPublisher<'static>)>,
+    publishers: Vec<(&'static str, String, AdvancedPublisher<'static>)>,
+    signing_key: Option<Arc<SigningKey>>,
     replay: zenoh::pubsub::Publisher<'static>,
 ) {
     let (mut newest, mut replay_ended) = (served.newest.clone(), served.status.replay_ended.subscribe());
@@ -189,7 +222,7 @@ async fn send_maps(
                 }
                 let map = newest.borrow_and_update().clone();
                 if let Some(map) = map {
-                    send_map(&map, &publishers).await;
+                    send_map(&map, &publishers, signing_key.as_deref()).await;
                 }
             }
             Ok(()) = replay_ended.changed() => {}
@@ -206,10 +239,16 @@ async fn send_maps(
     std::future::pending::<()>().await;
 }
 
-async fn send_map(map: &EncodedMap, publishers: &[(&'static str, AdvancedPublisher<'static>)]) {
+async fn send_map(
+    map: &EncodedMap,
+    publishers: &[(&'static str, String, AdvancedPublisher<'static>)],
+    signing_key: Option<&SigningKey>,
+) {
     for (layer, chunk) in &map.layers {
-        let Some((_, publisher)) = publishers.iter().find(|(name, _)| name == layer) else { continue };
-        if let Err(error) = publisher.put(map.layer(chunk)).await {
+        let Some((_, key, publisher)) = publishers.iter().find(|(name, ..)| name == layer) else { continue };
+        let bytes = map.layer(chunk);
+        let signature = signature(signing_key, key, &bytes);
+        if let Err(error) = publisher.put(bytes).attachment(signature).await {
             tracing::warn!(%error, layer, "zenoh: put");
         }
     }

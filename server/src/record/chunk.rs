@@ -13,7 +13,7 @@ use mcap::{McapError, parse_record};
 /// length is damage, refused before it is allocated.
 pub(super) const RECORD_BYTES_MAX: usize = 256 << 20;
 /// Length of the head of a record: its kind (one byte) and its length (eight bytes).
-const RECORD_HEAD_BYTES: usize = 9;
+pub(super) const RECORD_HEAD_BYTES: usize = 9;
 
 /// Decompresses a chunk and checks its length and, if it has one, its CRC.
 pub(super) fn decompress<'a>(header: &ChunkHeader, data: &'a [u8]) -> Result<Cow<'a, [u8]>, McapError> {

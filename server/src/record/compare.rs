@@ -37,8 +37,9 @@ pub struct Comparison {
     pub before: u64,
     /// Number of maps after, of one layer each.
     pub after: u64,
-    /// True if a crash cut one of the files; then the parts before the cut are compared.
-    pub cut: bool,
+    /// How a file is incomplete, with its name; `None` if both are whole. Maps after missing events may differ for that
+    /// reason alone.
+    pub incomplete: Option<String>,
     /// What changed, by vehicle and layer.
     pub layers: BTreeMap<(String, String), LayerChange>,
     /// The maps with the greatest share of changed cells, greatest first.
@@ -192,7 +193,7 @@ pub fn compare(before: &Path, after: &After<'_>, worst: usize) -> Result<Compari
                     RecordedMessage::Ros { .. } => {}
                 }
             }
-            pairs.comparison.cut = recording.is_cut();
+            pairs.comparison.incomplete = incomplete(before, &recording);
         }
         After::Recording(after) => {
             let mut sides = [recording, RecordingReader::open(after)?];
@@ -210,10 +211,15 @@ pub fn compare(before: &Path, after: &After<'_>, worst: usize) -> Result<Compari
                     }
                 };
             }
-            pairs.comparison.cut = sides.iter().any(RecordingReader::is_cut);
+            pairs.comparison.incomplete = files.into_iter().zip(&sides).find_map(|(file, side)| incomplete(file, side));
         }
     }
     Ok(pairs.finish())
+}
+
+/// How a recording that was read to its end is incomplete, with its name.
+fn incomplete(file: &Path, recording: &RecordingReader) -> Option<String> {
+    recording.incomplete().map(|how| format!("{} is {how}", file.display()))
 }
 
 /// The sides of a comparison, as indices.
@@ -422,7 +428,7 @@ fn has_other_value(before: &Layer, after: &Layer, cell: usize) -> bool {
 fn cell_m2(grid: &Grid, cell: usize) -> f64 {
     match grid {
         Grid::Cartesian { cell_m, .. } => f64::from(cell_m * cell_m),
-        Grid::Radial { row_radius_m, columns } => {
+        Grid::Radial { row_radius_m, columns, .. } => {
             let row = cell / *columns as usize;
             let radius_m = |row: usize| row_radius_m.get(row).map_or(0.0, |&radius| f64::from(radius));
             let (outer_m, inner_m) = (radius_m(row), row.checked_sub(1).map_or(0.0, radius_m));
@@ -437,7 +443,7 @@ mod tests {
 
     #[test]
     fn the_cells_of_a_radial_grid_have_the_area_of_its_disc() {
-        let grid = Grid::Radial { row_radius_m: vec![2.0, 5.0, 10.0], columns: 8 };
+        let grid = Grid::Radial { centre_m: [1.5, 0.0], row_radius_m: vec![2.0, 5.0, 10.0], columns: 8 };
         let sum: f64 = (0..24).map(|cell| cell_m2(&grid, cell)).sum();
         assert!((sum - std::f64::consts::PI * 100.0).abs() < 1e-9, "{sum}");
     }

@@ -18,6 +18,7 @@ use mcap::write::NoSeek;
 use mcap::{Attachment, Compression, McapError, WriteOptions};
 use prost::Message;
 
+use super::mcap_reader::FORMAT;
 use crate::encode::{self, EncodedMap};
 
 /// The contents of a recording before its first event.
@@ -105,6 +106,7 @@ impl<D: Disk> McapFile<D> {
             .create(NoSeek::new(BufWriter::new(StopAtFailure { disk, failed: None })))?;
         let names: Vec<&str> = header.vehicles.iter().map(|(name, _)| &**name).collect();
         let mut metadata = header.metadata.clone();
+        metadata.insert("format".into(), FORMAT.to_string());
         metadata.insert("boot_id".into(), header.boot_id.to_string());
         metadata.insert("version".into(), env!("CARGO_PKG_VERSION").into());
         metadata.insert("vehicles".into(), names.join(","));

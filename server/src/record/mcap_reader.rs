@@ -1,29 +1,31 @@
-//! Any MCAP file -> its header and its messages, in file order. All commands read MCAP files with this reader.
+//! Any MCAP file, or a ROS 2 bag in sqlite -> its header and its messages, in file order. All commands read such files
+//! with this reader.
 //!
-//! The reader returns all whole chunks of a file that a crash has cut, and then reports it as cut. Damage is an error,
-//! even after valid messages: the reader checks the CRC of a chunk before it returns a message of it.
-//! [`McapReader::salvage`] instead returns the messages before the damage and then reports it.
+//! Damage costs the damaged chunk and is not an error, and neither is a file that a crash has cut: the reader returns
+//! every message that is whole, and [`McapReader::incomplete`] then says what is missing. A chunk whose CRC is wrong is
+//! damaged as a whole.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
-use std::fs::File;
-use std::io::{Error, ErrorKind, Read};
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use bytes::Bytes;
 use clearway_ros::Kind;
-use mcap::McapError;
-use mcap::records::{ChunkHeader, Record};
-use mcap::sans_io::LinearReaderOptions;
-use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader};
+use mcap::records::Record;
 
 use crate::counted::counted;
 use crate::file_advice::advised;
 
-use super::chunk::{RECORD_BYTES_MAX, decompress, parse, split_record};
+use super::damage::Damage;
+use super::file_records::FileRecords;
+use super::mcap_records::{LostPart, McapRecords, RecordsError};
+use super::mcap_summary;
 
-/// Greatest number of bytes of one read. A record that claims to be long gets memory only as its bytes are read.
-const READ_BYTES_MAX: usize = 1 << 20;
+/// Version of the contents of our recordings, in their metadata. A recording without one has version 1.
+pub const FORMAT: u32 = 1;
+/// The packages of the messages that this version reads.
+const PACKAGES: [&str; 1] = ["clearway.v1."];
 
 /// The contents of a recording before its first message; empty in an MCAP file of another program.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -126,53 +128,50 @@ pub enum McapReadError {
         /// The file.
         file: PathBuf,
     },
-    /// The file is damaged.
-    #[error("{}: damaged after {}: {source}", file.display(), counted(*messages, "message"))]
-    Damaged {
+    /// A later version of clearway wrote the file.
+    #[error("{}: a recording with {found}; this clearway reads {known}: use the version that wrote it, {by}, or a later one",
+        file.display())]
+    Version {
         /// The file.
         file: PathBuf,
-        /// Number of valid messages before the damage.
-        messages: u64,
-        /// The kind of damage.
-        source: McapError,
+        /// What the file has.
+        found: String,
+        /// What this version reads.
+        known: String,
+        /// The version that wrote the file.
+        by: String,
     },
 }
 
 /// An open MCAP file; an iterator over its messages.
 pub struct McapReader {
     file: PathBuf,
-    source: Box<dyn Read + Send>,
-    records: LinearReader,
+    records: FileRecords,
+    /// True if `file` can be opened to read its summary.
+    has_path: bool,
     schemas: HashMap<u16, String>,
     channels: HashMap<u16, Arc<Channel>>,
     header: Header,
-    /// Messages of the newest chunk, and the damage after them.
-    waiting: VecDeque<Result<Message, McapReadError>>,
+    /// Records of the summary that are read before their turn, and the message that needs them.
+    waiting: VecDeque<Record<'static>>,
+    /// The first message, which opening the file has read.
+    first: Option<Message>,
     messages: u64,
-    bytes_read: u64,
-    salvages: bool,
-    has_footer: bool,
+    /// Number of messages of channels that no record describes.
+    unknown: u64,
+    /// Number of messages by the file's own count.
+    stated: Option<u64>,
     has_ended: bool,
-    damage: Option<String>,
 }
 
 impl McapReader {
-    /// Opens a file and reads up to its first message. Damage is an error.
+    /// Opens a file and reads up to its first message.
     ///
     /// # Errors
     /// [`McapReadError::Read`] if the file cannot be read, [`McapReadError::NotMcap`] if it is not an MCAP file,
-    /// [`McapReadError::Damaged`] if it is damaged before its first message.
+    /// [`McapReadError::Version`] if a later version of clearway wrote it.
     pub fn open(file: &Path) -> Result<Self, McapReadError> {
-        Self::from_source(file, open(file)?)
-    }
-
-    /// Opens a file like [`McapReader::open`], but damage only ends the messages: [`McapReader::incomplete`] then
-    /// describes it.
-    ///
-    /// # Errors
-    /// [`McapReadError::Read`] if the file cannot be read, [`McapReadError::NotMcap`] if it is not an MCAP file.
-    pub fn salvage(file: &Path) -> Result<Self, McapReadError> {
-        Self::new(file, open(file)?, true)
+        Self::new(file, open(file, false)?, true)
     }
 
     /// Reads an MCAP file from `source`, up to its first message; errors name it `file`.
@@ -180,34 +179,35 @@ impl McapReader {
     /// # Errors
     /// As [`McapReader::open`].
     pub fn from_source(file: &Path, source: impl Read + Send + 'static) -> Result<Self, McapReadError> {
-        Self::new(file, source, false)
+        Self::new(file, FileRecords::Mcap(McapRecords::new(source, false)), false)
     }
 
-    fn new(file: &Path, source: impl Read + Send + 'static, salvages: bool) -> Result<Self, McapReadError> {
-        let options = LinearReaderOptions::default()
-            .with_skip_end_magic(true)
-            .with_emit_chunks(true)
-            .with_validate_data_section_crc(true)
-            .with_record_length_limit(RECORD_BYTES_MAX);
-        let mut reader = Self {
+    /// Opens a file to read its records; its first bytes may be damaged too.
+    pub(super) fn open_any(file: &Path) -> Result<Self, McapReadError> {
+        Ok(Self::unread(file, open(file, true)?, true))
+    }
+
+    fn new(file: &Path, records: FileRecords, has_path: bool) -> Result<Self, McapReadError> {
+        let mut reader = Self::unread(file, records, has_path);
+        reader.first = reader.read()?;
+        Ok(reader)
+    }
+
+    fn unread(file: &Path, records: FileRecords, has_path: bool) -> Self {
+        Self {
             file: file.to_owned(),
-            source: Box::new(source),
-            records: LinearReader::new_with_options(options),
+            records,
+            has_path,
             schemas: HashMap::new(),
             channels: HashMap::new(),
             header: Header::default(),
             waiting: VecDeque::new(),
+            first: None,
             messages: 0,
-            bytes_read: 0,
-            salvages,
-            has_footer: false,
+            unknown: 0,
+            stated: None,
             has_ended: false,
-            damage: None,
-        };
-        if let Some(first) = reader.next().transpose()? {
-            reader.waiting.push_front(Ok(first));
         }
-        Ok(reader)
     }
 
     /// The file's path.
@@ -222,18 +222,55 @@ impl McapReader {
 
     /// Number of bytes read so far.
     pub fn bytes_read(&self) -> u64 {
-        self.bytes_read
+        self.records.offset()
     }
 
     /// True if the file ended before its closing records, because a crash cut it. Known after the last message.
     pub fn is_cut(&self) -> bool {
-        self.has_ended && !self.has_footer
+        self.has_ended && !self.records.has_end()
     }
 
-    /// How the file is incomplete: cut or damaged. `None` for a complete file, and before the last message.
+    /// The damaged parts so far.
+    pub fn damages(&self) -> Vec<Damage> {
+        let topic = |id: &u16| self.channels.get(id).map_or_else(|| format!("channel {id}"), |of| of.topic.clone());
+        let damage = |lost: &LostPart| Damage {
+            bytes: lost.bytes,
+            reason: lost.reason.clone(),
+            log_ns: lost.log_ns,
+            messages: lost.messages.iter().map(|(id, count)| (topic(id), *count)).collect(),
+        };
+        self.records.lost().iter().map(damage).collect()
+    }
+
+    /// Number of damaged parts so far.
+    pub fn damage_count(&self) -> usize {
+        self.records.lost().len()
+    }
+
+    /// How the file is incomplete: damaged, cut, or with fewer messages than it says. `None` for a complete file, and
+    /// before the last message.
     pub fn incomplete(&self) -> Option<String> {
-        let cut = || format!("cut after {} bytes: the closing records are missing", self.bytes_read);
-        self.damage.clone().or_else(|| (self.waiting.is_empty() && self.is_cut()).then(cut))
+        if !self.has_ended {
+            return None;
+        }
+        let damages = self.damages();
+        let mut faults = Vec::new();
+        if let Some(first) = damages.first() {
+            let places = counted(damages.len() as u64, "place");
+            let first = if damages.len() == 1 { first.to_string() } else { format!("the first: {first}") };
+            faults.push(format!("damaged in {places}, {first}"));
+        }
+        if self.is_cut() {
+            faults.push(format!("cut after {} bytes: the closing records are missing", self.bytes_read()));
+        }
+        if self.unknown > 0 {
+            faults.push(format!("{} of channels that the file does not describe", counted(self.unknown, "message")));
+        }
+        if let Some(stated) = self.stated.filter(|stated| damages.is_empty() && *stated != self.messages) {
+            let messages = counted(self.messages, "message");
+            faults.push(format!("has {messages}, and {stated} by its own count"));
+        }
+        (!faults.is_empty()).then(|| faults.join("; "))
     }
 
     /// The names of the layers of all maps so far, in alphabetical order.
@@ -256,97 +293,101 @@ impl McapReader {
 
     /// Reads the next message; `None` at the end, cut or not.
     fn read(&mut self) -> Result<Option<Message>, McapReadError> {
-        loop {
-            if let Some(message) = self.waiting.pop_front() {
-                return message.map(Some);
-            }
-            if self.has_ended {
-                return Ok(None);
-            }
-            let record = match self.records.next_event() {
-                None => break,
-                Some(Ok(LinearReadEvent::ReadRequest(need))) => {
-                    let read = self.source.read(self.records.insert(need.min(READ_BYTES_MAX))).map_err(|source| {
-                        McapReadError::Read { file: self.file.clone(), source: advised(&self.file, source) }
-                    })?;
-                    self.records.notify_read(read);
-                    self.bytes_read += read as u64;
-                    continue;
-                }
-                Some(Ok(LinearReadEvent::Record { opcode, data })) => parse(opcode, data),
-                Some(Err(McapError::UnexpectedEof)) if self.bytes_read > 0 => break,
-                Some(Err(McapError::BadMagic)) => return Err(McapReadError::NotMcap { file: self.file.clone() }),
-                Some(Err(error)) => Err(error),
-            };
-            match record.map(Record::into_owned).map_err(|source| self.damaged(source))? {
-                Record::Chunk { header, data } => self.read_chunk(&header, &data)?,
-                record => {
-                    let message = self.read_record(record);
-                    self.waiting.extend(message.map(Ok));
-                }
+        while let Some(record) = self.next_record()? {
+            let Record::Message { header, data } = record else { continue };
+            if let Some(channel) = self.channels.get(&header.channel_id).cloned() {
+                return Ok(Some(Message { channel, log_ns: header.log_time, data: Bytes::from(data.into_owned()) }));
             }
         }
-        self.has_ended = true;
         Ok(None)
     }
 
-    /// Reads all records of a chunk, up to the first damaged one.
-    fn read_chunk(&mut self, header: &ChunkHeader, data: &[u8]) -> Result<(), McapReadError> {
-        let content = decompress(header, data).map_err(|source| self.damaged(source))?;
-        let mut rest = &*content;
-        while !rest.is_empty() {
-            match split_record(&mut rest) {
-                Ok(record) => {
-                    let message = self.read_record(record);
-                    self.waiting.extend(message.map(Ok));
+    /// Reads the next record, also of a chunk; `None` at the end, cut or not.
+    pub(super) fn next_record(&mut self) -> Result<Option<Record<'static>>, McapReadError> {
+        let record = match self.waiting.pop_front() {
+            Some(record) => Some(record),
+            None => self.records.next().map_err(|error| match error {
+                RecordsError::Read(source) => {
+                    McapReadError::Read { file: self.file.clone(), source: advised(&self.file, source) }
                 }
-                Err(source) => {
-                    let damaged = self.damaged(source);
-                    self.waiting.push_back(Err(damaged));
-                    break;
-                }
-            }
+                RecordsError::NotMcap => McapReadError::NotMcap { file: self.file.clone() },
+            })?,
+        };
+        let Some(mut record) = record else {
+            self.has_ended = true;
+            return Ok(None);
+        };
+        let is_unknown = |id: &u16| !self.channels.contains_key(id);
+        if let Record::Message { header, .. } = &record
+            && is_unknown(&header.channel_id)
+            && std::mem::take(&mut self.has_path)
+        {
+            // The chunk that describes the channels is damaged; the summary repeats them.
+            self.waiting.extend(mcap_summary::schemas_and_channels(&self.file).unwrap_or_default());
+            self.waiting.push_back(record);
+            record = self.waiting.pop_front().expect("the record itself");
         }
-        Ok(())
+        self.remember(&record)?;
+        Ok(Some(record))
     }
 
-    fn damaged(&self, source: McapError) -> McapReadError {
-        McapReadError::Damaged { file: self.file.clone(), messages: self.messages, source }
-    }
-
-    /// Reads one record: returns a message, or remembers a schema, a channel or a part of the header.
-    fn read_record(&mut self, record: Record<'_>) -> Option<Message> {
+    /// Remembers what a record says about the messages and the file.
+    fn remember(&mut self, record: &Record<'_>) -> Result<(), McapReadError> {
         match record {
             Record::Schema { header, .. } => {
-                self.schemas.insert(header.id, header.name);
+                self.check_version(&header.name)?;
+                self.schemas.insert(header.id, header.name.clone());
             }
-            Record::Channel(channel) => {
-                let schema = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-                let content = content(&channel.topic, &schema, &channel.message_encoding);
-                self.channels.insert(channel.id, Arc::new(Channel { topic: channel.topic, schema, content }));
+            Record::Channel(of) => {
+                let schema = self.schemas.get(&of.schema_id).cloned().unwrap_or_default();
+                let content = content(&of.topic, &schema, &of.message_encoding);
+                self.channels.insert(of.id, Arc::new(Channel { topic: of.topic.clone(), schema, content }));
             }
-            Record::Message { header, data } => {
+            Record::Message { header, .. } => {
                 self.messages += 1;
-                let channel = self.channels.get(&header.channel_id)?.clone();
-                return Some(Message { channel, log_ns: header.log_time, data: Bytes::from(data.into_owned()) });
+                self.unknown += u64::from(!self.channels.contains_key(&header.channel_id));
             }
             Record::Metadata(metadata) if metadata.name == "clearway" => {
                 let boot_id = metadata.metadata.get("boot_id").and_then(|id| id.parse().ok());
                 self.header.boot_id = boot_id.unwrap_or_default();
-                self.header.metadata = metadata.metadata;
+                self.header.metadata.clone_from(&metadata.metadata);
+                self.check_format()?;
             }
             Record::Attachment { header, data, .. } => {
-                let text = String::from_utf8_lossy(&data).into_owned();
+                let text = String::from_utf8_lossy(data).into_owned();
                 if header.name == "config.toml" {
                     self.header.config = Some(text);
                 } else if header.name.starts_with("calibration/") {
-                    self.header.calibrations.insert(header.name, text);
+                    self.header.calibrations.insert(header.name.clone(), text);
                 }
             }
-            Record::Footer(_) => self.has_footer = true,
+            Record::Statistics(statistics) => self.stated = Some(statistics.message_count),
             _ => {}
         }
-        None
+        Ok(())
+    }
+
+    fn check_format(&self) -> Result<(), McapReadError> {
+        let Some(found) = self.header.metadata.get("format") else { return Ok(()) };
+        match found.parse::<u32>() {
+            Ok(1..=FORMAT) => Ok(()),
+            _ => Err(self.version_error(format!("format {found}"), format!("formats up to {FORMAT}"))),
+        }
+    }
+
+    fn check_version(&self, schema: &str) -> Result<(), McapReadError> {
+        let is_known = !schema.starts_with("clearway.") || PACKAGES.iter().any(|package| schema.starts_with(package));
+        match is_known {
+            true => Ok(()),
+            false => {
+                Err(self.version_error(format!("messages of schema {schema}"), format!("{}*", PACKAGES.join("*, "))))
+            }
+        }
+    }
+
+    fn version_error(&self, found: String, known: String) -> McapReadError {
+        let by = self.header.metadata.get("version").cloned().unwrap_or_else(|| "which it does not name".into());
+        McapReadError::Version { file: self.file.clone(), found, known, by }
     }
 }
 
@@ -354,28 +395,18 @@ impl Iterator for McapReader {
     type Item = Result<Message, McapReadError>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        let next = self.read().transpose();
-        if let Some(Err(error)) = &next {
-            self.has_ended = true;
-            self.waiting.clear();
-            if let (McapReadError::Damaged { source, .. }, true) = (error, self.salvages) {
-                self.damage = Some(format!("damaged near byte {}: {source}", self.bytes_read));
-                return None;
-            }
+        if let Some(first) = self.first.take() {
+            return Some(Ok(first));
         }
+        let next = self.read().transpose();
+        self.has_ended |= matches!(next, Some(Err(_)));
         next
     }
 }
 
-fn open(file: &Path) -> Result<File, McapReadError> {
+fn open(file: &Path, any_start: bool) -> Result<FileRecords, McapReadError> {
     let wrong = |source| McapReadError::Read { file: file.to_owned(), source: advised(file, source) };
-    let opened = File::open(file).map_err(wrong)?;
-    match opened.metadata().map_err(wrong)? {
-        of_file if of_file.is_file() && of_file.len() == 0 => {
-            Err(wrong(Error::new(ErrorKind::UnexpectedEof, "the file is empty")))
-        }
-        _ => Ok(opened),
-    }
+    FileRecords::open(file, any_start).map_err(wrong)
 }
 
 /// The kind of the messages of a channel, by its topic, the name of its schema, and its encoding.

@@ -4,15 +4,28 @@
 //! |---|---|
 //! | [`writer`] | events and maps -> queue -> recorder thread |
 //! | [`mcap_file`] | events and maps -> bytes of the MCAP file |
-//! | [`mcap_reader`] | any MCAP file -> its header and its messages |
+//! | `mcap_records`, `chunk` | the bytes of any MCAP file -> its records, and the parts that cannot be read |
+//! | `bag_records` | a ROS 2 bag in sqlite -> the same records |
+//! | `file_records` | a file of either kind -> its records |
+//! | `mcap_summary` | the end of an MCAP file -> its schemas and channels |
+//! | [`mcap_reader`] | those records -> the header and the messages |
+//! | [`damage`] | a part that cannot be read -> what is lost with it |
 //! | [`reader`] | those messages -> events, maps, ROS 2 messages |
+//! | [`repair`] | damaged recording -> a whole one with all that can be read |
 //! | [`verify`] | recording -> differences between the recorded maps and the maps of the recorded events |
 //! | [`compare`] | two sets of maps of one drive -> changed cells, gained and lost free space |
 
+#[cfg(feature = "sqlite")]
+mod bag_records;
 mod chunk;
 pub mod compare;
+pub mod damage;
+mod file_records;
 pub mod mcap_file;
 pub mod mcap_reader;
+mod mcap_records;
+mod mcap_summary;
 pub mod reader;
+pub mod repair;
 pub mod verify;
 pub mod writer;

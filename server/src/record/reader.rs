@@ -6,9 +6,11 @@ use std::path::{Path, PathBuf};
 
 use bytes::Bytes;
 use clearway_lidar::calibration::Calibration;
+use clearway_mapping::config::TimeConfig;
 use clearway_mapping::event::Event;
 use clearway_ros::Kind;
 
+use super::damage::Damage;
 use super::mcap_reader::{Content, Header, McapReadError, McapReader, Message};
 use crate::config::{Calibrations, Config, ConfigError};
 use crate::encode::{EventDecodeError, event_from_bytes};
@@ -48,7 +50,7 @@ pub enum RecordedMessage {
 /// A recording cannot be read further, or its configuration cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordingError {
-    /// The file cannot be read, is not an MCAP file, or is damaged.
+    /// The file cannot be read, is not an MCAP file, or is of a later version.
     #[error(transparent)]
     Mcap(#[from] McapReadError),
     /// A message of a journal is not an event.
@@ -92,8 +94,7 @@ impl RecordingReader {
     /// Opens a recording and reads up to its first message.
     ///
     /// # Errors
-    /// [`RecordingError::Mcap`] if the file cannot be read, is not an MCAP file, or is damaged before its first
-    /// message.
+    /// [`RecordingError::Mcap`] if the file cannot be read, is not an MCAP file, or is of a later version.
     pub fn open(file: &Path) -> Result<Self, RecordingError> {
         Ok(Self { reader: McapReader::open(file)?, has_ended: false })
     }
@@ -121,6 +122,22 @@ impl RecordingReader {
         self.reader.is_cut()
     }
 
+    /// The damaged parts so far.
+    pub fn damages(&self) -> Vec<Damage> {
+        self.reader.damages()
+    }
+
+    /// Number of damaged parts so far.
+    pub fn damage_count(&self) -> usize {
+        self.reader.damage_count()
+    }
+
+    /// How the file is incomplete: damaged, cut, or with fewer messages than it says. `None` for a complete file, and
+    /// before the last message.
+    pub fn incomplete(&self) -> Option<String> {
+        self.reader.incomplete()
+    }
+
     /// The configuration of the recorded run, and its calibration tables as [`Config::calibrations`] returns them.
     ///
     /// # Errors
@@ -129,7 +146,8 @@ impl RecordingReader {
     pub fn config(&self) -> Result<(Config, Calibrations), RecordingError> {
         let (file, header) = (self.reader.file(), self.header());
         let text = header.config.as_ref().ok_or_else(|| RecordingError::NoConfig { file: file.to_owned() })?;
-        let config = Config::parse(text, &file.join("config.toml"), &[])?;
+        let mut config = Config::parse(text, &file.join("config.toml"), &[])?;
+        use_rules_of_the_run(&mut config, text);
         let table = |vehicle: &str, sensor: &clearway_mapping::config::SensorConfig| {
             if sensor.calibration.is_none() {
                 return Ok(None);
@@ -170,6 +188,18 @@ impl RecordingReader {
     }
 }
 
+/// Sets the rules of a run that was recorded before they could be configured. A recorded configuration is complete, so
+/// a table that it lacks is one that its program did not have.
+fn use_rules_of_the_run(config: &mut Config, text: &str) {
+    let document: toml::Table = text.parse().unwrap_or_default();
+    let recorded = document.get("vehicle").and_then(toml::Value::as_array).into_iter().flatten();
+    for (vehicle, recorded) in config.vehicles.iter_mut().zip(recorded) {
+        if recorded.get("time").is_none() {
+            vehicle.time = TimeConfig::WITHOUT_EPOCHS;
+        }
+    }
+}
+
 impl Iterator for RecordingReader {
     type Item = Result<RecordedMessage, RecordingError>;
 
@@ -190,5 +220,23 @@ impl Iterator for RecordingReader {
         };
         self.has_ended = !matches!(next, Some(Ok(_)));
         next
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_recording_of_a_program_without_epochs_is_replayed_without_epochs() {
+        let mut config = Config::of_one_vehicle("car", "top");
+        let text = config.to_toml();
+        use_rules_of_the_run(&mut config, &text);
+        assert_eq!(config.vehicles[0].time, TimeConfig::default());
+        let mut document: toml::Table = text.parse().unwrap();
+        let vehicle = document["vehicle"][0].as_table_mut().unwrap();
+        assert!(vehicle.remove("time").is_some(), "a recorded configuration is complete");
+        use_rules_of_the_run(&mut config, &document.to_string());
+        assert_eq!(config.vehicles[0].time, TimeConfig::WITHOUT_EPOCHS);
     }
 }

@@ -10,6 +10,7 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use clearway_mapping::config::ConfigValueError;
+use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::codec::{DecodeError, Limits};
 use clearway_proto::grid::Grid;
@@ -19,6 +20,7 @@ use prost::Message;
 use serde_json::{Value, json};
 
 use crate::encode::{EncodedMap, as_served};
+use crate::record::damage::Damage;
 use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 
 /// Greatest number of differences in a report; all are counted. Ours: the first ones explain the others.
@@ -39,6 +41,13 @@ pub struct Report {
     pub cut: bool,
     /// Number of maps, of one layer each, that belong to the last event before the cut and are not recorded.
     pub beyond_cut: u64,
+    /// Number of layers of maps after missing events, which do not equal the computed layer or are not recorded. They
+    /// cannot be judged, because the events that made them are not all known.
+    pub unjudged: u64,
+    /// The damaged parts of the file.
+    pub damages: Vec<Damage>,
+    /// How the file is incomplete; `None` if it is whole.
+    pub incomplete: Option<String>,
     /// The first differences.
     pub differences: Vec<Difference>,
     /// Number of all differences.
@@ -97,7 +106,7 @@ pub enum DifferenceKind {
 /// A recording cannot be verified.
 #[derive(Debug, thiserror::Error)]
 pub enum VerifyError {
-    /// The file cannot be read or is damaged.
+    /// The file cannot be read.
     #[error(transparent)]
     Recording(#[from] RecordingError),
     /// The recorded configuration of a vehicle is invalid.
@@ -106,18 +115,19 @@ pub enum VerifyError {
 }
 
 impl Report {
-    /// True if every recorded map is the map of its events.
+    /// True if the readable part of the recording has events, and every map in it is the map of its events.
     pub fn is_good(&self) -> bool {
-        self.different == 0
+        self.different == 0 && self.events > 0
     }
 
     /// The report as one JSON object.
     pub fn to_json(&self) -> Value {
         json!({
-            "ok": self.is_good(),
+            "ok": self.is_good() && self.incomplete.is_none(),
             "events": self.events, "maps": self.maps, "equal": self.equal, "different": self.different,
             "cells": self.cells,
-            "cut": self.cut, "beyond_cut": self.beyond_cut,
+            "cut": self.cut, "beyond_cut": self.beyond_cut, "unjudged": self.unjudged, "incomplete": self.incomplete,
+            "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(),
             "differences": self.differences.iter().map(Difference::to_json).collect::<Vec<_>>(),
         })
     }
@@ -175,14 +185,16 @@ struct VehicleReplay {
     pipeline: Pipeline,
     valid_ms: u32,
     next_event: u64,
+    /// True if events are missing before this one; the maps that follow need not equal the computed ones.
+    lacks_events: bool,
     /// Computed maps that are not compared yet, by sequence and layer.
     computed: BTreeMap<(u64, String), Bytes>,
 }
 
-/// Verifies a recording. A map that differs is not an error; the [`Report`] contains it.
+/// Verifies a recording. A map that differs and a damaged part are no errors; the [`Report`] contains them.
 ///
 /// # Errors
-/// [`VerifyError::Recording`] if the file is not a recording or is damaged, [`VerifyError::Config`] if its
+/// [`VerifyError::Recording`] if the file is not a recording or cannot be read, [`VerifyError::Config`] if its
 /// configuration is invalid.
 pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     let mut recording = RecordingReader::open(file)?;
@@ -195,54 +207,89 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
             pipeline: Pipeline::new(&vehicle.core(), tables)?,
             valid_ms: vehicle.maps.valid_ms,
             next_event: 0,
+            lacks_events: false,
             computed: BTreeMap::new(),
         });
     }
     let mut report = Report::default();
-    for message in recording.by_ref() {
+    let mut damages = 0;
+    while let Some(message) = recording.next() {
+        let damages_before = std::mem::replace(&mut damages, recording.damage_count());
+        let follows_damage = damages > damages_before;
+        if follows_damage {
+            for replay in &mut replays {
+                // The damaged part may have had the maps of the newest event.
+                replay.lacks_events = true;
+                report.unjudged += std::mem::take(&mut replay.computed).len() as u64;
+            }
+        }
         match message? {
             RecordedMessage::Event { vehicle, event } => {
                 let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else { continue };
                 report.events += 1;
-                if event.sequence != replay.next_event {
-                    report.add(&vehicle, replay.next_event, "", DifferenceKind::Gap { found: event.sequence });
-                }
-                replay.next_event = event.sequence.saturating_add(1);
-                if let Ok(Some(map)) = replay.pipeline.step(&event) {
-                    let map = EncodedMap::new(map, replay.name.clone(), boot_id, replay.valid_ms);
-                    report.maps += 1;
-                    for (layer, chunk) in &map.layers {
-                        replay.computed.insert((map.sequence, (*layer).to_owned()), map.layer(chunk));
-                    }
-                }
+                replay.step(&event, boot_id, &mut report, recording.damage_count() > 0);
             }
             RecordedMessage::Map { vehicle, layer, bytes } => {
-                let (sequence, cells) = sequence_and_cells(&bytes);
-                let replay = replays.iter_mut().find(|r| *r.name == *vehicle);
-                let computed = replay.and_then(|replay| replay.computed.remove(&(sequence, layer.clone())));
-                report.cells += if computed.is_some() { cells } else { 0 };
-                match computed.map(|computed| as_served(computed, &bytes)) {
-                    None => report.add(&vehicle, sequence, &layer, DifferenceKind::Extra),
-                    Some(computed) if computed == bytes => report.equal += 1,
-                    Some(computed) => report.add(&vehicle, sequence, &layer, first_difference(&bytes, &computed)),
-                }
+                let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else {
+                    report.add(&vehicle, sequence_and_cells(&bytes).0, &layer, DifferenceKind::Extra);
+                    continue;
+                };
+                replay.compare(&layer, &bytes, &mut report);
             }
             RecordedMessage::Ros { .. } => {}
         }
     }
     report.cut = recording.is_cut();
+    report.damages = recording.damages();
+    report.incomplete = recording.incomplete();
     for replay in &replays {
         // The recorder writes an event before its map, so a cut can remove only the map of the last event.
         let tail = replay.computed.last_key_value().map(|((sequence, _), _)| *sequence);
         for (sequence, layer) in replay.computed.keys() {
             if report.cut && Some(*sequence) == tail {
                 report.beyond_cut += 1;
+            } else if replay.lacks_events || !report.damages.is_empty() {
+                report.unjudged += 1;
             } else {
                 report.add(&replay.name, *sequence, layer, DifferenceKind::Missing);
             }
         }
     }
     Ok(report)
+}
+
+impl VehicleReplay {
+    /// Computes the map of the next event. Events that are missing in a damaged file are no difference: the damage
+    /// is reported.
+    fn step(&mut self, event: &Event, boot_id: u64, report: &mut Report, is_damaged: bool) {
+        if event.sequence != self.next_event {
+            if !(is_damaged && self.lacks_events) {
+                report.add(&self.name, self.next_event, "", DifferenceKind::Gap { found: event.sequence });
+            }
+            self.lacks_events = true;
+        }
+        self.next_event = event.sequence.saturating_add(1);
+        if let Ok(Some(map)) = self.pipeline.step(event) {
+            let map = EncodedMap::new(map, self.name.clone(), boot_id, self.valid_ms);
+            report.maps += 1;
+            for (layer, chunk) in &map.layers {
+                self.computed.insert((map.sequence, (*layer).to_owned()), map.layer(chunk));
+            }
+        }
+    }
+
+    /// Compares a recorded layer with the computed one.
+    fn compare(&mut self, layer: &str, bytes: &Bytes, report: &mut Report) {
+        let (sequence, cells) = sequence_and_cells(bytes);
+        let computed = self.computed.remove(&(sequence, layer.to_owned()));
+        report.cells += if computed.is_some() { cells } else { 0 };
+        match computed.map(|computed| as_served(computed, bytes)) {
+            Some(computed) if computed == *bytes => report.equal += 1,
+            _ if self.lacks_events => report.unjudged += 1,
+            None => report.add(&self.name, sequence, layer, DifferenceKind::Extra),
+            Some(computed) => report.add(&self.name, sequence, layer, first_difference(bytes, &computed)),
+        }
+    }
 }
 
 /// The sequence of a recorded map of one layer and the number of its cells; `u64::MAX` for an unreadable map, which then

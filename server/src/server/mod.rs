@@ -6,10 +6,12 @@
 //! | `setup` | parameters of a server; errors of its start and its end |
 //! | `start` | [`Setup`] -> [`Running`] |
 //! | `input` | event queue and UDP addresses of one vehicle |
+//! | `listeners` | the TCP listeners of a configuration |
 //! | `running` | [`Running`], and its shutdown |
 //! | `over_zenoh` | everything that uses the zenoh session |
 
 mod input;
+mod listeners;
 #[cfg(feature = "zenoh")]
 mod over_zenoh;
 mod running;

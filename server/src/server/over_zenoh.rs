@@ -4,11 +4,12 @@ use tokio::task::JoinSet;
 use zenoh::Session;
 
 use super::input::VehicleInput;
-use crate::config::Config;
+use crate::config::{Config, ZenohMode};
 use crate::ingest::gateway::Gateways;
 use crate::ingest::ros::live::{self, LiveTopics};
-use crate::ingest::zenoh::Ingest;
+use crate::ingest::zenoh::{Ingest, Senders};
 use crate::publish::Vehicles;
+use crate::publish::listen::access::Access;
 use crate::publish::zenoh::Publisher;
 use crate::zenoh_session::{self, ZenohError};
 
@@ -32,11 +33,13 @@ impl OverZenoh {
         gateways: &Gateways,
         inputs: &[VehicleInput],
     ) -> Result<Self, ZenohError> {
-        let session = zenoh_session::open(&config.zenoh, gateways.message_bytes_max()).await?;
+        let names = config.vehicles.iter().map(|vehicle| &*vehicle.name);
+        let session = zenoh_session::open(&config.zenoh, gateways.message_bytes_max(), names).await?;
         let publisher = Publisher::start(&session, &config.zenoh, vehicles).await?;
         let mut over_zenoh = Self { session, publisher, ingest: JoinSet::new(), ros: Vec::new() };
         for gateway in gateways.all() {
-            let ingest = Ingest::subscribe(&over_zenoh.session, gateway.clone()).await?;
+            let senders = senders(&over_zenoh.session, config);
+            let ingest = Ingest::subscribe(&over_zenoh.session, gateway.clone(), senders).await?;
             over_zenoh.ingest.spawn(ingest.run());
         }
         for (vehicle, input) in config.vehicles.iter().zip(inputs) {
@@ -68,4 +71,17 @@ impl OverZenoh {
             tracing::warn!(%error, "zenoh: close");
         }
     }
+}
+
+/// Who may send observations, if clients have roles and connect to this session; a router checks its own clients.
+fn senders(session: &Session, config: &Config) -> Option<Senders> {
+    let has_roles = config.grpc.tls.as_ref().is_some_and(|tls| tls.client_ca.is_some());
+    let access = (has_roles && config.zenoh.mode != ZenohMode::Client).then(|| Access::new(&config.grpc.access))?;
+    let may_send = move |names: &[String]| {
+        access
+            .check("/clearway.v1.IngestService/Stream", names)
+            .map(|_| ())
+            .map_err(|status| status.message().to_owned())
+    };
+    Some(Senders::new(session, Box::new(may_send)))
 }

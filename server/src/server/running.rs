@@ -1,8 +1,8 @@
 //! A running server, and its shutdown.
 
 use std::net::SocketAddr;
-use std::sync::Arc;
 use std::sync::mpsc::Receiver;
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -10,15 +10,22 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use super::input::VehicleInput;
+use super::listeners::limits;
 use super::setup::ShutdownError;
+use crate::config::{Certificates, Config};
 use crate::engine::Engine;
 use crate::ingest::queue::QueuedEvent;
 use crate::ingest::udp;
-use crate::publish::{Vehicles, foxglove};
+use crate::publish::Vehicles;
+use crate::publish::listen::ListenerHandle;
+use crate::publish::listen::security::{Current, Security};
 use crate::record::writer::Recorder;
 use crate::replay::ReplayHandle;
 use crate::subscriptions::LayerSubscription;
+use crate::sync::locked;
 
+/// Longest time of [`Running::shutdown_in_time`]. Ours: service managers wait 10 s or more before they kill a server.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_millis(4500);
 /// Longest wait for each kind of publisher at shutdown. Ours: a stalled peer must not keep the server from ending.
 const PUBLISHERS_STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -33,6 +40,8 @@ pub struct Running {
     pub grpc: Option<SocketAddr>,
     /// The address of the page.
     pub page: Option<SocketAddr>,
+    /// The address of `/healthz`, `/readyz` and `/metrics` alone.
+    pub metrics: Option<SocketAddr>,
     /// The endpoints of zenoh.
     pub zenoh: Vec<String>,
     /// The address of the Foxglove WebSocket.
@@ -47,9 +56,12 @@ pub struct Running {
     pub(super) udp: Option<udp::UdpThreads>,
     pub(super) publishers: JoinSet<()>,
     pub(super) stop: watch::Sender<bool>,
+    /// What the shutdown waits for.
+    shutdown_step: Arc<Mutex<&'static str>>,
     /// Layers that are computed with or without readers; held until the end.
     pub(super) subscriptions: Vec<LayerSubscription>,
-    pub(super) viewers: Option<foxglove::Publisher>,
+    /// The security and the counts of the TCP listeners.
+    pub(super) listeners: Option<(Security, Vec<(&'static str, ListenerHandle)>)>,
     #[cfg(feature = "zenoh")]
     pub(super) over_zenoh: Option<super::over_zenoh::OverZenoh>,
 }
@@ -65,12 +77,47 @@ impl Running {
         self.replay.clone()
     }
 
+    /// True if the TCP listeners have certificates.
+    pub fn is_encrypted(&self) -> bool {
+        self.listeners.as_ref().is_some_and(|(security, _)| security.current().tls.is_some())
+    }
+
+    /// Uses the certificates, tokens, roles and limits of another configuration from now on, for new connections and
+    /// new calls. Open connections stay.
+    ///
+    /// # Errors
+    /// A text that says which certificate is invalid, or that TLS cannot begin or end while the server runs; then
+    /// everything stays as it was.
+    pub fn reload(&self, config: &Config, certificates: Option<&Certificates>) -> Result<(), String> {
+        let Some((security, handles)) = &self.listeners else { return Ok(()) };
+        let next = Current::new(config, certificates)?;
+        if next.tls.is_some() != security.current().tls.is_some() {
+            return Err("TLS begins or ends only with a restart".into());
+        }
+        security.replace(next);
+        handles.iter().for_each(|(name, handle)| handle.set_limits(limits(name, config)));
+        Ok(())
+    }
+
     /// Resolves when the server stops.
     pub(super) fn stopped(&self) -> impl Future<Output = ()> + Send + use<> {
         let mut stopped = self.stop.subscribe();
         async move {
             // An error means that the sender is gone, so the server stops as well.
             let _ = stopped.wait_for(|stop| *stop).await;
+        }
+    }
+
+    /// As [`Running::shutdown`], but gives up after 4.5 s whatever a disk or an engine does. Threads may go on then, so
+    /// the process should end.
+    ///
+    /// # Errors
+    /// As [`Running::shutdown`], and [`ShutdownError::Deadline`] with the part that did not end.
+    pub async fn shutdown_in_time(self) -> Result<(), ShutdownError> {
+        let step = self.shutdown_step.clone();
+        match tokio::time::timeout(SHUTDOWN_TIMEOUT, self.shutdown()).await {
+            Ok(ended) => ended,
+            Err(_) => Err(ShutdownError::Deadline { waiting_for: *locked(&step), limit: SHUTDOWN_TIMEOUT }),
         }
     }
 
@@ -81,6 +128,9 @@ impl Running {
     /// [`ShutdownError`] if an engine panicked or the recording is incomplete; everything has ended then as well.
     pub async fn shutdown(mut self) -> Result<(), ShutdownError> {
         self.stepped.clear();
+        let step = self.shutdown_step.clone();
+        let begin = |what: &'static str| *locked(&step) = what;
+        begin("the sockets' threads");
         if let Some(threads) = self.udp.take() {
             // Fails only if the runtime shuts down; then the threads end by themselves.
             let _ = tokio::task::spawn_blocking(move || threads.stop()).await;
@@ -89,6 +139,7 @@ impl Running {
         if let Some(over_zenoh) = &mut self.over_zenoh {
             over_zenoh.stop_ros().await;
         }
+        begin("the event queues");
         let inputs = std::mem::take(&mut self.inputs);
         let close_queues = move || {
             for input in inputs {
@@ -99,18 +150,15 @@ impl Running {
         };
         let _ = tokio::task::spawn_blocking(close_queues).await;
         let (engines, recorder) = (self.engines, self.recorder);
-        let finished = tokio::task::spawn_blocking(move || finish(engines, recorder)).await;
+        let of_finish = step.clone();
+        let finished = tokio::task::spawn_blocking(move || finish(engines, recorder, &of_finish)).await;
         let outcome = finished.unwrap_or_else(|error| Err(error.into()));
+        begin("the publishers");
         self.stop.send_replace(true);
         let mut publishers = self.publishers;
         let all = async { while publishers.join_next().await.is_some() {} };
         if tokio::time::timeout(PUBLISHERS_STOP_TIMEOUT, all).await.is_err() {
             publishers.shutdown().await;
-        }
-        if let Some(viewers) = self.viewers
-            && tokio::time::timeout(PUBLISHERS_STOP_TIMEOUT, viewers.stop()).await.is_err()
-        {
-            tracing::warn!("the Foxglove WebSocket did not close in time");
         }
         #[cfg(feature = "zenoh")]
         if let Some(over_zenoh) = self.over_zenoh
@@ -123,13 +171,19 @@ impl Running {
 }
 
 /// Waits for the engines, and then for the recorder, whose error matters more than that of an engine.
-fn finish(engines: Vec<(Arc<str>, JoinHandle<()>)>, recorder: Option<Recorder>) -> Result<(), ShutdownError> {
+fn finish(
+    engines: Vec<(Arc<str>, JoinHandle<()>)>,
+    recorder: Option<Recorder>,
+    step: &Mutex<&'static str>,
+) -> Result<(), ShutdownError> {
     let mut outcome = Ok(());
+    *locked(step) = "the engines";
     for (name, engine) in engines {
         if engine.join().is_err() {
             outcome = Err(ShutdownError::Engine(name));
         }
     }
+    *locked(step) = "the recorder";
     recorder.map_or(Ok(()), Recorder::finish)?;
     outcome
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::config::{Calibrations, Certificates, Config};
 use crate::engine::Observer;
@@ -17,7 +18,7 @@ pub struct Setup {
     pub config: Config,
     /// The calibration tables of all sensors, as [`Config::calibrations`] returns them.
     pub calibrations: Calibrations,
-    /// The certificates, as [`Config::certificates`] returns them; without them gRPC is plain text.
+    /// The certificates, as [`Config::certificates`] returns them; without them all listeners are plain text.
     pub certificates: Option<Certificates>,
     /// Identifies this run in maps and recordings; a random number if absent.
     pub boot_id: Option<u64>,
@@ -45,9 +46,9 @@ pub enum StartError {
     #[error(transparent)]
     Record(#[from] RecordError),
     /// An address cannot be listened on.
-    #[error("{what} {at}: {source}")]
+    #[error("{what}.listen {at}: {source}")]
     Listen {
-        /// The configuration key.
+        /// The configuration's table.
         what: &'static str,
         /// The address.
         at: SocketAddr,
@@ -76,14 +77,6 @@ pub enum StartError {
         /// The system's reason.
         source: std::io::Error,
     },
-    /// The Foxglove WebSocket cannot be served.
-    #[error("foxglove.listen {at}: {source}")]
-    Foxglove {
-        /// The address.
-        at: SocketAddr,
-        /// Foxglove's reason.
-        source: foxglove::FoxgloveError,
-    },
     /// The zenoh session cannot be opened, or a key cannot be declared on it.
     #[cfg(feature = "zenoh")]
     #[error(transparent)]
@@ -99,6 +92,14 @@ pub enum ShutdownError {
     /// The thread of an engine panicked.
     #[error("the engine of vehicle {0} panicked")]
     Engine(Arc<str>),
+    /// A part of the server did not end in time.
+    #[error("not ended after {} ms: {waiting_for} did not end", .limit.as_millis())]
+    Deadline {
+        /// The part for which the shutdown waited.
+        waiting_for: &'static str,
+        /// Longest time of a shutdown.
+        limit: Duration,
+    },
     /// The recording is incomplete.
     #[error(transparent)]
     Recording(#[from] IncompleteRecordingError),

@@ -1,25 +1,26 @@
 //! Starts a server: [`Setup`] -> [`Running`].
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::hash::{BuildHasher, Hasher};
-use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_mapping::pipeline::{Pipeline, layer_names};
-use tokio::net::TcpListener;
 use tokio::sync::watch;
 
 use super::input::VehicleInput;
+use super::listeners::Listeners;
 use super::running::Running;
 use super::setup::{Setup, StartError};
-use crate::config::{Certificates, Config, Foxglove, Grpc, Vehicle};
+use crate::config::{Certificates, Config, Vehicle, listeners};
 use crate::engine::{Engine, Observer};
 use crate::ingest::gateway::{Gateway, Gateways};
 use crate::ingest::grpc::Ingest;
 use crate::ingest::queue::{EventQueue, QueuedEvent, event_queue};
 use crate::ingest::udp;
+use crate::publish::listen::Listener;
+use crate::publish::listen::security::{Current, Security};
 use crate::publish::{Served, Vehicles, foxglove, grpc, page};
 use crate::record::mcap_file::Header;
 use crate::record::writer::{Recorder, recording_path};
@@ -42,7 +43,8 @@ impl Server {
         let boot_id = boot_id.unwrap_or_else(random);
         let mut observer = setup.observer;
         calibrations.resize_with(config.vehicles.len(), Vec::new);
-        let mut running = Running { replay: setup.replay, ..Running::default() };
+        let mut running = Running::default();
+        running.replay = setup.replay;
         let mut prepared = Vec::new();
         for (vehicle, tables) in config.vehicles.iter().zip(&mut calibrations) {
             tables.resize(vehicle.sensors.len(), None);
@@ -83,6 +85,7 @@ impl Running {
     fn prepare(&mut self, vehicle: &Vehicle, boot_id: u64, pipeline: Pipeline, observer: Option<Observer>) -> Prepared {
         let name: Arc<str> = vehicle.name.as_str().into();
         let (queue, events) = event_queue(vehicle.queue);
+        let queue = queue.with_shares(vehicle.queue - vehicle.ingest.events_max(vehicle.queue), udp_sensors(vehicle));
         let layers = layer_names(&vehicle.maps);
         let status = Arc::new(VehicleStatus::new(name.clone(), boot_id, layers, queue.drops()));
         let (newest, receiver) = watch::channel(None);
@@ -102,17 +105,13 @@ impl Running {
         header: impl FnOnce() -> Header,
     ) -> Result<(), StartError> {
         // Before the recorder: a port in use must not overwrite an earlier recording.
-        let grpc = listen("grpc.listen", config.grpc.enabled.then_some(config.grpc.listen)).await?;
-        let page = listen("page.listen", config.page.enabled.then_some(config.page.listen)).await?;
-        let security = security(certificates, &config.grpc)?;
+        let current = Current::new(config, certificates.as_ref()).map_err(StartError::Certificates)?;
+        let listeners = Listeners::bind(config, &Security::new(current)).await?;
         let sockets = udp::Sockets::bind(&config.vehicles).map_err(|source| StartError::Udp {
             vehicle: config.vehicles[source.vehicle].name.as_str().into(),
             source,
         })?;
         let gateways = self.gateways(config);
-        if config.foxglove.enabled {
-            self.serve_foxglove(&config.foxglove).await?;
-        }
         #[cfg(feature = "zenoh")]
         if config.zenoh.enabled {
             let started = super::over_zenoh::OverZenoh::start(config, &self.vehicles, &gateways, &self.inputs);
@@ -121,12 +120,7 @@ impl Running {
             self.over_zenoh = Some(over_zenoh);
         }
         self.start_engines(config, prepared, driver, header)?;
-        if let Some(listener) = grpc {
-            self.serve_grpc(listener, security, config.grpc.connections_max, gateways);
-        }
-        if let Some(listener) = page {
-            self.serve_page(listener);
-        }
+        self.serve(listeners, gateways);
         self.start_udp(sockets)
     }
 
@@ -166,41 +160,32 @@ impl Running {
         Gateways::new(enabled.map(|(vehicle, input)| Gateway::new(vehicle, &input.queue)), self.stop.subscribe())
     }
 
-    fn serve_grpc(
-        &mut self,
-        listener: TcpListener,
-        security: grpc::Security,
-        connections_max: usize,
-        gateways: Gateways,
-    ) {
-        self.grpc = listener.local_addr().ok();
-        let (vehicles, stopped) = (self.vehicles.clone(), self.stopped());
-        let ingest = (!gateways.all().is_empty()).then(|| Ingest::new(gateways).into_service());
-        let replay = self.replay.clone();
-        self.publishers.spawn(async move {
-            let served = grpc::serve(listener, security, connections_max, vehicles, ingest, replay, stopped);
-            if let Err(error) = served.await {
-                tracing::error!(%error, "grpc ended");
-            }
-        });
-    }
-
-    fn serve_page(&mut self, listener: TcpListener) {
-        self.page = listener.local_addr().ok();
-        let (vehicles, stopped, replay) = (self.vehicles.clone(), self.stopped(), self.replay.clone());
-        self.publishers.spawn(async move {
-            if let Err(error) = page::serve(listener, vehicles, replay, stopped).await {
-                tracing::error!(%error, "page ended");
-            }
-        });
-    }
-
-    async fn serve_foxglove(&mut self, options: &Foxglove) -> Result<(), StartError> {
-        let started = foxglove::Publisher::start(options, &self.vehicles).await;
-        let viewers = started.map_err(|source| StartError::Foxglove { at: options.listen, source })?;
-        self.foxglove = Some(SocketAddr::new(options.listen.ip(), viewers.port()));
-        self.viewers = Some(viewers);
-        Ok(())
+    fn serve(&mut self, listeners: Listeners, gateways: Gateways) {
+        let Listeners { grpc, page, metrics, foxglove, security, handles } = listeners;
+        let listeners = handles.clone().into();
+        let shown = page::Shown { vehicles: self.vehicles.clone(), listeners, replay: self.replay.clone() };
+        self.listeners = Some((security, handles));
+        let address = |listener: &Option<Listener>| listener.as_ref().and_then(Listener::address);
+        (self.grpc, self.page, self.metrics) = (address(&grpc), address(&page), address(&metrics));
+        self.foxglove = address(&foxglove);
+        if let Some(listener) = grpc {
+            let (vehicles, stopped, replay) = (self.vehicles.clone(), self.stopped(), self.replay.clone());
+            let ingest = (!gateways.all().is_empty()).then(|| Ingest::new(gateways).into_service());
+            self.publishers.spawn(async move {
+                if let Err(error) = grpc::serve(listener, vehicles, ingest, replay, stopped).await {
+                    tracing::error!(%error, "grpc ended");
+                }
+            });
+        }
+        if let Some(listener) = page {
+            self.publishers.spawn(page::serve(listener, shown.clone(), self.stopped()));
+        }
+        if let Some(listener) = metrics {
+            self.publishers.spawn(page::serve_metrics(listener, shown, self.stopped()));
+        }
+        if let Some(listener) = foxglove {
+            self.publishers.spawn(foxglove::serve(listener, self.vehicles.clone(), self.stopped()));
+        }
     }
 
     /// Starts the threads that read the sockets. They start last, when everything behind them runs.
@@ -214,24 +199,10 @@ impl Running {
     }
 }
 
-/// The transport security of gRPC. It is never plain text if the configuration names certificates.
-fn security(certificates: Option<Certificates>, grpc: &Grpc) -> Result<grpc::Security, StartError> {
-    if grpc.enabled && grpc.tls.is_some() && certificates.is_none() {
-        return Err(StartError::Certificates("its files were not read".into()));
-    }
-    let security = grpc::Security::new(certificates, &grpc.access);
-    security.map_err(|error| StartError::Certificates(with_causes(&error)))
-}
-
-/// An error with all its causes, because "transport error" alone says little.
-fn with_causes(error: &dyn std::error::Error) -> String {
-    let causes = std::iter::successors(Some(error), |error| error.source());
-    causes.map(ToString::to_string).collect::<Vec<_>>().join(": ")
-}
-
-async fn listen(what: &'static str, at: Option<SocketAddr>) -> Result<Option<TcpListener>, StartError> {
-    let Some(at) = at else { return Ok(None) };
-    TcpListener::bind(at).await.map(Some).map_err(|source| StartError::Listen { what, at, source })
+/// Number of a vehicle's sensors that send datagrams.
+fn udp_sensors(vehicle: &Vehicle) -> usize {
+    let routes = listeners(std::slice::from_ref(vehicle)).into_iter().flat_map(|listener| listener.routes);
+    routes.map(|route| route.source).collect::<BTreeSet<_>>().len()
 }
 
 /// The header of the recording.

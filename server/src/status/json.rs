@@ -13,7 +13,7 @@ pub fn sensor_json(state: &v1::SensorState) -> Value {
         "rpm": state.rpm, "completeness": state.completeness, "partial": state.partial,
         "blocked_deg": state.blocked_sectors.iter().map(|b| [b.from_deg, b.to_deg]).collect::<Vec<_>>(),
         "blocked_lasers": state.blocked_lasers,
-        "clock": state.clock, "clock_offset_ms": state.clock_offset_ms,
+        "clock": state.clock, "clock_offset_ms": state.clock_offset_ms, "epoch": state.epoch,
         "elevations": state.elevations,
         "state": state.state, "age_ms": state.age_ms,
     })

@@ -11,13 +11,15 @@ use clearway_mapping::sensor::mount::check::MountDeviation;
 pub(super) struct Notices {
     elevations: BTreeMap<String, ElevationSource>,
     reference_sensor: String,
+    /// Number of the epoch of each sensor.
+    epochs: BTreeMap<String, u32>,
     /// Sensors whose mount the ground contradicts.
     contradicted: BTreeSet<String>,
 }
 
 impl Notices {
-    /// Logs what has changed since the last call: sensors whose elevations are not their own, and sensors whose mount
-    /// the ground contradicts.
+    /// Logs what has changed since the last call: sensors whose elevations are not their own, sensors whose stamps went
+    /// back, and sensors whose mount the ground contradicts.
     pub fn update(&mut self, vehicle: &str, sensors: &[NamedStatus]) {
         if let Some(chosen) = sensors.iter().find(|sensor| sensor.is_reference && self.reference_sensor != sensor.name)
         {
@@ -28,6 +30,7 @@ impl Notices {
         }
         for sensor in sensors {
             self.update_elevations(vehicle, sensor);
+            self.update_epoch(vehicle, sensor);
             self.update_mount(vehicle, sensor);
         }
     }
@@ -41,6 +44,15 @@ impl Notices {
         match source.advice() {
             Some(advice) => tracing::warn!(vehicle, sensor = %name, elevations, "{advice}"),
             None => tracing::info!(vehicle, sensor = %name, elevations, "elevations of the lasers"),
+        }
+    }
+
+    fn update_epoch(&mut self, vehicle: &str, sensor: &NamedStatus) {
+        let (name, epoch) = (&sensor.name, sensor.status.epoch);
+        if epoch != self.epochs.get(name).copied().unwrap_or(0) {
+            self.epochs.insert(name.clone(), epoch);
+            let clock = sensor.status.clock.map_or("sender", |clock| clock.as_str());
+            tracing::warn!(vehicle, sensor = %name, epoch, clock, "stamps went back to this clock: a new epoch");
         }
     }
 

@@ -10,13 +10,17 @@ use clearway_mapping::sensor::mount::check::MountDeviation;
 use super::vehicle::{Snapshot, VehicleStatus};
 use crate::clock::now_ns;
 
-/// The text of `/metrics`.
-pub fn prometheus(vehicles: &[Arc<VehicleStatus>]) -> String {
+/// Counts of a listener: open connections, bytes that wait for readers, connections refused or closed by reason.
+type ListenerCounts = (&'static str, (usize, usize, BTreeMap<&'static str, u64>));
+
+/// The text of `/metrics`: of these vehicles, and of the TCP listeners by name.
+pub fn prometheus(vehicles: &[Arc<VehicleStatus>], listeners: &[ListenerCounts]) -> String {
     let all = vehicles.iter().map(|status| (&**status, status.snapshot())).collect();
     let mut metrics = Metrics { all, text: String::new() };
     metrics.write_arrivals();
     metrics.write_sensors();
     metrics.write_maps();
+    metrics.write_listeners(listeners);
     metrics.text
 }
 
@@ -43,6 +47,19 @@ impl Metrics<'_> {
         self.each("clearway_roads_refused_total", "Roads refused.", |s| s.ledger.roads_refused.values().sum());
     }
 
+    fn write_listeners(&mut self, listeners: &[ListenerCounts]) {
+        let each = |of: &dyn Fn(&ListenerCounts) -> usize| {
+            listeners.iter().map(|counts| (format!("listener=\"{}\"", counts.0), of(counts) as f64)).collect()
+        };
+        self.family("clearway_connections", "Open connections of a listener.", each(&|(_, counts)| counts.0));
+        self.family("clearway_waiting_bytes", "Bytes that wait for the readers of a listener.", each(&|(_, c)| c.1));
+        let closed = listeners.iter().flat_map(|(name, (_, _, closed))| {
+            closed.iter().map(move |(reason, n)| (format!("listener=\"{name}\",reason=\"{reason}\""), *n as f64))
+        });
+        let help = "Connections and calls that a listener refused or closed, by reason.";
+        self.family("clearway_connections_closed_total", help, closed.collect());
+    }
+
     fn write_sensors(&mut self) {
         let help = "Datagrams and scans received from a sensor.";
         self.each_sensor("clearway_sensor_received_total", help, |s| s.ledger.received as f64);
@@ -60,6 +77,8 @@ impl Metrics<'_> {
         self.family("clearway_sensor_refused_total", help, refused);
         let help = "Data packets that did not arrive, by device time and azimuth, exact to one packet per gap.";
         self.each_sensor("clearway_packets_missing_total", help, |s| s.status.packets_lost as f64);
+        let help = "Times the stamps of a sensor went back: each began a new epoch.";
+        self.each_sensor("clearway_sensor_epochs_total", help, |s| f64::from(s.status.epoch));
         let help = "1 for the source of the elevations of a sensor's lasers.";
         let elevations = self
             .sensors()
@@ -105,6 +124,9 @@ impl Metrics<'_> {
 
     fn write_maps(&mut self) {
         self.each("clearway_maps_total", "Maps made.", |s| s.maps);
+        let alive = self.all.iter().map(|(of, _)| (vehicle(of), f64::from(u8::from(of.is_alive())))).collect();
+        let help = "1 if the vehicle's engine and the threads that read its sockets work, else 0.";
+        self.family("clearway_vehicle_alive", help, alive);
         self.each("clearway_revolutions_total", "Revolutions completed.", Snapshot::revolutions);
         let now_ns = now_ns();
         let age = |(of, s): &(&VehicleStatus, Snapshot)| {
@@ -195,7 +217,7 @@ mod tests {
         let shown = status.snapshot().ledger;
         assert_eq!(shown.refused["source"], 2);
         assert_eq!(shown.received, shown.decoded + shown.telemetry + shown.refused.values().sum::<u64>());
-        let text = prometheus(&[Arc::new(status)]);
+        let text = prometheus(&[Arc::new(status)], &[]);
         assert!(text.contains("clearway_packets_received_total{vehicle=\"car\"} 5\n"), "{text}");
         assert!(text.contains("clearway_packets_refused_total{vehicle=\"car\",reason=\"source\"} 2\n"), "{text}");
     }
@@ -218,7 +240,7 @@ mod tests {
         status.stepped(&Ledger::default(), sensors);
         let message = status.to_proto();
         assert_eq!((message.mounts["top"].height_m, message.reference_sensor.as_str()), (-0.58, "top"));
-        let text = prometheus(&[Arc::new(status)]);
+        let text = prometheus(&[Arc::new(status)], &[]);
         for line in [
             "clearway_sensor_elevations{vehicle=\"car\",sensor=\"top\",source=\"nominal\"} 1\n",
             "clearway_mount_height_deviation_meters{vehicle=\"car\",sensor=\"top\"} -0.58\n",

@@ -1,7 +1,7 @@
 //! The status of one vehicle: counts, rates, latency, readers, recorder.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
@@ -28,6 +28,9 @@ use super::notices::Notices;
 const LATENCIES: usize = 4096;
 /// Maps over which the rates are measured.
 const RATE_MAPS: usize = 16;
+/// Longest time between two signs of life of an engine that does not hang. Ours: the largest allowed scan takes half a
+/// second, and an engine without events polls fifty times a second.
+const ENGINE_SILENT_MAX: Duration = Duration::from_secs(2);
 /// Time without a new map after which the rates are 0.
 const RATE_AGE_MAX: Duration = Duration::from_secs(2);
 
@@ -59,6 +62,9 @@ pub struct VehicleStatus {
     drops: Arc<DropCounters>,
     pub(super) recorder: OnceLock<Arc<RecorderCounts>>,
     engine_stopped: AtomicBool,
+    /// Time of the newest sign of life of the engine, in ms after `started`; 0 before the first.
+    engine_beat_ms: AtomicU64,
+    started: Instant,
     state: Mutex<State>,
 }
 
@@ -161,6 +167,8 @@ impl VehicleStatus {
             drops,
             recorder: OnceLock::new(),
             engine_stopped: AtomicBool::new(false),
+            engine_beat_ms: AtomicU64::new(0),
+            started: Instant::now(),
             state: Mutex::default(),
         }
     }
@@ -170,9 +178,29 @@ impl VehicleStatus {
         self.recorder.get_or_init(|| counts);
     }
 
-    /// True if the vehicle's engine is running.
+    /// True if nothing of the vehicle has stopped or hangs.
     pub fn is_alive(&self) -> bool {
-        !self.engine_stopped.load(Ordering::Acquire)
+        self.fault().is_none()
+    }
+
+    /// What of the vehicle has stopped or hangs: its engine, or a thread that reads its sockets; `None` if nothing has.
+    pub fn fault(&self) -> Option<String> {
+        if self.engine_stopped.load(Ordering::Acquire) {
+            return Some(format!("the engine of vehicle {} has stopped", self.name));
+        }
+        let beat = Duration::from_millis(self.engine_beat_ms.load(Ordering::Relaxed));
+        let silent = self.started.elapsed().saturating_sub(beat);
+        if !beat.is_zero() && silent > ENGINE_SILENT_MAX {
+            return Some(format!("the engine of vehicle {} has hung for {} s", self.name, silent.as_secs()));
+        }
+        let ended = self.drops.ended_inputs();
+        (!ended.is_empty()).then(|| format!("vehicle {}: {}", self.name, ended.join("; ")))
+    }
+
+    /// Records that the engine is at work, or waits for events.
+    pub(crate) fn engine_beats(&self) {
+        let ms = u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX);
+        self.engine_beat_ms.store(ms.max(1), Ordering::Relaxed);
     }
 
     /// Records that the engine has stopped.
@@ -265,6 +293,7 @@ impl VehicleStatus {
             unknown_senders: self.drops.unknown_senders().iter().map(unknown_sender).collect(),
             observations_refused: by_name(&snapshot.observations_refused),
             reference_sensor: snapshot.reference_sensor().unwrap_or_default().to_owned(),
+            fault: self.fault().unwrap_or_default(),
             mounts: snapshot.sensors.iter().filter_map(|s| Some((s.name.clone(), mount(&s.mount?)))).collect(),
         }
     }
@@ -290,6 +319,7 @@ impl VehicleStatus {
         document["rates"] = json!({ "maps_hz": snapshot.maps_hz, "packets_hz": snapshot.packets_hz });
         document["latency_ms"] = json!({ "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 });
         document["alive"] = self.is_alive().into();
+        document["fault"] = self.fault().into();
         document
     }
 }

@@ -91,7 +91,7 @@ fn several_layers_or_all_are_exported_with_their_names() {
     assert_eq!(export("again", &["--layer", "second", "--layer", "drivability"]).1, both);
     assert_eq!(export("one", &["--layer", "second"]).1.len(), 3);
     let (refused, _) = export("none", &["--layer", "second,third"]);
-    assert_eq!(refused.status.code(), Some(1));
+    assert_eq!(refused.status.code(), Some(2));
     assert!(
         text(&refused.stderr).contains("no layer \"third\"; it has drivability, safe_path, second"),
         "{}",
@@ -106,11 +106,11 @@ fn options_that_the_format_does_not_use_are_refused() {
     {
         let done = clearway(&["export", "run.mcap", "--format", format, option, "--out", "x"]);
         let name = option.split('=').next().unwrap();
-        assert!(done.status.code() == Some(2) && text(&done.stderr).contains(name), "{}", text(&done.stderr));
+        assert!(done.status.code() == Some(3) && text(&done.stderr).contains(name), "{}", text(&done.stderr));
     }
     let done = clearway(&["get", "--out", "map.npy", "--rings", "10"]);
     assert!(text(&done.stderr).contains("--rings is for pictures: it needs --out FILE.png"), "{}", text(&done.stderr));
-    assert_eq!(done.status.code(), Some(2));
+    assert_eq!(done.status.code(), Some(3));
 }
 
 #[test]
@@ -169,7 +169,7 @@ fn a_recording_that_is_cut_off_is_exported_as_far_as_it_goes() {
     record(&file, false);
     let paths = [file.to_str().unwrap(), folder.path().to_str().unwrap()];
     let done = clearway(&["export", paths[0], "--layer", "drivability", "--format", "json", "--out", paths[1]]);
-    assert!(done.status.success(), "{}", text(&done.stderr));
+    assert_eq!(done.status.code(), Some(2), "{}", text(&done.stderr));
     assert!(text(&done.stderr).contains("cut after"), "{}", text(&done.stderr));
     assert!(folder.path().join("000001_drivability.json").exists());
 
@@ -181,18 +181,21 @@ fn a_recording_that_is_cut_off_is_exported_as_far_as_it_goes() {
 }
 
 #[test]
-fn an_unknown_layer_is_refused_with_the_names_of_the_layers() {
+fn an_unknown_layer_is_refused_with_the_names_of_the_layers_before_anything_is_written() {
     let folder = folder();
     let file = folder.path().join("run.mcap");
     record(&file, true);
-    let paths = [file.to_str().unwrap(), folder.path().to_str().unwrap()];
-    let done = clearway(&["export", paths[0], "--layer", "roughness", "--format", "png", "--out", paths[1]]);
-    assert_eq!(done.status.code(), Some(1));
-    assert!(
-        text(&done.stderr).contains("no layer \"roughness\"; it has drivability, safe_path"),
-        "{}",
-        text(&done.stderr)
-    );
+    let (path, out) = (file.to_str().unwrap(), folder.path().join("maps"));
+    for layers in ["roughness", "drivability,roughness"] {
+        for format in ["png", "npy", "foxglove"] {
+            let arguments = ["export", path, "--layer", layers, "--format", format, "--out", out.to_str().unwrap()];
+            let done = clearway(&arguments);
+            let error = text(&done.stderr);
+            assert_eq!(done.status.code(), Some(2));
+            assert!(error.contains("no layer \"roughness\"; it has drivability, safe_path"), "{error}");
+            assert!(!out.exists(), "{layers} as {format}");
+        }
+    }
 }
 
 #[test]
@@ -202,12 +205,12 @@ fn a_file_of_an_unknown_kind_is_refused() {
     std::fs::write(&file, "dear reader").unwrap();
     let path = file.to_str().unwrap();
     let info = clearway(&["info", path]);
-    assert_eq!(info.status.code(), Some(1));
+    assert_eq!(info.status.code(), Some(2));
     assert!(text(&info.stderr).contains("not a capture"), "{}", text(&info.stderr));
     let exported = clearway(&["export", path, "--layer", "x", "--format", "png", "--out", path]);
-    assert_eq!(exported.status.code(), Some(1));
+    assert_eq!(exported.status.code(), Some(2));
     assert!(text(&exported.stderr).contains("not an MCAP file"), "{}", text(&exported.stderr));
-    assert_eq!(clearway(&["export", path, "--format", "gif"]).status.code(), Some(2));
+    assert_eq!(clearway(&["export", path, "--format", "gif"]).status.code(), Some(3));
 }
 
 const CONFIG: &str = "[[vehicle]]\nname = 'alpha'\nqueue = 16\n[[vehicle.sensor]]\nname = 'top'\nmodel = 'hdl64e_s2'\n\

@@ -118,7 +118,7 @@ fn an_unknown_channel_is_refused_with_the_names_of_the_channels() {
     let paths = [file.to_str().unwrap(), folder.path().to_str().unwrap()];
     let arguments = ["export", paths[0], "--layer", "drivability", "--format", "png", "--out", paths[1]];
     let done = clearway(&[&arguments[..], &["--channel", "roughness"]].concat());
-    assert_eq!(done.status.code(), Some(1));
+    assert_eq!(done.status.code(), Some(2));
     let expected = "layer drivability has no channel \"roughness\"; it has class, unit_height, segment";
     assert!(text(&done.stderr).contains(expected), "{}", text(&done.stderr));
 }

@@ -8,7 +8,7 @@ const least = (cells) => (cells instanceof Int8Array ? -128 : 0);
 const tableLength = (cells) => 2 ** (8 * cells.BYTES_PER_ELEMENT);
 
 // True if the values of a channel are ids, of which only equality means something.
-export const isId = ({ name, unit }) => unit === "id" || (name === "segment" && unit === "");
+export const isId = ({ unit }) => unit === "id";
 
 // { colours, legend, range, bar }. colours: an ImageData word for each raw value. legend: [[colour or null, text,
 // share?, meaning?]]. The wire gives the classes' colours and meanings; that of "unknown" holds for every channel.

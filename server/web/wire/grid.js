@@ -14,7 +14,7 @@ export function gridOf(layer) {
   throw new DecodeError("geometry", `layer ${layer.name} has none; allowed are radial, cartesian`);
 }
 
-function radial({ row_radius_m, columns }) {
+function radial({ row_radius_m, columns, centre_x_m = 0, centre_y_m = 0 }) {
   const rows = row_radius_m.length;
   if (rows === 0 || columns === 0) {
     throw new DecodeError("geometry", `${rows} rows of ${columns} columns; at least 1 of each is needed`);
@@ -25,6 +25,9 @@ function radial({ row_radius_m, columns }) {
       throw new DecodeError("geometry", `row radius ${row} is ${outer} m; it must be finite and over ${inner} m`);
     }
   });
+  if (!Number.isFinite(centre_x_m + centre_y_m)) {
+    throw new DecodeError("geometry", `centre is (${centre_x_m}, ${centre_y_m}) m; it must be finite`);
+  }
   const radii = Float64Array.from(row_radius_m), perRadian = columns / (2 * Math.PI);
   const rowAt = (r) => {
     let low = 0, high = rows;
@@ -35,15 +38,17 @@ function radial({ row_radius_m, columns }) {
     }
     return low;
   };
-  const cellAt = (x, y) => {
+  const cellAt = (ego_x, ego_y) => {
+    const x = ego_x - centre_x_m, y = ego_y - centre_y_m;
     const row = rowAt(Math.hypot(x, y));
     if (row === rows) return -1;
     const azimuth = Math.atan2(y, x);
     const column = Math.floor((azimuth < 0 ? azimuth + 2 * Math.PI : azimuth) * perRadian);
     return row * columns + Math.min(column, columns - 1);
   };
-  const key = `radial ${columns} ${row_radius_m.join()}`;
-  return { key, radius_m: radii[rows - 1], cellAt, kind: key, shape: [rows, columns], first: [0n, 0n] };
+  const key = `radial ${centre_x_m} ${centre_y_m} ${columns} ${row_radius_m.join()}`;
+  const radius_m = radii[rows - 1] + Math.max(Math.abs(centre_x_m), Math.abs(centre_y_m));
+  return { key, radius_m, cellAt, kind: key, shape: [rows, columns], first: [0n, 0n] };
 }
 
 function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix = 0n, first_iy = 0n }) {

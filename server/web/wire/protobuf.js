@@ -144,7 +144,9 @@ const HEADER = {
   8: ["map_from_ego", message(POSE)], 9: ["speed_mps", optional(double)], 10: ["sensors", repeated(message(SENSOR))],
   11: ["compensation", string],
 };
-const RADIAL = { 1: ["row_radius_m", repeated(float)], 2: ["columns", uint32] };
+const RADIAL = {
+  1: ["row_radius_m", repeated(float)], 2: ["columns", uint32], 3: ["centre_x_m", float], 4: ["centre_y_m", float],
+};
 const CARTESIAN = {
   1: ["origin_x_m", double], 2: ["origin_y_m", double], 3: ["width", uint32], 4: ["height", uint32],
   5: ["cell_m", float], 6: ["yaw_rad", double], 7: ["first_ix", sint64], 8: ["first_iy", sint64],

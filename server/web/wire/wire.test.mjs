@@ -145,6 +145,25 @@ test("wrong cells are refused for the stated reason", () => {
   assertRefused("cells", channel(9, RAW, [1], [1], 1));
 });
 
+// The most memory that `run` allocates for arrays, in bytes.
+function allocated(run) {
+  const before = process.memoryUsage().arrayBuffers;
+  run();
+  return process.memoryUsage().arrayBuffers - before;
+}
+
+test("20 bytes that claim many cells allocate no more than they are worth", () => {
+  const few = [[], [0xff], Array(20).fill(0xff), Array(20).fill(0), [0, 0, 0, 0x80], Array(19).fill(0x55)];
+  for (const count of [2 ** 28, 2 ** 32 - 1, limits.CHANNEL_CELLS_MAX]) {
+    for (const payload of few) {
+      const given = channel(U16, ROWS, payload, [], count);
+      const reason = count > limits.CHANNEL_CELLS_MAX ? "too_many_cells" : "cells";
+      const bytes = allocated(() => assertRefused(reason, given));
+      assert.ok(bytes < 64 << 10, `${bytes} bytes for ${count} cells in ${payload.length} bytes`);
+    }
+  }
+});
+
 test("random bytes as changes give an error and no other exception", () => {
   let seed = 3;
   const byte = () => (seed = (Math.imul(seed, 1664525) + 1013904223) >>> 0) >>> 24;
@@ -192,6 +211,13 @@ test("columns run counter-clockwise from ahead, and an outer radius belongs to i
   assert.equal(grid.cellAt(3, -1e-18), 11);
   assert.equal(grid.cellAt(4.01, 0), -1);
   assert.throws(() => gridOf({ radial: { row_radius_m: [2, 1], columns: 4 } }), /row radius 1 is 1 m/);
+});
+
+test("a radial grid is addressed about its own centre", () => {
+  const grid = gridOf({ radial: { row_radius_m: [1, 2.5], columns: 12, centre_x_m: 1.5, centre_y_m: -0.5 } });
+  assert.deepEqual([grid.cellAt(1.6, -0.4), grid.cellAt(4.1, -0.5), grid.cellAt(-0.9, -0.4)], [1, -1, 17]);
+  assert.equal(grid.radius_m, 4);
+  assert.throws(() => gridOf({ radial: { row_radius_m: [1], columns: 4, centre_x_m: NaN } }), /centre is \(NaN, 0\)/);
 });
 
 test("a Cartesian cell contains its lower edge", () => {

@@ -100,10 +100,11 @@ fn add(sum: &mut Outcome, outcome: &Outcome) {
     sum.lost += outcome.lost;
     sum.read = (sum.read.0 + outcome.read.0, sum.read.1 + outcome.read.1);
     sum.healed_in = sum.healed_in.max(outcome.healed_in);
+    sum.fresh_in = sum.fresh_in.max(outcome.fresh_in);
 }
 
 fn report(seeds: u64, sum: &Outcome, failures: &[Failure], seconds: f64) {
-    let Outcome { events, maps, refused, lost, read: (read, skipped), healed_in, .. } = sum;
+    let Outcome { events, maps, refused, lost, read: (read, skipped), healed_in, fresh_in, .. } = sum;
     let simulated = sum.simulated_ns as f64 * 1e-9;
     println!("{seeds} seeds, {} failed", failures.len());
     println!(
@@ -115,7 +116,7 @@ fn report(seeds: u64, sum: &Outcome, failures: &[Failure], seconds: f64) {
     println!(
         "{events} events, {refused} refused, {lost} lost, {maps} maps; readers received {read} and skipped {skipped}"
     );
-    println!("recovered at most {healed_in} revolutions after the faults");
+    println!("whole at most {healed_in} revolutions after the faults, fresh at most {fresh_in}");
     if !failures.is_empty() {
         let seeds: Vec<String> = failures.iter().map(|failure| failure.seed.to_string()).collect();
         println!("failing seeds: {}", seeds.join(" "));

@@ -98,12 +98,12 @@ pub fn nothing_free(drive: &Drive, covered_deg: &Range<i64>, map: &Map) -> Resul
 /// Centre of a cell, ego frame, in metres.
 pub fn centre(layer: &Layer, cell: usize) -> [f64; 2] {
     match &layer.geometry {
-        Geometry::Radial { row_radius_m, columns } => {
+        Geometry::Radial { centre_m, row_radius_m, columns } => {
             let (row, column) = (cell / usize::from(*columns), cell % usize::from(*columns));
             let inner = if row == 0 { 0.0 } else { f64::from(row_radius_m[row - 1]) };
             let range = (inner + f64::from(row_radius_m[row])) / 2.0;
             let angle = (column as f64 + 0.5) * std::f64::consts::TAU / f64::from(*columns);
-            [range * angle.cos(), range * angle.sin()]
+            [f64::from(centre_m[0]) + range * angle.cos(), f64::from(centre_m[1]) + range * angle.sin()]
         }
         &Geometry::Cartesian { origin_x_m, origin_y_m, width, cell_m, yaw_rad, .. } => {
             let at = |origin: f64, index: usize| origin + (index as f64 + 0.5) * f64::from(cell_m);

@@ -12,6 +12,10 @@ use super::test_bed::TestBed;
 /// After the faults have ended, every sensor must be whole and in the map within this many revolutions.
 pub const REVOLUTIONS_TO_HEAL: i64 = 4;
 
+/// After the faults have ended, the newest map must be fresh within this many revolutions: a planner's clock and the
+/// stamps agree again.
+pub const REVOLUTIONS_TO_FRESH: i64 = 8;
+
 /// A run without a violation.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Outcome {
@@ -29,6 +33,8 @@ pub struct Outcome {
     pub read: (u64, u64),
     /// Revolutions from the end of the faults until every sensor was whole again.
     pub healed_in: i64,
+    /// Revolutions from the end of the faults until the newest map was fresh.
+    pub fresh_in: i64,
     /// True if the recording holds every event and map.
     pub recorded: bool,
     /// Hash of every map and of the recording.
@@ -46,6 +52,11 @@ impl TestBed<'_> {
                 "converge",
                 format!("not whole {healed_in} revolutions after the end of the faults: {last}"),
             ));
+        }
+        let fresh_in = revolutions(self.stale_ns);
+        if fresh_in > REVOLUTIONS_TO_FRESH {
+            let found = format!("not fresh {fresh_in} revolutions after the end of the faults: {last}");
+            return Err(violation("fresh", found));
         }
         let newest_ns = self.engine.pipeline.newest_map().map_or(0, |map| map.completed_ns);
         if self.clock.load(Ordering::Relaxed) - newest_ns > 2 * REVOLUTION_NS {
@@ -76,6 +87,7 @@ impl TestBed<'_> {
             lost: snapshot.ledger.lost,
             read: (sum(&|reader| reader.updates), sum(&|reader| reader.skipped)),
             healed_in,
+            fresh_in,
             ..Outcome::default()
         };
         self.check_recording(outcome, hasher)

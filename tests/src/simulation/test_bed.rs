@@ -49,8 +49,12 @@ pub(super) struct TestBed<'a> {
     pub(super) vehicles: Vehicles,
     pub(super) maps: Vec<Arc<EncodedMap>>,
     pub(super) taken: u64,
+    /// Epoch of the newest map.
+    pub(super) epoch: u32,
     /// Completion of the newest map in which a sensor was not whole.
     pub(super) unhealthy_ns: i64,
+    /// End of the newest tick in which a planner on the server's host could not use the newest map.
+    pub(super) stale_ns: i64,
 
     pub(super) networks: Vec<Impairment>,
     /// Datagrams on their way, by arrival time and number.
@@ -128,7 +132,9 @@ impl<'a> TestBed<'a> {
             vehicles: Vehicles(vec![Served { status, newest: receiver }].into()),
             maps: Vec::new(),
             taken: 0,
+            epoch: 0,
             unhealthy_ns: 0,
+            stale_ns: 0,
             networks: plan.networks.iter().map(|faults| Impairment::new(*faults)).collect(),
             arriving: BTreeMap::new(),
             datagrams: 0,
@@ -161,6 +167,7 @@ impl<'a> TestBed<'a> {
                 let snapshot = self.vehicles.0[0].status.snapshot();
                 accounts(self.offered, &snapshot.ledger, &snapshot.sensors)?;
             }
+            self.check_age();
             for reader in &mut self.readers {
                 reader.poll_at(self.now_ns, &self.vehicles, &self.maps, self.injected)?;
             }
@@ -201,11 +208,15 @@ impl<'a> TestBed<'a> {
             return Err(violation("map", format!("number {} after {} maps", encoded.sequence, self.maps.len())));
         }
         let stuck = self.injected == Some(InjectedFault::StuckStamp);
-        if let Some(before) = self.maps.last().filter(|before| stuck || before.capture_end_ns >= encoded.capture_end_ns)
-        {
-            let back_ms = before.capture_end_ns.saturating_sub(encoded.capture_end_ns) / 1_000_000;
-            let found = format!("{back_ms} ms before map {}: {}", before.sequence, describe(map));
-            return Err(violation("stamps", found));
+        let announced = map.epoch.checked_sub(std::mem::replace(&mut self.epoch, map.epoch));
+        if let Some(before) = self.maps.last() {
+            let goes_back = stuck || before.capture_end_ns >= encoded.capture_end_ns;
+            if announced != Some(u32::from(goes_back)) {
+                let back_ms = before.capture_end_ns.saturating_sub(encoded.capture_end_ns) / 1_000_000;
+                let found =
+                    format!("{back_ms} ms before map {}, epoch {}: {}", before.sequence, map.epoch, describe(map));
+                return Err(violation("stamps", found));
+            }
         }
         if let Some((sector, when)) = &self.plan.covered {
             let at_ns = map.completed_ns - self.drive.rig.start_ns - self.plan.offset_ns;
@@ -221,6 +232,15 @@ impl<'a> TestBed<'a> {
         }
         self.maps.push(encoded);
         Ok(())
+    }
+
+    /// Notes whether the newest map is too old, or too far ahead of the host's clock.
+    fn check_age(&mut self) {
+        let valid_ns = i64::from(self.engine.valid_ms) * 1_000_000;
+        let age_ns = |map: &Arc<EncodedMap>| self.clock.load(Ordering::Relaxed).saturating_sub(map.capture_end_ns);
+        if self.maps.last().is_none_or(|map| age_ns(map).saturating_abs() > valid_ns) {
+            self.stale_ns = self.now_ns;
+        }
     }
 
     pub fn instant(&self) -> Instant {

@@ -5,12 +5,11 @@ use std::sync::{Arc, Weak};
 
 use clearway::encode::EncodedMap;
 use clearway_proto::v1;
-use clearway_proto::v1::map_service_client::MapServiceClient;
+use clearway_tests::attack::http2::{WATCH, call, opening, reset};
+use clearway_tests::attack::sockets::{Opening, hold};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
-use tonic::Code;
-use tonic::transport::Channel;
 
 use super::fixture::{self, config, feed, sequence, start, until, within};
 use super::{Reader, keeps_up, of_layer, plain, portions};
@@ -114,58 +113,18 @@ async fn stopped_and_slow_readers_cost_the_others_nothing_and_resume_newest() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
-async fn idle_connections_are_limited_and_the_next_peer_is_told_the_limit() {
+async fn a_thousand_idle_connections_keep_no_reader_and_no_newcomer_out() {
     let mut config = config();
     config.grpc.connections_max = 32;
     let running = start(config).await;
     let server = running.grpc.unwrap();
     let mut healthy = Reader::open(&mut plain(server).await, of_layer(1)).await.unwrap();
-    let mut idle = Vec::new();
-    for _ in 0..1000 {
-        let mut connection = TcpStream::connect(server).await.unwrap();
-        // The HTTP/2 preface, so that the connection counts as alive; some are closed before it.
-        let _ = connection.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").await;
-        idle.push(connection);
-    }
+    let idle = within("idle connections", hold(server, 1000, Opening::Http2Preface)).await.unwrap();
     keeps_up(&mut healthy, &running).await;
-    // Connections over the limit are also limited. Once there are fewer, a new peer is told why it is refused.
-    let status = within("an answer", async {
-        loop {
-            let channel = Channel::from_shared(format!("http://{server}")).unwrap().connect_lazy();
-            let request = v1::ListVehiclesRequest {};
-            match MapServiceClient::new(channel).list_vehicles(request).await {
-                Err(status) if status.code() == Code::ResourceExhausted => return status,
-                // Closed without an answer.
-                Err(_) => {}
-                Ok(_) => panic!("all connections are in use"),
-            }
-        }
-    })
-    .await;
-    assert!(status.message().starts_with("32 connections are open, which grpc.connections_max allows"), "{status}");
+    let newcomer = fixture::grpc(&running).await.list_vehicles(v1::ListVehiclesRequest {}).await;
+    assert_eq!(newcomer.expect("it takes the place of an idle one").into_inner().vehicles.len(), 1);
     drop(idle);
-    within("a free connection", async {
-        let connect = || Channel::from_shared(format!("http://{server}")).unwrap().connect_lazy();
-        while MapServiceClient::new(connect()).list_vehicles(v1::ListVehiclesRequest {}).await.is_err() {}
-    })
-    .await;
     within("shutdown", running.shutdown()).await.unwrap();
-}
-
-/// An HTTP/2 frame.
-fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
-    let length = u32::try_from(payload.len()).unwrap().to_be_bytes();
-    [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
-}
-
-/// Opens a `Watch`, and resets it.
-fn open_and_reset(stream: u32) -> Vec<u8> {
-    let path = b"/clearway.v1.MapService/Watch";
-    let kind = b"application/grpc";
-    // POST, http; path, authority and content-type as literals.
-    let headers =
-        [&[0x83, 0x86, 0x04, path.len() as u8], &path[..], b"\x01\x01x\x0f\x10", &[kind.len() as u8], kind].concat();
-    [frame(1, 4, stream, &headers), frame(3, 0, stream, &8u32.to_be_bytes())].concat()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
@@ -174,8 +133,8 @@ async fn a_client_that_resets_streams_in_a_loop_loses_only_its_own_connection() 
     let server = running.grpc.unwrap();
     let mut healthy = Reader::open(&mut plain(server).await, of_layer(1)).await.unwrap();
     let mut hostile = TcpStream::connect(server).await.unwrap();
-    let mut frames = [&b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"[..], &frame(4, 0, 0, &[])].concat();
-    (0..20_000).for_each(|index| frames.extend(open_and_reset(2 * index + 1)));
+    let mut frames = opening(65_535);
+    (0..20_000).for_each(|index| frames.extend([call(2 * index + 1, WATCH), reset(2 * index + 1)].concat()));
     // The server may close the connection before it has read everything.
     let _ = hostile.write_all(&frames).await;
     let mut answer = Vec::new();

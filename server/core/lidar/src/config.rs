@@ -2,7 +2,7 @@
 
 use crate::calibration::Calibration;
 use crate::model::Model;
-use crate::time::clock::GPS_LATE_NS_MAX;
+use crate::time::clock::{AHEAD_NS_MAX, GPS_LATE_NS_MAX};
 
 /// Properties of a sensor that are known before its first datagram. The default finds everything in the data and cuts
 /// revolutions at azimuth 180 degrees, behind the vehicle.
@@ -18,10 +18,20 @@ pub struct SensorConfig {
     pub cut_azimuth_deg: f32,
     /// Greatest age of GPS time at its arrival, in ns; older GPS time is ignored ([`crate::clock`]).
     pub gps_late_ns_max: i64,
+    /// Greatest time, in ns, by which stamps may be ahead of the clock that they follow; if they are ahead by more,
+    /// they go back and a new epoch begins. 0: stamps never go back ([`crate::clock`]).
+    pub ahead_ns_max: i64,
 }
 
 impl Default for SensorConfig {
     fn default() -> Self {
-        Self { model: None, rpm: None, calibration: None, cut_azimuth_deg: 180.0, gps_late_ns_max: GPS_LATE_NS_MAX }
+        Self {
+            model: None,
+            rpm: None,
+            calibration: None,
+            cut_azimuth_deg: 180.0,
+            gps_late_ns_max: GPS_LATE_NS_MAX,
+            ahead_ns_max: AHEAD_NS_MAX,
+        }
     }
 }

@@ -51,6 +51,8 @@ pub struct SensorStatus {
     pub clock: Option<Clock>,
     /// Time by which the host's clock is ahead of that clock, in ms ([`crate::Revolution::clock_offset_ms`]).
     pub clock_offset_ms: i64,
+    /// Number of the epoch of the newest revolution ([`crate::Revolution::epoch`]).
+    pub epoch: u32,
     /// State of the pulse per second in the newest telemetry.
     pub pps: Option<Pps>,
     /// GPRMC of the newest telemetry.

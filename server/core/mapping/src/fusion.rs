@@ -377,6 +377,7 @@ fn sensor_state(scan: &SensorScan, contribution: Contribution, stamp_ns: i64) ->
         contribution,
         clock: scan.state.clock,
         clock_offset_ms: scan.state.clock_offset_ms,
+        epoch: scan.state.epoch,
         elevations: scan.state.elevations,
         age_ms: (scan.completed > 0).then(|| (age_ns as f64 / NS_PER_MS as f64) as f32),
         ..counts

@@ -195,7 +195,13 @@ impl Inputs {
     }
 
     fn add_sensor(&mut self, sensor: &SensorConfig, calibration: Option<Calibration>) {
-        let pipeline = SensorPipeline::new(sensor, calibration, self.config.body.as_ref(), self.extras);
+        let pipeline = SensorPipeline::new(
+            sensor,
+            self.config.time.ahead_ns_max(),
+            calibration,
+            self.config.body.as_ref(),
+            self.extras,
+        );
         self.scans.push(SensorScan::new(&sensor.name, pipeline.origin_m(), pipeline.tilt_rad()));
         self.sensors.push(pipeline);
     }

@@ -17,6 +17,9 @@ pub struct Map {
     /// Stamp of the source's last firing, ns since the Unix epoch. All points are expressed in the ego frame of this
     /// stamp, and the age of the map counts from it.
     pub capture_end_ns: i64,
+    /// Number of the epoch of `capture_end_ns`: how often it was not later than that of the map before. Within an epoch
+    /// it rises.
+    pub epoch: u32,
     /// Arrival of the event that completed the map, ns since the Unix epoch, host clock.
     pub completed_ns: i64,
     /// Ego frame in the world frame at `capture_end_ns`, interpolated; `None` if no pose is near enough.
@@ -62,6 +65,8 @@ pub struct SensorState {
     pub clock: &'static str,
     /// Offset of the host's clock from the stamps, ms; positive if the host's clock is ahead.
     pub clock_offset_ms: i64,
+    /// Number of the epoch of the sensor's stamps: how often they have gone back.
+    pub epoch: u32,
     /// Source of the elevations of the lasers; `None` before the first scan.
     pub elevations: Option<ElevationSource>,
     /// Whether the newest scan is in the map.

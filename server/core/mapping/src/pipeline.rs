@@ -30,6 +30,7 @@ use crate::sensor::sweep::Sweep;
 pub struct Pipeline {
     maps: MapsConfig,
     deadline_ns: i64,
+    has_epochs: bool,
     clock: EventClock,
     inputs: Inputs,
     ledgers: Ledgers,
@@ -82,6 +83,7 @@ impl Pipeline {
             reference: ReferenceChoice::new(is_named || config.sensors.len() == 1, config.fusion.deadline_ns()),
             maps: config.maps.clone(),
             deadline_ns: config.fusion.deadline_ns(),
+            has_epochs: config.time.ahead_ms_max > 0,
             clock: EventClock::default(),
             inputs,
             ledgers: Ledgers::new(config.sensors.len()),
@@ -99,7 +101,7 @@ impl Pipeline {
     /// # Errors
     /// [`EventError`] if the event is refused; then it changes nothing but the ledgers.
     pub fn step(&mut self, event: &Event) -> Result<Option<&Map>, EventError> {
-        let now = self.clock.advance(event.arrival_ns);
+        let now = self.clock.advance(event);
         let outcome = self.inputs.apply(event, now);
         self.ledgers.record(event, &outcome);
         let completed = outcome?.completed_scan.map(|_| event.source);
@@ -235,6 +237,8 @@ impl Pipeline {
     /// Begins the next map in place of the newest one: all but its sequence and its layers.
     fn begin_map(&mut self, merged: MergedScans, now: EventTime) {
         let map = &mut self.map;
+        let goes_back = self.maps_made > 0 && merged.end_ns <= map.capture_end_ns;
+        map.epoch = map.epoch.saturating_add(u32::from(goes_back && self.has_epochs));
         (map.capture_start_ns, map.capture_end_ns) = (merged.start_ns, merged.end_ns);
         map.completed_ns = now.arrival_ns;
         (map.map_from_ego, map.speed_mps) = (merged.map_from_ego, merged.speed_mps);

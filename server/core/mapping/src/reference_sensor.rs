@@ -12,6 +12,8 @@ use crate::sensor::scan::SensorScan;
 const UPRIGHT_RAD_MAX: f32 = 0.35;
 /// Number of directions around the sensor that are distinguished. Ours: a gap between buildings is narrower.
 const SECTORS: u32 = 12;
+/// Least number of directions in which a sensor that sees all around has returns. Ours: an open side has none.
+const SECTORS_ALL_AROUND: u32 = 9;
 
 /// Properties by which sensors are compared, the most important first; of two equal sensors the one configured first is
 /// chosen.
@@ -19,8 +21,9 @@ const SECTORS: u32 = 12;
 struct Merits {
     has_elevations: bool,
     is_upright: bool,
-    sectors: u32,
+    sees_all_around: bool,
     lasers: usize,
+    sectors: u32,
     /// Tilt in whole steps of 5 degrees, negative.
     uprightness: i32,
 }
@@ -32,31 +35,45 @@ pub(crate) struct ReferenceChoice {
     deadline_ns: i64,
     /// Event time of the first completed scan, ns.
     first_ns: Option<i64>,
+    /// For each sensor, true if it has completed a whole scan.
+    is_known: Vec<bool>,
+    /// Number of sensors with a whole scan when the scans decided last.
+    decided_by: Option<usize>,
 }
 
 impl ReferenceChoice {
     /// A choice before the first event; it is made already if the configuration names the sensor or has only one.
     pub fn new(is_decided: bool, deadline_ns: i64) -> Self {
-        Self { is_decided, deadline_ns, first_ns: None }
+        Self { is_decided, deadline_ns, first_ns: None, is_known: Vec::new(), decided_by: None }
     }
 
     /// The reference sensor by the configuration alone: `lasers_configured` has the number of lasers of each sensor
     /// whose elevations are configured, else 0.
     pub fn by_configuration(scans: &[SensorScan], lasers_configured: &[usize]) -> usize {
-        let merits = |(scan, lasers): (&SensorScan, &usize)| Merits { sectors: 0, ..merits(scan, *lasers) };
+        let merits = |(scan, lasers): (&SensorScan, &usize)| Merits {
+            sees_all_around: false,
+            sectors: 0,
+            ..merits(scan, *lasers)
+        };
         best(scans.iter().zip(lasers_configured).map(merits))
     }
 
-    /// The reference sensor by the scans, when they decide: after a completed scan, once.
+    /// The reference sensor by the scans, when they decide: after a completed scan.
     pub fn by_scans(&mut self, scans: &[SensorScan], now: EventTime) -> Option<usize> {
         if self.is_decided {
             return None;
         }
         let since_ns = now.event_ns.saturating_sub(*self.first_ns.get_or_insert(now.event_ns));
-        if since_ns <= self.deadline_ns && scans.iter().any(|scan| scan.completed == 0) {
+        self.is_known.resize(scans.len(), false);
+        for (is_known, scan) in self.is_known.iter_mut().zip(scans) {
+            *is_known |= scan.completed > 0 && scan.state.partial.is_empty();
+        }
+        let known = self.is_known.iter().filter(|is_known| **is_known).count();
+        self.is_decided = known == scans.len();
+        if !self.is_decided && (since_ns <= self.deadline_ns || self.decided_by == Some(known)) {
             return None;
         }
-        self.is_decided = true;
+        self.decided_by = Some(known);
         let lasers = |scan: &SensorScan| scan.sweep.calibration.as_ref().map_or(0, |table| table.lasers.len());
         Some(best(scans.iter().map(|scan| merits(scan, lasers(scan)))))
     }
@@ -81,8 +98,9 @@ fn merits(scan: &SensorScan, lasers: usize) -> Merits {
     Merits {
         has_elevations: lasers > 0,
         is_upright: scan.tilt_rad <= UPRIGHT_RAD_MAX,
-        sectors: seen.count_ones(),
+        sees_all_around: seen.count_ones() >= SECTORS_ALL_AROUND,
         lasers,
+        sectors: seen.count_ones(),
         uprightness: -((scan.tilt_rad.to_degrees() / 5.0) as i32),
     }
 }

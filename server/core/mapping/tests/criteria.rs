@@ -13,6 +13,7 @@ use clearway_mapping::layer::radial_grid::{ring_radii_m, row_radii_m};
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
+use proptest::prelude::*;
 
 const UNKNOWN: u8 = DrivabilityClass::Unknown.value();
 const DRIVABLE: u8 = DrivabilityClass::Drivable.value();
@@ -168,6 +169,56 @@ fn criterion_3_a_passage_narrower_than_3_m_is_not_crossed() {
     assert_eq!(class(&map(&DrivabilityConfig::default(), &passage(1.0)), behind, 0), NOT_DRIVABLE);
     let open = DrivabilityConfig { passage_m_min: 0.0, ..DrivabilityConfig::default() };
     assert_eq!(class(&map(&open, &passage(1.0)), behind, 0), DRIVABLE);
+}
+
+/// The opening of [`walled_bank`].
+#[derive(Clone, Debug)]
+enum Opening {
+    /// In the wall across the rows, this many columns wide.
+    Columns(usize),
+    /// In the wall along the first column, this many rows deep.
+    Rows(usize),
+}
+
+/// A bank 0.14 m high between columns 30 and 90, from `first_row` outwards, behind a wall one cell thick with one
+/// opening, and the width of the opening, metres.
+fn walled_bank(first_row: usize, opening: &Opening) -> (Sweep, f32) {
+    let is_open = |row: usize, column: usize| match opening {
+        Opening::Columns(columns) => row == first_row && (40..40 + columns).contains(&column),
+        Opening::Rows(rows) => column == 30 && (first_row + 2..first_row + 2 + rows).contains(&row),
+    };
+    let sweep = painted(|row, column, _, _| {
+        let is_bank = row >= first_row && (30..=90).contains(&column);
+        let is_wall = is_bank && (row == first_row || column == 30 || column == 90) && !is_open(row, column);
+        Some(if is_wall {
+            1.0
+        } else if is_bank {
+            0.14
+        } else {
+            0.0
+        })
+    });
+    let radii = row_radii_m(&ring_radii_m(&Calibration::factory(Model::Hdl64eS2), HEIGHT_M, 60.0), 60.0);
+    let width_m = match opening {
+        Opening::Columns(columns) => *columns as f32 * radii[first_row - 1] * 1f32.to_radians(),
+        Opening::Rows(rows) => radii[first_row + 1 + rows] - radii[first_row + 1],
+    };
+    (sweep, width_m)
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(40))]
+
+    #[test]
+    fn criterion_3_a_passage_is_crossed_exactly_if_it_is_as_wide_as_configured(
+        first_row in 12usize..36, opening in prop_oneof![(3usize..40).prop_map(Opening::Columns),
+        (3usize..12).prop_map(Opening::Rows)], wider in prop::sample::select(vec![0.5f32, 0.9, 0.99, 1.01, 1.1, 2.0]),
+    ) {
+        let (sweep, width_m) = walled_bank(first_row, &opening);
+        let config = DrivabilityConfig { passage_m_min: width_m / wider, ..DrivabilityConfig::default() };
+        let expected = if wider >= 1.0 { DRIVABLE } else { NOT_DRIVABLE };
+        prop_assert_eq!(class(&map(&config, &sweep), first_row + 5, 60), expected, "{} m wide", width_m);
+    }
 }
 
 #[test]

@@ -4,7 +4,7 @@ use bytes::Bytes;
 use clearway_lidar::BlockedSector;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::{Model, ReturnMode};
-use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::config::{Extrinsics, MapsConfig, SensorConfig, TimeConfig, VehicleConfig};
 use clearway_mapping::event::{Body, Event};
 use clearway_mapping::layer::{Cells, Geometry, Layer};
 use clearway_mapping::map::Map;
@@ -31,6 +31,7 @@ fn config(model: Model) -> VehicleConfig {
         extrinsics,
     };
     VehicleConfig {
+        time: TimeConfig::default(),
         name: "car-1".into(),
         sensors: vec![sensor],
         fusion: Default::default(),
@@ -153,7 +154,7 @@ fn covered(
 /// Middle of a cell, ego frame, metres.
 fn middle(geometry: &Geometry, cell: usize) -> (f64, f64) {
     match geometry {
-        Geometry::Radial { row_radius_m, columns } => {
+        Geometry::Radial { row_radius_m, columns, .. } => {
             let (row, column) = (cell / usize::from(*columns), cell % usize::from(*columns));
             let inner = if row == 0 { 0.0 } else { f64::from(row_radius_m[row - 1]) };
             let (r, angle) =

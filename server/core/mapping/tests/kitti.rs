@@ -7,7 +7,6 @@ mod common;
 use clearway_mapping::config::{DrivabilityConfig, DrivabilityVariant, Passage, PlaneTest, Seed};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
-use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::sensor::sweep::Sweep;
 use common::labels::*;
@@ -28,7 +27,7 @@ struct Labelled {
 
 fn by_cell(sweep: &Sweep, labels: &[u32], layer: &Layer) -> Labelled {
     let (rows, columns) = size(layer);
-    let grid = RadialGrid::new(benches(layer).to_vec(), columns as u16);
+    let grid = radial_grid(layer);
     let cells = rows * columns;
     let TruthByCell { road, free, obstacle } = truth_by_cell(sweep, labels, cells, |x, y| grid.cell(x, y));
 
@@ -100,16 +99,7 @@ fn the_labelled_frame_reaches_its_targets() {
 fn each_step_of_the_thesis_has_its_price_on_the_labelled_frame() {
     let own = DrivabilityConfig::default();
     let whole_boundary = DrivabilityConfig { plane_test: PlaneTest::WholeBoundary, ..own.clone() };
-    let thesis = DrivabilityConfig {
-        offset_m: 0.0,
-        bridge_rows: 0,
-        close_gaps: false,
-        step_m_max: 0.5,
-        grade_max: 0.0,
-        plane_test: PlaneTest::WholeBoundary,
-        passage: Passage::BetweenSegments,
-        ..own.clone()
-    };
+    let thesis = thesis_with_own_seeds();
     assert_eq!((own.seed, thesis.seed), (Seed::BlindZone, Seed::BlindZone));
     let [.., reachable] = shares(&own, Over::Plane);
     let [.., of_boundaries] = shares(&whole_boundary, Over::Plane);

@@ -10,7 +10,6 @@ use clearway_mapping::config::{DrivabilityConfig, HeightDifferenceConfig, Seed, 
 use clearway_mapping::event::Scan;
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::height_difference::HeightDifference;
-use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::layer::terrain::Terrain;
 use clearway_mapping::layer::terrain::class::TerrainClass;
 use clearway_mapping::layer::{Context, LayerMaker};
@@ -57,16 +56,17 @@ proptest! {
 
     #[test]
     fn over_the_plane_a_cell_is_known_exactly_if_it_contains_a_point(
-        model in models(), height in 0.1f32..4.0, points in points(), config in config(), seed in any::<u64>(),
+        model in models(), height in 0.1f32..4.0, place in [-3f32..3.0, -3f32..3.0], points in points(),
+        config in config(), seed in any::<u64>(),
     ) {
-        let mut sweep = Sweep { mount_height_m: height, ..empty(model) };
+        let mut sweep = Sweep { mount_height_m: height, mount_m: place, ..empty(model) };
         points.iter().for_each(|point| add(&mut sweep, *point));
         let mut map = Drivability::new(&config);
         let mut layer = map.layer();
         map.make(&sweep, &Context::default(), &mut layer);
 
         let (rows, columns) = size(&layer);
-        let grid = RadialGrid::new(benches(&layer).to_vec(), columns as u16);
+        let grid = radial_grid(&layer);
         let mut held = vec![false; rows * columns];
         for [x, y, z] in &points {
             if let Some(cell) = grid.cell(*x, *y) {

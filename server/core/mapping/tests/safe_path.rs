@@ -83,6 +83,21 @@ fn a_path_leads_through_a_passage_as_wide_as_the_vehicle_and_no_narrower() {
 }
 
 #[test]
+fn the_vehicle_joins_a_line_straight_through_a_gate_only_if_it_fits_through_the_gate() {
+    let side = 80;
+    for gate in [4, 6, 8, 10, 12, 14, 16, 18] {
+        for (wider, across_x) in [(0.95, true), (0.95, false), (1.01, true), (1.05, true), (1.05, false), (1.2, true)] {
+            // The gate is right ahead of the vehicle, which stands between the two middle cells.
+            let states = court_with_passage(side, (side - gate) / 2, gate, across_x);
+            let (_, links) = paths(side, &states, gate as f64 * wider);
+            let beyond = |point: &Point| point.position[usize::from(!across_x)] > 2 * (side as i32 / 2 + 13);
+            let case = format!("gate {gate}, vehicle {wider} times as wide, x {across_x}");
+            assert_eq!(links.points().iter().any(beyond), wider <= 1.0, "{case}");
+        }
+    }
+}
+
+#[test]
 fn a_corridor_has_its_middle_line_with_half_its_width_as_radius() {
     let side = 60;
     for free in [7usize, 8] {

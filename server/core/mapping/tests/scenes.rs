@@ -9,12 +9,11 @@
 
 mod common;
 
-use clearway_mapping::config::{DrivabilityConfig, DrivabilityVariant, HeightDifferenceConfig, Passage, PlaneTest};
+use clearway_mapping::config::{DrivabilityConfig, DrivabilityVariant, HeightDifferenceConfig};
 use clearway_mapping::layer::drivability::Drivability;
 use clearway_mapping::layer::drivability::class::DrivabilityClass;
 use clearway_mapping::layer::height_difference::HeightDifference;
 use clearway_mapping::layer::height_difference::class::HeightDifferenceClass;
-use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::layer::{Context, Layer, LayerMaker};
 use clearway_mapping::sensor::sweep::{Mount, Sweep};
 use clearway_sim::ground::{Ground, Profile};
@@ -59,7 +58,7 @@ fn height_difference(sweep: &Sweep) -> Layer {
 fn voted(scan: &SimulatedScan, layer: &Layer) -> Vec<Option<Truth>> {
     const CLASSES: [Truth; 4] = [Truth::Unreachable, Truth::Steep, Truth::Tight, Truth::Drivable];
     let (rows, columns) = size(layer);
-    let grid = RadialGrid::new(benches(layer).to_vec(), columns as u16);
+    let grid = radial_grid(layer);
     let mut votes = vec![([0u32; 4], false); rows * columns];
     for ((&x, &y), &z) in scan.sweep.x.iter().zip(&scan.sweep.y).zip(&scan.sweep.z) {
         let (Some(cell), Some(ground)) = (grid.cell(x, y), scan.truth.height_at(x.into(), y.into())) else { continue };
@@ -207,8 +206,7 @@ fn the_baseline_fails_as_the_thesis_reports() {
 
 /// The map as text: one character for each 2 m, x up, y left; the vehicle is in the middle.
 fn drawing(layer: &Layer) -> String {
-    let (_, columns) = size(layer);
-    let grid = RadialGrid::new(benches(layer).to_vec(), columns as u16);
+    let grid = radial_grid(layer);
     let line = |i: i32| {
         let cell = |j: i32| {
             let (x, y) = (2.0 * i as f32 + 0.5, 2.0 * j as f32 + 0.5);
@@ -235,17 +233,7 @@ fn the_maps_of_the_four_scenes_equal_the_snapshots() {
 #[test]
 fn the_thesis_whole_comes_near_its_table_in_the_simulated_scenes() {
     let paper = DrivabilityConfig { variant: DrivabilityVariant::Paper, ..DrivabilityConfig::default() };
-    // The same with seeds in the whole blind zone.
-    let seeded = DrivabilityConfig {
-        offset_m: 0.0,
-        bridge_rows: 0,
-        close_gaps: false,
-        step_m_max: 0.5,
-        grade_max: 0.0,
-        plane_test: PlaneTest::WholeBoundary,
-        passage: Passage::BetweenSegments,
-        ..DrivabilityConfig::default()
-    };
+    let seeded = thesis_with_own_seeds();
     for scene in scenes::of_the_thesis() {
         let (name, paper_share) = (scene.name, scene.paper_share.unwrap());
         let scan = simulate(scene);

@@ -301,8 +301,8 @@ fn called(layer: &Layer) -> Option<Vec<Called>> {
 /// A function that finds the cell of a position in the ego frame, in metres.
 fn locate(geometry: &Geometry) -> Box<dyn Fn([f32; 3]) -> Option<usize>> {
     match *geometry {
-        Geometry::Radial { ref row_radius_m, columns } => {
-            let grid = RadialGrid::new(row_radius_m.clone(), columns);
+        Geometry::Radial { centre_m, ref row_radius_m, columns } => {
+            let grid = RadialGrid::new(centre_m, row_radius_m.clone(), columns);
             Box::new(move |[x, y, _]| grid.cell(x, y))
         }
         Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
@@ -429,7 +429,7 @@ mod tests {
     #[test]
     fn a_radial_layer_is_judged_in_its_own_cells() {
         let radial = Layer {
-            geometry: Geometry::Radial { row_radius_m: vec![1.0], columns: 8 },
+            geometry: Geometry::Radial { centre_m: [0.0; 2], row_radius_m: vec![1.0], columns: 8 },
             channels: vec![Channel { cells: Cells::U8(vec![1, 0, 0, 0, 0, 0, 0, 0]), ..layer().channels.remove(0) }],
             ..layer()
         };

@@ -40,6 +40,7 @@ impl DrawingOptions {
             channel: channel.clone(),
             legend: !plain,
             caption: Vec::new(),
+            stale: false,
         }
     }
 

@@ -12,8 +12,8 @@ use crate::status::sensor_json;
 pub fn layer(map: &MapView, layer: &Layer, with_cells: bool) -> Value {
     let header = map.header();
     let geometry = match &layer.grid {
-        Grid::Radial { row_radius_m, columns } => {
-            json!({"kind": "radial", "row_radius_m": row_radius_m, "columns": columns})
+        Grid::Radial { centre_m, row_radius_m, columns } => {
+            json!({"kind": "radial", "centre_m": centre_m, "row_radius_m": row_radius_m, "columns": columns})
         }
         Grid::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix, first_iy } => json!({
             "kind": "cartesian", "origin_x_m": origin_x_m, "origin_y_m": origin_y_m, "width": width,

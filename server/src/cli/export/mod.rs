@@ -18,6 +18,7 @@ use clearway_client::{Channel, Layer, MapView};
 
 use self::sheet::Sheet;
 use self::viewer_file::{Dialect, ViewerFile};
+use super::exit::Exit;
 use super::files;
 use super::output::{counted, print_line, progress_bar, usage_error};
 use crate::encode::picture::{self, Style};
@@ -127,15 +128,36 @@ fn check(options: &Options) -> Result<()> {
     Ok(())
 }
 
+/// Checks, before anything is written, that the recording has a map of each layer. The recording is read until all have
+/// been seen, which is seldom far.
+fn check_layers(options: &Options) -> Result<()> {
+    let Options { recording: file, layers, vehicle, .. } = options;
+    let mut recording = McapReader::open(file)?;
+    let mut absent: Vec<&String> = layers.iter().collect();
+    while let Some(name) = absent.first() {
+        let Some(message) = recording.next() else {
+            bail!("{}", nothing_exported(file, &recording, Some(name), vehicle.as_deref()));
+        };
+        let message = message?;
+        if vehicle.as_ref().is_none_or(|only| message.vehicle() == Some(only))
+            && let Some((_, layer)) = message.map_of()
+        {
+            absent.retain(|name| *name != layer);
+        }
+    }
+    Ok(())
+}
+
 /// Exports the maps of the recording.
 ///
 /// # Errors
 /// If a file cannot be read or written; for an unknown layer or vehicle with the names of those in the recording.
-pub fn run(options: &Options) -> Result<()> {
+pub fn run(options: &Options) -> Result<Exit> {
     check(options)?;
     let Options { recording: file, layers, out, vehicle, .. } = options;
     let (_, length) = files::open(file)?;
-    let mut recording = McapReader::salvage(file)?;
+    check_layers(options)?;
+    let mut recording = McapReader::open(file)?;
     let mut output = Output::new(options)?;
     let style = options.drawing.style();
     let progress = progress_bar(length);
@@ -192,11 +214,9 @@ pub fn run(options: &Options) -> Result<()> {
             }
         }
     }
-    if let Some(cut) = recording.incomplete() {
-        eprintln!("clearway: {} is {cut}; the maps before that are exported", file.display());
-    }
-    if let Some(layer) = layers.iter().find(|layer| !maps.contains_key(*layer)) {
-        bail!("{}", nothing_exported(file, &recording, Some(layer), vehicle.as_deref()));
+    let incomplete = recording.incomplete();
+    if let Some(incomplete) = &incomplete {
+        eprintln!("clearway: {} is {incomplete}; the maps of the rest are exported", file.display());
     }
     if maps.is_empty() {
         bail!("{}", nothing_exported(file, &recording, None, vehicle.as_deref()));
@@ -204,7 +224,7 @@ pub fn run(options: &Options) -> Result<()> {
     for (layer, maps) in &maps {
         print_line(&format!("{} of {layer} in {}", counted(*maps, "map"), out.display()))?;
     }
-    Ok(())
+    Ok(Exit::from_incomplete(incomplete.is_some()))
 }
 
 fn decode(message: &Message, file: &Path) -> Result<MapView> {

@@ -10,7 +10,7 @@ use clearway_client::v1;
 use clearway_lidar::Sensor;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::Revolution;
-use clearway_mapping::config::{Extrinsics, SensorConfig};
+use clearway_mapping::config::{Extrinsics, SensorConfig, TimeConfig};
 use clearway_proto::packed::unpack;
 use nalgebra::Isometry3;
 use prost::Message;
@@ -37,6 +37,8 @@ pub struct ScanDecoder(BTreeMap<String, Vec<OneSensor>>);
 struct OneSensor {
     name: String,
     ego_from_sensor: Isometry3<f64>,
+    /// The rule of its vehicle ([`TimeConfig::ahead_ns_max`]).
+    ahead_ns_max: i64,
     decoder: Sensor,
 }
 
@@ -50,8 +52,15 @@ struct Config {
 #[derive(Deserialize)]
 struct Vehicle {
     name: String,
+    /// A recording without this table is older than epochs.
+    #[serde(default = "without_epochs")]
+    time: TimeConfig,
     #[serde(rename = "sensor")]
     sensors: Vec<SensorConfig>,
+}
+
+fn without_epochs() -> TimeConfig {
+    TimeConfig::WITHOUT_EPOCHS
 }
 
 impl ScanDecoder {
@@ -67,7 +76,7 @@ impl ScanDecoder {
                 let name = format!("calibration/{}/{}.yaml", vehicle.name, sensor.name);
                 let table = header.calibrations.get(&name).map(|table| Calibration::load_str(table));
                 let table = table.transpose().with_context(|| format!("attachment {name}"))?;
-                Ok(OneSensor::new(sensor, table))
+                Ok(OneSensor::new(sensor, vehicle.time.ahead_ns_max(), table))
             };
             let sensors = vehicle.sensors.iter().map(one).collect::<Result<_>>()?;
             Ok((vehicle.name.clone(), sensors))
@@ -86,11 +95,12 @@ impl ScanDecoder {
         let index = event.source as usize;
         if let Some(Body::Sensor(sensor)) = &event.body {
             if index == sensors.len() {
-                sensors.push(OneSensor::new(&declared(sensor), None));
+                let ahead_ns_max = sensors.first().map_or(0, |first| first.ahead_ns_max);
+                sensors.push(OneSensor::new(&declared(sensor), ahead_ns_max, None));
             }
             return Ok(None);
         }
-        let Some(OneSensor { name, ego_from_sensor, decoder }) = sensors.get_mut(index) else { return Ok(None) };
+        let Some(OneSensor { name, ego_from_sensor, decoder, .. }) = sensors.get_mut(index) else { return Ok(None) };
         let scan = match &event.body {
             Some(Body::Datagram(payload)) => {
                 decoder.push(payload, event.arrival_ns).ok().flatten().map(from_revolution)
@@ -104,11 +114,12 @@ impl ScanDecoder {
 }
 
 impl OneSensor {
-    fn new(config: &SensorConfig, table: Option<Calibration>) -> Self {
+    fn new(config: &SensorConfig, ahead_ns_max: i64, table: Option<Calibration>) -> Self {
         Self {
             name: config.name.clone(),
             ego_from_sensor: config.extrinsics.ego_from_sensor(),
-            decoder: Sensor::new(config.lidar(table)),
+            ahead_ns_max,
+            decoder: Sensor::new(config.lidar(table, ahead_ns_max)),
         }
     }
 }

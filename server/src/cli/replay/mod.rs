@@ -17,7 +17,6 @@
 //! is no ground to estimate from, the files are decoded and no map is made, and the summary says so.
 
 use std::io::IsTerminal;
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -25,6 +24,7 @@ use std::time::{Duration, Instant};
 use clearway_proto::v1;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::exit::Exit;
 use super::output::{block_on, counted, print, print_line, stop_signal};
 use super::serve::log_endpoints;
 use crate::config::{Config, Vehicle};
@@ -56,18 +56,17 @@ const DRAW_INTERVAL: Duration = Duration::from_millis(100);
 /// Longest wait for an acknowledgement in lockstep, in seconds. Ours: a planner that stands in a debugger says so with
 /// --lockstep-timeout.
 const ACKNOWLEDGE_S_MAX: f64 = 10.0;
-/// Exit code of a replay that a signal has stopped before its end.
-const STOPPED: u8 = 3;
 
-/// Replays the files and prints the summary. The exit code is 0 at the end, and 3 if a signal came before.
+/// Replays the files and prints the summary. A file that is not whole, or a signal before the end, is
+/// [`Exit::Unreadable`].
 ///
 /// # Errors
 /// [`ReplayError`].
-pub fn run(options: Options) -> anyhow::Result<ExitCode> {
+pub fn run(options: Options) -> anyhow::Result<Exit> {
     block_on(replay_and_print(options))
 }
 
-async fn replay_and_print(options: Options) -> anyhow::Result<ExitCode> {
+async fn replay_and_print(options: Options) -> anyhow::Result<Exit> {
     let (json, serve) = (options.json, options.serve);
     let progress = Arc::new(Progress::default());
     let mut bar = None;
@@ -90,7 +89,7 @@ async fn replay_and_print(options: Options) -> anyhow::Result<ExitCode> {
     }
     let summary = outcome?;
     for truncated in &summary.truncated {
-        eprintln!("warning: {}: {}; what came before was used", truncated.file.display(), truncated.reason);
+        eprintln!("warning: {}: {}; the rest was used", truncated.file.display(), truncated.reason);
     }
     for note in &summary.notes {
         eprintln!("note: {note}");
@@ -100,7 +99,7 @@ async fn replay_and_print(options: Options) -> anyhow::Result<ExitCode> {
     } else {
         print(&summary.to_text())?
     };
-    Ok(if summary.reached_end { ExitCode::SUCCESS } else { ExitCode::from(STOPPED) })
+    Ok(Exit::from_incomplete(!summary.truncated.is_empty() || !summary.reached_end))
 }
 
 /// How many bytes of the files a replay has read, for a progress bar.

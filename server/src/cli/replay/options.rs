@@ -29,7 +29,7 @@ use crate::server::{ShutdownError, StartError};
   clearway replay drive.mcap --serve --as-live
   clearway replay drive.mcap --serve --as-live --any-port --ready-file ready.json --wait-readers 1 --exit-at-end
 
-Exit codes: 0 the end was reached, 1 failure, 2 wrong usage, 3 stopped by a signal before the end.")]
+Exit codes: 0 the end was reached, 2 failure, a file that is not whole, or a signal before the end, 3 wrong use.")]
 pub struct Options {
     /// pcap, pcapng, MCAP, KITTI .bin, nuScenes .pcd.bin and .pcd files, or folders of them, in the order
     /// given.

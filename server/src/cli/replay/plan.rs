@@ -9,7 +9,7 @@ use std::sync::Arc;
 use clearway_lidar::Sensor;
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::revolution::{Echo, Revolution};
-use clearway_mapping::config::{Extrinsics, MapsConfig, SENSORS_MAX, SensorConfig};
+use clearway_mapping::config::{Extrinsics, MapsConfig, SENSORS_MAX, SensorConfig, TimeConfig};
 use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::scan_file::ScanFormat;
 use clearway_mapping::sensor::mount::estimate;
@@ -431,7 +431,7 @@ fn first_revolutions(
     config: &SensorConfig,
     calibration: Option<Calibration>,
 ) -> Result<Vec<Vec<[f32; 3]>>, ReplayError> {
-    let mut sensor = Sensor::new(config.lidar(calibration));
+    let mut sensor = Sensor::new(config.lidar(calibration, TimeConfig::default().ahead_ns_max()));
     let (mut clouds, mut seen) = (Vec::new(), 0);
     let mut push = |points: &dyn Fn() -> Vec<[f32; 3]>| {
         if seen < MOUNT_REVOLUTIONS_FIRST || seen % MOUNT_REVOLUTIONS_STEP == 0 {

@@ -18,6 +18,7 @@ use clearway_lidar::telemetry::TELEMETRY_LENGTH;
 use clearway_ros::velodyne_scan::VelodyneScan;
 use serde_json::{Value, json};
 
+use super::exit::Exit;
 use super::files;
 use super::output::{counted, print_line, progress_bar};
 use crate::record::mcap_reader::McapReader;
@@ -62,8 +63,8 @@ pub struct Options {
 ///
 /// # Errors
 /// If the capture cannot be read or the datagrams cannot be sent. A capture that is cut off is not an error; the output
-/// says so.
-pub fn run(options: &Options) -> Result<()> {
+/// and the exit code say so.
+pub fn run(options: &Options) -> Result<Exit> {
     let to = udp::target(&options.to)?;
     let telemetry_to = options.telemetry_to.as_deref().map_or(Ok(to), udp::target)?;
     let (_, length) = files::open(&options.file)?;
@@ -73,7 +74,7 @@ pub fn run(options: &Options) -> Result<()> {
         sender: Sender::new(to, telemetry_to, options.bind, options.speed)?,
         skipped: BTreeMap::new(),
     };
-    let is_mcap = options.file.extension().is_some_and(|extension| extension == "mcap");
+    let is_mcap = options.file.extension().is_some_and(|extension| extension == "mcap" || extension == "db3");
     let cut =
         if is_mcap { send_mcap(options, &mut route, length)? } else { send_capture(options, &mut route, length)? };
     let sent = route.finish()?;
@@ -81,13 +82,13 @@ pub fn run(options: &Options) -> Result<()> {
     if sent.sender.packets + sent.sender.telemetry == 0 {
         bail!("{} has no Velodyne datagram", options.file.display());
     }
-    Ok(())
+    Ok(Exit::from_incomplete(cut.is_some()))
 }
 
 /// Sends the packets of the VelodyneScan messages of an MCAP file; returns why the file is not whole.
 fn send_mcap(options: &Options, route: &mut Route, length: u64) -> Result<Option<String>> {
     let progress = progress_bar(length);
-    let mut recording = McapReader::salvage(&options.file)?;
+    let mut recording = McapReader::open(&options.file)?;
     while let Some(message) = recording.next() {
         let message = message?;
         progress.set_position(recording.bytes_read());

@@ -7,6 +7,7 @@ use std::time::Instant;
 
 use anyhow::{Context, Result};
 
+use crate::cli::exit::Exit;
 use crate::config::{Calibrations, Config};
 use crate::record::compare::{After, Comparison, compare};
 use crate::record::reader::RecordingReader;
@@ -57,13 +58,21 @@ pub enum Outcome {
 }
 
 impl Checked {
-    /// True if the file was read and all its maps are equal.
-    pub fn is_good(&self) -> bool {
+    /// [`Exit::Differs`] if a map differs, else [`Exit::Unreadable`] if the file could not be checked, is not whole or
+    /// has no event, else [`Exit::Good`].
+    pub fn exit(&self) -> Exit {
         match &self.outcome {
-            Outcome::Verified(report) => report.is_good(),
-            Outcome::Compared(comparison) => comparison.is_equal(),
-            Outcome::Unreadable(_) => false,
+            Outcome::Verified(report) if report.different > 0 => Exit::Differs,
+            Outcome::Verified(report) => Exit::from_incomplete(!report.is_good() || report.incomplete.is_some()),
+            Outcome::Compared(comparison) if !comparison.is_equal() => Exit::Differs,
+            Outcome::Compared(comparison) => Exit::from_incomplete(comparison.incomplete.is_some()),
+            Outcome::Unreadable(_) => Exit::Unreadable,
         }
+    }
+
+    /// True if the whole file was checked and all its maps are equal.
+    pub fn is_good(&self) -> bool {
+        self.exit() == Exit::Good
     }
 }
 

@@ -10,13 +10,13 @@
 //! | `pictures` | the maps that changed most -> pictures |
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Args;
 
 use self::checked::{Check, Checked, NewConfig, Outcome};
 use self::files::Shard;
+use super::exit::Exit;
 use super::files as one_file;
 use super::output::{print, print_line};
 
@@ -26,13 +26,11 @@ mod pictures;
 mod report;
 mod table;
 
-/// Exit code if a file cannot be read.
-const UNREADABLE: u8 = 2;
-
 /// Compute every map of recordings again from their events, and name the first differences; or compare their maps with
 /// those of another configuration or recording.
 #[derive(Args)]
-#[command(after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, 3 wrong usage.
+#[command(after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, is not whole or
+has no event, 3 wrong use.
 
 Examples:
   clearway verify drive.mcap
@@ -97,11 +95,12 @@ impl Change {
     }
 }
 
-/// Checks the files and prints the results. The exit code is 2 if a file cannot be read, else 1 if a map differs.
+/// Checks the files and prints the results. The exit code is 2 if a file cannot be checked as a whole, else 1 if a map
+/// differs.
 ///
 /// # Errors
 /// If the configuration is wrong, or a report or a picture cannot be written.
-pub fn run(options: &Options) -> Result<ExitCode> {
+pub fn run(options: &Options) -> Result<Exit> {
     let check = options.change.check()?;
     if let (Some(_), Check::Verify) = (&options.change.pictures, &check) {
         return Err(super::output::usage_error("--pictures needs --config, --set or --against"));
@@ -110,7 +109,7 @@ pub fn run(options: &Options) -> Result<ExitCode> {
         Ok(files) => files,
         Err(error) => {
             eprintln!("clearway: {error:#}");
-            return Ok(ExitCode::from(UNREADABLE));
+            return Ok(Exit::Unreadable);
         }
     };
     let jobs = options.jobs.map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), usize::from);
@@ -132,12 +131,14 @@ pub fn run(options: &Options) -> Result<ExitCode> {
     } else {
         print(&table::text(&results, &check))?;
     }
-    Ok(exit_code(&results))
+    Ok(exit(&results))
 }
 
-fn exit_code(results: &[Checked]) -> ExitCode {
-    if results.iter().any(|result| matches!(result.outcome, Outcome::Unreadable(_))) {
-        return ExitCode::from(UNREADABLE);
+fn exit(results: &[Checked]) -> Exit {
+    let has = |exit: Exit| results.iter().any(|result| result.exit() == exit);
+    match () {
+        () if has(Exit::Unreadable) => Exit::Unreadable,
+        () if has(Exit::Differs) => Exit::Differs,
+        () => Exit::Good,
     }
-    ExitCode::from(u8::from(!results.iter().all(Checked::is_good)))
 }

@@ -5,22 +5,31 @@ use std::fmt::Write as _;
 use serde_json::{Value, json};
 
 use super::checked::{Checked, Outcome};
+use crate::cli::exit::Exit;
 use crate::cli::output::counted;
 use crate::record::compare::{Comparison, LayerChange, MapChange};
 
 /// The result of one file in one line: `equal`, the first difference, or why it cannot be read.
 pub fn reason(outcome: &Outcome) -> String {
     match outcome {
-        Outcome::Verified(report) if report.is_good() && report.cut => {
-            "equal; the file is cut off, as after a crash, and this is all it holds".into()
-        }
-        Outcome::Verified(report) if report.is_good() => "equal".into(),
         Outcome::Verified(report) => {
-            let first = report.differences.first().map(ToString::to_string).unwrap_or_default();
-            format!("{}: {first}", counted(report.different, "difference"))
+            let result = match report.differences.first() {
+                Some(first) => format!("{}: {first}", counted(report.different, "difference")),
+                None if report.events == 0 => "no event, so nothing is verified".to_owned(),
+                None => "equal".to_owned(),
+            };
+            let unjudged = match report.unjudged {
+                0 => String::new(),
+                layers => format!("; {} after missing events cannot be judged", counted(layers, "layer")),
+            };
+            let incomplete = report.incomplete.iter().map(|how| format!("; the file is {how}"));
+            result + &unjudged + &incomplete.collect::<String>()
         }
-        Outcome::Compared(comparison) if comparison.is_equal() => "equal".into(),
-        Outcome::Compared(comparison) => first_change(comparison),
+        Outcome::Compared(comparison) => {
+            let result = if comparison.is_equal() { "equal".to_owned() } else { first_change(comparison) };
+            let incomplete = comparison.incomplete.iter().map(|how| format!("; {how}"));
+            result + &incomplete.collect::<String>()
+        }
         Outcome::Unreadable(reason) => format!("not checked: {reason}"),
     }
 }
@@ -83,17 +92,18 @@ fn comparison_json(comparison: &Comparison) -> Value {
         })
     };
     json!({
-        "maps_before": comparison.before, "maps_after": comparison.after, "cut": comparison.cut,
+        "maps_before": comparison.before, "maps_after": comparison.after, "incomplete": comparison.incomplete,
         "layers": comparison.layers.iter().map(layer).collect::<Vec<_>>(),
         "worst": comparison.worst.iter().map(worst).collect::<Vec<_>>(),
     })
 }
 
-/// All results as JUnit XML: one test case for each file; a difference is a failure, an unreadable file an error.
+/// All results as JUnit XML: one test case for each file; a difference is a failure, a file that is not whole
+/// or cannot be read an error.
 pub fn junit(results: &[Checked]) -> String {
     let count = |is: fn(&Checked) -> bool| results.iter().filter(|result| is(result)).count();
-    let errors = count(|result| matches!(result.outcome, Outcome::Unreadable(_)));
-    let failures = count(|result| !result.is_good()) - errors;
+    let errors = count(|result| result.exit() == Exit::Unreadable);
+    let failures = count(|result| result.exit() == Exit::Differs);
     let seconds: f64 = results.iter().map(|result| result.seconds).sum();
     let sums = format!(
         "name=\"clearway verify\" tests=\"{}\" failures=\"{failures}\" errors=\"{errors}\" time=\"{seconds:.3}\"",
@@ -109,8 +119,8 @@ pub fn junit(results: &[Checked]) -> String {
         let message = escaped(&reason(&result.outcome));
         let _ = match &result.outcome {
             _ if result.is_good() => writeln!(xml, "/>"),
-            Outcome::Unreadable(_) => writeln!(xml, "><error message=\"{message}\"/></testcase>"),
-            Outcome::Compared(_) => writeln!(xml, "><failure message=\"{message}\"/></testcase>"),
+            _ if result.exit() == Exit::Unreadable => writeln!(xml, "><error message=\"{message}\"/></testcase>"),
+            Outcome::Compared(_) | Outcome::Unreadable(_) => writeln!(xml, "><failure message=\"{message}\"/></testcase>"),
             Outcome::Verified(report) => {
                 let all: Vec<_> = report.differences.iter().map(|one| escaped(&one.to_string())).collect();
                 writeln!(xml, "><failure message=\"{message}\">{}</failure></testcase>", all.join("\n"))
@@ -150,7 +160,7 @@ mod tests {
         let difference = Difference { vehicle: "car".into(), sequence: 2, layer: "terrain".into(), kind };
         let report = Report { differences: vec![difference], different: 1, ..Report::default() };
         let results = [
-            checked("a&b <\"c\">.mcap", Outcome::Verified(Report::default())),
+            checked("a&b <\"c\">.mcap", Outcome::Verified(Report { events: 9, ..Report::default() })),
             checked("d.mcap", Outcome::Verified(report)),
             checked("e.mcap", Outcome::Unreadable("line 1\nbyte \u{1}".into())),
         ];

@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 
 use super::checked::{Check, Checked, Outcome};
 use super::report::reason;
+use crate::cli::exit::Exit;
 use crate::cli::output::counted;
 use crate::record::compare::{Comparison, LayerChange};
 
@@ -41,13 +42,13 @@ pub fn text(results: &[Checked], check: &Check) -> String {
         result.pictures.iter().for_each(|picture| _ = writeln!(text, "  picture {}", picture.display()));
     }
     let good = results.iter().filter(|result| result.is_good()).count();
-    let unreadable = results.iter().filter(|result| matches!(result.outcome, Outcome::Unreadable(_))).count();
+    let unchecked = results.iter().filter(|result| result.exit() == Exit::Unreadable).count();
     let what = if matches!(check, Check::Verify) { "every map is the map of its events" } else { "every map is equal" };
     let sum = counted(results.len() as u64, "file");
     let _ = match results.len() - good {
         0 if results.is_empty() => writeln!(text, "0 files in this shard: nothing to check"),
         0 => writeln!(text, "{sum}: {what}"),
-        bad => writeln!(text, "{sum}: {good} equal, {} different, {unreadable} not checked", bad - unreadable),
+        bad => writeln!(text, "{sum}: {good} equal, {} different, {unchecked} not checked", bad - unchecked),
     };
     text
 }

@@ -24,7 +24,7 @@ pub(crate) enum Colours {
 
 /// True if the values of a channel are ids, of which only equality means something.
 fn is_id(channel: &Channel) -> bool {
-    channel.unit == "id" || (channel.name == "segment" && channel.unit.is_empty())
+    channel.unit == "id"
 }
 
 impl Colours {

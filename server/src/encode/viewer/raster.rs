@@ -240,7 +240,7 @@ mod tests {
     #[test]
     fn every_radial_cell_that_is_not_free_is_in_a_square_that_is_not_free() {
         let row_radius_m: Vec<f32> = (1..=40).map(|row| 0.02 * (row * row) as f32).collect();
-        let grid = Grid::Radial { row_radius_m, columns: 360 };
+        let grid = Grid::Radial { centre_m: [0.0; 2], row_radius_m, columns: 360 };
         // Any mixture of classes.
         let class = |cell: u64| (cell.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 61).saturating_sub(4) as u8;
         let classes: Vec<u8> = (0..grid.cell_count()).map(class).collect();

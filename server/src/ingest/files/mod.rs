@@ -1,13 +1,13 @@
 //! Files and folders, in the given order -> readings.
 //!
-//! The first bytes of a file give its kind, or else its name does: pcap, pcapng, MCAP, KITTI `.bin`, nuScenes
-//! `.pcd.bin`, `.pcd`. A folder
-//! stands for its files in alphabetical order.
+//! The first bytes of a file give its kind, or else its name does: pcap, pcapng, MCAP, ROS 2 `.db3`, KITTI `.bin`,
+//! nuScenes `.pcd.bin`, `.pcd`. A folder stands for its files in alphabetical order, and numbered files in the order of
+//! their numbers: a bag or a recording in parts is one drive.
 //!
 //! | file | in -> out |
 //! |---|---|
 //! | [`capture`] | pcap, pcapng -> readings |
-//! | [`mcap`] | recording or ROS 2 bag -> readings |
+//! | [`mcap`] | recording or ROS 2 bag, in MCAP or sqlite -> readings |
 //! | [`kitti`] | one scan, `.bin`, `.pcd.bin` or `.pcd` -> reading |
 
 pub mod capture;
@@ -33,7 +33,7 @@ use mcap::{McapError, McapOptions, RefusedMessages};
 pub enum Kind {
     /// pcap or pcapng.
     Capture,
-    /// MCAP.
+    /// MCAP, or a ROS 2 bag in sqlite, which is read as the MCAP file of the same messages.
     Mcap,
     /// One scan: KITTI `.bin`, nuScenes `.pcd.bin` or `.pcd`.
     Scan,
@@ -51,24 +51,13 @@ pub enum FilesError {
         source: std::io::Error,
     },
     /// The kind of a file is unknown.
-    #[error("{}: not pcap, pcapng, MCAP, KITTI .bin, nuScenes .pcd.bin or .pcd", file.display())]
+    #[error("{}: not pcap, pcapng, MCAP, .db3, KITTI .bin, nuScenes .pcd.bin or .pcd", file.display())]
     Kind {
         /// The file or folder.
         file: PathBuf,
     },
-    /// A ROS 2 bag has the older sqlite3 storage.
-    #[error(
-        "{}: a ROS 2 bag in sqlite3; MCAP is read: write \
-         `output_bags: [{{uri: converted, storage_id: mcap, all_topics: true}}]` into convert.yaml, \
-         then `ros2 bag convert -i {} -o convert.yaml`",
-        file.display(), file.display()
-    )]
-    Sqlite {
-        /// The file or folder.
-        file: PathBuf,
-    },
     /// A folder has no file of a known kind.
-    #[error("{}: no pcap, pcapng, mcap, bin or pcd file in this folder", file.display())]
+    #[error("{}: no pcap, pcapng, mcap, db3, bin or pcd file in this folder", file.display())]
     Empty {
         /// The file or folder.
         file: PathBuf,
@@ -96,12 +85,12 @@ pub enum FilesError {
     Scan(#[from] ScanError),
 }
 
-/// A file that is truncated; its readings before the end were used.
+/// A file that is truncated or damaged; the readings of its whole parts were used.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Truncated {
     /// The file.
     pub file: PathBuf,
-    /// How the file ends.
+    /// How the file is incomplete.
     pub reason: String,
 }
 
@@ -136,8 +125,8 @@ impl Readings {
     /// Finds the kind of each file, without reading it; `options` apply to MCAP files.
     ///
     /// # Errors
-    /// [`FilesError::Open`] if a file or folder cannot be opened, [`FilesError::Kind`] or [`FilesError::Sqlite`] if a
-    /// file is of another kind, [`FilesError::Empty`] if a folder has no suitable file.
+    /// [`FilesError::Open`] if a file or folder cannot be opened, [`FilesError::Kind`] if a file is
+    /// of another kind, [`FilesError::Empty`] if a folder has no suitable file.
     pub fn open(files: &[PathBuf], options: McapOptions) -> Result<Self, FilesError> {
         let mut all = VecDeque::new();
         for file in files {
@@ -189,7 +178,7 @@ impl Readings {
         self.scan_format
     }
 
-    /// The truncated files so far.
+    /// The truncated and damaged files so far.
     pub fn truncated(&self) -> &[Truncated] {
         &self.truncated
     }
@@ -285,8 +274,7 @@ impl Readings {
                 self.notes.extend(source.notes().into_iter().map(|note| format!("{}: {note}", file.display())));
             }
             Some(Open::Mcap(file, mut source)) => {
-                if source.recording().is_cut() {
-                    let reason = "the file ends without its closing records, as after a crash".into();
+                if let Some(reason) = source.recording().incomplete() {
                     self.truncated.push(Truncated { file: file.clone(), reason });
                 }
                 self.notes.extend(source.notes().into_iter().map(|note| format!("{}: {note}", file.display())));
@@ -317,8 +305,7 @@ impl Iterator for Readings {
 /// Finds the kind of a file.
 ///
 /// # Errors
-/// [`FilesError::Open`] if the file cannot be read or is empty, [`FilesError::Sqlite`] if it is a ROS 2 bag in sqlite3,
-/// [`FilesError::Kind`] if its kind is unknown.
+/// [`FilesError::Open`] if the file cannot be read or is empty, [`FilesError::Kind`] if its kind is unknown.
 pub fn kind(file: &Path) -> Result<Kind, FilesError> {
     let mut magic = Vec::new();
     std::fs::File::open(file)
@@ -330,7 +317,7 @@ pub fn kind(file: &Path) -> Result<Kind, FilesError> {
         [0x4d, 0x3c, 0xb2, 0xa1, ..] | [0xa1, 0xb2, 0x3c, 0x4d, ..] => return Ok(Kind::Capture),
         [0x0a, 0x0d, 0x0d, 0x0a, ..] => return Ok(Kind::Capture),
         [0x89, b'M', b'C', b'A', b'P', ..] => return Ok(Kind::Mcap),
-        b"SQLite f" => return Err(FilesError::Sqlite { file: file.to_owned() }),
+        b"SQLite f" => return Ok(Kind::Mcap),
         _ => {}
     }
     // Without known first bytes the name decides; the reader of that kind then reports the fault.
@@ -345,7 +332,7 @@ pub fn kind(file: &Path) -> Result<Kind, FilesError> {
 fn kind_by_name(file: &Path) -> Option<Kind> {
     match file.extension()?.to_str()? {
         "pcap" | "pcapng" => Some(Kind::Capture),
-        "mcap" => Some(Kind::Mcap),
+        "mcap" | "db3" => Some(Kind::Mcap),
         "bin" | "pcd" => Some(Kind::Scan),
         _ => None,
     }
@@ -356,16 +343,26 @@ fn files_of_folder(folder: &Path) -> Result<Vec<(PathBuf, Kind)>, FilesError> {
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(open)? {
         let file = entry.map_err(open)?.path();
-        let is_bag = file.extension().is_some_and(|extension| extension == "db3");
-        if file.is_file() && (is_bag || kind_by_name(&file).is_some()) {
+        if file.is_file() && kind_by_name(&file).is_some() {
             files.push((file.clone(), kind(&file)?));
         }
     }
     if files.is_empty() {
         return Err(FilesError::Empty { file: folder.to_owned() });
     }
-    files.sort();
+    files.sort_by_cached_key(|(file, _)| order_of(file));
     Ok(files)
+}
+
+/// The place of a file in its folder: by name, and the files of a split bag or recording by their numbers, so that
+/// `drive_10` follows `drive_9`.
+fn order_of(file: &Path) -> (String, usize, String) {
+    let name = file.file_name().unwrap_or_default().to_string_lossy();
+    let (stem, ending) = name.split_once('.').unwrap_or((&name, ""));
+    let text = stem.trim_end_matches(|c: char| c.is_ascii_digit());
+    let number = stem[text.len()..].trim_start_matches('0');
+    // Of two numbers without leading zeros, the one with fewer digits is less.
+    (text.to_owned(), number.len(), format!("{number}.{ending}"))
 }
 
 #[cfg(test)]
@@ -384,9 +381,7 @@ mod tests {
         assert_eq!(kind(&at("a.bin", &[0x89, b'M', b'C', b'A', b'P'])).unwrap(), Kind::Mcap);
         assert_eq!(kind(&at("b.bin", &[0; 16])).unwrap(), Kind::Scan);
         assert!(matches!(kind(&at("notes.txt", b"hello")), Err(FilesError::Kind { .. })));
-        let bag =
-            Readings::open(&[at("bag_0.db3", b"SQLite format 3\0").parent().unwrap().into()], McapOptions::default());
-        assert!(bag.err().unwrap().to_string().contains("ros2 bag convert -i"));
+        assert_eq!(kind(&at("bag_0.db3", b"SQLite format 3\0")).unwrap(), Kind::Mcap);
         assert!(matches!(kind(Path::new("/no/such/file")), Err(FilesError::Open { .. })));
     }
 

@@ -4,6 +4,7 @@
 //! The threads do nothing else and never wait for an engine. If an engine does not keep up, readings are lost at its
 //! event queue, which counts them, and not in the kernel's buffer.
 
+use std::collections::BTreeSet;
 use std::io::{self, PipeReader, PipeWriter};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::os::fd::AsFd;
@@ -71,13 +72,33 @@ impl Sockets {
         for (socket, at, listener) in self.0 {
             let (queues, stopped) = (queues.to_vec(), stopped.try_clone()?);
             let run = move || {
-                if let Err(error) = receive(socket, &listener, &queues, &stopped) {
-                    tracing::error!(%at, %error, "udp ended");
-                }
+                let mut watch =
+                    ThreadWatch { at, listener: &listener, queues: &queues, fault: Some("it panicked".into()) };
+                watch.fault = receive(socket, &listener, &queues, &stopped).err().map(|error| error.to_string());
             };
             threads.push(std::thread::Builder::new().name(format!("udp {}", at.port())).spawn(run)?);
         }
         Ok(UdpThreads { stop, threads })
+    }
+}
+
+/// Tells the vehicles of a socket when its thread ends by a fault; dropped at the end of the thread, also if it panics.
+struct ThreadWatch<'a> {
+    at: SocketAddr,
+    listener: &'a Listener,
+    queues: &'a [EventQueue],
+    fault: Option<String>,
+}
+
+impl Drop for ThreadWatch<'_> {
+    fn drop(&mut self) {
+        let Some(fault) = self.fault.take() else { return };
+        tracing::error!(at = %self.at, %fault, "the thread of a udp socket has ended");
+        let vehicles: BTreeSet<usize> = self.listener.routes.iter().map(|route| route.vehicle).collect();
+        for vehicle in vehicles {
+            let what = format!("the thread of udp socket {} has ended: {fault}", self.at);
+            self.queues[vehicle].drops().record_ended_input(what);
+        }
     }
 }
 
@@ -180,13 +201,13 @@ fn receive(socket: Socket, listener: &Listener, queues: &[EventQueue], stopped: 
 struct VehicleBatch<'a> {
     vehicle: usize,
     queue: &'a EventQueue,
-    /// Index of the sensor, and the datagram.
-    readings: Vec<(u16, Body)>,
+    /// Index of the sensor, time at which the kernel received the datagram, and the datagram.
+    readings: Vec<(u16, Option<i64>, Body)>,
 }
 
 impl VehicleBatch<'_> {
     fn push(&mut self) -> Result<(), QueueClosedError> {
-        if self.readings.is_empty() { Ok(()) } else { self.queue.push_batch(self.readings.drain(..)) }
+        if self.readings.is_empty() { Ok(()) } else { self.queue.push_received(self.readings.drain(..)) }
     }
 }
 
@@ -205,7 +226,7 @@ fn route(datagram: Received, listener: &Listener, batches: &mut [VehicleBatch<'_
     if datagram.length > DATAGRAM_BYTES_MAX {
         batch.queue.record_drop(route.source, Cause::Length, 1);
     } else {
-        batch.readings.push((route.source, Body::Datagram(datagram.payload)));
+        batch.readings.push((route.source, datagram.received_ns, Body::Datagram(datagram.payload)));
     }
 }
 
@@ -229,16 +250,29 @@ mod tests {
     use crate::ingest::queue::event_queue;
 
     #[test]
+    fn a_thread_that_ends_by_a_fault_is_known_to_its_vehicles() {
+        let mut config = Config::of_one_vehicle("car", "top");
+        config.vehicles[0].udp = Some(Udp::default());
+        let listener = &listeners(&config.vehicles)[0];
+        let (queue, _events) = event_queue(4);
+        let watch = |fault| ThreadWatch { at: listener.at, listener, queues: std::slice::from_ref(&queue), fault };
+        drop(watch(None));
+        assert!(queue.drops().ended_inputs().is_empty());
+        drop(watch(Some("no memory".into())));
+        assert!(queue.drops().ended_inputs()[0].ends_with("has ended: no memory"));
+    }
+
+    #[test]
     fn a_datagram_without_a_sender_is_refused_and_counted() {
         let mut config = Config::of_one_vehicle("car", "top");
         config.vehicles[0].udp = Some(Udp::default());
         let listener = &listeners(&config.vehicles)[0];
         let (queue, _events) = event_queue(4);
         let mut batches = [VehicleBatch { vehicle: 0, queue: &queue, readings: Vec::new() }];
-        let datagram = |peer| Received { peer, length: 3, payload: "abc".into() };
+        let datagram = |peer| Received { peer, received_ns: Some(7), length: 3, payload: "abc".into() };
         route(datagram(None), listener, &mut batches);
         route(datagram(Some(([10, 0, 0, 1], 2368).into())), listener, &mut batches);
-        assert_eq!(batches[0].readings, [(0, Body::Datagram("abc".into()))]);
+        assert_eq!(batches[0].readings, [(0, Some(7), Body::Datagram("abc".into()))]);
         let mut ledger = Ledger::default();
         queue.drops().add_unreported_to(&mut ledger, []);
         assert_eq!((ledger.received, ledger.refused), (1, [("source", 1)].into()));

@@ -1,19 +1,22 @@
-//! One socket -> batches of datagrams, and the number of datagrams that the kernel dropped.
+//! One socket -> batches of datagrams with their times of arrival, and the number of datagrams that the kernel dropped.
 //!
 //! One call (`recvmsg`) reads the first datagram of a batch with the socket's drop counter (`SO_RXQ_OVFL`); a second
 //! call (`recvmmsg`) reads all datagrams that wait behind it. Both go through nix, so that no `unsafe` is needed here.
-//! nix' `recvmmsg` cannot return the counter, because it does not restore the length of a control buffer. The datagrams
-//! of a slab share one allocation, which lives as long as the last of them.
+//! The kernel stamps each datagram when it arrives (`SO_TIMESTAMPNS`), so that a server that stood still knows how old
+//! the datagrams are that it reads. nix' `recvmmsg` does not restore the lengths of its control buffers, so each call
+//! gets new ones. The datagrams of a slab share one allocation, which lives as long as the last of them.
 
 use std::io::{self, IoSliceMut};
 use std::net::{IpAddr, SocketAddr};
 use std::os::fd::AsRawFd;
+use std::time::Duration;
 
 use bytes::{Bytes, BytesMut};
-use nix::sys::socket::sockopt::RxqOvfl;
+use nix::sys::socket::sockopt::{ReceiveTimestampns, RxqOvfl};
 use nix::sys::socket::{
     ControlMessageOwned, MsgFlags, MultiHeaders, RecvMsg, SockaddrStorage, recvmmsg, recvmsg, setsockopt,
 };
+use nix::sys::time::TimeSpec;
 use socket2::Socket;
 
 /// Greatest length of a datagram in bytes. Ours: longer than an Ethernet frame and than the packets of all sensors, so
@@ -29,6 +32,8 @@ const SLOTS: usize = 2 * BATCH;
 pub struct Received {
     /// The sender's address; an IPv4 address also if an IPv6 socket received it. `None` if the kernel gives none.
     pub peer: Option<SocketAddr>,
+    /// Time at which the kernel received the datagram, ns since the Unix epoch; `None` if the kernel does not tell.
+    pub received_ns: Option<i64>,
     /// The datagram's length in bytes.
     pub length: usize,
     /// The first [`DATAGRAM_BYTES_MAX`] bytes of the datagram.
@@ -39,19 +44,21 @@ pub struct Received {
 pub struct Receiver {
     socket: Socket,
     slab: BytesMut,
-    headers: MultiHeaders<SockaddrStorage>,
     /// The kernel's drop counter at the last call; it wraps around.
     drops: u32,
 }
 
 impl Receiver {
-    /// A receiver for `socket`; the kernel counts the socket's drops from now on.
+    /// A receiver for `socket`; the kernel counts the socket's drops and stamps its datagrams from now on.
     ///
     /// # Errors
     /// [`io::Error`] if the kernel does not allow the drop counter.
     pub fn new(socket: Socket) -> io::Result<Self> {
         setsockopt(&socket, RxqOvfl, &1)?;
-        Ok(Self { socket, slab: BytesMut::new(), headers: MultiHeaders::preallocate(BATCH, None), drops: 0 })
+        if let Err(error) = setsockopt(&socket, ReceiveTimestampns, &true) {
+            tracing::warn!(%error, "the kernel does not stamp datagrams: they are stamped when they are read");
+        }
+        Ok(Self { socket, slab: BytesMut::new(), drops: 0 })
     }
 
     /// The socket.
@@ -72,23 +79,24 @@ impl Receiver {
         // With MSG_TRUNC the kernel returns the true length of a datagram that is longer than its slot.
         let flags = MsgFlags::MSG_DONTWAIT | MsgFlags::MSG_TRUNC;
         let (first, rest) = self.slab.split_at_mut(DATAGRAM_BYTES_MAX);
-        let mut control = nix::cmsg_space!(u32);
+        let mut control = nix::cmsg_space!(u32, TimeSpec);
         let mut slots = [IoSliceMut::new(first)];
         let message = recvmsg::<SockaddrStorage>(fd, &mut slots, Some(&mut control), flags)?;
         let drops = drops_of(&message).unwrap_or(self.drops);
         let mut found = Vec::with_capacity(BATCH);
-        found.push((peer_of(&message), message.bytes));
+        found.push((peer_of(&message), received_ns_of(&message), message.bytes));
 
         let mut slots: Vec<_> =
             rest.chunks_exact_mut(DATAGRAM_BYTES_MAX).take(BATCH - 1).map(|slot| [IoSliceMut::new(slot)]).collect();
         // An error here concerns a later datagram than the first; the next call returns it.
-        if let Ok(messages) = recvmmsg(fd, &mut self.headers, &mut slots, flags, None) {
-            found.extend(messages.map(|message| (peer_of(&message), message.bytes)));
+        let mut headers = MultiHeaders::preallocate(BATCH, Some(control));
+        if let Ok(messages) = recvmmsg(fd, &mut headers, &mut slots, flags, None) {
+            found.extend(messages.map(|message| (peer_of(&message), received_ns_of(&message), message.bytes)));
         }
-        for (peer, length) in found {
+        for (peer, received_ns, length) in found {
             let mut slot = self.slab.split_to(DATAGRAM_BYTES_MAX);
             slot.truncate(length);
-            batch.push(Received { peer, length, payload: slot.freeze() });
+            batch.push(Received { peer, received_ns, length, payload: slot.freeze() });
         }
         Ok(u64::from(drops.wrapping_sub(std::mem::replace(&mut self.drops, drops))))
     }
@@ -101,9 +109,76 @@ fn drops_of(message: &RecvMsg<'_, '_, SockaddrStorage>) -> Option<u32> {
     })
 }
 
+fn received_ns_of(message: &RecvMsg<'_, '_, SockaddrStorage>) -> Option<i64> {
+    message.cmsgs().ok()?.find_map(|control| match control {
+        ControlMessageOwned::ScmTimestampns(at) => i64::try_from(Duration::from(at).as_nanos()).ok(),
+        _ => None,
+    })
+}
+
 fn peer_of(message: &RecvMsg<'_, '_, SockaddrStorage>) -> Option<SocketAddr> {
     let address = message.address.as_ref()?;
     let v4 = address.as_sockaddr_in().map(|a| (IpAddr::V4(a.ip()), a.port()));
     let (ip, port) = v4.or_else(|| address.as_sockaddr_in6().map(|a| (IpAddr::V6(a.ip()), a.port())))?;
     Some(SocketAddr::new(ip.to_canonical(), port))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::UdpSocket;
+    use std::time::Instant;
+
+    use super::*;
+    use crate::clock::now_ns;
+
+    #[test]
+    fn datagrams_that_are_read_late_have_the_time_at_which_the_kernel_received_them() {
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        socket.set_nonblocking(true).unwrap();
+        let at = socket.local_addr().unwrap();
+        let (sender, mut receiver) = (UdpSocket::bind("127.0.0.1:0").unwrap(), Receiver::new(socket.into()).unwrap());
+        let began = Instant::now();
+        // The kernel begins to stamp shortly after it was told to: until then, it stamps when the datagram is read.
+        loop {
+            assert!(began.elapsed() < Duration::from_secs(60), "the kernel does not stamp");
+            let from_ns = now_ns();
+            (0..3).for_each(|_| _ = sender.send_to(&[7; 1206], at).unwrap());
+            let to_ns = now_ns();
+            while now_ns() <= to_ns + 1_000_000 {
+                std::thread::yield_now();
+            }
+            let mut batch = Vec::new();
+            while batch.len() < 3 {
+                assert!(began.elapsed() < Duration::from_secs(60), "{} of 3 datagrams", batch.len());
+                let _ = receiver.receive(&mut batch);
+            }
+            let stamps: Vec<i64> = batch.iter().map(|datagram| datagram.received_ns.expect("a stamp")).collect();
+            if stamps.iter().all(|ns| (from_ns..=to_ns).contains(ns)) {
+                assert!(stamps.is_sorted() && batch.iter().all(|datagram| datagram.payload[..] == [7; 1206]));
+                return;
+            }
+        }
+    }
+
+    #[test]
+    fn the_kernels_drops_are_counted_beside_its_stamps() {
+        let socket = Socket::new(socket2::Domain::IPV4, socket2::Type::DGRAM, None).unwrap();
+        socket.set_recv_buffer_size(8192).unwrap();
+        socket.set_nonblocking(true).unwrap();
+        socket.bind(&"127.0.0.1:0".parse::<SocketAddr>().unwrap().into()).unwrap();
+        let at = socket.local_addr().unwrap().as_socket().unwrap();
+        let (sender, mut receiver) = (UdpSocket::bind("127.0.0.1:0").unwrap(), Receiver::new(socket).unwrap());
+        let (mut sent, mut received, mut drops, mut batch) = (0, 0, 0, Vec::new());
+        for round in 0..1_000 {
+            let count = if round < 900 { 20 } else { 1 };
+            (0..count).for_each(|_| _ = sender.send_to(&[7; 1206], at).unwrap());
+            sent += count;
+            while let Ok(dropped) = receiver.receive(&mut batch) {
+                drops += dropped;
+                received += batch.drain(..).filter(|datagram| datagram.received_ns.is_some()).count() as u64;
+            }
+        }
+        assert!(drops > 1_000, "{drops}");
+        assert_eq!(received + drops, sent);
+    }
 }

@@ -1,31 +1,27 @@
 //! The gRPC server: `clearway.v1.MapService`, standard health and reflection, and the ingest service if it is
 //! configured ([`crate::ingest::grpc`]).
 //!
-//! The limits of what one client may cost are set here, each with its reason. [`reader`] has the updates of one reader.
+//! [`listen`](super::listen) accepts the connections and checks who calls. [`reader`] has the updates of one reader.
 
-pub mod access;
 pub mod reader;
 mod replay;
 pub mod selection;
 
 use std::pin::Pin;
-use std::sync::Arc;
 use std::time::Duration;
 
 use clearway_proto::{DESCRIPTORS, v1};
 use futures::Stream;
-use tokio::net::TcpListener;
-use tonic::transport::{Certificate, Identity, Server, ServerTlsConfig};
+use tonic::service::Routes;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::connections::Connections;
+use super::listen::Listener;
+use super::listen::access::Caller;
 use super::served::Vehicles;
-use access::{Access, Guard};
 use reader::watch;
 use replay::Replay;
 
 use crate::clock::now_ns;
-use crate::config::{self, Certificates};
 use crate::replay::ReplayHandle;
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
@@ -34,75 +30,20 @@ use v1::replay_service_server::ReplayServiceServer;
 
 /// Longest request, in bytes. Ours: requests hold names and numbers.
 const REQUEST_BYTES_MAX: usize = 64 << 10;
-/// Flow-control window of a connection, in bytes: what a client may send before the server reads it. Ours: a scan takes
-/// a few windows, and a client that is not read costs no more than one.
-const WINDOW_BYTES: u32 = 1 << 20;
-/// Most streams on one connection. Ours: more than a fleet page needs for its vehicles and layers.
-const STREAMS_MAX: u32 = 128;
-/// Most streams of one connection that the client reset before the server accepted them, and most that the server reset
-/// because of the client's errors. A planner that restarts resets a few; a client that keeps opening and resetting
-/// streams loses its connection.
-const RESETS_PENDING_MAX: usize = 20;
-const RESETS_FOR_MISTAKES_MAX: usize = 128;
-/// Longest headers of a request, in bytes. Ours: gRPC headers have a few hundred bytes; this is hyper's default.
-const HEADERS_BYTES_MAX: u32 = 16 << 10;
 /// Longest time from opening `Watch` to its first request. Ours: a reader sends its selection at once.
 const SELECTION_TIMEOUT: Duration = Duration::from_secs(10);
-/// Interval and timeout of HTTP/2 keepalive: a client that has disappeared is noticed after both.
-const KEEPALIVE: Duration = Duration::from_secs(10);
-/// Longest TLS handshake. Ours: a client that has begun one has no reason to wait.
-const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
-
-/// How clients connect: in plain text with every right, or with certificates and roles.
-pub struct Security {
-    builder: Server,
-    guard: Guard,
-}
-
-impl Security {
-    /// The security of a configuration; plain text without certificates.
-    ///
-    /// # Errors
-    /// [`tonic::transport::Error`] if a certificate or key is invalid.
-    pub fn new(certificates: Option<Certificates>, access: &config::Access) -> Result<Self, tonic::transport::Error> {
-        let Some(Certificates { certificate, key, client_ca }) = certificates else {
-            return Ok(Self { builder: Server::builder(), guard: Guard(None) });
-        };
-        let mut tls = ServerTlsConfig::new().identity(Identity::from_pem(certificate, key)).timeout(HANDSHAKE_TIMEOUT);
-        let guard = Guard(client_ca.is_some().then(|| Arc::new(Access::new(access))));
-        if let Some(client_ca) = client_ca {
-            tls = tls.client_ca_root(Certificate::from_pem(client_ca));
-        }
-        Ok(Self { builder: Server::builder().tls_config(tls)?, guard })
-    }
-}
-
-/// Why the gRPC server has stopped.
-#[derive(Debug, thiserror::Error)]
-pub enum GrpcError {
-    /// The transport failed.
-    #[error(transparent)]
-    Transport(#[from] tonic::transport::Error),
-    /// The reflection service could not be built from the descriptors.
-    #[error(transparent)]
-    Reflection(#[from] tonic_reflection::server::Error),
-}
-
 /// Serves maps, `ingest` if it is configured, and the control of `replay` if there is one, until `stop` resolves and
 /// all streams have ended.
 ///
 /// # Errors
-/// [`GrpcError::Transport`] if the transport fails, [`GrpcError::Reflection`] if the descriptors are invalid.
+/// [`tonic_reflection::server::Error`] if the descriptors are invalid.
 pub async fn serve<I: IngestService>(
-    listener: TcpListener,
-    security: Security,
-    connections_max: usize,
+    listener: Listener,
     vehicles: Vehicles,
     ingest: Option<IngestServiceServer<I>>,
     replay: Option<ReplayHandle>,
     stop: impl Future<Output = ()>,
-) -> Result<(), GrpcError> {
-    let Security { builder, guard } = security;
+) -> Result<(), tonic_reflection::server::Error> {
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<MapServiceServer<Maps>>().await;
     if ingest.is_some() {
@@ -117,31 +58,23 @@ pub async fn serve<I: IngestService>(
             .register_encoded_file_descriptor_set(DESCRIPTORS)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    let maps = MapServiceServer::new(Maps { vehicles }).max_decoding_message_size(REQUEST_BYTES_MAX);
-    builder
-        .layer(guard)
-        .http2_keepalive_interval(Some(KEEPALIVE))
-        .http2_keepalive_timeout(Some(KEEPALIVE))
-        // Streams get the window of their connection, because one scan has megabytes.
-        .initial_stream_window_size(WINDOW_BYTES)
-        .initial_connection_window_size(WINDOW_BYTES)
-        .max_concurrent_streams(STREAMS_MAX)
-        .http2_max_pending_accept_reset_streams(Some(RESETS_PENDING_MAX))
-        .http2_max_local_error_reset_streams(Some(RESETS_FOR_MISTAKES_MAX))
-        .http2_max_header_list_size(HEADERS_BYTES_MAX)
-        .add_service(maps)
-        .add_optional_service(ingest)
-        .add_optional_service(replay)
-        .add_service(health_service)
-        .add_service(reflection().build_v1()?)
-        // Older versions of grpcurl know only this version.
-        .add_service(reflection().build_v1alpha()?)
-        .serve_with_incoming_shutdown(
-            Connections::new(listener, connections_max).with_errors_over_limit().stream(),
-            stop,
-        )
-        .await?;
+    let mut routes = Routes::builder();
+    routes.add_service(MapServiceServer::new(Maps { vehicles }).max_decoding_message_size(REQUEST_BYTES_MAX));
+    if let Some(ingest) = ingest {
+        routes.add_service(ingest);
+    }
+    if let Some(replay) = replay {
+        routes.add_service(replay);
+    }
+    // Older versions of grpcurl know only the older version of reflection.
+    routes.add_service(health_service).add_service(reflection().build_v1()?).add_service(reflection().build_v1alpha()?);
+    listener.serve(routes.routes().prepare().into_axum_router(), stop).await;
     Ok(())
+}
+
+/// What the client of a request may reach.
+fn caller<T>(request: &Request<T>) -> Caller {
+    request.extensions().get().cloned().unwrap_or_default()
 }
 
 struct Maps {
@@ -157,22 +90,28 @@ impl MapService for Maps {
         request: Request<Streaming<v1::WatchRequest>>,
     ) -> Result<Response<Self::WatchStream>, Status> {
         let agent = request.metadata().get("user-agent").and_then(|agent| agent.to_str().ok()).map(str::to_owned);
+        let caller = caller(&request);
         let mut requests = request.into_inner();
         let first = tokio::time::timeout(SELECTION_TIMEOUT, requests.message())
             .await
             .map_err(|_| Status::deadline_exceeded(format!("no selection within {SELECTION_TIMEOUT:?}")))??;
         let selection = first.and_then(|first| first.selection);
-        let selection = selection.ok_or_else(|| Status::invalid_argument("the first request carries a selection"))?;
+        let mut selection =
+            selection.ok_or_else(|| Status::invalid_argument("the first request carries a selection"))?;
         let layers = if selection.layers.is_empty() { "all layers".to_owned() } else { selection.layers.join(", ") };
         let name = format!("gRPC reader of {layers} ({})", agent.as_deref().unwrap_or("no user-agent"));
+        let served = self.vehicles.find(&selection.vehicle)?;
+        selection.layers = caller.layers(&served.status.name, selection.layers, &served.status.layers)?;
         Ok(Response::new(Box::pin(watch(&self.vehicles, selection, requests, name)?)))
     }
 
     async fn get_map(&self, request: Request<v1::GetMapRequest>) -> Result<Response<v1::MapUpdate>, Status> {
+        let caller = caller(&request);
         let v1::GetMapRequest { vehicle, layers } = request.into_inner();
         let served = self.vehicles.find(&vehicle)?;
         served.check_layers(&layers)?;
         let name = &served.status.name;
+        let layers = caller.layers(name, layers, &served.status.layers)?;
         if served.newest.borrow().is_none() {
             return Err(Status::unavailable(format!("vehicle {name} has no map yet")));
         }
@@ -185,9 +124,12 @@ impl MapService for Maps {
 
     async fn list_vehicles(
         &self,
-        _: Request<v1::ListVehiclesRequest>,
+        request: Request<v1::ListVehiclesRequest>,
     ) -> Result<Response<v1::ListVehiclesResponse>, Status> {
-        let vehicles = self.vehicles.statuses().iter().map(|status| status.to_proto()).collect();
+        let caller = caller(&request);
+        let statuses = self.vehicles.statuses();
+        let vehicles = statuses.iter().filter(|status| caller.may_reach(&status.name));
+        let vehicles = vehicles.map(|status| status.to_proto()).collect();
         Ok(Response::new(v1::ListVehiclesResponse { vehicles }))
     }
 }

@@ -52,7 +52,6 @@ struct Watch<R> {
     base: Option<Arc<EncodedMap>>,
     /// The reader asked for a whole map.
     want_full: bool,
-    over: bool,
     /// Learns which maps the reader has finished with; `None` if it never acknowledges.
     finished: Option<AcknowledgingReader>,
     /// Until it goes, its layers are made.
@@ -77,7 +76,6 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
             last: None,
             base: None,
             want_full: false,
-            over: false,
             finished: selection.credits.are_limited().then(|| served.status.acknowledgements.add(name)),
             _reader: Reader::new(&served.status.grpc_readers),
             selection,
@@ -85,14 +83,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
     }
 
     fn updates(self) -> impl Stream<Item = Result<v1::MapUpdate, Status>> {
-        stream::unfold(self, |mut watch| async move {
-            if watch.over {
-                return None;
-            }
-            let update = watch.next().await.transpose()?;
-            watch.over = update.is_err();
-            Some((update, watch))
-        })
+        stream::try_unfold(self, |mut watch| async move { Ok(watch.next().await?.map(|update| (update, watch))) })
     }
 
     /// The next update: the newest map that is due, as soon as there is a credit. `None` if the reader has

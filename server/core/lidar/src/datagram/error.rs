@@ -85,11 +85,17 @@ pub enum DatagramError {
     /// The NMEA sentence of a telemetry datagram is damaged.
     #[error("telemetry: {0}")]
     Nmea(NmeaError),
+    /// A datagram of 512 bytes has no sentence and is no telemetry.
+    #[error("telemetry without a sentence, device time {device_us} us: under 3601000000 us, and text, are allowed")]
+    Telemetry {
+        /// Bytes 198 to 201.
+        device_us: u32,
+    },
 }
 
 impl DatagramError {
     /// Name of the variant: `length`, `block_flag`, `azimuth`, `model`, `duplicate`, `late`, `device_time`,
-    /// `calibration` or `nmea`.
+    /// `calibration`, `nmea` or `telemetry`.
     pub fn reason(&self) -> &'static str {
         match self {
             Self::Length { .. } => "length",
@@ -101,6 +107,7 @@ impl DatagramError {
             Self::DeviceTime { .. } => "device_time",
             Self::Calibration(_) => "calibration",
             Self::Nmea(_) => "nmea",
+            Self::Telemetry { .. } => "telemetry",
         }
     }
 }

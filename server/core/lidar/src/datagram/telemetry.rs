@@ -11,6 +11,8 @@ use super::nmea::Gprmc;
 pub const TELEMETRY_LENGTH: usize = 512;
 const DEVICE_US: usize = 198;
 const PPS: usize = 202;
+/// Device time from which on none is possible, in microseconds: in a leap second the counter passes the hour.
+const DEVICE_US_MAX: u32 = 3_601_000_000;
 const NMEA: std::ops::Range<usize> = 206..334;
 
 /// The content of a telemetry datagram.
@@ -45,6 +47,7 @@ impl Telemetry {
     /// # Errors
     /// - [`DatagramError::Length`] if the payload has not 512 bytes.
     /// - [`DatagramError::Nmea`] if there is a sentence and it is damaged.
+    /// - [`DatagramError::Telemetry`] if there is no sentence and the other fields are not those of a sensor.
     pub fn new(payload: &[u8]) -> Result<Self, DatagramError> {
         if payload.len() != TELEMETRY_LENGTH {
             return Err(DatagramError::Length { length: payload.len() });
@@ -59,6 +62,11 @@ impl Telemetry {
         };
         let text = payload[NMEA].split(|byte| matches!(byte, 0 | b'\r' | b'\n')).next().unwrap_or_default();
         let gprmc = if text.is_empty() { None } else { Some(Gprmc::parse(text).map_err(DatagramError::Nmea)?) };
+        let is_text = |byte: &u8| matches!(byte, 0 | b'\r' | b'\n' | b' '..=b'~');
+        let is_telemetry = device_us < DEVICE_US_MAX && payload[NMEA].iter().all(is_text);
+        if gprmc.is_none() && !is_telemetry {
+            return Err(DatagramError::Telemetry { device_us });
+        }
         Ok(Self { device_us, pps, gprmc })
     }
 }

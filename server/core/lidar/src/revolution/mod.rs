@@ -52,6 +52,8 @@ pub struct Revolution {
     /// Time by which the host's clock is ahead of the stamps, in ms: arrival less stamp of the packet with the least
     /// delay, so that it includes the time on the network.
     pub clock_offset_ms: i64,
+    /// Number of the epoch of the stamps: how often the sensor's stamps have gone back. Within an epoch they rise.
+    pub epoch: u32,
     /// Measured rate of rotation, in revolutions per minute.
     pub rpm: f32,
     /// Reason for which the revolution is incomplete; `None` if it is complete.
@@ -141,6 +143,7 @@ impl Revolution {
             end_ns: 0,
             clock: Clock::Arrival,
             clock_offset_ms: 0,
+            epoch: 0,
             rpm: 0.0,
             partial: None,
             packets: 0,

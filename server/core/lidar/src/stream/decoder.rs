@@ -85,7 +85,7 @@ impl Decoder {
             spec,
             mode: ReturnMode::Strongest,
             points: PointCorrection::new(spec, &calibration),
-            clock: DeviceClock::new(config.gps_late_ns_max),
+            clock: DeviceClock::new(config.gps_late_ns_max, config.ahead_ns_max),
             cutter: Cutter::new(config.cut_azimuth_deg),
             loss: Loss::default(),
             blocked: BlockedDetector::default(),
@@ -366,6 +366,7 @@ impl Decoder {
         }
         (finished.start_ns, finished.end_ns) = (stamp.start_ns, stamp.end_ns);
         (finished.clock, finished.clock_offset_ms) = (stamp.clock, stamp.clock_offset_ms);
+        (finished.epoch, self.status.epoch) = (stamp.epoch, stamp.epoch);
         (self.status.clock, self.status.clock_offset_ms) = (Some(stamp.clock), stamp.clock_offset_ms);
         let count_rad = std::f32::consts::TAU / AZIMUTHS_PER_REVOLUTION as f32;
         finished.fov_gap_rad = self.loss.fov_gap().map(|ends| ends.map(|count| count as f32 * count_rad));

@@ -16,10 +16,15 @@
 //! | A GPRMC is within reach. | `gps_unlocked` | that of the GPRMC |
 //! | Arrival is within reach, and agrees with the device's minutes to 250 ms. | `device` | whole hours |
 //! | Arrival is within reach. | `arrival` | the least delay of a revolution |
-//! | None of these, or arrival must not be followed. | `holdover` | unchanged |
+//! | None of these, or arrival must not be followed yet. | `holdover` | unchanged |
 //!
-//! A clock is *within reach* if it is at most 60 s behind the stamps already given. If it is behind them during the
-//! whole revolution, the stamps run at half speed, and the state is `holdover` with the offset of that clock.
+//! A GPRMC is *within reach* if it is at most 60 s behind the stamps already given; arrival always is. If the chosen
+//! clock is behind the stamps during the whole revolution, the state is `holdover` with the offset of that clock, and:
+//!
+//! - behind by at most [`crate::SensorConfig::ahead_ns_max`], the stamps run at half speed until they are right;
+//! - behind by more, they go back to that clock at once: a new *epoch* begins, and the revolution states its number.
+//!
+//! Within an epoch stamps always rise. A second of the timeline passes from the beginning of one to that of the next.
 //!
 //! # Transitions
 //!
@@ -30,7 +35,9 @@
 //! | GPRMC invalid; telemetry silent for 3 s; device counter jumps | `gps_unlocked` | - | - | - |
 //! | device counter jumps, and arrival differs by 10 to 500 ms | `gps_unlocked` | - | new offset | new offset |
 //! | least delay rises by more than 500 ms | - | - | new offset | new offset |
+//! | least delay rises by more than 500 ms, in a burst | - | - | - | - |
 //! | least delay falls by more than 500 ms | - | - | `holdover` | - |
+//! | 0.35 s agree on a delay less by 100 ms (`device`: 250 ms) | - | - | new offset | new offset |
 //! | ten seconds agree on another delay, by 10 ms (`device`: 500 ms) | - | - | new offset | new offset |
 //! | the stamps reach the offset again | - | - | - | state of that offset |
 //!
@@ -45,15 +52,20 @@
 //! - The offset of a GPRMC is a whole number of hours. It is the same to the nanosecond for all arrivals, and it stays
 //!   in force if GPS or the pulse is lost, over a restart, and if the host disagrees. If it is not within reach, the
 //!   stamps go on by arrival.
-//! - The offset by arrival is held and not averaged. A rise of the delay means that the host's clock was set, or that
-//!   the first revolution was read from a full socket buffer.
+//! - The offset by arrival is held and not averaged. A rise of the delay means that the host's clock was set forward.
+//!   If the packets come faster than they were sent, they have waited (a receiver that stood still, a network): then
+//!   the rise is an age and no offset, and the stamps must show it.
+//! - A delay that stays less than the offset means that the host's clock was set back, or that the offset came from
+//!   packets that had waited. While the delay goes on falling (a capture that is sent too fast, a burst), there is no
+//!   clock to follow.
 //! - If the device's minutes and seconds agree with UTC, a receiver without telemetry, or PTP, has set them.
 //! - If the host's clock is set while the device is silent, that is no longer silence (`timeline.rs`). If it is set
 //!   between the two packets between which the device's counter jumps, the host's step is used, because nothing else
 //!   measures the jump. Stamps that are too far ahead for that reason wait until GPS or the host reaches them.
-//! - Stamps always rise. A correction forward applies at once. For a correction backward of at most 60 s the stamps run
-//!   at half speed. A longer correction backward is not made: a host's clock that falls behind the device (set back, or
-//!   a capture that is played too fast) is not followed.
+//! - A correction forward applies at once. A reader whose clock is behind the stamps cannot tell the age of a map, so
+//!   it uses none: stamps that are too far ahead must go back soon, and must not do so silently.
+//! - If `ahead_ns_max` is 0, no epoch begins: for a clock that is at most 60 s behind, the stamps run at half speed,
+//!   and no other is followed. Recordings made before there were epochs are replayed so.
 
 use super::minimum_delay::{MinimumDelay, STEP_NS_MAX};
 use super::timeline::{NS_PER_HOUR, NS_PER_SECOND, StepKind, Timeline, nearest_hour};
@@ -79,9 +91,18 @@ const DRIFT_NS_MAX: i64 = 10_000_000;
 /// Greatest difference, in ns, between whole hours and the offset by arrival of a device that was set. It is half of
 /// [`STEP_NS_MAX`], so that a small later difference does not change the state again.
 const HOUR_ERROR_NS_MAX: i64 = 250_000_000;
-/// Greatest time, in ns, by which stamps may be ahead of an offset that is within reach. At half speed the stamps need
-/// twice that time (two minutes) to be right again; ours, because a longer wait is worse than a wrong clock.
-const CATCH_UP_NS_MAX: i64 = 60 * NS_PER_SECOND;
+/// Greatest time, in ns, by which stamps may be ahead of an offset that is within reach. Ours: a receiver that differs
+/// by more from the host is less likely to be right.
+const REACH_NS_MAX: i64 = 60 * NS_PER_SECOND;
+/// Default of [`crate::SensorConfig::ahead_ns_max`], in ns: less than the 300 ms for which a map is valid, and at half
+/// speed the stamps are right again after twice this time.
+pub const AHEAD_NS_MAX: i64 = 250_000_000;
+/// Least time, in ns of the timeline, between the beginnings of two epochs. Ours: telemetry that contradicts itself
+/// does not make the stamps go back more often.
+const EPOCH_NS_MIN: i64 = NS_PER_SECOND;
+/// Fall of the delay, in ns, that is followed as soon as revolutions agree on it. Ours: a smaller one is drift, for
+/// which ten seconds are soon enough.
+const FALL_NS_MIN: i64 = 100_000_000;
 
 /// The clock that the stamps of a revolution follow.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -124,6 +145,8 @@ pub(crate) struct Stamp {
     pub clock: Clock,
     /// Least delay of the revolution's packets: arrival less stamp, in ms.
     pub clock_offset_ms: i64,
+    /// Number of the epoch: how often stamps have gone back since the first.
+    pub epoch: u32,
     /// Time, in ns, by which `start_ns` is ahead of the clock, so that stamps rise.
     early_ns: i64,
 }
@@ -144,6 +167,7 @@ impl Stamp {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct DeviceClock {
     gps_late_ns_max: i64,
+    ahead_ns_max: i64,
     timeline: Timeline,
     gps: Option<Gps>,
     /// Telemetry from behind a jump that no data packet has shown yet.
@@ -154,6 +178,8 @@ pub(crate) struct DeviceClock {
     /// True if the device's counter has jumped since the offset was chosen.
     jumped: bool,
     newest: Option<Stamp>,
+    /// Beginning of the newest epoch on the timeline; `None` in the first.
+    epoch_began_ns: Option<i64>,
 }
 
 /// The newest valid GPRMC.
@@ -174,8 +200,9 @@ struct PendingGps {
 }
 
 impl DeviceClock {
-    pub fn new(gps_late_ns_max: i64) -> Self {
-        Self { gps_late_ns_max, ..Self::default() }
+    /// The clock of a sensor before its first datagram. The arguments are those of [`crate::SensorConfig`].
+    pub fn new(gps_late_ns_max: i64, ahead_ns_max: i64) -> Self {
+        Self { gps_late_ns_max, ahead_ns_max, ..Self::default() }
     }
 
     /// Applies telemetry that arrived at `arrival_ns`. `reports_pps`: true if the model reports the state of the pulse.
@@ -216,7 +243,7 @@ impl DeviceClock {
         if step != StepKind::Continuous {
             self.apply_pending();
         }
-        self.minimum_delay.push(sent_ns - time_ns);
+        self.minimum_delay.push(time_ns, sent_ns - time_ns);
         time_ns
     }
 
@@ -226,8 +253,14 @@ impl DeviceClock {
         let delay_ns = self.minimum_delay.end_revolution(first_ns);
         let (offset_ns, clock) = self.choose(first_ns, delay_ns);
         let right_ns = offset_ns + first_ns;
-        let start_ns = self.newest.map_or(right_ns, |newest| right_ns.max(newest.end_ns + 1));
-        let mut stamp = Stamp { start_ns, end_ns: start_ns, clock, clock_offset_ms: 0, early_ns: start_ns - right_ns };
+        let begins_epoch = self.begin_epoch_if_ahead(first_ns, right_ns);
+        let start_ns = match self.newest {
+            Some(newest) if !begins_epoch => right_ns.max(newest.end_ns + 1),
+            _ => right_ns,
+        };
+        let epoch = self.newest.map_or(0, |newest| newest.epoch.saturating_add(u32::from(begins_epoch)));
+        let early_ns = start_ns - right_ns;
+        let mut stamp = Stamp { start_ns, end_ns: start_ns, clock, clock_offset_ms: 0, epoch, early_ns };
         if let Some(last_offset_ns) = last_offset_ns {
             let last_offset_ns = i64::from(stamp.offset_ns(last_offset_ns));
             stamp.end_ns += last_offset_ns;
@@ -244,18 +277,38 @@ impl DeviceClock {
         stamp
     }
 
+    /// Begins an epoch if the right stamp of a revolution is so far behind the newest one that stamps go back to it.
+    fn begin_epoch_if_ahead(&mut self, first_ns: i64, right_ns: i64) -> bool {
+        let is_ahead = self.newest.is_some_and(|newest| newest.end_ns - right_ns > self.ahead_ns_max);
+        let begins = self.ahead_ns_max > 0 && is_ahead && self.may_begin_epoch(first_ns);
+        if begins {
+            self.epoch_began_ns = Some(first_ns);
+        }
+        begins
+    }
+
+    /// True if the newest epoch is old enough for another one to begin at `first_ns` on the timeline.
+    fn may_begin_epoch(&self, first_ns: i64) -> bool {
+        self.epoch_began_ns.is_none_or(|began_ns| first_ns - began_ns >= EPOCH_NS_MIN)
+    }
+
     /// Chooses the offset of a revolution, and the clock that it follows.
     fn choose(&mut self, first_ns: i64, delay_ns: Option<i64>) -> (i64, Clock) {
         let newest_ns = self.newest.map(|newest| newest.end_ns);
-        let in_reach = |offset_ns: i64| newest_ns.is_none_or(|ns| ns - (offset_ns + first_ns) <= CATCH_UP_NS_MAX);
-        let wanted = match self.gps.filter(|gps| in_reach(gps.offset_ns)) {
+        let is_ahead = |offset_ns: i64, ns_max: i64| newest_ns.is_some_and(|ns| ns - (offset_ns + first_ns) > ns_max);
+        let wanted = match self.gps.filter(|gps| !is_ahead(gps.offset_ns, REACH_NS_MAX)) {
             Some(gps) => {
                 let lost = !gps.locked || first_ns - gps.received_ns > GPS_SILENCE_NS_MAX;
                 Some((gps.offset_ns, if lost { Clock::GpsUnlocked } else { Clock::Gps }))
             }
             None => self.choose_by_arrival(first_ns, delay_ns),
         };
-        match (wanted.filter(|(offset_ns, _)| in_reach(*offset_ns)), self.offset) {
+        let ahead_ns_max = match self.ahead_ns_max {
+            0 => REACH_NS_MAX,
+            _ if self.may_begin_epoch(first_ns) => i64::MAX,
+            ahead_ns_max => ahead_ns_max,
+        };
+        match (wanted.filter(|(offset_ns, _)| !is_ahead(*offset_ns, ahead_ns_max)), self.offset) {
             (Some(wanted), _) => *self.offset.insert(wanted),
             (None, before) => (before.map_or(0, |(offset_ns, _)| offset_ns), Clock::Holdover),
         }
@@ -268,8 +321,17 @@ impl DeviceClock {
         };
         let later_ns = delay_ns - offset_ns;
         let jumped = std::mem::take(&mut self.jumped);
-        if later_ns > STEP_NS_MAX || (jumped && (DRIFT_NS_MAX..=STEP_NS_MAX).contains(&later_ns.abs())) {
+        let (has_epochs, is_burst) = (self.ahead_ns_max > 0, self.minimum_delay.is_burst());
+        if later_ns > STEP_NS_MAX && !(has_epochs && is_burst)
+            || (jumped && (DRIFT_NS_MAX..=STEP_NS_MAX).contains(&later_ns.abs()))
+        {
             return Some(self.offset_by_arrival(delay_ns));
+        }
+        let fall_ns_min = if clock == Clock::Arrival { FALL_NS_MIN } else { HOUR_ERROR_NS_MAX };
+        if let Some(agreed_ns) = self.minimum_delay.agreed(first_ns).filter(|_| has_epochs)
+            && offset_ns - agreed_ns > fall_ns_min
+        {
+            return Some(self.offset_by_arrival(agreed_ns));
         }
         let bound_ns = if clock == Clock::Arrival { DRIFT_NS_MAX } else { STEP_NS_MAX };
         if let Some(agreed_ns) = self.minimum_delay.end_window(first_ns)

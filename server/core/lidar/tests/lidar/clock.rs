@@ -1,4 +1,5 @@
-//! Stamps: they always rise, and after an event of any clock they are right again one revolution later.
+//! Stamps: they rise within an epoch, and after an event of any clock they are right again one revolution later, or
+//! half a second later if they must go back.
 
 use clearway_lidar::{Clock, DatagramError, Model, Revolution, Sensor, SensorConfig};
 use proptest::collection::vec;
@@ -63,7 +64,8 @@ fn past_hour_us(script: &Script, t: i64) -> u32 {
 
 fn assert_rising(name: &str, revolutions: &[Revolution]) {
     for pair in revolutions.windows(2) {
-        assert!(pair[0].end_ns < pair[1].start_ns, "{name}: revolution {}", pair[1].sequence);
+        let (goes_back, epochs) = (pair[0].end_ns >= pair[1].start_ns, pair[1].epoch - pair[0].epoch);
+        assert_eq!(epochs, u32::from(goes_back), "{name}: revolution {}", pair[1].sequence);
     }
     for revolution in revolutions {
         assert!(revolution.start_ns < revolution.end_ns, "{name}: revolution {}", revolution.sequence);
@@ -98,7 +100,20 @@ fn stamps_rise_and_are_right_one_revolution_after_an_event() {
             let error_ns = revolution.start_ns - (script.utc_ns + t + (script.right_ns)(t));
             assert!(error_ns.abs() <= script.tolerance_ns, "{name}: revolution {index} is {error_ns} ns off");
         }
-        assert_eq!(revolutions.last().unwrap().clock, script.last, "{name}");
+        let last = revolutions.last().unwrap();
+        assert_eq!((last.clock, last.epoch), (script.last, script.epochs), "{name}");
+    }
+}
+
+#[test]
+fn without_epochs_stamps_never_go_back() {
+    let config = SensorConfig { ahead_ns_max: 0, ..SensorConfig::default() };
+    let free = Script { device_ns: FREE, telemetry: SILENT, lasts_ns: 4 * S, ..BASE };
+    for host_ns in [|t| after(t, -HOUR, 0), |t| after(t, -2 * S, 0)] {
+        let revolutions = play(&Script { host_ns, ..free }, &mut Sensor::new(config.clone()));
+        assert_rising("without epochs", &revolutions);
+        let last = revolutions.last().unwrap();
+        assert_eq!((last.clock, last.epoch), (Clock::Holdover, 0));
     }
 }
 
@@ -263,7 +278,7 @@ proptest! {
         let model = if timed { Model::Vlp16 } else { Model::Hdl64eS1 };
         let stream = Stream::of(model);
         let mut sensor = Sensor::new(SensorConfig { model: Some(model), ..SensorConfig::default() });
-        let (mut newest_ns, mut index, mut device_us, mut arrival_ns) = (i64::MIN, 0, 0_u32, NOON);
+        let (mut newest_ns, mut epoch, mut index, mut device_us, mut arrival_ns) = (i64::MIN, 0, 0, 0_u32, NOON);
         for (kind, us, ns, second, near) in events {
             match kind {
                 0 => device_us = us,
@@ -285,9 +300,11 @@ proptest! {
                 arrival_ns = arrival_ns.saturating_add(1_327_000);
                 let packet = with_device_us(stream.packet(index), device_us);
                 if let Some(revolution) = push(&mut sensor, &packet, arrival_ns) {
-                    prop_assert!(newest_ns < revolution.start_ns, "{newest_ns} {}", revolution.start_ns);
+                    let goes_back = newest_ns >= revolution.start_ns;
+                    let (start_ns, expected) = (revolution.start_ns, epoch + u32::from(goes_back));
+                    prop_assert!(revolution.epoch == expected, "{newest_ns} {start_ns}");
                     prop_assert!(revolution.start_ns <= revolution.end_ns);
-                    newest_ns = revolution.end_ns;
+                    (newest_ns, epoch) = (revolution.end_ns, revolution.epoch);
                 }
             }
         }

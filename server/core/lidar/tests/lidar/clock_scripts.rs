@@ -34,6 +34,8 @@ pub(crate) struct Script {
     pub(crate) healed_ns: i64,
     pub(crate) tolerance_ns: i64,
     pub(crate) last: Clock,
+    /// How often stamps go back.
+    pub(crate) epochs: u32,
 }
 
 pub(crate) const BASE: Script = Script {
@@ -49,6 +51,7 @@ pub(crate) const BASE: Script = Script {
     healed_ns: REVOLUTION,
     tolerance_ns: 200_000,
     last: Clock::Gps,
+    epochs: 0,
 };
 pub(crate) const NOON: i64 = MIDNIGHT + 12 * HOUR + 1_234 * S;
 /// One second before the end of a day.
@@ -80,6 +83,11 @@ pub(crate) fn restarted(t: i64) -> bool {
     (EVENT - REVOLUTION..EVENT).contains(&t)
 }
 
+/// Time by which a packet is read late if the receiver stands still for `for_ns` after the event.
+fn stood_still(t: i64, for_ns: i64) -> i64 {
+    if t < EVENT { 0 } else { (EVENT + for_ns - t).max(0) }
+}
+
 pub(crate) fn after<T>(t: i64, then: T, before: T) -> T {
     if t >= EVENT { then } else { before }
 }
@@ -87,6 +95,15 @@ pub(crate) fn after<T>(t: i64, then: T, before: T) -> T {
 pub(crate) fn scripts() -> Vec<Script> {
     let late = Script { utc_ns: LATE, device_ns: |t| LATE + t, telemetry: |t| gps(LATE + t), ..BASE };
     let free = Script { device_ns: FREE, telemetry: SILENT, last: Clock::Arrival, ..BASE };
+    // Stamps are right half a second after the host's clock was set back: revolutions must agree on it.
+    let back = Script {
+        host_ns: |t| after(t, -2 * S, 0),
+        right_ns: |t| after(t, -2 * S, 0),
+        lasts_ns: 4 * S,
+        healed_ns: 5 * REVOLUTION,
+        epochs: 1,
+        ..free
+    };
     let silent = Script { silence_ns: 3 * REVOLUTION, healed_ns: 4 * REVOLUTION, ..BASE };
     vec![
         Script { name: "hour and day end, and telemetry arrives in that microsecond", event_ns: S, ..late },
@@ -159,12 +176,10 @@ pub(crate) fn scripts() -> Vec<Script> {
             ..free
         },
         Script {
-            name: "the host steps 2 s back during a silence, without GPS: stamps continue",
-            host_ns: |t| after(t, -2 * S, 0),
+            name: "the host steps 2 s back during a silence, without GPS",
             silence_ns: silent.silence_ns,
-            healed_ns: silent.healed_ns,
-            last: Clock::Holdover,
-            ..free
+            healed_ns: silent.silence_ns + back.healed_ns,
+            ..back
         },
         Script {
             name: "the host steps an hour back before a silence and forward during it, without GPS",
@@ -180,10 +195,63 @@ pub(crate) fn scripts() -> Vec<Script> {
             ..free
         },
         Script {
-            name: "the host steps an hour back, without GPS: stamps continue",
+            name: "the host steps an hour back, without GPS",
             host_ns: |t| after(t, -HOUR, 0),
-            last: Clock::Holdover,
+            right_ns: |t| after(t, -HOUR, 0),
+            ..back
+        },
+        Script { name: "the host steps 2 s back, without GPS", ..back },
+        Script {
+            name: "the host steps 2 s forward, without GPS",
+            host_ns: |t| after(t, 2 * S, 0),
+            right_ns: |t| after(t, 2 * S, 0),
             ..free
+        },
+        Script {
+            name: "the host steps 0.2 s back, without GPS: stamps run at half speed until they are right",
+            host_ns: |t| after(t, -200_000_000, 0),
+            right_ns: |t| after(t, -200_000_000, 0),
+            healed_ns: 9 * REVOLUTION,
+            epochs: 0,
+            ..back
+        },
+        Script {
+            name: "the host steps an hour back for a second and a half, without GPS",
+            host_ns: |t| if (S..S + 3 * S / 2).contains(&t) { -HOUR } else { 0 },
+            right_ns: |_| 0,
+            event_ns: S,
+            healed_ns: 16 * REVOLUTION,
+            last: Clock::Arrival,
+            ..back
+        },
+        Script {
+            name: "the receiver stands still for 1 s, and its packets have no stamps of the kernel",
+            host_ns: |t| stood_still(t, S),
+            ..free
+        },
+        Script {
+            name: "the receiver stands still for 4 s, and its packets have no stamps of the kernel",
+            host_ns: |t| stood_still(t, 4 * S),
+            lasts_ns: 7 * S,
+            ..free
+        },
+        Script {
+            name: "a capture is played at ten times its speed for 5 s, and then the sensor sends",
+            host_ns: |t| -t.min(5 * S) / 10 * 9,
+            right_ns: |t| if t < 5 * S { 0 } else { -5 * S / 10 * 9 },
+            tolerance_ns: REVOLUTION,
+            event_ns: 5 * S,
+            lasts_ns: 7 * S,
+            ..back
+        },
+        Script {
+            name: "GPS is found 20 s behind the host",
+            device_ns: |t| after(t, NOON, 500 * S) + t,
+            telemetry: |t| after(t, gps(NOON + t), None),
+            host_ns: |_| 20 * S,
+            right_ns: |t| after(t, 0, 20 * S),
+            epochs: 1,
+            ..BASE
         },
         Script {
             name: "the sensor is restarted",
@@ -271,6 +339,7 @@ pub(crate) fn scripts() -> Vec<Script> {
             event_ns: 2 * S,
             lasts_ns: 5 * S,
             healed_ns: 2 * S + REVOLUTION,
+            epochs: 1,
             ..late
         },
     ]

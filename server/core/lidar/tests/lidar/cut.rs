@@ -82,23 +82,48 @@ fn a_field_of_view_of_180_degrees_gives_complete_revolutions() {
     }
 }
 
+/// A packet whose blocks all have the same azimuth.
+fn still(stream: &Stream) -> Vec<u8> {
+    let mut packet = stream.packet(0);
+    (0..12).for_each(|block| packet[block * 100 + 2..block * 100 + 4].copy_from_slice(&[0, 1]));
+    packet
+}
+
 #[test]
 fn a_sensor_that_stands_still_does_not_fill_the_memory() {
     let stream = Stream::of(Model::Hdl64eS2);
-    let still: Vec<u8> = {
-        let mut packet = stream.packet(0);
-        (0..12).for_each(|block| packet[block * 100 + 2..block * 100 + 4].copy_from_slice(&[0, 1]));
-        packet
-    };
+    let still = still(&stream);
     let mut sensor = Sensor::new(SensorConfig::default());
-    let mut longest = 0;
+    let mut lengths = Vec::new();
     for index in 0..10_000 {
         if let Some(revolution) = sensor.push(&stream.at_time_of(index, &still), stream.arrival_ns(index)).unwrap() {
             assert!(matches!(revolution.partial, Some(Partial::Start | Partial::Overlong)));
-            longest = longest.max(revolution.firings.len());
+            lengths.push(revolution.firings.len());
         }
     }
-    assert!(longest > 0 && longest <= 12_500, "{longest}");
+    // The limit is 12,500, and a packet has at most 24 firings.
+    assert!(!lengths.is_empty() && lengths.iter().all(|length| (12_476..=12_500).contains(length)), "{lengths:?}");
+}
+
+#[test]
+fn a_pause_of_more_than_a_second_ends_the_revolution_of_a_sensor_that_stands_still() {
+    let stream = Stream::of(Model::Vlp16);
+    let still = still(&stream);
+    let packet_ns = stream.model.spec().packet_period_ns(stream.mode) as usize;
+    for (pause_ms, is_long) in [(500, false), (990, false), (1_010, true), (1_500, true), (3_000, true)] {
+        let resumed = 50 + pause_ms * 1_000_000 / packet_ns;
+        let mut sensor = Sensor::new(SensorConfig::default());
+        let (mut ended, mut refused) = (Vec::new(), 0);
+        for index in (0..50).chain(resumed..resumed + 50) {
+            match sensor.push(&stream.at_time_of(index, &still), stream.arrival_ns(index)) {
+                Ok(done) => ended.extend(done.map(|revolution| (revolution.firings.len(), revolution.partial))),
+                Err(_) => refused += 1,
+            }
+        }
+        // The first packet after a long pause is refused until the second one confirms its device time.
+        let expected = if is_long { vec![(50 * 24, Some(Partial::Start))] } else { Vec::new() };
+        assert_eq!((ended, refused), (expected, usize::from(is_long)), "{pause_ms} ms");
+    }
 }
 
 #[test]

@@ -41,6 +41,27 @@ fn telemetry_without_receiver_or_fix_is_accepted() {
 }
 
 #[test]
+fn random_bytes_of_the_length_of_telemetry_are_refused() {
+    let mut state = 12_u64;
+    let mut random = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 56) as u8
+    };
+    let mut sensor = Sensor::new(SensorConfig::default());
+    for _ in 0..20_000 {
+        let mut payload: Vec<u8> = (0..512).map(|_| random()).collect();
+        // Every second one states no sentence.
+        payload[206] &= 0x0d * u8::from(payload[0].is_multiple_of(2));
+        assert!(sensor.push(&payload, START_NS).is_err());
+    }
+    assert_eq!(sensor.status().telemetry, 0);
+    let mut empty = datagram(3_601_000_000, "");
+    assert!(matches!(Telemetry::new(&empty), Err(DatagramError::Telemetry { device_us: 3_601_000_000 })));
+    empty[201] = 0;
+    assert!(Telemetry::new(&empty).is_ok());
+}
+
+#[test]
 fn a_damaged_sentence_is_refused_as_nmea_with_the_wrong_value() {
     let error_of = |sentence: &str| match Telemetry::new(&datagram(0, sentence)).unwrap_err() {
         error @ DatagramError::Nmea(_) => (error.reason(), error.to_string()),
@@ -94,12 +115,12 @@ fn gprmc_gives_the_hour_and_a_refused_datagram_changes_nothing() {
 }
 
 #[test]
-fn stamps_ahead_of_gps_run_at_half_speed_until_gps_catches_up() {
+fn without_epochs_stamps_ahead_of_gps_run_at_half_speed_until_gps_catches_up() {
     // The stream starts without GPS, and the host is 9 s ahead of the device's hour; then GPRMC sets stamps 9 s back.
     let utc_past_hour_us = 41 * 60_000_000 + 7_100_000;
     let stream = Stream { device_us: utc_past_hour_us, ..Stream::of(Model::Vlp16) };
     let arrival_ns = |index| 1_437_687_667_250_000_000 + stream.arrival_ns(index) - START_NS + 9_000_000_000;
-    let mut sensor = Sensor::new(SensorConfig::default());
+    let mut sensor = Sensor::new(SensorConfig { ahead_ns_max: 0, ..SensorConfig::default() });
     let mut revolutions = Vec::new();
     for index in 0..stream.packets(1.6) {
         revolutions.extend(sensor.push(&stream.packet(index), arrival_ns(index)).unwrap().cloned());

@@ -9,6 +9,7 @@
 //! |---|---|
 //! | `vehicle` | `[vehicle]` |
 //! | `sensor` | `[[vehicle.sensor]]` |
+//! | `time` | `[vehicle.time]` |
 //! | `fusion` | `[vehicle.fusion]` |
 //! | `body` | `[vehicle.body]` |
 //! | `motion` | `[vehicle.maps.motion]` |
@@ -26,6 +27,7 @@ pub(crate) mod check;
 pub(crate) mod fusion;
 pub(crate) mod motion;
 pub(crate) mod sensor;
+pub(crate) mod time;
 pub(crate) mod vehicle;
 
 pub use body::BodyConfig;
@@ -33,6 +35,7 @@ pub use check::ConfigValueError;
 pub use fusion::FusionConfig;
 pub use motion::MotionConfig;
 pub use sensor::{BLIND_MAX, Extrinsics, RINGS_MAX, SensorConfig};
+pub use time::TimeConfig;
 pub use vehicle::{SENSORS_MAX, VehicleConfig};
 
 pub use crate::ground::config::{GroundConfig, Variant as GroundVariant};

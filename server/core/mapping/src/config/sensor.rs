@@ -142,14 +142,16 @@ impl SensorConfig {
         }
     }
 
-    /// Configuration of the sensor's decoder, with the sensor's calibration table.
-    pub fn lidar(&self, calibration: Option<Calibration>) -> clearway_lidar::SensorConfig {
+    /// Configuration of the sensor's decoder, with the sensor's calibration table. `ahead_ns_max`:
+    /// [`clearway_lidar::SensorConfig::ahead_ns_max`].
+    pub fn lidar(&self, calibration: Option<Calibration>, ahead_ns_max: i64) -> clearway_lidar::SensorConfig {
         clearway_lidar::SensorConfig {
             model: self.model,
             rpm: self.rpm,
             calibration,
             cut_azimuth_deg: self.cut_azimuth_deg,
             gps_late_ns_max: (self.gps_late_days_max * 86_400e9) as i64,
+            ahead_ns_max,
         }
     }
 

@@ -8,6 +8,7 @@ use crate::config::body::BodyConfig;
 use crate::config::check::{ConfigValueError, check_name};
 use crate::config::fusion::FusionConfig;
 use crate::config::sensor::SensorConfig;
+use crate::config::time::TimeConfig;
 use crate::layer::registry::MapsConfig;
 
 /// Greatest number of sensors of one vehicle, declared ones included. Ours: the newest scan of each takes some
@@ -23,6 +24,9 @@ pub struct VehicleConfig {
     /// The sensors. The source of an event is an index into them.
     #[serde(rename = "sensor")]
     pub sensors: Vec<SensorConfig>,
+    /// How stamps follow the clocks.
+    #[serde(default)]
+    pub time: TimeConfig,
     /// How one map is made from several sensors.
     #[serde(default)]
     pub fusion: FusionConfig,
@@ -37,8 +41,8 @@ pub struct VehicleConfig {
 impl VehicleConfig {
     /// A vehicle with these sensors and the defaults of all other values.
     pub fn new(name: impl Into<String>, sensors: Vec<SensorConfig>) -> Self {
-        let (fusion, maps) = (FusionConfig::default(), MapsConfig::default());
-        Self { name: name.into(), sensors, fusion, body: None, maps }
+        let (time, fusion, maps) = (TimeConfig::default(), FusionConfig::default(), MapsConfig::default());
+        Self { name: name.into(), sensors, time, fusion, body: None, maps }
     }
 
     /// Checks every value, in the order of the file.
@@ -58,6 +62,7 @@ impl VehicleConfig {
             let (key, name) = ("vehicle.fusion.reference_sensor", &self.fusion.reference_sensor);
             return Err(ConfigValueError::new(key, name, "the name of one of the sensors"));
         }
+        self.time.validate()?;
         self.fusion.validate()?;
         self.body.iter().try_for_each(BodyConfig::validate)?;
         self.maps.validate()

@@ -3,10 +3,12 @@
 /// Grid of a layer: how many cells it has, and which part of the ground each covers.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Geometry {
-    /// r-θ grid: cell index = row * columns + column; row 0 is innermost, row j spans ranges
-    /// `(row_radius_m[j-1], row_radius_m[j]]`; column c spans azimuths [c, c+1) * 2π/columns, counter-clockwise from
-    /// the ego x axis.
+    /// r-θ grid: cell index = row * columns + column; row 0 is innermost, row j spans ranges from the centre
+    /// `(row_radius_m[j-1], row_radius_m[j]]`; column c spans azimuths [c, c+1) * 2π/columns about the centre,
+    /// counter-clockwise from the direction of the ego x axis.
     Radial {
+        /// Position (x, y) of the centre, metres: the sensor whose lasers define the rows.
+        centre_m: [f32; 2],
         /// Outer radius of each row, metres, ascending. The drivability thesis calls it `r_bench`.
         row_radius_m: Vec<f32>,
         /// Number of columns.
@@ -34,9 +36,9 @@ pub enum Geometry {
 }
 
 impl Geometry {
-    /// An r-θ grid of `columns` columns, without rows.
+    /// An r-θ grid of `columns` columns about the ego origin, without rows.
     pub fn radial(columns: u16) -> Self {
-        Self::Radial { row_radius_m: Vec::new(), columns }
+        Self::Radial { centre_m: [0.0; 2], row_radius_m: Vec::new(), columns }
     }
 
     /// A square of `side` x `side` cells (an even number) along the vehicle's axes, with the vehicle in the middle.

@@ -1,10 +1,9 @@
 //! The r-θ grid (UT Austin thesis, section IV.1): rows are ranges, columns are azimuths.
 //!
-//! In: the lasers' elevations, the sensor's height, the number of columns; then points, ego frame, metres. Out: the
+//! In: the lasers' elevations, the sensor's position, the number of columns; then points, ego frame, metres. Out: the
 //! cell of each point, `row * columns + column`. The rows follow from the sensor: their radii (`r_bench` in the thesis)
-//! separate the rings that its lasers draw on level ground. The rows are circles about the ego origin, as in the
-//! thesis. The rings are circles about the sensor, so the ego origin should lie under the sensor, or within a metre or
-//! two of it.
+//! separate the rings that its lasers draw on level ground. The rows are circles about the sensor, as the rings are; in
+//! the thesis, the sensor is above the origin.
 
 use std::f32::consts::{FRAC_PI_2, TAU};
 use std::sync::Arc;
@@ -27,9 +26,14 @@ const WHOLE_FROM: f32 = 8_388_608.0;
 /// Least distance between two rings with a row each, metres. Ours: an HDL-64E's range noise of 2 cm mixes nearer rings.
 const RING_SPACING_M_MIN: f32 = 0.02;
 
-/// Grid of range and azimuth about the ego origin.
+/// Depth of a row if the rings are not known, metres. Ours: near ground must not free a cell that reaches far beyond it.
+const ROW_DEPTH_M: f32 = 1.0;
+
+/// Grid of range and azimuth about a sensor.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RadialGrid {
+    /// Position (x, y) of the sensor, ego frame, metres.
+    centre_m: [f32; 2],
     /// Outer radius of each row, metres, ascending; the last is the largest range.
     row_radius_m: Vec<f32>,
     /// The same squared, then infinity for the row beyond the grid.
@@ -46,8 +50,9 @@ pub struct RadialGrid {
 }
 
 impl RadialGrid {
-    /// A grid with these rows (outer radii, metres, positive, ascending) and columns.
-    pub fn new(row_radius_m: Vec<f32>, columns: u16) -> Self {
+    /// A grid about a position (x, y) of the ego frame, metres, with these rows (outer radii, metres, positive,
+    /// ascending) and columns.
+    pub fn new(centre_m: [f32; 2], row_radius_m: Vec<f32>, columns: u16) -> Self {
         let mut row_radius_squared: Vec<f32> = row_radius_m.iter().map(|r| r * r).collect();
         let innermost = row_radius_squared.first().copied().unwrap_or(1.0);
         let outermost = row_radius_squared.last().copied().unwrap_or(1.0);
@@ -63,6 +68,7 @@ impl RadialGrid {
         row_radius_squared.push(f32::INFINITY);
         let azimuths = AzimuthColumns::new(columns);
         Self {
+            centre_m,
             row_radius_m,
             row_radius_squared,
             row_of_bucket,
@@ -76,20 +82,20 @@ impl RadialGrid {
     /// Computes the rows again if the sensor of `sweep` differs from the last one.
     pub fn update_rows(&mut self, sweep: &Sweep, range_m_max: f32, columns: u16) {
         let Some(calibration) = &sweep.calibration else {
-            // The rings are not known: one row to the largest range.
-            *self = Self::new(vec![range_m_max], columns);
+            *self = Self::new(sweep.mount_m, row_radii_m(&[], range_m_max), columns);
             return;
         };
         let height = sweep.mount_height_m;
         // All revolutions of a sensor share its table, so that comparing the pointers mostly suffices.
         if let Some((known, known_height)) = &self.made_from
             && *known_height == height
+            && self.centre_m == sweep.mount_m
             && (Arc::ptr_eq(known, calibration) || known == calibration)
         {
             return;
         }
         let rings = ring_radii_m(calibration, height, range_m_max);
-        *self = Self::new(row_radii_m(&rings, range_m_max), columns);
+        *self = Self::new(sweep.mount_m, row_radii_m(&rings, range_m_max), columns);
         self.made_from = Some((Arc::clone(calibration), height));
     }
 
@@ -108,36 +114,39 @@ impl RadialGrid {
         self.rows() * self.columns()
     }
 
+    /// True if the centre is the ego origin.
+    fn is_about_origin(&self) -> bool {
+        self.centre_m == [0.0; 2]
+    }
+
     /// Inner and outer radius of a row, metres.
     pub fn row_span_m(&self, row: usize) -> (f32, f32) {
         let inner = if row == 0 { 0.0 } else { self.row_radius_m[row - 1] };
         (inner, self.row_radius_m[row])
     }
 
-    /// Writes the rows and columns into `geometry`, reusing its memory.
+    /// Writes the centre, rows and columns into `geometry`, reusing its memory.
     pub fn write_geometry(&self, geometry: &mut Geometry) {
-        match geometry {
-            Geometry::Radial { row_radius_m, columns } => {
-                row_radius_m.clone_from(&self.row_radius_m);
-                *columns = self.azimuths.columns;
-            }
-            other => {
-                let columns = self.azimuths.columns;
-                *other = Geometry::Radial { row_radius_m: self.row_radius_m.clone(), columns };
-            }
+        if !matches!(geometry, Geometry::Radial { .. }) {
+            *geometry = Geometry::radial(self.azimuths.columns);
+        }
+        if let Geometry::Radial { centre_m, row_radius_m, columns } = geometry {
+            (*centre_m, *columns) = (self.centre_m, self.azimuths.columns);
+            row_radius_m.clone_from(&self.row_radius_m);
         }
     }
 
     /// The cell that contains a position; `None` beyond the last row.
     pub fn cell(&self, x: f32, y: f32) -> Option<usize> {
+        let [x, y] = [x - self.centre_m[0], y - self.centre_m[1]];
         let row = self.row(self.clamped(x * x + y * y));
         (row < self.rows()).then(|| row * self.columns() + self.azimuths.column(x, y) as usize)
     }
 
     /// Calls `visit(first_point, cells)` for each chunk of the sweep. A point beyond the last row falls into the row
     /// after it: its cell is `self.cells()` or more, and less than `self.cells() + self.columns()`. If the sweep's
-    /// rings are not known, there is no call. `azimuths` are those of the points in columns of two degrees, if they are
-    /// known.
+    /// rings are not known, there is no call. `azimuths` are those of the points about the ego origin in columns of two
+    /// degrees, if they are known.
     pub fn for_each_chunk(&self, sweep: &Sweep, azimuths: Option<&[f32]>, mut visit: impl FnMut(usize, &[u32])) {
         if sweep.calibration.is_none() {
             return;
@@ -147,11 +156,13 @@ impl RadialGrid {
         let columns = self.columns() as u32;
         let ratio = f32::from(self.azimuths.columns) / f32::from(AzimuthColumns::TWO_DEGREES);
         // The product with a power of two is exact, so that the columns are those of the position itself.
-        let azimuths = azimuths.filter(|_| ratio.to_bits() & 0x007f_ffff == 0);
+        let azimuths = azimuths.filter(|_| ratio.to_bits() & 0x007f_ffff == 0 && self.is_about_origin());
+        let [centre_x, centre_y] = self.centre_m;
         for (index, (x, y)) in sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).enumerate() {
             let n = x.len();
             // The first loops are arithmetic alone, so that the compiler vectorises them; the last reads the tables.
             for ((range_squared, &x), &y) in ranges_squared.iter_mut().zip(x).zip(y) {
+                let (x, y) = (x - centre_x, y - centre_y);
                 *range_squared = self.clamped(x * x + y * y);
             }
             match azimuths {
@@ -162,7 +173,7 @@ impl RadialGrid {
                 }
                 None => {
                     for ((cell, &x), &y) in cells.iter_mut().zip(x).zip(y) {
-                        *cell = self.azimuths.column(x, y);
+                        *cell = self.azimuths.column(x - centre_x, y - centre_y);
                     }
                 }
             }
@@ -311,7 +322,12 @@ pub fn ring_radii_m(calibration: &Calibration, height_m: f32, range_m_max: f32) 
 
 /// Outer radius of each row, metres, ascending (`r_bench` of the UT Austin thesis, section IV.1). A radius lies midway
 /// between neighbouring rings, so that noise does not move a ring over a row border; the last is the largest range.
+/// Fewer than two rings separate nothing: then all rows have the same depth.
 pub fn row_radii_m(rings_m: &[f32], range_m_max: f32) -> Vec<f32> {
+    if rings_m.len() < 2 {
+        let rows = (range_m_max / ROW_DEPTH_M).ceil().max(1.0) as u16;
+        return (1..=rows).map(|row| range_m_max * f32::from(row) / f32::from(rows)).collect();
+    }
     let midway = rings_m.windows(2).map(|pair| (pair[0] + pair[1]) / 2.0);
     midway.chain([range_m_max]).collect()
 }
@@ -330,7 +346,7 @@ mod tests {
     #[test]
     fn a_position_falls_into_the_column_of_its_azimuth() {
         for columns in [8, 90, 180, 360, 1440] {
-            let grid = RadialGrid::new(vec![100.0], columns);
+            let grid = RadialGrid::new([0.0; 2], vec![100.0], columns);
             for step in 0..200_000 {
                 let (angle, range) = (f64::from(step) * 3.141_59e-5, 1.0 + f64::from(step % 97) * 0.7);
                 let (x, y) = ((range * angle.cos()) as f32, (range * angle.sin()) as f32);
@@ -345,7 +361,7 @@ mod tests {
 
     #[test]
     fn each_axis_lies_in_the_first_column_of_its_quadrant() {
-        let grid = RadialGrid::new(vec![10.0], 360);
+        let grid = RadialGrid::new([0.0; 2], vec![10.0], 360);
         let axes = [([1.0, 0.0], 0), ([0.0, 1.0], 90), ([-1.0, 0.0], 180), ([0.0, -1.0], 270), ([1.0, -1e-7], 359)];
         for ([x, y], column) in axes {
             assert_eq!(grid.cell(x, y), Some(column), "({x}, {y})");
@@ -357,7 +373,7 @@ mod tests {
     #[test]
     fn a_row_ends_at_its_radius_and_the_table_agrees_with_a_search() {
         let radii = vec![0.5, 3.0, 3.02, 3.05, 9.0, 60.0];
-        let grid = RadialGrid::new(radii.clone(), 8);
+        let grid = RadialGrid::new([0.0; 2], radii.clone(), 8);
         for step in 0..70_000 {
             let range_squared = (step as f32 * 1e-3) * (step as f32 * 1e-3);
             let row = radii.iter().position(|radius| range_squared <= radius * radius);

@@ -56,6 +56,8 @@ pub(crate) struct SensorPipeline {
     elevations: Option<ElevationSource>,
     /// Stamp and event time of the newest accepted scan event, ns.
     newest_scan: Option<(i64, i64)>,
+    /// How often the stamps of accepted scan events have gone back; `None` if that is not counted.
+    scan_epoch: Option<u32>,
     mount_check: MountCheck,
     /// End of the newest scan, ns; `None` before the first.
     newest_end_ns: Option<i64>,
@@ -84,9 +86,11 @@ struct Series {
 }
 
 impl SensorPipeline {
-    /// A sensor without events; `body` is the vehicle's own box.
+    /// A sensor without events; `body` is the vehicle's own box. `ahead_ns_max`:
+    /// [`clearway_lidar::SensorConfig::ahead_ns_max`].
     pub fn new(
         config: &SensorConfig,
+        ahead_ns_max: i64,
         calibration: Option<Calibration>,
         body: Option<&BodyConfig>,
         extras: ScanExtras,
@@ -98,10 +102,11 @@ impl SensorPipeline {
             scan_calibration: scan_calibration.map(Arc::new),
             scan_elevations,
             elevations: None,
-            decoder: Sensor::new(config.lidar(calibration)),
+            decoder: Sensor::new(config.lidar(calibration, ahead_ns_max)),
             filter: SelfFilter::new(body, mount.origin_m(), &config.blind_deg),
             mount,
             newest_scan: None,
+            scan_epoch: (ahead_ns_max > 0).then_some(0),
             mount_check: MountCheck::default(),
             newest_end_ns: None,
             scans: 0,
@@ -146,6 +151,7 @@ impl SensorPipeline {
         let mut status = self.decoder.status();
         status.revolutions += self.scans;
         status.returns += self.scan_returns;
+        status.epoch = status.epoch.saturating_add(self.scan_epoch.unwrap_or(0));
         status
     }
 
@@ -243,6 +249,10 @@ impl SensorPipeline {
         {
             check_newer(scan.stamp_ns, Some(newest_ns))?;
         }
+        if let Some(epoch) = &mut self.scan_epoch {
+            let goes_back = self.newest_scan.is_some_and(|(newest_ns, _)| scan.stamp_ns < newest_ns);
+            *epoch = epoch.saturating_add(u32::from(goes_back));
+        }
         self.newest_scan = Some((scan.stamp_ns, now.event_ns));
         self.find_elevations(scan);
         motion.follow_scan(scan, &mut self.trajectory);
@@ -261,6 +271,7 @@ impl SensorPipeline {
             newest.no_returns.extend(scan.no_returns.iter().filter(|ray| !is_blind(ray)).map(to_ego));
         }
         newest.state = scan_state(&self.name, scan, self.scan_elevations, newest.sweep.returns, now);
+        newest.state.epoch = self.scan_epoch.unwrap_or(0);
         let first_ns = scan.offset_ns.iter().min().copied().unwrap_or(0);
         newest.start_ns = scan.stamp_ns.saturating_add(i64::from(first_ns));
         (newest.end_ns, newest.is_revolution) = (scan.stamp_ns, false);
@@ -337,6 +348,7 @@ fn revolution_state(name: &str, revolution: &Revolution, elevations: ElevationSo
         blocked: revolution.blocked.clone(),
         clock: revolution.clock.as_str(),
         clock_offset_ms: revolution.clock_offset_ms,
+        epoch: revolution.epoch,
         elevations: Some(elevations),
     }
 }

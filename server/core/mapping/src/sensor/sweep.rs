@@ -58,6 +58,8 @@ pub struct Sweep {
     pub calibration: Option<Arc<Calibration>>,
     /// Height of the sensor over the ground, metres.
     pub mount_height_m: f32,
+    /// Position (x, y) of the sensor, ego frame, metres: the centre of radial maps.
+    pub mount_m: [f32; 2],
 }
 
 impl Sweep {
@@ -250,7 +252,8 @@ impl Sweep {
         self.deviation.clone_from(&other.deviation);
         self.noise.clone_from(&other.noise);
         self.calibration.clone_from(&other.calibration);
-        (self.returns, self.mount_height_m) = (other.returns, other.mount_height_m);
+        self.returns = other.returns;
+        self.copy_mount(other);
     }
 
     /// Adds another sensor's points after transforming them, with their deviations. If this sweep has no rows of radial
@@ -287,10 +290,14 @@ impl Sweep {
         self.z.push(z);
     }
 
-    /// Copies what defines the rows of radial maps: the elevations and the height of the sensor.
+    /// Copies what defines the rows of radial maps: the elevations and the position of the sensor.
     pub(crate) fn copy_rows(&mut self, other: &Sweep) {
         self.calibration.clone_from(&other.calibration);
-        self.mount_height_m = other.mount_height_m;
+        self.copy_mount(other);
+    }
+
+    fn copy_mount(&mut self, other: &Sweep) {
+        (self.mount_height_m, self.mount_m) = (other.mount_height_m, other.mount_m);
     }
 
     /// True if [`Sweep::set_scan`] keeps a point at this position, sensor frame, metres.
@@ -300,7 +307,8 @@ impl Sweep {
 
     fn prepare(&mut self, calibration: Option<&Arc<Calibration>>, mount: &Mount) {
         self.calibration = calibration.map(Arc::clone);
-        self.mount_height_m = mount.ego_from_sensor.translation.z as f32;
+        let at = mount.ego_from_sensor.translation;
+        (self.mount_height_m, self.mount_m) = (at.z as f32, [at.x as f32, at.y as f32]);
         self.deviation.clear();
         self.noise.clear();
     }

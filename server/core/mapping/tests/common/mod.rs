@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_lidar::model::Model;
-use clearway_mapping::config::ReachConfig;
+use clearway_mapping::config::{DrivabilityConfig, Passage, PlaneTest, ReachConfig};
 use clearway_mapping::ground::Ground;
 use clearway_mapping::layer::radial_grid::RadialGrid;
 use clearway_mapping::layer::{Cells, Context, Geometry, Layer, Rays};
@@ -63,6 +63,20 @@ pub fn cast(model: Model, inside: impl Fn(f32, f32, f32) -> bool) -> Sweep {
     sweep
 }
 
+/// The parameters of the UT Austin thesis, but for the cells where segments start: the whole blind zone.
+pub fn thesis_with_own_seeds() -> DrivabilityConfig {
+    DrivabilityConfig {
+        offset_m: 0.0,
+        bridge_rows: 0,
+        close_gaps: false,
+        step_m_max: 0.5,
+        grade_max: 0.0,
+        plane_test: PlaneTest::WholeBoundary,
+        passage: Passage::BetweenSegments,
+        ..DrivabilityConfig::default()
+    }
+}
+
 /// Level ground.
 pub fn plain(_x: f32, _y: f32, z: f32) -> bool {
     z <= 0.0
@@ -103,7 +117,7 @@ pub fn off_borders(sweep: &Sweep) -> Sweep {
 /// Rows and columns of a layer.
 pub fn size(layer: &Layer) -> (usize, usize) {
     match &layer.geometry {
-        Geometry::Radial { row_radius_m, columns } => (row_radius_m.len(), usize::from(*columns)),
+        Geometry::Radial { row_radius_m, columns, .. } => (row_radius_m.len(), usize::from(*columns)),
         Geometry::Cartesian { width, height, .. } => (*height as usize, *width as usize),
     }
 }
@@ -111,7 +125,7 @@ pub fn size(layer: &Layer) -> (usize, usize) {
 /// The cell of a layer that contains a position, if there is one.
 pub fn cell_at(layer: &Layer, x: f32, y: f32) -> Option<usize> {
     match &layer.geometry {
-        Geometry::Radial { row_radius_m, columns } => RadialGrid::new(row_radius_m.clone(), *columns).cell(x, y),
+        Geometry::Radial { .. } => radial_grid(layer).cell(x, y),
         Geometry::Cartesian { origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, .. } => {
             let ((x, y), (sin, cos)) = ((f64::from(x), f64::from(y)), yaw_rad.sin_cos());
             let place = |v: f64, origin: f64| ((v - origin) / f64::from(*cell_m)).floor();
@@ -139,6 +153,16 @@ pub fn quarter_rotated(layer: &Layer, values: &[i32]) -> Vec<i32> {
             assert_eq!(rows, columns, "only a square grid can be rotated by 90°");
             (0..rows * columns).map(|cell| values[(columns - 1 - cell % columns) * columns + cell / columns]).collect()
         }
+    }
+}
+
+/// The grid of a radial layer.
+pub fn radial_grid(layer: &Layer) -> RadialGrid {
+    match &layer.geometry {
+        Geometry::Radial { centre_m, row_radius_m, columns } => {
+            RadialGrid::new(*centre_m, row_radius_m.clone(), *columns)
+        }
+        Geometry::Cartesian { .. } => panic!("{} is no radial grid", layer.name),
     }
 }
 

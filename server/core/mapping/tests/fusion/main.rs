@@ -147,15 +147,15 @@ fn another_sensor_replaces_a_reference_sensor_that_stops() {
 #[test]
 fn the_rows_of_radial_maps_are_those_of_the_reference_sensor() {
     let mut coarse = config();
-    // For this sensor alone all the ground is one row.
-    coarse.sensors[1].elevations_deg = vec![-5.0];
+    // For this sensor alone the ground is two rows.
+    coarse.sensors[1].elevations_deg = vec![-10.0, -5.0];
     let rows = |pipeline: &mut Pipeline, event: &Event| {
         let map = step(pipeline, event)?;
         Some((map.source, common::benches(&map.layers[0]).to_vec()))
     };
     let mut alone = pipeline(&coarse);
     assert_eq!(rows(&mut alone, &scan(1, 10 * MS)), None);
-    assert_eq!(rows(&mut alone, &scan(1, 300 * MS)).map(|(source, rows)| (source, rows.len())), Some((1, 1)));
+    assert_eq!(rows(&mut alone, &scan(1, 300 * MS)).map(|(source, rows)| (source, rows.len())), Some((1, 2)));
     let mut pipeline = pipeline(&coarse);
     let (_, reference_rows) = rows(&mut pipeline, &scan(0, 100 * MS)).unwrap();
     assert!(reference_rows.len() > 4);
@@ -205,6 +205,16 @@ fn scans_with_older_stamps_are_accepted_after_the_deadline() {
     let again = event(1, 9_000 * MS, restarted(5_400).body);
     assert_eq!(pipeline.step(&again).unwrap_err().reason(), "stamp");
     assert_eq!(pipeline.sensors()[1].ledger.refused, [("stamp", 2)].into());
+}
+
+#[test]
+fn a_host_clock_set_back_does_not_hold_back_the_maps_of_another_sensor() {
+    let mut pipeline = pipeline(&config());
+    let hour_ns = 3_600_000 * MS;
+    assert!((0..5).all(|n| step(&mut pipeline, &scan(0, hour_ns + n * 100 * MS)).is_some()));
+    // The reference sensor stops as the clock is set; stamps and arrivals of the other one agree.
+    let made = (0..10).filter_map(|n| step(&mut pipeline, &scan(1, n * 100 * MS))).count();
+    assert!((6..=9).contains(&made), "{made} maps in 1 s: none until the deadline, then one a scan");
 }
 
 #[test]

@@ -41,6 +41,8 @@ fn the_sensor_that_sees_all_around_is_the_reference_whichever_sends_first() {
         let mut pipeline = pipeline(&bumper_and_roof());
         let made: Vec<Map> = events(first).iter().filter_map(|event| step(&mut pipeline, event)).collect();
         assert_eq!(pipeline.reference_sensor(), 1, "{first}");
+        let marked: Vec<bool> = pipeline.sensors().iter().map(|sensor| sensor.is_reference).collect();
+        assert_eq!(marked, [false, true], "the status of the sensors names it too");
         let chosen = made.iter().skip_while(|map| map.reference_sensor == 0);
         assert!(chosen.clone().count() >= 5, "{first}: chosen when both have completed a scan");
         assert!(chosen.clone().all(|map| (map.source, map.reference_sensor) == (1, 1)), "{first}");
@@ -76,4 +78,18 @@ fn a_sensor_that_never_sends_does_not_delay_the_choice() {
     let made: Vec<Map> = alone.filter_map(|event| step(&mut pipeline, &event)).collect();
     assert_eq!(pipeline.reference_sensor(), 1);
     assert!(made.iter().any(|map| (map.source, map.reference_sensor) == (1, 1)));
+}
+
+#[test]
+fn a_better_sensor_that_starts_late_becomes_the_reference() {
+    let mut pipeline = pipeline(&bumper_and_roof());
+    let late = |event: &Event| event.source == 0 || event.arrival_ns > 4 * 100 * MS;
+    for event in events(0).iter().filter(|event| late(event)) {
+        step(&mut pipeline, event);
+        assert_eq!(pipeline.reference_sensor(), usize::from(event.source), "after {} ms", event.arrival_ns / MS);
+        if event.source == 1 {
+            return;
+        }
+    }
+    panic!("the roof's sensor sends nothing");
 }

@@ -81,19 +81,6 @@ impl Scans {
             Self::Paper(lines) => lines.clear(),
         }
     }
-
-    fn write_evidence(
-        &mut self,
-        config: &OccupancyConfig,
-        earliest_ns: i64,
-        window: &Window,
-        of_cell: &mut [u8],
-    ) -> bool {
-        match self {
-            Self::Polar(scans) => scans.write_evidence(config, earliest_ns, window, of_cell),
-            Self::Paper(lines) => lines.write_evidence(earliest_ns, window, of_cell),
-        }
-    }
 }
 
 impl Occupancy {
@@ -147,7 +134,10 @@ impl Occupancy {
         let cells = self.window.side() * self.window.side();
         class.resize(cells, 0);
         hits.resize(cells, 0);
-        let any = self.scans.write_evidence(&self.config, earliest_ns, &self.window, &mut class);
+        let any = match &mut self.scans {
+            Scans::Polar(scans) => scans.write_evidence(&self.config, earliest_ns, &self.window, &mut class),
+            Scans::Paper(lines) => lines.write_evidence(earliest_ns, &self.window, &mut class),
+        };
         let limits = [needed, self.config.hold_maps];
         self.window.update_states(limits, any, self.config.hits, &mut class, &mut hits);
         let share =

@@ -111,11 +111,11 @@ impl FreeSpace {
     fn project(&mut self, drivability: Option<&Layer>, sweep: &Sweep, outline: &Outline, config: &SafePathConfig) {
         let class = drivability.and_then(|layer| TypedChannel::CLASS.values(&layer.channels));
         let (Some(layer), Some(class)) = (drivability, class) else { return self.states.fill(State::Unknown) };
-        let Geometry::Radial { row_radius_m, columns } = &layer.geometry else {
+        let Geometry::Radial { centre_m, row_radius_m, columns } = &layer.geometry else {
             return self.states.fill(State::Unknown);
         };
         if self.made_for.as_ref() != Some(&layer.geometry) {
-            self.find_radial_cells(row_radius_m, *columns);
+            self.find_radial_cells(*centre_m, row_radius_m, *columns);
             self.made_for = Some(layer.geometry.clone());
         }
         self.of_radial_cell.clear();
@@ -218,8 +218,8 @@ impl FreeSpace {
     }
 
     /// Computes the radial cell of each cell.
-    fn find_radial_cells(&mut self, row_radius_m: &[f32], columns: u16) {
-        self.grid = RadialGrid::new(row_radius_m.to_vec(), columns);
+    fn find_radial_cells(&mut self, centre_m: [f32; 2], row_radius_m: &[f32], columns: u16) {
+        self.grid = RadialGrid::new(centre_m, row_radius_m.to_vec(), columns);
         let cell = |index: usize| self.grid.cell(self.centre_m(index % self.side), self.centre_m(index / self.side));
         let cells = 0..self.side * self.side;
         self.radial_cell = cells.map(|index| cell(index).unwrap_or(self.grid.cells()) as u32).collect();

@@ -22,7 +22,8 @@ classes! {
 }
 
 /// Shape of a cell's points, as [`Shape`].
-pub const SHAPE: TypedChannel<u8> = TypedChannel { name: "shape", unit: "", scale: 1.0, unknown: Shape::Unknown as u8 };
+pub const SHAPE: TypedChannel<u8> =
+    TypedChannel { name: "shape", unit: "id", scale: 1.0, unknown: Shape::Unknown as u8 };
 
 /// Square root of the paper's roughness: one raw unit is a fifth of a millimetre of range deviation per metre of
 /// distance. Unknown in a cell that is not flat, or has too few points with a distance series.

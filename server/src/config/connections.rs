@@ -1,0 +1,105 @@
+//! The table `[connections]`: what the peers of every TCP listener may cost, and which addresses may be public.
+
+use std::net::IpAddr;
+
+use serde::{Deserialize, Serialize};
+
+use super::error::ValueError;
+
+/// The table `[connections]`. It holds for gRPC, the page, the metrics and Foxglove.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Connections {
+    /// Most connections of one address at once, at each listener.
+    pub per_address_max: usize,
+    /// Connections of each listener that only known peers may use.
+    pub kept: usize,
+    /// Addresses that are known peers; so are the names in certificates and tokens that have a role.
+    pub known: Vec<IpAddr>,
+    /// A connection without a request for this time is closed, in s.
+    pub idle_s: u64,
+    /// A connection that receives nothing of what waits for it for this time is closed, in s.
+    pub stalled_s: u64,
+    /// Most gRPC calls at once, of all readers and senders.
+    pub calls_max: usize,
+    /// Most gRPC calls of one address at once.
+    pub calls_per_address_max: usize,
+    /// Names by which a browser may address the page, beside addresses, `localhost` and the names in the certificate.
+    pub hosts: Vec<String>,
+    /// Origins of other web pages that may connect, such as `https://fleet.example`.
+    pub origins: Vec<String>,
+    /// Listeners that may serve other hosts without protection.
+    pub unprotected: Vec<Service>,
+}
+
+impl Default for Connections {
+    fn default() -> Self {
+        Self {
+            per_address_max: 64,
+            kept: 16,
+            known: Vec::new(),
+            idle_s: 60,
+            stalled_s: 10,
+            calls_max: 1024,
+            calls_per_address_max: 256,
+            hosts: Vec::new(),
+            origins: Vec::new(),
+            unprotected: Vec::new(),
+        }
+    }
+}
+
+/// What listens on an address.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Service {
+    /// gRPC.
+    Grpc,
+    /// The page and its WebSocket.
+    Page,
+    /// The listener of `/healthz`, `/readyz` and `/metrics` alone.
+    Metrics,
+    /// Foxglove's WebSocket.
+    Foxglove,
+    /// zenoh.
+    Zenoh,
+    /// Datagrams.
+    Udp,
+}
+
+impl Service {
+    /// The name in the configuration.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Grpc => "grpc",
+            Self::Page => "page",
+            Self::Metrics => "metrics",
+            Self::Foxglove => "foxglove",
+            Self::Zenoh => "zenoh",
+            Self::Udp => "udp",
+        }
+    }
+}
+
+impl Connections {
+    pub(super) fn check(&self) -> Result<(), ValueError> {
+        let number = |key: &str, value: u64, most: u64| match (1..=most).contains(&value) {
+            true => Ok(()),
+            false => Err(ValueError::new(format!("connections.{key}"), value, format!("1 to {most}"))),
+        };
+        number("per_address_max", self.per_address_max as u64, 65_536)?;
+        number("idle_s", self.idle_s, 86_400)?;
+        number("stalled_s", self.stalled_s, 3600)?;
+        number("calls_max", self.calls_max as u64, 1 << 20)?;
+        number("calls_per_address_max", self.calls_per_address_max as u64, 1 << 20)?;
+        if self.kept > 65_535 {
+            return Err(ValueError::new("connections.kept", self.kept, "0 to 65535 connections"));
+        }
+        let is_wrong = |origin: &&String| !origin.contains("://") || origin.ends_with('/');
+        if let Some(origin) = self.origins.iter().find(is_wrong) {
+            let allowed = "origins such as \"https://fleet.example\", without a path";
+            return Err(ValueError::new("connections.origins", origin, allowed));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,334 @@
+//! The connections of one listener: how many there may be, in all and of one address, and which are closed because
+//! they do nothing.
+//!
+//! A newcomer takes a free place, or the place of the connection that has been without a request for the longest time.
+//! It is refused only if every connection has a request in progress. Some places are kept for known peers. So idle,
+//! silent and half-open connections can never keep another peer out, however many hosts open them.
+
+use std::collections::BTreeMap;
+use std::net::IpAddr;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use tokio_util::sync::CancellationToken;
+
+use super::flow::{Flow, Flows};
+use crate::config;
+use crate::sync::locked;
+
+/// Longest time from the connection to its first request, with the TLS handshake. Ours: every client sends at once.
+const FIRST_REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
+/// Longest time that a connection over the limit stays open: enough for a handshake, one call and its answer.
+const OVER_LIMIT_TIMEOUT: Duration = Duration::from_secs(5);
+/// Most connections over the limit that are open at once to receive an error; others are closed without one. Ours: a
+/// small share of the file handles of a process.
+const OVER_LIMIT_MAX: usize = 16;
+
+/// The limits of one listener.
+#[derive(Clone, Debug)]
+pub struct Limits {
+    /// Most connections.
+    pub connections_max: usize,
+    /// What says so, in an error.
+    pub allowed_by: &'static str,
+    /// Most connections of one address.
+    pub per_address_max: usize,
+    /// Connections that only known peers may use.
+    pub kept: usize,
+    /// Addresses that are known.
+    pub known: Vec<IpAddr>,
+    /// Longest time without a request.
+    pub idle: Duration,
+    /// Longest time in which nothing of what waits for the peer is sent.
+    pub stalled: Duration,
+}
+
+impl Limits {
+    /// The limits of a configuration, for a listener with at most `connections_max` connections. At least half of them
+    /// are for every peer.
+    pub fn new(config: &config::Connections, connections_max: usize, allowed_by: &'static str) -> Self {
+        Self {
+            connections_max,
+            allowed_by,
+            per_address_max: config.per_address_max,
+            kept: config.kept.min(connections_max / 2),
+            known: config.known.clone(),
+            idle: Duration::from_secs(config.idle_s),
+            stalled: Duration::from_secs(config.stalled_s),
+        }
+    }
+}
+
+/// The connections of one listener.
+#[derive(Debug)]
+pub struct Places {
+    limits: Mutex<Limits>,
+    open: Mutex<Open>,
+    /// Connections that were refused or closed by the server, by reason.
+    closed: Mutex<BTreeMap<&'static str, u64>>,
+    flows: Arc<Flows>,
+}
+
+#[derive(Debug, Default)]
+struct Open {
+    next: u64,
+    all: BTreeMap<u64, Arc<Occupant>>,
+}
+
+/// What is known of one connection.
+#[derive(Debug)]
+struct Occupant {
+    peer: IpAddr,
+    is_known: AtomicBool,
+    over_limit: Mutex<Option<String>>,
+    opened: Instant,
+    closing: CancellationToken,
+    activity: Mutex<Activity>,
+    flows: Mutex<Vec<Arc<Flow>>>,
+}
+
+#[derive(Debug)]
+struct Activity {
+    requests: u64,
+    in_progress: u32,
+    /// Since when no request is in progress.
+    idle_since: Instant,
+    /// Since when the socket takes no byte of what is to be sent.
+    blocked_since: Option<Instant>,
+}
+
+impl Occupant {
+    /// Since when it has been without a request; `None` while it has one, and if it is being closed.
+    fn idle_since(&self) -> Option<Instant> {
+        let activity = locked(&self.activity);
+        (activity.in_progress == 0 && !self.closing.is_cancelled()).then_some(activity.idle_since)
+    }
+
+    fn is_known(&self) -> bool {
+        self.is_known.load(Ordering::Relaxed)
+    }
+
+    fn is_over_limit(&self) -> bool {
+        locked(&self.over_limit).is_some()
+    }
+
+    fn counts(&self) -> bool {
+        !self.is_over_limit() && !self.closing.is_cancelled()
+    }
+
+    /// Why the connection is to be closed now.
+    fn fault(&self, limits: &Limits, now: Instant) -> Option<&'static str> {
+        let past = |since: Instant, limit: Duration| now.saturating_duration_since(since) > limit;
+        if self.is_over_limit() {
+            return past(self.opened, OVER_LIMIT_TIMEOUT).then_some("over_limit_timeout");
+        }
+        let activity = locked(&self.activity);
+        if activity.requests == 0 && past(self.opened, FIRST_REQUEST_TIMEOUT.min(limits.idle)) {
+            return Some("no_request");
+        }
+        if activity.in_progress == 0 && activity.requests > 0 && past(activity.idle_since, limits.idle) {
+            return Some("idle");
+        }
+        let is_blocked = activity.blocked_since.is_some_and(|since| past(since, limits.stalled));
+        drop(activity);
+        let mut flows = locked(&self.flows);
+        flows.retain(|flow| Arc::strong_count(flow) > 1);
+        let is_stalled =
+            is_blocked || flows.iter().any(|flow| flow.stuck_since().is_some_and(|s| past(s, limits.stalled)));
+        is_stalled.then_some("stalled")
+    }
+}
+
+impl Places {
+    /// No connection yet. `flows` is what waits for all peers of this listener.
+    pub fn new(limits: Limits, flows: Arc<Flows>) -> Arc<Self> {
+        Arc::new(Self { limits: Mutex::new(limits), open: Mutex::default(), closed: Mutex::default(), flows })
+    }
+
+    /// Uses other limits from now on; open connections stay.
+    pub fn set_limits(&self, limits: Limits) {
+        *locked(&self.limits) = limits;
+    }
+
+    /// Number of open connections, and the connections that were refused or closed by the server, by reason.
+    pub fn counts(&self) -> (usize, BTreeMap<&'static str, u64>) {
+        (locked(&self.open).all.len(), locked(&self.closed).clone())
+    }
+
+    /// Counts a connection that was refused or closed.
+    pub fn count(&self, reason: &'static str) {
+        *locked(&self.closed).entry(reason).or_default() += 1;
+    }
+
+    /// Closes the connection that has been idle for the longest time, to free its file handle.
+    pub fn free_one(&self) {
+        let open = locked(&self.open);
+        self.close_idlest(&open, "made_room", |_| true);
+    }
+
+    /// Admits a connection of this peer. Over a limit it gets a place in which it can only receive an error, and of
+    /// these there are a few.
+    pub fn admit(self: &Arc<Self>, peer: IpAddr) -> Place {
+        let limits = locked(&self.limits).clone();
+        let mut open = locked(&self.open);
+        let is_known = limits.known.contains(&peer);
+        let over_limit = self.make_room(&open, &limits, peer, is_known).err();
+        if over_limit.is_some() {
+            let of_limit = open.all.values().filter(|o| o.is_over_limit() && !o.closing.is_cancelled());
+            let of_limit: Vec<_> = of_limit.collect();
+            // The oldest: a peer that has a certificate shows it at once, and then it is within the limit.
+            if let Some(oldest) = of_limit.first().filter(|_| of_limit.len() >= OVER_LIMIT_MAX) {
+                oldest.closing.cancel();
+            }
+        }
+        let now = Instant::now();
+        let occupant = Arc::new(Occupant {
+            peer,
+            is_known: is_known.into(),
+            over_limit: Mutex::new(over_limit),
+            opened: now,
+            closing: CancellationToken::new(),
+            activity: Mutex::new(Activity { requests: 0, in_progress: 0, idle_since: now, blocked_since: None }),
+            flows: Mutex::default(),
+        });
+        open.next += 1;
+        let number = open.next;
+        open.all.insert(number, occupant.clone());
+        Place { number, occupant, places: self.clone() }
+    }
+
+    /// Finds room for one more connection, if need be by closing an idle one.
+    ///
+    /// # Errors
+    /// What is exhausted, as a text.
+    fn make_room(&self, open: &Open, limits: &Limits, peer: IpAddr, is_known: bool) -> Result<(), String> {
+        let of_peer = |occupant: &Occupant| occupant.peer == peer;
+        let count = |of: &dyn Fn(&Occupant) -> bool| open.all.values().filter(|o| o.counts() && of(o)).count();
+        let of_address = count(&of_peer);
+        if of_address >= limits.per_address_max && !self.close_idlest(open, "made_room", of_peer) {
+            return Err(format!(
+                "{of_address} connections of {peer} are open, which connections.per_address_max allows"
+            ));
+        }
+        let (all, unknown) = (count(&|_| true), count(&|occupant| !occupant.is_known()));
+        let is_full = all >= limits.connections_max || (!is_known && unknown >= limits.connections_max - limits.kept);
+        if is_full && !self.close_idlest(open, "made_room", |occupant| is_known || !occupant.is_known()) {
+            let (most, by) = (limits.connections_max, limits.allowed_by);
+            return Err(match all >= most {
+                true => format!("{most} connections are open, which {by} allows; try again when one is closed"),
+                false => format!(
+                    "{unknown} connections are open; of the {most} that {by} allows, {} are kept for known peers",
+                    limits.kept
+                ),
+            });
+        }
+        Ok(())
+    }
+
+    /// Closes the one of these connections that has been idle for the longest time; those of unknown peers first.
+    fn close_idlest(&self, open: &Open, reason: &'static str, of: impl Fn(&Occupant) -> bool) -> bool {
+        let idle = open.all.values().filter(|occupant| occupant.counts() && of(occupant));
+        let idle = idle.filter_map(|occupant| Some(((occupant.is_known(), occupant.idle_since()?), occupant)));
+        let Some((_, idlest)) = idle.min_by_key(|(key, _)| *key) else { return false };
+        idlest.closing.cancel();
+        self.count(reason);
+        true
+    }
+
+    /// Closes the connections that have been idle or stalled for too long.
+    pub fn sweep(&self) {
+        let limits = locked(&self.limits).clone();
+        let now = Instant::now();
+        for occupant in locked(&self.open).all.values().filter(|occupant| !occupant.closing.is_cancelled()) {
+            if let Some(reason) = occupant.fault(&limits, now) {
+                tracing::info!(peer = %occupant.peer, reason, "connection closed");
+                occupant.closing.cancel();
+                self.count(reason);
+            }
+        }
+    }
+}
+
+/// The place of one connection; it is free again when this is dropped.
+#[derive(Debug)]
+pub struct Place {
+    number: u64,
+    occupant: Arc<Occupant>,
+    places: Arc<Places>,
+}
+
+impl Place {
+    /// The address of the peer.
+    pub fn peer(&self) -> IpAddr {
+        self.occupant.peer
+    }
+
+    /// Is cancelled when the connection is to be closed.
+    pub fn closing(&self) -> CancellationToken {
+        self.occupant.closing.clone()
+    }
+
+    /// Why the connection is served nothing; `None` if it is served.
+    pub fn over_limit(&self) -> Option<String> {
+        locked(&self.occupant.over_limit).clone()
+    }
+
+    /// The peer has shown a certificate or token that has a role: it may use the connections kept for known peers.
+    pub fn set_known(&self) {
+        if self.occupant.is_known.swap(true, Ordering::Relaxed) || !self.occupant.is_over_limit() {
+            return;
+        }
+        let (places, limits) = (&self.places, locked(&self.places.limits).clone());
+        let open = locked(&places.open);
+        if places.make_room(&open, &limits, self.occupant.peer, true).is_ok() {
+            *locked(&self.occupant.over_limit) = None;
+        }
+    }
+
+    /// Counts a refusal or an end of this connection.
+    pub fn count(&self, reason: &'static str) {
+        self.places.count(reason);
+    }
+
+    /// Records whether the socket takes no byte at present.
+    pub fn set_blocked(&self, is_blocked: bool) {
+        let blocked_since = &mut locked(&self.occupant.activity).blocked_since;
+        *blocked_since = is_blocked.then(|| blocked_since.unwrap_or_else(Instant::now));
+    }
+
+    /// A request is in progress until the return value is dropped.
+    pub fn begin_request(self: &Arc<Self>) -> InProgress {
+        let mut activity = locked(&self.occupant.activity);
+        (activity.requests, activity.in_progress) = (activity.requests + 1, activity.in_progress + 1);
+        InProgress(self.clone())
+    }
+
+    /// What waits in the server for one response of this connection; `None` if the connection's address has too many
+    /// responses in progress.
+    pub fn begin_flow(&self) -> Option<Arc<Flow>> {
+        let mut flows = locked(&self.occupant.flows);
+        flows.retain(|flow| Arc::strong_count(flow) > 1);
+        let flow = self.places.flows.begin(self.occupant.peer, self.number)?;
+        flows.push(flow.clone());
+        Some(flow)
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        locked(&self.places.open).all.remove(&self.number);
+    }
+}
+
+/// A request in progress.
+#[derive(Debug)]
+pub struct InProgress(Arc<Place>);
+
+impl Drop for InProgress {
+    fn drop(&mut self) {
+        let mut activity = locked(&self.0.occupant.activity);
+        activity.in_progress -= 1;
+        activity.idle_since = Instant::now();
+    }
+}

@@ -1,0 +1,114 @@
+//! A ROS 2 bag in sqlite (`.db3`) -> the records that an MCAP file of the same messages would have, in the order of
+//! their times.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::io::Read;
+use std::path::Path;
+
+use mcap::records::{Channel, MessageHeader, Record, SchemaHeader};
+use rusqlite::{Connection, OpenFlags, params};
+
+use super::chunk::RECORD_BYTES_MAX;
+use super::mcap_records::LostPart;
+
+/// Number of messages that are read at once. Ours: a message of points has about a megabyte.
+const BATCH: i64 = 16;
+/// First bytes of a message that rosbag2 has compressed with zstd. No message in CDR starts with them.
+const ZSTD: &[u8] = &[0x28, 0xb5, 0x2f, 0xfd];
+
+/// A bag while it is read.
+pub(super) struct BagRecords {
+    bag: Connection,
+    waiting: VecDeque<Record<'static>>,
+    /// Time and id of the newest message.
+    newest: (i64, i64),
+    bytes_read: u64,
+    has_ended: bool,
+    lost: Vec<LostPart>,
+}
+
+impl BagRecords {
+    /// Opens a bag and reads its topics.
+    ///
+    /// # Errors
+    /// If it is not a bag, or its tables cannot be read.
+    pub(super) fn open(file: &Path) -> rusqlite::Result<Self> {
+        let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+        let bag = Connection::open_with_flags(file, flags)?;
+        let mut waiting = VecDeque::new();
+        let mut topics = bag.prepare("SELECT id, name, type, serialization_format FROM topics ORDER BY id")?;
+        let mut rows = topics.query([])?;
+        while let Some(row) = rows.next()? {
+            let (id, topic, name, message_encoding) = (row.get(0)?, row.get(1)?, row.get(2)?, row.get(3)?);
+            // A bag has no definitions of its types; an empty encoding says so.
+            let header = SchemaHeader { id, name, encoding: String::new() };
+            waiting.push_back(Record::Schema { header, data: Vec::new().into() });
+            let channel = Channel { id, schema_id: id, topic, message_encoding, metadata: BTreeMap::new() };
+            waiting.push_back(Record::Channel(channel));
+        }
+        drop(rows);
+        drop(topics);
+        let newest = (i64::MIN, i64::MIN);
+        Ok(Self { bag, waiting, newest, bytes_read: 0, has_ended: false, lost: Vec::new() })
+    }
+
+    /// Number of bytes of the messages so far.
+    pub(super) fn bytes_read(&self) -> u64 {
+        self.bytes_read
+    }
+
+    /// True if the bag was read to its end.
+    pub(super) fn has_end(&self) -> bool {
+        self.has_ended && self.lost.is_empty()
+    }
+
+    /// The part that cannot be read.
+    pub(super) fn lost(&self) -> &[LostPart] {
+        &self.lost
+    }
+
+    /// The next record; `None` at the end.
+    pub(super) fn next(&mut self) -> Option<Record<'static>> {
+        if self.waiting.is_empty()
+            && !self.has_ended
+            && let Err(error) = self.read_batch()
+        {
+            // The pages of a table hang on each other: what follows a damaged page cannot be found.
+            self.has_ended = true;
+            let reason = format!("the messages after {} cannot be read: {error}", self.newest.0);
+            let bytes = (self.bytes_read, self.bytes_read);
+            self.lost.push(LostPart { bytes, reason, log_ns: None, messages: BTreeMap::new() });
+        }
+        self.waiting.pop_front()
+    }
+
+    fn read_batch(&mut self) -> rusqlite::Result<()> {
+        let mut messages = self.bag.prepare(
+            "SELECT id, topic_id, timestamp, data FROM messages WHERE (timestamp, id) > (?1, ?2) \
+             ORDER BY timestamp, id LIMIT ?3",
+        )?;
+        let mut rows = messages.query(params![self.newest.0, self.newest.1, BATCH])?;
+        self.has_ended = true;
+        while let Some(row) = rows.next()? {
+            let (id, channel_id, time): (i64, u16, i64) = (row.get(0)?, row.get(1)?, row.get(2)?);
+            let data: Vec<u8> = row.get(3)?;
+            self.bytes_read += data.len() as u64;
+            let data = if data.starts_with(ZSTD) { decompressed(&data)? } else { data };
+            let log_time = u64::try_from(time).unwrap_or(0);
+            let header = MessageHeader { channel_id, sequence: 0, log_time, publish_time: log_time };
+            self.waiting.push_back(Record::Message { header, data: data.into() });
+            self.newest = (time, id);
+            self.has_ended = false;
+        }
+        Ok(())
+    }
+}
+
+fn decompressed(data: &[u8]) -> rusqlite::Result<Vec<u8>> {
+    let mut content = Vec::new();
+    let frame = zstd::stream::read::Decoder::new(data).map(|frame| frame.take(RECORD_BYTES_MAX as u64));
+    frame
+        .and_then(|mut frame| frame.read_to_end(&mut content))
+        .map_err(|error| rusqlite::Error::FromSqlConversionFailure(3, rusqlite::types::Type::Blob, Box::new(error)))?;
+    Ok(content)
+}

@@ -1,0 +1,48 @@
+//! A damaged part of an MCAP file: where it is, and what is lost with it.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use serde_json::{Value, json};
+
+use crate::counted::counted;
+
+/// A part of an MCAP file that cannot be read.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Damage {
+    /// The bytes of the file, from the first up to, without, the second.
+    pub bytes: (u64, u64),
+    /// The kind of damage.
+    pub reason: String,
+    /// Least and greatest log time of the lost messages, ns since the Unix epoch; `None` if it is not known or if no
+    /// message is lost.
+    pub log_ns: Option<(u64, u64)>,
+    /// Number of lost messages by topic, as far as known: the index behind a chunk counts its messages.
+    pub messages: BTreeMap<String, u64>,
+}
+
+impl Damage {
+    /// The damage as one JSON object.
+    pub fn to_json(&self) -> Value {
+        let (first, last) = self.log_ns.unzip();
+        json!({
+            "bytes": [self.bytes.0, self.bytes.1], "reason": self.reason,
+            "lost_from_ns": first, "lost_to_ns": last, "lost": self.messages,
+        })
+    }
+}
+
+impl fmt::Display for Damage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "bytes {} to {}: {}", self.bytes.0, self.bytes.1, self.reason)?;
+        if !self.messages.is_empty() {
+            let lost = self.messages.iter().map(|(topic, count)| format!("{} of {topic}", counted(*count, "message")));
+            write!(f, "; lost: {}", lost.collect::<Vec<_>>().join(", "))?;
+        }
+        if let Some((first, last)) = self.log_ns {
+            let seconds = |ns: u64| ns as f64 * 1e-9;
+            write!(f, "; lost from {:.3} s to {:.3} s", seconds(first), seconds(last))?;
+        }
+        Ok(())
+    }
+}

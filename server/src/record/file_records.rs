@@ -1,0 +1,90 @@
+//! A file -> its records, by the kind of the file: MCAP, or a ROS 2 bag in sqlite.
+
+use std::fs::File;
+use std::io::{Error, ErrorKind, Read, Seek};
+use std::path::Path;
+
+use mcap::records::Record;
+
+#[cfg(feature = "sqlite")]
+use super::bag_records::BagRecords;
+use super::mcap_records::{LostPart, McapRecords, RecordsError};
+
+/// First bytes of a bag in sqlite.
+const SQLITE: &[u8] = b"SQLite format 3\0";
+
+/// The records of a file while it is read.
+pub(super) enum FileRecords {
+    Mcap(McapRecords),
+    #[cfg(feature = "sqlite")]
+    Bag(Box<BagRecords>),
+}
+
+impl FileRecords {
+    /// Opens a file. With `any_start`, wrong first bytes are damage and not an error.
+    pub(super) fn open(path: &Path, any_start: bool) -> Result<Self, Error> {
+        let mut file = File::open(path)?;
+        let metadata = file.metadata()?;
+        if metadata.is_file() && metadata.len() == 0 {
+            return Err(Error::new(ErrorKind::UnexpectedEof, "the file is empty"));
+        }
+        if metadata.is_file() {
+            let mut start = Vec::new();
+            (&mut file).take(SQLITE.len() as u64).read_to_end(&mut start)?;
+            if start == SQLITE {
+                return bag(path);
+            }
+            file.rewind()?;
+        }
+        Ok(Self::Mcap(McapRecords::new(file, any_start)))
+    }
+
+    /// Number of bytes read so far.
+    pub(super) fn offset(&self) -> u64 {
+        match self {
+            Self::Mcap(records) => records.offset(),
+            #[cfg(feature = "sqlite")]
+            Self::Bag(records) => records.bytes_read(),
+        }
+    }
+
+    /// True if the file was read to an end that its writer has made.
+    pub(super) fn has_end(&self) -> bool {
+        match self {
+            Self::Mcap(records) => records.has_footer(),
+            #[cfg(feature = "sqlite")]
+            Self::Bag(records) => records.has_end(),
+        }
+    }
+
+    /// The parts so far that cannot be read.
+    pub(super) fn lost(&self) -> &[LostPart] {
+        match self {
+            Self::Mcap(records) => records.lost(),
+            #[cfg(feature = "sqlite")]
+            Self::Bag(records) => records.lost(),
+        }
+    }
+
+    /// The next record; `None` at the end.
+    pub(super) fn next(&mut self) -> Result<Option<Record<'static>>, RecordsError> {
+        match self {
+            Self::Mcap(records) => records.next(),
+            #[cfg(feature = "sqlite")]
+            Self::Bag(records) => Ok(records.next()),
+        }
+    }
+}
+
+#[cfg(feature = "sqlite")]
+fn bag(path: &Path) -> Result<FileRecords, Error> {
+    let wrong = |error| Error::new(ErrorKind::InvalidData, format!("not a ROS 2 bag that can be read: {error}"));
+    Ok(FileRecords::Bag(Box::new(BagRecords::open(path).map_err(wrong)?)))
+}
+
+#[cfg(not(feature = "sqlite"))]
+fn bag(_: &Path) -> Result<FileRecords, Error> {
+    let reason = "a ROS 2 bag in sqlite, and this clearway was built without the feature sqlite; `ros2 bag convert` \
+        writes it as MCAP";
+    Err(Error::new(ErrorKind::Unsupported, reason))
+}

@@ -1,0 +1,172 @@
+//! A damaged MCAP file -> a whole one with every record that can be read, and a report of what is lost.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+
+use mcap::records::{AttachmentHeader, Metadata, Record};
+use mcap::{Attachment, Compression, McapError, WriteOptions};
+use serde_json::{Value, json};
+
+use super::damage::Damage;
+use super::mcap_reader::{McapReadError, McapReader};
+use crate::file_advice::advised;
+
+/// The name of the metadata that a repaired file has beside those of the damaged one.
+const METADATA: &str = "clearway-repair";
+
+/// What was recovered and what is lost.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Report {
+    /// Number of messages of the new file.
+    pub messages: u64,
+    /// The damaged parts of the file.
+    pub damages: Vec<Damage>,
+    /// How the file is incomplete; `None` if it is whole.
+    pub incomplete: Option<String>,
+}
+
+impl Report {
+    /// The report as one JSON object.
+    pub fn to_json(&self) -> Value {
+        json!({
+            "messages": self.messages, "incomplete": self.incomplete,
+            "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(),
+        })
+    }
+}
+
+/// A file cannot be repaired.
+#[derive(Debug, thiserror::Error)]
+pub enum RepairError {
+    /// The damaged file cannot be read.
+    #[error(transparent)]
+    Read(#[from] McapReadError),
+    /// No message of the damaged file can be read.
+    #[error("{}: no message can be read{}", file.display(), incomplete.as_ref().map_or(String::new(), |of| format!(": {of}")))]
+    Nothing {
+        /// The damaged file.
+        file: PathBuf,
+        /// How it is incomplete.
+        incomplete: Option<String>,
+    },
+    /// The new file cannot be created or moved to its name.
+    #[error("{}: {source}", file.display())]
+    Create {
+        /// The new file.
+        file: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The new file cannot be written.
+    #[error("{}: {source}", file.display())]
+    Write {
+        /// The new file.
+        file: PathBuf,
+        /// The reason.
+        source: McapError,
+    },
+    /// The new file does not hold what was written to it.
+    #[error("{}: read again, it has {found} messages and not {written}", file.display())]
+    Differs {
+        /// The new file.
+        file: PathBuf,
+        /// Number of messages that were written.
+        written: u64,
+        /// Number of messages that it has.
+        found: u64,
+    },
+}
+
+/// Writes every record of `input` that can be read to the new file `output`, which has its name only once it is whole.
+///
+/// # Errors
+/// [`RepairError`]; then there is no file `output`.
+pub fn repair(input: &Path, output: &Path) -> Result<Report, RepairError> {
+    let create = |source| RepairError::Create { file: output.to_owned(), source: advised(output, source) };
+    if output.exists() {
+        return Err(create(std::io::ErrorKind::AlreadyExists.into()));
+    }
+    let mut reader = McapReader::open_any(input)?;
+    let folder = output.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let name = output.file_name().unwrap_or_default().to_string_lossy();
+    let partial = folder.join(format!(".{name}.{}.partial", std::process::id()));
+    let file = File::create_new(&partial).map_err(create)?;
+    let written = copy(&mut reader, file, output).and_then(|report| {
+        read_again(&partial, output, report.messages)?;
+        // A hard link, unlike a rename, never replaces a file that has appeared meanwhile.
+        std::fs::hard_link(&partial, output).map_err(create)?;
+        Ok(report)
+    });
+    // The new file has its own name now; after an error the rest is of no use.
+    let _ = std::fs::remove_file(&partial);
+    written
+}
+
+/// Copies all records; returns the report, or an error if there was no message.
+fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, RepairError> {
+    let failed = |source| RepairError::Write { file: output.to_owned(), source };
+    let mut writer = WriteOptions::new()
+        .profile("")
+        .library(concat!("clearway/", env!("CARGO_PKG_VERSION")))
+        .compression(Some(Compression::Zstd))
+        .compression_threads(0)
+        .create(BufWriter::new(file))
+        .map_err(failed)?;
+    let mut report = Report::default();
+    // Ids of the damaged file -> ids of the new one.
+    let (mut schemas, mut channels) = (BTreeMap::from([(0, 0)]), BTreeMap::new());
+    while let Some(record) = reader.next_record()? {
+        let copied = match record {
+            Record::Schema { header, data } => {
+                let id = writer.add_schema(&header.name, &header.encoding, &data);
+                id.map(|id| _ = schemas.insert(header.id, id))
+            }
+            Record::Channel(channel) => {
+                let schema = schemas.get(&channel.schema_id).copied().unwrap_or_default();
+                let id = writer.add_channel(schema, &channel.topic, &channel.message_encoding, &channel.metadata);
+                id.map(|id| _ = channels.insert(channel.id, id))
+            }
+            Record::Message { mut header, data } => match channels.get(&header.channel_id) {
+                Some(id) => {
+                    header.channel_id = *id;
+                    report.messages += 1;
+                    writer.write_to_known_channel(&header, &data)
+                }
+                None => Ok(()),
+            },
+            Record::Metadata(metadata) => writer.write_metadata(&metadata),
+            Record::Attachment { header, data, .. } => {
+                let AttachmentHeader { log_time, create_time, name, media_type } = header;
+                writer.attach(&Attachment { log_time, create_time, name, media_type, data })
+            }
+            _ => Ok(()),
+        };
+        copied.map_err(failed)?;
+    }
+    (report.damages, report.incomplete) = (reader.damages(), reader.incomplete());
+    if report.messages == 0 {
+        return Err(RepairError::Nothing { file: reader.file().to_owned(), incomplete: report.incomplete });
+    }
+    if let Some(incomplete) = &report.incomplete {
+        let metadata = BTreeMap::from([("lost".to_owned(), incomplete.clone())]);
+        writer.write_metadata(&Metadata { name: METADATA.into(), metadata }).map_err(failed)?;
+    }
+    writer.finish().map_err(failed)?;
+    let file = writer.into_inner().into_inner().map_err(|error| failed(McapError::Io(error.into_error())))?;
+    file.sync_all().map_err(|error| failed(McapError::Io(error)))?;
+    Ok(report)
+}
+
+/// Reads the new file from its start to its end.
+fn read_again(partial: &Path, output: &Path, written: u64) -> Result<(), RepairError> {
+    let mut reader = McapReader::open(partial)?;
+    let mut found = 0;
+    for message in reader.by_ref() {
+        message?;
+        found += 1;
+    }
+    let is_whole = reader.incomplete().is_none() && found == written;
+    if is_whole { Ok(()) } else { Err(RepairError::Differs { file: output.to_owned(), written, found }) }
+}

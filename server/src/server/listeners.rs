@@ -1,0 +1,75 @@
+//! The TCP listeners of a configuration, and what of them can be replaced while they serve.
+
+use std::net::SocketAddr;
+
+use tokio::net::TcpListener;
+
+use super::setup::StartError;
+use crate::config::Config;
+use crate::publish::foxglove;
+use crate::publish::listen::security::Security;
+use crate::publish::listen::{Limits, Listener, ListenerHandle, Protocol};
+
+/// Most connections of the page and of Foxglove. Ours: some dozens of browsers with a few connections each.
+const WEB_CONNECTIONS_MAX: usize = 256;
+/// Most connections of the metrics. Ours: some probes and collectors.
+const METRICS_CONNECTIONS_MAX: usize = 64;
+
+/// The TCP listeners.
+pub(super) struct Listeners {
+    pub grpc: Option<Listener>,
+    pub page: Option<Listener>,
+    pub metrics: Option<Listener>,
+    pub foxglove: Option<Listener>,
+    pub security: Security,
+    pub handles: Vec<(&'static str, ListenerHandle)>,
+}
+
+impl Listeners {
+    /// Listens on all addresses that the configuration enables.
+    ///
+    /// # Errors
+    /// [`StartError::Listen`] with the first address that cannot be listened on.
+    pub async fn bind(config: &Config, security: &Security) -> Result<Self, StartError> {
+        let mut listeners =
+            Self { grpc: None, page: None, metrics: None, foxglove: None, security: security.clone(), handles: vec![] };
+        let (grpc, page, metrics, foxglove) = (&config.grpc, &config.page, &config.metrics, &config.foxglove);
+        let web = Protocol::Web(&[]);
+        let for_foxglove = Protocol::Web(foxglove::ORIGINS);
+        listeners.grpc = listeners.add("grpc", grpc.enabled, grpc.listen, Protocol::Grpc, config).await?;
+        listeners.page = listeners.add("page", page.enabled, page.listen, web, config).await?;
+        listeners.metrics = listeners.add("metrics", metrics.enabled, metrics.listen, web, config).await?;
+        let added = listeners.add("foxglove", foxglove.enabled, foxglove.listen, for_foxglove, config);
+        listeners.foxglove = added.await?;
+        Ok(listeners)
+    }
+
+    async fn add(
+        &mut self,
+        name: &'static str,
+        is_enabled: bool,
+        at: SocketAddr,
+        protocol: Protocol,
+        config: &Config,
+    ) -> Result<Option<Listener>, StartError> {
+        if !is_enabled {
+            return Ok(None);
+        }
+        let socket = TcpListener::bind(at).await.map_err(|source| StartError::Listen { what: name, at, source })?;
+        let calls = (config.connections.calls_max, config.connections.calls_per_address_max);
+        let (listener, handle) = Listener::new(socket, protocol, limits(name, config), calls, self.security.clone());
+        self.handles.push((name, handle));
+        Ok(Some(listener))
+    }
+}
+
+/// The limits of the listener with this name.
+pub(super) fn limits(name: &str, config: &Config) -> Limits {
+    let (connections_max, allowed_by) = match name {
+        "grpc" => (config.grpc.connections_max, "grpc.connections_max"),
+        "metrics" => (METRICS_CONNECTIONS_MAX, "the metrics' listener"),
+        "page" => (WEB_CONNECTIONS_MAX, "the page's listener"),
+        _ => (WEB_CONNECTIONS_MAX, "Foxglove's listener"),
+    };
+    Limits::new(&config.connections, connections_max, allowed_by)
+}

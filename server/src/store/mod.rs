@@ -1,0 +1,14 @@
+//! Long-term storage of recordings: a folder, or a bucket of S3 or of a compatible server.
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | [`location`] | a path or a URL -> the store |
+//! | [`index`] | a finished part -> what it holds, for a search; a search -> the parts |
+//! | [`upload`] | finished parts of a folder -> the store, confirmed |
+//!
+//! A part is the object `parts/<time>-<CRC>.mcap`; what it holds is the object `index/<vehicle>/<time>-<CRC>.json`,
+//! one for each vehicle. The time is that of the first message, in ns, in 20 digits, so that names sort by time.
+
+pub mod index;
+pub mod location;
+pub mod upload;

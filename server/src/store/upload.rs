@@ -1,0 +1,220 @@
+//! Finished parts of a folder -> the store, confirmed.
+//!
+//! A part is confirmed when it was read back from the store, its CRC was that of the file, and its index was written
+//! after it. A file beside the part, `<part>.confirmed`, then says so; it is what makes the part deletable. A crash
+//! between two steps repeats them: the name of a part has its CRC, so it is never written with other contents.
+
+use std::fs::{self, File};
+use std::io::{self, BufReader, Read, Write};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use futures::TryStreamExt;
+use object_store::{ObjectStore, ObjectStoreExt, WriteMultipart, path::Path as Key};
+use serde::{Deserialize, Serialize};
+
+use super::index::Entry;
+use crate::record::mcap_reader::McapReadError;
+
+/// Bytes of one piece of a part, which is sent at once. S3 allows 5 MiB or more.
+const PIECE_BYTES: usize = 8 << 20;
+/// Pieces that are sent at the same time.
+const PIECES: usize = 2;
+/// Age after which a file without closing records is no longer being written. Ours: a recorder writes each second.
+const STILL_WRITTEN: Duration = Duration::from_secs(60);
+
+/// The store's confirmation of a part.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Confirmation {
+    /// The name of the part's object in the store.
+    pub part: String,
+    /// Length of the part, in bytes.
+    pub bytes: u64,
+    /// CRC-32 of the part, as it was read back from the store.
+    pub crc32: u32,
+}
+
+/// A part is not confirmed. It stays where it is.
+#[derive(Debug, thiserror::Error)]
+pub enum UploadError {
+    /// The part cannot be read.
+    #[error("{}: {source}", file.display())]
+    Read {
+        /// The part.
+        file: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// The part is not a recording.
+    #[error(transparent)]
+    Recording(#[from] McapReadError),
+    /// The part has no event and no map.
+    #[error("{}: a recording without an event or a map", file.display())]
+    Nothing {
+        /// The part.
+        file: PathBuf,
+    },
+    /// The store refused the part or did not answer.
+    #[error("{}: {source}", file.display())]
+    Store {
+        /// The part.
+        file: PathBuf,
+        /// The store's reason.
+        source: object_store::Error,
+    },
+    /// The store has other bytes than it was sent.
+    #[error(
+        "{}: the store confirmed the part {part} and holds other bytes: CRC {found:08x} and not {sent:08x}",
+        file.display()
+    )]
+    Differs {
+        /// The part.
+        file: PathBuf,
+        /// The name of the object.
+        part: String,
+        /// CRC-32 of the file.
+        sent: u32,
+        /// CRC-32 of the object.
+        found: u32,
+    },
+}
+
+/// Sends a finished part to the store, confirms it there, and writes its confirmation beside it. Sending a part again
+/// changes nothing.
+///
+/// # Errors
+/// [`UploadError`]; the part is then not confirmed.
+pub async fn upload(store: &dyn ObjectStore, finished_part: &Path) -> Result<Confirmation, UploadError> {
+    let file = finished_part;
+    let read = |source| UploadError::Read { file: file.to_owned(), source };
+    let refused = |source| UploadError::Store { file: file.to_owned(), source };
+    let (bytes, crc32) = crc_of(file).map_err(read)?;
+    let entries = Entry::of_part(file, bytes, crc32)?;
+    let Some(first) = entries.first() else { return Err(UploadError::Nothing { file: file.to_owned() }) };
+    let part = first.part.clone();
+    let key = Key::from(part.as_str());
+    send(store, &key, file).await?;
+    let found = crc_in_store(store, &key).await.map_err(refused)?;
+    if found != (bytes, crc32) {
+        return Err(UploadError::Differs { file: file.to_owned(), part, sent: crc32, found: found.1 });
+    }
+    for entry in &entries {
+        let json = serde_json::to_vec_pretty(entry).expect("an entry has only text and numbers");
+        store.put(&entry.key(), json.into()).await.map_err(refused)?;
+    }
+    let confirmation = Confirmation { part, bytes, crc32 };
+    write_durably(&confirmation_of(file), &confirmation).map_err(read)?;
+    Ok(confirmation)
+}
+
+/// The finished parts of a folder that are not confirmed, oldest first. A file that is still being written is left out.
+///
+/// # Errors
+/// If the folder cannot be read.
+pub fn unconfirmed(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut parts = Vec::new();
+    for entry in fs::read_dir(folder)? {
+        let file = entry?.path();
+        if file.extension().is_some_and(|extension| extension == "mcap")
+            && file.is_file()
+            && !is_confirmed(&file)
+            && is_finished(&file)?
+        {
+            parts.push((file.metadata()?.modified()?, file));
+        }
+    }
+    parts.sort();
+    Ok(parts.into_iter().map(|(_, file)| file).collect())
+}
+
+/// True if the store has confirmed this part as it is now, so that it may be deleted.
+pub fn is_confirmed(file: &Path) -> bool {
+    let confirmation = fs::read(confirmation_of(file)).ok();
+    let confirmation = confirmation.and_then(|json| serde_json::from_slice::<Confirmation>(&json).ok());
+    confirmation.is_some_and(|of| crc_of(file).is_ok_and(|found| found == (of.bytes, of.crc32)))
+}
+
+/// Deletes a part that the store has confirmed, and its confirmation. Returns false, and deletes nothing, if it has
+/// not.
+///
+/// # Errors
+/// If the files cannot be deleted.
+pub fn delete_confirmed(file: &Path) -> io::Result<bool> {
+    if !is_confirmed(file) {
+        return Ok(false);
+    }
+    fs::remove_file(file)?;
+    fs::remove_file(confirmation_of(file))?;
+    Ok(true)
+}
+
+/// True if the file has its closing records, or if a crash has left it without them.
+fn is_finished(file: &Path) -> io::Result<bool> {
+    let mut opened = File::open(file)?;
+    let length = opened.metadata()?.len();
+    let mut end = Vec::new();
+    io::Seek::seek(&mut opened, io::SeekFrom::Start(length.saturating_sub(mcap::MAGIC.len() as u64)))?;
+    opened.read_to_end(&mut end)?;
+    let age = file.metadata()?.modified()?.elapsed().unwrap_or_default();
+    Ok(length > mcap::MAGIC.len() as u64 && end == mcap::MAGIC || age > STILL_WRITTEN)
+}
+
+async fn send(store: &dyn ObjectStore, key: &Key, file: &Path) -> Result<(), UploadError> {
+    let read = |source| UploadError::Read { file: file.to_owned(), source };
+    let refused = |source| UploadError::Store { file: file.to_owned(), source };
+    let mut opened = File::open(file).map_err(read)?;
+    let upload = store.put_multipart(key).await.map_err(refused)?;
+    let mut pieces = WriteMultipart::new_with_chunk_size(upload, PIECE_BYTES);
+    loop {
+        let mut piece = Vec::new();
+        (&mut opened).take(PIECE_BYTES as u64).read_to_end(&mut piece).map_err(read)?;
+        if piece.is_empty() {
+            break;
+        }
+        pieces.wait_for_capacity(PIECES).await.map_err(refused)?;
+        pieces.put(piece.into());
+    }
+    pieces.finish().await.map(drop).map_err(refused)
+}
+
+async fn crc_in_store(store: &dyn ObjectStore, key: &Key) -> object_store::Result<(u64, u32)> {
+    let mut content = store.get(key).await?.into_stream();
+    let (mut length, mut crc) = (0, crc32fast::Hasher::new());
+    while let Some(bytes) = content.try_next().await? {
+        length += bytes.len() as u64;
+        crc.update(&bytes);
+    }
+    Ok((length, crc.finalize()))
+}
+
+/// The length and the CRC-32 of a file.
+fn crc_of(file: &Path) -> io::Result<(u64, u32)> {
+    let (mut source, mut crc, mut length) = (BufReader::new(File::open(file)?), crc32fast::Hasher::new(), 0);
+    let mut buffer = vec![0; 1 << 16];
+    loop {
+        match source.read(&mut buffer)? {
+            0 => return Ok((length, crc.finalize())),
+            read => {
+                crc.update(&buffer[..read]);
+                length += read as u64;
+            }
+        }
+    }
+}
+
+fn confirmation_of(file: &Path) -> PathBuf {
+    let mut name = file.as_os_str().to_owned();
+    name.push(".confirmed");
+    name.into()
+}
+
+/// Writes a file under a temporary name, and renames it once it is on the disk.
+fn write_durably(file: &Path, confirmation: &Confirmation) -> io::Result<()> {
+    let partial = file.with_extension("partial");
+    let mut opened = File::create(&partial)?;
+    opened.write_all(&serde_json::to_vec(confirmation)?)?;
+    opened.sync_all()?;
+    fs::rename(partial, file)?;
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    File::open(folder)?.sync_all()
+}

@@ -1,0 +1,176 @@
+//! Runs every attack against one server process with healthy readers beside it, and prints what each attack costs.
+//!
+//!   cargo run --release -p clearway-tests --bin siege -- --minutes 10
+//!
+//! Columns: a healthy gRPC reader's 99th percentile and worst age of its maps, the maps it missed, and how often its
+//! stream broke; the same of a healthy zenoh reader, with the messages it passed over; the time until a new gRPC client
+//! has its first map (`-`: none in 5 s); the server's resident memory before, at most during, and 5 s after.
+
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
+use std::path::PathBuf;
+use std::process::{Child, Command, ExitCode, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use clap::Parser;
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes::flat;
+use clearway_sim::send::{Pace, Until, drive};
+use clearway_sim::vehicle::SimulatedVehicle;
+use clearway_tests::siege::attacks;
+use clearway_tests::siege::target::{Attack, Target};
+use clearway_tests::siege::watch::{Reader, newcomer, resident_mib};
+
+/// Every attack against one server, with healthy readers beside it.
+#[derive(Parser)]
+struct Arguments {
+    /// Time for all attacks together, in minutes.
+    #[arg(long, default_value_t = 10.0)]
+    minutes: f64,
+    /// Only attacks whose name contains this text.
+    #[arg(long, default_value = "")]
+    only: String,
+    /// The server's binary; by default `clearway` beside this one, built first.
+    #[arg(long)]
+    server: Option<PathBuf>,
+}
+
+/// Time for which the server recovers after an attack, before its memory is read.
+const RECOVERY: Duration = Duration::from_secs(5);
+/// Interval at which the memory is read.
+const SAMPLE: Duration = Duration::from_millis(100);
+
+fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    let server = arguments.server.clone().unwrap_or_else(build);
+    let chosen: Vec<_> = attacks().into_iter().filter(|attack| attack.name.contains(&arguments.only)).collect();
+    if chosen.is_empty() {
+        eprintln!("no attack is named {:?}", arguments.only);
+        return ExitCode::FAILURE;
+    }
+    let each = Duration::from_secs_f64(arguments.minutes * 60.0 / chosen.len() as f64);
+    let (folder, target) = (tempfile::tempdir().expect("a folder"), target());
+    let mut process = start(&server, folder.path().join("clearway.toml"), &target);
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+    let ended = runtime.expect("a runtime").block_on(besiege(&mut process, &target, chosen, each));
+    let _ended_already = process.kill();
+    let _reaped = process.wait();
+    if let Some(attack) = ended {
+        eprintln!("the server ended during {attack:?}");
+        return ExitCode::FAILURE;
+    }
+    ExitCode::SUCCESS
+}
+
+/// Builds the server in the profile and folder of this binary.
+fn build() -> PathBuf {
+    let own = std::env::current_exe().expect("the path of this binary");
+    let folder = own.parent().expect("target/<profile>");
+    let mut cargo = Command::new(env!("CARGO"));
+    cargo.args(["build", "--quiet", "--workspace", "--bin", "clearway", "--target-dir"]);
+    cargo.arg(folder.parent().expect("target"));
+    if folder.ends_with("release") {
+        cargo.arg("--release");
+    }
+    let built = cargo.current_dir(clearway_tests::workspace()).status().expect("cargo runs");
+    assert!(built.success(), "cargo build: {built}");
+    folder.join("clearway")
+}
+
+/// Addresses that are free now.
+fn target() -> Target {
+    let any = (Ipv4Addr::LOCALHOST, 0);
+    let tcp = || TcpListener::bind(any).and_then(|listener| listener.local_addr()).expect("a free port");
+    let udp = UdpSocket::bind(any).and_then(|socket| socket.local_addr()).expect("a free port");
+    Target { grpc: tcp(), page: tcp(), udp, zenoh: format!("tcp/{}", tcp()) }
+}
+
+/// Starts the server with the default configuration, and the sensor's sender known.
+fn start(server: &PathBuf, config: PathBuf, target: &Target) -> Child {
+    let Target { grpc, page, udp, zenoh } = target;
+    let telemetry = SocketAddr::new(udp.ip(), 0);
+    let text = format!(
+        "[grpc]\nlisten = \"{grpc}\"\n[page]\nlisten = \"{page}\"\n[zenoh]\nlisten = [\"{zenoh}\"]\n\
+         [[vehicle]]\nname = \"car\"\n[vehicle.udp]\ndata = \"{udp}\"\ntelemetry = \"{telemetry}\"\n\
+         [vehicle.udp.from]\ntop = \"127.0.0.1\"\n[[vehicle.sensor]]\nname = \"top\"\n\
+         [vehicle.sensor.extrinsics]\nx_m = 0.0\ny_m = 0.0\nz_m = 1.9\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n"
+    );
+    std::fs::write(&config, text).expect("a file of ours");
+    let log = std::fs::File::create(config.with_extension("log")).expect("a file of ours");
+    let mut command = Command::new(server);
+    command.args(["serve", "--config"]).arg(&config).stdout(Stdio::null()).stderr(log);
+    command.spawn().unwrap_or_else(|error| panic!("{}: {error}", server.display()))
+}
+
+/// Runs the attacks one after the other. Returns the attack during which the server ended.
+async fn besiege(process: &mut Child, target: &Target, attacks: Vec<Attack>, each: Duration) -> Option<&'static str> {
+    let halt = Arc::new(AtomicBool::new(false));
+    let sensor = std::thread::spawn({
+        let (halt, at) = (halt.clone(), target.udp);
+        move || {
+            let (vehicle, until) = (SimulatedVehicle::new(flat(), ScannerConfig::default()), Until::default());
+            let until = Until { stop: Some(&halt), ..until };
+            drive((Ipv4Addr::LOCALHOST, 0).into(), vehicle, at, at, Pace::RealTime, until)
+        }
+    });
+    let began = Instant::now();
+    while newcomer(target).await.is_none() {
+        assert!(began.elapsed() < Duration::from_secs(60), "the server does not start");
+    }
+    let readers = [Reader::start(target, false), Reader::start(target, true)];
+    tokio::time::sleep(RECOVERY).await;
+    println!(
+        "| attack | gRPC p99 ms | worst ms | missed | broken | zenoh p99 ms | worst ms | missed | broken | passed over \
+         | newcomer ms | MiB before | during | after |\n|---|{}",
+        "---:|".repeat(13)
+    );
+    readers.iter().for_each(|reader| drop(reader.take()));
+    let calm = Attack { name: "none", run: |_| Box::pin(std::future::pending()) };
+    let mut ended = None;
+    for attack in std::iter::once(calm).chain(attacks) {
+        run(process.id(), target, &attack, each, &readers).await;
+        if !matches!(process.try_wait(), Ok(None)) {
+            ended = Some(attack.name);
+            break;
+        }
+    }
+    readers.into_iter().for_each(Reader::stop);
+    halt.store(true, Ordering::Relaxed);
+    let _sent = sensor.join();
+    ended
+}
+
+/// Runs one attack and prints its line.
+async fn run(process: u32, target: &Target, attack: &Attack, each: Duration, readers: &[Reader; 2]) {
+    let before = resident_mib(process);
+    let (attacking, end) = (tokio::spawn((attack.run)(target.clone())), Instant::now() + each);
+    let joining = tokio::spawn({
+        let target = target.clone();
+        async move {
+            tokio::time::sleep(each / 2).await;
+            newcomer(&target).await
+        }
+    });
+    let mut during = before;
+    while Instant::now() < end {
+        tokio::time::sleep(SAMPLE).await;
+        during = during.max(resident_mib(process));
+    }
+    let joined = joining.await.ok().flatten();
+    attacking.abort();
+    let seen = readers.each_ref().map(Reader::take);
+    tokio::time::sleep(RECOVERY).await;
+    readers.iter().for_each(|reader| drop(reader.take()));
+    let of = |mut seen: clearway_tests::siege::watch::Seen| {
+        let (p99, worst) = (seen.age_ms(0.99), seen.age_ms(1.0));
+        (format!("{p99:.0} | {worst:.0} | {} | {}", seen.missed, seen.broken), seen.passed_over)
+    };
+    let [(grpc, _), (zenoh, passed_over)] = seen.map(of);
+    let joined = joined.map_or("-".into(), |joined| format!("{}", joined.as_millis()));
+    let after = resident_mib(process);
+    println!(
+        "| {} | {grpc} | {zenoh} | {passed_over} | {joined} | {before:.0} | {during:.0} | {after:.0} |",
+        attack.name
+    );
+}

@@ -1,0 +1,116 @@
+//! The healthy readers beside an attack, a newcomer, and the server's memory: what an attack costs.
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use clearway_client::{Client, ClientError, MapStream, Subscription, ZenohClient, now_ns};
+
+use super::target::Target;
+
+/// Longest time that a reader waits for one map, or a newcomer for its first.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// What one reader has seen since the last [`Reader::take`].
+#[derive(Clone, Debug, Default)]
+pub struct Seen {
+    /// Age of each map on arrival, in ms.
+    pub ages_ms: Vec<f64>,
+    /// Maps that it did not get, by their sequences.
+    pub missed: u64,
+    /// Times that the stream ended or gave no map for [`PATIENCE`].
+    pub broken: u64,
+    /// Messages that were passed over because no honest publisher sends them.
+    pub passed_over: u64,
+}
+
+impl Seen {
+    /// The age that this share of the maps does not exceed, in ms; 0 without maps.
+    pub fn age_ms(&mut self, share: f64) -> f64 {
+        self.ages_ms.sort_by(f64::total_cmp);
+        let last = self.ages_ms.len().saturating_sub(1);
+        self.ages_ms.get((last as f64 * share).round() as usize).copied().unwrap_or_default()
+    }
+}
+
+/// A reader in a thread and a runtime of its own, so that the attackers' tasks do not delay it.
+pub struct Reader {
+    seen: Arc<Mutex<Seen>>,
+    stop: Arc<AtomicBool>,
+    thread: JoinHandle<()>,
+}
+
+impl Reader {
+    /// Starts a reader over gRPC, or over zenoh.
+    pub fn start(target: &Target, over_zenoh: bool) -> Self {
+        let (seen, stop, target) = (Arc::<Mutex<Seen>>::default(), Arc::<AtomicBool>::default(), target.clone());
+        let thread = std::thread::spawn({
+            let (seen, stop) = (seen.clone(), stop.clone());
+            move || {
+                let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
+                runtime.expect("a runtime").block_on(read(&target, over_zenoh, &seen, &stop));
+            }
+        });
+        Self { seen, stop, thread }
+    }
+
+    /// What it has seen since the last call.
+    pub fn take(&self) -> Seen {
+        std::mem::take(&mut *self.seen.lock().expect("the reader does not panic"))
+    }
+
+    /// Ends it.
+    pub fn stop(self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.join().expect("the reader does not panic");
+    }
+}
+
+async fn subscribe(target: &Target, over_zenoh: bool) -> Result<MapStream, ClientError> {
+    if over_zenoh {
+        return ZenohClient::connect(&target.zenoh).await?.subscribe("car", "drivability").await;
+    }
+    let subscription = Subscription { layers: vec!["drivability".into()], ..Subscription::default() };
+    Client::connect(&target.grpc.to_string()).await?.subscribe(subscription).await
+}
+
+async fn read(target: &Target, over_zenoh: bool, seen: &Mutex<Seen>, stop: &AtomicBool) {
+    let seen = || seen.lock().expect("the siege does not panic");
+    while !stop.load(Ordering::Relaxed) {
+        let Ok(mut maps) = subscribe(target, over_zenoh).await else {
+            seen().broken += 1;
+            tokio::time::sleep(Duration::from_millis(200)).await;
+            continue;
+        };
+        let mut passed_over = 0;
+        while !stop.load(Ordering::Relaxed) {
+            let Ok(Ok(update)) = tokio::time::timeout(PATIENCE, maps.next()).await else {
+                seen().broken += 1;
+                break;
+            };
+            let mut seen = seen();
+            seen.ages_ms.push(update.map.age_ms(now_ns()));
+            seen.missed += update.skipped;
+            let hostile = maps.passed_over().hostile();
+            seen.passed_over += hostile - passed_over;
+            passed_over = hostile;
+        }
+    }
+}
+
+/// Time until a new client has its first map over gRPC; `None` if it has none after [`PATIENCE`].
+pub async fn newcomer(target: &Target) -> Option<Duration> {
+    let began = Instant::now();
+    let first = async { subscribe(target, false).await.ok()?.next().await.ok() };
+    tokio::time::timeout(PATIENCE, first).await.ok().flatten().map(|_| began.elapsed())
+}
+
+/// Resident memory of a process, in MiB.
+pub fn resident_mib(process: u32) -> f64 {
+    let status = std::fs::read_to_string(PathBuf::from(format!("/proc/{process}/status"))).unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    let kib = line.and_then(|line| line.split_whitespace().next()?.parse::<f64>().ok());
+    kib.unwrap_or_default() / 1024.0
+}

@@ -1,0 +1,213 @@
+//! A damaged recording: what is wrong is named, the rest is read, and the exit code is never 0.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Output;
+
+use clearway::record::mcap_reader::McapReader;
+use clearway::record::reader::{RecordedMessage, RecordingReader};
+use clearway::record::repair::repair;
+use clearway::record::verify::verify;
+use clearway_mapping::pipeline::Pipeline;
+use clearway_proto::codec::Limits;
+use clearway_proto::map::decode_map;
+use clearway_tests::damage::{Original, rechunk};
+use clearway_tests::{run, workspace};
+use mcap::records::op;
+use proptest::prelude::*;
+use proptest::test_runner::TestRunner;
+
+/// Events and maps of the golden recording.
+const GOLDEN: (u64, u64) = (172, 3);
+
+fn golden() -> PathBuf {
+    workspace().join("tests/golden/drive.mcap")
+}
+
+/// The golden recording in many chunks.
+fn in_chunks() -> Vec<u8> {
+    rechunk(&std::fs::read(golden()).unwrap(), 16 << 10).unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+/// Position of each record of this kind outside of chunks.
+fn records(bytes: &[u8], kind: u8) -> Vec<usize> {
+    let (mut at, mut found) = (8, Vec::new());
+    while at + 9 <= bytes.len() {
+        let length = u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap());
+        found.extend((bytes[at] == kind).then_some(at));
+        at += 9 + length as usize;
+    }
+    found
+}
+
+#[test]
+fn the_golden_recording_is_read_by_every_version() {
+    let mut recording = RecordingReader::open(&golden()).unwrap();
+    let (config, tables) = recording.config().unwrap();
+    let mut pipeline = Pipeline::new(&config.vehicles[0].core(), tables[0].clone()).unwrap();
+    let (mut events, mut computed, mut layers) = (0, 0, BTreeMap::<String, u64>::new());
+    for message in recording.by_ref() {
+        match message.unwrap() {
+            RecordedMessage::Event { event, .. } => {
+                events += 1;
+                computed += u64::from(pipeline.step(&event).unwrap().is_some());
+            }
+            RecordedMessage::Map { layer, bytes, .. } => {
+                let map = decode_map(bytes, &Limits::default()).unwrap();
+                assert!(map.layers[0].name == layer && !map.layers[0].channels.is_empty());
+                *layers.entry(layer).or_default() += 1;
+            }
+            RecordedMessage::Ros { .. } => panic!("a recording of clearway has no ROS message"),
+        }
+    }
+    assert_eq!(recording.incomplete(), None);
+    assert_eq!((events, computed), GOLDEN);
+    let recorded: Vec<_> = layers.into_iter().collect();
+    let names = ["drivability", "height_difference", "occupancy", "safe_path", "speed", "terrain"];
+    assert_eq!(recorded, names.map(|name| (name.to_owned(), GOLDEN.1)));
+}
+
+#[test]
+fn a_cut_at_any_byte_is_named_and_loses_no_whole_chunk() {
+    let original = Original::read(in_chunks()).unwrap();
+    assert!(original.chunks() > 5, "{} chunks", original.chunks());
+    // Every byte of the start and of the end, and a sample between them; `cuts_and_flips` cuts at every byte.
+    let length = original.length();
+    let cuts = (0..200).chain((200..length - 300).step_by(7919)).chain(length - 300..length);
+    for cut in cuts {
+        original.cut(cut).unwrap_or_else(|error| panic!("cut after {cut} bytes: {error}"));
+    }
+}
+
+#[test]
+fn a_changed_bit_is_named_and_costs_at_most_its_chunk() {
+    let folder = tempfile::tempdir().unwrap();
+    let original = Original::read(in_chunks()).unwrap();
+    let copy = original.copy(&folder.path().join("changed.mcap")).unwrap();
+    let mut runner = TestRunner::new(ProptestConfig { cases: 150, ..ProptestConfig::default() });
+    let change = (0..original.length(), 0..8_u8);
+    runner.run(&change, |(at, bit)| copy.flip(&original, at, bit).map(drop).map_err(TestCaseError::fail)).unwrap();
+    // The heads of the records have few of all bytes, but all of the framing.
+    let bytes = in_chunks();
+    for at in records(&bytes, op::CHUNK).into_iter().chain(records(&bytes, op::MESSAGE_INDEX)) {
+        for (byte, bit) in [(at, 0), (at, 7), (at + 1, 3), (at + 4, 1), (at + 8, 6), (at + 9 + 16, 2)] {
+            copy.flip(&original, byte, bit).unwrap();
+        }
+    }
+}
+
+#[test]
+fn a_damaged_chunk_costs_that_chunk_and_is_reported_by_topic_and_time() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("damaged.mcap");
+    let mut bytes = in_chunks();
+    let chunks = records(&bytes, op::CHUNK);
+    bytes[chunks[chunks.len() / 2] + 100] ^= 0x10;
+    std::fs::write(&file, &bytes).unwrap();
+    let (all, read) = (McapReader::open(&golden()).unwrap().count(), McapReader::open(&file).unwrap().count());
+
+    let report = verify(&file).unwrap();
+    assert!(report.is_good() && report.incomplete.is_some() && report.events > 0, "{report:?}");
+    let [damage] = &report.damages[..] else { panic!("one chunk: {report:?}") };
+    assert_eq!(damage.messages.values().sum::<u64>(), (all - read) as u64, "each lost message has its topic");
+    let (first, last) = damage.log_ns.expect("the index has the times");
+    assert!(first <= last && last - first < 1_000_000_000, "{damage}");
+
+    let path = file.to_str().unwrap();
+    let info = run(folder.path(), "clearway", &["info", path]);
+    let said = text(&info.stdout);
+    assert_eq!(info.status.code(), Some(2), "{said}");
+    assert!(said.contains("damaged in 1 place") && said.contains("lost: ") && said.contains("/car/journal"), "{said}");
+    for command in [&["verify", path][..], &["export", path, "--format", "json", "--out", "maps"], &["replay", path]] {
+        let output = run(folder.path(), "clearway", command);
+        assert_eq!(output.status.code(), Some(2), "{command:?}: {}", text(&output.stderr));
+    }
+}
+
+#[test]
+fn a_repaired_recording_is_whole_and_has_all_that_can_be_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let (damaged, repaired) = (folder.path().join("damaged.mcap"), folder.path().join("repaired.mcap"));
+    let mut bytes = in_chunks();
+    // The first chunk describes the channels, which then come from the summary; the magic bytes are damaged too.
+    let chunks = records(&bytes, op::CHUNK);
+    bytes[chunks[0] + 100] ^= 0x10;
+    bytes[chunks[3] + 1] ^= 0x40;
+    bytes[2] ^= 1;
+    std::fs::write(&damaged, &bytes).unwrap();
+    let clearway = |arguments: &[&str]| run(folder.path(), "clearway", arguments);
+    let output = clearway(&["repair", "damaged.mcap", "repaired.mcap"]);
+    let said = text(&output.stdout);
+    assert_eq!(output.status.code(), Some(1), "{said}{}", text(&output.stderr));
+    assert!(said.matches("lost: ").count() >= 3 && said.contains("/car/journal"), "{said}");
+    assert_eq!(clearway(&["info", "repaired.mcap"]).status.code(), Some(0));
+    let mut recording = RecordingReader::open(&repaired).unwrap();
+    recording.config().unwrap();
+    assert!(recording.by_ref().all(|message| message.is_ok()) && recording.incomplete().is_none());
+    let all = McapReader::open(&golden()).unwrap().count();
+    let kept = McapReader::open(&repaired).unwrap().count();
+    assert!(kept < all && kept > all / 2, "{kept} of {all}");
+
+    let again = clearway(&["repair", "damaged.mcap", "repaired.mcap"]);
+    assert_eq!(again.status.code(), Some(2));
+    assert!(text(&again.stderr).contains("exists and is not overwritten"), "{}", text(&again.stderr));
+    let whole = repair(&golden(), &folder.path().join("whole.mcap")).unwrap();
+    assert!(whole.incomplete.is_none() && whole.messages == all as u64, "{whole:?}");
+    assert_eq!(verify(&folder.path().join("whole.mcap")).unwrap(), verify(&golden()).unwrap());
+}
+
+#[test]
+fn an_unreadable_file_never_ends_with_success() {
+    let folder = tempfile::tempdir().unwrap();
+    let bytes = std::fs::read(golden()).unwrap();
+    let mut wrong_start = bytes.clone();
+    wrong_start[0] ^= 1;
+    let no_index = records(&bytes, op::CHUNK)[0];
+    let files: [(&str, &[u8]); 5] = [
+        ("empty.mcap", b""),
+        ("short.mcap", &bytes[..5]),
+        ("magic.mcap", &bytes[..8]),
+        ("start.mcap", &bytes[..no_index]),
+        ("wrong.mcap", &wrong_start),
+    ];
+    for (name, bytes) in files {
+        std::fs::write(folder.path().join(name), bytes).unwrap();
+        for command in [
+            &["info", name][..],
+            &["verify", name],
+            &["replay", name],
+            &["export", name, "--format", "json", "--out", "maps"],
+        ] {
+            let output = run(folder.path(), "clearway", command);
+            assert_eq!(output.status.code(), Some(2), "{command:?}: {}", text(&output.stderr));
+            assert!(text(&[output.stdout, output.stderr].concat()).contains(name), "{command:?}");
+        }
+    }
+    let output: Output = run(folder.path(), "clearway", &["repair", "start.mcap", "out.mcap"]);
+    assert!(output.status.code() == Some(2) && !folder.path().join("out.mcap").exists());
+    assert!(text(&output.stderr).contains("no message can be read"), "{}", text(&output.stderr));
+}
+
+#[test]
+fn a_recording_of_a_later_version_is_refused_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, metadata: &[(&str, &str)], schema: &str| {
+        let file = folder.path().join(name);
+        let mut writer = mcap::Writer::new(std::io::BufWriter::new(std::fs::File::create(&file).unwrap())).unwrap();
+        let metadata = metadata.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect();
+        writer.write_metadata(&mcap::records::Metadata { name: "clearway".into(), metadata }).unwrap();
+        writer.add_schema(schema, "protobuf", b"").unwrap();
+        writer.finish().unwrap();
+        file
+    };
+    let refused = |file: &Path| RecordingReader::open(file).err().expect("refused").to_string();
+    let later = refused(&write("later.mcap", &[("format", "2"), ("version", "0.7.0")], "clearway.v1.Event"));
+    assert!(later.contains("format 2") && later.contains("0.7.0") && later.contains("later.mcap"), "{later}");
+    let schema = refused(&write("schema.mcap", &[("version", "3.0.0")], "clearway.v2.Event"));
+    assert!(schema.contains("clearway.v2.Event") && schema.contains("3.0.0"), "{schema}");
+    RecordingReader::open(&write("earlier.mcap", &[], "clearway.v1.Event")).unwrap();
+}

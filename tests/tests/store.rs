@@ -1,0 +1,200 @@
+//! Recordings in a store: a folder, and a bucket of an S3-compatible server that refuses, lies and vanishes.
+
+#[path = "fixture/venv.rs"]
+mod venv;
+
+use std::io::{BufRead, BufReader, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Output, Stdio};
+
+use clearway::store::index::{Entry, Search, search};
+use clearway::store::{location, upload};
+use clearway_tests::{binaries, workspace};
+use serde_json::Value;
+
+/// Time of the first message of the golden recording, as its capture was made.
+const GOLDEN_DAY: &str = "2026-01-01";
+
+/// A folder with these copies of the golden recording.
+fn recordings(folder: &Path, names: &[&str]) -> PathBuf {
+    let recordings = folder.join("recordings");
+    std::fs::create_dir_all(&recordings).unwrap();
+    for name in names {
+        std::fs::copy(workspace().join("tests/golden/drive.mcap"), recordings.join(name)).unwrap();
+    }
+    recordings
+}
+
+fn clearway(environment: &[(&str, &str)], arguments: &[&str]) -> Output {
+    let mut command = Command::new(binaries().join("clearway"));
+    command.envs(environment.iter().copied()).args(arguments).output().expect("the binary starts")
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+fn found(environment: &[(&str, &str)], store: &str, more: &[&str]) -> usize {
+    let output = clearway(environment, &[&["recordings", "--store", store, "--json"], more].concat());
+    assert_eq!(output.status.code(), Some(0), "{more:?}: {}", text(&output.stderr));
+    serde_json::from_slice::<Value>(&output.stdout).unwrap().as_array().unwrap().len()
+}
+
+#[test]
+fn parts_are_found_in_a_folder_by_vehicle_time_place_and_faults() {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), &["whole.mcap"]);
+    let bytes = std::fs::read(recordings.join("whole.mcap")).unwrap();
+    let cut = recordings.join("cut.mcap");
+    std::fs::write(&cut, &bytes[..bytes.len() - 1000]).unwrap();
+    let store = folder.path().join("store").display().to_string();
+    let upload = || clearway(&[], &["upload", recordings.to_str().unwrap(), "--store", &store]);
+    let first = upload();
+    assert_eq!(first.status.code(), Some(0), "{}", text(&first.stderr));
+    // The cut file may still be written, until it is old.
+    assert_eq!(text(&first.stdout).lines().count(), 1, "{}", text(&first.stdout));
+    let old = std::time::SystemTime::now() - std::time::Duration::from_secs(600);
+    std::fs::File::options().write(true).open(&cut).unwrap().set_modified(old).unwrap();
+    assert_eq!(upload().status.code(), Some(0));
+    assert!(upload().stdout.is_empty(), "what is confirmed is not sent again");
+
+    assert_eq!(found(&[], &store, &[]), 2);
+    // The golden drive has no ego poses, so its entries get a place here.
+    assert_eq!(found(&[], &store, &["--near", "0,0"]), 0);
+    for file in std::fs::read_dir(Path::new(&store).join("index/car")).unwrap() {
+        let file = file.unwrap().path();
+        let mut entry: Entry = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+        entry.cells.insert((2, -1));
+        std::fs::write(file, serde_json::to_vec(&entry).unwrap()).unwrap();
+    }
+    let [before, after] = [format!("{GOLDEN_DAY}T11:00:00Z"), format!("{GOLDEN_DAY}T13:00:00Z")];
+    let searches: [(&[&str], usize); 9] = [
+        (&["--vehicle", "car"], 2),
+        (&["--vehicle", "bus"], 0),
+        (&["--from", &before, "--to", &after], 2),
+        (&["--from", &after], 0),
+        (&["--to", &before], 0),
+        (&["--near", "60,-10"], 2),
+        (&["--near", "1000,0"], 0),
+        (&["--near", "1000,0", "--within", "2000"], 2),
+        (&["--faults"], 1),
+    ];
+    for (options, expected) in searches {
+        assert_eq!(found(&[], &store, options), expected, "{options:?}");
+    }
+    assert_eq!(clearway(&[], &["recordings", "--store", &store, "--from", "today"]).status.code(), Some(3));
+    let unknown = clearway(&[], &["recordings", "--store", "ftp://a/b"]);
+    assert_eq!(unknown.status.code(), Some(2));
+    assert!(text(&unknown.stderr).contains("ftp:// is not known"), "{}", text(&unknown.stderr));
+}
+
+#[tokio::test]
+async fn a_part_is_deleted_only_if_it_is_the_part_that_was_confirmed() {
+    let folder = tempfile::tempdir().unwrap();
+    let part = recordings(folder.path(), &["drive.mcap"]).join("drive.mcap");
+    let store = location::open(folder.path().join("store").to_str().unwrap()).unwrap();
+    assert!(!upload::delete_confirmed(&part).unwrap(), "it is not confirmed");
+    let confirmation = upload::upload(&*store, &part).await.unwrap();
+    let expected = Entry::of_part(&part, confirmation.bytes, confirmation.crc32).unwrap();
+    assert_eq!(search(&*store, &Search::default()).await.unwrap().entries, expected);
+    assert_eq!((expected[0].events, expected[0].layers), (172, 18));
+    // Another recording with the name of the confirmed one is another part.
+    let bytes = std::fs::read(&part).unwrap();
+    std::fs::write(&part, &bytes[..bytes.len() - 1]).unwrap();
+    assert!(!upload::delete_confirmed(&part).unwrap() && part.exists());
+    std::fs::write(&part, &bytes).unwrap();
+    assert!(upload::delete_confirmed(&part).unwrap() && !part.exists());
+}
+
+/// An S3-compatible server in a process of its own.
+struct S3 {
+    process: Child,
+    faults: ChildStdin,
+    said: BufReader<ChildStdout>,
+    url: String,
+}
+
+impl S3 {
+    fn start() -> Self {
+        const PACKAGE: &str = "moto[server]==5.2.5";
+        let python = venv::environment("python-s3", PACKAGE, |_| vec![PACKAGE.into()]);
+        let mut process = Command::new(python)
+            .arg("-B")
+            .arg(workspace().join("tests/python/s3_server.py"))
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .expect("python starts");
+        let (faults, said) = (process.stdin.take().unwrap(), BufReader::new(process.stdout.take().unwrap()));
+        let mut server = Self { process, faults, said, url: String::new() };
+        server.url = server.line();
+        assert!(server.url.starts_with("http://127.0.0.1:"), "{}", server.url);
+        server
+    }
+
+    fn line(&mut self) -> String {
+        let mut line = String::new();
+        self.said.read_line(&mut line).unwrap();
+        line.trim().to_owned()
+    }
+
+    fn fault(&mut self, fault: &str) {
+        writeln!(self.faults, "{fault}").unwrap();
+        assert_eq!(self.line(), fault);
+    }
+
+    fn environment(&self) -> [(&str, &str); 5] {
+        [
+            ("AWS_ENDPOINT_URL", &self.url),
+            ("AWS_ACCESS_KEY_ID", "test"),
+            ("AWS_SECRET_ACCESS_KEY", "test"),
+            ("AWS_REGION", "us-east-1"),
+            ("AWS_ALLOW_HTTP", "true"),
+        ]
+    }
+}
+
+impl Drop for S3 {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+#[test]
+#[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
+fn a_bucket_that_refuses_lies_or_vanishes_costs_no_recording() {
+    const STORE: &str = "s3://fleet/kept";
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = recordings(folder.path(), &["a.mcap", "b.mcap"]);
+    let kept = || recordings.join("a.mcap").exists() && recordings.join("b.mcap").exists();
+    let mut server = S3::start();
+    let upload = |server: &S3| {
+        let arguments = ["upload", recordings.to_str().unwrap(), "--store", STORE, "--delete"];
+        clearway(&server.environment(), &arguments)
+    };
+    for (fault, said) in [("deny", "403"), ("lie", "the store confirmed the part"), ("refuse", "503")] {
+        server.fault(fault);
+        let output = upload(&server);
+        let complained = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{fault}: {complained}");
+        assert!(complained.contains("not confirmed, and kept") && complained.contains(said), "{fault}: {complained}");
+        assert!(output.stdout.is_empty() && kept(), "{fault}: {}", text(&output.stdout));
+    }
+    server.fault("none");
+    assert_eq!(found(&server.environment(), STORE, &[]), 0, "what is not confirmed has no entry");
+    let output = upload(&server);
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    assert_eq!(text(&output.stdout).matches("is confirmed").count(), 2);
+    assert!(std::fs::read_dir(&recordings).unwrap().next().is_none(), "both are deleted, with their confirmations");
+    let options = ["--vehicle", "car", "--from", "2026-01-01T00:00:00Z"];
+    assert_eq!(found(&server.environment(), STORE, &options), 1, "two names of one content are one entry");
+
+    std::fs::copy(workspace().join("tests/golden/drive.mcap"), recordings.join("c.mcap")).unwrap();
+    server.process.kill().unwrap();
+    server.process.wait().unwrap();
+    let output = upload(&server);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(recordings.join("c.mcap").exists(), "{}", text(&output.stderr));
+}
