@@ -10,8 +10,9 @@ use crate::config::Config;
 use crate::record::writer;
 use crate::server::{Running, Server, Setup, ShutdownError};
 
-/// Listen for sensor data, make maps and publish them, until SIGINT or SIGTERM. SIGHUP reads certificates, tokens,
-/// roles and limits again.
+/// Listen for sensor data, make maps and publish them, until SIGINT or SIGTERM.
+///
+/// SIGHUP reads certificates, tokens, roles and limits again.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway serve

@@ -1,7 +1,7 @@
 //! `clearway transport`: controls the replay that a server serves.
 
 use anyhow::{Result, bail};
-use clap::{Args, Subcommand};
+use clap::{ArgAction, Args, Subcommand};
 use clearway_client::ClientError;
 use clearway_client::v1::{ReplayControl, ReplayState};
 
@@ -60,13 +60,13 @@ enum Request {
     /// Begin again at the end, or do not.
     Loop {
         /// on or off.
-        #[arg(value_parser = on_or_off)]
+        #[arg(value_parser = on_or_off, action = ArgAction::Set)]
         on: bool,
     },
     /// Wait for the acknowledgement of each map, or do not.
     Lockstep {
         /// on or off.
-        #[arg(value_parser = on_or_off)]
+        #[arg(value_parser = on_or_off, action = ArgAction::Set)]
         on: bool,
     },
 }

@@ -26,8 +26,9 @@ mod pictures;
 mod report;
 mod table;
 
-/// Compute every map of recordings again from their events, and name the first differences; or compare their maps with
-/// those of another configuration or recording.
+/// Compute every map of recordings again from their events, and name the first differences.
+///
+/// Or compare their maps with those of another configuration or recording.
 #[derive(Args)]
 #[command(after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, is not whole or
 has no event, 3 wrong use.

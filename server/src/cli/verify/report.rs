@@ -120,7 +120,9 @@ pub fn junit(results: &[Checked]) -> String {
         let _ = match &result.outcome {
             _ if result.is_good() => writeln!(xml, "/>"),
             _ if result.exit() == Exit::Unreadable => writeln!(xml, "><error message=\"{message}\"/></testcase>"),
-            Outcome::Compared(_) | Outcome::Unreadable(_) => writeln!(xml, "><failure message=\"{message}\"/></testcase>"),
+            Outcome::Compared(_) | Outcome::Unreadable(_) => {
+                writeln!(xml, "><failure message=\"{message}\"/></testcase>")
+            }
             Outcome::Verified(report) => {
                 let all: Vec<_> = report.differences.iter().map(|one| escaped(&one.to_string())).collect();
                 writeln!(xml, "><failure message=\"{message}\">{}</failure></testcase>", all.join("\n"))
