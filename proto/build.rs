@@ -5,7 +5,7 @@ use std::{env, error::Error, fs, path::PathBuf};
 use prost::Message;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let protos = ["ingest", "journal", "map", "service"].map(|name| format!("clearway/v1/{name}.proto"));
+    let protos = ["ingest", "journal", "map", "replay", "service"].map(|name| format!("clearway/v1/{name}.proto"));
     for proto in &protos {
         println!("cargo::rerun-if-changed={proto}");
     }

@@ -50,6 +50,13 @@ pub enum ClientError {
         /// The address.
         address: String,
     },
+    /// The replay that the server serves has reached its end, and its last map was returned. The stream goes on:
+    /// further maps come if the replay is set back.
+    #[error("{address}: the replay has ended")]
+    ReplayEnded {
+        /// The address.
+        address: String,
+    },
     /// A received map is invalid.
     #[error("refused a map: {0}")]
     Map(#[from] MapError),

@@ -11,6 +11,7 @@ use clearway_proto::v1;
 use clearway_proto::v1::ingest_service_client::IngestServiceClient;
 use clearway_proto::v1::map_service_client::MapServiceClient;
 use clearway_proto::v1::recording_service_client::RecordingServiceClient;
+use clearway_proto::v1::replay_service_client::ReplayServiceClient;
 use prost::Message;
 use tokio::sync::mpsc;
 use tokio_stream::StreamExt;
@@ -165,6 +166,18 @@ impl Client {
         Ok(map.with_arrival(&Clock::default()))
     }
 
+    /// Controls the replay that the server serves; an empty request changes nothing. Returns the state after the
+    /// change.
+    ///
+    /// # Errors
+    /// [`ClientError::Unreachable`] if the connection fails, [`ClientError::Refused`] if the server serves no replay
+    /// (`Unimplemented`) or the request is not allowed.
+    pub async fn replay_control(&self, request: v1::ReplayControl) -> Result<v1::ReplayState, ClientError> {
+        let mut service = ReplayServiceClient::new(dial(&self.endpoint, &self.address).await?);
+        let answer = service.control(request).await;
+        Ok(answer.map_err(|status| refused(&self.address, &status))?.into_inner())
+    }
+
     /// Streams maps over a separate connection.
     ///
     /// # Errors
@@ -250,11 +263,17 @@ async fn receive_maps(
             Ok(None) => return ClientError::Ended { address },
             Err(status) => return refused(&address, &status),
         };
+        if update.replay_ended {
+            slot.end_replay(ClientError::ReplayEnded { address: address.clone() });
+            continue;
+        }
         left_out += update.left_out;
         let request = match MapView::decode_on(update.map.clone(), base.as_ref()) {
             Ok(map) => {
                 let sequence = map.sequence();
-                let last = base.replace(map.clone()).map_or(sequence, |last| last.sequence() + 1);
+                // Maps of another run, or before a jump of a replay, were not skipped.
+                let last = base.replace(map.clone()).filter(|last| last.header().boot_id == map.header().boot_id);
+                let last = last.map_or(sequence, |last| last.sequence() + 1);
                 let skipped = sequence.saturating_sub(last).saturating_sub(left_out);
                 slot.store(map, |_| Missed { skipped, left_out, ..Missed::default() });
                 (is_requested, left_out) = (false, 0);

@@ -29,6 +29,7 @@
 //! | `signature` | a map on its key and its signature -> whether the expected server published it (feature `zenoh`) |
 //! | [`ingest`] | observations -> the server, and their outcomes |
 //! | `zenoh` | endpoint of a router -> `ZenohClient` (feature `zenoh`); its `subscription`: one key -> the newest map |
+//! | `test` | a recording -> a server that replays it, for tests of planners (feature `test`) |
 //! | `error` | why a call failed |
 
 mod error;
@@ -40,6 +41,8 @@ pub mod observation;
 #[cfg(feature = "zenoh")]
 pub mod signature;
 pub mod stream;
+#[cfg(feature = "test")]
+pub mod test;
 pub mod view;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;

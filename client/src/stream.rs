@@ -45,6 +45,8 @@ pub struct MapStream {
     seen: Option<Counters>,
     /// The last map returned, until it is reported as stale.
     fresh: Option<MapView>,
+    /// `Slot::replay_ends` at the last call.
+    replay_ends: u64,
     task: JoinHandle<()>,
 }
 
@@ -54,6 +56,9 @@ struct Slot {
     counters: Counters,
     passed_over: PassedOver,
     ended: Option<ClientError>,
+    /// How often a replay has reached its end, and how the reader is told.
+    replay_ends: u64,
+    replay_ended: Option<ClientError>,
 }
 
 /// Numbers of received maps that a stream passed over since its start, by reason. None of them was shown to the reader.
@@ -113,11 +118,15 @@ pub(crate) struct Missed {
 }
 
 impl MapStream {
-    /// Runs a task in the background that stores maps in the slot. Its result is the reason why it ended.
+    /// Runs a task in the background that stores the maps of one server in the slot. Its result is the reason why it
+    /// ended.
     pub(crate) fn spawn<F: Future<Output = ClientError> + Send + 'static>(task: impl FnOnce(LatestSlot) -> F) -> Self {
-        Self::spawn_with_clock(Clock::default(), task)
+        let slot = LatestSlot { has_one_server: true, ..LatestSlot::new(Clock::default()) };
+        let task = task(slot.clone());
+        Self::of_slot(&slot, task)
     }
 
+    #[cfg(test)]
     fn spawn_with_clock<F: Future<Output = ClientError> + Send + 'static>(
         clock: Clock,
         task: impl FnOnce(LatestSlot) -> F,
@@ -134,7 +143,7 @@ impl MapStream {
             let reason = task.await;
             sender.send_modify(|slot| slot.ended = Some(reason));
         });
-        Self { slot: receiver, seen: None, fresh: None, task }
+        Self { slot: receiver, seen: None, fresh: None, replay_ends: 0, task }
     }
 
     /// Waits for a map newer than the last one returned.
@@ -142,7 +151,8 @@ impl MapStream {
     /// # Errors
     /// Why the stream has ended, after its last map was returned; subscribe again then. [`ClientError::Ended`] if the
     /// server ended it, [`ClientError::Unreachable`] if the connection failed, [`ClientError::Refused`] if the server
-    /// refused a request, [`ClientError::Map`] if a map is invalid.
+    /// refused a request, [`ClientError::Map`] if a map is invalid. [`ClientError::ReplayEnded`] once after the last
+    /// map of a replay; the stream has not ended then.
     pub async fn next(&mut self) -> Result<Update, ClientError> {
         loop {
             {
@@ -155,6 +165,10 @@ impl MapStream {
                     let skipped = counters.maps - before.maps - 1;
                     let (lost, left_out) = (counters.lost - before.lost, counters.left_out - before.left_out);
                     return Ok(Update { map: map.clone(), skipped, lost, left_out });
+                }
+                if let Some(ended) = slot.replay_ended.clone().filter(|_| slot.replay_ends > self.replay_ends) {
+                    self.replay_ends = slot.replay_ends;
+                    return Err(ended);
                 }
                 if let Some(reason) = &slot.ended {
                     return Err(reason.clone());
@@ -229,11 +243,21 @@ async fn wait_stale(map: Option<MapView>) -> MapView {
 pub(crate) struct LatestSlot {
     slot: watch::Sender<Slot>,
     clock: Clock,
+    /// True if all maps come from one server that is known: another run is then a jump of its replay.
+    has_one_server: bool,
 }
 
 impl LatestSlot {
     pub(crate) fn new(clock: Clock) -> Self {
-        Self { slot: watch::channel(Slot::default()).0, clock }
+        Self { slot: watch::channel(Slot::default()).0, clock, has_one_server: false }
+    }
+
+    /// Records that the replay has ended, for the reader of the stream.
+    pub(crate) fn end_replay(&self, ended: ClientError) {
+        self.slot.send_modify(|slot| {
+            slot.replay_ends += 1;
+            slot.replay_ended = Some(ended);
+        });
     }
 
     /// Stores a map as the newest, with the numbers of maps between it and the one before, or counts it as passed over
@@ -241,7 +265,9 @@ impl LatestSlot {
     pub(crate) fn store(&self, map: MapView, missed: impl FnOnce(u64) -> Missed) {
         let map = map.with_arrival(&self.clock);
         self.slot.send_if_modified(|slot| {
-            if let Some(reason) = slot.newest.as_ref().and_then(|newest| refuse(newest, &map)) {
+            let is_jump = |newest: &MapView| self.has_one_server && newest.header().boot_id != map.header().boot_id;
+            let newest = slot.newest.as_ref().filter(|newest| !is_jump(newest));
+            if let Some(reason) = newest.and_then(|newest| refuse(newest, &map)) {
                 *reason(&mut slot.passed_over) += 1;
                 return false;
             }

@@ -13,7 +13,7 @@ use clearway_mapping::event::Event;
 use clearway_mapping::pipeline::Pipeline;
 use tokio::sync::watch;
 
-use crate::encode::{self, EncodedMap};
+use crate::encode::{self, EncodedMap, Replayed};
 use crate::ingest::queue::QueuedEvent;
 use crate::ingest::receipt::Outcome;
 use crate::newest::Newest;
@@ -41,6 +41,8 @@ pub struct Engine {
     pub status: Arc<VehicleStatus>,
     /// Is called after each revolution.
     pub observer: Option<Observer>,
+    /// How the header of the next map differs from that of a live one; `None` if it does not.
+    pub replayed: Option<Replayed>,
 }
 
 impl Engine {
@@ -74,6 +76,23 @@ impl Engine {
             self.update_status();
             receipt.deliver(Outcome::from(outcome));
         }
+    }
+
+    /// Steps the pipeline without publishing or recording: a replay jumps. A refused event changes nothing but the
+    /// counts, as in [`Engine::step`].
+    pub fn step_silently(&mut self, event: &Event) {
+        self.update_layers();
+        let _ = self.pipeline.step(event);
+    }
+
+    /// Number of maps made so far.
+    pub fn maps(&self) -> u64 {
+        self.pipeline.newest_map().map_or(0, |map| map.sequence + 1)
+    }
+
+    /// Publishes the newest map once more, if there is one: after the pipeline was stepped without publishing.
+    pub fn publish_newest_map(&mut self) {
+        self.publish(Instant::now());
     }
 
     /// Copies the ledger and the sensors into the status; the thread of [`Engine::start`] does so whenever no event
@@ -141,13 +160,15 @@ impl Engine {
         // Without any configured layer a revolution makes no map; without any subscriber it makes a header.
         let encoded = (!self.status.layers.is_empty()).then(|| {
             let states = map.sensors.iter().map(encode::sensor).collect();
-            (Arc::new(EncodedMap::new(map, self.status.name.clone(), self.status.boot_id, self.valid_ms)), states)
+            let (name, boot_id) = (self.status.name.clone(), self.status.boot_id);
+            (Arc::new(EncodedMap::replayed(map, name, boot_id, self.valid_ms, self.replayed)), states)
         });
         let latency = started.elapsed();
         // The points come before the map, so that a reader of the map finds its points.
         if self.status.sweeps.receiver_count() > 0 {
             let sweep = self.pipeline.newest_sweep().clone();
-            self.status.sweeps.send_replace(Some(Arc::new((map.capture_end_ns, sweep))));
+            let stamp_ns = encoded.as_ref().map_or(map.capture_end_ns, |(encoded, _)| encoded.capture_end_ns);
+            self.status.sweeps.send_replace(Some(Arc::new((stamp_ns, sweep))));
         }
         // The status comes before the map too, so that a reader of the map finds it counted.
         self.update_status();
@@ -169,5 +190,12 @@ impl Engine {
         let all = self.recording.as_ref().is_some_and(RecordingHandle::is_recording);
         let subscriptions = &self.status.subscriptions;
         self.pipeline.set_active_layers(|layer| all || subscriptions.is_subscribed(layer));
+    }
+}
+
+/// Marks the engine as stopped, also if its thread panics.
+impl Drop for Engine {
+    fn drop(&mut self) {
+        self.status.engine_stopped();
     }
 }

@@ -8,11 +8,13 @@
 //! | [`config`] | one TOML file -> vehicles, sources, publishers, recorder |
 //! | [`ingest`] | datagrams, observations, ROS 2 messages, files -> numbered events on one queue a vehicle |
 //! | [`engine`] | events -> journal, step of the pipeline, encoded maps |
+//! | [`acknowledgements`] | readers that acknowledge -> the maps that they have finished with |
 //! | [`subscriptions`] | readers -> layers to compute |
 //! | [`encode`] | map -> bytes, once; regions and deltas of them; event <-> bytes of the journal |
 //! | [`newest`] | contents of the latest-value slots between engine and readers |
 //! | [`publish`] | newest map -> gRPC, zenoh, ROS 2, Foxglove, page |
 //! | [`record`] | events and maps -> MCAP file, and back; verification |
+//! | [`replay`] | recorded readings -> engines that are stepped in recorded time, and set back |
 //! | `store` | finished recordings -> a folder or a bucket, with an index; a search -> recordings |
 //! | [`status`] | ledger, rates and latency of each vehicle |
 //! | [`server`] | starts and stops all of these |
@@ -20,6 +22,7 @@
 //!
 //! At the ground, used by all: [`clock`], `sync`, `counted`, [`directory`], `file_advice`, `zenoh_session`.
 
+pub mod acknowledgements;
 pub mod cli;
 pub mod clock;
 pub mod config;
@@ -32,6 +35,7 @@ pub mod ingest;
 pub mod newest;
 pub mod publish;
 pub mod record;
+pub mod replay;
 pub mod server;
 pub mod status;
 #[cfg(feature = "store")]

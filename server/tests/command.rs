@@ -174,7 +174,7 @@ fn a_file_that_cannot_be_used_is_named_with_what_to_do() {
         (&["replay", &recording], &recording, is_empty),
         (&["replay", &unknown], &unknown, is_empty),
         (&["verify", &absent], &absent, no_file),
-        (&["verify", &here], &here, is_folder),
+        (&["verify", &here], &here, "no file *.mcap in this folder"),
         (&["verify", &recording], &recording, is_empty),
         (&["export", &here, "--format", "png", "--out", &png], &here, is_folder),
         (&["export", &recording, "--format", "png", "--out", &png], &recording, is_empty),

@@ -49,6 +49,11 @@ export class Link {
     }
   }
 
+  // Sends a text to the server, if there is a connection.
+  send(text) {
+    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(text);
+  }
+
   // Drops the connection and the messages that wait in it, and makes a new one.
   reconnect(text) {
     this.#retry(text);

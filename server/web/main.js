@@ -7,6 +7,7 @@ import { Link } from "./link.js";
 import { MapStream } from "./map_stream.js";
 import * as metrics from "./metrics.js";
 import { Panel } from "./panel.js";
+import { ReplayBar } from "./replay.js";
 import { bytes, dash, duration, setText } from "./text.js";
 
 const RATE_OVER_MS = 3000;
@@ -45,8 +46,12 @@ const link = new Link({
     stream.restart();
     first_drawn_ms = null;
     drawn_ms = [];
+    // A replay reports itself again on the new connection.
+    replay.hide();
   },
 }, new URLSearchParams(location.search).get("vehicle") ?? undefined);
+
+const replay = new ReplayBar($("replay"), (text) => link.send(text));
 
 function writeVehicles(list, chosen) {
   const names = list.map((vehicle) => vehicle.name);
@@ -63,6 +68,7 @@ function writeVehicles(list, chosen) {
 function readStatus(text) {
   try {
     const message = JSON.parse(text);
+    if (message.type === "replay") replay.show(message);
     if (message.type !== "status") return;
     status = message;
     status_arrived_ms = performance.now();

@@ -5,6 +5,7 @@ import test from "node:test";
 import { freshness, ServerClock } from "./clock.js";
 import { paintChannel } from "./draw/paint.js";
 import { MapStream } from "./map_stream.js";
+import { view } from "./replay.js";
 import { clockWords } from "./text.js";
 
 const ns = (ms) => BigInt(Math.round(ms * 1e6));
@@ -119,4 +120,15 @@ test("a legend gives each class its colour, its share of the cells and its meani
     [[4, 5, 6], "not drivable", 0.75, "not reached"],
   ]);
   assert.deepEqual([...painted.colours.slice(0, 3)], [0xff030201, 0xff060504, 0]);
+});
+
+test("the time bar counts seconds from the first event, within the range that is played", () => {
+  const at = (ms) => (1_317_000_000_000_000_000n + ns(ms)).toString();
+  const state = {
+    phase: "playing", rate: "max", begin_ns: at(0), end_ns: at(9000), from_ns: at(2000), to_ns: at(8000), position_ns: at(500),
+  };
+  const before = view(state);
+  assert.deepEqual([before.from_s, before.to_s, before.position_s, before.plays], [2, 8, 2, true]);
+  assert.equal(view({ ...state, position_ns: at(3456) }).time, "3.5 / 8.0 s");
+  assert.equal(view({ ...state, phase: "waiting", readers_awaited: 2 }).phase, "waiting for 2 readers");
 });

@@ -2,55 +2,22 @@
 
 mod fixture;
 
-use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use clearway::server::Running;
 use fixture::certificates::{self, behind, certificates, router};
-use fixture::venv::{environment, run};
+use fixture::venv::{copy_of_client, environment, fingerprint, run};
 use fixture::{config, feed, readings, start, until, within};
 
 const REPOSITORY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
-
-fn files(folder: &Path, into: &mut Vec<PathBuf>) {
-    let skipped = ["build", "__pycache__", ".pytest_cache", "clearway.egg-info", "golden"];
-    for entry in std::fs::read_dir(folder).expect("a folder of the repository") {
-        let path = entry.expect("readable").path();
-        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-        if path.is_dir() && !skipped.contains(&name) {
-            files(&path, into);
-        } else if path.is_file() {
-            into.push(path);
-        }
-    }
-}
-
-/// Hash of the files that determine the installed packages.
-fn fingerprint(repository: &Path) -> String {
-    let mut paths = Vec::new();
-    files(&repository.join("client/python"), &mut paths);
-    files(&repository.join("proto/clearway"), &mut paths);
-    paths.sort();
-    let mut hasher = DefaultHasher::new();
-    for path in paths {
-        (&path, std::fs::read(&path).expect("readable")).hash(&mut hasher);
-    }
-    format!("{:016x}", hasher.finish())
-}
 
 /// Interpreter of an environment with the client of this tree. It is made again only if the client changes.
 fn python() -> PathBuf {
     let repository = Path::new(REPOSITORY).canonicalize().expect("the repository");
     environment("python-client", &fingerprint(&repository), |environment| {
-        // Built from a copy: a build leaves its traces in the folder it builds from.
-        let copy = environment.join("tree");
-        let sources = [repository.join("client/python"), repository.join("proto")];
-        for (from, to) in sources.iter().zip(["client", "."]) {
-            std::fs::create_dir_all(copy.join(to)).expect("a folder of ours");
-            run(Command::new("cp").arg("-r").arg(from).arg(copy.join(to)), "cp");
-        }
-        vec![format!("{}[zenoh,signed,recording,test]", copy.join("client/python").display()).into()]
+        let client = copy_of_client(&repository, environment);
+        vec![format!("{}[zenoh,signed,recording,test]", client.display()).into()]
     })
 }
 

@@ -75,7 +75,7 @@ def watch(address: str, selection: service_pb2.Selection, tls: Tls | None) -> Ma
             yield request
 
     updates = service.Watch(outgoing())
-    stream = MapStream()
+    stream = MapStream(has_one_server=True)
 
     def run() -> None:
         try:
@@ -110,6 +110,9 @@ def _receive_maps(
     base: Map | None = None
     is_requested, left_out = False, 0
     for update in updates:
+        if update.replay_ended:
+            stream.end_replay()
+            continue
         left_out += update.left_out
         message = map_pb2.Map.FromString(update.map)
         answer = service_pb2.WatchRequest()
@@ -117,7 +120,9 @@ def _receive_maps(
             answer.acknowledged = message.header.sequence
         try:
             m = Map(update.map, base=base)
-            between = 0 if base is None else m.sequence - base.sequence - 1
+            # Maps of another run, or before a jump of a replay, were not skipped.
+            is_next = base is not None and base.header.boot_id == m.header.boot_id
+            between = m.sequence - base.sequence - 1 if is_next else 0
             stream.store(m, max(between - left_out, 0), left_out=left_out)
             base, is_requested, left_out = m, False, 0
         except DecodeError:

@@ -49,10 +49,13 @@ _SKIPPED_MAX_PER_MS, _SKIPPED_MAX = 1, 1000
 
 
 class MapStream:
-    """An endless iterator over the newest map. Close it, or use it in a `with` statement."""
+    """An iterator over the newest map; it stops at the end of a replay, and has no end otherwise. Close it, or use it
+    in a `with` statement."""
 
-    def __init__(self, clock: Clock = Clock()) -> None:
+    def __init__(self, clock: Clock = Clock(), *, has_one_server: bool = False) -> None:
         self._clock = clock
+        #: True if all maps come from one server that is known: another run is then a jump of its replay.
+        self._has_one_server = has_one_server
         self._changed = threading.Condition()
         self._newest: Map | None = None
         self._counters = _Counters()
@@ -63,6 +66,8 @@ class MapStream:
         self._fresh: Map | None = None
         self._ended: ClearwayError | None = None
         self._closed = False
+        #: Replays that have reached their end, and those of them after which the iteration has stopped.
+        self._replay_ends = self._replay_ends_seen = 0
         self._close: Callable[[], None] = lambda: None
 
     def __iter__(self) -> Iterator[Map]:
@@ -70,7 +75,7 @@ class MapStream:
 
     def __next__(self) -> Map:
         """Waits for a map newer than the last one returned. Raises the reason if the stream has ended; stops when
-        closed."""
+        closed, and once after the last map of a replay: iterate again for the maps of a replay that is set back."""
         return self._next(report_stale=False)
 
     def next_or_stale(self) -> Map:
@@ -81,7 +86,7 @@ class MapStream:
 
     def _next(self, *, report_stale: bool) -> Map:
         with self._changed:
-            while not (self._closed or self._is_unseen() or self._ended):
+            while not (self._closed or self._is_unseen() or self._ended or self.replay_ended):
                 last = self._fresh if report_stale else None
                 if last is not None and last.stale:
                     self._fresh = None
@@ -91,6 +96,9 @@ class MapStream:
             if self._closed:
                 raise StopIteration
             newest = self._newest
+            if self.replay_ended and not self._is_unseen():
+                self._replay_ends_seen = self._replay_ends
+                raise StopIteration
             if newest is None or not self._is_unseen():
                 assert self._ended is not None
                 raise self._ended
@@ -102,6 +110,11 @@ class MapStream:
             )
             self._fresh = None if last.stale else last
             return last
+
+    @property
+    def replay_ended(self) -> bool:
+        """True from the end of a replay until the iteration has stopped for it."""
+        return self._replay_ends > self._replay_ends_seen
 
     def newest(self) -> Map | None:
         """The newest map at this moment; `None` before the first. It does not wait and does not change the counts of
@@ -137,7 +150,9 @@ class MapStream:
         the requested rate excluded. Returns whether it is stored. For the background thread."""
         m.with_arrival(self._clock)
         with self._changed:
-            if self._newest is not None and (reason := _refuse(self._newest, m)):
+            newest = self._newest
+            is_jump = self._has_one_server and newest is not None and newest.header.boot_id != m.header.boot_id
+            if newest is not None and not is_jump and (reason := _refuse(newest, m)):
                 self._count(reason)
                 return False
             if skipped is None:
@@ -161,6 +176,12 @@ class MapStream:
         """Ends the stream with a reason. For the background thread."""
         with self._changed:
             self._ended = reason
+            self._changed.notify_all()
+
+    def end_replay(self) -> None:
+        """Records that the replay has ended. For the background thread."""
+        with self._changed:
+            self._replay_ends += 1
             self._changed.notify_all()
 
     def on_close(self, close: Callable[[], None]) -> None:

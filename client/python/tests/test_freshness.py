@@ -18,9 +18,10 @@ class TestBed:
 
     __test__ = False
 
-    def __init__(self):
+    def __init__(self, *, has_one_server=False):
         self.wall_ns, self.steady_ns = START_NS, 0
-        self.stream = MapStream(Clock(lambda: self.wall_ns, lambda: self.steady_ns))
+        clock = Clock(lambda: self.wall_ns, lambda: self.steady_ns)
+        self.stream = MapStream(clock, has_one_server=has_one_server)
 
     def pass_(self, ns):
         self.wall_ns += ns
@@ -57,6 +58,16 @@ def test_a_map_is_reported_as_stale_after_the_link_is_cut():
     bed.check_becomes_stale(0)
     bed.store_aged(7, 20, 40 * MS)
     assert bed.next() == (False, 20, 40 * MS)
+
+
+def test_a_jump_of_a_replay_is_followed_at_once_where_the_server_is_known():
+    for has_one_server in (True, False):
+        bed = TestBed(has_one_server=has_one_server)
+        bed.store_aged(7, 20, 40 * MS)
+        assert bed.next() == (False, 20, 40 * MS)
+        bed.store_aged(8, 3, 30 * MS)
+        assert bed.stream.newest().sequence == (3 if has_one_server else 20)
+        assert bed.stream.passed_over.other_run == (0 if has_one_server else 1)
 
 
 def test_the_last_map_of_a_stopped_server_becomes_stale():

@@ -7,7 +7,8 @@
 //! | [`demo`] | a simulated vehicle -> a server of its own, over real UDP |
 //! | `serve` | a configuration -> a server that runs until a signal |
 //! | [`replay`] | recorded drives -> maps, a recording |
-//! | `verify` | a recording -> true if each map is the map of its events |
+//! | `transport` | a request -> the replay that a server serves |
+//! | `verify` | recordings -> whether each map is the map of its events, or what a change changes in the maps |
 //! | [`evaluate`] | labelled scans, simulated scenes -> precision and recall of each map |
 //! | `check` | a configuration -> the same with every default |
 //! | `watch`, `get` | a server -> a line for each map; the newest map as a file |
@@ -57,6 +58,7 @@ mod send;
 mod serve;
 #[cfg(feature = "sim")]
 mod simulate;
+mod transport;
 #[cfg(feature = "store")]
 mod upload;
 mod vehicles;
@@ -106,6 +108,7 @@ enum Command {
     Demo(demo::command::Options),
     Serve(serve::Options),
     Replay(Box<replay::Options>),
+    Transport(transport::Options),
     Verify(verify::Options),
     Evaluate(evaluate::Options),
     Check(check::Options),
@@ -129,7 +132,7 @@ enum Command {
 
 /// The subcommands by purpose, as `clearway --help` lists them.
 const GROUPS: [(&str, &[&str]); 8] = [
-    ("Make maps", &["demo", "serve", "replay"]),
+    ("Make maps", &["demo", "serve", "replay", "transport"]),
     ("Check maps and configurations", &["verify", "evaluate", "check"]),
     ("Read maps from a server", &["watch", "get", "vehicles"]),
     ("Control a server", &["recorder"]),
@@ -199,6 +202,7 @@ fn run(command: Command) -> Result<Exit> {
         Command::Demo(options) => demo::command::run(options)?,
         Command::Serve(options) => serve::run(&options)?,
         Command::Replay(options) => return replay::run(*options),
+        Command::Transport(options) => transport::run(&options)?,
         Command::Verify(options) => return verify::run(&options),
         Command::Evaluate(options) => evaluate::run(&options)?,
         Command::Check(options) => check::run(&options)?,

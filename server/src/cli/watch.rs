@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use anyhow::{Result, bail};
 use clap::Args;
-use clearway_client::{MapStream, PassedOver, StreamEvent, Subscription, Update, now_ns};
+use clearway_client::{ClientError, MapStream, PassedOver, StreamEvent, Subscription, Update, now_ns};
 use serde_json::json;
 
 use super::connection::{ServerOptions, explain};
@@ -61,7 +61,7 @@ pub struct Options {
     until_stale: bool,
 }
 
-/// Prints lines until the stream ends, the count is reached, the map is stale with `--until-stale`, or the reader of
+/// Prints lines until the stream or a replay ends, the count is reached, the map is stale with `--until-stale`, or the reader of
 /// stdout has closed it.
 ///
 /// # Errors
@@ -87,6 +87,10 @@ async fn watch(options: &Options) -> Result<Exit> {
                 };
                 newest = Some(update);
                 (said, is_new)
+            }
+            Ok(Err(error @ ClientError::ReplayEnded { .. })) => {
+                eprintln!("clearway: {error}");
+                break;
             }
             Ok(Err(ended)) => {
                 if let Some(last) = newest.filter(|_| !is_stale) {

@@ -43,8 +43,9 @@ pub struct Strip {
     pub rgb: Vec<Rgb>,
 }
 
-/// Draws the strip of a picture that is `width` pixels wide and shows `metres` metres in each pixel.
-pub fn strip(legend: &Legend, width: usize, metres: f64) -> Strip {
+/// Draws the strip of a picture that is `width` pixels wide and shows `metres` metres in each pixel; the lines of
+/// `caption` stand first, and continue on the next line if they are longer than the strip.
+pub fn strip(caption: &[String], legend: &Legend, width: usize, metres: f64) -> Strip {
     let dot = (width / PIXELS_PER_DOT).max(1);
     let (scale_m, bar) = scale_bar(width, metres);
     let scale = format!("{scale_m} m");
@@ -56,11 +57,15 @@ pub fn strip(legend: &Legend, width: usize, metres: f64) -> Strip {
         }
     };
     let last = entry_width(bar, &scale, dot) + 2 * margin + text_width(up, dot);
-    let width = width.max(2 * margin + widest.unwrap_or(0).max(last));
-    let mut strip = match legend {
+    let longest = caption.iter().flat_map(|line| line.split(' ')).map(|word| text_width(word, dot)).max().unwrap_or(0);
+    let width = width.max(2 * margin + widest.unwrap_or(0).max(last).max(longest));
+    let mut strip = caption_strip(caption, width, dot);
+    let explained = match legend {
         Legend::Classes(classes) => class_strip(classes, width, dot),
         Legend::Scale(texts) => colour_strip(texts, width, dot),
     };
+    strip.rgb.extend(explained.rgb);
+    strip.height += explained.height;
     // A bar with raised ends.
     let y = strip.height;
     strip.extend(font::HEIGHT * dot + margin);
@@ -80,6 +85,27 @@ fn text_width(text: &str, dot: usize) -> usize {
 /// Width of an entry, in pixels: its square or bar, and its text.
 fn entry_width(square: usize, text: &str, dot: usize) -> usize {
     square + SPACE * dot + text_width(text, dot)
+}
+
+/// The lines of text.
+fn caption_strip(caption: &[String], width: usize, dot: usize) -> Strip {
+    let mut strip = Strip::new(width, 0);
+    let margin = SPACE * dot;
+    for line in caption {
+        let mut words = line.split(' ').peekable();
+        while let Some(first) = words.next() {
+            let mut text = first.to_owned();
+            while let Some(word) =
+                words.next_if(|word| text_width(&text, dot) + text_width(word, dot) + 2 * margin < width)
+            {
+                text = format!("{text} {word}");
+            }
+            let y = strip.height + margin;
+            strip.extend(LINE * dot);
+            strip.write((margin, y), dot, &text);
+        }
+    }
+    strip
 }
 
 /// The lines with a square of each class's colour and its name.
@@ -175,7 +201,7 @@ mod tests {
         for legend in [DrivabilityClass::LEGEND, OccupancyClass::LEGEND, TerrainClass::LEGEND] {
             let names: Vec<&str> = legend.iter().map(|class| class.name).collect();
             for width in [16, 120, 800] {
-                let strip = strip(&Legend::Classes(entries(&names)), width, 0.1);
+                let strip = strip(&[], &Legend::Classes(entries(&names)), width, 0.1);
                 assert!(strip.width >= width && strip.rgb.len() == strip.width * strip.height);
                 let dot = (width / PIXELS_PER_DOT).max(1);
                 for (_, colour) in entries(&names) {
@@ -193,7 +219,7 @@ mod tests {
     fn a_channel_has_a_bar_from_its_least_to_its_greatest_colour() {
         let legend = Legend::Scale(["-12.75".into(), "1023.5 m/s".into()]);
         for width in [16, 120, 800] {
-            let strip = strip(&legend, width, 0.1);
+            let strip = strip(&[], &legend, width, 0.1);
             let dot = (width / PIXELS_PER_DOT).max(1);
             for share in [0.0, 1.0] {
                 let pixels = strip.rgb.iter().filter(|&&pixel| pixel == scale_colour(share)).count();

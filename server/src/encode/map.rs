@@ -15,14 +15,26 @@ use clearway_proto::map::{encode_header, encode_layer};
 use clearway_proto::region::RegionError;
 use clearway_proto::v1;
 use nalgebra::Isometry3;
+use prost::Message;
 
 use super::payload_cache::{PayloadCache, cropped, delta};
+
+/// How the header of a replayed map differs from that of the recorded one ([`v1::Replay`]).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Replayed {
+    /// What is added to the stamps, in ns.
+    pub shift_ns: i64,
+    /// The boot id that the map is served with.
+    pub boot_id: u64,
+}
 
 /// One encoded map. A clone shares the bytes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EncodedMap {
     /// Name of the vehicle.
     pub vehicle: Arc<str>,
+    /// Identifier of the run that serves the map.
+    pub boot_id: u64,
     /// Sequence of the map.
     pub sequence: u64,
     /// End of the map's capture, in ns since the Unix epoch; the age of the map counts from here.
@@ -42,14 +54,26 @@ pub struct EncodedMap {
 impl EncodedMap {
     /// Encodes `map` of `vehicle`; `boot_id` names this run of the server, `valid_ms` how long the map may be used.
     pub fn new(map: &Map, vehicle: Arc<str>, boot_id: u64, valid_ms: u32) -> Self {
-        let header = encode_header(&header(map, &vehicle, boot_id, valid_ms));
+        Self::replayed(map, vehicle, boot_id, valid_ms, None)
+    }
+
+    /// Encodes `map` as [`EncodedMap::new`] does, with the header of a replayed map if `replayed` is given. The layers
+    /// are the same bytes.
+    pub fn replayed(map: &Map, vehicle: Arc<str>, boot_id: u64, valid_ms: u32, replayed: Option<Replayed>) -> Self {
+        let mut header = header(map, &vehicle, boot_id, valid_ms);
+        if let Some(replayed) = replayed {
+            alter_header(&mut header, replayed);
+        }
+        let (boot_id, capture_end_ns, completed_ns) = (header.boot_id, header.capture_end_ns, header.completed_ns);
+        let header = encode_header(&header);
         let encode = |layer: &Layer| (layer.name, encode_layer(&self::layer(layer)));
         let share = |layer: &Layer| layer.metrics.iter().find(|(name, _)| *name == "drivable_share").map(|(_, v)| *v);
         Self {
             vehicle,
+            boot_id,
             sequence: map.sequence,
-            capture_end_ns: map.capture_end_ns,
-            completed_ns: map.completed_ns,
+            capture_end_ns,
+            completed_ns,
             drivable_share: map.layers.iter().find_map(share),
             header,
             layers: map.layers.iter().map(encode).collect(),
@@ -124,6 +148,32 @@ impl EncodedMap {
     }
 }
 
+/// The encoded map `computed` with the replay's header, if the header of the encoded map `served` has one; equal to
+/// `served` if the map was replayed right. Bytes that are no map stay as they are.
+pub fn as_served(computed: Bytes, served: &Bytes) -> Bytes {
+    let header = v1::Map::decode(served.clone()).ok().and_then(|map| map.header);
+    let Some((boot_id, replay)) = header.and_then(|header| Some((header.boot_id, header.replay?))) else {
+        return computed;
+    };
+    let Ok(mut map) = v1::Map::decode(computed.clone()) else { return computed };
+    if let Some(header) = &mut map.header {
+        alter_header(header, Replayed { shift_ns: replay.shift_ns, boot_id });
+    }
+    map.encode_to_vec().into()
+}
+
+fn alter_header(header: &mut v1::Header, Replayed { shift_ns, boot_id }: Replayed) {
+    let stamps = [
+        &mut header.capture_start_ns,
+        &mut header.capture_end_ns,
+        &mut header.completed_ns,
+        &mut header.valid_until_ns,
+    ];
+    stamps.into_iter().for_each(|stamp| *stamp = stamp.saturating_add(shift_ns));
+    header.replay = Some(v1::Replay { shift_ns, recorded_boot_id: header.boot_id });
+    header.boot_id = boot_id;
+}
+
 fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
     v1::Header {
         vehicle: vehicle.to_owned(),
@@ -141,6 +191,7 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
         reference_sensor: (map.sensors.get(usize::from(map.reference_sensor)))
             .map_or(String::new(), |sensor| sensor.name.clone()),
         epoch: map.epoch,
+        replay: None,
     }
 }
 

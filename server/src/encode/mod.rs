@@ -21,7 +21,7 @@ pub mod viewer;
 
 pub use event::{EventDecodeError, event_from_bytes, event_to_proto};
 pub(crate) use event::{ego_pose_from_proto, road_from_proto, scan_from_proto, sensor_from_proto};
-pub use map::EncodedMap;
 #[cfg(test)]
 pub(crate) use map::meaning;
 pub(crate) use map::sensor;
+pub use map::{EncodedMap, Replayed, as_served};

@@ -108,6 +108,13 @@ struct State {
     reported_ns: i64,
 }
 
+/// What a queue remembers of the events before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct QueuePosition {
+    next_sequence: u64,
+    reported_ns: i64,
+}
+
 /// Creates a queue of `capacity` events that stamps live readings with the system's clock.
 pub fn event_queue(capacity: usize) -> (EventQueue, Receiver<QueuedEvent>) {
     event_queue_with_clock(Clock::default(), capacity)
@@ -279,6 +286,18 @@ impl EventQueue {
             }
         }
         Ok(())
+    }
+
+    /// What the queue remembers of the events so far.
+    pub fn position(&self) -> QueuePosition {
+        let state = locked(&self.state);
+        QueuePosition { next_sequence: state.next_sequence, reported_ns: state.reported_ns }
+    }
+
+    /// Goes on as if the events so far were those before `position`: a replay jumps.
+    pub fn set_position(&self, position: QueuePosition) {
+        let mut state = locked(&self.state);
+        (state.next_sequence, state.reported_ns) = (position.next_sequence, position.reported_ns);
     }
 
     /// Closes the queue for all clones: the engine handles the events on the queue and then ends.

@@ -34,6 +34,7 @@ use crate::encode::EncodedMap;
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::{base_frame, foxglove as messages, safe_paths};
 use crate::newest::NewestSweep;
+use crate::status::Reader;
 use crate::subscriptions::LayerSubscription;
 
 /// Pages from which Foxglove connects, beside those of the configuration.
@@ -273,6 +274,7 @@ struct Subscription {
     newest: watch::Receiver<Option<Message>>,
     /// Keeps its layer active.
     _layer: Option<LayerSubscription>,
+    _reader: Reader,
 }
 
 /// What a client may ask for.
@@ -363,7 +365,8 @@ impl Client {
                     let mut newest = channel.newest.subscribe();
                     newest.mark_changed();
                     of.subscribed.notify_one();
-                    self.subscriptions.insert(id, Subscription { newest, _layer: layer });
+                    let reader = Reader::new(&of.served.status.foxglove_readers);
+                    self.subscriptions.insert(id, Subscription { newest, _layer: layer, _reader: reader });
                 }
             }
         }

@@ -27,6 +27,7 @@ use super::served::Served;
 use crate::clock::now_ns;
 use crate::config::Ros2;
 use crate::encode::EncodedMap;
+use crate::status::Reader;
 use crate::zenoh_session::ZenohError;
 
 /// Name of the node.
@@ -174,6 +175,7 @@ impl Topic {
                 }
             }
             let _subscription = layer.map(|layer| served.status.subscriptions.subscribe(&[layer.to_owned()]));
+            let _reader = Reader::new(&served.status.zenoh_readers);
             newest.mark_changed();
             loop {
                 tokio::select! {

@@ -3,7 +3,8 @@
 //! A layer is made while its key has a subscriber, and for each query on it. Late joiners get the current map from the
 //! publisher's cache; it is old if the layer had no subscriber, and its age says so. The same key answers queries.
 //! Subscribers can detect misses. A liveliness token `clearway/<vehicle>` lives as long as the vehicle is served;
-//! `clearway/<vehicle>/status` has the status once a second, as JSON.
+//! `clearway/<vehicle>/status` has the status once a second, as JSON. `clearway/<vehicle>/replay` has `{"ended":true}`
+//! after the last map of a replay, and `{"ended":false}` when it is set back.
 //!
 //! With `zenoh.signing_key` each map has a signature ([`clearway_client::signature`]) as the sample's attachment.
 //!
@@ -28,6 +29,8 @@ use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, Mis
 use super::ros::Node;
 use super::served::{Served, Vehicles};
 use crate::config::{Zenoh as Options, secret};
+use crate::encode::EncodedMap;
+use crate::status::Reader;
 use crate::zenoh_session::ZenohError;
 
 /// Time between two status messages.
@@ -118,7 +121,11 @@ impl Publisher {
             .map_err(ZenohError::of(format!("publisher {key}")))?;
         let token = self.session.liveliness().declare_token(format!("clearway/{vehicle}"));
         self.tokens.push(token.await.map_err(ZenohError::of(format!("liveliness clearway/{vehicle}")))?);
-        self.tasks.spawn(send_maps(served.clone(), publishers, self.signing_key.clone()));
+        let key = format!("clearway/{vehicle}/replay");
+        let replay = self.session.declare_publisher(key.clone()).encoding(Encoding::APPLICATION_JSON).priority(MAPS);
+        let replay = replay.congestion_control(CongestionControl::Drop).await;
+        let replay = replay.map_err(ZenohError::of(format!("publisher {key}")))?;
+        self.tasks.spawn(send_maps(served.clone(), publishers, self.signing_key.clone(), replay));
         self.tasks.spawn({
             let served = served.clone();
             async move {
@@ -165,7 +172,9 @@ async fn subscribe_while(
     matching: MatchingListener<FifoChannelHandler<MatchingStatus>>,
 ) {
     loop {
-        let _taken = matches.then(|| served.status.subscriptions.subscribe(&[layer.to_owned()]));
+        let _taken = matches.then(|| {
+            (served.status.subscriptions.subscribe(&[layer.to_owned()]), Reader::new(&served.status.zenoh_readers))
+        });
         match matching.recv_async().await {
             Ok(status) => matches = status.matching(),
             Err(_) => return,
@@ -188,27 +197,55 @@ fn signature(key: Option<&SigningKey>, on: &str, map: &[u8]) -> Option<ZBytes> {
     key.map(|key| key.sign(on, map).as_slice().into())
 }
 
+/// Sends each newest map, and after the last map of a replay that it has ended.
 async fn send_maps(
     served: Served,
     publishers: Vec<(&'static str, String, AdvancedPublisher<'static>)>,
     signing_key: Option<Arc<SigningKey>>,
+    replay: zenoh::pubsub::Publisher<'static>,
 ) {
-    let mut newest = served.newest.clone();
+    let (mut newest, mut replay_ended) = (served.newest.clone(), served.status.replay_ended.subscribe());
     newest.mark_changed();
-    while newest.changed().await.is_ok() {
-        let map = newest.borrow_and_update().clone();
-        let Some(map) = map else { continue };
-        for (layer, chunk) in &map.layers {
-            let Some((_, key, publisher)) = publishers.iter().find(|(name, ..)| name == layer) else { continue };
-            let bytes = map.layer(chunk);
-            let signature = signature(signing_key.as_deref(), key, &bytes);
-            if let Err(error) = publisher.put(bytes).attachment(signature).await {
-                tracing::warn!(%error, layer, "zenoh: put");
+    let mut reported = false;
+    loop {
+        tokio::select! {
+            biased;
+            changed = newest.changed() => {
+                if changed.is_err() {
+                    break;
+                }
+                let map = newest.borrow_and_update().clone();
+                if let Some(map) = map {
+                    send_map(&map, &publishers, signing_key.as_deref()).await;
+                }
+            }
+            Ok(()) = replay_ended.changed() => {}
+        }
+        let ended = *replay_ended.borrow();
+        if ended != reported && !newest.has_changed().unwrap_or(false) {
+            reported = ended;
+            if let Err(error) = replay.put(format!("{{\"ended\":{ended}}}")).await {
+                tracing::warn!(%error, "zenoh: replay");
             }
         }
     }
     // The engine has stopped, but the current map stays in the caches until the session ends.
     std::future::pending::<()>().await;
+}
+
+async fn send_map(
+    map: &EncodedMap,
+    publishers: &[(&'static str, String, AdvancedPublisher<'static>)],
+    signing_key: Option<&SigningKey>,
+) {
+    for (layer, chunk) in &map.layers {
+        let Some((_, key, publisher)) = publishers.iter().find(|(name, ..)| name == layer) else { continue };
+        let bytes = map.layer(chunk);
+        let signature = signature(signing_key, key, &bytes);
+        if let Err(error) = publisher.put(bytes).attachment(signature).await {
+            tracing::warn!(%error, layer, "zenoh: put");
+        }
+    }
 }
 
 fn map_encoding() -> Encoding {

@@ -13,10 +13,12 @@
 //! | [`reader`] | those messages -> events, maps, ROS 2 messages |
 //! | [`repair`] | damaged recording -> a whole one with all that can be read |
 //! | [`verify`] | recording -> differences between the recorded maps and the maps of the recorded events |
+//! | [`compare`] | two sets of maps of one drive -> changed cells, gained and lost free space |
 
 #[cfg(feature = "sqlite")]
 mod bag_records;
 mod chunk;
+pub mod compare;
 pub mod damage;
 mod file_records;
 pub mod mcap_file;

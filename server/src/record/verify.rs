@@ -22,7 +22,7 @@ use clearway_proto::v1;
 use prost::Message;
 use serde_json::{Value, json};
 
-use crate::encode::EncodedMap;
+use crate::encode::{EncodedMap, as_served};
 use crate::record::damage::Damage;
 use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 
@@ -38,6 +38,8 @@ pub struct Report {
     pub equal: u64,
     /// Number of maps computed from the events.
     pub maps: u64,
+    /// Number of cells of the recorded maps that have a computed map: those of their layers' grids.
+    pub cells: u64,
     /// True if a crash cut the file; then the part before the cut is verified.
     pub cut: bool,
     /// Number of maps, of one layer each, that belong to the last event before the cut and are not recorded.
@@ -133,6 +135,7 @@ impl Report {
         json!({
             "ok": self.is_good() && self.incomplete.is_none(),
             "events": self.events, "maps": self.maps, "equal": self.equal, "different": self.different,
+            "cells": self.cells,
             "cut": self.cut, "beyond_cut": self.beyond_cut, "unjudged": self.unjudged, "incomplete": self.incomplete,
             "dropped": self.dropped, "dropped_because": self.dropped_because,
             "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(),
@@ -263,7 +266,7 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
             }
             RecordedMessage::Map { vehicle, layer, bytes } => {
                 let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else {
-                    report.add(&vehicle, sequence_of(&bytes), &layer, DifferenceKind::Extra);
+                    report.add(&vehicle, sequence_and_cells(&bytes).0, &layer, DifferenceKind::Extra);
                     continue;
                 };
                 replay.compare(&layer, &bytes, &mut report);
@@ -340,8 +343,10 @@ impl VehicleReplay {
 
     /// Compares a recorded layer with the computed one.
     fn compare(&mut self, layer: &str, bytes: &Bytes, report: &mut Report) {
-        let sequence = sequence_of(bytes);
-        match self.computed.remove(&(sequence, layer.to_owned())) {
+        let (sequence, cells) = sequence_and_cells(bytes);
+        let computed = self.computed.remove(&(sequence, layer.to_owned()));
+        report.cells += if computed.is_some() { cells } else { 0 };
+        match computed.map(|computed| as_served(computed, bytes)) {
             Some(computed) if computed == *bytes => report.equal += 1,
             _ if self.lacks_events || self.pipeline.is_none() => report.unjudged += 1,
             None => report.add(&self.name, sequence, layer, DifferenceKind::Extra),
@@ -350,10 +355,13 @@ impl VehicleReplay {
     }
 }
 
-/// The sequence of a recorded map; `u64::MAX` for an unreadable map, which then counts as extra.
-fn sequence_of(bytes: &Bytes) -> u64 {
-    let map = v1::Map::decode(bytes.clone()).ok();
-    map.and_then(|map| map.header).map_or(u64::MAX, |header| header.sequence)
+/// The sequence of a recorded map of one layer and the number of its cells; `u64::MAX` for an unreadable map, which then
+/// counts as extra.
+fn sequence_and_cells(bytes: &Bytes) -> (u64, u64) {
+    let Ok(map) = v1::Map::decode(bytes.clone()) else { return (u64::MAX, 0) };
+    let channels = map.layers.first().map(|layer| &layer.channels[..]).unwrap_or_default();
+    let cells = channels.first().map_or(0, |channel| channel.cell_count.into());
+    (map.header.map_or(u64::MAX, |header| header.sequence), cells)
 }
 
 /// The first difference of two encoded maps of one layer, in the order header, geometry, channels, all else.

@@ -1,6 +1,7 @@
 //! A running server, and its shutdown.
 
 use std::net::SocketAddr;
+use std::sync::mpsc::Receiver;
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -12,11 +13,14 @@ use super::input::VehicleInput;
 use super::listeners::limits;
 use super::setup::ShutdownError;
 use crate::config::{Certificates, Config};
+use crate::engine::Engine;
+use crate::ingest::queue::QueuedEvent;
 use crate::ingest::udp;
 use crate::publish::Vehicles;
 use crate::publish::listen::ListenerHandle;
 use crate::publish::listen::security::{Current, Security};
 use crate::record::writer::Recorder;
+use crate::replay::ReplayHandle;
 use crate::subscriptions::LayerSubscription;
 use crate::sync::locked;
 
@@ -42,6 +46,11 @@ pub struct Running {
     pub zenoh: Vec<String>,
     /// The address of the Foxglove WebSocket.
     pub foxglove: Option<SocketAddr>,
+    /// The engines that the caller steps, with the events of their queues; in the order of the vehicles. They must be
+    /// dropped before [`Running::shutdown`].
+    pub stepped: Vec<(Engine, Receiver<QueuedEvent>)>,
+    /// Controls the replay that the server serves.
+    pub(super) replay: Option<ReplayHandle>,
     pub(super) engines: Vec<(Arc<str>, JoinHandle<()>)>,
     pub(super) recorder: Option<Recorder>,
     pub(super) udp: Option<udp::UdpThreads>,
@@ -61,6 +70,11 @@ impl Running {
     /// The path of the recording, if the server records.
     pub fn recording(&self) -> Option<String> {
         self.recorder.as_ref().map(|recorder| recorder.counts().to_proto().file)
+    }
+
+    /// Controls the replay that the server serves, if it serves one.
+    pub fn replay(&self) -> Option<ReplayHandle> {
+        self.replay.clone()
     }
 
     /// True if the TCP listeners have certificates.
@@ -113,6 +127,7 @@ impl Running {
     /// # Errors
     /// [`ShutdownError`] if an engine panicked or the recording is incomplete; everything has ended then as well.
     pub async fn shutdown(mut self) -> Result<(), ShutdownError> {
+        self.stepped.clear();
         let step = self.shutdown_step.clone();
         let begin = |what: &'static str| *locked(&step) = what;
         begin("the sockets' threads");

@@ -9,6 +9,7 @@ use crate::config::{Calibrations, Certificates, Config};
 use crate::engine::Observer;
 use crate::ingest::udp;
 use crate::record::writer::{IncompleteRecordingError, RecordError};
+use crate::replay::ReplayHandle;
 
 /// The parameters of a server.
 #[derive(Default)]
@@ -29,6 +30,10 @@ pub struct Setup {
     pub metadata: BTreeMap<String, String>,
     /// Is called after each revolution of the first vehicle.
     pub observer: Option<Observer>,
+    /// True if the caller steps the engines ([`Running::stepped`](super::Running::stepped)); else each has a thread.
+    pub is_stepped: bool,
+    /// Controls the replay; offered to clients if the server has one.
+    pub replay: Option<ReplayHandle>,
 }
 
 /// A server did not start.

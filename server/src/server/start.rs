@@ -46,6 +46,7 @@ impl Server {
         let mut observer = setup.observer;
         calibrations.resize_with(config.vehicles.len(), Vec::new);
         let mut running = Running::default();
+        running.replay = setup.replay;
         let mut prepared = Vec::new();
         for (vehicle, tables) in config.vehicles.iter().zip(&mut calibrations) {
             tables.resize(vehicle.sensors.len(), None);
@@ -55,7 +56,8 @@ impl Server {
         }
         running.vehicles = Vehicles(prepared.iter().map(|prepared| prepared.served.clone()).collect());
         let header = || header(&config, &calibrations, boot_id, &setup.config_comments, setup.metadata);
-        match running.start_all(&config, setup.certificates, prepared, setup.from_files, header).await {
+        let driver = Driver { from_files: setup.from_files, is_stepped: setup.is_stepped };
+        match running.start_all(&config, setup.certificates, prepared, driver, header).await {
             Ok(()) => Ok(running),
             Err(error) => {
                 // The caller needs the error of the start, not one of the shutdown that follows from it.
@@ -64,6 +66,13 @@ impl Server {
             }
         }
     }
+}
+
+/// Where the events come from, and which thread steps the engines ([`Setup::from_files`], [`Setup::is_stepped`]).
+#[derive(Clone, Copy)]
+struct Driver {
+    from_files: bool,
+    is_stepped: bool,
 }
 
 /// One vehicle before its engine runs.
@@ -93,7 +102,8 @@ impl Running {
         let status = Arc::new(VehicleStatus::new(name.clone(), boot_id, layers, queue.drops()));
         let (newest, receiver) = watch::channel(None);
         let valid_ms = vehicle.maps.valid_ms;
-        let engine = Engine { pipeline, valid_ms, newest, recording: None, status: status.clone(), observer };
+        let engine =
+            Engine { pipeline, valid_ms, newest, recording: None, status: status.clone(), observer, replayed: None };
         self.inputs.push(VehicleInput { name, queue, udp: None });
         Prepared { served: Served { status, newest: receiver }, engine, events, core }
     }
@@ -103,7 +113,7 @@ impl Running {
         config: &Config,
         certificates: Option<Certificates>,
         prepared: Vec<Prepared>,
-        from_files: bool,
+        driver: Driver,
         header: impl FnOnce() -> Header,
     ) -> Result<(), StartError> {
         // Before the recorder: a port in use must not overwrite an earlier recording.
@@ -121,7 +131,7 @@ impl Running {
             self.zenoh = over_zenoh.endpoints().await;
             self.over_zenoh = Some(over_zenoh);
         }
-        self.start_engines(config, prepared, from_files, header)?;
+        self.start_engines(config, prepared, driver, header)?;
         if let Some(recorder) = self.recorder.as_ref().filter(|_| !config.recorder.save_on.is_empty()) {
             let (rules, stopped) =
                 (save_rules::watch(config.clone(), self.vehicles.clone(), recorder.control()), self.stopped());
@@ -141,21 +151,25 @@ impl Running {
         &mut self,
         config: &Config,
         prepared: Vec<Prepared>,
-        from_files: bool,
+        driver: Driver,
         header: impl FnOnce() -> Header,
     ) -> Result<(), StartError> {
         let mut handles = Vec::new().into_iter();
         if recording_path(&config.recorder).is_some() {
-            let (recorder, of_vehicles) = Recorder::start(&config.recorder, &header(), from_files)?;
+            let (recorder, of_vehicles) = Recorder::start(&config.recorder, &header(), driver.from_files)?;
             (self.recorder, handles) = (Some(recorder), of_vehicles.into_iter());
         }
         for Prepared { served: Served { status, .. }, mut engine, events, core: (core, tables) } in prepared {
             self.recorder.iter().for_each(|recorder| status.show_recorder(recorder.counts()));
             // A replay computes all layers: a reader that comes late gets the last map, and the summary has all
             // metrics.
-            self.subscriptions.extend(from_files.then(|| status.subscriptions.subscribe(&[])));
+            self.subscriptions.extend(driver.from_files.then(|| status.subscriptions.subscribe(&[])));
             engine.recording = handles.next();
             engine.recording.iter_mut().for_each(|recording| recording.set_config(core.clone(), tables.clone()));
+            if driver.is_stepped {
+                self.stepped.push((engine, events));
+                continue;
+            }
             let name = status.name.clone();
             let thread = engine.start(events).map_err(|source| StartError::Thread { vehicle: name.clone(), source })?;
             self.engines.push((name, thread));
@@ -171,17 +185,19 @@ impl Running {
 
     fn serve(&mut self, listeners: Listeners, gateways: Gateways) {
         let Listeners { grpc, page, metrics, foxglove, security, handles } = listeners;
-        let shown = page::Shown { vehicles: self.vehicles.clone(), listeners: handles.clone().into() };
+        let listeners = handles.clone().into();
+        let shown = page::Shown { vehicles: self.vehicles.clone(), listeners, replay: self.replay.clone() };
         self.listeners = Some((security, handles));
         let address = |listener: &Option<Listener>| listener.as_ref().and_then(Listener::address);
         (self.grpc, self.page, self.metrics) = (address(&grpc), address(&page), address(&metrics));
         self.foxglove = address(&foxglove);
         if let Some(listener) = grpc {
-            let (vehicles, stopped) = (self.vehicles.clone(), self.stopped());
+            let (vehicles, stopped, replay) = (self.vehicles.clone(), self.stopped(), self.replay.clone());
             let recorder = self.recorder.as_ref().map(Recorder::control);
             let ingest = (!gateways.all().is_empty()).then(|| Ingest::new(gateways).into_service());
             self.publishers.spawn(async move {
-                if let Err(error) = grpc::serve(listener, vehicles, ingest, recorder, stopped).await {
+                let served = grpc::serve(listener, vehicles, ingest, recorder, replay, stopped);
+                if let Err(error) = served.await {
                     tracing::error!(%error, "grpc ended");
                 }
             });
@@ -242,6 +258,6 @@ fn header(
 }
 
 /// A random 64-bit number: the system seeds each `RandomState` with its randomness.
-fn random() -> u64 {
+pub fn random() -> u64 {
     std::hash::RandomState::new().build_hasher().finish()
 }

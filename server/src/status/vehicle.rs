@@ -12,6 +12,7 @@ use clearway_proto::v1;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
+use crate::acknowledgements::Acknowledgements;
 use crate::clock::now_ns;
 use crate::encode::EncodedMap;
 use crate::ingest::drops::{DropCounters, UnknownSender};
@@ -44,12 +45,20 @@ pub struct VehicleStatus {
     pub layers: Vec<&'static str>,
     /// Subscriptions of readers to the layers.
     pub subscriptions: LayerSubscriptions,
+    /// The newest map that each acknowledging reader has finished with.
+    pub acknowledgements: Acknowledgements,
     /// The points of the newest map, while a reader subscribes to them.
     pub sweeps: watch::Sender<NewestSweep>,
     /// Number of readers over gRPC.
     pub grpc_readers: Arc<AtomicU32>,
     /// Number of open pages.
     pub page_readers: Arc<AtomicU32>,
+    /// Number of keys of zenoh and topics of ROS 2 with a subscriber.
+    pub zenoh_readers: Arc<AtomicU32>,
+    /// Number of subscriptions of Foxglove's clients.
+    pub foxglove_readers: Arc<AtomicU32>,
+    /// True while a replay stands at its end.
+    pub replay_ended: watch::Sender<bool>,
     drops: Arc<DropCounters>,
     pub(super) recorder: OnceLock<Arc<RecorderCounts>>,
     engine_stopped: AtomicBool,
@@ -147,10 +156,14 @@ impl VehicleStatus {
             name,
             boot_id,
             subscriptions: LayerSubscriptions::new(&layers),
+            acknowledgements: Acknowledgements::default(),
             sweeps: watch::Sender::new(None),
             layers,
             grpc_readers: Arc::default(),
             page_readers: Arc::default(),
+            zenoh_readers: Arc::default(),
+            foxglove_readers: Arc::default(),
+            replay_ended: watch::Sender::new(false),
             drops,
             recorder: OnceLock::new(),
             engine_stopped: AtomicBool::new(false),
@@ -212,7 +225,8 @@ impl VehicleStatus {
     pub(crate) fn mapped(&self, map: &EncodedMap, states: Vec<v1::SensorState>, latency: Duration) {
         let mut state = locked(&self.state);
         state.states = states;
-        state.maps += 1;
+        // A jump of a replay sets the number back.
+        state.maps = map.sequence + 1;
         state.newest_capture_end_ns = map.capture_end_ns;
         state.drivable_share = map.drivable_share;
         if state.latencies_ns.len() == LATENCIES {
@@ -253,9 +267,15 @@ impl VehicleStatus {
     }
 
     /// Number of readers of its maps, by transport.
-    pub(super) fn readers(&self) -> [(&'static str, u32); 2] {
-        [("grpc", &self.grpc_readers), ("page", &self.page_readers)]
+    pub fn readers(&self) -> [(&'static str, u32); 4] {
+        let (grpc, page) = (&self.grpc_readers, &self.page_readers);
+        [("grpc", grpc), ("page", page), ("zenoh", &self.zenoh_readers), ("foxglove", &self.foxglove_readers)]
             .map(|(transport, readers)| (transport, readers.load(Ordering::Relaxed)))
+    }
+
+    /// Number of readers of its maps over all transports.
+    pub fn readers_sum(&self) -> u32 {
+        self.readers().iter().map(|(_, readers)| readers).sum()
     }
 
     /// The status as a message of the wire.
@@ -358,7 +378,7 @@ fn rates(paces: &VecDeque<(Instant, u64)>) -> (f64, f64) {
     if paces.len() < 2 || seconds <= 0.0 || last.elapsed() > RATE_AGE_MAX {
         return (0.0, 0.0);
     }
-    ((paces.len() - 1) as f64 / seconds, (after - before) as f64 / seconds)
+    ((paces.len() - 1) as f64 / seconds, after.saturating_sub(*before) as f64 / seconds)
 }
 
 /// Nearest-rank percentile of ascending durations.

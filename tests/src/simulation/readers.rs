@@ -128,7 +128,7 @@ impl Reader {
         let max_in_flight = self.max_in_flight as u32;
         let layers = self.layers.clone();
         let selection = v1::Selection { vehicle: "car".into(), layers, max_in_flight, ..Default::default() };
-        let updates = watch(vehicles, selection, received);
+        let updates = watch(vehicles, selection, received, "a simulated reader".into());
         let updates =
             updates.map_err(|status| violation("reader", format!("{:?} is refused: {status}", self.habit)))?;
         self.open = Some((Box::pin(updates), requests));

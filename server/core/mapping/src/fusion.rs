@@ -50,6 +50,7 @@ struct NewestMap {
 }
 
 /// A map whose source has completed its scan, while scans with the same stamp are due.
+#[derive(Clone)]
 struct WaitingMap {
     /// The source's scan, without its points.
     own: OwnScan,
@@ -60,6 +61,7 @@ struct WaitingMap {
 }
 
 /// What a map needs of its source's scan beside the points. A later scan does not change it.
+#[derive(Clone)]
 struct OwnScan {
     source: usize,
     start_ns: i64,
@@ -85,6 +87,7 @@ impl OwnScan {
 }
 
 /// The fusion of one vehicle.
+#[derive(Clone)]
 pub(crate) struct Fusion {
     reference_sensor: usize,
     deadline_ns: i64,

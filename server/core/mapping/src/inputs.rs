@@ -39,6 +39,7 @@ pub(crate) struct Outcome {
 }
 
 /// The inputs of one vehicle.
+#[derive(Clone)]
 pub(crate) struct Inputs {
     config: VehicleConfig,
     deadline_ns: i64,

@@ -15,6 +15,7 @@ use crate::sensor::scan::SensorScan;
 use crate::sensor::sweep::Sweep;
 
 /// The ground of the newest map.
+#[derive(Clone)]
 pub(crate) struct MapGround {
     /// `None` if heights are taken over the plane under the vehicle.
     estimates: Option<Estimates>,
@@ -26,6 +27,7 @@ pub(crate) struct MapGround {
     scan_heights_m: Vec<f32>,
 }
 
+#[derive(Clone)]
 struct Estimates {
     ground: Ground,
     reach: Reach,

@@ -25,7 +25,8 @@ use crate::sensor::mount::check::MountDeviation;
 use crate::sensor::pipeline::SensorPipeline;
 use crate::sensor::sweep::Sweep;
 
-/// The maps of one vehicle, made from its events.
+/// The maps of one vehicle, made from its events. A clone goes on from the same state with other events.
+#[derive(Clone)]
 pub struct Pipeline {
     maps: MapsConfig,
     deadline_ns: i64,

@@ -29,6 +29,7 @@ struct Merits {
 }
 
 /// The choice of one vehicle.
+#[derive(Clone)]
 pub(crate) struct ReferenceChoice {
     is_decided: bool,
     deadline_ns: i64,

@@ -18,6 +18,7 @@ use clearway_mapping::sensor::sweep::Sweep;
 use common::*;
 
 /// Safe paths, and the drivability they are made from.
+#[derive(Clone)]
 struct SafePathFromDrivability {
     drivability: Drivability,
     safe_path: SafePath,
@@ -36,6 +37,7 @@ impl LayerMaker for SafePathFromDrivability {
 }
 
 /// The occupancy of one scan.
+#[derive(Clone)]
 struct OccupancyOfOneScan(Occupancy);
 
 impl LayerMaker for OccupancyOfOneScan {

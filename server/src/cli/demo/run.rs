@@ -148,15 +148,7 @@ fn draw(map: &EncodedMap, file: &Path) -> Result<(), DemoError> {
     let error = |reason: String| DemoError::Picture { file: file.to_owned(), reason };
     let map = decode_map(map.select(&["drivability".into()]), &Limits::default()).map_err(|e| error(e.to_string()))?;
     let Some(layer) = map.layer("drivability") else { return Ok(()) };
-    let style = Style {
-        pixels: 640,
-        range_m: None,
-        rings_m: Some(10.0),
-        vehicle: true,
-        channel: None,
-        legend: true,
-        stale: false,
-    };
+    let style = Style { pixels: 640, rings_m: Some(10.0), ..Style::default() };
     let bytes = picture::png(layer, &style).map_err(|e| error(e.to_string()))?;
     let unfinished = file.with_extension("png.part");
     std::fs::write(&unfinished, bytes).map_err(|e| error(e.to_string()))?;

@@ -4,9 +4,6 @@ use clap::Args;
 
 use crate::encode::picture::Style;
 
-/// Edge of the map in a picture if the options do not give it, in pixels; ours, because it fits a screen.
-const PIXELS: u32 = 800;
-
 /// The options for drawing pictures.
 #[derive(Args)]
 #[command(next_help_heading = "Pictures")]
@@ -36,12 +33,13 @@ impl DrawingOptions {
     pub fn style(&self) -> Style {
         let Self { pixels, range, rings, ref channel, no_vehicle, plain } = *self;
         Style {
-            pixels: pixels.unwrap_or(PIXELS),
+            pixels: pixels.unwrap_or(Style::default().pixels),
             range_m: range,
             rings_m: rings,
             vehicle: !no_vehicle,
             channel: channel.clone(),
             legend: !plain,
+            caption: Vec::new(),
             stale: false,
         }
     }

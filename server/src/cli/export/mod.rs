@@ -5,6 +5,7 @@
 //! | `drawing` | options -> the style of pictures |
 //! | `layer_json` | a layer -> JSON |
 //! | `npy` | the cells of a channel -> a NumPy file |
+//! | `sheet` | the maps of a layer -> one picture of many |
 //! | `scans` | the events of a recording -> the points of each scan |
 //! | `viewer_file` | maps, points -> an MCAP file for viewers |
 
@@ -15,6 +16,7 @@ use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use clearway_client::{Channel, Layer, MapView};
 
+use self::sheet::Sheet;
 use self::viewer_file::{Dialect, ViewerFile};
 use super::exit::Exit;
 use super::files;
@@ -27,6 +29,7 @@ mod drawing;
 pub mod layer_json;
 pub mod npy;
 mod scans;
+mod sheet;
 mod viewer_file;
 
 /// Export the maps of a recording: files for each map, or one MCAP file for viewers.
@@ -34,8 +37,9 @@ mod viewer_file;
 /// Names of the files begin with the map's sequence number in six digits, and contain the layer. png and json write
 /// `<sequence>_<layer>.<format>`, png with --channel `<sequence>_<layer>_<channel>.png`; npy writes
 /// `<sequence>_<layer>_<channel>.npy` (NumPy 1.0, shape (rows, columns)) and `<sequence>_<layer>.json` with geometry,
-/// pose, stamps and class legend. Pictures show the map from above, with the vehicle in the middle, forward up and left
-/// on the left, and the legend under it.
+/// pose, stamps and class legend; sheet writes `sheet_<layer>.png`. Pictures show the map from above, with
+/// the vehicle in the middle, forward up and left
+/// on the left, and under it the stamp, the sensors that are partial, the legend and a scale.
 ///
 /// foxglove and ros2 write one new MCAP file with the layers of every vehicle and the sensors' points: foxglove has
 /// coloured grids, scenes of the safe points and transforms, ros2 has occupancy grids (0 free, 100 occupied, -1
@@ -45,6 +49,7 @@ mod viewer_file;
   clearway export drive.mcap --layer drivability --format png --out maps
   clearway export drive.mcap --layer terrain --channel roughness --format png --out maps
   clearway export drive.mcap --format png --rings 10 --out maps
+  clearway export drive.mcap --layer drivability --format sheet --pixels 240 --out maps
   clearway export drive.mcap --format foxglove --out drive.foxglove.mcap")]
 pub struct Options {
     /// The recording (MCAP); a file that is cut off is exported as far as it goes.
@@ -73,6 +78,8 @@ pub struct Options {
 pub enum Format {
     /// Pictures from above.
     Png,
+    /// One picture for each layer, with up to 24 maps of the drive side by side.
+    Sheet,
     /// NumPy arrays, one for each channel, and a JSON document.
     Npy,
     /// A JSON document with the cells.
@@ -89,6 +96,8 @@ type Encoder = fn(&MapView, &Layer, &Style) -> Result<Vec<(String, Vec<u8>)>>;
 /// Destination of the maps.
 enum Output {
     Files(Encoder),
+    /// By layer.
+    Sheets(BTreeMap<String, Sheet>),
     Viewer(Box<ViewerFile>),
 }
 
@@ -97,6 +106,7 @@ impl Output {
         let viewer = |dialect| ViewerFile::create(&options.out, dialect, !options.no_points).map(Box::new);
         Ok(match options.format {
             Format::Png => Self::Files(png),
+            Format::Sheet => Self::Sheets(BTreeMap::new()),
             Format::Npy => Self::Files(npy),
             Format::Json => Self::Files(json),
             Format::Foxglove => Self::Viewer(viewer(Dialect::Foxglove)?),
@@ -107,8 +117,10 @@ impl Output {
 
 /// Refuses options that the format does not use.
 fn check(options: &Options) -> Result<()> {
-    if let Some(option) = options.drawing.first_given().filter(|_| options.format != Format::Png) {
-        return Err(usage_error(format!("{option} is for pictures: it needs --format png")));
+    if let Some(option) =
+        options.drawing.first_given().filter(|_| !matches!(options.format, Format::Png | Format::Sheet))
+    {
+        return Err(usage_error(format!("{option} is for pictures: it needs --format png or sheet")));
     }
     if options.no_points && !matches!(options.format, Format::Foxglove | Format::Ros2) {
         return Err(usage_error("--no-points needs --format foxglove or ros2; other formats have no points"));
@@ -173,8 +185,13 @@ pub fn run(options: &Options) -> Result<Exit> {
         let of_layer = map.layer(layer)?;
         match &mut output {
             Output::Viewer(viewer) => viewer.write_map(&map, of_layer, message.log_ns)?,
-            Output::Files(_) if vehicles.len() > 1 => {
+            Output::Files(_) | Output::Sheets(_) if vehicles.len() > 1 => {
                 bail!("{} has maps of {}: name one with --vehicle", file.display(), vehicles.join(" and "))
+            }
+            Output::Sheets(sheets) => {
+                let style = Style { caption: picture::caption(map.header(), layer), ..style.clone() };
+                let sheet = sheets.entry(layer.to_owned()).or_default();
+                sheet.push(|| picture::of_layer(of_layer, &style))?;
             }
             Output::Files(encode) => {
                 if maps.is_empty() {
@@ -187,8 +204,15 @@ pub fn run(options: &Options) -> Result<Exit> {
         progress.set_message(counted(maps.values().sum(), "map"));
     }
     progress.finish_and_clear();
-    if let Output::Viewer(viewer) = output {
-        viewer.finish().with_context(|| format!("write {}", out.display()))?;
+    match output {
+        Output::Files(_) => {}
+        Output::Viewer(viewer) => viewer.finish().with_context(|| format!("write {}", out.display()))?,
+        Output::Sheets(sheets) => {
+            files::create_folder(out)?;
+            for (layer, sheet) in sheets {
+                write(&format!("sheet_{layer}"), vec![(ending(&style), sheet.finish().to_png()?)], out)?;
+            }
+        }
     }
     let incomplete = recording.incomplete();
     if let Some(incomplete) = &incomplete {
@@ -233,9 +257,14 @@ fn write(stem: &str, encoded: Vec<(String, Vec<u8>)>, out: &Path) -> Result<()> 
     })
 }
 
-fn png(_: &MapView, layer: &Layer, style: &Style) -> Result<Vec<(String, Vec<u8>)>> {
-    let ending = style.channel.as_ref().map_or(".png".to_owned(), |channel| format!("_{channel}.png"));
-    Ok(vec![(ending, picture::png(layer, style)?)])
+fn png(map: &MapView, layer: &Layer, style: &Style) -> Result<Vec<(String, Vec<u8>)>> {
+    let style = Style { caption: picture::caption(map.header(), &layer.name), ..style.clone() };
+    Ok(vec![(ending(&style), picture::png(layer, &style)?)])
+}
+
+/// The end of the name of a picture: it names the channel if the style does.
+fn ending(style: &Style) -> String {
+    style.channel.as_ref().map_or(".png".to_owned(), |channel| format!("_{channel}.png"))
 }
 
 fn json(map: &MapView, layer: &Layer, _: &Style) -> Result<Vec<(String, Vec<u8>)>> {

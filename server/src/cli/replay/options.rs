@@ -12,6 +12,9 @@ use crate::cli::model::ModelParser;
 use crate::config::ConfigError;
 use crate::ingest::files::FilesError;
 use crate::record::reader::RecordingError;
+use crate::replay::control::{ControlError, RATES};
+use crate::replay::faults::{Fault, FaultError};
+use crate::replay::outcome::PlayError;
 use crate::server::{ShutdownError, StartError};
 
 /// Make maps from recorded drives: pcap, pcapng, MCAP, KITTI, nuScenes and PCD files or folders.
@@ -23,7 +26,10 @@ use crate::server::{ShutdownError, StartError};
 #[command(after_help = "Examples:
   clearway replay drive.pcap --record drive.mcap
   clearway replay drive.pcap --extrinsics 0,0,1.9,0,0,0 --json
-  clearway replay drive.mcap --serve --speed as-recorded")]
+  clearway replay drive.mcap --serve --as-live
+  clearway replay drive.mcap --serve --as-live --any-port --ready-file ready.json --wait-readers 1 --exit-at-end
+
+Exit codes: 0 the end was reached, 2 failure, a file that is not whole, or a signal before the end, 3 wrong use.")]
 pub struct Options {
     /// pcap, pcapng, MCAP, KITTI .bin, nuScenes .pcd.bin and .pcd files, or folders of them, in the order
     /// given.
@@ -66,13 +72,56 @@ pub struct Options {
     /// Override a key of the configuration, such as vehicle.maps.valid_ms=500; may be given several times.
     #[arg(long, value_name = "KEY=VALUE", requires = "config")]
     pub set: Vec<String>,
-    /// Publish the maps, and the last one until SIGINT (Ctrl-C) or SIGTERM. The maps keep the stamps of the recording,
-    /// so readers see those of an old recording as stale.
+    /// Publish the maps, and the last one until SIGINT (Ctrl-C) or SIGTERM. Without --as-live the maps keep the stamps
+    /// of the recording, so readers see those of an old recording as stale.
     #[arg(long)]
     pub serve: bool,
     /// The vehicle to replay; needed if the recording or the configuration has several.
     #[arg(long, value_name = "NAME")]
     pub vehicle: Option<String>,
+    /// Begin this many seconds after the first event; the maps from there are those of the whole drive.
+    #[arg(long, value_name = "SECONDS")]
+    pub from: Option<f64>,
+    /// End this many seconds after the first event.
+    #[arg(long, value_name = "SECONDS")]
+    pub to: Option<f64>,
+    /// Move the stamps of the maps to the present, so that readers judge their age as on the vehicle.
+    #[arg(long, requires = "serve")]
+    pub as_live: bool,
+    /// Begin again at the end of the drive or of --to, until a signal.
+    #[arg(long, requires = "serve", conflicts_with_all = ["record", "exit_at_end"])]
+    pub r#loop: bool,
+    /// Begin paused; `clearway transport`, the page or a key starts it.
+    #[arg(long, requires = "serve")]
+    pub paused: bool,
+    /// Make the next map when every reader that acknowledges has acknowledged the last one; the default speed is max.
+    #[arg(long, requires = "serve")]
+    pub lockstep: bool,
+    /// Longest wait for an acknowledgement with --lockstep [default: 10].
+    #[arg(long, value_name = "SECONDS", requires = "lockstep", value_parser = seconds)]
+    pub lockstep_timeout: Option<f64>,
+    /// Wait for this many readers before the first event: gRPC streams, pages, zenoh keys and Foxglove subscriptions.
+    #[arg(long, value_name = "N", requires = "serve")]
+    pub wait_readers: Option<u32>,
+    /// Write the process id and the addresses to this file as JSON once readers can connect; it is removed at the end.
+    #[arg(long, value_name = "FILE.json", requires = "serve")]
+    pub ready_file: Option<PathBuf>,
+    /// Listen on free ports of this machine only; --ready-file and the log say which.
+    #[arg(long, requires = "serve")]
+    pub any_port: bool,
+    /// Replay with a fault: lost:SENSOR@FROM-TO, loss:PERCENT[@FROM-TO], clock:MS@AT, pose:X,Y,YAW@AT or stop@FROM-TO,
+    /// in seconds after the first event, metres and degrees; may be given several times.
+    #[arg(long = "fault", value_name = "FAULT", value_parser = |text: &str| text.parse::<Fault>())]
+    pub faults: Vec<Fault>,
+    /// Replay with the faults of this file, one a line; # begins a comment.
+    #[arg(long, value_name = "FILE")]
+    pub fault_script: Option<PathBuf>,
+    /// Seed of the faults; without --fault and --fault-script it draws one of each kind.
+    #[arg(long, value_name = "SEED")]
+    pub fault_seed: Option<u64>,
+    /// End when the end of the drive or of --to is reached, instead of serving the last map.
+    #[arg(long, requires = "serve")]
+    pub exit_at_end: bool,
 }
 
 /// Speed of a replay, relative to the recorded time.
@@ -84,6 +133,24 @@ pub enum Speed {
     Max,
 }
 
+impl Speed {
+    /// The rate relative to recorded time; infinity for [`Speed::Max`].
+    pub fn rate(self) -> f64 {
+        match self {
+            Self::Times(times) => times,
+            Self::Max => f64::INFINITY,
+        }
+    }
+}
+
+/// A number of seconds above 0.
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(seconds) if seconds > 0.0 && f64::is_finite(seconds) => Ok(seconds),
+        _ => Err("a number of seconds above 0 is allowed".into()),
+    }
+}
+
 impl std::str::FromStr for Speed {
     type Err = String;
 
@@ -92,8 +159,8 @@ impl std::str::FromStr for Speed {
             "as-recorded" => Ok(Self::Times(1.0)),
             "max" => Ok(Self::Max),
             factor => match factor.parse() {
-                Ok(times) if times > 0.0 && f64::is_finite(times) => Ok(Self::Times(times)),
-                _ => Err("as-recorded, max, or a factor above 0 is allowed".into()),
+                Ok(times) if RATES.contains(&times) => Ok(Self::Times(times)),
+                _ => Err("as-recorded, max, or a factor from 0.1 to 1000 is allowed".into()),
             },
         }
     }
@@ -156,9 +223,61 @@ pub enum ReplayError {
     /// The server did not end in order.
     #[error(transparent)]
     End(#[from] ShutdownError),
-    /// The engine stopped before the end of the files.
-    #[error("the vehicle's engine has stopped")]
+    /// The thread of the replay panicked.
+    #[error("the thread of the replay has panicked")]
     Engine,
+    /// The range is not in the files.
+    #[error("--{0}")]
+    Control(#[from] ControlError),
+    /// The files have no events.
+    #[error("the files have no events to serve")]
+    Empty,
+    /// A fault is not known.
+    #[error(transparent)]
+    Fault(#[from] FaultError),
+    /// The script of the faults cannot be read.
+    #[error("--fault-script {}: {source}", file.display())]
+    FaultScript {
+        /// The file.
+        file: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// Two recordings of one vehicle have different configurations of it.
+    #[error("{}: its configuration of vehicle {vehicle} differs from that of the files before", file.display())]
+    Differs {
+        /// The recording.
+        file: PathBuf,
+        /// The vehicle's name.
+        vehicle: String,
+    },
+    /// The configuration does not fit the recording: its sensors are others, or in another order.
+    #[error(
+        "{}: vehicle {vehicle} has the sensors [{configured}], but the recording has [{recorded}]; the same names in \
+         the same order are allowed",
+        file.display()
+    )]
+    Sensors {
+        /// The configuration.
+        file: PathBuf,
+        /// The vehicle's name.
+        vehicle: String,
+        /// Its sensors in the configuration, separated by commas.
+        configured: String,
+        /// Its sensors in the recording, separated by commas.
+        recorded: String,
+    },
+    /// The replay could not go on.
+    #[error(transparent)]
+    Play(#[from] PlayError),
+    /// The file that tells programs the addresses cannot be written.
+    #[error("--ready-file {}: {source}", file.display())]
+    ReadyFile {
+        /// The file.
+        file: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
 }
 
 #[cfg(test)]
@@ -166,11 +285,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_speed_is_a_word_or_a_factor_above_zero() {
+    fn a_speed_is_a_word_or_a_factor() {
         assert_eq!("as-recorded".parse(), Ok(Speed::Times(1.0)));
         assert_eq!("max".parse(), Ok(Speed::Max));
         assert_eq!("2.5".parse(), Ok(Speed::Times(2.5)));
-        for wrong in ["0", "-1", "inf", "NaN", "fast"] {
+        for wrong in ["0", "-1", "0.05", "inf", "NaN", "fast"] {
             assert!(wrong.parse::<Speed>().unwrap_err().contains("as-recorded, max"), "{wrong}");
         }
     }

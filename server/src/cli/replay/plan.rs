@@ -1,8 +1,10 @@
 //! The options and files of a replay -> everything that is known before its first event: the configuration, how the
 //! sensors are mounted, the readings.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use clearway_lidar::Sensor;
 use clearway_lidar::calibration::Calibration;
@@ -15,6 +17,7 @@ use nalgebra::{Isometry3, Point3, Vector3};
 
 use super::clouds::{Clouds, Written};
 use super::options::{Options, ReplayError};
+use super::recordings::{Recorded, check_sensors, several_vehicles};
 use super::summary::{Mount, describe};
 use crate::config::{Calibrations, Config, Origin, Recorder};
 use crate::ingest::files::mcap::{McapError, McapOptions};
@@ -23,6 +26,8 @@ use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
 use crate::ingest::ros::decoder::PoseSource;
 use crate::record::reader::RecordingReader;
 use crate::record::writer::is_same_file;
+use crate::replay::faults::Faults;
+use crate::replay::timeline::{Timeline, Track};
 use crate::server::Setup;
 
 /// Number of revolutions from which the mount is estimated: the first of them follow each other, and between the others
@@ -39,7 +44,11 @@ pub(super) struct Plan {
     pub(super) setup: Setup,
     pub(super) mount: Mount,
     pub(super) extrinsics: Extrinsics,
-    pub(super) readings: Readings,
+    pub(super) timeline: Timeline,
+    /// Bytes of all files.
+    pub(super) bytes: u64,
+    /// Boot id of the recording whose maps are made again.
+    pub(super) boot_id: Option<u64>,
     /// The number of point clouds written, or the error that ended the writing.
     pub(super) clouds: Option<Written>,
 }
@@ -56,6 +65,12 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
         None => false,
     };
     check(options, recorded.as_deref(), journal)?;
+    if options.vehicle.is_none()
+        && options.config.is_none()
+        && let Some(recordings) = several_vehicles(&files)?
+    {
+        return plan_several(options, recordings, files.bytes());
+    }
     let mut known = configured(options, recorded.as_deref())?;
     let vehicle = &mut known.config.vehicles[0];
     (vehicle.udp, vehicle.ros) = (None, None);
@@ -70,7 +85,7 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     };
     known.apply_options(options)?;
     let open = || Readings::open(&options.files, wanted.clone());
-    let readings = open()?;
+    let bytes = files.bytes();
     let mount = match options.extrinsics {
         Some(extrinsics) => {
             known.config.vehicles[0].sensors[0].extrinsics = extrinsics;
@@ -84,7 +99,52 @@ pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
     let setup = known.setup(options)?;
     let clouds = options.clouds.as_deref().map(Clouds::create).transpose()?;
     let (observer, clouds) = clouds.map(Clouds::observer).unzip();
-    Ok(Plan { setup: Setup { observer, ..setup }, mount, extrinsics, readings, clouds })
+    let boot_id = setup.boot_id;
+    let tracks = vec![Track { files: options.files.clone(), options: wanted }];
+    let timeline = Timeline { tracks, bytes_read: Arc::default(), faults: Faults::default() };
+    Ok(Plan { setup: Setup { observer, ..setup }, mount, extrinsics, timeline, bytes, boot_id, clouds })
+}
+
+/// The plan of several vehicles in one recorded time. The files of one vehicle follow each other.
+fn plan_several(options: &Options, recordings: Vec<Recorded>, bytes: u64) -> Result<Plan, ReplayError> {
+    let given = [
+        ("--extrinsics", options.extrinsics.is_some()),
+        ("--model", options.model.is_some()),
+        ("--rpm", options.rpm.is_some()),
+        ("--calibration", options.calibration.is_some()),
+        ("--clouds", options.clouds.is_some()),
+    ];
+    if let Some((option, _)) = given.iter().find(|(_, is_given)| *is_given) {
+        let reason = "the recordings have several vehicles; name one with --vehicle".to_owned();
+        return Err(ReplayError::Unused { option: (*option).to_owned(), reason });
+    }
+    let boot_ids: BTreeSet<u64> = recordings.iter().map(|recording| recording.boot_id).collect();
+    let boot_id = boot_ids.first().copied().filter(|_| boot_ids.len() == 1);
+    let config = Config { vehicles: Vec::new(), ..Config::default() };
+    let mut known = Known { config, tables: Vec::new(), boot_id, is_mounted: true, remarks: Vec::new() };
+    let mut tracks: Vec<Track> = Vec::new();
+    for Recorded { file, config, tables, .. } in recordings {
+        for (mut vehicle, tables) in config.vehicles.into_iter().zip(tables) {
+            (vehicle.udp, vehicle.ros) = (None, None);
+            match known.config.vehicles.iter().position(|before| before.name == vehicle.name) {
+                Some(index) if known.config.vehicles[index] != vehicle => {
+                    return Err(ReplayError::Differs { file, vehicle: vehicle.name });
+                }
+                Some(index) => tracks[index].files.push(file.clone()),
+                None => {
+                    let options = McapOptions { vehicle: Some(vehicle.name.clone()), ..McapOptions::default() };
+                    tracks.push(Track { files: vec![file.clone()], options });
+                    known.config.vehicles.push(vehicle);
+                    known.tables.push(tables);
+                }
+            }
+        }
+    }
+    let extrinsics = known.config.vehicles[0].sensors[0].extrinsics;
+    let setup = known.setup(options)?;
+    let boot_id = setup.boot_id;
+    let timeline = Timeline { tracks, bytes_read: Arc::default(), faults: Faults::default() };
+    Ok(Plan { setup, mount: Mount::Given, extrinsics, timeline, bytes, boot_id, clouds: None })
 }
 
 /// Refuses options that have no meaning for the files. `mcap` is the first MCAP file, and `journal` is true if it is a
@@ -107,6 +167,10 @@ fn check(options: &Options, mcap: Option<&Path>, journal: bool) -> Result<(), Re
         return unused(format!("--vehicle {name}"), reason.into());
     }
     let Some(record) = &options.record else { return Ok(()) };
+    if let Some(from) = options.from {
+        let reason = "a recording begins with the first event; --to may end it earlier";
+        return unused(format!("--from {from}"), reason.into());
+    }
     // A folder stands for the files in it.
     let is_in = |folder: &Path| {
         let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
@@ -228,6 +292,11 @@ impl Known {
             (config.grpc.enabled, config.page.enabled, config.foxglove.enabled) = (false, false, false);
             (config.zenoh.enabled, config.zenoh.ros2.enabled) = (false, false);
         }
+        if options.any_port {
+            let any = SocketAddr::from(([127, 0, 0, 1], 0));
+            (config.grpc.listen, config.page.listen, config.foxglove.listen) = (any, any, any);
+            config.zenoh.listen = vec!["tcp/127.0.0.1:0".into()];
+        }
         config.check(&origin(options, file))?;
         let certificates = if options.serve { config.certificates(file)? } else { None };
         // The same files and settings get the same boot id. Served maps need a new one, because a reader that has seen
@@ -249,6 +318,8 @@ impl Known {
             config_comments: remarks,
             metadata: notes,
             observer: None,
+            is_stepped: true,
+            replay: None,
         })
     }
 }
@@ -288,6 +359,7 @@ fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, Repla
         let mut config = Config::load(file, &options.set)?;
         let mut tables = config.calibrations(file)?;
         pick(file, &mut config, &mut tables)?;
+        recorded.map_or(Ok(()), |recording| check_sensors(file, &config, recording))?;
         return Ok(known(config, tables, None, true));
     }
     if let Some(file) = recorded {

@@ -50,6 +50,8 @@ pub struct Summary {
     pub seconds: f64,
     /// The recording that was written.
     pub record: Option<PathBuf>,
+    /// False if the replay was stopped before its end.
+    pub reached_end: bool,
 }
 
 impl Summary {
@@ -80,6 +82,7 @@ impl Summary {
             "notes": self.notes,
             "clouds": self.clouds,
             "record": self.record,
+            "reached_end": self.reached_end,
             "seconds": self.seconds,
         })
     }
@@ -150,6 +153,9 @@ impl Summary {
         }
         if let Some(record) = &self.record {
             lines.push(format!("recorded {}", record.display()));
+        }
+        if !self.reached_end {
+            lines.push("stopped before the end".to_owned());
         }
         if self.clouds > 0 {
             lines.push(format!("{} written", counted(self.clouds, "point cloud")));

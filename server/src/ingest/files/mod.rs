@@ -62,6 +62,18 @@ pub enum FilesError {
         /// The file or folder.
         file: PathBuf,
     },
+    /// A file of a vehicle begins before the file before it has ended.
+    #[error(
+        "{}: it begins {overlap_s:.3} s before the end of the file before it; give the files of one vehicle in the \
+         order of their times, without overlap",
+        file.display()
+    )]
+    Overlap {
+        /// The later file.
+        file: PathBuf,
+        /// By how much, in seconds.
+        overlap_s: f64,
+    },
     /// A capture cannot be read.
     #[error(transparent)]
     Capture(#[from] CaptureError),
@@ -100,6 +112,8 @@ pub struct Readings {
     truncated: Vec<Truncated>,
     notes: Vec<String>,
     has_ended: bool,
+    /// True until the first reading of the open file.
+    is_file_new: bool,
 }
 
 enum Open {
@@ -135,6 +149,7 @@ impl Readings {
             truncated: Vec::new(),
             notes: Vec::new(),
             has_ended: false,
+            is_file_new: false,
         })
     }
 
@@ -191,6 +206,7 @@ impl Readings {
             };
             if let Some(reading) = next {
                 let is_journal = matches!(&self.open, Some(Open::Mcap(_, source)) if source.is_journal());
+                self.check_overlap(&reading, is_journal)?;
                 self.note_unfinished(&reading, is_journal);
                 return Ok(Some(reading));
             }
@@ -200,6 +216,7 @@ impl Readings {
                 let (arrival_ns, source) = (*arrival_ns, sources.pop_first());
                 return Ok(source.map(|source| Reading { arrival_ns, source, body: Body::End }));
             };
+            self.is_file_new = true;
             match kind {
                 Kind::Capture => self.open = Some(Open::Capture(file.clone(), Box::new(capture::Source::open(&file)?))),
                 Kind::Mcap => {
@@ -216,6 +233,22 @@ impl Readings {
                 }
             }
         }
+    }
+
+    /// Refuses a file whose first reading is older than the last of the file before. Bags of ROS 2 may overlap a
+    /// little.
+    fn check_overlap(&mut self, reading: &Reading, is_journal: bool) -> Result<(), FilesError> {
+        let file = match &self.open {
+            Some(Open::Capture(file, _)) => file,
+            Some(Open::Mcap(file, _)) if is_journal => file,
+            _ => return Ok(()),
+        };
+        let newest_ns = self.pending_ends.0;
+        if std::mem::take(&mut self.is_file_new) && reading.arrival_ns < newest_ns {
+            let overlap_s = (newest_ns - reading.arrival_ns) as f64 * 1e-9;
+            return Err(FilesError::Overlap { file: file.clone(), overlap_s });
+        }
+        Ok(())
     }
 
     /// Remembers the sensor of a reading, whose last revolution may need an end. A journal contains the ends itself.

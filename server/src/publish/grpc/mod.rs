@@ -5,6 +5,7 @@
 
 pub mod reader;
 mod recording;
+mod replay;
 pub mod selection;
 
 use std::pin::Pin;
@@ -21,13 +22,16 @@ use super::listen::access::Caller;
 use super::served::Vehicles;
 use reader::watch;
 use recording::Recordings;
+use replay::Replay;
 
 use crate::clock::now_ns;
 use crate::record::writer::RecorderControl;
+use crate::replay::ReplayHandle;
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
 use v1::map_service_server::{MapService, MapServiceServer};
 use v1::recording_service_server::RecordingServiceServer;
+use v1::replay_service_server::ReplayServiceServer;
 
 /// Longest request, in bytes. Ours: requests hold names and numbers.
 const REQUEST_BYTES_MAX: usize = 64 << 10;
@@ -36,7 +40,8 @@ const SELECTION_TIMEOUT: Duration = Duration::from_secs(10);
 /// Interval at which the health of the recorder is reported.
 const RECORDER_PERIOD: Duration = Duration::from_secs(1);
 
-/// Serves maps, and `ingest` if it is configured, until `stop` resolves and all streams have ended.
+/// Serves maps, `ingest` if it is configured, and the control of `recorder` and `replay` if there is one, until `stop`
+/// resolves and all streams have ended.
 ///
 /// # Errors
 /// [`tonic_reflection::server::Error`] if the descriptors are invalid.
@@ -45,12 +50,17 @@ pub async fn serve<I: IngestService>(
     vehicles: Vehicles,
     ingest: Option<IngestServiceServer<I>>,
     recorder: Option<RecorderControl>,
+    replay: Option<ReplayHandle>,
     stop: impl Future<Output = ()>,
 ) -> Result<(), tonic_reflection::server::Error> {
     let (health, health_service) = tonic_health::server::health_reporter();
     health.set_serving::<MapServiceServer<Maps>>().await;
     if ingest.is_some() {
         health.set_serving::<IngestServiceServer<I>>().await;
+    }
+    let replay = replay.map(|replay| ReplayServiceServer::new(Replay(replay)));
+    if replay.is_some() {
+        health.set_serving::<ReplayServiceServer<Replay>>().await;
     }
     let reflection = || {
         tonic_reflection::server::Builder::configure()
@@ -63,6 +73,9 @@ pub async fn serve<I: IngestService>(
     routes.add_service(recordings.max_decoding_message_size(REQUEST_BYTES_MAX));
     if let Some(ingest) = ingest {
         routes.add_service(ingest);
+    }
+    if let Some(replay) = replay {
+        routes.add_service(replay);
     }
     // Older versions of grpcurl know only the older version of reflection.
     routes.add_service(health_service).add_service(reflection().build_v1()?).add_service(reflection().build_v1alpha()?);
@@ -102,6 +115,7 @@ impl MapService for Maps {
         &self,
         request: Request<Streaming<v1::WatchRequest>>,
     ) -> Result<Response<Self::WatchStream>, Status> {
+        let agent = request.metadata().get("user-agent").and_then(|agent| agent.to_str().ok()).map(str::to_owned);
         let caller = caller(&request);
         let mut requests = request.into_inner();
         let first = tokio::time::timeout(SELECTION_TIMEOUT, requests.message())
@@ -110,9 +124,11 @@ impl MapService for Maps {
         let selection = first.and_then(|first| first.selection);
         let mut selection =
             selection.ok_or_else(|| Status::invalid_argument("the first request carries a selection"))?;
+        let layers = if selection.layers.is_empty() { "all layers".to_owned() } else { selection.layers.join(", ") };
+        let name = format!("gRPC reader of {layers} ({})", agent.as_deref().unwrap_or("no user-agent"));
         let served = self.vehicles.find(&selection.vehicle)?;
         selection.layers = caller.layers(&served.status.name, selection.layers, &served.status.layers)?;
-        Ok(Response::new(Box::pin(watch(&self.vehicles, selection, requests)?)))
+        Ok(Response::new(Box::pin(watch(&self.vehicles, selection, requests, name)?)))
     }
 
     async fn get_map(&self, request: Request<v1::GetMapRequest>) -> Result<Response<v1::MapUpdate>, Status> {
@@ -129,7 +145,7 @@ impl MapService for Maps {
         let map = newest.ok_or_else(|| {
             Status::unavailable(format!("vehicle {name} makes no map at present: no data arrived since the request"))
         })?;
-        Ok(Response::new(v1::MapUpdate { map: map.select(&layers), skipped: 0, sent_ns: now_ns(), left_out: 0 }))
+        Ok(Response::new(v1::MapUpdate { map: map.select(&layers), sent_ns: now_ns(), ..Default::default() }))
     }
 
     async fn list_vehicles(

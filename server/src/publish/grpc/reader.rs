@@ -12,6 +12,7 @@ use tokio::sync::watch;
 use tonic::Status;
 
 use super::selection::{Selection, Sent};
+use crate::acknowledgements::{AcknowledgingReader, MapId};
 use crate::clock::now_ns;
 use crate::encode::EncodedMap;
 use crate::newest::Newest;
@@ -20,7 +21,7 @@ use crate::status::Reader;
 use crate::subscriptions::LayerSubscription;
 
 /// The updates of one reader: the selected parts of the newest maps, within its credits. Any executor can drive the
-/// stream.
+/// stream. `name` names the reader to people.
 ///
 /// # Errors
 /// A status that names the vehicle, layer or value of the selection that is not allowed, and what is.
@@ -28,17 +29,22 @@ pub fn watch<R>(
     vehicles: &Vehicles,
     selection: v1::Selection,
     requests: R,
+    name: String,
 ) -> Result<impl Stream<Item = Result<v1::MapUpdate, Status>> + Send + use<R>, Status>
 where
     R: Stream<Item = Result<v1::WatchRequest, Status>> + Send + Unpin,
 {
     let served = vehicles.find(&selection.vehicle)?;
-    Ok(Watch::new(served, Selection::new(served, selection)?, requests).updates())
+    Ok(Watch::new(served, Selection::new(served, selection)?, requests, name).updates())
 }
 
 struct Watch<R> {
     requests: Option<R>,
     newest: watch::Receiver<Newest>,
+    /// True while a replay stands at its end.
+    replay_ended: watch::Receiver<bool>,
+    /// The reader was not told yet that the replay has ended.
+    is_end_due: bool,
     selection: Selection,
     /// The last map sent to this reader.
     last: Option<Sent>,
@@ -46,6 +52,8 @@ struct Watch<R> {
     base: Option<Arc<EncodedMap>>,
     /// The reader asked for a whole map.
     want_full: bool,
+    /// Learns which maps the reader has finished with; `None` if it never acknowledges.
+    finished: Option<AcknowledgingReader>,
     /// Until it goes, its layers are made.
     subscription: LayerSubscription,
     // Last, and only held: the reader is counted while this lives.
@@ -53,19 +61,24 @@ struct Watch<R> {
 }
 
 impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
-    fn new(served: &Served, selection: Selection, requests: R) -> Self {
+    fn new(served: &Served, selection: Selection, requests: R, name: String) -> Self {
         let mut newest = served.newest.clone();
         // The current map, if there is one, is the first update.
         newest.mark_changed();
+        let mut replay_ended = served.status.replay_ended.subscribe();
+        let is_end_due = *replay_ended.borrow_and_update();
         Self {
             requests: Some(requests),
             newest,
+            replay_ended,
+            is_end_due,
             subscription: served.status.subscriptions.subscribe(&selection.layers),
-            selection,
             last: None,
             base: None,
             want_full: false,
+            finished: selection.credits.are_limited().then(|| served.status.acknowledgements.add(name)),
             _reader: Reader::new(&served.status.grpc_readers),
+            selection,
         }
     }
 
@@ -77,6 +90,11 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
     /// disconnected.
     async fn next(&mut self) -> Result<Option<v1::MapUpdate>, Status> {
         loop {
+            // Only now: the last map comes before the end.
+            if self.is_end_due && !self.newest.has_changed().unwrap_or(false) {
+                self.is_end_due = false;
+                return Ok(Some(v1::MapUpdate { replay_ended: true, sent_ns: now_ns(), ..Default::default() }));
+            }
             tokio::select! {
                 // Acknowledgements first: they free the credit that the map needs.
                 biased;
@@ -88,10 +106,14 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
                 changed = self.newest.changed(), if self.selection.credits.left() => {
                     changed.map_err(|_| Status::unavailable("the vehicle's engine has stopped"))?;
                     let newest = self.newest.borrow_and_update().clone();
-                    if let Some(map) = newest.filter(|map| self.is_due(map)) {
-                        return self.send(map).map(Some);
+                    match newest {
+                        Some(map) if self.is_due(&map) => return self.send(map).map(Some),
+                        // Left out, because of the rate.
+                        Some(map) => self.finish((map.boot_id, map.sequence)),
+                        None => {}
                     }
                 },
+                Ok(()) = self.replay_ended.changed() => self.is_end_due = *self.replay_ended.borrow_and_update(),
             }
         }
     }
@@ -99,6 +121,9 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
     fn apply(&mut self, request: v1::WatchRequest) -> Result<(), Status> {
         if let Some(sequence) = request.acknowledged {
             self.selection.credits.acknowledge(sequence)?;
+            if let Some(last) = self.last {
+                self.finish((last.boot_id, last.sequence));
+            }
         }
         if request.request_keyframe {
             self.want_full = true;
@@ -107,20 +132,30 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         Ok(())
     }
 
+    /// Reports that the reader has finished with `map`, if it has acknowledged all that was sent.
+    fn finish(&self, map: MapId) {
+        if let Some(finished) = self.finished.as_ref().filter(|_| self.selection.credits.are_all_back()) {
+            finished.finished(map);
+        }
+    }
+
     /// True if a map is to be sent. A map without one of the layers was made before this reader subscribed.
     fn is_due(&self, map: &EncodedMap) -> bool {
-        (self.want_full || self.selection.rate.is_due(map.capture_end_ns)) && self.subscription.is_covered_by(map)
+        let jumped = self.last.is_some_and(|last| last.boot_id != map.boot_id);
+        let is_due = self.want_full || jumped || self.selection.rate.is_due(map.capture_end_ns);
+        is_due && self.subscription.is_covered_by(map)
     }
 
     fn send(&mut self, map: Arc<EncodedMap>) -> Result<v1::MapUpdate, Status> {
         let Self { selection, last, base, want_full, .. } = self;
-        let bytes = selection.bytes(&map, base.as_deref().filter(|_| !*want_full))?;
-        let sent = Sent { sequence: map.sequence, stamp_ns: map.capture_end_ns };
+        let is_base = |base: &&EncodedMap| !*want_full && base.boot_id == map.boot_id;
+        let bytes = selection.bytes(&map, base.as_deref().filter(is_base))?;
+        let sent = Sent { boot_id: map.boot_id, sequence: map.sequence, stamp_ns: map.capture_end_ns };
         let (skipped, left_out) = last.replace(sent).map_or((0, 0), |last| selection.rate.between(last, sent));
         selection.rate.send(sent.stamp_ns);
         selection.credits.send(sent.sequence);
         (*base, *want_full) = (selection.deltas.then_some(map), false);
-        Ok(v1::MapUpdate { map: bytes, skipped, sent_ns: now_ns(), left_out })
+        Ok(v1::MapUpdate { map: bytes, skipped, sent_ns: now_ns(), left_out, replay_ended: false })
     }
 }
 

@@ -106,6 +106,10 @@ impl Rate {
         let quarter_ns = self.period_ns / 4;
         self.due_ns = match self.due_ns {
             None => Some(stamp_ns.saturating_add(3 * quarter_ns)),
+            // A replay has jumped back.
+            Some(due_ns) if due_ns.saturating_sub(stamp_ns) > self.period_ns.saturating_mul(2) => {
+                Some(stamp_ns.saturating_add(3 * quarter_ns))
+            }
             // A requested keyframe was sent between two maps that are due.
             Some(due_ns) if stamp_ns < due_ns => Some(due_ns),
             Some(due_ns) => Some(due_ns.saturating_add(self.period_ns).max(stamp_ns.saturating_add(quarter_ns))),
@@ -123,6 +127,10 @@ impl Rate {
 
     /// Maps between two sent ones: (missed, left out because of the rate).
     pub fn between(&self, last: Sent, next: Sent) -> (u64, u64) {
+        if last.boot_id != next.boot_id {
+            // A jump of a replay, which leaves nothing out.
+            return (0, 0);
+        }
         let all = next.sequence.saturating_sub(last.sequence.saturating_add(1));
         let missed = self.room(all, [last.stamp_ns, next.stamp_ns]);
         (missed, all - missed)
@@ -132,6 +140,8 @@ impl Rate {
 /// Sequence and capture stamp of a sent map.
 #[derive(Clone, Copy, Debug)]
 pub struct Sent {
+    /// Boot id of the map.
+    pub boot_id: u64,
     /// Sequence of the map.
     pub sequence: u64,
     /// End of its capture, in ns since the Unix epoch.
@@ -151,6 +161,16 @@ pub struct Credits {
 impl Credits {
     fn new(max_in_flight: usize) -> Self {
         Self { max_in_flight, in_flight: VecDeque::new(), sent: None, acknowledged: None }
+    }
+
+    /// True if the reader acknowledges.
+    pub fn are_limited(&self) -> bool {
+        self.max_in_flight > 0
+    }
+
+    /// True if no map is on the way.
+    pub fn are_all_back(&self) -> bool {
+        self.in_flight.is_empty()
     }
 
     /// True if one more map may be sent; always true for readers that never acknowledge.
@@ -181,8 +201,9 @@ impl Credits {
             let text = format!("acknowledged {sequence}: this map was never sent on this stream; {last}");
             return Err(Status::invalid_argument(text));
         }
-        while self.in_flight.front().is_some_and(|&sent| sent <= sequence) {
-            self.in_flight.pop_front();
+        // By its place and not by its number: after a jump of a replay the numbers begin again.
+        if let Some(place) = self.in_flight.iter().position(|&sent| sent == sequence) {
+            self.in_flight.drain(..=place);
         }
         self.acknowledged = self.acknowledged.max(Some(sequence));
         Ok(())

@@ -18,7 +18,7 @@ pub enum Role {
     Reader,
     /// May send scans, poses, roads and packets.
     Ingester,
-    /// May do both, and control the recorder.
+    /// May do both, and control the recorder and a replay.
     Operator,
 }
 
@@ -45,6 +45,8 @@ pub const RPCS: &[(&str, &[Role])] = &[
     ("/clearway.v1.RecordingService/Save", &[Role::Operator]),
     ("/clearway.v1.RecordingService/List", &[Role::Operator]),
     ("/clearway.v1.RecordingService/Status", &[Role::Operator]),
+    ("/clearway.v1.ReplayService/Control", &[Role::Operator]),
+    ("/clearway.v1.ReplayService/WatchState", &[Role::Reader]),
     ("/grpc.health.v1.Health/Check", &[Role::Reader, Role::Ingester]),
     ("/grpc.health.v1.Health/Watch", &[Role::Reader, Role::Ingester]),
     ("/grpc.reflection.v1.ServerReflection/ServerReflectionInfo", &[Role::Reader, Role::Ingester]),
@@ -75,12 +77,18 @@ pub struct Access {
 #[derive(Clone, Debug, Default)]
 pub struct Caller {
     limits: Arc<[Only]>,
+    is_operator: bool,
 }
 
 impl Caller {
-    /// A client that may reach everything.
+    /// A client that may do and reach everything.
     pub fn unlimited() -> Self {
-        Self { limits: [Only::default()].into() }
+        Self { limits: [Only::default()].into(), is_operator: true }
+    }
+
+    /// True if the client may do what only operators may.
+    pub fn is_operator(&self) -> bool {
+        self.is_operator
     }
 
     fn limits_for(&self, vehicle: &str) -> impl Iterator<Item = &Only> {
@@ -176,11 +184,12 @@ impl Access {
         let is_allowed = |role: Role| !allowed.is_empty() && (role == Role::Operator || allowed.contains(&role));
         let admitted: Vec<_> = names.iter().filter(|name| roles_of(name).any(is_allowed)).collect();
         if !admitted.is_empty() {
+            let is_operator = admitted.iter().any(|name| roles_of(name).any(|role| role == Role::Operator));
             let limits = admitted.into_iter().map(|name| self.only.get(name).cloned().unwrap_or_default());
-            return Ok(Caller { limits: limits.collect() });
+            return Ok(Caller { limits: limits.collect(), is_operator });
         }
         let list = |roles: &mut dyn Iterator<Item = Role>| roles.map(Role::as_str).collect::<Vec<_>>().join(", ");
-        let operator = (!allowed.is_empty()).then_some(Role::Operator);
+        let operator = (!allowed.is_empty() && !allowed.contains(&Role::Operator)).then_some(Role::Operator);
         let allowed = list(&mut allowed.iter().copied().chain(operator));
         let roles = list(&mut names.iter().flat_map(roles_of).collect::<BTreeSet<_>>().into_iter());
         let names = names.join(", ");

@@ -391,6 +391,7 @@ impl Decoder {
 }
 
 /// The cut between two revolutions inside a packet.
+#[derive(Clone)]
 struct Cut {
     /// First firing of the next revolution, as an index in the packet.
     firing: usize,

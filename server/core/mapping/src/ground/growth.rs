@@ -55,6 +55,7 @@ enum Outcome {
 }
 
 /// The ground of each cell.
+#[derive(Clone)]
 pub struct Growth {
     fronts: Vec<Front>,
     outcomes: Vec<Outcome>,

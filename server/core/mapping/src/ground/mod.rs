@@ -32,6 +32,7 @@ use polar::{COLUMNS, PolarCells, RANGE_M_MIN, ROWS};
 use surface::{Confidence, Surface};
 
 /// The local ground around the vehicle, ego frame.
+#[derive(Clone)]
 pub struct Ground {
     cells: PolarCells,
     plane: NearPlane,

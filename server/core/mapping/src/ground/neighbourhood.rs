@@ -11,6 +11,7 @@ const MARGIN: usize = 2;
 const WIDTH: usize = COLUMNS + 2 * MARGIN;
 
 /// Values with their weights, and the sums of one row.
+#[derive(Clone)]
 pub struct Neighbourhood {
     weights: Vec<f32>,
     weighted: Vec<f32>,

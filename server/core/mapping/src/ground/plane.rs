@@ -77,7 +77,7 @@ impl NearPlane {
 }
 
 /// Sums of the normal equations.
-#[derive(Default)]
+#[derive(Clone, Default)]
 struct Sums {
     cells: usize,
     directions: u32,

@@ -45,6 +45,7 @@ pub struct Return {
 }
 
 /// The returns of each cell; index `row * COLUMNS + column`.
+#[derive(Clone)]
 pub struct PolarCells {
     azimuths: AzimuthColumns,
     outline: Outline,

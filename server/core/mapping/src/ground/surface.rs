@@ -42,6 +42,7 @@ const BLIND_ZONE_M: f32 = 10.0;
 const NONE: usize = usize::MAX;
 
 /// Heights and confidences of all cells.
+#[derive(Clone)]
 pub struct Surface {
     heights_m: Vec<f32>,
     confidences: Vec<Confidence>,

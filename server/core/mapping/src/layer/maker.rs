@@ -149,8 +149,26 @@ pub struct ScanExtras {
     pub no_returns: bool,
 }
 
+/// A copy of a maker of which only the trait is known.
+pub trait CloneMaker {
+    /// A copy with the same evidence.
+    fn cloned(&self) -> Box<dyn LayerMaker>;
+}
+
+impl<T: LayerMaker + Clone + 'static> CloneMaker for T {
+    fn cloned(&self) -> Box<dyn LayerMaker> {
+        Box::new(self.clone())
+    }
+}
+
+impl Clone for Box<dyn LayerMaker> {
+    fn clone(&self) -> Self {
+        (**self).cloned()
+    }
+}
+
 /// Makes one layer for map after map, reusing its buffers.
-pub trait LayerMaker: Send {
+pub trait LayerMaker: CloneMaker + Send {
     /// The layer without cells.
     fn layer(&self) -> Layer;
 

@@ -108,9 +108,11 @@ layers! {
 }
 
 /// The enabled layers, active or not.
+#[derive(Clone)]
 pub(crate) struct Layers(Vec<EnabledLayer>);
 
 /// One layer that the configuration enables.
+#[derive(Clone)]
 struct EnabledLayer {
     name: &'static str,
     create: Create,
@@ -123,6 +125,7 @@ struct EnabledLayer {
 }
 
 /// The maker of an active layer.
+#[derive(Clone)]
 struct Active {
     maker: Box<dyn LayerMaker>,
     /// The layer's memory while it is in no map.

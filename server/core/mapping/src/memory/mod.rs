@@ -47,6 +47,7 @@ struct Cell {
 }
 
 /// The memory of one vehicle.
+#[derive(Clone)]
 pub(crate) struct Memory {
     config: MemoryConfig,
     cells: Vec<Cell>,

@@ -47,6 +47,7 @@ enum View {
 }
 
 /// Closed cells and reached ground around the vehicle, ego frame.
+#[derive(Clone)]
 pub struct Reach {
     config: ReachConfig,
     /// By cell: the polar cell of its centre.

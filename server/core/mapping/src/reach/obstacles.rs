@@ -12,6 +12,7 @@ use super::config::ReachConfig;
 const EMPTY: [f32; 2] = [f32::INFINITY, f32::NEG_INFINITY];
 
 /// The cells with an obstacle.
+#[derive(Clone)]
 pub struct Obstacles {
     /// By cell: lowest and highest height of its returns over the ground, metres.
     spans_m: Vec<[f32; 2]>,

@@ -16,6 +16,7 @@ const NEAR: [[isize; 2]; 10] = [[1, 0], [0, 1], [1, 1], [-1, 1], [2, 0], [0, 2],
 const EMPTY: [i16; 2] = [i16::MAX, i16::MIN];
 
 /// Heights of the lowest and highest return from the ground of each cell.
+#[derive(Clone)]
 pub struct Steps {
     /// Millimetres, ego frame.
     spans: Vec<[i16; 2]>,

@@ -42,6 +42,7 @@ const ESTIMATES_MAX: u64 = 20;
 const RANGE_NOISE_M: f32 = 0.02;
 
 /// One sensor of the vehicle.
+#[derive(Clone)]
 pub(crate) struct SensorPipeline {
     name: String,
     decoder: Sensor,
@@ -78,7 +79,7 @@ pub(crate) struct SensorPipeline {
 }
 
 /// The distance series of a sensor's revolutions and scan events.
-#[derive(Default)]
+#[derive(Clone, Default)]
 struct Series {
     of_lasers: DistanceSeries,
     of_rings: RingSeries,

@@ -11,7 +11,7 @@ use crate::sensor::motion::Compensation;
 use crate::sensor::sweep::Sweep;
 
 /// The newest scan of one sensor, made from a revolution of its firings or from a scan event.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub(crate) struct SensorScan {
     /// Number of scans that the sensor has completed. While it is 0, all but the origin and the name are defaults.
     pub completed: u64,

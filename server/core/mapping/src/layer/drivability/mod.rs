@@ -35,6 +35,7 @@ use search::Search;
 use segments::Segments;
 
 /// Maker of the layer `drivability`. It reuses its buffers from map to map.
+#[derive(Clone)]
 pub struct Drivability {
     config: DrivabilityConfig,
     grid: RadialGrid,

@@ -18,6 +18,7 @@ use class::{DIFFERENCE, HeightDifferenceClass};
 use config::HeightDifferenceConfig;
 
 /// Maker of the layer `height_difference`. It reuses its buffers from map to map.
+#[derive(Clone)]
 pub struct HeightDifference {
     config: HeightDifferenceConfig,
     grid: RadialGrid,

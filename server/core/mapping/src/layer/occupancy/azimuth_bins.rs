@@ -12,6 +12,7 @@ pub const BINS: usize = 1440;
 const BESIDE: isize = 2;
 
 /// The azimuth bins around a sensor.
+#[derive(Clone)]
 pub struct AzimuthBins {
     /// Position -> bin.
     pub columns: AzimuthColumns,

@@ -16,12 +16,13 @@ use super::states::{HIDDEN, LOOKED_AT, THROUGH};
 use super::window::Window;
 
 /// The newest scans of all sensors.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub struct Lines {
     scans: Vec<LineScan>,
 }
 
 /// The evidence of one sensor's newest scan.
+#[derive(Clone)]
 struct LineScan {
     sensor: u16,
     /// True if the scan arrived since the last map.

@@ -51,6 +51,7 @@ use polar_scan::PolarScans;
 use window::Window;
 
 /// Maker of the layer `occupancy`. It keeps the evidence of the scans between two maps.
+#[derive(Clone)]
 pub struct Occupancy {
     config: OccupancyConfig,
     window: Window,
@@ -60,6 +61,7 @@ pub struct Occupancy {
 }
 
 /// The newest scan of each sensor, as its variant keeps it.
+#[derive(Clone)]
 enum Scans {
     Polar(PolarScans),
     Paper(Lines),

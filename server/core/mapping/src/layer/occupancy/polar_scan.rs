@@ -45,6 +45,7 @@ const STEPS_MAX: f32 = 65_000.0;
 const CHUNK: usize = 256;
 
 /// A return from the ground.
+#[derive(Clone)]
 struct Ground {
     bin: u16,
     /// Step at which the ray comes below the clearance.
@@ -56,6 +57,7 @@ struct Ground {
 }
 
 /// Values computed from points by arithmetic alone; ranges and steps are in cells from the sensor.
+#[derive(Clone)]
 struct Chunk {
     bin: [u32; CHUNK],
     range: [f32; CHUNK],
@@ -71,6 +73,7 @@ struct Chunk {
 }
 
 /// The newest scans of all sensors.
+#[derive(Clone)]
 pub struct PolarScans {
     azimuths: AzimuthBins,
     scans: Vec<PolarScan>,
@@ -79,6 +82,7 @@ pub struct PolarScans {
 }
 
 /// The newest scan of one sensor, by azimuth bin.
+#[derive(Clone)]
 struct PolarScan {
     sensor: u16,
     /// True if the scan arrived since the last map.

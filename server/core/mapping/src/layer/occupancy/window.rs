@@ -25,6 +25,7 @@ pub struct EgoPose {
 }
 
 /// The window and its cells.
+#[derive(Clone)]
 pub struct Window {
     /// Number of cells along a side.
     side: usize,

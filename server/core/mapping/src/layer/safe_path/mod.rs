@@ -36,6 +36,7 @@ use links::Links;
 use medial_axis::MedialAxis;
 
 /// Maker of the layer `safe_path`. It reuses its buffers from map to map.
+#[derive(Clone)]
 pub struct SafePath {
     config: SafePathConfig,
     free_space: FreeSpace,

@@ -41,6 +41,7 @@ use painting_conditions::{Condition, PaintingConditions, RoadSource};
 use rough_ground::RoughGround;
 
 /// Maker of the layer `speed`. It reuses its buffers from map to map.
+#[derive(Clone)]
 pub struct Speed {
     config: SpeedConfig,
     heights: HeightMap,

@@ -43,6 +43,7 @@ use moments::{Cells, half_width};
 use regions::{FIRST_FLAT, NOT_FLAT, Plane, Regions};
 
 /// Maker of the layer `terrain`. It reuses its buffers from map to map.
+#[derive(Clone)]
 pub struct Terrain {
     config: TerrainConfig,
     cells: Cells,

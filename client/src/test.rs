@@ -1,0 +1,153 @@
+//! For tests of planners: a recording -> a server of its own process that replays it as if live (feature `test`).
+//!
+//! The command `clearway` is the one that the environment variable `CLEARWAY` names, else the one that cargo built
+//! beside the test, else the installed one. The stamps of the maps are shifted to the present, so that age and staleness
+//! are as on the vehicle. The drive begins when the first reader has subscribed; after its end the last map stays, and
+//! becomes stale.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use crate::{Client, ClientError};
+
+/// Longest wait for the server; ours, ten times what a loaded machine needs.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Interval at which the ready file is looked for.
+const POLL: Duration = Duration::from_millis(5);
+
+/// A recording that is replayed by a server of its own process, on free ports of this machine. Dropping it ends the
+/// server.
+#[derive(Debug)]
+pub struct Replay {
+    server: Child,
+    folder: PathBuf,
+    /// Address of gRPC, `HOST:PORT`.
+    pub grpc: String,
+    /// Address of the page, a URL; empty if it is not served.
+    pub page: String,
+}
+
+/// Why a replay did not start.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// The command cannot be run.
+    #[error("run {command:?}: {source}; install clearway, or name its command in the environment variable CLEARWAY")]
+    Command {
+        /// The command.
+        command: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// The server ended before readers could connect.
+    #[error("clearway replay ended: {0}")]
+    Ended(String),
+    /// The server was not ready in time.
+    #[error("clearway replay is not ready after {} s", PATIENCE.as_secs())]
+    Late,
+    /// A folder or file of the replay cannot be written or read.
+    #[error("{}: {source}", path.display())]
+    File {
+        /// The folder or file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+}
+
+/// The golden recording: 2 s of a car with a VLP-16 in a simulated town, 21 maps.
+pub fn town() -> &'static Path {
+    Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/golden/town.mcap"))
+}
+
+/// The command that replays.
+fn command() -> PathBuf {
+    let beside = || {
+        let test = std::env::current_exe().ok()?;
+        // target/<profile>/deps/<test>
+        Some(test.parent()?.parent()?.join("clearway")).filter(|command| command.is_file())
+    };
+    std::env::var_os("CLEARWAY").map(PathBuf::from).or_else(beside).unwrap_or_else(|| "clearway".into())
+}
+
+impl Replay {
+    /// Starts the replay of a recording.
+    ///
+    /// # Errors
+    /// As [`Replay::with`].
+    pub fn start(recording: impl AsRef<Path>) -> Result<Self, ReplayError> {
+        Self::with(recording, &[])
+    }
+
+    /// Starts the replay of a recording with more options of `clearway replay`, such as `["--speed", "0.5"]`; returns
+    /// when readers can connect.
+    ///
+    /// # Errors
+    /// [`ReplayError::Command`] if the command cannot be run, [`ReplayError::Ended`] with its message if it ends,
+    /// [`ReplayError::Late`] if it is not ready after 60 s, [`ReplayError::File`] if a file cannot be written or read.
+    pub fn with(recording: impl AsRef<Path>, options: &[&str]) -> Result<Self, ReplayError> {
+        static STARTED: AtomicU32 = AtomicU32::new(0);
+        let number = STARTED.fetch_add(1, Ordering::Relaxed);
+        let folder = std::env::temp_dir().join(format!("clearway-replay-{}-{number}", std::process::id()));
+        let [ready, log] = ["ready.json", "log.txt"].map(|name| folder.join(name));
+        let file = |path: &Path| {
+            let path = path.to_owned();
+            move |source| ReplayError::File { path, source }
+        };
+        fs::create_dir_all(&folder).map_err(file(&folder))?;
+        let command = command();
+        let server = Command::new(&command)
+            .arg("replay")
+            .arg(recording.as_ref())
+            .args(["--serve", "--as-live", "--any-port", "--wait-readers", "1", "--ready-file"])
+            .arg(&ready)
+            .args(options)
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(fs::File::create(&log).map_err(file(&log))?)
+            .spawn()
+            .map_err(|source| ReplayError::Command { command, source })?;
+        let mut replay = Self { server, folder, grpc: String::new(), page: String::new() };
+        let began = Instant::now();
+        while !ready.exists() {
+            if let Ok(Some(status)) = replay.server.try_wait() {
+                let said = fs::read_to_string(&log).unwrap_or_default();
+                return Err(ReplayError::Ended(format!("{status}: {}", said.trim())));
+            }
+            if began.elapsed() > PATIENCE {
+                return Err(ReplayError::Late);
+            }
+            std::thread::sleep(POLL);
+        }
+        let text = fs::read_to_string(&ready).map_err(file(&ready))?;
+        let addresses: serde_json::Value =
+            serde_json::from_str(&text).map_err(|error| file(&ready)(std::io::Error::other(error)))?;
+        let address = |name: &str| addresses[name].as_str().unwrap_or_default().to_owned();
+        (replay.grpc, replay.page) = (address("grpc"), address("page"));
+        Ok(replay)
+    }
+
+    /// A client of the server.
+    ///
+    /// # Errors
+    /// As [`Client::connect`].
+    pub async fn client(&self) -> Result<Client, ClientError> {
+        Client::connect(&self.grpc).await
+    }
+
+    /// Stops the server as a crash would: without a word to its readers.
+    pub fn kill(&mut self) {
+        // It may have ended already.
+        let _ = self.server.kill();
+        let _ = self.server.wait();
+    }
+}
+
+impl Drop for Replay {
+    fn drop(&mut self) {
+        self.kill();
+        let _ = fs::remove_dir_all(&self.folder);
+    }
+}

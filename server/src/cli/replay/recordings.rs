@@ -1,0 +1,58 @@
+//! Files that are recordings of this server: their vehicles, and whether a configuration fits them.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use super::options::ReplayError;
+use crate::config::{Calibrations, Config, Vehicle};
+use crate::ingest::files::{Kind, Readings};
+use crate::record::reader::RecordingReader;
+
+/// A recording of this server.
+pub(super) struct Recorded {
+    /// The file.
+    pub file: PathBuf,
+    /// Its configuration.
+    pub config: Config,
+    /// Its calibration tables.
+    pub tables: Calibrations,
+    /// Boot id of its maps.
+    pub boot_id: u64,
+}
+
+/// The recordings, if all files are recordings of this server and they have several vehicles.
+pub(super) fn several_vehicles(files: &Readings) -> Result<Option<Vec<Recorded>>, ReplayError> {
+    let (mut recordings, mut names) = (Vec::new(), BTreeSet::new());
+    for (file, kind) in files.files() {
+        if kind != Kind::Mcap {
+            return Ok(None);
+        }
+        let recording = RecordingReader::open(file)?;
+        if recording.header().config.is_none() {
+            return Ok(None);
+        }
+        let (config, tables) = recording.config()?;
+        names.extend(config.vehicles.iter().map(|vehicle| vehicle.name.clone()));
+        recordings.push(Recorded { file: file.to_owned(), config, tables, boot_id: recording.header().boot_id });
+    }
+    Ok((names.len() > 1).then_some(recordings))
+}
+
+/// Refuses a configuration whose sensors are not those of the recording: events name a sensor by its place.
+pub(super) fn check_sensors(file: &Path, config: &Config, recording: &Path) -> Result<(), ReplayError> {
+    let recording = RecordingReader::open(recording)?;
+    if recording.header().config.is_none() {
+        return Ok(());
+    }
+    let (recorded, _) = recording.config()?;
+    let vehicle = &config.vehicles[0];
+    let names =
+        |vehicle: &Vehicle| vehicle.sensors.iter().map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", ");
+    let of_name = recorded.vehicles.iter().find(|of| of.name == vehicle.name || recorded.vehicles.len() == 1);
+    match of_name.map(|of| (names(vehicle), names(of))) {
+        Some((configured, recorded)) if configured != recorded => {
+            Err(ReplayError::Sensors { file: file.to_owned(), vehicle: vehicle.name.clone(), configured, recorded })
+        }
+        _ => Ok(()),
+    }
+}

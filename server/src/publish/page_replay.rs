@@ -1,0 +1,118 @@
+//! The time bar of the page: the state of a replay as JSON, and requests of the page.
+//!
+//! A request is a JSON object with some of the fields of [`v1::ReplayControl`] under their own names; times are strings
+//! of nanoseconds, because a browser's doubles cannot hold them, and the rate may be `"max"`. It is answered with the
+//! state after the change, or with `error`.
+
+use clearway_proto::v1;
+use serde::Deserialize;
+use serde_json::json;
+use tokio::sync::watch;
+
+use super::listen::access::Caller;
+use crate::replay::ReplayHandle;
+
+/// The replay as one page reaches it.
+pub(super) struct PageReplay {
+    pub handle: ReplayHandle,
+    /// True if the client is an operator.
+    may_control: bool,
+}
+
+impl PageReplay {
+    /// The replay as a client reaches it; `None` if it may not reach all its vehicles, which have one time.
+    pub fn new(handle: ReplayHandle, caller: &Caller) -> Option<Self> {
+        let reaches_all = handle.state().borrow().vehicles.iter().all(|vehicle| caller.may_reach(vehicle));
+        reaches_all.then(|| Self { handle, may_control: caller.is_operator() })
+    }
+}
+
+/// Waits for the next change of the state; for ever if there is no replay, or it is over.
+pub(super) async fn replay_changed(state: &mut Option<watch::Receiver<v1::ReplayState>>) -> v1::ReplayState {
+    if let Some(state) = state
+        && state.changed().await.is_ok()
+    {
+        return state.borrow_and_update().clone();
+    }
+    std::future::pending().await
+}
+
+/// The state as the page reads it; `error` is why a request was refused, or empty.
+pub(super) fn replay_json(state: &v1::ReplayState, error: &str) -> String {
+    let phase = state.phase().as_str_name().trim_start_matches("REPLAY_PHASE_").to_lowercase();
+    let rate = if state.rate.is_finite() { json!(state.rate) } else { json!("max") };
+    json!({
+        "type": "replay", "phase": phase, "rate": rate, "repeat": state.repeat, "lockstep": state.lockstep,
+        "as_live": state.as_live, "jumps": state.jumps, "readers_awaited": state.readers_awaited,
+        "begin_ns": state.begin_ns.to_string(), "end_ns": state.end_ns.to_string(),
+        "from_ns": state.from_ns.to_string(), "to_ns": state.to_ns.to_string(),
+        "position_ns": state.position_ns.to_string(), "error": error,
+    })
+    .to_string()
+}
+
+impl PageReplay {
+    /// Carries out a request; returns the state after it.
+    pub async fn answer(&self, text: &str) -> String {
+        let outcome = match serde_json::from_str::<PageRequest>(text) {
+            Err(error) => Err(error.to_string()),
+            Ok(_) if !self.may_control => Err("the role operator is needed to control the replay".to_owned()),
+            Ok(request) => match request.to_control() {
+                Err(error) => Err(error),
+                Ok(request) => self.handle.control(request).await.map_err(|error| error.to_string()),
+            },
+        };
+        match outcome {
+            Ok(state) => replay_json(&state, ""),
+            Err(error) => replay_json(&self.handle.state().borrow(), &error),
+        }
+    }
+}
+
+/// A request of the page.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields, default)]
+#[derive(Default)]
+struct PageRequest {
+    seek_ns: Option<String>,
+    rate: Option<serde_json::Value>,
+    repeat: Option<bool>,
+    lockstep: Option<bool>,
+    paused: Option<bool>,
+    step: Option<u32>,
+}
+
+impl PageRequest {
+    fn to_control(&self) -> Result<v1::ReplayControl, String> {
+        let seek_ns =
+            self.seek_ns.as_ref().map(|text| text.parse().map_err(|_| format!("seek_ns {text:?}: no integer")));
+        let rate = self.rate.as_ref().map(|rate| match (rate.as_f64(), rate.as_str()) {
+            (Some(rate), _) => Ok(rate),
+            (None, Some("max")) => Ok(f64::INFINITY),
+            _ => Err(format!("rate {rate}: a number or \"max\" is allowed")),
+        });
+        Ok(v1::ReplayControl {
+            seek_ns: seek_ns.transpose()?,
+            rate: rate.transpose()?,
+            repeat: self.repeat,
+            lockstep: self.lockstep,
+            paused: self.paused,
+            step: self.step,
+            ..Default::default()
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_request_of_the_page_is_read_whole_or_refused() {
+        let request = |text: &str| serde_json::from_str::<PageRequest>(text).map_err(|e| e.to_string())?.to_control();
+        let control = request(r#"{"seek_ns":"1700000000123456789","rate":"max","paused":true}"#).unwrap();
+        assert_eq!((control.seek_ns, control.paused), (Some(1_700_000_000_123_456_789), Some(true)));
+        assert_eq!(control.rate, Some(f64::INFINITY));
+        assert!(request(r#"{"seek_ns":"soon"}"#).is_err() && request(r#"{"jump":1}"#).is_err());
+    }
+}

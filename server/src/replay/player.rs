@@ -1,0 +1,470 @@
+//! The thread of a replay: takes the readings of a timeline when they are due, and steps the engines with them.
+//!
+//! One thread does everything, so a pause is a thread that waits, and a jump exchanges pipelines between two steps.
+//! Readings and observations of live clients pass through the vehicles' event queues as ever.
+
+use std::sync::mpsc::Receiver;
+use std::time::{Duration, Instant};
+
+use clearway_proto::v1::{self, ReplayPhase};
+use tokio::runtime::Handle;
+
+use super::clock::ReplayClock;
+use super::control::{Command, ControlError, ReplayInput, check};
+use super::outcome::{PlayError, Played};
+use super::snapshots::{Snapshot, Snapshots};
+use super::timeline::{Ahead, Timeline};
+use crate::clock::now_ns;
+use crate::counted::counted;
+use crate::encode::Replayed;
+use crate::engine::Engine;
+use crate::ingest::files::FilesError;
+use crate::ingest::files::mcap::RefusedMessages;
+use crate::ingest::queue::{EventQueue, QueuedEvent};
+
+/// Interval at which a waiting replay looks for live observations and readers. Ours: short beside a revolution.
+const POLL: Duration = Duration::from_millis(20);
+/// Least time between two reports of the position. Ours: what a time bar shows.
+const REPORT: Duration = Duration::from_millis(100);
+/// Waits shorter than this are slept exactly; tokio's timers have a millisecond.
+const EXACT: Duration = Duration::from_millis(2);
+/// Longest wait for readers to leave after the end, if the replay ends there. Ours: they have been told.
+const LEAVE_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// One vehicle of a replay.
+pub struct ReplayedVehicle {
+    /// Its engine.
+    pub engine: Engine,
+    /// The events of its queue.
+    pub events: Receiver<QueuedEvent>,
+    /// Its queue.
+    pub queue: EventQueue,
+}
+
+/// What a replay does besides what clients can change ([`v1::ReplayState`]).
+#[derive(Clone, Copy, Debug)]
+pub struct PlayerOptions {
+    /// The replay is published: clients can control it, and it waits for a stop after its end.
+    pub is_served: bool,
+    /// The replay is recorded, so it cannot jump.
+    pub is_recorded: bool,
+    /// Ends after the end of the range.
+    pub exits_at_end: bool,
+    /// Longest wait for the acknowledgement of a map in lockstep.
+    pub acknowledge_timeout: Duration,
+    /// The boot id that maps are served with, if their header differs from the recorded one; each jump adds 1.
+    pub boot_id: u64,
+}
+
+/// The client or the user wants the replay to end.
+struct Stopped;
+
+/// A map that readers have to acknowledge before the replay goes on.
+struct AwaitedMap {
+    vehicle: usize,
+    sequence: u64,
+    since: Instant,
+}
+
+/// A replay.
+pub struct Player {
+    timeline: Timeline,
+    vehicles: Vec<ReplayedVehicle>,
+    input: ReplayInput,
+    options: PlayerOptions,
+    state: v1::ReplayState,
+    reported: Instant,
+    clock: ReplayClock,
+    readings: Ahead,
+    /// Number of readings taken.
+    taken: u64,
+    /// Recorded time of the newest of them.
+    newest_ns: Option<i64>,
+    snapshots: Snapshots,
+    /// Maps until the pause; `None` outside a step.
+    step: Option<u32>,
+    awaited: Option<AwaitedMap>,
+    runtime: Handle,
+}
+
+impl Player {
+    /// A replay before its first reading. `input.state` holds how it begins.
+    ///
+    /// # Errors
+    /// [`FilesError`] if a file cannot be opened.
+    pub fn new(
+        timeline: Timeline,
+        vehicles: Vec<ReplayedVehicle>,
+        input: ReplayInput,
+        options: PlayerOptions,
+        runtime: Handle,
+    ) -> Result<Self, FilesError> {
+        let state = input.state.borrow().clone();
+        let readings = timeline.start(0)?;
+        let copies = vehicles.iter().filter(|_| options.is_served);
+        let copies = copies.map(|vehicle| (vehicle.engine.pipeline.clone(), vehicle.queue.position())).collect();
+        Ok(Self {
+            clock: ReplayClock::new(state.rate),
+            snapshots: Snapshots::new(copies),
+            reported: Instant::now(),
+            timeline,
+            vehicles,
+            input,
+            options,
+            state,
+            readings,
+            taken: 0,
+            newest_ns: None,
+            step: None,
+            awaited: None,
+            runtime,
+        })
+    }
+
+    /// Replays until the end of the range or until it is stopped; a served replay waits there for commands.
+    ///
+    /// # Errors
+    /// [`PlayError`].
+    pub fn run(mut self) -> Result<Played, PlayError> {
+        let played = match self.play()? {
+            Ok(()) => true,
+            Err(Stopped) => self.state.phase() == ReplayPhase::Ended,
+        };
+        let remarks = self.readings.end().map(std::mem::take).unwrap_or_default();
+        Ok(Played { reached_end: played, remarks })
+    }
+
+    fn play(&mut self) -> Result<Result<(), Stopped>, PlayError> {
+        if self.await_readers()?.is_err() {
+            return Ok(Err(Stopped));
+        }
+        if self.state.from_ns > self.state.begin_ns {
+            self.jump(self.state.from_ns, false)?;
+        }
+        loop {
+            match self.state.phase() {
+                ReplayPhase::Playing if !self.is_acknowledged()? => {
+                    self.clock.restart();
+                    if self.wait(Instant::now())?.is_err() {
+                        return Ok(Err(Stopped));
+                    }
+                    self.step_waiting(None);
+                }
+                ReplayPhase::Playing => match self.readings.next_ns()? {
+                    Some(at_ns) if at_ns <= self.state.to_ns => {
+                        if self.wait_for(at_ns)?.is_err() {
+                            return Ok(Err(Stopped));
+                        }
+                    }
+                    _ => self.end()?,
+                },
+                ReplayPhase::Ended if !self.options.is_served => return Ok(Ok(())),
+                ReplayPhase::Ended if self.options.exits_at_end => {
+                    self.let_readers_leave();
+                    return Ok(Ok(()));
+                }
+                _ => {
+                    self.clock.restart();
+                    if self.wait(Instant::now() + POLL)?.is_err() {
+                        return Ok(Err(Stopped));
+                    }
+                    self.step_waiting(None);
+                }
+            }
+        }
+    }
+
+    /// Waits until as many readers are there as the state demands.
+    fn await_readers(&mut self) -> Result<Result<(), Stopped>, PlayError> {
+        while self.state.phase() == ReplayPhase::Waiting {
+            let readers: u32 = self.vehicles.iter().map(|vehicle| vehicle.engine.status.readers_sum()).sum();
+            if readers >= self.state.readers_awaited {
+                self.state.readers_awaited = 0;
+                self.set_phase(ReplayPhase::Playing);
+            } else if self.wait(Instant::now() + POLL)?.is_err() {
+                return Ok(Err(Stopped));
+            }
+        }
+        Ok(Ok(()))
+    }
+
+    /// Steps the next reading, of recorded time `at_ns`, when it is due, unless a command comes before.
+    fn wait_for(&mut self, at_ns: i64) -> Result<Result<(), Stopped>, PlayError> {
+        if self.step.is_some() {
+            // A step is as fast as possible, and its stamps are those of the present.
+            self.clock.restart();
+        }
+        let due = self.step.is_none().then(|| self.clock.due(at_ns, now_ns())).flatten();
+        let left = due.map_or(Duration::ZERO, |due| due.saturating_duration_since(Instant::now()));
+        let has_command = !self.input.commands.is_empty();
+        if left > EXACT || has_command {
+            // The last part is slept exactly when this is called again.
+            let until = Instant::now() + left.saturating_sub(EXACT / 2).min(POLL);
+            let stopped = self.wait(until)?;
+            self.step_waiting(None);
+            return Ok(stopped);
+        }
+        std::thread::sleep(left);
+        self.take_next()?;
+        Ok(Ok(()))
+    }
+
+    /// Waits for one command until a time, and applies it.
+    fn wait(&mut self, until: Instant) -> Result<Result<(), Stopped>, PlayError> {
+        let commands = &mut self.input.commands;
+        let command = self.runtime.block_on(async {
+            tokio::select! {
+                biased;
+                command = commands.recv() => Some(command),
+                () = tokio::time::sleep_until(until.into()) => None,
+            }
+        });
+        match command {
+            None => {}
+            Some(Some(Command::Change(request, outcome))) => {
+                let changed = self.change(&request)?;
+                // Fails if the client has gone.
+                let _ = outcome.send(changed.map(|()| self.state.clone()));
+            }
+            Some(Some(Command::Stop) | None) => return Ok(Err(Stopped)),
+        }
+        Ok(Ok(()))
+    }
+
+    /// Takes the next reading and steps its vehicle.
+    fn take_next(&mut self) -> Result<(), PlayError> {
+        let Some(vehicle) = self.push_next()? else { return Ok(()) };
+        let made = self.step_waiting(Some(vehicle));
+        if let Some(sequence) = made {
+            if self.state.lockstep {
+                self.awaited = Some(AwaitedMap { vehicle, sequence, since: Instant::now() });
+            }
+            self.copy_if_due();
+            if let Some(left) = &mut self.step {
+                *left -= 1;
+                if *left == 0 {
+                    self.step = None;
+                    self.set_phase(ReplayPhase::Paused);
+                }
+            }
+        }
+        if self.reported.elapsed() >= REPORT {
+            self.report();
+        }
+        Ok(())
+    }
+
+    /// Pushes the next reading to the queue of its vehicle; returns the vehicle.
+    fn push_next(&mut self) -> Result<Option<usize>, PlayError> {
+        let Some(next) = self.readings.take() else { return Ok(None) };
+        self.taken += 1;
+        self.newest_ns = Some(next.at_ns);
+        self.state.position_ns = next.at_ns;
+        let queue = &self.vehicles[next.vehicle].queue;
+        report_refused(queue, next.refused);
+        queue.push_captured(next.reading)?;
+        Ok(Some(next.vehicle))
+    }
+
+    /// Steps the events that wait on the queue of one vehicle, or of all. Returns the sequence of the newest map, if
+    /// one was made of that vehicle.
+    fn step_waiting(&mut self, vehicle: Option<usize>) -> Option<u64> {
+        let now_ns = now_ns();
+        let (clock, state, boot_id) = (&self.clock, &self.state, self.options.boot_id);
+        let vehicles = self.vehicles.iter_mut().enumerate();
+        let mut made = None;
+        for (_, ReplayedVehicle { engine, events, .. }) in vehicles.filter(|(i, _)| vehicle.is_none_or(|v| v == *i)) {
+            let before = engine.maps();
+            while let Ok(queued) = events.try_recv() {
+                engine.replayed = replayed(clock, state, boot_id, state.position_ns, now_ns);
+                engine.step(queued);
+            }
+            if vehicle.is_none() {
+                engine.update_status();
+            }
+            made = (engine.maps() > before).then(|| engine.maps() - 1);
+        }
+        made
+    }
+
+    /// The end of the range: the drops that are left, and then the phase.
+    fn end(&mut self) -> Result<(), PlayError> {
+        if let Some(remarks) = self.readings.end() {
+            for (vehicle, refused) in self.vehicles.iter().zip(remarks.refused.drain(..)) {
+                report_refused(&vehicle.queue, refused);
+            }
+            for index in 0..self.vehicles.len() {
+                self.vehicles[index].queue.report_drops(self.newest_ns)?;
+            }
+        }
+        self.step_waiting(None);
+        if self.state.repeat && self.newest_ns.is_some() {
+            return self.jump(self.state.from_ns, true);
+        }
+        self.step = None;
+        self.set_phase(ReplayPhase::Ended);
+        Ok(())
+    }
+
+    /// After the end: waits until all readers have left, at most a short time.
+    fn let_readers_leave(&self) {
+        let began = Instant::now();
+        let are_there = || self.vehicles.iter().any(|vehicle| vehicle.engine.status.readers_sum() > 0);
+        while are_there() && began.elapsed() < LEAVE_TIMEOUT {
+            std::thread::sleep(POLL);
+        }
+    }
+
+    /// True if no map waits for an acknowledgement.
+    ///
+    /// # Errors
+    /// [`PlayError::Unacknowledged`] if it has waited too long.
+    fn is_acknowledged(&mut self) -> Result<bool, PlayError> {
+        let Some(AwaitedMap { vehicle, sequence, since }) = &self.awaited else { return Ok(true) };
+        let status = &self.vehicles[*vehicle].engine.status;
+        let boot_id = self.vehicles[*vehicle].engine.replayed.map_or(status.boot_id, |replayed| replayed.boot_id);
+        let mut changes = status.acknowledgements.changes();
+        let awaited = status.acknowledgements.awaited((boot_id, *sequence));
+        if !self.state.lockstep || awaited.as_ref().is_some_and(Vec::is_empty) {
+            self.awaited = None;
+            return Ok(true);
+        }
+        if since.elapsed() >= self.options.acknowledge_timeout {
+            return Err(PlayError::Unacknowledged {
+                vehicle: status.name.to_string(),
+                sequence: *sequence,
+                seconds: self.options.acknowledge_timeout.as_secs_f64(),
+                readers: awaited.map_or("any reader that acknowledges".to_owned(), |names| names.join(", ")),
+            });
+        }
+        // Whichever comes first; then the caller looks for commands and asks again.
+        if self.input.commands.is_empty() {
+            // A timeout needs nothing further.
+            let _ = self.runtime.block_on(async { tokio::time::timeout(POLL, changes.changed()).await });
+        }
+        Ok(false)
+    }
+
+    /// Applies a request of a client.
+    fn change(&mut self, request: &v1::ReplayControl) -> Result<Result<(), ControlError>, PlayError> {
+        let (from_ns, to_ns) = match check(request, &self.state, self.options.is_recorded) {
+            Ok(range) => range,
+            Err(error) => return Ok(Err(error)),
+        };
+        (self.state.from_ns, self.state.to_ns) = (from_ns, to_ns);
+        if let Some(rate) = request.rate {
+            self.state.rate = rate;
+            self.clock.set_rate(rate);
+        }
+        self.state.repeat = request.repeat.unwrap_or(self.state.repeat);
+        self.state.lockstep = request.lockstep.unwrap_or(self.state.lockstep);
+        let is_waiting = self.state.phase() == ReplayPhase::Waiting;
+        let position_ns = self.state.position_ns;
+        let outside = (!(from_ns..=to_ns).contains(&position_ns)).then_some(position_ns.clamp(from_ns, to_ns));
+        if let Some(at_ns) = request.seek_ns.or(outside.filter(|_| !self.options.is_recorded && !is_waiting)) {
+            self.jump(at_ns, true)?;
+        }
+        match (request.step, request.paused) {
+            (Some(maps), _) => {
+                self.step = Some(maps);
+                self.set_phase(ReplayPhase::Playing);
+            }
+            (None, Some(true)) => self.set_phase(ReplayPhase::Paused),
+            (None, Some(false)) if self.state.phase() != ReplayPhase::Ended => self.set_phase(ReplayPhase::Playing),
+            // The range may have grown.
+            (None, _) if self.state.phase() == ReplayPhase::Ended && position_ns < to_ns => {
+                self.set_phase(ReplayPhase::Paused)
+            }
+            (None, _) => {}
+        }
+        self.clock.restart();
+        self.report();
+        Ok(Ok(()))
+    }
+
+    /// Goes to a recorded time and publishes the newest map of that moment.
+    fn jump(&mut self, to_ns: i64, counts: bool) -> Result<(), PlayError> {
+        let copy = self.snapshots.before(to_ns);
+        let is_back = self.newest_ns.is_some_and(|newest_ns| to_ns < newest_ns);
+        if is_back || copy.readings > self.taken {
+            for (vehicle, (pipeline, position)) in self.vehicles.iter_mut().zip(&copy.vehicles) {
+                vehicle.engine.pipeline = pipeline.clone();
+                vehicle.queue.set_position(*position);
+            }
+            (self.taken, self.newest_ns) = (copy.readings, None);
+            self.readings = self.timeline.start(copy.readings)?;
+        }
+        if counts {
+            self.state.jumps += 1;
+        }
+        self.awaited = None;
+        while let Some(at_ns) = self.readings.next_ns()?.filter(|at_ns| *at_ns <= to_ns) {
+            debug_assert!(at_ns <= to_ns);
+            let Some(vehicle) = self.push_next()? else { break };
+            let ReplayedVehicle { engine, events, .. } = &mut self.vehicles[vehicle];
+            let before = engine.maps();
+            events.try_iter().for_each(|queued| engine.step_silently(&queued.event));
+            if engine.maps() > before {
+                self.copy_if_due();
+            }
+        }
+        self.state.position_ns = to_ns;
+        self.clock.restart();
+        let now_ns = now_ns();
+        let (clock, state, boot_id) = (&self.clock, &self.state, self.options.boot_id);
+        for ReplayedVehicle { engine, .. } in &mut self.vehicles {
+            engine.replayed = replayed(clock, state, boot_id, to_ns, now_ns);
+            engine.publish_newest_map();
+        }
+        if self.state.phase() == ReplayPhase::Ended {
+            self.set_phase(ReplayPhase::Playing);
+        }
+        self.report();
+        Ok(())
+    }
+
+    /// Copies the pipelines, if the last copy is old enough.
+    fn copy_if_due(&mut self) {
+        let at_ns = self.state.position_ns;
+        if self.options.is_served && !self.options.is_recorded && self.snapshots.is_due(at_ns, self.taken) {
+            let copies = self.vehicles.iter();
+            let vehicles = copies.map(|of| (of.engine.pipeline.clone(), of.queue.position())).collect();
+            self.snapshots.add(Snapshot { at_ns, readings: self.taken, vehicles });
+        }
+    }
+
+    fn set_phase(&mut self, phase: ReplayPhase) {
+        self.state.set_phase(phase);
+        self.clock.restart();
+        for vehicle in &self.vehicles {
+            vehicle.engine.update_status();
+            let ended = phase == ReplayPhase::Ended;
+            vehicle.engine.status.replay_ended.send_if_modified(|was| std::mem::replace(was, ended) != ended);
+        }
+        tracing::debug!(?phase, jumps = %counted(self.state.jumps, "jump"), "replay");
+        self.report();
+    }
+
+    fn report(&mut self) {
+        self.reported = Instant::now();
+        self.input.state.send_if_modified(|state| {
+            let changed = *state != self.state;
+            state.clone_from(&self.state);
+            changed
+        });
+    }
+}
+
+/// The header that a map of the recorded time `at_ns` is served with; `None` for that of the recorded map.
+fn replayed(clock: &ReplayClock, state: &v1::ReplayState, boot_id: u64, at_ns: i64, now_ns: i64) -> Option<Replayed> {
+    let shift_ns = if state.as_live { clock.shift_ns(at_ns, now_ns) } else { 0 };
+    let boot_id = boot_id.wrapping_add(state.jumps);
+    (state.as_live || state.jumps > 0).then_some(Replayed { shift_ns, boot_id })
+}
+
+/// Counts the messages that the files' readers have refused.
+fn report_refused(queue: &EventQueue, refused: RefusedMessages) {
+    for ((source, reason), count) in refused {
+        queue.drops().record_refused_messages(source, reason, count);
+    }
+}

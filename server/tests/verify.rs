@@ -1,0 +1,197 @@
+//! `clearway verify` as a tool for CI: many recordings, shards, reports, and what a change changes.
+
+mod common;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
+use clearway_proto::v1;
+use common::{clearway, text};
+use mcap::records::Record;
+use prost::Message;
+use serde_json::Value;
+
+/// The golden recording: a VLP-16 in the simulated town, 21 maps.
+fn town() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../client/golden/town.mcap")
+}
+
+/// Copies the golden recording with another class in cell (5, 7) of the layer safe_path of map 3; returns the class
+/// before and after.
+fn with_one_changed_cell(to: &Path) -> (i32, i32) {
+    let bytes = fs::read(town()).unwrap();
+    let mut writer = mcap::Writer::new(fs::File::create(to).unwrap()).unwrap();
+    for record in mcap::read::LinearReader::new(&bytes).unwrap() {
+        match record.unwrap() {
+            Record::Metadata(metadata) => writer.write_metadata(&metadata).unwrap(),
+            Record::Attachment { header, data, .. } => {
+                let mcap::records::AttachmentHeader { log_time, create_time, name, media_type } = header;
+                writer.attach(&mcap::Attachment { log_time, create_time, name, media_type, data }).unwrap();
+            }
+            _ => {}
+        }
+    }
+    let mut classes = None;
+    for message in mcap::MessageStream::new(&bytes).unwrap() {
+        let mut message = message.unwrap();
+        if message.channel.topic == "/car/map/safe_path" {
+            let mut map = v1::Map::decode(&message.data[..]).unwrap();
+            if map.header.as_ref().unwrap().sequence == 3 {
+                let columns = 240;
+                let channel = &mut map.layers[0].channels[0];
+                let Cells::U8(mut cells) = decode(channel, columns, &Limits::default()).unwrap() else {
+                    panic!("classes are u8")
+                };
+                let cell = &mut cells[5 * columns + 7];
+                let was = *cell;
+                *cell = (was + 1) % 5;
+                classes = Some((was.into(), (*cell).into()));
+                let v1::Channel { name, unit, scale, unknown, .. } = channel.clone();
+                *channel = encode_grid(CellsRef::U8(&cells), columns).into_channel(&name, &unit, scale, unknown);
+                message.data = map.encode_to_vec().into();
+            }
+        }
+        writer.write(&message).unwrap();
+    }
+    writer.finish().unwrap();
+    classes.expect("map 3 has the layer")
+}
+
+/// Runs `clearway verify` with these arguments; returns its exit code and what it printed as JSON.
+fn verified(arguments: &[&str]) -> (i32, Value) {
+    let output = clearway(&[&["verify", "--json"], arguments].concat());
+    let printed = serde_json::from_slice(&output.stdout);
+    (output.status.code().unwrap(), printed.unwrap_or_else(|_| panic!("{}", text(&output.stderr))))
+}
+
+#[test]
+fn the_golden_recording_holds_the_maps_of_its_events() {
+    let (code, report) = verified(&[town().to_str().unwrap()]);
+    assert_eq!(code, 0, "its README.md says how to make it again: {report:#}");
+    let file = &report["files"][0];
+    assert_eq!((&file["events"], &file["maps"], &file["equal"]), (&1709.into(), &21.into(), &126.into()));
+    // 7 rows of 360 columns twice, 400 x 400 twice, 240 x 240, 160 x 160.
+    assert_eq!(file["cells"], 21 * (2 * 7 * 360 + 2 * 400 * 400 + 240 * 240 + 160 * 160));
+}
+
+#[test]
+fn many_files_have_a_line_each_the_first_difference_and_the_worst_exit_code() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).display().to_string();
+    fs::copy(town(), at("a.mcap")).unwrap();
+    let (all, junit) = (at("*.mcap"), at("junit.xml"));
+    assert_eq!(verified(&[&all]).0, 0);
+
+    let (was, is) = with_one_changed_cell(Path::new(&at("b.mcap")));
+    let output = clearway(&["verify", folder.path().to_str().unwrap(), "--jobs", "2"]);
+    let table = text(&output.stdout);
+    assert_eq!(output.status.code(), Some(1), "{table}");
+    let cell = format!("cell row 5 column 7, channel class: recorded {is}, computed {was}");
+    let line = table.lines().find(|line| line.contains("b.mcap")).expect("a line for each file");
+    assert!(line.contains("sequence 3, layer safe_path") && line.contains(&cell), "{line}");
+    assert!(table.contains("2 files: 1 equal, 1 different, 0 not checked"), "{table}");
+
+    fs::write(at("c.mcap"), "not a recording").unwrap();
+    let (code, report) = verified(&[&all, "--junit", &junit]);
+    assert_eq!((code, &report["ok"]), (2, &false.into()));
+    let good: Vec<_> = report["files"].as_array().unwrap().iter().map(|file| file["ok"] == true).collect();
+    assert_eq!(good, [true, false, false], "in the order of their names");
+    let xml = fs::read_to_string(junit).unwrap();
+    let document = roxmltree::Document::parse(&xml).unwrap();
+    let suite = document.root_element().first_element_child().unwrap();
+    let of = |name| suite.attribute(name).unwrap();
+    assert_eq!([of("tests"), of("failures"), of("errors")], ["3", "1", "1"]);
+    assert!(xml.contains(&cell) && xml.contains("not an MCAP file"), "{xml}");
+
+    let shards = [("1/2", 2), ("2/2", 1), ("3/3", 1)].map(|(shard, files)| {
+        let (code, report) = verified(&[&all, "--shard", shard]);
+        assert_eq!(report["files"].as_array().unwrap().len(), files, "{shard}");
+        code
+    });
+    assert_eq!(shards, [2, 1, 2], "a, c; b; c");
+    let (code, report) = verified(&[&all, "--shard", "4/4"]);
+    assert_eq!((code, &report["files"]), (0, &Value::Array(Vec::new())), "a shard may be empty");
+}
+
+/// The layers of a comparison whose cells changed.
+fn changed(file: &Value) -> Vec<&Value> {
+    file["layers"].as_array().unwrap().iter().filter(|layer| layer["changed"] != 0).collect()
+}
+
+#[test]
+fn a_changed_configuration_is_compared_by_layer_class_and_free_space_with_pictures() {
+    let folder = tempfile::tempdir().unwrap();
+    let pictures = folder.path().join("changes");
+    let town = town().display().to_string();
+    // A wider vehicle reaches less ground.
+    let wider = ["--set", "vehicle.maps.reach.vehicle_width_m=2.6", "--worst", "2"];
+    let (code, report) = verified(&[&[&*town, "--pictures", pictures.to_str().unwrap()], &wider[..]].concat());
+    assert_eq!(code, 1);
+    let file = &report["files"][0];
+    let layers = changed(file);
+    assert!(layers.iter().any(|layer| layer["layer"] == "speed"), "{file:#}");
+    for layer in &layers {
+        let classes = layer["classes"].as_array().unwrap();
+        let sum: u64 = classes.iter().map(|pair| pair["cells"].as_u64().unwrap()).sum();
+        assert_eq!(layer["changed"], sum, "{layer:#}");
+        assert!(layer["first"]["before"] != layer["first"]["after"], "{layer:#}");
+    }
+    let lost = |layer: &Value| layer["free_lost_m2"].as_f64().unwrap() - layer["free_gained_m2"].as_f64().unwrap();
+    assert!(layers.iter().map(|layer| lost(layer)).sum::<f64>() > 10.0, "{file:#}");
+    let drawn = file["pictures"].as_array().unwrap();
+    assert_eq!((drawn.len(), file["worst"].as_array().unwrap().len()), (2, 2));
+    for picture in drawn {
+        let png = png::Decoder::new(std::io::BufReader::new(fs::File::open(picture.as_str().unwrap()).unwrap()));
+        let reader = png.read_info().unwrap();
+        assert!(reader.info().width >= 3 * 480, "three maps side by side");
+    }
+
+    // Another cell size: the maps are compared where the cells lie; no other layer changes.
+    let (code, report) = verified(&[&town, "--set", "vehicle.maps.terrain.cell_m=0.5"]);
+    let names: Vec<_> = changed(&report["files"][0]).iter().map(|layer| layer["layer"].clone()).collect();
+    assert_eq!((code, names), (1, vec!["terrain".into()]));
+    // The recorded configuration changes nothing.
+    let (code, report) = verified(&[&town, "--set", "vehicle.maps.valid_ms=500"]);
+    assert_eq!((code, changed(&report["files"][0]).len()), (0, 0));
+    assert_eq!(report["files"][0]["layers"][0]["maps"], 21);
+}
+
+#[test]
+fn two_recordings_of_one_drive_are_compared_map_by_map() {
+    let folder = tempfile::tempdir().unwrap();
+    let other = folder.path().join("other.mcap");
+    with_one_changed_cell(&other);
+    let town = town().display().to_string();
+    let (code, report) = verified(&[&town, "--against", other.to_str().unwrap()]);
+    let layers = changed(&report["files"][0]);
+    assert_eq!((code, layers.len()), (1, 1));
+    let layer = layers[0];
+    assert_eq!((&layer["layer"], &layer["maps"], &layer["changed"]), (&"safe_path".into(), &21.into(), &1.into()));
+    let first = &layer["first"];
+    assert_eq!((&first["sequence"], &first["row"], &first["column"]), (&3.into(), &5.into(), &7.into()));
+    assert_eq!(verified(&[&town, "--against", &town]).0, 0);
+}
+
+#[test]
+fn a_configuration_that_does_not_fit_the_recording_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let town = town().display().to_string();
+    let config = folder.path().join("new.toml");
+    let new = |from: &str, to: &str| {
+        let default = include_str!("../../deploy/clearway.toml");
+        assert!(default.contains(from), "{from}");
+        fs::write(&config, default.replace(from, to)).unwrap();
+        let output = clearway(&["verify", &town, "--config", config.to_str().unwrap()]);
+        (output.status.code().unwrap(), text(&output.stderr))
+    };
+    assert_eq!(new("name = \"car\"", "name = \"car\"").0, 0, "the default configuration fits");
+    let (code, error) = new("name = \"top\"", "name = \"left\"");
+    assert!(code == 2 && error.contains("left; recorded, in this order: top"), "{error}");
+    let (code, error) = new("name = \"car\"", "name = \"bus\"");
+    assert!(code == 2 && error.contains("its vehicles are bus; recorded, in this order: car"), "{error}");
+    let output = clearway(&["verify", &town, "--pictures", "x"]);
+    assert!(!output.status.success() && text(&output.stderr).contains("--pictures needs --config"));
+    let output = clearway(&["verify", &town, "--shard", "3/2"]);
+    assert!(!output.status.success() && text(&output.stderr).contains("I/N is needed"));
+}

@@ -1,0 +1,131 @@
+//! The tests of a planner that the README shows, in Rust, Python and a shell, as they are written there.
+
+mod fixture;
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use clearway_client::test::{Replay, town};
+use clearway_client::{Footprint, StreamEvent, Subscription, now_ns};
+use clearway_tests::{binaries, run, workspace};
+
+#[tokio::test]
+async fn the_street_ahead_is_free() -> Result<(), Box<dyn std::error::Error>> {
+    binaries();
+    let drive = Replay::start(town())?;
+    let mut maps = drive.client().await?.subscribe(Subscription::default()).await?;
+    let map = loop {
+        match maps.next().await?.map {
+            map if map.sequence() >= 5 => break map,
+            _ => continue,
+        }
+    };
+    let car = Footprint { x_m: 8.0, y_m: 0.0, heading_rad: 0.0, length_m: 4.0, width_m: 2.0 };
+    assert!(!map.is_stale(now_ns()) && map.is_free("drivability", &car)?);
+    assert_eq!(map.layer("occupancy")?.class_at(8.0, 0.0).1, "clear");
+    assert!(map.nearest_obstacle("occupancy", 0.0, 0.0)?.is_some_and(|obstacle| obstacle.distance_m > 1.0));
+    while !matches!(maps.next_or_stale().await?, StreamEvent::Stale(_)) {}
+    Ok(())
+}
+
+/// The code blocks of the README's section, by language.
+fn blocks(language: &str) -> Vec<String> {
+    let readme = fs::read_to_string(workspace().join("README.md")).expect("README.md");
+    let (_, section) = readme.split_once("## Testing your planner on a recording").expect("the section");
+    let section = section.split("\n## ").next().expect("its text");
+    let start = format!("```{language}\n");
+    section.split(&start).skip(1).filter_map(|rest| rest.split("```").next()).map(str::to_owned).collect()
+}
+
+#[test]
+fn the_test_in_rust_is_the_one_of_the_readme() {
+    let shown = blocks("rust,ignore");
+    assert_eq!(shown.len(), 1);
+    let own = include_str!("kit.rs").replace("    binaries();\n", "");
+    let body = shown[0].split_once("#[tokio::test]").expect("a test").1;
+    assert!(own.contains(body), "the README shows another test:\n{body}");
+}
+
+#[test]
+#[cfg_attr(not(clearway_python), ignore = "needs Python: apt-get install python3 python3-venv")]
+fn the_test_in_python_passes_with_the_client_of_its_source_distribution_and_the_oldest_protobuf() {
+    let interpreter = fixture::venv::oldest_client(&workspace());
+    let folder = tempfile::tempdir().unwrap();
+    let shown = blocks("python");
+    assert_eq!(shown.len(), 1);
+    fs::write(folder.path().join("test_planner.py"), &shown[0]).unwrap();
+    let mut pytest = Command::new(interpreter);
+    pytest.args(["-B", "-m", "pytest", "-q", "-p", "no:cacheprovider"]).current_dir(folder.path());
+    pytest.env("CLEARWAY", binaries().join("clearway"));
+    let said = fixture::venv::run(&mut pytest, "pytest names what failed");
+    assert!(said.contains("1 passed"), "{said}");
+}
+
+#[test]
+fn the_shell_steps_end_with_success_and_fail_for_a_recording_that_is_not_there() {
+    let shown = blocks("bash");
+    assert_eq!(shown.len(), 1);
+    let path = format!("{}:{}", binaries().display(), std::env::var("PATH").unwrap_or_default());
+    let steps = |recording: &Path| {
+        let folder = tempfile::tempdir().unwrap();
+        fs::copy(recording, folder.path().join("drive.mcap")).unwrap();
+        let mut shell = Command::new("bash");
+        shell.args(["-euo", "pipefail", "-c", &shown[0]]).env("PATH", &path).current_dir(folder.path());
+        let output = shell.output().expect("bash runs");
+        (output.status.success(), format!("{}{}", text(&output.stdout), text(&output.stderr)))
+    };
+    let (passed, said) = steps(town());
+    assert!(passed, "{said}");
+    let (passed, said) = steps(&workspace().join("client/golden/README.md"));
+    assert!(!passed && said.contains("drive.mcap"), "{said}");
+}
+
+#[test]
+fn the_verify_commands_end_with_the_exit_codes_that_the_readme_gives() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    fs::create_dir(at("drives")).unwrap();
+    for copy in ["drives/town.mcap", "before.mcap", "after.mcap"] {
+        fs::copy(town(), at(copy)).unwrap();
+    }
+    let config = fs::read_to_string(workspace().join("deploy/clearway.toml")).unwrap();
+    fs::write(at("new.toml"), config.replace("vehicle_width_m = 2.0", "vehicle_width_m = 2.6")).unwrap();
+    let shown = blocks("shell");
+    let codes = shown[0].lines().map(|command| {
+        let words: Vec<_> = command.split_whitespace().collect();
+        run(folder.path(), words[0], &words[1..]).status.code()
+    });
+    assert_eq!(codes.collect::<Vec<_>>(), [Some(0), Some(1), Some(0)]);
+    assert!(at("verify.xml").is_file() && at("changes").is_dir());
+}
+
+#[test]
+fn the_steps_of_the_ci_examples_run() {
+    let path = format!("{}:{}", binaries().display(), std::env::var("PATH").unwrap_or_default());
+    let config = fs::read_to_string(workspace().join("deploy/clearway.toml")).unwrap();
+    for file in ["deploy/ci/github.yml", "deploy/ci/gitlab.yml"] {
+        let text_of_file = fs::read_to_string(workspace().join(file)).unwrap();
+        let step = |line: &str| line.find("clearway verify").map(|at| line[at..].to_owned());
+        let steps: Vec<_> = text_of_file.lines().filter(|line| !line.starts_with('#')).filter_map(step).collect();
+        assert_eq!(steps.len(), 2, "{file}: {steps:?}");
+        let folder = tempfile::tempdir().unwrap();
+        let recordings = folder.path().join("client/golden");
+        fs::create_dir_all(&recordings).unwrap();
+        fs::copy(town(), recordings.join("town.mcap")).unwrap();
+        fs::write(folder.path().join("new.toml"), config.replace("vehicle_width_m = 2.0", "vehicle_width_m = 2.6"))
+            .unwrap();
+        for step in &steps {
+            let mut shell = Command::new("bash");
+            shell.args(["-e", "-c", step]).env("PATH", &path).env("SHARD", "1/2").current_dir(folder.path());
+            let output = shell.output().expect("bash runs");
+            assert!(output.status.success(), "{step}: {}", text(&output.stderr));
+        }
+        assert!(fs::read_to_string(folder.path().join("verify.xml")).unwrap().contains("failures=\"0\""), "{file}");
+        assert!(fs::read_dir(folder.path().join("changes")).unwrap().count() > 0, "{file}: pictures of the changes");
+    }
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
