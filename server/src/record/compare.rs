@@ -190,7 +190,7 @@ pub fn compare(before: &Path, after: &After<'_>, worst: usize) -> Result<Compari
                     RecordedMessage::Map { vehicle, layer, bytes } => {
                         pairs.push(BEFORE, before, vehicle, layer, bytes)?;
                     }
-                    RecordedMessage::Ros { .. } => {}
+                    RecordedMessage::Keyframe { .. } | RecordedMessage::Counts(_) | RecordedMessage::Ros { .. } => {}
                 }
             }
             pairs.comparison.incomplete = incomplete(before, &recording);
@@ -232,11 +232,17 @@ struct Computing {
     boot_id: u64,
     valid_ms: u32,
     pipeline: Pipeline,
+    /// Sequence from which events are new; earlier ones are repeated for a keyframe.
+    next_event: u64,
 }
 
 impl Computing {
     /// The layers of the map that an event completes: name and bytes of each.
     fn step(&mut self, event: &Event) -> Vec<(String, Bytes)> {
+        if event.sequence < self.next_event {
+            return Vec::new();
+        }
+        self.next_event = event.sequence.saturating_add(1);
         // Refused events make no map, here and in the recorded run.
         let Ok(Some(map)) = self.pipeline.step(event) else { return Vec::new() };
         let map = EncodedMap::new(map, self.name.clone(), self.boot_id, self.valid_ms);
@@ -274,6 +280,7 @@ fn pipelines(
             name: is.name.as_str().into(),
             boot_id: recording.header().boot_id,
             valid_ms: is.maps.valid_ms,
+            next_event: 0,
             pipeline: Pipeline::new(&is.core(), tables)?,
         });
     }
