@@ -31,7 +31,7 @@ fn every_subcommand_has_help() {
     let help = text(&clearway(&["--help"]).stdout);
     let names = help.lines().filter_map(|line| line.strip_prefix("  ")?.split_once(' ').map(|(name, _)| name));
     let names: Vec<&str> = names.filter(|name| !name.is_empty() && !name.starts_with('-')).collect();
-    assert_eq!(names.len(), 18, "{names:?}");
+    assert_eq!(names.len(), 19, "{names:?}");
     for name in names {
         let output = clearway(&[name, "--help"]);
         assert!(output.status.success() && text(&output.stdout).contains(&format!("Usage: clearway {name}")), "{name}");
@@ -115,7 +115,7 @@ fn wrong_usage_prints_the_usage_and_exits_with_3() {
 #[test]
 fn a_negative_number_is_a_wrong_value_and_not_an_unknown_option() {
     for (arguments, allowed) in [
-        (&["replay", "a.pcap", "--speed", "-1"][..], "a factor above 0 is allowed"),
+        (&["replay", "a.pcap", "--speed", "-1"][..], "or a factor from 0.1 to 1000 is allowed"),
         (&["simulate", "flat", "--out", "a.pcap", "--seconds", "-1"], "0.1 to 3600 seconds are allowed"),
         (&["demo", "--seconds", "-1"], "0 or more seconds are allowed"),
         (&["ingest", "a.bin", "--hz", "-1"], "0.1 to 100 is allowed"),
@@ -157,7 +157,8 @@ fn a_file_that_cannot_be_used_is_named_with_what_to_do() {
         std::fs::write(at(name), "").unwrap();
     }
     let (no_file, is_folder, is_empty) = (": No such file", ": this is a folder; name a file", "empty");
-    let poses = at("absent.tum");
+    let (poses, none) = (at("absent.tum"), at("none"));
+    std::fs::create_dir(&none).unwrap();
     let (absent, here) = (at("absent.pcap"), folder.path().display().to_string());
     let (capture, recording, unknown) = (at("empty.pcap"), at("empty.mcap"), at("empty.bag"));
     let (to, png) = ("udp://127.0.0.1:9", at("out"));
@@ -174,7 +175,7 @@ fn a_file_that_cannot_be_used_is_named_with_what_to_do() {
         (&["replay", &recording], &recording, is_empty),
         (&["replay", &unknown], &unknown, is_empty),
         (&["verify", &absent], &absent, no_file),
-        (&["verify", &here], &here, "no file *.mcap in this folder"),
+        (&["verify", &none], &none, "no file *.mcap in this folder"),
         (&["verify", &recording], &recording, is_empty),
         (&["export", &here, "--format", "png", "--out", &png], &here, is_folder),
         (&["export", &recording, "--format", "png", "--out", &png], &recording, is_empty),
