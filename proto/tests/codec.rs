@@ -57,7 +57,7 @@ proptest! {
         let [qx, qy, qz, qw] = [qx, qy, qz, qw].map(|part| part * scale);
         let pose = v1::Pose { x: 1.0, y: -2.0, z: 0.5, qx, qy, qz, qw };
         let header = v1::Header { map_from_ego: Some(pose), ..Default::default() };
-        let decoded = map::decode_map(map::encode_header(&header).into(), &Limits::default());
+        let decoded = map::decode_map(map::encode_header(&header), &Limits::default());
         prop_assert_eq!(decoded.is_ok(), allowed, "{:?}", decoded);
     }
 
