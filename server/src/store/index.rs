@@ -73,7 +73,7 @@ impl Entry {
     pub fn of_part(file: &Path, bytes: u64, crc32: u32) -> Result<Vec<Self>, McapReadError> {
         let mut reader = McapReader::open(file)?;
         let mut entries: BTreeMap<String, Self> = BTreeMap::new();
-        while let Some(message) = reader.next() {
+        for message in reader.by_ref() {
             let message = message?;
             let Some(vehicle) = message.vehicle() else { continue };
             let entry = entries.entry(vehicle.to_owned()).or_insert_with(|| Self {

@@ -109,8 +109,8 @@ pub struct Options {
     /// Listen on free ports of this machine only; --ready-file and the log say which.
     #[arg(long, requires = "serve")]
     pub any_port: bool,
-    /// Replay with a fault: lost:SENSOR@FROM-TO, loss:PERCENT[@FROM-TO], clock:MS@AT, pose:X,Y,YAW@AT or stop@FROM-TO,
-    /// in seconds after the first event, metres and degrees; may be given several times.
+    /// Replay with a fault: lost:SENSOR@FROM-TO, loss:PERCENT or loss:PERCENT@FROM-TO, clock:MS@AT, pose:X,Y,YAW@AT or
+    /// stop@FROM-TO, in seconds after the first event, metres and degrees; may be given several times.
     #[arg(long = "fault", value_name = "FAULT", value_parser = |text: &str| text.parse::<Fault>())]
     pub faults: Vec<Fault>,
     /// Replay with the faults of this file, one a line; # begins a comment.
