@@ -31,8 +31,9 @@ const SECURITY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../SECURITY.md");
 const BEGIN: &str = "<!-- The table is written by tests/tests/access.rs. -->\n";
 const END: &str = "<!-- End of the table. -->";
 
-/// Errors that only those get that may make a call: it lacks content, or the server serves no replay.
-const OF_CONTENT: [Code; 4] = [Code::InvalidArgument, Code::NotFound, Code::OutOfRange, Code::Unimplemented];
+/// Errors that only those get that may make a call: it lacks content, or the server has no recorder or replay.
+const OF_CONTENT: [Code; 5] =
+    [Code::InvalidArgument, Code::NotFound, Code::OutOfRange, Code::FailedPrecondition, Code::Unimplemented];
 
 /// Headers that ask for a WebSocket.
 const UPGRADE: &str = "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n\
@@ -178,7 +179,13 @@ impl Bed {
     }
 
     async fn ask(&self, ask: impl AsyncFn() -> FifoChannelHandler<zenoh::query::Reply>) {
-        while ask().await.recv_async().await.is_err() {
+        loop {
+            // A query that nobody answers ends with an error.
+            while let Ok(reply) = ask().await.recv_async().await {
+                if reply.result().is_ok() {
+                    return;
+                }
+            }
             pause().await;
         }
     }

@@ -24,7 +24,7 @@ use super::output::{counted, print_line};
 use crate::encode::event_from_bytes;
 use crate::record::mcap_reader::{McapReader, Message};
 
-/// Describe a file: an MCAP recording, a ROS 2 bag, a capture (pcap, pcapng) or a scan (.bin, .pcd.bin, .pcd).
+/// Describe a file: a recording, a ROS 2 bag, a capture (pcap, pcapng) or a scan (.bin, .pcd.bin, .pcd).
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway info drive.mcap
