@@ -180,7 +180,7 @@ impl Bed {
 
     async fn ask(&self, ask: impl AsyncFn() -> FifoChannelHandler<zenoh::query::Reply>) {
         loop {
-            // A query that nobody answers ends with an error.
+            // A query without an answer ends with an error.
             while let Ok(reply) = ask().await.recv_async().await {
                 if reply.result().is_ok() {
                     return;

@@ -69,12 +69,13 @@ use std::fmt::Write as _;
 use std::io::IsTerminal;
 use std::process::ExitCode;
 
-use anyhow::{Error, Result};
+use anyhow::Result;
 use clap::builder::StyledStr;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use tracing_subscriber::EnvFilter;
 
 use exit::{EXIT_CODES, Exit};
+use output::with_causes;
 
 /// Clearway turns LIDAR packets into maps of where a vehicle may drive.
 #[derive(Parser)]
@@ -176,17 +177,6 @@ fn print_usage(usage: &clap::Error) -> ExitCode {
     if usage.use_stderr() { Exit::WrongUse.into() } else { Exit::Good.into() }
 }
 
-/// The text of an error and of its causes. A cause that the text before it contains already is left out.
-fn with_causes(error: &Error) -> String {
-    let mut text = error.to_string();
-    for cause in error.chain().skip(1).map(ToString::to_string) {
-        if !text.contains(&cause) {
-            text = format!("{text}: {cause}");
-        }
-    }
-    text
-}
-
 fn start_logs(format: LogFormat) {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,zenoh=error"));
     let logs = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
@@ -255,6 +245,8 @@ fn grouped_subcommands(command: &clap::Command) -> String {
 
 #[cfg(test)]
 mod tests {
+    use anyhow::Error;
+
     use super::*;
 
     #[test]

@@ -11,6 +11,17 @@ pub use crate::counted::counted;
 /// Threads of the runtime at least, because zenoh needs several, whatever the machine has.
 const THREADS_MIN: usize = 2;
 
+/// The text of an error and of its causes. A cause that the text before it contains already is left out.
+pub fn with_causes(error: &Error) -> String {
+    let mut text = error.to_string();
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        if !text.contains(&cause) {
+            text = format!("{text}: {cause}");
+        }
+    }
+    text
+}
+
 /// Prints `text` on stdout. `false` if the reader of stdout has closed it (`| head`), which is no error.
 ///
 /// # Errors

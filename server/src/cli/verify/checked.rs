@@ -8,6 +8,7 @@ use std::time::Instant;
 use anyhow::{Context, Result};
 
 use crate::cli::exit::Exit;
+use crate::cli::output::with_causes;
 use crate::config::{Calibrations, Config};
 use crate::record::compare::{After, Comparison, compare};
 use crate::record::reader::RecordingReader;
@@ -97,7 +98,7 @@ pub fn check_all(files: &[PathBuf], check: &Check, jobs: usize) -> Vec<Checked> 
 
 fn check_one(file: &Path, check: &Check) -> Checked {
     let began = Instant::now();
-    let outcome = outcome(file, check).unwrap_or_else(|error| Outcome::Unreadable(crate::cli::with_causes(&error)));
+    let outcome = outcome(file, check).unwrap_or_else(|error| Outcome::Unreadable(with_causes(&error)));
     Checked { file: file.to_owned(), seconds: began.elapsed().as_secs_f64(), outcome, pictures: Vec::new() }
 }
 
