@@ -300,7 +300,7 @@ async fn two_captures_sent_to_one_port_make_the_maps_of_their_files() {
     let live = recorded_of(&at("live.mcap"));
 
     for (vehicle, capture, _) in captures {
-        let record = at("file.mcap");
+        let record = at(&format!("{vehicle}.mcap"));
         let options = Options {
             files: vec![capture],
             record: Some(record.clone()),

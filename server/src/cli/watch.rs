@@ -61,8 +61,8 @@ pub struct Options {
     until_stale: bool,
 }
 
-/// Prints lines until the stream or a replay ends, the count is reached, the map is stale with `--until-stale`, or the reader of
-/// stdout has closed it.
+/// Prints lines until the stream or a replay ends, the count is reached, the map is stale with `--until-stale`,
+/// or the reader of stdout has closed it.
 ///
 /// # Errors
 /// [`ClientError`](clearway_client::ClientError) if the server refuses, does not answer or ends the stream.

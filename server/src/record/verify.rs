@@ -124,8 +124,8 @@ pub enum VerifyError {
 }
 
 impl Report {
-    /// True if the readable part of the recording has events, every map in it is the map of its events, and the recorder
-    /// has dropped nothing.
+    /// True if the readable part of the recording has events, every map in it is the map of its events, and the
+    /// recorder has dropped nothing.
     pub fn is_good(&self) -> bool {
         self.different == 0 && self.events > 0 && self.dropped == 0
     }
@@ -355,8 +355,8 @@ impl VehicleReplay {
     }
 }
 
-/// The sequence of a recorded map of one layer and the number of its cells; `u64::MAX` for an unreadable map, which then
-/// counts as extra.
+/// The sequence of a recorded map of one layer and the number of its cells; `u64::MAX` for an unreadable map, which
+/// then counts as extra.
 fn sequence_and_cells(bytes: &Bytes) -> (u64, u64) {
     let Ok(map) = v1::Map::decode(bytes.clone()) else { return (u64::MAX, 0) };
     let channels = map.layers.first().map(|layer| &layer.channels[..]).unwrap_or_default();

@@ -18,7 +18,7 @@ use tonic::{Request, Response, Status, Streaming};
 use tonic_health::server::HealthReporter;
 
 use super::listen::Listener;
-use super::listen::access::Caller;
+use super::listen::access::caller;
 use super::served::Vehicles;
 use reader::watch;
 use recording::Recordings;
@@ -96,11 +96,6 @@ async fn report_recorder(health: HealthReporter, recorder: RecorderControl) {
             health.set_not_serving::<RecordingServiceServer<Recordings>>().await;
         }
     }
-}
-
-/// What the client of a request may reach.
-fn caller<T>(request: &Request<T>) -> Caller {
-    request.extensions().get().cloned().unwrap_or_default()
 }
 
 struct Maps {

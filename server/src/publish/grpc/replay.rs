@@ -8,8 +8,7 @@ use futures::{Stream, stream};
 use tonic::{Request, Response, Status};
 use v1::replay_service_server::ReplayService;
 
-use super::super::listen::access::Caller;
-use super::caller;
+use super::super::listen::access::{Caller, caller};
 use crate::replay::ReplayHandle;
 
 /// Least time between two states of a stream.

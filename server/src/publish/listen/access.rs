@@ -80,6 +80,11 @@ pub struct Caller {
     is_operator: bool,
 }
 
+/// What the client of a request may reach.
+pub fn caller<T>(request: &tonic::Request<T>) -> Caller {
+    request.extensions().get().cloned().unwrap_or_default()
+}
+
 impl Caller {
     /// A client that may do and reach everything.
     pub fn unlimited() -> Self {

@@ -26,7 +26,8 @@ const WHOLE_FROM: f32 = 8_388_608.0;
 /// Least distance between two rings with a row each, metres. Ours: an HDL-64E's range noise of 2 cm mixes nearer rings.
 const RING_SPACING_M_MIN: f32 = 0.02;
 
-/// Depth of a row if fewer than two rings meet the ground, metres. Ours: near ground must not free a cell that reaches far beyond it.
+/// Depth of a row if fewer than two rings meet the ground, metres. Ours: near ground must
+/// not free a cell that reaches far beyond it.
 const ROW_DEPTH_M: f32 = 1.0;
 
 /// Grid of range and azimuth about a sensor.
