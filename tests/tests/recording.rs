@@ -301,8 +301,8 @@ async fn an_address_in_use_is_refused_and_the_old_recording_is_kept() {
 fn a_full_disk_ends_the_recording_and_maps_continue() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("full.mcap");
-    // No file of this process may grow beyond half a megabyte; the write fails instead of the process.
-    let limited = "trap '' XFSZ; ulimit -f 1024; exec \"$0\" demo --seconds 4 --json --record \"$1\"";
+    // No file of this process may grow beyond three megabytes, a few chunks; the write fails instead of the process.
+    let limited = "trap '' XFSZ; ulimit -f 6144; exec \"$0\" demo --seconds 4 --json --record \"$1\"";
     let output = std::process::Command::new("sh")
         .args(["-c", limited])
         .arg(clearway_tests::binaries().join("clearway"))
