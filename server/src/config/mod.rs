@@ -29,6 +29,7 @@ mod zenoh;
 
 pub use connections::{Connections, Service};
 pub use error::{ConfigError, Origin};
+#[cfg(feature = "zenoh")]
 pub(crate) use grpc::secret;
 pub use grpc::{Access, Certificates, Grpc, Only, Tls};
 pub use listeners::{Listener, Route, listeners};
