@@ -143,11 +143,13 @@ impl Bed {
     async fn attempt(&self, attempt: &Attempt, caller: Caller, id: u64) {
         let session = self.sessions.get(caller.name);
         match (attempt, session) {
-            (Attempt::Rpc(path), _) => self.call(path, caller).await,
+            (Attempt::Rpc(path), _) => repeat(async || self.call(path, caller).await).await,
             (Attempt::Get(listener, path), _) => {
-                self.request(*listener, path, caller, "Connection: close\r\n", 200).await;
+                repeat(async || self.request(*listener, path, caller, "Connection: close\r\n").await == 200).await;
             }
-            (Attempt::WebSocket(listener, path), _) => self.request(*listener, path, caller, UPGRADE, 101).await,
+            (Attempt::WebSocket(listener, path), _) => {
+                repeat(async || self.request(*listener, path, caller, UPGRADE).await == 101).await;
+            }
             (_, None) => std::future::pending().await,
             (Attempt::Subscribe(key), Some(session)) => {
                 // What this session puts itself would reach it without the server.
@@ -190,7 +192,8 @@ impl Bed {
         }
     }
 
-    async fn call(&self, path: &'static str, caller: Caller) {
+    /// Calls an RPC; true if the caller may make it.
+    async fn call(&self, path: &'static str, caller: Caller) -> bool {
         let read = |folder: &Path, file: String| std::fs::read_to_string(folder.join(file)).expect("a certificate");
         let mut tls = ClientTlsConfig::new().domain_name("localhost");
         tls = tls.ca_certificate(Certificate::from_pem(read(&certificates("ours"), "ca.pem".into())));
@@ -200,25 +203,23 @@ impl Bed {
         }
         let at = format!("https://{}", self.running.grpc.expect("gRPC is served"));
         let Ok(channel) = Endpoint::from_shared(at).unwrap().tls_config(tls).unwrap().connect().await else {
-            return std::future::pending().await;
+            return false;
         };
         let mut client = tonic::client::Grpc::new(channel);
         let (Ok(()), path) = (client.ready().await, PathAndQuery::from_static(path)) else {
-            return std::future::pending().await;
+            return false;
         };
         let mut request = tonic::Request::new(tokio_stream::once(()));
         if let Some(token) = caller.token {
             request.metadata_mut().insert("authorization", format!("Bearer {token}").parse().unwrap());
         }
-        match client.streaming(request, path, ProstCodec::<(), ()>::default()).await {
-            Err(status) if !OF_CONTENT.contains(&status.code()) => std::future::pending().await,
-            // An answer, or a complaint about the content of the call, which only those get that may make it.
-            _ => {}
-        }
+        // An answer, or a complaint about the content of the call, which only those get that may make it.
+        let answer = client.streaming(request, path, ProstCodec::<(), ()>::default()).await;
+        answer.err().is_none_or(|status| OF_CONTENT.contains(&status.code()))
     }
 
-    /// Sends a request with these headers; returns if its answer has this status.
-    async fn request(&self, listener: Listener, path: &str, caller: Caller, headers: &str, status: u16) {
+    /// Sends a request with these headers; returns the status of its answer, 0 without one.
+    async fn request(&self, listener: Listener, path: &str, caller: Caller, headers: &str) -> u16 {
         let at = match listener {
             Listener::Page => self.running.page,
             Listener::Metrics => self.running.metrics,
@@ -230,9 +231,14 @@ impl Bed {
         if let Some(mut stream) = https::send(at.expect("it is served"), &head, caller.certificate).await {
             let _closed = stream.read_exact(&mut answer).await;
         }
-        if https::status(&String::from_utf8_lossy(&answer)) != status {
-            std::future::pending().await
-        }
+        https::status(&String::from_utf8_lossy(&answer))
+    }
+}
+
+/// Makes an attempt on a connection of its own until it succeeds: all attempts at once are more than a listener takes.
+async fn repeat(attempt: impl AsyncFn() -> bool) {
+    while !attempt().await {
+        tokio::time::sleep(Duration::from_secs(1)).await;
     }
 }
 
