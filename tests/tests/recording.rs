@@ -317,7 +317,7 @@ fn a_full_disk_ends_the_recording_and_maps_continue() {
     );
     let seconds: Vec<serde_json::Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let maps: Vec<u64> = seconds.iter().map(|second| second["maps"].as_u64().unwrap()).collect();
-    assert!(maps.len() > 2 && maps.last() > maps.get(1), "maps are made after the disk has failed: {said}");
+    assert!(maps.len() > 1 && maps.last() > maps.first(), "maps are made after the disk has failed: {said}");
     let report = verify(&file.with_extension("unfinished.mcap")).unwrap();
     assert!(report.is_good() && report.cut, "what was recorded before is good: {report:?}");
 }
