@@ -66,18 +66,26 @@ fn mark_changed(contexts: &mut [u8], columns: usize, changed: usize) {
     }
 }
 
+/// Number of unchanged cells of context 0 at the beginning, a multiple of [`CALM`]'s length.
+fn calm_cells<T: Cell>(cells: &[T], now: &[T], contexts: &[u8]) -> usize {
+    const STEP: usize = CALM.len();
+    let blocks = cells.as_chunks::<STEP>().0.iter().zip(now.as_chunks::<STEP>().0).zip(contexts.as_chunks::<STEP>().0);
+    STEP * blocks.take_while(|((cells, now), contexts)| **contexts == CALM && cells == now).count()
+}
+
 /// Encodes `cells` as differences from `base`, which has as many cells, in rows of `columns`.
 pub(crate) fn encode_changes<T: Cell>(cells: &[T], base: Vec<T>, columns: usize) -> Vec<u8> {
     let mut contexts = borders(&base, columns);
     let mut writer = RunWriter { tokens: Vec::new(), newest: [None; CONTEXTS] };
     let (mut now, mut at) = (base, 0);
     while at < cells.len() {
-        if contexts[at..].starts_with(&CALM) && cells[at..at + CALM.len()] == now[at..at + CALM.len()] {
-            writer.push_flags(0, false, CALM.len() as u64);
-            at += CALM.len();
+        let is_changed = cells[at] != now[at];
+        if contexts[at] == 0 && !is_changed {
+            let calm = calm_cells(&cells[at..], &now[at..], &contexts[at..]);
+            writer.push_flags(0, false, calm.max(1) as u64);
+            at += calm.max(1);
             continue;
         }
-        let is_changed = cells[at] != now[at];
         writer.push_flags(contexts[at].into(), is_changed, 1);
         if is_changed {
             mark_changed(&mut contexts, columns, at);
