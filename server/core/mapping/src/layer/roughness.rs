@@ -49,11 +49,14 @@ impl Roughness {
         let (mut deviations, mut noises) = ([0_i32; CHUNK], [0_i32; CHUNK]);
         for ((cells, deviation), noise) in cells.chunks(CHUNK).zip(deviation.chunks(CHUNK)).zip(noise.chunks(CHUNK)) {
             // Without a branch, so that the compiler vectorises it. The casts saturate.
-            for (steps, &deviation) in deviations.iter_mut().zip(deviation) {
+            for ((steps, squared), (&deviation, &noise)) in
+                deviations.iter_mut().zip(&mut noises).zip(deviation.iter().zip(noise))
+            {
                 // NaN fails the comparison.
-                *steps = if deviation.abs() <= DEVIATION_MAX { (deviation * STEPS) as i32 } else { UNKNOWN };
+                let is_known = deviation.abs() <= DEVIATION_MAX;
+                *steps = if is_known { (deviation * STEPS) as i32 } else { UNKNOWN };
+                *squared = (noise * STEPS) as i32;
             }
-            noises.iter_mut().zip(noise).for_each(|(steps, noise)| *steps = (noise * STEPS) as i32);
             for ((&cell, &deviation), &noise) in cells.iter().zip(&deviations).zip(&noises) {
                 if deviation != UNKNOWN
                     && let Some(sums) = self.sums.get_mut(cell as usize)

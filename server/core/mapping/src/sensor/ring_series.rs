@@ -28,8 +28,8 @@ pub struct RingSeries {
     ranks: Vec<f32>,
     /// Index in `points` of the next point of each ring.
     next_of_ring: Vec<u32>,
-    /// Points by ring: a number that rises with the azimuth, and the index in the scan.
-    points: Vec<(f32, u32)>,
+    /// Points by ring, as [`key`]s.
+    points: Vec<u64>,
     /// Of one ring, by point: x, y and z, metres.
     positions_m: [Vec<f32>; 3],
     /// Of one ring, by point: angle to the point before, radians.
@@ -85,20 +85,20 @@ impl RingSeries {
             self.first_of_ring[ring + 1] += self.first_of_ring[ring];
         }
         self.next_of_ring.clone_from(&self.first_of_ring);
-        self.points.resize(self.first_of_ring[rings] as usize, (0.0, 0));
+        self.points.resize(self.first_of_ring[rings] as usize, 0);
         for (index, (&ring, &rank)) in (0..).zip(scan.ring.iter().zip(&self.ranks)) {
             if !rank.is_nan() {
                 let slot = &mut self.next_of_ring[usize::from(ring)];
-                self.points[*slot as usize] = (rank, index);
+                self.points[*slot as usize] = key(rank, index);
                 *slot += 1;
             }
         }
     }
 
-    fn find_steps(&mut self, scan: &Scan, of_ring: &[(f32, u32)]) {
+    fn find_steps(&mut self, scan: &Scan, of_ring: &[u64]) {
         for (positions_m, from) in self.positions_m.iter_mut().zip([&scan.x, &scan.y, &scan.z]) {
             positions_m.clear();
-            positions_m.extend(of_ring.iter().map(|(_, point)| from[*point as usize]));
+            positions_m.extend(of_ring.iter().map(|key| from[*key as u32 as usize]));
         }
         let [xs, ys, _] = &self.positions_m;
         self.steps_rad.clear();
@@ -112,7 +112,7 @@ impl RingSeries {
     }
 
     /// Fills `ranges_m` and `measured`; both stay empty if the ring has no azimuth step.
-    fn fill_gaps(&mut self, of_ring: &[(f32, u32)]) {
+    fn fill_gaps(&mut self, of_ring: &[u64]) {
         self.ranges_m.clear();
         self.measured.clear();
         self.candidates.clear();
@@ -125,7 +125,7 @@ impl RingSeries {
         let [xs, ys, zs] = &self.positions_m;
         let mut since_last_rad = f32::INFINITY;
         let points = of_ring.iter().zip(&self.steps_rad).zip(xs.iter().zip(ys).zip(zs));
-        for ((&(_, point), &rad), ((x, y), z)) in points {
+        for ((&key, &rad), ((x, y), z)) in points {
             since_last_rad += rad;
             if since_last_rad < SAME_RAY_SHARE * step_rad {
                 continue;
@@ -139,7 +139,7 @@ impl RingSeries {
                 let missing = (steps.round() as usize).saturating_sub(1).min(REACH);
                 self.ranges_m.extend(std::iter::repeat_n(last_m, missing));
             }
-            self.measured.push((self.ranges_m.len() as u32, point));
+            self.measured.push((self.ranges_m.len() as u32, key as u32));
             self.ranges_m.push(range_m);
             since_last_rad = 0.0;
         }
@@ -166,13 +166,31 @@ impl RingSeries {
     }
 }
 
-/// Sorts the points of a ring by azimuth; points of equal azimuth keep their order. Most come in one or two rising
-/// runs.
-fn sort_by_azimuth(of_ring: &mut [(f32, u32)]) {
-    let falls = |pair: &[(f32, u32)]| pair[1].0 < pair[0].0;
-    let Some(end) = of_ring.windows(2).position(falls).map(|at| at + 1) else { return };
-    let is_rotated = of_ring[of_ring.len() - 1].0 < of_ring[0].0 && !of_ring[end..].windows(2).any(falls);
-    if is_rotated { of_ring.rotate_left(end) } else { of_ring.sort_by(|(a, _), (b, _)| a.total_cmp(b)) }
+/// A point of a ring: its rank, which is not negative, so that its bits rise with it; then its index in the scan. Of two
+/// points of equal azimuth the first in the scan comes first.
+fn key(rank: f32, index: u32) -> u64 {
+    u64::from(rank.to_bits()) << 32 | u64::from(index)
+}
+
+/// Sorts the points of a ring by azimuth. Most rings come by azimuth, from any azimuth on, with few points out of order.
+fn sort_by_azimuth(of_ring: &mut [u64]) {
+    // Where the azimuth falls by a half circle, the next one begins.
+    let rank = |key: u64| f32::from_bits((key >> 32) as u32);
+    if let Some(at) = of_ring.windows(2).position(|pair| rank(pair[0]) - rank(pair[1]) > 2.0) {
+        of_ring.rotate_left(at + 1);
+    }
+    let mut moves = 4 * of_ring.len();
+    for at in 1..of_ring.len() {
+        let (key, mut to) = (of_ring[at], at);
+        while to > 0 && of_ring[to - 1] > key && moves > 0 {
+            of_ring[to] = of_ring[to - 1];
+            (to, moves) = (to - 1, moves - 1);
+        }
+        of_ring[to] = key;
+        if moves == 0 {
+            return of_ring.sort_unstable();
+        }
+    }
 }
 
 /// A number from 0 to 4 that rises with the azimuth of a direction, counter-clockwise from behind.

@@ -32,15 +32,15 @@ impl RoughGround {
         self.roughness.clear(side * side);
         let (middle, cells_a_m, end) = ((side / 2) as f32, 1.0 / config.cell_m, side as f32);
         let points = sweep.x.iter().zip(&sweep.y).zip(heights_m);
-        self.cell_of_point.clear();
+        self.cell_of_point.resize(sweep.x.len(), NOWHERE);
         // Without a branch, so that the compiler vectorises it.
-        self.cell_of_point.extend(points.map(|((&x, &y), &height)| {
+        for (cell, ((&x, &y), &height)) in self.cell_of_point.iter_mut().zip(points) {
             let (ix, iy) = (x * cells_a_m + middle, y * cells_a_m + middle);
             // NaN fails every comparison.
             let inside = (ix >= 0.0) & (ix < end) & (iy >= 0.0) & (iy < end) & (height <= config.overhang_m);
             let [ix, iy] = [ix, iy].map(|index| floor_to_whole(if inside { index } else { 0.0 }));
-            if inside { iy * side as u32 + ix } else { NOWHERE }
-        }));
+            *cell = if inside { iy * side as u32 + ix } else { NOWHERE };
+        }
         self.roughness.add_points(&self.cell_of_point, &sweep.deviation, &sweep.noise);
     }
 
