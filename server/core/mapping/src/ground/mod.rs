@@ -170,8 +170,7 @@ impl Ground {
         let range_m = RANGE_M_MIN;
         self.nodes.clear();
         let directions = polar::column_directions();
-        let first: Vec<f32> =
-            directions.iter().map(|[cos, sin]| self.plane.height_m(range_m * cos, range_m * sin)).collect();
+        let first = directions.map(|[cos, sin]| self.plane.height_m(range_m * cos, range_m * sin));
         for row in std::iter::once(&first[..]).chain(self.surface.heights_m().chunks(COLUMNS)) {
             self.nodes.push(row[COLUMNS - 1]);
             self.nodes.extend_from_slice(row);
