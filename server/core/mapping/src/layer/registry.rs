@@ -207,7 +207,10 @@ impl Layers {
 
     /// Adds the evidence of one sensor's scan to the active layers.
     pub fn integrate(&mut self, rays: &Rays<'_>) {
-        self.layers.iter_mut().filter_map(|layer| layer.active.as_mut()).for_each(|active| active.maker.integrate(rays));
+        self.layers
+            .iter_mut()
+            .filter_map(|layer| layer.active.as_mut())
+            .for_each(|active| active.maker.integrate(rays));
     }
 
     /// Makes the active layers of one map, in place of those in `layers`, whose memory is used again.

@@ -103,7 +103,8 @@ impl Terrain {
     fn seen_cells(&self) -> impl Iterator<Item = usize> {
         self.seen.iter().enumerate().filter(|(_, bits)| **bits != 0).flat_map(|(word, &bits)| {
             let without_lowest = |bits: &u64| Some(bits & (bits - 1)).filter(|bits| *bits != 0);
-            std::iter::successors(Some(bits), without_lowest).map(move |bits| 64 * word + bits.trailing_zeros() as usize)
+            std::iter::successors(Some(bits), without_lowest)
+                .map(move |bits| 64 * word + bits.trailing_zeros() as usize)
         })
     }
 
