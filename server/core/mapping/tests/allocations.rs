@@ -50,7 +50,7 @@ fn the_maps_of_the_same_scan_need_few_allocations_once_their_buffers_are_there()
         step(&mut pipeline, &event(Body::EgoPose(EgoPose { stamp_ns, map_from_ego, speed_mps: 0.0 })));
         let (allocations, made) = step(&mut pipeline, &event(Body::Scan(Scan { stamp_ns, ..scan.clone() })));
         assert!(made);
-        // The state of the window changes from map to map, and two maps take turns in their buffers.
+        // In the first maps the buffers get their sizes.
         assert!(number < 6 || allocations <= MAP_MAX, "map {number}: {allocations} allocations");
     }
 }
