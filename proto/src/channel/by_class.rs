@@ -51,7 +51,8 @@ pub enum ByClassError {
 /// [`encode_grid`](crate::channel::codec::encode_grid).
 ///
 /// # Panics
-/// As [`encode_grid`](crate::channel::codec::encode_grid); also if `class` has another length than `cells`, or holds a value of `classes` or more.
+/// As [`encode_grid`](crate::channel::codec::encode_grid); also if `class` has another length than `cells`, or holds a
+/// value of `classes` or more.
 pub fn encode_beside(cells: CellsRef<'_>, class: &[u8], classes: usize, columns: usize) -> Encoded {
     assert_eq!(cells.len(), class.len(), "one class per cell");
     let changes = match cells {

@@ -166,13 +166,14 @@ impl RingSeries {
     }
 }
 
-/// A point of a ring: its rank, which is not negative, so that its bits rise with it; then its index in the scan. Of two
-/// points of equal azimuth the first in the scan comes first.
+/// A point of a ring: its rank, which is not negative, so that its bits rise with it; then its index in the scan. Of
+/// two points of equal azimuth the first in the scan comes first.
 fn key(rank: f32, index: u32) -> u64 {
     u64::from(rank.to_bits()) << 32 | u64::from(index)
 }
 
-/// Sorts the points of a ring by azimuth. Most rings come by azimuth, from any azimuth on, with few points out of order.
+/// Sorts the points of a ring by azimuth. Most rings come by azimuth, from any azimuth on, with few points out of
+/// order.
 fn sort_by_azimuth(of_ring: &mut [u64]) {
     // Where the azimuth falls by a half circle, the next one begins.
     let rank = |key: u64| f32::from_bits((key >> 32) as u32);
