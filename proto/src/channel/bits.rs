@@ -22,7 +22,7 @@ impl Mean {
 /// Writes numbers as bits.
 pub(crate) struct BitWriter {
     bytes: Vec<u8>,
-    /// The last `count` bits are not yet in `bytes`; `count` is less than 8.
+    /// The last `count` bits are not yet in `bytes`; `count` is less than 32.
     pending: u64,
     count: u32,
 }
@@ -35,7 +35,7 @@ impl BitWriter {
 
     /// Number of complete bytes so far.
     pub(crate) fn len(&self) -> usize {
-        self.bytes.len()
+        self.bytes.len() + self.count as usize / 8
     }
 
     pub(crate) fn write_bit(&mut self, bit: bool) {
@@ -55,24 +55,34 @@ impl BitWriter {
 
     /// Fills the last byte with zeros and returns the bytes.
     pub(crate) fn finish(mut self) -> Vec<u8> {
-        let free = (8 - self.count) % 8;
-        self.write_bits(0, free);
+        let left = self.count.div_ceil(8);
+        let pending = (self.pending << (32 - self.count)) as u32;
+        self.bytes.extend_from_slice(&pending.to_be_bytes()[..left as usize]);
         self.bytes
     }
 
     fn write_golomb(&mut self, number: u64, order: u32) {
         let number = number + (1 << order);
         let bits = number.ilog2() + 1;
-        self.write_bits(0, bits - 1 - order);
-        self.write_bits(number, bits);
+        let zeros = bits - 1 - order;
+        if zeros + bits <= 32 {
+            // Zeros before a number do not change its value.
+            self.write_bits(number, zeros + bits);
+        } else {
+            self.write_bits(0, zeros);
+            self.write_bits(number >> 16, bits - 16);
+            self.write_bits(number & 0xffff, 16);
+        }
     }
 
+    /// Writes up to 32 bits.
+    #[inline]
     fn write_bits(&mut self, bits: u64, count: u32) {
         self.pending = self.pending << count | bits;
         self.count += count;
-        while self.count >= 8 {
-            self.count -= 8;
-            self.bytes.push((self.pending >> self.count) as u8);
+        if self.count >= 32 {
+            self.count -= 32;
+            self.bytes.extend_from_slice(&((self.pending >> self.count) as u32).to_be_bytes());
         }
     }
 }

@@ -8,8 +8,11 @@ use bytes::Bytes;
 
 use crate::channel::cells::{Cell, Cells, CellsRef};
 use crate::channel::changes::encode_changes;
-use crate::channel::codec::{Encoded, encode_grid};
+use crate::channel::codec::{Encoded, encode_smallest};
 use crate::v1;
+
+/// Number of cells that are compared at once. Ours: most of a map are patches of one class.
+const BLOCK: usize = 32;
 
 /// Why the class table of a channel was refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -44,29 +47,34 @@ pub enum ByClassError {
 }
 
 /// Encodes the cells of a grid with rows of `columns` cells whose classes are known; `class` holds one value per cell,
-/// less than `classes`. The result has a class table if that is shorter than [`encode_grid`].
+/// less than `classes`. The result has a class table if that is shorter than
+/// [`encode_grid`](crate::channel::codec::encode_grid).
 ///
 /// # Panics
-/// As [`encode_grid`]; also if `class` has another length than `cells`, or holds a value of `classes` or more.
+/// As [`encode_grid`](crate::channel::codec::encode_grid); also if `class` has another length than `cells`, or holds a
+/// value of `classes` or more.
 pub fn encode_beside(cells: CellsRef<'_>, class: &[u8], classes: usize, columns: usize) -> Encoded {
     assert_eq!(cells.len(), class.len(), "one class per cell");
-    let plain = encode_grid(cells, columns);
-    let (by_class, changes) = match cells {
+    let changes = match cells {
         CellsRef::U8(cells) => table_and_changes(cells, class, classes, columns.max(1)),
         CellsRef::I8(cells) => table_and_changes(cells, class, classes, columns.max(1)),
         CellsRef::U16(cells) => table_and_changes(cells, class, classes, columns.max(1)),
     };
-    if by_class.len() + changes.len() < plain.payload.len() {
-        Encoded { encoding: v1::Encoding::Changes, payload: changes.into(), by_class, ..plain }
-    } else {
-        plain
-    }
+    encode_smallest(cells, columns, Some(changes))
 }
 
 /// The class table, and the changes from it.
 fn table_and_changes<T: Cell>(cells: &[T], class: &[u8], classes: usize, columns: usize) -> (Bytes, Vec<u8>) {
     let table = majorities(cells, class, classes);
-    let base = class.iter().map(|&class| table[usize::from(class)]).collect();
+    let mut base = Vec::with_capacity(class.len());
+    let (blocks, rest) = class.as_chunks::<BLOCK>();
+    for block in blocks {
+        match equal_value(block) {
+            Some(class) => base.extend([table[usize::from(class)]; BLOCK]),
+            None => base.extend(block.map(|class| table[usize::from(class)])),
+        }
+    }
+    base.extend(rest.iter().map(|class| table[usize::from(*class)]));
     let changes = encode_changes(cells, base, columns);
     (T::into_cells(table).as_ref().to_le_bytes().into_owned().into(), changes)
 }
@@ -75,15 +83,33 @@ fn table_and_changes<T: Cell>(cells: &[T], class: &[u8], classes: usize, columns
 /// there is no majority.
 fn majorities<T: Cell>(cells: &[T], class: &[u8], classes: usize) -> Vec<T> {
     let mut majorities = vec![(T::default(), 0_u32); classes];
-    for (&cell, &class) in cells.iter().zip(class) {
-        let (value, votes) = &mut majorities[usize::from(class)];
-        match *votes {
-            0 => (*value, *votes) = (cell, 1),
-            _ if *value == cell => *votes += 1,
-            _ => *votes -= 1,
+    // Cells of one value and one class vote together.
+    let mut vote = |cell: T, class: u8, votes: u32| {
+        let (value, lead) = &mut majorities[usize::from(class)];
+        if *value == cell {
+            *lead += votes;
+        } else if *lead >= votes {
+            *lead -= votes;
+        } else {
+            (*value, *lead) = (cell, votes - *lead);
+        }
+    };
+    let ((cell_blocks, last_cells), (class_blocks, last_classes)) =
+        (cells.as_chunks::<BLOCK>(), class.as_chunks::<BLOCK>());
+    for (cells, classes) in cell_blocks.iter().zip(class_blocks) {
+        match (equal_value(cells), equal_value(classes)) {
+            (Some(cell), Some(class)) => vote(cell, class, BLOCK as u32),
+            _ => cells.iter().zip(classes).for_each(|(cell, class)| vote(*cell, *class, 1)),
         }
     }
+    last_cells.iter().zip(last_classes).for_each(|(cell, class)| vote(*cell, *class, 1));
     majorities.into_iter().map(|(value, _)| value).collect()
+}
+
+/// The value of a block of equal values; `None` if they differ. It has no branches, so that the compiler vectorises it.
+fn equal_value<T: Copy + PartialEq>(block: &[T; BLOCK]) -> Option<T> {
+    let first = block[0];
+    block.iter().fold(true, |equal, value| equal & (*value == first)).then_some(first)
 }
 
 /// The base of a channel with a class table: the table's value for each cell's class. `class`: the cells of channel

@@ -85,7 +85,11 @@ impl<'a> CellsRef<'a> {
         match self {
             Self::U8(cells) => Cow::Borrowed(cells),
             Self::I8(cells) => cells.iter().map(|&v| v as u8).collect::<Vec<u8>>().into(),
-            Self::U16(cells) => cells.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into(),
+            Self::U16(cells) => {
+                let mut bytes = vec![0; 2 * cells.len()];
+                bytes.as_chunks_mut().0.iter_mut().zip(cells).for_each(|(bytes, v)| *bytes = v.to_le_bytes());
+                bytes.into()
+            }
         }
     }
 }

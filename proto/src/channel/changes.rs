@@ -66,18 +66,26 @@ fn mark_changed(contexts: &mut [u8], columns: usize, changed: usize) {
     }
 }
 
+/// Number of unchanged cells of context 0 at the beginning, a multiple of [`CALM`]'s length.
+fn calm_cells<T: Cell>(cells: &[T], now: &[T], contexts: &[u8]) -> usize {
+    const STEP: usize = CALM.len();
+    let blocks = cells.as_chunks::<STEP>().0.iter().zip(now.as_chunks::<STEP>().0).zip(contexts.as_chunks::<STEP>().0);
+    STEP * blocks.take_while(|((cells, now), contexts)| **contexts == CALM && cells == now).count()
+}
+
 /// Encodes `cells` as differences from `base`, which has as many cells, in rows of `columns`.
 pub(crate) fn encode_changes<T: Cell>(cells: &[T], base: Vec<T>, columns: usize) -> Vec<u8> {
     let mut contexts = borders(&base, columns);
-    let mut writer = RunWriter { tokens: Vec::new(), newest: [None; CONTEXTS] };
+    let mut writer = RunWriter { tokens: Vec::with_capacity(cells.len() / 16), newest: [Run::default(); CONTEXTS] };
     let (mut now, mut at) = (base, 0);
     while at < cells.len() {
-        if contexts[at..].starts_with(&CALM) && cells[at..at + CALM.len()] == now[at..at + CALM.len()] {
-            writer.push_flags(0, false, CALM.len() as u64);
-            at += CALM.len();
+        let is_changed = cells[at] != now[at];
+        if contexts[at] == 0 && !is_changed {
+            let calm = calm_cells(&cells[at..], &now[at..], &contexts[at..]);
+            writer.push_flags(0, false, calm.max(1) as u32);
+            at += calm.max(1);
             continue;
         }
-        let is_changed = cells[at] != now[at];
         writer.push_flags(contexts[at].into(), is_changed, 1);
         if is_changed {
             mark_changed(&mut contexts, columns, at);
@@ -87,7 +95,7 @@ pub(crate) fn encode_changes<T: Cell>(cells: &[T], base: Vec<T>, columns: usize)
                 writer.push_flags(MISPREDICTED, is_mispredicted, 1);
             }
             if is_mispredicted {
-                writer.tokens.push(Token::Value(cells[at].to_wire().into()));
+                writer.tokens.push(Token::Value(cells[at].to_wire()));
             }
             now[at] = cells[at];
         }
@@ -99,34 +107,60 @@ pub(crate) fn encode_changes<T: Cell>(cells: &[T], base: Vec<T>, columns: usize)
 /// A piece of the payload.
 enum Token {
     /// A run of equal flags of one context; `is_first` if it is the context's first run.
-    Run { context: u8, flag: bool, is_first: bool, length: u64 },
+    Run { context: u8, flag: bool, is_first: bool, length: u32 },
     /// A cell value as a number on the wire.
-    Value(u64),
+    Value(u16),
+}
+
+/// The newest run of a context.
+#[derive(Clone, Copy, Default)]
+struct Run {
+    /// `None` before the context's first run.
+    flag: Option<bool>,
+    length: u32,
+    /// Index of its piece in [`RunWriter::tokens`], which gets the length when the run has ended.
+    token: usize,
 }
 
 /// Collects the pieces of a payload in the order in which a decoder needs them. A run grows after it was started.
 struct RunWriter {
     tokens: Vec<Token>,
-    /// Index in `tokens` of the newest run of each context.
-    newest: [Option<usize>; CONTEXTS],
+    /// By context.
+    newest: [Run; CONTEXTS],
 }
 
 impl RunWriter {
     /// Appends `count` equal flags of a context.
-    fn push_flags(&mut self, context: usize, value: bool, count: u64) {
-        let newest = self.newest[context];
-        if let Some(Token::Run { flag, length, .. }) = newest.and_then(|newest| self.tokens.get_mut(newest))
-            && *flag == value
-        {
-            *length += count;
-            return;
+    #[inline]
+    fn push_flags(&mut self, context: usize, value: bool, count: u32) {
+        let newest = &mut self.newest[context];
+        if newest.flag == Some(value) {
+            newest.length += count;
+        } else {
+            self.begin_run(context, value, count);
         }
-        self.newest[context] = Some(self.tokens.len());
-        let is_first = newest.is_none();
+    }
+
+    #[inline(never)]
+    fn begin_run(&mut self, context: usize, value: bool, count: u32) {
+        self.end_run(context);
+        let is_first = self.newest[context].flag.is_none();
+        self.newest[context] = Run { flag: Some(value), length: count, token: self.tokens.len() };
         self.tokens.push(Token::Run { context: context as u8, flag: value, is_first, length: count });
     }
 
-    fn finish(self) -> Vec<u8> {
+    /// Writes the length of the newest run of a context into its piece.
+    fn end_run(&mut self, context: usize) {
+        let newest = self.newest[context];
+        if newest.flag.is_some()
+            && let Some(Token::Run { length, .. }) = self.tokens.get_mut(newest.token)
+        {
+            *length = newest.length;
+        }
+    }
+
+    fn finish(mut self) -> Vec<u8> {
+        (0..CONTEXTS).for_each(|context| self.end_run(context));
         let mut bits = BitWriter::with_capacity(2 * self.tokens.len());
         let (mut runs, mut values) = ([[Mean::default(); 2]; CONTEXTS], Mean::default());
         for token in self.tokens {
@@ -135,9 +169,9 @@ impl RunWriter {
                     if is_first {
                         bits.write_bit(flag);
                     }
-                    bits.write_adaptive(&mut runs[usize::from(context)][usize::from(flag)], length - 1);
+                    bits.write_adaptive(&mut runs[usize::from(context)][usize::from(flag)], u64::from(length) - 1);
                 }
-                Token::Value(value) => bits.write_adaptive(&mut values, value),
+                Token::Value(value) => bits.write_adaptive(&mut values, value.into()),
             }
         }
         bits.finish()

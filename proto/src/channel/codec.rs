@@ -64,20 +64,32 @@ impl Encoded {
 /// # Panics
 /// If there are 2³² cells or more. No grid has so many, and [`Limits`] refuses far fewer.
 pub fn encode_grid(cells: CellsRef<'_>, columns: usize) -> Encoded {
+    encode_smallest(cells, columns, None)
+}
+
+/// Encodes the cells of a grid with rows of `columns` cells in the smallest encoding; `changes` are a class table and
+/// the changes from it.
+pub(crate) fn encode_smallest(cells: CellsRef<'_>, columns: usize, changes: Option<(Bytes, Vec<u8>)>) -> Encoded {
     let columns = columns.max(1);
-    let rows = match cells {
-        CellsRef::U8(cells) => encode_rows(cells, columns),
-        CellsRef::I8(cells) => encode_rows(cells, columns),
-        CellsRef::U16(cells) => encode_rows(cells, columns),
-    };
     let raw = cells.to_le_bytes();
+    let changes_length = changes.as_ref().map_or(usize::MAX, |(by_class, changes)| by_class.len() + changes.len());
+    // Of equal lengths, raw precedes rows, and rows precede changes.
+    let length_max = raw.len().min(changes_length.saturating_add(1));
+    let rows = match cells {
+        CellsRef::U8(cells) => encode_rows(cells, columns, length_max),
+        CellsRef::I8(cells) => encode_rows(cells, columns, length_max),
+        CellsRef::U16(cells) => encode_rows(cells, columns, length_max),
+    };
     let crc32 = crc32fast::hash(&raw);
-    let (encoding, payload) = match rows {
-        Some(rows) => (v1::Encoding::Rows, Bytes::from(rows)),
-        None => (v1::Encoding::Raw, Bytes::from(raw.into_owned())),
+    let (encoding, payload, by_class) = match (rows, changes) {
+        (Some(rows), _) => (v1::Encoding::Rows, Bytes::from(rows), Bytes::new()),
+        (None, Some((by_class, changes))) if changes_length < raw.len() => {
+            (v1::Encoding::Changes, Bytes::from(changes), by_class)
+        }
+        (None, _) => (v1::Encoding::Raw, Bytes::from(raw.into_owned()), Bytes::new()),
     };
     let cell_count = u32::try_from(cells.len()).expect("a grid has fewer than 2^32 cells");
-    Encoded { cell_type: cells.cell_type(), encoding, cell_count, crc32, payload, by_class: Bytes::new() }
+    Encoded { cell_type: cells.cell_type(), encoding, cell_count, crc32, payload, by_class }
 }
 
 /// Decodes the cells of a channel of a whole layer, with rows of `columns` cells and without a class table. It

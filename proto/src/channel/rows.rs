@@ -7,15 +7,14 @@ use crate::channel::bits::{BitReader, BitWriter};
 use crate::channel::cells::Cell;
 use crate::channel::error::DecodeError;
 
-/// Encodes cells in rows of `columns`; `None` if the result is not smaller than the raw cells.
-pub(crate) fn encode_rows<T: Cell>(cells: &[T], columns: usize) -> Option<Vec<u8>> {
-    let raw_length = cells.len() * T::BYTES;
-    let mut bits = BitWriter::with_capacity((raw_length / 16).max(16));
+/// Encodes cells in rows of `columns`; `None` if the result does not have fewer bytes than `length_max`.
+pub(crate) fn encode_rows<T: Cell>(cells: &[T], columns: usize, length_max: usize) -> Option<Vec<u8>> {
+    let mut bits = BitWriter::with_capacity((cells.len() * T::BYTES / 16).max(16));
     let mut at = 0;
     loop {
         let end = copy_end(cells, columns, at);
         bits.write_number((end - at) as u64);
-        if end == cells.len() || bits.len() >= raw_length {
+        if end == cells.len() || bits.len() >= length_max {
             break;
         }
         let repeats_before = end > 0 && cells[end] == cells[end - 1];
@@ -30,7 +29,7 @@ pub(crate) fn encode_rows<T: Cell>(cells: &[T], columns: usize) -> Option<Vec<u8
         }
     }
     let rows = bits.finish();
-    (rows.len() < raw_length).then_some(rows)
+    (rows.len() < length_max).then_some(rows)
 }
 
 /// Index of the first cell from `start` on that differs from the cell one row before. The row before the first is

@@ -294,6 +294,7 @@ impl Pipeline {
             earliest_ns: stamp_ns.saturating_sub(self.deadline_ns),
             map_from_ego: self.map.map_from_ego,
             ground: self.ground.ground(),
+            radial: &[],
             reach: self.ground.reach(),
             memory: self.ground.memory(),
             road: roads.to_paint(),

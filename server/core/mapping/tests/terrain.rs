@@ -297,7 +297,7 @@ fn coarse_roughness(sweep: &Sweep) -> Vec<Option<f32>> {
     roughness.clear(200 * 200);
     for index in (0..sweep.x.len()).filter(|index| sweep.z[*index] < 2.5) {
         if let Some(cell) = coarse_cell(sweep.x[index], sweep.y[index]) {
-            roughness.add(cell, sweep.deviation[index], sweep.noise[index]);
+            roughness.add_points(&[cell as u32], &sweep.deviation[index..=index], &sweep.noise[index..=index]);
         }
     }
     (0..200 * 200).map(|cell| roughness.of_cell(cell, 4)).collect()

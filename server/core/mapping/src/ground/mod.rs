@@ -48,6 +48,8 @@ pub struct Ground {
 /// Least height over the near plane of a point that may be an object where no ground was seen, metres. Ours: one unit
 /// of the layer `drivability`.
 const OBJECT_M_MIN: f32 = 0.25;
+/// Number of points that are processed together. Ours: their intermediate values fit into the first-level cache.
+const CHUNK: usize = 1024;
 /// Columns of [`Ground::nodes`].
 const WIDTH: usize = COLUMNS + 2;
 
@@ -106,11 +108,41 @@ impl Ground {
 
     fn measure_own_points(&mut self, sweep: &Sweep) {
         let mut heights_m = std::mem::take(&mut self.heights_m);
-        heights_m.clear();
+        heights_m.resize(sweep.x.len(), 0.0);
         let [rows, turns] = self.cells.point_coordinates();
-        let points = sweep.x.iter().zip(&sweep.y).zip(&sweep.z).zip(rows.iter().zip(turns));
-        heights_m.extend(points.map(|(((&x, &y), &z), (&row, &turn))| self.height_over(x, y, z, [row, turn])));
+        let points = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
+        let coordinates = rows.chunks(CHUNK).zip(turns.chunks(CHUNK));
+        for ((((xs, ys), zs), (rows, turns)), heights_m) in points.zip(coordinates).zip(heights_m.chunks_mut(CHUNK)) {
+            self.measure_chunk([xs, ys, zs], [rows, turns], heights_m);
+        }
         self.heights_m = heights_m;
+    }
+
+    /// As [`Self::height_over`] for up to [`CHUNK`] points. What needs no table is computed first and without branches,
+    /// so that the compiler vectorises it.
+    fn measure_chunk(&self, [xs, ys, zs]: [&[f32]; 3], [rows, turns]: [&[f32]; 2], heights_m: &mut [f32]) {
+        let n = xs.len().min(CHUNK);
+        let (xs, ys, zs, rows, turns) = (&xs[..n], &ys[..n], &zs[..n], &rows[..n], &turns[..n]);
+        let (mut cells, mut nodes, mut shares) = ([0_u32; CHUNK], [0_u32; CHUNK], [[0.0_f32; CHUNK]; 2]);
+        let [us, vs] = &mut shares;
+        for i in 0..n {
+            cells[i] = floor_to_whole(rows[i]) * COLUMNS as u32 + floor_to_whole(turns[i]);
+            let (row, column) = (rows[i] + 0.5, turns[i] + 0.5);
+            let (whole_row, whole_column) = (floor_to_whole(row), floor_to_whole(column));
+            (us[i], vs[i]) = (row - whole_row as i32 as f32, column - whole_column as i32 as f32);
+            nodes[i] = whole_row * WIDTH as u32 + whole_column;
+        }
+        let confidences = self.surface.confidences();
+        for i in 0..n {
+            let (x, y, z) = (xs[i], ys[i], zs[i]);
+            let is_near = x * x + y * y < RANGE_M_MIN * RANGE_M_MIN;
+            let confidence = confidences.get(cells[i] as usize).copied().unwrap_or_default();
+            heights_m[i] = if is_near || confidence == Confidence::None {
+                self.height_over(x, y, z, [rows[i], turns[i]])
+            } else {
+                z - self.between_nodes(nodes[i] as usize, [us[i], vs[i]])
+            };
+        }
     }
 
     /// Height of a point over the ground, metres. Where no ground was seen near it, it is the height over the near
@@ -138,8 +170,7 @@ impl Ground {
         let range_m = RANGE_M_MIN;
         self.nodes.clear();
         let directions = polar::column_directions();
-        let first: Vec<f32> =
-            directions.iter().map(|[cos, sin]| self.plane.height_m(range_m * cos, range_m * sin)).collect();
+        let first = directions.map(|[cos, sin]| self.plane.height_m(range_m * cos, range_m * sin));
         for row in std::iter::once(&first[..]).chain(self.surface.heights_m().chunks(COLUMNS)) {
             self.nodes.push(row[COLUMNS - 1]);
             self.nodes.extend_from_slice(row);
@@ -159,6 +190,16 @@ impl Ground {
         self.look_up(x, y, self.cells.coordinates(x, y)).1
     }
 
+    /// Height of the surface behind a node, metres, at these shares of the way to the next row and the next column.
+    #[inline(always)]
+    fn between_nodes(&self, at: usize, [u, v]: [f32; 2]) -> f32 {
+        // A cell of the surface has nodes on all sides.
+        let square = &self.nodes[at..at + WIDTH + 2];
+        let [a, b, c, d] = [square[0], square[1], square[WIDTH], square[WIDTH + 1]];
+        let (inner, outer) = (a + v * (b - a), c + v * (d - c));
+        inner + u * (outer - inner)
+    }
+
     #[inline(always)]
     fn look_up(&self, x: f32, y: f32, [row, column]: [f32; 2]) -> (f32, Confidence) {
         if x * x + y * y < RANGE_M_MIN * RANGE_M_MIN {
@@ -174,10 +215,6 @@ impl Ground {
         let (row, column) = (row + 0.5, column + 0.5);
         let (i, j) = (floor_to_whole(row), floor_to_whole(column));
         let (u, v) = (row - i as f32, column - j as f32);
-        let at = i as usize * WIDTH + j as usize;
-        // A cell of the surface has nodes on all sides.
-        let [a, b, c, d] = [at, at + 1, at + WIDTH, at + WIDTH + 1].map(|node| self.nodes[node]);
-        let (inner, outer) = (a + v * (b - a), c + v * (d - c));
-        (inner + u * (outer - inner), confidence)
+        (self.between_nodes(i as usize * WIDTH + j as usize, [u, v]), confidence)
     }
 }

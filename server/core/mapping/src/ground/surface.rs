@@ -47,12 +47,14 @@ pub struct Surface {
     heights_m: Vec<f32>,
     confidences: Vec<Confidence>,
     around: Neighbourhood,
+    /// Columns of a row whose heights are known.
+    known: [usize; COLUMNS],
 }
 
 impl Default for Surface {
     fn default() -> Self {
         let confidences = vec![Confidence::None; CELLS];
-        Self { heights_m: vec![0.0; CELLS], confidences, around: Neighbourhood::default() }
+        Self { heights_m: vec![0.0; CELLS], confidences, around: Neighbourhood::default(), known: [0; COLUMNS] }
     }
 }
 
@@ -133,11 +135,14 @@ impl Surface {
         for (row, middle_m) in middles_m.iter().enumerate() {
             let column_m = middle_m * std::f32::consts::TAU / COLUMNS as f32;
             let of_row = |column: usize| row * COLUMNS + column % COLUMNS;
-            let known: Vec<usize> =
-                (0..COLUMNS).filter(|column| self.confidences[of_row(*column)] != Confidence::None).collect();
-            let ends =
-                known.iter().zip(known.iter().skip(1).copied().chain(known.first().map(|first| first + COLUMNS)));
-            for (&from, to) in ends {
+            let (known, mut columns) = (&mut self.known, 0);
+            for column in 0..COLUMNS {
+                known[columns] = column;
+                columns += usize::from(self.confidences[of_row(column)] != Confidence::None);
+            }
+            for at in 0..columns {
+                let from = self.known[at];
+                let to = if at + 1 < columns { self.known[at + 1] } else { self.known[0] + COLUMNS };
                 let gap_m = (to - from) as f32 * column_m;
                 let [a, b] = [from, to].map(|column| self.heights_m[of_row(column)]);
                 let longest_m = BRIDGED_M_MAX.min(BRIDGED_ACROSS_SHARE * middle_m);

@@ -9,8 +9,9 @@ use crate::ground::Ground;
 use crate::layer::channel::Channel;
 use crate::layer::class::ClassInfo;
 use crate::layer::grid::Geometry;
+use crate::layer::radial_points::{RadialPoints, RadialSize};
 use crate::memory::MemoryState;
-use crate::reach::Reach;
+use crate::reach::{Reach, ReachCell};
 use crate::road::StoredRoad;
 use crate::sensor::sweep::Sweep;
 
@@ -74,6 +75,8 @@ pub struct Context<'a> {
     pub map_from_ego: Option<Isometry3<f64>>,
     /// Local ground of the sweep; `None` if heights are taken over the plane under the vehicle.
     pub ground: Option<&'a Ground>,
+    /// The radial cells of the sweep's points, for each size that layers share ([`LayerMaker::radial_size`]).
+    pub radial: &'a [RadialPoints],
     /// What the vehicle can reach; `None` if layers do not consider it.
     pub reach: Option<&'a Reach>,
     /// What the map got from memory; `None` without a memory.
@@ -105,13 +108,27 @@ impl<'a> Context<'a> {
     /// True if the vehicle can get to a position.
     #[inline(always)]
     pub fn is_reached(&self, x: f32, y: f32) -> bool {
-        self.reach.is_none_or(|reach| reach.is_reached(x, y))
+        self.reach.is_none_or(|reach| reach.is_reached(ReachCell::at(x, y)))
     }
 
     /// True if an obstacle stands at a position, or a step of the ground ends there.
     #[inline(always)]
     pub fn is_closed(&self, x: f32, y: f32) -> bool {
-        self.reach.is_some_and(|reach| reach.is_closed(x, y))
+        self.reach.is_some_and(|reach| reach.is_closed(ReachCell::at(x, y)))
+    }
+
+    /// The radial cells of the sweep's points; `own` finds them if no other layer shares them.
+    pub fn radial_points<'b>(&self, sweep: &Sweep, own: &'b mut RadialPoints) -> &'b RadialPoints
+    where
+        'a: 'b,
+    {
+        match self.radial.iter().find(|shared| shared.size() == own.size()) {
+            Some(shared) => shared,
+            None => {
+                own.find(sweep, self.azimuths());
+                own
+            }
+        }
     }
 }
 
@@ -175,6 +192,11 @@ pub trait LayerMaker: CloneMaker + Send {
     /// Names of the earlier layers this one is made from.
     fn needs(&self) -> &'static [&'static str] {
         &[]
+    }
+
+    /// The radial grid of a layer that takes the points' cells from [`Context::radial_points`].
+    fn radial_size(&self) -> Option<RadialSize> {
+        None
     }
 
     /// The optional data of a scan this layer uses.

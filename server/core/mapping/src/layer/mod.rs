@@ -28,6 +28,7 @@ pub mod height_difference;
 mod maker;
 pub mod occupancy;
 pub mod radial_grid;
+pub mod radial_points;
 pub(crate) mod registry;
 pub mod roughness;
 pub mod safe_path;

@@ -15,6 +15,7 @@ use crate::layer::height_difference::config::HeightDifferenceConfig;
 use crate::layer::maker::{Context, Layer, LayerMaker, Rays, ScanExtras};
 use crate::layer::occupancy::Occupancy;
 use crate::layer::occupancy::config::OccupancyConfig;
+use crate::layer::radial_points::RadialPoints;
 use crate::layer::safe_path::SafePath;
 use crate::layer::safe_path::config::SafePathConfig;
 use crate::layer::speed::Speed;
@@ -109,7 +110,11 @@ layers! {
 
 /// The enabled layers, active or not.
 #[derive(Clone)]
-pub(crate) struct Layers(Vec<EnabledLayer>);
+pub(crate) struct Layers {
+    layers: Vec<EnabledLayer>,
+    /// The radial cells of the newest map's points, for each size that active layers use.
+    radial: Vec<RadialPoints>,
+}
 
 /// One layer that the configuration enables.
 #[derive(Clone)]
@@ -146,22 +151,22 @@ impl Layers {
             let name = maker.layer().name;
             Some(EnabledLayer { name, create, subscribed: true, made: 0, active: Some(Active::new(maker)) })
         };
-        Self(LAYERS.iter().filter_map(enabled).collect())
+        Self { layers: LAYERS.iter().filter_map(enabled).collect(), radial: Vec::new() }
     }
 
     /// Name of each enabled layer, and how often it was made.
     pub fn made(&self) -> Vec<(&'static str, u64)> {
-        self.0.iter().map(|layer| (layer.name, layer.made)).collect()
+        self.layers.iter().map(|layer| (layer.name, layer.made)).collect()
     }
 
     /// True if any layer is active.
     pub fn any_active(&self) -> bool {
-        self.0.iter().any(|layer| layer.active.is_some())
+        self.layers.iter().any(|layer| layer.active.is_some())
     }
 
     /// The optional data of each scan that the active layers use.
     pub fn uses(&self) -> ScanExtras {
-        let active = self.0.iter().filter_map(|layer| layer.active.as_ref());
+        let active = self.layers.iter().filter_map(|layer| layer.active.as_ref());
         active.map(|active| active.maker.uses()).fold(ScanExtras::default(), |all, uses| ScanExtras {
             ground: all.ground || uses.ground,
             deviations: all.deviations || uses.deviations,
@@ -173,7 +178,7 @@ impl Layers {
     /// A layer that was not active starts without evidence. Returns true if the subscriptions changed.
     pub fn set_active(&mut self, maps: &MapsConfig, is_subscribed: impl Fn(&str) -> bool) -> bool {
         let mut changed = false;
-        for layer in &mut self.0 {
+        for layer in &mut self.layers {
             let subscribed = is_subscribed(layer.name);
             changed |= layer.subscribed != subscribed;
             layer.subscribed = subscribed;
@@ -188,7 +193,7 @@ impl Layers {
     fn assign_makers(&mut self, maps: &MapsConfig) {
         let mut needed: Vec<&str> = Vec::new();
         // Backwards, because a layer is made from earlier ones only.
-        for layer in self.0.iter_mut().rev() {
+        for layer in self.layers.iter_mut().rev() {
             if !layer.subscribed && !needed.contains(&layer.name) {
                 layer.active = None;
                 continue;
@@ -202,23 +207,40 @@ impl Layers {
 
     /// Adds the evidence of one sensor's scan to the active layers.
     pub fn integrate(&mut self, rays: &Rays<'_>) {
-        self.0.iter_mut().filter_map(|layer| layer.active.as_mut()).for_each(|active| active.maker.integrate(rays));
+        self.layers
+            .iter_mut()
+            .filter_map(|layer| layer.active.as_mut())
+            .for_each(|active| active.maker.integrate(rays));
     }
 
     /// Makes the active layers of one map, in place of those in `layers`, whose memory is used again.
     pub fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layers: &mut Vec<Layer>) {
         for made in layers.drain(..) {
-            let layer = self.0.iter_mut().find(|layer| layer.name == made.name);
+            let layer = self.layers.iter_mut().find(|layer| layer.name == made.name);
             if let Some(active) = layer.and_then(|layer| layer.active.as_mut()) {
                 active.spare = Some(made);
             }
         }
-        for layer in &mut self.0 {
+        self.find_radial_cells(sweep, context);
+        for layer in &mut self.layers {
             let Some(Active { maker, spare }) = &mut layer.active else { continue };
             let mut made = spare.take().unwrap_or_else(|| maker.layer());
-            maker.make(sweep, &Context { earlier: layers, ..*context }, &mut made);
+            maker.make(sweep, &Context { earlier: layers, radial: &self.radial, ..*context }, &mut made);
             layers.push(made);
             layer.made += 1;
         }
+    }
+
+    /// Finds the radial cells of the points, once for each size.
+    fn find_radial_cells(&mut self, sweep: &Sweep, context: &Context<'_>) {
+        let makers = self.layers.iter().filter_map(|layer| layer.active.as_ref()).map(|active| &active.maker);
+        let sizes = || makers.clone().filter_map(|maker| maker.radial_size());
+        self.radial.retain(|shared| sizes().any(|size| size == shared.size()));
+        for size in sizes() {
+            if !self.radial.iter().any(|shared| shared.size() == size) {
+                self.radial.push(RadialPoints::new(size));
+            }
+        }
+        self.radial.iter_mut().for_each(|shared| shared.find(sweep, context.azimuths()));
     }
 }

@@ -17,15 +17,9 @@ pub fn find(xs: &[f32], ys: &[f32], cells: &mut Vec<u32>) {
     cells.extend(xs.iter().zip(ys).map(|(&x, &y)| cell(x, y)));
 }
 
-/// Index of the cell that contains a position; `None` beyond the grid.
+/// Index of the cell that contains a position; [`NOWHERE`] beyond the grid.
 #[inline(always)]
-pub fn at(x: f32, y: f32) -> Option<usize> {
-    let cell = cell(x, y);
-    (cell != NOWHERE).then_some(cell as usize)
-}
-
-#[inline(always)]
-fn cell(x: f32, y: f32) -> u32 {
+pub fn cell(x: f32, y: f32) -> u32 {
     let (ix, iy) = (x * (1.0 / CELL_M) + SIDE as f32 / 2.0, y * (1.0 / CELL_M) + SIDE as f32 / 2.0);
     let side = SIDE as f32;
     // NaN fails every comparison.

@@ -46,6 +46,24 @@ enum View {
     Closed,
 }
 
+/// Cell of [`Reach`] that contains a position; [`ReachCell::at`] finds it once for a fixed position.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ReachCell(u32);
+
+impl ReachCell {
+    /// The cell that contains a position, ego frame, metres.
+    #[inline(always)]
+    pub fn at(x: f32, y: f32) -> Self {
+        Self(cells::cell(x, y))
+    }
+
+    /// Index of the cell; `None` beyond the grid.
+    #[inline(always)]
+    fn index(self) -> Option<usize> {
+        (self.0 != cells::NOWHERE).then_some(self.0 as usize)
+    }
+}
+
 /// Closed cells and reached ground around the vehicle, ego frame.
 #[derive(Clone)]
 pub struct Reach {
@@ -111,16 +129,16 @@ impl Reach {
         self.flood.run(&self.open, &self.closed, radius);
     }
 
-    /// True if an obstacle stands at a position, or a step of the ground ends there.
+    /// True if an obstacle stands in a cell, or a step of the ground ends there.
     #[inline(always)]
-    pub fn is_closed(&self, x: f32, y: f32) -> bool {
-        cells::at(x, y).is_some_and(|cell| self.closed.get(cell % SIDE, cell / SIDE))
+    pub fn is_closed(&self, cell: ReachCell) -> bool {
+        cell.index().is_some_and(|cell| self.closed.get(cell % SIDE, cell / SIDE))
     }
 
-    /// True if the vehicle can get to a position: if the disc covers it somewhere on its path.
+    /// True if the vehicle can get to a cell: if the disc covers it somewhere on its path.
     #[inline(always)]
-    pub fn is_reached(&self, x: f32, y: f32) -> bool {
-        cells::at(x, y).is_some_and(|cell| self.flood.is_reached(cell % SIDE, cell / SIDE))
+    pub fn is_reached(&self, cell: ReachCell) -> bool {
+        cell.index().is_some_and(|cell| self.flood.is_reached(cell % SIDE, cell / SIDE))
     }
 
     /// Opens the cells with a return from the ground, and the unseen ones between them. Unseen ground right behind an

@@ -24,16 +24,24 @@ const POINTS_MIN: usize = 2 * REACH + 1;
 pub struct RingSeries {
     /// Number of points before each ring; one entry more than rings.
     first_of_ring: Vec<u32>,
-    /// Points by ring: a number that rises with the azimuth, and the index in the scan.
-    points: Vec<(f32, u32)>,
+    /// By point of the scan: a number that rises with the azimuth; NaN if it is no return.
+    ranks: Vec<f32>,
+    /// Index in `points` of the next point of each ring.
+    next_of_ring: Vec<u32>,
+    /// Points by ring, as [`key`]s.
+    points: Vec<u64>,
+    /// Of one ring, by point: x, y and z, metres.
+    positions_m: [Vec<f32>; 3],
     /// Of one ring, by point: angle to the point before, radians.
     steps_rad: Vec<f32>,
-    /// The steps of one ring that are no rounding, in any order.
-    candidates_rad: Vec<f32>,
+    /// Bits of the steps of one ring that are no rounding, in any order. They rise with the step.
+    candidates: Vec<u32>,
     /// Of one ring: ranges with missing returns replaced, metres.
     ranges_m: Vec<f32>,
     /// Of one ring: index of each measured range in `ranges_m`, and of its point in the scan.
     measured: Vec<(u32, u32)>,
+    /// Of one ring: mean of the nine ranges around each of `ranges_m`, metres; the first and last four are not used.
+    means_m: Vec<f32>,
     /// Deviation by point, metres.
     deviation_m: Vec<f32>,
 }
@@ -49,10 +57,9 @@ impl RingSeries {
             let of_ring = self.first_of_ring[ring - 1] as usize..self.first_of_ring[ring] as usize;
             if of_ring.len() >= POINTS_MIN {
                 let of_ring = &mut points[of_ring];
-                // Points of a ring come in one or two rising runs, which a stable sort merges.
-                of_ring.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+                sort_by_azimuth(of_ring);
                 self.find_steps(scan, of_ring);
-                self.fill_gaps(scan, of_ring);
+                self.fill_gaps(of_ring);
                 self.subtract();
             }
         }
@@ -62,31 +69,42 @@ impl RingSeries {
 
     /// Fills `points` and `first_of_ring` with the returns of the scan.
     fn sort_points(&mut self, scan: &Scan) {
-        let is_return = |index: usize| classify(scan.x[index], scan.y[index], scan.z[index]).1;
+        self.ranks.clear();
+        let points = scan.x.iter().zip(&scan.y).zip(&scan.z);
+        self.ranks.extend(points.map(|((&x, &y), &z)| match classify(x, y, z).1 {
+            true => azimuth_rank(x, y),
+            false => f32::NAN,
+        }));
         let rings = scan.ring.iter().max().map_or(0, |ring| usize::from(*ring) + 1);
         self.first_of_ring.clear();
         self.first_of_ring.resize(rings + 1, 0);
-        for (index, &ring) in scan.ring.iter().enumerate() {
-            self.first_of_ring[usize::from(ring) + 1] += u32::from(is_return(index));
+        for (&ring, rank) in scan.ring.iter().zip(&self.ranks) {
+            self.first_of_ring[usize::from(ring) + 1] += u32::from(!rank.is_nan());
         }
         for ring in 0..rings {
             self.first_of_ring[ring + 1] += self.first_of_ring[ring];
         }
-        let mut next = self.first_of_ring.clone();
-        self.points.clear();
-        self.points.resize(self.first_of_ring[rings] as usize, (0.0, 0));
-        for (index, &ring) in scan.ring.iter().enumerate().filter(|(index, _)| is_return(*index)) {
-            let slot = &mut next[usize::from(ring)];
-            self.points[*slot as usize] = (azimuth_rank(scan.x[index], scan.y[index]), index as u32);
-            *slot += 1;
+        self.next_of_ring.clone_from(&self.first_of_ring);
+        self.points.resize(self.first_of_ring[rings] as usize, 0);
+        for (index, (&ring, &rank)) in (0..).zip(scan.ring.iter().zip(&self.ranks)) {
+            if !rank.is_nan() {
+                let slot = &mut self.next_of_ring[usize::from(ring)];
+                self.points[*slot as usize] = key(rank, index);
+                *slot += 1;
+            }
         }
     }
 
-    fn find_steps(&mut self, scan: &Scan, of_ring: &[(f32, u32)]) {
+    fn find_steps(&mut self, scan: &Scan, of_ring: &[u64]) {
+        for (positions_m, from) in self.positions_m.iter_mut().zip([&scan.x, &scan.y, &scan.z]) {
+            positions_m.clear();
+            positions_m.extend(of_ring.iter().map(|key| from[*key as u32 as usize]));
+        }
+        let [xs, ys, _] = &self.positions_m;
         self.steps_rad.clear();
         self.steps_rad.push(0.0);
-        self.steps_rad.extend(of_ring.windows(2).map(|pair| {
-            let [(ax, ay), (bx, by)] = [0, 1].map(|i| (scan.x[pair[i].1 as usize], scan.y[pair[i].1 as usize]));
+        let pairs = xs.iter().zip(ys).zip(xs[1..].iter().zip(&ys[1..]));
+        self.steps_rad.extend(pairs.map(|((ax, ay), (bx, by))| {
             let (cross, dot) = (ax * by - ay * bx, ax * bx + ay * by);
             // The tangent is the angle for all but wide gaps.
             if dot > 0.0 { cross / dot } else { f32::INFINITY }
@@ -94,42 +112,84 @@ impl RingSeries {
     }
 
     /// Fills `ranges_m` and `measured`; both stay empty if the ring has no azimuth step.
-    fn fill_gaps(&mut self, scan: &Scan, of_ring: &[(f32, u32)]) {
+    fn fill_gaps(&mut self, of_ring: &[u64]) {
         self.ranges_m.clear();
         self.measured.clear();
-        self.candidates_rad.clear();
-        self.candidates_rad.extend(self.steps_rad.iter().filter(|step| **step > STEP_RAD_MIN));
-        if self.candidates_rad.is_empty() {
+        self.candidates.clear();
+        self.candidates.extend(self.steps_rad.iter().filter(|step| **step > STEP_RAD_MIN).map(|step| step.to_bits()));
+        if self.candidates.is_empty() {
             return;
         }
-        let middle = self.candidates_rad.len() / 2;
-        let step_rad = *self.candidates_rad.select_nth_unstable_by(middle, f32::total_cmp).1;
+        let middle = self.candidates.len() / 2;
+        let step_rad = f32::from_bits(*self.candidates.select_nth_unstable(middle).1);
+        let [xs, ys, zs] = &self.positions_m;
         let mut since_last_rad = f32::INFINITY;
-        for (&(_, point), &rad) in of_ring.iter().zip(&self.steps_rad) {
+        let points = of_ring.iter().zip(&self.steps_rad).zip(xs.iter().zip(ys).zip(zs));
+        for ((&key, &rad), ((x, y), z)) in points {
             since_last_rad += rad;
             if since_last_rad < SAME_RAY_SHARE * step_rad {
                 continue;
             }
-            let index = point as usize;
-            let (x, y, z) = (scan.x[index], scan.y[index], scan.z[index]);
             let range_m = (x * x + y * y + z * z).sqrt();
-            if let Some(&last_m) = self.ranges_m.last() {
+            let steps = since_last_rad / step_rad;
+            if let Some(&last_m) = self.ranges_m.last()
+                && steps >= 1.5
+            {
                 // `as` saturates. A mean reaches four ranges back, so that four missing ones are as good as all.
-                let missing = ((since_last_rad / step_rad).round() as usize).saturating_sub(1).min(REACH);
+                let missing = (steps.round() as usize).saturating_sub(1).min(REACH);
                 self.ranges_m.extend(std::iter::repeat_n(last_m, missing));
             }
-            self.measured.push((self.ranges_m.len() as u32, point));
+            self.measured.push((self.ranges_m.len() as u32, key as u32));
             self.ranges_m.push(range_m);
             since_last_rad = 0.0;
         }
     }
 
     fn subtract(&mut self) {
+        let (ranges_m, ranges) = (&self.ranges_m, self.ranges_m.len());
+        self.means_m.clear();
+        self.means_m.resize(ranges, 0.0);
+        // Without a branch, so that the compiler vectorises it.
+        for (mean, window) in self.means_m.iter_mut().skip(REACH).zip(ranges_m.array_windows::<{ 2 * REACH + 1 }>()) {
+            *mean = window.iter().sum::<f32>() / window.len() as f32;
+        }
         for &(at, point) in &self.measured {
             let at = at as usize;
-            let window = &self.ranges_m[at.saturating_sub(REACH)..(at + REACH + 1).min(self.ranges_m.len())];
-            let mean_m = window.iter().sum::<f32>() / window.len() as f32;
-            self.deviation_m[point as usize] = mean_m - self.ranges_m[at];
+            let mean_m = if at >= REACH && at + REACH < ranges {
+                self.means_m[at]
+            } else {
+                let window = &ranges_m[at.saturating_sub(REACH)..(at + REACH + 1).min(ranges)];
+                window.iter().sum::<f32>() / window.len() as f32
+            };
+            self.deviation_m[point as usize] = mean_m - ranges_m[at];
+        }
+    }
+}
+
+/// A point of a ring: its rank, which is not negative, so that its bits rise with it; then its index in the scan. Of
+/// two points of equal azimuth the first in the scan comes first.
+fn key(rank: f32, index: u32) -> u64 {
+    u64::from(rank.to_bits()) << 32 | u64::from(index)
+}
+
+/// Sorts the points of a ring by azimuth. Most rings come by azimuth, from any azimuth on, with few points out of
+/// order.
+fn sort_by_azimuth(of_ring: &mut [u64]) {
+    // Where the azimuth falls by a half circle, the next one begins.
+    let rank = |key: u64| f32::from_bits((key >> 32) as u32);
+    if let Some(at) = of_ring.windows(2).position(|pair| rank(pair[0]) - rank(pair[1]) > 2.0) {
+        of_ring.rotate_left(at + 1);
+    }
+    let mut moves = 4 * of_ring.len();
+    for at in 1..of_ring.len() {
+        let (key, mut to) = (of_ring[at], at);
+        while to > 0 && of_ring[to - 1] > key && moves > 0 {
+            of_ring[to] = of_ring[to - 1];
+            (to, moves) = (to - 1, moves - 1);
+        }
+        of_ring[to] = key;
+        if moves == 0 {
+            return of_ring.sort_unstable();
         }
     }
 }

@@ -4,7 +4,7 @@
 //! under the overhang cut-off, and `unit_height = floor((height + offset) / unit)`.
 
 use crate::layer::maker::Context;
-use crate::layer::radial_grid::RadialGrid;
+use crate::layer::radial_points::RadialPoints;
 use crate::sensor::sweep::Sweep;
 
 use super::class::UNIT_HEIGHT_UNKNOWN;
@@ -31,19 +31,16 @@ pub struct Heights {
 impl Heights {
     /// Finds the highest point of each cell; points too far or too high are dropped (UT Austin thesis, procedure
     /// "Setting up the radial grid").
-    pub fn compute(&mut self, grid: &RadialGrid, sweep: &Sweep, context: &Context<'_>, config: &DrivabilityConfig) {
-        let heights_m = context.heights_m(sweep);
+    pub fn compute(&mut self, points: &RadialPoints, sweep: &Sweep, context: &Context<'_>, config: &DrivabilityConfig) {
+        let (grid, heights_m) = (points.grid(), context.heights_m(sweep));
         self.highest.clear();
         // One more row holds the points beyond the grid.
         self.highest.resize(grid.cells() + grid.columns(), EMPTY);
-        let highest = &mut self.highest;
-        grid.for_each_chunk(sweep, context.azimuths(), |first, cells| {
-            for (i, (cell, &height)) in cells.iter().zip(&heights_m[first..]).enumerate() {
-                if height <= config.overhang_m {
-                    adjust_height(&mut highest[*cell as usize], height, first + i, sweep);
-                }
+        for (point, (cell, &height)) in points.cells().iter().zip(heights_m).enumerate() {
+            if height <= config.overhang_m {
+                adjust_height(&mut self.highest[*cell as usize], height, point, sweep);
             }
-        });
+        }
 
         self.points.clear();
         self.z_m.clear();

@@ -24,7 +24,7 @@ use crate::layer::channel::TypedChannel;
 use crate::layer::class::drivable_share;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker};
-use crate::layer::radial_grid::RadialGrid;
+use crate::layer::radial_points::{RadialPoints, RadialSize};
 use crate::sensor::sweep::Sweep;
 
 use class::{DrivabilityClass, SEGMENT, UNIT_HEIGHT_UNKNOWN};
@@ -38,7 +38,7 @@ use segments::Segments;
 #[derive(Clone)]
 pub struct Drivability {
     config: DrivabilityConfig,
-    grid: RadialGrid,
+    points: RadialPoints,
     heights: Heights,
     segments: Segments,
     /// Planes of the heights over the ground, for the criteria.
@@ -53,7 +53,7 @@ impl Drivability {
     pub fn new(config: &DrivabilityConfig) -> Self {
         Self {
             config: config.of_variant(),
-            grid: RadialGrid::default(),
+            points: RadialPoints::new(RadialSize { range_m_max: config.range_m_max, columns: config.columns }),
             heights: Heights::default(),
             segments: Segments::default(),
             planes: Planes::default(),
@@ -63,7 +63,6 @@ impl Drivability {
     }
 
     fn write(&self, context: &Context<'_>, layer: &mut Layer) {
-        self.grid.write_geometry(&mut layer.geometry);
         layer.clear_lists();
         let mut unit_height = self.unit_height().reuse(&mut layer.channels);
         let mut segment = SEGMENT.reuse(&mut layer.channels);
@@ -114,17 +113,23 @@ impl LayerMaker for Drivability {
         Layer::new("drivability", Geometry::radial(self.config.columns), DrivabilityClass::LEGEND, channels)
     }
 
+    fn radial_size(&self) -> Option<RadialSize> {
+        (self.config.variant != DrivabilityVariant::Paper).then_some(self.points.size())
+    }
+
     fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
         // The thesis takes heights over the plane under the vehicle, and has no width of a vehicle.
-        let plane = Context { ground: None, reach: None, ..*context };
+        let plane = Context { ground: None, radial: &[], reach: None, ..*context };
         let context = if self.config.variant == DrivabilityVariant::Paper { &plane } else { context };
-        self.grid.update_rows(sweep, self.config.range_m_max, self.config.columns);
-        self.heights.compute(&self.grid, sweep, context, &self.config);
-        self.segments.grow(&self.grid, &self.heights, &self.config);
+        let points = context.radial_points(sweep, &mut self.points);
+        let grid = points.grid();
+        grid.write_geometry(&mut layer.geometry);
+        self.heights.compute(points, sweep, context, &self.config);
+        self.segments.grow(grid, &self.heights, &self.config);
         let points = self.heights.points().iter().copied();
         self.planes.fit(points.clone(), &self.segments);
         self.ego_planes.fit(points.zip(self.heights.z_m()).map(|([x, y, _], &z)| [x, y, z]), &self.segments);
-        self.search.run(&self.grid, &self.heights, &self.segments, &self.planes, &self.config);
+        self.search.run(grid, &self.heights, &self.segments, &self.planes, &self.config);
         self.write(context, layer);
     }
 }

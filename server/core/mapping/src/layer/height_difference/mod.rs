@@ -11,7 +11,7 @@ use crate::layer::channel::TypedChannel;
 use crate::layer::class::drivable_share;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker, ScanExtras};
-use crate::layer::radial_grid::RadialGrid;
+use crate::layer::radial_points::{RadialPoints, RadialSize};
 use crate::sensor::sweep::Sweep;
 
 use class::{DIFFERENCE, HeightDifferenceClass};
@@ -21,7 +21,7 @@ use config::HeightDifferenceConfig;
 #[derive(Clone)]
 pub struct HeightDifference {
     config: HeightDifferenceConfig,
-    grid: RadialGrid,
+    points: RadialPoints,
     /// Highest and lowest z of each cell, metres, and of one more row for points beyond the grid.
     span: Vec<[f32; 2]>,
 }
@@ -29,7 +29,11 @@ pub struct HeightDifference {
 impl HeightDifference {
     /// A maker with validated parameters.
     pub fn new(config: &HeightDifferenceConfig) -> Self {
-        Self { config: config.clone(), grid: RadialGrid::default(), span: Vec::new() }
+        Self { config: config.clone(), points: RadialPoints::new(Self::size(config)), span: Vec::new() }
+    }
+
+    fn size(config: &HeightDifferenceConfig) -> RadialSize {
+        RadialSize { range_m_max: config.range_m_max, columns: config.columns }
     }
 }
 
@@ -44,24 +48,26 @@ impl LayerMaker for HeightDifference {
         ScanExtras::default()
     }
 
-    fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
-        self.grid.update_rows(sweep, self.config.range_m_max, self.config.columns);
-        self.span.clear();
-        self.span.resize(self.grid.cells() + self.grid.columns(), [f32::NEG_INFINITY, f32::INFINITY]);
-        let span = &mut self.span;
-        self.grid.for_each_chunk(sweep, context.azimuths(), |first, cells| {
-            for (cell, &z) in cells.iter().zip(&sweep.z[first..]) {
-                let [highest, lowest] = &mut span[*cell as usize];
-                *highest = if z > *highest { z } else { *highest };
-                *lowest = if z < *lowest { z } else { *lowest };
-            }
-        });
+    fn radial_size(&self) -> Option<RadialSize> {
+        Some(self.points.size())
+    }
 
-        self.grid.write_geometry(&mut layer.geometry);
+    fn make(&mut self, sweep: &Sweep, context: &Context<'_>, layer: &mut Layer) {
+        let points = context.radial_points(sweep, &mut self.points);
+        let grid = points.grid();
+        self.span.clear();
+        self.span.resize(grid.cells() + grid.columns(), [f32::NEG_INFINITY, f32::INFINITY]);
+        for (cell, &z) in points.cells().iter().zip(&sweep.z) {
+            let [highest, lowest] = &mut self.span[*cell as usize];
+            *highest = if z > *highest { z } else { *highest };
+            *lowest = if z < *lowest { z } else { *lowest };
+        }
+
+        grid.write_geometry(&mut layer.geometry);
         layer.clear_lists();
         let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
         let mut difference = DIFFERENCE.reuse(&mut layer.channels);
-        let spans = &self.span[..self.grid.cells()];
+        let spans = &self.span[..grid.cells()];
         class.extend(spans.iter().map(|[highest, lowest]| {
             let class = match highest - lowest {
                 apart if apart > self.config.difference_m_max => HeightDifferenceClass::Obstacle,

@@ -40,6 +40,7 @@ pub mod states;
 pub mod window;
 
 use crate::layer::channel::TypedChannel;
+use crate::layer::class::count_cells;
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker, Rays, ScanExtras};
 use crate::sensor::sweep::Sweep;
@@ -140,8 +141,7 @@ impl Occupancy {
         };
         let limits = [needed, self.config.hold_maps];
         self.window.update_states(limits, any, self.config.hits, &mut class, &mut hits);
-        let share =
-            |of: OccupancyClass| class.iter().filter(|class| **class == of.value()).count() as f64 / cells as f64;
+        let share = |of: OccupancyClass| count_cells(&class, of.value()) as f64 / cells as f64;
         layer.metrics.extend([
             ("clear_share", share(OccupancyClass::Clear)),
             ("occupied_share", share(OccupancyClass::Occupied)),

@@ -267,7 +267,7 @@ impl PolarScan {
 
     /// Marks the steps behind the nearest hit that returns from the ground prove free.
     fn prove_ground(&mut self, azimuths: &AzimuthBins) {
-        let nearest: Vec<usize> = (0..BINS).map(|bin| self.nearest(bin)).collect();
+        let nearest: [usize; BINS] = std::array::from_fn(|bin| self.nearest(bin));
         for &Ground { bin, from, low, end } in &self.ground {
             let (bin, from, low, end) = (usize::from(bin), usize::from(from), usize::from(low), usize::from(end));
             if low <= nearest[bin] {

@@ -17,6 +17,7 @@ use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer};
 use crate::layer::occupancy::class::OccupancyClass;
 use crate::layer::radial_grid::RadialGrid;
+use crate::reach::ReachCell;
 use crate::sensor::sweep::Sweep;
 use crate::vehicle_outline::Outline;
 
@@ -62,6 +63,8 @@ pub struct FreeSpace {
     side: usize,
     cell_m: f64,
     states: Vec<State>,
+    /// By cell: the cell of the reach stage that contains its centre.
+    reach_cell: Vec<ReachCell>,
     of_radial_cell: Vec<State>,
     grid: RadialGrid,
     /// By radial cell near the vehicle's outline.
@@ -75,10 +78,12 @@ pub struct FreeSpace {
 impl FreeSpace {
     /// A grid of unknown cells.
     pub fn new(side: usize, cell_m: f64) -> Self {
+        let at = |index| ReachCell::at(centre_m(index % side, side, cell_m), centre_m(index / side, side, cell_m));
         Self {
             side,
             cell_m,
             states: vec![State::Unknown; side * side],
+            reach_cell: (0..side * side).map(at).collect(),
             of_radial_cell: Vec::new(),
             grid: RadialGrid::default(),
             returns: Vec::new(),
@@ -141,14 +146,13 @@ impl FreeSpace {
 
     /// Closes the cells in which an obstacle stands, and those that the vehicle cannot reach.
     fn add_obstacles(&mut self, context: &Context<'_>) {
-        for index in 0..self.states.len() {
-            let (x, y) = (self.centre_m(index % self.side), self.centre_m(index / self.side));
-            let state = &mut self.states[index];
+        let Some(reach) = context.reach else { return };
+        for (state, &cell) in self.states.iter_mut().zip(&self.reach_cell) {
             *state = match *state {
-                _ if context.is_closed(x, y) => State::Obstacle,
+                _ if reach.is_closed(cell) => State::Obstacle,
                 // The obstacle stands in another part of the radial cell.
-                State::Obstacle if context.reach.is_some() => State::Unknown,
-                free if free.is_free() && !context.is_reached(x, y) => State::NotReached,
+                State::Obstacle => State::Unknown,
+                free if free.is_free() && !reach.is_reached(cell) => State::NotReached,
                 unchanged => unchanged,
             };
         }
@@ -177,7 +181,7 @@ impl FreeSpace {
 
     /// Coordinate of the centre of a cell, metres.
     fn centre_m(&self, index: usize) -> f32 {
-        ((index as f64 + 0.5 - self.side as f64 / 2.0) * self.cell_m) as f32
+        centre_m(index, self.side, self.cell_m)
     }
 
     /// Makes radial cells unknown that have returns only from the vehicle itself.
@@ -224,6 +228,11 @@ impl FreeSpace {
         let cells = 0..self.side * self.side;
         self.radial_cell = cells.map(|index| cell(index).unwrap_or(self.grid.cells()) as u32).collect();
     }
+}
+
+/// Coordinate of the centre of a cell of a grid with the vehicle in the middle, metres.
+fn centre_m(index: usize, side: usize, cell_m: f64) -> f32 {
+    ((index as f64 + 0.5 - side as f64 / 2.0) * cell_m) as f32
 }
 
 /// Marks unseen cells nearer to the vehicle than drivable ground that begins within the blind zone.

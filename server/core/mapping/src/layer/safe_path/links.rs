@@ -12,6 +12,14 @@ use super::medial_axis::{AROUND, MedialAxis, Point};
 pub struct Links {
     points: Vec<Point>,
     not_reached: usize,
+    /// Memory of links that no point uses.
+    spare: Vec<Vec<u32>>,
+    /// Squared distance of each point of the axis from the vehicle, and its index.
+    nearest: Vec<(i32, usize)>,
+    /// By point of the axis: its index among the reached points.
+    reached: Vec<Option<u32>>,
+    /// Points whose lines are still to be followed.
+    open: Vec<usize>,
 }
 
 impl Links {
@@ -35,7 +43,7 @@ impl Links {
         width_cells: f64,
         join_cells: f64,
     ) {
-        self.points.clear();
+        self.spare.extend(self.points.drain(..).map(|point| point.links));
         let found = axis.points();
         self.not_reached = found.len();
         // The vehicle's own position lies between the four middle cells.
@@ -48,55 +56,61 @@ impl Links {
             let (dx, dy) = (point.position[0] - own_position[0], point.position[1] - own_position[1]);
             dx * dx + dy * dy
         };
-        let mut nearest: Vec<(i32, usize)> = found.iter().enumerate().map(|(i, p)| (away_squared(p), i)).collect();
-        nearest.retain(|(away, _)| f64::from(*away) <= 4.0 * join_cells * join_cells);
-        nearest.sort_unstable();
+        self.nearest.clear();
+        self.nearest.extend(found.iter().enumerate().map(|(i, p)| (away_squared(p), i)));
+        self.nearest.retain(|(away, _)| f64::from(*away) <= 4.0 * join_cells * join_cells);
+        self.nearest.sort_unstable();
         // A vehicle nearer to a wall than a path would be may drive away from it, but not nearer to it.
         let clearance = width_cells.min(f64::from(own_clearance).sqrt());
 
         let own = Point { cell: 0, position: own_position, clearance_squared: own_clearance, links: Vec::new() };
         self.points.push(own);
-        // By point of the axis: its index among the reached points.
-        let mut reached = vec![None::<u32>; found.len()];
-        for (_, first) in nearest {
-            if reached[first].is_none() && is_clear(&found[first], own_position, states, distances, clearance) {
-                self.add_lines(axis, first, &mut reached);
+        self.reached.clear();
+        self.reached.resize(found.len(), None);
+        for at in 0..self.nearest.len() {
+            let first = self.nearest[at].1;
+            if self.reached[first].is_none() && is_clear(&found[first], own_position, states, distances, clearance) {
+                self.add_lines(axis, first);
             }
         }
         self.not_reached = found.len() + 1 - self.points.len();
         if self.points.len() == 1 {
-            self.points.clear();
+            self.spare.extend(self.points.drain(..).map(|point| point.links));
         }
     }
 
     /// Adds the points of the lines that start at one point, depth first. That point is linked with the vehicle.
-    fn add_lines(&mut self, axis: &MedialAxis, first: usize, reached: &mut [Option<u32>]) {
+    fn add_lines(&mut self, axis: &MedialAxis, first: usize) {
         let found = axis.points();
-        let mut open = vec![first];
-        while let Some(index) = open.pop() {
-            if reached[index].is_some() {
+        self.open.push(first);
+        while let Some(index) = self.open.pop() {
+            if self.reached[index].is_some() {
                 continue;
             }
             let neighbours = neighbours(axis, &found[index]);
-            let mut links: Vec<u32> = neighbours.iter().filter_map(|&n| reached[n]).collect();
+            let neighbours = neighbours.iter().flatten().copied();
+            let mut links = self.spare.pop().unwrap_or_default();
+            links.clear();
+            links.extend(neighbours.clone().filter_map(|n| self.reached[n]));
             if index == first {
                 links.push(0);
             }
             links.sort_unstable();
-            reached[index] = Some(self.points.len() as u32);
-            self.points.push(Point { links, ..found[index].clone() });
-            open.extend(neighbours.iter().rev().filter(|&&n| reached[n].is_none()));
+            self.reached[index] = Some(self.points.len() as u32);
+            let Point { cell, position, clearance_squared, .. } = found[index];
+            self.points.push(Point { cell, position, clearance_squared, links });
+            self.open.extend(neighbours.rev().filter(|n| self.reached[*n].is_none()));
         }
     }
 }
 
 /// Indices of the points in the neighbouring cells, without corners that are reached across a side as well.
-fn neighbours(axis: &MedialAxis, point: &Point) -> Vec<usize> {
+fn neighbours(axis: &MedialAxis, point: &Point) -> [Option<usize>; 8] {
     let (ix, iy) = ((point.cell % axis.side()) as i32, (point.cell / axis.side()) as i32);
     let points = AROUND.map(|[dx, dy]| axis.point_in(ix + dx, iy + dy));
     let is_side = |i: usize| i.is_multiple_of(2);
     let beside_a_side = |i: usize| points[(i + 7) % 8].is_some() || points[(i + 1) % 8].is_some();
-    (0..8).filter(|&i| is_side(i) || !beside_a_side(i)).filter_map(|i| points[i]).collect()
+    std::array::from_fn(|i| points[i].filter(|_| is_side(i) || !beside_a_side(i)))
 }
 
 /// True if the straight line from a position to a point is free, and each of its positions is at least `clearance_min`

@@ -29,14 +29,15 @@ pub struct Point {
 }
 
 impl Point {
-    /// The point in metres, ego frame.
-    pub fn in_metres(&self, side: usize, cell_m: f64) -> SafePoint {
+    /// The point in metres, ego frame. `links` is memory for its links.
+    pub fn in_metres(&self, side: usize, cell_m: f64, mut links: Vec<u32>) -> SafePoint {
+        links.clone_from(&self.links);
         let metres = |half_cells: i32| (f64::from(half_cells + 1) - side as f64) / 2.0 * cell_m;
         SafePoint {
             x_m: metres(self.position[0]),
             y_m: metres(self.position[1]),
             radius_m: f64::from(self.clearance_squared).sqrt() / 2.0 * cell_m,
-            links: self.links.clone(),
+            links,
         }
     }
 }
@@ -52,6 +53,8 @@ pub struct MedialAxis {
     points: Vec<Point>,
     /// Indices of the cells with a bit in `across`.
     marked: Vec<u32>,
+    /// Clearance and cell of the points that thinning may still remove.
+    order: Vec<(i32, usize)>,
 }
 
 /// Bits of `across`, with the step to the neighbour in cells, which is the step to the position between in half cells.
@@ -61,7 +64,8 @@ impl MedialAxis {
     /// An axis without points.
     pub fn new(side: usize) -> Self {
         let cells = side * side;
-        Self { side, across: vec![0; cells], point_of_cell: vec![0; cells], points: Vec::new(), marked: Vec::new() }
+        let (points, marked, order) = Default::default();
+        Self { side, across: vec![0; cells], point_of_cell: vec![0; cells], points, marked, order }
     }
 
     /// Number of cells along x, and along y.
@@ -174,7 +178,9 @@ impl MedialAxis {
     /// neighbours stay connected without it, unless it is the end of a line.
     fn thin(&mut self) {
         self.points.iter().for_each(|point| self.point_of_cell[point.cell] = 1);
-        let mut order: Vec<(i32, usize)> = self.points.iter().map(|p| (p.clearance_squared, p.cell)).collect();
+        let mut order = std::mem::take(&mut self.order);
+        order.clear();
+        order.extend(self.points.iter().map(|p| (p.clearance_squared, p.cell)));
         order.sort_unstable();
         loop {
             let before = order.len();
@@ -191,6 +197,7 @@ impl MedialAxis {
                 break;
             }
         }
+        self.order = order;
         self.points.retain(|point| self.point_of_cell[point.cell] != 0);
     }
 }

@@ -43,6 +43,8 @@ pub struct SafePath {
     distances: Distances,
     medial_axis: MedialAxis,
     links: Links,
+    /// Memory of the links of the newest layer's points.
+    spare: Vec<Vec<u32>>,
 }
 
 impl SafePath {
@@ -55,10 +57,16 @@ impl SafePath {
             distances: Distances::new(side),
             medial_axis: MedialAxis::new(side),
             links: Links::default(),
+            spare: Vec::new(),
         }
     }
 
-    fn write(&self, layer: &mut Layer) {
+    fn geometry(&self) -> Geometry {
+        Geometry::about_vehicle(self.free_space.side() as u32, self.config.cell_m)
+    }
+
+    fn write(&mut self, layer: &mut Layer) {
+        self.spare.extend(layer.points.drain(..).map(|point| point.links));
         layer.clear_lists();
         let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
         class.extend(self.free_space.states().iter().map(|state| {
@@ -72,7 +80,9 @@ impl SafePath {
         }));
         let side = self.free_space.side();
         let cell_m = f64::from(self.config.cell_m);
-        layer.points.extend(self.links.points().iter().map(|point| point.in_metres(side, cell_m)));
+        for point in self.links.points() {
+            layer.points.push(point.in_metres(side, cell_m, self.spare.pop().unwrap_or_default()));
+        }
         // The first point is the vehicle's own position, which lies between four cells.
         self.links.points().iter().skip(1).for_each(|point| class[point.cell] = SafePathClass::Path.value());
         TypedChannel::CLASS.store(&mut layer.channels, class);
@@ -85,8 +95,7 @@ impl SafePath {
 
 impl LayerMaker for SafePath {
     fn layer(&self) -> Layer {
-        let geometry = Geometry::about_vehicle(self.free_space.side() as u32, self.config.cell_m);
-        Layer::new("safe_path", geometry, SafePathClass::LEGEND, vec![TypedChannel::CLASS.empty()])
+        Layer::new("safe_path", self.geometry(), SafePathClass::LEGEND, vec![TypedChannel::CLASS.empty()])
     }
 
     fn needs(&self) -> &'static [&'static str] {
@@ -101,7 +110,7 @@ impl LayerMaker for SafePath {
         self.medial_axis.find(self.free_space.states(), &self.distances, width_cells);
         let join_cells = f64::from(self.config.join_m_max) / f64::from(self.config.cell_m);
         self.links.link(&self.medial_axis, self.free_space.states(), &self.distances, width_cells, join_cells);
-        layer.geometry = self.layer().geometry;
+        layer.geometry = self.geometry();
         self.write(layer);
     }
 }

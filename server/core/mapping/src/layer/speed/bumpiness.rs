@@ -55,16 +55,6 @@ impl Cell {
         self.sum += wide;
         self.squares += wide * wide;
     }
-
-    #[inline(always)]
-    fn add_cell(&mut self, other: &Self) {
-        self.highest = self.highest.max(other.highest);
-        self.lowest = self.lowest.min(other.lowest);
-        self.highest_over_ground = self.highest_over_ground.max(other.highest_over_ground);
-        self.points += other.points;
-        self.sum += other.sum;
-        self.squares += other.squares;
-    }
 }
 
 const EMPTY: Cell =
@@ -120,8 +110,6 @@ impl HeightMap {
         }
         self.seen.clear();
         let (mut cells, mut millimetres, mut over_ground) = ([NOWHERE; CHUNK], [0; CHUNK], [0; CHUNK]);
-        // Neighbouring points of a laser mostly share a cell, so they are summed before the sums are written.
-        let (mut index, mut sums) = (NOWHERE, EMPTY);
         let lowest_m = if context.ground.is_some() { LOWEST_M } else { LOWEST_OVER_PLANE_M };
         let heights_m = context.heights_m(sweep).chunks(CHUNK);
         let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
@@ -132,26 +120,15 @@ impl HeightMap {
                 &mut cells,
                 [&mut millimetres, &mut over_ground],
             );
-            for ((&next, &millimetres), &over_ground) in cells.iter().zip(&millimetres).zip(&over_ground).take(xs.len())
+            for ((&cell, &millimetres), &over_ground) in cells.iter().zip(&millimetres).zip(&over_ground).take(xs.len())
             {
-                if next != index {
-                    self.add(index, &sums);
-                    (index, sums) = (next, EMPTY);
+                if let Some(sums) = self.cells.get_mut(cell as usize) {
+                    if sums.points == 0 {
+                        self.seen.push(cell);
+                    }
+                    sums.add_point([millimetres as i16, over_ground as i16]);
                 }
-                sums.add_point([millimetres as i16, over_ground as i16]);
             }
-        }
-        self.add(index, &sums);
-    }
-
-    #[inline(always)]
-    fn add(&mut self, index: u32, sums: &Cell) {
-        if index != NOWHERE {
-            let cell = &mut self.cells[index as usize];
-            if cell.points == 0 {
-                self.seen.push(index);
-            }
-            cell.add_cell(sums);
         }
     }
 

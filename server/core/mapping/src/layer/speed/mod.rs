@@ -137,6 +137,10 @@ impl Speed {
         }
     }
 
+    fn geometry(&self) -> Geometry {
+        Geometry::about_vehicle(self.heights.side() as u32, self.config.cell_m)
+    }
+
     fn write(&self, context: &Context<'_>, layer: &mut Layer) {
         layer.clear_lists();
         let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
@@ -189,9 +193,8 @@ impl Speed {
 
 impl LayerMaker for Speed {
     fn layer(&self) -> Layer {
-        let geometry = Geometry::about_vehicle(self.heights.side() as u32, self.config.cell_m);
         let channels = vec![TypedChannel::CLASS.empty(), self.channel().empty()];
-        Layer::new("speed", geometry, SpeedClass::LEGEND, channels)
+        Layer::new("speed", self.geometry(), SpeedClass::LEGEND, channels)
     }
 
     fn uses(&self) -> ScanExtras {
@@ -203,7 +206,7 @@ impl LayerMaker for Speed {
         self.heights.judge(context, &self.config);
         self.rough_ground.update(sweep, context.heights_m(sweep), self.heights.side(), &self.config);
         self.paint(sweep, context);
-        layer.geometry = self.layer().geometry;
+        layer.geometry = self.geometry();
         self.write(context, layer);
     }
 }

@@ -4,7 +4,7 @@
 //! gravel or a field, which the distances show (section 2.4 of that paper) and the heights do not.
 
 use crate::layer::radial_grid::floor_to_whole;
-use crate::layer::roughness::Roughness;
+use crate::layer::roughness::{NOWHERE, Roughness};
 use crate::sensor::sweep::Sweep;
 
 use super::config::SpeedConfig;
@@ -16,6 +16,8 @@ const POINTS_MIN: u16 = 4;
 #[derive(Clone, Debug, Default)]
 pub struct RoughGround {
     roughness: Roughness,
+    /// By point of the sweep.
+    cell_of_point: Vec<u32>,
     /// True if the newest sweep has deviations.
     is_known: bool,
 }
@@ -29,15 +31,17 @@ impl RoughGround {
         }
         self.roughness.clear(side * side);
         let (middle, cells_a_m, end) = ((side / 2) as f32, 1.0 / config.cell_m, side as f32);
-        let points = sweep.x.iter().zip(&sweep.y).zip(heights_m).zip(&sweep.deviation).zip(&sweep.noise);
-        for ((((&x, &y), &height), &deviation), &noise) in points {
+        let points = sweep.x.iter().zip(&sweep.y).zip(heights_m);
+        self.cell_of_point.resize(sweep.x.len(), NOWHERE);
+        // Without a branch, so that the compiler vectorises it.
+        for (cell, ((&x, &y), &height)) in self.cell_of_point.iter_mut().zip(points) {
             let (ix, iy) = (x * cells_a_m + middle, y * cells_a_m + middle);
             // NaN fails every comparison.
-            if ix >= 0.0 && ix < end && iy >= 0.0 && iy < end && height <= config.overhang_m {
-                let [ix, iy] = [ix, iy].map(|index| floor_to_whole(index) as usize);
-                self.roughness.add(iy * side + ix, deviation, noise);
-            }
+            let inside = (ix >= 0.0) & (ix < end) & (iy >= 0.0) & (iy < end) & (height <= config.overhang_m);
+            let [ix, iy] = [ix, iy].map(|index| floor_to_whole(if inside { index } else { 0.0 }));
+            *cell = if inside { iy * side as u32 + ix } else { NOWHERE };
         }
+        self.roughness.add_points(&self.cell_of_point, &sweep.deviation, &sweep.noise);
     }
 
     /// Roughness of a cell, metres per metre; `None` if it is not known.

@@ -30,7 +30,7 @@ pub mod moments;
 pub mod regions;
 
 use crate::layer::channel::TypedChannel;
-use crate::layer::class::drivable_share;
+use crate::layer::class::{count_cells, drivable_share};
 use crate::layer::grid::Geometry;
 use crate::layer::maker::{Context, Layer, LayerMaker, ScanExtras};
 use crate::layer::roughness::Roughness;
@@ -50,8 +50,8 @@ pub struct Terrain {
     regions: Regions,
     holes: Holes,
     roughness: Roughness,
-    /// By cell: true if a point fell into it.
-    seen: Vec<bool>,
+    /// One bit for each cell, set if a point fell into it.
+    seen: Vec<u64>,
     /// By cell.
     class: Vec<TerrainClass>,
 }
@@ -83,7 +83,8 @@ impl Terrain {
             }
             self.fill_holes(&mut class, context);
         } else {
-            class.extend(region_of.iter().zip(&self.seen).map(|(&region, &seen)| match (region, seen) {
+            let seen = (0..region_of.len()).map(|cell| self.is_seen(cell));
+            class.extend(region_of.iter().zip(seen).map(|(&region, seen)| match (region, seen) {
                 (NOT_FLAT, _) => TerrainClass::Obstacle,
                 (FIRST_FLAT.., true) => TerrainClass::Flat,
                 (FIRST_FLAT.., false) => TerrainClass::FlatInferred,
@@ -91,6 +92,20 @@ impl Terrain {
             }));
         }
         self.class = class;
+    }
+
+    /// True if a point fell into a cell.
+    fn is_seen(&self, cell: usize) -> bool {
+        self.seen[cell / 64] >> (cell % 64) & 1 != 0
+    }
+
+    /// Indices of the cells into which a point fell, ascending.
+    fn seen_cells(&self) -> impl Iterator<Item = usize> {
+        self.seen.iter().enumerate().filter(|(_, bits)| **bits != 0).flat_map(|(word, &bits)| {
+            let without_lowest = |bits: &u64| Some(bits & (bits - 1)).filter(|bits| *bits != 0);
+            std::iter::successors(Some(bits), without_lowest)
+                .map(move |bits| 64 * word + bits.trailing_zeros() as usize)
+        })
     }
 
     /// Class of a cell with points, in the variant `grounded`: flat if all its points lie on the local ground.
@@ -109,24 +124,27 @@ impl Terrain {
     /// Infers narrow holes in flat ground that the vehicle can reach. A seen cell with too few points to be judged is
     /// flat in such a hole if they lie on the local ground.
     fn fill_holes(&mut self, class: &mut [TerrainClass], context: &Context<'_>) {
-        let (cells, seen, width) = (&self.cells, &self.seen, self.cells.width());
+        let (cells, width) = (&self.cells, self.cells.width());
         let span = (self.config.inference_m_max / self.config.cell_m).round() as usize;
         let is_low = |cell: usize| {
             let [x, y] = cells.cell_centre_m(cell);
             cells.span_m(cells.slot_of_cell(cell))[1] - context.ground_m(x, y) <= self.config.step_m_max
         };
-        self.holes.find(width, span, |cell| match class[cell] {
+        let role = |cell: usize| match class[cell] {
             TerrainClass::Flat => Role::Flat,
-            TerrainClass::Unknown if !seen[cell] || is_low(cell) => Role::Fillable,
+            TerrainClass::Unknown if is_low(cell) => Role::Fillable,
             _ => Role::Barrier,
-        });
-        for &cell in self.holes.cells() {
+        };
+        let mut holes = std::mem::take(&mut self.holes);
+        holes.find(width, span, self.seen_cells().map(|cell| (cell, role(cell))));
+        for &cell in holes.cells() {
             let cell = cell as usize;
-            let [x, y] = cells.cell_centre_m(cell);
+            let [x, y] = self.cells.cell_centre_m(cell);
             if context.is_reached(x, y) {
-                class[cell] = if seen[cell] { TerrainClass::Flat } else { TerrainClass::FlatInferred };
+                class[cell] = if self.is_seen(cell) { TerrainClass::Flat } else { TerrainClass::FlatInferred };
             }
         }
+        self.holes = holes;
     }
 
     /// Writes the roughness of the flat cells (section 2.4); `raw` is empty before.
@@ -136,16 +154,12 @@ impl Terrain {
             return;
         }
         self.roughness.clear(self.cells.slots());
-        let points = self.cells.slot_of_points().zip(&sweep.deviation).zip(&sweep.noise);
-        for ((slot, &deviation), &noise) in points {
-            if let Some(slot) = slot {
-                self.roughness.add(slot, deviation, noise);
-            }
-        }
+        self.roughness.add_points(self.cells.numbers_of_points(), &sweep.deviation, &sweep.noise);
         for (slot, &cell) in self.regions.cell_of_slot().iter().enumerate() {
             let cell = cell as usize;
             let is_flat = matches!(self.class[cell], TerrainClass::Flat | TerrainClass::FlatUnreachable);
-            let known = self.roughness.of_cell(slot, self.config.roughness_points_min).filter(|_| is_flat);
+            let number = self.cells.number_of_slot(slot);
+            let known = self.roughness.of_cell(number, self.config.roughness_points_min).filter(|_| is_flat);
             if let Some(roughness) = known {
                 let steps = (roughness / ROUGHNESS.scale).round() as u32;
                 raw[cell] = steps.min(u32::from(ROUGHNESS.unknown) - 1) as u8;
@@ -170,7 +184,7 @@ impl Terrain {
         layer.clear_lists();
         let mut class = TypedChannel::CLASS.reuse(&mut layer.channels);
         class.extend(self.class.iter().map(|class| class.value()));
-        let count = |of: TerrainClass| class.iter().filter(|class| **class == of.value()).count() as f64;
+        let count = |of: TerrainClass| count_cells(&class, of.value()) as f64;
         let [flat, inferred] = [TerrainClass::Flat, TerrainClass::FlatInferred].map(count);
         layer.metrics.push(("drivable_share", drivable_share(layer.legend, &class)));
         layer.metrics.push(("inferred_share", if flat == 0.0 { 0.0 } else { inferred / flat }));
@@ -218,8 +232,8 @@ impl LayerMaker for Terrain {
         self.cells.sort_points(sweep, heights_m, self.config.overhang_m);
         self.regions.divide(&self.cells, &self.config);
         self.seen.clear();
-        self.seen.resize(self.regions.of_cell().len(), false);
-        self.regions.cell_of_slot().iter().for_each(|cell| self.seen[*cell as usize] = true);
+        self.seen.resize(self.regions.of_cell().len().div_ceil(64), 0);
+        self.regions.cell_of_slot().iter().for_each(|cell| self.seen[*cell as usize / 64] |= 1 << (cell % 64));
         self.classify(context);
         self.write(sweep, layer);
     }

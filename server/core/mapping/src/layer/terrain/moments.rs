@@ -6,14 +6,15 @@
 //!
 //! Sums of whole numbers are exact, so that they do not depend on the order of the points.
 
+use crate::layer::roughness::NOWHERE;
 use crate::sensor::sweep::Sweep;
 
 use super::division::{Division, Region, cell_of_rank};
 
-/// Cell of a point that lies in no cell.
-const NOWHERE: u32 = u32::MAX;
 /// A value from 2^23 to 2^24, where each f32 is a whole number.
 const WHOLE: f32 = 1.5 * 8_388_608.0;
+/// Number of points that are processed together. Ours: their intermediate values fit into the first-level cache.
+const CHUNK: usize = 1024;
 /// Largest depth of a point below the ego origin, metres. Ours: it bounds the sums.
 const DEPTH_M_MAX: f32 = 100.0;
 
@@ -86,8 +87,14 @@ pub struct Cells {
     rank_of_cell: Vec<u32>,
     /// Index in the grid of the cell of each rank; [`NOWHERE`] for a cell beyond the grid.
     cell_of_rank: Vec<u32>,
-    /// Cell of each point; then the rank of that cell; after the slots are numbered, its slot.
-    cell_of_point: Vec<u32>,
+    /// Number of each cell of the grid, in the order in which points fell into them; [`NOWHERE`] without points.
+    number_of_cell: Vec<u32>,
+    /// By number of a cell: the cell.
+    numbered: Vec<u32>,
+    /// By number of a cell: the sums over its points, and the heights of its lowest and highest point, mm.
+    sums_of_number: Vec<(Moments, [f32; 2])>,
+    /// Number of the cell of each point.
+    number_of_point: Vec<u32>,
     /// One bit for each cell of the grid, by rank: set if the cell has a point.
     occupied: Vec<u64>,
     /// Number of occupied cells before each word of `occupied`.
@@ -121,7 +128,8 @@ impl Cells {
                 *of_cell = rank;
             }
         }
-        Self { half, side, cell_m, rank_of_cell, cell_of_rank, ..Self::default() }
+        let number_of_cell = vec![NOWHERE; rank_of_cell.len()];
+        Self { half, side, cell_m, rank_of_cell, cell_of_rank, number_of_cell, ..Self::default() }
     }
 
     /// The region with which the division begins.
@@ -140,16 +148,41 @@ impl Cells {
     /// Assigns the points to cells, and sums them. Points that are higher over the ground than `overhang_m`, and points
     /// beyond the grid, are left out. `heights_m` are the heights of the points over the ground, metres.
     pub fn sort_points(&mut self, sweep: &Sweep, heights_m: &[f32], overhang_m: f32) {
-        self.find_cells(sweep, heights_m, overhang_m);
+        self.sum_cells(sweep, heights_m, overhang_m);
         self.number_slots();
-        self.sum(sweep);
+        self.sum_slots();
     }
 
-    fn find_cells(&mut self, sweep: &Sweep, heights_m: &[f32], overhang_m: f32) {
+    /// Sums the points of each cell.
+    fn sum_cells(&mut self, sweep: &Sweep, heights_m: &[f32], overhang_m: f32) {
+        self.numbered.drain(..).for_each(|cell| self.number_of_cell[cell as usize] = NOWHERE);
+        self.sums_of_number.clear();
+        self.number_of_point.clear();
+        let (mut cells, mut points) = ([NOWHERE; CHUNK], [[0.0; CHUNK]; 3]);
+        let chunks = sweep.x.chunks(CHUNK).zip(sweep.y.chunks(CHUNK)).zip(sweep.z.chunks(CHUNK));
+        for (((xs, ys), zs), heights_m) in chunks.zip(heights_m.chunks(CHUNK)) {
+            self.find_cells([xs, ys, heights_m], overhang_m, &mut cells);
+            for (millimetres_of, metres) in points.iter_mut().zip([xs, ys, zs]) {
+                millimetres_of.iter_mut().zip(metres).for_each(|(mm, metres)| *mm = millimetres(*metres));
+            }
+            let [xs, ys, zs] = &points;
+            for (i, &cell) in cells[..heights_m.len()].iter().enumerate() {
+                let number = self.number(cell);
+                self.number_of_point.push(number);
+                if let Some((sums, [low, high])) = self.sums_of_number.get_mut(number as usize) {
+                    let z = zs[i];
+                    sums.add([xs[i], ys[i], z]);
+                    (*low, *high) = (if z < *low { z } else { *low }, if z > *high { z } else { *high });
+                }
+            }
+        }
+    }
+
+    /// Finds the cell of each point of a chunk. It has no branches, so that the compiler vectorises it.
+    fn find_cells(&self, [xs, ys, heights_m]: [&[f32]; 3], overhang_m: f32, cells: &mut [u32; CHUNK]) {
         let (scale, half) = (1.0 / self.cell_m, self.half as f32);
         let (offset, width) = (self.half, 2 * self.half as u32);
-        self.cell_of_point.resize(sweep.x.len(), NOWHERE);
-        for (((cell, &x), &y), &height) in self.cell_of_point.iter_mut().zip(&sweep.x).zip(&sweep.y).zip(heights_m) {
+        for (((cell, &x), &y), &height) in cells.iter_mut().zip(xs).zip(ys).zip(heights_m) {
             let (i, j) = (x * scale, y * scale);
             // NaN fails every comparison.
             let inside = (i >= -half)
@@ -165,20 +198,24 @@ impl Cells {
         }
     }
 
+    /// Number of a cell, a new one if no point fell into it before; [`NOWHERE`] for a cell beyond the grid.
+    #[inline(always)]
+    fn number(&mut self, cell: u32) -> u32 {
+        let Some(number) = self.number_of_cell.get_mut(cell as usize) else { return NOWHERE };
+        if *number == NOWHERE {
+            *number = self.numbered.len() as u32;
+            self.numbered.push(cell);
+            self.sums_of_number.push((Moments::default(), [f32::INFINITY, -f32::INFINITY]));
+        }
+        *number
+    }
+
     fn number_slots(&mut self) {
         self.occupied.clear();
         self.occupied.resize(self.cell_of_rank.len().div_ceil(64), 0);
-        // Neighbouring points of a laser mostly share a cell.
-        let (mut last, mut rank) = (NOWHERE, NOWHERE);
-        for cell in &mut self.cell_of_point {
-            if *cell != last {
-                last = *cell;
-                rank = self.rank_of_cell.get(last as usize).copied().unwrap_or(NOWHERE);
-                if rank != NOWHERE {
-                    self.occupied[(rank >> 6) as usize] |= 1 << (rank & 63);
-                }
-            }
-            *cell = rank;
+        for cell in &self.numbered {
+            let rank = self.rank_of_cell[*cell as usize];
+            self.occupied[(rank >> 6) as usize] |= 1 << (rank & 63);
         }
         self.slots_before.clear();
         self.rank_of_slot.clear();
@@ -192,41 +229,18 @@ impl Cells {
         }
     }
 
-    fn sum(&mut self, sweep: &Sweep) {
-        let slots = self.rank_of_slot.len();
-        self.sums.clear();
-        self.sums.resize(slots + 1, Moments::default());
+    /// Adds the cells up in the order of their slots.
+    fn sum_slots(&mut self) {
         self.span.clear();
-        self.span.resize(slots, [f32::INFINITY, -f32::INFINITY]);
-        // Neighbouring points of a laser mostly share a cell, so they are summed before the sums are written.
-        let nothing = (Moments::default(), f32::INFINITY, -f32::INFINITY);
-        let (mut rank, mut slot_of_rank, (mut held, mut low, mut high)) = (NOWHERE, NOWHERE, nothing);
-        let mut write = |slot: u32, held: &Moments, low: f32, high: f32| {
-            if slot != NOWHERE {
-                let slot = slot as usize;
-                self.sums[slot + 1] = self.sums[slot + 1].plus(held);
-                let [lowest, highest] = &mut self.span[slot];
-                (*lowest, *highest) = ((*lowest).min(low), (*highest).max(high));
-            }
-        };
-        let points = self.cell_of_point.iter_mut().zip(&sweep.x).zip(&sweep.y).zip(&sweep.z);
-        for (((cell, &x), &y), &z) in points {
-            if *cell != rank {
-                write(slot_of_rank, &held, low, high);
-                (rank, (held, low, high)) = (*cell, nothing);
-                let inside = rank != NOWHERE;
-                slot_of_rank = if inside { slot(&self.occupied, &self.slots_before, rank) as u32 } else { NOWHERE };
-            }
-            *cell = slot_of_rank;
-            let [x, y, z] = [x, y, z].map(millimetres);
-            held.add([x, y, z]);
-            (low, high) = (if z < low { z } else { low }, if z > high { z } else { high });
-        }
-        write(slot_of_rank, &held, low, high);
+        self.sums.clear();
         let mut running = Moments::default();
-        for sums in &mut self.sums {
+        self.sums.push(running);
+        for rank in &self.rank_of_slot {
+            let number = self.number_of_cell[self.cell_of_rank[*rank as usize] as usize] as usize;
+            let (sums, span) = &self.sums_of_number[number];
+            self.span.push(*span);
             running = running.plus(sums);
-            *sums = running;
+            self.sums.push(running);
         }
     }
 
@@ -283,9 +297,14 @@ impl Cells {
         self.cell_of_rank[self.rank_of_slot[slot] as usize] as usize
     }
 
-    /// The slot of each point, in the sweep's order; `None` for points that are left out.
-    pub fn slot_of_points(&self) -> impl Iterator<Item = Option<usize>> + '_ {
-        self.cell_of_point.iter().map(|slot| (*slot != NOWHERE).then_some(*slot as usize))
+    /// By point, in the sweep's order: the number of its cell; [`NOWHERE`] for points that are left out.
+    pub fn numbers_of_points(&self) -> &[u32] {
+        &self.number_of_point
+    }
+
+    /// By slot: the number of its cell.
+    pub fn number_of_slot(&self, slot: usize) -> usize {
+        self.number_of_cell[self.cell_of_slot(slot)] as usize
     }
 }
 

@@ -73,6 +73,14 @@ pub(crate) struct MountCheck {
     deviations: VecDeque<[f64; 3]>,
     newest: Option<MountDeviation>,
     cells: Vec<f32>,
+    /// Position of the lowest return of each cell that has one, metres.
+    lowest_m: Vec<[f64; 3]>,
+    /// Height and weight of these, by height.
+    heights: Vec<[f64; 2]>,
+    /// Those of them that lie on the plane.
+    on_plane: Vec<[f64; 3]>,
+    /// One value of the last scans with its weight, ascending.
+    ascending: Vec<[f64; 2]>,
 }
 
 impl MountCheck {
@@ -92,7 +100,7 @@ impl MountCheck {
         }
         self.deviations.push_back([-(plane.x * x + plane.y * y + plane.z), pitch_rad, roll_rad]);
         let [(height_m, height_std), (pitch_rad, pitch_std), (roll_rad, roll_std)] =
-            [0, 1, 2].map(|of| median_and_std(self.deviations.iter().map(|values| values[of])));
+            [0, 1, 2].map(|of| median_and_std(self.deviations.iter().map(|values| values[of]), &mut self.ascending));
         let was = self.newest.is_some_and(|newest| newest.contradicts);
         let exceeds = |value: f64, std: f64, least: f64| match was {
             true => value.abs() > END_SHARE * least,
@@ -120,22 +128,22 @@ impl MountCheck {
             }
         }
         let middle = |index: usize, half: f32| f64::from((index as f32 + 0.5) * CELL_M - half);
-        let cells: Vec<[f64; 3]> = (self.cells.iter().enumerate().filter(|(_, z)| z.is_finite()))
-            .map(|(cell, z)| {
-                let [x, y] = [middle(cell / CELLS_BESIDE, AHEAD_M), middle(cell % CELLS_BESIDE, BESIDE_M)];
-                [x, y, f64::from(*z)]
-            })
-            .collect();
+        let Self { lowest_m: cells, heights, on_plane, .. } = self;
+        cells.clear();
+        cells.extend(self.cells.iter().enumerate().filter(|(_, z)| z.is_finite()).map(|(cell, z)| {
+            let [x, y] = [middle(cell / CELLS_BESIDE, AHEAD_M), middle(cell % CELLS_BESIDE, BESIDE_M)];
+            [x, y, f64::from(*z)]
+        }));
         // The first plane is level, at the weighted median height.
-        let mut heights: Vec<[f64; 2]> = cells.iter().map(|cell| [cell[2], weight(cell)]).collect();
+        heights.clear();
+        heights.extend(cells.iter().map(|cell| [cell[2], weight(cell)]));
         heights.sort_by(|a, b| a[0].total_cmp(&b[0]));
-        let mut plane = Vector3::new(0.0, 0.0, weighted_median(&heights));
+        let mut plane = Vector3::new(0.0, 0.0, weighted_median(heights));
         let distance = |plane: &Vector3<f64>, [x, y, z]: &[f64; 3]| z - (plane.x * x + plane.y * y + plane.z);
-        let mut on_plane = Vec::new();
         for [over_m, under_m] in TOLERANCES_M {
             on_plane.clear();
             on_plane.extend(cells.iter().filter(|cell| (-under_m..=over_m).contains(&distance(&plane, cell))));
-            plane = fit(&on_plane)?;
+            plane = fit(on_plane)?;
         }
         let ahead = on_plane.iter().filter(|cell| cell[0] > 0.0).count();
         let is_seen = on_plane.len() >= CELLS_MIN && ahead >= HALF_MIN && on_plane.len() - ahead >= HALF_MIN;
@@ -149,7 +157,7 @@ fn weight([x, y, _]: &[f64; 3]) -> f64 {
 }
 
 /// The plane of weighted least squares; `None` if the cells lie in a line.
-fn fit(cells: &[&[f64; 3]]) -> Option<Vector3<f64>> {
+fn fit(cells: &[[f64; 3]]) -> Option<Vector3<f64>> {
     let (mut matrix, mut vector) = (Matrix3::zeros(), Vector3::zeros());
     for cell in cells {
         let (row, weight) = (Vector3::new(cell[0], cell[1], 1.0), weight(cell));
@@ -159,11 +167,12 @@ fn fit(cells: &[&[f64; 3]]) -> Option<Vector3<f64>> {
     matrix.cholesky().map(|cholesky| cholesky.solve(&vector))
 }
 
-/// Median and standard deviation of values.
-fn median_and_std(values: impl Iterator<Item = f64>) -> (f64, f64) {
-    let mut ascending: Vec<[f64; 2]> = values.map(|value| [value, 1.0]).collect();
+/// Median and standard deviation of values; `ascending` is a buffer.
+fn median_and_std(values: impl Iterator<Item = f64>, ascending: &mut Vec<[f64; 2]>) -> (f64, f64) {
+    ascending.clear();
+    ascending.extend(values.map(|value| [value, 1.0]));
     ascending.sort_by(|a, b| a[0].total_cmp(&b[0]));
-    (weighted_median(&ascending), weighted_std(&ascending))
+    (weighted_median(ascending), weighted_std(ascending))
 }
 
 #[cfg(test)]
