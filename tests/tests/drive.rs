@@ -9,6 +9,8 @@
 #[path = "../../client/examples/planner/astar.rs"]
 mod astar;
 mod fixture;
+#[path = "../../client/examples/planner/motion.rs"]
+mod motion;
 #[allow(dead_code, reason = "the example has a goal straight ahead")]
 #[path = "../../client/examples/follower/safe_points.rs"]
 mod safe_points;

@@ -6,6 +6,7 @@ mod venv;
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Output, Stdio};
+use std::time::{Duration, SystemTime};
 
 use clearway::store::index::{Entry, Search, search};
 use clearway::store::{location, upload};
@@ -23,6 +24,13 @@ fn recordings(folder: &Path, names: &[&str]) -> PathBuf {
         std::fs::copy(workspace().join("tests/golden/drive.mcap"), recordings.join(name)).unwrap();
     }
     recordings
+}
+
+/// Sets the time at which a file was last written to so many hours before now.
+fn modified_hours_ago(file: &Path, hours: i64) {
+    let (now, span) = (SystemTime::now(), Duration::from_secs(hours.unsigned_abs() * 3600));
+    let time = if hours < 0 { now + span } else { now - span };
+    std::fs::File::options().write(true).open(file).unwrap().set_modified(time).unwrap();
 }
 
 fn clearway(environment: &[(&str, &str)], arguments: &[&str]) -> Output {
@@ -47,14 +55,15 @@ fn parts_are_found_in_a_folder_by_vehicle_time_place_and_faults() {
     let bytes = std::fs::read(recordings.join("whole.mcap")).unwrap();
     let cut = recordings.join("cut.mcap");
     std::fs::write(&cut, &bytes[..bytes.len() - 1000]).unwrap();
+    // An hour ahead of the clock, so that it is new however long this test waits for a build.
+    modified_hours_ago(&cut, -1);
     let store = folder.path().join("store").display().to_string();
     let upload = || clearway(&[], &["upload", recordings.to_str().unwrap(), "--store", &store]);
     let first = upload();
     assert_eq!(first.status.code(), Some(0), "{}", text(&first.stderr));
     // The cut file may still be written, until it is old.
     assert_eq!(text(&first.stdout).lines().count(), 1, "{}", text(&first.stdout));
-    let old = std::time::SystemTime::now() - std::time::Duration::from_secs(600);
-    std::fs::File::options().write(true).open(&cut).unwrap().set_modified(old).unwrap();
+    modified_hours_ago(&cut, 1);
     assert_eq!(upload().status.code(), Some(0));
     assert!(upload().stdout.is_empty(), "what is confirmed is not sent again");
 
