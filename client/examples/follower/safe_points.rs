@@ -27,7 +27,6 @@ const REST_WEIGHT: f64 = 3.0;
 /// Least and greatest distance of the point to aim at, in metres.
 const AIM_M: std::ops::Range<f64> = 2.0..10.0;
 
-
 /// The safe points of the newest map.
 #[derive(Debug, Default)]
 pub struct Follower {

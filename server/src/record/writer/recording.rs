@@ -6,8 +6,8 @@
 
 use std::collections::VecDeque;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant, SystemTime};
 
 use clearway_mapping::event::Event;
@@ -18,7 +18,7 @@ use super::super::mcap_file::{Disk, Header, McapFile};
 use super::control::{Command, Request};
 use super::counts::RecorderCounts;
 use super::folder::{Files, RecordError};
-use super::handle::{Item, RecordingHandle, WantedPart};
+use super::handle::{Item, Link, RecordingHandle, WantedPart, link};
 use crate::config::Recorder as Options;
 use crate::encode::EncodedMap;
 
@@ -90,9 +90,19 @@ impl<F: Files> RecordingWriter<F> {
         waits: bool,
         now: Instant,
     ) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
-        let (queue, items) = sync_channel(options.queue);
-        let counts = Arc::new(RecorderCounts::new(&header.vehicles));
-        let wanted = Arc::new(AtomicU64::new(0));
+        let (link, handles) = link(options, header, waits);
+        Ok((Self::begin(files, link, options, header, waits, now)?, handles))
+    }
+
+    /// As [`RecordingWriter::new`], for handles that exist.
+    pub(super) fn begin(
+        files: F,
+        Link { items, counts, wanted }: Link,
+        options: &Options,
+        header: &Header,
+        waits: bool,
+        now: Instant,
+    ) -> Result<Self, RecordError> {
         let mut writer = Self {
             files,
             options: options.clone(),
@@ -100,23 +110,19 @@ impl<F: Files> RecordingWriter<F> {
             parts: VecDeque::new(),
             vehicles: vec![VehicleState::default(); header.vehicles.len()],
             items,
-            wanted: wanted.clone(),
+            wanted,
             newest_part: 0,
             closed: VecDeque::new(),
             sync_at: None,
             retry_at: None,
             is_stopped: false,
             waits,
-            counts: counts.clone(),
+            counts,
             reason: String::new(),
         };
         writer.begin_part(now)?;
         writer.vehicles.iter_mut().for_each(|vehicle| vehicle.part = Some(1));
-        let warm_up = Duration::from_millis(options.warm_up_ms);
-        let handle =
-            |vehicle| RecordingHandle::new(vehicle, queue.clone(), counts.clone(), waits, wanted.clone(), warm_up);
-        let handles = (0..header.vehicles.len()).map(handle).collect();
-        Ok((writer, handles))
+        Ok(writer)
     }
 
     /// The counts of the recording.
@@ -127,6 +133,7 @@ impl<F: Files> RecordingWriter<F> {
     /// Writes events and maps, and answers requests, until all handles are dropped.
     pub(super) fn run(mut self, requests: &std::sync::mpsc::Receiver<Request>) {
         loop {
+            self.counts.beat();
             match self.items.recv_timeout(POLL_INTERVAL) {
                 Ok(item) => self.write(item, Instant::now()),
                 Err(RecvTimeoutError::Timeout) => {}
@@ -162,6 +169,7 @@ impl<F: Files> RecordingWriter<F> {
         while let Some(part) = self.parts.pop_front() {
             self.close(part, Instant::now());
         }
+        self.counts.set_ended();
     }
 
     /// Does what has become due.
