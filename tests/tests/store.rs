@@ -200,6 +200,20 @@ fn a_bucket_that_refuses_lies_or_vanishes_costs_no_recording() {
     let options = ["--vehicle", "car", "--from", "2026-01-01T00:00:00Z"];
     assert_eq!(found(&server.environment(), STORE, &options), 1, "two names of one content are one entry");
 
+    for url in ["s3://fleet/kept", "s3://fleet/kept/parts"] {
+        let output = clearway(&server.environment(), &["verify", url, "--json"]);
+        assert_eq!(output.status.code(), Some(0), "{url}: {}", text(&output.stderr));
+        let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let files = report["files"].as_array().unwrap();
+        assert_eq!((files.len(), &files[0]["maps"]), (1, &3.into()), "{url}: {report:#}");
+        assert!(files[0]["file"].as_str().unwrap().starts_with("s3://fleet/kept/parts/"), "{report:#}");
+    }
+    for (url, said) in [("s3://fleet/other", "no recording"), ("s3://fleet/kept/a.mcap", "s3://fleet/kept/a.mcap")] {
+        let output = clearway(&server.environment(), &["verify", url]);
+        assert_eq!(output.status.code(), Some(2), "{url}");
+        assert!(text(&output.stderr).contains(said), "{url}: {}", text(&output.stderr));
+    }
+
     std::fs::copy(workspace().join("tests/golden/drive.mcap"), recordings.join("c.mcap")).unwrap();
     server.process.kill().unwrap();
     server.process.wait().unwrap();

@@ -39,6 +39,9 @@ pub struct Recorder {
     /// True if an existing file is replaced when the new one is whole; never configured, only by `--force`.
     #[serde(skip)]
     pub replaces: bool,
+    /// True if no part is deleted that the store has not confirmed; never configured, only by `[store]`.
+    #[serde(skip)]
+    pub awaits_store: bool,
     /// True if a file that exists stays, and the recording gets the next free name; never configured, only by `serve`.
     #[serde(skip)]
     pub is_numbered: bool,
@@ -84,6 +87,7 @@ impl Default for Recorder {
             chunk_kb: 1024,
             compression: Compression::Zstd,
             replaces: false,
+            awaits_store: false,
             is_numbered: false,
             family: PathBuf::new(),
         }

@@ -16,7 +16,9 @@ use super::listeners::Listeners;
 use super::running::Running;
 use super::save_rules;
 use super::setup::{Setup, StartError};
-use crate::config::{Certificates, Config, Vehicle, listeners};
+#[cfg(feature = "store")]
+use super::uploads;
+use crate::config::{self, Certificates, Config, Vehicle, listeners};
 use crate::engine::{Engine, Observer};
 use crate::ingest::gateway::{Gateway, Gateways};
 use crate::ingest::grpc::Ingest;
@@ -47,6 +49,9 @@ impl Server {
         let Setup { config, mut calibrations, boot_id, .. } = setup;
         if config.zenoh.enabled && !cfg!(feature = "zenoh") {
             return Err(StartError::NoZenoh);
+        }
+        if !config.store.url.is_empty() && !cfg!(feature = "store") {
+            return Err(StartError::NoStore);
         }
         let boot_id = boot_id.unwrap_or_else(random);
         let mut observer = setup.observer;
@@ -162,7 +167,25 @@ impl Running {
     ) -> Result<(), StartError> {
         let mut handles = Vec::new().into_iter();
         if recording_path(&config.recorder).is_some() {
-            let (recorder, of_vehicles) = Recorder::start(&config.recorder, &header(), driver.from_files)?;
+            let options = config::Recorder { awaits_store: !config.store.url.is_empty(), ..config.recorder.clone() };
+            let (recorder, of_vehicles) = Recorder::start(&options, &header(), driver.from_files)?;
+            #[cfg(feature = "store")]
+            if options.awaits_store {
+                let uploads = uploads::upload_finished(config.store.clone(), recorder.control(), recorder.counts());
+                let (stopped, runtime) = (self.stopped(), tokio::runtime::Handle::current());
+                // What the store has not confirmed at the end stays, and the next start sends it. On a thread of its
+                // own, because it reads whole files.
+                let work = async move {
+                    tokio::select! {
+                        () = uploads => {}
+                        () = stopped => {}
+                    }
+                };
+                self.publishers.spawn(async move {
+                    // Fails only if the runtime shuts down.
+                    let _ = tokio::task::spawn_blocking(move || runtime.block_on(work)).await;
+                });
+            }
             (self.recorder, handles) = (Some(recorder), of_vehicles.into_iter());
         }
         for Prepared { served: Served { status, .. }, mut engine, events, core: (core, tables) } in prepared {

@@ -67,7 +67,17 @@ pub struct RecorderCounts {
     /// Time of the newest sign of life of the recorder's thread, in ms after `started`.
     beat_ms: AtomicU64,
     has_ended: AtomicBool,
+    store: StoreCounters,
     changing: Mutex<Changing>,
+}
+
+/// Parts that the long-term store has confirmed, those that wait for it, attempts that failed, and why the newest did.
+#[derive(Debug, Default)]
+struct StoreCounters {
+    confirmed: AtomicU64,
+    waiting: AtomicU64,
+    failures: AtomicU64,
+    problem: Mutex<String>,
 }
 
 /// What changes seldom.
@@ -93,6 +103,7 @@ impl RecorderCounts {
             started: Instant::now(),
             beat_ms: AtomicU64::new(0),
             has_ended: AtomicBool::new(false),
+            store: StoreCounters::default(),
             changing: Mutex::default(),
         };
         for (vehicle, layers) in vehicles {
@@ -182,6 +193,27 @@ impl RecorderCounts {
         changing.failure.get_or_insert_with(|| reason.to_owned());
     }
 
+    /// Notes how many finished parts the store has not confirmed.
+    pub(crate) fn set_waiting_for_store(&self, parts: u64) {
+        self.store.waiting.store(parts, Ordering::Relaxed);
+    }
+
+    /// Counts a part that the store has confirmed; `waiting` are left.
+    pub(crate) fn add_confirmed(&self, waiting: u64) {
+        self.store.confirmed.fetch_add(1, Ordering::Relaxed);
+        self.set_waiting_for_store(waiting);
+    }
+
+    /// Counts an attempt to store a part that failed.
+    pub(crate) fn add_store_failure(&self) {
+        self.store.failures.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Notes why the store has not confirmed a part; empty: nothing is wrong.
+    pub(crate) fn set_store_problem(&self, problem: String) {
+        *locked(&self.store.problem) = problem;
+    }
+
     /// The first failure of the disk; `None` without one.
     pub fn stop_reason(&self) -> Option<String> {
         locked(&self.changing).failure.clone()
@@ -250,6 +282,10 @@ impl RecorderCounts {
             durable_events: durable
                 .map(|(vehicle, events)| (vehicle.to_string(), events.load(Ordering::Acquire)))
                 .collect::<BTreeMap<_, _>>(),
+            store_confirmed: self.store.confirmed.load(Ordering::Relaxed),
+            store_waiting: self.store.waiting.load(Ordering::Relaxed),
+            store_failures: self.store.failures.load(Ordering::Relaxed),
+            store_problem: locked(&self.store.problem).clone(),
         }
     }
 }

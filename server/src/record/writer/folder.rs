@@ -80,6 +80,7 @@ pub struct Folder {
     keep_bytes: Option<u64>,
     keep_time: Option<Duration>,
     saved_bytes: Option<u64>,
+    awaits_store: bool,
 }
 
 impl Folder {
@@ -106,7 +107,15 @@ impl Folder {
         let family = if options.family.as_os_str().is_empty() { &options.file } else { &options.family };
         let (file, family) = (options.file.clone(), family.clone());
         let saved_bytes = Some(options.saved_mb << 20).filter(|bytes| *bytes > 0);
-        Self { file, family, replaces: options.replaces, keep_bytes, keep_time, saved_bytes }
+        Self {
+            file,
+            family,
+            replaces: options.replaces,
+            keep_bytes,
+            keep_time,
+            saved_bytes,
+            awaits_store: options.awaits_store,
+        }
     }
 
     fn parent(&self) -> &Path {
@@ -243,18 +252,28 @@ impl Files for Folder {
         for (path, length, modified) in parts {
             let is_over = self.keep_bytes.is_some_and(|keep| bytes > keep);
             let is_old = self.keep_time.is_some_and(|keep| modified.elapsed().is_ok_and(|age| age > keep));
-            if !is_over && !is_old {
+            let confirmation = confirmation_of(&path);
+            if (!is_over && !is_old) || (self.awaits_store && !confirmation.exists()) {
                 continue;
             }
             match fs::remove_file(&path) {
                 Ok(()) => {
                     bytes -= length;
+                    // Of a part that is not there it means nothing.
+                    let _ = fs::remove_file(confirmation);
                     tracing::info!(file = %path.display(), is_over, is_old, "deleted an old part of the recording");
                 }
                 Err(error) => tracing::warn!(file = %path.display(), %error, "an old part cannot be deleted"),
             }
         }
     }
+}
+
+/// The file beside a part that says that the long-term store has confirmed it.
+pub fn confirmation_of(part: &Path) -> PathBuf {
+    let mut name = part.as_os_str().to_owned();
+    name.push(".confirmed");
+    name.into()
 }
 
 /// Renames a file unless the new name exists: a link cannot replace a file.

@@ -50,6 +50,9 @@ pub(super) struct Link {
     pub items: Receiver<Item>,
     pub counts: Arc<RecorderCounts>,
     pub wanted: WantedPart,
+    pub options: Options,
+    pub header: Header,
+    pub waits: bool,
 }
 
 /// The queue of a recording, with a handle for each vehicle of the header. What the handles send belongs to part 1.
@@ -60,7 +63,8 @@ pub(super) fn link(options: &Options, header: &Header, waits: bool) -> (Link, Ve
     let warm_up = Duration::from_millis(options.warm_up_ms);
     let handle = |vehicle| RecordingHandle::new(vehicle, queue.clone(), counts.clone(), waits, wanted.clone(), warm_up);
     let handles = (0..header.vehicles.len()).map(handle).collect();
-    (Link { items, counts, wanted }, handles)
+    let (options, header) = (options.clone(), header.clone());
+    (Link { items, counts, wanted, options, header, waits }, handles)
 }
 
 /// A new pipeline that processes events beside the vehicle's own.

@@ -30,7 +30,7 @@ mod recording;
 
 pub use control::{Command, ControlError, RecorderControl};
 pub use counts::{IncompleteRecordingError, RecorderCounts, RecorderState};
-pub use folder::{Files, Folder, RecordError, is_same_file, next_free_name, parts_of, recording_path};
+pub use folder::{Files, Folder, RecordError, confirmation_of, is_same_file, next_free_name, parts_of, recording_path};
 pub use handle::RecordingHandle;
 pub use recording::RecordingWriter;
 
@@ -77,11 +77,10 @@ impl Recorder {
         let (requests, received) = channel();
         let (begun, has_begun) = channel();
         let control = RecorderControl { requests, counts: counts.clone(), options: options.clone() };
-        let (of_thread, header, failed) = (options.clone(), header.clone(), create.clone());
+        let failed = create.clone();
         let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
-            let writer = open()
-                .map_err(failed)
-                .and_then(|files| RecordingWriter::begin(files, link, &of_thread, &header, waits, Instant::now()));
+            let writer = open().map_err(failed);
+            let writer = writer.and_then(|files| RecordingWriter::begin(files, link, Instant::now()));
             let (outcome, writer) = writer.map_or_else(|error| (Err(error), None), |writer| (Ok(()), Some(writer)));
             // The start waits no longer if the disk was late; then its failure is in the status.
             if let Err(SendError(Err(error))) = begun.send(outcome) {

@@ -91,24 +91,18 @@ impl<F: Files> RecordingWriter<F> {
         now: Instant,
     ) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
         let (link, handles) = link(options, header, waits);
-        Ok((Self::begin(files, link, options, header, waits, now)?, handles))
+        Ok((Self::begin(files, link, now)?, handles))
     }
 
     /// As [`RecordingWriter::new`], for handles that exist.
-    pub(super) fn begin(
-        files: F,
-        Link { items, counts, wanted }: Link,
-        options: &Options,
-        header: &Header,
-        waits: bool,
-        now: Instant,
-    ) -> Result<Self, RecordError> {
+    pub(super) fn begin(files: F, link: Link, now: Instant) -> Result<Self, RecordError> {
+        let Link { items, counts, wanted, options, header, waits } = link;
         let mut writer = Self {
             files,
-            options: options.clone(),
-            header: header.clone(),
             parts: VecDeque::new(),
             vehicles: vec![VehicleState::default(); header.vehicles.len()],
+            options,
+            header,
             items,
             wanted,
             newest_part: 0,
