@@ -66,7 +66,10 @@ async fn upload_all(
     for (part, seen) in waiting {
         let opened = match store {
             Some(store) => store.clone(),
-            None => location::open(&options.url).map_err(|error| error.to_string())?,
+            None => location::open(&options.url).map_err(|error| {
+                counts.add_store_failure();
+                error.to_string()
+            })?,
         };
         *store = Some(opened.clone());
         match upload::upload(&*opened, &part).await {

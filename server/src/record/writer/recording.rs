@@ -145,6 +145,7 @@ impl<F: Files> RecordingWriter<F> {
 
     /// Writes the first queued item, if there is one, at the time `now`. Returns true if there was one.
     pub fn write_next(&mut self, now: Instant) -> bool {
+        self.counts.beat();
         let item = self.items.try_recv();
         let is_item = item.is_ok();
         if let Ok(item) = item {
