@@ -55,8 +55,8 @@ pub struct Subscription {
     pub region: Option<v1::Region>,
     /// Layers may be sent as deltas to the map before: fewer bytes, the same maps.
     pub deltas: bool,
-    /// True: a map is as old as it was when it was made, plus the time since it came. So the maps of a replay that keeps
-    /// the recorded stamps are judged by the replay's clock; pass [`MapView::now_ns`] to [`MapView::is_stale`].
+    /// True: a map is as old as it was when it was made, plus the time since it came. So the maps of a replay that
+    /// keeps the recorded stamps are judged by the replay's clock; pass [`MapView::now_ns`] to [`MapView::is_stale`].
     pub replay_clock: bool,
 }
 

@@ -111,8 +111,8 @@ impl MapView {
         self.arrival.as_ref().map_or(0, |arrival| arrival.since_ns())
     }
 
-    /// Present time of the clock by which the map's age is measured, ns since the Unix epoch: this machine's wall clock,
-    /// or the clock of a replay ([`crate::Subscription::replay_clock`]).
+    /// Present time of the clock by which the map's age is measured, ns since the Unix epoch: this machine's wall
+    /// clock, or the clock of a replay ([`crate::Subscription::replay_clock`]).
     pub fn now_ns(&self) -> i64 {
         self.arrival.as_ref().map_or_else(now_ns, |arrival| arrival.now_ns())
     }

@@ -108,8 +108,9 @@ def _receive_maps(
     *,
     acknowledges: bool,
 ) -> None:
-    """Stores the map of every update and acknowledges it, in lockstep when it was handled. If a delta needs a map that is not here (an update was lost),
-    it requests a keyframe. Maps not stored count as skipped, except those that the requested rate excluded."""
+    """Stores the map of every update and acknowledges it, in lockstep when it was handled. If a delta needs a map that
+    is not here (an update was lost), it requests a keyframe. Maps not stored count as skipped, except those that the
+    requested rate excluded."""
     base: Map | None = None
     is_requested, left_out = False, 0
     for update in updates:

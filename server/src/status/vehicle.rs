@@ -190,8 +190,8 @@ impl VehicleStatus {
         self.fault().is_none()
     }
 
-    /// What has stopped or hangs: the vehicle's engine, a listener, or a thread that reads its sockets; `None` if nothing
-    /// has.
+    /// What has stopped or hangs: the vehicle's engine, a listener, or a thread that reads its sockets; `None` if
+    /// nothing has.
     pub fn fault(&self) -> Option<String> {
         if self.engine_stopped.load(Ordering::Acquire) {
             return Some(format!("the engine of vehicle {} has stopped", self.name));

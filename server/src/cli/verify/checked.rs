@@ -107,7 +107,7 @@ fn outcome_of(file: &Path, check: &Check) -> Result<Outcome> {
     #[cfg(feature = "store")]
     if let Some(url) = file.to_str().filter(|text| super::files::is_url(text)) {
         let copy = crate::cli::output::block_on(crate::store::fetch::fetch(url))?;
-        // Reasons name the copy, which nobody knows.
+        // A reason names the copy, which is gone when it is read.
         return outcome(copy.path(), check)
             .map_err(|error| anyhow::anyhow!(with_causes(&error).replace(&copy.path().display().to_string(), url)));
     }

@@ -34,8 +34,8 @@ pub use folder::{Files, Folder, RecordError, confirmation_of, is_same_file, next
 pub use handle::RecordingHandle;
 pub use recording::RecordingWriter;
 
-/// Longest wait for the disk at the start of a live recording; after it the server starts, and the recorder goes on when
-/// the disk answers. Ours: a disk that works creates a file in milliseconds.
+/// Longest wait for the disk at the start of a live recording; after it the server starts, and the recorder goes on
+/// when the disk answers. Ours: a disk that works creates a file in milliseconds.
 const START_TIME_MAX: Duration = Duration::from_millis(500);
 /// Longest wait for the disk at the end of a live recording. Ours: a process supervisor kills after ten seconds.
 const FINISH_TIME_MAX: Duration = Duration::from_secs(5);
