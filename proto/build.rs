@@ -9,8 +9,13 @@ fn main() -> Result<(), Box<dyn Error>> {
     for proto in &protos {
         println!("cargo::rerun-if-changed={proto}");
     }
+    let out = PathBuf::from(env::var("OUT_DIR")?);
     let descriptors = protox::compile(protos, ["."])?;
-    fs::write(PathBuf::from(env::var("OUT_DIR")?).join("clearway.v1.bin"), descriptors.encode_to_vec())?;
+    fs::write(out.join("clearway.v1.bin"), descriptors.encode_to_vec())?;
+    // A recording carries a schema for each of its messages: those without comments and services.
+    let mut recorded = protox::compile(["clearway/v1/journal.proto"], ["."])?;
+    recorded.file.iter_mut().for_each(|file| file.source_code_info = None);
+    fs::write(out.join("recording.bin"), recorded.encode_to_vec())?;
     // Ordered maps: the same map must always give the same bytes.
     tonic_prost_build::configure().bytes(".clearway.v1").btree_map(".clearway.v1").compile_fds(descriptors)?;
     Ok(())

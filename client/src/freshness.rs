@@ -24,13 +24,15 @@ pub(crate) struct Clock {
     pub wall_ns: Read,
     /// Steady clock, ns since the start of the process; it never goes back.
     pub steady_ns: Read,
+    /// True: the wall clock is the replay's, which stood at the end of the making of each map when it came.
+    pub is_of_replay: bool,
 }
 
 impl Default for Clock {
     /// The clocks of this machine.
     fn default() -> Self {
         let steady = || i64::try_from(START.elapsed().as_nanos()).unwrap_or(i64::MAX);
-        Self { wall_ns: Arc::new(now_ns), steady_ns: Arc::new(steady) }
+        Self { wall_ns: Arc::new(now_ns), steady_ns: Arc::new(steady), is_of_replay: false }
     }
 }
 
@@ -50,8 +52,12 @@ pub(crate) struct Arrival {
 }
 
 impl Arrival {
-    /// Arrival, now, of a map captured at `capture_end_ns`.
-    pub fn new(clock: Clock, capture_end_ns: i64) -> Self {
+    /// Arrival, now, of a map captured at `capture_end_ns` and made at `completed_ns`.
+    pub fn new(mut clock: Clock, capture_end_ns: i64, completed_ns: i64) -> Self {
+        if clock.is_of_replay {
+            let (steady, came_ns) = (clock.steady_ns.clone(), (clock.steady_ns)());
+            clock.wall_ns = Arc::new(move || completed_ns.saturating_add(steady().saturating_sub(came_ns)));
+        }
         let age_ns = (clock.wall_ns)().saturating_sub(capture_end_ns).max(0);
         Self { steady_ns: (clock.steady_ns)(), age_ns, clock }
     }

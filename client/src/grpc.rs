@@ -55,6 +55,9 @@ pub struct Subscription {
     pub region: Option<v1::Region>,
     /// Layers may be sent as deltas to the map before: fewer bytes, the same maps.
     pub deltas: bool,
+    /// True: a map is as old as it was when it was made, plus the time since it came. So the maps of a replay that
+    /// keeps the recorded stamps are judged by the replay's clock; pass [`MapView::now_ns`] to [`MapView::is_stale`].
+    pub replay_clock: bool,
 }
 
 /// Certificates of an encrypted connection, as PEM text.
@@ -77,6 +80,7 @@ impl Default for Subscription {
             max_rate_hz: None,
             region: None,
             deltas: false,
+            replay_clock: false,
         }
     }
 }
@@ -184,7 +188,7 @@ impl Client {
     /// [`ClientError::Unreachable`] if the connection fails, [`ClientError::Refused`] if the vehicle, a layer, the rate
     /// or the region cannot be served.
     pub async fn subscribe(&self, subscription: Subscription) -> Result<MapStream, ClientError> {
-        let Subscription { vehicle, layers, max_in_flight, max_rate_hz, region, deltas } = subscription;
+        let Subscription { vehicle, layers, max_in_flight, max_rate_hz, region, deltas, replay_clock } = subscription;
         let max_in_flight = max_in_flight.max(1);
         let selection = v1::Selection { vehicle, layers, max_in_flight, max_rate_hz, region, deltas };
         let mut service = MapServiceClient::new(dial(&self.endpoint, &self.address).await?);
@@ -193,7 +197,8 @@ impl Client {
         let updates = service.watch(first.chain(ReceiverStream::new(requests))).await;
         let updates = updates.map_err(|status| refused(&self.address, &status))?.into_inner();
         let address = self.address.clone();
-        Ok(MapStream::spawn(move |slot| receive_maps(slot, address, updates, acknowledge)))
+        let clock = Clock { is_of_replay: replay_clock, ..Clock::default() };
+        Ok(MapStream::spawn(clock, move |slot| receive_maps(slot, address, updates, acknowledge)))
     }
 
     /// Opens a stream for a vehicle's observations, over a separate connection.
@@ -246,7 +251,8 @@ impl Tls {
     }
 }
 
-/// Stores the map of every update in the slot and acknowledges it; returns why the stream ended. If a delta needs a map
+/// Stores the map of every update in the slot and acknowledges it, in lockstep when it was handled; returns why the
+/// stream ended. If a delta needs a map
 /// that is not here (an update was lost), it requests a keyframe. Maps not stored count as skipped, except those that
 /// the requested rate excluded.
 async fn receive_maps(
@@ -287,6 +293,9 @@ async fn receive_maps(
                 v1::WatchRequest { acknowledged: Some(acknowledged), request_keyframe, selection: None }
             }
         };
+        if update.lockstep && request.acknowledged.is_some() && !request.request_keyframe {
+            slot.handled().await;
+        }
         if requests.send(request).await.is_err() {
             return ClientError::Ended { address };
         }

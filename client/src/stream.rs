@@ -47,6 +47,8 @@ pub struct MapStream {
     fresh: Option<MapView>,
     /// `Slot::replay_ends` at the last call.
     replay_ends: u64,
+    /// `Counters::maps` of the map that the reader has handled.
+    handled: watch::Sender<u64>,
     task: JoinHandle<()>,
 }
 
@@ -120,8 +122,11 @@ pub(crate) struct Missed {
 impl MapStream {
     /// Runs a task in the background that stores the maps of one server in the slot. Its result is the reason why it
     /// ended.
-    pub(crate) fn spawn<F: Future<Output = ClientError> + Send + 'static>(task: impl FnOnce(LatestSlot) -> F) -> Self {
-        let slot = LatestSlot { has_one_server: true, ..LatestSlot::new(Clock::default()) };
+    pub(crate) fn spawn<F: Future<Output = ClientError> + Send + 'static>(
+        clock: Clock,
+        task: impl FnOnce(LatestSlot) -> F,
+    ) -> Self {
+        let slot = LatestSlot { has_one_server: true, ..LatestSlot::new(clock) };
         let task = task(slot.clone());
         Self::of_slot(&slot, task)
     }
@@ -143,10 +148,11 @@ impl MapStream {
             let reason = task.await;
             sender.send_modify(|slot| slot.ended = Some(reason));
         });
-        Self { slot: receiver, seen: None, fresh: None, replay_ends: 0, task }
+        let handled = slot.handled.clone();
+        Self { slot: receiver, seen: None, fresh: None, replay_ends: 0, handled, task }
     }
 
-    /// Waits for a map newer than the last one returned.
+    /// Waits for a map newer than the last one returned, which counts as handled: a replay in lockstep goes on then.
     ///
     /// # Errors
     /// Why the stream has ended, after its last map was returned; subscribe again then. [`ClientError::Ended`] if the
@@ -154,6 +160,7 @@ impl MapStream {
     /// refused a request, [`ClientError::Map`] if a map is invalid. [`ClientError::ReplayEnded`] once after the last
     /// map of a replay; the stream has not ended then.
     pub async fn next(&mut self) -> Result<Update, ClientError> {
+        self.handled.send_replace(self.seen.map_or(0, |seen| seen.maps));
         loop {
             {
                 let slot = self.slot.borrow_and_update();
@@ -245,11 +252,19 @@ pub(crate) struct LatestSlot {
     clock: Clock,
     /// True if all maps come from one server that is known: another run is then a jump of its replay.
     has_one_server: bool,
+    handled: watch::Sender<u64>,
 }
 
 impl LatestSlot {
     pub(crate) fn new(clock: Clock) -> Self {
-        Self { slot: watch::channel(Slot::default()).0, clock, has_one_server: false }
+        Self { slot: watch::Sender::new(Slot::default()), clock, has_one_server: false, handled: watch::Sender::new(0) }
+    }
+
+    /// Waits until the reader has handled the newest map.
+    pub(crate) async fn handled(&self) {
+        let newest = self.slot.borrow().counters.maps;
+        // The sender is here, so it cannot be gone.
+        let _ = self.handled.subscribe().wait_for(|handled| *handled >= newest).await;
     }
 
     /// Records that the replay has ended, for the reader of the stream.

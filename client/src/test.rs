@@ -57,7 +57,7 @@ pub enum ReplayError {
     },
 }
 
-/// The golden recording: 2 s of a car with a VLP-16 in a simulated town, 21 maps.
+/// The golden recording: 0.9 s of a car with a VLP-16 in a simulated town, 10 maps.
 pub fn town() -> &'static Path {
     Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/golden/town.mcap"))
 }

@@ -46,7 +46,7 @@ impl MapView {
 
     /// Sets the arrival of the map to now.
     pub(crate) fn with_arrival(self, clock: &Clock) -> Self {
-        let arrival = Arrival::new(clock.clone(), self.map.header.capture_end_ns);
+        let arrival = Arrival::new(clock.clone(), self.map.header.capture_end_ns, self.map.header.completed_ns);
         Self { arrival: Some(Arc::new(arrival)), ..self }
     }
 
@@ -111,8 +111,9 @@ impl MapView {
         self.arrival.as_ref().map_or(0, |arrival| arrival.since_ns())
     }
 
-    /// Present time of the wall clock by which the map's age is measured, ns since the Unix epoch.
-    pub(crate) fn now_ns(&self) -> i64 {
+    /// Present time of the clock by which the map's age is measured, ns since the Unix epoch: this machine's wall
+    /// clock, or the clock of a replay ([`crate::Subscription::replay_clock`]).
+    pub fn now_ns(&self) -> i64 {
         self.arrival.as_ref().map_or_else(now_ns, |arrival| arrival.now_ns())
     }
 

@@ -32,6 +32,9 @@ pub mod v1 {
     tonic::include_proto!("clearway.v1");
 }
 
-/// The encoded `FileDescriptorSet` of `clearway/v1/*.proto`, imports included: for gRPC reflection and for the schemas
-/// in recordings.
+/// The encoded `FileDescriptorSet` of `clearway/v1/*.proto`, imports included: for gRPC reflection.
 pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/clearway.v1.bin"));
+
+/// The encoded `FileDescriptorSet` of `clearway/v1/journal.proto`, imports included, without comments: for the schemas
+/// in recordings.
+pub const RECORDING_DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/recording.bin"));

@@ -4,6 +4,7 @@
 //! for. Readers that never acknowledge are not in it.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 
 use tokio::sync::watch;
@@ -18,6 +19,7 @@ pub type MapId = (u64, u64);
 pub struct Acknowledgements {
     readers: Arc<Mutex<Readers>>,
     changed: Arc<watch::Sender<()>>,
+    is_lockstep: Arc<AtomicBool>,
 }
 
 #[derive(Debug, Default)]
@@ -35,7 +37,7 @@ pub struct AcknowledgingReader {
 
 impl Default for Acknowledgements {
     fn default() -> Self {
-        Self { readers: Arc::default(), changed: Arc::new(watch::Sender::new(())) }
+        Self { readers: Arc::default(), changed: Arc::new(watch::Sender::new(())), is_lockstep: Arc::default() }
     }
 }
 
@@ -49,6 +51,11 @@ impl Acknowledgements {
         drop(readers);
         self.changed.send_replace(());
         AcknowledgingReader { all: self.clone(), number }
+    }
+
+    /// Says whether a replay waits for the acknowledgements.
+    pub fn set_lockstep(&self, is_lockstep: bool) {
+        self.is_lockstep.store(is_lockstep, Ordering::Relaxed);
     }
 
     /// Names of the readers that have not finished with `map`; `None` if no reader acknowledges.
@@ -65,6 +72,11 @@ impl Acknowledgements {
 }
 
 impl AcknowledgingReader {
+    /// True if a replay waits for the acknowledgement of each map.
+    pub fn is_in_lockstep(&self) -> bool {
+        self.all.is_lockstep.load(Ordering::Relaxed)
+    }
+
     /// Records that the reader has finished with `map` and all before it.
     pub fn finished(&self, map: MapId) {
         if let Some((_, finished)) = locked(&self.all.readers).by_number.get_mut(&self.number) {

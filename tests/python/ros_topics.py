@@ -72,6 +72,7 @@ OF_TYPE = {
     "nav_msgs/msg/OccupancyGrid": grid,
     "visualization_msgs/msg/MarkerArray": markers,
     "geometry_msgs/msg/PoseArray": poses,
+    "std_msgs/msg/Bool": lambda decoded: {"data": bool(decoded.data)},
 }
 
 

@@ -9,6 +9,8 @@
 #[path = "../../client/examples/planner/astar.rs"]
 mod astar;
 mod fixture;
+#[path = "../../client/examples/planner/motion.rs"]
+mod motion;
 #[allow(dead_code, reason = "the example has a goal straight ahead")]
 #[path = "../../client/examples/follower/safe_points.rs"]
 mod safe_points;
@@ -64,7 +66,7 @@ impl Driver for Planner {
     }
 
     fn next_move(&self, goal: [f64; 2]) -> Move {
-        let astar::Move { curvature_per_m, mps, .. } = Planner::next_move(self, goal);
+        let motion::Move { curvature_per_m, mps, .. } = Planner::next_move(self, goal);
         Move { curvature_per_m, mps }
     }
 }
@@ -77,7 +79,7 @@ impl Driver for Follower {
     }
 
     fn next_move(&self, goal: [f64; 2]) -> Move {
-        let safe_points::Move { curvature_per_m, mps, .. } = Follower::next_move(self, goal);
+        let motion::Move { curvature_per_m, mps, .. } = Follower::next_move(self, goal);
         Move { curvature_per_m, mps }
     }
 }

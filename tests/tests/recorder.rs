@@ -137,6 +137,40 @@ async fn a_recording_is_stopped_started_saved_and_listed() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn finished_parts_go_to_the_store_and_none_is_deleted_before_it_is_confirmed() {
+    let folder = tempfile::tempdir().unwrap();
+    let (recordings, away) = (folder.path().join("recordings"), folder.path().join("away"));
+    // The store is away: its folder cannot be made while a file has the name of its parent.
+    std::fs::write(&away, "").unwrap();
+    let mut config = config();
+    config.recorder.file = recordings.join("car.mcap");
+    (config.recorder.warm_up_ms, config.recorder.keep_mb) = (500, 1);
+    config.store.url = away.join("store").display().to_string();
+    let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
+    let (mut service, status) = (service(&running).await, running.vehicles.0[0].status.clone());
+    let recorder = || status.to_proto().recorder.unwrap();
+    let finished = |part: &str| recordings.join(part).exists();
+    for group in cut_at(&[8, 18]) {
+        feed(&running, group).await;
+        service.split(v1::SplitRecordingRequest {}).await.unwrap();
+    }
+    until("the first part waits", || recorder().store_waiting >= 1 && recorder().store_failures >= 2).await;
+    assert!(recorder().store_problem.contains("away/store"), "{}", recorder().store_problem);
+    assert_eq!(recorder().store_confirmed, 0);
+    assert!(std::fs::metadata(recordings.join("car.mcap")).unwrap().len() > 1 << 20, "longer than keep_mb");
+    until("the second part is whole", || finished("car.part-0002.mcap")).await;
+    assert!(finished("car.mcap"), "keep_mb deletes no part that the store has not confirmed");
+
+    std::fs::remove_file(&away).unwrap();
+    until("both are confirmed", || recorder().store_confirmed >= 2 && recorder().store_problem.is_empty()).await;
+    let stored = clearway::store::location::open(away.join("store").to_str().unwrap()).unwrap();
+    let found = clearway::store::index::search(&*stored, &Default::default()).await.unwrap().entries;
+    assert!(found.len() >= 2 && found.iter().all(|entry| entry.vehicle == "car" && entry.events > 0), "{found:?}");
+    within("shutdown", running.shutdown()).await.unwrap();
+    assert!(!finished("car.mcap"), "the end of the last part deletes the oldest confirmed one");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn without_a_recorder_each_request_is_refused() {
     let running = fixture::start(config()).await;
     let refused = service(&running).await.split(v1::SplitRecordingRequest {}).await.unwrap_err();

@@ -1,5 +1,7 @@
 //! The maps of a recording are the maps of its events; `verify` names the first map, layer and cell that differs.
 
+#[path = "../../server/tests/common/copied.rs"]
+mod copied;
 mod fixture;
 
 use std::collections::BTreeMap;
@@ -16,8 +18,8 @@ use clearway::server::{Server, Setup};
 use clearway_mapping::event::Body;
 use clearway_proto::codec::{Cells, CellsRef, Limits, decode, encode_grid};
 use clearway_proto::v1;
+use copied::copy;
 use fixture::{config, readings, start, until, within};
-use mcap::records::Record;
 use prost::Message;
 
 /// A recording of the simulated vehicle.
@@ -33,31 +35,6 @@ async fn recording(file: &Path) {
     let fed = move || readings.into_iter().try_for_each(|reading| queue.push_captured(reading));
     tokio::task::spawn_blocking(fed).await.unwrap().unwrap();
     running.shutdown().await.unwrap();
-}
-
-/// Copies a recording, passing every message through `change`; `None` leaves it out.
-fn copy(from: &Path, to: &Path, mut change: impl FnMut(&str, u32, Vec<u8>) -> Option<Vec<u8>>) {
-    let bytes = std::fs::read(from).unwrap();
-    let mut writer = mcap::Writer::new(BufWriter::new(File::create(to).unwrap())).unwrap();
-    for record in mcap::read::LinearReader::new(&bytes).unwrap() {
-        match record.unwrap() {
-            Record::Metadata(metadata) => writer.write_metadata(&metadata).unwrap(),
-            Record::Attachment { header, data, .. } => {
-                let mcap::records::AttachmentHeader { log_time, create_time, name, media_type } = header;
-                writer.attach(&mcap::Attachment { log_time, create_time, name, media_type, data }).unwrap();
-            }
-            _ => {}
-        }
-    }
-    for message in mcap::MessageStream::new(&bytes).unwrap() {
-        let mut message = message.unwrap();
-        let topic = message.channel.topic.clone();
-        if let Some(data) = change(&topic, message.sequence, message.data.into_owned()) {
-            message.data = data.into();
-            writer.write(&message).unwrap();
-        }
-    }
-    writer.finish().unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -6,6 +6,7 @@ mod venv;
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Output, Stdio};
+use std::time::{Duration, SystemTime};
 
 use clearway::store::index::{Entry, Search, search};
 use clearway::store::{location, upload};
@@ -23,6 +24,13 @@ fn recordings(folder: &Path, names: &[&str]) -> PathBuf {
         std::fs::copy(workspace().join("tests/golden/drive.mcap"), recordings.join(name)).unwrap();
     }
     recordings
+}
+
+/// Sets the time at which a file was last written to so many hours before now.
+fn modified_hours_ago(file: &Path, hours: i64) {
+    let (now, span) = (SystemTime::now(), Duration::from_secs(hours.unsigned_abs() * 3600));
+    let time = if hours < 0 { now + span } else { now - span };
+    std::fs::File::options().write(true).open(file).unwrap().set_modified(time).unwrap();
 }
 
 fn clearway(environment: &[(&str, &str)], arguments: &[&str]) -> Output {
@@ -47,14 +55,15 @@ fn parts_are_found_in_a_folder_by_vehicle_time_place_and_faults() {
     let bytes = std::fs::read(recordings.join("whole.mcap")).unwrap();
     let cut = recordings.join("cut.mcap");
     std::fs::write(&cut, &bytes[..bytes.len() - 1000]).unwrap();
+    // An hour ahead of the clock, so that it is new however long this test waits for a build.
+    modified_hours_ago(&cut, -1);
     let store = folder.path().join("store").display().to_string();
     let upload = || clearway(&[], &["upload", recordings.to_str().unwrap(), "--store", &store]);
     let first = upload();
     assert_eq!(first.status.code(), Some(0), "{}", text(&first.stderr));
     // The cut file may still be written, until it is old.
     assert_eq!(text(&first.stdout).lines().count(), 1, "{}", text(&first.stdout));
-    let old = std::time::SystemTime::now() - std::time::Duration::from_secs(600);
-    std::fs::File::options().write(true).open(&cut).unwrap().set_modified(old).unwrap();
+    modified_hours_ago(&cut, 1);
     assert_eq!(upload().status.code(), Some(0));
     assert!(upload().stdout.is_empty(), "what is confirmed is not sent again");
 
@@ -190,6 +199,20 @@ fn a_bucket_that_refuses_lies_or_vanishes_costs_no_recording() {
     assert!(std::fs::read_dir(&recordings).unwrap().next().is_none(), "both are deleted, with their confirmations");
     let options = ["--vehicle", "car", "--from", "2026-01-01T00:00:00Z"];
     assert_eq!(found(&server.environment(), STORE, &options), 1, "two names of one content are one entry");
+
+    for url in ["s3://fleet/kept", "s3://fleet/kept/parts"] {
+        let output = clearway(&server.environment(), &["verify", url, "--json"]);
+        assert_eq!(output.status.code(), Some(0), "{url}: {}", text(&output.stderr));
+        let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let files = report["files"].as_array().unwrap();
+        assert_eq!((files.len(), &files[0]["maps"]), (1, &3.into()), "{url}: {report:#}");
+        assert!(files[0]["file"].as_str().unwrap().starts_with("s3://fleet/kept/parts/"), "{report:#}");
+    }
+    for (url, said) in [("s3://fleet/other", "no recording"), ("s3://fleet/kept/a.mcap", "s3://fleet/kept/a.mcap")] {
+        let output = clearway(&server.environment(), &["verify", url]);
+        assert_eq!(output.status.code(), Some(2), "{url}");
+        assert!(text(&output.stderr).contains(said), "{url}: {}", text(&output.stderr));
+    }
 
     std::fs::copy(workspace().join("tests/golden/drive.mcap"), recordings.join("c.mcap")).unwrap();
     server.process.kill().unwrap();

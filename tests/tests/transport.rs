@@ -13,7 +13,7 @@ use clearway::encode::as_served;
 use clearway::ingest::queue::Reading;
 use clearway::record::verify::verify;
 use clearway::server::Running;
-use clearway_client::{Client, ClientError, Subscription};
+use clearway_client::{Client, ClientError, StreamEvent, Subscription};
 use clearway_mapping::event::{Body, EgoPose};
 use clearway_proto::v1;
 use clearway_proto::v1::replay_service_client::ReplayServiceClient;
@@ -283,6 +283,61 @@ async fn in_lockstep_a_reader_gets_every_map_and_one_that_never_acknowledges_is_
     let error = summary.unwrap_err().to_string();
     let named = "map 0 of vehicle car was not acknowledged within 0.2 s; awaited: gRPC reader of drivability";
     assert!(error.contains(named), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn in_lockstep_the_next_map_is_made_when_the_client_has_handled_the_last() {
+    let folder = tempfile::tempdir().unwrap();
+    let drive = recorded_drive(folder.path(), 8).await;
+    let maps = recorded_maps(&drive).len() as u64;
+    let options = Options { lockstep: true, exit_at_end: true, wait_readers: Some(1), ..served(&drive) };
+    let (summary, sequences) = replayed(options.clone(), async |address| {
+        let client = Client::connect(&address).await.unwrap();
+        let mut stream = client.subscribe(Subscription::default()).await.unwrap();
+        let mut sequences = Vec::new();
+        while let Ok(update) = stream.next().await {
+            sequences.push(update.map.sequence());
+        }
+        sequences
+    })
+    .await;
+    assert!(summary.unwrap().reached_end);
+    assert_eq!(sequences.unwrap(), (0..maps).collect::<Vec<_>>());
+
+    // A client that never asks for the next map still handles the first, although it has arrived.
+    let options = Options { lockstep_timeout: Some(0.2), ..options };
+    let (summary, _) = replayed(options, async |address| {
+        let client = Client::connect(&address).await.unwrap();
+        let mut stream = client.subscribe(Subscription::default()).await.unwrap();
+        let first = stream.next().await.unwrap().map.sequence();
+        while stream.ended().is_none() {
+            tokio::task::yield_now().await;
+        }
+        assert_eq!((first, stream.newest().unwrap().sequence()), (0, 0));
+    })
+    .await;
+    let error = summary.unwrap_err().to_string();
+    assert!(error.contains("map 0 of vehicle car was not acknowledged within 0.2 s"), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn recorded_stamps_are_stale_by_the_wall_clock_and_fresh_by_the_replays() {
+    let folder = tempfile::tempdir().unwrap();
+    let drive = recorded_drive(folder.path(), 8).await;
+    let (summary, _) = replayed(Options { wait_readers: Some(1), ..served(&drive) }, async |address| {
+        let client = Client::connect(&address).await.unwrap();
+        let by_replay = Subscription { replay_clock: true, ..Subscription::default() };
+        let mut by_replay = client.subscribe(by_replay).await.unwrap();
+        let StreamEvent::Fresh(update) = by_replay.next_or_stale().await.unwrap() else { panic!("it is fresh") };
+        assert!(!update.map.is_stale(update.map.now_ns()) && update.map.is_stale(clearway_client::now_ns()));
+        let mut by_wall = client.subscribe(Subscription::default()).await.unwrap();
+        assert!(matches!(by_wall.next_or_stale().await.unwrap(), StreamEvent::Stale(_)));
+        // After the last map they are stale by both.
+        while by_replay.next().await.is_ok() {}
+        while !matches!(by_replay.next_or_stale().await.unwrap(), StreamEvent::Stale(_)) {}
+    })
+    .await;
+    summary.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -58,6 +58,8 @@ async fn a_late_ros_2_subscriber_receives_every_layer_and_the_transform() {
     let readings = readings(4);
     send_poses(&running, &readings).await;
     feed(&running, readings).await;
+    // As at the end of a replay.
+    running.vehicles.0[0].status.replay_ended.send_replace(true);
     let endpoint = running.zenoh.iter().find(|e| e.starts_with("tcp/127.0.0.1")).expect("zenoh listens").clone();
     let received = tokio::task::spawn_blocking(move || {
         venv::run(venv::script("ros_topics.py").args([&endpoint, "7"]), "the script names what it missed")
@@ -66,7 +68,8 @@ async fn a_late_ros_2_subscriber_receives_every_layer_and_the_transform() {
 
     let map = newest(&running);
     assert_eq!(map.layers().len() as u64, LAYERS);
-    assert_eq!(received["topics"].as_object().unwrap().len() as u64, LAYERS + 3);
+    assert_eq!(received["topics"].as_object().unwrap().len() as u64, LAYERS + 4);
+    assert_eq!(received["messages"]["/clearway/car/replay_ended"]["data"], true);
     let mut gids = Vec::new();
     for layer in map.layers() {
         let topic = format!("/clearway/car/{}", layer.name);
@@ -132,6 +135,8 @@ async fn a_foxglove_client_gets_the_current_map_and_points_of_later_maps() {
     send_poses(&running, &readings).await;
     let rest = readings.split_off(readings.len() / 2);
     feed(&running, readings).await;
+    // As at the end of a replay.
+    running.vehicles.0[0].status.replay_ended.send_replace(true);
     let address = format!("ws://{}", running.foxglove.expect("Foxglove is served"));
     let map = newest(&running);
 
@@ -146,7 +151,9 @@ async fn a_foxglove_client_gets_the_current_map_and_points_of_later_maps() {
         tokio::task::spawn_blocking(move || (lines.next().expect("a line").unwrap(), lines)).await.unwrap();
     let newest_map: Value = serde_json::from_str(&newest_map).unwrap();
     assert_eq!(newest_map["name"], "clearway");
-    assert_eq!(newest_map["channels"].as_object().unwrap().len() as u64, LAYERS + 3);
+    assert_eq!(newest_map["channels"].as_object().unwrap().len() as u64, LAYERS + 4);
+    assert_eq!(newest_map["channels"]["/car/log"], "foxglove.Log");
+    assert_eq!(newest_map["/car/log"]["message"], "the replay has ended");
     for name in ["drivability", "occupancy"] {
         let (layer, grid) = (map.layer(name).unwrap(), &newest_map[format!("/car/map/{name}")]);
         let (raster, schema) = (Raster::from_grid(&layer.grid), &newest_map["channels"][format!("/car/map/{name}")]);

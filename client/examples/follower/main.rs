@@ -1,10 +1,13 @@
 //! Follows the safe points of the layer `safe_path` (UT Austin thesis, section VI). It prints the next move at each
 //! map. `cargo run -p clearway-client --example follower -- [ADDRESS]`
 
+#[path = "../planner/motion.rs"]
+mod motion;
 mod safe_points;
 
 use clearway_client::{Client, Subscription, now_ns};
-use safe_points::{Follower, Move};
+use motion::Move;
+use safe_points::Follower;
 
 #[tokio::main]
 async fn main() -> Result<(), Box<dyn std::error::Error>> {

@@ -10,8 +10,8 @@ use std::collections::BinaryHeap;
 
 use clearway_client::{ClientError, MapView};
 
-/// Centres of three discs that cover a car, in metres ahead of its centre; each has a radius of 1.16 m.
-const DISCS_M: [f64; 3] = [1.45, 0.0, -1.45];
+use super::motion::{BRAKE_MPS2, CURVATURE_MAX, DISCS_M, MPS_MAX, Move, Point, distance, ego_pose, in_ego};
+
 /// Distance that the centre of each disc keeps from obstacles, in metres, and greatest speed in m/s. The first is the
 /// disc's radius and 0.24 m more; the last is for passages about as wide as the configured vehicle.
 const CLEARANCES_M: [(f64, f64); 3] = [(1.4, MPS_MAX), (1.2, 3.0), (LINK_CLEARANCE_M, 1.0)];
@@ -26,26 +26,6 @@ const STEP_M: f64 = 0.25;
 const REST_WEIGHT: f64 = 3.0;
 /// Least and greatest distance of the point to aim at, in metres.
 const AIM_M: std::ops::Range<f64> = 2.0..10.0;
-/// Greatest speed in m/s.
-const MPS_MAX: f64 = 8.0;
-/// Greatest braking and lateral acceleration in m/s².
-const BRAKE_MPS2: f64 = 4.0;
-/// Greatest curvature in 1/m.
-const CURVATURE_MAX: f64 = 0.2;
-
-/// A point, in metres.
-pub type Point = [f64; 2];
-
-/// What the vehicle should do until the next map.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Move {
-    /// Curvature of the arc to follow in 1/m, positive to the left.
-    pub curvature_per_m: f64,
-    /// Speed in m/s; 0 if there is no path.
-    pub mps: f64,
-    /// Length of the path towards the goal, in metres.
-    pub path_m: f64,
-}
 
 /// The safe points of the newest map.
 #[derive(Debug, Default)]
@@ -69,12 +49,7 @@ impl Follower {
     /// Replaces the safe points by those of a map with the layer `safe_path`.
     pub fn update(&mut self, map: &MapView) -> Result<(), ClientError> {
         let layer = map.layer("safe_path")?;
-        self.ego = match &map.header().map_from_ego {
-            Some(p) => {
-                [p.x, p.y, f64::atan2(2.0 * (p.qw * p.qz + p.qx * p.qy), 1.0 - 2.0 * (p.qy * p.qy + p.qz * p.qz))]
-            }
-            None => [0.0; 3],
-        };
+        self.ego = ego_pose(map).unwrap_or_default();
         let point = |point: &clearway_client::SafePoint| SafePoint {
             at: [point.x_m.into(), point.y_m.into()],
             radius_m: point.radius_m.into(),
@@ -200,17 +175,12 @@ impl Follower {
         path
     }
 
-    fn in_ego(&self, [x, y]: Point) -> Point {
-        let ([dx, dy], (sin, cos)) = ([x - self.ego[0], y - self.ego[1]], self.ego[2].sin_cos());
-        [dx * cos + dy * sin, dy * cos - dx * sin]
+    fn in_ego(&self, point: Point) -> Point {
+        in_ego(self.ego, point)
     }
 }
 
 /// Curvature in 1/m of the arc that starts straight ahead and leads through a point.
 fn curvature([x, y]: Point) -> f64 {
     2.0 * y / (x * x + y * y)
-}
-
-fn distance(a: Point, b: Point) -> f64 {
-    (a[0] - b[0]).hypot(a[1] - b[1])
 }

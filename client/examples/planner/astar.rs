@@ -10,12 +10,12 @@ use std::collections::{BinaryHeap, HashMap};
 use clearway_client::v1::ClassMeaning;
 use clearway_client::{ClientError, MapView};
 
+use super::motion::{BRAKE_MPS2, CURVATURE_MAX, DISCS_M, MPS_MAX, Move, Point, distance, ego_pose, in_ego};
+
 /// Edge of a cell of the planner's grid, in metres.
 const CELL_M: f64 = 0.5;
 /// Radius of the planner's grid around the vehicle, in metres.
 const RANGE_M: f64 = 16.0;
-/// Centres of three discs that cover the vehicle, in metres ahead of its centre; each has a radius of 1.16 m.
-const DISCS_M: [f64; 3] = [1.45, 0.0, -1.45];
 /// Distance from the centre of a disc to that of an obstacle's cell in metres (its radius and half a cell), and
 /// greatest speed in m/s. The second is tried if there is no path with the first.
 const CLEARANCES_M: [(f64, f64); 2] = [(1.5, MPS_MAX), (1.2, 1.0)];
@@ -25,29 +25,10 @@ const START_M: f64 = 5.0;
 const START_MPS: f64 = 2.0;
 /// Time after which an obstacle that is not measured again is removed, in ns; its cell is then unknown.
 const MEMORY_NS: i64 = 2_000_000_000;
-/// Greatest speed in m/s.
-const MPS_MAX: f64 = 8.0;
 /// Least distance of the point to aim at, in metres.
 const NEAREST_M: f64 = 2.0;
-/// Greatest braking and lateral acceleration in m/s².
-const BRAKE_MPS2: f64 = 4.0;
-/// Greatest curvature in 1/m.
-const CURVATURE_MAX: f64 = 0.2;
 
-/// A point, in metres.
-pub type Point = [f64; 2];
 type Cell = [i32; 2];
-
-/// What the vehicle should do until the next map.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Move {
-    /// Curvature of the arc to follow in 1/m, positive to the left.
-    pub curvature_per_m: f64,
-    /// Speed in m/s; 0 if there is no path.
-    pub mps: f64,
-    /// Length of the path towards the goal, in metres.
-    pub path_m: f64,
-}
 
 /// A planner with a grid of recently measured cells.
 #[derive(Debug, Default)]
@@ -68,15 +49,11 @@ impl Planner {
     /// Updates the grid from a map with the layer `speed`.
     pub fn update(&mut self, map: &MapView) -> Result<(), ClientError> {
         let (layer, stamp_ns) = (map.layer("speed")?, map.header().capture_end_ns);
-        self.ego = match &map.header().map_from_ego {
-            Some(p) => {
-                [p.x, p.y, f64::atan2(2.0 * (p.qw * p.qz + p.qx * p.qy), 1.0 - 2.0 * (p.qy * p.qy + p.qz * p.qz))]
-            }
-            None => {
-                self.seen.clear();
-                [0.0; 3]
-            }
-        };
+        let ego = ego_pose(map);
+        if ego.is_none() {
+            self.seen.clear();
+        }
+        self.ego = ego.unwrap_or_default();
         let is_first = self.seen.is_empty();
         let here = [self.ego[0], self.ego[1]];
         self.seen.retain(|cell, seen| {
@@ -216,9 +193,8 @@ impl Planner {
         cell_of([self.ego[0], self.ego[1]])
     }
 
-    fn in_ego(&self, [x, y]: Point) -> Point {
-        let ([dx, dy], (sin, cos)) = ([x - self.ego[0], y - self.ego[1]], self.ego[2].sin_cos());
-        [dx * cos + dy * sin, dy * cos - dx * sin]
+    fn in_ego(&self, point: Point) -> Point {
+        in_ego(self.ego, point)
     }
 
     fn in_map(&self, [x, y]: Point) -> Point {
@@ -233,10 +209,6 @@ fn cell_of(point: Point) -> Cell {
 
 fn centre(cell: Cell) -> Point {
     cell.map(|index| (f64::from(index) + 0.5) * CELL_M)
-}
-
-fn distance(a: Point, b: Point) -> f64 {
-    (a[0] - b[0]).hypot(a[1] - b[1])
 }
 
 /// The cells whose centres lie within a distance in metres of the centre of a cell, including it.

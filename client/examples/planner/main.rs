@@ -3,9 +3,11 @@
 //! tcp/localhost:7447.
 
 mod astar;
+mod motion;
 
-use astar::{Move, Planner};
+use astar::Planner;
 use clearway_client::{Client, Subscription, ZenohClient, now_ns};
+use motion::Move;
 
 #[tokio::main]
 async fn main() -> Result<(), Box<dyn std::error::Error>> {

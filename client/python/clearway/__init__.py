@@ -38,6 +38,7 @@ def watch(
     deltas: bool = False,
     tls: Tls | None = None,
     signed_by: str | PathLike[str] | None = None,
+    replay_clock: bool = False,
 ) -> MapStream:
     """Streams the newest map, starting with the present one.
 
@@ -45,14 +46,17 @@ def watch(
     zenoh both must be named. With `tls` the connection is encrypted. The other arguments are for gRPC: at most
     `max_in_flight` maps are sent without an acknowledgement, and at most `max_rate_hz` maps per second. Each layer is
     cut to the `region` (x_from_m, x_to_m, y_from_m, y_to_m) in the ego frame. With `deltas`, layers are sent as
-    changes from the map before: fewer bytes, the same maps. Errors of the server are raised by the first `next`; for
-    an unknown vehicle or layer the message lists the known ones. For zenoh: with `signed_by`, the PEM file of a
-    server's public key, only maps that this server has signed are believed; `MapStream.passed_over` counts the others.
+    changes from the map before: fewer bytes, the same maps. With `replay_clock`, a map is as old as it was when it was
+    made, plus the time since it came: for a replay that keeps the recorded stamps. Errors of the server are raised by
+    the first `next`; for an unknown vehicle or layer the message lists the known ones. For zenoh: with `signed_by`,
+    the PEM file of a server's public key, only maps that this server has signed are believed; `MapStream.passed_over`
+    counts the others.
     """
     _check_signed_by(address, signed_by)
     if endpoint := _zenoh(address, vehicle, layers):
-        if max_rate_hz is not None or region is not None or deltas:
-            raise ClearwayError("selection", f"{address}: max_rate_hz, region and deltas are for gRPC, HOST:PORT")
+        if max_rate_hz is not None or region is not None or deltas or replay_clock:
+            text = "max_rate_hz, region, deltas and replay_clock are for gRPC, HOST:PORT"
+            raise ClearwayError("selection", f"{address}: {text}")
         return over_zenoh.watch(endpoint, vehicle, layers, tls, signed_by)
     selection = service_pb2.Selection(vehicle=vehicle, layers=layers, max_in_flight=max_in_flight, deltas=deltas)
     if max_rate_hz is not None:
@@ -60,7 +64,7 @@ def watch(
     if region is not None:
         x_from_m, x_to_m, y_from_m, y_to_m = region
         selection.region.CopyFrom(map_pb2.Region(x_from_m=x_from_m, x_to_m=x_to_m, y_from_m=y_from_m, y_to_m=y_to_m))
-    return over_grpc.watch(address, selection, tls)
+    return over_grpc.watch(address, selection, tls, replay_clock=replay_clock)
 
 
 def get(

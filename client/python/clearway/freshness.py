@@ -27,6 +27,8 @@ class Clock(NamedTuple):
     wall_ns: Callable[[], int] = now_ns
     #: Steady clock, ns since an arbitrary moment; it never goes back.
     steady_ns: Callable[[], int] = time.monotonic_ns
+    #: True: the wall clock is the replay's, which stood at the end of the making of each map when it came.
+    is_of_replay: bool = False
 
 
 class Arrival(NamedTuple):
@@ -38,7 +40,10 @@ class Arrival(NamedTuple):
     age_ns: int
 
     @staticmethod
-    def of(capture_end_ns: int, clock: Clock) -> Arrival:
+    def of(capture_end_ns: int, completed_ns: int, clock: Clock) -> Arrival:
+        if clock.is_of_replay:
+            steady, came_ns = clock.steady_ns, clock.steady_ns()
+            clock = clock._replace(wall_ns=lambda: completed_ns + steady() - came_ns)
         return Arrival(clock, clock.steady_ns(), max(clock.wall_ns() - capture_end_ns, 0))
 
     def age_ns_min(self) -> int:

@@ -293,7 +293,7 @@ class Map:
 
     def with_arrival(self, clock: Clock = Clock()) -> Map:
         """Sets the arrival of the map to now."""
-        self._arrival = Arrival.of(self.header.capture_end_ns, clock)
+        self._arrival = Arrival.of(self.header.capture_end_ns, self.header.completed_ns, clock)
         return self
 
     def copy_with(self, skipped: int = 0, lost: int = 0, left_out: int = 0) -> Map:

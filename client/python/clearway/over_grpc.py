@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import grpc
 
 from .errors import ClearwayError, DecodeError
+from .freshness import Clock
 from .limits import MAP_BYTES_MAX
 from .map import Map
 from .stream import MapStream
@@ -65,7 +66,9 @@ def get(address: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -> M
             raise _refused(address, error) from None
 
 
-def watch(address: str, selection: service_pb2.Selection, tls: Tls | None) -> MapStream:
+def watch(
+    address: str, selection: service_pb2.Selection, tls: Tls | None, *, replay_clock: bool = False
+) -> MapStream:
     channel, service = _service(address, tls)
     requests: queue.SimpleQueue[service_pb2.WatchRequest | None] = queue.SimpleQueue()
     requests.put(service_pb2.WatchRequest(selection=selection))
@@ -75,7 +78,7 @@ def watch(address: str, selection: service_pb2.Selection, tls: Tls | None) -> Ma
             yield request
 
     updates = service.Watch(outgoing())
-    stream = MapStream(has_one_server=True)
+    stream = MapStream(Clock(is_of_replay=replay_clock), has_one_server=True)
 
     def run() -> None:
         try:
@@ -105,8 +108,9 @@ def _receive_maps(
     *,
     acknowledges: bool,
 ) -> None:
-    """Stores the map of every update and acknowledges it. If a delta needs a map that is not here (an update was lost),
-    it requests a keyframe. Maps not stored count as skipped, except those that the requested rate excluded."""
+    """Stores the map of every update and acknowledges it, in lockstep when it was handled. If a delta needs a map that
+    is not here (an update was lost), it requests a keyframe. Maps not stored count as skipped, except those that the
+    requested rate excluded."""
     base: Map | None = None
     is_requested, left_out = False, 0
     for update in updates:
@@ -130,5 +134,7 @@ def _receive_maps(
                 raise
             # More deltas may be in flight; one request is enough for all of them.
             answer.request_keyframe, is_requested = not is_requested, True
+        if update.lockstep and acknowledges and not answer.request_keyframe:
+            stream.wait_until_handled()
         if answer.request_keyframe or acknowledges:
             request(answer)

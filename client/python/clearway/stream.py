@@ -62,6 +62,8 @@ class MapStream:
         self._passed_over = PassedOver()
         #: `_counters` at the map before; `None` before the first.
         self._seen: _Counters | None = None
+        #: `_seen` when the reader asked for the next map: it has handled all maps until then.
+        self._handled: _Counters | None = None
         #: The last map returned, until it is reported as stale.
         self._fresh: Map | None = None
         self._ended: ClearwayError | None = None
@@ -74,7 +76,8 @@ class MapStream:
         return self
 
     def __next__(self) -> Map:
-        """Waits for a map newer than the last one returned. Raises the reason if the stream has ended; stops when
+        """Waits for a map newer than the last one returned, which counts as handled: a replay in lockstep goes on then.
+        Raises the reason if the stream has ended; stops when
         closed, and once after the last map of a replay: iterate again for the maps of a replay that is set back."""
         return self._next(report_stale=False)
 
@@ -86,6 +89,8 @@ class MapStream:
 
     def _next(self, *, report_stale: bool) -> Map:
         with self._changed:
+            self._handled = self._seen
+            self._changed.notify_all()
             while not (self._closed or self._is_unseen() or self._ended or self.replay_ended):
                 last = self._fresh if report_stale else None
                 if last is not None and last.stale:
@@ -177,6 +182,13 @@ class MapStream:
         with self._changed:
             self._ended = reason
             self._changed.notify_all()
+
+    def wait_until_handled(self) -> None:
+        """Waits until the reader has handled the newest map: until it asks for the next. For the background thread."""
+        with self._changed:
+            newest = self._counters
+            while not self._closed and (self._handled is None or self._handled.maps < newest.maps):
+                self._changed.wait(1.0)
 
     def end_replay(self) -> None:
         """Records that the replay has ended. For the background thread."""

@@ -30,7 +30,7 @@ impl TestBed {
             let clock = clock.clone();
             Arc::new(move || clock.load(Ordering::SeqCst))
         };
-        let clock = Clock { wall_ns: read(&wall_ns), steady_ns: read(&steady_ns) };
+        let clock = Clock { wall_ns: read(&wall_ns), steady_ns: read(&steady_ns), is_of_replay: false };
         let (end, ended) = oneshot::channel();
         let mut slot = None;
         let stream = MapStream::spawn_with_clock(clock, |given| {

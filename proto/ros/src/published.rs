@@ -77,3 +77,11 @@ pub const MARKER_ARRAY: Published = Published::new(
     "RIHS01_86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf",
     include_str!("definitions/MarkerArray.msg"),
 );
+
+/// `std_msgs/msg/Bool`.
+pub const BOOL: Published = Published::new(
+    "std_msgs",
+    "Bool",
+    "RIHS01_feb91e995ff9ebd09c0cb3d2aed18b11077585839fb5db80193b62d74528f6c9",
+    include_str!("definitions/Bool.msg"),
+);

@@ -7,7 +7,6 @@ use tokio::signal::unix::{SignalKind, signal};
 use super::configuration::ConfigurationOptions;
 use super::output::{block_on, stop_signal};
 use crate::config::Config;
-use crate::record::writer;
 use crate::server::{Running, Server, Setup, ShutdownError};
 
 /// Listen for sensor data, make maps and publish them, until SIGINT or SIGTERM.
@@ -37,10 +36,7 @@ async fn serve(configuration: &ConfigurationOptions) -> Result<()> {
     let calibrations = config.calibrations(file)?;
     let certificates = config.certificates(file)?;
     let mut config = config.located(file);
-    if let Some(recording) = writer::recording_path(&config.recorder) {
-        let free = writer::next_free_name(recording);
-        config.recorder.family = std::mem::replace(&mut config.recorder.file, free);
-    }
+    config.recorder.is_numbered = true;
     // Before the server starts, so that a signal during the start ends it in order.
     let stop = stop_signal()?;
     let mut hangups = signal(SignalKind::hangup())?;
@@ -74,7 +70,7 @@ fn reload(running: &Running, configuration: &ConfigurationOptions, old: &Config)
     let certificates = config.certificates(file)?;
     running.reload(&config, certificates.as_ref()).map_err(|reason| anyhow!("grpc.tls: {reason}"))?;
     let mut config = config.located(file);
-    config.recorder.file.clone_from(&old.recorder.file);
+    config.recorder.is_numbered = old.recorder.is_numbered;
     let unchanged = config.without_reloaded(old) == *old;
     if !unchanged {
         tracing::warn!("other keys than certificates, tokens, roles and limits have changed: they need a restart");

@@ -23,6 +23,7 @@ mod listeners;
 mod read;
 mod recorder;
 mod ros;
+mod store;
 mod udp;
 mod vehicle;
 mod zenoh;
@@ -35,6 +36,7 @@ pub use grpc::{Access, Certificates, Grpc, Only, Tls};
 pub use listeners::{Listener, Route, listeners};
 pub use recorder::{Compression, Recorder, SaveRule};
 pub use ros::Ros;
+pub use store::Store;
 pub use udp::{Ports, Sender, Udp};
 pub use vehicle::{Ingest, Vehicle};
 pub use zenoh::{Ros2, Zenoh, ZenohMode};
@@ -71,6 +73,9 @@ pub struct Config {
     /// The recording.
     #[serde(default)]
     pub recorder: Recorder,
+    /// Where finished parts of the recording go.
+    #[serde(default)]
+    pub store: Store,
     /// One or more vehicles.
     #[serde(default, rename = "vehicle")]
     pub vehicles: Vec<Vehicle>,
@@ -209,6 +214,7 @@ impl Config {
         self.grpc.check()?;
         self.connections.check()?;
         self.recorder.check()?;
+        self.store.check()?;
         self.zenoh.check(&self.vehicles)?;
         let mut names = BTreeSet::new();
         for vehicle in &self.vehicles {
@@ -236,6 +242,9 @@ impl Config {
             if !path.as_os_str().is_empty() {
                 *path = beside(file, path);
             }
+        }
+        if !self.store.url.is_empty() && !self.store.url.contains("://") {
+            self.store.url = beside(file, Path::new(&self.store.url)).display().to_string();
         }
         self
     }

@@ -28,6 +28,8 @@ pub struct Recorder {
     pub keep_hours: u64,
     /// Number of seconds that a save keeps, unless the request says otherwise.
     pub save_s: u64,
+    /// Total length in MiB of the saved files beyond which the oldest saves are deleted; 0: none is.
+    pub saved_mb: u64,
     /// Conditions on which the last `save_s` seconds are saved without a request.
     pub save_on: Vec<SaveRule>,
     /// Length of a chunk in KiB before compression.
@@ -37,6 +39,12 @@ pub struct Recorder {
     /// True if an existing file is replaced when the new one is whole; never configured, only by `--force`.
     #[serde(skip)]
     pub replaces: bool,
+    /// True if no part is deleted that the store has not confirmed; never configured, only by `[store]`.
+    #[serde(skip)]
+    pub awaits_store: bool,
+    /// True if a file that exists stays, and the recording gets the next free name; never configured, only by `serve`.
+    #[serde(skip)]
+    pub is_numbered: bool,
     /// The configured file, if `file` is another name because that one is taken.
     #[serde(skip)]
     pub family: PathBuf,
@@ -74,10 +82,13 @@ impl Default for Recorder {
             keep_mb: 0,
             keep_hours: 0,
             save_s: 60,
+            saved_mb: 0,
             save_on: Vec::new(),
             chunk_kb: 1024,
             compression: Compression::Zstd,
             replaces: false,
+            awaits_store: false,
+            is_numbered: false,
             family: PathBuf::new(),
         }
     }
@@ -95,6 +106,7 @@ impl Recorder {
             ("recorder.warm_up_ms", self.warm_up_ms, 100..=600_000, "100 to 600000 ms"),
             ("recorder.keep_mb", self.keep_mb, 0..=1 << 30, "0 to 1073741824 MiB"),
             ("recorder.keep_hours", self.keep_hours, 0..=876_000, "0 to 876000 h"),
+            ("recorder.saved_mb", self.saved_mb, 0..=1 << 30, "0 to 1073741824 MiB"),
             ("recorder.save_s", self.save_s, 1..=86_400, "1 to 86400 s"),
             ("recorder.chunk_kb", self.chunk_kb, 16..=65_536, "16 to 65536 KiB"),
         ];

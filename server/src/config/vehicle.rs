@@ -76,7 +76,7 @@ pub struct Ingest {
 
 impl Default for Ingest {
     fn default() -> Self {
-        Self { enabled: true, points_max: 2_000_000, streams_max: 8, ahead_ms_max: 10_000 }
+        Self { enabled: true, points_max: 500_000, streams_max: 8, ahead_ms_max: 10_000 }
     }
 }
 

@@ -1,7 +1,8 @@
 //! Maps, points and poses for Foxglove, and for other clients of its WebSocket protocol (`foxglove.sdk.v1`).
 //!
 //! Channels: `/<vehicle>/map/<layer>` (`foxglove.Grid`), `/<vehicle>/safe_points` (`foxglove.SceneUpdate`: lines and
-//! circles of the layer `safe_path`), `/<vehicle>/points` (`foxglove.PointCloud`: what the newest map was made from)
+//! circles of the layer `safe_path`), `/<vehicle>/log` (`foxglove.Log`: the end of a replay), `/<vehicle>/points`
+//! (`foxglove.PointCloud`: what the newest map was made from)
 //! and `/tf` (`foxglove.FrameTransforms`: `<vehicle>/base_link` in `map`). Channels without a subscription are not
 //! made; a message is encoded once for all clients. A new subscription gets the newest map at once. A slow client skips
 //! messages, and one that receives nothing for [`SEND_TIMEOUT`] is disconnected.
@@ -20,7 +21,7 @@ use base64::Engine as _;
 use base64::prelude::BASE64_STANDARD;
 use bytes::{BufMut, Bytes, BytesMut};
 use clearway_client::MapView;
-use foxglove::messages::{FrameTransforms, Grid, PointCloud, SceneUpdate};
+use foxglove::messages::{FrameTransforms, Grid, Log, PointCloud, SceneUpdate};
 use foxglove::{Encode, Schema};
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -30,6 +31,7 @@ use tokio::task::JoinSet;
 use super::listen::access::Caller;
 use super::listen::{InProgress, Listener, Place};
 use super::served::{Served, Vehicles};
+use crate::clock::now_ns;
 use crate::encode::EncodedMap;
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::{base_frame, foxglove as messages, safe_paths};
@@ -81,6 +83,7 @@ enum Kind {
     SafePoints,
     Points,
     Transforms,
+    Log,
 }
 
 /// A message of a channel, without the subscription that it is for.
@@ -105,7 +108,7 @@ impl Channel {
         match self.kind {
             Kind::Layer(name) => Some(name),
             Kind::SafePoints => Some(safe_paths::LAYER),
-            Kind::Points | Kind::Transforms => None,
+            Kind::Points | Kind::Transforms | Kind::Log => None,
         }
     }
 
@@ -115,6 +118,7 @@ impl Channel {
             Kind::SafePoints => SceneUpdate::get_schema(),
             Kind::Points => PointCloud::get_schema(),
             Kind::Transforms => FrameTransforms::get_schema(),
+            Kind::Log => Log::get_schema(),
         }
     }
 
@@ -134,11 +138,14 @@ impl Channel {
     }
 
     fn publish<T: Encode>(&self, map: &EncodedMap, message: &T) {
+        self.put(map.sequence, log_ns(map), message);
+    }
+
+    fn put<T: Encode>(&self, sequence: u64, log_ns: u64, message: &T) {
         let mut data = BytesMut::with_capacity(message.encoded_len().unwrap_or(1024));
         match message.encode(&mut data) {
             Ok(()) => {
-                let message = Message { sequence: map.sequence, log_ns: log_ns(map), data: data.freeze() };
-                self.newest.send_replace(Some(message));
+                self.newest.send_replace(Some(Message { sequence, log_ns, data: data.freeze() }));
             }
             Err(error) => tracing::error!(%error, topic = self.topic, "foxglove: a message cannot be encoded"),
         }
@@ -167,6 +174,7 @@ impl VehicleChannels {
         if served.status.layers.contains(&safe_paths::LAYER) {
             kinds.push((format!("/{vehicle}/safe_points"), Kind::SafePoints));
         }
+        kinds.push((format!("/{vehicle}/log"), Kind::Log));
         kinds.push((format!("/{vehicle}/points"), Kind::Points));
         kinds.push(("/tf".to_owned(), Kind::Transforms));
         let channel = |(topic, kind)| {
@@ -177,19 +185,38 @@ impl VehicleChannels {
         Self { served: served.clone(), channels, subscribed: Notify::new(), published }
     }
 
+    /// Publishes a line of the log, after all maps so far.
+    fn log(&self, text: &str) {
+        let now_ns = now_ns();
+        for channel in self.channels.iter().filter(|channel| channel.kind == Kind::Log) {
+            channel.put(0, u64::try_from(now_ns).unwrap_or(0), &messages::log(now_ns, &self.served.status.name, text));
+        }
+        self.published.send_modify(|count| *count += 1);
+    }
+
     /// Encodes each newest map for the channels that have subscriptions, and the current one for new subscriptions.
     async fn run(&self) {
         let mut newest = self.served.newest.clone();
         let mut rasters = Rasters::default();
         let mut sweeps = None;
         newest.mark_changed();
+        let mut replay_ended = self.served.status.replay_ended.subscribe();
+        // What is so from the beginning is no change.
+        let mut reported = false;
         loop {
+            let ended = *replay_ended.borrow_and_update();
+            if ended != reported && !newest.has_changed().unwrap_or(false) {
+                reported = ended;
+                self.log(if ended { "the replay has ended" } else { "the replay was set back" });
+            }
             tokio::select! {
+                biased;
                 changed = newest.changed() => if changed.is_err() {
                     // The engine has stopped; new subscriptions still get its last map.
                     self.subscribed.notified().await;
                 },
                 () = self.subscribed.notified() => {}
+                Ok(()) = replay_ended.changed() => continue,
             }
             let has_points = |channel: &Channel| channel.kind == Kind::Points && channel.newest.receiver_count() > 0;
             match self.channels.iter().any(has_points) {
@@ -226,6 +253,8 @@ fn publish(channel: &Channel, map: &EncodedMap, sweep: &NewestSweep, rasters: &m
                 channel.publish(map, &transforms);
             }
         }
+        // It has no map.
+        Kind::Log => {}
         Kind::Points => {
             if let Some(sweep) = sweep.as_ref().filter(|sweep| sweep.0 == map.capture_end_ns) {
                 let sweep = &sweep.1;

@@ -2,7 +2,8 @@
 //!
 //! For each vehicle: `<namespace>/<vehicle>/<layer>` (`nav_msgs/msg/OccupancyGrid`), of the layer `safe_path` also
 //! `.../safe_path/markers` (`visualization_msgs/msg/MarkerArray`) and `.../safe_path/poses`
-//! (`geometry_msgs/msg/PoseArray`), all reliable, transient local, depth 1; and its pose in `map` on `/tf` (reliable,
+//! (`geometry_msgs/msg/PoseArray`), and `<namespace>/<vehicle>/replay_ended` (`std_msgs/msg/Bool`: true from the end of
+//! a replay until it is set back), all reliable, transient local, depth 1; and its pose in `map` on `/tf` (reliable,
 //! volatile). A topic is published under `<domain>/<topic>/<type>/<hash>`,
 //! the payload CDR, with an attachment: sequence, time of sending, length 16, the publisher's 16 bytes. Liveliness
 //! tokens under `@ros2_lv` announce the node and its publishers. A message is made only while there is a subscriber;
@@ -15,7 +16,8 @@ use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::{ros, safe_paths};
 use clearway_client::Layer;
 use clearway_client::MapView;
-use clearway_ros::published::{MARKER_ARRAY, OCCUPANCY_GRID, POSE_ARRAY, Published, TF_MESSAGE};
+use clearway_ros::cdr::Writer;
+use clearway_ros::published::{BOOL, MARKER_ARRAY, OCCUPANCY_GRID, POSE_ARRAY, Published, TF_MESSAGE};
 use tokio::task::JoinSet;
 use zenoh::Session;
 use zenoh::liveliness::LivelinessToken;
@@ -76,6 +78,8 @@ impl<'a> Node<'a> {
             ros::tf(&map)
         };
         tasks.spawn(tf.publish(served.clone(), None, transform));
+        let topic = format!("{}/{vehicle}/replay_ended", self.options.namespace);
+        tasks.spawn(self.topic(&topic, &BOOL, LATCHED).await?.publish_replay_end(served.clone()));
         Ok(())
     }
 
@@ -195,6 +199,20 @@ impl Topic {
                         Err(_) => return,
                     },
                 }
+            }
+        }
+    }
+
+    /// Sends whether a replay has ended, now and whenever that changes, after the last map.
+    async fn publish_replay_end(mut self, served: Served) {
+        let mut ended = served.status.replay_ended.subscribe();
+        loop {
+            let has_ended = *ended.borrow_and_update();
+            let mut message = Writer::default();
+            message.bytes(&[has_ended.into()]);
+            self.put(message.finish()).await;
+            if ended.changed().await.is_err() {
+                return std::future::pending().await;
             }
         }
     }

@@ -25,7 +25,7 @@ use std::sync::{Arc, Mutex};
 
 use bytes::Bytes;
 use clearway_mapping::event::Event;
-use clearway_proto::{DESCRIPTORS, v1};
+use clearway_proto::{RECORDING_DESCRIPTORS, v1};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{Attachment, McapError, WriteOptions};
@@ -163,10 +163,10 @@ impl<D: Disk> McapFile<D> {
         for (vehicle, sensor, yaml) in &header.calibrations {
             attach(format!("calibration/{vehicle}/{sensor}.yaml"), "application/yaml", yaml)?;
         }
-        let event = writer.add_schema("clearway.v1.Event", "protobuf", DESCRIPTORS)?;
-        let map = writer.add_schema("clearway.v1.Map", "protobuf", DESCRIPTORS)?;
-        let keyframe = writer.add_schema("clearway.v1.Keyframe", "protobuf", DESCRIPTORS)?;
-        let counts = writer.add_schema("clearway.v1.RecordingCounts", "protobuf", DESCRIPTORS)?;
+        let event = writer.add_schema("clearway.v1.Event", "protobuf", RECORDING_DESCRIPTORS)?;
+        let map = writer.add_schema("clearway.v1.Map", "protobuf", RECORDING_DESCRIPTORS)?;
+        let keyframe = writer.add_schema("clearway.v1.Keyframe", "protobuf", RECORDING_DESCRIPTORS)?;
+        let counts = writer.add_schema("clearway.v1.RecordingCounts", "protobuf", RECORDING_DESCRIPTORS)?;
         let mut channel = |schema, topic: &str| writer.add_channel(schema, topic, "protobuf", &BTreeMap::new());
         let mut vehicles = Vec::new();
         for (vehicle, layers) in &header.vehicles {

@@ -275,6 +275,7 @@ impl Player {
         let mut made = None;
         for (_, ReplayedVehicle { engine, events, .. }) in vehicles.filter(|(i, _)| vehicle.is_none_or(|v| v == *i)) {
             let before = engine.maps();
+            engine.status.acknowledgements.set_lockstep(state.lockstep);
             while let Ok(queued) = events.try_recv() {
                 engine.replayed = replayed(clock, state, boot_id, state.position_ns, now_ns);
                 engine.step(queued);

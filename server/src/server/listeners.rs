@@ -8,7 +8,7 @@ use super::setup::StartError;
 use crate::config::Config;
 use crate::publish::foxglove;
 use crate::publish::listen::security::Security;
-use crate::publish::listen::{Limits, Listener, ListenerHandle, Protocol};
+use crate::publish::listen::{AllPlaces, Limits, Listener, ListenerHandle, Protocol};
 
 /// Most connections of the page and of Foxglove. Ours: some dozens of browsers with a few connections each.
 const WEB_CONNECTIONS_MAX: usize = 256;
@@ -23,6 +23,7 @@ pub(super) struct Listeners {
     pub foxglove: Option<Listener>,
     pub security: Security,
     pub handles: Vec<(&'static str, ListenerHandle)>,
+    all: AllPlaces,
 }
 
 impl Listeners {
@@ -31,8 +32,9 @@ impl Listeners {
     /// # Errors
     /// [`StartError::Listen`] with the first address that cannot be listened on.
     pub async fn bind(config: &Config, security: &Security) -> Result<Self, StartError> {
+        let (security, all) = (security.clone(), AllPlaces::default());
         let mut listeners =
-            Self { grpc: None, page: None, metrics: None, foxglove: None, security: security.clone(), handles: vec![] };
+            Self { grpc: None, page: None, metrics: None, foxglove: None, security, handles: vec![], all };
         let (grpc, page, metrics, foxglove) = (&config.grpc, &config.page, &config.metrics, &config.foxglove);
         let web = Protocol::Web(&[]);
         let for_foxglove = Protocol::Web(foxglove::ORIGINS);
@@ -57,7 +59,8 @@ impl Listeners {
         }
         let socket = TcpListener::bind(at).await.map_err(|source| StartError::Listen { what: name, at, source })?;
         let calls = (config.connections.calls_max, config.connections.calls_per_address_max);
-        let (listener, handle) = Listener::new(socket, protocol, limits(name, config), calls, self.security.clone());
+        let (listener, handle) =
+            Listener::new(socket, protocol, limits(name, config), calls, self.security.clone(), &self.all);
         self.handles.push((name, handle));
         Ok(Some(listener))
     }

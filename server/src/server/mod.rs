@@ -9,6 +9,7 @@
 //! | `listeners` | the TCP listeners of a configuration |
 //! | `running` | [`Running`], and its shutdown |
 //! | `save_rules` | stale maps and lost sensors -> saves of the recording |
+//! | `uploads` | finished parts of the recording -> the store |
 //! | `over_zenoh` | everything that uses the zenoh session |
 
 mod input;
@@ -19,6 +20,8 @@ mod running;
 mod save_rules;
 mod setup;
 mod start;
+#[cfg(feature = "store")]
+mod uploads;
 
 pub use input::VehicleInput;
 pub use running::Running;

@@ -67,9 +67,10 @@ pub struct Running {
 }
 
 impl Running {
-    /// The path of the recording, if the server records.
+    /// The path of the recording, if the server records and the disk has answered.
     pub fn recording(&self) -> Option<String> {
-        self.recorder.as_ref().map(|recorder| recorder.counts().to_proto().file)
+        let file = self.recorder.as_ref().map(|recorder| recorder.counts().to_proto().file);
+        file.filter(|file| !file.is_empty())
     }
 
     /// Controls the replay that the server serves, if it serves one.
@@ -83,7 +84,7 @@ impl Running {
     }
 
     /// Uses the certificates, tokens, roles and limits of another configuration from now on, for new connections and
-    /// new calls. Open connections stay.
+    /// new calls. Open connections stay, unless their client has lost its role.
     ///
     /// # Errors
     /// A text that says which certificate is invalid, or that TLS cannot begin or end while the server runs; then
@@ -94,8 +95,11 @@ impl Running {
         if next.tls.is_some() != security.current().tls.is_some() {
             return Err("TLS begins or ends only with a restart".into());
         }
-        security.replace(next);
-        handles.iter().for_each(|(name, handle)| handle.set_limits(limits(name, config)));
+        security.replace(next.clone());
+        for (name, handle) in handles {
+            handle.set_limits(limits(name, config));
+            handle.recheck(&next);
+        }
         Ok(())
     }
 

@@ -84,6 +84,9 @@ pub enum StartError {
     /// The configuration enables zenoh, but the program was built without it.
     #[error("zenoh.enabled = true: this clearway was built without the feature zenoh; allowed: false")]
     NoZenoh,
+    /// The configuration names a store, but the program was built without it.
+    #[error("store.url: this clearway was built without the feature store; an empty text is allowed")]
+    NoStore,
 }
 
 /// A server ended, but not as it should have.

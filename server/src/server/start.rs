@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::hash::{BuildHasher, Hasher};
 use std::sync::Arc;
 use std::sync::mpsc::Receiver;
+use std::time::Duration;
 
 use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::VehicleConfig;
@@ -15,18 +16,25 @@ use super::listeners::Listeners;
 use super::running::Running;
 use super::save_rules;
 use super::setup::{Setup, StartError};
-use crate::config::{Certificates, Config, Vehicle, listeners};
+#[cfg(feature = "store")]
+use super::uploads;
+use crate::config::{self, Certificates, Config, Vehicle, listeners};
 use crate::engine::{Engine, Observer};
 use crate::ingest::gateway::{Gateway, Gateways};
 use crate::ingest::grpc::Ingest;
 use crate::ingest::queue::{EventQueue, QueuedEvent, event_queue};
 use crate::ingest::udp;
-use crate::publish::listen::Listener;
 use crate::publish::listen::security::{Current, Security};
+use crate::publish::listen::{Listener, ListenerHandle};
 use crate::publish::{Served, Vehicles, foxglove, grpc, page};
 use crate::record::mcap_file::Header;
 use crate::record::writer::{Recorder, recording_path};
 use crate::status::VehicleStatus;
+
+/// Longest time between two signs of life of a listener that does not hang: it gives one twice a second.
+const LISTENER_SILENT_MAX: Duration = Duration::from_secs(3);
+/// Interval at which the listeners are looked at.
+const LISTENER_POLL_INTERVAL: Duration = Duration::from_millis(500);
 
 /// The server.
 pub struct Server;
@@ -41,6 +49,9 @@ impl Server {
         let Setup { config, mut calibrations, boot_id, .. } = setup;
         if config.zenoh.enabled && !cfg!(feature = "zenoh") {
             return Err(StartError::NoZenoh);
+        }
+        if !config.store.url.is_empty() && !cfg!(feature = "store") {
+            return Err(StartError::NoStore);
         }
         let boot_id = boot_id.unwrap_or_else(random);
         let mut observer = setup.observer;
@@ -156,7 +167,25 @@ impl Running {
     ) -> Result<(), StartError> {
         let mut handles = Vec::new().into_iter();
         if recording_path(&config.recorder).is_some() {
-            let (recorder, of_vehicles) = Recorder::start(&config.recorder, &header(), driver.from_files)?;
+            let options = config::Recorder { awaits_store: !config.store.url.is_empty(), ..config.recorder.clone() };
+            let (recorder, of_vehicles) = Recorder::start(&options, &header(), driver.from_files)?;
+            #[cfg(feature = "store")]
+            if options.awaits_store {
+                let uploads = uploads::upload_finished(config.store.clone(), recorder.control(), recorder.counts());
+                let (stopped, runtime) = (self.stopped(), tokio::runtime::Handle::current());
+                // What the store has not confirmed at the end stays, and the next start sends it. On a thread of its
+                // own, because it reads whole files.
+                let work = async move {
+                    tokio::select! {
+                        () = uploads => {}
+                        () = stopped => {}
+                    }
+                };
+                self.publishers.spawn(async move {
+                    // Fails only if the runtime shuts down.
+                    let _ = tokio::task::spawn_blocking(move || runtime.block_on(work)).await;
+                });
+            }
             (self.recorder, handles) = (Some(recorder), of_vehicles.into_iter());
         }
         for Prepared { served: Served { status, .. }, mut engine, events, core: (core, tables) } in prepared {
@@ -184,9 +213,10 @@ impl Running {
     }
 
     fn serve(&mut self, listeners: Listeners, gateways: Gateways) {
-        let Listeners { grpc, page, metrics, foxglove, security, handles } = listeners;
+        let Listeners { grpc, page, metrics, foxglove, security, handles, .. } = listeners;
         let listeners = handles.clone().into();
         let shown = page::Shown { vehicles: self.vehicles.clone(), listeners, replay: self.replay.clone() };
+        self.publishers.spawn(watch_listeners(handles.clone(), self.vehicles.clone(), self.stopped()));
         self.listeners = Some((security, handles));
         let address = |listener: &Option<Listener>| listener.as_ref().and_then(Listener::address);
         (self.grpc, self.page, self.metrics) = (address(&grpc), address(&page), address(&metrics));
@@ -221,6 +251,29 @@ impl Running {
         let queues: Vec<EventQueue> = self.inputs.iter().map(|input| input.queue.clone()).collect();
         self.udp = Some(sockets.start(&queues).map_err(StartError::UdpThread)?);
         Ok(())
+    }
+}
+
+/// Names a listener that hangs or has stopped in the status of every vehicle, until `stop` resolves.
+async fn watch_listeners(
+    handles: Vec<(&'static str, ListenerHandle)>,
+    vehicles: Vehicles,
+    stop: impl Future<Output = ()>,
+) {
+    let watch = async {
+        let mut every = tokio::time::interval(LISTENER_POLL_INTERVAL);
+        loop {
+            every.tick().await;
+            let silent = |handle: &ListenerHandle| handle.silent().filter(|silent| *silent > LISTENER_SILENT_MAX);
+            let silent = handles.iter().filter_map(|(name, handle)| Some((name, silent(handle)?)));
+            let fault = silent.map(|(name, silent)| format!("the listener {name} has hung for {} s", silent.as_secs()));
+            let fault = fault.collect::<Vec<_>>().join("; ");
+            vehicles.0.iter().for_each(|served| served.status.set_listener_fault(&fault));
+        }
+    };
+    tokio::select! {
+        () = watch => {}
+        () = stop => {}
     }
 }
 

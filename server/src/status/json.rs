@@ -42,6 +42,10 @@ pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
             "file": recorder.file, "events": recorder.events, "maps": recorder.maps, "lost": recorder.lost,
             "state": recorder.state, "reason": recorder.reason, "part": recorder.part,
             "durable_events": recorder.durable_events,
+            "store": {
+                "confirmed": recorder.store_confirmed, "waiting": recorder.store_waiting,
+                "failures": recorder.store_failures, "problem": recorder.store_problem,
+            },
             "topics": recorder.topics.iter().map(|of| {
                 json!({"topic": of.topic, "offered": of.offered, "written": of.written, "dropped": of.dropped})
             }).collect::<Vec<_>>(),

@@ -62,6 +62,7 @@ pub struct VehicleStatus {
     drops: Arc<DropCounters>,
     pub(super) recorder: OnceLock<Arc<RecorderCounts>>,
     engine_stopped: AtomicBool,
+    listener_fault: Mutex<String>,
     /// Time of the newest sign of life of the engine, in ms after `started`; 0 before the first.
     engine_beat_ms: AtomicU64,
     started: Instant,
@@ -167,6 +168,7 @@ impl VehicleStatus {
             drops,
             recorder: OnceLock::new(),
             engine_stopped: AtomicBool::new(false),
+            listener_fault: Mutex::default(),
             engine_beat_ms: AtomicU64::new(0),
             started: Instant::now(),
             state: Mutex::default(),
@@ -188,7 +190,8 @@ impl VehicleStatus {
         self.fault().is_none()
     }
 
-    /// What of the vehicle has stopped or hangs: its engine, or a thread that reads its sockets; `None` if nothing has.
+    /// What has stopped or hangs: the vehicle's engine, a listener, or a thread that reads its sockets; `None` if
+    /// nothing has.
     pub fn fault(&self) -> Option<String> {
         if self.engine_stopped.load(Ordering::Acquire) {
             return Some(format!("the engine of vehicle {} has stopped", self.name));
@@ -198,6 +201,10 @@ impl VehicleStatus {
         if !beat.is_zero() && silent > ENGINE_SILENT_MAX {
             return Some(format!("the engine of vehicle {} has hung for {} s", self.name, silent.as_secs()));
         }
+        let listener_fault = locked(&self.listener_fault).clone();
+        if !listener_fault.is_empty() {
+            return Some(listener_fault);
+        }
         let ended = self.drops.ended_inputs();
         (!ended.is_empty()).then(|| format!("vehicle {}: {}", self.name, ended.join("; ")))
     }
@@ -206,6 +213,11 @@ impl VehicleStatus {
     pub(crate) fn engine_beats(&self) {
         let ms = u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX);
         self.engine_beat_ms.store(ms.max(1), Ordering::Relaxed);
+    }
+
+    /// Records which listeners hang or have stopped; empty: none.
+    pub(crate) fn set_listener_fault(&self, fault: &str) {
+        fault.clone_into(&mut locked(&self.listener_fault));
     }
 
     /// Records that the engine has stopped.

@@ -4,11 +4,13 @@
 //! |---|---|
 //! | [`location`] | a path or a URL -> the store |
 //! | [`index`] | a finished part -> what it holds, for a search; a search -> the parts |
+//! | [`fetch`] | the URL of a recording in a store -> a copy here |
 //! | [`upload`] | finished parts of a folder -> the store, confirmed |
 //!
 //! A part is the object `parts/<time>-<CRC>.mcap`; what it holds is the object `index/<vehicle>/<time>-<CRC>.json`,
 //! one for each vehicle. The time is that of the first message, in ns, in 20 digits, so that names sort by time.
 
+pub mod fetch;
 pub mod index;
 pub mod location;
 pub mod upload;

@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use super::index::Entry;
 use crate::record::mcap_reader::McapReadError;
+use crate::record::writer::confirmation_of;
 
 /// Bytes of one piece of a part, which is sent at once. S3 allows 5 MiB or more.
 const PIECE_BYTES: usize = 8 << 20;
@@ -200,12 +201,6 @@ fn crc_of(file: &Path) -> io::Result<(u64, u32)> {
             }
         }
     }
-}
-
-fn confirmation_of(file: &Path) -> PathBuf {
-    let mut name = file.as_os_str().to_owned();
-    name.push(".confirmed");
-    name.into()
 }
 
 /// Writes a file under a temporary name, and renames it once it is on the disk.

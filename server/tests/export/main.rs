@@ -100,6 +100,38 @@ fn several_layers_or_all_are_exported_with_their_names() {
 }
 
 #[test]
+fn a_gif_has_the_pictures_of_all_maps_at_the_speed_of_the_drive() {
+    let folder = folder();
+    let file = folder.path().join("run.mcap");
+    record(&file, true);
+    let [run, out] = [file.to_str().unwrap(), folder.path().to_str().unwrap()];
+    let export = |format: &str| {
+        clearway(&["export", run, "--layer", "drivability", "--format", format, "--pixels", "64", "--out", out])
+    };
+    assert!(export("gif").status.success() && export("png").status.success());
+    let mut options = gif::DecodeOptions::new();
+    options.set_color_output(gif::ColorOutput::RGBA);
+    let film = File::open(folder.path().join("drive_drivability.gif")).unwrap();
+    let mut film = options.read_info(film).unwrap();
+    let mut delays = Vec::new();
+    for sequence in 0..3 {
+        let picture = File::open(folder.path().join(format!("{sequence:06}_drivability.png"))).unwrap();
+        let mut picture = png::Decoder::new(std::io::BufReader::new(picture)).read_info().unwrap();
+        let mut rgb = vec![0; picture.output_buffer_size().unwrap()];
+        let info = picture.next_frame(&mut rgb).unwrap();
+        assert_eq!((u32::from(film.width()), u32::from(film.height())), (info.width, info.height));
+        let frame = film.read_next_frame().unwrap().expect("a frame for each map");
+        let shown: Vec<u8> = frame.buffer.chunks(4).flat_map(|pixel| pixel[..3].to_vec()).collect();
+        assert_eq!(shown, rgb, "the pixels of the picture, with its legend and stamp");
+        delays.push(frame.delay);
+    }
+    assert!(film.read_next_frame().unwrap().is_none());
+    assert_eq!(delays, [10, 10, 100], "maps come ten times a second");
+    let again = export("gif");
+    assert!(text(&again.stderr).contains("drive_drivability.gif") && !again.status.success(), "it is not replaced");
+}
+
+#[test]
 fn options_that_the_format_does_not_use_are_refused() {
     for (format, option) in
         [("json", "--plain"), ("npy", "--no-vehicle"), ("ros2", "--pixels=80"), ("png", "--no-points")]

@@ -94,16 +94,19 @@ async fn a_name_reaches_only_its_vehicles_and_layers() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 #[cfg_attr(not(clearway_openssl), ignore = "needs openssl: apt-get install openssl")]
-async fn certificates_and_roles_change_without_losing_a_reader() {
+async fn certificates_and_roles_change_without_losing_a_reader_that_keeps_its_role() {
     let mut config = secured(true);
     let running = start(config.clone()).await;
     let address = running.grpc.unwrap().to_string();
     let reader = Client::connect_tls(&address, &client_tls("ours", "reader")).await.unwrap();
-    let mut maps = reader.subscribe(Subscription::default()).await.unwrap();
+    let mut cut = reader.subscribe(Subscription::default()).await.unwrap();
+    let operator = Client::connect_tls(&address, &client_tls("ours", "operator")).await.unwrap();
+    let mut maps = operator.subscribe(Subscription::default()).await.unwrap();
     let mut drive = readings(6);
     let rest = drive.split_off(drive.len() / 2);
     feed(&running, drive).await;
     within("a map", maps.next()).await.unwrap();
+    within("a map", cut.next()).await.unwrap();
 
     // The server shows a certificate of the other CA; readers lose their role; the operator stays.
     let theirs = certificates("theirs");
@@ -113,7 +116,19 @@ async fn certificates_and_roles_change_without_losing_a_reader() {
     let read = config.certificates(Path::new("")).unwrap();
     running.reload(&config, read.as_ref()).unwrap();
     let maps_made = feed(&running, rest).await;
-    within("the reader goes on", async { while maps.next().await.unwrap().map.sequence() + 1 < maps_made {} }).await;
+    let ended = within("the stream of the lost role is cut", async {
+        loop {
+            if let Err(ended) = cut.next().await {
+                return ended;
+            }
+        }
+    });
+    let ended = ended.await;
+    assert!(matches!(ended, ClientError::Unreachable { .. } | ClientError::Ended { .. }), "{ended:?}");
+    within("the operator's stream goes on", async {
+        while maps.next().await.unwrap().map.sequence() + 1 < maps_made {}
+    })
+    .await;
     let before = Client::connect_tls(&address, &client_tls("ours", "operator")).await;
     assert!(before.is_err(), "a client that trusts the old CA only");
     let operator = Client::connect_tls(&address, &client_tls("theirs", "operator")).await.unwrap();

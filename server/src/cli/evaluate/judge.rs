@@ -465,15 +465,10 @@ mod tests {
 
     #[test]
     fn points_near_the_estimated_ground_are_called_ground() {
-        let points = [
-            point(1.0, 1.0, "road", Vote::Drivable),
-            point(2.0, 1.3, "road", Vote::Drivable),
-            point(3.0, 0.9, "car", Vote::Obstacle),
-            point(4.0, 3.0, "car", Vote::Obstacle),
-            point(50.0, 1.0, "road", Vote::Drivable),
-        ];
+        let road = [(1.0, 1.0), (2.0, 1.3), (50.0, 1.0)].map(|(x, z)| point(x, z, "road", Vote::Drivable));
+        let car = [(3.0, 0.9), (4.0, 3.0)].map(|(x, z)| point(x, z, "car", Vote::Obstacle));
         let mut tally = Tally::default();
-        judge_ground(&mut tally, &points, |[x, _, z]| (x < 40.0).then_some(z - 1.0));
+        judge_ground(&mut tally, &[&road[..], &car].concat(), |[x, _, z]| (x < 40.0).then_some(z - 1.0));
         assert_eq!(tally.points[0], Confusion { right: 1, wrong: 1, missed: 2 });
     }
 }

@@ -3,6 +3,7 @@
 //! | file | in -> out |
 //! |---|---|
 //! | `drawing` | options -> the style of pictures |
+//! | `gif` | the maps of a layer -> one GIF |
 //! | `layer_json` | a layer -> JSON |
 //! | `npy` | the cells of a channel -> a NumPy file |
 //! | `sheet` | the maps of a layer -> one picture of many |
@@ -16,6 +17,7 @@ use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use clearway_client::{Channel, Layer, MapView};
 
+use self::gif::Gif;
 use self::sheet::Sheet;
 use self::viewer_file::{Dialect, ViewerFile};
 use super::exit::Exit;
@@ -26,6 +28,7 @@ use crate::record::mcap_reader::{McapReader, Message};
 pub use drawing::DrawingOptions;
 
 mod drawing;
+mod gif;
 pub mod layer_json;
 pub mod npy;
 mod scans;
@@ -37,7 +40,8 @@ mod viewer_file;
 /// Names of the files begin with the map's sequence number in six digits, and contain the layer. png and json write
 /// `<sequence>_<layer>.<format>`, png with --channel `<sequence>_<layer>_<channel>.png`; npy writes
 /// `<sequence>_<layer>_<channel>.npy` (NumPy 1.0, shape (rows, columns)) and `<sequence>_<layer>.json` with geometry,
-/// pose, stamps and class legend; sheet writes `sheet_<layer>.png`. Pictures show the map from above, with
+/// pose, stamps and class legend; sheet writes `sheet_<layer>.png`, gif `drive_<layer>.gif`, at
+/// the speed of the drive. Pictures show the map from above, with
 /// the vehicle in the middle, forward up and left
 /// on the left, and under it the stamp, the sensors that are partial, the legend and a scale.
 ///
@@ -50,6 +54,7 @@ mod viewer_file;
   clearway export drive.mcap --layer terrain --channel roughness --format png --out maps
   clearway export drive.mcap --format png --rings 10 --out maps
   clearway export drive.mcap --layer drivability --format sheet --pixels 240 --out maps
+  clearway export drive.mcap --layer speed --format gif --pixels 400 --out films
   clearway export drive.mcap --format foxglove --out drive.foxglove.mcap")]
 pub struct Options {
     /// The recording (MCAP); a file that is cut off is exported as far as it goes.
@@ -80,6 +85,8 @@ pub enum Format {
     Png,
     /// One picture for each layer, with up to 24 maps of the drive side by side.
     Sheet,
+    /// One film for each layer.
+    Gif,
     /// NumPy arrays, one for each channel, and a JSON document.
     Npy,
     /// A JSON document with the cells.
@@ -98,6 +105,8 @@ enum Output {
     Files(Encoder),
     /// By layer.
     Sheets(BTreeMap<String, Sheet>),
+    /// By layer.
+    Gifs(BTreeMap<String, Gif>),
     Viewer(Box<ViewerFile>),
 }
 
@@ -107,6 +116,7 @@ impl Output {
         Ok(match options.format {
             Format::Png => Self::Files(png),
             Format::Sheet => Self::Sheets(BTreeMap::new()),
+            Format::Gif => Self::Gifs(BTreeMap::new()),
             Format::Npy => Self::Files(npy),
             Format::Json => Self::Files(json),
             Format::Foxglove => Self::Viewer(viewer(Dialect::Foxglove)?),
@@ -118,9 +128,9 @@ impl Output {
 /// Refuses options that the format does not use.
 fn check(options: &Options) -> Result<()> {
     if let Some(option) =
-        options.drawing.first_given().filter(|_| !matches!(options.format, Format::Png | Format::Sheet))
+        options.drawing.first_given().filter(|_| !matches!(options.format, Format::Png | Format::Sheet | Format::Gif))
     {
-        return Err(usage_error(format!("{option} is for pictures: it needs --format png or sheet")));
+        return Err(usage_error(format!("{option} is for pictures: it needs --format png, sheet or gif")));
     }
     if options.no_points && !matches!(options.format, Format::Foxglove | Format::Ros2) {
         return Err(usage_error("--no-points needs --format foxglove or ros2; other formats have no points"));
@@ -185,13 +195,23 @@ pub fn run(options: &Options) -> Result<Exit> {
         let of_layer = map.layer(layer)?;
         match &mut output {
             Output::Viewer(viewer) => viewer.write_map(&map, of_layer, message.log_ns)?,
-            Output::Files(_) | Output::Sheets(_) if vehicles.len() > 1 => {
+            Output::Files(_) | Output::Sheets(_) | Output::Gifs(_) if vehicles.len() > 1 => {
                 bail!("{} has maps of {}: name one with --vehicle", file.display(), vehicles.join(" and "))
             }
             Output::Sheets(sheets) => {
                 let style = Style { caption: picture::caption(map.header(), layer), ..style.clone() };
                 let sheet = sheets.entry(layer.to_owned()).or_default();
                 sheet.push(|| picture::of_layer(of_layer, &style))?;
+            }
+            Output::Gifs(gifs) => {
+                let style = Style { caption: picture::caption(map.header(), layer), ..style.clone() };
+                let drawn = picture::of_layer(of_layer, &style)?;
+                if !gifs.contains_key(layer) {
+                    files::create_folder(out)?;
+                    let name = format!("drive_{layer}{}", ending(&style, "gif"));
+                    gifs.insert(layer.to_owned(), Gif::create(&out.join(name))?);
+                }
+                gifs.get_mut(layer).into_iter().try_for_each(|gif| gif.push(&drawn, map.header().capture_end_ns))?;
             }
             Output::Files(encode) => {
                 if maps.is_empty() {
@@ -206,11 +226,12 @@ pub fn run(options: &Options) -> Result<Exit> {
     progress.finish_and_clear();
     match output {
         Output::Files(_) => {}
+        Output::Gifs(gifs) => gifs.into_values().try_for_each(Gif::finish)?,
         Output::Viewer(viewer) => viewer.finish().with_context(|| format!("write {}", out.display()))?,
         Output::Sheets(sheets) => {
             files::create_folder(out)?;
             for (layer, sheet) in sheets {
-                write(&format!("sheet_{layer}"), vec![(ending(&style), sheet.finish().to_png()?)], out)?;
+                write(&format!("sheet_{layer}"), vec![(ending(&style, "png"), sheet.finish().to_png()?)], out)?;
             }
         }
     }
@@ -259,12 +280,12 @@ fn write(stem: &str, encoded: Vec<(String, Vec<u8>)>, out: &Path) -> Result<()> 
 
 fn png(map: &MapView, layer: &Layer, style: &Style) -> Result<Vec<(String, Vec<u8>)>> {
     let style = Style { caption: picture::caption(map.header(), &layer.name), ..style.clone() };
-    Ok(vec![(ending(&style), picture::png(layer, &style)?)])
+    Ok(vec![(ending(&style, "png"), picture::png(layer, &style)?)])
 }
 
 /// The end of the name of a picture: it names the channel if the style does.
-fn ending(style: &Style) -> String {
-    style.channel.as_ref().map_or(".png".to_owned(), |channel| format!("_{channel}.png"))
+fn ending(style: &Style, extension: &str) -> String {
+    style.channel.as_ref().map_or(format!(".{extension}"), |channel| format!("_{channel}.{extension}"))
 }
 
 fn json(map: &MapView, layer: &Layer, _: &Style) -> Result<Vec<(String, Vec<u8>)>> {

@@ -98,8 +98,20 @@ pub fn check_all(files: &[PathBuf], check: &Check, jobs: usize) -> Vec<Checked> 
 
 fn check_one(file: &Path, check: &Check) -> Checked {
     let began = Instant::now();
-    let outcome = outcome(file, check).unwrap_or_else(|error| Outcome::Unreadable(with_causes(&error)));
+    let outcome = outcome_of(file, check).unwrap_or_else(|error| Outcome::Unreadable(with_causes(&error)));
     Checked { file: file.to_owned(), seconds: began.elapsed().as_secs_f64(), outcome, pictures: Vec::new() }
+}
+
+/// The outcome of a file, or of a recording in a store, which is copied here meanwhile.
+fn outcome_of(file: &Path, check: &Check) -> Result<Outcome> {
+    #[cfg(feature = "store")]
+    if let Some(url) = file.to_str().filter(|text| super::files::is_url(text)) {
+        let copy = crate::cli::output::block_on(crate::store::fetch::fetch(url))?;
+        // A reason names the copy, which is gone when it is read.
+        return outcome(copy.path(), check)
+            .map_err(|error| anyhow::anyhow!(with_causes(&error).replace(&copy.path().display().to_string(), url)));
+    }
+    outcome(file, check)
 }
 
 fn outcome(file: &Path, check: &Check) -> Result<Outcome> {

@@ -1,4 +1,4 @@
-//! Paths and patterns of the command line -> files, in alphabetical order; a shard of them.
+//! Paths, patterns and stores of the command line -> files, in alphabetical order; a shard of them.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -25,14 +25,18 @@ impl FromStr for Shard {
     }
 }
 
-/// The files that paths, folders and patterns name, each once, in alphabetical order; with a shard, its part of them,
-/// which may be empty.
+/// The files that paths, folders, patterns and URLs of stores name, each once, in alphabetical order; with a shard, its
+/// part of them, which may be empty. A recording in a store is its URL.
 ///
 /// # Errors
-/// If a path does not exist, or a folder or a pattern has no recording.
+/// If a path does not exist, or a folder, a pattern or a store has no recording.
 pub fn find(given: &[String], shard: Option<Shard>) -> Result<Vec<PathBuf>> {
     let mut files = BTreeSet::new();
     for text in given {
+        if is_url(text) {
+            files.extend(in_store(text)?);
+            continue;
+        }
         let path = Path::new(text);
         // A file may have a name with the letters of patterns.
         if path.is_dir() {
@@ -53,6 +57,26 @@ pub fn find(given: &[String], shard: Option<Shard>) -> Result<Vec<PathBuf>> {
     }
     let Some(Shard { index, count }) = shard else { return Ok(files.into_iter().collect()) };
     Ok(files.into_iter().skip(index - 1).step_by(count).collect())
+}
+
+/// True for the URL of a store, or of a recording in one.
+pub fn is_url(text: &str) -> bool {
+    text.contains("://")
+}
+
+/// The URLs of the recordings that the URL of a store names.
+#[cfg(feature = "store")]
+fn in_store(url: &str) -> Result<Vec<PathBuf>> {
+    let found = crate::cli::output::block_on(crate::store::fetch::list(url))?;
+    if found.is_empty() {
+        bail!("{url}: no recording *.mcap in this store");
+    }
+    Ok(found.into_iter().map(PathBuf::from).collect())
+}
+
+#[cfg(not(feature = "store"))]
+fn in_store(url: &str) -> Result<Vec<PathBuf>> {
+    bail!("{url}: this clearway was built without the feature store");
 }
 
 /// The files that match a pattern.

@@ -37,11 +37,13 @@ Examples:
   clearway verify drive.mcap
   clearway verify 'drives/**/*.mcap' --junit verify.xml
   clearway verify drives --shard 2/5 --json
+  clearway verify s3://fleet/clearway/parts --shard 2/5
   clearway verify drives --config new.toml --pictures changes
   clearway verify drive.mcap --set vehicle.maps.reach.vehicle_width_m=2.5
   clearway verify before.mcap --against after.mcap")]
 pub struct Options {
-    /// Recordings (MCAP), folders of them, or patterns in quotes, such as 'drives/**/*.mcap'.
+    /// Recordings (MCAP), folders of them, patterns in quotes, such as 'drives/**/*.mcap', or URLs of a store or of a
+    /// recording in it, such as s3://BUCKET/PREFIX.
     #[arg(required = true, value_name = "FILES")]
     files: Vec<String>,
     /// Check part I of N of the files: every N-th of the sorted list, from the I-th on. All parts together are all

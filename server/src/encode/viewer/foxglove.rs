@@ -3,9 +3,10 @@
 
 use clearway_proto::map::Layer;
 use foxglove::messages::line_primitive::Type;
+use foxglove::messages::log::Level;
 use foxglove::messages::packed_element_field::NumericType;
 use foxglove::messages::{
-    Color, Duration, FrameTransform, FrameTransforms, Grid, LinePrimitive, PackedElementField, Point3, PointCloud,
+    Color, Duration, FrameTransform, FrameTransforms, Grid, LinePrimitive, Log, PackedElementField, Point3, PointCloud,
     Pose, Quaternion, SceneEntity, SceneUpdate, Timestamp, Vector2, Vector3,
 };
 use nalgebra::Isometry3;
@@ -69,6 +70,18 @@ pub fn transforms(map: &MapView) -> Option<FrameTransforms> {
     let stamp_ns = map.header().capture_end_ns;
     let transform = transform(stamp_ns, MAP_FRAME, &base_frame(map.vehicle()), &map_from_ego(map)?);
     Some(FrameTransforms { transforms: vec![transform] })
+}
+
+/// A line of the log of a vehicle.
+pub fn log(stamp_ns: i64, vehicle: &str, text: &str) -> Log {
+    Log {
+        timestamp: Some(timestamp(stamp_ns)),
+        level: Level::Info.into(),
+        message: text.to_owned(),
+        name: vehicle.to_owned(),
+        file: String::new(),
+        line: 0,
+    }
 }
 
 /// Transform of a frame in its parent.

@@ -155,7 +155,8 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         selection.rate.send(sent.stamp_ns);
         selection.credits.send(sent.sequence);
         (*base, *want_full) = (selection.deltas.then_some(map), false);
-        Ok(v1::MapUpdate { map: bytes, skipped, sent_ns: now_ns(), left_out, replay_ended: false })
+        let lockstep = self.finished.as_ref().is_some_and(AcknowledgingReader::is_in_lockstep);
+        Ok(v1::MapUpdate { map: bytes, skipped, sent_ns: now_ns(), left_out, replay_ended: false, lockstep })
     }
 }
 

@@ -74,7 +74,7 @@ pub struct Access {
 }
 
 /// What the client of one call may reach. The default may reach nothing.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Caller {
     limits: Arc<[Only]>,
     is_operator: bool,

@@ -11,7 +11,7 @@ use http_body::{Frame, SizeHint};
 use tokio::time::Sleep;
 
 use super::flow::Flow;
-use super::places::InProgress;
+use super::places::{Grant, InProgress};
 
 /// Longest piece of a message that the transport gets at once: how much a peer must receive within the time limit for
 /// stalled connections.
@@ -45,14 +45,15 @@ pub struct CountedBody {
     flow: Option<Arc<Flow>>,
     pause: Option<Pin<Box<Sleep>>>,
     _in_progress: InProgress,
+    _grant: Option<Arc<Grant>>,
 }
 
 impl CountedBody {
     /// Without a flow, bytes are not counted.
-    pub fn new(body: Body, in_progress: InProgress, flow: Option<Arc<Flow>>) -> Self {
+    pub fn new(body: Body, in_progress: InProgress, flow: Option<Arc<Flow>>, grant: Option<Arc<Grant>>) -> Self {
         // From now on the transport should ask for the first piece.
         flow.iter().for_each(|flow| flow.set_polled(false));
-        Self { body, rest: Bytes::new(), flow, pause: None, _in_progress: in_progress }
+        Self { body, rest: Bytes::new(), flow, pause: None, _in_progress: in_progress, _grant: grant }
     }
 
     /// The next piece of the message.

@@ -48,14 +48,18 @@ use access::Caller;
 use body::CountedBody;
 use connection::{Connection, Transport};
 use flow::Flows;
-use places::Places;
+use places::{Grant, Places};
 use security::Security;
 
-pub use places::{InProgress, Limits, Place};
+pub use places::{AllPlaces, InProgress, Limits, Place};
 
 /// Pause after an error of the listener itself, such as no free file handle: to try again at once would only use a
 /// core.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// That pause if connections without a request were closed, and most that are closed at once. Ours: 3200 newcomers a
+/// second get a file handle, more than the kernel's queue of them holds.
+const FREED_PAUSE: Duration = Duration::from_millis(10);
+const FREED_MAX: usize = 32;
 /// Time between two looks for connections that are idle or stalled.
 const SWEEP_PERIOD: Duration = Duration::from_millis(500);
 /// Longest TLS handshake. Ours: a client that has begun one has no reason to wait.
@@ -93,6 +97,7 @@ pub enum Protocol {
 pub struct Listener {
     socket: TcpListener,
     shared: Shared,
+    all: AllPlaces,
 }
 
 /// What the connections of a listener share.
@@ -108,7 +113,7 @@ pub type Counts = (usize, usize, BTreeMap<&'static str, u64>);
 
 /// The counts of one listener, and its limits, which can be replaced.
 #[derive(Clone)]
-pub struct ListenerHandle(Arc<Places>, Arc<Flows>);
+pub struct ListenerHandle(Arc<Places>, Arc<Flows>, Protocol);
 
 impl ListenerHandle {
     /// The counts at present.
@@ -121,21 +126,42 @@ impl ListenerHandle {
     pub fn set_limits(&self, limits: Limits) {
         self.0.set_limits(limits);
     }
+
+    /// Closes the connections whose clients have lost their role, or may reach other vehicles or layers than when their
+    /// request began.
+    pub fn recheck(&self, current: &security::Current) {
+        let Some(access) = &current.access else { return };
+        self.0.recheck(|grant| {
+            let allowed = match self.2 {
+                Protocol::Grpc => access.check(&grant.path, &grant.names),
+                Protocol::Web(_) => access.check_path(&grant.path, &grant.names),
+            };
+            allowed.is_ok_and(|caller| caller == grant.caller)
+        });
+    }
+
+    /// How long the listener has given no sign of life; it gives one twice a second. `None` before its first.
+    pub fn silent(&self) -> Option<Duration> {
+        self.0.silent()
+    }
 }
 
 impl Listener {
-    /// A listener with these limits; at most so many responses at once, in all and for one address.
+    /// A listener with these limits; at most so many responses at once, in all and for one address. It shares file
+    /// handles with those of `all`.
     pub fn new(
         socket: TcpListener,
         protocol: Protocol,
         limits: Limits,
         calls: (usize, usize),
         security: Security,
+        all: &AllPlaces,
     ) -> (Self, ListenerHandle) {
         let flows = Flows::new(calls.0, calls.1);
         let places = Places::new(limits, flows.clone());
         let shared = Shared { protocol, places: places.clone(), security };
-        (Self { socket, shared }, ListenerHandle(places, flows))
+        all.add(places.clone());
+        (Self { socket, shared, all: all.clone() }, ListenerHandle(places, flows, protocol))
     }
 
     /// The address it listens on.
@@ -145,7 +171,7 @@ impl Listener {
 
     /// Answers requests until `stop` resolves and all connections have ended.
     pub async fn serve(self, router: Router, stop: impl Future<Output = ()>) {
-        let Self { socket, shared } = self;
+        let Self { socket, shared, all } = self;
         let stopping = CancellationToken::new();
         let mut connections = JoinSet::new();
         let mut sweep = tokio::time::interval(SWEEP_PERIOD);
@@ -154,6 +180,7 @@ impl Listener {
             let accepted = tokio::select! {
                 () = &mut stop => break,
                 _ = sweep.tick() => {
+                    shared.places.beat();
                     shared.places.sweep();
                     continue;
                 }
@@ -167,11 +194,11 @@ impl Listener {
                     connections.spawn(run);
                 }
                 Err(error) => {
-                    tracing::warn!(%error, "accept");
                     shared.places.count("accept_error");
                     // There may be no free file handle.
-                    shared.places.free_one();
-                    tokio::time::sleep(ACCEPT_PAUSE).await;
+                    let freed = all.free(FREED_MAX);
+                    tracing::warn!(%error, freed, "accept");
+                    tokio::time::sleep(if freed > 0 { FREED_PAUSE } else { ACCEPT_PAUSE }).await;
                 }
             }
         }
@@ -253,10 +280,13 @@ impl Shared {
     ) -> Result<Response<CountedBody>, Infallible> {
         let in_progress = place.begin_request();
         let mut request = request.map(Body::new);
+        let mut grant = None;
         let (mut response, flow) = match self.check(&request, &place, &names) {
-            Ok(caller) => match place.begin_flow() {
+            Ok((caller, names)) => match place.begin_flow() {
                 None => (self.refuse_call(&place), None),
                 flow => {
+                    let path = request.uri().path().to_owned();
+                    grant = Some(place.grant(Grant { path, names, caller: caller.clone() }));
                     request.extensions_mut().insert(caller);
                     request.extensions_mut().insert(place);
                     let Ok(()) = poll_fn(|context| Service::<Request<Body>>::poll_ready(&mut router, context)).await;
@@ -269,11 +299,16 @@ impl Shared {
         if self.protocol != Protocol::Grpc {
             web::protect(&mut response);
         }
-        Ok(response.map(|body| CountedBody::new(body, in_progress, flow)))
+        Ok(response.map(|body| CountedBody::new(body, in_progress, flow, grant)))
     }
 
-    /// What the client of a request may reach.
-    fn check(&self, request: &Request<Body>, place: &Place, names: &[String]) -> Result<Caller, Box<Response<Body>>> {
+    /// What the client of a request may reach, and its names.
+    fn check(
+        &self,
+        request: &Request<Body>,
+        place: &Place,
+        names: &[String],
+    ) -> Result<(Caller, Vec<String>), Box<Response<Body>>> {
         if let Some(text) = place.over_limit() {
             place.count("over_limit");
             return Err(Box::new(self.refuse(StatusCode::SERVICE_UNAVAILABLE, Status::resource_exhausted(text))));
@@ -281,8 +316,8 @@ impl Shared {
         let current = self.security.current();
         match self.protocol {
             Protocol::Grpc => {
-                let Some(access) = &current.access else { return Ok(Caller::unlimited()) };
-                access.check(request.uri().path(), names).map_err(|status| {
+                let Some(access) = &current.access else { return Ok((Caller::unlimited(), Vec::new())) };
+                access.check(request.uri().path(), names).map(|caller| (caller, names.to_vec())).map_err(|status| {
                     tracing::info!(peer = %place.peer(), status = status.message(), "denied");
                     place.count("denied");
                     Box::new(status.into_http())
@@ -293,7 +328,7 @@ impl Shared {
                     if current.access.as_ref().is_some_and(|access| access.knows(&names)) {
                         place.set_known();
                     }
-                    Ok(caller)
+                    Ok((caller, names))
                 }
                 Err(refusal) => {
                     if !refusal.status().is_redirection() {

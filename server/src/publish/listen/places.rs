@@ -8,11 +8,12 @@
 use std::collections::BTreeMap;
 use std::net::IpAddr;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, Weak};
 use std::time::{Duration, Instant};
 
 use tokio_util::sync::CancellationToken;
 
+use super::access::Caller;
 use super::flow::{Flow, Flows};
 use crate::config;
 use crate::sync::locked;
@@ -68,6 +69,46 @@ pub struct Places {
     /// Connections that were refused or closed by the server, by reason.
     closed: Mutex<BTreeMap<&'static str, u64>>,
     flows: Arc<Flows>,
+    beat: Mutex<Option<Instant>>,
+}
+
+/// The connections of all listeners of a server, which share its file handles.
+#[derive(Clone, Debug, Default)]
+pub struct AllPlaces(Arc<Mutex<Vec<Arc<Places>>>>);
+
+impl AllPlaces {
+    /// Adds those of one listener.
+    pub fn add(&self, places: Arc<Places>) {
+        locked(&self.0).push(places);
+    }
+
+    /// Closes up to `count` connections without a request, those that have been so for the longest time first, to free
+    /// their file handles. Returns how many.
+    pub fn free(&self, count: usize) -> usize {
+        let all = locked(&self.0).clone();
+        let mut idle: Vec<_> = all
+            .iter()
+            .flat_map(|places| places.idle().into_iter().map(move |(key, occupant)| (key, occupant, places)))
+            .collect();
+        idle.sort_by_key(|(key, ..)| *key);
+        idle.truncate(count);
+        for (_, occupant, places) in &idle {
+            occupant.closing.cancel();
+            places.count("made_room");
+        }
+        idle.len()
+    }
+}
+
+/// What a request was allowed by, while it is in progress.
+#[derive(Debug)]
+pub struct Grant {
+    /// The RPC or the path.
+    pub path: String,
+    /// The names in the certificate and of the token.
+    pub names: Vec<String>,
+    /// What the client may reach.
+    pub caller: Caller,
 }
 
 #[derive(Debug, Default)]
@@ -86,6 +127,9 @@ struct Occupant {
     closing: CancellationToken,
     activity: Mutex<Activity>,
     flows: Mutex<Vec<Arc<Flow>>>,
+    grants: Mutex<Vec<Weak<Grant>>>,
+    /// That of the newest request: a WebSocket outlives its response.
+    newest_grant: Mutex<Option<Arc<Grant>>>,
 }
 
 #[derive(Debug)]
@@ -143,7 +187,13 @@ impl Occupant {
 impl Places {
     /// No connection yet. `flows` is what waits for all peers of this listener.
     pub fn new(limits: Limits, flows: Arc<Flows>) -> Arc<Self> {
-        Arc::new(Self { limits: Mutex::new(limits), open: Mutex::default(), closed: Mutex::default(), flows })
+        Arc::new(Self {
+            limits: Mutex::new(limits),
+            open: Mutex::default(),
+            closed: Mutex::default(),
+            flows,
+            beat: Mutex::default(),
+        })
     }
 
     /// Uses other limits from now on; open connections stay.
@@ -161,10 +211,34 @@ impl Places {
         *locked(&self.closed).entry(reason).or_default() += 1;
     }
 
-    /// Closes the connection that has been idle for the longest time, to free its file handle.
-    pub fn free_one(&self) {
+    /// The connections without a request, each with what says how soon it may be closed.
+    fn idle(&self) -> Vec<((bool, Instant), Arc<Occupant>)> {
         let open = locked(&self.open);
-        self.close_idlest(&open, "made_room", |_| true);
+        let idle = |occupant: &Arc<Occupant>| Some(((occupant.is_known(), occupant.idle_since()?), occupant.clone()));
+        open.all.values().filter_map(idle).collect()
+    }
+
+    /// Notes that the listener is at work.
+    pub fn beat(&self) {
+        *locked(&self.beat) = Some(Instant::now());
+    }
+
+    /// How long the listener has given no sign of life; `None` before its first.
+    pub fn silent(&self) -> Option<Duration> {
+        locked(&self.beat).map(|at| at.elapsed())
+    }
+
+    /// Closes the connections with a request that was allowed and no longer is.
+    pub fn recheck(&self, is_allowed: impl Fn(&Grant) -> bool) {
+        for occupant in locked(&self.open).all.values().filter(|occupant| !occupant.closing.is_cancelled()) {
+            let mut grants = locked(&occupant.grants);
+            grants.retain(|grant| grant.strong_count() > 0);
+            if grants.iter().filter_map(Weak::upgrade).any(|grant| !is_allowed(&grant)) {
+                tracing::info!(peer = %occupant.peer, "connection closed: its client has lost its role");
+                occupant.closing.cancel();
+                self.count("role_lost");
+            }
+        }
     }
 
     /// Admits a connection of this peer. Over a limit it gets a place in which it can only receive an error, and of
@@ -191,6 +265,8 @@ impl Places {
             closing: CancellationToken::new(),
             activity: Mutex::new(Activity { requests: 0, in_progress: 0, idle_since: now, blocked_since: None }),
             flows: Mutex::default(),
+            grants: Mutex::default(),
+            newest_grant: Mutex::default(),
         });
         open.next += 1;
         let number = open.next;
@@ -302,6 +378,16 @@ impl Place {
         let mut activity = locked(&self.occupant.activity);
         (activity.requests, activity.in_progress) = (activity.requests + 1, activity.in_progress + 1);
         InProgress(self.clone())
+    }
+
+    /// The request that this allows is in progress while the return value lives, and until the next request.
+    pub fn grant(&self, grant: Grant) -> Arc<Grant> {
+        let grant = Arc::new(grant);
+        let mut grants = locked(&self.occupant.grants);
+        grants.retain(|other| other.strong_count() > 0);
+        grants.push(Arc::downgrade(&grant));
+        *locked(&self.occupant.newest_grant) = Some(grant.clone());
+        grant
     }
 
     /// What waits in the server for one response of this connection; `None` if the connection's address has too many

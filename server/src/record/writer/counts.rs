@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 
 use clearway_proto::v1;
 
@@ -15,6 +16,10 @@ pub struct IncompleteRecordingError {
     /// The failure that made it incomplete.
     pub reason: String,
 }
+
+/// Longest time between two signs of life of a recorder that does not hang. Ours: it looks for messages twenty times a
+/// second, and a sync that takes longer is an alarm of its own.
+const SILENT_MAX: Duration = Duration::from_secs(2);
 
 /// What the recorder does.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -49,7 +54,7 @@ struct TopicCounters {
 }
 
 /// The counts of one recorder. Topics are numbered: of each vehicle the journal, then its layers.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct RecorderCounts {
     topics: Vec<TopicCounters>,
     /// The index of each vehicle's first topic.
@@ -58,7 +63,21 @@ pub struct RecorderCounts {
     /// By vehicle: number of events that are on the disk for certain.
     durable: Vec<AtomicU64>,
     is_late: AtomicBool,
+    started: Instant,
+    /// Time of the newest sign of life of the recorder's thread, in ms after `started`.
+    beat_ms: AtomicU64,
+    has_ended: AtomicBool,
+    store: StoreCounters,
     changing: Mutex<Changing>,
+}
+
+/// Parts that the long-term store has confirmed, those that wait for it, attempts that failed, and why the newest did.
+#[derive(Debug, Default)]
+struct StoreCounters {
+    confirmed: AtomicU64,
+    waiting: AtomicU64,
+    failures: AtomicU64,
+    problem: Mutex<String>,
 }
 
 /// What changes seldom.
@@ -75,7 +94,18 @@ struct Changing {
 impl RecorderCounts {
     /// Counts of a recorder of these vehicles, with the layers of their maps.
     pub fn new(vehicles: &[(Arc<str>, Vec<&'static str>)]) -> Self {
-        let mut counts = Self::default();
+        let mut counts = Self {
+            topics: Vec::new(),
+            first_topics: Vec::new(),
+            vehicles: Vec::new(),
+            durable: Vec::new(),
+            is_late: AtomicBool::new(false),
+            started: Instant::now(),
+            beat_ms: AtomicU64::new(0),
+            has_ended: AtomicBool::new(false),
+            store: StoreCounters::default(),
+            changing: Mutex::default(),
+        };
         for (vehicle, layers) in vehicles {
             counts.first_topics.push(counts.topics.len());
             counts.vehicles.push(vehicle.clone());
@@ -123,6 +153,24 @@ impl RecorderCounts {
         self.durable[vehicle].store(events, Ordering::Release);
     }
 
+    /// Notes that the recorder's thread is at work, or waits for messages.
+    pub(super) fn beat(&self) {
+        let ms = u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX);
+        self.beat_ms.store(ms, Ordering::Relaxed);
+    }
+
+    /// Notes that the recorder has ended in order: its silence means nothing.
+    pub(super) fn set_ended(&self) {
+        self.has_ended.store(true, Ordering::Relaxed);
+    }
+
+    /// How long the recorder's thread has been silent, if that is too long: it waits for the disk, or has stopped.
+    fn hung(&self) -> Option<Duration> {
+        let beat = Duration::from_millis(self.beat_ms.load(Ordering::Relaxed));
+        let silent = self.started.elapsed().saturating_sub(beat);
+        (silent > SILENT_MAX && !self.has_ended.load(Ordering::Relaxed)).then_some(silent)
+    }
+
     /// Notes that the disk takes much longer than it should, or that it no longer does.
     pub(super) fn set_late(&self, is_late: bool) {
         self.is_late.store(is_late, Ordering::Relaxed);
@@ -145,6 +193,27 @@ impl RecorderCounts {
         changing.failure.get_or_insert_with(|| reason.to_owned());
     }
 
+    /// Notes how many finished parts the store has not confirmed.
+    pub(crate) fn set_waiting_for_store(&self, parts: u64) {
+        self.store.waiting.store(parts, Ordering::Relaxed);
+    }
+
+    /// Counts a part that the store has confirmed; `waiting` are left.
+    pub(crate) fn add_confirmed(&self, waiting: u64) {
+        self.store.confirmed.fetch_add(1, Ordering::Relaxed);
+        self.set_waiting_for_store(waiting);
+    }
+
+    /// Counts an attempt to store a part that failed.
+    pub(crate) fn add_store_failure(&self) {
+        self.store.failures.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Notes why the store has not confirmed a part; empty: nothing is wrong.
+    pub(crate) fn set_store_problem(&self, problem: String) {
+        *locked(&self.store.problem) = problem;
+    }
+
     /// The first failure of the disk; `None` without one.
     pub fn stop_reason(&self) -> Option<String> {
         locked(&self.changing).failure.clone()
@@ -154,9 +223,10 @@ impl RecorderCounts {
     pub fn problem(&self) -> Option<String> {
         let changing = locked(&self.changing).clone();
         let lost = self.lost();
+        let hung = self.hung().map(|silent| format!("the disk has not answered for {} s", silent.as_secs()));
         let late = || self.is_late.load(Ordering::Relaxed).then(|| "the disk is too slow".to_owned());
         let lost = || (lost > 0).then(|| format!("{lost} events and maps are lost to the recording"));
-        changing.reason.or_else(late).or_else(lost)
+        changing.reason.or(hung).or_else(late).or_else(lost)
     }
 
     /// Number of events and maps that the recording lacks, because its queue was full or its disk failed. A map counts
@@ -212,6 +282,10 @@ impl RecorderCounts {
             durable_events: durable
                 .map(|(vehicle, events)| (vehicle.to_string(), events.load(Ordering::Acquire)))
                 .collect::<BTreeMap<_, _>>(),
+            store_confirmed: self.store.confirmed.load(Ordering::Relaxed),
+            store_waiting: self.store.waiting.load(Ordering::Relaxed),
+            store_failures: self.store.failures.load(Ordering::Relaxed),
+            store_problem: locked(&self.store.problem).clone(),
         }
     }
 }

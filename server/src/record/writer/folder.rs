@@ -79,6 +79,8 @@ pub struct Folder {
     replaces: bool,
     keep_bytes: Option<u64>,
     keep_time: Option<Duration>,
+    saved_bytes: Option<u64>,
+    awaits_store: bool,
 }
 
 impl Folder {
@@ -87,7 +89,10 @@ impl Folder {
     /// # Errors
     /// [`io::Error`] if the file exists and must not be replaced, or if its folder cannot be created.
     pub fn open(options: &Options) -> io::Result<Self> {
-        let folder = Self::of(options);
+        let mut folder = Self::of(options);
+        if options.is_numbered {
+            folder.file = next_free_name(&folder.file);
+        }
         fs::create_dir_all(folder.parent())?;
         if !folder.replaces && is_taken(&folder.file) {
             return Err(ErrorKind::AlreadyExists.into());
@@ -101,11 +106,46 @@ impl Folder {
         let keep_time = Some(Duration::from_secs(options.keep_hours * 3600)).filter(|time| !time.is_zero());
         let family = if options.family.as_os_str().is_empty() { &options.file } else { &options.family };
         let (file, family) = (options.file.clone(), family.clone());
-        Self { file, family, replaces: options.replaces, keep_bytes, keep_time }
+        let saved_bytes = Some(options.saved_mb << 20).filter(|bytes| *bytes > 0);
+        Self {
+            file,
+            family,
+            replaces: options.replaces,
+            keep_bytes,
+            keep_time,
+            saved_bytes,
+            awaits_store: options.awaits_store,
+        }
     }
 
     fn parent(&self) -> &Path {
         self.file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+    }
+
+    /// The folder of the saves.
+    fn saved(&self) -> PathBuf {
+        self.parent().join("saved")
+    }
+
+    /// Deletes the oldest saves beyond the configured length, but never the newest. Their names begin with their time.
+    fn delete_old_saves(&self) {
+        let Some(keep) = self.saved_bytes else { return };
+        let folders = |of: &Path| fs::read_dir(of).into_iter().flatten().filter_map(Result::ok);
+        let length_of = |save: &Path| folders(save).filter_map(|file| Some(file.metadata().ok()?.len())).sum::<u64>();
+        let mut saves: Vec<_> = folders(&self.saved()).map(|entry| entry.path()).collect();
+        saves.sort();
+        let mut bytes: u64 = saves.iter().map(|save| length_of(save)).sum();
+        saves.pop();
+        for save in saves.into_iter().take_while(|save| {
+            let is_over = bytes > keep;
+            bytes -= if is_over { length_of(save) } else { 0 };
+            is_over
+        }) {
+            match fs::remove_dir_all(&save) {
+                Ok(()) => tracing::info!(save = %save.display(), "deleted an old save of the recording"),
+                Err(error) => tracing::warn!(save = %save.display(), %error, "an old save cannot be deleted"),
+            }
+        }
     }
 
     /// The path of a whole part.
@@ -183,7 +223,7 @@ impl Files for Folder {
     }
 
     fn keep(&mut self, parts: &[u64], name: &str) -> io::Result<Vec<PathBuf>> {
-        let folder = self.parent().join("saved").join(name);
+        let folder = self.saved().join(name);
         fs::create_dir_all(&folder)?;
         let mut links = Vec::new();
         for part in parts {
@@ -199,6 +239,7 @@ impl Files for Folder {
         for synced in [&*folder, folder.parent().unwrap_or(&folder), self.parent()] {
             File::open(synced)?.sync_all()?;
         }
+        self.delete_old_saves();
         Ok(links)
     }
 
@@ -211,18 +252,28 @@ impl Files for Folder {
         for (path, length, modified) in parts {
             let is_over = self.keep_bytes.is_some_and(|keep| bytes > keep);
             let is_old = self.keep_time.is_some_and(|keep| modified.elapsed().is_ok_and(|age| age > keep));
-            if !is_over && !is_old {
+            let confirmation = confirmation_of(&path);
+            if (!is_over && !is_old) || (self.awaits_store && !confirmation.exists()) {
                 continue;
             }
             match fs::remove_file(&path) {
                 Ok(()) => {
                     bytes -= length;
+                    // Of a part that is not there it means nothing.
+                    let _ = fs::remove_file(confirmation);
                     tracing::info!(file = %path.display(), is_over, is_old, "deleted an old part of the recording");
                 }
                 Err(error) => tracing::warn!(file = %path.display(), %error, "an old part cannot be deleted"),
             }
         }
     }
+}
+
+/// The file beside a part that says that the long-term store has confirmed it.
+pub fn confirmation_of(part: &Path) -> PathBuf {
+    let mut name = part.as_os_str().to_owned();
+    name.push(".confirmed");
+    name.into()
 }
 
 /// Renames a file unless the new name exists: a link cannot replace a file.
@@ -351,6 +402,28 @@ mod tests {
         assert_eq!(left, [false, false, true, true], "two parts of 400 KiB fit into 1 MiB");
         assert!(saved.len() == 2 && saved.iter().all(|link| link.metadata().unwrap().len() == 400 << 10));
         assert!(at("car2.mcap").exists(), "a file of another name is not a part");
+    }
+
+    #[test]
+    fn the_oldest_saves_are_deleted_beyond_the_configured_length_and_the_newest_stays() {
+        let temporary = tempfile::tempdir().unwrap();
+        let options = Options { file: temporary.path().join("car.mcap"), saved_mb: 1, ..Options::default() };
+        let mut folder = Folder::open(&options).unwrap();
+        fs::write(&options.file, vec![0; 400 << 10]).unwrap();
+        let saves = || {
+            let names = fs::read_dir(temporary.path().join("saved")).unwrap();
+            let mut names: Vec<_> = names.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+            names.sort();
+            names
+        };
+        for name in ["1-a", "2-b", "3-c", "4-d"] {
+            folder.keep(&[1], name).unwrap();
+        }
+        assert_eq!(saves(), ["3-c", "4-d"], "each has 400 KiB");
+        fs::write(&options.file, vec![0; 2 << 20]).unwrap();
+        folder.keep(&[1], "5-e").unwrap();
+        assert_eq!(saves(), ["5-e"], "the newest stays, however long it is");
+        assert!(options.file.exists());
     }
 
     #[test]

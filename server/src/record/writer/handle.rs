@@ -7,7 +7,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{SyncSender, TrySendError};
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::time::{Duration, Instant};
 
 use clearway_lidar::calibration::Calibration;
@@ -15,7 +15,9 @@ use clearway_mapping::config::VehicleConfig;
 use clearway_mapping::event::{Body, Event};
 use clearway_mapping::pipeline::{Handover, Pipeline};
 
+use super::super::mcap_file::Header;
 use super::counts::RecorderCounts;
+use crate::config::Recorder as Options;
 use crate::encode::EncodedMap;
 
 /// Greatest difference of the stamps of the newest maps of both pipelines at a handover, ns. Ours: far below the period
@@ -42,6 +44,28 @@ pub(super) enum Item {
 
 /// The part that the handles are to record, shared by the writer and its handles; 0: none.
 pub(super) type WantedPart = Arc<AtomicU64>;
+
+/// The writer's end of the queue, and what it shares with the handles.
+pub(super) struct Link {
+    pub items: Receiver<Item>,
+    pub counts: Arc<RecorderCounts>,
+    pub wanted: WantedPart,
+    pub options: Options,
+    pub header: Header,
+    pub waits: bool,
+}
+
+/// The queue of a recording, with a handle for each vehicle of the header. What the handles send belongs to part 1.
+pub(super) fn link(options: &Options, header: &Header, waits: bool) -> (Link, Vec<RecordingHandle>) {
+    let (queue, items) = sync_channel(options.queue);
+    let counts = Arc::new(RecorderCounts::new(&header.vehicles));
+    let wanted = Arc::new(AtomicU64::new(1));
+    let warm_up = Duration::from_millis(options.warm_up_ms);
+    let handle = |vehicle| RecordingHandle::new(vehicle, queue.clone(), counts.clone(), waits, wanted.clone(), warm_up);
+    let handles = (0..header.vehicles.len()).map(handle).collect();
+    let (options, header) = (options.clone(), header.clone());
+    (Link { items, counts, wanted, options, header, waits }, handles)
+}
 
 /// A new pipeline that processes events beside the vehicle's own.
 struct WarmUp {

@@ -12,8 +12,9 @@
 //! full or the disk fails, maps are still computed and served; what the recording lacks is counted by topic, in the
 //! status and in the recording, and a keyframe lets the maps after it be verified again.
 
+use std::io;
 use std::sync::Arc;
-use std::sync::mpsc::channel;
+use std::sync::mpsc::{RecvTimeoutError, SendError, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -29,10 +30,13 @@ mod recording;
 
 pub use control::{Command, ControlError, RecorderControl};
 pub use counts::{IncompleteRecordingError, RecorderCounts, RecorderState};
-pub use folder::{Files, Folder, RecordError, is_same_file, next_free_name, parts_of, recording_path};
+pub use folder::{Files, Folder, RecordError, confirmation_of, is_same_file, next_free_name, parts_of, recording_path};
 pub use handle::RecordingHandle;
 pub use recording::RecordingWriter;
 
+/// Longest wait for the disk at the start of a live recording; after it the server starts, and the recorder goes on
+/// when the disk answers. Ours: a disk that works creates a file in milliseconds.
+const START_TIME_MAX: Duration = Duration::from_millis(500);
 /// Longest wait for the disk at the end of a live recording. Ours: a process supervisor kills after ten seconds.
 const FINISH_TIME_MAX: Duration = Duration::from_secs(5);
 /// Interval at which the end of the recorder's thread is looked for.
@@ -47,21 +51,55 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Creates the file, writes the header and starts the thread. Returns a handle for each vehicle, in the order of
-    /// the header. With `waits` a full queue delays its sender and loses nothing: right for files, wrong for live data.
+    /// Starts the thread, which creates the file and writes the header. Returns a handle for each vehicle, in the order
+    /// of the header. With `waits` a full queue delays its sender and loses nothing: right for files, wrong for live
+    /// data. A live recording does not wait for a disk that hangs: events and maps wait in the queue.
     ///
     /// # Errors
     /// [`RecordError::Create`] if the file exists or it or the thread cannot be created, [`RecordError::Write`] if the
     /// header cannot be written.
     pub fn start(options: &Options, header: &Header, waits: bool) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
+        let of_folder = options.clone();
+        Self::start_in(move || Folder::open(&of_folder), options, header, waits)
+    }
+
+    /// As [`Recorder::start`], to the files that `open` opens.
+    fn start_in<F: Files + 'static>(
+        open: impl FnOnce() -> io::Result<F> + Send + 'static,
+        options: &Options,
+        header: &Header,
+        waits: bool,
+    ) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
         let path = options.file.clone();
-        let create = |source| RecordError::Create { file: path.clone(), source: advised(&path, source) };
-        let folder = Folder::open(options).map_err(create)?;
-        let (writer, handles) = RecordingWriter::new(folder, options, header, waits, Instant::now())?;
+        let create = move |source| RecordError::Create { file: path.clone(), source: advised(&path, source) };
+        let (link, handles) = handle::link(options, header, waits);
+        let counts = link.counts.clone();
         let (requests, received) = channel();
-        let control = RecorderControl { requests, counts: writer.counts(), options: options.clone() };
-        let thread = std::thread::Builder::new().name("recorder".into());
-        let thread = thread.spawn(move || writer.run(&received)).map_err(create)?;
+        let (begun, has_begun) = channel();
+        let control = RecorderControl { requests, counts: counts.clone(), options: options.clone() };
+        let failed = create.clone();
+        let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
+            let writer = open().map_err(failed);
+            let writer = writer.and_then(|files| RecordingWriter::begin(files, link, Instant::now()));
+            let (outcome, writer) = writer.map_or_else(|error| (Err(error), None), |writer| (Ok(()), Some(writer)));
+            // The start waits no longer if the disk was late; then its failure is in the status.
+            if let Err(SendError(Err(error))) = begun.send(outcome) {
+                counts.set_failed(&error.to_string());
+                tracing::error!(%error, "nothing is recorded; maps are still served");
+            }
+            writer.into_iter().for_each(|writer| writer.run(&received));
+        });
+        let thread = thread.map_err(&create)?;
+        let start_time_max = if waits { Duration::MAX } else { START_TIME_MAX };
+        match has_begun.recv_timeout(start_time_max) {
+            Ok(outcome) => outcome?,
+            Err(RecvTimeoutError::Timeout) => {
+                tracing::error!(file = %options.file.display(), "the disk does not answer; maps are served meanwhile");
+            }
+            Err(RecvTimeoutError::Disconnected) => {
+                return Err(create(io::Error::other("the recorder's thread panicked")));
+            }
+        }
         Ok((Self { control, thread, waits }, handles))
     }
 
@@ -98,12 +136,57 @@ impl Recorder {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clearway_mapping::event::Event;
 
     #[test]
     fn a_file_that_cannot_be_created_is_named() {
         let options = Options { file: "/proc/no/such.mcap".into(), ..Options::default() };
         let error = Recorder::start(&options, &Header::default(), false).map(|_| ()).unwrap_err().to_string();
         assert!(error.contains("/proc/no"), "{error}");
+    }
+
+    #[test]
+    fn a_disk_that_hangs_at_the_start_delays_nothing_and_gets_everything_when_it_answers() {
+        let temporary = tempfile::tempdir().unwrap();
+        let options = Options { file: temporary.path().join("car.mcap"), ..Options::default() };
+        let header = Header { vehicles: vec![("car".into(), vec!["speed"])], ..Header::default() };
+        let (answers, is_answered) = channel();
+        let of_folder = options.clone();
+        let hanging = move || {
+            is_answered.recv().unwrap();
+            Folder::open(&of_folder)
+        };
+        // Returns although the disk does not answer.
+        let (recorder, mut handles) = Recorder::start_in(hanging, &options, &header, false).unwrap();
+        for sequence in 0..100 {
+            let body = clearway_mapping::event::Body::End;
+            handles[0].record_event(&Event { sequence, arrival_ns: 1 + sequence as i64, source: 0, body });
+        }
+        let counts = recorder.counts();
+        while counts.problem().is_none() {
+            std::thread::yield_now();
+        }
+        assert!(counts.problem().unwrap().contains("the disk has not answered for"), "{:?}", counts.problem());
+        answers.send(()).unwrap();
+        drop(handles);
+        recorder.finish().unwrap();
+        assert_eq!((counts.durable_events("car"), counts.lost(), counts.problem()), (100, 0, None));
+        assert!(options.file.exists());
+    }
+
+    #[test]
+    fn a_disk_that_fails_after_the_start_is_named_in_the_status() {
+        let options = Options { file: "late.mcap".into(), ..Options::default() };
+        let (answers, is_answered) = channel();
+        let hanging = move || -> io::Result<Folder> {
+            is_answered.recv().unwrap();
+            Err(io::Error::other("pulled out"))
+        };
+        let (recorder, handles) = Recorder::start_in(hanging, &options, &Header::default(), false).unwrap();
+        answers.send(()).unwrap();
+        drop(handles);
+        let error = recorder.finish().unwrap_err().to_string();
+        assert!(error.contains("late.mcap") && error.contains("pulled out"), "{error}");
     }
 
     #[test]

@@ -6,8 +6,8 @@
 
 use std::collections::VecDeque;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant, SystemTime};
 
 use clearway_mapping::event::Event;
@@ -18,7 +18,7 @@ use super::super::mcap_file::{Disk, Header, McapFile};
 use super::control::{Command, Request};
 use super::counts::RecorderCounts;
 use super::folder::{Files, RecordError};
-use super::handle::{Item, RecordingHandle, WantedPart};
+use super::handle::{Item, Link, RecordingHandle, WantedPart, link};
 use crate::config::Recorder as Options;
 use crate::encode::EncodedMap;
 
@@ -90,33 +90,33 @@ impl<F: Files> RecordingWriter<F> {
         waits: bool,
         now: Instant,
     ) -> Result<(Self, Vec<RecordingHandle>), RecordError> {
-        let (queue, items) = sync_channel(options.queue);
-        let counts = Arc::new(RecorderCounts::new(&header.vehicles));
-        let wanted = Arc::new(AtomicU64::new(0));
+        let (link, handles) = link(options, header, waits);
+        Ok((Self::begin(files, link, now)?, handles))
+    }
+
+    /// As [`RecordingWriter::new`], for handles that exist.
+    pub(super) fn begin(files: F, link: Link, now: Instant) -> Result<Self, RecordError> {
+        let Link { items, counts, wanted, options, header, waits } = link;
         let mut writer = Self {
             files,
-            options: options.clone(),
-            header: header.clone(),
             parts: VecDeque::new(),
             vehicles: vec![VehicleState::default(); header.vehicles.len()],
+            options,
+            header,
             items,
-            wanted: wanted.clone(),
+            wanted,
             newest_part: 0,
             closed: VecDeque::new(),
             sync_at: None,
             retry_at: None,
             is_stopped: false,
             waits,
-            counts: counts.clone(),
+            counts,
             reason: String::new(),
         };
         writer.begin_part(now)?;
         writer.vehicles.iter_mut().for_each(|vehicle| vehicle.part = Some(1));
-        let warm_up = Duration::from_millis(options.warm_up_ms);
-        let handle =
-            |vehicle| RecordingHandle::new(vehicle, queue.clone(), counts.clone(), waits, wanted.clone(), warm_up);
-        let handles = (0..header.vehicles.len()).map(handle).collect();
-        Ok((writer, handles))
+        Ok(writer)
     }
 
     /// The counts of the recording.
@@ -127,6 +127,7 @@ impl<F: Files> RecordingWriter<F> {
     /// Writes events and maps, and answers requests, until all handles are dropped.
     pub(super) fn run(mut self, requests: &std::sync::mpsc::Receiver<Request>) {
         loop {
+            self.counts.beat();
             match self.items.recv_timeout(POLL_INTERVAL) {
                 Ok(item) => self.write(item, Instant::now()),
                 Err(RecvTimeoutError::Timeout) => {}
@@ -144,6 +145,7 @@ impl<F: Files> RecordingWriter<F> {
 
     /// Writes the first queued item, if there is one, at the time `now`. Returns true if there was one.
     pub fn write_next(&mut self, now: Instant) -> bool {
+        self.counts.beat();
         let item = self.items.try_recv();
         let is_item = item.is_ok();
         if let Ok(item) = item {
@@ -162,6 +164,7 @@ impl<F: Files> RecordingWriter<F> {
         while let Some(part) = self.parts.pop_front() {
             self.close(part, Instant::now());
         }
+        self.counts.set_ended();
     }
 
     /// Does what has become due.

@@ -1,0 +1,184 @@
+//! The recorder when something goes wrong: the last seconds are saved by a rule and on request, and a disk that fails
+//! costs what it must and no more.
+
+mod fixture;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant, SystemTime};
+
+use clearway::config::{Recorder, SaveRule};
+use clearway::record::mcap_file::{Disk, Header};
+use clearway::record::reader::{RecordedMessage, RecordingReader};
+use clearway::record::verify::verify;
+use clearway::record::writer::{Files, RecordingWriter};
+use clearway::server::{Running, Server, Setup};
+use clearway_mapping::event::{Body, Event};
+use clearway_mapping::pipeline::Pipeline;
+use clearway_proto::v1;
+use clearway_proto::v1::recording_service_client::RecordingServiceClient;
+use fixture::{Driving, config, until, within};
+use tonic::transport::Channel;
+
+async fn service(running: &Running) -> RecordingServiceClient<Channel> {
+    let address = format!("http://{}", running.grpc.expect("gRPC is served"));
+    RecordingServiceClient::connect(address).await.expect("gRPC answers")
+}
+
+/// The sequences of the events of a recording.
+fn events(file: &Path) -> BTreeSet<u64> {
+    let messages = RecordingReader::open(file).unwrap().filter_map(|message| match message.unwrap() {
+        RecordedMessage::Event { event, .. } => Some(event.sequence),
+        _ => None,
+    });
+    messages.collect()
+}
+
+/// The names of the saves beside a recording.
+fn saves(folder: &Path) -> Vec<String> {
+    let entries = std::fs::read_dir(folder.join("saved")).into_iter().flatten();
+    entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect()
+}
+
+/// Milliseconds since the Unix epoch.
+fn now_ms() -> u128 {
+    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap().as_millis()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn the_last_seconds_are_saved_when_the_maps_become_stale_and_on_request() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = config();
+    config.recorder.file = folder.path().join("car.mcap");
+    (config.recorder.warm_up_ms, config.recorder.save_on) = (500, vec![SaveRule::MapStale]);
+    // So that a busy test machine makes no map stale while the vehicle drives.
+    config.vehicles[0].maps.valid_ms = 5000;
+    let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
+    let driving = Driving::to(&running);
+    let status = running.vehicles.0[0].status.clone();
+    until("ten maps", || status.snapshot().maps >= 10).await;
+    let asked_ms = now_ms();
+    let save = v1::SaveRecordingRequest { seconds: 5, reason: "button".into() };
+    let saved = service(&running).await.save(save).await.unwrap().into_inner().files;
+    println!("a request is answered, with its files on the disk, after {} ms", now_ms() - asked_ms);
+    assert!(saves(folder.path()).len() == 1 && saved[0].contains("button"), "{saved:?}");
+    driving.halt();
+    let is_stale = |name: &String| name.ends_with("map-stale");
+    until("the rule saves", || saves(folder.path()).iter().any(is_stale)).await;
+    let stale_ms = status.snapshot().newest_capture_end_ns as u128 / 1_000_000 + 5000;
+    let save = saves(folder.path()).into_iter().find(is_stale).expect("it was just there");
+    let saved_ms: u128 = save.split('-').next().unwrap().parse().unwrap();
+    println!("saved {} ms after the newest map had become stale", saved_ms - stale_ms);
+    within("shutdown", running.shutdown()).await.unwrap();
+    for file in std::fs::read_dir(folder.path().join("saved").join(save)).unwrap() {
+        let report = verify(&file.unwrap().path()).unwrap();
+        assert!(report.is_good() && report.is_closed, "{report:?}");
+    }
+}
+
+/// A disk in memory that returns an error to every call while it is `failing`. Its files are whole as they are.
+#[derive(Clone, Default)]
+struct FailingDisk {
+    failing: Arc<AtomicBool>,
+    files: Arc<Mutex<BTreeMap<u64, Vec<u8>>>>,
+}
+
+impl FailingDisk {
+    fn check(&self) -> std::io::Result<()> {
+        let fails = self.failing.load(Ordering::Relaxed);
+        if fails { Err(std::io::Error::other("the disk fails")) } else { Ok(()) }
+    }
+}
+
+/// One of its files.
+struct FailingFile(FailingDisk, u64);
+
+impl Files for FailingDisk {
+    type File = FailingFile;
+
+    fn create(&mut self, part: u64) -> std::io::Result<FailingFile> {
+        self.check()?;
+        self.files.lock().unwrap().insert(part, Vec::new());
+        Ok(FailingFile(self.clone(), part))
+    }
+
+    fn complete(&mut self, _: u64) -> std::io::Result<()> {
+        self.check()
+    }
+
+    fn path(&self, part: u64) -> PathBuf {
+        format!("part-{part}").into()
+    }
+}
+
+impl Write for FailingFile {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.check()?;
+        self.0.files.lock().unwrap().get_mut(&self.1).unwrap().extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Disk for FailingFile {
+    fn sync(&mut self) -> std::io::Result<()> {
+        self.0.check()
+    }
+}
+
+#[test]
+fn a_disk_that_fails_for_a_minute_costs_that_minute_and_a_warm_up_and_each_loss_is_counted() {
+    let (config, disk) = (config(), FailingDisk::default());
+    let core = config.vehicles[0].core();
+    let options = Recorder { warm_up_ms: 2000, ..Recorder::default() };
+    let header = Header { vehicles: vec![("car".into(), vec![])], config: config.to_toml(), ..Header::default() };
+    let began = Instant::now();
+    let (mut writer, mut handles) = RecordingWriter::new(disk.clone(), &options, &header, false, began).unwrap();
+    let (counts, mut pipeline) = (writer.counts(), Pipeline::new(&core, vec![None]).unwrap());
+    let handle = &mut handles[0];
+    handle.set_config(core, vec![None]);
+    let mut durable = 0;
+    // Ten events a second for two minutes; the disk fails from the 30th second to the 90th.
+    for sequence in 0..1200 {
+        let now = Duration::from_millis(100 * sequence);
+        disk.failing.store((300..900).contains(&sequence), Ordering::Relaxed);
+        if sequence == 300 {
+            durable = counts.durable_events("car");
+        }
+        let arrival_ns = 1_700_000_000_000_000_000 + now.as_nanos() as i64;
+        let event = Event { sequence, arrival_ns, source: 0, body: Body::Datagram(vec![7; 100].into()) };
+        handle.record_event(&event);
+        let _ = pipeline.step(&event);
+        handle.keep_up(&event, &mut pipeline);
+        while writer.write_next(began + now) {}
+    }
+    drop(handles);
+    writer.finish();
+    let status = counts.to_proto();
+    let journal = &status.topics[0];
+    assert_eq!((journal.offered, journal.written + journal.dropped), (1200, 1200), "{journal:?}");
+    // A second before the failure that was not synced, the minute, a second until the next attempt, and what was
+    // recorded for the warm-up alone is there twice.
+    assert!((600..=640).contains(&journal.dropped), "{journal:?}");
+    assert!(durable >= 285, "{durable} of 300");
+    let folder = tempfile::tempdir().unwrap();
+    let mut recorded = BTreeSet::new();
+    for (part, bytes) in &*disk.files.lock().unwrap() {
+        let file = folder.path().join(format!("{part}.mcap"));
+        std::fs::write(&file, bytes).unwrap();
+        if bytes.len() > 100 {
+            recorded.extend(events(&file));
+        }
+    }
+    let missing = (0..1200).filter(|sequence| !recorded.contains(sequence)).collect::<Vec<u64>>();
+    assert!((0..durable).all(|sequence| recorded.contains(&sequence)), "no durable event is lost: {missing:?}");
+    let (first, last) = (missing[0], missing[missing.len() - 1]);
+    assert!(first >= durable && (890..915).contains(&last), "missing from {first} to {last}");
+    println!("lost {} of 1200 events: {first} to {last}; the disk failed from 300 to 899", missing.len());
+}
