@@ -11,7 +11,7 @@ use std::time::Duration;
 use axum::Router;
 use axum::extract::ws::{Message as Frame, WebSocket, WebSocketUpgrade};
 use axum::extract::{Extension, Query, State};
-use axum::http::{StatusCode, Uri, header};
+use axum::http::{HeaderMap, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use bytes::Bytes;
@@ -27,7 +27,7 @@ use super::page_replay::{PageReplay, replay_changed, replay_json};
 use super::served::{Served, Vehicles};
 use crate::clock::now_ns;
 use crate::replay::ReplayHandle;
-use crate::status::{Reader, Transport, prometheus};
+use crate::status::{Format, Reader, Transport, prometheus};
 
 /// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
@@ -111,12 +111,18 @@ fn unavailable(text: String) -> Response {
     (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
 }
 
-async fn metrics(State(shown): State<Shown>, Extension(caller): Extension<Caller>) -> impl IntoResponse {
-    let kind = [(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")];
+async fn metrics(
+    State(shown): State<Shown>,
+    Extension(caller): Extension<Caller>,
+    headers: HeaderMap,
+) -> impl IntoResponse {
+    let accept = headers.get(header::ACCEPT).and_then(|accept| accept.to_str().ok()).unwrap_or_default();
+    let format = Format::accepted(accept);
+    let kind = [(header::CONTENT_TYPE, format.content_type())];
     let mut statuses = shown.vehicles.statuses();
     statuses.retain(|status| caller.may_reach(&status.name));
-    let listeners: Vec<_> = shown.listeners.iter().map(|(name, listener)| (*name, listener.counts())).collect();
-    (kind, prometheus(&statuses, &listeners))
+    let listeners = shown.listeners.iter().map(|(name, listener)| (*name, listener.counts())).collect();
+    (kind, prometheus(&statuses, listeners, format))
 }
 
 #[derive(serde::Deserialize)]

@@ -100,6 +100,7 @@ impl Running {
         let queue = queue.with_shares(vehicle.queue - vehicle.ingest.events_max(vehicle.queue), udp_sensors(vehicle));
         let layers = layer_names(&vehicle.maps);
         let status = VehicleStatus::new(name.clone(), boot_id, layers, queue.drops());
+        status.show_queue(queue.space());
         let status = Arc::new(status.with_outline(vehicle.body.as_ref()));
         let (newest, receiver) = watch::channel(None);
         let valid_ms = vehicle.maps.valid_ms;

@@ -10,6 +10,8 @@
 //! | `message` | a snapshot and a state -> message, JSON |
 //! | `json` | a vehicle's and a sensor's state and counts -> JSON |
 //! | `notices` | changes of the sensors -> the log, each once |
+//! | `text_format` | OpenMetrics -> Prometheus' text format |
+//! | `process` | `/proc` -> memory, files and time of this process |
 //! | `metrics` | the status of all vehicles, listeners and process -> OpenMetrics or Prometheus' text format |
 
 pub mod assess;
@@ -19,6 +21,8 @@ mod json;
 mod message;
 mod metrics;
 mod notices;
+mod process;
+mod text_format;
 pub mod transports;
 pub mod vehicle;
 pub mod window;
@@ -27,6 +31,7 @@ pub use assess::{state_changed, watch_states};
 pub use health::State;
 pub use json::{sensor_json, vehicle_json};
 pub use metrics::prometheus;
+pub use text_format::Format;
 pub use transports::{Reader, Transport};
 pub(crate) use vehicle::MadeMap;
 pub use vehicle::{Snapshot, VehicleStatus};

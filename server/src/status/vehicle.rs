@@ -15,6 +15,7 @@ use tokio::sync::watch;
 use crate::acknowledgements::Acknowledgements;
 use crate::encode::EncodedMap;
 use crate::ingest::drops::DropCounters;
+use crate::ingest::queue::QueueSpace;
 use crate::newest::NewestSweep;
 use crate::record::writer::RecorderCounts;
 use crate::subscriptions::LayerSubscriptions;
@@ -59,6 +60,7 @@ pub struct VehicleStatus {
     pub(super) outline_m: Vec<f64>,
     pub(super) drops: Arc<DropCounters>,
     pub(super) recorder: OnceLock<Arc<RecorderCounts>>,
+    queue: OnceLock<QueueSpace>,
     /// True if the events come from files, so that maps have the stamps of a recording.
     pub(super) is_from_files: AtomicBool,
     /// Other servers that serve a vehicle of this name: their names and their newest signs of life, by boot id.
@@ -201,6 +203,7 @@ impl VehicleStatus {
             outline_m: Vec::new(),
             drops,
             recorder: OnceLock::new(),
+            queue: OnceLock::new(),
             is_from_files: AtomicBool::new(false),
             claims: Mutex::default(),
             health: Mutex::default(),
@@ -238,6 +241,28 @@ impl VehicleStatus {
         if boot_id != self.boot_id.to_string() {
             locked(&self.claims).insert(boot_id.to_owned(), (server.to_owned(), Instant::now()));
         }
+    }
+
+    /// Adds the space of the vehicle's event queue; a second call changes nothing.
+    pub(crate) fn show_queue(&self, space: QueueSpace) {
+        self.queue.get_or_init(|| space);
+    }
+
+    /// The space of the vehicle's event queue, if it has one.
+    pub(super) fn queue(&self) -> Option<&QueueSpace> {
+        self.queue.get()
+    }
+
+    /// Time since the newest packet or scan of each sensor that could be read, by the sensor's name.
+    pub(super) fn packet_ages(&self) -> Vec<(String, Duration)> {
+        let (changing, now) = (locked(&self.changing), self.started.elapsed());
+        let age = |seen: &Seen| Some(now.saturating_sub(seen.read_at?));
+        changing.seen.iter().filter_map(|(name, seen)| Some((name.clone(), age(seen)?))).collect()
+    }
+
+    /// Covered share of the revolution of each sensor in the newest map.
+    pub(super) fn completeness(&self) -> Vec<(String, f32)> {
+        locked(&self.changing).states.iter().map(|state| (state.name.clone(), state.completeness)).collect()
     }
 
     /// Adds the counts of the vehicle's recorder; a second call changes nothing.
