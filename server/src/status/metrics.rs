@@ -17,6 +17,7 @@ use super::assess::Assessment;
 use super::health::State;
 use super::histogram::Histogram;
 use super::process;
+use super::reasons::{CLOSE_REASONS, OBSERVATION_REASONS, PACKET_REASONS};
 use super::text_format::{Format, to_text_format};
 use super::transports::Transport;
 use super::vehicle::{Snapshot, VehicleStatus};
@@ -27,58 +28,6 @@ type ListenerCounts = (&'static str, (usize, usize, BTreeMap<&'static str, u64>)
 
 /// The labels of one sample.
 type Labels = Vec<(&'static str, String)>;
-
-/// Reasons for which packets and scans are refused; each has a series before it occurs, so that a rate is known then.
-const PACKET_REASONS: [&str; 18] = [
-    "azimuth",
-    "block_flag",
-    "calibration",
-    "device_time",
-    "duplicate",
-    "late",
-    "length",
-    "model",
-    "nmea",
-    "no_returns",
-    "observation",
-    "scan_lengths",
-    "scan_offset",
-    "sensor",
-    "source",
-    "stamp",
-    "stamp_range",
-    "telemetry",
-];
-/// Reasons for which messages are no observations.
-const OBSERVATION_REASONS: [&str; 13] = [
-    "body",
-    "columns",
-    "message",
-    "message_length",
-    "missing",
-    "packed",
-    "packets",
-    "points",
-    "ros_frame",
-    "ros_frames",
-    "ros_kind",
-    "ros_message",
-    "stamp_ahead",
-];
-/// Reasons for which a listener refuses or closes connections and calls.
-const CLOSE_REASONS: [&str; 11] = [
-    "accept_error",
-    "calls",
-    "denied",
-    "handshake",
-    "handshake_timeout",
-    "idle",
-    "made_room",
-    "no_request",
-    "over_limit",
-    "over_limit_timeout",
-    "stalled",
-];
 
 /// The text of `/metrics`: of these vehicles, and of the TCP listeners by name.
 pub fn prometheus(vehicles: &[Arc<VehicleStatus>], listeners: Vec<ListenerCounts>, format: Format) -> String {
@@ -393,9 +342,13 @@ impl Families<'_, '_> {
         let mut family = self.encoder.encode_descriptor(counter.unwrap_or(name), help, None, kind)?;
         for (labels, value) in samples {
             let mut metric = family.encode_family(&labels)?;
-            match counter {
-                Some(_) => metric.encode_counter::<Labels, f64, f64>(&value, None)?,
-                None => metric.encode_gauge(&value)?,
+            // Whole numbers without a decimal point, as people write them.
+            let whole = (value.fract() == 0.0 && value.abs() < 1e15).then_some(value as i64);
+            match (counter, whole) {
+                (Some(_), Some(whole)) => metric.encode_counter::<Labels, u64, f64>(&whole.unsigned_abs(), None)?,
+                (Some(_), None) => metric.encode_counter::<Labels, f64, f64>(&value, None)?,
+                (None, Some(whole)) => metric.encode_gauge(&whole)?,
+                (None, None) => metric.encode_gauge(&value)?,
             }
         }
         Ok(())
@@ -447,8 +400,8 @@ mod tests {
         assert_eq!(shown.refused["source"], 2);
         assert_eq!(shown.received, shown.decoded + shown.telemetry + shown.refused.values().sum::<u64>());
         let text = text(status);
-        assert!(text.contains("clearway_packets_received_total{vehicle=\"car\"} 5.0\n"), "{text}");
-        assert!(text.contains("clearway_packets_refused_total{vehicle=\"car\",reason=\"source\"} 2.0\n"), "{text}");
+        assert!(text.contains("clearway_packets_received_total{vehicle=\"car\"} 5\n"), "{text}");
+        assert!(text.contains("clearway_packets_refused_total{vehicle=\"car\",reason=\"source\"} 2\n"), "{text}");
     }
 
     #[test]
@@ -471,9 +424,9 @@ mod tests {
         assert_eq!((message.mounts["top"].height_m, message.reference_sensor.as_str()), (-0.58, "top"));
         let text = text(status);
         for line in [
-            "clearway_sensor_elevations{vehicle=\"car\",sensor=\"top\",source=\"nominal\"} 1.0\n",
+            "clearway_sensor_elevations{vehicle=\"car\",sensor=\"top\",source=\"nominal\"} 1\n",
             "clearway_mount_height_deviation_meters{vehicle=\"car\",sensor=\"top\"} -0.58\n",
-            "clearway_mount_contradicted{vehicle=\"car\",sensor=\"top\"} 1.0\n",
+            "clearway_mount_contradicted{vehicle=\"car\",sensor=\"top\"} 1\n",
         ] {
             assert!(text.contains(line), "{text}");
         }
@@ -490,9 +443,9 @@ mod tests {
         let text = prometheus(&[status], vec![], Format::Prometheus);
         assert!(text.contains("# TYPE clearway_maps_total counter\n") && !text.contains("# EOF"), "{text}");
         for line in [
-            "clearway_packets_refused_total{vehicle=\"car\",reason=\"length\"} 0.0\n",
-            "clearway_skipped_maps_total{vehicle=\"car\",transport=\"page\"} 0.0\n",
-            "clearway_vehicle_state{vehicle=\"car\",state=\"error\"} 1.0\n",
+            "clearway_packets_refused_total{vehicle=\"car\",reason=\"length\"} 0\n",
+            "clearway_skipped_maps_total{vehicle=\"car\",transport=\"page\"} 0\n",
+            "clearway_vehicle_state{vehicle=\"car\",state=\"error\"} 1\n",
             "clearway_map_latency_seconds_count{vehicle=\"car\",stage=\"map\"} 0\n",
         ] {
             assert!(text.contains(line), "{line}{text}");

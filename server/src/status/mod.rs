@@ -10,6 +10,7 @@
 //! | `message` | a snapshot and a state -> message, JSON |
 //! | `json` | a vehicle's and a sensor's state and counts -> JSON |
 //! | `notices` | changes of the sensors -> the log, each once |
+//! | `reasons` | the reasons for which metrics exist before they occur |
 //! | `text_format` | OpenMetrics -> Prometheus' text format |
 //! | `process` | `/proc` -> memory, files and time of this process |
 //! | `metrics` | the status of all vehicles, listeners and process -> OpenMetrics or Prometheus' text format |
@@ -22,6 +23,7 @@ mod message;
 mod metrics;
 mod notices;
 mod process;
+mod reasons;
 mod text_format;
 pub mod transports;
 pub mod vehicle;

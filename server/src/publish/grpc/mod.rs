@@ -57,6 +57,8 @@ pub async fn serve<I: IngestService>(
 ) -> Result<(), tonic_reflection::server::Error> {
     let of_health = vehicles.clone();
     let (health, health_service) = tonic_health::server::health_reporter();
+    // Until the first report.
+    health.set_not_serving::<MapServiceServer<Maps>>().await;
     if ingest.is_some() {
         health.set_serving::<IngestServiceServer<I>>().await;
     }
