@@ -34,6 +34,9 @@ const RATE_MAPS: usize = 16;
 /// Longest time between two signs of life of an engine that does not hang. Ours: the largest allowed scan takes half a
 /// second, and an engine without events polls fifty times a second.
 const ENGINE_SILENT_MAX: Duration = Duration::from_secs(2);
+/// Most other servers that are remembered, and the longest name of one. Ours: people read them.
+const CLAIMS_MAX: usize = 8;
+const SERVER_NAME_MAX: usize = 64;
 /// Time without a new map after which the rates are 0.
 const RATE_AGE_MAX: Duration = Duration::from_secs(2);
 
@@ -64,7 +67,7 @@ pub struct VehicleStatus {
     /// True if the events come from files, so that maps have the stamps of a recording.
     pub(super) is_from_files: AtomicBool,
     /// Other servers that serve a vehicle of this name: their names and their newest signs of life, by boot id.
-    pub(super) claims: Mutex<BTreeMap<String, (String, Instant)>>,
+    pub(super) claims: Mutex<BTreeMap<u64, (String, Instant)>>,
     pub(super) health: Mutex<Health>,
     pub(super) health_state: watch::Sender<State>,
     engine_stopped: AtomicBool,
@@ -236,10 +239,14 @@ impl VehicleStatus {
         self.is_from_files.store(true, Ordering::Relaxed);
     }
 
-    /// Notes a sign of life of another server that serves a vehicle of this name, by the boot id of its run.
+    /// Notes a sign of life of another server that serves a vehicle of this name, by the boot id of its run. Anyone may
+    /// have sent it: of a few runs, a short printable name is kept.
     pub fn note_claim(&self, boot_id: &str, server: &str) {
-        if boot_id != self.boot_id.to_string() {
-            locked(&self.claims).insert(boot_id.to_owned(), (server.to_owned(), Instant::now()));
+        let Ok(id) = boot_id.parse::<u64>() else { return };
+        let mut claims = locked(&self.claims);
+        if id != self.boot_id && (claims.len() < CLAIMS_MAX || claims.contains_key(&id)) {
+            let name = server.chars().filter(|c| !c.is_control()).take(SERVER_NAME_MAX).collect();
+            claims.insert(id, (name, Instant::now()));
         }
     }
 
@@ -428,6 +435,19 @@ fn percentile_ms(ascending_ns: &[u64], percent: usize) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn another_server_that_claims_the_vehicle_is_named_and_a_flood_of_claims_is_bounded() {
+        let status = VehicleStatus::new("car".into(), 7, vec![], Arc::default());
+        status.note_claim("7", "itself");
+        status.note_claim("no number", "liar");
+        assert_eq!(status.assess().claimed_by, Vec::<String>::new());
+        status.note_claim("8", "b\u{1b}[2J");
+        assert_eq!(status.assess().claimed_by, ["b[2J"]);
+        (100..200).for_each(|boot_id: u64| status.note_claim(&boot_id.to_string(), &format!("{boot_id:>99}")));
+        let claimed_by = status.assess().claimed_by;
+        assert!(claimed_by.len() <= CLAIMS_MAX && claimed_by.iter().all(|name| name.len() <= SERVER_NAME_MAX));
+    }
 
     #[test]
     fn percentiles_are_nearest_ranks() {

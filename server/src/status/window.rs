@@ -117,7 +117,7 @@ mod tests {
         assert_eq!(window.map_rate_hz(now), 10.0);
         assert_eq!(window.map_bytes(now), 1000.0);
         assert_eq!(window.latency_ms(now), BTreeMap::from([("map", 4.0), ("encode", 2.0)]));
-        assert_eq!(window.map_rate_hz(ms(35_000)), 4.9, "the maps of 25.0 s and later");
+        assert_eq!(window.map_rate_hz(ms(35_000)), 5.0, "the maps of 25.0 s and later");
         assert_eq!((window.map_rate_hz(ms(60_000)), window.map_bytes(ms(60_000))), (0.0, 0.0));
         assert!(window.latency_ms(ms(60_000)).is_empty());
     }
