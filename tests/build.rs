@@ -7,6 +7,7 @@
 //! | `clearway_python` | `python3` with the modules `venv` and `ensurepip` |
 //! | `clearway_openssl` | `openssl`, with which `deploy/make-test-ca.sh` makes certificates |
 //! | `clearway_browser` | `chromium` and `chromedriver` |
+//! | `clearway_promtool` | `promtool`, which comes with Prometheus |
 //!
 //! `env!("CLEARWAY_DATA")` is the path of the recorded drives, or empty. After you install one of them,
 //! `touch tests/build.rs` makes cargo look again.
@@ -33,6 +34,7 @@ fn main() {
     println!("cargo::rustc-env=CLEARWAY_DATA={}", data.unwrap_or_default().display());
     set("clearway_python", succeeds("python3", &["-c", "import venv, ensurepip"]));
     set("clearway_openssl", succeeds("openssl", &["version"]));
+    set("clearway_promtool", succeeds("promtool", &["--version"]));
     set("clearway_browser", succeeds("chromium", &["--version"]) && succeeds("chromedriver", &["--version"]));
 }
 

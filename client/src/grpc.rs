@@ -14,8 +14,8 @@ use clearway_proto::v1::recording_service_client::RecordingServiceClient;
 use clearway_proto::v1::replay_service_client::ReplayServiceClient;
 use prost::Message;
 use tokio::sync::mpsc;
-use tokio_stream::StreamExt;
 use tokio_stream::wrappers::ReceiverStream;
+use tokio_stream::{Stream, StreamExt};
 use tonic::Status;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
 
@@ -156,6 +156,26 @@ impl Client {
     pub async fn vehicles(&self) -> Result<Vec<v1::Vehicle>, ClientError> {
         let answer = self.service.clone().list_vehicles(v1::ListVehiclesRequest {}).await;
         Ok(answer.map_err(|status| refused(&self.address, &status))?.into_inner().vehicles)
+    }
+
+    /// State of these vehicles (empty: all) once a second, and at each change of a vehicle's state. The stream ends with
+    /// an error if the connection fails.
+    ///
+    /// # Errors
+    /// [`ClientError::Unreachable`] if the connection fails, [`ClientError::Refused`] if the server refuses the call or
+    /// a vehicle is unknown.
+    pub async fn watch_status(
+        &self,
+        vehicles: &[String],
+    ) -> Result<impl Stream<Item = Result<Vec<v1::Vehicle>, ClientError>> + Unpin + use<>, ClientError> {
+        let request = v1::WatchStatusRequest { vehicles: vehicles.to_vec() };
+        let answer = self.service.clone().watch_status(request).await;
+        let updates = answer.map_err(|status| refused(&self.address, &status))?.into_inner();
+        let address = self.address.clone();
+        Ok(updates.map(move |update| match update {
+            Ok(update) => Ok(update.vehicles),
+            Err(status) => Err(refused(&address, &status)),
+        }))
     }
 
     /// Newest map of a vehicle (empty: the only one) with these layers (empty: all).

@@ -27,6 +27,7 @@ struct Script {
 #[tonic::async_trait]
 impl MapService for Script {
     type WatchStream = Pin<Box<dyn Stream<Item = Result<v1::MapUpdate, Status>> + Send>>;
+    type WatchStatusStream = futures::stream::Empty<Result<v1::WatchStatusResponse, Status>>;
 
     async fn watch(
         &self,
@@ -48,6 +49,13 @@ impl MapService for Script {
             "alpha" => Ok(Response::new(v1::MapUpdate { map: map(9, CAPTURE_END_NS), ..Default::default() })),
             other => Err(Status::not_found(format!("no vehicle {other:?}; there is alpha"))),
         }
+    }
+
+    async fn watch_status(
+        &self,
+        _: Request<v1::WatchStatusRequest>,
+    ) -> Result<Response<Self::WatchStatusStream>, Status> {
+        Err(Status::unimplemented("not called by this test"))
     }
 
     async fn list_vehicles(

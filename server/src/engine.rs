@@ -9,16 +9,19 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use clearway_mapping::error::EventError;
-use clearway_mapping::event::Event;
+use clearway_mapping::event::{EgoPose, Event};
 use clearway_mapping::pipeline::Pipeline;
+use clearway_proto::v1;
+use nalgebra::Vector3;
 use tokio::sync::watch;
 
+use crate::clock::now_ns;
 use crate::encode::{self, EncodedMap, Replayed};
 use crate::ingest::queue::QueuedEvent;
 use crate::ingest::receipt::Outcome;
 use crate::newest::Newest;
 use crate::record::writer::RecordingHandle;
-use crate::status::VehicleStatus;
+use crate::status::{MadeMap, VehicleStatus};
 
 /// Period at which an engine without events checks for new subscribers. Ours: short beside a revolution of 50 to 200
 /// ms.
@@ -92,13 +95,15 @@ impl Engine {
 
     /// Publishes the newest map once more, if there is one: after the pipeline was stepped without publishing.
     pub fn publish_newest_map(&mut self) {
-        self.publish(Instant::now());
+        self.publish(Instant::now(), None);
     }
 
     /// Copies the ledger and the sensors into the status; the thread of [`Engine::start`] does so whenever no event
     /// waits.
     pub fn update_status(&self) {
-        self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors());
+        let shift_ns = self.replayed.map_or(0, |replayed| replayed.shift_ns);
+        let pose = self.pipeline.newest_pose().map(|pose| vehicle_pose(pose, shift_ns));
+        self.status.stepped(self.pipeline.ledger(), self.pipeline.sensors(), pose);
     }
 
     /// Waits for the next event; `None` once the queue is closed and empty. Updates the status before it waits.
@@ -130,7 +135,7 @@ impl Engine {
         let started = Instant::now();
         self.update_layers();
         if self.pipeline.remake_newest_map().is_some() {
-            self.publish(started);
+            self.publish(started, None);
         }
     }
 
@@ -138,11 +143,11 @@ impl Engine {
         if let Some(recording) = &mut self.recording {
             recording.record_event(event);
         }
-        let started = Instant::now();
+        let (started, waited) = (Instant::now(), duration(now_ns().saturating_sub(event.arrival_ns)));
         self.update_layers();
         let outcome = self.pipeline.step(event).map(|map| map.is_some());
         match &outcome {
-            Ok(true) => self.publish(started),
+            Ok(true) => self.publish(started, waited),
             Ok(false) => {}
             Err(error) => {
                 tracing::debug!(vehicle = %self.status.name, sequence = event.sequence, %error, "refused");
@@ -154,8 +159,10 @@ impl Engine {
         outcome.map(|_| ())
     }
 
-    /// Encodes the newest map and gives it to readers, recorder and observer.
-    fn publish(&mut self, started: Instant) {
+    /// Encodes the newest map and gives it to readers, recorder and observer. Its computation has `started` then, after
+    /// its event had `waited`, if that is known.
+    fn publish(&mut self, started: Instant, waited: Option<Duration>) {
+        let computed = started.elapsed();
         let Some(map) = self.pipeline.newest_map() else { return };
         // Without any configured layer a revolution makes no map; without any subscriber it makes a header.
         let encoded = (!self.status.layers.is_empty()).then(|| {
@@ -163,7 +170,8 @@ impl Engine {
             let (name, boot_id) = (self.status.name.clone(), self.status.boot_id);
             (Arc::new(EncodedMap::replayed(map, name, boot_id, self.valid_ms, self.replayed)), states)
         });
-        let latency = started.elapsed();
+        let encoding = started.elapsed().saturating_sub(computed);
+        let speed_m_s = map.speed_mps;
         // The points come before the map, so that a reader of the map finds its points.
         if self.status.sweeps.receiver_count() > 0 {
             let sweep = self.pipeline.newest_sweep().clone();
@@ -173,7 +181,23 @@ impl Engine {
         // The status comes before the map too, so that a reader of the map finds it counted.
         self.update_status();
         if let Some((encoded, states)) = encoded {
-            self.status.mapped(&encoded, states, latency);
+            let total = duration(now_ns().saturating_sub(encoded.capture_end_ns));
+            let is_shifted = self.replayed.is_some();
+            // The stamps of a recording say nothing of this run.
+            let is_live = !is_shifted && !self.status.is_from_files();
+            self.status.mapped(MadeMap {
+                encoded: &encoded,
+                states,
+                stages: [
+                    waited.filter(|_| is_live),
+                    Some(computed),
+                    Some(encoding),
+                    total.filter(|_| is_live || is_shifted),
+                ],
+                validity: Duration::from_millis(self.valid_ms.into()),
+                speed_m_s,
+                is_shifted,
+            });
             self.newest.send_replace(Some(encoded.clone()));
             if let Some(recording) = &mut self.recording {
                 recording.record_map(&encoded);
@@ -190,6 +214,23 @@ impl Engine {
         let all = self.recording.as_ref().is_some_and(RecordingHandle::is_recording);
         let subscriptions = &self.status.subscriptions;
         self.pipeline.set_active_layers(|layer| all || subscriptions.is_subscribed(layer));
+    }
+}
+
+/// A time span in ns; `None` if it is negative, because the clocks of its ends differ.
+fn duration(span_ns: i64) -> Option<Duration> {
+    u64::try_from(span_ns).ok().map(Duration::from_nanos)
+}
+
+/// A pose on the wire, its stamp moved by `shift_ns`.
+fn vehicle_pose(pose: &EgoPose, shift_ns: i64) -> v1::VehiclePose {
+    let position = pose.map_from_ego.translation.vector;
+    let forward = pose.map_from_ego.rotation * Vector3::x();
+    v1::VehiclePose {
+        x_m: position.x,
+        y_m: position.y,
+        heading_deg: forward.y.atan2(forward.x).to_degrees(),
+        stamp_ns: pose.stamp_ns.saturating_add(shift_ns),
     }
 }
 

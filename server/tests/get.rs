@@ -26,6 +26,7 @@ fn fresh_map() -> Vec<u8> {
 #[tonic::async_trait]
 impl MapService for TwoVehicles {
     type WatchStream = Pin<Box<dyn Stream<Item = Result<v1::MapUpdate, Status>> + Send>>;
+    type WatchStatusStream = futures::stream::Empty<Result<v1::WatchStatusResponse, Status>>;
 
     async fn watch(&self, _: Request<Streaming<v1::WatchRequest>>) -> Result<Response<Self::WatchStream>, Status> {
         Err(Status::unimplemented("get does not watch"))
@@ -37,6 +38,13 @@ impl MapService for TwoVehicles {
             _ => map(7, CAPTURE_END_NS),
         };
         Ok(Response::new(v1::MapUpdate { map, ..Default::default() }))
+    }
+
+    async fn watch_status(
+        &self,
+        _: Request<v1::WatchStatusRequest>,
+    ) -> Result<Response<Self::WatchStatusStream>, Status> {
+        Err(Status::unimplemented("get watches no status"))
     }
 
     async fn list_vehicles(

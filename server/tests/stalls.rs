@@ -228,7 +228,10 @@ async fn watch_says_stale_when_nothing_comes_and_its_exit_code_too() {
     for at in [&grpc, &zenoh] {
         let output = until_stale(at).await;
         let said = text(&output.stdout);
-        assert!(said.starts_with("STALE: no map has arrived") && output.status.code() == Some(4), "{at:?}: {said}");
+        assert!(
+            said.starts_with("STALE: waiting for the first map") && output.status.code() == Some(4),
+            "{at:?}: {said}"
+        );
     }
     // With data that end.
     for (at, stops) in [(&grpc, false), (&zenoh, false), (&zenoh, true)] {

@@ -179,6 +179,9 @@ async fn health_and_reflection_answer() {
     let channel = channel.connect().await.unwrap();
     let request = HealthCheckRequest { service: "clearway.v1.MapService".into() };
     let health = HealthClient::new(channel.clone()).check(request).await.unwrap().into_inner();
+    // No packet has arrived, so there are no maps to serve; the server itself is alive.
+    assert_eq!(health.status(), ServingStatus::NotServing);
+    let health = HealthClient::new(channel.clone()).check(HealthCheckRequest::default()).await.unwrap().into_inner();
     assert_eq!(health.status(), ServingStatus::Serving);
 
     let list = MessageRequest::ListServices(String::new());

@@ -68,7 +68,7 @@ fn advice(error: &str) -> Option<&'static str> {
     let has_no_map = error.contains("no map");
     has_no_map.then_some(
         "the server has no map to give: no packet or scan has arrived since it started, or none arrives now; \
-         `clearway vehicles` shows what arrives, and `clearway watch` waits for the next map",
+         `clearway status` says why, and `clearway get --wait` and `clearway watch` wait for the next map",
     )
 }
 

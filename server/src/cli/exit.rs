@@ -15,13 +15,16 @@ pub enum Exit {
     Unreadable = 2,
     /// The command line is wrong.
     WrongUse = 3,
-    /// The newest map is stale, or none has come.
+    /// The newest map is stale, or none has come; the state of a vehicle is "error".
     Stale = 4,
+    /// The state of a vehicle is "warn", and of none "error".
+    Warn = 5,
 }
 
 /// The exit codes, as the help text lists them.
 pub const EXIT_CODES: &str = "Exit codes: 0 good, 1 the result differs, 2 an input cannot be read or is not whole, or \
-    the command failed, 3 wrong use, 4 the map is stale (get, watch).";
+    the command failed, 3 wrong use, 4 the map is stale (get, watch) or a vehicle's state is error (status), 5 it is \
+    warn (status).";
 
 impl Exit {
     /// [`Exit::Stale`] if the newest map is stale.

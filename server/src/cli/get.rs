@@ -1,10 +1,11 @@
 //! `clearway get`: a server -> its newest map, printed or written to a file.
 
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Error, Result};
 use clap::Args;
-use clearway_client::{Layer, MapView, now_ns};
+use clearway_client::{ClientError, Layer, MapView, now_ns};
 use serde_json::{Value, json};
 
 use super::connection::{ServerOptions, explain};
@@ -14,12 +15,18 @@ use super::files;
 use super::output::{block_on, print_line, usage_error};
 use crate::encode::picture;
 
+/// Interval at which a server is asked again. Ours: a tenth of a second is a revolution.
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
+/// Longest wait: a day.
+const WAIT_MAX: Duration = Duration::from_secs(86_400);
+
 /// Get the newest map: print one layer's classes and metrics, or write the layer to a file.
 ///
 /// If the map is stale, the output and the picture say STALE, and the exit code is 4.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway get
+  clearway get --wait
   clearway get --layer drivability --out newest.png --rings 10
   clearway get --layer occupancy --out newest.npy
   clearway get --json")]
@@ -36,6 +43,10 @@ pub struct Options {
     /// the first), .json (everything).
     #[arg(long, value_name = "FILE.png|.npy|.json")]
     out: Option<PathBuf>,
+    /// Wait for a fresh map, for at most this time (30 s if no time is given): the server may still start, or wait for
+    /// its sensors.
+    #[arg(long, value_name = "SECONDS", num_args = 0..=1, require_equals = true, default_missing_value = "30")]
+    wait: Option<f64>,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -80,10 +91,8 @@ impl Format {
 }
 
 async fn get(options: &Options, format: Option<Format>) -> Result<Exit> {
-    let Options { server, vehicle, layer, out, json, drawing } = options;
-    let client = server.connect().await?;
-    let layers: Vec<String> = layer.iter().cloned().collect();
-    let map = client.newest(vehicle, &layers).await.map_err(explain)?;
+    let Options { layer, out, json, drawing, .. } = options;
+    let map = newest(options).await?;
     let layer = match layer {
         Some(name) => map.layer(name)?,
         None => map.layers().first().context("the map has no layer")?,
@@ -116,6 +125,37 @@ async fn get(options: &Options, format: Option<Format>) -> Result<Exit> {
         format!("{vehicle} #{sequence:06}: {name}, {age_ms:.0} ms old{said}, written to {}", file.display())
     })?;
     Ok(Exit::from_stale(stale))
+}
+
+/// The newest map. With `--wait` it is fresh, unless none comes in that time; then the answer of the server holds.
+async fn newest(options: &Options) -> Result<MapView> {
+    let limit = Duration::try_from_secs_f64(options.wait.unwrap_or_default());
+    let wait = options.wait.unwrap_or_default();
+    let limit = limit.map_err(|_| usage_error(format!("--wait={wait}: 0 or more seconds are allowed")))?;
+    let until = Instant::now() + limit.min(WAIT_MAX);
+    loop {
+        let answer = ask(options).await;
+        let is_fresh = answer.as_ref().is_ok_and(|map| !map.is_stale(now_ns()));
+        if is_fresh || Instant::now() >= until || answer.as_ref().is_err_and(|error| !is_passing(error)) {
+            return answer;
+        }
+        tokio::time::sleep(POLL_INTERVAL).await;
+    }
+}
+
+async fn ask(options: &Options) -> Result<MapView> {
+    let client = options.server.connect().await?;
+    let layers: Vec<String> = options.layer.iter().cloned().collect();
+    client.newest(&options.vehicle, &layers).await.map_err(explain)
+}
+
+/// True for an error that passes by itself: no server answers yet, or it has no map yet.
+fn is_passing(error: &Error) -> bool {
+    match error.downcast_ref::<ClientError>() {
+        Some(ClientError::Unreachable { .. }) => true,
+        Some(error) => error.to_string().contains("no map"),
+        None => false,
+    }
 }
 
 /// The header, geometry, legend and metrics of one layer.

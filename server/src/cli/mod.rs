@@ -13,6 +13,7 @@
 //! | `check` | a configuration -> the same with every default |
 //! | `watch`, `get` | a server -> a line for each map; the newest map as a file |
 //! | `vehicles` | a server -> the state of its vehicles |
+//! | `status`, `top` | a server -> the states of its vehicles, once and live |
 //! | `recorder` | a request -> the recorder of a server |
 //! | `export` | a recording -> pictures, arrays, documents, files for viewers |
 //! | `info` | a file -> a description of its contents, and what is wrong with it |
@@ -58,6 +59,8 @@ mod send;
 mod serve;
 #[cfg(feature = "sim")]
 mod simulate;
+mod status;
+mod top;
 mod transport;
 #[cfg(feature = "store")]
 mod upload;
@@ -116,6 +119,8 @@ enum Command {
     Watch(watch::Options),
     Get(get::Options),
     Vehicles(vehicles::Options),
+    Status(status::Options),
+    Top(top::Options),
     Recorder(recorder::Options),
     Export(export::Options),
     Info(info::Options),
@@ -135,7 +140,7 @@ enum Command {
 const GROUPS: [(&str, &[&str]); 8] = [
     ("Make maps", &["demo", "serve", "replay", "transport"]),
     ("Check maps and configurations", &["verify", "evaluate", "check"]),
-    ("Read maps from a server", &["watch", "get", "vehicles"]),
+    ("Read maps from a server", &["watch", "get", "vehicles", "status", "top"]),
     ("Control a server", &["recorder"]),
     ("Read files", &["export", "info", "repair"]),
     ("Keep recordings", &["upload", "recordings"]),
@@ -199,6 +204,8 @@ fn run(command: Command) -> Result<Exit> {
         Command::Watch(options) => return watch::run(&options),
         Command::Get(options) => return get::run(&options),
         Command::Vehicles(options) => vehicles::run(&options)?,
+        Command::Status(options) => return status::run(&options),
+        Command::Top(options) => top::run(&options)?,
         Command::Recorder(options) => recorder::run(options)?,
         Command::Export(options) => return export::run(&options),
         Command::Info(options) => return info::run(&options),

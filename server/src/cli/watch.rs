@@ -182,7 +182,7 @@ fn stale_line(newest: Option<&Update>, passed_over: PassedOver, options: &Option
         None if options.json => {
             json!({"vehicle": options.vehicle, "sequence": null, "age_ms": null, "stale": true}).to_string()
         }
-        None => "STALE: no map has arrived; waiting (`clearway vehicles` shows what the server receives)".to_owned(),
+        None => "STALE: waiting for the first map (`clearway status` says why none has come)".to_owned(),
     }
 }
 

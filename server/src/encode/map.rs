@@ -41,7 +41,7 @@ pub struct EncodedMap {
     pub capture_end_ns: i64,
     /// Arrival of the event that completed the map, in ns since the Unix epoch.
     pub completed_ns: i64,
-    /// Share of the known cells that are drivable; `None` if the map has no layer with that metric.
+    /// Share of the judged cells of the layer `drivability` that are drivable; `None` if the map does not have it.
     pub drivable_share: Option<f64>,
     /// Encoded `Map` with the header alone.
     pub header: Bytes,
@@ -67,7 +67,10 @@ impl EncodedMap {
         let (boot_id, capture_end_ns, completed_ns) = (header.boot_id, header.capture_end_ns, header.completed_ns);
         let header = encode_header(&header);
         let encode = |layer: &Layer| (layer.name, encode_layer(&self::layer(layer)));
-        let share = |layer: &Layer| layer.metrics.iter().find(|(name, _)| *name == "drivable_share").map(|(_, v)| *v);
+        let share = |layer: &Layer| {
+            let share = layer.metrics.iter().find(|(name, _)| *name == "drivable_share");
+            share.filter(|_| layer.name == "drivability").map(|(_, value)| *value)
+        };
         Self {
             vehicle,
             boot_id,
@@ -90,6 +93,11 @@ impl EncodedMap {
         message.extend_from_slice(&self.header);
         chunks().for_each(|chunk| message.extend_from_slice(chunk));
         message.freeze()
+    }
+
+    /// Length of the encoded map with every layer, in bytes.
+    pub fn bytes(&self) -> usize {
+        self.header.len() + self.layers.iter().map(|(_, chunk)| chunk.len()).sum::<usize>()
     }
 
     /// The encoded map with the layer of `chunk`: the payload of zenoh and of the recording.

@@ -93,6 +93,7 @@ impl Shares {
 pub struct EventQueue {
     state: Arc<Mutex<State>>,
     space: Arc<Semaphore>,
+    capacity: usize,
     shares: Option<Arc<Shares>>,
     drops: Arc<DropCounters>,
     clock: Clock,
@@ -106,6 +107,21 @@ struct State {
     next_sequence: u64,
     /// Arrival of the newest report of drops, ns since the Unix epoch.
     reported_ns: i64,
+}
+
+/// The space of a queue.
+#[derive(Clone, Debug)]
+pub struct QueueSpace {
+    free: Arc<Semaphore>,
+    /// Events for which the queue has space.
+    pub capacity: usize,
+}
+
+impl QueueSpace {
+    /// Number of events that wait for the engine, or that it works on.
+    pub fn waiting(&self) -> usize {
+        self.capacity.saturating_sub(self.free.available_permits())
+    }
 }
 
 /// What a queue remembers of the events before.
@@ -125,7 +141,7 @@ pub fn event_queue_with_clock(clock: Clock, capacity: usize) -> (EventQueue, Rec
     let (sender, events) = sync_channel(capacity);
     let state = State { sender: Some(sender), next_sequence: 0, reported_ns: 0 };
     let (state, space) = (Arc::new(Mutex::new(state)), Arc::new(Semaphore::new(capacity)));
-    (EventQueue { state, space, shares: None, drops: Arc::default(), clock }, events)
+    (EventQueue { state, space, capacity, shares: None, drops: Arc::default(), clock }, events)
 }
 
 impl EventQueue {
@@ -303,6 +319,11 @@ impl EventQueue {
     /// Closes the queue for all clones: the engine handles the events on the queue and then ends.
     pub fn close(&self) {
         locked(&self.state).sender = None;
+    }
+
+    /// The space of the queue, which outlives it.
+    pub fn space(&self) -> QueueSpace {
+        QueueSpace { free: self.space.clone(), capacity: self.capacity }
     }
 
     /// The counts of readings that did not become events.

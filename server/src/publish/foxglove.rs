@@ -36,7 +36,7 @@ use crate::encode::EncodedMap;
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::{base_frame, foxglove as messages, safe_paths};
 use crate::newest::NewestSweep;
-use crate::status::Reader;
+use crate::status::{Reader, Transport};
 use crate::subscriptions::LayerSubscription;
 
 /// Pages from which Foxglove connects, beside those of the configuration.
@@ -302,8 +302,8 @@ struct Client {
 struct Subscription {
     newest: watch::Receiver<Option<Message>>,
     /// Keeps its layer active.
-    _layer: Option<LayerSubscription>,
-    _reader: Reader,
+    layer: Option<LayerSubscription>,
+    reader: Reader,
 }
 
 /// What a client may ask for.
@@ -394,8 +394,8 @@ impl Client {
                     let mut newest = channel.newest.subscribe();
                     newest.mark_changed();
                     of.subscribed.notify_one();
-                    let reader = Reader::new(&of.served.status.foxglove_readers);
-                    self.subscriptions.insert(id, Subscription { newest, _layer: layer, _reader: reader });
+                    let reader = Reader::new(&of.served.status.transports, Transport::Foxglove);
+                    self.subscriptions.insert(id, Subscription { newest, layer, reader });
                 }
             }
         }
@@ -407,6 +407,10 @@ impl Client {
         let changed = self.subscriptions.iter_mut().filter(|(_, of)| of.newest.has_changed().unwrap_or(false));
         let due = changed.filter_map(|(&id, of)| {
             let message = of.newest.borrow_and_update().clone()?;
+            // Points and poses are not in every map.
+            if of.layer.is_some() {
+                of.reader.got(0, message.sequence);
+            }
             let mut frame = BytesMut::with_capacity(13 + message.data.len());
             frame.put_u8(1);
             frame.put_u32_le(id);

@@ -11,7 +11,7 @@ use std::time::Duration;
 use axum::Router;
 use axum::extract::ws::{Message as Frame, WebSocket, WebSocketUpgrade};
 use axum::extract::{Extension, Query, State};
-use axum::http::{StatusCode, Uri, header};
+use axum::http::{HeaderMap, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use bytes::Bytes;
@@ -27,7 +27,7 @@ use super::page_replay::{PageReplay, replay_changed, replay_json};
 use super::served::{Served, Vehicles};
 use crate::clock::now_ns;
 use crate::replay::ReplayHandle;
-use crate::status::{Reader, prometheus};
+use crate::status::{Format, Reader, Transport, prometheus};
 
 /// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
@@ -99,11 +99,11 @@ async fn health(State(shown): State<Shown>) -> Response {
     }
 }
 
-/// Ready: every vehicle is alive and has a map.
+/// Ready: the state of no vehicle is an error. Else one line for each that is, with its worst reason.
 async fn ready(State(shown): State<Shown>) -> Response {
-    match shown.vehicles.0.iter().find(|served| !served.status.is_alive() || served.newest.borrow().is_none()) {
-        None => "ready\n".into_response(),
-        Some(served) => unavailable(format!("vehicle {} has no map\n", served.status.name)),
+    match shown.vehicles.not_ready() {
+        lines if lines.is_empty() => "ready\n".into_response(),
+        lines => unavailable(lines),
     }
 }
 
@@ -111,12 +111,18 @@ fn unavailable(text: String) -> Response {
     (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
 }
 
-async fn metrics(State(shown): State<Shown>, Extension(caller): Extension<Caller>) -> impl IntoResponse {
-    let kind = [(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")];
+async fn metrics(
+    State(shown): State<Shown>,
+    Extension(caller): Extension<Caller>,
+    headers: HeaderMap,
+) -> impl IntoResponse {
+    let accept = headers.get(header::ACCEPT).and_then(|accept| accept.to_str().ok()).unwrap_or_default();
+    let format = Format::accepted(accept);
+    let kind = [(header::CONTENT_TYPE, format.content_type())];
     let mut statuses = shown.vehicles.statuses();
     statuses.retain(|status| caller.may_reach(&status.name));
-    let listeners: Vec<_> = shown.listeners.iter().map(|(name, listener)| (*name, listener.counts())).collect();
-    (kind, prometheus(&statuses, &listeners))
+    let listeners = shown.listeners.iter().map(|(name, listener)| (*name, listener.counts())).collect();
+    (kind, prometheus(&statuses, listeners, format))
 }
 
 #[derive(serde::Deserialize)]
@@ -155,23 +161,20 @@ async fn stream(
     replay: Option<PageReplay>,
     _in_progress: InProgress,
 ) {
-    let _reader = Reader::new(&served.status.page_readers);
+    let mut reader = Reader::new(&served.status.transports, Transport::Page);
     let subscription = served.status.subscriptions.subscribe(&layers);
     let mut newest = served.newest.clone();
     newest.mark_changed();
     let mut every = tokio::time::interval(STATUS_PERIOD);
     let mut replay_state = replay.as_ref().map(|replay| replay.handle.state());
     replay_state.iter_mut().for_each(watch::Receiver::mark_changed);
-    let mut last_sequence = None;
     loop {
         let frame = tokio::select! {
             changed = newest.changed() => {
                 let Ok(()) = changed else { break };
                 let map = newest.borrow_and_update().clone();
                 let Some(map) = map.filter(|map| subscription.is_covered_by(map)) else { continue };
-                let last = last_sequence.filter(|(boot_id, _)| *boot_id == map.boot_id);
-                let skipped = last.map_or(0, |(_, last): (u64, u64)| map.sequence.saturating_sub(last + 1));
-                last_sequence = Some((map.boot_id, map.sequence));
+                let skipped = reader.got(map.boot_id, map.sequence);
                 let update = v1::MapUpdate {
                     map: map.select(&layers), skipped, sent_ns: now_ns(), ..Default::default()
                 };

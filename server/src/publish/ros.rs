@@ -29,7 +29,7 @@ use super::served::Served;
 use crate::clock::now_ns;
 use crate::config::Ros2;
 use crate::encode::EncodedMap;
-use crate::status::Reader;
+use crate::status::{Reader, Transport};
 use crate::zenoh_session::ZenohError;
 
 /// Name of the node.
@@ -179,13 +179,14 @@ impl Topic {
                 }
             }
             let _subscription = layer.map(|layer| served.status.subscriptions.subscribe(&[layer.to_owned()]));
-            let _reader = Reader::new(&served.status.zenoh_readers);
+            let mut reader = Reader::new(&served.status.transports, Transport::Ros);
             newest.mark_changed();
             loop {
                 tokio::select! {
                     changed = newest.changed() => match changed {
                         Ok(()) => {
                             let map = newest.borrow_and_update().clone();
+                            map.iter().for_each(|map| _ = reader.got(map.boot_id, map.sequence));
                             if let Some(message) = map.and_then(|map| make(&map)) {
                                 self.put(message).await;
                             }

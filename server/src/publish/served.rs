@@ -30,6 +30,12 @@ impl Vehicles {
         find_vehicle(&self.0, name, |served| &served.status.name)
     }
 
+    /// A line for each vehicle of which no fresh map is made, with the worst reason; empty if there is none.
+    pub fn not_ready(&self) -> String {
+        let line = |served: &Served| Some(format!("vehicle {}: {}\n", served.status.name, served.status.not_ready()?));
+        self.0.iter().filter_map(line).collect()
+    }
+
     /// The status of every vehicle.
     pub fn statuses(&self) -> Vec<Arc<VehicleStatus>> {
         self.0.iter().map(|served| served.status.clone()).collect()

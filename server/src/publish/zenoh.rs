@@ -3,7 +3,8 @@
 //! A layer is made while its key has a subscriber, and for each query on it. Late joiners get the current map from the
 //! publisher's cache; it is old if the layer had no subscriber, and its age says so. The same key answers queries.
 //! Subscribers can detect misses. A liveliness token `clearway/<vehicle>` lives as long as the vehicle is served;
-//! `clearway/<vehicle>/status` has the status once a second, as JSON. `clearway/<vehicle>/replay` has `{"ended":true}`
+//! `clearway/<vehicle>/status` has the status once a second and at each change of its state, as JSON; what another server
+//! says there of a vehicle of the same name is in this server's status. `clearway/<vehicle>/replay` has `{"ended":true}`
 //! after the last map of a replay, and `{"ended":false}` when it is set back.
 //!
 //! With `zenoh.signing_key` each map has a signature ([`clearway_client::signature`]) as the sample's attachment.
@@ -17,6 +18,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clearway_client::signature::SigningKey;
+use serde_json::Value;
 use tokio::task::JoinSet;
 use zenoh::Session;
 use zenoh::bytes::{Encoding, ZBytes};
@@ -24,13 +26,14 @@ use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::matching::{MatchingListener, MatchingStatus};
 use zenoh::qos::{CongestionControl, Priority};
+use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig, RepliesConfig};
 
 use super::ros::Node;
 use super::served::{Served, Vehicles};
 use crate::config::{Zenoh as Options, secret};
 use crate::encode::EncodedMap;
-use crate::status::Reader;
+use crate::status::{Reader, Transport, state_changed};
 use crate::zenoh_session::ZenohError;
 
 /// Time between two status messages.
@@ -126,16 +129,37 @@ impl Publisher {
         let replay = replay.congestion_control(CongestionControl::Drop).await;
         let replay = replay.map_err(ZenohError::of(format!("publisher {key}")))?;
         self.tasks.spawn(send_maps(served.clone(), publishers, self.signing_key.clone(), replay));
+        self.watch_claims(served).await?;
         self.tasks.spawn({
             let served = served.clone();
             async move {
                 let mut every = tokio::time::interval(STATUS_PERIOD);
+                let mut states = [served.status.states()];
                 loop {
-                    every.tick().await;
+                    tokio::select! {
+                        _ = every.tick() => {}
+                        () = state_changed(&mut states) => {}
+                    }
                     if let Err(error) = status.put(served.status.to_json().to_string()).await {
                         tracing::warn!(%error, "zenoh: status");
                     }
                 }
+            }
+        });
+        Ok(())
+    }
+
+    /// Notes the servers that publish the status of a vehicle of the same name.
+    async fn watch_claims(&mut self, served: &Served) -> Result<(), ZenohError> {
+        let key = format!("clearway/{}/status", served.status.name);
+        let subscriber = self.session.declare_subscriber(key.clone()).allowed_origin(Locality::Remote);
+        let claims = subscriber.await.map_err(ZenohError::of(format!("subscriber {key}")))?;
+        let status = served.status.clone();
+        self.tasks.spawn(async move {
+            while let Ok(sample) = claims.recv_async().await {
+                let Ok(document) = serde_json::from_slice::<Value>(&sample.payload().to_bytes()) else { continue };
+                let boot_id = document["boot_id"].as_str().unwrap_or_default();
+                status.note_claim(boot_id, document["server"].as_str().unwrap_or("of unknown name"));
             }
         });
         Ok(())
@@ -173,7 +197,10 @@ async fn subscribe_while(
 ) {
     loop {
         let _taken = matches.then(|| {
-            (served.status.subscriptions.subscribe(&[layer.to_owned()]), Reader::new(&served.status.zenoh_readers))
+            (
+                served.status.subscriptions.subscribe(&[layer.to_owned()]),
+                Reader::new(&served.status.transports, Transport::Zenoh),
+            )
         });
         match matching.recv_async().await {
             Ok(status) => matches = status.matching(),
@@ -206,7 +233,7 @@ async fn send_maps(
 ) {
     let (mut newest, mut replay_ended) = (served.newest.clone(), served.status.replay_ended.subscribe());
     newest.mark_changed();
-    let mut reported = false;
+    let (mut reported, mut last) = (false, None);
     loop {
         tokio::select! {
             biased;
@@ -216,6 +243,9 @@ async fn send_maps(
                 }
                 let map = newest.borrow_and_update().clone();
                 if let Some(map) = map {
+                    let before = last.replace((map.boot_id, map.sequence)).filter(|(boot_id, _)| *boot_id == map.boot_id);
+                    let skipped = before.map_or(0, |(_, last)| map.sequence.saturating_sub(last + 1));
+                    served.status.transports.skip_for_all(Transport::Zenoh, skipped);
                     send_map(&map, &publishers, signing_key.as_deref()).await;
                 }
             }

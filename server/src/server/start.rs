@@ -29,7 +29,7 @@ use crate::publish::listen::{Listener, ListenerHandle};
 use crate::publish::{Served, Vehicles, foxglove, grpc, page};
 use crate::record::mcap_file::Header;
 use crate::record::writer::{Recorder, recording_path};
-use crate::status::VehicleStatus;
+use crate::status::{VehicleStatus, watch_states};
 
 /// Longest time between two signs of life of a listener that does not hang: it gives one twice a second.
 const LISTENER_SILENT_MAX: Duration = Duration::from_secs(3);
@@ -110,7 +110,9 @@ impl Running {
         let (queue, events) = event_queue(vehicle.queue);
         let queue = queue.with_shares(vehicle.queue - vehicle.ingest.events_max(vehicle.queue), udp_sensors(vehicle));
         let layers = layer_names(&vehicle.maps);
-        let status = Arc::new(VehicleStatus::new(name.clone(), boot_id, layers, queue.drops()));
+        let status = VehicleStatus::new(name.clone(), boot_id, layers, queue.drops());
+        status.show_queue(queue.space());
+        let status = Arc::new(status.with_outline(vehicle.body.as_ref()));
         let (newest, receiver) = watch::channel(None);
         let valid_ms = vehicle.maps.valid_ms;
         let engine =
@@ -153,6 +155,13 @@ impl Running {
                 }
             });
         }
+        let (states, stopped) = (watch_states(self.vehicles.statuses()), self.stopped());
+        self.publishers.spawn(async move {
+            tokio::select! {
+                () = states => {}
+                () = stopped => {}
+            }
+        });
         self.serve(listeners, gateways);
         self.start_udp(sockets)
     }
@@ -190,6 +199,9 @@ impl Running {
         }
         for Prepared { served: Served { status, .. }, mut engine, events, core: (core, tables) } in prepared {
             self.recorder.iter().for_each(|recorder| status.show_recorder(recorder.counts()));
+            if driver.from_files {
+                status.set_from_files();
+            }
             // A replay computes all layers: a reader that comes late gets the last map, and the summary has all
             // metrics.
             self.subscriptions.extend(driver.from_files.then(|| status.subscriptions.subscribe(&[])));

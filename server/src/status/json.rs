@@ -20,7 +20,7 @@ pub fn sensor_json(state: &v1::SensorState) -> Value {
 }
 
 /// The state of a vehicle as a JSON object: the fields of [`v1::Vehicle`] under their own names, each sensor with its
-/// ledger and its mount. Boot id, stamps and unknown senders are left out, because the page and people need them in
+/// ledger and its mount; null where a value is absent. Boot id, stamps and unknown senders are left out, because the page and people need them in
 /// different forms.
 pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
     let recorder = vehicle.recorder.clone().unwrap_or_default();
@@ -51,6 +51,25 @@ pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
             }).collect::<Vec<_>>(),
         },
         "readers": vehicle.readers,
+        "fault": (!vehicle.fault.is_empty()).then_some(&vehicle.fault),
+        "state": vehicle.state,
+        "reasons": vehicle.reasons,
+        "pose": vehicle.pose.map(|pose| {
+            // As a string: a double of a browser cannot hold it.
+            let stamp_ns = pose.stamp_ns.to_string();
+            json!({"x_m": pose.x_m, "y_m": pose.y_m, "heading_deg": pose.heading_deg, "stamp_ns": stamp_ns})
+        }),
+        "speed_m_s": vehicle.speed_m_s,
+        "map_age_ms": vehicle.map_age_ms,
+        "map_rate_hz": vehicle.map_rate_hz,
+        "loss": vehicle.loss,
+        "latency_ms": vehicle.latency_ms,
+        "drivable_share": vehicle.drivable_share,
+        "map_bytes": vehicle.map_bytes,
+        "skips": vehicle.skips,
+        "server": vehicle.server,
+        "claimed_by": vehicle.claimed_by,
+        "outline_m": vehicle.outline_m,
     })
 }
 

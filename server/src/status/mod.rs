@@ -2,16 +2,38 @@
 //!
 //! | file | in -> out |
 //! |---|---|
-//! | [`vehicle`] | counts of engine, queue, recorder and readers -> one snapshot, as message or JSON |
+//! | [`vehicle`] | counts of engine, queue, recorder and readers -> one snapshot |
+//! | [`transports`] | readers that come, go and skip maps -> counts by transport |
+//! | [`window`], [`histogram`] | maps and packet counts -> rates, loss and latency of the last 10 s; buckets of times |
+//! | [`health`] | what is known at one time -> ok, warn or error, with reasons |
+//! | [`assess`] | the status of a vehicle -> its state, again and again |
+//! | `message` | a snapshot and a state -> message, JSON |
 //! | `json` | a vehicle's and a sensor's state and counts -> JSON |
 //! | `notices` | changes of the sensors -> the log, each once |
-//! | `prometheus` | the status of all vehicles -> Prometheus' text format |
+//! | `reasons` | the reasons for which metrics exist before they occur |
+//! | `text_format` | OpenMetrics -> Prometheus' text format |
+//! | `process` | `/proc` -> memory, files and time of this process |
+//! | `metrics` | the status of all vehicles, listeners and process -> OpenMetrics or Prometheus' text format |
 
+pub mod assess;
+pub mod health;
+pub mod histogram;
 mod json;
+mod message;
+mod metrics;
 mod notices;
-mod prometheus;
+mod process;
+mod reasons;
+mod text_format;
+pub mod transports;
 pub mod vehicle;
+pub mod window;
 
+pub use assess::{state_changed, watch_states};
+pub use health::State;
 pub use json::{sensor_json, vehicle_json};
-pub use prometheus::prometheus;
-pub use vehicle::{Reader, Snapshot, VehicleStatus};
+pub use metrics::prometheus;
+pub use text_format::Format;
+pub use transports::{Reader, Transport};
+pub(crate) use vehicle::MadeMap;
+pub use vehicle::{Snapshot, VehicleStatus};

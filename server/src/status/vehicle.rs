@@ -1,28 +1,31 @@
 //! The status of one vehicle: counts, rates, latency, readers, recorder.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
+use clearway_mapping::config::BodyConfig;
 use clearway_mapping::ledger::Ledger;
 use clearway_mapping::pipeline::NamedStatus;
-use clearway_mapping::sensor::mount::check::MountDeviation;
 use clearway_proto::v1;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
 use crate::acknowledgements::Acknowledgements;
-use crate::clock::now_ns;
 use crate::encode::EncodedMap;
-use crate::ingest::drops::{DropCounters, UnknownSender};
+use crate::ingest::drops::DropCounters;
+use crate::ingest::queue::QueueSpace;
 use crate::newest::NewestSweep;
 use crate::record::writer::RecorderCounts;
 use crate::subscriptions::LayerSubscriptions;
 use crate::sync::locked;
 
-use super::json::vehicle_json;
+use super::health::{Health, State};
+use super::histogram::Histogram;
 use super::notices::Notices;
+use super::transports::{Readers, Transport};
+use super::window::{PacketCounts, STAGES, StageTimes, Window};
 
 /// Latencies kept for the percentiles: seven minutes of a 10 Hz sensor.
 const LATENCIES: usize = 4096;
@@ -31,6 +34,9 @@ const RATE_MAPS: usize = 16;
 /// Longest time between two signs of life of an engine that does not hang. Ours: the largest allowed scan takes half a
 /// second, and an engine without events polls fifty times a second.
 const ENGINE_SILENT_MAX: Duration = Duration::from_secs(2);
+/// Most other servers that are remembered, and the longest name of one. Ours: people read them.
+const CLAIMS_MAX: usize = 8;
+const SERVER_NAME_MAX: usize = 64;
 /// Time without a new map after which the rates are 0.
 const RATE_AGE_MAX: Duration = Duration::from_secs(2);
 
@@ -49,57 +55,83 @@ pub struct VehicleStatus {
     pub acknowledgements: Acknowledgements,
     /// The points of the newest map, while a reader subscribes to them.
     pub sweeps: watch::Sender<NewestSweep>,
-    /// Number of readers over gRPC.
-    pub grpc_readers: Arc<AtomicU32>,
-    /// Number of open pages.
-    pub page_readers: Arc<AtomicU32>,
-    /// Number of keys of zenoh and topics of ROS 2 with a subscriber.
-    pub zenoh_readers: Arc<AtomicU32>,
-    /// Number of subscriptions of Foxglove's clients.
-    pub foxglove_readers: Arc<AtomicU32>,
+    /// The readers of its maps, by transport.
+    pub transports: Arc<Readers>,
     /// True while a replay stands at its end.
     pub replay_ended: watch::Sender<bool>,
-    drops: Arc<DropCounters>,
+    /// Outline of the vehicle in the ego frame as x0, y0, x1, y1, ..., in metres; empty if none is configured.
+    pub(super) outline_m: Vec<f64>,
+    pub(super) drops: Arc<DropCounters>,
     pub(super) recorder: OnceLock<Arc<RecorderCounts>>,
+    queue: OnceLock<QueueSpace>,
+    /// True if the events come from files, so that maps have the stamps of a recording.
+    pub(super) is_from_files: AtomicBool,
+    /// Other servers that serve a vehicle of this name: their names and their newest signs of life, by boot id.
+    pub(super) claims: Mutex<BTreeMap<u64, (String, Instant)>>,
+    pub(super) health: Mutex<Health>,
+    pub(super) health_state: watch::Sender<State>,
     engine_stopped: AtomicBool,
     listener_fault: Mutex<String>,
     /// Time of the newest sign of life of the engine, in ms after `started`; 0 before the first.
     engine_beat_ms: AtomicU64,
-    started: Instant,
-    state: Mutex<State>,
+    pub(super) started: Instant,
+    pub(super) changing: Mutex<Changing>,
 }
 
+/// What the engine changes.
 #[derive(Debug, Default)]
-struct State {
+pub(super) struct Changing {
     ledger: Ledger,
-    sensors: Vec<NamedStatus>,
+    pub(super) sensors: Vec<NamedStatus>,
+    /// When something of each sensor arrived and could be read, by name.
+    pub(super) seen: BTreeMap<String, Seen>,
+    pub(super) pose: Option<v1::VehiclePose>,
     notices: Notices,
-    states: Vec<v1::SensorState>,
-    maps: u64,
-    newest_capture_end_ns: i64,
+    pub(super) states: Vec<v1::SensorState>,
+    pub(super) maps: u64,
+    pub(super) newest_capture_end_ns: i64,
+    /// Publication of the newest map, after `started`.
+    pub(super) mapped_at: Duration,
+    pub(super) validity: Duration,
+    pub(super) speed_m_s: Option<f64>,
+    pub(super) has_recorded_stamps: bool,
     drivable_share: Option<f64>,
+    pub(super) window: Window,
+    /// Time of all maps by stage, in the order of [`STAGES`].
+    pub(super) stages: [Histogram; STAGES.len()],
+    /// Age of the newest map, sampled at each assessment.
+    pub(super) ages: Histogram,
     /// Time to step and encode each of the newest maps, in ns.
     latencies_ns: VecDeque<u64>,
     /// Publication of each of the newest maps, and the datagrams received until then.
     paces: VecDeque<(Instant, u64)>,
 }
 
-/// One reader of a vehicle's maps, counted until it is dropped.
-#[derive(Debug)]
-pub struct Reader(Arc<AtomicU32>);
-
-impl Reader {
-    /// Counts one more reader.
-    pub fn new(readers: &Arc<AtomicU32>) -> Self {
-        readers.fetch_add(1, Ordering::Relaxed);
-        Self(readers.clone())
-    }
+/// The newest signs of life of a sensor, after the start of the server.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Seen {
+    received: u64,
+    read: u64,
+    /// Something arrived.
+    pub received_at: Option<Duration>,
+    /// A packet or scan could be read.
+    pub read_at: Option<Duration>,
 }
 
-impl Drop for Reader {
-    fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::Relaxed);
-    }
+/// A map that the engine has just made, and what of it the status shows.
+pub(crate) struct MadeMap<'a> {
+    /// The map.
+    pub encoded: &'a EncodedMap,
+    /// Its sensors.
+    pub states: Vec<v1::SensorState>,
+    /// Time that it took in each stage.
+    pub stages: StageTimes,
+    /// Age at which it is stale.
+    pub validity: Duration,
+    /// Speed of the vehicle.
+    pub speed_m_s: Option<f64>,
+    /// True if its stamps were moved to the present.
+    pub is_shifted: bool,
 }
 
 /// Status of a vehicle at one moment.
@@ -125,6 +157,16 @@ pub struct Snapshot {
     pub maps_hz: f64,
     /// Datagrams per second, over the newest maps.
     pub packets_hz: f64,
+    /// Median time by stage over the maps of the last 10 s.
+    pub latency_ms: BTreeMap<&'static str, f64>,
+    /// Maps per second over the last 10 s.
+    pub map_rate_hz: f64,
+    /// Mean size of an encoded map of the last 10 s, in bytes.
+    pub map_bytes: f64,
+    /// Time of all maps by stage, in the order of [`STAGES`].
+    pub stages: [Histogram; STAGES.len()],
+    /// Age of the newest map, sampled since the server started.
+    pub ages: Histogram,
 }
 
 impl Snapshot {
@@ -160,19 +202,76 @@ impl VehicleStatus {
             acknowledgements: Acknowledgements::default(),
             sweeps: watch::Sender::new(None),
             layers,
-            grpc_readers: Arc::default(),
-            page_readers: Arc::default(),
-            zenoh_readers: Arc::default(),
-            foxglove_readers: Arc::default(),
+            transports: Arc::default(),
             replay_ended: watch::Sender::new(false),
+            outline_m: Vec::new(),
             drops,
             recorder: OnceLock::new(),
+            queue: OnceLock::new(),
+            is_from_files: AtomicBool::new(false),
+            claims: Mutex::default(),
+            health: Mutex::default(),
+            health_state: watch::Sender::new(State::default()),
             engine_stopped: AtomicBool::new(false),
             listener_fault: Mutex::default(),
             engine_beat_ms: AtomicU64::new(0),
             started: Instant::now(),
-            state: Mutex::default(),
+            changing: Mutex::default(),
         }
+    }
+
+    /// Adds the outline of the vehicle.
+    pub fn with_outline(self, body: Option<&BodyConfig>) -> Self {
+        let corners = |body: &BodyConfig| {
+            let BodyConfig { x_m_min, x_m_max, y_m_min, y_m_max, .. } = *body;
+            let corners = [x_m_max, y_m_min, x_m_max, y_m_max, x_m_min, y_m_max, x_m_min, y_m_min];
+            // The shortest decimal: 0.1 stays 0.1.
+            corners.iter().map(|m| m.to_string().parse().unwrap_or(f64::from(*m))).collect()
+        };
+        Self { outline_m: body.map_or_else(Vec::new, corners), ..self }
+    }
+
+    /// True if the events come from files.
+    pub(crate) fn is_from_files(&self) -> bool {
+        self.is_from_files.load(Ordering::Relaxed)
+    }
+
+    /// Notes that the events come from files.
+    pub(crate) fn set_from_files(&self) {
+        self.is_from_files.store(true, Ordering::Relaxed);
+    }
+
+    /// Notes a sign of life of another server that serves a vehicle of this name, by the boot id of its run. Anyone may
+    /// have sent it: of a few runs, a short printable name is kept.
+    pub fn note_claim(&self, boot_id: &str, server: &str) {
+        let Ok(id) = boot_id.parse::<u64>() else { return };
+        let mut claims = locked(&self.claims);
+        if id != self.boot_id && (claims.len() < CLAIMS_MAX || claims.contains_key(&id)) {
+            let name = server.chars().filter(|c| !c.is_control()).take(SERVER_NAME_MAX).collect();
+            claims.insert(id, (name, Instant::now()));
+        }
+    }
+
+    /// Adds the space of the vehicle's event queue; a second call changes nothing.
+    pub(crate) fn show_queue(&self, space: QueueSpace) {
+        self.queue.get_or_init(|| space);
+    }
+
+    /// The space of the vehicle's event queue, if it has one.
+    pub(super) fn queue(&self) -> Option<&QueueSpace> {
+        self.queue.get()
+    }
+
+    /// Time since the newest packet or scan of each sensor that could be read, by the sensor's name.
+    pub(super) fn packet_ages(&self) -> Vec<(String, Duration)> {
+        let (changing, now) = (locked(&self.changing), self.started.elapsed());
+        let age = |seen: &Seen| Some(now.saturating_sub(seen.read_at?));
+        changing.seen.iter().filter_map(|(name, seen)| Some((name.clone(), age(seen)?))).collect()
+    }
+
+    /// Covered share of the revolution of each sensor in the newest map.
+    pub(super) fn completeness(&self) -> Vec<(String, f32)> {
+        locked(&self.changing).states.iter().map(|state| (state.name.clone(), state.completeness)).collect()
     }
 
     /// Adds the counts of the vehicle's recorder; a second call changes nothing.
@@ -225,22 +324,45 @@ impl VehicleStatus {
         self.engine_stopped.store(true, Ordering::Release);
     }
 
-    /// Records the counts after a step of the engine.
-    pub(crate) fn stepped(&self, ledger: &Ledger, sensors: Vec<NamedStatus>) {
-        let mut state = locked(&self.state);
+    /// Records the counts after a step of the engine, and the newest pose.
+    pub(crate) fn stepped(&self, ledger: &Ledger, sensors: Vec<NamedStatus>, pose: Option<v1::VehiclePose>) {
+        let mut state = locked(&self.changing);
+        let now = self.started.elapsed();
         state.ledger.clone_from(ledger);
         state.notices.update(&self.name, &sensors);
-        state.sensors = sensors;
+        for NamedStatus { name, ledger, .. } in &sensors {
+            let (received, read) = (ledger.received, ledger.decoded + ledger.telemetry);
+            let seen = state.seen.entry(name.clone()).or_default();
+            if seen.received != received {
+                seen.received_at = Some(now);
+            }
+            if seen.read != read {
+                seen.read_at = Some(now);
+            }
+            (seen.received, seen.read) = (received, read);
+        }
+        (state.sensors, state.pose) = (sensors, pose);
     }
 
     /// Records a new map and the time it took.
-    pub(crate) fn mapped(&self, map: &EncodedMap, states: Vec<v1::SensorState>, latency: Duration) {
-        let mut state = locked(&self.state);
+    pub(crate) fn mapped(&self, made: MadeMap<'_>) {
+        let MadeMap { encoded: map, states, stages, validity, speed_m_s, is_shifted } = made;
+        let mut state = locked(&self.changing);
         state.states = states;
         // A jump of a replay sets the number back.
         state.maps = map.sequence + 1;
         state.newest_capture_end_ns = map.capture_end_ns;
         state.drivable_share = map.drivable_share;
+        state.mapped_at = self.started.elapsed();
+        (state.validity, state.speed_m_s) = (validity, speed_m_s);
+        state.has_recorded_stamps = !is_shifted && self.is_from_files.load(Ordering::Relaxed);
+        let at = state.mapped_at;
+        state.window.push_map(at, stages, map.bytes());
+        for (histogram, time) in state.stages.iter_mut().zip(stages) {
+            time.into_iter().for_each(|time| histogram.observe(time));
+        }
+        let [_, map_time, encode_time, _] = stages.map(Option::unwrap_or_default);
+        let latency = map_time + encode_time;
         if state.latencies_ns.len() == LATENCIES {
             state.latencies_ns.pop_front();
         }
@@ -254,9 +376,10 @@ impl VehicleStatus {
 
     /// The current status.
     pub fn snapshot(&self) -> Snapshot {
-        let state = locked(&self.state);
+        let state = locked(&self.changing);
         let mut latencies: Vec<u64> = state.latencies_ns.iter().copied().collect();
         let (maps_hz, packets_hz) = rates(&state.paces);
+        let now = self.started.elapsed();
         let mut snapshot = Snapshot {
             ledger: state.ledger.clone(),
             sensors: state.sensors.clone(),
@@ -265,6 +388,11 @@ impl VehicleStatus {
             drivable_share: state.drivable_share,
             maps_hz,
             packets_hz,
+            latency_ms: state.window.latency_ms(now),
+            map_rate_hz: state.window.map_rate_hz(now),
+            map_bytes: state.window.map_bytes(now),
+            stages: state.stages.clone(),
+            ages: state.ages.clone(),
             ..Snapshot::default()
         };
         let sensors = snapshot.sensors.iter_mut().map(|sensor| &mut sensor.ledger);
@@ -279,108 +407,25 @@ impl VehicleStatus {
     }
 
     /// Number of readers of its maps, by transport.
-    pub fn readers(&self) -> [(&'static str, u32); 4] {
-        let (grpc, page) = (&self.grpc_readers, &self.page_readers);
-        [("grpc", grpc), ("page", page), ("zenoh", &self.zenoh_readers), ("foxglove", &self.foxglove_readers)]
-            .map(|(transport, readers)| (transport, readers.load(Ordering::Relaxed)))
+    pub fn readers(&self) -> [(&'static str, u32); Transport::ALL.len()] {
+        Transport::ALL.map(|transport| (transport.as_str(), self.transports.count(transport)))
     }
 
     /// Number of readers of its maps over all transports.
     pub fn readers_sum(&self) -> u32 {
         self.readers().iter().map(|(_, readers)| readers).sum()
     }
-
-    /// The status as a message of the wire.
-    pub fn to_proto(&self) -> v1::Vehicle {
-        self.proto_of(&self.snapshot())
-    }
-
-    fn proto_of(&self, snapshot: &Snapshot) -> v1::Vehicle {
-        v1::Vehicle {
-            name: self.name.to_string(),
-            boot_id: self.boot_id,
-            layers: self.layers.iter().map(|&layer| layer.to_owned()).collect(),
-            maps: snapshot.maps,
-            newest_capture_end_ns: snapshot.newest_capture_end_ns,
-            sensors: locked(&self.state).states.clone(),
-            ledger: Some(ledger(&snapshot.ledger)),
-            sensor_ledgers: snapshot.sensors.iter().map(|s| (s.name.clone(), ledger(&s.ledger))).collect(),
-            recorder: Some(self.recorder.get().map(|counts| counts.to_proto()).unwrap_or_default()),
-            readers: self.readers().map(|(transport, readers)| (transport.to_owned(), readers)).into(),
-            unknown_senders: self.drops.unknown_senders().iter().map(unknown_sender).collect(),
-            observations_refused: by_name(&snapshot.observations_refused),
-            reference_sensor: snapshot.reference_sensor().unwrap_or_default().to_owned(),
-            fault: self.fault().unwrap_or_default(),
-            mounts: snapshot.sensors.iter().filter_map(|s| Some((s.name.clone(), mount(&s.mount?)))).collect(),
-        }
-    }
-
-    /// The status as JSON: the content of [`VehicleStatus::to_proto`], rates, latency and age. 64-bit numbers that a
-    /// browser's doubles cannot hold (boot id, stamps) are strings.
-    pub fn to_json(&self) -> Value {
-        let snapshot = self.snapshot();
-        let proto = self.proto_of(&snapshot);
-        let unknown_senders = proto.unknown_senders.iter();
-        let unknown_senders = unknown_senders.map(|sender| {
-            json!({
-                "address": sender.address, "datagrams": sender.datagrams, "newest_ns": sender.newest_ns.to_string()
-            })
-        });
-        let mut document = vehicle_json(&proto);
-        document["boot_id"] = proto.boot_id.to_string().into();
-        document["newest_capture_end_ns"] = proto.newest_capture_end_ns.to_string().into();
-        document["now_ns"] = now_ns().to_string().into();
-        document["drivable_share"] = snapshot.drivable_share.into();
-        document["recorder"]["stopped"] = self.recorder.get().and_then(|counts| counts.stop_reason()).into();
-        document["unknown_senders"] = unknown_senders.collect();
-        document["rates"] = json!({ "maps_hz": snapshot.maps_hz, "packets_hz": snapshot.packets_hz });
-        document["latency_ms"] = json!({ "p50": snapshot.latency_ms_p50, "p99": snapshot.latency_ms_p99 });
-        document["alive"] = self.is_alive().into();
-        document["fault"] = self.fault().into();
-        document
-    }
 }
 
-fn mount(deviation: &MountDeviation) -> v1::MountDeviation {
-    let [height_std_m, pitch_std_rad, roll_std_rad] = deviation.std;
-    v1::MountDeviation {
-        height_m: deviation.height_m,
-        pitch_deg: deviation.pitch_rad.to_degrees(),
-        roll_deg: deviation.roll_rad.to_degrees(),
-        height_std_m,
-        pitch_std_deg: pitch_std_rad.to_degrees(),
-        roll_std_deg: roll_std_rad.to_degrees(),
-        scans: deviation.scans as u32,
-        contradicts: deviation.contradicts,
+/// The counts of packets of which the loss is computed, with the ledgers of the sensors: packets of unknown senders and
+/// copies of packets are not expected.
+pub(super) fn packet_counts(sensors: &[NamedStatus]) -> PacketCounts {
+    let sum = |count: fn(&NamedStatus) -> u64| sensors.iter().map(count).sum();
+    PacketCounts {
+        read: sum(|sensor| sensor.ledger.decoded),
+        missing: sum(|sensor| sensor.status.packets_lost),
+        dropped: sum(|sensor| sensor.ledger.refused_sum() + sensor.ledger.lost + sensor.ledger.kernel_drops),
     }
-}
-
-fn unknown_sender(sender: &UnknownSender) -> v1::UnknownSender {
-    let UnknownSender { address, datagrams, newest_ns } = *sender;
-    v1::UnknownSender { address: address.to_string(), datagrams, newest_ns }
-}
-
-fn ledger(ledger: &Ledger) -> v1::Ledger {
-    v1::Ledger {
-        received: ledger.received,
-        decoded: ledger.decoded,
-        telemetry: ledger.telemetry,
-        refused: by_name(&ledger.refused),
-        lost: ledger.lost,
-        kernel_drops: ledger.kernel_drops,
-        points_dropped: ledger.points_dropped,
-        own_body: ledger.own_body,
-        through_body: ledger.through_body,
-        blind: ledger.blind,
-        poses: ledger.poses,
-        poses_refused: ledger.poses_refused,
-        roads: ledger.roads,
-        roads_refused: by_name(&ledger.roads_refused),
-    }
-}
-
-fn by_name(counts: &BTreeMap<&'static str, u64>) -> BTreeMap<String, u64> {
-    counts.iter().map(|(&reason, &n)| (reason.to_owned(), n)).collect()
 }
 
 /// Maps and datagrams per second.
@@ -404,20 +449,24 @@ mod tests {
     use super::*;
 
     #[test]
+    fn another_server_that_claims_the_vehicle_is_named_and_a_flood_of_claims_is_bounded() {
+        let status = VehicleStatus::new("car".into(), 7, vec![], Arc::default());
+        status.note_claim("7", "itself");
+        status.note_claim("no number", "liar");
+        assert_eq!(status.assess().claimed_by, Vec::<String>::new());
+        status.note_claim("8", "b\u{1b}[2J");
+        assert_eq!(status.assess().claimed_by, ["b[2J"]);
+        (100..200).for_each(|boot_id: u64| status.note_claim(&boot_id.to_string(), &format!("{boot_id:>99}")));
+        let claimed_by = status.assess().claimed_by;
+        assert!(claimed_by.len() <= CLAIMS_MAX && claimed_by.iter().all(|name| name.len() <= SERVER_NAME_MAX));
+    }
+
+    #[test]
     fn percentiles_are_nearest_ranks() {
         let ns: Vec<u64> = (1..=100).map(|ms| ms * 1_000_000).collect();
         assert_eq!(percentile_ms(&ns, 50), Some(50.0));
         assert_eq!(percentile_ms(&ns, 99), Some(99.0));
         assert_eq!(percentile_ms(&ns[..1], 50), Some(1.0));
         assert_eq!(percentile_ms(&[], 50), None);
-    }
-
-    #[test]
-    fn a_reader_is_counted_until_it_is_dropped() {
-        let readers = Arc::new(AtomicU32::new(0));
-        let reader = Reader::new(&readers);
-        assert_eq!(readers.load(Ordering::Relaxed), 1);
-        drop(reader);
-        assert_eq!(readers.load(Ordering::Relaxed), 0);
     }
 }

@@ -17,7 +17,7 @@ use clearway::ingest::receipt::{ClientSession, ObservationId, Outcome as EventOu
 use clearway::publish::{Served, Vehicles};
 use clearway::record::mcap_file::Header;
 use clearway::record::writer::RecordingWriter;
-use clearway::status::VehicleStatus;
+use clearway::status::{Transport, VehicleStatus};
 use clearway_mapping::pipeline::{Pipeline, layer_names};
 use clearway_proto::v1;
 use clearway_sim::impair::Impairment;
@@ -176,7 +176,7 @@ impl<'a> TestBed<'a> {
                 reader.poll_at(self.now_ns, &self.vehicles, &self.maps, self.injected)?;
             }
             let open = self.readers.iter().filter(|reader| reader.is_open()).count() as u32;
-            let counted = self.vehicles.0[0].status.grpc_readers.load(Ordering::Relaxed);
+            let counted = self.vehicles.0[0].status.transports.count(Transport::Grpc);
             if counted != open {
                 return Err(violation("reader", format!("{open} readers are open, {counted} are counted")));
             }

@@ -248,6 +248,7 @@ struct Lossy {
 #[tonic::async_trait]
 impl MapService for Lossy {
     type WatchStream = Pin<Box<dyn Stream<Item = Result<v1::MapUpdate, Status>> + Send>>;
+    type WatchStatusStream = futures::stream::Empty<Result<v1::WatchStatusResponse, Status>>;
 
     async fn watch(
         &self,
@@ -262,6 +263,13 @@ impl MapService for Lossy {
     }
 
     async fn get_map(&self, _: Request<v1::GetMapRequest>) -> Result<Response<v1::MapUpdate>, Status> {
+        Err(Status::unimplemented("not called by this test"))
+    }
+
+    async fn watch_status(
+        &self,
+        _: Request<v1::WatchStatusRequest>,
+    ) -> Result<Response<Self::WatchStatusStream>, Status> {
         Err(Status::unimplemented("not called by this test"))
     }
 

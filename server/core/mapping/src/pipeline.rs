@@ -10,7 +10,7 @@ use clearway_lidar::revolution::Revolution;
 
 use crate::config::{ConfigValueError, MapsConfig, VehicleConfig};
 use crate::error::EventError;
-use crate::event::{Body, Event};
+use crate::event::{Body, EgoPose, Event};
 use crate::event_time::{EventClock, EventTime};
 use crate::fusion::{Fusion, MergedScans};
 use crate::ground::Ground;
@@ -200,6 +200,11 @@ impl Pipeline {
                 ledger: ledger.clone(),
             };
         self.inputs.sensors().zip(ledgers).enumerate().map(with_ledger).collect()
+    }
+
+    /// The newest ego pose; `None` before the first.
+    pub fn newest_pose(&self) -> Option<&EgoPose> {
+        self.inputs.motion().newest_pose()
     }
 
     /// The newest map; `None` before the first.

@@ -7,6 +7,7 @@ pub mod reader;
 mod recording;
 mod replay;
 pub mod selection;
+mod status;
 
 use std::pin::Pin;
 use std::time::Duration;
@@ -27,6 +28,7 @@ use replay::Replay;
 use crate::clock::now_ns;
 use crate::record::writer::RecorderControl;
 use crate::replay::ReplayHandle;
+use crate::status::state_changed;
 
 use v1::ingest_service_server::{IngestService, IngestServiceServer};
 use v1::map_service_server::{MapService, MapServiceServer};
@@ -37,8 +39,8 @@ use v1::replay_service_server::ReplayServiceServer;
 const REQUEST_BYTES_MAX: usize = 64 << 10;
 /// Longest time from opening `Watch` to its first request. Ours: a reader sends its selection at once.
 const SELECTION_TIMEOUT: Duration = Duration::from_secs(10);
-/// Interval at which the health of the recorder is reported.
-const RECORDER_PERIOD: Duration = Duration::from_secs(1);
+/// Interval at which the health of the services is reported.
+const HEALTH_PERIOD: Duration = Duration::from_secs(1);
 
 /// Serves maps, `ingest` if it is configured, and the control of `recorder` and `replay` if there is one, until `stop`
 /// resolves and all streams have ended.
@@ -53,8 +55,10 @@ pub async fn serve<I: IngestService>(
     replay: Option<ReplayHandle>,
     stop: impl Future<Output = ()>,
 ) -> Result<(), tonic_reflection::server::Error> {
+    let of_health = vehicles.clone();
     let (health, health_service) = tonic_health::server::health_reporter();
-    health.set_serving::<MapServiceServer<Maps>>().await;
+    // Until the first report.
+    health.set_not_serving::<MapServiceServer<Maps>>().await;
     if ingest.is_some() {
         health.set_serving::<IngestServiceServer<I>>().await;
     }
@@ -79,21 +83,33 @@ pub async fn serve<I: IngestService>(
     }
     // Older versions of grpcurl know only the older version of reflection.
     routes.add_service(health_service).add_service(reflection().build_v1()?).add_service(reflection().build_v1alpha()?);
-    let reports = recorder.map(|recorder| tokio::spawn(report_recorder(health, recorder)));
-    listener.serve(routes.routes().prepare().into_axum_router(), stop).await;
-    reports.iter().for_each(tokio::task::JoinHandle::abort);
+    let reports = report_health(health, of_health, recorder);
+    tokio::select! {
+        () = listener.serve(routes.routes().prepare().into_axum_router(), stop) => {}
+        () = reports => {}
+    }
     Ok(())
 }
 
-/// Reports the health of the recorder as that of its service, once in [`RECORDER_PERIOD`].
-async fn report_recorder(health: HealthReporter, recorder: RecorderControl) {
-    let mut every = tokio::time::interval(RECORDER_PERIOD);
+/// Reports the health of the services, once in [`HEALTH_PERIOD`] and at each change of a vehicle's state, for ever: the
+/// maps are served if no vehicle's state is an error, and the recordings if nothing is wrong with the recorder.
+async fn report_health(health: HealthReporter, vehicles: Vehicles, recorder: Option<RecorderControl>) {
+    let mut every = tokio::time::interval(HEALTH_PERIOD);
+    let mut states: Vec<_> = vehicles.0.iter().map(|served| served.status.states()).collect();
     loop {
-        every.tick().await;
-        if recorder.status().reason.is_empty() {
-            health.set_serving::<RecordingServiceServer<Recordings>>().await;
+        tokio::select! {
+            _ = every.tick() => {}
+            () = state_changed(&mut states) => {}
+        }
+        if vehicles.not_ready().is_empty() {
+            health.set_serving::<MapServiceServer<Maps>>().await;
         } else {
-            health.set_not_serving::<RecordingServiceServer<Recordings>>().await;
+            health.set_not_serving::<MapServiceServer<Maps>>().await;
+        }
+        match recorder.as_ref().map(|recorder| recorder.status().reason.is_empty()) {
+            Some(true) => health.set_serving::<RecordingServiceServer<Recordings>>().await,
+            Some(false) => health.set_not_serving::<RecordingServiceServer<Recordings>>().await,
+            None => {}
         }
     }
 }
@@ -141,6 +157,17 @@ impl MapService for Maps {
             Status::unavailable(format!("vehicle {name} makes no map at present: no data arrived since the request"))
         })?;
         Ok(Response::new(v1::MapUpdate { map: map.select(&layers), sent_ns: now_ns(), ..Default::default() }))
+    }
+
+    type WatchStatusStream = Pin<Box<dyn Stream<Item = Result<v1::WatchStatusResponse, Status>> + Send>>;
+
+    async fn watch_status(
+        &self,
+        request: Request<v1::WatchStatusRequest>,
+    ) -> Result<Response<Self::WatchStatusStream>, Status> {
+        let caller = caller(&request);
+        let names = request.into_inner().vehicles;
+        Ok(Response::new(Box::pin(status::watch(status::selected(&self.vehicles, &caller, &names)?))))
     }
 
     async fn list_vehicles(

@@ -17,7 +17,7 @@ use crate::clock::now_ns;
 use crate::encode::EncodedMap;
 use crate::newest::Newest;
 use crate::publish::served::{Served, Vehicles};
-use crate::status::Reader;
+use crate::status::{Reader, Transport};
 use crate::subscriptions::LayerSubscription;
 
 /// The updates of one reader: the selected parts of the newest maps, within its credits. Any executor can drive the
@@ -56,8 +56,8 @@ struct Watch<R> {
     finished: Option<AcknowledgingReader>,
     /// Until it goes, its layers are made.
     subscription: LayerSubscription,
-    // Last, and only held: the reader is counted while this lives.
-    _reader: Reader,
+    /// The reader is counted while this lives, and what it skips.
+    reader: Reader,
 }
 
 impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
@@ -77,7 +77,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
             base: None,
             want_full: false,
             finished: selection.credits.are_limited().then(|| served.status.acknowledgements.add(name)),
-            _reader: Reader::new(&served.status.grpc_readers),
+            reader: Reader::new(&served.status.transports, Transport::Grpc),
             selection,
         }
     }
@@ -152,6 +152,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
         let bytes = selection.bytes(&map, base.as_deref().filter(is_base))?;
         let sent = Sent { boot_id: map.boot_id, sequence: map.sequence, stamp_ns: map.capture_end_ns };
         let (skipped, left_out) = last.replace(sent).map_or((0, 0), |last| selection.rate.between(last, sent));
+        self.reader.skipped(skipped);
         selection.rate.send(sent.stamp_ns);
         selection.credits.send(sent.sequence);
         (*base, *want_full) = (selection.deltas.then_some(map), false);

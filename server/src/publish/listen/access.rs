@@ -38,6 +38,7 @@ pub const RPCS: &[(&str, &[Role])] = &[
     ("/clearway.v1.MapService/Watch", &[Role::Reader]),
     ("/clearway.v1.MapService/GetMap", &[Role::Reader]),
     ("/clearway.v1.MapService/ListVehicles", &[Role::Reader, Role::Ingester]),
+    ("/clearway.v1.MapService/WatchStatus", &[Role::Reader, Role::Ingester]),
     ("/clearway.v1.IngestService/Stream", &[Role::Ingester]),
     ("/clearway.v1.RecordingService/Start", &[Role::Operator]),
     ("/clearway.v1.RecordingService/Stop", &[Role::Operator]),

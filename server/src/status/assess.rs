@@ -1,0 +1,157 @@
+//! The status of a vehicle -> its state ([`super::health`]), at each call and five times a second.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures::future::select_all;
+use tokio::sync::watch;
+use tokio::time::MissedTickBehavior;
+
+use super::health::{Facts, SILENT_AFTER, SensorFacts, State};
+use super::vehicle::{Changing, VehicleStatus, packet_counts};
+use crate::clock::now_ns;
+use crate::sync::locked;
+
+/// Interval at which the vehicles are assessed. Ours: short beside the time in which a person or a probe reacts.
+const ASSESS_PERIOD: Duration = Duration::from_millis(200);
+/// Time after which another server that claims the vehicle's name is forgotten. Ours: it publishes once a second.
+const CLAIM_AGE_MAX: Duration = Duration::from_secs(4);
+
+/// What an assessment has found.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Assessment {
+    /// The state.
+    pub state: State,
+    /// Why it is not `ok`, worst first.
+    pub reasons: Vec<String>,
+    /// Age of the newest map; `None` before the first.
+    pub map_age_ms: Option<f64>,
+    /// Share of the packets of the last 10 s that were lost or refused, 0 to 1.
+    pub loss: f64,
+    /// Speed of the vehicle, if maps are made.
+    pub speed_m_s: Option<f64>,
+    /// Names of other servers that serve a vehicle of the same name.
+    pub claimed_by: Vec<String>,
+}
+
+/// Assesses the vehicles again and again, so that a change of a state is seen without a reader.
+pub async fn watch_states(statuses: Vec<Arc<VehicleStatus>>) {
+    let mut every = tokio::time::interval(ASSESS_PERIOD);
+    every.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    loop {
+        every.tick().await;
+        for status in &statuses {
+            let age_ms = status.assess().map_age_ms;
+            if let Some(age_ms) = age_ms {
+                let age = Duration::from_secs_f64(age_ms.max(0.0) / 1e3);
+                locked(&status.changing).ages.observe(age);
+            }
+        }
+    }
+}
+
+/// Resolves when one of the states has changed; never without a vehicle.
+pub async fn state_changed(states: &mut [watch::Receiver<State>]) {
+    let changes: Vec<_> = states.iter_mut().map(|state| Box::pin(state.changed())).collect();
+    match changes.is_empty() {
+        true => std::future::pending().await,
+        // The senders live as long as the vehicles that the caller holds.
+        false => _ = select_all(changes).await,
+    }
+}
+
+impl VehicleStatus {
+    /// The state of the vehicle as it changes, with the one of now.
+    pub fn states(&self) -> watch::Receiver<State> {
+        self.health_state.subscribe()
+    }
+
+    /// Assesses the vehicle now.
+    pub fn assess(&self) -> Assessment {
+        let mut health = locked(&self.health);
+        let facts = self.facts();
+        health.update(&facts);
+        let (state, reasons) = (health.state(), health.reasons().to_vec());
+        self.health_state.send_if_modified(|last| std::mem::replace(last, state) != state);
+        drop(health);
+        let changing = locked(&self.changing);
+        let age_ns = now_ns().saturating_sub(changing.newest_capture_end_ns);
+        let is_made = changing.maps > 0 && self.started.elapsed().saturating_sub(changing.mapped_at) <= SILENT_AFTER;
+        Assessment {
+            state,
+            reasons,
+            map_age_ms: (changing.maps > 0).then_some(age_ns as f64 / 1e6),
+            loss: facts.loss,
+            speed_m_s: changing.speed_m_s.filter(|_| is_made),
+            claimed_by: facts.claimed_by,
+        }
+    }
+
+    /// Why the vehicle is not ready: its worst reason, if no fresh map is made; else `None`.
+    pub fn not_ready(&self) -> Option<String> {
+        let Assessment { state, reasons, .. } = self.assess();
+        (state == State::Error).then(|| reasons.into_iter().next().unwrap_or_default())
+    }
+
+    fn facts(&self) -> Facts {
+        let claimed_by = self.claimed_by();
+        let mut changing = locked(&self.changing);
+        let up = self.started.elapsed();
+        let mut sensors = changing.sensors.clone();
+        let mut of_vehicle = clearway_mapping::ledger::Ledger::default();
+        self.drops.add_unreported_to(&mut of_vehicle, sensors.iter_mut().map(|sensor| &mut sensor.ledger));
+        let counts = packet_counts(&sensors);
+        let loss = changing.window.loss(counts);
+        changing.window.push_counts(up, counts);
+        let since_mapped = up.saturating_sub(changing.mapped_at);
+        let by_clock = now_ns().saturating_sub(changing.newest_capture_end_ns);
+        let by_clock = Duration::from_nanos(u64::try_from(by_clock).unwrap_or(0));
+        // As in a client: no step of a clock makes an old map look young.
+        let age = if changing.has_recorded_stamps { since_mapped } else { by_clock.max(since_mapped) };
+        Facts {
+            fault: self.fault(),
+            up,
+            makes_maps: !self.layers.is_empty(),
+            map_age: (changing.maps > 0).then_some(age),
+            validity: changing.validity,
+            has_recorded_stamps: changing.has_recorded_stamps,
+            is_replay_ended: *self.replay_ended.borrow(),
+            sensors: changing.sensors.iter().map(|sensor| sensor_facts(sensor, &changing, up)).collect(),
+            loss,
+            recorder_problem: self.recorder_problem(),
+            claimed_by,
+        }
+    }
+
+    /// Names of other servers that serve a vehicle of the same name, each once.
+    fn claimed_by(&self) -> Vec<String> {
+        let mut claims = locked(&self.claims);
+        claims.retain(|_, (_, newest)| newest.elapsed() <= CLAIM_AGE_MAX);
+        let names: BTreeSet<_> = claims.values().map(|(server, _)| server.clone()).collect();
+        names.into_iter().collect()
+    }
+}
+
+fn sensor_facts(sensor: &clearway_mapping::pipeline::NamedStatus, changing: &Changing, up: Duration) -> SensorFacts {
+    let seen = changing.seen.get(&sensor.name).copied().unwrap_or_default();
+    let since = |at: Option<Duration>| at.map(|at| up.saturating_sub(at));
+    let silent = since(seen.read_at);
+    let state = changing.states.iter().find(|state| state.name == sensor.name);
+    let left_out = state.map_or("", |state| &state.state);
+    SensorFacts {
+        name: sensor.name.clone(),
+        silent,
+        is_refused: since(seen.received_at).is_some_and(|age| age <= SILENT_AFTER)
+            && silent.is_none_or(|age| age > SILENT_AFTER),
+        left_out: if matches!(left_out, "late" | "ahead" | "silent") { left_out.to_owned() } else { String::new() },
+        completeness: state.filter(|_| left_out != "silent").map(|state| state.completeness),
+        clock: sensor.status.clock.map_or("", |clock| clock.as_str()).to_owned(),
+        clock_offset_ms: sensor.status.clock_offset_ms,
+        blocked_deg: sensor.status.blocked.sectors.iter().map(|s| f64::from(s.to_deg) - f64::from(s.from_deg)).sum(),
+        mount: sensor
+            .mount
+            .filter(|mount| mount.contradicts)
+            .map(|mount| [mount.height_m, mount.pitch_rad.to_degrees(), mount.roll_rad.to_degrees()]),
+    }
+}

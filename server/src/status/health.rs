@@ -1,0 +1,408 @@
+//! How well a vehicle is served: what is known of it at one time -> `ok`, `warn` or `error`, with reasons in words.
+//!
+//! Pure: [`findings`] is a function of [`Facts`], and [`Health`] adds what is remembered from one assessment to the
+//! next. A state that gets worse is believed at once, one that gets better only after [`BETTER_AFTER`].
+
+use std::time::Duration;
+
+/// Time without a packet after which a sensor is silent. Ours: ten revolutions of the slowest sensor, and more than two
+/// scans a second need.
+pub const SILENT_AFTER: Duration = Duration::from_secs(2);
+/// Time for which the newest map must be older than its validity before that is an error. Ours: a second; planners are
+/// told at once, but one late map is no alarm.
+const STALE_ERROR_AFTER: Duration = Duration::from_secs(1);
+/// Time for which a better state must last. Ours: an operator reads one state instead of a flicker.
+const BETTER_AFTER: Duration = Duration::from_secs(3);
+/// Share of lost packets above which a vehicle warns, and below which it no longer does. Ours: 1 % is one packet in
+/// each revolution of a VLP-16 of 76 packets.
+const LOSS_WARNS: f64 = 0.01;
+const LOSS_ENDS: f64 = 0.005;
+/// Completeness of the newest revolution below which a sensor warns. Ours.
+const COMPLETENESS_MIN: f32 = 0.9;
+/// Difference of the clocks of host and sensor above which a sensor warns, in ms. Ours: three times the validity.
+const CLOCK_OFFSET_MS_MAX: i64 = 1000;
+
+/// State of a vehicle, better ones first.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub enum State {
+    /// Fresh maps are made, and nothing is known to be wrong.
+    Ok,
+    /// Maps are made, but something is wrong with them or with an input.
+    Warn,
+    /// No fresh map is made.
+    #[default]
+    Error,
+}
+
+impl State {
+    /// The name on the wire and in metrics.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Ok => "ok",
+            Self::Warn => "warn",
+            Self::Error => "error",
+        }
+    }
+
+    /// All states.
+    pub const ALL: [Self; 3] = [Self::Ok, Self::Warn, Self::Error];
+}
+
+/// What is known of a vehicle at one time.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Facts {
+    /// What of the vehicle has stopped or hangs.
+    pub fault: Option<String>,
+    /// Time since the server started.
+    pub up: Duration,
+    /// True if its maps have a layer, so that maps are expected.
+    pub makes_maps: bool,
+    /// Age of the newest map; `None` before the first.
+    pub map_age: Option<Duration>,
+    /// Age at which a map is stale.
+    pub validity: Duration,
+    /// True if the maps carry the stamps of a recording, so that their age is not counted by the server's clock.
+    pub has_recorded_stamps: bool,
+    /// True if a replay stands at its end.
+    pub is_replay_ended: bool,
+    /// The sensors.
+    pub sensors: Vec<SensorFacts>,
+    /// Share of the packets of the last 10 s that were lost or refused, 0 to 1.
+    pub loss: f64,
+    /// What is wrong with the recording.
+    pub recorder_problem: Option<String>,
+    /// Other servers that serve a vehicle of the same name.
+    pub claimed_by: Vec<String>,
+}
+
+/// What is known of one sensor.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct SensorFacts {
+    /// Name of the sensor.
+    pub name: String,
+    /// Time since its newest packet or scan that could be read; `None` before the first.
+    pub silent: Option<Duration>,
+    /// True if packets of it have arrived in the last seconds, but none of them could be read.
+    pub is_refused: bool,
+    /// Why its newest scan is not, or not as it should be, in the newest map: "late", "ahead", "silent"; else empty.
+    pub left_out: String,
+    /// Covered share of its newest revolution.
+    pub completeness: Option<f32>,
+    /// Name of the clock in use.
+    pub clock: String,
+    /// Time by which the host's clock is ahead of the sensor's, in ms.
+    pub clock_offset_ms: i64,
+    /// Width of the sectors that have lost their returns, in degrees.
+    pub blocked_deg: f64,
+    /// Height (m), pitch and roll (degrees) by which the ground contradicts the configured mount, if it does.
+    pub mount: Option<[f64; 3]>,
+}
+
+/// One thing that is wrong.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Finding {
+    /// How bad it is.
+    pub state: State,
+    /// What it is, in words.
+    pub text: String,
+}
+
+/// The assessment of one vehicle, with what is remembered between two of them.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Health {
+    state: State,
+    reasons: Vec<String>,
+    /// Since when a better state lasts.
+    better_since: Option<Duration>,
+    /// True once a state was better than the first.
+    was_better: bool,
+    is_lossy: bool,
+}
+
+impl Health {
+    /// Assesses the vehicle at `facts.up`, which never goes back. True if the state has changed.
+    pub fn update(&mut self, facts: &Facts) -> bool {
+        self.is_lossy = facts.loss > if self.is_lossy { LOSS_ENDS } else { LOSS_WARNS };
+        let findings = findings(facts, self.is_lossy);
+        let found = findings.first().map_or(State::Ok, |worst| worst.state);
+        let before = self.state;
+        if found >= self.state {
+            self.better_since = None;
+        } else {
+            let since = *self.better_since.get_or_insert(facts.up);
+            // The first maps of a server are no recovery.
+            if self.was_better && facts.up.saturating_sub(since) < BETTER_AFTER {
+                return false;
+            }
+            (self.was_better, self.better_since) = (true, None);
+        }
+        self.state = found;
+        self.reasons = findings.into_iter().map(|finding| finding.text).collect();
+        self.state != before
+    }
+
+    /// The state.
+    pub fn state(&self) -> State {
+        self.state
+    }
+
+    /// Why it is not `ok`, worst first.
+    pub fn reasons(&self) -> &[String] {
+        &self.reasons
+    }
+}
+
+/// Everything that is wrong, worst first; equally bad things in the order of the data's way.
+fn findings(facts: &Facts, is_lossy: bool) -> Vec<Finding> {
+    let mut findings = Vec::new();
+    let mut add = |state, text: String| findings.push(Finding { state, text });
+    if let Some(fault) = &facts.fault {
+        add(State::Error, fault.clone());
+    }
+    silence(facts, &mut add);
+    staleness(facts, &mut add);
+    for sensor in &facts.sensors {
+        sensor_findings(sensor, &mut add);
+    }
+    if is_lossy {
+        add(State::Warn, format!("{:.1} % of the packets of the last 10 s were lost or refused", 100.0 * facts.loss));
+    }
+    if let Some(problem) = &facts.recorder_problem {
+        add(State::Warn, format!("recorder: {problem}"));
+    }
+    for server in &facts.claimed_by {
+        add(State::Warn, format!("server {server} serves a vehicle of the same name"));
+    }
+    findings.sort_by_key(|finding| std::cmp::Reverse(finding.state));
+    findings
+}
+
+/// Sensors of which nothing arrives. One of several is a warning, because the others make maps.
+fn silence(facts: &Facts, add: &mut impl FnMut(State, String)) {
+    if facts.is_replay_ended {
+        return;
+    }
+    if facts.sensors.iter().all(|sensor| sensor.silent.is_none() && !sensor.is_refused) {
+        let names = facts.sensors.iter().map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", ");
+        let from = if names.is_empty() { String::new() } else { format!(" from {names}") };
+        add(State::Error, format!("no packets{from} since the server started {} ago", seconds(facts.up)));
+        return;
+    }
+    let is_silent = |sensor: &SensorFacts| sensor.silent.unwrap_or(facts.up) > SILENT_AFTER;
+    let state = if facts.sensors.iter().all(is_silent) { State::Error } else { State::Warn };
+    for sensor in facts.sensors.iter().filter(|sensor| is_silent(sensor)) {
+        let (name, refused) = (&sensor.name, if sensor.is_refused { "readable " } else { "" });
+        add(
+            state,
+            match sensor.silent {
+                Some(silent) => format!("no {refused}packets from {name} for {}", seconds(silent)),
+                None => format!("no {refused}packets from {name} since the server started {} ago", seconds(facts.up)),
+            },
+        );
+    }
+}
+
+fn staleness(facts: &Facts, add: &mut impl FnMut(State, String)) {
+    if !facts.makes_maps {
+        return;
+    }
+    if facts.is_replay_ended {
+        add(State::Warn, "the replay has ended".to_owned());
+    }
+    let Some(age) = facts.map_age else {
+        return add(State::Error, "no map yet".to_owned());
+    };
+    if facts.has_recorded_stamps {
+        add(State::Warn, "maps are replayed with the stamps of the recording: readers call them stale".to_owned());
+    }
+    if age > facts.validity {
+        let is_long = age > facts.validity + STALE_ERROR_AFTER;
+        let state = if is_long { State::Error } else { State::Warn };
+        add(state, format!("the newest map is {} old, and valid for {}", seconds(age), seconds(facts.validity)));
+    }
+}
+
+fn sensor_findings(sensor: &SensorFacts, add: &mut impl FnMut(State, String)) {
+    let name = &sensor.name;
+    let is_silent = sensor.silent.is_none_or(|silent| silent > SILENT_AFTER);
+    if let Some([height_m, pitch_deg, roll_deg]) = sensor.mount {
+        let place = if height_m < 0.0 { "above" } else { "below" };
+        let tilt = if pitch_deg.abs().max(roll_deg.abs()) < 0.5 {
+            String::new()
+        } else {
+            format!(", and is tilted by {pitch_deg:+.1} deg in pitch and {roll_deg:+.1} deg in roll")
+        };
+        let height = height_m.abs();
+        add(State::Warn, format!("the ground lies {height:.1} m {place} the configured mount of {name}{tilt}"));
+    }
+    if is_silent {
+        return;
+    }
+    if !sensor.left_out.is_empty() {
+        add(State::Warn, format!("{name} is left out of the newest map: its scan is {}", sensor.left_out));
+    }
+    if let Some(completeness) = sensor.completeness.filter(|share| *share < COMPLETENESS_MIN) {
+        add(State::Warn, format!("{name} covers {:.0} % of its revolution", 100.0 * completeness));
+    }
+    if sensor.blocked_deg > 0.0 {
+        add(State::Warn, format!("{:.0} deg of {name} are blocked", sensor.blocked_deg));
+    }
+    if sensor.clock == "holdover" || sensor.clock == "gps_unlocked" {
+        add(State::Warn, format!("the clock of {name} is {}", sensor.clock));
+    }
+    if sensor.clock_offset_ms.abs() > CLOCK_OFFSET_MS_MAX {
+        let offset_s = sensor.clock_offset_ms as f64 / 1e3;
+        add(State::Warn, format!("the host's clock is {offset_s:+.1} s ahead of that of {name}"));
+    }
+}
+
+/// A duration for people: tenths of a second below ten seconds.
+fn seconds(duration: Duration) -> String {
+    let seconds = duration.as_secs_f64();
+    if seconds < 9.95 { format!("{seconds:.1} s") } else { format!("{seconds:.0} s") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const fn ms(ms: u64) -> Duration {
+        Duration::from_millis(ms)
+    }
+
+    fn sensor(name: &str, silent_ms: u64) -> SensorFacts {
+        SensorFacts {
+            name: name.into(),
+            silent: Some(ms(silent_ms)),
+            completeness: Some(1.0),
+            clock: "device".into(),
+            ..SensorFacts::default()
+        }
+    }
+
+    fn fine() -> Facts {
+        Facts {
+            up: ms(60_000),
+            makes_maps: true,
+            map_age: Some(ms(90)),
+            validity: ms(300),
+            sensors: vec![sensor("top", 1), sensor("rear", 2)],
+            ..Facts::default()
+        }
+    }
+
+    fn words(facts: &Facts) -> Vec<(&'static str, String)> {
+        findings(facts, facts.loss > LOSS_WARNS).into_iter().map(|of| (of.state.as_str(), of.text)).collect()
+    }
+
+    #[test]
+    fn nothing_is_wrong_with_fresh_maps_of_whole_scans() {
+        assert_eq!(words(&fine()), []);
+    }
+
+    #[test]
+    fn each_thing_that_is_wrong_has_its_words() {
+        type Change = fn(&mut Facts);
+        let cases: [(&str, &str, Change); 16] = [
+            ("error", "the engine has hung for 4 s", |f| f.fault = Some("the engine has hung for 4 s".into())),
+            ("warn", "no packets from rear for 76 s", |f| f.sensors[1].silent = Some(ms(76_000))),
+            ("warn", "no packets from rear since the server started 60 s ago", |f| f.sensors[1].silent = None),
+            ("warn", "no readable packets from rear for 5.0 s", |f| {
+                (f.sensors[1].silent, f.sensors[1].is_refused) = (Some(ms(5000)), true);
+            }),
+            ("error", "no map yet", |f| f.map_age = None),
+            ("warn", "the newest map is 0.4 s old, and valid for 0.3 s", |f| f.map_age = Some(ms(400))),
+            ("error", "the newest map is 1.4 s old, and valid for 0.3 s", |f| f.map_age = Some(ms(1400))),
+            ("warn", "maps are replayed with the stamps of the recording: readers call them stale", |f| {
+                f.has_recorded_stamps = true;
+            }),
+            ("warn", "the ground lies 0.4 m below the configured mount of top", |f| {
+                f.sensors[0].mount = Some([0.4, 0.1, 0.0]);
+            }),
+            (
+                "warn",
+                "the ground lies 0.2 m above the configured mount of top, and is tilted by -2.0 deg in pitch and +0.0 \
+                 deg in roll",
+                |f| f.sensors[0].mount = Some([-0.2, -2.0, 0.0]),
+            ),
+            ("warn", "rear is left out of the newest map: its scan is late", |f| f.sensors[1].left_out = "late".into()),
+            ("warn", "top covers 72 % of its revolution", |f| f.sensors[0].completeness = Some(0.72)),
+            ("warn", "the clock of top is holdover", |f| f.sensors[0].clock = "holdover".into()),
+            ("warn", "4.2 % of the packets of the last 10 s were lost or refused", |f| f.loss = 0.042),
+            ("warn", "recorder: the disk is too slow", |f| f.recorder_problem = Some("the disk is too slow".into())),
+            ("warn", "server b serves a vehicle of the same name", |f| f.claimed_by = vec!["b".into()]),
+        ];
+        for (state, text, change) in cases {
+            let mut facts = fine();
+            change(&mut facts);
+            assert_eq!(words(&facts), [(state, text.to_owned())]);
+        }
+    }
+
+    #[test]
+    fn the_worst_stands_first() {
+        let mut facts = fine();
+        facts.loss = 0.5;
+        facts.map_age = Some(ms(9000));
+        facts.sensors.iter_mut().for_each(|sensor| sensor.silent = Some(ms(9000)));
+        let states: Vec<_> = words(&facts).into_iter().map(|(state, _)| state).collect();
+        assert_eq!(states, ["error", "error", "error", "warn"]);
+    }
+
+    #[test]
+    fn a_vehicle_without_any_packet_is_an_error_that_says_so() {
+        let never = SensorFacts { silent: None, completeness: None, ..sensor("top", 0) };
+        let facts = Facts { sensors: vec![never], map_age: None, ..fine() };
+        let text = "no packets from top since the server started 60 s ago".to_owned();
+        assert_eq!(words(&facts), [("error", text), ("error", "no map yet".to_owned())]);
+        let mut health = Health::default();
+        assert!(!health.update(&facts));
+        assert_eq!(health.state(), State::Error);
+    }
+
+    /// Plays a script of what was observed at which time; returns the state after each line.
+    fn play(script: &[(u64, fn(&mut Facts))]) -> Vec<&'static str> {
+        let mut health = Health::default();
+        let mut step = |(at, change): &(u64, fn(&mut Facts))| {
+            let mut facts = fine();
+            facts.up = ms(*at);
+            change(&mut facts);
+            health.update(&facts);
+            health.state().as_str()
+        };
+        script.iter().map(&mut step).collect()
+    }
+
+    #[test]
+    fn a_state_gets_worse_at_once_and_better_after_three_seconds() {
+        let script: [(u64, fn(&mut Facts)); 11] = [
+            (0, |f| (f.map_age, f.sensors[0].silent, f.sensors[1].silent) = (None, None, None)),
+            (200, |_| {}),
+            (1000, |f| f.map_age = Some(ms(400))),
+            (1200, |f| f.map_age = Some(ms(2000))),
+            (1400, |f| f.map_age = Some(ms(400))),
+            (4200, |f| f.map_age = Some(ms(400))),
+            (4400, |f| f.map_age = Some(ms(400))),
+            (4600, |_| {}),
+            (6000, |f| f.map_age = Some(ms(400))),
+            (6200, |_| {}),
+            (9300, |_| {}),
+        ];
+        let states = ["error", "ok", "warn", "error", "error", "error", "warn", "warn", "warn", "warn", "ok"];
+        assert_eq!(play(&script), states);
+    }
+
+    #[test]
+    fn loss_warns_above_one_percent_and_until_it_is_below_half_a_percent() {
+        let script: [(u64, fn(&mut Facts)); 7] = [
+            (0, |_| {}),
+            (1000, |f| f.loss = 0.009),
+            (2000, |f| f.loss = 0.011),
+            (9000, |f| f.loss = 0.009),
+            (20_000, |f| f.loss = 0.006),
+            (30_000, |f| f.loss = 0.004),
+            (33_000, |f| f.loss = 0.009),
+        ];
+        assert_eq!(play(&script), ["ok", "ok", "warn", "warn", "warn", "warn", "ok"]);
+    }
+}

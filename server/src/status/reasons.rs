@@ -1,0 +1,53 @@
+//! The reasons that metrics show with 0 before they occur, so that the first occurrence is a rise.
+
+/// Reasons for which packets and scans are refused; each has a series before it occurs, so that a rate is known then.
+pub const PACKET_REASONS: [&str; 18] = [
+    "azimuth",
+    "block_flag",
+    "calibration",
+    "device_time",
+    "duplicate",
+    "late",
+    "length",
+    "model",
+    "nmea",
+    "no_returns",
+    "observation",
+    "scan_lengths",
+    "scan_offset",
+    "sensor",
+    "source",
+    "stamp",
+    "stamp_range",
+    "telemetry",
+];
+/// Reasons for which messages are no observations.
+pub const OBSERVATION_REASONS: [&str; 13] = [
+    "body",
+    "columns",
+    "message",
+    "message_length",
+    "missing",
+    "packed",
+    "packets",
+    "points",
+    "ros_frame",
+    "ros_frames",
+    "ros_kind",
+    "ros_message",
+    "stamp_ahead",
+];
+/// Reasons for which a listener refuses or closes connections and calls.
+pub const CLOSE_REASONS: [&str; 11] = [
+    "accept_error",
+    "calls",
+    "denied",
+    "handshake",
+    "handshake_timeout",
+    "idle",
+    "made_room",
+    "no_request",
+    "over_limit",
+    "over_limit_timeout",
+    "stalled",
+];

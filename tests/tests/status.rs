@@ -1,0 +1,131 @@
+//! The status of a vehicle over gRPC and HTTP, and its metrics, alerts and dashboard as Prometheus' own tools see them.
+
+mod fixture;
+
+use std::io::Write;
+use std::process::{Command, Stdio};
+
+use clearway_proto::v1;
+use fixture::{config, feed, grpc, readings, start, within};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+
+/// Sends a plain HTTP request; returns its status line and its body.
+async fn ask(address: std::net::SocketAddr, path: &str) -> (String, String) {
+    let mut stream = tokio::net::TcpStream::connect(address).await.unwrap();
+    let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n");
+    stream.write_all(request.as_bytes()).await.unwrap();
+    let mut answer = Vec::new();
+    within("an answer", stream.read_to_end(&mut answer)).await.unwrap();
+    let answer = String::from_utf8(answer).unwrap();
+    let (head, body) = answer.split_once("\r\n\r\n").unwrap();
+    (head.lines().next().unwrap().to_owned(), body.to_owned())
+}
+
+/// Runs promtool with this input; panics with what it says if it is not content.
+fn promtool(arguments: &[&str], input: &str) {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/prometheus");
+    let mut tool = Command::new("promtool");
+    tool.args(arguments).current_dir(folder).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut tool = tool.spawn().unwrap();
+    tool.stdin.take().unwrap().write_all(input.as_bytes()).unwrap();
+    let output = tool.wait_with_output().unwrap();
+    let said = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
+    // `check metrics` has an exit code for errors alone, and prints a line for each thing that is not as it should be.
+    assert!(output.status.success() && (arguments[1] != "metrics" || said.is_empty()), "{arguments:?}: {said}{input}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_vehicle_that_never_had_a_packet_is_alive_not_ready_and_says_why() {
+    let mut config = config();
+    config.page.enabled = true;
+    let running = start(config).await;
+    let page = running.page.unwrap();
+    assert_eq!(ask(page, "/healthz").await, ("HTTP/1.1 200 OK".to_owned(), "ok\n".to_owned()));
+    let (head, body) = ask(page, "/readyz").await;
+    assert!(head.starts_with("HTTP/1.1 503") && body.starts_with("vehicle car: no packets from "), "{head} {body}");
+
+    let mut client = grpc(&running).await;
+    let mut updates = client.watch_status(v1::WatchStatusRequest::default()).await.unwrap().into_inner();
+    let first = within("a status", updates.message()).await.unwrap().unwrap().vehicles.remove(0);
+    assert_eq!((first.name.as_str(), first.state.as_str(), first.map_age_ms), ("car", "error", None));
+    assert!(first.reasons[0].starts_with("no packets from "), "{:?}", first.reasons);
+
+    let maps = feed(&running, readings(3)).await;
+    let newest = loop {
+        let update = within("a status", updates.message()).await.unwrap().unwrap();
+        assert!(update.sent_ns > 0);
+        match update.vehicles.into_iter().next().unwrap() {
+            vehicle if vehicle.maps == maps => break vehicle,
+            _ => continue,
+        }
+    };
+    // The simulated drive is an old one, so its maps are stale.
+    assert!(newest.reasons[0].starts_with("the newest map is "), "{:?}", newest.reasons);
+    assert!(newest.map_bytes > 0.0 && newest.map_rate_hz > 0.0, "{newest:?}");
+    assert!(newest.latency_ms["map"] > 0.0 && newest.latency_ms["encode"] > 0.0, "{:?}", newest.latency_ms);
+    let (_, body) = ask(page, "/vehicles").await;
+    let json: serde_json::Value = serde_json::from_str(&body).unwrap();
+    assert_eq!(json[0]["state"], "error");
+    assert_eq!(json[0]["readers"]["ros"], 0);
+    assert_eq!(json[0]["pose"], serde_json::Value::Null);
+
+    let refused = client.watch_status(v1::WatchStatusRequest { vehicles: vec!["bus".into()] }).await.unwrap_err();
+    assert!(refused.message().contains("bus") && refused.message().contains("car"), "{refused}");
+    drop(updates);
+    running.shutdown().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_promtool), ignore = "needs promtool: apt-get install prometheus")]
+async fn promtool_finds_nothing_wrong_with_the_metrics_of_a_server() {
+    let mut config = config();
+    config.page.enabled = true;
+    let running = start(config).await;
+    for _ in 0..2 {
+        let (_, metrics) = ask(running.page.unwrap(), "/metrics").await;
+        promtool(&["check", "metrics"], &metrics);
+        feed(&running, readings(2)).await;
+    }
+    running.shutdown().await.unwrap();
+}
+
+#[test]
+#[cfg_attr(not(clearway_promtool), ignore = "needs promtool: apt-get install prometheus")]
+fn every_alert_is_sound_fires_and_clears() {
+    promtool(&["check", "config", "prometheus.yml"], "");
+    promtool(&["check", "rules", "alerts.yml"], "");
+    promtool(&["test", "rules", "alerts.test.yml"], "");
+    let read = |file: &str| {
+        std::fs::read_to_string(format!("{}/../deploy/prometheus/{file}", env!("CARGO_MANIFEST_DIR"))).unwrap()
+    };
+    let (rules, tests) = (read("alerts.yml"), read("alerts.test.yml"));
+    let alerts: Vec<_> = rules.lines().filter_map(|line| line.trim().strip_prefix("- alert: ")).collect();
+    assert!(alerts.len() >= 10, "{alerts:?}");
+    for alert in alerts {
+        assert_eq!(tests.matches(&format!("alertname: {alert}\n")).count(), 3, "{alert}: before, firing, cleared");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_dashboard_and_the_alerts_use_metrics_that_a_server_has() {
+    let mut config = config();
+    config.page.enabled = true;
+    let running = start(config).await;
+    feed(&running, readings(3)).await;
+    let (_, metrics) = ask(running.page.unwrap(), "/metrics").await;
+    running.shutdown().await.unwrap();
+    for file in ["grafana/clearway.json", "prometheus/alerts.yml"] {
+        let file = format!("{}/../deploy/{file}", env!("CARGO_MANIFEST_DIR"));
+        let text = std::fs::read_to_string(&file).unwrap();
+        let words = text.split(|c: char| !c.is_ascii_alphanumeric() && c != '_');
+        let used: std::collections::BTreeSet<_> =
+            words.filter(|word| word.starts_with("clearway_") || word.starts_with("process_")).collect();
+        // Of a recording server and of a sensor that has seen its ground.
+        let absent_here = |name: &&&str| name.starts_with("clearway_recorder_") || name.starts_with("clearway_mount_");
+        for name in used.iter().filter(|name| !absent_here(name)) {
+            let is_there = metrics.lines().any(|line| line.split(['{', ' ']).next() == Some(*name));
+            assert!(is_there, "{file}: {name} is no metric: {metrics}");
+        }
+        assert!(used.len() >= 8, "{used:?}");
+    }
+}
