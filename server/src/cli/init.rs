@@ -289,7 +289,7 @@ fn configuration(vehicle: &str, sensors: &[Found], place: &str) -> String {
         );
         text += "[vehicle.sensor.extrinsics]\n\
             # Measure these: the position relative to the point on the ground under the vehicle's reference point (x\n\
-            # forward, y left), and where the sensor's y axis points (0: forward).\nx_m = 0.0\ny_m = 0.0\nyaw_deg = 0.0\n";
+            # forward, y left), and where azimuth 0 of the sensor points (0: forward, 90: left).\nx_m = 0.0\ny_m = 0.0\nyaw_deg = 0.0\n";
         match &sensor.mount {
             Ok(mount) => {
                 let [pitch, pitch_std, roll, roll_std] =

@@ -1,5 +1,5 @@
 //! The layers of a configuration, of which the later ones replace keys of the earlier ones: `[vehicle_defaults]`, each
-//! `[[vehicle]]`, environment variables and `--set`. Each value keeps where it was given.
+//! `[[vehicle]]`, environment variables and `--set`. Each value keeps the place at which it was given.
 
 use std::collections::BTreeMap;
 use std::path::Path;
