@@ -35,7 +35,7 @@ install -D -m 644 deploy/systemd/clearway.sysusers "$package/usr/lib/sysusers.d/
 "$binary" completions zsh | install -D -m 644 /dev/stdin "$package/usr/share/zsh/vendor-completions/_clearway"
 doc=$package/usr/share/doc/clearway
 install -D -m 644 deploy/README.md "$doc/README.md"
-install -D -m 644 LICENSE "$doc/copyright"
+install -D -m 644 deploy/debian/copyright "$doc/copyright"
 {
     printf 'clearway (%s) stable; urgency=medium\n\n  * See CHANGELOG.md of the sources.\n\n' "$version"
     printf ' -- The Clearway developers <clearway@localhost>  %s\n' "$(date -u -R -d "@$SOURCE_DATE_EPOCH")"

@@ -76,7 +76,7 @@ fn the_guide_of_the_first_sensor_leads_to_a_map() {
         }
     }
     // `init` does not replace the file that it has written.
-    script += "! clearway init --seconds 1\n";
+    script += "if clearway init --seconds 1; then exit 1; fi\n";
     let printed = follow(folder.path(), &script);
     let config = fs::read_to_string(folder.path().join("clearway.toml")).expect("init wrote it");
     assert!(config.contains("model = \"vlp16\"\n") && config.contains("top = \"127.0.0.1\"\n"), "{config}");
@@ -97,7 +97,7 @@ fn the_guide_of_a_fleet_with_tls_leads_through_the_router_to_a_map() {
     let router = venv::script("router.py");
     let words: Vec<_> =
         [router.get_program()].into_iter().chain(router.get_args()).map(|word| word.to_string_lossy()).collect();
-    _ = writeln!(script, "zenohd() {{ {} \"$2\"; }}", words.join(" "));
+    _ = writeln!(script, "zenohd() {{ exec {} \"$2\"; }}", words.join(" "));
     let python = venv::client(&workspace());
     for (language, block) in &blocks {
         match (language.as_str(), block.split_whitespace().next()) {
@@ -114,10 +114,9 @@ fn the_guide_of_a_fleet_with_tls_leads_through_the_router_to_a_map() {
                 let tls = "--ca certificates/ca.pem --cert certificates/reader.pem --key certificates/reader.key";
                 _ = writeln!(script, "{} 2>serve.log &\nwait_until $! clearway vehicles {tls}", block.trim());
                 // The vehicle listens nowhere that others could reach; the router does.
-                script +=
-                    "ss --no-header --listening --tcp --udp --numeric --processes | grep clearway | tee listening\n";
-                script += "! grep -v '127.0.0.1:' listening\n";
-                script += "! clearway vehicles --ca certificates/ca.pem\n";
+                script += "ss --no-header --listening --tcp --udp --numeric --processes | grep \"pid=$pid,\" | tee listening\n";
+                script += "if grep -v ' 127.0.0.1:' listening; then exit 1; fi\n";
+                script += "if clearway vehicles --ca certificates/ca.pem; then exit 1; fi\n";
             }
             _ => script += block,
         }

