@@ -1,13 +1,16 @@
-# !/bin/sh Makes a CA for trying out TLS, and certificates of it: a server's (localhost) and one for each role. Not for
+#!/bin/sh
+# Makes a CA for trying out TLS, and certificates of it: a server's (localhost) and one for each role. Not for
 # production: the CA's key lies beside them, and nothing can be revoked.
 #
-#   deploy/make-test-ca.sh FOLDER [DAYS]
+#   deploy/make-test-ca.sh FOLDER [DAYS [NAMES]]
 #
+# NAMES are further names of the server, such as DNS:clearway-router,DNS:vehicle.local,IP:192.168.1.10.
 # Gives FOLDER/ca.pem, and {server,reader,ingester,operator}.{pem,key}. Needs openssl.
 set -eu
 
-folder=${1:?usage: make-test-ca.sh FOLDER [DAYS]}
+folder=${1:?usage: make-test-ca.sh FOLDER [DAYS [NAMES]]}
 days=${2:-30}
+names=DNS:localhost,IP:127.0.0.1${3:+,$3}
 umask 077
 mkdir -p "$folder"
 cd "$folder"
@@ -29,7 +32,7 @@ certificate() { # name, extended key usage, alternative names
     rm "$1.csr" "$1.ext"
 }
 
-certificate server serverAuth,clientAuth DNS:localhost,IP:127.0.0.1
+certificate server serverAuth,clientAuth "$names"
 for role in reader ingester operator; do
     certificate "$role" clientAuth "DNS:$role"
 done

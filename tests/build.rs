@@ -6,6 +6,7 @@
 //! | `clearway_data` | recorded drives with an `INDEX.md`: `$CLEARWAY_DATA`, else `shared/data` beside the repository |
 //! | `clearway_python` | `python3` with the modules `venv` and `ensurepip` |
 //! | `clearway_openssl` | `openssl`, with which `deploy/make-test-ca.sh` makes certificates |
+//! | `clearway_deploy` | the tools that lint and start `deploy/`: those of [`DEPLOY`], as root |
 //! | `clearway_browser` | `chromium` and `chromedriver` |
 //! | `clearway_promtool` | `promtool`, which comes with Prometheus |
 //!
@@ -15,6 +16,19 @@
 use std::env;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+
+/// Programs that lint and start what `deploy/` holds, with an argument that makes each end at once with success.
+const DEPLOY: [(&str, &[&str]); 8] = [
+    ("systemd-analyze", &["--version"]),
+    ("shellcheck", &["--version"]),
+    ("kubectl", &["version", "--client"]),
+    ("buildah", &["--version"]),
+    ("mmdebstrap", &["--version"]),
+    ("strip", &["--version"]),
+    ("ip", &["-Version"]),
+    // Only root may make namespaces.
+    ("unshare", &["--mount", "--net", "true"]),
+];
 
 fn main() {
     println!("cargo::rerun-if-env-changed=CLEARWAY_DATA");
@@ -35,6 +49,8 @@ fn main() {
     set("clearway_python", succeeds("python3", &["-c", "import venv, ensurepip"]));
     set("clearway_openssl", succeeds("openssl", &["version"]));
     set("clearway_promtool", succeeds("promtool", &["--version"]));
+    let can_deploy = DEPLOY.iter().all(|(program, arguments)| succeeds(program, arguments));
+    set("clearway_deploy", can_deploy && succeeds("python3", &["-c", "import venv, ensurepip"]));
     set("clearway_browser", succeeds("chromium", &["--version"]) && succeeds("chromedriver", &["--version"]));
 }
 

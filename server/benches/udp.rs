@@ -10,6 +10,7 @@ use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
 use clearway::config::{Config, Udp};
+use clearway::held_sockets::HeldSockets;
 use clearway::ingest::{queue::event_queue, udp};
 use clearway_mapping::event::Body;
 use clearway_mapping::ledger::Ledger;
@@ -32,7 +33,7 @@ fn main() {
     let mut config = Config::of_one_vehicle("car", "top");
     let any = "127.0.0.1:0".parse().expect("an address");
     config.vehicles[0].udp = Some(Udp { data: any, telemetry: any, ..Udp::default() });
-    let sockets = udp::Sockets::bind(&config.vehicles).expect("free ports");
+    let sockets = udp::Sockets::bind(&config.vehicles, &mut HeldSockets::default()).expect("free ports");
     let (data, _) = sockets.addresses(0).expect("a socket");
     let (queue, events) = event_queue(config.vehicles[0].queue);
     let threads = sockets.start(std::slice::from_ref(&queue)).expect("threads");

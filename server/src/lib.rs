@@ -20,7 +20,8 @@
 //! | [`server`] | starts and stops all of these |
 //! | [`cli`] | the subcommands of `clearway` |
 //!
-//! At the ground, used by all: [`clock`], `sync`, `counted`, [`directory`], `file_advice`, `zenoh_session`.
+//! At the ground, used by all: [`clock`], `sync`, `counted`, [`directory`], `file_advice`, [`held_sockets`],
+//! `zenoh_session`.
 
 pub mod acknowledgements;
 pub mod cli;
@@ -31,6 +32,7 @@ pub mod directory;
 pub mod encode;
 pub mod engine;
 mod file_advice;
+pub mod held_sockets;
 pub mod ingest;
 pub mod newest;
 pub mod publish;

@@ -7,18 +7,13 @@ use std::process::Command;
 
 use clearway::server::Running;
 use fixture::certificates::{self, behind, certificates, router};
-use fixture::venv::{copy_of_client, environment, fingerprint, run};
+use fixture::venv::{self, run};
 use fixture::{config, feed, readings, start, until, within};
 
 const REPOSITORY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
 
-/// Interpreter of an environment with the client of this tree. It is made again only if the client changes.
 fn python() -> PathBuf {
-    let repository = Path::new(REPOSITORY).canonicalize().expect("the repository");
-    environment("python-client", &fingerprint(&repository), |environment| {
-        let client = copy_of_client(&repository, environment);
-        vec![format!("{}[zenoh,signed,recording,test]", client.display()).into()]
-    })
+    venv::client(Path::new(REPOSITORY))
 }
 
 /// A server with some maps that requires client certificates, behind a router that requires them too.

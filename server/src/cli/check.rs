@@ -5,13 +5,14 @@ use clap::Args;
 
 use super::configuration::ConfigurationOptions;
 use super::output::print;
-use crate::config::COMMENTED;
+use crate::config::{COMMENTED, Config};
 
 /// The first lines of the configuration that is printed.
-const HEAD: &str = "# Every value that this configuration has, given or default. Optional tables that it does not have \
-    are not here.\n# `clearway check --default` prints them too, and what each key means.\n\n";
+const HEAD: &str = "# Every value that this configuration has. A comment says where it was given: a line of the file (and \
+    whether the\n# vehicle has it from [vehicle_defaults]), an environment variable, or --set. A value without a comment \
+    is a default.\n# Optional tables that the configuration does not have are not here.\n# `clearway check --default` prints them too, and what each key means.\n\n";
 
-/// Check a configuration file and print it with every default.
+/// Check a configuration file and print it with every default, and where each other value was given.
 ///
 /// With --default, print instead the default configuration with an explanation of every key; optional keys and tables
 /// are comments in it.
@@ -41,6 +42,6 @@ pub fn run(options: &Options) -> Result<()> {
     let config = configuration.load()?;
     config.calibrations(&configuration.config)?;
     config.certificates(&configuration.config)?;
-    print(&format!("{HEAD}{}", config.to_toml()))?;
+    print(&format!("{HEAD}{}", Config::explain(&configuration.config, &configuration.overrides())?))?;
     Ok(())
 }

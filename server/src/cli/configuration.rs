@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use clearway_mapping::config::Extrinsics;
 
-use crate::config::{Config, ConfigError, Origin};
+use crate::config::{Config, ConfigError, Origin, of_environment};
 
 /// The options that name a configuration file and override its keys.
 #[derive(Args)]
@@ -14,7 +14,9 @@ pub struct ConfigurationOptions {
     /// with every key explained.
     #[arg(short, long, value_name = "FILE", default_value_os_t = default_file())]
     pub config: PathBuf,
-    /// Override a key of the configuration, such as grpc.listen=0.0.0.0:50051; may be given several times.
+    /// Override a key of the configuration, such as grpc.listen=0.0.0.0:50051 or vehicle[car2].queue=4096; may be given
+    /// several times. The environment variable CLEARWAY__GRPC__LISTEN=0.0.0.0:50051 does the same; this option takes
+    /// precedence.
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
 }
@@ -26,9 +28,17 @@ impl ConfigurationOptions {
     /// # Errors
     /// [`ConfigError`].
     pub fn load(&self) -> Result<Config, ConfigError> {
-        let config = Config::load(&self.config, &self.set)?;
+        let config = Config::load(&self.config, &self.overrides())?;
         config.check_exposure(&Origin::file(&self.config))?;
         Ok(config)
+    }
+
+    /// The overrides of the environment, and then those of the options, which take precedence.
+    pub fn overrides(&self) -> Vec<String> {
+        let variables = std::env::vars_os();
+        let variables =
+            variables.filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)));
+        of_environment(variables).into_iter().chain(self.set.iter().cloned()).collect()
     }
 }
 

@@ -11,6 +11,7 @@
 //! | `verify` | recordings -> whether each map is the map of its events, or what a change changes in the maps |
 //! | [`evaluate`] | labelled scans, simulated scenes -> precision and recall of each map |
 //! | `check` | a configuration -> the same with every default |
+//! | `init` | sensors that send, or a capture -> a first configuration |
 //! | `watch`, `get` | a server -> a line for each map; the newest map as a file |
 //! | `vehicles` | a server -> the state of its vehicles |
 //! | `status`, `top` | a server -> the states of its vehicles, once and live |
@@ -29,10 +30,12 @@
 //! | file | in -> out |
 //! |---|---|
 //! | `configuration` | options -> a configuration, extrinsics |
+//! | `ground_revolutions` | revolutions -> those from which a mount is estimated |
 //! | `model` | the name of a sensor model -> the model |
 //! | `connection` | options -> a connected client |
 //! | `exit` | the exit codes |
 //! | `files` | paths -> open files, or errors that say what to do |
+//! | `service_manager` | a running server -> what systemd is told |
 //! | `output` | text -> stdout; progress bar, runtime, signals, errors of usage |
 
 mod check;
@@ -46,8 +49,10 @@ mod exit;
 mod export;
 mod files;
 mod get;
+mod ground_revolutions;
 mod info;
 mod ingest;
+mod init;
 mod model;
 mod output;
 mod recorder;
@@ -57,6 +62,7 @@ mod repair;
 pub mod replay;
 mod send;
 mod serve;
+mod service_manager;
 #[cfg(feature = "sim")]
 mod simulate;
 mod status;
@@ -116,6 +122,7 @@ enum Command {
     Verify(verify::Options),
     Evaluate(evaluate::Options),
     Check(check::Options),
+    Init(init::Options),
     Watch(watch::Options),
     Get(get::Options),
     Vehicles(vehicles::Options),
@@ -139,7 +146,7 @@ enum Command {
 /// The subcommands by purpose, as `clearway --help` lists them.
 const GROUPS: [(&str, &[&str]); 8] = [
     ("Make maps", &["demo", "serve", "replay", "transport"]),
-    ("Check maps and configurations", &["verify", "evaluate", "check"]),
+    ("Check maps and configurations", &["verify", "evaluate", "check", "init"]),
     ("Read maps from a server", &["watch", "get", "vehicles", "status", "top"]),
     ("Control a server", &["recorder"]),
     ("Read files", &["export", "info", "repair"]),
@@ -201,6 +208,7 @@ fn run(command: Command) -> Result<Exit> {
         Command::Verify(options) => return verify::run(&options),
         Command::Evaluate(options) => evaluate::run(&options)?,
         Command::Check(options) => check::run(&options)?,
+        Command::Init(options) => init::run(&options)?,
         Command::Watch(options) => return watch::run(&options),
         Command::Get(options) => return get::run(&options),
         Command::Vehicles(options) => vehicles::run(&options)?,

@@ -1,17 +1,20 @@
 //! `clearway serve`: a configuration file -> a server that runs until a signal.
 
-use anyhow::{Result, anyhow};
+use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::configuration::ConfigurationOptions;
 use super::output::{block_on, stop_signal};
+use super::service_manager;
 use crate::config::Config;
+use crate::held_sockets::HeldSockets;
 use crate::server::{Running, Server, Setup, ShutdownError};
 
 /// Listen for sensor data, make maps and publish them, until SIGINT or SIGTERM.
 ///
-/// SIGHUP reads certificates, tokens, roles and limits again.
+/// SIGHUP reads certificates, tokens, roles and limits again. Under systemd it reports when it is ready and that it
+/// lives, and uses the sockets that systemd holds.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway serve
@@ -27,10 +30,11 @@ pub struct Options {
 /// [`ConfigError`](crate::config::ConfigError), [`StartError`](crate::server::StartError), and
 /// [`ShutdownError`](crate::server::ShutdownError) at the end.
 pub fn run(options: &Options) -> Result<()> {
-    block_on(serve(&options.configuration))
+    let held = HeldSockets::from_environment().context("LISTEN_FDS: a socket of the service manager")?;
+    block_on(serve(&options.configuration, held))
 }
 
-async fn serve(configuration: &ConfigurationOptions) -> Result<()> {
+async fn serve(configuration: &ConfigurationOptions, held_sockets: HeldSockets) -> Result<()> {
     let file = &configuration.config;
     let config = configuration.load()?;
     let calibrations = config.calibrations(file)?;
@@ -40,19 +44,22 @@ async fn serve(configuration: &ConfigurationOptions) -> Result<()> {
     // Before the server starts, so that a signal during the start ends it in order.
     let stop = stop_signal()?;
     let mut hangups = signal(SignalKind::hangup())?;
-    let running =
-        Server::start(Setup { config: config.clone(), calibrations, certificates, ..Setup::default() }).await?;
+    let setup = Setup { config: config.clone(), calibrations, certificates, held_sockets, ..Setup::default() };
+    let running = Server::start(setup).await?;
     log_endpoints(&running);
+    service_manager::ready();
     tokio::pin!(stop);
     loop {
         tokio::select! {
             () = &mut stop => break,
+            () = service_manager::report_life(&running) => {}
             _ = hangups.recv() => match reload(&running, configuration, &config) {
                 Ok(()) => tracing::info!("certificates, tokens, roles and limits are read again"),
                 Err(error) => tracing::error!("nothing is changed: {error:#}"),
             }
         }
     }
+    service_manager::stopping();
     tracing::info!("stopping");
     let ended = running.shutdown_in_time().await;
     if let Err(error @ ShutdownError::Deadline { .. }) = &ended {

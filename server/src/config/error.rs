@@ -37,7 +37,7 @@ pub enum Origin {
         /// Number of the line, if it is known.
         line: Option<usize>,
     },
-    /// In options of the command line, such as `--set grpc.listen=abc`.
+    /// In options of the command line or in environment variables, such as `--set grpc.listen=abc`.
     Options(Vec<String>),
 }
 
@@ -82,17 +82,25 @@ pub enum ConfigError {
         source: Box<toml::de::Error>,
     },
     /// An override is not `key=value`.
-    #[error("--set {text}: expected KEY=VALUE, such as grpc.listen=\"0.0.0.0:50051\"")]
+    #[error("{option}: expected KEY=VALUE, such as grpc.listen=\"0.0.0.0:50051\"")]
     Override {
-        /// The override.
-        text: String,
+        /// The option or the variable.
+        option: String,
     },
     /// The key of an override goes on below a value that is no table.
-    #[error("--set {text}: {key} is not a table, so that it has no keys")]
+    #[error("{option}: {key} is not a table, so that it has no keys")]
     NotTable {
-        /// The override.
-        text: String,
+        /// The option or the variable.
+        option: String,
         /// The key that is no table.
+        key: String,
+    },
+    /// The key of an override names an item of a list that there is not.
+    #[error("{option}: there is no {key}; in brackets stands the name of a vehicle or sensor, or its index from 0")]
+    NotThere {
+        /// The option or the variable.
+        option: String,
+        /// The key with the name in brackets.
         key: String,
     },
     /// A table has no such key.

@@ -2,7 +2,7 @@
 //!
 //! An error names where the key was given (the file and its line, or the option), the key, its value and what is
 //! allowed. Calibration files are read here too, so that no socket is opened before the whole configuration is valid.
-//! `deploy/clearway.toml` holds every key with its default.
+//! `deploy/clearway.toml` holds every key with its default. `layers` says which value holds if several places give one.
 
 use std::collections::BTreeSet;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -14,12 +14,17 @@ use serde::{Deserialize, Serialize};
 
 use crate::file_advice::advised;
 use error::{ValueError, beside};
-use read::{Problem, Refusal, plain_key};
+use layers::Layers;
+use overrides::{blamed, matching, set};
+use read::{Problem, Refusal};
 
 mod connections;
 mod error;
+mod explain;
 mod grpc;
+mod layers;
 mod listeners;
+mod overrides;
 mod read;
 mod recorder;
 mod ros;
@@ -34,6 +39,7 @@ pub use error::{ConfigError, Origin};
 pub(crate) use grpc::secret;
 pub use grpc::{Access, Certificates, Grpc, Only, Tls};
 pub use listeners::{Listener, Route, listeners};
+pub use overrides::of_environment;
 pub use recorder::{Compression, Recorder, SaveRule};
 pub use ros::Ros;
 pub use store::Store;
@@ -135,9 +141,7 @@ impl Config {
     /// # Errors
     /// [`ConfigError::Read`] if the file cannot be read, and the errors of [`Config::parse`].
     pub fn load(file: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(file)
-            .map_err(|source| ConfigError::Read { file: file.to_owned(), source: advised(file, source) })?;
-        Self::parse(&text, file, overrides)
+        Self::parse(&text_of(file)?, file, overrides)
     }
 
     /// Like [`Config::load`], from a text; errors name `file`.
@@ -148,16 +152,16 @@ impl Config {
     /// [`ConfigError::MissingKey`] and [`ConfigError::Value`] for the first key or value that is not allowed.
     pub fn parse(text: &str, file: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
         let syntax = |source| ConfigError::Syntax { file: file.to_owned(), source: Box::new(source) };
-        let mut table: toml::Table = toml::from_str(text).map_err(syntax)?;
-        let config: Self = read::from_text(text, &table).map_err(|refusal| {
-            let line = refusal.at.map(|at| 1 + text[..at].matches('\n').count());
-            refused(refusal, Origin::File { file: file.to_owned(), line })
-        })?;
+        let table: toml::Table = toml::from_str(text).map_err(syntax)?;
+        let config = Self::of_file(text, &table, file)?;
         if overrides.is_empty() {
             config.check(&Origin::file(file))?;
             return Ok(config);
         }
-        overrides.iter().try_for_each(|text| set(&mut table, text))?;
+        let mut layers = Layers::of_file(text, &table, file);
+        overrides.iter().try_for_each(|text| set(&mut layers, text))?;
+        inherit(&mut layers, |key| Origin::Options(blamed(overrides, key)))?;
+        let table = layers.into_table();
         let blamed = |key: &str| Origin::Options(blamed(overrides, key));
         let overridden: Self = read::from_table(&table).map_err(|refusal| {
             // A key is missing because an override begins its table.
@@ -173,6 +177,39 @@ impl Config {
             error.at(&origin)
         })?;
         Ok(overridden)
+    }
+
+    /// The configuration of the file alone; its values are not checked yet.
+    fn of_file(text: &str, table: &toml::Table, file: &Path) -> Result<Self, ConfigError> {
+        let origin = |line| Origin::File { file: file.to_owned(), line };
+        if !table.contains_key(layers::DEFAULTS) {
+            return read::from_text(text, table).map_err(|refusal| {
+                let line = refusal.at.map(|at| 1 + text[..at].matches('\n').count());
+                refused(refusal, origin(line))
+            });
+        }
+        let mut layers = Layers::of_file(text, table, file);
+        let first = layers.origin(layers::DEFAULTS).unwrap_or(origin(None));
+        inherit(&mut layers, |_| first.clone())?;
+        read::from_table(&layers.clone().into_table()).map_err(|refusal| {
+            let origin = layers.origin(&refusal.key).unwrap_or(origin(None));
+            refused(refusal, origin)
+        })
+    }
+
+    /// The configuration as TOML, with every default, and behind each other value where it was given.
+    ///
+    /// # Errors
+    /// As [`Config::load`].
+    pub fn explain(file: &Path, overrides: &[String]) -> Result<String, ConfigError> {
+        let text = text_of(file)?;
+        let config = Self::parse(&text, file, overrides)?;
+        // The text has been parsed, and its layers have been merged.
+        let table: toml::Table = toml::from_str(&text).unwrap_or_default();
+        let mut layers = Layers::of_file(&text, &table, file);
+        overrides.iter().try_for_each(|text| set(&mut layers, text))?;
+        inherit(&mut layers, |_| Origin::file(file))?;
+        Ok(explain::explained(&config.to_toml(), &layers.given()))
     }
 
     /// Checks that nothing is served to other hosts without protection, unless `connections.unprotected` names it. For
@@ -275,6 +312,16 @@ impl Config {
     }
 }
 
+fn text_of(file: &Path) -> Result<String, ConfigError> {
+    std::fs::read_to_string(file)
+        .map_err(|source| ConfigError::Read { file: file.to_owned(), source: advised(file, source) })
+}
+
+/// Gives every vehicle what it has from `[vehicle_defaults]`.
+fn inherit(layers: &mut Layers, origin: impl FnOnce(&str) -> Origin) -> Result<(), ConfigError> {
+    layers.inherit().map_err(|(key, value, allowed)| ConfigError::Value { origin: origin(&key), key, value, allowed })
+}
+
 /// The error for a key or value that was given at `origin`.
 fn refused(refusal: Refusal, origin: Origin) -> ConfigError {
     let Refusal { key, problem, .. } = refusal;
@@ -283,52 +330,6 @@ fn refused(refusal: Refusal, origin: Origin) -> ConfigError {
         Problem::Missing => ConfigError::MissingKey { origin, key },
         Problem::Value { value, allowed } => ConfigError::Value { origin, key, value, allowed },
     }
-}
-
-/// The overrides that set `key`, a table with that key, or a key of that table.
-fn matching<'a>(overrides: &'a [String], key: &str) -> impl Iterator<Item = &'a String> {
-    let key = plain_key(key);
-    let is_within = |inner: &str, outer: &str| {
-        inner.strip_prefix(outer).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
-    };
-    overrides.iter().filter(move |text| {
-        let path = text.split('=').next().unwrap_or(text).trim();
-        is_within(path, &key) || is_within(&key, path)
-    })
-}
-
-/// The options that an error at `key` is due to: the last override of that key, or all if none sets it.
-fn blamed(overrides: &[String], key: &str) -> Vec<String> {
-    let option = |text: &String| format!("--set {text}");
-    match matching(overrides, key).last() {
-        Some(text) => vec![option(text)],
-        None => overrides.iter().map(option).collect(),
-    }
-}
-
-/// Applies the override `a.b=value`; the value is TOML, or a bare string.
-fn set(table: &mut toml::Table, text: &str) -> Result<(), ConfigError> {
-    let wrong = || ConfigError::Override { text: text.to_owned() };
-    let (path, value) = text.split_once('=').ok_or_else(wrong)?;
-    let value = match toml::from_str::<toml::Table>(&format!("v = {value}")) {
-        Ok(mut parsed) => parsed.remove("v").ok_or_else(wrong)?,
-        Err(_) => toml::Value::String(value.to_owned()),
-    };
-    let keys: Vec<&str> = path.trim().split('.').collect();
-    let (last, before) = keys.split_last().filter(|_| keys.iter().all(|key| !key.is_empty())).ok_or_else(wrong)?;
-    let mut place = table;
-    for (index, key) in before.iter().enumerate() {
-        let not_table = || ConfigError::NotTable { text: text.to_owned(), key: keys[..=index].join(".") };
-        let slot = place.entry(*key).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        // `vehicle.udp.data` means the first vehicle: the common case has one.
-        let slot = match slot {
-            toml::Value::Array(items) => items.first_mut().ok_or_else(not_table)?,
-            other => other,
-        };
-        place = slot.as_table_mut().ok_or_else(not_table)?;
-    }
-    place.insert((*last).to_owned(), value);
-    Ok(())
 }
 
 impl Config {

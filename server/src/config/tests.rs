@@ -367,3 +367,65 @@ fn a_reload_changes_certificates_roles_and_limits_and_nothing_else() {
         assert_ne!(config(fixed).without_reloaded(&old), old, "{fixed}");
     }
 }
+
+/// Three vehicles with common keys; `third` has two sensors of its own.
+const FLEET: &str = "[vehicle_defaults]\nqueue = 64\n[vehicle_defaults.udp]\ndata = \"127.0.0.1:0\"\n\
+    [[vehicle_defaults.sensor]]\nname = \"top\"\nmodel = \"vlp16\"\n[vehicle_defaults.sensor.extrinsics]\nx_m = 0.0\n\
+    y_m = 0.0\nz_m = 1.9\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n[[vehicle]]\nname = \"first\"\n[[vehicle]]\n\
+    name = \"second\"\nqueue = 128\n[vehicle.udp]\nreceive_buffer_bytes = 65536\n[[vehicle]]\nname = \"third\"\n\
+    [[vehicle.sensor]]\nname = \"rear\"\nextrinsics = { x_m = -1, y_m = 0, z_m = 1, roll_deg = 0, pitch_deg = 0, \
+    yaw_deg = 180 }\n[[vehicle.sensor]]\nname = \"top\"\nextrinsics = { z_m = 2.5 }\n";
+
+#[test]
+fn vehicles_have_the_keys_of_the_defaults_that_they_do_not_have_themselves() {
+    let config = parse(FLEET).unwrap();
+    let [first, second, third] = &config.vehicles[..] else { panic!("{config:?}") };
+    assert_eq!([first.queue, second.queue, third.queue], [64, 128, 64]);
+    let [udp, of_second] = [first, second].map(|vehicle| vehicle.udp.clone().unwrap());
+    assert_eq!((udp.data.port(), of_second.data.port(), of_second.receive_buffer_bytes), (0, 0, 65536));
+    assert_eq!(first.sensors, second.sensors);
+    let named: Vec<_> = third.sensors.iter().map(|sensor| (&*sensor.name, sensor.model.is_some())).collect();
+    assert_eq!(named, [("rear", false), ("top", true)]);
+    assert_eq!((third.sensors[1].extrinsics.z_m, first.sensors[0].extrinsics.z_m), (2.5, 1.9));
+}
+
+#[test]
+fn wrong_defaults_are_named_with_their_line_and_the_vehicle() {
+    for (of, wrong, said) in [
+        ("queue = 64", "queue = \"many\"", ", line 2: vehicle.queue (of first) = \"many\": allowed: a whole number"),
+        ("z_m = 1.9", "z = 1.9", ", line 11: vehicle.sensor[0].extrinsics.z (of first) is not a key"),
+        ("queue = 64", "name = \"car\"", ", line 2: vehicle_defaults.name = \"car\": allowed: no name"),
+        ("queue = 128", "queue = 3", ": vehicle.queue (of second) = 3: allowed: 16 to 1048576"),
+    ] {
+        let refused = error(&FLEET.replacen(of, wrong, 1));
+        assert!(refused.starts_with(&format!("configuration clearway.toml{said}")), "{refused}");
+    }
+    let refused = error(&format!("vehicle_defaults = 1\n{NEEDED}"));
+    assert!(refused.ends_with("line 1: vehicle_defaults = (no table): allowed: one table: write [vehicle_defaults]"));
+}
+
+#[test]
+fn variables_and_options_override_keys_of_all_vehicles_or_of_one() {
+    let variables = [
+        ("CLEARWAY__VEHICLE_DEFAULTS__QUEUE", "32"),
+        ("CLEARWAY__GRPC__LISTEN", "127.0.0.1:1"),
+        ("CLEARWAY__PAGE__LISTEN", "127.0.0.1:2"),
+        ("CLEARWAY_CONFIG", "a.toml"),
+    ];
+    let mut overrides = of_environment(variables.iter().map(|(name, value)| (name.to_string(), value.to_string())));
+    let options = ["page.listen=127.0.0.1:3", "vehicle[third].queue=256", "vehicle[2].sensor[top].rpm=600"];
+    overrides.extend(options.map(str::to_owned));
+    let config = Config::parse(FLEET, Path::new("a.toml"), &overrides).unwrap();
+    assert_eq!(config.vehicles.iter().map(|vehicle| vehicle.queue).collect::<Vec<_>>(), [32, 128, 256]);
+    assert_eq!((config.grpc.listen.port(), config.page.listen.port()), (1, 3), "an option comes after a variable");
+    let rpm: Vec<_> = config.vehicles[2].sensors.iter().map(|sensor| sensor.rpm).collect();
+    assert_eq!(rpm, [None, Some(600.0)]);
+    let refused = |text: &str| Config::parse(FLEET, Path::new("a.toml"), &[text.to_owned()]).unwrap_err().to_string();
+    assert!(
+        refused("vehicle[fourth].queue=1").starts_with("--set vehicle[fourth].queue=1: there is no vehicle[fourth];")
+    );
+    let start = "$CLEARWAY__GRPC__LISTE=1: grpc.liste is not a key; its table has: enabled, listen";
+    assert!(refused("$CLEARWAY__GRPC__LISTE=1").starts_with(start), "{}", refused("$CLEARWAY__GRPC__LISTE=1"));
+    let start = "--set vehicle_defaults.queue=3: vehicle.queue (of first) = 3: allowed: 16";
+    assert!(refused("vehicle_defaults.queue=3").starts_with(start), "{}", refused("vehicle_defaults.queue=3"));
+}

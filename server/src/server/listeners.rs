@@ -6,6 +6,7 @@ use tokio::net::TcpListener;
 
 use super::setup::StartError;
 use crate::config::Config;
+use crate::held_sockets::HeldSockets;
 use crate::publish::foxglove;
 use crate::publish::listen::security::Security;
 use crate::publish::listen::{AllPlaces, Limits, Listener, ListenerHandle, Protocol};
@@ -27,21 +28,21 @@ pub(super) struct Listeners {
 }
 
 impl Listeners {
-    /// Listens on all addresses that the configuration enables.
+    /// Listens on all addresses that the configuration enables, at the held sockets where there are some.
     ///
     /// # Errors
     /// [`StartError::Listen`] with the first address that cannot be listened on.
-    pub async fn bind(config: &Config, security: &Security) -> Result<Self, StartError> {
+    pub async fn bind(config: &Config, security: &Security, held: &mut HeldSockets) -> Result<Self, StartError> {
         let (security, all) = (security.clone(), AllPlaces::default());
         let mut listeners =
             Self { grpc: None, page: None, metrics: None, foxglove: None, security, handles: vec![], all };
         let (grpc, page, metrics, foxglove) = (&config.grpc, &config.page, &config.metrics, &config.foxglove);
         let web = Protocol::Web(&[]);
         let for_foxglove = Protocol::Web(foxglove::ORIGINS);
-        listeners.grpc = listeners.add("grpc", grpc.enabled, grpc.listen, Protocol::Grpc, config).await?;
-        listeners.page = listeners.add("page", page.enabled, page.listen, web, config).await?;
-        listeners.metrics = listeners.add("metrics", metrics.enabled, metrics.listen, web, config).await?;
-        let added = listeners.add("foxglove", foxglove.enabled, foxglove.listen, for_foxglove, config);
+        listeners.grpc = listeners.add("grpc", grpc.enabled, grpc.listen, Protocol::Grpc, config, held).await?;
+        listeners.page = listeners.add("page", page.enabled, page.listen, web, config, held).await?;
+        listeners.metrics = listeners.add("metrics", metrics.enabled, metrics.listen, web, config, held).await?;
+        let added = listeners.add("foxglove", foxglove.enabled, foxglove.listen, for_foxglove, config, held);
         listeners.foxglove = added.await?;
         Ok(listeners)
     }
@@ -53,11 +54,16 @@ impl Listeners {
         at: SocketAddr,
         protocol: Protocol,
         config: &Config,
+        held: &mut HeldSockets,
     ) -> Result<Option<Listener>, StartError> {
         if !is_enabled {
             return Ok(None);
         }
-        let socket = TcpListener::bind(at).await.map_err(|source| StartError::Listen { what: name, at, source })?;
+        let socket = match held.take_tcp(at) {
+            Some(socket) => socket.set_nonblocking(true).and_then(|()| TcpListener::from_std(socket)),
+            None => TcpListener::bind(at).await,
+        };
+        let socket = socket.map_err(|source| StartError::Listen { what: name, at, source })?;
         let calls = (config.connections.calls_max, config.connections.calls_per_address_max);
         let (listener, handle) =
             Listener::new(socket, protocol, limits(name, config), calls, self.security.clone(), &self.all);

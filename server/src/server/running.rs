@@ -78,6 +78,11 @@ impl Running {
         self.replay.clone()
     }
 
+    /// What of the vehicles has stopped or hangs, as `/healthz` says it; `None` if nothing has.
+    pub fn fault(&self) -> Option<String> {
+        self.vehicles.statuses().iter().find_map(|status| status.fault())
+    }
+
     /// True if the TCP listeners have certificates.
     pub fn is_encrypted(&self) -> bool {
         self.listeners.as_ref().is_some_and(|(security, _)| security.current().tls.is_some())

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use crate::config::{Calibrations, Certificates, Config};
 use crate::engine::Observer;
+use crate::held_sockets::HeldSockets;
 use crate::ingest::udp;
 use crate::record::writer::{IncompleteRecordingError, RecordError};
 use crate::replay::ReplayHandle;
@@ -32,6 +33,8 @@ pub struct Setup {
     pub observer: Option<Observer>,
     /// True if the caller steps the engines ([`Running::stepped`](super::Running::stepped)); else each has a thread.
     pub is_stepped: bool,
+    /// Sockets that a service manager holds; their services use them and bind none.
+    pub held_sockets: HeldSockets,
     /// Controls the replay; offered to clients if the server has one.
     pub replay: Option<ReplayHandle>,
 }

@@ -20,6 +20,7 @@ use super::setup::{Setup, StartError};
 use super::uploads;
 use crate::config::{self, Certificates, Config, Vehicle, listeners};
 use crate::engine::{Engine, Observer};
+use crate::held_sockets::HeldSockets;
 use crate::ingest::gateway::{Gateway, Gateways};
 use crate::ingest::grpc::Ingest;
 use crate::ingest::queue::{EventQueue, QueuedEvent, event_queue};
@@ -68,7 +69,8 @@ impl Server {
         running.vehicles = Vehicles(prepared.iter().map(|prepared| prepared.served.clone()).collect());
         let header = || header(&config, &calibrations, boot_id, &setup.config_comments, setup.metadata);
         let driver = Driver { from_files: setup.from_files, is_stepped: setup.is_stepped };
-        match running.start_all(&config, setup.certificates, prepared, driver, header).await {
+        let given = (setup.certificates, setup.held_sockets);
+        match running.start_all(&config, given, prepared, driver, header).await {
             Ok(()) => Ok(running),
             Err(error) => {
                 // The caller needs the error of the start, not one of the shutdown that follows from it.
@@ -124,18 +126,21 @@ impl Running {
     async fn start_all(
         &mut self,
         config: &Config,
-        certificates: Option<Certificates>,
+        (certificates, mut held): (Option<Certificates>, HeldSockets),
         prepared: Vec<Prepared>,
         driver: Driver,
         header: impl FnOnce() -> Header,
     ) -> Result<(), StartError> {
         // Before the recorder: a port in use must not overwrite an earlier recording.
         let current = Current::new(config, certificates.as_ref()).map_err(StartError::Certificates)?;
-        let listeners = Listeners::bind(config, &Security::new(current)).await?;
-        let sockets = udp::Sockets::bind(&config.vehicles).map_err(|source| StartError::Udp {
+        let listeners = Listeners::bind(config, &Security::new(current), &mut held).await?;
+        let sockets = udp::Sockets::bind(&config.vehicles, &mut held).map_err(|source| StartError::Udp {
             vehicle: config.vehicles[source.vehicle].name.as_str().into(),
             source,
         })?;
+        held.unused()
+            .for_each(|socket| tracing::warn!(%socket, "the service manager holds a socket that no service uses"));
+        drop(held);
         let gateways = self.gateways(config);
         #[cfg(feature = "zenoh")]
         if config.zenoh.enabled {

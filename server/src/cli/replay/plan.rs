@@ -8,7 +8,6 @@ use std::sync::Arc;
 
 use clearway_lidar::Sensor;
 use clearway_lidar::calibration::Calibration;
-use clearway_lidar::revolution::{Echo, Revolution};
 use clearway_mapping::config::{Extrinsics, MapsConfig, SENSORS_MAX, SensorConfig, TimeConfig};
 use clearway_mapping::event::{Body, Scan};
 use clearway_mapping::scan_file::ScanFormat;
@@ -19,6 +18,7 @@ use super::clouds::{Clouds, Written};
 use super::options::{Options, ReplayError};
 use super::recordings::{Recorded, check_sensors, several_vehicles};
 use super::summary::{Mount, describe};
+use crate::cli::ground_revolutions::{GroundRevolutions, points_of};
 use crate::config::{Calibrations, Config, Origin, Recorder};
 use crate::ingest::files::mcap::{McapError, McapOptions};
 use crate::ingest::files::{FilesError, Kind, Readings};
@@ -30,11 +30,6 @@ use crate::replay::faults::Faults;
 use crate::replay::timeline::{Timeline, Track};
 use crate::server::Setup;
 
-/// Number of revolutions from which the mount is estimated: the first of them follow each other, and between the others
-/// there are ten. Ours: a second at 600 rpm, which a short file has, and ten seconds more, in which the road changes.
-const MOUNT_REVOLUTIONS: usize = 20;
-const MOUNT_REVOLUTIONS_FIRST: usize = 10;
-const MOUNT_REVOLUTIONS_STEP: usize = 10;
 /// Height of a sensor above the ego frame's origin until its mount is given or estimated, in metres; ours, about the
 /// roof of a car.
 const MOUNT_HEIGHT_M: f64 = 2.0;
@@ -317,9 +312,8 @@ impl Known {
             from_files: true,
             config_comments: remarks,
             metadata: notes,
-            observer: None,
             is_stepped: true,
-            replay: None,
+            ..Setup::default()
         })
     }
 }
@@ -440,40 +434,24 @@ fn first_revolutions(
     calibration: Option<Calibration>,
 ) -> Result<Vec<Vec<[f32; 3]>>, ReplayError> {
     let mut sensor = Sensor::new(config.lidar(calibration, TimeConfig::default().ahead_ns_max()));
-    let (mut clouds, mut seen) = (Vec::new(), 0);
-    let mut push = |points: &dyn Fn() -> Vec<[f32; 3]>| {
-        if seen < MOUNT_REVOLUTIONS_FIRST || seen % MOUNT_REVOLUTIONS_STEP == 0 {
-            clouds.push(points());
-        }
-        seen += 1;
-        clouds.len() < MOUNT_REVOLUTIONS
-    };
+    let mut revolutions = GroundRevolutions::default();
     for reading in readings.filter(|reading| !matches!(reading, Ok(other) if other.source != 0)) {
         let reading = reading?;
         let needs_more = match &reading.body {
             // Refused datagrams are counted in the second pass, which makes the maps.
             Body::Datagram(payload) => match sensor.push(payload, reading.arrival_ns) {
-                Ok(Some(revolution)) => push(&|| points_of(revolution)),
+                Ok(Some(revolution)) => revolutions.push(|| points_of(revolution)),
                 Ok(None) | Err(_) => true,
             },
-            Body::Scan(scan) => push(&|| points_of_scan(scan)),
-            Body::End => sensor.finish().is_none_or(|revolution| push(&|| points_of(revolution))),
+            Body::Scan(scan) => revolutions.push(|| points_of_scan(scan)),
+            Body::End => sensor.finish().is_none_or(|revolution| revolutions.push(|| points_of(revolution))),
             Body::EgoPose(_) | Body::Road(_) | Body::Sensor(_) | Body::Lost { .. } => true,
         };
         if !needs_more {
             break;
         }
     }
-    Ok(clouds)
-}
-
-fn points_of(revolution: &Revolution) -> Vec<[f32; 3]> {
-    let echo = revolution.echoes.first();
-    let returned = |echo: &Echo| {
-        let slots = (0..echo.range_m.len()).filter(|&slot| echo.range_m[slot] > 0.0);
-        slots.map(|slot| [echo.x[slot], echo.y[slot], echo.z[slot]]).collect()
-    };
-    echo.map(returned).unwrap_or_default()
+    Ok(revolutions.into_clouds())
 }
 
 fn points_of_scan(scan: &Scan) -> Vec<[f32; 3]> {

@@ -16,6 +16,7 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
 
 use crate::config::{Listener, Vehicle, listeners};
+use crate::held_sockets::HeldSockets;
 use crate::ingest::queue::{EventQueue, QueueClosedError};
 
 mod receive;
@@ -39,13 +40,13 @@ pub struct BindError {
 }
 
 impl Sockets {
-    /// Binds the configured sockets of all vehicles. Logs a warning if the kernel allows a smaller receive buffer than
+    /// Takes the held sockets at the configured addresses of all vehicles, and binds the others. Logs a warning if the kernel allows a smaller receive buffer than
     /// configured.
     ///
     /// # Errors
     /// [`BindError`] for the first socket that cannot be bound.
-    pub fn bind(vehicles: &[Vehicle]) -> Result<Self, BindError> {
-        let bound = listeners(vehicles).into_iter().map(|listener| match bind(&listener) {
+    pub fn bind(vehicles: &[Vehicle], held: &mut HeldSockets) -> Result<Self, BindError> {
+        let bound = listeners(vehicles).into_iter().map(|listener| match bind(&listener, held) {
             Ok((socket, at)) => Ok((socket, at, listener)),
             Err(source) => Err(BindError { vehicle: listener.routes[0].vehicle, at: listener.at, source }),
         });
@@ -121,9 +122,14 @@ impl UdpThreads {
     }
 }
 
-fn bind(listener: &Listener) -> io::Result<(Socket, SocketAddr)> {
+fn bind(listener: &Listener, held: &mut HeldSockets) -> io::Result<(Socket, SocketAddr)> {
     let Listener { at, receive_buffer_bytes, groups, .. } = listener;
-    let socket = Socket::new(Domain::for_address(*at), Type::DGRAM, Some(Protocol::UDP))?;
+    let held = held.take_udp(*at).map(Socket::from);
+    let is_held = held.is_some();
+    let socket = match held {
+        Some(socket) => socket,
+        None => Socket::new(Domain::for_address(*at), Type::DGRAM, Some(Protocol::UDP))?,
+    };
     socket.set_recv_buffer_size(*receive_buffer_bytes)?;
     // Linux reports twice the requested size, because it adds as much for its own bookkeeping.
     let granted = socket.recv_buffer_size()? / 2;
@@ -132,18 +138,28 @@ fn bind(listener: &Listener) -> io::Result<(Socket, SocketAddr)> {
         tracing::warn!(%at, requested, granted, "receive buffer clamped: raise net.core.rmem_max");
     }
     socket.set_nonblocking(true)?;
-    if at.is_ipv6() {
+    if at.is_ipv6() && !is_held {
         // An IPv6 socket at [::] receives IPv4 too, with any setting of net.ipv6.bindv6only.
         socket.set_only_v6(false)?;
     }
-    socket.bind(&(*at).into())?;
+    if !is_held {
+        socket.bind(&(*at).into())?;
+    }
     for (group, interface) in groups {
-        join_group(&socket, *group, interface).map_err(|error| {
+        joined(join_group(&socket, *group, interface)).map_err(|error| {
             io::Error::new(error.kind(), format!("join {group} on interface {interface:?}: {error}"))
         })?;
     }
     let at = socket.local_addr()?.as_socket().ok_or(io::ErrorKind::AddrNotAvailable)?;
     Ok((socket, at))
+}
+
+/// A held socket has joined its groups before.
+fn joined(result: io::Result<()>) -> io::Result<()> {
+    match result {
+        Err(error) if error.kind() == io::ErrorKind::AddrInUse => Ok(()),
+        other => other,
+    }
 }
 
 fn join_group(socket: &Socket, group: IpAddr, interface: &str) -> io::Result<()> {

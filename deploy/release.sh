@@ -1,0 +1,64 @@
+#!/bin/sh
+# Makes everything that a release has, for this host's architecture.
+#
+#   deploy/release.sh FOLDER [BINARY]
+#
+# Gives in FOLDER:
+#   clearway-VERSION-ARCHITECTURE.tar.gz             the production build: the command, its units and configurations
+#   clearway-VERSION-ARCHITECTURE-v3.tar.gz          on x86-64 the same for processors with AVX2; the same maps
+#   clearway_VERSION_ARCHITECTURE.deb                the Debian package of the first
+#   clearway.cdx.json                                what is in it (CycloneDX)
+#   SHA256SUMS                                       checksums of all these; sha256sum --check SHA256SUMS
+#
+# With BINARY nothing is built: that binary is packed. Needs cargo, dpkg-deb, objdump and strip (binutils).
+set -eu
+
+mkdir -p "${1:?usage: release.sh FOLDER [BINARY]}"
+folder=$(realpath "$1")
+given=${2:+$(realpath "$2")}
+cd "$(dirname "$0")/.."
+SOURCE_DATE_EPOCH=$(git log -1 --format=%ct)
+export SOURCE_DATE_EPOCH
+architecture=$(uname -m)
+root=$(mktemp -d)
+trap 'rm -rf "$root"' EXIT
+
+build() { # processor, as rustc names it
+    RUSTFLAGS="-C target-cpu=$1" cargo build --release --locked --package clearway --no-default-features \
+        --features sqlite,store,zenoh --target-dir "target/release-$1"
+    echo "target/release-$1/release/clearway"
+}
+
+# Refuses a binary that needs more libraries than every Linux with glibc has.
+check_libraries() {
+    objdump -p "$1" | sed -n 's/^ *NEEDED *//p' | while read -r library; do
+        case $library in
+            libc.so.6 | libm.so.6 | libgcc_s.so.1 | libdl.so.2 | libpthread.so.0 | librt.so.1 | ld-linux-*) ;;
+            *) echo "$1 needs $library: allowed are libc, libm and libgcc_s" >&2 && exit 1 ;;
+        esac
+    done
+}
+
+archive() { # binary, suffix
+    version=$("$1" --version | cut -d ' ' -f 2)
+    name=clearway-$version-$architecture$2
+    install -D "$1" "$root/$name/bin/clearway"
+    strip --strip-unneeded "$root/$name/bin/clearway"
+    check_libraries "$root/$name/bin/clearway"
+    cp -R LICENSE README.md CHANGELOG.md SECURITY.md deploy "$root/$name"
+    tar -C "$root" --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$SOURCE_DATE_EPOCH" -c "$name" |
+        gzip -9n >"$folder/$name.tar.gz"
+}
+
+case $architecture in x86_64) plain=x86-64 ;; *) plain=generic ;; esac
+binary=${given:-$(build "$plain")}
+archive "$binary" ""
+if [ "$architecture" = x86_64 ] && [ -z "$given" ]; then
+    faster=$(build x86-64-v3)
+    archive "$faster" -v3
+fi
+deploy/debian/make-deb.sh "$binary" "$folder"
+deploy/make-sbom.sh "$folder"
+cd "$folder"
+sha256sum -- *.tar.gz *.deb *.cdx.json >SHA256SUMS
+cat SHA256SUMS

@@ -1,0 +1,152 @@
+//! The guides of deploy/README.md, followed in a network of their own.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::os::unix::fs::symlink;
+use std::path::Path;
+use std::process::Command;
+
+use clearway_tests::{binaries, workspace};
+
+use super::{said, venv};
+
+/// The blocks of code of one section of the README: their language and their text, in order.
+fn blocks(section: &str) -> Vec<(String, String)> {
+    let readme = fs::read_to_string(workspace().join("deploy/README.md")).expect("deploy/README.md");
+    let heading = format!("## {section}\n");
+    let (_, text) = readme.split_once(&heading).unwrap_or_else(|| panic!("no section {section:?}"));
+    let text = text.split("\n## ").next().unwrap_or(text);
+    let mut blocks: Vec<(String, String)> = Vec::new();
+    let mut is_inside = false;
+    for line in text.lines() {
+        match line.strip_prefix("```") {
+            Some(language) if !is_inside => blocks.push((language.to_owned(), String::new())),
+            None if is_inside => {
+                let (_, block) = blocks.last_mut().expect("it has begun");
+                _ = writeln!(block, "{line}");
+            }
+            _ => {}
+        }
+        is_inside ^= line.starts_with("```");
+    }
+    blocks
+}
+
+/// Starts the test: a network with a loopback interface and nothing else, and programs that end with the script.
+const HEAD: &str = "set -eu
+ip link set lo up
+trap 'kill $(jobs -p) 2>/dev/null' EXIT
+wait_until() { # pid, command
+    pid=$1
+    shift
+    until \"$@\" >/dev/null 2>&1; do kill -0 \"$pid\"; done
+}
+";
+/// Sends what a VLP-16 sends that stands on flat ground, 1.9 m over it.
+const SENSOR: &str = "clearway simulate flat --sensor vlp16 --seconds 600 --to udp://127.0.0.1:2368 \
+    --telemetry-to udp://127.0.0.1:8308 2>simulate.log &
+";
+
+/// Runs a script in a network namespace and in this folder.
+fn follow(folder: &Path, script: &str) -> String {
+    symlink(workspace().join("deploy"), folder.join("deploy")).expect("a link of ours");
+    fs::write(folder.join("guide.sh"), format!("{HEAD}{script}")).expect("a file of ours");
+    let path = format!("{}:{}", binaries().display(), std::env::var("PATH").unwrap_or_default());
+    let mut command = Command::new("timeout");
+    command.args(["300", "unshare", "--net", "bash", "guide.sh"]).current_dir(folder).env("PATH", path);
+    let output = command.output().expect("timeout");
+    assert!(output.status.success(), "{}\n{script}\n{}", output.status, said(&output));
+    said(&output)
+}
+
+#[test]
+#[cfg_attr(not(clearway_deploy), ignore = "needs the tools that .ci/run installs")]
+fn the_guide_of_the_first_sensor_leads_to_a_map() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut script = SENSOR.to_owned();
+    let blocks = blocks("A real Velodyne in ten minutes");
+    let commands: Vec<_> =
+        blocks.iter().filter(|(language, _)| language == "sh").flat_map(|(_, of)| of.lines()).collect();
+    assert_eq!(commands.len(), 5, "{commands:?}");
+    for command in commands {
+        // A running server keeps its terminal.
+        match command.starts_with("clearway serve") {
+            true => _ = writeln!(script, "{command} 2>serve.log &\nwait_until $! clearway get --layer drivability"),
+            false => _ = writeln!(script, "{command}"),
+        }
+    }
+    // `init` does not replace the file that it has written.
+    script += "if clearway init --seconds 1; then exit 1; fi\n";
+    let printed = follow(folder.path(), &script);
+    let config = fs::read_to_string(folder.path().join("clearway.toml")).expect("init wrote it");
+    assert!(config.contains("model = \"vlp16\"\n") && config.contains("top = \"127.0.0.1\"\n"), "{config}");
+    let height = config.lines().find_map(|line| line.strip_prefix("z_m = ")).expect("the height is estimated");
+    let height: f64 = height.parse().expect("a number");
+    assert!((height - 1.9).abs() < 0.05, "the sensor is 1.9 m over the ground, not {height} m");
+    assert!(printed.contains("exists, and is not overwritten"), "{printed}");
+    assert!(fs::metadata(folder.path().join("newest.png")).expect("a picture").len() > 1000);
+}
+
+#[test]
+#[cfg_attr(not(clearway_deploy), ignore = "needs the tools that .ci/run installs")]
+fn the_guide_of_a_fleet_with_tls_leads_through_the_router_to_a_map() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let blocks = blocks("A fleet with TLS from nothing");
+    let mut script = SENSOR.to_owned();
+    // zenoh's router from its Python package, instead of the program.
+    let router = venv::script("router.py");
+    let words: Vec<_> =
+        [router.get_program()].into_iter().chain(router.get_args()).map(|word| word.to_string_lossy()).collect();
+    _ = writeln!(script, "zenohd() {{ exec {} \"$2\"; }}", words.join(" "));
+    let python = venv::client(&workspace());
+    for (language, block) in &blocks {
+        match (language.as_str(), block.split_whitespace().next()) {
+            ("toml", _) => fs::write(folder.path().join("vehicle.toml"), block).expect("a file of ours"),
+            ("python", _) => {
+                fs::write(folder.path().join("planner.py"), block).expect("a file of ours");
+                _ = writeln!(script, "{} planner.py", python.display());
+            }
+            (_, Some("zenohd")) => {
+                let port = "bash -c '</dev/tcp/localhost/7447'";
+                _ = writeln!(script, "{} 2>router.log &\nwait_until $! {port}", block.trim());
+            }
+            _ if block.starts_with("clearway serve") => {
+                let tls = "--ca certificates/ca.pem --cert certificates/reader.pem --key certificates/reader.key";
+                _ = writeln!(script, "{} 2>serve.log &\nwait_until $! clearway vehicles {tls}", block.trim());
+                // The vehicle listens nowhere that others could reach; the router does.
+                script += "ss --no-header --listening --tcp --udp --numeric --processes | grep \"pid=$pid,\" | tee listening\n";
+                script += "if grep -v ' 127.0.0.1:' listening; then exit 1; fi\n";
+                script += "if clearway vehicles --ca certificates/ca.pem; then exit 1; fi\n";
+            }
+            _ => script += block,
+        }
+    }
+    let printed = follow(folder.path(), &script);
+    assert!(printed.lines().any(|line| line.ends_with(" False")), "a fresh map: {printed}");
+}
+
+#[test]
+fn the_example_of_the_configuration_is_valid_and_says_where_each_value_was_given() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (_, example) =
+        blocks("Configuration").into_iter().find(|(language, _)| language == "toml").expect("an example");
+    fs::write(folder.path().join("clearway.toml"), &example).expect("a file of ours");
+    let mut check = Command::new(binaries().join("clearway"));
+    check.args(["check", "--set", "vehicle[car2].queue=4096"]).current_dir(folder.path());
+    let output = check.env("CLEARWAY__PAGE__LISTEN", "127.0.0.1:8081").output().expect("clearway starts");
+    let text = said(&output);
+    assert!(output.status.success(), "{text}");
+    let line_of = |wanted: &str| 1 + example.lines().position(|line| line.starts_with(wanted)).expect("in the example");
+    let (first, second) = text.split_once("name = \"car2\"").expect("two vehicles");
+    for (part, line) in [
+        (first, "listen = \"127.0.0.1:8081\"  # $CLEARWAY__PAGE__LISTEN".to_owned()),
+        (first, "queue = 8192\n".to_owned()),
+        (first, format!("valid_ms = 250  # clearway.toml:{}, vehicle_defaults", line_of("valid_ms"))),
+        (first, format!("z_m = 1.9  # clearway.toml:{}, vehicle_defaults", line_of("z_m = 1.9"))),
+        (second, "queue = 4096  # --set vehicle[car2].queue".to_owned()),
+        (second, format!("model = \"vlp16\"  # clearway.toml:{}, vehicle_defaults", line_of("model"))),
+        (second, format!("z_m = 2.05  # clearway.toml:{}\n", line_of("z_m = 2.05"))),
+    ] {
+        assert!(part.contains(&line), "{line:?} in:\n{part}");
+    }
+}
