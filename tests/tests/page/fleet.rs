@@ -1,0 +1,241 @@
+//! The page of one vehicle that stops, of a server that goes and comes back, and of fifty vehicles. The vehicles send
+//! scans and poses over gRPC, which costs little: their maps are made of a few thousand points, once or more a second.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use clearway::config::Config;
+use clearway::server::{Running, Server, Setup};
+use clearway_client::{Client, Observation, now_ns};
+use tokio::runtime::Runtime;
+use tokio::task::JoinHandle;
+
+use crate::webdriver::Browser;
+
+const VEHICLES: usize = 50;
+/// A name that would be markup.
+const MARKUP: &str = "<img src=x onerror=\"document.title='taken'\"> & co";
+
+/// A server with these vehicles, without other sources than gRPC.
+fn config(names: &[String], page: SocketAddr) -> Config {
+    let mut config = Config::of_one_vehicle(&names[0], "top");
+    let any = "127.0.0.1:0".parse().expect("an address");
+    (config.grpc.listen, config.page.listen) = (any, page);
+    config.page.enabled = true;
+    config.zenoh.enabled = false;
+    config.vehicles[0].udp = None;
+    config.vehicles[0].sensors[0].extrinsics.z_m = 1.9;
+    let first = config.vehicles[0].clone();
+    config.vehicles = names
+        .iter()
+        .map(|name| {
+            let mut vehicle = first.clone();
+            vehicle.name.clone_from(name);
+            vehicle
+        })
+        .collect();
+    config
+}
+
+async fn serve(names: &[String], page: SocketAddr) -> Running {
+    let setup = Setup { config: config(names, page), ..Setup::default() };
+    Server::start(setup).await.expect("the server starts")
+}
+
+fn any() -> SocketAddr {
+    "127.0.0.1:0".parse().expect("an address")
+}
+
+/// A plain with a wall of 2 m ahead whose distance differs from vehicle to vehicle, in the sensor's frame.
+fn points(number: usize) -> [Vec<f32>; 3] {
+    let ground = (0..7200_u32).map(|ray| {
+        let (angle, range_m) = ((f64::from(ray) * 0.05).to_radians(), 3.0 + f64::from(ray % 20) * 1.5);
+        [angle.cos() * range_m, angle.sin() * range_m, -1.9]
+    });
+    let wall_m = 8.0 + (number % 10) as f64;
+    let wall = (0..2000_u32).map(|i| [wall_m, f64::from(i % 100) * 0.1 - 5.0, f64::from(i / 100) * 0.1 - 1.9]);
+    let points: Vec<[f64; 3]> = ground.chain(wall).collect();
+    [0, 1, 2].map(|axis| points.iter().map(|point| point[axis] as f32).collect())
+}
+
+/// Vehicles that drive until they are told to halt.
+struct Driving {
+    halt: Arc<AtomicBool>,
+    tasks: Vec<JoinHandle<()>>,
+}
+
+impl Driving {
+    /// Each vehicle sends its pose and a scan every `period`.
+    async fn start(running: &Running, names: &[String], period: Duration) -> Self {
+        let halt = Arc::new(AtomicBool::new(false));
+        let client = Client::connect(&running.grpc.expect("gRPC").to_string()).await.expect("gRPC answers");
+        let mut tasks = Vec::new();
+        for (number, name) in names.iter().enumerate() {
+            let mut ingester = client.ingest(name).await.expect("a stream");
+            let halt = halt.clone();
+            tasks.push(tokio::spawn(async move {
+                let [x, y, z] = points(number);
+                // Not all at one moment.
+                tokio::time::sleep(period.mul_f64((number % 10) as f64 / 10.0)).await;
+                let mut every = tokio::time::interval(period);
+                for step in 0_u32.. {
+                    every.tick().await;
+                    if halt.load(Ordering::Relaxed) {
+                        break;
+                    }
+                    let now_ns = now_ns();
+                    let at = [(number % 10) as f64 * 30.0 + f64::from(step) * 0.5, (number / 10) as f64 * 25.0, 0.0];
+                    let pose = Observation::pose(now_ns, at, [0.0, 0.0, 0.0, 1.0], number as f64 / 5.0);
+                    let scan = Observation::scan("top", now_ns, &x, &y, &z);
+                    if ingester.send(pose).await.is_err() || ingester.send(scan).await.is_err() {
+                        break;
+                    }
+                }
+            }));
+        }
+        Self { halt, tasks }
+    }
+
+    async fn halt(self) {
+        self.halt.store(true, Ordering::Relaxed);
+        for task in self.tasks {
+            task.await.expect("it drives without a fault");
+        }
+    }
+}
+
+fn shows(state: &str) -> String {
+    format!("return document.getElementById('freshness').textContent === {state:?}")
+}
+
+pub fn a_stopped_vehicle_is_stale() {
+    Runtime::new().expect("a runtime").block_on(async {
+        let names = ["car".to_owned()];
+        let running = serve(&names, any()).await;
+        let driving = Driving::start(&running, &names, Duration::from_millis(100)).await;
+        let browser = Browser::start(1440, 900);
+        browser.open(&format!("http://{}/", running.page.expect("a page")));
+        browser.until("FRESH", &shows("FRESH"));
+        driving.halt().await;
+        browser.until("STALE", &shows("STALE"));
+        browser.until(
+            "an age of seconds",
+            "return parseFloat(document.getElementById('age').textContent) >= 2 &&
+            document.getElementById('age').textContent.endsWith(' s')",
+        );
+        let newest = running.vehicles.0[0].newest.borrow().clone().expect("a map");
+        // The page and this test are on one machine, so the age by the wall clock is the true one.
+        let age = browser.run("return [parseFloat(document.getElementById('age').textContent), Date.now()]");
+        let (shown_s, now_ms) = (age[0].as_f64().expect("seconds"), age[1].as_f64().expect("a time"));
+        let true_s = now_ms / 1e3 - newest.capture_end_ns as f64 * 1e-9;
+        assert!((shown_s - true_s).abs() < 0.4, "the page shows {shown_s} s, and the age is {true_s} s");
+        let banner = browser.text("#stale");
+        assert!(banner.starts_with("STALE · "), "{banner}");
+        browser.screenshot("stale-1440x900");
+        assert_eq!(browser.console_errors(), Vec::<String>::new());
+        running.shutdown().await.expect("it ends well");
+    });
+}
+
+pub fn the_page_reconnects() {
+    Runtime::new().expect("a runtime").block_on(async {
+        let names = ["car".to_owned()];
+        let running = serve(&names, any()).await;
+        let page = running.page.expect("a page");
+        let driving = Driving::start(&running, &names, Duration::from_millis(200)).await;
+        let browser = Browser::start(1440, 900);
+        browser.open(&format!("http://{page}/"));
+        browser.until("FRESH", &shows("FRESH"));
+        driving.halt().await;
+        running.shutdown().await.expect("it ends well");
+        browser.until("lost", "return document.getElementById('link').dataset.phase === 'lost'");
+        browser.until("STALE", &shows("STALE"));
+        let running = serve(&names, page).await;
+        let driving = Driving::start(&running, &names, Duration::from_millis(200)).await;
+        browser.until("live", "return document.getElementById('link').dataset.phase === 'live'");
+        browser.until("FRESH", &shows("FRESH"));
+        driving.halt().await;
+        // The attempts to connect meanwhile are errors that a browser reports by itself.
+        let errors = browser.console_errors();
+        let others: Vec<_> = errors.iter().filter(|error| !error.contains("WebSocket")).collect();
+        assert!(others.is_empty(), "{others:?}");
+        running.shutdown().await.expect("it ends well");
+    });
+}
+
+pub fn fifty_vehicles_are_shown() {
+    Runtime::new().expect("a runtime").block_on(async {
+        let mut names: Vec<String> = (1..VEHICLES).map(|number| format!("shuttle {number}")).collect();
+        names.push(MARKUP.to_owned());
+        let running = serve(&names, any()).await;
+        let driving = Driving::start(&running, &names, Duration::from_secs(1)).await;
+        let browser = Browser::start(1440, 900);
+        browser.open(&format!("http://{}/", running.page.expect("a page")));
+        browser.until("all cards", &format!("return document.querySelectorAll('.card').length === {VEHICLES}"));
+        let in_sight = "[...document.querySelectorAll('.card')].filter((card) =>
+            card.getBoundingClientRect().top < innerHeight)";
+        let all_fresh = format!(
+            "const cards = {in_sight};
+            return cards.length > 8 && cards.every((card) => card.dataset.fresh === 'fresh')"
+        );
+        browser.until("fresh maps on the cards in sight", &all_fresh);
+        // Only the cards in sight cost the server anything.
+        let readers: u32 = running.vehicles.0.iter().map(|of| of.status.page_readers.load(Ordering::Relaxed)).sum();
+        assert!((8..VEHICLES as u32 - 5).contains(&readers), "maps of {readers} vehicles are sent");
+        // A name is a text.
+        assert_eq!(browser.run("return document.querySelectorAll('.card img').length"), 0);
+        assert_eq!(browser.run("return document.title"), "Fleet · Clearway");
+        let titles = browser.run("return [...document.querySelectorAll('.card strong')].map((e) => e.textContent)");
+        assert!(titles.as_array().expect("a list").iter().any(|title| title == MARKUP), "{titles}");
+        browser.until("the vehicles on the map", "return !document.getElementById('where').hidden");
+        browser.screenshot("fleet-1440x900");
+        is_smooth(&browser);
+        is_sorted_and_found(&browser);
+        // One vehicle, and back.
+        browser.click(".card:not([hidden])");
+        browser.until("one vehicle", "return document.body.dataset.view === 'vehicle'");
+        browser.until("a map", "return document.getElementById('freshness').textContent !== 'NO MAP YET'");
+        assert!(browser.url().ends_with("?vehicle=shuttle%2017"), "{}", browser.url());
+        browser.click(".crumbs a");
+        browser.until("the fleet", "return document.body.dataset.view === 'fleet'");
+        assert_eq!(browser.console_errors(), Vec::<String>::new());
+        drop(browser);
+        let phone = Browser::start_phone(390, 844);
+        phone.open(&format!("http://{}/?fleet", running.page.expect("a page")));
+        phone.until("fresh maps on the cards in sight", &all_fresh.replace("> 8", "> 1"));
+        phone.screenshot("fleet-390x844");
+        assert_eq!(phone.run("return document.documentElement.scrollWidth"), 390, "nothing is wider than the phone");
+        drop(phone);
+        driving.halt().await;
+        running.shutdown().await.expect("it ends well");
+    });
+}
+
+/// Scrolls from the first card to the last, and prints the time between display frames: a figure to look at, because
+/// the machine does other things as well.
+fn is_smooth(browser: &Browser) {
+    browser.run(
+        "window.gaps = []; let before = performance.now(), top = 0;
+        const step = (now) => {
+            window.gaps.push(now - before); before = now; top += 25; scrollTo(0, top);
+            if (window.gaps.length < 120) requestAnimationFrame(step);
+        };
+        requestAnimationFrame(step)",
+    );
+    browser.until("120 frames", "return window.gaps.length >= 120");
+    let gaps = browser.run("const sorted = window.gaps.toSorted((a, b) => a - b); return [sorted[60], sorted[118]]");
+    println!("display frames while scrolling, p50 and p99: {gaps} ms");
+    browser.run("scrollTo(0, 0)");
+}
+
+fn is_sorted_and_found(browser: &Browser) {
+    browser.run("const order = document.getElementById('order'); order.value = 'name'; order.onchange()");
+    let shown = "[...document.querySelectorAll('.card:not([hidden]) strong')].map((e) => e.textContent)";
+    let first = browser.run(&format!("return {shown}.slice(0, 4)"));
+    assert_eq!(first, serde_json::json!([MARKUP, "shuttle 1", "shuttle 2", "shuttle 3"]), "numbers count as numbers");
+    browser.run("const order = document.getElementById('order'); order.value = 'speed'; order.onchange()");
+    browser.run("const find = document.getElementById('find'); find.value = 'Shuttle 17'; find.oninput()");
+    assert_eq!(browser.run(&format!("return {shown}")), serde_json::json!(["shuttle 17"]));
+}

@@ -1,0 +1,130 @@
+//! The page beside a replay of the golden recording: its maps stand still when the test wants it.
+
+use clearway_client::test::{Replay, town};
+use clearway_client::{Client, MapView};
+
+use crate::webdriver::Browser;
+
+/// Chooses every layer: the first as the shown one, all others over it.
+const ALL_LAYERS: &str = "document.querySelector('.layer input[type=radio]').click();
+    for (const box of document.querySelectorAll('.layer input[type=checkbox]:not(:checked):enabled')) box.click()";
+/// The values of the cell under the cursor: [[layer, cell, values by channel]].
+const CELL: &str = "return [...document.querySelectorAll('#cell [data-layer]')].map(({ dataset }) =>
+    [dataset.layer, Number(dataset.cell), { ...dataset }])";
+/// Sequence of the map whose cell is shown.
+const SEQUENCE: &str = "return document.getElementById('cell').dataset.sequence ?? ''";
+
+/// Runs `test` with a browser beside a paused replay that has made some maps.
+fn beside_a_replay(test: impl AsyncFnOnce(&Browser, &Client)) {
+    let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+    runtime.block_on(async {
+        let replay = Replay::with(town(), &["--paused"]).expect("the replay starts");
+        let client = replay.client().await.expect("gRPC answers");
+        let browser = Browser::start(1440, 900);
+        browser.open(&replay.page);
+        browser.until("the time bar", "return !document.getElementById('replay').hidden");
+        test(&browser, &client).await;
+        assert_eq!(browser.console_errors(), Vec::<String>::new());
+    });
+}
+
+async fn newest(client: &Client) -> Option<MapView> {
+    client.newest("", &[]).await.ok()
+}
+
+/// Clicks "Next map" until the server has made `sequence`.
+async fn step_to(browser: &Browser, client: &Client, sequence: u64) -> MapView {
+    for _ in 0..1000 {
+        match newest(client).await {
+            Some(map) if map.sequence() >= sequence => return map,
+            before => {
+                browser.click("[data-part=step]");
+                let before = before.map(|map| map.sequence());
+                for _ in 0..200 {
+                    if newest(client).await.map(|map| map.sequence()) != before {
+                        break;
+                    }
+                    tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+                }
+            }
+        }
+    }
+    panic!("map {sequence} does not come");
+}
+
+pub fn cells_are_those_of_the_client() {
+    beside_a_replay(async |browser, client| {
+        step_to(browser, client, 8).await;
+        browser.until("layers", "return document.querySelectorAll('.layer').length === 6");
+        browser.run(ALL_LAYERS);
+        // The layers that nobody wanted are made with the next map.
+        let map = step_to(browser, client, 9).await;
+        let mut compared = 0;
+        // From the vehicle: one cell, then ten ahead, then to the left and the right of it.
+        for keys in ["\u{e013}", "\u{e008}\u{e013}\u{e008}", "\u{e012}\u{e012}\u{e012}", "\u{e008}\u{e014}\u{e008}"] {
+            browser.key("#map", keys);
+            browser.until("the cell of this map", &format!("{SEQUENCE} === '{}'", map.sequence()));
+            let at = "return document.querySelector('#cell p').textContent.match(/x (-?[0-9.]+) m, y (-?[0-9.]+)/)
+                .slice(1).map(Number)";
+            // The page answers a move of the cursor with the next message of its worker.
+            let expected = [1.0, 11.0, 11.0, 11.0][compared / 6];
+            browser.until("the cursor's place", &format!("const [x] = (() => {{ {at} }})(); return x === {expected}"));
+            let left = [0.0, 0.0, 3.0, -7.0][compared / 6];
+            browser.until("the cursor's place", &format!("const [, y] = (() => {{ {at} }})(); return y === {left}"));
+            let shown = browser.run(CELL);
+            let shown = shown.as_array().expect("a list");
+            assert_eq!(shown.len(), 6, "{shown:?}");
+            for entry in shown {
+                let name = entry[0].as_str().expect("a name");
+                let layer = map.layer(name).expect("a layer of the map");
+                let cell = layer.grid.cell_at(expected, left);
+                assert_eq!(entry[1].as_i64(), Some(cell.map_or(-1, |cell| cell as i64)), "{name}: {entry}");
+                let Some(cell) = cell else { continue };
+                for channel in &layer.channels {
+                    let raw = entry[2][format!("raw_{}", channel.name)].as_str().and_then(|text| text.parse().ok());
+                    assert_eq!(raw, Some(channel.cells.get(cell)), "{name} {}: {entry}", channel.name);
+                }
+                compared += 1;
+            }
+        }
+        assert_eq!(compared, 24);
+        browser.screenshot("replay-1440x900");
+    });
+}
+
+pub fn the_time_bar_controls_a_replay() {
+    beside_a_replay(async |browser, client| {
+        let first = step_to(browser, client, 3).await;
+        let time = browser.text("[data-part=time]");
+        browser.click("[data-part=step]");
+        let next = step_to(browser, client, first.sequence() + 1).await;
+        assert_eq!(next.sequence(), first.sequence() + 1, "one step is one map");
+        browser.until(
+            "the time moves",
+            &format!("return document.querySelector('[data-part=time]').textContent !== {time:?}"),
+        );
+        // Back to the begin: the page shows the map of that moment.
+        browser.run(
+            "const bar = document.querySelector('[data-part=position]');
+            bar.value = bar.max; bar.dispatchEvent(new Event('input')); bar.dispatchEvent(new Event('change'))",
+        );
+        browser.until(
+            "the end",
+            "const bar = document.querySelector('[data-part=position]'); return bar.value >= 0.9 * bar.max",
+        );
+        browser.until("the map of that moment", "return Number(document.querySelector('#stream dd').textContent) > 15");
+        browser.run(
+            "const rate = document.querySelector('[data-part=rate]');
+            rate.value = '2'; rate.dispatchEvent(new Event('change'))",
+        );
+        let mut state = client.replay_control(Default::default()).await.expect("a state");
+        for _ in 0..200 {
+            if state.rate == 2.0 {
+                break;
+            }
+            tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+            state = client.replay_control(Default::default()).await.expect("a state");
+        }
+        assert_eq!(state.rate, 2.0);
+    });
+}
