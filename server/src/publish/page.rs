@@ -14,6 +14,7 @@ use serde_json::Value;
 
 use super::listen::access::Caller;
 use super::listen::{Listener, ListenerHandle, Place};
+pub use super::page_live::Summaries;
 use super::page_live::{Live, MESSAGE_BYTES_MAX};
 use super::served::Vehicles;
 use crate::replay::ReplayHandle;
@@ -32,6 +33,8 @@ pub struct Shown {
     pub listeners: Arc<[(&'static str, ListenerHandle)]>,
     /// Controls the replay that the server serves.
     pub replay: Option<ReplayHandle>,
+    /// What all browsers share of the vehicles' status.
+    pub summaries: Summaries,
 }
 
 /// Serves the page until `stop` resolves.
@@ -116,7 +119,7 @@ async fn live(
     upgrade: WebSocketUpgrade,
 ) -> Response {
     let live = match query.vehicle {
-        None => Live::new(&shown.vehicles, caller, shown.replay),
+        None => Live::new(&shown.vehicles, shown.summaries, caller, shown.replay),
         Some(vehicle) => match shown.vehicles.find(&vehicle) {
             Err(unknown) => return (StatusCode::NOT_FOUND, format!("{unknown}\n")).into_response(),
             Ok(served) => match Live::of_one(served, caller, shown.replay) {

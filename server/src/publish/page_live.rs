@@ -16,7 +16,8 @@
 
 use std::collections::BTreeMap;
 use std::pin::Pin;
-use std::time::Duration;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 
 use axum::extract::ws::{Message as Frame, WebSocket};
 use bytes::Bytes;
@@ -26,7 +27,7 @@ use futures::stream::{AbortHandle, SelectAll, abortable};
 use futures::{Stream, StreamExt};
 use prost::Message;
 use serde::Deserialize;
-use serde_json::{Value, json};
+use serde_json::json;
 use tokio::sync::watch;
 use tonic::{Code, Status};
 
@@ -36,6 +37,7 @@ use super::listen::access::Caller;
 use super::page_replay::{PageReplay, PageRequest, replay_changed, replay_json};
 use super::served::{Served, Vehicles};
 use crate::replay::ReplayHandle;
+use crate::sync::locked;
 
 /// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
@@ -96,9 +98,31 @@ enum Next {
     End,
 }
 
+/// The short status of each vehicle as JSON, which all browsers share, with the time at which it was written.
+#[derive(Clone, Debug, Default)]
+pub struct Summaries(Arc<Mutex<BTreeMap<String, (Instant, Arc<str>)>>>);
+
+impl Summaries {
+    fn of(&self, served: &Served) -> Arc<str> {
+        let mut all = locked(&self.0);
+        let kept = all.get(&*served.status.name).filter(|(written, _)| written.elapsed() < STATUS_PERIOD / 2);
+        if let Some((_, summary)) = kept {
+            return summary.clone();
+        }
+        let mut status = served.status.to_json();
+        if let Some(fields) = status.as_object_mut() {
+            DETAILS.iter().for_each(|part| _ = fields.remove(*part));
+        }
+        let summary: Arc<str> = status.to_string().into();
+        all.insert(served.status.name.to_string(), (Instant::now(), summary.clone()));
+        summary
+    }
+}
+
 /// One browser's connection.
 pub(super) struct Live {
     vehicles: Vec<Served>,
+    summaries: Summaries,
     /// True for a connection of one vehicle.
     is_of_one: bool,
     caller: Caller,
@@ -111,11 +135,11 @@ pub(super) struct Live {
 
 impl Live {
     /// A connection of all vehicles that the caller may reach.
-    pub fn new(vehicles: &Vehicles, caller: Caller, replay: Option<ReplayHandle>) -> Self {
+    pub fn new(vehicles: &Vehicles, summaries: Summaries, caller: Caller, replay: Option<ReplayHandle>) -> Self {
         let vehicles = vehicles.0.iter().filter(|served| caller.may_reach(&served.status.name)).cloned().collect();
         let replay = replay.and_then(|handle| PageReplay::new(handle, &caller));
         let (detail, watching, updates) = (String::new(), BTreeMap::new(), SelectAll::new());
-        Self { vehicles, is_of_one: false, caller, replay, detail, watching, updates }
+        Self { vehicles, summaries, is_of_one: false, caller, replay, detail, watching, updates }
     }
 
     /// A connection of one vehicle, with all layers that the caller may read.
@@ -125,7 +149,8 @@ impl Live {
     pub fn of_one(served: &Served, caller: Caller, replay: Option<ReplayHandle>) -> Result<Self, Status> {
         let vehicle = served.status.name.to_string();
         let all = Vehicles([served.clone()].into());
-        let mut live = Self { is_of_one: true, detail: vehicle.clone(), ..Self::new(&all, caller, replay) };
+        let mut live =
+            Self { is_of_one: true, detail: vehicle.clone(), ..Self::new(&all, Summaries::default(), caller, replay) };
         // Refused here, before the connection is upgraded, a caller learns it from the response.
         live.caller.layers(&vehicle, Vec::new(), &served.status.layers)?;
         live.watch(WatchRequest { vehicle, ..WatchRequest::default() })?;
@@ -181,20 +206,17 @@ impl Live {
         if !self.vehicles.is_empty() && self.vehicles.iter().all(|served| served.newest.has_changed().is_err()) {
             return Next::End;
         }
-        let statuses = self.vehicles.iter().map(|served| {
+        if let (true, [served]) = (self.is_of_one, &self.vehicles[..]) {
             let mut status = served.status.to_json();
-            if let Some(fields) = status.as_object_mut().filter(|_| *served.status.name != self.detail) {
-                DETAILS.iter().for_each(|part| _ = fields.remove(*part));
-            }
-            status
-        });
-        let mut statuses: Vec<Value> = statuses.collect();
-        if !self.is_of_one {
-            return text(json!({ "type": "fleet", "vehicles": statuses }).to_string());
+            status["type"] = "status".into();
+            return text(status.to_string());
         }
-        let mut status = statuses.pop().unwrap_or_default();
-        status["type"] = "status".into();
-        text(status.to_string())
+        let statuses = self.vehicles.iter().map(|served| {
+            let is_detailed = *served.status.name == self.detail;
+            if is_detailed { served.status.to_json().to_string().into() } else { self.summaries.of(served) }
+        });
+        let statuses: Vec<Arc<str>> = statuses.collect();
+        text(format!(r#"{{"type":"fleet","vehicles":[{}]}}"#, statuses.join(",")))
     }
 
     async fn apply(&mut self, message: &str) -> Next {

@@ -68,7 +68,10 @@ export class Layers {
       channel.replaceChildren(...channels.map((name) => new Option(words(name), name)));
     }
     if (frame?.base && channel.value !== frame.base.channel) channel.value = frame.base.channel;
-    this.#writeChosen(frame?.base?.layer);
+    const shown = frame?.base?.layer, chosen = this.#settings.layer;
+    // A layer that nobody wanted so far is made with the next map.
+    const is_awaited = shown !== undefined && shown !== chosen && this.#names.split(",").includes(chosen);
+    setText(this.#part("awaited"), is_awaited ? `${words(chosen)} comes with the next map; this is ${words(shown)}` : "");
     this.#writeScale(frame?.bar ?? null);
     this.#writeLegend(frame?.legend ?? []);
   }
@@ -79,7 +82,8 @@ export class Layers {
     this.#changed();
   }
 
-  #writeChosen(shown = this.#settings.layer) {
+  #writeChosen() {
+    const known = this.#names.split(","), { layer } = this.#settings, shown = known.includes(layer) ? layer : known[0];
     for (const row of this.#part("layers").children) {
       const [radio, box] = row.querySelectorAll("input");
       radio.checked = radio.value === shown;

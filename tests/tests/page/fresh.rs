@@ -85,6 +85,7 @@ fn each_layer_can_be_shown(browser: &Browser) {
         browser.until(class, &format!("{}.includes({class:?})", legend.replace("return ", "return (") + ")"));
     }
     browser.key("body", "3");
+    browser.until("roughness", "return Boolean(document.querySelector('[data-part=channel] [value=roughness]'))");
     browser.run(
         "const channel = document.querySelector('[data-part=channel]');
         channel.value = 'roughness'; channel.dispatchEvent(new Event('change'))",

@@ -2,6 +2,7 @@
 
 use clearway_client::test::{Replay, town};
 use clearway_client::{Client, MapView};
+use clearway_proto::v1;
 
 use crate::webdriver::Browser;
 
@@ -12,13 +13,13 @@ const ALL_LAYERS: &str = "document.querySelector('.layer input[type=radio]').cli
 const CELL: &str = "return [...document.querySelectorAll('#cell [data-layer]')].map(({ dataset }) =>
     [dataset.layer, Number(dataset.cell), { ...dataset }])";
 /// Sequence of the map whose cell is shown.
-const SEQUENCE: &str = "return document.getElementById('cell').dataset.sequence ?? ''";
+const SEQUENCE: &str = "return document.getElementById('cell').dataset.sequence";
 
-/// Runs `test` with a browser beside a paused replay that has made some maps.
+/// Runs `test` with a browser beside a replay.
 fn beside_a_replay(test: impl AsyncFnOnce(&Browser, &Client)) {
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
     runtime.block_on(async {
-        let replay = Replay::with(town(), &["--paused"]).expect("the replay starts");
+        let replay = Replay::start(town()).expect("the replay starts");
         let client = replay.client().await.expect("gRPC answers");
         let browser = Browser::start(1440, 900);
         browser.open(&replay.page);
@@ -28,37 +29,28 @@ fn beside_a_replay(test: impl AsyncFnOnce(&Browser, &Client)) {
     });
 }
 
-async fn newest(client: &Client) -> Option<MapView> {
-    client.newest("", &[]).await.ok()
+/// Stops the replay at this many seconds from its begin; returns the map of that moment.
+async fn stop_at(client: &Client, seconds: f64) -> MapView {
+    let state = client.replay_control(v1::ReplayControl::default()).await.expect("a state");
+    let seek_ns = Some(state.begin_ns + (seconds * 1e9) as i64);
+    let control = v1::ReplayControl { paused: Some(true), seek_ns, ..v1::ReplayControl::default() };
+    client.replay_control(control).await.expect("it stops there");
+    client.newest("", &[]).await.expect("a map")
 }
 
-/// Clicks "Next map" until the server has made `sequence`.
-async fn step_to(browser: &Browser, client: &Client, sequence: u64) -> MapView {
-    for _ in 0..1000 {
-        match newest(client).await {
-            Some(map) if map.sequence() >= sequence => return map,
-            before => {
-                browser.click("[data-part=step]");
-                let before = before.map(|map| map.sequence());
-                for _ in 0..200 {
-                    if newest(client).await.map(|map| map.sequence()) != before {
-                        break;
-                    }
-                    tokio::time::sleep(std::time::Duration::from_millis(20)).await;
-                }
-            }
-        }
-    }
-    panic!("map {sequence} does not come");
+/// Waits until the page shows this map.
+fn await_map(browser: &Browser, sequence: u64) {
+    let shown = "document.querySelector('#stream dd').textContent";
+    browser.until("the map", &format!("return {shown} === '{sequence}'"));
 }
 
 pub fn cells_are_those_of_the_client() {
     beside_a_replay(async |browser, client| {
-        step_to(browser, client, 8).await;
         browser.until("layers", "return document.querySelectorAll('.layer').length === 6");
         browser.run(ALL_LAYERS);
-        // The layers that nobody wanted are made with the next map.
-        let map = step_to(browser, client, 9).await;
+        let map = stop_at(client, 1.0).await;
+        assert_eq!(map.layers().len(), 6);
+        await_map(browser, map.sequence());
         let mut compared = 0;
         // From the vehicle: one cell, then ten ahead, then to the left and the right of it.
         for keys in ["\u{e013}", "\u{e008}\u{e013}\u{e008}", "\u{e012}\u{e012}\u{e012}", "\u{e008}\u{e014}\u{e008}"] {
@@ -81,8 +73,9 @@ pub fn cells_are_those_of_the_client() {
                 assert_eq!(entry[1].as_i64(), Some(cell.map_or(-1, |cell| cell as i64)), "{name}: {entry}");
                 let Some(cell) = cell else { continue };
                 for channel in &layer.channels {
-                    let raw = entry[2][format!("raw_{}", channel.name)].as_str().and_then(|text| text.parse().ok());
-                    assert_eq!(raw, Some(channel.cells.get(cell)), "{name} {}: {entry}", channel.name);
+                    let raw = entry[2][format!("raw_{}", channel.name)].as_str().expect("a value");
+                    let expected = channel.cells.get(cell).expect("a cell").to_string();
+                    assert_eq!(raw, expected, "{name} {}: {entry}", channel.name);
                 }
                 compared += 1;
             }
@@ -94,36 +87,31 @@ pub fn cells_are_those_of_the_client() {
 
 pub fn the_time_bar_controls_a_replay() {
     beside_a_replay(async |browser, client| {
-        let first = step_to(browser, client, 3).await;
-        let time = browser.text("[data-part=time]");
+        let first = stop_at(client, 0.5).await;
+        await_map(browser, first.sequence());
+        browser.until("a pause", "return document.querySelector('[data-part=play]').textContent === 'Play'");
         browser.click("[data-part=step]");
-        let next = step_to(browser, client, first.sequence() + 1).await;
-        assert_eq!(next.sequence(), first.sequence() + 1, "one step is one map");
-        browser.until(
-            "the time moves",
-            &format!("return document.querySelector('[data-part=time]').textContent !== {time:?}"),
-        );
-        // Back to the begin: the page shows the map of that moment.
+        await_map(browser, first.sequence() + 1);
         browser.run(
             "const bar = document.querySelector('[data-part=position]');
-            bar.value = bar.max; bar.dispatchEvent(new Event('input')); bar.dispatchEvent(new Event('change'))",
+            bar.value = 1.5; bar.dispatchEvent(new Event('input')); bar.dispatchEvent(new Event('change'))",
         );
         browser.until(
-            "the end",
-            "const bar = document.querySelector('[data-part=position]'); return bar.value >= 0.9 * bar.max",
+            "the map of that moment",
+            "return document.querySelector('[data-part=time]').textContent.startsWith('1.5 ') &&
+                Number(document.querySelector('#stream dd').textContent) >= 13",
         );
-        browser.until("the map of that moment", "return Number(document.querySelector('#stream dd').textContent) > 15");
         browser.run(
             "const rate = document.querySelector('[data-part=rate]');
             rate.value = '2'; rate.dispatchEvent(new Event('change'))",
         );
-        let mut state = client.replay_control(Default::default()).await.expect("a state");
+        let mut state = client.replay_control(v1::ReplayControl::default()).await.expect("a state");
         for _ in 0..200 {
             if state.rate == 2.0 {
                 break;
             }
             tokio::time::sleep(std::time::Duration::from_millis(20)).await;
-            state = client.replay_control(Default::default()).await.expect("a state");
+            state = client.replay_control(v1::ReplayControl::default()).await.expect("a state");
         }
         assert_eq!(state.rate, 2.0);
     });
