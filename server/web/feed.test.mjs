@@ -28,8 +28,11 @@ function mapOf(layers) {
   return { names: [...made.keys()], layer: (name) => made.get(name) ?? null };
 }
 
-const SHOW = { base: { layer: "a", channel: "class" }, overlays: [], road: false, safe_points: false, by_meaning: false };
-const frameOf = (layers, show = {}, ranges = new Map()) => newFrame(mapOf(layers), { ...SHOW, ...show }, RASTER, ranges);
+const SHOW = {
+  base: { layer: "a", channel: "class" }, overlays: [], road: false, safe_points: false, by_meaning: false,
+};
+const frameOf = (layers, show = {}, ranges = new Map()) =>
+  newFrame(mapOf(layers), { ...SHOW, ...show }, RASTER, ranges);
 const colours = ({ pixels }) => [...pixels].map((pixel) => [pixel & 255, (pixel >> 8) & 255, (pixel >> 16) & 255]);
 const CLASSES = channel("class", Uint8Array.of(0, 1, 1, 2));
 
@@ -48,7 +51,8 @@ test("a layer over another one leaves what it does not know, and mixes the rest"
 });
 
 test("a channel is a heat map with a colour bar, whose range only grows", () => {
-  const slope = (...cells) => ({ a: [CLASSES, channel("slope", Int8Array.from(cells), { scale: 0.02, unknown: -128 })] });
+  const slope = (...cells) =>
+    ({ a: [CLASSES, channel("slope", Int8Array.from(cells), { scale: 0.02, unknown: -128 })] });
   const ranges = new Map(), show = { base: { layer: "a", channel: "slope" } };
   assert.deepEqual(frameOf(slope(-128, -50, 0, 50), show, ranges).bar, ["-1.00", "0.00", "1.00"]);
   assert.deepEqual(frameOf(slope(-128, 0, 0, 0), show, ranges).bar, ["-1.00", "0.00", "1.00"]);
@@ -147,7 +151,9 @@ test("a layer is selected with those that are drawn over it, and unknown ones ar
 
 test("kept settings of another kind do no harm", () => {
   const defaults = readSettings(null);
-  for (const text of ["{", "null", "3", '{"overlays":{},"layer":7,"road":"yes"}']) assert.deepEqual(readSettings(text), defaults);
+  for (const text of ["{", "null", "3", '{"overlays":{},"layer":7,"road":"yes"}']) {
+    assert.deepEqual(readSettings(text), defaults);
+  }
   const kept = readSettings('{"overlays":["terrain",7],"layer":"speed","more":1}');
   assert.deepEqual([kept.overlays, kept.layer, kept.more], [["terrain"], "speed", undefined]);
 });

@@ -45,8 +45,8 @@ const withLegend = (layer, legend) => ({
   name: layer.name, grid: layer.grid, legend, channels: layer.channels, cells: (name) => layer.cells(name),
 });
 
-// Every value of the cell at a point of the ego frame, by layer: [{ layer, cell, values: [[channel, text, raw]] }]. cell
-// is -1 outside the layer's grid.
+// Every value of the cell at a point of the ego frame, by layer: [{ layer, cell, values: [[channel, text, raw]] }].
+// cell is -1 outside the layer's grid.
 export function cellValues(map, { x, y }) {
   return map.names.map((name) => {
     const layer = map.layer(name), cell = layer.grid.cellAt(x, y);

@@ -37,7 +37,8 @@ export class Link {
       if (typeof data === "string") this.#on.text(data);
       else this.#on.update(new Uint8Array(data), this.#arrived_ms);
     };
-    socket.onclose = () => this.#retry(this.#pause_ms === PAUSE_MS_MIN ? "Connection lost" : "The server does not answer");
+    const was_live = () => this.#pause_ms === PAUSE_MS_MIN;
+    socket.onclose = () => this.#retry(was_live() ? "Connection lost" : "The server does not answer");
   }
 
   // Sends a request to the server, if there is a connection.

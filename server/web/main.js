@@ -18,7 +18,8 @@ const post = (message) => worker.postMessage(message);
 const clock = new ServerClock(), settings = loadSettings();
 const keep = () => keepSettings(settings);
 const fleet = new FleetView(post, clock, settings, keep), view = new VehicleView(post, clock, settings, keep);
-const replay = new ReplayBar($("replay"), (request) => post({ type: "server", request: { type: "replay", ...request } }));
+const control = (request) => post({ type: "server", request: { type: "replay", ...request } });
+const replay = new ReplayBar($("replay"), control);
 // Frames that are not drawn yet, by vehicle.
 const frames = new Map();
 let is_draw_scheduled = false, wall_minus_monotonic = Date.now() - performance.now();

@@ -1,6 +1,6 @@
 // In: the updates of one vehicle, as they arrive. Out: the newest map that was not drawn yet, and counts of what
-// happened to all others. Of a whole map only the header is read here; the cells of a map that is replaced before it was
-// drawn are never decoded. A delta is decoded at once, because the next one starts from it.
+// happened to all others. Of a whole map only the header is read here; the cells of a map that is replaced before it
+// was drawn are never decoded. A delta is decoded at once, because the next one starts from it.
 
 import { openUpdate } from "./wire/map.js";
 

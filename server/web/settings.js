@@ -1,4 +1,4 @@
-// What a reader chose, kept in this browser: which layer is shown, what lies over it, rate, colours, order of the fleet.
+// What a reader chose, kept in this browser: the shown layer, what lies over it, rate, colours, order of the fleet.
 
 const KEY = "clearway.page";
 const DEFAULTS = {
@@ -12,7 +12,8 @@ export function readSettings(text) {
   try {
     const kept = JSON.parse(text ?? "{}");
     for (const name in DEFAULTS) {
-      const fits = typeof kept?.[name] === typeof DEFAULTS[name] && Array.isArray(kept[name]) === Array.isArray(DEFAULTS[name]);
+      const value = kept?.[name], other = DEFAULTS[name];
+      const fits = typeof value === typeof other && Array.isArray(value) === Array.isArray(other);
       if (fits) settings[name] = kept[name];
     }
     settings.overlays = settings.overlays.filter((layer) => typeof layer === "string");

@@ -8,7 +8,7 @@
 //! | | `{"type":"unwatch","vehicle"}`; `{"type":"detail","vehicle"}`: whose whole status is wanted |
 //! | | `{"type":"replay",...}`: a request of the time bar, of operators |
 //! | to the browser, binary | `clearway.v1.MapUpdate`; the header names the vehicle |
-//! | to the browser, text | `watching` (the maps after it are those of this `id`), `refused` (with `reason`), `fleet` (the status of each vehicle, once a second), `replay` (at each change) |
+//! | to the browser, text | `"watching"` (the maps after it are those of this `id`), `"refused"` (with `reason`), `"fleet"` (the status of each vehicle, once a second), `"replay"` (at each change) |
 //!
 //! A selection means what it means over gRPC. With `max_in_flight`, no more maps than that are on the way, so a slow
 //! link has no backlog. A connection of one vehicle, `/live?vehicle=V`, begins with all its layers, and its status is a

@@ -28,8 +28,8 @@ export function paintPixels(pixels, table, cells, colours) {
   for (let i = 0; i < table.length; i++) pixels[i] = table[i] < 0 ? 0 : colours[cells[table[i]] - low];
 }
 
-// Draws a layer over pixels that are painted: half of its colour and half of theirs. colours: an ImageData word for each
-// raw value, 0 for those that leave a pixel as it is.
+// Draws a layer over pixels that are painted: half of its colour and half of theirs. colours: an ImageData word for
+// each raw value, 0 for those that leave a pixel as it is.
 export function blendPixels(pixels, table, cells, colours) {
   const low = least(cells), half = 0x7f7f7f7f;
   for (let i = 0; i < table.length; i++) {

@@ -9,7 +9,8 @@ export function viewOf(places, { width, height }) {
   const range = (of) => [Math.min(...places.map(of)), Math.max(...places.map(of))];
   const [west, east] = range(({ pose }) => pose.x_m), [south, north] = range(({ pose }) => pose.y_m);
   const room = (pixels) => Math.max(pixels - 2 * MARGIN_PX, 1);
-  const scale = Math.min(room(width) / Math.max(east - west, SPAN_MIN_M), room(height) / Math.max(north - south, SPAN_MIN_M));
+  const span = (from, to) => Math.max(to - from, SPAN_MIN_M);
+  const scale = Math.min(room(width) / span(west, east), room(height) / span(south, north));
   return {
     scale,
     px: ({ x_m }) => width / 2 + (x_m - (west + east) / 2) * scale,
@@ -34,7 +35,8 @@ export function drawPlaces(canvas, places) {
   if (!size.width) return [];
   const [width, height] = [size.width, size.height].map((pixels) => Math.round(pixels * ratio));
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-  const pen = canvas.getContext("2d"), style = getComputedStyle(canvas), colour = (name) => style.getPropertyValue(name);
+  const pen = canvas.getContext("2d"), style = getComputedStyle(canvas);
+  const colour = (name) => style.getPropertyValue(name);
   const view = viewOf(places, size);
   pen.setTransform(ratio, 0, 0, ratio, 0, 0);
   pen.clearRect(0, 0, size.width, size.height);

@@ -19,7 +19,8 @@ export function ageOf(status, status_age_ms, frame_age_ms) {
 }
 
 // "fresh", "stale" or "none". A card gets a map a second, so this much is allowed over the validity.
-export const freshOf = (age_ms, validity_ms) => (age_ms === null ? "none" : age_ms <= validity_ms + NEWS_MS ? "fresh" : "stale");
+export const freshOf = (age_ms, validity_ms) =>
+  age_ms === null ? "none" : age_ms <= validity_ms + NEWS_MS ? "fresh" : "stale";
 
 // A vehicle that is not well: its state says so, or its maps are old.
 export const needsCare = ({ status, fresh }) =>

@@ -40,7 +40,8 @@ export function lines(samples, name, now_ms, { width, height, top, span_ms = SPA
 
 // The least of 1, 2, 5 times a power of ten that is not below the greatest value.
 export function niceTop(samples, name, least) {
-  const greatest = samples.reduce((max, sample) => (Number.isFinite(sample[name]) ? Math.max(max, sample[name]) : max), least);
+  const known = samples.map((sample) => sample[name]).filter(Number.isFinite);
+  const greatest = Math.max(least, ...known);
   const power = 10 ** Math.floor(Math.log10(greatest));
   return [1, 2, 5, 10].map((factor) => factor * power).find((top) => top >= greatest - 1e-9);
 }

@@ -1,6 +1,6 @@
 // The choice of layers: for each layer a button that shows it, and a box that draws it over the shown one; the channel
-// of the shown layer; safe paths, road, trail, colours, rate. In: settings, the vehicle's layers, the newest frame. Out:
-// changed settings, and the legend of what is shown.
+// of the shown layer; safe paths, road, trail, colours, rate. In: settings, the vehicle's layers, the newest frame.
+// Out: changed settings, and the legend of what is shown.
 
 import { css, scaleGradient } from "../draw/palette.js";
 import { percent, setText, words } from "../text.js";
@@ -71,7 +71,8 @@ export class Layers {
     const shown = frame?.base?.layer, chosen = this.#settings.layer;
     // A layer that nobody wanted so far is made with the next map.
     const is_awaited = shown !== undefined && shown !== chosen && this.#names.split(",").includes(chosen);
-    setText(this.#part("awaited"), is_awaited ? `${words(chosen)} comes with the next map; this is ${words(shown)}` : "");
+    const text = is_awaited ? `${words(chosen)} comes with the next map; this is ${words(shown)}` : "";
+    setText(this.#part("awaited"), text);
     this.#writeScale(frame?.bar ?? null);
     this.#writeLegend(frame?.legend ?? []);
   }

@@ -142,7 +142,8 @@ export class VehicleView {
   #want() {
     if (this.name === null || this.#layer_names.length === 0) return;
     const want = wantOf(this.#settings, this.#layer_names);
-    this.#post({ type: "want", vehicle: this.name, want: { ...want, raster: this.#map.raster, probe: this.#map.probe } });
+    const { raster, probe } = this.#map;
+    this.#post({ type: "want", vehicle: this.name, want: { ...want, raster, probe } });
   }
 
   // A drag changes the view more often than a display can show.
@@ -212,17 +213,18 @@ export class VehicleView {
     setText($("rate"), hz.toFixed(1));
     setText($("size"), shown ? bytes(shown.length) : dash);
     const speed = shown?.header.speed_mps ?? status?.speed_m_s;
-    setText($("speed"), speed == null ? dash : `${speed.toFixed(1)} m/s`);
+    $("speed").parentElement.hidden = speed == null;
+    setText($("speed"), speed == null ? "" : `${speed.toFixed(1)} m/s`);
     const pose = shown?.header.map_from_ego;
-    setText($("heading"), pose ? `${((((yawOf(pose) * 180) / Math.PI) % 360) + 360).toFixed(0) % 360}°` : dash);
+    $("heading").parentElement.hidden = !pose;
+    setText($("heading"), pose ? `${(Math.round((yawOf(pose) * 180) / Math.PI) + 360) % 360}°` : "");
     const { state, reasons } = stateOf(status);
     $("state").hidden = !state;
     $("state").dataset.state = state ?? "";
     setText($("state"), state ? state.toUpperCase() : "");
     $("reasons").hidden = reasons.length === 0;
     setText($("reasons"), reasons.join(" · "));
-    const counts = shown?.counts ?? { received: 0n, skipped: 0n, replaced: 0n, lost: 0n, repeated: 0n, refused: 0n, restarts: 0n };
-    metrics.writeMapMetrics($("stream"), shown, counts, this.#clock.ahead_ms(Date.now() - now_ms));
+    metrics.writeMapMetrics($("stream"), shown, shown?.counts ?? {}, this.#clock.ahead_ms(Date.now() - now_ms));
     metrics.writePacketMetrics($("packets"), status);
     metrics.writeServerMetrics($("server"), status);
     metrics.writeSensors($("sensors"), shown?.header.sensors ?? status?.sensors ?? []);
@@ -247,7 +249,8 @@ export class VehicleView {
     }
     const { at: { x, y }, sequence, layers } = message, where = document.createElement("p");
     readout.dataset.sequence = sequence.toString();
-    setText(where, `${Math.hypot(x, y).toFixed(1)} m, ${bearing(Math.atan2(y, x))} (x ${x.toFixed(2)} m, y ${y.toFixed(2)} m)`);
+    const place = `${Math.hypot(x, y).toFixed(1)} m, ${bearing(Math.atan2(y, x))}`;
+    setText(where, `${place} (x ${x.toFixed(2)} m, y ${y.toFixed(2)} m)`);
     readout.replaceChildren(where, ...layers.map(({ layer, cell, values }) => {
       const line = document.createElement("p"), name = document.createElement("b");
       line.dataset.layer = layer;

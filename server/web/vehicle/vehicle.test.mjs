@@ -1,4 +1,5 @@
-// Tests of the view of one vehicle: where things are on the canvas, the trail, the plots. Run: cd server/web && node --test
+// Tests of the view of one vehicle: where things are on the canvas, the trail, the plots.
+// Run: cd server/web && node --test
 
 import assert from "node:assert/strict";
 import test from "node:test";

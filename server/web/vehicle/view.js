@@ -1,5 +1,5 @@
-// A view of the ego frame on a canvas: { x_m, y_m: the middle, in the ego frame, metres: a CSS pixel's side }. Forward is
-// up, left is left. All functions return new views. size: { width, height } in CSS pixels.
+// A view of the ego frame on a canvas: { x_m, y_m: the middle, in the ego frame, metres: a CSS pixel's side }. Forward
+// is up, left is left. All functions return new views. size: { width, height } in CSS pixels.
 
 export const METRES_MIN = 0.005, METRES_MAX = 1;
 

@@ -6,7 +6,8 @@ import { DecodeError } from "./limits.js";
 
 // How many cells a grid may have is checked where they are decoded (codec.js).
 //
-// { key, radius_m, cellAt(x, y) -> the cell's index or -1, fill(table, raster) }, and for deltas { kind: equal if cells are comparable,
+// { key, radius_m, cellAt(x, y) -> the cell's index or -1, fill(table, raster) }, and for deltas { kind: equal if cells
+// are comparable,
 // shape: [rows, columns], first: [number of the first row, of the first column] }.
 export function gridOf(layer) {
   if (layer.radial) return radial(layer.radial);
@@ -86,11 +87,12 @@ function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, fir
       }
     }
   };
-  return { key, radius_m, cellAt, fill, kind: `cartesian ${cell_m}`, shape: [height, width], first: [first_iy, first_ix] };
+  const shape = [height, width], first = [first_iy, first_ix];
+  return { key, radius_m, cellAt, fill, kind: `cartesian ${cell_m}`, shape, first };
 }
 
-// A raster is a picture of the ego frame, forward up, left on the left: { width, height: pixels, x_m, y_m: of its middle
-// in the ego frame, metres: a pixel's side }.
+// A raster is a picture of the ego frame, forward up, left on the left: { width, height: pixels, x_m, y_m: of its
+// middle in the ego frame, metres: a pixel's side }.
 
 // The ego coordinates of the middle of a pixel.
 export function egoAt({ width, height, x_m, y_m, metres }, px, py) {

@@ -26,7 +26,7 @@ fn config(names: &[String], page: SocketAddr) -> Config {
     config.page.enabled = true;
     config.zenoh.enabled = false;
     config.vehicles[0].udp = None;
-    config.vehicles[0].sensors[0].extrinsics.z_m = 1.9;
+    config.vehicles[0].sensors[0].extrinsics.z_m = SENSOR_M;
     let first = config.vehicles[0].clone();
     config.vehicles = names
         .iter()
@@ -48,16 +48,31 @@ fn any() -> SocketAddr {
     "127.0.0.1:0".parse().expect("an address")
 }
 
-/// A plain with a wall of 2 m ahead whose distance differs from vehicle to vehicle, in the sensor's frame.
-fn points(number: usize) -> [Vec<f32>; 3] {
-    let ground = (0..7200_u32).map(|ray| {
-        let (angle, range_m) = ((f64::from(ray) * 0.05).to_radians(), 3.0 + f64::from(ray % 20) * 1.5);
-        [angle.cos() * range_m, angle.sin() * range_m, -1.9]
-    });
-    let wall_m = 8.0 + (number % 10) as f64;
-    let wall = (0..2000_u32).map(|i| [wall_m, f64::from(i % 100) * 0.1 - 5.0, f64::from(i / 100) * 0.1 - 1.9]);
-    let points: Vec<[f64; 3]> = ground.chain(wall).collect();
-    [0, 1, 2].map(|axis| points.iter().map(|point| point[axis] as f32).collect())
+/// Height of the sensor over the ground, and of the walls, in metres.
+const SENSOR_M: f64 = 1.9;
+const WALL_M: f64 = 3.0;
+
+/// Points and their rings of 16 lasers in a street with walls to both sides and one ahead, in the sensor's frame. The
+/// street differs from vehicle to vehicle.
+fn street(number: usize) -> ([Vec<f32>; 3], Vec<u16>) {
+    let (ahead_m, right_m) = (14.0 + (number % 10) as f64, 6.0 + (number % 4) as f64);
+    let (mut points, mut rings) = ([const { Vec::new() }; 3], Vec::new());
+    for azimuth in (0..720).map(|half| (f64::from(half) * 0.5).to_radians()) {
+        let (sin, cos) = azimuth.sin_cos();
+        let side_m = if sin > 0.0 { 7.0 / sin } else { -right_m / sin };
+        let wall_m = if cos > 0.0 { side_m.min(ahead_m / cos) } else { side_m };
+        for ring in 0..16_u16 {
+            let slope = (f64::from(ring) * 2.0 - 15.0).to_radians().tan();
+            let ground_m = if slope < 0.0 { -SENSOR_M / slope } else { f64::INFINITY };
+            let range_m = ground_m.min(wall_m);
+            if range_m < 80.0 && SENSOR_M + range_m * slope < WALL_M {
+                let point = [range_m * cos, range_m * sin, range_m * slope];
+                points.iter_mut().zip(point).for_each(|(axis, value)| axis.push(value as f32));
+                rings.push(ring);
+            }
+        }
+    }
+    (points, rings)
 }
 
 /// Vehicles that drive until they are told to halt, in a thread of their own.
@@ -92,7 +107,7 @@ impl Driving {
 
 async fn drive(client: &Client, name: &str, number: usize, period: Duration, halt: &AtomicBool) {
     let mut ingester = client.ingest(name).await.expect("a stream");
-    let [x, y, z] = points(number);
+    let ([x, y, z], rings) = street(number);
     // Not all at one moment.
     tokio::time::sleep(period.mul_f64((number % 10) as f64 / 10.0)).await;
     let mut every = tokio::time::interval(period);
@@ -104,7 +119,7 @@ async fn drive(client: &Client, name: &str, number: usize, period: Duration, hal
         let now_ns = now_ns();
         let at = [(number % 10) as f64 * 30.0 + f64::from(step) * 0.5, (number / 10) as f64 * 25.0, 0.0];
         let pose = Observation::pose(now_ns, at, [0.0, 0.0, 0.0, 1.0], number as f64 / 5.0);
-        let scan = Observation::scan("top", now_ns, &x, &y, &z);
+        let scan = Observation::scan("top", now_ns, &x, &y, &z).rings(&rings);
         ingester.send(pose).await.expect("a stream");
         ingester.send(scan).await.expect("a stream");
     }
@@ -217,7 +232,8 @@ fn a_name_with_markup_is_a_text(browser: &Browser) {
     let name = serde_json::json!(MARKUP);
     let text = browser.run(&format!(
         "return (async () => {{
-            const {{ FleetView }} = await import('/fleet/fleet.js'), {{ VehicleView }} = await import('/vehicle/vehicle.js');
+            const {{ FleetView }} = await import('/fleet/fleet.js');
+            const {{ VehicleView }} = await import('/vehicle/vehicle.js');
             const settings = {{ order: 'name', only: 'all', overlays: [] }}, clock = {{ now_ns: () => null }};
             const status = {{ name: {name}, layers: [{name}], state: 'error', reasons: [{name}] }};
             document.getElementById('cards').replaceChildren();
