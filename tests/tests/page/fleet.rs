@@ -234,7 +234,8 @@ fn a_name_with_markup_is_a_text(browser: &Browser) {
         "return (async () => {{
             const {{ FleetView }} = await import('/fleet/fleet.js');
             const {{ VehicleView }} = await import('/vehicle/vehicle.js');
-            const settings = {{ order: 'name', only: 'all', overlays: [] }}, clock = {{ now_ns: () => null, ahead_ms: () => null }};
+            const settings = {{ order: 'name', only: 'all', overlays: [] }};
+            const clock = {{ now_ns: () => null, ahead_ms: () => null }};
             const status = {{ name: {name}, layers: [{name}], state: 'error', reasons: [{name}] }};
             document.getElementById('cards').replaceChildren();
             const fleet = new FleetView(() => {{}}, clock, settings, () => {{}});
