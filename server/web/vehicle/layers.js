@@ -69,7 +69,7 @@ export class Layers {
     }
     if (frame?.base && channel.value !== frame.base.channel) channel.value = frame.base.channel;
     const shown = frame?.base?.layer, chosen = this.#settings.layer;
-    // A layer that nobody wanted so far is made with the next map.
+    // A layer that no reader wanted so far is made with the next map.
     const is_awaited = shown !== undefined && shown !== chosen && this.#names.split(",").includes(chosen);
     const text = is_awaited ? `${words(chosen)} comes with the next map; this is ${words(shown)}` : "";
     setText(this.#part("awaited"), text);
