@@ -251,7 +251,7 @@ fn a_name_with_markup_is_a_text(browser: &Browser) {
                 document.getElementById('refusal')].map((element) => element.textContent);
         }})()"
     ));
-    assert_eq!(text, serde_json::json!([MARKUP; 5]));
+    assert_eq!(text, serde_json::json!(vec![MARKUP; 5]));
     assert_eq!(browser.run("return document.querySelectorAll('main img').length"), 0);
     assert_ne!(browser.run("return document.title"), "taken");
 }
