@@ -1,81 +1,35 @@
-// The connection to the server. In: the name of a vehicle. Out: calls to `on`: vehicles(list, name), update(bytes,
-// arrived_ms), text(string), state({ phase, text, retry_at_ms }). It reconnects with growing pauses; a connection on
-// which nothing arrives counts as lost.
-// Server: GET vehicles (JSON list), WebSocket live?vehicle=NAME (binary: MapUpdate, text: JSON with "type").
+// The connection to the server, in the Worker. Out: calls to `on`: update(bytes, arrived_ms), text(string), state({
+// phase, text, retry_in_ms }). It reconnects with growing pauses; a connection on which nothing arrives counts as lost.
+// Server: WebSocket live (server/src/publish/page_live.rs).
 
 const PAUSE_MS_MIN = 250, PAUSE_MS_MAX = 5000;
 // The server sends a status every second, so four missing ones mean that the connection is lost.
 const SILENCE_MS_MAX = 4500;
-const ANSWER_MS_MAX = 4000;
-const LIST_EVERY_MS = 10000;
 
 export class Link {
   #on;
-  // The vehicle's name; undefined until one is chosen.
-  #vehicle;
+  #address;
   #socket = null;
   #pause_ms = PAUSE_MS_MIN;
   #arrived_ms = 0;
   #timer = 0;
-  // Counts attempts, so that an answer to an earlier one is ignored.
-  #attempt = 0;
 
-  constructor(on, vehicle) {
+  constructor(on, address) {
     this.#on = on;
-    this.#vehicle = vehicle;
+    this.#address = address;
     setInterval(() => this.#checkSilence(), 500);
-    setInterval(() => this.#socket && this.#list().catch(() => {}), LIST_EVERY_MS);
     addEventListener("online", () => !this.#socket && this.connect());
   }
 
-  choose(vehicle) {
-    this.#vehicle = vehicle;
-    this.connect();
-  }
-
-  async connect() {
+  connect() {
     this.#drop();
-    const attempt = ++this.#attempt;
     this.#on.state({ phase: "connecting", text: "Connecting …" });
-    try {
-      const names = (await this.#list()).map((vehicle) => vehicle.name);
-      if (attempt !== this.#attempt) return;
-      this.#vehicle ??= names[0];
-      if (this.#vehicle === undefined) return this.#retry("The server has no vehicle yet");
-      if (!names.includes(this.#vehicle)) return this.#retry(`The server has no vehicle “${this.#vehicle}”`);
-      this.#open(this.#vehicle);
-    } catch {
-      if (attempt === this.#attempt) this.#retry("The server does not answer");
-    }
-  }
-
-  // Sends a text to the server, if there is a connection.
-  send(text) {
-    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(text);
-  }
-
-  // Drops the connection and the messages that wait in it, and makes a new one.
-  reconnect(text) {
-    this.#retry(text);
-  }
-
-  async #list() {
-    const answer = await fetch("vehicles", { cache: "no-store", signal: AbortSignal.timeout(ANSWER_MS_MAX) });
-    if (!answer.ok) throw new Error(`vehicles: ${answer.status}`);
-    const vehicles = await answer.json();
-    this.#on.vehicles(vehicles, this.#vehicle);
-    return vehicles;
-  }
-
-  #open(vehicle) {
-    const address = new URL(`live?vehicle=${encodeURIComponent(vehicle)}`, location.href);
-    address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
-    const socket = (this.#socket = new WebSocket(address));
+    const socket = (this.#socket = new WebSocket(this.#address));
     socket.binaryType = "arraybuffer";
     this.#arrived_ms = performance.now();
     socket.onopen = () => {
       this.#arrived_ms = performance.now();
-      this.#on.state({ phase: "live", text: "Connected", vehicle });
+      this.#on.state({ phase: "live", text: "Connected" });
     };
     socket.onmessage = ({ data }) => {
       this.#arrived_ms = performance.now();
@@ -83,7 +37,18 @@ export class Link {
       if (typeof data === "string") this.#on.text(data);
       else this.#on.update(new Uint8Array(data), this.#arrived_ms);
     };
-    socket.onclose = () => this.#retry("Connection lost");
+    const was_live = () => this.#pause_ms === PAUSE_MS_MIN;
+    socket.onclose = () => this.#retry(was_live() ? "Connection lost" : "The server does not answer");
+  }
+
+  // Sends a request to the server, if there is a connection.
+  send(request) {
+    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(request));
+  }
+
+  // Drops the connection and the messages that wait in it, and makes a new one.
+  reconnect(text) {
+    this.#retry(text);
   }
 
   #checkSilence() {
@@ -93,11 +58,10 @@ export class Link {
 
   #retry(text) {
     this.#drop();
-    this.#attempt++;
     const pause_ms = this.#pause_ms * (0.75 + Math.random() / 2);
     this.#pause_ms = Math.min(2 * this.#pause_ms, PAUSE_MS_MAX);
     this.#timer = setTimeout(() => this.connect(), pause_ms);
-    this.#on.state({ phase: "lost", text, retry_at_ms: performance.now() + pause_ms });
+    this.#on.state({ phase: "lost", text, retry_in_ms: pause_ms });
   }
 
   #drop() {

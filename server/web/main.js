@@ -1,180 +1,123 @@
-// The page: one vehicle's newest map, live, with its age. Messages arrive through link.js and are counted by
-// map_stream.js. Once a display frame the newest map is decoded, as far as it is in sight, and drawn.
-// The age of the shown map grows by the server's clock (clock.js) whether maps arrive or not.
+// The page: which view is open, and messages between it and the Worker. The address says what is shown: `?vehicle=NAME`
+// one vehicle, `?fleet` all of them, neither: the fleet, or the vehicle if there is only one.
 
-import { freshness, ServerClock } from "./clock.js";
-import { Link } from "./link.js";
-import { MapStream } from "./map_stream.js";
-import * as metrics from "./metrics.js";
-import { Panel } from "./panel.js";
+import { ServerClock } from "./clock.js";
+import { FleetView } from "./fleet/fleet.js";
 import { ReplayBar } from "./replay.js";
-import { bytes, dash, duration, setText } from "./text.js";
+import { keepSettings, loadSettings } from "./settings.js";
+import { setText } from "./text.js";
+import { VehicleView } from "./vehicle/vehicle.js";
 
-const RATE_OVER_MS = 3000;
-// Ages are written ten times a second, which a reader can follow; each text costs the browser a layout.
-const AGE_EVERY_MS = 100;
-const METRICS_EVERY_MS = 500;
 // The two clocks of a browser run alike, unless one was set or the computer slept.
 const CLOCK_STEP_MS = 1000;
-
-// The layer whose safe points can be drawn over the other layers.
-const SAFE_PATH = "safe_path";
+const TICK_MS = 1000;
 
 const $ = (id) => document.getElementById(id);
-const clock = new ServerClock();
-const panels = new Map();
-let stream = new MapStream();
-// The update that is shown; null before the first.
-let shown = null;
-let status = null, status_arrived_ms = null;
-let link_state = { phase: "connecting", text: "Connecting …" };
-// When maps were drawn on this connection: the first, and those of the last RATE_OVER_MS.
-let first_drawn_ms = null, drawn_ms = [];
-// True if the safe paths are drawn over every layer.
-let with_paths = false;
-let is_draw_scheduled = false, age_timer = 0, metrics_at_ms = 0, view_m = 0;
-let wall_minus_monotonic = Date.now() - performance.now();
+const worker = new Worker("worker.js", { type: "module" });
+const post = (message) => worker.postMessage(message);
+const clock = new ServerClock(), settings = loadSettings();
+const keep = () => keepSettings(settings);
+const fleet = new FleetView(post, clock, settings, keep), view = new VehicleView(post, clock, settings, keep);
+const control = (request) => post({ type: "server", request: { type: "replay", ...request } });
+const replay = new ReplayBar($("replay"), control);
+// Frames that are not drawn yet, by vehicle.
+const frames = new Map();
+let is_draw_scheduled = false, wall_minus_monotonic = Date.now() - performance.now();
+let link = { phase: "connecting", text: "Connecting …" }, retry_at_ms = 0;
+let names = null;
 
-const link = new Link({
-  vehicles: writeVehicles,
-  update: pushUpdate,
-  text: readStatus,
-  state(next) {
-    link_state = next;
-    if (next.phase !== "live") return;
+// Times of the Worker are those of this thread's clock, from the Unix epoch.
+const local = (absolute_ms) => absolute_ms - performance.timeOrigin;
+
+const FROM_WORKER = {
+  link(state) {
+    link = state;
+    retry_at_ms = state.retry_in_ms ? performance.now() + state.retry_in_ms : 0;
+    writeLink();
+    view.link(state);
+    if (state.phase !== "live") return;
     clock.restart();
-    stream.restart();
-    first_drawn_ms = null;
-    drawn_ms = [];
     // A replay reports itself again on the new connection.
     replay.hide();
   },
-}, new URLSearchParams(location.search).get("vehicle") ?? undefined);
+  fleet({ vehicles, arrived_ms }) {
+    names = vehicles.map(({ name }) => name);
+    if (view.name === null && isUndecided()) go(names.length === 1 ? names[0] : null, "replaceState");
+    writePicker();
+    fleet.status(vehicles, local(arrived_ms));
+    if (view.name !== null) view.status(vehicles.find(({ name }) => name === view.name), local(arrived_ms));
+  },
+  replay: (state) => replay.show(state),
+  frame(frame) {
+    if (!clock.sample(local(frame.arrived_ms), frame.sent_ns)) {
+      post({ type: "reconnect", text: "The connection lags; starting again" });
+    }
+    frames.set(frame.vehicle, frame);
+    if (is_draw_scheduled) return;
+    is_draw_scheduled = true;
+    requestAnimationFrame(draw);
+  },
+  cell: (message) => message.vehicle === view.name && view.cell(message),
+  refused({ vehicle, reason }) {
+    if (view.name !== null && (vehicle === view.name || vehicle === "")) view.refuse(reason);
+    else if (view.name === null) setText($("fleet-refusal"), reason);
+    $("fleet-refusal").hidden = $("fleet-refusal").textContent === "";
+  },
+};
 
-const replay = new ReplayBar($("replay"), (text) => link.send(text));
+worker.onmessage = ({ data }) => FROM_WORKER[data.type]?.(data);
+worker.onerror = (event) => {
+  link = { phase: "lost", text: `This page failed: ${event.message}` };
+  writeLink();
+};
 
-function writeVehicles(list, chosen) {
-  const names = list.map((vehicle) => vehicle.name);
-  if (chosen !== undefined && !names.includes(chosen)) names.unshift(chosen);
+function draw() {
+  is_draw_scheduled = false;
+  const drawn = [...frames];
+  frames.clear();
+  for (const [vehicle, frame] of drawn) {
+    // The Worker sends the next frame after this, even if this one cannot be drawn.
+    post({ type: "drawn", vehicle });
+    if (view.name === null) fleet.frame(vehicle, frame);
+    else if (vehicle === view.name) view.frame(frame);
+  }
+}
+
+const query = () => new URLSearchParams(location.search);
+const isUndecided = () => !query().has("vehicle") && !query().has("fleet");
+
+// Shows a vehicle, or the fleet (null).
+function go(vehicle, how = "pushState") {
+  history[how](null, "", vehicle === null ? "?fleet" : `?vehicle=${encodeURIComponent(vehicle)}`);
+  show(vehicle);
+}
+
+function show(vehicle) {
+  document.body.dataset.view = vehicle === null ? "fleet" : "vehicle";
+  if (vehicle === null) {
+    document.body.dataset.map = "none";
+    document.title = "Fleet · Clearway";
+    view.close();
+    return fleet.open();
+  }
+  document.title = `${vehicle} · Clearway`;
+  fleet.close(vehicle);
+  view.open(vehicle);
+}
+
+function writePicker() {
   const select = $("vehicle");
   if ([...select.options].map((option) => option.value).join("\n") !== names.join("\n")) {
     select.replaceChildren(...names.map((name) => new Option(name, name)));
   }
-  select.value = chosen ?? names[0];
+  if (view.name !== null) select.value = view.name;
   select.hidden = names.length < 2;
-  setText($("vehicle-name"), select.hidden ? (names[0] ?? "") : "");
 }
 
-function readStatus(text) {
-  try {
-    const message = JSON.parse(text);
-    if (message.type === "replay") replay.show(message);
-    if (message.type !== "status") return;
-    status = message;
-    status_arrived_ms = performance.now();
-  } catch (error) {
-    writeRefusal("status", error);
-  }
-}
-
-function pushUpdate(message, arrived_ms) {
-  try {
-    const update = stream.push(message);
-    if (!clock.sample(arrived_ms, update.sent_ns)) link.reconnect("The connection lags; starting again");
-    scheduleDraw();
-  } catch (error) {
-    writeRefusal("map", error);
-  }
-}
-
-function writeRefusal(what, error) {
-  $("refusal").hidden = false;
-  setText($("refusal"), `A ${what} message was refused: ${error.message}`);
-}
-
-function scheduleDraw() {
-  if (is_draw_scheduled) return;
-  is_draw_scheduled = true;
-  requestAnimationFrame(draw);
-}
-
-function draw() {
-  is_draw_scheduled = false;
-  const newest = stream.removeNewest();
-  if (newest && canDecode(newest.map)) {
-    shown = newest;
-    const now_ms = performance.now();
-    first_drawn_ms ??= now_ms;
-    drawn_ms.push(now_ms);
-    $("refusal").hidden = true;
-  }
-  if (!shown) return;
-  writePanels(shown.map.names);
-  for (const panel of panels.values()) drawPanel(panel);
-  writeAge();
-}
-
-// Decodes what is in sight. A map of which a part is refused is not shown at all.
-function canDecode(map) {
-  try {
-    for (const panel of panels.values()) if (panel.is_in_sight) panel.decode(map);
-    safePoints(map);
-    return true;
-  } catch (error) {
-    stream.counts.refused++;
-    writeRefusal("map", error);
-    return false;
-  }
-}
-
-// The safe points to draw over every layer; null if none are wanted or the map has none.
-const safePoints = (map) => (with_paths ? (map.layer(SAFE_PATH)?.safe_points ?? null) : null);
-
-// Makes a panel for each layer, and removes the panels of layers that the map has not.
-function writePanels(names) {
-  $("paths-choice").hidden = !names.includes(SAFE_PATH);
-  for (const [name, panel] of panels) {
-    if (names.includes(name)) continue;
-    panel.element.remove();
-    panels.delete(name);
-  }
-  for (const name of names) {
-    if (panels.has(name)) continue;
-    const panel = new Panel($("panel"), name, () => requestAnimationFrame(() => shown && drawPanel(panel)));
-    panels.set(name, panel);
-    $("panels").append(panel.element);
-  }
-}
-
-// A layer that comes into sight is decoded only now, so it can be refused only now.
-function drawPanel(panel) {
-  if (!panel.is_in_sight) return;
-  try {
-    panel.draw(shown.map, view_m, safePoints(shown.map));
-  } catch (error) {
-    panel.clear();
-    writeRefusal("map", error);
-  }
-}
-
-// Writes the age every AGE_EVERY_MS, and at the moment at which the map becomes stale.
-function writeAge() {
-  clearTimeout(age_timer);
-  let wait_ms = AGE_EVERY_MS;
-  try {
-    checkClock();
-    const now_ms = performance.now();
-    const age = shown && freshness(shown.map.header, clock.now_ns(now_ms));
-    writeFreshness(age);
-    if (age?.fresh) wait_ms = Math.min(wait_ms, Math.max(1, age.validity_ms - age.age_ms + 1));
-    if (now_ms - metrics_at_ms >= METRICS_EVERY_MS) {
-      metrics_at_ms = now_ms;
-      writeMetrics(now_ms);
-    }
-  } finally {
-    // An error must not stop the age.
-    age_timer = setTimeout(writeAge, wait_ms);
-  }
+function writeLink() {
+  const wait = link.phase === "lost" && retry_at_ms ? Math.ceil((retry_at_ms - performance.now()) / 1e3) : 0;
+  $("link").dataset.phase = link.phase;
+  setText($("link-text"), link.text + (wait > 0 ? ` · again in ${wait} s` : ""));
 }
 
 // After a sleep the messages that wait in the connection are old, and the monotonic clock may have stood still.
@@ -183,70 +126,36 @@ function checkClock() {
   if (Math.abs(difference - wall_minus_monotonic) < CLOCK_STEP_MS) return;
   wall_minus_monotonic = difference;
   clock.forget();
-  link.reconnect("This computer's clock was set, or the computer slept");
+  post({ type: "reconnect", text: "This computer's clock was set, or the computer slept" });
 }
 
-function writeFreshness(age) {
-  const state = !age ? "none" : age.fresh ? "fresh" : "stale";
-  document.body.dataset.map = state;
-  // A screen reader announces this text, so it holds the state alone and not the age.
-  setText($("freshness"), { none: "NO MAP YET", fresh: "FRESH", stale: "STALE" }[state]);
-  const share = age?.age_ms == null ? 1 : Math.min(Math.max(age.age_ms / age.validity_ms, 0), 1);
-  $("bar").style.transform = `scaleX(${age ? share.toFixed(2) : 0})`;
-  setText($("age"), age ? duration(age.age_ms) : dash);
-  const valid = age && `valid for ${duration(age.validity_ms)} after capture`;
-  setText($("why"), age ? age.why || valid : "waiting for the first map");
-  const label = state === "stale" ? `STALE · ${duration(age.age_ms)}` : "";
-  for (const panel of panels.values()) panel.writeStale(label);
-}
+setInterval(() => {
+  checkClock();
+  writeLink();
+  fleet.write();
+}, TICK_MS);
 
-function writeMetrics(now_ms) {
-  drawn_ms = drawn_ms.filter((at) => now_ms - at <= RATE_OVER_MS);
-  // Until a connection is RATE_OVER_MS old, the rate is that of the intervals so far.
-  const over_ms = first_drawn_ms === null ? 0 : now_ms - first_drawn_ms;
-  const { phase, text, retry_at_ms } = link_state;
-  const per_ms = over_ms >= RATE_OVER_MS ? drawn_ms.length / RATE_OVER_MS : (drawn_ms.length - 1) / over_ms;
-  const rate = phase === "live" ? per_ms : 0;
-  setText($("rate"), (Number.isFinite(rate) && rate > 0 ? 1e3 * rate : 0).toFixed(1));
-  setText($("size"), shown ? bytes(shown.map.length) : dash);
-  const wait = retry_at_ms ? ` · again in ${Math.max(0, Math.ceil((retry_at_ms - now_ms) / 1e3))} s` : "";
-  $("link").dataset.phase = phase;
-  setText($("link-text"), text + wait);
-  metrics.writeMapMetrics($("stream"), shown, stream.counts, clock.ahead_ms(wall_minus_monotonic));
-  metrics.writePacketMetrics($("packets"), status);
-  metrics.writeServerMetrics($("server"), status);
-  metrics.writeSensors($("sensors"), shown?.map.header.sensors ?? status?.sensors ?? []);
-  for (const element of document.querySelectorAll("[data-status-age]")) {
-    metrics.writeStatusAge(element, status_arrived_ms, now_ms);
-  }
-}
+onpopstate = () => show(query().get("vehicle"));
+$("vehicle").onchange = () => go($("vehicle").value);
 
-function forgetVehicle() {
-  shown = status = status_arrived_ms = first_drawn_ms = null;
-  drawn_ms = [];
-  stream = new MapStream();
-  for (const panel of panels.values()) panel.element.remove();
-  panels.clear();
-  $("refusal").hidden = true;
-}
+// Links of this page open without loading it again, unless the user wants a new tab.
+document.addEventListener("click", (event) => {
+  const link = event.target.closest?.("a[href^='?']");
+  if (!link || event.ctrlKey || event.metaKey || event.shiftKey || event.button !== 0) return;
+  event.preventDefault();
+  go(new URLSearchParams(new URL(link.href).search).get("vehicle"));
+  scrollTo(0, 0);
+});
 
-$("vehicle").onchange = () => {
-  forgetVehicle();
-  const address = new URL(location.href);
-  address.searchParams.set("vehicle", $("vehicle").value);
-  history.replaceState(null, "", address);
-  link.choose($("vehicle").value);
-};
-$("view").onchange = () => {
-  view_m = Number($("view").value);
-  scheduleDraw();
-};
-// A browser may keep the check mark when the page is loaded again.
-with_paths = $("paths").checked;
-$("paths").onchange = () => {
-  with_paths = $("paths").checked;
-  scheduleDraw();
-};
+document.addEventListener("keydown", (event) => {
+  const is_typing = event.target.closest?.("input:not([type=checkbox],[type=radio],[type=range]), select, textarea");
+  if (is_typing || event.ctrlKey || event.metaKey || event.altKey) return;
+  const isIn = (name) => document.body.dataset.view === name;
+  if (event.key === "f" && isIn("vehicle")) go(null);
+  else if (event.key === "/" && isIn("fleet")) $("find").focus();
+  else if (!isIn("vehicle") || !view.pressKey(event.key)) return;
+  event.preventDefault();
+});
 
-link.connect();
-writeAge();
+writeLink();
+if (!isUndecided()) show(query().get("vehicle"));

@@ -1,6 +1,6 @@
 // In: the updates of one vehicle, as they arrive. Out: the newest map that was not drawn yet, and counts of what
-// happened to all others. Only the header of an update is read here; the cells of a map that is replaced before it was
-// drawn are never decoded.
+// happened to all others. Of a whole map only the header is read here; the cells of a map that is replaced before it
+// was drawn are never decoded. A delta is decoded at once, because the next one starts from it.
 
 import { openUpdate } from "./wire/map.js";
 
@@ -12,18 +12,23 @@ export class MapStream {
   #is_new_connection = true;
   // Updates that could not be read since the last map: they are in a gap of the sequence, but were not lost.
   #unreadable = 0n;
+  // The map that the next delta starts from; null if maps are whole.
+  #base = null;
 
   // Starts a new connection. The maps that were made while there was none count neither as skipped nor as lost.
   restart() {
     this.#is_new_connection = true;
     this.#unreadable = 0n;
+    this.#base = null;
   }
 
   // Records one message; returns its update. Throws a DecodeError or WireError if the message is refused.
-  push(message) {
+  // with_deltas: true if the server may send deltas.
+  push(message, with_deltas = false) {
     let update;
     try {
-      update = openUpdate(message);
+      update = openUpdate(message, this.#base);
+      this.#base = with_deltas ? update.map : null;
     } catch (error) {
       this.#unreadable++;
       this.counts.refused++;

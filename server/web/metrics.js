@@ -29,7 +29,7 @@ function writeList(element, entries) {
 }
 
 export function writeMapMetrics(element, shown, counts, server_ahead_ms) {
-  const header = shown?.map.header, pose = header?.map_from_ego;
+  const header = shown?.header, pose = header?.map_from_ego;
   const ms = (from, to) => duration(Number(to - from) / 1e6);
   writeList(element, [
     ["Sequence", header ? count(header.sequence) : dash],
@@ -45,7 +45,7 @@ export function writeMapMetrics(element, shown, counts, server_ahead_ms) {
     ["Repeated or late", count(counts.repeated), counts.repeated > 0],
     ["Refused by this page", count(counts.refused), counts.refused > 0],
     ["Restarts of the server", count(counts.restarts)],
-    ["Map size", shown ? bytes(shown.map.length) : dash],
+    ["Map size", shown ? bytes(shown.length) : dash],
     ["Server clock ahead by", duration(server_ahead_ms)],
   ]);
 }

@@ -125,7 +125,8 @@ test("a legend gives each class its colour, its share of the cells and its meani
 test("the time bar counts seconds from the first event, within the range that is played", () => {
   const at = (ms) => (1_317_000_000_000_000_000n + ns(ms)).toString();
   const state = {
-    phase: "playing", rate: "max", begin_ns: at(0), end_ns: at(9000), from_ns: at(2000), to_ns: at(8000), position_ns: at(500),
+    phase: "playing", rate: "max", begin_ns: at(0), end_ns: at(9000), from_ns: at(2000), to_ns: at(8000),
+    position_ns: at(500),
   };
   const before = view(state);
   assert.deepEqual([before.from_s, before.to_s, before.position_s, before.plays], [2, 8, 2, true]);

@@ -1,5 +1,5 @@
 // The time bar of a replay. In: the server's texts of type "replay", and the user's clicks. Out: the bar, and requests
-// through `send(text)`. Times are strings of nanoseconds on the wire; the bar counts seconds from the first event.
+// through `send(request)`. Times are strings of nanoseconds on the wire; the bar counts seconds from the first event.
 
 import { setText } from "./text.js";
 
@@ -33,7 +33,7 @@ export class ReplayBar {
 
   constructor(element, send) {
     this.#element = element;
-    this.#send = (request) => send(JSON.stringify(request));
+    this.#send = send;
     const part = (name) => this.#part(name);
     part("play").onclick = () => this.#toggle();
     part("step").onclick = () => this.#send({ step: 1 });

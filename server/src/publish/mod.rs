@@ -12,12 +12,14 @@
 //! | `ros` | newest map -> ROS 2 topics in rmw_zenoh's key space |
 //! | [`foxglove`] | newest map, points, pose -> Foxglove's WebSocket |
 //! | `page_replay` | the state of a replay and requests of the page, as JSON |
+//! | `page_live` | selections and acknowledgements of a browser -> maps, status and replay state on its WebSocket |
 //! | [`page`] | newest map, status -> the page's WebSocket, `/vehicles`, `/healthz`, `/readyz`, `/metrics` |
 
 pub mod foxglove;
 pub mod grpc;
 pub mod listen;
 pub mod page;
+mod page_live;
 mod page_replay;
 #[cfg(feature = "zenoh")]
 mod ros;

@@ -1,40 +1,24 @@
-//! The HTTP server of the page: its embedded files, its WebSocket `/live?vehicle=V`, `/vehicles`, `/healthz`, `/readyz`
-//! and `/metrics`. The last three are also served alone, on a listener of their own.
-//!
-//! The WebSocket sends each newest map as a binary `clearway.v1.MapUpdate` with all layers, and the status once a
-//! second as a JSON text. Over a replay it also sends its state as a JSON text (`type`: `replay`) at each change, and
-//! takes requests of operators. A browser that reads nothing for [`SEND_TIMEOUT`] is disconnected.
+//! The HTTP server of the page: its embedded files, its WebSocket `/live` ([`super::page_live`]), `/vehicles`,
+//! `/healthz`, `/readyz` and `/metrics`. The last three are also served alone, on a listener of their own.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use axum::Router;
-use axum::extract::ws::{Message as Frame, WebSocket, WebSocketUpgrade};
+use axum::extract::ws::WebSocketUpgrade;
 use axum::extract::{Extension, Query, State};
 use axum::http::{HeaderMap, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use bytes::Bytes;
-use clearway_proto::v1;
-use prost::Message;
 use rust_embed::RustEmbed;
 use serde_json::Value;
-use tokio::sync::watch;
 
 use super::listen::access::Caller;
-use super::listen::{InProgress, Listener, ListenerHandle, Place};
-use super::page_replay::{PageReplay, replay_changed, replay_json};
-use super::served::{Served, Vehicles};
-use crate::clock::now_ns;
+use super::listen::{Listener, ListenerHandle, Place};
+pub use super::page_live::Summaries;
+use super::page_live::{Live, MESSAGE_BYTES_MAX};
+use super::served::Vehicles;
 use crate::replay::ReplayHandle;
-use crate::status::{Format, Reader, Transport, prometheus};
-
-/// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.
-const SEND_TIMEOUT: Duration = Duration::from_secs(5);
-/// Time between two status messages.
-const STATUS_PERIOD: Duration = Duration::from_secs(1);
-/// Longest message from a browser, in bytes. Ours: the page sends pongs and short requests.
-const MESSAGE_BYTES_MAX: usize = 4096;
+use crate::status::{Format, prometheus};
 
 #[derive(RustEmbed)]
 #[folder = "web/"]
@@ -49,6 +33,8 @@ pub struct Shown {
     pub listeners: Arc<[(&'static str, ListenerHandle)]>,
     /// Controls the replay that the server serves.
     pub replay: Option<ReplayHandle>,
+    /// What all browsers share of the vehicles' status.
+    pub summaries: Summaries,
 }
 
 /// Serves the page until `stop` resolves.
@@ -127,10 +113,10 @@ async fn metrics(
 
 #[derive(serde::Deserialize)]
 struct LiveQuery {
-    #[serde(default)]
-    vehicle: String,
+    vehicle: Option<String>,
 }
 
+/// The WebSocket: of all vehicles that the caller may reach, or of one, whose maps then begin at once.
 async fn live(
     State(shown): State<Shown>,
     Extension(caller): Extension<Caller>,
@@ -138,67 +124,17 @@ async fn live(
     Query(query): Query<LiveQuery>,
     upgrade: WebSocketUpgrade,
 ) -> Response {
-    let served = match shown.vehicles.find(&query.vehicle) {
-        Ok(served) => served.clone(),
-        Err(unknown) => return (StatusCode::NOT_FOUND, format!("{unknown}\n")).into_response(),
-    };
-    match caller.layers(&served.status.name, Vec::new(), &served.status.layers) {
-        Ok(layers) => {
-            let replay = shown.replay.and_then(|handle| PageReplay::new(handle, &caller));
-            let in_progress = place.begin_request();
-            let upgrade = upgrade.max_message_size(MESSAGE_BYTES_MAX);
-            upgrade.on_upgrade(move |socket| stream(socket, served, layers, replay, in_progress))
-        }
-        Err(denied) => (StatusCode::FORBIDDEN, format!("{}\n", denied.message())).into_response(),
-    }
-}
-
-/// Sends maps and status until the browser disconnects or stalls, or the engine stops.
-async fn stream(
-    mut socket: WebSocket,
-    served: Served,
-    layers: Vec<String>,
-    replay: Option<PageReplay>,
-    _in_progress: InProgress,
-) {
-    let mut reader = Reader::new(&served.status.transports, Transport::Page);
-    let subscription = served.status.subscriptions.subscribe(&layers);
-    let mut newest = served.newest.clone();
-    newest.mark_changed();
-    let mut every = tokio::time::interval(STATUS_PERIOD);
-    let mut replay_state = replay.as_ref().map(|replay| replay.handle.state());
-    replay_state.iter_mut().for_each(watch::Receiver::mark_changed);
-    loop {
-        let frame = tokio::select! {
-            changed = newest.changed() => {
-                let Ok(()) = changed else { break };
-                let map = newest.borrow_and_update().clone();
-                let Some(map) = map.filter(|map| subscription.is_covered_by(map)) else { continue };
-                let skipped = reader.got(map.boot_id, map.sequence);
-                let update = v1::MapUpdate {
-                    map: map.select(&layers), skipped, sent_ns: now_ns(), ..Default::default()
-                };
-                Frame::Binary(Bytes::from(update.encode_to_vec()))
-            }
-            _ = every.tick() => {
-                let mut status = served.status.to_json();
-                status["type"] = "status".into();
-                Frame::Text(status.to_string().into())
-            }
-            state = replay_changed(&mut replay_state) => Frame::Text(replay_json(&state, "").into()),
-            received = socket.recv() => match received {
-                Some(Ok(Frame::Text(text))) => match &replay {
-                    Some(replay) => Frame::Text(replay.answer(&text).await.into()),
-                    // Other messages of the page have no meaning; the library answers pings.
-                    None => continue,
-                },
-                Some(Ok(_)) => continue,
-                Some(Err(_)) | None => break,
+    let live = match query.vehicle {
+        None => Live::new(&shown.vehicles, shown.summaries, caller, shown.replay),
+        Some(vehicle) => match shown.vehicles.find(&vehicle) {
+            Err(unknown) => return (StatusCode::NOT_FOUND, format!("{unknown}\n")).into_response(),
+            Ok(served) => match Live::of_one(served, caller, shown.replay) {
+                Err(denied) => return (StatusCode::FORBIDDEN, format!("{}\n", denied.message())).into_response(),
+                Ok(live) => live,
             },
-        };
-        match tokio::time::timeout(SEND_TIMEOUT, socket.send(frame)).await {
-            Ok(Ok(())) => {}
-            Ok(Err(_)) | Err(_) => break,
-        }
-    }
+        },
+    };
+    let in_progress = place.begin_request();
+    let upgrade = upgrade.max_message_size(MESSAGE_BYTES_MAX);
+    upgrade.on_upgrade(move |socket| live.serve(socket, in_progress))
 }

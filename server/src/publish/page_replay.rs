@@ -53,14 +53,14 @@ pub(super) fn replay_json(state: &v1::ReplayState, error: &str) -> String {
 
 impl PageReplay {
     /// Carries out a request; returns the state after it.
-    pub async fn answer(&self, text: &str) -> String {
-        let outcome = match serde_json::from_str::<PageRequest>(text) {
-            Err(error) => Err(error.to_string()),
-            Ok(_) if !self.may_control => Err("the role operator is needed to control the replay".to_owned()),
-            Ok(request) => match request.to_control() {
+    pub async fn answer(&self, request: &PageRequest) -> String {
+        let outcome = if self.may_control {
+            match request.to_control() {
                 Err(error) => Err(error),
                 Ok(request) => self.handle.control(request).await.map_err(|error| error.to_string()),
-            },
+            }
+        } else {
+            Err("the role operator is needed to control the replay".to_owned())
         };
         match outcome {
             Ok(state) => replay_json(&state, ""),
@@ -69,11 +69,10 @@ impl PageReplay {
     }
 }
 
-/// A request of the page.
-#[derive(Deserialize)]
+/// A request of the time bar.
+#[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-#[derive(Default)]
-struct PageRequest {
+pub(super) struct PageRequest {
     seek_ns: Option<String>,
     rate: Option<serde_json::Value>,
     repeat: Option<bool>,

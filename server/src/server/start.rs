@@ -232,8 +232,9 @@ impl Running {
     fn serve(&mut self, listeners: Listeners, gateways: Gateways) {
         let Listeners { grpc, page, metrics, foxglove, security, handles, .. } = listeners;
         let listeners = handles.clone().into();
-        let shown = page::Shown { vehicles: self.vehicles.clone(), listeners, replay: self.replay.clone() };
-        self.publishers.spawn(watch_listeners(handles.clone(), self.vehicles.clone(), self.stopped()));
+        let (vehicles, replay) = (self.vehicles.clone(), self.replay.clone());
+        self.publishers.spawn(watch_listeners(handles.clone(), vehicles.clone(), self.stopped()));
+        let shown = page::Shown { vehicles, listeners, replay, summaries: page::Summaries::default() };
         self.listeners = Some((security, handles));
         let address = |listener: &Option<Listener>| listener.as_ref().and_then(Listener::address);
         (self.grpc, self.page, self.metrics) = (address(&grpc), address(&page), address(&metrics));

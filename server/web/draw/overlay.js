@@ -1,50 +1,119 @@
-// In: a canvas over a map of view_m metres to every side. Out: range rings and the vehicle, drawn on it.
+// What is drawn over a map: range rings, the vehicle, its trail, safe paths, the cell under the cursor. In: a pen whose
+// unit is a CSS pixel, and a view (vehicle/view.js).
 
-const RINGS_M = [10, 20, 40, 60];
-// The vehicle's length and width, and how long and wide it is drawn at least, in CSS pixels.
-const VEHICLE_M = [4.5, 1.8], VEHICLE_PX_MIN = [13, 6];
+import { egoFrom, toPixel } from "../vehicle/view.js";
 
-// size: the canvas's side in pixels. scale: its pixels per CSS pixel.
-export function drawOverlay(canvas, size, scale, view_m) {
-  const pen = canvas.getContext("2d"), per_metre = size / (2 * view_m);
-  pen.clearRect(0, 0, size, size);
-  pen.font = `${11 * scale}px system-ui, sans-serif`;
+const RINGS_M = [5, 10, 20, 40, 60, 80];
+// A ring is drawn if it is this many pixels from the vehicle at least.
+const RING_PX_MIN = 40;
+// The vehicle's outline if its configuration has none: length and width in metres.
+const LENGTH_M = 4.5, WIDTH_M = 1.8;
+// The vehicle is drawn at least this long, in pixels.
+const VEHICLE_PX_MIN = 12;
+const BAND = "rgb(255 255 255 / 20%)", EDGE = "rgb(255 255 255 / 55%)";
+// A line is drawn twice, dark and then light, so that it is seen on every colour.
+const PATH = [["rgb(10 14 18 / 85%)", 4.5], ["#ffe14d", 2]], TRAIL = [["rgb(10 14 18 / 70%)", 4], ["#7fd6ff", 1.75]];
+// Every so many safe points, the circle itself is drawn. The points lie a cell apart, 0.25 m by default.
+const CIRCLE_EVERY = 16;
+
+function strokeTwice(pen, path, strokes) {
+  pen.lineCap = pen.lineJoin = "round";
+  for (const [colour, width] of strokes) {
+    pen.strokeStyle = colour;
+    pen.lineWidth = width;
+    pen.stroke(path);
+  }
+}
+
+export function drawRings(pen, view, size) {
+  const { px, py } = toPixel(view, size, 0, 0);
+  pen.font = "11px system-ui, sans-serif";
   pen.textAlign = "center";
   pen.textBaseline = "middle";
-  for (const radius_m of RINGS_M.filter((radius_m) => radius_m <= view_m)) {
-    drawRing(pen, size / 2, scale, radius_m * per_metre, `${radius_m} m`);
+  for (const radius_m of RINGS_M) {
+    const radius = radius_m / view.metres;
+    if (radius < RING_PX_MIN || radius > 2 * Math.max(size.width, size.height)) continue;
+    const ring = new Path2D();
+    ring.arc(px, py, radius, 0, 2 * Math.PI);
+    strokeTwice(pen, ring, [["rgb(0 0 0 / 35%)", 2.5], ["rgb(255 255 255 / 65%)", 1]]);
+    // Labels stand ahead and to the right, where those of neighbouring rings do not touch.
+    const x = px + radius * Math.SQRT1_2, y = py - radius * Math.SQRT1_2;
+    pen.lineWidth = 3.5;
+    pen.strokeStyle = "rgb(0 0 0 / 75%)";
+    pen.strokeText(`${radius_m} m`, x, y);
+    pen.fillStyle = "#fff";
+    pen.fillText(`${radius_m} m`, x, y);
   }
-  drawVehicle(pen, size / 2, scale, per_metre);
 }
 
-function drawRing(pen, middle, scale, radius, label) {
-  const ring = new Path2D();
-  ring.arc(middle, middle, radius, 0, 2 * Math.PI);
-  for (const [colour, width] of [["rgb(0 0 0 / 45%)", 2.5], ["rgb(255 255 255 / 75%)", 1]]) {
-    pen.strokeStyle = colour;
-    pen.lineWidth = width * scale;
-    pen.stroke(ring);
-  }
-  // Labels stand ahead and to the right, where those of neighbouring rings do not touch.
-  const x = middle + radius * Math.SQRT1_2, y = middle - radius * Math.SQRT1_2;
-  pen.lineWidth = 3.5 * scale;
-  pen.strokeStyle = "rgb(0 0 0 / 75%)";
-  pen.strokeText(label, x, y);
-  pen.fillStyle = "#fff";
-  pen.fillText(label, x, y);
-}
-
-function drawVehicle(pen, middle, scale, per_metre) {
-  const [length, width] = VEHICLE_M.map((m, i) => Math.max(m * per_metre, VEHICLE_PX_MIN[i] * scale) / 2);
+// outline: x0, y0, x1, y1 ... in the ego frame; empty if the configuration has none.
+export function drawOutline(pen, view, size, outline) {
+  const [length, width] = [LENGTH_M / 2, WIDTH_M / 2];
+  const given = outline.length >= 6 ? outline : [length, width, length, -width, -length, -width, -length, width];
+  const xs = given.filter((_, i) => i % 2 === 0), ys = given.filter((_, i) => i % 2 === 1);
+  const [front, back] = [Math.max(...xs), Math.min(...xs)], side = Math.max(...ys.map(Math.abs));
+  // Too small to be seen, it is drawn larger.
+  const larger = Math.max(1, (VEHICLE_PX_MIN * view.metres) / Math.max(front - back, 0.1));
+  const at = (x, y) => Object.values(toPixel(view, size, x * larger, y * larger));
   const body = new Path2D(), nose = new Path2D();
-  body.roundRect(middle - width, middle - length, 2 * width, 2 * length, width / 2);
-  nose.moveTo(middle - width * 0.6, middle - length * 0.1);
-  nose.lineTo(middle, middle - length * 0.65);
-  nose.lineTo(middle + width * 0.6, middle - length * 0.1);
+  xs.forEach((x, i) => (i ? body.lineTo(...at(x, ys[i])) : body.moveTo(...at(x, ys[i]))));
+  body.closePath();
+  const middle = (front + back) / 2, half = (front - back) / 2;
+  nose.moveTo(...at(middle + half * 0.1, side * 0.6));
+  nose.lineTo(...at(middle + half * 0.7, 0));
+  nose.lineTo(...at(middle + half * 0.1, -side * 0.6));
   pen.fillStyle = "#fff";
   pen.fill(body);
   pen.strokeStyle = pen.fillStyle = "#111";
-  pen.lineWidth = 1.5 * scale;
+  pen.lineWidth = 1.5;
+  pen.lineJoin = "round";
   pen.stroke(body);
   pen.fill(nose);
+}
+
+// points: where the vehicle was, in the frame of `pose`, in which it is now.
+export function drawTrail(pen, view, size, points, pose) {
+  if (points.length < 2) return;
+  const path = new Path2D();
+  points.forEach((point, i) => {
+    const { x, y } = egoFrom(pose, point), { px, py } = toPixel(view, size, x, y);
+    if (i) path.lineTo(px, py);
+    else path.moveTo(px, py);
+  });
+  strokeTwice(pen, path, TRAIL);
+}
+
+// points: of wire/safe_points.js; null draws nothing. The ground within their radii is a band.
+export function drawSafePoints(pen, view, size, points) {
+  if (!points || points.x.length === 0) return;
+  const at = (i) => toPixel(view, size, points.x[i], points.y[i]), per_metre = 1 / view.metres;
+  // One path for all circles: where they overlap, the band is not brighter.
+  const band = new Path2D(), circles = new Path2D(), lines = new Path2D();
+  const circle = (path, i) => {
+    const { px, py } = at(i), radius = points.radius[i] * per_metre;
+    path.moveTo(px + radius, py);
+    path.arc(px, py, radius, 0, 2 * Math.PI);
+  };
+  // Point 0 is the vehicle's position.
+  for (let i = 1; i < points.x.length; i++) {
+    circle(band, i);
+    if (i % CIRCLE_EVERY === 1) circle(circles, i);
+  }
+  for (const [from, to] of points.links) {
+    lines.moveTo(at(from).px, at(from).py);
+    lines.lineTo(at(to).px, at(to).py);
+  }
+  pen.fillStyle = BAND;
+  pen.fill(band, "nonzero");
+  pen.strokeStyle = EDGE;
+  pen.lineWidth = 0.75;
+  pen.stroke(circles);
+  strokeTwice(pen, lines, PATH);
+}
+
+export function drawProbe(pen, view, size, probe) {
+  if (!probe) return;
+  const { px, py } = toPixel(view, size, probe.x, probe.y), mark = new Path2D();
+  mark.arc(px, py, 7, 0, 2 * Math.PI);
+  strokeTwice(pen, mark, [["#000", 5], ["#fff", 2]]);
 }

@@ -28,6 +28,25 @@ export function paintPixels(pixels, table, cells, colours) {
   for (let i = 0; i < table.length; i++) pixels[i] = table[i] < 0 ? 0 : colours[cells[table[i]] - low];
 }
 
+// Draws a layer over pixels that are painted: half of its colour and half of theirs. colours: an ImageData word for
+// each raw value, 0 for those that leave a pixel as it is.
+export function blendPixels(pixels, table, cells, colours) {
+  const low = least(cells), half = 0x7f7f7f7f;
+  for (let i = 0; i < table.length; i++) {
+    const over = table[i] < 0 ? 0 : colours[cells[table[i]] - low];
+    if (over !== 0) pixels[i] = (((over >>> 1) & half) + ((pixels[i] >>> 1) & half)) | 0xff000000;
+  }
+}
+
+// The colours of the classes of a layer that is drawn over another one: those of which `is_drawn(class)` is true.
+export function overlayColours(legend, is_drawn) {
+  const colours = new Uint32Array(256);
+  legend.forEach((entry, value) => {
+    if (is_drawn(entry)) colours[value] = word(entry.colour);
+  });
+  return colours;
+}
+
 function paintClasses(layer, cells) {
   const counts = new Uint32Array(tableLength(cells)), colours = new Uint32Array(tableLength(cells)), low = least(cells);
   for (let i = 0; i < cells.length; i++) counts[cells[i] - low]++;

@@ -29,3 +29,21 @@ export function idColour(id) {
 // A colour as a 32-bit word of ImageData, in little-endian memory.
 export const word = ([red, green, blue]) => ((255 << 24) | (blue << 16) | (green << 8) | red) >>> 0;
 export const css = ([red, green, blue]) => `rgb(${red} ${green} ${blue})`;
+
+// Colours by what a class means to a planner, told apart by all kinds of colour-blind eyes (Okabe and Ito 2008), for
+// readers to whom the classes' own colours look alike.
+const BY_MEANING = {
+  free: [0, 114, 178], inferred: [86, 180, 233], occupied: [213, 94, 0], hidden: [204, 121, 167],
+  "not reached": [150, 150, 150], unknown: UNKNOWN,
+};
+
+// A legend with colours by meaning. Classes of one meaning differ in lightness.
+export function legendByMeaning(legend) {
+  const seen = {};
+  return legend.map((entry) => {
+    const order = (seen[entry.meaning] = (seen[entry.meaning] ?? -1) + 1);
+    const lighter = Math.min(0.3 * order, 0.75);
+    const colour = (BY_MEANING[entry.meaning] ?? UNKNOWN).map((part) => Math.round(part + (255 - part) * lighter));
+    return { ...entry, colour };
+  });
+}

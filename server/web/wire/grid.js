@@ -1,12 +1,13 @@
 // In: the geometry of a layer, radial or Cartesian (ego frame: x forward, y left, metres). Out: the cell at a point,
-// and a table from pixels to cells for a square canvas with the vehicle in its middle, forward up and left on the left.
-// The table is computed once for each geometry and size; then a map costs one look-up a pixel.
+// and a table from the pixels of a raster to cells. The table is computed once for each geometry and raster; then a map
+// costs one look-up a pixel.
 
 import { DecodeError } from "./limits.js";
 
 // How many cells a grid may have is checked where they are decoded (codec.js).
 //
-// { key, radius_m, cellAt(x, y) -> the cell's index or -1 }, and for deltas { kind: equal if cells are comparable,
+// { key, radius_m, cellAt(x, y) -> the cell's index or -1, fill(table, raster) }, and for deltas { kind: equal if cells
+// are comparable,
 // shape: [rows, columns], first: [number of the first row, of the first column] }.
 export function gridOf(layer) {
   if (layer.radial) return radial(layer.radial);
@@ -48,7 +49,14 @@ function radial({ row_radius_m, columns, centre_x_m = 0, centre_y_m = 0 }) {
   };
   const key = `radial ${centre_x_m} ${centre_y_m} ${columns} ${row_radius_m.join()}`;
   const radius_m = radii[rows - 1] + Math.max(Math.abs(centre_x_m), Math.abs(centre_y_m));
-  return { key, radius_m, cellAt, kind: key, shape: [rows, columns], first: [0n, 0n] };
+  const fill = (table, raster) => {
+    for (let py = 0, i = 0; py < raster.height; py++) {
+      const x = raster.x_m + (raster.height / 2 - py - 0.5) * raster.metres;
+      const left = raster.y_m + (raster.width / 2 - 0.5) * raster.metres;
+      for (let px = 0; px < raster.width; px++, i++) table[i] = cellAt(x, left - px * raster.metres);
+    }
+  };
+  return { key, radius_m, cellAt, fill, kind: key, shape: [rows, columns], first: [0n, 0n] };
 }
 
 function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix = 0n, first_iy = 0n }) {
@@ -67,32 +75,43 @@ function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, fir
   const edges = [origin_x_m, origin_x_m + width * cell_m, origin_y_m, origin_y_m + height * cell_m];
   const key = `cartesian ${origin_x_m} ${origin_y_m} ${width} ${height} ${cell_m} ${yaw_rad}`;
   const radius_m = Math.max(...edges.map(Math.abs));
-  return { key, radius_m, cellAt, kind: `cartesian ${cell_m}`, shape: [height, width], first: [first_iy, first_ix] };
+  // From pixel to pixel a position in the grid moves by a constant, so this costs two additions a pixel.
+  const fill = (table, raster) => {
+    const step = raster.metres / cell_m;
+    for (let py = 0, i = 0; py < raster.height; py++) {
+      const { x, y } = egoAt(raster, 0, py);
+      let across = (x * cos - y * sin - origin_x_m) / cell_m, along = (x * sin + y * cos - origin_y_m) / cell_m;
+      for (let px = 0; px < raster.width; px++, i++, across += sin * step, along -= cos * step) {
+        const ix = Math.floor(across), iy = Math.floor(along);
+        table[i] = ix >= 0 && ix < width && iy >= 0 && iy < height ? iy * width + ix : -1;
+      }
+    }
+  };
+  const shape = [height, width], first = [first_iy, first_ix];
+  return { key, radius_m, cellAt, fill, kind: `cartesian ${cell_m}`, shape, first };
 }
 
-// The ego coordinates, in metres, of the middle of a pixel of a canvas that is `size` pixels wide and shows `view_m` to
-// every side.
-export function egoAt(px, py, size, view_m) {
-  const metres = (2 * view_m) / size;
-  return { x: (size / 2 - py - 0.5) * metres, y: (size / 2 - px - 0.5) * metres };
+// A raster is a picture of the ego frame, forward up, left on the left: { width, height: pixels, x_m, y_m: of its
+// middle in the ego frame, metres: a pixel's side }.
+
+// The ego coordinates of the middle of a pixel.
+export function egoAt({ width, height, x_m, y_m, metres }, px, py) {
+  return { x: x_m + (height / 2 - py - 0.5) * metres, y: y_m + (width / 2 - px - 0.5) * metres };
 }
 
-// Layers of one map mostly share a geometry, so their panels share a table. A change of the view makes new tables, and
-// so does each map of a grid that turns under the vehicle; the table that was not used for the longest time is dropped.
+// The layers of one map mostly share a geometry, so their tables are kept. A new raster makes new tables, and so does
+// each map of a grid that turns under the vehicle; the table that was not used for the longest time is dropped.
 const TABLES_MAX = 4;
 const tables = new Map();
 
-// The index of the cell in the middle of each pixel, row by row from the upper left; -1 outside the grid.
-export function pixelCells(grid, size, view_m) {
-  const key = `${size} ${view_m} ${grid.key}`;
+// The index of the cell in the middle of each pixel of a raster, row by row from the upper left; -1 outside the grid.
+export function pixelCells(grid, raster) {
+  const { width, height, x_m, y_m, metres } = raster;
+  const key = `${width} ${height} ${x_m} ${y_m} ${metres} ${grid.key}`;
   let table = tables.get(key);
   if (!table) {
-    table = new Int32Array(size * size);
-    const metres = (2 * view_m) / size, { cellAt } = grid;
-    for (let py = 0, i = 0; py < size; py++) {
-      const x = (size / 2 - py - 0.5) * metres;
-      for (let px = 0; px < size; px++, i++) table[i] = cellAt(x, (size / 2 - px - 0.5) * metres);
-    }
+    table = new Int32Array(width * height);
+    grid.fill(table, raster);
     if (tables.size >= TABLES_MAX) tables.delete(tables.keys().next().value);
   }
   tables.delete(key);

@@ -9,11 +9,11 @@ import { DecodeError, MAP_BYTES_MAX, MAP_CELLS_MAX, MAP_PARTS_MAX } from "./limi
 import { countParts, readLayer, readLayerName, readMap, readMapUpdate } from "./protobuf.js";
 import { readSafePoints } from "./safe_points.js";
 
-// { skipped, sent_ns, map }: a MapUpdate and its map. 64-bit values are BigInt.
-export function openUpdate(message) {
+// { skipped, sent_ns, map }: a MapUpdate and its map. 64-bit values are BigInt. base: the map that deltas start from.
+export function openUpdate(message, base = null) {
   const update = readMapUpdate(message);
   if (update.sent_ns <= 0n) throw new DecodeError("sent_ns", `${update.sent_ns}; the age needs it`);
-  return { ...update, map: new LiveMap(update.map) };
+  return { ...update, map: new LiveMap(update.map, base) };
 }
 
 // A map of which only the header and the layers' names are read at first.

@@ -232,9 +232,25 @@ test("a grid that turns under the vehicle is addressed along its own axes", () =
   assert.deepEqual([grid.cellAt(1.5, 0.5), grid.cellAt(-0.5, 1.5), grid.cellAt(2.5, 0)], [13, 4, -1]);
 });
 
+const RASTER = { width: 10, height: 10, x_m: 0, y_m: 0, metres: 1 };
+
 test("forward is up and left is left", () => {
-  const { x, y } = egoAt(0, 0, 10, 5);
+  const { x, y } = egoAt(RASTER, 0, 0);
   assert.deepEqual([x, y], [4.5, 4.5]);
   const grid = gridOf({ radial: { row_radius_m: [20], columns: 4 } });
-  assert.deepEqual([...pixelCells(grid, 2, 5)], [0, 3, 1, 2]);
+  assert.deepEqual([...pixelCells(grid, { ...RASTER, width: 2, height: 2, metres: 5 })], [0, 3, 1, 2]);
+});
+
+test("the table of a raster holds the cell in the middle of each pixel, wherever the raster lies", () => {
+  const cartesian = { origin_x_m: -3, origin_y_m: -4.2, width: 9, height: 7, cell_m: 0.7, yaw_rad: 0.4 };
+  const radial = { row_radius_m: [1, 2, 5], columns: 8, centre_x_m: 0.5 };
+  for (const grid of [gridOf({ cartesian }), gridOf({ radial })]) {
+    const raster = { width: 31, height: 17, x_m: 0.7, y_m: -1.3, metres: 0.31 };
+    const expected = Array.from({ length: 31 * 17 }, (_, i) => {
+      const { x, y } = egoAt(raster, i % 31, Math.floor(i / 31));
+      return grid.cellAt(x, y);
+    });
+    assert.deepEqual([...pixelCells(grid, raster)], expected);
+    assert.ok(expected.includes(-1) && new Set(expected).size > 10);
+  }
 });

@@ -2,14 +2,17 @@
 
 use std::io::{self, BufRead, BufReader, Lines, Write};
 use std::net::TcpStream;
+use std::path::Path;
 use std::process::{Child, ChildStdout, Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
 /// ChromeDriver answers within a page load, which takes a few seconds on a loaded machine.
 const ANSWER_MAX: Duration = Duration::from_secs(60);
+/// Longest wait for something on the page.
+const PATIENCE: Duration = Duration::from_secs(60);
 /// The key of an element's id in an answer (W3C WebDriver, section 12).
 const ELEMENT: &str = "element-6066-11e4-a52e-4f735466cecf";
 /// Chromium without a display, a graphics card, a sandbox (which root cannot have), and without traffic of its own.
@@ -36,8 +39,25 @@ pub struct Browser {
 }
 
 impl Browser {
-    /// Starts ChromeDriver and through it a Chromium whose window has this width and height.
+    /// A Chromium that shows pages at this width and height.
     pub fn start(width: u32, height: u32) -> Self {
+        let browser = Self::begin(width, height, json!({}));
+        // The window's frame takes some of its height.
+        let inner = browser.run("return [innerWidth, innerHeight]");
+        let [inner_width, inner_height] = [0, 1].map(|i| inner[i].as_u64().expect("a number") as u32);
+        let rect = json!({ "width": 2 * width - inner_width, "height": 2 * height - inner_height });
+        browser.post(&format!("{}/window/rect", browser.session), rect);
+        browser
+    }
+
+    /// A Chromium like that of a phone: touch, and two pixels for each CSS pixel.
+    pub fn start_phone(width: u32, height: u32) -> Self {
+        let metrics = json!({ "width": width, "height": height, "pixelRatio": 2, "touch": true });
+        Self::begin(width, height, json!({ "deviceMetrics": metrics }))
+    }
+
+    /// Starts ChromeDriver and through it a Chromium with a window of this size.
+    fn begin(width: u32, height: u32, mobile: Value) -> Self {
         let mut driver = Command::new("chromedriver")
             .arg("--port=0")
             .stdout(Stdio::piped())
@@ -52,11 +72,15 @@ impl Browser {
         let mut flags = FLAGS.map(str::to_owned).to_vec();
         flags.push(format!("--user-data-dir={}", browser.profile.path().display()));
         flags.push(format!("--window-size={width},{height}"));
+        let mut options = json!({ "args": flags });
+        if mobile["deviceMetrics"].is_object() {
+            options["mobileEmulation"] = mobile;
+        }
         let session = browser.post(
             "/session",
             json!({ "capabilities": { "alwaysMatch": {
                 "browserName": "chrome",
-                "goog:chromeOptions": { "args": flags },
+                "goog:chromeOptions": options,
                 "goog:loggingPrefs": { "browser": "ALL" },
             } } }),
         );
@@ -69,11 +93,50 @@ impl Browser {
         self.post(&format!("{}/url", self.session), json!({ "url": url }));
     }
 
-    /// The text of an element, as a person sees it.
-    pub fn text(&self, selector: &str) -> String {
+    /// The address of the page.
+    pub fn url(&self) -> String {
+        self.request("GET", &format!("{}/url", self.session), None).as_str().expect("a text").to_owned()
+    }
+
+    /// Waits until a script returns true.
+    pub fn until(&self, what: &str, script: &str) {
+        let began = Instant::now();
+        while self.run(script) != true {
+            assert!(began.elapsed() < PATIENCE, "waited in vain: {what}\n{}", self.text("body"));
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+
+    /// Presses keys while an element has the focus.
+    pub fn key(&self, selector: &str, keys: &str) {
+        let element = self.find(selector);
+        self.post(&format!("{}/element/{element}/value", self.session), json!({ "text": keys }));
+    }
+
+    /// Clicks the middle of an element.
+    pub fn click(&self, selector: &str) {
+        let element = self.find(selector);
+        self.post(&format!("{}/element/{element}/click", self.session), json!({}));
+    }
+
+    /// Keeps a picture of the window in `target/page`.
+    pub fn screenshot(&self, name: &str) {
+        let picture = self.request("GET", &format!("{}/screenshot", self.session), None);
+        let picture = decoded_base64(picture.as_str().expect("a text"));
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/page");
+        std::fs::create_dir_all(&folder).expect("a folder");
+        std::fs::write(folder.join(format!("{name}.png")), picture).expect("a picture");
+    }
+
+    fn find(&self, selector: &str) -> String {
         let found =
             self.post(&format!("{}/element", self.session), json!({ "using": "css selector", "value": selector }));
-        let element = found[ELEMENT].as_str().expect("an element's id");
+        found[ELEMENT].as_str().expect("an element's id").to_owned()
+    }
+
+    /// The text of an element, as a person sees it.
+    pub fn text(&self, selector: &str) -> String {
+        let element = self.find(selector);
         let text = self.request("GET", &format!("{}/element/{element}/text", self.session), None);
         text.as_str().expect("a text").to_owned()
     }
@@ -151,4 +214,21 @@ fn read_answer(stream: &mut impl BufRead) -> io::Result<(String, Vec<u8>)> {
     let mut body = vec![0; length];
     stream.read_exact(&mut body)?;
     Ok((status, body))
+}
+
+/// The bytes of a text in base64 (RFC 4648, section 4).
+fn decoded_base64(text: &str) -> Vec<u8> {
+    let value = |letter: u8| match letter {
+        b'A'..=b'Z' => letter - b'A',
+        b'a'..=b'z' => letter - b'a' + 26,
+        b'0'..=b'9' => letter - b'0' + 52,
+        b'+' => 62,
+        _ => 63,
+    };
+    let letters: Vec<u8> = text.bytes().filter(|&letter| letter != b'=').map(value).collect();
+    let bytes = letters.chunks(4).flat_map(|four| {
+        let bits = four.iter().enumerate().fold(0, |bits, (i, &six)| bits | u32::from(six) << (18 - 6 * i));
+        bits.to_be_bytes()[1..four.len()].to_vec()
+    });
+    bytes.collect()
 }

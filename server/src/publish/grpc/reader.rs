@@ -35,7 +35,25 @@ where
     R: Stream<Item = Result<v1::WatchRequest, Status>> + Send + Unpin,
 {
     let served = vehicles.find(&selection.vehicle)?;
-    Ok(Watch::new(served, Selection::new(served, selection)?, requests, name).updates())
+    let selection = Selection::new(served, selection)?;
+    let finished = selection.credits.are_limited().then(|| served.status.acknowledgements.add(name));
+    Ok(Watch::new(served, selection, requests, finished, Transport::Grpc).updates())
+}
+
+/// The same for a browser: it is counted as a reader of the page, and no replay in lockstep waits for it.
+///
+/// # Errors
+/// As [`watch`].
+pub fn watch_from_page<R>(
+    served: &Served,
+    selection: v1::Selection,
+    requests: R,
+) -> Result<impl Stream<Item = Result<v1::MapUpdate, Status>> + Send + use<R>, Status>
+where
+    R: Stream<Item = Result<v1::WatchRequest, Status>> + Send + Unpin,
+{
+    let selection = Selection::new(served, selection)?;
+    Ok(Watch::new(served, selection, requests, None, Transport::Page).updates())
 }
 
 struct Watch<R> {
@@ -52,7 +70,7 @@ struct Watch<R> {
     base: Option<Arc<EncodedMap>>,
     /// The reader asked for a whole map.
     want_full: bool,
-    /// Learns which maps the reader has finished with; `None` if it never acknowledges.
+    /// Learns which maps the reader has finished with; `None` if nothing waits for it.
     finished: Option<AcknowledgingReader>,
     /// Until it goes, its layers are made.
     subscription: LayerSubscription,
@@ -61,7 +79,13 @@ struct Watch<R> {
 }
 
 impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
-    fn new(served: &Served, selection: Selection, requests: R, name: String) -> Self {
+    fn new(
+        served: &Served,
+        selection: Selection,
+        requests: R,
+        finished: Option<AcknowledgingReader>,
+        transport: Transport,
+    ) -> Self {
         let mut newest = served.newest.clone();
         // The current map, if there is one, is the first update.
         newest.mark_changed();
@@ -76,8 +100,8 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
             last: None,
             base: None,
             want_full: false,
-            finished: selection.credits.are_limited().then(|| served.status.acknowledgements.add(name)),
-            reader: Reader::new(&served.status.transports, Transport::Grpc),
+            finished,
+            reader: Reader::new(&served.status.transports, transport),
             selection,
         }
     }

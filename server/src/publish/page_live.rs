@@ -1,0 +1,318 @@
+//! The page's WebSocket: one connection of a browser for all vehicles that it shows.
+//!
+//! | direction | message |
+//! |---|---|
+//! | from the browser, text | `{"type":"watch","vehicle","id","layers","max_rate_hz","deltas","max_in_flight"}` begins the maps of a vehicle, or replaces the selection |
+//! | | `{"type":"acknowledge","vehicle","id","sequence"}`: the map is drawn (`sequence` is a string of digits) |
+//! | | `{"type":"keyframe","vehicle","id"}`: the base of a delta is missing |
+//! | | `{"type":"unwatch","vehicle"}`; `{"type":"detail","vehicle"}`: whose whole status is wanted |
+//! | | `{"type":"replay",...}`: a request of the time bar, of operators |
+//! | to the browser, binary | `clearway.v1.MapUpdate`; the header names the vehicle |
+//! | to the browser, text | `"watching"` (the maps after it are those of this `id`), `"refused"` (with `reason`), `"fleet"` (the status of each vehicle, once a second), `"replay"` (at each change) |
+//!
+//! A selection means what it means over gRPC. With `max_in_flight`, no more maps than that are on the way, so a slow
+//! link has no backlog. A connection of one vehicle, `/live?vehicle=V`, begins with all its layers, and its status is a
+//! `status` message. A browser that reads nothing for [`SEND_TIMEOUT`] is disconnected.
+
+use std::collections::BTreeMap;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use axum::extract::ws::{Message as Frame, WebSocket};
+use bytes::Bytes;
+use clearway_proto::v1;
+use futures::channel::mpsc;
+use futures::stream::{AbortHandle, SelectAll, abortable};
+use futures::{Stream, StreamExt};
+use prost::Message;
+use serde::Deserialize;
+use serde_json::json;
+use tokio::sync::watch;
+use tonic::{Code, Status};
+
+use super::grpc::reader::watch_from_page;
+use super::listen::InProgress;
+use super::listen::access::Caller;
+use super::page_replay::{PageReplay, PageRequest, replay_changed, replay_json};
+use super::served::{Served, Vehicles};
+use crate::replay::ReplayHandle;
+use crate::sync::locked;
+
+/// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.
+const SEND_TIMEOUT: Duration = Duration::from_secs(5);
+/// Time between two status messages.
+const STATUS_PERIOD: Duration = Duration::from_secs(1);
+/// Longest message from a browser, in bytes. Ours: the page sends pongs and short requests.
+pub(super) const MESSAGE_BYTES_MAX: usize = 4096;
+/// Most vehicles whose maps one browser receives. Ours: more maps than a screen shows.
+const WATCHES_MAX: usize = 64;
+/// Most acknowledgements that wait for one vehicle; more are a fault of the browser.
+const REQUESTS_MAX: usize = 64;
+/// Parts of the status that only the view of one vehicle shows.
+const DETAILS: [&str; 4] = ["sensors", "ledger", "observations_refused", "recorder"];
+
+/// A text of a browser.
+#[derive(Debug, Deserialize)]
+#[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
+enum Request {
+    Watch(WatchRequest),
+    Unwatch { vehicle: String },
+    Acknowledge { vehicle: String, id: u64, sequence: String },
+    Keyframe { vehicle: String, id: u64 },
+    Detail { vehicle: String },
+    Replay(PageRequest),
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct WatchRequest {
+    vehicle: String,
+    id: u64,
+    layers: Vec<String>,
+    max_rate_hz: Option<f64>,
+    deltas: bool,
+    max_in_flight: u32,
+}
+
+/// The maps of one vehicle on their way to a browser. They end when this is dropped.
+struct Watching {
+    id: u64,
+    requests: mpsc::Sender<Result<v1::WatchRequest, Status>>,
+    updates: AbortHandle,
+}
+
+impl Drop for Watching {
+    fn drop(&mut self) {
+        self.updates.abort();
+    }
+}
+
+/// A map, or the end of a vehicle's maps, with the vehicle's name and the id of its selection.
+type Update = (String, u64, Result<v1::MapUpdate, Status>);
+
+/// What a connection sends next.
+enum Next {
+    Frame(Frame),
+    Nothing,
+    End,
+}
+
+/// The short status of each vehicle as JSON, which all browsers share, with the time at which it was written.
+#[derive(Clone, Debug, Default)]
+pub struct Summaries(Arc<Mutex<BTreeMap<String, (Instant, Arc<str>)>>>);
+
+impl Summaries {
+    fn of(&self, served: &Served) -> Arc<str> {
+        let mut all = locked(&self.0);
+        let kept = all.get(&*served.status.name).filter(|(written, _)| written.elapsed() < STATUS_PERIOD / 2);
+        if let Some((_, summary)) = kept {
+            return summary.clone();
+        }
+        let mut status = served.status.to_json();
+        if let Some(fields) = status.as_object_mut() {
+            DETAILS.iter().for_each(|part| _ = fields.remove(*part));
+        }
+        let summary: Arc<str> = status.to_string().into();
+        all.insert(served.status.name.to_string(), (Instant::now(), summary.clone()));
+        summary
+    }
+}
+
+/// One browser's connection.
+pub(super) struct Live {
+    vehicles: Vec<Served>,
+    summaries: Summaries,
+    /// True for a connection of one vehicle.
+    is_of_one: bool,
+    caller: Caller,
+    replay: Option<PageReplay>,
+    /// The vehicle whose whole status is sent.
+    detail: String,
+    watching: BTreeMap<String, Watching>,
+    updates: SelectAll<Pin<Box<dyn Stream<Item = Update> + Send>>>,
+}
+
+impl Live {
+    /// A connection of all vehicles that the caller may reach.
+    pub fn new(vehicles: &Vehicles, summaries: Summaries, caller: Caller, replay: Option<ReplayHandle>) -> Self {
+        let vehicles = vehicles.0.iter().filter(|served| caller.may_reach(&served.status.name)).cloned().collect();
+        let replay = replay.and_then(|handle| PageReplay::new(handle, &caller));
+        let (detail, watching, updates) = (String::new(), BTreeMap::new(), SelectAll::new());
+        Self { vehicles, summaries, is_of_one: false, caller, replay, detail, watching, updates }
+    }
+
+    /// A connection of one vehicle, with all layers that the caller may read.
+    ///
+    /// # Errors
+    /// `PermissionDenied` if the caller may read none.
+    pub fn of_one(served: &Served, caller: Caller, replay: Option<ReplayHandle>) -> Result<Self, Status> {
+        let vehicle = served.status.name.to_string();
+        let all = Vehicles([served.clone()].into());
+        let mut live =
+            Self { is_of_one: true, detail: vehicle.clone(), ..Self::new(&all, Summaries::default(), caller, replay) };
+        // Refused here, before the connection is upgraded, a caller learns it from the response.
+        live.caller.layers(&vehicle, Vec::new(), &served.status.layers)?;
+        live.watch(WatchRequest { vehicle, ..WatchRequest::default() })?;
+        Ok(live)
+    }
+
+    /// Sends maps and status until the browser disconnects or stalls, or the engines stop.
+    pub async fn serve(mut self, mut socket: WebSocket, _in_progress: InProgress) {
+        let mut every = tokio::time::interval(STATUS_PERIOD);
+        let mut replay_state = self.replay.as_ref().map(|replay| replay.handle.state());
+        replay_state.iter_mut().for_each(watch::Receiver::mark_changed);
+        loop {
+            let next = tokio::select! {
+                Some(update) = self.updates.next(), if !self.updates.is_empty() => self.send(update),
+                _ = every.tick() => self.status(),
+                state = replay_changed(&mut replay_state) => text(replay_json(&state, "")),
+                received = socket.recv() => match received {
+                    Some(Ok(Frame::Text(text))) => self.apply(&text).await,
+                    // The library answers pings.
+                    Some(Ok(_)) => Next::Nothing,
+                    Some(Err(_)) | None => Next::End,
+                },
+            };
+            let frame = match next {
+                Next::Frame(frame) => frame,
+                Next::Nothing => continue,
+                Next::End => break,
+            };
+            match tokio::time::timeout(SEND_TIMEOUT, socket.send(frame)).await {
+                Ok(Ok(())) => {}
+                Ok(Err(_)) | Err(_) => break,
+            }
+        }
+    }
+
+    fn send(&mut self, (vehicle, id, update): Update) -> Next {
+        match update {
+            // The end of a replay is in its state.
+            Ok(update) if update.replay_ended => Next::Nothing,
+            Ok(update) => Next::Frame(Frame::Binary(Bytes::from(update.encode_to_vec()))),
+            Err(status) if status.code() == Code::Unavailable => Next::End,
+            Err(status) => {
+                if self.watching.get(&vehicle).is_some_and(|watching| watching.id == id) {
+                    self.watching.remove(&vehicle);
+                }
+                refused(&vehicle, id, status.message())
+            }
+        }
+    }
+
+    /// The status of all vehicles; the parts that only one vehicle's view shows are left out of the others.
+    fn status(&self) -> Next {
+        if !self.vehicles.is_empty() && self.vehicles.iter().all(|served| served.newest.has_changed().is_err()) {
+            return Next::End;
+        }
+        if let (true, [served]) = (self.is_of_one, &self.vehicles[..]) {
+            let mut status = served.status.to_json();
+            status["type"] = "status".into();
+            return text(status.to_string());
+        }
+        let statuses = self.vehicles.iter().map(|served| {
+            let is_detailed = *served.status.name == self.detail;
+            if is_detailed { served.status.to_json().to_string().into() } else { self.summaries.of(served) }
+        });
+        let statuses: Vec<Arc<str>> = statuses.collect();
+        text(format!(r#"{{"type":"fleet","vehicles":[{}]}}"#, statuses.join(",")))
+    }
+
+    async fn apply(&mut self, message: &str) -> Next {
+        match serde_json::from_str(message) {
+            Err(error) => refused("", 0, &error.to_string()),
+            Ok(Request::Replay(request)) => match &self.replay {
+                Some(replay) => text(replay.answer(&request).await),
+                None => refused("", 0, "the server replays nothing that this reader may control"),
+            },
+            Ok(Request::Watch(request)) => {
+                let (vehicle, id) = (request.vehicle.clone(), request.id);
+                match self.watch(request) {
+                    Ok(()) => text(json!({ "type": "watching", "vehicle": vehicle, "id": id }).to_string()),
+                    Err(status) => refused(&vehicle, id, status.message()),
+                }
+            }
+            Ok(Request::Unwatch { vehicle }) => {
+                self.watching.remove(&vehicle);
+                Next::Nothing
+            }
+            Ok(Request::Detail { vehicle }) => {
+                self.detail = vehicle;
+                self.status()
+            }
+            Ok(Request::Keyframe { vehicle, id }) => {
+                let request = v1::WatchRequest { request_keyframe: true, ..v1::WatchRequest::default() };
+                self.request(&vehicle, id, request)
+            }
+            Ok(Request::Acknowledge { vehicle, id, sequence }) => match sequence.parse() {
+                Err(_) => refused(&vehicle, id, &format!("sequence {sequence:?}: digits in a string are allowed")),
+                Ok(sequence) => {
+                    let request = v1::WatchRequest { acknowledged: Some(sequence), ..v1::WatchRequest::default() };
+                    self.request(&vehicle, id, request)
+                }
+            },
+        }
+    }
+
+    fn watch(&mut self, request: WatchRequest) -> Result<(), Status> {
+        let WatchRequest { vehicle, id, layers, max_rate_hz, deltas, max_in_flight } = request;
+        let served = self.vehicles.iter().find(|served| *served.status.name == vehicle);
+        let served = served.ok_or_else(|| Status::not_found(format!("no vehicle is named {vehicle:?}")))?;
+        let layers = self.caller.layers(&vehicle, layers, &served.status.layers)?;
+        if self.watching.len() >= WATCHES_MAX && !self.watching.contains_key(&vehicle) {
+            return Err(Status::resource_exhausted(format!("at most {WATCHES_MAX} vehicles are allowed at a time")));
+        }
+        let selection = v1::Selection {
+            vehicle: vehicle.clone(),
+            layers,
+            max_in_flight,
+            max_rate_hz,
+            deltas,
+            ..Default::default()
+        };
+        let (requests, receiver) = mpsc::channel(REQUESTS_MAX);
+        let (updates, handle) = abortable(watch_from_page(served, selection, receiver)?);
+        let name = vehicle.clone();
+        self.updates.push(Box::pin(updates.map(move |update| (name.clone(), id, update))));
+        self.watching.insert(vehicle, Watching { id, requests, updates: handle });
+        Ok(())
+    }
+
+    /// Passes a request to a vehicle's maps. One for a selection that was replaced meanwhile means nothing any more.
+    fn request(&mut self, vehicle: &str, id: u64, request: v1::WatchRequest) -> Next {
+        let Some(watching) = self.watching.get_mut(vehicle).filter(|watching| watching.id == id) else {
+            return Next::Nothing;
+        };
+        if watching.requests.try_send(Ok(request)).is_ok() {
+            return Next::Nothing;
+        }
+        self.watching.remove(vehicle);
+        refused(vehicle, id, &format!("more than {REQUESTS_MAX} requests wait"))
+    }
+}
+
+fn text(json: String) -> Next {
+    Next::Frame(Frame::Text(json.into()))
+}
+
+fn refused(vehicle: &str, id: u64, reason: &str) -> Next {
+    text(json!({ "type": "refused", "vehicle": vehicle, "id": id, "reason": reason }).to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_request_of_a_browser_is_read_whole_or_refused() {
+        let read = |text: &str| serde_json::from_str::<Request>(text);
+        let watch = read(r#"{"type":"watch","vehicle":"car","id":3,"layers":["speed"],"max_rate_hz":2,"deltas":true}"#);
+        let Ok(Request::Watch(watch)) = watch else { panic!("{watch:?}") };
+        assert_eq!((&*watch.vehicle, watch.id, watch.max_rate_hz, watch.deltas), ("car", 3, Some(2.0), true));
+        assert!(matches!(read(r#"{"type":"replay","paused":true}"#), Ok(Request::Replay(_))));
+        for wrong in [r#"{"type":"watch","layer":"x"}"#, r#"{"type":"jump"}"#, r#"{"type":"replay","jump":1}"#, "{"] {
+            assert!(read(wrong).is_err(), "{wrong}");
+        }
+    }
+}

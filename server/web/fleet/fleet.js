@@ -1,0 +1,232 @@
+// The view of all vehicles: a card for each, sorted and filtered, and where they are. In: the status of each once a
+// second, and frames of the cards in sight. Out: the cards, and what is wanted of the Worker: small maps at a low rate,
+// of the cards in sight alone.
+
+import { freshness } from "../clock.js";
+import { dash, duration, percent, setText } from "../text.js";
+import { drawPlaces, vehicleAt } from "./places.js";
+import { ageOf, chosen, freshOf, stateOf, tally } from "./state.js";
+
+const MAP_HZ = 1, MAP_RADIUS_M = 30, MAP_PX = 150, SCALE_MAX = 2;
+// Cards change places this often at most, so that they can be read and clicked.
+const ORDER_EVERY_MS = 3000;
+const SIGHT_MARGIN = "100px";
+// Validity of a map of which only the age is known. Ours: three revolutions of a slow sensor.
+const VALIDITY_MS = 500;
+
+const $ = (id) => document.getElementById(id);
+
+export class FleetView {
+  #post;
+  #clock;
+  #settings;
+  #cards = new Map();
+  #is_open = false;
+  #ordered_ms = -Infinity;
+  #order = "";
+  #sight;
+  #places = [];
+
+  constructor(post, clock, settings, changed) {
+    this.#post = post;
+    this.#clock = clock;
+    this.#settings = settings;
+    this.#sight = new IntersectionObserver((entries) => {
+      for (const entry of entries) {
+        const card = this.#cards.get(entry.target.dataset.vehicle);
+        if (!card) continue;
+        card.is_in_sight = entry.isIntersecting;
+        this.#want(card);
+      }
+    }, { rootMargin: SIGHT_MARGIN });
+    for (const name of ["order", "only"]) {
+      $(name).value = settings[name];
+      $(name).onchange = () => {
+        settings[name] = $(name).value;
+        changed();
+        this.#arrange();
+      };
+    }
+    $("find").oninput = () => this.#arrange();
+    $("places").onclick = (event) => {
+      const box = $("places").getBoundingClientRect();
+      const name = vehicleAt(this.#places, event.clientX - box.left, event.clientY - box.top);
+      if (name !== null) this.#cards.get(name)?.element.click();
+    };
+  }
+
+  open() {
+    this.#is_open = true;
+    this.#arrange();
+    for (const card of this.#cards.values()) this.#want(card);
+  }
+
+  // keep: the vehicle whose maps another view wants, which are not ended here.
+  close(keep) {
+    this.#is_open = false;
+    for (const card of this.#cards.values()) this.#want(card, card.status.name === keep);
+  }
+
+  // The status of all vehicles.
+  status(list, arrived_ms) {
+    const names = new Set(list.map(({ name }) => name));
+    for (const [name, card] of this.#cards) {
+      if (names.has(name)) continue;
+      // It vanished.
+      card.is_in_sight = false;
+      this.#want(card);
+      this.#sight.unobserve(card.element);
+      card.element.remove();
+      this.#cards.delete(name);
+      this.#ordered_ms = -Infinity;
+    }
+    for (const status of list) {
+      const card = this.#cards.get(status.name) ?? this.#newCard(status);
+      card.status = status;
+      card.status_arrived_ms = arrived_ms;
+    }
+    this.write();
+  }
+
+  frame(vehicle, frame) {
+    const card = this.#cards.get(vehicle);
+    if (!card || !frame.pixels) return;
+    card.frame = frame;
+    const { raster, pixels } = frame, canvas = card.parts.map;
+    canvas.width = raster.width;
+    canvas.height = raster.height;
+    const pen = canvas.getContext("2d");
+    pen.putImageData(new ImageData(new Uint8ClampedArray(pixels.buffer), raster.width, raster.height), 0, 0);
+    drawVehicle(pen, raster);
+    this.#writeCard(card, performance.now());
+  }
+
+  // Writes what changes with time.
+  write() {
+    if (!this.#is_open) return;
+    const now_ms = performance.now();
+    for (const card of this.#cards.values()) this.#writeCard(card, now_ms);
+    if (now_ms - this.#ordered_ms > ORDER_EVERY_MS) this.#arrange();
+    this.#writeTally();
+    const placed = [...this.#cards.values()].map(({ status, fresh, frame }) => ({
+      name: status.name, pose: poseOf(status, frame), ...stateOf(status), fresh,
+    })).filter(({ pose }) => pose);
+    $("where").hidden = placed.length === 0;
+    if (placed.length > 0) this.#places = drawPlaces($("places"), placed);
+  }
+
+  #newCard(status) {
+    const element = $("card").content.firstElementChild.cloneNode(true);
+    const part = (name) => element.querySelector(`[data-part="${name}"]`);
+    const names = ["name", "state", "fresh", "age", "hz", "loss", "speed", "reasons", "map"];
+    const card = {
+      element, parts: Object.fromEntries(names.map((name) => [name, part(name)])), status, status_arrived_ms: 0,
+      frame: null, is_in_sight: false, is_wanted: false, age_ms: null, fresh: "none", speed: null, maps: [],
+    };
+    element.dataset.vehicle = status.name;
+    element.href = `?vehicle=${encodeURIComponent(status.name)}`;
+    setText(card.parts.name, status.name);
+    this.#cards.set(status.name, card);
+    $("cards").append(element);
+    this.#sight.observe(element);
+    this.#ordered_ms = -Infinity;
+    return card;
+  }
+
+  #want(card, is_kept = false) {
+    const is_wanted = this.#is_open && card.is_in_sight;
+    if (is_wanted === card.is_wanted || !card.status.layers?.length) return;
+    card.is_wanted = is_wanted;
+    if (is_kept) return;
+    const { layers, name } = card.status, layer = layers.includes("drivability") ? "drivability" : layers[0];
+    const side = Math.round(MAP_PX * Math.min(devicePixelRatio, SCALE_MAX));
+    this.#post({
+      type: "want", vehicle: name,
+      want: is_wanted ? {
+        layers: [layer], max_rate_hz: MAP_HZ, deltas: false, probe: null,
+        raster: { width: side, height: side, x_m: 0, y_m: 0, metres: (2 * MAP_RADIUS_M) / side },
+        show: {
+          base: { layer, channel: "class" }, overlays: [], road: false, safe_points: false,
+          by_meaning: this.#settings.by_meaning,
+        },
+      } : null,
+    });
+  }
+
+  #writeCard(card, now_ms) {
+    const { status, frame, parts, element } = card;
+    const shown = frame && freshness(frame.header, this.#clock.now_ns(now_ms));
+    card.age_ms = ageOf(status, now_ms - card.status_arrived_ms, shown?.age_ms);
+    card.fresh = freshOf(card.age_ms, shown?.validity_ms ?? VALIDITY_MS);
+    card.speed = status.speed_m_s ?? frame?.header.speed_mps ?? null;
+    const { state, reasons } = stateOf(status);
+    element.dataset.fresh = card.fresh;
+    element.dataset.state = state ?? "";
+    parts.state.hidden = !state;
+    setText(parts.state, state?.toUpperCase() ?? "");
+    setText(parts.fresh, { none: "NO MAP", fresh: "FRESH", stale: "STALE" }[card.fresh]);
+    setText(parts.age, card.age_ms === null ? dash : coarse(card.age_ms));
+    writeValue(parts.hz, status.map_rate_hz, (hz) => `${hz.toFixed(1)} Hz`);
+    writeValue(parts.loss, status.loss, (loss) => percent(loss));
+    writeValue(parts.speed, card.speed, (speed) => `${speed.toFixed(1)} m/s`);
+    parts.reasons.hidden = reasons.length === 0;
+    setText(parts.reasons, reasons.join(" · "));
+  }
+
+  #arrange() {
+    this.#ordered_ms = performance.now();
+    const { order, only } = this.#settings, text = $("find").value;
+    const names = chosen([...this.#cards.values()], { order, only, text });
+    const shown = new Set(names);
+    for (const [name, card] of this.#cards) card.element.hidden = !shown.has(name);
+    // A card that moves loses the focus, so only a new order moves cards.
+    if (names.join("\n") !== this.#order) {
+      this.#order = names.join("\n");
+      names.forEach((name, i) => {
+        const { element } = this.#cards.get(name);
+        if ($("cards").children[i] !== element) $("cards").insertBefore(element, $("cards").children[i] ?? null);
+      });
+    }
+    $("nothing").hidden = names.length > 0;
+    setText($("nothing"), this.#cards.size === 0 ? "The server has no vehicle that you may see." : "No vehicle matches.");
+  }
+
+  #writeTally() {
+    const { all, error, warn, ok, stale } = tally([...this.#cards.values()]);
+    const parts = [[error, "error"], [warn, "warn"], [ok, "ok"], [stale, "stale"]].filter(([n]) => n > 0);
+    const text = [`${all} vehicle${all === 1 ? "" : "s"}`, ...parts.map(([n, what]) => `${n} ${what}`)].join(" · ");
+    setText($("tally"), text);
+  }
+}
+
+// Ages on cards are coarse: a text that changes ten times a second cannot be read fifty times.
+const coarse = (ms) => (ms < 1000 ? `${Math.max(0.1, Math.round(ms / 100) / 10).toFixed(1)} s` : duration(ms));
+
+function writeValue(element, value, text) {
+  const is_known = Number.isFinite(value);
+  element.parentElement.hidden = !is_known;
+  if (is_known) setText(element, text(value));
+}
+
+function poseOf(status, frame) {
+  if (status.pose) return status.pose;
+  const pose = frame?.header.map_from_ego;
+  if (!pose) return null;
+  const yaw = Math.atan2(2 * (pose.qw * pose.qz + pose.qx * pose.qy), 1 - 2 * (pose.qy ** 2 + pose.qz ** 2));
+  return { x_m: pose.x, y_m: pose.y, heading_deg: (yaw * 180) / Math.PI };
+}
+
+function drawVehicle(pen, { width, height }) {
+  const [x, y] = [width / 2, height / 2];
+  pen.beginPath();
+  pen.moveTo(x, y - 9);
+  pen.lineTo(x + 6, y + 8);
+  pen.lineTo(x, y + 4);
+  pen.lineTo(x - 6, y + 8);
+  pen.closePath();
+  pen.fillStyle = "#fff";
+  pen.strokeStyle = "#111";
+  pen.lineWidth = 2;
+  pen.stroke();
+  pen.fill();
+}

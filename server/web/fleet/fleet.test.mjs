@@ -1,0 +1,61 @@
+// Tests of what the fleet says of a vehicle, and of the order of the cards. Run: cd server/web && node --test
+
+import assert from "node:assert/strict";
+import test from "node:test";
+import { gridStep, vehicleAt, viewOf } from "./places.js";
+import { ageOf, chosen, freshOf, needsCare, stateOf, tally } from "./state.js";
+
+test("a state that the server does not send, or that is unknown, is not shown", () => {
+  assert.deepEqual(stateOf(undefined), { state: null, reasons: [] });
+  assert.deepEqual(stateOf({ state: "constructor" }), { state: null, reasons: [] });
+  const reasons = ["no packets from top for 76 s"];
+  assert.deepEqual(stateOf({ state: "error", reasons }), { state: "error", reasons });
+  assert.deepEqual(stateOf({ claimed_by: ["b:50051"] }).reasons, ["also claimed by b:50051"]);
+});
+
+test("the age of a vehicle's maps is that of the newest one known of, and grows", () => {
+  assert.equal(ageOf({}, 100, null), null);
+  assert.equal(ageOf({ map_age_ms: 200 }, 700, null), 900);
+  assert.equal(ageOf({ map_age_ms: 200 }, 700, 400), 400);
+  assert.equal(ageOf({ map_age_ms: null }, 700, 1400), 1400);
+});
+
+test("a card that gets a map a second is fresh, and stale without one", () => {
+  assert.deepEqual([freshOf(null, 300), freshOf(1200, 300), freshOf(2801, 300)], ["none", "fresh", "stale"]);
+});
+
+const card = (name, more = {}, fresh = "fresh", age_ms = 100) =>
+  ({ status: { name, ...more }, fresh, age_ms, speed: more.speed_m_s ?? null });
+const CARDS = [
+  card("car 10", { state: "ok", speed_m_s: 3, loss: 0 }),
+  card("car 9", { state: "warn", speed_m_s: 9, loss: 0.2 }),
+  card("bus", {}, "stale", 9000),
+  card("tram", { state: "error" }, "none", null),
+];
+const order = (order, only = "all", text = "") => chosen(CARDS, { order, only, text });
+
+test("vehicles are ordered by state, name, age, loss or speed, and the unknown comes last", () => {
+  assert.deepEqual(order("state"), ["tram", "car 9", "bus", "car 10"]);
+  assert.deepEqual(order("name"), ["bus", "car 9", "car 10", "tram"]);
+  assert.deepEqual(order("age"), ["tram", "bus", "car 9", "car 10"], "a vehicle without a map first");
+  assert.deepEqual(order("speed").slice(0, 2), ["car 9", "car 10"]);
+  assert.deepEqual(order("loss").slice(0, 2), ["car 9", "car 10"]);
+  assert.deepEqual(order("no such order"), order("name"));
+});
+
+test("vehicles are found by a part of their name, and by their need of care", () => {
+  assert.deepEqual(order("name", "all", " CAR "), ["car 9", "car 10"]);
+  assert.deepEqual(order("name", "care"), ["bus", "car 9", "tram"]);
+  assert.ok(!needsCare(CARDS[0]));
+  assert.deepEqual(tally(CARDS), { all: 4, error: 1, warn: 1, ok: 1, stale: 1 });
+});
+
+test("all vehicles are on the map, x to the right and y up, and a click finds the nearest", () => {
+  const at = (name, x_m, y_m) => ({ name, pose: { x_m, y_m } });
+  const places = [at("a", 1000, -50), at("b", 1400, 50)], view = viewOf(places, { width: 468, height: 168 });
+  assert.equal(view.scale, 1);
+  const drawn = places.map(({ name, pose }) => ({ name, px: view.px(pose), py: view.py(pose) }));
+  assert.deepEqual(drawn, [{ name: "a", px: 34, py: 134 }, { name: "b", px: 434, py: 34 }]);
+  assert.deepEqual([vehicleAt(drawn, 40, 130), vehicleAt(drawn, 200, 100), vehicleAt([], 0, 0)], ["a", null, null]);
+  assert.deepEqual([gridStep(1, 60), gridStep(10, 60), gridStep(0.03, 60)], [100, 10, 2000]);
+});

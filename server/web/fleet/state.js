@@ -1,0 +1,65 @@
+// What a vehicle's status says, in the words of the fleet. Pure. A field that the server does not send is not shown.
+
+const ORDER = { error: 0, warn: 1, ok: 2 };
+// A status is a second old at most, and so is the map that it tells of. A vehicle without news for longer is silent.
+const NEWS_MS = 2500;
+
+export function stateOf(status) {
+  const state = Object.hasOwn(ORDER, status?.state ?? "") ? status.state : null;
+  const claimed = status?.claimed_by?.length ? [`also claimed by ${status.claimed_by.join(", ")}`] : [];
+  return { state, reasons: [...(status?.reasons ?? []), ...claimed] };
+}
+
+// The age of the newest map that is known of, in ms; null if none is known. status_age_ms: since the status arrived.
+// frame_age_ms: age of the map on the card, null without one.
+export function ageOf(status, status_age_ms, frame_age_ms) {
+  const by_status = status.map_age_ms == null ? Infinity : status.map_age_ms + status_age_ms;
+  const age = Math.min(by_status, frame_age_ms ?? Infinity);
+  return Number.isFinite(age) ? age : null;
+}
+
+// "fresh", "stale" or "none". A card gets a map a second, so this much is allowed over the validity.
+export const freshOf = (age_ms, validity_ms) =>
+  age_ms === null ? "none" : age_ms <= validity_ms + NEWS_MS ? "fresh" : "stale";
+
+// A vehicle that is not well: its state says so, or its maps are old.
+export const needsCare = ({ status, fresh }) =>
+  ["error", "warn"].includes(stateOf(status).state) || fresh === "stale";
+
+const compare = (a, b) => (a < b ? -1 : a > b ? 1 : 0);
+const natural = new Intl.Collator("en", { numeric: true });
+const byName = (a, b) => natural.compare(a.status.name, b.status.name);
+// The unknown comes last.
+const descending = (of) => (a, b) => compare(of(b) ?? -Infinity, of(a) ?? -Infinity);
+const ORDERS = {
+  name: byName,
+  state: (a, b) => compare(rank(a), rank(b)),
+  age: descending(({ age_ms }) => age_ms ?? Infinity),
+  loss: descending(({ status }) => status.loss),
+  speed: descending(({ speed }) => speed),
+};
+
+function rank(card) {
+  const { state } = stateOf(card.status);
+  return state === "error" ? 0 : state === "warn" ? 1 : card.fresh === "stale" ? 2 : 3;
+}
+
+// cards: [{ status, age_ms, fresh, speed }]. The names of those that are shown, in order.
+export function chosen(cards, { order, only, text }) {
+  const wanted = text.trim().toLowerCase();
+  const isShown = (card) =>
+    card.status.name.toLowerCase().includes(wanted) && (only !== "care" || needsCare(card));
+  const by = ORDERS[order] ?? byName;
+  return cards.filter(isShown).sort((a, b) => by(a, b) || byName(a, b)).map(({ status }) => status.name);
+}
+
+// The numbers of vehicles: { all, error, warn, ok, stale }.
+export function tally(cards) {
+  const counts = { all: cards.length, error: 0, warn: 0, ok: 0, stale: 0 };
+  for (const { status, fresh } of cards) {
+    const { state } = stateOf(status);
+    if (state) counts[state]++;
+    if (fresh === "stale") counts.stale++;
+  }
+  return counts;
+}

@@ -1,0 +1,118 @@
+//! The page beside a replay of the golden recording: its maps stand still when the test wants it.
+
+use clearway_client::test::{Replay, town};
+use clearway_client::{Client, MapView};
+use clearway_proto::v1;
+
+use crate::webdriver::Browser;
+
+/// Chooses every layer: the first as the shown one, all others over it.
+const ALL_LAYERS: &str = "document.querySelector('.layer input[type=radio]').click();
+    for (const box of document.querySelectorAll('.layer input[type=checkbox]:not(:checked):enabled')) box.click()";
+/// The values of the cell under the cursor: [[layer, cell, values by channel]].
+const CELL: &str = "return [...document.querySelectorAll('#cell [data-layer]')].map(({ dataset }) =>
+    [dataset.layer, Number(dataset.cell), { ...dataset }])";
+/// Sequence of the map whose cell is shown.
+const SEQUENCE: &str = "return document.getElementById('cell').dataset.sequence";
+
+/// Runs `test` with a browser beside a replay.
+fn beside_a_replay(test: impl AsyncFnOnce(&Browser, &Client)) {
+    let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+    runtime.block_on(async {
+        let replay = Replay::start(town()).expect("the replay starts");
+        let client = replay.client().await.expect("gRPC answers");
+        let browser = Browser::start(1440, 900);
+        browser.open(&replay.page);
+        browser.until("the time bar", "return !document.getElementById('replay').hidden");
+        test(&browser, &client).await;
+        assert_eq!(browser.console_errors(), Vec::<String>::new());
+    });
+}
+
+/// Stops the replay at this many seconds from its begin; returns the map of that moment.
+async fn stop_at(client: &Client, seconds: f64) -> MapView {
+    let state = client.replay_control(v1::ReplayControl::default()).await.expect("a state");
+    let seek_ns = Some(state.begin_ns + (seconds * 1e9) as i64);
+    let control = v1::ReplayControl { paused: Some(true), seek_ns, ..v1::ReplayControl::default() };
+    client.replay_control(control).await.expect("it stops there");
+    client.newest("", &[]).await.expect("a map")
+}
+
+/// Waits until the page shows this map.
+fn await_map(browser: &Browser, sequence: u64) {
+    let shown = "document.querySelector('#stream dd').textContent";
+    browser.until("the map", &format!("return {shown} === '{sequence}'"));
+}
+
+pub fn cells_are_those_of_the_client() {
+    beside_a_replay(async |browser, client| {
+        browser.until("layers", "return document.querySelectorAll('.layer').length === 6");
+        browser.run(ALL_LAYERS);
+        let map = stop_at(client, 1.0).await;
+        assert_eq!(map.layers().len(), 6);
+        await_map(browser, map.sequence());
+        let mut compared = 0;
+        // From the vehicle: one cell, then ten ahead, then to the left and the right of it.
+        for keys in ["\u{e013}", "\u{e008}\u{e013}\u{e008}", "\u{e012}\u{e012}\u{e012}", "\u{e008}\u{e014}\u{e008}"] {
+            browser.key("#map", keys);
+            browser.until("the cell of this map", &format!("{SEQUENCE} === '{}'", map.sequence()));
+            let at = "return document.querySelector('#cell p').textContent.match(/x (-?[0-9.]+) m, y (-?[0-9.]+)/)
+                .slice(1).map(Number)";
+            // The page answers a move of the cursor with the next message of its worker.
+            let expected = [1.0, 11.0, 11.0, 11.0][compared / 6];
+            browser.until("the cursor's place", &format!("const [x] = (() => {{ {at} }})(); return x === {expected}"));
+            let left = [0.0, 0.0, 3.0, -7.0][compared / 6];
+            browser.until("the cursor's place", &format!("const [, y] = (() => {{ {at} }})(); return y === {left}"));
+            let shown = browser.run(CELL);
+            let shown = shown.as_array().expect("a list");
+            assert_eq!(shown.len(), 6, "{shown:?}");
+            for entry in shown {
+                let name = entry[0].as_str().expect("a name");
+                let layer = map.layer(name).expect("a layer of the map");
+                let cell = layer.grid.cell_at(expected, left);
+                assert_eq!(entry[1].as_i64(), Some(cell.map_or(-1, |cell| cell as i64)), "{name}: {entry}");
+                let Some(cell) = cell else { continue };
+                for channel in &layer.channels {
+                    let raw = entry[2][format!("raw_{}", channel.name)].as_str().expect("a value");
+                    let expected = channel.cells.get(cell).expect("a cell").to_string();
+                    assert_eq!(raw, expected, "{name} {}: {entry}", channel.name);
+                }
+                compared += 1;
+            }
+        }
+        assert_eq!(compared, 24);
+        browser.screenshot("replay-1440x900");
+    });
+}
+
+pub fn the_time_bar_controls_a_replay() {
+    beside_a_replay(async |browser, client| {
+        let first = stop_at(client, 0.5).await;
+        await_map(browser, first.sequence());
+        browser.until("a pause", "return document.querySelector('[data-part=play]').textContent === 'Play'");
+        browser.click("[data-part=step]");
+        await_map(browser, first.sequence() + 1);
+        browser.run(
+            "const bar = document.querySelector('[data-part=position]');
+            bar.value = 1.5; bar.dispatchEvent(new Event('input')); bar.dispatchEvent(new Event('change'))",
+        );
+        browser.until(
+            "the map of that moment",
+            "return document.querySelector('[data-part=time]').textContent.startsWith('1.5 ') &&
+                Number(document.querySelector('#stream dd').textContent) >= 13",
+        );
+        browser.run(
+            "const rate = document.querySelector('[data-part=rate]');
+            rate.value = '2'; rate.dispatchEvent(new Event('change'))",
+        );
+        let mut state = client.replay_control(v1::ReplayControl::default()).await.expect("a state");
+        for _ in 0..200 {
+            if state.rate == 2.0 {
+                break;
+            }
+            tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+            state = client.replay_control(v1::ReplayControl::default()).await.expect("a state");
+        }
+        assert_eq!(state.rate, 2.0);
+    });
+}
