@@ -35,3 +35,6 @@ pub mod v1 {
 /// The encoded `FileDescriptorSet` of `clearway/v1/*.proto`, imports included: for gRPC reflection and for the schemas
 /// in recordings.
 pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/clearway.v1.bin"));
+
+/// The metadata of `NOT_FOUND` that says at which address, `HOST:PORT`, another server serves the vehicle.
+pub const SERVED_AT: &str = "clearway-served-at";

@@ -6,7 +6,7 @@
 //! takes requests of operators. A browser that reads nothing for [`SEND_TIMEOUT`] is disconnected.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::ws::{Message as Frame, WebSocket, WebSocketUpgrade};
@@ -26,8 +26,9 @@ use super::listen::{InProgress, Listener, ListenerHandle, Place};
 use super::page_replay::{PageReplay, replay_changed, replay_json};
 use super::served::{Served, Vehicles};
 use crate::clock::now_ns;
+use crate::fleet::Fleet;
 use crate::replay::ReplayHandle;
-use crate::status::{Reader, prometheus};
+use crate::status::{Reader, prometheus, vehicle_json};
 
 /// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);
@@ -45,6 +46,8 @@ struct Assets;
 pub struct Shown {
     /// The vehicles.
     pub vehicles: Vehicles,
+    /// The vehicles of other servers.
+    pub fleet: Fleet,
     /// The listeners.
     pub listeners: Arc<[(&'static str, ListenerHandle)]>,
     /// Controls the replay that the server serves.
@@ -83,7 +86,10 @@ async fn asset(uri: Uri) -> Response {
 
 async fn list(State(shown): State<Shown>, Extension(caller): Extension<Caller>) -> impl IntoResponse {
     let statuses = shown.vehicles.statuses();
-    let all = statuses.iter().filter(|status| caller.may_reach(&status.name)).map(|status| status.to_json());
+    let own = statuses.iter().filter(|status| caller.may_reach(&status.name)).map(|status| status.to_json());
+    let mut others = shown.fleet.vehicles(Instant::now());
+    others.retain(|vehicle| caller.may_reach(&vehicle.name));
+    let all = own.chain(others.iter().map(vehicle_json));
     ([(header::CONTENT_TYPE, "application/json")], Value::from(all.collect::<Vec<_>>()).to_string())
 }
 

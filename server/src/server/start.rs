@@ -126,7 +126,13 @@ impl Running {
         let gateways = self.gateways(config);
         #[cfg(feature = "zenoh")]
         if config.zenoh.enabled {
-            let started = super::over_zenoh::OverZenoh::start(config, &self.vehicles, &gateways, &self.inputs);
+            let started = super::over_zenoh::OverZenoh::start(
+                config,
+                &self.vehicles,
+                &gateways,
+                &self.inputs,
+                (&self.fleet, listeners.grpc_address()),
+            );
             let over_zenoh = started.await?;
             self.zenoh = over_zenoh.endpoints().await;
             self.over_zenoh = Some(over_zenoh);
@@ -186,17 +192,23 @@ impl Running {
     fn serve(&mut self, listeners: Listeners, gateways: Gateways) {
         let Listeners { grpc, page, metrics, foxglove, security, handles } = listeners;
         let listeners = handles.clone().into();
-        let shown = page::Shown { vehicles: self.vehicles.clone(), listeners, replay: self.replay.clone() };
+        let shown = page::Shown {
+            vehicles: self.vehicles.clone(),
+            fleet: self.fleet.clone(),
+            listeners,
+            replay: self.replay.clone(),
+        };
         self.listeners = Some((security, handles));
         let address = |listener: &Option<Listener>| listener.as_ref().and_then(Listener::address);
         (self.grpc, self.page, self.metrics) = (address(&grpc), address(&page), address(&metrics));
         self.foxglove = address(&foxglove);
         if let Some(listener) = grpc {
             let (vehicles, stopped, replay) = (self.vehicles.clone(), self.stopped(), self.replay.clone());
+            let fleet = self.fleet.clone();
             let recorder = self.recorder.as_ref().map(Recorder::control);
             let ingest = (!gateways.all().is_empty()).then(|| Ingest::new(gateways).into_service());
             self.publishers.spawn(async move {
-                let served = grpc::serve(listener, vehicles, ingest, recorder, replay, stopped);
+                let served = grpc::serve(listener, vehicles, fleet, ingest, recorder, replay, stopped);
                 if let Err(error) = served.await {
                     tracing::error!(%error, "grpc ended");
                 }

@@ -299,6 +299,8 @@ impl VehicleStatus {
             observations_refused: by_name(&snapshot.observations_refused),
             reference_sensor: snapshot.reference_sensor().unwrap_or_default().to_owned(),
             fault: self.fault().unwrap_or_default(),
+            server: String::new(),
+            grpc: String::new(),
             mounts: snapshot.sensors.iter().filter_map(|s| Some((s.name.clone(), mount(&s.mount?)))).collect(),
         }
     }
