@@ -2,16 +2,16 @@
 //!
 //! In: the address of a server. Out: its vehicles, their newest maps, and [`MapStream`]s. Each stream has its own
 //! connection with a small window and acknowledges every map, so a stalled reader delays no other reader and receives
-//! no old maps.
+//! no old maps. A server that knows which other server serves a vehicle leads the client there.
 
 use std::time::Duration;
 
 use bytes::Bytes;
-use clearway_proto::v1;
 use clearway_proto::v1::ingest_service_client::IngestServiceClient;
 use clearway_proto::v1::map_service_client::MapServiceClient;
 use clearway_proto::v1::recording_service_client::RecordingServiceClient;
 use clearway_proto::v1::replay_service_client::ReplayServiceClient;
+use clearway_proto::{SERVED_AT, v1};
 use prost::Message;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -37,8 +37,12 @@ const KEEPALIVE: Duration = Duration::from_secs(2);
 pub struct Client {
     address: String,
     endpoint: Endpoint,
+    tls: Option<Tls>,
     service: MapServiceClient<Channel>,
 }
+
+/// The updates of an open stream, and the requests on it.
+type Watch = (tonic::Streaming<v1::MapUpdate>, mpsc::Sender<v1::WatchRequest>);
 
 /// Which maps to stream. The default is every layer of the server's only vehicle, with two maps in flight.
 #[derive(Clone, Debug, PartialEq)]
@@ -60,7 +64,7 @@ pub struct Subscription {
     pub replay_clock: bool,
 }
 
-/// Certificates of an encrypted connection, as PEM text.
+/// Certificates of an encrypted connection, as PEM text. Debug output does not show them.
 #[derive(Clone, Default)]
 pub struct Tls {
     /// Certificate of the authority that must have signed the server's certificate.
@@ -146,7 +150,7 @@ impl Client {
             .http2_keep_alive_interval(KEEPALIVE)
             .keep_alive_timeout(KEEPALIVE);
         let service = MapServiceClient::new(dial(&endpoint, &url).await?);
-        Ok(Self { address: url, endpoint, service })
+        Ok(Self { address: url, endpoint, tls: tls.cloned(), service })
     }
 
     /// State of every vehicle of the server.
@@ -185,7 +189,10 @@ impl Client {
     /// unknown or there is no map yet, [`ClientError::Map`] if the map is invalid.
     pub async fn newest(&self, vehicle: &str, layers: &[String]) -> Result<MapView, ClientError> {
         let request = v1::GetMapRequest { vehicle: vehicle.into(), layers: layers.to_vec() };
-        let answer = self.service.clone().get_map(request).await;
+        let mut answer = self.service.clone().get_map(request.clone()).await;
+        if let Some(server) = self.led_by(answer.as_ref().err()).await? {
+            answer = server.service.clone().get_map(request).await;
+        }
         let map = MapView::decode(answer.map_err(|status| refused(&self.address, &status))?.into_inner().map)?;
         Ok(map.with_arrival(&Clock::default()))
     }
@@ -211,14 +218,33 @@ impl Client {
         let Subscription { vehicle, layers, max_in_flight, max_rate_hz, region, deltas, replay_clock } = subscription;
         let max_in_flight = max_in_flight.max(1);
         let selection = v1::Selection { vehicle, layers, max_in_flight, max_rate_hz, region, deltas };
-        let mut service = MapServiceClient::new(dial(&self.endpoint, &self.address).await?);
-        let (acknowledge, requests) = mpsc::channel(8);
-        let first = tokio_stream::once(v1::WatchRequest { selection: Some(selection), ..Default::default() });
-        let updates = service.watch(first.chain(ReceiverStream::new(requests))).await;
-        let updates = updates.map_err(|status| refused(&self.address, &status))?.into_inner();
-        let address = self.address.clone();
+        let (mut address, mut opened) = (self.address.clone(), self.watch(&selection).await?);
+        if let Some(server) = self.led_by(opened.as_ref().err()).await? {
+            opened = server.watch(&selection).await?;
+            address = server.address;
+        }
+        let (updates, acknowledge) = opened.map_err(|status| refused(&address, &status))?;
         let clock = Clock { is_of_replay: replay_clock, ..Clock::default() };
         Ok(MapStream::spawn(clock, move |slot| receive_maps(slot, address, updates, acknowledge)))
+    }
+
+    /// Opens a stream of maps on a connection of its own. The inner error is the server's answer.
+    async fn watch(&self, selection: &v1::Selection) -> Result<Result<Watch, Status>, ClientError> {
+        let mut service = MapServiceClient::new(dial(&self.endpoint, &self.address).await?);
+        let (acknowledge, requests) = mpsc::channel(8);
+        let first = v1::WatchRequest { selection: Some(selection.clone()), ..Default::default() };
+        let updates = service.watch(tokio_stream::once(first).chain(ReceiverStream::new(requests))).await;
+        Ok(updates.map(|updates| (updates.into_inner(), acknowledge)))
+    }
+
+    /// The server to which this one leads: it serves the vehicle that this one does not. With the certificates of this
+    /// connection.
+    async fn led_by(&self, status: Option<&Status>) -> Result<Option<Self>, ClientError> {
+        let address = status.and_then(|status| status.metadata().get(SERVED_AT)?.to_str().ok());
+        match address {
+            Some(address) => Self::open(address, self.tls.as_ref()).await.map(Some),
+            None => Ok(None),
+        }
     }
 
     /// Opens a stream for a vehicle's observations, over a separate connection.
@@ -255,6 +281,12 @@ impl Client {
             }
         });
         Ok(Ingester::new(address, send, reports))
+    }
+}
+
+impl std::fmt::Debug for Tls {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Tls").finish_non_exhaustive()
     }
 }
 

@@ -38,3 +38,6 @@ pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/clearwa
 /// The encoded `FileDescriptorSet` of `clearway/v1/journal.proto`, imports included, without comments: for the schemas
 /// in recordings.
 pub const RECORDING_DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/recording.bin"));
+
+/// The metadata of `NOT_FOUND` that says at which address, `HOST:PORT`, another server serves the vehicle.
+pub const SERVED_AT: &str = "clearway-served-at";

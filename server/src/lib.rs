@@ -11,6 +11,7 @@
 //! | [`acknowledgements`] | readers that acknowledge -> the maps that they have finished with |
 //! | [`subscriptions`] | readers -> layers to compute |
 //! | [`encode`] | map -> bytes, once; regions and deltas of them; event <-> bytes of the journal |
+//! | [`fleet`] | announcements of other servers -> their vehicles, and where they are served |
 //! | [`newest`] | contents of the latest-value slots between engine and readers |
 //! | [`publish`] | newest map -> gRPC, zenoh, ROS 2, Foxglove, page |
 //! | [`record`] | events and maps -> MCAP file, and back; verification |
@@ -32,6 +33,7 @@ pub mod directory;
 pub mod encode;
 pub mod engine;
 mod file_advice;
+pub mod fleet;
 pub mod held_sockets;
 pub mod ingest;
 pub mod newest;

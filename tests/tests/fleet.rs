@@ -2,30 +2,18 @@
 
 mod fixture;
 
-use std::path::Path;
 use std::sync::{Arc, Mutex, mpsc};
 
 use clearway::config::ZenohMode;
 use clearway::ingest::queue::Reading;
 use clearway::server::{Running, Server, Setup};
 use clearway_client::{MapStream, StreamEvent, ZenohClient};
+use fixture::routers::router;
 use fixture::{config, feed, readings, sequence, start, within};
 use zenoh::Session;
 use zenoh::sample::SampleKind;
 
 const LAYER: &str = "drivability";
-
-/// Starts the router of `deploy/` on this port, in plain text and without access control; returns its address too.
-async fn router(port: u16) -> (Session, String) {
-    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/zenoh/router.json5");
-    let text = std::fs::read_to_string(file).expect("a file of the repository");
-    let text = text.replace("tls/0.0.0.0:7447", &format!("tcp/127.0.0.1:{port}"));
-    let mut config = zenoh::Config::from_json5(&text).unwrap();
-    config.insert_json5("access_control/enabled", "false").unwrap();
-    let router = within("a router", zenoh::open(config).into_future()).await.expect("the port is free");
-    let at = router.info().locators().await.first().expect("the router listens").to_string();
-    (router, at)
-}
 
 /// Portions of less than a revolution (about 350 datagrams), so that each portion makes at most one map.
 fn portions(tenths: i64) -> impl Iterator<Item = Vec<Reading>> {
@@ -77,7 +65,7 @@ async fn behind(router: &str) -> Running {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn streams_through_a_router_survive_a_restart_of_the_router() {
-    let (first, at) = router(0).await;
+    let (first, at) = router(0, &[]).await;
     let port = at.rsplit_once(':').and_then(|(_, port)| port.parse().ok()).expect("a port");
     let running = behind(&at).await;
     let mut portions = portions(20);
@@ -112,7 +100,7 @@ async fn streams_through_a_router_survive_a_restart_of_the_router() {
     while next < before + 3 {
         next = feed(&running, portions.next().unwrap()).await;
     }
-    let (second, _) = router(port).await;
+    let (second, _) = router(port, &[]).await;
     early_given.receive_up_to(next - 1, &mut early_maps).await;
     late_given.receive_up_to(next - 1, &mut late_maps).await;
     for given in [&early_given, &late_given] {

@@ -47,6 +47,11 @@ def _refused(address: str, error: grpc.RpcError) -> ClearwayError:
     return ClearwayError(error.code().name, f"{address}: {error.details()}")
 
 
+def _led_to(error: grpc.RpcError) -> str | None:
+    """Address of the server to which this one leads: it serves the vehicle that this one does not."""
+    return next((value for key, value in error.trailing_metadata() or () if key == "clearway-served-at"), None)
+
+
 def vehicles(address: str, tls: Tls | None) -> list[service_pb2.Vehicle]:
     channel, service = _service(address, tls)
     with channel:
@@ -57,47 +62,66 @@ def vehicles(address: str, tls: Tls | None) -> list[service_pb2.Vehicle]:
 
 
 def get(address: str, vehicle: str, layers: Sequence[str], tls: Tls | None) -> Map:
+    request = service_pb2.GetMapRequest(vehicle=vehicle, layers=layers)
+    try:
+        return _get(address, request, tls)
+    except grpc.RpcError as error:
+        server = _led_to(error)
+        if server is None:
+            raise _refused(address, error) from None
+    try:
+        return _get(server, request, tls)
+    except grpc.RpcError as error:
+        raise _refused(server, error) from None
+
+
+def _get(address: str, request: service_pb2.GetMapRequest, tls: Tls | None) -> Map:
     channel, service = _service(address, tls)
     with channel:
-        try:
-            request = service_pb2.GetMapRequest(vehicle=vehicle, layers=layers)
-            return Map(service.GetMap(request, timeout=_TIMEOUT_S).map).with_arrival()
-        except grpc.RpcError as error:
-            raise _refused(address, error) from None
+        return Map(service.GetMap(request, timeout=_TIMEOUT_S).map).with_arrival()
+
+
+class _Watch:
+    """One open stream of maps, on a connection of its own."""
+
+    def __init__(self, address: str, selection: service_pb2.Selection, tls: Tls | None) -> None:
+        self.channel, service = _service(address, tls)
+        self.requests: queue.SimpleQueue[service_pb2.WatchRequest | None] = queue.SimpleQueue()
+        self.requests.put(service_pb2.WatchRequest(selection=selection))
+        self.updates = service.Watch(iter(self.requests.get, None))
+
+    def close(self) -> None:
+        self.requests.put(None)
+        self.updates.cancel()
+        self.channel.close()
 
 
 def watch(
     address: str, selection: service_pb2.Selection, tls: Tls | None, *, replay_clock: bool = False
 ) -> MapStream:
-    channel, service = _service(address, tls)
-    requests: queue.SimpleQueue[service_pb2.WatchRequest | None] = queue.SimpleQueue()
-    requests.put(service_pb2.WatchRequest(selection=selection))
-
-    def outgoing() -> Iterator[service_pb2.WatchRequest]:
-        while (request := requests.get()) is not None:
-            yield request
-
-    updates = service.Watch(outgoing())
     stream = MapStream(Clock(is_of_replay=replay_clock), has_one_server=True)
+    opened = [_Watch(address, selection, tls)]
 
-    def run() -> None:
+    def run(at: str, *, may_be_led: bool) -> None:
+        of = opened[-1]
         try:
-            _receive_maps(stream, updates, requests.put, acknowledges=selection.max_in_flight > 0)
-            stream.end(ClearwayError("ended", f"{address}: the server has ended the stream"))
+            _receive_maps(stream, of.updates, of.requests.put, acknowledges=selection.max_in_flight > 0)
+            stream.end(ClearwayError("ended", f"{at}: the server has ended the stream"))
         except grpc.RpcError as error:
-            stream.end(_refused(address, error))
+            server = _led_to(error) if may_be_led else None
+            if server is None:
+                stream.end(_refused(at, error))
+                return
+            of.close()
+            opened.append(_Watch(server, selection, tls))
+            run(server, may_be_led=False)
         except ClearwayError as error:
             stream.end(error)
         except Exception as error:  # noqa: BLE001: any error ends the stream.
-            stream.end(ClearwayError("protobuf", f"{address}: {error}"))
+            stream.end(ClearwayError("protobuf", f"{at}: {error}"))
 
-    def close() -> None:
-        requests.put(None)
-        updates.cancel()
-        channel.close()
-
-    stream.on_close(close)
-    threading.Thread(target=run, name="clearway watch", daemon=True).start()
+    stream.on_close(lambda: [of.close() for of in list(opened)])
+    threading.Thread(target=run, args=(address,), kwargs={"may_be_led": True}, name="clearway watch", daemon=True).start()
     return stream
 
 

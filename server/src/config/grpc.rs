@@ -20,6 +20,9 @@ pub struct Grpc {
     pub enabled: bool,
     /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,
+    /// The host, with or without a port, at which other machines reach `listen`: other servers lead readers there.
+    /// Empty: the address of `listen` itself, unless it is a wildcard or of this host alone.
+    pub advertise: String,
     /// Most connections at once; further ones are refused with RESOURCE_EXHAUSTED.
     pub connections_max: usize,
     /// Certificates; without them gRPC is plain text.
@@ -32,7 +35,14 @@ pub struct Grpc {
 impl Default for Grpc {
     fn default() -> Self {
         let listen = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 50051);
-        Self { enabled: true, listen, connections_max: 256, tls: None, access: Access::default() }
+        Self {
+            enabled: true,
+            listen,
+            advertise: String::new(),
+            connections_max: 256,
+            tls: None,
+            access: Access::default(),
+        }
     }
 }
 
@@ -102,10 +112,25 @@ impl Grpc {
             let allowed = "no name without grpc.tls.client_ca, the CA of the clients' certificates";
             return Err(ValueError::new("grpc.access", name, allowed));
         }
+        let (_, port) = host_and_port(&self.advertise);
+        if self.advertise.contains("//") || port.is_some_and(|port| port.parse::<u16>().is_err()) {
+            let allowed = "a host such as \"vehicle-7.example\", or host and port such as \"10.0.0.7:50051\"";
+            return Err(ValueError::new("grpc.advertise", &self.advertise, allowed));
+        }
         if !(1..=65_536).contains(&self.connections_max) {
             return Err(ValueError::new("grpc.connections_max", self.connections_max, "1 to 65536 connections"));
         }
         Ok(())
+    }
+
+    /// The address, `HOST:PORT`, at which other machines reach gRPC when it listens on `bound`; `None` if they cannot.
+    pub fn advertised(&self, bound: SocketAddr) -> Option<String> {
+        match host_and_port(&self.advertise) {
+            ("", _) if bound.ip().is_unspecified() || bound.ip().is_loopback() => None,
+            ("", _) => Some(bound.to_string()),
+            (host, None) => Some(format!("{host}:{}", bound.port())),
+            (_, Some(_)) => Some(self.advertise.clone()),
+        }
     }
 
     /// Reads the files of `[grpc.tls]`: [`Config::certificates`](super::Config::certificates).
@@ -146,6 +171,14 @@ fn wrong(file: &Path, key: String, named: PathBuf, reason: String) -> ConfigErro
 
 fn text(file: &Path) -> Result<String, String> {
     std::fs::read_to_string(file).map_err(|error| advised(file, error).to_string())
+}
+
+/// The parts of `HOST`, `HOST:PORT` or `[IPV6]:PORT`.
+fn host_and_port(address: &str) -> (&str, Option<&str>) {
+    match address.rsplit_once(':') {
+        Some((host, port)) if !host.contains(':') || host.ends_with(']') => (host, Some(port)),
+        _ => (address, None),
+    }
 }
 
 /// The text of a file that only its owner and its group may read: of each key and each token.

@@ -45,7 +45,7 @@ pub use ros::Ros;
 pub use store::Store;
 pub use udp::{Ports, Sender, Udp};
 pub use vehicle::{Ingest, Vehicle};
-pub use zenoh::{Ros2, Zenoh, ZenohMode};
+pub use zenoh::{Fleet, Ros2, Zenoh, ZenohMode};
 
 /// The commented configuration: every key with its default, the optional tables as comments.
 pub const COMMENTED: &str = include_str!("../../../deploy/clearway.toml");

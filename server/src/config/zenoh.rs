@@ -22,6 +22,8 @@ pub struct Zenoh {
     pub connect: Vec<String>,
     /// True if peers are found by multicast.
     pub scouting: bool,
+    /// The vehicles of other servers.
+    pub fleet: Fleet,
     /// Maps as ROS 2 topics.
     pub ros2: Ros2,
     /// A zenoh configuration (JSON5) with TLS and access control; the keys above take precedence over it. A relative
@@ -40,6 +42,7 @@ impl Default for Zenoh {
             listen: vec!["tcp/127.0.0.1:7447".into()],
             connect: Vec::new(),
             scouting: false,
+            fleet: Fleet::default(),
             ros2: Ros2::default(),
             file: PathBuf::new(),
             signing_key: PathBuf::new(),
@@ -79,6 +82,23 @@ impl ZenohMode {
             Self::Client => "client",
             Self::Router => "router",
         }
+    }
+}
+
+/// The table `[zenoh.fleet]`: one list of vehicles for all servers of a zenoh network.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Fleet {
+    /// True if the vehicles of this server are announced to others, some kilobytes a second for each.
+    pub announce: bool,
+    /// True if the vehicles of other servers are listed, and readers are led to them. A server on a vehicle with a thin
+    /// uplink does without.
+    pub list: bool,
+}
+
+impl Default for Fleet {
+    fn default() -> Self {
+        Self { announce: true, list: true }
     }
 }
 

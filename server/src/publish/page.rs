@@ -2,6 +2,7 @@
 //! `/healthz`, `/readyz` and `/metrics`. The last three are also served alone, on a listener of their own.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use axum::Router;
 use axum::extract::ws::WebSocketUpgrade;
@@ -17,8 +18,9 @@ use super::listen::{Listener, ListenerHandle, Place};
 pub use super::page_live::Summaries;
 use super::page_live::{Live, MESSAGE_BYTES_MAX};
 use super::served::Vehicles;
+use crate::fleet::Fleet;
 use crate::replay::ReplayHandle;
-use crate::status::{Format, prometheus};
+use crate::status::{Format, prometheus, vehicle_json};
 
 #[derive(RustEmbed)]
 #[folder = "web/"]
@@ -29,6 +31,8 @@ struct Assets;
 pub struct Shown {
     /// The vehicles.
     pub vehicles: Vehicles,
+    /// The vehicles of other servers.
+    pub fleet: Fleet,
     /// The listeners.
     pub listeners: Arc<[(&'static str, ListenerHandle)]>,
     /// Controls the replay that the server serves.
@@ -69,7 +73,10 @@ async fn asset(uri: Uri) -> Response {
 
 async fn list(State(shown): State<Shown>, Extension(caller): Extension<Caller>) -> impl IntoResponse {
     let statuses = shown.vehicles.statuses();
-    let all = statuses.iter().filter(|status| caller.may_reach(&status.name)).map(|status| status.to_json());
+    let own = statuses.iter().filter(|status| caller.may_reach(&status.name)).map(|status| status.to_json());
+    let mut others = shown.fleet.vehicles(Instant::now());
+    others.retain(|vehicle| caller.may_reach(&vehicle.name));
+    let all = own.chain(others.iter().map(vehicle_json));
     ([(header::CONTENT_TYPE, "application/json")], Value::from(all.collect::<Vec<_>>()).to_string())
 }
 

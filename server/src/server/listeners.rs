@@ -47,6 +47,12 @@ impl Listeners {
         Ok(listeners)
     }
 
+    /// The address on which gRPC listens.
+    #[cfg(feature = "zenoh")]
+    pub fn grpc_address(&self) -> Option<SocketAddr> {
+        self.grpc.as_ref().and_then(Listener::address)
+    }
+
     async fn add(
         &mut self,
         name: &'static str,

@@ -1,10 +1,14 @@
 //! Everything of a running server that uses the zenoh session: maps out, observations in, live ROS 2 topics in.
 
+use std::net::SocketAddr;
+
 use tokio::task::JoinSet;
 use zenoh::Session;
+use zenoh::pubsub::Subscriber;
 
 use super::input::VehicleInput;
 use crate::config::{Config, ZenohMode};
+use crate::fleet::{Fleet, over_zenoh};
 use crate::ingest::gateway::Gateways;
 use crate::ingest::ros::live::{self, LiveTopics};
 use crate::ingest::zenoh::{Ingest, Senders};
@@ -20,10 +24,14 @@ pub(super) struct OverZenoh {
     /// One task a vehicle.
     ingest: JoinSet<()>,
     ros: Vec<LiveTopics>,
+    /// One task a vehicle.
+    announcements: JoinSet<()>,
+    _fleet: Option<Subscriber<()>>,
 }
 
 impl OverZenoh {
-    /// Opens the session, publishes all vehicles, and subscribes to their observations and ROS 2 topics.
+    /// Opens the session, publishes all vehicles, and subscribes to their observations and ROS 2 topics. Announces the
+    /// vehicles with the address at which gRPC listens, and fills the fleet with those of others.
     ///
     /// # Errors
     /// [`ZenohError`] if the session cannot be opened or a key cannot be declared.
@@ -32,11 +40,22 @@ impl OverZenoh {
         vehicles: &Vehicles,
         gateways: &Gateways,
         inputs: &[VehicleInput],
+        (fleet, grpc): (&Fleet, Option<SocketAddr>),
     ) -> Result<Self, ZenohError> {
         let names = config.vehicles.iter().map(|vehicle| &*vehicle.name);
         let session = zenoh_session::open(&config.zenoh, gateways.message_bytes_max(), names).await?;
         let publisher = Publisher::start(&session, &config.zenoh, vehicles).await?;
-        let mut over_zenoh = Self { session, publisher, ingest: JoinSet::new(), ros: Vec::new() };
+        let mut announcements = JoinSet::new();
+        if config.zenoh.fleet.announce {
+            let address = grpc.and_then(|bound| config.grpc.advertised(bound)).unwrap_or_default();
+            over_zenoh::announce(&session, vehicles, &address, &mut announcements).await?;
+        }
+        let others = match config.zenoh.fleet.list {
+            true => Some(over_zenoh::hear(&session, fleet.clone()).await?),
+            false => None,
+        };
+        let (ingest, ros) = (JoinSet::new(), Vec::new());
+        let mut over_zenoh = Self { session, publisher, ingest, ros, announcements, _fleet: others };
         for gateway in gateways.all() {
             let senders = senders(&over_zenoh.session, config);
             let ingest = Ingest::subscribe(&over_zenoh.session, gateway.clone(), senders).await?;
@@ -65,6 +84,7 @@ impl OverZenoh {
 
     /// Ends publishing and ingest, and closes the session.
     pub(super) async fn stop(mut self) {
+        self.announcements.shutdown().await;
         self.ingest.shutdown().await;
         self.publisher.stop().await;
         if let Err(error) = self.session.close().await {

@@ -14,6 +14,7 @@ use super::listeners::limits;
 use super::setup::ShutdownError;
 use crate::config::{Certificates, Config};
 use crate::engine::Engine;
+use crate::fleet::Fleet;
 use crate::ingest::queue::QueuedEvent;
 use crate::ingest::udp;
 use crate::publish::Vehicles;
@@ -34,6 +35,8 @@ const PUBLISHERS_STOP_TIMEOUT: Duration = Duration::from_secs(2);
 pub struct Running {
     /// The newest maps and the status of all vehicles.
     pub vehicles: Vehicles,
+    /// The vehicles of other servers.
+    pub fleet: Fleet,
     /// The inputs of all vehicles.
     pub inputs: Vec<VehicleInput>,
     /// The address of gRPC.

@@ -144,7 +144,13 @@ impl Running {
         let gateways = self.gateways(config);
         #[cfg(feature = "zenoh")]
         if config.zenoh.enabled {
-            let started = super::over_zenoh::OverZenoh::start(config, &self.vehicles, &gateways, &self.inputs);
+            let started = super::over_zenoh::OverZenoh::start(
+                config,
+                &self.vehicles,
+                &gateways,
+                &self.inputs,
+                (&self.fleet, listeners.grpc_address()),
+            );
             let over_zenoh = started.await?;
             self.zenoh = over_zenoh.endpoints().await;
             self.over_zenoh = Some(over_zenoh);
@@ -234,17 +240,19 @@ impl Running {
         let listeners = handles.clone().into();
         let (vehicles, replay) = (self.vehicles.clone(), self.replay.clone());
         self.publishers.spawn(watch_listeners(handles.clone(), vehicles.clone(), self.stopped()));
-        let shown = page::Shown { vehicles, listeners, replay, summaries: page::Summaries::default() };
+        let (fleet, summaries) = (self.fleet.clone(), page::Summaries::default());
+        let shown = page::Shown { vehicles, fleet, listeners, replay, summaries };
         self.listeners = Some((security, handles));
         let address = |listener: &Option<Listener>| listener.as_ref().and_then(Listener::address);
         (self.grpc, self.page, self.metrics) = (address(&grpc), address(&page), address(&metrics));
         self.foxglove = address(&foxglove);
         if let Some(listener) = grpc {
             let (vehicles, stopped, replay) = (self.vehicles.clone(), self.stopped(), self.replay.clone());
+            let fleet = self.fleet.clone();
             let recorder = self.recorder.as_ref().map(Recorder::control);
             let ingest = (!gateways.all().is_empty()).then(|| Ingest::new(gateways).into_service());
             self.publishers.spawn(async move {
-                let served = grpc::serve(listener, vehicles, ingest, recorder, replay, stopped);
+                let served = grpc::serve(listener, vehicles, fleet, ingest, recorder, replay, stopped);
                 if let Err(error) = served.await {
                     tracing::error!(%error, "grpc ended");
                 }

@@ -10,22 +10,23 @@ pub mod selection;
 mod status;
 
 use std::pin::Pin;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use clearway_proto::{DESCRIPTORS, v1};
+use clearway_proto::{DESCRIPTORS, SERVED_AT, v1};
 use futures::Stream;
 use tonic::service::Routes;
 use tonic::{Request, Response, Status, Streaming};
 use tonic_health::server::HealthReporter;
 
 use super::listen::Listener;
-use super::listen::access::caller;
-use super::served::Vehicles;
+use super::listen::access::{Caller, caller};
+use super::served::{Served, Vehicles};
 use reader::watch;
 use recording::Recordings;
 use replay::Replay;
 
 use crate::clock::now_ns;
+use crate::fleet::Fleet;
 use crate::record::writer::RecorderControl;
 use crate::replay::ReplayHandle;
 use crate::status::state_changed;
@@ -42,7 +43,7 @@ const SELECTION_TIMEOUT: Duration = Duration::from_secs(10);
 /// Interval at which the health of the services is reported.
 const HEALTH_PERIOD: Duration = Duration::from_secs(1);
 
-/// Serves maps, `ingest` if it is configured, and the control of `recorder` and `replay` if there is one, until `stop`
+/// Serves maps, leads readers of the `fleet`'s vehicles to their servers, serves `ingest` if it is configured, and the control of `recorder` and `replay` if there is one, until `stop`
 /// resolves and all streams have ended.
 ///
 /// # Errors
@@ -50,6 +51,7 @@ const HEALTH_PERIOD: Duration = Duration::from_secs(1);
 pub async fn serve<I: IngestService>(
     listener: Listener,
     vehicles: Vehicles,
+    fleet: Fleet,
     ingest: Option<IngestServiceServer<I>>,
     recorder: Option<RecorderControl>,
     replay: Option<ReplayHandle>,
@@ -72,7 +74,7 @@ pub async fn serve<I: IngestService>(
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
     let mut routes = Routes::builder();
-    routes.add_service(MapServiceServer::new(Maps { vehicles }).max_decoding_message_size(REQUEST_BYTES_MAX));
+    routes.add_service(MapServiceServer::new(Maps { vehicles, fleet }).max_decoding_message_size(REQUEST_BYTES_MAX));
     let recordings = RecordingServiceServer::new(Recordings { control: recorder.clone() });
     routes.add_service(recordings.max_decoding_message_size(REQUEST_BYTES_MAX));
     if let Some(ingest) = ingest {
@@ -116,6 +118,26 @@ async fn report_health(health: HealthReporter, vehicles: Vehicles, recorder: Opt
 
 struct Maps {
     vehicles: Vehicles,
+    fleet: Fleet,
+}
+
+impl Maps {
+    /// The vehicle with this name; the only one of this server if it is empty. The error for a vehicle of another
+    /// server has its address in the metadata [`SERVED_AT`], for callers that may reach the vehicle.
+    fn find(&self, name: &str, caller: &Caller) -> Result<&Served, Status> {
+        let unknown = match self.vehicles.find(name) {
+            Ok(served) => return Ok(served),
+            Err(unknown) => unknown,
+        };
+        let elsewhere = self.fleet.address_of(name, Instant::now()).filter(|_| caller.may_reach(name));
+        let Some((address, value)) = elsewhere.and_then(|address| Some((address.clone(), address.parse().ok()?)))
+        else {
+            return Err(unknown.into());
+        };
+        let mut led = Status::not_found(format!("vehicle {name:?} is served at {address}"));
+        led.metadata_mut().insert(SERVED_AT, value);
+        Err(led)
+    }
 }
 
 #[tonic::async_trait]
@@ -137,7 +159,7 @@ impl MapService for Maps {
             selection.ok_or_else(|| Status::invalid_argument("the first request carries a selection"))?;
         let layers = if selection.layers.is_empty() { "all layers".to_owned() } else { selection.layers.join(", ") };
         let name = format!("gRPC reader of {layers} ({})", agent.as_deref().unwrap_or("no user-agent"));
-        let served = self.vehicles.find(&selection.vehicle)?;
+        let served = self.find(&selection.vehicle, &caller)?;
         selection.layers = caller.layers(&served.status.name, selection.layers, &served.status.layers)?;
         Ok(Response::new(Box::pin(watch(&self.vehicles, selection, requests, name)?)))
     }
@@ -145,7 +167,7 @@ impl MapService for Maps {
     async fn get_map(&self, request: Request<v1::GetMapRequest>) -> Result<Response<v1::MapUpdate>, Status> {
         let caller = caller(&request);
         let v1::GetMapRequest { vehicle, layers } = request.into_inner();
-        let served = self.vehicles.find(&vehicle)?;
+        let served = self.find(&vehicle, &caller)?;
         served.check_layers(&layers)?;
         let name = &served.status.name;
         let layers = caller.layers(name, layers, &served.status.layers)?;
@@ -177,7 +199,9 @@ impl MapService for Maps {
         let caller = caller(&request);
         let statuses = self.vehicles.statuses();
         let vehicles = statuses.iter().filter(|status| caller.may_reach(&status.name));
-        let vehicles = vehicles.map(|status| status.to_proto()).collect();
+        let own = vehicles.map(|status| status.to_proto());
+        let others = self.fleet.vehicles(Instant::now()).into_iter().filter(|vehicle| caller.may_reach(&vehicle.name));
+        let vehicles = own.chain(others).collect();
         Ok(Response::new(v1::ListVehiclesResponse { vehicles }))
     }
 }

@@ -1,0 +1,67 @@
+//! Announcements over zenoh: the key `clearway/@fleet/<run of the server, hexadecimal>/<vehicle>`, an encoded
+//! [`v1::Vehicle`]. The key has the run in it, so that two servers that claim one vehicle are told apart. Keys with `*`
+//! and `**` do not match `@fleet`: readers of maps do not receive announcements.
+
+use std::time::{Duration, Instant};
+
+use clearway_proto::v1;
+use prost::Message;
+use tokio::task::JoinSet;
+use zenoh::Session;
+use zenoh::bytes::Encoding;
+use zenoh::pubsub::Subscriber;
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::sample::Locality;
+
+use super::Fleet;
+use crate::publish::Vehicles;
+use crate::zenoh_session::ZenohError;
+
+/// Time between two announcements of a vehicle.
+const PERIOD: Duration = Duration::from_secs(1);
+/// The keys of all announcements.
+const ALL: &str = "clearway/@fleet/*/*";
+
+/// Announces the vehicles of this server until the tasks end, each with the `address` at which its maps are served over
+/// gRPC; it is empty if others cannot reach it.
+///
+/// # Errors
+/// [`ZenohError`] if a publisher cannot be declared.
+pub(crate) async fn announce(
+    session: &Session,
+    vehicles: &Vehicles,
+    address: &str,
+    tasks: &mut JoinSet<()>,
+) -> Result<(), ZenohError> {
+    for served in vehicles.0.iter() {
+        let key = format!("clearway/@fleet/{:016x}/{}", served.status.boot_id, served.status.name);
+        let publisher = session.declare_publisher(key.clone()).encoding(Encoding::APPLICATION_PROTOBUF);
+        let publisher = publisher.congestion_control(CongestionControl::Drop).priority(Priority::DataLow);
+        let publisher = publisher.await.map_err(ZenohError::of(format!("publisher {key}")))?;
+        let (status, address) = (served.status.clone(), address.to_owned());
+        tasks.spawn(async move {
+            let mut every = tokio::time::interval(PERIOD);
+            loop {
+                every.tick().await;
+                let vehicle = v1::Vehicle { grpc: address.clone(), ..status.to_proto() };
+                if let Err(error) = publisher.put(vehicle.encode_to_vec()).await {
+                    tracing::warn!(%error, vehicle = %status.name, "zenoh: announcement");
+                }
+            }
+        });
+    }
+    Ok(())
+}
+
+/// Hears the announcements of other servers until the subscriber is dropped.
+///
+/// # Errors
+/// [`ZenohError`] if the subscriber cannot be declared.
+pub(crate) async fn hear(session: &Session, fleet: Fleet) -> Result<Subscriber<()>, ZenohError> {
+    session
+        .declare_subscriber(ALL)
+        .allowed_origin(Locality::Remote)
+        .callback(move |sample| fleet.hear(&sample.payload().to_bytes(), Instant::now()))
+        .await
+        .map_err(ZenohError::of(format!("subscriber {ALL}")))
+}

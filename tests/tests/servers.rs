@@ -1,0 +1,104 @@
+//! Several servers in one zenoh network: each lists the vehicles of all, and leads planners to them.
+
+mod fixture;
+
+use clearway::config::ZenohMode;
+use clearway::server::Running;
+use clearway_client::{Client, ClientError, Subscription};
+use fixture::routers::router;
+use fixture::{config, feed, readings, start, until, within};
+
+/// A server with one vehicle of this name, behind a router, with one map.
+async fn server(vehicle: &str, router: &str) -> Running {
+    let mut config = config();
+    config.vehicles[0].name = vehicle.into();
+    config.grpc.advertise = "127.0.0.1".into();
+    config.zenoh.enabled = true;
+    (config.zenoh.mode, config.zenoh.listen) = (ZenohMode::Client, Vec::new());
+    config.zenoh.connect = vec![router.into()];
+    let running = start(config).await;
+    feed(&running, readings(3)).await;
+    running
+}
+
+async fn client(running: &Running) -> Client {
+    Client::connect(&running.grpc.unwrap().to_string()).await.unwrap()
+}
+
+/// Names of the vehicles that a server lists.
+async fn listed(client: &Client) -> Vec<String> {
+    let mut names: Vec<_> = client.vehicles().await.unwrap().into_iter().map(|vehicle| vehicle.name).collect();
+    names.sort();
+    names
+}
+
+/// Waits until a server lists these vehicles.
+async fn lists(client: &Client, expected: &[&str]) {
+    within(&format!("a list of {expected:?}"), async {
+        while listed(client).await != expected {
+            tokio::task::yield_now().await;
+        }
+    })
+    .await;
+}
+
+fn boot_id(running: &Running) -> u64 {
+    running.vehicles.0[0].status.boot_id
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn every_server_lists_the_vehicles_of_all_and_leads_a_planner_to_them() {
+    let (first, near) = router(0, &[]).await;
+    let (second, far) = router(0, &[&near]).await;
+    let servers = [server("car", &near).await, server("van", &far).await, server("bus", &far).await];
+    for running in &servers {
+        lists(&client(running).await, &["bus", "car", "van"]).await;
+    }
+
+    let anywhere = client(&servers[0]).await;
+    for running in &servers {
+        let vehicle = &*running.vehicles.0[0].status.name;
+        let newest = within("a map", anywhere.newest(vehicle, &[])).await.unwrap();
+        assert_eq!(newest.header().boot_id, boot_id(running), "{vehicle}");
+        let subscription = Subscription { vehicle: vehicle.into(), ..Subscription::default() };
+        let mut maps = within("a stream", anywhere.subscribe(subscription)).await.unwrap();
+        let update = within("a map", maps.next()).await.unwrap();
+        assert_eq!(update.map.header().boot_id, boot_id(running), "{vehicle}");
+    }
+    let unknown = anywhere.newest("tram", &[]).await.unwrap_err();
+    assert!(matches!(&unknown, ClientError::Refused { reason, .. } if reason.contains("\"tram\"")), "{unknown}");
+
+    let [car, van, bus] = servers;
+    within("shutdown", van.shutdown()).await.unwrap();
+    lists(&anywhere, &["bus", "car"]).await;
+    let gone = anywhere.newest("van", &[]).await.unwrap_err();
+    assert!(matches!(&gone, ClientError::Refused { .. }), "{gone}");
+    let moved = server("van", &near).await;
+    lists(&anywhere, &["bus", "car", "van"]).await;
+    assert_eq!(anywhere.newest("van", &[]).await.unwrap().header().boot_id, boot_id(&moved));
+    for running in [car, bus, moved] {
+        within("shutdown", running.shutdown()).await.unwrap();
+    }
+    second.close().await.unwrap();
+    first.close().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn two_servers_that_claim_one_vehicle_are_both_listed_and_a_planner_keeps_the_one_it_has() {
+    let (router, at) = router(0, &[]).await;
+    let (car, van, other) = (server("car", &at).await, server("van", &at).await, server("van", &at).await);
+    let anywhere = client(&car).await;
+    lists(&anywhere, &["car", "van", "van"]).await;
+    let own = client(&van).await;
+    let subscription = Subscription { vehicle: "van".into(), ..Subscription::default() };
+    let mut maps = within("a stream", own.subscribe(subscription)).await.unwrap();
+    assert_eq!(within("a map", maps.next()).await.unwrap().map.header().boot_id, boot_id(&van));
+    feed(&other, readings(3)).await;
+    let made = feed(&van, readings(6).split_off(readings(3).len())).await;
+    while within("a map", maps.next()).await.unwrap().map.sequence() + 1 < made {}
+    until("the claim", || van.fleet.servers_of("van", std::time::Instant::now()).len() == 1).await;
+    for running in [car, van, other] {
+        within("shutdown", running.shutdown()).await.unwrap();
+    }
+    router.close().await.unwrap();
+}
