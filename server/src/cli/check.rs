@@ -8,9 +8,10 @@ use super::output::print;
 use crate::config::{COMMENTED, Config};
 
 /// The first lines of the configuration that is printed.
-const HEAD: &str = "# Every value that this configuration has. A comment says where it was given: a line of the file (and \
-    whether the\n# vehicle has it from [vehicle_defaults]), an environment variable, or --set. A value without a comment \
-    is a default.\n# Optional tables that the configuration does not have are not here.\n# `clearway check --default` prints them too, and what each key means.\n\n";
+const HEAD: &str = "# Every value that this configuration has. A comment says where it was given: a line of the file \
+    (and whether the\n# vehicle has it from [vehicle_defaults]), an environment variable, or --set. A value without a \
+    comment is a default.\n# Optional tables that the configuration does not have are not here.\n\
+    # `clearway check --default` prints them too, and what each key means.\n\n";
 
 /// Check a configuration file and print it with every default, and where each other value was given.
 ///

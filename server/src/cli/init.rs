@@ -227,7 +227,7 @@ impl Heard {
                 rpm: status.rpm,
                 packets: sender.packets,
                 refused: sender.refused.values().sum(),
-                mount: estimate(&sender.revolutions.into_clouds()).map_err(|error| error.to_string()),
+                mount: estimate(sender.revolutions.into_clouds()).map_err(|error| error.to_string()),
             });
         }
         found

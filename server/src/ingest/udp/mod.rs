@@ -40,8 +40,8 @@ pub struct BindError {
 }
 
 impl Sockets {
-    /// Takes the held sockets at the configured addresses of all vehicles, and binds the others. Logs a warning if the kernel allows a smaller receive buffer than
-    /// configured.
+    /// Takes the held sockets at the configured addresses of all vehicles, and binds the others. Logs a warning if the
+    /// kernel allows a smaller receive buffer than configured.
     ///
     /// # Errors
     /// [`BindError`] for the first socket that cannot be bound.
