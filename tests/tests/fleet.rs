@@ -10,7 +10,6 @@ use clearway::server::{Running, Server, Setup};
 use clearway_client::{MapStream, StreamEvent, ZenohClient};
 use fixture::routers::router;
 use fixture::{config, feed, readings, sequence, start, within};
-use zenoh::Session;
 use zenoh::sample::SampleKind;
 
 const LAYER: &str = "drivability";

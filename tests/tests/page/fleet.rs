@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use clearway::config::Config;
 use clearway::server::{Running, Server, Setup};
+use clearway::status::Transport;
 use clearway_client::{Client, Observation, now_ns};
 use tokio::runtime::Runtime;
 
@@ -200,7 +201,8 @@ pub fn fifty_vehicles_are_shown() {
         );
         browser.until("fresh maps on the cards in sight", &all_fresh);
         // Only the cards in sight cost the server anything.
-        let readers: u32 = running.vehicles.0.iter().map(|of| of.status.page_readers.load(Ordering::Relaxed)).sum();
+        let readers = running.vehicles.0.iter().map(|of| of.status.transports.count(Transport::Page));
+        let readers: u32 = readers.sum();
         assert!((8..VEHICLES as u32 - 5).contains(&readers), "maps of {readers} vehicles are sent");
         browser.until("the vehicles on the map", "return !document.getElementById('where').hidden");
         browser.screenshot("fleet-1440x900");
