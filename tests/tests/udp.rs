@@ -14,6 +14,7 @@ use clearway::ingest::queue::event_queue;
 use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::record::verify::verify;
 use clearway::server::Running;
+use clearway::status::{Format, prometheus};
 use clearway_lidar::capture::Capture;
 use clearway_mapping::event::{Body, Cause};
 use clearway_mapping::ledger::Ledger;
@@ -127,7 +128,7 @@ async fn every_datagram_is_counted_in_the_ledger_and_in_the_recording() {
     assert_eq!((sensors[0].ledger.decoded, sensors[0].ledger.telemetry), (packets.len() as u64, 1));
     assert_eq!(sensors[0].ledger.refused, [("block_flag", 3), ("length", 15)].into());
     assert_eq!((sensors[1].ledger.received, sensors[1].ledger.decoded, sensors[1].ledger.refused["length"]), (6, 1, 3));
-    let metrics = clearway::status::prometheus(std::slice::from_ref(&status), &[]);
+    let metrics = prometheus(std::slice::from_ref(&status), Vec::new(), Format::Prometheus);
     let line = "clearway_sensor_refused_total{vehicle=\"car\",sensor=\"side\",reason=\"length\"} 3\n";
     assert!(metrics.contains(line), "{metrics}");
     let unknown_senders = status.to_proto().unknown_senders;

@@ -100,7 +100,9 @@ enum Next {
 
 /// The short status of each vehicle as JSON, which all browsers share, with the time at which it was written.
 #[derive(Clone, Debug, Default)]
-pub struct Summaries(Arc<Mutex<BTreeMap<String, (Instant, Arc<str>)>>>);
+pub struct Summaries(Arc<Mutex<BTreeMap<String, Summary>>>);
+
+type Summary = (Instant, Arc<str>);
 
 impl Summaries {
     fn of(&self, served: &Served) -> Arc<str> {

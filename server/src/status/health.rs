@@ -360,10 +360,13 @@ mod tests {
         assert_eq!(health.state(), State::Error);
     }
 
-    /// Plays a script of what was observed at which time; returns the state after each line.
-    fn play(script: &[(u64, fn(&mut Facts))]) -> Vec<&'static str> {
+    /// A time in ms, and what is observed then other than that all is fine.
+    type Line = (u64, fn(&mut Facts));
+
+    /// Plays a script; returns the state after each line.
+    fn play(script: &[Line]) -> Vec<&'static str> {
         let mut health = Health::default();
-        let mut step = |(at, change): &(u64, fn(&mut Facts))| {
+        let mut step = |(at, change): &Line| {
             let mut facts = fine();
             facts.up = ms(*at);
             change(&mut facts);
@@ -375,7 +378,7 @@ mod tests {
 
     #[test]
     fn a_state_gets_worse_at_once_and_better_after_three_seconds() {
-        let script: [(u64, fn(&mut Facts)); 11] = [
+        let script: [Line; 11] = [
             (0, |f| (f.map_age, f.sensors[0].silent, f.sensors[1].silent) = (None, None, None)),
             (200, |_| {}),
             (1000, |f| f.map_age = Some(ms(400))),
@@ -394,7 +397,7 @@ mod tests {
 
     #[test]
     fn loss_warns_above_one_percent_and_until_it_is_below_half_a_percent() {
-        let script: [(u64, fn(&mut Facts)); 7] = [
+        let script: [Line; 7] = [
             (0, |_| {}),
             (1000, |f| f.loss = 0.009),
             (2000, |f| f.loss = 0.011),

@@ -438,7 +438,7 @@ mod tests {
     fn known_reasons_are_there_before_they_occur_and_both_formats_name_counters_as_they_ask() {
         let (queue, _events) = crate::ingest::queue::event_queue(4);
         let status = Arc::new(VehicleStatus::new("car".into(), 1, vec!["drivability"], queue.drops()));
-        let open = prometheus(&[status.clone()], vec![], Format::OpenMetrics);
+        let open = prometheus(std::slice::from_ref(&status), vec![], Format::OpenMetrics);
         assert!(open.contains("# TYPE clearway_maps counter\n") && open.ends_with("# EOF\n"), "{open}");
         let text = prometheus(&[status], vec![], Format::Prometheus);
         assert!(text.contains("# TYPE clearway_maps_total counter\n") && !text.contains("# EOF"), "{text}");
