@@ -43,7 +43,7 @@ where
 /// The same for a browser: it is counted as a reader of the page, and no replay in lockstep waits for it.
 ///
 /// # Errors
-/// As [`watch`].
+/// As [`watch()`].
 pub fn watch_from_page<R>(
     served: &Served,
     selection: v1::Selection,

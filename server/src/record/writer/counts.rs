@@ -193,27 +193,6 @@ impl RecorderCounts {
         changing.failure.get_or_insert_with(|| reason.to_owned());
     }
 
-    /// Notes how many finished parts the store has not confirmed.
-    pub(crate) fn set_waiting_for_store(&self, parts: u64) {
-        self.store.waiting.store(parts, Ordering::Relaxed);
-    }
-
-    /// Counts a part that the store has confirmed; `waiting` are left.
-    pub(crate) fn add_confirmed(&self, waiting: u64) {
-        self.store.confirmed.fetch_add(1, Ordering::Relaxed);
-        self.set_waiting_for_store(waiting);
-    }
-
-    /// Counts an attempt to store a part that failed.
-    pub(crate) fn add_store_failure(&self) {
-        self.store.failures.fetch_add(1, Ordering::Relaxed);
-    }
-
-    /// Notes why the store has not confirmed a part; empty: nothing is wrong.
-    pub(crate) fn set_store_problem(&self, problem: String) {
-        *locked(&self.store.problem) = problem;
-    }
-
     /// The first failure of the disk; `None` without one.
     pub fn stop_reason(&self) -> Option<String> {
         locked(&self.changing).failure.clone()
@@ -287,5 +266,30 @@ impl RecorderCounts {
             store_failures: self.store.failures.load(Ordering::Relaxed),
             store_problem: locked(&self.store.problem).clone(),
         }
+    }
+}
+
+/// What the uploads of the store report.
+#[cfg(feature = "store")]
+impl RecorderCounts {
+    /// Notes how many finished parts the store has not confirmed.
+    pub(crate) fn set_waiting_for_store(&self, parts: u64) {
+        self.store.waiting.store(parts, Ordering::Relaxed);
+    }
+
+    /// Counts a part that the store has confirmed; `waiting` are left.
+    pub(crate) fn add_confirmed(&self, waiting: u64) {
+        self.store.confirmed.fetch_add(1, Ordering::Relaxed);
+        self.set_waiting_for_store(waiting);
+    }
+
+    /// Counts an attempt to store a part that failed.
+    pub(crate) fn add_store_failure(&self) {
+        self.store.failures.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Notes why the store has not confirmed a part; empty: nothing is wrong.
+    pub(crate) fn set_store_problem(&self, problem: String) {
+        *locked(&self.store.problem) = problem;
     }
 }
