@@ -370,10 +370,10 @@ fn a_reload_changes_certificates_roles_and_limits_and_nothing_else() {
 
 /// Three vehicles with common keys; `third` has two sensors of its own.
 const FLEET: &str = "[vehicle_defaults]\nqueue = 64\n[vehicle_defaults.udp]\ndata = \"127.0.0.1:0\"\n\
-    [[vehicle_defaults.sensor]]\nname = \"top\"\nmodel = \"vlp16\"\n[vehicle_defaults.sensor.extrinsics]\nx_m = 0.0\n\
+    telemetry = \"127.0.0.1:0\"\n[[vehicle_defaults.sensor]]\nname = \"top\"\nmodel = \"vlp16\"\n[vehicle_defaults.sensor.extrinsics]\nx_m = 0.0\n\
     y_m = 0.0\nz_m = 1.9\nroll_deg = 0.0\npitch_deg = 0.0\nyaw_deg = 0.0\n[[vehicle]]\nname = \"first\"\n[[vehicle]]\n\
     name = \"second\"\nqueue = 128\n[vehicle.udp]\nreceive_buffer_bytes = 65536\n[[vehicle]]\nname = \"third\"\n\
-    [[vehicle.sensor]]\nname = \"rear\"\nextrinsics = { x_m = -1, y_m = 0, z_m = 1, roll_deg = 0, pitch_deg = 0, \
+    [vehicle.udp.from]\nrear = \"127.0.0.2\"\ntop = \"127.0.0.3\"\n[[vehicle.sensor]]\nname = \"rear\"\nextrinsics = { x_m = -1, y_m = 0, z_m = 1, roll_deg = 0, pitch_deg = 0, \
     yaw_deg = 180 }\n[[vehicle.sensor]]\nname = \"top\"\nextrinsics = { z_m = 2.5 }\n";
 
 #[test]
@@ -393,7 +393,7 @@ fn vehicles_have_the_keys_of_the_defaults_that_they_do_not_have_themselves() {
 fn wrong_defaults_are_named_with_their_line_and_the_vehicle() {
     for (of, wrong, said) in [
         ("queue = 64", "queue = \"many\"", ", line 2: vehicle.queue (of first) = \"many\": allowed: a whole number"),
-        ("z_m = 1.9", "z = 1.9", ", line 11: vehicle.sensor[0].extrinsics.z (of first) is not a key"),
+        ("z_m = 1.9", "z = 1.9", ", line 12: vehicle.sensor[0].extrinsics.z (of first) is not a key"),
         ("queue = 64", "name = \"car\"", ", line 2: vehicle_defaults.name = \"car\": allowed: no name"),
         ("queue = 128", "queue = 3", ": vehicle.queue (of second) = 3: allowed: 16 to 1048576"),
     ] {
