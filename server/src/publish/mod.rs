@@ -9,12 +9,15 @@
 //! | [`listen`] | a TCP listener -> connections within their limits, requests of clients that may send them |
 //! | [`grpc`] | newest map -> gRPC streams, each with its layers, region, rate, deltas and credits |
 //! | `zenoh` | newest map -> one key for each layer, a status, a liveliness token |
+//! | `announcements` | own vehicles -> other servers; theirs -> the fleet |
 //! | `ros` | newest map -> ROS 2 topics in rmw_zenoh's key space |
 //! | [`foxglove`] | newest map, points, pose -> Foxglove's WebSocket |
 //! | `page_replay` | the state of a replay and requests of the page, as JSON |
 //! | `page_live` | selections and acknowledgements of a browser -> maps, status and replay state on its WebSocket |
 //! | [`page`] | newest map, status -> the page's WebSocket, `/vehicles`, `/healthz`, `/readyz`, `/metrics` |
 
+#[cfg(feature = "zenoh")]
+pub(crate) mod announcements;
 pub mod foxglove;
 pub mod grpc;
 pub mod listen;

@@ -8,13 +8,13 @@ use zenoh::pubsub::Subscriber;
 
 use super::input::VehicleInput;
 use crate::config::{Config, ZenohMode};
-use crate::fleet::{Fleet, over_zenoh};
+use crate::fleet::Fleet;
 use crate::ingest::gateway::Gateways;
 use crate::ingest::ros::live::{self, LiveTopics};
 use crate::ingest::zenoh::{Ingest, Senders};
-use crate::publish::Vehicles;
 use crate::publish::listen::access::Access;
 use crate::publish::zenoh::Publisher;
+use crate::publish::{Vehicles, announcements};
 use crate::zenoh_session::{self, ZenohError};
 
 /// The open session and its users.
@@ -48,10 +48,10 @@ impl OverZenoh {
         let mut announcements = JoinSet::new();
         if config.zenoh.fleet.announce {
             let address = grpc.and_then(|bound| config.grpc.advertised(bound)).unwrap_or_default();
-            over_zenoh::announce(&session, vehicles, &address, &mut announcements).await?;
+            announcements::announce(&session, vehicles, &address, &mut announcements).await?;
         }
         let others = match config.zenoh.fleet.list {
-            true => Some(over_zenoh::hear(&session, fleet.clone()).await?),
+            true => Some(announcements::hear(&session, fleet.clone()).await?),
             false => None,
         };
         let (ingest, ros) = (JoinSet::new(), Vec::new());

@@ -3,10 +3,8 @@
 //! Each server announces its vehicles once a second; the others list them and lead readers to them. Announcements tell
 //! what a vehicle's server says of it: a server takes its own vehicles from no announcement.
 //!
-//! | file | in -> out |
-//! |---|---|
-//! | this one | announcements -> [`Fleet`]: the vehicles of other servers, and who claims a name |
-//! | `over_zenoh` | own vehicles -> announcements; announcements of others -> [`Fleet`] |
+//! In: announcements, in the order in which they come. Out: the vehicles, who claims a name, and where it is served.
+//! `publish::announcements` sends and receives them.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -16,9 +14,6 @@ use clearway_proto::v1;
 use prost::Message;
 
 use crate::sync::locked;
-
-#[cfg(feature = "zenoh")]
-pub(crate) mod over_zenoh;
 
 /// Time after its last announcement at which a vehicle is no longer listed. Ours: two lost announcements and the delay
 /// of a bad link.

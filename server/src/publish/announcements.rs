@@ -13,8 +13,8 @@ use zenoh::pubsub::Subscriber;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::sample::Locality;
 
-use super::Fleet;
-use crate::publish::Vehicles;
+use super::served::Vehicles;
+use crate::fleet::Fleet;
 use crate::zenoh_session::ZenohError;
 
 /// Time between two announcements of a vehicle.
