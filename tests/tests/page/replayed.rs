@@ -48,7 +48,7 @@ pub fn cells_are_those_of_the_client() {
     beside_a_replay(async |browser, client| {
         browser.until("layers", "return document.querySelectorAll('.layer').length === 6");
         browser.run(ALL_LAYERS);
-        let map = stop_at(client, 1.0).await;
+        let map = stop_at(client, 0.5).await;
         assert_eq!(map.layers().len(), 6);
         await_map(browser, map.sequence());
         let mut compared = 0;
@@ -87,19 +87,19 @@ pub fn cells_are_those_of_the_client() {
 
 pub fn the_time_bar_controls_a_replay() {
     beside_a_replay(async |browser, client| {
-        let first = stop_at(client, 0.5).await;
+        let first = stop_at(client, 0.3).await;
         await_map(browser, first.sequence());
         browser.until("a pause", "return document.querySelector('[data-part=play]').textContent === 'Play'");
         browser.click("[data-part=step]");
         await_map(browser, first.sequence() + 1);
         browser.run(
             "const bar = document.querySelector('[data-part=position]');
-            bar.value = 1.5; bar.dispatchEvent(new Event('input')); bar.dispatchEvent(new Event('change'))",
+            bar.value = 0.8; bar.dispatchEvent(new Event('input')); bar.dispatchEvent(new Event('change'))",
         );
         browser.until(
             "the map of that moment",
-            "return document.querySelector('[data-part=time]').textContent.startsWith('1.5 ') &&
-                Number(document.querySelector('#stream dd').textContent) >= 13",
+            "return document.querySelector('[data-part=time]').textContent.startsWith('0.8 ') &&
+                Number(document.querySelector('#stream dd').textContent) >= 7",
         );
         browser.run(
             "const rate = document.querySelector('[data-part=rate]');
