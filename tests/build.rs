@@ -10,7 +10,7 @@
 //! | `clearway_browser` | `chromium` and `chromedriver` |
 //! | `clearway_promtool` | `promtool`, which comes with Prometheus |
 //!
-//! `env!("CLEARWAY_DATA")` is the path of the recorded drives, or empty. After you install one of them,
+//! `env!("CLEARWAY_DRIVES")` is the path of the recorded drives, or empty. After you install one of them,
 //! `touch tests/build.rs` makes cargo look again.
 
 use std::env;
@@ -45,7 +45,7 @@ fn main() {
         println!("cargo::rerun-if-changed={}", data.join("INDEX.md").display());
     }
     set("clearway_data", data.is_some());
-    println!("cargo::rustc-env=CLEARWAY_DATA={}", data.unwrap_or_default().display());
+    println!("cargo::rustc-env=CLEARWAY_DRIVES={}", data.unwrap_or_default().display());
     set("clearway_python", succeeds("python3", &["-c", "import venv, ensurepip"]));
     set("clearway_openssl", succeeds("openssl", &["version"]));
     set("clearway_promtool", succeeds("promtool", &["--version"]));

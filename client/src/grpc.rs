@@ -162,8 +162,8 @@ impl Client {
         Ok(answer.map_err(|status| refused(&self.address, &status))?.into_inner().vehicles)
     }
 
-    /// State of these vehicles (empty: all) once a second, and at each change of a vehicle's state. The stream ends with
-    /// an error if the connection fails.
+    /// State of these vehicles (empty: all) once a second, and at each change of a vehicle's state. The stream ends
+    /// with an error if the connection fails.
     ///
     /// # Errors
     /// [`ClientError::Unreachable`] if the connection fails, [`ClientError::Refused`] if the server refuses the call or

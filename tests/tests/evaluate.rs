@@ -11,7 +11,7 @@ use serde_json::Value;
 const GROUND_F1: f64 = 0.989;
 
 fn kitti() -> String {
-    Path::new(env!("CLEARWAY_DATA")).join("kitti").display().to_string()
+    Path::new(env!("CLEARWAY_DRIVES")).join("kitti").display().to_string()
 }
 
 fn evaluated(arguments: &[&str]) -> Value {
@@ -107,7 +107,7 @@ fn every_variation_of_the_labelled_frame_is_judged() {
 #[test]
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn a_log_of_argoverse_is_judged_by_its_map_of_the_ground() {
-    let log = Path::new(env!("CLEARWAY_DATA")).join("argoverse2/adcf7d18-0510-35b0-a2fa-b4cea13a6d76");
+    let log = Path::new(env!("CLEARWAY_DRIVES")).join("argoverse2/adcf7d18-0510-35b0-a2fa-b4cea13a6d76");
     let report = evaluated(&[&log.display().to_string()]);
     let row = &report["sources"][0]["rows"][0];
     assert_eq!(row["frames"], 1);

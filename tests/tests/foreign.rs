@@ -12,7 +12,7 @@ use mcap::WriteOptions;
 use mcap::records::op;
 use rusqlite::Connection;
 
-const DATA: &str = env!("CLEARWAY_DATA");
+const DATA: &str = env!("CLEARWAY_DRIVES");
 const BAG: &str = "ros2bag/nebula/decoder_ground_truth/vlp16/1673400471837873222/1673400471837873222_0.db3";
 
 /// The same four scans of a VLP-16, as MCAP with zstd and as a bag in sqlite.

@@ -78,7 +78,7 @@ fn the_demo_runs_and_ends_cleanly() {
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn the_offline_commands_of_the_readme_succeed_on_a_capture() {
     let folder = tempfile::tempdir().expect("a folder");
-    let capture = Path::new(env!("CLEARWAY_DATA")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
+    let capture = Path::new(env!("CLEARWAY_DRIVES")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
     fs::copy(&capture, folder.path().join("drive.pcap")).expect("the HDL-32E capture");
     let offline: Vec<_> = commands()
         .into_iter()
@@ -108,7 +108,7 @@ fn the_offline_commands_of_the_readme_succeed_on_a_capture() {
 #[cfg_attr(not(clearway_data), ignore = "needs the recorded drives: set CLEARWAY_DATA")]
 fn the_evaluate_commands_of_the_readme_succeed() {
     let folder = tempfile::tempdir().expect("a folder");
-    let data = Path::new(option_env!("CLEARWAY_DATA").unwrap_or_default()).join("kitti");
+    let data = Path::new(option_env!("CLEARWAY_DRIVES").unwrap_or_default()).join("kitti");
     for (file, place) in [("patchwork-plusplus/000000.bin", "velodyne"), ("mmdet3d/000000.label", "labels")] {
         let to = folder.path().join("sequences/00").join(place);
         fs::create_dir_all(&to).expect("the layout of SemanticKITTI");
@@ -127,7 +127,7 @@ fn the_evaluate_commands_of_the_readme_succeed() {
 fn the_default_configuration_serves_what_send_sends_to_the_readers() {
     let _ports = DEFAULT_PORTS.lock().unwrap_or_else(PoisonError::into_inner);
     let folder = tempfile::tempdir().expect("a folder");
-    let capture = Path::new(env!("CLEARWAY_DATA")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
+    let capture = Path::new(env!("CLEARWAY_DRIVES")).join("pcap/rust-lidar-utils/hdl32_example.pcap");
     fs::copy(&capture, folder.path().join("drive.pcap")).expect("the HDL-32E capture");
     let config = workspace().join("deploy/clearway.toml");
     let server = Command::new(binaries().join("clearway"))

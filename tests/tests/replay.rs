@@ -13,7 +13,7 @@ async fn replayed(options: Options) -> Result<Summary, ReplayError> {
 }
 
 fn drive(path: &str) -> PathBuf {
-    Path::new(env!("CLEARWAY_DATA")).join(path)
+    Path::new(env!("CLEARWAY_DRIVES")).join(path)
 }
 
 const HDL32: &str = "pcap/rust-lidar-utils/hdl32_example.pcap";

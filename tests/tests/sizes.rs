@@ -68,7 +68,7 @@ impl Sized {
 /// Replays a drive once for its events and the mount of its sensor, then makes its maps with the poses added.
 async fn maps(drive: &Drive) -> Vec<Sized> {
     let folder = tempfile::tempdir().unwrap();
-    let (file, record) = (Path::new(env!("CLEARWAY_DATA")).join(drive.path), folder.path().join("drive.mcap"));
+    let (file, record) = (Path::new(env!("CLEARWAY_DRIVES")).join(drive.path), folder.path().join("drive.mcap"));
     let options = Options { files: vec![file.clone()], record: Some(record.clone()), ..Options::default() };
     fixture::within("replay", replay(options, Default::default(), |_, _| {}, std::future::pending())).await.unwrap();
     let mut recording = RecordingReader::open(&record).unwrap();

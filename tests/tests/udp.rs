@@ -223,7 +223,7 @@ fn a_million_datagrams_add_up_exactly() {
 }
 
 fn drive(path: &str) -> PathBuf {
-    Path::new(env!("CLEARWAY_DATA")).join(path)
+    Path::new(env!("CLEARWAY_DRIVES")).join(path)
 }
 
 /// The vehicle `name` with a level sensor 1.9 m above the ground that receives at `at` from the sender `from`.

@@ -40,7 +40,7 @@ fn mount(height_m: f64) -> Mount {
 
 /// KITTI's first scan: x, y, z and intensity of each point.
 fn kitti() -> Option<Scan> {
-    let bytes = std::fs::read(concat!(env!("CLEARWAY_DATA"), "/kitti/patchwork-plusplus/000000.bin")).ok()?;
+    let bytes = std::fs::read(concat!(env!("CLEARWAY_DRIVES"), "/kitti/patchwork-plusplus/000000.bin")).ok()?;
     let mut scan = Scan::default();
     for point in bytes.chunks_exact(16) {
         let value = |i: usize| f32::from_le_bytes([point[4 * i], point[4 * i + 1], point[4 * i + 2], point[4 * i + 3]]);

@@ -165,7 +165,7 @@ fn a_padded_table_is_cut_and_a_short_one_is_refused() {
 fn every_recorded_calibration_is_read() {
     let mut read = 0;
     for folder in ["nebula", "ros-drivers", "valgur", "xml"] {
-        let folder = format!("{}/calib/{folder}", env!("CLEARWAY_DATA"));
+        let folder = format!("{}/calib/{folder}", env!("CLEARWAY_DRIVES"));
         for entry in std::fs::read_dir(folder).unwrap() {
             let path = entry.unwrap().path();
             let calibration = Calibration::load_str(&std::fs::read_to_string(&path).unwrap());
@@ -187,7 +187,7 @@ fn factory_tables_equal_those_of_veloview() {
         (Model::Vlp32c, "VLP-32C.yml"),
         (Model::Vls128, "Alpha_Prime.yml"),
     ] {
-        let path = format!("{}/calib/valgur/{file}", env!("CLEARWAY_DATA"));
+        let path = format!("{}/calib/valgur/{file}", env!("CLEARWAY_DRIVES"));
         let theirs = Calibration::load_str(&std::fs::read_to_string(path).unwrap()).unwrap();
         let ours = Calibration::factory(model);
         assert_eq!(ours.distance_m_per_count, theirs.distance_m_per_count, "{model:?}");

@@ -16,7 +16,7 @@ use clearway_ros::velodyne_scan::VelodyneScan;
 
 /// Path of a file of the recorded drives.
 pub fn data(path: &str) -> PathBuf {
-    PathBuf::from(env!("CLEARWAY_DATA")).join(path)
+    PathBuf::from(env!("CLEARWAY_DRIVES")).join(path)
 }
 
 /// All complete datagrams of a capture.

@@ -201,7 +201,7 @@ pub fn figure(layer: &Layer, name: &str) -> f64 {
 
 /// Path of a recorded drive.
 pub fn data(path: &str) -> std::path::PathBuf {
-    std::path::Path::new(env!("CLEARWAY_DATA")).join(path)
+    std::path::Path::new(env!("CLEARWAY_DRIVES")).join(path)
 }
 
 /// A KITTI scan, sensor frame.
