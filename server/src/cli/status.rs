@@ -11,8 +11,8 @@ use crate::status::{State, vehicle_json};
 
 /// Print the state of each vehicle: ok, or what is wrong with it.
 ///
-/// The exit code is 0 if every vehicle is ok, 5 if the worst of them warns, 4 if one is an error (no fresh map is made),
-/// and 2 if the server does not answer.
+/// The exit code is 0 if every vehicle is ok, 5 if the worst of them warns, 4 if one is an error (no fresh map is
+/// made), and 2 if the server does not answer.
 #[derive(Args)]
 #[command(after_help = "Examples:
   clearway status

@@ -3,9 +3,9 @@
 //! A layer is made while its key has a subscriber, and for each query on it. Late joiners get the current map from the
 //! publisher's cache; it is old if the layer had no subscriber, and its age says so. The same key answers queries.
 //! Subscribers can detect misses. A liveliness token `clearway/<vehicle>` lives as long as the vehicle is served;
-//! `clearway/<vehicle>/status` has the status once a second and at each change of its state, as JSON; what another server
-//! says there of a vehicle of the same name is in this server's status. `clearway/<vehicle>/replay` has `{"ended":true}`
-//! after the last map of a replay, and `{"ended":false}` when it is set back.
+//! `clearway/<vehicle>/status` has the status once a second and at each change of its state, as JSON; what another
+//! server says there of a vehicle of the same name is in this server's status. `clearway/<vehicle>/replay` has
+//! `{"ended":true}` after the last map of a replay, and `{"ended":false}` when it is set back.
 //!
 //! With `zenoh.signing_key` each map has a signature ([`clearway_client::signature`]) as the sample's attachment.
 //!
@@ -243,7 +243,8 @@ async fn send_maps(
                 }
                 let map = newest.borrow_and_update().clone();
                 if let Some(map) = map {
-                    let before = last.replace((map.boot_id, map.sequence)).filter(|(boot_id, _)| *boot_id == map.boot_id);
+                    let before = last.replace((map.boot_id, map.sequence));
+                    let before = before.filter(|(boot_id, _)| *boot_id == map.boot_id);
                     let skipped = before.map_or(0, |(_, last)| map.sequence.saturating_sub(last + 1));
                     served.status.transports.skip_for_all(Transport::Zenoh, skipped);
                     send_map(&map, &publishers, signing_key.as_deref()).await;

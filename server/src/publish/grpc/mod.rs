@@ -43,8 +43,8 @@ const SELECTION_TIMEOUT: Duration = Duration::from_secs(10);
 /// Interval at which the health of the services is reported.
 const HEALTH_PERIOD: Duration = Duration::from_secs(1);
 
-/// Serves maps, leads readers of the `fleet`'s vehicles to their servers, serves `ingest` if it is configured, and the control of `recorder` and `replay` if there is one, until `stop`
-/// resolves and all streams have ended.
+/// Serves maps, leads readers of the `fleet`'s vehicles to their servers, serves `ingest` if it is configured, and the
+/// control of `recorder` and `replay` if there is one, until `stop` resolves and all streams have ended.
 ///
 /// # Errors
 /// [`tonic_reflection::server::Error`] if the descriptors are invalid.
