@@ -20,8 +20,8 @@ pub fn sensor_json(state: &v1::SensorState) -> Value {
 }
 
 /// The state of a vehicle as a JSON object: the fields of [`v1::Vehicle`] under their own names, each sensor with its
-/// ledger and its mount; null where a value is absent. Boot id, stamps and unknown senders are left out, because the page and people need them in
-/// different forms.
+/// ledger and its mount; null where a value is absent. Boot id, stamps and unknown senders are left out, because the
+/// page and people need them in different forms.
 pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
     let recorder = vehicle.recorder.clone().unwrap_or_default();
     let sensors = vehicle.sensors.iter().map(|state| {
