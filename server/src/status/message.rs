@@ -61,8 +61,8 @@ impl VehicleStatus {
         }
     }
 
-    /// The status as JSON: the content of [`VehicleStatus::to_proto`], and rates of the newest maps. 64-bit numbers that
-    /// a browser's doubles cannot hold (boot id, stamps) are strings.
+    /// The status as JSON: the content of [`VehicleStatus::to_proto`], and rates of the newest maps. 64-bit numbers
+    /// that a browser's doubles cannot hold (boot id, stamps) are strings.
     pub fn to_json(&self) -> Value {
         let snapshot = self.snapshot();
         let proto = self.proto_of(&snapshot);
