@@ -200,7 +200,7 @@ impl Engine {
             });
             self.newest.send_replace(Some(encoded.clone()));
             if let Some(recording) = &mut self.recording {
-                recording.record_map(&encoded);
+                recording.record_map(&encoded, self.status.traces.hop(&encoded, "record", None));
             }
         }
         if let Some(observer) = &mut self.observer {

@@ -19,6 +19,7 @@
 //! | `store` | finished recordings -> a folder or a bucket, with an index; a search -> recordings |
 //! | [`status`] | ledger, rates and latency of each vehicle |
 //! | [`server`] | starts and stops all of these |
+//! | [`traces`] | the hops of each map -> spans of a trace, to a collector |
 //! | [`cli`] | the subcommands of `clearway` |
 //!
 //! At the ground, used by all: [`clock`], `sync`, `counted`, [`directory`], `file_advice`, [`held_sockets`],
@@ -46,5 +47,6 @@ pub mod status;
 pub mod store;
 pub mod subscriptions;
 mod sync;
+pub mod traces;
 #[cfg(feature = "zenoh")]
 pub mod zenoh_session;

@@ -29,6 +29,7 @@ mod read;
 mod recorder;
 mod ros;
 mod store;
+mod traces;
 mod udp;
 mod vehicle;
 mod zenoh;
@@ -43,6 +44,7 @@ pub use overrides::of_environment;
 pub use recorder::{Compression, Recorder, SaveRule};
 pub use ros::Ros;
 pub use store::Store;
+pub use traces::Traces;
 pub use udp::{Ports, Sender, Udp};
 pub use vehicle::{Ingest, Vehicle};
 pub use zenoh::{Fleet, Ros2, Zenoh, ZenohMode};
@@ -82,6 +84,9 @@ pub struct Config {
     /// Where finished parts of the recording go.
     #[serde(default)]
     pub store: Store,
+    /// Where the traces of revolutions go.
+    #[serde(default)]
+    pub traces: Traces,
     /// One or more vehicles.
     #[serde(default, rename = "vehicle")]
     pub vehicles: Vec<Vehicle>,
@@ -252,6 +257,7 @@ impl Config {
         self.connections.check()?;
         self.recorder.check()?;
         self.store.check()?;
+        self.traces.check()?;
         self.zenoh.check(&self.vehicles)?;
         let mut names = BTreeSet::new();
         for vehicle in &self.vehicles {

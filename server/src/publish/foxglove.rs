@@ -226,10 +226,10 @@ impl VehicleChannels {
             let map = newest.borrow_and_update().clone();
             let Some(map) = map else { continue };
             let sweep = sweeps.as_ref().and_then(|sweeps| sweeps.borrow().clone());
-            self.channels
-                .iter()
-                .filter(|channel| channel.lacks(&map))
-                .for_each(|channel| publish(channel, &map, &sweep, &mut rasters));
+            let lacking: Vec<_> = self.channels.iter().filter(|channel| channel.lacks(&map)).collect();
+            let trace = || self.served.status.traces.hop(&map, "send", Some(Transport::Foxglove.as_str()));
+            let _hop = (!lacking.is_empty()).then(trace);
+            lacking.into_iter().for_each(|channel| publish(channel, &map, &sweep, &mut rasters));
             self.published.send_modify(|count| *count += 1);
         }
     }

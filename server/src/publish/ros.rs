@@ -187,6 +187,8 @@ impl Topic {
                         Ok(()) => {
                             let map = newest.borrow_and_update().clone();
                             map.iter().for_each(|map| _ = reader.got(map.boot_id, map.sequence));
+                            let trace = |map: &EncodedMap| served.status.traces.hop(map, "send", Some(Transport::Ros.as_str()));
+                            let _hop = map.as_deref().map(trace);
                             if let Some(message) = map.and_then(|map| make(&map)) {
                                 self.put(message).await;
                             }

@@ -247,6 +247,7 @@ async fn send_maps(
                     let before = before.filter(|(boot_id, _)| *boot_id == map.boot_id);
                     let skipped = before.map_or(0, |(_, last)| map.sequence.saturating_sub(last + 1));
                     served.status.transports.skip_for_all(Transport::Zenoh, skipped);
+                    let _hop = served.status.traces.hop(&map, "send", Some(Transport::Zenoh.as_str()));
                     send_map(&map, &publishers, signing_key.as_deref()).await;
                 }
             }

@@ -24,6 +24,7 @@ use crate::record::writer::Recorder;
 use crate::replay::ReplayHandle;
 use crate::subscriptions::LayerSubscription;
 use crate::sync::locked;
+use crate::traces::Traces;
 
 /// Longest time of [`Running::shutdown_in_time`]. Ours: service managers wait 10 s or more before they kill a server.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_millis(4500);
@@ -65,6 +66,7 @@ pub struct Running {
     pub(super) subscriptions: Vec<LayerSubscription>,
     /// The security and the counts of the TCP listeners.
     pub(super) listeners: Option<(Security, Vec<(&'static str, ListenerHandle)>)>,
+    pub(super) traces: Traces,
     #[cfg(feature = "zenoh")]
     pub(super) over_zenoh: Option<super::over_zenoh::OverZenoh>,
 }
@@ -178,6 +180,10 @@ impl Running {
         {
             tracing::warn!("zenoh did not close in time");
         }
+        begin("the traces");
+        let traces = self.traces;
+        // Fails only if the runtime shuts down.
+        let _ = tokio::task::spawn_blocking(move || traces.end()).await;
         outcome
     }
 }

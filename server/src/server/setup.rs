@@ -87,6 +87,9 @@ pub enum StartError {
     /// The configuration enables zenoh, but the program was built without it.
     #[error("zenoh.enabled = true: this clearway was built without the feature zenoh; allowed: false")]
     NoZenoh,
+    /// The address of the collector cannot be used.
+    #[error("traces.endpoint: {0}")]
+    Traces(#[from] opentelemetry_otlp::ExporterBuildError),
     /// The configuration names a store, but the program was built without it.
     #[error("store.url: this clearway was built without the feature store; an empty text is allowed")]
     NoStore,

@@ -31,6 +31,7 @@ use crate::publish::{Served, Vehicles, foxglove, grpc, page};
 use crate::record::mcap_file::Header;
 use crate::record::writer::{Recorder, recording_path};
 use crate::status::{VehicleStatus, watch_states};
+use crate::traces::Traces;
 
 /// Longest time between two signs of life of a listener that does not hang: it gives one twice a second.
 const LISTENER_SILENT_MAX: Duration = Duration::from_secs(3);
@@ -59,6 +60,7 @@ impl Server {
         calibrations.resize_with(config.vehicles.len(), Vec::new);
         let mut running = Running::default();
         running.replay = setup.replay;
+        running.traces = Traces::start(&config.traces, boot_id)?;
         let mut prepared = Vec::new();
         for (vehicle, tables) in config.vehicles.iter().zip(&mut calibrations) {
             tables.resize(vehicle.sensors.len(), None);
@@ -114,7 +116,7 @@ impl Running {
         let layers = layer_names(&vehicle.maps);
         let status = VehicleStatus::new(name.clone(), boot_id, layers, queue.drops());
         status.show_queue(queue.space());
-        let status = Arc::new(status.with_outline(vehicle.body.as_ref()));
+        let status = Arc::new(status.with_outline(vehicle.body.as_ref()).with_traces(self.traces.clone()));
         let (newest, receiver) = watch::channel(None);
         let valid_ms = vehicle.maps.valid_ms;
         let engine =

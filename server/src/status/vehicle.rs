@@ -20,6 +20,7 @@ use crate::newest::NewestSweep;
 use crate::record::writer::RecorderCounts;
 use crate::subscriptions::LayerSubscriptions;
 use crate::sync::locked;
+use crate::traces::Traces;
 
 use super::health::{Health, State};
 use super::histogram::Histogram;
@@ -59,6 +60,8 @@ pub struct VehicleStatus {
     pub transports: Arc<Readers>,
     /// True while a replay stands at its end.
     pub replay_ended: watch::Sender<bool>,
+    /// Traces its maps.
+    pub traces: Traces,
     /// Outline of the vehicle in the ego frame as x0, y0, x1, y1, ..., in metres; empty if none is configured.
     pub(super) outline_m: Vec<f64>,
     pub(super) drops: Arc<DropCounters>,
@@ -204,6 +207,7 @@ impl VehicleStatus {
             layers,
             transports: Arc::default(),
             replay_ended: watch::Sender::new(false),
+            traces: Traces::default(),
             outline_m: Vec::new(),
             drops,
             recorder: OnceLock::new(),
@@ -229,6 +233,11 @@ impl VehicleStatus {
             corners.iter().map(|m| m.to_string().parse().unwrap_or(f64::from(*m))).collect()
         };
         Self { outline_m: body.map_or_else(Vec::new, corners), ..self }
+    }
+
+    /// Traces the maps.
+    pub fn with_traces(self, traces: Traces) -> Self {
+        Self { traces, ..self }
     }
 
     /// True if the events come from files.
@@ -347,6 +356,7 @@ impl VehicleStatus {
     /// Records a new map and the time it took.
     pub(crate) fn mapped(&self, made: MadeMap<'_>) {
         let MadeMap { encoded: map, states, stages, validity, speed_m_s, is_shifted } = made;
+        self.traces.published(map, stages);
         let mut state = locked(&self.changing);
         state.states = states;
         // A jump of a replay sets the number back.

@@ -19,6 +19,7 @@ use crate::newest::Newest;
 use crate::publish::served::{Served, Vehicles};
 use crate::status::{Reader, Transport};
 use crate::subscriptions::LayerSubscription;
+use crate::traces::Traces;
 
 /// The updates of one reader: the selected parts of the newest maps, within its credits. Any executor can drive the
 /// stream. `name` names the reader to people.
@@ -74,6 +75,8 @@ struct Watch<R> {
     finished: Option<AcknowledgingReader>,
     /// Until it goes, its layers are made.
     subscription: LayerSubscription,
+    traces: Traces,
+    transport: Transport,
     /// The reader is counted while this lives, and what it skips.
     reader: Reader,
 }
@@ -97,6 +100,8 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
             replay_ended,
             is_end_due,
             subscription: served.status.subscriptions.subscribe(&selection.layers),
+            traces: served.status.traces.clone(),
+            transport,
             last: None,
             base: None,
             want_full: false,
@@ -171,6 +176,7 @@ impl<R: Stream<Item = Result<v1::WatchRequest, Status>> + Unpin> Watch<R> {
     }
 
     fn send(&mut self, map: Arc<EncodedMap>) -> Result<v1::MapUpdate, Status> {
+        let _hop = self.traces.hop(&map, "send", Some(self.transport.as_str()));
         let Self { selection, last, base, want_full, .. } = self;
         let is_base = |base: &&EncodedMap| !*want_full && base.boot_id == map.boot_id;
         let bytes = selection.bytes(&map, base.as_deref().filter(is_base))?;

@@ -19,6 +19,7 @@ use super::super::mcap_file::Header;
 use super::counts::RecorderCounts;
 use crate::config::Recorder as Options;
 use crate::encode::EncodedMap;
+use crate::traces::Hop;
 
 /// Greatest difference of the stamps of the newest maps of both pipelines at a handover, ns. Ours: far below the period
 /// of a sensor, so that the stamps of the maps rise across the handover.
@@ -30,8 +31,8 @@ const WARM_UPS_MAX: i64 = 3;
 pub(super) enum Item {
     /// An event.
     Event(usize, Event),
-    /// A map.
-    Map(usize, Arc<EncodedMap>),
+    /// A map, and the hop that ends when it is written.
+    Map(usize, Arc<EncodedMap>, Hop),
     /// A new pipeline starts for this part, with the event of this sequence as the first that is not repeated.
     WarmUp { vehicle: usize, part: u64, first_event: u64, repeated: Vec<Event> },
     /// From here on the vehicle's events and maps belong to this part.
@@ -152,15 +153,15 @@ impl RecordingHandle {
         self.keep_in_force(event);
     }
 
-    /// Records a map.
-    pub fn record_map(&mut self, map: &Arc<EncodedMap>) {
+    /// Records a map; `hop` ends when it is written or lost.
+    pub fn record_map(&mut self, map: &Arc<EncodedMap>, hop: Hop) {
         if self.part.is_none() {
             return;
         }
         let first = self.counts.first_topic(self.vehicle) + 1;
         let topics = first..first + map.layers.len();
         topics.clone().for_each(|topic| self.counts.add_offered(topic));
-        if !self.push(Item::Map(self.vehicle, map.clone())) {
+        if !self.push(Item::Map(self.vehicle, map.clone(), hop)) {
             topics.for_each(|topic| self.drop_message(topic));
         }
     }

@@ -245,7 +245,7 @@ impl<F: Files> RecordingWriter<F> {
     fn write(&mut self, item: Item, now: Instant) {
         match item {
             Item::Event(vehicle, event) => self.write_event(vehicle, &event, now),
-            Item::Map(vehicle, map) => self.write_map(vehicle, &map, now),
+            Item::Map(vehicle, map, _hop) => self.write_map(vehicle, &map, now),
             Item::WarmUp { vehicle, part, first_event, repeated } => {
                 self.vehicles[vehicle].warm_up = Some(part);
                 let phase = v1::KeyframePhase::WarmUp.into();
