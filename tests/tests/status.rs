@@ -2,11 +2,12 @@
 
 mod fixture;
 
-use std::io::Write;
+use std::io::{BufRead, Write};
 use std::process::{Command, Stdio};
 
+use clearway::server::{Server, Setup};
 use clearway_proto::v1;
-use fixture::{config, feed, grpc, readings, start, within};
+use fixture::{Driving, config, feed, grpc, readings, start, within};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 /// Sends a plain HTTP request; returns its status line and its body.
@@ -139,4 +140,91 @@ async fn the_dashboard_and_the_alerts_use_metrics_that_a_server_has() {
         }
         assert!(used.len() >= 8, "{used:?}");
     }
+}
+
+/// A running Prometheus with the configuration and the alerts of `deploy/prometheus`, faster by far.
+struct Prometheus {
+    process: std::process::Child,
+    address: std::net::SocketAddr,
+    _folder: tempfile::TempDir,
+}
+
+impl Prometheus {
+    /// Starts one that scrapes this address.
+    fn scraping(target: std::net::SocketAddr) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let copy = |file: &str, change: &dyn Fn(&str) -> String| {
+            let of = format!("{}/../deploy/prometheus/{file}", env!("CARGO_MANIFEST_DIR"));
+            std::fs::write(folder.path().join(file), change(&std::fs::read_to_string(of).unwrap())).unwrap();
+        };
+        copy("prometheus.yml", &|text| text.replace("127.0.0.1:8080", &target.to_string()).replace("5s", "1s"));
+        let at_once = |line: &str| if line.trim().starts_with("for: ") { "        for: 1s\n" } else { line }.to_owned();
+        copy("alerts.yml", &|text| text.split_inclusive('\n').map(at_once).collect());
+        let mut command = Command::new("prometheus");
+        command.args(["--config.file=prometheus.yml", "--storage.tsdb.path=data", "--web.listen-address=127.0.0.1:0"]);
+        command.current_dir(folder.path()).stderr(Stdio::piped());
+        let mut process = command.spawn().unwrap();
+        let mut log = std::io::BufReader::new(process.stderr.take().unwrap());
+        let address = loop {
+            let mut line = String::new();
+            assert!(log.read_line(&mut line).unwrap() > 0, "Prometheus has ended");
+            if let Some((_, address)) = line.split_once("msg=\"Listening on\" address=") {
+                break address.trim().parse().unwrap();
+            }
+        };
+        // Reads on, so that the log never blocks.
+        std::thread::spawn(move || std::io::copy(&mut log, &mut std::io::sink()));
+        Self { process, address, _folder: folder }
+    }
+
+    /// Waits until this alert is as `fires` says, as Prometheus knows it.
+    async fn wait_until(&self, alert: &str, fires: bool) {
+        within(alert, async {
+            loop {
+                let (_, body) = ask(self.address, "/api/v1/alerts").await;
+                let json: serde_json::Value = serde_json::from_str(&body).unwrap_or_default();
+                let alerts = json["data"]["alerts"].as_array().cloned();
+                let is_firing = |alerts: Vec<serde_json::Value>| {
+                    alerts.iter().any(|of| of["labels"]["alertname"] == alert && of["state"] == "firing")
+                };
+                if alerts.map(is_firing) == Some(fires) {
+                    break;
+                }
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+    }
+}
+
+impl Drop for Prometheus {
+    fn drop(&mut self) {
+        // An error means that it has ended.
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[cfg_attr(not(clearway_promtool), ignore = "needs Prometheus: apt-get install prometheus")]
+async fn a_real_prometheus_sees_alerts_fire_and_clear_as_a_vehicle_comes_and_a_server_goes() {
+    let mut config = config();
+    config.page.enabled = true;
+    let running = Server::start(Setup { config: config.clone(), ..Setup::default() }).await.unwrap();
+    config.page.listen = running.page.unwrap();
+    let prometheus = Prometheus::scraping(config.page.listen);
+    prometheus.wait_until("ClearwayNoMaps", true).await;
+    let driving = Driving::to(&running);
+    prometheus.wait_until("ClearwayNoMaps", false).await;
+    prometheus.wait_until("ClearwaySensorSilent", false).await;
+    let (_, body) = ask(prometheus.address, "/api/v1/query?query=clearway_map_age_seconds").await;
+    let json: serde_json::Value = serde_json::from_str(&body).unwrap();
+    assert_eq!(json["data"]["result"][0]["metric"]["vehicle"], "car", "{body}");
+    driving.halt();
+    prometheus.wait_until("ClearwayServerDown", false).await;
+    running.shutdown().await.unwrap();
+    prometheus.wait_until("ClearwayServerDown", true).await;
+    let running = Server::start(Setup { config, ..Setup::default() }).await.unwrap();
+    prometheus.wait_until("ClearwayServerDown", false).await;
+    running.shutdown().await.unwrap();
 }

@@ -53,6 +53,7 @@ mod ground_revolutions;
 mod info;
 mod ingest;
 mod init;
+mod logs;
 mod model;
 mod output;
 mod recorder;
@@ -75,13 +76,11 @@ mod verify;
 mod watch;
 
 use std::fmt::Write as _;
-use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::builder::StyledStr;
-use clap::{CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
-use tracing_subscriber::EnvFilter;
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use exit::{EXIT_CODES, Exit};
 use output::with_causes;
@@ -100,15 +99,9 @@ struct Arguments {
         hide_possible_values = true,
         display_order = 900
     )]
-    log_format: LogFormat,
+    log_format: logs::LogFormat,
     #[command(subcommand)]
     command: Command,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-enum LogFormat {
-    Text,
-    Json,
 }
 
 /// The subcommands, in the order of the help text.
@@ -169,7 +162,7 @@ pub fn main() -> ExitCode {
         Ok(arguments) => arguments,
         Err(usage) => return print_usage(&usage),
     };
-    start_logs(arguments.log_format);
+    logs::start(arguments.log_format);
     match run(arguments.command) {
         Ok(exit) => exit.into(),
         Err(error) => match error.downcast::<clap::Error>() {
@@ -187,15 +180,6 @@ fn print_usage(usage: &clap::Error) -> ExitCode {
     // A closed stdout or stderr changes nothing.
     let _ = usage.print();
     if usage.use_stderr() { Exit::WrongUse.into() } else { Exit::Good.into() }
-}
-
-fn start_logs(format: LogFormat) {
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,zenoh=error"));
-    let logs = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
-    match format {
-        LogFormat::Text => logs.with_ansi(std::io::stderr().is_terminal()).init(),
-        LogFormat::Json => logs.json().init(),
-    }
 }
 
 fn run(command: Command) -> Result<Exit> {

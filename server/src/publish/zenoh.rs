@@ -141,7 +141,7 @@ impl Publisher {
                         () = state_changed(&mut states) => {}
                     }
                     if let Err(error) = status.put(served.status.to_json().to_string()).await {
-                        tracing::warn!(%error, "zenoh: status");
+                        tracing::warn!(vehicle = %served.status.name, %error, "zenoh: status");
                     }
                 }
             }
@@ -257,7 +257,7 @@ async fn send_maps(
         if ended != reported && !newest.has_changed().unwrap_or(false) {
             reported = ended;
             if let Err(error) = replay.put(format!("{{\"ended\":{ended}}}")).await {
-                tracing::warn!(%error, "zenoh: replay");
+                tracing::warn!(vehicle = %served.status.name, %error, "zenoh: replay");
             }
         }
     }
@@ -275,7 +275,7 @@ async fn send_map(
         let bytes = map.layer(chunk);
         let signature = signature(signing_key, key, &bytes);
         if let Err(error) = publisher.put(bytes).attachment(signature).await {
-            tracing::warn!(%error, layer, "zenoh: put");
+            tracing::warn!(vehicle = %map.vehicle, layer, %error, "zenoh: put");
         }
     }
 }
