@@ -3,6 +3,7 @@
 
 import { ServerClock } from "./clock.js";
 import { FleetView } from "./fleet/fleet.js";
+import { Recorder } from "./recorder.js";
 import { ReplayBar } from "./replay.js";
 import { keepSettings, loadSettings } from "./settings.js";
 import { setText } from "./text.js";
@@ -20,6 +21,8 @@ const keep = () => keepSettings(settings);
 const fleet = new FleetView(post, clock, settings, keep), view = new VehicleView(post, clock, settings, keep);
 const control = (request) => post({ type: "server", request: { type: "replay", ...request } });
 const replay = new ReplayBar($("replay"), control);
+const record = (request) => post({ type: "server", request: { type: "recorder", ...request } });
+const recorder = new Recorder($("recorder"), record);
 // Frames that are not drawn yet, by vehicle.
 const frames = new Map();
 let is_draw_scheduled = false, wall_minus_monotonic = Date.now() - performance.now();
@@ -39,15 +42,20 @@ const FROM_WORKER = {
     clock.restart();
     // A replay reports itself again on the new connection.
     replay.hide();
+    recorder.hide();
   },
   fleet({ vehicles, arrived_ms }) {
     names = vehicles.map(({ name }) => name);
     if (view.name === null && isUndecided()) go(names.length === 1 ? names[0] : null, "replaceState");
     writePicker();
     fleet.status(vehicles, local(arrived_ms));
-    if (view.name !== null) view.status(vehicles.find(({ name }) => name === view.name), local(arrived_ms));
+    if (view.name === null) return;
+    const status = vehicles.find(({ name }) => name === view.name);
+    view.status(status, local(arrived_ms));
+    recorder.status(status?.recorder);
   },
   replay: (state) => replay.show(state),
+  recorder: (message) => recorder.answer(message),
   frame(frame) {
     if (!clock.sample(local(frame.arrived_ms), frame.sent_ns)) {
       post({ type: "reconnect", text: "The connection lags; starting again" });

@@ -5,6 +5,7 @@ import test from "node:test";
 import { freshness, ServerClock } from "./clock.js";
 import { paintChannel } from "./draw/paint.js";
 import { MapStream } from "./map_stream.js";
+import { view as recorderView } from "./recorder.js";
 import { view } from "./replay.js";
 import { clockWords } from "./text.js";
 
@@ -132,4 +133,12 @@ test("the time bar counts seconds from the first event, within the range that is
   assert.deepEqual([before.from_s, before.to_s, before.position_s, before.plays], [2, 8, 2, true]);
   assert.equal(view({ ...state, position_ns: at(3456) }).time, "3.5 / 8.0 s");
   assert.equal(view({ ...state, phase: "waiting", readers_awaited: 2 }).phase, "waiting for 2 readers");
+});
+
+test("the recorder's section says its state, what was saved and what went wrong", () => {
+  const on = { state: "recording", file: "drive.mcap", part: 2, reason: "" };
+  assert.deepEqual(recorderView(on), { is_on: true, toggle: "Stop", text: "recording: part 2, drive.mcap", said: "" });
+  assert.equal(recorderView(on, { files: ["a.mcap"] }).said, "Saved a.mcap");
+  const failed = recorderView({ state: "failed", file: "", part: 2, reason: "disk full" }, { error: "no" });
+  assert.deepEqual(failed, { is_on: false, toggle: "Record", text: "failed: disk full", said: "no" });
 });

@@ -1,7 +1,8 @@
 // The Worker of the page: the connection, and the decoding and painting of maps. The page's own thread draws finished
 // pictures alone.
 // From the page: { type: "want", vehicle, want } (feed.js; null ends it), "probe" { vehicle, at }, "drawn" { vehicle },
-// "reconnect" { text }, "server" { request }. To the page: "frame", "cell", "refused", "link", "fleet", "replay".
+// "reconnect" { text }, "server" { request }. To the page: "frame", "cell", "refused", "link", "fleet", "replay",
+// "recorder".
 
 import { Feed } from "./feed.js";
 import { Link } from "./link.js";

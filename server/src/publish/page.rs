@@ -17,8 +17,10 @@ use super::listen::access::Caller;
 use super::listen::{Listener, ListenerHandle, Place};
 pub use super::page_live::Summaries;
 use super::page_live::{Live, MESSAGE_BYTES_MAX};
+use super::page_recorder::PageRecorder;
 use super::served::Vehicles;
 use crate::fleet::Fleet;
+use crate::record::writer::RecorderControl;
 use crate::replay::ReplayHandle;
 use crate::status::{Format, prometheus, vehicle_json};
 
@@ -37,6 +39,8 @@ pub struct Shown {
     pub listeners: Arc<[(&'static str, ListenerHandle)]>,
     /// Controls the replay that the server serves.
     pub replay: Option<ReplayHandle>,
+    /// Controls the recorder, if the server records.
+    pub recorder: Option<RecorderControl>,
     /// What all browsers share of the vehicles' status.
     pub summaries: Summaries,
 }
@@ -132,7 +136,10 @@ async fn live(
     upgrade: WebSocketUpgrade,
 ) -> Response {
     let live = match query.vehicle {
-        None => Live::new(&shown.vehicles, shown.summaries, caller, shown.replay),
+        None => {
+            let recorder = shown.recorder.and_then(|control| PageRecorder::new(control, &caller));
+            Live::new(&shown.vehicles, shown.summaries, caller, shown.replay).with_recorder(recorder)
+        }
         Some(vehicle) => match shown.vehicles.find(&vehicle) {
             Err(unknown) => return (StatusCode::NOT_FOUND, format!("{unknown}\n")).into_response(),
             Ok(served) => match Live::of_one(served, caller, shown.replay) {

@@ -34,6 +34,7 @@ use tonic::{Code, Status};
 use super::grpc::reader::watch_from_page;
 use super::listen::InProgress;
 use super::listen::access::Caller;
+use super::page_recorder::{PageRecorder, RecorderRequest, recorder_answered};
 use super::page_replay::{PageReplay, PageRequest, replay_changed, replay_json};
 use super::served::{Served, Vehicles};
 use crate::replay::ReplayHandle;
@@ -62,6 +63,7 @@ enum Request {
     Keyframe { vehicle: String, id: u64 },
     Detail { vehicle: String },
     Replay(PageRequest),
+    Recorder(RecorderRequest),
 }
 
 #[derive(Debug, Default, Deserialize)]
@@ -129,6 +131,7 @@ pub(super) struct Live {
     is_of_one: bool,
     caller: Caller,
     replay: Option<PageReplay>,
+    recorder: Option<PageRecorder>,
     /// The vehicle whose whole status is sent.
     detail: String,
     watching: BTreeMap<String, Watching>,
@@ -141,7 +144,12 @@ impl Live {
         let vehicles = vehicles.0.iter().filter(|served| caller.may_reach(&served.status.name)).cloned().collect();
         let replay = replay.and_then(|handle| PageReplay::new(handle, &caller));
         let (detail, watching, updates) = (String::new(), BTreeMap::new(), SelectAll::new());
-        Self { vehicles, summaries, is_of_one: false, caller, replay, detail, watching, updates }
+        Self { vehicles, summaries, is_of_one: false, caller, replay, recorder: None, detail, watching, updates }
+    }
+
+    /// Adds the recorder's buttons.
+    pub fn with_recorder(self, recorder: Option<PageRecorder>) -> Self {
+        Self { recorder, ..self }
     }
 
     /// A connection of one vehicle, with all layers that the caller may read.
@@ -162,6 +170,11 @@ impl Live {
     /// Sends maps and status until the browser disconnects or stalls, or the engines stop.
     pub async fn serve(mut self, mut socket: WebSocket, _in_progress: InProgress) {
         let mut every = tokio::time::interval(STATUS_PERIOD);
+        if let Some(recorder) = &self.recorder
+            && socket.send(Frame::Text(recorder.state().into())).await.is_err()
+        {
+            return;
+        }
         let mut replay_state = self.replay.as_ref().map(|replay| replay.handle.state());
         replay_state.iter_mut().for_each(watch::Receiver::mark_changed);
         loop {
@@ -169,6 +182,7 @@ impl Live {
                 Some(update) = self.updates.next(), if !self.updates.is_empty() => self.send(update),
                 _ = every.tick() => self.status(),
                 state = replay_changed(&mut replay_state) => text(replay_json(&state, "")),
+                answer = recorder_answered(&mut self.recorder) => text(answer),
                 received = socket.recv() => match received {
                     Some(Ok(Frame::Text(text))) => self.apply(&text).await,
                     // The library answers pings.
@@ -227,6 +241,10 @@ impl Live {
             Ok(Request::Replay(request)) => match &self.replay {
                 Some(replay) => text(replay.answer(&request).await),
                 None => refused("", 0, "the server replays nothing that this reader may control"),
+            },
+            Ok(Request::Recorder(request)) => match &mut self.recorder {
+                Some(recorder) => recorder.begin(request).map_or(Next::Nothing, text),
+                None => refused("", 0, "the server records nothing that this reader may control"),
             },
             Ok(Request::Watch(request)) => {
                 let (vehicle, id) = (request.vehicle.clone(), request.id);

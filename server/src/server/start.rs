@@ -243,7 +243,8 @@ impl Running {
         let (vehicles, replay) = (self.vehicles.clone(), self.replay.clone());
         self.publishers.spawn(watch_listeners(handles.clone(), vehicles.clone(), self.stopped()));
         let (fleet, summaries) = (self.fleet.clone(), page::Summaries::default());
-        let shown = page::Shown { vehicles, fleet, listeners, replay, summaries };
+        let recorder = self.recorder.as_ref().map(Recorder::control);
+        let shown = page::Shown { vehicles, fleet, listeners, replay, recorder: recorder.clone(), summaries };
         self.listeners = Some((security, handles));
         let address = |listener: &Option<Listener>| listener.as_ref().and_then(Listener::address);
         (self.grpc, self.page, self.metrics) = (address(&grpc), address(&page), address(&metrics));
@@ -251,7 +252,6 @@ impl Running {
         if let Some(listener) = grpc {
             let (vehicles, stopped, replay) = (self.vehicles.clone(), self.stopped(), self.replay.clone());
             let fleet = self.fleet.clone();
-            let recorder = self.recorder.as_ref().map(Recorder::control);
             let ingest = (!gateways.all().is_empty()).then(|| Ingest::new(gateways).into_service());
             self.publishers.spawn(async move {
                 let served = grpc::serve(listener, vehicles, fleet, ingest, recorder, replay, stopped);

@@ -159,6 +159,39 @@ pub fn a_stopped_vehicle_is_stale() {
     });
 }
 
+pub fn the_recorder_is_controlled() {
+    Runtime::new().expect("a runtime").block_on(async {
+        let (names, folder) = (["car".to_owned()], tempfile::tempdir().expect("a folder"));
+        let mut config = config(&names, any());
+        config.recorder.file = folder.path().join("drive.mcap");
+        let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
+        let driving = Driving::start(&running, &names, Duration::from_millis(100));
+        let browser = Browser::start(1440, 900);
+        browser.open(&format!("http://{}/", running.page.expect("a page")));
+        browser.until("FRESH", &shows("FRESH"));
+        let says = |part: &str, text: &str| {
+            let script = "return document.querySelector('[data-recorder=PART]').textContent.startsWith('TEXT')";
+            browser.until(text, &script.replace("PART", part).replace("TEXT", text));
+        };
+        says("state", "recording: part 1");
+        browser.click("[data-recorder=split]");
+        says("state", "recording: part 2");
+        browser.click("[data-recorder=save]");
+        says("said", "Saved ");
+        let said = browser.text("[data-recorder=said]");
+        let files: Vec<_> = said.trim_start_matches("Saved ").split(", ").collect();
+        browser.click("[data-recorder=toggle]");
+        says("state", "stopped");
+        browser.screenshot("recorder-1440x900");
+        browser.click("[data-recorder=toggle]");
+        says("state", "recording");
+        assert_eq!(browser.console_errors(), Vec::<String>::new());
+        driving.halt();
+        running.shutdown().await.expect("it ends well");
+        assert!(files.iter().all(|file| std::path::Path::new(file).is_file()), "{files:?}");
+    });
+}
+
 pub fn the_page_reconnects() {
     Runtime::new().expect("a runtime").block_on(async {
         let names = ["car".to_owned()];

@@ -1,0 +1,95 @@
+//! The recorder's buttons on the page: requests of operators, and what came of them, as JSON.
+//!
+//! A request is `{"type":"recorder","command":"save","seconds":30}`; the commands are those of
+//! [`clearway_proto::v1::recording_service_server::RecordingService`]: `start`, `stop`, `split`, `save`. The answer has
+//! the state after it, the files that were saved, and `error`. Operators get one without asking when they connect, so a
+//! page that has none shows no buttons.
+
+use std::pin::Pin;
+
+use futures::StreamExt;
+use futures::stream::FuturesUnordered;
+use serde::Deserialize;
+use serde_json::json;
+
+use super::listen::access::Caller;
+use crate::record::writer::{Command, RecorderControl};
+
+/// The recorder as one page reaches it.
+pub(super) struct PageRecorder {
+    control: RecorderControl,
+    /// The request that the recorder has not answered yet: a disk may hang, and the maps go on meanwhile.
+    pending: FuturesUnordered<Pin<Box<dyn Future<Output = String> + Send>>>,
+}
+
+/// A request of a button.
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RecorderRequest {
+    command: Button,
+    /// Seconds to save; 0: the configured number.
+    #[serde(default)]
+    seconds: u32,
+}
+
+#[derive(Clone, Copy, Debug, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Button {
+    Start,
+    Stop,
+    Split,
+    Save,
+}
+
+impl PageRecorder {
+    /// The recorder as an operator reaches it; `None` for other callers.
+    pub fn new(control: RecorderControl, caller: &Caller) -> Option<Self> {
+        caller.is_operator().then(|| Self { control, pending: FuturesUnordered::new() })
+    }
+
+    /// The state of the recorder.
+    pub fn state(&self) -> String {
+        answer(&self.control, &[], "")
+    }
+
+    /// Begins to carry out a request; returns why it does not.
+    pub fn begin(&mut self, request: RecorderRequest) -> Option<String> {
+        if !self.pending.is_empty() {
+            return Some(answer(&self.control, &[], "the recorder has not answered the last request yet"));
+        }
+        let command = match request.command {
+            Button::Start => Command::Start,
+            Button::Stop => Command::Stop,
+            Button::Split => Command::Split,
+            Button::Save => Command::Save { seconds: request.seconds.into(), reason: "page".to_owned() },
+        };
+        let control = self.control.clone();
+        self.pending.push(Box::pin(async move {
+            match control.send(command).await {
+                Ok(files) => {
+                    let files: Vec<_> = files.iter().map(|file| file.display().to_string()).collect();
+                    answer(&control, &files, "")
+                }
+                Err(error) => answer(&control, &[], &error.to_string()),
+            }
+        }));
+        None
+    }
+}
+
+/// Waits for the answer to the pending request; for ever if there is none.
+pub(super) async fn recorder_answered(recorder: &mut Option<PageRecorder>) -> String {
+    match recorder {
+        Some(recorder) if !recorder.pending.is_empty() => recorder.pending.next().await.unwrap_or_default(),
+        _ => std::future::pending().await,
+    }
+}
+
+fn answer(control: &RecorderControl, files: &[String], error: &str) -> String {
+    let status = control.status();
+    json!({
+        "type": "recorder", "state": status.state, "file": status.file, "part": status.part,
+        "files": files, "error": error,
+    })
+    .to_string()
+}
