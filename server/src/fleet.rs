@@ -88,7 +88,7 @@ impl State {
             return Err("length");
         }
         let vehicle = v1::Vehicle::decode(announcement).map_err(|_| "message")?;
-        let names = [&vehicle.name, &vehicle.server, &vehicle.grpc];
+        let names = [&vehicle.name, &vehicle.server, &vehicle.grpc, &vehicle.page];
         if vehicle.name.is_empty() || names.iter().any(|name| name.len() > NAME_BYTES_MAX) {
             return Err("name");
         }

@@ -3,6 +3,7 @@
 
 import { ServerClock } from "./clock.js";
 import { FleetView } from "./fleet/fleet.js";
+import { elsewhere } from "./fleet/state.js";
 import { Recorder } from "./recorder.js";
 import { ReplayBar } from "./replay.js";
 import { keepSettings, loadSettings } from "./settings.js";
@@ -44,11 +45,12 @@ const FROM_WORKER = {
     replay.hide();
     recorder.hide();
   },
-  fleet({ vehicles, arrived_ms }) {
+  fleet({ vehicles, others, arrived_ms }) {
     names = vehicles.map(({ name }) => name);
-    if (view.name === null && isUndecided()) go(names.length === 1 ? names[0] : null, "replaceState");
+    const is_alone = names.length === 1 && others.length === 0;
+    if (view.name === null && isUndecided()) go(is_alone ? names[0] : null, "replaceState");
     writePicker();
-    fleet.status(vehicles, local(arrived_ms));
+    fleet.status([...vehicles, ...others.map(elsewhere)], local(arrived_ms));
     if (view.name === null) return;
     const status = vehicles.find(({ name }) => name === view.name);
     view.status(status, local(arrived_ms));

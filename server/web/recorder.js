@@ -8,7 +8,8 @@ export function view({ state, file, part, reason }, { files = [], error = "" } =
   const is_on = state === "recording";
   const where = is_on ? `part ${part}, ${file}` : reason || "";
   const saved = files.length > 0 ? `Saved ${files.join(", ")}` : "";
-  return { is_on, toggle: is_on ? "Stop" : "Record", text: [state, where].filter(Boolean).join(": "), said: error || saved };
+  const text = [state, where].filter(Boolean).join(": ");
+  return { is_on, toggle: is_on ? "Stop" : "Record", text, said: error || saved };
 }
 
 export class Recorder {

@@ -100,11 +100,24 @@ pub struct Page {
     pub enabled: bool,
     /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,
+    /// URL at which others reach the page, for the pages of other servers; empty: they show its vehicles without a link.
+    pub advertise: String,
 }
 
 impl Default for Page {
     fn default() -> Self {
-        Self { enabled: true, listen: SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 8080) }
+        let listen = SocketAddr::new(Ipv4Addr::LOCALHOST.into(), 8080);
+        Self { enabled: true, listen, advertise: String::new() }
+    }
+}
+
+impl Page {
+    fn check(&self) -> Result<(), ValueError> {
+        let is_url = ["http://", "https://"].iter().any(|scheme| self.advertise.starts_with(scheme));
+        if !self.advertise.is_empty() && !is_url {
+            return Err(ValueError::new("page.advertise", &self.advertise, "http://HOST:PORT/ or https://HOST:PORT/"));
+        }
+        Ok(())
     }
 }
 
@@ -254,6 +267,7 @@ impl Config {
             return Err(ValueError::new("vehicle", "[]", "at least one [[vehicle]]"));
         }
         self.grpc.check()?;
+        self.page.check()?;
         self.connections.check()?;
         self.recorder.check()?;
         self.store.check()?;

@@ -23,14 +23,14 @@ const PERIOD: Duration = Duration::from_secs(1);
 const ALL: &str = "clearway/@fleet/*/*";
 
 /// Announces the vehicles of this server until the tasks end, each with the `address` at which its maps are served over
-/// gRPC; it is empty if others cannot reach it.
+/// gRPC and the URL of the `page`; they are empty if others cannot reach them.
 ///
 /// # Errors
 /// [`ZenohError`] if a publisher cannot be declared.
 pub(crate) async fn announce(
     session: &Session,
     vehicles: &Vehicles,
-    address: &str,
+    (address, page): (&str, &str),
     tasks: &mut JoinSet<()>,
 ) -> Result<(), ZenohError> {
     for served in vehicles.0.iter() {
@@ -38,12 +38,12 @@ pub(crate) async fn announce(
         let publisher = session.declare_publisher(key.clone()).encoding(Encoding::APPLICATION_PROTOBUF);
         let publisher = publisher.congestion_control(CongestionControl::Drop).priority(Priority::DataLow);
         let publisher = publisher.await.map_err(ZenohError::of(format!("publisher {key}")))?;
-        let (status, address) = (served.status.clone(), address.to_owned());
+        let (status, address, page) = (served.status.clone(), address.to_owned(), page.to_owned());
         tasks.spawn(async move {
             let mut every = tokio::time::interval(PERIOD);
             loop {
                 every.tick().await;
-                let vehicle = v1::Vehicle { grpc: address.clone(), ..status.to_proto() };
+                let vehicle = v1::Vehicle { grpc: address.clone(), page: page.clone(), ..status.to_proto() };
                 if let Err(error) = publisher.put(vehicle.encode_to_vec()).await {
                     tracing::warn!(%error, vehicle = %status.name, "zenoh: announcement");
                 }

@@ -138,7 +138,7 @@ async fn live(
     let live = match query.vehicle {
         None => {
             let recorder = shown.recorder.and_then(|control| PageRecorder::new(control, &caller));
-            Live::new(&shown.vehicles, shown.summaries, caller, shown.replay).with_recorder(recorder)
+            Live::new(&shown.vehicles, shown.summaries, caller, shown.replay).with(shown.fleet, recorder)
         }
         Some(vehicle) => match shown.vehicles.find(&vehicle) {
             Err(unknown) => return (StatusCode::NOT_FOUND, format!("{unknown}\n")).into_response(),

@@ -27,7 +27,7 @@ use futures::stream::{AbortHandle, SelectAll, abortable};
 use futures::{Stream, StreamExt};
 use prost::Message;
 use serde::Deserialize;
-use serde_json::json;
+use serde_json::{Value, json};
 use tokio::sync::watch;
 use tonic::{Code, Status};
 
@@ -37,7 +37,9 @@ use super::listen::access::Caller;
 use super::page_recorder::{PageRecorder, RecorderRequest, recorder_answered};
 use super::page_replay::{PageReplay, PageRequest, replay_changed, replay_json};
 use super::served::{Served, Vehicles};
+use crate::fleet::Fleet;
 use crate::replay::ReplayHandle;
+use crate::status::vehicle_json;
 use crate::sync::locked;
 
 /// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.
@@ -102,30 +104,57 @@ enum Next {
 
 /// The short status of each vehicle as JSON, which all browsers share, with the time at which it was written.
 #[derive(Clone, Debug, Default)]
-pub struct Summaries(Arc<Mutex<BTreeMap<String, Summary>>>);
+pub struct Summaries(Arc<Mutex<Written>>);
+
+#[derive(Debug, Default)]
+struct Written {
+    own: BTreeMap<String, Summary>,
+    /// Of the vehicles of other servers, with their names.
+    others: Option<(Instant, OtherSummaries)>,
+}
+
+type OtherSummaries = Arc<[(String, String)]>;
 
 type Summary = (Instant, Arc<str>);
 
 impl Summaries {
     fn of(&self, served: &Served) -> Arc<str> {
         let mut all = locked(&self.0);
-        let kept = all.get(&*served.status.name).filter(|(written, _)| written.elapsed() < STATUS_PERIOD / 2);
+        let kept = all.own.get(&*served.status.name).filter(|(written, _)| written.elapsed() < STATUS_PERIOD / 2);
         if let Some((_, summary)) = kept {
             return summary.clone();
         }
-        let mut status = served.status.to_json();
-        if let Some(fields) = status.as_object_mut() {
-            DETAILS.iter().for_each(|part| _ = fields.remove(*part));
-        }
-        let summary: Arc<str> = status.to_string().into();
-        all.insert(served.status.name.to_string(), (Instant::now(), summary.clone()));
+        let summary: Arc<str> = without_details(served.status.to_json()).to_string().into();
+        all.own.insert(served.status.name.to_string(), (Instant::now(), summary.clone()));
         summary
     }
+
+    fn of_others(&self, fleet: &Fleet) -> OtherSummaries {
+        let now = Instant::now();
+        let mut all = locked(&self.0);
+        let is_new = |(written, _): &&(Instant, OtherSummaries)| now.duration_since(*written) < STATUS_PERIOD / 2;
+        if let Some((_, kept)) = all.others.as_ref().filter(is_new) {
+            return kept.clone();
+        }
+        let summary = |of: &v1::Vehicle| (of.name.clone(), without_details(vehicle_json(of)).to_string());
+        let others: OtherSummaries = fleet.vehicles(now).iter().map(summary).collect();
+        all.others = Some((now, others.clone()));
+        others
+    }
+}
+
+fn without_details(mut status: Value) -> Value {
+    if let Some(fields) = status.as_object_mut() {
+        DETAILS.iter().for_each(|part| _ = fields.remove(*part));
+    }
+    status
 }
 
 /// One browser's connection.
 pub(super) struct Live {
     vehicles: Vec<Served>,
+    /// The vehicles of other servers.
+    fleet: Fleet,
     summaries: Summaries,
     /// True for a connection of one vehicle.
     is_of_one: bool,
@@ -144,12 +173,13 @@ impl Live {
         let vehicles = vehicles.0.iter().filter(|served| caller.may_reach(&served.status.name)).cloned().collect();
         let replay = replay.and_then(|handle| PageReplay::new(handle, &caller));
         let (detail, watching, updates) = (String::new(), BTreeMap::new(), SelectAll::new());
-        Self { vehicles, summaries, is_of_one: false, caller, replay, recorder: None, detail, watching, updates }
+        let fleet = Fleet::default();
+        Self { vehicles, fleet, summaries, is_of_one: false, caller, replay, recorder: None, detail, watching, updates }
     }
 
-    /// Adds the recorder's buttons.
-    pub fn with_recorder(self, recorder: Option<PageRecorder>) -> Self {
-        Self { recorder, ..self }
+    /// Adds the vehicles of other servers, and the recorder's buttons.
+    pub fn with(self, fleet: Fleet, recorder: Option<PageRecorder>) -> Self {
+        Self { fleet, recorder, ..self }
     }
 
     /// A connection of one vehicle, with all layers that the caller may read.
@@ -232,7 +262,11 @@ impl Live {
             if is_detailed { served.status.to_json().to_string().into() } else { self.summaries.of(served) }
         });
         let statuses: Vec<Arc<str>> = statuses.collect();
-        text(format!(r#"{{"type":"fleet","vehicles":[{}]}}"#, statuses.join(",")))
+        let others = self.summaries.of_others(&self.fleet);
+        let others = others.iter().filter(|(name, _)| self.caller.may_reach(name));
+        let others: Vec<&str> = others.map(|(_, summary)| &**summary).collect();
+        let (own, others) = (statuses.join(","), others.join(","));
+        text(format!(r#"{{"type":"fleet","vehicles":[{own}],"others":[{others}]}}"#))
     }
 
     async fn apply(&mut self, message: &str) -> Next {

@@ -48,7 +48,7 @@ impl OverZenoh {
         let mut announcements = JoinSet::new();
         if config.zenoh.fleet.announce {
             let address = grpc.and_then(|bound| config.grpc.advertised(bound)).unwrap_or_default();
-            announcements::announce(&session, vehicles, &address, &mut announcements).await?;
+            announcements::announce(&session, vehicles, (&address, &config.page.advertise), &mut announcements).await?;
         }
         let others = match config.zenoh.fleet.list {
             true => Some(announcements::hear(&session, fleet.clone()).await?),

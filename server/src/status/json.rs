@@ -68,6 +68,8 @@ pub fn vehicle_json(vehicle: &v1::Vehicle) -> Value {
         "map_bytes": vehicle.map_bytes,
         "skips": vehicle.skips,
         "server": vehicle.server,
+        "grpc": vehicle.grpc,
+        "page": vehicle.page,
         "claimed_by": vehicle.claimed_by,
         "outline_m": vehicle.outline_m,
     })

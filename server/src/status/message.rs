@@ -56,6 +56,7 @@ impl VehicleStatus {
             skips: Transport::ALL.map(|of| (of.as_str().to_owned(), self.transports.skips(of))).into(),
             server: server_name().to_owned(),
             grpc: String::new(),
+            page: String::new(),
             claimed_by: assessment.claimed_by,
             outline_m: self.outline_m.clone(),
         }

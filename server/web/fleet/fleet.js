@@ -5,7 +5,7 @@
 import { freshness } from "../clock.js";
 import { dash, duration, percent, setText } from "../text.js";
 import { drawPlaces, vehicleAt } from "./places.js";
-import { ageOf, chosen, freshOf, stateOf, tally } from "./state.js";
+import { addressOf, ageOf, chosen, freshOf, stateOf, tally } from "./state.js";
 
 const MAP_HZ = 1, MAP_RADIUS_M = 30, MAP_PX = 150, SCALE_MAX = 2;
 // Cards change places this often at most, so that they can be read and clicked.
@@ -14,6 +14,7 @@ const SIGHT_MARGIN = "100px";
 // Validity of a map of which only the age is known. Ours: three revolutions of a slow sensor.
 const VALIDITY_MS = 500;
 
+const keyOf = (status) => status.key ?? status.name;
 const $ = (id) => document.getElementById(id);
 
 export class FleetView {
@@ -64,24 +65,24 @@ export class FleetView {
   // keep: the vehicle whose maps another view wants, which are not ended here.
   close(keep) {
     this.#is_open = false;
-    for (const card of this.#cards.values()) this.#want(card, card.status.name === keep);
+    for (const card of this.#cards.values()) this.#want(card, keyOf(card.status) === keep);
   }
 
   // The status of all vehicles.
   status(list, arrived_ms) {
-    const names = new Set(list.map(({ name }) => name));
-    for (const [name, card] of this.#cards) {
-      if (names.has(name)) continue;
+    const keys = new Set(list.map(keyOf));
+    for (const [key, card] of this.#cards) {
+      if (keys.has(key)) continue;
       // It vanished.
       card.is_in_sight = false;
       this.#want(card);
       this.#sight.unobserve(card.element);
       card.element.remove();
-      this.#cards.delete(name);
+      this.#cards.delete(key);
       this.#ordered_ms = -Infinity;
     }
     for (const status of list) {
-      const card = this.#cards.get(status.name) ?? this.#newCard(status);
+      const card = this.#cards.get(keyOf(status)) ?? this.#newCard(status);
       card.status = status;
       card.status_arrived_ms = arrived_ms;
     }
@@ -109,7 +110,7 @@ export class FleetView {
     if (now_ms - this.#ordered_ms > ORDER_EVERY_MS) this.#arrange();
     this.#writeTally();
     const placed = [...this.#cards.values()].map(({ status, fresh, frame }) => ({
-      name: status.name, pose: poseOf(status, frame), ...stateOf(status), fresh,
+      name: keyOf(status), pose: poseOf(status, frame), ...stateOf(status), fresh,
     })).filter(({ pose }) => pose);
     $("where").hidden = placed.length === 0;
     if (placed.length > 0) this.#places = drawPlaces($("places"), placed);
@@ -123,10 +124,11 @@ export class FleetView {
       element, parts: Object.fromEntries(names.map((name) => [name, part(name)])), status, status_arrived_ms: 0,
       frame: null, is_in_sight: false, is_wanted: false, age_ms: null, fresh: "none", speed: null, maps: [],
     };
-    element.dataset.vehicle = status.name;
-    element.href = `?vehicle=${encodeURIComponent(status.name)}`;
+    element.dataset.vehicle = keyOf(status);
+    const address = addressOf(status);
+    if (address !== null) element.href = address;
     setText(card.parts.name, status.name);
-    this.#cards.set(status.name, card);
+    this.#cards.set(keyOf(status), card);
     $("cards").append(element);
     this.#sight.observe(element);
     this.#ordered_ms = -Infinity;
@@ -135,7 +137,8 @@ export class FleetView {
 
   #want(card, is_kept = false) {
     const is_wanted = this.#is_open && card.is_in_sight;
-    if (is_wanted === card.is_wanted || !card.status.layers?.length) return;
+    const { is_elsewhere } = card.status;
+    if (is_wanted === card.is_wanted || is_elsewhere || !card.status.layers?.length) return;
     card.is_wanted = is_wanted;
     if (is_kept) return;
     const { layers, name } = card.status, layer = layers.includes("drivability") ? "drivability" : layers[0];
@@ -176,18 +179,18 @@ export class FleetView {
   #arrange() {
     this.#ordered_ms = performance.now();
     const { order, only } = this.#settings, text = $("find").value;
-    const names = chosen([...this.#cards.values()], { order, only, text });
-    const shown = new Set(names);
-    for (const [name, card] of this.#cards) card.element.hidden = !shown.has(name);
+    const keys = chosen([...this.#cards.values()], { order, only, text });
+    const shown = new Set(keys);
+    for (const [key, card] of this.#cards) card.element.hidden = !shown.has(key);
     // A card that moves loses the focus, so only a new order moves cards.
-    if (names.join("\n") !== this.#order) {
-      this.#order = names.join("\n");
-      names.forEach((name, i) => {
-        const { element } = this.#cards.get(name);
+    if (keys.join("\n") !== this.#order) {
+      this.#order = keys.join("\n");
+      keys.forEach((key, i) => {
+        const { element } = this.#cards.get(key);
         if ($("cards").children[i] !== element) $("cards").insertBefore(element, $("cards").children[i] ?? null);
       });
     }
-    $("nothing").hidden = names.length > 0;
+    $("nothing").hidden = keys.length > 0;
     setText($("nothing"), this.#cards.size === 0 ? "The server has no vehicle that you may see." : "No vehicle matches.");
   }
 

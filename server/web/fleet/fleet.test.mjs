@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 import { gridStep, vehicleAt, viewOf } from "./places.js";
-import { ageOf, chosen, freshOf, needsCare, stateOf, tally } from "./state.js";
+import { addressOf, ageOf, chosen, elsewhere, freshOf, needsCare, stateOf, tally } from "./state.js";
 
 test("a state that the server does not send, or that is unknown, is not shown", () => {
   assert.deepEqual(stateOf(undefined), { state: null, reasons: [] });
@@ -58,4 +58,15 @@ test("all vehicles are on the map, x to the right and y up, and a click finds th
   assert.deepEqual(drawn, [{ name: "a", px: 34, py: 134 }, { name: "b", px: 434, py: 34 }]);
   assert.deepEqual([vehicleAt(drawn, 40, 130), vehicleAt(drawn, 200, 100), vehicleAt([], 0, 0)], ["a", null, null]);
   assert.deepEqual([gridStep(1, 60), gridStep(10, 60), gridStep(0.03, 60)], [100, 10, 2000]);
+});
+
+test("a vehicle of another server has its own key, says who serves it, and links to that server's page alone", () => {
+  const van = elsewhere({ name: "van", server: "b", grpc: "b:1", page: "https://b:8080/", reasons: ["old"] });
+  assert.equal(van.key, "van @ b @ b:1");
+  assert.deepEqual(stateOf(van).reasons, ["served by b", "old"]);
+  assert.equal(addressOf(van), "https://b:8080/?vehicle=van");
+  assert.equal(addressOf({ name: "a b" }), "?vehicle=a%20b");
+  for (const page of [undefined, "", "b:8080", "javascript:alert(1)"]) assert.equal(addressOf({ ...van, page }), null);
+  const cards = [van, { name: "van" }].map((status) => ({ status, age_ms: 1, fresh: "fresh", speed: null }));
+  assert.deepEqual(chosen(cards, { order: "name", only: "all", text: "VAN" }), ["van @ b @ b:1", "van"]);
 });

@@ -4,10 +4,24 @@ const ORDER = { error: 0, warn: 1, ok: 2 };
 // A status is a second old at most, and so is the map that it tells of. A vehicle without news for longer is silent.
 const NEWS_MS = 2500;
 
+// A vehicle of another server, as that server says it. Two servers may claim one name: its card has a key of its own.
+export const elsewhere = (status) => {
+  const { name, server, grpc } = status;
+  return { ...status, is_elsewhere: true, key: [name, server, grpc].join(" @ ") };
+};
+
+// Where a click on a vehicle's card leads: its view here, or the page of its server; null if that has none for others.
+export function addressOf({ name, is_elsewhere, page }) {
+  const vehicle = `?vehicle=${encodeURIComponent(name)}`;
+  if (!is_elsewhere) return vehicle;
+  return URL.canParse(page ?? "") && /^https?:$/.test(new URL(page).protocol) ? new URL(vehicle, page).href : null;
+}
+
 export function stateOf(status) {
   const state = Object.hasOwn(ORDER, status?.state ?? "") ? status.state : null;
   const claimed = status?.claimed_by?.length ? [`also claimed by ${status.claimed_by.join(", ")}`] : [];
-  return { state, reasons: [...(status?.reasons ?? []), ...claimed] };
+  const served = status?.is_elsewhere ? [`served by ${status.server}`] : [];
+  return { state, reasons: [...served, ...(status?.reasons ?? []), ...claimed] };
 }
 
 // The age of the newest map that is known of, in ms; null if none is known. status_age_ms: since the status arrived.
@@ -44,13 +58,13 @@ function rank(card) {
   return state === "error" ? 0 : state === "warn" ? 1 : card.fresh === "stale" ? 2 : 3;
 }
 
-// cards: [{ status, age_ms, fresh, speed }]. The names of those that are shown, in order.
+// cards: [{ status, age_ms, fresh, speed }]. The keys of those that are shown, in order.
 export function chosen(cards, { order, only, text }) {
   const wanted = text.trim().toLowerCase();
   const isShown = (card) =>
     card.status.name.toLowerCase().includes(wanted) && (only !== "care" || needsCare(card));
   const by = ORDERS[order] ?? byName;
-  return cards.filter(isShown).sort((a, b) => by(a, b) || byName(a, b)).map(({ status }) => status.name);
+  return cards.filter(isShown).sort((a, b) => by(a, b) || byName(a, b)).map(({ status }) => status.key ?? status.name);
 }
 
 // The numbers of vehicles: { all, error, warn, ok, stale }.

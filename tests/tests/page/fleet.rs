@@ -159,6 +159,33 @@ pub fn a_stopped_vehicle_is_stale() {
     });
 }
 
+pub fn other_servers_are_shown() {
+    Runtime::new().expect("a runtime").block_on(async {
+        let other_page = std::net::TcpListener::bind(any()).and_then(|port| port.local_addr()).expect("a free port");
+        let start = async |name: &str, page: SocketAddr, connect: &[String]| {
+            let mut config = config(&[name.to_owned()], page);
+            config.page.advertise = format!("http://{page}/");
+            config.zenoh.enabled = true;
+            config.zenoh.listen = vec!["tcp/127.0.0.1:0".to_owned()];
+            config.zenoh.connect = connect.to_vec();
+            Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts")
+        };
+        let own = start("car", any(), &[]).await;
+        let other = start("van", other_page, &own.zenoh).await;
+        let browser = Browser::start(1440, 900);
+        browser.open(&format!("http://{}/?fleet", own.page.expect("a page")));
+        let card = "document.querySelector('.card[data-vehicle^=\"van @ \"]')";
+        browser.until("the other server's vehicle", &format!("return {card}?.textContent.includes('served by ')"));
+        browser.until("its own vehicle", "return document.querySelector('.card[data-vehicle=car]') !== null");
+        assert_eq!(browser.console_errors(), Vec::<String>::new());
+        browser.click(".card[data-vehicle^=\"van @ \"]");
+        browser.until("its page", "return document.getElementById('vehicle-name')?.textContent === 'van'");
+        assert_eq!(browser.url(), format!("http://{other_page}/?vehicle=van"));
+        other.shutdown().await.expect("it ends well");
+        own.shutdown().await.expect("it ends well");
+    });
+}
+
 pub fn the_recorder_is_controlled() {
     Runtime::new().expect("a runtime").block_on(async {
         let (names, folder) = (["car".to_owned()], tempfile::tempdir().expect("a folder"));

@@ -33,6 +33,7 @@ in_a_browser! {
     a_cell_on_the_page_has_the_values_that_a_client_reads => replayed::cells_are_those_of_the_client,
     the_time_bar_steps_and_seeks_a_replay => replayed::the_time_bar_controls_a_replay,
     a_map_that_no_longer_comes_is_stale_with_its_true_age => fleet::a_stopped_vehicle_is_stale,
+    vehicles_of_other_servers_are_on_the_page => fleet::other_servers_are_shown,
     the_recorder_is_controlled_from_the_page => fleet::the_recorder_is_controlled,
     the_page_comes_back_after_the_server_does => fleet::the_page_reconnects,
     fifty_vehicles_are_shown_sorted_and_found => fleet::fifty_vehicles_are_shown,
