@@ -228,3 +228,29 @@ async fn a_real_prometheus_sees_alerts_fire_and_clear_as_a_vehicle_comes_and_a_s
     prometheus.wait_until("ClearwayServerDown", false).await;
     running.shutdown().await.unwrap();
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_vehicle_in_error_does_not_cost_the_others_their_server() {
+    let mut config = config();
+    config.page.enabled = true;
+    let mut other = config.vehicles[0].clone();
+    other.name = "van".into();
+    config.vehicles.push(other);
+    let running = Server::start(Setup { config, ..Setup::default() }).await.unwrap();
+    let page = running.page.unwrap();
+    let (head, body) = ask(page, "/readyz").await;
+    assert!(head.starts_with("HTTP/1.1 503") && body.lines().count() == 2, "{head} {body}");
+    let driving = Driving::to(&running);
+    within("the first is ready", async {
+        loop {
+            let (head, body) = ask(page, "/readyz").await;
+            if head.starts_with("HTTP/1.1 200") {
+                assert!(body.starts_with("ready\nvehicle van: no packets from "), "{body}");
+                break;
+            }
+        }
+    })
+    .await;
+    driving.halt();
+    running.shutdown().await.unwrap();
+}

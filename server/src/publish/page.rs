@@ -96,11 +96,12 @@ async fn health(State(shown): State<Shown>) -> Response {
     }
 }
 
-/// Ready: the state of no vehicle is an error. Else one line for each that is, with its worst reason.
+/// Ready: the state of at least one vehicle is no error. Behind that one line for each that is, with its worst reason.
 async fn ready(State(shown): State<Shown>) -> Response {
-    match shown.vehicles.not_ready() {
-        lines if lines.is_empty() => "ready\n".into_response(),
-        lines => unavailable(lines),
+    let lines = shown.vehicles.not_ready();
+    match shown.vehicles.are_ready() {
+        true => format!("ready\n{lines}").into_response(),
+        false => unavailable(lines),
     }
 }
 

@@ -30,6 +30,12 @@ impl Vehicles {
         find_vehicle(&self.0, name, |served| &served.status.name)
     }
 
+    /// True if a fresh map of at least one vehicle is made: the fault of one vehicle must not cost the planners of the
+    /// others their server.
+    pub fn are_ready(&self) -> bool {
+        self.0.is_empty() || self.0.iter().any(|served| served.status.not_ready().is_none())
+    }
+
     /// A line for each vehicle of which no fresh map is made, with the worst reason; empty if there is none.
     pub fn not_ready(&self) -> String {
         let line = |served: &Served| Some(format!("vehicle {}: {}\n", served.status.name, served.status.not_ready()?));

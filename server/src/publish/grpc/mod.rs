@@ -94,7 +94,7 @@ pub async fn serve<I: IngestService>(
 }
 
 /// Reports the health of the services, once in [`HEALTH_PERIOD`] and at each change of a vehicle's state, for ever: the
-/// maps are served if no vehicle's state is an error, and the recordings if nothing is wrong with the recorder.
+/// maps are served unless every vehicle's state is an error, and the recordings if nothing is wrong with the recorder.
 async fn report_health(health: HealthReporter, vehicles: Vehicles, recorder: Option<RecorderControl>) {
     let mut every = tokio::time::interval(HEALTH_PERIOD);
     let mut states: Vec<_> = vehicles.0.iter().map(|served| served.status.states()).collect();
@@ -103,7 +103,7 @@ async fn report_health(health: HealthReporter, vehicles: Vehicles, recorder: Opt
             _ = every.tick() => {}
             () = state_changed(&mut states) => {}
         }
-        if vehicles.not_ready().is_empty() {
+        if vehicles.are_ready() {
             health.set_serving::<MapServiceServer<Maps>>().await;
         } else {
             health.set_not_serving::<MapServiceServer<Maps>>().await;
