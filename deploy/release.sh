@@ -26,8 +26,8 @@ trap 'rm -rf "$root"' EXIT
 
 build() { # processor, as rustc names it
     # GNU's linker notes the processor in the binary, for glibc; Rust's own linker leaves the note out.
-    RUSTFLAGS="-C target-cpu=$1 -C link-arg=-fuse-ld=bfd -C link-arg=-Wl,-z,$1" cargo build --release --locked --package clearway --no-default-features \
-        --features sqlite,store,zenoh --target-dir "target/release-$1"
+    RUSTFLAGS="-C target-cpu=$1 -C link-arg=-fuse-ld=bfd -C link-arg=-Wl,-z,$1" cargo build --release --locked \
+        --package clearway --no-default-features --features sqlite,store,zenoh --target-dir "target/release-$1"
     echo "target/release-$1/release/clearway"
 }
 
