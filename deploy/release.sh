@@ -5,12 +5,13 @@
 #
 # Gives in FOLDER:
 #   clearway-VERSION-ARCHITECTURE.tar.gz             the production build: the command, its units and configurations
-#   clearway-VERSION-ARCHITECTURE-v3.tar.gz          on x86-64 the same for processors with AVX2; the same maps
+#   clearway-VERSION-ARCHITECTURE-v3.tar.gz          on x86-64 the same for processors with AVX2; the same maps.
+#                                                    On others glibc says "CPU ISA level is lower than required"
 #   clearway_VERSION_ARCHITECTURE.deb                the Debian package of the first
 #   clearway.cdx.json                                what is in it (CycloneDX)
 #   SHA256SUMS                                       checksums of all these; sha256sum --check SHA256SUMS
 #
-# With BINARY nothing is built: that binary is packed. Needs cargo, dpkg-deb, objdump and strip (binutils).
+# With BINARY nothing is built: that binary is packed. Needs cargo, dpkg-deb, ld, objdump, readelf and strip (binutils).
 set -eu
 
 mkdir -p "${1:?usage: release.sh FOLDER [BINARY]}"
@@ -24,9 +25,16 @@ root=$(mktemp -d)
 trap 'rm -rf "$root"' EXIT
 
 build() { # processor, as rustc names it
-    RUSTFLAGS="-C target-cpu=$1" cargo build --release --locked --package clearway --no-default-features \
-        --features sqlite,store,zenoh --target-dir "target/release-$1"
+    # GNU's linker notes the processor in the binary, for glibc; Rust's own linker leaves the note out.
+    RUSTFLAGS="-C target-cpu=$1 -C link-arg=-fuse-ld=bfd -C link-arg=-Wl,-z,$1" cargo build --release --locked \
+        --package clearway --no-default-features --features sqlite,store,zenoh --target-dir "target/release-$1"
     echo "target/release-$1/release/clearway"
+}
+
+# Refuses a binary that would not say on which processors it runs.
+check_processor() { # binary, processor
+    readelf --notes "$1" | grep -q "x86 ISA needed: .*$2" && return
+    echo "$1 has no note that it needs $2: it was not linked by GNU ld 2.36 or later" >&2 && exit 1
 }
 
 # Refuses a binary that needs more libraries than every Linux with glibc has.
@@ -55,6 +63,7 @@ binary=${given:-$(build "$plain")}
 archive "$binary" ""
 if [ "$architecture" = x86_64 ] && [ -z "$given" ]; then
     faster=$(build x86-64-v3)
+    check_processor "$faster" x86-64-v3
     archive "$faster" -v3
 fi
 deploy/debian/make-deb.sh "$binary" "$folder"
