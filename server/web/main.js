@@ -39,6 +39,7 @@ const FROM_WORKER = {
     clock.restart();
     // A replay reports itself again on the new connection.
     replay.hide();
+    view.replay(null);
   },
   fleet({ vehicles, arrived_ms }) {
     names = vehicles.map(({ name }) => name);
@@ -47,7 +48,10 @@ const FROM_WORKER = {
     fleet.status(vehicles, local(arrived_ms));
     if (view.name !== null) view.status(vehicles.find(({ name }) => name === view.name), local(arrived_ms));
   },
-  replay: (state) => replay.show(state),
+  replay(state) {
+    replay.show(state);
+    view.replay(state);
+  },
   frame(frame) {
     if (!clock.sample(local(frame.arrived_ms), frame.sent_ns)) {
       post({ type: "reconnect", text: "The connection lags; starting again" });

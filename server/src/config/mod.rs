@@ -40,7 +40,7 @@ pub(crate) use grpc::secret;
 pub use grpc::{Access, Certificates, Grpc, Only, Tls};
 pub use listeners::{Listener, Route, listeners};
 pub use overrides::of_environment;
-pub use recorder::{Compression, Recorder, SaveRule};
+pub use recorder::{Compression, RecordedMaps, Recorder, SaveRule};
 pub use ros::Ros;
 pub use store::Store;
 pub use udp::{Ports, Sender, Udp};
@@ -256,6 +256,12 @@ impl Config {
         let mut names = BTreeSet::new();
         for vehicle in &self.vehicles {
             vehicle.check(self.zenoh.enabled)?;
+            let (memory, warm_up_ms) = (&vehicle.maps.memory, self.recorder.warm_up_ms);
+            // Else each new part would change the maps: its pipeline would remember less ground.
+            if memory.enabled && (warm_up_ms as f64) < 1e3 * f64::from(memory.ground_s_max) {
+                let allowed = format!("at least vehicle.maps.memory.ground_s_max = {} s", memory.ground_s_max);
+                return Err(ValueError::new("recorder.warm_up_ms", warm_up_ms, allowed));
+            }
             if !names.insert(&vehicle.name) {
                 return Err(ValueError::new("vehicle.name", &vehicle.name, "a different name for each vehicle"));
             }
