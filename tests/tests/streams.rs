@@ -291,7 +291,6 @@ async fn http(address: std::net::SocketAddr, path: &str) -> String {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_page_its_live_maps_and_the_metrics_are_served() {
-    use tokio::io::{AsyncReadExt, AsyncWriteExt};
     let mut config = config();
     config.page.enabled = true;
     let running = start(config).await;

@@ -258,7 +258,8 @@ impl Config {
             vehicle.check(self.zenoh.enabled)?;
             let (memory, warm_up_ms) = (&vehicle.maps.memory, self.recorder.warm_up_ms);
             // Else each new part would change the maps: its pipeline would remember less ground.
-            if memory.enabled && (warm_up_ms as f64) < 1e3 * f64::from(memory.ground_s_max) {
+            let is_recorded = !self.recorder.file.as_os_str().is_empty();
+            if is_recorded && memory.enabled && (warm_up_ms as f64) < 1e3 * f64::from(memory.ground_s_max) {
                 let allowed = format!("at least vehicle.maps.memory.ground_s_max = {} s", memory.ground_s_max);
                 return Err(ValueError::new("recorder.warm_up_ms", warm_up_ms, allowed));
             }
