@@ -12,8 +12,8 @@
 //! | `/<vehicle>/keyframe` | `clearway.v1.Keyframe` | from where on the maps follow from this file's events alone |
 //! | `/recorder/counts` | `clearway.v1.RecordingCounts` | after each loss, and as the last message of a closed file |
 //!
-//! Metadata `maps` is `recorder.maps`: with `none` there is neither map nor digest; files without it have maps. Metadata
-//! `part` is the number of the part, `1` for the first. Part 1 begins with a new pipeline, so it needs no
+//! Metadata `maps` is `recorder.maps`: with `none` there is neither map nor digest; files without it have maps.
+//! Metadata `part` is the number of the part, `1` for the first. Part 1 begins with a new pipeline, so it needs no
 //! keyframe. Other parts hold no map before the first keyframe with `BEGIN`. Files of earlier versions have neither
 //! `part` nor the last two channels: they are read as part 1.
 //!

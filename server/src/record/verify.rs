@@ -1,8 +1,8 @@
 //! Verifies a recording: are the recorded maps the maps of the recorded events?
 //!
 //! Builds every vehicle's pipeline from the recorded configuration and calibrations, steps it with all events of the
-//! journal, and compares the bytes of each map with those of the recorded map, or their digest with the recorded one. At a keyframe a new pipeline replaces
-//! the old one, as it did in the recorded run. Maps that follow from events which the file lacks are counted as
+//! journal, and compares the bytes of each map with those of the recorded map, or their digest with the recorded one.
+//! At a keyframe a new pipeline replaces the old one, as it did in the recorded run. Maps that follow from events which the file lacks are counted as
 //! unjudged: those after a gap, until the next keyframe.
 
 use std::collections::BTreeMap;

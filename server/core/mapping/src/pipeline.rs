@@ -181,8 +181,8 @@ impl Pipeline {
         Handover { next_map: self.maps_made, newest, ledgers: self.ledgers.clone() }
     }
 
-    /// Replaces another pipeline: the next map gets its number, and stamps and counts go on from those of the other. All
-    /// else follows from the events that this pipeline has processed itself.
+    /// Replaces another pipeline: the next map gets its number, and stamps and counts go on from those of the other.
+    /// All else follows from the events that this pipeline has processed itself.
     pub fn take_over(&mut self, handover: Handover) {
         let sensors = self.inputs.sensors().count();
         self.maps_made = handover.next_map;

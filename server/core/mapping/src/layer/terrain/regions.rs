@@ -35,8 +35,8 @@ impl Plane {
         (a * a + b * b).sqrt()
     }
 
-    /// The plane of least squares through the points. The square of `noise_m` is added to the variances of the positions, so that a
-    /// piece of one ring, which does not determine the slope across it, has slope 0 there.
+    /// The plane of least squares through the points. The square of `noise_m` is added to the variances of the
+    /// positions, so that a piece of one ring, which does not determine the slope across it, has slope 0 there.
     fn fit(moments: &Moments, noise_m: f32) -> Self {
         let noise_m2 = f64::from(noise_m) * f64::from(noise_m);
         let [mut xx, mut yy, _, xy, xz, yz] = moments.covariance();
