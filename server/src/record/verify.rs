@@ -2,8 +2,8 @@
 //!
 //! Builds every vehicle's pipeline from the recorded configuration and calibrations, steps it with all events of the
 //! journal, and compares the bytes of each map with those of the recorded map, or their digest with the recorded one.
-//! At a keyframe a new pipeline replaces the old one, as it did in the recorded run. Maps that follow from events which the file lacks are counted as
-//! unjudged: those after a gap, until the next keyframe.
+//! At a keyframe a new pipeline replaces the old one, as it did in the recorded run. Maps that follow from events which
+//! the file lacks are counted as unjudged: those after a gap, until the next keyframe.
 
 use std::collections::BTreeMap;
 use std::fmt;
