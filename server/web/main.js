@@ -44,6 +44,7 @@ const FROM_WORKER = {
     // A replay reports itself again on the new connection.
     replay.hide();
     recorder.hide();
+    view.replay(null);
   },
   fleet({ vehicles, others, arrived_ms }) {
     names = vehicles.map(({ name }) => name);
@@ -56,7 +57,10 @@ const FROM_WORKER = {
     view.status(status, local(arrived_ms));
     recorder.status(status?.recorder);
   },
-  replay: (state) => replay.show(state),
+  replay(state) {
+    replay.show(state);
+    view.replay(state);
+  },
   recorder: (message) => recorder.answer(message),
   frame(frame) {
     if (!clock.sample(local(frame.arrived_ms), frame.sent_ns)) {

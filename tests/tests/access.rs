@@ -100,6 +100,8 @@ fn rows() -> Vec<(String, Attempt)> {
         row("zenoh, subscribe to `clearway/car/status`", Attempt::Subscribe("clearway/car/status")),
         row("zenoh, subscribe to `clearway/car/ingest/**`", Attempt::Subscribe("clearway/car/ingest/**")),
         row("zenoh, query `clearway/car/map/drivability`", Attempt::Query("clearway/car/map/drivability")),
+        row("zenoh, query `clearway/car/recorder/status`", Attempt::Query("clearway/car/recorder/status")),
+        row("zenoh, query `clearway/car/recorder/list`", Attempt::Query("clearway/car/recorder/list")),
         row("zenoh, liveliness of `clearway/*`", Attempt::Liveliness("clearway/*")),
         row("zenoh, put `clearway/car/ingest/pose`", Attempt::Observe("pose")),
         row("zenoh, put `clearway/car/ingest/road`", Attempt::Observe("road")),
@@ -156,7 +158,10 @@ impl Bed {
                 let samples = session.declare_subscriber(*key).allowed_origin(Locality::Remote).await.unwrap();
                 samples.recv_async().await.unwrap();
             }
-            (Attempt::Query(key), Some(session)) => self.ask(async || session.get(*key).await.unwrap()).await,
+            (Attempt::Query(key), Some(session)) => {
+                let source = || SourceInfo::new(session.id(), 0);
+                self.ask(async || session.get(*key).source_info(source()).await.unwrap()).await;
+            }
             (Attempt::Liveliness(key), Some(session)) => {
                 self.ask(async || session.liveliness().get(*key).await.unwrap()).await;
             }
@@ -275,6 +280,7 @@ async fn bed(folder: &Path) -> Bed {
     let mut config = with_roles(folder);
     // All attempts are made at once, from one address.
     config.connections.per_address_max = 256;
+    config.recorder.file = folder.join("car.mcap");
     let file = folder.join("server.json5");
     std::fs::write(&file, zenoh_file("server.json5", &certificates("ours"))).unwrap();
     (config.zenoh.enabled, config.zenoh.file) = (true, file);

@@ -5,21 +5,27 @@ mod fixture;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
-use clearway::config::{Recorder, SaveRule};
+use clearway::config::{Recorder, SaveRule, Sender};
 use clearway::record::mcap_file::{Disk, Header};
 use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::record::verify::verify;
 use clearway::record::writer::{Files, RecordingWriter};
 use clearway::server::{Running, Server, Setup};
+use clearway_lidar::model::Model;
+use clearway_mapping::config::SensorConfig;
 use clearway_mapping::event::{Body, Event};
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::v1;
 use clearway_proto::v1::recording_service_client::RecordingServiceClient;
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes::flat;
+use clearway_sim::vehicle::SimulatedVehicle;
 use fixture::{Driving, config, until, within};
 use tonic::transport::Channel;
 
@@ -73,6 +79,44 @@ async fn the_last_seconds_are_saved_when_the_maps_become_stale_and_on_request() 
     let saved_ms: u128 = save.split('-').next().unwrap().parse().unwrap();
     println!("saved {} ms after the newest map had become stale", saved_ms - stale_ms);
     within("shutdown", running.shutdown()).await.unwrap();
+    for file in std::fs::read_dir(folder.path().join("saved").join(save)).unwrap() {
+        let report = verify(&file.unwrap().path()).unwrap();
+        assert!(report.is_good() && report.is_closed, "{report:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn the_last_seconds_are_saved_when_one_of_two_sensors_is_lost() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = config();
+    config.recorder.file = folder.path().join("car.mcap");
+    (config.recorder.warm_up_ms, config.recorder.save_on) = (500, vec![SaveRule::SensorLost]);
+    let vehicle = &mut config.vehicles[0];
+    let rear = SensorConfig { name: "rear".into(), ..vehicle.sensors[0].clone() };
+    vehicle.sensors.push(rear);
+    let senders: [SocketAddr; 2] = ["127.0.0.2:0", "127.0.0.3:0"].map(|at| at.parse().unwrap());
+    let names = vehicle.sensors.iter().map(|sensor| sensor.name.clone());
+    vehicle.udp.as_mut().unwrap().from =
+        names.zip(senders).map(|(name, at)| (name, Sender::Address(at.ip()))).collect();
+    let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
+    let vlp16 = || {
+        let config = ScannerConfig { model: Model::Vlp16, ..ScannerConfig::default() };
+        SimulatedVehicle::new(flat(), config)
+    };
+    let [top, rear] = senders.map(|sender| Driving::with(vlp16(), sender, &running));
+    let status = running.vehicles.0[0].status.clone();
+    let are_in_maps = || {
+        let sensors = status.to_proto().sensors;
+        sensors.len() == 2 && sensors.iter().all(|sensor| sensor.state == "ok")
+    };
+    until("maps of both sensors", are_in_maps).await;
+    assert_eq!(saves(folder.path()), [""; 0], "nothing is lost yet");
+    rear.halt();
+    until("the rule saves", || !saves(folder.path()).is_empty()).await;
+    top.halt();
+    within("shutdown", running.shutdown()).await.unwrap();
+    let [save] = &saves(folder.path())[..] else { panic!("{:?}", saves(folder.path())) };
+    assert!(save.ends_with("sensor-1-lost"), "{save}");
     for file in std::fs::read_dir(folder.path().join("saved").join(save)).unwrap() {
         let report = verify(&file.unwrap().path()).unwrap();
         assert!(report.is_good() && report.is_closed, "{report:?}");

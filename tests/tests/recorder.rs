@@ -1,6 +1,8 @@
 //! The recorder as a service: it replaces no file, its parts are verifiable alone, it says what the disk has, and it
 //! loses nothing that it has confirmed.
 
+#[path = "../../server/tests/common/copied.rs"]
+mod copied;
 mod fixture;
 
 use std::collections::BTreeSet;
@@ -9,7 +11,7 @@ use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use clearway::config::Config;
+use clearway::config::{Config, RecordedMaps};
 use clearway::ingest::queue::Reading;
 use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::record::verify::verify;
@@ -17,7 +19,9 @@ use clearway::server::{Running, Server, Setup};
 use clearway_mapping::event::Body;
 use clearway_proto::v1;
 use clearway_proto::v1::recording_service_client::RecordingServiceClient;
+use copied::copy;
 use fixture::{config, feed, readings, until, within};
+use prost::Message as _;
 use tonic::Code;
 use tonic::transport::Channel;
 
@@ -168,6 +172,119 @@ async fn finished_parts_go_to_the_store_and_none_is_deleted_before_it_is_confirm
     assert!(found.len() >= 2 && found.iter().all(|entry| entry.vehicle == "car" && entry.events > 0), "{found:?}");
     within("shutdown", running.shutdown()).await.unwrap();
     assert!(!finished("car.mcap"), "the end of the last part deletes the oldest confirmed one");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recording_is_split_saved_stopped_and_listed_over_zenoh() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = config();
+    config.recorder.file = folder.path().join("car.mcap");
+    (config.recorder.warm_up_ms, config.zenoh.enabled) = (500, true);
+    let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
+    let settings = format!("{{ mode: \"client\", connect: {{ endpoints: [{:?}] }} }}", running.zenoh[0]);
+    let session = zenoh::open(zenoh::Config::from_json5(&settings).unwrap()).await.expect("a session");
+    let ask = async |request: &str, payload: Vec<u8>| {
+        let replies = session.get(format!("clearway/car/recorder/{request}")).payload(payload).await.unwrap();
+        let reply = within("a reply", replies.recv_async()).await.unwrap();
+        let bytes = |payload: &zenoh::bytes::ZBytes| payload.to_bytes().into_owned();
+        match reply.result() {
+            Ok(sample) => Ok(bytes(sample.payload())),
+            Err(error) => Err(String::from_utf8(bytes(error.payload())).unwrap()),
+        }
+    };
+    let response = |answer: Result<Vec<u8>, String>| v1::RecordingResponse::decode(&*answer.unwrap()).unwrap();
+    let groups = cut_at(&[8, 18]);
+    let mut groups = groups.into_iter();
+    feed(&running, groups.next().unwrap()).await;
+    assert_eq!(response(ask("status", Vec::new()).await).status.unwrap().state, "recording");
+    assert!(ask("start", Vec::new()).await.unwrap_err().contains("not stopped"));
+    assert!(ask("erase", Vec::new()).await.unwrap_err().contains("save, list and status are allowed"));
+    assert!(ask("save", b"\xff".to_vec()).await.unwrap_err().contains("SaveRecordingRequest"));
+    let wrong = v1::SaveRecordingRequest { seconds: 10, reason: "../x".into() };
+    assert!(ask("save", wrong.encode_to_vec()).await.unwrap_err().contains("\"../x\""));
+    let save = v1::SaveRecordingRequest { seconds: 10, reason: "near-miss".into() };
+    let saved = response(ask("save", save.encode_to_vec()).await).files;
+    assert!(saved.len() == 1 && saved[0].contains("near-miss"), "{saved:?}");
+    feed(&running, groups.next().unwrap()).await;
+    let part = || running.vehicles.0[0].status.to_proto().recorder.unwrap().part;
+    until("the part after the save", || part() == 2).await;
+    ask("split", Vec::new()).await.unwrap();
+    feed(&running, groups.next().unwrap()).await;
+    let listed = v1::ListRecordingsResponse::decode(&*ask("list", Vec::new()).await.unwrap()).unwrap().parts;
+    assert!(listed.len() >= 3, "{listed:?}");
+    ask("stop", Vec::new()).await.unwrap();
+    until("the recorder has stopped", || running.vehicles.0[0].status.to_proto().recorder.unwrap().state == "stopped")
+        .await;
+    session.close().await.unwrap();
+    within("shutdown", running.shutdown()).await.unwrap();
+    assert!(verify(Path::new(&saved[0])).unwrap().is_good());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn digests_in_place_of_maps_prove_the_same_and_events_alone_make_the_maps_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    for maps in [RecordedMaps::Full, RecordedMaps::Digest, RecordedMaps::None] {
+        let mut config = config();
+        config.recorder.file = at(&format!("{}.mcap", maps.as_str()));
+        (config.recorder.maps, config.recorder.warm_up_ms) = (maps, 500);
+        // The same boot id, because it is in each map.
+        let setup = Setup { config, boot_id: Some(7), ..Setup::default() };
+        let running = Server::start(setup).await.expect("the server starts");
+        let groups = cut_at(&[8]);
+        for group in groups {
+            feed(&running, group).await;
+            service(&running).await.split(v1::SplitRecordingRequest {}).await.unwrap();
+        }
+        within("shutdown", running.shutdown()).await.unwrap();
+    }
+    let length = |name: &str| std::fs::metadata(at(name)).unwrap().len();
+    assert!(length("none.mcap") < length("digest.mcap") && length("digest.mcap") < length("full.mcap"));
+    for part in [".mcap", ".part-0002.mcap"] {
+        let [full, digest, none] =
+            ["full", "digest", "none"].map(|name| verify(&at(&format!("{name}{part}"))).unwrap());
+        for report in [&full, &digest, &none] {
+            assert!(report.is_good() && report.is_closed && report.maps > 5, "{report:?}");
+        }
+        assert!(full.equal > 5 * fixture::LAYERS && full.cells > 0, "{full:?}");
+        assert_eq!((digest.equal, digest.cells, none.equal), (full.equal, full.cells, 0));
+    }
+    // One packet with other ranges makes other maps, and the first of each layer is named.
+    copy(&at("digest.mcap"), &at("changed.mcap"), |topic, sequence, data| {
+        if topic != "/car/journal" || sequence != 400 {
+            return Some(data);
+        }
+        let mut event = v1::Event::decode(&data[..]).unwrap();
+        let Some(v1::event::Body::Datagram(packet)) = &mut event.body else { panic!("a datagram") };
+        *packet = [&packet[..4], &[0; 96], &packet[100..]].concat().into();
+        Some(event.encode_to_vec())
+    });
+    let report = verify(&at("changed.mcap")).unwrap();
+    let first = report.differences.first().expect("a difference").to_string();
+    assert!(report.different < report.equal && first.contains("sha256: recorded"), "{first}");
+
+    let replay = ["replay", "none.mcap", "--record", "made.mcap"];
+    let output = clearway_tests::run(folder.path(), "clearway", &replay);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let (made, full) = (fixture::recorded(&at("made.mcap")), fixture::recorded(&at("full.mcap")));
+    assert!(full.len() as u64 > 5 * fixture::LAYERS);
+    assert!(full.iter().all(|(map, bytes)| made.get(map) == Some(bytes)), "the maps of the drive that was live");
+    for (arguments, says) in [
+        (&["verify", "full.mcap", "--against", "digest.mcap"][..], "digest.mcap has no maps"),
+        (&["export", "digest.mcap", "--format", "png", "--out", "pictures"], "has no maps; if it has events"),
+        (&["verify", "none.mcap"], "no map is recorded"),
+    ] {
+        let output = clearway_tests::run(folder.path(), "clearway", arguments);
+        let text = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
+        assert!(text.contains(says), "{arguments:?}: {text}");
+    }
+    let other_width = ["verify", "digest.mcap", "--set", "vehicle.maps.reach.width_m=4.0"];
+    let output = clearway_tests::run(folder.path(), "clearway", &other_width);
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(
+        output.status.code() == Some(1) && text.contains("cells changed") && !text.contains("only after"),
+        "{text}"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -4,7 +4,7 @@
 mod copied;
 mod fixture;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
 use std::io::BufWriter;
 use std::net::SocketAddr;
@@ -75,6 +75,40 @@ async fn verify_names_a_changed_cell_by_sequence_layer_row_and_column() {
         difference.kind,
         DifferenceKind::Cell { row: row as u32, column: column as u32, channel, recorded, computed }
     );
+}
+
+/// A core that is not deterministic: one cell by the order of a hash map, one header by the time of day.
+#[tokio::test(flavor = "multi_thread")]
+async fn planted_nondeterminism_is_named_by_sequence_layer_and_cell() {
+    let folder = tempfile::tempdir().unwrap();
+    let (whole, planted) = (folder.path().join("whole.mcap"), folder.path().join("planted.mcap"));
+    recording(&whole).await;
+    let (columns, mut changed) = (360, 0);
+    copy(&whole, &planted, |topic, sequence, data| {
+        let mut map = match (topic, sequence) {
+            ("/car/map/drivability", 1) | ("/car/map/terrain", 3) => v1::Map::decode(&data[..]).unwrap(),
+            _ => return Some(data),
+        };
+        if sequence == 3 {
+            map.header.as_mut().unwrap().completed_ns = clearway::clock::now_ns();
+            return Some(map.encode_to_vec());
+        }
+        let channel = &mut map.layers[0].channels[0];
+        let Cells::U8(mut cells) = decode(channel, columns, &Limits::default()).unwrap() else {
+            panic!("classes are u8")
+        };
+        let seen: HashMap<usize, u8> = cells.iter().copied().enumerate().filter(|(_, class)| *class > 0).collect();
+        changed = *seen.keys().next().expect("a seen cell");
+        cells[changed] = 0;
+        let v1::Channel { name, unit, scale, unknown, .. } = channel.clone();
+        *channel = encode_grid(CellsRef::U8(&cells), columns).into_channel(&name, &unit, scale, unknown);
+        Some(map.encode_to_vec())
+    });
+    let report = verify(&planted).unwrap();
+    let found: Vec<String> = report.differences.iter().map(ToString::to_string).collect();
+    let cell = format!("sequence 1, layer drivability: cell row {} column {}, ", changed / columns, changed % columns);
+    assert!(report.different == 2 && found[0].contains(&cell), "{found:?}, planted in cell {changed}");
+    assert!(found[1].contains("sequence 3, layer terrain: header completed_ns: "), "{found:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

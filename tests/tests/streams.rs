@@ -9,7 +9,9 @@ use bytes::Bytes;
 use clearway::server::{Server, Setup};
 use clearway_proto::v1;
 use clearway_sim::send::{Pace, Until, drive};
-use fixture::{config, feed, grpc, readings, recorded, selection, sequence, start, until, vehicle, within};
+use fixture::{
+    config, feed, frame, grpc, readings, recorded, selection, sequence, start, until, vehicle, web_socket, within,
+};
 use tokio::net::UdpSocket;
 use tokio::sync::mpsc;
 use tonic::{Code, Streaming};
@@ -276,21 +278,6 @@ async fn a_stopped_reader_slows_no_other_reader_and_gets_only_its_credits() {
     assert_eq!(end.unwrap_err().code(), Code::Unavailable, "the stream ends with the status that the server stops");
 }
 
-/// One frame of a WebSocket: its opcode and payload. Servers do not mask.
-async fn frame(stream: &mut tokio::net::TcpStream) -> (u8, Vec<u8>) {
-    use tokio::io::AsyncReadExt;
-    let mut head = [0; 2];
-    stream.read_exact(&mut head).await.unwrap();
-    let length = match head[1] {
-        126 => u64::from(stream.read_u16().await.unwrap()),
-        127 => stream.read_u64().await.unwrap(),
-        short => u64::from(short),
-    };
-    let mut payload = vec![0; usize::try_from(length).unwrap()];
-    stream.read_exact(&mut payload).await.unwrap();
-    (head[0] & 0x0f, payload)
-}
-
 /// Sends a plain HTTP request; returns the whole answer.
 async fn http(address: std::net::SocketAddr, path: &str) -> String {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -304,7 +291,6 @@ async fn http(address: std::net::SocketAddr, path: &str) -> String {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_page_its_live_maps_and_the_metrics_are_served() {
-    use tokio::io::{AsyncReadExt, AsyncWriteExt};
     let mut config = config();
     config.page.enabled = true;
     let running = start(config).await;
@@ -325,15 +311,7 @@ async fn the_page_its_live_maps_and_the_metrics_are_served() {
     let vehicles: serde_json::Value = serde_json::from_str(body).unwrap();
     assert_eq!(vehicles[0]["name"], "car");
 
-    let mut stream = tokio::net::TcpStream::connect(address).await.unwrap();
-    let upgrade = "GET /live?vehicle=car HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
-        Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n";
-    stream.write_all(upgrade.as_bytes()).await.unwrap();
-    let mut head = Vec::new();
-    while !head.ends_with(b"\r\n\r\n") {
-        head.push(stream.read_u8().await.unwrap());
-    }
-    assert!(head.starts_with(b"HTTP/1.1 101"));
+    let mut stream = web_socket(address, "/live?vehicle=car").await;
     let (mut update, mut status) = (None, None);
     within("a map and a status", async {
         while update.is_none() || status.is_none() {

@@ -73,6 +73,7 @@ mod transport;
 mod upload;
 mod vehicles;
 mod verify;
+mod view;
 mod watch;
 
 use std::fmt::Write as _;
@@ -111,6 +112,7 @@ enum Command {
     Demo(demo::command::Options),
     Serve(serve::Options),
     Replay(Box<replay::Options>),
+    View(view::Options),
     Transport(transport::Options),
     Verify(verify::Options),
     Evaluate(evaluate::Options),
@@ -138,7 +140,7 @@ enum Command {
 
 /// The subcommands by purpose, as `clearway --help` lists them.
 const GROUPS: [(&str, &[&str]); 8] = [
-    ("Make maps", &["demo", "serve", "replay", "transport"]),
+    ("Make maps", &["demo", "serve", "replay", "view", "transport"]),
     ("Check maps and configurations", &["verify", "evaluate", "check", "init"]),
     ("Read maps from a server", &["watch", "get", "vehicles", "status", "top"]),
     ("Control a server", &["recorder"]),
@@ -188,6 +190,7 @@ fn run(command: Command) -> Result<Exit> {
         Command::Demo(options) => demo::command::run(options)?,
         Command::Serve(options) => serve::run(&options)?,
         Command::Replay(options) => return replay::run(*options),
+        Command::View(options) => return view::run(options),
         Command::Transport(options) => transport::run(&options)?,
         Command::Verify(options) => return verify::run(&options),
         Command::Evaluate(options) => evaluate::run(&options)?,

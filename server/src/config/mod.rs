@@ -41,7 +41,7 @@ pub(crate) use grpc::secret;
 pub use grpc::{Access, Certificates, Grpc, Only, Tls};
 pub use listeners::{Listener, Route, listeners};
 pub use overrides::of_environment;
-pub use recorder::{Compression, Recorder, SaveRule};
+pub use recorder::{Compression, RecordedMaps, Recorder, SaveRule};
 pub use ros::Ros;
 pub use store::Store;
 pub use traces::Traces;
@@ -276,6 +276,13 @@ impl Config {
         let mut names = BTreeSet::new();
         for vehicle in &self.vehicles {
             vehicle.check(self.zenoh.enabled)?;
+            let (memory, warm_up_ms) = (&vehicle.maps.memory, self.recorder.warm_up_ms);
+            // Else each new part would change the maps: its pipeline would remember less ground.
+            let is_recorded = !self.recorder.file.as_os_str().is_empty();
+            if is_recorded && memory.enabled && (warm_up_ms as f64) < 1e3 * f64::from(memory.ground_s_max) {
+                let allowed = format!("at least vehicle.maps.memory.ground_s_max = {} s", memory.ground_s_max);
+                return Err(ValueError::new("recorder.warm_up_ms", warm_up_ms, allowed));
+            }
             if !names.insert(&vehicle.name) {
                 return Err(ValueError::new("vehicle.name", &vehicle.name, "a different name for each vehicle"));
             }

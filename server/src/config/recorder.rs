@@ -36,6 +36,8 @@ pub struct Recorder {
     pub chunk_kb: u64,
     /// Compression of the chunks.
     pub compression: Compression,
+    /// What is recorded of the maps, beside all events.
+    pub maps: RecordedMaps,
     /// True if an existing file is replaced when the new one is whole; never configured, only by `--force`.
     #[serde(skip)]
     pub replaces: bool,
@@ -56,8 +58,32 @@ pub struct Recorder {
 pub enum SaveRule {
     /// A vehicle's newest map has become older than its `valid_ms`.
     MapStale,
-    /// A sensor that was in the maps of its vehicle no longer is.
+    /// A sensor that was in the maps of its vehicle no longer is, or its data no longer arrive.
     SensorLost,
+}
+
+/// What a recording holds of the maps. Every one of them has all events, from which a replay makes the maps.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RecordedMaps {
+    /// The maps.
+    #[default]
+    Full,
+    /// The header and the SHA-256 of each layer: enough to verify that a replay makes the same bytes.
+    Digest,
+    /// Nothing.
+    None,
+}
+
+impl RecordedMaps {
+    /// The name in the configuration and in the metadata of a recording.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Full => "full",
+            Self::Digest => "digest",
+            Self::None => "none",
+        }
+    }
 }
 
 /// Compression of the chunks.
@@ -86,6 +112,7 @@ impl Default for Recorder {
             save_on: Vec::new(),
             chunk_kb: 1024,
             compression: Compression::Zstd,
+            maps: RecordedMaps::Full,
             replaces: false,
             awaits_store: false,
             is_numbered: false,

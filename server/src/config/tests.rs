@@ -183,6 +183,12 @@ fn a_value_out_of_bounds_is_named_with_file_key_and_allowed_values() {
         ("[vehicle.udp]", "[vehicle.udp]\ngroups = [\"ff02::1\"]", "multicast"),
         ("[[vehicle]]", "[zenoh]\nlisten = [\"quic/1.2.3.4:1\"]\n[[vehicle]]", "tcp/127.0.0.1:7447"),
         ("[[vehicle]]", "[recorder]\nflush_ms = 1\n[[vehicle]]", "10 to 60000"),
+        ("[[vehicle]]", "[recorder]\nmaps = \"some\"\n[[vehicle]]", "full"),
+        (
+            "[[vehicle]]",
+            "[recorder]\nfile = \"a\"\nwarm_up_ms = 500\n[vehicle_defaults.maps.memory]\nenabled = true\n[[vehicle]]",
+            "ground_s_max = 5 s",
+        ),
     ];
     for (from, to, allowed) in wrong {
         let error = error(&NEEDED.replacen(from, to, 1));

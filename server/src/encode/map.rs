@@ -159,8 +159,12 @@ impl EncodedMap {
 /// The encoded map `computed` with the replay's header, if the header of the encoded map `served` has one; equal to
 /// `served` if the map was replayed right. Bytes that are no map stay as they are.
 pub fn as_served(computed: Bytes, served: &Bytes) -> Bytes {
-    let header = v1::Map::decode(served.clone()).ok().and_then(|map| map.header);
-    let Some((boot_id, replay)) = header.and_then(|header| Some((header.boot_id, header.replay?))) else {
+    as_served_with(computed, v1::Map::decode(served.clone()).ok().and_then(|map| map.header))
+}
+
+/// As [`as_served`], from the header of the served map.
+pub fn as_served_with(computed: Bytes, served: Option<v1::Header>) -> Bytes {
+    let Some((boot_id, replay)) = served.and_then(|header| Some((header.boot_id, header.replay?))) else {
         return computed;
     };
     let Ok(mut map) = v1::Map::decode(computed.clone()) else { return computed };

@@ -24,4 +24,4 @@ pub(crate) use event::{ego_pose_from_proto, road_from_proto, scan_from_proto, se
 #[cfg(test)]
 pub(crate) use map::meaning;
 pub(crate) use map::sensor;
-pub use map::{EncodedMap, Replayed, as_served};
+pub use map::{EncodedMap, Replayed, as_served, as_served_with};

@@ -46,28 +46,31 @@ struct QueuedSample {
     source: Option<ZenohId>,
 }
 
-/// Who may send observations, if clients have roles.
+/// Who may send observations and queries, if clients have roles.
 pub struct Senders {
     peers: PeerNames,
-    may_send: MaySend,
+    may_call: MayCall,
 }
 
-/// Whether a client with these names in its certificate may send observations; if not, why.
-type MaySend = Box<dyn Fn(&[String]) -> Result<(), String> + Send + Sync>;
+/// Whether a client with these names in its certificate may do what this RPC does; if not, why.
+type MayCall = Box<dyn Fn(&str, &[String]) -> Result<(), String> + Send + Sync>;
 
 impl Senders {
     /// The senders of a session whose peers connect to this server: each shows its own certificate.
-    pub fn new(session: &Session, may_send: MaySend) -> Self {
-        Self { peers: PeerNames::new(session), may_send }
+    pub fn new(session: &Session, may_call: MayCall) -> Self {
+        Self { peers: PeerNames::new(session), may_call }
     }
 
-    /// Checks the sender of a sample by the certificate of its link.
-    async fn check(&mut self, source: Option<ZenohId>) -> Result<(), String> {
+    /// Checks by the certificate of its link that the sender of a sample or query may do what an RPC does.
+    ///
+    /// # Errors
+    /// Why it may not.
+    pub async fn check(&mut self, rpc: &str, source: Option<ZenohId>) -> Result<(), String> {
         let Some(source) = source else {
-            return Err("the sample does not state its source; with roles it must (zenoh's source_info)".into());
+            return Err("the message does not state its source; with roles it must (zenoh's source_info)".into());
         };
         let name = self.peers.name(source).await.map(str::to_owned);
-        (self.may_send)(name.as_slice())
+        (self.may_call)(rpc, name.as_slice())
     }
 }
 
@@ -145,7 +148,7 @@ impl Ingest {
                     let bytes = Bytes::from(payload.to_bytes().into_owned());
                     self.bytes_queued.fetch_sub(bytes.len(), Ordering::Relaxed);
                     let allowed = match &mut self.senders {
-                        Some(senders) => senders.check(source).await,
+                        Some(senders) => senders.check("/clearway.v1.IngestService/Stream", source).await,
                         None => Ok(()),
                     };
                     self.push(&key, bytes, allowed, &mut clients, &outcome_sender);

@@ -17,7 +17,7 @@ use clearway_proto::grid::Grid;
 use clearway_proto::map::{Layer, MapError, decode_map};
 
 use super::reader::{RecordedMessage, RecordingError, RecordingReader};
-use crate::config::{Calibrations, Config};
+use crate::config::{Calibrations, Config, RecordedMaps};
 use crate::encode::EncodedMap;
 use crate::encode::picture::change::{Change, class_name};
 
@@ -130,6 +130,16 @@ pub enum CompareError {
         /// The fault.
         source: Box<MapError>,
     },
+    /// A recording has no maps to compare with those of another one.
+    #[error(
+        "{} has no maps (recorder.maps = {:?}): `clearway replay` makes them with --record", file.display(), maps.as_str()
+    )]
+    NoMaps {
+        /// The recording.
+        file: PathBuf,
+        /// What it holds of them.
+        maps: RecordedMaps,
+    },
     /// The configuration does not fit the sensors of the recording: events name sensors by their place in the list.
     #[error(
         "the configuration does not fit {}: {what} {given}; recorded, in this order: {recorded}", file.display()
@@ -171,26 +181,38 @@ impl MapChange {
 ///
 /// # Errors
 /// [`CompareError::Recording`] if a file cannot be read, [`CompareError::Misfit`] if the configuration names other
-/// vehicles or sensors than the recording, [`CompareError::Config`] if it is invalid, [`CompareError::Map`] if a map
-/// cannot be decoded.
+/// vehicles or sensors than the recording, [`CompareError::NoMaps`] if two recordings are compared and one has no maps,
+/// [`CompareError::Config`] if a configuration is invalid, [`CompareError::Map`] if a map cannot be decoded.
 pub fn compare(before: &Path, after: &After<'_>, worst: usize) -> Result<Comparison, CompareError> {
     let mut pairs = Pairs { waiting: BTreeMap::new(), worst, comparison: Comparison::default() };
     let mut recording = RecordingReader::open(before)?;
     match after {
         After::Config(config, tables) => {
             let mut vehicles = pipelines(before, &recording, config, *tables)?;
+            // Without recorded maps those of the recorded configuration are made too.
+            let mut recorded = match recording.maps() {
+                RecordedMaps::Full => Vec::new(),
+                RecordedMaps::Digest | RecordedMaps::None => {
+                    pipelines(before, &recording, &recording.config()?.0, None)?
+                }
+            };
             for message in recording.by_ref() {
                 match message? {
                     RecordedMessage::Event { vehicle, event } => {
-                        let Some(computing) = vehicles.iter_mut().find(|v| *v.name == *vehicle) else { continue };
-                        for (layer, bytes) in computing.step(&event) {
-                            pairs.push(AFTER, before, vehicle.clone(), layer, bytes)?;
+                        for (side, vehicles) in [(BEFORE, &mut recorded), (AFTER, &mut vehicles)] {
+                            let Some(computing) = vehicles.iter_mut().find(|v| *v.name == *vehicle) else { continue };
+                            for (layer, bytes) in computing.step(&event) {
+                                pairs.push(side, before, vehicle.clone(), layer, bytes)?;
+                            }
                         }
                     }
                     RecordedMessage::Map { vehicle, layer, bytes } => {
                         pairs.push(BEFORE, before, vehicle, layer, bytes)?;
                     }
-                    RecordedMessage::Keyframe { .. } | RecordedMessage::Counts(_) | RecordedMessage::Ros { .. } => {}
+                    RecordedMessage::Digest { .. }
+                    | RecordedMessage::Keyframe { .. }
+                    | RecordedMessage::Counts(_)
+                    | RecordedMessage::Ros { .. } => {}
                 }
             }
             pairs.comparison.incomplete = incomplete(before, &recording);
@@ -198,6 +220,11 @@ pub fn compare(before: &Path, after: &After<'_>, worst: usize) -> Result<Compari
         After::Recording(after) => {
             let mut sides = [recording, RecordingReader::open(after)?];
             let files = [before, *after];
+            for (file, side) in files.iter().zip(&sides) {
+                if side.maps() != RecordedMaps::Full {
+                    return Err(CompareError::NoMaps { file: file.to_path_buf(), maps: side.maps() });
+                }
+            }
             let mut newest_ns = [Some(i64::MIN); 2];
             // The side that is behind is read next, so that few maps wait for their counterpart.
             while let Some(side) = (0..2).filter(|&side| newest_ns[side].is_some()).min_by_key(|&s| newest_ns[s]) {

@@ -8,9 +8,11 @@
 //! |---|---|---|
 //! | `/<vehicle>/journal` | `clearway.v1.Event` | every event; at a keyframe also those that are in force |
 //! | `/<vehicle>/map/<layer>` | `clearway.v1.Map` | the same bytes that zenoh carries |
+//! | `/<vehicle>/digest/<layer>` | `clearway.v1.MapDigest` | in place of the maps with `recorder.maps = "digest"` |
 //! | `/<vehicle>/keyframe` | `clearway.v1.Keyframe` | from where on the maps follow from this file's events alone |
 //! | `/recorder/counts` | `clearway.v1.RecordingCounts` | after each loss, and as the last message of a closed file |
 //!
+//! Metadata `maps` is `recorder.maps`: with `none` there is neither map nor digest; files without it have maps.
 //! Metadata `part` is the number of the part, `1` for the first. Part 1 begins with a new pipeline, so it needs no
 //! keyframe. Other parts hold no map before the first keyframe with `BEGIN`. Files of earlier versions have neither
 //! `part` nor the last two channels: they are read as part 1.
@@ -32,7 +34,7 @@ use mcap::{Attachment, McapError, WriteOptions};
 use prost::Message;
 
 use super::mcap_reader::FORMAT;
-use crate::config::{Compression, Recorder as Options};
+use crate::config::{Compression, RecordedMaps, Recorder as Options};
 use crate::encode::{self, EncodedMap};
 use crate::sync::locked;
 
@@ -109,6 +111,23 @@ impl<D: Disk> Write for SharedDisk<D> {
     }
 }
 
+/// The topic of a layer's maps, or of their digests.
+pub(super) fn topic_of_layer(vehicle: &str, layer: &str, maps: RecordedMaps) -> String {
+    let kind = if maps == RecordedMaps::Digest { "digest" } else { "map" };
+    format!("/{vehicle}/{kind}/{layer}")
+}
+
+/// The encoded digest of an encoded map of one layer; `header` is the encoded map with the header alone.
+fn digest(header: &Bytes, map: &Bytes) -> Vec<u8> {
+    let header = v1::Map::decode(header.clone()).ok().and_then(|map| map.header);
+    v1::MapDigest { header, sha256: sha256(map) }.encode_to_vec()
+}
+
+/// The SHA-256 of an encoded map.
+pub(super) fn sha256(map: &Bytes) -> Bytes {
+    Bytes::copy_from_slice(ring::digest::digest(&ring::digest::SHA256, map).as_ref())
+}
+
 /// An open MCAP file with the channels of all vehicles.
 pub(super) struct McapFile<D: Disk> {
     writer: mcap::Writer<NoSeek<BufWriter<SharedDisk<D>>>>,
@@ -116,6 +135,7 @@ pub(super) struct McapFile<D: Disk> {
     vehicles: Vec<VehicleChannels>,
     counts: u16,
     newest_ns: i64,
+    records: RecordedMaps,
 }
 
 struct VehicleChannels {
@@ -154,6 +174,7 @@ impl<D: Disk> McapFile<D> {
         metadata.insert("version".into(), env!("CARGO_PKG_VERSION").into());
         metadata.insert("vehicles".into(), names.join(","));
         metadata.insert("part".into(), part.to_string());
+        metadata.insert("maps".into(), options.maps.as_str().into());
         writer.write_metadata(&Metadata { name: "clearway".into(), metadata })?;
         let mut attach = |name: String, media_type: &str, text: &str| {
             let data = text.as_bytes().into();
@@ -164,7 +185,8 @@ impl<D: Disk> McapFile<D> {
             attach(format!("calibration/{vehicle}/{sensor}.yaml"), "application/yaml", yaml)?;
         }
         let event = writer.add_schema("clearway.v1.Event", "protobuf", RECORDING_DESCRIPTORS)?;
-        let map = writer.add_schema("clearway.v1.Map", "protobuf", RECORDING_DESCRIPTORS)?;
+        let of_maps = if options.maps == RecordedMaps::Digest { "clearway.v1.MapDigest" } else { "clearway.v1.Map" };
+        let map = writer.add_schema(of_maps, "protobuf", RECORDING_DESCRIPTORS)?;
         let keyframe = writer.add_schema("clearway.v1.Keyframe", "protobuf", RECORDING_DESCRIPTORS)?;
         let counts = writer.add_schema("clearway.v1.RecordingCounts", "protobuf", RECORDING_DESCRIPTORS)?;
         let mut channel = |schema, topic: &str| writer.add_channel(schema, topic, "protobuf", &BTreeMap::new());
@@ -174,12 +196,12 @@ impl<D: Disk> McapFile<D> {
             let keyframes = channel(keyframe, &format!("/{vehicle}/keyframe"))?;
             let maps = layers
                 .iter()
-                .map(|&layer| Ok((layer, channel(map, &format!("/{vehicle}/map/{layer}"))?)))
+                .map(|&layer| Ok((layer, channel(map, &topic_of_layer(vehicle, layer, options.maps))?)))
                 .collect::<Result<_, McapError>>()?;
             vehicles.push(VehicleChannels { journal, keyframes, maps });
         }
         let counts = channel(counts, "/recorder/counts")?;
-        let mut file = Self { writer, disk, vehicles, counts, newest_ns: 0 };
+        let mut file = Self { writer, disk, vehicles, counts, newest_ns: 0, records: options.maps };
         file.sync()?;
         Ok(file)
     }
@@ -196,11 +218,15 @@ impl<D: Disk> McapFile<D> {
         self.write_message(self.vehicles[vehicle].journal, event.sequence, event.arrival_ns, &bytes)
     }
 
-    /// Writes each layer of a map into its channel of the vehicle with this index.
+    /// Writes each layer of a map, or its digest, into its channel of the vehicle with this index.
     pub(super) fn write_map(&mut self, vehicle: usize, map: &EncodedMap) -> Result<(), McapError> {
         for (layer, chunk) in &map.layers {
             let Some(&channel) = self.vehicles[vehicle].maps.get(layer) else { continue };
             let bytes: Bytes = map.layer(chunk);
+            let bytes = match self.records {
+                RecordedMaps::Digest => digest(&map.header, &bytes).into(),
+                RecordedMaps::Full | RecordedMaps::None => bytes,
+            };
             self.write_message(channel, map.sequence, map.completed_ns, &bytes)?;
         }
         Ok(())

@@ -11,8 +11,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use bytes::Bytes;
+use clearway_proto::v1;
 use clearway_ros::Kind;
 use mcap::records::Record;
+use prost::Message as _;
 
 use crate::counted::counted;
 use crate::file_advice::advised;
@@ -66,6 +68,13 @@ pub enum Content {
         /// The layer's name.
         layer: String,
     },
+    /// Digests of a vehicle's maps, with one layer each.
+    Digest {
+        /// The vehicle's name.
+        vehicle: String,
+        /// The layer's name.
+        layer: String,
+    },
     /// Keyframes of a vehicle.
     Keyframe {
         /// The vehicle's name.
@@ -107,9 +116,23 @@ impl Message {
         }
     }
 
-    /// The vehicle, if this is a map or an event.
+    /// The vehicle, if this is a map, the digest of one, or an event.
     pub fn vehicle(&self) -> Option<&str> {
-        self.map_of().map(|(vehicle, _)| vehicle).or_else(|| self.journal_of())
+        match &self.channel.content {
+            Content::Map { vehicle, .. } | Content::Digest { vehicle, .. } | Content::Journal { vehicle } => {
+                Some(vehicle)
+            }
+            _ => None,
+        }
+    }
+
+    /// The header of the map, if this is a map or the digest of one.
+    pub fn map_header(&self) -> Option<v1::Header> {
+        match &self.channel.content {
+            Content::Map { .. } => v1::Map::decode(self.data.clone()).ok()?.header,
+            Content::Digest { .. } => v1::MapDigest::decode(self.data.clone()).ok()?.header,
+            _ => None,
+        }
     }
 
     /// True if this is a `VelodyneScan`, in any encoding.
@@ -427,6 +450,9 @@ fn content(topic: &str, schema: &str, encoding: &str) -> Content {
         ("clearway.v1.Event", ["", vehicle, "journal"]) => Content::Journal { vehicle: (*vehicle).into() },
         ("clearway.v1.Map", ["", vehicle, "map", layer]) => {
             Content::Map { vehicle: (*vehicle).into(), layer: (*layer).into() }
+        }
+        ("clearway.v1.MapDigest", ["", vehicle, "digest", layer]) => {
+            Content::Digest { vehicle: (*vehicle).into(), layer: (*layer).into() }
         }
         ("clearway.v1.Keyframe", ["", vehicle, "keyframe"]) => Content::Keyframe { vehicle: (*vehicle).into() },
         ("clearway.v1.RecordingCounts", ["", "recorder", "counts"]) => Content::Counts,

@@ -14,7 +14,7 @@ use prost::Message as _;
 
 use super::damage::Damage;
 use super::mcap_reader::{Content, Header, McapReadError, McapReader, Message};
-use crate::config::{Calibrations, Config, ConfigError};
+use crate::config::{Calibrations, Config, ConfigError, RecordedMaps};
 use crate::encode::{EventDecodeError, event_from_bytes};
 
 /// One message of a recording.
@@ -35,6 +35,15 @@ pub enum RecordedMessage {
         layer: String,
         /// An encoded `clearway.v1.Map` with this one layer.
         bytes: Bytes,
+    },
+    /// A digest of `/<vehicle>/digest/<layer>`.
+    Digest {
+        /// The vehicle's name.
+        vehicle: String,
+        /// The layer's name.
+        layer: String,
+        /// The header of the map, and the SHA-256 of its bytes.
+        digest: v1::MapDigest,
     },
     /// A mark of `/<vehicle>/keyframe`.
     Keyframe {
@@ -154,6 +163,13 @@ impl RecordingReader {
         self.header().metadata.get("part").and_then(|part| part.parse().ok()).unwrap_or(1)
     }
 
+    /// What the recording holds of the maps.
+    pub fn maps(&self) -> RecordedMaps {
+        let recorded = self.header().metadata.get("maps");
+        let kinds = [RecordedMaps::Digest, RecordedMaps::None];
+        kinds.into_iter().find(|maps| recorded.is_some_and(|name| name == maps.as_str())).unwrap_or_default()
+    }
+
     /// The configuration of the recorded run, and its calibration tables as [`Config::calibrations`] returns them.
     ///
     /// # Errors
@@ -189,6 +205,12 @@ impl RecordingReader {
             Content::Other => None,
             Content::Map { vehicle, layer } => {
                 Some(Ok(RecordedMessage::Map { vehicle: vehicle.clone(), layer: layer.clone(), bytes }))
+            }
+            Content::Digest { vehicle, layer } => {
+                let (vehicle, layer) = (vehicle.clone(), layer.clone());
+                // One that cannot be decoded differs from every map.
+                let digest = v1::MapDigest::decode(bytes).unwrap_or_default();
+                Some(Ok(RecordedMessage::Digest { vehicle, layer, digest }))
             }
             Content::Keyframe { vehicle } => {
                 // One that cannot be decoded leaves the maps after it unjudged.

@@ -1,9 +1,9 @@
 //! Verifies a recording: are the recorded maps the maps of the recorded events?
 //!
 //! Builds every vehicle's pipeline from the recorded configuration and calibrations, steps it with all events of the
-//! journal, and compares the bytes of each map with those of the recorded map. At a keyframe a new pipeline replaces
-//! the old one, as it did in the recorded run. Maps that follow from events which the file lacks are counted as
-//! unjudged: those after a gap, until the next keyframe.
+//! journal, and compares the bytes of each map with those of the recorded map, or their digest with the recorded one.
+//! At a keyframe a new pipeline replaces the old one, as it did in the recorded run. Maps that follow from events which
+//! the file lacks are counted as unjudged: those after a gap, until the next keyframe.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -22,8 +22,10 @@ use clearway_proto::v1;
 use prost::Message;
 use serde_json::{Value, json};
 
-use crate::encode::{EncodedMap, as_served};
+use crate::config::RecordedMaps;
+use crate::encode::{EncodedMap, as_served, as_served_with};
 use crate::record::damage::Damage;
+use crate::record::mcap_file::sha256;
 use crate::record::reader::{RecordedMessage, RecordingError, RecordingReader};
 
 /// Greatest number of differences in a report; all are counted. Ours: the first ones explain the others.
@@ -34,7 +36,9 @@ const DIFFERENCES_MAX: usize = 20;
 pub struct Report {
     /// Number of events of all journals.
     pub events: u64,
-    /// Number of recorded maps, of one layer each, that equal the computed map byte for byte.
+    /// What the recording holds of the maps. Without any, only its events are checked.
+    pub recorded: RecordedMaps,
+    /// Number of recorded maps or digests, of one layer each, that equal those of the computed map byte for byte.
     pub equal: u64,
     /// Number of maps computed from the events.
     pub maps: u64,
@@ -135,7 +139,7 @@ impl Report {
         json!({
             "ok": self.is_good() && self.incomplete.is_none(),
             "events": self.events, "maps": self.maps, "equal": self.equal, "different": self.different,
-            "cells": self.cells,
+            "cells": self.cells, "recorded_maps": self.recorded.as_str(),
             "cut": self.cut, "beyond_cut": self.beyond_cut, "unjudged": self.unjudged, "incomplete": self.incomplete,
             "dropped": self.dropped, "dropped_because": self.dropped_because,
             "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(),
@@ -201,6 +205,7 @@ struct VehicleReplay {
     /// The pipeline of the next keyframe.
     warm_up: Option<Pipeline>,
     valid_ms: u32,
+    records: RecordedMaps,
     /// Sequence of the next event; `None` before the first one.
     next_event: Option<u64>,
     /// True if events are missing before this one, until the next keyframe; the maps need not equal the computed ones.
@@ -230,12 +235,13 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
             pipeline: is_first_part.then_some(pipeline),
             warm_up: None,
             valid_ms: vehicle.maps.valid_ms,
+            records: recording.maps(),
             next_event: is_first_part.then_some(0),
             lacks_events: false,
             computed: BTreeMap::new(),
         });
     }
-    let mut report = Report::default();
+    let mut report = Report { recorded: recording.maps(), ..Report::default() };
     let mut damages = 0;
     while let Some(message) = recording.next() {
         let damages_before = std::mem::replace(&mut damages, recording.damage_count());
@@ -271,6 +277,14 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
                 };
                 replay.compare(&layer, &bytes, &mut report);
             }
+            RecordedMessage::Digest { vehicle, layer, digest } => {
+                let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else {
+                    let sequence = digest.header.map_or(u64::MAX, |header| header.sequence);
+                    report.add(&vehicle, sequence, &layer, DifferenceKind::Extra);
+                    continue;
+                };
+                replay.compare_digest(&layer, digest, &mut report);
+            }
             RecordedMessage::Ros { .. } => {}
         }
     }
@@ -303,7 +317,8 @@ impl VehicleReplay {
             }
             v1::KeyframePhase::Begin => {
                 if let Some(mut pipeline) = self.warm_up.take() {
-                    pipeline.take_over(Handover::from_recording(keyframe.next_map, &keyframe.refused));
+                    let newest = (keyframe.epoch, keyframe.newest_end_ns);
+                    pipeline.take_over(Handover::from_recording(keyframe.next_map, newest, &keyframe.refused));
                     (self.pipeline, self.lacks_events) = (Some(pipeline), false);
                 }
             }
@@ -335,7 +350,8 @@ impl VehicleReplay {
         if let Ok(Some(map)) = pipeline.step(event) {
             let map = EncodedMap::new(map, self.name.clone(), boot_id, self.valid_ms);
             report.maps += 1;
-            for (layer, chunk) in &map.layers {
+            let recorded = map.layers.iter().filter(|_| self.records != RecordedMaps::None);
+            for (layer, chunk) in recorded {
                 self.computed.insert((map.sequence, (*layer).to_owned()), map.layer(chunk));
             }
         }
@@ -351,6 +367,29 @@ impl VehicleReplay {
             _ if self.lacks_events || self.pipeline.is_none() => report.unjudged += 1,
             None => report.add(&self.name, sequence, layer, DifferenceKind::Extra),
             Some(computed) => report.add(&self.name, sequence, layer, first_difference(bytes, &computed)),
+        }
+    }
+
+    /// Compares a recorded digest with that of the computed layer.
+    fn compare_digest(&mut self, layer: &str, digest: v1::MapDigest, report: &mut Report) {
+        let v1::MapDigest { header, sha256: recorded } = digest;
+        let sequence = header.as_ref().map_or(u64::MAX, |header| header.sequence);
+        let computed = self.computed.remove(&(sequence, layer.to_owned()));
+        report.cells += computed.as_ref().map_or(0, |computed| sequence_and_cells(computed).1);
+        match computed.map(|computed| sha256(&as_served_with(computed, header))) {
+            Some(computed) if computed == recorded => report.equal += 1,
+            _ if self.lacks_events || self.pipeline.is_none() => report.unjudged += 1,
+            None => report.add(&self.name, sequence, layer, DifferenceKind::Extra),
+            Some(computed) => {
+                let hex = |bytes: &Bytes| bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
+                let (recorded, computed) = (hex(&recorded), hex(&computed));
+                report.add(
+                    &self.name,
+                    sequence,
+                    layer,
+                    DifferenceKind::Field { field: "sha256".into(), recorded, computed },
+                );
+            }
         }
     }
 }

@@ -14,7 +14,8 @@ use crate::ingest::ros::live::{self, LiveTopics};
 use crate::ingest::zenoh::{Ingest, Senders};
 use crate::publish::listen::access::Access;
 use crate::publish::zenoh::Publisher;
-use crate::publish::{Vehicles, announcements};
+use crate::publish::{Vehicles, announcements, zenoh_recorder};
+use crate::record::writer::RecorderControl;
 use crate::zenoh_session::{self, ZenohError};
 
 /// The open session and its users.
@@ -26,6 +27,8 @@ pub(super) struct OverZenoh {
     ros: Vec<LiveTopics>,
     /// One task a vehicle.
     announcements: JoinSet<()>,
+    /// One task a vehicle.
+    recorder: JoinSet<()>,
     _fleet: Option<Subscriber<()>>,
 }
 
@@ -54,8 +57,8 @@ impl OverZenoh {
             true => Some(announcements::hear(&session, fleet.clone()).await?),
             false => None,
         };
-        let (ingest, ros) = (JoinSet::new(), Vec::new());
-        let mut over_zenoh = Self { session, publisher, ingest, ros, announcements, _fleet: others };
+        let (ingest, ros, recorder) = (JoinSet::new(), Vec::new(), JoinSet::new());
+        let mut over_zenoh = Self { session, publisher, ingest, ros, announcements, recorder, _fleet: others };
         for gateway in gateways.all() {
             let senders = senders(&over_zenoh.session, config);
             let ingest = Ingest::subscribe(&over_zenoh.session, gateway.clone(), senders).await?;
@@ -68,6 +71,23 @@ impl OverZenoh {
             over_zenoh.ros.push(topics);
         }
         Ok(over_zenoh)
+    }
+
+    /// Answers the queries of operators to the recorder, on the keys of each vehicle.
+    ///
+    /// # Errors
+    /// [`ZenohError`] if a key cannot be declared.
+    pub(super) async fn serve_recorder(
+        &mut self,
+        config: &Config,
+        control: Option<&RecorderControl>,
+    ) -> Result<(), ZenohError> {
+        for vehicle in &config.vehicles {
+            let operators = senders(&self.session, config);
+            zenoh_recorder::serve(&self.session, &vehicle.name, control.cloned(), operators, &mut self.recorder)
+                .await?;
+        }
+        Ok(())
     }
 
     /// The endpoints the session listens on.
@@ -86,6 +106,7 @@ impl OverZenoh {
     pub(super) async fn stop(mut self) {
         self.announcements.shutdown().await;
         self.ingest.shutdown().await;
+        self.recorder.shutdown().await;
         self.publisher.stop().await;
         if let Err(error) = self.session.close().await {
             tracing::warn!(%error, "zenoh: close");
@@ -93,15 +114,13 @@ impl OverZenoh {
     }
 }
 
-/// Who may send observations, if clients have roles and connect to this session; a router checks its own clients.
+/// Who may send observations and queries, if clients have roles and connect to this session; a router checks its own
+/// clients.
 fn senders(session: &Session, config: &Config) -> Option<Senders> {
     let has_roles = config.grpc.tls.as_ref().is_some_and(|tls| tls.client_ca.is_some());
     let access = (has_roles && config.zenoh.mode != ZenohMode::Client).then(|| Access::new(&config.grpc.access))?;
-    let may_send = move |names: &[String]| {
-        access
-            .check("/clearway.v1.IngestService/Stream", names)
-            .map(|_| ())
-            .map_err(|status| status.message().to_owned())
+    let may_call = move |rpc: &str, names: &[String]| {
+        access.check(rpc, names).map(|_| ()).map_err(|status| status.message().to_owned())
     };
-    Some(Senders::new(session, Box::new(may_send)))
+    Some(Senders::new(session, Box::new(may_call)))
 }

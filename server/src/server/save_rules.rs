@@ -3,32 +3,22 @@
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
-use crate::clock::now_ns;
 use crate::config::{Config, SaveRule};
 use crate::publish::Vehicles;
 use crate::record::writer::{Command, RecorderControl};
 
 /// Interval at which the conditions are looked at. Ours: a save is due within 2 s.
 const INTERVAL: Duration = Duration::from_millis(500);
-/// States of a sensor whose scan is in the newest map.
-const STATES_IN_MAP: [&str; 2] = ["ok", "partial"];
-
-/// What is wrong with one vehicle: the reasons of saves.
-type Reasons = BTreeSet<String>;
 
 /// Saves the last seconds when a condition begins, at most once in `recorder.save_s`; returns when the recorder ends.
 pub(super) async fn watch(config: Config, vehicles: Vehicles, control: RecorderControl) {
-    let rules = &config.recorder.save_on;
     let quiet = Duration::from_secs(config.recorder.save_s);
-    let mut before: Option<Reasons> = None;
+    let mut conditions = Conditions::default();
     let mut saved_at: Option<Instant> = None;
     let mut every = tokio::time::interval(INTERVAL);
     loop {
         every.tick().await;
-        let now = reasons(rules, &config, &vehicles);
-        // What was wrong at the start has not begun since.
-        let begun = now.difference(before.as_ref().unwrap_or(&now)).next().cloned();
-        before = Some(now);
+        let begun = conditions.update(&config.recorder.save_on, &observe(&config, &vehicles));
         let Some(reason) = begun.filter(|_| saved_at.is_none_or(|at| at.elapsed() >= quiet)) else { continue };
         match control.send(Command::Save { seconds: 0, reason: reason.clone() }).await {
             Ok(_) => saved_at = Some(Instant::now()),
@@ -37,28 +27,75 @@ pub(super) async fn watch(config: Config, vehicles: Vehicles, control: RecorderC
     }
 }
 
-/// The conditions that hold now.
-fn reasons(rules: &[SaveRule], config: &Config, vehicles: &Vehicles) -> Reasons {
-    let mut reasons = Reasons::new();
-    for (vehicle, status) in config.vehicles.iter().zip(vehicles.statuses()) {
-        let state = status.to_proto();
-        let age_ms = now_ns().saturating_sub(state.newest_capture_end_ns) / 1_000_000;
-        let is_stale = state.maps > 0 && age_ms > i64::from(vehicle.maps.valid_ms);
-        if rules.contains(&SaveRule::MapStale) && is_stale {
-            reasons.insert("map-stale".to_owned());
+/// What is seen of one vehicle.
+#[derive(Clone, Debug, Default)]
+struct Observed {
+    /// True if its newest map is stale.
+    is_stale: bool,
+    /// Of each sensor, whether its data arrive and are in the newest map.
+    in_maps: Vec<bool>,
+}
+
+fn observe(config: &Config, vehicles: &Vehicles) -> Vec<Observed> {
+    let of_vehicle = |(vehicle, status): (&crate::config::Vehicle, std::sync::Arc<crate::status::VehicleStatus>)| {
+        let is_stale = status.assess().map_age_ms.is_some_and(|age_ms| age_ms > f64::from(vehicle.maps.valid_ms));
+        Observed { is_stale, in_maps: status.sensors_in_maps() }
+    };
+    config.vehicles.iter().zip(vehicles.statuses()).map(of_vehicle).collect()
+}
+
+/// What was good and is no longer: only this begins a save.
+#[derive(Debug, Default)]
+struct Conditions {
+    /// Conditions that hold, by vehicle.
+    wrong: BTreeSet<(usize, String)>,
+    /// Conditions that did not hold at some time, by vehicle.
+    were_good: BTreeSet<(usize, String)>,
+}
+
+impl Conditions {
+    /// Takes what is seen of the vehicles; returns the reason of a condition that has begun. Names of sensors may have
+    /// characters that names of folders must not have, so a reason has the sensor's number.
+    fn update(&mut self, rules: &[SaveRule], observed: &[Observed]) -> Option<String> {
+        let mut begun = None;
+        for (vehicle, Observed { is_stale, in_maps }) in observed.iter().enumerate() {
+            let stale = rules.contains(&SaveRule::MapStale).then(|| ("map-stale".to_owned(), *is_stale));
+            let sensors = in_maps.iter().enumerate().filter(|_| rules.contains(&SaveRule::SensorLost));
+            let lost = sensors.map(|(index, is_in_map)| (format!("sensor-{index}-lost"), !is_in_map));
+            for (reason, holds) in stale.into_iter().chain(lost) {
+                let condition = (vehicle, reason.clone());
+                if !holds {
+                    self.wrong.remove(&condition);
+                    self.were_good.insert(condition);
+                } else if self.were_good.contains(&condition) && self.wrong.insert(condition) {
+                    begun.get_or_insert(reason);
+                }
+            }
         }
-        let is_lost = |sensor: &&clearway_proto::v1::SensorState| !STATES_IN_MAP.contains(&&*sensor.state);
-        if rules.contains(&SaveRule::SensorLost) {
-            // Names of sensors may have characters that names of folders must not have.
-            reasons.extend(
-                state
-                    .sensors
-                    .iter()
-                    .enumerate()
-                    .filter(|(_, sensor)| is_lost(sensor))
-                    .map(|(index, _)| format!("sensor-{index}-lost")),
-            );
-        }
+        begun
     }
-    reasons
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_condition_begins_once_and_only_after_it_did_not_hold() {
+        let rules = [SaveRule::MapStale, SaveRule::SensorLost];
+        let mut conditions = Conditions::default();
+        let mut update = |seen: [(bool, &[bool]); 2]| {
+            conditions.update(&rules, &seen.map(|(is_stale, in_maps)| Observed { is_stale, in_maps: in_maps.to_vec() }))
+        };
+        // The second sensor of the first vehicle starts late; the second vehicle has none.
+        assert_eq!(update([(true, &[]), (false, &[])]), None);
+        assert_eq!(update([(false, &[true, false]), (false, &[])]), None);
+        assert_eq!(update([(false, &[true, true]), (false, &[true])]), None);
+        assert_eq!(update([(false, &[true, false]), (false, &[true])]).as_deref(), Some("sensor-1-lost"));
+        assert_eq!(update([(false, &[true, false]), (false, &[true])]), None, "it has begun before");
+        assert_eq!(update([(false, &[true, false]), (false, &[false])]).as_deref(), Some("sensor-0-lost"));
+        assert_eq!(update([(true, &[true, true]), (false, &[true])]).as_deref(), Some("map-stale"));
+        assert_eq!(update([(false, &[true, false]), (false, &[true])]).as_deref(), Some("sensor-1-lost"), "again");
+        assert_eq!(Conditions::default().update(&[], &[Observed { is_stale: true, in_maps: vec![false] }]), None);
+    }
 }

@@ -158,6 +158,11 @@ impl Running {
             self.over_zenoh = Some(over_zenoh);
         }
         self.start_engines(config, prepared, driver, header)?;
+        #[cfg(feature = "zenoh")]
+        if let Some(over_zenoh) = &mut self.over_zenoh {
+            let control = self.recorder.as_ref().map(Recorder::control);
+            over_zenoh.serve_recorder(config, control.as_ref()).await?;
+        }
         if let Some(recorder) = self.recorder.as_ref().filter(|_| !config.recorder.save_on.is_empty()) {
             let (rules, stopped) =
                 (save_rules::watch(config.clone(), self.vehicles.clone(), recorder.control()), self.stopped());

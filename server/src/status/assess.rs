@@ -88,6 +88,13 @@ impl VehicleStatus {
         }
     }
 
+    /// Of each sensor, whether its data arrive and are in the newest map.
+    pub fn sensors_in_maps(&self) -> Vec<bool> {
+        let arrives = |sensor: &SensorFacts| sensor.silent.is_some_and(|silent| silent <= SILENT_AFTER);
+        let is_in_map = |sensor: &SensorFacts| sensor.left_out.is_empty() && sensor.completeness.is_some();
+        self.facts().sensors.iter().map(|sensor| arrives(sensor) && is_in_map(sensor)).collect()
+    }
+
     /// Why the vehicle is not ready: its worst reason, if no fresh map is made; else `None`.
     pub fn not_ready(&self) -> Option<String> {
         let Assessment { state, reasons, .. } = self.assess();

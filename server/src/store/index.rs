@@ -6,7 +6,6 @@ use std::path::Path;
 use clearway_proto::v1;
 use futures::TryStreamExt;
 use object_store::{ObjectStore, ObjectStoreExt, path::Path as Key};
-use prost::Message;
 use serde::{Deserialize, Serialize};
 
 use crate::record::mcap_reader::{McapReadError, McapReader};
@@ -91,11 +90,11 @@ impl Entry {
             });
             entry.from_ns = entry.from_ns.min(message.log_ns);
             entry.to_ns = entry.to_ns.max(message.log_ns);
-            match message.map_of() {
-                None => entry.events += 1,
-                Some(_) => {
+            match message.journal_of() {
+                Some(_) => entry.events += 1,
+                None => {
                     entry.layers += 1;
-                    if let Some(header) = v1::Map::decode(message.data).ok().and_then(|map| map.header) {
+                    if let Some(header) = message.map_header() {
                         entry.add_map(&header);
                     }
                 }

@@ -29,6 +29,7 @@ export class VehicleView {
   #layers;
   #plots;
   #shown = null;
+  #is_recorded = false;
   #status = null;
   #status_arrived_ms = null;
   #layer_names = [];
@@ -187,16 +188,22 @@ export class VehicleView {
     }
   }
 
+  // The state of the replay, or null without one. The stamps of maps as recorded say nothing about now.
+  replay(state) {
+    this.#is_recorded = state !== null && !state.as_live;
+  }
+
   #writeFreshness(age) {
-    const state = !age ? "none" : age.fresh ? "fresh" : "stale";
+    const state = !age ? "none" : this.#is_recorded ? "recorded" : age.fresh ? "fresh" : "stale";
     document.body.dataset.map = state;
     // A screen reader announces this text, so it holds the state alone and not the age.
-    setText($("freshness"), { none: "NO MAP YET", fresh: "FRESH", stale: "STALE" }[state]);
-    const share = age?.age_ms == null ? 1 : Math.min(Math.max(age.age_ms / age.validity_ms, 0), 1);
+    setText($("freshness"), { none: "NO MAP YET", fresh: "FRESH", stale: "STALE", recorded: "RECORDED" }[state]);
+    const share = state === "recorded" ? 0 : age?.age_ms == null ? 1 : Math.min(Math.max(age.age_ms / age.validity_ms, 0), 1);
     $("bar").style.transform = `scaleX(${age ? share.toFixed(2) : 0})`;
-    setText($("age"), age ? duration(age.age_ms) : dash);
+    setText($("age"), age && state !== "recorded" ? duration(age.age_ms) : dash);
     const valid = age && `valid for ${duration(age.validity_ms)} after capture`;
-    setText($("why"), age ? age.why || valid : "waiting for the first map");
+    const why = state === "recorded" ? "replayed with the stamps of the recording" : age?.why || valid;
+    setText($("why"), age ? why : "waiting for the first map");
     setText($("stale"), state === "stale" ? `STALE · ${duration(age.age_ms)}` : "");
   }
 

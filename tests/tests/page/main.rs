@@ -31,6 +31,7 @@ macro_rules! in_a_browser {
 in_a_browser! {
     the_page_beside_the_demo_shows_a_fresh_map => fresh::the_page_shows_a_fresh_map,
     a_cell_on_the_page_has_the_values_that_a_client_reads => replayed::cells_are_those_of_the_client,
+    a_viewed_drive_is_recorded_and_not_stale_and_steps => replayed::a_viewed_drive_steps,
     the_time_bar_steps_and_seeks_a_replay => replayed::the_time_bar_controls_a_replay,
     a_map_that_no_longer_comes_is_stale_with_its_true_age => fleet::a_stopped_vehicle_is_stale,
     vehicles_of_other_servers_are_on_the_page => fleet::other_servers_are_shown,

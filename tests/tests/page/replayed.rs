@@ -1,5 +1,8 @@
 //! The page beside a replay of the golden recording: its maps stand still when the test wants it.
 
+use std::io::{BufRead, BufReader};
+use std::process::{Child, Command, Stdio};
+
 use clearway_client::test::{Replay, town};
 use clearway_client::{Client, MapView};
 use clearway_proto::v1;
@@ -115,4 +118,37 @@ pub fn the_time_bar_controls_a_replay() {
         }
         assert_eq!(state.rate, 2.0);
     });
+}
+
+/// Ends `clearway view` when it is dropped.
+struct Viewing(Child);
+
+impl Drop for Viewing {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+pub fn a_viewed_drive_steps() {
+    let mut command = Command::new(clearway_tests::binaries().join("clearway"));
+    command.arg("view").arg(town()).args(["--from", "0.45"]).stdin(Stdio::null()).stdout(Stdio::piped());
+    let mut viewing = Viewing(command.spawn().expect("the command starts"));
+    let mut page = String::new();
+    BufReader::new(viewing.0.stdout.take().expect("a pipe")).read_line(&mut page).expect("an address");
+    let browser = Browser::start(1440, 900);
+    browser.open(page.trim());
+    browser.until("the time bar", "return !document.getElementById('replay').hidden");
+    browser.until("a pause", "return document.querySelector('[data-part=play]').textContent === 'Play'");
+    browser.click("[data-part=step]");
+    browser.until("a map", "return document.querySelector('#stream dd').textContent === '5'");
+    let shown = "return [document.body.dataset.map, document.getElementById('freshness').textContent,
+        document.getElementById('stale').textContent]";
+    browser.until("the state", "return document.body.dataset.map === 'recorded'");
+    assert_eq!(browser.run(shown), serde_json::json!(["recorded", "RECORDED", ""]));
+    browser.run(ALL_LAYERS);
+    browser.click("[data-part=step]");
+    await_map(&browser, 6);
+    browser.screenshot("view-1440x900");
+    assert_eq!(browser.console_errors(), Vec::<String>::new());
 }

@@ -66,13 +66,16 @@ pub struct NamedStatus {
 pub struct Handover {
     /// Sequence of the next map.
     pub next_map: u64,
+    /// Epoch of the newest map, and the end of its capture in ns: the stamps after the handover go on from these.
+    pub newest: (u32, i64),
     ledgers: Ledgers,
 }
 
 impl Handover {
-    /// A handover as a recording states it: the sequence of the next map, and [`Handover::refused`].
-    pub fn from_recording(next_map: u64, refused: &[u64]) -> Self {
-        Self { next_map, ledgers: Ledgers::with_refused(refused) }
+    /// A handover as a recording states it: the sequence of the next map, epoch and end of the newest one, and
+    /// [`Handover::refused`].
+    pub fn from_recording(next_map: u64, newest: (u32, i64), refused: &[u64]) -> Self {
+        Self { next_map, newest, ledgers: Ledgers::with_refused(refused) }
     }
 
     /// Number of refused datagrams and scans of each sensor, by source: the counts that are in maps.
@@ -174,15 +177,17 @@ impl Pipeline {
 
     /// What a pipeline that replaces this one takes over.
     pub fn handover(&self) -> Handover {
-        Handover { next_map: self.maps_made, ledgers: self.ledgers.clone() }
+        let newest = (self.map.epoch, self.map.capture_end_ns);
+        Handover { next_map: self.maps_made, newest, ledgers: self.ledgers.clone() }
     }
 
-    /// Replaces another pipeline: the next map gets its number, and the counts go on from those of the other. All else
-    /// follows from the events that this pipeline has processed itself.
+    /// Replaces another pipeline: the next map gets its number, and stamps and counts go on from those of the other.
+    /// All else follows from the events that this pipeline has processed itself.
     pub fn take_over(&mut self, handover: Handover) {
         let sensors = self.inputs.sensors().count();
         self.maps_made = handover.next_map;
         self.map.sequence = handover.next_map.saturating_sub(1);
+        (self.map.epoch, self.map.capture_end_ns) = handover.newest;
         self.ledgers = handover.ledgers;
         self.ledgers.set_sensors(sensors);
     }

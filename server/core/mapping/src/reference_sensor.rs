@@ -87,8 +87,9 @@ fn best(merits: impl Iterator<Item = Merits>) -> usize {
 
 fn merits(scan: &SensorScan, lasers: usize) -> Merits {
     let [x, y, _] = scan.origin_m;
-    let sector =
-        |x: f32, y: f32| (y.atan2(x).rem_euclid(std::f32::consts::TAU) / std::f32::consts::TAU) * SECTORS as f32;
+    let sector = |x: f32, y: f32| {
+        (libm::atan2f(y, x).rem_euclid(std::f32::consts::TAU) / std::f32::consts::TAU) * SECTORS as f32
+    };
     let seen = scan
         .sweep
         .x
@@ -113,8 +114,8 @@ mod tests {
         let mut scan = SensorScan::new("top", [1.0, 2.0, 1.8], tilt_deg.to_radians());
         for sector in 0..sectors {
             let angle = (sector as f32 + 0.5) * std::f32::consts::TAU / SECTORS as f32;
-            scan.sweep.x.push(1.0 + 9.0 * angle.cos());
-            scan.sweep.y.push(2.0 + 9.0 * angle.sin());
+            scan.sweep.x.push(1.0 + 9.0 * libm::cosf(angle));
+            scan.sweep.y.push(2.0 + 9.0 * libm::sinf(angle));
         }
         scan
     }

@@ -259,7 +259,7 @@ fn nothing_exported(file: &Path, recording: &McapReader, layer: Option<&str>, ve
         name.filter(|name| !known.iter().any(|known| known == name)).map(str::to_owned)
     };
     if layers.is_empty() {
-        return format!("{file} has no maps");
+        return format!("{file} has no maps; if it has events, `clearway replay {file} --record NEW.mcap` makes them");
     }
     if let Some(name) = absent(layer, &layers) {
         return format!("{file} has no layer {name:?}; it has {}", layers.join(", "));

@@ -17,6 +17,7 @@
 //! is no ground to estimate from, the files are decoded and no map is made, and the summary says so.
 
 use std::io::IsTerminal;
+use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -63,11 +64,32 @@ const ACKNOWLEDGE_S_MAX: f64 = 10.0;
 /// # Errors
 /// [`ReplayError`].
 pub fn run(options: Options) -> anyhow::Result<Exit> {
-    block_on(replay_and_print(options))
+    block_on(replay_and_print(options, None))
 }
 
-async fn replay_and_print(options: Options) -> anyhow::Result<Exit> {
+/// As [`run`], for a person who looks at the page: prints its address, and opens it with the desktop's browser if
+/// `opens` is true. A signal or the key q is the normal end.
+///
+/// # Errors
+/// [`ReplayError`].
+pub fn view(options: Options, opens: bool) -> anyhow::Result<Exit> {
+    block_on(replay_and_print(options, Some(opens)))
+}
+
+/// Prints the address of the page, and opens it.
+fn show_page(running: &Running, opens: bool) -> anyhow::Result<()> {
+    let Some(page) = running.page.map(|at| format!("http://{at}/")) else { return Ok(()) };
+    print_line(&page)?;
+    if opens && let Err(error) = Command::new("xdg-open").arg(&page).spawn() {
+        tracing::warn!(%error, "xdg-open");
+    }
+    Ok(())
+}
+
+/// `view`: whether to open the page, for [`view`].
+async fn replay_and_print(options: Options, view: Option<bool>) -> anyhow::Result<Exit> {
     let (json, serve) = (options.json, options.serve);
+    let mut shown = Ok(());
     let progress = Arc::new(Progress::default());
     let mut bar = None;
     let started = |running: &Running, summary: &Summary| {
@@ -75,6 +97,9 @@ async fn replay_and_print(options: Options) -> anyhow::Result<Exit> {
             eprintln!("extrinsics {description}");
         }
         log_endpoints(running);
+        if let Some(opens) = view {
+            shown = show_page(running, opens);
+        }
         // Only now: a bar drawn before these lines would stay above them.
         if let Some(replay) = running.replay() {
             keys::follow(replay, tokio::runtime::Handle::current());
@@ -88,18 +113,23 @@ async fn replay_and_print(options: Options) -> anyhow::Result<Exit> {
         let _ = bar.await;
     }
     let summary = outcome?;
+    shown?;
     for truncated in &summary.truncated {
         eprintln!("warning: {}: {}; the rest was used", truncated.file.display(), truncated.reason);
     }
     for note in &summary.notes {
         eprintln!("note: {note}");
     }
+    let is_whole = summary.truncated.is_empty();
+    if view.is_some() {
+        return Ok(Exit::from_incomplete(!is_whole));
+    }
     if json {
         print_line(&format!("{:#}", summary.to_json()))?
     } else {
         print(&summary.to_text())?
     };
-    Ok(Exit::from_incomplete(!summary.truncated.is_empty() || !summary.reached_end))
+    Ok(Exit::from_incomplete(!is_whole || !summary.reached_end))
 }
 
 /// How many bytes of the files a replay has read, for a progress bar.

@@ -19,7 +19,7 @@ use super::options::{Options, ReplayError};
 use super::recordings::{Recorded, check_sensors, several_vehicles};
 use super::summary::{Mount, describe};
 use crate::cli::ground_revolutions::{GroundRevolutions, points_of};
-use crate::config::{Calibrations, Config, Origin, Recorder};
+use crate::config::{Calibrations, Config, Origin, RecordedMaps, Recorder};
 use crate::ingest::files::mcap::{McapError, McapOptions};
 use crate::ingest::files::{FilesError, Kind, Readings};
 use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
@@ -283,6 +283,10 @@ impl Known {
         let mut config = if options.serve { config.located(file) } else { config };
         config.recorder.file = options.record.clone().unwrap_or_default();
         config.recorder.replaces = options.force;
+        // A replay of a recording without maps makes them.
+        if options.config.is_none() {
+            config.recorder.maps = RecordedMaps::Full;
+        }
         if !options.serve {
             (config.grpc.enabled, config.page.enabled, config.foxglove.enabled) = (false, false, false);
             (config.zenoh.enabled, config.zenoh.ros2.enabled) = (false, false);

@@ -7,6 +7,7 @@ use serde_json::{Value, json};
 use super::checked::{Checked, Outcome};
 use crate::cli::exit::Exit;
 use crate::cli::output::counted;
+use crate::config::RecordedMaps;
 use crate::record::compare::{Comparison, LayerChange, MapChange};
 
 /// The result of one file in one line: `equal`, the first difference, or why it cannot be read.
@@ -16,6 +17,7 @@ pub fn reason(outcome: &Outcome) -> String {
             let result = match report.differences.first() {
                 Some(first) => format!("{}: {first}", counted(report.different, "difference")),
                 None if report.events == 0 => "no event, so nothing is verified".to_owned(),
+                None if report.recorded == RecordedMaps::None => "the events are whole; no map is recorded".to_owned(),
                 None => "equal".to_owned(),
             };
             let unjudged = match report.unjudged {

@@ -139,7 +139,10 @@ impl Source {
                     self.refused_topics.entry(topic).or_insert_with(|| (0, error.to_string())).0 += 1;
                 }
             }
-            RecordedMessage::Map { .. } | RecordedMessage::Keyframe { .. } | RecordedMessage::Counts(_) => {}
+            RecordedMessage::Map { .. }
+            | RecordedMessage::Digest { .. }
+            | RecordedMessage::Keyframe { .. }
+            | RecordedMessage::Counts(_) => {}
         }
     }
 }

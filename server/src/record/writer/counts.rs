@@ -7,6 +7,8 @@ use std::time::{Duration, Instant};
 
 use clearway_proto::v1;
 
+use super::super::mcap_file::topic_of_layer;
+use crate::config::RecordedMaps;
 use crate::sync::locked;
 
 /// A recording ended before the last event or map.
@@ -92,8 +94,8 @@ struct Changing {
 }
 
 impl RecorderCounts {
-    /// Counts of a recorder of these vehicles, with the layers of their maps.
-    pub fn new(vehicles: &[(Arc<str>, Vec<&'static str>)]) -> Self {
+    /// Counts of a recorder of these vehicles, with the layers that are recorded of their maps.
+    pub fn new(vehicles: &[(Arc<str>, Vec<&'static str>)], maps: RecordedMaps) -> Self {
         let mut counts = Self {
             topics: Vec::new(),
             first_topics: Vec::new(),
@@ -111,7 +113,8 @@ impl RecorderCounts {
             counts.vehicles.push(vehicle.clone());
             counts.durable.push(AtomicU64::new(0));
             let journal = format!("/{vehicle}/journal");
-            let names = std::iter::once(journal).chain(layers.iter().map(|layer| format!("/{vehicle}/map/{layer}")));
+            let of_layers = layers.iter().map(|layer| topic_of_layer(vehicle, layer, maps));
+            let names = std::iter::once(journal).chain(of_layers);
             counts.topics.extend(names.map(|name| TopicCounters { name, ..TopicCounters::default() }));
         }
         counts
@@ -120,6 +123,12 @@ impl RecorderCounts {
     /// The index of a vehicle's first topic, its journal.
     pub(super) fn first_topic(&self, vehicle: usize) -> usize {
         self.first_topics[vehicle]
+    }
+
+    /// True if something is recorded of the vehicle's maps.
+    pub(super) fn has_maps(&self, vehicle: usize) -> bool {
+        let end = self.first_topics.get(vehicle + 1).copied().unwrap_or(self.topics.len());
+        end > self.first_topics[vehicle] + 1
     }
 
     /// The names of all topics.

@@ -17,7 +17,7 @@ use clearway_mapping::pipeline::{Handover, Pipeline};
 
 use super::super::mcap_file::Header;
 use super::counts::RecorderCounts;
-use crate::config::Recorder as Options;
+use crate::config::{RecordedMaps, Recorder as Options};
 use crate::encode::EncodedMap;
 use crate::traces::Hop;
 
@@ -59,12 +59,16 @@ pub(super) struct Link {
 /// The queue of a recording, with a handle for each vehicle of the header. What the handles send belongs to part 1.
 pub(super) fn link(options: &Options, header: &Header, waits: bool) -> (Link, Vec<RecordingHandle>) {
     let (queue, items) = sync_channel(options.queue);
-    let counts = Arc::new(RecorderCounts::new(&header.vehicles));
+    let mut header = header.clone();
+    if options.maps == RecordedMaps::None {
+        header.vehicles.iter_mut().for_each(|(_, layers)| layers.clear());
+    }
+    let counts = Arc::new(RecorderCounts::new(&header.vehicles, options.maps));
     let wanted = Arc::new(AtomicU64::new(1));
     let warm_up = Duration::from_millis(options.warm_up_ms);
     let handle = |vehicle| RecordingHandle::new(vehicle, queue.clone(), counts.clone(), waits, wanted.clone(), warm_up);
     let handles = (0..header.vehicles.len()).map(handle).collect();
-    let (options, header) = (options.clone(), header.clone());
+    let options = options.clone();
     (Link { items, counts, wanted, options, header, waits }, handles)
 }
 
@@ -155,7 +159,7 @@ impl RecordingHandle {
 
     /// Records a map; `hop` ends when it is written or lost.
     pub fn record_map(&mut self, map: &Arc<EncodedMap>, hop: Hop) {
-        if self.part.is_none() {
+        if self.part.is_none() || !self.counts.has_maps(self.vehicle) {
             return;
         }
         let first = self.counts.first_topic(self.vehicle) + 1;

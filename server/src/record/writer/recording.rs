@@ -258,9 +258,9 @@ impl<F: Files> RecordingWriter<F> {
             }
             Item::Begin { vehicle, part, handover } => {
                 let phase = v1::KeyframePhase::Begin.into();
-                let (next_map, refused) = (handover.next_map, handover.refused());
-                let keyframe =
-                    v1::Keyframe { phase, first_event: self.vehicles[vehicle].next_event, next_map, refused };
+                let (next_map, (epoch, newest_end_ns)) = (handover.next_map, handover.newest);
+                let (first_event, refused) = (self.vehicles[vehicle].next_event, handover.refused());
+                let keyframe = v1::Keyframe { phase, first_event, next_map, refused, epoch, newest_end_ns };
                 self.in_part(part, now, |part| part.file.write_keyframe(vehicle, &keyframe));
                 let is_open = self.parts.iter().any(|open| open.number == part);
                 let state = &mut self.vehicles[vehicle];

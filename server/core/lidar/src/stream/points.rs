@@ -25,7 +25,7 @@ const FAR_M: f64 = 25.04;
 /// Sine and cosine of every azimuth, by its count.
 static AZIMUTHS: LazyLock<Vec<[f32; 2]>> = LazyLock::new(|| {
     let sin_cos =
-        |count: u32| (f64::from(count) * std::f64::consts::TAU / f64::from(AZIMUTHS_PER_REVOLUTION)).sin_cos();
+        |count: u32| libm::sincos(f64::from(count) * std::f64::consts::TAU / f64::from(AZIMUTHS_PER_REVOLUTION));
     (0..AZIMUTHS_PER_REVOLUTION).map(sin_cos).map(|(sin, cos)| [sin as f32, cos as f32]).collect()
 });
 
@@ -169,8 +169,8 @@ impl Bank {
         let y = |i: usize| near(laser(i).dist_correction_y, i, NEAR_Y_M);
         Self {
             rotation_rad: std::array::from_fn(|i| laser(i).rot_correction),
-            sin_elevation: std::array::from_fn(|i| laser(i).vert_correction.sin() as f32),
-            cos_elevation: std::array::from_fn(|i| laser(i).vert_correction.cos() as f32),
+            sin_elevation: std::array::from_fn(|i| libm::sin(laser(i).vert_correction) as f32),
+            cos_elevation: std::array::from_fn(|i| libm::cos(laser(i).vert_correction) as f32),
             far_m: std::array::from_fn(|i| laser(i).dist_correction as f32),
             vertical_m: std::array::from_fn(|i| laser(i).vert_offset_correction as f32),
             horizontal_m: std::array::from_fn(|i| laser(i).horiz_offset_correction as f32),
@@ -195,6 +195,6 @@ impl Rotation {
         let all = |f: fn(f64) -> f64| {
             (0..banks.len()).map(|bank| std::array::from_fn(|i| f(angle(bank, i)) as f32)).collect::<Vec<Lanes>>()
         };
-        Self { step, sin: all(f64::sin), cos: all(f64::cos) }
+        Self { step, sin: all(libm::sin), cos: all(libm::cos) }
     }
 }

@@ -222,7 +222,7 @@ pub fn row_middles_m() -> [f32; ROWS] {
 pub fn column_directions() -> [[f32; 2]; COLUMNS] {
     const QUARTER: usize = COLUMNS / 4;
     std::array::from_fn(|column| {
-        let (y, x) = (((column % QUARTER) as f32 + 0.5) / COLUMNS as f32 * TAU).sin_cos();
+        let (y, x) = libm::sincosf(((column % QUARTER) as f32 + 0.5) / COLUMNS as f32 * TAU);
         [[x, y], [-y, x], [-x, -y], [y, -x]][column / QUARTER]
     })
 }
@@ -242,7 +242,7 @@ mod tests {
         let mut cells = PolarCells::new(Outline { width_m: 2.0, front_m: 3.0, rear_m: 2.0 });
         let mut sweep = Sweep { x: vec![-60.07333], y: vec![22.07249], ..Sweep::default() };
         for step in 0..3600 {
-            let (sin, cos) = (step as f32 * std::f32::consts::TAU / 3600.0).sin_cos();
+            let (sin, cos) = libm::sincosf(step as f32 * std::f32::consts::TAU / 3600.0);
             for range_m in [RANGE_M_MAX, RANGE_M_MAX.next_down(), RANGE_M_MAX.next_up()] {
                 sweep.x.push(range_m * cos);
                 sweep.y.push(range_m * sin);

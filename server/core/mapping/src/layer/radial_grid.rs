@@ -310,7 +310,7 @@ fn quarter_angle(y: f32, x: f32) -> f32 {
 pub fn ring_radii_m(calibration: &Calibration, height_m: f32, range_m_max: f32) -> Vec<f32> {
     let height = f64::from(height_m);
     let radius = |laser: &LaserCalibration| {
-        let (sin, cos) = laser.vert_correction.sin_cos();
+        let (sin, cos) = libm::sincos(laser.vert_correction);
         let offset = laser.vert_offset_correction;
         let range = (height + offset * cos) / -sin;
         (range * cos - offset * sin) as f32
@@ -340,7 +340,7 @@ mod tests {
 
     /// The exact column, and the distance from the position to the nearest column border, in columns.
     fn exact(x: f32, y: f32, columns: u16) -> (usize, f64) {
-        let turns = f64::from(y).atan2(f64::from(x)) / std::f64::consts::TAU;
+        let turns = libm::atan2(f64::from(y), f64::from(x)) / std::f64::consts::TAU;
         let column = turns.rem_euclid(1.0) * f64::from(columns);
         (column as usize % usize::from(columns), (column - column.round()).abs())
     }
@@ -351,7 +351,7 @@ mod tests {
             let grid = RadialGrid::new([0.0; 2], vec![100.0], columns);
             for step in 0..200_000 {
                 let (angle, range) = (f64::from(step) * 3.141_59e-5, 1.0 + f64::from(step % 97) * 0.7);
-                let (x, y) = ((range * angle.cos()) as f32, (range * angle.sin()) as f32);
+                let (x, y) = ((range * libm::cos(angle)) as f32, (range * libm::sin(angle)) as f32);
                 let (column, from_border) = exact(x, y, columns);
                 // A thousandth of a column at 1440 columns is 4 µrad, a quarter of a millimetre at 60 m.
                 if from_border > 1e-3 {

@@ -65,7 +65,7 @@ impl Shadow {
 
 /// Azimuth step and distance of a position.
 fn polar([x, y]: [f32; 2]) -> (u16, f32) {
-    let azimuth = (y.atan2(x) / TAU * AZIMUTHS as f32 + AZIMUTHS as f32 + 0.5) as usize % AZIMUTHS;
+    let azimuth = (libm::atan2f(y, x) / TAU * AZIMUTHS as f32 + AZIMUTHS as f32 + 0.5) as usize % AZIMUTHS;
     (azimuth as u16, (x * x + y * y).sqrt())
 }
 

@@ -126,7 +126,7 @@ pub fn check(road: &Road) -> Result<(), RoadError> {
         }
         if index > 0 {
             let [bx, by] = road.points[index - 1];
-            let distance_m = (x_m - bx).hypot(y_m - by);
+            let distance_m = libm::hypot(x_m - bx, y_m - by);
             if distance_m < SPACING_M_MIN {
                 return Err(RoadError::Coinciding { index, distance_m });
             }

@@ -20,7 +20,7 @@ impl LocalFrame {
         const SEMI_MAJOR_M: f64 = 6_378_137.0;
         const ECCENTRICITY_SQUARED: f64 = 6.694_379_990_14e-3;
         let (latitude, longitude) = (latitude_deg.to_radians(), longitude_deg.to_radians());
-        let (sin, cos) = ((latitude + self.latitude_rad) / 2.0).sin_cos();
+        let (sin, cos) = libm::sincos((latitude + self.latitude_rad) / 2.0);
         let w = 1.0 - ECCENTRICITY_SQUARED * sin * sin;
         let across_m = SEMI_MAJOR_M / w.sqrt();
         let along_m = SEMI_MAJOR_M * (1.0 - ECCENTRICITY_SQUARED) / (w * w.sqrt());

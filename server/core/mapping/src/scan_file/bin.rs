@@ -101,7 +101,7 @@ mod tests {
     fn scan(fields: usize) -> Vec<u8> {
         let point = |i: usize| {
             let (ring, angle) = ((i / 100) as f32, (i % 100) as f32 * 0.0628);
-            [(4.0 + ring) * angle.cos(), (4.0 + ring) * angle.sin(), -1.7, 0.25, ring, 0.013 * i as f32]
+            [(4.0 + ring) * libm::cosf(angle), (4.0 + ring) * libm::sinf(angle), -1.7, 0.25, ring, 0.013 * i as f32]
         };
         (0..800).flat_map(|i| bytes(&point(i)[..fields])).collect()
     }

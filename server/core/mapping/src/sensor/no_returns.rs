@@ -23,9 +23,7 @@ pub(crate) fn find_no_returns(
     no_returns.clear();
     let Some(echo) = revolution.echoes.first() else { return };
     let lasers: Vec<(f32, [f32; 2])> = (revolution.calibration.lasers.iter())
-        .map(|laser| {
-            (laser.rot_correction as f32, [laser.vert_correction.sin() as f32, laser.vert_correction.cos() as f32])
-        })
+        .map(|laser| (laser.rot_correction as f32, sin_cos(laser.vert_correction)))
         .collect();
     for (number, (firing, range_m)) in revolution.firings.iter().zip(echo.range_m.chunks(revolution.lasers)).enumerate()
     {
@@ -51,8 +49,14 @@ pub(crate) fn find_no_returns(
 
 /// Direction of a laser, sensor frame, from its azimuth (clockwise) and the sine and cosine of its elevation.
 fn direction(azimuth_rad: f32, [sin_elevation, cos_elevation]: [f32; 2]) -> [f32; 3] {
-    let (sin, cos) = azimuth_rad.sin_cos();
+    let (sin, cos) = libm::sincosf(azimuth_rad);
     [cos_elevation * cos, -cos_elevation * sin, sin_elevation]
+}
+
+/// Sine and cosine of an angle, in radians.
+fn sin_cos(angle_rad: f64) -> [f32; 2] {
+    let (sin, cos) = libm::sincos(angle_rad);
+    [sin as f32, cos as f32]
 }
 
 /// A direction turned by the rotation of a transform.
@@ -80,8 +84,8 @@ mod tests {
         for slot in (0..echo.range_m.len()).filter(|slot| echo.range_m[*slot] > 5.0) {
             let (firing, laser) = at(slot);
             let laser = &revolution.calibration.lasers[laser];
-            let elevation = [laser.vert_correction.sin() as f32, laser.vert_correction.cos() as f32];
-            let ray = direction(revolution.firings[firing].azimuth_rad - laser.rot_correction as f32, elevation);
+            let azimuth_rad = revolution.firings[firing].azimuth_rad - laser.rot_correction as f32;
+            let ray = direction(azimuth_rad, sin_cos(laser.vert_correction));
             let along = [echo.x[slot], echo.y[slot], echo.z[slot]].iter().zip(ray).map(|(p, r)| p * r).sum::<f32>();
             // The cosine of half a degree.
             assert!(along / echo.range_m[slot] > 0.99996, "slot {slot}");

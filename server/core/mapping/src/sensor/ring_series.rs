@@ -216,7 +216,7 @@ mod tests {
     fn ring(ranges_m: &[f32]) -> Scan {
         let mut scan = Scan::default();
         for (number, &range_m) in ranges_m.iter().enumerate().filter(|(_, range_m)| **range_m > 0.0) {
-            let (sin, cos) = (number as f32 * 0.2).to_radians().sin_cos();
+            let (sin, cos) = libm::sincosf((number as f32 * 0.2).to_radians());
             push(&mut scan, [range_m * cos, range_m * sin, 0.0], 3);
         }
         scan

@@ -74,7 +74,7 @@ pub fn from_order(scan: &Scan) -> Option<Vec<u16>> {
     let (mut piece, mut before) = (0u16, None);
     for ((&x, &y), &z) in scan.x.iter().zip(&scan.y).zip(&scan.z) {
         if classify(x, y, z).1 {
-            let azimuth = y.atan2(x).rem_euclid(TAU);
+            let azimuth = libm::atan2f(y, x).rem_euclid(TAU);
             if before.replace(azimuth).is_some_and(|before: f32| (azimuth - before).abs() > PI) {
                 piece += 1;
             }
@@ -104,7 +104,7 @@ fn ring_elevations(scan: &Scan, rings: &[u16]) -> Option<BTreeMap<u16, f32>> {
     let mut by_ring: BTreeMap<u16, Vec<f32>> = BTreeMap::new();
     for (((&x, &y), &z), &ring) in scan.x.iter().zip(&scan.y).zip(&scan.z).zip(rings) {
         if classify(x, y, z).1 {
-            by_ring.entry(ring).or_default().push(z.atan2(x.hypot(y)));
+            by_ring.entry(ring).or_default().push(libm::atan2f(z, libm::hypotf(x, y)));
         }
     }
     let median = |(ring, mut elevations): (u16, Vec<f32>)| {
@@ -121,7 +121,7 @@ fn clusters(scan: &Scan) -> Option<Calibration> {
     let mut points = 0;
     for ((&x, &y), &z) in scan.x.iter().zip(&scan.y).zip(&scan.z) {
         if classify(x, y, z).0 && x * x + y * y + z * z >= RANGE_M_MIN * RANGE_M_MIN {
-            let degrees = z.atan2(x.hypot(y)).to_degrees();
+            let degrees = libm::atan2f(z, libm::hypotf(x, y)).to_degrees();
             histogram[(((degrees + 90.0) / BIN_DEG) as usize).min(BINS - 1)] += 1;
             points += 1;
         }
@@ -159,9 +159,9 @@ mod tests {
             let (laser, column) = if by_ring { (15 - i / 200, i % 200) } else { (i % 16 * 7 % 16, i / 16) };
             let elevation = (2.0 * laser as f32 - 15.0).to_radians();
             let (azimuth, range) = (0.01 + column as f32 * TAU / 200.0, 5.0 + (i * 37 % 101) as f32 * 0.3);
-            scan.x.push(range * elevation.cos() * azimuth.cos());
-            scan.y.push(range * elevation.cos() * azimuth.sin());
-            scan.z.push(range * elevation.sin());
+            scan.x.push(range * libm::cosf(elevation) * libm::cosf(azimuth));
+            scan.y.push(range * libm::cosf(elevation) * libm::sinf(azimuth));
+            scan.z.push(range * libm::sinf(elevation));
             scan.intensity.push(0.0);
         }
         scan

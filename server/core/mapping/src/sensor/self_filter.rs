@@ -84,7 +84,7 @@ struct Sector {
 impl Sector {
     /// The sector between two angles, degrees clockwise from x seen from above.
     fn new([from_deg, to_deg]: [f32; 2]) -> Self {
-        let ray = |deg: f32| [deg.to_radians().cos(), -deg.to_radians().sin()];
+        let ray = |deg: f32| [libm::cosf(deg.to_radians()), -libm::sinf(deg.to_radians())];
         Self { from: ray(from_deg), to: ray(to_deg), is_wide: (to_deg - from_deg).rem_euclid(360.0) > 180.0 }
     }
 
@@ -157,7 +157,7 @@ mod tests {
 
     #[test]
     fn a_blind_sector_runs_clockwise_from_its_first_angle_to_its_second() {
-        let at = |deg: f32| [10.0 * deg.to_radians().cos(), -10.0 * deg.to_radians().sin(), 1.0];
+        let at = |deg: f32| [10.0 * libm::cosf(deg.to_radians()), -10.0 * libm::sinf(deg.to_radians()), 1.0];
         for (from, to) in [(80.0, 100.0), (350.0, 10.0), (30.0, 330.0), (0.0, 180.0)] {
             let filter = SelfFilter::new(None, [0.0; 3], &[[from, to]]).unwrap();
             for deg in (0..360).map(|deg| deg as f32 + 0.5) {

@@ -34,7 +34,7 @@ impl AzimuthBins {
         // to the bit.
         let line = |bin: usize, within: f64| {
             let angle = ((bin % (BINS / 4)) as f64 + within) / BINS as f64 * std::f64::consts::TAU;
-            let (y, x) = angle.sin_cos();
+            let (y, x) = libm::sincos(angle);
             [[x, y], [-y, x], [-x, -y], [y, -x]][bin / (BINS / 4)]
         };
         let lines = (0..BINS).map(|bin| [0.5, 0.25, 0.75].map(|within| line(bin, within)));

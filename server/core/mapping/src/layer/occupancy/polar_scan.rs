@@ -186,7 +186,7 @@ impl PolarScan {
     /// Sets the position of the sensor in the world, from the pose of the window.
     fn set_sensor_pose(&mut self, rays: &Rays<'_>, config: &OccupancyConfig, window: &Window) {
         let (pose, corner) = (window.ego_pose(), window.corner());
-        let (sin, cos) = pose.yaw_rad.sin_cos();
+        let (sin, cos) = libm::sincos(pose.yaw_rad);
         let [x, y] = [rays.origin_m[0], rays.origin_m[1]].map(|metres| f64::from(metres / config.cell_m));
         let from = [pose.cells[0] + x * cos - y * sin, pose.cells[1] + x * sin + y * cos];
         self.origin = [0, 1].map(|i| corner[i] as f64 + from[i]);
@@ -291,7 +291,7 @@ impl PolarScan {
     ) {
         let corner = window.corner();
         let from = [0, 1].map(|i| self.origin[i] - corner[i] as f64);
-        let (sin, cos) = self.yaw_rad.sin_cos();
+        let (sin, cos) = libm::sincos(self.yaw_rad);
         let reach = ((config.range_m_max / config.cell_m) as usize).min(azimuths.steps);
         if !from.iter().all(|cells| (0.0..window.side() as f64).contains(cells)) {
             return;

@@ -115,7 +115,7 @@ impl Window {
         let at = [pose.translation.x / self.cell_m, pose.translation.y / self.cell_m];
         self.scroll(at.map(|cells| cells.floor() as i64 - half));
         let cells = [0, 1].map(|i| at[i] - self.corner[i] as f64);
-        self.ego_pose = EgoPose { cells, yaw_rad: forward.y.atan2(forward.x) };
+        self.ego_pose = EgoPose { cells, yaw_rad: libm::atan2(forward.y, forward.x) };
         continues
     }
 
@@ -155,7 +155,7 @@ impl Window {
 
     /// The transform from the ego frame into the window, valid until the window moves.
     pub fn window_from_ego(&self) -> WindowFromEgo {
-        let (sin, cos) = self.ego_pose.yaw_rad.sin_cos();
+        let (sin, cos) = libm::sincos(self.ego_pose.yaw_rad);
         let rotation = [cos, sin].map(|part| (part / self.cell_m) as f32);
         WindowFromEgo { origin: self.ego_pose.cells.map(|cells| cells as f32), rotation }
     }

@@ -163,7 +163,7 @@ impl FreeSpace {
         let class = occupancy.and_then(|layer| TypedChannel::CLASS.values(&layer.channels));
         let (Some(layer), Some(class)) = (occupancy, class) else { return };
         let Geometry::Cartesian { origin_x_m, origin_y_m, width, cell_m, yaw_rad, .. } = layer.geometry else { return };
-        let (sin, cos) = yaw_rad.sin_cos();
+        let (sin, cos) = libm::sincos(yaw_rad);
         let occupied = (0..class.len()).filter(|cell| class[*cell] == OccupancyClass::Occupied.value());
         for cell in occupied {
             let (ix, iy) = (cell % width as usize, cell / width as usize);
@@ -186,7 +186,7 @@ impl FreeSpace {
 
     /// Makes radial cells unknown that have returns only from the vehicle itself.
     fn remove_own_returns(&mut self, sweep: &Sweep, outline: &Outline) {
-        let corner_m = outline.front_m.max(outline.rear_m).hypot(outline.width_m / 2.0);
+        let corner_m = libm::hypotf(outline.front_m.max(outline.rear_m), outline.width_m / 2.0);
         // Rows up to the end of the last one that touches the outline.
         let rows = (0..self.grid.rows()).take_while(|row| self.grid.row_span_m(*row).0 < corner_m).count();
         let reach_m = rows.checked_sub(1).map_or(0.0, |last| self.grid.row_span_m(last).1);

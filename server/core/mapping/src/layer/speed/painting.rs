@@ -132,7 +132,7 @@ impl Piece {
     /// The piece of two points; `None` if they are equal.
     fn new([from, to]: [[f64; 2]; 2], radii_m: [f64; 2]) -> Option<Self> {
         let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
-        let length_m = dx.hypot(dy);
+        let length_m = libm::hypot(dx, dy);
         (length_m > 0.0).then(|| Self { from, along: [dx / length_m, dy / length_m], radii_m, length_m })
     }
 
@@ -160,7 +160,7 @@ pub fn edge_points(points: &[[f64; 2]], widths_m: &[f64], edges: &mut Vec<[[f64;
     for (i, (&[x, y], &width)) in points.iter().zip(widths_m).enumerate() {
         let direction = |from: usize, to: usize| {
             let (dx, dy) = (points[to][0] - points[from][0], points[to][1] - points[from][1]);
-            (dx, dy, dx.hypot(dy))
+            (dx, dy, libm::hypot(dx, dy))
         };
         let (mut dx, mut dy, mut length) = direction(i.saturating_sub(1), (i + 1).min(last));
         if length == 0.0 {

@@ -158,7 +158,7 @@ pub fn divergence(votes: &[f32]) -> Option<f64> {
     let part = |&v: &f32| {
         let p = f64::from(v) / sum;
         // The limit of p ln p at 0 is 0.
-        if p > 0.0 { p * (p * votes.len() as f64).ln() } else { 0.0 }
+        if p > 0.0 { p * libm::log(p * votes.len() as f64) } else { 0.0 }
     };
     Some(votes.iter().map(part).sum())
 }
@@ -245,12 +245,12 @@ impl<'a> Walk<'a> {
 /// Length of a pair of points of a line.
 fn length(line: &[[f64; 2]], pair: usize) -> f64 {
     let ([ax, ay], [bx, by]) = (line[pair], line[pair + 1]);
-    (bx - ax).hypot(by - ay)
+    libm::hypot(bx - ax, by - ay)
 }
 
 /// Curvature of the circle through three positions: four times the triangle's area over the product of its sides.
 fn curvature_per_m([a, b, c]: [[f64; 2]; 3]) -> f64 {
-    let side = |p: [f64; 2], q: [f64; 2]| (q[0] - p[0]).hypot(q[1] - p[1]);
+    let side = |p: [f64; 2], q: [f64; 2]| libm::hypot(q[0] - p[0], q[1] - p[1]);
     let twice_area = ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs();
     let sides = side(a, b) * side(b, c) * side(a, c);
     // Two of the positions are equal, because the line turns back on itself: the curvature is that of a circle whose

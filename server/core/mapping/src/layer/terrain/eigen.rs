@@ -121,7 +121,7 @@ mod tests {
             thin in 0f64..1.0,
         ) {
             let mut values = values;
-            values[2] *= thin.powi(6);
+            values[2] *= libm::pow(thin, 6.0);
             let axes = Rotation3::from_euler_angles(roll, pitch, yaw);
             let matrix = axes.matrix() * Matrix3::from_diagonal(&Vector3::from(values)) * axes.matrix().transpose();
             let found = Principal::from_covariance(entries(&matrix));
@@ -130,7 +130,7 @@ mod tests {
             for (found, made) in found.values.iter().zip(sorted) {
                 prop_assert!((found - made).abs() < 1e-9 * sorted[0], "{found} {made}");
             }
-            let shares: Vec<f64> = (0..3).map(|i| axes.matrix()[(2, i)].powi(2)).collect();
+            let shares: Vec<f64> = (0..3).map(|i| axes.matrix()[(2, i)] * axes.matrix()[(2, i)]).collect();
             let most = (0..3).max_by(|i, j| shares[*i].total_cmp(&shares[*j])).unwrap();
             let clear = (0..3).all(|i| i == most || shares[most] - shares[i] > 1e-3);
             let apart = (0..3).all(|i| i == most || (values[most] - values[i]).abs() > 1e-4 * sorted[0]);
@@ -141,10 +141,10 @@ mod tests {
     }
 
     #[test]
-    fn the_cosine_of_a_third_agrees_with_the_standard_library() {
+    fn the_cosine_of_a_third_agrees_with_acos_and_cos() {
         for step in 0..=1000 {
             let cosine = f64::from(step) / 1000.0;
-            assert!((cosine_of_third(cosine) - (cosine.acos() / 3.0).cos()).abs() < 4e-16, "{cosine}");
+            assert!((cosine_of_third(cosine) - libm::cos(libm::acos(cosine) / 3.0)).abs() < 4e-16, "{cosine}");
         }
     }
 

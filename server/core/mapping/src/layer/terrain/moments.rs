@@ -338,9 +338,9 @@ mod tests {
         let mut sweep = Sweep::default();
         for k in 0..5000 {
             let (angle, range) = (k as f32 * 0.7, 0.012 * k as f32);
-            sweep.x.push(range * angle.cos());
-            sweep.y.push(range * angle.sin());
-            sweep.z.push(0.1 * angle.sin() - 0.2);
+            sweep.x.push(range * libm::cosf(angle));
+            sweep.y.push(range * libm::sinf(angle));
+            sweep.z.push(0.1 * libm::sinf(angle) - 0.2);
         }
         for (division, side, margin) in [(Division::Halves, 160, 0), (Division::Quarters, 256, 48)] {
             let mut cells = Cells::new(20.0, 0.25, division);

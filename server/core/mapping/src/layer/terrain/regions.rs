@@ -35,9 +35,10 @@ impl Plane {
         (a * a + b * b).sqrt()
     }
 
-    /// The plane of least squares through the points. `noise_m2` is added to the variances of the positions, so that a
-    /// piece of one ring, which does not determine the slope across it, has slope 0 there.
-    fn fit(moments: &Moments, noise_m2: f64) -> Self {
+    /// The plane of least squares through the points. The square of `noise_m` is added to the variances of the
+    /// positions, so that a piece of one ring, which does not determine the slope across it, has slope 0 there.
+    fn fit(moments: &Moments, noise_m: f32) -> Self {
+        let noise_m2 = f64::from(noise_m) * f64::from(noise_m);
         let [mut xx, mut yy, _, xy, xz, yz] = moments.covariance();
         (xx, yy) = (xx + noise_m2, yy + noise_m2);
         let determinant = xx * yy - xy * xy;
@@ -111,7 +112,7 @@ impl Regions {
                 continue;
             }
             if division.judges(&region) && is_flat(&moments, f64::from(config.flatness_m2_max)) {
-                let plane = Plane::fit(&moments, f64::from(config.noise_m).powi(2));
+                let plane = Plane::fit(&moments, config.noise_m);
                 if config.variant == Variant::Paper || is_ground_like(&plane, cells, from..to, config) {
                     self.planes.push(plane);
                     self.paint(cells.width(), cells.extent(&region), FIRST_FLAT + self.planes.len() as u32 - 1);
@@ -128,7 +129,7 @@ impl Regions {
 
     /// Adds a flat region; returns the value for its cells.
     fn add(&mut self, moments: &Moments, config: &TerrainConfig) -> u32 {
-        self.planes.push(Plane::fit(moments, f64::from(config.noise_m).powi(2)));
+        self.planes.push(Plane::fit(moments, config.noise_m));
         FIRST_FLAT + self.planes.len() as u32 - 1
     }
 

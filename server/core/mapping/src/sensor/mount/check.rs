@@ -94,7 +94,8 @@ impl MountCheck {
         let Some(plane) = self.ground_plane(sweep) else { return };
         let [x, y, _] = origin_m.map(f64::from);
         let normal = Vector3::new(-plane.x, -plane.y, 1.0).normalize();
-        let (roll_rad, pitch_rad) = (normal.y.atan2(normal.z), -normal.x.atan2(normal.y.hypot(normal.z)));
+        let (roll_rad, pitch_rad) =
+            (libm::atan2(normal.y, normal.z), -libm::atan2(normal.x, libm::hypot(normal.y, normal.z)));
         if self.deviations.len() == SCANS_MAX {
             self.deviations.pop_front();
         }
@@ -153,7 +154,8 @@ impl MountCheck {
 
 /// Weight of a cell by its range and by its distance from the vehicle's path.
 fn weight([x, y, _]: &[f64; 3]) -> f64 {
-    1.0 / ((x * x + y * y + NEAR_M * NEAR_M) * (1.0 + (y / PATH_M).powi(4)))
+    let squared = (y / PATH_M) * (y / PATH_M);
+    1.0 / ((x * x + y * y + NEAR_M * NEAR_M) * (1.0 + squared * squared))
 }
 
 /// The plane of weighted least squares; `None` if the cells lie in a line.
@@ -184,7 +186,7 @@ mod tests {
         let mut sweep = Sweep::default();
         for i in 0..240 * 160 {
             let (x, y) = ((i / 160) as f32 * 0.1 - 12.0, (i % 160) as f32 * 0.1 - 8.0);
-            if x.hypot(y) < 3.0 {
+            if libm::hypotf(x, y) < 3.0 {
                 continue;
             }
             let object = if y > 2.5 || (4.0..8.0).contains(&x) && y.abs() < 0.9 { 1.0 } else { 0.0 };

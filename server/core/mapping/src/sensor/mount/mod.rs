@@ -136,8 +136,8 @@ where
     let [slope_y, slope_y_std] = combine(|plane| [plane.slope[1], plane.slope_std[1]]);
     // Rz(0) Ry(pitch) Rx(roll) rotates the ground's normal, sensor frame, onto the vertical.
     let normal = Vector3::new(-slope_x, -slope_y, 1.0).normalize();
-    let roll_rad = normal.y.atan2(normal.z);
-    let pitch_rad = -normal.x.atan2(normal.y.hypot(normal.z));
+    let roll_rad = libm::atan2(normal.y, normal.z);
+    let pitch_rad = -libm::atan2(normal.x, libm::hypot(normal.y, normal.z));
     debug_assert!((UnitQuaternion::from_euler_angles(roll_rad, pitch_rad, 0.0) * normal - Vector3::z()).norm() < 1e-9);
     let residuals = found.iter().map(|plane| [plane.residual_m, 1.0]).collect();
     Ok(MountEstimate {
@@ -160,11 +160,11 @@ where
 /// because revolutions that follow each other see the same road.
 fn combined(mut values: Vec<[f64; 2]>) -> [f64; 2] {
     values.sort_by(|a, b| a[0].total_cmp(&b[0]));
-    let weighted: Vec<[f64; 2]> = values.iter().map(|[value, std]| [*value, std.powi(-2)]).collect();
+    let weighted: Vec<[f64; 2]> = values.iter().map(|[value, std]| [*value, 1.0 / (std * std)]).collect();
     let mut stds: Vec<f64> = values.iter().map(|[_, std]| *std).collect();
     stds.sort_by(f64::total_cmp);
     let own = stds.get(stds.len() / 2).copied().unwrap_or(0.0);
-    [weighted_median(&weighted), own.hypot(weighted_std(&weighted))]
+    [weighted_median(&weighted), libm::hypot(own, weighted_std(&weighted))]
 }
 
 #[cfg(test)]

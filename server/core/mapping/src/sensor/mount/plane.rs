@@ -134,7 +134,7 @@ impl Plane {
 
     fn is_plausible(&self) -> bool {
         // NaN fails both comparisons.
-        HEIGHT_M.contains(&self.height_m()) && self.0.x.hypot(self.0.y) <= SLOPE_MAX
+        HEIGHT_M.contains(&self.height_m()) && libm::hypot(self.0.x, self.0.y) <= SLOPE_MAX
     }
 }
 
@@ -156,8 +156,8 @@ impl Refined {
         let mut refined = Self { residual_m: (STD_OF_MEDIAN * median).max(RESIDUAL_M_MIN), ..Self::default() };
         for cell in &cells {
             let scaled = plane.distance(cell) / (TUKEY * refined.residual_m);
-            let loss = (1.0 - (scaled * scaled).min(1.0)).powi(2);
-            let (weight, row) = (loss * path_weight(cell), Vector3::new(cell.x, cell.y, 1.0));
+            let loss = 1.0 - (scaled * scaled).min(1.0);
+            let (weight, row) = (loss * loss * path_weight(cell), Vector3::new(cell.x, cell.y, 1.0));
             let (matrix, vector) = &mut refined.sums[sector(cell)];
             *matrix += row * row.transpose() * weight;
             *vector += row * (cell.z * weight);
@@ -194,7 +194,8 @@ fn near_weight(p: &Vector3<f64>) -> f64 {
 
 /// Weight of a cell by its range and by its distance from the vehicle's path.
 fn path_weight(p: &Vector3<f64>) -> f64 {
-    near_weight(p) / (1.0 + (p.y / PATH_M).powi(4))
+    let squared = (p.y / PATH_M) * (p.y / PATH_M);
+    near_weight(p) / (1.0 + squared * squared)
 }
 
 /// The points around the sensor in which the ground is searched.
@@ -266,7 +267,7 @@ fn best_candidate(samples: &[Vector3<f64>]) -> Option<Plane> {
 
 /// Direction of a point: 0 to 11, counter-clockwise.
 fn sector(p: &Vector3<f64>) -> usize {
-    ((p.y.atan2(p.x) / std::f64::consts::TAU).rem_euclid(1.0) * SECTORS as f64) as usize % SECTORS
+    ((libm::atan2(p.y, p.x) / std::f64::consts::TAU).rem_euclid(1.0) * SECTORS as f64) as usize % SECTORS
 }
 
 /// Number of directions in which there are points.
