@@ -165,6 +165,14 @@ impl EventQueue {
         self.push_batch([(source, body)])
     }
 
+    /// Pushes an event that is no reading, stamped now, if the queue has space. Never waits, and counts nothing: the
+    /// caller tries again. True if the event is on the queue.
+    pub fn push_if_space(&self, source: u16, body: Body) -> bool {
+        let mut state = locked(&self.state);
+        let Some(place) = self.try_acquire() else { return false };
+        state.push(place.into(), Reading { arrival_ns: self.clock.now_ns(), source, body }, None).is_ok()
+    }
+
     /// Pushes live readings that arrived together, all with the same stamp. Never waits, as [`EventQueue::push`].
     ///
     /// # Errors
