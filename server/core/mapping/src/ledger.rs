@@ -135,11 +135,19 @@ impl Ledgers {
     /// Counts one event and what became of it.
     pub fn record(&mut self, event: &Event, outcome: &Result<Outcome, EventError>) {
         match (&event.body, outcome) {
-            (Body::Datagram(_) | Body::Scan(_) | Body::End | Body::Withdrawn, Ok(outcome)) => self.record_reading(event, outcome),
-            (Body::Datagram(_) | Body::Scan(_), Err(error)) => self.each(event.source, |ledger| {
-                ledger.received += 1;
-                ledger.record_refused(error.reason(), 1);
-            }),
+            (Body::Datagram(_) | Body::Scan(_) | Body::End | Body::Withdrawn, Ok(outcome)) => {
+                self.record_reading(event, outcome)
+            }
+            (Body::Datagram(_) | Body::Scan(_), Err(error)) => {
+                let refuse = |ledger: &mut Ledger| {
+                    ledger.received += 1;
+                    ledger.record_refused(error.reason(), 1);
+                };
+                match error {
+                    EventError::Source { .. } => refuse(&mut self.vehicle),
+                    _ => self.each(event.source, refuse),
+                }
+            }
             // An accepted `End` is not a reading; an `End` for an unknown sensor counts as one refused reading.
             (Body::End | Body::Withdrawn, Err(_)) => self.vehicle.record_lost(Cause::Sender, 1),
             (Body::EgoPose(_), Ok(_)) => self.vehicle.poses += 1,
