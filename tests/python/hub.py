@@ -32,6 +32,8 @@ def machine(name: str, host: int) -> int:
     ip("netns", "add", name)
     ip("link", "set", f"hub{host}", "netns", name, "name", "wire")
     inside = ["-n", name]
+    # The second address stays when the first is deleted.
+    ip("netns", "exec", name, "sysctl", "-qw", "net.ipv4.conf.all.promote_secondaries=1")
     for address in (host, host + 100):
         ip(*inside, "address", "add", f"10.99.0.{address}/24", "dev", "wire")
     ip(*inside, "link", "set", "wire", "up")
@@ -56,11 +58,12 @@ def main() -> None:
             left = max(0.0, waiting[0][0] - time.monotonic()) if waiting else None
             for key, _ in ready.select(left):
                 if key.data is None:
-                    line = sys.stdin.readline()
-                    if not line:
+                    # Not by readline, which would keep a second line where `select` does not see it.
+                    text = os.read(sys.stdin.fileno(), 4096).decode()
+                    if not text:
                         return
-                    first, second, delay_ms, loss = line.split()
-                    links[frozenset((hosts[first], hosts[second]))] = float(delay_ms) / 1e3, float(loss)
+                    for first, second, delay_ms, loss in map(str.split, text.splitlines()):
+                        links[frozenset((hosts[first], hosts[second]))] = float(delay_ms) / 1e3, float(loss)
                     continue
                 try:
                     packet = os.read(key.fd, 65536)

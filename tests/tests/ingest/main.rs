@@ -309,10 +309,10 @@ async fn sensors_end_with_the_last_stream_that_declared_them_and_the_recording_r
     let moved = Sensor { y_m: -0.8, ..left };
     let last = vec![declared(&moved), seen("left", 1_200_000_000), seen("top", 1_210_000_000)];
     assert_eq!(send_all(&mut third, last).await, []);
-    let mut stranger = ingester(&running).await;
+    let mut undeclared = ingester(&running).await;
     drop(third);
     until("the end of the sensor", || sensors(&running) == ["top"]).await;
-    let unknown = send_all(&mut stranger, vec![seen("left", 1_300_000_000)]).await;
+    let unknown = send_all(&mut undeclared, vec![seen("left", 1_300_000_000)]).await;
     assert_eq!(by_reason(&unknown), [("source", 1)].into(), "{unknown:?}");
     within("shutdown", running.shutdown()).await.unwrap();
     let report = verify(&file).unwrap();
