@@ -46,7 +46,7 @@ def main() -> None:
     seeded = random.Random(16)
     links: dict[frozenset[int], tuple[float, float]] = {}
     waiting: list[tuple[float, int, int, bytes]] = []
-    passed = 0
+    passed, begun = 0, ""
     try:
         tuns = {host: machine(name, host) for name, host in hosts.items()}
         ready = selectors.DefaultSelector()
@@ -62,7 +62,8 @@ def main() -> None:
                     text = os.read(sys.stdin.fileno(), 4096).decode()
                     if not text:
                         return
-                    for first, second, delay_ms, loss in map(str.split, text.splitlines()):
+                    *lines, begun = (begun + text).split("\n")
+                    for first, second, delay_ms, loss in map(str.split, lines):
                         links[frozenset((hosts[first], hosts[second]))] = float(delay_ms) / 1e3, float(loss)
                     continue
                 try:
