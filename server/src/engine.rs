@@ -166,7 +166,7 @@ impl Engine {
         let Some(map) = self.pipeline.newest_map() else { return };
         // Without any configured layer a revolution makes no map; without any subscriber it makes a header.
         let encoded = (!self.status.layers.is_empty()).then(|| {
-            let states = map.sensors.iter().map(encode::sensor).collect();
+            let states = map.present_sensors().map(encode::sensor).collect();
             let (name, boot_id) = (self.status.name.clone(), self.status.boot_id);
             (Arc::new(EncodedMap::replayed(map, name, boot_id, self.valid_ms, self.replayed)), states)
         });

@@ -16,9 +16,10 @@ const LIMITS: [(&str, &str); 12] = [
     // Handshakes at a time; a peer that opens a connection and stays silent loses it after 5 s.
     ("transport/unicast/accept_pending", "100"),
     ("transport/unicast/accept_timeout", "5000"),
-    ("transport/unicast/open_timeout", "5000"),
-    // A restarted router has the maps again within a second.
-    ("connect/retry", "{ period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2 }"),
+    // A peer behind a repaired link, or a restarted router, has the maps again within 2 s: the kernel repeats the first
+    // packet of a connection after 1 s and then only after 3 s, so that a new attempt is sooner.
+    ("transport/unicast/open_timeout", "2000"),
+    ("connect/retry", "{ period_init_ms: 100, period_max_ms: 500, period_increase_factor: 2 }"),
     // A peer that disappears silently (a pulled cable) is noticed after 2 s; a live one sends four keep-alive
     // messages in that time.
     ("transport/link/tx/lease", "2000"),

@@ -42,7 +42,7 @@ _SETTINGS = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "connect/timeout_ms": 5000,
-    "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "transport/unicast/open_timeout": 2000,
     "transport/link/tx/lease": 2000,
     "transport/link/rx/max_message_size": 16777216,
@@ -59,13 +59,13 @@ def _session(endpoint: str, tls: Tls | None) -> zenoh.Session:
         raise ClearwayError("zenoh", "zenoh is not installed: pip install 'clearway[zenoh]'") from None
     encrypted = {"so_rcvbuf": 262144}
     if tls is not None:
-        if not endpoint.startswith("tls/"):
+        if not all(one.startswith("tls/") for one in endpoint.split(",")):
             raise ClearwayError("certificate", f"zenoh:{endpoint}: certificates are for zenoh:tls/HOST:PORT")
         files = {_CERTIFICATES[name]: path for name, path in tls.files().items()}
         # Without this setting the client presents no certificate.
         encrypted |= files | {"enable_mtls": tls.cert is not None}
     config = zenoh.Config()
-    for key, value in (_SETTINGS | {"connect/endpoints": [endpoint], "transport/link/tls": encrypted}).items():
+    for key, value in (_SETTINGS | {"connect/endpoints": endpoint.split(","), "transport/link/tls": encrypted}).items():
         config.insert_json5(key, json.dumps(value))
     try:
         return zenoh.open(config)

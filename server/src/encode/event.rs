@@ -174,6 +174,7 @@ pub fn event_to_proto(event: &Event) -> v1::Event {
         Body::Sensor(sensor) => v1::event::Body::Sensor(sensor_config(sensor)),
         Body::Lost { count, .. } => v1::event::Body::Lost(*count),
         Body::End => v1::event::Body::End(v1::End {}),
+        Body::Withdrawn => v1::event::Body::Withdrawn(v1::Withdrawn {}),
     };
     v1::Event {
         sequence: event.sequence,
@@ -257,6 +258,7 @@ pub fn event_from_bytes(bytes: Bytes) -> Result<Event, EventDecodeError> {
             Body::Lost { cause, count }
         }
         v1::event::Body::End(v1::End {}) => Body::End,
+        v1::event::Body::Withdrawn(v1::Withdrawn {}) => Body::Withdrawn,
     };
     Ok(Event { sequence, arrival_ns: event.arrival_ns, source, body })
 }
@@ -305,6 +307,7 @@ mod tests {
             Body::Lost { cause: Cause::Queue, count: 12 },
             Body::Lost { cause: Cause::Kernel, count: 3 },
             Body::End,
+            Body::Withdrawn,
         ];
         for (sequence, body) in (0..).zip(bodies) {
             let event = Event { sequence, arrival_ns: i64::MIN + 1, source: 3, body };

@@ -197,7 +197,7 @@ fn header(map: &Map, vehicle: &str, boot_id: u64, valid_ms: u32) -> v1::Header {
         valid_until_ns: map.capture_end_ns.saturating_add(i64::from(valid_ms) * 1_000_000),
         map_from_ego: map.map_from_ego.as_ref().map(pose),
         speed_mps: map.speed_mps,
-        sensors: map.sensors.iter().map(sensor).collect(),
+        sensors: map.present_sensors().map(sensor).collect(),
         compensation: map.compensation.as_str().to_owned(),
         source_sensor: map.sensors.get(usize::from(map.source)).map_or(String::new(), |sensor| sensor.name.clone()),
         reference_sensor: (map.sensors.get(usize::from(map.reference_sensor)))

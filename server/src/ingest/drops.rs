@@ -43,11 +43,11 @@ pub struct UnknownSender {
 impl DropCounters {
     /// Adds the drops that are not reported to the engine yet to the vehicle's ledger and to the ledgers of its
     /// sensors.
-    pub fn add_unreported_to<'a>(&self, ledger: &mut Ledger, sensors: impl IntoIterator<Item = &'a mut Ledger>) {
-        let mut sensors: Vec<_> = sensors.into_iter().collect();
+    pub fn add_unreported_to<'a>(&self, ledger: &mut Ledger, sensors: impl IntoIterator<Item = (u16, &'a mut Ledger)>) {
+        let mut sensors: BTreeMap<_, _> = sensors.into_iter().collect();
         for (&(cause, source), &count) in &*locked(&self.unreported) {
             ledger.record_lost(cause, count);
-            if let Some(sensor) = sensors.get_mut(usize::from(source)).filter(|_| cause.has_source()) {
+            if let Some(sensor) = sensors.get_mut(&source).filter(|_| cause.has_source()) {
                 sensor.record_lost(cause, count);
             }
         }

@@ -1,6 +1,7 @@
 //! The gateway of one vehicle: one observation of a client -> events on the vehicle's queue. gRPC and zenoh both use
 //! it.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
 use clearway_mapping::config::{SensorConfig, VehicleConfig};
@@ -25,11 +26,37 @@ pub struct Gateway {
     /// Greatest number of events in flight of one client. All streams together fill half the vehicle's queue; the other
     /// half is for UDP.
     pub in_flight_max: usize,
-    /// With the declared sensors: the configuration that the engine will have after the events pushed so far.
-    config: Mutex<VehicleConfig>,
+    sensors: Mutex<Sensors>,
     streams: Arc<Semaphore>,
     streams_max: usize,
     queue: EventQueue,
+}
+
+/// The sensors of a vehicle, as the engine will have them after the events pushed so far.
+#[derive(Debug)]
+struct Sensors {
+    /// With the declared sensors.
+    config: VehicleConfig,
+    /// Number of clients that have declared each declared sensor, by its index. One without a client is withdrawn as
+    /// soon as the queue has space.
+    clients: BTreeMap<u16, usize>,
+}
+
+impl Sensors {
+    /// Index of the sensor of this name; of the only sensor if the name is empty.
+    fn source(&self, name: &str, vehicle: &str) -> Result<u16, UnknownNameError> {
+        let sensors = &self.config.sensors;
+        if name.is_empty() && sensors.len() == 1 {
+            return Ok(0);
+        }
+        let present = sensors.iter().filter(|sensor| !sensor.is_withdrawn());
+        let index = sensors.iter().position(|sensor| sensor.name == name && !sensor.is_withdrawn());
+        index.and_then(|index| u16::try_from(index).ok()).ok_or_else(|| UnknownNameError::Sensor {
+            name: name.to_owned(),
+            vehicle: vehicle.to_owned(),
+            known: present.map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", "),
+        })
+    }
 }
 
 /// All streams that a vehicle allows are open.
@@ -53,7 +80,7 @@ impl Gateway {
                 ..Limits::from_points_max(vehicle.ingest.points_max)
             },
             in_flight_max: (vehicle.ingest.events_max(vehicle.queue) / streams_max).max(1),
-            config: Mutex::new(vehicle.core()),
+            sensors: Mutex::new(Sensors { config: vehicle.core(), clients: BTreeMap::new() }),
             streams: Arc::new(Semaphore::new(streams_max)),
             streams_max,
             queue: queue.clone(),
@@ -83,32 +110,43 @@ impl Gateway {
     ) -> Result<(), UnknownNameError> {
         let (client, number) = (observation.client, observation.number);
         let concerns_vehicle = concerns_vehicle(&observation);
+        let sensor = if concerns_vehicle { None } else { Some(observation.sensor.clone()) };
         if let Err(error) = session.check_number(number) {
             self.refuse(session, number, "number", error.to_string());
             return Ok(());
         }
-        let source = match self.source_of(&observation) {
-            Ok(source) => source,
-            Err(unknown) => {
-                session.begin(number, 0, 0);
-                self.refuse(session, number, "source", unknown.to_string());
-                return Err(unknown);
-            }
+        let source = |sensors: &Sensors| sensor.as_ref().map_or(Ok(0), |name| sensors.source(name, &self.vehicle));
+        let refuse = |unknown: UnknownNameError, session: &mut ClientSession| {
+            session.begin(number, 0, 0);
+            self.refuse(session, number, "source", unknown.to_string());
+            Err(unknown)
+        };
+        let known = match source(&locked(&self.sensors)) {
+            Ok(known) => known,
+            Err(unknown) => return refuse(unknown, session),
         };
         let now_ns = self.queue.now_ns();
         let decoded = observation::decode(observation, &self.limits);
         match decoded.and_then(|bodies| observation::check_stamps(bodies, now_ns, &self.limits)) {
             Err(error) => {
                 session.begin(number, 0, 0);
-                self.record_drop(if concerns_vehicle { UNKNOWN_SOURCE } else { source }, error.reason());
+                self.record_drop(if concerns_vehicle { UNKNOWN_SOURCE } else { known }, error.reason());
                 session.refuse(number, error.reason(), error.to_string(), 1);
             }
             Ok(bodies) => {
+                // While it was decoded, the sensor may have been withdrawn, and another declared at its index.
+                let mut sensors = locked(&self.sensors);
+                let source = match source(&sensors) {
+                    Ok(source) => source,
+                    Err(unknown) => return refuse(unknown, session),
+                };
                 session.begin(number, bodies.len(), bytes);
                 for (captured_ns, body) in bodies {
                     let receipt = Receipt::new(ObservationId { client, number }, outcomes);
                     match body {
-                        Body::Sensor(sensor) => self.push_declaration(captured_ns, sensor, receipt),
+                        Body::Sensor(sensor) => {
+                            self.push_declaration(captured_ns, sensor, receipt, &mut sensors, session);
+                        }
                         body => _ = self.push_event(captured_ns, source, body, receipt),
                     }
                 }
@@ -147,17 +185,51 @@ impl Gateway {
         self.queue.push_observation(captured_ns, source, body, receipt).unwrap_or(false)
     }
 
+    /// Ends a client: the sensors that it alone has declared are withdrawn.
+    pub fn end(&self, session: &mut ClientSession) {
+        let mut sensors = locked(&self.sensors);
+        for source in session.take_declared() {
+            sensors.clients.entry(source).and_modify(|clients| *clients = clients.saturating_sub(1));
+        }
+        self.withdraw_without_client(&mut sensors);
+    }
+
+    /// Withdraws the sensors whose clients have ended, as far as the queue has space.
+    fn withdraw_without_client(&self, sensors: &mut Sensors) {
+        let Sensors { config, clients } = sensors;
+        clients.retain(|source, clients| {
+            let is_withdrawn = *clients == 0 && self.queue.push_if_space(*source, Body::Withdrawn);
+            if is_withdrawn {
+                config.withdraw(usize::from(*source));
+            }
+            !is_withdrawn
+        });
+    }
+
     /// Pushes the declaration of a new sensor, or of one that exists already. The configuration here changes as the
     /// engine's will, so that the next observation can name the sensor.
-    fn push_declaration(&self, captured_ns: Option<i64>, sensor: Box<SensorConfig>, receipt: Receipt) {
-        let mut config = locked(&self.config);
-        let before = config.sensors.len();
-        let index = config.sensors.iter().position(|known| *known == *sensor).unwrap_or(before);
+    fn push_declaration(
+        &self,
+        captured_ns: Option<i64>,
+        sensor: Box<SensorConfig>,
+        receipt: Receipt,
+        sensors: &mut Sensors,
+        session: &mut ClientSession,
+    ) {
+        self.withdraw_without_client(sensors);
+        let Sensors { config, clients } = sensors;
+        let at = |is_it: &dyn Fn(&SensorConfig) -> bool| config.sensors.iter().position(is_it);
+        let known = at(&|known| *known == *sensor);
+        let index = known.or_else(|| at(&SensorConfig::is_withdrawn)).unwrap_or(config.sensors.len());
         let declared = config.declare(index, &sensor).map_err(|error| error.to_string());
         match declared.and_then(|_| u16::try_from(index).map_err(|error| error.to_string())) {
             Ok(source) => {
-                if !self.push_event(captured_ns, source, Body::Sensor(sensor), receipt) {
-                    config.sensors.truncate(before);
+                let is_pushed = self.push_event(captured_ns, source, Body::Sensor(sensor), receipt);
+                let is_declared = known.is_none() || clients.contains_key(&source);
+                if is_pushed && is_declared && session.declare(source) {
+                    *clients.entry(source).or_default() += 1;
+                } else if !is_pushed && known.is_none() {
+                    config.withdraw(index);
                 }
             }
             Err(message) => {
@@ -165,21 +237,6 @@ impl Gateway {
                 receipt.deliver(Outcome::Refused { reason: "sensor", message });
             }
         }
-    }
-
-    /// Index of the observation's sensor; 0 if the observation concerns the whole vehicle.
-    fn source_of(&self, observation: &v1::Observation) -> Result<u16, UnknownNameError> {
-        let name = &observation.sensor;
-        let sensors = &locked(&self.config).sensors;
-        if concerns_vehicle(observation) || (name.is_empty() && sensors.len() == 1) {
-            return Ok(0);
-        }
-        let index = sensors.iter().position(|sensor| sensor.name == *name);
-        index.and_then(|index| u16::try_from(index).ok()).ok_or_else(|| UnknownNameError::Sensor {
-            name: name.clone(),
-            vehicle: self.vehicle.to_string(),
-            known: sensors.iter().map(|sensor| sensor.name.as_str()).collect::<Vec<_>>().join(", "),
-        })
     }
 }
 

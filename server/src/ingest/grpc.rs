@@ -174,6 +174,13 @@ impl IngestStream {
     }
 }
 
+impl Drop for IngestStream {
+    /// The sensors that the stream has declared end with it.
+    fn drop(&mut self) {
+        self.gateway.end(&mut self.session);
+    }
+}
+
 /// True if the message was too long or not an observation, false for a failure of the network.
 fn is_refusal(status: &Status) -> bool {
     matches!(status.code(), Code::OutOfRange | Code::Internal)

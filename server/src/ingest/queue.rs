@@ -107,6 +107,8 @@ struct State {
     next_sequence: u64,
     /// Arrival of the newest report of drops, ns since the Unix epoch.
     reported_ns: i64,
+    /// Arrival of the newest event, ns since the Unix epoch; `None` before the first.
+    newest_ns: Option<i64>,
 }
 
 /// The space of a queue.
@@ -139,7 +141,7 @@ pub fn event_queue(capacity: usize) -> (EventQueue, Receiver<QueuedEvent>) {
 /// Creates a queue of `capacity` events that stamps live readings with `clock`.
 pub fn event_queue_with_clock(clock: Clock, capacity: usize) -> (EventQueue, Receiver<QueuedEvent>) {
     let (sender, events) = sync_channel(capacity);
-    let state = State { sender: Some(sender), next_sequence: 0, reported_ns: 0 };
+    let state = State { sender: Some(sender), next_sequence: 0, reported_ns: 0, newest_ns: None };
     let (state, space) = (Arc::new(Mutex::new(state)), Arc::new(Semaphore::new(capacity)));
     (EventQueue { state, space, capacity, shares: None, drops: Arc::default(), clock }, events)
 }
@@ -163,6 +165,16 @@ impl EventQueue {
     /// [`QueueClosedError`] if the engine has stopped.
     pub fn push(&self, source: u16, body: Body) -> Result<(), QueueClosedError> {
         self.push_batch([(source, body)])
+    }
+
+    /// Pushes an event that is no reading, if the queue has space. Its stamp is that of the newest event, so that the
+    /// time of a captured drive does not jump. Never waits, and counts nothing: the caller tries again. True if the
+    /// event is on the queue.
+    pub fn push_if_space(&self, source: u16, body: Body) -> bool {
+        let mut state = locked(&self.state);
+        let Some(place) = self.try_acquire() else { return false };
+        let arrival_ns = state.newest_ns.unwrap_or_else(|| self.clock.now_ns());
+        state.push(place.into(), Reading { arrival_ns, source, body }, None).is_ok()
     }
 
     /// Pushes live readings that arrived together, all with the same stamp. Never waits, as [`EventQueue::push`].
@@ -367,6 +379,7 @@ impl State {
         // There are as many permits as the channel is long, so this does not wait.
         sender.send(QueuedEvent { event, receipt, _space: space }).map_err(|_| QueueClosedError)?;
         self.next_sequence += 1;
+        self.newest_ns = Some(arrival_ns);
         Ok(())
     }
 }

@@ -1,7 +1,7 @@
 //! The outcome of an event -> a report to the client that sent it. The receipt is on the queue together with its
 //! event. It is not recorded, so a replay has no receipts.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 
 use clearway_mapping::error::EventError;
 use clearway_proto::v1;
@@ -101,6 +101,8 @@ pub struct ClientSession {
     /// The acknowledgement of the last report.
     reported: Option<u64>,
     refused: Vec<v1::Refused>,
+    /// Indices of the sensors that the client has declared.
+    declared: BTreeSet<u16>,
 }
 
 #[derive(Debug)]
@@ -114,6 +116,16 @@ impl ClientSession {
     /// The session of a client that has sent nothing yet.
     pub fn new(client: u64) -> Self {
         Self { client, ..Self::default() }
+    }
+
+    /// Remembers that the client has declared this sensor; false if it had done so before.
+    pub fn declare(&mut self, source: u16) -> bool {
+        self.declared.insert(source)
+    }
+
+    /// The sensors that the client has declared, which it has no more.
+    pub fn take_declared(&mut self) -> BTreeSet<u16> {
+        std::mem::take(&mut self.declared)
     }
 
     /// True if no observation is in flight.

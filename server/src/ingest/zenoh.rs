@@ -11,7 +11,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use clearway_proto::v1;
@@ -36,6 +36,9 @@ const QUEUED_MAX: usize = 256;
 const CLIENTS_MAX: usize = 64;
 /// Period and number of the repetitions of the newest acknowledgement.
 const REPEAT: (Duration, u32) = (Duration::from_secs(1), 10);
+/// Time without an observation after which a client has ended, and the sensors that it has declared with it. Ours:
+/// zenoh does not tell when a client behind a router is gone; a sensor that is silent for so long is no longer there.
+const SILENT_MAX: Duration = Duration::from_secs(600);
 
 /// A sample that is not decoded yet.
 struct QueuedSample {
@@ -153,8 +156,12 @@ impl Ingest {
                     };
                     self.push(&key, bytes, allowed, &mut clients, &outcome_sender);
                 }
-                _ = repeat.tick() => clients.request_repetitions(),
+                _ = repeat.tick() => {
+                    clients.request_repetitions();
+                    clients.forget_silent(Instant::now());
+                }
             }
+            clients.forgotten.drain(..).for_each(|mut session| self.gateway.end(&mut session));
             while let Ok((id, outcome)) = outcomes.try_recv() {
                 if let Some(client) = clients.get_mut(id.client) {
                     client.session.record_outcome(id.number, outcome);
@@ -228,9 +235,15 @@ fn sensor_of_key<'k>(key: &'k str, body: Option<&v1::observation::Body>) -> Opti
 
 /// The remembered clients of one vehicle, ordered from the longest silent to the most recent.
 #[derive(Default)]
-struct Clients(Vec<Client>);
+struct Clients {
+    all: Vec<Client>,
+    /// The sessions of clients that have ended since they were last taken.
+    forgotten: Vec<ClientSession>,
+}
 
 struct Client {
+    /// When its newest observation came.
+    heard: Instant,
     id: u64,
     session: ClientSession,
     /// Number of repetitions of its newest acknowledgement that are left.
@@ -242,42 +255,58 @@ struct Client {
 impl Clients {
     /// The client `id`, which becomes the most recent one.
     fn get_or_insert(&mut self, id: u64) -> &mut Client {
-        let at = self.0.iter().position(|client| client.id == id);
+        let at = self.all.iter().position(|client| client.id == id);
         let client = match at {
-            Some(at) => self.0.remove(at),
+            Some(at) => self.all.remove(at),
             None => {
-                let is_full = self.0.len() >= CLIENTS_MAX;
+                let is_full = self.all.len() >= CLIENTS_MAX;
                 if let Some(idle) = self.longest_idle().filter(|_| is_full) {
-                    self.0.remove(idle);
+                    self.forget(idle);
                 }
-                Client { id, session: ClientSession::new(id), repetitions: 0, is_due: false }
+                Client { heard: Instant::now(), id, session: ClientSession::new(id), repetitions: 0, is_due: false }
             }
         };
-        self.0.push_mut(client)
+        let client = self.all.push_mut(client);
+        client.heard = Instant::now();
+        client
     }
 
     fn get_mut(&mut self, id: u64) -> Option<&mut Client> {
-        self.0.iter_mut().find(|client| client.id == id)
+        self.all.iter_mut().find(|client| client.id == id)
+    }
+
+    /// Forgets the clients without observations in flight that were silent for [`SILENT_MAX`].
+    fn forget_silent(&mut self, now: Instant) {
+        let is_over =
+            |client: &Client| client.session.is_idle() && now.saturating_duration_since(client.heard) > SILENT_MAX;
+        while let Some(silent) = self.all.iter().position(is_over) {
+            self.forget(silent);
+        }
+    }
+
+    fn forget(&mut self, index: usize) {
+        let client = self.all.remove(index);
+        self.forgotten.push(client.session);
     }
 
     /// Index of the longest silent client without observations in flight.
     fn longest_idle(&self) -> Option<usize> {
-        self.0.iter().position(|client| client.session.is_idle())
+        self.all.iter().position(|client| client.session.is_idle())
     }
 
     /// True if another observation of any client, also of a new one, may be decoded: fewer than `events_max` events and
     /// `bytes_max` bytes of all clients are in flight, and a new client has space.
     fn have_credit(&self, events_max: usize, bytes_max: usize) -> bool {
-        if self.0.len() >= CLIENTS_MAX && self.longest_idle().is_none() {
+        if self.all.len() >= CLIENTS_MAX && self.longest_idle().is_none() {
             return false;
         }
         let (events, bytes) =
-            self.0.iter().map(|client| client.session.in_flight()).fold((0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
+            self.all.iter().map(|client| client.session.in_flight()).fold((0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
         events == 0 || (events < events_max && bytes < bytes_max)
     }
 
     fn request_repetitions(&mut self) {
-        for client in self.0.iter_mut().filter(|client| client.repetitions > 0) {
+        for client in self.all.iter_mut().filter(|client| client.repetitions > 0) {
             client.repetitions -= 1;
             client.is_due = true;
         }
@@ -293,7 +322,7 @@ impl Clients {
             }
             report.or_else(|| is_due.then(|| client.session.repeated_report()))
         };
-        self.0.iter_mut().filter_map(report).collect()
+        self.all.iter_mut().filter_map(report).collect()
     }
 }
 
@@ -327,6 +356,6 @@ mod tests {
             clients.next_reports().iter().map(|report| (report.client, report.acknowledged)).collect();
         let expected: Vec<_> = (1..=CLIENTS_MAX as u64).filter(|id| ![3, 7].contains(id)).map(|id| (id, 1)).collect();
         assert_eq!(reported, expected, "each client gets its acknowledgement");
-        assert_eq!(clients.0.len(), CLIENTS_MAX);
+        assert_eq!(clients.all.len(), CLIENTS_MAX);
     }
 }

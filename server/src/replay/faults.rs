@@ -157,7 +157,7 @@ impl Faults {
             let is_dropped = match &fault.kind {
                 Kind::Lost { sensor: lost } => is_data && sensor == Some(lost),
                 Kind::Loss { share: least } => is_data && share(self.seed ^ index as u64, number) < *least,
-                Kind::Stop => !matches!(reading.body, Body::Sensor(_) | Body::End),
+                Kind::Stop => !matches!(reading.body, Body::Sensor(_) | Body::Withdrawn | Body::End),
                 Kind::Clock { step_ns } => {
                     reading.arrival_ns = reading.arrival_ns.saturating_add(*step_ns);
                     self.counts[index] += 1;

@@ -347,3 +347,43 @@ fn header(
 pub fn random() -> u64 {
     std::hash::RandomState::new().build_hasher().finish()
 }
+
+#[cfg(test)]
+mod tests {
+    use std::future::pending;
+
+    use super::*;
+
+    async fn until(condition: impl Fn() -> bool) {
+        while !condition() {
+            tokio::task::yield_now().await;
+        }
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_listener_that_hangs_is_a_fault_of_every_vehicle_until_it_goes_on() {
+        let mut config = Config::of_one_vehicle("car", "top");
+        (config.page.enabled, config.grpc.listen) = (false, "127.0.0.1:0".parse().expect("an address"));
+        let security = Security::new(Current::new(&config, None).expect("no certificates"));
+        let bound = Listeners::bind(&config, &security, &mut HeldSockets::default()).await;
+        let Listeners { grpc, handles, .. } = bound.expect("a free port");
+        let status = VehicleStatus::new("car".into(), 1, Vec::new(), event_queue(1).0.drops());
+        let (status, (_, newest)) = (Arc::new(status), watch::channel(None));
+        let vehicles = Vehicles([Served { status: status.clone(), newest }].into());
+        let watching = tokio::spawn(watch_listeners(handles.clone(), vehicles, pending()));
+
+        let of_listener = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
+        let of_listener = of_listener.expect("a thread");
+        of_listener.spawn(grpc.expect("gRPC is served").serve(axum::Router::new(), pending()));
+        until(|| handles[0].1.silent().is_some()).await;
+        assert_eq!(status.fault(), None);
+        let (hang, hung) = std::sync::mpsc::channel::<()>();
+        of_listener.spawn(async move { hung.recv() });
+        until(|| status.fault().is_some()).await;
+        assert!(status.fault().is_some_and(|fault| fault.starts_with("the listener grpc has hung for")));
+        drop(hang);
+        until(|| status.fault().is_none()).await;
+        watching.abort();
+        of_listener.shutdown_background();
+    }
+}

@@ -107,7 +107,8 @@ impl VehicleStatus {
         let up = self.started.elapsed();
         let mut sensors = changing.sensors.clone();
         let mut of_vehicle = clearway_mapping::ledger::Ledger::default();
-        self.drops.add_unreported_to(&mut of_vehicle, sensors.iter_mut().map(|sensor| &mut sensor.ledger));
+        let ledgers = sensors.iter_mut().map(|sensor| (sensor.source, &mut sensor.ledger));
+        self.drops.add_unreported_to(&mut of_vehicle, ledgers);
         let counts = packet_counts(&sensors);
         let loss = changing.window.loss(counts);
         changing.window.push_counts(up, counts);

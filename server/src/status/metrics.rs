@@ -410,6 +410,7 @@ mod tests {
         let (door, _events) = crate::ingest::queue::event_queue(4);
         let status = VehicleStatus::new("car".into(), 1, vec!["drivability"], door.drops());
         let sensor = |name: &str, elevations, mount| NamedStatus {
+            source: 0,
             name: name.into(),
             is_reference: name == "top",
             status: clearway_lidar::SensorStatus::default(),

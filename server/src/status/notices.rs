@@ -89,6 +89,7 @@ mod tests {
     fn sensor(height_m: f64, contradicts: bool) -> NamedStatus {
         let mount = Some(MountDeviation { height_m, contradicts, scans: 20, ..MountDeviation::default() });
         NamedStatus {
+            source: 0,
             name: "top".to_owned(),
             is_reference: true,
             status: clearway_lidar::SensorStatus::default(),

@@ -405,7 +405,7 @@ impl VehicleStatus {
             ages: state.ages.clone(),
             ..Snapshot::default()
         };
-        let sensors = snapshot.sensors.iter_mut().map(|sensor| &mut sensor.ledger);
+        let sensors = snapshot.sensors.iter_mut().map(|sensor| (sensor.source, &mut sensor.ledger));
         self.drops.add_unreported_to(&mut snapshot.ledger, sensors);
         // The engine waits for this lock, so slower work follows after it.
         drop(state);

@@ -73,6 +73,8 @@ fn build() -> PathBuf {
     if folder.ends_with("release") {
         cargo.arg("--release");
     }
+    // `cargo run` has set it. A build script that reads it would run again, and half of all crates with it.
+    cargo.env_remove("CARGO_MANIFEST_DIR");
     let built = cargo.current_dir(clearway_tests::workspace()).status().expect("cargo runs");
     assert!(built.success(), "cargo build: {built}");
     folder.join("clearway")
@@ -99,6 +101,8 @@ fn start(server: &PathBuf, config: PathBuf, target: &Target) -> Child {
     std::fs::write(&config, text).expect("a file of ours");
     let log = std::fs::File::create(config.with_extension("log")).expect("a file of ours");
     let mut command = Command::new(server);
+    // As in deploy/systemd/clearway.service.
+    command.envs([("MALLOC_ARENA_MAX", "2"), ("MALLOC_TRIM_THRESHOLD_", "131072")]);
     command.args(["serve", "--config"]).arg(&config).stdout(Stdio::null()).stderr(log);
     command.spawn().unwrap_or_else(|error| panic!("{}: {error}", server.display()))
 }

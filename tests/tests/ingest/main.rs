@@ -23,7 +23,7 @@ use clearway_proto::v1::ingest_service_client::IngestServiceClient;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::town;
 use clearway_sim::vehicle::SimulatedVehicle;
-use fixture::{config, feed, readings, recorded, within};
+use fixture::{config, feed, readings, recorded, until, within};
 use prost::Message;
 
 /// A server with a boot id that two runs have in common, recording to `file`.
@@ -268,6 +268,58 @@ async fn a_sensor_declared_in_the_stream_is_mapped_and_recorded() {
     assert!(report.is_good() && report.maps == 1, "{report:?}");
     let header = layer(&recorded(&file), "drivability")[0].header.clone().unwrap();
     assert_eq!(header.sensors.iter().map(|sensor| sensor.returns).collect::<Vec<_>>(), [7200, 7200]);
+}
+
+/// Names of the first vehicle's sensors.
+fn sensors(running: &Running) -> Vec<String> {
+    running.vehicles.0[0].status.snapshot().sensors.into_iter().map(|sensor| sensor.name).collect()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn sensors_end_with_the_last_stream_that_declared_them_and_the_recording_replays() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("r.mcap");
+    let running = start(scanned_config(), &file).await;
+    let left = Sensor { name: "left".into(), x_m: 1.0, y_m: 0.8, z_m: 1.9, ..Sensor::default() };
+    let declared = |sensor: &Sensor| Observation::declare(sensor.clone()).captured_at(1_000_000_000);
+    let seen = |sensor: &str, stamp_ns: i64| {
+        let v1::Scan { x, y, z, .. } = plain(stamp_ns);
+        let [x, y, z] = [x, y, z].map(|list| unpack::<f32>(&list).unwrap());
+        Observation::scan(sensor, stamp_ns, &x, &y, &z).captured_at(stamp_ns)
+    };
+    let (mut first, mut second) = (ingester(&running).await, ingester(&running).await);
+    assert_eq!(send_all(&mut first, vec![declared(&left), seen("left", 1_000_000_000)]).await, []);
+    assert_eq!(send_all(&mut second, vec![declared(&left), seen("top", 1_010_000_000)]).await, []);
+    // More names than a vehicle has, one stream after the other.
+    for number in 0..40 {
+        let mut other = ingester(&running).await;
+        let name = format!("other-{number}");
+        let sensor = Sensor { name: name.clone(), ..left.clone() };
+        assert_eq!(send_all(&mut other, vec![declared(&sensor)]).await, [], "{name}");
+        assert_eq!(sensors(&running), ["top", "left", &name]);
+        drop(other);
+        until("the end of the sensor", || sensors(&running) == ["top", "left"]).await;
+    }
+    drop(first);
+    // The second stream keeps the sensor.
+    assert_eq!(send_all(&mut second, vec![seen("left", 1_100_000_000), seen("top", 1_110_000_000)]).await, []);
+    drop(second);
+    until("the end of the sensor", || sensors(&running) == ["top"]).await;
+    let mut third = ingester(&running).await;
+    let moved = Sensor { y_m: -0.8, ..left };
+    let last = vec![declared(&moved), seen("left", 1_200_000_000), seen("top", 1_210_000_000)];
+    assert_eq!(send_all(&mut third, last).await, []);
+    let mut undeclared = ingester(&running).await;
+    drop(third);
+    until("the end of the sensor", || sensors(&running) == ["top"]).await;
+    let unknown = send_all(&mut undeclared, vec![seen("left", 1_300_000_000)]).await;
+    assert_eq!(by_reason(&unknown), [("source", 1)].into(), "{unknown:?}");
+    within("shutdown", running.shutdown()).await.unwrap();
+    let report = verify(&file).unwrap();
+    assert!(report.is_good() && report.maps == 3, "{report:?}");
+    let headers = layer(&recorded(&file), "drivability");
+    let last = headers[2].header.clone().unwrap();
+    assert_eq!(last.sensors.iter().map(|sensor| &*sensor.name).collect::<Vec<_>>(), ["top", "left"]);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]

@@ -23,6 +23,14 @@ pub enum EventError {
         /// Number of sensors of the vehicle.
         sensors: usize,
     },
+    /// The sensor is one of the configuration, so that its declaration cannot be withdrawn.
+    #[error("source {source_index} withdrawn: a declared sensor is allowed, from {first_declared} on")]
+    Withdrawn {
+        /// Source of the event.
+        source_index: u16,
+        /// Number of sensors of the configuration, which is the first index of a declared one.
+        first_declared: usize,
+    },
     /// A declared sensor has a value that is not allowed.
     #[error("declared sensor: {0}")]
     Sensor(#[from] ConfigValueError),
@@ -95,7 +103,7 @@ impl EventError {
         match self {
             Self::Datagram(refusal) => refusal.reason(),
             Self::Source { .. } => "source",
-            Self::Sensor(_) => "sensor",
+            Self::Sensor(_) | Self::Withdrawn { .. } => "sensor",
             Self::ScanLengths { .. } | Self::ScanList { .. } => "scan_lengths",
             Self::ScanOffset { .. } => "scan_offset",
             Self::NoReturn { .. } => "no_returns",

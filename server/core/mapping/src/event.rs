@@ -31,9 +31,12 @@ pub enum Body {
     EgoPose(EgoPose),
     /// Shape of a road.
     Road(Road),
-    /// Declaration of a sensor that the configuration does not contain. The event's source is its index, which is the
-    /// next one. A repeated declaration changes nothing.
+    /// Declaration of a sensor that the configuration does not contain. The event's source is its index, which no
+    /// sensor has. A repeated declaration changes nothing.
     Sensor(Box<SensorConfig>),
+    /// The declaration of the source is withdrawn: its unfinished revolution becomes a partial one, and then its name
+    /// and its index are free.
+    Withdrawn,
     /// Readings that were dropped before they became events.
     Lost {
         /// Why they were dropped.

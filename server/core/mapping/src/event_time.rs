@@ -66,7 +66,7 @@ fn lane(body: &Body) -> u8 {
         Body::Scan(_) => 2,
         Body::EgoPose(_) => 3,
         Body::Road(_) => 4,
-        Body::Sensor(_) | Body::Lost { .. } | Body::End => 5,
+        Body::Sensor(_) | Body::Withdrawn | Body::Lost { .. } | Body::End => 5,
     }
 }
 

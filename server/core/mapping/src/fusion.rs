@@ -44,7 +44,8 @@ const EQUAL_STAMP_PARTS: i64 = 50;
 /// The newest map, as far as the next one depends on it.
 #[derive(Clone, Copy, Debug)]
 struct NewestMap {
-    source: usize,
+    /// `None` once its sensor was withdrawn.
+    source: Option<usize>,
     stamp_ns: i64,
     event_ns: i64,
 }
@@ -147,9 +148,21 @@ impl Fusion {
         self.reference_sensor
     }
 
-    /// Index of the sensor whose scan made the newest map; `None` before the first map.
+    /// Index of the sensor whose scan made the newest map; `None` before the first map, and if it was withdrawn since.
     pub fn source(&self) -> Option<usize> {
-        self.newest.map(|newest| newest.source)
+        self.newest?.source
+    }
+
+    /// Forgets a sensor that is withdrawn. The points of the newest map stay; a map of its last scan that still waits
+    /// for scans of others is not made.
+    pub fn remove_sensor(&mut self, source: usize, scans: &[SensorScan]) {
+        if self.source() == Some(source) {
+            self.copy_once(&scans[source].sweep);
+            self.newest.iter_mut().for_each(|newest| newest.source = None);
+            self.is_current = false;
+        }
+        self.waiting.take_if(|waiting| waiting.own.source == source);
+        self.waiting.iter_mut().for_each(|waiting| waiting.due.retain(|due| *due != source));
     }
 
     /// True if no sensor has completed a scan since the newest map was made.
@@ -182,7 +195,7 @@ impl Fusion {
             return released;
         }
         let own = OwnScan::new(source, &scans[source]);
-        self.newest = Some(NewestMap { source, stamp_ns: own.end_ns, event_ns: now.event_ns });
+        self.newest = Some(NewestMap { source: Some(source), stamp_ns: own.end_ns, event_ns: now.event_ns });
         let due = self.due(source, scans, now);
         if released.is_some() || !due.is_empty() {
             // Only one map is made at a time: behind a map that has waited, this one waits for the next event.
@@ -283,7 +296,7 @@ impl Fusion {
         self.newest.is_none_or(|newest| {
             let since_ns = scan.end_ns.saturating_sub(newest.stamp_ns);
             let tolerance_ns = self.period_ns / PERIOD_TOLERANCE_PARTS;
-            newest.source != source || since_ns < 0 || since_ns >= self.period_ns - tolerance_ns
+            newest.source != Some(source) || since_ns < 0 || since_ns >= self.period_ns - tolerance_ns
         })
     }
 
@@ -298,7 +311,7 @@ impl Fusion {
         self.newest.is_none_or(|newest| {
             let newer_ns = scan.end_ns.saturating_sub(newest.stamp_ns);
             let is_set_back = is_overdue && newer_ns < -self.deadline_ns && !self.came_late(scan);
-            newest.source == source || newer_ns > 0 || is_set_back
+            newest.source == Some(source) || newer_ns > 0 || is_set_back
         })
     }
 

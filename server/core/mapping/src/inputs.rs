@@ -45,6 +45,8 @@ pub(crate) struct Inputs {
     deadline_ns: i64,
     extras: ScanExtras,
     reference_sensor: usize,
+    /// Number of sensors of the configuration; those after them are declared.
+    configured: usize,
     /// By source.
     sensors: Vec<SensorPipeline>,
     /// By source.
@@ -62,6 +64,7 @@ impl Inputs {
             deadline_ns: config.fusion.deadline_ns(),
             extras,
             reference_sensor: config.reference_sensor().unwrap_or(0),
+            configured: config.sensors.len(),
             sensors: Vec::new(),
             scans: Vec::new(),
             motion: Motion::new(&config.maps.motion),
@@ -69,9 +72,7 @@ impl Inputs {
             pose_event_ns: None,
             config: config.clone(),
         };
-        for (sensor, calibration) in config.sensors.iter().zip(calibrations) {
-            inputs.add_sensor(sensor, calibration);
-        }
+        calibrations.into_iter().enumerate().for_each(|(index, calibration)| inputs.begin_sensor(index, calibration));
         inputs
     }
 
@@ -87,7 +88,8 @@ impl Inputs {
                 let removed = sensor.apply_scan(scan, newest, &self.motion, now, self.deadline_ns)?;
                 Outcome { completed_scan: Some(removed), packets_unfit: 0 }
             }
-            Body::End => {
+            Body::End | Body::Withdrawn => {
+                self.check_may_end(event)?;
                 let (sensor, newest) = sensor_mut(&mut self.sensors, &mut self.scans, event.source)?;
                 let completed_scan = sensor.finish(newest, &self.motion, now);
                 Outcome { completed_scan, packets_unfit: sensor.drain_unfit() }
@@ -101,6 +103,18 @@ impl Inputs {
             self.motion.note_scan_end(self.scans[usize::from(event.source)].end_ns);
         }
         Ok(outcome)
+    }
+
+    /// Removes a declared sensor with all that is known of it.
+    pub fn remove_sensor(&mut self, source: u16) {
+        let index = usize::from(source);
+        self.config.withdraw(index);
+        let sensors = self.config.sensors.len();
+        self.sensors.truncate(sensors);
+        self.scans.truncate(sensors);
+        if index < sensors {
+            self.begin_sensor(index, None);
+        }
     }
 
     /// Sets what the active layers need of every scan from now on.
@@ -138,9 +152,16 @@ impl Inputs {
         &self.roads
     }
 
-    /// Name of each sensor and its pipeline, by source.
-    pub fn sensors(&self) -> impl Iterator<Item = (&str, &SensorPipeline)> {
-        self.config.sensors.iter().map(|sensor| sensor.name.as_str()).zip(&self.sensors)
+    /// Number of indices of sensors, those of withdrawn sensors included.
+    pub fn sources(&self) -> usize {
+        self.sensors.len()
+    }
+
+    /// Index, name and pipeline of each sensor.
+    pub fn sensors(&self) -> impl Iterator<Item = (usize, &str, &SensorPipeline)> {
+        let all = self.config.sensors.iter().zip(&self.sensors).enumerate();
+        all.filter(|(_, (config, _))| !config.is_withdrawn())
+            .map(|(index, (config, sensor))| (index, config.name.as_str(), sensor))
     }
 
     /// The revolution from which the newest scan of a sensor was made; `None` if the scan came as an event.
@@ -187,14 +208,30 @@ impl Inputs {
     }
 
     fn declare_sensor(&mut self, source: u16, sensor: &SensorConfig) -> Result<(), EventError> {
-        let calibration = self.config.declare(usize::from(source), sensor)?;
-        if self.sensors.len() < self.config.sensors.len() {
-            self.add_sensor(sensor, calibration);
+        let index = usize::from(source);
+        if self.config.sensors.get(index) == Some(sensor) {
+            return Ok(());
         }
+        let calibration = self.config.declare(index, sensor)?;
+        (self.sensors.len()..index).for_each(|withdrawn| self.begin_sensor(withdrawn, None));
+        self.begin_sensor(index, calibration);
         Ok(())
     }
 
-    fn add_sensor(&mut self, sensor: &SensorConfig, calibration: Option<Calibration>) {
+    /// Refuses the withdrawal of a sensor that was not declared.
+    fn check_may_end(&self, event: &Event) -> Result<(), EventError> {
+        let (source_index, first_declared) = (event.source, self.configured);
+        match event.body {
+            Body::Withdrawn if usize::from(source_index) < first_declared => {
+                Err(EventError::Withdrawn { source_index, first_declared })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Begins the pipeline of the sensor `index`, in place of the one before.
+    fn begin_sensor(&mut self, index: usize, calibration: Option<Calibration>) {
+        let sensor = &self.config.sensors[index];
         let pipeline = SensorPipeline::new(
             sensor,
             self.config.time.ahead_ns_max(),
@@ -202,8 +239,14 @@ impl Inputs {
             self.config.body.as_ref(),
             self.extras,
         );
-        self.scans.push(SensorScan::new(&sensor.name, pipeline.origin_m(), pipeline.tilt_rad()));
-        self.sensors.push(pipeline);
+        let scan = SensorScan::new(&sensor.name, pipeline.origin_m(), pipeline.tilt_rad());
+        match (self.scans.get_mut(index), self.sensors.get_mut(index)) {
+            (Some(before), Some(pipeline_before)) => (*before, *pipeline_before) = (scan, pipeline),
+            _ => {
+                self.scans.push(scan);
+                self.sensors.push(pipeline);
+            }
+        }
     }
 }
 
@@ -213,9 +256,12 @@ fn sensor_mut<'a>(
     scans: &'a mut [SensorScan],
     source_index: u16,
 ) -> Result<(&'a mut SensorPipeline, &'a mut SensorScan), EventError> {
-    let (source, count) = (usize::from(source_index), sensors.len());
-    let sensor = sensors.get_mut(source).ok_or(EventError::Source { source_index, sensors: count })?;
-    Ok((sensor, &mut scans[source]))
+    let (source, count) = (usize::from(source_index), scans.iter().filter(|scan| !scan.is_withdrawn()).count());
+    let unknown = EventError::Source { source_index, sensors: count };
+    match (sensors.get_mut(source), scans.get_mut(source)) {
+        (Some(sensor), Some(scan)) if !scan.is_withdrawn() => Ok((sensor, scan)),
+        _ => Err(unknown),
+    }
 }
 
 fn check_pose(pose: &EgoPose) -> Result<(), EventError> {

@@ -116,6 +116,12 @@ impl Ledgers {
         self.sensors.resize(sensors, Ledger::default());
     }
 
+    /// Forgets the counts of a sensor that was withdrawn, in a list of so many indices. Those of the vehicle stay.
+    pub fn remove_sensor(&mut self, source: u16, sensors: usize) {
+        self.sensors.iter_mut().skip(usize::from(source)).take(1).for_each(|ledger| *ledger = Ledger::default());
+        self.set_sensors(sensors);
+    }
+
     /// The ledger of the whole vehicle.
     pub fn vehicle(&self) -> &Ledger {
         &self.vehicle
@@ -129,13 +135,21 @@ impl Ledgers {
     /// Counts one event and what became of it.
     pub fn record(&mut self, event: &Event, outcome: &Result<Outcome, EventError>) {
         match (&event.body, outcome) {
-            (Body::Datagram(_) | Body::Scan(_) | Body::End, Ok(outcome)) => self.record_reading(event, outcome),
-            (Body::Datagram(_) | Body::Scan(_), Err(error)) => self.each(event.source, |ledger| {
-                ledger.received += 1;
-                ledger.record_refused(error.reason(), 1);
-            }),
+            (Body::Datagram(_) | Body::Scan(_) | Body::End | Body::Withdrawn, Ok(outcome)) => {
+                self.record_reading(event, outcome)
+            }
+            (Body::Datagram(_) | Body::Scan(_), Err(error)) => {
+                let refuse = |ledger: &mut Ledger| {
+                    ledger.received += 1;
+                    ledger.record_refused(error.reason(), 1);
+                };
+                match error {
+                    EventError::Source { .. } => refuse(&mut self.vehicle),
+                    _ => self.each(event.source, refuse),
+                }
+            }
             // An accepted `End` is not a reading; an `End` for an unknown sensor counts as one refused reading.
-            (Body::End, Err(_)) => self.vehicle.record_lost(Cause::Sender, 1),
+            (Body::End | Body::Withdrawn, Err(_)) => self.vehicle.record_lost(Cause::Sender, 1),
             (Body::EgoPose(_), Ok(_)) => self.vehicle.poses += 1,
             (Body::EgoPose(_), Err(_)) => self.vehicle.poses_refused += 1,
             (Body::Road(_), Ok(_)) => self.vehicle.roads += 1,
@@ -154,7 +168,7 @@ impl Ledgers {
 
     /// Counts an accepted datagram, scan or end of a sensor.
     fn record_reading(&mut self, event: &Event, outcome: &Outcome) {
-        let is_reading = !matches!(event.body, Body::End);
+        let is_reading = !matches!(event.body, Body::End | Body::Withdrawn);
         let is_telemetry = matches!(&event.body, Body::Datagram(payload) if payload.len() == TELEMETRY_LENGTH);
         self.each(event.source, |ledger| {
             ledger.received += u64::from(is_reading);

@@ -32,10 +32,17 @@ pub struct Map {
     pub source: u16,
     /// Index of the reference sensor: the configured one, else the one that was chosen.
     pub reference_sensor: u16,
-    /// Every sensor of the vehicle, in the order of the configuration, whether it contributes or not.
+    /// Every sensor of the vehicle by index, whether it contributes or not. One without a name was withdrawn.
     pub sensors: Vec<SensorState>,
     /// The active layers, in the order of the configuration.
     pub layers: Vec<Layer>,
+}
+
+impl Map {
+    /// The sensors but those that were withdrawn.
+    pub fn present_sensors(&self) -> impl Iterator<Item = &SensorState> {
+        self.sensors.iter().filter(|sensor| !sensor.name.is_empty())
+    }
 }
 
 /// One sensor's state in a map. Values that describe its scan are 0 or empty if the scan is not in the map.

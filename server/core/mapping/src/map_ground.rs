@@ -69,6 +69,11 @@ impl MapGround {
         }
     }
 
+    /// Forgets which scan alone gave the ground: another sensor may get its index.
+    pub fn forget_scan(&mut self) {
+        self.sole_scan = None;
+    }
+
     /// The points of the newest map and the remembered ones; `own` are the former alone.
     pub fn sweep<'a>(&'a self, own: &'a Sweep) -> &'a Sweep {
         let estimates = self.estimates.as_ref().filter(|_| self.is_known);

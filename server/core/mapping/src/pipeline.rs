@@ -47,6 +47,8 @@ pub struct Pipeline {
 /// A sensor with its status and its counts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NamedStatus {
+    /// Index of the sensor: the source of its events.
+    pub source: u16,
     /// Name of the sensor in the configuration.
     pub name: String,
     /// True if it is the reference sensor: the configured one, else the one that was chosen.
@@ -124,6 +126,15 @@ impl Pipeline {
     /// # Errors
     /// [`EventError`] if the event is refused; then it changes nothing but the ledgers.
     pub fn step(&mut self, event: &Event) -> Result<Option<&Map>, EventError> {
+        let is_map = self.apply(event)?;
+        if matches!(event.body, Body::Withdrawn) {
+            self.remove_sensor(event.source);
+        }
+        Ok(is_map.then_some(&self.map))
+    }
+
+    /// True if the event completed a map.
+    fn apply(&mut self, event: &Event) -> Result<bool, EventError> {
         let now = self.clock.advance(event);
         let outcome = self.inputs.apply(event, now);
         self.ledgers.record(event, &outcome);
@@ -132,10 +143,24 @@ impl Pipeline {
         let merged = self.merge_scans(event, completed, now);
         self.estimate_ground(merged.as_ref());
         self.integrate(completed, now);
-        let Some(merged) = merged else { return Ok(None) };
+        let Some(merged) = merged else { return Ok(false) };
         self.begin_map(merged, now);
         self.make_layers();
-        Ok(Some(&self.map))
+        Ok(true)
+    }
+
+    /// Removes a sensor that is withdrawn, once what it has completed is in a map.
+    fn remove_sensor(&mut self, source: u16) {
+        let index = usize::from(source);
+        let was_reference = self.fusion.reference_sensor() == index;
+        self.fusion.remove_sensor(index, self.inputs.scans());
+        self.inputs.remove_sensor(source);
+        self.ledgers.remove_sensor(source, self.inputs.sources());
+        self.ground.forget_scan();
+        self.reference.remove_sensor(index, was_reference);
+        if was_reference {
+            self.set_reference_sensor(self.inputs.reference_by_configuration());
+        }
     }
 
     /// Activates the layers for which `is_active` returns true and the layers they are made from. The others take no
@@ -184,7 +209,7 @@ impl Pipeline {
     /// Replaces another pipeline: the next map gets its number, and stamps and counts go on from those of the other.
     /// All else follows from the events that this pipeline has processed itself.
     pub fn take_over(&mut self, handover: Handover) {
-        let sensors = self.inputs.sensors().count();
+        let sensors = self.inputs.sources();
         self.maps_made = handover.next_map;
         self.map.sequence = handover.next_map.saturating_sub(1);
         (self.map.epoch, self.map.capture_end_ns) = handover.newest;
@@ -195,16 +220,16 @@ impl Pipeline {
     /// The sensors in the order of the configuration, then the declared ones.
     pub fn sensors(&self) -> Vec<NamedStatus> {
         let ledgers = self.ledgers.sensors();
-        let with_ledger =
-            |(index, ((name, sensor), ledger)): (usize, ((&str, &SensorPipeline), &Ledger))| NamedStatus {
-                name: name.to_owned(),
-                is_reference: index == self.fusion.reference_sensor(),
-                status: sensor.status(),
-                elevations: sensor.elevations(),
-                mount: sensor.mount_deviation(),
-                ledger: ledger.clone(),
-            };
-        self.inputs.sensors().zip(ledgers).enumerate().map(with_ledger).collect()
+        let with_ledger = |(index, name, sensor): (usize, &str, &SensorPipeline)| NamedStatus {
+            source: index as u16,
+            name: name.to_owned(),
+            is_reference: index == self.fusion.reference_sensor(),
+            status: sensor.status(),
+            elevations: sensor.elevations(),
+            mount: sensor.mount_deviation(),
+            ledger: ledgers.get(index).cloned().unwrap_or_default(),
+        };
+        self.inputs.sensors().map(with_ledger).collect()
     }
 
     /// The newest ego pose; `None` before the first.
@@ -240,9 +265,13 @@ impl Pipeline {
             && let Some(chosen) = self.reference.by_scans(self.inputs.scans(), now)
             && chosen != self.fusion.reference_sensor()
         {
-            self.fusion.set_reference_sensor(chosen);
-            self.inputs.set_reference_sensor(chosen);
+            self.set_reference_sensor(chosen);
         }
+    }
+
+    fn set_reference_sensor(&mut self, chosen: usize) {
+        self.fusion.set_reference_sensor(chosen);
+        self.inputs.set_reference_sensor(chosen);
     }
 
     /// Merges the newest scans to a map if the completed scan, or the time of the event, completes one.
@@ -251,7 +280,7 @@ impl Pipeline {
         match completed {
             Some(source) => self.fusion.merge(usize::from(source), scans, motion, now),
             None => {
-                let ended = matches!(event.body, Body::End).then_some(usize::from(event.source));
+                let ended = matches!(event.body, Body::End | Body::Withdrawn).then_some(usize::from(event.source));
                 self.fusion.merge_waiting(ended, scans, motion, now)
             }
         }

@@ -19,6 +19,8 @@ const SECTORS_ALL_AROUND: u32 = 9;
 /// chosen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Merits {
+    /// False if the sensor was withdrawn.
+    is_there: bool,
     has_elevations: bool,
     is_upright: bool,
     sees_all_around: bool,
@@ -58,6 +60,14 @@ impl ReferenceChoice {
         best(scans.iter().zip(lasers_configured).map(merits))
     }
 
+    /// Forgets a sensor that is withdrawn. If it was the reference sensor, the scans decide again.
+    pub fn remove_sensor(&mut self, source: usize, was_reference: bool) {
+        self.is_known.iter_mut().skip(source).take(1).for_each(|is_known| *is_known = false);
+        if was_reference {
+            (self.is_decided, self.decided_by) = (false, None);
+        }
+    }
+
     /// The reference sensor by the scans, when they decide: after a completed scan.
     pub fn by_scans(&mut self, scans: &[SensorScan], now: EventTime) -> Option<usize> {
         if self.is_decided {
@@ -69,7 +79,7 @@ impl ReferenceChoice {
             *is_known |= scan.completed > 0 && scan.state.partial.is_empty();
         }
         let known = self.is_known.iter().filter(|is_known| **is_known).count();
-        self.is_decided = known == scans.len();
+        self.is_decided = known == scans.iter().filter(|scan| !scan.is_withdrawn()).count();
         if !self.is_decided && (since_ns <= self.deadline_ns || self.decided_by == Some(known)) {
             return None;
         }
@@ -97,6 +107,7 @@ fn merits(scan: &SensorScan, lasers: usize) -> Merits {
         .zip(&scan.sweep.y)
         .fold(0u32, |seen, (px, py)| seen | 1 << (sector(px - x, py - y) as u32).min(SECTORS - 1));
     Merits {
+        is_there: !scan.is_withdrawn(),
         has_elevations: lasers > 0,
         is_upright: scan.tilt_rad <= UPRIGHT_RAD_MAX,
         sees_all_around: seen.count_ones() >= SECTORS_ALL_AROUND,

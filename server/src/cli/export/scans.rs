@@ -31,11 +31,13 @@ pub struct SensorScan<'a> {
 }
 
 /// The decoders of the sensors of a recording, by vehicle and index.
-pub struct ScanDecoder(BTreeMap<String, Vec<OneSensor>>);
+pub struct ScanDecoder(BTreeMap<String, BTreeMap<usize, OneSensor>>);
 
 /// One sensor and its decoder.
 struct OneSensor {
     name: String,
+    /// Its declaration; `None` for a sensor of the configuration.
+    declaration: Option<v1::Sensor>,
     ego_from_sensor: Isometry3<f64>,
     /// The rule of its vehicle ([`TimeConfig::ahead_ns_max`]).
     ahead_ns_max: i64,
@@ -78,7 +80,8 @@ impl ScanDecoder {
                 let table = table.transpose().with_context(|| format!("attachment {name}"))?;
                 Ok(OneSensor::new(sensor, vehicle.time.ahead_ns_max(), table))
             };
-            let sensors = vehicle.sensors.iter().map(one).collect::<Result<_>>()?;
+            let sensors = vehicle.sensors.iter().map(one).collect::<Result<Vec<_>>>()?;
+            let sensors = sensors.into_iter().enumerate().collect();
             Ok((vehicle.name.clone(), sensors))
         };
         config.vehicles.into_iter().map(sensors).collect::<Result<_>>().map(Self)
@@ -94,18 +97,21 @@ impl ScanDecoder {
         let event = v1::Event::decode(event).with_context(|| format!("journal of {vehicle}"))?;
         let index = event.source as usize;
         if let Some(Body::Sensor(sensor)) = &event.body {
-            if index == sensors.len() {
-                let ahead_ns_max = sensors.first().map_or(0, |first| first.ahead_ns_max);
-                sensors.push(OneSensor::new(&declared(sensor), ahead_ns_max, None));
+            // A repeated declaration changes nothing; another one at its index follows its withdrawal.
+            let is_known = |known: &OneSensor| known.declaration.as_ref().is_none_or(|known| known == sensor);
+            if !sensors.get(&index).is_some_and(is_known) {
+                let ahead_ns_max = sensors.values().next().map_or(0, |first| first.ahead_ns_max);
+                let new = OneSensor::new(&declared(sensor), ahead_ns_max, None);
+                sensors.insert(index, OneSensor { declaration: Some(sensor.clone()), ..new });
             }
             return Ok(None);
         }
-        let Some(OneSensor { name, ego_from_sensor, decoder, .. }) = sensors.get_mut(index) else { return Ok(None) };
+        let Some(OneSensor { name, ego_from_sensor, decoder, .. }) = sensors.get_mut(&index) else { return Ok(None) };
         let scan = match &event.body {
             Some(Body::Datagram(payload)) => {
                 decoder.push(payload, event.arrival_ns).ok().flatten().map(from_revolution)
             }
-            Some(Body::End(_)) => decoder.finish().map(from_revolution),
+            Some(Body::End(_) | Body::Withdrawn(_)) => decoder.finish().map(from_revolution),
             Some(Body::Scan(scan)) => from_scan(scan),
             _ => None,
         };
@@ -117,6 +123,7 @@ impl OneSensor {
     fn new(config: &SensorConfig, ahead_ns_max: i64, table: Option<Calibration>) -> Self {
         Self {
             name: config.name.clone(),
+            declaration: None,
             ego_from_sensor: config.extrinsics.ego_from_sensor(),
             ahead_ns_max,
             decoder: Sensor::new(config.lidar(table, ahead_ns_max)),

@@ -246,11 +246,15 @@ impl RecordingHandle {
     /// Remembers an event that stays in force, in place of the one that it replaces.
     fn keep_in_force(&mut self, event: &Event) {
         match &event.body {
-            Body::Sensor(sensor) => {
-                let is_same = |other: &Event| matches!(&other.body, Body::Sensor(known) if known.name == sensor.name);
+            Body::Sensor(_) => {
+                let is_same = |other: &Event| other.source == event.source && other.body == event.body;
                 if !self.in_force.iter().any(is_same) {
                     self.in_force.push(event.clone());
                 }
+            }
+            Body::Withdrawn => {
+                let is_same = |other: &Event| matches!(other.body, Body::Sensor(_)) && other.source == event.source;
+                self.in_force.retain(|other| !is_same(other));
             }
             Body::Road(road) => {
                 let is_same = |other: &Event| matches!(&other.body, Body::Road(known) if known.purpose == road.purpose);

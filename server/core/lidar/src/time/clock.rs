@@ -38,6 +38,7 @@
 //! | least delay rises by more than 500 ms, in a burst | - | - | - | - |
 //! | least delay falls by more than 500 ms | - | - | `holdover` | - |
 //! | 0.35 s agree on a delay less by 100 ms (`device`: 250 ms) | - | - | new offset | new offset |
+//! | 0.35 s agree on a delay more by 100 ms, not in a burst (`device`: -) | - | - | new offset | new offset |
 //! | ten seconds agree on another delay, by 10 ms (`device`: 500 ms) | - | - | new offset | new offset |
 //! | the stamps reach the offset again | - | - | - | state of that offset |
 //!
@@ -54,7 +55,8 @@
 //!   stamps go on by arrival.
 //! - The offset by arrival is held and not averaged. A rise of the delay means that the host's clock was set forward.
 //!   If the packets come faster than they were sent, they have waited (a receiver that stood still, a network): then
-//!   the rise is an age and no offset, and the stamps must show it.
+//!   the rise is an age and no offset, and the stamps must show it. A rise that stays cannot be told from a clock that
+//!   was set; if the device's minutes agree with UTC, they decide.
 //! - A delay that stays less than the offset means that the host's clock was set back, or that the offset came from
 //!   packets that had waited. While the delay goes on falling (a capture that is sent too fast, a burst), there is no
 //!   clock to follow.
@@ -100,9 +102,9 @@ pub const AHEAD_NS_MAX: i64 = 250_000_000;
 /// Least time, in ns of the timeline, between the beginnings of two epochs. Ours: telemetry that contradicts itself
 /// does not make the stamps go back more often.
 const EPOCH_NS_MIN: i64 = NS_PER_SECOND;
-/// Fall of the delay, in ns, that is followed as soon as revolutions agree on it. Ours: a smaller one is drift, for
+/// Change of the delay, in ns, that is followed as soon as revolutions agree on it. Ours: a smaller one is drift, for
 /// which ten seconds are soon enough.
-const FALL_NS_MIN: i64 = 100_000_000;
+const CHANGE_NS_MIN: i64 = 100_000_000;
 
 /// The clock that the stamps of a revolution follow.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -327,9 +329,13 @@ impl DeviceClock {
         {
             return Some(self.offset_by_arrival(delay_ns));
         }
-        let fall_ns_min = if clock == Clock::Arrival { FALL_NS_MIN } else { HOUR_ERROR_NS_MAX };
+        let (fall_ns_min, rise_ns_min) = match clock {
+            Clock::Arrival if is_burst => (CHANGE_NS_MIN, i64::MAX),
+            Clock::Arrival => (CHANGE_NS_MIN, CHANGE_NS_MIN),
+            _ => (HOUR_ERROR_NS_MAX, i64::MAX),
+        };
         if let Some(agreed_ns) = self.minimum_delay.agreed(first_ns).filter(|_| has_epochs)
-            && offset_ns - agreed_ns > fall_ns_min
+            && (offset_ns - agreed_ns > fall_ns_min || agreed_ns - offset_ns > rise_ns_min)
         {
             return Some(self.offset_by_arrival(agreed_ns));
         }

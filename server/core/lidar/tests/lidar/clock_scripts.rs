@@ -104,6 +104,9 @@ pub(crate) fn scripts() -> Vec<Script> {
         epochs: 1,
         ..free
     };
+    // So are they if packets take longer from now on: that is a clock that was set forward, for all that can be seen.
+    let grown =
+        |host_ns, name| Script { name, host_ns, right_ns: host_ns, lasts_ns: 4 * S, healed_ns: 5 * REVOLUTION, ..free };
     let silent = Script { silence_ns: 3 * REVOLUTION, healed_ns: 4 * REVOLUTION, ..BASE };
     vec![
         Script { name: "hour and day end, and telemetry arrives in that microsecond", event_ns: S, ..late },
@@ -214,6 +217,21 @@ pub(crate) fn scripts() -> Vec<Script> {
             healed_ns: 9 * REVOLUTION,
             epochs: 0,
             ..back
+        },
+        grown(|t| after(t, 200_000_000, 0), "packets take 0.2 s longer, without GPS"),
+        grown(|t| after(t, 400_000_000, 0), "packets take 0.4 s longer, without GPS"),
+        grown(|t| after(t, 600_000_000, 0), "packets take 0.6 s longer, without GPS"),
+        Script {
+            healed_ns: 10 * REVOLUTION + 5 * REVOLUTION,
+            tolerance_ns: 105_000_000,
+            ..grown(|t| after(t, (t - EVENT).min(900_000_000), 0), "packets take longer by and by, without GPS")
+        },
+        Script {
+            healed_ns: 6 * REVOLUTION + 5 * REVOLUTION,
+            ..grown(
+                |t| stood_still(t, S).max(after(t, 400_000_000, 0)),
+                "the receiver stands still for 1 s, and its packets take 0.4 s longer from then on",
+            )
         },
         Script {
             name: "the host steps an hour back for a second and a half, without GPS",

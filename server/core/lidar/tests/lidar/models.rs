@@ -224,3 +224,21 @@ fn a_calibration_of_another_model_refuses_the_first_packet() {
     assert_eq!(error.reason(), "calibration");
     assert_eq!(error.to_string(), "calibration: lasers: 16 of them, but a VLP-32C has 32");
 }
+
+#[test]
+fn lasers_fire_at_the_times_and_azimuths_of_the_manuals() {
+    for (model, laser, offset_ns) in [
+        (Model::Hdl64eS1, 63, 0),
+        (Model::Hdl64eS2, 5, 7_260),
+        (Model::Hdl64eS3, 39, 9_700),
+        (Model::Vlp32c, 3, 2_304),
+        (Model::Vls128, 63, 18_655),
+        (Model::Vls128, 64, 26_650),
+    ] {
+        assert_eq!(model.spec().laser_offset_ns(laser), offset_ns, "{model:?} {laser}");
+    }
+    // The lowest lasers of the second and of the first pair of the lower block: 5.25 and -1.75 degrees.
+    let lasers = Calibration::factory(Model::Hdl64eS2).lasers;
+    let apart = (lasers[42].rot_correction - lasers[38].rot_correction).abs().to_degrees();
+    assert!((apart - 7.0).abs() < 1e-3, "{apart}");
+}

@@ -79,6 +79,7 @@ fn a_damaged_sentence_is_refused_as_nmea_with_the_wrong_value() {
         ("GPRMC,214106,A,3760.0000,N", "latitude: `3760.0000`; it must be degrees and minutes below 60"),
         ("GPRMC,214106,A,3707.8178,N,01199.9999,E", "longitude: `01199.9999`"),
         ("GPRMC,216006,A,,,,,,,230715", "time: `216006`"),
+        ("GPRMC,2141067,A,,,,,,,230715", "time: `2141067`"),
         ("GPRMC,214161,A,,,,,,,230715", "time: `214161`"),
         ("GPRMC,214106,A,,,,,,,310615", "date: `310615`"),
         ("GPRMC,214106,A,,,,,,,290215", "date: `290215`"),

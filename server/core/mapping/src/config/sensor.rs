@@ -142,6 +142,16 @@ impl SensorConfig {
         }
     }
 
+    /// What stands at the index of a declared sensor that was withdrawn, until another one is declared there.
+    pub(crate) fn withdrawn() -> Self {
+        Self::new("", Extrinsics { x_m: 0.0, y_m: 0.0, z_m: 0.0, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 })
+    }
+
+    /// True if no sensor has this index at present. Sensors have names.
+    pub fn is_withdrawn(&self) -> bool {
+        self.name.is_empty()
+    }
+
     /// Configuration of the sensor's decoder, with the sensor's calibration table. `ahead_ns_max`:
     /// [`clearway_lidar::SensorConfig::ahead_ns_max`].
     pub fn lidar(&self, calibration: Option<Calibration>, ahead_ns_max: i64) -> clearway_lidar::SensorConfig {

@@ -76,28 +76,38 @@ impl VehicleConfig {
         self.sensors.iter().position(|sensor| sensor.name == self.fusion.reference_sensor)
     }
 
-    /// Adds a sensor that the file does not contain, as sensor number `index`, which is the next one. A repeated
+    /// Adds a sensor that the file does not contain, as sensor number `index`, which no sensor has. A repeated
     /// declaration changes nothing, so that a sender may declare its sensor whenever it connects. Returns the
     /// calibration of a new sensor, if it brings one: its `calibration` is the text of a table and not a path, so that
     /// a replay needs no file.
     ///
     /// # Errors
-    /// [`ConfigValueError`] if the index is not the next one, if the name is in use, if a value is not allowed, or if
-    /// the calibration cannot be read.
+    /// [`ConfigValueError`] if the index or the name is in use, if a value is not allowed, or if the calibration cannot
+    /// be read.
     pub fn declare(&mut self, index: usize, sensor: &SensorConfig) -> Result<Option<Calibration>, ConfigValueError> {
         if self.sensors.get(index) == Some(sensor) {
             return Ok(None);
         }
-        if index != self.sensors.len() || index >= SENSORS_MAX {
-            return Err(ConfigValueError::new("vehicle.sensor", index, "the next index, under 32"));
+        if index >= SENSORS_MAX || self.sensors.get(index).is_some_and(|sensor| !sensor.is_withdrawn()) {
+            return Err(ConfigValueError::new("vehicle.sensor", index, "an index of no sensor, under 32"));
         }
         self.check_sensor(index, sensor)?;
         let calibration = sensor.declared_calibration().map_err(|error| {
             let allowed = "the text of a ROS YAML table, up to 65536 bytes, of as many lasers as the model has";
             ConfigValueError::new(format!("vehicle.sensor[{index}].calibration"), error, allowed)
         })?;
-        self.sensors.push(sensor.clone());
+        self.sensors.resize(self.sensors.len().max(index + 1), SensorConfig::withdrawn());
+        self.sensors[index] = sensor.clone();
         Ok(calibration)
+    }
+
+    /// Takes back the declaration of the sensor `index`: its name and its index are free. The indices of the others
+    /// stay; a free one below them has [`SensorConfig::withdrawn`].
+    pub fn withdraw(&mut self, index: usize) {
+        if let Some(sensor) = self.sensors.get_mut(index) {
+            *sensor = SensorConfig::withdrawn();
+        }
+        while self.sensors.pop_if(|last| last.is_withdrawn()).is_some() {}
     }
 
     fn check_sensor(&self, index: usize, sensor: &SensorConfig) -> Result<(), ConfigValueError> {

@@ -54,6 +54,11 @@ impl SensorScan {
         }
     }
 
+    /// True if no sensor has this index at present: the one that had it was withdrawn.
+    pub fn is_withdrawn(&self) -> bool {
+        self.state.name.is_empty()
+    }
+
     /// The scan as the input of layers that gather evidence; `sensor` is the index of the sensor. Heights are those
     /// over the plane under the vehicle.
     pub fn rays(&self, sensor: u16) -> Rays<'_> {
