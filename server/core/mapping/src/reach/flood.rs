@@ -9,6 +9,8 @@
 pub struct Flood {
     width: usize,
     passable: Bits,
+    /// Passable cells of one stage.
+    near: Bits,
     reached: Bits,
     covered: Bits,
 }
@@ -17,13 +19,14 @@ impl Flood {
     /// A flood fill of `width` × `width` cells.
     pub fn new(width: usize) -> Self {
         let bits = Bits::square(width);
-        Self { width, passable: bits.clone(), reached: bits.clone(), covered: bits }
+        Self { width, passable: bits.clone(), near: bits.clone(), reached: bits.clone(), covered: bits }
     }
 
     /// Floods the grid with a disc whose radius is `radius` cells around its middle cell. The middle of the disc moves
-    /// over open cells.
-    pub fn run(&mut self, open: &Bits, closed: &Bits, radius: usize) {
-        let Self { width, passable, reached, covered } = self;
+    /// over open cells. `stages` are sets of cells, each within the next: a cell is reached only over cells of the
+    /// first set that contains it.
+    pub fn run(&mut self, open: &Bits, closed: &Bits, radius: usize, stages: &[Bits]) {
+        let Self { width, passable, near, reached, covered } = self;
         passable.clear();
         passable.dilate(closed, radius);
         passable.words.iter_mut().zip(&open.words).for_each(|(passable, open)| *passable = open & !*passable);
@@ -34,6 +37,13 @@ impl Flood {
             reached.set(ix, iy);
         }
         reached.words.iter_mut().zip(&passable.words).for_each(|(reached, passable)| *reached &= passable);
+        for stage in stages {
+            let words = near.words.iter_mut().zip(&passable.words).zip(&stage.words);
+            words.for_each(|((near, passable), stage)| *near = passable & stage);
+            reached.flood(near);
+            let words = passable.words.iter_mut().zip(&reached.words).zip(&stage.words);
+            words.for_each(|((passable, reached), stage)| *passable &= reached | !stage);
+        }
         reached.flood(passable);
         covered.clear();
         covered.dilate(reached, radius);
@@ -42,6 +52,16 @@ impl Flood {
     /// True if the disc covers the cell somewhere on its path.
     pub fn is_reached(&self, ix: usize, iy: usize) -> bool {
         self.covered.get(ix, iy)
+    }
+
+    /// True if the middle of the disc gets to the cell.
+    pub fn is_middle(&self, ix: usize, iy: usize) -> bool {
+        self.reached.get(ix, iy)
+    }
+
+    /// Makes cells unreached: these bits of a word ([`Bits::place`]).
+    pub fn remove(&mut self, word: u32, bits: u64) {
+        self.covered.words[word as usize] &= !bits;
     }
 }
 
@@ -73,6 +93,11 @@ impl Bits {
             let bits = (self.width - first).min(64);
             *word = (0..bits).fold(0, |word, bit| word | u64::from(is_set(iy * self.width + first + bit)) << bit);
         }
+    }
+
+    /// Index of the word with the bit of a cell, and the bit.
+    pub fn place(&self, ix: usize, iy: usize) -> (u32, u64) {
+        ((iy * self.stride + ix / 64) as u32, 1 << (ix % 64))
     }
 
     /// Sets the bit of a cell.
@@ -198,7 +223,7 @@ mod tests {
         let width = picture.len();
         let is = |c: u8| bits(width, |cell| picture[cell / width].as_bytes()[cell % width] == c);
         let mut flood = Flood::new(width);
-        flood.run(&is(b'.'), &is(b'#'), radius);
+        flood.run(&is(b'.'), &is(b'#'), radius, &[]);
         let drawn = |(iy, row): (usize, &&str)| {
             let cell = |(ix, c): (usize, char)| if c == '.' && flood.is_reached(ix, iy) { 'o' } else { c };
             row.chars().enumerate().map(cell).collect()
@@ -238,7 +263,7 @@ mod tests {
         let gap = |iy: usize| if iy % 8 == 3 { width - 1 } else { 0 };
         let is_closed = |cell: usize| wall(cell / width) && cell % width != gap(cell / width);
         let mut flood = Flood::new(width);
-        flood.run(&bits(width, |cell| !is_closed(cell)), &bits(width, is_closed), 0);
+        flood.run(&bits(width, |cell| !is_closed(cell)), &bits(width, is_closed), 0, &[]);
         assert!((0..width * width).all(|cell| flood.is_reached(cell % width, cell / width) != is_closed(cell)));
     }
 }

@@ -12,9 +12,11 @@
 //! | points -> cells beside a step of the ground | `steps` |
 //! | obstacles -> the ground that they hide | `shadow` |
 //! | open and closed cells -> reached cells | `flood` |
+//! | reached cells -> those without a detour over farther ground | `directions` |
 
 mod cells;
 pub mod config;
+mod directions;
 mod flood;
 mod obstacles;
 mod shadow;
@@ -27,6 +29,7 @@ use crate::sensor::sweep::Sweep;
 
 use cells::{CELL_M, SIDE};
 use config::ReachConfig;
+use directions::Directions;
 use flood::{Bits, Flood};
 use obstacles::Obstacles;
 use shadow::Shadow;
@@ -83,6 +86,7 @@ pub struct Reach {
     views: Vec<View>,
     open: Bits,
     closed: Bits,
+    directions: Directions,
     flood: Flood,
 }
 
@@ -104,6 +108,7 @@ impl Reach {
             views: vec![View::Closed; CELLS],
             open: bits.clone(),
             closed: bits,
+            directions: Directions::new(),
             flood: Flood::new(SIDE),
         }
     }
@@ -126,7 +131,8 @@ impl Reach {
         self.open_seen_ground(sweep.mount_height_m, ground.confidences());
         // Radius, in cells, of the largest disc sure to fit through a passage of the vehicle's width.
         let radius = ((self.config.vehicle_width_m / CELL_M - 2.0) / 2.0).max(0.0) as usize;
-        self.flood.run(&self.open, &self.closed, radius);
+        self.flood.run(&self.open, &self.closed, radius, self.directions.near());
+        self.directions.close(&mut self.flood);
     }
 
     /// True if an obstacle stands in a cell, or a step of the ground ends there.
