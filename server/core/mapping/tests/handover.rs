@@ -94,7 +94,7 @@ fn scan(stamp_ns: i64, arrival_ns: i64) -> Event {
         scan.intensity.push(0.3);
         scan.ring.push((i % 16) as u16);
     }
-    Event { sequence: 0, arrival_ns, source: 0, body: Body::Scan(scan.into()) }
+    Event { sequence: 0, arrival_ns, source: 0, body: Body::Scan(scan) }
 }
 
 #[test]

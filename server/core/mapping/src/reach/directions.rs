@@ -43,7 +43,7 @@ impl Directions {
         let mut beyond: Vec<Vec<(u32, u64)>> = inside.iter().map(|_| Vec::new()).collect();
         for cell in 0..SIDE * SIDE {
             let [x, y] = centre_m(cell);
-            let (range_m, direction) = (x.hypot(y), direction(x, y));
+            let (range_m, direction) = (libm::hypotf(x, y), direction(x, y));
             for (edge, Edge { range_m: edge_m, .. }) in EDGES.iter().enumerate() {
                 if range_m < *edge_m {
                     near[edge].set(cell % SIDE, cell / SIDE);
@@ -94,7 +94,7 @@ impl Directions {
 
 /// The direction of a position.
 fn direction(x: f32, y: f32) -> usize {
-    let turns = (y.atan2(x) / TAU).rem_euclid(1.0);
+    let turns = (libm::atan2f(y, x) / TAU).rem_euclid(1.0);
     (turns * DIRECTIONS as f32) as usize % DIRECTIONS
 }
 
