@@ -111,14 +111,14 @@ fn looks_well_on_a_phone(demo: &RunningDemo) {
 }
 
 /// A demo in this process, on ports of the operating system's choice.
-struct RunningDemo {
-    page: SocketAddr,
+pub struct RunningDemo {
+    pub page: SocketAddr,
     stop: tokio::sync::oneshot::Sender<()>,
     thread: std::thread::JoinHandle<Summary>,
 }
 
 impl RunningDemo {
-    fn start() -> Self {
+    pub fn start() -> Self {
         let (stop, stopped) = tokio::sync::oneshot::channel();
         let (send_page, page) = mpsc::channel();
         let thread = std::thread::spawn(move || {
@@ -137,7 +137,7 @@ impl RunningDemo {
         Self { page: page.recv_timeout(START_MAX).expect("the demo starts"), stop, thread }
     }
 
-    fn stop(self) -> Summary {
+    pub fn stop(self) -> Summary {
         self.stop.send(()).expect("the demo still runs");
         self.thread.join().expect("the demo ends well")
     }

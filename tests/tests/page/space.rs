@@ -1,0 +1,79 @@
+//! The view in 3-D beside a simulated drive.
+
+use crate::fresh::RunningDemo;
+use crate::webdriver::Browser;
+
+/// Draws the view in 3-D again, and counts the colours of its pixels in `window.colours`: the pixels can be read only in
+/// the display frame in which they are drawn.
+const COUNT_COLOURS: &str = "const canvas = document.getElementById('space');
+    canvas.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowLeft' }));
+    canvas.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight' }));
+    requestAnimationFrame(() => {
+        const copy = new OffscreenCanvas(300, 200), pen = copy.getContext('2d');
+        pen.drawImage(canvas, 0, 0, 300, 200);
+        window.colours = new Set(new Uint32Array(pen.getImageData(0, 0, 300, 200).data.buffer)).size;
+    });";
+/// Least number of colours of a drawn map: a canvas on which nothing is drawn has one.
+const COLOURS_MIN: u32 = 100;
+
+pub fn a_drive_is_shown_in_3d() {
+    let demo = RunningDemo::start();
+    let browser = Browser::start(1440, 900);
+    browser.open(&format!("http://{}/", demo.page));
+    browser.until("a map", "return document.getElementById('freshness').textContent !== 'NO MAP YET'");
+    assert_eq!(
+        browser.run("return document.getElementById('space').hidden"),
+        true,
+        "it is not shown before it is chosen"
+    );
+    browser.click("#space-button");
+    until_text(&browser, "in the planes of drivability's segments");
+    colours_are_drawn(&browser);
+    // Points travel only when they are wanted.
+    assert!(!browser.text("#space-text").contains("points"), "{}", browser.text("#space-text"));
+    browser.click("#space-points");
+    until_text(&browser, "points, dark");
+    browser.screenshot("space-drivability-1440x900");
+    let count = "return parseInt(document.getElementById('space-text').textContent.split('· ')[1].replace(',', ''))";
+    let points = browser.run(count).as_u64().expect("a number");
+    println!("{}", browser.text("#space-text"));
+    assert!(points > 5000, "{points} points");
+    browser.key("body", "3");
+    until_legend(&browser, "flat inferred");
+    browser.screenshot("space-terrain-1440x900");
+    browser.key("body", "4");
+    browser.click("[data-part=road]");
+    until_legend(&browser, "255 hits");
+    browser.key("#space", "-");
+    browser.screenshot("space-occupancy-1440x900");
+    colours_are_drawn(&browser);
+    browser.click("#space-button");
+    browser.until("the flat map", "return !document.getElementById('map').hidden");
+    let errors = browser.console_errors();
+    drop(browser);
+    let phone = Browser::start_phone(390, 844);
+    phone.open(&format!("http://{}/", demo.page));
+    phone.until("a map", "return document.getElementById('freshness').textContent !== 'NO MAP YET'");
+    phone.run("document.getElementById('space-button').click(); document.getElementById('space-points').click()");
+    until_text(&phone, "points, dark");
+    phone.screenshot("space-390x844");
+    demo.stop();
+    assert_eq!(errors, Vec::<String>::new(), "the console has no errors");
+    assert_eq!(phone.console_errors(), Vec::<String>::new(), "the console of the phone has no errors");
+}
+
+fn until_text(browser: &Browser, words: &str) {
+    let script = format!("return document.getElementById('space-text').textContent.includes({words:?})");
+    browser.until(words, &script);
+}
+
+fn until_legend(browser: &Browser, words: &str) {
+    let script = format!("return document.querySelector('.legend').textContent.includes({words:?})");
+    browser.until(words, &script);
+}
+
+fn colours_are_drawn(browser: &Browser) {
+    browser.run("window.colours = 0");
+    browser.until("a drawn map", &format!("{COUNT_COLOURS} return window.colours >= {COLOURS_MIN}"));
+    println!("colours: {}", browser.run("return window.colours"));
+}
