@@ -2,7 +2,8 @@
 // the Worker.
 //
 // Each cell is a quad in the plane of its ground (ground.js). A cell of a class named "obstacle" is a box: as high as
-// its layer says, else OBSTACLE_M. Cells of which nothing is known are not drawn.
+// its layer says, else OBSTACLE_M. Cells of which nothing is known are not drawn. Neighbours of one colour in one plane
+// are one quad; only terrain's quads are drawn one by one, as in Neuhaus 2009, figure 4.
 
 import { overlayColours } from "../draw/paint.js";
 import { legendByMeaning, word } from "../draw/palette.js";
@@ -62,14 +63,33 @@ function pushCells(quads, ground, layer, lift, colourOf) {
   const { grid } = layer, [rows, columns] = grid.shape, xy = new Float64Array(8);
   const classes = layer.cells("class"), obstacle = layer.legend.findIndex(({ name }) => name === OBSTACLE);
   const rise = riseOf(layer);
+  const is_merged = grid.is_straight && layer.name !== "terrain", run = new Float64Array(8);
+  let run_colour = 0, run_plane = null;
+  const endRun = () => {
+    if (run_colour !== 0) quads.pushInPlane(run, run_plane, lift, run_colour);
+    run_colour = 0;
+  };
   for (let cell = 0; cell < rows * columns; cell++) {
+    if (cell % columns === 0) endRun();
     const colour = colourOf(cell);
-    if (colour === 0) continue;
+    if (colour === 0) {
+      endRun();
+      continue;
+    }
     grid.corners(cell, xy);
     const plane = ground.planeAt((xy[0] + xy[4]) / 2, (xy[1] + xy[5]) / 2);
-    if (classes && obstacle >= 0 && classes[cell] === obstacle) quads.pushBox(xy, plane, rise(cell) + lift, colour);
-    else quads.pushInPlane(xy, plane, lift, colour);
+    if (classes && obstacle >= 0 && classes[cell] === obstacle) {
+      endRun();
+      quads.pushBox(xy, plane, rise(cell) + lift, colour);
+    } else if (is_merged && colour === run_colour && plane === run_plane) {
+      for (let i = 2; i < 6; i++) run[i] = xy[i];
+    } else {
+      endRun();
+      run.set(xy);
+      [run_colour, run_plane] = [colour, plane];
+    }
   }
+  endRun();
 }
 
 // The height of what stands in a cell of a layer, metres.

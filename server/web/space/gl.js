@@ -1,38 +1,41 @@
 // Quads and points on a canvas, by WebGL 2. In: buffers of quads.js and points.js, and a matrix of orbit.js.
 
 import { scaleColour } from "../draw/palette.js";
-import { COLOUR_AT, QUAD_BYTES } from "./quads.js";
+import { COLOUR_AT, CORNER_BYTES } from "./quads.js";
 
 const GROUND = [0.043, 0.055, 0.067, 1];
 // Colours of points: from their height over the ground under the vehicle, metres.
 export const LOW_M = -0.5, HIGH_M = 3;
 const STOPS = [0, 0.25, 0.5, 0.75, 1];
 
-// A quad is a strip of two triangles: corners 0, 1, 3, 2. It is lit from above, so that planes of another slope differ,
-// and its edge is darker where a pixel is smaller than it.
+// A quad is two triangles of four corners. It is lit from above, so that planes of another slope differ, and its edge is
+// darker where a pixel is smaller than it.
 const QUAD = [`#version 300 es
 uniform mat4 matrix;
-in vec3 corner0, corner1, corner2, corner3;
+in vec3 corner;
 in vec4 colour;
-out vec4 lit;
+out vec4 painted;
+out vec3 place;
 out vec2 at;
 void main() {
-  vec3 corner = gl_VertexID == 0 ? corner0 : gl_VertexID == 1 ? corner1 : gl_VertexID == 2 ? corner3 : corner2;
-  vec3 normal = normalize(cross(corner1 - corner0, corner3 - corner0) + vec3(0.0, 0.0, 1e-6));
-  float light = 0.62 + 0.38 * abs(dot(normal, vec3(-0.34, 0.2, 0.919)));
-  lit = vec4(colour.rgb * light, colour.a);
-  at = vec2(gl_VertexID & 1, gl_VertexID >> 1);
-  gl_Position = matrix * vec4(0.01 * corner, 1.0);
+  int number = gl_VertexID & 3;
+  at = vec2(number == 1 || number == 2 ? 1.0 : 0.0, number >= 2 ? 1.0 : 0.0);
+  painted = colour;
+  place = 0.01 * corner;
+  gl_Position = matrix * vec4(place, 1.0);
 }`, `#version 300 es
-precision mediump float;
-in vec4 lit;
+precision highp float;
+in vec4 painted;
+in vec3 place;
 in vec2 at;
 out vec4 pixel;
 void main() {
+  vec3 normal = cross(dFdx(place), dFdy(place));
+  float light = 0.62 + 0.38 * abs(dot(normal / max(length(normal), 1e-12), vec3(-0.34, 0.2, 0.919)));
   vec2 size = max(fwidth(at), vec2(1e-4)), inside = min(at, 1.0 - at) / size;
   float is_large = 1.0 - smoothstep(0.1, 0.35, max(size.x, size.y));
   float edge = (1.0 - smoothstep(0.4, 1.4, min(inside.x, inside.y))) * is_large;
-  pixel = vec4(lit.rgb * (1.0 - 0.35 * edge), lit.a);
+  pixel = vec4(painted.rgb * light * (1.0 - 0.35 * edge), painted.a);
 }`];
 
 const POINT = [`#version 300 es
@@ -65,18 +68,34 @@ export class Scene {
   // The buffers of quads by name, in the order in which they are drawn, and the buffer of the points.
   #lists = new Map();
   #cloud;
+  // The corners of the triangles of all quads, and of how many.
+  #corners;
+  #corners_of = 0;
+  // Signalled when the graphics card has drawn the last picture; null if it has.
+  #drawing = null;
 
   // Throws an Error that says what the browser lacks.
   constructor(canvas) {
-    const gl = (this.#gl = canvas.getContext("webgl2", { antialias: true }));
+    const gl = (this.#gl = canvas.getContext("webgl2", { antialias: devicePixelRatio < 2 }));
     if (!gl) throw new Error("this browser gives no WebGL 2");
     this.#quads = program(gl, QUAD);
     this.#points = program(gl, POINT);
     this.#cloud = this.#newPoints();
+    this.#corners = gl.createBuffer();
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.clearColor(...GROUND);
+  }
+
+  // True if the last picture is not drawn yet. A new one would only wait, and the page with it.
+  get is_busy() {
+    const gl = this.#gl;
+    if (this.#drawing && gl.getSyncParameter(this.#drawing, gl.SYNC_STATUS) === gl.SIGNALED) {
+      gl.deleteSync(this.#drawing);
+      this.#drawing = null;
+    }
+    return this.#drawing !== null;
   }
 
   // Replaces the quads of a name.
@@ -87,6 +106,7 @@ export class Scene {
     gl.bindBuffer(gl.ARRAY_BUFFER, list.buffer);
     gl.bufferData(gl.ARRAY_BUFFER, bytes, gl.DYNAMIC_DRAW);
     list.count = count;
+    if (count > this.#corners_of) this.#addCorners(2 * count);
   }
 
   // xyz: Int16Array, centimetres.
@@ -115,9 +135,12 @@ export class Scene {
     gl.uniformMatrix4fv(gl.getUniformLocation(this.#quads, "matrix"), false, matrix);
     for (const { vertices, count } of this.#lists.values()) {
       gl.bindVertexArray(vertices);
-      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.#corners);
+      gl.drawElements(gl.TRIANGLES, 6 * count, gl.UNSIGNED_INT, 0);
     }
     gl.bindVertexArray(null);
+    this.#drawing = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
   }
 
   #newList() {
@@ -127,12 +150,22 @@ export class Scene {
     const add = (name, size, type, normalized, offset) => {
       const place = gl.getAttribLocation(this.#quads, name);
       gl.enableVertexAttribArray(place);
-      gl.vertexAttribPointer(place, size, type, normalized, QUAD_BYTES, offset);
-      gl.vertexAttribDivisor(place, 1);
+      gl.vertexAttribPointer(place, size, type, normalized, CORNER_BYTES, offset);
     };
-    for (let i = 0; i < 4; i++) add(`corner${i}`, 3, gl.SHORT, false, 6 * i);
+    add("corner", 3, gl.SHORT, false, 0);
     add("colour", 4, gl.UNSIGNED_BYTE, true, COLOUR_AT);
     return { vertices, buffer, count: 0 };
+  }
+
+  #addCorners(quads) {
+    const gl = this.#gl, corners = new Uint32Array(6 * quads);
+    for (let quad = 0, at = 0; quad < quads; quad++) {
+      for (const corner of [0, 1, 2, 0, 2, 3]) corners[at++] = 4 * quad + corner;
+    }
+    gl.bindVertexArray(null);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.#corners);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    this.#corners_of = quads;
   }
 
   #newPoints() {

@@ -25,6 +25,8 @@ export class Space {
   #camera = START;
   #size = { width: 0, height: 0 };
   #is_scheduled = false;
+  // Quads by name that the scene gets with the next picture.
+  #quads = new Map();
   #vehicle = null;
   #outline = null;
   #frame = null;
@@ -75,12 +77,12 @@ export class Space {
     if (!this.is_open || !this.#begin()) return;
     if (outline.join() !== this.#outline) {
       this.#outline = outline.join();
-      this.#scene.setQuads("vehicle", vehicleQuads(outline));
+      this.#quads.set("vehicle", vehicleQuads(outline));
     }
-    if (frame?.space && frame !== this.#frame) this.#scene.setQuads("cells", frame.space);
-    if (!frame) this.#scene.setQuads("cells", NONE);
+    if (frame?.space && frame !== this.#frame) this.#quads.set("cells", frame.space);
+    if (!frame) this.#quads.set("cells", NONE);
     if (frame && frame !== this.#frame) this.#poses.push(frame.header.capture_end_ns, pose);
-    this.#scene.setQuads("trail", pose ? trailQuads(trail, pose) : NONE);
+    this.#quads.set("trail", pose ? trailQuads(trail, pose) : NONE);
     this.#frame = frame;
     this.#schedule();
   }
@@ -153,7 +155,9 @@ export class Space {
     this.#is_scheduled = true;
     requestAnimationFrame(() => {
       this.#is_scheduled = false;
-      if (this.is_open && this.#scene) this.#draw();
+      if (!this.is_open || !this.#scene) return;
+      if (this.#scene.is_busy) this.#schedule();
+      else this.#draw();
     });
   }
 
@@ -165,6 +169,8 @@ export class Space {
     }
     this.#size = { width, height };
     const matrix = matrixOf(this.#camera, this.#size), points = this.#shownPoints();
+    for (const [name, quads] of this.#quads) this.#scene.setQuads(name, quads);
+    this.#quads.clear();
     this.#scene.setPoints(points?.xyz ?? new Int16Array(0));
     this.#scene.draw(matrix, scale, (points && this.#poses.move(points.capture_end_ns)) ?? NOT_MOVED);
     this.#placeLabels(matrix);

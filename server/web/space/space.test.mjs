@@ -8,7 +8,7 @@ import { gridOf } from "../wire/grid.js";
 import { groundOf } from "./ground.js";
 import { matrixOf, move, project, START, turn, zoom } from "./orbit.js";
 import { isPoints, Poses, readPoints } from "./points.js";
-import { COLOUR_AT, QUAD_BYTES, QuadList } from "./quads.js";
+import { COLOUR_AT, CORNER_BYTES, QUAD_BYTES, QuadList } from "./quads.js";
 import { text } from "./space.js";
 import { trailQuads, vehicleQuads } from "./vehicle.js";
 
@@ -21,8 +21,10 @@ function read({ bytes, count }) {
   const view = new DataView(bytes.buffer, bytes.byteOffset);
   return Array.from({ length: count }, (_, i) => {
     const at = i * QUAD_BYTES, short = (k) => view.getInt16(at + 2 * k, true) / 100;
-    const corners = [0, 3, 6, 9].map((k) => [short(k), short(k + 1), short(k + 2)]);
-    return { corners, colour: [...bytes.subarray(at + COLOUR_AT, at + QUAD_BYTES)] };
+    const corners = [0, 1, 2, 3].map((i) => [0, 1, 2].map((k) => short((i * CORNER_BYTES) / 2 + k)));
+    const colours = [0, 1, 2, 3].map((i) => [...bytes.slice(at + i * CORNER_BYTES + COLOUR_AT).subarray(0, 4)]);
+    colours.forEach((colour) => assert.deepEqual(colour, colours[0]));
+    return { corners, colour: colours[0] };
   });
 }
 
@@ -125,7 +127,8 @@ test("without terrain's planes the cells of every layer lie in those of the segm
   const layers = { drivability: [[classes, segment], planes], speed: [[classes]] };
   const { quads, space } = quadsOf(layers, "speed");
   assert.equal(space.source, "drivability");
-  assert.deepEqual(quads.map(zs), [[3, 3, 3, 3], [0, 1, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]]);
+  assert.deepEqual(quads.map(zs), [[3, 3, 3, 3], [0, 1, 1, 0], [0, 0, 0, 0]]);
+  assert.deepEqual(quads[2].corners, [[-10, 0, 0], [10, 0, 0], [10, 10, 0], [-10, 10, 0]], "two cells in one plane");
   assert.equal(groundOf(mapOf({ speed: [[classes]] })).source, null);
 });
 

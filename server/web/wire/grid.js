@@ -7,7 +7,8 @@ import { DecodeError } from "./limits.js";
 // How many cells a grid may have is checked where they are decoded (codec.js).
 //
 // { key, radius_m, cellAt(x, y) -> the cell's index or -1, fill(table, raster), corners(cell, xy):
-// writes x0, y0 ... x3, y3, in order around the cell }, and for deltas { kind: equal if cells
+// writes x0, y0 ... x3, y3, in order around the cell, is_straight: true if the cells of a row are one rectangle, with
+// corners 0 and 3 of its first cell and 1 and 2 of its last }, and for deltas { kind: equal if cells
 // are comparable,
 // shape: [rows, columns], first: [number of the first row, of the first column] }.
 export function gridOf(layer) {
@@ -66,7 +67,7 @@ function radial({ row_radius_m, columns, centre_x_m = 0, centre_y_m = 0 }) {
       xy[2 * i + 1] = centre_y_m + radius * Math.sin(azimuth);
     }
   };
-  return { key, radius_m, cellAt, fill, corners, kind: key, shape: [rows, columns], first: [0n, 0n] };
+  return { key, radius_m, cellAt, fill, corners, is_straight: false, kind: key, shape: [rows, columns], first: [0n, 0n] };
 }
 
 function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix = 0n, first_iy = 0n }) {
@@ -106,7 +107,7 @@ function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, fir
     }
   };
   const shape = [height, width], first = [first_iy, first_ix];
-  return { key, radius_m, cellAt, fill, corners, kind: `cartesian ${cell_m}`, shape, first };
+  return { key, radius_m, cellAt, fill, corners, is_straight: true, kind: `cartesian ${cell_m}`, shape, first };
 }
 
 // A raster is a picture of the ego frame, forward up, left on the left: { width, height: pixels, x_m, y_m: of its

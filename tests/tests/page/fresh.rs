@@ -5,6 +5,7 @@ use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
 use clearway::cli::demo::report::{Report, Summary};
+use clearway::cli::demo::sensors::Sensors;
 use clearway::cli::demo::{Endpoints, Options, demo};
 
 use crate::webdriver::Browser;
@@ -43,7 +44,7 @@ pub fn the_page_shows_a_fresh_map() {
     let fresh_percent_min = if seconds.is_some() { FRESH_PERCENT_MIN } else { 1 };
     let seconds: u64 = seconds.map_or(30, |text| text.parse().expect("CLEARWAY_PAGE_SECONDS is a number"));
     let looks = LOOKS_MIN.max(seconds / LOOK_EVERY_S);
-    let demo = RunningDemo::start();
+    let demo = RunningDemo::start(Sensors::Auto);
     let browser = Browser::start(1440, 900);
     browser.open(&format!("http://{}/", demo.page));
     // With one vehicle the page opens on it.
@@ -118,11 +119,11 @@ pub struct RunningDemo {
 }
 
 impl RunningDemo {
-    pub fn start() -> Self {
+    pub fn start(sensors: Sensors) -> Self {
         let (stop, stopped) = tokio::sync::oneshot::channel();
         let (send_page, page) = mpsc::channel();
         let thread = std::thread::spawn(move || {
-            let options = Options { any_port: true, ..Options::default() };
+            let options = Options { any_port: true, sensors, ..Options::default() };
             let begun = move |endpoints: &Endpoints| {
                 println!("sensors: {}", endpoints.sensors);
                 send_page.send(endpoints.page).expect("the test waits");
