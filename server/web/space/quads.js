@@ -1,7 +1,7 @@
 // A list of quads for the view in 3-D, as the graphics card reads it: for each quad four corners in order around it,
-// each x, y, z as int16 (centimetres in the ego frame), two bytes of nothing and a colour (an ImageData word). Quads are
-// not instances: software that draws without a graphics card takes a hundred times longer for each instance.
-// All arguments are metres.
+// each x, y, z as int16 (centimetres in the ego frame), two bytes of nothing and a colour (an ImageData word). All
+// arguments are metres. All quads of a list are one draw of triangles, not instances of one quad, which a browser
+// without a graphics card draws one by one.
 
 // Bytes of one corner and of one quad, and the offset of a corner's colour.
 export const CORNER_BYTES = 12, QUAD_BYTES = 4 * CORNER_BYTES, COLOUR_AT = 8;
