@@ -48,7 +48,8 @@ export function newFrame(map, show, raster, ranges) {
 }
 
 const withLegend = (layer, legend) => ({
-  name: layer.name, planes: layer.planes, grid: layer.grid, legend, channels: layer.channels, cells: (name) => layer.cells(name),
+  name: layer.name, planes: layer.planes, grid: layer.grid, legend, channels: layer.channels,
+  cells: (name) => layer.cells(name),
 });
 
 // Every value of the cell at a point of the ego frame, by layer: [{ layer, cell, values: [[channel, text, raw]] }].

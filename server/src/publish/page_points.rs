@@ -1,8 +1,8 @@
 //! The points of one vehicle for the page's view in 3-D.
 //!
 //! Each request of the page (`{"type":"points","vehicle","wanted":true}`) is answered with one frame, the newest points
-//! that were not sent yet, at most one every [`PERIOD`]. The page asks again when it has drawn the frame, so no link has
-//! a backlog. `"wanted":false` ends it.
+//! that were not sent yet, at most one every [`PERIOD`]. The page asks again when it has drawn the frame, so no link
+//! has a backlog. `"wanted":false` ends it.
 //!
 //! A frame is binary and little-endian. It is told apart from a `clearway.v1.MapUpdate` by its first byte: no protobuf
 //! message of this package begins with it (it would begin a group).

@@ -8,8 +8,8 @@ const GROUND = [0.043, 0.055, 0.067, 1];
 export const LOW_M = -0.5, HIGH_M = 3;
 const STOPS = [0, 0.25, 0.5, 0.75, 1];
 
-// A quad is two triangles of four corners. It is lit from above, so that planes of another slope differ, and its edge is
-// darker where a pixel is smaller than it.
+// A quad is two triangles of four corners. It is lit from above, so that planes of another slope differ, and its edge
+// is darker where a pixel is smaller than it.
 const QUAD = [`#version 300 es
 uniform mat4 matrix;
 in vec3 corner;

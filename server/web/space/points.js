@@ -42,8 +42,8 @@ export class Poses {
     if (this.#poses.length > POSES_MAX) this.#poses.shift();
   }
 
-  // Where the ego frame at a time is in that of the newest map: { x, y, yaw }; null if it is not known. Between two maps
-  // the vehicle moves evenly.
+  // Where the ego frame at a time is in that of the newest map: { x, y, yaw }; null if it is not known. Between two
+  // maps the vehicle moves evenly.
   move(stamp_ns) {
     const after = this.#poses.findIndex((at) => at.stamp_ns >= stamp_ns), to = this.#poses[after];
     if (!to || (after === 0 && to.stamp_ns !== stamp_ns)) return null;

@@ -66,6 +66,11 @@ test("the corners of a cell enclose the points that the grid says are in it", ()
     const xy = new Float64Array(8), [rows, columns] = grid.shape;
     for (let cell = 0; cell < rows * columns; cell++) {
       grid.corners(cell, xy);
+      // They are in order around it, counter-clockwise: a corner where the outline turns right would be out of order.
+      for (let i = 0; i < 4; i++) {
+        const [ax, ay, bx, by, cx, cy] = [0, 1, 2].flatMap((k) => [0, 1].map((axis) => xy[2 * ((i + k) % 4) + axis]));
+        assert.ok((bx - ax) * (cy - by) - (by - ay) * (cx - bx) > -1e-9, `${grid.key}, order`);
+      }
       // The middle, and places near each corner towards the middle.
       const middle = [0, 1].map((k) => (xy[k] + xy[2 + k] + xy[4 + k] + xy[6 + k]) / 4);
       for (let i = 0; i < 4; i++) {
@@ -220,6 +225,8 @@ test("the points of an earlier map are moved to where the vehicle is now", () =>
   // The vehicle was at (2, 0), looks to the left now from (4, 2): 2 m behind and 2 m to the left of it.
   [then.x, then.y, then.yaw].forEach((value, i) => near(value, [-2, 2, -Math.PI / 2][i]));
   assert.deepEqual([poses.move(99n), poses.move(301n)], [null, null], "not known");
+  const turning = poses.move(250n);
+  [turning.x, turning.y, turning.yaw].forEach((value, i) => near(value, [-1, 0, -Math.PI / 4][i]));
   poses.push(50n, { x: 0, y: 0, qx: 0, qy: 0, qz: 0, qw: 1 });
   assert.equal(poses.move(200n), null, "a replay that was set back begins again");
 });

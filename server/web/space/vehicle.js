@@ -28,8 +28,8 @@ export function vehicleQuads(outline) {
   return { bytes: quads.bytes, count: quads.count };
 }
 
-// points: where the vehicle was, in the frame of `pose`, in which it is now. They have no heights: the trail lies on the
-// ground plane under the vehicle.
+// points: where the vehicle was, in the frame of `pose`, in which it is now. They have no heights: the trail lies on
+// the ground plane under the vehicle.
 export function trailQuads(points, pose) {
   const quads = new QuadList(points.length + 1);
   const at = (point) => {
