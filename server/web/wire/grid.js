@@ -67,7 +67,8 @@ function radial({ row_radius_m, columns, centre_x_m = 0, centre_y_m = 0 }) {
       xy[2 * i + 1] = centre_y_m + radius * Math.sin(azimuth);
     }
   };
-  return { key, radius_m, cellAt, fill, corners, is_straight: false, kind: key, shape: [rows, columns], first: [0n, 0n] };
+  return { key, radius_m, cellAt, fill, corners, is_straight: false, kind: key, shape: [rows, columns],
+    first: [0n, 0n] };
 }
 
 function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix = 0n, first_iy = 0n }) {

@@ -5,15 +5,16 @@ use clearway::cli::demo::sensors::Sensors;
 use crate::fresh::RunningDemo;
 use crate::webdriver::Browser;
 
-/// Draws the view in 3-D again, and counts the colours of its pixels in `window.colours`: the pixels can be read only in
-/// the display frame in which they are drawn.
+/// Draws the view in 3-D again, and counts the colours of its pixels in `window.colours`: they can be read only in the
+/// display frame in which they are drawn.
 const COUNT_COLOURS: &str = "const canvas = document.getElementById('space');
     canvas.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowLeft' }));
     canvas.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight' }));
     requestAnimationFrame(() => {
         const copy = new OffscreenCanvas(300, 200), pen = copy.getContext('2d');
         pen.drawImage(canvas, 0, 0, 300, 200);
-        window.colours = Math.max(window.colours, new Set(new Uint32Array(pen.getImageData(0, 0, 300, 200).data.buffer)).size);
+        const { data } = pen.getImageData(0, 0, 300, 200);
+        window.colours = Math.max(window.colours, new Set(new Uint32Array(data.buffer)).size);
     });";
 /// Least number of colours of a drawn map: a canvas on which nothing is drawn has one.
 const COLOURS_MIN: u32 = 100;
