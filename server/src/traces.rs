@@ -10,7 +10,7 @@
 //! | `record` | the recorder begins to write the map -> it is written | recorder |
 //! | `send` | a publisher begins with the map -> it has handed it on; attribute `transport` | publishers |
 //!
-//! The id of a trace is computed from the map's header ([`trace_id`]), so whoever holds a map finds its trace, and a
+//! The id of a trace is computed from the map's header ([`trace_id`]), so a reader of the map finds its trace, and a
 //! planner can add spans of its own. Without a collector nothing is made.
 
 use std::cell::Cell;

@@ -2,10 +2,12 @@
 // the values of one cell. Runs in the Worker; everything in a frame can be posted.
 //
 // show: { base: { layer, channel }, overlays: [layer], road: true if classes named "road" are drawn over the base,
-// safe_points: true if they are wanted, by_meaning: true for colours by meaning }.
+// safe_points: true if they are wanted, by_meaning: true for colours by meaning, space: true for the view in 3-D, whose
+// frame has `space` (space/cells.js) and no pixels }.
 
 import { blendPixels, isId, overlayColours, paintChannel, paintPixels } from "./draw/paint.js";
 import { legendByMeaning } from "./draw/palette.js";
+import { CONFIDENCE, hasConfidence, spaceOf } from "./space/cells.js";
 import { count, valueText, words } from "./text.js";
 import { pixelCells } from "./wire/grid.js";
 
@@ -14,20 +16,24 @@ export const SAFE_PATH = "safe_path", ROAD = "road";
 // ranges: the colour scales so far by layer and channel, which this changes. Throws a DecodeError for a refused layer.
 export function newFrame(map, show, raster, ranges) {
   const base = map.layer(show.base.layer) ?? map.layer(map.names[0]);
-  if (!base) return { base: null, pixels: null, channels: [], legend: [], bar: null, safe_points: null };
+  if (!base) return { base: null, pixels: null, space: null, channels: [], legend: [], bar: null, safe_points: null };
   const layer = show.by_meaning ? withLegend(base, legendByMeaning(base.legend)) : base;
   const channel = layer.channels.find(({ name }) => name === show.base.channel) ?? layer.channels[0];
   const cells = layer.cells(channel.name), key = `${layer.name} ${channel.name}`;
   const { colours, legend, range, bar } = paintChannel(layer, channel, cells, ranges.get(key) ?? null);
   ranges.set(key, range);
-  const pixels = new Uint32Array(raster.width * raster.height);
-  paintPixels(pixels, pixelCells(layer.grid, raster), cells, colours);
-  for (const name of show.overlays) drawOver(map.layer(name), ({ meaning }) => meaning !== "unknown");
-  if (show.road) for (const name of map.names) drawOver(map.layer(name), (entry) => entry.name === ROAD);
+  const pixels = show.space ? null : new Uint32Array(raster.width * raster.height);
+  if (pixels) {
+    paintPixels(pixels, pixelCells(layer.grid, raster), cells, colours);
+    for (const name of show.overlays) drawOver(map.layer(name), ({ meaning }) => meaning !== "unknown");
+    if (show.road) for (const name of map.names) drawOver(map.layer(name), (entry) => entry.name === ROAD);
+  }
+  const space = show.space ? spaceOf(map, layer, channel, cells, colours, show) : null;
+  if (space && hasConfidence(layer, channel)) legend.push(...CONFIDENCE);
   return {
     base: { layer: layer.name, channel: channel.name },
     channels: layer.channels.map(({ name }) => name),
-    pixels, legend, bar,
+    pixels, space, legend, bar,
     radius_m: layer.grid.radius_m,
     drivable_share: map.layer("drivability")?.metrics.get("drivable_share") ?? null,
     safe_points: show.safe_points ? (map.layer(SAFE_PATH)?.safe_points ?? null) : null,
@@ -42,7 +48,8 @@ export function newFrame(map, show, raster, ranges) {
 }
 
 const withLegend = (layer, legend) => ({
-  name: layer.name, grid: layer.grid, legend, channels: layer.channels, cells: (name) => layer.cells(name),
+  name: layer.name, planes: layer.planes, grid: layer.grid, legend, channels: layer.channels,
+  cells: (name) => layer.cells(name),
 });
 
 // Every value of the cell at a point of the ego frame, by layer: [{ layer, cell, values: [[channel, text, raw]] }].

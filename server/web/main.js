@@ -71,6 +71,7 @@ const FROM_WORKER = {
     is_draw_scheduled = true;
     requestAnimationFrame(draw);
   },
+  points: (message) => view.points(message),
   cell: (message) => message.vehicle === view.name && view.cell(message),
   refused({ vehicle, reason }) {
     if (view.name !== null && (vehicle === view.name || vehicle === "")) view.refuse(reason);

@@ -3,7 +3,7 @@
 const KEY = "clearway.page";
 const DEFAULTS = {
   layer: "drivability", channel: "class", overlays: [], road: false, safe_points: true, trail: true, by_meaning: false,
-  max_rate_hz: 0, save_data: false, order: "state", only: "all",
+  space: false, points: false, max_rate_hz: 0, save_data: false, order: "state", only: "all",
 };
 
 // Reads what was kept. A value of another type than its default is left out, so that no old version harms.
@@ -49,13 +49,15 @@ export function wantOf(settings, layers) {
   // The layer with the road's cells, and the one with the safe points.
   if (settings.road) wanted.push("speed");
   if (settings.safe_points) wanted.push("safe_path");
+  // The layers with planes, on which the view in 3-D puts all cells.
+  if (settings.space) wanted.push("terrain", "drivability");
   return {
     layers: [...new Set(wanted)].filter(known).sort(),
     max_rate_hz: settings.max_rate_hz > 0 ? settings.max_rate_hz : null,
     deltas: settings.save_data,
     show: {
       base: { layer: base, channel: settings.channel }, overlays, road: settings.road,
-      safe_points: settings.safe_points, by_meaning: settings.by_meaning,
+      safe_points: settings.safe_points, by_meaning: settings.by_meaning, space: settings.space,
     },
   };
 }

@@ -6,6 +6,7 @@
 
 import { Feed } from "./feed.js";
 import { Link } from "./link.js";
+import { isPoints, readPoints } from "./space/points.js";
 import { readMap, readMapUpdate } from "./wire/protobuf.js";
 
 const feeds = new Map();
@@ -27,6 +28,7 @@ const link = new Link({
   },
   update(bytes, arrived_ms) {
     try {
+      if (isPoints(bytes)) return postMessage({ type: "points", ...readPoints(bytes) });
       const { header } = readMap(readMapUpdate(bytes).map);
       feeds.get(header?.vehicle)?.push(bytes, absolute(arrived_ms));
     } catch (error) {
@@ -36,8 +38,8 @@ const link = new Link({
 }, address);
 
 const emit = (message) => {
-  if (message.type !== "frame" || !message.pixels) return postMessage(message);
-  postMessage(message, [message.pixels.buffer]);
+  const pictures = [message.pixels, message.space?.bytes].filter(Boolean);
+  postMessage(message, pictures.map(({ buffer }) => buffer));
 };
 
 const FROM_PAGE = {

@@ -13,6 +13,7 @@
 //! | `announcements` | own vehicles -> other servers; theirs -> the fleet |
 //! | `ros` | newest map -> ROS 2 topics in rmw_zenoh's key space |
 //! | [`foxglove`] | newest map, points, pose -> Foxglove's WebSocket |
+//! | `page_points` | newest points -> a binary frame for the page's view in 3-D |
 //! | `page_recorder` | the recorder's buttons on the page, as JSON |
 //! | `page_replay` | the state of a replay and requests of the page, as JSON |
 //! | `page_live` | selections and acknowledgements of a browser -> maps, status and replay state on its WebSocket |
@@ -25,6 +26,7 @@ pub mod grpc;
 pub mod listen;
 pub mod page;
 mod page_live;
+mod page_points;
 mod page_recorder;
 mod page_replay;
 #[cfg(feature = "zenoh")]

@@ -7,8 +7,9 @@
 //! | | `{"type":"keyframe","vehicle","id"}`: the base of a delta is missing |
 //! | | `{"type":"unwatch","vehicle"}`; `{"type":"detail","vehicle"}`: whose whole status is wanted |
 //! | | `{"type":"replay",...}`: a request of the time bar, of operators |
-//! | to the browser, binary | `clearway.v1.MapUpdate`; the header names the vehicle |
-//! | to the browser, text | `"watching"` (the maps after it are those of this `id`), `"refused"` (with `reason`), `"fleet"` (the status of each vehicle, once a second), `"replay"` (at each change) |
+//! | | `{"type":"points","vehicle","wanted"}`: one frame of points, or no more of them ([`super::page_points`]) |
+//! | to the browser, binary | `clearway.v1.MapUpdate`; the header names the vehicle. A frame of points |
+//! | to the browser, text | `"watching"` (the maps after it are those of this `id`), `"refused"` (with `reason`), `"fleet"` (the status of each vehicle, once a second), `"replay"` (at each change), `"points"` (with `reason`: why there are none) |
 //!
 //! A selection means what it means over gRPC. With `max_in_flight`, no more maps than that are on the way, so a slow
 //! link has no backlog. A connection of one vehicle, `/live?vehicle=V`, begins with all its layers, and its status is a
@@ -34,6 +35,7 @@ use tonic::{Code, Status};
 use super::grpc::reader::watch_from_page;
 use super::listen::InProgress;
 use super::listen::access::Caller;
+use super::page_points::{PagePoints, next_points};
 use super::page_recorder::{PageRecorder, RecorderRequest, recorder_answered};
 use super::page_replay::{PageReplay, PageRequest, replay_changed, replay_json};
 use super::served::{Served, Vehicles};
@@ -64,6 +66,7 @@ enum Request {
     Acknowledge { vehicle: String, id: u64, sequence: String },
     Keyframe { vehicle: String, id: u64 },
     Detail { vehicle: String },
+    Points { vehicle: String, wanted: bool },
     Replay(PageRequest),
     Recorder(RecorderRequest),
 }
@@ -160,6 +163,7 @@ pub(super) struct Live {
     is_of_one: bool,
     caller: Caller,
     replay: Option<PageReplay>,
+    points: Option<PagePoints>,
     recorder: Option<PageRecorder>,
     /// The vehicle whose whole status is sent.
     detail: String,
@@ -173,8 +177,9 @@ impl Live {
         let vehicles = vehicles.0.iter().filter(|served| caller.may_reach(&served.status.name)).cloned().collect();
         let replay = replay.and_then(|handle| PageReplay::new(handle, &caller));
         let (detail, watching, updates) = (String::new(), BTreeMap::new(), SelectAll::new());
-        let fleet = Fleet::default();
-        Self { vehicles, fleet, summaries, is_of_one: false, caller, replay, recorder: None, detail, watching, updates }
+        let (fleet, points, recorder) = (Fleet::default(), None, None);
+        let is_of_one = false;
+        Self { vehicles, fleet, summaries, is_of_one, caller, replay, points, recorder, detail, watching, updates }
     }
 
     /// Adds the vehicles of other servers, and the recorder's buttons.
@@ -211,6 +216,7 @@ impl Live {
             let next = tokio::select! {
                 Some(update) = self.updates.next(), if !self.updates.is_empty() => self.send(update),
                 _ = every.tick() => self.status(),
+                points = next_points(&mut self.points) => Next::Frame(Frame::Binary(points)),
                 state = replay_changed(&mut replay_state) => text(replay_json(&state, "")),
                 answer = recorder_answered(&mut self.recorder) => text(answer),
                 received = socket.recv() => match received {
@@ -295,6 +301,16 @@ impl Live {
                 self.detail = vehicle;
                 self.status()
             }
+            Ok(Request::Points { vehicle, wanted: false }) => {
+                self.points.take_if(|points| points.are_of(&vehicle));
+                Next::Nothing
+            }
+            Ok(Request::Points { vehicle, wanted: true }) => match self.request_points(&vehicle) {
+                Ok(()) => Next::Nothing,
+                Err(status) => {
+                    text(json!({ "type": "points", "vehicle": vehicle, "reason": status.message() }).to_string())
+                }
+            },
             Ok(Request::Keyframe { vehicle, id }) => {
                 let request = v1::WatchRequest { request_keyframe: true, ..v1::WatchRequest::default() };
                 self.request(&vehicle, id, request)
@@ -309,10 +325,22 @@ impl Live {
         }
     }
 
+    fn served(&self, vehicle: &str) -> Result<&Served, Status> {
+        let served = self.vehicles.iter().find(|served| *served.status.name == *vehicle);
+        served.ok_or_else(|| Status::not_found(format!("no vehicle is named {vehicle:?}")))
+    }
+
+    fn request_points(&mut self, vehicle: &str) -> Result<(), Status> {
+        if !self.points.as_ref().is_some_and(|points| points.are_of(vehicle)) {
+            self.points = Some(PagePoints::new(self.served(vehicle)?, &self.caller)?);
+        }
+        self.points.iter_mut().for_each(PagePoints::request);
+        Ok(())
+    }
+
     fn watch(&mut self, request: WatchRequest) -> Result<(), Status> {
         let WatchRequest { vehicle, id, layers, max_rate_hz, deltas, max_in_flight } = request;
-        let served = self.vehicles.iter().find(|served| *served.status.name == vehicle);
-        let served = served.ok_or_else(|| Status::not_found(format!("no vehicle is named {vehicle:?}")))?;
+        let served = self.served(&vehicle)?;
         let layers = self.caller.layers(&vehicle, layers, &served.status.layers)?;
         if self.watching.len() >= WATCHES_MAX && !self.watching.contains_key(&vehicle) {
             return Err(Status::resource_exhausted(format!("at most {WATCHES_MAX} vehicles are allowed at a time")));

@@ -5,6 +5,7 @@ import { freshness } from "../clock.js";
 import * as metrics from "../metrics.js";
 import { bearing, bytes, dash, duration, setText, words } from "../text.js";
 import { wantOf } from "../settings.js";
+import { Space } from "../space/space.js";
 import { stateOf } from "../fleet/state.js";
 import { Layers } from "./layers.js";
 import { MapCanvas } from "./map_canvas.js";
@@ -27,6 +28,7 @@ export class VehicleView {
   #settings;
   #map;
   #layers;
+  #space;
   #plots;
   #shown = null;
   #is_recorded = false;
@@ -51,11 +53,15 @@ export class VehicleView {
     this.#settings = settings;
     this.#plots = new Plots($("plots"));
     const part = (name) => $("layer-choice").querySelector(`[data-part="${name}"]`);
-    this.#layers = new Layers(part, settings, () => {
+    const draw = () => {
       changed();
       this.#want();
       this.#draw();
-    });
+    };
+    this.#layers = new Layers(part, settings, draw);
+    const ask = (request) => this.#post({ type: "server", request: { type: "points", ...request } });
+    this.#space = new Space(settings, draw, ask);
+    const shown = () => (this.#space.is_open ? this.#space : this.#map);
     this.#map = new MapCanvas($("map"), {
       view: () => this.#wantSoon(),
       probe: (at) => {
@@ -63,9 +69,9 @@ export class VehicleView {
         if (!at) this.#writeCell(null);
       },
     });
-    $("zoom-in").onclick = () => this.#map.zoom(1.5);
-    $("zoom-out").onclick = () => this.#map.zoom(1 / 1.5);
-    $("zoom-all").onclick = () => this.#map.reset();
+    $("zoom-in").onclick = () => shown().zoom(1.5);
+    $("zoom-out").onclick = () => shown().zoom(1 / 1.5);
+    $("zoom-all").onclick = () => shown().reset();
   }
 
   // Begins to show a vehicle.
@@ -74,6 +80,7 @@ export class VehicleView {
     this.name = name;
     setText($("vehicle-name"), name);
     this.#map.forgetView();
+    this.#space.open(name);
     this.#writeCell(null);
     this.#writeAge();
     this.#post({ type: "server", request: { type: "detail", vehicle: name } });
@@ -83,6 +90,7 @@ export class VehicleView {
     clearTimeout(this.#age_timer);
     if (this.name !== null) this.#post({ type: "want", vehicle: this.name, want: null });
     this.name = null;
+    this.#space.open(null);
     this.#shown = this.#status = this.#status_arrived_ms = this.#first_drawn_ms = null;
     this.#drawn_ms = [];
     this.#layer_names = [];
@@ -96,6 +104,7 @@ export class VehicleView {
     if (state.phase !== "live" || this.name === null) return;
     this.#first_drawn_ms = null;
     this.#drawn_ms = [];
+    this.#space.open(this.name);
     this.#post({ type: "server", request: { type: "detail", vehicle: this.name } });
   }
 
@@ -122,6 +131,10 @@ export class VehicleView {
     $("refusal").hidden = true;
     this.#draw();
     this.#writeAge();
+  }
+
+  points(points) {
+    this.#space.points(points);
   }
 
   cell(message) {
@@ -159,10 +172,12 @@ export class VehicleView {
 
   #draw() {
     const pose = this.#shown?.header.map_from_ego ?? null;
+    const vehicle = {
+      outline: this.#status?.outline_m ?? [], trail: this.#settings.trail ? this.#trail.points : [], pose,
+    };
+    this.#space.show(this.#shown, vehicle);
     this.#map.show(this.#shown, {
-      outline: this.#status?.outline_m ?? [],
-      trail: this.#settings.trail ? this.#trail.points : [],
-      pose,
+      ...vehicle,
       safe_points: this.#settings.safe_points ? (this.#shown?.safe_points ?? null) : null,
     });
     const label = this.#shown?.base ? `${words(this.#shown.base.layer)} around the vehicle, forward up` : "No map yet";

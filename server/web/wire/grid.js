@@ -6,7 +6,9 @@ import { DecodeError } from "./limits.js";
 
 // How many cells a grid may have is checked where they are decoded (codec.js).
 //
-// { key, radius_m, cellAt(x, y) -> the cell's index or -1, fill(table, raster) }, and for deltas { kind: equal if cells
+// { key, radius_m, cellAt(x, y) -> the cell's index or -1, fill(table, raster), corners(cell, xy):
+// writes x0, y0 ... x3, y3, in order around the cell, is_straight: true if the cells of a row are one rectangle, with
+// corners 0 and 3 of its first cell and 1 and 2 of its last }, and for deltas { kind: equal if cells
 // are comparable,
 // shape: [rows, columns], first: [number of the first row, of the first column] }.
 export function gridOf(layer) {
@@ -56,7 +58,17 @@ function radial({ row_radius_m, columns, centre_x_m = 0, centre_y_m = 0 }) {
       for (let px = 0; px < raster.width; px++, i++) table[i] = cellAt(x, left - px * raster.metres);
     }
   };
-  return { key, radius_m, cellAt, fill, kind: key, shape: [rows, columns], first: [0n, 0n] };
+  const corners = (cell, xy) => {
+    const row = Math.floor(cell / columns), from = (cell % columns) / perRadian, to = from + 1 / perRadian;
+    const inner = row ? radii[row - 1] : 0, outer = radii[row];
+    for (let i = 0; i < 4; i++) {
+      const radius = i === 1 || i === 2 ? outer : inner, azimuth = i >= 2 ? to : from;
+      xy[2 * i] = centre_x_m + radius * Math.cos(azimuth);
+      xy[2 * i + 1] = centre_y_m + radius * Math.sin(azimuth);
+    }
+  };
+  return { key, radius_m, cellAt, fill, corners, is_straight: false, kind: key, shape: [rows, columns],
+    first: [0n, 0n] };
 }
 
 function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, first_ix = 0n, first_iy = 0n }) {
@@ -87,8 +99,16 @@ function cartesian({ origin_x_m, origin_y_m, width, height, cell_m, yaw_rad, fir
       }
     }
   };
+  const corners = (cell, xy) => {
+    const left = origin_x_m + (cell % width) * cell_m, low = origin_y_m + Math.floor(cell / width) * cell_m;
+    for (let i = 0; i < 4; i++) {
+      const across = left + (i === 1 || i === 2 ? cell_m : 0), along = low + (i >= 2 ? cell_m : 0);
+      xy[2 * i] = across * cos + along * sin;
+      xy[2 * i + 1] = along * cos - across * sin;
+    }
+  };
   const shape = [height, width], first = [first_iy, first_ix];
-  return { key, radius_m, cellAt, fill, kind: `cartesian ${cell_m}`, shape, first };
+  return { key, radius_m, cellAt, fill, corners, is_straight: true, kind: `cartesian ${cell_m}`, shape, first };
 }
 
 // A raster is a picture of the ego frame, forward up, left on the left: { width, height: pixels, x_m, y_m: of its

@@ -67,7 +67,7 @@ export class LiveMap {
 }
 
 // One layer: { name, legend: [{ name, meaning, colour }], grid, metrics, channels: [{ name, unit, scale, unknown }],
-// safe_points: of safe_points.js, or null }.
+// planes: [{ a, b, c }] by segment, safe_points: of safe_points.js, or null }.
 class Layer {
   #channels = new Map();
   #cells = new Map();
@@ -79,6 +79,7 @@ class Layer {
     this.grid = gridOf(message);
     this.legend = before && isWithoutLegend(message) ? before.legend : readLegend(message);
     this.metrics = message.metrics;
+    this.planes = message.planes;
     this.safe_points = readSafePoints(message.name, message.safe_points);
     this.#before = before;
     for (const channel of message.channels) {

@@ -160,10 +160,11 @@ const SAFE_POINTS = {
   1: ["step_m", float], 2: ["x", repeated(sint32)], 3: ["y", repeated(sint32)], 4: ["radius_cm", repeated(sint32)],
   5: ["starts", repeated(uint32)], 6: ["link_from", repeated(uint32)], 7: ["link_back", repeated(uint32)],
 };
+const PLANE = { 1: ["a", double], 2: ["b", double], 3: ["c", double] };
 const LAYER = {
   1: ["name", string], 2: ["radial", message(RADIAL)], 3: ["cartesian", message(CARTESIAN)],
   4: ["legend", repeated(string)],
-  5: ["channels", repeated(message(CHANNEL))], 7: ["metrics", map(double)],
+  5: ["channels", repeated(message(CHANNEL))], 6: ["planes", repeated(message(PLANE))], 7: ["metrics", map(double)],
   9: ["safe_points", message(SAFE_POINTS)],
   10: ["base_sequence", optional(uint64)],
   11: ["legend_meanings", repeated(uint32)], 12: ["legend_rgb", repeated(fixed32)],

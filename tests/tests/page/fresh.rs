@@ -5,6 +5,7 @@ use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
 use clearway::cli::demo::report::{Report, Summary};
+use clearway::cli::demo::sensors::Sensors;
 use clearway::cli::demo::{Endpoints, Options, demo};
 
 use crate::webdriver::Browser;
@@ -43,7 +44,7 @@ pub fn the_page_shows_a_fresh_map() {
     let fresh_percent_min = if seconds.is_some() { FRESH_PERCENT_MIN } else { 1 };
     let seconds: u64 = seconds.map_or(30, |text| text.parse().expect("CLEARWAY_PAGE_SECONDS is a number"));
     let looks = LOOKS_MIN.max(seconds / LOOK_EVERY_S);
-    let demo = RunningDemo::start();
+    let demo = RunningDemo::start(Sensors::Auto);
     let browser = Browser::start(1440, 900);
     browser.open(&format!("http://{}/", demo.page));
     // With one vehicle the page opens on it.
@@ -111,18 +112,18 @@ fn looks_well_on_a_phone(demo: &RunningDemo) {
 }
 
 /// A demo in this process, on ports of the operating system's choice.
-struct RunningDemo {
-    page: SocketAddr,
+pub struct RunningDemo {
+    pub page: SocketAddr,
     stop: tokio::sync::oneshot::Sender<()>,
     thread: std::thread::JoinHandle<Summary>,
 }
 
 impl RunningDemo {
-    fn start() -> Self {
+    pub fn start(sensors: Sensors) -> Self {
         let (stop, stopped) = tokio::sync::oneshot::channel();
         let (send_page, page) = mpsc::channel();
         let thread = std::thread::spawn(move || {
-            let options = Options { any_port: true, ..Options::default() };
+            let options = Options { any_port: true, sensors, ..Options::default() };
             let begun = move |endpoints: &Endpoints| {
                 println!("sensors: {}", endpoints.sensors);
                 send_page.send(endpoints.page).expect("the test waits");
@@ -137,7 +138,7 @@ impl RunningDemo {
         Self { page: page.recv_timeout(START_MAX).expect("the demo starts"), stop, thread }
     }
 
-    fn stop(self) -> Summary {
+    pub fn stop(self) -> Summary {
         self.stop.send(()).expect("the demo still runs");
         self.thread.join().expect("the demo ends well")
     }

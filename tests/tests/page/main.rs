@@ -12,6 +12,8 @@ mod fresh;
 #[cfg(clearway_browser)]
 mod replayed;
 #[cfg(clearway_browser)]
+mod space;
+#[cfg(clearway_browser)]
 mod webdriver;
 
 macro_rules! in_a_browser {
@@ -30,6 +32,7 @@ macro_rules! in_a_browser {
 
 in_a_browser! {
     the_page_beside_the_demo_shows_a_fresh_map => fresh::the_page_shows_a_fresh_map,
+    a_drive_is_shown_in_3d_with_its_points => space::a_drive_is_shown_in_3d,
     a_cell_on_the_page_has_the_values_that_a_client_reads => replayed::cells_are_those_of_the_client,
     a_viewed_drive_is_recorded_and_not_stale_and_steps => replayed::a_viewed_drive_steps,
     the_time_bar_steps_and_seeks_a_replay => replayed::the_time_bar_controls_a_replay,
