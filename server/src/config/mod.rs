@@ -100,7 +100,7 @@ pub struct Page {
     pub enabled: bool,
     /// Address and port to listen on; port 0 selects a free port.
     pub listen: SocketAddr,
-    /// URL at which others reach the page, for the pages of other servers; empty: they show its vehicles without a link.
+    /// URL at which others reach the page, for pages of other servers; empty: they show its vehicles without a link.
     pub advertise: String,
 }
 
