@@ -110,6 +110,9 @@ async fn the_last_seconds_are_saved_when_one_of_two_sensors_is_lost() {
         sensors.len() == 2 && sensors.iter().all(|sensor| sensor.state == "ok")
     };
     until("maps of both sensors", are_in_maps).await;
+    // The rule looks twice a second, and must have seen both: that is longer than ten revolutions take.
+    let maps = status.snapshot().maps;
+    until("the rule has seen them", || status.snapshot().maps >= maps + 15).await;
     assert_eq!(saves(folder.path()), [""; 0], "nothing is lost yet");
     rear.halt();
     until("the rule saves", || !saves(folder.path()).is_empty()).await;

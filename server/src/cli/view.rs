@@ -8,7 +8,7 @@ use clap::Args;
 use super::exit::Exit;
 use super::replay;
 
-/// Look at recorded drives on the page: paused, with a time bar, a step, all layers, the trail and every value.
+/// Look at recorded drives on the page: paused, with a time bar, a step and all layers.
 ///
 /// Replays the files as recorded on free ports of this machine, and prints the address of the page. The keys of
 /// `clearway replay` work too.

@@ -96,7 +96,9 @@ fn datagrams_that_arrive_while_the_server_restarts_wait_in_the_sockets_of_the_se
         socket2::SockRef::from(&held).set_cloexec(false).expect("inherited");
         socket2::SockRef::from(&grpc).set_cloexec(false).expect("inherited");
         // As systemd passes them: descriptors 3 and 4.
-        let script = format!("exec 8<&{} 9<&{}; exec 3<&8 4<&9 8<&- 9<&-; exec \"$@\"", fds[0], fds[1]);
+        // By way of numbers that no descriptor of this process has.
+        let [udp, tcp] = fds;
+        let script = format!("exec 900<&{udp} 901<&{tcp}; exec 3<&900 4<&901 900<&- 901<&-; exec \"$@\"");
         let server = Command::new("bash")
             .args(["-c", &script, "bash"])
             .arg(binaries().join("clearway"))

@@ -1,0 +1,272 @@
+//! Measures how many vehicles one server bears: HDL-64Es at 10 Hz over UDP, poses at 20 Hz over gRPC, and one gRPC
+//! reader of `drivability` and `speed` for each vehicle.
+//!
+//!   cargo bench -p clearway-tests --bench vehicles                                1, 2, 4, 8 and 16 vehicles
+//!   cargo bench -p clearway-tests --bench vehicles -- --vehicles 4 --seconds 60 --cpus 0,1
+//!
+//! The server runs in its own process, on the processors of `--cpus`; senders and readers run on the others. The
+//! datagrams are made beforehand, and every vehicle sends the same ones, each begun at another moment of a revolution.
+//! Age: from the end of a map's capture, by the server's estimate, to the reader's hands. Lost: datagrams that were
+//! sent and not received, dropped by the kernel or lost at the queue. Memory: growth of the server's resident set over
+//! that of a server without vehicles' data, divided by the number of vehicles.
+
+use std::io::{BufRead, BufReader};
+use std::net::{SocketAddr, UdpSocket};
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use clap::Parser;
+use clearway::config::{Config, Udp};
+use clearway::server::{Server, Setup};
+use clearway_client::{Client, Observation, Subscription, now_ns};
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes::town;
+use clearway_sim::vehicle::{Datagram, Kind, SimulatedVehicle};
+use tokio::task::JoinSet;
+
+/// Time after which readers are connected and memory is allocated; maps until then are not counted.
+const SETTLE: Duration = Duration::from_secs(3);
+/// Time between two poses of a vehicle.
+const POSE_PERIOD: Duration = Duration::from_millis(50);
+/// Time of a revolution.
+const REVOLUTION: Duration = Duration::from_millis(100);
+/// Threads that send.
+const SENDERS: usize = 2;
+/// Time before its due time within which a packet is sent without waiting.
+const BURST: Duration = Duration::from_millis(1);
+/// The layers that are read.
+const LAYERS: [&str; 2] = ["drivability", "speed"];
+
+#[derive(Parser)]
+struct Arguments {
+    /// How many vehicles, one row each.
+    #[arg(long, value_delimiter = ',', default_values_t = [1, 2, 4, 8, 16])]
+    vehicles: Vec<usize>,
+    /// Seconds of each row.
+    #[arg(long, default_value_t = 20)]
+    seconds: u64,
+    /// Processors of the server.
+    #[arg(long, default_value = "0,1")]
+    cpus: String,
+    /// Runs as the server of so many vehicles; this program starts itself so.
+    #[arg(long, hide = true)]
+    serve: Option<usize>,
+    /// Set by cargo bench.
+    #[arg(long, hide = true)]
+    bench: bool,
+}
+
+fn main() {
+    let arguments = Arguments::parse();
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+    let runtime = runtime.expect("a runtime");
+    if let Some(vehicles) = arguments.serve {
+        return runtime.block_on(serve(vehicles));
+    }
+    let length = SETTLE + Duration::from_secs(arguments.seconds) + 2 * REVOLUTION;
+    let drive: Arc<[Datagram]> = packets(length).into();
+    println!("| vehicles | maps/s | age p50 / p99 / worst ms | maps missed | datagrams lost | MiB a vehicle | server's cores |");
+    println!("|---|---|---|---|---|---|---|");
+    for &vehicles in &arguments.vehicles {
+        println!("{}", runtime.block_on(measure(vehicles, &arguments, &drive)));
+    }
+}
+
+/// The data packets of a drive of this length.
+fn packets(length: Duration) -> Vec<Datagram> {
+    let vehicle = SimulatedVehicle::new(town(), ScannerConfig::default());
+    let mut data = vehicle.filter(|datagram| datagram.kind != Kind::Telemetry).peekable();
+    let first_ns = data.peek().expect("datagrams do not end").stamp_ns;
+    data.take_while(|datagram| datagram.stamp_ns - first_ns < length.as_nanos() as i64).collect()
+}
+
+/// Runs one row.
+async fn measure(vehicles: usize, arguments: &Arguments, drive: &Arc<[Datagram]>) -> String {
+    let mut server = Process::start(vehicles, &arguments.cpus);
+    let client = Client::connect(&server.grpc).await.expect("the server answers");
+    let empty_kib = server.resident_kib();
+    let is_measured = Arc::new(AtomicBool::new(false));
+    let (mut readers, mut poses) = (JoinSet::new(), JoinSet::new());
+    for number in 0..vehicles {
+        let (client, is_measured) = (client.clone(), is_measured.clone());
+        poses.spawn(send_poses(client.clone(), name(number)));
+        readers.spawn(async move { read(client, name(number), &is_measured).await });
+    }
+    let sent = Arc::new(AtomicU64::new(0));
+    let senders: Vec<_> = (0..SENDERS.min(vehicles))
+        .map(|sender| {
+            let to: Vec<_> = server.data.iter().copied().enumerate().skip(sender).step_by(SENDERS).collect();
+            let (drive, sent) = (drive.clone(), sent.clone());
+            std::thread::spawn(move || send(&drive, &to, vehicles, &sent))
+        })
+        .collect();
+    tokio::time::sleep(SETTLE).await;
+    let (began, processor_s) = (Instant::now(), server.processor_s());
+    is_measured.store(true, Ordering::Relaxed);
+    tokio::time::sleep(Duration::from_secs(arguments.seconds)).await;
+    is_measured.store(false, Ordering::Relaxed);
+    let (cores, kib) = ((server.processor_s() - processor_s) / began.elapsed().as_secs_f64(), server.resident_kib());
+    senders.into_iter().for_each(|sender| sender.join().expect("it sends"));
+    // The engines finish what waits.
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    let received: u64 = counts(&client).await;
+    server.stop();
+    poses.shutdown().await;
+    let (mut ages, mut missed) = (Vec::new(), 0);
+    while let Some(read) = readers.join_next().await {
+        let (of_vehicle, skipped) = read.expect("no panic");
+        ages.extend(of_vehicle);
+        missed += skipped;
+    }
+    ages.sort_by(f64::total_cmp);
+    let at = |share: f64| ages.get(((ages.len() as f64 * share) as usize).min(ages.len().max(1) - 1)).copied();
+    let [p50, p99, worst] = [0.5, 0.99, 1.0].map(|share| at(share).unwrap_or(f64::NAN));
+    let rate = ages.len() as f64 / arguments.seconds as f64;
+    let mib = (kib - empty_kib) as f64 / 1024.0 / vehicles as f64;
+    let lost = sent.load(Ordering::Relaxed).saturating_sub(received);
+    format!(
+        "| {vehicles} | {rate:.0} | {p50:.1} / {p99:.1} / {worst:.0} | {missed} | {lost} | {mib:.0} | {cores:.2} |"
+    )
+}
+
+fn name(number: usize) -> String {
+    format!("v{number:02}")
+}
+
+/// The datagrams that the server has received and not lost.
+async fn counts(client: &Client) -> u64 {
+    let vehicles = client.vehicles().await.expect("the server answers");
+    let ledgers = vehicles.into_iter().filter_map(|vehicle| vehicle.ledger);
+    ledgers.map(|ledger| ledger.received).sum()
+}
+
+/// Ages in ms of the maps of a vehicle that come while they are measured, and the number of those that were skipped.
+async fn read(client: Client, vehicle: String, is_measured: &AtomicBool) -> (Vec<f64>, u64) {
+    let layers = LAYERS.map(str::to_owned).to_vec();
+    let subscription = Subscription { vehicle, layers, ..Subscription::default() };
+    let mut maps = client.subscribe(subscription).await.expect("a stream");
+    let (mut ages, mut missed, mut last) = (Vec::new(), 0, None);
+    while let Ok(update) = maps.next().await {
+        let sequence = update.map.sequence();
+        let between = last.replace(sequence).map_or(0, |last: u64| sequence.saturating_sub(last + 1));
+        if is_measured.load(Ordering::Relaxed) {
+            ages.push((now_ns() - update.map.header().capture_end_ns) as f64 * 1e-6);
+            missed += between;
+        }
+    }
+    (ages, missed)
+}
+
+/// Sends where the vehicle is, until the task is stopped.
+async fn send_poses(client: Client, vehicle: String) {
+    let mut ingester = client.ingest(&vehicle).await.expect("ingest is allowed");
+    let mut every = tokio::time::interval(POSE_PERIOD);
+    loop {
+        every.tick().await;
+        let pose = Observation::pose(now_ns(), [0.0; 3], [0.0, 0.0, 0.0, 1.0], 0.0);
+        if ingester.send(pose).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// Sends the drive in real time to each of these vehicles; that with number n begins n / `vehicles` revolutions later.
+fn send(drive: &[Datagram], to: &[(usize, SocketAddr)], vehicles: usize, sent: &AtomicU64) {
+    let sockets: Vec<_> = to
+        .iter()
+        .map(|(number, address)| {
+            let socket = UdpSocket::bind("127.0.0.1:0").expect("a free port");
+            socket.connect(address).expect("loopback");
+            (socket, REVOLUTION.mul_f64(*number as f64 / vehicles as f64))
+        })
+        .collect();
+    let (began, first_ns) = (Instant::now(), drive[0].stamp_ns);
+    let due = |at: usize| Duration::from_nanos(drive[at].stamp_ns.abs_diff(first_ns));
+    let mut next = vec![0; sockets.len()];
+    while next.iter().any(|at| *at < drive.len()) {
+        let mut wait = REVOLUTION;
+        for ((socket, later), at) in sockets.iter().zip(&mut next) {
+            while *at < drive.len() && due(*at) + *later <= began.elapsed() + BURST {
+                // A full socket buffer drops the packet, as a network would; the server's counts tell.
+                let _ = socket.send(&drive[*at].payload);
+                sent.fetch_add(1, Ordering::Relaxed);
+                *at += 1;
+            }
+            if *at < drive.len() {
+                wait = wait.min((due(*at) + *later).saturating_sub(began.elapsed() + BURST));
+            }
+        }
+        std::thread::sleep(wait);
+    }
+}
+
+/// The server's process.
+struct Process {
+    child: Child,
+    grpc: String,
+    data: Vec<SocketAddr>,
+}
+
+impl Process {
+    fn start(vehicles: usize, cpus: &str) -> Self {
+        let mut command = Command::new("taskset");
+        command.args(["--cpu-list", cpus]).arg(std::env::current_exe().expect("this program"));
+        command.args(["--serve", &vehicles.to_string()]).stdin(Stdio::piped()).stdout(Stdio::piped());
+        let mut child = command.spawn().expect("taskset, of util-linux");
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().expect("piped")).read_line(&mut line).expect("a line");
+        let mut places = line.split_whitespace();
+        let grpc = places.next().expect("an address").to_owned();
+        Self { grpc, data: places.map(|at| at.parse().expect("an address")).collect(), child }
+    }
+
+    /// Resident set of the process, in KiB.
+    fn resident_kib(&self) -> i64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).expect("Linux");
+        let line = status.lines().find(|line| line.starts_with("VmRSS")).expect("VmRSS");
+        line.split_whitespace().nth(1).and_then(|kib| kib.parse().ok()).expect("a number")
+    }
+
+    /// Processor time of the process so far, in seconds.
+    fn processor_s(&self) -> f64 {
+        let text = std::fs::read_to_string(format!("/proc/{}/schedstat", self.child.id())).expect("Linux");
+        let of_main = text.split_whitespace().next().and_then(|ns| ns.parse().ok()).unwrap_or(0.0);
+        let tasks = std::fs::read_dir(format!("/proc/{}/task", self.child.id())).expect("Linux");
+        let of_task = |task: std::io::Result<std::fs::DirEntry>| {
+            let text = std::fs::read_to_string(task.ok()?.path().join("schedstat")).ok()?;
+            text.split_whitespace().next()?.parse::<f64>().ok()
+        };
+        tasks.filter_map(of_task).sum::<f64>().max(of_main) * 1e-9
+    }
+
+    /// Ends the process by the end of its standard input.
+    fn stop(&mut self) {
+        drop(self.child.stdin.take());
+        self.child.wait().expect("it ends");
+    }
+}
+
+/// Runs the server until standard input ends.
+async fn serve(vehicles: usize) {
+    let any: SocketAddr = "127.0.0.1:0".parse().expect("an address");
+    let mut config = Config::of_one_vehicle("v00", "top");
+    config.grpc.listen = any;
+    config.page.enabled = false;
+    config.zenoh.enabled = false;
+    config.connections.per_address_max = 256;
+    let vehicle = &mut config.vehicles[0];
+    vehicle.udp = Some(Udp { data: any, telemetry: any, ..Udp::default() });
+    vehicle.sensors[0].extrinsics.z_m = ScannerConfig::default().ego_from_sensor.translation.z;
+    // The drive is older than its arrival.
+    vehicle.sensors[0].gps_late_days_max = 36_525.0;
+    let first = vehicle.clone();
+    config.vehicles = (0..vehicles).map(|number| clearway::config::Vehicle { name: name(number), ..first.clone() }).collect();
+    let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
+    print!("{}", running.grpc.expect("gRPC is served"));
+    running.inputs.iter().for_each(|input| print!(" {}", input.udp.expect("a socket").0));
+    println!();
+    let ended = tokio::task::spawn_blocking(|| std::io::copy(&mut std::io::stdin(), &mut std::io::sink()));
+    ended.await.expect("no panic").expect("standard input");
+}
