@@ -256,7 +256,8 @@ export class VehicleView {
     if (now_ms - this.#sampled_ms < SAMPLE_EVERY_MS) return;
     this.#sampled_ms = now_ms;
     this.#history.push({
-      at_ms: now_ms, age_ms: age?.age_ms ?? null, hz: shown ? hz : null, loss: status?.loss ?? null,
+      at_ms: now_ms, age_ms: this.#is_recorded ? null : (age?.age_ms ?? null), hz: shown ? hz : null,
+      loss: status?.loss ?? null,
       share: shown?.drivable_share ?? status?.drivable_share ?? null, latency_ms: status?.latency_ms?.total ?? null,
     });
     this.#plots.draw(this.#history, now_ms);
