@@ -278,7 +278,7 @@ async fn digests_in_place_of_maps_prove_the_same_and_events_alone_make_the_maps_
         let text = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
         assert!(text.contains(says), "{arguments:?}: {text}");
     }
-    let other_width = ["verify", "digest.mcap", "--set", "vehicle.maps.reach.width_m=4.0"];
+    let other_width = ["verify", "digest.mcap", "--set", "vehicle.maps.reach.vehicle_width_m=4.0"];
     let output = clearway_tests::run(folder.path(), "clearway", &other_width);
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(
