@@ -67,7 +67,9 @@ fn main() {
     }
     let length = SETTLE + Duration::from_secs(arguments.seconds) + 2 * REVOLUTION;
     let drive: Arc<[Datagram]> = packets(length).into();
-    println!("| vehicles | maps/s | age p50 / p99 / worst ms | maps missed | datagrams lost | MiB a vehicle | server's cores |");
+    println!(
+        "| vehicles | maps/s | age p50 / p99 / worst ms | maps missed | datagrams lost | MiB a vehicle | server's cores |"
+    );
     println!("|---|---|---|---|---|---|---|");
     for &vehicles in &arguments.vehicles {
         println!("{}", runtime.block_on(measure(vehicles, &arguments, &drive)));
@@ -126,9 +128,7 @@ async fn measure(vehicles: usize, arguments: &Arguments, drive: &Arc<[Datagram]>
     let rate = ages.len() as f64 / arguments.seconds as f64;
     let mib = (kib - empty_kib) as f64 / 1024.0 / vehicles as f64;
     let lost = sent.load(Ordering::Relaxed).saturating_sub(received);
-    format!(
-        "| {vehicles} | {rate:.0} | {p50:.1} / {p99:.1} / {worst:.0} | {missed} | {lost} | {mib:.0} | {cores:.2} |"
-    )
+    format!("| {vehicles} | {rate:.0} | {p50:.1} / {p99:.1} / {worst:.0} | {missed} | {lost} | {mib:.0} | {cores:.2} |")
 }
 
 fn name(number: usize) -> String {
@@ -262,7 +262,8 @@ async fn serve(vehicles: usize) {
     // The drive is older than its arrival.
     vehicle.sensors[0].gps_late_days_max = 36_525.0;
     let first = vehicle.clone();
-    config.vehicles = (0..vehicles).map(|number| clearway::config::Vehicle { name: name(number), ..first.clone() }).collect();
+    config.vehicles =
+        (0..vehicles).map(|number| clearway::config::Vehicle { name: name(number), ..first.clone() }).collect();
     let running = Server::start(Setup { config, ..Setup::default() }).await.expect("the server starts");
     print!("{}", running.grpc.expect("gRPC is served"));
     running.inputs.iter().for_each(|input| print!(" {}", input.udp.expect("a socket").0));
