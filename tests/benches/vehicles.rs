@@ -6,7 +6,7 @@
 //!
 //! The server runs in its own process, on the processors of `--cpus`; senders and readers run on the others. The
 //! datagrams are made beforehand, and every vehicle sends the same ones, each begun at another moment of a revolution.
-//! Age: from the end of a map's capture, by the server's estimate, to the reader's hands. Lost: datagrams that were
+//! Age: from the moment at which a map's last packet is due to be sent to the reader's hands. Lost: datagrams that were
 //! sent and not received, dropped by the kernel or lost at the queue. Memory: growth of the server's resident set over
 //! that of a server without vehicles' data, divided by the number of vehicles.
 
@@ -90,18 +90,27 @@ async fn measure(vehicles: usize, arguments: &Arguments, drive: &Arc<[Datagram]>
     let client = Client::connect(&server.grpc).await.expect("the server answers");
     let empty_kib = server.resident_kib();
     let is_measured = Arc::new(AtomicBool::new(false));
-    let (mut readers, mut poses) = (JoinSet::new(), JoinSet::new());
+    let mut readers = JoinSet::new();
+    let (start, start_ns) = (Instant::now() + REVOLUTION, now_ns() + REVOLUTION.as_nanos() as i64);
     for number in 0..vehicles {
         let (client, is_measured) = (client.clone(), is_measured.clone());
-        poses.spawn(send_poses(client.clone(), name(number)));
-        readers.spawn(async move { read(client, name(number), &is_measured).await });
+        let shift_ns = start_ns + later(number, vehicles).as_nanos() as i64 - drive[0].stamp_ns;
+        readers.spawn(async move { read(client, name(number), shift_ns, &is_measured).await });
     }
+    let poses = std::thread::spawn({
+        let client = client.clone();
+        move || {
+            let senders = (0..vehicles).map(|number| send_poses(client.clone(), name(number)));
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+            runtime.block_on(futures::future::join_all(senders));
+        }
+    });
     let sent = Arc::new(AtomicU64::new(0));
     let senders: Vec<_> = (0..SENDERS.min(vehicles))
         .map(|sender| {
             let to: Vec<_> = server.data.iter().copied().enumerate().skip(sender).step_by(SENDERS).collect();
             let (drive, sent) = (drive.clone(), sent.clone());
-            std::thread::spawn(move || send(&drive, &to, vehicles, &sent))
+            std::thread::spawn(move || send(&drive, &to, vehicles, start, &sent))
         })
         .collect();
     tokio::time::sleep(SETTLE).await;
@@ -115,7 +124,7 @@ async fn measure(vehicles: usize, arguments: &Arguments, drive: &Arc<[Datagram]>
     tokio::time::sleep(Duration::from_secs(2)).await;
     let received: u64 = counts(&client).await;
     server.stop();
-    poses.shutdown().await;
+    poses.join().expect("it sends");
     let (mut ages, mut missed) = (Vec::new(), 0);
     while let Some(read) = readers.join_next().await {
         let (of_vehicle, skipped) = read.expect("no panic");
@@ -131,6 +140,11 @@ async fn measure(vehicles: usize, arguments: &Arguments, drive: &Arc<[Datagram]>
     format!("| {vehicles} | {rate:.0} | {p50:.1} / {p99:.1} / {worst:.0} | {missed} | {lost} | {mib:.0} | {cores:.2} |")
 }
 
+/// How much later than the first vehicle one with this number begins: the revolutions end evenly spread.
+fn later(number: usize, vehicles: usize) -> Duration {
+    REVOLUTION.mul_f64(number as f64 / vehicles as f64)
+}
+
 fn name(number: usize) -> String {
     format!("v{number:02}")
 }
@@ -143,7 +157,8 @@ async fn counts(client: &Client) -> u64 {
 }
 
 /// Ages in ms of the maps of a vehicle that come while they are measured, and the number of those that were skipped.
-async fn read(client: Client, vehicle: String, is_measured: &AtomicBool) -> (Vec<f64>, u64) {
+/// Packets are sent `shift_ns` after their stamps.
+async fn read(client: Client, vehicle: String, shift_ns: i64, is_measured: &AtomicBool) -> (Vec<f64>, u64) {
     let layers = LAYERS.map(str::to_owned).to_vec();
     let subscription = Subscription { vehicle, layers, ..Subscription::default() };
     let mut maps = client.subscribe(subscription).await.expect("a stream");
@@ -152,14 +167,14 @@ async fn read(client: Client, vehicle: String, is_measured: &AtomicBool) -> (Vec
         let sequence = update.map.sequence();
         let between = last.replace(sequence).map_or(0, |last: u64| sequence.saturating_sub(last + 1));
         if is_measured.load(Ordering::Relaxed) {
-            ages.push((now_ns() - update.map.header().capture_end_ns) as f64 * 1e-6);
+            ages.push((now_ns() - shift_ns - update.map.header().capture_end_ns) as f64 * 1e-6);
             missed += between;
         }
     }
     (ages, missed)
 }
 
-/// Sends where the vehicle is, until the task is stopped.
+/// Sends where the vehicle is, until the server ends.
 async fn send_poses(client: Client, vehicle: String) {
     let mut ingester = client.ingest(&vehicle).await.expect("ingest is allowed");
     let mut every = tokio::time::interval(POSE_PERIOD);
@@ -172,30 +187,30 @@ async fn send_poses(client: Client, vehicle: String) {
     }
 }
 
-/// Sends the drive in real time to each of these vehicles; that with number n begins n / `vehicles` revolutions later.
-fn send(drive: &[Datagram], to: &[(usize, SocketAddr)], vehicles: usize, sent: &AtomicU64) {
+/// Sends the drive in real time from `start` on to each of these vehicles.
+fn send(drive: &[Datagram], to: &[(usize, SocketAddr)], vehicles: usize, start: Instant, sent: &AtomicU64) {
     let sockets: Vec<_> = to
         .iter()
         .map(|(number, address)| {
             let socket = UdpSocket::bind("127.0.0.1:0").expect("a free port");
             socket.connect(address).expect("loopback");
-            (socket, REVOLUTION.mul_f64(*number as f64 / vehicles as f64))
+            (socket, later(*number, vehicles))
         })
         .collect();
-    let (began, first_ns) = (Instant::now(), drive[0].stamp_ns);
+    let first_ns = drive[0].stamp_ns;
     let due = |at: usize| Duration::from_nanos(drive[at].stamp_ns.abs_diff(first_ns));
     let mut next = vec![0; sockets.len()];
     while next.iter().any(|at| *at < drive.len()) {
         let mut wait = REVOLUTION;
         for ((socket, later), at) in sockets.iter().zip(&mut next) {
-            while *at < drive.len() && due(*at) + *later <= began.elapsed() + BURST {
+            while *at < drive.len() && due(*at) + *later <= start.elapsed() + BURST && Instant::now() >= start {
                 // A full socket buffer drops the packet, as a network would; the server's counts tell.
                 let _ = socket.send(&drive[*at].payload);
                 sent.fetch_add(1, Ordering::Relaxed);
                 *at += 1;
             }
             if *at < drive.len() {
-                wait = wait.min((due(*at) + *later).saturating_sub(began.elapsed() + BURST));
+                wait = wait.min((due(*at) + *later).saturating_sub(start.elapsed() + BURST));
             }
         }
         std::thread::sleep(wait);
