@@ -9,8 +9,8 @@
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
+use clearway::base::held_sockets::HeldSockets;
 use clearway::config::{Config, Udp};
-use clearway::held_sockets::HeldSockets;
 use clearway::ingest::{queue::event_queue, udp};
 use clearway_mapping::event::Body;
 use clearway_mapping::ledger::Ledger;

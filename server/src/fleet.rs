@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use clearway_proto::v1;
 use prost::Message;
 
-use crate::sync::locked;
+use crate::base::sync::locked;
 
 /// Time after its last announcement at which a vehicle is no longer listed. Ours: two lost announcements and the delay
 /// of a bad link.

@@ -7,12 +7,9 @@
 //! |---|---|
 //! | [`config`] | one TOML file -> vehicles, sources, publishers, recorder |
 //! | [`ingest`] | datagrams, observations, ROS 2 messages, files -> numbered events on one queue a vehicle |
-//! | [`engine`] | events -> journal, step of the pipeline, encoded maps |
-//! | [`acknowledgements`] | readers that acknowledge -> the maps that they have finished with |
-//! | [`subscriptions`] | readers -> layers to compute |
+//! | [`engine`] | events -> journal, step of the pipeline, encoded maps, of the layers that readers want |
 //! | [`encode`] | map -> bytes, once; regions and deltas of them; event <-> bytes of the journal |
 //! | [`fleet`] | announcements of other servers -> their vehicles, and where they are served |
-//! | [`newest`] | contents of the latest-value slots between engine and readers |
 //! | [`publish`] | newest map -> gRPC, zenoh, ROS 2, Foxglove, page |
 //! | [`record`] | events and maps -> MCAP file, and back; verification |
 //! | [`replay`] | recorded readings -> engines that are stepped in recorded time, and set back |
@@ -22,22 +19,15 @@
 //! | [`traces`] | the hops of each map -> spans of a trace, to a collector |
 //! | [`cli`] | the subcommands of `clearway` |
 //!
-//! At the ground, used by all: [`clock`], `sync`, `counted`, [`directory`], `file_advice`, [`held_sockets`],
-//! `zenoh_session`.
+//! At the ground, used by all: [`base`] and `zenoh_session`.
 
-pub mod acknowledgements;
+pub mod base;
 pub mod cli;
-pub mod clock;
 pub mod config;
-mod counted;
-pub mod directory;
 pub mod encode;
 pub mod engine;
-mod file_advice;
 pub mod fleet;
-pub mod held_sockets;
 pub mod ingest;
-pub mod newest;
 pub mod publish;
 pub mod record;
 pub mod replay;
@@ -45,8 +35,6 @@ pub mod server;
 pub mod status;
 #[cfg(feature = "store")]
 pub mod store;
-pub mod subscriptions;
-mod sync;
 pub mod traces;
 #[cfg(feature = "zenoh")]
 pub mod zenoh_session;

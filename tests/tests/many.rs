@@ -7,8 +7,8 @@ use std::collections::BTreeMap;
 use std::iter::Peekable;
 use std::net::UdpSocket;
 
-use clearway::cli::demo::car::address;
-use clearway::cli::demo::rig::{Rig, TimedObservation};
+use clearway::cli::make::demo::car::address;
+use clearway::cli::make::demo::rig::{Rig, TimedObservation};
 use clearway::config::{Sender, Udp};
 use clearway_client::{Client, MapView};
 use clearway_mapping::config::BodyConfig;

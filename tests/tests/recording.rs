@@ -90,7 +90,7 @@ async fn planted_nondeterminism_is_named_by_sequence_layer_and_cell() {
             _ => return Some(data),
         };
         if sequence == 3 {
-            map.header.as_mut().unwrap().completed_ns = clearway::clock::now_ns();
+            map.header.as_mut().unwrap().completed_ns = clearway::base::clock::now_ns();
             return Some(map.encode_to_vec());
         }
         let channel = &mut map.layers[0].channels[0];

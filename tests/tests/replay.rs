@@ -5,7 +5,7 @@ mod fixture;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use clearway::cli::replay::{Mount, Options, ReplayError, Summary, describe, replay};
+use clearway::cli::make::replay::{Mount, Options, ReplayError, Summary, describe, replay};
 use clearway::record::verify::verify;
 
 async fn replayed(options: Options) -> Result<Summary, ReplayError> {

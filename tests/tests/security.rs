@@ -7,7 +7,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::sync::Arc;
 
-use clearway::cli::replay::{Options, Summary, replay};
+use clearway::cli::make::replay::{Options, Summary, replay};
 use clearway::server::{Running, Server, Setup};
 use clearway_client::{Client, ClientError, Observation, PublicKey, Subscription, Tls, ZenohClient, now_ns};
 use fixture::certificates::{behind, certificates, router, secured, start, zenoh_file};

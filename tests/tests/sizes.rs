@@ -9,8 +9,8 @@ mod fixture;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use clearway::cli::demo::rig::Rig;
-use clearway::cli::replay::{Options, replay};
+use clearway::cli::make::demo::rig::Rig;
+use clearway::cli::make::replay::{Options, replay};
 use clearway::config::Config;
 use clearway::encode::EncodedMap;
 use clearway::ingest::observation;

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use clearway::cli::replay::{Options, ReplayError, Summary, replay};
+use clearway::cli::make::replay::{Options, ReplayError, Summary, replay};
 use clearway::encode::as_served;
 use clearway::ingest::queue::Reading;
 use clearway::record::verify::verify;

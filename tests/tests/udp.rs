@@ -8,7 +8,7 @@ use std::io::BufReader;
 use std::net::{SocketAddr, UdpSocket};
 use std::path::{Path, PathBuf};
 
-use clearway::cli::replay::{Options, replay};
+use clearway::cli::make::replay::{Options, replay};
 use clearway::config::{Config, Sender, Udp};
 use clearway::ingest::queue::event_queue;
 use clearway::record::reader::{RecordedMessage, RecordingReader};

@@ -4,7 +4,7 @@ use anyhow::Result;
 use clap::{Args, Command};
 use clap_complete::Shell;
 
-use super::output::print;
+use crate::cli::shared::output::print;
 
 /// Print the completion script of a shell.
 #[derive(Args)]

@@ -2,79 +2,23 @@
 //!
 //! Each subcommand is one file or folder with its `Options` (as clap reads them from the command line) and its `run`:
 //!
-//! | file | in -> out |
+//! | folder | subcommands |
 //! |---|---|
-//! | [`demo`] | a simulated vehicle -> a server of its own, over real UDP |
-//! | `serve` | a configuration -> a server that runs until a signal |
-//! | [`replay`] | recorded drives -> maps, a recording |
-//! | `transport` | a request -> the replay that a server serves |
-//! | `verify` | recordings -> whether each map is the map of its events, or what a change changes in the maps |
-//! | [`evaluate`] | labelled scans, simulated scenes -> precision and recall of each map |
-//! | `check` | a configuration -> the same with every default |
-//! | `init` | sensors that send, or a capture -> a first configuration |
-//! | `watch`, `get` | a server -> a line for each map; the newest map as a file |
-//! | `vehicles` | a server -> the state of its vehicles |
-//! | `status`, `top` | a server -> the states of its vehicles, once and live |
-//! | `recorder` | a request -> the recorder of a server |
-//! | `export` | a recording -> pictures, arrays, documents, files for viewers |
-//! | `info` | a file -> a description of its contents, and what is wrong with it |
-//! | `repair` | a damaged recording -> a recording of all that can be read |
-//! | `upload` | a folder of recordings -> a store |
-//! | `recordings` | a store and a search -> the recordings that it finds |
-//! | `send`, `ingest` | files -> a server: as datagrams over UDP; as observations over gRPC or zenoh |
-//! | `simulate` | a simulated scene -> a capture, or datagrams over UDP |
+//! | [`make`] | make maps in this process: `demo`, `serve`, `replay`, `view` |
+//! | [`checks`] | check maps and configurations: `verify`, `evaluate`, `check`, `init` |
+//! | `client` | ask a running server: `watch`, `get`, `vehicles`, `status`, `top`, `recorder`, `transport` |
+//! | `archive` | read and keep files: `export`, `info`, `repair`, `upload`, `recordings` |
+//! | `sources` | send sensor data: `send`, `ingest`, `simulate` |
 //! | `completions` | a shell's name -> its completion script |
-//!
-//! They share:
-//!
-//! | file | in -> out |
-//! |---|---|
-//! | `configuration` | options -> a configuration, extrinsics |
-//! | `ground_revolutions` | revolutions -> those from which a mount is estimated |
-//! | `model` | the name of a sensor model -> the model |
-//! | `connection` | options -> a connected client |
-//! | `exit` | the exit codes |
-//! | `files` | paths -> open files, or errors that say what to do |
-//! | `service_manager` | a running server -> what systemd is told |
-//! | `output` | text -> stdout; progress bar, runtime, signals, errors of usage |
+//! | `shared` | what several subcommands share |
 
-mod check;
+mod archive;
+pub mod checks;
+mod client;
 mod completions;
-mod configuration;
-mod connection;
-#[cfg(feature = "sim")]
-pub mod demo;
-pub mod evaluate;
-mod exit;
-mod export;
-mod files;
-mod get;
-mod ground_revolutions;
-mod info;
-mod ingest;
-mod init;
-mod logs;
-mod model;
-mod output;
-mod recorder;
-#[cfg(feature = "store")]
-mod recordings;
-mod repair;
-pub mod replay;
-mod send;
-mod serve;
-mod service_manager;
-#[cfg(feature = "sim")]
-mod simulate;
-mod status;
-mod top;
-mod transport;
-#[cfg(feature = "store")]
-mod upload;
-mod vehicles;
-mod verify;
-mod view;
-mod watch;
+pub mod make;
+mod shared;
+mod sources;
 
 use std::fmt::Write as _;
 use std::process::ExitCode;
@@ -83,8 +27,20 @@ use anyhow::Result;
 use clap::builder::StyledStr;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
-use exit::{EXIT_CODES, Exit};
-use output::with_causes;
+use archive::{export, info, repair};
+#[cfg(feature = "store")]
+use archive::{recordings, upload};
+use checks::{check, evaluate, init, verify};
+use client::{get, recorder, status, top, transport, vehicles, watch};
+#[cfg(feature = "sim")]
+use make::demo;
+use make::{replay, serve, view};
+use shared::exit::{EXIT_CODES, Exit};
+use shared::logs;
+use shared::output::with_causes;
+#[cfg(feature = "sim")]
+use sources::simulate;
+use sources::{ingest, send};
 
 /// Clearway turns LIDAR packets into maps of where a vehicle may drive.
 #[derive(Parser)]

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::file_advice::advised;
+use crate::base::file_advice::advised;
 
 use super::error::{ConfigError, ValueError, beside};
 

@@ -12,7 +12,7 @@ use clearway_lidar::calibration::Calibration;
 use clearway_mapping::config::SensorConfig;
 use serde::{Deserialize, Serialize};
 
-use crate::file_advice::advised;
+use crate::base::file_advice::advised;
 use error::{ValueError, beside};
 use layers::Layers;
 use overrides::{blamed, matching, set};

@@ -14,7 +14,7 @@ use clearway_proto::region::{RegionError, crop};
 use clearway_proto::v1;
 use prost::Message;
 
-use crate::sync::locked;
+use crate::base::sync::locked;
 
 /// Most payloads kept for one map; further ones are encoded for each reader. Ours: ten readers with regions of their
 /// own, six layers each.

@@ -9,7 +9,7 @@ use std::sync::Mutex;
 use clearway_mapping::event::Cause;
 use clearway_mapping::ledger::Ledger;
 
-use crate::sync::locked;
+use crate::base::sync::locked;
 
 /// Number of unknown senders that are remembered. Ours: enough to find a sensor with a wrong address.
 const UNKNOWN_SENDERS_MAX: usize = 8;

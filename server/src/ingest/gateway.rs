@@ -12,9 +12,9 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use super::observation::{self, Limits, ObservationError};
 use super::queue::EventQueue;
 use super::receipt::{ClientSession, ObservationId, Outcome, OutcomeSender, Receipt};
+use crate::base::directory::{UnknownNameError, find_vehicle};
+use crate::base::sync::locked;
 use crate::config::Vehicle;
-use crate::directory::{UnknownNameError, find_vehicle};
-use crate::sync::locked;
 
 /// The gateway of one vehicle.
 #[derive(Debug)]

@@ -18,8 +18,8 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::drops::{DropCounters, Unreported, next_unreported};
 use super::receipt::{Outcome, Receipt};
-use crate::clock::Clock;
-use crate::sync::locked;
+use crate::base::clock::Clock;
+use crate::base::sync::locked;
 
 /// Least time between two reports of drops to the engine, in ns. Drops by a full queue are reported at once; a flood of
 /// datagrams from unknown senders must not fill the journal. Ours: ten reports a second are fine enough for a rate.

@@ -31,13 +31,13 @@ use tokio::task::JoinSet;
 use super::listen::access::Caller;
 use super::listen::{InProgress, Listener, Place};
 use super::served::{Served, Vehicles};
-use crate::clock::now_ns;
+use crate::base::clock::now_ns;
 use crate::encode::EncodedMap;
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::{base_frame, foxglove as messages, safe_paths};
-use crate::newest::NewestSweep;
+use crate::engine::newest::NewestSweep;
+use crate::engine::subscriptions::LayerSubscription;
 use crate::status::{Reader, Transport};
-use crate::subscriptions::LayerSubscription;
 
 /// Pages from which Foxglove connects, beside those of the configuration.
 pub const ORIGINS: &[&str] = &["https://app.foxglove.dev"];

@@ -39,10 +39,10 @@ use super::page_points::{PagePoints, next_points};
 use super::page_recorder::{PageRecorder, RecorderRequest, recorder_answered};
 use super::page_replay::{PageReplay, PageRequest, replay_changed, replay_json};
 use super::served::{Served, Vehicles};
+use crate::base::sync::locked;
 use crate::fleet::Fleet;
 use crate::replay::ReplayHandle;
 use crate::status::vehicle_json;
-use crate::sync::locked;
 
 /// Longest time to send a frame. Ours: a browser this late shows a stale map anyway, and reconnects by itself.
 const SEND_TIMEOUT: Duration = Duration::from_secs(5);

@@ -28,7 +28,7 @@ use tonic::Status;
 
 use super::listen::access::Caller;
 use super::served::Served;
-use crate::newest::NewestSweep;
+use crate::engine::newest::NewestSweep;
 
 /// Least time between two frames. Ours: a reader sees traffic move, and a frame is larger than a map.
 const PERIOD: Duration = Duration::from_millis(500);

@@ -26,7 +26,7 @@ use zenoh::sample::Locality;
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
 
 use super::served::Served;
-use crate::clock::now_ns;
+use crate::base::clock::now_ns;
 use crate::config::Ros2;
 use crate::encode::EncodedMap;
 use crate::status::{Reader, Transport};

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use tokio::sync::watch;
 
-use crate::directory::{UnknownNameError, find_vehicle};
-use crate::newest::Newest;
+use crate::base::directory::{UnknownNameError, find_vehicle};
+use crate::engine::newest::Newest;
 use crate::status::VehicleStatus;
 
 /// One vehicle, as publishers use it.

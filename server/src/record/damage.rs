@@ -5,7 +5,7 @@ use std::fmt;
 
 use serde_json::{Value, json};
 
-use crate::counted::counted;
+use crate::base::counted::counted;
 
 /// A part of an MCAP file that cannot be read.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -34,9 +34,9 @@ use mcap::{Attachment, McapError, WriteOptions};
 use prost::Message;
 
 use super::mcap_reader::FORMAT;
+use crate::base::sync::locked;
 use crate::config::{Compression, RecordedMaps, Recorder as Options};
 use crate::encode::{self, EncodedMap};
-use crate::sync::locked;
 
 /// The contents of a recording before its first event.
 #[derive(Clone, Debug, Default, PartialEq)]

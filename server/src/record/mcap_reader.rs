@@ -16,8 +16,8 @@ use clearway_ros::Kind;
 use mcap::records::Record;
 use prost::Message as _;
 
-use crate::counted::counted;
-use crate::file_advice::advised;
+use crate::base::counted::counted;
+use crate::base::file_advice::advised;
 
 use super::damage::Damage;
 use super::file_records::FileRecords;

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 
 use super::damage::Damage;
 use super::mcap_reader::{McapReadError, McapReader};
-use crate::file_advice::advised;
+use crate::base::file_advice::advised;
 
 /// The name of the metadata that a repaired file has beside those of the damaged one.
 const METADATA: &str = "clearway-repair";

@@ -9,7 +9,7 @@ use std::str::FromStr;
 use clearway_mapping::event::Body;
 use nalgebra::{Isometry3, Vector3};
 
-use crate::counted::counted;
+use crate::base::counted::counted;
 use crate::ingest::queue::Reading;
 
 /// What [`Fault`] accepts, for errors and help.

@@ -5,8 +5,8 @@ use std::net::SocketAddr;
 use tokio::net::TcpListener;
 
 use super::setup::StartError;
+use crate::base::held_sockets::HeldSockets;
 use crate::config::Config;
-use crate::held_sockets::HeldSockets;
 use crate::publish::foxglove;
 use crate::publish::listen::security::Security;
 use crate::publish::listen::{AllPlaces, Limits, Listener, ListenerHandle, Protocol};

@@ -12,8 +12,10 @@ use tokio::task::JoinSet;
 use super::input::VehicleInput;
 use super::listeners::limits;
 use super::setup::ShutdownError;
+use crate::base::sync::locked;
 use crate::config::{Certificates, Config};
 use crate::engine::Engine;
+use crate::engine::subscriptions::LayerSubscription;
 use crate::fleet::Fleet;
 use crate::ingest::queue::QueuedEvent;
 use crate::ingest::udp;
@@ -22,8 +24,6 @@ use crate::publish::listen::ListenerHandle;
 use crate::publish::listen::security::{Current, Security};
 use crate::record::writer::Recorder;
 use crate::replay::ReplayHandle;
-use crate::subscriptions::LayerSubscription;
-use crate::sync::locked;
 use crate::traces::Traces;
 
 /// Longest time of [`Running::shutdown_in_time`]. Ours: service managers wait 10 s or more before they kill a server.

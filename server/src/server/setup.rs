@@ -5,9 +5,9 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use crate::base::held_sockets::HeldSockets;
 use crate::config::{Calibrations, Certificates, Config};
 use crate::engine::Observer;
-use crate::held_sockets::HeldSockets;
 use crate::ingest::udp;
 use crate::record::writer::{IncompleteRecordingError, RecordError};
 use crate::replay::ReplayHandle;

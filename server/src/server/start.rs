@@ -18,9 +18,9 @@ use super::save_rules;
 use super::setup::{Setup, StartError};
 #[cfg(feature = "store")]
 use super::uploads;
+use crate::base::held_sockets::HeldSockets;
 use crate::config::{self, Certificates, Config, Vehicle, listeners};
 use crate::engine::{Engine, Observer};
-use crate::held_sockets::HeldSockets;
 use crate::ingest::gateway::{Gateway, Gateways};
 use crate::ingest::grpc::Ingest;
 use crate::ingest::queue::{EventQueue, QueuedEvent, event_queue};

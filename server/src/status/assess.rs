@@ -10,8 +10,8 @@ use tokio::time::MissedTickBehavior;
 
 use super::health::{Facts, SILENT_AFTER, SensorFacts, State};
 use super::vehicle::{Changing, VehicleStatus, packet_counts};
-use crate::clock::now_ns;
-use crate::sync::locked;
+use crate::base::clock::now_ns;
+use crate::base::sync::locked;
 
 /// Interval at which the vehicles are assessed. Ours: short beside the time in which a person or a probe reacts.
 const ASSESS_PERIOD: Duration = Duration::from_millis(200);

@@ -11,9 +11,9 @@ use serde_json::{Value, json};
 use super::json::vehicle_json;
 use super::transports::Transport;
 use super::vehicle::{Snapshot, VehicleStatus};
-use crate::clock::now_ns;
+use crate::base::clock::now_ns;
+use crate::base::sync::locked;
 use crate::ingest::drops::UnknownSender;
-use crate::sync::locked;
 
 impl VehicleStatus {
     /// The status as a message of the wire.

@@ -70,10 +70,11 @@ impl Notices {
 /// A deviation in one line, and what to do.
 fn describe(deviation: &MountDeviation) -> String {
     let MountDeviation { height_m, pitch_rad, roll_rad, std, scans, .. } = deviation;
+    let (offset_m, direction) = (height_m.abs(), if *height_m < 0.0 { "lower" } else { "higher" });
     format!(
-        "the ground contradicts the configured mount: in the median of {scans} scans the sensor is {height_m:+.2} ± \
-         {:.2} m higher than configured, and the ground is tilted by {:+.1} ± {:.1} deg in pitch and {:+.1} ± {:.1} \
-         deg in roll: check `extrinsics` of the sensor",
+        "the ground contradicts the configured mount: in the median of {scans} scans the sensor is {offset_m:.2} ± \
+         {:.2} m {direction} than configured, and the ground is tilted by {:+.1} ± {:.1} deg in pitch and {:+.1} ± \
+         {:.1} deg in roll: check `extrinsics` of the sensor",
         std[0],
         pitch_rad.to_degrees(),
         std[1].to_degrees(),
@@ -123,7 +124,7 @@ mod tests {
         });
         let text = String::from_utf8(lines.0.lock().unwrap().clone()).unwrap();
         assert_eq!(text.matches("off by 0.33 m in the median").count(), 1, "{text}");
-        assert_eq!(text.matches("the sensor is -0.58").count(), 2, "{text}");
+        assert_eq!(text.matches(" m lower than configured").count(), 2, "{text}");
         assert_eq!(text.matches("fits the configured mount again").count(), 1, "{text}");
     }
 }

@@ -56,7 +56,7 @@ mod tests {
     #[test]
     fn the_system_tells_this_process_apart() {
         let Process { start_s, resident_bytes, cpu_s, open_files, open_files_max } = read();
-        let now_s = crate::clock::now_ns() as f64 / 1e9;
+        let now_s = crate::base::clock::now_ns() as f64 / 1e9;
         assert!(start_s.is_some_and(|start| start < now_s && start > now_s - 86_400.0), "{start_s:?}, now {now_s}");
         assert!(resident_bytes.is_some_and(|bytes| bytes > 1e6), "{resident_bytes:?}");
         assert!(cpu_s.is_some() && open_files.is_some_and(|files| files >= 3.0), "{cpu_s:?} {open_files:?}");

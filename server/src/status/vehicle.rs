@@ -12,14 +12,14 @@ use clearway_proto::v1;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
-use crate::acknowledgements::Acknowledgements;
+use crate::base::sync::locked;
 use crate::encode::EncodedMap;
+use crate::engine::acknowledgements::Acknowledgements;
+use crate::engine::newest::NewestSweep;
+use crate::engine::subscriptions::LayerSubscriptions;
 use crate::ingest::drops::DropCounters;
 use crate::ingest::queue::QueueSpace;
-use crate::newest::NewestSweep;
 use crate::record::writer::RecorderCounts;
-use crate::subscriptions::LayerSubscriptions;
-use crate::sync::locked;
 use crate::traces::Traces;
 
 use super::health::{Health, State};

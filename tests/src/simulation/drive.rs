@@ -2,7 +2,7 @@
 
 use std::sync::OnceLock;
 
-use clearway::cli::demo::rig::Rig;
+use clearway::cli::make::demo::rig::Rig;
 use clearway::config::Config;
 use clearway_proto::v1;
 use clearway_sim::scenes::{self, Scene};

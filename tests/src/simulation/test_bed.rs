@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
-use clearway::clock::Clock;
+use clearway::base::clock::Clock;
 use clearway::config::Config;
 use clearway::encode::EncodedMap;
 use clearway::engine::Engine;

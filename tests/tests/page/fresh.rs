@@ -4,9 +4,9 @@ use std::net::SocketAddr;
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
-use clearway::cli::demo::report::{Report, Summary};
-use clearway::cli::demo::sensors::Sensors;
-use clearway::cli::demo::{Endpoints, Options, demo};
+use clearway::cli::make::demo::report::{Report, Summary};
+use clearway::cli::make::demo::sensors::Sensors;
+use clearway::cli::make::demo::{Endpoints, Options, demo};
 
 use crate::webdriver::Browser;
 

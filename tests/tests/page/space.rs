@@ -1,6 +1,6 @@
 //! The view in 3-D beside a simulated drive.
 
-use clearway::cli::demo::sensors::Sensors;
+use clearway::cli::make::demo::sensors::Sensors;
 
 use crate::fresh::RunningDemo;
 use crate::webdriver::Browser;

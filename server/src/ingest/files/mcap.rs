@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::path::Path;
 
-use crate::counted::counted;
+use crate::base::counted::counted;
 use crate::ingest::queue::Reading;
 use crate::ingest::ros::choice::{AvailableTopics, ChoiceError};
 use crate::ingest::ros::decoder::TopicDecoder;

@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 use clearway_mapping::event::Body;
 use clearway_mapping::scan_file::ScanFormat;
 
-use crate::file_advice::advised;
+use crate::base::file_advice::advised;
 use crate::ingest::queue::Reading;
 use crate::ingest::ros::decoder::TopicDecoder;
 use capture::CaptureError;

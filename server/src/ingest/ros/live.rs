@@ -16,9 +16,9 @@ use zenoh::sample::Sample;
 use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, HistoryConfig};
 
 use super::decoder::{PoseSource, TopicDecoder};
+use crate::base::sync::locked;
 use crate::config::Ros;
 use crate::ingest::queue::EventQueue;
-use crate::sync::locked;
 use crate::zenoh_session::ZenohError;
 
 /// Greatest number of publishers whose sequences are checked; messages of further publishers are accepted unchecked.

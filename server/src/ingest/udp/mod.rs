@@ -15,8 +15,8 @@ use nix::net::if_::if_nametoindex;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
 
+use crate::base::held_sockets::HeldSockets;
 use crate::config::{Listener, Vehicle, listeners};
-use crate::held_sockets::HeldSockets;
 use crate::ingest::queue::{EventQueue, QueueClosedError};
 
 mod receive;

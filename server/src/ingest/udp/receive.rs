@@ -129,7 +129,7 @@ mod tests {
     use std::time::Instant;
 
     use super::*;
-    use crate::clock::now_ns;
+    use crate::base::clock::now_ns;
 
     #[test]
     fn datagrams_that_are_read_late_have_the_time_at_which_the_kernel_received_them() {

@@ -25,7 +25,7 @@ use reader::watch;
 use recording::Recordings;
 use replay::Replay;
 
-use crate::clock::now_ns;
+use crate::base::clock::now_ns;
 use crate::fleet::Fleet;
 use crate::record::writer::RecorderControl;
 use crate::replay::ReplayHandle;

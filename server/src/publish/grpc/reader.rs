@@ -12,13 +12,13 @@ use tokio::sync::watch;
 use tonic::Status;
 
 use super::selection::{Selection, Sent};
-use crate::acknowledgements::{AcknowledgingReader, MapId};
-use crate::clock::now_ns;
+use crate::base::clock::now_ns;
 use crate::encode::EncodedMap;
-use crate::newest::Newest;
+use crate::engine::acknowledgements::{AcknowledgingReader, MapId};
+use crate::engine::newest::Newest;
+use crate::engine::subscriptions::LayerSubscription;
 use crate::publish::served::{Served, Vehicles};
 use crate::status::{Reader, Transport};
-use crate::subscriptions::LayerSubscription;
 use crate::traces::Traces;
 
 /// The updates of one reader: the selected parts of the newest maps, within its credits. Any executor can drive the

@@ -8,7 +8,7 @@ use futures::{Stream, stream};
 use tokio::time::MissedTickBehavior;
 use tonic::Status;
 
-use crate::clock::now_ns;
+use crate::base::clock::now_ns;
 use crate::publish::listen::access::Caller;
 use crate::publish::served::Vehicles;
 use crate::status::{VehicleStatus, state_changed};

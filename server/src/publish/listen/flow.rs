@@ -9,7 +9,7 @@ use std::net::IpAddr;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-use crate::sync::locked;
+use crate::base::sync::locked;
 
 /// Most bytes that wait for one response, for one connection, for one address and for all. Ours: a map of the default
 /// grids has less than 64 KiB; a message may exceed a limit once.

@@ -15,8 +15,8 @@ use tokio_util::sync::CancellationToken;
 
 use super::access::Caller;
 use super::flow::{Flow, Flows};
+use crate::base::sync::locked;
 use crate::config;
-use crate::sync::locked;
 
 /// Longest time from the connection to its first request, with the TLS handshake. Ours: every client sends at once.
 const FIRST_REQUEST_TIMEOUT: Duration = Duration::from_secs(10);

@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 use clearway_proto::v1;
 
 use super::super::mcap_file::topic_of_layer;
+use crate::base::sync::locked;
 use crate::config::RecordedMaps;
-use crate::sync::locked;
 
 /// A recording ended before the last event or map.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]

@@ -19,8 +19,8 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::mcap_file::Header;
+use crate::base::file_advice::advised;
 use crate::config::Recorder as Options;
-use crate::file_advice::advised;
 
 mod control;
 mod counts;

@@ -1,0 +1,17 @@
+//! What every part of the server stands on: the clock, locks, names and files. Nothing here knows a map.
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | [`clock`] | the wall clock -> nanoseconds |
+//! | `sync` | a mutex -> its value, also after a panic |
+//! | `counted` | a count and a noun -> text |
+//! | [`directory`] | the name of a vehicle -> what is served for it |
+//! | `file_advice` | a path and an error -> what to do about it |
+//! | [`held_sockets`] | sockets that systemd holds -> listeners |
+
+pub mod clock;
+pub(crate) mod counted;
+pub mod directory;
+pub(crate) mod file_advice;
+pub mod held_sockets;
+pub(crate) mod sync;

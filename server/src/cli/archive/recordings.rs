@@ -1,0 +1,125 @@
+//! `clearway recordings`: a store and a search -> the parts that it finds.
+
+use anyhow::Result;
+use clap::Args;
+use serde_json::json;
+use toml::value::{Datetime, Offset};
+
+use crate::cli::shared::exit::Exit;
+use crate::cli::shared::output::{block_on, counted, print_line};
+use crate::store::index::{Entry, Found, Search, search};
+use crate::store::location;
+
+/// Find recordings in a store by vehicle, time, place and faults.
+#[derive(Args)]
+#[command(after_help = "Examples:
+  clearway recordings --store /mnt/archive
+  clearway recordings --store s3://fleet/clearway --vehicle car --from 2026-01-01T12:00:00Z --near 120,-35")]
+pub struct Options {
+    /// The store: a folder, or s3://BUCKET/PREFIX with the environment variables of the AWS tools.
+    #[arg(long, value_name = "URL", env = "CLEARWAY_STORE")]
+    store: String,
+    /// Only this vehicle.
+    #[arg(long, value_name = "NAME")]
+    vehicle: Option<String>,
+    /// Only parts that do not end before this time, such as 2026-01-01T12:00:00Z.
+    #[arg(long, value_name = "TIME", value_parser = time_ns)]
+    from: Option<u64>,
+    /// Only parts that do not begin after this time.
+    #[arg(long, value_name = "TIME", value_parser = time_ns)]
+    to: Option<u64>,
+    /// Only parts in which the vehicle was near this place: x,y in metres in the frame of its map.
+    #[arg(long, value_name = "X,Y", value_parser = place)]
+    near: Option<(f64, f64)>,
+    /// Greatest distance from --near, in metres.
+    #[arg(long, value_name = "METRES", default_value_t = 50.0, requires = "near")]
+    within: f64,
+    /// Only parts with a fault.
+    #[arg(long)]
+    faults: bool,
+    /// Print one JSON array.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Searches and prints what is found.
+///
+/// # Errors
+/// If the store's URL is wrong or it does not answer.
+pub fn run(options: &Options) -> Result<Exit> {
+    let wanted = Search {
+        vehicle: options.vehicle.clone(),
+        from_ns: options.from,
+        to_ns: options.to,
+        near: options.near.map(|(x, y)| (x, y, options.within)),
+        with_faults: options.faults,
+    };
+    let store = location::open(&options.store)?;
+    let Found { entries, unreadable } = block_on(async { Ok(search(&*store, &wanted).await?) })?;
+    if options.json {
+        print_line(&format!("{:#}", json!(entries)))?;
+    } else {
+        for entry in &entries {
+            print_line(&line(entry))?;
+        }
+        print_line(&format!("{} found", counted(entries.len() as u64, "part")))?;
+    }
+    for (name, reason) in &unreadable {
+        eprintln!("clearway: {name} is no entry of the index: {reason}");
+    }
+    Ok(Exit::from_incomplete(!unreadable.is_empty()))
+}
+
+fn line(entry: &Entry) -> String {
+    let list = |names: &std::collections::BTreeSet<String>| names.iter().cloned().collect::<Vec<_>>().join(", ");
+    let seconds = |ns: u64| ns as f64 * 1e-9;
+    let faults = if entry.faults.is_empty() { String::new() } else { format!("; FAULTS: {}", list(&entry.faults)) };
+    format!(
+        "{}: {}, {:.3} s to {:.3} s, {}, sensors {}{faults}",
+        entry.part,
+        entry.vehicle,
+        seconds(entry.from_ns),
+        seconds(entry.to_ns),
+        counted(entry.bytes, "byte"),
+        list(&entry.sensors)
+    )
+}
+
+/// A time such as `2026-01-01T12:00:00Z`, as ns since the Unix epoch.
+fn time_ns(text: &str) -> Result<u64, String> {
+    let wrong = || "a time such as 2026-01-01T12:00:00Z, of 1970 or later, is allowed".to_owned();
+    let Datetime { date, time, offset } = text.parse().map_err(|_| wrong())?;
+    let (date, time) = (date.ok_or_else(wrong)?, time.ok_or_else(wrong)?);
+    let offset_minutes = match offset.ok_or_else(wrong)? {
+        Offset::Z => 0,
+        Offset::Custom { minutes } => i64::from(minutes),
+    };
+    // Days since the epoch of a date in the Gregorian calendar; the year begins in March, so that a leap day ends it.
+    let (year, month) = (i64::from(date.year) - i64::from(date.month <= 2), (i64::from(date.month) + 9) % 12);
+    let days = 365 * year + year / 4 - year / 100 + year / 400 + (153 * month + 2) / 5 + i64::from(date.day) - 719_469;
+    let minutes = (days * 24 + i64::from(time.hour)) * 60 + i64::from(time.minute) - offset_minutes;
+    let seconds = minutes * 60 + i64::from(time.second.unwrap_or_default());
+    let ns =
+        seconds.checked_mul(1_000_000_000).and_then(|ns| ns.checked_add(time.nanosecond.unwrap_or_default().into()));
+    ns.and_then(|ns| ns.try_into().ok()).ok_or_else(wrong)
+}
+
+fn place(text: &str) -> Result<(f64, f64), String> {
+    let numbers = text.split_once(',').and_then(|(x, y)| Some((x.trim().parse().ok()?, y.trim().parse().ok()?)));
+    numbers.ok_or_else(|| "two numbers are needed: x,y in metres".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_time_is_read_with_its_offset() {
+        assert_eq!(time_ns("1970-01-01T00:00:00Z"), Ok(0));
+        assert_eq!(time_ns("2026-01-01T12:00:00Z"), Ok(1_767_268_800_000_000_000));
+        assert_eq!(time_ns("2024-02-29T13:30:00.5+01:30"), Ok(1_709_208_000_500_000_000));
+        for wrong in ["", "2026-01-01", "12:00:00Z", "2026-01-01T12:00:00", "1969-12-31T23:59:59Z"] {
+            assert!(time_ns(wrong).is_err(), "{wrong}");
+        }
+    }
+}

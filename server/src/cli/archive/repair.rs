@@ -1,0 +1,54 @@
+//! `clearway repair`: a damaged recording -> a whole recording of all that can be read, and a report of the rest.
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+use clap::Args;
+
+use crate::cli::shared::exit::Exit;
+use crate::cli::shared::output::{counted, print_line};
+use crate::record::repair::repair;
+
+/// Write all that can be read of a damaged MCAP file to a new one, and report what is lost.
+///
+/// The file that is read stays as it is; the file that is written must not exist. It is read again before the command
+/// ends.
+#[derive(Args)]
+#[command(
+    after_help = "Exit codes: 0 the file was whole and so is the new one, 1 the new file is whole and lacks what \
+    is lost, 2 no message can be read and no file is written, 3 wrong use.
+
+Example:
+  clearway repair damaged.mcap repaired.mcap"
+)]
+pub struct Options {
+    /// The damaged file (MCAP, of any program).
+    input: PathBuf,
+    /// The new file.
+    output: PathBuf,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Repairs the file and prints what is lost.
+///
+/// # Errors
+/// [`RepairError`](crate::record::repair::RepairError) if the file cannot be read, has no message that can be read, or
+/// the new file cannot be written.
+pub fn run(options: &Options) -> Result<Exit> {
+    let report = repair(&options.input, &options.output)?;
+    if options.json {
+        print_line(&format!("{:#}", report.to_json()))?;
+    } else {
+        let messages = counted(report.messages, "message");
+        print_line(&format!("{} has {messages} of {}", options.output.display(), options.input.display()))?;
+        for damage in &report.damages {
+            print_line(&format!("lost: {damage}"))?;
+        }
+        if let Some(incomplete) = &report.incomplete {
+            print_line(&format!("{} is {incomplete}", options.input.display()))?;
+        }
+    }
+    Ok(if report.incomplete.is_none() { Exit::Good } else { Exit::Differs })
+}

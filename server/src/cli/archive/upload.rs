@@ -1,0 +1,90 @@
+//! `clearway upload`: a folder of finished recordings -> a store, confirmed part by part.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+use clap::Args;
+use object_store::ObjectStore;
+
+use crate::cli::shared::exit::Exit;
+use crate::cli::shared::output::{block_on, counted, print_line, stop_signal};
+use crate::store::{location, upload};
+
+/// Time between two looks into the folder.
+const SCAN_PERIOD: Duration = Duration::from_secs(5);
+
+/// Send the finished recordings of a folder to a store, and confirm each by reading it back.
+///
+/// A part that the store has not confirmed stays where it is and is sent again; nothing is deleted without --delete.
+#[derive(Args)]
+#[command(after_help = "Examples:
+  clearway upload recordings --store /mnt/archive
+  clearway upload recordings --store s3://fleet/clearway --follow --delete
+
+Exit codes: 0 every part is confirmed, 2 a part is not, 3 wrong use.")]
+pub struct Options {
+    /// The folder with the recordings (.mcap). One that is still being written is left out.
+    folder: PathBuf,
+    /// The store: a folder, or s3://BUCKET/PREFIX with the environment variables of the AWS tools.
+    #[arg(long, value_name = "URL", env = "CLEARWAY_STORE")]
+    store: String,
+    /// Go on until Ctrl-C: send each further part once it is finished.
+    #[arg(long)]
+    follow: bool,
+    /// Delete each part from the folder after the store has confirmed it.
+    #[arg(long)]
+    delete: bool,
+}
+
+/// Sends the parts.
+///
+/// # Errors
+/// If the folder cannot be read or the store's URL is wrong. A part that is not confirmed is no error; the output and
+/// the exit code say so.
+pub fn run(options: &Options) -> Result<Exit> {
+    block_on(send(options))
+}
+
+async fn send(options: &Options) -> Result<Exit> {
+    let store = location::open(&options.store)?;
+    if !options.follow {
+        let unconfirmed = send_all(options, &*store).await?;
+        return Ok(Exit::from_incomplete(unconfirmed > 0));
+    }
+    let follow = async {
+        loop {
+            send_all(options, &*store).await?;
+            tokio::time::sleep(SCAN_PERIOD).await;
+        }
+    };
+    tokio::select! {
+        ended = follow => ended,
+        () = stop_signal()? => Ok(Exit::from_incomplete(!parts(&options.folder)?.is_empty())),
+    }
+}
+
+fn parts(folder: &Path) -> Result<Vec<PathBuf>> {
+    upload::unconfirmed(folder).with_context(|| folder.display().to_string())
+}
+
+/// Sends every finished part; returns the number of those that are not confirmed.
+async fn send_all(options: &Options, store: &dyn ObjectStore) -> Result<u64> {
+    let mut failed = 0;
+    for part in parts(&options.folder)? {
+        match upload::upload(store, &part).await {
+            Ok(confirmation) => {
+                let bytes = counted(confirmation.bytes, "byte");
+                print_line(&format!("{} is confirmed: {bytes}, {}", part.display(), confirmation.part))?;
+                if options.delete {
+                    upload::delete_confirmed(&part).with_context(|| part.display().to_string())?;
+                }
+            }
+            Err(error) => {
+                failed += 1;
+                eprintln!("clearway: not confirmed, and kept: {error}");
+            }
+        }
+    }
+    Ok(failed)
+}

@@ -1,0 +1,48 @@
+//! `clearway check`: a configuration file -> the configuration with every default, or its first error.
+
+use anyhow::Result;
+use clap::Args;
+
+use crate::cli::shared::configuration::ConfigurationOptions;
+use crate::cli::shared::output::print;
+use crate::config::{COMMENTED, Config};
+
+/// The first lines of the configuration that is printed.
+const HEAD: &str = "# Every value that this configuration has. A comment says where it was given: a line of the file \
+    (and whether the\n# vehicle has it from [vehicle_defaults]), an environment variable, or --set. A value without a \
+    comment is a default.\n# Optional tables that the configuration does not have are not here.\n\
+    # `clearway check --default` prints them too, and what each key means.\n\n";
+
+/// Check a configuration file and print it with every default, and where each other value was given.
+///
+/// With --default, print instead the default configuration with an explanation of every key; optional keys and tables
+/// are comments in it.
+#[derive(Args)]
+#[command(after_help = "Examples:
+  clearway check --default > clearway.toml
+  clearway check --config clearway.toml
+  clearway check --set grpc.listen=0.0.0.0:50051")]
+pub struct Options {
+    /// Print the default configuration, in which every key and every optional table is explained.
+    #[arg(long, conflicts_with_all = ["config", "set"])]
+    default: bool,
+    #[command(flatten)]
+    configuration: ConfigurationOptions,
+}
+
+/// Prints the configuration that the options name, as TOML.
+///
+/// # Errors
+/// [`ConfigError`](crate::config::ConfigError), also for a calibration or a certificate that the file names.
+pub fn run(options: &Options) -> Result<()> {
+    let Options { default, configuration } = options;
+    if *default {
+        print(COMMENTED)?;
+        return Ok(());
+    }
+    let config = configuration.load()?;
+    config.calibrations(&configuration.config)?;
+    config.certificates(&configuration.config)?;
+    print(&format!("{HEAD}{}", Config::explain(&configuration.config, &configuration.overrides())?))?;
+    Ok(())
+}

@@ -1,0 +1,137 @@
+//! Files -> the result of each, several at a time.
+
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Instant;
+
+use anyhow::{Context, Result};
+
+use crate::base::sync::locked;
+use crate::cli::shared::exit::Exit;
+use crate::cli::shared::output::with_causes;
+use crate::config::{Calibrations, Config};
+use crate::record::compare::{After, Comparison, compare};
+use crate::record::reader::RecordingReader;
+use crate::record::verify::{Report, verify};
+
+/// What is checked of each recording.
+pub enum Check {
+    /// Its maps are those of its events.
+    Verify,
+    /// What another configuration changes in its maps; without one, the recorded configuration with overrides.
+    Config { config: Option<Box<NewConfig>>, set: Vec<String>, worst: usize },
+    /// What differs in the maps of another recording.
+    Against { other: PathBuf, worst: usize },
+}
+
+/// A configuration and its calibration tables.
+pub struct NewConfig(Config, Calibrations);
+
+impl NewConfig {
+    /// Reads a configuration, with overrides, and its calibration tables.
+    ///
+    /// # Errors
+    /// [`ConfigError`](crate::config::ConfigError).
+    pub fn load(file: &Path, set: &[String]) -> Result<Self> {
+        let config = Config::load(file, set)?;
+        let tables = config.calibrations(file)?;
+        Ok(Self(config, tables))
+    }
+}
+
+/// The result of one file.
+pub struct Checked {
+    pub file: PathBuf,
+    /// Time that the check took, in seconds.
+    pub seconds: f64,
+    pub outcome: Outcome,
+    /// Pictures that were drawn of its changes.
+    pub pictures: Vec<PathBuf>,
+}
+
+/// What a check found.
+pub enum Outcome {
+    Verified(Report),
+    Compared(Comparison),
+    /// The file cannot be read, or its maps cannot be made or compared: the reason.
+    Unreadable(String),
+}
+
+impl Checked {
+    /// [`Exit::Differs`] if a map differs, else [`Exit::Unreadable`] if the file could not be checked, is not whole or
+    /// has no event, else [`Exit::Good`].
+    pub fn exit(&self) -> Exit {
+        match &self.outcome {
+            Outcome::Verified(report) if report.different > 0 => Exit::Differs,
+            Outcome::Verified(report) => Exit::from_incomplete(!report.is_good() || report.incomplete.is_some()),
+            Outcome::Compared(comparison) if !comparison.is_equal() => Exit::Differs,
+            Outcome::Compared(comparison) => Exit::from_incomplete(comparison.incomplete.is_some()),
+            Outcome::Unreadable(_) => Exit::Unreadable,
+        }
+    }
+
+    /// True if the whole file was checked and all its maps are equal.
+    pub fn is_good(&self) -> bool {
+        self.exit() == Exit::Good
+    }
+}
+
+/// Checks all files, at most `jobs` at the same time; the results are in the order of the files.
+pub fn check_all(files: &[PathBuf], check: &Check, jobs: usize) -> Vec<Checked> {
+    let next = AtomicUsize::new(0);
+    let results: Mutex<Vec<Option<Checked>>> = Mutex::new(files.iter().map(|_| None).collect());
+    std::thread::scope(|scope| {
+        for _ in 0..jobs.min(files.len()) {
+            scope.spawn(|| {
+                loop {
+                    let index = next.fetch_add(1, Ordering::Relaxed);
+                    let Some(file) = files.get(index) else { break };
+                    let result = check_one(file, check);
+                    locked(&results)[index] = Some(result);
+                }
+            });
+        }
+    });
+    results.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).into_iter().flatten().collect()
+}
+
+fn check_one(file: &Path, check: &Check) -> Checked {
+    let began = Instant::now();
+    let outcome = outcome_of(file, check).unwrap_or_else(|error| Outcome::Unreadable(with_causes(&error)));
+    Checked { file: file.to_owned(), seconds: began.elapsed().as_secs_f64(), outcome, pictures: Vec::new() }
+}
+
+/// The outcome of a file, or of a recording in a store, which is copied here meanwhile.
+fn outcome_of(file: &Path, check: &Check) -> Result<Outcome> {
+    #[cfg(feature = "store")]
+    if let Some(url) = file.to_str().filter(|text| super::files::is_url(text)) {
+        let copy = crate::cli::shared::output::block_on(crate::store::fetch::fetch(url))?;
+        // A reason names the copy, which is gone when it is read.
+        return outcome(copy.path(), check)
+            .map_err(|error| anyhow::anyhow!(with_causes(&error).replace(&copy.path().display().to_string(), url)));
+    }
+    outcome(file, check)
+}
+
+fn outcome(file: &Path, check: &Check) -> Result<Outcome> {
+    Ok(match check {
+        Check::Verify => Outcome::Verified(verify(file)?),
+        Check::Against { other, worst } => Outcome::Compared(compare(file, &After::Recording(other), *worst)?),
+        Check::Config { config, set, worst } => {
+            let compared = match config.as_deref() {
+                Some(NewConfig(config, tables)) => compare(file, &After::Config(config, Some(tables)), *worst)?,
+                None => compare(file, &After::Config(&overridden(file, set)?, None), *worst)?,
+            };
+            Outcome::Compared(compared)
+        }
+    })
+}
+
+/// The recorded configuration with overrides.
+fn overridden(file: &Path, set: &[String]) -> Result<Config> {
+    let recording = RecordingReader::open(file)?;
+    recording.config()?;
+    let text = recording.header().config.as_deref().context("the recording has a configuration")?;
+    Ok(Config::parse(text, &file.join("config.toml"), set)?)
+}

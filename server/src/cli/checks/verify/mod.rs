@@ -1,0 +1,147 @@
+//! `clearway verify`: recordings -> whether each of their maps is the map of its events, or what a change of the
+//! configuration or of the program changed in them.
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | `files` | paths and patterns of the command line, a shard -> files |
+//! | `checked` | files -> the result of each, several at a time |
+//! | `table` | results -> text |
+//! | `report` | results -> JSON, JUnit XML |
+//! | `pictures` | the maps that changed most -> pictures |
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+use clap::Args;
+
+use self::checked::{Check, Checked, NewConfig, Outcome};
+use self::files::Shard;
+use crate::cli::shared::exit::Exit;
+use crate::cli::shared::files as one_file;
+use crate::cli::shared::output::{print, print_line};
+
+mod checked;
+mod files;
+mod pictures;
+mod report;
+mod table;
+
+/// Compute every map of recordings again from their events, and name the first differences.
+///
+/// Or compare their maps with those of another configuration or recording.
+#[derive(Args)]
+#[command(after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, is not whole or
+has no event, 3 wrong use.
+
+Examples:
+  clearway verify drive.mcap
+  clearway verify 'drives/**/*.mcap' --junit verify.xml
+  clearway verify drives --shard 2/5 --json
+  clearway verify s3://fleet/clearway/parts --shard 2/5
+  clearway verify drives --config new.toml --pictures changes
+  clearway verify drive.mcap --set vehicle.maps.reach.vehicle_width_m=2.5
+  clearway verify before.mcap --against after.mcap")]
+pub struct Options {
+    /// Recordings (MCAP), folders of them, patterns in quotes, such as 'drives/**/*.mcap', or URLs of a store or of a
+    /// recording in it, such as s3://BUCKET/PREFIX.
+    #[arg(required = true, value_name = "FILES")]
+    files: Vec<String>,
+    /// Check part I of N of the files: every N-th of the sorted list, from the I-th on. All parts together are all
+    /// files.
+    #[arg(long, value_name = "I/N")]
+    shard: Option<Shard>,
+    /// Number of files that are checked at the same time; the number of processors if absent.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    jobs: Option<u16>,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+    /// Write the results to this file as JUnit XML, with one test case for each recording.
+    #[arg(long, value_name = "FILE.xml")]
+    junit: Option<PathBuf>,
+    #[command(flatten)]
+    change: Change,
+}
+
+/// The options that compare the recorded maps with others.
+#[derive(Args)]
+#[command(next_help_heading = "Compare a change")]
+struct Change {
+    /// Compare the recorded maps with those that this configuration makes of the recorded events.
+    #[arg(long, value_name = "NEW.toml", conflicts_with = "against")]
+    config: Option<PathBuf>,
+    /// Override a key of that configuration, or of the recorded one; may be given several times.
+    #[arg(long, value_name = "KEY=VALUE", conflicts_with = "against")]
+    set: Vec<String>,
+    /// Compare the maps with those of this recording of the same drive.
+    #[arg(long, value_name = "OTHER.mcap")]
+    against: Option<PathBuf>,
+    /// Number of the maps that changed most to list for each recording.
+    #[arg(long, value_name = "N", default_value = "5", value_parser = clap::value_parser!(u16).range(0..=1000))]
+    worst: u16,
+    /// Draw these maps to this folder: before, after, and what changed.
+    #[arg(long, value_name = "FOLDER")]
+    pictures: Option<PathBuf>,
+}
+
+impl Change {
+    fn check(&self) -> Result<Check> {
+        let worst = usize::from(self.worst);
+        Ok(match (&self.config, &self.against) {
+            (_, Some(other)) => Check::Against { other: other.clone(), worst },
+            (None, None) if self.set.is_empty() => Check::Verify,
+            (config, None) => {
+                let config = config.as_ref().map(|file| NewConfig::load(file, &self.set)).transpose()?;
+                Check::Config { config: config.map(Box::new), set: self.set.clone(), worst }
+            }
+        })
+    }
+}
+
+/// Checks the files and prints the results. The exit code is 2 if a file cannot be checked as a whole, else 1 if a map
+/// differs.
+///
+/// # Errors
+/// If the configuration is wrong, or a report or a picture cannot be written.
+pub fn run(options: &Options) -> Result<Exit> {
+    let check = options.change.check()?;
+    if let (Some(_), Check::Verify) = (&options.change.pictures, &check) {
+        return Err(crate::cli::shared::output::usage_error("--pictures needs --config, --set or --against"));
+    }
+    let files = match files::find(&options.files, options.shard) {
+        Ok(files) => files,
+        Err(error) => {
+            eprintln!("clearway: {error:#}");
+            return Ok(Exit::Unreadable);
+        }
+    };
+    let jobs = options.jobs.map_or_else(|| std::thread::available_parallelism().map_or(1, usize::from), usize::from);
+    let mut results = checked::check_all(&files, &check, jobs);
+    if let Some(folder) = &options.change.pictures {
+        one_file::create_folder(folder)?;
+        results.iter_mut().try_for_each(|result| pictures::draw(result, folder))?;
+    }
+    if let Some(file) = &options.junit {
+        one_file::write(file, report::junit(&results).as_bytes())?;
+    }
+    for result in &results {
+        if let Outcome::Unreadable(reason) = &result.outcome {
+            eprintln!("clearway: {reason}");
+        }
+    }
+    if options.json {
+        print_line(&format!("{:#}", report::json(&results)))?;
+    } else {
+        print(&table::text(&results, &check))?;
+    }
+    Ok(exit(&results))
+}
+
+fn exit(results: &[Checked]) -> Exit {
+    let has = |exit: Exit| results.iter().any(|result| result.exit() == exit);
+    match () {
+        () if has(Exit::Unreadable) => Exit::Unreadable,
+        () if has(Exit::Differs) => Exit::Differs,
+        () => Exit::Good,
+    }
+}

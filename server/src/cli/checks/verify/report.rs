@@ -1,0 +1,184 @@
+//! The results of all files for programs: one JSON object, or JUnit XML.
+
+use std::fmt::Write as _;
+
+use serde_json::{Value, json};
+
+use super::checked::{Checked, Outcome};
+use crate::cli::shared::exit::Exit;
+use crate::cli::shared::output::counted;
+use crate::config::RecordedMaps;
+use crate::record::compare::{Comparison, LayerChange, MapChange};
+
+/// The result of one file in one line: `equal`, the first difference, or why it cannot be read.
+pub fn reason(outcome: &Outcome) -> String {
+    match outcome {
+        Outcome::Verified(report) => {
+            let result = match report.differences.first() {
+                Some(first) => format!("{}: {first}", counted(report.different, "difference")),
+                None if report.events == 0 => "no event, so nothing is verified".to_owned(),
+                None if report.recorded == RecordedMaps::None => "the events are whole; no map is recorded".to_owned(),
+                None => "equal".to_owned(),
+            };
+            let unjudged = match report.unjudged {
+                0 => String::new(),
+                layers => format!("; {} after missing events cannot be judged", counted(layers, "layer")),
+            };
+            let incomplete = report.incomplete.iter().map(|how| format!("; the file is {how}"));
+            result + &unjudged + &incomplete.collect::<String>()
+        }
+        Outcome::Compared(comparison) => {
+            let result = if comparison.is_equal() { "equal".to_owned() } else { first_change(comparison) };
+            let incomplete = comparison.incomplete.iter().map(|how| format!("; {how}"));
+            result + &incomplete.collect::<String>()
+        }
+        Outcome::Unreadable(reason) => format!("not checked: {reason}"),
+    }
+}
+
+/// The first change of a comparison, of the earliest map.
+fn first_change(comparison: &Comparison) -> String {
+    let cells = comparison.layers.iter().filter_map(|(key, change)| Some((key, change.first.as_ref()?)));
+    match cells.min_by_key(|(_, cell)| cell.sequence) {
+        Some(((vehicle, layer), cell)) => format!(
+            "first change: vehicle {vehicle}, sequence {}, layer {layer}, cell row {} column {}: {} before, {} after",
+            cell.sequence, cell.row, cell.column, cell.before, cell.after
+        ),
+        None => "no class changed; other values, or maps of one side only".into(),
+    }
+}
+
+/// All results as one JSON object.
+pub fn json(results: &[Checked]) -> Value {
+    let file = |result: &Checked| {
+        let mut object = json!({ "file": result.file, "seconds": result.seconds, "ok": result.is_good() });
+        let details = match &result.outcome {
+            Outcome::Verified(report) => report.to_json(),
+            Outcome::Compared(comparison) => comparison_json(comparison),
+            Outcome::Unreadable(reason) => json!({ "not_checked": reason }),
+        };
+        if let (Value::Object(object), Value::Object(details)) = (&mut object, details) {
+            object.extend(details);
+            if !result.pictures.is_empty() {
+                object.insert("pictures".into(), json!(result.pictures));
+            }
+        }
+        object
+    };
+    json!({ "ok": results.iter().all(Checked::is_good), "files": results.iter().map(file).collect::<Vec<_>>() })
+}
+
+fn comparison_json(comparison: &Comparison) -> Value {
+    let layer = |((vehicle, layer), change): (&(String, String), &LayerChange)| {
+        let classes = change
+            .classes
+            .iter()
+            .map(|((before, after), cells)| json!({ "before": before, "after": after, "cells": cells }));
+        json!({
+            "vehicle": vehicle, "layer": layer, "maps": change.maps,
+            "only_before": change.only_before, "only_after": change.only_after,
+            "cells": change.cells, "changed": change.changed, "other_values": change.values,
+            "free_gained_m2": change.gained_m2, "free_lost_m2": change.lost_m2,
+            "classes": classes.collect::<Vec<_>>(),
+            "first": change.first.as_ref().map(|cell| json!({
+                "sequence": cell.sequence, "row": cell.row, "column": cell.column,
+                "before": cell.before, "after": cell.after,
+            })),
+        })
+    };
+    let worst = |map: &MapChange| {
+        json!({
+            "vehicle": map.vehicle, "layer": map.after.name, "sequence": map.sequence, "stamp_ns": map.stamp_ns,
+            "changed": map.changed, "cells": map.cells,
+            "free_gained_m2": map.gained_m2, "free_lost_m2": map.lost_m2,
+        })
+    };
+    json!({
+        "maps_before": comparison.before, "maps_after": comparison.after, "incomplete": comparison.incomplete,
+        "layers": comparison.layers.iter().map(layer).collect::<Vec<_>>(),
+        "worst": comparison.worst.iter().map(worst).collect::<Vec<_>>(),
+    })
+}
+
+/// All results as JUnit XML: one test case for each file; a difference is a failure, a file that is not whole
+/// or cannot be read an error.
+pub fn junit(results: &[Checked]) -> String {
+    let count = |is: fn(&Checked) -> bool| results.iter().filter(|result| is(result)).count();
+    let errors = count(|result| result.exit() == Exit::Unreadable);
+    let failures = count(|result| result.exit() == Exit::Differs);
+    let seconds: f64 = results.iter().map(|result| result.seconds).sum();
+    let sums = format!(
+        "name=\"clearway verify\" tests=\"{}\" failures=\"{failures}\" errors=\"{errors}\" time=\"{seconds:.3}\"",
+        results.len()
+    );
+    let mut xml = "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n".to_owned();
+    // Writing to a string cannot fail.
+    let _ = writeln!(xml, "<testsuites {sums}>\n  <testsuite {sums}>");
+    for result in results {
+        let name = escaped(&result.file.display().to_string());
+        let _ =
+            write!(xml, "    <testcase classname=\"clearway.verify\" name=\"{name}\" time=\"{:.3}\"", result.seconds);
+        let message = escaped(&reason(&result.outcome));
+        let _ = match &result.outcome {
+            _ if result.is_good() => writeln!(xml, "/>"),
+            _ if result.exit() == Exit::Unreadable => writeln!(xml, "><error message=\"{message}\"/></testcase>"),
+            Outcome::Compared(_) | Outcome::Unreadable(_) => {
+                writeln!(xml, "><failure message=\"{message}\"/></testcase>")
+            }
+            Outcome::Verified(report) => {
+                let all: Vec<_> = report.differences.iter().map(|one| escaped(&one.to_string())).collect();
+                writeln!(xml, "><failure message=\"{message}\">{}</failure></testcase>", all.join("\n"))
+            }
+        };
+    }
+    xml + "  </testsuite>\n</testsuites>\n"
+}
+
+/// A text in an XML attribute or element. Control characters, which XML does not allow, become `?`.
+fn escaped(text: &str) -> String {
+    let mut escaped = String::with_capacity(text.len());
+    for letter in text.chars() {
+        match letter {
+            '&' => escaped.push_str("&amp;"),
+            '<' => escaped.push_str("&lt;"),
+            '>' => escaped.push_str("&gt;"),
+            '"' => escaped.push_str("&quot;"),
+            '\n' | '\t' => escaped.push(' '),
+            '\u{fffe}' | '\u{ffff}' => escaped.push('?'),
+            letter if letter.is_control() => escaped.push('?'),
+            letter => escaped.push(letter),
+        }
+    }
+    escaped
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::record::verify::{Difference, DifferenceKind, Report};
+
+    #[test]
+    fn junit_is_xml_with_a_case_for_each_file_whatever_its_name() {
+        let checked = |file: &str, outcome| Checked { file: file.into(), seconds: 0.25, outcome, pictures: Vec::new() };
+        let kind = DifferenceKind::Cell { row: 3, column: 17, channel: "class".into(), recorded: 1, computed: 3 };
+        let difference = Difference { vehicle: "car".into(), sequence: 2, layer: "terrain".into(), kind };
+        let report = Report { differences: vec![difference], different: 1, ..Report::default() };
+        let results = [
+            checked("a&b <\"c\">.mcap", Outcome::Verified(Report { events: 9, ..Report::default() })),
+            checked("d.mcap", Outcome::Verified(report)),
+            checked("e.mcap", Outcome::Unreadable("line 1\nbyte \u{1}".into())),
+        ];
+        let xml = junit(&results);
+        let document = roxmltree::Document::parse(&xml).expect("XML");
+        let suite = document.root_element().first_element_child().expect("a suite");
+        let of = |name| suite.attribute(name);
+        assert_eq!((of("tests"), of("failures"), of("errors")), (Some("3"), Some("1"), Some("1")));
+        let cases: Vec<_> = suite.children().filter(|node| node.has_tag_name("testcase")).collect();
+        assert_eq!(cases[0].attribute("name"), Some("a&b <\"c\">.mcap"));
+        let failure = cases[1].first_element_child().expect("a failure");
+        assert!(failure.has_tag_name("failure"));
+        assert!(failure.text().is_some_and(|text| text.contains("row 3 column 17, channel class: recorded 1")));
+        let error = cases[2].first_element_child().and_then(|error| error.attribute("message"));
+        assert_eq!(error, Some("not checked: line 1 byte ?"));
+    }
+}

@@ -1,0 +1,86 @@
+//! The options that name a server and the certificates to reach it -> a connected client.
+
+use std::path::PathBuf;
+
+use anyhow::{Error, Result};
+use clap::Args;
+use clearway_client::{Client, ClientError, Tls};
+
+use crate::cli::shared::files;
+
+/// The gRPC address of a server with the default configuration.
+const ADDRESS: &str = "localhost:50051";
+
+/// The options that name a server and the certificates to reach it.
+#[derive(Args)]
+pub struct ServerOptions {
+    /// The server's gRPC address.
+    #[arg(long = "server", value_name = "HOST:PORT", default_value = ADDRESS, env = "CLEARWAY_SERVER")]
+    pub address: String,
+    /// PEM file with the CA certificate that signed the server's certificate; turns on encryption.
+    #[arg(long, value_name = "FILE.pem", env = "CLEARWAY_CA")]
+    ca: Option<PathBuf>,
+    /// PEM file with this client's certificate, if the server requires one.
+    #[arg(long, value_name = "FILE.pem", env = "CLEARWAY_CERT", requires_all = ["ca", "key"])]
+    cert: Option<PathBuf>,
+    /// PEM file with the private key of --cert.
+    #[arg(long, value_name = "FILE.key", env = "CLEARWAY_KEY", requires = "cert")]
+    key: Option<PathBuf>,
+}
+
+impl ServerOptions {
+    /// Connects to the server, with certificates if `--ca` is given.
+    ///
+    /// # Errors
+    /// If a PEM file cannot be read, and as [`Client::connect`].
+    pub async fn connect(&self) -> Result<Client> {
+        let read = |file: &PathBuf| files::read_text(file);
+        let Some(ca) = &self.ca else { return Client::connect(&self.address).await.map_err(explain) };
+        let identity = match (&self.cert, &self.key) {
+            (Some(certificate), Some(key)) => Some((read(certificate)?, read(key)?)),
+            _ => None,
+        };
+        let tls = Tls { ca: read(ca)?, identity, server_name: String::new() };
+        Client::connect_tls(&self.address, &tls).await.map_err(explain)
+    }
+}
+
+/// Adds to an error of the client what to do about it, if that is known.
+pub fn explain(error: ClientError) -> Error {
+    let text = error.to_string();
+    let advice = advice(&text);
+    let error = Error::from(error);
+    match advice {
+        Some(advice) => error.context(advice),
+        None => error,
+    }
+}
+
+/// What to do about an error of this text; `None` if the text says all that is known.
+fn advice(error: &str) -> Option<&'static str> {
+    let is_http = ["invalid compression flag", "HTTP status code", "http2 error", "h2 protocol error"];
+    if is_http.iter().any(|part| error.contains(part)) {
+        return Some(
+            "something answers at this address, but not a gRPC server: --server needs the address of [grpc] listen \
+             (port 50051 by default), not the one of the page ([page] listen, port 8080 by default)",
+        );
+    }
+    let has_no_map = error.contains("no map");
+    has_no_map.then_some(
+        "the server has no map to give: no packet or scan has arrived since it started, or none arrives now; \
+         `clearway status` says why, and `clearway get --wait` and `clearway watch` wait for the next map",
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_answer_over_http_is_explained_by_the_ports() {
+        let error =
+            "http://localhost:8080: protocol error: received message with invalid compression flag: 110 (Internal)";
+        assert!(advice(error).unwrap().contains("[page] listen"));
+        assert!(advice("no clearway server answers at http://localhost:1: Connection refused").is_none());
+    }
+}

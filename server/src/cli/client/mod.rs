@@ -1,0 +1,18 @@
+//! The subcommands that are clients of a running server.
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | `watch`, `get` | a server -> a line for each map; the newest map as a file |
+//! | `vehicles` | a server -> its vehicles |
+//! | `status`, `top` | a server -> the states of its vehicles, once and live |
+//! | `recorder`, `transport` | a request -> the recorder of a server; the replay that it serves |
+//! | `connection` | options -> a connected client |
+
+pub(super) mod connection;
+pub(super) mod get;
+pub(super) mod recorder;
+pub(super) mod status;
+pub(super) mod top;
+pub(super) mod transport;
+pub(super) mod vehicles;
+pub(super) mod watch;

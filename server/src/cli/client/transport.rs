@@ -1,0 +1,125 @@
+//! `clearway transport`: controls the replay that a server serves.
+
+use anyhow::{Result, bail};
+use clap::{ArgAction, Args, Subcommand};
+use clearway_client::ClientError;
+use clearway_client::v1::{ReplayControl, ReplayState};
+
+use crate::cli::client::connection::{ServerOptions, explain};
+use crate::cli::make::replay::{Speed, state};
+use crate::cli::shared::output::{block_on, print_line};
+
+/// Control the replay of a server: pause, play, step, seek, range, speed, loop, lockstep.
+#[derive(Args)]
+#[command(after_help = "Examples:
+  clearway transport
+  clearway transport pause
+  clearway transport seek 12.5
+  clearway transport step 3
+  clearway transport rate max")]
+pub struct Options {
+    #[command(subcommand)]
+    request: Option<Request>,
+    #[command(flatten)]
+    server: ServerOptions,
+    /// Print the state as one JSON object.
+    #[arg(long, global = true)]
+    json: bool,
+}
+
+/// What to change. Times are seconds after the first event.
+#[derive(Clone, Copy, Subcommand)]
+enum Request {
+    /// Go on.
+    Play,
+    /// Stop until `play`.
+    Pause,
+    /// Make this many maps, and pause.
+    Step {
+        /// Number of maps.
+        #[arg(default_value = "1")]
+        maps: u32,
+    },
+    /// Jump to this time.
+    Seek {
+        /// Seconds after the first event.
+        seconds: f64,
+    },
+    /// Play only this part.
+    Range {
+        /// Begin, in seconds after the first event.
+        from: f64,
+        /// End, in seconds after the first event.
+        to: f64,
+    },
+    /// Set the speed: 0.1 to 1000 times the recorded one, or max.
+    Rate {
+        /// A factor, or max.
+        rate: Speed,
+    },
+    /// Begin again at the end, or do not.
+    Loop {
+        /// on or off.
+        #[arg(value_parser = on_or_off, action = ArgAction::Set)]
+        on: bool,
+    },
+    /// Wait for the acknowledgement of each map, or do not.
+    Lockstep {
+        /// on or off.
+        #[arg(value_parser = on_or_off, action = ArgAction::Set)]
+        on: bool,
+    },
+}
+
+fn on_or_off(text: &str) -> Result<bool, String> {
+    match text {
+        "on" => Ok(true),
+        "off" => Ok(false),
+        _ => Err("on or off is allowed".into()),
+    }
+}
+
+/// Changes how the replay goes on, and prints its state after the change.
+///
+/// # Errors
+/// If the server does not answer, serves no replay, or refuses the change.
+pub fn run(options: &Options) -> Result<()> {
+    block_on(control(options))
+}
+
+async fn control(options: &Options) -> Result<()> {
+    let client = options.server.connect().await?;
+    let replay = match client.replay_control(ReplayControl::default()).await {
+        Err(ClientError::Refused { address, code, .. }) if code == "Unimplemented" => {
+            bail!("{address} replays nothing; start it with `clearway replay FILE --serve`")
+        }
+        replay => replay.map_err(explain)?,
+    };
+    let replay = match options.request {
+        None => replay,
+        Some(request) => client.replay_control(request.to_control(&replay)?).await.map_err(explain)?,
+    };
+    print_line(&if options.json { state::json(&replay) } else { state::line(&replay) })?;
+    Ok(())
+}
+
+impl Request {
+    fn to_control(self, state: &ReplayState) -> Result<ReplayControl> {
+        let at = |seconds: f64| match seconds.is_finite() {
+            // Saturates: what lies outside the drive is refused by the server.
+            true => Ok(Some(state.begin_ns.saturating_add((seconds * 1e9) as i64))),
+            false => bail!("{seconds} s: a finite number of seconds is allowed"),
+        };
+        let nothing = ReplayControl::default();
+        Ok(match self {
+            Self::Play => ReplayControl { paused: Some(false), ..nothing },
+            Self::Pause => ReplayControl { paused: Some(true), ..nothing },
+            Self::Step { maps } => ReplayControl { step: Some(maps), ..nothing },
+            Self::Seek { seconds } => ReplayControl { seek_ns: at(seconds)?, ..nothing },
+            Self::Range { from, to } => ReplayControl { from_ns: at(from)?, to_ns: at(to)?, ..nothing },
+            Self::Rate { rate } => ReplayControl { rate: Some(rate.rate()), ..nothing },
+            Self::Loop { on } => ReplayControl { repeat: Some(on), ..nothing },
+            Self::Lockstep { on } => ReplayControl { lockstep: Some(on), ..nothing },
+        })
+    }
+}

@@ -1,0 +1,214 @@
+//! `clearway watch`: a server -> one line for each map, and a line when the maps stop.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::{Result, bail};
+use clap::Args;
+use clearway_client::{ClientError, MapStream, PassedOver, StreamEvent, Subscription, Update, now_ns};
+use serde_json::json;
+
+use crate::cli::client::connection::{ServerOptions, explain};
+use crate::cli::shared::exit::Exit;
+#[cfg(feature = "zenoh")]
+use crate::cli::shared::files;
+use crate::cli::shared::output::{block_on, print_line};
+
+/// Time between two lines while no fresh map comes. Ours: a person sees that the command still waits.
+const STALE_PERIOD: Duration = Duration::from_secs(1);
+/// Interval at which the age of the last map is read after the stream has ended.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
+
+/// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps.
+///
+/// If no map arrives, or no newer one before the last one becomes stale, a line says STALE once a second until maps
+/// arrive again. The exit code is 4 if the last line says STALE, and 2 if the server ends the stream.
+#[derive(Args)]
+#[command(after_help = "Examples:
+  clearway watch
+  clearway watch --server vehicle.local:50051 --layers drivability,occupancy --max-rate-hz 2
+  clearway watch --count 10 --json
+  clearway watch --until-stale || echo \"the maps are stale\"")]
+pub struct Options {
+    #[command(flatten)]
+    server: ServerOptions,
+    /// Read over zenoh instead of gRPC, from this endpoint, such as tcp/localhost:7447.
+    #[arg(long, value_name = "ENDPOINT", conflicts_with_all = ["address", "ca", "cert", "key"])]
+    zenoh: Option<String>,
+    /// Believe only maps that are signed with the private key of this public key (`zenoh.signing_key` of the server).
+    #[arg(long, value_name = "FILE.pub", requires = "zenoh")]
+    signed_by: Option<PathBuf>,
+    /// The vehicle, if the server has several.
+    #[arg(long, value_name = "NAME")]
+    vehicle: Option<String>,
+    /// Layers, separated by commas; all if absent. Over zenoh one layer; drivability if absent.
+    #[arg(long, alias = "layer", value_name = "LAYER", value_delimiter = ',')]
+    layers: Vec<String>,
+    /// Greatest number of maps a second; every map if absent.
+    #[arg(long, value_name = "HZ", conflicts_with = "zenoh")]
+    max_rate_hz: Option<f64>,
+    /// Receive only the cells that have changed since the last map.
+    #[arg(long, conflicts_with = "zenoh")]
+    deltas: bool,
+    /// Print each line as a JSON object.
+    #[arg(long)]
+    json: bool,
+    /// End after this many maps; at Ctrl-C if absent.
+    #[arg(long, value_name = "MAPS")]
+    count: Option<u64>,
+    /// End with exit code 4 as soon as the map is stale, or none has come for a second.
+    #[arg(long)]
+    until_stale: bool,
+}
+
+/// Prints lines until the stream or a replay ends, the count is reached, the map is stale with `--until-stale`,
+/// or the reader of stdout has closed it.
+///
+/// # Errors
+/// [`ClientError`](clearway_client::ClientError) if the server refuses, does not answer or ends the stream.
+pub fn run(options: &Options) -> Result<Exit> {
+    block_on(watch(options))
+}
+
+async fn watch(options: &Options) -> Result<Exit> {
+    let mut maps = subscribe(options).await?;
+    let mut newest: Option<Update> = None;
+    let (mut printed, mut is_stale) = (0, false);
+    while options.count.is_none_or(|count| printed < count) && !(is_stale && options.until_stale) {
+        let event = tokio::time::timeout(STALE_PERIOD, maps.next_or_stale()).await;
+        let (said, is_new) = match event {
+            Ok(Ok(StreamEvent::Fresh(update) | StreamEvent::Stale(update))) => {
+                let is_new = newest.as_ref().map(id) != Some(id(&update));
+                is_stale = update.map.is_stale(now_ns());
+                let said = if is_new {
+                    line(&update, maps.passed_over(), options.json)
+                } else {
+                    stale_line(Some(&update), maps.passed_over(), options)
+                };
+                newest = Some(update);
+                (said, is_new)
+            }
+            Ok(Err(error @ ClientError::ReplayEnded { .. })) => {
+                eprintln!("clearway: {error}");
+                break;
+            }
+            Ok(Err(ended)) => {
+                if let Some(last) = newest.filter(|_| !is_stale) {
+                    wait_until_stale(&last).await;
+                    print_line(&stale_line(Some(&last), maps.passed_over(), options))?;
+                }
+                return Err(explain(ended));
+            }
+            // A fresh map is not repeated: maps may be rarer than this period.
+            Err(_) if newest.as_ref().is_some_and(|last| !last.map.is_stale(now_ns())) => continue,
+            Err(_) => {
+                is_stale = true;
+                (stale_line(newest.as_ref(), maps.passed_over(), options), false)
+            }
+        };
+        if !print_line(&said)? {
+            break;
+        }
+        printed += u64::from(is_new);
+    }
+    Ok(Exit::from_stale(is_stale))
+}
+
+/// Identity of a map.
+fn id(update: &Update) -> (u64, u64) {
+    (update.map.header().boot_id, update.map.sequence())
+}
+
+/// Waits until the last map of a stream that has ended is stale.
+async fn wait_until_stale(last: &Update) {
+    while !last.map.is_stale(now_ns()) {
+        tokio::time::sleep(POLL_INTERVAL).await;
+    }
+}
+
+async fn subscribe(options: &Options) -> Result<MapStream> {
+    let Options { zenoh, vehicle, layers, max_rate_hz, deltas, .. } = options;
+    if let Some(endpoint) = zenoh {
+        return subscribe_over_zenoh(endpoint, options).await;
+    }
+    let subscription = Subscription {
+        vehicle: vehicle.clone().unwrap_or_default(),
+        layers: layers.clone(),
+        max_rate_hz: *max_rate_hz,
+        deltas: *deltas,
+        ..Subscription::default()
+    };
+    options.server.connect().await?.subscribe(subscription).await.map_err(explain)
+}
+
+/// The line for a new map.
+fn line(update: &Update, passed_over: PassedOver, as_json: bool) -> String {
+    let (map, skipped, now) = (&update.map, update.skipped, now_ns());
+    let share = map.metric("drivable_share");
+    if as_json {
+        let document = json!({
+            "vehicle": map.vehicle(), "sequence": map.sequence(), "age_ms": map.age_ms(now), "stale": map.is_stale(now),
+            "drivable_share": share, "bytes": map.bytes().len(), "skipped": skipped,
+            "lost": update.lost, "left_out": update.left_out, "passed_over": passed_over.hostile(),
+            "layers": map.layers().iter().map(|layer| &layer.name).collect::<Vec<_>>(),
+        });
+        return document.to_string();
+    }
+    let share = share.map_or("    -".into(), |share| format!("{:5.1}", 100.0 * share));
+    let stale = if map.is_stale(now) { "  STALE" } else { "" };
+    let passed_over = match passed_over.hostile() {
+        0 => String::new(),
+        messages => format!("  passed over {messages} messages that are no maps of this server"),
+    };
+    format!(
+        "{} #{:06}  age {:7.1} ms  drivable {share} %  {:6} bytes  skipped {skipped}{stale}{passed_over}",
+        map.vehicle(),
+        map.sequence(),
+        map.age_ms(now),
+        map.bytes().len()
+    )
+}
+
+/// The line while no fresh map is there: the newest one is stale, or none has come.
+fn stale_line(newest: Option<&Update>, passed_over: PassedOver, options: &Options) -> String {
+    match newest {
+        Some(update) if options.json => line(update, passed_over, true),
+        Some(Update { map, .. }) => format!(
+            "{} #{:06}  age {:7.1} ms  STALE: no newer map has arrived; waiting",
+            map.vehicle(),
+            map.sequence(),
+            map.age_ms(now_ns())
+        ),
+        None if options.json => {
+            json!({"vehicle": options.vehicle, "sequence": null, "age_ms": null, "stale": true}).to_string()
+        }
+        None => "STALE: waiting for the first map (`clearway status` says why none has come)".to_owned(),
+    }
+}
+
+#[cfg(feature = "zenoh")]
+async fn subscribe_over_zenoh(endpoint: &str, options: &Options) -> Result<MapStream> {
+    let layer = match &options.layers[..] {
+        [] => "drivability",
+        [layer] => layer,
+        several => bail!("--layers {}: over zenoh each layer has its own key; name one", several.join(",")),
+    };
+    let mut client = clearway_client::ZenohClient::connect(endpoint).await?;
+    if let Some(file) = &options.signed_by {
+        client = client.signed_by(clearway_client::PublicKey::from_pem(&files::read_text(file)?)?);
+    }
+    let vehicle = match &options.vehicle {
+        Some(name) => name.clone(),
+        None => match &client.vehicles().await?[..] {
+            [] => bail!("no server at {endpoint} publishes a vehicle"),
+            [only] => only.clone(),
+            several => bail!("{endpoint} has {}: name one with --vehicle", several.join(", ")),
+        },
+    };
+    Ok(client.subscribe(&vehicle, layer).await?)
+}
+
+#[cfg(not(feature = "zenoh"))]
+async fn subscribe_over_zenoh(endpoint: &str, _: &Options) -> Result<MapStream> {
+    bail!("--zenoh {endpoint}: this clearway was built without the feature zenoh")
+}

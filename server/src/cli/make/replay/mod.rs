@@ -1,0 +1,317 @@
+//! `clearway replay`: recorded drives -> maps, through the same event queue, engine, recorder and publishers as live
+//! data, with the stamps of the recording. The same files always make the same maps.
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | [`options`] | the command line -> [`Options`] |
+//! | `plan` | options, files -> configuration, mount, readings |
+//! | `recordings` | files -> recordings of several vehicles; sensors that do not fit |
+//! | `ready_file` | the running server -> the file that tells programs its addresses |
+//! | `keys` | lines of a terminal -> requests |
+//! | [`state`] | the state of the replay -> text, JSON |
+//! | [`clouds`] | revolutions -> PCD files |
+//! | [`summary`] | the state at the end -> text, JSON |
+//!
+//! A capture rarely contains how its sensor was mounted. Without extrinsics, a first pass over the first revolutions
+//! estimates height, pitch and roll from the ground around the vehicle; the estimate is printed and recorded. If there
+//! is no ground to estimate from, the files are decoded and no map is made, and the summary says so.
+
+use std::io::IsTerminal;
+use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use clearway_proto::v1;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::base::sync::locked;
+use crate::cli::make::serve::log_endpoints;
+use crate::cli::shared::exit::Exit;
+use crate::cli::shared::output::{block_on, counted, print, print_line, stop_signal};
+use crate::config::{Config, Vehicle};
+use crate::replay::ReplayHandle;
+use crate::replay::control::check;
+use crate::replay::faults::Faults;
+use crate::replay::outcome::Played;
+use crate::replay::player::{Player, PlayerOptions, ReplayedVehicle};
+use crate::replay::timeline::Timeline;
+use crate::server::{Running, Server, Setup, random};
+
+pub mod clouds;
+mod keys;
+pub mod options;
+mod plan;
+mod ready_file;
+mod recordings;
+pub mod state;
+pub mod summary;
+
+pub use options::{Options, ReplayError, Speed};
+use plan::{Plan, plan};
+use ready_file::ReadyFile;
+pub use summary::{Mount, Summary, describe};
+
+/// Interval at which the progress bar is drawn again.
+const DRAW_INTERVAL: Duration = Duration::from_millis(100);
+/// Longest wait for an acknowledgement in lockstep, in seconds. Ours: a planner that stands in a debugger says so with
+/// --lockstep-timeout.
+const ACKNOWLEDGE_S_MAX: f64 = 10.0;
+
+/// Replays the files and prints the summary. A file that is not whole, or a signal before the end, is
+/// [`Exit::Unreadable`].
+///
+/// # Errors
+/// [`ReplayError`].
+pub fn run(options: Options) -> anyhow::Result<Exit> {
+    block_on(replay_and_print(options, None))
+}
+
+/// As [`run`], for a person who looks at the page: prints its address, and opens it with the desktop's browser if
+/// `opens` is true. A signal or the key q is the normal end.
+///
+/// # Errors
+/// [`ReplayError`].
+pub fn view(options: Options, opens: bool) -> anyhow::Result<Exit> {
+    block_on(replay_and_print(options, Some(opens)))
+}
+
+/// Prints the address of the page, and opens it.
+fn show_page(running: &Running, opens: bool) -> anyhow::Result<()> {
+    let Some(page) = running.page.map(|at| format!("http://{at}/")) else { return Ok(()) };
+    print_line(&page)?;
+    if opens && let Err(error) = Command::new("xdg-open").arg(&page).spawn() {
+        tracing::warn!(%error, "xdg-open");
+    }
+    Ok(())
+}
+
+/// `view`: whether to open the page, for [`view`].
+async fn replay_and_print(options: Options, view: Option<bool>) -> anyhow::Result<Exit> {
+    let (json, serve) = (options.json, options.serve);
+    let mut shown = Ok(());
+    let progress = Arc::new(Progress::default());
+    let mut bar = None;
+    let started = |running: &Running, summary: &Summary| {
+        if let Some(description) = describe(&summary.mount) {
+            eprintln!("extrinsics {description}");
+        }
+        log_endpoints(running);
+        if let Some(opens) = view {
+            shown = show_page(running, opens);
+        }
+        // Only now: a bar drawn before these lines would stay above them.
+        if let Some(replay) = running.replay() {
+            keys::follow(replay, tokio::runtime::Handle::current());
+        }
+        bar = (!json && !serve && std::io::stderr().is_terminal()).then(|| tokio::spawn(draw(progress.clone())));
+    };
+    let outcome = replay(options, progress.clone(), started, stop_signal()?).await;
+    if let Some(bar) = bar {
+        bar.abort();
+        // The task ends with a cancellation, which is its normal end.
+        let _ = bar.await;
+    }
+    let summary = outcome?;
+    shown?;
+    for truncated in &summary.truncated {
+        eprintln!("warning: {}: {}; the rest was used", truncated.file.display(), truncated.reason);
+    }
+    for note in &summary.notes {
+        eprintln!("note: {note}");
+    }
+    let is_whole = summary.truncated.is_empty();
+    if view.is_some() {
+        return Ok(Exit::from_incomplete(!is_whole));
+    }
+    if json {
+        print_line(&format!("{:#}", summary.to_json()))?
+    } else {
+        print(&summary.to_text())?
+    };
+    Ok(Exit::from_incomplete(!is_whole || !summary.reached_end))
+}
+
+/// How many bytes of the files a replay has read, for a progress bar.
+#[derive(Debug, Default)]
+pub struct Progress {
+    /// Bytes of all files.
+    pub bytes: AtomicU64,
+    /// Bytes read so far.
+    pub bytes_read: Arc<AtomicU64>,
+}
+
+/// Draws the progress bar until the task is aborted, and then clears it.
+async fn draw(progress: Arc<Progress>) {
+    struct Cleared(ProgressBar);
+    impl Drop for Cleared {
+        fn drop(&mut self) {
+            self.0.finish_and_clear();
+        }
+    }
+    let template = "{bar:40} {bytes}/{total_bytes} {bytes_per_sec} {eta}";
+    let style = ProgressStyle::with_template(template).expect("the template is a constant");
+    let bar = Cleared(ProgressBar::new(progress.bytes.load(Ordering::Relaxed)).with_style(style));
+    loop {
+        bar.0.set_position(progress.bytes_read.load(Ordering::Relaxed));
+        tokio::time::sleep(DRAW_INTERVAL).await;
+    }
+}
+
+/// Replays the files to their end. `started` is called with the running server before the first event; with
+/// [`Options::serve`] the replay returns only after `stop` has resolved, or with [`Options::exit_at_end`]. It ends
+/// early if `stop` resolves. Needs a multi-thread tokio runtime.
+///
+/// # Errors
+/// [`ReplayError`]; nothing is left running.
+pub async fn replay(
+    options: Options,
+    progress: Arc<Progress>,
+    started: impl FnOnce(&Running, &Summary),
+    stop: impl Future<Output = ()>,
+) -> Result<Summary, ReplayError> {
+    let began = Instant::now();
+    options.ready_file.as_deref().map_or(Ok(()), ReadyFile::remove_earlier)?;
+    let plan = tokio::task::block_in_place(|| plan(&options))?;
+    let Plan { setup, mount, extrinsics, mut timeline, bytes, boot_id, clouds } = plan;
+    progress.bytes.store(bytes, Ordering::Relaxed);
+    timeline.bytes_read = progress.bytes_read.clone();
+    let extent = tokio::task::block_in_place(|| extent(&options, &timeline))?;
+    let mut state = initial_state(&options, extent)?;
+    state.vehicles = setup.config.vehicles.iter().map(|vehicle| vehicle.name.clone()).collect();
+    timeline.faults = faults(&options, extent, &setup.config)?;
+    let (handle, input) = ReplayHandle::new(state);
+    let setup = Setup { replay: options.serve.then(|| handle.clone()), ..setup };
+    let mut running = Server::start(setup).await?;
+    let ready_file = options.ready_file.as_deref().map(|file| ReadyFile::write(file, &running)).transpose();
+    let running_vehicles = running.vehicles.clone();
+    let status = running_vehicles.0[0].status.clone();
+    let mut summary = Summary {
+        snapshot: status.snapshot(),
+        extrinsics,
+        mount,
+        truncated: Vec::new(),
+        notes: Vec::new(),
+        clouds: 0,
+        seconds: 0.0,
+        record: options.record.clone(),
+        reached_end: false,
+    };
+    started(&running, &summary);
+
+    // Maps that are as recorded keep their boot id until the first jump.
+    let first_boot_id = boot_id.filter(|_| !options.as_live).unwrap_or_else(random);
+    let player_options = PlayerOptions {
+        is_served: options.serve,
+        is_recorded: options.record.is_some(),
+        exits_at_end: options.exit_at_end,
+        acknowledge_timeout: Duration::from_secs_f64(options.lockstep_timeout.unwrap_or(ACKNOWLEDGE_S_MAX)),
+        boot_id: first_boot_id,
+    };
+    let stepped = std::mem::take(&mut running.stepped).into_iter().zip(&running.inputs);
+    let vehicles: Vec<_> = stepped
+        .map(|((engine, events), input)| ReplayedVehicle { engine, events, queue: input.queue.clone() })
+        .collect();
+    let runtime = tokio::runtime::Handle::current();
+    let play = move || Player::new(timeline, vehicles, input, player_options, runtime)?.run();
+    let outcome = match &ready_file {
+        Err(_) => {
+            // With its engines, for which the recorder waits.
+            drop(play);
+            Ok(Ok(Played::default()))
+        }
+        Ok(_) => {
+            let mut player = tokio::task::spawn_blocking(play);
+            tokio::select! {
+                played = &mut player => played,
+                () = stop => {
+                    handle.stop();
+                    player.await
+                }
+            }
+        }
+    };
+    let ended = running.shutdown().await;
+    ready_file?;
+    let played = outcome.map_err(|_| ReplayError::Engine)??;
+    ended?;
+    summary.reached_end = played.reached_end;
+    summary.snapshot = status.snapshot();
+    summary.truncated = played.remarks.truncated;
+    summary.notes = played.remarks.notes;
+    let others = running_vehicles.0.iter().skip(1);
+    summary
+        .notes
+        .extend(others.map(|served| {
+            format!("vehicle {}: {}", served.status.name, counted(served.status.snapshot().maps, "map"))
+        }));
+    if let Some(clouds) = clouds {
+        summary.clouds = std::mem::replace(&mut *locked(&clouds), Ok(0))?;
+        if summary.clouds == 0 {
+            summary.notes.push("--clouds wrote no file: it writes revolutions, and the files have none".into());
+        }
+    }
+    summary.seconds = began.elapsed().as_secs_f64();
+    Ok(summary)
+}
+
+/// Recorded time of the first and the last event. Reads the files once if that time matters.
+fn extent(options: &Options, timeline: &Timeline) -> Result<Option<(i64, i64)>, ReplayError> {
+    let has_range = options.from.is_some() || options.to.is_some();
+    if options.serve || has_range || options.fault_seed.is_some() {
+        return Ok(Some(timeline.extent()?.ok_or(ReplayError::Empty)?));
+    }
+    Ok(None)
+}
+
+/// The faults of the options, of the script, or of the seed alone.
+fn faults(options: &Options, extent: Option<(i64, i64)>, config: &Config) -> Result<Faults, ReplayError> {
+    let mut all = options.faults.clone();
+    if let Some(file) = &options.fault_script {
+        let text = std::fs::read_to_string(file);
+        let text = text.map_err(|source| ReplayError::FaultScript { file: file.clone(), source })?;
+        let lines = text.lines().map(|line| line.split('#').next().unwrap_or_default().trim());
+        for line in lines.filter(|line| !line.is_empty()) {
+            all.push(line.parse()?);
+        }
+    }
+    let names = |vehicle: &Vehicle| vehicle.sensors.iter().map(|sensor| sensor.name.clone()).collect();
+    let sensors: Vec<Vec<String>> = config.vehicles.iter().map(names).collect();
+    if let (Some(seed), Some((begin, end)), true) = (options.fault_seed, extent, all.is_empty()) {
+        all = Faults::random(seed, end.saturating_sub(begin) as f64 * 1e-9, &sensors);
+    }
+    Ok(Faults::new(all, options.fault_seed.unwrap_or(0), sensors)?)
+}
+
+/// How the replay begins; `extent` is the recorded time of its events, if it is known.
+fn initial_state(options: &Options, extent: Option<(i64, i64)>) -> Result<v1::ReplayState, ReplayError> {
+    let (begin_ns, end_ns) = extent.unwrap_or((i64::MIN, i64::MAX));
+    let default_speed = if options.serve && !options.lockstep { Speed::Times(1.0) } else { Speed::Max };
+    let phase = match (options.wait_readers, options.paused) {
+        (Some(1..), _) => v1::ReplayPhase::Waiting,
+        (_, true) => v1::ReplayPhase::Paused,
+        (_, false) => v1::ReplayPhase::Playing,
+    };
+    let mut state = v1::ReplayState {
+        phase: phase.into(),
+        begin_ns,
+        end_ns,
+        from_ns: begin_ns,
+        to_ns: end_ns,
+        position_ns: begin_ns,
+        rate: options.speed.unwrap_or(default_speed).rate(),
+        repeat: options.r#loop,
+        lockstep: options.lockstep,
+        as_live: options.as_live,
+        jumps: 0,
+        vehicles: Vec::new(),
+        readers_awaited: options.wait_readers.unwrap_or(0),
+    };
+    // Saturates: what lies outside the files is refused.
+    let at = |seconds: f64| begin_ns.saturating_add((seconds * 1e9) as i64);
+    let range = v1::ReplayControl { from_ns: options.from.map(at), to_ns: options.to.map(at), ..Default::default() };
+    if range.from_ns.is_some() || range.to_ns.is_some() {
+        (state.from_ns, state.to_ns) = check(&range, &state, false)?;
+    }
+    Ok(state)
+}

@@ -1,0 +1,471 @@
+//! The options and files of a replay -> everything that is known before its first event: the configuration, how the
+//! sensors are mounted, the readings.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use clearway_lidar::Sensor;
+use clearway_lidar::calibration::Calibration;
+use clearway_mapping::config::{Extrinsics, MapsConfig, SENSORS_MAX, SensorConfig, TimeConfig};
+use clearway_mapping::event::{Body, Scan};
+use clearway_mapping::scan_file::ScanFormat;
+use clearway_mapping::sensor::mount::estimate;
+use nalgebra::{Isometry3, Point3, Vector3};
+
+use super::clouds::{Clouds, Written};
+use super::options::{Options, ReplayError};
+use super::recordings::{Recorded, check_sensors, several_vehicles};
+use super::summary::{Mount, describe};
+use crate::cli::shared::ground_revolutions::{GroundRevolutions, points_of};
+use crate::config::{Calibrations, Config, Origin, RecordedMaps, Recorder};
+use crate::ingest::files::mcap::{McapError, McapOptions};
+use crate::ingest::files::{FilesError, Kind, Readings};
+use crate::ingest::ros::choice::{AvailableTopics, SensorTopic, TopicChoice};
+use crate::ingest::ros::decoder::PoseSource;
+use crate::record::reader::RecordingReader;
+use crate::record::writer::is_same_file;
+use crate::replay::faults::Faults;
+use crate::replay::timeline::{Timeline, Track};
+use crate::server::Setup;
+
+/// Height of a sensor above the ego frame's origin until its mount is given or estimated, in metres; ours, about the
+/// roof of a car.
+const MOUNT_HEIGHT_M: f64 = 2.0;
+
+/// What is known before the first event.
+pub(super) struct Plan {
+    pub(super) setup: Setup,
+    pub(super) mount: Mount,
+    pub(super) extrinsics: Extrinsics,
+    pub(super) timeline: Timeline,
+    /// Bytes of all files.
+    pub(super) bytes: u64,
+    /// Boot id of the recording whose maps are made again.
+    pub(super) boot_id: Option<u64>,
+    /// The number of point clouds written, or the error that ended the writing.
+    pub(super) clouds: Option<Written>,
+}
+
+/// Finds the configuration, the mounts and the readings of a replay.
+///
+/// # Errors
+/// [`ReplayError`] if a file, a recording or the configuration cannot be used.
+pub(super) fn plan(options: &Options) -> Result<Plan, ReplayError> {
+    let files = Readings::open(&options.files, McapOptions::default())?;
+    let recorded = files.files().find(|(_, kind)| *kind == Kind::Mcap).map(|(file, _)| file.to_owned());
+    let journal = match &recorded {
+        Some(file) => RecordingReader::open(file)?.header().config.is_some(),
+        None => false,
+    };
+    check(options, recorded.as_deref(), journal)?;
+    if options.vehicle.is_none()
+        && options.config.is_none()
+        && let Some(recordings) = several_vehicles(&files)?
+    {
+        return plan_several(options, recordings, files.bytes());
+    }
+    let mut known = configured(options, recorded.as_deref())?;
+    let vehicle = &mut known.config.vehicles[0];
+    (vehicle.udp, vehicle.ros) = (None, None);
+    let mut wanted = McapOptions {
+        vehicle: options.vehicle.clone(),
+        topics: options.topics.clone(),
+        sensors_max: if known.is_mounted { vehicle.sensors.len() } else { SENSORS_MAX },
+    };
+    let mount_from_tf = match recorded.filter(|_| !known.is_mounted) {
+        Some(bag) => known.apply_bag(&bag, &mut wanted, options.extrinsics.is_some())?,
+        None => None,
+    };
+    known.apply_options(options)?;
+    let open = || Readings::open(&options.files, wanted.clone());
+    let bytes = files.bytes();
+    let mount = match options.extrinsics {
+        Some(extrinsics) => {
+            known.config.vehicles[0].sensors[0].extrinsics = extrinsics;
+            Mount::Given
+        }
+        None if known.is_mounted => Mount::Given,
+        None if let Some(mount) = mount_from_tf => mount,
+        None => known.estimate_mount(open()?)?,
+    };
+    let extrinsics = known.config.vehicles[0].sensors[0].extrinsics;
+    let setup = known.setup(options)?;
+    let clouds = options.clouds.as_deref().map(Clouds::create).transpose()?;
+    let (observer, clouds) = clouds.map(Clouds::observer).unzip();
+    let boot_id = setup.boot_id;
+    let tracks = vec![Track { files: options.files.clone(), options: wanted }];
+    let timeline = Timeline { tracks, bytes_read: Arc::default(), faults: Faults::default() };
+    Ok(Plan { setup: Setup { observer, ..setup }, mount, extrinsics, timeline, bytes, boot_id, clouds })
+}
+
+/// The plan of several vehicles in one recorded time. The files of one vehicle follow each other.
+fn plan_several(options: &Options, recordings: Vec<Recorded>, bytes: u64) -> Result<Plan, ReplayError> {
+    let given = [
+        ("--extrinsics", options.extrinsics.is_some()),
+        ("--model", options.model.is_some()),
+        ("--rpm", options.rpm.is_some()),
+        ("--calibration", options.calibration.is_some()),
+        ("--clouds", options.clouds.is_some()),
+    ];
+    if let Some((option, _)) = given.iter().find(|(_, is_given)| *is_given) {
+        let reason = "the recordings have several vehicles; name one with --vehicle".to_owned();
+        return Err(ReplayError::Unused { option: (*option).to_owned(), reason });
+    }
+    let boot_ids: BTreeSet<u64> = recordings.iter().map(|recording| recording.boot_id).collect();
+    let boot_id = boot_ids.first().copied().filter(|_| boot_ids.len() == 1);
+    let config = Config { vehicles: Vec::new(), ..Config::default() };
+    let mut known = Known { config, tables: Vec::new(), boot_id, is_mounted: true, remarks: Vec::new() };
+    let mut tracks: Vec<Track> = Vec::new();
+    for Recorded { file, config, tables, .. } in recordings {
+        for (mut vehicle, tables) in config.vehicles.into_iter().zip(tables) {
+            (vehicle.udp, vehicle.ros) = (None, None);
+            match known.config.vehicles.iter().position(|before| before.name == vehicle.name) {
+                Some(index) if known.config.vehicles[index] != vehicle => {
+                    return Err(ReplayError::Differs { file, vehicle: vehicle.name });
+                }
+                Some(index) => tracks[index].files.push(file.clone()),
+                None => {
+                    let options = McapOptions { vehicle: Some(vehicle.name.clone()), ..McapOptions::default() };
+                    tracks.push(Track { files: vec![file.clone()], options });
+                    known.config.vehicles.push(vehicle);
+                    known.tables.push(tables);
+                }
+            }
+        }
+    }
+    let extrinsics = known.config.vehicles[0].sensors[0].extrinsics;
+    let setup = known.setup(options)?;
+    let boot_id = setup.boot_id;
+    let timeline = Timeline { tracks, bytes_read: Arc::default(), faults: Faults::default() };
+    Ok(Plan { setup, mount: Mount::Given, extrinsics, timeline, bytes, boot_id, clouds: None })
+}
+
+/// Refuses options that have no meaning for the files. `mcap` is the first MCAP file, and `journal` is true if it is a
+/// recording of clearway.
+fn check(options: &Options, mcap: Option<&Path>, journal: bool) -> Result<(), ReplayError> {
+    let unused = |option: String, reason: String| Err(ReplayError::Unused { option, reason });
+    if let Some(topic) = options.topics.first() {
+        let option = format!("--topic {topic}");
+        match mcap {
+            None => return unused(option, "the files have no topics; a ROS 2 bag in MCAP has".into()),
+            Some(file) if journal => {
+                let file = file.display();
+                return unused(option, format!("{file} is a recording of clearway, of which the events are replayed"));
+            }
+            Some(_) => {}
+        }
+    }
+    if let Some(name) = options.vehicle.as_ref().filter(|_| options.config.is_none() && !journal) {
+        let reason = "the files name no vehicle; the option needs --config FILE or a recording of clearway";
+        return unused(format!("--vehicle {name}"), reason.into());
+    }
+    let Some(record) = &options.record else { return Ok(()) };
+    if let Some(from) = options.from {
+        let reason = "a recording begins with the first event; --to may end it earlier";
+        return unused(format!("--from {from}"), reason.into());
+    }
+    // A folder stands for the files in it.
+    let is_in = |folder: &Path| {
+        let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
+        entries.map(|entry| entry.path()).any(|file| is_same_file(&file, record))
+    };
+    if options.files.iter().any(|file| is_same_file(file, record) || is_in(file)) {
+        return Err(ReplayError::RecordsInput { file: record.clone() });
+    }
+    if !options.force && record.symlink_metadata().is_ok() {
+        return Err(ReplayError::RecordExists { file: record.clone() });
+    }
+    Ok(())
+}
+
+/// What is known about the vehicle so far.
+struct Known {
+    /// The configuration, with one vehicle.
+    config: Config,
+    tables: Calibrations,
+    /// Boot id of the recording whose maps are made again.
+    boot_id: Option<u64>,
+    /// True if the extrinsics of the sensors are known.
+    is_mounted: bool,
+    /// Lines about the mounts, for the recording.
+    remarks: Vec<String>,
+}
+
+impl Known {
+    /// Configures the sensors of a ROS bag and puts their topics into `wanted`. Returns the mount of the first sensor
+    /// if tf has it.
+    fn apply_bag(
+        &mut self,
+        bag: &Path,
+        wanted: &mut McapOptions,
+        is_given: bool,
+    ) -> Result<Option<Mount>, ReplayError> {
+        let mut choice = choice(bag, wanted)?;
+        keep_placed(&mut choice.sensors, is_given);
+        // With names, the same topics are chosen again when the bag is read.
+        wanted.topics = choice.sensors.iter().map(|sensor| sensor.topic.clone()).collect();
+        if let Some(PoseSource::Topic(topic)) = &choice.pose {
+            wanted.topics.push(topic.clone());
+        }
+        if choice.sensors.is_empty() {
+            return Ok(None);
+        }
+        (wanted.sensors_max, self.tables) = (choice.sensors.len(), vec![vec![None; choice.sensors.len()]]);
+        let (sensors, mounts) = sensors_of(&choice);
+        sensors.iter().zip(&mounts).for_each(|(sensor, mount)| self.remark(&sensor.name, mount.as_ref()));
+        self.config.vehicles[0].sensors = sensors;
+        Ok(mounts.into_iter().next().flatten())
+    }
+
+    fn remark(&mut self, sensor: &str, mount: Option<&Mount>) {
+        self.remarks.extend(mount.and_then(describe).map(|said| format!("extrinsics of {sensor}: {said}")));
+    }
+
+    /// Applies the sensor options. A model on the command line comes before the configured elevations.
+    fn apply_options(&mut self, options: &Options) -> Result<(), ReplayError> {
+        let sensors = &mut self.config.vehicles[0].sensors;
+        for sensor in sensors.iter_mut() {
+            (sensor.model, sensor.rpm) = (options.model.or(sensor.model), options.rpm.or(sensor.rpm));
+            if options.model.is_some() {
+                sensor.elevations_deg.clear();
+            }
+        }
+        if let Some(file) = &options.calibration {
+            sensors[0].calibration = Some(file.display().to_string());
+            // The tables of the other sensors have been read from the folder of their own configuration.
+            let mut first = self.config.clone();
+            first.vehicles[0].sensors.truncate(1);
+            self.tables[0][0] = first.calibrations(Path::new(""))?.remove(0).remove(0);
+        }
+        Ok(())
+    }
+
+    /// Estimates the mount of the first sensor from the ground in the first revolutions. If that fails, no map is made.
+    fn estimate_mount(&mut self, mut readings: Readings) -> Result<Mount, ReplayError> {
+        let vehicle = &mut self.config.vehicles[0];
+        let sensor = &mut vehicle.sensors[0];
+        let mut revolutions = first_revolutions(&mut readings, sensor, self.tables[0][0].clone())?;
+        if revolutions.is_empty() {
+            return Ok(Mount::Unneeded);
+        }
+        // The ground does not show which way is forward; the format of a scan file does.
+        let yaw_rad = readings.scan_format().map_or(0.0, ScanFormat::yaw_deg).to_radians();
+        let forward_from_sensor = Isometry3::rotation(Vector3::z() * yaw_rad);
+        if yaw_rad != 0.0 {
+            let turned = |point: &mut [f32; 3]| {
+                *point = (forward_from_sensor * Point3::from(point.map(f64::from))).cast::<f32>().into();
+            };
+            revolutions.iter_mut().flatten().for_each(turned);
+        }
+        let mount = estimate(&revolutions).map_or_else(Mount::Unknown, Mount::Estimated);
+        match &mount {
+            Mount::Estimated(estimate) => {
+                let ego_from_forward = estimate.extrinsics().ego_from_sensor();
+                sensor.extrinsics = match yaw_rad {
+                    0.0 => estimate.extrinsics(),
+                    _ => extrinsics_of(&(ego_from_forward * forward_from_sensor)),
+                };
+            }
+            _ => vehicle.maps = MapsConfig::none(),
+        }
+        let name = sensor.name.clone();
+        self.remark(&name, Some(&mount));
+        Ok(mount)
+    }
+
+    /// The setup with which the server starts.
+    fn setup(self, options: &Options) -> Result<Setup, ReplayError> {
+        let Self { config, tables: calibrations, boot_id, remarks, .. } = self;
+        let file = options.config.as_deref().unwrap_or(Path::new("of the replayed files"));
+        // A run that serves nothing opens none of these paths, and its boot id must not depend on the folder.
+        let mut config = if options.serve { config.located(file) } else { config };
+        config.recorder.file = options.record.clone().unwrap_or_default();
+        config.recorder.replaces = options.force;
+        // A replay of a recording without maps makes them.
+        if options.config.is_none() {
+            config.recorder.maps = RecordedMaps::Full;
+        }
+        if !options.serve {
+            (config.grpc.enabled, config.page.enabled, config.foxglove.enabled) = (false, false, false);
+            (config.zenoh.enabled, config.zenoh.ros2.enabled) = (false, false);
+        }
+        if options.any_port {
+            let any = SocketAddr::from(([127, 0, 0, 1], 0));
+            (config.grpc.listen, config.page.listen, config.foxglove.listen) = (any, any, any);
+            config.zenoh.listen = vec!["tcp/127.0.0.1:0".into()];
+        }
+        config.check(&origin(options, file))?;
+        let certificates = if options.serve { config.certificates(file)? } else { None };
+        // The same files and settings get the same boot id. Served maps need a new one, because a reader that has seen
+        // these maps before would drop them as old.
+        let altered = options.extrinsics.is_some() || options.model.is_some() || options.rpm.is_some();
+        let same_maps = !altered && options.calibration.is_none();
+        let boot_id =
+            boot_id.filter(|_| same_maps).or_else(|| (!options.serve).then(|| fingerprint(&config, &options.files)));
+        let mut notes = BTreeMap::new();
+        if !remarks.is_empty() {
+            notes.insert("mount".to_owned(), remarks.join("\n"));
+        }
+        Ok(Setup {
+            config,
+            calibrations,
+            certificates,
+            boot_id,
+            from_files: true,
+            config_comments: remarks,
+            metadata: notes,
+            is_stepped: true,
+            ..Setup::default()
+        })
+    }
+}
+
+/// Where a wrong value of the configuration was given. The configuration was checked when it was read, so a value is
+/// wrong because of the options, or of the mounts in a bag.
+fn origin(options: &Options, file: &Path) -> Origin {
+    let extrinsics = options
+        .extrinsics
+        .map(|e| format!("--extrinsics {},{},{},{},{},{}", e.x_m, e.y_m, e.z_m, e.roll_deg, e.pitch_deg, e.yaw_deg));
+    let rpm = options.rpm.map(|rpm| format!("--rpm {rpm}"));
+    let given: Vec<String> = rpm.into_iter().chain(extrinsics).collect();
+    if given.is_empty() { Origin::file(file) } else { Origin::Options(given) }
+}
+
+/// The configuration of `--config`, else of the recording, else the default one.
+fn configured(options: &Options, recorded: Option<&Path>) -> Result<Known, ReplayError> {
+    let known =
+        |config, tables, boot_id, is_mounted| Known { config, tables, boot_id, is_mounted, remarks: Vec::new() };
+    let pick = |file: &Path, config: &mut Config, tables: &mut Calibrations| {
+        let known = || config.vehicles.iter().map(|v| v.name.as_str()).collect::<Vec<_>>().join(", ");
+        let index = match &options.vehicle {
+            None if config.vehicles.len() > 1 => {
+                return Err(ReplayError::Vehicles { file: file.to_owned(), known: known() });
+            }
+            None => 0,
+            Some(name) => {
+                let found = config.vehicles.iter().position(|vehicle| vehicle.name == *name);
+                found.ok_or_else(|| ReplayError::Vehicle { name: name.clone(), known: known() })?
+            }
+        };
+        config.vehicles = vec![config.vehicles.swap_remove(index)];
+        *tables = vec![tables.swap_remove(index)];
+        Ok::<_, ReplayError>(())
+    };
+    if let Some(file) = &options.config {
+        let mut config = Config::load(file, &options.set)?;
+        let mut tables = config.calibrations(file)?;
+        pick(file, &mut config, &mut tables)?;
+        recorded.map_or(Ok(()), |recording| check_sensors(file, &config, recording))?;
+        return Ok(known(config, tables, None, true));
+    }
+    if let Some(file) = recorded {
+        let recording = RecordingReader::open(file)?;
+        if recording.header().config.is_some() {
+            let (mut config, mut tables) = recording.config()?;
+            pick(file, &mut config, &mut tables)?;
+            // The publishers and files of the recorded run are not those of this run.
+            let config = Config { vehicles: config.vehicles, ..Config::default() };
+            return Ok(known(config, tables, Some(recording.header().boot_id), true));
+        }
+    }
+    Ok(known(Config::of_one_vehicle("car", "top"), vec![vec![None]], None, false))
+}
+
+/// The topics of a ROS bag to read.
+fn choice(bag: &Path, wanted: &McapOptions) -> Result<TopicChoice, ReplayError> {
+    let offered = AvailableTopics::from_file(bag).map_err(McapError::from).map_err(FilesError::from)?;
+    let choice = offered.choose(bag, &wanted.topics, wanted.sensors_max).map_err(McapError::from);
+    Ok(choice.map_err(FilesError::from)?)
+}
+
+/// Keeps the sensors that tf places. If tf places none, keeps the first, whose mount is estimated or given. If the
+/// mount `is_given`, the first sensor counts as placed.
+fn keep_placed(sensors: &mut Vec<SensorTopic>, is_given: bool) {
+    let mut number = 0;
+    let mut known = |sensor: &SensorTopic| {
+        number += 1;
+        sensor.ego_from_sensor.is_some() || (number == 1 && is_given)
+    };
+    match sensors.iter().any(|sensor| sensor.ego_from_sensor.is_some()) {
+        true => sensors.retain(&mut known),
+        false => sensors.truncate(1),
+    }
+}
+
+/// The configuration of each sensor of a ROS bag, and its mount if tf has it. A single sensor is named `top`, several
+/// are named after their frames.
+fn sensors_of(choice: &TopicChoice) -> (Vec<SensorConfig>, Vec<Option<Mount>>) {
+    let mut sensors: Vec<SensorConfig> = Vec::new();
+    for (index, sensor) in choice.sensors.iter().enumerate() {
+        let mut name = name_of_frame(&sensor.frame_id);
+        if choice.sensors.len() == 1 {
+            name = "top".to_owned();
+        } else if sensors.iter().any(|before| before.name == name) {
+            name = format!("{name}-{index}");
+        }
+        // Without a transform the mount is given or estimated later.
+        let unknown = || Isometry3::translation(0.0, 0.0, MOUNT_HEIGHT_M);
+        let ego_from_sensor = sensor.ego_from_sensor.unwrap_or_else(unknown);
+        sensors.push(SensorConfig::new(name, extrinsics_of(&ego_from_sensor)));
+    }
+    let mount = |sensor: &SensorTopic| {
+        let tf = Mount::Tf { ego_frame: choice.ego_frame.clone(), frame_id: sensor.frame_id.clone() };
+        sensor.ego_from_sensor.map(|_| tf)
+    };
+    (sensors, choice.sensors.iter().map(mount).collect())
+}
+
+/// A frame's id, with each character that a sensor's name cannot have replaced by `_`.
+fn name_of_frame(frame_id: &str) -> String {
+    let letter = |c: char| if c.is_ascii_alphanumeric() || c == '-' { c.to_ascii_lowercase() } else { '_' };
+    let name: String = frame_id.chars().map(letter).take(48).collect();
+    if name.is_empty() { "sensor".to_owned() } else { name }
+}
+
+fn extrinsics_of(ego_from_sensor: &Isometry3<f64>) -> Extrinsics {
+    let (roll, pitch, yaw) = ego_from_sensor.rotation.euler_angles();
+    let [x_m, y_m, z_m] = ego_from_sensor.translation.vector.into();
+    let [roll_deg, pitch_deg, yaw_deg] = [roll, pitch, yaw].map(f64::to_degrees);
+    Extrinsics { x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg }
+}
+
+/// The points of the first revolutions or scans, in the sensor frame, in metres.
+fn first_revolutions(
+    readings: &mut Readings,
+    config: &SensorConfig,
+    calibration: Option<Calibration>,
+) -> Result<Vec<Vec<[f32; 3]>>, ReplayError> {
+    let mut sensor = Sensor::new(config.lidar(calibration, TimeConfig::default().ahead_ns_max()));
+    let mut revolutions = GroundRevolutions::default();
+    for reading in readings.filter(|reading| !matches!(reading, Ok(other) if other.source != 0)) {
+        let reading = reading?;
+        let needs_more = match &reading.body {
+            // Refused datagrams are counted in the second pass, which makes the maps.
+            Body::Datagram(payload) => match sensor.push(payload, reading.arrival_ns) {
+                Ok(Some(revolution)) => revolutions.push(|| points_of(revolution)),
+                Ok(None) | Err(_) => true,
+            },
+            Body::Scan(scan) => revolutions.push(|| points_of_scan(scan)),
+            Body::End => sensor.finish().is_none_or(|revolution| revolutions.push(|| points_of(revolution))),
+            Body::EgoPose(_) | Body::Road(_) | Body::Sensor(_) | Body::Withdrawn | Body::Lost { .. } => true,
+        };
+        if !needs_more {
+            break;
+        }
+    }
+    Ok(revolutions.into_clouds())
+}
+
+fn points_of_scan(scan: &Scan) -> Vec<[f32; 3]> {
+    scan.x.iter().zip(&scan.y).zip(&scan.z).map(|((&x, &y), &z)| [x, y, z]).collect()
+}
+
+/// FNV-1a hash of the settings and the file names.
+fn fingerprint(config: &Config, files: &[PathBuf]) -> u64 {
+    let settings = Config { recorder: Recorder::default(), ..config.clone() }.to_toml();
+    let names = files.iter().filter_map(|file| file.file_name()).flat_map(|name| name.as_encoded_bytes());
+    let bytes = settings.as_bytes().iter().chain(names);
+    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, &byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
+}

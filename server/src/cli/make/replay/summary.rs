@@ -1,0 +1,195 @@
+//! The result of a replay, as text and as JSON.
+
+use std::path::PathBuf;
+
+use clearway_mapping::config::Extrinsics;
+use clearway_mapping::map::ElevationSource;
+use clearway_mapping::sensor::mount::{MountError, MountEstimate};
+use serde_json::{Value, json};
+
+use crate::cli::shared::output::counted;
+use crate::ingest::files::Truncated;
+use crate::status::Snapshot;
+
+/// Where the extrinsics of the first sensor come from.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Mount {
+    /// The options, the configuration or the recording.
+    Given,
+    /// The transforms of a ROS bag.
+    Tf {
+        /// Name of the vehicle's frame.
+        ego_frame: String,
+        /// Name of the sensor's frame.
+        frame_id: String,
+    },
+    /// An estimate from the ground in the first revolutions.
+    Estimated(MountEstimate),
+    /// Nowhere: no ground was found to estimate them from, so no map was made.
+    Unknown(MountError),
+    /// Nowhere: the files hold no revolution, so none are needed.
+    Unneeded,
+}
+
+/// The result of a replay.
+#[derive(Clone, Debug)]
+pub struct Summary {
+    /// Counters, sensors, maps and latency of the vehicle.
+    pub snapshot: Snapshot,
+    /// Extrinsics of the first sensor.
+    pub extrinsics: Extrinsics,
+    /// Where the extrinsics come from.
+    pub mount: Mount,
+    /// Files that are cut off.
+    pub truncated: Vec<Truncated>,
+    /// Remarks about the files, one a line.
+    pub notes: Vec<String>,
+    /// Number of point clouds written.
+    pub clouds: u64,
+    /// Duration of the replay, in seconds.
+    pub seconds: f64,
+    /// The recording that was written.
+    pub record: Option<PathBuf>,
+    /// False if the replay was stopped before its end.
+    pub reached_end: bool,
+}
+
+impl Summary {
+    /// The summary as one JSON object.
+    pub fn to_json(&self) -> Value {
+        let Snapshot { ledger, sensors, .. } = &self.snapshot;
+        let sensors = sensors.iter().map(|sensor| {
+            let model = sensor.status.model.map(clearway_lidar::model::Model::as_str);
+            json!({
+                "name": sensor.name, "model": model, "returns": sensor.status.returns, "rpm": sensor.status.rpm,
+                "revolutions": sensor.status.revolutions,
+                "elevations": sensor.elevations.map(ElevationSource::as_str),
+            })
+        });
+        let truncated = self.truncated.iter().map(|t| json!({ "file": t.file, "reason": t.reason }));
+        json!({
+            "packets": self.snapshot.packets_json(),
+            "telemetry": ledger.telemetry,
+            "lost": ledger.lost, "kernel_drops": ledger.kernel_drops,
+            "revolutions": self.snapshot.revolutions(),
+            "maps": self.snapshot.maps,
+            "sensors": sensors.collect::<Vec<_>>(),
+            "reference_sensor": self.snapshot.reference_sensor(),
+            "latency_ms": { "p50": self.snapshot.latency_ms_p50, "p99": self.snapshot.latency_ms_p99 },
+            "drivable_share": self.snapshot.drivable_share,
+            "mount": self.mount_json(),
+            "truncated": truncated.collect::<Vec<_>>(),
+            "notes": self.notes,
+            "clouds": self.clouds,
+            "record": self.record,
+            "reached_end": self.reached_end,
+            "seconds": self.seconds,
+        })
+    }
+
+    fn mount_json(&self) -> Value {
+        let e = &self.extrinsics;
+        let mut known = json!({
+            "source": "given",
+            "x_m": e.x_m, "y_m": e.y_m, "z_m": e.z_m,
+            "roll_deg": e.roll_deg, "pitch_deg": e.pitch_deg, "yaw_deg": e.yaw_deg,
+        });
+        match &self.mount {
+            Mount::Given => known,
+            Mount::Tf { ego_frame, frame_id } => {
+                known["source"] = "tf".into();
+                known["ego_frame"] = ego_frame.clone().into();
+                known["frame_id"] = frame_id.clone().into();
+                known
+            }
+            Mount::Estimated(estimate) => {
+                known["source"] = "estimated".into();
+                known["revolutions"] = estimate.revolutions.into();
+                known["height_std_m"] = estimate.height_std_m.into();
+                known["pitch_std_deg"] = estimate.pitch_std_rad.to_degrees().into();
+                known["roll_std_deg"] = estimate.roll_std_rad.to_degrees().into();
+                known["residual_m"] = estimate.residual_m.into();
+                known["inliers"] = estimate.inliers.into();
+                known["samples"] = estimate.samples.into();
+                known
+            }
+            Mount::Unknown(why) => json!({ "source": "unknown", "reason": why.to_string() }),
+            Mount::Unneeded => json!({ "source": "none" }),
+        }
+    }
+
+    /// The summary as a few lines of text.
+    pub fn to_text(&self) -> String {
+        let snapshot = &self.snapshot;
+        let ledger = &snapshot.ledger;
+        let mut lines = vec![format!(
+            "{} received, {} decoded, {} telemetry, {} refused, {} lost",
+            ledger.received,
+            ledger.decoded,
+            ledger.telemetry,
+            snapshot.refused(),
+            ledger.lost
+        )];
+        lines.extend(ledger.refused.iter().map(|(reason, n)| format!("  refused for {reason}: {n}")));
+        let several = snapshot.sensors.len() > 1;
+        for sensor in &snapshot.sensors {
+            let model = sensor.status.model.map_or("unknown model", clearway_lidar::model::Model::as_str);
+            let rpm = sensor.status.rpm.map_or(String::new(), |rpm| format!(", {rpm:.0} rpm"));
+            let (revolutions, returns) = (sensor.status.revolutions, sensor.status.returns);
+            let (revolutions, returns) = (counted(revolutions, "revolution"), counted(returns, "return"));
+            lines.push(format!("{}: {model}{rpm}, {revolutions}, {returns}", sensor.name));
+            if several && sensor.is_reference {
+                lines.push("  reference sensor: its scans make the maps".to_owned());
+            }
+            if let Some((source, advice)) = sensor.elevations.and_then(|of| Some((of.as_str(), of.advice()?))) {
+                lines.push(format!("  elevations {source}: {advice}"));
+            }
+        }
+        let share =
+            snapshot.drivable_share.map_or(String::new(), |share| format!(", newest {:.1} % drivable", 100.0 * share));
+        lines.push(format!("{}{share}", counted(snapshot.maps, "map")));
+        if let (Some(p50), Some(p99)) = (snapshot.latency_ms_p50, snapshot.latency_ms_p99) {
+            lines.push(format!("time to make a map: median {p50:.2} ms, 99th percentile {p99:.2} ms"));
+        }
+        if let Some(record) = &self.record {
+            lines.push(format!("recorded {}", record.display()));
+        }
+        if !self.reached_end {
+            lines.push("stopped before the end".to_owned());
+        }
+        if self.clouds > 0 {
+            lines.push(format!("{} written", counted(self.clouds, "point cloud")));
+        }
+        lines.join("\n") + "\n"
+    }
+}
+
+/// How the sensor is mounted and how that is known, in one line; `None` if it was given or is not needed.
+pub fn describe(mount: &Mount) -> Option<String> {
+    match mount {
+        Mount::Estimated(estimate) => Some(format!(
+            "estimated from the ground in {}: height {:.3} ± {:.3} m, pitch {:.2} ± {:.2} deg, roll {:.2} ± {:.2} deg \
+             ({} of {} lowest points on one plane, residual {:.3} m)",
+            counted(estimate.revolutions as u64, "revolution"),
+            estimate.height_m,
+            estimate.height_std_m,
+            estimate.pitch_rad.to_degrees(),
+            estimate.pitch_std_rad.to_degrees(),
+            estimate.roll_rad.to_degrees(),
+            estimate.roll_std_rad.to_degrees(),
+            estimate.inliers,
+            estimate.samples,
+            estimate.residual_m,
+        )),
+        Mount::Tf { ego_frame, frame_id } => Some(format!(
+            "from tf, from {frame_id} to {ego_frame}; this assumes that the origin of {ego_frame} is on the ground; \
+             if it is not, give --extrinsics"
+        )),
+        Mount::Unknown(why) => Some(format!(
+            "unknown, so no map is made: the files do not contain how the sensor is mounted, and it cannot be \
+             estimated: {why}; give it with --extrinsics x,y,z,roll,pitch,yaw (metres and degrees, such as \
+             0,0,1.9,0,0,0), or with --config FILE"
+        )),
+        Mount::Given | Mount::Unneeded => None,
+    }
+}

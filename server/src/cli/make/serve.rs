@@ -1,0 +1,114 @@
+//! `clearway serve`: a configuration file -> a server that runs until a signal.
+
+use anyhow::{Context, Result, anyhow};
+use clap::Args;
+use tokio::signal::unix::{SignalKind, signal};
+
+use crate::base::held_sockets::HeldSockets;
+use crate::cli::make::service_manager;
+use crate::cli::shared::configuration::ConfigurationOptions;
+use crate::cli::shared::output::{block_on, stop_signal};
+use crate::config::Config;
+use crate::server::{Running, Server, Setup, ShutdownError};
+
+/// Listen for sensor data, make maps and publish them, until SIGINT or SIGTERM.
+///
+/// SIGHUP reads certificates, tokens, roles and limits again. Under systemd it reports when it is ready and that it
+/// lives, and uses the sockets that systemd holds.
+#[derive(Args)]
+#[command(after_help = "Examples:
+  clearway serve
+  clearway serve --config car.toml --set grpc.listen=0.0.0.0:50051 --set recorder.file=drive.mcap")]
+pub struct Options {
+    #[command(flatten)]
+    configuration: ConfigurationOptions,
+}
+
+/// Runs the server that the configuration describes, until SIGINT or SIGTERM.
+///
+/// # Errors
+/// [`ConfigError`](crate::config::ConfigError), [`StartError`](crate::server::StartError), and
+/// [`ShutdownError`](crate::server::ShutdownError) at the end.
+pub fn run(options: &Options) -> Result<()> {
+    let held = HeldSockets::from_environment().context("LISTEN_FDS: a socket of the service manager")?;
+    block_on(serve(&options.configuration, held))
+}
+
+async fn serve(configuration: &ConfigurationOptions, held_sockets: HeldSockets) -> Result<()> {
+    let file = &configuration.config;
+    let config = configuration.load()?;
+    let calibrations = config.calibrations(file)?;
+    let certificates = config.certificates(file)?;
+    let mut config = config.located(file);
+    config.recorder.is_numbered = true;
+    // Before the server starts, so that a signal during the start ends it in order.
+    let stop = stop_signal()?;
+    let mut hangups = signal(SignalKind::hangup())?;
+    let setup = Setup { config: config.clone(), calibrations, certificates, held_sockets, ..Setup::default() };
+    let running = Server::start(setup).await?;
+    log_endpoints(&running);
+    service_manager::ready();
+    tokio::pin!(stop);
+    loop {
+        tokio::select! {
+            () = &mut stop => break,
+            () = service_manager::report_life(&running) => {}
+            _ = hangups.recv() => match reload(&running, configuration, &config) {
+                Ok(()) => tracing::info!("certificates, tokens, roles and limits are read again"),
+                Err(error) => tracing::error!("nothing is changed: {error:#}"),
+            }
+        }
+    }
+    service_manager::stopping();
+    tracing::info!("stopping");
+    let ended = running.shutdown_in_time().await;
+    if let Err(error @ ShutdownError::Deadline { .. }) = &ended {
+        // A thread that hangs would keep the runtime, and with it the process.
+        tracing::error!(%error, "ending without it");
+        std::process::exit(1);
+    }
+    Ok(ended?)
+}
+
+/// Reads the configuration again and applies what can be changed without a restart; names the tables that cannot.
+fn reload(running: &Running, configuration: &ConfigurationOptions, old: &Config) -> Result<()> {
+    let file = &configuration.config;
+    let config = configuration.load()?;
+    let certificates = config.certificates(file)?;
+    running.reload(&config, certificates.as_ref()).map_err(|reason| anyhow!("grpc.tls: {reason}"))?;
+    let mut config = config.located(file);
+    config.recorder.is_numbered = old.recorder.is_numbered;
+    let unchanged = config.without_reloaded(old) == *old;
+    if !unchanged {
+        tracing::warn!("other keys than certificates, tokens, roles and limits have changed: they need a restart");
+    }
+    Ok(())
+}
+
+/// Logs every address at which the server listens, and the recording.
+pub fn log_endpoints(running: &Running) {
+    for vehicle in &running.inputs {
+        if let Some((data, telemetry)) = vehicle.udp {
+            tracing::info!(vehicle = %vehicle.name, %data, %telemetry, "listening for datagrams");
+        }
+    }
+    if let Some(at) = running.grpc {
+        tracing::info!(%at, "gRPC");
+    }
+    let tls = if running.is_encrypted() { "s" } else { "" };
+    if let Some(at) = running.page {
+        tracing::info!("page http{tls}://{at}/");
+    }
+    if let Some(at) = running.metrics {
+        tracing::info!("metrics http{tls}://{at}/metrics");
+    }
+    for endpoint in &running.zenoh {
+        tracing::info!(%endpoint, "zenoh");
+    }
+    if let Some(at) = running.foxglove {
+        tracing::info!("foxglove ws{tls}://{at}");
+    }
+    if let Some(recording) = running.recording() {
+        tracing::info!(%recording, "recording");
+    }
+}

@@ -1,0 +1,79 @@
+//! What the subcommands share to run and to print: stdout, the progress bar, the runtime, the signals that end them.
+
+use std::io::{ErrorKind, Write};
+
+use anyhow::{Context, Error, Result};
+use indicatif::{ProgressBar, ProgressStyle};
+use tokio::signal::unix::{SignalKind, signal};
+
+pub use crate::base::counted::counted;
+
+/// Threads of the runtime at least, because zenoh needs several, whatever the machine has.
+const THREADS_MIN: usize = 2;
+
+/// The text of an error and of its causes. A cause that the text before it contains already is left out.
+pub fn with_causes(error: &Error) -> String {
+    let mut text = error.to_string();
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        if !text.contains(&cause) {
+            text = format!("{text}: {cause}");
+        }
+    }
+    text
+}
+
+/// Prints `text` on stdout. `false` if the reader of stdout has closed it (`| head`), which is no error.
+///
+/// # Errors
+/// If stdout cannot be written, such as a file on a full disk.
+pub fn print(text: &str) -> Result<bool> {
+    let mut stdout = std::io::stdout();
+    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+        Ok(()) => Ok(true),
+        Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(false),
+        Err(error) => Err(error).context("write to stdout"),
+    }
+}
+
+/// Prints `line` and a line end, as [`print()`] does.
+///
+/// # Errors
+/// As [`print()`].
+pub fn print_line(line: &str) -> Result<bool> {
+    print(&format!("{line}\n"))
+}
+
+/// An error of usage that only the values of several options together show; the command ends with exit code 3.
+pub fn usage_error(message: impl std::fmt::Display) -> Error {
+    clap::Error::raw(clap::error::ErrorKind::ArgumentConflict, format!("{message}\n")).into()
+}
+
+/// A progress bar on stderr of `length` bytes; nothing is drawn if stderr is not a terminal.
+pub fn progress_bar(length: u64) -> ProgressBar {
+    let style = ProgressStyle::with_template("{bar:40} {percent:>3} % {msg}").expect("the template is a constant");
+    ProgressBar::new(length).with_style(style)
+}
+
+/// Runs `work` to its end on a runtime of several threads.
+///
+/// # Errors
+/// The error of `work`, or the system's if it has no threads to give.
+pub fn block_on<T>(work: impl Future<Output = Result<T>>) -> Result<T> {
+    let threads = std::thread::available_parallelism().map_or(THREADS_MIN, usize::from).max(THREADS_MIN);
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(threads).enable_all().build();
+    runtime.context("start the runtime")?.block_on(work)
+}
+
+/// A future that resolves at SIGINT or SIGTERM. The signals are caught from this call on.
+///
+/// # Errors
+/// If the system refuses to catch them.
+pub fn stop_signal() -> Result<impl Future<Output = ()>> {
+    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    Ok(async move {
+        tokio::select! {
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+        }
+    })
+}

@@ -1,0 +1,146 @@
+//! `clearway ingest`: files -> observations (scans, poses, roads, tunnelled packets) -> a server.
+//!
+//! | file | in -> out |
+//! |---|---|
+//! | `files` | files -> observations and their stamps |
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use clearway_client::{Ingester, Observation, Refusal};
+use serde_json::json;
+
+use crate::cli::client::connection::{ServerOptions, explain};
+use crate::cli::shared::output::{block_on, counted, print_line, usage_error};
+use files::{FileOptions, Item, Plan};
+
+mod files;
+
+/// Send observations from files to a server: scans, poses, roads and the packets of drives.
+///
+/// Reads scans (KITTI .bin, nuScenes .pcd.bin, .pcd), ego poses (.tum: lines of "seconds x y z qx qy qz qw"), roads
+/// (.rddf, .rndf) and drives (.pcap, .pcapng: their packets with their own stamps). Prints what the server has refused,
+/// and why.
+#[derive(Args)]
+#[command(after_help = "Examples:
+  clearway ingest scans/*.bin poses.tum --sensor top
+  clearway ingest drive.pcap --zenoh tcp/localhost:7447 --vehicle car --sensor top")]
+pub struct Options {
+    #[command(flatten)]
+    files: FileOptions,
+    #[command(flatten)]
+    server: ServerOptions,
+    /// Send over zenoh instead of gRPC, to this endpoint, such as tcp/localhost:7447.
+    #[arg(long, value_name = "ENDPOINT", conflicts_with_all = ["address", "ca", "cert", "key"])]
+    zenoh: Option<String>,
+    /// The vehicle; needed over zenoh, and if the server has several.
+    #[arg(long, value_name = "NAME", default_value = "", hide_default_value = true)]
+    vehicle: String,
+    /// The sensor of the scans or packets; needed over zenoh, and if the vehicle has several.
+    #[arg(long, value_name = "NAME", default_value = "", hide_default_value = true)]
+    sensor: String,
+    /// Send as fast as the server accepts, instead of at the recorded pace.
+    #[arg(long)]
+    fast: bool,
+    /// Print one JSON object at the end.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Sends the observations.
+///
+/// # Errors
+/// If a file cannot be read, or as [`ClientError`](clearway_client::ClientError). A refused observation is not an
+/// error; the output says so.
+pub fn run(options: &Options) -> Result<()> {
+    block_on(ingest(options))
+}
+
+async fn ingest(options: &Options) -> Result<()> {
+    let plan = Plan::new(&options.files)?;
+    let has_scans = plan.items.iter().any(|(_, item)| matches!(item, Item::Scan(_)));
+    if !options.sensor.is_empty() && !has_scans && plan.drives.is_empty() {
+        return Err(usage_error("--sensor is for scans and drives, and the files have neither"));
+    }
+    let ingester = match &options.zenoh {
+        Some(endpoint) => ingest_over_zenoh(endpoint, &options.vehicle).await?,
+        None => options.server.connect().await?.ingest(&options.vehicle).await.map_err(explain)?,
+    };
+    let mut sender =
+        Sender { ingester, paced: !options.fast, started: None, sent: BTreeMap::new(), refusals: Vec::new() };
+    for (stamp_ns, item) in &plan.items {
+        let (kind, observation) = item.read(&options.sensor, *stamp_ns)?;
+        sender.send(kind, *stamp_ns, observation).await?;
+    }
+    for file in &plan.drives {
+        for chunk in files::chunks(file)? {
+            let packets = chunk.with_context(|| file.display().to_string())?;
+            let stamp_ns = packets.last().map_or(0, |(stamp_ns, _)| *stamp_ns);
+            sender.send("packets", stamp_ns, Observation::packets(&options.sensor, &packets)).await?;
+        }
+    }
+    sender.refusals.extend(sender.ingester.settled().await?);
+    report(&sender, &plan.notes, options.json)
+}
+
+#[cfg(feature = "zenoh")]
+async fn ingest_over_zenoh(endpoint: &str, vehicle: &str) -> Result<Ingester> {
+    Ok(clearway_client::ZenohClient::connect(endpoint).await?.ingest(vehicle).await?)
+}
+
+#[cfg(not(feature = "zenoh"))]
+async fn ingest_over_zenoh(endpoint: &str, _: &str) -> Result<Ingester> {
+    bail!("--zenoh {endpoint}: this clearway was built without the feature zenoh")
+}
+
+/// A stream of observations to a server, and the counts of what was sent and refused.
+struct Sender {
+    ingester: Ingester,
+    /// True if each observation is sent at the time of its stamp.
+    paced: bool,
+    /// When the first observation was sent, and its stamp.
+    started: Option<(Instant, i64)>,
+    /// Number of observations sent, by kind.
+    sent: BTreeMap<&'static str, u64>,
+    refusals: Vec<Refusal>,
+}
+
+impl Sender {
+    async fn send(&mut self, kind: &'static str, stamp_ns: i64, observation: Observation) -> Result<()> {
+        let (started, first_ns) = *self.started.get_or_insert((Instant::now(), stamp_ns));
+        if self.paced {
+            let due = Duration::from_nanos(u64::try_from(stamp_ns.saturating_sub(first_ns)).unwrap_or(0));
+            tokio::time::sleep(due.saturating_sub(started.elapsed())).await;
+        }
+        if let Err(error) = self.ingester.send(observation).await {
+            for refusal in self.ingester.refusals() {
+                eprintln!("refused {}: {}", refusal.reason, refusal.message);
+            }
+            bail!(error);
+        }
+        *self.sent.entry(kind).or_default() += 1;
+        self.refusals.extend(self.ingester.refusals());
+        Ok(())
+    }
+}
+
+fn report(sender: &Sender, notes: &[String], as_json: bool) -> Result<()> {
+    let reasons = clearway_client::observation::by_reason(&sender.refusals);
+    if as_json {
+        print_line(&json!({ "sent": sender.sent, "refused": reasons, "notes": notes }).to_string())?;
+        return Ok(());
+    }
+    let sent = sender.sent.iter().map(|(kind, count)| counted(*count, kind.trim_end_matches('s')));
+    let sent: Vec<String> = sent.collect();
+    print_line(&format!("sent {}; all of them were acknowledged", sent.join(", ")))?;
+    for (reason, count) in &reasons {
+        let first = sender.refusals.iter().find(|refusal| refusal.reason == **reason);
+        print_line(&format!("refused {count}: {reason}: {}", first.map_or("", |refusal| &refusal.message)))?;
+    }
+    for note in notes {
+        print_line(note)?;
+    }
+    Ok(())
+}
