@@ -1,0 +1,381 @@
+//! Measures each stage of a revolution of an HDL-64E on one thread, in turn with a floor: the least work on the same
+//! data that could do it.
+//!
+//!   cargo bench -p clearway-tests --bench stages                                  a simulated scan of a town
+//!   cargo bench -p clearway-tests --bench stages -- SCAN.bin --height 1.73        a scan in KITTI's format
+//!   cargo bench -p clearway-tests --bench stages -- --ask                         for `tests/peers/peers.py`
+//!
+//! | stage | from -> to | floor |
+//! |---|---|---|
+//! | decode | the datagrams of a revolution -> the revolution | each return once through a table of sines and cosines |
+//! | a layer | a scan event -> a map of that layer alone, with its ground and reach | see [`Floor`] |
+//! | occupancy_six_units | the scans of six sensors in 100 ms -> the layer | |
+//! | maps | a scan event -> a map of all six layers | |
+//! | encode | a map of six layers -> the bytes of each, with all channels | the runs of six grids of 160,000 cells |
+//!
+//! The first rounds, in which buffers get their sizes, are not counted.
+
+use std::collections::BTreeMap;
+use std::hint::black_box;
+use std::io::{BufRead, stdin};
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use clap::Parser;
+use clearway::encode::EncodedMap;
+use clearway_lidar::model::Model;
+use clearway_lidar::{Sensor, SensorConfig as LidarConfig};
+use clearway_mapping::config::{Extrinsics, MapsConfig, OccupancyConfig, SensorConfig, VehicleConfig};
+use clearway_mapping::event::{Body, EgoPose, Event, Scan};
+use clearway_mapping::layer::occupancy::Occupancy;
+use clearway_mapping::layer::{Context, Layer, LayerMaker, Rays};
+use clearway_mapping::pipeline::Pipeline;
+use clearway_mapping::scan_file;
+use clearway_mapping::sensor::sweep::Sweep;
+use clearway_sim::scanner::ScannerConfig;
+use clearway_sim::scenes::town;
+use clearway_sim::traffic;
+use clearway_sim::vehicle::{Kind, SimulatedVehicle};
+use nalgebra::{Isometry3, Point3};
+
+/// Rounds before the first that counts.
+const WARM_UP: u32 = 6;
+const PERIOD_NS: i64 = 100_000_000;
+/// The layers, in the order of a map.
+const LAYERS: [&str; 6] = ["drivability", "height_difference", "terrain", "occupancy", "speed", "safe_path"];
+/// Side of the grid of the floors, in cells, and of a cell, metres.
+const SIDE: usize = 400;
+const CELL_M: f32 = 0.25;
+
+#[derive(Parser)]
+struct Arguments {
+    /// A scan in KITTI's format: float32 x y z intensity.
+    scan: Option<PathBuf>,
+    /// Height of its sensor over the ground, metres.
+    #[arg(long, default_value_t = 1.73)]
+    height: f64,
+    /// Rounds of the table.
+    #[arg(long, default_value_t = 30)]
+    rounds: u32,
+    /// Reads names of stages, one a line, runs each once, and answers each with its nanoseconds.
+    #[arg(long)]
+    ask: bool,
+    /// Set by cargo bench.
+    #[arg(long, hide = true)]
+    bench: bool,
+}
+
+fn main() {
+    let arguments = Arguments::parse();
+    let mut stages = Stages::new(&arguments);
+    if arguments.ask {
+        for name in stdin().lock().lines().map_while(Result::ok) {
+            println!("{}", stages.run(&name).as_nanos());
+        }
+        return;
+    }
+    println!("| stage | median ms | floor ms | times its floor |\n|---|---|---|---|");
+    let mut times: BTreeMap<&str, (Vec<Duration>, Vec<Duration>)> = BTreeMap::new();
+    for round in 0..WARM_UP + arguments.rounds {
+        for name in Stages::NAMES {
+            let (own, floor) = (stages.run(name), stages.run_floor(name));
+            if round >= WARM_UP {
+                let (owns, floors) = times.entry(name).or_default();
+                owns.push(own);
+                floors.extend(floor);
+            }
+        }
+    }
+    for name in Stages::NAMES {
+        let Some((owns, floors)) = times.get_mut(name) else { continue };
+        let own_ms = median_ms(owns).unwrap_or_default();
+        match median_ms(floors) {
+            Some(floor_ms) => println!("| {name} | {own_ms:.2} | {floor_ms:.2} | {:.1} |", own_ms / floor_ms),
+            None => println!("| {name} | {own_ms:.2} | | |"),
+        }
+    }
+}
+
+fn median_ms(times: &mut [Duration]) -> Option<f64> {
+    times.sort_unstable();
+    times.get(times.len() / 2).map(|time| time.as_secs_f64() * 1e3)
+}
+
+/// Runs `work` and takes its time; what it returns is dropped after that.
+fn timed<T>(work: impl FnOnce() -> T) -> Duration {
+    let start = Instant::now();
+    let result = black_box(work());
+    let time = start.elapsed();
+    drop(result);
+    time
+}
+
+/// What every stage runs on.
+struct Stages {
+    datagrams: Vec<Box<[u8]>>,
+    decoder: Sensor,
+    scan: Scan,
+    /// A pipeline for each layer alone, by name, and under `maps` and `encode` one for all.
+    pipelines: BTreeMap<&'static str, Pipeline>,
+    six_units: SixUnits,
+    floor: Floor,
+    /// Number of runs so far: the stamps of a stage rise.
+    runs: i64,
+}
+
+impl Stages {
+    const NAMES: [&'static str; 10] = [
+        "decode",
+        "drivability",
+        "height_difference",
+        "terrain",
+        "occupancy",
+        "speed",
+        "safe_path",
+        "occupancy_six_units",
+        "maps",
+        "encode",
+    ];
+
+    fn new(arguments: &Arguments) -> Self {
+        let vehicle = SimulatedVehicle::new(town(), ScannerConfig::default());
+        let start_ns = vehicle.start_ns();
+        let data = vehicle.clone().filter(|datagram| datagram.kind == Kind::Data);
+        let datagrams = data.take_while(|datagram| datagram.stamp_ns < start_ns + PERIOD_NS);
+        let (scan, height_m) = match &arguments.scan {
+            Some(file) => {
+                let bytes = std::fs::read(file).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
+                let (_, scan) = scan_file::read(&file.to_string_lossy(), &bytes).expect("a scan");
+                (scan, arguments.height)
+            }
+            None => (simulated_scan(&vehicle), 1.9),
+        };
+        let alone = LAYERS.map(|layer| (layer, pipeline(height_m, &[layer])));
+        let all = ["maps", "encode"].map(|stage| (stage, pipeline(height_m, &LAYERS)));
+        Self {
+            datagrams: datagrams.map(|datagram| datagram.payload.into()).collect(),
+            decoder: Sensor::new(LidarConfig { model: Some(Model::Hdl64eS2), ..LidarConfig::default() }),
+            pipelines: alone.into_iter().chain(all).collect(),
+            six_units: SixUnits::new(),
+            floor: Floor::new(&scan),
+            scan,
+            runs: 0,
+        }
+    }
+
+    /// Runs a stage once.
+    fn run(&mut self, name: &str) -> Duration {
+        self.runs += 1;
+        let stamp_ns = 1_700_000_000_000_000_000 + self.runs * PERIOD_NS;
+        match name {
+            "decode" => timed(|| {
+                // When the stream begins again its device time goes back, and the first packet is refused.
+                let mut firings = 0;
+                for datagram in &self.datagrams {
+                    if let Ok(Some(revolution)) = self.decoder.push(datagram, stamp_ns) {
+                        firings += revolution.firings.len();
+                    }
+                }
+                firings
+            }),
+            "occupancy_six_units" => timed(|| self.six_units.run()),
+            _ => {
+                let pipeline = self.pipelines.get_mut(name).unwrap_or_else(|| panic!("{name} is no stage"));
+                let event = |body| Event { sequence: 0, arrival_ns: stamp_ns, source: 0, body };
+                let pose = EgoPose { stamp_ns, map_from_ego: Isometry3::identity(), speed_mps: 0.0 };
+                pipeline.step(&event(Body::EgoPose(pose))).expect("a pose");
+                let scan = event(Body::Scan(Scan { stamp_ns, ..self.scan.clone() }));
+                let start = Instant::now();
+                let map = pipeline.step(&scan).expect("a scan").expect("a map");
+                if name != "encode" {
+                    return start.elapsed();
+                }
+                timed(|| EncodedMap::new(map, "car".into(), 1, 300))
+            }
+        }
+    }
+
+    /// Runs the floor of a stage once; `None` if it has none.
+    fn run_floor(&mut self, name: &str) -> Option<Duration> {
+        let (floor, scan) = (&mut self.floor, &self.scan);
+        Some(match name {
+            "decode" => timed(|| floor.decode(&self.datagrams)),
+            "drivability" => timed(|| floor.scatter_polar(scan)),
+            "height_difference" => timed(|| floor.scatter_square(scan)),
+            "terrain" => timed(|| floor.sum_moments(scan)),
+            "encode" => timed(|| floor.count_runs()),
+            _ => return None,
+        })
+    }
+}
+
+/// A pipeline of an HDL-64E that makes `layers`.
+fn pipeline(height_m: f64, layers: &[&str]) -> Pipeline {
+    let extrinsics = Extrinsics { x_m: 0.0, y_m: 0.0, z_m: height_m, roll_deg: 0.0, pitch_deg: 0.0, yaw_deg: 0.0 };
+    let sensor = SensorConfig { model: Some(Model::Hdl64eS2), ..SensorConfig::new("top", extrinsics) };
+    let config = VehicleConfig { maps: MapsConfig::default(), ..VehicleConfig::new("car", vec![sensor]) };
+    let mut pipeline = Pipeline::new(&config, vec![None]).expect("the default configuration");
+    pipeline.set_active_layers(|layer| layers.contains(&layer));
+    pipeline
+}
+
+/// A revolution in the town, as a client sends it.
+fn simulated_scan(vehicle: &SimulatedVehicle) -> Scan {
+    let revolution = vehicle.revolution(1);
+    let echo = &revolution.echoes[0];
+    let mut scan = Scan::default();
+    for slot in (0..echo.range_m.len()).filter(|slot| echo.range_m[*slot] > 0.0) {
+        scan.x.push(echo.x[slot]);
+        scan.y.push(echo.y[slot]);
+        scan.z.push(echo.z[slot]);
+        scan.intensity.push(0.5);
+        scan.ring.push((slot % revolution.lasers) as u16);
+    }
+    scan
+}
+
+/// Scans of 100 ms from six sensors of four planes each on a vehicle in traffic: 52,800 rays, with and without a
+/// return (Seo 2014).
+struct SixUnits {
+    scans: Vec<(Sweep, [f32; 3])>,
+    maker: Occupancy,
+    layer: Layer,
+}
+
+impl SixUnits {
+    fn new() -> Self {
+        let (scene, units) = (traffic::street(0.0), traffic::six_units());
+        let scans = (1..=5).flat_map(|number| units.iter().map(move |unit| (unit, number)));
+        let scans = scans.map(|(unit, number)| {
+            let scan = unit.scan(&scene, number);
+            let mut sweep = Sweep::default();
+            for ((x, y), z) in scan.x.iter().zip(&scan.y).zip(&scan.z) {
+                let point = (unit.ego_from_sensor * Point3::new(*x, *y, *z).cast::<f64>()).cast::<f32>();
+                sweep.x.push(point.x);
+                sweep.y.push(point.y);
+                sweep.z.push(point.z);
+            }
+            (sweep, unit.ego_from_sensor.translation.vector.cast::<f32>().into())
+        });
+        let scans = scans.collect();
+        let maker = Occupancy::new(&OccupancyConfig::default());
+        Self { scans, layer: maker.layer(), maker }
+    }
+
+    fn run(&mut self) {
+        let pose = Some(Isometry3::identity());
+        for (number, (returns, origin_m)) in self.scans.iter().enumerate() {
+            self.maker.integrate(&Rays {
+                sensor: (number % 6) as u16,
+                stamp_ns: 0,
+                returns,
+                heights_m: &returns.z,
+                origin_m: *origin_m,
+                origin_height_m: origin_m[2],
+                no_returns: &[],
+                map_from_ego: pose,
+                speed_mps: Some(0.0),
+            });
+        }
+        let context = Context { map_from_ego: pose, ..Context::default() };
+        self.maker.make(&Sweep::default(), &context, &mut self.layer);
+    }
+}
+
+/// The least work that could do a stage: each point, return or cell once, with the arithmetic that cannot be left out,
+/// into buffers of the size of the result.
+struct Floor {
+    /// Sine and cosine of each hundredth of a degree.
+    azimuths: Vec<[f32; 2]>,
+    points: Vec<[f32; 3]>,
+    /// Number, least and greatest height by cell.
+    polar: Vec<[f32; 3]>,
+    square: Vec<[f32; 2]>,
+    /// Number, sums and products of the coordinates by cell.
+    moments: Vec<[f32; 10]>,
+    classes: Vec<u8>,
+}
+
+impl Floor {
+    fn new(scan: &Scan) -> Self {
+        // One class where a point fell, another elsewhere: runs as long as those of a map.
+        let mut classes = vec![0; SIDE * SIDE];
+        for (&x, &y) in scan.x.iter().zip(&scan.y) {
+            if let Some(cell) = square_cell(x, y) {
+                classes[cell] = 1;
+            }
+        }
+        Self {
+            azimuths: (0..36_000).map(|i| (i as f32 / 100.0).to_radians().sin_cos().into()).collect(),
+            points: Vec::new(),
+            polar: vec![[0.0; 3]; 360 * 64],
+            square: vec![[0.0; 2]; SIDE * SIDE],
+            moments: vec![[0.0; 10]; SIDE * SIDE],
+            classes,
+        }
+    }
+
+    /// Points of the returns, with one elevation for all.
+    fn decode(&mut self, datagrams: &[Box<[u8]>]) -> usize {
+        self.points.clear();
+        for block in datagrams.iter().flat_map(|datagram| datagram[..1_200].chunks_exact(100)) {
+            let azimuth = usize::from(u16::from_le_bytes([block[2], block[3]]));
+            let [sin, cos] = self.azimuths[azimuth % 36_000];
+            let ranges = block[4..].chunks_exact(3).map(|r| f32::from(u16::from_le_bytes([r[0], r[1]])) * 0.002);
+            self.points.extend(ranges.map(|range| [range * cos, range * sin, range * 0.1]));
+        }
+        self.points.len()
+    }
+
+    /// Least and greatest height by sector of a degree and ring of a metre.
+    fn scatter_polar(&mut self, scan: &Scan) -> f32 {
+        self.polar.fill([0.0, f32::INFINITY, f32::NEG_INFINITY]);
+        for ((&x, &y), &z) in scan.x.iter().zip(&scan.y).zip(&scan.z) {
+            // A cubic is as near as a cell needs.
+            let share = y / (x.abs() + y.abs()).max(1e-6);
+            let eighth = share * (1.27 - 0.27 * share * share);
+            let turn = if x >= 0.0 { 1.0 + eighth } else { 3.0 - eighth };
+            let ring = ((x * x + y * y).sqrt() as usize).min(63);
+            let cell = &mut self.polar[(turn * 89.0) as usize * 64 + ring];
+            *cell = [cell[0] + 1.0, cell[1].min(z), cell[2].max(z)];
+        }
+        self.polar[0][0]
+    }
+
+    /// Least and greatest height by square cell.
+    fn scatter_square(&mut self, scan: &Scan) -> f32 {
+        self.square.fill([f32::INFINITY, f32::NEG_INFINITY]);
+        for ((&x, &y), &z) in scan.x.iter().zip(&scan.y).zip(&scan.z) {
+            if let Some(cell) = square_cell(x, y) {
+                let cell = &mut self.square[cell];
+                *cell = [cell[0].min(z), cell[1].max(z)];
+            }
+        }
+        self.square[0][0]
+    }
+
+    /// The ten sums from which the planes of cells follow.
+    fn sum_moments(&mut self, scan: &Scan) -> f32 {
+        self.moments.fill([0.0; 10]);
+        for ((&x, &y), &z) in scan.x.iter().zip(&scan.y).zip(&scan.z) {
+            if let Some(cell) = square_cell(x, y) {
+                let terms = [1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z];
+                self.moments[cell].iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
+            }
+        }
+        self.moments[0][0]
+    }
+
+    /// Number of runs in six grids.
+    fn count_runs(&self) -> usize {
+        LAYERS.iter().map(|_| black_box(&self.classes).windows(2).filter(|pair| pair[0] != pair[1]).count()).sum()
+    }
+}
+
+/// The square cell of a point; `None` outside the grid.
+fn square_cell(x: f32, y: f32) -> Option<usize> {
+    let half = SIDE as f32 / 2.0;
+    let (column, row) = (x / CELL_M + half, y / CELL_M + half);
+    let inside = column >= 0.0 && row >= 0.0 && column < SIDE as f32 && row < SIDE as f32;
+    inside.then(|| row as usize * SIDE + column as usize)
+}
