@@ -86,7 +86,8 @@ def build():
         return next(m["executable"] for m in built if m.get("executable") and m["target"]["name"] == name)
 
     stages = executable(["bench", "-p", "clearway-tests", "--bench", "stages", "--no-run"], "stages")
-    return stages, executable(["build", "--release", "-p", "clearway", "--no-default-features", "-F", "sim"], "clearway")
+    command = executable(["build", "--release", "-p", "clearway", "--no-default-features", "-F", "sim"], "clearway")
+    return stages, command
 
 
 class Clearway:

@@ -7,10 +7,14 @@
 //! | `status`, `top` | a server -> the states of its vehicles, once and live |
 //! | `recorder`, `transport` | a request -> the recorder of a server; the replay that it serves |
 //! | `connection` | options -> a connected client |
+//! | `drawing` | a layer -> lines of text |
+//! | `screen` | lines of text -> a terminal |
 
 pub(super) mod connection;
+mod drawing;
 pub(super) mod get;
 pub(super) mod recorder;
+mod screen;
 pub(super) mod status;
 pub(super) mod top;
 pub(super) mod transport;

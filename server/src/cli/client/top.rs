@@ -3,14 +3,12 @@
 use anyhow::Result;
 use clap::Args;
 use clearway_client::v1;
-use console::{Style, Term, truncate_str};
+use console::{Style, truncate_str};
 use futures::StreamExt;
 
 use crate::cli::client::connection::{ServerOptions, explain};
-use crate::cli::shared::output::{block_on, print, stop_signal};
-
-/// Number of columns of a table that is not on a terminal.
-const COLUMNS: usize = 120;
+use crate::cli::client::screen::Screen;
+use crate::cli::shared::output::{block_on, stop_signal};
 
 /// Show the vehicles of a server live: state, age, rate, loss, latency, readers, and what is wrong.
 ///
@@ -37,19 +35,14 @@ pub struct Options {
 /// # Errors
 /// [`ClientError`](clearway_client::ClientError) if the server refuses, does not answer or ends the stream.
 pub fn run(options: &Options) -> Result<()> {
-    let terminal = Term::stdout();
-    let is_live = terminal.is_term();
-    if is_live {
-        terminal.hide_cursor()?;
-    }
-    let ended = block_on(show(options, &terminal));
-    if is_live {
-        terminal.show_cursor()?;
-    }
+    let screen = Screen::new();
+    screen.set_cursor(false)?;
+    let ended = block_on(show(options, &screen));
+    screen.set_cursor(true)?;
     ended
 }
 
-async fn show(options: &Options, terminal: &Term) -> Result<()> {
+async fn show(options: &Options, screen: &Screen) -> Result<()> {
     let stop = stop_signal()?;
     let mut updates = options.server.connect().await?.watch_status(&options.vehicles).await.map_err(explain)?;
     let mut shown = 0;
@@ -61,20 +54,7 @@ async fn show(options: &Options, terminal: &Term) -> Result<()> {
         };
         let Some(update) = update else { break };
         let vehicles = update.map_err(explain)?;
-        let goes_on = if terminal.is_term() {
-            let (rows, columns) = terminal.size();
-            let lines = table(vehicles, columns.into(), true);
-            // The last row stays free, so that the terminal does not scroll.
-            let lines = &lines[..lines.len().min(usize::from(rows).saturating_sub(1))];
-            terminal.move_cursor_to(0, 0)?;
-            let text: String = lines.iter().map(|line| format!("{line}\x1b[K\r\n")).collect();
-            terminal.write_str(&text)?;
-            terminal.clear_to_end_of_screen()?;
-            true
-        } else {
-            print(&format!("{}\n", table(vehicles, COLUMNS, false).join("\n")))?
-        };
-        if !goes_on {
+        if !screen.show(&table(vehicles, screen.size().1, screen.is_live()))? {
             break;
         }
         shown += 1;

@@ -3,23 +3,28 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use clap::Args;
 use clearway_client::{ClientError, MapStream, PassedOver, StreamEvent, Subscription, Update, now_ns};
+use console::truncate_str;
 use serde_json::json;
 
 use crate::cli::client::connection::{ServerOptions, explain};
+use crate::cli::client::drawing;
+use crate::cli::client::screen::Screen;
 use crate::cli::shared::exit::Exit;
 #[cfg(feature = "zenoh")]
 use crate::cli::shared::files;
-use crate::cli::shared::output::{block_on, print_line};
+use crate::cli::shared::output::{block_on, print_line, usage_error};
 
 /// Time between two lines while no fresh map comes. Ours: a person sees that the command still waits.
 const STALE_PERIOD: Duration = Duration::from_secs(1);
+/// The layer that is drawn, and read over zenoh, if none is named.
+const DEFAULT_LAYER: &str = "drivability";
 /// Interval at which the age of the last map is read after the stream has ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
-/// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps.
+/// Print a line for each map: sequence number, age, drivable share, bytes, skipped maps; or draw each map.
 ///
 /// If no map arrives, or no newer one before the last one becomes stale, a line says STALE once a second until maps
 /// arrive again. The exit code is 4 if the last line says STALE, and 2 if the server ends the stream.
@@ -27,6 +32,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(20);
 #[command(after_help = "Examples:
   clearway watch
   clearway watch --server vehicle.local:50051 --layers drivability,occupancy --max-rate-hz 2
+  clearway watch --draw --layers occupancy --range 20
   clearway watch --count 10 --json
   clearway watch --until-stale || echo \"the maps are stale\"")]
 pub struct Options {
@@ -51,8 +57,15 @@ pub struct Options {
     #[arg(long, conflicts_with = "zenoh")]
     deltas: bool,
     /// Print each line as a JSON object.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "draw")]
     json: bool,
+    /// Draw one layer of each map in the terminal; drivability if --layers names none. Elsewhere than in a terminal a
+    /// cell is the first letter of its class.
+    #[arg(long)]
+    draw: bool,
+    /// With --draw: distance from the vehicle to the edge, in metres; the whole grid if absent.
+    #[arg(long, value_name = "METRES", requires = "draw")]
+    range: Option<f64>,
     /// End after this many maps; at Ctrl-C if absent.
     #[arg(long, value_name = "MAPS")]
     count: Option<u64>,
@@ -71,7 +84,14 @@ pub fn run(options: &Options) -> Result<Exit> {
 }
 
 async fn watch(options: &Options) -> Result<Exit> {
+    if options.draw && options.layers.len() > 1 {
+        return Err(usage_error(format!("--draw: --layers {}: one layer is allowed", options.layers.join(","))));
+    }
+    if let Some(range_m) = options.range.filter(|range_m| !(*range_m > 0.0 && range_m.is_finite())) {
+        return Err(usage_error(format!("--range {range_m}: more than 0 is allowed")));
+    }
     let mut maps = subscribe(options).await?;
+    let screen = options.draw.then(Screen::new);
     let mut newest: Option<Update> = None;
     let (mut printed, mut is_stale) = (0, false);
     while options.count.is_none_or(|count| printed < count) && !(is_stale && options.until_stale) {
@@ -106,12 +126,27 @@ async fn watch(options: &Options) -> Result<Exit> {
                 (stale_line(newest.as_ref(), maps.passed_over(), options), false)
             }
         };
-        if !print_line(&said)? {
+        let goes_on = match &screen {
+            Some(screen) => screen.show(&drawn(newest.as_ref(), said, screen, options)?)?,
+            None => print_line(&said)?,
+        };
+        if !goes_on {
             break;
         }
         printed += u64::from(is_new);
     }
     Ok(Exit::from_stale(is_stale))
+}
+
+/// The lines of a drawn map: the newest one, if there is one, and what is said of it.
+fn drawn(newest: Option<&Update>, said: String, screen: &Screen, options: &Options) -> Result<Vec<String>> {
+    let Some(Update { map, .. }) = newest else { return Ok(vec![said]) };
+    let layer = map.layers().first().context("the map has no layer")?;
+    let (rows, columns) = screen.size();
+    let size = (rows.saturating_sub(1), columns);
+    let mut lines = drawing::lines(layer, options.range, size, screen.is_live())?;
+    lines.push(truncate_str(&said, columns, "…").into_owned());
+    Ok(lines)
 }
 
 /// Identity of a map.
@@ -131,9 +166,10 @@ async fn subscribe(options: &Options) -> Result<MapStream> {
     if let Some(endpoint) = zenoh {
         return subscribe_over_zenoh(endpoint, options).await;
     }
+    let drawn = (options.draw && layers.is_empty()).then(|| vec![DEFAULT_LAYER.to_owned()]);
     let subscription = Subscription {
         vehicle: vehicle.clone().unwrap_or_default(),
-        layers: layers.clone(),
+        layers: drawn.unwrap_or_else(|| layers.clone()),
         max_rate_hz: *max_rate_hz,
         deltas: *deltas,
         ..Subscription::default()
@@ -189,7 +225,7 @@ fn stale_line(newest: Option<&Update>, passed_over: PassedOver, options: &Option
 #[cfg(feature = "zenoh")]
 async fn subscribe_over_zenoh(endpoint: &str, options: &Options) -> Result<MapStream> {
     let layer = match &options.layers[..] {
-        [] => "drivability",
+        [] => DEFAULT_LAYER,
         [layer] => layer,
         several => bail!("--layers {}: over zenoh each layer has its own key; name one", several.join(",")),
     };
