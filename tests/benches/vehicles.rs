@@ -8,7 +8,8 @@
 //! datagrams are made beforehand, and every vehicle sends the same ones, each begun at another moment of a revolution.
 //! Age: from the moment at which a map's last packet is due to be sent to the reader's hands. Lost: datagrams that were
 //! sent and not received, dropped by the kernel or lost at the queue. Memory: growth of the server's resident set over
-//! that of a server without vehicles' data, divided by the number of vehicles.
+//! that of a server without vehicles' data, divided by the number of vehicles. The last column says which threads the
+//! processor time of a map went to.
 
 use std::io::{BufRead, BufReader};
 use std::net::{SocketAddr, UdpSocket};
@@ -68,9 +69,10 @@ fn main() {
     let length = SETTLE + Duration::from_secs(arguments.seconds) + 2 * REVOLUTION;
     let drive: Arc<[Datagram]> = packets(length).into();
     println!(
-        "| vehicles | maps/s | age p50 / p99 / worst ms | maps missed | datagrams lost | MiB a vehicle | server's cores |"
+        "| vehicles | maps/s | age p50 / p99 / worst ms | maps missed | datagrams lost | MiB a vehicle | server's cores \
+         | ms a map: engine / UDP / all else |"
     );
-    println!("|---|---|---|---|---|---|---|");
+    println!("|---|---|---|---|---|---|---|---|");
     for &vehicles in &arguments.vehicles {
         println!("{}", runtime.block_on(measure(vehicles, &arguments, &drive)));
     }
@@ -114,11 +116,12 @@ async fn measure(vehicles: usize, arguments: &Arguments, drive: &Arc<[Datagram]>
         })
         .collect();
     tokio::time::sleep(SETTLE).await;
-    let (began, processor_s) = (Instant::now(), server.processor_s());
+    let (began, before) = (Instant::now(), server.processor_s());
     is_measured.store(true, Ordering::Relaxed);
     tokio::time::sleep(Duration::from_secs(arguments.seconds)).await;
     is_measured.store(false, Ordering::Relaxed);
-    let (cores, kib) = ((server.processor_s() - processor_s) / began.elapsed().as_secs_f64(), server.resident_kib());
+    let (seconds, after, kib) = (began.elapsed().as_secs_f64(), server.processor_s(), server.resident_kib());
+    let spent_s = [0, 1, 2].map(|group| after[group] - before[group]);
     senders.into_iter().for_each(|sender| sender.join().expect("it sends"));
     // The engines finish what waits.
     tokio::time::sleep(Duration::from_secs(2)).await;
@@ -137,7 +140,12 @@ async fn measure(vehicles: usize, arguments: &Arguments, drive: &Arc<[Datagram]>
     let rate = ages.len() as f64 / arguments.seconds as f64;
     let mib = (kib - empty_kib) as f64 / 1024.0 / vehicles as f64;
     let lost = sent.load(Ordering::Relaxed).saturating_sub(received);
-    format!("| {vehicles} | {rate:.0} | {p50:.1} / {p99:.1} / {worst:.0} | {missed} | {lost} | {mib:.0} | {cores:.2} |")
+    let cores = spent_s.iter().sum::<f64>() / seconds;
+    let [engine, udp, other] = spent_s.map(|spent_s| 1e3 * spent_s / seconds / rate);
+    format!(
+        "| {vehicles} | {rate:.0} | {p50:.1} / {p99:.1} / {worst:.0} | {missed} | {lost} | {mib:.0} | {cores:.2} \
+         | {engine:.1} / {udp:.1} / {other:.1} |"
+    )
 }
 
 /// How much later than the first vehicle one with this number begins: the revolutions end evenly spread.
@@ -244,16 +252,19 @@ impl Process {
         line.split_whitespace().nth(1).and_then(|kib| kib.parse().ok()).expect("a number")
     }
 
-    /// Processor time of the process so far, in seconds.
-    fn processor_s(&self) -> f64 {
-        let text = std::fs::read_to_string(format!("/proc/{}/schedstat", self.child.id())).expect("Linux");
-        let of_main = text.split_whitespace().next().and_then(|ns| ns.parse().ok()).unwrap_or(0.0);
+    /// Processor time so far, in seconds: of the engines, of the threads that receive datagrams, of all others.
+    fn processor_s(&self) -> [f64; 3] {
         let tasks = std::fs::read_dir(format!("/proc/{}/task", self.child.id())).expect("Linux");
-        let of_task = |task: std::io::Result<std::fs::DirEntry>| {
-            let text = std::fs::read_to_string(task.ok()?.path().join("schedstat")).ok()?;
-            text.split_whitespace().next()?.parse::<f64>().ok()
-        };
-        tasks.filter_map(of_task).sum::<f64>().max(of_main) * 1e-9
+        let mut groups_s = [0.0; 3];
+        for task in tasks.flatten() {
+            // A thread that has ended meanwhile has no files.
+            let text = |name| std::fs::read_to_string(task.path().join(name)).unwrap_or_default();
+            let name = text("comm");
+            let group = ["engine ", "udp "].iter().position(|prefix| name.starts_with(prefix)).unwrap_or(2);
+            let spent_ns = text("schedstat").split_whitespace().next().and_then(|ns| ns.parse().ok());
+            groups_s[group] += spent_ns.unwrap_or(0.0) * 1e-9;
+        }
+        groups_s
     }
 
     /// Ends the process by the end of its standard input.

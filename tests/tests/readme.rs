@@ -46,10 +46,11 @@ fn succeeds(folder: &Path, command: &str) {
 }
 
 /// The capture has ended, so the newest map may be stale: then the exit code is 4.
-fn shows_a_map(folder: &Path, command: &str) {
+fn shows_a_map(folder: &Path, command: &str) -> String {
     let words: Vec<_> = command.split_whitespace().collect();
     let output = run(folder, words[0], &words[1..]);
     assert!(matches!(output.status.code(), Some(0 | 4)), "{command}: {}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
 #[test]
@@ -147,6 +148,10 @@ fn the_default_configuration_serves_what_send_sends_to_the_readers() {
         succeeds(folder.path(), command);
     }
     shows_a_map(folder.path(), "clearway watch --count 1");
+    let draw =
+        commands().into_iter().find(|c| c.starts_with("clearway watch --draw")).expect("`clearway watch --draw`");
+    let drawn = shows_a_map(folder.path(), &format!("{draw} --count 1"));
+    assert!(drawn.contains("dddd") && drawn.contains("d drivable"), "{drawn}");
     let get = commands().into_iter().find(|c| c.starts_with("clearway get")).expect("the README shows `clearway get`");
     shows_a_map(folder.path(), &get);
     assert!(folder.path().join("newest.png").is_file());
