@@ -241,7 +241,7 @@ fn publish(channel: &Channel, map: &EncodedMap, sweep: &NewestSweep, rasters: &m
         Kind::Layer(_) | Kind::SafePoints => {
             let name = channel.layer().unwrap_or_default();
             let chunk = map.layers.iter().find(|(of, _)| *of == name);
-            let Some(view) = chunk.and_then(|(_, chunk)| view(map.layer(chunk))) else { return };
+            let Some(view) = chunk.and_then(|(_, chunk)| view(map, map.layer(chunk))) else { return };
             let Some(layer) = view.layers().first() else { return };
             match channel.kind {
                 Kind::SafePoints => channel.publish(map, &messages::safe_paths(&view, layer)),
@@ -249,7 +249,7 @@ fn publish(channel: &Channel, map: &EncodedMap, sweep: &NewestSweep, rasters: &m
             }
         }
         Kind::Transforms => {
-            if let Some(transforms) = view(map.header.clone()).and_then(|view| messages::transforms(&view)) {
+            if let Some(transforms) = view(map, map.header.clone()).and_then(|view| messages::transforms(&view)) {
                 channel.publish(map, &transforms);
             }
         }
@@ -265,9 +265,10 @@ fn publish(channel: &Channel, map: &EncodedMap, sweep: &NewestSweep, rasters: &m
     }
 }
 
-fn view(bytes: Bytes) -> Option<MapView> {
+/// The decoded `bytes` of `map`.
+fn view(map: &EncodedMap, bytes: Bytes) -> Option<MapView> {
     MapView::decode(bytes)
-        .inspect_err(|error| tracing::error!(%error, "foxglove: the newest map cannot be decoded"))
+        .inspect_err(|error| tracing::error!(vehicle = %map.vehicle, %error, "foxglove: a map cannot be decoded"))
         .ok()
 }
 

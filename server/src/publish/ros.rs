@@ -14,6 +14,7 @@ use std::time::Duration;
 
 use crate::encode::viewer::raster::Rasters;
 use crate::encode::viewer::{ros, safe_paths};
+use bytes::Bytes;
 use clearway_client::Layer;
 use clearway_client::MapView;
 use clearway_ros::cdr::Writer;
@@ -74,7 +75,7 @@ impl<'a> Node<'a> {
         }
         let tf = self.topic("/tf", &TF_MESSAGE, MOVING).await?;
         let transform = |map: &EncodedMap| {
-            let map = MapView::decode(map.header.clone()).inspect_err(log_decode_error).ok()?;
+            let map = decode(map, map.header.clone())?;
             ros::tf(&map)
         };
         tasks.spawn(tf.publish(served.clone(), None, transform));
@@ -95,7 +96,7 @@ impl<'a> Node<'a> {
         let topic = self.topic(topic, kind, LATCHED).await?;
         let message = move |map: &EncodedMap| {
             let (_, chunk) = map.layers.iter().find(|(name, _)| *name == layer)?;
-            let map = MapView::decode(map.layer(chunk)).inspect_err(log_decode_error).ok()?;
+            let map = decode(map, map.layer(chunk))?;
             let layer = map.layers().first()?;
             Some(write(&map, layer))
         };
@@ -149,8 +150,11 @@ fn gid(token: &str) -> [u8; 16] {
     gid
 }
 
-fn log_decode_error(error: &clearway_client::ClientError) {
-    tracing::error!(%error, "ros: the newest map cannot be decoded");
+/// The decoded `bytes` of `map`.
+fn decode(map: &EncodedMap, bytes: Bytes) -> Option<MapView> {
+    MapView::decode(bytes)
+        .inspect_err(|error| tracing::error!(vehicle = %map.vehicle, %error, "ros: a map cannot be decoded"))
+        .ok()
 }
 
 /// The publisher of one topic.

@@ -67,7 +67,7 @@ impl OverZenoh {
         for (vehicle, input) in config.vehicles.iter().zip(inputs) {
             let Some(ros) = &vehicle.ros else { continue };
             let sensors = vehicle.sensors.iter().map(|sensor| &sensor.name);
-            let topics = live::subscribe(&over_zenoh.session, ros, sensors, input.queue.clone()).await?;
+            let topics = live::subscribe(&over_zenoh.session, ros, &vehicle.name, sensors, input.queue.clone()).await?;
             over_zenoh.ros.push(topics);
         }
         Ok(over_zenoh)

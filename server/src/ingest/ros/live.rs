@@ -27,8 +27,8 @@ const PUBLISHERS_MAX: usize = 256;
 const LOST_MAX: u64 = 1000;
 
 /// The subscriptions of one vehicle.
-#[derive(Default)]
 pub struct LiveTopics {
+    vehicle: Arc<str>,
     topics: Vec<Subscriber<()>>,
     latched: Vec<AdvancedSubscriber<()>>,
 }
@@ -38,12 +38,12 @@ impl LiveTopics {
     pub async fn stop(self) {
         for subscriber in self.topics {
             if let Err(error) = subscriber.undeclare().await {
-                tracing::warn!(%error, "ros: subscriber");
+                tracing::warn!(vehicle = %self.vehicle, %error, "ros: subscriber");
             }
         }
         for subscriber in self.latched {
             if let Err(error) = subscriber.undeclare().await {
-                tracing::warn!(%error, "ros: subscriber");
+                tracing::warn!(vehicle = %self.vehicle, %error, "ros: subscriber");
             }
         }
     }
@@ -51,19 +51,21 @@ impl LiveTopics {
 
 /// Receives the samples of all topics of one vehicle.
 struct SampleReceiver {
+    vehicle: Arc<str>,
     decoder: TopicDecoder,
     queue: EventQueue,
     /// Newest sequence by publisher.
     sequences: BTreeMap<[u8; 16], i64>,
 }
 
-/// Subscribes to the configured topics; `sensors` are the names of the vehicle's sensors, by index.
+/// Subscribes to the configured topics of `vehicle`; `sensors` are the names of its sensors, by index.
 ///
 /// # Errors
 /// [`ZenohError`] if a subscriber cannot be declared.
 pub async fn subscribe<'a>(
     session: &Session,
     ros: &Ros,
+    vehicle: &str,
     sensors: impl Iterator<Item = &'a String>,
     queue: EventQueue,
 ) -> Result<LiveTopics, ZenohError> {
@@ -77,8 +79,9 @@ pub async fn subscribe<'a>(
     let pose_topic = (!ros.pose.is_empty()).then(|| ros.pose.clone());
     let topics: Vec<String> = sensors.keys().cloned().chain(pose_topic).chain([ros.tf.clone()]).collect();
     let decoder = TopicDecoder::new(sensors, pose, &ros.ego_frame, Frames::default());
-    let receiver = Arc::new(Mutex::new(SampleReceiver { decoder, queue, sequences: BTreeMap::new() }));
-    let mut subscribed = LiveTopics::default();
+    let receiver =
+        Arc::new(Mutex::new(SampleReceiver { vehicle: vehicle.into(), decoder, queue, sequences: BTreeMap::new() }));
+    let mut subscribed = LiveTopics { vehicle: vehicle.into(), topics: Vec::new(), latched: Vec::new() };
     for topic in topics.into_iter().filter(|topic| !topic.is_empty()) {
         let (key, receiver) = (key(ros.domain, &topic), receiver.clone());
         let subscriber = session.declare_subscriber(key.clone());
@@ -107,13 +110,13 @@ impl SampleReceiver {
         self.queue.record_drop(self.decoder.source(topic), Cause::Queue, lost);
         let name = sample.key_expr().as_str().rsplit('/').nth(1).unwrap_or_default();
         let Some(kind) = Kind::from_name(name) else {
-            tracing::info!(topic, name, "ros: a type that is not decoded");
+            tracing::info!(vehicle = %self.vehicle, topic, name, "ros: a type that is not decoded");
             return self.record_refusal(topic, "ros_type");
         };
         let bytes = sample.payload().to_bytes().into_owned().into();
         let mut readings = VecDeque::new();
         if let Err(error) = self.decoder.decode(topic, kind, 0, &bytes, &mut readings) {
-            tracing::info!(topic, %error, "ros: refused");
+            tracing::info!(vehicle = %self.vehicle, topic, %error, "ros: refused");
             return self.record_refusal(topic, error.reason());
         }
         for reading in readings {
