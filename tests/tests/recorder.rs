@@ -14,6 +14,7 @@ use std::time::{Duration, Instant};
 
 use clearway::config::{Config, RecordedMaps};
 use clearway::ingest::queue::Reading;
+use clearway::record::mcap_reader::{McapReader, Message};
 use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::record::verify::verify;
 use clearway::server::{Running, Server, Setup};
@@ -99,6 +100,11 @@ async fn each_part_is_verifiable_alone_and_together_they_hold_everything() {
         let report = verify(&file).unwrap();
         assert!(report.is_good() && !report.cut && report.is_closed && report.unjudged == 0, "{part}: {report:?}");
         assert!(report.equal >= 3 * fixture::LAYERS, "{part}: {report:?}");
+        let is_timed = |message: Message| message.log_ns > 1_000_000_000_000_000_000;
+        assert!(
+            McapReader::open(&file).unwrap().all(|message| is_timed(message.unwrap())),
+            "{part}: a log time of 1970"
+        );
         let (of_part, maps_of_part) = contents(&file);
         events.extend(of_part);
         maps_of_part.into_iter().for_each(|map| assert!(maps.insert(map), "{part}: each map is in one part"));

@@ -311,8 +311,8 @@ async fn an_address_in_use_is_refused_and_the_old_recording_is_kept() {
 #[test]
 fn a_full_disk_ends_the_recording_and_maps_continue() {
     let folder = tempfile::tempdir().unwrap();
-    // No file of this process may grow beyond three megabytes, a few chunks; the write fails instead of the process.
-    let limited = "trap '' XFSZ; ulimit -f 6144; exec \"$0\" demo --seconds 4 --json --record \"$1/full.mcap\"";
+    // No file of this process may grow beyond 1.5 MiB, a few chunks; the write fails instead of the process.
+    let limited = "trap '' XFSZ; ulimit -f 3072; exec \"$0\" demo --seconds 4 --json --record \"$1/full.mcap\"";
     maps_continue_on_a_full_disk(std::process::Command::new("sh").args(["-c", limited]), folder.path(), "too large");
 }
 
@@ -320,15 +320,16 @@ fn a_full_disk_ends_the_recording_and_maps_continue() {
 #[cfg_attr(not(clearway_deploy), ignore = "needs the tools that .ci/run installs")]
 fn a_full_file_system_ends_the_recording_and_maps_continue() {
     let folder = tempfile::tempdir().unwrap();
-    // A file system in memory of three megabytes, which is gone with the process; so the recording is copied from it.
-    let mounted = "mkdir \"$1/small\" && mount -t tmpfs -o size=3m none \"$1/small\" || exit 9
+    // A file system in memory of 1.5 MiB, which is gone with the process; so the recording is copied from it. The
+    // network is another one too, because every demo has the same ports.
+    let mounted = "mkdir \"$1/small\" && mount -t tmpfs -o size=1536k none \"$1/small\" && ip link set lo up || exit 9
         \"$0\" demo --seconds 4 --json --record \"$1/small/full.mcap\"
         code=$?
         df --output=avail \"$1/small\" >&2
         cp \"$1\"/small/*.mcap \"$1\"
         exit $code";
     let mut command = std::process::Command::new("unshare");
-    command.args(["--mount", "sh", "-c", mounted]);
+    command.args(["--mount", "--net", "sh", "-c", mounted]);
     maps_continue_on_a_full_disk(&mut command, folder.path(), "No space left");
 }
 

@@ -16,7 +16,8 @@ use crate::store::location;
   clearway recordings --store /mnt/archive
   clearway recordings --store s3://fleet/clearway --vehicle car --from 2026-01-01T12:00:00Z --near 120,-35")]
 pub struct Options {
-    /// The store: a folder (also file:///FOLDER), or s3://BUCKET/PREFIX with the environment variables of the AWS tools.
+    /// The store: a folder, also as file:///FOLDER, or s3://BUCKET/PREFIX with the environment variables of the AWS
+    /// tools.
     #[arg(long, value_name = "URL", env = "CLEARWAY_STORE")]
     store: String,
     /// Only this vehicle.

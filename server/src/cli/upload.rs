@@ -28,7 +28,8 @@ Exit codes: 0 every part is confirmed, 2 a part is not, 3 wrong use.")]
 pub struct Options {
     /// The folder with the recordings (.mcap). One that is still being written is left out.
     folder: PathBuf,
-    /// The store: a folder (also file:///FOLDER), or s3://BUCKET/PREFIX with the environment variables of the AWS tools.
+    /// The store: a folder, also as file:///FOLDER, or s3://BUCKET/PREFIX with the environment variables of the AWS
+    /// tools.
     #[arg(long, value_name = "URL", env = "CLEARWAY_STORE")]
     store: String,
     /// Go on until Ctrl-C: send each further part once it is finished.

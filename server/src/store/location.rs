@@ -27,8 +27,8 @@ pub struct OpenError {
 }
 
 /// Opens a store to write: a folder by its path or as `file:///PATH`, which is created if it does not exist, or
-/// `s3://BUCKET/PREFIX`. The environment variables `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_REGION`, `AWS_ENDPOINT_URL` (of a
-/// compatible server) and `AWS_ALLOW_HTTP` are those of the AWS tools.
+/// `s3://BUCKET/PREFIX`. The environment variables `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_REGION`,
+/// `AWS_ENDPOINT_URL` (of a compatible server) and `AWS_ALLOW_HTTP` are those of the AWS tools.
 ///
 /// # Errors
 /// [`OpenError`] for another kind of URL, a folder that cannot be created, or variables that contradict each other. A

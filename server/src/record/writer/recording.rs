@@ -246,11 +246,11 @@ impl<F: Files> RecordingWriter<F> {
         match item {
             Item::Event(vehicle, event) => self.write_event(vehicle, &event, now),
             Item::Map(vehicle, map, _hop) => self.write_map(vehicle, &map, now),
-            Item::WarmUp { vehicle, part, first_event, repeated } => {
+            Item::WarmUp { vehicle, part, from_ns, first_event, repeated } => {
                 self.vehicles[vehicle].warm_up = Some(part);
                 let phase = v1::KeyframePhase::WarmUp.into();
                 let keyframe = v1::Keyframe { phase, first_event, ..v1::Keyframe::default() };
-                self.in_part(part, now, |part| part.file.write_keyframe(vehicle, &keyframe));
+                self.in_part(part, now, |part| part.file.write_keyframe(vehicle, from_ns, &keyframe));
                 let journal = self.counts.first_topic(vehicle);
                 for event in &repeated {
                     self.in_part(part, now, |part| part.write_event(vehicle, event, journal));
@@ -261,7 +261,7 @@ impl<F: Files> RecordingWriter<F> {
                 let (next_map, (epoch, newest_end_ns)) = (handover.next_map, handover.newest);
                 let (first_event, refused) = (self.vehicles[vehicle].next_event, handover.refused());
                 let keyframe = v1::Keyframe { phase, first_event, next_map, refused, epoch, newest_end_ns };
-                self.in_part(part, now, |part| part.file.write_keyframe(vehicle, &keyframe));
+                self.in_part(part, now, |part| part.file.write_keyframe(vehicle, 0, &keyframe));
                 let is_open = self.parts.iter().any(|open| open.number == part);
                 let state = &mut self.vehicles[vehicle];
                 (state.part, state.warm_up) = (Some(part).filter(|_| is_open), None);
