@@ -1,11 +1,16 @@
-//! Damaged copies of a recording, and whether the reader names the damage and loses no more than the damaged chunk.
+//! Damaged copies of a recording: whether the reader names the damage and loses no more than the damaged chunk, and
+//! whether the repaired copy has all the rest and verifies.
 
 use std::io::{Cursor, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::sync::Arc;
 
-use clearway::record::mcap_reader::{McapReader, Message};
+use clearway::record::mcap_reader::{McapReadError, McapReader, Message};
+use clearway::record::repair::{RepairError, repair};
+use clearway::record::verify::verify;
+use mcap::MAGIC;
 
 /// A whole recording.
 pub struct Original {
@@ -14,6 +19,10 @@ pub struct Original {
     messages: Vec<u32>,
     /// The messages of each chunk, as indices.
     chunks: Vec<Range<usize>>,
+    /// The end of each chunk in the file, in bytes.
+    ends: Vec<usize>,
+    /// The start of each record outside of chunks, in bytes.
+    records: Vec<usize>,
 }
 
 /// What was read of a damaged copy.
@@ -25,6 +34,8 @@ pub struct Outcome {
     pub lost: u64,
     /// Number of lost messages that the report names with their topic.
     pub named: u64,
+    /// True if the copy was repaired, and the new file is whole and verifies.
+    pub repaired: bool,
 }
 
 impl Original {
@@ -34,18 +45,20 @@ impl Original {
     /// If it is not whole.
     pub fn read(bytes: Vec<u8>) -> Result<Self, String> {
         let summary = mcap::Summary::read(&bytes).map_err(|error| error.to_string())?.ok_or("no summary")?;
-        let (mut indexes, mut chunks, mut from) = (summary.chunk_indexes.clone(), Vec::new(), 0);
+        let (mut indexes, mut chunks, mut ends, mut from) = (summary.chunk_indexes.clone(), Vec::new(), Vec::new(), 0);
         indexes.sort_by_key(|index| index.chunk_start_offset);
         for index in &indexes {
             let end = from + summary.stream_chunk(&bytes, index).map_err(|error| error.to_string())?.count();
             chunks.push(from..end);
+            ends.push((index.chunk_start_offset + index.chunk_length) as usize);
             from = end;
         }
+        let records = records(&bytes).into_iter().map(|(_, at)| at).collect();
         let bytes: Arc<[u8]> = bytes.into();
         let (messages, incomplete) = messages_of(reader(bytes.clone(), bytes.len())?)?;
         match incomplete {
             Some(incomplete) => Err(incomplete),
-            None => Ok(Self { bytes, messages, chunks }),
+            None => Ok(Self { bytes, messages, chunks, ends, records }),
         }
     }
 
@@ -59,24 +72,88 @@ impl Original {
         self.chunks.iter().filter(|chunk| !chunk.is_empty()).count()
     }
 
+    /// The bytes within `distance` of the start of a record, at most as many as the file has.
+    pub fn near_records(&self, distance: usize) -> Vec<usize> {
+        let near = |at: &usize| at.saturating_sub(distance)..(at + distance + 1).min(self.length());
+        let mut bytes: Vec<usize> = self.records.iter().flat_map(near).collect();
+        bytes.sort_unstable();
+        bytes.dedup();
+        bytes
+    }
+
+    /// The messages of the chunks that end within the first `length` bytes: what a cut must not cost.
+    fn before(&self, length: usize) -> &[u32] {
+        let whole = self.ends.iter().zip(&self.chunks).take_while(|(end, _)| **end <= length);
+        &self.messages[..whole.last().map_or(0, |(_, chunk)| chunk.end)]
+    }
+
     /// Reads the first `length` bytes.
     ///
     /// # Errors
-    /// If the cut is not named, or a whole chunk before it is lost.
+    /// If the cut is not named, or a message of a whole chunk before it is lost, or one is read that was not recorded.
     pub fn cut(&self, length: usize) -> Result<Outcome, String> {
         let read = match reader(self.bytes.clone(), length) {
             Ok(read) => read,
-            // Shorter than the magic bytes.
-            Err(_) if length < 8 => return Ok(Outcome { refused: true, ..Outcome::default() }),
+            Err(_) if length < MAGIC.len() => return Ok(Outcome { refused: true, ..Outcome::default() }),
             Err(error) => return Err(error),
         };
         let (messages, incomplete) = messages_of(read)?;
         incomplete.ok_or("the cut is not named")?;
-        let is_boundary = messages.is_empty() || self.chunks.iter().any(|chunk| chunk.end == messages.len());
-        if messages[..] != self.messages[..messages.len().min(self.messages.len())] || !is_boundary {
-            return Err("the messages before the cut are not those of whole chunks".into());
+        let expected = self.before(length);
+        if messages != expected {
+            return Err(format!("{} messages are read, and {} are before the cut", messages.len(), expected.len()));
         }
         Ok(Outcome { lost: (self.messages.len() - messages.len()) as u64, ..Outcome::default() })
+    }
+
+    /// Writes the first `length` bytes to a file in `folder`, repairs it, and verifies the repaired file.
+    ///
+    /// # Errors
+    /// As [`Original::cut`], of the repaired file; and if it is not whole or a map in it differs.
+    pub fn repair_cut(&self, length: usize, folder: &Path) -> Result<Outcome, String> {
+        let file = folder.join("cut.mcap");
+        std::fs::write(&file, &self.bytes[..length]).map_err(|error| error.to_string())?;
+        let Some(messages) = repaired(&file)? else {
+            return match self.before(length) {
+                [] => Ok(Outcome { refused: true, ..Outcome::default() }),
+                lost => Err(format!("{} messages are before the cut, and nothing is repaired", lost.len())),
+            };
+        };
+        if messages != self.before(length) {
+            return Err(format!("{} messages are repaired, and not those before the cut", messages.len()));
+        }
+        let lost = (self.messages.len() - messages.len()) as u64;
+        Ok(Outcome { lost, repaired: true, ..Outcome::default() })
+    }
+
+    /// Writes the first `length` bytes to a file in `folder`, and runs `info`, `verify` and `repair` of the program
+    /// `clearway` on it.
+    ///
+    /// # Errors
+    /// If a command ends with another exit code than it should, does not name the file, or panics.
+    pub fn cut_by_program(&self, length: usize, clearway: &Path, folder: &Path) -> Result<Outcome, String> {
+        let (file, repaired) = (folder.join("cut.mcap"), folder.join("repaired.mcap"));
+        std::fs::write(&file, &self.bytes[..length]).map_err(|error| error.to_string())?;
+        let run = |command: &str, files: &[&Path], expected: i32| {
+            let output = Command::new(clearway).arg(command).args(files).output().map_err(|error| error.to_string())?;
+            let said = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
+            let is_right = output.status.code() == Some(expected);
+            if is_right { Ok(said) } else { Err(format!("cut {length}: {command}: {}: {said}", output.status)) }
+        };
+        for command in ["info", "verify"] {
+            let said = run(command, &[&file], 2)?;
+            if !said.contains("cut.mcap") {
+                return Err(format!("cut {length}: {command} does not name the file: {said}"));
+            }
+        }
+        let kept = self.before(length).len();
+        run("repair", &[&file, &repaired], if kept > 0 { 1 } else { 2 })?;
+        if kept > 0 {
+            run("info", &[&repaired], 0)?;
+            run("verify", &[&repaired], 0)?;
+            std::fs::remove_file(&repaired).map_err(|error| error.to_string())?;
+        }
+        Ok(Outcome { lost: (self.messages.len() - kept) as u64, repaired: kept > 0, ..Outcome::default() })
     }
 
     /// Copies the recording to `file`.
@@ -114,20 +191,19 @@ impl Copy {
     }
 
     fn read(&self, original: &Original) -> Result<Outcome, String> {
+        let name = self.file.display().to_string();
         let mut reader = match McapReader::open(&self.file) {
             Ok(reader) => reader,
-            Err(error) if error.to_string().contains(&self.file.display().to_string()) => {
-                return Ok(Outcome { refused: true, ..Outcome::default() });
+            // Its first bytes, or the version in its metadata, are changed.
+            Err(error @ (McapReadError::NotMcap { .. } | McapReadError::Version { .. })) => {
+                let is_named = error.to_string().contains(&name);
+                let refused = Outcome { refused: true, ..Outcome::default() };
+                return if is_named { Ok(refused) } else { Err(format!("{error} does not name {name}")) };
             }
             Err(error) => return Err(error.to_string()),
         };
-        let mut messages = Vec::new();
-        for message in reader.by_ref() {
-            match message {
-                Ok(message) => messages.push(hash(&message)),
-                Err(_) => return Ok(Outcome { refused: true, ..Outcome::default() }),
-            }
-        }
+        let messages = reader.by_ref().map(|message| message.map(|message| hash(&message)));
+        let messages = messages.collect::<Result<Vec<_>, _>>().map_err(|error| error.to_string())?;
         reader.incomplete().ok_or("the change is not named")?;
         let lost = original.messages.len().checked_sub(messages.len()).ok_or("more messages than were recorded")?;
         let same = original.messages.iter().zip(&messages).take_while(|(was, is)| was == is).count();
@@ -142,8 +218,47 @@ impl Copy {
             ));
         }
         let named = reader.damages().iter().flat_map(|damage| damage.messages.values()).sum();
-        Ok(Outcome { refused: false, lost: lost as u64, named })
+        let is_repaired = match repaired(&self.file)? {
+            Some(kept) if kept != messages => return Err("the repaired file has other messages".into()),
+            kept => kept.is_some(),
+        };
+        Ok(Outcome { refused: false, lost: lost as u64, named, repaired: is_repaired })
     }
+}
+
+/// Repairs `file`, verifies the new file and removes it; returns its messages, or `None` if there is no message.
+///
+/// # Errors
+/// If a map in the new file differs, or it is not whole, or there is a new file although nothing was repaired.
+fn repaired(file: &Path) -> Result<Option<Vec<u32>>, String> {
+    let output = file.with_extension("repaired.mcap");
+    match repair(file, &output) {
+        Ok(_) => {}
+        Err(RepairError::Nothing { .. } | RepairError::Read(_)) if !output.exists() => return Ok(None),
+        Err(error) => return Err(format!("repair: {error}")),
+    }
+    let (messages, incomplete) = messages_of(McapReader::open(&output).map_err(|error| error.to_string())?)?;
+    // A repaired file whose configuration is lost has messages and no maps that could be made again.
+    let report = verify(&output).map_err(|error| error.to_string());
+    std::fs::remove_file(&output).map_err(|error| error.to_string())?;
+    match (incomplete, report) {
+        (Some(incomplete), _) => Err(format!("the repaired file is {incomplete}")),
+        (None, Ok(report)) if report.different > 0 => {
+            Err(format!("the repaired file does not verify: {}", report.differences[0]))
+        }
+        (None, Err(error)) if !error.contains("config") => Err(format!("the repaired file does not verify: {error}")),
+        (None, _) => Ok(Some(messages)),
+    }
+}
+
+/// The kind and the start of each record outside of chunks.
+pub fn records(bytes: &[u8]) -> Vec<(u8, usize)> {
+    let (mut at, mut found) = (MAGIC.len(), Vec::new());
+    while at + 9 <= bytes.len() {
+        found.push((bytes[at], at));
+        at += 9 + u64::from_le_bytes(bytes[at + 1..at + 9].try_into().expect("eight bytes")) as usize;
+    }
+    found
 }
 
 fn reader(bytes: Arc<[u8]>, length: usize) -> Result<McapReader, String> {

@@ -12,21 +12,26 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
 use clearway::config::{Recorder, SaveRule, Sender};
+use clearway::encode::EncodedMap;
+use clearway::ingest::queue::Reading;
 use clearway::record::mcap_file::{Disk, Header};
+use clearway::record::mcap_reader::McapReader;
 use clearway::record::reader::{RecordedMessage, RecordingReader};
 use clearway::record::verify::verify;
 use clearway::record::writer::{Files, RecordingWriter};
 use clearway::server::{Running, Server, Setup};
+use clearway::store::index::Entry;
+use clearway::traces::Traces;
 use clearway_lidar::model::Model;
 use clearway_mapping::config::SensorConfig;
 use clearway_mapping::event::{Body, Event};
-use clearway_mapping::pipeline::Pipeline;
+use clearway_mapping::pipeline::{Pipeline, layer_names};
 use clearway_proto::v1;
 use clearway_proto::v1::recording_service_client::RecordingServiceClient;
 use clearway_sim::scanner::ScannerConfig;
 use clearway_sim::scenes::flat;
 use clearway_sim::vehicle::SimulatedVehicle;
-use fixture::{Driving, config, until, within};
+use fixture::{Driving, config, readings, until, within};
 use tonic::transport::Channel;
 
 async fn service(running: &Running) -> RecordingServiceClient<Channel> {
@@ -126,7 +131,8 @@ async fn the_last_seconds_are_saved_when_one_of_two_sensors_is_lost() {
     }
 }
 
-/// A disk in memory that returns an error to every call while it is `failing`. Its files are whole as they are.
+/// A disk in memory that creates files, and returns an error to every other call while it is `failing`. Its files are
+/// whole as they are.
 #[derive(Clone, Default)]
 struct FailingDisk {
     failing: Arc<AtomicBool>,
@@ -147,9 +153,12 @@ impl Files for FailingDisk {
     type File = FailingFile;
 
     fn create(&mut self, part: u64) -> std::io::Result<FailingFile> {
-        self.check()?;
         self.files.lock().unwrap().insert(part, Vec::new());
         Ok(FailingFile(self.clone(), part))
+    }
+
+    fn discard(&mut self, part: u64) -> std::io::Result<()> {
+        self.files.lock().unwrap().remove(&part).map(drop).ok_or(std::io::ErrorKind::NotFound.into())
     }
 
     fn complete(&mut self, _: u64) -> std::io::Result<()> {
@@ -223,9 +232,89 @@ fn a_disk_that_fails_for_a_minute_costs_that_minute_and_a_warm_up_and_each_loss_
             recorded.extend(events(&file));
         }
     }
+    assert_eq!(disk.files.lock().unwrap().len(), 2, "an attempt that fails leaves no file");
     let missing = (0..1200).filter(|sequence| !recorded.contains(sequence)).collect::<Vec<u64>>();
     assert!((0..durable).all(|sequence| recorded.contains(&sequence)), "no durable event is lost: {missing:?}");
     let (first, last) = (missing[0], missing[missing.len() - 1]);
     assert!(first >= durable && (890..915).contains(&last), "missing from {first} to {last}");
     println!("lost {} of 1200 events: {first} to {last}; the disk failed from 300 to 899", missing.len());
+}
+
+#[test]
+fn of_what_a_slow_disk_does_not_take_each_topic_counts_the_same_live_and_in_the_file() {
+    let (config, disk) = (config(), FailingDisk::default());
+    let core = config.vehicles[0].core();
+    let options = Recorder { warm_up_ms: 500, queue: 100, ..Recorder::default() };
+    let mut pipeline = Pipeline::new(&core, vec![None]).unwrap();
+    let vehicles = vec![("car".into(), layer_names(&core.maps))];
+    let header = Header { vehicles, config: config.to_toml(), ..Header::default() };
+    let began = Instant::now();
+    let (mut writer, mut handles) = RecordingWriter::new(disk.clone(), &options, &header, false, began).unwrap();
+    let (counts, handle) = (writer.counts(), &mut handles[0]);
+    handle.set_config(core, vec![None]);
+    let (all, traces) = (readings(30), Traces::default());
+    let start_ns = all[0].arrival_ns;
+    for (sequence, Reading { arrival_ns, source, body }) in (0..).zip(all) {
+        let now = Duration::from_nanos((arrival_ns - start_ns) as u64);
+        let event = Event { sequence, arrival_ns, source, body };
+        handle.record_event(&event);
+        if let Ok(Some(map)) = pipeline.step(&event) {
+            let map = Arc::new(EncodedMap::new(map, "car".into(), 7, 300));
+            handle.record_map(&map, traces.hop(&map, "record", None));
+        }
+        handle.keep_up(&event, &mut pipeline);
+        // In the second second the disk takes one message of four.
+        let is_slow = (1000..2000).contains(&now.as_millis());
+        if !is_slow || sequence % 4 == 0 {
+            while writer.write_next(began + now) && !is_slow {}
+        }
+    }
+    drop(handles);
+    writer.finish();
+    let live = counts.topic_counts();
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("slow.mcap");
+    std::fs::write(&file, &disk.files.lock().unwrap()[&1]).unwrap();
+    let (mut messages, mut last) = (BTreeMap::<String, u64>::new(), None);
+    for message in McapReader::open(&file).unwrap() {
+        *messages.entry(message.unwrap().channel.topic.clone()).or_default() += 1;
+    }
+    for message in RecordingReader::open(&file).unwrap() {
+        if let RecordedMessage::Counts(counts) = message.unwrap() {
+            last = Some(counts);
+        }
+    }
+    let in_file = last.expect("the file ends with its counts");
+    assert!(in_file.closed && in_file.reason.contains("queue was full"), "{in_file:?}");
+    assert!(live.iter().all(|topic| topic.dropped > 0), "events and maps are lost: {live:?}");
+    assert_eq!(live.len(), in_file.topics.len());
+    for (live, in_file) in live.iter().zip(&in_file.topics) {
+        assert_eq!(live, in_file);
+        assert_eq!(live.offered, live.written + live.dropped, "{live:?}");
+        assert_eq!(messages[&live.topic], live.written, "{live:?}");
+    }
+    println!("{live:#?}");
+    let entries = Entry::of_part(&file, 0, 0).unwrap();
+    assert!(entries[0].faults.iter().any(|fault| fault.contains("dropped: the recorder's queue was full")));
+    let report = verify(&file).unwrap();
+    assert!(report.equal > 0 && report.dropped > 0 && !report.is_good(), "{report:?}");
+}
+
+#[test]
+fn a_part_without_a_message_gets_no_successor() {
+    let disk = FailingDisk::default();
+    let options = Recorder { part_s: 1, ..Recorder::default() };
+    let header = Header { vehicles: vec![("car".into(), vec![])], config: config().to_toml(), ..Header::default() };
+    let began = Instant::now();
+    let (mut writer, mut handles) = RecordingWriter::new(disk.clone(), &options, &header, false, began).unwrap();
+    let parts = || disk.files.lock().unwrap().len();
+    for second in 0..3600 {
+        writer.write_next(began + Duration::from_secs(second));
+    }
+    assert_eq!(parts(), 1, "an hour without data is one file");
+    handles[0].record_event(&Event { sequence: 0, arrival_ns: 1, source: 0, body: Body::End });
+    for second in 3600..3602 {
+        writer.write_next(began + Duration::from_secs(second));
+    }
+    assert_eq!(parts(), 2, "the time counts from the first message");
 }

@@ -11,7 +11,7 @@ use clearway::record::verify::verify;
 use clearway_mapping::pipeline::Pipeline;
 use clearway_proto::codec::Limits;
 use clearway_proto::map::decode_map;
-use clearway_tests::damage::{Original, rechunk};
+use clearway_tests::damage::{self, Original, rechunk};
 use clearway_tests::{run, workspace};
 use mcap::records::op;
 use proptest::prelude::*;
@@ -35,13 +35,7 @@ fn text(bytes: &[u8]) -> String {
 
 /// Position of each record of this kind outside of chunks.
 fn records(bytes: &[u8], kind: u8) -> Vec<usize> {
-    let (mut at, mut found) = (8, Vec::new());
-    while at + 9 <= bytes.len() {
-        let length = u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap());
-        found.extend((bytes[at] == kind).then_some(at));
-        at += 9 + length as usize;
-    }
-    found
+    damage::records(bytes).into_iter().filter(|(of, _)| *of == kind).map(|(_, at)| at).collect()
 }
 
 #[test]
@@ -77,12 +71,18 @@ fn the_golden_recording_is_read_by_every_version() {
 fn a_cut_at_any_byte_is_named_and_loses_no_whole_chunk() {
     let original = Original::read(in_chunks()).unwrap();
     assert!(original.chunks() > 5, "{} chunks", original.chunks());
-    // Every byte of the start and of the end, and a sample between them; `cuts_and_flips` cuts at every byte.
-    let length = original.length();
-    let cuts = (0..200).chain((200..length - 300).step_by(7919)).chain(length - 300..length);
-    for cut in cuts {
+    // Every byte around the records, and a sample between them; `cuts_and_flips` cuts at every byte.
+    let (length, near) = (original.length(), original.near_records(12));
+    for cut in (0..length).step_by(7919).chain(near) {
         original.cut(cut).unwrap_or_else(|error| panic!("cut after {cut} bytes: {error}"));
     }
+    let folder = tempfile::tempdir().unwrap();
+    let mut repaired = 0;
+    for cut in (0..length).step_by(7919) {
+        let outcome = original.repair_cut(cut, folder.path());
+        repaired += u64::from(outcome.unwrap_or_else(|error| panic!("cut after {cut} bytes: {error}")).repaired);
+    }
+    assert!(repaired > 20, "{repaired} repaired copies verify");
 }
 
 #[test]
@@ -131,6 +131,28 @@ fn a_damaged_chunk_costs_that_chunk_and_is_reported_by_topic_and_time() {
 }
 
 #[test]
+fn of_damage_over_two_chunks_the_file_says_what_is_lost_in_all() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("damaged.mcap");
+    let mut bytes = in_chunks();
+    let chunks = records(&bytes, op::CHUNK);
+    // From within one chunk, over its indexes, into the next one.
+    let (from, to) = (chunks[3] + 100, chunks[4] + 100);
+    bytes[from..to].fill(0);
+    std::fs::write(&file, &bytes).unwrap();
+    let mut reader = McapReader::open(&file).unwrap();
+    let lost = |topic: &str, read: &BTreeMap<String, u64>| {
+        let all = McapReader::open(&golden()).unwrap().filter(|of| of.as_ref().unwrap().channel.topic == topic).count();
+        all as u64 - read.get(topic).copied().unwrap_or(0)
+    };
+    let mut read = BTreeMap::<String, u64>::new();
+    reader.by_ref().for_each(|message| *read.entry(message.unwrap().channel.topic.clone()).or_default() += 1);
+    let said = reader.incomplete().unwrap();
+    let expected = format!("{} messages of /car/journal", lost("/car/journal", &read));
+    assert!(said.contains("lost in all, by its own count: ") && said.contains(&expected), "{expected}: {said}");
+}
+
+#[test]
 fn a_repaired_recording_is_whole_and_has_all_that_can_be_read() {
     let folder = tempfile::tempdir().unwrap();
     let (damaged, repaired) = (folder.path().join("damaged.mcap"), folder.path().join("repaired.mcap"));
@@ -153,6 +175,11 @@ fn a_repaired_recording_is_whole_and_has_all_that_can_be_read() {
     let all = McapReader::open(&golden()).unwrap().count();
     let kept = McapReader::open(&repaired).unwrap().count();
     assert!(kept < all && kept > all / 2, "{kept} of {all}");
+    // The damaged file ends with exit code 2; the new one is whole, and what is lost is said and is no difference.
+    let verified = clearway(&["verify", "repaired.mcap"]);
+    let said = text(&verified.stdout);
+    assert_eq!(verified.status.code(), Some(0), "{said}");
+    assert!(said.contains("what was lost in 2 places is no difference, the first: "), "{said}");
 
     let again = clearway(&["repair", "damaged.mcap", "repaired.mcap"]);
     assert_eq!(again.status.code(), Some(2));
@@ -176,6 +203,10 @@ fn an_unreadable_file_never_ends_with_success() {
         ("start.mcap", &bytes[..no_index]),
         ("wrong.mcap", &wrong_start),
     ];
+    std::fs::write(folder.path().join("text.mcap"), "no recording").unwrap();
+    let output = run(folder.path(), "clearway", &["repair", "text.mcap", "out.mcap"]);
+    assert_eq!(output.status.code(), Some(2));
+    assert!(text(&output.stderr).contains("text.mcap: not an MCAP file"), "{}", text(&output.stderr));
     for (name, bytes) in files {
         std::fs::write(folder.path().join(name), bytes).unwrap();
         for command in [

@@ -311,21 +311,35 @@ async fn an_address_in_use_is_refused_and_the_old_recording_is_kept() {
 #[test]
 fn a_full_disk_ends_the_recording_and_maps_continue() {
     let folder = tempfile::tempdir().unwrap();
-    let file = folder.path().join("full.mcap");
-    // No file of this process may grow beyond three megabytes, a few chunks; the write fails instead of the process.
-    let limited = "trap '' XFSZ; ulimit -f 6144; exec \"$0\" demo --seconds 4 --json --record \"$1\"";
-    let output = std::process::Command::new("sh")
-        .args(["-c", limited])
-        .arg(clearway_tests::binaries().join("clearway"))
-        .arg(&file)
-        .output()
-        .unwrap();
+    // No file of this process may grow beyond 1.5 MiB, a few chunks; the write fails instead of the process.
+    let limited = "trap '' XFSZ; ulimit -f 3072; exec \"$0\" demo --seconds 4 --json --record \"$1/full.mcap\"";
+    maps_continue_on_a_full_disk(std::process::Command::new("sh").args(["-c", limited]), folder.path(), "too large");
+}
+
+#[test]
+#[cfg_attr(not(clearway_deploy), ignore = "needs the tools that .ci/run installs")]
+fn a_full_file_system_ends_the_recording_and_maps_continue() {
+    let folder = tempfile::tempdir().unwrap();
+    // A file system in memory of 1.5 MiB, which is gone with the process; so the recording is copied from it. The
+    // network is another one too, because every demo has the same ports.
+    let mounted = "mkdir \"$1/small\" && mount -t tmpfs -o size=1536k none \"$1/small\" && ip link set lo up || exit 9
+        \"$0\" demo --seconds 4 --json --record \"$1/small/full.mcap\"
+        code=$?
+        df --output=avail \"$1/small\" >&2
+        cp \"$1\"/small/*.mcap \"$1\"
+        exit $code";
+    let mut command = std::process::Command::new("unshare");
+    command.args(["--mount", "--net", "sh", "-c", mounted]);
+    maps_continue_on_a_full_disk(&mut command, folder.path(), "No space left");
+}
+
+/// Runs the demo by `command`, which gets the program and a folder, and records to a disk that becomes full.
+fn maps_continue_on_a_full_disk(command: &mut std::process::Command, folder: &Path, reason: &str) {
+    let file = folder.join("full.mcap");
+    let output = command.arg(clearway_tests::binaries().join("clearway")).arg(folder).output().unwrap();
     let (said, complained) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(!output.status.success(), "an incomplete recording is no success");
-    assert!(
-        complained.contains("the recording is incomplete") && complained.contains("File too large"),
-        "{complained}"
-    );
+    assert!(complained.contains("the recording is incomplete") && complained.contains(reason), "{complained}");
     let seconds: Vec<serde_json::Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let maps: Vec<u64> = seconds.iter().map(|second| second["maps"].as_u64().unwrap()).collect();
     assert!(maps.len() > 1 && maps.last() > maps.first(), "maps are made after the disk has failed: {said}");

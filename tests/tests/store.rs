@@ -92,9 +92,19 @@ fn parts_are_found_in_a_folder_by_vehicle_time_place_and_faults() {
         assert_eq!(found(&[], &store, options), expected, "{options:?}");
     }
     assert_eq!(clearway(&[], &["recordings", "--store", &store, "--from", "today"]).status.code(), Some(3));
-    let unknown = clearway(&[], &["recordings", "--store", "ftp://a/b"]);
-    assert_eq!(unknown.status.code(), Some(2));
-    assert!(text(&unknown.stderr).contains("ftp:// is not known"), "{}", text(&unknown.stderr));
+    assert_eq!(found(&[], &format!("file://{store}"), &[]), 2);
+    let absent = folder.path().join("absent").display().to_string();
+    for (url, said) in [
+        ("ftp://a/b", "a folder, file:///FOLDER and s3://BUCKET/PREFIX are allowed"),
+        ("file://relative", "a folder, file:///FOLDER and s3://BUCKET/PREFIX are allowed"),
+        ("s3://", "the bucket is missing"),
+        (&absent, "there is no such folder"),
+    ] {
+        let output = clearway(&[], &["recordings", "--store", url]);
+        assert_eq!(output.status.code(), Some(2), "{url}");
+        assert!(text(&output.stderr).contains(said), "{}", text(&output.stderr));
+    }
+    assert!(!Path::new(&absent).exists(), "a search creates nothing");
 }
 
 #[tokio::test]

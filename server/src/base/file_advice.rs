@@ -15,7 +15,7 @@ pub fn advised(file: &Path, error: Error) -> Error {
         },
         ErrorKind::PermissionDenied => "permission denied; check its owner and its mode".into(),
         _ if file.is_dir() => "this is a folder; name a file".into(),
-        ErrorKind::AlreadyExists if file.exists() => {
+        ErrorKind::AlreadyExists if file.symlink_metadata().is_ok() => {
             "the file exists and is not overwritten; delete it, or name another file".into()
         }
         ErrorKind::AlreadyExists | ErrorKind::NotADirectory => {

@@ -232,9 +232,16 @@ impl<D: Disk> McapFile<D> {
         Ok(())
     }
 
-    /// Writes a keyframe of the vehicle with this index, with the log time of the newest event.
-    pub(super) fn write_keyframe(&mut self, vehicle: usize, keyframe: &v1::Keyframe) -> Result<(), McapError> {
+    /// Writes a keyframe of the vehicle with this index, with the log time of the newest event, but no earlier than
+    /// `least_ns`: a new file has no event yet.
+    pub(super) fn write_keyframe(
+        &mut self,
+        vehicle: usize,
+        least_ns: i64,
+        keyframe: &v1::Keyframe,
+    ) -> Result<(), McapError> {
         let channel = self.vehicles[vehicle].keyframes;
+        self.newest_ns = self.newest_ns.max(least_ns);
         self.write_message(channel, keyframe.first_event, self.newest_ns, &keyframe.encode_to_vec())
     }
 

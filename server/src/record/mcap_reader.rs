@@ -26,6 +26,9 @@ use super::mcap_summary;
 
 /// Version of the contents of our recordings, in their metadata. A recording without one has version 1.
 pub const FORMAT: u32 = 1;
+/// The name of the metadata that a repaired file has at each place at which a part of the damaged file is lost, and the
+/// key of what is lost there.
+pub(super) const REPAIR_METADATA: (&str, &str) = ("clearway-repair", "lost");
 /// The packages of the messages that this version reads.
 const PACKAGES: [&str; 1] = ["clearway.v1."];
 
@@ -153,7 +156,8 @@ pub enum McapReadError {
         source: std::io::Error,
     },
     /// The file does not start as an MCAP file does.
-    #[error("{}: not an MCAP file: it does not start with the magic bytes", file.display())]
+    #[error("{}: not an MCAP file: it does not start with the magic bytes; `clearway repair` reads a damaged one",
+        file.display())]
     NotMcap {
         /// The file.
         file: PathBuf,
@@ -186,11 +190,14 @@ pub struct McapReader {
     waiting: VecDeque<Record<'static>>,
     /// The first message, which opening the file has read.
     first: Option<Message>,
-    messages: u64,
     /// Number of messages of channels that no record describes.
     unknown: u64,
-    /// Number of messages by the file's own count.
-    stated: Option<u64>,
+    /// Number of messages by the file's own count, and by channel.
+    stated: Option<(u64, BTreeMap<u16, u64>)>,
+    /// Number of messages by channel.
+    read: BTreeMap<u16, u64>,
+    /// What a repair could not read, in file order.
+    repaired: Vec<String>,
     has_ended: bool,
 }
 
@@ -233,9 +240,10 @@ impl McapReader {
             header: Header::default(),
             waiting: VecDeque::new(),
             first: None,
-            messages: 0,
             unknown: 0,
             stated: None,
+            read: BTreeMap::new(),
+            repaired: Vec::new(),
             has_ended: false,
         }
     }
@@ -262,12 +270,11 @@ impl McapReader {
 
     /// The damaged parts so far.
     pub fn damages(&self) -> Vec<Damage> {
-        let topic = |id: &u16| self.channels.get(id).map_or_else(|| format!("channel {id}"), |of| of.topic.clone());
         let damage = |lost: &LostPart| Damage {
             bytes: lost.bytes,
             reason: lost.reason.clone(),
             log_ns: lost.log_ns,
-            messages: lost.messages.iter().map(|(id, count)| (topic(id), *count)).collect(),
+            messages: lost.messages.iter().map(|(id, count)| (self.topic(*id), *count)).collect(),
         };
         self.records.lost().iter().map(damage).collect()
     }
@@ -275,6 +282,12 @@ impl McapReader {
     /// Number of damaged parts so far.
     pub fn damage_count(&self) -> usize {
         self.records.lost().len()
+    }
+
+    /// What `clearway repair` could not read of the damaged file, if it wrote this one: the losses so far, in file
+    /// order. The file itself is whole.
+    pub fn repaired(&self) -> &[String] {
+        &self.repaired
     }
 
     /// How the file is incomplete: damaged, cut, or with fewer messages than it says. `None` for a complete file, and
@@ -290,17 +303,38 @@ impl McapReader {
             let first = if damages.len() == 1 { first.to_string() } else { format!("the first: {first}") };
             faults.push(format!("damaged in {places}, {first}"));
         }
+        faults.extend(self.faults_of_end());
+        (!faults.is_empty()).then(|| faults.join("; "))
+    }
+
+    /// What is wrong with the file beside its damaged parts; empty before the last message.
+    pub(super) fn faults_of_end(&self) -> Vec<String> {
+        let mut faults = Vec::new();
         if self.is_cut() {
             faults.push(format!("cut after {} bytes: the closing records are missing", self.bytes_read()));
         }
-        if self.unknown > 0 {
+        if self.has_ended && self.unknown > 0 {
             faults.push(format!("{} of channels that the file does not describe", counted(self.unknown, "message")));
         }
-        if let Some(stated) = self.stated.filter(|stated| damages.is_empty() && *stated != self.messages) {
-            let messages = counted(self.messages, "message");
-            faults.push(format!("has {messages}, and {stated} by its own count"));
+        let Some((stated, by_channel)) = self.stated.as_ref().filter(|_| self.has_ended) else { return faults };
+        let read: u64 = self.read.values().sum();
+        if self.damage_count() == 0 && *stated != read {
+            faults.push(format!("has {}, and {stated} by its own count", counted(read, "message")));
         }
-        (!faults.is_empty()).then(|| faults.join("; "))
+        let read_of = |id| self.read.get(id).copied().unwrap_or_default();
+        let lost = by_channel.iter().map(|(id, stated)| (*id, stated.saturating_sub(read_of(id))));
+        let lost: BTreeMap<u16, u64> = lost.filter(|(_, lost)| *lost > 0).collect();
+        // Damage over several chunks may have destroyed an index that counts their messages.
+        let named: u64 = self.records.lost().iter().flat_map(|part| part.messages.values()).sum();
+        if self.damage_count() > 0 && named < lost.values().sum() {
+            let lost = lost.iter().map(|(id, lost)| format!("{} of {}", counted(*lost, "message"), self.topic(*id)));
+            faults.push(format!("lost in all, by its own count: {}", lost.collect::<Vec<_>>().join(", ")));
+        }
+        faults
+    }
+
+    fn topic(&self, id: u16) -> String {
+        self.channels.get(&id).map_or_else(|| format!("channel {id}"), |of| of.topic.clone())
     }
 
     /// The names of the layers of all maps so far, in alphabetical order.
@@ -374,7 +408,7 @@ impl McapReader {
                 self.channels.insert(of.id, Arc::new(Channel { topic: of.topic.clone(), schema, content }));
             }
             Record::Message { header, .. } => {
-                self.messages += 1;
+                *self.read.entry(header.channel_id).or_default() += 1;
                 self.unknown += u64::from(!self.channels.contains_key(&header.channel_id));
             }
             Record::Metadata(metadata) if metadata.name == "clearway" => {
@@ -382,6 +416,9 @@ impl McapReader {
                 self.header.boot_id = boot_id.unwrap_or_default();
                 self.header.metadata.clone_from(&metadata.metadata);
                 self.check_format()?;
+            }
+            Record::Metadata(metadata) if metadata.name == REPAIR_METADATA.0 => {
+                self.repaired.extend(metadata.metadata.get(REPAIR_METADATA.1).cloned());
             }
             Record::Attachment { header, data, .. } => {
                 let text = String::from_utf8_lossy(data).into_owned();
@@ -391,7 +428,7 @@ impl McapReader {
                     self.header.calibrations.insert(header.name.clone(), text);
                 }
             }
-            Record::Statistics(statistics) => self.stated = Some(statistics.message_count),
+            Record::Statistics(of) => self.stated = Some((of.message_count, of.channel_message_counts.clone())),
             _ => {}
         }
         Ok(())

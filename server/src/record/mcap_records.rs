@@ -17,6 +17,8 @@ use super::chunk::{RECORD_BYTES_MAX, RECORD_HEAD_BYTES, decompress, parse, split
 const SEARCH_BYTES: usize = 1 << 20;
 /// Length of the fields of a chunk before its data, without the name of its compression.
 const CHUNK_FIELDS_BYTES: usize = 40;
+/// Least kind of the records that programs define for themselves.
+const PRIVATE: u8 = 0x80;
 /// Names of the compressions, as chunks have them.
 const COMPRESSIONS: [&[u8]; 3] = [b"", b"zstd", b"lz4"];
 
@@ -73,6 +75,8 @@ pub(super) struct McapRecords {
     has_chunks: bool,
     /// True while message indexes belong to the newest lost part.
     indexes_are_lost: bool,
+    /// The bytes of the newest record, if it is of a private kind. Message indexes behind it say that it was a chunk.
+    private: Option<(u64, u64)>,
     has_footer: bool,
     lost: Vec<LostPart>,
 }
@@ -92,6 +96,7 @@ impl McapRecords {
             any_start,
             has_chunks: false,
             indexes_are_lost: false,
+            private: None,
             has_footer: false,
             lost: Vec::new(),
         }
@@ -152,6 +157,9 @@ impl McapRecords {
             self.consume(MAGIC.len());
         } else if self.any_start {
             self.search("the file does not start with the magic bytes")?;
+            if self.section == Section::Ended {
+                return Err(RecordsError::NotMcap);
+            }
         } else {
             return Err(RecordsError::NotMcap);
         }
@@ -197,9 +205,14 @@ impl McapRecords {
                 } else {
                     self.consume(end);
                 }
+                let private = self.private.take();
                 if let Some(Record::MessageIndex(index)) = &record {
+                    private
+                        .into_iter()
+                        .for_each(|chunk| self.add_lost(chunk, &"a chunk has the kind of other records"));
                     self.add_index(index);
                 }
+                self.private = Some((from, self.offset)).filter(|_| opcode >= PRIVATE);
                 Ok(record)
             }
             Err((error, _)) if !self.head_at(end)? => {
@@ -390,7 +403,7 @@ fn head(bytes: &[u8]) -> (u8, Option<usize>) {
 
 /// True for the kinds of the specification and for private ones.
 fn is_opcode(opcode: u8) -> bool {
-    (op::HEADER..=op::DATA_END).contains(&opcode) || opcode >= 0x80
+    (op::HEADER..=op::DATA_END).contains(&opcode) || opcode >= PRIVATE
 }
 
 /// Parses a record, and refuses one whose length is not that of its fields, because its kind is damaged.

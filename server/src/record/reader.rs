@@ -147,9 +147,14 @@ impl RecordingReader {
         self.reader.damages()
     }
 
-    /// Number of damaged parts so far.
-    pub fn damage_count(&self) -> usize {
-        self.reader.damage_count()
+    /// What a repair could not read of the damaged file, if this one is repaired: the losses so far.
+    pub fn repaired(&self) -> &[String] {
+        self.reader.repaired()
+    }
+
+    /// Number of damaged parts so far, of this file and of the one from which it was repaired.
+    pub fn loss_count(&self) -> usize {
+        self.reader.damage_count() + self.repaired().len()
     }
 
     /// How the file is incomplete: damaged, cut, or with fewer messages than it says. `None` for a complete file, and

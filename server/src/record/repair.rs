@@ -10,11 +10,8 @@ use mcap::{Attachment, Compression, McapError, WriteOptions};
 use serde_json::{Value, json};
 
 use super::damage::Damage;
-use super::mcap_reader::{McapReadError, McapReader};
+use super::mcap_reader::{McapReadError, McapReader, REPAIR_METADATA};
 use crate::base::file_advice::advised;
-
-/// The name of the metadata that a repaired file has beside those of the damaged one.
-const METADATA: &str = "clearway-repair";
 
 /// What was recovered and what is lost.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -115,9 +112,15 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
         .create(BufWriter::new(file))
         .map_err(failed)?;
     let mut report = Report::default();
+    let mut damages = 0;
     // Ids of the damaged file -> ids of the new one.
     let (mut schemas, mut channels) = (BTreeMap::from([(0, 0)]), BTreeMap::new());
     while let Some(record) = reader.next_record()? {
+        if reader.damage_count() > damages {
+            let lost: Vec<String> = reader.damages()[damages..].iter().map(ToString::to_string).collect();
+            damages += lost.len();
+            writer.write_metadata(&lost_here(lost)).map_err(failed)?;
+        }
         let copied = match record {
             Record::Schema { header, data } => {
                 let id = writer.add_schema(&header.name, &header.encoding, &data);
@@ -149,14 +152,21 @@ fn copy(reader: &mut McapReader, file: File, output: &Path) -> Result<Report, Re
     if report.messages == 0 {
         return Err(RepairError::Nothing { file: reader.file().to_owned(), incomplete: report.incomplete });
     }
-    if let Some(incomplete) = &report.incomplete {
-        let metadata = BTreeMap::from([("lost".to_owned(), incomplete.clone())]);
-        writer.write_metadata(&Metadata { name: METADATA.into(), metadata }).map_err(failed)?;
+    let mut at_end: Vec<String> = report.damages[damages..].iter().map(ToString::to_string).collect();
+    at_end.extend(reader.faults_of_end());
+    if !at_end.is_empty() {
+        writer.write_metadata(&lost_here(at_end)).map_err(failed)?;
     }
     writer.finish().map_err(failed)?;
     let file = writer.into_inner().into_inner().map_err(|error| failed(McapError::Io(error.into_error())))?;
     file.sync_all().map_err(|error| failed(McapError::Io(error)))?;
     Ok(report)
+}
+
+/// The metadata at the place of a loss.
+fn lost_here(lost: Vec<String>) -> Metadata {
+    let (name, key) = REPAIR_METADATA;
+    Metadata { name: name.into(), metadata: BTreeMap::from([(key.to_owned(), lost.join("; "))]) }
 }
 
 /// Reads the new file from its start to its end.

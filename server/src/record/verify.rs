@@ -61,6 +61,9 @@ pub struct Report {
     pub damages: Vec<Damage>,
     /// How the file is incomplete; `None` if it is whole.
     pub incomplete: Option<String>,
+    /// What `clearway repair` could not read of the damaged file, if it wrote this one. The events and maps that are
+    /// lost there are no differences.
+    pub repaired: Vec<String>,
     /// The first differences.
     pub differences: Vec<Difference>,
     /// Number of all differences.
@@ -142,7 +145,7 @@ impl Report {
             "cells": self.cells, "recorded_maps": self.recorded.as_str(),
             "cut": self.cut, "beyond_cut": self.beyond_cut, "unjudged": self.unjudged, "incomplete": self.incomplete,
             "dropped": self.dropped, "dropped_because": self.dropped_because,
-            "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(),
+            "damage": self.damages.iter().map(Damage::to_json).collect::<Vec<_>>(), "repaired": self.repaired,
             "differences": self.differences.iter().map(Difference::to_json).collect::<Vec<_>>(),
         })
     }
@@ -242,11 +245,10 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
         });
     }
     let mut report = Report { recorded: recording.maps(), ..Report::default() };
-    let mut damages = 0;
+    let mut losses = 0;
     while let Some(message) = recording.next() {
-        let damages_before = std::mem::replace(&mut damages, recording.damage_count());
-        let follows_damage = damages > damages_before;
-        if follows_damage {
+        let losses_before = std::mem::replace(&mut losses, recording.loss_count());
+        if losses > losses_before {
             for replay in &mut replays {
                 // The damaged part may have had the maps of the newest event.
                 replay.lacks_events = true;
@@ -257,7 +259,7 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
             RecordedMessage::Event { vehicle, event } => {
                 let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else { continue };
                 report.events += 1;
-                replay.step(&event, boot_id, &mut report, recording.damage_count() > 0);
+                replay.step(&event, boot_id, &mut report, recording.loss_count() > 0);
             }
             RecordedMessage::Keyframe { vehicle, keyframe } => {
                 let Some(replay) = replays.iter_mut().find(|r| *r.name == *vehicle) else { continue };
@@ -291,13 +293,14 @@ pub fn verify(file: &Path) -> Result<Report, VerifyError> {
     report.cut = recording.is_cut();
     report.damages = recording.damages();
     report.incomplete = recording.incomplete();
+    report.repaired = recording.repaired().to_vec();
     for replay in &replays {
         // The recorder writes an event before its map, so a cut can remove only the map of the last event.
         let tail = replay.computed.last_key_value().map(|((sequence, _), _)| *sequence);
         for (sequence, layer) in replay.computed.keys() {
             if report.cut && Some(*sequence) == tail {
                 report.beyond_cut += 1;
-            } else if replay.lacks_events || !report.damages.is_empty() {
+            } else if replay.lacks_events || recording.loss_count() > 0 {
                 report.unjudged += 1;
             } else {
                 report.add(&replay.name, *sequence, layer, DifferenceKind::Missing);

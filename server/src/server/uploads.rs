@@ -1,6 +1,6 @@
 //! Finished parts of the recording -> the store of the configuration, confirmed, while the server runs.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -9,89 +9,197 @@ use object_store::ObjectStore;
 
 use crate::config::Store;
 use crate::record::writer::{RecorderControl, RecorderCounts};
-use crate::store::{location, upload};
+use crate::store::location;
+use crate::store::upload::{self, Prepared, UploadError};
 
-/// Time between two looks for finished parts, and between two attempts with a store that is away. Ours: a part is
-/// minutes long.
+/// Time between two looks for finished parts, and the first between two attempts with a store that is away; each
+/// further one is twice as long. Ours: a part is minutes long.
 const PERIOD: Duration = Duration::from_secs(2);
+/// Longest time between two attempts. Ours: a store that was away for an hour gets its parts a minute after its return.
+const PERIOD_MAX: Duration = Duration::from_secs(60);
 
-/// A file as it was when the store confirmed it: path, length, time of the newest change.
+/// A file as it was when it was read: path, length, time of the newest change.
 type Seen = (PathBuf, u64, SystemTime);
+
+/// What an attempt to store all parts found wrong.
+enum Problem {
+    /// A part or the configuration: the reason.
+    Part(String),
+    /// The store: the reason.
+    Store(String),
+}
+
+/// The parts of the folder, and the store.
+struct Uploads {
+    options: Store,
+    control: RecorderControl,
+    counts: Arc<RecorderCounts>,
+    store: Option<Arc<dyn ObjectStore>>,
+    /// Parts that the store has confirmed, and those without an event or a map.
+    settled: BTreeSet<Seen>,
+    /// Parts that wait, as they were read: a store that is away costs no second reading.
+    prepared: BTreeMap<Seen, Prepared>,
+}
 
 /// Sends each finished part to the store until the task is aborted. What the store does not confirm stays, and is sent
 /// again.
 pub(super) async fn upload_finished(options: Store, control: RecorderControl, counts: Arc<RecorderCounts>) {
-    let mut store = None;
-    let mut confirmed = BTreeSet::new();
-    let mut every = tokio::time::interval(PERIOD);
+    let mut uploads = Uploads::new(options, control, counts);
+    let mut period = PERIOD;
     loop {
-        every.tick().await;
-        let outcome = upload_all(&options, &control, &counts, &mut store, &mut confirmed).await;
-        if let Err(reason) = &outcome {
-            tracing::warn!(store = options.url, reason, "parts wait for the store");
+        let problem = uploads.upload_all().await.err();
+        period = period_after(period, problem.as_ref());
+        let reason = problem.map(|(Problem::Part(reason) | Problem::Store(reason))| reason);
+        if let Some(reason) = &reason {
+            tracing::warn!(store = uploads.options.url, reason, "parts wait for the store");
         }
-        counts.set_store_problem(outcome.err().unwrap_or_default());
+        uploads.counts.set_store_problem(reason.unwrap_or_default());
+        tokio::time::sleep(period).await;
     }
 }
 
-/// Sends all parts that wait.
-///
-/// # Errors
-/// Why the first of them is not confirmed, as a text.
-async fn upload_all(
-    options: &Store,
-    control: &RecorderControl,
-    counts: &RecorderCounts,
-    store: &mut Option<Arc<dyn ObjectStore>>,
-    confirmed: &mut BTreeSet<Seen>,
-) -> Result<(), String> {
-    let finished = control.list().into_iter().filter(|part| !part.is_unfinished);
-    let parts: Vec<PathBuf> = finished.map(|part| part.file.into()).collect();
-    let mut waiting = Vec::new();
-    for part in parts {
-        let Some(seen) = seen(&part) else { continue };
-        if confirmed.contains(&seen) {
-            continue;
-        }
-        // A restart finds the confirmation of an earlier run.
-        if upload::is_confirmed(&part) {
-            confirmed.insert(seen);
-        } else {
-            waiting.push((part, seen));
-        }
+/// The time until the next attempt.
+fn period_after(period: Duration, problem: Option<&Problem>) -> Duration {
+    match problem {
+        Some(Problem::Store(_)) => (2 * period).min(PERIOD_MAX),
+        Some(Problem::Part(_)) | None => PERIOD,
     }
-    let mut left = waiting.len() as u64;
-    counts.set_waiting_for_store(left);
-    let mut outcome = Ok(());
-    for (part, seen) in waiting {
-        let opened = match store {
-            Some(store) => store.clone(),
-            None => location::open(&options.url).map_err(|error| {
-                counts.add_store_failure();
-                error.to_string()
-            })?,
-        };
-        *store = Some(opened.clone());
-        match upload::upload(&*opened, &part).await {
-            Ok(_) => {
-                left -= 1;
-                counts.add_confirmed(left);
-                confirmed.insert(seen);
-                tracing::info!(part = %part.display(), "the store has confirmed a part");
-                if options.delete {
-                    upload::delete_confirmed(&part).map_err(|error| format!("{}: {error}", part.display()))?;
+}
+
+impl Uploads {
+    fn new(options: Store, control: RecorderControl, counts: Arc<RecorderCounts>) -> Self {
+        let (store, settled, prepared) = (None, BTreeSet::new(), BTreeMap::new());
+        Self { options, control, counts, store, settled, prepared }
+    }
+
+    /// Sends the parts that wait, up to the first that the store refuses.
+    ///
+    /// # Errors
+    /// Why the first of them is not confirmed.
+    async fn upload_all(&mut self) -> Result<(), Problem> {
+        let waiting = self.waiting();
+        let mut left = waiting.len() as u64;
+        self.counts.set_waiting_for_store(left);
+        let mut outcome = Ok(());
+        for (part, seen) in waiting {
+            match self.upload(&part, &seen).await {
+                Ok(is_new) => {
+                    left -= 1;
+                    if is_new {
+                        self.counts.add_confirmed(left);
+                        tracing::info!(part = %part.display(), "the store has confirmed a part");
+                    }
+                    self.counts.set_waiting_for_store(left);
+                    self.prepared.remove(&seen);
+                    self.settled.insert(seen);
+                }
+                Err(problem) => {
+                    self.counts.add_store_failure();
+                    let is_away = matches!(problem, Problem::Store(_));
+                    outcome = outcome.and(Err(problem));
+                    if is_away {
+                        break;
+                    }
                 }
             }
-            Err(error) => {
-                counts.add_store_failure();
-                outcome = outcome.and(Err(error.to_string()));
+        }
+        outcome
+    }
+
+    /// The finished parts that are not settled.
+    fn waiting(&mut self) -> Vec<(PathBuf, Seen)> {
+        let mut waiting = Vec::new();
+        for part in self.control.list().into_iter().filter(|part| !part.is_unfinished) {
+            let part = PathBuf::from(part.file);
+            let Some(seen) = seen(&part).filter(|seen| !self.settled.contains(seen)) else { continue };
+            // A restart finds the confirmation of an earlier run.
+            if upload::is_confirmed(&part) {
+                self.settled.insert(seen);
+            } else {
+                waiting.push((part, seen));
             }
         }
+        waiting
     }
-    outcome
+
+    /// Sends one part. Returns false if it has nothing that could be found again; then it stays where it is.
+    async fn upload(&mut self, part: &Path, seen: &Seen) -> Result<bool, Problem> {
+        let of_part = |error: UploadError| Problem::Part(error.to_string());
+        if !self.prepared.contains_key(seen) {
+            match upload::prepare(part) {
+                Ok(prepared) => _ = self.prepared.insert(seen.clone(), prepared),
+                Err(UploadError::Nothing { .. }) => return Ok(false),
+                Err(error) => return Err(of_part(error)),
+            }
+        }
+        let store = match &self.store {
+            Some(store) => store.clone(),
+            None => location::open(&self.options.url).map_err(|error| Problem::Store(error.to_string()))?,
+        };
+        self.store = Some(store.clone());
+        upload::upload_prepared(&*store, part, &self.prepared[seen]).await.map_err(|error| match error {
+            UploadError::Store { .. } | UploadError::Differs { .. } => Problem::Store(error.to_string()),
+            error => of_part(error),
+        })?;
+        if self.options.delete {
+            upload::delete_confirmed(part).map_err(|error| Problem::Part(format!("{}: {error}", part.display())))?;
+        }
+        Ok(true)
+    }
 }
 
 fn seen(part: &Path) -> Option<Seen> {
     let metadata = part.metadata().ok()?;
     Some((part.to_owned(), metadata.len(), metadata.modified().ok()?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Recorder as Options;
+    use crate::record::mcap_file::Header;
+    use crate::record::writer::Recorder;
+
+    #[tokio::test]
+    async fn a_store_that_vanishes_for_an_hour_costs_an_attempt_a_minute_and_then_gets_every_part() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/golden/drive.mcap");
+        let add = |part: u64| _ = std::fs::copy(golden, at(&format!("car-1.part-{part:04}.mcap"))).unwrap();
+        let options = Options { file: at("car.mcap"), ..Options::default() };
+        let (recorder, handles) = Recorder::start(&options, &Header::default(), false).unwrap();
+        let counts = recorder.counts();
+        let store = Store { url: at("store").display().to_string(), delete: false };
+        let mut uploads = Uploads::new(store, recorder.control(), counts.clone());
+        add(1);
+        assert!(uploads.upload_all().await.is_ok());
+        assert_eq!(counts.to_proto().store_confirmed, 1);
+        // The store vanishes: its folder is a file now.
+        std::fs::rename(at("store"), at("kept")).unwrap();
+        std::fs::write(at("store"), "").unwrap();
+        (2..=4).for_each(add);
+        let (mut passed, mut period) = (Duration::ZERO, PERIOD);
+        while passed < Duration::from_secs(3600) {
+            let problem = uploads.upload_all().await.err();
+            assert!(matches!(problem, Some(Problem::Store(_))));
+            period = period_after(period, problem.as_ref());
+            passed += period;
+        }
+        let away = counts.to_proto();
+        println!("{} attempts in an hour without the store", away.store_failures);
+        assert_eq!((away.store_confirmed, away.store_waiting), (1, 3), "{away:?}");
+        assert!((60..70).contains(&away.store_failures), "{away:?}");
+        assert_eq!(uploads.prepared.len(), 1, "one part is read, once");
+        std::fs::remove_file(at("store")).unwrap();
+        std::fs::rename(at("kept"), at("store")).unwrap();
+        assert!(uploads.upload_all().await.is_ok());
+        assert_eq!((counts.to_proto().store_confirmed, uploads.prepared.len()), (4, 0));
+        // A part without an event has nothing that could be found again: it stays, and nothing waits for it.
+        drop(handles);
+        recorder.finish().unwrap();
+        assert!(uploads.upload_all().await.is_ok());
+        let end = counts.to_proto();
+        assert_eq!((end.store_confirmed, end.store_waiting), (4, 0), "{end:?}");
+        assert!(at("car.mcap").exists());
+    }
 }

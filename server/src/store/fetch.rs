@@ -25,7 +25,7 @@ pub async fn list(url: &str) -> Result<Vec<String>> {
         return Ok(vec![url.to_owned()]);
     }
     let (root, prefix) = split(url);
-    let store = location::open(&root)?;
+    let store = location::open_existing(&root)?;
     let found: Vec<_> = store.list(Some(&prefix)).try_collect().await.with_context(|| url.to_owned())?;
     let keys = found.into_iter().map(|object| object.location).filter(|key| key.as_ref().ends_with(".mcap"));
     let mut urls: Vec<String> = keys.map(|key| format!("{root}/{key}")).collect();
@@ -39,7 +39,7 @@ pub async fn list(url: &str) -> Result<Vec<String>> {
 /// If the store has no such recording or does not answer, or the copy cannot be written.
 pub async fn fetch(url: &str) -> Result<NamedTempFile> {
     let (root, key) = split(url);
-    let mut content = location::open(&root)?.get(&key).await.with_context(|| url.to_owned())?.into_stream();
+    let mut content = location::open_existing(&root)?.get(&key).await.with_context(|| url.to_owned())?.into_stream();
     let mut copy = NamedTempFile::with_suffix(".mcap").context("a copy of a recording in a store")?;
     while let Some(bytes) = content.try_next().await.with_context(|| url.to_owned())? {
         copy.write_all(&bytes).with_context(|| format!("copy {url} to {}", copy.path().display()))?;

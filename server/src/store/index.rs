@@ -6,9 +6,11 @@ use std::path::Path;
 use clearway_proto::v1;
 use futures::TryStreamExt;
 use object_store::{ObjectStore, ObjectStoreExt, path::Path as Key};
+use prost::Message as _;
 use serde::{Deserialize, Serialize};
 
-use crate::record::mcap_reader::{McapReadError, McapReader};
+use crate::base::counted::counted;
+use crate::record::mcap_reader::{Content, McapReadError, McapReader};
 
 /// Edge length of the cells that an entry has for the places of its vehicle, in metres; ours.
 pub const CELL_M: f64 = 25.0;
@@ -71,9 +73,12 @@ impl Entry {
     /// [`McapReadError`] if the part is not a recording.
     pub fn of_part(file: &Path, bytes: u64, crc32: u32) -> Result<Vec<Self>, McapReadError> {
         let mut reader = McapReader::open(file)?;
-        let mut entries: BTreeMap<String, Self> = BTreeMap::new();
+        let (mut entries, mut counts) = (BTreeMap::<String, Self>::new(), v1::RecordingCounts::default());
         for message in reader.by_ref() {
             let message = message?;
+            if message.channel.content == Content::Counts {
+                counts = v1::RecordingCounts::decode(message.data.clone()).unwrap_or(counts);
+            }
             let Some(vehicle) = message.vehicle() else { continue };
             let entry = entries.entry(vehicle.to_owned()).or_insert_with(|| Self {
                 part: String::new(),
@@ -104,6 +109,12 @@ impl Entry {
         for entry in entries.values_mut() {
             entry.part = format!("parts/{from_ns:020}-{crc32:08x}.mcap");
             entry.faults.extend(reader.incomplete().map(|reason| format!("file: {reason}")));
+            let of_vehicle = format!("/{}/", entry.vehicle);
+            let dropped = counts.topics.iter().filter(|of| of.topic.starts_with(&of_vehicle)).map(|of| of.dropped);
+            let dropped = Some(dropped.sum()).filter(|dropped| *dropped > 0);
+            let lost = |dropped| format!("recorder: {} dropped: {}", counted(dropped, "message"), counts.reason);
+            entry.faults.extend(dropped.map(lost));
+            entry.faults.extend(reader.repaired().iter().map(|lost| format!("repaired file: {lost}")));
         }
         Ok(entries.into_values().collect())
     }

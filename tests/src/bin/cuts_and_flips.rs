@@ -1,7 +1,9 @@
 //! Cuts a recording at many bytes and changes many of its bits, and judges what is read of each copy.
 //!
-//! `cargo run --release -p clearway-tests --bin cuts_and_flips -- drive.mcap --flips 10000` cuts at every byte; the
-//! exit code is 1 if damage is not named, costs more than its chunk, or causes a panic.
+//! `cargo run --release -p clearway-tests --bin cuts_and_flips -- drive.mcap --flips 10000` cuts at every byte, repairs
+//! every 499th cut and every changed copy, and verifies what was repaired; the exit code is 1 if damage is not named,
+//! costs more than its chunk, or causes a panic, or if a repaired copy lacks what can be read or does not verify. With
+//! `--clearway PROGRAM` that program does the same with every 4999th cut, and its exit codes are judged.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -12,6 +14,7 @@ use std::time::Instant;
 
 use clap::Parser;
 use clearway_tests::damage::{Original, Outcome, rechunk};
+use tempfile::TempDir;
 
 /// Cuts a recording at many bytes and changes many of its bits.
 #[derive(Parser)]
@@ -21,6 +24,15 @@ struct Arguments {
     /// Cut at every so many bytes.
     #[arg(long, default_value_t = 1)]
     cut_step: usize,
+    /// Repair and verify at every so many bytes, and at each start of a record.
+    #[arg(long, default_value_t = 499)]
+    repair_step: usize,
+    /// Run `info`, `verify` and `repair` of this program on every so many bytes' cut.
+    #[arg(long)]
+    clearway: Option<PathBuf>,
+    /// The bytes between two cuts that --clearway gets.
+    #[arg(long, default_value_t = 4999)]
+    clearway_step: usize,
     /// Number of changed bits.
     #[arg(long, default_value_t = 10_000)]
     flips: usize,
@@ -49,7 +61,20 @@ fn main() -> ExitCode {
         let original = &original;
         move |index| original.cut(index * arguments.cut_step)
     });
-    let folder = tempfile::tempdir().expect("a folder");
+    let mut repairs: Vec<usize> = (0..original.length()).step_by(arguments.repair_step).collect();
+    repairs.extend(original.near_records(0));
+    let is_good = judge("repaired cuts", repairs.len(), arguments.threads, || {
+        let (original, repairs, folder) = (&original, &repairs, tempfile::tempdir().expect("a folder"));
+        move |index| original.repair_cut(repairs[index], folder.path())
+    }) && is_good;
+    let is_good = arguments.clearway.as_ref().is_none_or(|clearway| {
+        let cuts = original.length().div_ceil(arguments.clearway_step);
+        judge("cuts read by the program", cuts, arguments.threads, || {
+            let (original, folder) = (&original, tempfile::tempdir().expect("a folder"));
+            move |index| original.cut_by_program(index * arguments.clearway_step, clearway, folder.path())
+        })
+    }) && is_good;
+    let folder = TempDir::new().expect("a folder");
     let copies = AtomicUsize::new(0);
     let is_good = judge("flips", arguments.flips, arguments.threads, || {
         let copy = folder.path().join(format!("{}.mcap", copies.fetch_add(1, Ordering::Relaxed)));
@@ -90,6 +115,7 @@ fn judge<J: FnMut(usize) -> Result<Outcome, String>>(
                                 u64::from(!outcome.refused && outcome.lost == 0);
                             *counts.entry("lost messages").or_default() += outcome.lost;
                             *counts.entry("of them named by topic").or_default() += outcome.named.min(outcome.lost);
+                            *counts.entry("repaired and verified").or_default() += u64::from(outcome.repaired);
                         }
                         Err(failure) => failures.push(format!("{index}: {failure}")),
                     }

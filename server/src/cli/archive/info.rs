@@ -48,7 +48,7 @@ pub fn run(options: &Options) -> Result<Exit> {
     let extension = file.extension().and_then(|extension| extension.to_str()).unwrap_or("");
     let document = match extension {
         "bin" | "pcd" => scan_file(file),
-        _ if start.starts_with(b"\x89MCAP") || start == b"SQLite f" => recording(file),
+        _ if extension == "mcap" || start.starts_with(b"\x89MCAP") || start == b"SQLite f" => recording(file),
         _ => capture(file),
     }
     .with_context(|| file.display().to_string())?;
@@ -150,6 +150,7 @@ fn recording(file: &Path) -> Result<Value> {
         "complete": faults.is_empty(),
         "state": if faults.is_empty() { "complete".to_owned() } else { faults.join("; ") },
         "damage": damage,
+        "repaired": recording.repaired(),
         "duration_s": span.map(|(first, last)| rounded((last - first) as f64 * 1e-9)),
         "run": header.metadata,
         "maps": vehicles,

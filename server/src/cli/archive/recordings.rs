@@ -16,7 +16,8 @@ use crate::store::location;
   clearway recordings --store /mnt/archive
   clearway recordings --store s3://fleet/clearway --vehicle car --from 2026-01-01T12:00:00Z --near 120,-35")]
 pub struct Options {
-    /// The store: a folder, or s3://BUCKET/PREFIX with the environment variables of the AWS tools.
+    /// The store: a folder, also as file:///FOLDER, or s3://BUCKET/PREFIX with the environment variables of the AWS
+    /// tools.
     #[arg(long, value_name = "URL", env = "CLEARWAY_STORE")]
     store: String,
     /// Only this vehicle.
@@ -54,7 +55,7 @@ pub fn run(options: &Options) -> Result<Exit> {
         near: options.near.map(|(x, y)| (x, y, options.within)),
         with_faults: options.faults,
     };
-    let store = location::open(&options.store)?;
+    let store = location::open_existing(&options.store)?;
     let Found { entries, unreadable } = block_on(async { Ok(search(&*store, &wanted).await?) })?;
     if options.json {
         print_line(&format!("{:#}", json!(entries)))?;

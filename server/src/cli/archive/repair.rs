@@ -22,7 +22,7 @@ Example:
   clearway repair damaged.mcap repaired.mcap"
 )]
 pub struct Options {
-    /// The damaged file (MCAP, of any program).
+    /// The damaged file: MCAP of any program, or a ROS 2 bag in sqlite.
     input: PathBuf,
     /// The new file.
     output: PathBuf,

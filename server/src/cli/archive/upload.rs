@@ -3,13 +3,15 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use object_store::ObjectStore;
 
+use crate::base::file_advice::advised;
 use crate::cli::shared::exit::Exit;
 use crate::cli::shared::output::{block_on, counted, print_line, stop_signal};
-use crate::store::{location, upload};
+use crate::store::location;
+use crate::store::upload::{self, UploadError};
 
 /// Time between two looks into the folder.
 const SCAN_PERIOD: Duration = Duration::from_secs(5);
@@ -26,7 +28,8 @@ Exit codes: 0 every part is confirmed, 2 a part is not, 3 wrong use.")]
 pub struct Options {
     /// The folder with the recordings (.mcap). One that is still being written is left out.
     folder: PathBuf,
-    /// The store: a folder, or s3://BUCKET/PREFIX with the environment variables of the AWS tools.
+    /// The store: a folder, also as file:///FOLDER, or s3://BUCKET/PREFIX with the environment variables of the AWS
+    /// tools.
     #[arg(long, value_name = "URL", env = "CLEARWAY_STORE")]
     store: String,
     /// Go on until Ctrl-C: send each further part once it is finished.
@@ -47,6 +50,8 @@ pub fn run(options: &Options) -> Result<Exit> {
 }
 
 async fn send(options: &Options) -> Result<Exit> {
+    // A folder that is not there is an error before the store's is made.
+    parts(&options.folder)?;
     let store = location::open(&options.store)?;
     if !options.follow {
         let unconfirmed = send_all(options, &*store).await?;
@@ -65,7 +70,7 @@ async fn send(options: &Options) -> Result<Exit> {
 }
 
 fn parts(folder: &Path) -> Result<Vec<PathBuf>> {
-    upload::unconfirmed(folder).with_context(|| folder.display().to_string())
+    upload::unconfirmed(folder).map_err(|error| anyhow!("{}: {}", folder.display(), advised(folder, error)))
 }
 
 /// Sends every finished part; returns the number of those that are not confirmed.
@@ -80,6 +85,7 @@ async fn send_all(options: &Options, store: &dyn ObjectStore) -> Result<u64> {
                     upload::delete_confirmed(&part).with_context(|| part.display().to_string())?;
                 }
             }
+            Err(error @ UploadError::Nothing { .. }) => eprintln!("clearway: not sent, and kept: {error}"),
             Err(error) => {
                 failed += 1;
                 eprintln!("clearway: not confirmed, and kept: {error}");

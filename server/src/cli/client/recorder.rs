@@ -71,7 +71,8 @@ async fn send(Options { server, request }: Options) -> Result<()> {
     let v1::RecordingResponse { status, files } = answer.map_err(refused)?.into_inner();
     let status = status.unwrap_or_default();
     let reason = if status.reason.is_empty() { String::new() } else { format!(": {}", status.reason) };
-    print_line(&format!("{} {}, part {}{reason}", status.state, status.file, status.part))?;
+    let file = if status.file.is_empty() { String::new() } else { format!(" {}", status.file) };
+    print_line(&format!("{}{file}, part {}{reason}", status.state, status.part))?;
     for (vehicle, events) in &status.durable_events {
         print_line(&format!("  {vehicle}: events below {events} are on the disk"))?;
     }

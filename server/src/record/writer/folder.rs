@@ -48,6 +48,15 @@ pub trait Files: Send {
     /// [`io::Error`] if it exists or the disk fails.
     fn create(&mut self, part: u64) -> io::Result<Self::File>;
 
+    /// Deletes the file of a part in which nothing was recorded.
+    ///
+    /// # Errors
+    /// [`io::Error`] if the disk fails, or keeps every file.
+    fn discard(&mut self, part: u64) -> io::Result<()> {
+        let _ = part;
+        Err(ErrorKind::Unsupported.into())
+    }
+
     /// Gives a closed part its name.
     ///
     /// # Errors
@@ -206,6 +215,10 @@ impl Files for Folder {
         }?;
         self.sync_names()?;
         Ok(file)
+    }
+
+    fn discard(&mut self, part: u64) -> io::Result<()> {
+        fs::remove_file(self.path(part))
     }
 
     fn complete(&mut self, part: u64) -> io::Result<()> {

@@ -27,14 +27,19 @@ const STAMPS_NS_MAX: u64 = 20_000_000;
 /// A handover takes place after this many warm-up times in any case, also if the stamps differ.
 const WARM_UPS_MAX: i64 = 3;
 
+/// Time without a loss after which a new pipeline starts, ns. Ours: making one takes as long as a map, so a queue that
+/// is full again and again must not cost the vehicle its maps.
+const AFTER_LOSS_NS: u64 = 1_000_000_000;
+
 /// One element of the recorder's queue.
 pub(super) enum Item {
     /// An event.
     Event(usize, Event),
     /// A map, and the hop that ends when it is written.
     Map(usize, Arc<EncodedMap>, Hop),
-    /// A new pipeline starts for this part, with the event of this sequence as the first that is not repeated.
-    WarmUp { vehicle: usize, part: u64, first_event: u64, repeated: Vec<Event> },
+    /// A new pipeline starts for this part at this time (ns since the Unix epoch), with the event of this sequence as
+    /// the first that is not repeated.
+    WarmUp { vehicle: usize, part: u64, from_ns: i64, first_event: u64, repeated: Vec<Event> },
     /// From here on the vehicle's events and maps belong to this part.
     Begin { vehicle: usize, part: u64, handover: Handover },
     /// Messages of this vehicle that did not fit into the queue before this item: topic, number.
@@ -92,8 +97,8 @@ pub struct RecordingHandle {
     part: Option<u64>,
     /// Sequence of the next event, and arrival of the newest one, in ns.
     next_event: (u64, i64),
-    /// True if the part lacks an event since its last keyframe.
-    has_gap: bool,
+    /// Arrival of the newest event that the part lacks since its last keyframe, ns.
+    gap_ns: Option<i64>,
     /// Messages that did not fit into the queue since the last item in it, by topic.
     dropped: Vec<u64>,
     /// The configuration of new pipelines; without it there are no keyframes.
@@ -123,7 +128,7 @@ impl RecordingHandle {
             warm_up_time,
             part,
             next_event: (0, 0),
-            has_gap: false,
+            gap_ns: None,
             dropped,
             config: None,
             in_force: Vec::new(),
@@ -151,7 +156,7 @@ impl RecordingHandle {
             if !self.push(Item::Event(self.vehicle, event.clone())) {
                 self.drop_message(topic);
                 // A new pipeline that the file cannot follow is of no use.
-                (self.has_gap, self.warm_up) = (true, None);
+                (self.gap_ns, self.warm_up) = (Some(event.arrival_ns), None);
             }
         }
         self.keep_in_force(event);
@@ -207,7 +212,7 @@ impl RecordingHandle {
         if self.push(Item::Begin { vehicle, part, handover: handover.clone() }) {
             warm_up.pipeline.take_over(handover);
             *own = warm_up.pipeline;
-            (self.part, self.has_gap) = (Some(part), false);
+            (self.part, self.gap_ns) = (Some(part), None);
         } else {
             self.warm_up = Some(warm_up);
         }
@@ -218,16 +223,17 @@ impl RecordingHandle {
     fn follow(&mut self, first_event: u64, from_ns: i64) {
         self.leave_if_stopped();
         let wanted = self.wanted.load(Ordering::Acquire);
-        let is_needed = wanted > 0 && (self.part != Some(wanted) || self.has_gap);
+        let is_needed = wanted > 0 && (self.part != Some(wanted) || self.gap_ns.is_some());
         let is_under_way = self.warm_up.as_ref().is_some_and(|warm_up| warm_up.part == wanted);
-        if !is_needed || is_under_way {
+        let is_soon = self.gap_ns.is_some_and(|gap_ns| from_ns.abs_diff(gap_ns) < AFTER_LOSS_NS);
+        if !is_needed || is_under_way || is_soon || self.config.is_none() {
             return;
         }
-        let Some((config, calibrations)) = &self.config else { return };
-        let Ok(mut pipeline) = Pipeline::new(config, calibrations.clone()) else { return };
         let (vehicle, repeated) = (self.vehicle, self.in_force.clone());
-        let warm_up = Item::WarmUp { vehicle, part: wanted, first_event, repeated };
+        let warm_up = Item::WarmUp { vehicle, part: wanted, from_ns, first_event, repeated };
         if self.push(warm_up) {
+            let Some((config, calibrations)) = &self.config else { return };
+            let Ok(mut pipeline) = Pipeline::new(config, calibrations.clone()) else { return };
             for event in &self.in_force {
                 // Refused now as it was before.
                 let _ = pipeline.step(event);

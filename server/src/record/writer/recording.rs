@@ -176,10 +176,11 @@ impl<F: Files> RecordingWriter<F> {
             self.retry_at = None;
             self.begin_or_fail(now);
         }
+        // The time of a part counts from its first message, so that no series of empty parts is written.
+        self.parts.iter_mut().filter(|part| part.topics.iter().all(|of| of.0 == 0)).for_each(|part| part.began = now);
         let is_due = self.parts.front().is_some_and(|part| {
-            let is_long = self.options.part_mb > 0 && part.file.bytes() >= self.options.part_mb << 20;
-            let time = Duration::from_secs(self.options.part_s);
-            is_long || (!time.is_zero() && now.saturating_duration_since(part.began) >= time)
+            let (mb, s, age) = (self.options.part_mb, self.options.part_s, now.saturating_duration_since(part.began));
+            (mb > 0 && part.file.bytes() >= mb << 20) || (s > 0 && age >= Duration::from_secs(s))
         });
         if is_due && self.parts.len() == 1 && !self.waits && !self.is_stopped {
             self.begin_or_fail(now);
@@ -199,8 +200,7 @@ impl<F: Files> RecordingWriter<F> {
             Command::Start => return Err("the recorder is not stopped".to_owned()),
             Command::Stop if self.is_stopped => return Err("the recorder is stopped already".to_owned()),
             Command::Stop => {
-                self.is_stopped = true;
-                self.retry_at = None;
+                (self.is_stopped, self.retry_at) = (true, None);
                 self.wanted.store(0, Ordering::Release);
                 self.close_left(now);
             }
@@ -246,11 +246,11 @@ impl<F: Files> RecordingWriter<F> {
         match item {
             Item::Event(vehicle, event) => self.write_event(vehicle, &event, now),
             Item::Map(vehicle, map, _hop) => self.write_map(vehicle, &map, now),
-            Item::WarmUp { vehicle, part, first_event, repeated } => {
+            Item::WarmUp { vehicle, part, from_ns, first_event, repeated } => {
                 self.vehicles[vehicle].warm_up = Some(part);
                 let phase = v1::KeyframePhase::WarmUp.into();
                 let keyframe = v1::Keyframe { phase, first_event, ..v1::Keyframe::default() };
-                self.in_part(part, now, |part| part.file.write_keyframe(vehicle, &keyframe));
+                self.in_part(part, now, |part| part.file.write_keyframe(vehicle, from_ns, &keyframe));
                 let journal = self.counts.first_topic(vehicle);
                 for event in &repeated {
                     self.in_part(part, now, |part| part.write_event(vehicle, event, journal));
@@ -261,7 +261,7 @@ impl<F: Files> RecordingWriter<F> {
                 let (next_map, (epoch, newest_end_ns)) = (handover.next_map, handover.newest);
                 let (first_event, refused) = (self.vehicles[vehicle].next_event, handover.refused());
                 let keyframe = v1::Keyframe { phase, first_event, next_map, refused, epoch, newest_end_ns };
-                self.in_part(part, now, |part| part.file.write_keyframe(vehicle, &keyframe));
+                self.in_part(part, now, |part| part.file.write_keyframe(vehicle, 0, &keyframe));
                 let is_open = self.parts.iter().any(|open| open.number == part);
                 let state = &mut self.vehicles[vehicle];
                 (state.part, state.warm_up) = (Some(part).filter(|_| is_open), None);
@@ -388,12 +388,13 @@ impl<F: Files> RecordingWriter<F> {
         let path = self.files.path(number);
         let create = |source| RecordError::Create { file: path.clone(), source };
         let disk = self.files.create(number).map_err(create)?;
-        // A file that was created exists, also if its header cannot be written.
-        self.newest_part = number;
         let written = McapFile::create(disk, &self.options, &self.header, number);
+        // A file without a whole header is of no use; once it is deleted, its number is free again.
+        let is_free = written.is_err() && self.files.discard(number).is_ok();
+        self.newest_part = if is_free { self.newest_part } else { number };
         let file = written.map_err(|source| RecordError::Write { file: path.clone(), source })?;
-        let topics = vec![(0, 0); self.counts.topics().len()];
-        let unsynced = vec![0; topics.len()];
+        let count = self.counts.topics().len();
+        let (topics, unsynced) = (vec![(0, 0); count], vec![0; count]);
         self.parts.push_back(Part { number, file, began: now, topics, unsynced, has_loss: false });
         self.counts.set_file(path.display().to_string(), number);
         self.wanted.store(number, Ordering::Release);

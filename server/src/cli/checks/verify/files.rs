@@ -33,6 +33,7 @@ impl FromStr for Shard {
 pub fn find(given: &[String], shard: Option<Shard>) -> Result<Vec<PathBuf>> {
     let mut files = BTreeSet::new();
     for text in given {
+        let text = text.strip_prefix("file://").unwrap_or(text);
         if is_url(text) {
             files.extend(in_store(text)?);
             continue;

@@ -18,14 +18,29 @@ pub fn reason(outcome: &Outcome) -> String {
                 Some(first) => format!("{}: {first}", counted(report.different, "difference")),
                 None if report.events == 0 => "no event, so nothing is verified".to_owned(),
                 None if report.recorded == RecordedMaps::None => "the events are whole; no map is recorded".to_owned(),
+                None if report.maps + report.equal == 0 => "the events are whole; no map follows from them".to_owned(),
                 None => "equal".to_owned(),
             };
             let unjudged = match report.unjudged {
                 0 => String::new(),
                 layers => format!("; {} after missing events cannot be judged", counted(layers, "layer")),
             };
+            let dropped = match report.dropped {
+                0 => String::new(),
+                messages => {
+                    let lost = counted(messages, "message");
+                    format!("; the recorder has dropped {lost}, the first of {}", report.dropped_because)
+                }
+            };
+            let repaired = match &report.repaired[..] {
+                [] => String::new(),
+                [first, ..] => {
+                    let places = counted(report.repaired.len() as u64, "place");
+                    format!("; repaired: what was lost in {places} is no difference, the first: {first}")
+                }
+            };
             let incomplete = report.incomplete.iter().map(|how| format!("; the file is {how}"));
-            result + &unjudged + &incomplete.collect::<String>()
+            result + &unjudged + &dropped + &repaired + &incomplete.collect::<String>()
         }
         Outcome::Compared(comparison) => {
             let result = if comparison.is_equal() { "equal".to_owned() } else { first_change(comparison) };
