@@ -33,8 +33,9 @@ const REPORT_TIMEOUT: Duration = Duration::from_secs(10);
 /// Most refusals kept until they are read. If there are more, the oldest are dropped and counted.
 const REFUSALS_MAX: usize = 4096;
 
-/// Function that gives one observation to a transport.
-pub(crate) type SendObservation = Box<dyn FnMut(v1::Observation) -> BoxFuture<'static, Result<(), ClientError>> + Send>;
+/// Function that gives one observation to a transport. It is `Sync`, so that the futures of an [`Ingester`] are `Send`.
+pub(crate) type SendObservation =
+    Box<dyn FnMut(v1::Observation) -> BoxFuture<'static, Result<(), ClientError>> + Send + Sync>;
 
 /// Sender of one vehicle's observations, over gRPC ([`Client::ingest`](crate::Client::ingest)) or zenoh
 /// (`ZenohClient::ingest`).

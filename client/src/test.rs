@@ -28,6 +28,8 @@ pub struct Replay {
     pub grpc: String,
     /// Address of the page, a URL; empty if it is not served.
     pub page: String,
+    /// Endpoints of zenoh, separated by commas, as `ZenohClient::connect` takes them; empty if it is not served.
+    pub zenoh: String,
 }
 
 /// Why a replay did not start.
@@ -109,7 +111,7 @@ impl Replay {
             .stderr(fs::File::create(&log).map_err(file(&log))?)
             .spawn()
             .map_err(|source| ReplayError::Command { command, source })?;
-        let mut replay = Self { server, folder, grpc: String::new(), page: String::new() };
+        let mut replay = Self { server, folder, grpc: String::new(), page: String::new(), zenoh: String::new() };
         let began = Instant::now();
         while !ready.exists() {
             if let Ok(Some(status)) = replay.server.try_wait() {
@@ -126,6 +128,8 @@ impl Replay {
             serde_json::from_str(&text).map_err(|error| file(&ready)(std::io::Error::other(error)))?;
         let address = |name: &str| addresses[name].as_str().unwrap_or_default().to_owned();
         (replay.grpc, replay.page) = (address("grpc"), address("page"));
+        let endpoints = addresses["zenoh"].as_array().into_iter().flatten().filter_map(|endpoint| endpoint.as_str());
+        replay.zenoh = endpoints.collect::<Vec<_>>().join(",");
         Ok(replay)
     }
 

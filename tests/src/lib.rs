@@ -7,6 +7,7 @@ use std::sync::OnceLock;
 
 pub mod attack;
 pub mod damage;
+pub mod digests;
 pub mod simulation;
 
 #[cfg(feature = "siege")]

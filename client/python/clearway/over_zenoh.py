@@ -156,8 +156,10 @@ def watch(
     def close() -> None:
         atexit.unregister(close)
         session.close()
+        # The garbage collector may call this from one of them.
         for thread in threads:
-            thread.join(_TIMEOUT_S)
+            if thread is not threading.current_thread():
+                thread.join(_TIMEOUT_S)
 
     # A thread that returns from zenoh while Python shuts down would abort the process.
     atexit.register(close)

@@ -64,6 +64,8 @@ class Replay:
         self.grpc: str = addresses["grpc"]
         #: Address of the page, a URL; None if it is not served.
         self.page: str | None = addresses["page"]
+        #: Address of zenoh for `clearway.watch`, zenoh:ENDPOINT; None if it is not served.
+        self.zenoh: str | None = next((f"zenoh:{endpoint}" for endpoint in addresses["zenoh"]), None)
 
     def watch(self, **selection: Any) -> clearway.MapStream:
         """Streams the newest map; the arguments are those of `clearway.watch`."""

@@ -42,7 +42,8 @@ pub struct Comparison {
     pub incomplete: Option<String>,
     /// What changed, by vehicle and layer.
     pub layers: BTreeMap<(String, String), LayerChange>,
-    /// The maps with the greatest share of changed cells, greatest first.
+    /// The maps with the greatest share of changed cells: that of each layer, greatest first, then the second of each
+    /// layer, and so on.
     pub worst: Vec<MapChange>,
 }
 
@@ -184,7 +185,8 @@ impl MapChange {
 /// vehicles or sensors than the recording, [`CompareError::NoMaps`] if two recordings are compared and one has no maps,
 /// [`CompareError::Config`] if a configuration is invalid, [`CompareError::Map`] if a map cannot be decoded.
 pub fn compare(before: &Path, after: &After<'_>, worst: usize) -> Result<Comparison, CompareError> {
-    let mut pairs = Pairs { waiting: BTreeMap::new(), worst, comparison: Comparison::default() };
+    let mut pairs =
+        Pairs { waiting: BTreeMap::new(), worst, changed_most: BTreeMap::new(), comparison: Comparison::default() };
     let mut recording = RecordingReader::open(before)?;
     match after {
         After::Config(config, tables) => {
@@ -325,7 +327,10 @@ struct OneLayer {
 struct Pairs {
     /// By vehicle and layer: the maps of each side in the order of their stamps.
     waiting: BTreeMap<(String, String), [VecDeque<OneLayer>; 2]>,
+    /// Number of maps that changed most to list.
     worst: usize,
+    /// By vehicle and layer: the maps that changed most, greatest share first.
+    changed_most: BTreeMap<(String, String), Vec<MapChange>>,
     comparison: Comparison,
 }
 
@@ -365,7 +370,7 @@ impl Pairs {
             Some(counterpart) => {
                 let (was, is) = if side == AFTER { (counterpart, map) } else { (map, counterpart) };
                 let one = self.comparison.layers.entry(key.clone()).or_default().add(&key.0, was, is);
-                keep_worst(&mut self.comparison.worst, one, self.worst);
+                keep_worst(self.changed_most.entry(key).or_default(), one, self.worst);
             }
         }
         Ok(stamp_ns)
@@ -377,6 +382,11 @@ impl Pairs {
             change.count_alone(BEFORE, before.len() as u64);
             change.count_alone(AFTER, after.len() as u64);
         }
+        // Layers have cells of other sizes, and of a changed one there is something to see.
+        let ranked = self.changed_most.into_values().flat_map(|maps| maps.into_iter().enumerate());
+        let mut ranked: Vec<_> = ranked.collect();
+        ranked.sort_by(|(a, one), (b, other)| a.cmp(b).then(other.share().total_cmp(&one.share())));
+        self.comparison.worst = ranked.into_iter().map(|(_, map)| map).take(self.worst).collect();
         self.comparison
     }
 }

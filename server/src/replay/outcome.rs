@@ -1,5 +1,7 @@
 //! How a replay ends: at its end, stopped, or with an error.
 
+use std::time::Duration;
+
 use super::timeline::Remarks;
 use crate::ingest::files::FilesError;
 use crate::ingest::queue::QueueClosedError;
@@ -9,6 +11,8 @@ use crate::ingest::queue::QueueClosedError;
 pub struct Played {
     /// False if it was stopped before the end of its range.
     pub reached_end: bool,
+    /// Greatest time by which an event was replayed too late: the machine was too slow for the rate.
+    pub behind_max: Duration,
     /// What the files have beside their readings; empty if their end was not reached.
     pub remarks: Remarks,
 }

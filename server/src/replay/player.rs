@@ -28,6 +28,8 @@ const POLL: Duration = Duration::from_millis(20);
 const REPORT: Duration = Duration::from_millis(100);
 /// Waits shorter than this are slept exactly; tokio's timers have a millisecond.
 const EXACT: Duration = Duration::from_millis(2);
+/// Time behind the drive from which a replay says so. Ours: the default validity of a map.
+pub const BEHIND_MAX: Duration = Duration::from_millis(300);
 /// Longest wait for readers to leave after the end, if the replay ends there. Ours: they have been told.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -84,6 +86,8 @@ pub struct Player {
     /// Maps until the pause; `None` outside a step.
     step: Option<u32>,
     awaited: Option<AwaitedMap>,
+    /// Greatest time by which an event was too late.
+    behind_max: Duration,
     runtime: Handle,
 }
 
@@ -101,6 +105,7 @@ impl Player {
     ) -> Result<Self, FilesError> {
         let state = input.state.borrow().clone();
         let readings = timeline.start(0)?;
+        vehicles.iter().for_each(|vehicle| vehicle.engine.status.set_replay_phase(state.phase()));
         let copies = vehicles.iter().filter(|_| options.is_served);
         let copies = copies.map(|vehicle| (vehicle.engine.pipeline.clone(), vehicle.queue.position())).collect();
         Ok(Self {
@@ -117,6 +122,7 @@ impl Player {
             newest_ns: None,
             step: None,
             awaited: None,
+            behind_max: Duration::ZERO,
             runtime,
         })
     }
@@ -131,7 +137,7 @@ impl Player {
             Err(Stopped) => self.state.phase() == ReplayPhase::Ended,
         };
         let remarks = self.readings.end().map(std::mem::take).unwrap_or_default();
-        Ok(Played { reached_end: played, remarks })
+        Ok(Played { reached_end: played, behind_max: self.behind_max, remarks })
     }
 
     fn play(&mut self) -> Result<Result<(), Stopped>, PlayError> {
@@ -195,7 +201,9 @@ impl Player {
             self.clock.restart();
         }
         let due = self.step.is_none().then(|| self.clock.due(at_ns, now_ns())).flatten();
-        let left = due.map_or(Duration::ZERO, |due| due.saturating_duration_since(Instant::now()));
+        let now = Instant::now();
+        let left = due.map_or(Duration::ZERO, |due| due.saturating_duration_since(now));
+        self.note_delay(due.map_or(Duration::ZERO, |due| now.saturating_duration_since(due)));
         let has_command = !self.input.commands.is_empty();
         if left > EXACT || has_command {
             // The last part is slept exactly when this is called again.
@@ -207,6 +215,14 @@ impl Player {
         std::thread::sleep(left);
         self.take_next()?;
         Ok(Ok(()))
+    }
+
+    /// Remembers the greatest delay, and logs once that there is one.
+    fn note_delay(&mut self, behind: Duration) {
+        if self.behind_max <= BEHIND_MAX && behind > BEHIND_MAX {
+            tracing::warn!("this machine is too slow for the rate of the replay: its maps are late");
+        }
+        self.behind_max = self.behind_max.max(behind);
     }
 
     /// Waits for one command until a time, and applies it.
@@ -439,8 +455,7 @@ impl Player {
         self.clock.restart();
         for vehicle in &self.vehicles {
             vehicle.engine.update_status();
-            let ended = phase == ReplayPhase::Ended;
-            vehicle.engine.status.replay_ended.send_if_modified(|was| std::mem::replace(was, ended) != ended);
+            vehicle.engine.status.set_replay_phase(phase);
         }
         tracing::debug!(?phase, jumps = %counted(self.state.jumps, "jump"), "replay");
         self.report();

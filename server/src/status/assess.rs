@@ -124,7 +124,7 @@ impl VehicleStatus {
             map_age: (changing.maps > 0).then_some(age),
             validity: changing.validity,
             has_recorded_stamps: changing.has_recorded_stamps,
-            is_replay_ended: *self.replay_ended.borrow(),
+            replay: changing.replay.map(|(phase, at)| (phase, up.saturating_sub(at))),
             sensors: changing.sensors.iter().map(|sensor| sensor_facts(sensor, &changing, up)).collect(),
             loss,
             recorder_problem: self.recorder_problem(),

@@ -5,6 +5,8 @@
 
 use std::time::Duration;
 
+use clearway_proto::v1::ReplayPhase;
+
 /// Time without a packet after which a sensor is silent. Ours: ten revolutions of the slowest sensor, and more than two
 /// scans a second need.
 pub const SILENT_AFTER: Duration = Duration::from_secs(2);
@@ -63,8 +65,8 @@ pub struct Facts {
     pub validity: Duration,
     /// True if the maps carry the stamps of a recording, so that their age is not counted by the server's clock.
     pub has_recorded_stamps: bool,
-    /// True if a replay stands at its end.
-    pub is_replay_ended: bool,
+    /// Phase of the replay that makes the maps, and since when it lasts; `None` if they are made live.
+    pub replay: Option<(ReplayPhase, Duration)>,
     /// The sensors.
     pub sensors: Vec<SensorFacts>,
     /// Share of the packets of the last 10 s that were lost or refused, 0 to 1.
@@ -177,9 +179,24 @@ fn findings(facts: &Facts, is_lossy: bool) -> Vec<Finding> {
     findings
 }
 
+/// Why a replay stands still; `None` if it plays, or nothing is replayed.
+fn standing(facts: &Facts) -> Option<&'static str> {
+    match facts.replay?.0 {
+        ReplayPhase::Waiting => Some("the replay waits for readers"),
+        ReplayPhase::Paused => Some("the replay is paused"),
+        ReplayPhase::Ended => Some("the replay has ended"),
+        ReplayPhase::Playing | ReplayPhase::Unspecified => None,
+    }
+}
+
+/// True if packets and maps are expected: of live sensors, and of a replay that has played for a while.
+fn expects_data(facts: &Facts) -> bool {
+    facts.replay.is_none_or(|(phase, since)| phase == ReplayPhase::Playing && since > SILENT_AFTER)
+}
+
 /// Sensors of which nothing arrives. One of several is a warning, because the others make maps.
 fn silence(facts: &Facts, add: &mut impl FnMut(State, String)) {
-    if facts.is_replay_ended {
+    if !expects_data(facts) {
         return;
     }
     if facts.sensors.iter().all(|sensor| sensor.silent.is_none() && !sensor.is_refused) {
@@ -206,16 +223,20 @@ fn staleness(facts: &Facts, add: &mut impl FnMut(State, String)) {
     if !facts.makes_maps {
         return;
     }
-    if facts.is_replay_ended {
-        add(State::Warn, "the replay has ended".to_owned());
+    if let Some(why) = standing(facts) {
+        add(State::Warn, why.to_owned());
     }
     let Some(age) = facts.map_age else {
-        return add(State::Error, "no map yet".to_owned());
+        if expects_data(facts) {
+            add(State::Error, "no map yet".to_owned());
+        }
+        return;
     };
     if facts.has_recorded_stamps {
         add(State::Warn, "maps are replayed with the stamps of the recording: readers call them stale".to_owned());
     }
-    if age > facts.validity {
+    // A map with the stamp of the recording does not age while the replay stands still.
+    if age > facts.validity && (expects_data(facts) || !facts.has_recorded_stamps) {
         let is_long = age > facts.validity + STALE_ERROR_AFTER;
         let state = if is_long { State::Error } else { State::Warn };
         add(state, format!("the newest map is {} old, and valid for {}", seconds(age), seconds(facts.validity)));
@@ -358,6 +379,27 @@ mod tests {
         let mut health = Health::default();
         assert!(!health.update(&facts));
         assert_eq!(health.state(), State::Error);
+    }
+
+    #[test]
+    fn a_replay_that_stands_still_is_a_warning_until_its_maps_are_stale_as_live() {
+        let never = SensorFacts { silent: None, completeness: None, ..sensor("top", 0) };
+        let in_phase = |phase, since_ms| Some((phase, ms(since_ms)));
+        let replay = in_phase(ReplayPhase::Waiting, 9000);
+        let waiting = Facts { replay, sensors: vec![never], map_age: None, ..fine() };
+        assert_eq!(words(&waiting), [("warn", "the replay waits for readers".to_owned())]);
+        let begun = Facts { replay: in_phase(ReplayPhase::Playing, 100), ..waiting };
+        assert_eq!(words(&begun), []);
+        let replay = in_phase(ReplayPhase::Paused, 9000);
+        let paused = Facts { replay, map_age: Some(ms(9000)), sensors: vec![sensor("top", 9000)], ..fine() };
+        let old = "the newest map is 9.0 s old, and valid for 0.3 s".to_owned();
+        assert_eq!(words(&paused), [("error", old), ("warn", "the replay is paused".to_owned())]);
+        let as_recorded = Facts { has_recorded_stamps: true, ..paused };
+        assert!(words(&as_recorded).iter().all(|(state, _)| *state == "warn"), "{:?}", words(&as_recorded));
+        let resumed = Facts { replay: in_phase(ReplayPhase::Playing, 100), ..as_recorded.clone() };
+        assert!(words(&resumed).iter().all(|(state, _)| *state == "warn"), "{:?}", words(&resumed));
+        let silent = Facts { replay: in_phase(ReplayPhase::Playing, 9000), ..as_recorded };
+        assert_eq!(words(&silent)[0], ("error", "no packets from top for 9.0 s".to_owned()));
     }
 
     /// A time in ms, and what is observed then other than that all is fine.

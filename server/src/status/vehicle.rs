@@ -98,6 +98,8 @@ pub(super) struct Changing {
     pub(super) validity: Duration,
     pub(super) speed_m_s: Option<f64>,
     pub(super) has_recorded_stamps: bool,
+    /// Phase of the replay that makes the maps, and since when after `started`; `None` if they are made live.
+    pub(super) replay: Option<(v1::ReplayPhase, Duration)>,
     drivable_share: Option<f64>,
     pub(super) window: Window,
     /// Time of all maps by stage, in the order of [`STAGES`].
@@ -326,6 +328,13 @@ impl VehicleStatus {
     /// Records which listeners hang or have stopped; empty: none.
     pub(crate) fn set_listener_fault(&self, fault: &str) {
         fault.clone_into(&mut locked(&self.listener_fault));
+    }
+
+    /// Records the phase of the replay that makes the maps, and tells readers of its end.
+    pub(crate) fn set_replay_phase(&self, phase: v1::ReplayPhase) {
+        locked(&self.changing).replay = Some((phase, self.started.elapsed()));
+        let ended = phase == v1::ReplayPhase::Ended;
+        self.replay_ended.send_if_modified(|was| std::mem::replace(was, ended) != ended);
     }
 
     /// Records that the engine has stopped.

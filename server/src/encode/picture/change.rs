@@ -11,8 +11,10 @@ use crate::encode::palette::Rgb;
 pub enum Change {
     /// The cell lies outside one of the grids, or is unknown in both maps.
     Unknown,
-    /// The class is the same.
-    Same,
+    /// The class is the same, and free.
+    Free,
+    /// The class is the same, and neither free nor unknown.
+    Closed,
     /// The cell is free now.
     FreeGained,
     /// The cell was free.
@@ -23,8 +25,9 @@ pub enum Change {
 
 impl Change {
     /// The changes that a picture shows, as its legend names them.
-    const SHOWN: [(Self, &str); 4] = [
-        (Self::Same, "same class"),
+    const SHOWN: [(Self, &str); 5] = [
+        (Self::Free, "still free"),
+        (Self::Closed, "still not free"),
         (Self::FreeGained, "free gained"),
         (Self::FreeLost, "free lost"),
         (Self::Other, "other change"),
@@ -42,13 +45,11 @@ impl Change {
     pub fn of(before: &Layer, was: usize, after: &Layer, is: usize) -> Self {
         let meanings = (before.meaning_of(was), after.meaning_of(is));
         match meanings {
-            _ if class_name(before, was) == class_name(after, is) => {
-                if meanings.1 == ClassMeaning::Unknown {
-                    Self::Unknown
-                } else {
-                    Self::Same
-                }
-            }
+            _ if class_name(before, was) == class_name(after, is) => match meanings.1 {
+                ClassMeaning::Unknown => Self::Unknown,
+                ClassMeaning::Free => Self::Free,
+                _ => Self::Closed,
+            },
             (was, is) if (was == ClassMeaning::Free) == (is == ClassMeaning::Free) => Self::Other,
             (_, ClassMeaning::Free) => Self::FreeGained,
             _ => Self::FreeLost,
@@ -59,7 +60,8 @@ impl Change {
     pub fn colour(self) -> Rgb {
         match self {
             Self::Unknown => [24, 26, 30],
-            Self::Same => [90, 96, 104],
+            Self::Free => [66, 72, 80],
+            Self::Closed => [150, 156, 164],
             Self::FreeGained => [86, 180, 233],
             Self::FreeLost => [213, 94, 0],
             Self::Other => [240, 228, 66],

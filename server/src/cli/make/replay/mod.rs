@@ -34,7 +34,7 @@ use crate::replay::ReplayHandle;
 use crate::replay::control::check;
 use crate::replay::faults::Faults;
 use crate::replay::outcome::Played;
-use crate::replay::player::{Player, PlayerOptions, ReplayedVehicle};
+use crate::replay::player::{BEHIND_MAX, Player, PlayerOptions, ReplayedVehicle};
 use crate::replay::timeline::Timeline;
 use crate::server::{Running, Server, Setup, random};
 
@@ -239,6 +239,10 @@ pub async fn replay(
     summary.snapshot = status.snapshot();
     summary.truncated = played.remarks.truncated;
     summary.notes = played.remarks.notes;
+    if played.behind_max > BEHIND_MAX {
+        let seconds = played.behind_max.as_secs_f64();
+        summary.notes.push(format!("this machine was too slow for this speed: maps were up to {seconds:.1} s late"));
+    }
     let others = running_vehicles.0.iter().skip(1);
     summary
         .notes
