@@ -1,8 +1,10 @@
 //! Far ground counts as reached only in the directions in which the vehicle gets to it near.
 //!
-//! In: by cell whether the middle of the vehicle's disc gets there. Out: reached cells without those that only a detour
-//! over farther ground leads to, or a way around what closes their direction near. Rings lie metres apart far away, so
-//! that no return shows a kerb, a ditch or a rail there; but near the vehicle the same edge was seen.
+//! In: by cell whether it is open, and whether the middle of the vehicle's disc gets there. Out: reached cells without
+//! those that only a detour over farther ground leads to, or a way around what closes their direction near. Rings lie
+//! metres apart far away, so that no return shows a kerb, a ditch or a rail there; but near the vehicle the same edge
+//! was seen. A direction is closed at an edge of near ground if the ground before the edge is open and none of it is
+//! reached. Where an obstacle hides that ground, nothing is known of a kerb, and the direction stays as it was.
 
 use std::f32::consts::TAU;
 
@@ -12,9 +14,12 @@ use super::flood::{Bits, Flood};
 /// Number of directions. Ours: those of the ground's estimate.
 const DIRECTIONS: usize = 180;
 /// The edges of near ground. Ours; tuned on the even seeds of the random worlds.
-const EDGES: [Edge; 2] = [Edge { range_m: 15.0, beside: 8 }, Edge { range_m: 25.0, beside: 5 }];
-/// Depth of near ground at its edge in which a direction must be reached, metres. Ours; tuned as the edges.
-const DEPTH_M: f32 = 6.0;
+const EDGES: [Edge; 2] = [Edge { range_m: 15.0, beside: 2 }, Edge { range_m: 25.0, beside: 1 }];
+/// Depth of near ground at its edge, metres. Ours; tuned as the edges.
+const DEPTH_M: f32 = 4.0;
+/// Share of the near ground of a direction that must be open if none of it is reached, so that it is closed. Ours;
+/// tuned as the edges.
+const OPEN_SHARE_MIN: f32 = 0.5;
 
 /// An edge of near ground.
 struct Edge {
@@ -70,16 +75,22 @@ impl Directions {
         &self.near
     }
 
-    /// Removes the reached cells beyond an edge in directions that are closed there.
-    pub fn close(&self, flood: &mut Flood) {
+    /// Removes the reached cells beyond an edge in directions that are closed there. `open` are the cells over which
+    /// the disc's middle may move if nothing closes them.
+    pub fn close(&self, open: &Bits, flood: &mut Flood) {
         let mut is_open = [true; DIRECTIONS];
         for (edge, Edge { beside, .. }) in EDGES.iter().enumerate() {
             let of_edge = edge * DIRECTIONS..(edge + 1) * DIRECTIONS;
-            let is_reached = |cell: &u32| flood.is_middle(*cell as usize % SIDE, *cell as usize / SIDE);
             let mut leads_on = [false; DIRECTIONS];
-            for direction in (0..DIRECTIONS).filter(|at| self.inside[of_edge.start + at].iter().any(is_reached)) {
-                for near in 0..=2 * beside {
-                    leads_on[(direction + DIRECTIONS - beside + near) % DIRECTIONS] = true;
+            for (direction, cells) in self.inside[of_edge.clone()].iter().enumerate() {
+                match View::of(cells, open, flood) {
+                    View::Reached => {
+                        for near in 0..=2 * beside {
+                            leads_on[(direction + DIRECTIONS - beside + near) % DIRECTIONS] = true;
+                        }
+                    }
+                    View::Hidden => leads_on[direction] = true,
+                    View::Closed => {}
                 }
             }
             for (direction, words) in self.beyond[of_edge].iter().enumerate() {
@@ -89,6 +100,27 @@ impl Directions {
                 }
             }
         }
+    }
+}
+
+/// What is known of the near ground of a direction.
+enum View {
+    /// Some of it is reached.
+    Reached,
+    /// Most of it is not open: obstacles hide it.
+    Hidden,
+    /// It is open, and none of it is reached.
+    Closed,
+}
+
+impl View {
+    fn of(cells: &[u32], open: &Bits, flood: &Flood) -> Self {
+        let place = |cell: &u32| (*cell as usize % SIDE, *cell as usize / SIDE);
+        if cells.iter().map(place).any(|(ix, iy)| flood.is_middle(ix, iy)) {
+            return Self::Reached;
+        }
+        let seen = cells.iter().map(place).filter(|(ix, iy)| open.get(*ix, *iy)).count();
+        if seen as f32 >= OPEN_SHARE_MIN * cells.len() as f32 { Self::Closed } else { Self::Hidden }
     }
 }
 
@@ -103,27 +135,38 @@ mod tests {
     use super::super::cells::cell;
     use super::*;
 
+    /// True if a place is reached with a wall 6 m to the left, this long ahead and behind. `hides` is true for the
+    /// cells behind it that are not open.
+    fn is_reached(half_m: f32, hides: impl Fn([f32; 2]) -> bool, [x, y]: [f32; 2]) -> bool {
+        let [mut open, mut closed] = [Bits::square(SIDE), Bits::square(SIDE)];
+        open.fill(|cell| !hides(centre_m(cell)));
+        closed.fill(|cell| {
+            let [x, y] = centre_m(cell);
+            x.abs() < half_m && (6.0..6.5).contains(&y)
+        });
+        let (directions, mut flood) = (Directions::new(), Flood::new(SIDE));
+        flood.run(&open, &closed, 3, directions.near());
+        directions.close(&open, &mut flood);
+        let cell = cell(x, y) as usize;
+        flood.is_reached(cell % SIDE, cell / SIDE)
+    }
+
     #[test]
     fn ground_behind_a_long_wall_is_not_reached_around_its_far_end() {
-        // A wall 6 m to the left, this long ahead and behind.
-        let reached = |half_m: f32, [x, y]: [f32; 2]| {
-            let [mut open, mut closed] = [Bits::square(SIDE), Bits::square(SIDE)];
-            open.fill(|_| true);
-            closed.fill(|cell| {
-                let [x, y] = centre_m(cell);
-                x.abs() < half_m && (6.0..6.5).contains(&y)
-            });
-            let (directions, mut flood) = (Directions::new(), Flood::new(SIDE));
-            flood.run(&open, &closed, 3, directions.near());
-            directions.close(&mut flood);
-            let cell = cell(x, y) as usize;
-            flood.is_reached(cell % SIDE, cell / SIDE)
-        };
+        let reached = |half_m: f32, place: [f32; 2]| is_reached(half_m, |_| false, place);
         for beside in [[0.0, 10.0], [10.0, 20.0], [0.0, 50.0]] {
             assert!(reached(10.0, beside), "the end of the wall is near: {beside:?}");
             assert!(!reached(40.0, beside), "the end of the wall is far: {beside:?}");
             assert!(reached(40.0, beside.map(|metres| -metres)), "no wall on that side: {beside:?}");
         }
         assert!(reached(40.0, [50.0, 4.0]), "beyond the end of the wall, ahead");
+    }
+
+    #[test]
+    fn a_direction_whose_near_ground_is_hidden_is_not_closed() {
+        // The wall hides all ground behind it up to 25 m.
+        let is_hidden = |[x, y]: [f32; 2]| y > 6.5 && libm::hypotf(x, y) < 25.0;
+        assert!(is_reached(40.0, is_hidden, [0.0, 50.0]), "around the far end of the wall");
+        assert!(!is_reached(40.0, |place| is_hidden(place) && place[0] < 0.0, [5.0, 50.0]), "open ground before it");
     }
 }

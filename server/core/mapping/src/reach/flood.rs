@@ -112,6 +112,22 @@ impl Bits {
         self.words[iy * self.stride + ix / 64] >> (ix % 64) & 1 != 0
     }
 
+    /// Replaces the bits by those of an equally large square.
+    pub fn copy_from(&mut self, other: &Self) {
+        self.words.copy_from_slice(&other.words);
+    }
+
+    /// Calls `each` with each cell whose bit is set, row by row.
+    pub fn each(&self, mut each: impl FnMut(usize, usize)) {
+        for (at, word) in self.words.iter().enumerate() {
+            let mut rest = *word;
+            while rest != 0 {
+                each(at % self.stride * 64 + rest.trailing_zeros() as usize, at / self.stride);
+                rest &= rest - 1;
+            }
+        }
+    }
+
     /// Adds each cell within `radius` of a cell of `from`. Bits beyond the last column may be set; they are no cells.
     fn dilate(&mut self, from: &Self, radius: usize) {
         let rows = from.words.len() / from.stride;

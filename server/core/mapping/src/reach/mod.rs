@@ -10,6 +10,7 @@
 //! |---|---|
 //! | points -> cells with an obstacle | `obstacles` |
 //! | points -> cells beside a step of the ground | `steps` |
+//! | cells beside a step -> those between two of them | `joins` |
 //! | obstacles -> the ground that they hide | `shadow` |
 //! | open and closed cells -> reached cells | `flood` |
 //! | reached cells -> those without a detour over farther ground | `directions` |
@@ -18,6 +19,7 @@ mod cells;
 pub mod config;
 mod directions;
 mod flood;
+mod joins;
 mod obstacles;
 mod shadow;
 mod steps;
@@ -31,6 +33,7 @@ use cells::{CELL_M, SIDE};
 use config::ReachConfig;
 use directions::Directions;
 use flood::{Bits, Flood};
+use joins::Joins;
 use obstacles::Obstacles;
 use shadow::Shadow;
 use steps::Steps;
@@ -86,6 +89,9 @@ pub struct Reach {
     views: Vec<View>,
     open: Bits,
     closed: Bits,
+    joins: Joins,
+    /// Closed cells, and those between two cells beside a step.
+    barred: Bits,
     directions: Directions,
     flood: Flood,
 }
@@ -107,7 +113,9 @@ impl Reach {
             has_obstacle: vec![false; CELLS],
             views: vec![View::Closed; CELLS],
             open: bits.clone(),
-            closed: bits,
+            closed: bits.clone(),
+            joins: Joins::new(),
+            barred: bits,
             directions: Directions::new(),
             flood: Flood::new(SIDE),
         }
@@ -124,15 +132,21 @@ impl Reach {
         let closed = &mut self.closed;
         cells::find(&sweep.x, &sweep.y, &mut self.cell_of_point);
         self.obstacles.find(sweep, ground.heights_m(), &self.cell_of_point, &self.config);
-        self.obstacles.cells().for_each(|(cell, _)| closed.set(cell % SIDE, cell / SIDE));
         self.steps.find(sweep, ground.heights_m(), &self.cell_of_point, &self.config, |cell| {
             closed.set(cell % SIDE, cell / SIDE)
         });
+        self.barred.copy_from(closed);
+        let barred = &mut self.barred;
+        self.joins.find(closed, &self.polar_of_cell, ground.confidences(), |ix, iy| barred.set(ix, iy));
+        for (cell, _) in self.obstacles.cells() {
+            closed.set(cell % SIDE, cell / SIDE);
+            barred.set(cell % SIDE, cell / SIDE);
+        }
         self.open_seen_ground(sweep.mount_height_m, ground.confidences());
         // Radius, in cells, of the largest disc sure to fit through a passage of the vehicle's width.
         let radius = ((self.config.vehicle_width_m / CELL_M - 2.0) / 2.0).max(0.0) as usize;
-        self.flood.run(&self.open, &self.closed, radius, self.directions.near());
-        self.directions.close(&mut self.flood);
+        self.flood.run(&self.open, &self.barred, radius, self.directions.near());
+        self.directions.close(&self.open, &mut self.flood);
     }
 
     /// True if an obstacle stands in a cell, or a step of the ground ends there.
