@@ -83,7 +83,7 @@ fn main() -> ExitCode {
         drives.push(drives::simulated(scene, sensor, &file));
     }
     drives.extend(drives::recorded(&drives::data()));
-    if is_wanted("live") {
+    if is_wanted("live, eight sensors") || is_wanted("live, four vehicles") {
         let capture = folder.path().join("fleet.pcap");
         drives::simulate(&programs[0], Surroundings::PLAIN, "town", FLEET_SENSOR, &capture);
         for program in &programs {

@@ -121,7 +121,8 @@ pub fn junit(results: &[Checked]) -> String {
     let count = |is: fn(&Checked) -> bool| results.iter().filter(|result| is(result)).count();
     let errors = count(|result| result.exit() == Exit::Unreadable);
     let failures = count(|result| result.exit() == Exit::Differs);
-    let seconds: f64 = results.iter().map(|result| result.seconds).sum();
+    // `sum` of nothing is -0.
+    let seconds = results.iter().fold(0.0, |seconds, result| seconds + result.seconds);
     let sums = format!(
         "name=\"clearway verify\" tests=\"{}\" failures=\"{failures}\" errors=\"{errors}\" time=\"{seconds:.3}\"",
         results.len()
