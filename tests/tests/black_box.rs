@@ -259,7 +259,7 @@ fn of_what_a_slow_disk_does_not_take_each_topic_counts_the_same_live_and_in_the_
         let event = Event { sequence, arrival_ns, source, body };
         handle.record_event(&event);
         if let Ok(Some(map)) = pipeline.step(&event) {
-            let map = Arc::new(EncodedMap::new(map, "car".into(), 7, 300));
+            let map = Arc::new(EncodedMap::new(map, "car".into(), 0, 300));
             handle.record_map(&map, traces.hop(&map, "record", None));
         }
         handle.keep_up(&event, &mut pipeline);
@@ -293,7 +293,7 @@ fn of_what_a_slow_disk_does_not_take_each_topic_counts_the_same_live_and_in_the_
         assert_eq!(live.offered, live.written + live.dropped, "{live:?}");
         assert_eq!(messages[&live.topic], live.written, "{live:?}");
     }
-    println!("{live:#?}");
+    live.iter().for_each(|topic| println!("{topic:?}"));
     let entries = Entry::of_part(&file, 0, 0).unwrap();
     assert!(entries[0].faults.iter().any(|fault| fault.contains("dropped: the recorder's queue was full")));
     let report = verify(&file).unwrap();
