@@ -115,7 +115,7 @@ mod tests {
         assert_eq!(line.len(), 15);
         assert!(line.iter().all(|cell| (centre_m(*cell)[1] - 5.1).abs() < 0.3), "along the line between them");
         assert_eq!(joined([24.1, 5.1], 22.0), [], "ground was seen between them");
-        assert_eq!(joined([24.1, 12.1], 40.0), [], "too far across");
+        assert_eq!(joined([22.1, 16.1], 40.0), [], "too far across");
         assert_eq!(joined([50.1, 12.1], 60.0), [], "too far away");
     }
 }
