@@ -28,7 +28,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::base::sync::locked;
 use crate::cli::make::serve::log_endpoints;
 use crate::cli::shared::exit::Exit;
-use crate::cli::shared::output::{block_on, counted, print, print_line, stop_signal};
+use crate::cli::shared::output::{block_on, counted, print, print_line, stop_signal, usage_error};
 use crate::config::{Config, Vehicle};
 use crate::replay::ReplayHandle;
 use crate::replay::control::check;
@@ -64,6 +64,11 @@ const ACKNOWLEDGE_S_MAX: f64 = 10.0;
 /// # Errors
 /// [`ReplayError`].
 pub fn run(options: Options) -> anyhow::Result<Exit> {
+    if let (Some(from), Some(to)) = (options.from, options.to)
+        && from >= to
+    {
+        return Err(usage_error(format!("--from {from} --to {to}: the range must end after it begins")));
+    }
     block_on(replay_and_print(options, None))
 }
 
