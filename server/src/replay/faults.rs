@@ -105,12 +105,7 @@ impl Faults {
     ///
     /// # Errors
     /// [`FaultError`] if no vehicle has the sensor of a fault, or a fault begins after the drive.
-    pub fn new(
-        faults: Vec<Fault>,
-        seed: u64,
-        length_s: f64,
-        sensors: Vec<Vec<String>>,
-    ) -> Result<Self, FaultError> {
+    pub fn new(faults: Vec<Fault>, seed: u64, length_s: f64, sensors: Vec<Vec<String>>) -> Result<Self, FaultError> {
         for fault in &faults {
             if fault.from_s > length_s {
                 let reason = format!("it begins after the drive, which is {length_s:.3} s long");

@@ -31,7 +31,8 @@ mod table;
 ///
 /// Or compare their maps with those of another configuration or recording.
 #[derive(Args)]
-#[command(after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, is not whole, has
+#[command(
+    after_help = "Exit codes: 0 all maps are equal, 1 a map differs, 2 a file cannot be checked, is not whole, has
 no event, or no map in common with that of --against, 3 wrong use.
 
 Examples:
@@ -41,7 +42,8 @@ Examples:
   clearway verify s3://fleet/clearway/parts --shard 2/5
   clearway verify drives --config new.toml --pictures changes
   clearway verify drive.mcap --set vehicle.maps.reach.vehicle_width_m=2.5
-  clearway verify before.mcap --against after.mcap")]
+  clearway verify before.mcap --against after.mcap"
+)]
 pub struct Options {
     /// Recordings (MCAP), folders of them, patterns in quotes, such as 'drives/**/*.mcap', or URLs of a store or of a
     /// recording in it, such as s3://BUCKET/PREFIX.

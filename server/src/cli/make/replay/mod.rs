@@ -318,6 +318,8 @@ fn initial_state(options: &Options, extent: Option<(i64, i64)>) -> Result<v1::Re
         jumps: 0,
         vehicles: Vec::new(),
         readers_awaited: options.wait_readers.unwrap_or(0),
+        awaited: String::new(),
+        maps: Vec::new(),
     };
     // Saturates: what lies outside the files is refused.
     let at = |seconds: f64| begin_ns.saturating_add((seconds * 1e9) as i64);

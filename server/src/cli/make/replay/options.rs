@@ -97,7 +97,8 @@ pub struct Options {
     /// Make the next map when every reader that acknowledges has acknowledged the last one; the default speed is max.
     #[arg(long, requires = "serve")]
     pub lockstep: bool,
-    /// Longest wait for an acknowledgement with --lockstep [default: 10].
+    /// Longest wait for an acknowledgement with --lockstep [default: 10]. After it the server ends with exit code 2,
+    /// and names the map and the readers.
     #[arg(long, value_name = "SECONDS", requires = "lockstep", value_parser = seconds)]
     pub lockstep_timeout: Option<f64>,
     /// Wait for this many readers before the first event: gRPC streams, pages, zenoh keys and Foxglove subscriptions.
