@@ -342,8 +342,6 @@ async fn in_lockstep_the_next_map_is_made_when_the_client_has_handled_the_last()
             tokio::task::yield_now().await;
         }
         assert_eq!((first, stream.newest().unwrap().sequence()), (0, 0));
-        let why = stream.ended().unwrap().to_string();
-        assert!(why.contains("lockstep: map 0 of vehicle car was not acknowledged within 0.2 s"), "{why}");
     })
     .await;
     let error = summary.unwrap_err().to_string();
