@@ -24,7 +24,8 @@ pub enum Exit {
 
 /// The exit codes, as the help text lists them.
 pub const EXIT_CODES: &str = "Exit codes: 0 good, 1 the result differs, 2 an input cannot be read or is not whole, or \
-    the command failed (a value that does not fit the files too), 3 wrong use, 4 the map is stale (get, watch) or a vehicle's state is error (status), 5 it is \
+    the command failed (a value that does not fit the files too), 3 wrong use, \
+    4 the map is stale (get, watch) or a vehicle's state is error (status), 5 it is \
     warn (status).";
 
 impl Exit {
